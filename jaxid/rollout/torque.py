@@ -8,7 +8,6 @@ it needs no second derivative, and errors that add up over the horizon count.
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,71 +16,18 @@ import numpy as np
 from jaxid.arrays import AnyArray, Array, Float, double_precision
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.dispatch import program_of
+from jaxid.dynamics.motion import Motion
+from jaxid.dynamics.terms import HardSign
 from jaxid.errors import InputError
 from jaxid.identification.identify import identify
 from jaxid.identification.uncertainty import Uncertainty
 from jaxid.identification.uncertainty.blocks import block_covariance
-from jaxid.measurement.observations import Observations
+from jaxid.measurement.observations import Observations, joined
 from jaxid.program.xla import lower
-from jaxid.result_table import Column, Table, with_deviations
+from jaxid.result_table import Column, Summarised, Table, with_deviations
 
 from .least_squares import minimise
-
-MARGIN = 0.05
-"""Time before and behind a window for which its torques are known, for delays [s]."""
-SLIDING = 0.05
-"""Speed at which friction by torque has about its full size [rad/s or m/s]."""
-BLOCKS = 40
-"""Contiguous parts of the logs whose scatter gives the uncertainty."""
-
-
-class Windows(NamedTuple):
-    """Windows of logs, all of one length.
-
-    The windows are the last axis, which makes the loops over them fast.
-
-    Attributes:
-        q: Initial positions [joints, windows].
-        qd: Initial velocities.
-        forces: Torques, with a margin at both ends [samples, joints, windows].
-        measured: Measured positions behind the first sample [steps, joints, windows].
-        blocks: Part of the logs to which each window belongs.
-    """
-
-    q: Float[AnyArray, "joints windows"]
-    qd: Float[AnyArray, "joints windows"]
-    forces: Float[AnyArray, "samples joints windows"]
-    measured: Float[AnyArray, "steps joints windows"]
-    blocks: np.ndarray
-
-    @classmethod
-    def of(cls, logs: Sequence[Observations], horizon: float, spacing: float) -> "Windows":
-        """Return windows of a horizon [s], whose starts are `spacing` [s] apart."""
-        dt = logs[0].sample_time
-        if any(abs(o.sample_time - dt) > 0.01 * dt for o in logs):
-            raise InputError("`observations` must have one sample time.")
-        steps, margin = max(1, round(horizon / dt)), round(MARGIN / dt)
-        parts, count = [], 0
-        for o in logs:
-            q, qd, forces = (np.asarray(x) for x in (o.motion.q, o.motion.qd, o.forces))
-            edge = o.filter.edge(dt) + margin
-            for a, b in o.segments:
-                starts = np.arange(a + edge, b - edge - steps, max(1, round(spacing / dt)))
-                parts += [
-                    (
-                        q[k],
-                        qd[k],
-                        forces[k - margin : k + steps + margin + 1],
-                        q[k + 1 : k + steps + 1],
-                        count + k - a,
-                    )
-                    for k in starts
-                ]
-                count += b - a
-        if not parts:
-            raise InputError(f"`observations` hold no window of {horizon:g} s: shorten `horizon`.")
-        q0, qd0, u, measured, place = (np.stack(x, axis=-1) for x in zip(*parts, strict=True))
-        return cls(q0, qd0, u, measured, place * BLOCKS // max(count, 1))
+from .torque_windows import MARGIN, SLIDING, TorqueRows, Windows
 
 
 @dataclasses.dataclass(frozen=True)
@@ -109,45 +55,102 @@ class TorqueRollout:
     def start(self, p: AnyArray) -> np.ndarray:
         """Return the unknowns without delay, with gains of 1."""
         n = self.base.model.robot.joints
-        return np.concatenate([p, np.zeros(1), np.ones(n), np.zeros(n)])
+        return np.concatenate([np.asarray(p), np.zeros(1), np.ones(n), np.zeros(n)])
 
     def errors(self, x: Array, windows: Windows) -> Float[Array, "steps joints windows"]:
         """Return simulated less measured positions, by the Runge-Kutta method of order four."""
-        n, h = self.base.model.robot.joints, self.sample_time
-        p, delay, gains, load = jnp.split(x, np.cumsum([self.base.size, 1, n]))
-        p, gains, load = self.base.to_standard(p)[:, None], gains[:, None], load[:, None]
-        forces, margin = jnp.asarray(windows.forces), round(MARGIN / h)
-        steps = len(forces) - 2 * margin - 1
-        at = jnp.clip(
-            margin + jnp.asarray(np.arange(steps + 1.0)) - delay / h, 0.0, len(forces) - 1.001
-        )
-        whole = jnp.floor(at)
-        k = whole.astype(int)
-        late = forces[k] + (at - whole)[:, None, None] * (forces[k + 1] - forces[k])
-        acceleration = self._acceleration
+        forces, h = jnp.asarray(windows.forces), self.sample_time
+        margin = round(MARGIN / h)
+        at = margin + jnp.arange(len(forces) - 2.0 * margin) - self._parts(x)[1] / h
+        late = _between(forces, jnp.clip(at, 0.0, len(forces) - 1.001))
+        start = jnp.asarray(windows.q), jnp.asarray(windows.qd)
+        return self._integrate(x, start, (late,))[0] - windows.measured
 
-        def rate(state, u):
+    def torque_errors(self, x: Array, rows: TorqueRows) -> Float[Array, "rows joints"]:
+        """Return predicted less measured torques at the measured motion; zero if not counted."""
+        p, delay, gains, load = self._parts(x)
+        first, last = jnp.asarray(rows.ends)
+        at = jnp.arange(1.0 * len(rows.forces)) - delay / rows.row_time
+        at = jnp.clip(at, first, jnp.maximum(first, last - 0.001))
+        forces, friction = (_between(jnp.asarray(y), at) for y in (rows.forces, rows.load))
+        torques = gains[None] * forces - load[None] * friction
+        return (jnp.asarray(rows.columns) @ p - torques) * jnp.asarray(rows.counted)
+
+    def follow(
+        self, p: AnyArray, logs: Sequence[Observations], bandwidth: float
+    ) -> tuple[Motion, ...]:
+        """Return simulations of whole logs, which a controller keeps near the measured motions.
+
+        Args:
+            p: Base parameters.
+            logs: Filtered logs with torques.
+            bandwidth: Double pole of the closed loop [rad/s].
+        """
+        spans = [(o, span) for o in logs for span in o.segments]
+        longest = max(b - a for _, (a, b) in spans)
+        # Shorter segments are continued by their last samples.
+        places = [np.minimum(np.arange(a, a + longest), b - 1) for _, (a, b) in spans]
+        channels = [(o.motion.q, o.motion.qd, o.forces) for o, _ in spans]
+        inputs = [
+            np.stack([np.asarray(x)[k] for x, k in zip(kind, places, strict=True)], axis=-1)
+            for kind in zip(*channels, strict=True)
+        ]
+        with double_precision():
+            found = _follow(self, jnp.asarray(self.start(p)), *inputs, float(bandwidth))
+        found = [np.asarray(x) for x in found]
+        parts = iter(
+            Motion(*(x[: b - a, :, k] for x in found)) for k, (_, (a, b)) in enumerate(spans)
+        )
+        return tuple(joined([next(parts) for _ in o.segments]) for o in logs)
+
+    def _parts(self, x: Array) -> list[Array]:
+        """Return base parameters, delay, gains, and friction by torque."""
+        n = self.base.model.robot.joints
+        return jnp.split(x, np.cumsum([self.base.size, 1, n]))
+
+    def _integrate(
+        self,
+        x: Array,
+        start: tuple[Array, Array],
+        inputs: tuple[Array, ...],
+        bandwidth: Array | float = 0.0,
+    ) -> Sequence[Array]:
+        """Return positions and velocities behind each step, and accelerations before it.
+
+        Args:
+            x: Unknowns.
+            start: Initial positions and velocities [joints, windows].
+            inputs: Torques, and positions and velocities to follow, if any.
+            bandwidth: Double pole of the controller that follows [rad/s].
+        """
+        h, acceleration = self.sample_time, self._acceleration
+        p, _, gains, load = self._parts(x)
+        p, gains, load = self.base.to_standard(p)[:, None], gains[:, None], load[:, None]
+
+        def rate(state, inputs):
             q, qd = state
+            u, *measured = inputs
             # Gear friction grows with the torque that it carries.
             u = gains * u - load * jnp.abs(u) * jnp.tanh(qd / SLIDING)
-            return qd, jnp.stack(acceleration(p, q, qd, u))
+            pulls = zip((bandwidth**2, 2.0 * bandwidth), measured, state, strict=False)
+            return qd, jnp.stack(acceleration(p, q, qd, u)) + sum(k * (m - y) for k, m, y in pulls)
 
         def moved(state, rate, time):
             return jax.tree.map(lambda y, r: y + time * r, state, rate)
 
         def step(state, inputs):
-            u0, u1 = inputs
-            middle = 0.5 * (u0 + u1)
-            k1 = rate(state, u0)
+            first, last = inputs
+            middle = jax.tree.map(lambda a, b: 0.5 * (a + b), first, last)
+            k1 = rate(state, first)
             k2 = rate(moved(state, k1, 0.5 * h), middle)
             k3 = rate(moved(state, k2, 0.5 * h), middle)
-            k4 = rate(moved(state, k3, h), u1)
+            k4 = rate(moved(state, k3, h), last)
             mean = jax.tree.map(lambda a, b, c, d: (a + 2 * b + 2 * c + d) / 6, k1, k2, k3, k4)
             state = moved(state, mean, h)
-            return state, state[0]
+            return state, (*state, k1[1])
 
-        start = jnp.asarray(windows.q), jnp.asarray(windows.qd)
-        return jax.lax.scan(step, start, (late[:-1], late[1:]))[1] - windows.measured
+        ends = ([y[part] for y in inputs] for part in (slice(-1), slice(1, None)))
+        return jax.lax.scan(step, start, tuple(ends))[1]
 
     @functools.cached_property
     def _acceleration(self) -> Callable:
@@ -157,8 +160,25 @@ class TorqueRollout:
         return lower(program_of(model, model.acceleration, (model.size,), *[joints] * 3), False)
 
 
+def _between(series: Array, at: Array) -> Array:
+    """Return a series at fractions of its samples along the first axis."""
+    whole = jnp.floor(at)
+    k, part = whole.astype(int), (at - whole).reshape(-1, *[1] * (series.ndim - 1))
+    return series[k] + part * (series[k + 1] - series[k])
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _follow(
+    rollout: TorqueRollout, x: Array, q: Array, qd: Array, forces: Array, bandwidth: Array | float
+) -> Sequence[Array]:
+    """Return simulated positions, velocities and accelerations [samples, joints, segments]."""
+    after = rollout._integrate(x, (q[0], qd[0]), (forces, q, qd), bandwidth)
+    begun = (jnp.concatenate([y[:1], z]) for y, z in zip((q, qd), after, strict=False))
+    return (*begun, jnp.concatenate([after[2], after[2][-1:]]))
+
+
 @dataclasses.dataclass(frozen=True)
-class TorqueRolloutFit:
+class TorqueRolloutFit(Summarised):
     """Parameters for which open-loop simulations follow the measured positions.
 
     Attributes:
@@ -169,6 +189,7 @@ class TorqueRolloutFit:
         horizon: Horizon of the windows [s].
         rms: Errors of the identification over the windows [rad or m].
         start: Base parameters of the fit of torques from which the search started.
+        torque_rows: Whether errors of torques counted as well.
     """
 
     rollout: TorqueRollout
@@ -178,6 +199,7 @@ class TorqueRolloutFit:
     horizon: float
     rms: Float[np.ndarray, " joints"]
     start: Float[np.ndarray, " base"]
+    torque_rows: bool = False
 
     @property
     def parameters(self) -> Float[np.ndarray, " base"]:
@@ -202,8 +224,25 @@ class TorqueRolloutFit:
         windows = Windows.of(logs, horizon, 0.04)
         x = self.unknowns if parameters is None else self.rollout.start(parameters)
         with double_precision():
-            errors = jax.jit(self.rollout.errors)(jnp.asarray(x), windows._replace(blocks=None))
+            errors = jax.jit(self.rollout.errors)(jnp.asarray(x), windows)
         return np.sqrt(np.mean(np.asarray(errors)[-1] ** 2, axis=-1))
+
+    def torque_errors(
+        self,
+        observations: Sequence[Observations] | Observations,
+        parameters: AnyArray | None = None,
+    ) -> Float[np.ndarray, " joints"]:
+        """Return the root mean square error of torques at the measured motion [N m or N].
+
+        The arguments are those of `errors_at`.
+        """
+        logs = [observations] if isinstance(observations, Observations) else observations
+        x = self.unknowns if parameters is None else self.rollout.start(parameters)
+        rows = TorqueRows.of(self.rollout.base, logs)
+        with double_precision():
+            errors = np.asarray(self.rollout.torque_errors(jnp.asarray(x), rows))
+            gains = np.asarray(self.rollout._parts(jnp.asarray(x))[2])
+        return np.sqrt(np.sum(errors**2, axis=0) / rows.counted.sum(axis=0)) / gains
 
     def summary(self) -> Table:
         """Return a table of the estimates with 95 % intervals."""
@@ -225,9 +264,6 @@ class TorqueRolloutFit:
             facts=[(f"errors within {self.horizon:g} s", f"{errors} mrad or mm RMS")],
         )
 
-    def __str__(self) -> str:
-        return self.summary().text()
-
 
 def identify_torque_rollout(
     base: BaseParameters,
@@ -236,6 +272,7 @@ def identify_torque_rollout(
     horizon: float = 0.2,
     gains: bool = False,
     load_friction: bool = False,
+    torque_rows: bool = False,
     every: int = 5,
 ) -> TorqueRolloutFit:
     """Identify a robot so that its simulation under recorded torques follows the positions.
@@ -249,46 +286,68 @@ def identify_torque_rollout(
         gains: Whether the gains of the other joints' torques, relative to the first joint's, are
             estimated. A gain common to all scales all parameters, and no log tells it.
         load_friction: Whether friction that grows with the torque is estimated.
+        torque_rows: Whether errors of the torques at the measured motion count as well. Positions
+            and torques of each joint are divided by the standard deviation of their errors.
         every: Number of samples from one that counts to the next.
 
     Raises:
-        InputError: If there is no window of the horizon, or the model is not that of a robot with a
-            positive mass matrix.
+        InputError: If there is no window of the horizon, or the model cannot be simulated.
     """
     logs = [observations] if isinstance(observations, Observations) else list(observations)
+    _require_simulation(base)
     rollout = TorqueRollout(base, logs[0].sample_time)
     windows = Windows.of(logs, horizon, 0.2 * horizon)
+    rows = TorqueRows.of(base, logs) if torque_rows else None
     first, n = np.asarray(identify(base, logs).parameters), base.model.robot.joints
     free = np.concatenate(
         [np.ones(base.size + 1), np.full(n, gains), np.full(n, load_friction)]
     ).astype(bool)
     # All torques, masses and friction can be scaled together: the first gain is 1.
     free[base.size + 1] = False
-    start = rollout.start(first)
-    functions = _compiled(rollout, windows, free, every)
+    objective = _Objective(rollout, windows, rows, free, every)
+    x, weights = rollout.start(first), np.repeat([[1.0], [0.0]], n, axis=1)
+    limits = _limits(x, base.size)
+
+    def search(x: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        functions = objective.functions(weights)
+        return minimise(*functions, x[None], free[None], limits, 25, 1e-5).x[0]
+
     with double_precision():
-        limits = _limits(start, base.size)
-        found = minimise(*functions[:2], start[None], free[None], limits, 25, 1e-5)
-        x = found.x[0]
-        r, J = functions[2](x)
-    if not np.isfinite(r).all():
+        x = search(x, weights)
+        for _ in range(2 if torque_rows else 0):
+            weights = 1.0 / np.maximum(objective.sizes(x), 1e-12)
+            x = search(x, weights)
+        sizes = objective.sizes(x)
+        r, J = objective.linearised(x, weights)
+    if not np.isfinite(sizes).all():
         raise InputError(
             "`observations`: the simulation diverges from the fit of torques: shorten `horizon`, "
             "or choose terms of the model that these logs determine."
         )
-    uncertainty = _uncertainty(r, J[free], windows.blocks)
-    rms = np.sqrt(np.mean(r**2, axis=(0, 2)))
-    return TorqueRolloutFit(rollout, x, free, uncertainty, horizon, rms, first)
+    uncertainty = _uncertainty(r, J[free], objective.blocks)
+    return TorqueRolloutFit(rollout, x, free, uncertainty, horizon, sizes[0], first, torque_rows)
+
+
+def _require_simulation(base: BaseParameters) -> None:
+    """Check that the model has accelerations that are smooth functions of state and torques."""
+    model = base.model
+    leaves = jax.tree.leaves(model.terms, is_leaf=lambda x: isinstance(x, HardSign))
+    if model.memory is not None or any(isinstance(x, HardSign) for x in leaves):
+        raise InputError(
+            "`base`: dry friction must be smooth in a simulation: use `Tanh(0.1)` (`coulomb = "
+            "{ epsilon = 0.1 }` in an experiment file) in place of a sign or of presliding."
+        )
+    if model.robot.tool is not None:
+        raise InputError(
+            "`base`: a known tool is not simulated: leave `tool` out, and it counts as part of the "
+            "body that carries it."
+        )
 
 
 def _uncertainty(r: np.ndarray, J: np.ndarray, part: np.ndarray) -> Uncertainty:
-    """Return the uncertainty from residuals and their derivatives, windows on the last axis."""
-    blocks = [
-        (J[..., part == k].reshape(len(J), -1).T, r[..., part == k].ravel())
-        for k in np.unique(part)
-    ]
-    flat = J.reshape(len(J), -1)
-    inverse = np.linalg.pinv(flat @ flat.T, rcond=1e-12, hermitian=True)
+    """Return the uncertainty from residuals, their derivatives, and parts of the logs."""
+    blocks = [(J[:, part == k].T, r[part == k]) for k in np.unique(part)]
+    inverse = np.linalg.pinv(J @ J.T, rcond=1e-12, hermitian=True)
     covariance, dof = block_covariance(blocks, inverse)
     return Uncertainty(covariance, np.full(len(J), dof), inverse * float(np.mean(r**2)))
 
@@ -302,37 +361,78 @@ def _limits(start: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
     return low, high
 
 
-def _compiled(
-    rollout: TorqueRollout, windows: Windows, free: np.ndarray, every: int
-) -> tuple[Callable, Callable, Callable]:
-    """Return moments, costs, and residuals with their derivatives, for a batch of one."""
-    data, index = windows._replace(blocks=None), np.flatnonzero(free)
+class _Objective:
+    """Errors of positions in windows, and of torques if their rows are given, in one vector.
 
-    def residuals(x, data):
-        return rollout.errors(x, data)[every - 1 :: every]
+    Weights are those of the joints' positions, and of their torques [2, joints].
+    """
 
-    @jax.jit
-    def derivatives(x, data):
-        def along(direction):
-            return jax.jvp(lambda x: residuals(x, data), (x,), (direction,))
+    def __init__(
+        self,
+        rollout: TorqueRollout,
+        windows: Windows,
+        rows: TorqueRows | None,
+        free: np.ndarray,
+        every: int,
+    ):
+        index = np.flatnonzero(free)
 
-        return jax.vmap(along, out_axes=(None, 0))(jnp.eye(len(x))[index])
+        def errors(x, data):
+            windows, rows, _ = data
+            positions = rollout.errors(x, windows)[every - 1 :: every]
+            return positions, None if rows is None else rollout.torque_errors(x, rows)
 
-    cost = jax.jit(lambda x, data: jnp.sum(residuals(x, data) ** 2))
+        def residuals(x, data):
+            positions, torques = errors(x, data)
+            first, second = data[2]
+            parts = [(first[None, :, None] * positions).ravel()]
+            return jnp.concatenate(
+                [*parts, *([] if rows is None else [(second[None] * torques).ravel()])]
+            )
 
-    def linearised(x):
-        r, found = (np.asarray(y) for y in derivatives(jnp.asarray(x), data))
-        J = np.zeros((len(x), *r.shape))
-        J[index] = found
+        def derivatives(x, data):
+            def along(direction):
+                return jax.jvp(lambda x: residuals(x, data), (x,), (direction,))
+
+            return jax.vmap(along, out_axes=(None, 0))(jnp.eye(len(x))[index])
+
+        self._free, self._windows, self._rows = index, windows, rows
+        self._errors, self._derivatives = jax.jit(errors), jax.jit(derivatives)
+        self._cost = jax.jit(lambda x, data: jnp.sum(residuals(x, data) ** 2))
+        joints, steps = windows.q.shape[0], len(windows.measured) // every
+        shape = (steps, joints, windows.q.shape[1])
+        blocks = [np.broadcast_to(windows.blocks, shape).ravel()]
+        blocks += [] if rows is None else [np.repeat(rows.blocks, joints)]
+        self.blocks = np.concatenate(blocks)
+
+    def _data(self, weights: np.ndarray) -> tuple:
+        return self._windows, self._rows, weights
+
+    def sizes(self, x: np.ndarray) -> np.ndarray:
+        """Return root mean squares of the errors [2, joints]; one where there are no torques."""
+        positions, torques = self._errors(jnp.asarray(x), self._data(np.ones(0)))
+        rms = np.sqrt(np.mean(np.asarray(positions) ** 2, axis=(0, 2)))
+        if self._rows is None:
+            return np.stack([rms, np.ones_like(rms)])
+        squares = np.sum(np.asarray(torques) ** 2, axis=0)
+        return np.stack([rms, np.sqrt(squares / np.sum(self._rows.counted, axis=0))])
+
+    def linearised(self, x: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return weighted errors, and their derivatives by all unknowns [unknowns, errors]."""
+        r, found = (np.asarray(y) for y in self._derivatives(jnp.asarray(x), self._data(weights)))
+        J = np.zeros((len(x), len(r)))
+        J[self._free] = found
         return r, J
 
-    def moments(x, _):
-        r, J = linearised(x[0])
-        flat = J.reshape(len(J), -1)
-        return np.array([np.sum(r**2)]), (flat @ r.ravel())[None], (flat @ flat.T)[None]
+    def functions(self, weights: np.ndarray) -> tuple[Callable, Callable]:
+        """Return moments and costs, for a batch of one."""
 
-    def costs(x, _):
-        found = float(cost(jnp.asarray(x[0]), data))
-        return np.array([found if np.isfinite(found) else np.inf])
+        def moments(x, _):
+            r, J = self.linearised(x[0], weights)
+            return np.array([np.sum(r**2)]), (J @ r)[None], (J @ J.T)[None]
 
-    return moments, costs, linearised
+        def costs(x, _):
+            found = float(self._cost(jnp.asarray(x[0]), self._data(weights)))
+            return np.array([found if np.isfinite(found) else np.inf])
+
+        return moments, costs

@@ -302,12 +302,13 @@ class InstrumentalVariables(AbstractEstimator):
     the encoders' noise. The instruments are kept in memory.
 
     Attributes:
-        references: Commanded trajectory of each recording, or one for all.
+        references: Commanded trajectory of each recording, or one for all; or motions at their
+            samples, such as simulated ones.
         weights: Weights of the joints; by default the reciprocals of the largest forces (Eq. 30).
         starts: Time stamps of the recordings at which the trajectories began [s], or one for all.
     """
 
-    references: tuple[AbstractTrajectory, ...]
+    references: tuple[AbstractTrajectory | Motion, ...]
     weights: AbstractWeights = MaximumForces()
     starts: tuple[float, ...] = eqx.field(static=True, default=(0.0,))
 
@@ -350,9 +351,12 @@ class InstrumentalVariables(AbstractEstimator):
         )
 
 
-def _columns(base, observations: Observations, reference: AbstractTrajectory, start: float):
+def _columns(
+    base, observations: Observations, reference: AbstractTrajectory | Motion, start: float
+) -> tuple[np.ndarray, ...]:
     """Return the columns of a reference for each joint, filtered like those of the recording."""
-    m = reference.motion(np.asarray(observations.time) - start)
+    known = isinstance(reference, Motion)
+    m = reference if known else reference.motion(np.asarray(observations.time) - start)
     motion = Motion(*(np.asarray(x, np.float64) for x in (m.q, m.qd, m.qdd)))
     source = SamplesInMemory(motion, np.zeros(motion.q.shape))
     problem = RegressionProblem(base, [observations.replace(source=source)])

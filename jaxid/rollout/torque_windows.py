@@ -1,0 +1,118 @@
+"""What of logs with torques is compared with a model: windows to simulate, and rows of torques."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxid.arrays import AnyArray, Bool, Float
+from jaxid.dynamics.base import BaseParameters
+from jaxid.errors import InputError
+from jaxid.identification.problem import RegressionProblem
+from jaxid.measurement.observations import Observations
+
+MARGIN = 0.05
+"""Time before and behind a window for which its torques are known, for delays [s]."""
+SLIDING = 0.05
+"""Speed at which friction by torque has about its full size [rad/s or m/s]."""
+BLOCKS = 40
+"""Contiguous parts of the logs whose scatter gives the uncertainty."""
+
+
+class Windows(NamedTuple):
+    """Windows of logs, all of one length.
+
+    The windows are the last axis, which makes the loops over them fast.
+
+    Attributes:
+        q: Initial positions [joints, windows].
+        qd: Initial velocities.
+        forces: Torques, with a margin at both ends [samples, joints, windows].
+        measured: Measured positions behind the first sample [steps, joints, windows].
+        blocks: Part of the logs to which each window belongs.
+    """
+
+    q: Float[AnyArray, "joints windows"]
+    qd: Float[AnyArray, "joints windows"]
+    forces: Float[AnyArray, "samples joints windows"]
+    measured: Float[AnyArray, "steps joints windows"]
+    blocks: np.ndarray
+
+    @classmethod
+    def of(cls, logs: Sequence[Observations], horizon: float, spacing: float) -> "Windows":
+        """Return windows of a horizon [s], whose starts are `spacing` [s] apart."""
+        dt = logs[0].sample_time
+        if any(abs(o.sample_time - dt) > 0.01 * dt for o in logs):
+            raise InputError("`observations` must have one sample time.")
+        steps, margin = max(1, round(horizon / dt)), round(MARGIN / dt)
+        parts, count = [], 0
+        for o in logs:
+            q, qd, forces = (np.asarray(x) for x in (o.motion.q, o.motion.qd, o.forces))
+            edge = o.filter.edge(dt) + margin
+            for a, b in o.segments:
+                starts = np.arange(a + edge, b - edge - steps, max(1, round(spacing / dt)))
+                parts += [
+                    (
+                        q[k],
+                        qd[k],
+                        forces[k - margin : k + steps + margin + 1],
+                        q[k + 1 : k + steps + 1],
+                        count + k - a,
+                    )
+                    for k in starts
+                ]
+                count += b - a
+        if not parts:
+            raise InputError(f"`observations` hold no window of {horizon:g} s: shorten `horizon`.")
+        q0, qd0, u, measured, place = (np.stack(x, axis=-1) for x in zip(*parts, strict=True))
+        return cls(q0, qd0, u, measured, place * BLOCKS // max(count, 1))
+
+
+class TorqueRows(NamedTuple):
+    """Inverse dynamics of logs at the measured motion, filtered and decimated.
+
+    Attributes:
+        columns: Base regressor [rows, joints, base].
+        forces: Torques [rows, joints].
+        load: Their sizes, with the signs of the joints' speeds.
+        counted: Whether a row counts.
+        ends: First and last row of the segment of each row [2, rows].
+        row_time: Time between two rows [s].
+        blocks: Part of the logs to which each row belongs.
+    """
+
+    columns: Float[AnyArray, "rows joints base"]
+    forces: Float[AnyArray, "rows joints"]
+    load: Float[AnyArray, "rows joints"]
+    counted: Bool[AnyArray, "rows joints"]
+    ends: Float[AnyArray, "2 rows"]
+    row_time: float
+    blocks: np.ndarray
+
+    @classmethod
+    def of(cls, base: BaseParameters, logs: Sequence[Observations]) -> "TorqueRows":
+        """Return the rows of some logs."""
+        columns = []
+        for chunk in RegressionProblem(base, logs).chunks():
+            dense = np.zeros((*chunk.forces.shape, base.size))
+            for j, own in enumerate(chunk.indices):
+                dense[:, j, list(own)] = chunk.columns[j]
+            columns.append(dense)
+        parts, ends, places, count, samples = [], [], [], 0, 0
+        for o in logs:
+            forces = np.asarray(o.forces)
+            load = np.abs(forces) * np.tanh(np.asarray(o.motion.qd) / SLIDING)
+            parts.append((o.reduce(forces), o.reduce(load), np.asarray(o.mask)))
+            ends += [np.full((b - a, 2), (count + a, count + b - 1.0)) for a, b in o.row_segments]
+            places.append(samples + o.instants)
+            count, samples = count + o.rows, samples + o.samples
+        forces, load, counted = map(np.concatenate, zip(*parts, strict=True))
+        return cls(
+            np.concatenate(columns),
+            forces,
+            load,
+            counted,
+            np.concatenate(ends).T,
+            logs[0].row_time,
+            np.concatenate(places) * BLOCKS // samples,
+        )
