@@ -369,10 +369,11 @@ def rollout(
     output: options.OutputFolder = Path("rollout"),
     force: options.Force = False,
 ) -> None:
-    """Identify joints behind position servos, without torques.
+    """Identify so that simulations move like the robot: from commands without torques, or torques.
 
-    So that a simulation moves like the robot: a page with measured and simulated motion, numbers
-    for simulators, and MJCF. The experiment file names the columns of the commands.
+    If the experiment file names the columns of commands, joints behind position servos, with
+    numbers for simulators and MJCF; otherwise the model of `identify`, with errors beside those of
+    other methods. A page shows measured and simulated motion.
     """
     console = options.start(experiment, *logs, *(verify or []), output=output, force=force)
     from . import commands

@@ -25,6 +25,7 @@ from jaxid.experiment.excitation import (
 )
 from jaxid.experiment.experiment import Experiment, load_experiment
 from jaxid.experiment.robot_tables import joint_number
+from jaxid.experiment.rollout_logs import identify_rollouts
 from jaxid.experiment.template import toml_text
 from jaxid.export.c_code import export_c
 from jaxid.export.simulators import export_mjcf, export_pinocchio, export_urdf
@@ -50,11 +51,9 @@ from jaxid.report.result_files import (
     write_estimates,
     write_report,
 )
-from jaxid.report.rollout import RolloutReport, rollout_verdict, write_rollout
 from jaxid.report.verdict import Report, verdict
 from jaxid.result_table import Remark, Status, Table, significant
 from jaxid.robot.inertia import INERTIAL_NAMES, INERTIAL_UNITS
-from jaxid.rollout import identify_rollout
 from jaxid.simulation import preview
 from jaxid.trajectory.files import load_trajectory
 
@@ -435,38 +434,15 @@ def states(console: Console, path: Path, logs: list[Path], output: Path) -> None
 def rollout(
     console: Console, path: Path, logs: list[Path], verify: list[Path], output: Path
 ) -> None:
-    """Identify servos from commands and positions, simulate, and write the report."""
+    """Identify so that simulations follow the positions, and write the report."""
     _check_logs(logs, verify, None)
     experiment = load_experiment(path)
-    settings = experiment.rollout
     with identify_logs.stages(open_console(stderr=True)) as stage:
-        seen, unseen = [], []
-        for log, kept in [*((x, seen) for x in logs), *((x, unseen) for x in verify)]:
-            stage(f"reading {log.name}")
-            kept.append(experiment.read_commands(log))
-        stage("identifying")
-        fit = identify_rollout(
-            seen,
-            experiment.bodies(),
-            joint_names=experiment.robot.joint_names,
-            time_step=settings.time_step,
-            friction=settings.friction,
-            saturation=settings.saturation,
-        )
-        stage("simulating")
-        errors = fit.validate(unseen or seen)
-        report = RolloutReport(
-            fit,
-            errors,
-            fit.window_errors(unseen or seen),
-            bool(unseen),
-            settings.stiffness,
-            settings.samples,
-            {"command": command_line(), "experiment_text": experiment.text},
-        )
-        written = write_rollout(output, report)
-    show(console, fit.summary(), *report.tables())
-    show_remarks(console, [rollout_verdict(errors)])
+        report = identify_rollouts(experiment, logs, verify, command_line(), stage)
+        stage("writing the report")
+        written = report.write(output)
+    show(console, *report.tables())
+    show_remarks(console, [report.verdict])
     show_files(console, output, [p.name for p in written])
 
 

@@ -112,11 +112,13 @@ def load_log(
     return recording, observations.replace(notes=(*observations.notes, *notes)), diagnosis
 
 
-def _findings(logs: Sequence[LoadedLog]) -> list[str]:
+def findings(logs: Sequence[LoadedLog]) -> list[str]:
+    """Return the findings on logs, each behind the name of its log."""
     return [f"{log.name}: {text}" for log, _, diagnosis in logs for text in diagnosis.findings]
 
 
-def _require_motion(logs: Sequence[LoadedLog]) -> None:
+def require_motion(logs: Sequence[LoadedLog]) -> None:
+    """Reject logs in which nothing moves."""
     for log, _, diagnosis in logs:
         if diagnosis.statistics.speed.max() < 1e-9:
             raise InputError(f"no joint moves in `{log.name}`: name other columns, or another log.")
@@ -200,8 +202,8 @@ def read_runs(
     for paths, name in zip(groups, names, strict=True):
         fits = [earlier_run(experiment, path) for path in paths if is_report(path)]
         logs = [load_log(experiment, path, stage) for path in paths if not is_report(path)]
-        _require_motion(logs)
-        doubts += _findings(logs)
+        require_motion(logs)
+        doubts += findings(logs)
         if logs:
             stage(f"factorising the rows, {name}")
             observations = [log for _, log, _ in logs]
@@ -245,7 +247,7 @@ def identify_logs(
         folder = Path(os.path.realpath(path)).parent.name
         name = f"{folder}/{path.stem}" if stems.count(path.stem) > 1 else None
         loaded.append(load_log(experiment, path, stage, name))
-    _require_motion(loaded)
+    require_motion(loaded)
     observations = [log for _, log, _ in loaded]
     fitted, unseen = observations[: len(logs)], observations[len(logs) :]
     if split is not None:
@@ -270,10 +272,10 @@ def identify_logs(
     for log, whole, diagnosis in loaded[: len(logs)]:
         if isinstance(log, Recording) and not diagnosis.faulty:
             notes += [f"{log.name}: {x}" for x in resolution_note(fit, log, whole)]
-    notes, findings = list(dict.fromkeys(notes)), _findings(loaded)
+    notes, found = list(dict.fromkeys(notes)), findings(loaded)
     claims = _errors_of_claims(experiment, fit, every)
     return Identification(
-        experiment, choice, fit, validation, len(fitted), notes, findings, mistakes, *claims
+        experiment, choice, fit, validation, len(fitted), notes, found, mistakes, *claims
     )
 
 

@@ -231,9 +231,13 @@ class Logs:
         }
 
 
+SERVO_KEYS = ("bodies", "stiffness", "time_step", "friction", "saturation", "samples")
+"""Keys of `[rollout]` for logs of commands; the others are for logs of torques."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Rollout:
-    """Settings of `jaxid rollout`, which needs commands and positions, but no torques.
+    """Settings of `jaxid rollout`: for logs of commands, without torques, or for logs of torques.
 
     Attributes:
         bodies: Whether the bodies of the robot's file load the joints; by default if it has some.
@@ -243,6 +247,11 @@ class Rollout:
         friction: Whether friction that grows with load or falls with speed is tried.
         saturation: Whether a largest torque of the servo is tried.
         samples: Number of MJCF files drawn from the distribution of the estimates.
+        horizon: With torques: length of the windows that are simulated [s].
+        gains: With torques: whether gains of the other joints' torques, relative to the first
+            joint's, are identified.
+        load_friction: With torques: whether friction that grows with the torque is identified.
+        torque_rows: With torques: whether errors of torques count beside those of positions.
     """
 
     bodies: bool | None = None
@@ -251,6 +260,24 @@ class Rollout:
     friction: bool = True
     saturation: bool = True
     samples: Annotated[int, Bounds(least=0, most=10_000)] = 0
+    horizon: Positive = 0.2
+    gains: bool = False
+    load_friction: bool = False
+    torque_rows: bool = False
+
+    def options(self, torques: bool) -> dict[str, Any]:
+        """Return the settings for logs of torques, or of commands.
+
+        Raises:
+            InputError: If a setting is given that is for logs of the other kind.
+        """
+        values = dataclasses.asdict(self)
+        own = {key: x for key, x in values.items() if (key in SERVO_KEYS) != torques}
+        for key in sorted(values.keys() - own.keys()):
+            if values[key] != getattr(Rollout, key):
+                kind = "commands" if torques else "forces` without `recording.commands"
+                raise InputError(f"`rollout.{key}` is for logs with `recording.{kind}`.")
+        return own
 
 
 SIDES = ("angles_on_motor_side", "forces_on_motor_side")

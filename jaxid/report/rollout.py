@@ -1,5 +1,6 @@
 """Report of an identification without torques: measured and simulated motion, and its numbers."""
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -42,13 +43,22 @@ class RolloutReport(NamedTuple):
     settings: Mapping[str, Any]
 
     @property
+    def verdict(self) -> Remark:
+        """Whether the simulation is closer to the robot than a linear joint."""
+        return rollout_verdict(self.errors)
+
+    @property
     def has_stiffness(self) -> bool:
         """Whether simulators can be given absolute numbers."""
         return self.stiffness is not None or bool(np.isfinite(self.fit.stiffness).any())
 
+    def write(self, folder: Path) -> list[Path]:
+        """Write the page, `rollout.json`, `rollout.csv`, and MJCF if bodies are known."""
+        return write_rollout(folder, self)
+
     def tables(self) -> list[Table]:
-        """Return errors beside the baselines, errors of each motion, numbers for simulators."""
-        found = [comparison_table(self), self.errors.summary()]
+        """Return estimates, errors beside the baselines and by motion, numbers for simulators."""
+        found = [self.fit.summary(), comparison_table(self), self.errors.summary()]
         return [*found, simulator_table(self.fit, self.stiffness)] if self.has_stiffness else found
 
 
@@ -77,19 +87,27 @@ def motion_figure(errors: RolloutErrors, motion: int) -> Figure:
     for name, command, measured, simulated, counted in zip(
         errors.joint_names, *channels, strict=True
     ):
-        wrong = 1e3 * (simulated - measured)
-        curves = [
-            Curve(time, command, "commanded", GREY, width=0.6),
-            Curve(time, measured, "measured", MEASURED, width=1.9),
-            Curve(time, simulated, "simulated", PREDICTED, width=0.9),
-        ]
-        error = Curve(time, wrong, "error", ERROR, width=0.7)
-        below = [Panel([error], y="error", unit="mrad or mm", share=0.6)]
-        rms = np.sqrt(np.mean(wrong[counted > 0] ** 2)) if counted.any() else np.nan
-        said = f"RMS {significant(float(rms))} mrad or mm"
-        panels.append(Panel(curves, name, said, y="position", unit="rad or m", below=below))
+        commanded = Curve(time, command, "commanded", GREY, width=0.6)
+        panel = motion_panel(name, time, measured, simulated, counted > 0)
+        panels.append(dataclasses.replace(panel, curves=[commanded, *panel.curves]))
     title = f"{errors.motions[motion]}: measured and simulated, free-running"
     return Figure(title, panels, columns=2, height=3.6)
+
+
+def motion_panel(
+    name: str, time: np.ndarray, measured: np.ndarray, simulated: np.ndarray, counted: np.ndarray
+) -> Panel:
+    """Return measured and simulated positions of a joint, and the errors of what counts below."""
+    wrong = 1e3 * (simulated - measured)
+    rms = np.sqrt(np.mean(wrong[counted] ** 2)) if counted.any() else np.nan
+    error = Curve(time, wrong, "error", ERROR, width=0.7)
+    curves = [
+        Curve(time, measured, "measured", MEASURED, width=1.9),
+        Curve(time, simulated, "simulated", PREDICTED, width=0.9),
+    ]
+    below = [Panel([error], y="error", unit="mrad or mm", share=0.6)]
+    said = f"RMS {significant(float(rms))} mrad or mm"
+    return Panel(curves, name, said, y="position", unit="rad or m", below=below)
 
 
 def rollout_verdict(errors: RolloutErrors) -> Remark:
@@ -114,7 +132,7 @@ def rollout_page(report: RolloutReport, figures: Sequence[Figure]) -> str:
     if report.has_stiffness:
         simulators = [simulator_table(fit, report.stiffness)]
     sections: list[Section] = [
-        ("Verdict", [rollout_verdict(errors), parameters.remarks]),
+        ("Verdict", [report.verdict, parameters.remarks]),
         ("Errors", [comparison_table(report), errors.summary()]),
         ("Measured and simulated motion", figures),
         (
@@ -172,6 +190,7 @@ def _record(report: RolloutReport, rows: list[dict[str, Any]]) -> dict[str, Any]
     return plain(
         {
             **header("rollout.json"),
+            "kind": "commands",
             "joints": fit.joint_names,
             "combinations": rows,
             "symbols": [x.symbol for x in PARAMETERS],

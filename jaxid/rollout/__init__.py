@@ -1,4 +1,4 @@
-"""Identification from rollouts: a simulation that moves like the robot, without torques."""
+"""Identification from rollouts: a simulation that moves like the robot."""
 
 from .contact import Contact as Contact
 from .errors import RolloutErrors as RolloutErrors
@@ -8,6 +8,7 @@ from .result import Combination as Combination, ServoFit as ServoFit
 from .servo import PARAMETERS as PARAMETERS
 from .torque import (
     TorqueRolloutFit as TorqueRolloutFit,
+    WindowPaths as WindowPaths,
     identify_torque_rollout as identify_torque_rollout,
 )
 from .torque_methods import (

@@ -8,6 +8,7 @@ it needs no second derivative, and errors that add up over the horizon count.
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -51,6 +52,11 @@ class TorqueRollout:
         joints = range(1, self.base.model.robot.joints + 1)
         gains = (f"{kind}{j}" for kind in ("gain", "load friction") for j in joints)
         return (*self.base.names, "delay", *gains)
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Units of the unknowns."""
+        return (*self.base.units, "s", *["1"] * (2 * self.base.model.robot.joints))
 
     def start(self, p: AnyArray) -> np.ndarray:
         """Return the unknowns without delay, with gains of 1."""
@@ -177,6 +183,22 @@ def _follow(
     return (*begun, jnp.concatenate([after[2], after[2][-1:]]))
 
 
+class WindowPaths(NamedTuple):
+    """Measured and simulated positions of windows behind each other.
+
+    Attributes:
+        name: Name of the log.
+        time: Instants [s].
+        measured: Measured positions [rad or m].
+        simulated: Simulated positions, with NaN behind each window.
+    """
+
+    name: str
+    time: Float[np.ndarray, " samples"]
+    measured: Float[np.ndarray, "samples joints"]
+    simulated: Float[np.ndarray, "samples joints"]
+
+
 @dataclasses.dataclass(frozen=True)
 class TorqueRolloutFit(Summarised):
     """Parameters for which open-loop simulations follow the measured positions.
@@ -226,6 +248,19 @@ class TorqueRolloutFit(Summarised):
         with double_precision():
             errors = jax.jit(self.rollout.errors)(jnp.asarray(x), windows)
         return np.sqrt(np.mean(np.asarray(errors)[-1] ** 2, axis=-1))
+
+    def simulate(self, log: Observations) -> WindowPaths:
+        """Return measured and simulated positions of a log, window behind window."""
+        windows = Windows.of([log], self.horizon, self.horizon)
+        with double_precision():
+            errors = jax.jit(self.rollout.errors)(jnp.asarray(self.unknowns), windows)
+        start, gap = windows.q[None], np.full((1, *windows.q.shape), np.nan)
+        measured = np.concatenate([start, windows.measured, windows.measured[-1:]])
+        simulated = np.concatenate([start, windows.measured + np.asarray(errors), gap])
+        steps = np.minimum(np.arange(len(measured)), len(measured) - 2)
+        time = log.time[(windows.starts + steps[:, None])].T.ravel()
+        paths = (x.transpose(2, 0, 1).reshape(len(time), -1) for x in (measured, simulated))
+        return WindowPaths(log.name, time, *paths)
 
     def torque_errors(
         self,

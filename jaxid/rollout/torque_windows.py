@@ -29,6 +29,7 @@ class Windows(NamedTuple):
         qd: Initial velocities.
         forces: Torques, with a margin at both ends [samples, joints, windows].
         measured: Measured positions behind the first sample [steps, joints, windows].
+        starts: Sample at which each window starts, counted through all logs.
         blocks: Part of the logs to which each window belongs.
     """
 
@@ -36,6 +37,7 @@ class Windows(NamedTuple):
     qd: Float[AnyArray, "joints windows"]
     forces: Float[AnyArray, "samples joints windows"]
     measured: Float[AnyArray, "steps joints windows"]
+    starts: np.ndarray
     blocks: np.ndarray
 
     @classmethod
@@ -65,7 +67,7 @@ class Windows(NamedTuple):
         if not parts:
             raise InputError(f"`observations` hold no window of {horizon:g} s: shorten `horizon`.")
         q0, qd0, u, measured, place = (np.stack(x, axis=-1) for x in zip(*parts, strict=True))
-        return cls(q0, qd0, u, measured, place * BLOCKS // max(count, 1))
+        return cls(q0, qd0, u, measured, place, place * BLOCKS // max(count, 1))
 
 
 class TorqueRows(NamedTuple):

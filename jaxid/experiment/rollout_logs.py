@@ -1,0 +1,66 @@
+"""Work of `jaxid rollout`: logs of commands or of torques become a report."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from jaxid.report.rollout import RolloutReport
+from jaxid.report.torque_rollout import TorqueRolloutReport
+from jaxid.rollout import compare_methods, identify_rollout, identify_torque_rollout
+
+from .decoder import within
+from .experiment import Experiment
+from .identify_logs import Stages, findings, load_log, require_motion, select_filter
+
+
+def identify_rollouts(
+    experiment: Experiment,
+    logs: Sequence[Path],
+    verify: Sequence[Path],
+    command: str,
+    stage: Stages,
+) -> RolloutReport | TorqueRolloutReport:
+    """Identify from commands if the file names them, otherwise from torques; and simulate."""
+    torques = experiment.logs.commands is None
+    with within("rollout", experiment.path.name):
+        options = experiment.rollout.options(torques)
+    settings = {"command": command, "experiment_text": experiment.text}
+    identify = _with_torques if torques else _with_commands
+    return identify(experiment, logs, verify, options, settings, stage)
+
+
+def _with_commands(experiment, logs, verify, options, settings, stage) -> RolloutReport:
+    """Identify joints behind position servos."""
+    seen, unseen = [], []
+    for log, kept in [*((x, seen) for x in logs), *((x, unseen) for x in verify)]:
+        stage(f"reading {log.name}")
+        kept.append(experiment.read_commands(log))
+    stage("identifying")
+    fit = identify_rollout(
+        seen,
+        experiment.bodies(),
+        joint_names=experiment.robot.joint_names,
+        **{key: options[key] for key in ("time_step", "friction", "saturation")},
+    )
+    stage("simulating")
+    errors, windows = fit.validate(unseen or seen), fit.window_errors(unseen or seen)
+    numbers = options["stiffness"], options["samples"]
+    return RolloutReport(fit, errors, windows, bool(unseen), *numbers, settings)
+
+
+def _with_torques(experiment, logs, verify, options, settings, stage) -> TorqueRolloutReport:
+    """Identify the model of `jaxid identify`, beside other methods."""
+    stage("finding base parameters")
+    base = experiment.base
+    experiment, _ = select_filter(experiment, logs, stage)
+    loaded = [load_log(experiment, path, stage) for path in (*logs, *verify)]
+    require_motion(loaded)
+    observations = [log for _, log, _ in loaded]
+    seen, unseen = observations[: len(logs)], observations[len(logs) :]
+    stage("identifying")
+    fit = identify_torque_rollout(base, seen, **options)
+    stage("comparing methods")
+    comparison = compare_methods(fit, seen, unseen)
+    stage("simulating")
+    paths = [fit.simulate(log) for log in unseen or seen]
+    notes = (*experiment.notes, *(note for o in observations for note in o.notes))
+    return TorqueRolloutReport(fit, comparison, paths, notes, tuple(findings(loaded)), settings)
