@@ -3,7 +3,8 @@
 so101: the SO-101's log (needs ../shared/data), identified on four motions, free-running on six
 others, beside the linear joint and the copied command; joints 1 to 5 [mrad]; time with compiling.
 pendulum: the double pendulum's four logs, ends of windows of 0.1 and 0.2 s on two others, beside
-the authors' models with their own friction, cf arctan(100 v), and the same torques.
+the authors' models with their own friction, cf arctan(100 v), and the same torques, and beside
+other methods; the same on the four logs, each left out in turn, and on those of the fit.
 coverage: a simulated servo arm of six axes on MuJoCo, 50 Hz, 12 bits; the truth lies in so many of
 the 95 % intervals; with Stribeck friction that the model leaves out, in how many draws it warns.
 gains: the same arm with servos of 1 and 1.6 times the gain.
@@ -125,6 +126,15 @@ def authors_rate(y: dict[str, float], x: np.ndarray, u: np.ndarray) -> np.ndarra
     return np.stack([v1, v2, (m22 * r1 - m12 * r2) / det, (m11 * r2 - m12 * r1) / det])
 
 
+VARIANTS = {
+    "rollouts": {},
+    "rollouts and torque rows": {"torque_rows": True},
+    "rollouts, gains, load friction": {"gains": True, "load_friction": True},
+}
+"""Options of identifications of the pendulum."""
+HORIZONS = (0.1, 0.2)
+
+
 def pendulum(quick: bool) -> None:
     folder = DATA / "double_pendulum"
     robot = jid.load_urdf(folder / "pendubot_model_1.0.urdf")
@@ -139,18 +149,34 @@ def pendulum(quick: bool) -> None:
             return [jid.observe(log, robot, smooth) for log in logs]
 
         seen, unseen = read("143339", "143524", "143601", "143704"), read("143747", "144003")
-        start = time.time()
-        plain = jid.rollout.identify_torque_rollout(base, seen)
-        rich = jid.rollout.identify_torque_rollout(base, seen, gains=True, load_friction=True)
-        print(f"tau_{kind}: {time.time() - start:.0f} s for both; q1 q2 at 0.1 s, at 0.2 s [rad]")
-        horizons = (0.1, 0.2)
-        rows = {f"authors {n}": [authors_errors(authors(n), unseen, h) for h in horizons]
-                for n in ("1.0", "1.1", "2.0", "3.0")}  # fmt: skip
-        rows["torque fit"] = [plain.errors_at(unseen, h, plain.start) for h in horizons]
-        rows["rollout"] = [plain.errors_at(unseen, h) for h in horizons]
-        rows["rollout, gains, load friction"] = [rich.errors_at(unseen, h) for h in horizons]
-        for name, values in rows.items():
-            print(f"  {name:30s}", np.concatenate(values).round(4))
+        start, found = time.time(), {}
+        for word, options in VARIANTS.items():
+            found[word] = jid.rollout.identify_torque_rollout(base, seen, **options)
+        plain = found["rollouts"]
+        print(f"tau_{kind}: {time.time() - start:.0f} s for all; q1 q2 at 0.1 s, at 0.2 s [rad]")
+        for n in ("1.0", "1.1", "2.0", "3.0"):
+            values = [authors_errors(authors(n), unseen, h) for h in HORIZONS]
+            print_errors(f"authors {n}", values)
+        compared = jid.rollout.compare_methods(plain, seen, unseen)
+        for word, values in zip(jid.rollout.METHODS[:-1], compared.errors, strict=False):
+            print_errors(word, values)
+        for word, fit in found.items():
+            print_errors(word, [fit.errors_at(unseen, h) for h in HORIZONS])
+        print_errors("rollouts, logs of the fit", [plain.errors_at(seen, h) for h in HORIZONS])
+        own = jid.rollout.identify_torque_rollout(base, unseen)
+        print_errors("rollouts, fitted to these logs", [own.errors_at(unseen, h) for h in HORIZONS])
+        squares = []
+        for k in range(0 if quick else 4):
+            rest = [*seen[:k], *seen[k + 1 :]]
+            fit = jid.rollout.identify_torque_rollout(base, rest)
+            squares.append(jid.rollout.compare_methods(fit, rest, [seen[k]]).errors ** 2)
+        means = np.sqrt(np.mean(squares, axis=0)) if squares else ()
+        for word, values in zip(jid.rollout.METHODS, means, strict=False):
+            print_errors(f"{word}, each left out", values)
+
+
+def print_errors(word: str, values) -> None:
+    print(f"  {word:34s}", np.concatenate(list(values)).round(4), flush=True)
 
 
 def arm_text(gain: float, stribeck: bool, axes: int = 6) -> str:

@@ -3,8 +3,10 @@
 from collections.abc import Sequence
 from pathlib import Path
 
+from jaxid.errors import InputError
 from jaxid.report.rollout import RolloutReport
 from jaxid.report.torque_rollout import TorqueRolloutReport
+from jaxid.result_table import Remark, Status
 from jaxid.rollout import compare_methods, identify_rollout, identify_torque_rollout
 
 from .decoder import within
@@ -49,6 +51,8 @@ def _with_commands(experiment, logs, verify, options, settings, stage) -> Rollou
 
 def _with_torques(experiment, logs, verify, options, settings, stage) -> TorqueRolloutReport:
     """Identify the model of `jaxid identify`, beside other methods."""
+    if experiment.load_transition is not None:
+        raise InputError(f"{experiment.path.name}: give `rollout.load_friction`, not `model.load`.")
     stage("finding base parameters")
     base = experiment.base
     experiment, _ = select_filter(experiment, logs, stage)
@@ -62,5 +66,6 @@ def _with_torques(experiment, logs, verify, options, settings, stage) -> TorqueR
     comparison = compare_methods(fit, seen, unseen)
     stage("simulating")
     paths = [fit.simulate(log) for log in unseen or seen]
-    notes = (*experiment.notes, *(note for o in observations for note in o.notes))
-    return TorqueRolloutReport(fit, comparison, paths, notes, tuple(findings(loaded)), settings)
+    doubts = [Remark(text, Status.DOUBTFUL) for text in findings(loaded)]
+    notes = [*experiment.notes, *(note for o in observations for note in o.notes)]
+    return TorqueRolloutReport(fit, comparison, paths, doubts, [*map(Remark, notes)], settings)

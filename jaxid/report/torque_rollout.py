@@ -26,16 +26,16 @@ class TorqueRolloutReport(NamedTuple):
         fit: Fit of rollouts.
         comparison: Errors beside those of other methods.
         paths: Measured and simulated positions of logs.
-        notes: Notes on the experiment and the logs.
         findings: Findings on the logs.
+        notes: Notes on the experiment and the logs.
         settings: Command and text of the experiment file.
     """
 
     fit: TorqueRolloutFit
     comparison: MethodComparison
     paths: Sequence[WindowPaths]
-    notes: tuple[str, ...]
-    findings: tuple[str, ...]
+    findings: list[Remark]
+    notes: list[Remark]
     settings: Mapping[str, Any]
 
     @property
@@ -52,16 +52,13 @@ class TorqueRolloutReport(NamedTuple):
         detail = "" if found.best == METHODS[-1] else other
         return Remark(text, Status.GOOD if closer else Status.DOUBTFUL, detail)
 
-    @property
-    def remarks(self) -> list[Remark]:
-        """Findings and notes."""
-        return [Remark(text, Status.DOUBTFUL) for text in self.findings] + [
-            *map(Remark, self.notes)
-        ]
-
     def tables(self) -> list[Table]:
         """Return estimates, and errors of all methods."""
-        return [self.fit.summary(), self.comparison.summary(), Table("", remarks=self.remarks)]
+        return [
+            self.fit.summary(),
+            self.comparison.summary(),
+            Table("", remarks=[*self.notes, *self.findings]),
+        ]
 
     def write(self, folder: Path) -> list[Path]:
         """Write the page, `rollout.json` and `rollout.csv`."""
@@ -75,10 +72,10 @@ class TorqueRolloutReport(NamedTuple):
 
     def _page(self, figures: Sequence[Figure]) -> str:
         sections: list[Section] = [
-            ("Verdict", [self.verdict, self.remarks]),
+            ("Verdict", [self.verdict, self.findings]),
             ("Errors", [self.comparison.summary()]),
             ("Measured and simulated motion", figures),
-            ("Parameters", [self.fit.summary()]),
+            ("Parameters", [self.fit.summary(), self.notes]),
             provenance(self.settings),
         ]
         return render_page("Simulations under recorded torques", sections)
@@ -118,7 +115,7 @@ class TorqueRolloutReport(NamedTuple):
                     "base_parameters": fit.rollout.base.names,
                     "methods": [dict(zip(keys, method, strict=True)) for method in methods],
                 },
-                "notes": [r.text for r in self.remarks],
+                "notes": [r.text for r in (*self.findings, *self.notes)],
             }
         )
 

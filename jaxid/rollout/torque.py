@@ -75,12 +75,11 @@ class TorqueRollout:
     def torque_errors(self, x: Array, rows: TorqueRows) -> Float[Array, "rows joints"]:
         """Return predicted less measured torques at the measured motion; zero if not counted."""
         p, delay, gains, load = self._parts(x)
-        first, last = jnp.asarray(rows.ends)
-        at = jnp.arange(1.0 * len(rows.forces)) - delay / rows.row_time
-        at = jnp.clip(at, first, jnp.maximum(first, last - 0.001))
+        count = len(rows.forces)
+        at = jnp.clip(jnp.arange(1.0 * count) - delay / rows.row_time, 0.0, count - 1.001)
         forces, friction = (_between(jnp.asarray(y), at) for y in (rows.forces, rows.load))
         torques = gains[None] * forces - load[None] * friction
-        return (jnp.asarray(rows.columns) @ p - torques) * jnp.asarray(rows.counted)
+        return jnp.where(rows.counted, jnp.asarray(rows.columns) @ p - torques, 0.0)
 
     def follow(
         self, p: AnyArray, logs: Sequence[Observations], bandwidth: float
@@ -92,22 +91,16 @@ class TorqueRollout:
             logs: Filtered logs with torques.
             bandwidth: Double pole of the closed loop [rad/s].
         """
-        spans = [(o, span) for o in logs for span in o.segments]
-        longest = max(b - a for _, (a, b) in spans)
-        # Shorter segments are continued by their last samples.
-        places = [np.minimum(np.arange(a, a + longest), b - 1) for _, (a, b) in spans]
-        channels = [(o.motion.q, o.motion.qd, o.forces) for o, _ in spans]
-        inputs = [
-            np.stack([np.asarray(x)[k] for x, k in zip(kind, places, strict=True)], axis=-1)
-            for kind in zip(*channels, strict=True)
-        ]
+        x = jnp.asarray(self.start(p))
+
+        def simulated(o: Observations, a: int, b: int) -> Motion:
+            m, forces = o.read(slice(a, b))
+            inputs = (np.asarray(y)[..., None] for y in (m.q, m.qd, forces))
+            found = _follow(self, x, *inputs, float(bandwidth))
+            return Motion(*(np.asarray(y)[..., 0] for y in found))
+
         with double_precision():
-            found = _follow(self, jnp.asarray(self.start(p)), *inputs, float(bandwidth))
-        found = [np.asarray(x) for x in found]
-        parts = iter(
-            Motion(*(x[: b - a, :, k] for x in found)) for k, (_, (a, b)) in enumerate(spans)
-        )
-        return tuple(joined([next(parts) for _ in o.segments]) for o in logs)
+            return tuple(joined(simulated(o, *span) for span in o.segments) for o in logs)
 
     def _parts(self, x: Array) -> list[Array]:
         """Return base parameters, delay, gains, and friction by torque."""
@@ -369,8 +362,8 @@ def _require_simulation(base: BaseParameters) -> None:
     leaves = jax.tree.leaves(model.terms, is_leaf=lambda x: isinstance(x, HardSign))
     if model.memory is not None or any(isinstance(x, HardSign) for x in leaves):
         raise InputError(
-            "`base`: dry friction must be smooth in a simulation: use `Tanh(0.1)` (`coulomb = "
-            "{ epsilon = 0.1 }` in an experiment file) in place of a sign or of presliding."
+            "`base`: dry friction must be smooth in a simulation: use `Tanh(0.1)` "
+            "(`[model.coulomb] epsilon = 0.1` in an experiment file), no sign and no presliding."
         )
     if model.robot.tool is not None:
         raise InputError(

@@ -8,7 +8,6 @@ import numpy as np
 from jaxid.arrays import AnyArray, Bool, Float
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
-from jaxid.identification.problem import RegressionProblem
 from jaxid.measurement.observations import Observations
 
 MARGIN = 0.05
@@ -77,8 +76,7 @@ class TorqueRows(NamedTuple):
         columns: Base regressor [rows, joints, base].
         forces: Torques [rows, joints].
         load: Their sizes, with the signs of the joints' speeds.
-        counted: Whether a row counts.
-        ends: First and last row of the segment of each row [2, rows].
+        counted: Whether a row counts: not near an end of a segment, where delays need others.
         row_time: Time between two rows [s].
         blocks: Part of the logs to which each row belongs.
     """
@@ -87,34 +85,20 @@ class TorqueRows(NamedTuple):
     forces: Float[AnyArray, "rows joints"]
     load: Float[AnyArray, "rows joints"]
     counted: Bool[AnyArray, "rows joints"]
-    ends: Float[AnyArray, "2 rows"]
     row_time: float
     blocks: np.ndarray
 
     @classmethod
     def of(cls, base: BaseParameters, logs: Sequence[Observations]) -> "TorqueRows":
         """Return the rows of some logs."""
-        columns = []
-        for chunk in RegressionProblem(base, logs).chunks():
-            dense = np.zeros((*chunk.forces.shape, base.size))
-            for j, own in enumerate(chunk.indices):
-                dense[:, j, list(own)] = chunk.columns[j]
-            columns.append(dense)
-        parts, ends, places, count, samples = [], [], [], 0, 0
+        parts, samples, margin = [], 0, round(MARGIN / logs[0].row_time)
         for o in logs:
-            forces = np.asarray(o.forces)
+            forces, counted = np.asarray(o.forces), np.array(o.mask)
             load = np.abs(forces) * np.tanh(np.asarray(o.motion.qd) / SLIDING)
-            parts.append((o.reduce(forces), o.reduce(load), np.asarray(o.mask)))
-            ends += [np.full((b - a, 2), (count + a, count + b - 1.0)) for a, b in o.row_segments]
-            places.append(samples + o.instants)
-            count, samples = count + o.rows, samples + o.samples
-        forces, load, counted = map(np.concatenate, zip(*parts, strict=True))
-        return cls(
-            np.concatenate(columns),
-            forces,
-            load,
-            counted,
-            np.concatenate(ends).T,
-            logs[0].row_time,
-            np.concatenate(places) * BLOCKS // samples,
-        )
+            for a, b in o.row_segments:
+                counted[[*range(a, a + margin), *range(b - margin, b)]] = False
+            columns = o.reduce(np.asarray(base.regressor(o.motion)))
+            parts.append((columns, o.reduce(forces), o.reduce(load), counted, samples + o.instants))
+            samples += o.samples
+        theta, forces, load, counted, at = map(np.concatenate, zip(*parts, strict=True))
+        return cls(theta, forces, load, counted, logs[0].row_time, at * BLOCKS // samples)

@@ -1,7 +1,8 @@
-"""`jaxid rollout`: from an experiment file and logs without torque to a report."""
+"""`jaxid rollout`: from an experiment file and logs, without or with torques, to a report."""
 
 import json
 
+import driven_pendulum
 import mujoco
 import numpy as np
 import polars as pl
@@ -57,10 +58,72 @@ def test_a_report_without_torques(folder, monkeypatch):
     assert "free-running" in page
 
 
-def test_the_columns_of_commands_are_needed(folder, monkeypatch):
-    monkeypatch.chdir(folder)
-    text = FILE.replace('commands = "command{}"', 'forces = "command{}"')
-    (folder / "other.toml").write_text(text)
-    done = CliRunner().invoke(app, ["rollout", "other.toml", "a.csv"])
+TORQUES = """
+[robot]
+mjcf = "pendulum.xml"
+[model]
+coulomb = false
+rotor_inertia = false
+[recording]
+angles = "q{}"
+forces = "tau{}"
+time = "time"
+[filter]
+kind = "butterworth"
+cutoff = 30.0
+[rollout]
+horizon = 0.1
+"""
+
+
+@pytest.fixture(scope="module")
+def driven(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("torques")
+    (folder / "pendulum.xml").write_text(driven_pendulum.XML)
+    (folder / "experiment.toml").write_text(TORQUES)
+    for seed in range(2):
+        log = driven_pendulum.log(seed)
+        columns = {"time": log.time}
+        for j in range(2):
+            columns[f"q{j + 1}"], columns[f"tau{j + 1}"] = log.angles[:, j], log.forces[:, j]
+        pl.DataFrame(columns).write_csv(folder / f"log{seed}.csv")
+    return folder
+
+
+def test_a_report_with_torques(driven, monkeypatch):
+    monkeypatch.chdir(driven)
+    words = ["rollout", "experiment.toml", "log0.csv", "--verify", "log1.csv", "-o", "out"]
+    done = CliRunner().invoke(app, words, catch_exceptions=False)
+    assert done.exit_code == 0, done.output
+    assert "Simulations are closer to the robot" in done.output
+    found = json.loads((driven / "out" / "rollout.json").read_text())
+    assert (found["kind"], found["horizon"]) == ("torques", 0.1)
+    assert found["errors"]["unseen"]
+    plain, *_, rollouts = found["errors"]["methods"]
+    assert (plain["method"], rollouts["method"]) == ("least squares", "rollouts")
+    assert (np.array(rollouts["errors"]) < 0.3 * np.array(plain["errors"])).all()
+    delay = next(x for x in found["unknowns"] if x["parameter"] == "delay")
+    assert delay["estimate"] == pytest.approx(driven_pendulum.LATE + 0.001, abs=5e-4)
+    assert set(found["files"]) == {p.name for p in (driven / "out").iterdir()}
+    page = (driven / "out" / "rollout.html").read_text()
+    assert "log1: measured, and simulated in windows of 0.1 s" in page
+
+
+def test_settings_of_the_other_kind_of_logs_are_rejected(driven, folder, monkeypatch):
+    for place, text, key in ((driven, TORQUES, "samples = 2"), (folder, FILE, "horizon = 0.1")):
+        monkeypatch.chdir(place)
+        (place / "other.toml").write_text(f"{text}{key}\n")
+        log = "log0.csv" if place is driven else "a.csv"
+        done = CliRunner().invoke(app, ["rollout", "other.toml", log, "-o", "none"])
+        assert done.exit_code != 0
+        assert f"`rollout.{key.split()[0]}` is for logs" in str(done.exception)
+        assert not (place / "none").exists()
+
+
+def test_dry_friction_with_torques_must_be_smooth(driven, monkeypatch):
+    monkeypatch.chdir(driven)
+    (driven / "hard.toml").write_text(TORQUES.replace("coulomb = false", "coulomb.hard = true"))
+    done = CliRunner().invoke(app, ["rollout", "hard.toml", "log0.csv", "-o", "none"])
     assert done.exit_code != 0
-    assert "`recording.commands`" in str(done.exception)
+    assert "epsilon = 0.1" in str(done.exception)
+    assert not (driven / "none").exists()

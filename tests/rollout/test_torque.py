@@ -1,83 +1,119 @@
 """Open-loop rollouts of a pendulum with two links, whose motion MuJoCo simulates."""
 
+import dataclasses
+
+import driven_pendulum
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 import pytest
 
 import jaxid as jid
-from jaxid.rollout.torque import TorqueRollout, Windows
+from jaxid.dynamics.terms import HardSign
+from jaxid.rollout.torque import TorqueRollout
+from jaxid.rollout.torque_windows import TorqueRows, Windows
 
-LATE = 0.006
-XML = """<mujoco><compiler angle="radian"/>
-<option timestep="0.0005" integrator="implicitfast"/><worldbody>
-<body name="a"><inertial pos="0 0 -0.15" mass="1" diaginertia="0.01 0.01 0.001"/>
-<joint name="a" axis="0 1 0" damping="0.05"/>
-<body name="b" pos="0 0 -0.3"><inertial pos="0 0 -0.2" mass="0.6" diaginertia="0.008 0.008 0.001"/>
-<joint name="b" axis="0 1 0" damping="0.03"/></body></body></worldbody>
-<actuator><motor joint="a" ctrlrange="-9 9"/><motor joint="b" ctrlrange="-9 9"/></actuator>
-</mujoco>"""
+TERMS = (jid.RigidBodies(), jid.ViscousFriction())
 
 
 @pytest.fixture(scope="module")
-def pendulum(tmp_path_factory):
+def path(tmp_path_factory):
     path = tmp_path_factory.mktemp("pendulum") / "pendulum.xml"
-    path.write_text(XML)
-    robot = jid.load_mjcf(path)
-    return robot, mujoco.MjModel.from_xml_path(str(path))
-
-
-def _observed(pendulum, seed):
-    robot, model = pendulum
-    data, random = mujoco.MjData(model), np.random.default_rng(seed)
-    t = 0.002 * np.arange(3000)
-    phases, rates = random.uniform(0, 6, (5, 2)), random.uniform(1.5, 8.0, (5, 2))
-    sent = np.sum(0.25 * np.sin(t[:, None, None] * rates + phases), axis=1)
-    q = np.zeros_like(sent)
-    for k in range(4 * len(t)):
-        if k % 4 == 0:
-            q[k // 4] = data.qpos
-        data.ctrl[:] = sent[max(0, (k - round(LATE / 0.0005)) // 4)]
-        mujoco.mj_step(model, data)
-    log = jid.Recording.of(q, sent, sample_time=0.002)
-    return jid.observe(log, robot, jid.ZeroPhaseButterworth(30.0))
+    path.write_text(driven_pendulum.XML)
+    return path
 
 
 @pytest.fixture(scope="module")
-def base(pendulum):
-    return jid.base_parameters(jid.Model(pendulum[0], (jid.RigidBodies(), jid.ViscousFriction())))
+def base(path):
+    return jid.base_parameters(jid.Model(jid.load_mjcf(path), TERMS))
 
 
-def test_late_torques_are_found_and_the_simulation_is_closer(pendulum, base):
-    found = jid.rollout.identify_torque_rollout(base, _observed(pendulum, 0))
-    other = _observed(pendulum, 1)
+def _observed(base, seed, **options):
+    log = driven_pendulum.log(seed, **options)
+    return jid.observe(log, base.model.robot, jid.ZeroPhaseButterworth(30.0))
+
+
+@pytest.fixture(scope="module")
+def logs(base):
+    return _observed(base, 0), _observed(base, 1)
+
+
+def test_late_torques_are_found_and_the_simulation_is_closer(base, logs):
+    found, other = jid.rollout.identify_torque_rollout(base, logs[0]), logs[1]
     assert found.errors_at(other, 0.2).max() < 2e-3
     assert (found.errors_at(other, 0.2) < 0.2 * found.errors_at(other, 0.2, found.start)).all()
     delay = float(found.unknowns[base.size])
     # A held torque is half a sample later than an interpolated one.
-    assert delay == pytest.approx(LATE + 0.001, abs=5e-4)
+    assert delay == pytest.approx(driven_pendulum.LATE + 0.001, abs=5e-4)
     damping = found.parameters[[base.names.index(x) for x in ("fv1", "fv2")]]
-    np.testing.assert_allclose(damping, [0.05, 0.03], rtol=0.1)
+    np.testing.assert_allclose(damping, driven_pendulum.DAMPING, rtol=0.1)
     assert "delay" in str(found)
+    # Torques must be shifted by the delay, in the same direction as in the simulation.
+    late = found.torque_errors(other, found.parameters)
+    assert (found.torque_errors(other) < 0.3 * late).all()
 
 
-def test_derivatives_of_windows_agree_with_differences(pendulum, base):
-    log = _observed(pendulum, 0)
-    rollout = TorqueRollout(base, log.sample_time)
-    windows = Windows.of([log], 0.1, 1.0)._replace(blocks=None)
-    x = rollout.start(np.asarray(jid.identify(base, log).parameters))
+def test_torque_rows_add_what_windows_do_not_tell(base, logs):
+    alone = jid.rollout.identify_torque_rollout(base, logs[0])
+    both = jid.rollout.identify_torque_rollout(base, logs[0], torque_rows=True)
+    assert both.torque_rows
+    np.testing.assert_allclose(both.unknowns, alone.unknowns, atol=2e-3)
+    assert (both.torque_errors(logs[0]) <= 1.001 * alone.torque_errors(logs[0])).all()
+    assert both.errors_at(logs[1], 0.2).max() < 2e-3
+
+
+def test_simulated_windows_start_on_the_measured_positions(base, logs):
+    found = jid.rollout.identify_torque_rollout(base, logs[0])
+    path, steps = found.simulate(logs[1]), round(0.2 / 0.002)
+    starts = np.arange(0, len(path.time), steps + 2)
+    np.testing.assert_array_equal(path.simulated[starts], path.measured[starts])
+    assert np.isnan(path.simulated[starts + steps + 1]).all()
+    times = np.searchsorted(logs[1].time, path.time + 1e-9) - 1
+    np.testing.assert_allclose(path.measured, np.asarray(logs[1].motion.q)[times], atol=1e-12)
+    ends = (path.simulated - path.measured)[starts + steps]
+    sizes = np.sqrt(np.mean(ends**2, axis=0))
+    np.testing.assert_allclose(sizes, found.errors_at(logs[1], 0.2), rtol=0.3)
+
+
+def test_simulated_motions_take_the_bias_of_noisy_encoders_away(path, base):
+    noise = {"late": -0.001, "noise": 3e-4}
+    seen, unseen = (_observed(base, k, **noise) for k in (0, 1))
+    fit = jid.rollout.identify_torque_rollout(base, seen)
+    found = jid.rollout.compare_methods(fit, [seen], [unseen])
+    bodies = jid.urdf_parameters(path)
+    truth = np.asarray(base.from_standard([*bodies, *driven_pendulum.DAMPING]))
+    errors = np.linalg.norm(found.parameters - truth, axis=1) / np.linalg.norm(truth)
+    plain, instruments, didim, rollouts = errors
+    assert plain > 0.1
+    assert max(instruments, didim) < 0.02
+    assert rollouts < 0.003
+    assert found.best != "least squares"
+    assert found.unseen
+    assert str(found).count("DIDIM") == 2
+
+
+def test_derivatives_agree_with_differences(base, logs):
+    rollout = TorqueRollout(base, logs[0].sample_time)
+    windows, rows = Windows.of(logs[:1], 0.1, 1.0), TorqueRows.of(base, logs[:1])
+    x = rollout.start(np.asarray(jid.identify(base, logs[0]).parameters))
     x[base.size] = 0.0041
-    J = jax.jacfwd(lambda x: rollout.errors(x, windows))(jnp.asarray(x))
-    for k in range(len(x)):
-        step = np.zeros_like(x)
-        step[k] = 1e-6
-        ends = [rollout.errors(jnp.asarray(x + s * step), windows) for s in (1, -1)]
-        difference = np.asarray(ends[0] - ends[1]) / 2e-6
-        scale = max(np.abs(difference).max(), 1e-3)
-        np.testing.assert_allclose(np.asarray(J)[..., k], difference, atol=1e-6 * scale)
+    for function, data in ((rollout.errors, windows), (rollout.torque_errors, rows)):
+        J = jax.jacfwd(lambda x, f=function, data=data: f(x, data))(jnp.asarray(x))
+        for k in range(len(x)):
+            step = np.zeros_like(x)
+            step[k] = 1e-6
+            ends = [function(jnp.asarray(x + s * step), data) for s in (1, -1)]
+            difference = np.asarray(ends[0] - ends[1]) / 2e-6
+            scale = max(np.abs(difference).max(), 1e-3)
+            np.testing.assert_allclose(np.asarray(J)[..., k], difference, atol=1e-6 * scale)
 
 
-def test_windows_need_room(pendulum, base):
+def test_what_cannot_be_simulated_is_rejected(base, logs):
+    robot = base.model.robot
+    hard = jid.Model(robot, (*TERMS, jid.CoulombFriction(HardSign())))
+    tool = dataclasses.replace(robot, tool=jid.Tool(1, mass=0.1, centre_of_mass=[0.0, 0.0, -0.1]))
+    for model, name in ((hard, "Tanh"), (jid.Model(tool, TERMS), "tool")):
+        with pytest.raises(jid.InputError, match=f"`{name}"):
+            jid.rollout.identify_torque_rollout(jid.base_parameters(model), logs[0])
     with pytest.raises(jid.InputError, match="`observations`"):
-        jid.rollout.identify_torque_rollout(base, _observed(pendulum, 0), horizon=100.0)
+        jid.rollout.identify_torque_rollout(base, logs[0], horizon=100.0)
