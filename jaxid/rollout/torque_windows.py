@@ -1,4 +1,4 @@
-"""What of logs with torques is compared with a model: windows to simulate, and rows of torques."""
+"""Windows of logs with torques that are simulated, and rows of their torques."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
