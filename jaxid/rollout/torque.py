@@ -333,18 +333,14 @@ def identify_torque_rollout(
     # All torques, masses and friction can be scaled together: the first gain is 1.
     free[base.size + 1] = False
     objective = _Objective(rollout, windows, rows, free, every)
-    x, weights = rollout.start(first), np.repeat([[1.0], [0.0]], n, axis=1)
-    limits = _limits(x, base.size)
-
-    def search(x: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        functions = objective.functions(weights)
-        return minimise(*functions, x[None], free[None], limits, 25, 1e-5).x[0]
-
+    x, limits = rollout.start(first), _limits(rollout.start(first), base.size)
+    # At first positions count alone.
+    weights = objective.weights(np.repeat([1.0, np.inf], n))
     with double_precision():
-        x = search(x, weights)
+        x = objective.minimum(x, weights, free, limits)
         for _ in range(2 if torque_rows else 0):
-            weights = 1.0 / np.maximum(objective.sizes(x), 1e-12)
-            x = search(x, weights)
+            weights = objective.weights(objective.sizes(x))
+            x = objective.minimum(x, weights, free, limits)
         sizes = objective.sizes(x)
         r, J = objective.linearised(x, weights)
     if not np.isfinite(sizes).all():
@@ -353,7 +349,7 @@ def identify_torque_rollout(
             "or choose terms of the model that these logs determine."
         )
     uncertainty = _uncertainty(r, J[free], objective.blocks)
-    return TorqueRolloutFit(rollout, x, free, uncertainty, horizon, sizes[0], first, torque_rows)
+    return TorqueRolloutFit(rollout, x, free, uncertainty, horizon, sizes[:n], first, torque_rows)
 
 
 def _require_simulation(base: BaseParameters) -> None:
@@ -392,7 +388,10 @@ def _limits(start: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
 class _Objective:
     """Errors of positions in windows, and of torques if their rows are given, in one vector.
 
-    Weights are those of the joints' positions, and of their torques [2, joints].
+    Attributes:
+        kinds: Kind of each error: the joint of a position, joints + the joint of a torque; one
+            more if it does not count.
+        blocks: Part of the logs to which each error belongs.
     """
 
     def __init__(
@@ -403,64 +402,57 @@ class _Objective:
         free: np.ndarray,
         every: int,
     ):
-        index = np.flatnonzero(free)
+        index, self._data = np.flatnonzero(free), (windows, rows)
+        shape, n = windows.measured[every - 1 :: every].shape, len(windows.q)
+        parts = [np.broadcast_arrays(np.arange(n)[:, None], windows.blocks, np.zeros(shape))]
+        if rows is not None:
+            kinds = np.where(rows.counted, n + np.arange(n), 2 * n)
+            parts.append(np.broadcast_arrays(kinds, rows.blocks[:, None], kinds))
+        self.kinds, self.blocks, _ = (
+            np.concatenate([x.ravel() for x in each]) for each in zip(*parts, strict=True)
+        )
 
-        def errors(x, data):
-            windows, rows, _ = data
-            positions = rollout.errors(x, windows)[every - 1 :: every]
-            return positions, None if rows is None else rollout.torque_errors(x, rows)
+        def residuals(x, data, weights):
+            windows, rows = data
+            found = [rollout.errors(x, windows)[every - 1 :: every].ravel()]
+            if rows is not None:
+                found.append(rollout.torque_errors(x, rows).ravel())
+            return weights * jnp.concatenate(found)
 
-        def residuals(x, data):
-            positions, torques = errors(x, data)
-            first, second = data[2]
-            parts = [(first[None, :, None] * positions).ravel()]
-            return jnp.concatenate(
-                [*parts, *([] if rows is None else [(second[None] * torques).ravel()])]
-            )
-
-        def derivatives(x, data):
+        def derivatives(x, *inputs):
             def along(direction):
-                return jax.jvp(lambda x: residuals(x, data), (x,), (direction,))
+                return jax.jvp(lambda x: residuals(x, *inputs), (x,), (direction,))
 
-            return jax.vmap(along, out_axes=(None, 0))(jnp.eye(len(x))[index])
+            r, found = jax.vmap(along, out_axes=(None, 0))(jnp.eye(len(x))[index])
+            return r, jnp.zeros((len(x), len(r))).at[index].set(found)
 
-        self._free, self._windows, self._rows = index, windows, rows
-        self._errors, self._derivatives = jax.jit(errors), jax.jit(derivatives)
-        self._cost = jax.jit(lambda x, data: jnp.sum(residuals(x, data) ** 2))
-        joints, steps = windows.q.shape[0], len(windows.measured) // every
-        shape = (steps, joints, windows.q.shape[1])
-        blocks = [np.broadcast_to(windows.blocks, shape).ravel()]
-        blocks += [] if rows is None else [np.repeat(rows.blocks, joints)]
-        self.blocks = np.concatenate(blocks)
+        self._residuals, self._derivatives = jax.jit(residuals), jax.jit(derivatives)
 
-    def _data(self, weights: np.ndarray) -> tuple:
-        return self._windows, self._rows, weights
+    def weights(self, sizes: np.ndarray) -> np.ndarray:
+        """Return the reciprocal size of each error; zero if it does not count."""
+        return np.append(1.0 / np.maximum(sizes, 1e-12), 0.0)[self.kinds]
 
     def sizes(self, x: np.ndarray) -> np.ndarray:
-        """Return root mean squares of the errors [2, joints]; one where there are no torques."""
-        positions, torques = self._errors(jnp.asarray(x), self._data(np.ones(0)))
-        rms = np.sqrt(np.mean(np.asarray(positions) ** 2, axis=(0, 2)))
-        if self._rows is None:
-            return np.stack([rms, np.ones_like(rms)])
-        squares = np.sum(np.asarray(torques) ** 2, axis=0)
-        return np.stack([rms, np.sqrt(squares / np.sum(self._rows.counted, axis=0))])
+        """Return root mean squares of the errors of all joints' positions, then of torques."""
+        r = np.asarray(self._residuals(jnp.asarray(x), self._data, np.ones(len(self.kinds))))
+        count = 2 * len(self._data[0].q) + 1
+        squares, counts = (np.bincount(self.kinds, y, count) for y in (r**2, np.ones(len(r))))
+        return np.sqrt(squares / np.maximum(counts, 1.0))[:-1]
 
     def linearised(self, x: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return weighted errors, and their derivatives by all unknowns [unknowns, errors]."""
-        r, found = (np.asarray(y) for y in self._derivatives(jnp.asarray(x), self._data(weights)))
-        J = np.zeros((len(x), len(r)))
-        J[self._free] = found
-        return r, J
+        r, J = self._derivatives(jnp.asarray(x), self._data, weights)
+        return np.asarray(r), np.asarray(J)
 
-    def functions(self, weights: np.ndarray) -> tuple[Callable, Callable]:
-        """Return moments and costs, for a batch of one."""
+    def minimum(self, x: np.ndarray, weights: np.ndarray, free: np.ndarray, limits: tuple):
+        """Return the unknowns with the least sum of squares."""
 
         def moments(x, _):
             r, J = self.linearised(x[0], weights)
             return np.array([np.sum(r**2)]), (J @ r)[None], (J @ J.T)[None]
 
         def costs(x, _):
-            found = float(self._cost(jnp.asarray(x[0]), self._data(weights)))
-            return np.array([found if np.isfinite(found) else np.inf])
+            r = np.asarray(self._residuals(jnp.asarray(x[0]), self._data, weights))
+            return np.nan_to_num(np.array([np.sum(r**2)]), nan=np.inf)
 
-        return moments, costs
+        return minimise(moments, costs, x[None], free[None], limits, 25, 1e-5).x[0]
