@@ -65,7 +65,7 @@ def _with_torques(experiment, logs, verify, options, settings, stage) -> TorqueR
     stage("comparing methods")
     comparison = compare_methods(fit, seen, unseen)
     stage("simulating")
-    paths = [fit.simulate(log) for log in unseen or seen]
+    paths = [(log.name, *fit.simulate(log)) for log in unseen or seen]
     doubts = [Remark(text, Status.DOUBTFUL) for text in findings(loaded)]
     notes = [*experiment.notes, *(note for o in observations for note in o.notes)]
     return TorqueRolloutReport(fit, comparison, paths, doubts, [*map(Remark, notes)], settings)

@@ -201,17 +201,7 @@ def write_estimates(
 
     The page shows the `tables`, and the `doubts` above them.
     """
-    rows = []
-    for names, units, values, uncertainty in estimates:
-        deviations = uncertainty.standard_deviations
-        halves = uncertainty.half_widths()
-        rows += _rows(
-            name=names,
-            unit=units,
-            estimate=values,
-            standard_deviation=deviations,
-            half_width=halves,
-        )
+    rows = [row for each in estimates for row in estimate_rows(each)]
     everything = {
         "sources": {key: [str(p) for p in paths] for key, paths in sources.items()},
         "level": LEVEL,
@@ -223,6 +213,18 @@ def write_estimates(
     blocks = [*([doubts] if doubts else []), *tables]
     page = render_page(f"{kind.capitalize()}: results", [("Result", blocks), ("Logs", [logs])])
     return _write_table(folder, kind, everything, rows, page)
+
+
+def estimate_rows(estimates: Estimates) -> list[dict[str, Any]]:
+    """Return the rows of a CSV file for some estimates."""
+    names, units, values, uncertainty = estimates
+    return _rows(
+        name=names,
+        unit=units,
+        estimate=values,
+        standard_deviation=uncertainty.standard_deviations,
+        half_width=uncertainty.half_widths(),
+    )
 
 
 def _write_table(

@@ -8,15 +8,12 @@ import numpy as np
 
 from jaxid.io import atomic_folder
 from jaxid.result_table import Remark, Status, Table, significant
-from jaxid.rollout import METHODS, MethodComparison, TorqueRolloutFit, WindowPaths
+from jaxid.rollout import METHODS, MethodComparison, TorqueRolloutFit
 
 from .figure import Figure
 from .page import Section, provenance, render_page
-from .result_files import header, plain, write_csv, write_json
+from .result_files import estimate_rows, header, plain, write_csv, write_json
 from .rollout import SHOWN, motion_panel
-
-WINDOWS = 10.0
-"""Largest time of a log whose windows a figure shows [s]."""
 
 
 class TorqueRolloutReport(NamedTuple):
@@ -25,7 +22,7 @@ class TorqueRolloutReport(NamedTuple):
     Attributes:
         fit: Fit of rollouts.
         comparison: Errors beside those of other methods.
-        paths: Measured and simulated positions of logs.
+        paths: Names of logs, with times, measured and simulated positions of their windows.
         findings: Findings on the logs.
         notes: Notes on the experiment and the logs.
         settings: Command and text of the experiment file.
@@ -33,7 +30,7 @@ class TorqueRolloutReport(NamedTuple):
 
     fit: TorqueRolloutFit
     comparison: MethodComparison
-    paths: Sequence[WindowPaths]
+    paths: Sequence[tuple[str, np.ndarray, np.ndarray, np.ndarray]]
     findings: list[Remark]
     notes: list[Remark]
     settings: Mapping[str, Any]
@@ -62,73 +59,50 @@ class TorqueRolloutReport(NamedTuple):
 
     def write(self, folder: Path) -> list[Path]:
         """Write the page, `rollout.json` and `rollout.csv`."""
-        rows, names = self._rows(), ["rollout.html", "rollout.json", "rollout.csv"]
-        page = self._page([window_figure(self.fit, path) for path in self.paths[:SHOWN]])
-        with atomic_folder(folder) as staging:
-            write_json(staging / "rollout.json", {**self._record(rows), "files": names})
-            write_csv(staging / "rollout.csv", rows)
-            (staging / "rollout.html").write_text(page, encoding="utf-8")
-        return [folder / name for name in names]
-
-    def _page(self, figures: Sequence[Figure]) -> str:
+        fit, free = self.fit, np.flatnonzero(self.fit.free)
+        names, units = ([x[k] for k in free] for x in (fit.rollout.names, fit.rollout.units))
+        rows = estimate_rows((names, units, fit.unknowns[free], fit.uncertainty))
+        files = ["rollout.html", "rollout.json", "rollout.csv"]
         sections: list[Section] = [
             ("Verdict", [self.verdict, self.findings]),
             ("Errors", [self.comparison.summary()]),
-            ("Measured and simulated motion", figures),
-            ("Parameters", [self.fit.summary(), self.notes]),
+            ("Measured and simulated motion", [*map(self._figure, self.paths[:SHOWN])]),
+            ("Parameters", [fit.summary(), self.notes]),
             provenance(self.settings),
         ]
-        return render_page("Simulations under recorded torques", sections)
-
-    def _rows(self) -> list[dict[str, Any]]:
-        fit, free = self.fit, np.flatnonzero(self.fit.free)
-        deviations, half = fit.uncertainty.standard_deviations, fit.uncertainty.half_widths()
-        return [
-            {
-                "parameter": fit.rollout.names[k],
-                "unit": fit.rollout.units[k],
-                "estimate": fit.unknowns[k],
-                "standard_deviation": deviations[i],
-                "low_95": fit.unknowns[k] - half[i],
-                "high_95": fit.unknowns[k] + half[i],
-            }
-            for i, k in enumerate(free)
-        ]
+        page = render_page("Simulations under recorded torques", sections)
+        with atomic_folder(folder) as staging:
+            write_json(staging / "rollout.json", {**self._record(rows), "files": files})
+            write_csv(staging / "rollout.csv", rows)
+            (staging / "rollout.html").write_text(page, encoding="utf-8")
+        return [folder / name for name in files]
 
     def _record(self, rows: list[dict[str, Any]]) -> dict[str, Any]:
         fit, found = self.fit, self.comparison
         methods = zip(METHODS, found.parameters, found.errors, found.torque_errors, strict=True)
         keys = ("method", "parameters", "errors", "torque_errors")
-        return plain(
-            {
-                **header("rollout.json"),
-                "kind": "torques",
-                "joints": found.joint_names,
-                "horizon": fit.horizon,
-                "torque_rows": fit.torque_rows,
-                "unknowns": rows,
-                "covariance": fit.uncertainty.covariance,
-                "rms": fit.rms,
-                "errors": {
-                    "unseen": found.unseen,
-                    "horizons": found.horizons,
-                    "base_parameters": fit.rollout.base.names,
-                    "methods": [dict(zip(keys, method, strict=True)) for method in methods],
-                },
-                "notes": [r.text for r in (*self.findings, *self.notes)],
-            }
-        )
+        errors = {
+            "unseen": found.unseen,
+            "horizons": found.horizons,
+            "base_parameters": fit.rollout.base.names,
+            "methods": [dict(zip(keys, method, strict=True)) for method in methods],
+        }
+        content = {
+            "kind": "torques",
+            "joints": found.joint_names,
+            "horizon": fit.horizon,
+            "torque_rows": fit.torque_rows,
+            "parameters": rows,
+            "covariance": fit.uncertainty.covariance,
+            "rms": fit.rms,
+            "errors": errors,
+            "notes": [r.text for r in (*self.findings, *self.notes)],
+        }
+        return plain({**header("rollout.json"), **content})
 
-
-def window_figure(fit: TorqueRolloutFit, path: WindowPaths) -> Figure:
-    """Return measured and simulated positions of all joints in windows of a log, and the errors."""
-    shown = path.time - path.time[0] <= WINDOWS
-    channels = (path.measured[shown].T, path.simulated[shown].T)
-    panels = [
-        motion_panel(name, path.time[shown], measured, simulated, np.isfinite(simulated))
-        for name, measured, simulated in zip(
-            fit.rollout.base.model.robot.joint_names, *channels, strict=True
-        )
-    ]
-    title = f"{path.name}: measured, and simulated in windows of {fit.horizon:g} s"
-    return Figure(title, panels, columns=2, height=3.6)
+    def _figure(self, path: tuple[str, np.ndarray, np.ndarray, np.ndarray]) -> Figure:
+        name, time, measured, simulated = path
+        joints = zip(self.comparison.joint_names, measured.T, simulated.T, strict=True)
+        panels = [motion_panel(j, time, q, y, np.isfinite(y)) for j, q, y in joints]
+        title = f"{name}: measured, and simulated in windows of {self.fit.horizon:g} s"
+        return Figure(title, panels, columns=2, height=3.6)

@@ -8,7 +8,6 @@ from .result import Combination as Combination, ServoFit as ServoFit
 from .servo import PARAMETERS as PARAMETERS
 from .torque import (
     TorqueRolloutFit as TorqueRolloutFit,
-    WindowPaths as WindowPaths,
     identify_torque_rollout as identify_torque_rollout,
 )
 from .torque_methods import (

@@ -8,7 +8,6 @@ it needs no second derivative, and errors that add up over the horizon count.
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -176,22 +175,6 @@ def _follow(
     return (*begun, jnp.concatenate([after[2], after[2][-1:]]))
 
 
-class WindowPaths(NamedTuple):
-    """Measured and simulated positions of windows behind each other.
-
-    Attributes:
-        name: Name of the log.
-        time: Instants [s].
-        measured: Measured positions [rad or m].
-        simulated: Simulated positions, with NaN behind each window.
-    """
-
-    name: str
-    time: Float[np.ndarray, " samples"]
-    measured: Float[np.ndarray, "samples joints"]
-    simulated: Float[np.ndarray, "samples joints"]
-
-
 @dataclasses.dataclass(frozen=True)
 class TorqueRolloutFit(Summarised):
     """Parameters for which open-loop simulations follow the measured positions.
@@ -242,8 +225,17 @@ class TorqueRolloutFit(Summarised):
             errors = jax.jit(self.rollout.errors)(jnp.asarray(x), windows)
         return np.sqrt(np.mean(np.asarray(errors)[-1] ** 2, axis=-1))
 
-    def simulate(self, log: Observations) -> WindowPaths:
-        """Return measured and simulated positions of a log, window behind window."""
+    def simulate(
+        self, log: Observations
+    ) -> tuple[
+        Float[np.ndarray, " samples"],
+        Float[np.ndarray, "samples joints"],
+        Float[np.ndarray, "samples joints"],
+    ]:
+        """Return times, measured and simulated positions of windows that follow each other.
+
+        Behind each window a sample of the simulation is NaN.
+        """
         windows = Windows.of([log], self.horizon, self.horizon)
         with double_precision():
             errors = jax.jit(self.rollout.errors)(jnp.asarray(self.unknowns), windows)
@@ -251,9 +243,11 @@ class TorqueRolloutFit(Summarised):
         measured = np.concatenate([start, windows.measured, windows.measured[-1:]])
         simulated = np.concatenate([start, windows.measured + np.asarray(errors), gap])
         steps = np.minimum(np.arange(len(measured)), len(measured) - 2)
-        time = log.time[(windows.starts + steps[:, None])].T.ravel()
-        paths = (x.transpose(2, 0, 1).reshape(len(time), -1) for x in (measured, simulated))
-        return WindowPaths(log.name, time, *paths)
+        time = log.time[windows.starts + steps[:, None]].T.ravel()
+        measured, simulated = (
+            x.transpose(2, 0, 1).reshape(len(time), -1) for x in (measured, simulated)
+        )
+        return time, measured, simulated
 
     def torque_errors(
         self,

@@ -102,7 +102,7 @@ def test_a_report_with_torques(driven, monkeypatch):
     plain, *_, rollouts = found["errors"]["methods"]
     assert (plain["method"], rollouts["method"]) == ("least squares", "rollouts")
     assert (np.array(rollouts["errors"]) < 0.3 * np.array(plain["errors"])).all()
-    delay = next(x for x in found["unknowns"] if x["parameter"] == "delay")
+    delay = next(x for x in found["parameters"] if x["name"] == "delay")
     assert delay["estimate"] == pytest.approx(driven_pendulum.LATE + 0.001, abs=5e-4)
     assert set(found["files"]) == {p.name for p in (driven / "out").iterdir()}
     page = (driven / "out" / "rollout.html").read_text()

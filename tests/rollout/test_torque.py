@@ -64,14 +64,13 @@ def test_torque_rows_add_what_windows_do_not_tell(base, logs):
 
 def test_simulated_windows_start_on_the_measured_positions(base, logs):
     found = jid.rollout.identify_torque_rollout(base, logs[0])
-    path, steps = found.simulate(logs[1]), round(0.2 / 0.002)
-    starts = np.arange(0, len(path.time), steps + 2)
-    np.testing.assert_array_equal(path.simulated[starts], path.measured[starts])
-    assert np.isnan(path.simulated[starts + steps + 1]).all()
-    times = np.searchsorted(logs[1].time, path.time + 1e-9) - 1
-    np.testing.assert_allclose(path.measured, np.asarray(logs[1].motion.q)[times], atol=1e-12)
-    ends = (path.simulated - path.measured)[starts + steps]
-    sizes = np.sqrt(np.mean(ends**2, axis=0))
+    (time, measured, simulated), steps = found.simulate(logs[1]), round(0.2 / 0.002)
+    starts = np.arange(0, len(time), steps + 2)
+    np.testing.assert_array_equal(simulated[starts], measured[starts])
+    assert np.isnan(simulated[starts + steps + 1]).all()
+    places = np.searchsorted(logs[1].time, time + 1e-9) - 1
+    np.testing.assert_allclose(measured, np.asarray(logs[1].motion.q)[places], atol=1e-12)
+    sizes = np.sqrt(np.mean((simulated - measured)[starts + steps] ** 2, axis=0))
     np.testing.assert_allclose(sizes, found.errors_at(logs[1], 0.2), rtol=0.3)
 
 
