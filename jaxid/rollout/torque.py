@@ -90,12 +90,11 @@ class TorqueRollout:
             logs: Filtered logs with torques.
             bandwidth: Double pole of the closed loop [rad/s].
         """
-        x = jnp.asarray(self.start(p))
 
         def simulated(o: Observations, a: int, b: int) -> Motion:
             m, forces = o.read(slice(a, b))
             inputs = (np.asarray(y)[..., None] for y in (m.q, m.qd, forces))
-            found = _follow(self, x, *inputs, float(bandwidth))
+            found = _follow(self, jnp.asarray(self.start(p)), *inputs, float(bandwidth))
             return Motion(*(np.asarray(y)[..., 0] for y in found))
 
         with double_precision():

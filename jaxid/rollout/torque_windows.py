@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxid.arrays import AnyArray, Bool, Float
+from jaxid.arrays import AnyArray, Bool, Float, double_precision
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
 from jaxid.measurement.observations import Observations
@@ -97,7 +97,8 @@ class TorqueRows(NamedTuple):
             load = np.abs(forces) * np.tanh(np.asarray(o.motion.qd) / SLIDING)
             for a, b in o.row_segments:
                 counted[[*range(a, a + margin), *range(b - margin, b)]] = False
-            columns = o.reduce(np.asarray(base.regressor(o.motion)))
+            with double_precision():
+                columns = o.reduce(np.asarray(base.regressor(o.motion)))
             parts.append((columns, o.reduce(forces), o.reduce(load), counted, samples + o.instants))
             samples += o.samples
         theta, forces, load, counted, at = map(np.concatenate, zip(*parts, strict=True))
