@@ -39,7 +39,7 @@ class TorqueRolloutReport(NamedTuple):
     def verdict(self) -> Remark:
         """Whether simulations are closer to the robot than those of the fit of torques."""
         found = self.comparison
-        plain, *_, own = found.errors[:, -1]
+        plain, *_, own = np.nan_to_num(found.errors[:, -1], nan=np.inf)
         closer = bool((own < plain).all())
         text = f"Simulations are {'closer' if closer else 'no closer'} to the robot than with the "
         sizes = (", ".join(significant(1e3 * x) for x in errors) for errors in (own, plain))
