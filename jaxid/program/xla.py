@@ -62,7 +62,7 @@ def fenced_nodes(program: Program) -> frozenset[int]:
     for k, node in enumerate(program.nodes):
         own = 20 if "function" in node.operation.traits else node.operation not in free
         cost = own + sum(costs[i] for i in node.uses)
-        if cost * (program.uses[k] - 1) > 6:
+        if "truth" not in node.operation.traits and cost * (program.uses[k] - 1) > 6:
             fenced.add(k)
             cost = 0
         costs.append(cost)
