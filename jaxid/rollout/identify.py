@@ -1,25 +1,29 @@
 """Identification of joints behind position servos, from commands and positions alone.
 
 Each choice of effects (gravity, friction by load, Stribeck friction, saturation, inertial torques)
-is made by motions that the fit has not seen: leave one out among those given. Held and interpolated
-commands have the same parameters: their errors decide.
+is made by motions that the fit has not seen: leave one out among those given. So is the choice
+between commands that are held and interpolated ones.
 """
 
 import dataclasses
 import itertools
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
-from jaxid.arrays import Bool, Float
+from jaxid.arrays import Bool
 from jaxid.errors import InputError
 from jaxid.measurement.recording import Recording
 
+from .bodies import Bodies
 from .contact import contact_rows
+from .coupled import CoupledSimulator
 from .least_squares import Solution, bounded_step, minimise
-from .motion import Bodies, ServoMotion, settling
+from .motion import ServoMotion
+from .refine import RESOLUTION, Refinement, refine, weights_of
 from .result import ServoFit
-from .servo import INDEX, LOWER, START, UPPER, ServoSimulator, coupled_states
+from .servo import INDEX, LOWER, START, UPPER, ServoSimulator
 
 BASIC = ("J", "B", "d", "F", "b")
 """Parameters of every joint, before the choice."""
@@ -35,18 +39,12 @@ GAIN = 0.04
 """Fall of the logarithm of the held-out mean square for which a larger model is chosen."""
 FOLDS = 4
 """Smallest number of parts for the choice: fewer logs are divided."""
-RESOLUTION = 1e-4
-"""Errors below which no motion counts more [rad or m]."""
+LARGEST = 1e6
+"""Mean square error of a simulation that left all bounds [rad² or m²]."""
 SHORTEST = 5.0
 """Shortest part into which a log is divided [s]."""
 LIGHT = 0.02
 """Load, relative to the most loaded joint's, below which a joint counts as unloaded."""
-FALL = 0.002
-"""Fall of the logarithm of the mean square error for which the refinement goes on."""
-NEARLY_NONE = 1e-6
-"""Damping of the refinement: more would keep badly known combinations near the search's values."""
-ROUNDS = 12
-"""Largest number of refinements under loads of the simulated motion."""
 _STARTS = [(J, B, d) for J in (2e-4, 2e-3, 1e-2) for B in (0.01, 0.04, 0.15) for d in (0.0, 0.02)]
 """Inertia, damping and delay from which searches may start."""
 
@@ -86,28 +84,30 @@ def identify_rollout(
     motion = ServoMotion.of(_divided(logs))
     _require_motion(motion)
     names = _joint_names(motion, bodies, joint_names)
-    simulator = ServoSimulator(motion if bodies is None else bodies.loads(motion), time_step)
-    # Commands held or interpolated differ within a sample time only; the rest shows in long steps.
+    # Choices show in long steps, too.
     coarse = max(time_step, float(motion.sample_time.max()))
-    search = _Search(dataclasses.replace(simulator, time_step=coarse))
-    search.start()
-    groups: list[Sequence[tuple[str, ...]]] = list(EFFECTS)
-    if bodies is None:
-        groups[0] = (("b",),)
-    if not friction:
-        groups[1] = ((),)
-    if not saturation:
-        groups[2] = ((),)
-    for k, group in enumerate(groups):
-        search.choose(group)
-        if k == 0:
-            search.remove_contact()
-    search.simulator = dataclasses.replace(search.simulator, time_step=time_step)
-    if bodies is not None and not bodies.coupled:
-        bodies = search.choose_coupling(bodies)
-    solution = search.refine(bodies)
-    found = search.simulator, search.weights, solution, search.free, search.linear
-    return ServoFit.of(*found, names, bodies)
+    motion = motion if bodies is None else bodies.loads(motion)
+    search = _Search(ServoSimulator(motion, coarse))
+    whole = None if bodies is None else dataclasses.replace(bodies, coupled=True)
+    coupled = CoupledSimulator(motion, time_step, False, whole)
+    with ThreadPoolExecutor(1) as pool:
+        # What the refinement needs is compiled while the search runs.
+        pool.submit(coupled.simulate, search.x)
+        search.run(bodies is not None, friction, saturation)
+    if bodies is not None and whole is not None:
+        together = bodies.coupled or search.choose_coupling(whole)
+        bodies = whole if together else bodies
+        # Inertial torques act on all joints, however badly a log tells them from `J`.
+        search.free[:, INDEX["a"]] |= together
+    motion = search.simulator.motion
+    coupled = dataclasses.replace(coupled, motion=motion, bodies=bodies)
+    held = search.x.copy()
+    held[:, INDEX["d"]] -= 0.5 * float(motion.sample_time.mean())
+    found, told = refine(
+        Refinement(coupled, search.x, search.free),
+        Refinement(dataclasses.replace(coupled, hold=True), held, search.free),
+    )
+    return ServoFit.of(found, search.linear, names, told)
 
 
 def _divided(logs: Sequence[Recording]) -> list[Recording]:
@@ -126,7 +126,7 @@ def _require_motion(motion: ServoMotion) -> None:
         if still.any():
             joint = int(np.argmax(still)) + 1
             raise InputError(
-                f"`logs`: the {channel} of joint {joint} never change: nothing can be identified. "
+                f"`logs`: the {channel} of joint {joint} change by less than 1 mrad or 1 mm. "
                 "Leave the joint out, or give logs in which it moves."
             )
 
@@ -151,6 +151,16 @@ def mask(symbols: Sequence[str]) -> Bool[np.ndarray, " parameters"]:
     return np.isin(list(INDEX), list(symbols))
 
 
+def _lower(scores: np.ndarray, others: np.ndarray) -> Bool[np.ndarray, " joints"]:
+    """Return whether scores [motions, joints] are lower than others, by more than their scatter."""
+    change = scores - others
+    count = np.isfinite(change).sum(axis=0)
+    mean = np.nansum(change, axis=0) / np.maximum(count, 1)
+    squares = np.nansum((change - mean) ** 2, axis=0)
+    scatter = np.sqrt(squares / np.maximum(count - 1, 1) / np.maximum(count, 1))
+    return mean < -np.maximum(GAIN, scatter)
+
+
 class _Search:
     """Fits of all joints, candidate models and folds, in batches.
 
@@ -171,8 +181,29 @@ class _Search:
         self.free = np.tile(mask(BASIC), (joints, 1))
         self.linear = self.x.copy()
 
+    def run(self, loaded: bool, friction: bool, saturation: bool) -> None:
+        """Choose the effects of all joints.
+
+        Args:
+            loaded: Whether bodies load the joints.
+            friction: Whether friction by load and Stribeck friction are tried.
+            saturation: Whether a largest torque is tried.
+        """
+        self.start()
+        groups: list[Sequence[tuple[str, ...]]] = list(EFFECTS)
+        if not loaded:
+            groups[0] = (("b",),)
+        if not friction:
+            groups[1] = ((),)
+        if not saturation:
+            groups[2] = ((),)
+        for k, group in enumerate(groups):
+            self.choose(group)
+            if k == 0:
+                self.remove_contact()
+
     def solve(
-        self, x: np.ndarray, free: np.ndarray, iterations: int = 10, damping: float = 1e-2
+        self, x: np.ndarray, free: np.ndarray, iterations: int = 12, damping: float = 1e-2
     ) -> Solution:
         """Fit candidates [candidates, joints, parameters] to all motions."""
         w = self.weights[:, None, :]
@@ -186,10 +217,13 @@ class _Search:
 
         return minimise(moments, costs, x, free, (LOWER, UPPER), iterations, damping=damping)
 
-    def held_out(self, found: Solution, free: np.ndarray) -> Float[np.ndarray, "candidates joints"]:
-        """Return mean logarithms of the mean square errors of motions left out, one at a time.
+    def held_out(self, found: Solution, free: np.ndarray) -> np.ndarray:
+        """Return logarithms of the mean square errors of motions left out, one at a time.
 
         Without a motion the fit moves by a Gauss-Newton step; its error is simulated.
+
+        Returns:
+            Scores [motions, candidates, joints]; NaN where nothing counts.
         """
         w = self.weights[:, None, :]
         _, g, H = self.simulator.moments(found.x)
@@ -199,9 +233,8 @@ class _Search:
         errors = self.simulator.costs(np.clip(x + step, LOWER, UPPER), each=True)
         counted = np.asarray(self.simulator.motion.counted).sum(axis=-1)
         mean = errors / np.maximum(counted, 1.0)[:, None]
-        share = (counted > 0)[:, None] + 0.0
-        scores = (share * np.log(mean + RESOLUTION**2)).sum(axis=0) / share.sum(axis=0)
-        return np.where(np.isfinite(scores), scores, np.inf)
+        scores = np.log(np.minimum(np.nan_to_num(mean, nan=LARGEST), LARGEST) + RESOLUTION**2)
+        return np.where((counted > 0)[:, None], scores, np.nan)
 
     def start(self) -> None:
         """Fit the basic model from the best of many starts, and the linear baseline."""
@@ -222,12 +255,8 @@ class _Search:
         self.x = np.take_along_axis(x, chosen[None, :, None], axis=0)[0]
 
     def _weigh(self, x: np.ndarray) -> None:
-        """Weigh motions by their own errors, so that the worst one does not decide alone."""
-        counted = np.asarray(self.simulator.motion.counted).sum(axis=-1)
-        mean = self.simulator.costs(x[None])[:, 0] / np.maximum(counted, 1.0)
-        self.weights = np.where(counted > 0, 1.0 / (mean + RESOLUTION**2), 0.0) / np.maximum(
-            counted, 1
-        )
+        """Weigh motions by their own errors."""
+        self.weights = weights_of(self.simulator.motion, self.simulator.costs(x[None])[:, 0])
 
     def remove_contact(self) -> None:
         """Leave out the samples in which a joint is held by something that is not in the model."""
@@ -262,10 +291,10 @@ class _Search:
         scores = self.held_out(found, free)
         chosen = np.zeros(len(self.x), int)
         for k in range(1, len(group)):
-            current = np.take_along_axis(scores, chosen[None], axis=0)[0]
+            current = np.take_along_axis(scores, chosen[None, None], axis=1)[:, 0]
             # Effects that have been found stay: a known weight is not replaced by a bias.
             larger = np.array([set(group[c]) <= set(group[k]) for c in chosen])
-            chosen = np.where(larger & (scores[k] < current - GAIN), k, chosen)
+            chosen = np.where(larger & _lower(scores[:, k], current), k, chosen)
         self._take(found.x, chosen)
         self.free = np.take_along_axis(free, chosen[None, :, None], axis=0)[0]
         self._weigh(self.x)
@@ -292,10 +321,9 @@ class _Search:
         }
         return values[symbol]
 
-    def choose_coupling(self, bodies: Bodies) -> Bodies:
+    def choose_coupling(self, bodies: Bodies) -> bool:
         """Decide whether inertial torques of the bodies act, beside those of gravity."""
-        coupled = dataclasses.replace(bodies, coupled=True)
-        motion = coupled.loads(self.simulator.motion)
+        motion = bodies.loads(self.simulator.motion)
         x, a = self.x.copy(), self.x[:, INDEX["a"]] * self.free[:, INDEX["a"]]
         own = a * np.asarray(motion.inertia).mean(axis=(0, 2))
         x[:, INDEX["J"]] = np.maximum(x[:, INDEX["J"]] - own, 1e-5)
@@ -303,54 +331,10 @@ class _Search:
         other = dataclasses.replace(self.simulator, motion=motion)
         for simulator, start in ((self.simulator, self.x), (other, x)):
             self.simulator = simulator
-            found = self.solve(start[None], self.free[None], iterations=5)
-            scores.append(self.held_out(found, self.free[None]).mean())
+            found = self.solve(start[None], self.free[None], iterations=3)
+            scores.append(np.nanmean(self.held_out(found, self.free[None])))
             results.append((simulator, found.x[0]))
         better = bool(scores[1] < scores[0])
         self.simulator, self.x = results[int(better)]
         self._weigh(self.x)
-        return coupled if better else bodies
-
-    def refine(self, bodies: Bodies | None) -> Solution:
-        """Return the fit under the loads of the simulated motion, commands held or interpolated."""
-        if bodies is not None and bodies.coupled:
-            # Inertial torques act on all joints, however badly a log tells them from `J`.
-            self.free[:, INDEX["a"]] = True
-        first = self._refined(bodies, self.simulator, self.x)
-        _, simulator, x = first
-        held = x.copy()
-        held[:, INDEX["d"]] -= 0.5 * float(simulator.motion.sample_time.mean())
-        second = self._refined(bodies, dataclasses.replace(simulator, hold=True), held)
-        _, self.simulator, self.x = min(first, second, key=lambda found: found[0])
-        self._weigh(self.x)
-        return self.solve(self.x[None], self.free[None], 1, NEARLY_NONE)
-
-    def _refined(
-        self, bodies: Bodies | None, simulator: ServoSimulator, x: np.ndarray
-    ) -> tuple[float, ServoSimulator, np.ndarray]:
-        """Return the mean logarithm of errors, the simulator and the parameters of a refinement.
-
-        Measured positions tell inertial torques roughly. Here the loads follow the simulation, and
-        all samples count, with initial velocities estimated.
-        """
-        motion = simulator.motion
-        early = np.arange(motion.positions.shape[-1]) < settling(motion)[:, None, None]
-        counted = np.where(early, 1.0, motion.counted)
-        simulator = dataclasses.replace(simulator, motion=motion.replace(counted=counted))
-        states, best, waited = simulator.states_of(x), (np.inf, simulator, x), 0
-        for _ in range(ROUNDS):
-            if bodies is not None:
-                states = coupled_states(simulator, bodies, x, states, 5)
-                loaded = bodies.loads(simulator.motion, *states)
-                simulator = dataclasses.replace(simulator, motion=loaded)
-            simulator = simulator.with_better_rates(x)
-            mean = simulator.costs(x[None])[:, 0] / np.maximum(counted.sum(axis=-1), 1.0)
-            score = float(np.log(mean + RESOLUTION**2).mean())
-            waited = 0 if score < best[0] - FALL else waited + 1
-            best = (score, simulator, x) if score < best[0] else best
-            if waited == 2:
-                break
-            self.simulator = simulator
-            self._weigh(x)
-            x = self.solve(x[None], self.free[None], 1, NEARLY_NONE).x[0]
-        return best
+        return better

@@ -7,6 +7,8 @@ import numpy as np
 
 from jaxid.arrays import Bool, Float
 
+HELD = 6
+"""Largest number of times that parameters are brought to their bounds in a step."""
 Moments = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, ...]]
 """Function of parameters [..., size] and of the indices of their problems along the first axis.
 
@@ -62,7 +64,7 @@ def minimise(
     cost, g, H = moments(x, left)
     for _ in range(iterations):
         own = (y[left] for y in (x, cost, g, H, free, dampings))
-        x[left], dampings[left], converged = _improve(costs, left, *own, bounds, tolerance)
+        x[left], dampings[left], converged = improve(costs, left, *own, bounds, tolerance)
         cost[left], g[left], H[left] = moments(x[left], left)
         left = left[~converged.reshape(len(left), -1).all(axis=1)]
         if not left.size:
@@ -70,7 +72,7 @@ def minimise(
     return Solution(x, cost, g, H)
 
 
-def _improve(costs, problems, x, cost, g, H, free, damping, bounds, tolerance):
+def improve(costs, problems, x, cost, g, H, free, damping, bounds, tolerance):
     """Return parameters of lower costs, their damping, and which problems have converged."""
     decrease = np.zeros_like(cost)
     for _ in range(5):
@@ -95,23 +97,30 @@ def bounded_step(
     bounds: tuple[np.ndarray, np.ndarray],
     damping: np.ndarray | float,
 ) -> np.ndarray:
-    """Return damped Gauss-Newton steps of the free parameters that no bound holds.
+    """Return damped Gauss-Newton steps of the free parameters within their bounds.
 
-    Where derivatives have overflowed, the step is zero.
+    A parameter that would leave its bounds goes to them, and the others follow. Where derivatives
+    have overflowed, the step is zero.
     """
     low, high = bounds
     known = np.isfinite(information).all(axis=(-1, -2)) & np.isfinite(gradient).all(axis=-1)
     known = np.asarray(known)
     information = np.where(known[..., None, None], information, 0.0)
     gradient = np.where(known[..., None], gradient, 0.0)
-    held = ((x <= low) & (gradient > 0)) | ((x >= high) & (gradient < 0))
-    moving = (free & ~held).astype(float)
     size = np.sqrt(np.maximum(np.diagonal(information, axis1=-2, axis2=-1), 1e-300))
-    moving = moving * (size > 1e-140)
     scaled = information / size[..., None] / size[..., None, :]
-    scaled = scaled * moving[..., None] * moving[..., None, :]
-    identity = np.eye(x.shape[-1])
-    more = np.asarray(damping)[..., None, None] + 1e-12
-    A = scaled + identity * (more + (1.0 - moving)[..., None])
-    step = np.linalg.solve(A, (-gradient / size * moving)[..., None])[..., 0]
-    return step / size
+    identity, more = np.eye(x.shape[-1]), np.asarray(damping)[..., None, None] + 1e-12
+    held = ((x <= low) & (gradient > 0)) | ((x >= high) & (gradient < 0))
+    moving, step = (free & ~held & (size > 1e-140)).astype(float), np.zeros_like(gradient)
+    for _ in range(HELD):
+        A = scaled * moving[..., None] * moving[..., None, :]
+        A = A + identity * (more + (1.0 - moving)[..., None])
+        rest = -gradient / size - np.einsum("...ij,...j->...i", scaled, step * size)
+        own = np.linalg.solve(A, (rest * moving)[..., None])[..., 0] / size
+        step = np.where(moving > 0, own, step)
+        leaves = (moving > 0) & ((x + step < low) | (x + step > high))
+        if not leaves.any():
+            break
+        step = np.where(leaves, np.clip(x + step, low, high) - x, np.where(moving > 0, 0.0, step))
+        moving = np.where(leaves, 0.0, moving)
+    return step

@@ -1,4 +1,4 @@
-"""Motions of joints behind position servos, and the bodies that load them."""
+"""Motions of joints behind position servos."""
 
 import dataclasses
 import math
@@ -10,13 +10,15 @@ import jax
 import numpy as np
 
 from jaxid.arrays import AnyArray, Float
-from jaxid.dynamics.dispatch import in_numpy
-from jaxid.dynamics.model import Model
 from jaxid.errors import InputError
 from jaxid.measurement.recording import Recording
 
 SETTLING = 0.5
 """Time at the start of a log that does not count, because the initial speed is not known [s]."""
+EARLY = 0.2
+"""Time at the start of a log whose velocities bound the initial ones [s]."""
+ROUNDING = 1e-3
+"""Rounding of positions that is assumed for those of the start [rad or m]."""
 PADDED = 500
 """Samples to a multiple of which motions are padded, so that few lengths are compiled."""
 
@@ -29,7 +31,7 @@ class ServoMotion(eqx.Module):
         positions: Measured positions.
         load: Torques of the bodies between a sample, or step, and the next one [N m or N].
         inertia: Inertia of the bodies about each joint [kg m² or kg].
-        rates: Initial velocities [motions, joints].
+        start: Initial positions and velocities.
         counted: Whether a sample counts in the fit.
         sample_time: Time between two samples of each motion [s].
         lengths: Number of samples of each motion.
@@ -40,7 +42,7 @@ class ServoMotion(eqx.Module):
     positions: Float[AnyArray, "motions joints samples"]
     load: Float[AnyArray, "motions joints instants"]
     inertia: Float[AnyArray, "motions joints instants"]
-    rates: Float[AnyArray, "motions joints"]
+    start: Float[AnyArray, "motions 2 joints"]
     counted: Float[AnyArray, "motions joints samples"]
     sample_time: Float[AnyArray, " motions"]
     lengths: tuple[int, ...] = eqx.field(static=True)
@@ -84,12 +86,25 @@ class ServoMotion(eqx.Module):
             positions=positions,
             load=np.zeros_like(positions),
             inertia=np.zeros_like(positions),
-            rates=np.array(rates),
+            start=np.stack([positions[..., 0], np.array(rates)], axis=1),
             counted=np.repeat(counted[:, None].astype(float), positions.shape[1], axis=1),
             sample_time=times,
             lengths=lengths,
             names=tuple(log.name for log, _, _ in parts),
         )
+
+    @property
+    def certainty(self) -> Float[np.ndarray, "motions 2 joints"]:
+        """Inverse variance of the initial states as the first samples show them, over their number.
+
+        Velocities are within those of the first fifth of a second, positions within rounding.
+        """
+        found = np.full(self.start.shape, 1.0 / ROUNDING**2)
+        for k, dt in enumerate(map(float, self.sample_time)):
+            count = max(2, round(EARLY / dt))
+            ranges = np.ptp(np.asarray(self.positions[k])[:, : count + 1], axis=-1)
+            found[k, 1] = (count * dt / np.maximum(ranges, ROUNDING)) ** 2
+        return found / np.maximum(np.asarray(self.counted).sum(axis=-1), 1.0)[:, None]
 
     @property
     def motions(self) -> int:
@@ -116,7 +131,8 @@ class ServoMotion(eqx.Module):
         rates = (q[..., early] - q[..., 0]) / (early * dt[:, None])
         names = tuple(self.names[k] for k in index)
         lengths = (size,) * len(index)
-        return self.replace(**arrays, rates=rates, sample_time=dt, lengths=lengths, names=names)
+        start = np.stack([q[..., 0], rates], axis=1)
+        return self.replace(**arrays, start=start, sample_time=dt, lengths=lengths, names=names)
 
     def part(self, motion: int) -> "ServoMotion":
         """Return one motion, without the axis of motions."""
@@ -126,61 +142,3 @@ class ServoMotion(eqx.Module):
 def settling(motion: ServoMotion) -> np.ndarray:
     """Return the number of first samples of each motion that do not count."""
     return np.ceil(SETTLING / np.asarray(motion.sample_time)).astype(int)
-
-
-@dataclasses.dataclass(frozen=True)
-class Bodies:
-    """Bodies that load the joints: a model with its parameters, often from a URDF file.
-
-    Attributes:
-        model: Model of the robot.
-        parameters: Standard parameters.
-        coupled: Whether inertial torques count, beside those of gravity.
-    """
-
-    model: Model
-    parameters: Float[AnyArray, " standard"]
-    coupled: bool = False
-
-    def loads(
-        self, motion: ServoMotion, q: np.ndarray | None = None, v: np.ndarray | None = None
-    ) -> ServoMotion:
-        """Return the motions with the loads between two samples.
-
-        Args:
-            motion: Motions.
-            q: Positions; the measured ones if None.
-            v: Velocities of a simulation, whose changes are the mean accelerations; smoothed
-                derivatives of the positions if None. Simulations may have several steps in each
-                sample time.
-        """
-        q = np.asarray(motion.positions if q is None else q)
-        load, inertia = np.zeros_like(q), np.zeros_like(q)
-        model, p = self.model, np.asarray(self.parameters)
-        steps = (q.shape[-1] - 1) // (motion.positions.shape[-1] - 1)
-        for k, dt in enumerate(map(float, np.asarray(motion.sample_time) / steps)):
-            if v is None:
-                rates = smooth_rates(q[k].T, dt)
-                path, qd, qdd = (0.5 * (x[1:] + x[:-1]) for x in rates)
-            else:
-                path, qd = (0.5 * (x[k].T[1:] + x[k].T[:-1]) for x in (q, v))
-                qdd = np.diff(v[k].T, axis=0) / dt
-            if self.coupled:
-                M = in_numpy(model, model.inertia, path, shared=(p,))
-                own = np.diagonal(M, axis1=1, axis2=2)
-                forces = in_numpy(model, model.forces, path, qd, qdd, shared=(p,)) - own * qdd
-                inertia[k, :, :-1] = own.T
-            else:
-                forces = in_numpy(model, model.forces, path, 0 * qd, 0 * qd, shared=(p,))
-            load[k, :, :-1] = forces.T
-        return motion.replace(load=load, inertia=inertia)
-
-
-def smooth_rates(q: np.ndarray, dt: float, cutoff: float = 8.0) -> tuple[np.ndarray, ...]:
-    """Return positions below a frequency [Hz] with their first and second derivatives."""
-    from scipy.signal import butter, sosfiltfilt
-
-    if cutoff < 0.4 / dt:
-        q = sosfiltfilt(butter(2, 2.0 * cutoff * dt, output="sos"), q, axis=0)
-    qd = np.gradient(q, dt, axis=0)
-    return q, qd, np.gradient(qd, dt, axis=0)

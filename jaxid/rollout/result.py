@@ -5,22 +5,28 @@ from collections.abc import Sequence
 from functools import cached_property
 from typing import NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from scipy import special, stats
 
-from jaxid.arrays import AnyArray, Bool, Float, double_precision
+from jaxid.arrays import AnyArray, Array, Bool, Float, double_precision
 from jaxid.identification.uncertainty.spectral import sandwich_of_columns
 from jaxid.measurement.recording import Recording
 from jaxid.result_table import Column, Remark, Status, Table, significant, with_deviations
 
+from .bodies import Bodies
 from .contact import Contact, contact_rows, contacts, sustained_errors, typical_errors
+from .coupled import CoupledSimulator
 from .errors import RolloutErrors
-from .least_squares import Solution
-from .motion import Bodies, ServoMotion
-from .servo import INDEX, LOWER, PARAMETERS, SCALE, UPPER, ServoSimulator, coupled_states
+from .motion import ServoMotion
+from .refine import Refinement, mean_squares, weights_of
+from .servo import INDEX, LOWER, PARAMETERS, SCALE, UPPER, ServoSimulator
 
 UNDETERMINED = 0.5
 """Standard deviation, relative to a parameter's size, above which it is not determined."""
+LIMITED = [INDEX[x] for x in ("B", "d", "b", "um", "g")]
+"""Parameters that are not at a limit of the search unless something is wrong."""
 SYSTEMATIC = 1.5
 """Multiple of the encoder's rounding above which slow errors show a missing effect."""
 
@@ -33,7 +39,7 @@ class Combination(NamedTuple):
         name: Parameter, with those that are merged into it.
         meaning: Description in words.
         unit: Unit.
-        coefficients: Factor of each parameter.
+        coefficients: Factor of each parameter of all joints.
         value: Estimate.
         deviation: Standard deviation.
         dof: Degrees of freedom of the deviation.
@@ -43,7 +49,7 @@ class Combination(NamedTuple):
     name: str
     meaning: str
     unit: str
-    coefficients: Float[np.ndarray, " parameters"]
+    coefficients: Float[np.ndarray, "joints parameters"]
     value: float
     deviation: float
     dof: float
@@ -62,7 +68,7 @@ class ServoFit:
         joint_names: Names of the joints.
         parameters: Parameters of each joint, in the order of `jid.rollout.PARAMETERS`.
         free: Parameters that were estimated.
-        covariance: Covariance of the parameters of each joint; zero where they are fixed.
+        covariance: Covariance of the estimated parameters, joint by joint.
         combinations: Parameters and combinations that the logs determine.
         linear: Parameters of the linear baseline.
         hold: Whether commands are held until the next one, instead of interpolated.
@@ -74,12 +80,13 @@ class ServoFit:
         bodies: Bodies whose weight loads the joints; None without.
         load: Mean absolute load of each joint in the logs [N m or N].
         notes: Doubts about the model, in sentences.
+        hold_is_told: Whether the logs tell held commands from interpolated ones.
     """
 
     joint_names: tuple[str, ...]
     parameters: Float[np.ndarray, "joints parameters"]
     free: Bool[np.ndarray, "joints parameters"]
-    covariance: Float[np.ndarray, "joints parameters parameters"]
+    covariance: Float[np.ndarray, "free free"]
     combinations: tuple[Combination, ...]
     linear: Float[np.ndarray, "joints parameters"]
     hold: bool
@@ -91,59 +98,58 @@ class ServoFit:
     bodies: Bodies | None
     load: Float[np.ndarray, " joints"]
     notes: tuple[str, ...] = ()
+    hold_is_told: bool = True
 
     @classmethod
     def of(
         cls,
-        simulator: ServoSimulator,
-        weights: Float[np.ndarray, "motions joints"],
-        solution: Solution,
-        free: Bool[np.ndarray, "joints parameters"],
+        found: Refinement,
         linear: Float[np.ndarray, "joints parameters"],
         joint_names: tuple[str, ...],
-        bodies: Bodies | None,
+        hold_is_told: bool = True,
     ) -> "ServoFit":
-        """Return the fit of a solution, with its uncertainty."""
-        x, motion = solution.x, simulator.motion
-        y, S = (y[:, 0] for y in simulator.sensitivities(x))
-        r, S = (y - motion.positions) * motion.counted, S * np.asarray(motion.counted)[..., None]
-        S = without_rates(S, np.maximum(np.mean(r**2, axis=-1), 1e-12))
-        covariance, combinations, lacking = np.zeros((*x[0].shape, len(PARAMETERS))), [], []
-        for j in range(len(x[0])):
-            root, counted = np.sqrt(weights[:, j])[:, None], np.asarray(motion.counted)[:, j]
-            scaled = root * r[:, j], root[..., None] * S[:, j]
-            rows = _Rows(*scaled, counted.mean(axis=1), float(motion.sample_time.mean()))
-            own, covariance[j] = _determined(rows, x[0, j], free[j], j)
-            combinations += own
-            if (
-                rms := systematic_error(r[:, j], counted > 0, np.asarray(motion.positions)[:, j])
-            ) > 0:
-                lacking.append(f"{joint_names[j]} {1e3 * rms:.2g}")
-        notes = (
+        """Return the fit of a refinement, with its uncertainty."""
+        simulator, r = found.simulator, found.residuals
+        motion = simulator.motion
+        everything = simulator.positions(found.path) - np.asarray(motion.positions)
+        typical = typical_errors(motion, sustained_errors(motion, everything))
+        combinations, covariance = _determined(_Rows.of(found), found, joint_names)
+        positions, lacking = np.asarray(motion.positions), []
+        for j, name in enumerate(joint_names):
+            kept = np.asarray(motion.counted)[:, j] > 0
+            if (rms := systematic_error(r[:, j], kept, positions[:, j])) > 0:
+                lacking.append(f"{name} {1e3 * rms:.2g}")
+        notes = [
+            f"{joint_names[j]}: {PARAMETERS[k].meaning} is at the limit of the search, "
+            f"{found.parameters[j, k]:.3g}: check signs, units and offsets of the commands"
+            for j, k in np.argwhere(found.free)
+            if found.parameters[j, k] in (UPPER[k], LOWER[k]) and k in LIMITED
+        ]
+        missing = (
             f"errors are larger than an encoder's rounding and change slowly "
             f"({', '.join(lacking)} mrad or mm RMS): an effect is missing, such as other friction, "
-            "play, elasticity or load, and the parameters are those that imitate it best",
+            "play, elasticity or load, and the parameters are those that imitate it best"
         )
-        errors = np.where(np.asarray(motion.counted) > 0, r, 0.0)
-        count = np.maximum(np.asarray(motion.counted).sum(axis=-1), 1.0)
-        everything = y - np.asarray(motion.positions)
-        typical = typical_errors(motion, sustained_errors(motion, everything))
+        load = np.zeros_like(motion.positions)
+        if simulator.bodies is not None:
+            load = simulator.bodies.loads(motion).load
         return cls(
             joint_names,
-            x[0],
-            free,
+            found.parameters,
+            found.free,
             covariance,
-            tuple(combinations),
+            combinations,
             linear,
             simulator.hold,
             simulator.time_step,
-            np.sqrt((errors**2).sum(axis=-1) / count),
+            np.sqrt(mean_squares(motion, found.sums)),
             motion.names,
             typical,
             contacts(motion, everything, typical),
-            bodies,
-            np.abs(motion.load).mean(axis=(0, 2)),
-            notes if lacking else (),
+            simulator.bodies,
+            np.abs(load).mean(axis=(0, 2)),
+            (*notes, *([missing] if lacking else [])),
+            hold_is_told,
         )
 
     @cached_property
@@ -155,6 +161,20 @@ class ServoFit:
             if c.name == "a" and c.deviation < UNDETERMINED * abs(c.value):
                 found[c.joint] = 1.0 / c.value
         return found
+
+    @property
+    def _commands(self) -> str:
+        said = "held until the next one" if self.hold else "interpolated"
+        if self.hold_is_told:
+            return said
+        return f"{said}; if held, delays are half a sample time shorter: the logs do not tell"
+
+    @property
+    def _lengths(self) -> list[str]:
+        """Unit of the positions of each joint."""
+        if self.bodies is None:
+            return ["rad"] * len(self.joint_names)
+        return ["rad" if turns else "m" for turns in self.bodies.model.robot.revolute]
 
     def of_parameter(self, symbol: str) -> Float[np.ndarray, " joints"]:
         """Return a parameter of all joints by its symbol, like `"J"`."""
@@ -176,12 +196,8 @@ class ServoFit:
     def paths(self, motion: ServoMotion, parameters: AnyArray | None = None) -> np.ndarray:
         """Return simulated positions [motions, joints, samples], with loads at these positions."""
         x = np.asarray(self.parameters if parameters is None else parameters)
-        simulator = ServoSimulator(motion, self.time_step, self.hold)
-        if self.bodies is None:
-            return simulator.paths(x[None])[:, 0]
-        loaded = self.bodies.loads(motion, np.asarray(motion.commands))
-        states = dataclasses.replace(simulator, motion=loaded).states_of(x)
-        return coupled_states(simulator, self.bodies, x, states)[0][..., :: simulator.steps]
+        simulator = CoupledSimulator(motion, self.time_step, self.hold, self.bodies)
+        return simulator.positions(simulator.simulate(x))
 
     def validate(self, logs: Sequence[Recording] | Recording) -> RolloutErrors:
         """Compare free-running simulations with logs, and with simple baselines.
@@ -234,10 +250,10 @@ class ServoFit:
         """
         random = np.random.default_rng(seed)
         draws = np.tile(self.parameters, (count, 1, 1))
-        for j, C in enumerate(self.covariance):
-            size, vectors = np.linalg.eigh(C / SCALE / SCALE[:, None])
-            root = SCALE[:, None] * vectors * np.sqrt(np.maximum(size, 0.0))
-            draws[:, j] += random.normal(size=(count, len(C))) @ root.T
+        scale = SCALE[np.nonzero(self.free)[1]]
+        size, vectors = np.linalg.eigh(self.covariance / scale / scale[:, None])
+        root = scale[:, None] * vectors * np.sqrt(np.maximum(size, 0.0))
+        draws[:, self.free] += random.normal(size=(count, len(scale))) @ root.T
         return np.clip(draws, LOWER, UPPER)
 
     def summary(self) -> Table:
@@ -261,7 +277,7 @@ class ServoFit:
                 "  ".join(significant(1e3 * x) for x in np.sqrt((self.rms**2).mean(axis=0)))
                 + "  mrad or mm RMS",
             ),
-            ("commands", "held until the next one" if self.hold else "interpolated"),
+            ("commands", self._commands),
             ("stiffness", K or "not determined: all parameters are ratios to it"),
         ]
         remarks: list[Remark | str] = [
@@ -284,7 +300,7 @@ class ServoFit:
             Column("meaning", [c.meaning for c in rows]),
             Column("estimate", values, kind="number"),
             Column("±", deviations, kind="number"),
-            Column("unit", [c.unit.replace("u", "rad") for c in rows]),
+            Column("unit", [c.unit.replace("u", self._lengths[c.joint]) for c in rows]),
             Column("95 %\nfrom", low, kind="number"),
             Column("95 %\nto", high, kind="number"),
             facts=facts,
@@ -297,56 +313,86 @@ class ServoFit:
         return self.summary().text()
 
 
-def without_rates(S: np.ndarray, variance: np.ndarray) -> np.ndarray:
-    """Return sensitivities to the parameters less what initial velocities can imitate."""
-    start, own = S[..., -1:], S[..., :-1]
-    known = np.sum(start**2, axis=-2, keepdims=True) + variance[..., None, None]
-    return own - start * np.sum(start * own, axis=-2, keepdims=True) / known
-
-
 class _Rows(NamedTuple):
-    """Weighted residuals and sensitivities of one joint, in all motions.
+    """Weighted sensitivities of a refinement, less what initial states can imitate.
 
     Attributes:
-        residuals: Residuals [motions, samples].
-        sensitivities: Sensitivities [motions, samples, parameters].
-        exposure: Fraction of the samples of each motion that count.
-        sample_time: Mean sample time [s].
+        found: Refinement.
+        weights: Weight of each motion's squared errors [motions, joints].
+        imitated: Initial states that imitate each parameter [motions, 2 joints, parameters].
+        scores: Sensitivities times residuals [motions, parameters].
+        information: Gauss-Newton matrix.
     """
 
-    residuals: np.ndarray
-    sensitivities: np.ndarray
-    exposure: np.ndarray
-    sample_time: float
+    found: Refinement
+    weights: np.ndarray
+    imitated: np.ndarray
+    scores: np.ndarray
+    information: np.ndarray
 
-    def covariance(self, own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return covariance and degrees of freedom of some parameters.
+    @classmethod
+    def of(cls, found: Refinement) -> "_Rows":
+        """Return the rows of a refinement."""
+        weights = weights_of(found.simulator.motion, found.sums)
+        size, scores, imitated = 2 * weights.shape[1], [], []
+        information = np.zeros((int(found.free.sum()),) * 2)
+        certainties = found.simulator.motion.certainty
+        for w, g, H, certainty in zip(weights, *found.products, certainties, strict=True):
+            own_g, own_H = w @ g, np.tensordot(w, H, 1)
+            known = own_H[-size:, -size:] + np.diag(certainty.ravel())
+            imitated.append(np.linalg.solve(known, own_H[-size:, :-size]))
+            scores.append(own_g[:-size] - own_g[-size:] @ imitated[-1])
+            information += own_H[:-size, :-size] - own_H[:-size, -size:] @ imitated[-1]
+        return cls(found, weights, np.stack(imitated), np.stack(scores), information)
+
+    @property
+    def white(self) -> np.ndarray:
+        """Covariance of the parameters if errors were independent."""
+        samples = np.asarray(self.found.simulator.motion.counted).sum(axis=-1)
+        return _inverse(self.information) / max(float(samples.max()), 1.0)
+
+    @property
+    def columns(self) -> list[Array]:
+        """Sensitivities of each motion and joint [parameters, samples]."""
+        rows = zip(self.found.sensitivities, self.imitated, strict=True)
+        with double_precision():
+            return [x for S, start in rows for x in _without_start(S, start)]
+
+    def covariance(self, columns: list[Array], own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return covariance and degrees of freedom if only some parameters are unknown.
 
         The spectral sandwich; where motions differ more than it explains, their scatter.
         """
-        S, count = self.sensitivities[..., own], len(self.residuals)
-        A = S.reshape(-1, S.shape[-1])
-        B = _inverse(A.T @ A)
+        motion, (motions, joints) = self.found.simulator.motion, self.weights.shape
+        B, place = np.zeros_like(self.information), np.ix_(own, own)
+        B[place] = _inverse(self.information[place])
         with double_precision():
             found = sandwich_of_columns(
-                [range(len(B))] * count,
-                np.ones(count),
+                [range(len(B))] * (motions * joints),
+                np.sqrt(self.weights).ravel(),
                 B,
                 np.zeros((1, len(B))),
-                list(np.moveaxis(S, 1, 2)),
-                list(self.residuals[:, None]),
-                self.exposure,
-                self.sample_time,
+                columns,
+                list(self.found.residuals.reshape(motions * joints, 1, -1)),
+                np.asarray(motion.counted).mean(axis=-1).ravel(),
+                float(motion.sample_time.mean()),
             )
         variance, dof = (np.asarray(x)[0] for x in found)
-        correlation = B / np.sqrt(np.outer(np.diag(B), np.diag(B)))
-        scores = np.einsum("mtp,mt->mp", S, self.residuals) @ B
-        scatter = count / max(count - 1, 1) * (scores**2).sum(axis=0)
-        limit = stats.f.ppf(0.95, count - 1, dof) if count > 1 else np.inf
-        differ = scatter > limit * variance
-        dof = np.where(differ, count - 1.0, dof)
+        size = np.sqrt(np.maximum(np.diag(B), 1e-300))
+        changes = self.scores @ B
+        scatter = motions / max(motions - 1, 1) * (changes**2).sum(axis=0)
+        limit = stats.f.ppf(0.95, max(motions - 1, 1), dof)
+        differ = (motions > 1) & (scatter > limit * variance)
+        dof = np.where(differ, motions - 1.0, dof)
         deviation = np.sqrt(np.where(differ, scatter, variance))
-        return correlation * np.outer(deviation, deviation), dof
+        return B / np.outer(size, size) * np.outer(deviation, deviation), dof
+
+
+@jax.jit
+def _without_start(S: Array, start: Array) -> Array:
+    """Return sensitivities of a motion to the parameters [joints, parameters, samples]."""
+    own, by_start = S[..., : -len(start)], S[..., -len(start) :]
+    return jnp.swapaxes(own - by_start @ start, 1, 2)
 
 
 def systematic_error(r: np.ndarray, kept: np.ndarray, q: np.ndarray) -> float:
@@ -376,34 +422,36 @@ def _inverse(H: np.ndarray) -> np.ndarray:
 
 
 def _determined(
-    rows: _Rows, x: np.ndarray, moving: np.ndarray, joint: int
-) -> tuple[list[Combination], np.ndarray]:
-    """Return the combinations that a joint's rows determine, and the covariance of all."""
-    covariance, _ = rows.covariance(moving)
-    index = np.flatnonzero(moving)
-    size = np.maximum(np.abs(x[index]), 0.1 * SCALE[index])
-    own, kappa = _merge(covariance / np.outer(size, size))
+    rows: _Rows, found: Refinement, joint_names: tuple[str, ...]
+) -> tuple[tuple[Combination, ...], np.ndarray]:
+    """Return the combinations that the rows determine, and the covariance of all parameters."""
+    x, joints, symbols = found.parameters[found.free], *np.nonzero(found.free)
+    columns = rows.columns
+    covariance, _ = rows.covariance(columns, np.arange(len(x)))
+    size = np.maximum(np.abs(x), 0.1 * SCALE[symbols])
+    # The sandwich is blind where no error can show: there the information alone tells.
+    own, kappa = _merge((covariance + rows.white) / np.outer(size, size))
     kappa = kappa * size[own][:, None] / size[None, :]
-    chosen = np.zeros(len(x), bool)
-    chosen[index[own]] = True
-    reduced, dof = rows.covariance(chosen)
-    full = np.zeros((len(x), len(x)))
-    full[np.ix_(index, index)] = covariance
-    found = []
-    for k, i in enumerate(index[own]):
-        coefficients = np.zeros(len(x))
-        coefficients[index] = kappa[k]
-        merged = [m for m in np.flatnonzero(coefficients) if m != i]
-        parts = [f"{coefficients[m]:+.3g} {PARAMETERS[m].symbol}" for m in merged]
-        name = " ".join([PARAMETERS[i].symbol, *parts])
-        meaning = PARAMETERS[i].meaning
-        if merged:
-            others = ", ".join(PARAMETERS[m].meaning for m in merged)
-            meaning = f"{meaning} and {others} only together"
-        numbers = float(coefficients @ x), float(np.sqrt(reduced[k, k])), float(dof[k])
-        unit = PARAMETERS[i].unit
-        found.append(Combination(joint, name, meaning, unit, coefficients, *numbers))
-    return found, full
+    reduced, dof = rows.covariance(columns, own)
+    combinations = []
+    for k, i in enumerate(own):
+        coefficients = np.zeros(found.parameters.shape)
+        coefficients[found.free] = kappa[k]
+        name, meaning = PARAMETERS[symbols[i]].symbol, PARAMETERS[symbols[i]].meaning
+        others = []
+        for m in np.flatnonzero(kappa[k]):
+            if m != i:
+                elsewhere = joints[m] != joints[i]
+                where = f" of {joint_names[joints[m]]}" if elsewhere else ""
+                name += f" {kappa[k, m]:+.3g} {PARAMETERS[symbols[m]].symbol}{where}"
+                others.append(PARAMETERS[symbols[m]].meaning + where)
+        if others:
+            meaning = f"{meaning} and {', '.join(others)} only together"
+        numbers = float(kappa[k] @ x), float(np.sqrt(reduced[i, i])), float(dof[i])
+        unit = PARAMETERS[symbols[i]].unit
+        place = int(joints[i]), name, meaning, unit, coefficients
+        combinations.append(Combination(*place, *numbers))
+    return tuple(combinations), covariance
 
 
 def _merge(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -427,5 +475,7 @@ def _merge(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     if own:
         kappa = np.linalg.lstsq(W[:, own], W, rcond=None)[0]
         kappa[:, own] = np.eye(len(own))
-        kappa[np.abs(kappa) < 0.02] = 0.0
+        # What changes a combination by less than its deviation is left out.
+        deviation = np.sqrt(np.diag(np.linalg.inv(W[:, own].T @ W[:, own])))
+        kappa[np.abs(kappa) < np.minimum(0.02, deviation)[:, None]] = 0.0
     return np.array(own, int), kappa

@@ -5,9 +5,8 @@ Positions alone tell torques only in units of the servo's stiffness $K$, which i
 $J \ddot q + B \dot q + (F + \mu |a L| + F_s e^{-(\dot q/v_s)^2})\, \mathrm{sign}\, \dot q
 = \mathrm{sat}(g c(t - d) + b - q) - a L$
 
-with the command $c$ and the load torque $L$ of the bodies. Dry friction is exact: a soft threshold
-in implicit steps, which holds a joint at rest without creep. The steps are of second order
-and L-stable, so that $J \to 0$ is allowed.
+with the command $c$ and the load torque $L$ of the bodies. Dry friction is exact: it holds a joint
+at rest without creep. The steps are of second order and L-stable, so that $J \to 0$ is allowed.
 """
 
 import dataclasses
@@ -21,16 +20,17 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Array, Float, double_precision, on_cores
 
-from .motion import Bodies, ServoMotion
+from .dry_friction import Slip
+from .motion import ServoMotion
 
 GAMMA = 1.0 - math.sqrt(0.5)
 """Fraction of a step that each of its two implicit stages takes."""
-SWEEPS = 15
-"""Largest number of simulations in which loads and positions must agree."""
-AGREED = 1e-4
-"""Change of the positions at which they agree [rad or m]."""
-DEPTH = 6
-"""Simulations from which the next positions are extrapolated (Anderson's method)."""
+
+
+BLOCK = 250
+"""Samples whose derivatives are found at once."""
+TOGETHER = 4
+"""Candidates that are simulated at once."""
 
 
 class ServoParameter(NamedTuple):
@@ -64,11 +64,6 @@ INDEX = {parameter.symbol: k for k, parameter in enumerate(PARAMETERS)}
 START, LOWER, UPPER, SCALE = (
     np.array([getattr(x, key) for x in PARAMETERS]) for key in ("start", "lower", "upper", "scale")
 )
-
-
-def shrink(x: Array, threshold: Array) -> Array:
-    """Return what a force leaves beyond a friction that it must overcome: soft threshold."""
-    return x - jnp.clip(x, -threshold, threshold)
 
 
 def delayed_command(c: AnyArray, t: Array, hold: AnyArray) -> Array:
@@ -116,13 +111,26 @@ class Stages(NamedTuple):
         def alternating(first: float, second: float) -> Array:
             return jnp.tile(jnp.array([first, second]), count * steps)[:, None]
 
-        commands = jnp.repeat(_commands(theta, motion, steps, hold), 2, axis=0)
+        commands = jnp.repeat(commands_of_steps(theta, motion, steps, hold), 2, axis=0)
         share = alternating(1.0 - GAMMA, GAMMA)
         ahead = alternating((1.0 - GAMMA) / GAMMA, 1.0)
         return cls(commands, repeated(motion.load), repeated(motion.inertia), share, ahead)
 
+    @classmethod
+    def with_delay(
+        cls, theta: Array, motion: ServoMotion, steps: int, hold: AnyArray
+    ) -> tuple["Stages", Array]:
+        """Return the stages, and the derivatives of their commands by the delay."""
 
-def _commands(theta: Array, motion: ServoMotion, steps: int, hold: AnyArray) -> Array:
+        def late(delay: Array) -> Array:
+            return commands_of_steps(theta.at[:, INDEX["d"]].set(delay), motion, steps, hold)
+
+        delay = theta[:, INDEX["d"]]
+        by_delay = jax.jvp(late, (delay,), (jnp.ones_like(delay),))[1]
+        return cls.of(theta, motion, steps, hold), jnp.repeat(by_delay, 2, axis=0)
+
+
+def commands_of_steps(theta: Array, motion: ServoMotion, steps: int, hold: AnyArray) -> Array:
     """Return the command of each step, with gain and bias [steps, joints]."""
     delay, bias, gain = (theta[:, INDEX[key]] for key in ("d", "b", "g"))
     instants = jnp.asarray(np.arange((motion.commands.shape[-1] - 1) * steps + 1) / steps)
@@ -134,93 +142,107 @@ def _commands(theta: Array, motion: ServoMotion, steps: int, hold: AnyArray) -> 
     return gain[None] * commands + bias[None]
 
 
-def _equation(q: Array, w: Array, theta: Array, stages: Stages, h: AnyArray):
-    """Return the force on a joint, its dry friction, its resistance, and partial results.
+class Forces(NamedTuple):
+    """Forces on the joints in a stage, over the stiffness.
 
-    Args:
-        q: Positions.
-        w: Velocities with which the stages start.
-        theta: Parameters [parameters, joints].
-        stages: Inputs of the stages.
-        h: Time of a step [s].
+    Attributes:
+        force: Force without friction and inertia.
+        friction: Dry friction.
+        inertia: Inertia over the time of the stage.
+        resistance: Decrease of the force with the velocity in the stage, with inertia.
+        inside: Whether the servo is not saturated.
+        falling: Part of the Stribeck friction that is left.
     """
-    J, B, _, _, a, F, mu, Fs, vs, um, _ = theta
-    load, error, inertia = a * stages.load, stages.commands - q, J + a * stages.inertia
-    inside = jnp.where(jnp.abs(error) < um, 1.0, 0.0)
-    falling = jnp.exp(-((w / vs) ** 2))
-    friction = F + mu * jnp.abs(load) + Fs * falling
-    inertia = inertia / (GAMMA * h)
-    force = inertia * w + jnp.clip(error, -um, um) - load
-    return force, friction, inertia + B + inside * GAMMA * h, (inside, falling, inertia)
+
+    force: Array
+    friction: Array
+    inertia: Array
+    resistance: Array
+    inside: Array
+    falling: Array
+
+    @classmethod
+    def of(cls, q: Array, w: Array, theta: Array, stages: Stages, h: AnyArray) -> "Forces":
+        """Return the forces at positions and velocities before a stage.
+
+        Args:
+            q: Positions.
+            w: Velocities.
+            theta: Parameters [parameters, joints].
+            stages: Inputs of the stages.
+            h: Time of a step [s].
+        """
+        J, B, _, _, a, F, mu, Fs, vs, um, _ = theta
+        load, error = a * stages.load, stages.commands - q
+        inside = jnp.where(jnp.abs(error) < um, 1.0, 0.0)
+        falling = jnp.exp(-((w / vs) ** 2))
+        friction = F + mu * jnp.abs(load) + Fs * falling
+        inertia = (J + a * stages.inertia) / (GAMMA * h)
+        resistance = inertia + B + inside * GAMMA * h
+        return cls(jnp.clip(error, -um, um) - load, friction, inertia, resistance, inside, falling)
+
+    def slip(self, w: Array, stages: Stages, force: Array) -> Slip:
+        """Return how joints slip under a force."""
+        return Slip.of(force, self.inertia, self.friction, self.resistance, w, stages.ahead)
+
+
+def moved(q: Array, w: Array, u: Array, stage: Stages, h: AnyArray) -> tuple[Array, Array]:
+    """Return positions and velocities behind a stage from the velocities in it."""
+    # A joint that has stopped in the first stage starts the second one at rest.
+    after = jnp.where(u == 0.0, 0.0, w + stage.ahead * (u - w))
+    return q + stage.share * h * u, after
 
 
 def _stage(q: Array, w: Array, theta: Array, stage: Stages, h: AnyArray):
     """Return position and velocity behind a stage, and the velocity in it."""
-    force, friction, resistance, _ = _equation(q, w, theta, stage, h)
-    u = shrink(force, friction) / resistance
-    # A joint that has stopped in the first stage starts the second one at rest.
-    after = jnp.where(u == 0.0, 0.0, w + stage.ahead * (u - w))
-    return q + stage.share * h * u, after, u
+    x = Forces.of(q, w, theta, stage, h)
+    slip = x.slip(w, stage, x.force)
+    balance = x.force + x.inertia * w - x.friction * slip.direction
+    u = slip.free * balance / x.resistance
+    return *moved(q, w, u, stage, h), u
 
 
 def _start(motion: ServoMotion) -> tuple[Array, Array]:
-    return jnp.asarray(motion.positions)[:, 0], jnp.asarray(motion.rates)
+    position, velocity = jnp.asarray(motion.start)
+    return position, velocity
 
 
-@functools.partial(jax.jit, static_argnums=(2, 4))
-def _states(
-    theta: Array, motion: ServoMotion, steps: int, hold: AnyArray, all_steps: bool
-) -> tuple[Array, Array]:
-    """Simulate one motion from its first measured positions; return positions and velocities.
+@functools.partial(jax.jit, static_argnums=2)
+def _path(theta: Array, motion: ServoMotion, steps: int, hold: AnyArray) -> tuple[Array]:
+    """Simulate one motion; return its positions.
 
     Args:
         theta: Parameters of each joint, as in `PARAMETERS`.
         motion: One motion: commands, load, initial state.
         steps: Steps in each sample time.
         hold: Whether commands are held until the next one, instead of interpolated.
-        all_steps: Whether all steps are returned, instead of samples.
 
     Returns:
-        Both [samples or steps, joints].
+        Positions [joints, samples].
     """
     h = motion.sample_time / steps
 
     def one(state: tuple[Array, Array], stage: Stages):
         state = _stage(*state, theta.T, stage, h)[:2]
-        return state, state
+        return state, state[0]
 
     start = _start(motion)
     _, path = jax.lax.scan(one, start, Stages.of(theta, motion, steps, hold))
-    size = 2 if all_steps else 2 * steps
-    every = slice(size - 1, None, size)
-    q, v = (jnp.concatenate([x[None], y[every]]) for x, y in zip(start, path, strict=True))
-    return q, v
-
-
-def _path(theta: Array, motion: ServoMotion, steps: int, hold: AnyArray) -> tuple[Array]:
-    return (_states(theta, motion, steps, hold, False)[0],)
-
-
-def _all_steps(theta: Array, motion: ServoMotion, steps: int, hold: AnyArray):
-    return _states(theta, motion, steps, hold, True)
+    return (jnp.concatenate([start[0][None], path[2 * steps - 1 :: 2 * steps]]).T,)
 
 
 @functools.partial(jax.jit, static_argnums=2)
-def _sensitivities(theta: Array, motion: ServoMotion, steps: int, hold: AnyArray):
-    """Return positions [samples, joints], and derivatives [samples, parameters + 1, joints].
+def _moments(theta: Array, motion: ServoMotion, steps: int, hold: AnyArray) -> tuple[Array, ...]:
+    """Return sums of squared errors, half their gradients, and Gauss-Newton matrices.
 
-    The last derivative is that by the initial velocity. Loads are held. Derivatives of all stages
-    are found at once; only their linear recursion runs in time.
+    Loads are held. In blocks, whose numbers stay in the processor's cache, the derivatives of all
+    stages are found at once; only their linear recursion runs in time.
     """
-    h, stages = motion.sample_time / steps, Stages.of(theta, motion, steps, hold)
+    h, n, P = motion.sample_time / steps, len(theta), len(PARAMETERS)
 
     def forward(state: tuple[Array, Array], stage: Stages):
-        q, w, u = _stage(*state, theta.T, stage, h)
-        return (q, w), (q, w, u)
-
-    start = _start(motion)
-    _, (*path, u) = jax.lax.scan(forward, start, stages)
-    q, w = (jnp.concatenate([x[None], y[:-1]]) for x, y in zip(start, path, strict=True))
+        after = _stage(*state, theta.T, stage, h)
+        return after[:2], (*state, after[2])
 
     def tangent(state: tuple[Array, Array], inputs: tuple[Array, ...]):
         q, w = state
@@ -229,60 +251,117 @@ def _sensitivities(theta: Array, motion: ServoMotion, steps: int, hold: AnyArray
             q, w = q + share * h * u, runs * (w + ahead * (u - w))
         return (q, w), q
 
-    def late(delay: Array) -> Array:
-        return _commands(theta.at[:, INDEX["d"]].set(delay), motion, steps, hold)
+    def block(state, inputs):
+        state, tangents, *sums = state
+        stages, by_delay, measured, counted = inputs
+        state, (q, w, u) = jax.lax.scan(forward, state, stages)
+        found = partials(q, w, u, theta, stages, by_delay, h, jnp.zeros_like(u))
+        runs = jnp.where(u == 0.0, 0.0, 1.0)
+        factor = runs / found.resistance
+        rows = factor * found.by_q, factor * found.by_w, stages.share, stages.ahead, runs
+        # One long last axis: `jnp.stack` takes twenty times as long.
+        by_theta = jnp.concatenate([factor * x for x in found.by_theta], axis=-1)
+        rows = tuple(x.reshape(BLOCK, 2 * steps, 1, x.shape[-1]) for x in rows)
+        rows = *rows, by_theta.reshape(BLOCK, 2 * steps, P, n)
+        tangents, S = jax.lax.scan(tangent, tangents, rows)
+        path = jnp.concatenate([q[2 * steps :: 2 * steps], state[0][None]])
+        r, S = (path - measured) * counted, S * counted[:, None]
+        own = (
+            jnp.sum(r**2, axis=0),
+            jnp.einsum("tpj,tj->jp", S, r),
+            jnp.einsum("tpj,tqj->jpq", S, S),
+        )
+        return (state, tangents, *(x + y for x, y in zip(sums, own, strict=True))), None
 
-    delay = theta[:, INDEX["d"]]
-    by_delay = jnp.repeat(jax.jvp(late, (delay,), (jnp.ones_like(delay),))[1], 2, axis=0)
-    by_q, by_w, by_theta = _partials(q, w, u, theta.T[:, None], stages, by_delay, h)
-    runs = jnp.where(u == 0.0, 0.0, 1.0)
-    every_row = (x[:, None] for x in (by_q, by_w, stages.share, stages.ahead, runs))
-    inputs = (*every_row, by_theta)
-    zero = jnp.zeros(by_theta.shape[1:])
-    rows = jax.tree.map(lambda x: x.reshape(-1, 2 * steps, *x.shape[1:]), inputs)
-    _, S = jax.lax.scan(tangent, (zero, zero.at[-1].set(1.0)), rows)
-    path = jnp.concatenate([start[0][None], path[0][2 * steps - 1 :: 2 * steps]])
-    return path, jnp.concatenate([zero[None], S])
+    def blocks(x: Array, size: int, mode: str = "edge") -> Array:
+        padded = jnp.pad(x, ((0, -len(x) % size), (0, 0)), mode)
+        return padded.reshape(-1, size, x.shape[-1])
+
+    stages, by_delay = Stages.with_delay(theta, motion, steps, hold)
+    stages = jax.tree.map(lambda x: blocks(x, 2 * steps * BLOCK), (stages, by_delay))
+    measured = blocks(jnp.asarray(motion.positions).T[1:], BLOCK)
+    counted = blocks(jnp.asarray(motion.counted).T[1:], BLOCK, "constant")
+    zero = jnp.zeros((P, n))
+    sums = jnp.zeros(n), jnp.zeros((n, P)), jnp.zeros((n, P, P))
+    start = _start(motion), (zero, zero), *sums
+    return jax.lax.scan(block, start, (*stages, measured, counted))[0][2:]
 
 
-def _partials(
-    q: Array, w: Array, u: Array, theta: Array, stages: Stages, by_delay: Array, h: AnyArray
-) -> tuple[Array, Array, Array]:
-    """Return derivatives of the velocities in all stages by position, velocity and parameters.
+class Partials(NamedTuple):
+    """Derivatives of the balance of forces in all stages, at fixed velocities in them.
+
+    Attributes:
+        by_q: By the position before the stage [stages, joints].
+        by_w: By the velocity before the stage.
+        by_theta: By each parameter of the joint.
+        by_force: By a further force.
+        by_inertia: By the inertia over the time of the stage.
+        by_load: By the load.
+        resistance: Less the derivative by the velocity in the stage.
+    """
+
+    by_q: Array
+    by_w: Array
+    by_theta: tuple[Array, ...]
+    by_force: Array
+    by_inertia: Array
+    by_load: Array
+    resistance: Array
+
+
+def partials(
+    q: Array,
+    w: Array,
+    u: Array,
+    theta: Array,
+    stages: Stages,
+    by_delay: Array,
+    h: AnyArray,
+    others: Array,
+) -> Partials:
+    """Return derivatives of the balance of forces in stages of one motion.
 
     Args:
-        q: Positions before the stages.
+        q: Positions before the stages [stages, joints].
         w: Velocities before the stages.
         u: Velocities in the stages.
-        theta: Parameters [parameters, 1, joints].
+        theta: Parameters of each joint.
         stages: Inputs of the stages.
         by_delay: Derivatives of the commands by the delay.
         h: Time of a step [s].
+        others: Torques by the accelerations of other joints [stages, joints] [N m or N].
     """
-    _, _, resistance, (inside, falling, inertia) = _equation(q, w, theta, stages, h)
-    _, _, _, b, a, _, mu, Fs, vs, _, g = theta
-    sign, slope = jnp.sign(u), (w - u) / (GAMMA * h)
-    factor = jnp.abs(sign) / resistance
-    weight = stages.load + sign * mu * jnp.abs(stages.load)
-    slowing = 2.0 * sign * Fs * falling * w / vs**2
-    forces = {
-        "J": slope,
-        "B": -u,
-        "d": inside * by_delay,
-        "b": inside,
-        "a": stages.inertia * slope - weight,
-        "F": -sign,
-        "mu": -sign * jnp.abs(a * stages.load),
-        "Fs": -sign * falling,
-        "vs": -slowing * w / vs,
-        "um": (1.0 - inside) * jnp.sign(stages.commands - q),
-        "g": inside * (stages.commands - b) / g,
+    every = theta.T[:, None]
+    x = Forces.of(q, w, every, stages, h)
+    _, _, _, b, a, _, mu, Fs, vs, _, g = every
+    slip = x.slip(w, stages, x.force + a * others)
+    by_inertia, by_friction = slip.by_inertia - u, slip.by_friction
+    by_servo = slip.by_force * x.inside
+    falling = 2.0 * Fs * x.falling * w / vs**2
+    by_load = mu * by_friction * jnp.sign(stages.load) - slip.by_force
+    of_bodies = slip.by_force * others + by_load * stages.load
+    derivatives = {
+        "J": by_inertia / (GAMMA * h),
+        "B": slip.by_resistance - u,
+        "d": by_servo * by_delay,
+        "b": by_servo,
+        "a": of_bodies + by_inertia * stages.inertia / (GAMMA * h),
+        "F": by_friction,
+        "mu": by_friction * jnp.abs(a * stages.load),
+        "Fs": by_friction * x.falling,
+        "vs": by_friction * falling * w / vs,
+        "um": slip.by_force * (1.0 - x.inside) * jnp.sign(stages.commands - q),
+        "g": by_servo * (stages.commands - b) / g,
     }
-    # One column at a time: `jnp.stack` takes twenty times as long.
-    by_theta = jnp.zeros((len(q), len(PARAMETERS) + 1, q.shape[1]))
-    for symbol, k in INDEX.items():
-        by_theta = by_theta.at[:, k].set(factor * forces[symbol])
-    return -factor * inside, factor * (inertia + slowing), by_theta
+    by_theta = tuple(derivatives[x] for x in INDEX)
+    by_w = slip.by_w - by_friction * falling
+    terms = slip.by_force, by_inertia, a * by_load
+    return Partials(-by_servo, by_w, by_theta, *terms, x.resistance)
+
+
+def steps_of(motion: ServoMotion, time_step: float, least: int = 1) -> int:
+    """Return the steps in each sample time, of which the longest is 5 % longer than asked."""
+    return max(least, math.ceil(float(motion.sample_time.max()) / time_step - 0.05))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -304,126 +383,59 @@ class ServoSimulator:
     @property
     def steps(self) -> int:
         """Steps in each sample time."""
-        return math.ceil(float(self.motion.sample_time.max()) / self.time_step - 0.05)
+        return steps_of(self.motion, self.time_step)
 
     def _map(self, function, reduce, theta: AnyArray, *, each: bool = False):
         """Apply a compiled function to all motions and candidates, on all cores.
 
         Args:
-            function: Compiled function of the parameters of all joints and one motion.
-            reduce: Function of the motion's index and the results.
+            function: Compiled function of the parameters of some joints and one motion.
+            reduce: Function of the motion's index and the results, joints first.
             theta: Parameters.
             each: Whether the parameters have the motions first.
         """
         theta = np.asarray(theta)
-        count = theta.shape[-3]
+        count, joints, _ = theta.shape[-3:]
 
-        def one(index: int):
-            k, c = divmod(index, count)
-            own = theta[k, c] if each else theta[c]
+        def one(place: tuple[int, int]):
+            k, first = place
+            own = theta[k] if each else theta
+            # Always as many at once, so that nothing is compiled anew.
+            chosen = np.minimum(np.arange(first, first + TOGETHER), count - 1)
+            part = self.motion.part(k)
+            copies = {
+                key: np.tile(np.asarray(getattr(part, key)), (TOGETHER, 1))
+                for key in ("commands", "positions", "load", "inertia", "counted")
+            }
+            part = dataclasses.replace(
+                part, **copies, start=np.tile(part.start, (1, TOGETHER)), lengths=(), names=()
+            )
             with double_precision():
-                part = dataclasses.replace(self.motion.part(k), lengths=(), names=())
-                found = function(jnp.asarray(own), part, self.steps, np.array(self.hold))
-                return reduce(k, *map(np.asarray, found))
+                rows = jnp.asarray(own[chosen].reshape(TOGETHER * joints, -1))
+                found = function(rows, part, self.steps, np.array(self.hold))
+            used = min(TOGETHER, count - first)
+            shaped = (np.asarray(x).reshape(TOGETHER, joints, *x.shape[1:]) for x in found)
+            return reduce(k, *(x[:used] for x in shaped))
 
+        places = [(k, c) for k in range(self.motion.motions) for c in range(0, count, TOGETHER)]
         # The first call compiles, and the others wait for it.
-        results = [one(0), *on_cores(one, range(1, self.motion.motions * count))]
-        shape = self.motion.motions, count
-        return tuple(np.stack(x).reshape(*shape, *x[0].shape) for x in zip(*results, strict=True))
+        results = [one(places[0]), *on_cores(one, places[1:])]
+        joined = (np.concatenate(x) for x in zip(*results, strict=True))
+        return tuple(x.reshape(self.motion.motions, count, *x.shape[1:]) for x in joined)
 
     def paths(self, theta: AnyArray) -> Float[np.ndarray, "motions candidates joints samples"]:
         """Return the simulated positions."""
-        return self._map(_path, lambda k, q: (q.T,), theta)[0]
-
-    def states(self, theta: AnyArray) -> tuple[np.ndarray, ...]:
-        """Return the positions and velocities of all steps."""
-        return self._map(_all_steps, lambda k, q, v: (q.T, v.T), theta)
-
-    def states_of(self, theta: AnyArray) -> np.ndarray:
-        """Return both for one candidate, stacked."""
-        return np.stack([x[:, 0] for x in self.states(np.asarray(theta)[None])])
+        return self._map(_path, lambda k, q: (q,), theta)[0]
 
     def costs(self, theta: AnyArray, *, each: bool = False) -> np.ndarray:
         """Return sums of squared errors; with `each`, parameters have the motions first, too."""
 
         def reduce(k: int, q: np.ndarray) -> tuple[np.ndarray]:
-            return (np.sum(self._errors(k, q) ** 2, axis=0),)
+            errors = (q - np.asarray(self.motion.positions[k])) * np.asarray(self.motion.counted[k])
+            return (np.sum(errors**2, axis=-1),)
 
         return self._map(_path, reduce, theta, each=each)[0]
 
     def moments(self, theta: AnyArray) -> tuple[np.ndarray, ...]:
         """Return costs, gradients and Gauss-Newton matrices, each halved cost's derivatives."""
-
-        def reduce(k: int, q: np.ndarray, S: np.ndarray) -> tuple[np.ndarray, ...]:
-            r = self._errors(k, q)
-            A = S[:, :-1].transpose(2, 1, 0) * np.asarray(self.motion.counted[k])[:, None]
-            gradient = A @ r.T[..., None]
-            return np.sum(r**2, axis=0), gradient[..., 0], A @ A.swapaxes(-1, -2)
-
-        return self._map(_sensitivities, reduce, theta)
-
-    def _errors(self, k: int, q: np.ndarray) -> np.ndarray:
-        """Return simulated less measured positions of one motion [samples, joints]."""
-        return (q - np.asarray(self.motion.positions[k]).T) * np.asarray(self.motion.counted[k]).T
-
-    def sensitivities(self, theta: AnyArray) -> tuple[np.ndarray, ...]:
-        """Return the simulated positions and their derivatives on the last axis.
-
-        The derivatives are those by the parameters and by the initial velocity.
-        """
-        return self._map(_sensitivities, lambda k, q, S: (q.T, S.transpose(2, 0, 1)), theta)
-
-    def with_better_rates(self, theta: np.ndarray) -> "ServoSimulator":
-        """Return the simulator with initial velocities by a Gauss-Newton step.
-
-        Where the counted samples do not tell them, they stay within about 1 rad/s or m/s.
-        """
-        motion = self.motion
-        y, S = (x[:, 0] for x in self.sensitivities(theta[None]))
-        r = (y - np.asarray(motion.positions)) * np.asarray(motion.counted)
-        s = S[..., -1] * np.asarray(motion.counted)
-        variance = np.sum(r**2, axis=-1) / np.maximum(np.asarray(motion.counted).sum(axis=-1), 1.0)
-        change = np.sum(s * r, axis=-1) / (np.sum(s**2, axis=-1) + variance + 1e-12)
-        other = dataclasses.replace(self, motion=motion.replace(rates=motion.rates - change))
-        better = other.costs(theta[None])[:, 0] < np.sum(r**2, axis=-1)
-        rates = np.where(better, other.motion.rates, motion.rates)
-        return dataclasses.replace(self, motion=motion.replace(rates=rates))
-
-
-def coupled_states(
-    simulator: ServoSimulator,
-    bodies: Bodies,
-    theta: AnyArray,
-    states: np.ndarray,
-    sweeps: int = SWEEPS,
-) -> np.ndarray:
-    """Return positions and velocities of all steps under the loads of this motion itself.
-
-    Args:
-        simulator: Motions and steps.
-        bodies: Bodies that load the joints.
-        theta: Parameters [joints, parameters].
-        states: Positions and velocities from which the iteration starts.
-        sweeps: Largest number of simulations.
-    """
-    tried: list[np.ndarray] = []
-    found: list[np.ndarray] = []
-    for _ in range(sweeps):
-        tried.append(states)
-        loaded = dataclasses.replace(simulator, motion=bodies.loads(simulator.motion, *states))
-        found.append(loaded.states_of(theta))
-        if np.abs(found[-1] - states)[0].max() < AGREED:
-            break
-        states = _extrapolated(tried[-DEPTH:], found[-DEPTH:])
-    return found[-1]
-
-
-def _extrapolated(tried: list[np.ndarray], found: list[np.ndarray]) -> np.ndarray:
-    """Return where a fixed-point iteration leads, by Anderson's method."""
-    errors = [(y - x)[0].ravel() for x, y in zip(tried, found, strict=True)]
-    if len(errors) == 1:
-        return found[0]
-    steps = np.stack([e - errors[-1] for e in errors[:-1]], axis=1)
-    weights = np.linalg.lstsq(steps, -errors[-1], rcond=1e-10)[0]
-    changes = (w * (y - found[-1]) for w, y in zip(weights, found[:-1], strict=True))
-    return found[-1] + np.sum(list(changes), axis=0)
+        return self._map(_moments, lambda _, *found: found, theta)

@@ -16,10 +16,10 @@ XML = """<mujoco><compiler angle="radian"/>
 <worldbody><body name="turn">
 <inertial pos="0 0 0" mass="1" diaginertia="0.002 0.002 0.002"/>
 <joint name="turn" axis="0 0 1" armature="{I[0]}" damping="{D[0]}" frictionloss="{F[0]}"
- solreffriction="0.004 1" solimpfriction="0.99 0.9999 0.001"/>
+ solreffriction="{soft} 1" solimpfriction="0.99 0.9999 0.001"/>
 <body name="lift"><inertial pos="{c} 0 0" mass="{m}" diaginertia="0.001 0.001 0.001"/>
 <joint name="lift" axis="0 1 0" armature="{I[1]}" damping="{D[1]}" frictionloss="{F[1]}"
- solreffriction="0.004 1" solimpfriction="0.99 0.9999 0.001"/>
+ solreffriction="{soft} 1" solimpfriction="0.99 0.9999 0.001"/>
 </body></body></worldbody><actuator>
 <position name="turn" joint="turn" kp="{K[0]}"/><position name="lift" joint="lift" kp="{K[1]}"/>
 </actuator></mujoco>"""
@@ -28,7 +28,10 @@ XML = """<mujoco><compiler angle="radian"/>
 def model_text(stiffer=1.0, step=0.001, friction=FRICTION):
     """Return the arm as MJCF."""
     gains = tuple(stiffer * k for k in KP)
-    return XML.format(step=step, I=ARMATURE, D=DAMPING, F=friction, K=gains, c=CENTRE, m=MASS)
+    soft = 2.0 * step
+    return XML.format(
+        step=step, soft=soft, I=ARMATURE, D=DAMPING, F=friction, K=gains, c=CENTRE, m=MASS
+    )
 
 
 def bodies(coupled=True):
@@ -62,7 +65,15 @@ def commands(seed, duration=40.0, rate=50.0):
     return envelope * q
 
 
-def log(seed=0, stiffer=1.0, duration=40.0, step=0.001, friction=FRICTION, block=None):
+def log(
+    seed=0,
+    stiffer=1.0,
+    duration=40.0,
+    step=0.001,
+    friction=FRICTION,
+    block=None,
+    rounding=ENCODER,
+):
     """Return a log of 50 Hz; commands are held until the next one and reach the servo late."""
     model = mujoco.MjModel.from_xml_string(model_text(stiffer, step, friction))
     data, sent = mujoco.MjData(model), commands(seed, duration)
@@ -76,5 +87,5 @@ def log(seed=0, stiffer=1.0, duration=40.0, step=0.001, friction=FRICTION, block
             # A stiff one-sided spring stands in for a table.
             data.qfrc_applied[1] = min(0.0, 400.0 * (block - data.qpos[1]))
         mujoco.mj_step(model, data)
-    measured = ENCODER * np.round(measured / ENCODER)
+    measured = rounding * np.round(measured / rounding)
     return jid.Recording.of(measured, sent, sample_time=0.02, name=f"motion {seed}")

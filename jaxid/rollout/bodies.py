@@ -1,0 +1,124 @@
+"""Bodies that load the joints of a robot: as loads of a known motion, and in scalar programs."""
+
+import dataclasses
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxid.arrays import AnyArray, Array, Float
+from jaxid.dynamics.dispatch import in_numpy, solve_symmetric
+from jaxid.dynamics.model import Model
+from jaxid.program import Program, trace
+from jaxid.program.trace import FREE
+
+from .dry_friction import Slip
+from .motion import ServoMotion
+
+
+class Programs(NamedTuple):
+    """Scalar programs of bodies that are simulated.
+
+    Attributes:
+        bodies: Mass matrix and bias forces from positions and velocities.
+        derivatives: Both with their derivatives: of matrix and forces by positions, of the forces
+            by velocities.
+        solve: Velocities in a stage, as in `stage_velocities`.
+    """
+
+    bodies: Program
+    derivatives: Program
+    solve: Program
+
+
+@dataclasses.dataclass(frozen=True)
+class Bodies:
+    """Bodies that load the joints: a model with its parameters, often from a URDF file.
+
+    Attributes:
+        model: Model of the robot.
+        parameters: Standard parameters.
+        coupled: Whether inertial torques count, beside those of gravity.
+    """
+
+    model: Model
+    parameters: Float[AnyArray, " standard"]
+    coupled: bool = False
+
+    def matrix_and_bias(self, q: Array, v: Array) -> tuple[AnyArray, AnyArray]:
+        """Return mass matrix and bias forces; without coupling, no matrix and gravity alone."""
+        model, p, rest = self.model, np.asarray(self.parameters), jnp.zeros_like(q)
+        if self.coupled:
+            return model.inertia(p, q), model.bias(p, q, v)
+        return jnp.zeros((len(q), len(q))), model.forces(p, q, rest, rest)
+
+    @functools.cached_property
+    def programs(self) -> Programs:
+        """Programs of a simulation of these bodies."""
+        n = self.model.robot.joints
+
+        def derived(q, v):
+            by_q = jax.jacfwd(self.matrix_and_bias)(q, v)
+            return *by_q, jax.jacfwd(lambda v: self.matrix_and_bias(q, v)[1])(v)
+
+        bodies, derivatives = (trace(f, (n,), (n,)) for f in (self.matrix_and_bias, derived))
+        matrix = np.full(bodies.nonzeros[0].shape, FREE)
+        matrix[~bodies.nonzeros[0]] = 0.0
+        solve = trace(stage_velocities, matrix, *[(n,)] * 6, (), *[(n,)] * 2)
+        return Programs(bodies, derivatives, solve)
+
+    def loads(self, motion: ServoMotion) -> ServoMotion:
+        """Return the motions with the loads between two samples of the measured positions."""
+        q = np.asarray(motion.positions)
+        load, inertia = np.zeros_like(q), np.zeros_like(q)
+        model, p = self.model, np.asarray(self.parameters)
+        for k, dt in enumerate(map(float, motion.sample_time)):
+            path, qd, qdd = (0.5 * (x[1:] + x[:-1]) for x in smooth_rates(q[k].T, dt))
+            if self.coupled:
+                M = in_numpy(model, model.inertia, path, shared=(p,))
+                own = np.diagonal(M, axis1=1, axis2=2)
+                forces = in_numpy(model, model.forces, path, qd, qdd, shared=(p,)) - own * qdd
+                inertia[k, :, :-1] = own.T
+            else:
+                forces = in_numpy(model, model.forces, path, 0 * qd, 0 * qd, shared=(p,))
+            load[k, :, :-1] = forces.T
+        return motion.replace(load=load, inertia=inertia)
+
+
+def stage_velocities(
+    M, force, inertia, friction, resistance, scale, w, ahead, free, direction
+) -> tuple[Array, Array, Array]:
+    """Return velocities in a stage, and how the joints slip at these velocities.
+
+    Args:
+        M: Mass matrix over the time of the stage, rows and columns times `scale`.
+        force: Forces on the joints over the stiffness.
+        inertia: Inertia of each joint without the bodies.
+        friction: Dry friction.
+        resistance: Resistance of each joint without the bodies.
+        scale: Root of the inverse stiffness.
+        w: Velocities before the stage.
+        ahead: Change of the velocity behind the stage over that in it.
+        free: 1 for joints that move, 0 for those that friction holds.
+        direction: Mean direction of the joints that move.
+    """
+    moved = M @ (w / scale)
+    A = M * jnp.outer(free, free) + jnp.diag(resistance * free + 1.0 - free)
+    balance = (force + inertia * w - friction * direction) / scale + moved
+    u = scale * solve_symmetric(A, free * balance)
+    own = jnp.stack([M[j, j] for j in range(len(force))])
+    others = scale * (moved - M @ (u / scale)) - own * (w - u)
+    slip = Slip.of(force + others, inertia + own, friction, resistance + own, w, ahead)
+    return u, slip.free, slip.direction
+
+
+def smooth_rates(q: np.ndarray, dt: float, cutoff: float = 8.0) -> tuple[np.ndarray, ...]:
+    """Return positions below a frequency [Hz] with their first and second derivatives."""
+    from scipy.signal import butter, sosfiltfilt
+
+    if cutoff < 0.4 / dt:
+        q = sosfiltfilt(butter(2, 2.0 * cutoff * dt, output="sos"), q, axis=0)
+    qd = np.gradient(q, dt, axis=0)
+    return q, qd, np.gradient(qd, dt, axis=0)

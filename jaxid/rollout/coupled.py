@@ -1,0 +1,334 @@
+"""Joints that load each other: one simulation of all, and its exact sensitivities.
+
+In each step the bodies have the mass matrix and the bias forces of its predicted middle, and the
+servos take two implicit stages. Velocities are solved for until they agree with the joints that dry
+friction holds, or whose direction it changes.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxid.arrays import AnyArray, Array, Bool, Float, double_precision, on_cores
+from jaxid.program import evaluate
+from jaxid.program.xla import lower
+
+from .bodies import Bodies, Programs
+from .motion import ServoMotion
+from .servo import (
+    GAMMA,
+    INDEX,
+    Forces,
+    Partials,
+    Stages,
+    commands_of_steps,
+    moved,
+    partials,
+    steps_of,
+)
+
+ATTEMPTS = 15
+"""Largest number of solutions in a stage."""
+AGREED = 1e-9
+"""Change of the mean direction of a joint at which velocities and friction agree."""
+LEAST = 1e-9
+"""Least inverse stiffness by which equations are scaled [rad/(N m) or m/N]."""
+FADED = 1e-30
+"""Derivatives that count as zero: denormal numbers would be slow."""
+BLOCK = 1024
+"""Samples whose derivatives are found at once, so that they stay in the processor's cache."""
+
+
+class Path(NamedTuple):
+    """Simulation of several motions; the last axis is that of the motions.
+
+    Attributes:
+        before: Positions before each stage [steps, stages, joints, motions].
+        velocity: Velocities before each stage.
+        within: Velocities in the stages, zero where friction holds a joint.
+        positions: Positions behind each step [steps, joints, motions].
+    """
+
+    before: AnyArray
+    velocity: AnyArray
+    within: AnyArray
+    positions: AnyArray
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _simulate(
+    programs: Programs | None, steps: int, theta: Array, motion: ServoMotion, hold: AnyArray
+) -> Path:
+    """Simulate all motions from their initial states."""
+    h = jnp.asarray(motion.sample_time)[None] / steps
+    share, ahead = jnp.array([1.0 - GAMMA, GAMMA]), jnp.array([(1.0 - GAMMA) / GAMMA, 1.0])
+
+    def step(state: tuple[Array, ...], command: Array):
+        q, w, last = state
+        M, load = None, jnp.zeros_like(q)
+        if programs is not None:
+            M, load = lower(programs.bodies).dense(*middle_of(q, w, last, h))
+
+        def stage(state: tuple[Array, Array], shares: tuple[Array, Array]):
+            inputs = Stages(command, load, jnp.zeros_like(load), *shares)
+            u = _within(programs, *state, theta.T[:, :, None], inputs, M, h)
+            return moved(*state, u, inputs, h), (*state, u)
+
+        (q, after), stages = jax.lax.scan(stage, (q, w), (share, ahead))
+        return (q, after, w), (*stages, q)
+
+    q, v = jnp.moveaxis(jnp.asarray(motion.start), 0, -1)
+    commands = jax.vmap(lambda x: commands_of_steps(theta, x, steps, hold), out_axes=-1)(motion)
+    return Path(*jax.lax.scan(step, (q, v, v), commands)[1])
+
+
+def middle_of(q: Any, v: Any, last: Any, h: Any) -> tuple[Any, Any]:
+    """Return predicted position and velocity in the middle of a step.
+
+    Args:
+        q: Position before the step.
+        v: Velocity before it.
+        last: Velocity before the last step.
+        h: Time of a step [s].
+    """
+    return q + 0.5 * h * v, 1.5 * v - 0.5 * last
+
+
+def _within(
+    programs: Programs | None,
+    q: Array,
+    w: Array,
+    theta: Array,
+    stage: Stages,
+    M: Array | None,
+    h: AnyArray,
+) -> Array:
+    """Return the velocities in a stage [joints, motions]."""
+    x = Forces.of(q, w, theta, stage, h)
+    if programs is None or M is None:
+        slip = x.slip(w, stage, x.force)
+        return slip.free * (x.force + x.inertia * w - x.friction * slip.direction) / x.resistance
+    scale = jnp.sqrt(jnp.maximum(theta[INDEX["a"]], LEAST)) + jnp.zeros_like(w)
+    M = M * (scale[:, None] * scale[None]) / (GAMMA * h[None])
+    terms = x.force, x.inertia, x.friction, x.resistance, scale, w, stage.ahead
+    solve = lower(programs.solve)
+
+    def improve(state: tuple[Any, ...]) -> tuple[Any, ...]:
+        _, free, direction, *_, count = state
+        return *solve.dense(M, *terms, free, direction), free, direction, count + 1
+
+    def differs(state: tuple[Any, ...]) -> Array:
+        _, free, direction, free_before, direction_before, count = state
+        change = free * jnp.abs(direction - direction_before)
+        differ = jnp.any((free != free_before) | (change > AGREED))
+        return (count == 0) | differ & (count < ATTEMPTS)
+
+    slip = x.slip(w, stage, x.force)
+    start: tuple[Any, ...] = w, slip.free, slip.direction, slip.free, slip.direction, 0
+    return jax.lax.while_loop(differs, improve, start)[0]
+
+
+@functools.partial(jax.jit, static_argnums=5)
+def _partials(
+    theta: Array, motion: ServoMotion, hold: AnyArray, path: Path, others: Array, steps: int
+) -> Partials:
+    """Return the derivatives of the balance of forces in all stages of one motion [stages, ...]."""
+    q, w, u, others = (jnp.reshape(x, (-1, len(theta))) for x in (*path[:3], others))
+    stages, by_delay = Stages.with_delay(theta, motion, steps, hold)
+    return partials(q, w, u, theta, stages, by_delay, motion.sample_time / steps, others)
+
+
+class _BodyTerms(NamedTuple):
+    """Terms of the bodies in the middle of steps, and their derivatives; the steps come first.
+
+    Attributes:
+        M: Mass matrix.
+        M_by_q: Derivatives of the mass matrix by the positions, on the last axis.
+        load_by_q: Derivatives of the bias forces by the positions.
+        load_by_v: Derivatives of the bias forces by the velocities.
+    """
+
+    M: np.ndarray
+    M_by_q: np.ndarray
+    load_by_q: np.ndarray
+    load_by_v: np.ndarray
+
+
+@dataclasses.dataclass(frozen=True)
+class CoupledSimulator:
+    """Motions of all joints of a robot together.
+
+    Attributes:
+        motion: Motions.
+        time_step: Longest step, 5 % more if that makes them fewer [s].
+        hold: Whether commands are held until the next one, instead of interpolated.
+        bodies: Bodies that load the joints; None without.
+    """
+
+    motion: ServoMotion
+    time_step: float
+    hold: bool
+    bodies: Bodies | None
+
+    @property
+    def steps(self) -> int:
+        """Steps in each sample time: at least two, which tell held commands from others."""
+        return steps_of(self.motion, self.time_step, 2)
+
+    def simulate(self, theta: Float[AnyArray, "joints parameters"]) -> Path:
+        """Simulate the motions from their initial states."""
+        motion = self.motion.replace(lengths=(), names=())
+        programs = None if self.bodies is None else self.bodies.programs
+        with double_precision():
+            found = _simulate(programs, self.steps, jnp.asarray(theta), motion, np.array(self.hold))
+            return Path(*map(np.asarray, found))
+
+    def positions(self, path: Path) -> Float[np.ndarray, "motions joints samples"]:
+        """Return the positions of all samples."""
+        first = np.asarray(self.motion.start)[:, 0, :, None]
+        behind = path.positions[self.steps - 1 :: self.steps]
+        return np.concatenate([first, behind.transpose(2, 1, 0)], axis=-1)
+
+    def sensitivities(
+        self, theta: np.ndarray, path: Path, free: Bool[np.ndarray, "joints parameters"]
+    ) -> Float[np.ndarray, "motions joints samples unknowns"]:
+        """Return derivatives of the positions.
+
+        They are those by the free parameters, joint by joint, and then by the motion's initial
+        positions and velocities.
+        """
+        motions, n, samples = self.motion.motions, len(theta), self.motion.positions.shape[-1]
+        found = [self._transitions(k, np.asarray(theta), path, free) for k in range(motions)]
+        state = np.zeros((motions, 3 * n, free.sum() + 2 * n))
+        state[:, :n, -2 * n : -n] = state[:, n : 2 * n, -n:] = state[:, 2 * n :, -n:] = np.eye(n)
+        S = np.zeros((motions, n, samples, state.shape[-1]))
+        S[:, :, 0] = state[:, :n]
+        blocks = [slice(k, min(k + BLOCK, samples - 1)) for k in range(0, samples - 1, BLOCK)]
+        places = ((k, rows) for rows in blocks for k in range(motions))
+        parts = on_cores(lambda place: found[place[0]](place[1]), places, ahead=2 * motions)
+        for rows in blocks:
+            own = [next(parts) for _ in range(motions)]
+            T, C = (np.stack(x, axis=1) for x in zip(*own, strict=True))
+            for k in range(rows.stop - rows.start):
+                state = T[k] @ state
+                state[..., : -2 * n] += C[k]
+                state *= np.abs(state) > FADED
+                S[:, :, rows.start + k + 1] = state[:, :n]
+        return S
+
+    def _transitions(
+        self, motion: int, theta: np.ndarray, path: Path, free: np.ndarray
+    ) -> Callable[[slice], tuple[np.ndarray, np.ndarray]]:
+        """Return a function of some samples: derivatives of the state behind each sample time.
+
+        By the state before (positions, velocities, velocities a step before), and by the free
+        parameters.
+        """
+        part, own = self.motion.part(motion), Path(*(x[..., motion] for x in path))
+        part = dataclasses.replace(part, lengths=(), names=())
+        steps, h = self.steps, float(part.sample_time) / self.steps
+        slope = (own.velocity - own.within) / (GAMMA * h)
+        M, load, middle = self._body_terms(own, h)
+        inertia = np.diagonal(M, axis1=1, axis2=2)
+        others = np.einsum("tij,tsj->tsi", M, slope) - inertia[:, None] * slope
+        known = (np.concatenate([x, x[-1:]]).T for x in (load, inertia))
+        part = part.replace(**dict(zip(("load", "inertia"), known, strict=True)))
+        with double_precision():
+            found = _partials(theta, part, np.array(self.hold), own, others, steps)
+
+        def by_sample(x) -> np.ndarray:
+            return np.asarray(x).reshape(-1, steps, *np.shape(x)[1:])
+
+        local = jax.tree.map(lambda x: by_sample(x).reshape(-1, steps, 2, x.shape[-1]), found)
+        within, slope = by_sample(own.within), by_sample(slope)
+
+        def one(rows: slice):
+            some = jax.tree.map(lambda x: x[rows], local)
+            terms = None
+            if self.bodies is not None:
+                inside = [x[rows.start * steps : rows.stop * steps].T for x in middle]
+                derivatives = evaluate(self.bodies.programs.derivatives, *inside)
+                derivatives = (by_sample(np.moveaxis(x, -1, 0)) for x in derivatives)
+                terms = _BodyTerms(by_sample(M)[rows], *derivatives)
+            return _compose(theta, some, within[rows], slope[rows], terms, free, h)
+
+        return one
+
+    def _body_terms(self, path: Path, h: float):
+        """Return mass matrices and bias forces of all steps of a motion, and where they count."""
+        v = path.velocity[:, 0]
+        middle = middle_of(path.before[:, 0], v, np.concatenate([v[:1], v[:-1]]), h)
+        if self.bodies is None:
+            return np.zeros((*v.shape, v.shape[1])), np.zeros_like(v), middle
+        terms = evaluate(self.bodies.programs.bodies, *(x.T for x in middle))
+        return *(np.moveaxis(x, -1, 0) for x in terms), middle
+
+
+def _compose(
+    theta: np.ndarray,
+    local: Partials,
+    within: np.ndarray,
+    slope: np.ndarray,
+    terms: _BodyTerms | None,
+    free: np.ndarray,
+    h: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return derivatives of the states behind sample times by those before, and by parameters.
+
+    Args:
+        theta: Parameters.
+        local: Derivatives of the forces in the stages [samples, steps, stages, ...].
+        within: Velocities in the stages [samples, steps, stages, joints].
+        slope: Velocities before less those in the stages, over the time of a stage.
+        terms: Terms of the bodies [samples, steps, ...].
+        free: Free parameters.
+        h: Time of a step [s].
+    """
+    count, steps, _, n = within.shape
+    joint, symbol = np.nonzero(free)
+    columns = 3 * n + np.arange(len(joint))
+    q, w, last = np.zeros((3, count, n, 3 * n + len(joint)))
+    for k, x in enumerate((q, w, last)):
+        x[:, range(n), range(k * n, (k + 1) * n)] = 1.0
+    middle = q, w
+    for k, s in np.ndindex(steps, 2):
+        if s == 0:
+            middle, last = middle_of(q, w, last, h), w
+        at = jax.tree.map(lambda x, k=k, s=s: x[:, k, s], local)
+        moves = (within[:, k, s] != 0.0)[..., None]
+        force = at.by_q[..., None] * q + at.by_w[..., None] * w
+        force[:, joint, columns] += np.stack(at.by_theta, axis=1)[:, symbol, joint]
+        A = at.resistance[..., None] * np.eye(n)
+        if terms is not None:
+            at_step = _BodyTerms(*(x[:, k] for x in terms))
+            by_q, by_v, by_w = _derivatives_of_bodies(theta, at, at_step, slope[:, k, s], h)
+            A += by_w * (moves & moves.swapaxes(1, 2))
+            force += by_w @ w + by_q @ middle[0] + by_v @ middle[1]
+        change = np.linalg.solve(A, force * moves)
+        share, ahead = ((1.0 - GAMMA, (1.0 - GAMMA) / GAMMA), (GAMMA, 1.0))[s]
+        q = q + share * h * change
+        w = (w + ahead * (change - w)) * moves
+    state = np.concatenate([q, w, last], axis=1)
+    return state[..., : 3 * n], state[..., 3 * n :]
+
+
+def _derivatives_of_bodies(
+    theta: np.ndarray, at: Partials, terms: _BodyTerms, slope: np.ndarray, h: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return derivatives of the balance of forces by other joints [samples, joints, joints].
+
+    By positions and velocities in the middle of the step, and by velocities before the stage, less
+    those by velocities in it.
+    """
+    a, diagonal = theta[:, INDEX["a"], None], np.eye(len(theta), dtype=bool)
+    by_force, by_load = (np.asarray(x)[..., None] for x in (at.by_force, at.by_load))
+    by_inertia = np.asarray(at.by_inertia)[..., None] / (GAMMA * h)
+    by_matrix = a * np.where(diagonal, by_inertia, by_force * slope[:, None])
+    by_q = np.einsum("tijl,tij->til", terms.M_by_q, by_matrix) + by_load * terms.load_by_q
+    by_w = a * by_force * terms.M * ~diagonal / (GAMMA * h)
+    return by_q, by_load * terms.load_by_v, by_w
