@@ -16,8 +16,8 @@ from jaxid.rollout.servo import INDEX, START
 from .simulators import mjcf_text
 from .torque_program import body_parameters
 
-STICKING = {"solreffriction": "0.004 1", "solimpfriction": "0.99 0.9999 0.001"}
-"""Settings with which MuJoCo's dry friction holds a joint almost without creep."""
+STICKING = "0.99 0.9999 0.001"
+"""Impedance with which MuJoCo's dry friction holds a joint almost without creep."""
 
 
 def servo_stiffness(
@@ -165,8 +165,9 @@ def servo_mjcf(fit: ServoFit, values: dict[str, Any], timestep: float) -> str:
     root.find("option").set("integrator", "implicitfast")
     actuators = root.find("actuator")
     for joint in root.iter("joint"):
-        for key, value in STICKING.items():
-            joint.set(key, value)
+        # MuJoCo takes no stiffer friction than that of two time steps.
+        joint.set("solreffriction", f"{2.0 * timestep!r} 1")
+        joint.set("solimpfriction", STICKING)
     for k, motor in enumerate(list(actuators)):
         name, K, limit = fit.joint_names[k], values["stiffness"][k], values["effort_limit"][k]
         actuators.remove(motor)

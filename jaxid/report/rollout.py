@@ -195,6 +195,7 @@ def _record(report: RolloutReport, rows: list[dict[str, Any]]) -> dict[str, Any]
             "combinations": rows,
             "symbols": [x.symbol for x in PARAMETERS],
             "parameters": fit.parameters,
+            "free": fit.free,
             "covariance": fit.covariance,
             "hold": fit.hold,
             "errors": {
