@@ -249,6 +249,23 @@ def test_stiffness_and_delay_of_a_slow_ramp_are_merged():
     assert low < truth < high
 
 
+def test_fast_logs_have_whole_steps():
+    sent = np.sin(np.linspace(0.0, 3.0, 4000))[:, None]
+    motion = ServoMotion.of([jid.Recording.of(sent, sent, sample_time=0.0005)])
+    assert ServoSimulator(motion, 0.01).steps == 1
+    assert CoupledSimulator(motion, 0.01, True, None).steps == 2
+
+
+def test_commands_of_the_wrong_sign_are_named():
+    t = 0.02 * np.arange(600)
+    sent = 0.3 * np.sin(2.0 * t) + 0.1 * np.sin(7.0 * t)
+    simulator, x = _one_joint(sent, J=4e-3, B=0.08, F=0.01)
+    path = -simulator.paths(x)[0, 0, 0][: len(sent)]
+    log = jid.Recording.of(path[:, None], sent[:, None], sample_time=0.02)
+    found = jid.identify_rollout(log, friction=False, saturation=False)
+    assert any("check signs" in note for note in found.notes)
+
+
 def test_logs_that_cannot_be_used_are_rejected():
     still = jid.Recording.of(np.zeros((200, 1)), np.zeros((200, 1)), sample_time=0.02)
     with pytest.raises(jid.InputError, match="`logs`"):
