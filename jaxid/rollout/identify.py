@@ -111,10 +111,15 @@ def identify_rollout(
 
 
 def _divided(logs: Sequence[Recording]) -> list[Recording]:
-    """Return logs, the long ones divided so that there are enough parts for the choice."""
-    found = []
+    """Return logs, the long ones divided.
+
+    There are enough parts for the choice, and none is much longer than the others, to whose length
+    all are padded.
+    """
+    usual, found = max(float(np.median([x.duration for x in logs])), FOLDS * SHORTEST), []
     for log in logs:
-        parts = max(1, min(-(-FOLDS // len(logs)), int(log.duration // SHORTEST)))
+        wanted = max(-(-FOLDS // len(logs)), round(log.duration / usual))
+        parts = max(1, min(wanted, int(log.duration // SHORTEST)))
         ends = np.linspace(float(log.time[0]), float(log.time[-1]) + log.sample_time, parts + 1)
         found += [log.crop(float(a), float(b)) for a, b in itertools.pairwise(ends)]
     return found
