@@ -92,6 +92,9 @@ def simulator_table(fit: ServoFit, stiffness: Numbers | None = None) -> Table:
     """
     values = simulator_values(fit, stiffness)
     units = ("N m/rad", "N m s/rad", "kg m²", "N m", "N m", "s", "rad")
+    if fit.bodies is not None and not all(fit.bodies.model.robot.revolute):
+        linear = ("N/m", "N s/m", "kg", "N", "N", "s", "m")
+        units = [a if a == b else f"{a} or {b}" for a, b in zip(units, linear, strict=True)]
     columns = [
         Column(name.replace("_", " "), value, unit)
         for (name, value), unit in zip(values.items(), units, strict=True)

@@ -41,7 +41,7 @@ LEAST = 1e-9
 FADED = 1e-30
 """Derivatives that count as zero: denormal numbers would be slow."""
 BLOCK = 1024
-"""Samples whose derivatives are found at once, so that they stay in the processor's cache."""
+"""Samples whose derivatives are found at once: fewer cost time, more leave the cache."""
 
 
 class Path(NamedTuple):
