@@ -15,7 +15,7 @@ from jaxid.program import Program, trace
 from jaxid.program.trace import FREE
 
 from .dry_friction import Slip
-from .motion import ServoMotion
+from .motion import ServoMotion, smooth_rates
 
 
 class Programs(NamedTuple):
@@ -112,13 +112,3 @@ def stage_velocities(
     others = scale * (moved - M @ (u / scale)) - own * (w - u)
     slip = Slip.of(force + others, inertia + own, friction, resistance + own, w, ahead)
     return u, slip.free, slip.direction
-
-
-def smooth_rates(q: np.ndarray, dt: float, cutoff: float = 8.0) -> tuple[np.ndarray, ...]:
-    """Return positions below a frequency [Hz] with their first and second derivatives."""
-    from scipy.signal import butter, sosfiltfilt
-
-    if cutoff < 0.4 / dt:
-        q = sosfiltfilt(butter(2, 2.0 * cutoff * dt, output="sos"), q, axis=0)
-    qd = np.gradient(q, dt, axis=0)
-    return q, qd, np.gradient(qd, dt, axis=0)

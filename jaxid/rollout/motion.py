@@ -116,7 +116,10 @@ class ServoMotion(eqx.Module):
         return dataclasses.replace(self, **fields)
 
     def windows(self, horizon: float) -> "ServoMotion":
-        """Return consecutive windows of a length [s] as motions of their own."""
+        """Return consecutive windows of a length [s] as motions of their own.
+
+        Their velocities begin with those of the smoothed positions.
+        """
         size = max(3, round(horizon / float(self.sample_time.mean())))
         places = [(k, a) for k, n in enumerate(self.lengths) for a in range(0, n - size + 1, size)]
         index = np.array([k for k, _ in places])
@@ -127,8 +130,11 @@ class ServoMotion(eqx.Module):
         channels = ("commands", "positions", "load", "inertia", "counted")
         arrays = {key: cut(getattr(self, key)) for key in channels}
         q, dt = arrays["positions"], np.asarray(self.sample_time)[index]
-        early = min(2, size - 1)
-        rates = (q[..., early] - q[..., 0]) / (early * dt[:, None])
+        smooth = [
+            smooth_rates(np.asarray(self.positions[k])[:, :n].T, float(self.sample_time[k]))[1]
+            for k, n in enumerate(self.lengths)
+        ]
+        rates = np.array([smooth[k][a] for k, a in places])
         names = tuple(self.names[k] for k in index)
         lengths = (size,) * len(index)
         start = np.stack([q[..., 0], rates], axis=1)
@@ -142,3 +148,13 @@ class ServoMotion(eqx.Module):
 def settling(motion: ServoMotion) -> np.ndarray:
     """Return the number of first samples of each motion that do not count."""
     return np.ceil(SETTLING / np.asarray(motion.sample_time)).astype(int)
+
+
+def smooth_rates(q: np.ndarray, dt: float, cutoff: float = 8.0) -> tuple[np.ndarray, ...]:
+    """Return positions below a frequency [Hz] with their first and second derivatives."""
+    from scipy.signal import butter, sosfiltfilt
+
+    if cutoff < 0.4 / dt:
+        q = sosfiltfilt(butter(2, 2.0 * cutoff * dt, output="sos"), q, axis=0)
+    qd = np.gradient(q, dt, axis=0)
+    return q, qd, np.gradient(qd, dt, axis=0)

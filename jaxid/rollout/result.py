@@ -169,12 +169,11 @@ class ServoFit:
             return said
         return f"{said}; if held, delays are half a sample time shorter: the logs do not tell"
 
-    @property
-    def _lengths(self) -> list[str]:
-        """Unit of the positions of each joint."""
-        if self.bodies is None:
-            return ["rad"] * len(self.joint_names)
-        return ["rad" if turns else "m" for turns in self.bodies.model.robot.revolute]
+    def _unit(self, c: Combination) -> str:
+        """Return the unit of a parameter of a revolute or linear joint."""
+        if self.bodies is None or self.bodies.model.robot.revolute[c.joint]:
+            return c.unit.replace("u", "rad")
+        return c.unit.replace("u", "m").replace("(N m)", "N")
 
     def of_parameter(self, symbol: str) -> Float[np.ndarray, " joints"]:
         """Return a parameter of all joints by its symbol, like `"J"`."""
@@ -300,7 +299,7 @@ class ServoFit:
             Column("meaning", [c.meaning for c in rows]),
             Column("estimate", values, kind="number"),
             Column("±", deviations, kind="number"),
-            Column("unit", [c.unit.replace("u", self._lengths[c.joint]) for c in rows]),
+            Column("unit", [self._unit(c) for c in rows]),
             Column("95 %\nfrom", low, kind="number"),
             Column("95 %\nto", high, kind="number"),
             facts=facts,
