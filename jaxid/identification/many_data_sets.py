@@ -196,7 +196,7 @@ def _solve_one(
     deviations, dof = naive, jnp.broadcast_to(count.sum() - size, naive.shape)
     if row_time is not None:
         rest = A, Q, count / length, row_time
-        variance, dof = sandwich_of_columns(rows.columns, weights, inverse, p, *rest)
+        variance, dof = sandwich_of_columns(jnp, rows.columns, weights, inverse, p, *rest)
         deviations = jnp.sqrt(jnp.maximum(variance, 0.0))
     return BatchFit(
         p,

@@ -55,6 +55,11 @@ class Bodies:
         return jnp.zeros((len(q), len(q))), model.forces(p, q, rest, rest)
 
     @functools.cached_property
+    def together(self) -> "Bodies":
+        """The same bodies with their inertial torques."""
+        return self if self.coupled else dataclasses.replace(self, coupled=True)
+
+    @functools.cached_property
     def programs(self) -> Programs:
         """Programs of a simulation of these bodies."""
         n = self.model.robot.joints

@@ -26,7 +26,7 @@ from .servo import (
     Forces,
     Partials,
     Stages,
-    commands_of_steps,
+    commands_of_stages,
     moved,
     partials,
     steps_of,
@@ -64,27 +64,29 @@ class Path(NamedTuple):
 def _simulate(
     programs: Programs | None, steps: int, theta: Array, motion: ServoMotion, hold: AnyArray
 ) -> Path:
-    """Simulate all motions from their initial states."""
+    """Simulate all motions from their initial states, each with parameters of its own."""
     h = jnp.asarray(motion.sample_time)[None] / steps
     share, ahead = jnp.array([1.0 - GAMMA, GAMMA]), jnp.array([(1.0 - GAMMA) / GAMMA, 1.0])
 
-    def step(state: tuple[Array, ...], command: Array):
+    def step(state: tuple[Array, ...], commands: Array):
         q, w, last = state
         M, load = None, jnp.zeros_like(q)
         if programs is not None:
             M, load = lower(programs.bodies).dense(*middle_of(q, w, last, h))
 
-        def stage(state: tuple[Array, Array], shares: tuple[Array, Array]):
-            inputs = Stages(command, load, jnp.zeros_like(load), *shares)
-            u = _within(programs, *state, theta.T[:, :, None], inputs, M, h)
+        def stage(state: tuple[Array, Array], own: tuple[Array, ...]):
+            inputs = Stages(own[0], load, jnp.zeros_like(load), *own[1:])
+            u = _within(programs, *state, of_joints, inputs, M, h)
             return moved(*state, u, inputs, h), (*state, u)
 
-        (q, after), stages = jax.lax.scan(stage, (q, w), (share, ahead))
+        (q, after), stages = jax.lax.scan(stage, (q, w), (commands, share, ahead))
         return (q, after, w), (*stages, q)
 
     q, v = jnp.moveaxis(jnp.asarray(motion.start), 0, -1)
-    commands = jax.vmap(lambda x: commands_of_steps(theta, x, steps, hold), out_axes=-1)(motion)
-    return Path(*jax.lax.scan(step, (q, v, v), commands)[1])
+    commands = jax.vmap(lambda x, y: commands_of_stages(x.T, y, steps, hold), (-1, 0), -1)
+    commands = commands(theta, motion)
+    of_joints, by_step = tuple(theta), commands.reshape(-1, 2, *commands.shape[1:])
+    return Path(*jax.lax.scan(step, (q, v, v), by_step)[1])
 
 
 def middle_of(q: Any, v: Any, last: Any, h: Any) -> tuple[Any, Any]:
@@ -180,10 +182,16 @@ class CoupledSimulator:
         """Steps in each sample time: at least two, which tell held commands from others."""
         return steps_of(self.motion, self.time_step, 2)
 
-    def simulate(self, theta: Float[AnyArray, "joints parameters"]) -> Path:
-        """Simulate the motions from their initial states."""
+    def simulate(self, theta: Float[AnyArray, "*candidates joints parameters"]) -> Path:
+        """Simulate the motions from their initial states.
+
+        Args:
+            theta: Parameters, or some for each of several equal parts of the motions.
+        """
         motion = self.motion.replace(lengths=(), names=())
         programs = None if self.bodies is None else self.bodies.programs
+        theta = np.asarray(theta).reshape(-1, *np.shape(theta)[-2:])
+        theta = np.repeat(theta.T, self.motion.motions // len(theta), axis=-1)
         with double_precision():
             found = _simulate(programs, self.steps, jnp.asarray(theta), motion, np.array(self.hold))
             return Path(*map(np.asarray, found))

@@ -81,18 +81,18 @@ def identify_rollout(
         InputError: If logs differ in their joints, are too short, or do not move.
     """
     logs = [logs] if isinstance(logs, Recording) else list(logs)
-    motion = ServoMotion.of(_divided(logs))
+    motion = ServoMotion.of(_divided(logs)).known()
     _require_motion(motion)
     names = _joint_names(motion, bodies, joint_names)
     # Choices show in long steps, too.
     coarse = max(time_step, float(motion.sample_time.max()))
     motion = motion if bodies is None else bodies.loads(motion)
     search = _Search(ServoSimulator(motion, coarse))
-    whole = None if bodies is None else dataclasses.replace(bodies, coupled=True)
+    whole = None if bodies is None else bodies.together
     coupled = CoupledSimulator(motion, time_step, False, whole)
     with ThreadPoolExecutor(1) as pool:
         # What the refinement needs is compiled while the search runs.
-        pool.submit(coupled.simulate, search.x)
+        pool.submit(Refinement.of, coupled, search.x, search.free)
         search.run(bodies is not None, friction, saturation)
     if bodies is not None and whole is not None:
         together = bodies.coupled or search.choose_coupling(whole)
@@ -104,8 +104,8 @@ def identify_rollout(
     held = search.x.copy()
     held[:, INDEX["d"]] -= 0.5 * float(motion.sample_time.mean())
     found, told = refine(
-        Refinement(coupled, search.x, search.free),
-        Refinement(dataclasses.replace(coupled, hold=True), held, search.free),
+        Refinement.of(coupled, search.x, search.free),
+        Refinement.of(dataclasses.replace(coupled, hold=True), held, search.free),
     )
     return ServoFit.of(found, search.linear, names, told)
 
@@ -313,7 +313,7 @@ class _Search:
     def _first_value(self, symbol: str) -> float | np.ndarray:
         """Return a start at which an effect is active: otherwise it would have no gradient."""
         motion = self.simulator.motion
-        lag = np.abs(np.asarray(motion.commands) - motion.positions).max(axis=(0, 2))
+        lag = np.abs(motion.sent - motion.positions).max(axis=(0, 2))
         load = np.abs(motion.load).max(axis=(0, 2))
         own = self.x[:, INDEX["F"]]
         values = {

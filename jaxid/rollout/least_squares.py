@@ -41,13 +41,13 @@ def minimise(
     free: Bool[np.ndarray, "*batch size"],
     bounds: tuple[np.ndarray, np.ndarray],
     iterations: int = 30,
-    tolerance: float = 1e-4,
+    tolerance: float = 1e-3,
     damping: float = 1e-2,
 ) -> Solution:
     """Minimise sums of squares over the free parameters, each problem with its own damping.
 
     A parameter at a bound that its gradient would leave is held there for one step. Problems of one
-    index along the first axis are left alone as soon as all of them have converged.
+    index along the first axis are left alone as soon as each of them has converged once.
 
     Args:
         moments: Costs and their derivatives at parameters of all problems.
@@ -61,12 +61,14 @@ def minimise(
     """
     x = np.clip(x, *bounds)
     dampings, left = np.full(x.shape[:-1], damping), np.arange(len(x))
+    done = np.zeros(x.shape[:-1], bool)
     cost, g, H = moments(x, left)
     for _ in range(iterations):
         own = (y[left] for y in (x, cost, g, H, free, dampings))
         x[left], dampings[left], converged = improve(costs, left, *own, bounds, tolerance)
         cost[left], g[left], H[left] = moments(x[left], left)
-        left = left[~converged.reshape(len(left), -1).all(axis=1)]
+        done[left] |= converged
+        left = left[~done[left].reshape(len(left), -1).all(axis=1)]
         if not left.size:
             break
     return Solution(x, cost, g, H)

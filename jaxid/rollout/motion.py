@@ -15,10 +15,12 @@ from jaxid.measurement.recording import Recording
 
 SETTLING = 0.5
 """Time at the start of a log that does not count, because the initial speed is not known [s]."""
-EARLY = 0.2
-"""Time at the start of a log whose velocities bound the initial ones [s]."""
+NEAR = 0.1
+"""Time around an instant whose positions give its state [s]."""
 ROUNDING = 1e-3
-"""Rounding of positions that is assumed for those of the start [rad or m]."""
+"""Least deviation of positions around an instant, because encoders round [rad or m]."""
+HISTORY, AHEAD = 0.3, 0.1
+"""Time before the first sample and behind the last one from which commands may act [s]."""
 PADDED = 500
 """Samples to a multiple of which motions are padded, so that few lengths are compiled."""
 
@@ -27,22 +29,24 @@ class ServoMotion(eqx.Module):
     """Segments of logs as arrays of one length, padded behind their ends.
 
     Attributes:
-        commands: Commanded positions [motions, joints, samples].
-        positions: Measured positions.
+        commands: Commanded positions, which begin before the samples [motions, joints, instants].
+        positions: Measured positions [motions, joints, samples].
         load: Torques of the bodies between a sample, or step, and the next one [N m or N].
         inertia: Inertia of the bodies about each joint [kg m² or kg].
         start: Initial positions and velocities.
+        spread: Standard deviations of the initial states.
         counted: Whether a sample counts in the fit.
         sample_time: Time between two samples of each motion [s].
         lengths: Number of samples of each motion.
         names: Name of the log of each motion.
     """
 
-    commands: Float[AnyArray, "motions joints samples"]
+    commands: Float[AnyArray, "motions joints lead+samples"]
     positions: Float[AnyArray, "motions joints samples"]
     load: Float[AnyArray, "motions joints instants"]
     inertia: Float[AnyArray, "motions joints instants"]
     start: Float[AnyArray, "motions 2 joints"]
+    spread: Float[AnyArray, "motions 2 joints"]
     counted: Float[AnyArray, "motions joints samples"]
     sample_time: Float[AnyArray, " motions"]
     lengths: tuple[int, ...] = eqx.field(static=True)
@@ -77,16 +81,20 @@ class ServoMotion(eqx.Module):
         index = np.arange(padded)
         first = np.ceil(SETTLING / times)[:, None]
         counted = (index >= first) & (index < np.array(lengths)[:, None])
-        early = np.maximum(2, (0.1 / times).astype(int))
-        rates = [
-            (x[:, k] - x[:, 0]) / (k * dt) for x, k, dt in zip(positions, early, times, strict=True)
+        states = [
+            state_at(x[:, :n], 0, float(dt))
+            for x, n, dt in zip(positions, lengths, times, strict=True)
         ]
+        start, spread = (np.stack(x) for x in zip(*states, strict=True))
+        lead = math.ceil(HISTORY / times.min())
         return cls(
-            commands=stacked("forces"),
+            # Before the first command the robot stands still.
+            commands=np.pad(stacked("forces"), ((0, 0), (0, 0), (lead, 0)), "edge"),
             positions=positions,
             load=np.zeros_like(positions),
             inertia=np.zeros_like(positions),
-            start=np.stack([positions[..., 0], np.array(rates)], axis=1),
+            start=start,
+            spread=spread,
             counted=np.repeat(counted[:, None].astype(float), positions.shape[1], axis=1),
             sample_time=times,
             lengths=lengths,
@@ -95,16 +103,9 @@ class ServoMotion(eqx.Module):
 
     @property
     def certainty(self) -> Float[np.ndarray, "motions 2 joints"]:
-        """Inverse variance of the initial states as the first samples show them, over their number.
-
-        Velocities are within those of the first fifth of a second, positions within rounding.
-        """
-        found = np.full(self.start.shape, 1.0 / ROUNDING**2)
-        for k, dt in enumerate(map(float, self.sample_time)):
-            count = max(2, round(EARLY / dt))
-            ranges = np.ptp(np.asarray(self.positions[k])[:, : count + 1], axis=-1)
-            found[k, 1] = (count * dt / np.maximum(ranges, ROUNDING)) ** 2
-        return found / np.maximum(np.asarray(self.counted).sum(axis=-1), 1.0)[:, None]
+        """Inverse variance of the initial states, over the number of samples that count."""
+        counted = np.maximum(np.asarray(self.counted).sum(axis=-1), 1.0)
+        return 1.0 / np.asarray(self.spread) ** 2 / counted[:, None]
 
     @property
     def motions(self) -> int:
@@ -115,6 +116,16 @@ class ServoMotion(eqx.Module):
         """Return the motions with other arrays."""
         return dataclasses.replace(self, **fields)
 
+    @property
+    def lead(self) -> int:
+        """Number of commands before the first sample."""
+        return self.commands.shape[-1] - self.positions.shape[-1]
+
+    @property
+    def sent(self) -> Float[np.ndarray, "motions joints samples"]:
+        """Commands of the samples."""
+        return np.asarray(self.commands)[..., self.lead :]
+
     def windows(self, horizon: float) -> "ServoMotion":
         """Return consecutive windows of a length [s] as motions of their own.
 
@@ -122,32 +133,74 @@ class ServoMotion(eqx.Module):
         """
         size = max(3, round(horizon / float(self.sample_time.mean())))
         places = [(k, a) for k, n in enumerate(self.lengths) for a in range(0, n - size + 1, size)]
-        index = np.array([k for k, _ in places])
+        return self._from(places, size).replace(lengths=(size,) * len(places))
 
-        def cut(x: AnyArray) -> np.ndarray:
-            return np.stack([np.asarray(x)[k, :, a : a + size] for k, a in places])
+    def known(self) -> "ServoMotion":
+        """Return the motions where commands are known, whatever the delay.
 
-        channels = ("commands", "positions", "load", "inertia", "counted")
-        arrays = {key: cut(getattr(self, key)) for key in channels}
-        q, dt = arrays["positions"], np.asarray(self.sample_time)[index]
-        smooth = [
-            smooth_rates(np.asarray(self.positions[k])[:, :n].T, float(self.sample_time[k]))[1]
-            for k, n in enumerate(self.lengths)
+        They begin later; at their ends samples do not count that late positions might decide.
+        """
+        samples, times = self.positions.shape[-1], np.asarray(self.sample_time)
+        first = math.ceil(HISTORY / times.min())
+        found = self._from([(k, first) for k in range(self.motions)], samples)
+        lengths = np.array(self.lengths) - first
+        ends = lengths - np.ceil(AHEAD / times)
+        counted = np.asarray(found.counted) * (np.arange(samples) < ends[:, None, None])
+        return found.replace(lengths=tuple(map(int, lengths)), counted=counted)
+
+    def _from(self, places: Sequence[tuple[int, int]], size: int) -> "ServoMotion":
+        """Return motions of a size that start from measured states at samples of these."""
+
+        def cut(x: AnyArray, more: int = 0) -> np.ndarray:
+            rows = (np.asarray(x)[k, :, a : a + more + size] for k, a in places)
+            filled = (np.pad(y, ((0, 0), (0, more + size - y.shape[1])), "edge") for y in rows)
+            return np.stack(list(filled))
+
+        arrays = {x: cut(getattr(self, x)) for x in ("positions", "load", "inertia", "counted")}
+        states = [
+            state_at(np.asarray(self.positions[k])[:, : self.lengths[k]], a, float(dt))
+            for (k, a), dt in zip(places, self.sample_time[[k for k, _ in places]], strict=True)
         ]
-        rates = np.array([smooth[k][a] for k, a in places])
-        names = tuple(self.names[k] for k in index)
-        lengths = (size,) * len(index)
-        start = np.stack([q[..., 0], rates], axis=1)
-        return self.replace(**arrays, start=start, sample_time=dt, lengths=lengths, names=names)
+        start, spread = (np.stack(x) for x in zip(*states, strict=True))
+        index = np.array([k for k, _ in places])
+        return self.replace(
+            **arrays,
+            commands=cut(self.commands, self.lead),
+            start=start,
+            spread=spread,
+            sample_time=np.asarray(self.sample_time)[index],
+            lengths=tuple(self.lengths[k] for k in index),
+            names=tuple(self.names[k] for k in index),
+        )
+
+    def repeated(self, count: int) -> "ServoMotion":
+        """Return the motions several times."""
+        found = jax.tree.map(lambda x: np.concatenate([np.asarray(x)] * count), self)
+        return found.replace(lengths=self.lengths * count, names=self.names * count)
 
     def part(self, motion: int) -> "ServoMotion":
         """Return one motion, without the axis of motions."""
         return jax.tree.map(lambda x: x[motion], self)
 
 
-def settling(motion: ServoMotion) -> np.ndarray:
-    """Return the number of first samples of each motion that do not count."""
-    return np.ceil(SETTLING / np.asarray(motion.sample_time)).astype(int)
+def state_at(
+    q: Float[np.ndarray, "joints samples"], index: int, dt: float
+) -> tuple[Float[np.ndarray, "2 joints"], Float[np.ndarray, "2 joints"]]:
+    """Return positions and velocities at a sample, and their deviations.
+
+    They are those of a parabola through the samples around it. At the start the velocity is that
+    of a line, and the position the measured one.
+    """
+    near = max(2, round(NEAR / dt))
+    first, last = max(0, index - near), min(q.shape[1], index + near + 1)
+    t = dt * (np.arange(first, last) - index)
+    A = np.vander(t, 3 if index >= near else 2, increasing=True)
+    found, *_ = np.linalg.lstsq(A, q[:, first:last].T, rcond=None)
+    rest = max(len(t) - A.shape[1], 1)
+    error = np.sqrt(np.sum((q[:, first:last].T - A @ found) ** 2, axis=0) / rest)
+    rate = np.maximum(error, 0.1 * ROUNDING) / np.sqrt(np.sum((t - t.mean()) ** 2))
+    state = found[0] if index >= near else q[:, index], found[1]
+    return np.stack(state), np.stack([np.maximum(error, ROUNDING), rate])
 
 
 def smooth_rates(q: np.ndarray, dt: float, cutoff: float = 8.0) -> tuple[np.ndarray, ...]:

@@ -1,6 +1,7 @@
 """Least squares of all joints together, with initial velocities and loads of their simulation."""
 
 import dataclasses
+from collections.abc import Sequence
 from functools import cached_property
 
 import jax
@@ -9,17 +10,17 @@ import numpy as np
 
 from jaxid.arrays import Array, Bool, Float, double_precision
 
-from .coupled import CoupledSimulator
-from .least_squares import bounded_step, improve
-from .motion import ServoMotion, settling
-from .servo import INDEX, LOWER, UPPER
+from .coupled import CoupledSimulator, Path
+from .least_squares import bounded_step
+from .motion import ServoMotion
+from .servo import LOWER, UPPER
 
 RESOLUTION = 1e-4
 """Errors below which no motion counts more [rad or m]."""
-FALL, COARSE = 0.002, 0.02
+FALL, COARSE = 0.0005, 0.02
 """Fall of the logarithm of the mean square error for which the last, the first search go on."""
-DAMPING = 1e-5
-"""Least damping of a step of the refinement."""
+DAMPINGS = (1e-5, 0.01)
+"""Dampings of the steps of which the refinement takes the best."""
 ROUNDS = 25
 """Largest number of steps of the refinement."""
 
@@ -44,11 +45,24 @@ class Refinement:
         simulator: Motions, with their initial states.
         parameters: Parameters of each joint.
         free: Parameters that are estimated; the unknowns are these, then the initial states.
+        path: Simulation of all motions.
     """
 
     simulator: CoupledSimulator
     parameters: Float[np.ndarray, "joints parameters"]
     free: Bool[np.ndarray, "joints parameters"]
+    path: Path
+
+    @classmethod
+    def of(
+        cls,
+        simulator: CoupledSimulator,
+        parameters: Float[np.ndarray, "joints parameters"],
+        free: Bool[np.ndarray, "joints parameters"],
+    ) -> "Refinement":
+        """Return simulated joints."""
+        found = cls(simulator, parameters, free, Path(*[np.zeros(0)] * 4))
+        return found.with_unknowns([found.unknowns])[0]
 
     @property
     def unknowns(self) -> Float[np.ndarray, " unknowns"]:
@@ -56,19 +70,23 @@ class Refinement:
         start = np.asarray(self.simulator.motion.start)
         return np.concatenate([self.parameters[self.free], start.ravel()])
 
-    def with_unknowns(self, z: np.ndarray) -> "Refinement":
-        """Return the joints with other unknowns."""
-        x, count = self.parameters.copy(), int(self.free.sum())
-        x[self.free] = z[:count]
-        start = z[count:].reshape(self.simulator.motion.start.shape)
-        motion = self.simulator.motion.replace(start=start)
-        simulator = dataclasses.replace(self.simulator, motion=motion)
-        return dataclasses.replace(self, simulator=simulator, parameters=x)
-
-    @cached_property
-    def path(self):
-        """Simulation of all motions."""
-        return self.simulator.simulate(self.parameters)
+    def with_unknowns(self, candidates: Sequence[np.ndarray]) -> list["Refinement"]:
+        """Return the joints with other unknowns, simulated together."""
+        count, motion, motions = int(self.free.sum()), self.simulator.motion, []
+        theta = np.tile(self.parameters, (len(DAMPINGS), 1, 1))
+        # Always as many at once, so that nothing is compiled anew.
+        every = motion.repeated(len(DAMPINGS))
+        for k, z in enumerate(candidates):
+            theta[k, self.free] = z[:count]
+            motions.append(motion.replace(start=z[count:].reshape(motion.start.shape)))
+        spare = [motion] * (len(DAMPINGS) - len(motions))
+        every = every.replace(start=np.concatenate([x.start for x in (*motions, *spare)]))
+        path = dataclasses.replace(self.simulator, motion=every).simulate(theta)
+        paths = zip(*(np.split(x, len(DAMPINGS), axis=-1) for x in path), strict=True)
+        return [
+            Refinement(dataclasses.replace(self.simulator, motion=own), x, self.free, Path(*p))
+            for own, x, p in zip(motions, theta, paths, strict=False)
+        ]
 
     @cached_property
     def residuals(self) -> Float[np.ndarray, "motions joints samples"]:
@@ -129,8 +147,7 @@ def _products(S: Array, r: Array) -> tuple[Array, Array]:
 def refine(first: Refinement, other: Refinement) -> tuple[Refinement, bool]:
     """Return the best fit of all joints together, from two that are nearly right.
 
-    The second one goes on if it is clearly better. All samples count in the end from the instant on
-    that the first command takes effect; in them the initial states matter.
+    The second one goes on if it is clearly better.
 
     Returns:
         The fit, and whether the logs tell which of the two is better.
@@ -138,13 +155,7 @@ def refine(first: Refinement, other: Refinement) -> tuple[Refinement, bool]:
     best, other = (_descend(x, COARSE) for x in (first, other))
     told = abs(other.score - best.score) > FALL
     best = other if other.score < best.score - FALL else best
-    motion, late = best.simulator.motion, float(best.parameters[:, INDEX["d"]].max())
-    index = np.arange(motion.positions.shape[-1])
-    first_known = np.ceil(max(late, 0.0) / np.asarray(motion.sample_time))
-    early = (index < settling(motion)[:, None]) & (index >= first_known[:, None])
-    motion = motion.replace(counted=np.where(early[:, None], 1.0, motion.counted))
-    simulator = dataclasses.replace(best.simulator, motion=motion)
-    return _descend(dataclasses.replace(best, simulator=simulator), FALL), told
+    return _descend(best, FALL), told
 
 
 def _descend(best: Refinement, fall: float) -> Refinement:
@@ -154,35 +165,28 @@ def _descend(best: Refinement, fall: float) -> Refinement:
         best: Start.
         fall: Fall of the score, promised or found in a step, for which the search goes on.
     """
-    motion, first, damping = best.simulator.motion, best.unknowns, np.array([DAMPING])
-    rows = np.nonzero(best.free)[1]
+    motion, first, rows = best.simulator.motion, best.unknowns, np.nonzero(best.free)[1]
     count, wide = len(rows), np.full(len(first) - len(rows), np.inf)
     bounds = np.r_[LOWER[rows], -wide], np.r_[UPPER[rows], wide]
     prior = np.r_[np.zeros(count), motion.certainty.ravel()]
+    free = np.ones(len(first), bool)
     for _ in range(ROUNDS):
-        weights, tried = weights_of(motion, best.sums), {}
+        weights, z = weights_of(motion, best.sums), best.unknowns
 
         def cost(found: Refinement, weights=weights) -> float:
-            return float(np.sum(weights * found.sums) + prior @ (found.unknowns - first) ** 2)
-
-        def costs(z, _, tried=tried, cost=cost, start=best):
-            tried[z.tobytes()] = start.with_unknowns(z[0])
-            return np.array([cost(tried[z.tobytes()])])
+            squares = np.sum(weights * found.sums) + prior @ (found.unknowns - first) ** 2
+            return float(squares) / weights.size
 
         g, H = best.moments(weights)
-        z = best.unknowns
         g, H = g + prior * (z - first), H + np.diag(prior)
-        free = np.ones(len(z), bool)
-        step = bounded_step(g, H, z, free, bounds, DAMPING)
-        promised = float(-2.0 * g @ step - step @ H @ step) / weights.size
+        steps = [bounded_step(g, H, z, free, bounds, damping) for damping in DAMPINGS]
+        promised = float(-2.0 * g @ steps[0] - steps[0] @ H @ steps[0]) / weights.size
         if promised < fall:
-            return best
-        terms = z[None], np.array([cost(best)]), g[None], H[None], free[None], damping
-        z, damping, _ = improve(costs, np.zeros(1, int), *terms, bounds, 0.0)
-        found, damping = tried.get(z.tobytes(), best), np.maximum(damping, DAMPING)
-        if found is best and damping < 1.0 and promised > COARSE:
-            continue
-        if found.score > best.score - fall:
-            return min(found, best, key=lambda y: y.score)
-        best = found
+            break
+        trials = best.with_unknowns([np.clip(z + step, *bounds) for step in steps])
+        found = min(trials, key=cost)
+        gained = cost(best) - cost(found)
+        best = found if gained > 0.0 else best
+        if gained < fall or abs(promised - gained) < fall:
+            break
     return best

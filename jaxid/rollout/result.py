@@ -5,12 +5,10 @@ from collections.abc import Sequence
 from functools import cached_property
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from scipy import special, stats
 
-from jaxid.arrays import AnyArray, Array, Bool, Float, double_precision
+from jaxid.arrays import AnyArray, Bool, Float
 from jaxid.identification.uncertainty.spectral import sandwich_of_columns
 from jaxid.measurement.recording import Recording
 from jaxid.result_table import Column, Remark, Status, Table, significant, with_deviations
@@ -23,7 +21,7 @@ from .motion import ServoMotion
 from .refine import Refinement, mean_squares, weights_of
 from .servo import INDEX, LOWER, PARAMETERS, SCALE, UPPER, ServoSimulator
 
-UNDETERMINED = 0.5
+UNDETERMINED = 0.25
 """Standard deviation, relative to a parameter's size, above which it is not determined."""
 LIMITED = [INDEX[x] for x in ("B", "d", "b", "um", "g")]
 """Parameters that are not at a limit of the search unless something is wrong."""
@@ -69,6 +67,7 @@ class ServoFit:
         parameters: Parameters of each joint, in the order of `jid.rollout.PARAMETERS`.
         free: Parameters that were estimated.
         covariance: Covariance of the estimated parameters, joint by joint.
+        dof: Degrees of freedom of their deviations.
         combinations: Parameters and combinations that the logs determine.
         linear: Parameters of the linear baseline.
         hold: Whether commands are held until the next one, instead of interpolated.
@@ -87,6 +86,7 @@ class ServoFit:
     parameters: Float[np.ndarray, "joints parameters"]
     free: Bool[np.ndarray, "joints parameters"]
     covariance: Float[np.ndarray, "free free"]
+    dof: Float[np.ndarray, " free"]
     combinations: tuple[Combination, ...]
     linear: Float[np.ndarray, "joints parameters"]
     hold: bool
@@ -113,7 +113,7 @@ class ServoFit:
         motion = simulator.motion
         everything = simulator.positions(found.path) - np.asarray(motion.positions)
         typical = typical_errors(motion, sustained_errors(motion, everything))
-        combinations, covariance = _determined(_Rows.of(found), found, joint_names)
+        combinations, *distribution = _determined(_Rows.of(found), found, joint_names)
         positions, lacking = np.asarray(motion.positions), []
         for j, name in enumerate(joint_names):
             kept = np.asarray(motion.counted)[:, j] > 0
@@ -137,7 +137,7 @@ class ServoFit:
             joint_names,
             found.parameters,
             found.free,
-            covariance,
+            *distribution,
             combinations,
             linear,
             simulator.hold,
@@ -221,7 +221,7 @@ class ServoFit:
             tuple(float(times[k]) * np.arange(lengths[k]) for k in parts),
             cut(motion.positions),
             cut(simulated),
-            cut(motion.commands),
+            cut(motion.sent),
             cut(linear),
             cut((np.asarray(motion.counted) > 0) & ~touched),
             contacts(motion, errors, self.typical),
@@ -241,7 +241,7 @@ class ServoFit:
         return np.sqrt(np.mean(errors**2, axis=(0, 2)))
 
     def samples(self, count: int, seed: int = 0) -> Float[np.ndarray, "count joints parameters"]:
-        """Return parameters drawn from their distribution, within their limits.
+        """Return parameters drawn from their t distributions, within their limits.
 
         Args:
             count: Number of draws.
@@ -249,10 +249,11 @@ class ServoFit:
         """
         random = np.random.default_rng(seed)
         draws = np.tile(self.parameters, (count, 1, 1))
-        scale = SCALE[np.nonzero(self.free)[1]]
-        size, vectors = np.linalg.eigh(self.covariance / scale / scale[:, None])
-        root = scale[:, None] * vectors * np.sqrt(np.maximum(size, 0.0))
-        draws[:, self.free] += random.normal(size=(count, len(scale))) @ root.T
+        deviation = np.sqrt(np.diag(self.covariance))
+        size, vectors = np.linalg.eigh(self.covariance / deviation / deviation[:, None])
+        root = vectors * np.sqrt(np.maximum(size, 0.0))
+        normal = np.clip(random.normal(size=(count, len(root))) @ root.T, -7.0, 7.0)
+        draws[:, self.free] += deviation * special.stdtrit(self.dof, special.ndtr(normal))
         return np.clip(draws, LOWER, UPPER)
 
     def summary(self) -> Table:
@@ -262,7 +263,7 @@ class ServoFit:
         ends = np.array([c.interval() for c in rows]).reshape(-1, 2)
         low, high = (with_deviations(x, [c.deviation for c in rows])[0] for x in ends.T)
         size = np.array([abs(c.value) for c in rows])
-        clear = np.array([c.deviation for c in rows]) < 0.25 * np.maximum(size, 1e-12)
+        clear = np.array([c.deviation for c in rows]) < UNDETERMINED * np.maximum(size, 1e-12)
         first = [k for k in range(1, len(rows)) if rows[k].joint != rows[k - 1].joint]
         K = ", ".join(
             f"{name} {significant(k)}"
@@ -351,13 +352,15 @@ class _Rows(NamedTuple):
         return _inverse(self.information) / max(float(samples.max()), 1.0)
 
     @property
-    def columns(self) -> list[Array]:
+    def columns(self) -> list[np.ndarray]:
         """Sensitivities of each motion and joint [parameters, samples]."""
-        rows = zip(self.found.sensitivities, self.imitated, strict=True)
-        with double_precision():
-            return [x for S, start in rows for x in _without_start(S, start)]
+        found = []
+        for S, start in zip(self.found.sensitivities, self.imitated, strict=True):
+            own, by_start = S[..., : -len(start)], S[..., -len(start) :]
+            found += list(np.swapaxes(own - by_start @ start, 1, 2))
+        return found
 
-    def covariance(self, columns: list[Array], own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def covariance(self, columns: list, own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return covariance and degrees of freedom if only some parameters are unknown.
 
         The spectral sandwich; where motions differ more than it explains, their scatter.
@@ -365,18 +368,18 @@ class _Rows(NamedTuple):
         motion, (motions, joints) = self.found.simulator.motion, self.weights.shape
         B, place = np.zeros_like(self.information), np.ix_(own, own)
         B[place] = _inverse(self.information[place])
-        with double_precision():
-            found = sandwich_of_columns(
-                [range(len(B))] * (motions * joints),
-                np.sqrt(self.weights).ravel(),
-                B,
-                np.zeros((1, len(B))),
-                columns,
-                list(self.found.residuals.reshape(motions * joints, 1, -1)),
-                np.asarray(motion.counted).mean(axis=-1).ravel(),
-                float(motion.sample_time.mean()),
-            )
-        variance, dof = (np.asarray(x)[0] for x in found)
+        found = sandwich_of_columns(
+            np,
+            [range(len(B))] * (motions * joints),
+            np.sqrt(self.weights).ravel(),
+            B,
+            np.zeros((1, len(B))),
+            columns,
+            list(self.found.residuals.reshape(motions * joints, 1, -1)),
+            np.asarray(motion.counted).mean(axis=-1).ravel(),
+            float(motion.sample_time.mean()),
+        )
+        variance, dof = (x[0] for x in found)
         size = np.sqrt(np.maximum(np.diag(B), 1e-300))
         changes = self.scores @ B
         scatter = motions / max(motions - 1, 1) * (changes**2).sum(axis=0)
@@ -385,13 +388,6 @@ class _Rows(NamedTuple):
         dof = np.where(differ, motions - 1.0, dof)
         deviation = np.sqrt(np.where(differ, scatter, variance))
         return B / np.outer(size, size) * np.outer(deviation, deviation), dof
-
-
-@jax.jit
-def _without_start(S: Array, start: Array) -> Array:
-    """Return sensitivities of a motion to the parameters [joints, parameters, samples]."""
-    own, by_start = S[..., : -len(start)], S[..., -len(start) :]
-    return jnp.swapaxes(own - by_start @ start, 1, 2)
 
 
 def systematic_error(r: np.ndarray, kept: np.ndarray, q: np.ndarray) -> float:
@@ -422,14 +418,16 @@ def _inverse(H: np.ndarray) -> np.ndarray:
 
 def _determined(
     rows: _Rows, found: Refinement, joint_names: tuple[str, ...]
-) -> tuple[tuple[Combination, ...], np.ndarray]:
-    """Return the combinations that the rows determine, and the covariance of all parameters."""
+) -> tuple[tuple[Combination, ...], np.ndarray, np.ndarray]:
+    """Return the combinations that the rows determine, and covariance and dof of all parameters."""
     x, joints, symbols = found.parameters[found.free], *np.nonzero(found.free)
     columns = rows.columns
-    covariance, _ = rows.covariance(columns, np.arange(len(x)))
+    covariance, every_dof = rows.covariance(columns, np.arange(len(x)))
     size = np.maximum(np.abs(x), 0.1 * SCALE[symbols])
+    wider = special.stdtrit(every_dof, 0.975) / special.ndtri(0.975) / size
     # The sandwich is blind where no error can show: there the information alone tells.
-    own, kappa = _merge((covariance + rows.white) / np.outer(size, size))
+    known = covariance * np.outer(wider, wider) + rows.white / np.outer(size, size)
+    own, kappa = _merge(known, np.maximum(np.abs(x), SCALE[symbols]) / size)
     kappa = kappa * size[own][:, None] / size[None, :]
     reduced, dof = rows.covariance(columns, own)
     combinations = []
@@ -450,11 +448,15 @@ def _determined(
         unit = PARAMETERS[symbols[i]].unit
         place = int(joints[i]), name, meaning, unit, coefficients
         combinations.append(Combination(*place, *numbers))
-    return tuple(combinations), covariance
+    return tuple(combinations), covariance, every_dof
 
 
-def _merge(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _merge(covariance: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return which relative parameters are determined, and how the others merge into them.
+
+    Args:
+        covariance: Covariance of the relative parameters.
+        reach: Usual size of each, to which it may change if it is not determined.
 
     A parameter is not determined if, with those before it known only by the logs, its deviation
     exceeds `UNDETERMINED`: its column of the information's root adds almost nothing.
@@ -476,5 +478,5 @@ def _merge(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         kappa[:, own] = np.eye(len(own))
         # What changes a combination by less than its deviation is left out.
         deviation = np.sqrt(np.diag(np.linalg.inv(W[:, own].T @ W[:, own])))
-        kappa[np.abs(kappa) < np.minimum(0.02, deviation)[:, None]] = 0.0
+        kappa[np.abs(kappa) * reach < np.minimum(0.02, deviation)[:, None]] = 0.0
     return np.array(own, int), kappa

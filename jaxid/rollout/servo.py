@@ -21,7 +21,7 @@ import numpy as np
 from jaxid.arrays import AnyArray, Array, Float, double_precision, on_cores
 
 from .dry_friction import Slip
-from .motion import ServoMotion
+from .motion import AHEAD, HISTORY, ServoMotion
 
 GAMMA = 1.0 - math.sqrt(0.5)
 """Fraction of a step that each of its two implicit stages takes."""
@@ -49,7 +49,7 @@ PARAMETERS = (
     ServoParameter("J", "inertia / stiffness", "s²", 4e-3, 1e-7, 1.0, 2e-3),
     # With less damping than 6 % of a step, a step may overshoot where friction then holds.
     ServoParameter("B", "damping / stiffness", "s", 0.05, 1e-3, 5.0, 0.03),
-    ServoParameter("d", "delay", "s", 0.01, -0.1, 0.3, 0.01),
+    ServoParameter("d", "delay", "s", 0.01, -AHEAD, HISTORY, 0.01),
     ServoParameter("b", "bias / stiffness", "u", 0.0, -1.0, 1.0, 0.01),
     ServoParameter("a", "1 / stiffness", "u/(N m)", 0.0, 0.0, 100.0, 0.05),
     ServoParameter("F", "dry friction / stiffness", "u", 0.01, 0.0, 1.0, 0.01),
@@ -67,26 +67,29 @@ START, LOWER, UPPER, SCALE = (
 
 
 def delayed_command(c: AnyArray, t: Array, hold: AnyArray) -> Array:
-    """Return the mean command over each step between the instants `t`, in samples.
+    """Return the commands of the two stages of each step between the instants `t`, in samples.
 
-    Commands are held until the next one, or interpolated; before the first they stand still.
+    Commands are interpolated; or they are held until the next one, and count with their mean over
+    the step. Before the first they stand still.
     """
     table = jnp.concatenate([jnp.zeros(1), jnp.cumsum(c)])
     held = jnp.clip(t, -1e3, len(c) - 1e-6)
     whole = jnp.clip(jnp.floor(held), 0.0, len(c) - 1.0)
     k = whole.astype(int)
     mean = jnp.diff(table[k] + (held - whole) * c[k]) / jnp.maximum(jnp.diff(held), 1e-12)
-    middle = jnp.clip(0.5 * (t[1:] + t[:-1]), 0.0, len(c) - 1.0)
-    whole = jnp.clip(jnp.floor(middle), 0.0, len(c) - 2.0)
+    ends = jnp.stack([t[:-1] + GAMMA * jnp.diff(t), t[1:]], axis=1).ravel()
+    within = jnp.clip(ends, 0.0, len(c) - 1.0)
+    whole = jnp.clip(jnp.floor(within), 0.0, len(c) - 2.0)
     k = whole.astype(int)
-    return jnp.where(hold, mean, c[k] + (middle - whole) * (c[k + 1] - c[k]))
+    interpolated = c[k] + (within - whole) * (c[k + 1] - c[k])
+    return jnp.where(hold, jnp.repeat(mean, 2), interpolated)
 
 
 class Stages(NamedTuple):
     """Inputs of the implicit Euler stages of a simulation, two for each step [stages, joints].
 
     Attributes:
-        commands: Mean command of the step, with gain and bias.
+        commands: Command of the stage, with gain and bias.
         load: Torque of the bodies [N m or N].
         inertia: Inertia of the bodies [kg m² or kg].
         share: Fraction of the step by which the position moves [stages, 1].
@@ -102,7 +105,7 @@ class Stages(NamedTuple):
     @classmethod
     def of(cls, theta: Array, motion: ServoMotion, steps: int, hold: AnyArray) -> "Stages":
         """Return the stages of one motion with this number of steps in each sample time."""
-        count = motion.commands.shape[-1] - 1
+        count = motion.positions.shape[-1] - 1
 
         def repeated(x: AnyArray) -> Array:
             each = (x.shape[-1] - 1) // count
@@ -111,7 +114,7 @@ class Stages(NamedTuple):
         def alternating(first: float, second: float) -> Array:
             return jnp.tile(jnp.array([first, second]), count * steps)[:, None]
 
-        commands = jnp.repeat(commands_of_steps(theta, motion, steps, hold), 2, axis=0)
+        commands = commands_of_stages(theta, motion, steps, hold)
         share = alternating(1.0 - GAMMA, GAMMA)
         ahead = alternating((1.0 - GAMMA) / GAMMA, 1.0)
         return cls(commands, repeated(motion.load), repeated(motion.inertia), share, ahead)
@@ -123,17 +126,18 @@ class Stages(NamedTuple):
         """Return the stages, and the derivatives of their commands by the delay."""
 
         def late(delay: Array) -> Array:
-            return commands_of_steps(theta.at[:, INDEX["d"]].set(delay), motion, steps, hold)
+            return commands_of_stages(theta.at[:, INDEX["d"]].set(delay), motion, steps, hold)
 
         delay = theta[:, INDEX["d"]]
         by_delay = jax.jvp(late, (delay,), (jnp.ones_like(delay),))[1]
-        return cls.of(theta, motion, steps, hold), jnp.repeat(by_delay, 2, axis=0)
+        return cls.of(theta, motion, steps, hold), by_delay
 
 
-def commands_of_steps(theta: Array, motion: ServoMotion, steps: int, hold: AnyArray) -> Array:
-    """Return the command of each step, with gain and bias [steps, joints]."""
+def commands_of_stages(theta: Array, motion: ServoMotion, steps: int, hold: AnyArray) -> Array:
+    """Return the command of each stage, with gain and bias [stages, joints]."""
     delay, bias, gain = (theta[:, INDEX[key]] for key in ("d", "b", "g"))
-    instants = jnp.asarray(np.arange((motion.commands.shape[-1] - 1) * steps + 1) / steps)
+    count = motion.positions.shape[-1] - 1
+    instants = jnp.asarray(motion.lead + np.arange(count * steps + 1) / steps)
 
     def of_joint(command: AnyArray, delay: Array) -> Array:
         return delayed_command(command, instants - delay / motion.sample_time, hold)

@@ -13,7 +13,6 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from scipy import fft, stats
 
@@ -380,8 +379,8 @@ def residual_spectra(lines: Sequence[Lines]) -> ResidualSpectra:
     )
 
 
-def sandwich_of_columns(own, weights, inverse, p, columns, forces, exposure, row_time: float):
-    """Return variances and degrees of freedom of estimates `p` [draws, base], in JAX.
+def sandwich_of_columns(xp, own, weights, inverse, p, columns, forces, exposure, row_time: float):
+    """Return variances and degrees of freedom of estimates `p` [draws, base], in NumPy or JAX.
 
     Columns [columns, rows] and forces [draws, rows] of each joint are zero where a row does not
     count; the columns belong to its own parameters; `exposure` is the fraction of rows that count.
@@ -391,16 +390,16 @@ def sandwich_of_columns(own, weights, inverse, p, columns, forces, exposure, row
     energy, leverage, power = [], [], []
     for k, A, Q, w in zip(own, columns, forces, weights, strict=True):
         mine = np.array(k, int)
-        Z = jnp.fft.rfft(w * A)
+        Z = xp.fft.rfft(w * A)
         real, imaginary = inverse[:, mine] @ Z.real, inverse[:, mine] @ Z.imag
-        r = jnp.fft.rfft(w * (Q - p[:, mine] @ A))
+        r = xp.fft.rfft(w * (Q - p[:, mine] @ A))
         energy.append(m[None] / length * (real**2 + imaginary**2))
         both = real[mine] * Z.real + imaginary[mine] * Z.imag
-        leverage.append(jnp.sum(both, axis=0) / length)
+        leverage.append(xp.sum(both, axis=0) / length)
         power.append((r.real**2 + r.imag**2) / length)
-    leverage = jnp.stack(leverage)
-    exposures = jnp.broadcast_to(exposure[:, None], leverage.shape)
-    sums = jnp.stack(energy, axis=1), leverage, exposures
-    table = SpectralTable(jnp, frequency, m, *sums, length * row_time)
-    variance, dof = table(jnp.stack(power, axis=1))
-    return jnp.asarray(variance), jnp.maximum(dof, 1.0)
+    leverage = xp.stack(leverage)
+    exposures = xp.broadcast_to(exposure[:, None], leverage.shape)
+    sums = xp.stack(energy, axis=1), leverage, exposures
+    table = SpectralTable(xp, frequency, m, *sums, length * row_time)
+    variance, dof = table(xp.stack(power, axis=1))
+    return xp.asarray(variance), xp.maximum(dof, 1.0)
