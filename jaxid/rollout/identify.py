@@ -334,9 +334,9 @@ class _Search:
         x[:, INDEX["J"]] = np.maximum(x[:, INDEX["J"]] - own, 1e-5)
         scores, results = [], []
         other = dataclasses.replace(self.simulator, motion=motion)
-        for simulator, start in ((self.simulator, self.x), (other, x)):
+        for simulator, start, more in ((self.simulator, self.x, 0), (other, x, 3)):
             self.simulator = simulator
-            found = self.solve(start[None], self.free[None], iterations=3)
+            found = self.solve(start[None], self.free[None], iterations=more)
             scores.append(np.nanmean(self.held_out(found, self.free[None])))
             results.append((simulator, found.x[0]))
         better = bool(scores[1] < scores[0])
