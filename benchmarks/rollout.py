@@ -434,7 +434,7 @@ def peer_sequences(motion: ServoMotion, j: int, friction: str) -> list:
     model = spec.compile()
     for k, n in enumerate(motion.lengths):
         t, name = np.arange(n) * float(motion.sample_time[k]), motion.names[k]
-        sent = np.stack([x[k, j, :n] for x in (motion.commands, motion.load)], axis=1)
+        sent = np.stack([x[k, j, :n] for x in (motion.sent, motion.load)], axis=1)
         q = np.array(motion.positions[k, j, :n, None])
         first = peer.create_initial_state(model, q[0], motion.start[k, 1, [j]], np.zeros(0))
         control, sensor = peer.TimeSeries(t, sent), peer.TimeSeries.from_names(t, q, model)
