@@ -81,9 +81,12 @@ def contact_rows(
 
 
 def typical_errors(motion: ServoMotion, mean: np.ndarray) -> Float[np.ndarray, " joints"]:
-    """Return the root mean square of averaged errors of each joint at rest."""
+    """Return the usual size of averaged errors of each joint at rest, which contacts do not move.
+
+    It is the median of these errors over that of normal ones of unit variance.
+    """
     still = [mean[:, j][mean[:, j] > 0] for j in range(mean.shape[1])]
-    return np.array([np.sqrt(np.mean(x**2)) if x.size else 0.0 for x in still])
+    return np.array([np.median(x) / 0.6745 if x.size else 0.0 for x in still])
 
 
 def contacts(

@@ -105,7 +105,7 @@ def _within(
     programs: Programs | None,
     q: Array,
     w: Array,
-    theta: Array,
+    theta: tuple[Array, ...],
     stage: Stages,
     M: Array | None,
     h: AnyArray,

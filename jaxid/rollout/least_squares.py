@@ -64,8 +64,8 @@ def minimise(
     done = np.zeros(x.shape[:-1], bool)
     cost, g, H = moments(x, left)
     for _ in range(iterations):
-        own = (y[left] for y in (x, cost, g, H, free, dampings))
-        x[left], dampings[left], converged = improve(costs, left, *own, bounds, tolerance)
+        own = [y[left] for y in (x, cost, g, H, free, dampings)]
+        x[left], dampings[left], converged = improve(costs, left, own, bounds, tolerance)
         cost[left], g[left], H[left] = moments(x[left], left)
         done[left] |= converged
         left = left[~done[left].reshape(len(left), -1).all(axis=1)]
@@ -74,8 +74,9 @@ def minimise(
     return Solution(x, cost, g, H)
 
 
-def improve(costs, problems, x, cost, g, H, free, damping, bounds, tolerance):
+def improve(costs, problems, terms, bounds, tolerance):
     """Return parameters of lower costs, their damping, and which problems have converged."""
+    x, cost, g, H, free, damping = terms
     decrease = np.zeros_like(cost)
     for _ in range(5):
         step = bounded_step(g, H, x, free, bounds, damping)

@@ -17,7 +17,7 @@ from .bodies import Bodies
 from .contact import Contact, contact_rows, contacts, sustained_errors, typical_errors
 from .coupled import CoupledSimulator
 from .errors import RolloutErrors
-from .motion import ServoMotion
+from .motion import HISTORY, ServoMotion
 from .refine import Refinement, mean_squares, weights_of
 from .servo import INDEX, LOWER, PARAMETERS, SCALE, UPPER, ServoSimulator
 
@@ -113,7 +113,7 @@ class ServoFit:
         motion = simulator.motion
         everything = simulator.positions(found.path) - np.asarray(motion.positions)
         typical = typical_errors(motion, sustained_errors(motion, everything))
-        combinations, *distribution = _determined(_Rows.of(found), found, joint_names)
+        combinations, covariance, dof = _determined(_Rows.of(found), found, joint_names)
         positions, lacking = np.asarray(motion.positions), []
         for j, name in enumerate(joint_names):
             kept = np.asarray(motion.counted)[:, j] > 0
@@ -137,7 +137,8 @@ class ServoFit:
             joint_names,
             found.parameters,
             found.free,
-            *distribution,
+            covariance,
+            dof,
             combinations,
             linear,
             simulator.hold,
@@ -145,7 +146,11 @@ class ServoFit:
             np.sqrt(mean_squares(motion, found.sums)),
             motion.names,
             typical,
-            contacts(motion, everything, typical),
+            # The motions of a fit begin later than the logs.
+            tuple(
+                c._replace(start=c.start + HISTORY, stop=c.stop + HISTORY)
+                for c in contacts(motion, everything, typical)
+            ),
             simulator.bodies,
             np.abs(load).mean(axis=(0, 2)),
             (*notes, *([missing] if lacking else [])),

@@ -12,7 +12,7 @@ at rest without creep. The steps are of second order and L-stable, so that $J \t
 import dataclasses
 import functools
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -166,7 +166,7 @@ class Forces(NamedTuple):
     falling: Array
 
     @classmethod
-    def of(cls, q: Array, w: Array, theta: Array, stages: Stages, h: AnyArray) -> "Forces":
+    def of(cls, q: Array, w: Array, theta: Any, stages: Stages, h: AnyArray) -> "Forces":
         """Return the forces at positions and velocities before a stage.
 
         Args:

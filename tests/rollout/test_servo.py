@@ -325,6 +325,19 @@ def test_logs_that_cannot_be_used_are_rejected():
         jid.identify_rollout(moving, joint_names=["one"])
 
 
+def test_contact_in_a_log_of_the_fit_is_left_out_and_named():
+    """It lasts so long that the errors' mean square is that of the contact."""
+    blocked = servo_arm.log(9, duration=30.0, block=0.05)
+    logs = [servo_arm.log(0), servo_arm.log(2), servo_arm.log(3), blocked]
+    found = jid.identify_rollout(logs, servo_arm.bodies(), friction=False, saturation=False)
+    assert {(c.name, c.joint) for c in found.contacts} == {("motion 9", 1)}
+    K = servo_arm.KP[1]
+    assert found.of_parameter("F")[1] == pytest.approx(servo_arm.FRICTION[1] / K, rel=0.05)
+    again = found.validate(blocked).contacts
+    starts, others = ([c.start for c in x] for x in (found.contacts, again))
+    np.testing.assert_allclose(starts, others, atol=0.05)
+
+
 def test_contact_needs_a_joint_that_does_not_move():
     sent = np.sin(np.linspace(0.0, 20.0, 1000))
     simulator, _ = _one_joint(sent)
