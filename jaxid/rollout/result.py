@@ -368,7 +368,8 @@ class _Rows(NamedTuple):
     def covariance(self, columns: list, own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return covariance and degrees of freedom if only some parameters are unknown.
 
-        The spectral sandwich; where motions differ more than it explains, their scatter.
+        The spectral sandwich, at least that of independent errors; where motions differ more than
+        it explains, their scatter.
         """
         motion, (motions, joints) = self.found.simulator.motion, self.weights.shape
         B, place = np.zeros_like(self.information), np.ix_(own, own)
@@ -385,6 +386,8 @@ class _Rows(NamedTuple):
             float(motion.sample_time.mean()),
         )
         variance, dof = (x[0] for x in found)
+        samples = np.asarray(motion.counted).sum(axis=-1).max()
+        variance = np.maximum(variance, np.diag(B) / max(float(samples), 1.0))
         size = np.sqrt(np.maximum(np.diag(B), 1e-300))
         changes = self.scores @ B
         scatter = motions / max(motions - 1, 1) * (changes**2).sum(axis=0)

@@ -17,6 +17,7 @@ from jaxid.rollout.identify import mask
 from jaxid.rollout.least_squares import bounded_step, minimise
 from jaxid.rollout.motion import ServoMotion
 from jaxid.rollout.refine import Refinement
+from jaxid.rollout.result import _Rows
 from jaxid.rollout.servo import INDEX, LOWER, START, ServoSimulator
 
 
@@ -277,6 +278,17 @@ def test_mujoco_moves_like_the_simulation(fit, tmp_path):
     values = simulator_values(fit)
     np.testing.assert_allclose(values["armature"][1], servo_arm.ARMATURE[1], rtol=0.02)
     assert "other joints" in str(simulator_table(fit)) or np.isfinite(fit.stiffness).all()
+
+
+def test_deviations_are_at_least_those_of_independent_errors():
+    """Errors that alternate have no part that slow sensitivities could average."""
+    simulator, x, free = _arm(None, True)
+    found = Refinement.of(simulator, x, free & mask(("J", "B", "d", "F"))[None])
+    alternating = 1e-3 * (-1.0) ** np.arange(found.residuals.shape[-1])
+    found.__dict__["residuals"] = alternating * simulator.motion.counted
+    rows = _Rows.of(found)
+    covariance, _ = rows.covariance(rows.columns, np.arange(8))
+    assert (np.diag(covariance) > 0.999 * np.diag(rows.white)).all()
 
 
 def test_stiffness_and_delay_of_a_slow_ramp_are_merged():
