@@ -351,12 +351,6 @@ class _Rows(NamedTuple):
         return cls(found, weights, np.stack(imitated), np.stack(scores), information)
 
     @property
-    def white(self) -> np.ndarray:
-        """Covariance of the parameters if errors were independent."""
-        samples = np.asarray(self.found.simulator.motion.counted).sum(axis=-1)
-        return _inverse(self.information) / max(float(samples.max()), 1.0)
-
-    @property
     def columns(self) -> list[np.ndarray]:
         """Sensitivities of each motion and joint [parameters, samples]."""
         found = []
@@ -386,6 +380,7 @@ class _Rows(NamedTuple):
             float(motion.sample_time.mean()),
         )
         variance, dof = (x[0] for x in found)
+        # The sandwich is blind where no error can show: there the information alone tells.
         samples = np.asarray(motion.counted).sum(axis=-1).max()
         variance = np.maximum(variance, np.diag(B) / max(float(samples), 1.0))
         size = np.sqrt(np.maximum(np.diag(B), 1e-300))
@@ -433,9 +428,9 @@ def _determined(
     covariance, every_dof = rows.covariance(columns, np.arange(len(x)))
     size = np.maximum(np.abs(x), 0.1 * SCALE[symbols])
     wider = special.stdtrit(every_dof, 0.975) / special.ndtri(0.975) / size
-    # The sandwich is blind where no error can show: there the information alone tells.
-    known = covariance * np.outer(wider, wider) + rows.white / np.outer(size, size)
-    own, kappa = _merge(known, np.maximum(np.abs(x), SCALE[symbols]) / size)
+    own, kappa = _merge(
+        covariance * np.outer(wider, wider), np.maximum(np.abs(x), SCALE[symbols]) / size
+    )
     kappa = kappa * size[own][:, None] / size[None, :]
     reduced, dof = rows.covariance(columns, own)
     combinations = []
