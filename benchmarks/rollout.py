@@ -35,7 +35,8 @@ from jaxid.dynamics.terms import Tanh
 from jaxid.rollout.identify import LIGHT
 from jaxid.rollout.least_squares import minimise
 from jaxid.rollout.motion import ServoMotion
-from jaxid.rollout.servo import INDEX, LOWER, SCALE, START, UPPER, ServoSimulator
+from jaxid.rollout.servo import INDEX, LOWER, SCALE, START, UPPER
+from jaxid.rollout.uncoupled import ServoSimulator
 
 try:
     import mujoco.sysid as peer

@@ -231,7 +231,9 @@ class Logs:
         }
 
 
-SERVO_KEYS = ("bodies", "stiffness", "time_step", "friction", "saturation", "samples")
+SERVO_OPTIONS = ("stiffness", "time_step", "friction", "saturation", "integral")
+"""Arguments of `identify_rollout` among the keys of `[rollout]`."""
+SERVO_KEYS = (*SERVO_OPTIONS, "bodies", "samples")
 """Keys of `[rollout]` for logs of commands; the others are for logs of torques."""
 
 
@@ -241,11 +243,12 @@ class Rollout:
 
     Attributes:
         bodies: Whether the bodies of the robot's file load the joints; by default if it has some.
-        stiffness: Stiffness of the servos [N m/rad or N/m], like `12.0`, or a list: only where no
-            weight tells it, for simulators.
+        stiffness: Stiffness (proportional gain) of the servos if it is known [N m/rad or N/m], like
+            `12.0`, or a list with `nan` where it is not; otherwise a known weight tells it.
         time_step: Longest step of the simulation [s].
         friction: Whether friction that grows with load or falls with speed is tried.
         saturation: Whether a largest torque of the servo is tried.
+        integral: Whether the servos have integral action (PID instead of PD controllers).
         samples: Number of MJCF files drawn from the distribution of the estimates.
         horizon: With torques: length of the windows that are simulated [s].
         gains: With torques: whether gains of the other joints' torques, relative to the first
@@ -255,10 +258,11 @@ class Rollout:
     """
 
     bodies: bool | None = None
-    stiffness: Positive | list[Positive] | None = None
+    stiffness: Positive | list[float] | None = None
     time_step: Positive = 0.01
     friction: bool = True
     saturation: bool = True
+    integral: bool = False
     samples: Annotated[int, Bounds(least=0, most=10_000)] = 0
     horizon: Positive = 0.2
     gains: bool = False

@@ -12,6 +12,7 @@ from jaxid.rollout import compare_methods, identify_rollout, identify_torque_rol
 from .decoder import within
 from .experiment import Experiment
 from .identify_logs import Stages, findings, load_log, require_motion, select_filter
+from .model_and_log_tables import SERVO_OPTIONS
 
 
 def identify_rollouts(
@@ -41,12 +42,11 @@ def _with_commands(experiment, logs, verify, options, settings, stage) -> Rollou
         seen,
         experiment.bodies(),
         joint_names=experiment.robot.joint_names,
-        **{key: options[key] for key in ("time_step", "friction", "saturation")},
+        **{key: options[key] for key in SERVO_OPTIONS},
     )
     stage("simulating")
     errors, windows = fit.validate(unseen or seen), fit.window_errors(unseen or seen)
-    numbers = options["stiffness"], options["samples"]
-    return RolloutReport(fit, errors, windows, bool(unseen), *numbers, settings)
+    return RolloutReport(fit, errors, windows, bool(unseen), options["samples"], settings)
 
 
 def _with_torques(experiment, logs, verify, options, settings, stage) -> TorqueRolloutReport:

@@ -27,7 +27,8 @@ def servo_stiffness(
 
     Args:
         fit: Identified servos.
-        stiffness: Stiffness, one for all joints or one for each [N m/rad or N/m].
+        stiffness: Stiffness, one for all joints or one for each; that of the fit if None
+            [N m/rad or N/m].
 
     Raises:
         InputError: If no joint tells its stiffness and none is given.
@@ -58,13 +59,14 @@ def simulator_values(
 
     Returns:
         `stiffness`, `damping`, `armature`, `friction`, `effort_limit` (infinite without), `delay`
-        [s], and `offset` of the command.
+        [s], `offset` of the command, and `integral_gain`.
     """
     x = fit.parameters if parameters is None else np.asarray(parameters)
     K, at = servo_stiffness(fit, stiffness), {key: x[:, k] for key, k in INDEX.items()}
     if stiffness is None:
         # A draw has its own stiffness where the weight tells it.
-        K = np.where(np.isfinite(fit.stiffness), 1.0 / np.maximum(at["a"], 1e-9), K)
+        told = np.isfinite(fit.stiffness) & fit.free[:, INDEX["a"]]
+        K = np.where(told, 1.0 / np.maximum(at["a"], 1e-9), K)
     own = np.zeros(len(x))
     if fit.bodies is not None:
         # The simulator adds the inertia of the bodies, unless that has been taken out already.
@@ -80,6 +82,7 @@ def simulator_values(
         "effort_limit": np.where(limited, K * at["um"], np.inf),
         "delay": at["d"],
         "offset": at["b"],
+        "integral_gain": K * at["ki"],
     }
 
 
@@ -91,17 +94,20 @@ def simulator_table(fit: ServoFit, stiffness: Numbers | None = None) -> Table:
         stiffness: Stiffness of each servo, if a weight does not tell it [N m/rad or N/m].
     """
     values = simulator_values(fit, stiffness)
-    units = ("N m/rad", "N m s/rad", "kg m²", "N m", "N m", "s", "rad")
+    units = ("N m/rad", "N m s/rad", "kg m²", "N m", "N m", "s", "rad", "N m/(rad s)")
     if fit.bodies is not None and not all(fit.bodies.model.robot.revolute):
-        linear = ("N/m", "N s/m", "kg", "N", "N", "s", "m")
+        linear = ("N/m", "N s/m", "kg", "N", "N", "s", "m", "N/(m s)")
         units = [a if a == b else f"{a} or {b}" for a, b in zip(units, linear, strict=True)]
     columns = [
         Column(name.replace("_", " "), value, unit)
         for (name, value), unit in zip(values.items(), units, strict=True)
+        if name != "integral_gain" or value.any()
     ]
-    known = np.isfinite(fit.stiffness)
+    given, known = fit.given_stiffness, np.isfinite(fit.stiffness)
+    given = np.full(known.shape, stiffness is not None) if given is None else np.isfinite(given)
     source = [
-        "given" if stiffness is not None else "weight" if k else "other joints" for k in known
+        "given" if named else "weight" if told else "other joints"
+        for named, told in zip(given, known, strict=True)
     ]
     remarks = []
     if (values["delay"] < 0).any():
@@ -134,6 +140,7 @@ def export_servo_mjcf(
 
     Controls are the commanded positions, one each in the order of the joints. MJCF has no delay of
     commands and no bias: both stand in a comment and in `<custom>` numbers (`delay`, `offset`).
+    Servos with integral action are `mujoco.pid` plugins, which come with MuJoCo.
 
     Args:
         fit: Identified servos of a robot whose bodies are known.
@@ -166,7 +173,7 @@ def servo_mjcf(fit: ServoFit, values: dict[str, Any], timestep: float) -> str:
     text = mjcf_text(model.robot, rigid, values, timestep, " Delays [s] and offsets in <custom>. ")
     root = etree.fromstring(text)
     root.find("option").set("integrator", "implicitfast")
-    actuators = root.find("actuator")
+    actuators, integral = root.find("actuator"), values["integral_gain"]
     for joint in root.iter("joint"):
         # MuJoCo takes no stiffer friction than that of two time steps.
         joint.set("solreffriction", f"{2.0 * timestep!r} 1")
@@ -174,10 +181,20 @@ def servo_mjcf(fit: ServoFit, values: dict[str, Any], timestep: float) -> str:
     for k, motor in enumerate(list(actuators)):
         name, K, limit = fit.joint_names[k], values["stiffness"][k], values["effort_limit"][k]
         actuators.remove(motor)
-        servo = etree.SubElement(actuators, "position", name=name, joint=motor.get("joint"))
-        servo.set("kp", repr(float(K)))
+        kind = "plugin" if integral[k] > 0.0 else "position"
+        servo = etree.SubElement(actuators, kind, name=name, joint=motor.get("joint"))
+        if integral[k] > 0.0:
+            servo.set("plugin", "mujoco.pid")
+            servo.set("actdim", "1")
+            for key, gain in (("kp", K), ("ki", integral[k])):
+                etree.SubElement(servo, "config", key=key, value=repr(float(gain)))
+        else:
+            servo.set("kp", repr(float(K)))
         if np.isfinite(limit):
             servo.set("forcerange", f"{-float(limit)!r} {float(limit)!r}")
+    if integral.any():
+        extension = etree.SubElement(root, "extension")
+        etree.SubElement(extension, "plugin", plugin="mujoco.pid")
     custom = etree.SubElement(root, "custom")
     for key in ("delay", "offset"):
         numbers = " ".join(repr(float(x)) for x in values[key])

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxid.arrays import Float
-from jaxid.export.servo import export_servo_mjcf, servo_stiffness, simulator_table, simulator_values
+from jaxid.export.servo import export_servo_mjcf, simulator_table, simulator_values
 from jaxid.io import atomic_folder
 from jaxid.result_table import Column, Remark, Status, Table, significant
 from jaxid.rollout import PARAMETERS, RolloutErrors, ServoFit
@@ -29,7 +29,6 @@ class RolloutReport(NamedTuple):
         errors: Errors of free-running simulations.
         windows: Errors of windows of one second that start from measured states [rad or m].
         unseen: Whether these logs were not used for the fit.
-        stiffness: Stiffness of the servos, if the file gives it [N m/rad or N/m].
         samples: Number of MJCF files to draw.
         settings: Facts, command and text of the experiment file.
     """
@@ -38,7 +37,6 @@ class RolloutReport(NamedTuple):
     errors: RolloutErrors
     windows: Float[np.ndarray, " joints"]
     unseen: bool
-    stiffness: Any
     samples: int
     settings: Mapping[str, Any]
 
@@ -50,7 +48,7 @@ class RolloutReport(NamedTuple):
     @property
     def has_stiffness(self) -> bool:
         """Whether simulators can be given absolute numbers."""
-        return self.stiffness is not None or bool(np.isfinite(self.fit.stiffness).any())
+        return bool(np.isfinite(self.fit.stiffness).any())
 
     def write(self, folder: Path) -> list[Path]:
         """Write the page, `rollout.json`, `rollout.csv`, and MJCF if bodies are known."""
@@ -59,7 +57,7 @@ class RolloutReport(NamedTuple):
     def tables(self) -> list[Table]:
         """Return estimates, errors beside the baselines and by motion, numbers for simulators."""
         found = [self.fit.summary(), comparison_table(self), self.errors.summary()]
-        return [*found, simulator_table(self.fit, self.stiffness)] if self.has_stiffness else found
+        return [*found, simulator_table(self.fit)] if self.has_stiffness else found
 
 
 def comparison_table(report: RolloutReport) -> Table:
@@ -130,7 +128,7 @@ def rollout_page(report: RolloutReport, figures: Sequence[Figure]) -> str:
     parameters = fit.summary()
     simulators: list[Any] = ["No weight tells a stiffness: name it by `rollout.stiffness`."]
     if report.has_stiffness:
-        simulators = [simulator_table(fit, report.stiffness)]
+        simulators = [simulator_table(fit)]
     sections: list[Section] = [
         ("Verdict", [report.verdict, parameters.remarks]),
         ("Errors", [comparison_table(report), errors.summary()]),
@@ -169,8 +167,7 @@ def write_rollout(folder: Path, report: RolloutReport) -> list[Path]:
     names = ["rollout.html", "rollout.json", "rollout.csv"]
     with atomic_folder(folder) as staging:
         if report.has_stiffness and fit.bodies is not None:
-            options = {"stiffness": report.stiffness, "samples": report.samples}
-            made = export_servo_mjcf(fit, staging / "robot.xml", **options)
+            made = export_servo_mjcf(fit, staging / "robot.xml", samples=report.samples)
             names += [p.name for p in made]
         write_json(staging / "rollout.json", {**_record(report, rows), "files": names})
         write_csv(staging / "rollout.csv", rows)
@@ -184,7 +181,7 @@ def _record(report: RolloutReport, rows: list[dict[str, Any]]) -> dict[str, Any]
     fit, errors = report.fit, report.errors
     simulators = None
     if report.has_stiffness:
-        values = simulator_values(fit, servo_stiffness(fit, report.stiffness))
+        values = simulator_values(fit)
         limits = values.pop("effort_limit")
         simulators = {**values, "effort_limit": np.where(np.isfinite(limits), limits, -1.0)}
     return plain(

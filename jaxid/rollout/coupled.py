@@ -26,6 +26,7 @@ from .servo import (
     Forces,
     Partials,
     Stages,
+    State,
     commands_of_stages,
     moved,
     partials,
@@ -48,14 +49,12 @@ class Path(NamedTuple):
     """Simulation of several motions; the last axis is that of the motions.
 
     Attributes:
-        before: Positions before each stage [steps, stages, joints, motions].
-        velocity: Velocities before each stage.
+        before: States before each stage [steps, stages, joints, motions].
         within: Velocities in the stages, zero where friction holds a joint.
         positions: Positions behind each step [steps, joints, motions].
     """
 
-    before: AnyArray
-    velocity: AnyArray
+    before: State
     within: AnyArray
     positions: AnyArray
 
@@ -68,25 +67,26 @@ def _simulate(
     h = jnp.asarray(motion.sample_time)[None] / steps
     share, ahead = jnp.array([1.0 - GAMMA, GAMMA]), jnp.array([(1.0 - GAMMA) / GAMMA, 1.0])
 
-    def step(state: tuple[Array, ...], commands: Array):
-        q, w, last = state
-        M, load = None, jnp.zeros_like(q)
+    def step(states: tuple[State, Array], commands: Array):
+        before, last = states
+        M, load = None, jnp.zeros_like(last)
         if programs is not None:
-            M, load = lower(programs.bodies).dense(*middle_of(q, w, last, h))
+            M, load = lower(programs.bodies).dense(*middle_of(before.q, before.w, last, h))
 
-        def stage(state: tuple[Array, Array], own: tuple[Array, ...]):
+        def stage(state: State, own: tuple[Array, ...]):
             inputs = Stages(own[0], load, jnp.zeros_like(load), *own[1:])
-            u = _within(programs, *state, of_joints, inputs, M, h)
-            return moved(*state, u, inputs, h), (*state, u)
+            x = Forces.of(state, of_joints, inputs, h)
+            u = _within(programs, x, state.w, of_joints, inputs, M, h)
+            return moved(state, u, x, inputs, h), (state, u)
 
-        (q, after), stages = jax.lax.scan(stage, (q, w), (commands, share, ahead))
-        return (q, after, w), (*stages, q)
+        after, stages = jax.lax.scan(stage, before, (commands, share, ahead))
+        return (after, before.w), (*stages, after.q)
 
-    q, v = jnp.moveaxis(jnp.asarray(motion.start), 0, -1)
+    start = State(*jnp.moveaxis(jnp.asarray(motion.start), 0, -1))
     commands = jax.vmap(lambda x, y: commands_of_stages(x.T, y, steps, hold), (-1, 0), -1)
     commands = commands(theta, motion)
     of_joints, by_step = tuple(theta), commands.reshape(-1, 2, *commands.shape[1:])
-    return Path(*jax.lax.scan(step, (q, v, v), by_step)[1])
+    return Path(*jax.lax.scan(step, (start, start.w), by_step)[1])
 
 
 def middle_of(q: Any, v: Any, last: Any, h: Any) -> tuple[Any, Any]:
@@ -103,7 +103,7 @@ def middle_of(q: Any, v: Any, last: Any, h: Any) -> tuple[Any, Any]:
 
 def _within(
     programs: Programs | None,
-    q: Array,
+    x: Forces,
     w: Array,
     theta: tuple[Array, ...],
     stage: Stages,
@@ -111,7 +111,6 @@ def _within(
     h: AnyArray,
 ) -> Array:
     """Return the velocities in a stage [joints, motions]."""
-    x = Forces.of(q, w, theta, stage, h)
     if programs is None or M is None:
         slip = x.slip(w, stage, x.force)
         return slip.free * (x.force + x.inertia * w - x.friction * slip.direction) / x.resistance
@@ -140,9 +139,10 @@ def _partials(
     theta: Array, motion: ServoMotion, hold: AnyArray, path: Path, others: Array, steps: int
 ) -> Partials:
     """Return the derivatives of the balance of forces in all stages of one motion [stages, ...]."""
-    q, w, u, others = (jnp.reshape(x, (-1, len(theta))) for x in (*path[:3], others))
+    terms = path.before, path.within, others
+    state, u, others = jax.tree.map(lambda x: jnp.reshape(x, (-1, len(theta))), terms)
     stages, by_delay = Stages.with_delay(theta, motion, steps, hold)
-    return partials(q, w, u, theta, stages, by_delay, motion.sample_time / steps, others)
+    return partials(state, u, theta, stages, by_delay, motion.sample_time / steps, others)
 
 
 class _BodyTerms(NamedTuple):
@@ -194,7 +194,7 @@ class CoupledSimulator:
         theta = np.repeat(theta.T, self.motion.motions // len(theta), axis=-1)
         with double_precision():
             found = _simulate(programs, self.steps, jnp.asarray(theta), motion, np.array(self.hold))
-            return Path(*map(np.asarray, found))
+            return jax.tree.map(np.asarray, found)
 
     def positions(self, path: Path) -> Float[np.ndarray, "motions joints samples"]:
         """Return the positions of all samples."""
@@ -208,12 +208,15 @@ class CoupledSimulator:
         """Return derivatives of the positions.
 
         They are those by the free parameters, joint by joint, and then by the motion's initial
-        positions and velocities.
+        states.
         """
         motions, n, samples = self.motion.motions, len(theta), self.motion.positions.shape[-1]
         found = [self._transitions(k, np.asarray(theta), path, free) for k in range(motions)]
-        state = np.zeros((motions, 3 * n, free.sum() + 2 * n))
-        state[:, :n, -2 * n : -n] = state[:, n : 2 * n, -n:] = state[:, 2 * n :, -n:] = np.eye(n)
+        size = self.motion.start[0].size
+        state = np.zeros((motions, size + n, free.sum() + size))
+        state[:, :size, -size:] = np.eye(size)
+        # The velocity before is that of the start, too.
+        state[:, size:] = state[:, n : 2 * n]
         S = np.zeros((motions, n, samples, state.shape[-1]))
         S[:, :, 0] = state[:, :n]
         blocks = [slice(k, min(k + BLOCK, samples - 1)) for k in range(0, samples - 1, BLOCK)]
@@ -224,7 +227,7 @@ class CoupledSimulator:
             T, C = (np.stack(x, axis=1) for x in zip(*own, strict=True))
             for k in range(rows.stop - rows.start):
                 state = T[k] @ state
-                state[..., : -2 * n] += C[k]
+                state[..., :-size] += C[k]
                 state *= np.abs(state) > FADED
                 S[:, :, rows.start + k + 1] = state[:, :n]
         return S
@@ -234,13 +237,12 @@ class CoupledSimulator:
     ) -> Callable[[slice], tuple[np.ndarray, np.ndarray]]:
         """Return a function of some samples: derivatives of the state behind each sample time.
 
-        By the state before (positions, velocities, velocities a step before), and by the free
-        parameters.
+        By the state before, with the velocities a step before, and by the free parameters.
         """
-        part, own = self.motion.part(motion), Path(*(x[..., motion] for x in path))
+        part, own = self.motion.part(motion), jax.tree.map(lambda x: x[..., motion], path)
         part = dataclasses.replace(part, lengths=(), names=())
         steps, h = self.steps, float(part.sample_time) / self.steps
-        slope = (own.velocity - own.within) / (GAMMA * h)
+        slope = (own.before.w - own.within) / (GAMMA * h)
         M, load, middle = self._body_terms(own, h)
         inertia = np.diagonal(M, axis1=1, axis2=2)
         others = np.einsum("tij,tsj->tsi", M, slope) - inertia[:, None] * slope
@@ -253,7 +255,7 @@ class CoupledSimulator:
             return np.asarray(x).reshape(-1, steps, *np.shape(x)[1:])
 
         local = jax.tree.map(lambda x: by_sample(x).reshape(-1, steps, 2, x.shape[-1]), found)
-        within, slope = by_sample(own.within), by_sample(slope)
+        within, slope, size = by_sample(own.within), by_sample(slope), part.start.size
 
         def one(rows: slice):
             some = jax.tree.map(lambda x: x[rows], local)
@@ -263,14 +265,14 @@ class CoupledSimulator:
                 derivatives = evaluate(self.bodies.programs.derivatives, *inside)
                 derivatives = (by_sample(np.moveaxis(x, -1, 0)) for x in derivatives)
                 terms = _BodyTerms(by_sample(M)[rows], *derivatives)
-            return _compose(theta, some, within[rows], slope[rows], terms, free, h)
+            return _compose(theta, some, within[rows], slope[rows], terms, free, h, size)
 
         return one
 
     def _body_terms(self, path: Path, h: float):
         """Return mass matrices and bias forces of all steps of a motion, and where they count."""
-        v = path.velocity[:, 0]
-        middle = middle_of(path.before[:, 0], v, np.concatenate([v[:1], v[:-1]]), h)
+        v = path.before.w[:, 0]
+        middle = middle_of(path.before.q[:, 0], v, np.concatenate([v[:1], v[:-1]]), h)
         if self.bodies is None:
             return np.zeros((*v.shape, v.shape[1])), np.zeros_like(v), middle
         terms = evaluate(self.bodies.programs.bodies, *(x.T for x in middle))
@@ -285,6 +287,7 @@ def _compose(
     terms: _BodyTerms | None,
     free: np.ndarray,
     h: float,
+    size: int,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return derivatives of the states behind sample times by those before, and by parameters.
 
@@ -296,13 +299,13 @@ def _compose(
         terms: Terms of the bodies [samples, steps, ...].
         free: Free parameters.
         h: Time of a step [s].
+        size: Size of the state of all joints.
     """
     count, steps, _, n = within.shape
     joint, symbol = np.nonzero(free)
-    columns = 3 * n + np.arange(len(joint))
-    q, w, last = np.zeros((3, count, n, 3 * n + len(joint)))
-    for k, x in enumerate((q, w, last)):
-        x[:, range(n), range(k * n, (k + 1) * n)] = 1.0
+    columns = size + n + np.arange(len(joint))
+    state = np.tile(np.eye(size + n, size + n + len(joint)), (count, 1, 1))
+    q, w, *integral, last = np.split(state, 1 + size // n, axis=1)
     middle = q, w
     for k, s in np.ndindex(steps, 2):
         if s == 0:
@@ -310,6 +313,8 @@ def _compose(
         at = jax.tree.map(lambda x, k=k, s=s: x[:, k, s], local)
         moves = (within[:, k, s] != 0.0)[..., None]
         force = at.by_q[..., None] * q + at.by_w[..., None] * w
+        for x in integral:
+            force += at.by_integral[..., None] * x
         force[:, joint, columns] += np.stack(at.by_theta, axis=1)[:, symbol, joint]
         A = at.resistance[..., None] * np.eye(n)
         if terms is not None:
@@ -319,10 +324,14 @@ def _compose(
             force += by_w @ w + by_q @ middle[0] + by_v @ middle[1]
         change = np.linalg.solve(A, force * moves)
         share, ahead = ((1.0 - GAMMA, (1.0 - GAMMA) / GAMMA), (GAMMA, 1.0))[s]
+        for x in integral:
+            growth = -at.rate[..., None] * (q + GAMMA * h * change)
+            growth[:, joint, columns] += np.stack(at.growth, axis=1)[:, symbol, joint]
+            integral = [x + share * h * growth]
         q = q + share * h * change
         w = (w + ahead * (change - w)) * moves
-    state = np.concatenate([q, w, last], axis=1)
-    return state[..., : 3 * n], state[..., 3 * n :]
+    state = np.concatenate([q, w, *integral, last], axis=1)
+    return state[..., : size + n], state[..., size + n :]
 
 
 def _derivatives_of_bodies(

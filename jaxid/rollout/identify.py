@@ -12,7 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
-from jaxid.arrays import Bool
+from jaxid.arrays import Bool, Float, Numbers
 from jaxid.errors import InputError
 from jaxid.measurement.recording import Recording
 
@@ -23,7 +23,8 @@ from .least_squares import Solution, bounded_step, minimise
 from .motion import ServoMotion
 from .refine import RESOLUTION, Refinement, refine, weights_of
 from .result import ServoFit
-from .servo import INDEX, LOWER, START, UPPER, ServoSimulator
+from .servo import INDEX, LOWER, SCALE, START, UPPER, with_integral
+from .uncoupled import ServoSimulator
 
 BASIC = ("J", "B", "d", "F", "b")
 """Parameters of every joint, before the choice."""
@@ -57,6 +58,8 @@ def identify_rollout(
     time_step: float = 0.01,
     saturation: bool = True,
     friction: bool = True,
+    integral: bool = False,
+    stiffness: Numbers | None = None,
 ) -> ServoFit:
     """Identify position-controlled joints so that a simulation moves like the robot.
 
@@ -65,7 +68,8 @@ def identify_rollout(
     `jid.Columns(angles="position{}", forces="command{}")`.
 
     Positions tell torques in units of the servo's stiffness: the parameters are ratios to it. With
-    bodies of known weight the stiffness itself follows where gravity acts on the joint.
+    bodies of known weight the stiffness itself follows where gravity acts on the joint, unless it
+    is given.
 
     Args:
         logs: One or several recordings of the same robot and controller.
@@ -76,9 +80,13 @@ def identify_rollout(
         time_step: Longest step of the simulation [s].
         saturation: Whether a largest torque of the servo is tried.
         friction: Whether friction that grows with load or falls with speed is tried.
+        integral: Whether the servos have integral action (PID instead of PD controllers).
+        stiffness: Known proportional gains of the servos, one for all or one for each joint, NaN
+            where unknown [N m/rad or N/m].
 
     Raises:
-        InputError: If logs differ in their joints, are too short, or do not move.
+        InputError: If logs differ in their joints, are too short, or do not move, or if the
+            stiffness does not fit the joints.
     """
     logs = [logs] if isinstance(logs, Recording) else list(logs)
     motion = ServoMotion.of(_divided(logs)).known()
@@ -87,7 +95,10 @@ def identify_rollout(
     # Choices show in long steps, too.
     coarse = max(time_step, float(motion.sample_time.max()))
     motion = motion if bodies is None else bodies.loads(motion)
-    search = _Search(ServoSimulator(motion, coarse))
+    given = _known_stiffness(stiffness, len(names))
+    known = None if given is None or bodies is None else given
+    search = _Search(ServoSimulator(motion, coarse), integral, known)
+    motion = search.simulator.motion
     whole = None if bodies is None else bodies.together
     coupled = CoupledSimulator(motion, time_step, False, whole)
     with ThreadPoolExecutor(1) as pool:
@@ -98,8 +109,10 @@ def identify_rollout(
         together = bodies.coupled or search.choose_coupling(whole)
         bodies = whole if together else bodies
         # Inertial torques act on all joints, however badly a log tells them from `J`.
-        search.free[:, INDEX["a"]] |= together
+        search.free[:, INDEX["a"]] |= together & ~search.known
     motion = search.simulator.motion
+    if integral:
+        motion = with_integral(motion, search.x, False)
     coupled = dataclasses.replace(coupled, motion=motion, bodies=bodies)
     held = search.x.copy()
     held[:, INDEX["d"]] -= 0.5 * float(motion.sample_time.mean())
@@ -107,7 +120,7 @@ def identify_rollout(
         Refinement.of(coupled, search.x, search.free),
         Refinement.of(dataclasses.replace(coupled, hold=True), held, search.free),
     )
-    return ServoFit.of(found, search.linear, names, told)
+    return ServoFit.of(found, search.linear, names, told, given)
 
 
 def _divided(logs: Sequence[Recording]) -> list[Recording]:
@@ -151,6 +164,18 @@ def _joint_names(
     return names
 
 
+def _known_stiffness(stiffness: Numbers | None, joints: int) -> Float[np.ndarray, " joints"] | None:
+    if stiffness is None:
+        return None
+    given = np.asarray(stiffness, np.float64)
+    if given.shape not in ((), (joints,)) or (given <= 0.0).any():
+        raise InputError(
+            f"`stiffness` must be a positive number [N m/rad or N/m], or {joints} of them, one for "
+            "each joint."
+        )
+    return np.broadcast_to(given, (joints,)).copy()
+
+
 def mask(symbols: Sequence[str]) -> Bool[np.ndarray, " parameters"]:
     """Return which parameters are among these."""
     return np.isin(list(INDEX), list(symbols))
@@ -174,17 +199,26 @@ class _Search:
         weights: Weight of each motion's squared errors [motions, joints].
         x: Parameters so far [joints, parameters].
         free: Parameters that are estimated.
+        known: Joints whose stiffness is known.
         linear: Parameters of the linear baseline.
     """
 
-    def __init__(self, simulator: ServoSimulator):
-        self.simulator = simulator
+    def __init__(self, simulator: ServoSimulator, integral: bool, stiffness: np.ndarray | None):
         counted = np.asarray(simulator.motion.counted).sum(axis=-1)
         self.weights = 1.0 / np.maximum(counted, 1.0)
         joints = counted.shape[1]
         self.x = np.tile(START, (joints, 1))
         self.free = np.tile(mask(BASIC), (joints, 1))
         self.linear = self.x.copy()
+        self.known = np.zeros(joints, bool) if stiffness is None else np.isfinite(stiffness)
+        if stiffness is not None:
+            self.x[self.known, INDEX["a"]] = 1.0 / stiffness[self.known]
+        motion = simulator.motion
+        if integral:
+            self.x[:, INDEX["ki"]] = SCALE[INDEX["ki"]]
+            self.free[:, INDEX["ki"]] = True
+            motion = with_integral(motion, self.x, False)
+        self.simulator = dataclasses.replace(simulator, motion=motion)
 
     def run(self, loaded: bool, friction: bool, saturation: bool) -> None:
         """Choose the effects of all joints.
@@ -249,7 +283,7 @@ class _Search:
         best = np.argsort(costs, axis=0)[:3]
         x = np.concatenate([np.take_along_axis(grid, best[..., None], axis=0), self.linear[None]])
         x[3] = x[0]
-        x[3, :, INDEX["F"]] = 0.0
+        x[3][:, mask(("F", "a", "ki"))] = 0.0
         free = np.stack([self.free] * 3 + [np.tile(mask(LINEAR), (len(self.x), 1))])
         found = self.solve(x, free, iterations=8)
         self.linear = found.x[3]
@@ -288,10 +322,11 @@ class _Search:
                 x[k, :, INDEX[symbol]] = START[INDEX[symbol]]
             for symbol in effects:
                 x[k, :, INDEX[symbol]] = self._first_value(symbol)
-        # Friction per load needs a load.
-        free[..., INDEX["a"]] &= self._loaded
-        free[..., INDEX["mu"]] &= free[..., INDEX["a"]]
+        free[..., INDEX["a"]] &= self._loaded & ~self.known
         x[..., INDEX["a"]] *= self._loaded
+        x[:, self.known, INDEX["a"]] = self.x[self.known, INDEX["a"]]
+        # Friction per load needs a load.
+        free[..., INDEX["mu"]] &= self._loaded & (x[..., INDEX["a"]] > 0.0)
         found = self.solve(x, free)
         scores = self.held_out(found, free)
         chosen = np.zeros(len(self.x), int)
@@ -329,8 +364,8 @@ class _Search:
     def choose_coupling(self, bodies: Bodies) -> bool:
         """Decide whether inertial torques of the bodies act, beside those of gravity."""
         motion = bodies.loads(self.simulator.motion)
-        x, a = self.x.copy(), self.x[:, INDEX["a"]] * self.free[:, INDEX["a"]]
-        own = a * np.asarray(motion.inertia).mean(axis=(0, 2))
+        x = self.x.copy()
+        own = x[:, INDEX["a"]] * np.asarray(motion.inertia).mean(axis=(0, 2))
         x[:, INDEX["J"]] = np.maximum(x[:, INDEX["J"]] - own, 1e-5)
         scores, results = [], []
         other = dataclasses.replace(self.simulator, motion=motion)

@@ -33,8 +33,9 @@ class ServoMotion(eqx.Module):
         positions: Measured positions [motions, joints, samples].
         load: Torques of the bodies between a sample, or step, and the next one [N m or N].
         inertia: Inertia of the bodies about each joint [kg m² or kg].
-        start: Initial positions and velocities.
+        start: Initial positions and velocities, and integral actions of servos that have them.
         spread: Standard deviations of the initial states.
+        acceleration: Initial accelerations.
         counted: Whether a sample counts in the fit.
         sample_time: Time between two samples of each motion [s].
         lengths: Number of samples of each motion.
@@ -45,8 +46,9 @@ class ServoMotion(eqx.Module):
     positions: Float[AnyArray, "motions joints samples"]
     load: Float[AnyArray, "motions joints instants"]
     inertia: Float[AnyArray, "motions joints instants"]
-    start: Float[AnyArray, "motions 2 joints"]
-    spread: Float[AnyArray, "motions 2 joints"]
+    start: Float[AnyArray, "motions states joints"]
+    spread: Float[AnyArray, "motions states joints"]
+    acceleration: Float[AnyArray, "motions joints"]
     counted: Float[AnyArray, "motions joints samples"]
     sample_time: Float[AnyArray, " motions"]
     lengths: tuple[int, ...] = eqx.field(static=True)
@@ -85,7 +87,7 @@ class ServoMotion(eqx.Module):
             state_at(x[:, :n], 0, float(dt))
             for x, n, dt in zip(positions, lengths, times, strict=True)
         ]
-        start, spread = (np.stack(x) for x in zip(*states, strict=True))
+        start, spread, acceleration = (np.stack(x) for x in zip(*states, strict=True))
         lead = math.ceil(HISTORY / times.min())
         return cls(
             # Before the first command the robot stands still.
@@ -95,6 +97,7 @@ class ServoMotion(eqx.Module):
             inertia=np.zeros_like(positions),
             start=start,
             spread=spread,
+            acceleration=acceleration,
             counted=np.repeat(counted[:, None].astype(float), positions.shape[1], axis=1),
             sample_time=times,
             lengths=lengths,
@@ -102,7 +105,7 @@ class ServoMotion(eqx.Module):
         )
 
     @property
-    def certainty(self) -> Float[np.ndarray, "motions 2 joints"]:
+    def certainty(self) -> Float[np.ndarray, "motions states joints"]:
         """Inverse variance of the initial states, over the number of samples that count."""
         counted = np.maximum(np.asarray(self.counted).sum(axis=-1), 1.0)
         return 1.0 / np.asarray(self.spread) ** 2 / counted[:, None]
@@ -161,13 +164,14 @@ class ServoMotion(eqx.Module):
             state_at(np.asarray(self.positions[k])[:, : self.lengths[k]], a, float(dt))
             for (k, a), dt in zip(places, self.sample_time[[k for k, _ in places]], strict=True)
         ]
-        start, spread = (np.stack(x) for x in zip(*states, strict=True))
+        start, spread, acceleration = (np.stack(x) for x in zip(*states, strict=True))
         index = np.array([k for k, _ in places])
         return self.replace(
             **arrays,
             commands=cut(self.commands, self.lead),
             start=start,
             spread=spread,
+            acceleration=acceleration,
             sample_time=np.asarray(self.sample_time)[index],
             lengths=tuple(self.lengths[k] for k in index),
             names=tuple(self.names[k] for k in index),
@@ -185,8 +189,8 @@ class ServoMotion(eqx.Module):
 
 def state_at(
     q: Float[np.ndarray, "joints samples"], index: int, dt: float
-) -> tuple[Float[np.ndarray, "2 joints"], Float[np.ndarray, "2 joints"]]:
-    """Return positions and velocities at a sample, and their deviations.
+) -> tuple[Float[np.ndarray, "2 joints"], Float[np.ndarray, "2 joints"], np.ndarray]:
+    """Return positions and velocities at a sample, their deviations, and accelerations.
 
     They are those of a parabola through the samples around it. At the start the velocity is that
     of a line, and the position the measured one.
@@ -194,13 +198,15 @@ def state_at(
     near = max(2, round(NEAR / dt))
     first, last = max(0, index - near), min(q.shape[1], index + near + 1)
     t = dt * (np.arange(first, last) - index)
-    A = np.vander(t, 3 if index >= near else 2, increasing=True)
+    inside = index >= near
+    A = np.vander(t, 3 if inside else 2, increasing=True)
     found, *_ = np.linalg.lstsq(A, q[:, first:last].T, rcond=None)
     rest = max(len(t) - A.shape[1], 1)
     error = np.sqrt(np.sum((q[:, first:last].T - A @ found) ** 2, axis=0) / rest)
     rate = np.maximum(error, 0.1 * ROUNDING) / np.sqrt(np.sum((t - t.mean()) ** 2))
-    state = found[0] if index >= near else q[:, index], found[1]
-    return np.stack(state), np.stack([np.maximum(error, ROUNDING), rate])
+    state = np.stack([found[0] if inside else q[:, index], found[1]])
+    spread = np.stack([np.maximum(error, ROUNDING), rate])
+    return state, spread, 2.0 * found[2] if inside else 0.0 * rate
 
 
 def smooth_rates(q: np.ndarray, dt: float, cutoff: float = 8.0) -> tuple[np.ndarray, ...]:

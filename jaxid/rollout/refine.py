@@ -13,7 +13,7 @@ from jaxid.arrays import Array, Bool, Float, double_precision
 from .coupled import CoupledSimulator, Path
 from .least_squares import bounded_step
 from .motion import ServoMotion
-from .servo import LOWER, UPPER
+from .servo import LOWER, UPPER, State
 
 RESOLUTION = 1e-4
 """Errors below which no motion counts more [rad or m]."""
@@ -61,12 +61,13 @@ class Refinement:
         free: Bool[np.ndarray, "joints parameters"],
     ) -> "Refinement":
         """Return simulated joints."""
-        found = cls(simulator, parameters, free, Path(*[np.zeros(0)] * 4))
+        empty = np.zeros(0)
+        found = cls(simulator, parameters, free, Path(State(empty, empty), empty, empty))
         return found.with_unknowns([found.unknowns])[0]
 
     @property
     def unknowns(self) -> Float[np.ndarray, " unknowns"]:
-        """Free parameters, joint by joint, then positions and velocities of each motion's start."""
+        """Free parameters, joint by joint, then the initial state of each motion."""
         start = np.asarray(self.simulator.motion.start)
         return np.concatenate([self.parameters[self.free], start.ravel()])
 
@@ -82,10 +83,15 @@ class Refinement:
         spare = [motion] * (len(DAMPINGS) - len(motions))
         every = every.replace(start=np.concatenate([x.start for x in (*motions, *spare)]))
         path = dataclasses.replace(self.simulator, motion=every).simulate(theta)
-        paths = zip(*(np.split(x, len(DAMPINGS), axis=-1) for x in path), strict=True)
+        parts = [slice(k * motion.motions, (k + 1) * motion.motions) for k in range(len(motions))]
         return [
-            Refinement(dataclasses.replace(self.simulator, motion=own), x, self.free, Path(*p))
-            for own, x, p in zip(motions, theta, paths, strict=False)
+            Refinement(
+                dataclasses.replace(self.simulator, motion=own),
+                x,
+                self.free,
+                jax.tree.map(lambda y, part=part: y[..., part], path),
+            )
+            for own, x, part in zip(motions, theta, parts, strict=False)
         ]
 
     @cached_property
@@ -128,9 +134,8 @@ class Refinement:
 
     def moments(self, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return gradient and Gauss-Newton matrix of the weighted squares, by the unknowns."""
-        motions, joints = weights.shape
-        count = int(self.free.sum())
-        size, each = count + 2 * motions * joints, 2 * joints
+        count, each = int(self.free.sum()), self.simulator.motion.start[0].size
+        size = count + len(weights) * each
         g, H = np.zeros(size), np.zeros((size, size))
         for k, (w, own_g, own_H) in enumerate(zip(weights, *self.products, strict=True)):
             own = np.r_[:count, count + k * each : count + (k + 1) * each]

@@ -19,7 +19,8 @@ from .coupled import CoupledSimulator
 from .errors import RolloutErrors
 from .motion import HISTORY, ServoMotion
 from .refine import Refinement, mean_squares, weights_of
-from .servo import INDEX, LOWER, PARAMETERS, SCALE, UPPER, ServoSimulator
+from .servo import INDEX, LOWER, PARAMETERS, SCALE, UPPER, with_integral
+from .uncoupled import ServoSimulator
 
 UNDETERMINED = 0.25
 """Standard deviation, relative to a parameter's size, above which it is not determined."""
@@ -80,6 +81,7 @@ class ServoFit:
         load: Mean absolute load of each joint in the logs [N m or N].
         notes: Doubts about the model, in sentences.
         hold_is_told: Whether the logs tell held commands from interpolated ones.
+        given_stiffness: Stiffness of each servo as far as it was given, else NaN [N m/rad or N/m].
     """
 
     joint_names: tuple[str, ...]
@@ -99,6 +101,7 @@ class ServoFit:
     load: Float[np.ndarray, " joints"]
     notes: tuple[str, ...] = ()
     hold_is_told: bool = True
+    given_stiffness: Float[np.ndarray, " joints"] | None = None
 
     @classmethod
     def of(
@@ -107,6 +110,7 @@ class ServoFit:
         linear: Float[np.ndarray, "joints parameters"],
         joint_names: tuple[str, ...],
         hold_is_told: bool = True,
+        given_stiffness: Float[np.ndarray, " joints"] | None = None,
     ) -> "ServoFit":
         """Return the fit of a refinement, with its uncertainty."""
         simulator, r = found.simulator, found.residuals
@@ -128,7 +132,8 @@ class ServoFit:
         missing = (
             f"errors are larger than an encoder's rounding and change slowly "
             f"({', '.join(lacking)} mrad or mm RMS): an effect is missing, such as other friction, "
-            "play, elasticity or load, and the parameters are those that imitate it best"
+            "play, elasticity, load or integral action, and the parameters are those that imitate "
+            "it best"
         )
         load = np.zeros_like(motion.positions)
         if simulator.bodies is not None:
@@ -155,13 +160,15 @@ class ServoFit:
             np.abs(load).mean(axis=(0, 2)),
             (*notes, *([missing] if lacking else [])),
             hold_is_told,
+            given_stiffness,
         )
 
     @cached_property
     def stiffness(self) -> Float[np.ndarray, " joints"]:
-        """Stiffness of each servo [N m/rad or N/m], where a known weight tells it; else NaN."""
-        a = self.parameters[:, INDEX["a"]]
-        found = np.full(len(a), np.nan)
+        """Stiffness of each servo [N m/rad or N/m], given or told by a known weight; else NaN."""
+        found = np.full(len(self.joint_names), np.nan)
+        if self.given_stiffness is not None:
+            found = self.given_stiffness.copy()
         for c in self.combinations:
             if c.name == "a" and c.deviation < UNDETERMINED * abs(c.value):
                 found[c.joint] = 1.0 / c.value
@@ -200,6 +207,9 @@ class ServoFit:
     def paths(self, motion: ServoMotion, parameters: AnyArray | None = None) -> np.ndarray:
         """Return simulated positions [motions, joints, samples], with loads at these positions."""
         x = np.asarray(self.parameters if parameters is None else parameters)
+        if x[:, INDEX["ki"]].any():
+            loaded = motion if self.bodies is None else self.bodies.loads(motion)
+            motion = with_integral(loaded, x, self.hold)
         simulator = CoupledSimulator(motion, self.time_step, self.hold, self.bodies)
         return simulator.positions(simulator.simulate(x))
 
@@ -324,7 +334,7 @@ class _Rows(NamedTuple):
     Attributes:
         found: Refinement.
         weights: Weight of each motion's squared errors [motions, joints].
-        imitated: Initial states that imitate each parameter [motions, 2 joints, parameters].
+        imitated: Initial states that imitate each parameter [motions, states, parameters].
         scores: Sensitivities times residuals [motions, parameters].
         information: Gauss-Newton matrix.
     """
@@ -339,7 +349,7 @@ class _Rows(NamedTuple):
     def of(cls, found: Refinement) -> "_Rows":
         """Return the rows of a refinement."""
         weights = weights_of(found.simulator.motion, found.sums)
-        size, scores, imitated = 2 * weights.shape[1], [], []
+        size, scores, imitated = found.simulator.motion.start[0].size, [], []
         information = np.zeros((int(found.free.sum()),) * 2)
         certainties = found.simulator.motion.certainty
         for w, g, H, certainty in zip(weights, *found.products, certainties, strict=True):

@@ -11,7 +11,7 @@ DELAY = 0.012
 MASS, CENTRE = 0.6, 0.15
 ENCODER = 2 * np.pi / 4096
 
-XML = """<mujoco><compiler angle="radian"/>
+XML = """<mujoco><compiler angle="radian"/><extension><plugin plugin="mujoco.pid"/></extension>
 <option timestep="{step}" gravity="0 0 -9.81" integrator="implicitfast"/>
 <worldbody><body name="turn">
 <inertial pos="0 0 0" mass="1" diaginertia="0.002 0.002 0.002"/>
@@ -21,16 +21,29 @@ XML = """<mujoco><compiler angle="radian"/>
 <joint name="lift" axis="0 1 0" armature="{I[1]}" damping="{D[1]}" frictionloss="{F[1]}"
  solreffriction="{soft} 1" solimpfriction="0.99 0.9999 0.001"/>
 </body></body></worldbody><actuator>
-<position name="turn" joint="turn" kp="{K[0]}"/><position name="lift" joint="lift" kp="{K[1]}"/>
+<plugin name="turn" joint="turn" plugin="mujoco.pid" actdim="{n}">
+<config key="kp" value="{K[0]}"/><config key="ki" value="{Ki[0]}"/></plugin>
+<plugin name="lift" joint="lift" plugin="mujoco.pid" actdim="{n}">
+<config key="kp" value="{K[1]}"/><config key="ki" value="{Ki[1]}"/></plugin>
 </actuator></mujoco>"""
 
 
-def model_text(stiffer=1.0, step=0.001, friction=FRICTION):
-    """Return the arm as MJCF."""
+def model_text(stiffer=1.0, step=0.001, friction=FRICTION, ki=0.0):
+    """Return the arm as MJCF; `ki` is the integral gain over the stiffness."""
     gains = tuple(stiffer * k for k in KP)
+    integral = tuple(ki * k for k in gains)
     soft = 2.0 * step
     return XML.format(
-        step=step, soft=soft, I=ARMATURE, D=DAMPING, F=friction, K=gains, c=CENTRE, m=MASS
+        step=step,
+        soft=soft,
+        I=ARMATURE,
+        D=DAMPING,
+        F=friction,
+        K=gains,
+        Ki=integral,
+        n=int(ki > 0.0),
+        c=CENTRE,
+        m=MASS,
     )
 
 
@@ -73,9 +86,10 @@ def log(
     friction=FRICTION,
     block=None,
     rounding=ENCODER,
+    ki=0.0,
 ):
     """Return a log of 50 Hz; commands are held until the next one and reach the servo late."""
-    model = mujoco.MjModel.from_xml_string(model_text(stiffer, step, friction))
+    model = mujoco.MjModel.from_xml_string(model_text(stiffer, step, friction, ki))
     data, sent = mujoco.MjData(model), commands(seed, duration)
     every, late, measured = round(0.02 / step), round(DELAY / step), np.zeros_like(sent)
     data.qpos[:] = sent[0]

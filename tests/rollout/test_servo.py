@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
@@ -18,7 +19,14 @@ from jaxid.rollout.least_squares import bounded_step, minimise
 from jaxid.rollout.motion import ServoMotion
 from jaxid.rollout.refine import Refinement
 from jaxid.rollout.result import _Rows
-from jaxid.rollout.servo import INDEX, LOWER, START, ServoSimulator
+from jaxid.rollout.servo import (
+    INDEX,
+    LOWER,
+    START,
+    balanced_integral,
+    with_integral,
+)
+from jaxid.rollout.uncoupled import ServoSimulator
 
 
 def _one_joint(commands, load=0.0, **parameters):
@@ -76,7 +84,7 @@ VALUES = {"J": 5e-3, "B": 0.06, "d": 0.013, "b": 0.01, "a": 0.08, "F": 0.015, "m
 VALUES |= {"Fs": 0.004, "vs": 0.07, "um": 0.15}
 
 
-def _arm(bodies, hold):
+def _arm(bodies, hold, ki=0.0):
     """Return a simulator of the arm, its parameters, and which of them matter."""
     t = 0.02 * np.arange(300)[:, None]
     sent = 0.4 * np.sin([2.0, 2.7] * t) + 0.1 * np.sin([9.0, 7.0] * t + 1.0)
@@ -85,16 +93,21 @@ def _arm(bodies, hold):
     x = np.tile(START, (2, 1))
     for symbol, value in VALUES.items():
         x[:, INDEX[symbol]] = value * np.array([1.0, 1.1])
+    x[:, INDEX["ki"]] = ki
     free = np.ones(x.shape, bool)
+    free[:, INDEX["ki"]] = ki > 0.0
+    if ki > 0.0:
+        motion = with_integral(motion, x, hold)
     free[:, INDEX["a"]] = free[:, INDEX["mu"]] = bodies is not None
     return CoupledSimulator(motion, 0.01, hold, bodies), x, free
 
 
+@pytest.mark.parametrize("ki", [0.0, 4.0])
 @pytest.mark.parametrize("hold", [False, True])
 @pytest.mark.parametrize("coupled", [None, False, True])
-def test_sensitivities_agree_with_differences(coupled, hold):
+def test_sensitivities_agree_with_differences(coupled, hold, ki):
     bodies = None if coupled is None else servo_arm.bodies(coupled)
-    simulator, x, free = _arm(bodies, hold)
+    simulator, x, free = _arm(bodies, hold, ki)
     S = simulator.sensitivities(x, simulator.simulate(x), free)[0]
 
     def path(x, start):
@@ -108,26 +121,34 @@ def test_sensitivities_agree_with_differences(coupled, hold):
         ends = path(x + step, 0.0), path(x - step, 0.0)
         difference = (ends[0] - ends[1]) / (2 * step[joint, symbol])
         error, scale = np.abs(S[..., k] - difference), np.abs(difference).max()
-        # A kink within a step shifts single samples; differences of positions are rounded.
-        rounding = np.finfo(float).eps / step[joint, symbol]
+        # A kink within a step shifts single samples; differences of positions are rounded, and
+        # integral actions sum this up.
+        rounding = (16 if ki > 0.0 else 1) * np.finfo(float).eps / step[joint, symbol]
         assert np.quantile(error, 0.98) < 1e-6 * max(scale, 1e-3) + rounding, (joint, symbol)
-    for k in range(4):
-        start = np.zeros((2, 2))
+    size = simulator.motion.start[0].size
+    for k in range(size):
+        start = np.zeros_like(simulator.motion.start[0])
         start.ravel()[k] = 1e-6
         difference = (path(x, start) - path(x, -start)) / 2e-6
-        assert np.quantile(np.abs(S[..., k - 4] - difference), 0.98) < 1e-6
+        assert np.quantile(np.abs(S[..., k - size] - difference), 0.98) < 1e-6
 
 
-def test_the_search_has_the_gauss_newton_matrix_of_uncoupled_joints():
-    simulator, x, free = _arm(None, True)
+@pytest.mark.parametrize("ki", [0.0, 4.0])
+def test_the_search_has_the_gauss_newton_matrix_of_uncoupled_joints(ki):
+    simulator, x, free = _arm(None, True, ki)
     free[:] = True
     S = simulator.sensitivities(x, simulator.simulate(x), free)[0]
     counted = simulator.motion.counted[0]
     alone = ServoSimulator(simulator.motion, 0.01, True)
     r = (alone.paths(x[None])[0, 0] - simulator.motion.positions[0]) * counted
     cost, g, H = (z[0, 0] for z in alone.moments(x[None]))
+    of_start = jax.jacfwd(lambda x: balanced_integral(x, simulator.motion.part(0), True))(x)
     for j in range(2):
-        own = S[j, :, j * len(START) : (j + 1) * len(START)] * counted[j, :, None]
+        own = S[j, :, j * len(START) : (j + 1) * len(START)]
+        if ki > 0.0:
+            # The search starts in balance, whatever the parameters.
+            own = own + S[j, :, [j - 2]].T @ of_start[j, j][None]
+        own = own * counted[j, :, None]
         np.testing.assert_allclose(cost[j], r[j] @ r[j], rtol=1e-9)
         np.testing.assert_allclose(g[j], own.T @ r[j], rtol=1e-7, atol=1e-12)
         np.testing.assert_allclose(H[j], own.T @ own, rtol=1e-7, atol=1e-12)
@@ -263,9 +284,16 @@ def test_samples_have_the_deviations_and_degrees_of_freedom_of_the_fit(fit):
 def test_mujoco_moves_like_the_simulation(fit, tmp_path):
     paths = export_servo_mjcf(fit, tmp_path / "arm.xml", samples=2, timestep=0.001)
     assert len({p.read_text() for p in paths}) == 3
-    model = mujoco.MjModel.from_xml_path(str(paths[0]))
-    data, log = mujoco.MjData(model), servo_arm.log(9, duration=20.0)
-    delay = model.numeric("delay").data
+    _require_motion_of_mujoco(paths[0], servo_arm.log(9, duration=20.0))
+    values = simulator_values(fit)
+    np.testing.assert_allclose(values["armature"][1], servo_arm.ARMATURE[1], rtol=0.02)
+    assert "other joints" in str(simulator_table(fit)) or np.isfinite(fit.stiffness).all()
+
+
+def _require_motion_of_mujoco(path, log):
+    """Require that MuJoCo, with commands that are held and late, moves as in the log."""
+    model = mujoco.MjModel.from_xml_path(str(path))
+    data, delay = mujoco.MjData(model), model.numeric("delay").data
     measured, sent = np.asarray(log.angles), np.asarray(log.forces)
     path = np.zeros_like(measured)
     for k in range(20 * len(sent)):
@@ -275,9 +303,33 @@ def test_mujoco_moves_like_the_simulation(fit, tmp_path):
         data.ctrl[:] = sent[at, [0, 1]]
         mujoco.mj_step(model, data)
     assert np.sqrt(np.mean((path - measured) ** 2, axis=0)).max() < 1.5e-3
-    values = simulator_values(fit)
-    np.testing.assert_allclose(values["armature"][1], servo_arm.ARMATURE[1], rtol=0.02)
-    assert "other joints" in str(simulator_table(fit)) or np.isfinite(fit.stiffness).all()
+
+
+def test_integral_action_is_found_and_exported(tmp_path):
+    """Logs of MuJoCo's PID controller; the proportional gain is known."""
+    logs = [servo_arm.log(k, duration=20.0, ki=3.0) for k in (0, 1)]
+    options = {"friction": False, "saturation": False, "time_step": 0.005}
+    options |= {"integral": True, "stiffness": servo_arm.KP}
+    found = jid.identify_rollout(logs, servo_arm.bodies(), **options)
+    np.testing.assert_allclose(found.of_parameter("ki"), 3.0, rtol=0.01)
+    np.testing.assert_array_equal(found.stiffness, servo_arm.KP)
+    values = simulator_values(found)
+    np.testing.assert_allclose(values["armature"], servo_arm.ARMATURE, rtol=0.02)
+    np.testing.assert_allclose(values["damping"], servo_arm.DAMPING, rtol=0.02)
+    other = servo_arm.log(9, duration=20.0, ki=3.0)
+    errors = found.validate(other).rms()[0]
+    assert (errors < [0.7e-3, 2e-3]).all()
+    assert found.window_errors(other).max() < 8e-3
+    plain = servo_arm.log(9, duration=20.0)
+    assert np.sqrt(np.mean((plain.angles - other.angles) ** 2, axis=0)).min() > 10e-3
+    path = export_servo_mjcf(found, tmp_path / "arm.xml", timestep=0.001)[0]
+    _require_motion_of_mujoco(path, other)
+
+
+@pytest.mark.parametrize("stiffness", [0.0, [1.0, 2.0, 3.0]])
+def test_a_stiffness_that_does_not_fit_is_rejected(stiffness):
+    with pytest.raises(jid.InputError, match="`stiffness`"):
+        jid.identify_rollout(servo_arm.log(0, duration=10.0), stiffness=stiffness)
 
 
 def test_deviations_are_at_least_those_of_independent_errors():
