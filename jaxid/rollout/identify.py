@@ -270,8 +270,12 @@ class _Search:
         x = np.broadcast_to(found.x, g.shape)
         step = bounded_step(*left, x, np.broadcast_to(free, x.shape), (LOWER, UPPER), 1e-3)
         errors = self.simulator.costs(np.clip(x + step, LOWER, UPPER), each=True)
+        return self._scores(errors)
+
+    def _scores(self, squares: np.ndarray) -> np.ndarray:
+        """Return logarithms of mean square errors, of sums [motions, candidates, joints]."""
         counted = np.asarray(self.simulator.motion.counted).sum(axis=-1)
-        mean = errors / np.maximum(counted, 1.0)[:, None]
+        mean = squares / np.maximum(counted, 1.0)[:, None]
         scores = np.log(np.minimum(np.nan_to_num(mean, nan=LARGEST), LARGEST) + RESOLUTION**2)
         return np.where((counted > 0)[:, None], scores, np.nan)
 
@@ -287,8 +291,23 @@ class _Search:
         free = np.stack([self.free] * 3 + [np.tile(mask(LINEAR), (len(self.x), 1))])
         found = self.solve(x, free, iterations=8)
         self.linear = found.x[3]
-        self._take(found.x[:3], np.argmin(found.cost[:3], axis=0))
+        self._take(found.x[:3], self._least_oscillating(found.x[:3]))
         self._weigh(self.x)
+
+    def _least_oscillating(self, x: np.ndarray) -> np.ndarray:
+        """Return the most damped candidate, unless others are better by more than their scatter.
+
+        An oscillation that an initial state excites may imitate the rounding of an encoder.
+        """
+        scores = self._scores(self.simulator.costs(x))
+        damping = x[..., INDEX["B"]] / np.sqrt(x[..., INDEX["J"]])
+        chosen, *others = np.argsort(-damping, axis=0)
+        for other in others:
+            old, new = (
+                np.take_along_axis(scores, k[None, None], axis=1)[:, 0] for k in (chosen, other)
+            )
+            chosen = np.where(_lower(new, old), other, chosen)
+        return chosen
 
     def _take(self, x: np.ndarray, chosen: np.ndarray) -> None:
         self.x = np.take_along_axis(x, chosen[None, :, None], axis=0)[0]
