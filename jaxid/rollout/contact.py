@@ -28,7 +28,7 @@ class Contact(NamedTuple):
     Attributes:
         name: Name of the log.
         joint: Index of the joint.
-        start: Begin, from the start of the segment [s].
+        start: Begin, by the clock of the log [s].
         stop: End [s].
         error: Largest averaged error [rad or m].
     """
@@ -83,10 +83,11 @@ def contact_rows(
 def typical_errors(motion: ServoMotion, mean: np.ndarray) -> Float[np.ndarray, " joints"]:
     """Return the usual size of averaged errors of each joint at rest, which contacts do not move.
 
-    It is the median of these errors over that of normal ones of unit variance.
+    It is the median of these errors over that of normal ones of unit variance. The median motion
+    counts, since contact may last in some of them.
     """
-    still = [mean[:, j][mean[:, j] > 0] for j in range(mean.shape[1])]
-    return np.array([np.median(x) / 0.6745 if x.size else 0.0 for x in still])
+    still = np.where((mean > 0).any(axis=-1, keepdims=True) & (mean <= 0), np.nan, mean)
+    return np.median(np.nanmedian(still, axis=-1), axis=0) / 0.6745
 
 
 def contacts(
@@ -101,5 +102,6 @@ def contacts(
         edges = np.flatnonzero(np.diff(np.concatenate([[0], rows[k, j].astype(int), [0]])))
         for a, b in edges.reshape(-1, 2):
             peak = float(mean[k, j, a:b].max())
-            found.append(Contact(motion.names[k], int(j), a * dt, b * dt, peak))
+            start, stop = (float(motion.begin[k] + dt * i) for i in (a, b))
+            found.append(Contact(motion.names[k], int(j), start, stop, peak))
     return tuple(found)

@@ -211,7 +211,7 @@ class CoupledSimulator:
         states.
         """
         motions, n, samples = self.motion.motions, len(theta), self.motion.positions.shape[-1]
-        found = [self._transitions(k, np.asarray(theta), path, free) for k in range(motions)]
+        found = [self.transitions(k, np.asarray(theta), path, free) for k in range(motions)]
         size = self.motion.start[0].size
         state = np.zeros((motions, size + n, free.sum() + size))
         state[:, :size, -size:] = np.eye(size)
@@ -232,7 +232,7 @@ class CoupledSimulator:
                 S[:, :, rows.start + k + 1] = state[:, :n]
         return S
 
-    def _transitions(
+    def transitions(
         self, motion: int, theta: np.ndarray, path: Path, free: np.ndarray
     ) -> Callable[[slice], tuple[np.ndarray, np.ndarray]]:
         """Return a function of some samples: derivatives of the state behind each sample time.

@@ -17,7 +17,7 @@ class RolloutErrors:
     Attributes:
         joint_names: Names of the joints.
         motions: Name of the log of each motion.
-        time: Instants of the samples of each motion [s].
+        time: Instants of the samples of each motion, by the clock of the log [s].
         measured: Measured positions of each motion [joints, samples].
         simulated: Simulated positions.
         command: Commanded positions.

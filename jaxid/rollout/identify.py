@@ -21,7 +21,7 @@ from .contact import contact_rows
 from .coupled import CoupledSimulator
 from .least_squares import Solution, bounded_step, minimise
 from .motion import ServoMotion
-from .refine import RESOLUTION, Refinement, refine, weights_of
+from .refine import RESOLUTION, prepare, refine, weights_of
 from .result import ServoFit
 from .servo import INDEX, LOWER, SCALE, START, UPPER, with_integral
 from .uncoupled import ServoSimulator
@@ -103,7 +103,7 @@ def identify_rollout(
     coupled = CoupledSimulator(motion, time_step, False, whole)
     with ThreadPoolExecutor(1) as pool:
         # What the refinement needs is compiled while the search runs.
-        pool.submit(Refinement.of, coupled, search.x, search.free)
+        pool.submit(prepare, coupled, search.x, search.free)
         search.run(bodies is not None, friction, saturation)
     if bodies is not None and whole is not None:
         together = bodies.coupled or search.choose_coupling(whole)
@@ -116,10 +116,8 @@ def identify_rollout(
     coupled = dataclasses.replace(coupled, motion=motion, bodies=bodies)
     held = search.x.copy()
     held[:, INDEX["d"]] -= 0.5 * float(motion.sample_time.mean())
-    found, told = refine(
-        Refinement.of(coupled, search.x, search.free),
-        Refinement.of(dataclasses.replace(coupled, hold=True), held, search.free),
-    )
+    other = dataclasses.replace(coupled, hold=True)
+    found, told = refine((coupled, search.x), (other, held), search.free)
     return ServoFit.of(found, search.linear, names, told, given)
 
 

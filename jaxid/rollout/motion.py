@@ -38,6 +38,7 @@ class ServoMotion(eqx.Module):
         acceleration: Initial accelerations.
         counted: Whether a sample counts in the fit.
         sample_time: Time between two samples of each motion [s].
+        begin: Time of each motion's first sample in its log [s].
         lengths: Number of samples of each motion.
         names: Name of the log of each motion.
     """
@@ -51,6 +52,7 @@ class ServoMotion(eqx.Module):
     acceleration: Float[AnyArray, "motions joints"]
     counted: Float[AnyArray, "motions joints samples"]
     sample_time: Float[AnyArray, " motions"]
+    begin: Float[AnyArray, " motions"]
     lengths: tuple[int, ...] = eqx.field(static=True)
     names: tuple[str, ...] = eqx.field(static=True)
 
@@ -100,6 +102,7 @@ class ServoMotion(eqx.Module):
             acceleration=acceleration,
             counted=np.repeat(counted[:, None].astype(float), positions.shape[1], axis=1),
             sample_time=times,
+            begin=np.array([float(log.time[a]) for log, a, _ in parts]),
             lengths=lengths,
             names=tuple(log.name for log, _, _ in parts),
         )
@@ -165,14 +168,16 @@ class ServoMotion(eqx.Module):
             for (k, a), dt in zip(places, self.sample_time[[k for k, _ in places]], strict=True)
         ]
         start, spread, acceleration = (np.stack(x) for x in zip(*states, strict=True))
-        index = np.array([k for k, _ in places])
+        index, first = np.array(places).T
+        times = np.asarray(self.sample_time)[index]
         return self.replace(
             **arrays,
             commands=cut(self.commands, self.lead),
             start=start,
             spread=spread,
             acceleration=acceleration,
-            sample_time=np.asarray(self.sample_time)[index],
+            sample_time=times,
+            begin=np.asarray(self.begin)[index] + first * times,
             lengths=tuple(self.lengths[k] for k in index),
             names=tuple(self.names[k] for k in index),
         )

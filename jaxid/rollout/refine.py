@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import Array, Bool, Float, double_precision
+from jaxid.arrays import Array, Bool, Float, double_precision, on_cores
 
 from .coupled import CoupledSimulator, Path
 from .least_squares import bounded_step
@@ -149,18 +149,36 @@ def _products(S: Array, r: Array) -> tuple[Array, Array]:
     return jnp.einsum("jtu,jt->ju", S, r), jnp.einsum("jtu,jtv->juv", S, S)
 
 
-def refine(first: Refinement, other: Refinement) -> tuple[Refinement, bool]:
+def prepare(simulator: CoupledSimulator, parameters: np.ndarray, free: np.ndarray) -> None:
+    """Compile what the refinement of motions of this length needs."""
+    found = Refinement.of(simulator, parameters, free)
+    simulator.transitions(0, parameters, found.path, free)
+
+
+def refine(
+    first: tuple[CoupledSimulator, np.ndarray],
+    other: tuple[CoupledSimulator, np.ndarray],
+    free: Bool[np.ndarray, "joints parameters"],
+) -> tuple[Refinement, bool]:
     """Return the best fit of all joints together, from two that are nearly right.
 
     The second one goes on if it is clearly better.
 
+    Args:
+        first: Motions and parameters of each joint.
+        other: The same of the second one.
+        free: Parameters that are estimated.
+
     Returns:
         The fit, and whether the logs tell which of the two is better.
     """
-    best, other = (_descend(x, COARSE) for x in (first, other))
-    told = abs(other.score - best.score) > FALL
-    best = other if other.score < best.score - FALL else best
-    return _descend(best, FALL), told
+
+    def descend(start: tuple[CoupledSimulator, np.ndarray]) -> Refinement:
+        return _descend(Refinement.of(*start, free), COARSE)
+
+    one, two = on_cores(descend, (first, other))
+    told = abs(two.score - one.score) > FALL
+    return _descend(two if two.score < one.score - FALL else one, FALL), told
 
 
 def _descend(best: Refinement, fall: float) -> Refinement:

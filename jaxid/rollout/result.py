@@ -17,7 +17,7 @@ from .bodies import Bodies
 from .contact import Contact, contact_rows, contacts, sustained_errors, typical_errors
 from .coupled import CoupledSimulator
 from .errors import RolloutErrors
-from .motion import HISTORY, ServoMotion
+from .motion import ServoMotion
 from .refine import Refinement, mean_squares, weights_of
 from .servo import INDEX, LOWER, PARAMETERS, SCALE, UPPER, with_integral
 from .uncoupled import ServoSimulator
@@ -151,11 +151,7 @@ class ServoFit:
             np.sqrt(mean_squares(motion, found.sums)),
             motion.names,
             typical,
-            # The motions of a fit begin later than the logs.
-            tuple(
-                c._replace(start=c.start + HISTORY, stop=c.stop + HISTORY)
-                for c in contacts(motion, everything, typical)
-            ),
+            contacts(motion, everything, typical),
             simulator.bodies,
             np.abs(load).mean(axis=(0, 2)),
             (*notes, *([missing] if lacking else [])),
@@ -225,7 +221,8 @@ class ServoFit:
         errors = simulated - np.asarray(motion.positions)
         touched = contact_rows(motion, errors, self.typical)
         parts = range(motion.motions)
-        lengths, times = motion.lengths, motion.sample_time
+        lengths = motion.lengths
+        times = motion.begin[:, None] + np.outer(motion.sample_time, np.arange(max(lengths)))
 
         def cut(x: AnyArray) -> tuple[np.ndarray, ...]:
             return tuple(np.asarray(x[k])[..., : lengths[k]] for k in parts)
@@ -233,7 +230,7 @@ class ServoFit:
         return RolloutErrors(
             self.joint_names,
             motion.names,
-            tuple(float(times[k]) * np.arange(lengths[k]) for k in parts),
+            cut(times),
             cut(motion.positions),
             cut(simulated),
             cut(motion.sent),
