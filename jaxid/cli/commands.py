@@ -51,7 +51,7 @@ from jaxid.report.result_files import (
     write_estimates,
     write_report,
 )
-from jaxid.report.verdict import Report, verdict
+from jaxid.report.verdict import verdict
 from jaxid.result_table import Remark, Status, Table, significant
 from jaxid.robot.inertia import INERTIAL_NAMES, INERTIAL_UNITS
 from jaxid.simulation import preview
@@ -125,46 +125,21 @@ def identify(
     _check_logs(logs, verify, split)
     experiment = load_experiment(path)
     with identify_logs.stages(open_console(stderr=True)) as stage:
-        result = identify_logs.identify_logs(experiment, logs, verify, split, stage)
-        stage("writing the report")
-        settings = {
-            "experiment": str(path),
-            "command": command_line(),
-            "identification": [str(p) for p in logs],
-            "verification": [str(p) for p in verify],
-            "split": split,
-            "experiment_text": experiment.text,
-            "filter": str(result.experiment.filter),
-            "decimation": str(experiment.decimation),
-            "min_speed": experiment.min_speed,
-        }
-        errors = result.validation.errors
-        report = Report(
-            result.fit,
-            errors[: result.fitted],
-            errors[result.fitted :],
-            result.validation.definiteness,
-            settings,
-            (*result.experiment.notes, *result.notes),
-            result.findings,
-            result.mistakes,
-            result.choice,
-            result.claimed,
-            result.claimed_mass,
+        report, validation = identify_logs.identify_logs(
+            experiment, logs, verify, split, command_line(), stage
         )
+        stage("writing the report")
         written = write_report(output, report, figures or "")
-    fit, robot = result.fit, result.experiment.robot
+    fit, robot = report.fit, experiment.robot
     tabulated = () if fit.consistency is None else fit.consistency.findings
-    notes = [*result.experiment.notes, *result.notes]
-    notes += [note for note in fit.notes if note not in tabulated]
     show(console, robot.summary(), *motor_tables(robot))
-    show_remarks(console, notes)
+    show_remarks(console, [*report.notes, *(n for n in fit.notes if n not in tabulated)])
     show(console, fit.summary())
     if fit.residual_spectra is not None:
         show(console, residual_table(fit.residual_spectra, robot))
     if fit.consistency is not None:
         show(console, body_table(fit.consistency, robot.joint_names))
-    show(console, result.validation.summary())
+    show(console, validation.summary())
     judged = verdict(report)
     show_remarks(console, [r for r in judged if r is judged[0] or r.status in MARKED])
     show_files(console, output, [p.name for p in written])

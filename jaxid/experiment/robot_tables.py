@@ -234,6 +234,17 @@ class RobotSource:
             return None
         return np.asarray(urdf_parameters(folder / self.file, **self.chain)).reshape(-1, 10)
 
+    def claims(self, folder: Path) -> dict[str, float]:
+        """Return all that the robot's file claims, by names in a model; nothing without bodies.
+
+        Raises:
+            InputError: If the file describes a body that cannot exist.
+        """
+        bodies = self.parameters(folder)
+        if bodies is None or not np.any(bodies):
+            return {}
+        return named(bodies) | self.joint_parameters(folder)
+
     def joint_parameters(self, folder: Path) -> dict[str, float]:
         """Return rotor inertias and friction that the file claims, by their names in a model."""
         if self.file is None:
