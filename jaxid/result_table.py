@@ -69,31 +69,35 @@ class Remark:
 
 def in_html(macro: str, *arguments: Any) -> str:
     """Return what a macro of `result_table.html` makes of results."""
-    return str(getattr(_macros(), macro)(*arguments))
-
-
-def marked_up(text: str) -> str:
-    """Return a text for HTML; what stands between backticks becomes a name in other letters."""
-    return re.sub(r"`([^`]+)`", r'<span class="key">\1</span>', html.escape(printable(text)))
+    return str(getattr(macros(Path(__file__).with_suffix(".html")), macro)(*arguments))
 
 
 @functools.cache
-def _macros() -> Any:
+def macros(template: Path) -> Any:
+    """Return the macros of a template for HTML, which escape all texts."""
     # Commands that write no page do not wait for it.
     import jinja2
     from markupsafe import Markup
+
+    def marked_up(text: str) -> Markup:
+        # What stands between backticks becomes a name in other letters.
+        escaped = html.escape(printable(text))
+        return Markup(re.sub(r"`([^`]+)`", r'<span class="key">\1</span>', escaped))
 
     def aligned(number: str) -> str:
         # Blanks behind a number become as wide as the digits and the point left out.
         pointed = re.sub(r"^([^. ]*) ", "\\1\N{PUNCTUATION SPACE}", number)
         return pointed.replace(" ", "\N{FIGURE SPACE}")
 
-    folder = jinja2.FileSystemLoader(Path(__file__).parent)
     environment = jinja2.Environment(
-        loader=folder, autoescape=True, trim_blocks=True, lstrip_blocks=True
+        loader=jinja2.FileSystemLoader(template.parent),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
     )
-    environment.filters |= {"aligned": aligned, "marked_up": lambda text: Markup(marked_up(text))}
-    return environment.get_template("result_table.html").module
+    environment.filters |= {"aligned": aligned, "marked_up": marked_up}
+    return environment.get_template(template.name).module
 
 
 def significant(value: float, digits: int = 3) -> str:
