@@ -270,25 +270,22 @@ def torque_errors(
     mask = np.asarray(observations.mask)
     estimator = WeightedLeastSquares(ResidualVariances())
     own = estimator(RegressionProblem(fit.base, [observations])).parameters
-    shape = len(mask[::step]), observations.joints
-    measured, predicted, speeds, refitted, q = np.zeros((5, *shape))
+    found = np.zeros((5, len(mask[::step]), observations.joints))
     for chunk in observations.chunks(65536):
         first, stop = chunk.rows
         # Masked parts are not evaluated.
         if mask[first:stop].any():
             motion, forces = observations.read(slice(*chunk.samples))
             tool = fit.base.tool_forces(motion)
-            model_forces = fit.predict(motion) + tool
-            own_forces = fit.base.forces_in_numpy(own, motion) + tool
+            predicted = fit.predict(motion) + tool
+            refitted = fit.base.forces_in_numpy(own, motion) + tool
             rows = slice(-(-first // step), -(-stop // step))
             taken = slice(rows.start * step - first, None, step)
-            measured[rows] = chunk.reduce(forces)[taken]
-            predicted[rows] = chunk.reduce(model_forces)[taken]
-            refitted[rows] = chunk.reduce(own_forces)[taken]
-            speeds[rows] = chunk.reduce(motion.qd)[taken]
-            q[rows] = chunk.reduce(motion.q)[taken]
+            for kind, x in enumerate((forces, predicted, refitted, motion.qd, motion.q)):
+                found[kind, rows] = chunk.reduce(x)[taken]
         if progress is not None:
             progress(stop / observations.rows)
+    measured, predicted, refitted, speeds, q = found
     return TorqueErrors(
         name=observations.name,
         time=observations.reduced_time[::step],
