@@ -40,7 +40,7 @@ from jaxid.identification.payload import (
     identify_drive_gains,
     identify_payload,
 )
-from jaxid.io import atomic_folder, require_writable
+from jaxid.io import require_writable, write_text
 from jaxid.report.excitation import headline, ordered, plan_remarks, side_by_side_table
 from jaxid.report.identification import body_table, motor_tables, residual_table
 from jaxid.report.page import show, show_files, show_remarks
@@ -199,9 +199,7 @@ def show_motion(path: Path, output: Path) -> None:
     experiment, written = load_experiment(path), output.with_suffix(".json")
     if not written.is_file():
         raise InputError(f"`{written}` is not there: `--play` shows a motion that was designed.")
-    clearance = experiment.surroundings.clearance
-    shapes = None if clearance is None else clearance.model
-    preview.play(experiment.robot, shapes, load_trajectory(written))
+    preview.play(experiment.robot, experiment.surroundings.shapes, load_trajectory(written))
 
 
 class _BestMotion:
@@ -292,8 +290,7 @@ def choose(console: Console, path: Path, logs: list[Path], output: Path) -> None
         raise InputError("`--output` must lie beside the experiment file: its paths count from it.")
     with identify_logs.stages(open_console(stderr=True)) as stage:
         choice, text = choosing.choose(experiment, logs, stage)
-    with atomic_folder(output.parent) as folder:
-        (folder / output.name).write_text(text, encoding="utf-8")
+    write_text(output, text)
     show(console, choice.summary())
     show_files(console, output.parent, [output.name])
 

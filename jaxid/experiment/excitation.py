@@ -194,8 +194,7 @@ def write_design(
     settings = {"facts": seed, "experiment_text": experiment.text, "command": command}
     # First the page: where there is no room for pictures, nothing changes.
     place, motion = output.with_suffix(""), design.played.motion
-    clearance = experiment.surroundings.clearance
-    shapes = None if clearance is None else clearance.model
+    shapes = experiment.surroundings.shapes
     pictures = write_excitation(place, design.plan, motion, design.remarks, settings, shapes)
     return write_motion(experiment, design.played, output) + pictures
 

@@ -163,15 +163,15 @@ class Collision:
 
 
 class Surroundings(NamedTuple):
-    """Shapes of robot and surroundings.
+    """Shapes of robot and surroundings."""
 
-    Attributes:
-        clearance: Distance that they must keep; None if there are none.
-        faults: What is not known of them, in sentences.
-    """
+    clearance: Clearance | None  # distance that they must keep; None if there are none
+    faults: tuple[str, ...]  # what is not known of them, in sentences
 
-    clearance: Clearance | None
-    faults: tuple[str, ...]
+    @property
+    def shapes(self) -> CollisionModel | None:
+        """All shapes; None if there are none."""
+        return None if self.clearance is None else self.clearance.model
 
 
 @dataclasses.dataclass(frozen=True)
