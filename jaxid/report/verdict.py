@@ -33,34 +33,21 @@ OFFSET = 0.3
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Report:
-    """Content of the report of an identification.
+    """Content of the report of an identification."""
 
-    Attributes:
-        fit: Identified parameters.
-        identification: Errors on the logs of the fit.
-        verification: Errors on logs that the fit has not seen.
-        definiteness: Definiteness of the mass matrix.
-        settings: Origin of the result.
-        notes: Notes on the logs, as sentences.
-        doubts: Findings on the logs that deserve attention, as sentences.
-        mistakes: Likely mistakes in the description of the logs or the robot, as sentences.
-        choice: Choice of the filter, where it was left to the logs.
-        claimed: Errors of the parameters that the robot's file claims, on all logs; empty if it
-            claims none.
-        claimed_mass: Mass of all bodies that the robot's file claims [kg]; 0 if it claims none.
-    """
-
-    fit: Fit
-    identification: Sequence[TorqueErrors]
-    verification: Sequence[TorqueErrors]
-    definiteness: Definiteness
-    settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    notes: Sequence[str] = ()
-    doubts: Sequence[str] = ()
+    fit: Fit  # identified parameters
+    identification: Sequence[TorqueErrors]  # errors on the logs of the fit
+    verification: Sequence[TorqueErrors]  # errors on logs that the fit has not seen
+    definiteness: Definiteness  # of the mass matrix
+    settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # origin of the result
+    notes: Sequence[str] = ()  # notes on the logs, as sentences
+    doubts: Sequence[str] = ()  # findings on the logs that deserve attention, as sentences
+    # likely mistakes in the description of the logs or the robot, as sentences
     mistakes: Sequence[str] = ()
-    choice: FilterChoice | None = None
+    choice: FilterChoice | None = None  # choice of the filter, where it was left to the logs
+    # errors on all logs of the parameters that the robot's file claims; empty without
     claimed: Sequence[TorqueErrors] = ()
-    claimed_mass: float = 0.0
+    claimed_mass: float = 0.0  # mass of all bodies that it claims [kg]; 0 without
 
     @property
     def every_error(self) -> tuple[TorqueErrors, ...]:
