@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from jaxid.arrays import Float
+from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.dispatch import in_numpy
 from jaxid.dynamics.motion import Motion
 from jaxid.identification.fit_result import Fit
@@ -68,10 +69,8 @@ def _friction(fit: Fit, speeds: Float[np.ndarray, "speeds joints"]) -> tuple[np.
     base, n = fit.base, speeds.shape[1]
     moving = np.zeros((len(speeds) + 1, n, n))
     moving[:-1, np.arange(n), np.arange(n)] = speeds
-    law, qd = base.model.memory, moving.reshape(-1, n)
-    rest = np.zeros_like(qd)
-    state = None if law is None else np.asarray(law.settled(qd))
-    theta = in_numpy(base, base.columns, *base.model.arguments(Motion(rest, qd, rest, state)))
+    qd = moving.reshape(-1, n)
+    theta = _steady_columns(base, np.zeros_like(qd), qd)
     own = theta.reshape(len(speeds) + 1, n, n, -1)[:, np.arange(n), np.arange(n)]
     # Without speed there is weight only.
     own = own[:-1] - own[-1]
@@ -125,9 +124,15 @@ def gravity_forces(
     base, model = fit.base, fit.base.model
     bodies = [bool(t.body_parameters) for t in model.terms for _ in t.parameters(model.robot)]
     p = np.where([bodies[k] for k in base.indices], fit.parameters, 0.0)
-    rest = np.zeros_like(q)
-    state = None if model.memory is None else np.asarray(model.memory.settled(rest))
-    return in_numpy(base, base.columns, *model.arguments(Motion(q, rest, rest, state))) @ p
+    return _steady_columns(base, q, np.zeros_like(q)) @ p
+
+
+def _steady_columns(base: BaseParameters, q: np.ndarray, qd: np.ndarray) -> np.ndarray:
+    """Return the base regressor at constant speeds, with settled friction."""
+    law = base.model.memory
+    state = None if law is None else np.asarray(law.settled(qd))
+    motion = Motion(q, qd, np.zeros_like(q), state)
+    return in_numpy(base, base.columns, *base.model.arguments(motion))
 
 
 def _some(log: TorqueErrors) -> np.ndarray:
