@@ -233,14 +233,14 @@ def _write_table(
     names = ["report.html", f"{stem}.json", f"{stem}.csv"]
     with atomic_folder(folder) as staging:
         (staging / names[0]).write_text(page, encoding="utf-8")
-        write_json(staging / names[1], plain({**header(names[1]), **content}))
+        write_json(staging / names[1], {**header(names[1]), **content})
         write_csv(staging / names[2], rows)
     return [folder / name for name in names]
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:
     """Write a file that programs read exactly and people can read."""
-    path.write_text(json_text(content), encoding="utf-8")
+    path.write_text(json_text(plain(content)), encoding="utf-8")
 
 
 def write_csv(path: Path, rows: list[dict[str, Any]]) -> None:
@@ -284,44 +284,40 @@ def _rows(**columns: Any) -> list[dict[str, Any]]:
 
 def _record(report: Report) -> dict[str, Any]:
     """Return the content of `result.json`."""
-    fit, definiteness = report.fit, report.definiteness
-    base = fit.base
-    model = fit.base.model
-    robot = fit.base.model.robot
-    return plain(
-        {
-            **header("result.json"),
-            "verdict": [
-                {"status": remark.status.name.lower(), "text": remark.text}
-                for remark in verdict(report)
-            ],
-            "robot": _robot_record(robot),
-            "base_parameters": parameter_rows(fit),
-            "lengths": base.lengths,
-            "model": {
-                "terms": [str(term) for term in model.terms],
-                "standard_names": model.parameter_names,
-                "standard_units": model.parameter_units,
-                "independent": base.indices,
-                "dependent": base.dependent,
-                "kappa": base.kappa,
-            },
-            "fit": _fit_record(fit),
-            "consistency": consistency_record(fit),
-            "errors": {
-                role: [_error_record(errors, robot) for errors in getattr(report, role)]
-                for role in ("identification", "verification")
-            },
-            "mass_matrix": _entries(
-                definiteness,
-                "positive_definite pose poses",
-                smallest_eigenvalue="smallest",
-                indefinite_share="indefinite",
-            ),
-            "settings": report.settings,
-            "notes": report.every_note,
-        }
-    )
+    fit, base = report.fit, report.fit.base
+    model, robot = base.model, base.model.robot
+    return {
+        **header("result.json"),
+        "verdict": [
+            {"status": remark.status.name.lower(), "text": remark.text}
+            for remark in verdict(report)
+        ],
+        "robot": _robot_record(robot),
+        "base_parameters": parameter_rows(fit),
+        "lengths": base.lengths,
+        "model": {
+            "terms": [str(term) for term in model.terms],
+            "standard_names": model.parameter_names,
+            "standard_units": model.parameter_units,
+            "independent": base.indices,
+            "dependent": base.dependent,
+            "kappa": base.kappa,
+        },
+        "fit": _fit_record(fit),
+        "consistency": consistency_record(fit),
+        "errors": {
+            role: [_error_record(errors, robot) for errors in getattr(report, role)]
+            for role in ("identification", "verification")
+        },
+        "mass_matrix": _entries(
+            report.definiteness,
+            "positive_definite pose poses",
+            smallest_eigenvalue="smallest",
+            indefinite_share="indefinite",
+        ),
+        "settings": report.settings,
+        "notes": report.every_note,
+    }
 
 
 def parameter_rows(fit: Fit) -> list[dict[str, Any]]:
