@@ -99,7 +99,9 @@ def _data(report: Report) -> list[tuple[str, str]]:
             time = np.asarray(e.time)
             length = significant(float(time[-1] - time[0]))
             facts.append((word, f"{e.name}: {length} s, {len(time)} rows of each joint"))
-    facts.append(("estimator", words_of(fit.estimator)))
+    # A class `LeastSquares` is shown as "least squares".
+    estimator = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", type(fit.estimator).__name__).lower()
+    facts.append(("estimator", estimator))
     if fit.consistency is not None:
         mass = np.asarray(fit.consistency.bodies)[:, 0]
         loose = len(fit.consistency.masses_from_bounds)
@@ -165,11 +167,6 @@ def _parameters(fit: Fit, figure: Figure) -> list[Any]:
     doubts = [fit.determination] if fit.undetermined else []
     summary = f"All {base.size} estimates with 95 % intervals and combinations"
     return [*doubts, glossary(base), folded(summary, parameter_table(fit), *said, figure)]
-
-
-def words_of(x: Any) -> str:
-    """Return the name of an object's class in words, as `least squares`."""
-    return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", type(x).__name__).lower()
 
 
 def _details(report: Report, figures: Mapping[str, Figure]) -> list[Section]:
