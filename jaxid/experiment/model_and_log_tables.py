@@ -17,16 +17,7 @@ from jaxid.robot.limits_and_drives import per_joint
 from jaxid.robot.robot import Robot
 from jaxid.units import Unit
 
-from .decoder import (
-    Bounds,
-    Count,
-    Magnitude,
-    Positive,
-    call,
-    decode,
-    decode_value,
-    within,
-)
+from .decoder import Bounds, Count, Magnitude, Positive, call, decode, decode_value, within
 
 FILTERS: dict[str, type[filters.AbstractFilter]] = {
     "butterworth": filters.ZeroPhaseButterworth,

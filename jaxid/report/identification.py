@@ -12,15 +12,7 @@ from jaxid.identification.consistency.estimator import Consistency
 from jaxid.identification.fit_result import Fit
 from jaxid.identification.uncertainty import ResidualSpectra
 from jaxid.model_validation import TorqueErrors
-from jaxid.result_table import (
-    Column,
-    Remark,
-    Status,
-    Table,
-    percent,
-    significant,
-    with_deviations,
-)
+from jaxid.result_table import Column, Remark, Status, Table, percent, significant, with_deviations
 from jaxid.robot.robot import Robot
 
 from .figure import Figure
