@@ -1,8 +1,8 @@
 """Work of the commands for an experiment and its logs, and what they print."""
 
 import dataclasses
+import functools
 import os
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -170,7 +170,8 @@ def excite(
     motion = _BestMotion(experiment, output, faults)
     with process.handing_over(motion.farewell), identify_logs.stages(errors) as stage:
         try:
-            design = design_motion(experiment, preparation, motion.keep(stage), seconds)
+            keep = functools.partial(motion.keep, stage)
+            design = design_motion(experiment, preparation, keep, seconds)
         except KeyboardInterrupt:
             errors.print(Text(f"jaxid: {motion.farewell()}."), soft_wrap=True)
             raise typer.Exit(STOPPED) from None
@@ -182,7 +183,7 @@ def excite(
     show_files(console, output.parent, [str(p.relative_to(output.parent)) for p in files])
     if all_criteria and not design.plan.interrupted:
         with identify_logs.stages(errors) as stage:
-            plans = compare_criteria(experiment, _until_stopped(stage.design))
+            plans = compare_criteria(experiment, functools.partial(_show_progress, stage))
         if plans:
             show(console, side_by_side_table(plans))
         done = sum(not plan.interrupted for plan in plans)
@@ -209,16 +210,12 @@ class _BestMotion:
         self._experiment, self._output, self._faults = experiment, output, faults
         self._value = np.inf
 
-    def keep(self, stage: identify_logs.Stages) -> Callable[[DesignProgress], None]:
-        """Return the callback of a design, which writes every better motion."""
-
-        def progress(now: DesignProgress) -> None:
-            stage.design(now)
-            if now.feasible and now.best < self._value:
-                write_motion(self._experiment, play(self._experiment, now.trajectory), self._output)
-                self._value = now.best
-
-        return _until_stopped(progress)
+    def keep(self, stage: identify_logs.Stages, now: DesignProgress) -> None:
+        """Show the progress of a design, and write every better motion."""
+        _show_progress(stage, now)
+        if now.feasible and now.best < self._value:
+            write_motion(self._experiment, play(self._experiment, now.trajectory), self._output)
+            self._value = now.best
 
     def farewell(self) -> str:
         """Return what is said when Ctrl-C ends the search."""
@@ -231,17 +228,11 @@ class _BestMotion:
         )
 
 
-def _until_stopped(
-    progress: Callable[[DesignProgress], None],
-) -> Callable[[DesignProgress], None]:
-    """Return a callback that calls another one, and ends a design after a signal."""
-
-    def run(now: DesignProgress) -> None:
-        if process.STOP.is_set():
-            raise KeyboardInterrupt
-        progress(now)
-
-    return run
+def _show_progress(stage: identify_logs.Stages, now: DesignProgress) -> None:
+    """Show the progress of a design, or end it after a signal."""
+    if process.STOP.is_set():
+        raise KeyboardInterrupt
+    stage.design(now)
 
 
 def export(

@@ -53,14 +53,11 @@ def _capsule(capsule: Capsule) -> dict[str, str]:
 def _obstacle(obstacle: HalfSpace | Box) -> dict[str, str]:
     if isinstance(obstacle, Box):
         place = placement_attributes(obstacle.centre, obstacle.rotation)
-        return {
-            "name": obstacle.name,
-            "type": "box",
-            "size": exact_text(obstacle.size / 2),
-        } | place
+        size = exact_text(obstacle.size / 2)
+        return {"name": obstacle.name, "type": "box", "size": size, **place}
     normal = np.asarray(obstacle.normal)
     place = {"pos": exact_text(normal * obstacle.height), "zaxis": exact_text(normal)}
-    return {"name": obstacle.name, "type": "plane", "size": "3 3 0.1"} | place
+    return {"name": obstacle.name, "type": "plane", "size": "3 3 0.1", **place}
 
 
 def positions(trajectory: AbstractTrajectory) -> Float[np.ndarray, "pictures joints"]:
