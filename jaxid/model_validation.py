@@ -42,7 +42,7 @@ class TorqueErrors(eqx.Module):
         speeds: Velocities, filtered and decimated alike [rad/s or m/s].
         unexplained: Errors of the same model fitted to this recording alone: what no parameters of
             it explain; NaN where a row does not count [N m or N].
-        positions: Coordinates, filtered and decimated alike [rad or m]; None if not known.
+        positions: Coordinates, filtered and decimated alike [rad or m].
     """
 
     name: str = eqx.field(static=True)
@@ -53,7 +53,7 @@ class TorqueErrors(eqx.Module):
     max_forces: Float[AnyArray, " joints"]
     speeds: Float[AnyArray, "rows joints"]
     unexplained: Float[AnyArray, "rows joints"]
-    positions: Float[AnyArray, "rows joints"] | None = None
+    positions: Float[AnyArray, "rows joints"]
 
     @property
     def moving(self) -> Bool[np.ndarray, "rows joints"]:

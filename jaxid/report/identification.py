@@ -111,11 +111,9 @@ def _data(report: Report) -> list[tuple[str, str]]:
 
 def _physics(report: Report, figures: Mapping[str, Figure]) -> list[Section]:
     """Return what the model says of the robot: in motion, before and after, friction, weight."""
-    sections: list[Section] = []
-    if "robot" in figures:
-        text = "Each link has the colour of the torque error of the joint that moves it, the path "
-        text += "of the end-effector that of the mean. Turn it, and move the slider."
-        sections.append(("The robot along the motion", [picture(figures["robot"], text)]))
+    text = "Each link has the colour of the torque error of the joint that moves it, the path "
+    text += "of the end-effector that of the mean. Turn it, and move the slider."
+    sections: list[Section] = [("The robot along the motion", [picture(figures["robot"], text)])]
     if "before_and_after" in figures:
         text = (
             "Torque errors with the parameters that the robot's file claims (friction and rotors "
@@ -126,11 +124,9 @@ def _physics(report: Report, figures: Mapping[str, Figure]) -> list[Section]:
         "Lines: the model. Points: means over classes of speed of the measured forces, less all "
         "that the model explains otherwise. Points far from their line ask for another shape."
     )
-    sections.append(("Friction", [text, figures["friction"]]))
-    if "gravity" in figures:
-        log = report.verification[0] if report.verification else report.identification[0]
-        sections.append(("Weight", [gravity_table(report.fit, log), figures["gravity"]]))
-    return sections
+    log = report.verification[0] if report.verification else report.identification[0]
+    weight = [gravity_table(report.fit, log), figures["gravity"]]
+    return [*sections, ("Friction", [text, figures["friction"]]), ("Weight", weight)]
 
 
 def _torques(figures: Mapping[str, Figure], robot: Robot) -> list[Any]:

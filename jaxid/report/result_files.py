@@ -72,16 +72,15 @@ def _draw(report: Report) -> dict[str, Figure]:
     """Return all figures of a report by the names of their files, without suffix."""
     robot = report.fit.base.model.robot
     spectra = report.fit.residual_spectra
+    longest = max(report.identification, key=lambda errors: len(errors.time))
+    shown = report.verification[0] if report.verification else longest
     figures: dict[str, Figure] = {
         "errors": error_figure(report.identification, report.verification, robot),
         "parameters": parameter_figure(report.fit),
         "friction": friction_figure(report.fit, report.identification),
+        "gravity": gravity_figure(report.fit, shown),
+        "robot": error_scene(report.fit, shown),
     }
-    longest = max(report.identification, key=lambda errors: len(errors.time))
-    shown = report.verification[0] if report.verification else longest
-    if shown.positions is not None:
-        figures["gravity"] = gravity_figure(report.fit, shown)
-        figures["robot"] = error_scene(report.fit, shown)
     if report.claimed:
         groups = (("by the robot's file", report.claimed), ("identified", report.every_error))
         figures["before_and_after"] = bar_figure(groups, robot, "Torque errors before and after")

@@ -111,8 +111,6 @@ def verdict(report: Report) -> list[Remark]:
 
 def _judge_fit(fit: Fit, logs: Sequence[TorqueErrors]) -> list[Remark]:
     """Judge how much of the forces a fit misses, unless that is white noise."""
-    if not logs:
-        return []
     spectra, names = fit.residual_spectra, fit.base.model.robot.joint_names
     missed, found = 100 * _relative(logs), []
     # Of a residual that is white, no part counts; of others about what departs from white noise.
@@ -142,7 +140,7 @@ def _judge_fit(fit: Fit, logs: Sequence[TorqueErrors]) -> list[Remark]:
 
 def _judge_friction(fit: Fit, logs: Sequence[TorqueErrors]) -> list[Remark]:
     """Warn if errors on the logs of a fit depend on the speeds of the joints."""
-    found = np.any([e.depend_on_speed for e in logs], axis=0) if logs else []
+    found = np.any([e.depend_on_speed for e in logs], axis=0)
     names = [f"`{n}`" for n, x in zip(fit.base.model.robot.joint_names, found, strict=False) if x]
     remarks = [
         Remark(
@@ -181,14 +179,13 @@ def _judge_new_motions(
     if not verification:
         text = "The model was not validated on an unseen log: use `--verify` or `--split`."
         return [Remark(text, Status.DOUBTFUL)]
-    unseen, ratio = 100 * _relative(verification), 1.0
+    unseen = 100 * _relative(verification)
     worst = float(np.max(unseen))
     text = f"On logs that the fit has not seen, it misses up to {significant(worst, 2)} % of the "
     text += "RMS forces"
-    if identification:
-        # Errors that do not matter may grow.
-        ratios = unseen / np.maximum(100 * _relative(identification), 1e-9)
-        ratio = float(np.max(np.where(unseen > MATERIAL, ratios, 1.0)))
+    # Errors that do not matter may grow.
+    ratios = unseen / np.maximum(100 * _relative(identification), 1e-9)
+    ratio = float(np.max(np.where(unseen > MATERIAL, ratios, 1.0)))
     if ratio > 1:
         text += f", and up to {significant(ratio, 2)} times as much as of the fit's own"
     worst_joint = int(np.argmax(unseen))
