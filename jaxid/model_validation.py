@@ -23,8 +23,6 @@ STANDING = 0.01
 """Fraction of a joint's largest speed up to which it stands."""
 OCTAVES = 6
 """Number of times that a joint's largest speed is halved for classes of its speed."""
-FALSE_ALARM = 0.01
-"""Probability that errors which do not depend on speed seem to, at any joint of a log."""
 BLOCKS = 12
 """Blocks of time whose errors are compared."""
 
@@ -109,7 +107,8 @@ class TorqueErrors(eqx.Module):
         than after nearly any change of the blocks' signs, which leaves noise as it is
         (randomization test, Fisher). They make up a tenth of the squared errors at least.
         """
-        limit = FALSE_ALARM / self.errors.shape[1]
+        # One log of a hundred gives a false alarm.
+        limit = 0.01 / self.errors.shape[1]
         pairs = zip(*(np.asarray(x).T for x in (self.unexplained, self.speeds)), strict=True)
         return tuple(_chance(e, v) <= limit for e, v in pairs)
 

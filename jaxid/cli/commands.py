@@ -64,12 +64,6 @@ STOPPED = 130
 """Exit code of a command that Ctrl-C has ended, as shells expect it."""
 UNUSABLE = 3
 """Exit code if the verdict is that a model must not be used, or a motion not be recorded."""
-MARKED = (Status.DOUBTFUL, Status.BAD)
-"""Statuses that the terminal shows of a verdict."""
-SOURCES = (".urdf", ".xacro", ".xml")
-"""Suffixes of files that `jaxid export --to urdf` changes without being told."""
-UNLIKELY = 0.01
-"""Probability that the states agree on shared parameters, below which a remark is made."""
 
 
 def inspect(console: Console, path: Path, logs: list[Path]) -> None:
@@ -141,7 +135,8 @@ def identify(
         show(console, body_table(fit.consistency, robot.joint_names))
     show(console, validation.summary())
     judged = verdict(report)
-    show_remarks(console, [r for r in judged if r is judged[0] or r.status in MARKED])
+    marked = (r for r in judged[1:] if r.status in (Status.DOUBTFUL, Status.BAD))
+    show_remarks(console, [judged[0], *marked])
     show_files(console, output, [p.name for p in written])
     if judged[0].status is Status.BAD:
         raise typer.Exit(UNUSABLE)
@@ -256,7 +251,8 @@ def export(
         export_c(fit, path.parent, name=path.stem, double=double)
     elif to == "urdf":
         own = Path(fit.base.model.robot.source) if urdf is None else urdf
-        if urdf is None and (own.suffix not in SOURCES or not own.is_file()):
+        known = own.suffix in (".urdf", ".xacro", ".xml") and own.is_file()
+        if urdf is None and not known:
             raise InputError("`--to urdf` changes the robot's own file: name it with `--urdf`.")
         export_urdf(fit, own, path, **chain)
     else:
@@ -378,7 +374,7 @@ def states(console: Console, path: Path, logs: list[Path], output: Path) -> None
         "sharing_chance": chance,
     }
     rows = (found.names, found.units, found.parameters, found.uncertainty)
-    if chance < UNLIKELY:
+    if chance < 0.01:
         doubts.append(
             "the states do not agree on what they share (chance "
             f"{100 * chance:.2g} %): something else than friction and offsets differs"

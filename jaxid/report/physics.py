@@ -16,8 +16,6 @@ from jaxid.result_table import Column, Table, percent, shortened, significant
 from .figure import BLUE, CYCLE, GREY, MEASURED, Curve, Figure, Panel
 from .motion import pose_figure
 
-SPEEDS = 81
-"""Speeds of a friction curve."""
 ROWS = 2000
 """Largest number of poses whose weight is computed."""
 CLASSES = 24
@@ -36,7 +34,7 @@ def friction_figure(fit: Fit, logs: Sequence[TorqueErrors]) -> Figure:
     """
     robot = fit.base.model.robot
     fastest = np.max([np.max(np.abs(e.speeds), axis=0) for e in logs], axis=0)
-    shape = np.linspace(-1.0, 1.0, SPEEDS)
+    shape = np.linspace(-1.0, 1.0, 81)
     # Denser near standstill, where friction changes most.
     speeds = (np.sign(shape) * shape**2)[:, None] * fastest
     values, halves = _friction(fit, speeds)

@@ -18,8 +18,6 @@ from jaxid.trajectory.trajectory import AbstractTrajectory
 
 RATE = 60
 """Pictures per second."""
-PAUSE = 1.0
-"""Time at the end of the motion before it begins again [s]."""
 _BODY = (1.0, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0)
 """Parameters of bodies that only move; their inertia does not matter."""
 
@@ -83,7 +81,8 @@ def play(robot: Robot, shapes: CollisionModel | None, trajectory: AbstractTrajec
     with viewer.launch_passive(model, data, show_left_ui=False, show_right_ui=False) as window:
         began = time.monotonic()
         while window.is_running():
-            now = (time.monotonic() - began) % (len(rows) / RATE + PAUSE)
+            # It rests for a second before it begins again.
+            now = (time.monotonic() - began) % (len(rows) / RATE + 1.0)
             data.qpos[at] = rows[min(int(now * RATE), len(rows) - 1)]
             mujoco.mj_kinematics(model, data)
             window.sync()
