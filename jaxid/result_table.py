@@ -287,7 +287,8 @@ class Table:
         _shrink(widths, right, width - margin)
 
         def line(cells: Sequence[str]) -> str:
-            return "  ".join(map(_padded, cells, widths, right))
+            places = zip(map(shortened, cells, widths), widths, right, strict=True)
+            return "  ".join(s.rjust(w) if number else s.ljust(w) for s, w, number in places)
 
         height = max(map(len, headers))
         padded = ([""] * (height - len(header)) + header for header in headers)
@@ -305,12 +306,6 @@ def _hanging(entries: Iterable[tuple[str, Any, str]], width: int) -> Lines:
     for head, style, text in entries:
         for k, line in enumerate(_wrapped(text, width - len(head))):
             yield [(" " * len(head) if k else head, style), (line, "")]
-
-
-def _padded(text: str, width: int, right: bool) -> str:
-    """Return a text that takes so many places, shortened if it is longer."""
-    text = shortened(text, width)
-    return text.rjust(width) if right else text.ljust(width)
 
 
 def _wrapped(text: str, width: int) -> list[str]:
