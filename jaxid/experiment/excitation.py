@@ -357,21 +357,20 @@ def _remarks(
     yield from _force_doubts(experiment, preparation.nominal)
 
 
-def _force_doubts(experiment: Experiment, nominal: Nominal | None) -> list[Remark]:
-    """Return what the forces of a motion leave out."""
+def _force_doubts(experiment: Experiment, nominal: Nominal | None) -> Iterator[Remark]:
+    """Yield what the forces of a motion leave out."""
     if nominal is None:
-        return []
-    remarks, names = [], experiment.base.names
+        return
+    names = experiment.base.names
     unknown = [n for n, p in zip(names, nominal.parameters, strict=True) if np.isnan(p)]
     if unknown:
         text = f"not known, and counted as zero in the forces: {', '.join(unknown)}"
         if experiment.excitation.force_margin is None:
             text += f"; so {100 * UNKNOWN:g} % of the largest forces are kept free (`force_margin`)"
-        remarks.append(Remark(text, Status.DOUBTFUL))
+        yield Remark(text, Status.DOUBTFUL)
     if nominal.undetermined:
         text = (
             f"`{experiment.excitation.nominal}` does not determine "
             f"{', '.join(nominal.undetermined)}: their uncertainty counts as zero"
         )
-        remarks.append(Remark(text, Status.DOUBTFUL))
-    return remarks
+        yield Remark(text, Status.DOUBTFUL)
