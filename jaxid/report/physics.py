@@ -1,7 +1,6 @@
 """Figures of what a model says of its robot: friction, weight, and what its file claimed."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
@@ -43,8 +42,8 @@ def friction_figure(fit: Fit, logs: Sequence[TorqueErrors]) -> Figure:
         v, y = speeds[:, j], values[:, j]
         curves = [Curve(v, y, "model", BLUE, width=1.4)]
         if np.isfinite(halves[:, j]).all():
-            ends: dict[str, Any] = {"low": y - halves[:, j], "high": y + halves[:, j]}
-            curves.insert(0, Curve(v, y, "95 % band", MEASURED, "band", **ends))
+            low, high = y - halves[:, j], y + halves[:, j]
+            curves.insert(0, Curve(v, y, "95 % band", MEASURED, "band", low=low, high=high))
         places, means = _classes(logs, j, v, y)
         curves.append(Curve(places, means, "measured, mean of a class of speed", GREY, "points"))
         unit = robot.force_unit(j)

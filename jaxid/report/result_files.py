@@ -149,8 +149,7 @@ def write_comparison(
     folder: Path, comparison: Comparison, sources: Sequence[Path] = ()
 ) -> list[Path]:
     """Write `report.html`, `comparison.json` and `comparison.csv`; return the files."""
-    first = comparison.first
-    second = comparison.second
+    first, second = comparison.first, comparison.second
     k = list(comparison.indices)
     rows = _rows(
         name=comparison.names,
