@@ -8,7 +8,6 @@ import jax
 import numpy as np
 
 from jaxid.arrays import Float, double_precision
-from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
 from jaxid.excitation.constraints import AbstractConstraint, ForceLimits, TipLimits
 from jaxid.excitation.criteria import CRITERIA, information
@@ -40,12 +39,6 @@ class Nominal(NamedTuple):
     # covariance of an earlier fit, zero for what it does not determine; None if they are claims
     covariance: Float[np.ndarray, "base base"] | None
     undetermined: tuple[str, ...] = ()  # names of what an earlier fit does not determine
-
-    def force_limits(self, base: BaseParameters, margin: float | None) -> ForceLimits:
-        """Return the limits of forces, with a margin for what is unknown if none is given."""
-        if margin is None:
-            margin = UNKNOWN if np.isnan(self.parameters).any() else 0.0
-        return ForceLimits(base, np.nan_to_num(self.parameters), self.covariance, margin)
 
 
 class Played(NamedTuple):
@@ -235,7 +228,10 @@ def find_constraints(
         constraints.append(tip)
     fault = "not checked: no inertias are known; say in `excitation.nominal` where a report is"
     if nominal is not None:
-        forces = nominal.force_limits(experiment.base, table.force_margin)
+        known, margin = np.nan_to_num(nominal.parameters), table.force_margin
+        if margin is None:
+            margin = UNKNOWN if np.isnan(nominal.parameters).any() else 0.0
+        forces = ForceLimits(experiment.base, known, nominal.covariance, margin)
         fault = "not checked: no largest forces are known; give `limits.force`"
         if forces.entries(robot) and not (fault := gravity_fault(experiment, forces)):
             constraints.append(forces)

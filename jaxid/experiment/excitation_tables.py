@@ -100,7 +100,8 @@ class Collision:
             InputError: If shapes cannot be made, or a name is unknown.
         """
         capsules, obstacles, pairs, faults = [], [], None, []
-        if self.fit and source.builtin == "tx90l_on_rail" and not source.moved:
+        moved = source.base_rotation is not None or source.base_position is not None
+        if self.fit and source.builtin == "tx90l_on_rail" and not moved:
             capsules, obstacles, pairs = self._rail(tx90l_on_rail_collision())
         elif self.fit:
             capsules, faults = self._fitted(robot, source, folder)

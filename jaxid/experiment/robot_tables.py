@@ -181,11 +181,6 @@ class RobotSource:
         return {"base_rotation": R, "base_position": self.base_position or (0.0, 0.0, 0.0)}
 
     @property
-    def moved(self) -> bool:
-        """Whether the robot stands elsewhere than its source says."""
-        return self.base_rotation is not None or self.base_position is not None
-
-    @property
     def chain(self) -> dict[str, Any]:
         """Chain in the URDF or MJCF file."""
         return {"tip": self.tip, "base": self.base}
