@@ -21,8 +21,6 @@ MATERIAL = 2.0
 """Errors on new motions that are judged relative to those of the fit [% of the RMS force]."""
 UNSEEN_RATIO = 1.5
 """Errors on new motions, relative to those of the fit, that are good."""
-SMALL = 0.01
-"""Fraction (0 to 1) of the largest force below which an RMS force counts as that fraction."""
 LARGE_CONDITION = 1e3
 """Condition number, with scaled columns, above which parameters are hard to tell apart."""
 PRICE = (10.0, 100.0)
@@ -154,7 +152,8 @@ def _relative(logs: Sequence[TorqueErrors]) -> np.ndarray:
         np.sqrt(np.mean([np.asarray(x) ** 2 for x in group], axis=0))
         for group in ([e.rms for e in logs], [e.force_rms for e in logs])
     )
-    least = SMALL * np.nan_to_num(np.asarray(logs[0].max_forces))
+    # Forces below a hundredth of the largest count as that.
+    least = 0.01 * np.nan_to_num(np.asarray(logs[0].max_forces))
     forces = np.maximum(forces, least)
     return np.nan_to_num(rms / np.where(forces > 0, forces, np.inf))
 
