@@ -405,18 +405,14 @@ def judged(cases, folder):
     from rich.console import Console
 
     from jaxid.experiment import identify_logs  # private: what the command line runs
-    from jaxid.report.verdict import Report, verdict
+    from jaxid.report.verdict import verdict
 
     experiment, paths = written(cases, folder)
     with open("/dev/null", "w") as nowhere, identify_logs.stages(Console(file=nowhere)) as stage:
-        r = identify_logs.identify_logs(experiment, paths, [], 0.6, stage)
-    errors = r.validation.errors
-    fitted, unseen = errors[: r.fitted], errors[r.fitted :]
-    report = Report(
-        r.fit, fitted, unseen, r.validation.definiteness, {}, r.notes, r.findings, r.mistakes
-    )
+        report, _ = identify_logs.identify_logs(experiment, paths, [], 0.6, "", stage)
+    fitted = report.identification
     size = np.fmax(fitted[0].force_rms, 0.01 * np.nan_to_num(fitted[0].max_forces))
-    return verdict(report), r, float(np.nanmax(fitted[0].rms / size))
+    return verdict(report), report, float(np.nanmax(fitted[0].rms / size))
 
 
 def one(robot, urdf, change, j, amount, folder):

@@ -23,8 +23,6 @@ STANDING = 0.01
 """Fraction of a joint's largest speed up to which it stands."""
 OCTAVES = 6
 """Number of times that a joint's largest speed is halved for classes of its speed."""
-FALSE_ALARM = 0.01
-"""Probability that errors which do not depend on speed seem to, at any joint of a log."""
 BLOCKS = 12
 """Blocks of time whose errors are compared."""
 
@@ -42,7 +40,7 @@ class TorqueErrors(eqx.Module):
         speeds: Velocities, filtered and decimated alike [rad/s or m/s].
         unexplained: Errors of the same model fitted to this recording alone: what no parameters of
             it explain; NaN where a row does not count [N m or N].
-        positions: Coordinates, filtered and decimated alike [rad or m]; None if not known.
+        positions: Coordinates, filtered and decimated alike [rad or m].
     """
 
     name: str = eqx.field(static=True)
@@ -53,7 +51,7 @@ class TorqueErrors(eqx.Module):
     max_forces: Float[AnyArray, " joints"]
     speeds: Float[AnyArray, "rows joints"]
     unexplained: Float[AnyArray, "rows joints"]
-    positions: Float[AnyArray, "rows joints"] | None = None
+    positions: Float[AnyArray, "rows joints"]
 
     @property
     def moving(self) -> Bool[np.ndarray, "rows joints"]:
@@ -109,7 +107,8 @@ class TorqueErrors(eqx.Module):
         than after nearly any change of the blocks' signs, which leaves noise as it is
         (randomization test, Fisher). They make up a tenth of the squared errors at least.
         """
-        limit = FALSE_ALARM / self.errors.shape[1]
+        # One log of a hundred gives a false alarm.
+        limit = 0.01 / self.errors.shape[1]
         pairs = zip(*(np.asarray(x).T for x in (self.unexplained, self.speeds)), strict=True)
         return tuple(_chance(e, v) <= limit for e, v in pairs)
 
@@ -270,25 +269,22 @@ def torque_errors(
     mask = np.asarray(observations.mask)
     estimator = WeightedLeastSquares(ResidualVariances())
     own = estimator(RegressionProblem(fit.base, [observations])).parameters
-    shape = len(mask[::step]), observations.joints
-    measured, predicted, speeds, refitted, q = np.zeros((5, *shape))
+    found = np.zeros((5, len(mask[::step]), observations.joints))
     for chunk in observations.chunks(65536):
         first, stop = chunk.rows
         # Masked parts are not evaluated.
         if mask[first:stop].any():
             motion, forces = observations.read(slice(*chunk.samples))
             tool = fit.base.tool_forces(motion)
-            model_forces = fit.predict(motion) + tool
-            own_forces = fit.base.forces_in_numpy(own, motion) + tool
+            predicted = fit.predict(motion) + tool
+            refitted = fit.base.forces_in_numpy(own, motion) + tool
             rows = slice(-(-first // step), -(-stop // step))
             taken = slice(rows.start * step - first, None, step)
-            measured[rows] = chunk.reduce(forces)[taken]
-            predicted[rows] = chunk.reduce(model_forces)[taken]
-            refitted[rows] = chunk.reduce(own_forces)[taken]
-            speeds[rows] = chunk.reduce(motion.qd)[taken]
-            q[rows] = chunk.reduce(motion.q)[taken]
+            for kind, x in enumerate((forces, predicted, refitted, motion.qd, motion.q)):
+                found[kind, rows] = chunk.reduce(x)[taken]
         if progress is not None:
             progress(stop / observations.rows)
+    measured, predicted, refitted, speeds, q = found
     return TorqueErrors(
         name=observations.name,
         time=observations.reduced_time[::step],

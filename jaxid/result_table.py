@@ -69,31 +69,35 @@ class Remark:
 
 def in_html(macro: str, *arguments: Any) -> str:
     """Return what a macro of `result_table.html` makes of results."""
-    return str(getattr(_macros(), macro)(*arguments))
-
-
-def marked_up(text: str) -> str:
-    """Return a text for HTML; what stands between backticks becomes a name in other letters."""
-    return re.sub(r"`([^`]+)`", r'<span class="key">\1</span>', html.escape(printable(text)))
+    return str(getattr(macros(Path(__file__).with_suffix(".html")), macro)(*arguments))
 
 
 @functools.cache
-def _macros() -> Any:
+def macros(template: Path) -> Any:
+    """Return the macros of a template for HTML, which escape all texts."""
     # Commands that write no page do not wait for it.
     import jinja2
     from markupsafe import Markup
+
+    def marked_up(text: str) -> Markup:
+        # What stands between backticks becomes a name in other letters.
+        escaped = html.escape(printable(text))
+        return Markup(re.sub(r"`([^`]+)`", r'<span class="key">\1</span>', escaped))
 
     def aligned(number: str) -> str:
         # Blanks behind a number become as wide as the digits and the point left out.
         pointed = re.sub(r"^([^. ]*) ", "\\1\N{PUNCTUATION SPACE}", number)
         return pointed.replace(" ", "\N{FIGURE SPACE}")
 
-    folder = jinja2.FileSystemLoader(Path(__file__).parent)
     environment = jinja2.Environment(
-        loader=folder, autoescape=True, trim_blocks=True, lstrip_blocks=True
+        loader=jinja2.FileSystemLoader(template.parent),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
     )
-    environment.filters |= {"aligned": aligned, "marked_up": lambda text: Markup(marked_up(text))}
-    return environment.get_template("result_table.html").module
+    environment.filters |= {"aligned": aligned, "marked_up": marked_up}
+    return environment.get_template(template.name).module
 
 
 def significant(value: float, digits: int = 3) -> str:
@@ -283,7 +287,8 @@ class Table:
         _shrink(widths, right, width - margin)
 
         def line(cells: Sequence[str]) -> str:
-            return "  ".join(map(_padded, cells, widths, right))
+            places = zip(map(shortened, cells, widths), widths, right, strict=True)
+            return "  ".join(s.rjust(w) if number else s.ljust(w) for s, w, number in places)
 
         height = max(map(len, headers))
         padded = ([""] * (height - len(header)) + header for header in headers)
@@ -301,12 +306,6 @@ def _hanging(entries: Iterable[tuple[str, Any, str]], width: int) -> Lines:
     for head, style, text in entries:
         for k, line in enumerate(_wrapped(text, width - len(head))):
             yield [(" " * len(head) if k else head, style), (line, "")]
-
-
-def _padded(text: str, width: int, right: bool) -> str:
-    """Return a text that takes so many places, shortened if it is longer."""
-    text = shortened(text, width)
-    return text.rjust(width) if right else text.ljust(width)
 
 
 def _wrapped(text: str, width: int) -> list[str]:

@@ -271,9 +271,7 @@ def test_friction_that_the_file_claims_counts_in_the_forces(tmp_path):
     path.write_text(path.read_text().replace('<axis xyz="0 1 0"/>', claim))
     experiment = load_experiment(tmp_path / "arm.toml")
     found = find_nominal(experiment)
-    (limits,) = (
-        c for c in find_constraints(experiment, found).constraints if isinstance(c, ForceLimits)
-    )
+    (limits,) = (c for c in find_constraints(experiment, found)[0] if isinstance(c, ForceLimits))
     # Upright, at 1 rad/s, with a margin of 30 %: MuJoCo's forces over what is left of 50 N m.
     motion = Motion(np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]]), np.zeros((1, 3)))
     worst = np.asarray(limits(experiment.robot, motion)).max(axis=0)

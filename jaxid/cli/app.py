@@ -24,8 +24,6 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-ENDINGS = {"mjcf": ".xml", "pinocchio": "_pinocchio.json"}
-"""Endings of exported models where they are not the name of the format."""
 
 
 def main() -> None:
@@ -260,7 +258,8 @@ def export(
     console = options.start(report, *([urdf] if urdf else []))
     from . import commands
 
-    path = Path(f"arm{ENDINGS.get(to, f'.{to}')}") if output is None else output
+    endings = {"mjcf": ".xml", "pinocchio": "_pinocchio.json"}
+    path = Path(f"arm{endings.get(to, f'.{to}')}") if output is None else output
     made = [path, path.with_suffix(".h")] if to == "c" else [path]
     if to == "c" and path.suffix != ".c":
         raise InputError(f"`--output` must be a C file like arm.c, but is `{path}`.")

@@ -1,8 +1,8 @@
 """Work of the commands for an experiment and its logs, and what they print."""
 
 import dataclasses
+import functools
 import os
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +40,7 @@ from jaxid.identification.payload import (
     identify_drive_gains,
     identify_payload,
 )
-from jaxid.io import atomic_folder, require_writable
+from jaxid.io import require_writable, write_text
 from jaxid.report.excitation import headline, ordered, plan_remarks, side_by_side_table
 from jaxid.report.identification import body_table, motor_tables, residual_table
 from jaxid.report.page import show, show_files, show_remarks
@@ -51,7 +51,7 @@ from jaxid.report.result_files import (
     write_estimates,
     write_report,
 )
-from jaxid.report.verdict import Report, verdict
+from jaxid.report.verdict import verdict
 from jaxid.result_table import Remark, Status, Table, significant
 from jaxid.robot.inertia import INERTIAL_NAMES, INERTIAL_UNITS
 from jaxid.simulation import preview
@@ -64,12 +64,6 @@ STOPPED = 130
 """Exit code of a command that Ctrl-C has ended, as shells expect it."""
 UNUSABLE = 3
 """Exit code if the verdict is that a model must not be used, or a motion not be recorded."""
-MARKED = (Status.DOUBTFUL, Status.BAD)
-"""Statuses that the terminal shows of a verdict."""
-SOURCES = (".urdf", ".xacro", ".xml")
-"""Suffixes of files that `jaxid export --to urdf` changes without being told."""
-UNLIKELY = 0.01
-"""Probability that the states agree on shared parameters, below which a remark is made."""
 
 
 def inspect(console: Console, path: Path, logs: list[Path]) -> None:
@@ -125,48 +119,24 @@ def identify(
     _check_logs(logs, verify, split)
     experiment = load_experiment(path)
     with identify_logs.stages(open_console(stderr=True)) as stage:
-        result = identify_logs.identify_logs(experiment, logs, verify, split, stage)
-        stage("writing the report")
-        settings = {
-            "experiment": str(path),
-            "command": command_line(),
-            "identification": [str(p) for p in logs],
-            "verification": [str(p) for p in verify],
-            "split": split,
-            "experiment_text": experiment.text,
-            "filter": str(result.experiment.filter),
-            "decimation": str(experiment.decimation),
-            "min_speed": experiment.min_speed,
-        }
-        errors = result.validation.errors
-        report = Report(
-            result.fit,
-            errors[: result.fitted],
-            errors[result.fitted :],
-            result.validation.definiteness,
-            settings,
-            (*result.experiment.notes, *result.notes),
-            result.findings,
-            result.mistakes,
-            result.choice,
-            result.claimed,
-            result.claimed_mass,
+        report, validation = identify_logs.identify_logs(
+            experiment, logs, verify, split, command_line(), stage
         )
+        stage("writing the report")
         written = write_report(output, report, figures or "")
-    fit, robot = result.fit, result.experiment.robot
+    fit, robot = report.fit, experiment.robot
     tabulated = () if fit.consistency is None else fit.consistency.findings
-    notes = [*result.experiment.notes, *result.notes]
-    notes += [note for note in fit.notes if note not in tabulated]
     show(console, robot.summary(), *motor_tables(robot))
-    show_remarks(console, notes)
+    show_remarks(console, [*report.notes, *(n for n in fit.notes if n not in tabulated)])
     show(console, fit.summary())
     if fit.residual_spectra is not None:
         show(console, residual_table(fit.residual_spectra, robot))
     if fit.consistency is not None:
         show(console, body_table(fit.consistency, robot.joint_names))
-    show(console, result.validation.summary())
+    show(console, validation.summary())
     judged = verdict(report)
-    show_remarks(console, [r for r in judged if r is judged[0] or r.status in MARKED])
+    marked = (r for r in judged[1:] if r.status in (Status.DOUBTFUL, Status.BAD))
+    show_remarks(console, [judged[0], *marked])
     show_files(console, output, [p.name for p in written])
     if judged[0].status is Status.BAD:
         raise typer.Exit(UNUSABLE)
@@ -195,7 +165,8 @@ def excite(
     motion = _BestMotion(experiment, output, faults)
     with process.handing_over(motion.farewell), identify_logs.stages(errors) as stage:
         try:
-            design = design_motion(experiment, preparation, motion.keep(stage), seconds)
+            keep = functools.partial(motion.keep, stage)
+            design = design_motion(experiment, preparation, keep, seconds)
         except KeyboardInterrupt:
             errors.print(Text(f"jaxid: {motion.farewell()}."), soft_wrap=True)
             raise typer.Exit(STOPPED) from None
@@ -207,7 +178,7 @@ def excite(
     show_files(console, output.parent, [str(p.relative_to(output.parent)) for p in files])
     if all_criteria and not design.plan.interrupted:
         with identify_logs.stages(errors) as stage:
-            plans = compare_criteria(experiment, _until_stopped(stage.design))
+            plans = compare_criteria(experiment, functools.partial(_show_progress, stage))
         if plans:
             show(console, side_by_side_table(plans))
         done = sum(not plan.interrupted for plan in plans)
@@ -224,9 +195,7 @@ def show_motion(path: Path, output: Path) -> None:
     experiment, written = load_experiment(path), output.with_suffix(".json")
     if not written.is_file():
         raise InputError(f"`{written}` is not there: `--play` shows a motion that was designed.")
-    clearance = experiment.surroundings.clearance
-    shapes = None if clearance is None else clearance.model
-    preview.play(experiment.robot, shapes, load_trajectory(written))
+    preview.play(experiment.robot, experiment.surroundings.shapes, load_trajectory(written))
 
 
 class _BestMotion:
@@ -236,16 +205,12 @@ class _BestMotion:
         self._experiment, self._output, self._faults = experiment, output, faults
         self._value = np.inf
 
-    def keep(self, stage: identify_logs.Stages) -> Callable[[DesignProgress], None]:
-        """Return the callback of a design, which writes every better motion."""
-
-        def progress(now: DesignProgress) -> None:
-            stage.design(now)
-            if now.feasible and now.best < self._value:
-                write_motion(self._experiment, play(self._experiment, now.trajectory), self._output)
-                self._value = now.best
-
-        return _until_stopped(progress)
+    def keep(self, stage: identify_logs.Stages, now: DesignProgress) -> None:
+        """Show the progress of a design, and write every better motion."""
+        _show_progress(stage, now)
+        if now.feasible and now.best < self._value:
+            write_motion(self._experiment, play(self._experiment, now.trajectory), self._output)
+            self._value = now.best
 
     def farewell(self) -> str:
         """Return what is said when Ctrl-C ends the search."""
@@ -258,17 +223,11 @@ class _BestMotion:
         )
 
 
-def _until_stopped(
-    progress: Callable[[DesignProgress], None],
-) -> Callable[[DesignProgress], None]:
-    """Return a callback that calls another one, and ends a design after a signal."""
-
-    def run(now: DesignProgress) -> None:
-        if process.STOP.is_set():
-            raise KeyboardInterrupt
-        progress(now)
-
-    return run
+def _show_progress(stage: identify_logs.Stages, now: DesignProgress) -> None:
+    """Show the progress of a design, or end it after a signal."""
+    if process.STOP.is_set():
+        raise KeyboardInterrupt
+    stage.design(now)
 
 
 def export(
@@ -292,7 +251,8 @@ def export(
         export_c(fit, path.parent, name=path.stem, double=double)
     elif to == "urdf":
         own = Path(fit.base.model.robot.source) if urdf is None else urdf
-        if urdf is None and (own.suffix not in SOURCES or not own.is_file()):
+        known = own.suffix in (".urdf", ".xacro", ".xml") and own.is_file()
+        if urdf is None and not known:
             raise InputError("`--to urdf` changes the robot's own file: name it with `--urdf`.")
         export_urdf(fit, own, path, **chain)
     else:
@@ -317,8 +277,7 @@ def choose(console: Console, path: Path, logs: list[Path], output: Path) -> None
         raise InputError("`--output` must lie beside the experiment file: its paths count from it.")
     with identify_logs.stages(open_console(stderr=True)) as stage:
         choice, text = choosing.choose(experiment, logs, stage)
-    with atomic_folder(output.parent) as folder:
-        (folder / output.name).write_text(text, encoding="utf-8")
+    write_text(output, text)
     show(console, choice.summary())
     show_files(console, output.parent, [output.name])
 
@@ -415,7 +374,7 @@ def states(console: Console, path: Path, logs: list[Path], output: Path) -> None
         "sharing_chance": chance,
     }
     rows = (found.names, found.units, found.parameters, found.uncertainty)
-    if chance < UNLIKELY:
+    if chance < 0.01:
         doubts.append(
             "the states do not agree on what they share (chance "
             f"{100 * chance:.2g} %): something else than friction and offsets differs"

@@ -13,9 +13,6 @@ from rich.text import Text
 from jaxid.errors import InputError
 from jaxid.result_table import printable
 
-WIDTH = 100
-"""Width of the output where there is no terminal."""
-
 ExperimentFile = Annotated[
     Path, typer.Argument(help="The experiment file.", metavar="EXPERIMENT.TOML")
 ]
@@ -107,7 +104,7 @@ def open_console(stderr: bool = False) -> Console:
     """Return the terminal, or a console of fixed width where there is none."""
     console = Terminal(stderr=stderr, highlight=False)
     if not console.is_terminal and "COLUMNS" not in console._environ:
-        console.width = WIDTH
+        console.width = 100
     return console
 
 

@@ -16,10 +16,6 @@ import traceback
 from collections.abc import Callable, Iterator
 from typing import NoReturn
 
-GRACE = 1.0
-"""Time after Ctrl-C in which files that take their places may still do so [s]."""
-GARBAGE = 50_000
-"""Number of new objects after which cycles among them are looked for: by default hundreds."""
 STOP = threading.Event()
 """Set when a signal has asked the command to stop."""
 _farewells: list[Callable[[], str]] = []
@@ -44,7 +40,7 @@ def main() -> NoReturn:
     # Threads of BLAS wait busily for each other at small matrices; large work has its own threads.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # Imports, tracing and drawing make many small objects, of which few are in cycles.
-    gc.set_threshold(GARBAGE, 20, 100)
+    gc.set_threshold(50_000, 20, 100)
     codes, done = [], threading.Event()
 
     def work() -> None:
@@ -61,9 +57,9 @@ def main() -> NoReturn:
         for again in (signal.SIGINT, signal.SIGTERM):
             signal.signal(again, lambda *_: os._exit(128 + number))
         STOP.set()
-        # Files that belong together take their places together.
+        # Files that belong together take their places together, for a second at most.
         lock = getattr(sys.modules.get("jaxid.io"), "PLACING", None)
-        _ = lock is None or lock.acquire(timeout=GRACE)
+        _ = lock is None or lock.acquire(timeout=1.0)
         if not codes:
             _say(_farewells[-1]() if _farewells else "stopped: nothing was written")
             codes.append(128 + number)

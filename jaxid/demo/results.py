@@ -10,7 +10,7 @@ from jaxid.io import atomic_folder
 from jaxid.report.excitation import side_by_side_table
 from jaxid.report.identification import parameter_table
 from jaxid.report.page import Section, folded, picture, render_page
-from jaxid.report.result_files import SCHEMAS, plain, write_json
+from jaxid.report.result_files import SCHEMAS, write_json
 from jaxid.result_table import (
     MISSING,
     Column,
@@ -37,7 +37,7 @@ def write_study(folder: Path, study: Study) -> list[Path]:
     page = demo_page(study)
     with atomic_folder(folder) as staging:
         (staging / "report.html").write_text(page, encoding="utf-8")
-        write_json(staging / "demo.json", plain(_record(study)))
+        write_json(staging / "demo.json", _record(study))
     return [folder / "report.html", folder / "demo.json"]
 
 

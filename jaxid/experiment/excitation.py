@@ -8,7 +8,6 @@ import jax
 import numpy as np
 
 from jaxid.arrays import Float, double_precision
-from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
 from jaxid.excitation.constraints import AbstractConstraint, ForceLimits, TipLimits
 from jaxid.excitation.criteria import CRITERIA, information
@@ -28,93 +27,49 @@ from jaxid.trajectory.trajectory import AbstractTrajectory, LinearTrajectory, Pa
 from .decoder import within
 from .experiment import Experiment
 from .motion_check import gravity_fault, motion_checks
-from .robot_tables import named
 
 UNKNOWN = 0.3
 """Fraction of the largest forces that is kept free where friction, or anything else, is unknown."""
 
 
 class Nominal(NamedTuple):
-    """Base parameters as far as they are known before the experiment.
+    """Base parameters as far as they are known before the experiment."""
 
-    Attributes:
-        parameters: Values; NaN where nothing is known.
-        covariance: Covariance of an earlier fit; None if the parameters are only claimed. Zero for
-            what the fit does not determine.
-        undetermined: Names of parameters that an earlier fit does not determine.
-    """
-
-    parameters: Float[np.ndarray, " base"]
+    parameters: Float[np.ndarray, " base"]  # values; NaN where nothing is known
+    # covariance of an earlier fit, zero for what it does not determine; None if they are claims
     covariance: Float[np.ndarray, "base base"] | None
-    undetermined: tuple[str, ...] = ()
-
-    def force_limits(self, base: BaseParameters, margin: float | None) -> ForceLimits:
-        """Return the limits of forces, with a margin for what is unknown if none is given."""
-        if margin is None:
-            margin = UNKNOWN if np.isnan(self.parameters).any() else 0.0
-        return ForceLimits(base, np.nan_to_num(self.parameters), self.covariance, margin)
-
-
-class Limited(NamedTuple):
-    """Constraints of a motion beside the limits of the joints, and why they leave out forces.
-
-    Attributes:
-        constraints: The constraints.
-        fault: Why forces are no part of them; empty if they are.
-    """
-
-    constraints: tuple[AbstractConstraint, ...]
-    fault: str
+    undetermined: tuple[str, ...] = ()  # names of what an earlier fit does not determine
 
 
 class Played(NamedTuple):
-    """A motion as a robot can play it.
+    """A motion as a robot can play it."""
 
-    Attributes:
-        motion: Motion from standstill to standstill where that is possible.
-        sampled: Motion as it is written in samples: until a sample meets its end.
-        sample_time: Time between those samples [s].
-        window: Times between which it is the designed motion [s].
-        fault: Why it does not start and end at rest; empty if it does, or need not.
-    """
-
-    motion: AbstractTrajectory
-    sampled: AbstractTrajectory
-    sample_time: float
-    window: tuple[float, float]
-    fault: str
+    motion: AbstractTrajectory  # from standstill to standstill where that is possible
+    sampled: AbstractTrajectory  # as it is written in samples: until a sample meets its end
+    sample_time: float  # time between those samples [s]
+    window: tuple[float, float]  # times between which it is the designed motion [s]
+    fault: str  # why it does not start and end at rest; empty if it does, or need not
 
 
 class Design(NamedTuple):
-    """Designed motion as a robot can play it.
+    """Designed motion as a robot can play it."""
 
-    Attributes:
-        plan: Result of the optimisation.
-        played: Motion that the robot plays.
-        remarks: Remarks beside those of the plan.
-    """
-
-    plan: ExcitationPlan
-    played: Played
-    remarks: tuple[Remark, ...]
+    plan: ExcitationPlan  # result of the optimisation
+    played: Played  # motion that the robot plays
+    remarks: tuple[Remark, ...]  # remarks beside those of the plan
 
 
 class Preparation(NamedTuple):
-    """Knowledge that a design needs before its search.
+    """Knowledge that a design needs before its search."""
 
-    Attributes:
-        nominal: Parameters that are known.
-        limited: Constraints beside the limits of the joints.
-        begin: Motion to go on with; None to begin anew.
-    """
-
-    nominal: Nominal | None
-    limited: Limited
-    begin: LinearTrajectory | None
+    nominal: Nominal | None  # parameters that are known
+    constraints: tuple[AbstractConstraint, ...]  # constraints beside the limits of the joints
+    force_fault: str  # why forces are not among the constraints; empty if they are
+    begin: LinearTrajectory | None = None  # motion to go on with; None to begin anew
 
     def faults(self, experiment: Experiment) -> tuple[str, ...]:
         """Return what will not be checked, in sentences."""
-        forces = (f"forces: {self.limited.fault}",) if self.limited.fault else ()
+        forces = (f"forces: {self.force_fault}",) if self.force_fault else ()
         return (*experiment.surroundings.faults, *forces)
 
 
@@ -136,15 +91,15 @@ def prepare_design(experiment: Experiment, written: Path | None) -> Preparation:
                     "`leads = false` out, or set `rest = true`."
                 )
         nominal = find_nominal(experiment)
-        limited = find_constraints(experiment, nominal)
+        found = Preparation(nominal, *find_constraints(experiment, nominal))
     if written is None:
-        return Preparation(nominal, limited, None)
+        return found
     begin = load_trajectory(written)
     begin = begin.inner if isinstance(begin, WithLeads) else begin
-    basis = experiment.excitation.basis(bool(limited.constraints))
+    basis = experiment.excitation.basis(bool(found.constraints))
     if not (isinstance(begin, LinearTrajectory) and str(begin.basis) == str(basis)):
         raise InputError(f"`{written}` holds a motion of another kind: design anew.")
-    return Preparation(nominal, limited, begin)
+    return found._replace(begin=begin)
 
 
 def design_motion(
@@ -169,7 +124,7 @@ def design_motion(
             progress=progress,
             begin=preparation.begin,
             seconds=table.time if seconds is None else seconds,
-            **_settings(experiment, preparation.nominal, preparation.limited),
+            **_settings(experiment, preparation),
         )
     played = play(experiment, plan.trajectory)
     return Design(plan, played, tuple(_remarks(experiment, plan, played, preparation)))
@@ -180,8 +135,7 @@ def compare_criteria(
 ) -> list[ExcitationPlan]:
     """Design by every criterion, from few starts and without polishing, until Ctrl-C."""
     plans, table = [], experiment.excitation
-    nominal = find_nominal(experiment)
-    limited = find_constraints(experiment, nominal)
+    preparation = prepare_design(experiment, None)
     for number, criterion in enumerate(CRITERIA, 1):
 
         def tell(step: DesignProgress, number: int = number) -> None:
@@ -198,7 +152,7 @@ def compare_criteria(
                     polish=0,
                     progress=tell,
                     throw=False,
-                    **_settings(experiment, nominal, limited, bool(criterion.weighted)),
+                    **_settings(experiment, preparation, bool(criterion.weighted)),
                 )
         except KeyboardInterrupt:
             break
@@ -233,17 +187,14 @@ def write_design(
     settings = {"facts": seed, "experiment_text": experiment.text, "command": command}
     # First the page: where there is no room for pictures, nothing changes.
     place, motion = output.with_suffix(""), design.played.motion
-    clearance = experiment.surroundings.clearance
-    shapes = None if clearance is None else clearance.model
+    shapes = experiment.surroundings.shapes
     pictures = write_excitation(place, design.plan, motion, design.remarks, settings, shapes)
     return write_motion(experiment, design.played, output) + pictures
 
 
-def _settings(
-    experiment: Experiment, nominal: Nominal | None, limited: Limited, weighted: bool = True
-) -> dict:
+def _settings(experiment: Experiment, preparation: Preparation, weighted: bool = True) -> dict:
     """Return what all designs of one experiment have in common."""
-    table = experiment.excitation
+    table, nominal = experiment.excitation, preparation.nominal
     noise = assumed_noise(experiment.robot) if table.noise is None else np.array(table.noise)
     sizes = None
     if nominal is not None:
@@ -251,8 +202,8 @@ def _settings(
         open_ones = np.isin(experiment.base.names, nominal.undetermined)
         sizes = np.where(open_ones, np.nan, nominal.parameters)
     return {
-        "basis": table.basis(bool(limited.constraints)),
-        "constraints": limited.constraints,
+        "basis": table.basis(bool(preparation.constraints)),
+        "constraints": preparation.constraints,
         "key": jax.random.key(table.seed),
         "noise": noise,
         "nominal": sizes,
@@ -261,8 +212,10 @@ def _settings(
     }
 
 
-def find_constraints(experiment: Experiment, nominal: Nominal | None) -> Limited:
-    """Return the constraints of the motion beside the limits of the joints.
+def find_constraints(
+    experiment: Experiment, nominal: Nominal | None
+) -> tuple[tuple[AbstractConstraint, ...], str]:
+    """Return constraints beside the limits of the joints, and why forces are not among them.
 
     Raises:
         InputError: If `force_margin` is given, but no motion can keep the limits of forces.
@@ -275,13 +228,16 @@ def find_constraints(experiment: Experiment, nominal: Nominal | None) -> Limited
         constraints.append(tip)
     fault = "not checked: no inertias are known; say in `excitation.nominal` where a report is"
     if nominal is not None:
-        forces = nominal.force_limits(experiment.base, table.force_margin)
+        known, margin = np.nan_to_num(nominal.parameters), table.force_margin
+        if margin is None:
+            margin = UNKNOWN if np.isnan(nominal.parameters).any() else 0.0
+        forces = ForceLimits(experiment.base, known, nominal.covariance, margin)
         fault = "not checked: no largest forces are known; give `limits.force`"
         if forces.entries(robot) and not (fault := gravity_fault(experiment, forces)):
             constraints.append(forces)
     if fault and table.force_margin is not None:
         raise InputError(f"`force_margin`: {fault}.")
-    return Limited(tuple(constraints), fault)
+    return tuple(constraints), fault
 
 
 def _earlier_information(
@@ -319,15 +275,14 @@ def find_nominal(experiment: Experiment) -> Nominal | None:
     base, report, folder = experiment.base, experiment.excitation.nominal, experiment.path.parent
     if report is None:
         try:
-            bodies = experiment.source.parameters(folder)
+            known = experiment.source.claims(folder)
         except InputError:
             if experiment.excitation.force_margin is not None:
                 raise
             return None  # nothing depends on it, and the robot's notes name the body
-        if bodies is None or not np.any(bodies):
+        if not known:
             return None
         standard = experiment.model.parameter_names
-        known = named(bodies) | experiment.source.joint_parameters(folder)
         values = np.asarray(base.from_standard([known.get(name, 0.0) for name in standard]))
         leads = [standard[k] in known for k in base.indices]
         return Nominal(np.where(leads, values, np.nan), None)
@@ -374,17 +329,13 @@ def _remarks(
     experiment: Experiment, plan: ExcitationPlan, played: Played, preparation: Preparation
 ) -> Iterator[Remark]:
     """Yield what must be known of a designed motion beside its plan."""
-    table, leads, (begin, end) = (
-        experiment.excitation,
-        experiment.excitation.chosen_leads,
-        played.window,
-    )
+    table, (begin, end) = experiment.excitation, played.window
     if played.fault:
         yield Remark(played.fault, Status.BAD)
     if begin > 0:
         text = f"from {begin:.3f} to {end:.3f} s of {float(played.motion.duration):.3f} s"
         yield Remark(f"the robot starts at rest and is in the designed motion {text}")
-    count = 1 if leads is None else leads.periods
+    count = 1 if table.chosen_leads is None else table.chosen_leads.periods
     notes = {
         "the noise is assumed as 1 % of the largest forces: give `noise` if it is known": (
             table.noise is None
@@ -398,25 +349,24 @@ def _remarks(
     for text, holds in notes.items():
         if holds:
             yield Remark(text)
-    yield from motion_checks(experiment, plan, preparation.limited.fault)
+    yield from motion_checks(experiment, plan, preparation.force_fault)
     yield from _force_doubts(experiment, preparation.nominal)
 
 
-def _force_doubts(experiment: Experiment, nominal: Nominal | None) -> list[Remark]:
-    """Return what the forces of a motion leave out."""
+def _force_doubts(experiment: Experiment, nominal: Nominal | None) -> Iterator[Remark]:
+    """Yield what the forces of a motion leave out."""
     if nominal is None:
-        return []
-    remarks, names = [], experiment.base.names
+        return
+    names = experiment.base.names
     unknown = [n for n, p in zip(names, nominal.parameters, strict=True) if np.isnan(p)]
     if unknown:
         text = f"not known, and counted as zero in the forces: {', '.join(unknown)}"
         if experiment.excitation.force_margin is None:
             text += f"; so {100 * UNKNOWN:g} % of the largest forces are kept free (`force_margin`)"
-        remarks.append(Remark(text, Status.DOUBTFUL))
+        yield Remark(text, Status.DOUBTFUL)
     if nominal.undetermined:
         text = (
             f"`{experiment.excitation.nominal}` does not determine "
             f"{', '.join(nominal.undetermined)}: their uncertainty counts as zero"
         )
-        remarks.append(Remark(text, Status.DOUBTFUL))
-    return remarks
+        yield Remark(text, Status.DOUBTFUL)

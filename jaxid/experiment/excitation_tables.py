@@ -100,7 +100,8 @@ class Collision:
             InputError: If shapes cannot be made, or a name is unknown.
         """
         capsules, obstacles, pairs, faults = [], [], None, []
-        if self.fit and source.builtin == "tx90l_on_rail" and not source.moved:
+        moved = source.base_rotation is not None or source.base_position is not None
+        if self.fit and source.builtin == "tx90l_on_rail" and not moved:
             capsules, obstacles, pairs = self._rail(tx90l_on_rail_collision())
         elif self.fit:
             capsules, faults = self._fitted(robot, source, folder)
@@ -163,15 +164,15 @@ class Collision:
 
 
 class Surroundings(NamedTuple):
-    """Shapes of robot and surroundings.
+    """Shapes of robot and surroundings."""
 
-    Attributes:
-        clearance: Distance that they must keep; None if there are none.
-        faults: What is not known of them, in sentences.
-    """
+    clearance: Clearance | None  # distance that they must keep; None if there are none
+    faults: tuple[str, ...]  # what is not known of them, in sentences
 
-    clearance: Clearance | None
-    faults: tuple[str, ...]
+    @property
+    def shapes(self) -> CollisionModel | None:
+        """All shapes; None if there are none."""
+        return None if self.clearance is None else self.clearance.model
 
 
 @dataclasses.dataclass(frozen=True)

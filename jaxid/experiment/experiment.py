@@ -12,13 +12,7 @@ import numpy as np
 from jaxid.arrays import Float
 from jaxid.dynamics.base import BaseParameters, base_parameters
 from jaxid.dynamics.model import Model
-from jaxid.dynamics.terms import (
-    AbstractTerm,
-    AbstractTransition,
-    LoadFriction,
-    RigidBodies,
-    Tanh,
-)
+from jaxid.dynamics.terms import AbstractTerm, AbstractTransition, LoadFriction, RigidBodies, Tanh
 from jaxid.errors import InputError
 from jaxid.identification.consistency import BodyBounds, PhysicallyConsistent
 from jaxid.identification.estimators import NonlinearFriction

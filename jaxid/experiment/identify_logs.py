@@ -6,7 +6,6 @@ import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from rich.console import Console
@@ -41,10 +40,10 @@ from jaxid.model_validation import (
     validate,
 )
 from jaxid.report.result_files import read_fit
+from jaxid.report.verdict import Report
 
 from .decoder import within
 from .experiment import Experiment
-from .robot_tables import named
 
 LoadedLog = tuple[Recording | Observations, Observations, Diagnosis]
 """Log as it was read (of a log on disk its observations), filtered log, and diagnosis."""
@@ -214,29 +213,14 @@ def read_runs(
     return runs, doubts
 
 
-class Identification(NamedTuple):
-    """Result of the command `jaxid identify`."""
-
-    experiment: Experiment  # experiment with the filter that was chosen
-    choice: FilterChoice | None  # choice of the filter, where it was left to the logs
-    fit: Fit  # identified parameters
-    validation: Validation  # torque errors of all logs, those of the fit first
-    fitted: int  # number of logs, or of parts of logs, of the fit
-    notes: list[str]  # notes on the logs, as sentences
-    findings: list[str]  # findings on the logs
-    mistakes: tuple[str, ...]  # likely mistakes in the columns of the logs, by the fit
-    # torque errors of the parameters that the robot's file claims, like `validation`, if any
-    claimed: tuple[TorqueErrors, ...] = ()
-    claimed_mass: float = 0.0  # mass of all bodies that it claims [kg]
-
-
 def identify_logs(
     experiment: Experiment,
     paths: Sequence[Path],
     verify: Sequence[Path],
     split: float | None,
+    command: str,
     stage: Stages,
-) -> Identification:
+) -> tuple[Report, Validation]:
     """Identify with logs and with what earlier reports keep, and validate."""
     logs = [p for p in paths if not is_report(p)]
     reports = [p for p in paths if is_report(p)]
@@ -272,28 +256,48 @@ def identify_logs(
     for log, whole, diagnosis in loaded[: len(logs)]:
         if isinstance(log, Recording) and not diagnosis.faulty:
             notes += [f"{log.name}: {x}" for x in resolution_note(fit, log, whole)]
-    notes, found = list(dict.fromkeys(notes)), findings(loaded)
-    claims = _errors_of_claims(experiment, fit, every)
-    return Identification(
-        experiment, choice, fit, validation, len(fitted), notes, found, mistakes, *claims
+    settings = {
+        "experiment": str(experiment.path),
+        "command": command,
+        "identification": [str(p) for p in paths],
+        "verification": [str(p) for p in verify],
+        "split": split,
+        "experiment_text": experiment.text,
+        "filter": str(experiment.filter),
+        "decimation": str(experiment.decimation),
+        "min_speed": experiment.min_speed,
+    }
+    claimed, claimed_mass = _errors_of_claims(experiment, fit, every)
+    report = Report(
+        fit,
+        validation.errors[: len(fitted)],
+        validation.errors[len(fitted) :],
+        validation.definiteness,
+        settings,
+        notes=(*experiment.notes, *dict.fromkeys(notes)),
+        doubts=findings(loaded),
+        mistakes=mistakes,
+        choice=choice,
+        claimed=claimed,
+        claimed_mass=claimed_mass,
     )
+    return report, validation
 
 
 def _errors_of_claims(
     experiment: Experiment, fit: Fit, logs: Sequence[Observations]
 ) -> tuple[tuple[TorqueErrors, ...], float]:
     """Return torque errors of the parameters that the robot's file claims, and its mass [kg]."""
-    folder = experiment.path.parent
     try:
-        bodies = experiment.source.parameters(folder)
+        known = experiment.source.claims(experiment.path.parent)
     except InputError:
         return (), 0.0  # the robot's notes name the body
-    if bodies is None or not np.any(bodies):
+    if not known:
         return (), 0.0
-    known = named(bodies) | experiment.source.joint_parameters(folder)
     standard = [known.get(name, 0.0) for name in fit.base.model.parameter_names]
     claim = dataclasses.replace(fit, parameters=np.asarray(fit.base.from_standard(standard)))
-    return tuple(torque_errors(claim, log) for log in logs), float(bodies[:, 0].sum())
+    mass = float(np.sum([known[f"m{k + 1}"] for k in range(experiment.robot.joints)]))
+    return tuple(torque_errors(claim, log) for log in logs), mass
 
 
 def _add_reports(

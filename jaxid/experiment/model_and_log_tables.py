@@ -17,16 +17,7 @@ from jaxid.robot.limits_and_drives import per_joint
 from jaxid.robot.robot import Robot
 from jaxid.units import Unit
 
-from .decoder import (
-    Bounds,
-    Count,
-    Magnitude,
-    Positive,
-    call,
-    decode,
-    decode_value,
-    within,
-)
+from .decoder import Bounds, Count, Magnitude, Positive, call, decode, decode_value, within
 
 FILTERS: dict[str, type[filters.AbstractFilter]] = {
     "butterworth": filters.ZeroPhaseButterworth,
@@ -145,10 +136,13 @@ class Effects:
         coupled = self.coupled_drives
         if coupled is None:
             coupled = bool(terms.CoupledDrives().couplings(robot))
+        viscous = self.viscous and terms.ViscousFriction()
+        if self.viscous == "asymmetric":
+            viscous = terms.AsymmetricViscousFriction()
         ripples = bool(self.motor_ripple or self.joint_ripple)
         chosen = (
             terms.RigidBodies(principal_axes=self.principal_axes),
-            self._viscous_friction,
+            viscous,
             self.coulomb is not False and dry.term(robot),
             self.square_root and terms.SquareRootFriction(dry.transition(robot)),
             self.rotor_inertia and terms.RotorInertia(),
@@ -169,12 +163,6 @@ class Effects:
             raise InputError("`load` needs complete bodies: leave `principal_axes` out.")
         dry = self.coulomb if isinstance(self.coulomb, DryFriction) else DryFriction()
         return dry.transition(robot) if self.load else None
-
-    @property
-    def _viscous_friction(self) -> terms.AbstractTerm | bool:
-        if self.viscous == "asymmetric":
-            return terms.AsymmetricViscousFriction()
-        return self.viscous and terms.ViscousFriction()
 
     def linear_terms(self, robot: Robot) -> tuple[terms.AbstractTerm, ...]:
         """Return the terms with Coulomb's law in place of Stribeck's."""

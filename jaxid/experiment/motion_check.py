@@ -33,10 +33,10 @@ def motion_checks(
     if excess > 1e-6:
         text = f"positions, speeds and accelerations: limits are exceeded by {100 * excess:.2g} %"
     yield Remark(text, Status.BAD if excess > 1e-6 else Status.GOOD)
-    clearance, faults = experiment.surroundings
+    faults, shapes = experiment.surroundings.faults, experiment.surroundings.shapes
     near = [f for f in plan.findings if f.name.startswith("the clearance of ")]
-    floors = () if clearance is None else clearance.model.obstacles
-    floors = [o.name for o in floors if isinstance(o, HalfSpace)]
+    obstacles = () if shapes is None else shapes.obstacles
+    floors = [o.name for o in obstacles if isinstance(o, HalfSpace)]
     on_floor = [f for f in near if any(f.name.endswith(f" and {floor}") for floor in floors)]
     apart = [f for f in near if f not in on_floor]
     if floors and on_floor:
@@ -47,7 +47,7 @@ def motion_checks(
         yield Remark("floor: not checked, as `floor = false` asks", Status.DOUBTFUL)
     else:
         yield Remark("floor: not checked, for no shape of the robot is known", Status.BAD)
-    for note in () if clearance is None else clearance.model.notes:
+    for note in () if shapes is None else shapes.notes:
         yield Remark(f"self-collision: {note}", Status.DOUBTFUL)
     for fault in faults:
         yield Remark(f"self-collision: {fault}", Status.BAD)

@@ -181,11 +181,6 @@ class RobotSource:
         return {"base_rotation": R, "base_position": self.base_position or (0.0, 0.0, 0.0)}
 
     @property
-    def moved(self) -> bool:
-        """Whether the robot stands elsewhere than its source says."""
-        return self.base_rotation is not None or self.base_position is not None
-
-    @property
     def chain(self) -> dict[str, Any]:
         """Chain in the URDF or MJCF file."""
         return {"tip": self.tip, "base": self.base}
@@ -233,6 +228,17 @@ class RobotSource:
         if self.file is None:
             return None
         return np.asarray(urdf_parameters(folder / self.file, **self.chain)).reshape(-1, 10)
+
+    def claims(self, folder: Path) -> dict[str, float]:
+        """Return all that the robot's file claims, by names in a model; nothing without bodies.
+
+        Raises:
+            InputError: If the file describes a body that cannot exist.
+        """
+        bodies = self.parameters(folder)
+        if bodies is None or not np.any(bodies):
+            return {}
+        return named(bodies) | self.joint_parameters(folder)
 
     def joint_parameters(self, folder: Path) -> dict[str, float]:
         """Return rotor inertias and friction that the file claims, by their names in a model."""

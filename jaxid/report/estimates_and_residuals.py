@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from scipy.signal import fftconvolve
@@ -243,13 +242,10 @@ def autocorrelation_figure(
         white = [Curve(lags, filtered, "white noise behind the filters", GREY, dashed=True)]
 
     def panel(j: int) -> Panel:
-        ends: dict[str, Any] = {
-            "low": np.full(count, -limits[j]),
-            "high": np.full(count, limits[j]),
-        }
+        limit, inside = np.full(count, limits[j]), "white residuals: 95 % within"
         return Panel(
             [
-                Curve(lags, lags, "white residuals: 95 % within", MEASURED, "band", **ends),
+                Curve(lags, lags, inside, MEASURED, "band", low=-limit, high=limit),
                 Curve(lags, values[:, j], "residuals", marker=True),
                 *white,
             ],

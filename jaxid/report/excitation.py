@@ -84,21 +84,20 @@ def ordered(remarks: Iterable[Remark]) -> list[Remark]:
 def write_excitation(
     folder: Path,
     plan: ExcitationPlan,
-    played: AbstractTrajectory | None = None,
-    remarks: Sequence[Remark] = (),
-    settings: Mapping[str, Any] | None = None,
-    shapes: CollisionModel | None = None,
+    played: AbstractTrajectory,
+    remarks: Sequence[Remark],
+    settings: Mapping[str, Any],
+    shapes: CollisionModel | None,
 ) -> list[Path]:
     """Write the page of a design; return the file.
 
-    The motion with its leads is drawn where there is one, among the `shapes`. `settings` tell the
-    origin of the design as in `provenance`.
+    The motion as it is played is drawn among the `shapes`. `settings` tell the origin of the design
+    as in `provenance`.
     """
     robot = plan.base.model.robot
-    shown = plan.trajectory if played is None else played
     with double_precision():
-        time = np.linspace(0.0, float(shown.duration), 801)
-        motion = shown.motion(time)
+        time = np.linspace(0.0, float(played.duration), 801)
+        motion = played.motion(time)
     limits = plan.limits.limits
     speed, fastest = np.abs(np.asarray(motion.qd)), np.asarray(limits.velocity)
     used = 100.0 * speed / np.where(np.isfinite(fastest), fastest, np.max(speed))
@@ -115,14 +114,11 @@ def write_excitation(
         f"{robot.name}: a motion to record",
         [
             ("Verdict", [headline(plan, remarks), every]),
-            (
-                "The motion",
-                [picture(space, said), *figures],
-            ),
+            ("The motion", [picture(space, said), *figures]),
             ("Use of the limits", use),
             ("Gain over a random motion", [text, criteria]),
             ("Expected standard deviations", [deviations]),
-            provenance(settings or {}),
+            provenance(settings),
         ],
         f"Designed to determine {plan.base.size} base parameters of {robot.joints} joints.",
     )

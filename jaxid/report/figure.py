@@ -21,72 +21,43 @@ CYCLE = (BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY, GREY)
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Curve:
-    """Line, points, bars, band or intervals in a panel.
+    """Line, points, bars, band or intervals in a panel."""
 
-    Attributes:
-        x: Abscissas.
-        y: Ordinates.
-        name: Entry of the legend; curves of one name are one entry.
-        colour: Colour of all its parts.
-        kind: A band lies between `low` and `high`, intervals lie along x between them.
-        width: Width of the line [pt].
-        dashed: Whether the line is dashed.
-        marker: Whether a line has dots.
-        low: Lower ends.
-        high: Upper ends.
-        texts: Text of each point; of bars written on them.
-    """
-
-    x: Any
-    y: Any
-    name: str = ""
-    colour: str = BLUE
+    x: Any  # abscissas
+    y: Any  # ordinates
+    name: str = ""  # entry of the legend; curves of one name are one entry
+    colour: str = BLUE  # colour of all its parts
+    # a band lies between `low` and `high`, intervals lie along x between them
     kind: Literal["line", "points", "bars", "band", "intervals"] = "line"
-    width: float = 1.0
-    dashed: bool = False
-    marker: bool = False
-    low: Any = None
-    high: Any = None
-    texts: Sequence[str] = ()
+    width: float = 1.0  # width of the line [pt]
+    dashed: bool = False  # whether the line is dashed
+    marker: bool = False  # whether a line has dots
+    low: Any = None  # lower ends
+    high: Any = None  # upper ends
+    texts: Sequence[str] = ()  # text of each point; of bars written on them
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Panel:
-    """Axes with curves.
+    """Axes with curves."""
 
-    Attributes:
-        curves: What is drawn, the first one at the back.
-        title: Title, such as the name of a joint.
-        value: Measured value beside the title.
-        x: Label of the abscissa.
-        y: Label of the ordinate.
-        unit: Unit of the ordinate.
-        log: Logarithmic axes: `x`, `y` or both.
-        x_range: Limits of the abscissa; those of the curves if None.
-        y_range: Limits of the ordinate; those of the curves if None.
-        x_names: Names of the abscissas 0, 1, …, instead of numbers.
-        y_names: Names of the ordinates 0, 1, … from the top, instead of numbers.
-        beside: Texts to the right of these names.
-        levels: Thin lines across: `x` or `y`, value, colour.
-        below: Panels below this one with the same abscissa, smaller by their share.
-        share: Height relative to the first panel.
-    """
-
-    curves: Sequence[Curve]
-    title: str = ""
-    value: str = ""
-    x: str = "time [s]"
-    y: str = ""
-    unit: str = ""
-    log: str = ""
+    curves: Sequence[Curve]  # what is drawn, the first one at the back
+    title: str = ""  # title, such as the name of a joint
+    value: str = ""  # measured value beside the title
+    x: str = "time [s]"  # label of the abscissa
+    y: str = ""  # label of the ordinate
+    unit: str = ""  # unit of the ordinate
+    log: str = ""  # logarithmic axes: `x`, `y` or both
+    # limits of abscissa and ordinate; those of the curves if None
     x_range: tuple[float, float] | None = None
     y_range: tuple[float, float] | None = None
-    x_names: Sequence[str] = ()
-    y_names: Sequence[str] = ()
-    beside: Sequence[str] = ()
-    levels: Sequence[tuple[str, float, str]] = ()
+    x_names: Sequence[str] = ()  # names of the abscissas 0, 1, …, instead of numbers
+    y_names: Sequence[str] = ()  # names of the ordinates 0, 1, … from the top, instead of numbers
+    beside: Sequence[str] = ()  # texts to the right of these names
+    levels: Sequence[tuple[str, float, str]] = ()  # thin lines across: `x` or `y`, value, colour
+    # panels below this one with the same abscissa, smaller by their share
     below: Sequence["Panel"] = ()
-    share: float = 1.0
+    share: float = 1.0  # height relative to the first panel
 
     @property
     def parts(self) -> tuple["Panel", ...]:
@@ -105,18 +76,12 @@ class Panel:
 
 
 class Solids(NamedTuple):
-    """Surfaces of triangles that move with the robot's bodies, or stand on the ground.
+    """Surfaces of triangles that move with the robot's bodies, or stand on the ground."""
 
-    Attributes:
-        vertices: Vertices in the frames of their bodies [m].
-        bodies: Body of each vertex; -1 is the ground.
-        faces: Vertices of each triangle.
-        places: Rotation and origin of each body at the frames of the scene, as [R r].
-    """
-
-    vertices: Float[np.ndarray, "vertices 3"]
-    bodies: Int[np.ndarray, " vertices"]
-    faces: Int[np.ndarray, "faces 3"]
+    vertices: Float[np.ndarray, "vertices 3"]  # vertices in the frames of their bodies [m]
+    bodies: Int[np.ndarray, " vertices"]  # body of each vertex; -1 is the ground
+    faces: Int[np.ndarray, "faces 3"]  # vertices of each triangle
+    # rotation and origin of each body at the frames of the scene, as [R r]
     places: Float[np.ndarray, "frames bodies 3 4"]
 
     @property
@@ -129,27 +94,17 @@ class Solids(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Scene:
-    """Robot along a motion in space.
+    """Robot along a motion in space."""
 
-    Attributes:
-        time: Instants of the samples [s].
-        points: Origins of all bodies, and the end-effector [m].
-        links: Body from whose origin the line to each point leads; -1 for the ground.
-        frames: Samples at which the page shows the robot.
-        poses: Number of poses on paper.
-        values: Values of the joints at the samples, as colours; None for none.
-        label: Name of the values, with their unit.
-        solids: Shapes of the robot and around it, on a page; None for none.
-    """
-
-    time: Float[np.ndarray, " samples"]
-    points: Float[np.ndarray, "samples points 3"]
-    links: tuple[int, ...]
-    frames: Int[np.ndarray, " frames"]
-    poses: int = 6
+    time: Float[np.ndarray, " samples"]  # instants of the samples [s]
+    points: Float[np.ndarray, "samples points 3"]  # origins of all bodies, and the end-effector [m]
+    links: tuple[int, ...]  # body from whose origin the line to each point leads; -1 for the ground
+    frames: Int[np.ndarray, " frames"]  # samples at which the page shows the robot
+    poses: int = 6  # number of poses on paper
+    # values of the joints at the samples, as colours; None for none
     values: Float[np.ndarray, "samples joints"] | None = None
-    label: str = ""
-    solids: Solids | None = None
+    label: str = ""  # name of the values, with their unit
+    solids: Solids | None = None  # shapes of the robot and around it, on a page; None for none
 
     @property
     def bones(self) -> Float[np.ndarray, "samples points 2 3"]:

@@ -2,7 +2,7 @@
 
 import dataclasses
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,15 +12,7 @@ from jaxid.identification.consistency.estimator import Consistency
 from jaxid.identification.fit_result import Fit
 from jaxid.identification.uncertainty import ResidualSpectra
 from jaxid.model_validation import TorqueErrors
-from jaxid.result_table import (
-    Column,
-    Remark,
-    Status,
-    Table,
-    percent,
-    significant,
-    with_deviations,
-)
+from jaxid.result_table import Column, Remark, Status, Table, percent, significant, with_deviations
 from jaxid.robot.robot import Robot
 
 from .figure import Figure
@@ -87,10 +79,10 @@ def _three_numbers(report: Report) -> Markup:
     )
 
 
-def _data(report: Report) -> list[tuple[str, str]]:
-    """Return robot, logs, estimator and total mass, each with its word."""
+def _data(report: Report) -> Iterator[tuple[str, str]]:
+    """Yield robot, logs, estimator and total mass, each with its word."""
     fit, robot = report.fit, report.fit.base.model.robot
-    facts = [("robot", f"{robot.name}, {robot.joints} joints")]
+    yield "robot", f"{robot.name}, {robot.joints} joints"
     for word, logs in (
         ("identified with", report.identification),
         ("verified with", report.verification),
@@ -98,45 +90,40 @@ def _data(report: Report) -> list[tuple[str, str]]:
         for e in logs:
             time = np.asarray(e.time)
             length = significant(float(time[-1] - time[0]))
-            facts.append((word, f"{e.name}: {length} s, {len(time)} rows of each joint"))
-    facts.append(("estimator", words_of(fit.estimator)))
+            yield word, f"{e.name}: {length} s, {len(time)} rows of each joint"
+    # A class `LeastSquares` is shown as "least squares".
+    estimator = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", type(fit.estimator).__name__).lower()
+    yield "estimator", estimator
     if fit.consistency is not None:
         mass = np.asarray(fit.consistency.bodies)[:, 0]
         loose = len(fit.consistency.masses_from_bounds)
         proof = f", of which {loose} bodies follow from bounds too" if loose else ""
-        facts.append(
-            ("total mass of the moving bodies", f"{significant(float(mass.sum()))} kg{proof}")
-        )
+        yield "total mass of the moving bodies", f"{significant(float(mass.sum()))} kg{proof}"
     else:
         text = "forces tell combinations of masses only; physically consistent bodies have masses"
-        facts.append(("total mass", text))
+        yield "total mass", text
     if report.claimed_mass:
-        facts.append(("total mass by the robot's file", f"{significant(report.claimed_mass)} kg"))
-    return facts
+        yield "total mass by the robot's file", f"{significant(report.claimed_mass)} kg"
 
 
-def _physics(report: Report, figures: Mapping[str, Figure]) -> list[Section]:
-    """Return what the model says of the robot: in motion, before and after, friction, weight."""
-    sections: list[Section] = []
-    if "robot" in figures:
-        text = "Each link has the colour of the torque error of the joint that moves it, the path "
-        text += "of the end-effector that of the mean. Turn it, and move the slider."
-        sections.append(("The robot along the motion", [picture(figures["robot"], text)]))
+def _physics(report: Report, figures: Mapping[str, Figure]) -> Iterator[Section]:
+    """Yield what the model says of the robot: in motion, before and after, friction, weight."""
+    text = "Each link has the colour of the torque error of the joint that moves it, the path "
+    text += "of the end-effector that of the mean. Turn it, and move the slider."
+    yield "The robot along the motion", [picture(figures["robot"], text)]
     if "before_and_after" in figures:
         text = (
             "Torque errors with the parameters that the robot's file claims (friction and rotors "
             "count as zero where it claims none), and with those that were identified."
         )
-        sections.append(("Before and after", [text, figures["before_and_after"]]))
+        yield "Before and after", [text, figures["before_and_after"]]
     text = (
         "Lines: the model. Points: means over classes of speed of the measured forces, less all "
         "that the model explains otherwise. Points far from their line ask for another shape."
     )
-    sections.append(("Friction", [text, figures["friction"]]))
-    if "gravity" in figures:
-        log = report.verification[0] if report.verification else report.identification[0]
-        sections.append(("Weight", [gravity_table(report.fit, log), figures["gravity"]]))
-    return sections
+    yield "Friction", [text, figures["friction"]]
+    log = report.verification[0] if report.verification else report.identification[0]
+    yield "Weight", [gravity_table(report.fit, log), figures["gravity"]]
 
 
 def _torques(figures: Mapping[str, Figure], robot: Robot) -> list[Any]:
@@ -167,13 +154,8 @@ def _parameters(fit: Fit, figure: Figure) -> list[Any]:
     return [*doubts, glossary(base), folded(summary, parameter_table(fit), *said, figure)]
 
 
-def words_of(x: Any) -> str:
-    """Return the name of an object's class in words, as `least squares`."""
-    return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", type(x).__name__).lower()
-
-
-def _details(report: Report, figures: Mapping[str, Figure]) -> list[Section]:
-    """Return what experts ask for."""
+def _details(report: Report, figures: Mapping[str, Figure]) -> Iterator[Section]:
+    """Yield what experts ask for."""
     fit, settings, robot = report.fit, report.settings, report.fit.base.model.robot
     task = [
         ("experiment", settings.get("experiment")),
@@ -186,22 +168,17 @@ def _details(report: Report, figures: Mapping[str, Figure]) -> list[Section]:
     assumed = ", ".join(robot.limits.assumed) or "nothing"
     facts = [*about.facts, ("gravity [m/s²]", gravity), ("assumed", assumed)]
     notes = [Remark(note) for note in report.every_note]
-    sections: list[Section] = [
-        ("Task and notes", [Table("", facts=[f for f in task if f[1] is not None]), notes]),
-        ("Robot and drives", [Table("", *about.columns, facts=facts), *motor_tables(robot)]),
-        (
-            "Torque errors",
-            [
-                "Predicted less measured forces. Bars: the mean of their absolute values (Eq. 37, "
-                "Fig. 10 of the paper); points: their RMS. The offset is the mean error, which a "
-                "constant of the log explains; RMS values at rest and in motion are about it.",
-                figures["errors"],
-                tuple(error_table(e, robot) for e in report.every_error),
-            ],
-        ),
-    ]
+    yield "Task and notes", [Table("", facts=[f for f in task if f[1] is not None]), notes]
+    yield "Robot and drives", [Table("", *about.columns, facts=facts), *motor_tables(robot)]
+    text = (
+        "Predicted less measured forces. Bars: the mean of their absolute values (Eq. 37, Fig. 10 "
+        "of the paper); points: their RMS. The offset is the mean error, which a constant of the "
+        "log explains; RMS values at rest and in motion are about it."
+    )
+    tables = tuple(error_table(e, robot) for e in report.every_error)
+    yield "Torque errors", [text, figures["errors"], tables]
     if fit.consistency is not None:
-        sections.append(("Bodies", [body_table(fit.consistency, robot.joint_names)]))
+        yield "Bodies", [body_table(fit.consistency, robot.joint_names)]
     if fit.residual_spectra is not None:
         text = (
             "The residuals of a good model are noise. Power at low frequencies, or residuals that "
@@ -209,10 +186,9 @@ def _details(report: Report, figures: Mapping[str, Figure]) -> list[Section]:
             "is missing."
         )
         shown = [figures["residuals"], figures["autocorrelation"]]
-        sections.append(("Residuals", [text, *shown, residual_table(fit.residual_spectra, robot)]))
+        yield "Residuals", [text, *shown, residual_table(fit.residual_spectra, robot)]
     if "filter" in figures:
-        sections.append(("Choice of the filter", [figures["filter"]]))
-    return sections
+        yield "Choice of the filter", [figures["filter"]]
 
 
 def parameter_table(fit: Fit) -> Table:

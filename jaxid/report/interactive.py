@@ -26,8 +26,6 @@ from .figure import (
     decimate,
 )
 
-PIXELS = 96
-"""Pixels of an inch on the page."""
 SCALE = [[0.0, SKY], [0.5, ORANGE], [1.0, VERMILION]]
 """Colours of small to large values."""
 _GAP = 0.05
@@ -51,7 +49,7 @@ def charts(figure: Figure) -> list[dict[str, Any]]:
     """Return the charts of a figure: titles, values, heights [px] and packed contents."""
     if figure.scene is not None:
         return [{"title": "", "value": "", "height": 560, "content": _scene(figure.scene)}]
-    height = figure.height * PIXELS
+    height = figure.height * 96  # pixels of an inch on the page
     return [
         {"title": p.title, "value": p.value, "height": height, "content": _panel(figure, p)}
         for p in figure.panels

@@ -18,10 +18,6 @@ from jaxid.robot.robot import Robot
 
 from .figure import CYCLE, MEASURED, PREDICTED, VERMILION, Curve, Figure, Panel, Scene, Solids
 
-FRAMES = 150
-"""Poses of a robot that moves on a page."""
-PATH = 1500
-"""Points of the path of its end-effector."""
 SPREAD = 40
 """Points on the ball at each end of a capsule."""
 _SQUARE = np.array([[0, 1, 2], [1, 2, 3]])
@@ -140,8 +136,8 @@ def pose_figure(
         shapes: Shapes of robot and surroundings that the page shows.
     """
     q = np.atleast_2d(np.asarray(q, np.float64))
-    path = np.unique(np.linspace(0, len(q) - 1, min(PATH, len(q))).round().astype(int))
-    shown = np.linspace(0, len(path) - 1, min(FRAMES, len(path))).round().astype(int)
+    path = np.unique(np.linspace(0, len(q) - 1, min(1500, len(q))).round().astype(int))
+    shown = np.linspace(0, len(path) - 1, min(150, len(path))).round().astype(int)
     if values is not None:
         # Each point stands for all samples up to the next.
         sizes = np.nan_to_num(np.abs(np.asarray(values, np.float64)))

@@ -10,15 +10,7 @@ from markupsafe import Markup
 from rich.console import Console
 from rich.text import Text
 
-from jaxid.result_table import (
-    Remark,
-    Status,
-    Table,
-    in_html,
-    marked_up,
-    printable,
-    versions,
-)
+from jaxid.result_table import Remark, Status, Table, in_html, macros, printable, versions
 
 from .figure import Figure
 from .interactive import charts, library
@@ -34,6 +26,7 @@ STYLES = {
 """Styles of the parts of a table's lines in the terminal."""
 Section = tuple[str, Sequence[Any]]
 """Title, which the table of contents shows, and blocks as `render_page` takes them."""
+_macros = functools.partial(macros, Path(__file__).parent / "templates" / "page.html")
 
 
 def render_page(
@@ -109,22 +102,6 @@ def provenance(settings: Mapping[str, Any]) -> Section:
     if settings.get("experiment_text"):
         blocks.append(folded("The experiment file", code(str(settings["experiment_text"]))))
     return "To repeat this", blocks
-
-
-@functools.cache
-def _macros() -> Any:
-    # Commands that write no page do not wait for it.
-    import jinja2
-
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(Path(__file__).parent / "templates"),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters["marked_up"] = lambda text: Markup(marked_up(text))
-    return environment.get_template("page.html").module
 
 
 def show(console: Console, *tables: Table) -> None:

@@ -14,8 +14,6 @@ from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
 from .figure import GREY, INK, VERMILION, Curve, Figure, Panel, Scene, decimate
 
-BINS = 700
-"""Pixel columns of a line."""
 STYLE = ["default", Path(__file__).with_name("figures.mplstyle")]
 """Settings of matplotlib, which stay within this module."""
 
@@ -112,7 +110,8 @@ def _draw_curve(axes: Axes, curve: Curve, in_time: bool) -> None:
         case "points":
             axes.scatter(curve.x, curve.y, s=16, zorder=3, **look)
         case _:
-            points = decimate(curve.x, curve.y, BINS) if in_time else (curve.x, curve.y)
+            # As many bins as a line has pixel columns.
+            points = decimate(curve.x, curve.y, 700) if in_time else (curve.x, curve.y)
             look |= {"ls": "--" if curve.dashed else "-", "marker": "o" if curve.marker else ""}
             axes.plot(*points, lw=curve.width, ms=2.6, **look)
 

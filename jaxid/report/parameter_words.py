@@ -36,8 +36,6 @@ JOINT = {
     "fcm": "Coulomb friction of a coupled motor",
 }
 """Meanings of the parameters of a joint."""
-RIPPLE = {"sm": "motor", "cm": "motor", "sj": "joint", "cj": "joint"}
-"""Angles with which ripple repeats."""
 
 
 def in_words(name: str, robot: Robot) -> tuple[str, str]:
@@ -46,7 +44,8 @@ def in_words(name: str, robot: Robot) -> tuple[str, str]:
     if wave:
         side, times, place = wave.groups()
         kind = "sine" if side[0] == "s" else "cosine"
-        return f"ripple: {kind}, {times} times a turn of the {RIPPLE[side]}", _joint(robot, place)
+        turns = "motor" if side[1] == "m" else "joint"
+        return f"ripple: {kind}, {times} times a turn of the {turns}", _joint(robot, place)
     found = re.fullmatch(r"([A-Za-z]+?)(\d+)", name)
     symbol, place = found.groups() if found else (name, "")
     if symbol in BODY:

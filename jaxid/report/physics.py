@@ -1,11 +1,11 @@
 """Figures of what a model says of its robot: friction, weight, and what its file claimed."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
 from jaxid.arrays import Float
+from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.dispatch import in_numpy
 from jaxid.dynamics.motion import Motion
 from jaxid.identification.fit_result import Fit
@@ -15,8 +15,6 @@ from jaxid.result_table import Column, Table, percent, shortened, significant
 from .figure import BLUE, CYCLE, GREY, MEASURED, Curve, Figure, Panel
 from .motion import pose_figure
 
-SPEEDS = 81
-"""Speeds of a friction curve."""
 ROWS = 2000
 """Largest number of poses whose weight is computed."""
 CLASSES = 24
@@ -35,7 +33,7 @@ def friction_figure(fit: Fit, logs: Sequence[TorqueErrors]) -> Figure:
     """
     robot = fit.base.model.robot
     fastest = np.max([np.max(np.abs(e.speeds), axis=0) for e in logs], axis=0)
-    shape = np.linspace(-1.0, 1.0, SPEEDS)
+    shape = np.linspace(-1.0, 1.0, 81)
     # Denser near standstill, where friction changes most.
     speeds = (np.sign(shape) * shape**2)[:, None] * fastest
     values, halves = _friction(fit, speeds)
@@ -44,8 +42,8 @@ def friction_figure(fit: Fit, logs: Sequence[TorqueErrors]) -> Figure:
         v, y = speeds[:, j], values[:, j]
         curves = [Curve(v, y, "model", BLUE, width=1.4)]
         if np.isfinite(halves[:, j]).all():
-            ends: dict[str, Any] = {"low": y - halves[:, j], "high": y + halves[:, j]}
-            curves.insert(0, Curve(v, y, "95 % band", MEASURED, "band", **ends))
+            low, high = y - halves[:, j], y + halves[:, j]
+            curves.insert(0, Curve(v, y, "95 % band", MEASURED, "band", low=low, high=high))
         places, means = _classes(logs, j, v, y)
         curves.append(Curve(places, means, "measured, mean of a class of speed", GREY, "points"))
         unit = robot.force_unit(j)
@@ -68,10 +66,8 @@ def _friction(fit: Fit, speeds: Float[np.ndarray, "speeds joints"]) -> tuple[np.
     base, n = fit.base, speeds.shape[1]
     moving = np.zeros((len(speeds) + 1, n, n))
     moving[:-1, np.arange(n), np.arange(n)] = speeds
-    law, qd = base.model.memory, moving.reshape(-1, n)
-    rest = np.zeros_like(qd)
-    state = None if law is None else np.asarray(law.settled(qd))
-    theta = in_numpy(base, base.columns, *base.model.arguments(Motion(rest, qd, rest, state)))
+    qd = moving.reshape(-1, n)
+    theta = _steady_columns(base, np.zeros_like(qd), qd)
     own = theta.reshape(len(speeds) + 1, n, n, -1)[:, np.arange(n), np.arange(n)]
     # Without speed there is weight only.
     own = own[:-1] - own[-1]
@@ -125,9 +121,15 @@ def gravity_forces(
     base, model = fit.base, fit.base.model
     bodies = [bool(t.body_parameters) for t in model.terms for _ in t.parameters(model.robot)]
     p = np.where([bodies[k] for k in base.indices], fit.parameters, 0.0)
-    rest = np.zeros_like(q)
-    state = None if model.memory is None else np.asarray(model.memory.settled(rest))
-    return in_numpy(base, base.columns, *model.arguments(Motion(q, rest, rest, state))) @ p
+    return _steady_columns(base, q, np.zeros_like(q)) @ p
+
+
+def _steady_columns(base: BaseParameters, q: np.ndarray, qd: np.ndarray) -> np.ndarray:
+    """Return the base regressor at constant speeds, with settled friction."""
+    law = base.model.memory
+    state = None if law is None else np.asarray(law.settled(qd))
+    motion = Motion(q, qd, np.zeros_like(q), state)
+    return in_numpy(base, base.columns, *base.model.arguments(motion))
 
 
 def _some(log: TorqueErrors) -> np.ndarray:

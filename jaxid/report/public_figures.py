@@ -20,8 +20,4 @@ from .motion import (
     tip_figure as end_effector,
 )
 from .physics import friction_figure as friction, gravity_figure as gravity
-from .torques import (
-    bar_figure as bars,
-    error_figure as errors,
-    torque_figure as torques,
-)
+from .torques import bar_figure as bars, error_figure as errors, torque_figure as torques

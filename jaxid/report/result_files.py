@@ -72,16 +72,15 @@ def _draw(report: Report) -> dict[str, Figure]:
     """Return all figures of a report by the names of their files, without suffix."""
     robot = report.fit.base.model.robot
     spectra = report.fit.residual_spectra
+    longest = max(report.identification, key=lambda errors: len(errors.time))
+    shown = report.verification[0] if report.verification else longest
     figures: dict[str, Figure] = {
         "errors": error_figure(report.identification, report.verification, robot),
         "parameters": parameter_figure(report.fit),
         "friction": friction_figure(report.fit, report.identification),
+        "gravity": gravity_figure(report.fit, shown),
+        "robot": error_scene(report.fit, shown),
     }
-    longest = max(report.identification, key=lambda errors: len(errors.time))
-    shown = report.verification[0] if report.verification else longest
-    if shown.positions is not None:
-        figures["gravity"] = gravity_figure(report.fit, shown)
-        figures["robot"] = error_scene(report.fit, shown)
     if report.claimed:
         groups = (("by the robot's file", report.claimed), ("identified", report.every_error))
         figures["before_and_after"] = bar_figure(groups, robot, "Torque errors before and after")
@@ -150,8 +149,7 @@ def write_comparison(
     folder: Path, comparison: Comparison, sources: Sequence[Path] = ()
 ) -> list[Path]:
     """Write `report.html`, `comparison.json` and `comparison.csv`; return the files."""
-    first = comparison.first
-    second = comparison.second
+    first, second = comparison.first, comparison.second
     k = list(comparison.indices)
     rows = _rows(
         name=comparison.names,
@@ -233,14 +231,14 @@ def _write_table(
     names = ["report.html", f"{stem}.json", f"{stem}.csv"]
     with atomic_folder(folder) as staging:
         (staging / names[0]).write_text(page, encoding="utf-8")
-        write_json(staging / names[1], plain({**header(names[1]), **content}))
+        write_json(staging / names[1], {**header(names[1]), **content})
         write_csv(staging / names[2], rows)
     return [folder / name for name in names]
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:
     """Write a file that programs read exactly and people can read."""
-    path.write_text(json_text(content), encoding="utf-8")
+    path.write_text(json_text(plain(content)), encoding="utf-8")
 
 
 def write_csv(path: Path, rows: list[dict[str, Any]]) -> None:
@@ -284,44 +282,40 @@ def _rows(**columns: Any) -> list[dict[str, Any]]:
 
 def _record(report: Report) -> dict[str, Any]:
     """Return the content of `result.json`."""
-    fit, definiteness = report.fit, report.definiteness
-    base = fit.base
-    model = fit.base.model
-    robot = fit.base.model.robot
-    return plain(
-        {
-            **header("result.json"),
-            "verdict": [
-                {"status": remark.status.name.lower(), "text": remark.text}
-                for remark in verdict(report)
-            ],
-            "robot": _robot_record(robot),
-            "base_parameters": parameter_rows(fit),
-            "lengths": base.lengths,
-            "model": {
-                "terms": [str(term) for term in model.terms],
-                "standard_names": model.parameter_names,
-                "standard_units": model.parameter_units,
-                "independent": base.indices,
-                "dependent": base.dependent,
-                "kappa": base.kappa,
-            },
-            "fit": _fit_record(fit),
-            "consistency": consistency_record(fit),
-            "errors": {
-                role: [_error_record(errors, robot) for errors in getattr(report, role)]
-                for role in ("identification", "verification")
-            },
-            "mass_matrix": _entries(
-                definiteness,
-                "positive_definite pose poses",
-                smallest_eigenvalue="smallest",
-                indefinite_share="indefinite",
-            ),
-            "settings": report.settings,
-            "notes": report.every_note,
-        }
-    )
+    fit, base = report.fit, report.fit.base
+    model, robot = base.model, base.model.robot
+    return {
+        **header("result.json"),
+        "verdict": [
+            {"status": remark.status.name.lower(), "text": remark.text}
+            for remark in verdict(report)
+        ],
+        "robot": _robot_record(robot),
+        "base_parameters": parameter_rows(fit),
+        "lengths": base.lengths,
+        "model": {
+            "terms": [str(term) for term in model.terms],
+            "standard_names": model.parameter_names,
+            "standard_units": model.parameter_units,
+            "independent": base.indices,
+            "dependent": base.dependent,
+            "kappa": base.kappa,
+        },
+        "fit": _fit_record(fit),
+        "consistency": consistency_record(fit),
+        "errors": {
+            role: [_error_record(errors, robot) for errors in getattr(report, role)]
+            for role in ("identification", "verification")
+        },
+        "mass_matrix": _entries(
+            report.definiteness,
+            "positive_definite pose poses",
+            smallest_eigenvalue="smallest",
+            indefinite_share="indefinite",
+        ),
+        "settings": report.settings,
+        "notes": report.every_note,
+    }
 
 
 def parameter_rows(fit: Fit) -> list[dict[str, Any]]:

@@ -1,7 +1,7 @@
 """Verdict on an identified model: one sentence for everything, and one for each criterion."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -21,8 +21,6 @@ MATERIAL = 2.0
 """Errors on new motions that are judged relative to those of the fit [% of the RMS force]."""
 UNSEEN_RATIO = 1.5
 """Errors on new motions, relative to those of the fit, that are good."""
-SMALL = 0.01
-"""Fraction (0 to 1) of the largest force below which an RMS force counts as that fraction."""
 LARGE_CONDITION = 1e3
 """Condition number, with scaled columns, above which parameters are hard to tell apart."""
 PRICE = (10.0, 100.0)
@@ -33,34 +31,21 @@ OFFSET = 0.3
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Report:
-    """Content of the report of an identification.
+    """Content of the report of an identification."""
 
-    Attributes:
-        fit: Identified parameters.
-        identification: Errors on the logs of the fit.
-        verification: Errors on logs that the fit has not seen.
-        definiteness: Definiteness of the mass matrix.
-        settings: Origin of the result.
-        notes: Notes on the logs, as sentences.
-        doubts: Findings on the logs that deserve attention, as sentences.
-        mistakes: Likely mistakes in the description of the logs or the robot, as sentences.
-        choice: Choice of the filter, where it was left to the logs.
-        claimed: Errors of the parameters that the robot's file claims, on all logs; empty if it
-            claims none.
-        claimed_mass: Mass of all bodies that the robot's file claims [kg]; 0 if it claims none.
-    """
-
-    fit: Fit
-    identification: Sequence[TorqueErrors]
-    verification: Sequence[TorqueErrors]
-    definiteness: Definiteness
-    settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    notes: Sequence[str] = ()
-    doubts: Sequence[str] = ()
+    fit: Fit  # identified parameters
+    identification: Sequence[TorqueErrors]  # errors on the logs of the fit
+    verification: Sequence[TorqueErrors]  # errors on logs that the fit has not seen
+    definiteness: Definiteness  # of the mass matrix
+    settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # origin of the result
+    notes: Sequence[str] = ()  # notes on the logs, as sentences
+    doubts: Sequence[str] = ()  # findings on the logs that deserve attention, as sentences
+    # likely mistakes in the description of the logs or the robot, as sentences
     mistakes: Sequence[str] = ()
-    choice: FilterChoice | None = None
+    choice: FilterChoice | None = None  # choice of the filter, where it was left to the logs
+    # errors on all logs of the parameters that the robot's file claims; empty without
     claimed: Sequence[TorqueErrors] = ()
-    claimed_mass: float = 0.0
+    claimed_mass: float = 0.0  # mass of all bodies that it claims [kg]; 0 without
 
     @property
     def every_error(self) -> tuple[TorqueErrors, ...]:
@@ -82,8 +67,8 @@ def verdict(report: Report) -> list[Remark]:
     found = [
         *(Remark(text, Status.BAD) for text in dict.fromkeys(report.mistakes)),
         *(Remark(text, Status.DOUBTFUL) for text in dict.fromkeys(report.doubts)),
-        *_judge_fit(fit, report.identification),
-        *_judge_new_motions(report.identification, report.verification),
+        _judge_fit(fit, report.identification),
+        _judge_new_motions(report.identification, report.verification),
         *_judge_friction(fit, report.identification),
         dataclasses.replace(
             fit.determination[0],
@@ -122,10 +107,8 @@ def verdict(report: Report) -> list[Remark]:
     return [whole, *found]
 
 
-def _judge_fit(fit: Fit, logs: Sequence[TorqueErrors]) -> list[Remark]:
+def _judge_fit(fit: Fit, logs: Sequence[TorqueErrors]) -> Remark:
     """Judge how much of the forces a fit misses, unless that is white noise."""
-    if not logs:
-        return []
     spectra, names = fit.residual_spectra, fit.base.model.robot.joint_names
     missed, found = 100 * _relative(logs), []
     # Of a residual that is white, no part counts; of others about what departs from white noise.
@@ -141,31 +124,26 @@ def _judge_fit(fit: Fit, logs: Sequence[TorqueErrors]) -> list[Remark]:
         found.append("some effect is not in the model, or the noise itself is coloured")
         status = Status.BAD if missed[worst] > FIT_ERROR[1] else status
     text = f"The model misses up to {significant(missed[worst], 2)} % of the RMS forces that it "
-    return [
-        Remark(
-            f"{text}was fitted to (joint `{names[worst]}`): {', '.join(found)}.",
-            status,
-            f"Good: white noise, or up to {FIT_ERROR[0]:g} % that are not; tolerable: up to "
-            f"{FIT_ERROR[1]:g} %. Bartlett's test compares the cumulative spectrum with a "
-            "straight line. The intervals account for correlated residuals, not for what the model "
-            "lacks.",
-        )
-    ]
+    return Remark(
+        f"{text}was fitted to (joint `{names[worst]}`): {', '.join(found)}.",
+        status,
+        f"Good: white noise, or up to {FIT_ERROR[0]:g} % that are not; tolerable: up to "
+        f"{FIT_ERROR[1]:g} %. Bartlett's test compares the cumulative spectrum with a straight "
+        "line. The intervals account for correlated residuals, not for what the model lacks.",
+    )
 
 
-def _judge_friction(fit: Fit, logs: Sequence[TorqueErrors]) -> list[Remark]:
+def _judge_friction(fit: Fit, logs: Sequence[TorqueErrors]) -> Iterator[Remark]:
     """Warn if errors on the logs of a fit depend on the speeds of the joints."""
-    found = np.any([e.depend_on_speed for e in logs], axis=0) if logs else []
+    found = np.any([e.depend_on_speed for e in logs], axis=0)
     names = [f"`{n}`" for n, x in zip(fit.base.model.robot.joint_names, found, strict=False) if x]
-    remarks = [
-        Remark(
+    if names:
+        yield Remark(
             f"Errors depend on speed (joints {', '.join(names)}): friction seems to have another "
             "shape, and the intervals of its parameters may be too narrow.",
             Status.DOUBTFUL,
             "Means over classes of speed agree between blocks of time: try `jaxid choose`.",
         )
-    ]
-    return remarks if names else []
 
 
 def _relative(logs: Sequence[TorqueErrors]) -> np.ndarray:
@@ -174,7 +152,8 @@ def _relative(logs: Sequence[TorqueErrors]) -> np.ndarray:
         np.sqrt(np.mean([np.asarray(x) ** 2 for x in group], axis=0))
         for group in ([e.rms for e in logs], [e.force_rms for e in logs])
     )
-    least = SMALL * np.nan_to_num(np.asarray(logs[0].max_forces))
+    # Forces below a hundredth of the largest count as that.
+    least = 0.01 * np.nan_to_num(np.asarray(logs[0].max_forces))
     forces = np.maximum(forces, least)
     return np.nan_to_num(rms / np.where(forces > 0, forces, np.inf))
 
@@ -190,18 +169,17 @@ def _constant_share(logs: Sequence[TorqueErrors], joint: int) -> float:
 
 def _judge_new_motions(
     identification: Sequence[TorqueErrors], verification: Sequence[TorqueErrors]
-) -> list[Remark]:
+) -> Remark:
     if not verification:
         text = "The model was not validated on an unseen log: use `--verify` or `--split`."
-        return [Remark(text, Status.DOUBTFUL)]
-    unseen, ratio = 100 * _relative(verification), 1.0
+        return Remark(text, Status.DOUBTFUL)
+    unseen = 100 * _relative(verification)
     worst = float(np.max(unseen))
     text = f"On logs that the fit has not seen, it misses up to {significant(worst, 2)} % of the "
     text += "RMS forces"
-    if identification:
-        # Errors that do not matter may grow.
-        ratios = unseen / np.maximum(100 * _relative(identification), 1e-9)
-        ratio = float(np.max(np.where(unseen > MATERIAL, ratios, 1.0)))
+    # Errors that do not matter may grow.
+    ratios = unseen / np.maximum(100 * _relative(identification), 1e-9)
+    ratio = float(np.max(np.where(unseen > MATERIAL, ratios, 1.0)))
     if ratio > 1:
         text += f", and up to {significant(ratio, 2)} times as much as of the fit's own"
     worst_joint = int(np.argmax(unseen))
@@ -221,51 +199,47 @@ def _judge_new_motions(
         f"the fit where they exceed {MATERIAL:g} %; tolerable: up to {RMS_ERROR[1]:g} %. Mean "
         "errors by Eq. 37: the paper states below 1 %."
     )
-    return [Remark(f"{text}.", status, detail)]
+    return Remark(f"{text}.", status, detail)
 
 
-def _judge_signs(fit: Fit) -> list[Remark]:
+def _judge_signs(fit: Fit) -> Iterator[Remark]:
     """Name friction and rotor inertias that are negative beyond two deviations."""
     base, robot = fit.base, fit.base.model.robot
     if any(isinstance(term, SquareRootFriction) for term in base.model.terms):
-        # Only the sum of all friction cannot be negative.
-        return []
+        return  # only the sum of all friction cannot be negative
     least = np.concatenate([term.lower_bounds(robot) for term in base.model.terms])
     alone = ~np.any(np.asarray(base.kappa), axis=1) & (least[list(base.indices)] == 0.0)
     below = np.asarray(fit.parameters) < -2.0 * fit.standard_deviations
-    if not (names := [f"`{base.names[k]}`" for k in np.flatnonzero(alone & below)]):
-        return []
-    text = f"Friction or rotor inertia comes out negative, as neither is: {', '.join(names)}."
-    cure = (
-        "Good: none below zero by more than two standard deviations. The model lacks an effect of "
-        'these joints, or a sign is wrong; `kind = "consistent"` in `[estimator]` keeps them from '
-        "being negative."
-    )
-    return [Remark(text, Status.DOUBTFUL, cure)]
+    if names := [f"`{base.names[k]}`" for k in np.flatnonzero(alone & below)]:
+        yield Remark(
+            f"Friction or rotor inertia comes out negative, as neither is: {', '.join(names)}.",
+            Status.DOUBTFUL,
+            "Good: none below zero by more than two standard deviations. The model lacks an effect "
+            'of these joints, or a sign is wrong; `kind = "consistent"` in `[estimator]` keeps '
+            "them from being negative.",
+        )
 
 
-def _judge_bounds(fit: Fit) -> list[Remark]:
+def _judge_bounds(fit: Fit) -> Iterator[Remark]:
     """Judge the price of bounds: a large one says that the logs contradict them."""
     if fit.consistency is None:
-        return []
+        return
     price = 100 * fit.consistency.residual_increase
     active = "; ".join(fit.consistency.active) or "none"
     status = Status.GOOD if price <= PRICE[0] else Status.DOUBTFUL
     status = Status.BAD if price > PRICE[1] else status
-    return [
-        Remark(
-            f"All bodies are physically consistent, for {significant(price, 2)} % larger "
-            f"residuals; active bounds: {active}",
-            status,
-            f"Good: up to {PRICE[0]:g} %; tolerable: up to {PRICE[1]:g} %. Above, the logs "
-            "contradict the bounds: check `total_mass`, `mass_max`, units and signs.",
-        )
-    ]
+    yield Remark(
+        f"All bodies are physically consistent, for {significant(price, 2)} % larger residuals; "
+        f"active bounds: {active}",
+        status,
+        f"Good: up to {PRICE[0]:g} %; tolerable: up to {PRICE[1]:g} %. Above, the logs contradict "
+        "the bounds: check `total_mass`, `mass_max`, units and signs.",
+    )
 
 
-def _judge_offsets(fit: Fit) -> list[Remark]:
+def _judge_offsets(fit: Fit) -> Iterator[Remark]:
     """Judge constant forces: a large one is a weight that gravity does not explain."""
-    robot, found = fit.base.model.robot, []
+    robot = fit.base.model.robot
     estimates = zip(np.asarray(fit.parameters), fit.standard_deviations, strict=True)
     values = dict(zip(fit.base.names, estimates, strict=True))
     (symbol, *_), *_ = ConstantOffset.symbols
@@ -274,13 +248,10 @@ def _judge_offsets(fit: Fit) -> list[Remark]:
         largest = float(robot.known_max_forces[j])
         if abs(value) - 2.0 * deviation > OFFSET * largest:
             unit = robot.force_unit(j)
-            found.append(
-                Remark(
-                    f"Joint `{name}` has a constant force of {significant(value, 3)} {unit}, and "
-                    f"its limit is {significant(largest, 3)} {unit}: is `gravity` right, or does "
-                    "a spring or a cable pull?",
-                    Status.DOUBTFUL,
-                    f"Good: up to {100 * OFFSET:g} % of the largest force.",
-                )
+            yield Remark(
+                f"Joint `{name}` has a constant force of {significant(value, 3)} {unit}, and its "
+                f"limit is {significant(largest, 3)} {unit}: is `gravity` right, or does a spring "
+                "or a cable pull?",
+                Status.DOUBTFUL,
+                f"Good: up to {100 * OFFSET:g} % of the largest force.",
             )
-    return found

@@ -18,8 +18,6 @@ from jaxid.trajectory.trajectory import AbstractTrajectory
 
 RATE = 60
 """Pictures per second."""
-PAUSE = 1.0
-"""Time at the end of the motion before it begins again [s]."""
 _BODY = (1.0, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0)
 """Parameters of bodies that only move; their inertia does not matter."""
 
@@ -53,14 +51,11 @@ def _capsule(capsule: Capsule) -> dict[str, str]:
 def _obstacle(obstacle: HalfSpace | Box) -> dict[str, str]:
     if isinstance(obstacle, Box):
         place = placement_attributes(obstacle.centre, obstacle.rotation)
-        return {
-            "name": obstacle.name,
-            "type": "box",
-            "size": exact_text(obstacle.size / 2),
-        } | place
+        size = exact_text(obstacle.size / 2)
+        return {"name": obstacle.name, "type": "box", "size": size, **place}
     normal = np.asarray(obstacle.normal)
     place = {"pos": exact_text(normal * obstacle.height), "zaxis": exact_text(normal)}
-    return {"name": obstacle.name, "type": "plane", "size": "3 3 0.1"} | place
+    return {"name": obstacle.name, "type": "plane", "size": "3 3 0.1", **place}
 
 
 def positions(trajectory: AbstractTrajectory) -> Float[np.ndarray, "pictures joints"]:
@@ -86,7 +81,8 @@ def play(robot: Robot, shapes: CollisionModel | None, trajectory: AbstractTrajec
     with viewer.launch_passive(model, data, show_left_ui=False, show_right_ui=False) as window:
         began = time.monotonic()
         while window.is_running():
-            now = (time.monotonic() - began) % (len(rows) / RATE + PAUSE)
+            # It rests for a second before it begins again.
+            now = (time.monotonic() - began) % (len(rows) / RATE + 1.0)
             data.qpos[at] = rows[min(int(now * RATE), len(rows) - 1)]
             mujoco.mj_kinematics(model, data)
             window.sync()

@@ -15,7 +15,7 @@ def errors(counted=None):
     counted = np.ones((50, 2), bool) if counted is None else counted
     limits = np.array([100.0, 5.0])
     speeds = np.where(np.arange(50)[:, None] >= [20, 0], 1.0, 0.0)
-    data = measured, predicted, counted, limits, speeds, predicted - measured
+    data = measured, predicted, counted, limits, speeds, predicted - measured, speeds
     return TorqueErrors("log", np.arange(50) * 0.01, *data)
 
 
@@ -45,7 +45,7 @@ def test_errors_that_depend_on_speed_are_told_from_noise():
     false = 0
     for _ in range(50):
         x = rng.normal(size=shape.shape) + shape
-        e = TorqueErrors("", t, x, 0 * x, shape < 9.0, np.ones(3), speeds, -x)
+        e = TorqueErrors("", t, x, 0 * x, shape < 9.0, np.ones(3), speeds, -x, speeds)
         *steady, found = e.depend_on_speed
         assert found
         false += any(steady)

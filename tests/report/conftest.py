@@ -30,6 +30,7 @@ def errors_of():
             max_forces=np.full(joints, 50.0),
             speeds=np.where(random.random((rows, joints)) < 0.8, 1.0, 0.0),
             unexplained=errors,
+            positions=np.zeros((rows, joints)),
         )
 
     return errors_of

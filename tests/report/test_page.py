@@ -199,7 +199,7 @@ def test_a_weight_that_gravity_does_not_explain_is_pointed_out(fit):
         deviations = spread * np.abs(p)
         deviations[1] = spread * limits[0]
         sick = SimpleNamespace(base=base, parameters=p, standard_deviations=deviations)
-        found = _judge_offsets(sick)
+        found = list(_judge_offsets(sick))
         assert [r.status for r in found] == [Status.DOUBTFUL] * count
     assert f"joint `{robot.joint_names[0]}`" in found[0].text.lower()
 
