@@ -25,12 +25,12 @@ class Programs(NamedTuple):
         bodies: Mass matrix and bias forces from positions and velocities.
         derivatives: Both with their derivatives: of matrix and forces by positions, of the forces
             by velocities.
-        solve: Velocities in a stage, as in `stage_velocities`.
+        solve: Velocities in a stage, as in `stage_velocities`; None without coupling.
     """
 
     bodies: Program
     derivatives: Program
-    solve: Program
+    solve: Program | None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,9 +69,11 @@ class Bodies:
             return *by_q, jax.jacfwd(lambda v: self.matrix_and_bias(q, v)[1])(v)
 
         bodies, derivatives = (trace(f, (n,), (n,)) for f in (self.matrix_and_bias, derived))
-        matrix = np.full(bodies.nonzeros[0].shape, FREE)
-        matrix[~bodies.nonzeros[0]] = 0.0
-        solve = trace(stage_velocities, matrix, *[(n,)] * 6, (), *[(n,)] * 2)
+        solve = None
+        if self.coupled:
+            matrix = np.full(bodies.nonzeros[0].shape, FREE)
+            matrix[~bodies.nonzeros[0]] = 0.0
+            solve = trace(stage_velocities, matrix, *[(n,)] * 6, (), *[(n,)] * 2)
         return Programs(bodies, derivatives, solve)
 
     def loads(self, motion: ServoMotion) -> ServoMotion:

@@ -111,7 +111,7 @@ def _within(
     h: AnyArray,
 ) -> Array:
     """Return the velocities in a stage [joints, motions]."""
-    if programs is None or M is None:
+    if programs is None or programs.solve is None or M is None:
         slip = x.slip(w, stage, x.force)
         return slip.free * (x.force + x.inertia * w - x.friction * slip.direction) / x.resistance
     scale = jnp.sqrt(jnp.maximum(theta[INDEX["a"]], LEAST)) + jnp.zeros_like(w)
