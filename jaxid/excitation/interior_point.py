@@ -75,23 +75,14 @@ class State(NamedTuple):
 
 
 class Stage(NamedTuple):
-    """One run of the method.
+    """One run of the method."""
 
-    Attributes:
-        bound: Multiple to which limits are relaxed or tightened.
-        barrier: Weight of the logarithmic barrier at the start.
-        least: Weight below which the barrier does not fall.
-        iterations: Largest number of iterations.
-        sharpness: Sharpness of smooth extremes in the objective.
-        penalty: Penalty of the slack by which constraints are exceeded.
-    """
-
-    bound: float
-    barrier: float
-    least: float
-    iterations: int
-    sharpness: float = 4.0
-    penalty: float = 10.0
+    bound: float  # multiple to which limits are relaxed or tightened
+    barrier: float  # weight of the logarithmic barrier at the start
+    least: float  # weight below which the barrier does not fall
+    iterations: int  # largest number of iterations
+    sharpness: float = 4.0  # sharpness of smooth extremes in the objective
+    penalty: float = 10.0  # penalty of the slack by which constraints are exceeded
 
 
 def begin(grid: Grid, y: Float[np.ndarray, "starts scaled"], constraints: int = 0) -> list[State]:
@@ -111,12 +102,7 @@ def run(
 ) -> list[State]:
     """Move the starts inside the bound of a stage, then iterate until all have converged.
 
-    Args:
-        grid: Limits of the joints.
-        objective: Function from points [points, scaled] and the numbers of their starts to the
-            evaluations of the points.
-        states: Starts.
-        stage: Settings.
+    The objective evaluates points [points, scaled] of starts with these numbers.
     """
     states = [_begin_stage(grid, stage, one) for one in states]
     for _ in range(stage.iterations):
@@ -164,8 +150,8 @@ def _update(grid: Grid, stage: Stage, old: State, evaluation: Evaluation) -> Sta
         begun = old._replace(y=trial, slack=slack, evaluation=evaluation, duals=duals)
         return _directed(grid, stage, begun._replace(refused=0, fresh=False), room)
     before = _room(grid, stage, old.y, old.slack.sum() - old.evaluation.excess, old.slack)
-    merit = _merit(old.evaluation.value, old.slack, before, stage.penalty, old.barrier)
-    new = _merit(evaluation.value, slack, room, stage.penalty, old.barrier)
+    merit = _merit(old.evaluation, old.slack, before, stage.penalty, old.barrier)
+    new = _merit(evaluation, slack, room, stage.penalty, old.barrier)
     promised = DECREASE * old.length * old.slope
     finite = math.isfinite(evaluation.value) and np.isfinite(evaluation.gradient).all()
     if finite and new <= merit + promised + 1e-10 * abs(merit):
@@ -297,8 +283,8 @@ def _cheapest_slack(
 
 
 def _merit(
-    value: float, slack: np.ndarray, room: Inequalities, penalty: float, barrier: float
+    evaluation: Evaluation, slack: np.ndarray, room: Inequalities, penalty: float, barrier: float
 ) -> float:
     """Return the merit function, which a step must decrease."""
-    logs = float(np.log(np.maximum(room, 1e-300)).sum())
-    return value + penalty * float(slack.sum()) - barrier * logs
+    logs = sum(float(np.log(np.maximum(x, 1e-300)).sum()) for x in _parts(room, evaluation))
+    return evaluation.value + penalty * float(slack.sum()) - barrier * logs
