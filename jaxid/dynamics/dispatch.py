@@ -193,16 +193,8 @@ def on_samples(
 ) -> AnyArray:
     """Apply a method for one sample to arrays with any leading batch axes.
 
-    NumPy arrays give a NumPy array; arrays of JAX one on their device.
-
-    Args:
-        owner: Model.
-        definition: Method, whose arguments are first the shared ones, then those of one sample.
-        samples: Arguments with batch axes before their last axis.
-        shared: Parameters that all samples have in common, or with batch axes too.
-
-    Raises:
-        InputError: If batch axes do not fit each other, or parameters are no numbers.
+    NumPy arrays give a NumPy array; arrays of JAX one on their device. The method takes first the
+    `shared` parameters, which all samples have in common or which have batch axes too.
     """
     if is_traced(owner):
         owner, (numbers,) = opened(definition.__name__, owner)

@@ -143,8 +143,7 @@ class PackedRegressor(eqx.Module):
 @functools.lru_cache(maxsize=KEPT)
 def _places(program: Program) -> tuple[tuple[tuple[int, int | float], ...], ...]:
     """Return the `places` of a packed regressor; what is always zero has none."""
-    pairs = zip(program.distinct[1].tolist(), program.outputs, strict=True)
-    entries = [number if number >= 0 else constant for number, constant in pairs]
+    entries = program.pack(range(len(program.distinct[0])))
     rows = np.array(entries, object).reshape(program.output_shapes[0])
     return tuple(
         tuple((k, x) for k, x in enumerate(row) if isinstance(x, int) or x != 0) for row in rows
@@ -153,11 +152,4 @@ def _places(program: Program) -> tuple[tuple[tuple[int, int | float], ...], ...]
 
 @functools.lru_cache(maxsize=KEPT)
 def _compiled(program: Program) -> Callable:
-    _, first = np.unique(program.distinct[1], return_index=True)
-    varying = [k for k in first.tolist() if isinstance(program.outputs[k], int)]
-
-    def run(lowered: Lowered, *arrays: AnyArray) -> tuple:
-        outputs = lowered(*arrays)
-        return tuple(outputs[k] for k in varying)
-
-    return jax.jit(functools.partial(on_any_platform, program, run))
+    return jax.jit(functools.partial(on_any_platform, program, Lowered.distinct))

@@ -117,11 +117,9 @@ def regrouping(
 ) -> tuple[Float[np.ndarray, "base dependent"], float, Float[np.ndarray, " base"]]:
     r"""Return $\kappa$ with $\hat\Theta_2 = \hat\Theta_1 \kappa$, and how exact it is (Eq. 22).
 
-    A dependent column is a combination of independent columns before it.
-
-    Returns:
-        $\kappa$; the largest fraction of a dependent column that it does not explain; and the
-        fraction of each independent column that those before it do not explain.
+    A dependent column is a combination of independent columns before it. Beside $\kappa$ come the
+    largest fraction of a dependent column that it does not explain, and the fraction of each
+    independent column that those before it do not explain.
     """
     W = np.asarray(W, np.float64)
     norms = np.linalg.norm(W, axis=0)
@@ -149,10 +147,8 @@ def random_regressor(
     r"""Return the regressor at random motions, stacked and free of units: $\Theta_{QR}$ (Eq. 20).
 
     Lengths are measured in the robot's own size, so that metres or millimetres make no difference.
-    It is computed in float64, whatever the precision in which JAX runs.
-
-    Returns:
-        The matrix, and for each parameter the factor by which its column was multiplied.
+    It is computed in float64, whatever the precision in which JAX runs. With it comes for each
+    parameter the factor by which its column was multiplied.
     """
     samples = max(25, math.ceil(3.0 * model.size / model.robot.joints))
     motion = random_motion(model, samples, seed)

@@ -20,25 +20,23 @@ from jaxid.trajectory.trajectory import AbstractBasis
 
 
 class Grid(NamedTuple):
-    """Limits of all joints on a grid of times.
+    """Limits of all joints on a grid of times."""
 
-    Attributes:
-        R: Rows by scaled coefficients, for each joint first positions, then the higher orders.
-        c: Centres of the ranges, for positions; zero for the rest.
-        kinds: Ranges of the rows of positions, velocities, accelerations, and jerks if limited.
-        bound: Bound of |R y - c| with which the limits hold at all times.
-        constant: Scaled coefficients of a constant motion at half of each joint's range.
-    """
-
+    # rows by scaled coefficients, for each joint first positions, then the higher orders
     R: Float[np.ndarray, "joints rows variables"]
-    c: Float[np.ndarray, "joints rows"]
-    kinds: tuple[range, ...]
-    bound: float
+    c: Float[np.ndarray, "joints rows"]  # centres of the ranges, for positions; zero for the rest
+    kinds: tuple[range, ...]  # rows of positions, velocities, accelerations, and jerks if limited
+    bound: float  # bound of |R y - c| with which the limits hold at all times
+    # scaled coefficients of a constant motion at half of each joint's range
     constant: Float[np.ndarray, "joints variables"]
 
     def rows(self, y: Float[AnyArray, " scaled"]) -> Float[AnyArray, "joints rows"]:
         """Return the rows of a motion, R y."""
         return namespace(y).einsum("jrk,jk->jr", self.R, y.reshape(np.shape(self.constant)))
+
+    def use(self, y: Float[AnyArray, " scaled"]) -> Float[AnyArray, "joints rows"]:
+        """Return the used fractions of the limits, with the sign of the direction."""
+        return (self.rows(y) - self.c) / self.bound
 
     def scale_into_limits(
         self, y: Float[AnyArray, " scaled"], bound: Any | None = None, growth: float = 1.0
@@ -166,12 +164,12 @@ class JointLimits(eqx.Module):
         size, scale = self._sizes, np.asarray(self.scale)
         orders = 4 if np.isfinite(size[3]).any() else 3
         R = [scale[:, None] * envelope[k][None] / size[k][:, None, None] for k in range(orders)]
-        c = [np.zeros((len(scale), len(envelope[k]))) for k in range(orders)]
-        ends = np.asarray(self.limits.position_min), np.asarray(self.limits.position_max)
-        c[0] += (0.5 * (ends[0] + ends[1]) / size[0])[:, None]
-        ends = np.cumsum([0, *(part.shape[1] for part in c)])
-        kinds = tuple(range(int(a), int(b)) for a, b in itertools.pairwise(ends))
-        R, c = np.concatenate(R, axis=1), np.concatenate(c, axis=1)
+        ends = itertools.accumulate((part.shape[1] for part in R), initial=0)
+        kinds = tuple(range(a, b) for a, b in itertools.pairwise(ends))
+        R = np.concatenate(R, axis=1)
+        low, high = np.asarray(self.limits.position_min), np.asarray(self.limits.position_max)
+        c = np.zeros(R.shape[:2])
+        c[:, kinds[0]] = (0.5 * (low + high) / size[0])[:, None]
         return Grid(R, c, kinds, 1 / factor, np.asarray(self.constant))
 
     def use(self, x: Float[AnyArray, "joints variables"]) -> Float[np.ndarray, "4 joints"]:
@@ -180,9 +178,9 @@ class JointLimits(eqx.Module):
         The used fraction of a range is the distance from its middle, over half of the range.
         """
         grid, used = self.grid(), np.zeros((4, len(x)))
-        rows = np.einsum("jrk,jk->jr", grid.R, np.asarray(x) / self.scale) - grid.c
+        rows = grid.use(self.scaled(x))
         for order, kind in enumerate(grid.kinds):
-            used[order] = np.abs(rows[:, kind]).max(axis=1) / grid.bound
+            used[order] = np.abs(rows[:, kind]).max(axis=1)
         return used
 
     def random(

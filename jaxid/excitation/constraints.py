@@ -434,12 +434,7 @@ class ForceLimits(AbstractConstraint):
             size = size + self.deviations * deviation
         return size / limits[chosen] - 1.0, slopes
 
-    def forces(
-        self,
-        q: Coordinates,
-        qd: Coordinates,
-        qdd: Coordinates,
-    ) -> Float[Array, "3 joints"]:
+    def forces(self, q: Coordinates, qd: Coordinates, qdd: Coordinates) -> Float[Array, "3 joints"]:
         """Return the forces of one sample: as expected, and with dry friction to either side."""
         model = self.base.model
         p = self.base.to_standard(jnp.asarray(self.parameters))

@@ -3,14 +3,14 @@
 import functools
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Array, Float
+from jaxid.arrays import AnyArray, Array, Float, namespace
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.motion import Motion
 from jaxid.trajectory.trajectory import AbstractBasis
@@ -52,10 +52,8 @@ def information(
     """
     plain = np.zeros((base.size, base.size))
     weighted = plain.copy() if prior is None else np.array(prior, np.float64)
-    columns = base.acting_columns
-    for own, theta, w in zip(
-        columns, base.regressor_rows(motion), np.asarray(weights), strict=True
-    ):
+    rows = base.regressor_rows(motion)
+    for own, theta, w in zip(base.acting_columns, rows, np.asarray(weights), strict=True):
         gram = theta.T @ theta
         place = np.ix_(own, own)
         plain[place] += gram
@@ -107,10 +105,8 @@ def _gram_derivative(primals: tuple, tangents: tuple) -> tuple:
 
 def standard_deviations(weighted: Float[AnyArray, "base base"]) -> Float[np.ndarray, " base"]:
     """Return standard deviations from weighted information; infinite where undetermined."""
-    weighted = np.asarray(weighted, np.float64)
-    square = np.diag(weighted)
-    scale = 1.0 / np.sqrt(np.where(square > 0, square, 1.0))
-    values, U = np.linalg.eigh(scale[:, None] * weighted * scale[None])
+    scaled, scale = _unit_diagonal(np.asarray(weighted, np.float64))
+    values, U = np.linalg.eigh(scaled)
     lost = values < 1e-12 * values[-1]
     variances = (U[:, ~lost] ** 2 / values[None, ~lost]).sum(axis=1)
     # A parameter is undetermined if it takes part in a direction without information.
@@ -132,11 +128,7 @@ class AbstractCriterion(eqx.Module):
     extreme: ClassVar[bool] = True
 
     @abstractmethod
-    def __call__(
-        self,
-        information: Information,
-        sharpness: Sharpness = None,
-    ) -> Float[Array, ""]:
+    def __call__(self, information: Information, sharpness: Sharpness = None) -> Float[Array, ""]:
         """Return the logarithm of the number.
 
         Args:
@@ -171,11 +163,7 @@ class ConditionNumber(AbstractCriterion):
         of = ", weighted" if self.weighted else " of Λ (Eq. 36)"
         return f"condition number{of}{', columns scaled' if self.scaled else ''}"
 
-    def __call__(
-        self,
-        information: Information,
-        sharpness: Sharpness = None,
-    ) -> Float[Array, ""]:
+    def __call__(self, information: Information, sharpness: Sharpness = None) -> Float[Array, ""]:
         """Return the logarithm of the condition number."""
         matrix = jnp.asarray(information.weighted if self.weighted else information.plain)
         matrix = _unit_diagonal(matrix)[0] if self.scaled else matrix
@@ -192,11 +180,7 @@ class DOptimal(AbstractCriterion):
     name: ClassVar[str] = "D: mean axis of the confidence ellipsoid"
     extreme: ClassVar[bool] = False
 
-    def __call__(
-        self,
-        information: Information,
-        sharpness: Sharpness = None,
-    ) -> Float[Array, ""]:
+    def __call__(self, information: Information, sharpness: Sharpness = None) -> Float[Array, ""]:
         """Return the logarithm of the mean axis."""
         matrix = jnp.asarray(information.weighted)
         # The determinant does not depend on the scale that makes the factor accurate.
@@ -219,11 +203,7 @@ class AOptimal(AbstractCriterion):
     extreme: ClassVar[bool] = False
     sizes: Float[AnyArray, " base"] | None = None
 
-    def __call__(
-        self,
-        information: Information,
-        sharpness: Sharpness = None,
-    ) -> Float[Array, ""]:
+    def __call__(self, information: Information, sharpness: Sharpness = None) -> Float[Array, ""]:
         """Return the logarithm of the root mean square."""
         scaled = _divide_by_sizes(information, self.sizes)
         return 0.5 * jnp.asarray(spectral(log_mean_inverse, scaled, None))
@@ -239,11 +219,7 @@ class EOptimal(AbstractCriterion):
     name: ClassVar[str] = "E: longest axis of the scaled ellipsoid"
     sizes: Float[AnyArray, " base"] | None = None
 
-    def __call__(
-        self,
-        information: Information,
-        sharpness: Sharpness = None,
-    ) -> Float[Array, ""]:
+    def __call__(self, information: Information, sharpness: Sharpness = None) -> Float[Array, ""]:
         """Return the logarithm of the longest axis."""
         scaled = _divide_by_sizes(information, self.sizes)
         return 0.5 * jnp.asarray(spectral(log_largest_inverse, scaled, sharpness))
@@ -317,7 +293,9 @@ def _divide_by_sizes(information: Information, sizes: Float[AnyArray, " base"] |
     return sizes[:, None] * jnp.asarray(information.weighted) * sizes[None]
 
 
-def _unit_diagonal(matrix: Array) -> tuple[Array, Array]:
-    square = jnp.diagonal(matrix)
-    scale = 1.0 / jnp.sqrt(jnp.where(square > 0, square, 1.0))
+def _unit_diagonal(matrix: AnyArray) -> tuple[Any, Any]:
+    """Return the matrix scaled to ones on its diagonal, and the factor of each row and column."""
+    xp = namespace(matrix)
+    square = xp.diagonal(matrix)
+    scale = 1.0 / xp.sqrt(xp.where(square > 0, square, 1.0))
     return scale[:, None] * matrix * scale[None], scale

@@ -27,12 +27,7 @@ from jaxid.trajectory.trajectory import LinearTrajectory
 
 from .coefficient_limits import JointLimits
 from .constraints import Finding
-from .criteria import (
-    CRITERIA,
-    AbstractCriterion,
-    Information,
-    standard_deviations,
-)
+from .criteria import CRITERIA, AbstractCriterion, Information, standard_deviations
 
 VAGUE = 0.5
 """Relative standard deviation above which a parameter counts as hardly determined."""

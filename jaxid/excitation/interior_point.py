@@ -39,15 +39,11 @@ class Evaluation(NamedTuple):
     slopes: Float[np.ndarray, "constraints scaled"]
 
 
-class Inequalities(NamedTuple):
-    """One number for each inequality: its distance from the bound, or its multiplier.
+Inequalities = Float[np.ndarray, " inequalities"]
+"""One number for each inequality: its distance from the bound, or its multiplier.
 
-    Limits of the joints, upwards and downwards; constraints; sign of the slack if there are any.
-    """
-
-    limits: Float[np.ndarray, "2 joints rows"]
-    constraints: Float[np.ndarray, " constraints"]
-    slack: Float[np.ndarray, " slacks"]
+Limits of the joints, upwards, then downwards; constraints; sign of the slack if there are any.
+"""
 
 
 class State(NamedTuple):
@@ -79,29 +75,20 @@ class State(NamedTuple):
 
 
 class Stage(NamedTuple):
-    """One run of the method.
+    """One run of the method."""
 
-    Attributes:
-        bound: Multiple to which limits are relaxed or tightened.
-        barrier: Weight of the logarithmic barrier at the start.
-        least: Weight below which the barrier does not fall.
-        iterations: Largest number of iterations.
-        sharpness: Sharpness of smooth extremes in the objective.
-        penalty: Penalty of the slack by which constraints are exceeded.
-    """
-
-    bound: float
-    barrier: float
-    least: float
-    iterations: int
-    sharpness: float = 4.0
-    penalty: float = 10.0
+    bound: float  # multiple to which limits are relaxed or tightened
+    barrier: float  # weight of the logarithmic barrier at the start
+    least: float  # weight below which the barrier does not fall
+    iterations: int  # largest number of iterations
+    sharpness: float = 4.0  # sharpness of smooth extremes in the objective
+    penalty: float = 10.0  # penalty of the slack by which constraints are exceeded
 
 
 def begin(grid: Grid, y: Float[np.ndarray, "starts scaled"], constraints: int = 0) -> list[State]:
     """Return the state of some starts before the first stage, with a number of constraints."""
     size, slack = np.shape(y)[1], np.zeros(1 if constraints else 0)
-    duals = Inequalities(np.zeros((2, *grid.c.shape)), np.zeros(constraints), slack)
+    duals = np.zeros(2 * grid.c.size + constraints + len(slack))
     none = Evaluation(0.0, np.zeros(size), np.zeros(constraints), np.zeros((constraints, size)))
     curvature, step = STIFFNESS * np.eye(size), np.zeros(size + len(slack))
     return [State(np.array(x), slack, none, duals, curvature, 0.0, step, duals) for x in y]
@@ -115,12 +102,7 @@ def run(
 ) -> list[State]:
     """Move the starts inside the bound of a stage, then iterate until all have converged.
 
-    Args:
-        grid: Limits of the joints.
-        objective: Function from points [points, scaled] and the numbers of their starts to the
-            evaluations of the points.
-        states: Starts.
-        stage: Settings.
+    The objective evaluates points [points, scaled] of starts with these numbers.
     """
     states = [_begin_stage(grid, stage, one) for one in states]
     for _ in range(stage.iterations):
@@ -143,12 +125,13 @@ def _has_converged(stage: Stage, one: State) -> bool:
 def _begin_stage(grid: Grid, stage: Stage, one: State) -> State:
     """Move one start inside the bound, with multipliers on the central path."""
     y = np.asarray(grid.scale_into_limits(one.y, INSIDE * (stage.bound * grid.bound)))
-    central = stage.barrier / _room(grid, stage, y)
-    moved = not one.duals.limits.any() or (y != one.y).any()
-    limits = central if moved else np.clip(one.duals.limits, central / 1e3, central * 1e3)
+    central, duals = stage.barrier / _room(grid, stage, y), np.array(one.duals)
+    limits = duals[: len(central)]
+    moved = not limits.any() or (y != one.y).any()
+    limits[:] = central if moved else np.clip(limits, central / 1e3, central * 1e3)
     return one._replace(
         y=y,
-        duals=one.duals._replace(limits=limits),
+        duals=duals,
         barrier=stage.barrier,
         step=np.zeros_like(one.step),
         length=0.0,
@@ -160,19 +143,22 @@ def _update(grid: Grid, stage: Stage, old: State, evaluation: Evaluation) -> Sta
     """Take the step of one start, or shorten it."""
     trial = old.trial
     slack = _cheapest_slack(old.slack, evaluation.excess, stage.penalty, old.barrier)
-    room = _rooms(grid, stage, trial, slack, evaluation.excess)
+    room = _room(grid, stage, trial, slack.sum() - evaluation.excess, slack)
     if old.fresh:
-        return _directed(grid, stage, _taken(stage, old, trial, slack, evaluation, room))
-    before = _rooms(grid, stage, old.y, old.slack, old.evaluation.excess)
-    merit = _merit(old.evaluation.value, old.slack, before, stage.penalty, old.barrier)
-    new = _merit(evaluation.value, slack, room, stage.penalty, old.barrier)
+        duals = old.barrier / room
+        duals[: 2 * grid.c.size] = old.duals[: 2 * grid.c.size]
+        begun = old._replace(y=trial, slack=slack, evaluation=evaluation, duals=duals)
+        return _directed(grid, stage, begun._replace(refused=0, fresh=False), room)
+    before = _room(grid, stage, old.y, old.slack.sum() - old.evaluation.excess, old.slack)
+    merit = _merit(old.evaluation, old.slack, before, stage.penalty, old.barrier)
+    new = _merit(evaluation, slack, room, stage.penalty, old.barrier)
     promised = DECREASE * old.length * old.slope
     finite = math.isfinite(evaluation.value) and np.isfinite(evaluation.gradient).all()
     if finite and new <= merit + promised + 1e-10 * abs(merit):
-        return _directed(grid, stage, _taken(stage, old, trial, slack, evaluation, room))
+        return _directed(grid, stage, _taken(stage, old, slack, evaluation, room), room)
     if old.refused >= PATIENCE:
         flat = np.eye(len(trial)) * np.trace(old.curvature) / len(trial)
-        return _directed(grid, stage, old._replace(curvature=flat, refused=0))
+        return _directed(grid, stage, old._replace(curvature=flat, refused=0), before)
     # A refused step is shortened to the minimum of a parabola through what is known.
     shorter = -old.slope * old.length**2 / (2 * (new - merit - old.slope * old.length))
     least, most = 0.1 * old.length, 0.5 * old.length
@@ -181,63 +167,49 @@ def _update(grid: Grid, stage: Stage, old: State, evaluation: Evaluation) -> Sta
 
 
 def _taken(
-    stage: Stage,
-    old: State,
-    trial: np.ndarray,
-    slack: np.ndarray,
-    evaluation: Evaluation,
-    room: Inequalities,
+    stage: Stage, old: State, slack: np.ndarray, evaluation: Evaluation, room: Inequalities
 ) -> State:
     """Return the state of one start after its step was taken."""
-    if old.fresh:
-        central = (old.barrier / x for x in room)
-        duals = Inequalities(*central)._replace(limits=old.duals.limits)
-        fresh = {"slack": slack, "evaluation": evaluation, "duals": duals}
-        return old._replace(y=trial, refused=0, fresh=False, **fresh)
     barrier = max(stage.least, old.barrier * (COOLING if old.length > 0.1 else 1.0))
-    duals = Inequalities(
-        *(
-            np.clip(dual + old.dual_length * step, barrier / x / 1e3, barrier / x * 1e3)
-            for dual, step, x in zip(old.duals, old.dual_step, room, strict=True)
-        )
-    )
+    central = barrier / room
+    duals = np.clip(old.duals + old.dual_length * old.dual_step, central / 1e3, central * 1e3)
     # Curvature is that of the Lagrangian: of the value and of constraints that bend.
     change = evaluation.gradient - old.evaluation.gradient
-    change = change + duals.constraints @ (evaluation.slopes - old.evaluation.slopes)
+    _, bending, _ = _parts(duals, evaluation)
+    change = change + bending @ (evaluation.slopes - old.evaluation.slopes)
     return old._replace(
-        y=trial,
+        y=old.trial,
         slack=slack,
         evaluation=evaluation,
         duals=duals,
-        curvature=_damped_bfgs(old.curvature, trial - old.y, change),
+        curvature=_damped_bfgs(old.curvature, old.trial - old.y, change),
         barrier=barrier,
         refused=0,
     )
 
 
-def _directed(grid: Grid, stage: Stage, state: State) -> State:
+def _directed(grid: Grid, stage: Stage, state: State, room: Inequalities) -> State:
     """Return one start with the step to the barrier's minimum, and how far it may go."""
-    evaluation, size, R = state.evaluation, len(state.y), grid.R
+    evaluation, size, slacks, R = state.evaluation, len(state.y), len(state.slack), grid.R
     joints, _, variables = R.shape
-    room = _rooms(grid, stage, state.y, state.slack, evaluation.excess)
-    ratio = Inequalities(*(dual / x for dual, x in zip(state.duals, room, strict=True)))
-    central = Inequalities(*(state.barrier / x for x in room))
-    stiff = ratio.constraints[:, None] * evaluation.slopes
-    slacks = len(state.slack)
+    ratio, central = state.duals / room, state.barrier / room
+    stiffness, of_constraints, of_slack = _parts(ratio, evaluation)
+    push, pull, spare = _parts(central, evaluation)
+    stiff = of_constraints[:, None] * evaluation.slopes
     H = np.zeros((size + slacks, size + slacks))
     H[:size, :size] = state.curvature + evaluation.slopes.T @ stiff
-    weighted = R * (ratio.limits[0] + ratio.limits[1])[:, :, None]
+    weighted = R * stiffness.reshape(2, *grid.c.shape).sum(axis=0)[:, :, None]
     for j, block in enumerate(np.swapaxes(R, 1, 2) @ weighted):
         place = slice(j * variables, (j + 1) * variables)
         H[place, place] += block
     ridge = 1e-9 * np.trace(H[:size, :size]) / size
-    push = np.einsum("jrk,jr->jk", R, central.limits[0] - central.limits[1]).reshape(size)
-    downhill = -(evaluation.gradient + push + central.constraints @ evaluation.slopes)
+    up, down = push.reshape(2, *grid.c.shape)
+    away = np.einsum("jrk,jr->jk", R, up - down).reshape(size)
+    downhill = -(evaluation.gradient + away + pull @ evaluation.slopes)
     if slacks:
         H[:size, size] = H[size, :size] = -stiff.sum(axis=0)
-        H[size, size] = ratio.constraints.sum() + ratio.slack[0]
-        spare = central.constraints.sum() - stage.penalty + central.slack
-        downhill = np.concatenate([downhill, spare])
+        H[size, size] = of_constraints.sum() + of_slack[0]
+        downhill = np.concatenate([downhill, pull.sum() - stage.penalty + spare])
     H[np.diag_indices(size + slacks)] += ridge
     try:
         factor = scipy.linalg.cho_factor(H, lower=True, check_finite=False)
@@ -249,38 +221,34 @@ def _directed(grid: Grid, stage: Stage, state: State) -> State:
         step = downhill / np.diagonal(H)
     rows, more = np.einsum("jrk,jk->jr", R, step[:size].reshape(joints, variables)), step[size:]
     bent = evaluation.slopes @ step[:size] - more.sum()
-    change = Inequalities(np.stack([rows, -rows]), bent, -more)
-    dual_step = Inequalities(
-        *(
-            c - dual + r * x
-            for c, dual, r, x in zip(central, state.duals, ratio, change, strict=True)
-        )
-    )
+    change = np.concatenate([rows.ravel(), -rows.ravel(), bent, -more])
+    dual_step = central - state.duals + ratio * change
     return state._replace(
         step=step,
         dual_step=dual_step,
         length=_longest(change, room),
-        dual_length=_longest(Inequalities(*(-x for x in dual_step)), state.duals),
+        dual_length=_longest(-dual_step, state.duals),
         slope=-float(downhill @ step),
     )
 
 
-def _room(grid: Grid, stage: Stage, y: np.ndarray) -> Float[np.ndarray, "2 joints rows"]:
-    """Return the distances from the limits of the joints, upwards and downwards."""
-    away = np.einsum("jrk,jk->jr", grid.R, y.reshape(grid.constant.shape)) - grid.c
-    return stage.bound * grid.bound - np.stack([away, -away])
+def _room(grid: Grid, stage: Stage, y: np.ndarray, *more: np.ndarray) -> Inequalities:
+    """Return the distances from the limits of the joints, followed by those of what is given."""
+    away = (grid.rows(y) - grid.c).ravel()
+    bound = stage.bound * grid.bound
+    return np.concatenate([bound - away, bound + away, *more])
 
 
-def _rooms(
-    grid: Grid, stage: Stage, y: np.ndarray, slack: np.ndarray, excess: np.ndarray
-) -> Inequalities:
-    return Inequalities(_room(grid, stage, y), slack.sum() - excess, slack)
+def _parts(x: Inequalities, evaluation: Evaluation) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the numbers of limits, constraints and slack."""
+    constraints = len(evaluation.excess)
+    slack = len(x) - (constraints > 0)
+    return x[: slack - constraints], x[slack - constraints : slack], x[slack:]
 
 
 def _longest(change: Inequalities, room: Inequalities) -> float:
     """Return the longest step, at most 1, that stays inside all bounds."""
-    nearest = max(float((x / y).max(initial=1e-12)) for x, y in zip(change, room, strict=True))
-    return min(1.0, TO_BOUNDARY / nearest)
+    return min(1.0, TO_BOUNDARY / float((change / room).max(initial=1e-12)))
 
 
 def _damped_bfgs(B: np.ndarray, s: np.ndarray, change: np.ndarray) -> np.ndarray:
@@ -315,8 +283,8 @@ def _cheapest_slack(
 
 
 def _merit(
-    value: float, slack: np.ndarray, room: Inequalities, penalty: float, barrier: float
+    evaluation: Evaluation, slack: np.ndarray, room: Inequalities, penalty: float, barrier: float
 ) -> float:
     """Return the merit function, which a step must decrease."""
-    logs = sum(float(np.log(np.maximum(x, 1e-300)).sum()) for x in room)
-    return value + penalty * float(slack.sum()) - barrier * logs
+    logs = sum(float(np.log(np.maximum(x, 1e-300)).sum()) for x in _parts(room, evaluation))
+    return evaluation.value + penalty * float(slack.sum()) - barrier * logs

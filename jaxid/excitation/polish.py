@@ -19,6 +19,7 @@ from .problem import (
     Candidates,
     ExcitationProblem,
     Watched,
+    are_peaks,
     evaluate_within_limits,
 )
 
@@ -102,11 +103,11 @@ def _add_peaks(
 ) -> float:
     """Mark the peaks above a fraction of the limits; return the largest one."""
     grid = problem.limits.grid()
-    use = np.einsum("jrk,jk->jr", grid.R, x.reshape(problem.limits.shape)) - grid.c
-    use = np.stack([use, -use]) / grid.bound
+    use = np.asarray(grid.use(x))
+    use = np.stack([use, -use])
     for kind in grid.kinds:
         part = use[:, :, kind]
-        rows[:, :, kind] |= _are_peaks(part, 2) & (part > threshold)
+        rows[:, :, kind] |= are_peaks(part, 2) & (part > threshold)
     return float(use.max())
 
 
@@ -122,7 +123,3 @@ def _watched(problem: ExcitationProblem, x: np.ndarray, peaks: list[np.ndarray])
         )
         found.append((both[0], both[1]))
     return found
-
-
-def _are_peaks(values: np.ndarray, axis: int) -> np.ndarray:
-    return (values >= np.roll(values, 1, axis)) & (values >= np.roll(values, -1, axis))

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Array, Float, Int, PRNGKeyArray, require_float64
+from jaxid.arrays import AnyArray, Array, Float, Int, PRNGKeyArray, namespace, require_float64
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
@@ -135,10 +135,7 @@ class ExcitationProblem:
         return self.limits.random(key, 1)[0]
 
     def value(
-        self,
-        x: Float[AnyArray, " scaled"],
-        sharpness: Sharpness = None,
-        samples: int | None = None,
+        self, x: Float[AnyArray, " scaled"], sharpness: Sharpness = None, samples: int | None = None
     ) -> Float[Array, ""]:
         """Return the logarithm of the criterion of one run.
 
@@ -159,9 +156,8 @@ class ExcitationProblem:
         Args:
             x: Scaled coefficients.
         """
-        grid = self.limits.grid(SEARCHED)
-        rows = grid.rows(jnp.asarray(x)) - grid.c
-        limits = jnp.concatenate([rows.reshape(-1), -rows.reshape(-1)]) / grid.bound - 1.0
+        use = self.limits.grid(SEARCHED).use(jnp.asarray(x)).reshape(-1)
+        limits = jnp.concatenate([use, -use]) - 1.0
         if not self.constraints:
             return limits
         watched = self._constrained(x, WATCHED)
@@ -173,8 +169,7 @@ class ExcitationProblem:
         Args:
             x: Scaled coefficients.
         """
-        grid = self.limits.grid()
-        excess = jnp.max(jnp.abs(grid.rows(jnp.asarray(x)) - grid.c)) / grid.bound - 1.0
+        excess = jnp.max(jnp.abs(self.limits.grid().use(jnp.asarray(x)))) - 1.0
         tops = _tops(self._constrained(x)) if self.constraints else excess
         return jnp.maximum(excess, jnp.max(tops))
 
@@ -293,8 +288,8 @@ class ExcitationProblem:
         """
         found = []
         for values in self._by_constraint(x, slice(None, None, EVERY)):
-            peak = (values >= np.roll(values, 1, 0)) & (values >= np.roll(values, -1, 0))
-            highest = np.argsort(np.where(peak, values, -np.inf), axis=None)[-PEAKS:]
+            peaks = np.where(are_peaks(values, 0), values, -np.inf)
+            highest = np.argsort(peaks, axis=None)[-PEAKS:]
             highest = np.resize(highest, PEAKS)
             time, entry = np.unravel_index(highest, values.shape)
             at = np.concatenate([WATCHED // EVERY, time])
@@ -344,9 +339,7 @@ class ExcitationProblem:
         self, x: AnyArray, instants: Any = slice(None)
     ) -> Float[Array, "instants values"]:
         coefficients = self.limits.coefficients(jnp.asarray(x))
-        return self._evaluated(Motion(*(part[instants] @ coefficients.T for part in self._rows)))
-
-    def _evaluated(self, motion: Motion) -> Float[Array, "*batch values"]:
+        motion = Motion(*(part[instants] @ coefficients.T for part in self._rows))
         return jnp.concatenate([c(self.robot, motion) for c in self.constraints], axis=-1)
 
 
@@ -355,9 +348,14 @@ def assumed_noise(robot: Robot) -> Float[np.ndarray, " joints"]:
     return 0.01 * np.asarray(robot.max_forces)
 
 
+def are_peaks(values: np.ndarray, axis: int) -> np.ndarray:
+    """Return whether values are not below their neighbours along an axis that closes on itself."""
+    return (values >= np.roll(values, 1, axis)) & (values >= np.roll(values, -1, axis))
+
+
 def _tops(values: AnyArray) -> Float[AnyArray, " values"]:
     """Return the highest of each value, also between instants: the tops of parabolas."""
-    xp = np if isinstance(values, np.ndarray) else jnp
+    xp = namespace(values)
     before, peak, after = values[:-2], values[1:-1], values[2:]
     bend = 2 * peak - before - after
     top = (peak >= before) & (peak >= after) & (bend > 0)
@@ -366,16 +364,11 @@ def _tops(values: AnyArray) -> Float[AnyArray, " values"]:
 
 
 class Candidates(NamedTuple):
-    """The best motion of each start so far, certified to keep the limits of the joints.
+    """The best motion of each start so far, certified to keep the limits of the joints."""
 
-    Attributes:
-        x: Scaled coefficients.
-        value: Logarithm of the criterion, exact.
-        excess: Relative excess of the worst constraint; not positive where all are kept.
-    """
-
-    x: Float[AnyArray, "starts scaled"]
-    value: Float[AnyArray, " starts"]
+    x: Float[AnyArray, "starts scaled"]  # scaled coefficients
+    value: Float[AnyArray, " starts"]  # logarithm of the criterion, exact
+    # relative excess of the worst constraint; not positive where all are kept
     excess: Float[AnyArray, " starts"]
 
     @property
@@ -396,10 +389,17 @@ class Candidates(NamedTuple):
         """Return the starts, the most promising first: a small excess is soon mended."""
         return np.argsort(np.asarray(self.value) + PENALTY * self.broken, kind="stable")
 
-    def improved(self, other: "Candidates", where: Any = True) -> "Candidates":
-        """Return start by start the better of two, or of one, where it may be replaced."""
+    def placed(self, places: Any, other: "Candidates") -> "Candidates":
+        """Return the same motions with others at some places."""
+        whole = Candidates(*(np.array(part) for part in self))
+        for part, new in zip(whole, other, strict=True):
+            part[places] = new
+        return whole
+
+    def improved(self, other: "Candidates") -> "Candidates":
+        """Return start by start the better of two."""
         a, b = self.broken, other.broken
-        better = where & ((b < a) | ((b == a) & (other.value < self.value)))
+        better = (b < a) | ((b == a) & (other.value < self.value))
         return Candidates(
             np.where(better[:, None], other.x, self.x),
             np.where(better, other.value, self.value),

@@ -69,12 +69,6 @@ BATCH = 8
 """Starts that are improved together."""
 PART = 25
 """Iterations after which the peaks of constraints are found anew."""
-POLISHING = 0.35
-"""Fraction of a limited time that is left for the fine grid and for polishing."""
-SIZES = (0.6, 0.4, 0.3, 0.2, 0.15, 0.1, 0.05)
-"""Sizes of first motions that may keep constraints, relative to the limits of the joints."""
-POSES = 1000
-"""Random poses among which the middles of these motions are sought."""
 
 
 class Search:
@@ -102,16 +96,18 @@ class Search:
         self._polished = min(polished, starts)
         self._began, self._seconds = time.monotonic(), seconds
         x = problem.limits.random(key, starts)
-        self.first = evaluate(problem, x).value if not problem.constraints else _values(problem, x)
         if problem.constraints:
+            self.first = problem.value_and_gradient(x, None, problem.samples)[0]
             x = first_motions(problem, self._random, x)
+        else:
+            self.first = evaluate(problem, x).value
         if begin is not None:
             x[0] = begin
         self.best = evaluate_within_limits(problem, x[:1] if problem.constraints else x)
         self._x, self.history = x, [self.best.best_value]
-        schedule = len(CONSTRAINED if problem.constraints else SCHEDULE)
+        self._schedule = CONSTRAINED if problem.constraints else SCHEDULE
         batches = -(-starts // BATCH)
-        self.steps = batches * (schedule + 1) + generations + self._polished
+        self.steps = batches * (len(self._schedule) + 1) + generations + self._polished
 
     @property
     def feasible(self) -> bool:
@@ -132,9 +128,8 @@ class Search:
             yield from self._start_batches()
         else:
             yield "searching from many starts"
-        schedule = CONSTRAINED if problem.constraints else SCHEDULE
         for places in self._batches():
-            yield from self._improve_batch(places, schedule)
+            yield from self._improve_batch(places)
         for _ in range(self._generations):
             if self._is_late:
                 break
@@ -167,17 +162,15 @@ class Search:
                 break
             self.best = self.best.survivors(shrink_to_constraints(self._problem, x))
             yield self._done("looking for a first motion that keeps all limits")
-        found, unknown = self.best, np.full(len(self._x), np.inf)
-        self.best = Candidates(self._x, unknown, unknown.copy())
-        for part, one in zip(self.best, found, strict=True):
-            part[0] = one[int(found.order()[0])]
+        first, unknown = self.best.order()[:1], np.full(len(self._x), np.inf)
+        found = Candidates(*(part[first] for part in self.best))
+        self.best = Candidates(self._x, unknown, unknown).placed([0], found)
+        self._x = self.best.x
 
-    def _improve_batch(self, places: np.ndarray, schedule: tuple[Stage, ...]) -> Iterator[str]:
-        states, task = (
-            _begin(self._problem, SEARCHED, self._x[places]),
-            "searching from many starts",
-        )
-        for number, stage in enumerate(schedule):
+    def _improve_batch(self, places: np.ndarray) -> Iterator[str]:
+        task = "searching from many starts"
+        states = _begin(self._problem, SEARCHED, self._x[places])
+        for number, stage in enumerate(self._schedule):
             for _ in _improve(self._problem, SEARCHED, states, stage):
                 if self._is_late:
                     return
@@ -197,28 +190,24 @@ class Search:
                 yield task
             self._take(states, places)
             yield self._done(task)
-        order = self.best.promising()
-        for place in order[: self._polished]:
+        for place in self.best.promising()[: self._polished]:
             yield "polishing the best"
-            better = polish(problem, np.asarray(self.best.x[place]))
-            self.best = self.best.improved(better, np.arange(len(order)) == place)
+            self._replace([place], polish(problem, np.asarray(self.best.x[place])))
             yield self._done("polishing the best")
 
     @property
     def _is_late(self) -> bool:
-        """Whether only the time for the last steps is left."""
-        return self._seconds is not None and self.spent > 1.0 - POLISHING
+        """Whether only the time for the fine grid and for polishing is left."""
+        return self._seconds is not None and self.spent > 0.65
 
     def _take(self, states: list[State], places: np.ndarray) -> None:
+        """Replace the motions at some places by those of states that are better."""
+        x = np.array([one.y for one in states])
+        self._replace(places, evaluate_within_limits(self._problem, x))
+
+    def _replace(self, places: Any, found: Candidates) -> None:
         """Replace the motions at some places by better ones."""
-        x = np.array(self.best.x)
-        x[places] = [one.y for one in states]
-        chosen = np.isin(np.arange(len(x)), places)
-        found = evaluate_within_limits(self._problem, x[places])
-        whole = Candidates(*(np.array(part) for part in self.best))
-        for part, new in zip(whole, found, strict=True):
-            part[places] = new
-        self.best = self.best.improved(whole, chosen)
+        self.best = self.best.improved(self.best.placed(places, found))
 
     def _done(self, task: str) -> str:
         self.history.append(self.best.best_value)
@@ -228,9 +217,8 @@ class Search:
         """Make motions smaller where no other keeps all constraints."""
         if self.best.broken.all():
             for place in self.best.order()[:4]:
-                x = np.asarray(self.best.x[place])
-                small = shrink_to_constraints(self._problem, x)
-                self.best = self.best.improved(small, np.arange(len(self.best.x)) == place)
+                small = shrink_to_constraints(self._problem, self.best.x[place])
+                self._replace([place], small)
 
 
 def first_motions(
@@ -242,7 +230,7 @@ def first_motions(
     """
     limits, robot = problem.limits.limits, problem.base.model.robot
     low, high = np.asarray(limits.position_min), np.asarray(limits.position_max)
-    places = random.uniform(0.1, 0.9, (POSES, robot.joints))
+    places = random.uniform(0.1, 0.9, (1000, robot.joints))
     q = low + places * (high - low)
     still = Motion(q, np.zeros_like(q), np.zeros_like(q))
     values = [np.asarray(c(problem.robot, still)).max(axis=1) for c in problem.constraints]
@@ -250,17 +238,12 @@ def first_motions(
     fill = problem.limits.grid().fill
     many = [
         np.asarray(fill(y, place, size))
-        for size in SIZES
+        for size in (0.6, 0.4, 0.3, 0.2, 0.15, 0.1, 0.05)
         for y, place in zip(x, places[good], strict=True)
     ]
     excess = np.array([problem.watched_excess(y) for y in many])
     best = np.argsort(np.maximum(excess, 0.0), kind="stable")[: len(x)]
     return np.array(many)[best]
-
-
-def _values(problem: ExcitationProblem, x: Float[np.ndarray, "starts scaled"]) -> np.ndarray:
-    """Return the criterion of motions, whether they keep constraints or not."""
-    return problem.value_and_gradient(x, None, problem.samples)[0]
 
 
 def _begin(problem: ExcitationProblem, points: int, x: Any) -> list[State]:

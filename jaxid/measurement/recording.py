@@ -416,9 +416,8 @@ def _resampling(
 ) -> tuple[float, list[np.ndarray], list[str], Callable[[np.ndarray], np.ndarray]]:
     """Return how rows come to the uniform grid behind their time stamps.
 
-    Returns:
-        Time between two samples [s]; times of each segment's samples [s]; remarks; and a function
-        of a channel's rows: its samples as they are, or interpolated by cubic splines.
+    That is the time between two samples [s]; times of each segment's samples [s]; remarks; and a
+    function of a channel's rows: its samples as they are, or interpolated by cubic splines.
     """
     _require_forward(stamps, np.diff(stamps), first_row, source)
     kept = np.flatnonzero(np.diff(stamps, prepend=-np.inf) > 0)

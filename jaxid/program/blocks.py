@@ -6,6 +6,7 @@ place afterwards. An accelerator takes all samples at once.
 """
 
 import functools
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -26,8 +27,6 @@ def block_results(program: Program, *arrays: Array) -> tuple[Array, ...]:
 
     Inputs are [entries] if all samples have them in common, else [samples, entries].
     """
-    nodes, _ = program.distinct
-    lowered = lower(program, fence=True)
     block = next(len(x) for x in arrays if x.ndim == 2)
 
     def evaluate(arrays: tuple[Array, ...]) -> tuple[Array, ...]:
@@ -38,12 +37,11 @@ def block_results(program: Program, *arrays: Array) -> tuple[Array, ...]:
             [next(rows) for _ in x.T] if x.ndim == 2 else [jnp.broadcast_to(y, (block,)) for y in x]
             for x in arrays
         ]
-        values = lowered.run(inputs, primitives(whole[0]))[0]
-        return tuple(values[k] for k in nodes)
+        return lower(program, fence=True).run(inputs, primitives(whole[0]))
 
     # Results of a branch are stored: what uses them does not compute them again.
     first = arrays[-1][0, 0]
-    nothing = tuple(jnp.broadcast_to(first, (block,)) for _ in nodes)
+    nothing = tuple(jnp.broadcast_to(first, (block,)) for _ in program.distinct[0])
     return jax.lax.cond(hidden_one(first) > 0, evaluate, lambda _: nothing, arrays)
 
 
@@ -52,29 +50,24 @@ def results_at_once(program: Program, *arrays: Array) -> tuple[Array, ...]:
     count = next(len(x) for x in arrays if x.ndim == 2)
     inputs = [[jnp.broadcast_to(row, (count,)) for row in x.T] for x in arrays]
     like = jnp.zeros(count, arrays[-1].dtype)
-    values = lower(program, fence=False).run(inputs, primitives(like))[0]
-    return tuple(values[k] for k in program.distinct[0])
+    return lower(program, fence=False).run(inputs, primitives(like))
 
 
-def _dense(program: Program, rows: tuple[Array, ...], like: Array) -> Float[Array, "samples out"]:
+def _packed(
+    results: Callable[..., tuple[Array, ...]], program: Program, *arrays: Array
+) -> Float[Array, "samples out"]:
     """Return distinct results in the order of the packed result, with its constants."""
-    _, entries = program.distinct
-    pairs = zip(entries, program.outputs, strict=True)
-    full = [rows[k] if k >= 0 else jax.lax.full_like(like, x) for k, x in pairs]
+    packed = program.pack(results(program, *arrays))
+    like = jnp.zeros(len(arrays[-1]), arrays[-1].dtype)
+    full = [jax.lax.full_like(like, x) if isinstance(x, float) else x for x in packed]
     return jnp.stack(full, axis=1)
 
 
 def _in_blocks(program: Program, *arrays: Array) -> Float[Array, "samples out"]:
     """Return the packed result of each sample, block by block."""
-    count = next(len(x) for x in arrays if x.ndim == 2)
-    dtype = arrays[-1].dtype
-    size = min(count, BLOCK)
-
-    def turn(parts: list[Array]) -> Array:
-        return _dense(program, block_results(program, *parts), jnp.zeros(size, dtype))
-
+    count = len(arrays[-1])
     if count <= BLOCK:
-        return turn(list(arrays))
+        return _packed(block_results, program, *arrays)
 
     def step(k: Array, out: Array) -> Array:
         # The last block begins earlier, so that it is as long as the others.
@@ -82,17 +75,12 @@ def _in_blocks(program: Program, *arrays: Array) -> Float[Array, "samples out"]:
         parts = [
             jax.lax.dynamic_slice_in_dim(x, start, BLOCK) if x.ndim == 2 else x for x in arrays
         ]
-        return jax.lax.dynamic_update_slice_in_dim(out, turn(parts), start, axis=0)
+        part = _packed(block_results, program, *parts)
+        return jax.lax.dynamic_update_slice_in_dim(out, part, start, axis=0)
 
     # All of it is overwritten.
     empty = jnp.broadcast_to(arrays[-1][0, 0], (count, len(program.outputs)))
     return jax.lax.fori_loop(0, -(-count // BLOCK), step, empty)
-
-
-def _at_once(program: Program, *arrays: Array) -> Float[Array, "samples out"]:
-    """Return the packed result of each sample, all at once."""
-    rows = results_at_once(program, *arrays)
-    return _dense(program, rows, jnp.zeros(len(arrays[-1]), arrays[-1].dtype))
 
 
 def on_rows(program: Program, *arrays: Array) -> Float[Array, "samples out"]:
@@ -105,11 +93,9 @@ def on_rows(program: Program, *arrays: Array) -> Float[Array, "samples out"]:
 
     @custom_vmap
     def run(*arrays: Array) -> Array:
-        each = {
-            name: functools.partial(form, program)
-            for name, form in (("cpu", _in_blocks), ("default", _at_once))
-        }
-        return jax.lax.platform_dependent(*arrays, **each)
+        in_blocks = functools.partial(_in_blocks, program)
+        at_once = functools.partial(_packed, results_at_once, program)
+        return jax.lax.platform_dependent(*arrays, cpu=in_blocks, default=at_once)
 
     @run.def_vmap
     def batch(size: int, batched: list[bool], *arrays: Array) -> tuple[Array, bool]:
@@ -144,15 +130,14 @@ def row_products(
 
     A group holds positions in the packed result whose values are multiplied with each other.
     """
-    _, entries = program.distinct
     count, dtype = len(arrays[0]), arrays[0].dtype
     if count == 0:
         return [jnp.zeros((len(group), len(group)), dtype) for group in groups]
 
     def products(rows: tuple[Array, ...], counted: Array) -> list[Array]:
-        found = []
+        found, packed = [], program.pack(rows)
         for group in groups:
-            values = [rows[entries[k]] if entries[k] >= 0 else program.outputs[k] for k in group]
+            values = [packed[k] for k in group]
             stacked = jnp.stack([counted * x for x in values]) if group else counted[:0, None]
             found.append(stacked @ stacked.T)
         return found

@@ -35,18 +35,10 @@ _UNARY: dict[Operation, Callable[[Operand, Operand], Operand]] = {
 
 
 def pull_back(program: Program, weights: np.ndarray, *arrays: np.ndarray) -> list[np.ndarray]:
-    """Return the derivative of a weighted sum of a program's results by its inputs, in NumPy.
+    """Return the derivative of a weighted sum of a program's results by each input, in NumPy.
 
-    Args:
-        program: Program made by `trace`.
-        weights: Weight of each packed result, followed by any batch axes.
-        arrays: Arrays with the shapes of the inputs, each followed by the same batch axes.
-
-    Returns:
-        For each input an array of its shape.
-
-    Raises:
-        InputError: If the arrays do not fit the program's inputs.
+    Weights of the packed result, and arrays with the shapes of the inputs, are followed by any
+    batch axes.
     """
     return list(evaluate(gradient_program(program), *arrays, weights))
 

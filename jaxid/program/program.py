@@ -108,6 +108,11 @@ class Program:
         entries = [-1 if x is None else numbers.setdefault(x, len(numbers)) for x in nodes]
         return tuple(numbers), np.array(entries, int)
 
+    def pack(self, distinct: Sequence[Any]) -> list[Any]:
+        """Return the packed result from its distinct values; constants are floats."""
+        pairs = zip(self.distinct[1].tolist(), self.outputs, strict=True)
+        return [distinct[k] if k >= 0 else constant for k, constant in pairs]
+
     @functools.cached_property
     def nonzeros(self) -> Any:
         """Boolean arrays in the structure of the outputs, False where an entry is always 0."""

@@ -171,11 +171,7 @@ _add, _subtract, _multiply = (
     _each(f, 2) for f in (scalar.add, lambda x, y: scalar.add(x, scalar.negate(y)), scalar.multiply)
 )
 _maximum, _minimum = _operation(Operation.MAXIMUM), _operation(Operation.MINIMUM)
-_negate, _select = _each(scalar.negate, 1), _each(scalar.select, 3)
-_and, _or, _not = (
-    _each(lambda *x, o=o: scalar.logic(o, *x), n)
-    for o, n in ((Operation.AND, 2), (Operation.OR, 2), (Operation.NOT, 1))
-)
+_select = _each(scalar.select, 3)
 
 
 def _reduce(function: np.ufunc, x: np.ndarray, axes: Sequence, initial: float) -> Any:
@@ -214,11 +210,15 @@ _ELEMENTARY = [
 ]
 _ARITHMETIC: dict[str, Callable] = {
     **{o.value: _operation(o) for o in _ELEMENTARY},
+    **{
+        o.value: _each(functools.partial(scalar.logic, o), o.numpy.nin)
+        for o in (Operation.AND, Operation.OR, Operation.NOT)
+    },
     "add": _add,
     "add_any": _add,
     "sub": _subtract,
     "mul": _multiply,
-    "neg": _negate,
+    "neg": _each(scalar.negate, 1),
     "square": lambda x: _multiply(x, x),
     "one_minus_square": lambda x: _multiply(_add(1.0, x), _subtract(1.0, x)),
     "polynomial": lambda x, *c, **_: functools.reduce(
@@ -239,9 +239,6 @@ _ARITHMETIC: dict[str, Callable] = {
     "clamp": lambda low, x, high: _minimum(_maximum(low, x), high),
     "gt": _each(lambda x, y: scalar.apply(Operation.LESS, y, x), 2),
     "ge": _each(lambda x, y: scalar.apply(Operation.LESS_EQUAL, y, x), 2),
-    "and": _and,
-    "or": _or,
-    "not": _not,
     "dot_general": _dot_general,
     "reduce_sum": lambda x, *, axes, **_: _reduce(_add, x, axes, 0.0),
     "reduce_prod": lambda x, *, axes, **_: _reduce(_multiply, x, axes, 1.0),

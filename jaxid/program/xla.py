@@ -28,8 +28,6 @@ HOLDS = jax.__version_info__ >= (0, 12)
 CIRCULAR = (Operation.SINE, Operation.COSINE)
 Entries = Sequence[Array | Sequence[Array]]
 """Entries of each input, in order: arrays of the batch's shape."""
-Values = tuple[list[Array], dict[int, tuple[Array, Array]], Array | None]
-"""Array of each node, sines and cosines by the positions of their angles, and the fences' one."""
 
 
 def hidden_one(reference: Array) -> Array:
@@ -85,8 +83,11 @@ class Lowered(eqx.Module):
 
         For each entry of each output, in order, it is an array of the batch's shape or a constant.
         """
-        values = self.run(self.entries(*arrays)[0], ELEMENTWISE)[0]
-        return [values[x] if isinstance(x, int) else x for x in self.program.outputs]
+        return self.program.pack(self.distinct(*arrays))
+
+    def distinct(self, *arrays: AnyArray) -> tuple[Array, ...]:
+        """Compute the distinct results that vary, from the same arrays."""
+        return self.run(self.entries(*arrays)[0], ELEMENTWISE)
 
     def entries(self, *arrays: AnyArray) -> tuple[list[Array], tuple[int, ...]]:
         """Return the inputs with their own axes merged and the whole batch behind; its shape."""
@@ -104,8 +105,8 @@ class Lowered(eqx.Module):
         full = [jnp.broadcast_to(jnp.asarray(x, dtype), batch) for x in self(*arrays)]
         return self.program.unpack(jnp.stack(full) if full else jnp.zeros((0, *batch), dtype))
 
-    def run(self, entries: Entries, operations: dict[Operation, Callable]) -> Values:
-        """Compute all nodes from the entries of each input, with a function for each operation."""
+    def run(self, entries: Entries, operations: dict[Operation, Callable]) -> tuple[Array, ...]:
+        """Compute the distinct results that vary, with a function for each operation."""
         nodes = self.program.nodes
         # The last input: XLA folds what depends on constants, such as parameters often are.
         firsts = [x[0] for x in reversed(entries) if len(x)]
@@ -135,7 +136,7 @@ class Lowered(eqx.Module):
                     operands[1:] = [jnp.asarray(x, dtype) for x in operands[1:]]
                 value = operations[node.operation](*operands)
                 values.append(fenced(value, anchor) if position in self.fenced else value)
-        return values, pairs, anchor
+        return tuple(values[k] for k in self.program.distinct[0])
 
 
 def primitives(like: Array) -> dict[Operation, Callable]:

@@ -122,9 +122,8 @@ class CollisionModel(Hashable):
             first.setdefault(self._owner(shape), _stem(shapes[shape].name))
 
         def name(shape: int, alone: bool) -> str:
-            return (
-                shapes[shape].name if alone else first.get(self._owner(shape), shapes[shape].name)
-            )
+            own = shapes[shape].name
+            return own if alone else first.get(self._owner(shape), own)
 
         pairs = [(self.pairs[group[0]], len(group) == 1) for group in self.groups]
         return tuple(f"{name(i, alone)} and {name(k, alone)}" for (i, k), alone in pairs)

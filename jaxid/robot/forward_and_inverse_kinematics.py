@@ -111,14 +111,10 @@ def inverse_kinematics_along(
     rotation: Numbers,
     posture: Numbers | None = None,
 ) -> Float[np.ndarray, "poses joints"]:
-    """Return coordinates within the limits along a path, without a jump [rad or m].
+    """Return coordinates within the limits along a path of close positions [rad or m].
 
-    Args:
-        robot: Robot of the end-effector.
-        positions: Close positions of the end-effector on the ground [m].
-        rotation: Attitude on the ground, whose columns are the end-effector's axes.
-        posture: Preferred coordinates, where the search begins [rad or m]; the middle of the ranges
-            if None.
+    Columns of the `rotation` are the end-effector's axes on the ground. The search begins at the
+    preferred coordinates `posture`; the middle of the ranges if None.
 
     Raises:
         InputError: If the posture or the rotation is none, or the end-effector cannot follow the

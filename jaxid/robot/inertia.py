@@ -14,10 +14,6 @@ INERTIAL_UNITS = ("kg", *("kg m",) * 3, *("kg m²",) * 6)
 HEAVIEST = 1e5
 """Largest mass of a body of a robot [kg]."""
 
-_PINOCCHIO = (0, 1, 2, 3, 4, 9, 5, 8, 7, 6)
-"""Places of Pinocchio's (m, mx, my, mz, Ixx, Ixy, Iyy, Ixz, Iyz, Izz) in the paper's order."""
-_SIGNS = np.array([1.0, 1.0, 1.0, 1.0, 1.0, -1.0, 1.0, -1.0, -1.0, 1.0])
-
 
 class Inertia(eqx.Module):
     r"""Mass, centre of mass and inertia tensor of a body, or of many along leading axes.
@@ -62,8 +58,9 @@ class Inertia(eqx.Module):
     @property
     def pinocchio(self) -> Float[AnyArray, "*batch 10"]:
         """Dynamic parameters $(m, m r_c, I_{xx}, I_{xy}, I_{yy}, I_{xz}, I_{yz}, I_{zz})$."""
-        p = self.parameters[..., np.array(_PINOCCHIO)]
-        return p * np.broadcast_to(_SIGNS, p.shape)
+        p = self.parameters
+        J = inertia_tensor(p[..., 4:])[..., (0, 0, 1, 0, 1, 2), (0, 1, 1, 2, 2, 2)]
+        return namespace(p).concatenate([p[..., :4], J], axis=-1)
 
     @property
     def moments(self) -> Float[AnyArray, "*batch 6"]:

@@ -52,9 +52,6 @@ def mjcf_shapes(path: str | Path) -> dict[str, list[tuple[Float[np.ndarray, "poi
     """Return points and radii [m] of the shapes of all bodies, as `mjcf_as_urdf` names them.
 
     Shapes that cannot collide count only where a body has no others.
-
-    Raises:
-        InputError: If MuJoCo is not installed.
     """
     mujoco = import_mujoco()
     model = mujoco.MjModel.from_xml_path(str(path))

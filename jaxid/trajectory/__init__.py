@@ -1,9 +1,6 @@
 """Trajectories: bases, splines, leads, paths of the end-effector, and their files."""
 
-from .controllers import (
-    write_rsi as write_rsi,
-    write_urscript as write_urscript,
-)
+from .controllers import write_rsi as write_rsi, write_urscript as write_urscript
 from .files import (
     load_trajectory as load_trajectory,
     save_trajectory as save_trajectory,

@@ -15,26 +15,16 @@ from .trajectory import AbstractTrajectory
 
 
 class Controller(NamedTuple):
-    """Interface of a robot's controller that takes one position in each cycle.
+    """Interface of a robot's controller that takes one position in each cycle."""
 
-    Attributes:
-        joints: Number of joints of its robots, all revolute.
-        sample_time: Cycle that is taken if none is given [s].
-        suffix: Suffix of its file; empty if it plays the rows of the table.
-        write: Writer of its file; None if it plays the rows of the table.
-    """
-
-    joints: int
-    sample_time: float
+    joints: int  # number of joints of its robots, all revolute
+    sample_time: float  # cycle that is taken if none is given [s]
+    # suffix and writer of its file; none if it plays the rows of the table
     suffix: str = ""
     write: Callable[[AbstractTrajectory, Robot, Path, float], None] | None = None
 
     def require(self, robot: Robot) -> None:
-        """Reject a robot that the controller does not move.
-
-        Raises:
-            InputError: If the robot has another number of joints, or one is prismatic.
-        """
+        """Reject a robot with another number of joints, or with a prismatic one."""
         if robot.joints != self.joints or not all(robot.revolute):
             raise InputError(
                 f"`controller` moves robots of {self.joints} revolute joints, but `{robot.name}` "

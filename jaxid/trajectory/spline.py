@@ -49,10 +49,7 @@ def _evaluate(
     coefficients: Float[AnyArray, "powers pieces columns"],
     t: Float[AnyArray, " samples"],
 ) -> Float[AnyArray, "4 samples columns"]:
-    """Return piecewise polynomials and their first three derivatives, constant outside their times.
-
-    Arguments are the fields of `PiecewisePolynomial` and the times [s].
-    """
+    """Return a `PiecewisePolynomial` and three derivatives, constant outside its times [s]."""
     xp = namespace(times, coefficients, t)
     times, coefficients, t = (xp.asarray(x) for x in (times, coefficients, t))
     # Written with `where`, because the derivative of `clip` at its ends is one half.

@@ -1,7 +1,7 @@
 """Friction terms: viscous, Coulomb, Stribeck, by load, by temperature, of coupled drives."""
 
 from abc import abstractmethod
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -190,11 +190,14 @@ class AbstractDryFriction(AbstractTerm):
     """Friction with a `transition` from one direction of motion to the other."""
 
     transition: eqx.AbstractVar[AbstractTransition]
+    # Where not, it is identified only if chosen: `CoulombFriction` determines it better.
+    determines_transition: ClassVar[bool] = True
 
     @property
     def nonlinear_parameters(self):
         """Those of the transition."""
-        return tuple(x.inside("transition") for x in self.transition.nonlinear_parameters)
+        own = (x.inside("transition") for x in self.transition.nonlinear_parameters)
+        return tuple(x._replace(default=x.default and self.determines_transition) for x in own)
 
 
 class ViscousFriction(AbstractTerm):
@@ -268,6 +271,7 @@ class SquareRootFriction(AbstractDryFriction):
     """
 
     transition: AbstractTransition = Tanh()
+    determines_transition = False
     symbols = (("fr", "N m", "N"),)
 
     def columns(self, robot, q, qd, qdd):
@@ -275,11 +279,6 @@ class SquareRootFriction(AbstractDryFriction):
         # The small number keeps the slope finite at standstill.
         root = jnp.sqrt(jnp.sqrt(qd**2 + 1e-16))
         return jnp.diag(root * self.transition(qd))
-
-    @property
-    def nonlinear_parameters(self):
-        """Those of the transition, if chosen: `CoulombFriction` determines them better."""
-        return tuple(x._replace(default=False) for x in super().nonlinear_parameters)
 
 
 class StribeckFriction(AbstractDryFriction):
@@ -335,6 +334,7 @@ class LoadFriction(AbstractDryFriction):
 
     bodies: Float[AnyArray, "..."]
     transition: AbstractTransition = Tanh()
+    determines_transition = False
     symbols = (("fl", "1", "1"),)
     roles = ("load",)
 
@@ -362,11 +362,6 @@ class LoadFriction(AbstractDryFriction):
         bodies = jnp.asarray(self._bodies(robot), q.dtype)
         load = projection_equation.rigid_body_forces(robot, bodies, q, rest, rest)
         return jnp.diag(jnp.abs(load) * self.transition(qd))
-
-    @property
-    def nonlinear_parameters(self):
-        """Those of the transition, if chosen: `CoulombFriction` determines them better."""
-        return tuple(x._replace(default=False) for x in super().nonlinear_parameters)
 
 
 class TemperatureScaled(AbstractTerm):
@@ -464,8 +459,7 @@ class CoupledDrives(AbstractTerm):
         """Return inertia and viscous parts beside the diagonal, and Coulomb parts of motors."""
         inertia, viscous, dry = [], [], []
         for i, ratios in self.couplings(robot):
-            beside = np.outer(ratios, ratios)
-            np.fill_diagonal(beside, 0.0)
+            beside = _beside_diagonal(ratios)
             inertia.append(beside.astype(qdd.dtype) @ qdd)
             viscous.append(beside.astype(qd.dtype) @ qd)
             r = ratios.astype(qd.dtype)
@@ -484,7 +478,10 @@ class CoupledDrives(AbstractTerm):
         n, found = robot.joints, len(couplings)
         matrices = np.zeros((2, n, n, 3 * found))
         for place, (_, ratios) in enumerate(couplings):
-            beside = np.outer(ratios, ratios)
-            np.fill_diagonal(beside, 0.0)
+            beside = _beside_diagonal(ratios)
             matrices[0, :, :, place] = matrices[1, :, :, found + place] = beside
         return matrices
+
+
+def _beside_diagonal(ratios: np.ndarray) -> Float[np.ndarray, "joints joints"]:
+    return np.outer(ratios, ratios) * (1.0 - np.eye(len(ratios)))
