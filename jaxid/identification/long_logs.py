@@ -69,27 +69,16 @@ def impulse_response(low_pass: LowPass) -> Float[np.ndarray, " lags"]:
 
 
 class LoopShape(NamedTuple):
-    """Sizes of the loop and of its stages.
+    """Sizes of the loop and of its stages."""
 
-    Attributes:
-        samples: Samples of an iteration.
-        rows: Rows of an iteration.
-        iterations: Largest number of iterations of a call.
-        factors: Decimation factor of each stage.
-        lags: Length of the response of each stage.
-        delays: Rows by which the results of each stage come late.
-        delay: Rows at the start of a call that stand for nothing yet.
-        reach: Number of samples before, and after, a row's instant on which it depends.
-    """
-
-    samples: int
-    rows: int
-    iterations: int
-    factors: tuple[int, ...]
-    lags: tuple[int, ...]
-    delays: tuple[int, ...]
-    delay: int
-    reach: int
+    samples: int  # samples of an iteration
+    rows: int  # rows of an iteration
+    iterations: int  # largest number of iterations of a call
+    factors: tuple[int, ...]  # decimation factor of each stage
+    lags: tuple[int, ...]  # length of the response of each stage
+    delays: tuple[int, ...]  # rows by which the results of each stage come late
+    delay: int  # rows at the start of a call that stand for nothing yet
+    reach: int  # samples before, and after, a row's instant on which it depends
 
     @classmethod
     def of(cls, stages: Sequence[Stage], chunk: int) -> "LoopShape":
