@@ -156,11 +156,12 @@ class CrossValidated(AbstractSolution):
         """Test every candidate on every block; reject a single block."""
         squares, count = np.asarray(weights) ** 2, len(blocks.parts)
         errors = np.empty((len(self.candidates), count))
-        for k, (rest, held_out) in enumerate(cross_validation_folds(blocks, count)):
-            d = Decomposition.of(*rest.total.weighted(weights))
+        for k, (rest, part) in enumerate(cross_validation_folds(blocks, count)):
+            d = Decomposition.of(*blocks.select(rest).total.weighted(weights))
+            held_out = blocks.select(part).total
             for i, candidate in enumerate(self.candidates):
                 p = d.solve(candidate.inverse(d.values))
-                errors[i, k] = squares @ held_out.total.residual_squares(p)
+                errors[i, k] = squares @ held_out.residual_squares(p)
         total = errors.sum(axis=1)
         best = int(np.argmin(total))
         margin = errors[best].std(ddof=1) * np.sqrt(errors.shape[1])
