@@ -216,7 +216,9 @@ class _Stream:
 
     def _add(self, blocks: list[Grams], pieces: list[Piece], mixing: Grams, progress=None) -> None:
         """Add the Gram matrices of some pieces, and of the ends, to those of their blocks."""
-        for done, ((block, _, _), grams) in enumerate(self._run(pieces, mixing), 1):
+        # One core adds up a piece; the next ones are read meanwhile.
+        found = on_cores(lambda x: self._call(x, mixing), map(self._fill, pieces))
+        for done, ((block, _, _), grams) in enumerate(zip(pieces, found, strict=True), 1):
             for total, G in zip(blocks[block], grams, strict=True):
                 total += G
             if progress is not None:
@@ -226,15 +228,9 @@ class _Stream:
                 mixed = rows @ mix
                 total += mixed.T @ mixed
 
-    def _run(self, pieces: Sequence[Piece], mixing: Grams) -> Iterator[tuple[Piece, Grams]]:
-        """Call the loop for some pieces, each on one core, and read the next ones meanwhile."""
-        arrays = (self._fill(piece, self._observations.read(piece[2])) for piece in pieces)
-        grams = on_cores(lambda x: self._call(x, mixing), arrays)
-        return zip(pieces, grams, strict=True)
-
-    def _fill(self, piece: Piece, read: tuple) -> list[np.ndarray]:
-        """Return the arrays of one piece, filled up to the shape of the loop."""
-        (motion, forces), shape = read, self._shape
+    def _fill(self, piece: Piece) -> list[np.ndarray]:
+        """Read the arrays of one piece, filled up to the shape of the loop."""
+        (motion, forces), shape = self._observations.read(piece[2]), self._shape
         # The first rows come late, and do not count.
         mask = np.pad(self._mask[slice(*piece[1])], ((shape.delay, 0), (0, 0)))
         length = shape.iterations * shape.samples

@@ -63,8 +63,8 @@ class ModelChoice(Summarised, eqx.Module):
         order = np.argsort(means).tolist()
         excess, deviations = _excess(squares)
         half = 0.5 / np.sqrt(means)
-        columns = {"error": np.sqrt(means), "above": half * excess, "deviation": half * deviations}
-        error, above, deviation = (x[order].tolist() for x in columns.values())
+        columns = np.sqrt(means), half * excess, half * deviations
+        error, above, deviation = (x[order].tolist() for x in columns)
         return Table(
             "models by their errors on parts that were left out",
             Column("model", [self.candidates[k].name for k in order]),
