@@ -66,21 +66,17 @@ class LogStatistics:
         power, forces, velocities = self._energies
         return float(power / np.sqrt(forces * velocities)) if forces * velocities > 0 else 0.0
 
-    def velocity_findings(self, joint: int, name: str, sample_time: float) -> Iterator[str]:
-        """Yield whether measured velocities are late."""
+    def lateness(self, joint: int) -> float:
+        """Return how much later measured velocities stand than those of the angles [s].
+
+        It is zero where a shift does not explain most of the difference.
+        """
         P = self._products[joint]
         if P[0, 0] <= 0 or P[1, 1] <= 0:
-            return
+            return 0.0
         scale, lead = np.linalg.lstsq(P[:2, :2], P[:2, 2], rcond=1e-12)[0]
-        late, text = -lead / scale if scale else 0.0, f"the velocities of joint `{name}` "
-        # A shift must explain most of the difference.
-        if abs(late) > LATE * sample_time and lead**2 * P[1, 1] > 0.5 * (
-            P[2, 2] - 2 * P[0, 2] + P[0, 0]
-        ):
-            yield (
-                f"{text}stand {1e3 * abs(late):.3g} ms {'later' if late > 0 else 'earlier'} in the "
-                "log than the derivatives of its angles: leave `recording.velocities` out."
-            )
+        explained = lead**2 * P[1, 1] > 0.5 * (P[2, 2] - 2 * P[0, 2] + P[0, 0])
+        return float(-lead / scale) if scale and explained else 0.0
 
 
 def limit_findings(
@@ -222,8 +218,14 @@ def channel_findings(
             for j, ratio in unlike_derivatives(r).items()
         ]
         for j, name in enumerate(robot.joint_names):
-            late = statistics.velocity_findings(j, name, r.sample_time)
-            faults += [(j, text) for text in late]
+            late = statistics.lateness(j)
+            if abs(late) > LATE * r.sample_time:
+                text = (
+                    f"the velocities of joint `{name}` stand {1e3 * abs(late):.3g} ms "
+                    f"{'later' if late > 0 else 'earlier'} in the log than the derivatives of its "
+                    "angles: leave `recording.velocities` out."
+                )
+                faults.append((j, text))
     return faults
 
 

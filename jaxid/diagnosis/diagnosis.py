@@ -326,11 +326,10 @@ def delay_notes(
         return ()
     # What is advised must be sure.
     low, high = (1e3 * x for x in delay.interval(0.9999))
-    between = f"between {low:.2g} and {high:.2g} ms later in the log than the angles"
+    text = f"the forces stand between {low:.2g} and {high:.2g} ms later in the log than the angles"
     # A delay of a bus is that of all joints; other effects differ from joint to joint.
     if low <= 0.0 <= high or abs(delay.seconds) < float(np.std(delay.of_joints)):
-        return (f"the forces stand {between}: a delay cannot be told from none.",)
-    text = f"the forces stand {between}"
+        return (f"{text}: a delay cannot be told from none.",)
     if delay.p_value <= 0.001:
         least, most = (1e3 * float(x) for x in (np.min(delay.of_joints), np.max(delay.of_joints)))
         apart = f"{least:.3g} to {most:.3g} ms joint by joint"

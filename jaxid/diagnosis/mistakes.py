@@ -79,13 +79,12 @@ def likely_mistakes(
     them. Whether angles and forces are taken for the motors' is in `motor_sides`.
     """
     samples = _Samples(fit.base.model, logs)
-    robot, motion, forces = fit.base.model.robot, samples.motion, samples.forces
-    as_given = Correction("", robot, motion, forces)
-    left, left_unseen = samples.given, samples.missed(as_given, folds=FOLDS)
+    robot = fit.base.model.robot
+    left, left_unseen = samples.given, samples.missed(samples.as_given, folds=FOLDS)
     notes = samples.hidden(max(left / MOST, BAD))
     if left < BAD:
         return events, notes
-    parts = [slice(0, len(forces)), *(samples.parts if len(logs) > 1 else [])]
+    parts = [slice(0, len(samples.forces)), *(samples.parts if len(logs) > 1 else [])]
     for name, part in zip(("", *(f"{log.name}: " for log in logs)), parts, strict=False):
         motion, forces = samples.motion[part], samples.forces[part]
         candidates = [*_of_columns(robot, motion, forces, motor_sides)]
@@ -125,7 +124,8 @@ class _Samples:
         self._logs, self._instants, self._model = logs, instants, model
         self._fastest = np.abs(self.motion.qd).max(axis=0)
         self._geometries: dict[tuple[bool, ...], _AnyGeometry] = {}
-        self._rows = self._rows_of(Correction("", model.robot, self.motion, self.forces))
+        self.as_given = Correction("", model.robot, self.motion, self.forces)
+        self._rows = self._rows_of(self.as_given)
         braking = [re.fullmatch(r"f[vc]\d+", name) is not None for name in model.parameter_names]
         self._braking = np.ones(self._rows.shape[2] - 1, bool)
         self._braking[: len(braking)] = braking
@@ -162,14 +162,8 @@ class _Samples:
             change = mistake.correction(mistake.small, slice(None))
             if mistake.joint and self.missed(change) < shown:
                 unseen.setdefault(mistake.what, []).append(f"`{mistake.joint}`")
-        for signs, name in zip(
-            1 - 2 * np.eye(self.motion.joints), self._model.robot.joint_names, strict=True
-        ):
-            reversed_one = Motion(
-                *(x * signs for x in (self.motion.q, self.motion.qd, self.motion.qdd))
-            )
-            change = Correction("", self._model.robot, reversed_one, self.forces * signs)
-            if self.missed(change) < shown:
+        for j, name in enumerate(self._model.robot.joint_names):
+            if self.missed(_reversed(self.as_given, j)) < shown:
                 unseen.setdefault("a reversed axis", []).append(f"`{name}`")
         texts = [
             f"{what} ({'any joint' if len(names) == self.motion.joints > 1 else ', '.join(names)})"
@@ -232,6 +226,14 @@ def _any_friction(speeds: np.ndarray, fastest: np.ndarray) -> np.ndarray:
     shapes = [np.tanh(v / width) for width in (0.01, 0.1)]
     shapes += [np.tanh(v / 0.01) * np.exp(-((v / width) ** 2)) for width in (0.05, 0.2)]
     return np.concatenate([x[..., None] * np.eye(v.shape[1]) for x in (*shapes, v * abs(v))], 2)
+
+
+def _reversed(c: Correction, joint: int) -> Correction:
+    """Return a correction that also reverses the angle and the force of a joint."""
+    m, signs = c.motion, np.ones(c.motion.joints)
+    signs[joint] = -1.0
+    motion = Motion(m.q * signs, m.qd * signs, m.qdd * signs)
+    return c._replace(motion=motion, forces=c.forces * signs)
 
 
 def _misfit(fit: Fit, motion: Motion, forces: np.ndarray, left: float) -> tuple[str, ...]:
@@ -307,14 +309,8 @@ def _of_columns(
 def _of_robot(robot: Robot, motion: Motion, forces: np.ndarray) -> Iterator[Correction]:
     """Yield corrections of the robot: zeros of its angles, gravity, and axes of joints."""
     names, n, size = robot.joint_names, robot.joints, np.linalg.norm(robot.gravity)
-    own, every = np.arange(n) == np.arange(n)[:, None], (motion.q, motion.qd, motion.qdd)
-
-    def reversed_axis(text: str, j: int, changed: Robot) -> Correction:
-        signs = np.where(own[j], -1.0, 1.0)
-        return Correction(text, changed, Motion(*(x * signs for x in every)), forces * signs)
-
     for j, turns in ((j, k) for j in range(n) if robot.revolute[j] for k in (-1, 1, 2)):
-        q = motion.q + 0.5 * np.pi * turns * own[j]
+        q = motion.q + 0.5 * np.pi * turns * np.eye(n)[j]
         text = f"the angle of joint `{names[j]}` seems to lack {90 * turns} degrees (`recording."
         moved = Motion(q, motion.qd, motion.qdd)
         yield Correction(f"{text}angle_offsets`)", robot, moved, forces)
@@ -328,18 +324,15 @@ def _of_robot(robot: Robot, motion: Motion, forces: np.ndarray) -> Iterator[Corr
         yield Correction(text, robot.replace(gravity=np.zeros(3)), motion, forces)
     for j, name in enumerate(names):
         text = f"the axis of joint `{name}` seems to be reversed in the robot, or in the log both "
-        yield reversed_axis(f"{text}its angle and its force", j, robot)
+        yield _reversed(Correction(f"{text}its angle and its force", robot, motion, forces), j)
     for j, shift in itertools.product(range(n) if n <= MANY else (), (1, 2)):
         axis = np.array(robot.axis)
         axis[j] = np.roll(axis[j], shift)
-        turned, text = (
-            robot.replace(axis=axis),
-            f"the axis of joint `{names[j]}` seems to be ({{}})",
-        )
+        turned = Correction("", robot.replace(axis=axis), motion, forces)
+        text = f"the axis of joint `{names[j]}` seems to be ({{}}) in the frame of its body"
         shown, other = (" ".join(f"{x:g}" for x in s * axis[j] + 0.0) for s in (1, -1))
-        text += " in the frame of its body"
-        yield Correction(text.format(shown), turned, motion, forces)
-        yield reversed_axis(text.format(other), j, turned)
+        yield turned._replace(text=text.format(shown))
+        yield _reversed(turned, j)._replace(text=text.format(other))
 
 
 def _of_kinds(robot: Robot, motion: Motion, forces: np.ndarray) -> Iterator[Correction]:

@@ -10,8 +10,7 @@ from jaxid.measurement.recording import Recording
 
 from .estimators import GivenWeights, WeightedLeastSquares
 from .fit_result import Fit
-from .identify import identify
-from .uncertainty import IndependentRows
+from .problem import RegressionProblem
 
 FEWEST = 100
 """Changes of an angle from which its steps are looked for."""
@@ -63,9 +62,7 @@ def resolution_bias(
         o = observe(log, robot, observations.filter, observations.decimation)
         o = o.replace(mask=observations.mask)
         estimator = WeightedLeastSquares(GivenWeights(np.asarray(fit.weights)))
-        return np.asarray(
-            identify(fit.base, o, estimator, uncertainty=IndependentRows()).parameters
-        )
+        return np.asarray(estimator(RegressionProblem(fit.base, o)).parameters)
 
     return estimate(rounded) - estimate(exact)
 

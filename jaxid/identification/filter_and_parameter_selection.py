@@ -148,13 +148,12 @@ def choose_filter(
 
 def _held_out_errors(problem, test, estimator: AbstractEstimator, squares) -> np.ndarray:
     """Return the errors on held-out parts, relative to the forces of all parts."""
-    folds = cross_validation_folds(problem.blocks), cross_validation_folds(test.blocks)
-    pairs = [(rest, part) for (rest, _), (_, part) in zip(*folds, strict=True)]
-    total = squares @ test.factors.force_squares / len(pairs)
-    errors = []
-    for rest, part in pairs:
-        p = estimator(RegressionProblem(problem.base, blocks=rest)).parameters
-        errors.append(squares @ part.total.residual_squares(p) / total)
+    errors, folds = [], cross_validation_folds(problem.blocks)
+    total = squares @ test.factors.force_squares / len(folds)
+    for rest, part in folds:
+        seen = RegressionProblem(problem.base, blocks=problem.blocks.select(rest))
+        held_out = test.blocks.select(part).total
+        errors.append(squares @ held_out.residual_squares(estimator(seen).parameters) / total)
     return np.sqrt(errors)
 
 
@@ -252,11 +251,13 @@ def essential_parameters(
 
 def _eliminate(fit: Fit, problem: RegressionProblem) -> tuple[list[Elimination], list]:
     """Return the path to a single parameter, and the remaining parameters at each step."""
-    factors, weights = problem.factors, fit.weights
+    factors, weights, blocks = problem.factors, fit.weights, problem.blocks
     squares = weights**2
     total = float(squares @ factors.force_squares)
-    parts = cross_validation_folds(problem.blocks, 10)
-    folds = [(*rest.total.weighted(weights), part.total) for rest, part in parts]
+    folds = [
+        (*blocks.select(rest).total.weighted(weights), blocks.select(part).total)
+        for rest, part in cross_validation_folds(blocks, 10)
+    ]
     R, z = factors.weighted(weights)
     kept, ratio = list(range(fit.base.size)), np.empty(0)
     path, sets, name = [], [], ""

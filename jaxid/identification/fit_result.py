@@ -5,7 +5,7 @@ import hashlib
 import json
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -27,6 +27,7 @@ from jaxid.result_table import (
     with_deviations,
 )
 
+from .consistency.estimator import Consistency
 from .estimators.estimate import AbstractEstimator, EstimatorInWords
 from .estimators.regularisation_and_weights import (
     LARGEST_UNCERTAINTY,
@@ -37,12 +38,6 @@ from .estimators.regularisation_and_weights import (
 )
 from .factors import Blocks
 from .uncertainty.result import ResidualSpectra, Uncertainty
-
-if TYPE_CHECKING:
-    from .consistency.estimator import Consistency
-else:
-    # The module of physical consistency is loaded where it is used.
-    Consistency = eqx.Module
 
 TRUSTED, DOUBTFUL = 0.1, 0.5
 """Relative standard deviations up to which an estimate is trusted, or doubtful, as fractions."""
@@ -336,9 +331,6 @@ def load(path: str | Path) -> Fit:
         OSError: If the file cannot be read.
         InputError: If it is no model file, of another version, or not as it was written.
     """
-    # The file may name a class of this module.
-    import jaxid.identification.consistency.estimator  # noqa: F401
-
     try:
         document = read_json(path)
     except ValueError as error:

@@ -69,27 +69,16 @@ def impulse_response(low_pass: LowPass) -> Float[np.ndarray, " lags"]:
 
 
 class LoopShape(NamedTuple):
-    """Sizes of the loop and of its stages.
+    """Sizes of the loop and of its stages."""
 
-    Attributes:
-        samples: Samples of an iteration.
-        rows: Rows of an iteration.
-        iterations: Largest number of iterations of a call.
-        factors: Decimation factor of each stage.
-        lags: Length of the response of each stage.
-        delays: Rows by which the results of each stage come late.
-        delay: Rows at the start of a call that stand for nothing yet.
-        reach: Number of samples before, and after, a row's instant on which it depends.
-    """
-
-    samples: int
-    rows: int
-    iterations: int
-    factors: tuple[int, ...]
-    lags: tuple[int, ...]
-    delays: tuple[int, ...]
-    delay: int
-    reach: int
+    samples: int  # samples of an iteration
+    rows: int  # rows of an iteration
+    iterations: int  # largest number of iterations of a call
+    factors: tuple[int, ...]  # decimation factor of each stage
+    lags: tuple[int, ...]  # length of the response of each stage
+    delays: tuple[int, ...]  # rows by which the results of each stage come late
+    delay: int  # rows at the start of a call that stand for nothing yet
+    reach: int  # samples before, and after, a row's instant on which it depends
 
     @classmethod
     def of(cls, stages: Sequence[Stage], chunk: int) -> "LoopShape":
@@ -227,7 +216,9 @@ class _Stream:
 
     def _add(self, blocks: list[Grams], pieces: list[Piece], mixing: Grams, progress=None) -> None:
         """Add the Gram matrices of some pieces, and of the ends, to those of their blocks."""
-        for done, ((block, _, _), grams) in enumerate(self._run(pieces, mixing), 1):
+        # One core adds up a piece; the next ones are read meanwhile.
+        found = on_cores(lambda x: self._call(x, mixing), map(self._fill, pieces))
+        for done, ((block, _, _), grams) in enumerate(zip(pieces, found, strict=True), 1):
             for total, G in zip(blocks[block], grams, strict=True):
                 total += G
             if progress is not None:
@@ -237,15 +228,9 @@ class _Stream:
                 mixed = rows @ mix
                 total += mixed.T @ mixed
 
-    def _run(self, pieces: Sequence[Piece], mixing: Grams) -> Iterator[tuple[Piece, Grams]]:
-        """Call the loop for some pieces, each on one core, and read the next ones meanwhile."""
-        arrays = (self._fill(piece, self._observations.read(piece[2])) for piece in pieces)
-        grams = on_cores(lambda x: self._call(x, mixing), arrays)
-        return zip(pieces, grams, strict=True)
-
-    def _fill(self, piece: Piece, read: tuple) -> list[np.ndarray]:
-        """Return the arrays of one piece, filled up to the shape of the loop."""
-        (motion, forces), shape = read, self._shape
+    def _fill(self, piece: Piece) -> list[np.ndarray]:
+        """Read the arrays of one piece, filled up to the shape of the loop."""
+        (motion, forces), shape = self._observations.read(piece[2]), self._shape
         # The first rows come late, and do not count.
         mask = np.pad(self._mask[slice(*piece[1])], ((shape.delay, 0), (0, 0)))
         length = shape.iterations * shape.samples

@@ -36,6 +36,7 @@ from jaxid.program.rules import divided
 from jaxid.robot.robot import Robot
 
 from .estimators import AbstractEstimator, GivenWeights, WeightedLeastSquares
+from .estimators.regularisation_and_weights import inverse_information
 from .fit_result import Fit
 from .identify import identify
 from .uncertainty import IndependentRows
@@ -46,7 +47,6 @@ AT_ONCE, AT_ONCE_ON_GPU = 2048, 2**17
 WELL_CONDITIONED = 1e4
 """Condition number, with columns of length one, up to which products of rows are accurate enough;
 beyond it a data set is solved again by orthogonal factors."""
-RIDGE = 64 * np.finfo(float).eps
 
 
 class BatchFit(eqx.Module):
@@ -213,22 +213,6 @@ def _products(columns: list[Array], forces: list[Array]) -> tuple[list[Array], A
     """Return products of forces with columns, and the forces' squares by joint."""
     squares = jnp.stack([jnp.sum(Q**2, axis=-1) for Q in forces], axis=-1)
     return [Q @ A.T for A, Q in zip(columns, forces, strict=True)], squares
-
-
-def inverse_information(whole: Float[Array, "base base"]) -> tuple[Array, Array]:
-    """Return the inverse of an information, and a bound of its root's condition number.
-
-    Columns are scaled to length one, and a ridge of rounding's size keeps the factor from failing.
-    """
-    size = whole.shape[-1]
-    square = jnp.diagonal(whole)
-    scale = 1.0 / jnp.sqrt(jnp.where(square > 0, square, 1.0))
-    scaled = scale[:, None] * whole * scale[None] + RIDGE * np.eye(size)
-    L = jnp.linalg.cholesky(scaled)
-    Li = jax.lax.linalg.triangular_solve(L, jnp.eye(size), left_side=True, lower=True)
-    bound = jnp.sqrt(size * jnp.sum(Li**2))
-    Li = Li * scale[None]
-    return Li.T @ Li, jnp.where(jnp.isfinite(bound), bound, jnp.inf)
 
 
 def identify_batch(

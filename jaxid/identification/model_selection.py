@@ -15,7 +15,7 @@ from jaxid.result_table import Column, Remark, Status, Summarised, Table, percen
 
 from .estimators import AbstractEstimator, WeightedLeastSquares
 from .factors import Blocks, Factors
-from .problem import RegressionProblem
+from .problem import RegressionProblem, cross_validation_folds
 
 
 class Candidate(NamedTuple):
@@ -63,8 +63,8 @@ class ModelChoice(Summarised, eqx.Module):
         order = np.argsort(means).tolist()
         excess, deviations = _excess(squares)
         half = 0.5 / np.sqrt(means)
-        columns = {"error": np.sqrt(means), "above": half * excess, "deviation": half * deviations}
-        error, above, deviation = (x[order].tolist() for x in columns.values())
+        columns = np.sqrt(means), half * excess, half * deviations
+        error, above, deviation = (x[order].tolist() for x in columns)
         return Table(
             "models by their errors on parts that were left out",
             Column("model", [self.candidates[k].name for k in order]),
@@ -148,10 +148,9 @@ def _folds(base: BaseParameters, logs: Sequence[Observations], by_log: bool) -> 
     if by_log:
         return [RegressionProblem(base, [log]).factors for log in logs]
     blocks = RegressionProblem(base, logs).blocks
-    count = len(blocks.parts)
-    if count < 3:
+    if len(blocks.parts) < 3:
         raise InputError("a choice of models needs at least three blocks of rows: record longer.")
-    return [blocks.select(part).total for part in np.array_split(np.arange(count), min(5, count))]
+    return [blocks.select(part).total for _, part in cross_validation_folds(blocks)]
 
 
 def _held_out_squares(

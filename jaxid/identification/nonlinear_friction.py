@@ -21,7 +21,7 @@ from .estimators.variable_projection import NonlinearFriction, Shapes, ShapeSear
 from .factors import Blocks
 from .fit_result import Fit
 from .identify import fit_problem
-from .problem import RegressionProblem
+from .problem import RegressionProblem, cross_validation_folds
 
 
 class HeldOutErrors(eqx.Module):
@@ -148,12 +148,11 @@ def identify_nonlinear(
 
 def _held_out_errors(blocks, search: ShapeSearch, weights, progress) -> HeldOutErrors:
     """Test both models on blocks that neither has seen, nor the search for shapes."""
-    squares, errors, every = weights**2, [], np.arange(len(blocks.parts))
-    folds = np.array_split(every, min(5, len(every)))
-    for out in folds:
-        rest = np.setdiff1d(every, out)
+    squares, errors, folds = weights**2, [], cross_validation_folds(blocks)
+    for rest, out in folds:
         p = Decomposition.of(*blocks.select(rest).total.weighted(weights)).solve()
-        kept = np.isin(every, rest).astype(float)
+        kept = np.zeros(len(blocks.parts))
+        kept[rest] = 1.0
         x, _ = eqx.filter_jit(search)(weights, kept)
         _, left = eqx.filter_jit(search.fit)(x, search.row_weights(weights, kept))
         nonlinear = np.sum((search.row_weights(weights, 1.0 - kept) * left) ** 2)

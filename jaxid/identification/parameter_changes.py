@@ -128,8 +128,8 @@ class Comparison(Summarised, eqx.Module):
             dof = float(np.min(known.dof[k], initial=np.inf))
             covariance = known.covariance[np.ix_(k, k)]
             statistic, p = joint_test(self.difference[k], covariance, dof)
-            found = {"parameters": len(k), "statistic": statistic, "p_value": p}
-            groups.append({"name": name, **found})
+            found = {"name": name, "parameters": len(k), "statistic": statistic, "p_value": p}
+            groups.append(found)
         adjusted = _holm(np.array([group["p_value"] for group in groups]))
         for group, p in zip(groups, adjusted.tolist(), strict=True):
             group["changed"] = p <= 1.0 - self.level

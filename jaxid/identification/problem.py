@@ -12,11 +12,10 @@ from jaxid.measurement.observations import Observations, Progress
 from jaxid.robot.robot import Robot
 
 from .factors import Blocks, Columns, Factors, RowChunk, empty_factors, row_chunks
+from .long_logs import stream_blocks, suits
 
 Span = tuple[int, int, int]
 """Index of a recording, and the half-open range of some of its rows."""
-Equations = Callable[[RowChunk], Sequence[np.ndarray]]
-"""Function from a chunk to the rows `[columns, force]` of each joint."""
 
 
 class RegressionProblem:
@@ -73,20 +72,16 @@ class RegressionProblem:
         """The factors by contiguous blocks of time, made by the first pass over the rows."""
         if self._given is not None:
             return self._given
-        self.require_samples()
+        self._require_samples()
         numbers = range(len(self.recordings))
         return Blocks(tuple(part for number in numbers for part in self._blocks_of(number)))
 
     def _blocks_of(self, number: int) -> Sequence[Factors]:
         """Return the factors of a recording's blocks; for a long one the loop is compiled."""
         recording, edges = self.recordings[number], self._edges[number]
-        if recording.samples >= self.compiled_samples:
-            from .long_logs import stream_blocks, suits
-
-            if suits(recording):
-                report = functools.partial(self._report, number)
-                return stream_blocks(self.base, recording, edges, report)
-
+        if recording.samples >= self.compiled_samples and suits(recording):
+            report = functools.partial(self._report, number)
+            return stream_blocks(self.base, recording, edges, report)
         folded = self.fold(RowChunk.equations, chunks=self._chunks(number))
         first = self._first_block(number)
         return folded.parts[first : first + len(edges) - 1]
@@ -96,12 +91,8 @@ class RegressionProblem:
         """The factors of all rows together."""
         return self.blocks.total
 
-    def require_samples(self) -> None:
-        """Check that the rows themselves are known.
-
-        Raises:
-            InputError: If only factors are known.
-        """
+    def _require_samples(self) -> None:
+        """Check that the rows themselves are known."""
         if not self.recordings:
             raise InputError("this estimate needs the rows themselves: `identify` the recordings.")
 
@@ -113,12 +104,12 @@ class RegressionProblem:
         Raises:
             InputError: If only factors are known.
         """
-        self.require_samples()
+        self._require_samples()
         return RegressionProblem(base, self.recordings, self.progress)
 
     def fold(
         self,
-        equations: Equations,
+        equations: Callable[[RowChunk], Sequence[np.ndarray]],
         columns: Columns | None = None,
         chunks: Iterable[RowChunk] | None = None,
     ) -> Blocks:
@@ -148,7 +139,7 @@ class RegressionProblem:
         Raises:
             InputError: If only factors are known.
         """
-        self.require_samples()
+        self._require_samples()
         for number in range(len(self.recordings)):
             wanted = None if spans is None else [(a, b) for k, a, b in spans if k == number]
             yield from self._chunks(number, wanted)
@@ -210,11 +201,10 @@ def block_edges(observations: Observations, blocks: int) -> list[int]:
     return [0, *edges[1:], observations.rows]
 
 
-def cross_validation_folds(blocks: Blocks, count: int = 5) -> Iterator[tuple[Blocks, Blocks]]:
-    """Yield the blocks without one contiguous part of time, and that part; each in turn."""
-    size = len(blocks.parts)
-    if size < 2:
+def cross_validation_folds(blocks: Blocks, count: int = 5) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return indices of all blocks but one contiguous part of time, and of that part; each once."""
+    every = np.arange(len(blocks.parts))
+    if len(every) < 2:
         raise InputError("held-out errors need at least two blocks of rows: record longer.")
-    for part in np.array_split(np.arange(size), min(count, size)):
-        rest = np.setdiff1d(np.arange(size), part)
-        yield blocks.select(rest), blocks.select(part)
+    parts = np.array_split(every, min(count, len(every)))
+    return [(np.setdiff1d(every, part), part) for part in parts]

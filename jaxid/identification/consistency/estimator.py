@@ -166,11 +166,7 @@ class PhysicallyConsistent(AbstractEstimator):
         )
 
     def feasible_set(self, base: BaseParameters) -> FeasibleSet:
-        """Return the feasible set of a model.
-
-        Raises:
-            InputError: If the bounds do not fit the model.
-        """
+        """Return the feasible set of a model; bounds of other bodies are rejected."""
         robot = base.model.robot
         bounds = BodyBounds.from_geometry(robot) if self.bounds is None else self.bounds
         return feasible_set(base.model, bounds, self.margin)

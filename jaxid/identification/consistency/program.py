@@ -12,7 +12,7 @@ import equinox as eqx
 import numpy as np
 from scipy.sparse.csgraph import connected_components
 
-from jaxid.arrays import AnyArray, Float, Int
+from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.model import Model
 from jaxid.errors import InputError
@@ -213,10 +213,11 @@ class ConeProgram(eqx.Module):
     floors: Float[AnyArray, "*batch bodies 4 4"]  # lower bounds of the pseudo-inertias
     rows: Float[AnyArray, "*batch bodies rows width"]  # linear inequalities of each body
     offsets: Float[AnyArray, "*batch bodies rows"]  # and their constants
-    # Further positive semidefinite matrices: contributions of their variables, and constants, which
-    # are ones where a matrix is smaller than four.
-    couplings: Float[AnyArray, "*batch couplings members 4 4"]
-    members: Int[AnyArray, "*batch couplings members"]
+    # Further positive semidefinite matrices: contributions of the variables that take part in them,
+    # unit vectors of these variables, and constants, which are ones where a matrix is smaller than
+    # four.
+    couplings: Float[AnyArray, "*batch members couplings 4 4"]
+    members: Float[AnyArray, "*batch members variables"]
     fillings: Float[AnyArray, "*batch couplings 4 4"]
     equal: Float[AnyArray, "*batch equal variables"]  # functions that keep their value at the start
     pull: Number  # strength of the pull towards the prior's bodies; 0 for none
@@ -243,7 +244,7 @@ class ConeProgram(eqx.Module):
     @property
     def complementarity(self) -> int:
         """Sum of the sizes of all cones."""
-        matrices = 4 * (self.bodies + self.members.shape[-2])
+        matrices = 4 * (self.bodies + self.fillings.shape[-3])
         return matrices + self.bodies * self.rows.shape[-2] + 2 * self.drives
 
     def require_interior(self) -> None:
@@ -265,8 +266,7 @@ class ConeProgram(eqx.Module):
         bodies, drives = xp.reshape(y[:count], (self.bodies, self.width)), y[count:]
         flat = BASIS[: self.width].reshape(self.width, 16)
         S = xp.reshape(bodies @ flat, (self.bodies, 4, 4))
-        if self.members.shape[-2]:
-            S = xp.concatenate([S, xp.einsum("ki,kiab->kab", y[self.members], self.couplings)])
+        S = xp.concatenate([S, xp.tensordot(self.members @ y, self.couplings, 1)])
         s = xp.einsum("kri,ki->kr", self.rows, bodies)
         return S, xp.concatenate([xp.ravel(s), drives, -drives])
 
@@ -278,15 +278,7 @@ class ConeProgram(eqx.Module):
         linear = xp.reshape(z[:count], (self.bodies, -1))
         bodies = bodies + xp.einsum("kri,kr->ki", self.rows, linear)
         y = xp.concatenate([xp.ravel(bodies), z[count : count + n] - z[count + n :]])
-        if not self.members.shape[-2]:
-            return y
-        more = xp.einsum("kab,kiab->ki", Z[self.bodies :], self.couplings)
-        return y + xp.einsum("ki,kij->j", more, indicators(self.members, y.shape[0]))
-
-
-def indicators(places: Values, size: int) -> Values:
-    """Return unit vectors, with which sums over places become products of matrices."""
-    return (places[..., None] == np.arange(size)[None, None]).astype(float)
+        return y + xp.tensordot(self.couplings, Z[self.bodies :], 3) @ self.members
 
 
 def cone_program(xp, feasible, data: ScaledRows, strength=0.0, prior=None) -> ConeProgram:
@@ -329,9 +321,18 @@ def _coupled(xp: ModuleType, feasible: FeasibleSet, largest: Values):
 
     The units of the drives' variables are `largest`.
     """
-    w, bounds = feasible.width, feasible.bounds
-    matrices, members, fillings = [], [], []
-    for k in np.flatnonzero(bounds.has_ellipsoid).tolist():
+    w, bounds, unit_vectors = feasible.width, feasible.bounds, np.eye(len(feasible.order))
+    # At first no matrix: there may be none.
+    matrices, fillings = [np.zeros((len(unit_vectors), 0, 4, 4))], [np.zeros((0, 4, 4))]
+    members: set[int] = set()
+
+    def add(places: np.ndarray, basis: Values, filling: np.ndarray) -> None:
+        """Add a matrix with the contributions of some variables."""
+        matrices.append(xp.tensordot(unit_vectors[:, places], basis, 1)[:, None])
+        fillings.append(filling[None])
+        members.update(places.tolist())
+
+    for k in np.flatnonzero(bounds.has_ellipsoid):
         # Schur complements whose sum is definite for centres of mass in the ellipsoid.
         L, basis = bounds.radius[k], np.zeros((4, 4, 4))
         basis[0, range(3), range(3)] = (bounds.ellipsoid_axes[k] / L) ** 2
@@ -339,26 +340,19 @@ def _coupled(xp: ModuleType, feasible: FeasibleSet, largest: Values):
         basis[0, 3, 3] = 1.0
         for axis in range(3):
             basis[1 + axis, axis, 3] = basis[1 + axis, 3, axis] = 1.0
-        matrices.append(xp.asarray(basis))
-        members.append([*range(k * w, k * w + 4)])
-        fillings.append(np.zeros((4, 4)))
+        add(k * w + np.arange(4), basis, np.zeros((4, 4)))
     for coupling in feasible.couplings:
         places = feasible.drive_places(coupling.columns)
         size = 1.0 / xp.sqrt(largest[feasible.drive_places(coupling.diagonal)])
         unit = largest[places][:, None, None]
         basis = unit * coupling.basis * size[None, :, None] * size[None, None, :]
         axes = len(coupling.diagonal)
-        matrices.append(xp.pad(basis, ((0, 0), (0, 4 - axes), (0, 4 - axes))))
-        members.append((len(feasible.bodies) * w + places).tolist())
-        fillings.append(np.diag([0.0] * axes + [1.0] * (4 - axes)))
-    if not matrices:
-        return np.zeros((0, 0, 4, 4)), np.zeros((0, 0), int), np.zeros((0, 4, 4))
-    longest = max(len(m) for m in members)
-    for k, own in enumerate(members):
-        missing = longest - len(own)
-        matrices[k] = xp.pad(matrices[k], ((0, missing), (0, 0), (0, 0)))
-        members[k] = [*own, *[0] * missing]
-    return xp.stack(matrices), np.array(members), np.array(fillings)
+        basis = xp.pad(basis, ((0, 0), (0, 4 - axes), (0, 4 - axes)))
+        filling = np.diag([0.0] * axes + [1.0] * (4 - axes))
+        add(len(feasible.bodies) * w + places, basis, filling)
+    chosen = np.array(sorted(members), int)
+    couplings = xp.concatenate(matrices, axis=1)[chosen]
+    return couplings, unit_vectors[chosen], np.concatenate(fillings)
 
 
 def _start(xp: ModuleType, feasible: FeasibleSet, A, b, prior) -> Values:

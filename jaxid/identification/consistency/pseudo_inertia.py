@@ -147,23 +147,17 @@ def _cholesky(xp: ModuleType, P: Values) -> list[list[Values]]:
     return L
 
 
-def are_definite(P: Values) -> Values:
-    """Return whether matrices, side by side along the last axis, are positive definite."""
-    good = P[:, 0, 0] > 0
+def pivots(xp: ModuleType, P: Values) -> Values:
+    """Return the pivots of matrices [matrices, 4, 4, *more] on a leading axis.
+
+    All of them are positive where a matrix is positive definite; their product is the determinant.
+    """
+    found = [P[:, 0, 0]]
     for _ in range(P.shape[1] - 1):
         column = P[:, 1:, 0]
         P = P[:, 1:, 1:] - column[:, :, None] * (column / P[:, :1, 0])[:, None]
-        good = good & (P[:, 0, 0] > 0)
-    return good
-
-
-def log_determinant(xp: ModuleType, P: Values) -> Values:
-    """Return the logarithms of the determinants of positive definite matrices."""
-    L = _cholesky(xp, P)
-    total = xp.log(L[0][0])
-    for j in range(1, P.shape[-1]):
-        total = total + xp.log(L[j][j])
-    return 2.0 * total
+        found.append(P[:, 0, 0])
+    return xp.stack(found)
 
 
 def inverse(xp: ModuleType, P: Values) -> Values:

@@ -24,8 +24,8 @@ import scipy.linalg
 
 from jaxid.arrays import AnyArray, Bool, Float, Int
 
-from .program import ConeProgram, Number, indicators
-from .pseudo_inertia import BASIS, Values, are_definite, inverse, log_determinant, symmetric_part
+from .program import ConeProgram, Number
+from .pseudo_inertia import BASIS, Values, inverse, pivots, symmetric_part
 
 TOLERANCE = 2.5e-7
 """Error bound of a certified optimum, relative to objective and scale together."""
@@ -144,7 +144,7 @@ def _point(xp: ModuleType, p: ConeProgram, y: Values, Z: Values, z: Values) -> _
     """Compute slacks, the residual of the optimality conditions, and the error bound."""
     S, s = p.slacks(xp, y)
     rest = p.A @ y - p.b
-    more = xp.zeros((p.members.shape[-2], 4, 4))
+    more = xp.zeros_like(p.fillings)
     pull = p.adjoint(xp, xp.concatenate([p.pull * p.prior, more]), xp.zeros_like(z))
     residual = rest @ p.A + pull - p.adjoint(xp, Z, z)
     if p.equal.shape[0]:
@@ -156,7 +156,7 @@ def _point(xp: ModuleType, p: ConeProgram, y: Values, Z: Values, z: Values) -> _
     # optimum: their sum less that of one and of their logarithms.
     product = xp.sum(S * Z, axis=(-2, -1))
     gap, pulled = product[: p.bodies], p.pull > 0
-    logs = log_determinant(xp, S[: p.bodies]) + log_determinant(xp, Z[: p.bodies])
+    logs = sum(xp.sum(xp.log(pivots(xp, M[: p.bodies])), axis=0) for M in (S, Z))
     strength = 4.0 * xp.log(xp.where(pulled, p.pull, 1.0))
     gap = xp.where(pulled, gap - 4.0 * p.pull - p.pull * (logs - strength), gap)
     gap = xp.sum(gap) + xp.sum(product[p.bodies :])
@@ -166,7 +166,7 @@ def _point(xp: ModuleType, p: ConeProgram, y: Values, Z: Values, z: Values) -> _
 
 def _targets(xp: ModuleType, p: ConeProgram) -> Values:
     """Return the products of slacks and multipliers at the optimum: the pull's strength."""
-    strengths = [xp.ones(p.bodies) * p.pull, xp.zeros(p.members.shape[-2])]
+    strengths = [xp.ones(p.bodies) * p.pull, xp.zeros(len(p.fillings))]
     return xp.concatenate(strengths)[:, None, None]
 
 
@@ -239,7 +239,7 @@ def _length(xp: ModuleType, steps: np.ndarray, x: _Point, d: _Direction) -> Valu
     lengths = steps * xp.minimum(1.0, 1.0 / xp.maximum(fastest, 1e-300))
     matrices, changes = xp.concatenate([x.S, x.Z]), xp.concatenate([dS, dZ])
     tried = matrices[..., None] + changes[..., None] * lengths[None, None, None]
-    good = xp.all(are_definite(tried), axis=0)
+    good = xp.all(pivots(xp, tried) > 0, axis=(0, 1))
     return xp.where(xp.any(good), lengths[xp.argmax(good)], 0.0)
 
 
@@ -254,13 +254,10 @@ def _barriers(xp: ModuleType, p: ConeProgram, inverse_S, Z, ratio) -> Values:
     bodies = bodies * (1.0 + TINY * np.eye(w))[None]
     drives = xp.diag((1.0 + TINY) * (ratio[count : count + n] + ratio[count + n :]))
     block_diagonal = scipy.linalg.block_diag if xp is np else jax.scipy.linalg.block_diag
-    H = block_diagonal(*bodies, drives)
-    if p.members.shape[-2]:
-        flat = xp.reshape(p.couplings, (*p.members.shape, 16))
-        more = flat @ _products(xp, inverse_S[K:], Z[K:]) @ xp.swapaxes(flat, -1, -2)
-        ones = indicators(p.members, p.A.shape[-1])
-        H = H + xp.einsum("kia,kij,kjb->ab", ones, symmetric_part(xp, more), ones)
-    return H
+    flat = xp.reshape(p.couplings, (*p.couplings.shape[:2], 16))
+    mixed = xp.einsum("ikx,kxy->iky", flat, _products(xp, inverse_S[K:], Z[K:]))
+    more = symmetric_part(xp, xp.tensordot(mixed, flat, ((1, 2), (1, 2))))
+    return block_diagonal(*bodies, drives) + p.members.T @ more @ p.members
 
 
 def _products(xp: ModuleType, inverse_S: Values, Z: Values) -> Values:

@@ -3,7 +3,6 @@
 import dataclasses
 from abc import abstractmethod
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING
 
 import equinox as eqx
 import jax
@@ -14,6 +13,7 @@ from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
 from jaxid.measurement.observations import Observations, SamplesInMemory
+from jaxid.trajectory.trajectory import AbstractTrajectory
 
 from ..factors import Blocks, JointFactor, RowChunk
 from ..problem import RegressionProblem, Span
@@ -28,12 +28,6 @@ from .regularisation_and_weights import (
     MaximumForces,
     ResidualVariances,
 )
-
-if TYPE_CHECKING:
-    from jaxid.trajectory.trajectory import AbstractTrajectory
-else:
-    # Trajectories are loaded by those who have one.
-    AbstractTrajectory = eqx.Module
 
 
 class LeastSquares(AbstractEstimator):

@@ -3,9 +3,11 @@
 from abc import abstractmethod
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Bool, Float, one_or_each
+from jaxid.arrays import AnyArray, Array, Bool, Float, one_or_each
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
 from jaxid.robot.robot import Robot
@@ -15,6 +17,8 @@ from ..problem import cross_validation_folds
 
 NUMERICAL = 1e-11
 """Relative singular value below which a direction is only rounding."""
+RIDGE = 64 * np.finfo(float).eps
+"""Ridge of the products of columns of length one, which may depend on each other."""
 LARGEST_UNCERTAINTY = 0.1
 """Fraction of the forces by which an undetermined combination may be wrong."""
 
@@ -64,6 +68,24 @@ class Decomposition(eqx.Module):
         inverse = Complete().inverse(self.values) if inverse is None else inverse
         V = self.directions / self.scale
         return (V.T * inverse) @ V
+
+
+def inverse_information(
+    whole: Float[Array, "base base"], ridge: float = RIDGE
+) -> tuple[Array, Array]:
+    """Return the inverse of an information, and a bound of its root's condition number.
+
+    Columns are scaled to length one, and a ridge of rounding's size keeps the factor from failing.
+    """
+    size = whole.shape[-1]
+    square = jnp.diagonal(whole)
+    scale = 1.0 / jnp.sqrt(jnp.where(square > 0, square, 1.0))
+    scaled = scale[:, None] * whole * scale[None] + ridge * np.eye(size)
+    L = jnp.linalg.cholesky(scaled)
+    Li = jax.lax.linalg.triangular_solve(L, jnp.eye(size), left_side=True, lower=True)
+    bound = jnp.sqrt(size * jnp.sum(Li**2))
+    Li = Li * scale[None]
+    return Li.T @ Li, jnp.where(jnp.isfinite(bound), bound, jnp.inf)
 
 
 class AbstractSolution(eqx.Module):
@@ -156,11 +178,12 @@ class CrossValidated(AbstractSolution):
         """Test every candidate on every block; reject a single block."""
         squares, count = np.asarray(weights) ** 2, len(blocks.parts)
         errors = np.empty((len(self.candidates), count))
-        for k, (rest, held_out) in enumerate(cross_validation_folds(blocks, count)):
-            d = Decomposition.of(*rest.total.weighted(weights))
+        for k, (rest, part) in enumerate(cross_validation_folds(blocks, count)):
+            d = Decomposition.of(*blocks.select(rest).total.weighted(weights))
+            held_out = blocks.select(part).total
             for i, candidate in enumerate(self.candidates):
                 p = d.solve(candidate.inverse(d.values))
-                errors[i, k] = squares @ held_out.total.residual_squares(p)
+                errors[i, k] = squares @ held_out.residual_squares(p)
         total = errors.sum(axis=1)
         best = int(np.argmin(total))
         margin = errors[best].std(ddof=1) * np.sqrt(errors.shape[1])

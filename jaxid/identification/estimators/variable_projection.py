@@ -24,9 +24,8 @@ from jaxid.measurement.observations import Observations
 from ..problem import RegressionProblem
 from .estimate import AbstractEstimator
 from .least_squares import WeightedLeastSquares
+from .regularisation_and_weights import RIDGE, inverse_information
 
-RIDGE = 64 * np.finfo(float).eps
-"""Ridge of the products of columns of length one, which may depend on each other."""
 STEPS = 60
 """Largest number of steps of a search."""
 
@@ -188,9 +187,8 @@ class ShapeSearch(eqx.Module):
         entries = [
             (j, k, place[k]) for j, own in enumerate(base.acting_columns) for k in own if k in place
         ]
-        logs = tuple(problem.recordings)
-        start = shapes.values
-        return cls(shapes, start, logs, fixed, forces * counted, counted, blocks, tuple(entries))
+        known = shapes, shapes.values, problem.recordings
+        return cls(*known, fixed, forces * counted, counted, blocks, tuple(entries))
 
     def __call__(
         self, weights: Float[AnyArray, " joints"], kept: Float[AnyArray, " blocks"] | None = None
@@ -303,19 +301,13 @@ class ShapeSearch(eqx.Module):
         both = jnp.where(joint == joint[:, None], own.T @ (own * squares[:, joint]), 0.0)
         information = information.at[place].add(cross).at[:, place].add(cross.T)
         information = information.at[place[:, None], place].add(both)
-        information = jax.lax.stop_gradient(information)
-        length = jnp.sqrt(jnp.diagonal(information))
-        length = jnp.where(length > 0, length, 1.0)
-        scaled = information / jnp.outer(length, length) + RIDGE * len(length) * jnp.eye(
-            len(length)
-        )
-        root = jax.scipy.linalg.cho_factor(scaled)
+        size = len(information)
+        inverse, _ = inverse_information(jax.lax.stop_gradient(information), RIDGE * size)
 
         def refine(c: Array) -> Array:
-            along = project(forces - predict(c)) / length
-            return c + jax.scipy.linalg.cho_solve(root, along) / length
+            return c + inverse @ project(forces - predict(c))
 
-        c = jax.lax.stop_gradient(refine(refine(jnp.zeros(len(length)))))
+        c = jax.lax.stop_gradient(refine(refine(jnp.zeros(size))))
         # A step of Newton with a constant matrix has the derivatives of the solution.
         c = refine(c)
         return c, forces - predict(c)

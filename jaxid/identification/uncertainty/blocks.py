@@ -10,7 +10,7 @@ from jaxid.arrays import AnyArray, Array, Float, PRNGKeyArray, require_float64
 from jaxid.errors import InputError
 
 from ..estimators.estimate import Estimate
-from ..estimators.regularisation_and_weights import Decomposition
+from ..estimators.regularisation_and_weights import RIDGE, Decomposition, inverse_information
 from ..factors import Blocks
 from .result import AbstractUncertainty, Uncertainty
 
@@ -108,8 +108,6 @@ def bootstrap(
         InputError: If there are fewer than two blocks, or draws do not determine all parameters.
         RuntimeError: If JAX's 64-bit mode is off.
     """
-    from ..many_data_sets import RIDGE, inverse_information
-
     require_float64("a bootstrap")
     count = len(blocks.parts)
     if count < 2:

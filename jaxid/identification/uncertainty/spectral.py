@@ -88,29 +88,20 @@ class Lines(NamedTuple):
     r"""Spectra of all stretches of one length, added up.
 
     A stretch is a contiguous, equidistant part of the rows, which is transformed at once.
-
-    Attributes:
-        length: Rows of a stretch; shorter ones are padded with rows that do not count.
-        energy: $|\sum_t (B z_t)_i e^{-i \omega t}|^2 m / N$ [base, channels, lines].
-        leverage: Fraction (0 to 1) of each line explained by the fit [channels, lines].
-        power: Periodogram of the disturbances [channels, lines].
-        residual: Periodogram of the residuals [joints, lines], in [N² m²] or [N²].
-        exposure: Number of stretches, weighted by the fraction of rows of each channel that count.
-        stretches: Number of stretches, as an array without axes.
     """
 
-    length: int
+    length: int  # rows of a stretch; shorter ones are padded with rows that do not count
     row_time: float
     frequency: np.ndarray
     multiplicity: np.ndarray
     gain: np.ndarray
     bins: np.ndarray
-    energy: np.ndarray
-    leverage: np.ndarray
-    power: np.ndarray
-    residual: np.ndarray
-    exposure: np.ndarray
-    stretches: np.ndarray
+    energy: np.ndarray  # $|\sum_t (B z_t)_i e^{-i \omega t}|^2 m / N$ [base, channels, lines]
+    leverage: np.ndarray  # fraction (0 to 1) of each line explained by the fit [channels, lines]
+    power: np.ndarray  # periodogram of the disturbances [channels, lines]
+    residual: np.ndarray  # periodogram of the residuals [joints, lines], in [N² m²] or [N²]
+    exposure: np.ndarray  # stretches, weighted by the fraction of each channel's rows that count
+    stretches: np.ndarray  # number of stretches, as an array without axes
 
     @classmethod
     def empty(cls, length: int, observations: Observations, sizes: tuple[int, int]) -> "Lines":
