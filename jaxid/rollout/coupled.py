@@ -52,11 +52,16 @@ class Path(NamedTuple):
         before: States before each stage [steps, stages, joints, motions].
         within: Velocities in the stages, zero where friction holds a joint.
         positions: Positions behind each step [steps, joints, motions].
+        load: Bias forces of the bodies in each step; None without bodies.
+        M: Mass matrix of the bodies in each step [steps, joints, joints, motions]; None if they are
+            not coupled.
     """
 
     before: State
     within: AnyArray
     positions: AnyArray
+    load: AnyArray | None = None
+    M: AnyArray | None = None
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
@@ -69,18 +74,21 @@ def _simulate(
 
     def step(states: tuple[State, Array], commands: Array):
         before, last = states
-        M, load = None, jnp.zeros_like(last)
+        M = load = None
         if programs is not None:
             M, load = lower(programs.bodies).dense(*middle_of(before.q, before.w, last, h))
+            M = None if programs.solve is None else M
+        rest = jnp.zeros_like(last)
 
         def stage(state: State, own: tuple[Array, ...]):
-            inputs = Stages(own[0], load, jnp.zeros_like(load), *own[1:])
+            inputs = Stages(own[0], rest if load is None else load, rest, *own[1:])
             x = Forces.of(state, of_joints, inputs, h)
             u = _within(programs, x, state.w, of_joints, inputs, M, h)
             return moved(state, u, x, inputs, h), (state, u)
 
         after, stages = jax.lax.scan(stage, before, (commands, share, ahead))
-        return (after, before.w), (*stages, after.q)
+        # What is a result is computed once: XLA would repeat it for each joint that it loads.
+        return (after, before.w), (*stages, after.q, load, M)
 
     start = State(*jnp.moveaxis(jnp.asarray(motion.start), 0, -1))
     commands = jax.vmap(lambda x, y: commands_of_stages(x.T, y, steps, hold), (-1, 0), -1)
@@ -243,7 +251,7 @@ class CoupledSimulator:
         part = dataclasses.replace(part, lengths=(), names=())
         steps, h = self.steps, float(part.sample_time) / self.steps
         slope = (own.before.w - own.within) / (GAMMA * h)
-        M, load, middle = self._body_terms(own, h)
+        M, load, middle = _body_terms(own, h)
         inertia = np.diagonal(M, axis1=1, axis2=2)
         others = np.einsum("tij,tsj->tsi", M, slope) - inertia[:, None] * slope
         known = (np.concatenate([x, x[-1:]]).T for x in (load, inertia))
@@ -269,14 +277,13 @@ class CoupledSimulator:
 
         return one
 
-    def _body_terms(self, path: Path, h: float):
-        """Return mass matrices and bias forces of all steps of a motion, and where they count."""
-        v = path.before.w[:, 0]
-        middle = middle_of(path.before.q[:, 0], v, np.concatenate([v[:1], v[:-1]]), h)
-        if self.bodies is None:
-            return np.zeros((*v.shape, v.shape[1])), np.zeros_like(v), middle
-        terms = evaluate(self.bodies.programs.bodies, *(x.T for x in middle))
-        return *(np.moveaxis(x, -1, 0) for x in terms), middle
+
+def _body_terms(path: Path, h: float):
+    """Return mass matrices and bias forces of all steps of a motion, and where they count."""
+    v = path.before.w[:, 0]
+    middle = middle_of(path.before.q[:, 0], v, np.concatenate([v[:1], v[:-1]]), h)
+    M = np.zeros((*v.shape, v.shape[1])) if path.M is None else path.M
+    return M, np.zeros_like(v) if path.load is None else path.load, middle
 
 
 def _compose(
