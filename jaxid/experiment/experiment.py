@@ -185,9 +185,14 @@ class Experiment:
             )
         plain = {"forces": commands, "force_unit": NM, "force_signs": None, "force_gains": None}
         columns = dataclasses.replace(columns, **plain, torque_constants=None, velocities=None)
-        measured = self._read(log, columns)
         swapped = dataclasses.replace(columns, angles=commands, forces=columns.angles)
-        sent = self._read(log, swapped)
+        found = []
+        for key, chosen in (("forces", columns), ("angles", swapped)):
+            try:
+                found.append(self._read(log, chosen))
+            except InputError as error:
+                raise InputError(str(error).replace(f"`{key}`", "`commands`")) from None
+        measured, sent = found
         return dataclasses.replace(measured, forces=sent.angles)
 
     def bodies(self) -> Bodies | None:

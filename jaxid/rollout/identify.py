@@ -38,6 +38,8 @@ EFFECTS = (
 """Groups of effects, from which one each is chosen: bias or load; friction; saturation."""
 GAIN = 0.04
 """Fall of the logarithm of the held-out mean square for which a larger model is chosen."""
+DAMPED = 0.5
+"""Damping ratio below which a joint oscillates."""
 FOLDS = 4
 """Smallest number of parts for the choice: fewer logs are divided."""
 LARGEST = 1e6
@@ -289,23 +291,19 @@ class _Search:
         free = np.stack([self.free] * 3 + [np.tile(mask(LINEAR), (len(self.x), 1))])
         found = self.solve(x, free, iterations=8)
         self.linear = found.x[3]
-        self._take(found.x[:3], self._least_oscillating(found.x[:3]))
+        self._take(found.x[:3], self._best(found.x[:3], found.cost[:3]))
         self._weigh(self.x)
 
-    def _least_oscillating(self, x: np.ndarray) -> np.ndarray:
-        """Return the most damped candidate, unless others are better by more than their scatter.
+    def _best(self, x: np.ndarray, cost: np.ndarray) -> np.ndarray:
+        """Return the candidate of least cost; if it oscillates more, it must be clearly better.
 
         An oscillation that an initial state excites may imitate the rounding of an encoder.
         """
-        scores = self._scores(self.simulator.costs(x))
-        damping = x[..., INDEX["B"]] / np.sqrt(x[..., INDEX["J"]])
-        chosen, *others = np.argsort(-damping, axis=0)
-        for other in others:
-            old, new = (
-                np.take_along_axis(scores, k[None, None], axis=1)[:, 0] for k in (chosen, other)
-            )
-            chosen = np.where(_lower(new, old), other, chosen)
-        return chosen
+        best, scores = np.argmin(cost, axis=0), self._scores(self.simulator.costs(x))
+        ratio = 0.5 * x[..., INDEX["B"]] / np.sqrt(x[..., INDEX["J"]])
+        calm = np.lexsort((cost, -np.minimum(ratio, DAMPED)), axis=0)[0]
+        one, other = (np.take_along_axis(scores, k[None, None], axis=1)[:, 0] for k in (best, calm))
+        return np.where(_lower(one, other), best, calm)
 
     def _take(self, x: np.ndarray, chosen: np.ndarray) -> None:
         self.x = np.take_along_axis(x, chosen[None, :, None], axis=0)[0]

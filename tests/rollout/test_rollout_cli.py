@@ -58,6 +58,27 @@ def test_a_report_without_torques(folder, monkeypatch):
     assert "free-running" in page
 
 
+def test_known_gains_and_integral_action_of_a_servo_without_it(folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    text = FILE.replace("samples = 2", "stiffness = [12.0, nan]\nintegral = true")
+    (folder / "pid.toml").write_text(text)
+    words = ["rollout", "pid.toml", "a.csv", "b.csv", "--verify", "unseen.csv", "-o", "pid"]
+    done = CliRunner().invoke(app, words, catch_exceptions=False)
+    assert done.exit_code == 0, done.output
+    found = json.loads((folder / "pid" / "rollout.json").read_text())
+    np.testing.assert_allclose(found["simulators"]["stiffness"], servo_arm.KP, rtol=0.02)
+    assert found["simulators"]["stiffness"][0] == 12.0
+    assert np.max(found["simulators"]["integral_gain"]) < 0.1
+    assert np.max(found["errors"]["simulated"]) < 1e-3
+
+
+def test_a_missing_column_of_commands_is_named(folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    (folder / "wrong.toml").write_text(FILE.replace("command{}", "cmd{}"))
+    done = CliRunner().invoke(app, ["rollout", "wrong.toml", "a.csv", "-o", "none"])
+    assert "no column `cmd1` for `commands`" in str(done.exception)
+
+
 TORQUES = """
 [robot]
 mjcf = "pendulum.xml"
