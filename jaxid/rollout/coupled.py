@@ -91,7 +91,7 @@ def _simulate(
         return (after, before.w), (*stages, after.q, load, M)
 
     start = State(*jnp.moveaxis(jnp.asarray(motion.start), 0, -1))
-    commands = jax.vmap(lambda x, y: commands_of_stages(x.T, y, steps, hold), (-1, 0), -1)
+    commands = jax.vmap(lambda x, y: commands_of_stages(x.T, y, steps, hold)[0], (-1, 0), -1)
     commands = commands(theta, motion)
     of_joints, by_step = tuple(theta), commands.reshape(-1, 2, *commands.shape[1:])
     return Path(*jax.lax.scan(step, (start, start.w), by_step)[1])
@@ -149,7 +149,7 @@ def _partials(
     """Return the derivatives of the balance of forces in all stages of one motion [stages, ...]."""
     terms = path.before, path.within, others
     state, u, others = jax.tree.map(lambda x: jnp.reshape(x, (-1, len(theta))), terms)
-    stages, by_delay = Stages.with_delay(theta, motion, steps, hold)
+    stages, by_delay = Stages.of(theta, motion, steps, hold)
     return partials(state, u, theta, stages, by_delay, motion.sample_time / steps, others)
 
 

@@ -60,23 +60,34 @@ START, LOWER, UPPER, SCALE = (
 )
 
 
-def delayed_command(c: AnyArray, t: Array, hold: AnyArray) -> Array:
+def delayed_command(c: AnyArray, t: Array, hold: AnyArray) -> tuple[Array, Array]:
     """Return the commands of the two stages of each step between the instants `t`, in samples.
 
     Commands are interpolated; or they are held until the next one, and count with their mean over
     the step. Before the first they stand still.
+
+    Returns:
+        The commands, and their changes by a delay of one sample.
     """
-    table = jnp.concatenate([jnp.zeros(1), jnp.cumsum(c)])
-    held = jnp.clip(t, -1e3, len(c) - 1e-6)
-    whole = jnp.clip(jnp.floor(held), 0.0, len(c) - 1.0)
-    k = whole.astype(int)
-    mean = jnp.diff(table[k] + (held - whole) * c[k]) / jnp.maximum(jnp.diff(held), 1e-12)
-    ends = jnp.stack([t[:-1] + GAMMA * jnp.diff(t), t[1:]], axis=1).ravel()
-    within = jnp.clip(ends, 0.0, len(c) - 1.0)
-    whole = jnp.clip(jnp.floor(within), 0.0, len(c) - 2.0)
-    k = whole.astype(int)
-    interpolated = c[k] + (within - whole) * (c[k + 1] - c[k])
-    return jnp.where(hold, jnp.repeat(mean, 2), interpolated)
+
+    def held() -> tuple[Array, Array]:
+        table = jnp.concatenate([jnp.zeros(1), jnp.cumsum(c)])
+        within = jnp.clip(t, -1e3, len(c) - 1e-6)
+        whole = jnp.clip(jnp.floor(within), 0.0, len(c) - 1.0)
+        k = whole.astype(int)
+        length = jnp.maximum(jnp.diff(within), 1e-12)
+        mean = jnp.diff(table[k] + (within - whole) * c[k]) / length
+        return jnp.repeat(mean, 2), jnp.repeat(-jnp.diff(c[k]) / length, 2)
+
+    def interpolated() -> tuple[Array, Array]:
+        ends = jnp.stack([t[:-1] + GAMMA * jnp.diff(t), t[1:]], axis=1).ravel()
+        within = jnp.clip(ends, 0.0, len(c) - 1.0)
+        whole = jnp.clip(jnp.floor(within), 0.0, len(c) - 2.0)
+        k = whole.astype(int)
+        before, change = c[k], c[k + 1] - c[k]
+        return before + (within - whole) * change, jnp.where(within == ends, -change, 0.0)
+
+    return jax.lax.cond(hold, held, interpolated)
 
 
 class Stages(NamedTuple):
@@ -97,8 +108,13 @@ class Stages(NamedTuple):
     ahead: Array
 
     @classmethod
-    def of(cls, theta: Array, motion: ServoMotion, steps: int, hold: AnyArray) -> "Stages":
-        """Return the stages of one motion with this number of steps in each sample time."""
+    def of(
+        cls, theta: Array, motion: ServoMotion, steps: int, hold: AnyArray
+    ) -> tuple["Stages", Array]:
+        """Return the stages of one motion with this number of steps in each sample time.
+
+        Also return the derivatives of their commands by the delay.
+        """
         count = motion.positions.shape[-1] - 1
 
         def repeated(x: AnyArray) -> Array:
@@ -108,36 +124,30 @@ class Stages(NamedTuple):
         def alternating(first: float, second: float) -> Array:
             return jnp.tile(jnp.array([first, second]), count * steps)[:, None]
 
-        commands = commands_of_stages(theta, motion, steps, hold)
+        commands, by_delay = commands_of_stages(theta, motion, steps, hold)
         share = alternating(1.0 - GAMMA, GAMMA)
         ahead = alternating((1.0 - GAMMA) / GAMMA, 1.0)
-        return cls(commands, repeated(motion.load), repeated(motion.inertia), share, ahead)
-
-    @classmethod
-    def with_delay(
-        cls, theta: Array, motion: ServoMotion, steps: int, hold: AnyArray
-    ) -> tuple["Stages", Array]:
-        """Return the stages, and the derivatives of their commands by the delay."""
-
-        def late(delay: Array) -> Array:
-            return commands_of_stages(theta.at[:, INDEX["d"]].set(delay), motion, steps, hold)
-
-        delay = theta[:, INDEX["d"]]
-        by_delay = jax.jvp(late, (delay,), (jnp.ones_like(delay),))[1]
-        return cls.of(theta, motion, steps, hold), by_delay
+        stages = cls(commands, repeated(motion.load), repeated(motion.inertia), share, ahead)
+        return stages, by_delay
 
 
-def commands_of_stages(theta: Array, motion: ServoMotion, steps: int, hold: AnyArray) -> Array:
-    """Return the command of each stage, with gain and bias [stages, joints]."""
+def commands_of_stages(
+    theta: Array, motion: ServoMotion, steps: int, hold: AnyArray
+) -> tuple[Array, Array]:
+    """Return the command of each stage, with gain and bias, and its derivative by the delay.
+
+    Returns:
+        Both with the shape [stages, joints].
+    """
     delay, bias, gain = (theta[:, INDEX[key]] for key in ("d", "b", "g"))
     count = motion.positions.shape[-1] - 1
     instants = jnp.asarray(motion.lead + np.arange(count * steps + 1) / steps)
 
-    def of_joint(command: AnyArray, delay: Array) -> Array:
+    def of_joint(command: AnyArray, delay: Array) -> tuple[Array, Array]:
         return delayed_command(command, instants - delay / motion.sample_time, hold)
 
-    commands = jax.vmap(of_joint, out_axes=1)(motion.commands, delay)
-    return gain[None] * commands + bias[None]
+    commands, by_delay = jax.vmap(of_joint, out_axes=1)(motion.commands, delay)
+    return gain[None] * commands + bias[None], gain[None] * by_delay / motion.sample_time
 
 
 class State(NamedTuple):
@@ -221,7 +231,8 @@ def balanced_integral(theta: Array, motion: ServoMotion, hold: AnyArray) -> Arra
     direction = w / (jnp.abs(w) + motion.spread[1])
     torque = load + B * w + (F + mu * jnp.abs(load)) * direction
     torque = torque + (J + a * motion.inertia[:, 0]) * motion.acceleration
-    return jnp.where(ki > 0.0, torque - commands_of_stages(theta, motion, 1, hold)[0] + q, 0.0)
+    command = commands_of_stages(theta, motion, 1, hold)[0][0]
+    return jnp.where(ki > 0.0, torque - command + q, 0.0)
 
 
 def with_integral(motion: ServoMotion, theta: AnyArray, hold: bool) -> ServoMotion:

@@ -63,7 +63,8 @@ def _path(theta: Array, motion: ServoMotion, steps: int, hold: AnyArray) -> tupl
         return state, state.q
 
     start = _start(theta, motion, hold)
-    _, path = jax.lax.scan(one, start, Stages.of(theta, motion, steps, hold))
+    stages, _ = Stages.of(theta, motion, steps, hold)
+    _, path = jax.lax.scan(one, start, stages)
     return (jnp.concatenate([start.q[None], path[2 * steps - 1 :: 2 * steps]]).T,)
 
 
@@ -119,7 +120,7 @@ def _moments(theta: Array, motion: ServoMotion, steps: int, hold: AnyArray) -> t
         padded = jnp.pad(x, ((0, -len(x) % size), (0, 0)), mode)
         return padded.reshape(-1, size, x.shape[-1])
 
-    stages, by_delay = Stages.with_delay(theta, motion, steps, hold)
+    stages, by_delay = Stages.of(theta, motion, steps, hold)
     stages = jax.tree.map(lambda x: blocks(x, 2 * steps * BLOCK), (stages, by_delay))
     measured = blocks(jnp.asarray(motion.positions).T[1:], BLOCK)
     counted = blocks(jnp.asarray(motion.counted).T[1:], BLOCK, "constant")
