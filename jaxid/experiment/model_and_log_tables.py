@@ -236,7 +236,7 @@ class Rollout:
         time_step: Longest step of the simulation [s].
         friction: Whether friction that grows with load or falls with speed is tried.
         saturation: Whether a largest torque of the servo is tried.
-        integral: Whether the servos have integral action (PID instead of PD controllers).
+        integral: Whether integral action of the servos (PID instead of PD controllers) is tried.
         samples: Number of MJCF files drawn from the distribution of the estimates.
         horizon: With torques: length of the windows that are simulated [s].
         gains: With torques: whether gains of the other joints' torques, relative to the first

@@ -82,7 +82,7 @@ def identify_rollout(
         time_step: Longest step of the simulation [s].
         saturation: Whether a largest torque of the servo is tried.
         friction: Whether friction that grows with load or falls with speed is tried.
-        integral: Whether the servos have integral action (PID instead of PD controllers).
+        integral: Whether integral action of the servos (PID instead of PD controllers) is tried.
         stiffness: Known proportional gains of the servos, one for all or one for each joint, NaN
             where unknown [N m/rad or N/m].
 
@@ -106,7 +106,7 @@ def identify_rollout(
     with ThreadPoolExecutor(1) as pool:
         # What the refinement needs is compiled while the search runs.
         pool.submit(prepare, coupled, search.x, search.free)
-        search.run(bodies is not None, friction, saturation)
+        search.run(bodies is not None, friction, saturation, integral)
     if bodies is not None and whole is not None:
         together = bodies.coupled or search.choose_coupling(whole)
         bodies = whole if together else bodies
@@ -215,20 +215,21 @@ class _Search:
             self.x[self.known, INDEX["a"]] = 1.0 / stiffness[self.known]
         motion = simulator.motion
         if integral:
-            self.x[:, INDEX["ki"]] = SCALE[INDEX["ki"]]
-            self.free[:, INDEX["ki"]] = True
             motion = with_integral(motion, self.x, False)
         self.simulator = dataclasses.replace(simulator, motion=motion)
 
-    def run(self, loaded: bool, friction: bool, saturation: bool) -> None:
+    def run(self, loaded: bool, friction: bool, saturation: bool, integral: bool) -> None:
         """Choose the effects of all joints.
 
         Args:
             loaded: Whether bodies load the joints.
             friction: Whether friction by load and Stribeck friction are tried.
             saturation: Whether a largest torque is tried.
+            integral: Whether integral action is tried.
         """
         self.start()
+        if integral:
+            self.choose(((), ("ki",)))
         groups: list[Sequence[tuple[str, ...]]] = list(EFFECTS)
         if not loaded:
             groups[0] = (("b",),)
@@ -373,6 +374,7 @@ class _Search:
             "Fs": 0.3 * own + 1e-3,
             "vs": START[INDEX["vs"]],
             "um": 0.6 * lag,
+            "ki": SCALE[INDEX["ki"]],
         }
         return values[symbol]
 
