@@ -11,7 +11,7 @@ gains: the same arm with servos of 1 and 1.6 times the gain.
 confounded: one joint whose logs tell damping and delay, or armature and gain, only together.
 quadruped: twelve hung joints on MuJoCo, 30 s at 200 Hz: time, compiled before.
 band: one hundred posterior models on MuJoCo; fraction of a held-out motion within their band.
-sysid: the SO-101's joint 2, and joints 1 to 5, identified by mujoco.sysid; eight minutes.
+sysid: the SO-101's joint 2, and joints 1 to 5, identified by mujoco.sysid; fifteen minutes.
 evolution: the same joint by CMA-ES with the simulator of this package, given the same CPU time.
 
     python benchmarks/rollout.py so101 pendulum coverage gains confounded quadruped band
@@ -497,7 +497,7 @@ def sysid(quick: bool) -> list[Row]:
 def sysid_row(what: str, sets, bodies=None) -> Row:
     """Compare errors and times; the last of the peer's settings decide."""
     jax.clear_caches()
-    joints, peers = (list(range(5)), list(PEERS)[1:]) if bodies else ([0], list(PEERS))
+    joints = list(range(5)) if bodies else [0]
     turns = [seconds(lambda: jid.identify_rollout(sets[0], bodies, **SAME)) for _ in range(2)]
     (_, *cold), (fit, *warm) = turns
     ours = np.array([fit.validate(x).total()[joints] for x in sets])
@@ -506,8 +506,8 @@ def sysid_row(what: str, sets, bodies=None) -> Row:
     seen, unseen = 1e3 * ours.round(5)
     said = f"ours {unseen} mrad (seen {seen}), {warm[0]:.1f} s (CPU {warm[1]:.1f}), "
     said += f"with compiling {cold[0]:.1f} (CPU {cold[1]:.1f})"
-    for name in peers:
-        errors, wall, cpu = peer_result(motions, joints, *PEERS[name])
+    for name, settings in PEERS.items():
+        errors, wall, cpu = peer_result(motions, joints, *settings)
         seen, unseen = 1e3 * errors.round(5)
         said += f"; its, {name}: {unseen} mrad (seen {seen}), {wall:.0f} s (CPU {cpu:.0f}: "
         said += f"{cpu / warm[1]:.1f} times ours, {cpu / cold[1]:.1f} with compiling)"
