@@ -23,25 +23,27 @@ STICKING = "0.99 0.9999 0.001"
 def servo_stiffness(
     fit: ServoFit, stiffness: Numbers | None = None
 ) -> Float[np.ndarray, " joints"]:
-    """Return the stiffness of each servo: given, known by a weight, or that of the other joints.
+    """Return the stiffness of each servo: given, that of the fit, or that of the other joints.
 
     Args:
         fit: Identified servos.
-        stiffness: Stiffness, one for all joints or one for each; that of the fit if None
-            [N m/rad or N/m].
+        stiffness: Stiffness, one for all joints or one for each [N m/rad or N/m]; that of the fit
+            where it is None or NaN.
 
     Raises:
         InputError: If no joint tells its stiffness and none is given.
     """
+    found = fit.stiffness.copy()
     if stiffness is not None:
-        return np.broadcast_to(np.asarray(stiffness, np.float64), fit.stiffness.shape).copy()
-    known = np.isfinite(fit.stiffness)
+        given = np.broadcast_to(np.asarray(stiffness, np.float64), found.shape)
+        found = np.where(np.isnan(given), found, given)
+    known = np.isfinite(found)
     if not known.any():
         raise InputError(
             "`stiffness` [N m/rad] is needed: no known weight tells it, and positions tell ratios "
             "to it only. Any number gives the same motion of a robot without bodies."
         )
-    return np.where(known, fit.stiffness, np.median(fit.stiffness[known]))
+    return np.where(known, found, np.median(found[known]))
 
 
 def simulator_values(
@@ -54,7 +56,7 @@ def simulator_values(
 
     Args:
         fit: Identified servos.
-        stiffness: Stiffness of each servo, if a weight does not tell it [N m/rad or N/m].
+        stiffness: Stiffness of each servo [N m/rad or N/m]; that of the fit if None.
         parameters: Other parameters of the joints, such as a draw from their distribution.
 
     Returns:
@@ -91,7 +93,7 @@ def simulator_table(fit: ServoFit, stiffness: Numbers | None = None) -> Table:
 
     Args:
         fit: Identified servos.
-        stiffness: Stiffness of each servo, if a weight does not tell it [N m/rad or N/m].
+        stiffness: Stiffness of each servo [N m/rad or N/m]; that of the fit if None.
     """
     values = simulator_values(fit, stiffness)
     units = ("N m/rad", "N m s/rad", "kg m²", "N m", "N m", "s", "rad", "N m/(rad s)")
@@ -103,8 +105,9 @@ def simulator_table(fit: ServoFit, stiffness: Numbers | None = None) -> Table:
         for (name, value), unit in zip(values.items(), units, strict=True)
         if name != "integral_gain" or value.any()
     ]
-    given, known = fit.given_stiffness, np.isfinite(fit.stiffness)
-    given = np.full(known.shape, stiffness is not None) if given is None else np.isfinite(given)
+    known, given = np.isfinite(fit.stiffness), np.zeros(len(fit.joint_names), bool)
+    for numbers in (stiffness, fit.given_stiffness):
+        given |= numbers is not None and np.isfinite(np.asarray(numbers, np.float64))
     source = [
         "given" if named else "weight" if told else "other joints"
         for named, told in zip(given, known, strict=True)
@@ -140,12 +143,13 @@ def export_servo_mjcf(
 
     Controls are the commanded positions, one each in the order of the joints. MJCF has no delay of
     commands and no bias: both stand in a comment and in `<custom>` numbers (`delay`, `offset`).
-    Servos with integral action are `mujoco.pid` plugins, which come with MuJoCo.
+    Servos with integral action are `mujoco.pid` plugins, which come with MuJoCo. They start without
+    integral: wait until loaded joints have settled, or set `data.act`.
 
     Args:
         fit: Identified servos of a robot whose bodies are known.
         path: Path of the file.
-        stiffness: Stiffness of each servo, if a weight does not tell it [N m/rad or N/m].
+        stiffness: Stiffness of each servo [N m/rad or N/m]; that of the fit if None.
         samples: Number of further files, `NAME_000.xml` …, drawn from the estimates' distribution.
         seed: Seed of the draws.
         timestep: Time step of the simulation [s].

@@ -86,8 +86,11 @@ def typical_errors(motion: ServoMotion, mean: np.ndarray) -> Float[np.ndarray, "
     It is the median of these errors over that of normal ones of unit variance. The median motion
     counts, since contact may last in some of them.
     """
-    still = np.where((mean > 0).any(axis=-1, keepdims=True) & (mean <= 0), np.nan, mean)
-    return np.median(np.nanmedian(still, axis=-1), axis=0) / 0.6745
+    typical = np.zeros(mean.shape[1])
+    for j in range(len(typical)):
+        still = [np.median(x[x > 0]) for x in mean[:, j] if (x > 0).any()]
+        typical[j] = np.median(still) / 0.6745 if still else 0.0
+    return typical
 
 
 def contacts(

@@ -87,7 +87,7 @@ def _simulate(
             return moved(state, u, x, inputs, h), (state, u)
 
         after, stages = jax.lax.scan(stage, before, (commands, share, ahead))
-        # What is a result is computed once: XLA would repeat it for each joint that it loads.
+        # Results are computed once; otherwise XLA computes `load` and `M` again for each joint.
         return (after, before.w), (*stages, after.q, load, M)
 
     start = State(*jnp.moveaxis(jnp.asarray(motion.start), 0, -1))
@@ -120,8 +120,7 @@ def _within(
 ) -> Array:
     """Return the velocities in a stage [joints, motions]."""
     if programs is None or programs.solve is None or M is None:
-        slip = x.slip(w, stage, x.force)
-        return slip.free * (x.force + x.inertia * w - x.friction * slip.direction) / x.resistance
+        return x.velocity(w, stage)
     scale = jnp.sqrt(jnp.maximum(theta[INDEX["a"]], LEAST)) + jnp.zeros_like(w)
     M = M * (scale[:, None] * scale[None]) / (GAMMA * h[None])
     terms = x.force, x.inertia, x.friction, x.resistance, scale, w, stage.ahead

@@ -168,7 +168,7 @@ def _known_stiffness(stiffness: Numbers | None, joints: int) -> Float[np.ndarray
     if stiffness is None:
         return None
     given = np.asarray(stiffness, np.float64)
-    if given.shape not in ((), (joints,)) or (given <= 0.0).any():
+    if given.shape not in ((), (joints,)) or (given <= 0.0).any() or np.isinf(given).any():
         raise InputError(
             f"`stiffness` must be a positive number [N m/rad or N/m], or {joints} of them, one for "
             "each joint."
@@ -229,7 +229,9 @@ class _Search:
         """
         self.start()
         if integral:
-            self.choose(((), ("ki",)))
+            # A servo that saturates often hides its integral action.
+            alone = ((), ("ki",))
+            self.choose((*alone, ("um",), ("ki", "um")) if saturation else alone)
         groups: list[Sequence[tuple[str, ...]]] = list(EFFECTS)
         if not loaded:
             groups[0] = (("b",),)
@@ -296,7 +298,9 @@ class _Search:
         self._weigh(self.x)
 
     def _best(self, x: np.ndarray, cost: np.ndarray) -> np.ndarray:
-        """Return the candidate of least cost; if it oscillates more, it must be clearly better.
+        """Return the candidate of least cost, unless one that is more damped is nearly as good.
+
+        Damping counts up to the ratio `DAMPED`.
 
         An oscillation that an initial state excites may imitate the rounding of an encoder.
         """

@@ -135,7 +135,7 @@ class ServoMotion(eqx.Module):
     def windows(self, horizon: float) -> "ServoMotion":
         """Return consecutive windows of a length [s] as motions of their own.
 
-        Their velocities begin with those of the smoothed positions.
+        They begin with the states of the smoothed positions.
         """
         size = max(3, round(horizon / float(self.sample_time.mean())))
         places = [(k, a) for k, n in enumerate(self.lengths) for a in range(0, n - size + 1, size)]

@@ -24,7 +24,7 @@ from .uncoupled import ServoSimulator
 
 UNDETERMINED = 0.25
 """Standard deviation, relative to a parameter's size, above which it is not determined."""
-LIMITED = [INDEX[x] for x in ("B", "d", "b", "um", "g")]
+LIMITED = [INDEX[x] for x in ("B", "d", "b", "um", "g", "ki")]
 """Parameters that are not at a limit of the search unless something is wrong."""
 SYSTEMATIC = 1.5
 """Multiple of the encoder's rounding above which slow errors show a missing effect."""
@@ -127,13 +127,13 @@ class ServoFit:
             f"{joint_names[j]}: {PARAMETERS[k].meaning} is at the limit of the search, "
             f"{found.parameters[j, k]:.3g}: check signs, units and offsets of the commands"
             for j, k in np.argwhere(found.free)
-            if found.parameters[j, k] in (UPPER[k], LOWER[k]) and k in LIMITED
+            if found.parameters[j, k] in (UPPER[k], LOWER[k] or np.nan) and k in LIMITED
         ]
         missing = (
             f"errors are larger than an encoder's rounding and change slowly "
             f"({', '.join(lacking)} mrad or mm RMS): an effect is missing, such as other friction, "
-            "play, elasticity, load or integral action, and the parameters are those that imitate "
-            "it best"
+            f"play, elasticity{'' if found.free[:, INDEX['ki']].any() else ', integral action'} or "
+            "load, and the parameters are those that imitate it best"
         )
         load = np.zeros_like(motion.positions)
         if simulator.bodies is not None:

@@ -72,7 +72,7 @@ def delayed_command(c: AnyArray, t: Array, hold: AnyArray) -> tuple[Array, Array
 
     def held() -> tuple[Array, Array]:
         table = jnp.concatenate([jnp.zeros(1), jnp.cumsum(c)])
-        within = jnp.clip(t, -1e3, len(c) - 1e-6)
+        within = jnp.maximum(t, -1e3)
         whole = jnp.clip(jnp.floor(within), 0.0, len(c) - 1.0)
         k = whole.astype(int)
         length = jnp.maximum(jnp.diff(within), 1e-12)
@@ -169,7 +169,7 @@ class Forces(NamedTuple):
         resistance: Decrease of the force with the velocity in the stage, with inertia.
         inside: Whether the servo is not saturated.
         falling: Part of the Stribeck friction that is left.
-        gain: Factor of the error, to which the integral action of the stage adds.
+        gain: Factor of the error in the servo's force: 1, more with integral action.
         rate: Growth of the integral action by the error.
     """
 
@@ -208,6 +208,12 @@ class Forces(NamedTuple):
         force = jnp.clip(drive, -um, um) - load
         return cls(error, force, friction, inertia, resistance, inside, falling, gain, ki)
 
+    def velocity(self, w: Array, stages: Stages) -> Array:
+        """Return the velocities in a stage of joints that do not load each other."""
+        slip = self.slip(w, stages, self.force)
+        balance = self.force + self.inertia * w - self.friction * slip.direction
+        return slip.free * balance / self.resistance
+
     def slip(self, w: Array, stages: Stages, force: Array) -> Slip:
         """Return how joints slip under a force."""
         return Slip.of(force, self.inertia, self.friction, self.resistance, w, stages.ahead)
@@ -224,19 +230,20 @@ def moved(state: State, u: Array, x: Forces, stage: Stages, h: AnyArray) -> Stat
 
 
 def balanced_integral(theta: Array, motion: ServoMotion, hold: AnyArray) -> Array:
-    """Return the integral actions with which a motion starts with its acceleration."""
-    J, B, a, F, mu, ki = (theta[:, INDEX[key]] for key in ("J", "B", "a", "F", "mu", "ki"))
+    """Return the integral actions that balance the torques at the start of a motion."""
+    J, B, _, _, a, F, mu, Fs, vs, _, _, ki = theta.T
     q, w = motion.start[:2]
     load = a * motion.load[:, 0]
     direction = w / (jnp.abs(w) + motion.spread[1])
-    torque = load + B * w + (F + mu * jnp.abs(load)) * direction
+    friction = F + mu * jnp.abs(load) + Fs * jnp.exp(-((w / vs) ** 2))
+    torque = load + B * w + friction * direction
     torque = torque + (J + a * motion.inertia[:, 0]) * motion.acceleration
     command = commands_of_stages(theta, motion, 1, hold)[0][0]
     return jnp.where(ki > 0.0, torque - command + q, 0.0)
 
 
 def with_integral(motion: ServoMotion, theta: AnyArray, hold: bool) -> ServoMotion:
-    """Return motions whose initial states have integral actions, in balance but hardly known.
+    """Return motions with initial integral actions that balance the torques, but may be wrong.
 
     Args:
         motion: Motions.

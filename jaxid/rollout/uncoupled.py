@@ -31,9 +31,7 @@ TOGETHER = 4
 def _stage(state: State, theta: Array, stage: Stages, h: AnyArray) -> tuple[State, Array]:
     """Return the state behind a stage, and the velocity in it."""
     x = Forces.of(state, theta, stage, h)
-    slip = x.slip(state.w, stage, x.force)
-    balance = x.force + x.inertia * state.w - x.friction * slip.direction
-    u = slip.free * balance / x.resistance
+    u = x.velocity(state.w, stage)
     return moved(state, u, x, stage, h), u
 
 

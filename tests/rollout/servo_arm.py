@@ -21,14 +21,14 @@ XML = """<mujoco><compiler angle="radian"/><extension><plugin plugin="mujoco.pid
 <joint name="lift" axis="0 1 0" armature="{I[1]}" damping="{D[1]}" frictionloss="{F[1]}"
  solreffriction="{soft} 1" solimpfriction="0.99 0.9999 0.001"/>
 </body></body></worldbody><actuator>
-<plugin name="turn" joint="turn" plugin="mujoco.pid" actdim="{n}">
+<plugin name="turn" joint="turn" plugin="mujoco.pid" actdim="{n}" forcerange="-{u} {u}">
 <config key="kp" value="{K[0]}"/><config key="ki" value="{Ki[0]}"/></plugin>
-<plugin name="lift" joint="lift" plugin="mujoco.pid" actdim="{n}">
+<plugin name="lift" joint="lift" plugin="mujoco.pid" actdim="{n}" forcerange="-{u} {u}">
 <config key="kp" value="{K[1]}"/><config key="ki" value="{Ki[1]}"/></plugin>
 </actuator></mujoco>"""
 
 
-def model_text(stiffer=1.0, step=0.001, friction=FRICTION, ki=0.0):
+def model_text(stiffer=1.0, step=0.001, friction=FRICTION, ki=0.0, limit=1e3):
     """Return the arm as MJCF; `ki` is the integral gain over the stiffness."""
     gains = tuple(stiffer * k for k in KP)
     integral = tuple(ki * k for k in gains)
@@ -42,6 +42,7 @@ def model_text(stiffer=1.0, step=0.001, friction=FRICTION, ki=0.0):
         K=gains,
         Ki=integral,
         n=int(ki > 0.0),
+        u=limit,
         c=CENTRE,
         m=MASS,
     )
@@ -87,9 +88,10 @@ def log(
     block=None,
     rounding=ENCODER,
     ki=0.0,
+    limit=1e3,
 ):
     """Return a log of 50 Hz; commands are held until the next one and reach the servo late."""
-    model = mujoco.MjModel.from_xml_string(model_text(stiffer, step, friction, ki))
+    model = mujoco.MjModel.from_xml_string(model_text(stiffer, step, friction, ki, limit))
     data, sent = mujoco.MjData(model), commands(seed, duration)
     every, late, measured = round(0.02 / step), round(DELAY / step), np.zeros_like(sent)
     data.qpos[:] = sent[0]

@@ -326,7 +326,18 @@ def test_integral_action_is_found_and_exported(tmp_path):
     _require_motion_of_mujoco(path, other)
 
 
-@pytest.mark.parametrize("stiffness", [0.0, [1.0, 2.0, 3.0]])
+def test_integral_action_of_a_servo_that_saturates_is_found():
+    logs = [servo_arm.log(k, duration=20.0, ki=3.0, limit=1.6) for k in (0, 1)]
+    options = {"friction": False, "time_step": 0.005, "integral": True, "stiffness": servo_arm.KP}
+    found = jid.identify_rollout(logs, servo_arm.bodies(), **options)
+    np.testing.assert_allclose(found.of_parameter("ki"), 3.0, rtol=0.02)
+    limit = simulator_values(found)["effort_limit"]
+    np.testing.assert_allclose(limit, 1.6, rtol=0.02)
+    other = servo_arm.log(9, duration=20.0, ki=3.0, limit=1.6)
+    assert found.validate(other).rms().max() < 3e-3
+
+
+@pytest.mark.parametrize("stiffness", [0.0, np.inf, [1.0, 2.0, 3.0]])
 def test_a_stiffness_that_does_not_fit_is_rejected(stiffness):
     with pytest.raises(jid.InputError, match="`stiffness`"):
         jid.identify_rollout(servo_arm.log(0, duration=10.0), stiffness=stiffness)
