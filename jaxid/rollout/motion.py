@@ -29,7 +29,7 @@ class ServoMotion(eqx.Module):
     """Segments of logs as arrays of one length, padded behind their ends.
 
     Attributes:
-        commands: Commanded positions, which begin before the samples [motions, joints, instants].
+        commands: Commanded positions, which begin before the samples.
         positions: Measured positions [motions, joints, samples].
         load: Torques of the bodies between a sample, or step, and the next one [N m or N].
         inertia: Inertia of the bodies about each joint [kg m² or kg].
@@ -43,16 +43,16 @@ class ServoMotion(eqx.Module):
         names: Name of the log of each motion.
     """
 
-    commands: Float[AnyArray, "motions joints lead+samples"]
-    positions: Float[AnyArray, "motions joints samples"]
-    load: Float[AnyArray, "motions joints instants"]
-    inertia: Float[AnyArray, "motions joints instants"]
-    start: Float[AnyArray, "motions states joints"]
-    spread: Float[AnyArray, "motions states joints"]
-    acceleration: Float[AnyArray, "motions joints"]
-    counted: Float[AnyArray, "motions joints samples"]
-    sample_time: Float[AnyArray, " motions"]
-    begin: Float[AnyArray, " motions"]
+    commands: Float[AnyArray, "*motions joints commanded"]
+    positions: Float[AnyArray, "*motions joints samples"]
+    load: Float[AnyArray, "*motions joints instants"]
+    inertia: Float[AnyArray, "*motions joints instants"]
+    start: Float[AnyArray, "*motions states joints"]
+    spread: Float[AnyArray, "*motions states joints"]
+    acceleration: Float[AnyArray, "*motions joints"]
+    counted: Float[AnyArray, "*motions joints samples"]
+    sample_time: Float[AnyArray, " *motions"]
+    begin: Float[AnyArray, " *motions"]
     lengths: tuple[int, ...] = eqx.field(static=True)
     names: tuple[str, ...] = eqx.field(static=True)
 
@@ -189,7 +189,7 @@ class ServoMotion(eqx.Module):
 
     def part(self, motion: int) -> "ServoMotion":
         """Return one motion, without the axis of motions."""
-        return jax.tree.map(lambda x: x[motion], self)
+        return jax.tree.map(lambda x: x[motion, ...], self)
 
 
 def state_at(

@@ -143,7 +143,9 @@ def test_the_search_has_the_gauss_newton_matrix_of_uncoupled_joints(ki):
     alone = ServoSimulator(simulator.motion, 0.01, True)
     r = (alone.paths(x[None])[0, 0] - simulator.motion.positions[0]) * counted
     cost, g, H = (z[0, 0] for z in alone.moments(x[None]))
-    of_start = jax.jacfwd(lambda x: balanced_integral(x, simulator.motion.part(0), True))(x)
+    of_start = jax.jacfwd(lambda x: balanced_integral(x, simulator.motion.part(0), np.array(True)))(
+        x
+    )
     for j in range(2):
         own = S[j, :, j * len(START) : (j + 1) * len(START)]
         if ki > 0.0:
@@ -179,11 +181,11 @@ def test_a_joint_that_turns_around_keeps_its_velocity():
     """The force turns the joint around within a stage: friction first brakes, then opposes it."""
     force, inertia, friction, w = -3.0, 100.0, 1.0, 0.02
     one = (jnp.array([y]) for y in (force, inertia, friction, inertia, w))
-    slip = Slip.of(*one, 1.0)
+    slip = Slip.of(*one, jnp.ones(1))
     u = (force + inertia * w - friction * float(slip.direction[0])) / inertia
     rest = w * inertia / (friction - force)  # part of the stage until the joint is at rest
     assert u == pytest.approx((force + friction) * (1.0 - rest) / inertia)
-    held = Slip.of(*(jnp.array([y]) for y in (-0.5, inertia, friction, inertia, 0.01)), 1.0)
+    held = Slip.of(*(jnp.array([y]) for y in (-0.5, inertia, friction, inertia, 0.01)), jnp.ones(1))
     assert float(held.free[0]) == 0.0
 
 
