@@ -127,7 +127,9 @@ class ServoFit:
             f"{joint_names[j]}: {PARAMETERS[k].meaning} is at the limit of the search, "
             f"{found.parameters[j, k]:.3g}: check signs, units and offsets of the commands"
             for j, k in np.argwhere(found.free)
-            if found.parameters[j, k] in (UPPER[k], LOWER[k] or np.nan) and k in LIMITED
+            # An integral gain of zero is none.
+            if k in LIMITED and found.parameters[j, k] in (UPPER[k], LOWER[k])
+            if found.parameters[j, k] != 0.0
         ]
         missing = (
             f"errors are larger than an encoder's rounding and change slowly "
