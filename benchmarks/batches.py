@@ -2,10 +2,11 @@
 
     python benchmarks/batches.py [--quick] [--json FILE]
 
-The loop does for each data set what a careful user of NumPy does: regressor rows of the base
-parameters, weights, `numpy.linalg.lstsq`. Its rows come once from Pinocchio, called for each sample
-from Python, and once from this package (in NumPy). One turn takes the whole batch and a few data
-sets of each loop; the time for one data set is compared. BLAS has one thread.
+The loop does for each data set what a careful user of NumPy does: regressor rows of the
+base parameters, weights, `numpy.linalg.lstsq`. Its rows come once from Pinocchio,
+called for each sample from Python, and once from this package (in NumPy). One turn
+takes the whole batch and a few data sets of each loop; the time for one data set is
+compared. BLAS has one thread.
 """
 
 import os
@@ -29,7 +30,11 @@ def motions(datasets, samples, joints):
     w = 0.2 * np.pi * np.arange(1, 6)
     a, b = random.normal(scale=0.3, size=(2, datasets, joints, 5))
     c, s = np.cos(np.outer(w, t)), np.sin(np.outer(w, t))
-    series = (a @ c + b @ s, (b * w) @ c - (a * w) @ s, -(a * w**2) @ c - (b * w**2) @ s)
+    series = (
+        a @ c + b @ s,
+        (b * w) @ c - (a * w) @ s,
+        -(a * w**2) @ c - (b * w**2) @ s,
+    )
     return jid.Motion(*(np.ascontiguousarray(x.swapaxes(1, 2)) for x in series))
 
 
@@ -63,11 +68,15 @@ def by_pinocchio(base):
     def rows(m):
         found = np.empty((len(m.q), n, 10 * n))
         for k in range(len(m.q)):
-            found[k] = pin.computeJointTorqueRegressor(model, data, m.q[k], m.qd[k], m.qdd[k])
+            found[k] = pin.computeJointTorqueRegressor(
+                model, data, m.q[k], m.qd[k], m.qdd[k]
+            )
         rubbed = np.zeros((len(m.q), n, 2 * n))
         at = np.arange(n)
         rubbed[:, at, at], rubbed[:, at, n + at] = m.qd, np.tanh(m.qd / EPSILON)
-        return np.concatenate([in_our_order(found, n)[..., bodies], rubbed[..., friction]], axis=-1)
+        return np.concatenate(
+            [in_our_order(found, n)[..., bodies], rubbed[..., friction]], axis=-1
+        )
 
     return rows
 
@@ -78,7 +87,10 @@ def solved(rows, motion, forces, weights):
 
     theta = (rows(motion) * weights[:, None]).reshape(forces.size, -1)
     scale = np.linalg.norm(theta, axis=0)
-    return np.linalg.lstsq(theta / scale, (forces * weights).ravel(), rcond=None)[0] / scale
+    return (
+        np.linalg.lstsq(theta / scale, (forces * weights).ravel(), rcond=None)[0]
+        / scale
+    )
 
 
 def against_loops(datasets, samples, turns):
@@ -98,7 +110,9 @@ def against_loops(datasets, samples, turns):
     some = range(min(4, datasets))
 
     def batch():
-        return jax.block_until_ready(jid.identify_batch(base, motion, forces).parameters)
+        return jax.block_until_ready(
+            jid.identify_batch(base, motion, forces).parameters
+        )
 
     ours, first = timing.elapsed(batch)
     ways = {"NumPy + this package's rows": by_evaluation(base)}
@@ -110,7 +124,9 @@ def against_loops(datasets, samples, turns):
     for name, rows in ways.items():
         p = solved(rows, motion[0], forces[0], weights)
         np.testing.assert_allclose(ours[0], p, rtol=1e-8, atol=1e-8 * np.abs(p).max())
-        cases[name] = lambda rows=rows: [solved(rows, motion[k], forces[k], weights) for k in some]
+        cases[name] = lambda rows=rows: [
+            solved(rows, motion[k], forces[k], weights) for k in some
+        ]
     times = interleaved(cases, turns)
     mine = times["batch"].median / datasets
     found = []
@@ -120,12 +136,15 @@ def against_loops(datasets, samples, turns):
         found.append(
             Row(
                 "15",
-                f"{datasets} data sets x {samples} samples in one call, against {name} + lstsq",
-                f"Panda, {base.size} base parameters with friction, float64, two cores, median of "
+                f"{datasets} data sets x {samples} samples in one call, against "
+                f"{name} + lstsq",
+                f"Panda, {base.size} base parameters with friction, float64, two "
+                "cores, median of "
                 f"{turns} turns; the loop on {len(some)} data sets a turn; compile "
                 f"{first - times['batch'].median:.1f} s apart",
                 f"{ASKED:.0f}x",
-                f"{ratio:.1f}x ({1e3 * mine:.2f} ms against {1e3 * loop:.1f} ms for a data set)",
+                f"{ratio:.1f}x ({1e3 * mine:.2f} ms against {1e3 * loop:.1f} ms for a "
+                "data set)",
                 ratio >= ASKED,
             )
         )

@@ -1,13 +1,16 @@
 """Alarms on clean logs of many kinds of robots, and slips that are named.
 
-    python benchmarks/clean.py [--quick] [--json FILE] [--robot six] [--log slow] [--slip gain]
+    python benchmarks/clean.py [--quick] [--json FILE] [--robot six] [--log slow]
+    [--slip gain]
 
-Robots and logs: `closed_loop.py` (simulated by Pinocchio), each kind of log with two seeds. What
-`jaxid identify` and `jaxid inspect` say of a clean log is an alarm if it is a finding, a likely
-mistake, a doubt about a sign or about gravity, or advice on a delay that the log does not have.
-Slips: those of `spoilt.py` in ordinary logs, in the first, the middle and the last joint. A slip is
-named if a finding, or a note on a delay, says what it is, alone or beside others of the same
-effect; it is hidden if a note says that these logs would not show it.
+Robots and logs: `closed_loop.py` (simulated by Pinocchio), each kind of log with two
+seeds. What `jaxid identify` and `jaxid inspect` say of a clean log is an alarm if it is
+a finding, a likely mistake, a doubt about a sign or about gravity, or advice on a delay
+that the log does not have.
+Slips: those of `spoilt.py` in ordinary logs, in the first, the middle and the last
+    joint. A slip is
+named if a finding, or a note on a delay, says what it is, alone or beside others of the
+same effect; it is hidden if a note says that these logs would not show it.
 """
 
 import itertools
@@ -87,8 +90,14 @@ def recorded(robot, file, log, seed, folder):
         change(cases[0])
     if log == "two rates":
         with np.load(cache) as first:
-            settings |= {"friction": first["friction"], "seconds": 5.0, "seed": seed + 100}
-        cases += [spoilt.recorded(file, folder / f"{robot}-second-{seed}.npz", **settings)]
+            settings |= {
+                "friction": first["friction"],
+                "seconds": 5.0,
+                "seed": seed + 100,
+            }
+        cases += [
+            spoilt.recorded(file, folder / f"{robot}-second-{seed}.npz", **settings)
+        ]
         cases[0].rows(slice(None, None, 10))
     if robot == "ceiling":
         cases[0].key("gravity", "[0.0, 0.0, 9.81]")
@@ -104,8 +113,12 @@ def said(cases, folder):
     marked = [str(x.text) for x in remarks[1:] if x.status.name in ("DOUBTFUL", "BAD")]
     notes = list(r.notes)
     for path in sorted(folder.glob("log*.npz"))[: len(cases)]:
-        _, observations, diagnosis = identify_logs.load_log(r.experiment, path, lambda *_: None)
-        fit = jid.identify(r.experiment.base, observations, r.experiment.estimation.plain)
+        _, observations, diagnosis = identify_logs.load_log(
+            r.experiment, path, lambda *_: None
+        )
+        fit = jid.identify(
+            r.experiment.base, observations, r.experiment.estimation.plain
+        )
         inspected = diagnosis.with_fit(fit)
         marked += inspected.findings
         notes += inspected.notes
@@ -122,8 +135,22 @@ def is_alarm(text, log):
     if late and log in LATE:
         # To half a sample of the log.
         return abs(1e3 * float(late[1]) - LATE[log]) > 0.5e3 * spoilt.DT
-    words = "seem", "check", "wrong", "is it the right", "is `gravity` right", "later in the log"
-    words += "at its limit", "held the last", "remove", "departs", "does not fit", "negative"
+    words = (
+        "seem",
+        "check",
+        "wrong",
+        "is it the right",
+        "is `gravity` right",
+        "later in the log",
+    )
+    words += (
+        "at its limit",
+        "held the last",
+        "remove",
+        "departs",
+        "does not fit",
+        "negative",
+    )
     return any(word in text for word in words)
 
 
@@ -142,7 +169,11 @@ def slip(robot, file, name, j, seed, folder, work):
         return "named", marked
     # The note names joints behind the kind of mistake.
     note = next((x for x in notes if "would not show" in x), "")
-    words = {"offset": "zero that is off", "gain": "too large", "mirrored": "reversed axis"}
+    words = {
+        "offset": "zero that is off",
+        "gain": "too large",
+        "mirrored": "reversed axis",
+    }
     pattern = rf"{words.get(name, '^$')}[^(]*\((any joint|[^)]*`{names[j]}`)"
     hidden = re.search(pattern, note) is not None
     return "hidden" if hidden else "missed", [*marked, *filter(None, [note])]
@@ -167,35 +198,66 @@ def main():
     files = closed_loop.robots(folder)
     files["ceiling"] = files["six"]
     if given.quick:
-        given.robot, given.log, given.slip, given.seeds = ["pendulum"], ["slow"], ["sign"], 1
+        given.robot, given.log, given.slip, given.seeds = (
+            ["pendulum"],
+            ["slow"],
+            ["sign"],
+            1,
+        )
     robots, seeds = given.robot or list(files), SEEDS[: given.seeds]
     logs = list(LOGS) if given.log is None else given.log
     slips = list(SLIPS) if given.slip is None else given.slip
-    alarmed, alarms, counts = set(), [], {name: dict.fromkeys(WAYS, 0) for name in slips}
+    alarmed, alarms, counts = (
+        set(),
+        [],
+        {name: dict.fromkeys(WAYS, 0) for name in slips},
+    )
     for robot, log, seed in itertools.product(robots, logs, seeds):
         status, marked, _ = said(recorded(robot, files[robot], log, seed, folder), work)
         bad = [x for x in marked if is_alarm(x, log)]
         alarms += [f"{robot} | {log} | {x}" for x in bad]
         alarmed |= {(robot, log, seed)} if bad else set()
         if given.show:
-            print(f"{robot}, {log}, {seed}: {status}", *marked, sep="\n    ", flush=True)
+            print(
+                f"{robot}, {log}, {seed}: {status}", *marked, sep="\n    ", flush=True
+            )
     for robot, name, seed in itertools.product(robots, slips, seeds):
         n = len(re.findall(r'type="(?:rev|pris|cont)', files[robot].read_text()))
-        for j in dict.fromkeys({"f": 0, "m": n // 2, "l": n - 1}[x] for x in SLIPS[name][1]):
+        for j in dict.fromkeys(
+            {"f": 0, "m": n // 2, "l": n - 1}[x] for x in SLIPS[name][1]
+        ):
             way, marked = slip(robot, files[robot], name, j, seed, folder, work)
             counts[name][way] += 1
             if given.show or way == "missed":
-                print(f"{robot}, {name}, joint {j + 1}: {way}", *marked, sep="\n    ", flush=True)
+                print(
+                    f"{robot}, {name}, joint {j + 1}: {way}",
+                    *marked,
+                    sep="\n    ",
+                    flush=True,
+                )
     print("alarms:", *alarms, sep="\n")
     count = len(robots) * len(logs) * len(seeds)
     share = len(alarmed) / max(count, 1)
     said_of = f"{len(alarmed)} of {count}"
-    rows = [Row("clean/alarms", "alarms", f"{count} logs", "at most 3 %", said_of, share <= 0.03)]
+    rows = [
+        Row(
+            "clean/alarms",
+            "alarms",
+            f"{count} logs",
+            "at most 3 %",
+            said_of,
+            share <= 0.03,
+        )
+    ]
     for name, ways in counts.items():
         text = ", ".join(f"{number} {way}" for way, number in ways.items())
         shown = ways["named"] + ways["missed"]
         good = ways["named"] >= 0.9 * shown
-        rows.append(Row(f"clean/{name}", name, f"{sum(ways.values())} slips", "90 %", text, good))
+        rows.append(
+            Row(
+                f"clean/{name}", name, f"{sum(ways.values())} slips", "90 %", text, good
+            )
+        )
     hand_over(rows, given.json)
 
 

@@ -1,7 +1,8 @@
 """Logs of robots under closed-loop control, simulated by Pinocchio alone.
 
-Nothing of the package takes part: Pinocchio integrates the motion, NumPy adds friction, servo,
-disturbances and sensors. `robots` lists robots of many kinds, `simulate` moves one of them.
+Nothing of the package takes part: Pinocchio integrates the motion, NumPy adds friction,
+servo, disturbances and sensors. `robots` lists robots of many kinds, `simulate` moves
+one of them.
 """
 
 import dataclasses
@@ -30,8 +31,14 @@ KINDS = {
         ("prismatic", "0 0 0", "0 0 1", 8.0),
         ("revolute", "0 0 -0.3", "0 1 0", 2.0),
     ],
-    "pendulum": [("revolute", "0 0 1", "0 1 0", 3.0), ("revolute", "0 0 -0.5", "0 1 0", 2.0)],
-    "turntable": [("revolute", "0 0 0.1", "0 0 1", 20.0), ("revolute", "0 0 0.3", "1 0 0", 6.0)],
+    "pendulum": [
+        ("revolute", "0 0 1", "0 1 0", 3.0),
+        ("revolute", "0 0 -0.5", "0 1 0", 2.0),
+    ],
+    "turntable": [
+        ("revolute", "0 0 0.1", "0 0 1", 20.0),
+        ("revolute", "0 0 0.3", "1 0 0", 6.0),
+    ],
     "planar": [
         ("revolute", "0 0 0", "0 0 1", 5.0),
         ("revolute", "0.5 0 0", "0 0 1", 3.0),
@@ -91,11 +98,15 @@ def robots(folder):
     files = {name: Path(folder) / f"{name}.urdf" for name in KINDS}
     for name, joints in KINDS.items():
         files[name].write_text(_urdf(name, joints, [0.0] * len(joints)))
-        # Motors that are five times as strong as an ideal motion needs: friction needs more.
+        # Motors that are five times as strong as an ideal motion needs: friction needs
+        # more.
         model = pin.buildModelFromUrdf(str(files[name]))
         _, forces, _ = _ideal(model, *reference(model, 10.0, 0.01, 0))
         files[name].write_text(_urdf(name, joints, 5 * np.abs(forces).max(axis=0)))
-    data = Path(next(iter(cmeel.__path__))).parent / "cmeel.prefix/share/example-robot-data/robots"
+    data = (
+        Path(next(iter(cmeel.__path__))).parent
+        / "cmeel.prefix/share/example-robot-data/robots"
+    )
     return files | {
         "ur3": data / "ur_description/urdf/ur3_joint_limited_robot.urdf",
         "xarm7": data / "xarm_description/urdf/xarm7.urdf",
@@ -108,7 +119,9 @@ def _urdf(name, joints, efforts):
         J = 0.02 * m
         turns = kind == "revolute"
         parts += [
-            LINK.format(name=f"link{k}", x=0.12, y=-0.03, z=0.08, m=m, a=J, b=1.3 * J, c=0.8 * J),
+            LINK.format(
+                name=f"link{k}", x=0.12, y=-0.03, z=0.08, m=m, a=J, b=1.3 * J, c=0.8 * J
+            ),
             JOINT.format(
                 name=f"joint{k}",
                 kind=kind,
@@ -130,7 +143,8 @@ def reference(model, seconds, dt, seed, amplitude=0.5, pace=1.0):
     rng = np.random.default_rng(seed)
     t = np.arange(0, seconds, dt)
     low, high = (
-        np.clip(x, -2.5, 2.5) for x in (model.lowerPositionLimit, model.upperPositionLimit)
+        np.clip(x, -2.5, 2.5)
+        for x in (model.lowerPositionLimit, model.upperPositionLimit)
     )
     phases = rng.uniform(0, 2 * np.pi, (model.nv, 5))
     sizes = rng.uniform(0.3, 1.0, (model.nv, 5)) / np.arange(1, 6)
@@ -140,7 +154,9 @@ def reference(model, seconds, dt, seed, amplitude=0.5, pace=1.0):
     ramp = np.clip(np.minimum(t, seconds - t) / 0.5, 0, 1)[:, None]
     smooth = ramp**3 * (10 - 15 * ramp + 6 * ramp**2)
     q = smooth * q
-    fastest = np.abs(np.gradient(q, dt, axis=0)).max(axis=0) / (0.8 * model.velocityLimit)
+    fastest = np.abs(np.gradient(q, dt, axis=0)).max(axis=0) / (
+        0.8 * model.velocityLimit
+    )
     return t, (low + high) / 2 + q / np.maximum(fastest, 1.0)
 
 
@@ -192,7 +208,8 @@ def simulate(
         gravity: Gravity that acts on the robot [m/s²].
         amplitude: Used part of the ranges of the joints.
         pace: Frequencies of the motion over those of five harmonics of 10 s.
-        friction: Viscous and Coulomb coefficients of each joint, in place of their fractions.
+        friction: Viscous and Coulomb coefficients of each joint, in place of their
+            fractions.
         steps: Steps of integration in each sample.
     """
     model = pin.buildModelFromUrdf(str(urdf))
@@ -201,7 +218,11 @@ def simulate(
     t, r = reference(model, seconds, dt, seed, amplitude, pace)
     rd, ideal, _ = _ideal(model, t, r)
     size = np.sqrt(np.mean(ideal**2, axis=0)) + 1e-3 * np.abs(ideal).max()
-    fv, fc, fs = viscous * size / np.sqrt(np.mean(rd**2, axis=0)), coulomb * size, stribeck * size
+    fv, fc, fs = (
+        viscous * size / np.sqrt(np.mean(rd**2, axis=0)),
+        coulomb * size,
+        stribeck * size,
+    )
     fv, fc = (fv, fc) if friction is None else friction
     rng = np.random.default_rng(seed + 10**6)
     low = signal.butter(1, disturbance_hz, fs=1 / dt, output="sos")
@@ -216,16 +237,20 @@ def simulate(
         servo = M @ (w**2 * (r[k] - q) + 1.4 * w * (rd[k] - v))
         forces[k] = servo + 0.9 * ideal[k] + fc * np.tanh(rd[k] / epsilon)
         for _ in range(steps):
-            brake = (fc + fs * np.exp(-((v / 0.05) ** 2))) * np.tanh(v / epsilon) + fv * v
+            brake = (fc + fs * np.exp(-((v / 0.05) ** 2))) * np.tanh(
+                v / epsilon
+            ) + fv * v
             v = v + h * pin.aba(model, data, q, v, forces[k] - brake + unknown[k])
             q = q + h * v
-    # The drive holds a force for one sample: the mean around a sample belongs to its angles. The
-    # steps of a sample act at their beginnings.
+    # The drive holds a force for one sample: the mean around a sample belongs to its
+    # angles. The steps of a sample act at their beginnings.
     own = 0.5 + 0.5 / steps
     held = own * forces + (1 - own) * np.vstack([forces[:1], forces[:-1]])
     held = held + noise * size * rng.standard_normal(held.shape)
     if bits is not None:
-        turn = np.array([2 * np.pi if "R" in j.shortname() else 1.0 for j in model.joints[1:]])
+        turn = np.array(
+            [2 * np.pi if "R" in j.shortname() else 1.0 for j in model.joints[1:]]
+        )
         angles = np.round(angles / turn * 2**bits) * turn / 2**bits
     return Log(t, angles, held, r, np.array([fv, fc]))
 
@@ -233,6 +258,11 @@ def simulate(
 def write_csv(path, log, **columns):
     """Write a log as CSV: `t`, `q1…`, `tau1…`, `cmd1…`, and further columns."""
     named = {"q": log.angles, "tau": log.forces, "cmd": log.commands, **columns}
-    header = ["t", *(f"{k}{j + 1}" for k, x in named.items() for j in range(x.shape[1]))]
+    header = [
+        "t",
+        *(f"{k}{j + 1}" for k, x in named.items() for j in range(x.shape[1])),
+    ]
     table = np.column_stack([log.time, *named.values()])
-    np.savetxt(path, table, delimiter=",", header=",".join(header), comments="", fmt="%.9g")
+    np.savetxt(
+        path, table, delimiter=",", header=",".join(header), comments="", fmt="%.9g"
+    )

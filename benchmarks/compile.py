@@ -2,9 +2,11 @@
 
     python benchmarks/compile.py [--quick] [--json FILE]
 
-Each figure is a process of its own: one without a cache, one that fills a cache in an empty folder,
-one that finds it there. The time runs from the definition in JAX to the function that can be
-called: tracing to a scalar program, lowering by XLA, compiling. Imports are not counted.
+Each figure is a process of its own: one without a cache, one that fills a cache in an
+empty folder, one that finds it there. The time runs from the definition in JAX to the
+function that can be
+called: tracing to a scalar program, lowering by XLA, compiling. Imports are not
+    counted.
 """
 
 import json
@@ -65,14 +67,25 @@ def work(name, cache, turns):
     times = {"prepare": preparing, "lower": lowering, "compile": compiling}
     out = times | {"cpu": time.process_time() - cpu}
     if turns:
-        found = interleaved({name: lambda: jax.block_until_ready(run(*arguments))}, turns)[name]
+        found = interleaved(
+            {name: lambda: jax.block_until_ready(run(*arguments))}, turns
+        )[name]
         out |= {"median": found.median, "best": found.best}
     print(json.dumps(out))
 
 
 def measure(name, cache="", turns=0):
     """Return the times of a process of its own."""
-    command = [sys.executable, __file__, "--work", name, "--cache", cache, "--turns", str(turns)]
+    command = [
+        sys.executable,
+        __file__,
+        "--work",
+        name,
+        "--cache",
+        cache,
+        "--turns",
+        str(turns),
+    ]
     done = subprocess.run(command, capture_output=True, text=True)
     if done.returncode:
         raise SystemExit(f"{name}: {done.stderr[-2000:]}")
@@ -87,15 +100,21 @@ def total(times):
 def words(times):
     """Return the parts of the time in words."""
     parts = ", ".join(f"{k} {times[k]:.2f}" for k in ("lower", "compile"))
-    return f"{total(times):.2f} s ({parts}; {times['cpu']:.1f} s of CPU time with set-up)"
+    return (
+        f"{total(times):.2f} s ({parts}; {times['cpu']:.1f} s of CPU time with set-up)"
+    )
 
 
 def main():
     """Measure cold and cached compile times, and the run time of a design's criterion."""
     parser = timing.parser(__doc__, "only the regressor")
     parser.add_argument("--work", choices=WHAT, help="one process: prints its times")
-    parser.add_argument("--cache", default="", help="folder of the cache of that process")
-    parser.add_argument("--turns", type=int, default=0, help="timed calls of that process")
+    parser.add_argument(
+        "--cache", default="", help="folder of the cache of that process"
+    )
+    parser.add_argument(
+        "--turns", type=int, default=0, help="timed calls of that process"
+    )
     options = parser.parse_args()
     if options.work:
         work(options.work, options.cache, options.turns)
@@ -108,13 +127,19 @@ def main():
         best, limit = min(total(first), total(cold)), LIMITS[name]
         said = f"{words(cold)}; once more, filling the cache: {total(first):.2f} s"
         asked = f"<= {limit:g} s"
-        rows.append(Row(f"6{key}", f"{WHAT[name]}, cold", recipe, asked, said, best <= limit))
+        rows.append(
+            Row(f"6{key}", f"{WHAT[name]}, cold", recipe, asked, said, best <= limit)
+        )
         number, holds = f"6{chr(ord(key) + 1)}", total(again) <= 1.0
-        rows.append(Row(number, f"{WHAT[name]}, cached", recipe, "<= 1 s", words(again), holds))
+        rows.append(
+            Row(number, f"{WHAT[name]}, cached", recipe, "<= 1 s", words(again), holds)
+        )
         if "median" in cold:
             said = f"{cold['median'] * 1e3:.2f} ms (best {cold['best'] * 1e3:.2f} ms)"
             title = f"{WHAT[name]}, warm run"
-            rows.append(Row("6e", title, recipe, "<= 2.5 ms", said, cold["median"] <= 2.5e-3))
+            rows.append(
+                Row("6e", title, recipe, "<= 2.5 ms", said, cold["median"] <= 2.5e-3)
+            )
     hand_over(rows, options.json)
 
 

@@ -1,30 +1,36 @@
 """Physically consistent fits: optima against a conic solver, proofs, times, definiteness.
 
-    python benchmarks/consistency.py [--quick] [--only optimum proofs stress times weights]
+    python benchmarks/consistency.py [--quick] [--only optimum proofs stress times
+    weights]
 
-* `optimum`: the objective against CLARABEL's (through cvxpy, tolerances 1e-9; the same problem
-  as written in `references/conic.py`). Data: whole logs of TX40, UR10, KR300, prepared by the files
-  in `tests/real_data` (skipped where `../shared/data` is missing), and 50 simulated arms (Panda,
-  UR10, TX40 with coupled drives, TX90L on its rail, in turn) with noise from 0 to 20 % of each
-  joint's RMS force. Statistic: difference over max(objective, rows / 2).
-* `proofs`: 1000 simulated fits of these arms, noise uniform from 0 to 20 %, compiled. Statistics:
-  fits whose error bound stays above 2.5e-7 of objective + rows / 2, iterations, and the smallest
+* `optimum`: the objective against CLARABEL's (through cvxpy, tolerances 1e-9; the same
+  problem as written in `references/conic.py`). Data: whole logs of TX40, UR10, KR300,
+  prepared by the files in `tests/real_data` (skipped where `../shared/data` is
+  missing), and 50 simulated arms (Panda, UR10, TX40 with coupled drives, TX90L on its
+  rail, in turn) with noise from 0 to 20 % of each joint's RMS force. Statistic:
+  difference over max(objective, rows / 2).
+* `proofs`: 1000 simulated fits of these arms, noise uniform from 0 to 20 %, compiled.
+  Statistics: fits whose error bound stays above 2.5e-7 of objective + rows / 2,
+      iterations, and the smallest
   eigenvalue of M over 2000 random poses of every fit.
-* `stress`: 400 more in NumPy: in turn bounds divided by 100, bounds times 100, ten samples, 100 %
-  noise, and bounds that exclude the truth.
-* `times`: Panda, 98 parameters, 5 % noise: one warm compiled fit against the time that CLARABEL
-  reports for its own work, in turn, medians; and 256 data sets in one call, set-up included.
+* `stress`: 400 more in NumPy: in turn bounds divided by 100, bounds times 100, ten
+  samples, 100 % noise, and bounds that exclude the truth.
+* `times`: Panda, 98 parameters, 5 % noise: one warm compiled fit against the time that
+  CLARABEL reports for its own work, in turn, medians; and 256 data sets in one call,
+  set-up included.
 
-Bodies are clouds of points along the links; columns are those of ten parameters per body, viscous
-and Coulomb friction, rotors and offsets, of one random Fourier motion with 500 samples; joints
-weigh by their RMS force; noise is white. Keys: [trial, 1] truth, [trial, 2] noise, [trial, 3] its
-strength, [number of standard parameters, 4] poses. Bounds are those of `BodyBounds.from_geometry`.
+Bodies are clouds of points along the links; columns are those of ten parameters per
+body, viscous and Coulomb friction, rotors and offsets, of one random Fourier motion
+with 500 samples; joints weigh by their RMS force; noise is white. Keys: [trial, 1]
+truth, [trial, 2] noise, [trial, 3] its strength, [number of standard parameters, 4]
+poses. Bounds are those of `BodyBounds.from_geometry`.
 
-* `weights`: effect of weights and bounds on the mass matrix (paper, Figs. 6 and 7), over 100 trials
-  of the virtual TX90L on its rail with seven parameters per body and its disturbances. Each trial
-  has two random Fourier motions of 20 s at 100 Hz, of the seeds 2 trial and 2 trial + 1: one to
-  identify with, one to verify with. Statistics: trials with a positive definite mass matrix in 2000
-  random poses; RMS error over RMS force on the other motion, axes 1, 5 and 7, median.
+* `weights`: effect of weights and bounds on the mass matrix (paper, Figs. 6 and 7),
+  over 100 trials of the virtual TX90L on its rail with seven parameters per body and
+  its disturbances. Each trial has two random Fourier motions of 20 s at 100 Hz, of the
+  seeds 2 trial and 2 trial + 1: one to identify with, one to verify with. Statistics:
+  trials with a positive definite mass matrix in 2000 random poses; RMS error over RMS
+  force on the other motion, axes 1, 5 and 7, median.
 """
 
 import statistics
@@ -40,7 +46,13 @@ LOGS = {
     "kr300": ("kr300.toml", "kr300/traj_A.csv"),
 }
 SAMPLES = 500
-WAYS = ("bounds / 100", "bounds x 100", "ten samples", "100 % noise", "bounds exclude the truth")
+WAYS = (
+    "bounds / 100",
+    "bounds x 100",
+    "ten samples",
+    "100 % noise",
+    "bounds exclude the truth",
+)
 
 
 class Arm:
@@ -76,12 +88,16 @@ class Arm:
 
         rng = np.random.default_rng([trial, 1])
         robot = self.model.robot
-        heavy = np.geomspace(8.0, 1.0, robot.joints) * rng.uniform(0.7, 1.3, robot.joints)
+        heavy = np.geomspace(8.0, 1.0, robot.joints) * rng.uniform(
+            0.7, 1.3, robot.joints
+        )
         bodies = jid.simulation.random_bodies(robot, heavy, rng).ravel()
         scales = {"fv": 4.0, "fc": 6.0, "Ia": 1.0, "fo": 1.0}
         p = np.array(
             [
-                0.05 if name[2:3] == "m" else scales.get(name[:2], 0.1) * rng.uniform(0.2, 1.0)
+                0.05
+                if name[2:3] == "m"
+                else scales.get(name[:2], 0.1) * rng.uniform(0.2, 1.0)
                 for name in self.model.parameter_names
             ]
         )
@@ -92,11 +108,15 @@ class Arm:
         """Return triangle, right-hand side and number of rows of one trial."""
         import numpy as np
 
-        theta = self.theta if samples is None else self.theta[:: len(self.theta) // samples]
+        theta = (
+            self.theta if samples is None else self.theta[:: len(self.theta) // samples]
+        )
         truth = np.asarray(self.base.from_standard(self.truth(trial)))
         scale = np.sqrt(np.mean((self.theta @ truth) ** 2, axis=0))
         forces = theta @ truth / scale
-        forces += noise * np.random.default_rng([trial, 2]).standard_normal(forces.shape)
+        forces += noise * np.random.default_rng([trial, 2]).standard_normal(
+            forces.shape
+        )
         rows = (theta / scale[:, None]).reshape(-1, self.base.size)
         R = np.linalg.qr(np.column_stack([rows, forces.ravel()]), mode="r")
         return R[:, :-1], R[:, -1], len(rows)
@@ -153,11 +173,15 @@ def optimum(arms, quick):
     from references import conic
 
     import jaxid as jid
-    from jaxid.identification.consistency.solver import solve_in_numpy  # private: solver alone
+    from jaxid.identification.consistency.solver import (
+        solve_in_numpy,
+    )  # private: solver alone
 
     estimator, cases = jid.PhysicallyConsistent(), {}
     if DATA.is_dir():
-        cases = {f"{name}'s log": measured(name) for name in (("ur10",) if quick else LOGS)}
+        cases = {
+            f"{name}'s log": measured(name) for name in (("ur10",) if quick else LOGS)
+        }
     count = 4 if quick else 50
     simulated = f"{count} simulated arms"
     found = {name: [] for name in (*cases, simulated)}
@@ -176,9 +200,20 @@ def optimum(arms, quick):
         worst = max(apart for apart, _ in results)
         proved = sum(bool(ours.certified) for _, ours in results)
         most = max(int(ours.iterations) for _, ours in results)
-        said = f"{worst:.1e}; {proved} of {len(results)} proved, at most {most} iterations"
+        said = (
+            f"{worst:.1e}; {proved} of {len(results)} proved, at most {most} iterations"
+        )
         holds = worst <= 1e-6 and proved == len(results) and most <= 30
-        rows.append(Row("P1", f"objective, {name}", recipe, "<= 1e-6, proved, <= 30", said, holds))
+        rows.append(
+            Row(
+                "P1",
+                f"objective, {name}",
+                recipe,
+                "<= 1e-6, proved, <= 30",
+                said,
+                holds,
+            )
+        )
     return rows
 
 
@@ -192,7 +227,9 @@ def inertias(arm, poses):
     high = np.where(np.isfinite(limits.position_max), limits.position_max, np.pi)
     q = np.random.default_rng([arm.model.size, 4]).uniform(low, high, (poses, len(low)))
     units = jax.numpy.eye(arm.base.size)
-    return np.moveaxis(np.asarray(jax.vmap(lambda u: arm.base.mass_matrix(u, q))(units)), 0, -1)
+    return np.moveaxis(
+        np.asarray(jax.vmap(lambda u: arm.base.mass_matrix(u, q))(units)), 0, -1
+    )
 
 
 def proofs(arms, quick):
@@ -206,7 +243,9 @@ def proofs(arms, quick):
     for place, arm in enumerate(arms):
         trials = range(place, simulated, len(arms))
         noises = [0.2 * np.random.default_rng([k, 3]).random() for k in trials]
-        factors = [arm.factor(k, noise) for k, noise in zip(trials, noises, strict=True)]
+        factors = [
+            arm.factor(k, noise) for k, noise in zip(trials, noises, strict=True)
+        ]
         R, z, rows = (np.array([f[k] for f in factors]) for k in range(3))
         found = jid.consistency.consistent_batch(arm.base, R, z, rows)
         iterations += np.asarray(found.iterations).tolist()
@@ -238,7 +277,9 @@ def proofs(arms, quick):
 
 def stress(arms, quick):
     """Count fits without proof, and iterations, where fits are hard."""
-    from jaxid.identification.consistency.solver import solve_in_numpy  # private: solver alone
+    from jaxid.identification.consistency.solver import (
+        solve_in_numpy,
+    )  # private: solver alone
 
     iterations, failures = [], dict.fromkeys(WAYS, 0)
     for k in range(10 if quick else 400):
@@ -264,7 +305,10 @@ def stress(arms, quick):
 def counted(lost, iterations):
     """Return fits without proof, and iterations, in words."""
     median = int(statistics.median(iterations))
-    return f"{lost} of {len(iterations)}; iterations median {median}, most {max(iterations)}"
+    return (
+        f"{lost} of {len(iterations)}; iterations median {median}, most "
+        f"{max(iterations)}"
+    )
 
 
 def times(arms, quick):
@@ -274,7 +318,9 @@ def times(arms, quick):
     from references import conic
 
     import jaxid as jid
-    from jaxid.identification.consistency.solver import solve_compiled  # private: solver alone
+    from jaxid.identification.consistency.solver import (
+        solve_compiled,
+    )  # private: solver alone
 
     arm, estimator = arms[0], jid.PhysicallyConsistent()
     count, turns, many = (2, 2, 8) if quick else (10, 15, 256)
@@ -297,7 +343,8 @@ def times(arms, quick):
         problem.solve("CLARABEL")
         return problem.solver_stats.solve_time
 
-    # A turn takes all data sets with one solver, then with the next, so that each runs warm.
+    # A turn takes all data sets with one solver, then with the next, so that each runs
+    # warm.
     ways = (
         [partial(timed, solve_compiled, one) for one in programs],
         [partial(timed, solve, *factor) for factor in factors[:count]],
@@ -307,7 +354,9 @@ def times(arms, quick):
     R, z, rows = (np.array([f[k] for f in factors]) for k in range(3))
 
     def batch():
-        return finished(jid.consistency.consistent_batch, arm.base, R, z, rows, estimator)
+        return finished(
+            jid.consistency.consistent_batch, arm.base, R, z, rows, estimator
+        )
 
     many_fits = batch()
     spent = [timing.elapsed(batch)[1] for _ in range(3 if quick else 9)]
@@ -317,7 +366,8 @@ def times(arms, quick):
     ratio, all_of_them = np.median(ratios), np.median(spent)
     lost = int(np.sum(~np.asarray(many_fits.certified)))
     recipe = (
-        f"Panda, {arm.model.size} parameters, 5 % noise, {count} data sets one after another, "
+        f"Panda, {arm.model.size} parameters, 5 % noise, {count} data sets one after "
+        "another, "
         f"{turns} turns of both solvers; medians"
     )
     return [
@@ -326,7 +376,8 @@ def times(arms, quick):
             "one fit, warm",
             recipe,
             "<= 2.5 ms",
-            f"{1e3 * one:.2f} ms (best {1e3 * found[:, 0].min():.2f}); from triangle to parameters "
+            f"{1e3 * one:.2f} ms (best {1e3 * found[:, 0].min():.2f}); from triangle "
+            "to parameters "
             f"{1e3 * whole:.2f} ms",
             one <= 2.5e-3,
         ),
@@ -369,7 +420,9 @@ def weights(_, quick):
         logs = []
         for seed in (2 * trial, 2 * trial + 1):
             motion = jid.random_fourier_series(robot, omega=0.6, reach=0.9, seed=seed)
-            recording = virtual.measure(motion, duration=20.0, sample_time=0.01, seed=seed)
+            recording = virtual.measure(
+                motion, duration=20.0, sample_time=0.01, seed=seed
+            )
             logs.append(jid.observe(recording, robot, *smooth))
         for name, estimator in estimators.items():
             check = jid.validate(jid.identify(base, logs[0], estimator), [logs[1]])
@@ -379,9 +432,14 @@ def weights(_, quick):
     for name, fractions in indefinite.items():
         good = sum(fraction == 0.0 for fraction in fractions)
         typical = 100 * np.median(errors[name], axis=0)
-        said = ", ".join(f"{typical[axis]:.0f} % (axis {axis + 1})" for axis in (0, 4, 6))
+        said = ", ".join(
+            f"{typical[axis]:.0f} % (axis {axis + 1})" for axis in (0, 4, 6)
+        )
         holds = good == count if name == "physically consistent" else None
-        recipe = f"TX90L on its rail, {count} trials, 2000 poses each; errors on another motion"
+        recipe = (
+            f"TX90L on its rail, {count} trials, 2000 poses each; errors on "
+            "another motion"
+        )
         said = f"{good} of {count} trials; errors {said}"
         rows.append(Row("W", f"M positive definite, {name}", recipe, "-", said, holds))
     return rows
@@ -405,7 +463,8 @@ def main():
     names = ROBOTS[:: 2 if options.quick else 1]
     arms = [Arm(name) for name in (names[:1] if options.only == ["times"] else names)]
     hand_over(
-        [row for name in options.only for row in STUDIES[name](arms, options.quick)], options.json
+        [row for name in options.only for row in STUDIES[name](arms, options.quick)],
+        options.json,
     )
 
 

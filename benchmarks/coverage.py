@@ -2,16 +2,17 @@
 
     python benchmarks/coverage.py [--quick] [--json FILE]
 
-The model: `jid.robots.panda()` with random bodies of a Panda's masses, viscous and Coulomb friction
-(tanh), rotor inertias and offsets. The data: a random Fourier series (period 10 s, five harmonics)
-for 20 s at 1 kHz; forces by the model with noise of 1 % of the largest forces, of three kinds:
-white, and first-order noise with a memory of 50 ms and 300 ms; angles exact, or of 17-bit encoders
-at the joints. The pipeline: `jid.ZeroPhaseButterworth(15.0)` on angles, forces and columns, every
-20th row, weights by the largest forces. The statistic: of all base parameters the share whose 95 %
-interval holds the truth in 93 to 97 % of the draws; beside it the naive interval of the same rows.
-A draw of noise passes the same filter; the truth counts, so the filters' bias is part of every
-error. Times are of one core's own time for a fit with its intervals, once the table of the design
-is made.
+The model: `jid.robots.panda()` with random bodies of a Panda's masses, viscous and
+Coulomb friction (tanh), rotor inertias and offsets. The data: a random Fourier series
+(period 10 s, five harmonics) for 20 s at 1 kHz; forces by the model with noise of 1 %
+of the largest forces, of three kinds: white, and first-order noise with a memory of 50
+ms and 300 ms; angles exact, or of 17-bit encoders at the joints. The pipeline:
+`jid.ZeroPhaseButterworth(15.0)` on angles, forces and columns, every 20th row, weights
+by the largest forces. The statistic: of all base parameters the share whose 95 %
+interval holds the truth in 93 to 97 % of the draws; beside it the naive interval of the
+same rows. A draw of noise passes the same filter; the truth counts, so the filters'
+bias is part of every error. Times are of one core's own time for a fit with its
+intervals, once the table of the design is made.
 
 With 1000 draws a perfect method has 0.4 % of its parameters outside 93 to 97 %.
 """
@@ -84,7 +85,9 @@ def observations(base, p, seed, encoder, phase=0.0):
     if encoder:
         q = encoder * (np.round(q / encoder + phase) - phase)
     log = jid.Recording.of(q, forces, time=t)
-    return jid.observe(log, robot, jid.ZeroPhaseButterworth(CUTOFF), jid.Subsample(EVERY))
+    return jid.observe(
+        log, robot, jid.ZeroPhaseButterworth(CUTOFF), jid.Subsample(EVERY)
+    )
 
 
 def noise(random, shape, memory):
@@ -97,7 +100,9 @@ def noise(random, shape, memory):
         return white
     kept = math.exp(-1 / (RATE * memory))
     start = kept * random.standard_normal((shape[0], 1, shape[2]))
-    return signal.lfilter([np.sqrt(1 - kept**2)], [1, -kept], white, axis=1, zi=start)[0]
+    return signal.lfilter([np.sqrt(1 - kept**2)], [1, -kept], white, axis=1, zi=start)[
+        0
+    ]
 
 
 class Study:
@@ -128,7 +133,9 @@ class Study:
         self.A = A.reshape(-1, base.size)
         self.P = self.A @ np.asarray(e.inverse)
         self.square = np.einsum("tji,tji->ji", *[self.P.reshape(count, n, -1)] * 2)
-        self.own = self.o.reduced_forces - (self.A @ self.truth).reshape(count, n) / self.w
+        self.own = (
+            self.o.reduced_forces - (self.A @ self.truth).reshape(count, n) / self.w
+        )
 
     def fits(self, noise):
         """Return errors and deviations (naive; spectral, with degrees of freedom)."""
@@ -164,7 +171,9 @@ def coverage(study, memory, draws, seed):
         error, naive, honest, freedom = study.fits(e)
         quantile = special.stdtrit(np.maximum(freedom, 1.0), 0.975)
         spent += time.process_time() - start
-        naive_held = naive_held + np.sum(np.abs(error) <= special.ndtri(0.975) * naive, axis=0)
+        naive_held = naive_held + np.sum(
+            np.abs(error) <= special.ndtri(0.975) * naive, axis=0
+        )
         honest_held = honest_held + np.sum(np.abs(error) <= quantile * honest, axis=0)
         ratio = ratio + np.sum(honest / naive, axis=0)
     return naive_held / draws, honest_held / draws, ratio / draws, spent / draws
@@ -186,7 +195,10 @@ def inside(shares):
 
 def said(shares):
     """Return a coverage in words."""
-    return f"{inside(shares):.0f} (mean {100 * shares.mean():.1f}, lowest {100 * shares.min():.1f})"
+    return (
+        f"{inside(shares):.0f} (mean {100 * shares.mean():.1f}, lowest "
+        f"{100 * shares.min():.1f})"
+    )
 
 
 def coverage_rows(base, p, seeds, draws):
@@ -200,16 +212,21 @@ def coverage_rows(base, p, seeds, draws):
         for k, (name, memory) in enumerate(KINDS):
             naive, honest, ratio, spent = coverage(study, memory, draws, 10 * seed + k)
             asked = 85.0 if memory > 0.1 else 95.0
-            holds = bool(inside(honest) >= asked and (memory <= 0.1 or honest.min() >= 0.9))
+            holds = bool(
+                inside(honest) >= asked and (memory <= 0.1 or honest.min() >= 0.9)
+            )
             rows.append(
                 Row(
                     f"coverage {seed} {name}",
                     f"% of {base.size} parameters inside 93-97 %, noise {name}",
-                    f"trajectory {seed} (condition number {condition:.0f}), {draws} draws, noise "
+                    f"trajectory {seed} (condition number {condition:.0f}), {draws} "
+                    "draws, noise "
                     f"key {10 * seed + k}, {study.o.rows} rows at {RATE / EVERY:g} Hz; "
                     f"honest/naive {np.median(ratio):.2f} (median)",
-                    f">= {asked:g}{', none below 90' if memory > 0.1 else ''}; <= 1 ms per fit",
-                    f"{said(honest)}; {1e3 * spent:.2f} ms per fit; naive: {said(naive)}",
+                    f">= {asked:g}{', none below 90' if memory > 0.1 else ''}; <= 1 "
+                    "ms per fit",
+                    f"{said(honest)}; {1e3 * spent:.2f} ms per fit; naive: "
+                    f"{said(naive)}",
                     holds and spent <= 1e-3,
                 )
             )
@@ -242,14 +259,16 @@ def bias_rows(base, p, seeds, phases):
             also = ""
             if len(errors) > 1:
                 also = (
-                    f"; one log scatters by {scatter.max():.3f} (largest), so a mean of "
+                    f"; one log scatters by {scatter.max():.3f} (largest), so a mean "
+                    "of "
                     f"{phases} by {scatter.max() / phases**0.5:.3f}"
                 )
             rows.append(
                 Row(
                     f"bias {seed} {name}",
                     f"bias in standard deviations, {name} encoders",
-                    f"trajectory {seed}, forces without noise; deviations of white noise",
+                    f"trajectory {seed}, forces without noise; deviations of white "
+                    "noise",
                     "<= 0.05",
                     f"largest {shift.max():.3f}, median {np.median(shift):.4f}{also}",
                     bool(shift.max() <= 0.05),
@@ -265,7 +284,9 @@ def main():
     timing.pin_to(1)
     base = seven_axes()
     p = truth(base)
-    seeds, phases, draws = (SEEDS[:1], 1, 100) if options.quick else (SEEDS, PHASES, 1000)
+    seeds, phases, draws = (
+        (SEEDS[:1], 1, 100) if options.quick else (SEEDS, PHASES, 1000)
+    )
     rows = bias_rows(base, p, seeds, phases)
     rows += coverage_rows(base, p, seeds, draws)
     hand_over(rows, options.json)

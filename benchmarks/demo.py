@@ -1,15 +1,18 @@
 """Cost and results of `jaxid demo` as one table.
 
-The command runs in processes of its own, on the virtual TX90L on its rail, seed 0 (others with
-`--seeds`): first with an empty cache of compiled functions, then with the cache that the first run
-has left. Wall time and peak memory (largest resident set) are those of the processes; the rest is
-what `demo.json` says, the median over the seeds and the worst of them:
+The command runs in processes of its own, on the virtual TX90L on its rail, seed 0
+(others with `--seeds`): first with an empty cache of compiled functions, then with the
+cache that the first run has left. Wall time and peak memory (largest resident set) are
+those of the processes; the rest is what `demo.json` says, the median over the seeds and
+the worst of them:
 
-* average errors (Eq. 37): worst axis, percent of the largest torque, on identification and
-  verification, by least squares without weights, with weights, of bodies that could exist, and
-  by the true parameters, whose errors are what disturbs;
-* share of 2000 random poses in which the mass matrix has an eigenvalue that is not positive;
-* six base parameters cold and warm (Sec. 6), less the paper's, in percent of the paper's;
+* average errors (Eq. 37): worst axis, percent of the largest torque, on identification
+  and verification, by least squares without weights, with weights, of bodies that could
+  exist, and by the true parameters, whose errors are what disturbs;
+* share of 2000 random poses in which the mass matrix has an eigenvalue that is not
+  positive;
+* six base parameters cold and warm (Sec. 6), less the paper's, in percent of the
+  paper's;
 * speed and acceleration of the end-effector along the designed motion.
 
     python benchmarks/demo.py [--seeds 0 1 2] [--quick]
@@ -55,7 +58,9 @@ def figures(record):
     for name in ESTIMATORS:
         estimate = record["estimates"][name]
         for k, role in enumerate(("identification", "verification")):
-            found[f"average error, {role}, {name} [%]"] = max(estimate[f"mean_percent_{role}"])
+            found[f"average error, {role}, {name} [%]"] = max(
+                estimate[f"mean_percent_{role}"]
+            )
             moving = max(estimate["mean_percent_moving"][k])
             found[f"average error, {role}, {name}, moving [%]"] = moving
         found[f"poses with an indefinite mass matrix, {name} [%]"] = (
@@ -93,12 +98,18 @@ def main():
             runs = [run(root / f"warm{seed}", seed, cache) for seed in options.seeds]
             warm = float(np.median([wall for wall, _, _ in runs]))
             print(f"wall time, cold cache {cold[0]:.0f} s, warm {warm:.0f} s (median)")
-            print(f"peak memory, cold {cold[1]:.0f} MB, warm {max(r[1] for r in runs):.0f} MB")
+            print(
+                f"peak memory, cold {cold[1]:.0f} MB, warm "
+                f"{max(r[1] for r in runs):.0f} MB"
+            )
         found = [figures(record) for _, _, record in runs]
     print("\n| figure | median | worst |\n|---|---|---|")
     for name in found[0]:
         values = np.array([one[name] for one in found])
-        print(f"| {name} | {np.median(values):.4g} | {values[np.abs(values).argmax()]:.4g} |")
+        print(
+            f"| {name} | {np.median(values):.4g} | "
+            f"{values[np.abs(values).argmax()]:.4g} |"
+        )
 
 
 if __name__ == "__main__":

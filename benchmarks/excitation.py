@@ -2,25 +2,29 @@
 
     python benchmarks/excitation.py [PART ...] [--quick] [--keys 3] [--polish 0 4] ...
 
-Robot: rail + TX90L, rigid bodies (seven parameters each: 44 base parameters; ten: 57), viscous and
-Coulomb friction, rotors; joint limits of `jid.robots.tx90l_on_rail()`. Five harmonics at 0.8 rad/s,
-800 samples of one period without its end point, noise 1 % of the largest forces, 32 starts. The
-violation is the largest relative excess of position, velocity and acceleration on 8000 points. The
-gain of a motion is the geometric mean, over the parameters, of the standard deviations of weighted
-least squares in a random motion over those in this motion, and of that the mean over 15 random
-motions (`random_fourier_series`, seeds 0 to 14, at full reach).
+Robot: rail + TX90L, rigid bodies (seven parameters each: 44 base parameters; ten: 57),
+    viscous and
+Coulomb friction, rotors; joint limits of `jid.robots.tx90l_on_rail()`. Five harmonics
+at 0.8 rad/s, 800 samples of one period without its end point, noise 1 % of the largest
+forces, 32 starts. The violation is the largest relative excess of position, velocity
+and acceleration on 8000 points. The gain of a motion is the geometric mean, over the
+parameters, of the standard deviations of weighted least squares in a random motion over
+those in this motion, and of that the mean over 15 random motions
+(`random_fourier_series`, seeds 0 to 14, at full reach).
 
-* cond: condition number of the unweighted information (Eq. 36). d7, d10: D-optimal designs for 44
-  and 57 parameters. panda: both criteria for the Panda.
-* capsules-cond, capsules-d: at least 0.03 m between the robot's capsules and shapes; 8 starts, 4
-  generations, 2 polished.
+* cond: condition number of the unweighted information (Eq. 36). d7, d10: D-optimal
+  designs for 44 and 57 parameters. panda: both criteria for the Panda.
+* capsules-cond, capsules-d: at least 0.03 m between the robot's capsules and shapes; 8
+  starts, 4 generations, 2 polished.
 * rest: motions that start and stop at rest; 8 starts, 8 generations, 2 polished.
-* forces: forces of the nominal parameters below, with a payload of 6 kg, at most 90 % of the
-  limits; free: the same without this constraint.
-* step: one value and gradient against forward differences of the same function, 800 samples.
+* forces: forces of the nominal parameters below, with a payload of 6 kg, at most 90 %
+  of the limits; free: the same without this constraint.
+* step: one value and gradient against forward differences of the same function, 800
+  samples.
 * batch: starts per second of a whole search.
 
-Median and best of the keys. CPU seconds are those of the process; the first key's compile.
+Median and best of the keys. CPU seconds are those of the process; the first key's
+compile.
 """
 
 import time
@@ -71,7 +75,9 @@ def nominal_parameters(robot):
         inertia += mass * (centre @ centre - centre**2)
         bodies.append([mass, *(mass * centre), *inertia])
     force = np.asarray(robot.limits.force)
-    return np.concatenate([np.ravel(bodies), VISCOUS * force, COULOMB * force, ROTOR * force])
+    return np.concatenate(
+        [np.ravel(bodies), VISCOUS * force, COULOMB * force, ROTOR * force]
+    )
 
 
 class Evaluation:
@@ -84,14 +90,18 @@ class Evaluation:
     def __init__(self, bases):
         self.robot, self.bases = bases[0].model.robot, bases
         random = (
-            jid.random_fourier_series(self.robot, omega=0.8, harmonics=5, reach=1.0, seed=seed)
+            jid.random_fourier_series(
+                self.robot, omega=0.8, harmonics=5, reach=1.0, seed=seed
+            )
             for seed in range(15)
         )
         self.random = [[self.deviations(base, t) for base in bases] for t in random]
 
     def motion(self, trajectory, points=800):
         """Return one period without its end point."""
-        return trajectory.motion(np.arange(points) * float(trajectory.duration) / points)
+        return trajectory.motion(
+            np.arange(points) * float(trajectory.duration) / points
+        )
 
     def deviations(self, base, trajectory):
         """Return the standard deviations of weighted least squares."""
@@ -106,7 +116,9 @@ class Evaluation:
         """Return the gain for each of the base parameters."""
         own = [self.deviations(base, trajectory) for base in self.bases]
         return [
-            float(np.mean([np.exp(np.mean(np.log(r[k] / own[k]))) for r in self.random]))
+            float(
+                np.mean([np.exp(np.mean(np.log(r[k] / own[k]))) for r in self.random])
+            )
             for k in range(len(own))
         ]
 
@@ -116,7 +128,9 @@ class Evaluation:
         middle = 0.5 * (limits.position_max + limits.position_min)
         half = 0.5 * (limits.position_max - limits.position_min)
         uses = (np.abs(m.q - middle) / half, np.abs(m.qd) / limits.velocity)
-        return float(max(np.max(use) for use in (*uses, np.abs(m.qdd) / limits.acceleration)) - 1)
+        return float(
+            max(np.max(use) for use in (*uses, np.abs(m.qdd) / limits.acceleration)) - 1
+        )
 
 
 def condition(plan):
@@ -132,7 +146,9 @@ def design(name, base, figures, keys, options, **settings):
         settings |= {"starts": 2, "generations": 0, "polish": 0}
     for key in keys:
         wall, cpu = time.perf_counter(), time.process_time()
-        plan = jid.design_excitation(base, key=jax.random.key(key), throw=False, **settings)
+        plan = jid.design_excitation(
+            base, key=jax.random.key(key), throw=False, **settings
+        )
         wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
         found.append(figures(plan) | {"wall": wall, "CPU": cpu})
         print(f"  key {key}: {words(found[-1])}", flush=True)
@@ -157,7 +173,9 @@ def unconstrained(part, keys, options):
         return
     base = base_of(part != "d10")
     evaluation = Evaluation([base])
-    criteria = jid.criteria.ConditionNumber() if part == "cond" else jid.criteria.DOptimal()
+    criteria = (
+        jid.criteria.ConditionNumber() if part == "cond" else jid.criteria.DOptimal()
+    )
 
     def figures(plan):
         found = {"cond": condition(plan), "gain": evaluation.gains(plan.trajectory)[0]}
@@ -169,7 +187,9 @@ def unconstrained(part, keys, options):
 
 def constrained(part, keys, options):
     """Design with clearances, rest at the ends, or limited forces."""
-    bases = [base_of(axes, payload=part in ("forces", "free")) for axes in (True, False)]
+    bases = [
+        base_of(axes, payload=part in ("forces", "free")) for axes in (True, False)
+    ]
     evaluation, robot = Evaluation(bases), bases[0].model.robot
     settings = {"starts": 8, "generations": 8 if part == "rest" else 4, "polish": 2}
     p = nominal_parameters(robot)
@@ -197,9 +217,14 @@ def constrained(part, keys, options):
             found["speed at ends"] = float(np.abs(ends.qd[0]).max())
         if part in ("forces", "free"):
             model = bases[0].model
-            forces = np.abs(np.asarray(model.inverse_dynamics(p, m) + model.tool_forces(m)))
+            forces = np.abs(
+                np.asarray(model.inverse_dynamics(p, m) + model.tool_forces(m))
+            )
             use = forces.max(axis=0) / ((1 - MARGIN) * np.asarray(robot.limits.force))
-            found |= {"use of forces": use.max(), "joints over by 30 %": int((use > 1.3).sum())}
+            found |= {
+                "use of forces": use.max(),
+                "joints over by 30 %": int((use > 1.3).sum()),
+            }
         return found
 
     design(part, bases[0], figures, keys, options, **settings)
@@ -207,7 +232,9 @@ def constrained(part, keys, options):
 
 def step():
     """Time one value and gradient, and forward differences of the same function."""
-    problem = jid.ExcitationProblem(base_of(True), criterion=jid.criteria.ConditionNumber())
+    problem = jid.ExcitationProblem(
+        base_of(True), criterion=jid.criteria.ConditionNumber()
+    )
     x = problem.random(jax.random.key(1))
     gradient = jax.jit(jax.value_and_grad(lambda x: problem.value(x, 8.0)))
     value = jax.jit(lambda x: problem.value(x, 8.0))
@@ -248,7 +275,9 @@ def main():
     parser.add_argument("--first", type=int, default=0, help="the first key")
     parser.add_argument("--starts", type=int, default=32)
     parser.add_argument("--generations", type=int, default=12)
-    parser.add_argument("--polish", type=int, nargs="+", default=[0, 4], help="0: no polishing")
+    parser.add_argument(
+        "--polish", type=int, nargs="+", default=[0, 4], help="0: no polishing"
+    )
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     jid.keep_compiled()

@@ -2,24 +2,28 @@
 
     python benchmarks/export.py [--quick] [--model NAME ...] [--table NAME ...]
 
-Models: bodies only, so that peers do the same work; with viscous and Coulomb friction and rotors;
-the TX90L with seven parameters for each body (44 base parameters) and with ten (57); the TX40 with
-its coupled wrist. Parameters: uniform random numbers (seed 0), of which base parameters are made;
-times do not depend on them. `--quick`: a planar arm alone: does it still run, and agree?
+Models: bodies only, so that peers do the same work; with viscous and Coulomb friction
+    and rotors;
+the TX90L with seven parameters for each body (44 base parameters) and with ten (57);
+the TX40 with its coupled wrist. Parameters: uniform random numbers (seed 0), of which
+base parameters are made; times do not depend on them. `--quick`: a planar arm alone:
+does it still run, and agree?
 
-`times`: Eq. 39 factored (the recursion on base parameters that `export_c` writes); Eq. 39 literally
-as regressor times parameters; Eq. 38 as M qdd + h with M by composite bodies or by projection, on
-base parameters or on all parameters; sines and cosines alone, which are a part of each.
-All are straight-line C with parameters folded in, written by the same generator, with the same sine
-and cosine. States: 1024 random ones, in turn. One core, one process, all forms in turn, 1001 turns
-of 2048 calls, CPU time of the thread; the best of all turns, so that other work on the machine
-shows little, and ratios of these. `-O2` and `-O3 -march=native`, each
-with `-std=c99`, which leaves multiplications and additions unfused. Peers, of the Panda without
-friction, with `-O3 -march=native`: Pinocchio's `rnea` in C++, and what CasADi generates from it.
+`times`: Eq. 39 factored (the recursion on base parameters that `export_c` writes); Eq.
+39 literally as regressor times parameters; Eq. 38 as M qdd + h with M by composite
+bodies or by projection, on base parameters or on all parameters; sines and cosines
+alone, which are a part of each. All are straight-line C with parameters folded in,
+written by the same generator, with the same sine and cosine. States: 1024 random ones,
+in turn. One core, one process, all forms in turn, 1001 turns of 2048 calls, CPU time of
+the thread; the best of all turns, so that other work on the machine shows little, and
+ratios of these. `-O2` and `-O3 -march=native`, each with `-std=c99`, which leaves
+multiplications and additions unfused. Peers, of the Panda without friction, with `-O3
+-march=native`: Pinocchio's `rnea` in C++, and what CasADi generates from it.
 
-`worst`: 10^6 calls, each timed by the clock, beside as many calls of nothing: the clock's own cost
-and interruptions by the operating system. `counts`: operations for arms of which others have
-published programs. Agreement with JAX, Pinocchio and MuJoCo is tested in `tests/export`.
+`worst`: 10^6 calls, each timed by the clock, beside as many calls of nothing: the
+clock's own cost and interruptions by the operating system. `counts`: operations for
+arms of which others have published programs. Agreement with JAX, Pinocchio and MuJoCo
+is tested in `tests/export`.
 """
 
 import ctypes
@@ -38,7 +42,10 @@ import timing
 
 import jaxid as jid
 from jaxid.dynamics.projection_equation import partial_velocities  # private: Eq. 38
-from jaxid.export.torque_program import body_parameters, torque_program  # private: counts, timing
+from jaxid.export.torque_program import (
+    body_parameters,
+    torque_program,
+)  # private: counts, timing
 from jaxid.program import trace  # private: other forms of the same torques
 from jaxid.program.c_writer import CWriter  # private: C of other forms
 from jaxid.program.scalar import Operation  # private: number of angles
@@ -58,7 +65,12 @@ ARMS = {
         (jid.RigidBodies(), *FRICTION, jid.terms.CoupledDrives()),
     ),
 }
-QUICK = {"planar arm": (lambda: jid.robots.planar_arm(3, 0.4), (jid.RigidBodies(), *FRICTION))}
+QUICK = {
+    "planar arm": (
+        lambda: jid.robots.planar_arm(3, 0.4),
+        (jid.RigidBodies(), *FRICTION),
+    )
+}
 FACTORED, ALONE = "Eq. 39 factored", "sines and cosines alone"
 PEER_CALL = """
 static double memory[{size}];
@@ -137,13 +149,20 @@ def programs(model, p):
     numbers = np.asarray(fit.parameters)
 
     def eq38(x, inertia):
-        return trace(lambda q, qd, qdd: inertia(q) @ qdd + model.bias(x, q, qd), one, one, one)
+        return trace(
+            lambda q, qd, qdd: inertia(q) @ qdd + model.bias(x, q, qd), one, one, one
+        )
 
     factored = torque_program(fit)
     angles = len({x.operands for x in factored.nodes if x.operation is Operation.SINE})
     found = {
         FACTORED: factored,
-        ALONE: trace(lambda q, qd, qdd: jnp.sin(q[-angles:]) + jnp.cos(q[-angles:]), one, one, one),
+        ALONE: trace(
+            lambda q, qd, qdd: jnp.sin(q[-angles:]) + jnp.cos(q[-angles:]),
+            one,
+            one,
+            one,
+        ),
         "Eq. 39 literal": trace(lambda *s: base.columns(*s) @ numbers, one, one, one),
     }
     for name, x in (("base", own), ("all", full)):
@@ -164,7 +183,8 @@ def build(found, flags):
         text += writer.definition(program, names[name], ["q", "qd", "qdd"], ["tau"])
     opened = ctypes.CDLL(str(compiled(text + HARNESS, flags)))
     return {
-        name: ctypes.cast(getattr(opened, f), ctypes.c_void_p) for name, f in names.items()
+        name: ctypes.cast(getattr(opened, f), ctypes.c_void_p)
+        for name, f in names.items()
     }, opened
 
 
@@ -176,7 +196,9 @@ def compiled(text, flags):
     if not target.exists():
         source = target.with_suffix(".c")
         source.write_text(text)
-        subprocess.run([*command, str(source), "-o", f"{target}.part", "-lm"], check=True)
+        subprocess.run(
+            [*command, str(source), "-o", f"{target}.part", "-lm"], check=True
+        )
         Path(f"{target}.part").replace(target)
     return target
 
@@ -207,7 +229,8 @@ def time_forms(name, arm, quick):
     times = interleaved(work, 21 if quick else 1001)
     print(f"\n{name} ({jid.base_parameters(model).size} base parameters)\n")
     print(
-        "| form | multiplications + additions | -O2 [ns] | -O3 native [ns] | factored over it: "
+        "| form | multiplications + additions | -O2 [ns] | -O3 native [ns] | factored "
+        "over it: "
         "operations | time, -O2 and -O3 | without sines and cosines |"
     )
     print("|---|---|---|---|---|---|---|")
@@ -255,7 +278,9 @@ def states_of(robot, random, samples):
 
 def call(opened, function, calls, states, out):
     """Call a form on all states."""
-    opened.many(function, ctypes.c_long(calls), out.shape[1], *map(pointer, (*states, out)))
+    opened.many(
+        function, ctypes.c_long(calls), out.shape[1], *map(pointer, (*states, out))
+    )
 
 
 def peers(robot, states):
@@ -272,7 +297,12 @@ def peers(robot, states):
         print(f"a peer is skipped: {problem}")
         return found
     size = 1 + max(map(int, re.findall(r"\bw\[(\d+)\]", text)), default=0)
-    text = "#define _POSIX_C_SOURCE 199309L\n" + text + PEER_CALL.format(size=size) + HARNESS
+    text = (
+        "#define _POSIX_C_SOURCE 199309L\n"
+        + text
+        + PEER_CALL.format(size=size)
+        + HARNESS
+    )
     peer = ctypes.CDLL(str(compiled(text, FLAGS["O3"])))
     function, out = ctypes.cast(peer.peer_form, ctypes.c_void_p), np.zeros_like(wanted)
     call(peer, function, len(out), states, out)
@@ -317,8 +347,9 @@ def time_worst(name, arm, quick):
 def published(name, arm, quick):
     """Print operations for arms of which others have published programs, bodies only.
 
-    An RX90 with its joints as in robots/RX90/RX90_idm.txt of github.com/symoro/symoro; the LWR,
-    with joints like those of S7RRRRRRR1 in github.com/SchapplM/robsynth-serroblib.
+    An RX90 with its joints as in robots/RX90/RX90_idm.txt of github.com/symoro/symoro;
+    the LWR, with joints like those of S7RRRRRRR1 in
+    github.com/SchapplM/robsynth-serroblib.
     """
     twists = {"RX90": (0, 1, 0, -1, 1, -1), "LWR": (0, 1, -1, -1, 1, 1, -1)}
     lengths = {"RX90": (0, 0, 0.45, 0, 0, 0), "LWR": (0,) * 7}

@@ -1,24 +1,33 @@
 """Damaged files, SIGKILL at random moments, and long use in one process.
 
-    python benchmarks/faults.py [fuzz kill interrupt soak] [--quick] [--minutes 8] [--json FILE]
+    python benchmarks/faults.py [fuzz kill interrupt soak] [--quick] [--minutes 8]
+    [--json FILE]
 
 The files are those of `jaxid example`, the random numbers seeded.
 
-fuzz: a log (CSV, NPZ, Parquet), an experiment file, a URDF and a model file are damaged at random
-(bytes changed, inserted, removed, cut off, words replaced) and read again. Right is a result, or
-an `InputError` or `OSError`; any other exception or a warning counts as a crash.
+fuzz: a log (CSV, NPZ, Parquet), an experiment file, a URDF and a model file are damaged
+    at random
+(bytes changed, inserted, removed, cut off, words replaced) and read again. Right is a
+result, or an `InputError` or `OSError`; any other exception or a warning counts as a
+crash.
 
-kill: `jaxid identify` writes into the folder of an earlier report and gets SIGKILL at a random
-moment of the time that it takes undisturbed. Right is: every file equals that of one of the two
-reports, `result.json` is absent or all files belong to it, and the same command then ends well.
+kill: `jaxid identify` writes into the folder of an earlier report and gets SIGKILL at a
+    random
+moment of the time that it takes undisturbed. Right is: every file equals that of one of
+the two reports, `result.json` is absent or all files belong to it, and the same command
+then ends well.
 
-interrupt: each command gets SIGINT, every fifth time SIGTERM, at a random moment between 60 ms (in
-which Python itself starts) and its undisturbed end, or 20 s. Right is: it ends within 2 s with 130
-or 143 and one sentence, or as if nothing had come; no traceback; no temporary file is left.
-Signals that end Python itself before it has read the package are counted apart.
+interrupt: each command gets SIGINT, every fifth time SIGTERM, at a random moment
+    between 60 ms (in
+which Python itself starts) and its undisturbed end, or 20 s. Right is: it ends within 2
+s with 130 or 143 and one sentence, or as if nothing had come; no traceback; no
+temporary file is left. Signals that end Python itself before it has read the package
+are counted apart.
 
-soak: logs are identified, batches fitted and motions designed for robots that change every round.
-Printed: resident memory after the first sixth of the time and at the end, and open files.
+soak: logs are identified, batches fitted and motions designed for robots that change
+    every round.
+Printed: resident memory after the first sixth of the time and at the end, and open
+    files.
 """
 
 import contextlib
@@ -47,7 +56,14 @@ URDF = """<robot name="r"><link name="a"/><link name="b"><inertial>
 <limit lower="-2" upper="2" effort="50" velocity="3"/></joint>
 <joint name="k" type="prismatic"><parent link="b"/><child link="c"/><axis xyz="1 0 0"/>
 <limit upper="1" effort="5" velocity="1"/></joint></robot>"""
-FILES = ("log.csv", "log.npz", "log.parquet", "arm.urdf", "model.json", "experiment.toml")
+FILES = (
+    "log.csv",
+    "log.npz",
+    "log.parquet",
+    "arm.urdf",
+    "model.json",
+    "experiment.toml",
+)
 WORDS = (
     b"nan",
     b"inf",
@@ -85,7 +101,9 @@ def planar_base(lengths):
 
     limits = {"position_min": [-2, -2], "position_max": [2, 2], "velocity": [3, 3]}
     limits = jid.Limits(2, **limits, acceleration=[10, 10], force=[50, 20])
-    return jid.base_parameters(jid.Model(jid.robots.planar_arm(2, lengths).replace(limits=limits)))
+    return jid.base_parameters(
+        jid.Model(jid.robots.planar_arm(2, lengths).replace(limits=limits))
+    )
 
 
 # Damaged files
@@ -128,7 +146,9 @@ def readers(folder):
     (folder / "arm.urdf").write_text(URDF, encoding="utf-8")
     base = planar_base((0.5, 0.4))
     q = np.random.default_rng(0).normal(size=(4, 200, 2))
-    jid.identify(base, jid.Observations.of(*q, sample_time=0.01)).save(folder / "model.json")
+    jid.identify(base, jid.Observations.of(*q, sample_time=0.01)).save(
+        folder / "model.json"
+    )
 
     def log(path):
         return jid.read_recording(path, columns)
@@ -163,7 +183,10 @@ def fuzz(folder, minutes, quick):
                 pass
             except Exception as error:
                 line = traceback.extract_tb(error.__traceback__)[-1]
-                crashes[f"{type(error).__name__} at {Path(line.filename).name}:{line.lineno}"] = 1
+                crashes[
+                    f"{type(error).__name__} at "
+                    f"{Path(line.filename).name}:{line.lineno}"
+                ] = 1
         said = f"{count} executions, {len(crashes)} crashes {' '.join(crashes)}"
         rows.append(Row("fuzz", name, "faults.py fuzz", "0 crashes", said, not crashes))
     return rows
@@ -181,7 +204,9 @@ def contents(folder):
             values = json.loads(data)
             values.pop("made", None)
             values.pop("date", None)
-            data = json.dumps(values.get("base_parameters", values.get("parameters"))).encode()
+            data = json.dumps(
+                values.get("base_parameters", values.get("parameters"))
+            ).encode()
         if path.suffix != ".html":
             found[path.name] = hashlib.sha256(data).hexdigest()
     return found
@@ -238,7 +263,14 @@ def interrupt(folder, minutes, quick):
         "identify": ("identify", experiment, log, "-o", folder / "report"),
         "export": ("export", report, "--to", "c", "-o", folder / "arm.c", "--force"),
         "compare": ("compare", report, folder / "again", "-o", folder / "comparison"),
-        "states": ("states", experiment, log, folder / "verification.csv", "-o", folder / "states"),
+        "states": (
+            "states",
+            experiment,
+            log,
+            folder / "verification.csv",
+            "-o",
+            folder / "states",
+        ),
         "excite": ("excite", experiment, "-o", folder / "motion" / "motion.csv"),
         "demo": ("demo", "-o", folder / "demo"),
     }
@@ -265,12 +297,18 @@ def interrupt(folder, minutes, quick):
             if process.returncode == -signals and "jaxid/" not in said:
                 early += 1
                 continue
-            if left or "Traceback" in said or not (stopped or process.returncode in (0, 3)):
+            if (
+                left
+                or "Traceback" in said
+                or not (stopped or process.returncode in (0, 3))
+            ):
                 wrong.append(f"{process.returncode}: {said[-200:]!r} {left}")
         said = f"{moments} signals, {early} while Python started, "
         said += f"{len(wrong)} wrong, slowest {slowest:.2f} s {' '.join(wrong)}"
         holds = not wrong and slowest < 2.0
-        rows.append(Row("interrupt", name, "faults.py interrupt", "0 wrong, 2 s", said, holds))
+        rows.append(
+            Row("interrupt", name, "faults.py interrupt", "0 wrong, 2 s", said, holds)
+        )
         print(name, said, flush=True)
     return rows
 
@@ -297,13 +335,21 @@ def round_of_jobs(seed):
     forces = np.asarray(base.model.inverse_dynamics(np.ones(base.model.size), motion))
     noise = np.random.default_rng(seed).normal(0.0, 0.1, (8, *forces.shape))
     log = jid.Recording.of(motion.q, forces + noise[0], sample_time=0.002)
-    rows = jid.observe(log, base.model.robot, jid.ZeroPhaseButterworth(10.0), jid.Subsample(10))
+    rows = jid.observe(
+        log, base.model.robot, jid.ZeroPhaseButterworth(10.0), jid.Subsample(10)
+    )
     jid.identify(base, rows)
     with contextlib.suppress(jid.InputError):
         jid.identify(base, rows.split(0.99)[1])
     parts = (x[None, ::10] for x in (motion.q, motion.qd, motion.qdd))
     jid.identify_batch(base, jid.Motion(*parts), (forces + noise)[None, :, ::10])
-    settings = {"harmonics": 2, "starts": 2, "generations": 0, "polish": 0, "samples": 100}
+    settings = {
+        "harmonics": 2,
+        "starts": 2,
+        "generations": 0,
+        "polish": 0,
+        "samples": 100,
+    }
     jid.design_excitation(base, key=jax.random.key(seed), **settings)
 
 
@@ -318,7 +364,10 @@ def soak(folder, minutes, quick):
             early = resident()
     files = len(os.listdir("/proc/self/fd"))
     late = resident()
-    said = f"{rounds} rounds, {early:.0f} MiB after a sixth, {late:.0f} at the end, {files} files"
+    said = (
+        f"{rounds} rounds, {early:.0f} MiB after a sixth, {late:.0f} at the end, "
+        f"{files} files"
+    )
     flat = quick or late < 1.05 * early
     return [Row("soak", "memory", "faults.py soak", "at most 1.05 times", said, flat)]
 

@@ -2,10 +2,10 @@
 
     python benchmarks/fences.py [--quick] [--check] [--json FILE]
 
-A new version of JAX can ignore a fence silently: results stay right and the program becomes many
-times slower. The script prints run and compile time of a seven-joint regressor with and without
-fences; with `--check` it fails if they have no effect. Ratios count; absolute times depend on the
-machine.
+A new version of JAX can ignore a fence silently: results stay right and the program
+becomes many times slower. The script prints run and compile time of a seven-joint
+regressor with and without fences; with `--check` it fails if they have no effect.
+Ratios count; absolute times depend on the machine.
 """
 
 import sys
@@ -61,9 +61,13 @@ def accelerations(q, qd, qdd):
 
 def regressor(q, qd, qdd):
     """Return joint torques per inertial parameter, [joint, body, parameter]."""
-    partial = jax.jacfwd(lambda x: [(a, wd) for a, _, wd in accelerations(q, qd, x)])(qdd)
+    partial = jax.jacfwd(lambda x: [(a, wd) for a, _, wd in accelerations(q, qd, x)])(
+        qdd
+    )
     columns = []
-    for (along, about), (a, w, wd) in zip(partial, accelerations(q, qd, qdd), strict=True):
+    for (along, about), (a, w, wd) in zip(
+        partial, accelerations(q, qd, qdd), strict=True
+    ):
         force = [a[:, None], skew(wd) + skew(w) @ skew(w), np.zeros((3, 6))]
         moment = [
             np.zeros((3, 1)),
@@ -91,7 +95,9 @@ def measure(samples, turns):
     generator = np.random.default_rng(0)
     inputs = [jnp.asarray(x) for x in generator.uniform(-1, 1, (3, JOINTS, samples))]
     print(f"seven-joint regressor: {program.counts}")
-    runs, compiling = zip(*(compiled(lower(program, x), inputs) for x in FENCES), strict=True)
+    runs, compiling = zip(
+        *(compiled(lower(program, x), inputs) for x in FENCES), strict=True
+    )
     for plain, fenced in zip(*(run(*inputs) for run in runs), strict=True):
         np.testing.assert_allclose(fenced, plain, rtol=1e-11, atol=1e-11)
     times = []
@@ -106,7 +112,9 @@ def measure(samples, turns):
 def main():
     """Time both."""
     parser = timing.parser(__doc__, "fewer samples")
-    parser.add_argument("--check", action="store_true", help="fail if the fence is lost")
+    parser.add_argument(
+        "--check", action="store_true", help="fail if the fence is lost"
+    )
     options = parser.parse_args()
     timing.pin_to(2)
     jax.config.update("jax_platforms", "cpu")
@@ -117,9 +125,14 @@ def main():
     plain, fenced = np.median(times, axis=0)
     said = f"{ratio:.1f}x ({fenced:.0f} ns against {plain:.0f} ns)"
     print(f"{said}; compiled in {compiling[1]:.1f} s against {compiling[0]:.1f} s")
-    recipe = f"Panda, 70 columns, jax {jax.__version__}, two cores, N = {samples}, {turns} turns"
+    recipe = (
+        f"Panda, 70 columns, jax {jax.__version__}, two cores, N = {samples}, "
+        f"{turns} turns"
+    )
     holds, wanted = bool(ratio >= HOLDS_FROM), f">= {HOLDS_FROM:g}x"
-    rows = [Row("5b", "regressor, division against no fence", recipe, wanted, said, holds)]
+    rows = [
+        Row("5b", "regressor, division against no fence", recipe, wanted, said, holds)
+    ]
     hand_over(rows, options.json)
     if options.check and not holds:
         sys.exit(f"LOST FENCE: jax {jax.__version__} computes shared values again")

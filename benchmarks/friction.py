@@ -1,18 +1,20 @@
 """Friction: what `jaxid choose` finds on measured robots, and laws whose truth is known.
 
-Measured robots (`../shared/data`): the first 60 % of the logs of TX40 and UR10, log A of the KR300,
-four logs of the double pendulum. The choice sees these alone; the model that it writes is fitted
-to them and predicts the rest. "Weighted" is the RMS error in percent of the largest forces, root
-mean square of the joints (`held_out.py`); "relative" is RMS error over RMS force, mean of the
-joints; for the pendulum the norm of all errors over that of all forces, both low-pass filtered,
-beside the models of the data's authors (friction cf arctan(100 v) + b v, written down here). "What
-comes" over "promised": splits from 0.4 to 0.75, errors of the rest relative to the forces before.
+Measured robots (`../shared/data`): the first 60 % of the logs of TX40 and UR10, log A
+of the KR300, four logs of the double pendulum. The choice sees these alone; the model
+that it writes is fitted to them and predicts the rest. "Weighted" is the RMS error in
+percent of the largest forces, root mean square of the joints (`held_out.py`);
+"relative" is RMS error over RMS force, mean of the joints; for the pendulum the norm of
+all errors over that of all forces, both low-pass filtered, beside the models of the
+data's authors (friction cf arctan(100 v) + b v, written down here). "What comes" over
+"promised": splits from 0.4 to 0.75, errors of the rest relative to the forces before.
 
-Simulated arms (xarm7 and ur3 of `example-robot-data`): rigid bodies by Pinocchio, friction by
-NumPy, torque noise of 1 % of the RMS. Presliding: bristles (LuGre) with lengths of 1 to 8 mrad,
-rest-to-rest moves, encoders of 17 bits, 10 Hz; errors against the true torque of another log, in
-rows within 0.02 rad/s. Load: friction in proportion to the weight on a joint. Stribeck: half of the
-dry friction more near standstill, falling at 0.1 rad/s, which the model lacks.
+Simulated arms (xarm7 and ur3 of `example-robot-data`): rigid bodies by Pinocchio,
+friction by NumPy, torque noise of 1 % of the RMS. Presliding: bristles (LuGre) with
+lengths of 1 to 8 mrad, rest-to-rest moves, encoders of 17 bits, 10 Hz; errors against
+the true torque of another log, in rows within 0.02 rad/s. Load: friction in proportion
+to the weight on a joint. Stribeck: half of the dry friction more near standstill,
+falling at 0.1 rad/s, which the model lacks.
 
     python benchmarks/friction.py                       # everything, about an hour
     python benchmarks/friction.py tx40 stribeck         # only these
@@ -74,7 +76,9 @@ def measured(name):
     from jaxid.experiment.experiment import load_experiment  # private: experiment files
 
     experiment = load_experiment(EXPERIMENTS / f"{name}.toml")
-    return experiment, [experiment.observe(experiment.read(DATA / log)) for log in LOGS[name]]
+    return experiment, [
+        experiment.observe(experiment.read(DATA / log)) for log in LOGS[name]
+    ]
 
 
 def rest(name, asked):
@@ -88,7 +92,14 @@ def rest(name, asked):
     weighted = float(np.sqrt(np.mean(np.square(error.rms_percent))))
     said = f"{weighted:.2f} % (`{choice.chosen.name}`)"
     return [
-        Row(name, "weighted error on the rest", "60/40", f"<= {asked} %", said, weighted <= asked)
+        Row(
+            name,
+            "weighted error on the rest",
+            "60/40",
+            f"<= {asked} %",
+            said,
+            weighted <= asked,
+        )
     ]
 
 
@@ -98,9 +109,20 @@ def kr300():
 
     experiment, (first, *others) = measured("kr300")
     choice, fit = chosen_fit(experiment, [first])
-    errors = [100 * float(e.rms_relative.mean()) for e in jid.validate(fit, others).errors]
+    errors = [
+        100 * float(e.rms_relative.mean()) for e in jid.validate(fit, others).errors
+    ]
     said = "{:.0f}, {:.0f} % (`{}`)".format(*errors, choice.chosen.name)
-    return [Row("kr300", "relative errors on B, C", "A alone", "<= 22 %", said, max(errors) <= 22)]
+    return [
+        Row(
+            "kr300",
+            "relative errors on B, C",
+            "A alone",
+            "<= 22 %",
+            said,
+            max(errors) <= 22,
+        )
+    ]
 
 
 def promise(name, splits):
@@ -115,27 +137,52 @@ def promise(name, splits):
         before, after = jid.validate(fit, [train, later]).errors
         # The choice weights the joints as its first candidate does.
         first = choice.candidates[0]
-        size = np.asarray(first.estimator(jid.RegressionProblem(first.base, [train])).weights)
+        size = np.asarray(
+            first.estimator(jid.RegressionProblem(first.base, [train])).weights
+        )
         came = np.nanmean((after.errors * size) ** 2)
-        forces = np.nanmean((np.where(before.counted, before.measured, np.nan) * size) ** 2)
+        forces = np.nanmean(
+            (np.where(before.counted, before.measured, np.nan) * size) ** 2
+        )
         ratios.append(float(np.sqrt(came / forces)) / choice.promise)
         print(f"{name} {share:.2f} {choice.chosen.name}: {ratios[-1]:.2f}", flush=True)
     low, middle, high = np.quantile(ratios, (0.1, 0.5, 0.9))
     said = f"{middle:.2f} (80 % of the splits: {low:.2f} to {high:.2f})"
     what = "what comes over what was promised, median"
     asked = "0.9 to 1.15"
-    return [Row(f"{name}/promise", what, f"{splits} splits", asked, said, 0.9 <= middle <= 1.15)]
+    return [
+        Row(
+            f"{name}/promise",
+            what,
+            f"{splits} splits",
+            asked,
+            said,
+            0.9 <= middle <= 1.15,
+        )
+    ]
 
 
 def authors_torques(file, q, qd, qdd):
     """Return the torques of a published model of the pendulum."""
-    lines = dict(line.split(":") for line in file.read_text().splitlines() if ":" in line)
+    lines = dict(
+        line.split(":") for line in file.read_text().splitlines() if ":" in line
+    )
     m = {key.strip(): float(value) for key, value in lines.items()}
     (s1, s2), c2 = np.sin(q.T), np.cos(q[:, 1])
-    coupling, rotor = m["m2"] * m["l1"] * m["r2"], m["Ir"] * np.array([1, m["gr"], m["gr"] ** 2])
+    coupling, rotor = (
+        m["m2"] * m["l1"] * m["r2"],
+        m["Ir"] * np.array([1, m["gr"], m["gr"] ** 2]),
+    )
     M22 = m["I2"] + rotor[2]
     M12 = m["I2"] + coupling * c2 - rotor[1]
-    M11 = m["I1"] + m["I2"] + m["m2"] * m["l1"] ** 2 + 2 * coupling * c2 + rotor[0] + rotor[2]
+    M11 = (
+        m["I1"]
+        + m["I2"]
+        + m["m2"] * m["l1"] ** 2
+        + 2 * coupling * c2
+        + rotor[0]
+        + rotor[2]
+    )
     s12 = m["g"] * m["m2"] * m["r2"] * np.sin(q.sum(axis=1))
     v1, v2 = qd.T
     tau = np.stack(
@@ -159,8 +206,13 @@ def pendulum():
     from jaxid.experiment.experiment import parse_experiment
 
     folder = DATA / "double_pendulum"
-    experiment = parse_experiment(PENDULUM.format(folder=folder), folder / "pendulum.toml")
-    logs = [experiment.observe(experiment.read(folder / f"{x}.csv")) for x in IDENTIFY + VERIFY]
+    experiment = parse_experiment(
+        PENDULUM.format(folder=folder), folder / "pendulum.toml"
+    )
+    logs = [
+        experiment.observe(experiment.read(folder / f"{x}.csv"))
+        for x in IDENTIFY + VERIFY
+    ]
     train, later = logs[: len(IDENTIFY)], logs[len(IDENTIFY) :]
     choice, fit = chosen_fit(experiment, train)
     ours = [100 * e.relative for e in jid.validate(fit, later).errors]
@@ -172,7 +224,11 @@ def pendulum():
                 o.reduced_forces
                 - o.reduce(
                     authors_torques(
-                        file, *(np.asarray(x) for x in (o.motion.q, o.motion.qd, o.motion.qdd))
+                        file,
+                        *(
+                            np.asarray(x)
+                            for x in (o.motion.q, o.motion.qd, o.motion.qdd)
+                        ),
                     )
                 )
             )
@@ -181,10 +237,21 @@ def pendulum():
         ]
     best = np.min(list(theirs.values()), axis=0)
     said = "{:.0f}, {:.0f} % (`{}`)".format(*ours, choice.chosen.name)
-    recipe = "; ".join("{}: {:.0f}, {:.0f} %".format(name, *x) for name, x in theirs.items())
+    recipe = "; ".join(
+        "{}: {:.0f}, {:.0f} %".format(name, *x) for name, x in theirs.items()
+    )
     holds = bool(np.all(ours <= best))
     asked = "<= {:.0f}, {:.0f} %".format(*best)
-    return [Row("pendulum", "relative errors on two logs", f"authors {recipe}", asked, said, holds)]
+    return [
+        Row(
+            "pendulum",
+            "relative errors on two logs",
+            f"authors {recipe}",
+            asked,
+            said,
+            holds,
+        )
+    ]
 
 
 @functools.cache
@@ -196,7 +263,10 @@ def arm(name):
     import jaxid as jid
     from jaxid.robot.urdf import urdf_parameters
 
-    folder = Path(next(iter(cmeel.__path__))).parent / "cmeel.prefix/share/example-robot-data"
+    folder = (
+        Path(next(iter(cmeel.__path__))).parent
+        / "cmeel.prefix/share/example-robot-data"
+    )
     path = folder / "robots" / ARMS[name]
     model = pin.buildModelFromUrdf(str(path))
     data = model.createData()
@@ -220,7 +290,9 @@ def moves(joints, rng, step=1e-3, count=24):
         size = 0.02 if number % 3 == 1 else 0.8
         to = rng.uniform(-size, size, joints) + (at if size < 0.1 else 0.0)
         way = to - at
-        parts.append([at + way * shape[0], way * shape[1] / 1.5, way * shape[2] / 1.5**2])
+        parts.append(
+            [at + way * shape[0], way * shape[1] / 1.5, way * shape[2] / 1.5**2]
+        )
         still = np.zeros((int(0.5 / step), joints))
         parts.append([still + to, still, still])
         at = to
@@ -259,13 +331,21 @@ def presliding(name, draws):
         for _ in range(2):
             m = moves(n, rng)
             rigid = torques(m)
-            size = np.maximum(np.sqrt(np.mean(rigid**2, axis=0)), 0.5) if size is None else size
+            size = (
+                np.maximum(np.sqrt(np.mean(rigid**2, axis=0)), 0.5)
+                if size is None
+                else size
+            )
             true = rigid + 0.2 * size * m.qd + 0.2 * size * bristles(m.qd, length)
             grid = 2 * np.pi / 2**17
             forces = true + NOISE * size * rng.normal(size=true.shape)
-            recording = jid.Recording.of(np.round(m.q / grid) * grid, forces, sample_time=1e-3)
+            recording = jid.Recording.of(
+                np.round(m.q / grid) * grid, forces, sample_time=1e-3
+            )
             logs.append(
-                jid.observe(recording, robot, jid.ZeroPhaseButterworth(10), jid.Subsample(20))
+                jid.observe(
+                    recording, robot, jid.ZeroPhaseButterworth(10), jid.Subsample(20)
+                )
             )
             clean.append(logs[-1].reduce(true))
         still = np.abs(logs[1].reduced_motion.qd) < 0.02
@@ -281,13 +361,23 @@ def presliding(name, draws):
             found.append(np.sqrt(np.mean((error / size)[still] ** 2)))
         ratios.append(found[0] / found[1])
     errors = np.concatenate(worst)
-    lengths = f"median error {np.median(errors):.0%}, {np.mean(errors <= 0.2):.0%} within 20 %"
+    lengths = (
+        f"median error {np.median(errors):.0%}, {np.mean(errors <= 0.2):.0%} "
+        "within 20 %"
+    )
     recipe = f"{name}, {draws} draws"
     ratio = f"{np.median(ratios):.2f} (largest {max(ratios):.2f})"
     holds = bool(np.mean(errors <= 0.2) >= 0.95), bool(max(ratios) <= 1 / 3)
     return [
         Row(f"presliding/{name}", "lengths", recipe, "within 20 %", lengths, holds[0]),
-        Row(f"rest/{name}", "error at rest over tanh's", recipe, "<= 0.33", ratio, holds[1]),
+        Row(
+            f"rest/{name}",
+            "error at rest over tanh's",
+            recipe,
+            "<= 0.33",
+            ratio,
+            holds[1],
+        ),
     ]
 
 
@@ -317,7 +407,9 @@ def load(name, draws):
     from jaxid.experiment.experiment import parse_experiment
 
     path, robot, _, torques = arm(name)
-    experiment = parse_experiment(f'[robot]\nurdf = "{path}"\n[model]\nload = true\n', path)
+    experiment = parse_experiment(
+        f'[robot]\nurdf = "{path}"\n[model]\nload = true\n', path
+    )
     truth, errors, held = np.linspace(0.1, 0.25, robot.joints), [], []
     for seed in range(draws):
         rng = np.random.default_rng(seed)
@@ -327,16 +419,26 @@ def load(name, draws):
         log = observed(m, rigid + 0.1 * size * m.qd + dry * sign, size, rng)
         fit = experiment.fit(RegressionProblem(experiment.base, [log]))
         for j, value in enumerate(truth):
-            if f"fl{j + 1}" in fit.base.names and np.abs(weight[:, j]).max() > 0.02 * size.max():
+            if (
+                f"fl{j + 1}" in fit.base.names
+                and np.abs(weight[:, j]).max() > 0.02 * size.max()
+            ):
                 k = fit.base.names.index(f"fl{j + 1}")
                 errors.append(abs(fit.parameters[k] / value - 1))
                 low, high = fit.intervals()[k]
                 held.append(low <= value <= high)
     near, cover = np.mean(np.array(errors) <= 0.05), np.mean(held)
-    said = f"median error {np.median(errors):.1%}, {near:.0%} within 5 %; {cover:.1%} covered"
+    said = (
+        f"median error {np.median(errors):.1%}, {near:.0%} within 5 %; {cover:.1%} "
+        "covered"
+    )
     holds = bool(near >= 0.95 and 0.93 <= cover <= 0.97)
     asked = "within 5 %; 93 to 97 %"
-    return [Row(f"load/{name}", "coefficients of load", f"{draws} draws", asked, said, holds)]
+    return [
+        Row(
+            f"load/{name}", "coefficients of load", f"{draws} draws", asked, said, holds
+        )
+    ]
 
 
 def stribeck(name, draws):
@@ -362,11 +464,20 @@ def stribeck(name, draws):
             warned += any(jid.validate(fit, log).errors[0].depend_on_speed)
         cover, share_warned = np.mean(held), warned / draws
         said = f"{cover:.0%} covered, warned in {share_warned:.0%}"
-        asked = "85 % covered, or warned in 95 %" if share else "93 to 97 %; rarely warned"
+        asked = (
+            "85 % covered, or warned in 95 %" if share else "93 to 97 %; rarely warned"
+        )
         holds = cover >= 0.85 or share_warned >= 0.95 if share else share_warned <= 0.05
         what = "friction with unknown Stribeck part" if share else "without it"
         rows.append(
-            Row(f"stribeck/{name}/{share}", what, f"{draws} draws", asked, said, bool(holds))
+            Row(
+                f"stribeck/{name}/{share}",
+                what,
+                f"{draws} draws",
+                asked,
+                said,
+                bool(holds),
+            )
         )
     return rows
 
@@ -380,13 +491,18 @@ def main():
     draws = 2 if options.quick else 30
     parts = {}
     if DATA.is_dir() and not options.quick:
-        parts |= {"tx40": lambda: rest("tx40", 1.75), "ur10": lambda: rest("ur10", 1.65)}
+        parts |= {
+            "tx40": lambda: rest("tx40", 1.75),
+            "ur10": lambda: rest("ur10", 1.65),
+        }
         parts |= {"kr300": kr300, "pendulum": pendulum}
         parts |= {f"promise-{x}": functools.partial(promise, x, 20) for x in LOGS}
     if timing.missing("pinocchio") is None:
         for study in (presliding, load, stribeck):
             few = max(1, draws // 6) if study is presliding else draws
-            parts |= {f"{study.__name__}-{x}": functools.partial(study, x, few) for x in ARMS}
+            parts |= {
+                f"{study.__name__}-{x}": functools.partial(study, x, few) for x in ARMS
+            }
     rows = []
     for name, part in parts.items():
         if not options.parts or any(name.startswith(x) for x in options.parts):

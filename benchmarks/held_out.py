@@ -1,22 +1,29 @@
 """Held-out errors of estimators and friction models on two measured robots.
 
-Data: the logs of the Stäubli TX40 and the Universal Robots UR10 in `../shared/data`, prepared as
-the experiment files `tests/real_data/tx40.toml` (20 Hz, every 50th row) and `ur10.toml` (4 Hz) say,
-divided in time: the first 60 % of the rows to identify with, the rest to verify with.
+Data: the logs of the Stäubli TX40 and the Universal Robots UR10 in `../shared/data`,
+    prepared as
+the experiment files `tests/real_data/tx40.toml` (20 Hz, every 50th row) and `ur10.toml`
+(4 Hz) say, divided in time: the first 60 % of the rows to identify with, the rest to
+verify with.
 
-Model: rigid bodies with ten parameters each, rotor inertias, viscous and Coulomb friction (smooth
-sign, epsilon 0.01 rad/s), offsets, and on the TX40 the coupled wrist. The row "epsilons" finds one
-epsilon for each joint, the row "Stribeck" has Stribeck's law and finds its speeds too; each is the
-linear model where held-out blocks *of the identification part* say that it does not pay (last
-column). The row "essential" leaves out base parameters by held-out blocks of the same part.
+Model: rigid bodies with ten parameters each, rotor inertias, viscous and Coulomb
+    friction (smooth
+sign, epsilon 0.01 rad/s), offsets, and on the TX40 the coupled wrist. The row
+"epsilons" finds one epsilon for each joint, the row "Stribeck" has Stribeck's law and
+finds its speeds too; each is the linear model where held-out blocks *of the
+identification part* say that it does not pay (last column). The row "essential" leaves
+out base parameters by held-out blocks of the same part.
 
-Statistics: "weighted" is the RMS error in percent of the largest forces, root mean square of the
-joints: what weighted least squares minimise. "relative" is the norm of all errors over the norm of
-all forces. "moving" is the weighted error of the rows of the rest in which some joint moves: the
-TX40 stands still at the end. "of WLS" compares with weighted least squares.
+Statistics: "weighted" is the RMS error in percent of the largest forces, root mean
+    square of the
+joints: what weighted least squares minimise. "relative" is the norm of all errors over
+    the norm of
+all forces. "moving" is the weighted error of the rows of the rest in which some joint
+moves: the TX40 stands still at the end. "of WLS" compares with weighted least squares.
 
-    python benchmarks/held_out.py            # both robots, all rows; or one: `held_out.py ur10`
-    python benchmarks/held_out.py --quick    # the UR10, without the rows that search
+    python benchmarks/held_out.py            # both robots, all rows; or one:
+    `held_out.py ur10` python benchmarks/held_out.py --quick    # the UR10, without the
+    rows that search
 """
 
 import jax
@@ -60,11 +67,19 @@ def fits(base: jid.BaseParameters, train: jid.Observations, *, quick: bool):
     for remark, pull in (("", None), ("entropic pull", jid.consistency.EntropicPull())):
         consistent = jid.identify(base, train, jid.PhysicallyConsistent(pull=pull))
         price = f"residual increase {consistent.consistency.residual_increase:.1%}"
-        yield "physically consistent", consistent, ", ".join(filter(None, (remark, price)))
+        yield (
+            "physically consistent",
+            consistent,
+            ", ".join(filter(None, (remark, price))),
+        )
     stepwise = jid.identify(base, train, Stepwise())
     yield "axis by axis", stepwise, ""
     essential = jid.essential_parameters(wls, train)
-    yield "essential parameters", essential.fit, f"{essential.last.remaining} of {base.size}"
+    yield (
+        "essential parameters",
+        essential.fit,
+        f"{essential.last.remaining} of {base.size}",
+    )
     if quick:
         return
     for name, other in (("epsilons", base), ("Stribeck", stribeck(base))):
@@ -82,7 +97,8 @@ def table(name: str, *, quick: bool) -> list[str]:
     recording = experiment.read(DATA / LOGS[name])
     train, test = experiment.observe(recording).split(SHARE)
     lines = [
-        f"| {name.upper()} | weighted, first 60 % | weighted, rest | of WLS | moving | of WLS "
+        f"| {name.upper()} | weighted, first 60 % | weighted, rest | of WLS | moving "
+        "| of WLS "
         "| relative, rest | |",
         "|---|---|---|---|---|---|---|---|",
     ]
@@ -92,12 +108,18 @@ def table(name: str, *, quick: bool) -> list[str]:
         errors = jid.validate(fit, [train, test]).errors
         parts = (errors[0].errors, errors[1].errors, errors[1].errors[moving])
         largest = np.asarray(errors[0].max_forces)
-        before, after, there = (float(np.sqrt(np.nanmean((e / largest) ** 2))) for e in parts)
+        before, after, there = (
+            float(np.sqrt(np.nanmean((e / largest) ** 2))) for e in parts
+        )
         reference = (after, there) if reference is None else reference
-        beside, there_beside = (x / y - 1 for x, y in zip((after, there), reference, strict=True))
+        beside, there_beside = (
+            x / y - 1 for x, y in zip((after, there), reference, strict=True)
+        )
         lines.append(
             f"| {label} | {before:.2%} | {after:.2%} | {beside:+.1%} | {there:.2%} "
-            f"| {there_beside:+.1%} | {errors[1].relative:.2%} | {remark} |".replace("%", " %")
+            f"| {there_beside:+.1%} | {errors[1].relative:.2%} | {remark} |".replace(
+                "%", " %"
+            )
         )
     return lines
 

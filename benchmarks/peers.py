@@ -3,9 +3,9 @@
     python benchmarks/peers.py [--quick] [--json FILE]
     python benchmarks/peers.py --gpu            # on the first GPU of JAX, without peers
 
-The script starts itself twice: on one core, then on two. What is compared runs in turn in one
-process, on the same motion, and is compared number by number before it is timed. Peers that are
-not installed are skipped by name.
+The script starts itself twice: on one core, then on two. What is compared runs in turn
+in one process, on the same motion, and is compared number by number before it is timed.
+Peers that are not installed are skipped by name.
 """
 
 import json
@@ -81,8 +81,10 @@ def compare(number, what, recipe, asked, ours, peer, samples, target):
     """Return the row of a ratio to a peer."""
     ratio = peer / ours
     measured = (
-        f"{ratio:.1f}x ({per_sample(ours, samples)} against {per_sample(peer, samples)}); "
-        f"best turns {peer.best / ours.best:.1f}x ({ours.best / samples * NS:.0f} ns against "
+        f"{ratio:.1f}x ({per_sample(ours, samples)} against "
+        f"{per_sample(peer, samples)}); "
+        f"best turns {peer.best / ours.best:.1f}x ({ours.best / samples * NS:.0f} ns "
+        "against "
         f"{peer.best / samples * NS:.0f} ns)"
     )
     return Row(number, what, recipe, asked, measured, ratio >= target)
@@ -98,7 +100,8 @@ def with_friction(samples, turns):
 
     what = "regressor with friction and rotors, against FIGAROH"
     recipe = (
-        f"Panda, bodies + viscous + Coulomb (sign) + rotor columns = 91, N = {samples}, two cores "
+        "Panda, bodies + viscous + Coulomb (sign) + rotor columns = 91, N = "
+        f"{samples}, two cores "
         f"(FIGAROH's loop uses one of them), median of {turns} turns"
     )
     absent = timing.missing("figaroh") or timing.missing("pinocchio")
@@ -125,23 +128,39 @@ def with_friction(samples, turns):
 
         pinned = pinocchio_model(robot, Bodies(n))
         figaroh_robot = SimpleNamespace(model=pinned, data=pinned.createData())
-        config = {"has_friction": True, "has_actuator_inertia": True, "act_idxv": list(range(n))}
-        cases["figaroh"] = lambda: build_regressor_basic(figaroh_robot, q, qd, qdd, config)
+        config = {
+            "has_friction": True,
+            "has_actuator_inertia": True,
+            "act_idxv": list(range(n)),
+        }
+        cases["figaroh"] = lambda: build_regressor_basic(
+            figaroh_robot, q, qd, qdd, config
+        )
         theirs = cases["figaroh"]()
         bodies = theirs[:, : 10 * n].reshape(n, samples, 10 * n).swapaxes(0, 1)
         bodies = in_our_order(bodies, n).swapaxes(0, 1).reshape(n * samples, -1)
         np.testing.assert_allclose(matrix()[:, : 10 * n], bodies, atol=1e-9)
-        np.testing.assert_allclose(matrix()[:, 10 * n :], theirs[:, 10 * n :], atol=1e-9)
+        np.testing.assert_allclose(
+            matrix()[:, 10 * n :], theirs[:, 10 * n :], atol=1e-9
+        )
     times = interleaved(cases, turns)
     floor = f"floor: fill of the non-zero entries {per_sample(times['fill'], samples)}"
-    recipe = f"{recipe}; {floor}; `Model.regressor` {per_sample(times['public'], samples)}"
+    recipe = (
+        f"{recipe}; {floor}; `Model.regressor` {per_sample(times['public'], samples)}"
+    )
     if absent is not None:
-        ours = ", ".join(f"{k} {per_sample(times[k], samples)}" for k in ("packed", "matrix"))
-        return [Row("1", what, recipe, ">= 25x packed, >= 7x dense", f"{ours}; {absent}")]
+        ours = ", ".join(
+            f"{k} {per_sample(times[k], samples)}" for k in ("packed", "matrix")
+        )
+        return [
+            Row("1", what, recipe, ">= 25x packed, >= 7x dense", f"{ours}; {absent}")
+        ]
     return [
-        compare("1a", f"{what}, packed", recipe, ">= 25x (stretch 40x)", times["packed"],
+        compare("1a", f"{what}, packed", recipe, ">= 25x (stretch "
+"40x)", times["packed"],
                 times["figaroh"], samples, 25),
-        compare("1b", f"{what}, Fortran-ordered matrix", recipe, ">= 7x", times["matrix"],
+        compare("1b", f"{what}, Fortran-ordered "
+"matrix", recipe, ">= 7x", times["matrix"],
                 times["figaroh"], samples, 7),
     ]  # fmt: skip
 
@@ -167,7 +186,9 @@ def one_core(samples, turns):
     try:
         loop = Loop(robot, bodies, *state)
         matrix = packed().matrix()
-        theirs = in_our_order(loop.regressors(), n).swapaxes(0, 1).reshape(n * samples, -1)
+        theirs = (
+            in_our_order(loop.regressors(), n).swapaxes(0, 1).reshape(n * samples, -1)
+        )
         np.testing.assert_allclose(matrix, theirs, atol=1e-9)
         np.testing.assert_allclose(forces(), loop.torques(), atol=1e-9)
         cases |= {"C++ regressor": loop.regressors, "C++ forces": loop.torques}
@@ -184,26 +205,42 @@ def one_core(samples, turns):
     floor = times["fill"]
     work = counts.multiplications + counts.additions
     recipe = (
-        f"Panda, ten parameters per body = 70 columns, {nonzero} non-zero entries, N = {samples}, "
-        f"one core, median of {turns} turns; floors: warm fill {per_sample(floor, samples)}, "
+        f"Panda, ten parameters per body = 70 columns, {nonzero} non-zero entries, N "
+        f"= {samples}, "
+        f"one core, median of {turns} turns; floors: warm fill "
+        f"{per_sample(floor, samples)}, "
         f"{work} operations at {rate / NS:.0f} Gflop/s {work / rate * NS:.0f} ns"
     )
-    asked = {2: ">= 3.5x (stretch 5x)", 31: ">= 6x", 32: ">= 30x", 4: "<= 9x (stretch 6x)"}
+    asked = {
+        2: ">= 3.5x (stretch 5x)",
+        31: ">= 6x",
+        32: ">= 30x",
+        4: "<= 9x (stretch 6x)",
+    }
     ours, torque = times["regressor"], times["forces"]
     rows = []
     if "C++ regressor" in times:
         what = "regressor, against Pinocchio in C++ with store"
         rows.append(
-            compare("2", what, recipe, asked[2], ours, times["C++ regressor"], samples, 3.5)
+            compare(
+                "2", what, recipe, asked[2], ours, times["C++ regressor"], samples, 3.5
+            )
         )
         what = "inverse dynamics, against Pinocchio in C++"
-        rows.append(compare("3a", what, recipe, asked[31], torque, times["C++ forces"], samples, 6))
+        rows.append(
+            compare(
+                "3a", what, recipe, asked[31], torque, times["C++ forces"], samples, 6
+            )
+        )
     if "frax" in times:
         what = "inverse dynamics, against frax"
-        rows.append(compare("3b", what, recipe, asked[32], torque, times["frax"], samples, 30))
+        rows.append(
+            compare("3b", what, recipe, asked[32], torque, times["frax"], samples, 30)
+        )
     over = ours / floor
     measured = (
-        f"{over:.1f}x ({per_sample(ours, samples)} against {per_sample(floor, samples)}); "
+        f"{over:.1f}x ({per_sample(ours, samples)} against "
+        f"{per_sample(floor, samples)}); "
         f"best turns {ours.best / floor.best:.1f}x"
     )
     what = "regressor, against a warm fill of its non-zero entries"
@@ -251,18 +288,27 @@ def on_gpu(quick):
         turns,
     )
     recipe = (
-        f"{jax.devices()[0].device_kind}, jax {jax.__version__}, Panda, float64, N = {samples}, "
+        f"{jax.devices()[0].device_kind}, jax {jax.__version__}, Panda, float64, N = "
+        f"{samples}, "
         f"median of {turns} turns, compile of the regressor {compiling:.1f} s"
     )
     *dynamics, (name, design) = times.items()
-    rows = [Row("G", f"{key}, GPU", recipe, "-", per_sample(t, samples)) for key, t in dynamics]
-    return [*rows, Row("G", f"{name}, GPU", recipe, "-", f"{1e3 * design.median:.2f} ms")]
+    rows = [
+        Row("G", f"{key}, GPU", recipe, "-", per_sample(t, samples))
+        for key, t in dynamics
+    ]
+    return [
+        *rows,
+        Row("G", f"{name}, GPU", recipe, "-", f"{1e3 * design.median:.2f} ms"),
+    ]
 
 
 def main():
     """Measure on one core and on two, each in a process of its own."""
     parser = timing.parser(__doc__, "fewer samples and turns")
-    parser.add_argument("--cores", type=int, choices=(1, 2), help="only the rows of so many cores")
+    parser.add_argument(
+        "--cores", type=int, choices=(1, 2), help="only the rows of so many cores"
+    )
     parser.add_argument("--gpu", action="store_true", help="only the figures of a GPU")
     options = parser.parse_args()
     if options.gpu:
@@ -271,14 +317,25 @@ def main():
     if options.cores is not None:
         timing.pin_to(options.cores)
         samples, turns = (1024, 5) if options.quick else (16384, 25)
-        rows = with_friction(samples, turns) if options.cores == 2 else one_core(samples, turns)
+        rows = (
+            with_friction(samples, turns)
+            if options.cores == 2
+            else one_core(samples, turns)
+        )
         hand_over(rows, options.json)
         return
     rows = []
     for cores in (1, 2):
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "rows.json"
-            again = [sys.executable, __file__, "--cores", str(cores), "--json", str(path)]
+            again = [
+                sys.executable,
+                __file__,
+                "--cores",
+                str(cores),
+                "--json",
+                str(path),
+            ]
             subprocess.run([*again, *["--quick"] * options.quick], check=True)
             rows += [Row(**row) for row in json.loads(path.read_text())]
     if options.json:

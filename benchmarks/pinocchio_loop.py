@@ -1,8 +1,8 @@
 """The same arm in Pinocchio, and a C++ loop over samples that is built from its headers.
 
-The loop is compiled with all of this processor's instructions; it needs `g++`, Boost's headers
-(which come with the wheel of Pinocchio) and Eigen's. Eigen is looked for in `EIGEN3_INCLUDE`, in
-the wheel `cmeel-eigen`, and where distributions put it.
+The loop is compiled with all of this processor's instructions; it needs `g++`, Boost's
+headers (which come with the wheel of Pinocchio) and Eigen's. Eigen is looked for in
+`EIGEN3_INCLUDE`, in the wheel `cmeel-eigen`, and where distributions put it.
 """
 
 import ctypes
@@ -17,8 +17,8 @@ import numpy as np
 
 SOURCE = Path(__file__).with_name("pinocchio_loop.cpp")
 GENERATOR = Path(__file__).with_name("pinocchio_casadi.cpp")
-# Column of Pinocchio's regressor for each of (m, mx, my, mz, A, B, C, D, E, F); D, E and F are
-# integrals, Pinocchio has the entries of the tensor.
+# Column of Pinocchio's regressor for each of (m, mx, my, mz, A, B, C, D, E, F); D, E
+# and F are integrals, Pinocchio has the entries of the tensor.
 ORDER = [0, 1, 2, 3, 4, 6, 9, 8, 7, 5]
 SIGNS = np.array([1, 1, 1, 1, 1, 1, 1, -1, -1, -1.0])
 BOOST = {
@@ -44,7 +44,9 @@ class Bodies:
         rows = []
         for m, c, inertia in zip(self.mass, self.centre, self.inertia, strict=True):
             J = inertia + m * (c @ c * np.eye(3) - np.outer(c, c))
-            rows.append([m, *(m * c), J[0, 0], J[1, 1], J[2, 2], -J[1, 2], -J[0, 2], -J[0, 1]])
+            rows.append(
+                [m, *(m * c), J[0, 0], J[1, 1], J[2, 2], -J[1, 2], -J[0, 2], -J[0, 1]]
+            )
         return np.array(rows)
 
 
@@ -53,7 +55,11 @@ def pinocchio_model(robot, bodies):
     import pinocchio as pin
 
     model = pin.Model()
-    axes = {(1, 0, 0): pin.JointModelRX, (0, 1, 0): pin.JointModelRY, (0, 0, 1): pin.JointModelRZ}
+    axes = {
+        (1, 0, 0): pin.JointModelRX,
+        (0, 1, 0): pin.JointModelRY,
+        (0, 0, 1): pin.JointModelRZ,
+    }
     for i in range(robot.joints):
         axis = np.asarray(robot.axis[i])
         aligned = axes.get(tuple(axis))
@@ -90,9 +96,19 @@ def build(source=SOURCE, *extra):
         places.insert(0, Path(os.environ["EIGEN3_INCLUDE"]))
     eigen = next((p for p in places if (p / "Eigen/Core").exists()), None)
     if eigen is None:
-        raise RuntimeError("no headers of Eigen (pip install cmeel-eigen, or set EIGEN3_INCLUDE)")
+        raise RuntimeError(
+            "no headers of Eigen (pip install cmeel-eigen, or set EIGEN3_INCLUDE)"
+        )
     include = prefixes()[0] / "include"
-    command = ["g++", "-std=c++17", "-O3", "-march=native", "-DNDEBUG", "-shared", "-fPIC"]
+    command = [
+        "g++",
+        "-std=c++17",
+        "-O3",
+        "-march=native",
+        "-DNDEBUG",
+        "-shared",
+        "-fPIC",
+    ]
     command += ["-fvisibility=hidden", "-Wl,-Bsymbolic", "-w", str(source)]
     command += [f"-D{name}={value}" for name, value in BOOST.items()]
     command += [f"-I{include}", f"-I{eigen}", *extra]
@@ -102,11 +118,15 @@ def build(source=SOURCE, *extra):
     if not target.exists():
         partial = target.with_suffix(f".{os.getpid()}")
         try:
-            done = subprocess.run([*command, "-o", str(partial)], capture_output=True, text=True)
+            done = subprocess.run(
+                [*command, "-o", str(partial)], capture_output=True, text=True
+            )
         except OSError as problem:
             raise RuntimeError(f"no g++: {problem}") from problem
         if done.returncode:
-            first = next((x for x in done.stderr.splitlines() if "error" in x), "no message")
+            first = next(
+                (x for x in done.stderr.splitlines() if "error" in x), "no message"
+            )
             raise RuntimeError(f"g++ says: {first[:200]}")
         partial.replace(target)
     return target
@@ -122,10 +142,13 @@ class Loop:
         self.library.arm_new.restype = ctypes.c_void_p
         joints = robot.joints
         rows = np.concatenate(
-            [bodies.mass[:, None], bodies.centre, bodies.inertia.reshape(joints, 9)], axis=1
+            [bodies.mass[:, None], bodies.centre, bodies.inertia.reshape(joints, 9)],
+            axis=1,
         )
         parent = np.array(robot.parent, np.int32)
-        arrays = [np.ascontiguousarray(x, float) for x in (robot.rotation, robot.offset)]
+        arrays = [
+            np.ascontiguousarray(x, float) for x in (robot.rotation, robot.offset)
+        ]
         arrays += [np.ascontiguousarray(robot.axis, float), np.ascontiguousarray(rows)]
         self.arm = ctypes.c_void_p(
             self.library.arm_new(joints, *(_address(x) for x in [parent, *arrays]))

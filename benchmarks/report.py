@@ -2,9 +2,10 @@
 
     python benchmarks/report.py [--quick] [--json FILE]
 
-A Panda with random bodies follows two random Fourier series; every sample is a row, one log is of
-the fit and one verifies it. `write_report` runs twice; the second time counts, and includes all
-files. Whether the page can be read in a browser is tested in `tests/report/test_browser.py`.
+A Panda with random bodies follows two random Fourier series; every sample is a row, one
+log is of the fit and one verifies it. `write_report` runs twice; the second time
+counts, and includes all files. Whether the page can be read in a browser is tested in
+`tests/report/test_browser.py`.
 """
 
 import tempfile

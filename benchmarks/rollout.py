@@ -1,18 +1,28 @@
 """Rollouts: identification from commands and encoders, without torques.
 
-so101: the SO-101's log (needs ../shared/data), identified on four motions, free-running on six
-others, beside the linear joint and the copied command; joints 1 to 5 [mrad]; time with compiling.
-pendulum: the double pendulum's four logs, ends of windows of 0.1 and 0.2 s on two others, beside
-the authors' models with their own friction, cf arctan(100 v), and the same torques, and beside
-other methods; the same on the four logs, each left out in turn, and on those of the fit.
-coverage: a simulated servo arm of six axes on MuJoCo, 50 Hz, 12 bits; the truth lies in so many of
-the 95 % intervals; with Stribeck friction that the model leaves out, in how many draws it warns.
+so101: the SO-101's log (needs ../shared/data), identified on four motions, free-running
+    on six
+others, beside the linear joint and the copied command; joints 1 to 5 [mrad]; time with
+compiling.
+pendulum: the double pendulum's four logs, ends of windows of 0.1 and 0.2 s on two
+    others, beside
+the authors' models with their own friction, cf arctan(100 v), and the same torques, and
+beside other methods; the same on the four logs, each left out in turn, and on those of
+the fit.
+coverage: a simulated servo arm of six axes on MuJoCo, 50 Hz, 12 bits; the truth lies in
+    so many of
+the 95 % intervals; with Stribeck friction that the model leaves out, in how many draws
+it warns.
 gains: the same arm with servos of 1 and 1.6 times the gain.
-confounded: one joint whose logs tell damping and delay, or armature and gain, only together.
+confounded: one joint whose logs tell damping and delay, or armature and gain, only
+    together.
 quadruped: twelve hung joints on MuJoCo, 30 s at 200 Hz: time, compiled before.
-band: one hundred posterior models on MuJoCo; fraction of a held-out motion within their band.
-sysid: the SO-101's joint 2, and joints 1 to 5, identified by mujoco.sysid; fifteen minutes.
-evolution: the same joint by CMA-ES with the simulator of this package, given the same CPU time.
+band: one hundred posterior models on MuJoCo; fraction of a held-out motion within their
+    band.
+sysid: the SO-101's joint 2, and joints 1 to 5, identified by mujoco.sysid; fifteen
+    minutes.
+evolution: the same joint by CMA-ES with the simulator of this package, given the same
+    CPU time.
 
     python benchmarks/rollout.py so101 pendulum coverage gains confounded quadruped band
     python benchmarks/rollout.py --quick
@@ -68,7 +78,9 @@ def so101_file() -> str:
 
 
 def so101_logs(names) -> list[jid.Recording]:
-    return [jid.read_recording(DATA / "so101" / f"{name}.csv", COMMANDS) for name in names]
+    return [
+        jid.read_recording(DATA / "so101" / f"{name}.csv", COMMANDS) for name in names
+    ]
 
 
 def so101(quick: bool) -> None:
@@ -81,17 +93,26 @@ def so101(quick: bool) -> None:
     print(fit)
     errors = fit.validate(so101_logs(UNSEEN))
     for kind in ("simulated", "linear", "command"):
-        print(f"{kind:10s}", (1e3 * errors.total(kind)[:5]).round(1), "mrad, joints 1 to 5")
+        print(
+            f"{kind:10s}",
+            (1e3 * errors.total(kind)[:5]).round(1),
+            "mrad, joints 1 to 5",
+        )
     print(f"identified in {elapsed:.0f} s; contacts on the six: {len(errors.contacts)}")
     held = np.full((700, 6), 0.3)
     held[:100] *= np.linspace(0.0, 1.0, 100)[:, None]
     (path,) = fit.simulate(jid.Recording.of(0 * held, held, sample_time=0.02))
-    print(f"drift while the command holds for 12 s: {np.ptp(path[-550:], axis=0).max():.1e} rad")
+    print(
+        "drift while the command holds for 12 s: "
+        f"{np.ptp(path[-550:], axis=0).max():.1e} rad"
+    )
 
 
 def authors(number: str) -> dict[str, float]:
     lines = (DATA / "double_pendulum" / f"model_{number}.yml").read_text().splitlines()
-    return {k: float(v) for k, v in (line.split(": ") for line in lines if ": " in line)}
+    return {
+        k: float(v) for k, v in (line.split(": ") for line in lines if ": " in line)
+    }
 
 
 def authors_errors(y: dict[str, float], logs, horizon: float) -> np.ndarray:
@@ -117,11 +138,19 @@ def authors_rate(y: dict[str, float], x: np.ndarray, u: np.ndarray) -> np.ndarra
     q1, q2, v1, v2 = x
     c, s, C = np.cos(q2), np.sin(q2), y["m2"] * y["r2"] * y["l1"]
     rotor = y["Ir"]
-    m11 = y["I1"] + y["I2"] + y["m2"] * y["l1"] ** 2 + 2 * C * c + rotor * (1 + y["gr"] ** 2)
+    m11 = (
+        y["I1"]
+        + y["I2"]
+        + y["m2"] * y["l1"] ** 2
+        + 2 * C * c
+        + rotor * (1 + y["gr"] ** 2)
+    )
     m12, m22 = y["I2"] + C * c - y["gr"] * rotor, y["I2"] + y["gr"] ** 2 * rotor
     weight2 = y["g"] * y["m2"] * y["r2"] * np.sin(q1 + q2)
     weight1 = y["g"] * (y["m1"] * y["r1"] + y["m2"] * y["l1"]) * np.sin(q1) + weight2
-    f1, f2 = (y[f"b{k}"] * v + y[f"cf{k}"] * np.arctan(100 * v) for k, v in ((1, v1), (2, v2)))
+    f1, f2 = (
+        y[f"b{k}"] * v + y[f"cf{k}"] * np.arctan(100 * v) for k, v in ((1, v1), (2, v2))
+    )
     r1 = u[0] - weight1 + C * s * (2 * v1 * v2 + v2**2) - f1
     r2 = u[1] - weight2 - C * s * v1**2 - f2
     det = m11 * m22 - m12**2
@@ -141,37 +170,58 @@ def pendulum(quick: bool) -> None:
     folder = DATA / "double_pendulum"
     robot = jid.load_urdf(folder / "pendubot_model_1.0.urdf")
     friction = jid.ViscousFriction(), jid.CoulombFriction(Tanh(0.1))
-    base = jid.base_parameters(jid.Model(robot, (jid.RigidBodies(), jid.RotorInertia(), *friction)))
+    base = jid.base_parameters(
+        jid.Model(robot, (jid.RigidBodies(), jid.RotorInertia(), *friction))
+    )
     smooth = jid.ZeroPhaseButterworth(12.0)
     for kind in ("con",) if quick else ("con", "meas"):
-        columns = jid.Columns(time="time", angles="pos_meas{}", forces=f"tau_{kind}{{}}")
+        columns = jid.Columns(
+            time="time", angles="pos_meas{}", forces=f"tau_{kind}{{}}"
+        )
 
         def read(*names, columns=columns):
-            logs = [jid.read_recording(folder / f"{name}.csv", columns) for name in names]
+            logs = [
+                jid.read_recording(folder / f"{name}.csv", columns) for name in names
+            ]
             return [jid.observe(log, robot, smooth) for log in logs]
 
-        seen, unseen = read("143339", "143524", "143601", "143704"), read("143747", "144003")
+        seen, unseen = (
+            read("143339", "143524", "143601", "143704"),
+            read("143747", "144003"),
+        )
         start, found = time.time(), {}
         for word, options in VARIANTS.items():
             found[word] = jid.rollout.identify_torque_rollout(base, seen, **options)
         plain = found["rollouts"]
-        print(f"tau_{kind}: {time.time() - start:.0f} s for all; q1 q2 at 0.1 s, at 0.2 s [rad]")
+        print(
+            f"tau_{kind}: {time.time() - start:.0f} s for all; q1 q2 at 0.1 s, at 0.2 "
+            "s [rad]"
+        )
         for n in ("1.0", "1.1", "2.0", "3.0"):
             values = [authors_errors(authors(n), unseen, h) for h in HORIZONS]
             print_errors(f"authors {n}", values)
         compared = jid.rollout.compare_methods(plain, seen, unseen)
-        for word, values in zip(jid.rollout.METHODS[:-1], compared.errors, strict=False):
+        for word, values in zip(
+            jid.rollout.METHODS[:-1], compared.errors, strict=False
+        ):
             print_errors(word, values)
         for word, fit in found.items():
             print_errors(word, [fit.errors_at(unseen, h) for h in HORIZONS])
-        print_errors("rollouts, logs of the fit", [plain.errors_at(seen, h) for h in HORIZONS])
+        print_errors(
+            "rollouts, logs of the fit", [plain.errors_at(seen, h) for h in HORIZONS]
+        )
         own = jid.rollout.identify_torque_rollout(base, unseen)
-        print_errors("rollouts, fitted to these logs", [own.errors_at(unseen, h) for h in HORIZONS])
+        print_errors(
+            "rollouts, fitted to these logs",
+            [own.errors_at(unseen, h) for h in HORIZONS],
+        )
         squares = []
         for k in range(0 if quick else 4):
             rest = [*seen[:k], *seen[k + 1 :]]
             fit = jid.rollout.identify_torque_rollout(base, rest)
-            squares.append(jid.rollout.compare_methods(fit, rest, [seen[k]]).errors ** 2)
+            squares.append(
+                jid.rollout.compare_methods(fit, rest, [seen[k]]).errors ** 2
+            )
         means = np.sqrt(np.mean(squares, axis=0)) if squares else ()
         for word, values in zip(jid.rollout.METHODS, means, strict=False):
             print_errors(f"{word}, each left out", values)
@@ -188,17 +238,21 @@ def arm_text(gain: float, stribeck: bool, axes: int = 6) -> str:
         axis = ("0 0 1", "0 1 0", "0 1 0", "1 0 0", "0 1 0", "1 0 0")[j % 6]
         loss = 0.0 if stribeck else 0.1 + 0.02 * j
         text += (
-            f'<body name="b{j}" pos="{0.12 * (j > 0)} 0 0"><inertial pos="0.06 0 0" mass="0.15" '
+            f'<body name="b{j}" pos="{0.12 * (j > 0)} 0 0"><inertial pos="0.06 0 0" '
+            'mass="0.15" '
             f'diaginertia="2e-4 2e-4 2e-4"/><joint name="j{j}" axis="{axis}" '
-            f'armature="{0.04 + 0.004 * j}" damping="{0.6 + 0.05 * j}" frictionloss="{loss}" '
+            f'armature="{0.04 + 0.004 * j}" damping="{0.6 + 0.05 * j}" '
+            f'frictionloss="{loss}" '
             f'solreffriction="{2 * STEP} 1" solimpfriction="0.99 0.9999 0.001"/>'
         )
         end += "</body>"
     servos = "".join(
-        f'<position name="j{j}" joint="j{j}" kp="{gain * (12 - j)}"/>' for j in range(axes)
+        f'<position name="j{j}" joint="j{j}" kp="{gain * (12 - j)}"/>'
+        for j in range(axes)
     )
     return (
-        f'<mujoco><compiler angle="radian"/><option timestep="{STEP}" integrator="implicitfast"/>'
+        f'<mujoco><compiler angle="radian"/><option timestep="{STEP}" '
+        'integrator="implicitfast"/>'
         f"<worldbody>{text}{end}</worldbody><actuator>{servos}</actuator></mujoco>"
     )
 
@@ -207,24 +261,35 @@ def commanded(seed: int, axes: int, duration: float, rate: float) -> np.ndarray:
     random, t = np.random.default_rng(seed), np.arange(round(duration * rate)) / rate
     q = np.zeros((len(t), axes))
     for f in (0.11, 0.29, 0.63, 1.1, 1.9):
-        q += 0.25 / (1 + 2 * f) * np.sin(2 * np.pi * (f * t[:, None] + random.uniform(size=axes)))
+        q += (
+            0.25
+            / (1 + 2 * f)
+            * np.sin(2 * np.pi * (f * t[:, None] + random.uniform(size=axes)))
+        )
     return np.clip(t, 0.0, 1.0)[:, None] * q
 
 
-def drive(model, sent: np.ndarray, rate: float, stribeck=False, late=0.01, rounding=ENCODER):
+def drive(
+    model, sent: np.ndarray, rate: float, stribeck=False, late=0.01, rounding=ENCODER
+):
     """Return the encoders' positions; with Stribeck friction of a narrow smooth sign.
 
-    Each joint may have its own delay: in the step in which a command comes, it counts in part.
+    Each joint may have its own delay: in the step in which a command comes, it counts
+    in part.
     """
     data, every = mujoco.MjData(model), round(1 / rate / STEP)
     measured, late = np.zeros_like(sent), np.broadcast_to(late, sent.shape[1:]) / STEP
     samples, steps = np.divmod(late, every)
-    edges = np.unique([0, every, *np.floor(steps), *np.minimum(np.floor(steps) + 1, every)])
+    edges = np.unique(
+        [0, every, *np.floor(steps), *np.minimum(np.floor(steps) + 1, every)]
+    )
     joints = np.arange(sent.shape[1])
     old = [np.clip(steps - a, 0.0, 1.0) for a in edges[:-1]]
     for k in range(len(sent)):
         measured[k] = data.qpos
-        now, before = (sent[np.maximum(0, k - samples.astype(int) - i), joints] for i in (0, 1))
+        now, before = (
+            sent[np.maximum(0, k - samples.astype(int) - i), joints] for i in (0, 1)
+        )
         for share, count in zip(old, np.diff(edges).astype(int), strict=True):
             data.ctrl[:] = share * before + (1.0 - share) * now
             for _ in range(count if stribeck else 0):
@@ -245,11 +310,15 @@ def arm_bodies(text: str) -> jid.rollout.Bodies:
         return jid.rollout.Bodies(model, jid.urdf_parameters(path), coupled=True)
 
 
-def arm_logs(seed: int, gain: float = 1.0, stribeck: bool = False, duration: float = 20.0):
+def arm_logs(
+    seed: int, gain: float = 1.0, stribeck: bool = False, duration: float = 20.0
+):
     model = mujoco.MjModel.from_xml_string(arm_text(gain, stribeck))
     sent = [commanded(10 * seed + k, 6, duration, 50.0) for k in range(3)]
     return [
-        jid.Recording.of(drive(model, x, 50.0, stribeck), x, sample_time=0.02, name=f"log {k}")
+        jid.Recording.of(
+            drive(model, x, 50.0, stribeck), x, sample_time=0.02, name=f"log {k}"
+        )
         for k, x in enumerate(sent)
     ]
 
@@ -283,7 +352,8 @@ def coverage(quick: bool) -> None:
             hits += inside(fit, truth(1.0))
             warned += bool(fit.notes)
         print(
-            f"{draws} draws, {'with' if stribeck else 'without'} unmodelled Stribeck friction: "
+            f"{draws} draws, {'with' if stribeck else 'without'} unmodelled Stribeck "
+            "friction: "
             f"{100 * np.mean(hits):.1f} % of {len(hits)} intervals hold, {warned} warn "
             f"({time.time() - start:.0f} s)",
             flush=True,
@@ -294,7 +364,9 @@ def gains(quick: bool) -> None:
     """Compare armature, damping, friction, delay of two gains, whose ratio is known."""
     agree, bodies = [], arm_bodies(arm_text(1.0, False))
     for seed in range(1 if quick else 8):
-        one, other = (jid.identify_rollout(arm_logs(seed, g), bodies, **FINE) for g in (1.0, 1.6))
+        one, other = (
+            jid.identify_rollout(arm_logs(seed, g), bodies, **FINE) for g in (1.0, 1.6)
+        )
         second = {(c.joint, c.name): c for c in other.combinations}
         for c in one.combinations:
             if (d := second.get((c.joint, c.name))) is None:
@@ -315,7 +387,8 @@ def confounded(quick: bool) -> None:
             random, logs = np.random.default_rng(seed), []
             model = mujoco.MjModel.from_xml_string(arm_text(1.0, False, 1))
             for k in range(4):
-                # Slow ramps tell one lag; an upright axis has no weight, and one inertia.
+                # Slow ramps tell one lag; an upright axis has no weight, and one
+                # inertia.
                 sent = (-1) ** k * random.uniform(0.02, 0.05) * t[:, None]
                 if second == "a":
                     sent = commanded(10 * seed + k, 1, 10.0, 50.0)
@@ -323,21 +396,30 @@ def confounded(quick: bool) -> None:
                 logs.append(log.crop(2.0, 10.0))
             fit = jid.identify_rollout(logs, bodies if second == "a" else None, **FINE)
             x = truth(1.0)[:1]
-            x[:, [p.symbol for p in jid.rollout.PARAMETERS].index("d")] += 0.0 if fit.hold else 0.01
+            x[:, [p.symbol for p in jid.rollout.PARAMETERS].index("d")] += (
+                0.0 if fit.hold else 0.01
+            )
             both = [INDEX[first], INDEX[second]]
             for c, holds in zip(fit.combinations, inside(fit, x), strict=True):
                 if (c.coefficients[0, both] != 0.0).all():
                     named, hits = named + 1, hits + holds
                     break
-        print(f"{first} and {second} merged in {named} of {draws}, intervals hold in {hits}")
+        print(
+            f"{first} and {second} merged in {named} of {draws}, intervals hold in "
+            f"{hits}"
+        )
 
 
 def quadruped(quick: bool) -> None:
     leg = (
-        '<body name="h{k}" pos="0 {k} 0"><inertial pos="0 0 0" mass="0.7" diaginertia="2e-3 2e-3 '
-        '2e-3"/><joint name="h{k}" axis="1 0 0" {j}/><body name="t{k}" pos="0 0.08 0"><inertial '
-        'pos="0 0 -0.1" mass="1" diaginertia="5e-3 5e-3 1e-3"/><joint name="t{k}" axis="0 1 0" '
-        '{j}/><body name="s{k}" pos="0 0 -0.2"><inertial pos="0 0 -0.1" mass="0.2" diaginertia='
+        '<body name="h{k}" pos="0 {k} 0"><inertial pos="0 0 0" mass="0.7" '
+        'diaginertia="2e-3 2e-3 '
+        '2e-3"/><joint name="h{k}" axis="1 0 0" {j}/><body name="t{k}" pos="0 0.08 '
+        '0"><inertial '
+        'pos="0 0 -0.1" mass="1" diaginertia="5e-3 5e-3 1e-3"/><joint name="t{k}" '
+        'axis="0 1 0" '
+        '{j}/><body name="s{k}" pos="0 0 -0.2"><inertial pos="0 0 -0.1" mass="0.2" '
+        "diaginertia="
         '"2e-3 2e-3 1e-4"/><joint name="s{k}" axis="0 1 0" {j}/></body></body></body>'
     )
     joint = 'armature="0.01" damping="1" frictionloss="0.3" solreffriction="0.004 1"'
@@ -345,7 +427,8 @@ def quadruped(quick: bool) -> None:
     names = [f"{part}{k}" for k in range(4) for part in "hts"]
     servos = "".join(f'<position joint="{name}" kp="30"/>' for name in names)
     text = (
-        f'<mujoco><compiler angle="radian"/><option timestep="{STEP}" integrator="implicitfast"/>'
+        f'<mujoco><compiler angle="radian"/><option timestep="{STEP}" '
+        'integrator="implicitfast"/>'
         f"<worldbody>{legs}</worldbody><actuator>{servos}</actuator></mujoco>"
     )
     model = mujoco.MjModel.from_xml_string(text)
@@ -373,12 +456,17 @@ def band(quick: bool) -> None:
         paths = []
         for model in models:
             late, offset = (model.numeric(x).data for x in ("delay", "offset"))
-            # Positions that follow from a command in MuJoCo's next step count as half a step late.
+            # Positions that follow from a command in MuJoCo's next step count as half a
+            # step late.
             commands = sent + offset
-            paths.append(drive(model, commands, 50.0, late=late + STEP / 2, rounding=1e-12))
+            paths.append(
+                drive(model, commands, 50.0, late=late + STEP / 2, rounding=1e-12)
+            )
         low, high = np.quantile(paths, [0.05, 0.95], axis=0)
         held.append(100 * ((low <= true) & (true <= high))[25:].mean())
-        print(f"a band of {count} models holds {held[-1]:.0f} % of a motion", flush=True)
+        print(
+            f"a band of {count} models holds {held[-1]:.0f} % of a motion", flush=True
+        )
     print(f"in the mean {np.mean(held):.0f} % (90 wanted)")
 
 
@@ -386,7 +474,10 @@ SAME = {"friction": False, "saturation": False}
 """Options that leave effects out of our model which the peers are not given."""
 UNKNOWNS = ("J", "B", "d", "F", "b")
 STIFF = 'solimpfriction="0.9999 0.9999 0.001"'
-PEERS = {"its defaults": ("", {}), "stiff friction, scaled": (STIFF, {"x_scale": "jac"})}
+PEERS = {
+    "its defaults": ("", {}),
+    "stiff friction, scaled": (STIFF, {"x_scale": "jac"}),
+}
 """Settings of MuJoCo's dry friction and of its optimiser: as they come, and the best found."""
 
 
@@ -425,9 +516,12 @@ def write(spec, p) -> None:
 def peer_sequences(motion: ServoMotion, j: int, friction: str) -> list:
     """Return a joint's motions for the peer; a second control is the torque of the bodies."""
     text = (
-        '<mujoco><option timestep="0.01" gravity="0 0 0" integrator="implicitfast"/><worldbody>'
-        '<body><inertial pos="0 0 0" mass="1e-3" diaginertia="1e-9 1e-9 1e-9"/><joint name="q" '
-        f'armature="1" {friction}/></body></worldbody><actuator><position name="servo" joint="q" '
+        '<mujoco><option timestep="0.01" gravity="0 0 0" '
+        'integrator="implicitfast"/><worldbody>'
+        '<body><inertial pos="0 0 0" mass="1e-3" diaginertia="1e-9 1e-9 1e-9"/><joint '
+        'name="q" '
+        f'armature="1" {friction}/></body></worldbody><actuator><position '
+        'name="servo" joint="q" '
         'kp="1"/><general name="load" joint="q" gainprm="0"/></actuator>'
         '<sensor><jointpos name="q" joint="q"/></sensor></mujoco>'
     )
@@ -437,8 +531,13 @@ def peer_sequences(motion: ServoMotion, j: int, friction: str) -> list:
         t, name = np.arange(n) * float(motion.sample_time[k]), motion.names[k]
         sent = np.stack([x[k, j, :n] for x in (motion.sent, motion.load)], axis=1)
         q = np.array(motion.positions[k, j, :n, None])
-        first = peer.create_initial_state(model, q[0], motion.start[k, 1, [j]], np.zeros(0))
-        control, sensor = peer.TimeSeries(t, sent), peer.TimeSeries.from_names(t, q, model)
+        first = peer.create_initial_state(
+            model, q[0], motion.start[k, 1, [j]], np.zeros(0)
+        )
+        control, sensor = (
+            peer.TimeSeries(t, sent),
+            peer.TimeSeries.from_names(t, q, model),
+        )
         found.append(peer.ModelSequences(name, spec, name, first, control, sensor))
     return found
 
@@ -454,14 +553,18 @@ def peer_fit(motion: ServoMotion, j: int, friction: str, options: dict):
     late = peer.SignalTransform()
     late.delay("*", p["d"])
     sequences = peer_sequences(motion, j, friction)
-    residual = peer.build_residual_fn(models_sequences=sequences, modify_residual=late.apply)
+    residual = peer.build_residual_fn(
+        models_sequences=sequences, modify_residual=late.apply
+    )
     with contextlib.redirect_stdout(None):
         return peer.optimize(p, residual, verbose=False, **options)[0]
 
 
 def peer_error(p, motion: ServoMotion, j: int, friction: str) -> float:
     """Return the peer's free-running RMS error, on the samples that count for us."""
-    function = peer.build_residual_fn(models_sequences=peer_sequences(motion, j, friction))
+    function = peer.build_residual_fn(
+        models_sequences=peer_sequences(motion, j, friction)
+    )
     squares = []
     for k, (y,) in enumerate(function(p.as_vector(), p)[1]):
         n = motion.lengths[k]
@@ -498,7 +601,9 @@ def sysid_row(what: str, sets, bodies=None) -> Row:
     """Compare errors and times; the last of the peer's settings decide."""
     jax.clear_caches()
     joints = list(range(5)) if bodies else [0]
-    turns = [seconds(lambda: jid.identify_rollout(sets[0], bodies, **SAME)) for _ in range(2)]
+    turns = [
+        seconds(lambda: jid.identify_rollout(sets[0], bodies, **SAME)) for _ in range(2)
+    ]
     (_, *cold), (fit, *warm) = turns
     ours = np.array([fit.validate(x).total()[joints] for x in sets])
     motions = [ServoMotion.of(x) for x in sets]
@@ -509,16 +614,22 @@ def sysid_row(what: str, sets, bodies=None) -> Row:
     for name, settings in PEERS.items():
         errors, wall, cpu = peer_result(motions, joints, *settings)
         seen, unseen = 1e3 * errors.round(5)
-        said += f"; its, {name}: {unseen} mrad (seen {seen}), {wall:.0f} s (CPU {cpu:.0f}: "
+        said += (
+            f"; its, {name}: {unseen} mrad (seen {seen}), {wall:.0f} s (CPU {cpu:.0f}: "
+        )
         said += f"{cpu / warm[1]:.1f} times ours, {cpu / cold[1]:.1f} with compiling)"
     recipe = (
-        "identified on four motions, free-running on six others; inertia, damping, delay, "
-        f"friction, bias{', stiffness by the weight' if bodies else ''}; its start that of our "
+        "identified on four motions, free-running on six others; inertia, damping, "
+        "delay, "
+        f"friction, bias{', stiffness by the weight' if bodies else ''}; its start "
+        "that of our "
         "table, ours its 18 starts; its steps 10 ms"
     )
     holds = bool((ours[1] <= errors[1]).all() and 10 * warm[1] <= cpu)
     asked = "error <= its, time <= 1/10 of its"
-    return Row("sysid", f"SO-101, {what}, against mujoco.sysid", recipe, asked, said, holds)
+    return Row(
+        "sysid", f"SO-101, {what}, against mujoco.sysid", recipe, asked, said, holds
+    )
 
 
 def evolution(quick: bool) -> list[Row]:
@@ -530,7 +641,9 @@ def evolution(quick: bool) -> list[Row]:
     simulators = [ServoSimulator(ServoMotion.of(logs), 0.01) for logs in sets]
 
     def errors(x: np.ndarray) -> list[float]:
-        sums = [s.costs(x[None, None]).sum() / s.motion.counted.sum() for s in simulators]
+        sums = [
+            s.costs(x[None, None]).sum() / s.motion.counted.sum() for s in simulators
+        ]
         return [1e3 * float(np.sqrt(y)) for y in sums]
 
     def moments(x, k=None):
@@ -542,18 +655,28 @@ def evolution(quick: bool) -> list[Row]:
     x, free = START[None, None], np.isin(list(INDEX), UNKNOWNS)[None, None]
     for _ in range(2):  # the first calls compile
         fit, _, whole = seconds(lambda: jid.identify_rollout(sets[0], **SAME))
-        local, _, short = seconds(lambda: minimise(moments, costs, x, free, (LOWER, UPPER)))
+        local, _, short = seconds(
+            lambda: minimise(moments, costs, x, free, (LOWER, UPPER))
+        )
     ours, plain = 1e3 * float(fit.validate(sets[1]).total()[0]), errors(local.x[0, 0])
-    runs = [strategy(costs, seed, (short, whole)) for seed in range(1, 2 if quick else 6)]
+    runs = [
+        strategy(costs, seed, (short, whole)) for seed in range(1, 2 if quick else 6)
+    ]
     found = np.median([[errors(x) for x in run[0]] for run in runs], axis=0)
     longest = np.median([run[1] for run in runs])
     said = (
-        f"unseen: identify_rollout {ours:.2f} mrad in {whole:.1f} s of the CPU, CMA-ES then "
+        f"unseen: identify_rollout {ours:.2f} mrad in {whole:.1f} s of the CPU, "
+        "CMA-ES then "
         f"{found[1, 1]:.2f}; least squares alone, seen (unseen): Levenberg-Marquardt "
-        f"{plain[0]:.2f} ({plain[1]:.2f}) in {short:.2f} s, CMA-ES then {found[0, 0]:.2f} "
-        f"({found[0, 1]:.2f}), at its end {found[2, 0]:.2f} ({found[2, 1]:.2f}) in {longest:.0f} s"
+        f"{plain[0]:.2f} ({plain[1]:.2f}) in {short:.2f} s, CMA-ES then "
+        f"{found[0, 0]:.2f} "
+        f"({found[0, 1]:.2f}), at its end {found[2, 0]:.2f} ({found[2, 1]:.2f}) in "
+        f"{longest:.0f} s"
     )
-    recipe = f"{len(runs)} seeds, medians; same simulator, start, limits, scales; cma's defaults"
+    recipe = (
+        f"{len(runs)} seeds, medians; same simulator, start, limits, scales; "
+        "cma's defaults"
+    )
     holds = bool(ours <= found[1, 1] and plain[0] <= found[0, 0])
     what, asked = "SO-101, joint 2, against CMA-ES", "error <= its in our CPU time"
     return [Row("evolution", what, recipe, asked, said, holds)]
@@ -577,7 +700,8 @@ def strategy(costs, seed: int, budgets) -> tuple[list[np.ndarray], float]:
     while not search.stop():
         candidates = search.ask()
         search.tell(candidates, costs(parameters(candidates))[:, 0].tolist())
-        # The population that ends behind a budget counts still: a little more than our time.
+        # The population that ends behind a budget counts still: a little more than our
+        # time.
         while left and time.process_time() - start > left[0]:
             best.append(parameters([search.result.xbest])[0, 0])
             left.pop(0)
@@ -585,13 +709,25 @@ def strategy(costs, seed: int, budgets) -> tuple[list[np.ndarray], float]:
     return best, time.process_time() - start
 
 
-BENCHMARKS = (so101, pendulum, coverage, gains, confounded, quadruped, band, sysid, evolution)
+BENCHMARKS = (
+    so101,
+    pendulum,
+    coverage,
+    gains,
+    confounded,
+    quadruped,
+    band,
+    sysid,
+    evolution,
+)
 
 
 def main() -> None:
     """Run the parts named, or all."""
     parser = timing.parser(__doc__, "small parts, short logs")
-    parser.add_argument("parts", nargs="*", help=", ".join(x.__name__ for x in BENCHMARKS))
+    parser.add_argument(
+        "parts", nargs="*", help=", ".join(x.__name__ for x in BENCHMARKS)
+    )
     options, rows = parser.parse_args(), []
     for benchmark in BENCHMARKS:
         if not options.parts or benchmark.__name__ in options.parts:

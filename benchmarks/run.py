@@ -3,16 +3,18 @@
     python benchmarks/run.py                    # all figures of speed, about 25 minutes
     python benchmarks/run.py peers streaming    # only these scripts
     python benchmarks/run.py --methods          # also the quality of the methods: hours
-    python benchmarks/run.py --resume           # only what this machine has not measured today
-    python benchmarks/run.py --check            # everything small: does it still run?
+    python benchmarks/run.py --resume           # only what this machine has not
+    measured today python benchmarks/run.py --check            # everything small: does
+    it still run?
 
-Each script leaves its figures in `measured/NAME.json`, with machine, versions and date, as soon as
-it ends; all of them are written as tables to `results/measured.md`. A script that fails or takes
-too long keeps its old figures, is named at the end, and the exit code is 1.
+Each script leaves its figures in `measured/NAME.json`, with machine, versions and date,
+as soon as it ends; all of them are written as tables to `results/measured.md`. A script
+that fails or takes too long keeps its old figures, is named at the end, and the exit
+code is 1.
 
-`--check` runs every script with `--quick`, the notebooks, and the tests with run-time checks of
-shapes. It prints a table of results, writes it to `results/check.md`, and exits with 1 if something
-failed. It measures nothing.
+`--check` runs every script with `--quick`, the notebooks, and the tests with run-time
+checks of shapes. It prints a table of results, writes it to `results/check.md`, and
+exits with 1 if something failed. It measures nothing.
 """
 
 import argparse
@@ -88,7 +90,11 @@ def run(command, limit, show=True):
     """Return what a command prints, and whether it ended well within some seconds."""
     with tempfile.TemporaryFile("w+", errors="replace") as file:
         process = subprocess.Popen(
-            command, stdout=file, stderr=subprocess.STDOUT, start_new_session=True, cwd=REPOSITORY
+            command,
+            stdout=file,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
+            cwd=REPOSITORY,
         )
         try:
             code = process.wait(limit)
@@ -113,7 +119,9 @@ def measure(script):
         text, good = run(command, 180 * script.minutes)
         if not good:
             return None
-        return {"rows": json.loads(path.read_text())} if path.exists() else {"text": text}
+        return (
+            {"rows": json.loads(path.read_text())} if path.exists() else {"text": text}
+        )
 
 
 def stored(name):
@@ -140,7 +148,9 @@ def is_fresh(name, facts):
 def table(head, rows):
     """Return a table in Markdown."""
     lines = [head, ["---"] * len(head), *rows]
-    cells = [[str(x).replace("|", "/").replace("\n", " ") for x in line] for line in lines]
+    cells = [
+        [str(x).replace("|", "/").replace("\n", " ") for x in line] for line in lines
+    ]
     return "".join(f"| {' | '.join(line)} |\n" for line in cells)
 
 
@@ -152,7 +162,9 @@ def section(name, found):
         return f"{lines}```\n{found['text'].strip()}\n```\n"
     holds = {True: "yes", False: "**no**", None: ""}
     rows = [Row(**row) for row in found["rows"]]
-    cells = [(r.number, r.what, r.asked, r.measured, holds[r.holds], r.recipe) for r in rows]
+    cells = [
+        (r.number, r.what, r.asked, r.measured, holds[r.holds], r.recipe) for r in rows
+    ]
     return lines + table(HEAD, cells)
 
 
@@ -170,7 +182,10 @@ def measure_all(scripts, resume):
         start, facts = time.perf_counter(), machine()
         if resume and is_fresh(script.name, facts):
             continue
-        print(f"== {number}/{len(scripts)} {script.name}, about {script.minutes:g} min", flush=True)
+        print(
+            f"== {number}/{len(scripts)} {script.name}, about {script.minutes:g} min",
+            flush=True,
+        )
         found = measure(script)
         if found is None:
             failed.append(script.name)
@@ -181,7 +196,10 @@ def measure_all(scripts, resume):
         write_tables()
         lost += [Row(**row) for row in found.get("rows", []) if row["holds"] is False]
     for row in lost:
-        print(f"DOES NOT HOLD [{row.number}] {row.what}: {row.measured}; asked {row.asked}")
+        print(
+            f"DOES NOT HOLD [{row.number}] {row.what}: {row.measured}; asked "
+            f"{row.asked}"
+        )
     return failed
 
 
@@ -189,7 +207,10 @@ def check(scripts, whole):
     """Run everything small, write the table of results, and return the names of what failed."""
     jobs = {f"benchmarks/{s.name}.py --quick": [*s.command, "--quick"] for s in scripts}
     if whole:
-        jobs["notebooks/run_all.py"] = [sys.executable, str(REPOSITORY / "notebooks/run_all.py")]
+        jobs["notebooks/run_all.py"] = [
+            sys.executable,
+            str(REPOSITORY / "notebooks/run_all.py"),
+        ]
         jobs["tests with checked shapes"] = [
             *("env", "JAXID_CHECK_SHAPES=1", sys.executable, "-m", "pytest")
         ]
@@ -197,7 +218,9 @@ def check(scripts, whole):
     for name, command in jobs.items():
         start = time.perf_counter()
         _, good = run(command, 3600, show=False)
-        rows.append((name, f"{time.perf_counter() - start:.0f}", "ok" if good else "**failed**"))
+        rows.append(
+            (name, f"{time.perf_counter() - start:.0f}", "ok" if good else "**failed**")
+        )
         print(f"{name}: {rows[-1][1]} s, {'ok' if good else 'failed'}", flush=True)
     failed = [name for name, _, result in rows if result != "ok"]
     facts = "; ".join(f"{key}: {value}" for key, value in machine().items())
@@ -217,14 +240,24 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     known = {script.name: script for script in SCRIPTS}
     parser.add_argument("scripts", nargs="*", help=f"only these: {', '.join(known)}")
-    parser.add_argument("--check", action="store_true", help="everything small; the tests")
-    parser.add_argument("--resume", action="store_true", help="skip what was measured today")
-    parser.add_argument("--methods", action="store_true", help="also the quality of the methods")
-    parser.add_argument("--tables", action="store_true", help="only write the tables again")
+    parser.add_argument(
+        "--check", action="store_true", help="everything small; the tests"
+    )
+    parser.add_argument(
+        "--resume", action="store_true", help="skip what was measured today"
+    )
+    parser.add_argument(
+        "--methods", action="store_true", help="also the quality of the methods"
+    )
+    parser.add_argument(
+        "--tables", action="store_true", help="only write the tables again"
+    )
     options = parser.parse_args()
     unknown = [name for name in options.scripts if name not in known]
     if unknown:
-        parser.error(f"no such script: {', '.join(unknown)}; there are {', '.join(known)}")
+        parser.error(
+            f"no such script: {', '.join(unknown)}; there are {', '.join(known)}"
+        )
     every = SCRIPTS if options.methods or options.check else SPEED
     scripts = [known[name] for name in options.scripts] or every
     if options.tables:

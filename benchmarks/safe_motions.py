@@ -1,25 +1,29 @@
 """Designs for five arms by the command with its default settings, judged by MuJoCo.
 
-    python benchmarks/safe_motions.py [panda ur5 xarm7 z1 kinova] [--time 60] [--more 240] [--quick]
+    python benchmarks/safe_motions.py [panda ur5 xarm7 z1 kinova] [--time 60] [--more
+    240] [--quick]
 
-The descriptions are those of the package `example-robot-data`, two of them with a gripper. For each
-arm `jaxid init ARM.URDF` and `jaxid excite --time 60` run as a user runs them. Then MuJoCo, which
-shares no code with this package, judges 4001 instants of the whole motion, leads included: links
-as the convex hulls of their meshes, the plane z = 0 of the base as the floor, positions and speeds
-against the limits of the URDF, inverse dynamics with the URDF's inertias, damping and friction
-against its efforts. Links that a joint connects, and pairs that touch in each of 1000 random poses,
-count neither here nor there.
+The descriptions are those of the package `example-robot-data`, two of them with a
+gripper. For each arm `jaxid init ARM.URDF` and `jaxid excite --time 60` run as a user
+runs them. Then MuJoCo, which shares no code with this package, judges 4001 instants of
+the whole motion, leads included: links as the convex hulls of their meshes, the plane z
+= 0 of the base as the floor, positions and speeds against the limits of the URDF,
+inverse dynamics with the URDF's inertias, damping and friction against its efforts.
+Links that a joint connects, and pairs that touch in each of 1000 random poses, count
+neither here nor there.
 
-The search has one thread. Its seconds are counted by the processor's time, so that other programs
-on the machine do not matter: they are those of an idle machine.
+The search has one thread. Its seconds are counted by the processor's time, so that
+other programs on the machine do not matter: they are those of an idle machine.
 
-* first: time from the start of the command to the first motion that keeps all limits, in seconds of
-  the clock and of the processor (other programs may share the cores).
-* floor, self: smallest distance of a link from the floor and from another link; inf above 200 mm.
-* position: smallest distance from an end of a range; speed, use: largest speed and force of all
-  joints over the URDF's velocity and effort.
-* D: geometric mean of the parameters' standard deviations after `--time` over that of the longest
-  search, which goes on for `--more` seconds; below 1 the longer search has found nothing better.
+* first: time from the start of the command to the first motion that keeps all limits,
+  in seconds of the clock and of the processor (other programs may share the cores).
+* floor, self: smallest distance of a link from the floor and from another link; inf
+  above 200 mm.
+* position: smallest distance from an end of a range; speed, use: largest speed and
+  force of all joints over the URDF's velocity and effort.
+* D: geometric mean of the parameters' standard deviations after `--time` over that of
+  the longest search, which goes on for `--more` seconds; below 1 the longer search has
+  found nothing better.
 """
 
 import os
@@ -37,7 +41,9 @@ import timing
 import trimesh
 
 import jaxid as jid
-from jaxid.experiment.experiment import load_experiment  # private: the base that was designed for
+from jaxid.experiment.experiment import (
+    load_experiment,
+)  # private: the base that was designed for
 
 jax.config.update("jax_enable_x64", True)
 ROBOTS = "lib/python*/site-packages/cmeel.prefix/share/example-robot-data/robots"
@@ -60,8 +66,19 @@ def robots() -> Path:
 
 def design(folder: Path, seconds: float, *more: str) -> dict[str, float]:
     """Run the command, and return when its first motion was there; its output goes to a file."""
-    begin = "import time; time.monotonic = time.process_time; from jaxid.cli import main; main()"
-    command = [sys.executable, "-c", begin, "excite", "experiment.toml", "-o", "motion.csv"]
+    begin = (
+        "import time; time.monotonic = time.process_time; from jaxid.cli import "
+        "main; main()"
+    )
+    command = [
+        sys.executable,
+        "-c",
+        begin,
+        "excite",
+        "experiment.toml",
+        "-o",
+        "motion.csv",
+    ]
     command += ["--time", f"{seconds:g}"]
     first, start = {}, time.monotonic()
     with (folder / "output.txt").open("w") as output:
@@ -70,10 +87,17 @@ def design(folder: Path, seconds: float, *more: str) -> dict[str, float]:
         )
         while process.poll() is None:
             if not first and (folder / "motion.json").exists():
-                first = {"first": time.monotonic() - start, "first CPU": cpu(process.pid)}
+                first = {
+                    "first": time.monotonic() - start,
+                    "first CPU": cpu(process.pid),
+                }
             used = cpu(process.pid)
             time.sleep(0.05)
-    found = first | {"wall": time.monotonic() - start, "CPU": used, "code": process.returncode}
+    found = first | {
+        "wall": time.monotonic() - start,
+        "CPU": used,
+        "code": process.returncode,
+    }
     return found
 
 
@@ -170,7 +194,11 @@ def readable(urdf: Path, folder: Path) -> Path:
     tree = ET.parse(urdf)
     root = tree.getroot()
     compiler = ET.SubElement(ET.SubElement(root, "mujoco"), "compiler")
-    compiler.attrib |= {"meshdir": str(folder), "balanceinertia": "true", "discardvisual": "true"}
+    compiler.attrib |= {
+        "meshdir": str(folder),
+        "balanceinertia": "true",
+        "discardvisual": "true",
+    }
     for link in root.iter("link"):
         drawn = link.findall("visual")
         for visual in drawn:
@@ -182,7 +210,10 @@ def readable(urdf: Path, folder: Path) -> Path:
             path = mesh.get("filename").partition("://")[2]
             source = next(
                 p
-                for p in (robots().parent.parent / path, robots() / path.partition("robots/")[2])
+                for p in (
+                    robots().parent.parent / path,
+                    robots() / path.partition("robots/")[2],
+                )
                 if p.is_file()
             )
             name = f"{link.get('name')}_{number}.stl"
@@ -197,7 +228,9 @@ def log_deviation(experiment, trajectory) -> float:
     noise = 0.01 * np.asarray(experiment.robot.max_forces)
     motion = trajectory.motion(np.asarray(trajectory.basis.times(800)))
     theta = np.asarray(experiment.base.regressor(motion)) / noise[:, None]
-    sizes = np.abs(np.linalg.qr(theta.reshape(-1, experiment.base.size), mode="r").diagonal())
+    sizes = np.abs(
+        np.linalg.qr(theta.reshape(-1, experiment.base.size), mode="r").diagonal()
+    )
     return -float(np.mean(np.log(sizes)))
 
 
@@ -216,14 +249,25 @@ def main():
         urdf = robots() / ARMS[arm]
         with tempfile.TemporaryDirectory() as name:
             folder = Path(name)
-            text = subprocess.run([*JAXID, "init", urdf], capture_output=True, check=True, cwd=name)
+            text = subprocess.run(
+                [*JAXID, "init", urdf], capture_output=True, check=True, cwd=name
+            )
             (folder / "experiment.toml").write_bytes(text.stdout)
             found = design(folder, options.time)
             experiment = load_experiment(folder / "experiment.toml")
             trajectory = jid.trajectories.load_trajectory(folder / "motion.json")
-            motion = trajectory.motion(np.linspace(0.0, float(trajectory.duration), INSTANTS))
+            motion = trajectory.motion(
+                np.linspace(0.0, float(trajectory.duration), INSTANTS)
+            )
             margins = Oracle(urdf, folder).judge(experiment.robot.joint_names, motion)
-            good = min(margins["floor [mm]"], margins["self [mm]"], margins["position"] + 1e-9) > 0
+            good = (
+                min(
+                    margins["floor [mm]"],
+                    margins["self [mm]"],
+                    margins["position"] + 1e-9,
+                )
+                > 0
+            )
             good &= max(margins["speed [%]"], margins["use [%]"]) <= 100 + 1e-6
             clear += good
             figures = found | margins

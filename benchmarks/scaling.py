@@ -2,9 +2,10 @@
 
     python benchmarks/scaling.py [--quick] [--json FILE]
 
-Writes `benchmarks/scaling.png` (nothing with `--quick`). Samples and joints: the regressor on one
-core, ten parameters for each body, in a process of its own; from 16 384 samples on, ours goes
-through chunks of that size. A tree: the humanoid Talos with 32 joints (with `--quick` one arm).
+Writes `benchmarks/scaling.png` (nothing with `--quick`). Samples and joints: the
+regressor on one core, ten parameters for each body, in a process of its own; from 16
+384 samples on, ours goes through chunks of that size. A tree: the humanoid Talos with
+32 joints (with `--quick` one arm).
 Cores: `identify` of one log with every sample a row, on several cores, one process
 for each number. Medians.
 """
@@ -113,7 +114,10 @@ def by_samples(sizes, turns):
             cases = cases_of(model.robot, samples, packed)
             if samples <= 4096:
                 rows = jid.Motion(*motion(model.robot.joints, samples))
-                cases["jaxid, NumPy"] = (lambda m=rows: model.packed_regressor(m), samples)
+                cases["jaxid, NumPy"] = (
+                    lambda m=rows: model.packed_regressor(m),
+                    samples,
+                )
             yield samples, cases
 
     return curves(points(), turns)
@@ -151,7 +155,10 @@ def humanoid(quick):
 
     import jaxid as jid
 
-    shared = Path(next(iter(cmeel.__path__))).parent / "cmeel.prefix/share/example-robot-data"
+    shared = (
+        Path(next(iter(cmeel.__path__))).parent
+        / "cmeel.prefix/share/example-robot-data"
+    )
     name = "talos_left_arm" if quick else "talos_reduced"
     robot = jid.load_urdf(shared / f"robots/talos_data/robots/{name}.urdf")
     n, samples = robot.joints, 512 if quick else 2048
@@ -196,19 +203,31 @@ def by_cores(numbers, samples, turns):
 
     found, scaled = [], []
     for cores in numbers:
-        given = ["--cores", str(cores), "--samples", str(samples), "--turns", str(turns)]
-        done = subprocess.run([sys.executable, __file__, *given], capture_output=True, text=True)
+        given = [
+            "--cores",
+            str(cores),
+            "--samples",
+            str(samples),
+            "--turns",
+            str(turns),
+        ]
+        done = subprocess.run(
+            [sys.executable, __file__, *given], capture_output=True, text=True
+        )
         if done.returncode:
             sys.exit(f"{cores} cores: {done.stderr[-2000:]}")
         seconds, estimates = json.loads(done.stdout.splitlines()[-1])
         found.append((cores, seconds / samples * 1e9))
         scaled.append(np.array(estimates))
         print(f"{cores} core(s): {seconds:.3f} s for {samples} samples", flush=True)
-    away = max(np.linalg.norm(x - scaled[0]) / np.linalg.norm(scaled[0]) for x in scaled)
+    away = max(
+        np.linalg.norm(x - scaled[0]) / np.linalg.norm(scaled[0]) for x in scaled
+    )
     return found, float(away)
 
 
-# Colours that people with any colour vision can distinguish (Okabe and Ito), and markers.
+# Colours that people with any colour vision can distinguish (Okabe and Ito), and
+# markers.
 STYLES = {
     "jaxid, compiled": ("#0072B2", "o-"),
     "jaxid, NumPy": ("#56B4E9", "v--"),
@@ -231,7 +250,9 @@ def plot(samples, joints, compiling, cores, path):
     for axes, found in ((first, samples), (second, joints)):
         for name, (colour, style) in STYLES.items():
             if name in found:
-                axes.plot(*zip(*found[name], strict=True), style, color=colour, label=name)
+                axes.plot(
+                    *zip(*found[name], strict=True), style, color=colour, label=name
+                )
         axes.set(yscale="log", ylabel="regressor, time per sample [ns]")
     first.set(xscale="log", xlabel="samples in a call", title="seven joints, one core")
     first.legend()
@@ -240,11 +261,17 @@ def plot(samples, joints, compiling, cores, path):
     third.set(xlabel="joints", ylabel="trace and compile, once [s]", ylim=(0, None))
     third.set_title("serial arms, one core")
     numbers, costs = zip(*cores, strict=True)
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    cores = (
+        len(os.sched_getaffinity(0))
+        if hasattr(os, "sched_getaffinity")
+        else os.cpu_count()
+    )
     ideal = [costs[0] / min(n, cores or 1) for n in numbers]
     fourth.plot(numbers, costs, "o-", color="#0072B2", label="`identify`, measured")
     fourth.plot(numbers, ideal, ":", color="black", label=f"ideal on {cores} cores")
-    fourth.set(xscale="log", xlabel="cores", ylabel="time per sample [ns]", ylim=(0, None))
+    fourth.set(
+        xscale="log", xlabel="cores", ylabel="time per sample [ns]", ylim=(0, None)
+    )
     fourth.set_title(f"{LOG} samples, seven joints with friction")
     fourth.set_xticks(numbers)
     fourth.xaxis.set_major_formatter(ScalarFormatter())
@@ -286,7 +313,13 @@ def table(samples, joints, compiling, cores, away):
         for name, points in samples.items()
     ]
     rows += [
-        Row("9b", f"regressor by joints, {name}", f"arms, {ten}, N = 2048", "-", line(points))
+        Row(
+            "9b",
+            f"regressor by joints, {name}",
+            f"arms, {ten}, N = 2048",
+            "-",
+            line(points),
+        )
         for name, points in joints.items()
     ]
     rows.append(
@@ -336,7 +369,9 @@ def main():
     else:
         cores, away = by_cores(CORES, LOG, 5)
         plot(samples, joints, compiling, cores, HERE / "scaling.png")
-    rows = [Row(**row) for row in trees] + table(samples, joints, compiling, cores, away)
+    rows = [Row(**row) for row in trees] + table(
+        samples, joints, compiling, cores, away
+    )
     hand_over(rows, options.json)
 
 

@@ -1,17 +1,20 @@
 """Logs and descriptions with one mistake each, and what `jaxid identify` says of them.
 
-    python benchmarks/spoilt.py [--quick] [--json FILE] [--robot six] [--kind sign] [--show]
+    python benchmarks/spoilt.py [--quick] [--json FILE] [--robot six] [--kind sign]
+    [--show]
 
-Robots and logs: `closed_loop.py` (simulated by Pinocchio). Each robot moves for 10 s under control;
-measured are angles (17 bits), velocities and forces (0.3 % white noise). Then one thing is wrong:
-the log, its experiment file or the robot's URDF, each in several joints and amounts. The
-experiment file is that of `jaxid init`, the log is split at 60 %.
+Robots and logs: `closed_loop.py` (simulated by Pinocchio). Each robot moves for 10 s
+under control; measured are angles (17 bits), velocities and forces (0.3 % white noise).
+Then one thing is wrong: the log, its experiment file or the robot's URDF, each in
+several joints and amounts. The experiment file is that of `jaxid init`, the log is
+split at 60 %.
 
-Counted: cases without any `!` or ✗ in the verdict, although the model misses more than `MATTERS` of
-some joint's RMS force (or of 1 % of its largest force, if that is more) and half more than in the
-robot's good log, or is wrong by construction of the log (lost rows, held channels); sentences that
-name another mistake than the one that was made (wrong cures); verdicts of good logs that are not
-good.
+Counted: cases without any `!` or ✗ in the verdict, although the model misses more than
+    `MATTERS` of
+some joint's RMS force (or of 1 % of its largest force, if that is more) and half more
+than in the robot's good log, or is wrong by construction of the log (lost rows, held
+channels); sentences that name another mistake than the one that was made (wrong cures);
+verdicts of good logs that are not good.
 """
 
 import contextlib
@@ -60,16 +63,22 @@ class Case:
         if table is None:
             self.edits.append((rf"(?m)^(# )?{name} = .*$", f"{name} = {value}"))
         else:
-            self.edits.append((rf"(?m)^(# )?\[{table}\]$", f"[{table}]\n{name} = {value}"))
+            self.edits.append(
+                (rf"(?m)^(# )?\[{table}\]$", f"[{table}]\n{name} = {value}")
+            )
 
     def rows(self, kept):
         """Keep some rows."""
-        self.t, self.q, self.qd, self.tau = (x[kept] for x in (self.t, self.q, self.qd, self.tau))
+        self.t, self.q, self.qd, self.tau = (
+            x[kept] for x in (self.t, self.q, self.qd, self.tau)
+        )
 
     def joint(self, j, pattern, replacement):
         """Change the description of a joint in the URDF."""
         parts = re.split(r"(<joint\b.*?</joint>)", self.urdf, flags=re.S)
-        moving = [k for k, x in enumerate(parts) if re.search(r'type="(rev|pris|cont)', x)]
+        moving = [
+            k for k, x in enumerate(parts) if re.search(r'type="(rev|pris|cont)', x)
+        ]
         k = moving[j]
         parts[k], count = re.subn(pattern, replacement, parts[k], count=1)
         if not count:
@@ -158,7 +167,10 @@ def compensated(c, j, _):
 
 
 def filtered(c, j, hz):
-    c.tau = signal.lfilter(*signal.butter(1, hz, fs=1 / DT), c.tau - c.tau[0], axis=0) + c.tau[0]
+    c.tau = (
+        signal.lfilter(*signal.butter(1, hz, fs=1 / DT), c.tau - c.tau[0], axis=0)
+        + c.tau[0]
+    )
     c.cure = ("delay",)
 
 
@@ -247,7 +259,9 @@ def axis(c, j, _):
 
 def mirrored(c, j, _):
     def turned(found):
-        return 'axis xyz="{}"'.format(" ".join(f"{-float(x):g}" for x in found[1].split()))
+        return 'axis xyz="{}"'.format(
+            " ".join(f"{-float(x):g}" for x in found[1].split())
+        )
 
     c.joint(j, r'axis xyz="([^"]*)"', turned)
     c.cure = (f"axis of joint `{{{j}}}`",)
@@ -355,7 +369,11 @@ KINDS = {
     "drift": (drift, "f", (0.1,)),
     "epsilon": (broad_friction, "f", (1.0,)),
 }
-CHANNEL = {x for x in KINDS if x.split()[0] in ("lost", "repeated", "held", "spike", "saturated")}
+CHANNEL = {
+    x
+    for x in KINDS
+    if x.split()[0] in ("lost", "repeated", "held", "spike", "saturated")
+}
 """Kinds that the channels themselves show."""
 
 
@@ -376,12 +394,21 @@ def recorded(urdf, cache, **settings):
         log = {key: log[key] for key in log}
     rate = np.random.default_rng(1).normal(size=log["angles"].shape) * 1e-4
     rate = rate + np.gradient(signal_smooth(log["angles"], 60.0), DT, axis=0)
-    return Case(log["time"], log["angles"], rate, log["forces"], log["commands"], urdf.read_text())
+    return Case(
+        log["time"],
+        log["angles"],
+        rate,
+        log["forces"],
+        log["commands"],
+        urdf.read_text(),
+    )
 
 
 def written(cases, folder):
     """Write the logs of cases; return them and the experiment, which the first case describes."""
-    from jaxid.experiment.experiment import load_experiment  # private: what the command line runs
+    from jaxid.experiment.experiment import (
+        load_experiment,
+    )  # private: what the command line runs
     from jaxid.experiment.template import write_template
 
     case, paths = cases[0], []
@@ -394,7 +421,9 @@ def written(cases, folder):
     (folder / "e.toml").write_text(text)
     for k, c in enumerate(cases):
         table = {"q": c.q, "dq": c.qd, "tau": c.tau}
-        columns = {f"{k}{j + 1}": x[:, j] for k, x in table.items() for j in range(x.shape[1])}
+        columns = {
+            f"{k}{j + 1}": x[:, j] for k, x in table.items() for j in range(x.shape[1])
+        }
         paths.append(folder / (f"log{k + 1}.npz" if k else "log.npz"))
         np.savez(paths[-1], t=c.t, **columns)
     return load_experiment(folder / "e.toml"), paths
@@ -408,7 +437,10 @@ def judged(cases, folder):
     from jaxid.report.verdict import verdict
 
     experiment, paths = written(cases, folder)
-    with open("/dev/null", "w") as nowhere, identify_logs.stages(Console(file=nowhere)) as stage:
+    with (
+        open("/dev/null", "w") as nowhere,
+        identify_logs.stages(Console(file=nowhere)) as stage,
+    ):
         report, _ = identify_logs.identify_logs(experiment, paths, [], 0.6, "", stage)
     fitted = report.identification
     size = np.fmax(fitted[0].force_rms, 0.01 * np.nan_to_num(fitted[0].max_forces))
@@ -457,7 +489,9 @@ def main():
         n = len(re.findall(r'type="(?:rev|pris|cont)', files[robot].read_text()))
         every = [("good", None, 0, 1), *cases(n)]
         if given.kind:
-            every = [x for x in every if x[1] is None or any(k in x[0] for k in given.kind)]
+            every = [
+                x for x in every if x[1] is None or any(k in x[0] for k in given.kind)
+            ]
         matters = MATTERS
         for kind, change, j, amount in every:
             found = one(robot, files[robot], change, j, amount, folder)
@@ -471,13 +505,16 @@ def main():
                 if status != "GOOD":
                     alarms.append(label)
             if change is not None and status == "GOOD":
-                (silent if missed > matters or CHANNEL & {kind} else equal).append(label)
+                (silent if missed > matters or CHANNEL & {kind} else equal).append(
+                    label
+                )
             if bad_cure:
                 wrong.append(label)
             if given.show:
                 mark = "WRONG CURE" if bad_cure else ""
                 print(
-                    f"{label:45} {status:9} {missed:.3f} {mark} {' | '.join(said)[:230]}",
+                    f"{label:45} {status:9} {missed:.3f} {mark} "
+                    f"{' | '.join(said)[:230]}",
                     flush=True,
                 )
     print(f"{count} cases, {time.perf_counter() - began:.0f} s")
@@ -487,7 +524,14 @@ def main():
     print("wrong cure:", *wrong, sep="\n  ")
     hand_over(
         [
-            Row("spoilt/cures", "wrong cures", f"{count} cases", "0", str(len(wrong)), not wrong),
+            Row(
+                "spoilt/cures",
+                "wrong cures",
+                f"{count} cases",
+                "0",
+                str(len(wrong)),
+                not wrong,
+            ),
             Row(
                 "spoilt/silent",
                 "without a word",
@@ -496,7 +540,14 @@ def main():
                 str(len(silent)),
                 not silent,
             ),
-            Row("spoilt/good", "good logs with a doubt", "", "0", str(len(alarms)), not alarms),
+            Row(
+                "spoilt/good",
+                "good logs with a doubt",
+                "",
+                "0",
+                str(len(alarms)),
+                not alarms,
+            ),
         ],
         given.json,
     )

@@ -1,22 +1,25 @@
 """Several runs of one simulated robot: cold and warm, payload, drive gains, delay, update.
 
-Everything is simulated; noise on the forces has a standard deviation of 1 % of each joint's largest
-force, half of its variance white and half with a memory of 50 ms. Motions are
-`random_fourier_series` (5 harmonics, limits kept) that run through two periods, 500 samples in a
-second; filter: zero-phase Butterworth at 10 Hz, every 20th row; weights: the largest forces; model
-right unless a row says otherwise. Intervals and tests are those of the package at 95 %.
+Everything is simulated; noise on the forces has a standard deviation of 1 % of each
+joint's largest force, half of its variance white and half with a memory of 50 ms.
+Motions are `random_fourier_series` (5 harmonics, limits kept) that run through two
+periods, 500 samples in a second; filter: zero-phase Butterworth at 10 Hz, every 20th
+row; weights: the largest forces; model right unless a row says otherwise. Intervals and
+tests are those of the package at 95 %.
 
-Cold and warm (Sec. 6): the paper's arm on its rail with seven parameters per body (44 base
-parameters), ground frequency 0.8 rad/s, the same motion cold and warm. The truth has the paper's
-numbers where it gives some: p_B(1) = 273.40 kg and p_B(2) = 1.68 kg m in both states; of the axes 1
-and 2, viscous friction of 248.41 -> 90.19 N s/m and 41.26 -> 25.65 N m s, Coulomb friction of
-312.50 -> 233.00 N and 18.24 -> 15.07 N m. Bodies are random clouds of points with the CAD's masses;
-the axes 3 to 7 have 2 % (viscous, at 1 rad/s) and 4 % (Coulomb) of their largest torques and warm
-up like axis 2. Each draw has new noise.
+Cold and warm (Sec. 6): the paper's arm on its rail with seven parameters per body (44
+base parameters), ground frequency 0.8 rad/s, the same motion cold and warm. The truth
+has the paper's numbers where it gives some: p_B(1) = 273.40 kg and p_B(2) = 1.68 kg m
+in both states; of the axes 1 and 2, viscous friction of 248.41 -> 90.19 N s/m and 41.26
+-> 25.65 N m s, Coulomb friction of 312.50 -> 233.00 N and 18.24 -> 15.07 N m. Bodies
+are random clouds of points with the CAD's masses; the axes 3 to 7 have 2 % (viscous, at
+1 rad/s) and 4 % (Coulomb) of their largest torques and warm up like axis 2. Each draw
+has new noise.
 
-Payload, gains, delay, update: the built-in Panda with the example's bodies, ten parameters each,
-and friction and offsets; period 8 s. The tool has 3 kg, its centre 13 cm from the last frame;
-friction is 20 % larger with it. Gains are drawn within 20 % of 1. Forces are late by 10 ms.
+Payload, gains, delay, update: the built-in Panda with the example's bodies, ten
+parameters each, and friction and offsets; period 8 s. The tool has 3 kg, its centre 13
+cm from the last frame; friction is 20 % larger with it. Gains are drawn within 20 % of
+1. Forces are late by 10 ms.
 
     python benchmarks/states.py            # all tables
     python benchmarks/states.py payload    # some of them: cold, payload, delay
@@ -29,8 +32,12 @@ import timing
 from scipy import signal
 
 import jaxid as jid
-from jaxid.identification.operating_states import stores_energy  # private: kinds of parameters
-from jaxid.identification.parameter_changes import (  # private: levels, kinds of parameters
+from jaxid.identification.operating_states import (
+    stores_energy,
+)  # private: kinds of parameters
+
+# private: levels, kinds of parameters
+from jaxid.identification.parameter_changes import (
     LEVEL,
     Verdict,
     parameter_kinds,
@@ -82,14 +89,20 @@ class Rig:
         white, drive = random.standard_normal((2, *forces.shape))
         kept = np.exp(-SAMPLE_TIME / MEMORY)
         first = kept * random.standard_normal((1, forces.shape[1]))
-        coloured, _ = signal.lfilter([np.sqrt(1 - kept**2)], [1, -kept], drive, axis=0, zi=first)
+        coloured, _ = signal.lfilter(
+            [np.sqrt(1 - kept**2)], [1, -kept], drive, axis=0, zi=first
+        )
         size = NOISE * np.asarray(self.robot.max_forces) / np.sqrt(2.0)
         measured = (forces + size * (white + coloured)) / gains
-        return jid.Recording.of(self.motion.q, measured, sample_time=SAMPLE_TIME, name=name)
+        return jid.Recording.of(
+            self.motion.q, measured, sample_time=SAMPLE_TIME, name=name
+        )
 
     def rows(self, recording: jid.Recording) -> jid.Observations:
         """Return the filtered recording."""
-        return jid.observe(recording, self.robot, jid.ZeroPhaseButterworth(10.0), jid.Subsample(20))
+        return jid.observe(
+            recording, self.robot, jid.ZeroPhaseButterworth(10.0), jid.Subsample(20)
+        )
 
 
 def paper_truth(base: jid.BaseParameters) -> tuple[np.ndarray, np.ndarray]:
@@ -100,7 +113,9 @@ def paper_truth(base: jid.BaseParameters) -> tuple[np.ndarray, np.ndarray]:
     cold = np.zeros(model.size)
     bodies = jid.simulation.random_bodies(robot, np.array(CAD), random)
     for i, body in enumerate(bodies):
-        for name, value in zip(("m", "mx", "my", "mz", "A", "B", "C"), body[:7], strict=True):
+        for name, value in zip(
+            ("m", "mx", "my", "mz", "A", "B", "C"), body[:7], strict=True
+        ):
             cold[names.index(f"{name}{i + 1}")] = value
     largest = np.asarray(robot.max_forces)
     for j in range(7):
@@ -108,7 +123,9 @@ def paper_truth(base: jid.BaseParameters) -> tuple[np.ndarray, np.ndarray]:
         cold[names.index(f"fv{j + 1}")] = VISCOUS[j][0] if j < 2 else 0.02 * largest[j]
         cold[names.index(f"fc{j + 1}")] = COULOMB[j][0] if j < 2 else 0.04 * largest[j]
     for name, k, wanted in (("m1", 0, 273.40), ("mx2", 1, 1.68)):
-        cold[names.index(name)] += wanted - float(np.asarray(base.from_standard(cold))[k])
+        cold[names.index(name)] += wanted - float(
+            np.asarray(base.from_standard(cold))[k]
+        )
     warm = cold.copy()
     for j in range(7):
         for kind, numbers in (("fv", VISCOUS), ("fc", COULOMB)):
@@ -147,7 +164,9 @@ def cold_and_warm(draws: int) -> list[str]:
         states.append((tested.verdicts, both.sharing[1]))
         shared.append(_groups(cold, warm))
         apart = cold.standard_deviations[list(both.shared)]
-        widths.append(np.median(both.fit("cold").standard_deviations[list(both.shared)] / apart))
+        widths.append(
+            np.median(both.fit("cold").standard_deviations[list(both.shared)] / apart)
+        )
         if not seed:
             table = _paper_table(base, found, cold_p, warm_p)
     changed = np.array([[v is Verdict.CHANGED for v in row] for row in verdicts])
@@ -165,17 +184,23 @@ def cold_and_warm(draws: int) -> list[str]:
             f"| {_percent(changed[:, own])} | {_percent(perhaps[:, own])} "
             f"| {_percent(np.array(inside)[:, own])} |"
         )
-    false = np.array([[v is not Verdict.UNCHANGED for v in row] for row, _ in nothing], dtype=float)
+    false = np.array(
+        [[v is not Verdict.UNCHANGED for v in row] for row, _ in nothing], dtype=float
+    )
     certain = np.array([[v is Verdict.CHANGED for v in row] for row, _ in nothing])
     return [
         *lines,
         "",
         f"| of {draws} draws | share |",
         "|---|---|",
-        f"| warm: any inertia called changed (allowed 5 %) | {_any(changed[:, stored])} |",
-        f"| warm: all 14 friction parameters called changed | {_all(changed[:, ~stored])} |",
-        f"| warm: friction groups called changed, inertia groups not | {np.mean(shared):.0%} |",
-        f"| nothing changed: outside their own 95 % interval, of all | {_percent(false)} |",
+        "| warm: any inertia called changed (allowed 5 %) | "
+        f"{_any(changed[:, stored])} |",
+        "| warm: all 14 friction parameters called changed | "
+        f"{_all(changed[:, ~stored])} |",
+        "| warm: friction groups called changed, inertia groups not | "
+        f"{np.mean(shared):.0%} |",
+        "| nothing changed: outside their own 95 % interval, of all | "
+        f"{_percent(false)} |",
         f"| nothing changed: any called changed (allowed 5 %) | {_any(certain)} |",
         f"| nothing changed: any group called changed (allowed 5 %) "
         f"| {np.mean([g for _, g in nothing]):.0%} |",
@@ -196,9 +221,12 @@ def _groups(first: jid.Fit, second: jid.Fit) -> bool:
     return all(changed == ("friction" in name) for name, changed in found.items())
 
 
-def _paper_table(base: jid.BaseParameters, found, cold: np.ndarray, warm: np.ndarray) -> list[str]:
+def _paper_table(
+    base: jid.BaseParameters, found, cold: np.ndarray, warm: np.ndarray
+) -> list[str]:
     lines = [
-        "| parameter | cold: truth | estimate | warm: truth | estimate | difference | verdict |",
+        "| parameter | cold: truth | estimate | warm: truth | estimate | difference | "
+        "verdict |",
         "|---|---|---|---|---|---|---|",
     ]
     halves = [e.uncertainty.half_widths(LEVEL) for e in (found.first, found.second)]
@@ -209,7 +237,8 @@ def _paper_table(base: jid.BaseParameters, found, cold: np.ndarray, warm: np.nda
         )
         lines.append(
             f"| p_B({k + 1}), {base.names[k]} [{base.units[k]}] | {cold[k]:.2f} | {a} "
-            f"| {warm[k]:.2f} | {b} | {found.difference[k]:+.3f} ± {found.half_widths[k]:.3f} "
+            f"| {warm[k]:.2f} | {b} | {found.difference[k]:+.3f} ± "
+            f"{found.half_widths[k]:.3f} "
             f"| {found.verdicts[k].value} |"
         )
     return lines
@@ -266,7 +295,9 @@ def payload(draws: int) -> list[str]:
         ]
         drives = jid.identify_drive_gains(*currents, TOOL)
         gains.append(drives.gains / true - 1.0)
-        holds.append(np.abs(drives.gains - true) <= drives.uncertainty.half_widths(LEVEL))
+        holds.append(
+            np.abs(drives.gains - true) <= drives.uncertainty.half_widths(LEVEL)
+        )
     (first, known), names = estimates[0], zip(CENTRAL_NAMES, CENTRAL_UNITS, strict=True)
     lines = [
         "| parameter | truth | estimate (95 %) | largest error of all draws |",
@@ -286,11 +317,14 @@ def payload(draws: int) -> list[str]:
         "",
         f"| of {draws} draws | |",
         "|---|---|",
-        f"| mass: RMS error, largest | {100 * np.sqrt(np.mean(np.square(masses))):.2f} %, "
+        "| mass: RMS error, largest | "
+        f"{100 * np.sqrt(np.mean(np.square(masses))):.2f} %, "
         f"{100 * np.abs(masses).max():.2f} % |",
-        f"| intervals of the ten parameters that hold the truth | {_percent(np.array(inside))} |",
+        "| intervals of the ten parameters that hold the truth | "
+        f"{_percent(np.array(inside))} |",
         f"| estimates that belong to a body themselves; largest distance of the others "
-        f"| {np.mean(np.array(distances) == 0):.0%}; {max(distances):.1f} standard deviations |",
+        f"| {np.mean(np.array(distances) == 0):.0%}; {max(distances):.1f} standard "
+        "deviations |",
         f"| drive gains: RMS error; largest of each joint [%] "
         f"| {100 * np.sqrt(np.mean(gains**2)):.2f} %; {worst} |",
         f"| intervals of the gains that hold the truth | {_percent(np.array(holds))} |",
@@ -313,23 +347,30 @@ def delay(draws: int) -> list[str]:
         found.append(one.seconds)
         inside.append(low <= DELAY <= high)
         for fit, kept in zip(fits, (before, after), strict=True):
-            kept.append(np.median(np.abs(fit.parameters - truth) / fit.standard_deviations))
+            kept.append(
+                np.median(np.abs(fit.parameters - truth) / fit.standard_deviations)
+            )
         others = [rig.observe(clean, 1000 + 10 * seed + k) for k in range(3)]
         together = jid.identify(base, others).parameters
         earlier, *later = (jid.identify(base, o) for o in others)
         for run in later:
             earlier = jid.update(earlier, run)
-        apart.append(np.linalg.norm(earlier.parameters - together) / np.linalg.norm(together))
+        apart.append(
+            np.linalg.norm(earlier.parameters - together) / np.linalg.norm(together)
+        )
     errors = 1e6 * (np.array(found) - DELAY)
     return [
         f"| of {draws} draws | |",
         "|---|---|",
-        f"| delay of {1e3 * DELAY:g} ms (sample time {1e3 * SAMPLE_TIME:g} ms): mean error, RMS "
+        f"| delay of {1e3 * DELAY:g} ms (sample time {1e3 * SAMPLE_TIME:g} ms): mean "
+        "error, RMS "
         f"| {errors.mean():.1f} µs, {np.sqrt(np.mean(errors**2)):.1f} µs |",
         f"| its 95 % intervals that hold the truth | {np.mean(inside):.0%} |",
-        "| errors of the parameters in standard deviations (median), delay left in; removed "
+        "| errors of the parameters in standard deviations (median), delay left in; "
+        "removed "
         f"| {np.mean(before):.2f}; {np.mean(after):.2f} |",
-        "| three runs, added one by one, against all at once: largest relative difference "
+        "| three runs, added one by one, against all at once: largest relative "
+        "difference "
         f"| {max(apart):.0e} |",
     ]
 

@@ -1,19 +1,19 @@
 """Identification axis by axis, with and without friction first, compared with all at once.
 
-Axis by axis: the last axis is identified from its own force, its parameters are taken for known,
-then comes the axis before it. Friction can be identified first, from motions of single axes. Errors
-of the outer axes are passed on to the inner ones.
+Axis by axis: the last axis is identified from its own force, its parameters are taken
+for known, then comes the axis before it. Friction can be identified first, from motions
+of single axes. Errors of the outer axes are passed on to the inner ones.
 
-The robot: the virtual Panda of `jaxid example` (random bodies, friction with a little Stribeck
-effect that no model below has, noise of 1 % of the largest torques, 19-bit encoders), of one seed
-for each turn. The logs: two periods of 8 s of a random Fourier series at 500 Hz, and 4 s for each
-axis in which it alone moves, on its own part of the same series. The filter: `ZeroPhaseButterworth`
-at 10 Hz, every 20th row. The model: rigid bodies, viscous and Coulomb friction, rotor inertias,
-offsets.
+The robot: the virtual Panda of `jaxid example` (random bodies, friction with a little
+Stribeck effect that no model below has, noise of 1 % of the largest torques, 19-bit
+encoders), of one seed for each turn. The logs: two periods of 8 s of a random Fourier
+series at 500 Hz, and 4 s for each axis in which it alone moves, on its own part of the
+same series. The filter: `ZeroPhaseButterworth` at 10 Hz, every 20th row. The model:
+rigid bodies, viscous and Coulomb friction, rotor inertias, offsets.
 
-The statistics, means over the turns: the torques of another motion of 8 s without noise, RMS error
-in percent of the largest torques (root mean square of the joints); and the RMS error of viscous and
-Coulomb friction in percent of their true values.
+The statistics, means over the turns: the torques of another motion of 8 s without
+noise, RMS error in percent of the largest torques (root mean square of the joints); and
+the RMS error of viscous and Coulomb friction in percent of their true values.
 
     python benchmarks/stepwise.py [--quick]       # five turns, or one
 """
@@ -38,7 +38,8 @@ class Stepwise(jid.estimators.AbstractEstimator):
     """Least squares for one axis after the other, from the tip inward; deviations are not computed.
 
     Attributes:
-        single_axes: Motions of one axis each; from them friction is identified first, and kept.
+        single_axes: Motions of one axis each; from them friction is identified first,
+            and kept.
     """
 
     single_axes: tuple[jid.Observations, ...] = ()
@@ -48,10 +49,16 @@ class Stepwise(jid.estimators.AbstractEstimator):
         base = problem.base
         p, known = np.zeros(base.size), set()
         for j, observations in enumerate(self.single_axes):
-            alone = jid.RegressionProblem(base, [observations], divisions=1).factors.joints[j]
-            friction = [c for c, k in enumerate(alone.columns) if is_friction(base.names[k])]
+            alone = jid.RegressionProblem(
+                base, [observations], divisions=1
+            ).factors.joints[j]
+            friction = [
+                c for c, k in enumerate(alone.columns) if is_friction(base.names[k])
+            ]
             # In the motion of one axis most columns are alike: only their span counts.
-            R = np.asarray(alone.R) / np.maximum(np.linalg.norm(alone.R, axis=0), 1e-300)
+            R = np.asarray(alone.R) / np.maximum(
+                np.linalg.norm(alone.R, axis=0), 1e-300
+            )
             others = [c for c in range(len(alone.columns)) if c not in friction]
             U, s, _ = np.linalg.svd(R[:, others], full_matrices=False)
             U = U[:, s > DECIDED * s.max(initial=0.0)]
@@ -100,14 +107,22 @@ def observed(robot: jid.Robot, recording: jid.Recording) -> jid.Observations:
 def single_axes(virtual, seed: int) -> tuple[jid.Observations, ...]:
     """Return a log of each axis alone."""
     robot = virtual.model.robot
-    whole = jid.random_fourier_series(robot, omega=2 * np.pi / ALONE, reach=0.9, seed=seed)
+    whole = jid.random_fourier_series(
+        robot, omega=2 * np.pi / ALONE, reach=0.9, seed=seed
+    )
     logs = []
     for j in range(robot.joints):
         alone = np.arange(robot.joints) == j
         kept = alone[:, None] | (np.arange(whole.coefficients.shape[1]) == 0)
-        series = dataclasses.replace(whole, coefficients=np.where(kept, whole.coefficients, 0.0))
+        series = dataclasses.replace(
+            whole, coefficients=np.where(kept, whole.coefficients, 0.0)
+        )
         recording = virtual.measure(
-            series, duration=ALONE, sample_time=0.002, seed=seed + j, name=f"axis {j + 1}"
+            series,
+            duration=ALONE,
+            sample_time=0.002,
+            seed=seed + j,
+            name=f"axis {j + 1}",
         )
         logs.append(observed(robot, recording))
     return tuple(logs)
@@ -135,7 +150,9 @@ def turn(seed: int) -> dict[str, tuple[float, float]]:
     for name, fit in found.items():
         wrong = (fit.predict(motion) - truth) / largest
         friction = [fit.parameters[base.names.index(n)] / values[n] - 1 for n in names]
-        errors[name] = tuple(100 * float(np.sqrt(np.mean(np.square(e)))) for e in (wrong, friction))
+        errors[name] = tuple(
+            100 * float(np.sqrt(np.mean(np.square(e)))) for e in (wrong, friction)
+        )
     return errors
 
 

@@ -2,12 +2,13 @@
 
     python benchmarks/streaming.py [--quick] [--disk SAMPLES] [--json FILE]
 
-A seven-axis arm at 1 kHz in float64: every sample a row; forces and columns filtered (zero phase,
-20 Hz) and every 25th a row; the first against a loop over Pinocchio's regressor in NumPy,
-interleaved with it; the second from a Parquet file, whose reading overlaps with the computing.
-Medians of warm runs; compile times are given apart. Memory is the growth of the process's resident
-set during warm runs. The log on disk is one motion of 500 000 samples again and again. Ratios
-count; absolute times depend on the machine.
+A seven-axis arm at 1 kHz in float64: every sample a row; forces and columns filtered
+(zero phase, 20 Hz) and every 25th a row; the first against a loop over Pinocchio's
+regressor in NumPy, interleaved with it; the second from a Parquet file, whose reading
+overlaps with the computing. Medians of warm runs; compile times are given apart. Memory
+is the growth of the process's resident set during warm runs. The log on disk is one
+motion of 500 000 samples again and again. Ratios count; absolute times depend on the
+machine.
 """
 
 import functools
@@ -19,7 +20,8 @@ import threading
 import time
 from pathlib import Path
 
-# Before NumPy is imported: chunks run in parallel, and threads of BLAS would compete with them.
+# Before NumPy is imported: chunks run in parallel, and threads of BLAS would compete
+# with them.
 os.environ["OPENBLAS_NUM_THREADS"] = os.environ["OMP_NUM_THREADS"] = "1"
 os.environ["JAX_PLATFORMS"] = "cpu"
 
@@ -39,7 +41,11 @@ class Peak:
     """Largest growth of the resident set inside of a `with` block [MB]."""
 
     def __enter__(self):
-        self._start, self.megabytes, self._done = self._resident(), 0.0, threading.Event()
+        self._start, self.megabytes, self._done = (
+            self._resident(),
+            0.0,
+            threading.Event(),
+        )
         self._thread = threading.Thread(target=self._watch)
         self._thread.start()
         return self
@@ -129,7 +135,9 @@ def in_pinocchio(robot):
         kind = pin.JointModelRevoluteUnaligned
         kind = kind if robot.revolute[k] else pin.JointModelPrismaticUnaligned
         place = pin.SE3(np.asarray(robot.rotation[k]), np.asarray(robot.offset[k]))
-        joint = model.addJoint(joint, kind(np.asarray(robot.axis[k])), place, f"joint{k}")
+        joint = model.addJoint(
+            joint, kind(np.asarray(robot.axis[k])), place, f"joint{k}"
+        )
     return model
 
 
@@ -165,11 +173,14 @@ def case(number, name, base, o, repetitions, most, memory=math.inf):
     return Row(
         number,
         f"{len(o.forces)} samples in memory to base parameters, {name}",
-        f"rail + TX90L, {base.size} base parameters with friction and rotors, naive covariance, "
-        f"two cores, median of {repetitions} runs; {fit.rows[0]} rows; the first run, which "
+        f"rail + TX90L, {base.size} base parameters with friction and rotors, naive "
+        "covariance, "
+        f"two cores, median of {repetitions} runs; {fit.rows[0]} rows; the first run, "
+        "which "
         f"compiles, {first:.1f} s",
         asked,
-        f"{median:.2f} s (best {min(times):.2f} s), {peak.megabytes:.0f} MB beyond the inputs",
+        f"{median:.2f} s (best {min(times):.2f} s), {peak.megabytes:.0f} MB beyond "
+        "the inputs",
         median <= most and peak.megabytes <= memory,
     )
 
@@ -204,7 +215,9 @@ def written(base, samples, folder):
     step = min(samples, 500_000)
     motion, forces = virtual_log(base, step)
     arrays = {"q": motion.q, "tau": forces}
-    columns = {f"{n}{j + 1}": x[:, j] for n, x in arrays.items() for j in range(x.shape[1])}
+    columns = {
+        f"{n}{j + 1}": x[:, j] for n, x in arrays.items() for j in range(x.shape[1])
+    }
     part, path = folder / "part.parquet", folder / "log.parquet"
     pl.DataFrame(columns).write_parquet(part, row_group_size=65536)
     whole_log = pl.concat([pl.scan_parquet(part)] * -(-samples // step)).head(samples)
@@ -226,7 +239,8 @@ def from_disk(base, samples, repetitions):
         held = filtered(motion, forces)
         timed(identification, base, held)
         computing = [
-            timed(identification, base, held)[0] * samples / len(forces) for _ in range(repetitions)
+            timed(identification, base, held)[0] * samples / len(forces)
+            for _ in range(repetitions)
         ]
         with Peak() as peak:
             times = [timed(identification, base, log)[0] for _ in range(repetitions)]
@@ -236,8 +250,10 @@ def from_disk(base, samples, repetitions):
     return Row(
         "14",
         f"{samples} samples from Parquet on disk, 20 Hz, every 25th a row",
-        f"rail + TX90L, {base.size} base parameters, a file of {size:.0f} MB, two cores, median of "
-        f"{repetitions} runs; reading and filtering alone {read:.2f} s, computing alone "
+        f"rail + TX90L, {base.size} base parameters, a file of {size:.0f} MB, two "
+        "cores, median of "
+        f"{repetitions} runs; reading and filtering alone {read:.2f} s, computing "
+        "alone "
         f"{computed:.2f} s, both by a part of the log",
         "<= 1.2 x the larger of reading and computing, <= 1000 MB",
         f"{ratio:.2f} x the larger ({median:.2f} s), {peak.megabytes:.0f} MB",
@@ -262,7 +278,8 @@ def against_pinocchio(base, motion, forces, samples, repetitions):
     return Row(
         "11",
         f"{samples} samples in memory to base parameters, against NumPy + Pinocchio",
-        f"rail + TX90L, {base.size} base parameters, every sample a row; the loop is in Python, "
+        f"rail + TX90L, {base.size} base parameters, every sample a row; the loop is "
+        "in Python, "
         f"then a QR; median of {repetitions} turns; estimates differ by {away:.0e}",
         ">= 25x",
         f"{ratio:.0f}x ({a:.3f} s against {b:.2f} s)",
@@ -273,7 +290,10 @@ def against_pinocchio(base, motion, forces, samples, repetitions):
 def accuracy(base, motion, forces):
     """Measure the largest distance from a dense QR, filtered and not (row 12)."""
     found = []
-    for name, prepare in (("every sample a row", unfiltered), ("20 Hz, every 25th", filtered)):
+    for name, prepare in (
+        ("every sample a row", unfiltered),
+        ("20 Hz, every 25th", filtered),
+    ):
         o = prepare(motion, forces)
         away, condition = distance(base, o)
         found.append((away, f"{name} {away:.1e} (condition number {condition:.0f})"))
@@ -281,7 +301,8 @@ def accuracy(base, motion, forces):
     return Row(
         "12",
         "estimates from long logs, distance from a dense QR",
-        f"rail + TX90L, {base.size} base parameters, {len(forces)} samples, columns of length one",
+        f"rail + TX90L, {base.size} base parameters, {len(forces)} samples, columns "
+        "of length one",
         "<= 1e-12",
         "; ".join(words for _, words in found),
         worst <= 1e-12,
@@ -304,8 +325,23 @@ def main():
     base = jid.base_parameters(jid.Model(jid.robots.tx90l_on_rail()))
     motion, forces = virtual_log(base, samples)
     rows = [
-        case("10", "every sample a row", base, unfiltered(motion, forces), repetitions, 1.0, 50.0),
-        case("13", "20 Hz, every 25th a row", base, filtered(motion, forces), repetitions, 4.0),
+        case(
+            "10",
+            "every sample a row",
+            base,
+            unfiltered(motion, forces),
+            repetitions,
+            1.0,
+            50.0,
+        ),
+        case(
+            "13",
+            "20 Hz, every 25th a row",
+            base,
+            filtered(motion, forces),
+            repetitions,
+            4.0,
+        ),
         accuracy(base, motion[:checked], forces[:checked]),
     ]
     absent = timing.missing("pinocchio")
@@ -315,7 +351,9 @@ def main():
         print(absent)
     del motion, forces
     panda = jid.base_parameters(jid.Model(jid.robots.panda()))
-    rows.append(default_intervals(panda, unfiltered(*virtual_log(panda, samples)), repetitions))
+    rows.append(
+        default_intervals(panda, unfiltered(*virtual_log(panda, samples)), repetitions)
+    )
     rows.append(from_disk(base, given.disk or on_disk, 1 if quick else 3))
     hand_over(rows, given.json)
 

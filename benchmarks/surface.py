@@ -2,10 +2,11 @@
 
     python benchmarks/surface.py [--quick] [--json FILE]
 
-Panda with bodies, friction and rotors (91 standard parameters), random motions, float64, one core;
-medians of repeated calls in one process. The packed form is a batch-last program that returns one
-array for each distinct entry. Rollouts: 100 steps of semi-implicit Euler, value and gradient by the
-parameters and the forces; chains of 30 joints repeat the Panda's geometry.
+Panda with bodies, friction and rotors (91 standard parameters), random motions,
+float64, one core; medians of repeated calls in one process. The packed form is a
+batch-last program that returns one array for each distinct entry. Rollouts: 100 steps
+of semi-implicit Euler, value and gradient by the parameters and the forces; chains of
+30 joints repeat the Panda's geometry.
 """
 
 import functools
@@ -81,11 +82,15 @@ def geometry(model, p, rng):
 
     @jax.jit
     def as_inputs(offset, rotation, p, x):
-        own = eqx.tree_at(lambda m: (m.robot.offset, m.robot.rotation), model, (offset, rotation))
+        own = eqx.tree_at(
+            lambda m: (m.robot.offset, m.robot.rotation), model, (offset, rotation)
+        )
         return own.inverse_dynamics(p, x)
 
     numbers = jnp.asarray(robot.offset), jnp.asarray(robot.rotation)
-    ratio = median(as_inputs, *numbers, p, x) / median(jax.jit(model.inverse_dynamics), p, x)
+    ratio = median(as_inputs, *numbers, p, x) / median(
+        jax.jit(model.inverse_dynamics), p, x
+    )
     label = "offsets and rotations as inputs, of constants, 16,384 samples"
     return Row("geometry", label, "", "<= 1.1x", f"{ratio:.2f}x")
 
@@ -106,7 +111,9 @@ def dynamics(model, p, quick):
         times = [median(passed, p, x) / floor, median(closed, x) / floor]
         said = f"{times[0]:.2f} passed, {times[1]:.2f} closed over; packed takes "
         said += f"{1e9 * floor / samples:.0f} ns"
-        yield Row(f"inverse/{samples}", "inverse dynamics over packed", "", "<= 1.15", said)
+        yield Row(
+            f"inverse/{samples}", "inverse dynamics over packed", "", "<= 1.15", said
+        )
     for samples in (256, 2048) if quick else (256, 2048, 4096, 8192):
         x = motion(samples)
         host = jax.tree.map(np.asarray, x)
@@ -115,10 +122,14 @@ def dynamics(model, p, quick):
         loop = pinocchio_loop(samples)
         times = [median(dense, x), median(model.regressor, host)]
         said = (
-            f"{times[0] / floor:.1f} of packed; a loop over Pinocchio takes {loop / times[0]:.1f} "
-            f"times as long, {loop / times[1]:.1f} times with NumPy arrays, not compiled"
+            f"{times[0] / floor:.1f} of packed; a loop over Pinocchio takes "
+            f"{loop / times[0]:.1f} "
+            f"times as long, {loop / times[1]:.1f} times with NumPy arrays, not "
+            "compiled"
         )
-        yield Row(f"regressor/{samples}", "dense regressor", "", "<= 4.5 of packed", said)
+        yield Row(
+            f"regressor/{samples}", "dense regressor", "", "<= 4.5 of packed", said
+        )
 
 
 def pinocchio_loop(samples):
@@ -131,7 +142,10 @@ def pinocchio_loop(samples):
         at = pin.SE3(np.eye(3), np.array([0.0, 0.1, 0.2]))
         model.addJoint(k, axis, at, f"j{k}")
         model.appendBodyToJoint(k + 1, pin.Inertia.Random(), pin.SE3.Identity())
-    data, draws = model.createData(), np.random.default_rng(1).uniform(-1, 1, (samples, 3, 7))
+    data, draws = (
+        model.createData(),
+        np.random.default_rng(1).uniform(-1, 1, (samples, 3, 7)),
+    )
 
     def run():
         for q, qd, qdd in draws:
@@ -146,7 +160,10 @@ def rollout(model, p):
     import jax.numpy as jnp
 
     n = model.robot.joints
-    start, forces = jnp.zeros(n), jnp.asarray(np.random.default_rng(2).normal(size=(100, n)))
+    start, forces = (
+        jnp.zeros(n),
+        jnp.asarray(np.random.default_rng(2).normal(size=(100, n))),
+    )
 
     def loss(p, forces):
         def step(state, u):
@@ -183,7 +200,9 @@ def main():
     gram = jax.jit(model.gram).lower(x).compile()
     memory = gram.memory_analysis().temp_size_in_bytes / 1e6
     said = f"{median(gram, x):.2f} s, {memory:.1f} MB"
-    rows.append(Row("gram", f"gram of {len(x.q)} samples", "", "<= 1.5 s, <= 10 MB", said))
+    rows.append(
+        Row("gram", f"gram of {len(x.q)} samples", "", "<= 1.5 s, <= 10 MB", said)
+    )
     k = np.arange(30) % 7
     chain = jid.Robot(
         "chain",
@@ -212,7 +231,9 @@ def main():
             begun = time.perf_counter()
             jax.jit(method).lower(*arguments).compile()
             said = f"{time.perf_counter() - begun:.1f} s"
-            rows.append(Row(f"chain/{name}", f"{name}, 30 joints, compile", "", "<= 8 s", said))
+            rows.append(
+                Row(f"chain/{name}", f"{name}, 30 joints, compile", "", "<= 8 s", said)
+            )
     hand_over(rows, given.json)
 
 

@@ -76,14 +76,16 @@ class Times:
 
     def __truediv__(self, other: "Times") -> float:
         """Return the median of the ratios turn by turn, so that other load cancels."""
-        return statistics.median(a / b for a, b in zip(self.turns, other.turns, strict=True))
+        return statistics.median(
+            a / b for a, b in zip(self.turns, other.turns, strict=True)
+        )
 
 
 def interleaved(cases: dict[str, Callable[[], object]], turns: int) -> dict[str, Times]:
     """Time all cases in turn, again and again, after warming each of them up.
 
-    A case must block until its result is available. Each turn begins with a call that does not
-    count, since the case before has filled the caches.
+    A case must block until its result is available. Each turn begins with a call that
+    does not count, since the case before has filled the caches.
     """
     calls = {}
     for name, case in cases.items():
@@ -125,7 +127,10 @@ class Row:
 def hand_over(rows: list[Row], path: str | None) -> None:
     """Print rows, and write them where `run.py` reads them."""
     for row in rows:
-        print(f"[{row.number}] {row.what}: {row.measured}; asked {row.asked}\n    {row.recipe}")
+        print(
+            f"[{row.number}] {row.what}: {row.measured}; asked {row.asked}\n    "
+            f"{row.recipe}"
+        )
     if path is not None:
         # Comparisons of NumPy give its own booleans.
         Path(path).write_text(json.dumps([asdict(row) for row in rows], default=bool))
@@ -159,7 +164,11 @@ def machine() -> dict[str, str]:
         )
         model = lines.get("model name", model)
         features = " with AVX-512" if "avx512f" in lines.get("flags", "") else ""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    cores = (
+        len(os.sched_getaffinity(0))
+        if hasattr(os, "sched_getaffinity")
+        else os.cpu_count()
+    )
     packages = [f"{p} {version(p)}" for p in ("jax", "numpy", *PEERS) if version(p)]
     load = f"{os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else "unknown"
     return {

@@ -2,34 +2,39 @@
 
     python benchmarks/virtual_robot.py [--quick]
 
-Robot: the TX90L on its rail, cold, with seven parameters for each body, viscous and Coulomb
-friction and rotors: 70 columns, 44 base parameters, the published ones as published. Motion: random
-Fourier series of 0.8 rad/s with five harmonics that use 50 % of the limits; seed 1 to identify
-with, seed 3 to verify with; one period (7.85 s; 3 s with --quick) each. Servo: 1 kHz, 8 Hz, the
-true model fed forward. Sensors: encoders of 17 bits on the motors, noise of the torques of 1 % of
-the largest (seeds 1 and 3). Filter: zero-phase Butterworth at 15 Hz, columns too, 50 rows/s;
-weighted with the largest forces; intervals of 95 %.
+Robot: the TX90L on its rail, cold, with seven parameters for each body, viscous and
+    Coulomb
+friction and rotors: 70 columns, 44 base parameters, the published ones as published.
+Motion: random Fourier series of 0.8 rad/s with five harmonics that use 50 % of the
+    limits; seed 1 to identify
+with, seed 3 to verify with; one period (7.85 s; 3 s with --quick) each. Servo: 1 kHz, 8
+Hz, the true model fed forward. Sensors: encoders of 17 bits on the motors, noise of the
+torques of 1 % of the largest (seeds 1 and 3). Filter: zero-phase Butterworth at 15 Hz,
+columns too, 50 rows/s; weighted with the largest forces; intervals of 95 %.
 
-Table 1: forces by our inverse dynamics less those of MuJoCo along the same motion, largest
-difference over the largest force of each joint (no dry friction); then RMS difference of the
-torques in the same servo experiment, over the largest force, and the largest one of the positions.
-MuJoCo's dry friction is a constraint that holds a joint, ours here a tanh of 0.01 rad/s.
+Table 1: forces by our inverse dynamics less those of MuJoCo along the same motion,
+largest difference over the largest force of each joint (no dry friction); then RMS
+difference of the torques in the same servo experiment, over the largest force, and the
+largest one of the positions. MuJoCo's dry friction is a constraint that holds a joint,
+ours here a tanh of 0.01 rad/s.
 
-Table 2: base parameters identified from the logs of MuJoCo, of our robot as its model has it
-(`undisturbed`), and of our robot with stiction, Stribeck friction and torque ripple: intervals that
-hold the truth in this one draw of the noise, mean torque error (Eq. 37) by axis against the log, in
-percent of the largest force, and RMS error against the noise-free torques of the verification
-motion.
+Table 2: base parameters identified from the logs of MuJoCo, of our robot as its model
+has it (`undisturbed`), and of our robot with stiction, Stribeck friction and torque
+ripple: intervals that hold the truth in this one draw of the noise, mean torque error
+    (Eq. 37) by axis against the log, in
+percent of the largest force, and RMS error against the noise-free torques of the
+verification motion.
 
-Table 3: intervals of 95 % over 40 draws of the noise (2 with --quick; seeds 0, 1, ...): of the
-identification motion followed exactly (`measure`), and by the servo (`track`, the robot as its
-model has it); share of all that hold, median and least number of one draw, median over the
-parameters of the reported standard deviation over the scatter, and of the mean error over it.
+Table 3: intervals of 95 % over 40 draws of the noise (2 with --quick; seeds 0, 1, ...):
+of the identification motion followed exactly (`measure`), and by the servo (`track`,
+the robot as its model has it); share of all that hold, median and least number of one
+draw, median over the parameters of the reported standard deviation over the scatter,
+and of the mean error over it.
 
-Table 4: bias of the estimates by the paper's filter (Eq. 25), without any noise or encoder step:
-error of each estimate in standard deviations (of one log with noise, seed 0), and the fraction of
-95 % intervals that can hold with such a bias. Motions: the identification motion, and two periods
-of it as the demo runs them, from rest to rest.
+Table 4: bias of the estimates by the paper's filter (Eq. 25), without any noise or
+encoder step: error of each estimate in standard deviations (of one log with noise, seed
+0), and the fraction of 95 % intervals that can hold with such a bias. Motions: the
+identification motion, and two periods of it as the demo runs them, from rest to rest.
 
 Table 5: processor time of one second of the experiment.
 """
@@ -77,7 +82,9 @@ def without_dry_friction(virtual):
 
 def tracked(machine, virtual, which, seed=None, **how):
     """Run an experiment with the true model fed forward."""
-    trajectory = jid.random_fourier_series(virtual.robot, omega=0.8, reach=0.5, seed=which)
+    trajectory = jid.random_fourier_series(
+        virtual.robot, omega=0.8, reach=0.5, seed=which
+    )
 
     def known(motion):
         return virtual.model.inverse_dynamics(virtual.parameters, motion)
@@ -97,9 +104,9 @@ def agreement(virtual):
     smooth = without_dry_friction(virtual)
     trajectory = jid.random_fourier_series(virtual.robot, omega=0.8, reach=0.5, seed=1)
     motion = trajectory.motion(np.linspace(0.0, DURATION, 500))
-    apart = np.abs(smooth.forces(motion) - jid.simulation.MujocoRobot(smooth).forces(motion)).max(
-        axis=0
-    )
+    apart = np.abs(
+        smooth.forces(motion) - jid.simulation.MujocoRobot(smooth).forces(motion)
+    ).max(axis=0)
     print(header("ours less MuJoCo's", AXES))
     print(line("inverse dynamics [1e-15 of the largest force]", 1e15 * apart / most))
     for name, robot in (("without dry friction", smooth), ("with it", virtual)):
@@ -109,7 +116,9 @@ def agreement(virtual):
         )
         difference = 100 * rms(ours.forces - theirs.forces) / most
         print(line(f"torques in the servo experiment, {name} [%]", difference))
-        moved = np.abs(np.asarray(ours.actual.q) - np.asarray(theirs.actual.q)).max(axis=0)
+        moved = np.abs(np.asarray(ours.actual.q) - np.asarray(theirs.actual.q)).max(
+            axis=0
+        )
         print(line(f"positions there, {name} [1e-3 rad, mm]", 1e3 * moved))
 
 
@@ -127,13 +136,16 @@ def identified(virtual, disturbed):
     ):
         runs = [tracked(machine, virtual, which) for which in (1, 3)]
         seen, unseen = (
-            jid.observe(r.recording, virtual.robot, SMOOTH, jid.Subsample(20)) for r in runs
+            jid.observe(r.recording, virtual.robot, SMOOTH, jid.Subsample(20))
+            for r in runs
         )
         fit = jid.identify(base, seen)
         low, high = fit.intervals(0.95).T
         hold = f"{np.sum((low <= truth) & (truth <= high))} of {base.size}"
         check = jid.validate(fit, [seen, unseen])
-        for motion, errors in zip(("identification", "verification"), check.errors, strict=True):
+        for motion, errors in zip(
+            ("identification", "verification"), check.errors, strict=True
+        ):
             shown = " | ".join(f"{x:.2f}" for x in errors.mean_percent)
             print(f"| {name}: {motion}, mean | {hold} | {shown} |")
         wrong = 100 * rms(fit.predict(runs[1].actual) - runs[1].forces) / most
@@ -153,12 +165,20 @@ def calibration(virtual):
     trajectory = jid.random_fourier_series(virtual.robot, omega=0.8, reach=0.5, seed=1)
 
     def followed(seed):
-        return virtual.measure(trajectory, duration=DURATION, sample_time=1e-3, seed=seed)
+        return virtual.measure(
+            trajectory, duration=DURATION, sample_time=1e-3, seed=seed
+        )
 
     def by_servo(seed):
         return tracked(virtual, virtual, 1, seed).recording
 
-    columns = ("hold [%]", "median", "least", "reported / scatter", "mean error / scatter")
+    columns = (
+        "hold [%]",
+        "median",
+        "least",
+        "reported / scatter",
+        "mean error / scatter",
+    )
     print()
     print(header(f"{DRAWS} draws, of 44", columns))
     for name, log in (("followed exactly", followed), ("by the servo", by_servo)):
@@ -171,7 +191,8 @@ def calibration(virtual):
         held = inside.sum(axis=1)
         bias = np.abs(found.mean(axis=0) - truth) / scatter
         print(
-            f"| {name} | {100 * inside.mean():.1f} | {np.median(held):.0f} | {held.min()} | "
+            f"| {name} | {100 * inside.mean():.1f} | {np.median(held):.0f} | "
+            f"{held.min()} | "
             f"{np.median(reported / scatter):.2f} | {np.median(bias):.2f} |"
         )
 
@@ -181,11 +202,19 @@ def filters(virtual):
     base = jid.base_parameters(virtual.model)
     truth = np.asarray(base.from_standard(virtual.parameters))
     most = virtual.sensors.white_noise
-    perfect = dataclasses.replace(virtual.sensors, encoder_step=1e-11, white_noise=0.0 * most)
+    perfect = dataclasses.replace(
+        virtual.sensors, encoder_step=1e-11, white_noise=0.0 * most
+    )
     quiet = virtual.replace(sensors=perfect)
     series = jid.random_fourier_series(virtual.robot, omega=0.8, reach=0.5, seed=1)
     led = jid.trajectories.with_leads(series, virtual.robot, periods=2)
-    columns = ("median error [sd]", "largest [sd]", "worst", "beyond 1.96", "can hold [%]")
+    columns = (
+        "median error [sd]",
+        "largest [sd]",
+        "worst",
+        "beyond 1.96",
+        "can hold [%]",
+    )
     print()
     print(header("filter; motion", columns))
     for motion, trajectory, duration in (
@@ -206,8 +235,10 @@ def filters(virtual):
             hold = norm.cdf(1.96 - bias) - norm.cdf(-1.96 - bias)
             worst = int(np.argmax(np.abs(bias)))
             print(
-                f"| {name}; {motion} | {np.median(np.abs(bias)):.2f} | {abs(bias[worst]):.1f} | "
-                f"{base.names[worst]} | {np.sum(np.abs(bias) > 1.96)} | {100 * hold.mean():.0f} |"
+                f"| {name}; {motion} | {np.median(np.abs(bias)):.2f} | "
+                f"{abs(bias[worst]):.1f} | "
+                f"{base.names[worst]} | {np.sum(np.abs(bias) > 1.96)} | "
+                f"{100 * hold.mean():.0f} |"
             )
 
 

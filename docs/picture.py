@@ -17,7 +17,9 @@ def main() -> None:
     robot = jid.robots.tx90l_on_rail()
     time = np.linspace(0.0, 7.85, 400)
     motion = jid.random_fourier_series(robot, omega=OMEGA, seed=3).motion(time)
-    figure = jid.plot.poses(robot, motion.q, time, poses=4, title="TX90L on rail: a motion")
+    figure = jid.plot.poses(
+        robot, motion.q, time, poses=4, title="TX90L on rail: a motion"
+    )
     figure.save(Path(__file__).with_name("picture.png"))
 
 

@@ -8,7 +8,10 @@ from . import (
 )
 from .diagnosis import diagnose as diagnose
 from .dynamics import terms as terms
-from .dynamics.base import BaseParameters as BaseParameters, base_parameters as base_parameters
+from .dynamics.base import (
+    BaseParameters as BaseParameters,
+    base_parameters as base_parameters,
+)
 from .dynamics.model import Model as Model
 from .dynamics.motion import Motion as Motion
 from .dynamics.terms import (
@@ -20,7 +23,10 @@ from .dynamics.terms import (
 )
 from .errors import InputError as InputError
 from .excitation import constraints as constraints, criteria as criteria
-from .excitation.design import design_excitation as design_excitation, minimise as minimise
+from .excitation.design import (
+    design_excitation as design_excitation,
+    minimise as minimise,
+)
 from .excitation.design_result import ExcitationPlan as ExcitationPlan
 from .excitation.problem import ExcitationProblem as ExcitationProblem
 from .export.c_code import export_c as export_c
@@ -46,7 +52,10 @@ from .identification.filter_and_parameter_selection import (
 from .identification.fit_result import Fit as Fit, load as load
 from .identification.identify import identify as identify
 from .identification.many_data_sets import identify_batch as identify_batch
-from .identification.model_selection import Candidate as Candidate, choose_model as choose_model
+from .identification.model_selection import (
+    Candidate as Candidate,
+    choose_model as choose_model,
+)
 from .identification.nonlinear_friction import (
     identify_nonlinear as identify_nonlinear,
     identify_presliding as identify_presliding,

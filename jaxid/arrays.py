@@ -1,6 +1,7 @@
 """Shape vocabulary of annotations, and arrays of NumPy and JAX side by side.
 
-Axes: `joints` (= bodies), `standard` (columns of the full regressor), `base` (columns of the base
+Axes: `joints` (= bodies), `standard` (columns of the full regressor), `base` (columns
+    of the base
 regressor), `samples` (rows of a log), `rows` (rows left after filtering), `batch`.
 """
 
@@ -64,7 +65,9 @@ def as_array(name: str, value: Numbers) -> AnyArray:
     try:
         return np.array(value, np.float64)
     except (TypeError, ValueError) as error:
-        raise InputError(f"`{name}` must be an array of numbers, but is {value!r:.60}.") from error
+        raise InputError(
+            f"`{name}` must be an array of numbers, but is {value!r:.60}."
+        ) from error
 
 
 def given(value: Any) -> Any:
@@ -87,7 +90,8 @@ def matching(name: str, value: AnyArray | float, qd: AnyArray) -> AnyArray | flo
     shape = np.shape(value)
     if shape and shape != qd.shape[-1:]:
         raise InputError(
-            f"`{name}` must be one number, or one for each of {qd.shape[-1]} joints, but has shape "
+            f"`{name}` must be one number, or one for each of {qd.shape[-1]} joints, "
+            "but has shape "
             f"{shape}."
         )
     return value
@@ -111,8 +115,8 @@ def on_cores(
 ) -> Iterator[Any]:
     """Yield the results of a function for some items in their order, computed on all cores.
 
-    The calling thread makes the items, and at most `ahead` of them before it takes a result: by
-    default one for each core.
+    The calling thread makes the items, and at most `ahead` of them before it takes a
+    result: by default one for each core.
     """
     cores = cores or os.cpu_count() or 1
     ahead = ahead or cores
@@ -129,9 +133,9 @@ def on_cores(
 def in_parts(solve: Callable[[Any], Any], data: Any, size: int = 16) -> Any:
     """Return the results of a compiled function, called for so many entries of data at a time.
 
-    XLA leaves small operations to one core, so each core gets entries of its own. Parts of equal
-    size also mean that another number of entries compiles nothing anew. An accelerator takes the
-    parts one after the other.
+    XLA leaves small operations to one core, so each core gets entries of its own. Parts
+    of equal size also mean that another number of entries compiles nothing anew. An
+    accelerator takes the parts one after the other.
     """
     count = len(jax.tree.leaves(data)[0])
     size = min(count, size)
@@ -156,8 +160,8 @@ def content(tree: Any) -> tuple:
 class Hashable(eqx.Module):
     """Module with NumPy arrays whose methods `jax.jit` takes as they are.
 
-    JAX looks a bound method such as `model.regressor` up by the hash of the module, and arrays have
-    none. Here the hash is of the numbers.
+    JAX looks a bound method such as `model.regressor` up by the hash of the module, and
+    arrays have none. Here the hash is of the numbers.
     """
 
     def __hash__(self) -> int:

@@ -1,9 +1,9 @@
 """Atomic writes, safe reading of JSON, and modules as JSON values.
 
-A module becomes an object with the name of its class under `kind` and one entry for each field; an
-array becomes an object with its dtype as the only key. Numbers are exact to the last bit. Only
-classes that fit the annotation of a field are looked up, so that no file can run code. A user's
-own subclass is found once its module is imported.
+A module becomes an object with the name of its class under `kind` and one entry for
+each field; an array becomes an object with its dtype as the only key. Numbers are exact
+to the last bit. Only classes that fit the annotation of a field are looked up, so that
+no file can run code. A user's own subclass is found once its module is imported.
 """
 
 import contextlib
@@ -54,9 +54,10 @@ def atomic_folder(
 ) -> Iterator[Path]:
     """Yield an empty temporary folder whose files appear in `folder` when the block ends.
 
-    After an error in the block nothing has changed. A new folder appears in one step. In an
-    existing folder, each file replaces the one of its name in one step, files in JSON last: a
-    result whose JSON file is there is complete. Other files stay, but those that `outdated` names.
+    After an error in the block nothing has changed. A new folder appears in one step.
+    In an existing folder, each file replaces the one of its name in one step, files in
+    JSON last: a result whose JSON file is there is complete. Other files stay, but
+    those that `outdated` names.
     """
     folder = Path(folder).absolute()
     with _temporary_folder(folder) as staging:
@@ -82,7 +83,9 @@ def _temporary_folder(folder: Path) -> Iterator[Path]:
     while not place.exists() and not place.is_symlink():
         place = place.parent
     if not place.is_dir():
-        raise InputError(f"`{place}` must be a folder, but is none: choose another place.")
+        raise InputError(
+            f"`{place}` must be a folder, but is none: choose another place."
+        )
     path = place / f".jaxid-{uuid.uuid4().hex[:12]}"
     TEMPORARY.add(path)
     try:
@@ -97,11 +100,17 @@ def _temporary_folder(folder: Path) -> Iterator[Path]:
 
 
 def _move_files(staging: Path, folder: Path, outdated: Iterable[str]) -> None:
-    paths = sorted(staging.iterdir(), key=lambda path: (path.suffix == ".json", path.name))
+    paths = sorted(
+        staging.iterdir(), key=lambda path: (path.suffix == ".json", path.name)
+    )
     for path in paths:
         if (folder / path.name).is_dir():
-            raise InputError(f"`{folder / path.name}` must be a file, but is a folder: remove it.")
-    old = {name for name in outdated if (folder / name).is_file()} - {p.name for p in paths}
+            raise InputError(
+                f"`{folder / path.name}` must be a file, but is a folder: remove it."
+            )
+    old = {name for name in outdated if (folder / name).is_file()} - {
+        p.name for p in paths
+    }
     if len(paths) > 1:
         # Without its JSON files, no mixture of old and new files is taken for a result.
         old |= {p.name for p in paths if p.suffix == ".json"}
@@ -122,8 +131,12 @@ def read_json(path: str | Path) -> Any:
 def json_text(content: dict[str, Any]) -> str:
     """Return the text of a JSON file that programs read exactly and people can read."""
     text = json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False)
-    # A list of numbers or texts stands on one line. Texts hold no line breaks, so none is touched.
-    return re.sub(r"\[\n[^\[\]{}]*\n *\]", lambda m: re.sub(r"\n *", " ", m[0]), text) + "\n"
+    # A list of numbers or texts stands on one line. Texts hold no line breaks, so none
+    # is touched.
+    return (
+        re.sub(r"\[\n[^\[\]{}]*\n *\]", lambda m: re.sub(r"\n *", " ", m[0]), text)
+        + "\n"
+    )
 
 
 def fill_template(path: Path, **values: Any) -> str:
@@ -152,7 +165,8 @@ def import_extra(module: str, extra: str, use: str) -> Any:
     except ImportError as missing:
         package = module.partition(".")[0]
         raise InputError(
-            f'{use} the package `{package}`: install it (`pip install "jaxid-robotics[{extra}]"`).'
+            f"{use} the package `{package}`: install it (`pip install "
+            f'"jaxid-robotics[{extra}]"`).'
         ) from missing
 
 
@@ -172,7 +186,9 @@ def to_json(value: Any, refused: tuple[type, ...] = ()) -> Any:
         if name not in _DTYPES:
             raise InputError(f"a document cannot hold an array of {name}.")
         if array.dtype.kind == "f" and not np.isfinite(array).all():
-            shown = np.where(np.isfinite(array), array.astype(object), array.astype(str))
+            shown = np.where(
+                np.isfinite(array), array.astype(object), array.astype(str)
+            )
             entries = shown.tolist()
         return {name: entries} if array.size else {name: [], "shape": list(array.shape)}
     if isinstance(value, float):
@@ -236,8 +252,11 @@ def _object_from_json(value: dict[str, Any], options: Sequence[Any], place: str)
 def _module_from_json(value: dict[str, Any], options: Sequence[Any], place: str) -> Any:
     kind = value["kind"]
     families = [o for o in options if isinstance(o, type) and issubclass(o, eqx.Module)]
-    named = [c for family in families for c in _subclasses(family) if c.__name__ == kind]
-    # Of classes of one name the last one counts; not a twin that Equinox derives for its own ends.
+    named = [
+        c for family in families for c in _subclasses(family) if c.__name__ == kind
+    ]
+    # Of classes of one name the last one counts; not a twin that Equinox derives for
+    # its own ends.
     named = [c for c in named if not any(b in named for b in c.__mro__[1:])]
     if not named:
         raise InputError(
@@ -253,12 +272,17 @@ def _module_from_json(value: dict[str, Any], options: Sequence[Any], place: str)
     try:
         return named[-1](**entries)
     except TypeError as error:
-        raise InputError(f"`{place or kind}` ({kind}) has other keys: {error}") from error
+        raise InputError(
+            f"`{place or kind}` ({kind}) has other keys: {error}"
+        ) from error
 
 
 def _subclasses(family: type) -> list[type]:
     """Return a class and all that are derived from it, older ones first."""
-    return [family, *(c for child in family.__subclasses__() for c in _subclasses(child))]
+    return [
+        family,
+        *(c for child in family.__subclasses__() for c in _subclasses(child)),
+    ]
 
 
 def union_members(hint: Any) -> tuple[Any, ...]:

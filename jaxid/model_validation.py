@@ -13,7 +13,15 @@ from jaxid.identification.fit_result import Fit
 from jaxid.identification.problem import RegressionProblem
 from jaxid.measurement.friction_state import with_memory
 from jaxid.measurement.observations import Observations, Progress
-from jaxid.result_table import Column, Remark, Status, Summarised, Table, percent, significant
+from jaxid.result_table import (
+    Column,
+    Remark,
+    Status,
+    Summarised,
+    Table,
+    percent,
+    significant,
+)
 
 POSES = 2000
 """Random poses in which the mass matrix is evaluated."""
@@ -38,8 +46,8 @@ class TorqueErrors(eqx.Module):
         counted: Rows that count, for each joint.
         max_forces: Largest force of each joint [N m or N]; NaN where not known.
         speeds: Velocities, filtered and decimated alike [rad/s or m/s].
-        unexplained: Errors of the same model fitted to this recording alone: what no parameters of
-            it explain; NaN where a row does not count [N m or N].
+        unexplained: Errors of the same model fitted to this recording alone: what no
+            parameters of it explain; NaN where a row does not count [N m or N].
         positions: Coordinates, filtered and decimated alike [rad or m].
     """
 
@@ -103,19 +111,25 @@ class TorqueErrors(eqx.Module):
     def depend_on_speed(self) -> tuple[bool, ...]:
         """Whether errors of each joint depend on its speed: friction of another shape.
 
-        Then means of unexplained errors over classes of speed agree between blocks of time: more
-        than after nearly any change of the blocks' signs, which leaves noise as it is
-        (randomization test, Fisher). They make up a tenth of the squared errors at least.
+        Then means of unexplained errors over classes of speed agree between blocks of
+        time: more than after nearly any change of the blocks' signs, which leaves noise
+            as it is
+        (randomization test, Fisher). They make up a tenth of the squared errors at
+        least.
         """
         # One log of a hundred gives a false alarm.
         limit = 0.01 / self.errors.shape[1]
-        pairs = zip(*(np.asarray(x).T for x in (self.unexplained, self.speeds)), strict=True)
+        pairs = zip(
+            *(np.asarray(x).T for x in (self.unexplained, self.speeds)), strict=True
+        )
         return tuple(_chance(e, v) <= limit for e, v in pairs)
 
     def _rms_where(self, chosen: np.ndarray) -> np.ndarray:
         squares = (self.errors - self.offset) ** 2
         chosen = chosen & np.isfinite(squares)
-        return np.sqrt(_ratio(np.sum(squares, axis=0, where=chosen), np.sum(chosen, axis=0)))
+        return np.sqrt(
+            _ratio(np.sum(squares, axis=0, where=chosen), np.sum(chosen, axis=0))
+        )
 
     @property
     def force_rms(self) -> Float[np.ndarray, " joints"]:
@@ -130,14 +144,18 @@ class TorqueErrors(eqx.Module):
     @property
     def relative(self) -> float:
         r"""Norm of all errors over the norm of all forces, $|Wp - Q| / |Q|$."""
-        return float(np.sqrt(_ratio(np.nansum(self.errors**2), np.nansum(self._measured**2))))
+        return float(
+            np.sqrt(_ratio(np.nansum(self.errors**2), np.nansum(self._measured**2)))
+        )
 
     @property
     def _measured(self) -> np.ndarray:
         return np.where(self.counted, np.asarray(self.measured), np.nan)
 
 
-def _chance(errors: Float[np.ndarray, " rows"], speeds: Float[np.ndarray, " rows"]) -> float:
+def _chance(
+    errors: Float[np.ndarray, " rows"], speeds: Float[np.ndarray, " rows"]
+) -> float:
     """Return the probability of errors whose means over classes of speed agree as much.
 
     It is one if these means make up less than a tenth of the squared errors.
@@ -172,7 +190,8 @@ class Definiteness(eqx.Module):
     Attributes:
         smallest: Smallest eigenvalue over all poses, of the mass matrix in SI units.
         pose: Joint coordinates where it occurs [rad or m].
-        indefinite: Fraction (0 to 1) of the poses in which an eigenvalue is not positive.
+        indefinite: Fraction (0 to 1) of the poses in which an eigenvalue is not
+            positive.
         poses: Number of poses.
     """
 
@@ -190,7 +209,8 @@ class Definiteness(eqx.Module):
         if self.positive_definite:
             return f"The mass matrix is positive definite in all of {self.poses} poses."
         return (
-            f"The mass matrix is indefinite in {percent(self.indefinite)} % of {self.poses} poses; "
+            f"The mass matrix is indefinite in {percent(self.indefinite)} % of "
+            f"{self.poses} poses; "
             f"its smallest eigenvalue is {self.smallest:.2g}."
         )
 
@@ -218,15 +238,27 @@ class Validation(Summarised, eqx.Module):
             Column("joint", [self.joint_names[j] for _, j in rows]),
             Column("RMS error", [float(e.rms[j]) for e, j in rows]),
             Column("unit", [self.units[j] for _, j in rows]),
-            Column("of the forces", [float(e.rms_relative[j]) for e, j in rows], "%", percent),
-            Column("of the largest", [float(e.rms_percent[j]) for e, j in rows], "%", significant),
+            Column(
+                "of the forces",
+                [float(e.rms_relative[j]) for e, j in rows],
+                "%",
+                percent,
+            ),
+            Column(
+                "of the largest",
+                [float(e.rms_percent[j]) for e, j in rows],
+                "%",
+                significant,
+            ),
         ]
         status = Status.GOOD if self.definiteness.positive_definite else Status.BAD
         count = len(self.joint_names)
         return Table(
             "Validation",
             *columns,
-            facts=[(e.name, f"{percent(e.relative)} % of the forces") for e in self.errors],
+            facts=[
+                (e.name, f"{percent(e.relative)} % of the forces") for e in self.errors
+            ],
             remarks=[Remark(str(self.definiteness), status)],
             rules=range(count, len(rows), count),
         )
@@ -243,9 +275,12 @@ def validate(
     Args:
         fit: Fit of the model.
         observations: One or several recordings, preferably not used for the fit.
-        progress: Callback, called with the completed fraction (0 to 1) of each recording.
+        progress: Callback, called with the completed fraction (0 to 1) of each
+            recording.
     """
-    recordings = (observations,) if isinstance(observations, Observations) else observations
+    recordings = (
+        (observations,) if isinstance(observations, Observations) else observations
+    )
     robot = fit.base.model.robot
     return Validation(
         errors=tuple(torque_errors(fit, o, progress) for o in recordings),
@@ -260,8 +295,8 @@ def torque_errors(
 ) -> TorqueErrors:
     """Compare the forces that a model predicts with measured ones (Eqs. 27, 37).
 
-    The prediction is filtered and decimated like the measurement, in parts. Of more than `ROWS`
-    rows every n-th is compared.
+    The prediction is filtered and decimated like the measurement, in parts. Of more
+    than `ROWS` rows every n-th is compared.
     """
     known = fit.base.model.robot.known_max_forces
     observations = with_memory(observations, fit.base.model.memory)
@@ -280,7 +315,9 @@ def torque_errors(
             refitted = fit.base.forces_in_numpy(own, motion) + tool
             rows = slice(-(-first // step), -(-stop // step))
             taken = slice(rows.start * step - first, None, step)
-            for kind, x in enumerate((forces, predicted, refitted, motion.qd, motion.q)):
+            for kind, x in enumerate(
+                (forces, predicted, refitted, motion.qd, motion.q)
+            ):
                 found[kind, rows] = chunk.reduce(x)[taken]
         if progress is not None:
             progress(stop / observations.rows)
@@ -306,15 +343,23 @@ def comparison_step(observations: Observations) -> int:
 def definiteness(fit: Fit, poses: int = POSES) -> Definiteness:
     """Look for random poses in which the identified mass matrix is not positive definite (Sec. 5).
 
-    They are spread over the range of the joints. A joint without limits turns once, a rail without
-    limits stays within a metre of zero.
+    They are spread over the range of the joints. A joint without limits turns once, a
+    rail without limits stays within a metre of zero.
     """
     robot = fit.base.model.robot
     half = np.where(np.array(robot.revolute), np.pi, 1.0)
-    low, high = np.asarray(robot.limits.position_min), np.asarray(robot.limits.position_max)
-    low, high = np.where(np.isfinite(low), low, -half), np.where(np.isfinite(high), high, half)
+    low, high = (
+        np.asarray(robot.limits.position_min),
+        np.asarray(robot.limits.position_max),
+    )
+    low, high = (
+        np.where(np.isfinite(low), low, -half),
+        np.where(np.isfinite(high), high, half),
+    )
     q = np.random.default_rng(0).uniform(low, high, (poses, robot.joints))
     M = in_numpy(fit.base, fit.base.inertia, q, shared=(fit.parameters,))
     smallest = np.linalg.eigvalsh(M)[:, 0]
     worst = int(np.argmin(smallest))
-    return Definiteness(float(smallest[worst]), q[worst], float(np.mean(smallest <= 0.0)), poses)
+    return Definiteness(
+        float(smallest[worst]), q[worst], float(np.mean(smallest <= 0.0)), poses
+    )

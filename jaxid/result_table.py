@@ -1,9 +1,9 @@
 """Tables of results: facts, columns with units, remarks; as text, and as rows for pages.
 
-A result returns one by its method `summary()` and prints it by `__str__`. Columns hold numbers or
-texts; numbers are formatted by the column's function and aligned at their decimal points.
-Estimates and their deviations are rounded together: `values, deviations = with_deviations(p, s)`
-are texts for two columns of `kind="number"`.
+A result returns one by its method `summary()` and prints it by `__str__`. Columns hold
+numbers or texts; numbers are formatted by the column's function and aligned at their
+decimal points. Estimates and their deviations are rounded together: `values, deviations
+= with_deviations(p, s)` are texts for two columns of `kind="number"`.
 """
 
 import dataclasses
@@ -134,7 +134,10 @@ def with_deviation(value: float, deviation: float) -> tuple[str, str]:
 
 def with_deviations(values: Any, deviations: Any) -> tuple[list[str], list[str]]:
     """Return estimates and their deviations as texts for two columns, rounded together."""
-    pairs = [with_deviation(float(v), float(d)) for v, d in zip(values, deviations, strict=True)]
+    pairs = [
+        with_deviation(float(v), float(d))
+        for v, d in zip(values, deviations, strict=True)
+    ]
     return [pair[0] for pair in pairs], [pair[1] for pair in pairs]
 
 
@@ -155,8 +158,9 @@ class Column:
         values: Sequence or array of numbers or texts, one for each row.
         unit: Unit of all values, shown in brackets below the name.
         format: Function that makes a text of a number.
-        kind: Numbers are aligned at their decimal points; `code` is set in a fixed-width font on
-            pages. By default `number` if all values are numbers, else `text`.
+        kind: Numbers are aligned at their decimal points; `code` is set in a
+            fixed-width font on pages. By default `number` if all values are numbers,
+            else `text`.
     """
 
     name: str
@@ -184,12 +188,16 @@ class Column:
     @property
     def texts(self) -> list[str]:
         """Formatted values; numbers have blanks behind them so that their points are aligned."""
-        texts = [self.format(x) if isinstance(x, float) else str(x) for x in self.values]
+        texts = [
+            self.format(x) if isinstance(x, float) else str(x) for x in self.values
+        ]
         if self.kind != "number":
             return texts
         tails = [len(s) - s.index(".") if "." in s else 0 for s in texts]
         longest = max(tails, default=0)
-        return [s + " " * (longest - tail) for s, tail in zip(texts, tails, strict=True)]
+        return [
+            s + " " * (longest - tail) for s, tail in zip(texts, tails, strict=True)
+        ]
 
 
 class Summarised:
@@ -248,7 +256,9 @@ class Table:
 
         The widest columns of texts are shortened to fit, remarks are wrapped.
         """
-        return "\n".join("".join(part for part, _ in line).rstrip() for line in self.lines(width))
+        return "\n".join(
+            "".join(part for part, _ in line).rstrip() for line in self.lines(width)
+        )
 
     def __str__(self) -> str:
         return self.text()
@@ -265,7 +275,11 @@ class Table:
         indent = max((len(word) for word, _ in self.facts), default=0) + 2
         facts = [(word.ljust(indent), "dim", text) for word, text in self.facts]
         remarks = [
-            (f"{r.status.value}  ", r.status, f"{r.text} ({r.detail})" if r.detail else r.text)
+            (
+                f"{r.status.value}  ",
+                r.status,
+                f"{r.text} ({r.detail})" if r.detail else r.text,
+            )
             for r in self.remarks
         ]
         groups = (_hanging(facts, width), self._grid(width), _hanging(remarks, width))
@@ -281,14 +295,18 @@ class Table:
         if not self.columns:
             return
         texts, headers = zip(*((c.texts, c.header) for c in self.columns), strict=True)
-        widths = [max(map(len, (*h, *cells))) for h, cells in zip(headers, texts, strict=True)]
+        widths = [
+            max(map(len, (*h, *cells))) for h, cells in zip(headers, texts, strict=True)
+        ]
         right = [column.kind == "number" for column in self.columns]
         margin = 3 if self.status else 0
         _shrink(widths, right, width - margin)
 
         def line(cells: Sequence[str]) -> str:
             places = zip(map(shortened, cells, widths), widths, right, strict=True)
-            return "  ".join(s.rjust(w) if number else s.ljust(w) for s, w, number in places)
+            return "  ".join(
+                s.rjust(w) if number else s.ljust(w) for s, w, number in places
+            )
 
         height = max(map(len, headers))
         padded = ([""] * (height - len(header)) + header for header in headers)
@@ -296,7 +314,12 @@ class Table:
             yield [(" " * margin + line(head), "header")]
         for k, row in enumerate(zip(*texts, strict=True)):
             if k in self.rules:
-                yield [("─" * min(width, margin + sum(widths) + 2 * len(widths) - 2), "dim")]
+                yield [
+                    (
+                        "─" * min(width, margin + sum(widths) + 2 * len(widths) - 2),
+                        "dim",
+                    )
+                ]
             mark = self.status[k] if self.status else Status.NEUTRAL
             yield [(f"{mark.value}  "[:margin], mark), (line(row), "")]
 

@@ -23,8 +23,9 @@ class Quantity(enum.Enum):
 class Unit:
     """Unit of a measured quantity.
 
-    Define a unit for drive-specific counts: `Unit("count", 2 * pi / 4096, Quantity.COORDINATE)` for
-    an encoder, `Unit("permille", 1e-3 * rated, Quantity.FORCE)` for thousandths of rated torque.
+    Define a unit for drive-specific counts: `Unit("count", 2 * pi / 4096,
+    Quantity.COORDINATE)` for an encoder, `Unit("permille", 1e-3 * rated,
+    Quantity.FORCE)` for thousandths of rated torque.
 
     Attributes:
         symbol: Symbol, such as `deg`.
@@ -40,7 +41,8 @@ class Unit:
         """Refuse factors that cannot be inverted."""
         if not np.isfinite(self.factor) or self.factor == 0:
             raise InputError(
-                f"`factor` of `{self.symbol}` must be finite and not zero, but is {self.factor}."
+                f"`factor` of `{self.symbol}` must be finite and not zero, but is "
+                f"{self.factor}."
             )
 
 
@@ -75,7 +77,9 @@ def unit(symbol: str) -> Unit:
     """
     units = {known.symbol: known for known in ALL}
     if symbol not in units:
-        raise InputError(f"`{symbol}` is no known unit: write one of {', '.join(units)}.")
+        raise InputError(
+            f"`{symbol}` is no known unit: write one of {', '.join(units)}."
+        )
     return units[symbol]
 
 

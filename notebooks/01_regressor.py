@@ -69,7 +69,9 @@ print("regressor of", len(t), "samples:", theta.shape)
 
 one = np.abs(theta[100])
 figure, axes = plt.subplots(figsize=(11, 2.7))
-picture = axes.imshow(np.log10(np.where(one > 0, one, np.nan)), aspect="auto", vmin=-3, vmax=1.5)
+picture = axes.imshow(
+    np.log10(np.where(one > 0, one, np.nan)), aspect="auto", vmin=-3, vmax=1.5
+)
 axes.set_yticks(range(7), robot.joint_names)
 edges = [10 * i for i in range(8)] + [77, 84, 91]
 axes.set_xticks(
@@ -94,7 +96,9 @@ plt.show()
 masses = [200.0, 45.0, 30.0, 15.0, 20.0, 4.0, 1.5]
 ends = [*robot.offset[1:], robot.tip_offset]
 bodies = [
-    jid.Tool(i, mass=m, centre_of_mass=0.5 * end, inertia=0.01 * m * np.eye(3)).parameters
+    jid.Tool(
+        i, mass=m, centre_of_mass=0.5 * end, inertia=0.01 * m * np.eye(3)
+    ).parameters
     for i, (m, end) in enumerate(zip(masses, ends))
 ]
 viscous = [250.0, 41.0, 30.0, 16.0, 4.0, 5.0, 2.0]
@@ -118,7 +122,9 @@ print(
 # %%
 still = np.zeros_like(motion.q)
 frictionless = np.concatenate([*bodies, np.zeros(14), rotors])
-gravity = np.asarray(model.inverse_dynamics(frictionless, jid.Motion(motion.q, still, still)))
+gravity = np.asarray(
+    model.inverse_dynamics(frictionless, jid.Motion(motion.q, still, still))
+)
 slow = np.asarray(model.bias_forces(frictionless, motion.q, motion.qd)) - gravity
 inertia = np.einsum("nij,nj->ni", M, motion.qdd)
 friction = forces - gravity - slow - inertia
@@ -146,9 +152,9 @@ plt.show()
 # heights, the forces from $\Theta$: if a sign or a Coriolis term were wrong, the two lines would differ.
 
 # %%
-energy = np.asarray(model.kinetic_energy(frictionless, motion.q, motion.qd)) + np.asarray(
-    model.potential_energy(frictionless, motion.q)
-)
+energy = np.asarray(
+    model.kinetic_energy(frictionless, motion.q, motion.qd)
+) + np.asarray(model.potential_energy(frictionless, motion.q))
 fine = np.linspace(0.0, series.duration, 4000)
 along = series.motion(fine)
 E = np.asarray(model.kinetic_energy(frictionless, along.q, along.qd)) + np.asarray(

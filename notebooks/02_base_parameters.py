@@ -39,7 +39,10 @@ paper = jid.base_parameters(
 print(f"{paper.model.size} standard parameters, {paper.size} base parameters")
 for k in (0, 1, 2, 7, 10, 25):
     print(f"p_B({k + 1:2}) [{paper.units[k]:5}] = {paper.expressions[k]}")
-print("with", ", ".join(f"{letter} = {value:g} m" for letter, value in paper.lengths.items()))
+print(
+    "with",
+    ", ".join(f"{letter} = {value:g} m" for letter, value in paper.lengths.items()),
+)
 
 # %% [markdown]
 # ## All ten parameters of each body
@@ -61,10 +64,13 @@ names = ["m", "mx", "my", "mz", "A", "B", "C", "D", "E", "F"]
 figure, axes = plt.subplots(figsize=(11, 3.0))
 shown = np.vstack([verdict[:70].reshape(7, 10).T])
 colours = plt.matplotlib.colors.ListedColormap(["#d5dae0", "#E69F00", "#0072B2"])
-picture = axes.pcolormesh(shown, cmap=colours, vmin=-0.5, vmax=2.5, edgecolors="white", linewidth=2)
+picture = axes.pcolormesh(
+    shown, cmap=colours, vmin=-0.5, vmax=2.5, edgecolors="white", linewidth=2
+)
 axes.set_yticks(np.arange(10) + 0.5, names)
 axes.set_xticks(
-    np.arange(7) + 0.5, [f"body {i + 1} ({name})" for i, name in enumerate(robot.joint_names)]
+    np.arange(7) + 0.5,
+    [f"body {i + 1} ({name})" for i, name in enumerate(robot.joint_names)],
 )
 axes.invert_yaxis()
 axes.grid(False)
@@ -95,7 +101,9 @@ print("doubts:", base.notes or "none")
 
 figure, axes = plt.subplots(figsize=(11, 3.0))
 for values, label in ((scaled, "columns scaled"), (raw, "as it is, SI units")):
-    axes.semilogy(np.arange(1, 92), np.maximum(values / values[0], 1e-18), ".", label=label)
+    axes.semilogy(
+        np.arange(1, 92), np.maximum(values / values[0], 1e-18), ".", label=label
+    )
 axes.axvline(base.size + 0.5, color="#5f6b78", ls="--", lw=0.8)
 axes.annotate(f"{base.size} base parameters", (base.size - 0.5, 1e-8), ha="right")
 axes.set_xlabel("singular value of the stacked regressor")
@@ -112,7 +120,9 @@ plt.show()
 random = np.random.default_rng(0)
 p = random.normal(size=base.model.size)
 p_B = np.asarray(base.from_standard(p))
-motion = jid.random_fourier_series(robot, omega=0.8, seed=3).motion(np.linspace(0, 7, 50))
+motion = jid.random_fourier_series(robot, omega=0.8, seed=3).motion(
+    np.linspace(0, 7, 50)
+)
 full = np.asarray(base.model.regressor(motion)) @ p
 fewer = np.asarray(base.regressor(motion)) @ p_B
 print(
@@ -122,7 +132,9 @@ print(
     np.abs(full).max().round(1),
 )
 M = np.asarray(base.model.mass_matrix(p, motion.q))
-print("of the mass matrix:", np.abs(M - np.asarray(base.mass_matrix(p_B, motion.q))).max())
+print(
+    "of the mass matrix:", np.abs(M - np.asarray(base.mass_matrix(p_B, motion.q))).max()
+)
 
 figure, axes = plt.subplots(figsize=(11, 4.2))
 kappa = np.abs(np.asarray(base.kappa))
@@ -138,7 +150,8 @@ axes.set_yticks(rows, [base.names[k] for k in rows], fontsize=7)
 axes.set_ylim(rows[-1] + 0.7, -0.7)
 axes.set_aspect("auto")
 axes.set_title(
-    "kappa: into which base parameter (row) each dependent parameter (column) goes", pad=30
+    "kappa: into which base parameter (row) each dependent parameter (column) goes",
+    pad=30,
 )
 plt.show()
 

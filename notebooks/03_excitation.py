@@ -71,7 +71,9 @@ plans = {
     for name, criterion in criteria.items()
 }
 grams = np.where([unit.startswith("kg") for unit in base.units], 1e-3, 1.0)
-print(f"{'designed for':27}{'cond':>8}{'A':>8}{'D':>9}{'cond, grams':>14}{'use of limits':>16}")
+print(
+    f"{'designed for':27}{'cond':>8}{'A':>8}{'D':>9}{'cond, grams':>14}{'use of limits':>16}"
+)
 for name, plan in plans.items():
     value = {c.name: c.after for c in plan.criteria}
     cond, a, d = (value[criterion.name] for criterion in criteria.values())
@@ -115,7 +117,8 @@ def conditioned(trajectory):
 
 
 random = [
-    conditioned(jid.random_fourier_series(robot, omega=0.8, harmonics=4, seed=k)) for k in range(60)
+    conditioned(jid.random_fourier_series(robot, omega=0.8, harmonics=4, seed=k))
+    for k in range(60)
 ]
 unit = np.exp(np.median([np.log(s) for _, s in random], axis=0))
 
@@ -134,7 +137,9 @@ axes.loglog(
     label="random motions",
 )
 best = min(random, key=lambda pair: mean_deviation(pair[1]))
-print(f"{'best random motion':28} {best[0]:4.0f}, deviations {mean_deviation(best[1]):.2f}")
+print(
+    f"{'best random motion':28} {best[0]:4.0f}, deviations {mean_deviation(best[1]):.2f}"
+)
 for (name, plan), marker in zip(plans.items(), "sDo"):
     c, s = conditioned(plan.trajectory)
     axes.loglog(c, mean_deviation(s), marker, ms=9, label=name)
@@ -157,10 +162,15 @@ plt.show()
 truth = np.random.default_rng(2).uniform(0.5, 1.5, base.size)
 motions = [plan.trajectory.motion(measured) for plan in plans.values()]
 stacked = jid.Motion(
-    *(np.stack([np.asarray(getattr(m, x)) for m in motions]) for x in ("q", "qd", "qdd"))
+    *(
+        np.stack([np.asarray(getattr(m, x)) for m in motions])
+        for x in ("q", "qd", "qdd")
+    )
 )
 exact = np.asarray(base.inverse_dynamics(truth, stacked))
-draws = exact[:, None] + noise * np.random.default_rng(3).normal(size=(3, 200, *exact.shape[1:]))
+draws = exact[:, None] + noise * np.random.default_rng(3).normal(
+    size=(3, 200, *exact.shape[1:])
+)
 fits = jid.identify_batch(base, stacked, draws)
 scatter = np.asarray(fits.parameters).std(axis=1)
 
@@ -177,7 +187,9 @@ for k, (name, plan) in enumerate(plans.items()):
         ms=12,
         label="promised" if k == 2 else None,
     )
-axes.set_xticks(place, [f"{n}\n[{u}]" for n, u in zip(base.names, base.units)], fontsize=8)
+axes.set_xticks(
+    place, [f"{n}\n[{u}]" for n, u in zip(base.names, base.units)], fontsize=8
+)
 axes.set_ylabel("standard deviation")
 axes.grid(axis="x", visible=False)
 axes.legend(ncols=4, fontsize=8, loc="upper center", bbox_to_anchor=(0.5, 1.14))

@@ -41,7 +41,10 @@ if real:
         forces_on_motor_side=True,
     )
     log = jid.read_recording(
-        data / "motor_position.csv", columns, "TX40", forces_path=data / "motor_torque.csv"
+        data / "motor_position.csv",
+        columns,
+        "TX40",
+        forces_path=data / "motor_torque.csv",
     )
     friction = (
         jid.ViscousFriction(),
@@ -56,15 +59,21 @@ if real:
         "Ia": (0.362, 0.362, 0.0988, 0.0313, 0.0468, 0.0105),
     }
     known = {
-        f"{kind}{j + 1}": value for kind, six in published.items() for j, value in enumerate(six)
+        f"{kind}{j + 1}": value
+        for kind, six in published.items()
+        for j, value in enumerate(six)
     }
 else:
     robot = jid.robots.panda()
     with tempfile.TemporaryDirectory() as folder:
         jid.simulation.write_example(Path(folder))
         columns = jid.Columns(time="time", angles="q{}", forces="tau{}")
-        log = jid.read_recording(Path(folder) / "identification.csv", columns, "virtual arm")
-        truth = json.loads((Path(folder) / "truth.json").read_text())["standard_parameters"]
+        log = jid.read_recording(
+            Path(folder) / "identification.csv", columns, "virtual arm"
+        )
+        truth = json.loads((Path(folder) / "truth.json").read_text())[
+            "standard_parameters"
+        ]
     friction = (
         jid.ViscousFriction(),
         jid.CoulombFriction(),
@@ -72,7 +81,11 @@ else:
         jid.ConstantOffset(),
     )
     cutoff, step = 10.0, 20
-    known = {row["name"]: row["value"] for row in truth if row["name"][:2] in ("fv", "fc", "Ia")}
+    known = {
+        row["name"]: row["value"]
+        for row in truth
+        if row["name"][:2] in ("fv", "fc", "Ia")
+    }
 
 print(
     f"{log.name}: {log.samples} samples of {log.joints} axes, {log.duration:.1f} s at {1 / log.sample_time:.0f} Hz"
@@ -98,7 +111,10 @@ print(
     f"condition number {fit.condition_number:.0f}; {fit.condition_numbers.scaled:.0f} with columns of length one"
 )
 print(f"residual: {fit.residual:.1%} of the forces")
-print("not determined:", "; ".join(d.sentence(base) for d in fit.undetermined) or "nothing")
+print(
+    "not determined:",
+    "; ".join(d.sentence(base) for d in fit.undetermined) or "nothing",
+)
 
 # %% [markdown]
 # ## How well is each parameter known?
@@ -108,7 +124,9 @@ print("not determined:", "; ".join(d.sentence(base) for d in fit.undetermined) o
 
 # %%
 print(
-    "honest over naive standard deviations:", np.median(fit.uncertainty.ratios).round(1), "(median)"
+    "honest over naive standard deviations:",
+    np.median(fit.uncertainty.ratios).round(1),
+    "(median)",
 )
 jid.plot.parameters(fit)
 
@@ -119,14 +137,20 @@ jid.plot.parameters(fit)
 # can be compared. Parameters that the log hardly excites have wide intervals.
 
 # %%
-alone = [k for k, name in enumerate(base.names) if base.expressions[k] == name and name in known]
+alone = [
+    k
+    for k, name in enumerate(base.names)
+    if base.expressions[k] == name and name in known
+]
 others = np.array([known[base.names[k]] for k in alone])
 ratio = np.asarray(fit.parameters)[alone] / others
 half = fit.uncertainty.half_widths(0.95)[alone] / others
 figure, axes = plt.subplots(figsize=(11, 3.0))
 axes.axhline(1.0, color="#22262b", lw=1)
 axes.errorbar(range(len(alone)), ratio, half, fmt="o", ms=4, lw=1.2, capsize=3)
-axes.set_xticks(range(len(alone)), [f"{base.names[k]}\n{known[base.names[k]]:.3g}" for k in alone])
+axes.set_xticks(
+    range(len(alone)), [f"{base.names[k]}\n{known[base.names[k]]:.3g}" for k in alone]
+)
 axes.set_xlabel("parameter, and its known value [N m s, N m, kg m²]")
 axes.set_ylabel("estimate / known value")
 axes.grid(axis="x", visible=False)
@@ -177,8 +201,16 @@ figure, axes = plt.subplots(figsize=(11, 3.0))
 for k, estimator in enumerate(estimators.values()):
     one = jid.validate(jid.identify(base, seen, estimator), [seen, unseen])
     percent = [np.sqrt(np.mean(e.rms_percent**2)) for e in one.errors]
-    axes.barh(k - 0.18, percent[0], 0.34, color="#0072B2", label="seen" if k == 0 else None)
-    axes.barh(k + 0.18, percent[1], 0.34, color="#E69F00", label="not seen" if k == 0 else None)
+    axes.barh(
+        k - 0.18, percent[0], 0.34, color="#0072B2", label="seen" if k == 0 else None
+    )
+    axes.barh(
+        k + 0.18,
+        percent[1],
+        0.34,
+        color="#E69F00",
+        label="not seen" if k == 0 else None,
+    )
     least = one.definiteness.smallest
     axes.annotate(
         f"smallest eigenvalue of M: {least:.2g}",

@@ -37,7 +37,11 @@ bodies = np.array(
             mass=m,
             centre_of_mass=0.5 * end + 0.02,
             inertia=m
-            * (np.dot(end, end) / 12 * np.eye(3) - np.outer(end, end) / 12 + 0.003 * np.eye(3)),
+            * (
+                np.dot(end, end) / 12 * np.eye(3)
+                - np.outer(end, end) / 12
+                + 0.003 * np.eye(3)
+            ),
         ).parameters
         for i, (m, end) in enumerate(zip(masses, ends))
     ]
@@ -48,9 +52,13 @@ truth = np.concatenate([bodies.ravel(), 0.02 * largest, 0.03 * largest])
 def observations(p, seed, noise=0.05, duration=8.0):
     """A log of a random motion of the arm with the parameters p."""
     t = np.arange(0.0, duration, 0.004)
-    motion = jid.random_fourier_series(robot, omega=2 * np.pi / 8.0, seed=seed).motion(t)
+    motion = jid.random_fourier_series(robot, omega=2 * np.pi / 8.0, seed=seed).motion(
+        t
+    )
     forces = np.asarray(base.model.inverse_dynamics(p, motion))
-    forces = forces + noise * largest * np.random.default_rng(seed).normal(size=forces.shape)
+    forces = forces + noise * largest * np.random.default_rng(seed).normal(
+        size=forces.shape
+    )
     log = jid.Recording.of(motion.q, forces, time=t, name=f"log {seed}")
     return jid.observe(log, robot, jid.ZeroPhaseButterworth(10.0), jid.Subsample(10))
 
@@ -75,9 +83,17 @@ poses = np.random.default_rng(0).uniform(
 figure, axes = plt.subplots(figsize=(11, 3.0))
 edges = np.linspace(-0.06, 0.06, 80)
 for name, fit in fits.items():
-    least = np.linalg.eigvalsh(np.asarray(base.mass_matrix(fit.parameters, poses)))[:, 0]
+    least = np.linalg.eigvalsh(np.asarray(base.mass_matrix(fit.parameters, poses)))[
+        :, 0
+    ]
     check = jid.validate(fit, other)
-    axes.hist(np.clip(least, -0.06, 0.06), edges, histtype="stepfilled", alpha=0.45, label=name)
+    axes.hist(
+        np.clip(least, -0.06, 0.06),
+        edges,
+        histtype="stepfilled",
+        alpha=0.45,
+        label=name,
+    )
     print(
         f"{name:14} residual {fit.residual:.2%}, unseen motion {check.errors[0].relative:.2%}, "
         f"M not positive definite in {check.definiteness.indefinite:.0%} of the poses"
@@ -97,9 +113,14 @@ plt.show()
 # %%
 consistent = fits["consistent"].consistency
 print(f"the weighted residual grows by {consistent.residual_increase:.2%}")
-print(f"within {consistent.error_bound:.0e} of the optimum, {consistent.iterations} iterations")
+print(
+    f"within {consistent.error_bound:.0e} of the optimum, {consistent.iterations} iterations"
+)
 print("active bounds:", "; ".join(consistent.active) or "none")
-print("masses that reflect bounds, not data:", [f"m{k + 1}" for k in consistent.masses_from_bounds])
+print(
+    "masses that reflect bounds, not data:",
+    [f"m{k + 1}" for k in consistent.masses_from_bounds],
+)
 
 # %% [markdown]
 # ## What the data cannot determine
@@ -109,11 +130,15 @@ print("masses that reflect bounds, not data:", [f"m{k + 1}" for k in consistent.
 
 # %%
 cad = bodies * np.random.default_rng(5).uniform(0.8, 1.2, (7, 1))
-bounds = jid.consistency.BodyBounds.from_geometry(robot).replace(total_mass=float(masses.sum()))
+bounds = jid.consistency.BodyBounds.from_geometry(robot).replace(
+    total_mass=float(masses.sum())
+)
 pulled = jid.identify(
     base,
     short,
-    jid.PhysicallyConsistent(bounds=bounds, pull=jid.consistency.EntropicPull(cad, strength=1.0)),
+    jid.PhysicallyConsistent(
+        bounds=bounds, pull=jid.consistency.EntropicPull(cad, strength=1.0)
+    ),
 )
 figure, panels = plt.subplots(1, 2, figsize=(11, 3.2))
 place = np.arange(7)
@@ -153,7 +178,10 @@ plt.show()
 
 # %%
 tool = jid.Tool(
-    6, mass=2.0, centre_of_mass=(0.02, -0.03, 0.16), inertia=np.diag([0.012, 0.011, 0.006])
+    6,
+    mass=2.0,
+    centre_of_mass=(0.02, -0.03, 0.16),
+    inertia=np.diag([0.012, 0.011, 0.006]),
 )
 loaded = truth.copy()
 loaded[60:70] += tool.parameters

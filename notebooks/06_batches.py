@@ -96,7 +96,9 @@ for s, label in (
     (fits.standard_deviations, "spectral sandwich"),
     (fits.naive_standard_deviations, "independent rows"),
 ):
-    panels[1].plot(x, stats.norm.pdf(x, p_base[k], np.median(np.asarray(s)[0, :, k])), label=label)
+    panels[1].plot(
+        x, stats.norm.pdf(x, p_base[k], np.median(np.asarray(s)[0, :, k])), label=label
+    )
 panels[1].set_xlabel(f"{base.names[k]} [{base.units[k]}], 2000 estimates")
 panels[1].set_yticks([])
 panels[1].set_ylabel("density")
@@ -118,7 +120,9 @@ log = jid.Recording.of(motion.q, forces[0], sample_time=step, name="one log")
 seen = jid.observe(log, robot, jid.ZeroPhaseButterworth(12.0), jid.Subsample(3))
 fit = jid.identify(base, seen)
 blocks = jid.RegressionProblem(base, [seen], divisions=32).blocks
-draws = np.asarray(jid.uncertainty.bootstrap(blocks, fit.weights, 2000, jax.random.key(0)))
+draws = np.asarray(
+    jid.uncertainty.bootstrap(blocks, fit.weights, 2000, jax.random.key(0))
+)
 
 figure, axes = plt.subplots(figsize=(11, 3.0))
 axes.axhline(1.0, color="#22262b", lw=1)
@@ -130,7 +134,9 @@ for k, (values, label) in enumerate(
     )
 ):
     axes.plot(place + 0.16 * (k - 1), values / scatter, "oDs"[k], ms=5, label=label)
-    print(f"{label:18} {np.min(values / scatter):.2f} to {np.max(values / scatter):.2f}")
+    print(
+        f"{label:18} {np.min(values / scatter):.2f} to {np.max(values / scatter):.2f}"
+    )
 axes.set_xticks(place, base.names, rotation=90)
 axes.set_ylim(0, None)
 axes.set_ylabel("deviation from one log / scatter")
@@ -152,8 +158,12 @@ fleet = np.random.default_rng(4)
 count = 1000
 short = np.arange(0.0, 8.0, 0.04)
 asked = jid.random_fourier_series(robot, omega=2 * np.pi / 8.0, seed=5).motion(short)
-asked = jid.Motion(*(np.broadcast_to(x, (count, *x.shape)) for x in (asked.q, asked.qd, asked.qdd)))
-lengths = robot.offset + 5e-3 * fleet.normal(size=(count, 2, 3)) * (np.asarray(robot.offset) != 0)
+asked = jid.Motion(
+    *(np.broadcast_to(x, (count, *x.shape)) for x in (asked.q, asked.qd, asked.qdd))
+)
+lengths = robot.offset + 5e-3 * fleet.normal(size=(count, 2, 3)) * (
+    np.asarray(robot.offset) != 0
+)
 arms = [robot.replace(offset=x) for x in lengths]
 p = np.tile(truth, (count, 1))
 worn = fleet.choice(count, 30, replace=False)
@@ -162,10 +172,14 @@ p[worn, base.model.parameter_names.index("fv2")] *= 2
 
 def forces_of(offset, p, *state):
     """Forces of one arm of the fleet."""
-    return jid.Model(robot.replace(offset=offset)).inverse_dynamics(p, jid.Motion(*state))
+    return jid.Model(robot.replace(offset=offset)).inverse_dynamics(
+        p, jid.Motion(*state)
+    )
 
 
-forces = np.asarray(jax.jit(jax.vmap(forces_of))(lengths, p, asked.q, asked.qd, asked.qdd))
+forces = np.asarray(
+    jax.jit(jax.vmap(forces_of))(lengths, p, asked.q, asked.qd, asked.qdd)
+)
 forces = forces + 0.005 * largest * fleet.normal(size=forces.shape)
 ways = {
     "own geometry": jid.identify_batch(base, asked, forces, robots=arms),
@@ -177,7 +191,9 @@ k = base.names.index("C1")
 for name, some in ways.items():
     values = np.asarray(some.parameters)[:, k]
     promised = np.median(np.asarray(some.standard_deviations)[:, k])
-    print(f"C1, {name:18} scatters {values.std() / promised:.2f} times as much as it should")
+    print(
+        f"C1, {name:18} scatters {values.std() / promised:.2f} times as much as it should"
+    )
     bins = np.median(values) + np.linspace(-0.06, 0.06, 41)
     panels[0].hist(values, bins, histtype="stepfilled", alpha=0.5, label=name)
 panels[0].set_xlabel(f"C1 [{base.units[k]}]")
@@ -187,7 +203,10 @@ panels[0].legend(loc="upper left", fontsize=8)
 
 k = base.names.index("fv2")
 own = ways["own geometry"]
-value, deviation = np.asarray(own.parameters)[:, k], np.asarray(own.standard_deviations)[:, k]
+value, deviation = (
+    np.asarray(own.parameters)[:, k],
+    np.asarray(own.standard_deviations)[:, k],
+)
 middle = np.median(value)
 suspect = np.flatnonzero((value - middle) / deviation > 5)
 print(
@@ -217,8 +236,12 @@ plt.show()
 device = jax.devices()[0]  # a GPU, where there is one
 whole = jax.jit(lambda motion, forces: jid.identify_batch(base, motion, forces))
 again = whole(*jax.device_put((asked, forces), device)).parameters
-difference = np.abs(again - ways["drawing's geometry"].parameters).max() / np.abs(again).max()
-print(f"on this {device.platform}, in one computation: the same parameters, {difference < 1e-9}")
+difference = (
+    np.abs(again - ways["drawing's geometry"].parameters).max() / np.abs(again).max()
+)
+print(
+    f"on this {device.platform}, in one computation: the same parameters, {difference < 1e-9}"
+)
 
 # %% [markdown]
 # The amount of work decides: a single log of a few seconds leaves a GPU idle, thousands of data sets do not. All is in double precision, of which

@@ -27,7 +27,9 @@ plt.style.use("notebook.mplstyle")
 # %%
 cold = jid.simulation.virtual_tx90l_on_rail()
 robot = cold.robot
-motions = [jid.random_fourier_series(robot, omega=0.8, seed=k, reach=0.9) for k in (1, 2, 3)]
+motions = [
+    jid.random_fourier_series(robot, omega=0.8, seed=k, reach=0.9) for k in (1, 2, 3)
+]
 times, temperatures = cold.warming(motions[0], duration=3600.0)
 
 figure, panels = plt.subplots(1, 2, figsize=(11, 3.0))
@@ -57,7 +59,9 @@ smooth, thin = jid.ZeroPhaseButterworth(10.0), jid.Subsample(20)
 
 def observed(virtual, k, seed, name="log"):
     """A log of the k-th motion."""
-    log = virtual.measure(motions[k], duration=15.7, sample_time=0.002, seed=seed, name=name)
+    log = virtual.measure(
+        motions[k], duration=15.7, sample_time=0.002, seed=seed, name=name
+    )
     return jid.observe(log, virtual.robot, smooth, thin)
 
 
@@ -72,12 +76,16 @@ comparison = jid.compare(fits["cold"], fits["warm"])
 verdicts = comparison.verdicts
 kinds = {"fv": "viscous friction", "fc": "Coulomb friction", "Ia": "rotors"}
 for kind in (*kinds.values(), "bodies"):
-    members = [k for k, n in enumerate(base.names) if kinds.get(n[:2], "bodies") == kind]
+    members = [
+        k for k, n in enumerate(base.names) if kinds.get(n[:2], "bodies") == kind
+    ]
     changed = sum(verdicts[k].value == "changed" for k in members)
     print(f"{kind:17} {changed} of {len(members)} changed")
 
 print(f"\n{'':12}{'cold':>16}{'truth':>9}{'warm':>20}{'truth':>9}")
-exact = {name: np.asarray(base.from_standard(v.parameters)) for name, v in robots.items()}
+exact = {
+    name: np.asarray(base.from_standard(v.parameters)) for name, v in robots.items()
+}
 for parameter in ("fv1", "fv2", "fc1", "fc2"):
     k = base.names.index(parameter)
     line = f"{parameter:5}{base.units[k]:7}"

@@ -61,7 +61,9 @@ plan = jid.design_excitation(
     polish=0,
     key=jax.random.key(2),
 )
-print(f"standard deviations {plan.mean_gain:.2f} times smaller than those of a random motion")
+print(
+    f"standard deviations {plan.mean_gain:.2f} times smaller than those of a random motion"
+)
 time, motion = plan.trajectory.sample(0.01)
 jid.plot.joints(robot, limits, time, motion)
 
@@ -78,7 +80,9 @@ rotors = np.array([0.4, 0.5, 0.15])
 yours = jid.VirtualRobot(
     robot=robot,
     terms=(jid.RigidBodies(), jid.RotorInertia()),
-    values=np.concatenate([(cad * np.array([1.1, 1.25, 0.8])[:, None]).ravel(), rotors]),
+    values=np.concatenate(
+        [(cad * np.array([1.1, 1.25, 0.8])[:, None]).ravel(), rotors]
+    ),
     friction=jid.simulation.LuGreFriction(
         viscous=np.array([1.5, 2.0, 0.8]),
         coulomb=np.array([1.2, 1.8, 0.7]),
@@ -92,7 +96,9 @@ yours = jid.VirtualRobot(
 )
 run = yours.track(plan.trajectory, seed=1)
 log = run.recording
-observations = jid.observe(log, robot, jid.ZeroPhaseButterworth(12.0), jid.Subsample(25))
+observations = jid.observe(
+    log, robot, jid.ZeroPhaseButterworth(12.0), jid.Subsample(25)
+)
 print(
     f"{log.samples} samples at {1 / log.sample_time:.0f} Hz; the arm missed the motion by up to "
     f"{np.rad2deg(np.abs(run.tracking_error).max()):.2f} degrees"
@@ -108,12 +114,18 @@ print(
 fit = jid.identify(base, observations, jid.PhysicallyConsistent())
 other = jid.random_fourier_series(robot, omega=1.0, seed=5, reach=0.8)
 unseen = jid.observe(
-    yours.track(other, seed=2).recording, robot, jid.ZeroPhaseButterworth(12.0), jid.Subsample(25)
+    yours.track(other, seed=2).recording,
+    robot,
+    jid.ZeroPhaseButterworth(12.0),
+    jid.Subsample(25),
 )
 check = jid.validate(fit, [observations, unseen])
 print(f"residual {fit.residual:.1%}; unseen motion {check.errors[1].relative:.1%}")
 print("mean error [% of the largest torque]:", check.errors[1].mean_percent.round(2))
-print("not determined:", "; ".join(d.sentence(base) for d in fit.undetermined) or "nothing")
+print(
+    "not determined:",
+    "; ".join(d.sentence(base) for d in fit.undetermined) or "nothing",
+)
 print(
     f"mass matrix: smallest eigenvalue {check.definiteness.smallest:.3f} kg m² of {check.definiteness.poses} poses"
 )
@@ -135,7 +147,10 @@ figure, panels = plt.subplots(1, 3, figsize=(11, 3.2), sharex=True)
 for name, feed_forward in ways.items():
     followed = yours.track(other, seed=3, feed_forward=feed_forward)
     error = 1e3 * followed.tracking_error
-    print(f"{name:11} RMS tracking error [mrad]:", np.sqrt(np.mean(error**2, axis=0)).round(3))
+    print(
+        f"{name:11} RMS tracking error [mrad]:",
+        np.sqrt(np.mean(error**2, axis=0)).round(3),
+    )
     for j, axes in enumerate(panels):
         axes.plot(followed.time, error[:, j], label=name, lw=1)
         axes.set_title(robot.joint_names[j])
@@ -156,7 +171,10 @@ plt.show()
 with tempfile.TemporaryDirectory() as folder:
     fit.save(Path(folder) / "arm.json")
     again = jid.load(Path(folder) / "arm.json")
-    print("saved and loaded, bit by bit:", np.array_equal(again.parameters, fit.parameters))
+    print(
+        "saved and loaded, bit by bit:",
+        np.array_equal(again.parameters, fit.parameters),
+    )
 
     better = jid.export_urdf(fit, "arm.urdf", Path(folder) / "identified.urdf")
     bodies = jid.urdf_parameters(better).reshape(3, 10)
@@ -164,17 +182,23 @@ with tempfile.TemporaryDirectory() as folder:
     print("the new URDF file holds the identified bodies:", same)
 
     source = jid.export_c(fit, Path(folder) / "c")
-    print(f"{source.name}: {len(source.read_text().splitlines())} lines, with the functions")
+    print(
+        f"{source.name}: {len(source.read_text().splitlines())} lines, with the functions"
+    )
     for line in source.with_suffix(".h").read_text().splitlines():
         if line.startswith("void"):
             print("  ", line)
     if shutil.which("cc"):
         library = Path(folder) / "arm.so"
-        subprocess.run(["cc", "-O2", "-shared", "-fPIC", source, "-o", library, "-lm"], check=True)
+        subprocess.run(
+            ["cc", "-O2", "-shared", "-fPIC", source, "-o", library, "-lm"], check=True
+        )
         pointer = np.ctypeslib.ndpointer(float, flags="C")
         torque = ctypes.CDLL(str(library))[f"{source.stem}_torque"]
         torque.argtypes = [pointer] * 4
-        few = jid.Motion(*(np.asarray(x)[::50] for x in (motion.q, motion.qd, motion.qdd)))
+        few = jid.Motion(
+            *(np.asarray(x)[::50] for x in (motion.q, motion.qd, motion.qdd))
+        )
         torques = np.zeros(few.q.shape)
         for k, Q in enumerate(torques):
             torque(few.q[k].copy(), few.qd[k].copy(), few.qdd[k].copy(), Q)

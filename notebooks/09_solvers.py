@@ -88,7 +88,10 @@ def scipy_solver(method, options):
 
     def solve(problem, starts):
         value = jax.jit(jax.value_and_grad(problem.value))
-        excess, jacobian = jax.jit(problem.inequalities), jax.jit(jax.jacfwd(problem.inequalities))
+        excess, jacobian = (
+            jax.jit(problem.inequalities),
+            jax.jit(jax.jacfwd(problem.inequalities)),
+        )
         limits = scipy.optimize.NonlinearConstraint(excess, -np.inf, 0.0, jac=jacobian)
 
         def one(x):
@@ -121,7 +124,9 @@ def optax_solver(problem, starts):
             return (optax.apply_updates(x, change), state), None
 
         run = jax.jit(
-            lambda x, step=step, adam=adam: jax.lax.scan(step, (x, adam.init(x)), None, 400)
+            lambda x, step=step, adam=adam: jax.lax.scan(
+                step, (x, adam.init(x)), None, 400
+            )
         )
         x = run(x)[0][0]
     return x
@@ -135,7 +140,9 @@ def optimistix_solver(problem, starts):
 
         def one(x, cost=cost):
             solver = optx.BFGS(rtol=1e-8, atol=1e-8)
-            return optx.minimise(lambda y, _: cost(y), solver, x, max_steps=300, throw=False).value
+            return optx.minimise(
+                lambda y, _: cost(y), solver, x, max_steps=300, throw=False
+            ).value
 
         x = jax.jit(jax.vmap(one))(x)
     return x
@@ -145,7 +152,9 @@ def jaxopt_solver(problem, starts):
     """L-BFGS from all starts at once."""
     x = starts
     for weight in WEIGHTS:
-        solver = jaxopt.LBFGS(penalised(problem, weight), maxiter=300, linesearch="backtracking")
+        solver = jaxopt.LBFGS(
+            penalised(problem, weight), maxiter=300, linesearch="backtracking"
+        )
         x = jax.jit(jax.vmap(lambda x, solver=solver: solver.run(x).params))(x)
     return x
 
@@ -209,7 +218,9 @@ panels[0].set_xlabel("step of jid.minimise")
 panels[0].set_ylabel("mean axis of the ellipsoid")
 t = np.linspace(0, 2 * np.pi / 0.8, 400)
 for name, style in ((ours, "-"), ("SciPy SLSQP", "--")):
-    panels[1].plot(t, np.asarray(plans[name].trajectory.motion(t).q)[:, 1], style, label=name)
+    panels[1].plot(
+        t, np.asarray(plans[name].trajectory.motion(t).q)[:, 1], style, label=name
+    )
 panels[1].set_xlabel("time [s]")
 panels[1].set_ylabel("angle of the shoulder [rad]")
 panels[1].legend(fontsize=8)
@@ -222,7 +233,10 @@ plt.show()
 
 # %%
 x = problem.random(jax.random.key(2))
-forward, reverse = jax.jit(jax.jacfwd(problem.value))(x), jax.jit(jax.grad(problem.value))(x)
+forward, reverse = (
+    jax.jit(jax.jacfwd(problem.value))(x),
+    jax.jit(jax.grad(problem.value))(x),
+)
 print("largest difference of both modes:", f"{np.abs(forward - reverse).max():.1e}")
 print("shape of the Hessian:", jax.jit(jax.hessian(problem.value))(x).shape)
 

@@ -50,7 +50,9 @@ sines = 0.3 * np.sin(0.9 * t) + 0.1 * np.sin(5.1 * t) * np.clip(t, 0, 1)
 steps = 0.3 * np.sign(np.sin(0.7 * t)) * (t > 1) + 0.1 * np.sin(0.3 * t)
 chirp = 0.15 * np.sin(0.6 * t + 0.12 * t**2)
 logs = [
-    jid.Recording.of(measured(sent)[:, None], sent[:, None], sample_time=0.02, name=name)
+    jid.Recording.of(
+        measured(sent)[:, None], sent[:, None], sample_time=0.02, name=name
+    )
     for name, sent in (("sines", sines), ("steps", steps), ("chirp", chirp))
 ]
 
@@ -98,7 +100,9 @@ print(jid.simulator_table(fit))
 
 # %%
 sent = 0.25 * np.sin(1.3 * t) * np.sign(np.sin(0.4 * t)) + 0.1 * np.sin(2.9 * t)
-unseen = jid.Recording.of(measured(sent)[:, None], sent[:, None], sample_time=0.02, name="unseen")
+unseen = jid.Recording.of(
+    measured(sent)[:, None], sent[:, None], sample_time=0.02, name="unseen"
+)
 errors = fit.validate(unseen)
 print(errors)
 
@@ -127,8 +131,12 @@ plt.show()
 
 # %%
 slow = 0.03 * t
-log = jid.Recording.of(measured(slow)[:, None], slow[:, None], sample_time=0.02, name="slow")
-slow_fit = jid.identify_rollout(log, bodies, friction=False, saturation=False, joint_names=["lift"])
+log = jid.Recording.of(
+    measured(slow)[:, None], slow[:, None], sample_time=0.02, name="slow"
+)
+slow_fit = jid.identify_rollout(
+    log, bodies, friction=False, saturation=False, joint_names=["lift"]
+)
 print(slow_fit)
 
 # %% [markdown]

@@ -90,7 +90,9 @@ def executed(source: Path) -> Executed:
         client.execute()
     except CellExecutionError as raised:
         error = str(raised)
-    return Executed(notebook, time.perf_counter() - start, processor_time() - before, error)
+    return Executed(
+        notebook, time.perf_counter() - start, processor_time() - before, error
+    )
 
 
 def small(png: str) -> str:
@@ -109,7 +111,9 @@ def cleaned(notebook: nbformat.NotebookNode) -> nbformat.NotebookNode:
         for output in cell.get("outputs", ()):
             data = output.get("data", {})
             if "image/png" in data:
-                output["data"] = nbformat.from_dict({"image/png": small(data["image/png"])})
+                output["data"] = nbformat.from_dict(
+                    {"image/png": small(data["image/png"])}
+                )
             output["metadata"] = nbformat.from_dict({})
         if "outputs" in cell:
             cell.outputs = joined(cell.outputs)
@@ -132,7 +136,9 @@ def joined(outputs: list) -> list:
 def main() -> int:
     """Executes what is asked for; 1 if something fails."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("names", nargs="*", help="beginnings of names, such as 03; all if none")
+    parser.add_argument(
+        "names", nargs="*", help="beginnings of names, such as 03; all if none"
+    )
     parser.add_argument("--write", action="store_true", help="writes the .ipynb files")
     asked = parser.parse_args()
     sources = sorted(

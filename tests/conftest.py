@@ -1,7 +1,8 @@
 """What all tests share: float64, and the measured data where they are.
 
-With `JAXID_CHECK_SHAPES=1` shapes and types of all arguments are checked at run time, which takes
-about half of the time of a run: `benchmarks/run.py --check` does so before a release.
+With `JAXID_CHECK_SHAPES=1` shapes and types of all arguments are checked at run time,
+which takes about half of the time of a run: `benchmarks/run.py --check` does so before
+a release.
 """
 
 import os
@@ -9,7 +10,8 @@ import tempfile
 
 # The workers of one run share what they compile; the user's cache is left alone.
 os.environ["JAXID_CACHE_DIR"] = "off"
-# Each worker has one core; threads of linear algebra on the cores of other workers cost much time.
+# Each worker has one core; threads of linear algebra on the cores of other workers cost
+# much time.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     COMPILED = tempfile.TemporaryDirectory(prefix="jaxid-compiled-")

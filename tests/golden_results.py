@@ -1,8 +1,8 @@
 """Comparison with golden results: numbers of whole runs that no change of the code may move.
 
-The tolerance is 1e-9 relative; `JAXID_GOLDEN_TOLERANCE` widens it for machines with other
-instruction sets. To record new values after an intended change, delete the file of that case, run
-the test, and say in CHANGELOG.md what changed and why.
+The tolerance is 1e-9 relative; `JAXID_GOLDEN_TOLERANCE` widens it for machines with
+other instruction sets. To record new values after an intended change, delete the file
+of that case, run the test, and say in CHANGELOG.md what changed and why.
 """
 
 import json
@@ -34,7 +34,9 @@ def numbers_of_report(folder):
     errors = found["errors"]["identification"] + found["errors"]["verification"]
     return {
         "parameters": {p["name"]: p["estimate"] for p in found["base_parameters"]},
-        "deviations": {p["name"]: p["standard_deviation"] for p in found["base_parameters"]},
+        "deviations": {
+            p["name"]: p["standard_deviation"] for p in found["base_parameters"]
+        },
         "condition_numbers": found["fit"]["condition_numbers"],
         "residual": found["fit"]["residual"],
         "residual_rms": found["fit"]["residual_rms"],
@@ -48,7 +50,10 @@ def compare(case, found, tolerance=TOLERANCE):
     path = HERE / f"{case}.json"
     if not path.exists():
         path.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
-        pytest.fail(f"`{path.name}` was missing and has been recorded: check it, then run again.")
+        pytest.fail(
+            f"`{path.name}` was missing and has been recorded: check it, then run "
+            "again."
+        )
     _compare(case, json.loads(json.dumps(found)), golden(case), tolerance)
 
 
@@ -61,7 +66,8 @@ def _compare(place, found, golden, tolerance):
     assert type(found) is type(golden), place
     if isinstance(golden, dict):
         assert list(found) == list(golden), place
-        # Values of one kind share a scale: a parameter near zero is compared with the largest.
+        # Values of one kind share a scale: a parameter near zero is compared with the
+        # largest.
         flat = all(isinstance(x, float | int) for x in golden.values())
         if flat and golden and "condition" not in place:
             _close(place, list(found.values()), list(golden.values()), tolerance)
@@ -75,5 +81,7 @@ def _compare(place, found, golden, tolerance):
 def _close(place, found, golden, tolerance):
     found, golden = np.asarray(found, float), np.asarray(golden, float)
     scale = np.maximum(np.abs(golden), 1e-3 * np.abs(golden).max(initial=0.0))
-    worst = np.max(np.abs(found - golden) / np.where(scale > 0, scale, 1.0), initial=0.0)
+    worst = np.max(
+        np.abs(found - golden) / np.where(scale > 0, scale, 1.0), initial=0.0
+    )
     assert worst <= tolerance, f"{place}: {worst:.1e}"

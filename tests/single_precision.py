@@ -34,7 +34,12 @@ URDF = """<robot name="r"><link name="a"/><link name="b"/><link name="c"/>
 <limit lower="-2" upper="2" effort="20" velocity="3"/></joint></robot>"""
 FOLDER.mkdir()
 (FOLDER / "arm.urdf").write_text(URDF)
-TERMS = (jid.RigidBodies(), jid.ViscousFriction(), jid.CoulombFriction(), jid.ConstantOffset())
+TERMS = (
+    jid.RigidBodies(),
+    jid.ViscousFriction(),
+    jid.CoulombFriction(),
+    jid.ConstantOffset(),
+)
 robot = jid.load_urdf(FOLDER / "arm.urdf")
 model = jid.Model(robot, TERMS)
 p = standard_parameters(model)
@@ -54,7 +59,9 @@ def plain():
 
 def dynamics():
     """Methods of a model on arrays in float32, whose results have this precision too."""
-    motion = jid.Motion(*(jnp.asarray(x[:9], jnp.float32) for x in jax.tree.leaves(cold.motion)))
+    motion = jid.Motion(
+        *(jnp.asarray(x[:9], jnp.float32) for x in jax.tree.leaves(cold.motion))
+    )
     single = jnp.asarray(p, jnp.float32)
     found = (
         model.regressor(motion),
@@ -84,7 +91,9 @@ def consistent():
 
 def numbers_of(path):
     """All numbers of a text but those in its comments."""
-    text = re.sub(r"/\*.*?\*/|//.*|<!--.*?-->|<\?.*?\?>", "", path.read_text(), flags=re.DOTALL)
+    text = re.sub(
+        r"/\*.*?\*/|//.*|<!--.*?-->|<\?.*?\?>", "", path.read_text(), flags=re.DOTALL
+    )
     return [float(x) for x in re.findall(r"-?\d+\.\d+(?:e[-+]?\d+)?", text)]
 
 
@@ -94,7 +103,9 @@ def loaded():
 
 
 def angles_along_path():
-    path = jid.trajectories.iso9283_path([0.3, 0.1, 0.4], 0.2, np.diag([1.0, -1.0, -1.0]))
+    path = jid.trajectories.iso9283_path(
+        [0.3, 0.1, 0.4], 0.2, np.diag([1.0, -1.0, -1.0])
+    )
     return jid.trajectories.joint_path(jid.robots.tx40(), path).coefficients[-1]
 
 
@@ -113,19 +124,30 @@ def batch():
 
 def designed():
     return jid.design_excitation(
-        base, harmonics=2, omega=1.0, starts=2, polish=1, generations=0, samples=50, key=key
+        base,
+        harmonics=2,
+        omega=1.0,
+        starts=2,
+        polish=1,
+        generations=0,
+        samples=50,
+        key=key,
     ).trajectory.coefficients
 
 
 CASES = {
     "dynamics": dynamics,
-    "load_urdf": lambda: jax.tree.leaves(jid.load_urdf(FOLDER / "arm.urdf").rotation)[0],
+    "load_urdf": lambda: jax.tree.leaves(jid.load_urdf(FOLDER / "arm.urdf").rotation)[
+        0
+    ],
     "base_parameters": lambda: jid.base_parameters(model).kappa,
     "expressions": lambda: list(base.lengths.values()),
     "identify": lambda: plain().parameters,
     "standard deviations": lambda: plain().standard_deviations,
     "identify float32 arrays": rounded,
-    "Huber": lambda: jid.identify(base, cold, jid.estimators.IterativelyReweighted()).parameters,
+    "Huber": lambda: (
+        jid.identify(base, cold, jid.estimators.IterativelyReweighted()).parameters
+    ),
     "GeneralisedLeastSquares": lambda: (
         jid.identify(base, cold, jid.estimators.GeneralisedLeastSquares()).parameters
     ),
@@ -136,10 +158,13 @@ CASES = {
     ),
     "factorise_across_processes": lambda: (
         jid.identification.identify.fit_problem(
-            jid.devices.factorise_across_processes(base, [cold]), jid.estimators.LeastSquares()
+            jid.devices.factorise_across_processes(base, [cold]),
+            jid.estimators.LeastSquares(),
         ).parameters
     ),
-    "essential_parameters": lambda: jid.essential_parameters(plain(), cold).fit.parameters,
+    "essential_parameters": lambda: (
+        jid.essential_parameters(plain(), cold).fit.parameters
+    ),
     "identify_states": lambda: jid.identify_states(runs()).parameters,
     "update": lambda: jid.update(*runs()).parameters,
     "compare": lambda: jid.compare(plain(), jid.identify(base, warm)).difference,
@@ -152,11 +177,18 @@ CASES = {
     "export_urdf": lambda: numbers_of(
         jid.export_urdf(consistent(), FOLDER / "arm.urdf", FOLDER / "new.urdf")
     ),
-    "export_mjcf": lambda: numbers_of(jid.export_mjcf(consistent(), FOLDER / "new.xml")),
+    "export_mjcf": lambda: numbers_of(
+        jid.export_mjcf(consistent(), FOLDER / "new.xml")
+    ),
     "pinocchio_parameters": lambda: jid.export.pinocchio_parameters(consistent()),
     "joint_path": angles_along_path,
 }
-REFUSED = ("identify_batch", "bootstrap", "factorise_across_processes", "design_excitation")
+REFUSED = (
+    "identify_batch",
+    "bootstrap",
+    "factorise_across_processes",
+    "design_excitation",
+)
 """Cases that compute in JAX, which must not do so in float32."""
 if __name__ == "__main__":
     found = {}

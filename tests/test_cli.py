@@ -37,7 +37,8 @@ step = 4
 GRAVITY = 9.81
 STICK = (
     '<robot name="stick"><link name="a"/><link name="b"/><joint name="hinge" '
-    'type="continuous"><parent link="a"/><child link="b"/><axis xyz="0 1 0"/></joint></robot>'
+    'type="continuous"><parent link="a"/><child link="b"/><axis xyz="0 1 '
+    '0"/></joint></robot>'
 )
 
 
@@ -155,7 +156,14 @@ def test_identify_finds_a_textbook_arm(folder, run):
     assert (code, err) == (0, "")
     found = result(folder)
     by_name = {p["name"]: p for p in found["base_parameters"]}
-    truth = {"fv1": 0.4, "fv2": 0.4, "fc1": 0.3, "fc2": 0.3, "mx2": 0.75, "C2": 0.15 + 0.375}
+    truth = {
+        "fv1": 0.4,
+        "fv2": 0.4,
+        "fc1": 0.3,
+        "fc2": 0.3,
+        "mx2": 0.75,
+        "C2": 0.15 + 0.375,
+    }
     for name, value in truth.items():
         assert abs(by_name[name]["estimate"] - value) < 0.02, name
     assert found["errors"]["verification"][0]["relative"] < 0.01
@@ -166,7 +174,13 @@ def test_identify_finds_a_textbook_arm(folder, run):
     page = (folder / "report" / "report.html").read_text(encoding="utf-8")
     assert settings["command"] in page
     for text in (
-        *("planar arm, 2 joints", "condition number", "base parameters", "Validation", "N m"),
+        *(
+            "planar arm, 2 joints",
+            "condition number",
+            "base parameters",
+            "Validation",
+            "N m",
+        ),
         *("% of the forces", "positive definite in all"),
         "wrote report: report.html, result.json, parameters.csv",
     ):
@@ -186,10 +200,16 @@ def test_logs_of_one_name_are_told_apart_by_their_folders(folder, run):
 def test_what_is_not_determined_is_said_with_a_cure(folder, words):
     write_log(folder / "still.csv", 5, still=True)
     said = words("identify", "experiment.toml", "still.csv", ends=3)
-    for text in ("NOT DETERMINED by these logs", "mean nothing one by one", "Record a motion"):
+    for text in (
+        "NOT DETERMINED by these logs",
+        "mean nothing one by one",
+        "Record a motion",
+    ):
         assert text in said
     assert '`ridge = "cross_validated"`' in said
-    (folder / "ridge.toml").write_text(EXPERIMENT + "[estimator]\nridge = 'cross_validated'\n")
+    (folder / "ridge.toml").write_text(
+        EXPERIMENT + "[estimator]\nridge = 'cross_validated'\n"
+    )
     said = words("identify", "ridge.toml", "still.csv", "-o", "ridge", ends=3)
     assert "NOT DETERMINED" in said
     assert "`ridge =" not in said
@@ -197,13 +217,18 @@ def test_what_is_not_determined_is_said_with_a_cure(folder, words):
 
 def test_a_single_slip_that_explains_a_bad_fit_is_named(folder, run, words):
     pl.read_csv("a.csv").with_columns(-pl.col("tau2")).write_csv("turned.csv")
-    slip = "the sign of the force of joint `joint2` seems to be wrong (`recording.force_sig"
+    slip = (
+        "the sign of the force of joint `joint2` seems to be wrong "
+        "(`recording.force_sig"
+    )
     assert "!" not in words("inspect", "experiment.toml", "a.csv")
     assert slip in words("inspect", "experiment.toml", "turned.csv")
     said = words("identify", "experiment.toml", "turned.csv", ends=3)
     assert f"✗ turned: {slip}" in said
     assert "Do not rely on this model yet" in said
-    found = json.loads((folder / "report" / "result.json").read_text("utf-8"))["verdict"]
+    found = json.loads((folder / "report" / "result.json").read_text("utf-8"))[
+        "verdict"
+    ]
     assert [r["status"] for r in found[:2]] == ["bad", "bad"]
     command = ("export", "report", "--to", "json", "-o", "arm.json")
     assert refused(run(*command), "must not be used", slip, "`--force`")
@@ -219,7 +244,12 @@ def separate(folder, *args, out=subprocess.PIPE):
     environment["PYTHONPATH"] = str(ROOT)
     command = [sys.executable, "-m", "jaxid", *args]
     return subprocess.run(
-        command, cwd=folder, stdout=out, stderr=subprocess.PIPE, text=True, env=environment
+        command,
+        cwd=folder,
+        stdout=out,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=environment,
     )
 
 
@@ -243,7 +273,9 @@ def test_a_process_of_its_own_has_double_precision(folder):
 def test_help_needs_no_jax(run):
     script = "import sys; import jaxid.cli; sys.exit('jax' in sys.modules)"
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    assert subprocess.run([sys.executable, "-c", script], env=environment).returncode == 0
+    assert (
+        subprocess.run([sys.executable, "-c", script], env=environment).returncode == 0
+    )
     code, out, _ = run("--version")
     assert code == 0
     assert out.startswith("jaxid ")
@@ -273,7 +305,9 @@ def test_an_earlier_report_is_replaced_and_foreign_files_are_kept(folder, first,
 
 
 def test_after_a_failure_nothing_is_half_written(folder, first, run, monkeypatch):
-    before = {p: (folder / p).read_bytes() for p in listing(folder) if (folder / p).is_file()}
+    before = {
+        p: (folder / p).read_bytes() for p in listing(folder) if (folder / p).is_file()
+    }
 
     def full_disk(*args, **kwargs):
         raise OSError(28, "No space left on device", "torque_b.svg")
@@ -284,14 +318,17 @@ def test_after_a_failure_nothing_is_half_written(folder, first, run, monkeypatch
             run("identify", "experiment.toml", "b.csv", "-o", output),
             "`torque_b.svg`: No space left on device: nothing was written; make room",
         )
-    after = {p: (folder / p).read_bytes() for p in listing(folder) if (folder / p).is_file()}
+    after = {
+        p: (folder / p).read_bytes() for p in listing(folder) if (folder / p).is_file()
+    }
     assert after == before
     assert not (folder / "new").exists()
 
 
 def test_errors_that_are_not_the_users_keep_their_traceback(folder, monkeypatch):
     monkeypatch.setattr(
-        "jaxid.experiment.identify_logs.validate", lambda *_, **__: np.zeros(3) + np.zeros(4)
+        "jaxid.experiment.identify_logs.validate",
+        lambda *_, **__: np.zeros(3) + np.zeros(4),
     )
     monkeypatch.setattr(sys, "argv", ["jaxid", "identify", "experiment.toml", "a.csv"])
     with pytest.raises(ValueError, match="broadcast"):
@@ -316,7 +353,9 @@ def test_what_has_changed_between_two_runs_is_told(folder, first, run):
     assert len(changed) == 2, "one parameter and its kind"
     assert " fv1 " in changed[0]
     assert "viscous friction" in changed[1]
-    content = json.loads((folder / "comparison" / "comparison.json").read_text(encoding="utf-8"))
+    content = json.loads(
+        (folder / "comparison" / "comparison.json").read_text(encoding="utf-8")
+    )
     rows = {r["name"]: r for r in content["parameters"]}
     assert abs(rows["fv1"]["difference"] + 0.25) < 0.02
     assert content["sources"] == ["first", "warm"]
@@ -330,7 +369,9 @@ SLOW = SLOW.replace('time = "t"', 'time = "t"\nstart = 0.5\nstop = 5.5')
 
 
 @pytest.mark.parametrize(("kind", "compiled_rows"), [("csv", True), ("parquet", False)])
-def test_long_logs_give_what_short_ones_give(folder, words, monkeypatch, kind, compiled_rows):
+def test_long_logs_give_what_short_ones_give(
+    folder, words, monkeypatch, kind, compiled_rows
+):
     if kind == "parquet":
         for name in "ab":
             pl.read_csv(f"{name}.csv").write_parquet(f"{name}.parquet")
@@ -348,7 +389,9 @@ def test_long_logs_give_what_short_ones_give(folder, words, monkeypatch, kind, c
         assert short["fit"][key] == long["fit"][key]
     for a, b in zip(short["base_parameters"], long["base_parameters"], strict=True):
         assert abs(a["estimate"] - b["estimate"]) < 1e-7 * a["standard_deviation"]
-        assert b["standard_deviation"] == pytest.approx(a["standard_deviation"], rel=1e-9)
+        assert b["standard_deviation"] == pytest.approx(
+            a["standard_deviation"], rel=1e-9
+        )
     for role in ("identification", "verification"):
         for a, b in zip(short["errors"][role], long["errors"][role], strict=True):
             assert b["relative"] == pytest.approx(a["relative"], rel=1e-9)
@@ -371,19 +414,25 @@ def test_errors_of_many_rows_are_of_every_nth(folder, first, words, monkeypatch)
     monkeypatch.setattr("jaxid.model_validation.ROWS", 100)
     said = words("identify", "experiment.toml", "a.csv", "-o", "long")
     assert "torque errors and figures take one of every 3 of its 2" in said
-    short, long = (result(folder, n)["errors"]["identification"][0] for n in ("first", "long"))
+    short, long = (
+        result(folder, n)["errors"]["identification"][0] for n in ("first", "long")
+    )
     assert long["joints"][0]["rows"] == -(-short["joints"][0]["rows"] // 3)
     assert long["relative"] == pytest.approx(short["relative"], rel=0.1)
 
 
-def test_a_long_log_that_must_be_mended_is_read_as_a_whole(folder, run, words, monkeypatch):
+def test_a_long_log_that_must_be_mended_is_read_as_a_whole(
+    folder, run, words, monkeypatch
+):
     monkeypatch.setattr("jaxid.experiment.experiment.LONG", 500)
     lines = (folder / "a.csv").read_text().splitlines()
     lines.insert(700, lines[700])
     (folder / "twins.csv").write_text("\n".join(lines))
     said = words("identify", "experiment.toml", "twins.csv")
     assert "twins.csv is long, but was read as a whole: rows of" in said
-    (folder / "bad.csv").write_text("\n".join([*lines[:900], "1,2,x,4,5", *lines[901:]]))
+    (folder / "bad.csv").write_text(
+        "\n".join([*lines[:900], "1,2,x,4,5", *lines[901:]])
+    )
     assert refused(run("identify", "experiment.toml", "bad.csv"), "bad.csv")
 
 
@@ -393,13 +442,23 @@ def test_a_filter_is_chosen_from_a_list_and_the_report_shows_why(folder, words):
     said = words("identify", "experiment.toml", "a.csv", "--verify", "c.csv")
     assert re.search(r"a cut-off of (10|20) Hz predicts held-out parts", said)
     assert "2 Hz" in said
-    assert "Choice of the filter" in (folder / "report" / "report.html").read_text("utf-8")
+    assert "Choice of the filter" in (folder / "report" / "report.html").read_text(
+        "utf-8"
+    )
 
 
 @pytest.mark.parametrize("moment", [1.0, 4.0])
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_a_command_at_once_and_leaves_nothing(folder, moment, number):
-    command = [sys.executable, "-m", "jaxid", "excite", "experiment.toml", "-o", "new/motion.csv"]
+    command = [
+        sys.executable,
+        "-m",
+        "jaxid",
+        "excite",
+        "experiment.toml",
+        "-o",
+        "new/motion.csv",
+    ]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     process = subprocess.Popen(
         command, cwd=folder, env=environment, stderr=subprocess.PIPE, text=True

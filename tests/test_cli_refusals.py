@@ -22,8 +22,16 @@ KEYS = [
         )
         for key, value in (("epsilon", "inf"), ("epsilon", "500"), ("dead_zone", "inf"))
     ),
-    ("[limits]", "gravity = [0, 0, 1e308]\n[limits]", "no quantity is larger than 1e+12"),
-    ('builtin = "planar_arm"', 'urdf = "lost.urdf"', "`lost.urdf` is no file: paths are relative"),
+    (
+        "[limits]",
+        "gravity = [0, 0, 1e308]\n[limits]",
+        "no quantity is larger than 1e+12",
+    ),
+    (
+        'builtin = "planar_arm"',
+        'urdf = "lost.urdf"',
+        "`lost.urdf` is no file: paths are relative",
+    ),
 ]
 
 
@@ -37,18 +45,39 @@ def test_keys(folder, run, key, wrong, sentence):  # noqa: F811
 COMMANDS = [
     ("inspect none.toml", "`none.toml` is no file"),
     ("identify experiment.toml none.csv", "`none.csv` is no file"),
-    ("identify no.toml none.csv --verify x.csv", "`no.toml`, `none.csv`, `x.csv` are no files"),
+    (
+        "identify no.toml none.csv --verify x.csv",
+        "`no.toml`, `none.csv`, `x.csv` are no files",
+    ),
     ("identify experiment.toml a.csv --verify b.csv c.csv", "repeat it before `c.csv`"),
     ("identify experiment.toml a.csv --verify=b.csv c.csv", "repeat it before `c.csv`"),
     ("identify experiment.toml a.csv ./a.csv", "`a.csv` is given twice"),
-    ("identify experiment.toml a.csv --split 2", "`--split` must lie between 0 and 1, like 0.6"),
-    ("identify experiment.toml a.csv --verify ./a.csv", "`a.csv` is given both to identify and"),
+    (
+        "identify experiment.toml a.csv --split 2",
+        "`--split` must lie between 0 and 1, like 0.6",
+    ),
+    (
+        "identify experiment.toml a.csv --verify ./a.csv",
+        "`a.csv` is given both to identify and",
+    ),
     ("identify experiment.toml loop.csv", "`loop.csv` is no file"),
-    ("identify experiment.toml image.csv", "`image.csv` is no text: a log is CSV, Parquet, NPZ"),
-    ("identify experiment.toml long.csv", "line 4 (6 cells, but 5 columns) of `long.csv`; line 5"),
-    ("identify experiment.toml still.csv", "no joint moves in `still`: name other columns"),
+    (
+        "identify experiment.toml image.csv",
+        "`image.csv` is no text: a log is CSV, Parquet, NPZ",
+    ),
+    (
+        "identify experiment.toml long.csv",
+        "line 4 (6 cells, but 5 columns) of `long.csv`; line 5",
+    ),
+    (
+        "identify experiment.toml still.csv",
+        "no joint moves in `still`: name other columns",
+    ),
     ("init none.urdf", "none.urdf"),
-    ("excite experiment.toml -o a.csv", "`a.csv` is there already, and no motion of `jaxid exc"),
+    (
+        "excite experiment.toml -o a.csv",
+        "`a.csv` is there already, and no motion of `jaxid exc",
+    ),
     ("excite experiment.toml -o motion", "`motion` must end in .csv"),
     ("excite experiment.toml -o truth.csv", "`truth.json` is there al"),
     ("excite experiment.toml -o mine.csv", "`mine.ros.yaml` is there al"),
@@ -74,7 +103,9 @@ def test_commands(folder, run, words, sentence):  # noqa: F811
     assert sorted(folder.rglob("*")) == before
 
 
-@pytest.mark.parametrize("words", ["identify experiment.toml", "idntify", "identify a b --splt"])
+@pytest.mark.parametrize(
+    "words", ["identify experiment.toml", "idntify", "identify a b --splt"]
+)
 def test_words_that_no_command_knows(folder, run, words):  # noqa: F811
     code, _, err = run(*words.split())
     assert code == 2

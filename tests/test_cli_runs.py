@@ -64,7 +64,9 @@ def write(path, model, p, seed, gains=1.0, late=0.0):
     t = np.arange(0.0, 10.0, 0.005)
     felt = trajectory.motion(t - late)
     forces = in_numpy(model, model.forces, felt.q, felt.qd, felt.qdd, shared=(p,))
-    forces = forces + np.random.default_rng(seed).normal(0.0, [0.1, 0.1, 0.03], forces.shape)
+    forces = forces + np.random.default_rng(seed).normal(
+        0.0, [0.1, 0.1, 0.03], forces.shape
+    )
     table = np.column_stack([t, trajectory.motion(t).q, forces / gains])
     header = "t,q1,q2,q3,tau1,tau2,tau3"
     np.savetxt(path, table, "%.7f", ",", header=header, comments="")
@@ -108,7 +110,9 @@ def pasted(out, title):
 
 
 def test_a_payload_is_found_and_can_be_subtracted(shop, run):  # noqa: F811
-    code, out, err = run("payload", "experiment.toml", "empty.csv", "--loaded", "loaded.csv")
+    code, out, err = run(
+        "payload", "experiment.toml", "empty.csv", "--loaded", "loaded.csv"
+    )
     assert (code, err) == (0, "")
     assert set(os.listdir("payload")) == {"payload.json", "payload.csv", "report.html"}
     found = json.loads((shop / "payload" / "payload.json").read_text(encoding="utf-8"))
@@ -141,7 +145,9 @@ def test_true_forces_are_found_and_can_be_used(shop, run):  # noqa: F811
     forces = load_experiment("true.toml").read("empty_nominal.csv").forces
     expected = load_experiment("experiment.toml").read("empty.csv").forces
     np.testing.assert_allclose(forces, expected, rtol=0.02, atol=1e-3)
-    (shop / "tool.toml").write_text(SPATIAL + LOAD + LOAD.replace("[load]", "[robot.tool]"))
+    (shop / "tool.toml").write_text(
+        SPATIAL + LOAD + LOAD.replace("[load]", "[robot.tool]")
+    )
     assert refused(run("gains", "tool.toml", *logs), "has a known tool")
 
 
@@ -163,14 +169,18 @@ def test_a_report_takes_later_logs(folder, first, run):  # noqa: F811
     code, _, err = run("identify", "experiment.toml", "first/", "b.csv", "-o", "both")
     assert (code, err) == (0, "")
     added, together = result(folder, "both"), result(folder, "all")
-    for one, other in zip(added["base_parameters"], together["base_parameters"], strict=True):
+    for one, other in zip(
+        added["base_parameters"], together["base_parameters"], strict=True
+    ):
         assert one["estimate"] == pytest.approx(other["estimate"], rel=1e-9, abs=1e-12)
     assert added["fit"]["recordings"] == ["a", "b"]
     assert added["fit"]["rows"] == together["fit"]["rows"]
     assert added["settings"]["identification"] == ["first", "b.csv"]
     assert [e["recording"] for e in added["errors"]["identification"]] == ["b"]
     said = "have seen the same data"
-    assert refused(run("identify", "experiment.toml", "first", "a.csv", "-o", "twice"), said)
+    assert refused(
+        run("identify", "experiment.toml", "first", "a.csv", "-o", "twice"), said
+    )
     said = "a report that was given has seen the data of `a`"
     seen = ("first", "b.csv", "--verify", "a.csv", "-o", "twice")
     assert refused(run("identify", "experiment.toml", *seen), said)
@@ -180,13 +190,26 @@ def test_a_report_takes_later_logs(folder, first, run):  # noqa: F811
 FOREIGN = [
     ("", "identify e.toml other b.csv", "holds no `model.json`"),
     ("", "identify e.toml first", "at least one log"),
-    ("[estimator]\nridge = 0.1", "identify e.toml first b.csv", "to least squares only"),
-    ("[model]\nsprings = true", "identify e.toml first b.csv", "different base parameters"),
-    ("", "payload e.toml a.csv --loaded b.csv --body elbow", "`--body` must be the name of the jo"),
+    (
+        "[estimator]\nridge = 0.1",
+        "identify e.toml first b.csv",
+        "to least squares only",
+    ),
+    (
+        "[model]\nsprings = true",
+        "identify e.toml first b.csv",
+        "different base parameters",
+    ),
+    (
+        "",
+        "payload e.toml a.csv --loaded b.csv --body elbow",
+        "`--body` must be the name of the jo",
+    ),
     (
         "[estimator]\nnonlinear_friction = true",
         "payload e.toml a.csv --loaded b.csv",
-        "`estimator.nonlinear_friction` would find other shapes of friction in each run",
+        "`estimator.nonlinear_friction` would find other shapes of friction in each "
+        "run",
     ),
     ("", "states e.toml a.csv", "one log or report for each of two or more states"),
     ("", "gains e.toml a.csv --loaded b.csv", "the table `[load]` is missing"),
@@ -221,18 +244,24 @@ def test_states_share_inertia(folder, words):  # noqa: F811
     expected = jid.identify_states(runs)
     estimates = {row["name"]: row["estimate"] for row in found["parameters"]}
     assert tuple(estimates) == expected.names
-    np.testing.assert_allclose(list(estimates.values()), expected.parameters, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(
+        list(estimates.values()), expected.parameters, rtol=1e-9, atol=1e-12
+    )
     assert set(found["shared"]) == {base.names[k] for k in expected.shared}
 
 
 def test_essential_parameters_on_the_command_line(folder, first, run, words):  # noqa: F811
-    (folder / "essential.toml").write_text(EXPERIMENT + "[estimator]\nessential = 0.3\n")
+    (folder / "essential.toml").write_text(
+        EXPERIMENT + "[estimator]\nessential = 0.3\n"
+    )
     said = words("identify", "essential.toml", "a.csv", "-o", "few")
     few, every = (len(result(folder, k)["fit"]["covariance"]) for k in ("few", "first"))
     assert 0 < few < every
     assert f"{few} of {every} base parameters are essential" in said
     assert "eliminated, and taken as zero: " in said
-    assert refused(run("identify", "essential.toml", "first", "b.csv"), "for essential parameters")
+    assert refused(
+        run("identify", "essential.toml", "first", "b.csv"), "for essential parameters"
+    )
 
 
 def test_a_model_is_chosen_and_its_file_identifies(shop, run, monkeypatch):  # noqa: F811
@@ -246,20 +275,29 @@ def test_a_model_is_chosen_and_its_file_identifies(shop, run, monkeypatch):  # n
     # The truth has neither springs nor roots, and a comment of the file stays.
     names = [type(term).__name__ for term in chosen.model.terms]
     assert "LinearSpring" not in names
-    assert chosen.robot.joint_names == load_experiment("experiment.toml").robot.joint_names
+    assert (
+        chosen.robot.joint_names == load_experiment("experiment.toml").robot.joint_names
+    )
     assert run("identify", "chosen.toml", "empty.csv", "-o", "c")[0] in (0, 3)
     again = run("choose", "experiment.toml", "empty.csv", "-o", "chosen.toml")
     assert refused(again, "`chosen.toml` is there already")
 
 
-PRESLIDING = SPATIAL.replace("[recording]", "[model.coulomb]\npresliding = true\n[recording]")
+PRESLIDING = SPATIAL.replace(
+    "[recording]", "[model.coulomb]\npresliding = true\n[recording]"
+)
 
 
 def test_friction_with_memory_from_the_log_to_the_report(shop, run, words):  # noqa: F811
     (shop / "memory.toml").write_text(PRESLIDING)
     model = load_experiment("memory.toml").model.with_memory(length=0.05)
-    p, t = np.random.default_rng(0).uniform(0.2, 1.0, model.size), np.arange(0.0, 20.0, 0.005)
-    p[:30] = random_bodies(model.robot, np.array([3.0, 2.0, 1.0]), np.random.default_rng(0)).ravel()
+    p, t = (
+        np.random.default_rng(0).uniform(0.2, 1.0, model.size),
+        np.arange(0.0, 20.0, 0.005),
+    )
+    p[:30] = random_bodies(
+        model.robot, np.array([3.0, 2.0, 1.0]), np.random.default_rng(0)
+    ).ravel()
     motion = jid.random_fourier_series(model.robot, omega=1.2, seed=8).motion(t)
     forces = model.inverse_dynamics(
         p, jid.Motion(*map(np.asarray, (motion.q, motion.qd, motion.qdd)))
@@ -267,14 +305,20 @@ def test_friction_with_memory_from_the_log_to_the_report(shop, run, words):  # n
     forces = forces + np.random.default_rng(1).normal(0.0, 0.03, forces.shape)
     table, header = np.column_stack([t, motion.q, forces]), "t,q1,q2,q3,tau1,tau2,tau3"
     np.savetxt("memory.csv", table, "%.7f", ",", header=header, comments="")
-    said = words("identify", "memory.toml", "memory.csv", "-o", "report", "--split", "0.6")
+    said = words(
+        "identify", "memory.toml", "memory.csv", "-o", "report", "--split", "0.6"
+    )
     fit = jid.load("report/model.json")
     np.testing.assert_allclose(fit.base.model.memory.length, 0.05, rtol=0.1)
-    shown = re.findall(r"joint\d (0\.\d+) rad", said[said.index("lengths of presliding") :])
+    shown = re.findall(
+        r"joint\d (0\.\d+) rad", said[said.index("lengths of presliding") :]
+    )
     np.testing.assert_allclose([float(x) for x in shown[:3]], 0.05, rtol=0.12)
     for errors in result(shop, "report")["errors"].values():
         assert all(joint["rms"] < 0.05 for joint in errors[0]["joints"])
-    (shop / "both.toml").write_text(PRESLIDING + "[estimator]\nnonlinear_friction = true\n")
+    (shop / "both.toml").write_text(
+        PRESLIDING + "[estimator]\nnonlinear_friction = true\n"
+    )
     assert refused(run("identify", "both.toml", "memory.csv"), "but not both")
     words("export", "report", "--to", "c", "-o", "arm.c")
     assert "arm_advance" in (shop / "arm.h").read_text()

@@ -14,18 +14,23 @@ from jaxid.identification.parameter_changes import Verdict
 
 @pytest.fixture(scope="module")
 def found():
-    motion = jid.random_fourier_series(jid.robots.tx90l_on_rail(), omega=0.8, reach=0.7, seed=1)
+    motion = jid.random_fourier_series(
+        jid.robots.tx90l_on_rail(), omega=0.8, reach=0.7, seed=1
+    )
     return run_study(0, lambda name, fraction: None, periods=1, motion=motion)
 
 
 def test_numbers_are_golden(found):
     fit = found.weighted.fit
-    # A servo on quantised encoders with stiction amplifies rounding: a coefficient of the motion
-    # changed by 4e-16 moves these parameters by 1e-4 (relative to the largest of their kind).
+    # A servo on quantised encoders with stiction amplifies rounding: a coefficient of
+    # the motion changed by 4e-16 moves these parameters by 1e-4 (relative to the
+    # largest of their kind).
     compare(
         "demo",
         {
-            "parameters": dict(zip(fit.base.names, map(float, fit.parameters), strict=True)),
+            "parameters": dict(
+                zip(fit.base.names, map(float, fit.parameters), strict=True)
+            ),
             "deviations": list(map(float, fit.standard_deviations)),
             "errors": [found.weighted.mean_errors(k) for k in (0, 1)],
         },
@@ -39,9 +44,13 @@ def test_base_parameters_are_those_of_the_paper(found):
     assert found.base.expressions[1] == "mx2 + l2x*m3 - l2x*mz4/l3z"
 
 
-def test_weights_help_the_wrist_and_consistent_bodies_have_a_definite_mass_matrix(found):
+def test_weights_help_the_wrist_and_consistent_bodies_have_a_definite_mass_matrix(
+    found,
+):
     for recording in (0, 1):
-        plain, weighted = (x.mean_errors(recording) for x in (found.unweighted, found.weighted))
+        plain, weighted = (
+            x.mean_errors(recording) for x in (found.unweighted, found.weighted)
+        )
         assert weighted[6] < 0.5 * plain[6]
         assert max(weighted) < 0.5 * max(plain)
         assert max(found.consistent.mean_errors(recording)) < 1.2 * max(weighted)
@@ -49,18 +58,25 @@ def test_weights_help_the_wrist_and_consistent_bodies_have_a_definite_mass_matri
 
 
 def test_friction_falls_with_temperature_and_masses_stay(found):
-    cold, warm = np.asarray(found.weighted.fit.parameters), np.asarray(found.warm.parameters)
+    cold, warm = (
+        np.asarray(found.weighted.fit.parameters),
+        np.asarray(found.warm.parameters),
+    )
     for k in (26, 27, 33, 34):
         assert warm[k] < 0.95 * cold[k]
         assert found.temperature.verdicts[k] is Verdict.CHANGED
     assert warm[0] == pytest.approx(cold[0], rel=0.03)
-    np.testing.assert_allclose(cold[[26, 27, 33, 34]], found.truth[[26, 27, 33, 34]], rtol=0.15)
+    np.testing.assert_allclose(
+        cold[[26, 27, 33, 34]], found.truth[[26, 27, 33, 34]], rtol=0.15
+    )
 
 
 def test_resting_axes_are_what_the_verification_path_adds(found):
     for model in (found.weighted, found.true):
         errors = model.validation.errors[1]
-        by_row = 100 * np.abs(errors.errors).mean(axis=0) / np.asarray(errors.max_forces)
+        by_row = (
+            100 * np.abs(errors.errors).mean(axis=0) / np.asarray(errors.max_forces)
+        )
         np.testing.assert_allclose(by_row, model.mean_errors(1))
         assert (np.array(found.moving_errors(model, 1)) < by_row).all()
 

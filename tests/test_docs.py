@@ -24,7 +24,9 @@ from jaxid.dynamics.dispatch import in_numpy
 from jaxid.experiment.decoder import check_names, decode
 from jaxid.experiment.experiment import TABLES
 from jaxid.experiment.model_and_log_tables import FILTERS, SIDES
-from jaxid.identification.estimators.regularisation_and_weights import LARGEST_UNCERTAINTY
+from jaxid.identification.estimators.regularisation_and_weights import (
+    LARGEST_UNCERTAINTY,
+)
 from jaxid.identification.fit_result import DOUBTFUL, TRUSTED
 from jaxid.model_validation import POSES
 from jaxid.report.verdict import FIT_ERROR, LARGE_CONDITION, RMS_ERROR, UNSEEN_RATIO
@@ -41,7 +43,9 @@ def _blocks(page: Path, language: str) -> list[str]:
 
 
 def _with(language: str) -> list:
-    return [pytest.param(page, id=page.name) for page in PAGES if _blocks(page, language)]
+    return [
+        pytest.param(page, id=page.name) for page in PAGES if _blocks(page, language)
+    ]
 
 
 def _inertial(body) -> str:
@@ -50,7 +54,8 @@ def _inertial(body) -> str:
         [y * y + z * z, x * x + z * z, x * x + y * y, y * z, x * z, x * y]
     )
     return (
-        f'<inertial><origin xyz="{x} {y} {z}"/><mass value="{m}"/><inertia ixx="{A}" iyy="{B}" '
+        f'<inertial><origin xyz="{x} {y} {z}"/><mass value="{m}"/><inertia ixx="{A}" '
+        f'iyy="{B}" '
         f'izz="{C}" iyz="{-D}" ixz="{-E}" ixy="{-F}"/></inertial>'
     )
 
@@ -63,9 +68,11 @@ def _urdf(robot: jid.Robot, bodies) -> str:
         parent = f"link{j}" if j else "ground"
         limits = robot.limits
         parts.append(
-            f'<link name="link{j + 1}">{_inertial(bodies[j])}</link><joint name="{name}" '
+            f'<link name="link{j + 1}">{_inertial(bodies[j])}</link><joint '
+            f'name="{name}" '
             f'type="revolute"><origin xyz="{offset}"/><parent link="{parent}"/><child '
-            f'link="link{j + 1}"/><axis xyz="{axis}"/><limit lower="{limits.position_min[j]}" '
+            f'link="link{j + 1}"/><axis xyz="{axis}"/><limit '
+            f'lower="{limits.position_min[j]}" '
             f'upper="{limits.position_max[j]}" velocity="{limits.velocity[j]}" '
             f'effort="{limits.force[j]}"/></joint>'
         )
@@ -110,7 +117,9 @@ def _log(model: jid.Model, p, seed: int, alone: int | None = None) -> jid.Record
     )
     forces = in_numpy(model, model.forces, motion.q, motion.qd, motion.qdd, shared=(p,))
     noise = np.random.default_rng(seed).normal(0.0, 0.2, forces.shape)
-    return jid.Recording.of(motion.q, forces + noise, sample_time=STEP, name=f"log {seed}")
+    return jid.Recording.of(
+        motion.q, forces + noise, sample_time=STEP, name=f"log {seed}"
+    )
 
 
 @pytest.fixture(scope="module")
@@ -135,8 +144,12 @@ def given(tmp_path_factory):
     terms = (jid.RigidBodies(), jid.ViscousFriction(), jid.CoulombFriction())
     model = jid.Model(robot, terms)
     bodies = random_bodies(robot, np.array([8.0, 5.0]), np.random.default_rng(0))
-    p = np.concatenate([bodies.ravel(), 0.02 * robot.max_forces, 0.03 * robot.max_forces])
-    log, second, *single = (_log(model, p, k, j) for k, j in enumerate((None, None, 0, 1)))
+    p = np.concatenate(
+        [bodies.ravel(), 0.02 * robot.max_forces, 0.03 * robot.max_forces]
+    )
+    log, second, *single = (
+        _log(model, p, k, j) for k, j in enumerate((None, None, 0, 1))
+    )
     (folder / "arm.urdf").write_text(_urdf(robot, bodies), encoding="utf-8")
     _table(log, degrees=True).write_csv(folder / "log.csv")
     _table(log, degrees=True).write_parquet(folder / "weeks.parquet")
@@ -149,14 +162,27 @@ def given(tmp_path_factory):
     seen = [jid.observe(x, robot, smooth, every) for x in (log, second, *single)]
     observations, other = seen[:2]
     rows, forces = observations.reduced_motion, observations.reduced_forces
-    names = {"jax": jax, "np": np, "jid": jid, "robot": robot, "model": model, "base": base}
+    names = {
+        "jax": jax,
+        "np": np,
+        "jid": jid,
+        "robot": robot,
+        "model": model,
+        "base": base,
+    }
     names |= {"observations": observations, "log": log}
-    columns = jid.Columns(time="time", angles="q{}", forces="tau{}", angle_unit=jid.units.DEG)
+    columns = jid.Columns(
+        time="time", angles="q{}", forces="tau{}", angle_unit=jid.units.DEG
+    )
     names["columns"] = columns
     names |= {"recording": log, "motion": rows, "forces": forces, "p": p}
     names |= {"motions": jax.tree.map(lambda x: np.stack([x, x]), rows)}
     names |= {"torques": np.stack([forces, forces]), "single_axes": tuple(seen[2:])}
-    names |= {"other_observations": other, "theirs": _theirs(bodies[0]), "mass": bodies[0][0]}
+    names |= {
+        "other_observations": other,
+        "theirs": _theirs(bodies[0]),
+        "mass": bodies[0][0],
+    }
     names |= {"centre_of_mass": bodies[0][1:4] / bodies[0][0]}
     names |= {"matlab_inertia": _ordered(bodies[0], "Ixx Iyy Izz Iyz Ixz Ixy")}
     names |= {"deviations": np.array([0.0, 1e-3])[:, None, None] * np.ones((2, 3))}
@@ -197,7 +223,9 @@ def test_other_packages_bodies_become_ours(given):
             exec(block, names)
     body = np.asarray(names["p"])[:10]
     for package in ("pinocchio", "idyntree", "figaroh", "sympybotics", "matlab"):
-        np.testing.assert_allclose(names[f"from_{package}"], body, atol=1e-12, err_msg=package)
+        np.testing.assert_allclose(
+            names[f"from_{package}"], body, atol=1e-12, err_msg=package
+        )
 
 
 def test_the_example_in_the_readme_runs(given, tmp_path):
@@ -205,7 +233,9 @@ def test_the_example_in_the_readme_runs(given, tmp_path):
     (block,) = _blocks(ROOT / "README.md", "python")
     (tmp_path / "example.py").write_text(block, encoding="utf-8")
     shutil.copy(folder / "arm.urdf", tmp_path)
-    _table(names["log"], degrees=False).rename({"t": "time"}).write_csv(tmp_path / "log.csv")
+    _table(names["log"], degrees=False).rename({"t": "time"}).write_csv(
+        tmp_path / "log.csv"
+    )
     done = subprocess.run(
         [sys.executable, "-W", "error", "example.py"],
         cwd=tmp_path,
@@ -216,7 +246,11 @@ def test_the_example_in_the_readme_runs(given, tmp_path):
     )
     assert done.returncode == 0, done.stderr
     assert "12 base parameters" in done.stdout
-    made = {path.name for path in tmp_path.iterdir()} - {"arm.urdf", "log.csv", "example.py"}
+    made = {path.name for path in tmp_path.iterdir()} - {
+        "arm.urdf",
+        "log.csv",
+        "example.py",
+    }
     assert made == {"model.json"}
 
 
@@ -224,10 +258,12 @@ THRESHOLDS = {
     "3.": (f"{LARGEST_UNCERTAINTY:.0%}",),
     "4.": (f"below {LARGE_CONDITION:.0f}",),
     "5.": (
-        f"up to {FIT_ERROR[0]:.0f}% of each joint's RMS force; tolerable to {FIT_ERROR[1]:.0f}%",
+        f"up to {FIT_ERROR[0]:.0f}% of each joint's RMS force; tolerable to "
+        f"{FIT_ERROR[1]:.0f}%",
     ),
     "6.": (
-        f"up to {RMS_ERROR[0]:.0f}% of each joint's RMS force, tolerable to {RMS_ERROR[1]:.0f}%",
+        f"up to {RMS_ERROR[0]:.0f}% of each joint's RMS force, tolerable to "
+        f"{RMS_ERROR[1]:.0f}%",
         f"up to {UNSEEN_RATIO} times those of the fit",
     ),
     "7.": (f"up to {TRUSTED:.0%}", f"up to {DOUBTFUL:.0%} doubtful"),

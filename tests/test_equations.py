@@ -1,7 +1,8 @@
 """The equations that docstrings cite and the table in docs/equations.md agree.
 
-A module whose docstrings cite an equation stands in that equation's row: by its name, that of a
-package around it, or that of something in it. A range such as "(Eqs. 1-12)" needs no entry.
+A module whose docstrings cite an equation stands in that equation's row: by its name,
+that of a package around it, or that of something in it. A range such as "(Eqs. 1-12)"
+needs no entry.
 """
 
 import ast
@@ -15,7 +16,9 @@ ROOT = Path(__file__).resolve().parent.parent
 TABLE = (ROOT / "docs" / "equations.md").read_text(encoding="utf-8")
 ROWS = {
     int(number): [re.findall(r"`([^`]+)`", cell) for cell in (where, tests)]
-    for number, where, tests in re.findall(r"^\| (\d+) \|.*\| (.*) \| (.*) \|$", TABLE, re.M)
+    for number, where, tests in re.findall(
+        r"^\| (\d+) \|.*\| (.*) \| (.*) \|$", TABLE, re.M
+    )
 }
 CITATION = re.compile(r"\bEqs?\.\s+(\d+(?:\s*(?:[-,]|and)\s*\d+)*)")
 RANGE = re.compile(r"(\d+)\s*-\s*(\d+)")
@@ -25,7 +28,9 @@ def _cited(docstring: str) -> tuple[set[int], set[int]]:
     """Return the equations cited one by one, and those within ranges."""
     text = " ".join(CITATION.findall(docstring))
     ranges = [range(int(first), int(last) + 1) for first, last in RANGE.findall(text)]
-    return {int(n) for n in re.findall(r"\d+", RANGE.sub("", text))}, set().union(*ranges)
+    return {int(n) for n in re.findall(r"\d+", RANGE.sub("", text))}, set().union(
+        *ranges
+    )
 
 
 @cache

@@ -85,7 +85,8 @@ def arm(folder, shape=SHAPE, effort=50.0, keys=""):
     """Write a robot that stands upright at zero, and its experiment file."""
     links = "".join(LINK.format(k=k, shape=shape if k else "") for k in range(4))
     joints = "".join(
-        JOINT.format(k=k, p=k - 1, z=0.4 if k > 1 else 0.5, effort=effort) for k in range(1, 4)
+        JOINT.format(k=k, p=k - 1, z=0.4 if k > 1 else 0.5, effort=effort)
+        for k in range(1, 4)
     )
     (folder / "arm.urdf").write_text(f'<robot name="arm">{links}{joints}</robot>')
     path = folder / "arm.toml"
@@ -206,8 +207,19 @@ def test_writes_the_motion_and_says_what_to_expect(written, run):
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
 def test_a_stopped_search_leaves_its_best_motion_and_another_goes_on(tmp_path, number):
     arm(tmp_path)
-    command = [sys.executable, "-m", "jaxid", "excite", "arm.toml", "-o", "run/motion.csv"]
-    settings = {"cwd": tmp_path, "env": {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}}
+    command = [
+        sys.executable,
+        "-m",
+        "jaxid",
+        "excite",
+        "arm.toml",
+        "-o",
+        "run/motion.csv",
+    ]
+    settings = {
+        "cwd": tmp_path,
+        "env": {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+    }
     process = subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **settings
     )
@@ -220,14 +232,21 @@ def test_a_stopped_search_leaves_its_best_motion_and_another_goes_on(tmp_path, n
     assert files == ["motion.csv", "motion.json", "motion.ros.yaml"]
     if number is signal.SIGINT:
         assert process.returncode == 130
-        assert err.startswith("jaxid: stopped: `run/motion.csv` and the files beside it hold the")
+        assert err.startswith(
+            "jaxid: stopped: `run/motion.csv` and the files beside it hold the"
+        )
         assert "`--resume` goes on" in err
         found, rows = load_trajectory(motion), table(tmp_path / "run" / "motion.csv")
-        expected = np.concatenate([getattr(found.motion(rows[:, 0]), x) for x in ("q", "qd")], 1)
+        expected = np.concatenate(
+            [getattr(found.motion(rows[:, 0]), x) for x in ("q", "qd")], 1
+        )
         np.testing.assert_allclose(rows[:, 1:7], expected, atol=1e-9)
     before = load_trajectory(motion)
     done = subprocess.run(
-        [*command, "--resume", "--time", "1"], capture_output=True, text=True, **settings
+        [*command, "--resume", "--time", "1"],
+        capture_output=True,
+        text=True,
+        **settings,
     )
     assert done.returncode == 0, done.stderr
     assert "A motion that can be recorded" in done.stdout
@@ -239,21 +258,32 @@ def test_floor_self_collision_and_forces_are_kept_by_default(tmp_path, run):
     code, out, err = run("excite", tmp_path / "arm.toml", "-o", tmp_path / "motion.csv")
     assert code == 0, err
     said = " ".join(out.split())
-    for words in ("floor: 3 quantities", "self-collision: 1 quant", "forces by the nominal"):
+    for words in (
+        "floor: 3 quantities",
+        "self-collision: 1 quant",
+        "forces by the nominal",
+    ):
         assert f"✓ {words}" in said
     assert "less a margin of 30 %" in said
-    assert said.index("✓ A motion that can be recorded: it keeps all limits") > said.index("floor:")
+    assert said.index(
+        "✓ A motion that can be recorded: it keeps all limits"
+    ) > said.index("floor:")
     experiment = load_experiment(tmp_path / "arm.toml")
     q = table(tmp_path / "motion.csv")[:, 1:4]
     # The ends of all links in the plane in which they turn, from sums of angles.
     angles = np.cumsum(q, axis=1)
     up = np.cos(angles)
-    ends = 0.5 + 0.4 * np.cumsum(np.pad(up, ((0, 0), (1, 0)))[:, :3], axis=1) + 0.35 * up
+    ends = (
+        0.5 + 0.4 * np.cumsum(np.pad(up, ((0, 0), (1, 0)))[:, :3], axis=1) + 0.35 * up
+    )
     assert ends.min() >= 0.04 + 0.029
     assert np.ptp(q, axis=0).min() > 0.1
-    gaps = np.asarray(experiment.surroundings.clearance.model.clearance(experiment.robot, q))
+    gaps = np.asarray(
+        experiment.surroundings.clearance.model.clearance(experiment.robot, q)
+    )
     assert gaps.min() >= 0.029
-    # MuJoCo finds no contact between the cylinders of the file, but one where the arm is folded.
+    # MuJoCo finds no contact between the cylinders of the file, but one where the arm
+    # is folded.
     model = mujoco.MjModel.from_xml_path(str(tmp_path / "arm.urdf"))
     data, contacts = mujoco.MjData(model), []
     for pose in (*q, [0.0, 2.3, 2.3]):
@@ -271,8 +301,11 @@ def test_friction_that_the_file_claims_counts_in_the_forces(tmp_path):
     path.write_text(path.read_text().replace('<axis xyz="0 1 0"/>', claim))
     experiment = load_experiment(tmp_path / "arm.toml")
     found = find_nominal(experiment)
-    (limits,) = (c for c in find_constraints(experiment, found)[0] if isinstance(c, ForceLimits))
-    # Upright, at 1 rad/s, with a margin of 30 %: MuJoCo's forces over what is left of 50 N m.
+    (limits,) = (
+        c for c in find_constraints(experiment, found)[0] if isinstance(c, ForceLimits)
+    )
+    # Upright, at 1 rad/s, with a margin of 30 %: MuJoCo's forces over what is left of
+    # 50 N m.
     motion = Motion(np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]]), np.zeros((1, 3)))
     worst = np.asarray(limits(experiment.robot, motion)).max(axis=0)
     model = mujoco.MjModel.from_xml_path(str(path))
@@ -286,7 +319,9 @@ def test_friction_that_the_file_claims_counts_in_the_forces(tmp_path):
 
 def test_what_was_not_checked_is_said_first_and_ends_in_a_code(tmp_path, run):
     # Ahead of its base the arm cannot be held by 1 N m.
-    ahead = "[limits]\nposition_min = [1.2, -0.3, -0.3]\nposition_max = [1.9, 0.3, 0.3]\n"
+    ahead = (
+        "[limits]\nposition_min = [1.2, -0.3, -0.3]\nposition_max = [1.9, 0.3, 0.3]\n"
+    )
     arm(tmp_path, shape="", effort=1.0, keys=ahead)
     code, out, err = run("excite", tmp_path / "arm.toml", "-o", tmp_path / "motion.csv")
     assert code == 3, err
@@ -297,9 +332,13 @@ def test_what_was_not_checked_is_said_first_and_ends_in_a_code(tmp_path, run):
     for text in (before, said):
         assert "the shape of" in text
         assert "stout capsules" in text
-        assert re.search(r"gravity needs more .* at best the force of joint `j[12]` needs", text)
+        assert re.search(
+            r"gravity needs more .* at best the force of joint `j[12]` needs", text
+        )
     keys = f"force_margin = 0.1\n{ahead}"
-    code, out, err = run("excite", arm(tmp_path, effort=1.0, keys=keys), "-o", tmp_path / "x.csv")
+    code, out, err = run(
+        "excite", arm(tmp_path, effort=1.0, keys=keys), "-o", tmp_path / "x.csv"
+    )
     assert (code, out) == (2, "")
     assert "`force_margin`: in every one of" in err
 
@@ -308,10 +347,14 @@ def test_limits_forces_by_nominal_parameters_and_adds_to_earlier_motions(
     designed, run, no_pictures, monkeypatch
 ):
     written = designed
-    for name, stages in STAGES.items():  # a force that only few motions keep needs them all
+    for (
+        name,
+        stages,
+    ) in STAGES.items():  # a force that only few motions keep needs them all
         monkeypatch.setattr(search, name, stages)
 
-    # The angle turns about y: the rod points ahead at zero, and holding it there takes 7.8 N m.
+    # The angle turns about y: the rod points ahead at zero, and holding it there takes
+    # 7.8 N m.
     def largest_force(folder):
         _, q, _, qdd = table(written / folder / "motion.csv").T
         return np.abs((0.11 + 2 * 0.4**2) * qdd - 2 * 0.4 * 9.81 * np.cos(q)).max()
@@ -323,7 +366,8 @@ def test_limits_forces_by_nominal_parameters_and_adds_to_earlier_motions(
     assert largest_force("weak") <= 6.0 < 7.5 < largest_force("plan")
     assert "use of the other limits" in out
     assert re.search(
-        r"force of joint `hinge` +[45]\.\d+ N m +≤ 6 N m +[89]\d\.\d +12 less a margin of", out
+        r"force of joint `hinge` +[45]\.\d+ N m +≤ 6 N m +[89]\d\.\d +12 less a margin of",
+        out,
     )
     assert "counted as zero in the forces: fv1" in " ".join(out.split())
     assert "the robot starts at rest and is in the designed motion from 0.500 to" in out
@@ -332,7 +376,11 @@ def test_limits_forces_by_nominal_parameters_and_adds_to_earlier_motions(
 @pytest.mark.parametrize(
     ("key", "constrained", "expected"),
     [
-        ("spline = { points = 6, duration = 5.0 }", True, RestToRestSplineBasis(6, 5.0)),
+        (
+            "spline = { points = 6, duration = 5.0 }",
+            True,
+            RestToRestSplineBasis(6, 5.0),
+        ),
         ("leads = false", True, FourierBasis(2, 0.8)),
         ("leads = { periods = 3 }", True, LeadsBasis(2, 0.8, lead=0.5, periods=3)),
         ("leads = { time = 0.3 }", False, LeadsBasis(2, 0.8, lead=0.3)),
@@ -364,14 +412,20 @@ def test_earlier_results_are_nominal(written, excited, monkeypatch):
     covariance[0, 0] = np.inf
     found = find_nominal(experiment)
     assert found.undetermined == base.names[:1]
-    np.testing.assert_array_equal(np.diag(found.covariance), 0.01 * (np.arange(base.size) > 0))
-    find_constraints(load_experiment(path), found)  # refuses a covariance that is not finite
+    np.testing.assert_array_equal(
+        np.diag(found.covariance), 0.01 * (np.arange(base.size) > 0)
+    )
+    find_constraints(
+        load_experiment(path), found
+    )  # refuses a covariance that is not finite
     names[0] = "other"
     with pytest.raises(ValueError, match="are not the"):
         find_nominal(experiment)
 
 
-def test_tables_are_sampled_as_a_controller_wants_them(written, excited, no_pictures, monkeypatch):
+def test_tables_are_sampled_as_a_controller_wants_them(
+    written, excited, no_pictures, monkeypatch
+):
     monkeypatch.setattr(
         "jaxid.experiment.excitation.design_excitation", lambda *_, **__: excited.plan
     )
@@ -384,7 +438,9 @@ def test_tables_are_sampled_as_a_controller_wants_them(written, excited, no_pict
     t, q, qd, qdd = table(files[0]).T
     np.testing.assert_allclose(t, 0.03 * np.arange(len(t)), atol=1e-12)
     assert 0.0 <= t[-1] - float(found.played.motion.duration) < 0.03
-    np.testing.assert_allclose(q[-1], found.played.motion.motion(found.played.motion.duration).q[0])
+    np.testing.assert_allclose(
+        q[-1], found.played.motion.motion(found.played.motion.duration).q[0]
+    )
     assert np.abs([qd[-1], qdd[-1]]).max() < 1e-9
     assert files[1].name == "motion.ros.yaml"
     assert files[1].read_text().count("time_from_start") == len(t)
@@ -400,14 +456,20 @@ def test_tables_are_sampled_as_a_controller_wants_them(written, excited, no_pict
     np.testing.assert_allclose(t, 0.008 * np.arange(len(t)), atol=1e-12)
     assert files[-1].read_text().count("  servoj(") == len(t)
     write_design(experiment, found, written / "cycles" / "motion.csv")
-    assert listing(written / "cycles") == ["motion.csv", "motion.json", "motion.ros.yaml"]
+    assert listing(written / "cycles") == [
+        "motion.csv",
+        "motion.json",
+        "motion.ros.yaml",
+    ]
     said = [remark.text for remark in found.remarks]
     assert "the motion runs through 2 periods; the deviations are of one." in said
 
 
 def test_the_guide_shows_every_key():
     guide = Path(__file__).parent.parent / "docs" / "excitation.md"
-    shown = guide.read_text(encoding="utf-8").partition("```toml")[2].partition("```")[0]
+    shown = (
+        guide.read_text(encoding="utf-8").partition("```toml")[2].partition("```")[0]
+    )
     for kind in (Excitation, Leads, RestToRestSplineBasis):
         for key in keys_of(kind):
             assert re.search(rf"\b{key} = ", shown), key
@@ -423,7 +485,9 @@ def test_limits_that_nobody_gave_are_named(written, excited):
     assert not any("ssumed" in remark.text for remark in plan_remarks(excited.plan))
 
 
-def test_a_motion_without_a_way_into_it_is_written_with_a_warning(written, excited, monkeypatch):
+def test_a_motion_without_a_way_into_it_is_written_with_a_warning(
+    written, excited, monkeypatch
+):
     def refuse(series, robot, periods):
         raise InputError("no lead is short enough.")
 
@@ -434,7 +498,10 @@ def test_a_motion_without_a_way_into_it_is_written_with_a_warning(written, excit
     led = designed_by(load_experiment(written / "free.toml"))
     assert led.played.motion is led.plan.trajectory
     text = " ".join(remark.text for remark in led.remarks)
-    assert "the motion is without leads, and starts and ends at full speed: no lead is" in text
+    assert (
+        "the motion is without leads, and starts and ends at full speed: no lead is"
+        in text
+    )
 
 
 def test_ctrl_c_among_the_criteria_shows_those_that_are_done(
@@ -482,8 +549,13 @@ def test_ctrl_c_before_a_motion_keeps_all_limits(written, run, monkeypatch):
     monkeypatch.setattr("jaxid.cli.commands.design_motion", stopped)
     code, out, err = run("excite", "experiment.toml", "-o", "never/motion.csv")
     assert (code, out) == (130, "")
-    assert "jaxid: stopped before a motion kept all limits, and nothing was written." in err
-    code, out, err = run("excite", "experiment.toml", "-o", "never/motion.csv", "--resume")
+    assert (
+        "jaxid: stopped before a motion kept all limits, and nothing was written."
+        in err
+    )
+    code, out, err = run(
+        "excite", "experiment.toml", "-o", "never/motion.csv", "--resume"
+    )
     assert (code, out) == (2, "")
     assert "`never/motion.json` is not there: `--resume` needs" in err
 
@@ -493,14 +565,23 @@ def test_ctrl_c_before_a_motion_keeps_all_limits(written, run, monkeypatch):
     [
         ("rests = true", "`excitation.rests` is no known key: did you mean `rest`"),
         ("leads = false\nsample_time = 0.01", "choose `omega` = 0.79"),
-        ('controller = "franka"', "`controller` moves robots of 7 revolute joints, but `pendulum`"),
+        (
+            'controller = "franka"',
+            "`controller` moves robots of 7 revolute joints, but `pendulum`",
+        ),
         ("rest = true", "`harmonics` must be at least"),
         ("rest = true\nspline = {}", "a `spline` rests at its ends"),
-        ("spline = { point = 9 }", "`excitation.spline.point` is no known key: did you mean `po"),
+        (
+            "spline = { point = 9 }",
+            "`excitation.spline.point` is no known key: did you mean `po",
+        ),
         ("noise = [1, 2]", "`noise` must hold one positive number for each joint"),
         ('nominal = "nowhere"', "holds no `model.json`"),
         ('earlier = ["nowhere.json"]', "nowhere.json"),
-        ('earlier = ["arm.json"]', "the motion of `arm.json` moves 2 joint(s), but the robot"),
+        (
+            'earlier = ["arm.json"]',
+            "the motion of `arm.json` moves 2 joint(s), but the robot",
+        ),
         (
             'earlier = ["arm.json"]\ncriterion = "condition_number"',
             '`earlier` and `criterion = "condition_number"` do not go together',

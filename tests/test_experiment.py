@@ -103,7 +103,9 @@ def test_defaults_are_said(load):
     assert experiment.decimation == jid.Subsample(1)
     assert experiment.min_speed is None
     assert experiment.columns is None
-    assert isinstance(experiment.estimation.estimator.weights, jid.estimators.ResidualVariances)
+    assert isinstance(
+        experiment.estimation.estimator.weights, jid.estimators.ResidualVariances
+    )
     assert "10 Hz is assumed" in experiment.notes[0]
     assert "largest forces" in experiment.notes[1]
 
@@ -112,7 +114,9 @@ def test_a_table_of_angles_in_degrees_is_the_builtin_robot(load):
     rows = [(90, 0.0, 0.1273), (0, -0.612, 0.0), (0, -0.5723, 0.0)]
     rows += [(90, 0.0, 0.163941), (-90, 0.0, 0.1157), (0, 0.0, 0.0922)]
     table = ",\n".join(f"  {{ alpha = {al}, a = {a}, d = {d} }}" for al, a, d in rows)
-    robot = load(f'[robot]\nconvention = "standard"\nname = "mine"\ndh = [\n{table}\n]\n').robot
+    robot = load(
+        f'[robot]\nconvention = "standard"\nname = "mine"\ndh = [\n{table}\n]\n'
+    ).robot
     known = jid.robots.ur10()
     assert robot.name == "mine"
     np.testing.assert_array_equal(robot.rotation, known.rotation)
@@ -189,16 +193,25 @@ ESTIMATORS = {
         jid.estimators.CrossValidated()
     ),
     "ridge = 0.02": jid.WeightedLeastSquares(VARIANCES, jid.estimators.Ridge(0.02)),
-    "truncate = 0.02": jid.WeightedLeastSquares(VARIANCES, jid.estimators.Truncated(0.02)),
-    'kind = "huber"': jid.estimators.IterativelyReweighted(jid.estimators.Huber(), VARIANCES),
+    "truncate = 0.02": jid.WeightedLeastSquares(
+        VARIANCES, jid.estimators.Truncated(0.02)
+    ),
+    'kind = "huber"': jid.estimators.IterativelyReweighted(
+        jid.estimators.Huber(), VARIANCES
+    ),
     'kind = "tukey"\nlimit = 4\nridge = 0.1': jid.estimators.IterativelyReweighted(
         jid.estimators.Tukey(4.0), VARIANCES, jid.estimators.Ridge(0.1)
     ),
     'kind = "correlated"': jid.estimators.GeneralisedLeastSquares(),
     'kind = "consistent"\npull = 2\nmargin = 0.01': jid.PhysicallyConsistent(
-        VARIANCES, margin=0.01, pull=jid.consistency.EntropicPull(strength=2.0), throw=False
+        VARIANCES,
+        margin=0.01,
+        pull=jid.consistency.EntropicPull(strength=2.0),
+        throw=False,
     ),
-    "": jid.PhysicallyConsistent(VARIANCES, pull=jid.consistency.EntropicPull(), throw=False),
+    "": jid.PhysicallyConsistent(
+        VARIANCES, pull=jid.consistency.EntropicPull(), throw=False
+    ),
     "pull = 0": jid.PhysicallyConsistent(VARIANCES, throw=False),
 }
 
@@ -224,12 +237,16 @@ def test_filters_and_rows(load):
 def test_estimators_of_files(load, tmp_path):
     motion = jid.random_fourier_series(jid.robots.planar_arm(2), omega=1.0, seed=3)
     jid.trajectories.save_trajectory(motion, tmp_path / "motion.json")
-    text = '[estimator]\nkind = "instrumental"\nreference = ["motion.json"]\nreference_start = 2\n'
+    text = (
+        '[estimator]\nkind = "instrumental"\nreference = '
+        '["motion.json"]\nreference_start = 2\n'
+    )
     estimator = load(ARM + text).estimation.estimator
     assert isinstance(estimator, jid.estimators.InstrumentalVariables)
     assert (len(estimator.references), estimator.starts) == (1, (2.0,))
     inertia = (
-        "<inertial><mass value='{}'/><inertia ixx='{}' ixy='0' ixz='0' iyy='6' iyz='0' izz='6'/>"
+        "<inertial><mass value='{}'/><inertia ixx='{}' ixy='0' ixz='0' iyy='6' "
+        "iyz='0' izz='6'/>"
     )
     heavy = URDF
     for link, mass in (("cart", 5), ("arm", 7)):
@@ -242,7 +259,13 @@ def test_estimators_of_files(load, tmp_path):
     relative, names = experiment.estimation.estimator, experiment.model.parameter_names
     assert isinstance(relative, jid.estimators.RelativeTo)
     named = dict(zip(names, relative.parameters, strict=True))
-    assert [named[k] for k in ("m1", "m2", "A2", "C2", "fv1")] == [5.0, 7.0, 7.0, 6.0, 0.0]
+    assert [named[k] for k in ("m1", "m2", "A2", "C2", "fv1")] == [
+        5.0,
+        7.0,
+        7.0,
+        6.0,
+        0.0,
+    ]
     bounds = """kind = "consistent"
 mass_min = 0.5
 centre_min = [[-0.2, -inf, -0.1], [-0.3, -0.1, -0.1]]
@@ -294,8 +317,14 @@ REFUSALS = [
     (ARM + "[recording]\nangles = 'q{}'", "`recording.forces`"),
     (COLUMNS + "angle_unit = 'degree'", "`degree`"),
     (COLUMNS + "angle_signs = [1, 2]", "`angle_signs`"),
-    (RAIL + "angle_unit = 'deg'", '`angle_unit` of joint `rail` is "deg", but the joint slides'),
-    (RAIL + "force_unit = 'N'", '`force_unit` of joint `joint1` is "N", but the joint turns'),
+    (
+        RAIL + "angle_unit = 'deg'",
+        '`angle_unit` of joint `rail` is "deg", but the joint slides',
+    ),
+    (
+        RAIL + "force_unit = 'N'",
+        '`force_unit` of joint `joint1` is "N", but the joint turns',
+    ),
     (BUTTERWORTH + "cutoff = []", "`filter.cutoff`"),
     (ARM + "[filter]\nkind = 'paper'\ncutoff = 3", "`filter.cutoff`.*velocity"),
     (ARM + "[rows]\nslow = 2", "`rows.slow` was renamed to `min_speed`"),
@@ -306,10 +335,16 @@ REFUSALS = [
         ARM + "[estimator]\nkind = 'least_squares'\nweights = 'residual_variances'",
         "`estimator.weights`: belongs to `kind",
     ),
-    (ARM + "[estimator]\nlimit = 2.0", '`estimator.limit`: belongs to `kind = "huber" or "tuk'),
+    (
+        ARM + "[estimator]\nlimit = 2.0",
+        '`estimator.limit`: belongs to `kind = "huber" or "tuk',
+    ),
     (ARM + "[estimator]\nkind = 'instrumental'", "`estimator`: `reference`"),
     (ARM + "[estimator]\nridge = 0.1\nprior = 'urdf'", "`prior"),
-    (ARM + "[estimator]\nnonlinear_friction = true\nessential = 0.1", "`nonlinear_friction`"),
+    (
+        ARM + "[estimator]\nnonlinear_friction = true\nessential = 0.1",
+        "`nonlinear_friction`",
+    ),
     (ARM + BODIES + "centre_max = [[1, 1, 1], [1, 1]]", "`estimator.centre_max`"),
     (ARM + BODIES + "ellipsoid_centre = [0, 0, 0]", "`ellipsoid_axes`"),
     (ARM + "[estimator]\nessential = 0.1\nridge = 0.1", "`essential`.*`ridge`"),
@@ -317,9 +352,15 @@ REFUSALS = [
     (ARM + "[estimator]\nridge = 0.1\ntruncate = 0.1", "`truncate`.*`ridge`"),
     ("[robot\n", "TOML"),
     (ARM + "x = " + 3000 * "[", "TOML"),
-    (SHAPES.replace('body = "bend"', 'body = "wrist"'), "`collision`: `body`.*turn, lift"),
+    (
+        SHAPES.replace('body = "bend"', 'body = "wrist"'),
+        "`collision`: `body`.*turn, lift",
+    ),
     (SHAPES.replace("floor = -0.1", 'pairs = [["hand", "chair"]]'), "`chair`"),
-    (SHAPES.replace("floor = -0.1", "ground = 0.0"), "`collision.ground` was renamed to `floor`"),
+    (
+        SHAPES.replace("floor = -0.1", "ground = 0.0"),
+        "`collision.ground` was renamed to `floor`",
+    ),
 ]
 
 
@@ -336,7 +377,9 @@ def test_mistakes_are_one_sentence_with_file_and_key(load, text, expected):
 
 
 def test_columns_by_the_names_of_the_joints(load):
-    table = '[recording]\nangles = "/js.position.{name}"\nforces = "tau{}"\nunwrap = true\n'
+    table = (
+        '[recording]\nangles = "/js.position.{name}"\nforces = "tau{}"\nunwrap = true\n'
+    )
     experiment = load(ARM + table)
     names = experiment.robot.joint_names
     assert experiment.columns.angles == tuple(f"/js.position.{name}" for name in names)
@@ -348,22 +391,26 @@ def test_logs_that_do_not_fit_the_file(load, tmp_path):
     log = tmp_path / "run.csv"
     rows = "\n".join(f"{0.01 * i},{i},{i},{i},1,1,1" for i in range(100))
     log.write_text("t,q1,q2,q3,tau1,tau2,tau3\n" + rows)
-    missing = (
-        r"the table `\[recording\]` is missing: .* `run.csv`, which has `t`, `q1`, .* `tau3`\."
-    )
+    missing = r"the table `\[recording\]` is missing: .* `run.csv`, which has `t`, `q1`, .* `tau3`\."
     with pytest.raises(ValueError, match=missing):
         load(ARM).read(log)
     with pytest.raises(
         ValueError, match=r"`recording.angles` names 3 of the columns of `run.csv`, but"
     ):
         load(ARM + RECORDING).read(log)
-    short = RECORDING.replace('"q{}"', '["q1", "q2"]').replace('"tau{}"', '["tau1", "tau2"]')
+    short = RECORDING.replace('"q{}"', '["q1", "q2"]').replace(
+        '"tau{}"', '["tau1", "tau2"]'
+    )
     with pytest.raises(ValueError, match=r"`recording`: `run` has 0 samples from 5 s"):
         load(ARM + short + "start = 5\n").read(log)
-    parts = load(ARM + short + "start = {'run.csv' = 0.2}\nstop = {'other.csv' = 0.3}\n")
+    parts = load(
+        ARM + short + "start = {'run.csv' = 0.2}\nstop = {'other.csv' = 0.3}\n"
+    )
     assert parts.read(log).angles[[0, -1], 0].tolist() == [20, 99]
     experiment = load(ARM + short + "[filter]\nkind = 'butterworth'\ncutoff = 60\n")
-    with pytest.raises(ValueError, match=r"experiment.toml: `filter` and `rows`: .*cutoff"):
+    with pytest.raises(
+        ValueError, match=r"experiment.toml: `filter` and `rows`: .*cutoff"
+    ):
         experiment.observe(experiment.read(log))
 
 
@@ -374,8 +421,17 @@ def test_the_template_loads_as_it_is_and_keeps_what_the_urdf_says(tmp_path):
     path.write_text(text, encoding="utf-8")
     experiment = load_experiment(path)
     robot, known = experiment.robot, jid.load_urdf(tmp_path / "arm.urdf")
-    for name in ("position_min", "position_max", "velocity", "acceleration", "jerk", "force"):
-        np.testing.assert_array_equal(getattr(robot.limits, name), getattr(known.limits, name))
+    for name in (
+        "position_min",
+        "position_max",
+        "velocity",
+        "acceleration",
+        "jerk",
+        "force",
+    ):
+        np.testing.assert_array_equal(
+            getattr(robot.limits, name), getattr(known.limits, name)
+        )
     assert robot.drives.is_direct
     assert experiment.notes == ()
     assert experiment.columns.angle_unit == (units.M, units.RAD)
@@ -387,15 +443,20 @@ def test_the_template_loads_as_it_is_and_keeps_what_the_urdf_says(tmp_path):
 def test_an_mjcf_file_gives_template_robot_and_nominal_values(tmp_path):
     pytest.importorskip("mujoco")
     (tmp_path / "arm.xml").write_text(
-        '<mujoco><worldbody><body name="link"><joint name="hinge" armature="0.1" frictionloss="2"/>'
+        '<mujoco><worldbody><body name="link"><joint name="hinge" armature="0.1" '
+        'frictionloss="2"/>'
         '<geom size="0.1" pos="0.2 0 0"/></body></worldbody></mujoco>'
     )
-    text = write_template(tmp_path / "arm.xml", folder=tmp_path, base="world", tip="link")
+    text = write_template(
+        tmp_path / "arm.xml", folder=tmp_path, base="world", tip="link"
+    )
     (tmp_path / "experiment.toml").write_text(text, encoding="utf-8")
     experiment = load_experiment(tmp_path / "experiment.toml")
     assert 'mjcf = "arm.xml"' in text
     assert experiment.robot.joint_names == ("hinge",)
-    assert experiment.source.parameters(tmp_path)[0, 0] == pytest.approx(4000 / 3 * np.pi * 1e-3)
+    assert experiment.source.parameters(tmp_path)[0, 0] == pytest.approx(
+        4000 / 3 * np.pi * 1e-3
+    )
     assert experiment.source.joint_parameters(tmp_path) == {"Ia1": 0.1, "fc1": 2.0}
 
 
@@ -406,7 +467,9 @@ def test_every_commented_key_of_the_template_is_a_known_one(tmp_path):
     keys = dict.fromkeys(re.findall(r"^# (\w+) = ", text, flags=re.M))
     assert len(keys) > 25
     for key in set(keys) - {"kind", "coulomb"}:  # the second is a table as well
-        content = tomllib.loads(re.sub(rf"^# ({key} = )", r"\1", text, count=1, flags=re.M))
+        content = tomllib.loads(
+            re.sub(rf"^# ({key} = )", r"\1", text, count=1, flags=re.M)
+        )
         for name, table in content.items():
             functions = TABLES[name]
             if name == "filter":
@@ -422,7 +485,9 @@ def test_no_name_of_a_urdf_writes_into_the_template(tmp_path):
     folder = tmp_path / 'a"b\\c  # d'
     folder.mkdir()
     urdf = folder / "arm.urdf"
-    text = URDF.replace("rail and arm", "x&#10;[limits]&#13;#").replace("shoulder", "j  # k = 1")
+    text = URDF.replace("rail and arm", "x&#10;[limits]&#13;#").replace(
+        "shoulder", "j  # k = 1"
+    )
     urdf.write_text(text)
     found = tomllib.loads(write_template(urdf, tip="tool", folder=tmp_path))
     assert found["robot"] == {"urdf": 'a"b\\c  # d/arm.urdf', "tip": "tool"}
@@ -434,7 +499,9 @@ def test_no_name_of_a_urdf_writes_into_the_template(tmp_path):
         with pytest.raises(ValueError, match="name"):
             write_template(urdf, folder=tmp_path)
         urdf.write_text(URDF.replace('"tool"', f'"t{sign}"'))
-        assert found.keys() == tomllib.loads(write_template(urdf, folder=tmp_path)).keys()
+        assert (
+            found.keys() == tomllib.loads(write_template(urdf, folder=tmp_path)).keys()
+        )
 
 
 def test_shapes_come_from_the_file(load):

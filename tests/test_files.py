@@ -58,7 +58,12 @@ def test_other_files_stay_and_those_of_an_earlier_result_go(tmp_path):
     (tmp_path / "mine").write_text("mine")
     write(tmp_path, "b", "c")
     index = json.dumps({"files": ["b", "c"]})
-    assert contents(tmp_path) == {"b": "new", "c": "new", "mine": "mine", "result.json": index}
+    assert contents(tmp_path) == {
+        "b": "new",
+        "c": "new",
+        "mine": "mine",
+        "result.json": index,
+    }
 
 
 @pytest.mark.parametrize("calls", range(4))

@@ -58,8 +58,12 @@ def _public() -> dict[str, Any]:
 
 def _commands() -> list[str]:
     """Return the lines of the README's shell blocks."""
-    blocks = re.findall(r"```(?:bash|sh)\n(.*?)```", README.read_text(encoding="utf-8"), re.S)
-    return [line.strip() for block in blocks for line in block.splitlines() if line.strip()]
+    blocks = re.findall(
+        r"```(?:bash|sh)\n(.*?)```", README.read_text(encoding="utf-8"), re.S
+    )
+    return [
+        line.strip() for block in blocks for line in block.splitlines() if line.strip()
+    ]
 
 
 @pytest.mark.parametrize("path", SOURCES, ids=_name)
@@ -77,7 +81,11 @@ def test_a_file_is_short_documented_and_behaves(path):
             wrong.append(f"line {node.lineno}: an `assert`")
         # The process of a command ends itself, whatever its threads still do.
         ends = path.parts[-2:] == ("cli", "process.py")
-        if isinstance(node, ast.Call) and ast.unparse(node.func) in FORBIDDEN_CALLS and not ends:
+        if (
+            isinstance(node, ast.Call)
+            and ast.unparse(node.func) in FORBIDDEN_CALLS
+            and not ends
+        ):
             wrong.append(f"line {node.lineno}: a call of `{ast.unparse(node.func)}`")
         if isinstance(node, ast.ImportFrom) and node.module == "__future__":
             wrong.append(f"line {node.lineno}: annotations must be real ones")
@@ -94,7 +102,9 @@ def test_docstrings_are_in_plain_english():
     wrong = []
     for path in SOURCES:
         for node in ast.walk(_tree(path)):
-            if not isinstance(node, ast.Expr) or not isinstance(node.value, ast.Constant):
+            if not isinstance(node, ast.Expr) or not isinstance(
+                node.value, ast.Constant
+            ):
                 continue
             text = str(node.value.value)
             if text.startswith("What ") or re.search(r"^ +\w+: Of\b", text, re.M):
@@ -122,10 +132,14 @@ def test_every_abstract_class_has_at_most_three_abstract_methods():
                 f.name
                 for f in node.body
                 if isinstance(f, ast.FunctionDef)
-                and any(ast.unparse(d).endswith("abstractmethod") for d in f.decorator_list)
+                and any(
+                    ast.unparse(d).endswith("abstractmethod") for d in f.decorator_list
+                )
             ]
             assert len(abstract) <= 3, f"{_name(path)}: `{node.name}` has {abstract}"
-            assert not abstract or node.name.startswith("Abstract"), f"{_name(path)}: {node.name}"
+            assert not abstract or node.name.startswith("Abstract"), (
+                f"{_name(path)}: {node.name}"
+            )
 
 
 def test_importing_changes_nothing_and_loads_nothing_heavy():
@@ -154,7 +168,9 @@ def test_a_public_name_is_documented_with_units(name):
         annotations = inspect.get_annotations(thing)
         floats = [k for k, v in annotations.items() if v is float and k != "return"]
         for argument in floats:
-            described = re.search(rf"^\s*{argument}: (.+(?:\n {{8,}}.+)*)", docstring, re.M)
+            described = re.search(
+                rf"^\s*{argument}: (.+(?:\n {{8,}}.+)*)", docstring, re.M
+            )
             assert described, f"`{name}` does not document `{argument}`"
             assert re.search(r"\[[^\]]+\]|[Ff]raction|relative", described[1]), (
                 f"`{name}`: the unit of `{argument}` is missing"
@@ -178,11 +194,21 @@ def test_commands_in_the_readme_exist():
 
 
 def test_links_between_the_documents_lead_somewhere():
-    documents = [README, ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *ROOT.glob("docs/*.md")]
+    documents = [
+        README,
+        ROOT / "CONTRIBUTING.md",
+        ROOT / "CHANGELOG.md",
+        *ROOT.glob("docs/*.md"),
+    ]
     dead = []
     for document in documents:
-        for target in re.findall(r"\]\(([^)#\s]+)[^)]*\)", document.read_text(encoding="utf-8")):
-            if not target.startswith("http") and not (document.parent / target).exists():
+        for target in re.findall(
+            r"\]\(([^)#\s]+)[^)]*\)", document.read_text(encoding="utf-8")
+        ):
+            if (
+                not target.startswith("http")
+                and not (document.parent / target).exists()
+            ):
                 dead.append(f"{_name(document)}: {target}")
     assert not dead
 

@@ -75,7 +75,9 @@ def test_a_zero_phase_filter_knows_no_direction_of_time(seed, cutoff, order, shi
 
 @pytest.fixture(scope="module")
 def model_file(tmp_path_factory):
-    base = jid.base_parameters(jid.Model(ARM, (jid.RigidBodies(), jid.ViscousFriction())))
+    base = jid.base_parameters(
+        jid.Model(ARM, (jid.RigidBodies(), jid.ViscousFriction()))
+    )
     series = jid.random_fourier_series(ARM, omega=0.8, harmonics=2, seed=0)
     motion = series.motion(0.01 * np.arange(300))
     forces = base.model.inverse_dynamics(np.ones(base.model.size), motion)
@@ -88,7 +90,9 @@ def model_file(tmp_path_factory):
 
 @settings(max_examples=40)
 @given(place=st.floats(0.0, 1.0), length=st.integers(0, 8), put=st.binary(max_size=8))
-def test_a_model_file_is_the_one_that_was_written_or_refused(model_file, place, length, put):
+def test_a_model_file_is_the_one_that_was_written_or_refused(
+    model_file, place, length, put
+):
     good = model_file.read_bytes()
     start = int(place * len(good))
     data = good[:start] + put + good[start + length :]

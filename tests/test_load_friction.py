@@ -37,7 +37,9 @@ def test_coefficients_are_found(experiment, seed):
     for m, c in zip(mass, r, strict=True):
         J = inertia * np.eye(3) + m * (c @ c * np.eye(3) - np.outer(c, c))
         bodies.append([m, *(m * c), *np.diag(J), -J[1, 2], -J[0, 2], -J[0, 1]])
-    truth = jid.Model(robot, (*experiment.model.terms, jid.terms.LoadFriction(np.array(bodies))))
+    truth = jid.Model(
+        robot, (*experiment.model.terms, jid.terms.LoadFriction(np.array(bodies)))
+    )
     rest = rng.uniform(0.3, 1.0, truth.size - 33)
     coefficients = np.array([0.1, 0.15, 0.25])
     p = np.concatenate([np.ravel(bodies), rest, coefficients])

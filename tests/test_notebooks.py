@@ -15,7 +15,9 @@ COUNT = 10
 LARGEST = 2_000_000
 """Bytes of all notebooks together."""
 # Where a machine keeps things: a home, a temporary folder, installed packages, a drive.
-PATH = re.compile(r"/(home|root|tmp|usr|opt|var|work|private)/|site-packages|\b[A-Z]:\\")
+PATH = re.compile(
+    r"/(home|root|tmp|usr|opt|var|work|private)/|site-packages|\b[A-Z]:\\"
+)
 
 
 def _notebook(source: Path) -> dict:
@@ -36,7 +38,9 @@ def source(request):
 
 
 def test_there_are_notebooks_and_each_has_its_pair():
-    assert [path.stem[:2] for path in SOURCES] == [f"{k:02}" for k in range(1, COUNT + 1)]
+    assert [path.stem[:2] for path in SOURCES] == [
+        f"{k:02}" for k in range(1, COUNT + 1)
+    ]
     assert {p.stem for p in FOLDER.glob("*.ipynb")} == {p.stem for p in SOURCES}
 
 
@@ -58,7 +62,9 @@ def test_it_was_executed_from_top_to_bottom_without_an_error(source):
     assert [c["execution_count"] for c in cells] == list(range(1, len(cells) + 1))
     kinds = {o["output_type"] for c in cells for o in c["outputs"]}
     assert kinds <= {"stream", "display_data", "execute_result"}
-    streams = {o["name"] for c in cells for o in c["outputs"] if o["output_type"] == "stream"}
+    streams = {
+        o["name"] for c in cells for o in c["outputs"] if o["output_type"] == "stream"
+    }
     assert streams <= {"stdout"}, "a warning is shown"
 
 
@@ -67,7 +73,9 @@ def test_it_has_pictures_and_nothing_of_a_machine(source):
     assert sum("image/png" in o.get("data", {}) for o in outputs) >= 2
     for output in outputs:
         words = [_text(output.get("text", ""))]
-        words += [_text(v) for k, v in output.get("data", {}).items() if k.startswith("text/")]
+        words += [
+            _text(v) for k, v in output.get("data", {}).items() if k.startswith("text/")
+        ]
         found = PATH.search(" ".join(words))
         assert not found, f"{source.stem}: {found}"
     assert all(not c["metadata"] for c in _code(source))
@@ -84,7 +92,9 @@ def test_links_of_the_notebooks_lead_somewhere(source):
 def test_each_leads_to_the_next_one():
     for here, following in itertools.pairwise(SOURCES):
         last = _text(_notebook(here)["cells"][-1]["source"])
-        assert re.search(rf"Next: \[[^\]]+\]\({following.stem}\.ipynb\)", last), here.stem
+        assert re.search(rf"Next: \[[^\]]+\]\({following.stem}\.ipynb\)", last), (
+            here.stem
+        )
 
 
 def test_they_are_small():

@@ -27,7 +27,11 @@ def readers(tmp_path_factory):
 @pytest.mark.parametrize("name", faults.FILES)
 def test_damaged_files_end_in_a_sentence(readers, name):
     folder, read = readers[0], readers[1][name]
-    good, chance, target = (folder / name).read_bytes(), random.Random(7), folder / f"bad-{name}"
+    good, chance, target = (
+        (folder / name).read_bytes(),
+        random.Random(7),
+        folder / f"bad-{name}",
+    )
     read(folder / name)
     for _ in range(FILES):
         data = faults.damaged(good, chance)
@@ -36,7 +40,9 @@ def test_damaged_files_end_in_a_sentence(readers, name):
             read(target)
         except Exception as error:
             if not isinstance(error, InputError | OSError):
-                raise AssertionError(f"{type(error).__name__} on {data[:2000]!r}") from error
+                raise AssertionError(
+                    f"{type(error).__name__} on {data[:2000]!r}"
+                ) from error
 
 
 class Trap:

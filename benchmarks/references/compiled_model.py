@@ -33,8 +33,18 @@ class CompiledModel:
         weakref.finalize(self, folder.cleanup)
         source = jid.export_c(fit, folder.name, double=double)
         target = Path(folder.name) / "arm.so"
-        words = [os.environ.get("CC", "cc"), *STRICT, *flags, "-shared", "-fPIC", source, "-lm"]
-        done = subprocess.run([*words, "-o", target], capture_output=True, text=True, check=True)
+        words = [
+            os.environ.get("CC", "cc"),
+            *STRICT,
+            *flags,
+            "-shared",
+            "-fPIC",
+            source,
+            "-lm",
+        ]
+        done = subprocess.run(
+            [*words, "-o", target], capture_output=True, text=True, check=True
+        )
         self.messages = done.stderr
         self.library = ctypes.CDLL(str(target))
 
@@ -44,7 +54,9 @@ class CompiledModel:
 
         def on_rows(*inputs):
             rows = [np.ascontiguousarray(x, self.dtype) for x in inputs]
-            result = np.empty((len(rows[0]), *self.shapes.get(name, self.joints)), self.dtype)
+            result = np.empty(
+                (len(rows[0]), *self.shapes.get(name, self.joints)), self.dtype
+            )
             for sample in zip(*rows, result, strict=True):
                 function(*(ctypes.c_void_p(x.ctypes.data) for x in sample))
             return result.astype(np.float64)

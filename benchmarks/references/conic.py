@@ -6,15 +6,21 @@ import numpy as np
 from jaxid.identification.consistency.program import FeasibleSet, ScaledRows
 
 
-def problem(feasible: FeasibleSet, data: ScaledRows) -> tuple[cp.Problem, cp.Variable, np.ndarray]:
+def problem(
+    feasible: FeasibleSet, data: ScaledRows
+) -> tuple[cp.Problem, cp.Variable, np.ndarray]:
     """Return the fit as a conic program in SI units, its variables and their units."""
     bounds = feasible.bounds
     size = data.A.shape[1]
     norms = np.linalg.norm(data.A, axis=0)
-    unit = np.where(norms > 0, 10.0 * np.linalg.norm(data.b) / np.where(norms > 0, norms, 1), 0)
+    unit = np.where(
+        norms > 0, 10.0 * np.linalg.norm(data.b) / np.where(norms > 0, norms, 1), 0
+    )
     for k, columns in enumerate(feasible.bodies):
         L, m = bounds.radius[k], bounds.mass_max[k]
-        unit[list(columns)] = (m * L ** np.array([0, 1, 1, 1, 2, 2, 2, 2, 2, 2]))[: len(columns)]
+        unit[list(columns)] = (m * L ** np.array([0, 1, 1, 1, 2, 2, 2, 2, 2, 2]))[
+            : len(columns)
+        ]
     y = cp.Variable(size)
     p = cp.multiply(unit, y)
     constraints = []
@@ -50,10 +56,15 @@ def problem(feasible: FeasibleSet, data: ScaledRows) -> tuple[cp.Problem, cp.Var
     drives = list(feasible.drives)
     constraints += [y[drives] >= 0, y[drives] <= 1]
     for coupling in feasible.couplings:
-        parts = [p[j] * basis for j, basis in zip(coupling.columns, coupling.basis, strict=True)]
+        parts = [
+            p[j] * basis
+            for j, basis in zip(coupling.columns, coupling.basis, strict=True)
+        ]
         constraints.append(sum(parts[1:], parts[0]) >> 0)
     if bounds.total_mass is not None:
-        constraints.append(cp.sum(p[[c[0] for c in feasible.bodies]]) == bounds.total_mass)
+        constraints.append(
+            cp.sum(p[[c[0] for c in feasible.bodies]]) == bounds.total_mass
+        )
     objective = 0.5 * cp.sum_squares((data.A * unit) @ y - data.b)
     return cp.Problem(cp.Minimize(objective), constraints), y, unit
 

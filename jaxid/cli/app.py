@@ -43,7 +43,9 @@ def main() -> None:
 
 @app.callback(invoke_without_command=True)
 def _options(
-    version: Annotated[bool, typer.Option("--version", help="Show the version.")] = False,
+    version: Annotated[
+        bool, typer.Option("--version", help="Show the version.")
+    ] = False,
 ) -> None:
     if version:
         typer.echo(f"jaxid {versions()['jaxid']}")
@@ -58,8 +60,8 @@ def demo(
 ) -> None:
     """Run the whole method on a virtual seven-axis robot.
 
-    Base parameters, optimal excitation, measurement cold and warm, identification, and verification
-    on the path of ISO 9283.
+    Base parameters, optimal excitation, measurement cold and warm, identification, and
+    verification on the path of ISO 9283.
     """
     from jaxid.demo.results import remarks, tables, write_study
     from jaxid.demo.study import run_study
@@ -105,7 +107,10 @@ def example(
 @app.command()
 def init(
     urdf: Annotated[
-        Path, typer.Argument(help="The robot's URDF, xacro or MJCF file.", metavar="ARM.URDF")
+        Path,
+        typer.Argument(
+            help="The robot's URDF, xacro or MJCF file.", metavar="ARM.URDF"
+        ),
     ],
     tip: options.Tip = None,
     base: options.Base = None,
@@ -120,7 +125,9 @@ def init(
     from jaxid.robot.urdf import load_urdf
 
     text = write_template(urdf, tip=tip, base=base)
-    show_remarks(options.open_console(stderr=True), load_urdf(urdf, tip=tip, base=base).notes)
+    show_remarks(
+        options.open_console(stderr=True), load_urdf(urdf, tip=tip, base=base).notes
+    )
     typer.echo(text.encode(), nl=False)  # TOML is UTF-8, whatever the terminal is
 
 
@@ -128,7 +135,8 @@ def init(
 def excite(
     experiment: options.ExperimentFile,
     output: Annotated[
-        Path, typer.Option("-o", "--output", metavar="FILE.CSV", help="Table of the motion.")
+        Path,
+        typer.Option("-o", "--output", metavar="FILE.CSV", help="Table of the motion."),
     ] = Path("trajectory.csv"),
     time: Annotated[
         float | None,
@@ -138,18 +146,23 @@ def excite(
         bool, typer.Option("--resume", help="Go on with the motion that was written.")
     ] = False,
     all_criteria: Annotated[
-        bool, typer.Option("--all-criteria", help="Show what each of the criteria buys.")
+        bool,
+        typer.Option("--all-criteria", help="Show what each of the criteria buys."),
     ] = False,
     play: Annotated[
-        bool, typer.Option("--play", help="Show the motion that was written in MuJoCo's viewer.")
+        bool,
+        typer.Option(
+            "--play", help="Show the motion that was written in MuJoCo's viewer."
+        ),
     ] = False,
 ) -> None:
     """Design the motion to record, within the limits of the joints.
 
-    Floor, self-collision and forces count as far as the robot's file describes them. A first motion
-    is written after seconds, and every better one replaces it: the table, the trajectory itself
-    (.json) and the same for ROS (.ros.yaml) or other controllers; at the end also a page with
-    pictures. Ctrl-C keeps the best motion so far. The exit code is 3 if something was not checked.
+    Floor, self-collision and forces count as far as the robot's file describes them. A
+    first motion is written after seconds, and every better one replaces it: the table,
+    the trajectory itself (.json) and the same for ROS (.ros.yaml) or other controllers;
+    at the end also a page with pictures. Ctrl-C keeps the best motion so far. The exit
+    code is 3 if something was not checked.
     """
     console = options.start(experiment)
     from . import commands
@@ -170,8 +183,9 @@ def inspect(
 ) -> None:
     """Show what can be identified, and check logs for mistakes.
 
-    Joints, motors and limits; base parameters and what becomes of each standard parameter; ranges,
-    speeds and forces of each log beside the limits, and what the log does not determine.
+    Joints, motors and limits; base parameters and what becomes of each standard
+    parameter; ranges, speeds and forces of each log beside the limits, and what the log
+    does not determine.
     """
     console = options.start(experiment, *(logs or []))
     from . import commands
@@ -187,7 +201,8 @@ def identify(
     split: Annotated[
         float | None,
         typer.Option(
-            metavar="F", help="Fit the first fraction F (0-1) of each log, validate with the rest."
+            metavar="F",
+            help="Fit the first fraction F (0-1) of each log, validate with the rest.",
         ),
     ] = None,
     output: options.OutputFolder = Path("report"),
@@ -201,7 +216,9 @@ def identify(
 
     A page for the browser, with figures and a verdict; the same numbers for programs.
     """
-    console = options.start(experiment, *logs, *(verify or []), output=output, force=force)
+    console = options.start(
+        experiment, *logs, *(verify or []), output=output, force=force
+    )
     from . import commands
 
     commands.identify(console, experiment, logs, verify or [], split, output, figures)
@@ -212,16 +229,22 @@ def choose(
     experiment: options.ExperimentFile,
     logs: options.Logs,
     output: Annotated[
-        Path, typer.Option("-o", "--output", metavar="FILE", help="The experiment file to write.")
+        Path,
+        typer.Option(
+            "-o", "--output", metavar="FILE", help="The experiment file to write."
+        ),
     ] = Path("chosen.toml"),
     force: options.Force = False,
 ) -> None:
     """Choose friction and estimator by errors on unseen data.
 
-    A table of all models, and an experiment file with the simplest that is about as good as any.
+    A table of all models, and an experiment file with the simplest that is about as
+    good as any.
     """
     if output.exists() and not force:
-        raise InputError(f"`{output}` is there already: choose another `--output`, or `--force`.")
+        raise InputError(
+            f"`{output}` is there already: choose another `--output`, or `--force`."
+        )
     console = options.start(experiment, *logs)
     from . import commands
 
@@ -239,10 +262,13 @@ def export(
     ],
     output: Annotated[
         Path | None,
-        typer.Option("-o", "--output", metavar="FILE", help="The file; by default `arm`."),
+        typer.Option(
+            "-o", "--output", metavar="FILE", help="The file; by default `arm`."
+        ),
     ] = None,
     urdf: Annotated[
-        Path | None, typer.Option(metavar="ARM.URDF", help="The robot's file, for `--to urdf`.")
+        Path | None,
+        typer.Option(metavar="ARM.URDF", help="The robot's file, for `--to urdf`."),
     ] = None,
     tip: options.Tip = None,
     base: options.Base = None,
@@ -267,7 +293,9 @@ def export(
         if one.is_dir():
             raise InputError(f"`{one}` is a folder: choose another `--output`.")
         if one.exists() and not force:
-            raise InputError(f"`{one}` is there already: choose another `--output`, or `--force`.")
+            raise InputError(
+                f"`{one}` is there already: choose another `--output`, or `--force`."
+            )
     chain = {"tip": tip, "base": base}
     commands.export(report, to, path, urdf, chain, not single, force)
     console.print()
@@ -277,13 +305,18 @@ def export(
 @app.command()
 def compare(
     first: Annotated[
-        Path, typer.Argument(help="Report of one run, like that of the cold robot.", metavar="COLD")
+        Path,
+        typer.Argument(
+            help="Report of one run, like that of the cold robot.", metavar="COLD"
+        ),
     ],
     second: Annotated[
-        Path, typer.Argument(help="Report of another run of the same robot.", metavar="WARM")
+        Path,
+        typer.Argument(help="Report of another run of the same robot.", metavar="WARM"),
     ],
     level: Annotated[
-        float, typer.Option("--level", metavar="L", help="Confidence of the decisions (0-1).")
+        float,
+        typer.Option("--level", metavar="L", help="Confidence of the decisions (0-1)."),
     ] = 0.95,
     output: options.OutputFolder = Path("comparison"),
     force: options.Force = False,
@@ -306,10 +339,12 @@ def payload(
     logs: options.Logs,
     loaded: options.Loaded,
     body: Annotated[
-        str | None, typer.Option(metavar="JOINT", help="The joint that moves the payload.")
+        str | None,
+        typer.Option(metavar="JOINT", help="The joint that moves the payload."),
     ] = None,
     mass: Annotated[
-        float | None, typer.Option(metavar="KG", min=1e-6, help="Its mass, if a scale told it.")
+        float | None,
+        typer.Option(metavar="KG", min=1e-6, help="Its mass, if a scale told it."),
     ] = None,
     output: options.OutputFolder = Path("payload"),
     force: options.Force = False,
@@ -334,7 +369,8 @@ def gains(
 ) -> None:
     """Find the drives' true forces with a load that is known.
 
-    From logs without it and logs with it; the table `[load]` of the experiment file describes it.
+    From logs without it and logs with it; the table `[load]` of the experiment file
+    describes it.
     """
     console = options.start(experiment, *logs, *loaded, output=output, force=force)
     from . import commands
@@ -351,8 +387,8 @@ def states(
 ) -> None:
     """Fit several states at once: one inertia, friction for each.
 
-    One log or report for each, like cold and warm. Friction and offsets are each state's own,
-    all else is shared.
+    One log or report for each, like cold and warm. Friction and offsets are each
+    state's own, all else is shared.
     """
     console = options.start(experiment, *logs, output=output, force=force)
     from . import commands
@@ -370,11 +406,13 @@ def rollout(
 ) -> None:
     """Identify so that simulations move like the robot: from commands without torques, or torques.
 
-    If the experiment file names the columns of commands, joints behind position servos, with
-    numbers for simulators and MJCF; otherwise the model of `identify`, with errors beside those of
-    other methods. A page shows measured and simulated motion.
+    If the experiment file names the columns of commands, joints behind position servos,
+    with numbers for simulators and MJCF; otherwise the model of `identify`, with errors
+    beside those of other methods. A page shows measured and simulated motion.
     """
-    console = options.start(experiment, *logs, *(verify or []), output=output, force=force)
+    console = options.start(
+        experiment, *logs, *(verify or []), output=output, force=force
+    )
     from . import commands
 
     commands.rollout(console, experiment, logs, verify or [], output)

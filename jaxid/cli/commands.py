@@ -91,7 +91,9 @@ def inspect(console: Console, path: Path, logs: list[Path]) -> None:
 def _check_logs(logs: list[Path], verify: list[Path], split: float | None) -> None:
     """Reject logs that would count twice, or verify a model that has seen them."""
     if split is not None and not 0 < split < 1:
-        raise InputError(f"`--split` must lie between 0 and 1, like 0.6, but is {split:g}.")
+        raise InputError(
+            f"`--split` must lie between 0 and 1, like 0.6, but is {split:g}."
+        )
     places = [os.path.realpath(p) for p in logs]
     repeated = next((p for k, p in enumerate(logs) if places[k] in places[:k]), None)
     if repeated is not None:
@@ -99,11 +101,14 @@ def _check_logs(logs: list[Path], verify: list[Path], split: float | None) -> No
     both = set(places) & {os.path.realpath(p) for p in verify}
     if both:
         raise InputError(
-            f"`{Path(sorted(both)[0]).name}` is given both to identify and to verify with: use "
+            f"`{Path(sorted(both)[0]).name}` is given both to identify and to verify "
+            "with: use "
             "`--split`."
         )
     if all(map(identify_logs.is_report, logs)):
-        raise InputError("give at least one log as a file, for torque errors and figures.")
+        raise InputError(
+            "give at least one log as a file, for torque errors and figures."
+        )
 
 
 def identify(
@@ -127,7 +132,9 @@ def identify(
     fit, robot = report.fit, experiment.robot
     tabulated = () if fit.consistency is None else fit.consistency.findings
     show(console, robot.summary(), *motor_tables(robot))
-    show_remarks(console, [*report.notes, *(n for n in fit.notes if n not in tabulated)])
+    show_remarks(
+        console, [*report.notes, *(n for n in fit.notes if n not in tabulated)]
+    )
     show(console, fit.summary())
     if fit.residual_spectra is not None:
         show(console, residual_table(fit.residual_spectra, robot))
@@ -158,7 +165,9 @@ def excite(
     experiment, errors = load_experiment(path), open_console(stderr=True)
     written = output.with_suffix(".json") if resume else None
     if written is not None and not written.is_file():
-        raise InputError(f"`{written}` is not there: `--resume` needs a motion to go on with.")
+        raise InputError(
+            f"`{written}` is not there: `--resume` needs a motion to go on with."
+        )
     preparation = prepare_design(experiment, written)
     faults = preparation.faults(experiment)
     show_remarks(errors, [Remark(text, Status.BAD) for text in faults])
@@ -174,16 +183,24 @@ def excite(
         files = write_design(experiment, design, output, command_line())
     show(console, *design.plan.tables())
     verdict = headline(design.plan, design.remarks)
-    show_remarks(console, [*ordered((*plan_remarks(design.plan), *design.remarks)), verdict])
-    show_files(console, output.parent, [str(p.relative_to(output.parent)) for p in files])
+    show_remarks(
+        console, [*ordered((*plan_remarks(design.plan), *design.remarks)), verdict]
+    )
+    show_files(
+        console, output.parent, [str(p.relative_to(output.parent)) for p in files]
+    )
     if all_criteria and not design.plan.interrupted:
         with identify_logs.stages(errors) as stage:
-            plans = compare_criteria(experiment, functools.partial(_show_progress, stage))
+            plans = compare_criteria(
+                experiment, functools.partial(_show_progress, stage)
+            )
         if plans:
             show(console, side_by_side_table(plans))
         done = sum(not plan.interrupted for plan in plans)
         if done < len(CRITERIA):
-            show_remarks(console, _doubts([f"stopped after {done} of {len(CRITERIA)} criteria"]))
+            show_remarks(
+                console, _doubts([f"stopped after {done} of {len(CRITERIA)} criteria"])
+            )
     if design.plan.interrupted:
         raise typer.Exit(STOPPED)
     if verdict.status is Status.BAD:
@@ -194,8 +211,12 @@ def show_motion(path: Path, output: Path) -> None:
     """Show a motion that was written in MuJoCo's viewer, among the shapes that were checked."""
     experiment, written = load_experiment(path), output.with_suffix(".json")
     if not written.is_file():
-        raise InputError(f"`{written}` is not there: `--play` shows a motion that was designed.")
-    preview.play(experiment.robot, experiment.surroundings.shapes, load_trajectory(written))
+        raise InputError(
+            f"`{written}` is not there: `--play` shows a motion that was designed."
+        )
+    preview.play(
+        experiment.robot, experiment.surroundings.shapes, load_trajectory(written)
+    )
 
 
 class _BestMotion:
@@ -209,7 +230,9 @@ class _BestMotion:
         """Show the progress of a design, and write every better motion."""
         _show_progress(stage, now)
         if now.feasible and now.best < self._value:
-            write_motion(self._experiment, play(self._experiment, now.trajectory), self._output)
+            write_motion(
+                self._experiment, play(self._experiment, now.trajectory), self._output
+            )
             self._value = now.best
 
     def farewell(self) -> str:
@@ -218,7 +241,8 @@ class _BestMotion:
             return "stopped before a motion kept all limits, and nothing was written"
         unchecked = f"; NOT CHECKED: {'; '.join(self._faults)}" if self._faults else ""
         return (
-            f"stopped: `{self._output}` and the files beside it hold the best motion so far, which "
+            f"stopped: `{self._output}` and the files beside it hold the best motion "
+            "so far, which "
             f"keeps all limits that were checked{unchecked}; `--resume` goes on with it"
         )
 
@@ -244,7 +268,8 @@ def export(
     fit, faults = read_fit(report), read_faults(report)
     if faults and not force:
         raise InputError(
-            f"the verdict of `{report}` is that its model must not be used: {faults[0]} Mend "
+            f"the verdict of `{report}` is that its model must not be used: "
+            f"{faults[0]} Mend "
             "that first, or write it nonetheless with `--force`."
         )
     if to == "c":
@@ -253,14 +278,22 @@ def export(
         own = Path(fit.base.model.robot.source) if urdf is None else urdf
         known = own.suffix in (".urdf", ".xacro", ".xml") and own.is_file()
         if urdf is None and not known:
-            raise InputError("`--to urdf` changes the robot's own file: name it with `--urdf`.")
+            raise InputError(
+                "`--to urdf` changes the robot's own file: name it with `--urdf`."
+            )
         export_urdf(fit, own, path, **chain)
     else:
-        writers = {"mjcf": export_mjcf, "pinocchio": export_pinocchio, "jax": export_jax}
+        writers = {
+            "mjcf": export_mjcf,
+            "pinocchio": export_pinocchio,
+            "jax": export_jax,
+        }
         writers.get(to, Fit.save)(fit, path)
 
 
-def compare(console: Console, paths: tuple[Path, Path], level: float, output: Path) -> None:
+def compare(
+    console: Console, paths: tuple[Path, Path], level: float, output: Path
+) -> None:
     """Decide which parameters have changed between two runs."""
     cold, warm = (dataclasses.replace(read_fit(p), name=str(p)) for p in paths)
     found = compare_fits(cold, warm, level)
@@ -274,7 +307,9 @@ def choose(console: Console, path: Path, logs: list[Path], output: Path) -> None
     _check_logs(logs, [], None)
     experiment = load_experiment(path)
     if output.parent.resolve() != path.parent.resolve():
-        raise InputError("`--output` must lie beside the experiment file: its paths count from it.")
+        raise InputError(
+            "`--output` must lie beside the experiment file: its paths count from it."
+        )
     with identify_logs.stages(open_console(stderr=True)) as stage:
         choice, text = choosing.choose(experiment, logs, stage)
     write_text(output, text)
@@ -304,11 +339,15 @@ def payload(
     central = (CENTRAL_NAMES, CENTRAL_UNITS, *found.central)
     doubts = _doubts(doubts)
     tables = [found.summary()]
-    files = write_estimates(output, "payload", [rows, central], content, sources, tables, doubts)
+    files = write_estimates(
+        output, "payload", [rows, central], content, sources, tables, doubts
+    )
     show(console, *tables)
     show_remarks(console, doubts)
     upper = [(k, i) for k in range(3) for i in range(k, 3)]
-    inertia = ", ".join(f"{'xyz'[k]}{'xyz'[i]} = {found.inertia[k, i]:.6g}" for k, i in upper)
+    inertia = ", ".join(
+        f"{'xyz'[k]}{'xyz'[i]} = {found.inertia[k, i]:.6g}" for k, i in upper
+    )
     lines = [
         "[robot.tool]",
         f"body = {toml_text(name)}",
@@ -316,7 +355,9 @@ def payload(
         f"centre_of_mass = [{', '.join(f'{v:.6g}' for v in found.centre_of_mass)}]",
         f"inertia = {{ {inertia} }}",
     ]
-    _show_lines(console, "to subtract it from other logs, in the experiment file:", lines)
+    _show_lines(
+        console, "to subtract it from other logs, in the experiment file:", lines
+    )
     show_files(console, output, [p.name for p in files])
 
 
@@ -331,7 +372,8 @@ def gains(
     experiment = load_experiment(path)
     if experiment.load is None:
         raise InputError(
-            f"{path.name}: the table `[load]` is missing: it describes the load behind `--loaded`."
+            f"{path.name}: the table `[load]` is missing: it describes the load "
+            "behind `--loaded`."
         )
     (empty, full), doubts = _pair(experiment, logs, loaded)
     found = identify_drive_gains(empty, full, experiment.load)
@@ -340,13 +382,17 @@ def gains(
     if columns is not None:
         key = "force_gains" if columns.torque_constants is None else "torque_constants"
         known = getattr(columns, key)
-    values = (np.array(1.0 if known is None else known) * np.asarray(found.gains)).tolist()
+    values = (
+        np.array(1.0 if known is None else known) * np.asarray(found.gains)
+    ).tolist()
     sources = {"unloaded": logs, "loaded": loaded}
     names = found.joint_names
     rows = (names, ("1",) * len(names), found.gains, found.uncertainty)
     doubts = _doubts(doubts)
     tables = [found.summary()]
-    files = write_estimates(output, "gains", [rows], {key: values}, sources, tables, doubts)
+    files = write_estimates(
+        output, "gains", [rows], {key: values}, sources, tables, doubts
+    )
     show(console, *tables)
     show_remarks(console, doubts)
     shown = ", ".join(significant(v, 5) for v in values)
@@ -361,10 +407,13 @@ def states(console: Console, path: Path, logs: list[Path], output: Path) -> None
     names = [Path(os.path.realpath(log)).stem for log in logs]
     if len(set(names)) < max(len(names), 2):
         raise InputError(
-            "give one log or report for each of two or more states, with different names."
+            "give one log or report for each of two or more states, with different "
+            "names."
         )
     with identify_logs.stages(open_console(stderr=True)) as stage:
-        runs, doubts = identify_logs.read_runs(experiment, [[log] for log in logs], names, stage)
+        runs, doubts = identify_logs.read_runs(
+            experiment, [[log] for log in logs], names, stage
+        )
     found = identify_states(runs)
     chance = found.sharing[1]
     content = {
@@ -411,11 +460,14 @@ def _pair(
     twice = {os.path.realpath(p) for p in logs} & {os.path.realpath(p) for p in loaded}
     if twice:
         raise InputError(
-            f"`{Path(sorted(twice)[0]).name}` is given both without and with the load: name it "
+            f"`{Path(sorted(twice)[0]).name}` is given both without and with the "
+            "load: name it "
             "once."
         )
     with identify_logs.stages(open_console(stderr=True)) as stage:
-        return identify_logs.read_runs(experiment, [logs, loaded], ["unloaded", "loaded"], stage)
+        return identify_logs.read_runs(
+            experiment, [logs, loaded], ["unloaded", "loaded"], stage
+        )
 
 
 def _show_lines(console: Console, text: str, lines: list[str]) -> None:

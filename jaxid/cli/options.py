@@ -20,17 +20,21 @@ OutputFolder = Annotated[
     Path, typer.Option("-o", "--output", metavar="DIR", help="Folder of the result.")
 ]
 Force = Annotated[
-    bool, typer.Option("--force", help="Write even where other files are there already.")
+    bool,
+    typer.Option("--force", help="Write even where other files are there already."),
 ]
 Seed = Annotated[
     int, typer.Option("--seed", metavar="N", min=0, help="Seed of all that is random.")
 ]
 Tip = Annotated[
     str | None,
-    typer.Option(metavar="LINK", help="The end-effector: take only the chain that leads to it."),
+    typer.Option(
+        metavar="LINK", help="The end-effector: take only the chain that leads to it."
+    ),
 ]
 Base = Annotated[
-    str | None, typer.Option(metavar="LINK", help="The link on the ground; by default the root.")
+    str | None,
+    typer.Option(metavar="LINK", help="The link on the ground; by default the root."),
 ]
 Logs = Annotated[
     list[Path],
@@ -42,12 +46,16 @@ Logs = Annotated[
 Verified = Annotated[
     list[Path] | None,
     typer.Option(
-        "--verify", metavar="LOG", help="A log that the fit does not see; may be repeated."
+        "--verify",
+        metavar="LOG",
+        help="A log that the fit does not see; may be repeated.",
     ),
 ]
 Loaded = Annotated[
     list[Path],
-    typer.Option(metavar="LOG", help="A log with the load, or a report; may be repeated."),
+    typer.Option(
+        metavar="LOG", help="A log with the load, or a report; may be repeated."
+    ),
 ]
 
 
@@ -66,7 +74,9 @@ def start(*reads: Path, output: Path | None = None, force: bool = False) -> Cons
     """Turn on double precision and the cache of compiled code; return the terminal."""
     missing = [f"`{path}`" for path in reads if not path.exists()]
     if missing:
-        words = "is no file or folder" if len(missing) == 1 else "are no files or folders"
+        words = (
+            "is no file or folder" if len(missing) == 1 else "are no files or folders"
+        )
         raise InputError(f"{', '.join(missing)} {words}: check the path.")
     import jax
 
@@ -84,7 +94,8 @@ def start(*reads: Path, output: Path | None = None, force: bool = False) -> Cons
             )
         if not (force or empty or any(schema_of(output / file) for file in SCHEMAS)):
             raise InputError(
-                f"`{output}` holds files but no report: choose another -o, or add --force."
+                f"`{output}` holds files but no report: choose another -o, or add "
+                "--force."
             )
         require_writable(output)
     return open_console()
@@ -114,7 +125,10 @@ def describe_error(error: Exception) -> str:
         return str(error)
     where = f"`{error.filename}`: " if error.filename else ""
     if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
-        return f"{where}{error.strerror}: nothing was written; make room, or choose another -o."
+        return (
+            f"{where}{error.strerror}: nothing was written; make room, or choose "
+            "another -o."
+        )
     return f"{where}{error.strerror}."
 
 
@@ -138,9 +152,12 @@ def refuse_foreign_table(target: Path) -> None:
     except (OSError, ValueError):
         others = (target.with_suffix(suffix) for suffix in BESIDE)
         drawn = sorted(pictures.iterdir()) if pictures.is_dir() else []
-        foreign = next((path for path in (target, beside, *others, *drawn) if path.exists()), None)
+        foreign = next(
+            (path for path in (target, beside, *others, *drawn) if path.exists()), None
+        )
         if foreign is not None:
             raise InputError(
-                f"`{foreign}` is there already, and no motion of `jaxid excite`: choose another -o."
+                f"`{foreign}` is there already, and no motion of `jaxid excite`: "
+                "choose another -o."
             ) from None
         require_writable(target.parent)

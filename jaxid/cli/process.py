@@ -1,8 +1,9 @@
 """The process of a command: it works in a thread, and signals are answered at once.
 
-Python handles signals in the main thread, between two of its instructions. If the main thread
-compiled or computed, Ctrl-C would wait for that, or be lost in a callback of JAX. So it only waits.
-Files are written under temporary names and renamed, so that a process may end at any moment.
+Python handles signals in the main thread, between two of its instructions. If the main
+thread compiled or computed, Ctrl-C would wait for that, or be lost in a callback of
+JAX. So it only waits. Files are written under temporary names and renamed, so that a
+process may end at any moment.
 """
 
 import contextlib
@@ -37,7 +38,8 @@ def main() -> NoReturn:
     """Run a command; Ctrl-C and SIGTERM end it within two seconds, with one sentence."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, _receive)
-    # Threads of BLAS wait busily for each other at small matrices; large work has its own threads.
+    # Threads of BLAS wait busily for each other at small matrices; large work has its
+    # own threads.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # Imports, tracing and drawing make many small objects, of which few are in cycles.
     gc.set_threshold(50_000, 20, 100)
@@ -77,7 +79,11 @@ def _code() -> int:
 
         main()
     except SystemExit as stopped:
-        return stopped.code if isinstance(stopped.code, int) else int(stopped.code is not None)
+        return (
+            stopped.code
+            if isinstance(stopped.code, int)
+            else int(stopped.code is not None)
+        )
     except BaseException:
         traceback.print_exc()
         return 1

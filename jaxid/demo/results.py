@@ -54,18 +54,23 @@ def tables(study: Study) -> list[Table]:
 
 def remarks(study: Study) -> list[Remark]:
     """Return the findings of the paper, as far as they come out here."""
-    worst, true = ([max(m.mean_errors(k)) for k in (0, 1)] for m in (study.weighted, study.true))
+    worst, true = (
+        [max(m.mean_errors(k)) for k in (0, 1)] for m in (study.weighted, study.true)
+    )
     plain, weighted = (m.mean_errors(0)[-1] for m in (study.unweighted, study.weighted))
     return [
         Remark(
-            f"The identified model predicts the torques of every axis to {worst[0]:.2g} % of the "
+            "The identified model predicts the torques of every axis to "
+            f"{worst[0]:.2g} % of the "
             f"largest torque, and to {worst[1]:.2g} % on an unseen path.",
             Status.GOOD if max(worst) < 1.0 else Status.DOUBTFUL,
-            "Mean error of the worst axis; below 1 % in the paper. The true parameters leave "
+            "Mean error of the worst axis; below 1 % in the paper. The true "
+            "parameters leave "
             f"{true[0]:.2g} % and {true[1]:.2g} %.",
         ),
         Remark(
-            f"Without weights the last axis errs by {plain:.2g} %, with weights by {weighted:.2g} "
+            f"Without weights the last axis errs by {plain:.2g} %, with weights by "
+            f"{weighted:.2g} "
             "% of its largest torque.",
             Status.GOOD if weighted < plain else Status.BAD,
         ),
@@ -85,10 +90,18 @@ def paper_table(study: Study) -> Table:
         ("parameters, all of them", "70", str(base.model.size)),
         ("base parameters", "44", str(base.size)),
         ("p_B(1) (Eq. 24)", "m1 + m2 + m3 - m4 rc4z / l3z + I1", base.expressions[0]),
-        ("p_B(2) (Eq. 24)", "m2 rc2x + l2x m3 - l2x m4 rc4z / l3z", base.expressions[1]),
+        (
+            "p_B(2) (Eq. 24)",
+            "m2 rc2x + l2x m3 - l2x m4 rc4z / l3z",
+            base.expressions[1],
+        ),
         ("lengths in it [m]", "l2x, l3z", lengths),
         ("speed of the end-effector, up to [m/s]", "2.7", significant(speed)),
-        ("acceleration of the end-effector, up to [m/s²]", "11.3", significant(acceleration)),
+        (
+            "acceleration of the end-effector, up to [m/s²]",
+            "11.3",
+            significant(acceleration),
+        ),
         ("mean error, worst axis, identification [%]", "below 1", worst[0]),
         ("mean error, worst axis, verification [%]", "below 1", worst[1]),
         ("the same while the axis moves [%]", MISSING, moving),
@@ -98,10 +111,15 @@ def paper_table(study: Study) -> Table:
         ("mass matrix, consistent bodies", "not done", definite[2]),
     ]
     for k in COLD:
-        for state, paper, fit in (("cold", COLD, study.weighted.fit), ("warm", WARM, study.warm)):
+        for state, paper, fit in (
+            ("cold", COLD, study.weighted.fit),
+            ("warm", WARM, study.warm),
+        ):
             own = (fit.parameters[k - 1], fit.standard_deviations[k - 1])
             name = f"p_B({k}), {state} [{base.units[k - 1]}]"
-            rows.append((name, f"{paper[k]:.2f}", " ± ".join(with_deviation(*map(float, own)))))
+            rows.append(
+                (name, f"{paper[k]:.2f}", " ± ".join(with_deviation(*map(float, own))))
+            )
     title = f"the paper, and the results on the virtual {base.model.robot.name}"
     names = ("quantity", "paper", "here")
     return Table(title, *map(Column, names, zip(*rows, strict=True)))
@@ -118,7 +136,10 @@ def error_table(study: Study, recording: int) -> Table:
     return Table(
         f"mean error on {role}, relative to the largest torque (Fig. 10)",
         Column("axis", [*names, "worst"]),
-        *(column(m.name.replace(" ", "\n"), m.mean_errors(recording)) for m in study.models),
+        *(
+            column(m.name.replace(" ", "\n"), m.mean_errors(recording))
+            for m in study.models
+        ),
         column("weighted,\nmoving", study.moving_errors(study.weighted, recording)),
         rules=[len(names)],
     )
@@ -130,13 +151,18 @@ def demo_page(study: Study) -> str:
     notes = (
         "six base parameters, cold and warm, are the paper's",
         *study.base.model.robot.notes,
-        "assumed: the other parameters of bodies, rotors and friction, and all disturbances",
+        "assumed: the other parameters of bodies, rotors and friction, and all "
+        "disturbances",
     )
     warming = (
-        "Inertial parameters stay, friction falls as the lubricant warms. A parameter has changed "
+        "Inertial parameters stay, friction falls as the lubricant warms. A parameter "
+        "has changed "
         "if its difference is more than chance."
     )
-    every, changes = "All base parameters, cold and warm", jid.plot.comparison(study.temperature)
+    every, changes = (
+        "All base parameters, cold and warm",
+        jid.plot.comparison(study.temperature),
+    )
     used = ", ".join(f"{name} {number}" for name, number in versions().items())
     return render_page(
         "The paper, end to end",
@@ -145,11 +171,19 @@ def demo_page(study: Study) -> str:
             _excitation(study),
             _identification(study),
             _verification(study),
-            ("Cold and warm", [warming, study.temperature.group_summary(), folded(every, changes)]),
-            ("The robot, and assumptions", [[Remark(n[0].upper() + n[1:]) for n in notes]]),
+            (
+                "Cold and warm",
+                [warming, study.temperature.group_summary(), folded(every, changes)],
+            ),
+            (
+                "The robot, and assumptions",
+                [[Remark(n[0].upper() + n[1:]) for n in notes]],
+            ),
         ],
-        "A persistent method for parameter identification of a seven-axes manipulator, repeated "
-        "on a virtual Stäubli TX90L on its rail, with the paper's numbers beside the results.",
+        "A persistent method for parameter identification of a seven-axes "
+        "manipulator, repeated "
+        "on a virtual Stäubli TX90L on its rail, with the paper's numbers beside the "
+        "results.",
         f"`jaxid demo --seed {study.seed}`; {used}",
     )
 
@@ -160,19 +194,30 @@ def _excitation(study: Study) -> Section:
     times = np.linspace(0.0, float(series.duration), POINTS)
     motion = series.motion(times)
     return "Base parameters, and the motion that excites them", [
-        f"Of {base.model.size} columns the QR decomposition without pivoting leaves {base.size}; "
+        f"Of {base.model.size} columns the QR decomposition without pivoting leaves "
+        f"{base.size}; "
         "the first two are those of Eq. 24.",
-        folded(f"All {base.size} base parameters, weighted", parameter_table(study.weighted.fit)),
-        f"The motion is a Fourier series of {settings.HARMONICS} harmonics at {settings.OMEGA:g} "
-        "rad/s within all limits and clear of collisions. As in the paper, it has the least "
-        "condition number; the D-optimal one beside it makes the parameters most certain.",
+        folded(
+            f"All {base.size} base parameters, weighted",
+            parameter_table(study.weighted.fit),
+        ),
+        f"The motion is a Fourier series of {settings.HARMONICS} harmonics at "
+        f"{settings.OMEGA:g} "
+        "rad/s within all limits and clear of collisions. As in the paper, it has the "
+        "least "
+        "condition number; the D-optimal one beside it makes the parameters most "
+        "certain.",
         *([side_by_side_table(study.plans)] if study.plans else []),
         picture(
             _speed_scene(robot, times, motion),
             "Fig. 3: path of the end-effector along the designed motion, up to "
-            f"{speed:.3g} m/s and {acceleration:.3g} m/s² (in the paper 2.7 m/s and 11.3 m/s²).",
+            f"{speed:.3g} m/s and {acceleration:.3g} m/s² (in the paper 2.7 m/s and "
+            "11.3 m/s²).",
         ),
-        picture(jid.plot.joints(robot, robot.limits, times, motion), "Fig. 4: one period of it."),
+        picture(
+            jid.plot.joints(robot, robot.limits, times, motion),
+            "Fig. 4: one period of it.",
+        ),
     ]
 
 
@@ -180,20 +225,29 @@ def _identification(study: Study) -> Section:
     robot, observations = study.base.model.robot, study.observations[0]
     begin, end = (float(t) for t in study.played.window)
     time = np.asarray(observations.time)
-    shown = np.flatnonzero((time >= begin) & (time <= end))[:: max(1, len(time) // (2 * POINTS))]
+    shown = np.flatnonzero((time >= begin) & (time <= end))[
+        :: max(1, len(time) // (2 * POINTS))
+    ]
     desired, filtered = study.played.motion(time[shown]), observations.motion[shown]
-    plain, weighted = (m.validation.errors[0] for m in (study.unweighted, study.weighted))
+    plain, weighted = (
+        m.validation.errors[0] for m in (study.unweighted, study.weighted)
+    )
     return "Identification with and without weights", [
-        "Cold and warm, the servo follows the motion at 1000 Hz. Logs hold angles of 17-bit "
-        "encoders and torques with 1 % of noise, ripple, stiction and Stribeck friction. "
-        f"Filter (Eq. 25): {observations.filter}; {observations.rows} rows of each joint.",
+        "Cold and warm, the servo follows the motion at 1000 Hz. Logs hold angles of "
+        "17-bit "
+        "encoders and torques with 1 % of noise, ripple, stiction and Stribeck "
+        "friction. "
+        f"Filter (Eq. 25): {observations.filter}; {observations.rows} rows of each "
+        "joint.",
         picture(
             jid.plot.filtered(robot, time[shown], desired, filtered, 2),
-            "Fig. 5: desired velocity and acceleration, and those of the filtered angles.",
+            "Fig. 5: desired velocity and acceleration, and those of the filtered "
+            "angles.",
         ),
         picture(
             jid.plot.torques(plain, robot, "identified without weights", SHOWN),
-            "Fig. 6: torques of the axes 1, 3, 5 and 7, and their prediction without weights.",
+            "Fig. 6: torques of the axes 1, 3, 5 and 7, and their prediction without "
+            "weights.",
         ),
         picture(
             jid.plot.torques(weighted, robot, "identified with weights", SHOWN),
@@ -208,18 +262,27 @@ def _verification(study: Study) -> Section:
     motion = path.motion(times)
     first, second = study.weighted.validation.errors
     return "Verification on another path", [
-        f"The path after ISO 9283 in a cube of {settings.EDGE:g} m, with rests at its corners, up "
-        f"to {settings.SPEED:g} m/s and {settings.ACCELERATION:g} m/s². Of the redundant joint "
+        f"The path after ISO 9283 in a cube of {settings.EDGE:g} m, with rests at its "
+        "corners, up "
+        f"to {settings.SPEED:g} m/s and {settings.ACCELERATION:g} m/s². Of the "
+        "redundant joint "
         "angles the nearest to a posture are taken.",
-        picture(_speed_scene(robot, times, motion), "Fig. 8: path of the end-effector."),
+        picture(
+            _speed_scene(robot, times, motion), "Fig. 8: path of the end-effector."
+        ),
         picture(
             jid.plot.torques(second, robot, "verification", SHOWN),
             "Fig. 9: torques of the axes 1, 3, 5 and 7 on the verification path.",
         ),
-        picture(jid.plot.errors([first], [second], robot), "Fig. 10: mean errors on both paths."),
+        picture(
+            jid.plot.errors([first], [second], robot),
+            "Fig. 10: mean errors on both paths.",
+        ),
         (error_table(study, 0), error_table(study, 1)),
-        f"“Moving”: rows of each axis above {settings.AT_REST:g} rad/s or m/s. The torque of an "
-        "axis at rest may be anything up to stiction, which no model of speeds predicts.",
+        f"“Moving”: rows of each axis above {settings.AT_REST:g} rad/s or m/s. The "
+        "torque of an "
+        "axis at rest may be anything up to stiction, which no model of speeds "
+        "predicts.",
     ]
 
 
@@ -239,7 +302,11 @@ def _record(study: Study) -> dict[str, Any]:
         "schema": SCHEMAS["demo.json"],
         "versions": versions(),
         "seed": study.seed,
-        "base_parameters": {"count": base.size, "names": base.names, "truth": study.truth},
+        "base_parameters": {
+            "count": base.size,
+            "names": base.names,
+            "truth": study.truth,
+        },
         "excitation": {
             "designs": [
                 {"criterion": plan.criterion.name, "criteria": own}

@@ -45,17 +45,21 @@ class Study(NamedTuple):
     seed: int  # seed of all random numbers
     base: jid.BaseParameters  # base parameters of the robot
     truth: Float[np.ndarray, " base"]  # base parameters of the cold robot
-    # motions with the least condition number (Eq. 36), and D-optimal; none if a motion was given
+    # motions with the least condition number (Eq. 36), and D-optimal; none if a motion
+    # was given
     plans: tuple[jid.ExcitationPlan, ...]
     # motion of the identification, from standstill to standstill
     played: jid.trajectories.WithLeads
-    joint_path: jid.trajectories.AbstractTrajectory  # path of the verification in joint coordinates
+    joint_path: (
+        jid.trajectories.AbstractTrajectory
+    )  # path of the verification in joint coordinates
     # filtered recordings: identification cold, identification warm, verification
     observations: tuple[jid.Observations, ...]
     unweighted: Model  # least squares without weights
     weighted: Model  # least squares with the weights of Eq. 30
     consistent: Model  # estimate of physically consistent bodies
-    true: Model  # parameters of the robot itself: their errors are all due to disturbances
+    # parameters of the robot itself: their errors are all due to disturbances
+    true: Model
     warm: jid.Fit  # fit of the warm robot
     temperature: Comparison  # comparison of the cold with the warm robot
 
@@ -77,7 +81,9 @@ class Study(NamedTuple):
         """Largest speed [m/s] and acceleration [m/s²] of the end-effector in the identification."""
         series = self.played.inner
         times = np.linspace(0.0, float(series.duration), 4000, endpoint=False)
-        _, *rates = jid.constraints.tip_motion(self.base.model.robot, series.motion(times))
+        _, *rates = jid.constraints.tip_motion(
+            self.base.model.robot, series.motion(times)
+        )
         speed, acceleration = (float(np.linalg.norm(x, axis=1).max()) for x in rates)
         return speed, acceleration
 
@@ -107,7 +113,9 @@ def run_study(
     path = jid.trajectories.iso9283_path(  # the tool points along the rail (Fig. 8)
         CUBE, EDGE, forward, leans_along=1, speed=SPEED, acceleration=ACCELERATION
     )
-    joints = jid.trajectories.joint_path(robot, path, posture=(0.0, 1.57, -0.3, 1.8, 0.0, 0.0, 0.0))
+    joints = jid.trajectories.joint_path(
+        robot, path, posture=(0.0, 1.57, -0.3, 1.8, 0.0, 0.0, 0.0)
+    )
     observations = []
     for virtual, trajectory, name in (
         (cold, played, "identification, cold"),
@@ -128,10 +136,14 @@ def run_study(
         "weighted": jid.identify(base, rows, jid.WeightedLeastSquares()),
         "consistent": jid.identify(base, rows, jid.PhysicallyConsistent()),
     }
-    fits["true parameters"] = eqx.tree_at(lambda f: f.parameters, fits["weighted"], truth)
+    fits["true parameters"] = eqx.tree_at(
+        lambda f: f.parameters, fits["weighted"], truth
+    )
     progress("predicting torques", 0.0)
     recordings = [observations[0], observations[2]]
-    models = [Model(name, fit, jid.validate(fit, recordings)) for name, fit in fits.items()]
+    models = [
+        Model(name, fit, jid.validate(fit, recordings)) for name, fit in fits.items()
+    ]
     progress("comparing cold and warm", 0.0)
     warm = jid.identify(base, observations[1], jid.WeightedLeastSquares())
     found: Any = (*models, warm, jid.compare(fits["weighted"], warm))
@@ -144,11 +156,15 @@ def _design(
     """Return a motion with the least condition number, and a D-optimal one (Eq. 36)."""
     limits = base.model.robot.limits
     low, high, most = (
-        np.array(x) for x in (limits.position_min, limits.position_max, limits.acceleration)
+        np.array(x)
+        for x in (limits.position_min, limits.position_max, limits.acceleration)
     )
-    # The drive of the shoulder could not hold and move the arm in all that its limits allow.
+    # The drive of the shoulder could not hold and move the arm in all that its limits
+    # allow.
     low[2], high[2], most[2] = -0.4, 0.4, 3.0
-    limits = dataclasses.replace(limits, position_min=low, position_max=high, acceleration=most)
+    limits = dataclasses.replace(
+        limits, position_min=low, position_max=high, acceleration=most
+    )
 
     name, done = "designing two motions", {}
     progress(name, 0.0)
@@ -164,7 +180,9 @@ def _design(
             criterion=criterion,
             basis=jid.trajectories.FourierBasis(HARMONICS, OMEGA),
             limits=limits,
-            constraints=(jid.constraints.Clearance(jid.robots.tx90l_on_rail_collision()),),
+            constraints=(
+                jid.constraints.Clearance(jid.robots.tx90l_on_rail_collision()),
+            ),
             starts=2,
             generations=0,
             polish=0,
@@ -175,4 +193,6 @@ def _design(
         )
 
     # Most of the time is that of the compiler, which works on one core at a time.
-    return tuple(on_cores(design, (jid.criteria.ConditionNumber(), jid.criteria.DOptimal())))
+    return tuple(
+        on_cores(design, (jid.criteria.ConditionNumber(), jid.criteria.DOptimal()))
+    )

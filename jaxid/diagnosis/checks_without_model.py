@@ -33,7 +33,8 @@ class LogStatistics:
         self.highest = np.full(joints, -np.inf)
         self.speed, self.force = np.zeros((2, joints))
         self._energies = np.zeros(3)
-        # Of velocities, derivatives of the angles, and derivatives of these: sums of products.
+        # Of velocities, derivatives of the angles, and derivatives of these: sums of
+        # products.
         self._products = np.zeros((joints, 3, 3))
         # Of long logs every n-th sample tells how long joints stand.
         self._every, self._seen = -(-samples // 2**18), 0
@@ -64,7 +65,11 @@ class LogStatistics:
     def power(self) -> float:
         """Mean power over the product of the RMS forces and velocities."""
         power, forces, velocities = self._energies
-        return float(power / np.sqrt(forces * velocities)) if forces * velocities > 0 else 0.0
+        return (
+            float(power / np.sqrt(forces * velocities))
+            if forces * velocities > 0
+            else 0.0
+        )
 
     def lateness(self, joint: int) -> float:
         """Return how much later measured velocities stand than those of the angles [s].
@@ -87,7 +92,11 @@ def limit_findings(
     Joints in `faulty` have faults of single channels, which explain more.
     """
     s = statistics
-    angles = [] if faulty else unit_findings(robot, s.lowest, s.highest, log.angles_on_motor_side)
+    angles = (
+        []
+        if faulty
+        else unit_findings(robot, s.lowest, s.highest, log.angles_on_motor_side)
+    )
     forces = [] if faulty else _force_findings(robot, s)
     findings = angles + forces
     for j in range(robot.joints):
@@ -97,12 +106,14 @@ def limit_findings(
     # Over a whole log, friction makes a robot consume energy.
     if not faulty and s.power < -0.05:
         findings.append(
-            "the robot gives off energy: check `recording.angle_signs` and `force_signs`."
+            "the robot gives off energy: check `recording.angle_signs` and "
+            "`force_signs`."
         )
     standing = float(s.stands.all(axis=1).mean())
     if standing > 0.5:
         findings.append(
-            f"the robot stands still for {100 * standing:.0f} % of the log: crop it with "
+            f"the robot stands still for {100 * standing:.0f} % of the log: crop it "
+            "with "
             "`recording.start` and `recording.stop`."
         )
     return findings
@@ -123,18 +134,27 @@ def _joint_findings(
     slack = 0.02 * (high - low) if np.isfinite(high - low) else 0.0
     if with_range and not low - slack <= a <= b <= high + slack:
         yield (
-            f"joint `{name}` moves from {a:.3g} to {b:.3g}, its range is {low:.3g} to {high:.3g} "
-            f"{unit}: check `recording.angle_unit`, `side`, `angle_signs` and `angle_offsets`."
+            f"joint `{name}` moves from {a:.3g} to {b:.3g}, its range is {low:.3g} to "
+            f"{high:.3g} "
+            f"{unit}: check `recording.angle_unit`, `side`, `angle_signs` and "
+            "`angle_offsets`."
         )
     if statistics.speed[j] > 1.1 * limits.velocity[j]:
         yield (
-            f"joint `{name}` reaches {statistics.speed[j]:.3g} {unit}/s, but its limit is "
-            f"{float(limits.velocity[j]):.3g} {unit}/s: check the units, or lower the cut-off."
+            f"joint `{name}` reaches {statistics.speed[j]:.3g} {unit}/s, but its "
+            "limit is "
+            f"{float(limits.velocity[j]):.3g} {unit}/s: check the units, or lower the "
+            "cut-off."
         )
     if b - a < 0.02:
-        yield (f"joint `{name}` moves by {b - a:.2g} {unit} only: is it the right column and unit?")
+        yield (
+            f"joint `{name}` moves by {b - a:.2g} {unit} only: is it the right column "
+            "and unit?"
+        )
     if force == 0.0:
-        yield f"the forces of joint `{name}` are zero throughout: is it the right column?"
+        yield (
+            f"the forces of joint `{name}` are zero throughout: is it the right column?"
+        )
 
 
 def _force_findings(robot: Robot, statistics: LogStatistics) -> list[str]:
@@ -146,10 +166,15 @@ def _force_findings(robot: Robot, statistics: LogStatistics) -> list[str]:
         return []
     low, high = ratio.min(), ratio.max()
     if low > 1.2:
-        text = f"all joints need more than their largest forces, {low:.2g} to {high:.2g} times"
+        text = (
+            f"all joints need more than their largest forces, {low:.2g} to "
+            f"{high:.2g} times"
+        )
         return [f"{text} as much: {cure}"]
     if 0 < high < 0.02:
-        return [f"no joint needs more than {100 * high:.2g} % of its largest force: {cure}"]
+        return [
+            f"no joint needs more than {100 * high:.2g} % of its largest force: {cure}"
+        ]
     return []
 
 
@@ -186,8 +211,13 @@ def unit_findings(
     if not on_motor_side and not robot.drives.is_direct:
         joints = np.asarray(robot.drives.joint_angles(ends))
         corrected['the motors\' (`recording.side = "motor"`)'] = joints
-    cures = " or ".join(cure for cure, angles in corrected.items() if used_fraction(angles) > 0.1)
-    text = "the angles do not suit the ranges of the joints, but would if those in the log were "
+    cures = " or ".join(
+        cure for cure, angles in corrected.items() if used_fraction(angles) > 0.1
+    )
+    text = (
+        "the angles do not suit the ranges of the joints, but would if those in "
+        "the log were "
+    )
     return [f"{text}{cures}."] if cures else []
 
 
@@ -203,7 +233,11 @@ def channel_findings(
         x = angles[:, j]
         others = np.delete(angles, j, 1)
         text = _wrapped(x, time) if robot.revolute[j] else ""
-        text = text or _spikes(x, time, r.segments) or _held_angles(x, others, time, r.segments)
+        text = (
+            text
+            or _spikes(x, time, r.segments)
+            or _held_angles(x, others, time, r.segments)
+        )
         held = _held_forces(forces[:, j], x, time, r.segments)
         found += [(j, angle, text), (j, f"the forces of joint `{name}`", held)]
     faults = [(j, f"{channel} {text}") for j, channel, text in found if text]
@@ -211,8 +245,10 @@ def channel_findings(
         faults += [
             (
                 j,
-                f"the velocities of {owner} `{robot.joint_names[j]}` are {ratio:.3g} times the "
-                "derivatives of its angles: check `recording.velocity_unit` and the order of the "
+                f"the velocities of {owner} `{robot.joint_names[j]}` are {ratio:.3g} "
+                "times the "
+                "derivatives of its angles: check `recording.velocity_unit` and the "
+                "order of the "
                 "columns.",
             )
             for j, ratio in unlike_derivatives(r).items()
@@ -222,7 +258,8 @@ def channel_findings(
             if abs(late) > LATE * r.sample_time:
                 text = (
                     f"the velocities of joint `{name}` stand {1e3 * abs(late):.3g} ms "
-                    f"{'later' if late > 0 else 'earlier'} in the log than the derivatives of its "
+                    f"{'later' if late > 0 else 'earlier'} in the log than the "
+                    "derivatives of its "
                     "angles: leave `recording.velocities` out."
                 )
                 faults.append((j, text))
@@ -239,28 +276,39 @@ def clock_findings(recording: Recording) -> list[str]:
         before, own, after = steps[:-2], steps[1:-1], steps[2:]
         usual = 0.5 * (before + after)
         noise = 1.4826 * np.median(np.abs(own - usual), axis=0)
-        # Encoders round to half an increment; smaller differences are those of rounded numbers.
+        # Encoders round to half an increment; smaller differences are those of rounded
+        # numbers.
         sizes, rounding = np.abs(steps), 1e-9 * np.abs(recording.angles).max(axis=0)
         increment = np.where(sizes > rounding, sizes, np.inf).min(axis=0)
         noise = np.maximum(noise, 0.5 * increment)
         moving = np.isfinite(noise)
         if not moving.any():
             continue
-        usual, own, bend = (x[:, moving] / noise[moving] for x in (usual, own, after - before))
+        usual, own, bend = (
+            x[:, moving] / noise[moving] for x in (usual, own, after - before)
+        )
         # All joints go on by the same number of steps, as far as noise lets see.
         speed = np.sum(usual**2, axis=1)
         count = np.sum(own * usual, axis=1) / np.maximum(speed, 1.0)
         off, expected = np.abs(own - usual), np.abs(usual) * np.abs(count - 1)[:, None]
-        jumps = (np.abs(bend).max(axis=1) < SURE) & (speed > 9.0) & (off > SURE).any(axis=1)
+        jumps = (
+            (np.abs(bend).max(axis=1) < SURE) & (speed > 9.0) & (off > SURE).any(axis=1)
+        )
         jumps &= ((off > SURE) | (expected < 2 * SURE)).all(axis=1)
-        jumps &= np.sum((own - count[:, None] * usual) ** 2, axis=1) < 0.1 * np.sum(off**2, axis=1)
+        jumps &= np.sum((own - count[:, None] * usual) ** 2, axis=1) < 0.1 * np.sum(
+            off**2, axis=1
+        )
         inner = time[a + 2 : b - 1]
         lost += inner[jumps & (count > 1.5)].tolist()
         repeated += inner[jumps & (own == 0).all(axis=1)].tolist()
     cure = "name the column of times (`recording.time`), or record again"
     return [
-        f"{what} at {len(at)} instant{'' if len(at) == 1 else 's'}, first at {at[0]:.6g} s: {cure}."
-        for what, at in (("rows seem to be lost", lost), ("rows seem to be repeated", repeated))
+        f"{what} at {len(at)} instant{'' if len(at) == 1 else 's'}, first at "
+        f"{at[0]:.6g} s: {cure}."
+        for what, at in (
+            ("rows seem to be lost", lost),
+            ("rows seem to be repeated", repeated),
+        )
         if at
     ]
 
@@ -278,31 +326,42 @@ def _wrapped(x: np.ndarray, time: np.ndarray) -> str:
         if at.size and np.sum((unwrapped[at] - unwrapped[at - 1]) ** 2) < 0.01 * bends:
             times = "once" if at.size == 1 else f"{at.size} times"
             return (
-                f"jumps by a full turn ({turn:.4g}) {times}, first at {time[at[0] + 1]:.6g} s: "
+                f"jumps by a full turn ({turn:.4g}) {times}, first at "
+                f"{time[at[0] + 1]:.6g} s: "
                 "undo the wrapping (`recording.unwrap = true`)."
             )
     return ""
 
 
-def _spikes(x: np.ndarray, time: np.ndarray, segments: Sequence[tuple[int, int]]) -> str:
+def _spikes(
+    x: np.ndarray, time: np.ndarray, segments: Sequence[tuple[int, int]]
+) -> str:
     """Report jumps there and back within some samples, faster than the joint ever moves."""
     places, sizes = [], []
     for a, b in segments:
         smooth = ndimage.median_filter(x[a:b], 7, mode="nearest")
         off = np.abs(x[a:b] - smooth)
         fastest = np.abs(np.diff(smooth)).max(initial=0.0)
-        high = np.flatnonzero(off > max(1.5 * fastest, 10.0 * float(np.quantile(off, 0.99))))
+        high = np.flatnonzero(
+            off > max(1.5 * fastest, 10.0 * float(np.quantile(off, 0.99)))
+        )
         places += (a + high).tolist()
         sizes += off[high].tolist()
     if not places:
         return ""
     others = int(np.count_nonzero(np.diff(places) > 1))
     more = f", and {others} more" if others else ""
-    return f"jumps by {sizes[0]:.3g} and back at {time[places[0]]:.6g} s{more}: remove such rows."
+    return (
+        f"jumps by {sizes[0]:.3g} and back at {time[places[0]]:.6g} s{more}: "
+        "remove such rows."
+    )
 
 
 def _held_angles(
-    x: np.ndarray, others: np.ndarray, time: np.ndarray, segments: Sequence[tuple[int, int]]
+    x: np.ndarray,
+    others: np.ndarray,
+    time: np.ndarray,
+    segments: Sequence[tuple[int, int]],
 ) -> str:
     """Report an angle that stops or starts with a kink while other joints move."""
     for a, b in segments:
@@ -315,9 +374,13 @@ def _held_angles(
             usual = _usual_bends(own) if usual is None else usual
             for width, bend in usual.items():
                 kinks = [abs(own[first] - own[first - width])] if first >= width else []
-                kinks += [abs(own[last + width] - own[last])] if last + width < b - a else []
+                kinks += (
+                    [abs(own[last + width] - own[last])] if last + width < b - a else []
+                )
                 if max(kinks, default=0.0) > 3.0 * bend > 0:
-                    return f"stays at {_held(own[first], time[a + first], time[a + last])}"
+                    return (
+                        f"stays at {_held(own[first], time[a + first], time[a + last])}"
+                    )
     return ""
 
 
@@ -330,12 +393,17 @@ def _usual_bends(x: np.ndarray) -> dict[int, float]:
         covered = np.zeros(len(x) + 1, int)
         np.add.at(covered, np.maximum(0, ends - 2 * width), 1)
         np.add.at(covered, ends + 1, -1)
-        usual[width] = float(bends[np.cumsum(covered)[: len(bends)] == 0].max(initial=0.0))
+        usual[width] = float(
+            bends[np.cumsum(covered)[: len(bends)] == 0].max(initial=0.0)
+        )
     return usual
 
 
 def _held_forces(
-    forces: np.ndarray, x: np.ndarray, time: np.ndarray, segments: Sequence[tuple[int, int]]
+    forces: np.ndarray,
+    x: np.ndarray,
+    time: np.ndarray,
+    segments: Sequence[tuple[int, int]],
 ) -> str:
     """Report forces that stay constant for long although the speed of their joint varies."""
     lowest, highest = float(forces.min()), float(forces.max())
@@ -347,14 +415,20 @@ def _held_forces(
         lengths = np.diff(ends, prepend=0)
         fastest = speed.max(initial=0.0)
         moving = speed > STANDING * fastest
-        usual = float(np.median(np.repeat(lengths, lengths)[moving])) if moving.any() else np.inf
-        # Where most of a log is held, the number of values tells the usual length instead.
+        usual = (
+            float(np.median(np.repeat(lengths, lengths)[moving]))
+            if moving.any()
+            else np.inf
+        )
+        # Where most of a log is held, the number of values tells the usual length
+        # instead.
         usual = min(usual, (b - a) / len(ends))
         # A drive reaches or leaves its limit without a jump.
         step = float(np.quantile(np.abs(np.diff(f)), 0.99))
         for first, last in _runs(f, max(_shortest(b - a), int(30 * usual))):
             held = slice(first, last + 1)
-            # Forces of a robot may be constant at constant speed, but not if they are noisy.
+            # Forces of a robot may be constant at constant speed, but not if they are
+            # noisy.
             noisy = np.count_nonzero(np.diff(f) == 0) - (last - first) < 0.01 * len(f)
             steady = np.std(speed[held]) < 0.05 * fastest and not noisy
             if np.mean(moving[held]) < 0.5 or steady:
@@ -381,16 +455,20 @@ def _runs(x: np.ndarray, least: int) -> Iterator[tuple[int, int]]:
 
 def _held(value: float, start: float, stop: float) -> str:
     return (
-        f"{value:.3g} from {start:.6g} s to {stop:.6g} s, though the robot moves: a sensor or the "
-        "logger held the last value; leave that part out (`recording.start`, `recording.stop`)."
+        f"{value:.3g} from {start:.6g} s to {stop:.6g} s, though the robot moves: a "
+        "sensor or the "
+        "logger held the last value; leave that part out (`recording.start`, "
+        "`recording.stop`)."
     )
 
 
-def stuck_findings(robot: Robot, recording: Recording, faulty: Collection[int] = ()) -> list[str]:
+def stuck_findings(
+    robot: Robot, recording: Recording, faulty: Collection[int] = ()
+) -> list[str]:
     """Look for forces that are constant, or cut off at their largest value.
 
-    Forces are cut off if many samples lie on the largest value, and few on the values beside it.
-    Joints in `faulty` have known faults, and are left out.
+    Forces are cut off if many samples lie on the largest value, and few on the values
+    beside it. Joints in `faulty` have known faults, and are left out.
     """
     forces = np.asarray(recording.forces)
     angles = np.asarray(recording.angles)
@@ -402,7 +480,8 @@ def stuck_findings(robot: Robot, recording: Recording, faulty: Collection[int] =
         low, high = float(f.min()), float(f.max())
         if low == high != 0.0:
             findings.append(
-                f"the forces of joint `{name}` are {high:.3g} throughout: is it the right column?"
+                f"the forces of joint `{name}` are {high:.3g} throughout: is it the "
+                "right column?"
             )
         if low == high:
             continue
@@ -415,7 +494,9 @@ def stuck_findings(robot: Robot, recording: Recording, faulty: Collection[int] =
             beside = counts[nearest][1:4]
             if on > 0.005 * len(f) and on > 3.0 * beside.sum():
                 findings.append(
-                    f"the forces of joint `{name}` stay at {end:.3g} in {on} samples in which it "
-                    "moves: a drive or sensor is at its limit (`recording.stop` leaves that out)."
+                    f"the forces of joint `{name}` stay at {end:.3g} in {on} samples "
+                    "in which it "
+                    "moves: a drive or sensor is at its limit (`recording.stop` "
+                    "leaves that out)."
                 )
     return findings

@@ -16,7 +16,15 @@ from jaxid.measurement.filters import ZeroPhaseButterworth
 from jaxid.measurement.observations import Observations, Progress, observe
 from jaxid.measurement.reading import AT_ONCE, SamplesOnDisk
 from jaxid.measurement.recording import FEWEST, Recording, consecutive
-from jaxid.result_table import MISSING, Column, Remark, Status, Summarised, Table, significant
+from jaxid.result_table import (
+    MISSING,
+    Column,
+    Remark,
+    Status,
+    Summarised,
+    Table,
+    significant,
+)
 from jaxid.robot.robot import Robot
 
 from .checks_without_model import (
@@ -43,9 +51,10 @@ class Diagnosis(Summarised):
         robot: Robot of the log.
         statistics: Extremes of the log, joint by joint.
         findings: Signs of mistakes, as sentences; empty if there are none.
-        faulty: Joints whose channels no model can fit: held, spiky, wrapped, or with rows lost.
-        observations: Observations in which mistakes are looked for, of a long log a part; None if
-            no part is long enough.
+        faulty: Joints whose channels no model can fit: held, spiky, wrapped, or with
+            rows lost.
+        observations: Observations in which mistakes are looked for, of a long log a
+            part; None if no part is long enough.
         motor_sides: Whether angles and forces of the log are taken for the motors'.
         notes: Remarks on how the log was examined, as sentences.
     """
@@ -62,9 +71,9 @@ class Diagnosis(Summarised):
     def mistakes(self, fit: Fit) -> tuple[str, ...]:
         """Return the likely mistake in the description of the log or the robot, as a sentence.
 
-        That is a single one whose correction explains most of what the model misses, and more than
-        any other; nothing if the model fits. If it misses much, and no single mistake explains
-        that, the sentence says where.
+        That is a single one whose correction explains most of what the model misses,
+        and more than any other; nothing if the model fits. If it misses much, and no
+        single mistake explains that, the sentence says where.
 
         Args:
             fit: Fit of the robot's model, to this log or to several.
@@ -101,14 +110,24 @@ class Diagnosis(Summarised):
             Column("unit", [robot.joint_unit(j) for j in joints]),
             Column("force\nunit", [robot.force_unit(j) for j in joints]),
             facts=[
-                ("samples", f"{log.samples} at {significant(1 / log.sample_time, 4)} Hz"),
+                (
+                    "samples",
+                    f"{log.samples} at {significant(1 / log.sample_time, 4)} Hz",
+                ),
                 ("duration", f"{significant(log.duration, 4)} s"),
                 ("gaps", "none" if gaps == 0 else str(gaps)),
             ],
             remarks=[
                 *(Remark(note) for note in (*log.notes, *self.notes)),
-                *(Remark(text, Status.DOUBTFUL) for text in dict.fromkeys(self.findings)),
-                *([] if self.findings else [Remark("Nothing suspicious was found.", Status.GOOD)]),
+                *(
+                    Remark(text, Status.DOUBTFUL)
+                    for text in dict.fromkeys(self.findings)
+                ),
+                *(
+                    []
+                    if self.findings
+                    else [Remark("Nothing suspicious was found.", Status.GOOD)]
+                ),
             ],
         )
 
@@ -116,7 +135,10 @@ class Diagnosis(Summarised):
 def _beside(name: str, values: np.ndarray, limits: AnyArray, unit: str = "") -> Column:
     """Return a column of values with limits in brackets."""
     pairs = zip(values.tolist(), np.asarray(limits).tolist(), strict=True)
-    texts = [f"{significant(x)} ({MISSING if np.isinf(y) else significant(y)})" for x, y in pairs]
+    texts = [
+        f"{significant(x)} ({MISSING if np.isinf(y) else significant(y)})"
+        for x, y in pairs
+    ]
     return Column(name, texts, unit, kind="number")
 
 
@@ -131,27 +153,30 @@ def diagnose(
 ) -> Diagnosis:
     """Look for mistakes in a log: units, signs, order, sides, sensor faults and delays.
 
-    Observations on disk are read in parts, and single channels are examined in a part of the log.
-    Observations in memory hold no unfiltered angles, so spikes may escape.
+    Observations on disk are read in parts, and single channels are examined in a part
+    of the log. Observations in memory hold no unfiltered angles, so spikes may escape.
 
     Args:
         log: Recording or observations of the robot.
         robot: Robot, whose limits are compared with the log.
         fit: Fit to this log; mistakes that only a model reveals are left out if None.
-        observations: Observations of the recording; filtered below a tenth of its sampling rate,
-            and 20 Hz at most, if None.
+        observations: Observations of the recording; filtered below a tenth of its
+            sampling rate, and 20 Hz at most, if None.
         min_speed: Speed of each joint below which rows do not count [rad/s or m/s].
         progress: Callback, called with the completed fraction (0 to 1).
 
     Raises:
-        InputError: If log and robot do not belong together, or the log is too short to filter.
+        InputError: If log and robot do not belong together, or the log is too short to
+            filter.
     """
     notes: tuple[str, ...] = ()
     if isinstance(log, Recording):
         part = log
         if observations is None:
             cutoff = min(20.0, 0.1 / log.sample_time)
-            observations = observe(log, robot, ZeroPhaseButterworth(cutoff), min_speed=min_speed)
+            observations = observe(
+                log, robot, ZeroPhaseButterworth(cutoff), min_speed=min_speed
+            )
         whole = observations
     elif isinstance(log.source, SamplesOnDisk):
         part, whole, why = _excerpt(log, log.source), log, ""
@@ -166,12 +191,20 @@ def diagnose(
     else:
         whole = observations = log
         part = Recording(
-            *(log.time, np.asarray(log.motion.q), np.asarray(log.forces), None, False, False),
+            *(
+                log.time,
+                np.asarray(log.motion.q),
+                np.asarray(log.forces),
+                None,
+                False,
+                False,
+            ),
             *(log.segments, log.sample_time),
         )
     statistics = LogStatistics(robot.joints, whole.samples)
     for a, b in whole.segments:
-        # Differences at the ends of parts are not central: logs in memory are taken at once.
+        # Differences at the ends of parts are not central: logs in memory are taken at
+        # once.
         step = AT_ONCE if isinstance(whole.source, SamplesOnDisk) else b - a
         for start in range(a, b, step):
             samples = slice(start, min(start + step, b))
@@ -194,7 +227,9 @@ def diagnose(
         findings.append(f"the log has {rate:.3g} samples in a second: {cure}")
     found = tuple(findings)
     faulty = tuple(range(robot.joints)) if clock else faulty
-    diagnosis = Diagnosis(log, robot, statistics, found, faulty, observations, sides, notes)
+    diagnosis = Diagnosis(
+        log, robot, statistics, found, faulty, observations, sides, notes
+    )
     return diagnosis if fit is None else diagnosis.with_fit(fit)
 
 
@@ -209,19 +244,30 @@ def mistakes_in_logs(
     return (*friction, *(f"{name}{text}" for text in found)), notes
 
 
-def _mistakes(diagnoses: Sequence[Diagnosis], fit: Fit) -> tuple[tuple[str, ...], tuple[str, ...]]:
+def _mistakes(
+    diagnoses: Sequence[Diagnosis], fit: Fit
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return the likely mistake in logs, or moments that depart from the model, and notes."""
     # Faults of channels explain the rest.
-    logs = [d.observations for d in diagnoses if d.observations is not None and not d.faulty]
+    logs = [
+        d.observations for d in diagnoses if d.observations is not None and not d.faulty
+    ]
     named = "{0.name}: {1}" if len(diagnoses) > 1 else "{1}"
-    moments = tuple(named.format(log, text) for log in logs for text in departures(fit, log))
-    return likely_mistakes(fit, logs, diagnoses[0].motor_sides, moments) if logs else ((), ())
+    moments = tuple(
+        named.format(log, text) for log in logs for text in departures(fit, log)
+    )
+    return (
+        likely_mistakes(fit, logs, diagnoses[0].motor_sides, moments)
+        if logs
+        else ((), ())
+    )
 
 
 def _excerpt(log: Observations, source: SamplesOnDisk) -> Recording:
     """Return stretches of a log as they were recorded: from its beginning, middle and end."""
     dt = log.sample_time
-    # With a filter of a long memory, one long stretch tells more than several short ones.
+    # With a filter of a long memory, one long stretch tells more than several short
+    # ones.
     count = 4 if log.samples > EXAMINED >= 80 * log.filter.edge(dt) else 1
     length = min(log.samples, EXAMINED) // count
     parts, times = [], []
@@ -249,13 +295,16 @@ def _excerpt(log: Observations, source: SamplesOnDisk) -> Recording:
 def departures(fit: Fit, observations: Observations) -> tuple[str, ...]:
     """Report forces that depart from the model for one moment, and at no other time nearly as far.
 
-    Such a departure exceeds half of its joint's RMS force, and lasts a hundredth of the log at
-    most, beside what the filter spreads. Uncertain parameters do not explain it: where they matter
-    more than usual errors, the motion is one that the fit does not know.
+    Such a departure exceeds half of its joint's RMS force, and lasts a hundredth of the
+    log at most, beside what the filter spreads. Uncertain parameters do not explain it:
+    where they matter more than usual errors, the motion is one that the fit does not
+    know.
     """
     o, robot = observations, fit.base.model.robot
     motion, forces = o.motion[o.instants], np.asarray(o.reduced_forces)
-    errors = np.abs(forces - fit.predict(motion) - fit.base.tool_forces(motion)) * o.mask
+    errors = (
+        np.abs(forces - fit.predict(motion) - fit.base.tool_forces(motion)) * o.mask
+    )
     size = np.sqrt(np.mean(forces**2, axis=0))
     length = o.filter.edge(o.sample_time) + 0.01 * o.samples
     found = []
@@ -265,11 +314,15 @@ def departures(fit: Fit, observations: Observations) -> tuple[str, ...]:
         row = np.asarray(fit.base.regressor(motion[k]))[j]
         deviation = _deviation(fit, row)
         usual = others.max(initial=0.0)
-        if deviation <= usual and error[k] > max(0.5 * size[j], 5.0 * (deviation + usual)):
+        if deviation <= usual and error[k] > max(
+            0.5 * size[j], 5.0 * (deviation + usual)
+        ):
             found.append(
                 f"the force of joint `{name}` departs from the model by {error[k]:.3g} "
-                f"{robot.force_unit(j)} at {o.time[o.instants[k]]:.5g} s, and at no other time by "
-                "a fifth of that: a contact or a fault of a sensor; leave that part out "
+                f"{robot.force_unit(j)} at {o.time[o.instants[k]]:.5g} s, and at no "
+                "other time by "
+                "a fifth of that: a contact or a fault of a sensor; leave that part "
+                "out "
                 "(`recording.start`, `recording.stop`)."
             )
     return tuple(found)
@@ -287,17 +340,22 @@ def _deviation(fit: Fit, row: np.ndarray) -> float:
 def negative_friction(fit: Fit, logs: Sequence[Observations]) -> tuple[str, ...]:
     """Report joints that friction drives, beyond doubt: the model or a log is wrong.
 
-    A single parameter may be negative, as where friction falls with speed. Velocities count less
-    their mean: in one direction dry friction cannot be told from an offset of the force.
+    A single parameter may be negative, as where friction falls with speed. Velocities
+    count less their mean: in one direction dry friction cannot be told from an offset
+    of the force.
     """
     base, robot = fit.base, fit.base.model.robot
     p = np.asarray(fit.parameters)
     motions = [log.motion[log.instants[:: -(-log.rows // INSTANTS)]] for log in logs]
     rows = [base.regressor_rows(motion) for motion in motions]
     found = []
-    for j, (name, own) in enumerate(zip(robot.joint_names, base.acting_columns, strict=True)):
+    for j, (name, own) in enumerate(
+        zip(robot.joint_names, base.acting_columns, strict=True)
+    ):
         friction = [
-            k for k, i in enumerate(own) if re.fullmatch(rf"f(?!o)[a-z]+{j + 1}", base.names[i])
+            k
+            for k, i in enumerate(own)
+            if re.fullmatch(rf"f(?!o)[a-z]+{j + 1}", base.names[i])
         ]
         power, columns = np.zeros(base.size), [own[k] for k in friction]
         for motion, each in zip(motions, rows, strict=True):
@@ -306,7 +364,8 @@ def negative_friction(fit: Fit, logs: Sequence[Observations]) -> tuple[str, ...]
         if power @ p < -SURE * _deviation(fit, power):
             named = " and ".join(base.names[i] for i in columns if p[i] < 0)
             found.append(
-                f"friction of joint `{name}` comes out negative ({named}): it would drive the "
+                f"friction of joint `{name}` comes out negative ({named}): it would "
+                "drive the "
                 "joint; something in the model or the log of this joint is wrong."
             )
     return tuple(found)
@@ -326,12 +385,17 @@ def delay_notes(
         return ()
     # What is advised must be sure.
     low, high = (1e3 * x for x in delay.interval(0.9999))
-    text = f"the forces stand between {low:.2g} and {high:.2g} ms later in the log than the angles"
+    text = (
+        f"the forces stand between {low:.2g} and {high:.2g} ms later in the log "
+        "than the angles"
+    )
     # A delay of a bus is that of all joints; other effects differ from joint to joint.
     if low <= 0.0 <= high or abs(delay.seconds) < float(np.std(delay.of_joints)):
         return (f"{text}: a delay cannot be told from none.",)
     if delay.p_value <= 0.001:
-        least, most = (1e3 * float(x) for x in (np.min(delay.of_joints), np.max(delay.of_joints)))
+        least, most = (
+            1e3 * float(x) for x in (np.min(delay.of_joints), np.max(delay.of_joints))
+        )
         apart = f"{least:.3g} to {most:.3g} ms joint by joint"
         return (f"{text}, but {apart}: as likely, the model lacks an effect.",)
     if commanded is None and delay.feedback > 0.1 * abs(delay.seconds):

@@ -1,10 +1,11 @@
 """Likely mistakes in the description of a log or a robot, found by the model itself.
 
-Every possible mistake is corrected in turn, and the model is fitted anew to some instants of all
-logs, with any friction that takes energy from the robot, as all friction does. Without that
-condition a wrong sign would only change signs of parameters where joints are hardly coupled; with
-less friction, a mistake might be named where the model lacks some. What counts is also missed in
-stretches of time that were left out of the fit.
+Every possible mistake is corrected in turn, and the model is fitted anew to some
+instants of all logs, with any friction that takes energy from the robot, as all
+friction does. Without that condition a wrong sign would only change signs of parameters
+where joints are hardly coupled; with less friction, a mistake might be named where the
+model lacks some. What counts is also missed in stretches of time that were left out of
+the fit.
 """
 
 import itertools
@@ -74,9 +75,10 @@ def likely_mistakes(
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return a sentence about the mistake that explains most of what a model misses, and notes.
 
-    A mistake is looked for in all logs alike, then in the columns of each. The notes say which
-    mistakes would not show; `events`, sentences about moments, are returned if no mistake explains
-    them. Whether angles and forces are taken for the motors' is in `motor_sides`.
+    A mistake is looked for in all logs alike, then in the columns of each. The notes
+    say which mistakes would not show; `events`, sentences about moments, are returned
+    if no mistake explains them. Whether angles and forces are taken for the motors' is
+    in `motor_sides`.
     """
     samples = _Samples(fit.base.model, logs)
     robot = fit.base.model.robot
@@ -85,7 +87,9 @@ def likely_mistakes(
     if left < BAD:
         return events, notes
     parts = [slice(0, len(samples.forces)), *(samples.parts if len(logs) > 1 else [])]
-    for name, part in zip(("", *(f"{log.name}: " for log in logs)), parts, strict=False):
+    for name, part in zip(
+        ("", *(f"{log.name}: " for log in logs)), parts, strict=False
+    ):
         motion, forces = samples.motion[part], samples.forces[part]
         candidates = [*_of_columns(robot, motion, forces, motor_sides)]
         amounts = [samples.best(x, part) for x in samples.amounts()]
@@ -118,7 +122,9 @@ class _Samples:
         instants = [log.instants[::step] for log in logs]
         motions = [log.motion[at] for log, at in zip(logs, instants, strict=True)]
         self.motion = jax.tree.map(lambda *x: np.concatenate(x), *motions)
-        self.forces = np.concatenate([np.asarray(log.reduced_forces)[::step] for log in logs])
+        self.forces = np.concatenate(
+            [np.asarray(log.reduced_forces)[::step] for log in logs]
+        )
         ends = np.cumsum([0, *map(len, instants)]).tolist()
         self.parts = [slice(a, b) for a, b in itertools.pairwise(ends)]
         self._logs, self._instants, self._model = logs, instants, model
@@ -126,7 +132,10 @@ class _Samples:
         self._geometries: dict[tuple[bool, ...], _AnyGeometry] = {}
         self.as_given = Correction("", model.robot, self.motion, self.forces)
         self._rows = self._rows_of(self.as_given)
-        braking = [re.fullmatch(r"f[vc]\d+", name) is not None for name in model.parameter_names]
+        braking = [
+            re.fullmatch(r"f[vc]\d+", name) is not None
+            for name in model.parameter_names
+        ]
         self._braking = np.ones(self._rows.shape[2] - 1, bool)
         self._braking[: len(braking)] = braking
         self.given = _missed(self._rows, self._braking)
@@ -140,7 +149,8 @@ class _Samples:
     def best(self, mistake: _Amount, part: slice) -> Correction:
         """Return the correction of a mistake by the amount that leaves least.
 
-        Where a parabola through small amounts promises too little, the search is left out.
+        Where a parabola through small amounts promises too little, the search is left
+        out.
         """
 
         def left(amount: float) -> float:
@@ -169,12 +179,18 @@ class _Samples:
             f"{what} ({'any joint' if len(names) == self.motion.joints > 1 else ', '.join(names)})"
             for what, names in unseen.items()
         ]
-        return (f"mistakes that these logs cannot reveal: {', '.join(texts)}",) if texts else ()
+        return (
+            (f"mistakes that these logs cannot reveal: {', '.join(texts)}",)
+            if texts
+            else ()
+        )
 
     def amounts(self) -> Iterator[_Amount]:
         """Yield mistakes of any amount: a delay, zeros of angles, gains of forces."""
         robot, q, forces = self._model.robot, self.motion.q, self.forces
-        text = "the forces of the log seem to be late (`recording.force_delay = {:.3g}`)"
+        text = (
+            "the forces of the log seem to be late (`recording.force_delay = {:.3g}`)"
+        )
 
         def correction(text: str, part: slice, q=q, forces=forces) -> Correction:
             moved = Motion(q[part], self.motion.qd[part], self.motion.qdd[part])
@@ -188,18 +204,27 @@ class _Samples:
             own = np.eye(robot.joints)[j]
             unit, per = ("degrees", np.pi / 180) if robot.revolute[j] else ("m", 1.0)
 
-            def moved(x: float, part: slice, own=own, name=name, unit=unit, per=per) -> Correction:
+            def moved(
+                x: float, part: slice, own=own, name=name, unit=unit, per=per
+            ) -> Correction:
                 said = f"the angle of joint `{name}` seems to lack {x / per:.2g} {unit}"
-                return correction(f"{said} (`recording.angle_offsets`)", part, q + x * own)
+                return correction(
+                    f"{said} (`recording.angle_offsets`)", part, q + x * own
+                )
 
             def scaled(x: float, part: slice, own=own, name=name) -> Correction:
-                said = f"the gain of the force of joint `{name}` seems to be {np.exp(x):.2g}"
+                said = (
+                    f"the gain of the force of joint `{name}` seems to be "
+                    f"{np.exp(x):.2g}"
+                )
                 return correction(said, part, forces=forces * np.exp(-x * own))
 
             what = f"a zero that is off by {MOVED / per:.2g} {unit}"
             yield _Amount(name, what, moved, FARTHEST, MOVED)
             what = f"forces that are {SCALED:g} times too large"
-            yield _Amount(name, what, scaled, float(np.log(GAIN)), -float(np.log(SCALED)))
+            yield _Amount(
+                name, what, scaled, float(np.log(GAIN)), -float(np.log(SCALED))
+            )
 
     def _later(self, seconds: float) -> np.ndarray:
         """Return the forces that stand later in the logs."""
@@ -217,7 +242,9 @@ class _Samples:
             self._geometries[kinds] = _AnyGeometry(Model(c.robot, self._model.terms))
         columns, known = self._geometries[kinds](c.robot, c.motion)
         friction = _any_friction(np.asarray(c.motion.qd), self._fastest)
-        return np.concatenate([columns, friction, (c.forces - known)[..., None]], axis=2)
+        return np.concatenate(
+            [columns, friction, (c.forces - known)[..., None]], axis=2
+        )
 
 
 def _any_friction(speeds: np.ndarray, fastest: np.ndarray) -> np.ndarray:
@@ -225,7 +252,9 @@ def _any_friction(speeds: np.ndarray, fastest: np.ndarray) -> np.ndarray:
     v = speeds / np.where(fastest > 0, fastest, 1.0)
     shapes = [np.tanh(v / width) for width in (0.01, 0.1)]
     shapes += [np.tanh(v / 0.01) * np.exp(-((v / width) ** 2)) for width in (0.05, 0.2)]
-    return np.concatenate([x[..., None] * np.eye(v.shape[1]) for x in (*shapes, v * abs(v))], 2)
+    return np.concatenate(
+        [x[..., None] * np.eye(v.shape[1]) for x in (*shapes, v * abs(v))], 2
+    )
 
 
 def _reversed(c: Correction, joint: int) -> Correction:
@@ -236,7 +265,9 @@ def _reversed(c: Correction, joint: int) -> Correction:
     return c._replace(motion=motion, forces=c.forces * signs)
 
 
-def _misfit(fit: Fit, motion: Motion, forces: np.ndarray, left: float) -> tuple[str, ...]:
+def _misfit(
+    fit: Fit, motion: Motion, forces: np.ndarray, left: float
+) -> tuple[str, ...]:
     """Return a sentence about where a model does not fit, or nothing if it misses little."""
     if left < FAR:
         return ()
@@ -245,8 +276,10 @@ def _misfit(fit: Fit, motion: Motion, forces: np.ndarray, left: float) -> tuple[
     missed = np.sqrt(np.mean(errors**2, axis=0)) / np.where(size > 0, size, np.inf)
     worst = int(np.argmax(missed))
     return (
-        f"the model does not fit: it misses {significant(100 * left, 2)} % of the forces, most of "
-        f"all those of joint `{fit.base.model.robot.joint_names[worst]}`, and no single mistake in "
+        f"the model does not fit: it misses {significant(100 * left, 2)} % of the "
+        "forces, most of "
+        f"all those of joint `{fit.base.model.robot.joint_names[worst]}`, and no "
+        "single mistake in "
         "signs, order, units, offsets, axes or gravity explains that.",
     )
 
@@ -262,16 +295,24 @@ def _of_columns(
     columns = [motion.q, motion.qd, motion.qdd]
     torques = forces
     if sides[0]:
-        columns = [drives.motor_angles(motion.q), *map(drives.motor_velocities, columns[1:])]
+        columns = [
+            drives.motor_angles(motion.q),
+            *map(drives.motor_velocities, columns[1:]),
+        ]
     if sides[1]:
         torques = drives.motor_torques(forces)
 
-    def without(text: str, angles: np.ndarray = eye, forces: np.ndarray = eye, sides=sides):
+    def without(
+        text: str, angles: np.ndarray = eye, forces: np.ndarray = eye, sides=sides
+    ):
         """Return a correction with other combinations of the log's columns."""
         q, qd, qdd = (x @ angles for x in columns)
         f = torques @ forces
         if sides[0]:
-            q, qd, qdd = drives.joint_angles(q), *map(drives.joint_velocities, (qd, qdd))
+            q, qd, qdd = (
+                drives.joint_angles(q),
+                *map(drives.joint_velocities, (qd, qdd)),
+            )
         f = drives.joint_forces(f) if sides[1] else f
         return Correction(text, robot, Motion(q, qd, qdd), np.asarray(f))
 
@@ -284,13 +325,17 @@ def _of_columns(
     for i, j in itertools.combinations(range(n), 2) if n <= MANY else ():
         change = np.eye(n)
         change[[i, j]] = change[[j, i]]
-        key = f"of joints `{names[i]}` and `{names[j]}` seem to be exchanged (`recording."
+        key = (
+            f"of joints `{names[i]}` and `{names[j]}` seem to be exchanged (`recording."
+        )
         yield without(f"the forces {key}forces`)", forces=change)
         yield without(f"the angles {key}angles`)", change)
         yield without(f"angles and forces {key}angles`, `forces`)", change, change)
     for unit, factor in (("deg", np.pi / 180), ("rev", 2 * np.pi)):
         for said, by in ((unit, factor), (f"rad, not in {unit}", 1 / factor)):
-            text = f"the angles of the log seem to be in {said} (`recording.angle_unit`)"
+            text = (
+                f"the angles of the log seem to be in {said} (`recording.angle_unit`)"
+            )
             yield without(text, np.diag(np.where(robot.revolute, by, 1.0)))
     if drives.is_direct:
         return
@@ -302,7 +347,10 @@ def _of_columns(
     )
     for what, motors, key, other in cases[sides[0] != sides[1] :]:
         owner = "motor" if motors else "joint"
-        text = f"the {what} of the log seem to be the {owner}s' (`recording.{key.format(owner)}"
+        text = (
+            f"the {what} of the log seem to be the {owner}s' "
+            f"(`recording.{key.format(owner)}"
+        )
         yield without(text, sides=other)
 
 
@@ -311,7 +359,10 @@ def _of_robot(robot: Robot, motion: Motion, forces: np.ndarray) -> Iterator[Corr
     names, n, size = robot.joint_names, robot.joints, np.linalg.norm(robot.gravity)
     for j, turns in ((j, k) for j in range(n) if robot.revolute[j] for k in (-1, 1, 2)):
         q = motion.q + 0.5 * np.pi * turns * np.eye(n)[j]
-        text = f"the angle of joint `{names[j]}` seems to lack {90 * turns} degrees (`recording."
+        text = (
+            f"the angle of joint `{names[j]}` seems to lack {90 * turns} degrees "
+            "(`recording."
+        )
         moved = Motion(q, motion.qd, motion.qdd)
         yield Correction(f"{text}angle_offsets`)", robot, moved, forces)
     for g in (*np.eye(3), *-np.eye(3)):
@@ -320,16 +371,27 @@ def _of_robot(robot: Robot, motion: Motion, forces: np.ndarray) -> Iterator[Corr
             text = f"gravity seems to be [{shown}] (`robot.gravity`)"
             yield Correction(text, robot.replace(gravity=size * g), motion, forces)
     if size > 0:
-        text = "the forces seem not to contain gravity: the log, or the drive, has subtracted it"
+        text = (
+            "the forces seem not to contain gravity: the log, or the drive, has "
+            "subtracted it"
+        )
         yield Correction(text, robot.replace(gravity=np.zeros(3)), motion, forces)
     for j, name in enumerate(names):
-        text = f"the axis of joint `{name}` seems to be reversed in the robot, or in the log both "
-        yield _reversed(Correction(f"{text}its angle and its force", robot, motion, forces), j)
+        text = (
+            f"the axis of joint `{name}` seems to be reversed in the robot, or in "
+            "the log both "
+        )
+        yield _reversed(
+            Correction(f"{text}its angle and its force", robot, motion, forces), j
+        )
     for j, shift in itertools.product(range(n) if n <= MANY else (), (1, 2)):
         axis = np.array(robot.axis)
         axis[j] = np.roll(axis[j], shift)
         turned = Correction("", robot.replace(axis=axis), motion, forces)
-        text = f"the axis of joint `{names[j]}` seems to be ({{}}) in the frame of its body"
+        text = (
+            f"the axis of joint `{names[j]}` seems to be ({{}}) in the frame of "
+            "its body"
+        )
         shown, other = (" ".join(f"{x:g}" for x in s * axis[j] + 0.0) for s in (1, -1))
         yield turned._replace(text=text.format(shown))
         yield _reversed(turned, j)._replace(text=text.format(other))
@@ -350,7 +412,9 @@ class _AnyGeometry(eqx.Module):
 
     def columns(self, axis, gravity, q, qd, qdd, s=None):
         """Return the regressor of one sample, and the forces of the known tool behind it."""
-        model = Model(self.model.robot.replace(axis=axis, gravity=gravity), self.model.terms)
+        model = Model(
+            self.model.robot.replace(axis=axis, gravity=gravity), self.model.terms
+        )
         known = model.known_forces(q, qd, qdd)[:, None]
         return jnp.concatenate([model.columns(q, qd, qdd, s), known], axis=1)
 
@@ -365,9 +429,10 @@ class _AnyGeometry(eqx.Module):
 def _missed(rows: np.ndarray, braking: np.ndarray, folds: int = 1) -> float:
     """Return the fraction (0 to 1) of the forces that least squares miss.
 
-    The rows are a regressor with the forces as last column [instants, joints, columns]. All joints
-    count equally. Friction, the `braking` columns, is left out where it would come out negative.
-    Each of several `folds`, of several stretches each, is left out of the fit for it.
+    The rows are a regressor with the forces as last column [instants, joints, columns].
+    All joints count equally. Friction, the `braking` columns, is left out where it
+    would come out negative. Each of several `folds`, of several stretches each, is left
+    out of the fit for it.
     """
     size = np.sqrt(np.mean(rows[..., -1] ** 2, axis=0))
     theta = rows / np.where(size > 0, size, np.inf)[:, None]
@@ -376,7 +441,10 @@ def _missed(rows: np.ndarray, braking: np.ndarray, folds: int = 1) -> float:
         return np.inf
     theta[..., :-1] /= np.where(length[:-1] > 0, length[:-1], 1.0)
     stretches = np.array_split(theta, 4 * folds)
-    parts = [np.concatenate(stretches[k::folds]).reshape(-1, theta.shape[2]) for k in range(folds)]
+    parts = [
+        np.concatenate(stretches[k::folds]).reshape(-1, theta.shape[2])
+        for k in range(folds)
+    ]
     products, squares = np.array([x.T @ x for x in parts]), 0.0
     for unseen in products:
         seen = products.sum(axis=0) - unseen if folds > 1 else unseen
@@ -388,8 +456,8 @@ def _missed(rows: np.ndarray, braking: np.ndarray, folds: int = 1) -> float:
 def _with_braking(products: np.ndarray, braking: np.ndarray) -> np.ndarray:
     """Return the least-squares parameters, without friction that would not brake.
 
-    Products of columns of length one suffice, with a little on their diagonal for those that depend
-    on others: what both lose, 1e-6 of the forces, is far below `BAD`.
+    Products of columns of length one suffice, with a little on their diagonal for those
+    that depend on others: what both lose, 1e-6 of the forces, is far below `BAD`.
     """
     used = np.ones(len(braking), bool)
     regular = products[:-1, :-1] + 1e-12 * np.eye(len(braking))

@@ -20,7 +20,13 @@ from .dispatch import in_numpy, on_samples, program_of
 from .model import Coordinates, Model
 from .motion import Motion
 from .packed_regressor import JointRegressor, PackedRegressor
-from .rank import Dependence, gram_schmidt, random_regressor, regrouping, singular_values
+from .rank import (
+    Dependence,
+    gram_schmidt,
+    random_regressor,
+    regrouping,
+    singular_values,
+)
 
 Parameters = Float[AnyArray, " base"] | Sequence[float | int]
 
@@ -38,12 +44,14 @@ class BaseParameters(Summarised, Hashable):
 
     Attributes:
         model: The model with all its standard parameters.
-        indices: Columns of the independent standard parameters, in order (the paper's numbering).
+        indices: Columns of the independent standard parameters, in order (the paper's
+            numbering).
         dependent: Columns of the other standard parameters, in order.
         kappa: Matrix by which the dependent columns follow from the independent ones.
-        smallest_independent: Fraction of the least independent column that earlier columns do not
-            explain, from 0 to 1.
-        largest_dependent: Fraction of the most doubtful dependent column that they do not explain.
+        smallest_independent: Fraction of the least independent column that earlier
+            columns do not explain, from 0 to 1.
+        largest_dependent: Fraction of the most doubtful dependent column that they do
+            not explain.
         notes: Doubts about the rank, in sentences; empty if there are none.
     """
 
@@ -122,7 +130,9 @@ class BaseParameters(Summarised, Hashable):
         """For each joint the base parameters that can act on it."""
         return self.joint_regressor.columns
 
-    def regressor_rows(self, motion: Motion) -> list[Float[np.ndarray, "samples columns"]]:
+    def regressor_rows(
+        self, motion: Motion
+    ) -> list[Float[np.ndarray, "samples columns"]]:
         """Return each joint's row of the base regressor in its `acting_columns`, in NumPy (Eq. 23).
 
         Args:
@@ -142,7 +152,9 @@ class BaseParameters(Summarised, Hashable):
         """Return the forces of the known tool [N m or N] in float64; zero without a tool."""
         if self.model.robot.tool is None:
             return np.zeros(motion.q.shape)
-        return in_numpy(self.model, self.model.known_forces, motion.q, motion.qd, motion.qdd)
+        return in_numpy(
+            self.model, self.model.known_forces, motion.q, motion.qd, motion.qdd
+        )
 
     def regressor(self, motion: Motion) -> Float[AnyArray, "*batch joints base"]:
         r"""Return the base regressor $\Theta_B = \hat\Theta_1$ (Eq. 23)."""
@@ -152,8 +164,8 @@ class BaseParameters(Summarised, Hashable):
         r"""Return the stacked base regressor of many samples without its zeros (Eqs. 23, 26).
 
         Raises:
-            InputError: If the motion does not have one axis of samples, or JAX is tracing the
-                robot's geometry.
+            InputError: If the motion does not have one axis of samples, or JAX is
+                tracing the robot's geometry.
         """
         return PackedRegressor(self, self.columns, *self.model.arguments(motion))
 
@@ -170,7 +182,8 @@ class BaseParameters(Summarised, Hashable):
     ) -> Float[AnyArray, "*batch standard"]:
         """Return the standard parameters with the same forces whose dependent ones are zero.
 
-        They are no physical masses and inertias, but give the same forces and mass matrix.
+        They are no physical masses and inertias, but give the same forces and mass
+        matrix.
         """
         p = _one_each("base", p, self.size)
         shape, places = (*p.shape[:-1], self.model.size), np.array(self.indices)
@@ -180,11 +193,15 @@ class BaseParameters(Summarised, Hashable):
             return full
         return jnp.zeros(shape, p.dtype).at[..., places].set(p)
 
-    def inverse_dynamics(self, p: Parameters, motion: Motion) -> Float[AnyArray, "*batch joints"]:
+    def inverse_dynamics(
+        self, p: Parameters, motion: Motion
+    ) -> Float[AnyArray, "*batch joints"]:
         r"""Return the generalised forces $\Theta_B p_B$ [N m or N] (Eq. 39)."""
         return on_samples(self, self.forces, *self.model.arguments(motion), shared=(p,))
 
-    def mass_matrix(self, p: Parameters, q: Coordinates) -> Float[AnyArray, "*batch joints joints"]:
+    def mass_matrix(
+        self, p: Parameters, q: Coordinates
+    ) -> Float[AnyArray, "*batch joints joints"]:
         """Return the mass matrix, which base parameters determine completely (Eq. 38)."""
         return on_samples(self, self.inertia, self.model.check(q), shared=(p,))
 
@@ -208,7 +225,9 @@ class BaseParameters(Summarised, Hashable):
             each = zip(self.model.parameter_names, self.identifiability, strict=True)
             found = [name for name, verdict in each if verdict is kind]
             facts.append((f"{kind.value} ({len(found)})", ", ".join(found) or MISSING))
-        if lengths := ", ".join(f"{name} = {value:.4g}" for name, value in self.lengths.items()):
+        if lengths := ", ".join(
+            f"{name} = {value:.4g}" for name, value in self.lengths.items()
+        ):
             facts.append(("lengths", f"{lengths} (m; m/s² for g)"))
         count = f"{self.size} base parameters of {self.model.size} standard parameters"
         return Table(
@@ -227,7 +246,8 @@ def _one_each(kind: str, p: Numbers, size: int) -> Float[AnyArray, "*batch param
     p = as_array("p", p)
     if p.shape[-1:] != (size,):
         raise InputError(
-            f"`p` must have {size} {kind} parameters along its last axis, but has shape {p.shape}."
+            f"`p` must have {size} {kind} parameters along its last axis, but has "
+            f"shape {p.shape}."
         )
     return p
 
@@ -240,13 +260,15 @@ def base_parameters(
 ) -> BaseParameters:
     r"""Find the combinations of parameters that forces determine (Eqs. 20-22).
 
-    The regressor is evaluated at random motions and stacked. Columns that earlier ones replace are
-    found by Gram-Schmidt in column order, and counted again by singular values. Rounded quarter
-    turns count as exact here (`Robot.snapped`); in forces the robot keeps its own geometry.
+    The regressor is evaluated at random motions and stacked. Columns that earlier ones
+    replace are found by Gram-Schmidt in column order, and counted again by singular
+    values. Rounded quarter turns count as exact here (`Robot.snapped`); in forces the
+    robot keeps its own geometry.
 
     Args:
         model: The model.
-        method: Method by which dependence is decided; the other one is always the cross-check.
+        method: Method by which dependence is decided; the other one is always the
+            cross-check.
         seed: Seed of the random motions.
 
     Returns:
@@ -257,7 +279,9 @@ def base_parameters(
     """
     methods = {"gram_schmidt": gram_schmidt, "singular_values": singular_values}
     if method not in methods:
-        raise InputError(f"`method` must be one of {', '.join(methods)}, but is {method!r}.")
+        raise InputError(
+            f"`method` must be one of {', '.join(methods)}, but is {method!r}."
+        )
     W, scale = random_regressor(_snapped(model), seed)
     found = methods.pop(method)(W)
     ((_, check),) = methods.items()
@@ -268,29 +292,38 @@ def base_parameters(
     weakest = model.parameter_names[first[np.argmin(new)]] if len(new) else ""
     notes = _doubts(found, other, left, weakest)
     independent, dependent, smallest, largest = found
-    return BaseParameters(model, independent, dependent, kappa, smallest, largest, notes)
+    return BaseParameters(
+        model, independent, dependent, kappa, smallest, largest, notes
+    )
 
 
 def _snapped(model: Model) -> Model:
     return Model(model.robot.snapped(), model.terms)
 
 
-def _doubts(found: Dependence, other: Dependence, left: float, weakest: str) -> tuple[str, ...]:
+def _doubts(
+    found: Dependence, other: Dependence, left: float, weakest: str
+) -> tuple[str, ...]:
     notes = []
     if found.independent != other.independent:
         notes.append(
-            f"the two ways to choose base parameters disagree ({len(found.independent)} and "
-            f"{len(other.independent)}): the geometry is nearly degenerate, or angles are rounded."
+            "the two ways to choose base parameters disagree "
+            f"({len(found.independent)} and "
+            f"{len(other.independent)}): the geometry is nearly degenerate, or angles "
+            "are rounded."
         )
     if found.smallest_independent < 5e-4:
         notes.append(
-            f"`{weakest}` is barely a base parameter: only {found.smallest_independent:.1e} of its "
-            "column is new, because of a length near zero or an angle like 1.571 instead of pi/2, "
+            f"`{weakest}` is barely a base parameter: only "
+            f"{found.smallest_independent:.1e} of its "
+            "column is new, because of a length near zero or an angle like 1.571 "
+            "instead of pi/2, "
             "which `robot.snapped(1e-3)` (`snap_tolerance`) makes exact."
         )
     if found.dependent and found.gap < 1e3:
         notes.append(
-            "independent and dependent columns are not clearly apart: their new parts are "
+            "independent and dependent columns are not clearly apart: their new parts "
+            "are "
             f"{found.smallest_independent:.1e} and {found.largest_dependent:.1e}."
         )
     if left > 1e-9:

@@ -1,13 +1,15 @@
 r"""Closed forms of base parameters: their coefficients in letters, from the geometry (Eq. 24).
 
-The paper calls the symbolic analysis of base parameters manual and thus time-consuming (Sec. 3).
-Here every length is varied on its own first, which gives the powers with which it occurs in a
-coefficient. The products of such powers that have the right dimension are then fitted at random
-geometries, and the result is checked at other random geometries and at the robot's own.
+The paper calls the symbolic analysis of base parameters manual and thus time-consuming
+(Sec. 3). Here every length is varied on its own first, which gives the powers with
+which it occurs in a coefficient. The products of such powers that have the right
+dimension are then fitted at random geometries, and the result is checked at other
+random geometries and at the robot's own.
 
-A length is one component of the offset between two neighbouring bodies: `l3z` is the z component,
-in the frame of body 3, from its origin to the origin of the body after it. Bodies count from 1, the
-ground is 0; a body with several children has `l3_4z`, `l3_7z`. Gravity is `g`.
+A length is one component of the offset between two neighbouring bodies: `l3z` is the z
+component, in the frame of body 3, from its origin to the origin of the body after it.
+Bodies count from 1, the ground is 0; a body with several children has `l3_4z`, `l3_7z`.
+Gravity is `g`.
 """
 
 import itertools
@@ -26,7 +28,13 @@ from jaxid.units import Dimension, dimension
 
 from .base_parameter_expressions import Coefficient, Expression, Monomial
 from .model import Model
-from .rank import characteristic_length, column_units, random_motion, regrouping, row_units
+from .rank import (
+    characteristic_length,
+    column_units,
+    random_motion,
+    regrouping,
+    row_units,
+)
 
 _POWERS = np.arange(-2, 3)
 """Exponents of a length that are tried."""
@@ -60,7 +68,9 @@ def closed_forms(
             difference = None
             if own is not None and other is not None:
                 difference = np.subtract(own, other)
-            coefficient = finder.coefficient(row, column, difference, kappa[row, column])
+            coefficient = finder.coefficient(
+                row, column, difference, kappa[row, column]
+            )
             if coefficient is not None:
                 terms.append((second, coefficient))
         terms.sort(key=lambda term: term[0])
@@ -73,7 +83,9 @@ def closed_forms(
 class _Finder:
     """Values of the matrix at all geometries, from which one coefficient is found at a time."""
 
-    def __init__(self, model: Model, independent: tuple[int, ...], dependent: tuple[int, ...]):
+    def __init__(
+        self, model: Model, independent: tuple[int, ...], dependent: tuple[int, ...]
+    ):
         matrix = Regrouping(model, independent, dependent)
         lengths = changing_lengths(model.robot, matrix) if dependent else ()
         rng = np.random.default_rng(3)
@@ -81,12 +93,16 @@ class _Finder:
         alone = np.repeat(base, len(lengths) * len(_SCALES), axis=0)
         for k in range(len(lengths)):
             alone[k * len(_SCALES) : (k + 1) * len(_SCALES), k] *= _SCALES
-        values = np.concatenate([base, alone, draws(matrix, lengths, _FITTED + _CHECKED, rng)])
+        values = np.concatenate(
+            [base, alone, draws(matrix, lengths, _FITTED + _CHECKED, rng)]
+        )
         found, self.right = matrix(lengths, values)
         found = np.where(np.isfinite(found), found, 0.0)
         self.lengths: tuple[Length, ...] = lengths
         self._units = np.array([matrix.unit(x) for x in lengths])
-        self._entry_units = matrix.units[matrix.independent, None] / matrix.units[matrix.dependent]
+        self._entry_units = (
+            matrix.units[matrix.independent, None] / matrix.units[matrix.dependent]
+        )
         self._values = np.array([x.value for x in lengths]) / self._units
         scaled = values / self._units
         fitted, checked = slice(1 + len(alone), -_CHECKED), slice(-_CHECKED, None)
@@ -96,9 +112,15 @@ class _Finder:
         for k in range(len(lengths)):
             rows = [0, *range(1 + k * len(_SCALES), 1 + (k + 1) * len(_SCALES))]
             powers = scaled[rows, k, None] ** _POWERS
-            factors = np.abs(np.linalg.solve(powers, found[rows].reshape(len(rows), -1)))
-            shares.append(factors / np.maximum(factors.max(axis=0), np.finfo(float).tiny))
-        self._shares = np.array(shares).reshape(len(lengths), len(_POWERS), *found.shape[1:])
+            factors = np.abs(
+                np.linalg.solve(powers, found[rows].reshape(len(rows), -1))
+            )
+            shares.append(
+                factors / np.maximum(factors.max(axis=0), np.finfo(float).tiny)
+            )
+        self._shares = np.array(shares).reshape(
+            len(lengths), len(_POWERS), *found.shape[1:]
+        )
 
     def coefficient(
         self, row: int, column: int, difference: np.ndarray | None, value: float
@@ -107,7 +129,9 @@ class _Finder:
         x, kappa = self._fitted
         y = kappa[:, row, column]
         # A coefficient without a short form is a number.
-        whole = Fraction(round(value)) if abs(abs(value) - 1.0) < _FITS else float(value)
+        whole = (
+            Fraction(round(value)) if abs(abs(value) - 1.0) < _FITS else float(value)
+        )
         number = Coefficient((Monomial(whole),)) if value else None
         if not self.right or not y.any():
             return number
@@ -127,11 +151,15 @@ class _Finder:
         error = np.abs(_products(x, powers) @ numbers - checks).max()
         unit = self._entry_units[row, column]
         own = float((_products(self._values[None], powers) @ numbers)[0]) * unit
-        if error > _FITS * np.abs(checks).max() or abs(own - value) > 1e-6 * max(abs(value), unit):
+        if error > _FITS * np.abs(checks).max() or abs(own - value) > 1e-6 * max(
+            abs(value), unit
+        ):
             return number
         return self._written(numbers, powers, unit)
 
-    def _candidates(self, row: int, column: int, difference: np.ndarray | None) -> np.ndarray:
+    def _candidates(
+        self, row: int, column: int, difference: np.ndarray | None
+    ) -> np.ndarray:
         possible = self._shares[:, :, row, column] > _SMALL
         choices = [_POWERS[p] for p in possible]
         if np.prod([len(c) for c in choices], dtype=float) > 20_000:
@@ -143,12 +171,16 @@ class _Finder:
         dimensions = np.array([x.dimension for x in self.lengths], int).reshape(-1, 3)
         return powers[(powers @ dimensions == difference).all(axis=1)]
 
-    def _written(self, numbers: np.ndarray, powers: np.ndarray, unit: float) -> Coefficient:
+    def _written(
+        self, numbers: np.ndarray, powers: np.ndarray, unit: float
+    ) -> Coefficient:
         """Return numbers in the robot's own units in SI units, as simple fractions if they are."""
         monomials = []
         for number, exponents in zip(numbers[::-1], powers[::-1], strict=True):
             symbols = tuple(
-                (x.name, int(e)) for x, e in zip(self.lengths, exponents, strict=True) if e
+                (x.name, int(e))
+                for x, e in zip(self.lengths, exponents, strict=True)
+                if e
             )
             # With the right dimension the units of lengths and of the entry cancel.
             factor = unit / float(np.prod(self._units ** exponents.astype(float)))
@@ -179,16 +211,24 @@ class Length:
 class Regrouping:
     r"""The matrix $\kappa$ of a fixed choice of columns, as a function of the geometry (Eq. 22).
 
-    It is in the robot's own units (see `column_units`). The geometry is the vector of all offsets
-    and of gravity. The regressor is traced once and evaluated at many geometries together.
+    It is in the robot's own units (see `column_units`). The geometry is the vector of
+    all offsets and of gravity. The regressor is traced once and evaluated at many
+    geometries together.
     """
 
-    def __init__(self, model: Model, independent: tuple[int, ...], dependent: tuple[int, ...]):
-        self.independent, self.dependent = np.array(independent, int), np.array(dependent, int)
+    def __init__(
+        self, model: Model, independent: tuple[int, ...], dependent: tuple[int, ...]
+    ):
+        self.independent, self.dependent = (
+            np.array(independent, int),
+            np.array(dependent, int),
+        )
         robot = model.robot
         self.size = characteristic_length(model)
         self.gravity = float(np.linalg.norm(np.asarray(robot.gravity)))
-        offset, gravity = (np.array(x, np.float64) for x in (robot.offset, robot.gravity))
+        offset, gravity = (
+            np.array(x, np.float64) for x in (robot.offset, robot.gravity)
+        )
         offset[np.abs(offset) < _NOTHING * self.size] = 0.0
         gravity[np.abs(gravity) < _NOTHING * max(self.gravity, _NOTHING)] = 0.0
         self.geometry = np.concatenate([offset.ravel(), gravity])
@@ -216,8 +256,8 @@ class Regrouping:
     ) -> tuple[Float[np.ndarray, "cases base dependent"], bool]:
         """Return the matrix for other lengths, and whether the choice of columns is right at all.
 
-        It is if the dependent columns follow from earlier independent ones, and those are
-        independent.
+        It is if the dependent columns follow from earlier independent ones, and those
+        are independent.
         """
         geometries = np.repeat(self.geometry[None], len(values), axis=0)
         for column, length in enumerate(lengths):
@@ -227,7 +267,9 @@ class Regrouping:
         joints, samples = self._motion[0].shape
         for block in np.split(geometries, range(32, len(geometries), 32)):
             motion = [np.tile(x, len(block)) for x in self._motion]
-            theta = evaluate(self._program, *motion, np.repeat(block.T, samples, axis=1))
+            theta = evaluate(
+                self._program, *motion, np.repeat(block.T, samples, axis=1)
+            )
             theta = theta * self._rows[:, None, None] * self.units[:, None]
             theta = theta.reshape(joints, -1, len(block), samples).transpose(2, 0, 3, 1)
             for W in theta.reshape(len(block), joints * samples, -1):
@@ -238,7 +280,10 @@ class Regrouping:
 
 
 def draws(
-    matrix: Regrouping, lengths: tuple[Length, ...], cases: int, rng: np.random.Generator
+    matrix: Regrouping,
+    lengths: tuple[Length, ...],
+    cases: int,
+    rng: np.random.Generator,
 ) -> Float[np.ndarray, "cases lengths"]:
     """Return random values of lengths, all of the robot's size, so that small ones have effect."""
     units = np.array([math.copysign(matrix.unit(x), x.value) for x in lengths])
@@ -248,9 +293,9 @@ def draws(
 def changing_lengths(robot: Robot, matrix: Regrouping) -> tuple[Length, ...]:
     """Return the lengths that can vary without changing which columns are independent.
 
-    Where single ones cannot, the geometry has a coincidence, such as two equal lengths that make
-    axes meet: then those of one offset, equal ones, or all of them vary together. Lengths that
-    cannot vary at all get no name.
+    Where single ones cannot, the geometry has a coincidence, such as two equal lengths
+    that make axes meet: then those of one offset, equal ones, or all of them vary
+    together. Lengths that cannot vary at all get no name.
     """
     rng = np.random.default_rng(2)
     single = named_lengths(robot, matrix)
@@ -314,6 +359,7 @@ def _tied(lengths: tuple[Length, ...], robot: Robot) -> Length:
         name += "".join(x.name[-1] for x in lengths)
     value = float(np.linalg.norm(values)) if whole else lengths[0].value
     entries = tuple(
-        (x.entries[0][0], float(v / value)) for x, v in zip(lengths, values, strict=True)
+        (x.entries[0][0], float(v / value))
+        for x, v in zip(lengths, values, strict=True)
     )
     return Length(name, value, entries, Dimension(0, 1, 0))

@@ -1,7 +1,7 @@
 """Expressions of base parameters in letters, `mx2 + l2x*m3 - l2x*mz4/l3z` (Eq. 24).
 
-An expression is a sum of standard parameters; the coefficient of each is a short sum of products of
-lengths, or a number where there is no short form.
+An expression is a sum of standard parameters; the coefficient of each is a short sum of
+products of lengths, or a number where there is no short form.
 """
 
 import math
@@ -29,7 +29,9 @@ class Coefficient:
     @property
     def symbols(self) -> tuple[str, ...]:
         """Names of the lengths that occur."""
-        return tuple(dict.fromkeys(name for m in self.monomials for name, _ in m.powers))
+        return tuple(
+            dict.fromkeys(name for m in self.monomials for name, _ in m.powers)
+        )
 
     def factored(self) -> tuple[bool, Monomial, tuple[Monomial, ...]]:
         """Return whether it is negative, its common factor, and the remaining sum."""
@@ -49,19 +51,27 @@ class Coefficient:
         rest = tuple(
             Monomial(
                 (-m.number if negative else m.number) / common,
-                tuple((s, e.get(s, 0) - least[s]) for s in least if e.get(s, 0) != least[s]),
+                tuple(
+                    (s, e.get(s, 0) - least[s])
+                    for s in least
+                    if e.get(s, 0) != least[s]
+                ),
             )
             for m, e in zip(self.monomials, exponents, strict=True)
         )
-        return negative, Monomial(common, tuple((s, e) for s, e in least.items() if e)), rest
+        return (
+            negative,
+            Monomial(common, tuple((s, e) for s, e in least.items() if e)),
+            rest,
+        )
 
 
 @dataclass(frozen=True)
 class Expression:
     """A base parameter as a combination of standard parameters; `str` makes it readable."""
 
-    # Standard parameters in the order of their columns, with their coefficients. The first one
-    # leads the base parameter and has the coefficient 1
+    # Standard parameters in the order of their columns, with their coefficients. The
+    # first one leads the base parameter and has the coefficient 1
     terms: tuple[tuple[str, Coefficient], ...]
 
     @property
@@ -70,7 +80,8 @@ class Expression:
         return tuple(dict.fromkeys(s for _, c in self.terms for s in c.symbols))
 
     def __str__(self):
-        # Parameters that share a factor are put in one bracket, at the place of the first of them.
+        # Parameters that share a factor are put in one bracket, at the place of the
+        # first of them.
         groups: dict[tuple, list[tuple[bool, str]]] = {}
         for name, coefficient in self.terms:
             negative, factor, rest = coefficient.factored()
@@ -88,17 +99,29 @@ def _part(
     names = _sum([(sign != negative, name) for sign, name in members])
     above, below = _factors(factor)
     if len(rest) > 1:
-        inner = ((m.number < 0, _factors(Monomial(abs(m.number), m.powers))) for m in rest)
-        above.append(f"({_sum([(sign, _product(*factors)) for sign, factors in inner])})")
-    return negative, _product([*above, f"({names})" if len(members) > 1 else names], below)
+        inner = (
+            (m.number < 0, _factors(Monomial(abs(m.number), m.powers))) for m in rest
+        )
+        above.append(
+            f"({_sum([(sign, _product(*factors)) for sign, factors in inner])})"
+        )
+    return negative, _product(
+        [*above, f"({names})" if len(members) > 1 else names], below
+    )
 
 
 def _factors(monomial: Monomial) -> tuple[list[str], list[str]]:
     """Return numerator and denominator; the number must not be negative."""
     above, below = [], []
     if isinstance(monomial.number, Fraction):
-        above += [str(monomial.number.numerator)] if monomial.number.numerator != 1 else []
-        below += [str(monomial.number.denominator)] if monomial.number.denominator != 1 else []
+        above += (
+            [str(monomial.number.numerator)] if monomial.number.numerator != 1 else []
+        )
+        below += (
+            [str(monomial.number.denominator)]
+            if monomial.number.denominator != 1
+            else []
+        )
     else:
         above.append(f"{monomial.number:.6g}")
     for name, exponent in monomial.powers:

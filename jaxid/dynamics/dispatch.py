@@ -1,8 +1,9 @@
 """Methods for one sample applied to many: in NumPy for few samples, in compiled blocks for many.
 
-A method of a model is traced once into a scalar program, with numbers of the model that JAX is
-tracing, or in which models differ, as inputs; the programs of the models that were used last are
-kept. Derivatives take the model's spatial form, which is a short program on whole arrays.
+A method of a model is traced once into a scalar program, with numbers of the model that
+JAX is tracing, or in which models differ, as inputs; the programs of the models that
+were used last are kept. Derivatives take the model's spatial form, which is a short
+program on whole arrays.
 """
 
 import functools
@@ -18,7 +19,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Array, Float, Joints, Numbers, as_array, content, is_traced
+from jaxid.arrays import (
+    AnyArray,
+    Array,
+    Float,
+    Joints,
+    Numbers,
+    as_array,
+    content,
+    is_traced,
+)
 from jaxid.errors import InputError
 from jaxid.program import Program, evaluate, evaluate_rows, packed_entries, trace
 from jaxid.program.blocks import BLOCK, on_rows
@@ -42,7 +52,9 @@ class OpenModel(eqx.Module):
             order = np.arange(fixed.size)
             order[list(positions)] = fixed.size + np.arange(len(positions))
             own = numbers[begun : begun + len(positions)]
-            leaves[leaf] = jnp.concatenate([fixed.ravel(), own])[order].reshape(fixed.shape)
+            leaves[leaf] = jnp.concatenate([fixed.ravel(), own])[order].reshape(
+                fixed.shape
+            )
             begun += len(positions)
         return getattr(jax.tree.unflatten(structure, leaves), self.method)(*arguments)
 
@@ -96,8 +108,9 @@ def spatial_form(owner: Any) -> Any:
 class SampleMethod:
     """A method for one sample: its program, and the function that is differentiated.
 
-    An owner may have a method `derived_program(name, *shapes)`, which returns the program of its
-    method of that name if it follows from the program of another model, or None.
+    An owner may have a method `derived_program(name, *shapes)`, which returns the
+    program of its method of that name if it follows from the program of another model,
+    or None.
     """
 
     owner: Any  # model, whose numbers become constants of the program
@@ -172,7 +185,9 @@ _methods: OrderedDict[tuple, SampleMethod] = OrderedDict()
 _lock = threading.Lock()
 
 
-def method_of(owner: eqx.Module, definition: Callable, *shapes: tuple[int, ...]) -> SampleMethod:
+def method_of(
+    owner: eqx.Module, definition: Callable, *shapes: tuple[int, ...]
+) -> SampleMethod:
     """Return a method of a model of known geometry; those that were used last are kept."""
     key = (definition.__name__, shapes, *content(owner))
     with _lock:
@@ -183,18 +198,24 @@ def method_of(owner: eqx.Module, definition: Callable, *shapes: tuple[int, ...])
     return method
 
 
-def program_of(owner: eqx.Module, definition: Callable, *shapes: tuple[int, ...]) -> Program:
+def program_of(
+    owner: eqx.Module, definition: Callable, *shapes: tuple[int, ...]
+) -> Program:
     """Return the scalar program of a method of a model; see `method_of`."""
     return method_of(owner, definition, *shapes).program
 
 
 def on_samples(
-    owner: eqx.Module, definition: Callable, *samples: AnyArray, shared: tuple[Numbers, ...] = ()
+    owner: eqx.Module,
+    definition: Callable,
+    *samples: AnyArray,
+    shared: tuple[Numbers, ...] = (),
 ) -> AnyArray:
     """Apply a method for one sample to arrays with any leading batch axes.
 
-    NumPy arrays give a NumPy array; arrays of JAX one on their device. The method takes first the
-    `shared` parameters, which all samples have in common or which have batch axes too.
+    NumPy arrays give a NumPy array; arrays of JAX one on their device. The method takes
+    first the `shared` parameters, which all samples have in common or which have batch
+    axes too.
     """
     if is_traced(owner):
         owner, (numbers,) = opened(definition.__name__, owner)
@@ -205,7 +226,8 @@ def on_samples(
     except ValueError:
         shapes = ", ".join(str(x.shape) for x in arrays)
         raise InputError(
-            f"leading axes of parameters and motion must fit each other, but shapes are {shapes}."
+            "leading axes of parameters and motion must fit each other, but shapes "
+            f"are {shapes}."
         ) from None
     shapes = tuple(x.shape[-1:] for x in arrays)
     method = method_of(owner, definition, *shapes)
@@ -215,11 +237,15 @@ def on_samples(
     devices = {d for x in in_jax for d in x.devices()} if known else set()
     dtype = jnp.result_type(*(x.dtype for x in arrays), float)
     if few and len(devices) <= 1 and all(d.platform == "cpu" for d in devices):
-        out = _in_numpy(method.program, arrays, batch).reshape((*batch, *method.output_shape))
+        out = _in_numpy(method.program, arrays, batch).reshape(
+            (*batch, *method.output_shape)
+        )
         with jax.default_device(*devices or (None,)):
             return jnp.asarray(out, dtype) if in_jax else out
     run = method.compiled if known else method.on_rows
-    out = _over_batches(run, batch, [jnp.asarray(x, dtype) for x in arrays], len(shared))
+    out = _over_batches(
+        run, batch, [jnp.asarray(x, dtype) for x in arrays], len(shared)
+    )
     return np.asarray(out) if known and not in_jax else out
 
 
@@ -237,7 +263,9 @@ def _in_numpy(program: Program, arrays: list, batch: tuple[int, ...]) -> np.ndar
     return out
 
 
-def _over_batches(run: Callable, batch: tuple[int, ...], arrays: list[Array], shared: int) -> Array:
+def _over_batches(
+    run: Callable, batch: tuple[int, ...], arrays: list[Array], shared: int
+) -> Array:
     """Apply a function of rows of samples, by `vmap` over the leading axes of parameters."""
     ranks = [x.ndim - 1 for x in arrays[:shared]]
     if not any(ranks):
@@ -253,14 +281,20 @@ def _over_batches(run: Callable, batch: tuple[int, ...], arrays: list[Array], sh
         return _over_batches(run, batch[1:], inner, shared)[None]
 
     def one(*parts: Array) -> Array:
-        given = [x.reshape(x.shape[-1:]) if math.prod(x.shape[:-1]) == 1 else x for x in parts]
+        given = [
+            x.reshape(x.shape[-1:]) if math.prod(x.shape[:-1]) == 1 else x
+            for x in parts
+        ]
         return _over_batches(run, batch[1:], given, shared)
 
     return jax.vmap(one, axes)(*inner)
 
 
 def in_numpy(
-    owner: eqx.Module, definition: Callable, *samples: AnyArray, shared: tuple[AnyArray, ...] = ()
+    owner: eqx.Module,
+    definition: Callable,
+    *samples: AnyArray,
+    shared: tuple[AnyArray, ...] = (),
 ) -> np.ndarray:
     """Apply a method for one sample to rows of samples in NumPy: float64, never compiled."""
     arguments = [np.asarray(x, np.float64) for x in shared]

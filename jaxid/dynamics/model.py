@@ -40,11 +40,12 @@ def _has_memory(x: Any) -> bool:
 class Model(Hashable):
     r"""The equations of motion $\Theta(q, \dot q, \ddot q)\, p = Q_m$ (Eqs. 16, 18).
 
-    The columns stand in the order of the terms, the paper's order by default: bodies, viscous,
-    Coulomb, rotors. Every method takes any leading batch axes, which broadcast, and works under
-    `jit`, `vmap`, `grad`, `jvp` and `scan`, also with respect to the robot's geometry. NumPy arrays
-    give NumPy arrays; arrays of JAX stay on their device. For few samples a method runs in NumPy at
-    once; for many it is compiled for the robot, whose numbers are then constants: write
+    The columns stand in the order of the terms, the paper's order by default: bodies,
+    viscous, Coulomb, rotors. Every method takes any leading batch axes, which
+    broadcast, and works under `jit`, `vmap`, `grad`, `jvp` and `scan`, also with
+    respect to the robot's geometry. NumPy arrays give NumPy arrays; arrays of JAX stay
+    on their device. For few samples a method runs in NumPy at once; for many it is
+    compiled for the robot, whose numbers are then constants: write
     `jax.jit(model.regressor)` rather than pass the model to what is compiled.
 
     Attributes:
@@ -62,7 +63,8 @@ class Model(Hashable):
         if len(set(names)) != len(names):
             twice = next(n for n in names if names.count(n) > 1)
             raise InputError(
-                f"`terms` must not contribute the same parameter twice, but `{twice}` comes twice."
+                f"`terms` must not contribute the same parameter twice, but `{twice}` "
+                "comes twice."
             )
 
     @property
@@ -96,10 +98,13 @@ class Model(Hashable):
         sizes = [len(term.parameters(self.robot)) for term in self.terms]
         if p.shape != (sum(sizes),):
             raise InputError(
-                f"`p` must hold {sum(sizes)} standard parameters, but has shape {p.shape}."
+                f"`p` must hold {sum(sizes)} standard parameters, but has shape "
+                f"{p.shape}."
             )
         ends = np.cumsum(sizes)
-        return [(t, p[e - s : e]) for t, s, e in zip(self.terms, sizes, ends, strict=True)]
+        return [
+            (t, p[e - s : e]) for t, s, e in zip(self.terms, sizes, ends, strict=True)
+        ]
 
     @property
     def memory(self) -> Presliding | None:
@@ -108,7 +113,11 @@ class Model(Hashable):
         Raises:
             InputError: If terms have different lengths.
         """
-        laws = {x for x in jax.tree.leaves(self.terms, is_leaf=_has_memory) if _has_memory(x)}
+        laws = {
+            x
+            for x in jax.tree.leaves(self.terms, is_leaf=_has_memory)
+            if _has_memory(x)
+        }
         if len(laws) > 1:
             raise InputError("all terms with `Presliding` must have the same one.")
         return next(iter(laws), None)
@@ -122,13 +131,16 @@ class Model(Hashable):
     def with_memory(self, **changes: Any) -> "Model":
         """Return the model with other fields of `memory`, such as `length` or `state`."""
         leaves, tree = jax.tree.flatten(self.terms, is_leaf=_has_memory)
-        leaves = [dataclasses.replace(x, **changes) if _has_memory(x) else x for x in leaves]
+        leaves = [
+            dataclasses.replace(x, **changes) if _has_memory(x) else x for x in leaves
+        ]
         return dataclasses.replace(self, terms=jax.tree.unflatten(tree, leaves))
 
     def arguments(self, motion: Motion) -> tuple[AnyArray, ...]:
         """Return the arguments of `columns` at a motion: with the state if friction has memory.
 
-        Where a motion does not have the state, its samples are a path in the order of time.
+        Where a motion does not have the state, its samples are a path in the order of
+        time.
         """
         self.check(motion.q)
         law, qd, s = self.memory, motion.qd, motion.state
@@ -142,12 +154,16 @@ class Model(Hashable):
     def columns(self, q, qd, qdd, s=None) -> Float[AnyArray, "joints standard"]:
         r"""Return the regressor $\Theta$ of one sample by definition (Eqs. 16, 18)."""
         terms = self.terms if s is None else self.with_memory(state=s).terms
-        return jnp.concatenate([t.columns(self.robot, q, qd, qdd) for t in terms], axis=1)
+        return jnp.concatenate(
+            [t.columns(self.robot, q, qd, qdd) for t in terms], axis=1
+        )
 
     def forces(self, p, q, qd, qdd, s=None) -> Joints:
         """Return the generalised forces of one sample by definition (Eqs. 11, 15)."""
         own = self if s is None else self.with_memory(state=s)
-        return reduce(add, (t.forces(self.robot, x, q, qd, qdd) for t, x in own.split(p)))
+        return reduce(
+            add, (t.forces(self.robot, x, q, qd, qdd) for t, x in own.split(p))
+        )
 
     def inertia(self, p, q) -> Float[AnyArray, "joints joints"]:
         """Return the mass matrix of one sample by definition (Eq. 38)."""
@@ -163,7 +179,9 @@ class Model(Hashable):
 
     def potential(self, p, q) -> Float[AnyArray, ""]:
         """Return the potential energy of one sample by definition."""
-        return reduce(add, (t.potential_columns(self.robot, q) @ x for t, x in self.split(p)))
+        return reduce(
+            add, (t.potential_columns(self.robot, q) @ x for t, x in self.split(p))
+        )
 
     @property
     def spatial_form(self) -> "SpatialModel":
@@ -177,7 +195,9 @@ class Model(Hashable):
             return jnp.zeros_like(q)
         known = tool.parameters
         bodies = range(self.robot.joints)
-        p = namespace(known).stack([known if i == tool.body else np.zeros(10) for i in bodies])
+        p = namespace(known).stack(
+            [known if i == tool.body else np.zeros(10) for i in bodies]
+        )
         return projection_equation.rigid_body_forces(self.robot, p, q, qd, qdd)
 
     def regressor(self, motion: Motion) -> Float[AnyArray, "*batch joints standard"]:
@@ -191,14 +211,15 @@ class Model(Hashable):
     def packed_regressor(self, motion: Motion) -> PackedRegressor:
         r"""Return the stacked regressor $\bar\Theta$ of many samples without its zeros (Eq. 26).
 
-        Several times as fast as `regressor`, whose dense matrix costs more than its entries.
+        Several times as fast as `regressor`, whose dense matrix costs more than its
+        entries.
 
         Args:
             motion: Joint motion [samples, joints].
 
         Raises:
-            InputError: If the motion does not have one axis of samples, or JAX is tracing the
-                robot's geometry.
+            InputError: If the motion does not have one axis of samples, or JAX is
+                tracing the robot's geometry.
         """
         return PackedRegressor(self, self.columns, *self.arguments(motion))
 
@@ -215,7 +236,9 @@ class Model(Hashable):
         """
         return gram(self, self.columns, weights, *self.arguments(motion))
 
-    def inverse_dynamics(self, p: Parameters, motion: Motion) -> Float[AnyArray, "*batch joints"]:
+    def inverse_dynamics(
+        self, p: Parameters, motion: Motion
+    ) -> Float[AnyArray, "*batch joints"]:
         r"""Return the generalised forces $\Theta p$ [N m or N], without forming $\Theta$ (Eq. 16).
 
         Args:
@@ -224,7 +247,9 @@ class Model(Hashable):
         """
         return on_samples(self, self.forces, *self.arguments(motion), shared=(p,))
 
-    def mass_matrix(self, p: Parameters, q: Coordinates) -> Float[AnyArray, "*batch joints joints"]:
+    def mass_matrix(
+        self, p: Parameters, q: Coordinates
+    ) -> Float[AnyArray, "*batch joints joints"]:
         r"""Return the mass matrix $M(q)$, rotors included (Eq. 38).
 
         Args:
@@ -266,7 +291,9 @@ class Model(Hashable):
         M, qd = self.mass_matrix(p, q), self.check(qd)
         return 0.5 * jnp.einsum("...i,...ij,...j->...", qd, M, qd)
 
-    def potential_energy(self, p: Parameters, q: Coordinates) -> Float[AnyArray, "*batch"]:
+    def potential_energy(
+        self, p: Parameters, q: Coordinates
+    ) -> Float[AnyArray, "*batch"]:
         """Return the potential energy of gravity and springs [J], zero at the ground's origin."""
         return on_samples(self, self.potential, self.check(q), shared=(p,))
 
@@ -284,7 +311,8 @@ class Model(Hashable):
         q = as_array("q", q)
         if q.shape[-1:] != (self.robot.joints,):
             raise InputError(
-                f"`motion` must have {self.robot.joints} joints along its last axis, but has shape "
+                f"`motion` must have {self.robot.joints} joints along its last axis, "
+                "but has shape "
                 f"{q.shape}."
             )
         return q

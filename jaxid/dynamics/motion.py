@@ -8,7 +8,8 @@ from jaxid.arrays import AnyArray, Float, as_array
 
 
 def _coordinates(value: Any) -> AnyArray:
-    # Only lists: trees of what is no array, such as `in_axes` of `vmap`, stay as they are.
+    # Only lists: trees of what is no array, such as `in_axes` of `vmap`, stay as they
+    # are.
     return as_array("motion", value) if isinstance(value, list | tuple) else value
 
 

@@ -1,6 +1,7 @@
 """Regressor of many samples without its zeros: evaluated joint by joint, or stacked and packed.
 
-A joint feels only the bodies beyond it, so most entries of a regressor are zero for every motion.
+A joint feels only the bodies beyond it, so most entries of a regressor are zero for
+every motion.
 """
 
 import functools
@@ -13,7 +14,14 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Array, Float, as_array, is_traced
 from jaxid.errors import InputError
-from jaxid.program import Lowered, Program, evaluate_rows, lower, on_any_platform, packed_entries
+from jaxid.program import (
+    Lowered,
+    Program,
+    evaluate_rows,
+    lower,
+    on_any_platform,
+    packed_entries,
+)
 from jaxid.program.blocks import row_products
 
 from .dispatch import FEW, KEPT, program_of
@@ -27,7 +35,9 @@ class JointRegressor(eqx.Module):
     columns: tuple[tuple[int, ...], ...] = eqx.field(static=True)
     size: int = eqx.field(static=True)  # number of columns
 
-    def __init__(self, owner: eqx.Module, definition: Callable, *shapes: tuple[int, ...]):
+    def __init__(
+        self, owner: eqx.Module, definition: Callable, *shapes: tuple[int, ...]
+    ):
         self.program = program_of(owner, definition, *shapes)
         rows = np.asarray(self.program.nonzeros)
         self.columns = tuple(tuple(np.flatnonzero(row).tolist()) for row in rows)
@@ -50,9 +60,13 @@ class JointRegressor(eqx.Module):
         ]
         return [jnp.stack(own, axis=-2) if own else none for own in rows]
 
-    def gram(self, weights: AnyArray, *arrays: AnyArray) -> Float[Array, "columns columns"]:
+    def gram(
+        self, weights: AnyArray, *arrays: AnyArray
+    ) -> Float[Array, "columns columns"]:
         r"""Return $\sum_k \Theta_k^T W^2 \Theta_k$ over samples, without storing the columns."""
-        groups = tuple(tuple(j * self.size + k for k in own) for j, own in enumerate(self.columns))
+        groups = tuple(
+            tuple(j * self.size + k for k in own) for j, own in enumerate(self.columns)
+        )
         whole = jnp.zeros((self.size, self.size), arrays[0].dtype)
         sums = row_products(self.program, groups, *map(jnp.asarray, arrays))
         for own, w, products in zip(self.columns, weights, sums, strict=True):
@@ -66,7 +80,9 @@ class JointRegressor(eqx.Module):
         rows = evaluate_rows(program, *arrays)
         for joint, own in enumerate(self.columns):
             entries = joint * self.size + np.array(own, int)
-            found.append(packed_entries(program, rows, entries).reshape(len(own), *batch))
+            found.append(
+                packed_entries(program, rows, entries).reshape(len(own), *batch)
+            )
         return found
 
 
@@ -88,7 +104,9 @@ def gram(
 
 def _require_rows(owner: eqx.Module, q: AnyArray) -> int:
     if q.ndim != 2:
-        raise InputError(f"`motion` must have the shape [samples, joints], but has {q.shape}.")
+        raise InputError(
+            f"`motion` must have the shape [samples, joints], but has {q.shape}."
+        )
     if is_traced(owner):
         raise InputError(
             "a packed regressor needs a robot whose geometry is known: use `regressor`."
@@ -99,13 +117,13 @@ def _require_rows(owner: eqx.Module, q: AnyArray) -> int:
 class PackedRegressor(eqx.Module):
     r"""Stacked regressor $\bar\Theta$ as the entries that are not always zero (Eq. 26).
 
-    It has one array over the samples for each entry that varies, and writes zeros only into the
-    `matrix`.
+    It has one array over the samples for each entry that varies, and writes zeros only
+    into the `matrix`.
 
     Attributes:
         values: Distinct entries that vary with the motion, over the samples.
-        places: For each joint the pairs of a column and either the number of its array in `values`
-            or its constant, a float.
+        places: For each joint the pairs of a column and either the number of its array
+            in `values` or its constant, a float.
         samples: Number of samples.
         columns: Number of parameters.
     """
@@ -129,7 +147,8 @@ class PackedRegressor(eqx.Module):
     def matrix(self) -> Float[np.ndarray, "rows columns"]:
         """Return the whole matrix in Fortran's order: all samples of joint 1, of joint 2, etc.
 
-        `packed.matrix().reshape(joints, samples, columns)` is a view by joint and sample.
+        `packed.matrix().reshape(joints, samples, columns)` is a view by joint and
+        sample.
         """
         dtype = np.result_type(*(x.dtype for x in self.values), np.float32)
         out = np.zeros((self.columns, len(self.places), self.samples), dtype)
@@ -146,7 +165,8 @@ def _places(program: Program) -> tuple[tuple[tuple[int, int | float], ...], ...]
     entries = program.pack(range(len(program.distinct[0])))
     rows = np.array(entries, object).reshape(program.output_shapes[0])
     return tuple(
-        tuple((k, x) for k, x in enumerate(row) if isinstance(x, int) or x != 0) for row in rows
+        tuple((k, x) for k, x in enumerate(row) if isinstance(x, int) or x != 0)
+        for row in rows
     )
 
 

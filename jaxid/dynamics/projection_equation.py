@@ -1,11 +1,12 @@
 r"""The Projection Equation for one sample, on 3-vectors (Eqs. 1-12), written once.
 
-One recursion from the ground to the tips gives every body's angular velocity, angular acceleration
-and the acceleration $a = \dot v_o + \tilde\omega v_o - g$ of its origin, in the body's own frame.
-That is all that the regressor of a body needs (Eq. 10). The Jacobian that projects it into the
-space of the joints (Eqs. 5-7) is $\partial (v_o, \omega) / \partial \dot q$, and since $a$ and
-$\dot\omega$ are affine in $\ddot q$ with the same factors, it is taken from them: the velocity of
-the origin itself is never formed. Everything else is a derivative of this recursion.
+One recursion from the ground to the tips gives every body's angular velocity, angular
+acceleration and the acceleration $a = \dot v_o + \tilde\omega v_o - g$ of its origin,
+in the body's own frame. That is all that the regressor of a body needs (Eq. 10). The
+Jacobian that projects it into the space of the joints (Eqs. 5-7) is $\partial (v_o,
+\omega) / \partial \dot q$, and since $a$ and $\dot\omega$ are affine in $\ddot q$ with
+the same factors, it is taken from them: the velocity of the origin itself is never
+formed. Everything else is a derivative of this recursion.
 """
 
 import jax
@@ -27,8 +28,8 @@ def body_motions(
     r"""Return the motion of every body in its own frame: $(a, \omega, \dot\omega)$ (Eqs. 6, 8).
 
     Returns:
-        For each body the acceleration of its origin less gravity [m/s²], its angular velocity
-        [rad/s] and its angular acceleration [rad/s²].
+        For each body the acceleration of its origin less gravity [m/s²], its angular
+        velocity [rad/s] and its angular acceleration [rad/s²].
     """
     motions: list[tuple[Vector, Vector, Vector]] = []
     ground = (-robot.gravity, np.zeros(3), np.zeros(3))
@@ -65,8 +66,9 @@ def momentum_matrix(w: Vector) -> Float[AnyArray, "3 6"]:
 def body_regressor(a: Vector, w: Vector, wd: Vector) -> Float[AnyArray, "6 10"]:
     r"""Return the regressor $\bar\Theta_i$ of one free body (Eq. 10).
 
-    Multiplied with the body's parameters $p_i = (m, m r_c, A, B, C, D, E, F)$ it gives the force
-    [N] and the moment [N m] that the motion asks for at the body's origin, in the body's frame.
+    Multiplied with the body's parameters $p_i = (m, m r_c, A, B, C, D, E, F)$ it gives
+    the force [N] and the moment [N m] that the motion asks for at the body's origin, in
+    the body's frame.
 
     Args:
         a: Acceleration of the origin less gravity [m/s²].
@@ -74,7 +76,11 @@ def body_regressor(a: Vector, w: Vector, wd: Vector) -> Float[AnyArray, "6 10"]:
         wd: Angular acceleration [rad/s²].
     """
     force = [a[:, None], skew(wd) + skew(w) @ skew(w), np.zeros((3, 6))]
-    moment = [np.zeros((3, 1)), -skew(a), momentum_matrix(wd) + skew(w) @ momentum_matrix(w)]
+    moment = [
+        np.zeros((3, 1)),
+        -skew(a),
+        momentum_matrix(wd) + skew(w) @ momentum_matrix(w),
+    ]
     return jnp.block([force, moment])
 
 
@@ -96,8 +102,8 @@ def rigid_body_forces(
 ) -> Joints:
     r"""Return the generalised forces $\sum_i F_{o,i}^T \bar\Theta_i p_i$ [N m or N] (Eq. 11).
 
-    The projection is the transpose of the map that gives the accelerations: it is applied, and the
-    Jacobian is never built.
+    The projection is the transpose of the map that gives the accelerations: it is
+    applied, and the Jacobian is never built.
     """
     motions = body_motions(robot, q, qd, qdd)
     wrenches = [body_regressor(*m) @ p[i] for i, m in enumerate(motions)]
@@ -110,10 +116,10 @@ def rigid_body_mass_matrix(
 ) -> Float[AnyArray, "joints joints"]:
     r"""Return the mass matrix $\sum_i F_{o,i}^T M_i F_{o,i}$ (Eq. 38) by composite bodies.
 
-    All bodies beyond a joint move as one when that joint alone moves. Mass, first moment and
-    inertia of these composite bodies are summed from the tips to the ground; the wrench that one
-    of them needs for a unit acceleration of its joint is carried to the ground and felt by every
-    joint on the way.
+    All bodies beyond a joint move as one when that joint alone moves. Mass, first
+    moment and inertia of these composite bodies are summed from the tips to the ground;
+    the wrench that one of them needs for a unit acceleration of its joint is carried to
+    the ground and felt by every joint on the way.
     """
     n = robot.joints
     frames = [placement_in_parent(robot, i, q[i]) for i in range(n)]
@@ -123,11 +129,15 @@ def rigid_body_mass_matrix(
         m, h, J = composite[i]
         axis = robot.axis[i]
         force, moment = (
-            (-jnp.cross(h, axis), J @ axis) if robot.revolute[i] else (m * axis, jnp.cross(h, axis))
+            (-jnp.cross(h, axis), J @ axis)
+            if robot.revolute[i]
+            else (m * axis, jnp.cross(h, axis))
         )
         j = i
         while True:
-            M[i][j] = M[j][i] = jnp.dot(robot.axis[j], moment if robot.revolute[j] else force)
+            M[i][j] = M[j][i] = jnp.dot(
+                robot.axis[j], moment if robot.revolute[j] else force
+            )
             R, r = frames[j]
             j = robot.parent[j]
             if j < 0:
@@ -139,7 +149,12 @@ def rigid_body_mass_matrix(
             R, r = frames[i]
             h = R @ h
             # Steiner, with r x h terms since h is measured from the old origin.
-            J = R @ J @ R.T - skew(r) @ skew(h) - skew(h) @ skew(r) - m * (skew(r) @ skew(r))
+            J = (
+                R @ J @ R.T
+                - skew(r) @ skew(h)
+                - skew(h) @ skew(r)
+                - m * (skew(r) @ skew(r))
+            )
             mp, hp, Jp = composite[parent]
             composite[parent] = (mp + m, hp + h + m * r, Jp + J)
     return jnp.stack([jnp.stack([jnp.asarray(x) for x in row]) for row in M])
@@ -150,4 +165,6 @@ def potential_energy_columns(robot: Robot, q: Joints) -> Float[AnyArray, "joints
     rotations, origins = placements(robot, q)
     mass = -origins @ robot.gravity
     moment = -jnp.einsum("bij,i->bj", rotations, jnp.asarray(robot.gravity))
-    return jnp.concatenate([mass[:, None], moment, jnp.zeros((robot.joints, 6))], axis=1)
+    return jnp.concatenate(
+        [mass[:, None], moment, jnp.zeros((robot.joints, 6))], axis=1
+    )

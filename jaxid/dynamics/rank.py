@@ -1,8 +1,9 @@
 """Rank of the regressor: columns that depend on those before them (Eqs. 20-22).
 
 Two independent methods: Gram-Schmidt in column order, which is a QR decomposition
-whose dependent columns use up no direction, and the singular values of the whole matrix. Column
-order decides which columns are independent, so that the choice is the same for all motions.
+whose dependent columns use up no direction, and the singular values of the whole
+matrix. Column order decides which columns are independent, so that the choice is the
+same for all motions.
 """
 
 import math
@@ -34,14 +35,19 @@ class Dependence(NamedTuple):
     @property
     def gap(self) -> float:
         """Ratio of the smallest independent measure to the largest dependent one."""
-        return self.smallest_independent / max(self.largest_dependent, np.finfo(float).tiny)
+        return self.smallest_independent / max(
+            self.largest_dependent, np.finfo(float).tiny
+        )
 
 
-def gram_schmidt(W: Float[AnyArray, "rows columns"], tolerance: float = 1e-9) -> Dependence:
+def gram_schmidt(
+    W: Float[AnyArray, "rows columns"], tolerance: float = 1e-9
+) -> Dependence:
     """Orthogonalise the columns in order, twice, each relative to its own norm (Eq. 20).
 
-    A dependent column uses up no direction, unlike in a plain QR decomposition without pivoting,
-    and every column is measured against its own norm. So near-degenerate geometry is still told
+    A dependent column uses up no direction, unlike in a plain QR decomposition without
+    pivoting, and every column is measured against its own norm. So near-degenerate
+    geometry is still told
     apart: an elbow offset of a micrometre.
     """
     rows, columns = W.shape
@@ -57,7 +63,8 @@ def gram_schmidt(W: Float[AnyArray, "rows columns"], tolerance: float = 1e-9) ->
         if norms[k] > ROUNDING * largest and len(independent) < rows:
             w = w / norms[k]
             basis = Q[:, : len(independent)]
-            # Twice is enough unless almost nothing is left; the third pass costs little.
+            # Twice is enough unless almost nothing is left; the third pass costs
+            # little.
             for _ in range(3):
                 w = w - basis @ (basis.T @ w)
             share = float(np.linalg.norm(w))
@@ -71,12 +78,14 @@ def gram_schmidt(W: Float[AnyArray, "rows columns"], tolerance: float = 1e-9) ->
     return Dependence(tuple(independent), tuple(dependent), min(new), max(old))
 
 
-def singular_values(W: Float[AnyArray, "rows columns"], tolerance: float = 1e-6) -> Dependence:
+def singular_values(
+    W: Float[AnyArray, "rows columns"], tolerance: float = 1e-6
+) -> Dependence:
     """Find the null space by a singular value decomposition, the paper's alternative method.
 
-    The rank is where the singular values fall by the largest factor. A column depends on earlier
-    ones if some vector of the null space ends there: the null space is brought into that form by a
-    QR decomposition with its columns reversed.
+    The rank is where the singular values fall by the largest factor. A column depends
+    on earlier ones if some vector of the null space ends there: the null space is
+    brought into that form by a QR decomposition with its columns reversed.
     """
     W = np.asarray(W, np.float64)
     columns = W.shape[1]
@@ -85,16 +94,23 @@ def singular_values(W: Float[AnyArray, "rows columns"], tolerance: float = 1e-6)
     scaled = np.where(live, W / np.where(live, norms, 1.0), 0.0)
     # The triangular factor has the same singular values and null space, and few rows.
     _, s, Vt = np.linalg.svd(np.linalg.qr(scaled, mode="r"), full_matrices=True)
-    s = np.concatenate([s, np.zeros(columns - len(s))]) / max(s[0], np.finfo(float).tiny)
+    s = np.concatenate([s, np.zeros(columns - len(s))]) / max(
+        s[0], np.finfo(float).tiny
+    )
     floored = np.maximum(s, 1e-14)  # all below are rounding
     certain = int(np.count_nonzero(s > tolerance))
     drops = floored[:-1] / floored[1:]
     possible = np.arange(1, columns) >= certain
-    rank = certain if not possible.any() else 1 + int(np.argmax(np.where(possible, drops, 0.0)))
+    rank = (
+        certain
+        if not possible.any()
+        else 1 + int(np.argmax(np.where(possible, drops, 0.0)))
+    )
     rank = min(rank, np.count_nonzero(live))
     null = Vt[rank:]
     dependent: list[int] = []
-    # Eliminate from the last column backwards: a pivot found there is where a vector ends.
+    # Eliminate from the last column backwards: a pivot found there is where a vector
+    # ends.
     for k in reversed(range(columns)):
         if not len(null):
             break
@@ -117,9 +133,9 @@ def regrouping(
 ) -> tuple[Float[np.ndarray, "base dependent"], float, Float[np.ndarray, " base"]]:
     r"""Return $\kappa$ with $\hat\Theta_2 = \hat\Theta_1 \kappa$, and how exact it is (Eq. 22).
 
-    A dependent column is a combination of independent columns before it. Beside $\kappa$ come the
-    largest fraction of a dependent column that it does not explain, and the fraction of each
-    independent column that those before it do not explain.
+    A dependent column is a combination of independent columns before it. Beside
+    $\kappa$ come the largest fraction of a dependent column that it does not explain,
+    and the fraction of each independent column that those before it do not explain.
     """
     W = np.asarray(W, np.float64)
     norms = np.linalg.norm(W, axis=0)
@@ -132,7 +148,8 @@ def regrouping(
     new = np.abs(np.diag(R))
     kappa = np.zeros((len(first), len(second)))
     if len(first) and new.min() > ROUNDING:
-        # The second step takes out most of the rounding that poor conditioning amplifies.
+        # The second step takes out most of the rounding that poor conditioning
+        # amplifies.
         for _ in range(2):
             left = np.where(first[:, None] < second, Q.T @ (W2 - W1 @ kappa), 0.0)
             kappa = kappa + scipy.linalg.solve_triangular(R, left)
@@ -146,9 +163,9 @@ def random_regressor(
 ) -> tuple[Float[np.ndarray, "rows standard"], Float[np.ndarray, " standard"]]:
     r"""Return the regressor at random motions, stacked and free of units: $\Theta_{QR}$ (Eq. 20).
 
-    Lengths are measured in the robot's own size, so that metres or millimetres make no difference.
-    It is computed in float64, whatever the precision in which JAX runs. With it comes for each
-    parameter the factor by which its column was multiplied.
+    Lengths are measured in the robot's own size, so that metres or millimetres make no
+    difference. It is computed in float64, whatever the precision in which JAX runs.
+    With it comes for each parameter the factor by which its column was multiplied.
     """
     samples = max(25, math.ceil(3.0 * model.size / model.robot.joints))
     motion = random_motion(model, samples, seed)
@@ -160,8 +177,8 @@ def random_regressor(
 def random_motion(model: Model, samples: int, seed: int) -> Motion:
     """Return uniformly random coordinates, velocities and accelerations.
 
-    Every second sample is slow, by a random factor down to 1e-3: some friction is visible only
-    there.
+    Every second sample is slow, by a random factor down to 1e-3: some friction is
+    visible only there.
     """
     rng = np.random.default_rng(seed)
     shape = (samples, model.robot.joints)

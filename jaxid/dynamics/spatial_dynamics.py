@@ -1,11 +1,11 @@
 r"""Dynamics of the bodies as few operations on whole arrays, whatever the number of joints.
 
-The Projection Equation of `projection_equation` follows the tree body by body: traced into scalar
-operations it is the fastest program for many samples, but a long one. Here the same equations stand
-in spatial vectors $(\omega; v)$ about the origin of the ground, in its axes, where the recursions
-are products with the matrix that tells which bodies a joint moves (Featherstone, Rigid Body
-Dynamics Algorithms, Secs. 2, 5, 6). This form compiles soon, is differentiated fast, and takes the
-geometry as an input.
+The Projection Equation of `projection_equation` follows the tree body by body: traced
+into scalar operations it is the fastest program for many samples, but a long one. Here
+the same equations stand in spatial vectors $(\omega; v)$ about the origin of the
+ground, in its axes, where the recursions are products with the matrix that tells which
+bodies a joint moves (Featherstone, Rigid Body Dynamics Algorithms, Secs. 2, 5, 6). This
+form compiles soon, is differentiated fast, and takes the geometry as an input.
 """
 
 import jax.numpy as jnp
@@ -86,7 +86,8 @@ def all_placements(robot: Robot, q: Joints) -> Float[Array, "joints 4 4"]:
 
 GroundMotion = tuple[Float[Array, "joints 6 6"], Spatial, Spatial, Spatial]
 """Matrices that carry wrenches from the bodies' frames to the ground (transposed, motions back);
-motion of what a joint moves at unit speed; velocities, and accelerations less gravity."""
+motion of what a joint moves at unit speed; velocities, and accelerations less
+gravity."""
 
 
 def ground_motion(robot: Robot, q: Joints, qd: Joints, qdd: Joints) -> GroundMotion:
@@ -95,7 +96,11 @@ def ground_motion(robot: Robot, q: Joints, qd: Joints, qdd: Joints) -> GroundMot
     R = placed[:, :3, :3]
     arm = _combine(SKEW, placed[:, :3, 3]) @ R
     carry = jnp.concatenate(
-        [jnp.concatenate([R, arm], axis=2), jnp.concatenate([jnp.zeros_like(R), R], axis=2)], axis=1
+        [
+            jnp.concatenate([R, arm], axis=2),
+            jnp.concatenate([jnp.zeros_like(R), R], axis=2),
+        ],
+        axis=1,
     )
     turns, axis = np.array(robot.revolute)[:, None], jnp.asarray(robot.axis, dtype)
     turning, sliding = jnp.where(turns, axis, 0.0), jnp.where(turns, 0.0, axis)
@@ -114,7 +119,9 @@ def ground_inertias(p: Bodies, carry: Array) -> Float[Array, "joints 6 6"]:
     return carry @ _combine(INERTIA, p) @ jnp.swapaxes(carry, 1, 2)
 
 
-def spatial_forces(robot: Robot, p: Bodies, q: Joints, qd: Joints, qdd: Joints) -> Joints:
+def spatial_forces(
+    robot: Robot, p: Bodies, q: Joints, qd: Joints, qdd: Joints
+) -> Joints:
     """Return the generalised forces of all bodies [N m or N] (Eq. 11)."""
     x = ground_motion(robot, q, qd, qdd)
     return _projected_wrenches(robot, ground_inertias(p, x[0]), x)

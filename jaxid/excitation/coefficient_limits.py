@@ -1,7 +1,8 @@
 """Limits of the joints as matrices: linear in the coefficients, and certified for all times.
 
-The coefficients x of a trajectory are scaled, x = scale * y, so that each y alone meets a limit
-near one. All rows are scaled alike: a motion keeps its limits if |R y - c| <= 1 in every row.
+The coefficients x of a trajectory are scaled, x = scale * y, so that each y alone meets
+a limit near one. All rows are scaled alike: a motion keeps its limits if |R y - c| <= 1
+in every row.
 """
 
 import itertools
@@ -22,29 +23,39 @@ from jaxid.trajectory.trajectory import AbstractBasis
 class Grid(NamedTuple):
     """Limits of all joints on a grid of times."""
 
-    # rows by scaled coefficients, for each joint first positions, then the higher orders
+    # rows by scaled coefficients, for each joint first positions, then the higher
+    # orders
     R: Float[np.ndarray, "joints rows variables"]
-    c: Float[np.ndarray, "joints rows"]  # centres of the ranges, for positions; zero for the rest
-    kinds: tuple[range, ...]  # rows of positions, velocities, accelerations, and jerks if limited
+    c: Float[
+        np.ndarray, "joints rows"
+    ]  # centres of the ranges, for positions; zero for the rest
+    kinds: tuple[
+        range, ...
+    ]  # rows of positions, velocities, accelerations, and jerks if limited
     bound: float  # bound of |R y - c| with which the limits hold at all times
     # scaled coefficients of a constant motion at half of each joint's range
     constant: Float[np.ndarray, "joints variables"]
 
     def rows(self, y: Float[AnyArray, " scaled"]) -> Float[AnyArray, "joints rows"]:
         """Return the rows of a motion, R y."""
-        return namespace(y).einsum("jrk,jk->jr", self.R, y.reshape(np.shape(self.constant)))
+        return namespace(y).einsum(
+            "jrk,jk->jr", self.R, y.reshape(np.shape(self.constant))
+        )
 
     def use(self, y: Float[AnyArray, " scaled"]) -> Float[AnyArray, "joints rows"]:
         """Return the used fractions of the limits, with the sign of the direction."""
         return (self.rows(y) - self.c) / self.bound
 
     def scale_into_limits(
-        self, y: Float[AnyArray, " scaled"], bound: Any | None = None, growth: float = 1.0
+        self,
+        y: Float[AnyArray, " scaled"],
+        bound: Any | None = None,
+        growth: float = 1.0,
     ) -> Float[AnyArray, " scaled"]:
         """Return the nearest motion of the same shape that keeps |R y - c| <= bound.
 
-        Each joint's motion is scaled about its mean, where limits leave room by up to `growth`,
-        then shifted into its range.
+        Each joint's motion is scaled about its mean, where limits leave room by up to
+        `growth`, then shifted into its range.
         """
         xp, bound = namespace(y), self.bound if bound is None else bound
         q, peak = self._positions(y)
@@ -53,13 +64,18 @@ class Grid(NamedTuple):
         shift = xp.clip((1.0 - s) * q.mean(axis=1), low, xp.maximum(low, high))
         return self._moved(y, s, shift)
 
-    def shrink(self, y: Float[AnyArray, " scaled"], fraction: Any) -> Float[AnyArray, " scaled"]:
+    def shrink(
+        self, y: Float[AnyArray, " scaled"], fraction: Any
+    ) -> Float[AnyArray, " scaled"]:
         """Return a motion made smaller by a factor, each joint's about its mean position."""
         q, _ = self._positions(y)
         return self._moved(y, fraction, (1.0 - fraction) * q.mean(axis=1))
 
     def fill(
-        self, y: Float[AnyArray, " scaled"], places: Float[AnyArray, " joints"], size: Any
+        self,
+        y: Float[AnyArray, " scaled"],
+        places: Float[AnyArray, " joints"],
+        size: Any,
     ) -> Float[AnyArray, " scaled"]:
         """Return a motion of the same shape that fills a fraction of 95 % of its limits.
 
@@ -102,11 +118,13 @@ class JointLimits(eqx.Module):
     Attributes:
         limits: Finite ranges, speeds and accelerations; a jerk may be infinite.
         scale: Scale of the coefficients, x = scale * y.
-        constant: Scaled coefficients of a constant motion at half of each joint's range.
+        constant: Scaled coefficients of a constant motion at half of each joint's
+            range.
         assumed: Fields of the limits and joints (from 0) whose numbers were not given.
 
     Raises:
-        InputError: If no trajectory of the basis stands still anywhere else than at zero.
+        InputError: If no trajectory of the basis stands still anywhere else than at
+            zero.
     """
 
     basis: AbstractBasis
@@ -115,7 +133,9 @@ class JointLimits(eqx.Module):
     constant: Float[AnyArray, "joints variables"]
     assumed: tuple[tuple[str, int], ...] = eqx.field(static=True)
 
-    def __init__(self, robot: Robot, basis: AbstractBasis, limits: Limits | None = None):
+    def __init__(
+        self, robot: Robot, basis: AbstractBasis, limits: Limits | None = None
+    ):
         limits = robot.limits if limits is None else limits
         self.basis, self.limits = basis, complete_limits(robot.replace(limits=limits))
         self.assumed = tuple(
@@ -128,9 +148,13 @@ class JointLimits(eqx.Module):
         with np.errstate(divide="ignore"):
             self.scale = np.min(self._sizes[:, :, None] / reach[:, None, :], axis=0)
         one = np.linalg.lstsq(rows[0], np.ones(len(rows[0])), rcond=None)[0]
-        if np.abs(rows[0] @ one - 1.0).max() > 1e-9 or np.abs(rows[1] @ one).max() > 1e-9:
+        if (
+            np.abs(rows[0] @ one - 1.0).max() > 1e-9
+            or np.abs(rows[1] @ one).max() > 1e-9
+        ):
             raise InputError(
-                "`basis` must hold a constant, for motions that stand still at any position."
+                "`basis` must hold a constant, for motions that stand still at any "
+                "position."
             )
         self.constant = self._sizes[0][:, None] * one[None] / self.scale
 
@@ -154,7 +178,9 @@ class JointLimits(eqx.Module):
         scale = np.asarray(self.scale)[(None,) * (y.ndim - 1)]
         return y.reshape((*y.shape[:-1], *self.shape)) * scale
 
-    def scaled(self, x: Float[AnyArray, "joints variables"]) -> Float[np.ndarray, " scaled"]:
+    def scaled(
+        self, x: Float[AnyArray, "joints variables"]
+    ) -> Float[np.ndarray, " scaled"]:
         """Return the scaled coefficients of a trajectory."""
         return (np.asarray(x) / np.asarray(self.scale)).ravel()
 
@@ -163,19 +189,28 @@ class JointLimits(eqx.Module):
         envelope, factor = self.basis.envelope(scale_samples(points, self.basis))
         size, scale = self._sizes, np.asarray(self.scale)
         orders = 4 if np.isfinite(size[3]).any() else 3
-        R = [scale[:, None] * envelope[k][None] / size[k][:, None, None] for k in range(orders)]
+        R = [
+            scale[:, None] * envelope[k][None] / size[k][:, None, None]
+            for k in range(orders)
+        ]
         ends = itertools.accumulate((part.shape[1] for part in R), initial=0)
         kinds = tuple(range(a, b) for a, b in itertools.pairwise(ends))
         R = np.concatenate(R, axis=1)
-        low, high = np.asarray(self.limits.position_min), np.asarray(self.limits.position_max)
+        low, high = (
+            np.asarray(self.limits.position_min),
+            np.asarray(self.limits.position_max),
+        )
         c = np.zeros(R.shape[:2])
         c[:, kinds[0]] = (0.5 * (low + high) / size[0])[:, None]
         return Grid(R, c, kinds, 1 / factor, np.asarray(self.constant))
 
-    def use(self, x: Float[AnyArray, "joints variables"]) -> Float[np.ndarray, "4 joints"]:
+    def use(
+        self, x: Float[AnyArray, "joints variables"]
+    ) -> Float[np.ndarray, "4 joints"]:
         """Return the largest used fraction of each limit by coefficients, for all times.
 
-        The used fraction of a range is the distance from its middle, over half of the range.
+        The used fraction of a range is the distance from its middle, over half of the
+        range.
         """
         grid, used = self.grid(), np.zeros((4, len(x)))
         rows = grid.use(self.scaled(x))
@@ -192,7 +227,9 @@ class JointLimits(eqx.Module):
         draws = np.asarray(jax.random.normal(shape, (count, joints * variables), float))
         places = np.asarray(jax.random.uniform(place, (count, joints), float))
         fill = self.grid().fill
-        return np.array([fill(y, place, size) for y, place in zip(draws, places, strict=True)])
+        return np.array(
+            [fill(y, place, size) for y, place in zip(draws, places, strict=True)]
+        )
 
 
 def scale_samples(samples: int, basis: AbstractBasis) -> int:

@@ -34,10 +34,12 @@ class Finding(NamedTuple):
         size: Physical size of a constraint's value of 1.
         unit: Physical unit.
         limit: Limit of the quantity in this unit; NaN if it has no name.
-        least: Whether the quantity must not fall below the limit, rather than not rise above it.
+        least: Whether the quantity must not fall below the limit, rather than not rise
+            above it.
         note: Origin of the limit: `12 less a margin of 50 %`.
         value: Relative excess over the limit; negative or zero where it is kept.
-        usage: Function of the relative excess that returns the used fraction of the limit.
+        usage: Function of the relative excess that returns the used fraction of the
+            limit.
     """
 
     name: str
@@ -67,14 +69,20 @@ class Finding(NamedTuple):
     def __str__(self) -> str:
         """Return one sentence."""
         note = f" ({self.note})" if self.note else ""
-        bound = f": at {'least' if self.least else 'most'} {self.limit:.4g} {self.unit}{note}"
+        bound = (
+            f": at {'least' if self.least else 'most'} {self.limit:.4g} "
+            f"{self.unit}{note}"
+        )
         bound = "" if math.isnan(self.limit) else bound
         amount = f"{abs(self.excess):.3g} {self.unit}"
         if self.value <= 0:
             return f"{self.name} keeps its limit with {amount} to spare{bound}"
         if self.least:
             return f"{self.name} falls short of its limit by {amount}{bound}"
-        return f"{self.name} exceeds its limit by {amount} ({100 * self.value:.3g} %){bound}"
+        return (
+            f"{self.name} exceeds its limit by {amount} ({100 * self.value:.3g} "
+            f"%){bound}"
+        )
 
 
 BLOCK = 96
@@ -84,9 +92,9 @@ BLOCK = 96
 class AbstractConstraint(eqx.Module):
     """Limits on a motion that are not linear in the joints' motion.
 
-    Each sample of a motion is evaluated by itself, so that solvers can ask for values and
-    derivatives at any instants. Values are smooth where possible, and relative: in units of the
-    limit, or of another size that `entries` names.
+    Each sample of a motion is evaluated by itself, so that solvers can ask for values
+    and derivatives at any instants. Values are smooth where possible, and relative: in
+    units of the limit, or of another size that `entries` names.
     """
 
     @abstractmethod
@@ -106,7 +114,9 @@ class AbstractConstraint(eqx.Module):
 
     def linearise(
         self, robot: Robot, motion: Motion, chosen: Int[np.ndarray, " samples"]
-    ) -> tuple[Float[np.ndarray, " samples"], list[Float[np.ndarray, "samples joints"]]]:
+    ) -> tuple[
+        Float[np.ndarray, " samples"], list[Float[np.ndarray, "samples joints"]]
+    ]:
         """Return one value of each sample, and its derivatives by q, qd, qdd, in NumPy.
 
         Derivatives by qd and qdd may be left out where values depend on q only.
@@ -118,13 +128,19 @@ class AbstractConstraint(eqx.Module):
         """
         run, samples = _compiled(_Same(self, robot)), len(chosen)
         # Another number of samples would compile anew.
-        padded = np.resize(np.arange(samples), BLOCK * -(-samples // BLOCK)).reshape(-1, BLOCK)
+        padded = np.resize(np.arange(samples), BLOCK * -(-samples // BLOCK)).reshape(
+            -1, BLOCK
+        )
         parts = (chosen, motion.q, motion.qd, motion.qdd)
         found = [run(*(x[block] for x in parts)) for block in padded]
-        values, *slopes = (np.concatenate(x)[:samples] for x in zip(*found, strict=True))
+        values, *slopes = (
+            np.concatenate(x)[:samples] for x in zip(*found, strict=True)
+        )
         return values, slopes
 
-    def describe(self, robot: Robot, values: Float[AnyArray, "*batch values"]) -> list[Finding]:
+    def describe(
+        self, robot: Robot, values: Float[AnyArray, "*batch values"]
+    ) -> list[Finding]:
         """Return the limited quantities with the largest of their values."""
         entries = self.entries(robot)
         peaks = np.asarray(values).reshape(-1, len(entries)).max(axis=0)
@@ -141,7 +157,9 @@ class _Same:
         return hash(tuple(map(id, self.parts)))
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Same) and all(map(operator.is_, self.parts, other.parts))
+        return isinstance(other, _Same) and all(
+            map(operator.is_, self.parts, other.parts)
+        )
 
 
 @functools.lru_cache(maxsize=16)
@@ -198,13 +216,13 @@ def tip_motion(robot: Robot, motion: Motion) -> tuple[Float[AnyArray, "*batch 3"
 class Clearance(AbstractConstraint):
     """Least distance between the surfaces of shapes that must not collide.
 
-    Values count in units of 0.1 m: two shapes that overlap by 0.17 m where 0.03 m are required
-    give 2.
+    Values count in units of 0.1 m: two shapes that overlap by 0.17 m where 0.03 m are
+    required give 2.
 
     Attributes:
         model: Shapes and pairs.
-        distance: Least distance between surfaces [m]; half of the largest one of two bodies that
-            are nearer in every pose.
+        distance: Least distance between surfaces [m]; half of the largest one of two
+            bodies that are nearer in every pose.
     """
 
     model: CollisionModel
@@ -220,16 +238,22 @@ class Clearance(AbstractConstraint):
         gaps = self.model.clearances(self._axes(robot, motion.q))
         return (namespace(gaps).broadcast_to(self.distances, gaps.shape) - gaps) / 0.1
 
-    def _axes(self, robot: Robot, q: AnyArray) -> Float[AnyArray, "*batch capsules 2 3"]:
+    def _axes(
+        self, robot: Robot, q: AnyArray
+    ) -> Float[AnyArray, "*batch capsules 2 3"]:
         ends = eqx.Partial(self.model.ends, robot)
         run = on_samples if isinstance(q, jax.Array) or q.ndim != 2 else in_numpy
         return run(ends, ends.__call__, q)
 
     def linearise(
         self, robot: Robot, motion: Motion, chosen: Int[np.ndarray, " samples"]
-    ) -> tuple[Float[np.ndarray, " samples"], list[Float[np.ndarray, "samples joints"]]]:
+    ) -> tuple[
+        Float[np.ndarray, " samples"], list[Float[np.ndarray, "samples joints"]]
+    ]:
         """Return one missing distance of each sample, and its derivatives, in NumPy."""
-        gaps, slopes = self.model.slopes(np.asarray(self._axes(robot, motion.q)), chosen)
+        gaps, slopes = self.model.slopes(
+            np.asarray(self._axes(robot, motion.q)), chosen
+        )
         ends = eqx.Partial(self.model.ends, robot)
         (by_q,) = _pull(ends, ends.__call__, slopes / -0.1, np.asarray(motion.q))
         return (self.distances[chosen] - gaps) / 0.1, [by_q]
@@ -250,7 +274,9 @@ class Clearance(AbstractConstraint):
                 least=True,
                 usage=functools.partial(usage, distance=distance),
             )
-            for name, distance in zip(self.model.pair_names, self.distances.tolist(), strict=True)
+            for name, distance in zip(
+                self.model.pair_names, self.distances.tolist(), strict=True
+            )
         )
 
 
@@ -261,16 +287,19 @@ def _corner(x: Any) -> np.ndarray:
 class TipLimits(AbstractConstraint):
     """Limits of the end-effector: speed, acceleration, and a box parallel to the axes.
 
-    Values of the box count in half of its edges, or in metres where the opposite side is open.
+    Values of the box count in half of its edges, or in metres where the opposite side
+    is open.
 
     Attributes:
         speed: Largest speed; infinity for none [m/s].
         acceleration: Largest acceleration; infinity for none [m/s²].
-        low: Smallest coordinates of the origin; minus infinity where the box is open [m].
+        low: Smallest coordinates of the origin; minus infinity where the box is open
+            [m].
         high: Largest coordinates; infinity where the box is open [m].
 
     Raises:
-        InputError: If a limit is not positive, or `low` and `high` are no corners of a box.
+        InputError: If a limit is not positive, or `low` and `high` are no corners of a
+            box.
     """
 
     speed: float = math.inf
@@ -281,12 +310,18 @@ class TipLimits(AbstractConstraint):
     def __check_init__(self):
         if not (self.speed > 0 and self.acceleration > 0):
             raise InputError(
-                f"`speed` [m/s] and `acceleration` [m/s²] must be positive, but are {self.speed:g} "
+                "`speed` [m/s] and `acceleration` [m/s²] must be positive, but are "
+                f"{self.speed:g} "
                 f"and {self.acceleration:g}."
             )
-        if self.low.shape != (3,) or self.high.shape != (3,) or not (self.low < self.high).all():
+        if (
+            self.low.shape != (3,)
+            or self.high.shape != (3,)
+            or not (self.low < self.high).all()
+        ):
             raise InputError(
-                "`low` and `high` must hold three numbers each, and `low` the smaller ones, but "
+                "`low` and `high` must hold three numbers each, and `low` the smaller "
+                "ones, but "
                 f"are {self.low} and {self.high} [m]."
             )
 
@@ -294,10 +329,15 @@ class TipLimits(AbstractConstraint):
         """Return the relative excess over each limit."""
         position, velocity, acceleration = tip_motion(robot, motion)
         values = []
-        for vector, limit in ((velocity, self.speed), (acceleration, self.acceleration)):
+        for vector, limit in (
+            (velocity, self.speed),
+            (acceleration, self.acceleration),
+        ):
             if math.isfinite(limit):
                 # Smooth at zero, and there at most 1e-6 too large.
-                values.append(jnp.sqrt(jnp.sum((vector / limit) ** 2, axis=-1) + 1e-6**2) - 1.0)
+                values.append(
+                    jnp.sqrt(jnp.sum((vector / limit) ** 2, axis=-1) + 1e-6**2) - 1.0
+                )
         for axis, sign, end, size in self._sides:
             values.append((sign * position[..., axis] - end) / size)
         return jnp.stack(values, axis=-1)
@@ -305,12 +345,19 @@ class TipLimits(AbstractConstraint):
     def entries(self, robot: Robot) -> tuple[Finding, ...]:
         """Return the quantities that have a limit."""
         found = []
-        rates = {"speed": (self.speed, "m/s"), "acceleration": (self.acceleration, "m/s²")}
+        rates = {
+            "speed": (self.speed, "m/s"),
+            "acceleration": (self.acceleration, "m/s²"),
+        }
         for name, (limit, unit) in rates.items():
             if math.isfinite(limit):
-                found.append(Finding(f"the {name} of the end-effector", limit, unit, limit))
+                found.append(
+                    Finding(f"the {name} of the end-effector", limit, unit, limit)
+                )
         for axis, sign, end, size in self._sides:
-            entry = Finding(f"{'xyz'[axis]} of the end-effector", size, "m", sign * end, sign < 0)
+            entry = Finding(
+                f"{'xyz'[axis]} of the end-effector", size, "m", sign * end, sign < 0
+            )
             if not np.isfinite(self.low[axis] + self.high[axis]):
                 note = "the other side is open"
                 entry = entry._replace(note=note, usage=lambda value: math.nan)
@@ -335,21 +382,22 @@ class ForceLimits(AbstractConstraint):
 
     $$|Q_i| + k\,\sigma_i \le (1 - m)\,Q_{i,max}$$
 
-    The forces are those of nominal parameters; their standard deviation is that of the nominal
-    parameters, propagated through the regressor. Near standstill dry friction counts in the
-    direction that is worse: a joint that reverses passes through both, between any two samples.
-    Joints and motors without a limit are left out.
+    The forces are those of nominal parameters; their standard deviation is that of the
+    nominal parameters, propagated through the regressor. Near standstill dry friction
+    counts in the direction that is worse: a joint that reverses passes through both,
+    between any two samples. Joints and motors without a limit are left out.
 
     Attributes:
         base: Base parameters.
-        parameters: Nominal values of the base parameters: of a CAD model, or of an earlier fit.
+        parameters: Nominal values of the base parameters: of a CAD model, or of an
+            earlier fit.
         covariance: Covariance of the nominal values; None if they count as known.
         margin: Unused fraction $m$ of the limits, from 0 to 1.
         deviations: Number $k$ of standard deviations that must fit below the limits.
 
     Raises:
-        InputError: If there is not one number for each base parameter, or the covariance is not
-            finite.
+        InputError: If there is not one number for each base parameter, or the
+            covariance is not finite.
     """
 
     base: BaseParameters
@@ -357,7 +405,9 @@ class ForceLimits(AbstractConstraint):
         converter=lambda x: np.array(as_array("parameters", x), np.float64)
     )
     covariance: Float[AnyArray, "base base"] | None = eqx.field(
-        converter=lambda x: None if x is None else np.array(as_array("covariance", x), np.float64),
+        converter=lambda x: (
+            None if x is None else np.array(as_array("covariance", x), np.float64)
+        ),
         default=None,
     )
     margin: float = 0.1
@@ -367,15 +417,18 @@ class ForceLimits(AbstractConstraint):
         p, C, size = np.asarray(self.parameters), self.covariance, self.base.size
         if p.shape != (size,) or not np.isfinite(p).all():
             raise InputError(
-                f"`parameters` must hold one finite number for each base parameter ({size}), "
-                f"but has shape {p.shape}: `base.from_standard` makes them of standard ones."
+                "`parameters` must hold one finite number for each base parameter "
+                f"({size}), "
+                f"but has shape {p.shape}: `base.from_standard` makes them of "
+                "standard ones."
             )
         if C is None:
             return
         fits = C.shape == (size, size) and np.isfinite(C).all()
         if not fits or np.linalg.eigvalsh(C)[0] < -1e-9 * np.abs(C).max():
             raise InputError(
-                f"`covariance` must be a finite matrix of {size} rows and columns without "
+                f"`covariance` must be a finite matrix of {size} rows and columns "
+                "without "
                 "negative eigenvalues."
             )
 
@@ -388,7 +441,8 @@ class ForceLimits(AbstractConstraint):
         if self.covariance is not None:
             rows = xp.einsum("...jb,jm->...mb", self.base.regressor(motion), to_limited)
             variance = xp.einsum("...mb,bc,...mc->...m", rows, self.covariance, rows)
-            # A negligible fraction of the limits makes standard deviations smooth at zero.
+            # A negligible fraction of the limits makes standard deviations smooth at
+            # zero.
             smooth = xp.broadcast_to((1e-12 * limits) ** 2, variance.shape)
             size = size + self.deviations * xp.sqrt(xp.maximum(variance, 0.0) + smooth)
         return size / xp.broadcast_to(limits, size.shape) - 1.0
@@ -398,7 +452,9 @@ class ForceLimits(AbstractConstraint):
         whole = self._whole(robot)
         finite = np.isfinite(whole)
         to_motors = np.linalg.inv(np.asarray(robot.drives.reduction))
-        to_limited = np.concatenate([np.eye(robot.joints), to_motors], axis=1)[:, finite]
+        to_limited = np.concatenate([np.eye(robot.joints), to_motors], axis=1)[
+            :, finite
+        ]
         return (1 - self.margin) * whole[finite], to_limited
 
     def _forces(self, motion: Motion) -> Float[AnyArray, "*batch 3 joints"]:
@@ -409,7 +465,9 @@ class ForceLimits(AbstractConstraint):
 
     def linearise(
         self, robot: Robot, motion: Motion, chosen: Int[np.ndarray, " samples"]
-    ) -> tuple[Float[np.ndarray, " samples"], list[Float[np.ndarray, "samples joints"]]]:
+    ) -> tuple[
+        Float[np.ndarray, " samples"], list[Float[np.ndarray, "samples joints"]]
+    ]:
         """Return one relative excess of each sample, and its derivatives, in NumPy."""
         limits, to_limited = self._limited(robot)
         samples = np.arange(len(chosen))
@@ -434,7 +492,9 @@ class ForceLimits(AbstractConstraint):
             size = size + self.deviations * deviation
         return size / limits[chosen] - 1.0, slopes
 
-    def forces(self, q: Coordinates, qd: Coordinates, qdd: Coordinates) -> Float[Array, "3 joints"]:
+    def forces(
+        self, q: Coordinates, qd: Coordinates, qdd: Coordinates
+    ) -> Float[Array, "3 joints"]:
         """Return the forces of one sample: as expected, and with dry friction to either side."""
         model = self.base.model
         p = self.base.to_standard(jnp.asarray(self.parameters))
@@ -448,7 +508,10 @@ class ForceLimits(AbstractConstraint):
             return Reversal(part, side, width) if is_transition(part) else part
 
         sides = [eqx.Partial(reversing, side=side) for side in (1.0, -1.0)]
-        models = [model, *(jax.tree.map(side, model, is_leaf=is_transition) for side in sides)]
+        models = [
+            model,
+            *(jax.tree.map(side, model, is_leaf=is_transition) for side in sides),
+        ]
         found = jnp.stack([jnp.asarray(m.forces(p, q, qd, qdd)) for m in models])
         return found + model.known_forces(q, qd, qdd)[None]
 
@@ -460,8 +523,14 @@ class ForceLimits(AbstractConstraint):
         ]
         motors = [(f"the torque of motor {k + 1}", "N m") for k in range(robot.joints)]
         found = []
-        for (name, unit), whole in zip(joints + motors, self._whole(robot).tolist(), strict=True):
-            note = f"{whole:.4g} less a margin of {100 * self.margin:.4g} %" if self.margin else ""
+        for (name, unit), whole in zip(
+            joints + motors, self._whole(robot).tolist(), strict=True
+        ):
+            note = (
+                f"{whole:.4g} less a margin of {100 * self.margin:.4g} %"
+                if self.margin
+                else ""
+            )
             limit = (1 - self.margin) * whole
             found.append(Finding(name, limit, unit, limit, note=note))
         return tuple(entry for entry in found if np.isfinite(entry.limit))

@@ -24,8 +24,8 @@ class Information(eqx.Module):
 
     Attributes:
         plain: The paper's $\Lambda = \Theta_B^T \Theta_B$ (Eq. 36).
-        weighted: The same in units of the noise, $\Theta_B^T W^2 \Theta_B$, plus prior information;
-            its inverse is the covariance of weighted least squares.
+        weighted: The same in units of the noise, $\Theta_B^T W^2 \Theta_B$, plus prior
+            information; its inverse is the covariance of weighted least squares.
         sizes: Typical size of each parameter, in its unit.
     """
 
@@ -53,7 +53,9 @@ def information(
     plain = np.zeros((base.size, base.size))
     weighted = plain.copy() if prior is None else np.array(prior, np.float64)
     rows = base.regressor_rows(motion)
-    for own, theta, w in zip(base.acting_columns, rows, np.asarray(weights), strict=True):
+    for own, theta, w in zip(
+        base.acting_columns, rows, np.asarray(weights), strict=True
+    ):
         gram = theta.T @ theta
         place = np.ix_(own, own)
         plain[place] += gram
@@ -103,7 +105,9 @@ def _gram_derivative(primals: tuple, tangents: tuple) -> tuple:
     return _gram(columns), half + jnp.swapaxes(half, 1, 2)
 
 
-def standard_deviations(weighted: Float[AnyArray, "base base"]) -> Float[np.ndarray, " base"]:
+def standard_deviations(
+    weighted: Float[AnyArray, "base base"],
+) -> Float[np.ndarray, " base"]:
     """Return standard deviations from weighted information; infinite where undetermined."""
     scaled, scale = _unit_diagonal(np.asarray(weighted, np.float64))
     values, U = np.linalg.eigh(scaled)
@@ -128,7 +132,9 @@ class AbstractCriterion(eqx.Module):
     extreme: ClassVar[bool] = True
 
     @abstractmethod
-    def __call__(self, information: Information, sharpness: Sharpness = None) -> Float[Array, ""]:
+    def __call__(
+        self, information: Information, sharpness: Sharpness = None
+    ) -> Float[Array, ""]:
         """Return the logarithm of the number.
 
         Args:
@@ -144,14 +150,14 @@ class AbstractCriterion(eqx.Module):
 class ConditionNumber(AbstractCriterion):
     r"""Criterion of the paper: condition number of $\Lambda = \Theta_B^T \Theta_B$ (Eq. 36).
 
-    It depends on the choice of base parameters, and a small one need not mean small standard
-    deviations; use it for comparison.
+    It depends on the choice of base parameters, and a small one need not mean small
+    standard deviations; use it for comparison.
 
     Attributes:
-        weighted: Whether it is that of $\Theta_B^T W^2 \Theta_B$, the matrix of weighted least
-            squares.
-        scaled: Whether columns are scaled to unit length: then it does not depend on units, and
-            measures how similar columns are.
+        weighted: Whether it is that of $\Theta_B^T W^2 \Theta_B$, the matrix of
+            weighted least squares.
+        scaled: Whether columns are scaled to unit length: then it does not depend on
+            units, and measures how similar columns are.
     """
 
     weighted: bool = eqx.field(static=True, default=False)  # pyright: ignore
@@ -163,9 +169,13 @@ class ConditionNumber(AbstractCriterion):
         of = ", weighted" if self.weighted else " of Λ (Eq. 36)"
         return f"condition number{of}{', columns scaled' if self.scaled else ''}"
 
-    def __call__(self, information: Information, sharpness: Sharpness = None) -> Float[Array, ""]:
+    def __call__(
+        self, information: Information, sharpness: Sharpness = None
+    ) -> Float[Array, ""]:
         """Return the logarithm of the condition number."""
-        matrix = jnp.asarray(information.weighted if self.weighted else information.plain)
+        matrix = jnp.asarray(
+            information.weighted if self.weighted else information.plain
+        )
         matrix = _unit_diagonal(matrix)[0] if self.scaled else matrix
         return jnp.asarray(spectral(log_condition, matrix, sharpness))
 
@@ -173,14 +183,17 @@ class ConditionNumber(AbstractCriterion):
 class DOptimal(AbstractCriterion):
     r"""Volume of the confidence ellipsoid: $(\det \Theta_B^T W^2 \Theta_B)^{-1/(2n)}$.
 
-    The geometric mean of the ellipsoid's axes. It depends neither on units nor on the choice of
-    base parameters, and makes standard deviations smallest on the whole: the default.
+    The geometric mean of the ellipsoid's axes. It depends neither on units nor on the
+    choice of base parameters, and makes standard deviations smallest on the whole: the
+    default.
     """
 
     name: ClassVar[str] = "D: mean axis of the confidence ellipsoid"
     extreme: ClassVar[bool] = False
 
-    def __call__(self, information: Information, sharpness: Sharpness = None) -> Float[Array, ""]:
+    def __call__(
+        self, information: Information, sharpness: Sharpness = None
+    ) -> Float[Array, ""]:
         """Return the logarithm of the mean axis."""
         matrix = jnp.asarray(information.weighted)
         # The determinant does not depend on the scale that makes the factor accurate.
@@ -195,15 +208,18 @@ class AOptimal(AbstractCriterion):
     """Root mean square of the standard deviations, each divided by its parameter's size.
 
     Attributes:
-        sizes: Sizes of the base parameters, in their units; by default the standard deviation that
-            a parameter would have in a random motion if it were the only one.
+        sizes: Sizes of the base parameters, in their units; by default the standard
+            deviation that a parameter would have in a random motion if it were the only
+            one.
     """
 
     name: ClassVar[str] = "A: rms of the scaled deviations"
     extreme: ClassVar[bool] = False
     sizes: Float[AnyArray, " base"] | None = None
 
-    def __call__(self, information: Information, sharpness: Sharpness = None) -> Float[Array, ""]:
+    def __call__(
+        self, information: Information, sharpness: Sharpness = None
+    ) -> Float[Array, ""]:
         """Return the logarithm of the root mean square."""
         scaled = _divide_by_sizes(information, self.sizes)
         return 0.5 * jnp.asarray(spectral(log_mean_inverse, scaled, None))
@@ -219,7 +235,9 @@ class EOptimal(AbstractCriterion):
     name: ClassVar[str] = "E: longest axis of the scaled ellipsoid"
     sizes: Float[AnyArray, " base"] | None = None
 
-    def __call__(self, information: Information, sharpness: Sharpness = None) -> Float[Array, ""]:
+    def __call__(
+        self, information: Information, sharpness: Sharpness = None
+    ) -> Float[Array, ""]:
         """Return the logarithm of the longest axis."""
         scaled = _divide_by_sizes(information, self.sizes)
         return 0.5 * jnp.asarray(spectral(log_largest_inverse, scaled, sharpness))
@@ -244,9 +262,10 @@ def spectral(
 ) -> Float[Array, ""]:
     r"""Return a symmetric function of the logarithms of a positive matrix's eigenvalues.
 
-    For $f(\Lambda) = \varphi(\lambda)$ with $\Lambda = U \operatorname{diag}(\lambda) U^T$ the
-    gradient is $U \operatorname{diag}(\varphi'(\lambda)) U^T$: it needs no derivatives of
-    eigenvectors, also where eigenvalues are equal. The sharpness is a constant.
+    For $f(\Lambda) = \varphi(\lambda)$ with $\Lambda = U \operatorname{diag}(\lambda)
+    U^T$ the gradient is $U \operatorname{diag}(\varphi'(\lambda)) U^T$: it needs no
+    derivatives of eigenvectors, also where eigenvalues are equal. The sharpness is a
+    constant.
     """
     return function(jnp.log(_eigenvalues(matrix)[0]), sharpness)
 
@@ -266,19 +285,25 @@ def _eigenvalues(matrix: Float[Array, "size size"]) -> tuple[Array, Array]:
     return jnp.maximum(eigenvalues, 1e-15 * eigenvalues[-1]), U
 
 
-def log_condition(logs: Float[Array, " size"], sharpness: Sharpness) -> Float[Array, ""]:
+def log_condition(
+    logs: Float[Array, " size"], sharpness: Sharpness
+) -> Float[Array, ""]:
     r"""Return the log condition number, or above it $\log(\sum\lambda^p \sum\lambda^{-p})/p$."""
     if sharpness is None:
         return logs[-1] - logs[0]
     return _softmax(logs, sharpness) + _softmax(-logs, sharpness)
 
 
-def log_largest_inverse(logs: Float[Array, " size"], sharpness: Sharpness) -> Float[Array, ""]:
+def log_largest_inverse(
+    logs: Float[Array, " size"], sharpness: Sharpness
+) -> Float[Array, ""]:
     """Return the logarithm of the inverse's largest eigenvalue."""
     return -logs[0] if sharpness is None else _softmax(-logs, sharpness)
 
 
-def log_mean_inverse(logs: Float[Array, " size"], sharpness: Sharpness) -> Float[Array, ""]:
+def log_mean_inverse(
+    logs: Float[Array, " size"], sharpness: Sharpness
+) -> Float[Array, ""]:
     """Return the logarithm of the inverse's mean eigenvalue."""
     return jax.nn.logsumexp(-logs) - np.log(logs.shape[-1])
 
@@ -287,7 +312,9 @@ def _softmax(x: Array, sharpness: Float[Array, ""] | float) -> Array:
     return jax.nn.logsumexp(sharpness * x) / sharpness
 
 
-def _divide_by_sizes(information: Information, sizes: Float[AnyArray, " base"] | None) -> Array:
+def _divide_by_sizes(
+    information: Information, sizes: Float[AnyArray, " base"] | None
+) -> Array:
     """Return the information about the parameters divided by their sizes."""
     sizes = jnp.asarray(information.sizes if sizes is None else sizes)
     return sizes[:, None] * jnp.asarray(information.weighted) * sizes[None]

@@ -31,8 +31,8 @@ class DesignProgress(NamedTuple):
     Attributes:
         fraction: Completed fraction, from 0 to 1.
         task: Present task, in words.
-        best: Value of the criterion for the best motion so far that keeps all limits, or of the
-            best of all if none does.
+        best: Value of the criterion for the best motion so far that keeps all limits,
+            or of the best of all if none does.
         feasible: Whether it keeps all limits.
         trajectory: That motion.
     """
@@ -60,36 +60,46 @@ def design_excitation(
 ) -> ExcitationPlan:
     r"""Find the motion that determines the base parameters best within all limits (Eq. 36).
 
-    The problem is an `ExcitationProblem`, which `minimise` solves: that names further settings. The
-    limits of the joints hold for all times, not only at samples. The same key gives the same
-    motion.
+    The problem is an `ExcitationProblem`, which `minimise` solves: that names further
+    settings. The limits of the joints hold for all times, not only at samples. The same
+    key gives the same motion.
 
     Args:
         base: Base parameters to be determined.
-        limits: Limits of the joints, and of their forces for constraints that keep those; the
-            robot's if None. Unknown limits are assumed as in `random_fourier_series`.
+        limits: Limits of the joints, and of their forces for constraints that keep
+            those; the robot's if None. Unknown limits are assumed as in
+            `random_fourier_series`.
         harmonics: Number of harmonics of the Fourier series.
         omega: Ground frequency of the series [rad/s].
-        basis: Family of trajectories in place of Fourier series: for instance `RestToRestBasis`.
+        basis: Family of trajectories in place of Fourier series: for instance
+            `RestToRestBasis`.
         criterion: Criterion to be minimised; D-optimality if None.
         constraints: Constraints beside the limits of the joints.
-        noise: Standard deviation of each joint's force noise [N m or N]; 1 % of the largest forces
-            if None. Its inverse weights the criterion, like the estimator.
-        prior: Information of earlier experiments in the same noise, the inverse of their
-            covariance; the design adds to it.
+        noise: Standard deviation of each joint's force noise [N m or N]; 1 % of the
+            largest forces if None. Its inverse weights the criterion, like the
+            estimator.
+        prior: Information of earlier experiments in the same noise, the inverse of
+            their covariance; the design adds to it.
         samples: Number of measured samples of one run of the motion.
-        settings: Arguments of `minimise`: `solver`, `starts`, `generations`, `polish`, `key`,
-            `nominal`, `progress`, `begin`, `seconds`, `throw`.
+        settings: Arguments of `minimise`: `solver`, `starts`, `generations`, `polish`,
+            `key`, `nominal`, `progress`, `begin`, `seconds`, `throw`.
 
     Raises:
-        InputError: If arguments do not fit, or no motion keeps all constraints: the message says
-            which limit is exceeded, and by how much.
+        InputError: If arguments do not fit, or no motion keeps all constraints: the
+            message says which limit is exceeded, and by how much.
         KeyboardInterrupt: If Ctrl-C came before a motion kept all constraints.
         RuntimeError: If JAX runs in single precision.
     """
     basis = FourierBasis(harmonics, omega) if basis is None else basis
     problem = ExcitationProblem(
-        base, basis, limits, criterion, constraints, noise=noise, prior=prior, samples=samples
+        base,
+        basis,
+        limits,
+        criterion,
+        constraints,
+        noise=noise,
+        prior=prior,
+        samples=samples,
     )
     return minimise(problem, **settings)
 
@@ -110,32 +120,39 @@ def minimise(
 ) -> ExcitationPlan:
     """Solve an excitation problem from many starts.
 
-    Random motions are improved together by an interior point method, and so are their descendants,
-    which move some joints as one parent and some as the other; the best of them are polished one by
-    one. With constraints the search starts from small motions that keep them, so that there is a
-    result after seconds. Ctrl-C ends the design with the best motion so far.
+    Random motions are improved together by an interior point method, and so are their
+    descendants, which move some joints as one parent and some as the other; the best of
+    them are polished one by one. With constraints the search starts from small motions
+    that keep them, so that there is a result after seconds. Ctrl-C ends the design with
+    the best motion so far.
 
     Args:
         problem: Problem to be solved.
-        solver: Another solver: a function of the problem and of random motions [starts, scaled]
-            that returns better motions. What comes out is made to keep the limits of the joints for
-            all times, and the best motion is taken.
+        solver: Another solver: a function of the problem and of random motions [starts,
+            scaled] that returns better motions. What comes out is made to keep the
+            limits of the joints for all times, and the best motion is taken.
         starts: Number of random motions to start from.
         generations: Number of generations.
         polish: Number of the best motions that are polished.
         key: Key of the random motions; `jax.random.key(0)` if None.
-        nominal: Base parameters as far as they are known, NaN where not, for relative deviations.
+        nominal: Base parameters as far as they are known, NaN where not, for relative
+            deviations.
         progress: Callback, called with the progress after each step.
         begin: Motion of the same basis in place of the first random one, to go on with.
-        seconds: Time after which the best motion so far is returned [s]; None for all steps.
-        throw: Whether to raise an error if no feasible motion is found; otherwise the plan says
-            which limits are not kept.
+        seconds: Time after which the best motion so far is returned [s]; None for all
+            steps.
+        throw: Whether to raise an error if no feasible motion is found; otherwise the
+            plan says which limits are not kept.
 
     Raises:
         InputError: If a number is too small, or no motion keeps all constraints.
         KeyboardInterrupt: If Ctrl-C came before a motion kept all constraints.
     """
-    least = {"starts": (starts, 1), "generations": (generations, 0), "polish": (polish, 0)}
+    least = {
+        "starts": (starts, 1),
+        "generations": (generations, 0),
+        "polish": (polish, 0),
+    }
     for name, (value, low) in least.items():
         if value < low:
             raise InputError(f"`{name}` must be at least {low}, but is {value}.")
@@ -165,14 +182,18 @@ def minimise(
         noise=problem.noise,
         samples=problem.samples,
         findings=tuple(problem.findings(x)),
-        nominal=np.full(problem.base.size, np.nan) if nominal is None else np.asarray(nominal),
+        nominal=np.full(problem.base.size, np.nan)
+        if nominal is None
+        else np.asarray(nominal),
         status=status,
         history=np.asarray(history),
     )
     if throw and not plan.feasible:
         unkept = "; ".join(plan.diagnosis)
         if status is DesignStatus.STOPPED:
-            raise KeyboardInterrupt(f"stopped before a motion kept all limits: {unkept}")
+            raise KeyboardInterrupt(
+                f"stopped before a motion kept all limits: {unkept}"
+            )
         raise InputError(f"no motion was found that keeps all limits: {unkept}")
     return plan
 
@@ -197,5 +218,7 @@ def _run(
         return DesignStatus.STOPPED
     search.finish()
     history = search.history
-    improved = history[-1] < (1.0 - SETTLED) * history[len(history) - 1 - len(history) // 4]
+    improved = (
+        history[-1] < (1.0 - SETTLED) * history[len(history) - 1 - len(history) // 4]
+    )
     return DesignStatus.IMPROVING if improved else DesignStatus.CONVERGED

@@ -61,14 +61,15 @@ class ExcitationPlan(Summarised, eqx.Module):
         criterion: Criterion that was minimised.
         limits: Limits of the joints, with those that were assumed.
         information: Information of one run of the motion.
-        reference: Information of a random motion that fills the same limits: the median of the
-            starts.
+        reference: Information of a random motion that fills the same limits: the median
+            of the starts.
         noise: Assumed standard deviation of the forces' noise by joint [N m or N].
         samples: Number of measured samples of one run.
         findings: Use of the constraints beside the limits of the joints.
         nominal: Base parameters as far as they are known before, NaN where not.
         status: How the design ended.
-        history: Value of the criterion for the best motion, before the first step and after each.
+        history: Value of the criterion for the best motion, before the first step and
+            after each.
     """
 
     base: BaseParameters
@@ -112,8 +113,9 @@ class ExcitationPlan(Summarised, eqx.Module):
     def standard_deviations(self) -> Float[np.ndarray, " base"]:
         """Expected deviations of weighted least squares, in units of the parameters (Eq. 33).
 
-        Infinite for undetermined parameters. The noise is assumed to be independent from sample to
-        sample, with the standard deviations `noise`, and to be the only disturbance.
+        Infinite for undetermined parameters. The noise is assumed to be independent
+        from sample to sample, with the standard deviations `noise`, and to be the only
+        disturbance.
         """
         return standard_deviations(self.information.weighted)
 
@@ -127,7 +129,9 @@ class ExcitationPlan(Summarised, eqx.Module):
     def gains(self) -> Float[np.ndarray, " base"]:
         """Factor by which each standard deviation is smaller than that of a random motion."""
         with np.errstate(invalid="ignore"):
-            return standard_deviations(self.reference.weighted) / self.standard_deviations
+            return (
+                standard_deviations(self.reference.weighted) / self.standard_deviations
+            )
 
     @property
     def mean_gain(self) -> float:
@@ -163,7 +167,9 @@ class ExcitationPlan(Summarised, eqx.Module):
         base, relative, columns, status = self.base, self.relative_deviations, [], []
         if not np.isnan(relative).all():
             columns = [Column("±", relative, "%", percent)]
-            status = [Status.DOUBTFUL if r > VAGUE else Status.NEUTRAL for r in relative]
+            status = [
+                Status.DOUBTFUL if r > VAGUE else Status.NEUTRAL for r in relative
+            ]
         kinds = ("range", "speed", "acceleration", "jerk")
         tables = [
             Table(
@@ -179,7 +185,12 @@ class ExcitationPlan(Summarised, eqx.Module):
                 Column("parameter", base.names),
                 Column("±", self.standard_deviations),
                 Column("unit", base.units),
-                Column("better than\nrandom", self.gains, "factor", lambda gain: f"{gain:.2f}"),
+                Column(
+                    "better than\nrandom",
+                    self.gains,
+                    "factor",
+                    lambda gain: f"{gain:.2f}",
+                ),
                 *columns,
                 status=status,
             ),
@@ -193,26 +204,38 @@ class ExcitationPlan(Summarised, eqx.Module):
                 ),
             ),
         ]
-        return (*tables, _findings_table(self.findings)) if self.findings else tuple(tables)
+        return (
+            (*tables, _findings_table(self.findings))
+            if self.findings
+            else tuple(tables)
+        )
 
     @property
     def remarks(self) -> list[Remark]:
         """Gain of the design, limits that are not kept, and parameters that are not determined."""
-        gain = f"Standard deviations are {self.mean_gain:.3g} times smaller than a random motion's"
+        gain = (
+            f"Standard deviations are {self.mean_gain:.3g} times smaller than a "
+            "random motion's"
+        )
         if self.mean_gain < 1.0:
             gain = (
-                f"Standard deviations are {1.0 / self.mean_gain:.3g} times those of a random "
-                "motion, which keeps the limits of the joints alone: search longer (`--resume`)"
+                f"Standard deviations are {1.0 / self.mean_gain:.3g} times those of a "
+                "random "
+                "motion, which keeps the limits of the joints alone: search longer "
+                "(`--resume`)"
             )
         remarks = [Remark(gain), *(Remark(text, Status.BAD) for text in self.diagnosis)]
         if self.undetermined:
             text = f"This motion does not determine: {', '.join(self.undetermined)}"
             remarks.append(Remark(text, Status.BAD))
         if self.interrupted:
-            remarks.append(Remark("The design was stopped before its end", Status.DOUBTFUL))
+            remarks.append(
+                Remark("The design was stopped before its end", Status.DOUBTFUL)
+            )
         if self.status is DesignStatus.IMPROVING:
             text = (
-                "The last steps still improved the motion: more `generations` may find a better one"
+                "The last steps still improved the motion: more `generations` may "
+                "find a better one"
             )
             remarks.append(Remark(text))
         return remarks
@@ -229,8 +252,12 @@ class ExcitationPlan(Summarised, eqx.Module):
 
 def _findings_table(findings: tuple[Finding, ...]) -> Table:
     """Return a table of how near a motion comes to the limits of constraints."""
-    limits = [f"{'≥' if one.least else '≤'} {one.limit:.4g} {one.unit}" for one in findings]
-    used = [f"{100 * x.used:.1f}" if math.isfinite(x.used) else MISSING for x in findings]
+    limits = [
+        f"{'≥' if one.least else '≤'} {one.limit:.4g} {one.unit}" for one in findings
+    ]
+    used = [
+        f"{100 * x.used:.1f}" if math.isfinite(x.used) else MISSING for x in findings
+    ]
     return Table(
         "use of the other limits, at the instants that were checked",
         Column("quantity", [one.name.removeprefix("the ") for one in findings]),

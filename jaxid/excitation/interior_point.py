@@ -1,9 +1,10 @@
 """A primal-dual interior point method with quasi-Newton curvature, for many starts in lockstep.
 
-Minimises f(y) subject to |R y - c| <= b, rows joint by joint, and to constraints that are not
-linear, which a common slack may exceed at a penalty. Each iteration evaluates value and gradient of
-every start once; the step towards the barrier's minimum needs products with the rows and one
-Cholesky factor for each start. Curvature is a damped BFGS matrix [1, procedure 18.2].
+Minimises f(y) subject to |R y - c| <= b, rows joint by joint, and to constraints that
+are not linear, which a common slack may exceed at a penalty. Each iteration evaluates
+value and gradient of every start once; the step towards the barrier's minimum needs
+products with the rows and one Cholesky factor for each start. Curvature is a damped
+BFGS matrix [1, procedure 18.2].
 
 In NumPy: its matrices are small, and nothing is compiled.
 
@@ -24,7 +25,9 @@ from .coefficient_limits import Grid
 STIFFNESS = 0.3  # initial curvature: small, so that first steps are large
 TO_BOUNDARY = 0.995  # fraction of the way to the next limit that a step may go
 DECREASE = 1e-4  # fraction of the promised decrease that a step must give
-DAMPING = 0.1  # fraction of the expected curvature along a step below which it is damped
+DAMPING = (
+    0.1  # fraction of the expected curvature along a step below which it is damped
+)
 PATIENCE = 8  # refused steps in a row after which the curvature is forgotten
 COOLING = 0.9  # factor of the barrier after a good step
 INSIDE = 0.985  # fraction of the bound within which a stage starts
@@ -42,16 +45,18 @@ class Evaluation(NamedTuple):
 Inequalities = Float[np.ndarray, " inequalities"]
 """One number for each inequality: its distance from the bound, or its multiplier.
 
-Limits of the joints, upwards, then downwards; constraints; sign of the slack if there are any.
+Limits of the joints, upwards, then downwards; constraints; sign of the slack if there
+are any.
 """
 
 
 class State(NamedTuple):
     """State of one start.
 
-    `y`, `slack`, `evaluation` and `duals` are the present point, `step`, `dual_step`, `length` and
-    `dual_length` the next trial, `slope` is the derivative of the merit along the step, `refused`
-    counts refused steps in a row, and `fresh` says that the point is yet to be evaluated.
+    `y`, `slack`, `evaluation` and `duals` are the present point, `step`, `dual_step`,
+    `length` and `dual_length` the next trial, `slope` is the derivative of the merit
+    along the step, `refused` counts refused steps in a row, and `fresh` says that the
+    point is yet to be evaluated.
     """
 
     y: Float[np.ndarray, " scaled"]
@@ -85,13 +90,19 @@ class Stage(NamedTuple):
     penalty: float = 10.0  # penalty of the slack by which constraints are exceeded
 
 
-def begin(grid: Grid, y: Float[np.ndarray, "starts scaled"], constraints: int = 0) -> list[State]:
+def begin(
+    grid: Grid, y: Float[np.ndarray, "starts scaled"], constraints: int = 0
+) -> list[State]:
     """Return the state of some starts before the first stage, with a number of constraints."""
     size, slack = np.shape(y)[1], np.zeros(1 if constraints else 0)
     duals = np.zeros(2 * grid.c.size + constraints + len(slack))
-    none = Evaluation(0.0, np.zeros(size), np.zeros(constraints), np.zeros((constraints, size)))
+    none = Evaluation(
+        0.0, np.zeros(size), np.zeros(constraints), np.zeros((constraints, size))
+    )
     curvature, step = STIFFNESS * np.eye(size), np.zeros(size + len(slack))
-    return [State(np.array(x), slack, none, duals, curvature, 0.0, step, duals) for x in y]
+    return [
+        State(np.array(x), slack, none, duals, curvature, 0.0, step, duals) for x in y
+    ]
 
 
 def run(
@@ -149,7 +160,9 @@ def _update(grid: Grid, stage: Stage, old: State, evaluation: Evaluation) -> Sta
         duals[: 2 * grid.c.size] = old.duals[: 2 * grid.c.size]
         begun = old._replace(y=trial, slack=slack, evaluation=evaluation, duals=duals)
         return _directed(grid, stage, begun._replace(refused=0, fresh=False), room)
-    before = _room(grid, stage, old.y, old.slack.sum() - old.evaluation.excess, old.slack)
+    before = _room(
+        grid, stage, old.y, old.slack.sum() - old.evaluation.excess, old.slack
+    )
     merit = _merit(old.evaluation, old.slack, before, stage.penalty, old.barrier)
     new = _merit(evaluation, slack, room, stage.penalty, old.barrier)
     promised = DECREASE * old.length * old.slope
@@ -167,12 +180,18 @@ def _update(grid: Grid, stage: Stage, old: State, evaluation: Evaluation) -> Sta
 
 
 def _taken(
-    stage: Stage, old: State, slack: np.ndarray, evaluation: Evaluation, room: Inequalities
+    stage: Stage,
+    old: State,
+    slack: np.ndarray,
+    evaluation: Evaluation,
+    room: Inequalities,
 ) -> State:
     """Return the state of one start after its step was taken."""
     barrier = max(stage.least, old.barrier * (COOLING if old.length > 0.1 else 1.0))
     central = barrier / room
-    duals = np.clip(old.duals + old.dual_length * old.dual_step, central / 1e3, central * 1e3)
+    duals = np.clip(
+        old.duals + old.dual_length * old.dual_step, central / 1e3, central * 1e3
+    )
     # Curvature is that of the Lagrangian: of the value and of constraints that bend.
     change = evaluation.gradient - old.evaluation.gradient
     _, bending, _ = _parts(duals, evaluation)
@@ -190,7 +209,12 @@ def _taken(
 
 def _directed(grid: Grid, stage: Stage, state: State, room: Inequalities) -> State:
     """Return one start with the step to the barrier's minimum, and how far it may go."""
-    evaluation, size, slacks, R = state.evaluation, len(state.y), len(state.slack), grid.R
+    evaluation, size, slacks, R = (
+        state.evaluation,
+        len(state.y),
+        len(state.slack),
+        grid.R,
+    )
     joints, _, variables = R.shape
     ratio, central = state.duals / room, state.barrier / room
     stiffness, of_constraints, of_slack = _parts(ratio, evaluation)
@@ -219,7 +243,10 @@ def _directed(grid: Grid, stage: Stage, state: State, room: Inequalities) -> Sta
     if not np.isfinite(step).all():
         # Where rounding makes the matrix indefinite, its diagonal alone decides.
         step = downhill / np.diagonal(H)
-    rows, more = np.einsum("jrk,jk->jr", R, step[:size].reshape(joints, variables)), step[size:]
+    rows, more = (
+        np.einsum("jrk,jk->jr", R, step[:size].reshape(joints, variables)),
+        step[size:],
+    )
     bent = evaluation.slopes @ step[:size] - more.sum()
     change = np.concatenate([rows.ravel(), -rows.ravel(), bent, -more])
     dual_step = central - state.duals + ratio * change
@@ -239,7 +266,9 @@ def _room(grid: Grid, stage: Stage, y: np.ndarray, *more: np.ndarray) -> Inequal
     return np.concatenate([bound - away, bound + away, *more])
 
 
-def _parts(x: Inequalities, evaluation: Evaluation) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _parts(
+    x: Inequalities, evaluation: Evaluation
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the numbers of limits, constraints and slack."""
     constraints = len(evaluation.excess)
     slack = len(x) - (constraints > 0)
@@ -273,7 +302,8 @@ def _cheapest_slack(
     """
     if not len(like):
         return like
-    # From below, where the largest term alone balances the penalty, Newton's method grows to it.
+    # From below, where the largest term alone balances the penalty, Newton's method
+    # grows to it.
     x = max(0.0, float(excess.max())) + barrier / penalty
     for _ in range(12):
         room = np.append(x - excess, x)
@@ -283,8 +313,14 @@ def _cheapest_slack(
 
 
 def _merit(
-    evaluation: Evaluation, slack: np.ndarray, room: Inequalities, penalty: float, barrier: float
+    evaluation: Evaluation,
+    slack: np.ndarray,
+    room: Inequalities,
+    penalty: float,
+    barrier: float,
 ) -> float:
     """Return the merit function, which a step must decrease."""
-    logs = sum(float(np.log(np.maximum(x, 1e-300)).sum()) for x in _parts(room, evaluation))
+    logs = sum(
+        float(np.log(np.maximum(x, 1e-300)).sum()) for x in _parts(room, evaluation)
+    )
     return evaluation.value + penalty * float(slack.sum()) - barrier * logs

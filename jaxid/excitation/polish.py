@@ -1,7 +1,8 @@
 """Polishing of one motion by sequential quadratic programming with exact gradients.
 
-Of the limits' many rows only a permanent coarse grid and the peaks that a motion reaches are given
-to the solver; after each run new peaks are added. Constraints are treated in the same way.
+Of the limits' many rows only a permanent coarse grid and the peaks that a motion
+reaches are given to the solver; after each run new peaks are added. Constraints are
+treated in the same way.
 """
 
 import functools
@@ -24,7 +25,9 @@ from .problem import (
 )
 
 
-def polish(problem: ExcitationProblem, start: Float[np.ndarray, " scaled"]) -> Candidates:
+def polish(
+    problem: ExcitationProblem, start: Float[np.ndarray, " scaled"]
+) -> Candidates:
     """Return a better motion within all limits, or the same."""
     x: np.ndarray = np.array(start, np.float64)
     grid = problem.limits.grid()
@@ -77,7 +80,9 @@ def _minimise(
             return values[0], slopes[0]
 
         fun, jac = (lambda z, k=k: -linearised(z.tobytes())[k] for k in (0, 1))
-        conditions.append({"type": "ineq", "fun": lambda z: fun(z) - MARGIN, "jac": jac})
+        conditions.append(
+            {"type": "ineq", "fun": lambda z: fun(z) - MARGIN, "jac": jac}
+        )
 
     samples = scale_samples(100, problem.basis)
 
@@ -111,7 +116,9 @@ def _add_peaks(
     return float(use.max())
 
 
-def _watched(problem: ExcitationProblem, x: np.ndarray, peaks: list[np.ndarray]) -> Watched:
+def _watched(
+    problem: ExcitationProblem, x: np.ndarray, peaks: list[np.ndarray]
+) -> Watched:
     """Return the watched values of constraints with the peaks of this and earlier runs."""
     found = []
     for number, (instants, entries) in enumerate(problem.watched(x)):

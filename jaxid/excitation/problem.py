@@ -8,7 +8,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Array, Float, Int, PRNGKeyArray, namespace, require_float64
+from jaxid.arrays import (
+    AnyArray,
+    Array,
+    Float,
+    Int,
+    PRNGKeyArray,
+    namespace,
+    require_float64,
+)
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
@@ -51,28 +59,31 @@ Watched = Sequence[tuple[Int[np.ndarray, " values"], Int[np.ndarray, " values"]]
 class ExcitationProblem:
     """The problem of finding a motion that determines the base parameters well (Eq. 36).
 
-    Its unknown is one vector x of scaled coefficients: each of them alone meets a limit of its
-    joint near one. `value`, `inequalities` and `violation` are functions of x that run under `jit`,
-    `vmap` and `grad`, so that any solver can be put around them.
+    Its unknown is one vector x of scaled coefficients: each of them alone meets a limit
+    of its joint near one. `value`, `inequalities` and `violation` are functions of x
+    that run under `jit`, `vmap` and `grad`, so that any solver can be put around them.
 
     Args:
         base: Base parameters to be determined.
-        basis: Family of trajectories; Fourier series of five harmonics at 0.8 rad/s if None.
-        limits: Limits of the joints, and of their forces for constraints that keep those; the
-            robot's if None. Unknown limits are assumed as in `random_fourier_series`.
+        basis: Family of trajectories; Fourier series of five harmonics at 0.8 rad/s if
+            None.
+        limits: Limits of the joints, and of their forces for constraints that keep
+            those; the robot's if None. Unknown limits are assumed as in
+            `random_fourier_series`.
         criterion: Criterion to be minimised; D-optimality if None.
         constraints: Constraints beside the limits of the joints.
-        noise: Standard deviation of each joint's force noise [N m or N]; 1 % of the largest forces
-            if None. Its inverse weights the criterion, like the estimator.
-        prior: Information of earlier experiments in the same noise, the inverse of their
-            covariance; the design adds to it.
+        noise: Standard deviation of each joint's force noise [N m or N]; 1 % of the
+            largest forces if None. Its inverse weights the criterion, like the
+            estimator.
+        prior: Information of earlier experiments in the same noise, the inverse of
+            their covariance; the design adds to it.
         samples: Number of measured samples of one run.
 
     Attributes:
         limits: Limits of the joints on the trajectories of the basis.
         robot: Robot with the limits that constraints ask it for.
-        sizes: Typical sizes of the base parameters: the standard deviation of each in random
-            motions if it were the only unknown one.
+        sizes: Typical sizes of the base parameters: the standard deviation of each in
+            random motions if it were the only unknown one.
 
     Raises:
         InputError: If arguments do not fit.
@@ -93,23 +104,33 @@ class ExcitationProblem:
     ):
         require_float64("designing a motion")
         robot = base.model.robot
-        self.base, self.criterion = base, criteria.DOptimal() if criterion is None else criterion
-        self.limits = JointLimits(robot, FourierBasis(5, 0.8) if basis is None else basis, limits)
+        self.base, self.criterion = (
+            base,
+            criteria.DOptimal() if criterion is None else criterion,
+        )
+        self.limits = JointLimits(
+            robot, FourierBasis(5, 0.8) if basis is None else basis, limits
+        )
         self.basis = self.limits.basis
         self.constraints, self.samples = tuple(constraints), samples
         self.noise = assumed_noise(robot) if noise is None else np.asarray(noise, float)
-        self.prior = np.zeros((base.size, base.size)) if prior is None else np.asarray(prior)
+        self.prior = (
+            np.zeros((base.size, base.size)) if prior is None else np.asarray(prior)
+        )
         if prior is not None and not self.criterion.weighted:
             raise InputError(
-                f"`prior` needs a weighted criterion, but that is the {self.criterion.name}."
+                "`prior` needs a weighted criterion, but that is the "
+                f"{self.criterion.name}."
             )
         if self.prior.shape != (base.size, base.size):
             raise InputError(
-                f"`prior` must have {base.size} rows and columns, but has shape {self.prior.shape}."
+                f"`prior` must have {base.size} rows and columns, but has shape "
+                f"{self.prior.shape}."
             )
         if self.noise.shape != (robot.joints,) or not (self.noise > 0).all():
             raise InputError(
-                f"`noise` must hold one positive number for each joint, but is {self.noise}."
+                "`noise` must hold one positive number for each joint, but is "
+                f"{self.noise}."
             )
         self.robot = robot.replace(limits=self.limits.limits)
         self._regressor = base.joint_regressor
@@ -118,7 +139,9 @@ class ExcitationProblem:
         self._judged = jax.jit(jax.value_and_grad(self._criterion, argnums=(0, 1)))
         self.sizes = np.ones(base.size)
         motions = self.limits.random(jax.random.key(0), 8)
-        squares = np.mean([np.diag(self.information(x).weighted) for x in motions], axis=0)
+        squares = np.mean(
+            [np.diag(self.information(x).weighted) for x in motions], axis=0
+        )
         self.sizes = 1.0 / np.sqrt(np.where(squares > 0, squares, 1.0))
 
     @property
@@ -135,23 +158,28 @@ class ExcitationProblem:
         return self.limits.random(key, 1)[0]
 
     def value(
-        self, x: Float[AnyArray, " scaled"], sharpness: Sharpness = None, samples: int | None = None
+        self,
+        x: Float[AnyArray, " scaled"],
+        sharpness: Sharpness = None,
+        samples: int | None = None,
     ) -> Float[Array, ""]:
         """Return the logarithm of the criterion of one run.
 
         Args:
             x: Scaled coefficients.
             sharpness: Sharpness of smooth extremes of eigenvalues; exact if None.
-            samples: Number of evaluated samples, which stand for all measured ones; all of them if
-                None.
+            samples: Number of evaluated samples, which stand for all measured ones; all
+                of them if None.
         """
         return self.values(jnp.asarray(x)[None], sharpness, samples)[0]
 
-    def inequalities(self, x: Float[AnyArray, " scaled"]) -> Float[Array, " inequalities"]:
+    def inequalities(
+        self, x: Float[AnyArray, " scaled"]
+    ) -> Float[Array, " inequalities"]:
         """Return what must not be positive: relative excess over all limits and constraints.
 
-        Limits of the joints hold for all times if these are not positive. Constraints are evaluated
-        at equidistant instants, with a small margin.
+        Limits of the joints hold for all times if these are not positive. Constraints
+        are evaluated at equidistant instants, with a small margin.
 
         Args:
             x: Scaled coefficients.
@@ -199,7 +227,10 @@ class ExcitationProblem:
         return self.criterion(Information(plain, weighted, self.sizes), sharpness)
 
     def value_and_gradient(
-        self, x: Float[np.ndarray, "starts scaled"], sharpness: float | None, samples: int
+        self,
+        x: Float[np.ndarray, "starts scaled"],
+        sharpness: float | None,
+        samples: int,
     ) -> tuple[Float[np.ndarray, " starts"], Float[np.ndarray, "starts scaled"]]:
         """Return `value` of several motions and its derivatives, in NumPy."""
         rows = self._sampled(samples)
@@ -217,11 +248,15 @@ class ExcitationProblem:
         weighted += self.prior
         values, by_plain, by_weighted = self._judge(plain, weighted, sharpness)
         pulled = np.zeros((len(self.noise), self.base.size, *arrays[0].shape[1:]))
-        for joint, (place, y, weight) in enumerate(zip(places, columns, w, strict=True)):
+        for joint, (place, y, weight) in enumerate(
+            zip(places, columns, w, strict=True)
+        ):
             slope = by_plain[:, *place] + weight**2 * by_weighted[:, *place]
             both = scale * (slope + np.swapaxes(slope, 1, 2))
             pulled[joint, regressor.columns[joint]] = np.swapaxes(both @ y, 0, 1)
-        slopes = pull_back(regressor.program, pulled.reshape(-1, *pulled.shape[2:]), *arrays)
+        slopes = pull_back(
+            regressor.program, pulled.reshape(-1, *pulled.shape[2:]), *arrays
+        )
         parts = zip(slopes, rows, strict=True)
         gradient = sum(np.einsum("jbs,sk->bjk", slope, part) for slope, part in parts)
         return values, (gradient * np.asarray(self.limits.scale)).reshape(x.shape)
@@ -231,7 +266,8 @@ class ExcitationProblem:
     ) -> tuple[np.ndarray, ...]:
         """Return the criterion of several motions, and its derivatives by their information."""
         found = [
-            self._judged(*matrices, sharpness) for matrices in zip(plain, weighted, strict=True)
+            self._judged(*matrices, sharpness)
+            for matrices in zip(plain, weighted, strict=True)
         ]
         values, slopes = zip(*found, strict=True)
         return np.array(values), *(np.array(x) for x in zip(*slopes, strict=True))
@@ -258,12 +294,16 @@ class ExcitationProblem:
 
     def linearise(
         self, x: Float[np.ndarray, "starts scaled"], watched: Sequence[Watched]
-    ) -> tuple[Float[np.ndarray, "starts values"], Float[np.ndarray, "starts values scaled"]]:
+    ) -> tuple[
+        Float[np.ndarray, "starts values"], Float[np.ndarray, "starts values scaled"]
+    ]:
         """Return watched values of the constraints of several motions, and their derivatives."""
         coefficients, scale = self.limits.coefficients(x), np.asarray(self.limits.scale)
         excess: list[np.ndarray] = [np.zeros((len(x), 0))]
         derivatives: list[np.ndarray] = [np.zeros((len(x), 0, x.shape[-1]))]
-        for constraint, places in zip(self.constraints, zip(*watched, strict=True), strict=True):
+        for constraint, places in zip(
+            self.constraints, zip(*watched, strict=True), strict=True
+        ):
             instants, entries = (np.array(part) for part in zip(*places, strict=True))
             rows = self._rows[:, instants]
             q, qd, qdd = np.einsum("obwk,bjk->obwj", rows, coefficients, optimize=True)
@@ -284,7 +324,8 @@ class ExcitationProblem:
     def watched(self, x: Float[np.ndarray, " scaled"]) -> Watched:
         """Return the values to be watched near a motion, as instants and places in the entries.
 
-        Of each constraint these are the worst value at equidistant instants, and highest peaks.
+        Of each constraint these are the worst value at equidistant instants, and
+        highest peaks.
         """
         found = []
         for values in self._by_constraint(x, slice(None, None, EVERY)):
@@ -299,21 +340,27 @@ class ExcitationProblem:
 
     def watched_excess(self, x: Float[np.ndarray, " scaled"]) -> float:
         """Return the largest excess of the constraints at the equidistant watched instants."""
-        return max((float(v.max()) for v in self._by_constraint(x, WATCHED)), default=-np.inf)
+        return max(
+            (float(v.max()) for v in self._by_constraint(x, WATCHED)), default=-np.inf
+        )
 
     def _by_constraint(self, x: AnyArray, instants: Any) -> list[np.ndarray]:
         coefficients = self.limits.coefficients(np.asarray(x))
         motion = Motion(*(part[instants] @ coefficients.T for part in self._rows))
         return [np.asarray(c(self.robot, motion)) for c in self.constraints]
 
-    def checked(self, x: Float[AnyArray, " scaled"]) -> Float[np.ndarray, "checked values"]:
+    def checked(
+        self, x: Float[AnyArray, " scaled"]
+    ) -> Float[np.ndarray, "checked values"]:
         """Return all constraints of one motion at all checked instants."""
         return np.concatenate(self._by_constraint(x, slice(None)), axis=1)
 
     def information(self, x: Float[AnyArray, " scaled"]) -> Information:
         """Return the information of one run, computed in NumPy."""
         coefficients = self.limits.coefficients(np.asarray(x))
-        motion = Motion(*(part @ coefficients.T for part in self._sampled(self.samples)))
+        motion = Motion(
+            *(part @ coefficients.T for part in self._sampled(self.samples))
+        )
         weights = 1.0 / self.noise
         return criteria.information(self.base, motion, weights, self.prior, self.sizes)
 
@@ -324,7 +371,9 @@ class ExcitationProblem:
         # What is far from its limits need not be known closely.
         rough = self._by_constraint(x, slice(None, None, EVERY))
         coarse = float(_tops(np.concatenate(rough, axis=1)).max())
-        return coarse if not -SURE < coarse < NEAR else float(_tops(self.checked(x)).max())
+        return (
+            coarse if not -SURE < coarse < NEAR else float(_tops(self.checked(x)).max())
+        )
 
     def findings(self, x: Float[AnyArray, " scaled"]) -> list[Finding]:
         """Return all limited quantities with their largest values."""
@@ -340,7 +389,9 @@ class ExcitationProblem:
     ) -> Float[Array, "instants values"]:
         coefficients = self.limits.coefficients(jnp.asarray(x))
         motion = Motion(*(part[instants] @ coefficients.T for part in self._rows))
-        return jnp.concatenate([c(self.robot, motion) for c in self.constraints], axis=-1)
+        return jnp.concatenate(
+            [c(self.robot, motion) for c in self.constraints], axis=-1
+        )
 
 
 def assumed_noise(robot: Robot) -> Float[np.ndarray, " joints"]:
@@ -408,7 +459,9 @@ class Candidates(NamedTuple):
 
     def survivors(self, other: "Candidates") -> "Candidates":
         """Return as many of both together as these are, the best first, duplicates last."""
-        both = Candidates(*(np.concatenate([a, b]) for a, b in zip(self, other, strict=True)))
+        both = Candidates(
+            *(np.concatenate([a, b]) for a, b in zip(self, other, strict=True))
+        )
         order = both.order()
         again = np.diff(both.value[order], prepend=np.nan) <= 2e-5  # one found twice
         again &= np.diff(both.broken[order], prepend=np.nan) == 0.0
@@ -416,14 +469,18 @@ class Candidates(NamedTuple):
         return Candidates(*(np.asarray(part)[order] for part in both))
 
 
-def evaluate(problem: ExcitationProblem, x: Float[AnyArray, "starts scaled"]) -> Candidates:
+def evaluate(
+    problem: ExcitationProblem, x: Float[AnyArray, "starts scaled"]
+) -> Candidates:
     """Return motions as they are, with their exact values."""
     x = np.asarray(x)
     known = [jax.tree.map(jnp.asarray, problem.information(one)) for one in x]
     values = np.array([float(problem.criterion(one)) for one in known])
     excess = np.array([problem.excess(one) for one in x])
     finite = np.isfinite(values) & ~np.isnan(excess)
-    return Candidates(x, np.where(finite, values, np.inf), np.where(finite, excess, np.inf))
+    return Candidates(
+        x, np.where(finite, values, np.inf), np.where(finite, excess, np.inf)
+    )
 
 
 def evaluate_within_limits(
@@ -431,8 +488,8 @@ def evaluate_within_limits(
 ) -> Candidates:
     """Return motions after they were made to keep the limits of the joints for all times.
 
-    Where they almost keep the other constraints, they are made smaller until they do; without
-    constraints they fill their limits where that is better.
+    Where they almost keep the other constraints, they are made smaller until they do;
+    without constraints they fill their limits where that is better.
     """
     grid = problem.limits.grid()
 
@@ -443,7 +500,8 @@ def evaluate_within_limits(
         smaller = (np.asarray(grid.shrink(y, fraction)) for fraction in fractions)
         return next((z for z in smaller if problem.excess(z) <= 0.0), y)
 
-    # A larger motion mostly tells more, but a condition number may well become worse by it.
+    # A larger motion mostly tells more, but a condition number may well become worse by
+    # it.
     growths = (1.0,) if problem.constraints else (1.0, 1.05)
     scaled = [
         [np.asarray(grid.scale_into_limits(y, growth=growth)) for y in np.asarray(x)]
@@ -453,7 +511,9 @@ def evaluate_within_limits(
     return functools.reduce(Candidates.improved, found)
 
 
-def shrink_to_constraints(problem: ExcitationProblem, x: Float[AnyArray, " scaled"]) -> Candidates:
+def shrink_to_constraints(
+    problem: ExcitationProblem, x: Float[AnyArray, " scaled"]
+) -> Candidates:
     """Return a motion made so small that it keeps all constraints; unchanged if no size does."""
     x, shrink = np.asarray(x), problem.limits.grid().shrink
 

@@ -1,9 +1,10 @@
 """The search from many starts: relaxed limits first, then tight ones; then generations.
 
-The children of the motions found are improved in the same way, and of parents and children the best
-survive. In the end limits are kept on a finer grid, so that less of them is left unused, and the
-best motions are polished one by one. Where there are constraints, all starts are small motions that
-keep them, so that there is a result after seconds.
+The children of the motions found are improved in the same way, and of parents and
+children the best survive. In the end limits are kept on a finer grid, so that less of
+them is left unused, and the best motions are polished one by one. Where there are
+constraints, all starts are small motions that keep them, so that there is a result
+after seconds.
 """
 
 import time
@@ -77,7 +78,8 @@ class Search:
     Attributes:
         first: Values of the random motions.
         best: Best motions so far.
-        history: Value of the criterion for the best motion, before the first step and after each.
+        history: Value of the criterion for the best motion, before the first step and
+            after each.
         steps: Number of steps without a limit of time.
     """
 
@@ -142,7 +144,9 @@ class Search:
                         break
                     yield "improving descendants"
                 found[start : start + BATCH] = [one.y for one in states]
-            self.best = self.best.survivors(evaluate_within_limits(problem, np.array(found)))
+            self.best = self.best.survivors(
+                evaluate_within_limits(problem, np.array(found))
+            )
             yield self._done("improving descendants")
         yield from self._finish()
 
@@ -150,7 +154,10 @@ class Search:
         """Yield the places of starts; with constraints the first batch is one start alone."""
         every = np.arange(len(self._x))
         first = 1 if self._problem.constraints else 0
-        for batch in (every[:first], *np.split(every[first:], range(BATCH, len(every), BATCH))):
+        for batch in (
+            every[:first],
+            *np.split(every[first:], range(BATCH, len(every), BATCH)),
+        ):
             if len(batch) and not self._is_late:
                 yield batch
 
@@ -183,7 +190,9 @@ class Search:
         """Keep limits on a finer grid, then polish the best motions."""
         problem, task = self._problem, "keeping the limits closely"
         promising = self.best.promising()
-        for start in range(0, len(promising) if self._seconds is None else BATCH, BATCH):
+        for start in range(
+            0, len(promising) if self._seconds is None else BATCH, BATCH
+        ):
             places = promising[start : start + BATCH]
             states = _begin(problem, FINE, self.best.x[places])
             for _ in _improve(problem, FINE, states, LAST):
@@ -222,18 +231,23 @@ class Search:
 
 
 def first_motions(
-    problem: ExcitationProblem, random: np.random.Generator, x: Float[np.ndarray, "starts scaled"]
+    problem: ExcitationProblem,
+    random: np.random.Generator,
+    x: Float[np.ndarray, "starts scaled"],
 ) -> Float[np.ndarray, "starts scaled"]:
     """Return as many small motions that keep the constraints best, the largest of them first.
 
-    They have the shapes of given motions, about poses at which the robot may stand still.
+    They have the shapes of given motions, about poses at which the robot may stand
+    still.
     """
     limits, robot = problem.limits.limits, problem.base.model.robot
     low, high = np.asarray(limits.position_min), np.asarray(limits.position_max)
     places = random.uniform(0.1, 0.9, (1000, robot.joints))
     q = low + places * (high - low)
     still = Motion(q, np.zeros_like(q), np.zeros_like(q))
-    values = [np.asarray(c(problem.robot, still)).max(axis=1) for c in problem.constraints]
+    values = [
+        np.asarray(c(problem.robot, still)).max(axis=1) for c in problem.constraints
+    ]
     good = np.argsort(np.max(values, axis=0))[: len(x)]
     fill = problem.limits.grid().fill
     many = [
@@ -247,7 +261,9 @@ def first_motions(
 
 
 def _begin(problem: ExcitationProblem, points: int, x: Any) -> list[State]:
-    return interior_point.begin(problem.limits.grid(points), np.asarray(x), problem.conditions)
+    return interior_point.begin(
+        problem.limits.grid(points), np.asarray(x), problem.conditions
+    )
 
 
 def _improve(
@@ -260,7 +276,9 @@ def _improve(
         count = min(PART, stage.iterations - start)
         watched = [problem.watched(one.y) for one in states]
 
-        def objective(y: np.ndarray, active: Any, watched: Any = watched) -> list[Evaluation]:
+        def objective(
+            y: np.ndarray, active: Any, watched: Any = watched
+        ) -> list[Evaluation]:
             return problem.evaluate(y, stage.sharpness, [watched[k] for k in active])
 
         now = stage._replace(barrier=barrier, iterations=count)
@@ -276,10 +294,11 @@ def crossover(
 ) -> Float[np.ndarray, "starts scaled"]:
     """Return one child of each motion with another one: the most promising of several.
 
-    Some joints of a child move as in one parent, the others as in another, begun at another time.
-    Limits hold for each joint alone, so that a child keeps the limits that its parents keep. The
-    information of a motion does not depend on when its period begins or which way it runs, so that
-    two good motions may fit together at one shift only: many children are tried.
+    Some joints of a child move as in one parent, the others as in another, begun at
+    another time. Limits hold for each joint alone, so that a child keeps the limits
+    that its parents keep. The information of a motion does not depend on when its
+    period begins or which way it runs, so that two good motions may fit together at one
+    shift only: many children are tried.
     """
     retimings, count = problem.basis.retimings(), scale_samples(SEARCHED, problem.basis)
     best, least = np.array(x), np.full(len(x), np.inf)
@@ -295,16 +314,21 @@ def crossover(
 
 
 def _draw_children(
-    problem: ExcitationProblem, retimings: np.ndarray, x: np.ndarray, random: np.random.Generator
+    problem: ExcitationProblem,
+    retimings: np.ndarray,
+    x: np.ndarray,
+    random: np.random.Generator,
 ) -> np.ndarray:
     starts, (joints, _) = len(x), problem.limits.shape
     ahead = random.integers(1, max(starts, 2), starts)
-    # Half of the second parents are not retimed: motions of one descent fit together already.
+    # Half of the second parents are not retimed: motions of one descent fit together
+    # already.
     which = random.integers(0, len(retimings), starts)
     T = retimings[np.where(random.random(starts) < 0.5, 0, which)]
     mates = problem.limits.coefficients(x[(np.arange(starts) + ahead) % starts])
     second = np.einsum("bvw,bjw->bjv", T, mates) / np.asarray(problem.limits.scale)
-    # A child has this expected fraction of joints from its second parent, and at least one.
+    # A child has this expected fraction of joints from its second parent, and at least
+    # one.
     share = random.uniform(0.1, 0.5, (starts, 1))
     taken = random.random((starts, joints)) < share
     taken[np.arange(starts), random.integers(0, joints, starts)] = True

@@ -37,11 +37,14 @@ ESTIMATORS: dict[str, Changes] = {
 """Estimators beside the one that finds bodies that can exist."""
 
 
-def choose(experiment: Experiment, logs: Sequence[Path], stage: Stages) -> tuple[ModelChoice, str]:
+def choose(
+    experiment: Experiment, logs: Sequence[Path], stage: Stages
+) -> tuple[ModelChoice, str]:
     """Choose friction and estimator with some logs; return the choice and the text of a file."""
     if experiment.linear is not None:
         raise InputError(
-            f"{experiment.path.name}: leave `estimator.nonlinear_friction` out: the choice is "
+            f"{experiment.path.name}: leave `estimator.nonlinear_friction` out: the "
+            "choice is "
             "between models that are linear in their parameters."
         )
     experiment, _ = select_filter(experiment, logs, stage)
@@ -51,7 +54,9 @@ def choose(experiment: Experiment, logs: Sequence[Path], stage: Stages) -> tuple
 
 
 def choose_variant(
-    experiment: Experiment, observations: Sequence[Observations], progress: Progress | None = None
+    experiment: Experiment,
+    observations: Sequence[Observations],
+    progress: Progress | None = None,
 ) -> tuple[ModelChoice, str]:
     """Choose between variants of an experiment file; return the choice and the text of its file."""
     changes = dict(_variants(tomllib.loads(experiment.text)))
@@ -80,7 +85,9 @@ def _with_lengths(
     def with_length(base: BaseParameters) -> BaseParameters:
         if base.model.memory is None:
             return base
-        return eqx.tree_at(lambda b: b.model, base, base.model.with_memory(length=length))
+        return eqx.tree_at(
+            lambda b: b.model, base, base.model.with_memory(length=length)
+        )
 
     return [c._replace(base=with_length(c.base)) for c in candidates]
 

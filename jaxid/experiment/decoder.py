@@ -1,9 +1,9 @@
 """Decoding of TOML tables: a table calls a function, and its keys are the function's arguments.
 
-Names, types and defaults of the keys are those of the arguments, and the function's docstring
-describes them: `keys_of` gives all of it, also for the template that `jaxid init` prints. The
-function may be a class of the package. Of other functions, arguments before the `*` come from
-elsewhere and are no keys.
+Names, types and defaults of the keys are those of the arguments, and the function's
+docstring describes them: `keys_of` gives all of it, also for the template that `jaxid
+init` prints. The function may be a class of the package. Of other functions, arguments
+before the `*` come from elsewhere and are no keys.
 """
 
 import difflib
@@ -45,7 +45,9 @@ class Bounds(NamedTuple):
         rules = (("above", gt), ("at least", ge), ("at most", le), ("below", lt))
         for bound, (words, holds) in zip(self, rules, strict=True):
             if bound is not None and not holds(value, bound):
-                raise InputError(f"`{place}` must be {words} {bound:.10g}, but is {value}.")
+                raise InputError(
+                    f"`{place}` must be {words} {bound:.10g}, but is {value}."
+                )
 
 
 Positive = Annotated[float, Bounds(above=0.0)]
@@ -69,16 +71,25 @@ class Key(NamedTuple):
 def keys_of(function: Callable) -> dict[str, Key]:
     """Return the keys of a table that calls a function or class."""
     sections = re.findall(
-        r"^(?:Args|Attributes):\n((?:    .*\n?|\n)+)", inspect.getdoc(function) or "", flags=re.M
+        r"^(?:Args|Attributes):\n((?:    .*\n?|\n)+)",
+        inspect.getdoc(function) or "",
+        flags=re.M,
     )
-    entries = re.findall(r"^    (\w+): ((?:.*\n?)(?:        .*\n?)*)", "\n".join(sections), re.M)
+    entries = re.findall(
+        r"^    (\w+): ((?:.*\n?)(?:        .*\n?)*)", "\n".join(sections), re.M
+    )
     texts = {name: " ".join(text.split()) for name, text in entries}
     parameters = inspect.signature(function, eval_str=True).parameters.values()
-    kept = (p for p in parameters if isinstance(function, type) or p.kind is p.KEYWORD_ONLY)
-    # Converters widen the annotations of arguments; those of the fields say what is meant.
+    kept = (
+        p for p in parameters if isinstance(function, type) or p.kind is p.KEYWORD_ONLY
+    )
+    # Converters widen the annotations of arguments; those of the fields say what is
+    # meant.
     fields = typing.get_type_hints(function, include_extras=True)
     return {
-        p.name: Key(p.name, fields.get(p.name, p.annotation), p.default, texts.get(p.name, ""))
+        p.name: Key(
+            p.name, fields.get(p.name, p.annotation), p.default, texts.get(p.name, "")
+        )
         for p in kept
     }
 
@@ -109,7 +120,8 @@ def decode(
 ) -> list[dict[str, Any]]:
     """Return the arguments that a table holds for each of several functions that share it.
 
-    Arguments in `skip` are no keys; keys without default are needed where the table is `complete`.
+    Arguments in `skip` are no keys; keys without default are needed where the table is
+    `complete`.
     """
     groups = [{k: v for k, v in keys_of(f).items() if k not in skip} for f in functions]
     known = {name: key for keys in groups for name, key in keys.items()}
@@ -119,11 +131,15 @@ def decode(
     if missing and complete:
         table_name = re.sub(r"\[\d+\]", "", place)
         raise InputError(f"`{place}.{missing}` is missing: `[{table_name}]` needs it.")
-    values = {n: decode_value(v, known[n].hint, f"{place}.{n}") for n, v in table.items()}
+    values = {
+        n: decode_value(v, known[n].hint, f"{place}.{n}") for n, v in table.items()
+    }
     return [{n: values[n] for n in keys if n in values} for keys in groups]
 
 
-def check_names(table: dict[str, Any], known: list[str], place: str = "the file") -> None:
+def check_names(
+    table: dict[str, Any], known: list[str], place: str = "the file"
+) -> None:
     """Reject a key of a table, or a table of the file, that is not known."""
     name = next((name for name in table if name not in known), None)
     if name is None:
@@ -183,27 +199,37 @@ def _convert(value: Any, option: Any, place: str) -> Any:
         repeated = origin is list or arguments[-1] is Ellipsis
         hints = arguments[:1] * len(value) if repeated else arguments
         if len(hints) != len(value):
-            raise InputError(f"`{place}` must hold {len(hints)} values, but holds {len(value)}.")
+            raise InputError(
+                f"`{place}` must hold {len(hints)} values, but holds {len(value)}."
+            )
         pairs = enumerate(zip(value, hints, strict=True))
         return origin(decode_value(x, hint, f"{place}[{k}]") for k, (x, hint) in pairs)
     if origin is dict:
         if not isinstance(value, dict):
             return _OTHER
-        return {k: decode_value(x, arguments[1], f"{place}.{k}") for k, x in value.items()}
+        return {
+            k: decode_value(x, arguments[1], f"{place}.{k}") for k, x in value.items()
+        }
     if option not in _SCALARS:
         if isinstance(value, str | dict):
             return _OTHER
         try:
             made = np.array(value, np.float64)
         except (TypeError, ValueError) as error:
-            raise InputError(f"`{place}` must hold numbers, in rows of equal length.") from error
+            raise InputError(
+                f"`{place}` must hold numbers, in rows of equal length."
+            ) from error
         if (np.abs(made[np.isfinite(made)]) > LARGEST).any():
             raise InputError(f"`{place}`: no quantity is larger than {LARGEST:g}.")
         return made
-    if not isinstance(value, _SCALARS[option][0]) or isinstance(value, bool) != (option is bool):
+    if not isinstance(value, _SCALARS[option][0]) or isinstance(value, bool) != (
+        option is bool
+    ):
         return _OTHER
     if option in (int, float) and math.isfinite(value) and abs(value) > LARGEST:
-        raise InputError(f"`{place}` is {value:g}: no quantity is larger than {LARGEST:g}.")
+        raise InputError(
+            f"`{place}` is {value:g}: no quantity is larger than {LARGEST:g}."
+        )
     if isinstance(value, str) and not value.isprintable():
         raise InputError(f"`{place}` holds a control character, {value!a}: remove it.")
     return unit(value) if option is Unit else option(value)

@@ -67,9 +67,12 @@ def decode_estimator(table: dict[str, Any]) -> tuple[dict[str, Any], dict[str, A
     """Return the arguments of `build_estimation`, and the bounds of bodies.
 
     Raises:
-        InputError: If a key is wrong, belongs to another kind, or does not go with another one.
+        InputError: If a key is wrong, belongs to another kind, or does not go with
+            another one.
     """
-    given, bounds = decode([build_estimation, BodyBounds], table, "estimator", complete=False)
+    given, bounds = decode(
+        [build_estimation, BodyBounds], table, "estimator", complete=False
+    )
     owners = [KINDS["weighted"], KINDS["consistent"]]
     if not any(name in owners[0] and name not in owners[1] for name in given):
         kind = given.get("kind", "consistent")
@@ -78,12 +81,18 @@ def decode_estimator(table: dict[str, Any]) -> tuple[dict[str, Any], dict[str, A
     for name in (*given, *bounds):
         owners = [owner for owner, keys in KINDS.items() if name in keys]
         if owners and kind not in owners:
-            raise InputError(f"`estimator.{name}`: belongs to `kind = {quoted(owners)}`.")
+            raise InputError(
+                f"`estimator.{name}`: belongs to `kind = {quoted(owners)}`."
+            )
     defaults = {name: key.default for name, key in keys_of(build_estimation).items()}
-    changed = {name for name, value in given.items() if value and value != defaults[name]}
+    changed = {
+        name for name, value in given.items() if value and value != defaults[name]
+    }
     for name, others in ALTERNATIVES:
         if both := [other for other in others if {name, other} <= changed]:
-            raise InputError(f"`estimator`: `{name}` does not go with `{both[0]}`: choose one.")
+            raise InputError(
+                f"`estimator`: `{name}` does not go with `{both[0]}`: choose one."
+            )
     return given, bounds
 
 
@@ -94,7 +103,13 @@ def build_estimation(
     bounds: dict[str, Any],
     *,
     kind: Literal[
-        "weighted", "least_squares", "huber", "tukey", "correlated", "instrumental", "consistent"
+        "weighted",
+        "least_squares",
+        "huber",
+        "tukey",
+        "correlated",
+        "instrumental",
+        "consistent",
     ] = "consistent",
     weights: Literal["maximum_forces", "residual_variances"] | None = None,
     ridge: Fraction | Literal["cross_validated"] | None = None,
@@ -116,34 +131,37 @@ def build_estimation(
         source: Source of the robot, for a prior.
         folder: Folder of the experiment file.
         bounds: Bounds of bodies, in place of those from the robot's geometry.
-        kind: "consistent": weighted least squares over bodies that can exist; "weighted": without
-            that; "least_squares": every newton metre counts the same; "huber", "tukey": rows that
-            the model cannot explain count less, or not at all; "correlated": for residuals that
-            joints have in common; "instrumental": for noisy angles. Without it, what the other keys
-            belong to.
-        weights: Weights of the joints: "maximum_forces" (Eq. 30), the default where they are known;
-            or "residual_variances": what the model leaves unexplained.
-        ridge: Strength of a pull of undetermined combinations towards zero, relative to the
-            best-determined one, like `"cross_validated"`: as much as predicts left-out parts of the
-            logs best; or a number like 0.01.
-        truncate: Singular value below which directions are left out, relative to the largest, like
-            `0.01`.
-        prior: Prior of what the logs do not determine: "urdf" or "mjcf" takes the inertias of
-            the robot's file; with `ridge`, `truncate` or `kind = "consistent"`, which takes them by
-            itself if such bodies can exist.
-        essential: Held-out error that leaving out parameters may cost in all (fraction), like
-            `0.02`: keeps only parameters without which unseen data are predicted worse.
-        nonlinear_friction: Whether to find `epsilon` and `stribeck` of each joint too, and to keep
-            them if they predict unseen parts of the logs better.
-        uncertainty: Method of the standard deviations: "spectral"; "jackknife": from blocks of time
-            left out in turn; "independent": as if rows were independent, far too small.
-        limit: Standard deviations up to which a residual counts fully ("huber"), or from which it
-            does not count ("tukey"), like `4.0`.
-        reference: File of the commanded motion ("instrumental"), like `"trajectory.json"`; or a
-            list with one for each log.
+        kind: "consistent": weighted least squares over bodies that can exist;
+            "weighted": without that; "least_squares": every newton metre counts the
+            same; "huber", "tukey": rows that the model cannot explain count less, or
+            not at all; "correlated": for residuals that joints have in common;
+            "instrumental": for noisy angles. Without it, what the other keys belong to.
+        weights: Weights of the joints: "maximum_forces" (Eq. 30), the default where
+            they are known; or "residual_variances": what the model leaves unexplained.
+        ridge: Strength of a pull of undetermined combinations towards zero, relative to
+            the best-determined one, like `"cross_validated"`: as much as predicts
+            left-out parts of the logs best; or a number like 0.01.
+        truncate: Singular value below which directions are left out, relative to the
+            largest, like `0.01`.
+        prior: Prior of what the logs do not determine: "urdf" or "mjcf" takes the
+            inertias of the robot's file; with `ridge`, `truncate` or `kind =
+            "consistent"`, which takes them by itself if such bodies can exist.
+        essential: Held-out error that leaving out parameters may cost in all
+            (fraction), like `0.02`: keeps only parameters without which unseen data are
+            predicted worse.
+        nonlinear_friction: Whether to find `epsilon` and `stribeck` of each joint too,
+            and to keep them if they predict unseen parts of the logs better.
+        uncertainty: Method of the standard deviations: "spectral"; "jackknife": from
+            blocks of time left out in turn; "independent": as if rows were independent,
+            far too small.
+        limit: Standard deviations up to which a residual counts fully ("huber"), or
+            from which it does not count ("tukey"), like `4.0`.
+        reference: File of the commanded motion ("instrumental"), like
+            `"trajectory.json"`; or a list with one for each log.
         reference_start: Time stamp at which it began [s], like `0.0`; or a list.
         margin: Fraction of a ball that each body contains ("consistent"), like `0.01`.
-        pull: Strength of a pull towards the prior, or towards balls ("consistent"); 0 for none.
+        pull: Strength of a pull towards the prior, or towards balls ("consistent"); 0
+            for none.
 
     Raises:
         InputError: If keys do not go together, or a file cannot be read.
@@ -159,7 +177,8 @@ def build_estimation(
             if weights is not None:
                 raise InputError(f'`weights = "maximum_forces"`: {error}') from error
             notes.append(
-                "the largest forces of the joints are not known: joints are weighted by the "
+                "the largest forces of the joints are not known: joints are weighted "
+                "by the "
                 "residuals' variances."
             )
     solution: estimators.AbstractSolution = estimators.Complete()
@@ -181,29 +200,44 @@ def build_estimation(
         case "huber" | "tukey":
             loss = estimators.Huber if kind == "huber" else estimators.Tukey
             chosen = loss() if limit is None else loss(limit)
-            estimator = estimators.IterativelyReweighted(chosen, joint_weights, solution)
+            estimator = estimators.IterativelyReweighted(
+                chosen, joint_weights, solution
+            )
         case "correlated":
             estimator = estimators.GeneralisedLeastSquares(solution)
         case "instrumental":
             if reference is None:
-                raise InputError('`reference` is missing: `kind = "instrumental"` needs it.')
+                raise InputError(
+                    '`reference` is missing: `kind = "instrumental"` needs it.'
+                )
             names = [reference] if isinstance(reference, str) else reference
             references = tuple(load_trajectory(folder / name) for name in names)
-            starts = reference_start if isinstance(reference_start, list) else [reference_start]
-            estimator = estimators.InstrumentalVariables(references, joint_weights, tuple(starts))
+            starts = (
+                reference_start
+                if isinstance(reference_start, list)
+                else [reference_start]
+            )
+            estimator = estimators.InstrumentalVariables(
+                references, joint_weights, tuple(starts)
+            )
         case "consistent":
             if bodies is None:
                 bodies = _possible_bodies(source, folder)
             entropic = EntropicPull(bodies, pull) if pull else None
             if "ellipsoid_centre" in bounds and "ellipsoid_axes" not in bounds:
-                raise InputError("`ellipsoid_centre` needs `ellipsoid_axes`: the half axes [m].")
-            limits = BodyBounds.from_geometry(robot).replace(**bounds) if bounds else None
+                raise InputError(
+                    "`ellipsoid_centre` needs `ellipsoid_axes`: the half axes [m]."
+                )
+            limits = (
+                BodyBounds.from_geometry(robot).replace(**bounds) if bounds else None
+            )
             given = joint_weights, limits, margin or 0.0, entropic
             estimator = PhysicallyConsistent(*given, throw=False)
     if bodies is not None and kind != "consistent":
         if isinstance(solution, estimators.Complete):
             raise InputError(
-                "`prior` needs `ridge` or `truncate`: without them the logs decide everything."
+                "`prior` needs `ridge` or `truncate`: without them the logs decide "
+                "everything."
             )
         known = named(bodies)
         p = np.array([known.get(name, 0.0) for name in model.parameter_names])
@@ -212,7 +246,9 @@ def build_estimation(
     return Estimation(estimator, plain, method, essential, nonlinear_friction, notes)
 
 
-def _possible_bodies(source: RobotSource, folder: Path) -> Float[np.ndarray, "bodies 10"] | None:
+def _possible_bodies(
+    source: RobotSource, folder: Path
+) -> Float[np.ndarray, "bodies 10"] | None:
     """Return the bodies of the URDF file if all of them can exist, as those of a robot do."""
     try:
         bodies = source.parameters(folder)

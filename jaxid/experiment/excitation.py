@@ -19,10 +19,19 @@ from jaxid.report.excitation import write_excitation
 from jaxid.report.result_files import read_fit
 from jaxid.result_table import Remark, Status
 from jaxid.trajectory.controllers import BESIDE, CONTROLLERS
-from jaxid.trajectory.files import load_trajectory, save_trajectory, write_csv, write_ros
+from jaxid.trajectory.files import (
+    load_trajectory,
+    save_trajectory,
+    write_csv,
+    write_ros,
+)
 from jaxid.trajectory.fourier import FourierBasis, complete_limits
 from jaxid.trajectory.leads import WithLeads, with_leads
-from jaxid.trajectory.trajectory import AbstractTrajectory, LinearTrajectory, PaddedToCycle
+from jaxid.trajectory.trajectory import (
+    AbstractTrajectory,
+    LinearTrajectory,
+    PaddedToCycle,
+)
 
 from .decoder import within
 from .experiment import Experiment
@@ -36,16 +45,21 @@ class Nominal(NamedTuple):
     """Base parameters as far as they are known before the experiment."""
 
     parameters: Float[np.ndarray, " base"]  # values; NaN where nothing is known
-    # covariance of an earlier fit, zero for what it does not determine; None if they are claims
+    # covariance of an earlier fit, zero for what it does not determine; None if they
+    # are claims
     covariance: Float[np.ndarray, "base base"] | None
-    undetermined: tuple[str, ...] = ()  # names of what an earlier fit does not determine
+    undetermined: tuple[
+        str, ...
+    ] = ()  # names of what an earlier fit does not determine
 
 
 class Played(NamedTuple):
     """A motion as a robot can play it."""
 
     motion: AbstractTrajectory  # from standstill to standstill where that is possible
-    sampled: AbstractTrajectory  # as it is written in samples: until a sample meets its end
+    sampled: (
+        AbstractTrajectory  # as it is written in samples: until a sample meets its end
+    )
     sample_time: float  # time between those samples [s]
     window: tuple[float, float]  # times between which it is the designed motion [s]
     fault: str  # why it does not start and end at rest; empty if it does, or need not
@@ -63,7 +77,9 @@ class Preparation(NamedTuple):
     """Knowledge that a design needs before its search."""
 
     nominal: Nominal | None  # parameters that are known
-    constraints: tuple[AbstractConstraint, ...]  # constraints beside the limits of the joints
+    constraints: tuple[
+        AbstractConstraint, ...
+    ]  # constraints beside the limits of the joints
     force_fault: str  # why forces are not among the constraints; empty if they are
     begin: LinearTrajectory | None = None  # motion to go on with; None to begin anew
 
@@ -77,7 +93,8 @@ def prepare_design(experiment: Experiment, written: Path | None) -> Preparation:
     """Find the constraints of a design, and the motion of an earlier one to go on with.
 
     Raises:
-        InputError: If the table does not fit the robot, or the earlier motion does not fit either.
+        InputError: If the table does not fit the robot, or the earlier motion does not
+            fit either.
     """
     controller = experiment.excitation.controller
     if experiment.excitation.ros == "mcap":
@@ -188,14 +205,22 @@ def write_design(
     # First the page: where there is no room for pictures, nothing changes.
     place, motion = output.with_suffix(""), design.played.motion
     shapes = experiment.surroundings.shapes
-    pictures = write_excitation(place, design.plan, motion, design.remarks, settings, shapes)
+    pictures = write_excitation(
+        place, design.plan, motion, design.remarks, settings, shapes
+    )
     return write_motion(experiment, design.played, output) + pictures
 
 
-def _settings(experiment: Experiment, preparation: Preparation, weighted: bool = True) -> dict:
+def _settings(
+    experiment: Experiment, preparation: Preparation, weighted: bool = True
+) -> dict:
     """Return what all designs of one experiment have in common."""
     table, nominal = experiment.excitation, preparation.nominal
-    noise = assumed_noise(experiment.robot) if table.noise is None else np.array(table.noise)
+    noise = (
+        assumed_noise(experiment.robot)
+        if table.noise is None
+        else np.array(table.noise)
+    )
     sizes = None
     if nominal is not None:
         # An estimate of what is not determined means nothing alone.
@@ -218,7 +243,8 @@ def find_constraints(
     """Return constraints beside the limits of the joints, and why forces are not among them.
 
     Raises:
-        InputError: If `force_margin` is given, but no motion can keep the limits of forces.
+        InputError: If `force_margin` is given, but no motion can keep the limits of
+            forces.
     """
     table, robot = experiment.excitation, experiment.robot
     clearance = experiment.surroundings.clearance
@@ -226,7 +252,10 @@ def find_constraints(
     tip = TipLimits(table.tip_speed, table.tip_acceleration, *(table.workspace or ()))
     if tip.entries(robot):
         constraints.append(tip)
-    fault = "not checked: no inertias are known; say in `excitation.nominal` where a report is"
+    fault = (
+        "not checked: no inertias are known; say in `excitation.nominal` where a "
+        "report is"
+    )
     if nominal is not None:
         known, margin = np.nan_to_num(nominal.parameters), table.force_margin
         if margin is None:
@@ -249,7 +278,8 @@ def _earlier_information(
         return None
     if not table.objective.weighted:
         raise InputError(
-            f'`earlier` and `criterion = "{table.criterion}"` do not go together: choose a '
+            f'`earlier` and `criterion = "{table.criterion}"` do not go together: '
+            "choose a "
             'criterion in units of the noise, like "d_optimal".'
         )
     total = 0.0
@@ -257,7 +287,8 @@ def _earlier_information(
         trajectory = load_trajectory(folder / name)
         if trajectory.joints != experiment.robot.joints:
             raise InputError(
-                f"`earlier`: the motion of `{name}` moves {trajectory.joints} joint(s), but the "
+                f"`earlier`: the motion of `{name}` moves {trajectory.joints} "
+                "joint(s), but the "
                 f"robot `{experiment.robot.name}` has {experiment.robot.joints}."
             )
         times = np.arange(table.samples) * (float(trajectory.duration) / table.samples)
@@ -272,7 +303,11 @@ def find_nominal(experiment: Experiment) -> Nominal | None:
     Raises:
         InputError: If the earlier result is of other parameters.
     """
-    base, report, folder = experiment.base, experiment.excitation.nominal, experiment.path.parent
+    base, report, folder = (
+        experiment.base,
+        experiment.excitation.nominal,
+        experiment.path.parent,
+    )
     if report is None:
         try:
             known = experiment.source.claims(folder)
@@ -283,13 +318,16 @@ def find_nominal(experiment: Experiment) -> Nominal | None:
         if not known:
             return None
         standard = experiment.model.parameter_names
-        values = np.asarray(base.from_standard([known.get(name, 0.0) for name in standard]))
+        values = np.asarray(
+            base.from_standard([known.get(name, 0.0) for name in standard])
+        )
         leads = [standard[k] in known for k in base.indices]
         return Nominal(np.where(leads, values, np.nan), None)
     fit = read_fit(folder / report)
     if fit.base.names != base.names:
         raise InputError(
-            f"`nominal`: the base parameters of `{report}` are not the {base.size} of this file."
+            f"`nominal`: the base parameters of `{report}` are not the {base.size} of "
+            "this file."
         )
     covariance = np.array(fit.covariance)
     undetermined = ~np.isfinite(np.diag(covariance))
@@ -312,7 +350,8 @@ def play(experiment: Experiment, motion: LinearTrajectory) -> Played:
             begin, end = (float(t) for t in played.window)
         except InputError as error:
             fault = (
-                f"the motion is without leads, and starts and ends at full speed: {error} "
+                "the motion is without leads, and starts and ends at full speed: "
+                f"{error} "
                 "`rest = true` designs one at rest there."
             )
     elif leads is not None:
@@ -326,25 +365,29 @@ def play(experiment: Experiment, motion: LinearTrajectory) -> Played:
 
 
 def _remarks(
-    experiment: Experiment, plan: ExcitationPlan, played: Played, preparation: Preparation
+    experiment: Experiment,
+    plan: ExcitationPlan,
+    played: Played,
+    preparation: Preparation,
 ) -> Iterator[Remark]:
     """Yield what must be known of a designed motion beside its plan."""
     table, (begin, end) = experiment.excitation, played.window
     if played.fault:
         yield Remark(played.fault, Status.BAD)
     if begin > 0:
-        text = f"from {begin:.3f} to {end:.3f} s of {float(played.motion.duration):.3f} s"
+        text = (
+            f"from {begin:.3f} to {end:.3f} s of {float(played.motion.duration):.3f} s"
+        )
         yield Remark(f"the robot starts at rest and is in the designed motion {text}")
     count = 1 if table.chosen_leads is None else table.chosen_leads.periods
     notes = {
-        "the noise is assumed as 1 % of the largest forces: give `noise` if it is known": (
-            table.noise is None
-        ),
+        "the noise is assumed as 1 % of the largest forces: give `noise` if it is "
+        "known": (table.noise is None),
         f"deviations are those together with {', '.join(table.earlier)}": table.earlier,
-        f"the motion runs through {count} periods; the deviations are of one": count > 1,
-        "for relative deviations, say in `excitation.nominal` where an earlier result is": (
-            preparation.nominal is None
-        ),
+        f"the motion runs through {count} periods; the deviations are of one": count
+        > 1,
+        "for relative deviations, say in `excitation.nominal` where an earlier result "
+        "is": (preparation.nominal is None),
     }
     for text, holds in notes.items():
         if holds:
@@ -362,7 +405,10 @@ def _force_doubts(experiment: Experiment, nominal: Nominal | None) -> Iterator[R
     if unknown:
         text = f"not known, and counted as zero in the forces: {', '.join(unknown)}"
         if experiment.excitation.force_margin is None:
-            text += f"; so {100 * UNKNOWN:g} % of the largest forces are kept free (`force_margin`)"
+            text += (
+                f"; so {100 * UNKNOWN:g} % of the largest forces are kept free "
+                "(`force_margin`)"
+            )
         yield Remark(text, Status.DOUBTFUL)
     if nominal.undetermined:
         text = (

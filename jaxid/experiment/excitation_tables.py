@@ -54,7 +54,9 @@ def capsule(
     return body, Capsule(name, GROUND, start=start, end=end, radius=radius)
 
 
-def box(*, name: str, centre: Vector, size: Vector, rotation: Vector | None = None) -> Box:
+def box(
+    *, name: str, centre: Vector, size: Vector, rotation: Vector | None = None
+) -> Box:
     """Return a box in the world.
 
     Args:
@@ -75,14 +77,16 @@ class Collision:
         distance: Distance that must remain [m].
         fit: Whether to fit capsules around the geometry of the robot's links.
         packages: Folder of what the URDF file calls `package://`, like `"."`.
-        floor: Height of the floor [m], "base" for the plane on which the robot stands, or false
-            for none.
+        floor: Height of the floor [m], "base" for the plane on which the robot stands,
+            or false for none.
         capsules: Capsules on bodies or on the ground, like
-            `[{ name = "gun", body = "ground", start = [0, 0, 0], end = [0, 0, 1], radius = 0.1 }]`.
+            `[{ name = "gun", body = "ground", start = [0, 0, 0], end = [0, 0, 1],
+            radius = 0.1 }]`.
         boxes: Boxes in the world, with angles in degrees, like
-            `[{ name = "table", centre = [0.8, 0, 0.2], size = [1, 1, 1], rotation = [0, 0, 45] }]`.
-        pairs: Pairs of shapes to watch, like `[["gun", "table"]]`; by default all that the joints
-            can bring together.
+            `[{ name = "table", centre = [0.8, 0, 0.2], size = [1, 1, 1], rotation = [0,
+            0, 45] }]`.
+        pairs: Pairs of shapes to watch, like `[["gun", "table"]]`; by default all that
+            the joints can bring together.
     """
 
     distance: Positive = 0.03
@@ -109,7 +113,9 @@ class Collision:
             number = GROUND if body == "ground" else joint_number(robot, body)
             capsules.append(dataclasses.replace(shape, body=number))
         obstacles += self.boxes
-        if self.floor is not False and not any(isinstance(o, HalfSpace) for o in obstacles):
+        if self.floor is not False and not any(
+            isinstance(o, HalfSpace) for o in obstacles
+        ):
             obstacles.append(self._floor(source))
         if self.fit:
             # The base may be a frame alone.
@@ -119,8 +125,10 @@ class Collision:
             capsules += stout
             if names := ", ".join(f"`{c.name}`" for c in stout):
                 faults.append(
-                    f"the shape of {names} is unknown: stout capsules along the lines between the "
-                    "joints stand in for it; give `capsules` in `[collision]`, or a file with "
+                    f"the shape of {names} is unknown: stout capsules along the lines "
+                    "between the "
+                    "joints stand in for it; give `capsules` in `[collision]`, or a "
+                    "file with "
                     "collision geometry"
                 )
         try:
@@ -157,9 +165,17 @@ class Collision:
             return [], []
         packages, faults = None if self.packages is None else folder / self.packages, {}
         place = {**source.chain, **source.placement}
-        found = fit_capsules(folder / source.file, packages=packages, faults=faults, **place)
-        why = {text: [n for n, t in faults.items() if t == text] for text in faults.values()}
-        said = (f"{owners('link', n)}: geometry not read ({x.rstrip('.')})" for x, n in why.items())
+        found = fit_capsules(
+            folder / source.file, packages=packages, faults=faults, **place
+        )
+        why = {
+            text: [n for n, t in faults.items() if t == text]
+            for text in faults.values()
+        }
+        said = (
+            f"{owners('link', n)}: geometry not read ({x.rstrip('.')})"
+            for x, n in why.items()
+        )
         return list(found), list(said)
 
 
@@ -193,35 +209,38 @@ class Excitation:
     """Motion that `jaxid excite` designs, within the limits above.
 
     Attributes:
-        criterion: Objective: "d_optimal" for the smallest standard deviations on the whole,
-            a_optimal, e_optimal, condition_number (the paper's, Eq. 36), weighted_condition_number
-            or scaled_condition_number.
+        criterion: Objective: "d_optimal" for the smallest standard deviations on the
+            whole, a_optimal, e_optimal, condition_number (the paper's, Eq. 36),
+            weighted_condition_number or scaled_condition_number.
         harmonics: Number of harmonics of the Fourier series.
         omega: Ground frequency of the series [rad/s].
         rest: Whether the motion starts and stops at rest.
         spline: Spline from rest to rest in place of a series, like
             `{ points = 12, duration = 8.0 }`.
         leads: Way from standstill into the periodic motion, and out; or a table, like
-            `{ time = 0.5, periods = 2 }`: of so many seconds, designed together with the motion,
-            and two periods between them.
+            `{ time = 0.5, periods = 2 }`: of so many seconds, designed together with
+            the motion, and two periods between them.
         samples: Number of samples that one run will measure.
-        noise: Standard deviation of the forces' noise for each joint [N m or N]; by default 1 % of
-            the largest forces.
+        noise: Standard deviation of the forces' noise for each joint [N m or N]; by
+            default 1 % of the largest forces.
         starts: Number of random motions to start from.
         generations: Number of times that the motions found have children.
         polish: Number of the best motions that are polished.
-        time: Time for the search [s], like `60.0`; by default all of its steps are done.
+        time: Time for the search [s], like `60.0`; by default all of its steps are
+            done.
         seed: Seed of the random motions.
-        sample_time: Time between two rows of the written table, the controller's cycle [s], like
-            `0.004`; by default that of the controller, or of the samples.
+        sample_time: Time between two rows of the written table, the controller's cycle
+            [s], like `0.004`; by default that of the controller, or of the samples.
         controller: Controller that plays the motion, for its cycle and its file, like
             "universal_robots"; or franka, kuka_fri, kuka_rsi.
         ros: Kind of the file for ROS 2: "yaml" or "mcap" (a bag).
-        nominal: Folder of an earlier result of `jaxid identify`, to compare with, like `"report"`.
+        nominal: Folder of an earlier result of `jaxid identify`, to compare with, like
+            `"report"`.
         earlier: Motions whose logs will be used together with this one's, like
             `["trajectory.json"]`.
-        force_margin: Fraction of the largest forces to keep free, by nominal parameters, like
-            `0.1`; by default 0.3 if friction or others are unknown, else 0.
+        force_margin: Fraction of the largest forces to keep free, by nominal
+            parameters, like `0.1`; by default 0.3 if friction or others are unknown,
+            else 0.
         tip_speed: Largest speed of the end-effector [m/s], like `1.5`.
         tip_acceleration: Largest acceleration of the end-effector [m/s²], like `10.0`.
         workspace: Box for the end-effector: two corners [m], like
@@ -279,12 +298,14 @@ class Excitation:
         """Return the basis of the trajectories; with other constraints, leads are designed too.
 
         Raises:
-            InputError: If two kinds are asked for, or one whose end no sample would meet.
+            InputError: If two kinds are asked for, or one whose end no sample would
+                meet.
         """
         if self.spline is not None:
             if self.rest:
                 raise InputError(
-                    "`rest` is for Fourier series, and a `spline` rests at its ends: leave one out."
+                    "`rest` is for Fourier series, and a `spline` rests at its ends: "
+                    "leave one out."
                 )
             return self.spline
         leads, series = self.chosen_leads, (self.harmonics, self.omega)
@@ -296,8 +317,10 @@ class Excitation:
             count = count_cycles(period, step)
             if abs(count * step - period) > 1e-6 * step:
                 raise InputError(
-                    f"`sample_time` must divide the period of {period:.9g} s where there are no "
-                    f"`leads`: choose `omega` = {2 * np.pi / (count * step):.9g}, or use `leads`."
+                    f"`sample_time` must divide the period of {period:.9g} s where "
+                    "there are no "
+                    f"`leads`: choose `omega` = {2 * np.pi / (count * step):.9g}, or "
+                    "use `leads`."
                 )
         if leads is None or (not constrained and leads.time is None):
             return FourierBasis(*series)

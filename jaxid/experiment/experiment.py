@@ -12,7 +12,13 @@ import numpy as np
 from jaxid.arrays import Float
 from jaxid.dynamics.base import BaseParameters, base_parameters
 from jaxid.dynamics.model import Model
-from jaxid.dynamics.terms import AbstractTerm, AbstractTransition, LoadFriction, RigidBodies, Tanh
+from jaxid.dynamics.terms import (
+    AbstractTerm,
+    AbstractTransition,
+    LoadFriction,
+    RigidBodies,
+    Tanh,
+)
 from jaxid.errors import InputError
 from jaxid.identification.consistency import BodyBounds, PhysicallyConsistent
 from jaxid.identification.estimators import NonlinearFriction
@@ -88,7 +94,9 @@ class Experiment:
     # known load that is on the robot in some logs only; None if the file does not say
     load: Tool | float | None
     filter: AbstractFilter  # filter of motion, forces and columns
-    candidates: tuple[FilterCandidate, ...]  # filters to choose from; none if the file names one
+    candidates: tuple[
+        FilterCandidate, ...
+    ]  # filters to choose from; none if the file names one
     decimation: AbstractDecimation  # decimation of forces and columns
     # speeds below which rows do not count [rad/s or m/s]; None if all count
     min_speed: Float[np.ndarray, " joints"] | None
@@ -118,7 +126,9 @@ class Experiment:
         if self.linear is not None:
             linear = base_parameters(Model(self.robot, self.linear))
             estimator = NonlinearFriction(chosen.plain)
-            found = identify_nonlinear(self.base, logs, estimator, linear=linear, progress=progress)
+            found = identify_nonlinear(
+                self.base, logs, estimator, linear=linear, progress=progress
+            )
             return found.better
         notes = ()
         if self.model.memory is not None:
@@ -151,7 +161,10 @@ class Experiment:
             if np.abs(found - last).max() < 1e-3 * np.abs(found).max():
                 return fit
             last = found
-        note = f"friction by load has not settled in {LOAD_ROUNDS} fits: its values are uncertain."
+        note = (
+            f"friction by load has not settled in {LOAD_ROUNDS} fits: its values "
+            "are uncertain."
+        )
         return dataclasses.replace(fit, notes=(*fit.notes, note))
 
     def read(self, log: str | Path) -> Recording:
@@ -166,25 +179,35 @@ class Experiment:
         commands = self.logs.commands
         if commands is None or self.is_long(log):
             return None
-        columns = dataclasses.replace(self._columns_of(log), angles=commands, velocities=None)
+        columns = dataclasses.replace(
+            self._columns_of(log), angles=commands, velocities=None
+        )
         return self.observe(self._read(log, columns))
 
     def read_commands(self, log: str | Path) -> Recording:
         """Read a log with the commanded angles in place of forces.
 
         Raises:
-            InputError: If the file does not name the columns of the commands, or the log is not as
-                it says.
+            InputError: If the file does not name the columns of the commands, or the
+                log is not as it says.
         """
         log, commands = Path(log), self.logs.commands
         columns = self._columns_of(log)
         if commands is None:
             raise InputError(
-                f"{self.path.name}: `recording.commands` is missing: it names the columns of the "
+                f"{self.path.name}: `recording.commands` is missing: it names the "
+                "columns of the "
                 'commanded angles, like "cmd{}".'
             )
-        plain = {"forces": commands, "force_unit": NM, "force_signs": None, "force_gains": None}
-        columns = dataclasses.replace(columns, **plain, torque_constants=None, velocities=None)
+        plain = {
+            "forces": commands,
+            "force_unit": NM,
+            "force_signs": None,
+            "force_gains": None,
+        }
+        columns = dataclasses.replace(
+            columns, **plain, torque_constants=None, velocities=None
+        )
         swapped = dataclasses.replace(columns, angles=commands, forces=columns.angles)
         found = []
         for key, chosen in (("forces", columns), ("angles", swapped)):
@@ -201,7 +224,8 @@ class Experiment:
         found = None if wanted is False else self.source.parameters(self.path.parent)
         if found is None and wanted:
             raise InputError(
-                f"{self.path.name}: `rollout.bodies` needs a robot from a URDF or MJCF file."
+                f"{self.path.name}: `rollout.bodies` needs a robot from a URDF or "
+                "MJCF file."
             )
         if found is None or not (found[:, 0] > 0).any():
             return None
@@ -221,24 +245,32 @@ class Experiment:
         if recording.joints != self.robot.joints:
             raise InputError(
                 f"{self.path.name}: `recording.angles` names {recording.joints} of the "
-                f"columns of `{log.name}`, but `{self.robot.name}` has {self.robot.joints} joints: "
+                f"columns of `{log.name}`, but `{self.robot.name}` has "
+                f"{self.robot.joints} joints: "
                 "name one column for each, or choose another robot (`robot.tip`)."
             )
         with within("recording", self.path.name):
             if recording.sample_time < 1e-6:
                 rate = 1 / recording.sample_time
                 raise InputError(
-                    f"`{log.name}` has {rate:.3g} samples in a second: check `time_unit`."
+                    f"`{log.name}` has {rate:.3g} samples in a second: check "
+                    "`time_unit`."
                 )
             start, stop = logs.part(log)
             if np.isfinite((start, stop)).any():
                 recording = recording.crop(start, stop)
-            return remove_delay(recording, logs.force_delay) if logs.force_delay else recording
+            return (
+                remove_delay(recording, logs.force_delay)
+                if logs.force_delay
+                else recording
+            )
 
     def observe(self, recording: Recording) -> Observations:
         """Filter a recording and make rows of it, as the tables `[filter]` and `[rows]` say."""
         with within("filter` and `rows", self.path.name):
-            return observe(recording, self.robot, self.filter, self.decimation, self.min_speed)
+            return observe(
+                recording, self.robot, self.filter, self.decimation, self.min_speed
+            )
 
     def is_long(self, log: str | Path) -> bool:
         """Return whether a log is better read part by part than as a whole."""
@@ -266,7 +298,8 @@ class Experiment:
     def _columns_of(self, log: Path) -> Columns:
         if self.columns is None:
             raise InputError(
-                f"{self.path.name}: the table `[recording]` is missing: it names columns of "
+                f"{self.path.name}: the table `[recording]` is missing: it names "
+                "columns of "
                 f"`{log.name}`, which has {summarise_columns(log)}."
             )
         return self.columns
@@ -277,12 +310,15 @@ def load_experiment(path: str | Path) -> Experiment:
     path = Path(path)
     if not path.is_file():
         raise InputError(
-            f"`{path}` is no file: check its path, or write one with `jaxid init arm.urdf`."
+            f"`{path}` is no file: check its path, or write one with `jaxid init "
+            "arm.urdf`."
         )
     try:
         text = path.read_bytes().decode("utf-8-sig")
     except ValueError as error:
-        raise InputError(f"{path.name}: the file is no TOML in UTF-8: {error}.") from error
+        raise InputError(
+            f"{path.name}: the file is no TOML in UTF-8: {error}."
+        ) from error
     return parse_experiment(text, path)
 
 
@@ -292,7 +328,9 @@ def parse_experiment(text: str, path: Path) -> Experiment:
         content = tomllib.loads(text)
     except (ValueError, RecursionError) as error:
         said = str(error).rstrip(".")
-        raise InputError(f"{path.name}: the file is no TOML in UTF-8: {said}.") from error
+        raise InputError(
+            f"{path.name}: the file is no TOML in UTF-8: {said}."
+        ) from error
     try:
         experiment = Experiment(path=path, text=text, **_build(content, path.parent))
     except InputError as error:
@@ -330,10 +368,16 @@ def _build(content: dict[str, Any], folder: Path) -> dict[str, Any]:
     given, bounds = decode_estimator(content.get("estimator", {}))
     with within("estimator"):
         estimation = build_estimation(model, source, folder, bounds, **given)
-        if load_transition and not isinstance(estimation.estimator, PhysicallyConsistent):
-            raise InputError('`model.load` needs the bodies that `kind = "consistent"` finds.')
+        if load_transition and not isinstance(
+            estimation.estimator, PhysicallyConsistent
+        ):
+            raise InputError(
+                '`model.load` needs the bodies that `kind = "consistent"` finds.'
+            )
     if estimation.nonlinear and model.memory is not None:
-        raise InputError("give `coulomb.presliding` or `nonlinear_friction`, but not both.")
+        raise InputError(
+            "give `coulomb.presliding` or `nonlinear_friction`, but not both."
+        )
     tool = None
     if "load" in content:
         load = call(known_load, content["load"], "load")

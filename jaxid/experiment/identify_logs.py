@@ -25,7 +25,10 @@ from jaxid.identification.combination import (
 from jaxid.identification.consistency import PhysicallyConsistent
 from jaxid.identification.encoder_resolution import resolution_note
 from jaxid.identification.estimators import AbstractEstimator, Complete, GivenWeights
-from jaxid.identification.filter_and_parameter_selection import FilterChoice, choose_filter
+from jaxid.identification.filter_and_parameter_selection import (
+    FilterChoice,
+    choose_filter,
+)
 from jaxid.identification.fit_result import Fit
 from jaxid.identification.identify import fit_problem
 from jaxid.identification.problem import RegressionProblem
@@ -92,7 +95,9 @@ def load_log(
             log = log if name is None else log.replace(name=name)
             stage(f"looking through {path.name}")
             robot, min_speed = experiment.robot, experiment.min_speed
-            diagnosis = diagnose(log, robot, min_speed=min_speed, progress=stage.through)
+            diagnosis = diagnose(
+                log, robot, min_speed=min_speed, progress=stage.through
+            )
             notes, step = (*log.notes, *diagnosis.notes), comparison_step(log)
             if step > 1:
                 what = f"one of every {step} of its {log.rows} rows"
@@ -108,23 +113,36 @@ def load_log(
     stage(f"filtering {path.name}")
     observations = experiment.observe(recording)
     diagnosis = diagnose(recording, experiment.robot, observations=observations)
-    return recording, observations.replace(notes=(*observations.notes, *notes)), diagnosis
+    return (
+        recording,
+        observations.replace(notes=(*observations.notes, *notes)),
+        diagnosis,
+    )
 
 
 def findings(logs: Sequence[LoadedLog]) -> list[str]:
     """Return the findings on logs, each behind the name of its log."""
-    return [f"{log.name}: {text}" for log, _, diagnosis in logs for text in diagnosis.findings]
+    return [
+        f"{log.name}: {text}"
+        for log, _, diagnosis in logs
+        for text in diagnosis.findings
+    ]
 
 
 def require_motion(logs: Sequence[LoadedLog]) -> None:
     """Reject logs in which nothing moves."""
     for log, _, diagnosis in logs:
         if diagnosis.statistics.speed.max() < 1e-9:
-            raise InputError(f"no joint moves in `{log.name}`: name other columns, or another log.")
+            raise InputError(
+                f"no joint moves in `{log.name}`: name other columns, or another log."
+            )
 
 
 def select_filter(
-    experiment: Experiment, logs: Sequence[Path], stage: Stages, split: float | None = None
+    experiment: Experiment,
+    logs: Sequence[Path],
+    stage: Stages,
+    split: float | None = None,
 ) -> tuple[Experiment, FilterChoice | None]:
     """Return the experiment with the filter that suits some logs best, and the choice.
 
@@ -135,7 +153,8 @@ def select_filter(
     long = [log.name for log in logs if experiment.is_long(log)]
     if long:
         raise InputError(
-            f"{experiment.path.name}: `filter.cutoff` is a list, but `{long[0]}` is long: choose "
+            f"{experiment.path.name}: `filter.cutoff` is a list, but `{long[0]}` is "
+            "long: choose "
             "with a short part of it, and give that one number for the whole."
         )
     recordings = []
@@ -154,7 +173,9 @@ def select_filter(
             progress=stage.through,
         )
     notes = (*experiment.notes, str(choice))
-    return dataclasses.replace(experiment, filter=choice.filter, candidates=(), notes=notes), choice
+    return dataclasses.replace(
+        experiment, filter=choice.filter, candidates=(), notes=notes
+    ), choice
 
 
 def _without_bounds(experiment: Experiment) -> AbstractEstimator:
@@ -173,20 +194,29 @@ def earlier_run(experiment: Experiment, folder: Path) -> Fit:
     """Return the fit of the report in a folder."""
     fit = read_fit(folder)
     try:
-        require_same_base((fit, dataclasses.replace(fit, base=experiment.base, name="these logs")))
+        require_same_base(
+            (fit, dataclasses.replace(fit, base=experiment.base, name="these logs"))
+        )
     except InputError as error:
-        raise InputError(f"`{folder}` does not fit `{experiment.path.name}`: {error}") from error
+        raise InputError(
+            f"`{folder}` does not fit `{experiment.path.name}`: {error}"
+        ) from error
     return fit
 
 
 def read_runs(
-    experiment: Experiment, groups: Sequence[Sequence[Path]], names: Sequence[str], stage: Stages
+    experiment: Experiment,
+    groups: Sequence[Sequence[Path]],
+    names: Sequence[str],
+    stage: Stages,
 ) -> tuple[list[Fit], list[str]]:
     """Return a run of the logs and reports of each group, and doubts about the logs."""
     if experiment.linear is not None:
         raise InputError(
-            f"{experiment.path.name}: `estimator.nonlinear_friction` would find other shapes of "
-            "friction in each run: leave it out, and give all runs one `epsilon` and `stribeck`."
+            f"{experiment.path.name}: `estimator.nonlinear_friction` would find other "
+            "shapes of "
+            "friction in each run: leave it out, and give all runs one `epsilon` and "
+            "`stribeck`."
         )
     estimation, doubts = experiment.estimation, []
     complete = isinstance(estimation.plain.solution, Complete)
@@ -200,7 +230,9 @@ def read_runs(
     runs = []
     for paths, name in zip(groups, names, strict=True):
         fits = [earlier_run(experiment, path) for path in paths if is_report(path)]
-        logs = [load_log(experiment, path, stage) for path in paths if not is_report(path)]
+        logs = [
+            load_log(experiment, path, stage) for path in paths if not is_report(path)
+        ]
         require_motion(logs)
         doubts += findings(logs)
         if logs:
@@ -208,7 +240,9 @@ def read_runs(
             observations = [log for _, log, _ in logs]
             rows = RegressionProblem(experiment.base, observations, stage.through)
             fits.append(fit_problem(rows, estimation.plain))
-            doubts += mistakes_in_logs([diagnosis for *_, diagnosis in logs], fits[-1])[0]
+            doubts += mistakes_in_logs([diagnosis for *_, diagnosis in logs], fits[-1])[
+                0
+            ]
         runs.append(dataclasses.replace(functools.reduce(update, fits), name=name))
     return runs, doubts
 
@@ -236,7 +270,9 @@ def identify_logs(
     fitted, unseen = observations[: len(logs)], observations[len(logs) :]
     if split is not None:
         parts = [log.split(split) for log in fitted]
-        fitted = [a.replace(name=f"{a.name}, first {100 * split:g} %") for a, _ in parts]
+        fitted = [
+            a.replace(name=f"{a.name}, first {100 * split:g} %") for a, _ in parts
+        ]
         unseen = [*(b.replace(name=f"{b.name}, rest") for _, b in parts), *unseen]
     stage("finding base parameters")
     base = experiment.base
@@ -250,7 +286,10 @@ def identify_logs(
     validation = validate(fit, every, progress=stage.through)
     stage("looking for mistakes")
     # Bounds would hide what is wrong.
-    free, diagnoses = without_bounds(fit), [diagnosis for *_, diagnosis in loaded[: len(logs)]]
+    free, diagnoses = (
+        without_bounds(fit),
+        [diagnosis for *_, diagnosis in loaded[: len(logs)]],
+    )
     mistakes, more = mistakes_in_logs(diagnoses, free)
     notes = [*(note for o in every for note in o.notes), *more]
     for log, whole, diagnosis in loaded[: len(logs)]:
@@ -295,13 +334,18 @@ def _errors_of_claims(
     if not known:
         return (), 0.0
     standard = [known.get(name, 0.0) for name in fit.base.model.parameter_names]
-    claim = dataclasses.replace(fit, parameters=np.asarray(fit.base.from_standard(standard)))
+    claim = dataclasses.replace(
+        fit, parameters=np.asarray(fit.base.from_standard(standard))
+    )
     mass = float(np.sum([known[f"m{k + 1}"] for k in range(experiment.robot.joints)]))
     return tuple(torque_errors(claim, log) for log in logs), mass
 
 
 def _add_reports(
-    experiment: Experiment, reports: Sequence[Path], fit: Fit, unseen: Sequence[Observations]
+    experiment: Experiment,
+    reports: Sequence[Path],
+    fit: Fit,
+    unseen: Sequence[Observations],
 ) -> Fit:
     """Return a fit to all logs, those of earlier reports included, which must not be unseen."""
     bounded = fit.consistency is not None
@@ -309,11 +353,15 @@ def _add_reports(
         essential = experiment.estimation.essential is not None
         kind = "for essential parameters" if essential else fit.estimator
         raise InputError(
-            f"{experiment.path.name}: earlier reports can be added to least squares only, "
-            f"but the estimator is {kind}: leave `[estimator]` out, or give the logs themselves."
+            f"{experiment.path.name}: earlier reports can be added to least squares "
+            "only, "
+            f"but the estimator is {kind}: leave `[estimator]` out, or give the logs "
+            "themselves."
         )
     estimator = experiment.estimation.estimator
-    fit = functools.reduce(update, [*(earlier_run(experiment, p) for p in reports), fit])
+    fit = functools.reduce(
+        update, [*(earlier_run(experiment, p) for p in reports), fit]
+    )
     if isinstance(estimator, PhysicallyConsistent):
         rows = RegressionProblem(fit.base, blocks=fit.time_blocks, names=fit.recordings)
         weighted = dataclasses.replace(estimator, weights=GivenWeights(fit.weights))
@@ -323,6 +371,7 @@ def _add_reports(
         rows = RegressionProblem(experiment.base, [log])
         if fit.blocks is not None and share_rows(fit.blocks, rows.blocks):
             raise InputError(
-                f"a report that was given has seen the data of `{log.name}`: verify with another."
+                f"a report that was given has seen the data of `{log.name}`: verify "
+                "with another."
             )
     return fit

@@ -17,7 +17,16 @@ from jaxid.robot.limits_and_drives import per_joint
 from jaxid.robot.robot import Robot
 from jaxid.units import Unit
 
-from .decoder import Bounds, Count, Magnitude, Positive, call, decode, decode_value, within
+from .decoder import (
+    Bounds,
+    Count,
+    Magnitude,
+    Positive,
+    call,
+    decode,
+    decode_value,
+    within,
+)
 
 FILTERS: dict[str, type[filters.AbstractFilter]] = {
     "butterworth": filters.ZeroPhaseButterworth,
@@ -41,11 +50,12 @@ class DryFriction:
         epsilon: Speed of the smooth transition [rad/s or m/s]; or a list.
         dead_zone: Speed below which there is no dry friction [rad/s or m/s]; or a list.
         hard: Whether to take a sign instead of tanh(speed / epsilon).
-        asymmetric: Whether each direction has a level of its own (then there is no `offset`).
-        presliding: Whether friction has memory: it builds up along a path, whose length is found
-            from the logs, and rest keeps it.
-        stribeck: Speed about which friction falls from a static level [rad/s or m/s], like `0.1`;
-            or a list.
+        asymmetric: Whether each direction has a level of its own (then there is no
+            `offset`).
+        presliding: Whether friction has memory: it builds up along a path, whose length
+            is found from the logs, and rest keeps it.
+        stribeck: Speed about which friction falls from a static level [rad/s or m/s],
+            like `0.1`; or a list.
     """
 
     epsilon: Positive | list[Positive] = 0.01
@@ -59,7 +69,10 @@ class DryFriction:
         """Return the transition between the directions."""
         if self.presliding:
             steady = dataclasses.replace(self, presliding=False).transition(robot)
-            A, coupled = np.asarray(robot.drives.reduction), terms.CoupledDrives().couplings(robot)
+            A, coupled = (
+                np.asarray(robot.drives.reduction),
+                terms.CoupledDrives().couplings(robot),
+            )
             motors = A / np.diag(A)[:, None] if coupled else None
             return terms.Presliding(steady=steady, motors=motors)
         dead_zone = _speed(robot, "coulomb.dead_zone", self.dead_zone)
@@ -71,10 +84,16 @@ class DryFriction:
         """Return the term of the model."""
         transition = self.transition(robot)
         if self.stribeck is None:
-            kind = terms.AsymmetricCoulombFriction if self.asymmetric else terms.CoulombFriction
+            kind = (
+                terms.AsymmetricCoulombFriction
+                if self.asymmetric
+                else terms.CoulombFriction
+            )
             return kind(transition)
         if self.asymmetric:
-            raise InputError("give `coulomb.stribeck` or `coulomb.asymmetric`, but not both.")
+            raise InputError(
+                "give `coulomb.stribeck` or `coulomb.asymmetric`, but not both."
+            )
         speed = _speed(robot, "coulomb.stribeck", self.stribeck)
         return terms.StribeckFriction(speed=speed, transition=transition)
 
@@ -89,7 +108,8 @@ def _speed(
     if (slow := np.flatnonzero(speeds > fastest)).size:
         j = int(slow[0])
         raise InputError(
-            f"`{name}` must be below the largest speed of joint `{robot.joint_names[j]}`, "
+            f"`{name}` must be below the largest speed of joint "
+            f"`{robot.joint_names[j]}`, "
             f"{fastest[j]:g} {robot.joint_unit(j)}/s, but is {speeds[j]:g}."
         )
     return speeds if isinstance(value, list) else float(value)
@@ -100,19 +120,22 @@ class Effects:
     """Effects that the model has beside the rigid bodies.
 
     Attributes:
-        principal_axes: Whether to leave out products of inertia (seven per body, Eq. 12).
-        viscous: Whether friction grows with speed; "asymmetric": at one rate for each direction.
+        principal_axes: Whether to leave out products of inertia (seven per body, Eq.
+            12).
+        viscous: Whether friction grows with speed; "asymmetric": at one rate for each
+            direction.
         square_root: Whether friction grows with the square root of speed, too.
-        load: Whether dry friction grows with the weight on a joint, too; the bodies are those that
-            are identified, until both agree.
-        motor_ripple: Multiples of the motors' turns at which their torques ripple, like `[1, 2]`.
+        load: Whether dry friction grows with the weight on a joint, too; the bodies are
+            those that are identified, until both agree.
+        motor_ripple: Multiples of the motors' turns at which their torques ripple, like
+            `[1, 2]`.
         joint_ripple: Multiples of the joints' turns at which forces ripple, like `[1]`.
         rotor_inertia: Whether the motors' rotors are felt through the gears.
-        offset: Whether there is a constant force at each joint (sensor offsets); by default unless
-            dry friction is asymmetric.
+        offset: Whether there is a constant force at each joint (sensor offsets); by
+            default unless dry friction is asymmetric.
         springs: Whether there is a linear spring at each joint (counterbalances).
-        coupled_drives: Whether motors turn several axes; by default where the matrix of `[drives]`
-            has entries beside its diagonal.
+        coupled_drives: Whether motors turn several axes; by default where the matrix of
+            `[drives]` has entries beside its diagonal.
         coulomb: Dry friction, as a table; or none, like `false`.
     """
 
@@ -160,7 +183,9 @@ class Effects:
             InputError: If the bodies that it needs are not complete.
         """
         if self.load and self.principal_axes:
-            raise InputError("`load` needs complete bodies: leave `principal_axes` out.")
+            raise InputError(
+                "`load` needs complete bodies: leave `principal_axes` out."
+            )
         dry = self.coulomb if isinstance(self.coulomb, DryFriction) else DryFriction()
         return dry.transition(robot) if self.load else None
 
@@ -179,17 +204,18 @@ class Logs:
     Attributes:
         side: Side of the gears on which the log is: "joint" or "motor".
         forces_side: Side of the forces, if it is another one, like `"motor"`.
-        forces_file: File of the forces, if they lie in another file beside the log, like
-            `"{}_torque.csv"`: "{}" stands for the log's name without its suffix.
+        forces_file: File of the forces, if they lie in another file beside the log,
+            like `"{}_torque.csv"`: "{}" stands for the log's name without its suffix.
         velocities_file: File of the velocities, likewise, like `"{}_speed.csv"`.
-        commands: Columns of the commanded angles, like `"cmd{}"`: with them `jaxid inspect` tells a
-            delay in spite of disturbances, and `jaxid rollout` needs no `forces`.
+        commands: Columns of the commanded angles, like `"cmd{}"`: with them `jaxid
+            inspect` tells a delay in spite of disturbances, and `jaxid rollout` needs
+            no `forces`.
         force_delay: Time by which forces stand later in the log than angles [s].
-        largest_gap: Longest pause that is bridged, in sample times; a tenth of the period of the
-            filter's cut-off frequency is bridged in any case.
+        largest_gap: Longest pause that is bridged, in sample times; a tenth of the
+            period of the filter's cut-off frequency is bridged in any case.
         bad_rows: Fraction of the rows that may be bad, and are left out.
-        start: Start of the part of every log that is used [s], like `0.0`; or a table with that of
-            some logs, `{ "a.csv" = 1.5 }`.
+        start: Start of the part of every log that is used [s], like `0.0`; or a table
+            with that of some logs, `{ "a.csv" = 1.5 }`.
         stop: End of that part [s], like `10.0`; or a table.
     """
 
@@ -207,12 +233,17 @@ class Logs:
     def part(self, log: Path) -> tuple[float, float]:
         """Return start and stop of the part of a log that is used [s]."""
         ends = (self.start, -np.inf), (self.stop, np.inf)
-        start, stop = (x.get(log.name, own) if isinstance(x, dict) else x for x, own in ends)
+        start, stop = (
+            x.get(log.name, own) if isinstance(x, dict) else x for x, own in ends
+        )
         return start, stop
 
     def files(self, log: Path) -> dict[str, Any]:
         """Return the paths of the files beside a log, as the readers take them."""
-        names = {"forces_path": self.forces_file, "velocities_path": self.velocities_file}
+        names = {
+            "forces_path": self.forces_file,
+            "velocities_path": self.velocities_file,
+        }
         return {
             key: None if name is None else log.parent / name.replace("{}", log.stem)
             for key, name in names.items()
@@ -230,19 +261,24 @@ class Rollout:
     """Settings of `jaxid rollout`: for logs of commands, without torques, or for logs of torques.
 
     Attributes:
-        bodies: Whether the bodies of the robot's file load the joints; by default if it has some.
-        stiffness: Stiffness (proportional gain) of the servos if it is known [N m/rad or N/m], like
-            `12.0`, or a list with `nan` where it is not; otherwise a known weight tells it.
+        bodies: Whether the bodies of the robot's file load the joints; by default if it
+            has some.
+        stiffness: Stiffness (proportional gain) of the servos if it is known [N m/rad
+            or N/m], like `12.0`, or a list with `nan` where it is not; otherwise a
+            known weight tells it.
         time_step: Longest step of the simulation [s].
         friction: Whether friction that grows with load or falls with speed is tried.
         saturation: Whether a largest torque of the servo is tried.
-        integral: Whether integral action of the servos (PID instead of PD controllers) is tried.
+        integral: Whether integral action of the servos (PID instead of PD controllers)
+            is tried.
         samples: Number of MJCF files drawn from the distribution of the estimates.
         horizon: With torques: length of the windows that are simulated [s].
-        gains: With torques: whether gains of the other joints' torques, relative to the first
-            joint's, are identified.
-        load_friction: With torques: whether friction that grows with the torque is identified.
-        torque_rows: With torques: whether errors of torques count beside those of positions.
+        gains: With torques: whether gains of the other joints' torques, relative to the
+            first joint's, are identified.
+        load_friction: With torques: whether friction that grows with the torque is
+            identified.
+        torque_rows: With torques: whether errors of torques count beside those of
+            positions.
     """
 
     bodies: bool | None = None
@@ -268,7 +304,9 @@ class Rollout:
         for key in sorted(values.keys() - own.keys()):
             if values[key] != getattr(Rollout, key):
                 kind = "commands" if torques else "forces` without `recording.commands"
-                raise InputError(f"`rollout.{key}` is for logs with `recording.{kind}`.")
+                raise InputError(
+                    f"`rollout.{key}` is for logs with `recording.{kind}`."
+                )
         return own
 
 
@@ -290,16 +328,27 @@ def build_columns(table: dict[str, Any], robot: Robot) -> tuple[Columns, Logs]:
     given, reading = decode([Columns, Logs], table, "recording", skip=SIDES)
     with within("recording"):
         logs = Logs(**reading)
-        motors, motor_forces = logs.side == "motor", (logs.forces_side or logs.side) == "motor"
-        columns = Columns(**given, **dict(zip(SIDES, (motors, motor_forces), strict=True)))
+        motors, motor_forces = (
+            logs.side == "motor",
+            (logs.forces_side or logs.side) == "motor",
+        )
+        columns = Columns(
+            **given, **dict(zip(SIDES, (motors, motor_forces), strict=True))
+        )
         still = np.zeros((1, robot.joints))
         columns.to_si(still, still, still)  # refuses lists that do not fit the robot
         checked = [] if motors else ["angle_unit", "velocity_unit"]
         for name in (*checked, *([] if motor_forces else ["force_unit"])):
             units = given.get(name, ())
             units = [units] * robot.joints if isinstance(units, Unit) else units
-            for label, turns, one in zip(robot.joint_names, robot.revolute, units, strict=False):
-                foreign = ("mm", "mm/s", "N") if turns else ("deg", "rev", "deg/s", "rpm", "N m")
+            for label, turns, one in zip(
+                robot.joint_names, robot.revolute, units, strict=False
+            ):
+                foreign = (
+                    ("mm", "mm/s", "N")
+                    if turns
+                    else ("deg", "rev", "deg/s", "rpm", "N m")
+                )
                 if one.symbol in foreign:
                     raise InputError(
                         f'`{name}` of joint `{label}` is "{one.symbol}", but the joint '
@@ -308,11 +357,14 @@ def build_columns(table: dict[str, Any], robot: Robot) -> tuple[Columns, Logs]:
     return columns, logs
 
 
-def build_filters(table: dict[str, Any] | None) -> tuple[list[filters.AbstractFilter], list[str]]:
+def build_filters(
+    table: dict[str, Any] | None,
+) -> tuple[list[filters.AbstractFilter], list[str]]:
     """Return the filter, or several to choose from, and what is assumed without a table."""
     if table is None:
         note = (
-            f"no table `[filter]`: a Butterworth low-pass at {CUTOFF:g} Hz is assumed; choose "
+            f"no table `[filter]`: a Butterworth low-pass at {CUTOFF:g} Hz is "
+            "assumed; choose "
             "about five times the highest frequency of the motion."
         )
         return [filters.ZeroPhaseButterworth(CUTOFF)], [note]
@@ -337,19 +389,26 @@ def build_rows(
 
     Args:
         robot: Robot with the joints.
-        step: Number of samples from one row to the next, of signals below half of that rate.
-        factors: Factors of stages that low-pass and decimate, instead of `step`, like `[10, 10]`:
-            13 at most.
-        min_speed: Speed below which rows do not count [rad/s or m/s], like `0.05`; or a list.
+        step: Number of samples from one row to the next, of signals below half of that
+            rate.
+        factors: Factors of stages that low-pass and decimate, instead of `step`, like
+            `[10, 10]`: 13 at most.
+        min_speed: Speed below which rows do not count [rad/s or m/s], like `0.05`; or a
+            list.
 
     Raises:
         InputError: If two ways are asked for, or a factor is too large.
     """
     if step is not None and factors is not None:
-        raise InputError("give `step` or `factors`, which also low-pass filter, but not both.")
+        raise InputError(
+            "give `step` or `factors`, which also low-pass filter, but not both."
+        )
     speed = None
     if min_speed is not None:
-        speed = np.broadcast_to(_speed(robot, "min_speed", min_speed), (robot.joints,)) + 0.0
+        speed = (
+            np.broadcast_to(_speed(robot, "min_speed", min_speed), (robot.joints,))
+            + 0.0
+        )
     if factors is not None:
         return filters.Decimation(tuple(factors)), speed
     return filters.Subsample(step or 1), speed

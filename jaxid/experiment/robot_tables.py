@@ -78,16 +78,18 @@ def known_load(
 
     Args:
         mass: Mass [kg], like `1.5`.
-        centre_of_mass: Centre of mass in the frame of the end-effector, or of `body` [m], like
-            `[0.0, 0.0, 0.05]`. `jaxid gains` needs only the mass of a load on the end-effector.
+        centre_of_mass: Centre of mass in the frame of the end-effector, or of `body`
+            [m], like `[0.0, 0.0, 0.05]`. `jaxid gains` needs only the mass of a load on
+            the end-effector.
         inertia: Inertia tensor about the centre of mass [kg m²], like
-            `{ xx = 1e-3, yy = 1e-3, zz = 1e-3, xy = 0.0, xz = 0.0, yz = 0.0 }`; a point mass by
-            default.
-        body: Name of the joint that moves the body with the load, like `"joint1"`; the end-effector
-            by default.
+            `{ xx = 1e-3, yy = 1e-3, zz = 1e-3, xy = 0.0, xz = 0.0, yz = 0.0 }`; a point
+            mass by default.
+        body: Name of the joint that moves the body with the load, like `"joint1"`; the
+            end-effector by default.
 
     Returns:
-        Function from a robot to the load as a tool of it; to the mass if nothing else is known.
+        Function from a robot to the load as a tool of it; to the mass if nothing else
+        is known.
 
     Raises:
         InputError: If the centre of mass is missing beside `inertia` or `body`.
@@ -98,7 +100,11 @@ def known_load(
     def on(robot: Robot) -> Tool | float:
         if centre_of_mass is None:
             return mass
-        content: Any = {"mass": mass, "centre_of_mass": centre_of_mass, "inertia": inertia}
+        content: Any = {
+            "mass": mass,
+            "centre_of_mass": centre_of_mass,
+            "inertia": inertia,
+        }
         if body is None:
             return cast(Tool, robot.with_tool(**content).tool)
         return Tool(joint_number(robot, body), **content)
@@ -123,23 +129,23 @@ class RobotSource:
     Attributes:
         urdf: Path of a URDF or xacro file, as seen from the folder of this file.
         mjcf: Path of an MJCF file, which MuJoCo compiles, like `"arm.xml"`.
-        tip: Link (body or site) of the end-effector in the URDF (MJCF) file: only the chain from
-            `base` to it is used, like `"flange"`.
+        tip: Link (body or site) of the end-effector in the URDF (MJCF) file: only the
+            chain from `base` to it is used, like `"flange"`.
         base: Link (body) of that file that stands on the ground, like `"base_link"`.
-        builtin: Name of a robot that jaxid knows, like `"tx40"`: tx90l_on_rail, tx40, ur10, ur10e,
-            panda, iiwa14, kr300 or planar_arm.
-        dh: Denavit-Hartenberg table with one row for each joint, alpha and theta in degrees, a and
-            d in metres, like `[{ alpha = -90.0, a = 0.0, d = 0.3, theta = 90.0, name = "turn" }]`;
-            `slides = true` marks a prismatic joint.
-        convention: Convention of `dh`: "modified" lists alpha and a of the link before each joint,
-            "standard" those of the link after it.
+        builtin: Name of a robot that jaxid knows, like `"tx40"`: tx90l_on_rail, tx40,
+            ur10, ur10e, panda, iiwa14, kr300 or planar_arm.
+        dh: Denavit-Hartenberg table with one row for each joint, alpha and theta in
+            degrees, a and d in metres, like `[{ alpha = -90.0, a = 0.0, d = 0.3, theta
+            = 90.0, name = "turn" }]`; `slides = true` marks a prismatic joint.
+        convention: Convention of `dh`: "modified" lists alpha and a of the link before
+            each joint, "standard" those of the link after it.
         name: Name of the robot, like `"my robot"`.
         gravity: Gravity in the frame of the ground [m/s²], like `[0.0, 0.0, -9.81]`.
-        base_rotation: Orientation of the robot on the ground: roll, pitch, yaw [deg], like
-            `[0.0, 0.0, 0.0]`.
+        base_rotation: Orientation of the robot on the ground: roll, pitch, yaw [deg],
+            like `[0.0, 0.0, 0.0]`.
         base_position: Position of the robot on the ground [m], like `[0.0, 0.0, 0.0]`.
-        snap_tolerance: Angle [rad] up to which the robot's axes are taken for parallel or
-            perpendicular, like `1e-3` for a file with 1.571 instead of pi/2.
+        snap_tolerance: Angle [rad] up to which the robot's axes are taken for parallel
+            or perpendicular, like `1e-3` for a file with 1.571 instead of pi/2.
         tool: Known load at the end-effector, whose forces are subtracted.
     """
 
@@ -148,7 +154,16 @@ class RobotSource:
     tip: str | None = None
     base: str | None = None
     builtin: (
-        Literal["tx90l_on_rail", "tx40", "ur10", "ur10e", "panda", "iiwa14", "kr300", "planar_arm"]
+        Literal[
+            "tx90l_on_rail",
+            "tx40",
+            "ur10",
+            "ur10e",
+            "panda",
+            "iiwa14",
+            "kr300",
+            "planar_arm",
+        ]
         | None
     ) = None
     dh: list[Annotated[DhRow, dh_row]] | None = None
@@ -161,13 +176,20 @@ class RobotSource:
     tool: Annotated[Callable[[Robot], Tool | float], known_load] | None = None
 
     def __post_init__(self) -> None:
-        given = [k for k in ("urdf", "mjcf", "builtin", "dh") if getattr(self, k) is not None]
+        given = [
+            k for k in ("urdf", "mjcf", "builtin", "dh") if getattr(self, k) is not None
+        ]
         if len(given) != 1:
             came = " and ".join(f"`{k}`" for k in given) or "none of them"
             raise InputError(
-                f"one of `urdf`, `mjcf`, `builtin` and `dh` is needed, but there is {came}."
+                "one of `urdf`, `mjcf`, `builtin` and `dh` is needed, but there is "
+                f"{came}."
             )
-        owners = {"tip": ("urdf", "mjcf"), "base": ("urdf", "mjcf"), "convention": ("dh",)}
+        owners = {
+            "tip": ("urdf", "mjcf"),
+            "base": ("urdf", "mjcf"),
+            "convention": ("dh",),
+        }
         for key, owner in owners.items():
             if getattr(self, key) is not None and given[0] not in owner:
                 raise InputError(
@@ -177,8 +199,15 @@ class RobotSource:
     @property
     def placement(self) -> dict[str, Any]:
         """Position and orientation on the ground, as functions take them that make robots."""
-        R = None if self.base_rotation is None else rpy_rotation(np.deg2rad(self.base_rotation))
-        return {"base_rotation": R, "base_position": self.base_position or (0.0, 0.0, 0.0)}
+        R = (
+            None
+            if self.base_rotation is None
+            else rpy_rotation(np.deg2rad(self.base_rotation))
+        )
+        return {
+            "base_rotation": R,
+            "base_position": self.base_position or (0.0, 0.0, 0.0),
+        }
 
     @property
     def chain(self) -> dict[str, Any]:
@@ -195,19 +224,25 @@ class RobotSource:
         if self.file is not None:
             path, key = folder / self.file, "mjcf" if self.urdf is None else "urdf"
             if not path.is_file():
-                raise InputError(f"`{key}`: `{path}` is no file: paths are relative to this file.")
+                raise InputError(
+                    f"`{key}`: `{path}` is no file: paths are relative to this file."
+                )
             robot = load_urdf(path, **self.chain, **self.placement)
         elif self.dh is not None:
             robot = from_dh(
                 [numbers for _, _, numbers in self.dh],
                 convention=self.convention or "",
                 revolute=tuple(not slides for _, slides, _ in self.dh),
-                joint_names=tuple(name or f"joint{i}" for i, (name, *_) in enumerate(self.dh, 1)),
+                joint_names=tuple(
+                    name or f"joint{i}" for i, (name, *_) in enumerate(self.dh, 1)
+                ),
                 source="Denavit-Hartenberg table of the experiment file",
                 **self.placement,
             )
         else:
-            robot = getattr(library, cast(str, self.builtin))().mounted(*self.placement.values())
+            robot = getattr(library, cast(str, self.builtin))().mounted(
+                *self.placement.values()
+            )
         if self.snap_tolerance is not None:
             robot = robot.snapped(self.snap_tolerance)
         if self.gravity is not None:
@@ -227,7 +262,9 @@ class RobotSource:
         """
         if self.file is None:
             return None
-        return np.asarray(urdf_parameters(folder / self.file, **self.chain)).reshape(-1, 10)
+        return np.asarray(urdf_parameters(folder / self.file, **self.chain)).reshape(
+            -1, 10
+        )
 
     def claims(self, folder: Path) -> dict[str, float]:
         """Return all that the robot's file claims, by names in a model; nothing without bodies.
@@ -246,7 +283,12 @@ class RobotSource:
             return {}
         claimed = joint_parameters(folder / self.file, **self.chain)
         rows = zip(("Ia", "fv", "fc"), claimed.values(), strict=True)
-        return {f"{k}{j}": float(x) for k, row in rows for j, x in enumerate(row, 1) if x > 0.0}
+        return {
+            f"{k}{j}": float(x)
+            for k, row in rows
+            for j, x in enumerate(row, 1)
+            if x > 0.0
+        }
 
 
 def named(bodies: Float[np.ndarray, "bodies 10"]) -> dict[str, float]:
@@ -281,7 +323,11 @@ def replace_limits(
     Raises:
         InputError: If a list has another length, or a limit is not plausible.
     """
-    given = {"position_min": position_min, "position_max": position_max, "velocity": velocity}
+    given = {
+        "position_min": position_min,
+        "position_max": position_max,
+        "velocity": velocity,
+    }
     given |= {"acceleration": acceleration, "jerk": jerk, "force": force}
     fields, told = {}, []
     for name, values in given.items():
@@ -289,12 +335,18 @@ def replace_limits(
         new = new if name == "force" else new * _angle_scale(robot, angle_unit)
         known = np.isnan(new)
         fields[name] = np.where(known, getattr(robot.limits, name), new)
-        told += [f"{name} of {j}" for j, k in zip(robot.joint_names, known, strict=True) if not k]
+        told += [
+            f"{name} of {j}"
+            for j, k in zip(robot.joint_names, known, strict=True)
+            if not k
+        ]
         told += [] if known.any() else [name]
     # Forces that no joint has would make weights infinite.
     most = np.asarray(fields["force"])
     if ((most > 0) & (most < 1e-9)).any() or (np.isfinite(most) & (most >= 1e9)).any():
-        raise InputError(f"`force` must lie between 1e-9 and 1e9 N m or N, but is {most}.")
+        raise InputError(
+            f"`force` must lie between 1e-9 and 1e9 N m or N, but is {most}."
+        )
     for j, name in enumerate(robot.joint_names):
         low, high = fields["position_min"][j], fields["position_max"][j]
         if why := range_fault(low, high, robot.revolute[j]):
@@ -326,13 +378,13 @@ def replace_drives(
     Args:
         robot: Robot without these drives.
         gear_ratios: Ratio of motor to joint speed [1; rad/m for a prismatic joint].
-        matrix: Rows with the ratios of each motor to all joints, instead of `gear_ratios`, like
-            `[[50.0, 0.0], [50.0, 50.0]]`.
+        matrix: Rows with the ratios of each motor to all joints, instead of
+            `gear_ratios`, like `[[50.0, 0.0], [50.0, 50.0]]`.
         zero: Joint angles at which the motors' angles are zero [rad or m], like `0.0`.
         angle_unit: Unit of `zero`: "rad" or "deg".
         max_torques: Largest torques of the motors, before the gears [N m].
-        rotor_inertia: Inertias of the rotors, before the gears [kg m²], like `1e-4`; shown, not
-            used.
+        rotor_inertia: Inertias of the rotors, before the gears [kg m²], like `1e-4`;
+            shown, not used.
 
     Raises:
         InputError: If a list has another length, or the ratios cannot be inverted.

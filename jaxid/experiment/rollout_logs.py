@@ -46,13 +46,19 @@ def _with_commands(experiment, logs, verify, options, settings, stage) -> Rollou
     )
     stage("simulating")
     errors, windows = fit.validate(unseen or seen), fit.window_errors(unseen or seen)
-    return RolloutReport(fit, errors, windows, bool(unseen), options["samples"], settings)
+    return RolloutReport(
+        fit, errors, windows, bool(unseen), options["samples"], settings
+    )
 
 
-def _with_torques(experiment, logs, verify, options, settings, stage) -> TorqueRolloutReport:
+def _with_torques(
+    experiment, logs, verify, options, settings, stage
+) -> TorqueRolloutReport:
     """Identify the model of `jaxid identify`, beside other methods."""
     if experiment.load_transition is not None:
-        raise InputError(f"{experiment.path.name}: give `rollout.load_friction`, not `model.load`.")
+        raise InputError(
+            f"{experiment.path.name}: give `rollout.load_friction`, not `model.load`."
+        )
     stage("finding base parameters")
     base = experiment.base
     experiment, _ = select_filter(experiment, logs, stage)
@@ -68,4 +74,6 @@ def _with_torques(experiment, logs, verify, options, settings, stage) -> TorqueR
     paths = [(log.name, *fit.simulate(log)) for log in unseen or seen]
     doubts = [Remark(text, Status.DOUBTFUL) for text in findings(loaded)]
     notes = [*experiment.notes, *(note for o in observations for note in o.notes)]
-    return TorqueRolloutReport(fit, comparison, paths, doubts, [*map(Remark, notes)], settings)
+    return TorqueRolloutReport(
+        fit, comparison, paths, doubts, [*map(Remark, notes)], settings
+    )

@@ -1,7 +1,8 @@
 """Commented experiment file for a robot: what `jaxid init` prints.
 
-Keys, defaults and comments come from the functions and classes that take the keys. An example in a
-description ("like `0.1`") becomes the value of a key that is commented out.
+Keys, defaults and comments come from the functions and classes that take the keys. An
+example in a description ("like `0.1`") becomes the value of a key that is commented
+out.
 """
 
 import inspect
@@ -44,16 +45,21 @@ HEAD = """\
 #   jaxid identify experiment.toml log.csv -o report/   parameters and torque errors
 """
 SUMMARIES = {
-    "load": "Known load that is on the robot in some logs only: `jaxid gains` finds the true "
+    "load": "Known load that is on the robot in some logs only: `jaxid gains` finds "
+    "the true "
     "forces.",
-    "recording": "Columns of the logs: CSV (any separator), Parquet, NPZ, MAT, HDF5 or ROS bags. "
-    'A pattern ("{}" stands for the joint\'s number, "{name}" for its name), a list of names, or '
+    "recording": "Columns of the logs: CSV (any separator), Parquet, NPZ, MAT, HDF5 "
+    "or ROS bags. "
+    'A pattern ("{}" stands for the joint\'s number, "{name}" for its name), a list '
+    "of names, or "
     "positions from 0.",
 }
 """Descriptions of tables where the docstring of their function says something else."""
 INNER = {"robot": ("robot.tool", known_load), "model": ("model.coulomb", DryFriction)}
 """Tables within others, and their functions."""
-OF_KINDS = {*itertools.chain(*KINDS.values())} - set.intersection(*map(set, KINDS.values()))
+OF_KINDS = {*itertools.chain(*KINDS.values())} - set.intersection(
+    *map(set, KINDS.values())
+)
 """Keys that not all kinds of estimators take, which are commented out."""
 
 
@@ -67,12 +73,25 @@ def write_template(
     """Return a complete commented experiment file for a robot; it loads as it is."""
     robot = load_urdf(urdf, tip=tip, base=base)
     path = Path(os.path.relpath(Path(urdf).resolve(), Path(folder).resolve()))
-    limits = ("position_min", "position_max", "velocity", "acceleration", "jerk", "force")
+    limits = (
+        "position_min",
+        "position_max",
+        "velocity",
+        "acceleration",
+        "jerk",
+        "force",
+    )
     joints = range(robot.joints)
     angles, forces = [*map(robot.joint_unit, joints)], [*map(robot.force_unit, joints)]
     values = {
-        "robot": {"mjcf" if is_mjcf(urdf) else "urdf": path.as_posix(), "tip": tip, "base": base},
-        "limits": {name: np.asarray(getattr(robot.limits, name)).tolist() for name in limits},
+        "robot": {
+            "mjcf" if is_mjcf(urdf) else "urdf": path.as_posix(),
+            "tip": tip,
+            "base": base,
+        },
+        "limits": {
+            name: np.asarray(getattr(robot.limits, name)).tolist() for name in limits
+        },
         "drives": {"gear_ratios": [1.0] * robot.joints},
         "model": {"offset": True},
         "recording": {
@@ -192,6 +211,8 @@ def _joints(robot: Robot) -> str:
     """Return a comment with numbers, names and kinds of the joints."""
     names = (
         f"{i} {name} ({'turns' if turns else 'slides'})"
-        for i, (name, turns) in enumerate(zip(robot.joint_names, robot.revolute, strict=True), 1)
+        for i, (name, turns) in enumerate(
+            zip(robot.joint_names, robot.revolute, strict=True), 1
+        )
     )
     return "\n".join(_comment(f"The joints: {', '.join(names)}")) + "\n"

@@ -7,4 +7,7 @@ from .simulators import (
     export_urdf as export_urdf,
     pinocchio_parameters as pinocchio_parameters,
 )
-from .torque_program import export_jax as export_jax, exported_function as exported_function
+from .torque_program import (
+    export_jax as export_jax,
+    exported_function as exported_function,
+)

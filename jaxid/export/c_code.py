@@ -37,11 +37,14 @@ class CFunction(NamedTuple):
         return [math.prod(shape) for shape in self.program.input_shapes]
 
 
-def export_c(fit: Fit, folder: str | Path, *, name: str = "arm", double: bool = True) -> Path:
+def export_c(
+    fit: Fit, folder: str | Path, *, name: str = "arm", double: bool = True
+) -> Path:
     """Write the model as one C99 file and its header, for a real-time controller (Eqs. 38, 39).
 
-    The file needs no library, allocates nothing and does not branch on data, so that every call
-    takes the same time. It compiles as C++ too. A known tool is not included, as in `Fit.predict`.
+    The file needs no library, allocates nothing and does not branch on data, so that
+    every call takes the same time. It compiles as C++ too. A known tool is not
+    included, as in `Fit.predict`.
 
     Args:
         fit: Identified model.
@@ -74,14 +77,19 @@ def c_functions(fit: Fit) -> tuple[CFunction, ...]:
     own = np.asarray(base.to_standard(np.asarray(fit.parameters, np.float64)))
 
     functions = {
-        "torque": ("Feed-forward torques on base parameters (Eq. 39, factored)", torque),
+        "torque": (
+            "Feed-forward torques on base parameters (Eq. 39, factored)",
+            torque,
+        ),
         "torque_of_parameters": (
             "The same for given base parameters p, as Theta_B p (Eq. 39)",
             lambda q, qd, qdd, p, s=None: base.columns(q, qd, qdd, s) @ p,
         ),
         "torque_of_masses": (
             "The same as M qdd + h, with M by composite bodies (Eq. 38)",
-            lambda q, qd, qdd, s=None: model.inertia(own, q) @ qdd + model.bias(own, q, qd, s),
+            lambda q, qd, qdd, s=None: (
+                model.inertia(own, q) @ qdd + model.bias(own, q, qd, s)
+            ),
         ),
         "mass_matrix": (
             "Mass matrix M, rotors included, row by row (Eq. 38)",
@@ -97,40 +105,60 @@ def c_functions(fit: Fit) -> tuple[CFunction, ...]:
         ),
         "friction": (
             "Friction: the forces that motion adds to those at rest",
-            lambda q, qd, s=None: others(q, qd, rest, s) - others(q, rest, rest, relaxed),
+            lambda q, qd, s=None: (
+                others(q, qd, rest, s) - others(q, rest, rest, relaxed)
+            ),
         ),
         "regressor": ("Base regressor Theta_B, row by row (Eq. 23)", base.columns),
     }
     if law is not None:
-        functions["advance"] = "State of dry friction behind a step of the joints", law.advance
-    outputs = {"mass_matrix": "m", "bias": "h", "regressor": "theta", "advance": "s_next"}
+        functions["advance"] = (
+            "State of dry friction behind a step of the joints",
+            law.advance,
+        )
+    outputs = {
+        "mass_matrix": "m",
+        "bias": "h",
+        "regressor": "theta",
+        "advance": "s_next",
+    }
     written = []
     for name, (summary, function) in functions.items():
         inputs = (x for x in inspect.signature(function).parameters if x != "s" or law)
         inputs = tuple(inputs)
         shapes = {"p": (base.size,), "s": model.input_shapes[-1]}
         program = trace(function, *(shapes.get(x, one) for x in inputs))
-        written.append(CFunction(name, summary, program, inputs, outputs.get(name, "tau")))
+        written.append(
+            CFunction(name, summary, program, inputs, outputs.get(name, "tau"))
+        )
     return tuple(written)
 
 
-def c_texts(fit: Fit, writer: CWriter, functions: tuple[CFunction, ...]) -> dict[str, str]:
+def c_texts(
+    fit: Fit, writer: CWriter, functions: tuple[CFunction, ...]
+) -> dict[str, str]:
     """Return the texts of the header and of the C file, by their suffixes."""
     model = fit.base.model
     random, samples = np.random.default_rng(0), 4
     # The self-test compares all functions with their results in Python.
     used = dict.fromkeys(x for f in functions for x in f.inputs if x != "p")
     states = {
-        x: np.round(random.uniform(-2.0, 2.0, (samples, model.robot.joints)), 3) for x in used
+        x: np.round(random.uniform(-2.0, 2.0, (samples, model.robot.joints)), 3)
+        for x in used
     }
-    given = {**states, "p": np.tile(np.asarray(fit.parameters, np.float64), (samples, 1))}
+    given = {
+        **states,
+        "p": np.tile(np.asarray(fit.parameters, np.float64), (samples, 1)),
+    }
     tables = {x: rows.tolist() for x, rows in states.items()}
     for function in functions:
         arrays = [given[x] for x in function.inputs]
         if not writer.double:
             arrays = [x.astype(np.float32).astype(np.float64) for x in arrays]
         result = np.asarray(evaluate(function.program, *(x.T for x in arrays)))
-        rows = np.broadcast_to(result.reshape(function.size, -1), (function.size, samples)).T
+        rows = np.broadcast_to(
+            result.reshape(function.size, -1), (function.size, samples)
+        ).T
         tables[f"{function.name}_expected"] = rows.tolist()
     values = {
         "fit": fit,
@@ -149,7 +177,9 @@ def c_texts(fit: Fit, writer: CWriter, functions: tuple[CFunction, ...]) -> dict
         "quoted": json.dumps,
     }
     templates = Path(__file__).parent / "templates"
-    return {x: fill_template(templates / f"arm{x}.jinja", **values) for x in (".h", ".c")}
+    return {
+        x: fill_template(templates / f"arm{x}.jinja", **values) for x in (".h", ".c")
+    }
 
 
 def _ascii(text: str) -> str:

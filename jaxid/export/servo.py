@@ -27,8 +27,8 @@ def servo_stiffness(
 
     Args:
         fit: Identified servos.
-        stiffness: Stiffness, one for all joints or one for each [N m/rad or N/m]; that of the fit
-            where it is None or NaN.
+        stiffness: Stiffness, one for all joints or one for each [N m/rad or N/m]; that
+            of the fit where it is None or NaN.
 
     Raises:
         InputError: If no joint tells its stiffness and none is given.
@@ -40,7 +40,8 @@ def servo_stiffness(
     known = np.isfinite(found)
     if not known.any():
         raise InputError(
-            "`stiffness` [N m/rad] is needed: no known weight tells it, and positions tell ratios "
+            "`stiffness` [N m/rad] is needed: no known weight tells it, and positions "
+            "tell ratios "
             "to it only. Any number gives the same motion of a robot without bodies."
         )
     return np.where(known, found, np.median(found[known]))
@@ -51,17 +52,18 @@ def simulator_values(
 ) -> dict[str, Float[np.ndarray, " joints"]]:
     """Return the numbers of each joint that simulators of actuators take.
 
-    The damping is the sum of friction and of the servo's own: positions do not tell them apart.
-    Friction that grows with load is included at the mean load of the logs.
+    The damping is the sum of friction and of the servo's own: positions do not tell
+    them apart. Friction that grows with load is included at the mean load of the logs.
 
     Args:
         fit: Identified servos.
         stiffness: Stiffness of each servo [N m/rad or N/m]; that of the fit if None.
-        parameters: Other parameters of the joints, such as a draw from their distribution.
+        parameters: Other parameters of the joints, such as a draw from their
+            distribution.
 
     Returns:
-        `stiffness`, `damping`, `armature`, `friction`, `effort_limit` (infinite without), `delay`
-        [s], `offset` of the command, and `integral_gain`.
+        `stiffness`, `damping`, `armature`, `friction`, `effort_limit` (infinite
+        without), `delay` [s], `offset` of the command, and `integral_gain`.
     """
     x = fit.parameters if parameters is None else np.asarray(parameters)
     K, at = servo_stiffness(fit, stiffness), {key: x[:, k] for key, k in INDEX.items()}
@@ -71,7 +73,8 @@ def simulator_values(
         K = np.where(told, 1.0 / np.maximum(at["a"], 1e-9), K)
     own = np.zeros(len(x))
     if fit.bodies is not None:
-        # The simulator adds the inertia of the bodies, unless that has been taken out already.
+        # The simulator adds the inertia of the bodies, unless that has been taken out
+        # already.
         bodies, rest = fit.bodies, np.zeros(len(x))
         M = np.asarray(bodies.model.mass_matrix(bodies.parameters, rest))
         own = np.where(bodies.coupled & (at["a"] > 0), 0.0, np.diag(M))
@@ -99,7 +102,9 @@ def simulator_table(fit: ServoFit, stiffness: Numbers | None = None) -> Table:
     units = ("N m/rad", "N m s/rad", "kg m²", "N m", "N m", "s", "rad", "N m/(rad s)")
     if fit.bodies is not None and not all(fit.bodies.model.robot.revolute):
         linear = ("N/m", "N s/m", "kg", "N", "N", "s", "m", "N/(m s)")
-        units = [a if a == b else f"{a} or {b}" for a, b in zip(units, linear, strict=True)]
+        units = [
+            a if a == b else f"{a} or {b}" for a, b in zip(units, linear, strict=True)
+        ]
     columns = [
         Column(name.replace("_", " "), value, unit)
         for (name, value), unit in zip(values.items(), units, strict=True)
@@ -115,11 +120,13 @@ def simulator_table(fit: ServoFit, stiffness: Numbers | None = None) -> Table:
     remarks = []
     if (values["delay"] < 0).any():
         remarks.append(
-            "a negative delay means that positions are stamped later than commands: use 0"
+            "a negative delay means that positions are stamped later than commands: "
+            "use 0"
         )
     if not fit.hold:
         remarks.append(
-            "the delay counts for interpolated commands: held ones are later by half a step"
+            "the delay counts for interpolated commands: held ones are later by half "
+            "a step"
         )
     return Table(
         "actuators of simulators",
@@ -141,16 +148,18 @@ def export_servo_mjcf(
 ) -> list[Path]:
     """Write the robot for MuJoCo, with its identified servos as position actuators.
 
-    Controls are the commanded positions, one each in the order of the joints. MJCF has no delay of
-    commands and no bias: both stand in a comment and in `<custom>` numbers (`delay`, `offset`).
-    Servos with integral action are `mujoco.pid` plugins, which come with MuJoCo. They start without
+    Controls are the commanded positions, one each in the order of the joints. MJCF has
+    no delay of commands and no bias: both stand in a comment and in `<custom>` numbers
+    (`delay`, `offset`). Servos with integral action are `mujoco.pid` plugins, which
+    come with MuJoCo. They start without
     integral: wait until loaded joints have settled, or set `data.act`.
 
     Args:
         fit: Identified servos of a robot whose bodies are known.
         path: Path of the file.
         stiffness: Stiffness of each servo [N m/rad or N/m]; that of the fit if None.
-        samples: Number of further files, `NAME_000.xml` …, drawn from the estimates' distribution.
+        samples: Number of further files, `NAME_000.xml` …, drawn from the estimates'
+            distribution.
         seed: Seed of the draws.
         timestep: Time step of the simulation [s].
 
@@ -158,7 +167,9 @@ def export_servo_mjcf(
         InputError: If the fit has no bodies, or the stiffness is not known.
     """
     if fit.bodies is None:
-        raise InputError("`fit` has no bodies: identify with `bodies`, or use `simulator_table`.")
+        raise InputError(
+            "`fit` has no bodies: identify with `bodies`, or use `simulator_table`."
+        )
     path = Path(path)
     paths = [path, *(path.with_stem(f"{path.stem}_{k:03d}") for k in range(samples))]
     draws = [fit.parameters, *fit.samples(samples, seed)]
@@ -174,7 +185,9 @@ def servo_mjcf(fit: ServoFit, values: dict[str, Any], timestep: float) -> str:
         raise InputError("`fit` has no bodies.")
     model = fit.bodies.model
     rigid = np.asarray(body_parameters(model, np.asarray(fit.bodies.parameters)))
-    text = mjcf_text(model.robot, rigid, values, timestep, " Delays [s] and offsets in <custom>. ")
+    text = mjcf_text(
+        model.robot, rigid, values, timestep, " Delays [s] and offsets in <custom>. "
+    )
     root = etree.fromstring(text)
     root.find("option").set("integrator", "implicitfast")
     actuators, integral = root.find("actuator"), values["integral_gain"]
@@ -183,7 +196,11 @@ def servo_mjcf(fit: ServoFit, values: dict[str, Any], timestep: float) -> str:
         joint.set("solreffriction", f"{2.0 * timestep!r} 1")
         joint.set("solimpfriction", STICKING)
     for k, motor in enumerate(list(actuators)):
-        name, K, limit = fit.joint_names[k], values["stiffness"][k], values["effort_limit"][k]
+        name, K, limit = (
+            fit.joint_names[k],
+            values["stiffness"][k],
+            values["effort_limit"][k],
+        )
         actuators.remove(motor)
         kind = "plugin" if integral[k] > 0.0 else "position"
         servo = etree.SubElement(actuators, kind, name=name, joint=motor.get("joint"))

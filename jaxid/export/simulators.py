@@ -34,13 +34,14 @@ def joint_dynamics(
 ) -> tuple[dict[str, Float[np.ndarray, " joints"]], tuple[str, ...], tuple[str, ...]]:
     r"""Return inertia and friction at the joints, as far as simulators can describe them.
 
-    They follow from the columns of the terms: a parameter belongs to a joint if its forces, as the
-    mean of both directions, are $a \ddot q_j + b \dot q_j + c\, \mathrm{sign}(\dot q_j)$ at all
-    speeds beyond the transition of dry friction.
+    They follow from the columns of the terms: a parameter belongs to a joint if its
+    forces, as the mean of both directions, are $a \ddot q_j + b \dot q_j + c\,
+    \mathrm{sign}(\dot q_j)$ at all speeds beyond the transition of dry friction.
 
     Returns:
-        The `armature` [kg m² or kg], `damping` [N m s/rad or N s/m] and dry `friction` [N m or N];
-        the names of the parameters in `armature`; and the names of those in none of the three.
+        The `armature` [kg m² or kg], `damping` [N m s/rad or N s/m] and dry `friction`
+        [N m or N]; the names of the parameters in `armature`; and the names of those in
+        none of the three.
     """
     model = fit.base.model
     robot, total, rotors = model.robot, np.zeros((3, model.robot.joints)), []
@@ -59,15 +60,20 @@ def joint_dynamics(
     return values, tuple(rotors), tuple(left_out)
 
 
-def _joint_coefficients(term: AbstractTerm, robot: Robot) -> Float[np.ndarray, "3 joints columns"]:
+def _joint_coefficients(
+    term: AbstractTerm, robot: Robot
+) -> Float[np.ndarray, "3 joints columns"]:
     """Return inertia, viscous and dry friction of unit parameters; zeros if they are neither."""
     random, n, probes = np.random.default_rng(0), robot.joints, 6
     q, qdd = random.uniform(-1.0, 1.0, (2, probes, n))
-    qd = random.uniform(20.0, 80.0, (probes, n)) * random.choice([-1.0, 1.0], (probes, n))
+    qd = random.uniform(20.0, 80.0, (probes, n)) * random.choice(
+        [-1.0, 1.0], (probes, n)
+    )
     with double_precision():
         columns = 0.5 * np.array(
             [
-                np.asarray(term.columns(robot, x, v, a)) - term.columns(robot, x, -v, -a)
+                np.asarray(term.columns(robot, x, v, a))
+                - term.columns(robot, x, -v, -a)
                 for x, v, a in zip(q, qd, qdd, strict=True)
             ]
         )
@@ -84,24 +90,29 @@ def _joint_coefficients(term: AbstractTerm, robot: Robot) -> Float[np.ndarray, "
 def _feasible_bodies(fit: Fit, target: str) -> Float[np.ndarray, "joints 10"]:
     """Return ten parameters of each body; reject bodies and friction that cannot exist."""
     cure = (
-        "identify with `jid.PhysicallyConsistent()` (in the experiment file: `[estimator]` "
+        "identify with `jid.PhysicallyConsistent()` (in the experiment file: "
+        "`[estimator]` "
         '`kind = "consistent"`)'
     )
     if fit.full_parameters is None:
         raise InputError(
-            f"{target} needs all parameters, but the fit knows only base parameters: {cure}."
+            f"{target} needs all parameters, but the fit knows only base parameters: "
+            f"{cure}."
         )
     bodies = body_parameters(fit.base.model, fit.standard_parameters)
     # Rounding may reach slightly below zero.
     feasible = (np.asarray(consistency_margin(bodies)) >= -1e-9) & (bodies[:, 0] > 0)
     if not feasible.all():
         body = int(np.argmin(feasible)) + 1
-        raise InputError(f"{target} needs bodies that can exist, but body {body} cannot: {cure}.")
+        raise InputError(
+            f"{target} needs bodies that can exist, but body {body} cannot: {cure}."
+        )
     for quantity, values in joint_dynamics(fit)[0].items():
         if (values < 0).any():
             joint = fit.base.model.robot.joint_names[int(np.argmin(values))]
             raise InputError(
-                f"{target} needs `{quantity}` >= 0, but `{joint}` has {values.min():g}: {cure}."
+                f"{target} needs `{quantity}` >= 0, but `{joint}` has "
+                f"{values.min():g}: {cure}."
             )
     return bodies
 
@@ -124,23 +135,26 @@ def export_urdf(
 ) -> Path:
     """Write a robot's own URDF file with the identified model in it.
 
-    Replaced are the inertial of each link that a joint moves, with all that is fixed to it (fixed
-    links then have none), the damping and the dry friction of each joint, and its effort where a
-    largest force is known. Joints on identified bodies that the robot does not have, such as
-    fingers, become fixed where the robot holds them, because the bodies contain their links. A URDF
-    describes no rotor inertias, no offsets and no width of a tanh: a comment names what is left
-    out. Meshes, names and all else stay as they are.
+    Replaced are the inertial of each link that a joint moves, with all that is fixed to
+    it (fixed links then have none), the damping and the dry friction of each joint, and
+    its effort where a largest force is known. Joints on identified bodies that the
+    robot does not have, such as fingers, become fixed where the robot holds them,
+    because the bodies contain their links. A URDF describes no rotor inertias, no
+    offsets and no width of a tanh: a comment names what is left out. Meshes, names and
+    all else stay as they are.
 
     Args:
         fit: Physically consistent fit.
-        source: URDF file of the robot; from a xacro or MJCF file, its expanded form is written.
+        source: URDF file of the robot; from a xacro or MJCF file, its expanded form is
+            written.
         path: Path of the new file.
         tip: Last link, as in `load_urdf`.
         base: First link, as in `load_urdf`.
 
     Raises:
         FileNotFoundError: If the source does not exist.
-        InputError: If the bodies of the fit cannot exist, or the file describes another robot.
+        InputError: If the bodies of the fit cannot exist, or the file describes another
+            robot.
     """
     robot, bodies = fit.base.model.robot, _feasible_bodies(fit, "a URDF file")
     _require_same(robot, load_urdf(source, tip=tip, base=base), source)
@@ -153,7 +167,10 @@ def export_urdf(
             root.remove(comment)
     root.insert(0, etree.Comment(_COMMENT + _origin(fit, (*rotors, *left_out))))
     joints = {e.get("name"): e for e in root.iterfind("joint")}
-    moved = {joints[name].find("child").get("link"): i for i, name in enumerate(robot.joint_names)}
+    moved = {
+        joints[name].find("child").get("link"): i
+        for i, name in enumerate(robot.joint_names)
+    }
     links += [name for name, (body, _, _) in tree.carriers.items() if body >= 0]
     for name in links:
         link = tree.links[name]
@@ -167,11 +184,15 @@ def export_urdf(
             element.set(quantity, exact_text(dynamics[quantity][i]))
         if np.isfinite(efforts[i]):
             _child(joints[name], "limit").set("effort", exact_text(efforts[i]))
-    for limit, key in itertools.product(root.iterfind("joint/limit"), ("effort", "velocity")):
+    for limit, key in itertools.product(
+        root.iterfind("joint/limit"), ("effort", "velocity")
+    ):
         # A URDF must have both; MJCF has no speeds.
         limit.set(key, limit.get(key, "1e9"))
     write_bytes(
-        path, etree.tostring(root.getroottree(), xml_declaration=True, encoding="utf-8") + b"\n"
+        path,
+        etree.tostring(root.getroottree(), xml_declaration=True, encoding="utf-8")
+        + b"\n",
     )
     return Path(path)
 
@@ -195,8 +216,10 @@ def _hold_joints(tree: UrdfTree) -> list[str]:
 def _require_same(robot: Robot, described: Robot, source: str | Path) -> None:
     if robot.joint_names != described.joint_names:
         raise InputError(
-            f"`{source}` has the joints {', '.join(described.joint_names)}, but the fit has "
-            f"{', '.join(robot.joint_names)}: give the file of this robot, or its `tip`."
+            f"`{source}` has the joints {', '.join(described.joint_names)}, but the "
+            "fit has "
+            f"{', '.join(robot.joint_names)}: give the file of this robot, or its "
+            "`tip`."
         )
     for name, ours, theirs in zip(
         robot.joint_names, robot.revolute, described.revolute, strict=True
@@ -204,16 +227,24 @@ def _require_same(robot: Robot, described: Robot, source: str | Path) -> None:
         if ours != theirs:
             kinds = ("slides", "turns")
             raise InputError(
-                f"joint `{name}` {kinds[theirs]} in `{source}`, but {kinds[ours]} in the robot of "
+                f"joint `{name}` {kinds[theirs]} in `{source}`, but {kinds[ours]} in "
+                "the robot of "
                 "the fit: give its own file."
             )
     # The file does not say how the robot is mounted on the ground.
     inner = [i for i, parent in enumerate(robot.parent) if parent >= 0]
-    for quantity, rows in (("axis", slice(None)), ("rotation", inner), ("offset", inner)):
-        one, other = (np.asarray(getattr(r, quantity))[rows] for r in (robot, described))
+    for quantity, rows in (
+        ("axis", slice(None)),
+        ("rotation", inner),
+        ("offset", inner),
+    ):
+        one, other = (
+            np.asarray(getattr(r, quantity))[rows] for r in (robot, described)
+        )
         if not np.allclose(one, other, rtol=0.0, atol=1e-3):
             raise InputError(
-                f"`{source}` has another `{quantity}` than the robot of the fit: give its own file."
+                f"`{source}` has another `{quantity}` than the robot of the fit: give "
+                "its own file."
             )
 
 
@@ -235,9 +266,10 @@ def _child(element: etree._Element, tag: str) -> etree._Element:
 def export_mjcf(fit: Fit, path: str | Path) -> Path:
     """Write the model for MuJoCo: geometry, bodies, rotors, friction, limits, motors.
 
-    Rotor inertias are `armature`, viscous friction is `damping`, dry friction is `frictionloss`
-    (without the width of a tanh: MuJoCo's own dry friction holds a joint at rest). A comment in the
-    file names what MJCF cannot describe. A known tool is not included.
+    Rotor inertias are `armature`, viscous friction is `damping`, dry friction is
+    `frictionloss` (without the width of a tanh: MuJoCo's own dry friction holds a joint
+    at rest). A comment in the file names what MJCF cannot describe. A known tool is not
+    included.
 
     Args:
         fit: Physically consistent fit.
@@ -262,8 +294,8 @@ def mjcf_text(
 ) -> str:
     """Return a robot, its bodies and the `joint_dynamics` as MJCF.
 
-    Each body has ten parameters in the paper's order, and is named after its joint. Quantities that
-    `dynamics` does not hold are zero.
+    Each body has ten parameters in the paper's order, and is named after its joint.
+    Quantities that `dynamics` does not hold are zero.
     """
     root = etree.Element("mujoco", model=robot.name)
     if comment:
@@ -274,12 +306,20 @@ def mjcf_text(
     )
     world = etree.SubElement(root, "worldbody")
     actuators = etree.SubElement(root, "actuator")
-    attributes = {"armature": "armature", "damping": "damping", "frictionloss": "friction"}
-    at_joints = {key: dynamics[name] for key, name in attributes.items() if name in dynamics}
+    attributes = {
+        "armature": "armature",
+        "damping": "damping",
+        "frictionloss": "friction",
+    }
+    at_joints = {
+        key: dynamics[name] for key, name in attributes.items() if name in dynamics
+    }
     ranges = np.stack([robot.limits.position_min, robot.limits.position_max], axis=1)
     efforts = np.asarray(robot.known_max_forces)
     elements: list[etree._Element] = []
-    for i, (parent, name) in enumerate(zip(robot.parent, robot.joint_names, strict=True)):
+    for i, (parent, name) in enumerate(
+        zip(robot.parent, robot.joint_names, strict=True)
+    ):
         body = etree.SubElement(
             elements[parent] if parent >= 0 else world,
             "body",
@@ -293,7 +333,9 @@ def mjcf_text(
             "inertial",
             pos=exact_text(inertia.centre),
             mass=exact_text(inertia.mass),
-            fullinertia=exact_text(inertia.tensor[(0, 1, 2, 0, 0, 1), (0, 1, 2, 1, 2, 2)]),
+            fullinertia=exact_text(
+                inertia.tensor[(0, 1, 2, 0, 0, 1), (0, 1, 2, 1, 2, 2)]
+            ),
         )
         joint = etree.SubElement(
             body,
@@ -301,7 +343,11 @@ def mjcf_text(
             name=name,
             type="hinge" if robot.revolute[i] else "slide",
             axis=exact_text(robot.axis[i]),
-            **{key: exact_text(values[i]) for key, values in at_joints.items() if values[i]},
+            **{
+                key: exact_text(values[i])
+                for key, values in at_joints.items()
+                if values[i]
+            },
         )
         if np.isfinite(ranges[i]).all():
             joint.set("range", exact_text(ranges[i]))
@@ -322,10 +368,11 @@ def placement_attributes(offset: AnyArray, rotation: AnyArray) -> dict[str, str]
 def pinocchio_parameters(fit: Fit) -> Float[np.ndarray, "joints 10"]:
     r"""Return the bodies' parameters in Pinocchio's order, about the origins of the joint frames.
 
-    Each row is an argument of `pinocchio.Inertia.FromDynamicParameters` and fits the columns of
-    Pinocchio's `computeJointTorqueRegressor`:
-    $(m, m r_c, I_{xx}, I_{xy}, I_{yy}, I_{xz}, I_{yz}, I_{zz})$. The rows stand in the order of the
-    robot's joints. The forces are those of the fit even if the bodies cannot exist.
+    Each row is an argument of `pinocchio.Inertia.FromDynamicParameters` and fits the
+    columns of Pinocchio's `computeJointTorqueRegressor`:
+    $(m, m r_c, I_{xx}, I_{xy}, I_{yy}, I_{xz}, I_{yz}, I_{zz})$. The rows stand in the
+    order of the robot's joints. The forces are those of the fit even if the bodies
+    cannot exist.
 
     Args:
         fit: Identified model.
@@ -352,7 +399,8 @@ def export_pinocchio(fit: Fit, path: str | Path) -> Path:
         "date": fit.date,
         "names": ["m", "mx", "my", "mz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz"],
         "joints": [
-            dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)
+            dict(zip(columns, row, strict=True))
+            for row in zip(*columns.values(), strict=True)
         ],
         "left_out": list(left_out),
     }

@@ -1,12 +1,14 @@
 r"""The feed-forward of a controller as a scalar program with few operations (Eq. 39).
 
-The same robot can be described in many ways, with the same forces. Before the program is traced, a
-description is chosen that leaves few operations:
+The same robot can be described in many ways, with the same forces. Before the program
+is traced, a description is chosen that leaves few operations:
 
-* matter on a joint's axis moves alike with the bodies on both sides of it, so that it is carried
-  inward until nothing is left of it: what remains are the base parameters;
-* the origin of a frame may lie anywhere on its joint's axis (where axes meet, forces vanish);
-* the frame of the last body may be turned about its joint so that a first moment vanishes;
+* matter on a joint's axis moves alike with the bodies on both sides of it, so that it
+  is carried inward until nothing is left of it: what remains are the base parameters;
+* the origin of a frame may lie anywhere on its joint's axis (where axes meet, forces
+  vanish);
+* the frame of the last body may be turned about its joint so that a first moment
+  vanishes;
 * in a suitable unit of length, some lengths are one.
 """
 
@@ -26,7 +28,10 @@ from scipy.spatial.transform import Rotation
 from jaxid.arrays import AnyArray, Float, Joints, double_precision
 from jaxid.dynamics import projection_equation
 from jaxid.dynamics.model import Model
-from jaxid.identification.consistency.pseudo_inertia import inertial_parameters, pseudo_inertia
+from jaxid.identification.consistency.pseudo_inertia import (
+    inertial_parameters,
+    pseudo_inertia,
+)
 from jaxid.identification.fit_result import Fit
 from jaxid.io import write_bytes
 from jaxid.program import Lowered, Program, on_any_platform, trace
@@ -39,7 +44,9 @@ class Description:
 
     robot: Robot  # joints and frames, in the unit of length
     bodies: Float[np.ndarray, "joints 4 4"]  # pseudo-inertias
-    turned: Float[np.ndarray, " joints"]  # angles that are added to those of the joints [rad]
+    turned: Float[
+        np.ndarray, " joints"
+    ]  # angles that are added to those of the joints [rad]
     unit: float = 1.0  # unit of length [m]
 
     @property
@@ -65,8 +72,8 @@ class Description:
     def carry_inward(self) -> "Description":
         """Move what moves alike with the parent to the parent: the base parameters (Eq. 22).
 
-        For a revolute joint that is matter on the axis (mass, first and second moment along it),
-        for a prismatic one the second moments.
+        For a revolute joint that is matter on the axis (mass, first and second moment
+        along it), for a prismatic one the second moments.
         """
         bodies, robot = self.bodies.copy(), self.robot
         for i in reversed(range(robot.joints)):
@@ -118,7 +125,10 @@ class Description:
     def in_unit(self, unit: float) -> "Description":
         """Use another unit of length [m]; moments keep theirs."""
         robot, D = self.robot, np.diag([1.0, 1.0, 1.0, unit])
-        offset, gravity = np.asarray(robot.offset) / unit, np.asarray(robot.gravity) / unit
+        offset, gravity = (
+            np.asarray(robot.offset) / unit,
+            np.asarray(robot.gravity) / unit,
+        )
         return dataclasses.replace(
             self,
             robot=robot.replace(offset=offset, gravity=gravity),
@@ -127,9 +137,13 @@ class Description:
         )
 
 
-def simplest_description(robot: Robot, parameters: Float[np.ndarray, "joints 10"]) -> Description:
+def simplest_description(
+    robot: Robot, parameters: Float[np.ndarray, "joints 10"]
+) -> Description:
     """Return a description of a robot, with ten parameters of each body, of few operations."""
-    given = Description(robot, np.asarray(pseudo_inertia(parameters)), np.zeros(robot.joints))
+    given = Description(
+        robot, np.asarray(pseudo_inertia(parameters)), np.zeros(robot.joints)
+    )
     best = given.carry_inward()
     for body in range(robot.joints):
         for distance in _distances(given.robot, body):
@@ -139,7 +153,9 @@ def simplest_description(robot: Robot, parameters: Float[np.ndarray, "joints 10"
     for body in set(range(robot.joints)) - set(robot.parent):
         if robot.revolute[body]:
             best = min(best, best.turn_last(body), key=lambda x: x.cost)
-    lengths = [round(float(abs(x)), 12) for x in np.ravel(best.robot.offset) if abs(x) > 1e-9]
+    lengths = [
+        round(float(abs(x)), 12) for x in np.ravel(best.robot.offset) if abs(x) > 1e-9
+    ]
     units = sorted(set(lengths), key=lambda x: -lengths.count(x))
     return min([best, *map(best.in_unit, units[:3])], key=lambda x: x.cost)
 
@@ -150,7 +166,9 @@ def _distances(robot: Robot, body: int) -> Iterator[float]:
         return
     axis, R = np.asarray(robot.axis[body]), np.asarray(robot.rotation[body])
     nearest = [-float((R @ axis) @ robot.offset[body])]
-    nearest += [float(axis @ robot.offset[c]) for c, p in enumerate(robot.parent) if p == body]
+    nearest += [
+        float(axis @ robot.offset[c]) for c, p in enumerate(robot.parent) if p == body
+    ]
     yield from (x for x in dict.fromkeys(nearest) if abs(x) > 1e-9)
 
 
@@ -182,7 +200,10 @@ def other_forces(fit: Fit) -> Callable[..., Any]:
     model = fit.base.model
 
     def forces(q, qd, qdd, s=None):
-        total, given = jnp.zeros_like(q), model if s is None else model.with_memory(state=s)
+        total, given = (
+            jnp.zeros_like(q),
+            model if s is None else model.with_memory(state=s),
+        )
         for term, own in given.split(fit.standard_parameters):
             if not term.body_parameters:
                 total = total + term.forces(model.robot, own, q, qd, qdd)
@@ -196,7 +217,9 @@ def torques(fit: Fit) -> Callable[..., Any]:
     model = fit.base.model
     bodies = body_parameters(model, fit.standard_parameters)
     description, others = simplest_description(model.robot, bodies), other_forces(fit)
-    return lambda q, qd, qdd, s=None: description.forces(q, qd, qdd) + others(q, qd, qdd, s)
+    return lambda q, qd, qdd, s=None: (
+        description.forces(q, qd, qdd) + others(q, qd, qdd, s)
+    )
 
 
 def torque_program(fit: Fit) -> Program:
@@ -207,9 +230,10 @@ def torque_program(fit: Fit) -> Program:
 def exported_function(fit: Fit) -> export.Exported:
     """Return the forces of any number of samples as an exported function of JAX (Eq. 39).
 
-    `exported.call(q, qd, qdd)` takes arrays [samples, joints] of float64 and returns forces of the
-    same shape (with friction that has memory also its states, as `Presliding.states` gives them);
-    `exported.serialize()` gives bytes that `jax.export.deserialize` reads elsewhere.
+    `exported.call(q, qd, qdd)` takes arrays [samples, joints] of float64 and returns
+    forces of the same shape (with friction that has memory also its states, as
+    `Presliding.states` gives them); `exported.serialize()` gives bytes that
+    `jax.export.deserialize` reads elsewhere.
 
     Args:
         fit: Identified model.
@@ -229,7 +253,8 @@ def exported_function(fit: Fit) -> export.Exported:
 def export_jax(fit: Fit, path: str | Path) -> Path:
     """Write the feed-forward as a function of JAX that runs without jaxid (Eq. 39).
 
-    Read it with `jax.export.deserialize(bytearray(Path(path).read_bytes()))` in 64-bit mode.
+    Read it with `jax.export.deserialize(bytearray(Path(path).read_bytes()))` in 64-bit
+    mode.
 
     Args:
         fit: Identified model.
@@ -239,6 +264,8 @@ def export_jax(fit: Fit, path: str | Path) -> Path:
         RuntimeError: If the package `flatbuffers` is not installed.
     """
     if importlib.util.find_spec("flatbuffers") is None:
-        raise RuntimeError("JAX needs `flatbuffers` to export: `pip install flatbuffers`.")
+        raise RuntimeError(
+            "JAX needs `flatbuffers` to export: `pip install flatbuffers`."
+        )
     write_bytes(path, bytes(exported_function(fit).serialize()))
     return Path(path)

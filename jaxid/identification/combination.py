@@ -1,10 +1,11 @@
 r"""Combination of fits: least squares over several of them, from their factors alone.
 
-Fit $s$ has the base parameters $p_s = E_s x + c_s$ of common unknowns $x$: shared and own
-parameters of several states, a payload on top, known loads. The common estimate is linear in those
-of the single fits, $x = \sum_s A_s (\hat p_s - c_s)$ with $A_s = (\sum E^T G E)^{-1} E_s^T G_s$ and
-the information $G_s$ of each fit, and so is its error: the covariances of the single estimates,
-which are right for correlated errors, give that of the common one.
+Fit $s$ has the base parameters $p_s = E_s x + c_s$ of common unknowns $x$: shared and
+own parameters of several states, a payload on top, known loads. The common estimate is
+linear in those of the single fits, $x = \sum_s A_s (\hat p_s - c_s)$ with $A_s = (\sum
+E^T G E)^{-1} E_s^T G_s$ and the information $G_s$ of each fit, and so is its error: the
+covariances of the single estimates, which are right for correlated errors, give that of
+the common one.
 """
 
 import dataclasses
@@ -33,17 +34,21 @@ def require_same_base(fits: Sequence[Fit]) -> None:
         same = a.names == b.names and a.indices == b.indices
         if not same or not np.allclose(a.kappa, b.kappa, rtol=1e-6, atol=1e-9):
             others = sorted({*a.names} ^ {*b.names})
-            differs = f"`{others[0]}` is in one of them only" if others else "lengths differ"
+            differs = (
+                f"`{others[0]}` is in one of them only" if others else "lengths differ"
+            )
             pair = f"`{first.name}` and `{fit.name}`"
-            raise InputError(f"{pair} have different base parameters ({differs}): use one model.")
+            raise InputError(
+                f"{pair} have different base parameters ({differs}): use one model."
+            )
 
 
 def as_least_squares(fit: Fit) -> Fit:
     """Return weighted least squares of a fit's factors: the fit itself where it is that.
 
-    For robust, regularised or consistent estimates the factors are solved again with the same
-    weights. The standard deviations of consistent ones are those of least squares already; of
-    others they come from the block jackknife.
+    For robust, regularised or consistent estimates the factors are solved again with
+    the same weights. The standard deviations of consistent ones are those of least
+    squares already; of others they come from the block jackknife.
     """
     if fit.is_least_squares:
         return fit
@@ -62,19 +67,23 @@ def without_bounds(fit: Fit) -> Fit:
 def replace_estimates(fit: Fit, parameters, uncertainty: Uncertainty) -> Fit:
     """Return a fit with estimates and an uncertainty that were computed from several fits."""
     notes = tuple(note for note in fit.notes if note not in fit.uncertainty.notes)
-    return dataclasses.replace(fit, parameters=parameters, uncertainty=uncertainty, notes=notes)
+    return dataclasses.replace(
+        fit, parameters=parameters, uncertainty=uncertainty, notes=notes
+    )
 
 
 def combine(fits: Sequence[Fit], maps, offsets=None) -> tuple[np.ndarray, Uncertainty]:
     """Estimate common unknowns from the factors of several fits by least squares (Eq. 33).
 
-    The base parameters of each fit are its map [base, unknowns] times the unknowns, plus its
-    offset [base], if there are any.
+    The base parameters of each fit are its map [base, unknowns] times the unknowns,
+    plus its offset [base], if there are any.
     """
     for one, other in itertools.combinations(fits, 2):
         if share_rows(one.time_blocks, other.time_blocks):
             names = f"`{one.name}` and `{other.name}`"
-            raise InputError(f"{names} have seen the same data, which would count twice.")
+            raise InputError(
+                f"{names} have seen the same data, which would count twice."
+            )
     offsets = offsets or [np.zeros(fit.base.size) for fit in fits]
     factors, rows = [fit.factor for fit in fits], []
     for (R, z), E, c in zip(factors, maps, offsets, strict=True):
@@ -86,8 +95,9 @@ def combine(fits: Sequence[Fit], maps, offsets=None) -> tuple[np.ndarray, Uncert
     for fit, (R, _), E in zip(fits, factors, maps, strict=True):
         C, dof = fit.covariance, fit.uncertainty.dof
         if not np.isfinite(C).all():
-            # The fit alone does not determine everything, so not all of its estimates have a
-            # variance. The effect of its errors on others follows from blocks of time.
+            # The fit alone does not determine everything, so not all of its estimates
+            # have a variance. The effect of its errors on others follows from blocks of
+            # time.
             parts = [part.weighted(fit.weights) for part in fit.time_blocks.parts]
             _, C, few = solve_blocks(parts)
             dof = np.full(len(C), few)
@@ -108,8 +118,9 @@ def combine(fits: Sequence[Fit], maps, offsets=None) -> tuple[np.ndarray, Uncert
 def update(earlier: Fit, later: Fit, name: str | None = None) -> Fit:
     """Add a later fit to an earlier one, as if both had been identified together.
 
-    The estimates are those of the joint fit to rounding, and only factors are needed: the earlier
-    fit may come from a file. If the weights of the fits differ, each keeps its own.
+    The estimates are those of the joint fit to rounding, and only factors are needed:
+    the earlier fit may come from a file. If the weights of the fits differ, each keeps
+    its own.
 
     Args:
         earlier: Fit of the earlier recordings.
@@ -117,13 +128,15 @@ def update(earlier: Fit, later: Fit, name: str | None = None) -> Fit:
         name: Name of both together; by default their names in a row.
 
     Raises:
-        InputError: If the fits have different base parameters, or have seen the same data.
+        InputError: If the fits have different base parameters, or have seen the same
+            data.
     """
     require_same_base((earlier, later))
     earlier, later = as_least_squares(earlier), as_least_squares(later)
     identity = np.eye(earlier.base.size)
     p, uncertainty = combine((earlier, later), (identity, identity))
-    # The later rows are scaled so that they keep their weights under those of the earlier fit.
+    # The later rows are scaled so that they keep their weights under those of the
+    # earlier fit.
     scaled = later.time_blocks.scale_joints(later.weights / earlier.weights)
     blocks = Blocks((*earlier.time_blocks.parts, *scaled.parts))
     names = (*earlier.recordings, *later.recordings)
@@ -136,12 +149,16 @@ def update(earlier: Fit, later: Fit, name: str | None = None) -> Fit:
 def share_rows(first: Blocks, second: Blocks) -> bool:
     """Return whether two sets of factors were made of the same rows, at least in part.
 
-    Names do not tell: different logs may have the same, and one log several. Norms of the columns
-    and forces do, whatever the weights. Two blocks must agree: one may be a robot at rest.
+    Names do not tell: different logs may have the same, and one log several. Norms of
+    the columns and forces do, whatever the weights. Two blocks must agree: one may be a
+    robot at rest.
     """
     ours, theirs = list(_column_norms(first)), list(_column_norms(second))
     equal = sum(
-        any(m == n and a.shape == b.shape and np.abs(a - b).max() <= 1e-9 for n, b in theirs)
+        any(
+            m == n and a.shape == b.shape and np.abs(a - b).max() <= 1e-9
+            for n, b in theirs
+        )
         for m, a in ours
     )
     return equal >= max(1, min(2, len(ours), len(theirs)))

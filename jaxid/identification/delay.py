@@ -31,10 +31,10 @@ class Delay(eqx.Module):
         seconds: Delay of all joints [s].
         standard_deviation: Standard deviation of the delay [s].
         dof: Degrees of freedom of the standard deviation.
-        feedback: Largest error that disturbances can cause which the controller counteracts [s];
-            zero if the commanded motion is known.
-        resolution: What no log tells [s]: a tenth of a sample, for drives hold their forces, and a
-            model does not follow a filtered motion exactly.
+        feedback: Largest error that disturbances can cause which the controller
+            counteracts [s]; zero if the commanded motion is known.
+        resolution: What no log tells [s]: a tenth of a sample, for drives hold their
+            forces, and a model does not follow a filtered motion exactly.
         of_joints: Each joint's own delay [s].
         p_value: Probability that joints with one common delay would differ so much.
     """
@@ -53,7 +53,9 @@ class Delay(eqx.Module):
         Args:
             level: Probability (0 to 1) that the interval contains the true delay.
         """
-        half = self.standard_deviation * float(special.stdtrit(self.dof, 0.5 + 0.5 * level))
+        half = self.standard_deviation * float(
+            special.stdtrit(self.dof, 0.5 + 0.5 * level)
+        )
         half += self.feedback + self.resolution
         return self.seconds - half, self.seconds + half
 
@@ -67,16 +69,17 @@ def estimate_delay(
 ) -> Delay:
     r"""Estimate the delay of the forces together with the base parameters.
 
-    Forces that are late by $\tau$ are $\Theta(t - \tau) p$: the motion is shifted until the rate of
-    the model's own forces explains nothing more of the residuals. Remove the delay by
-    `remove_delay`, and observe again.
+    Forces that are late by $\tau$ are $\Theta(t - \tau) p$: the motion is shifted until
+    the rate of the model's own forces explains nothing more of the residuals. Remove
+    the delay by `remove_delay`, and observe again.
 
-    Disturbances that move a controlled robot are in its forces and in its motion. With the
-    commanded motion, which knows nothing of them, its regressor and rates are the instruments: the
-    estimate is consistent. Without it, disturbances $d$ reach the forces of the motion as $S d$
+    Disturbances that move a controlled robot are in its forces and in its motion. With
+    the commanded motion, which knows nothing of them, its regressor and rates are the
+    instruments: the estimate is consistent. Without it, disturbances $d$ reach the
+        forces of the motion as $S d$
     with the sensitivity $S$ of the loop, and shift the estimate by at most
-    $|S|_\infty\, |d|\, |\dot d| / |r|^2$, where $r$ is what the parameters leave of the rate;
-    `feedback` is that with the residuals as $d$ and $|S|_\infty = 2$.
+    $|S|_\infty\, |d|\, |\dot d| / |r|^2$, where $r$ is what the parameters leave of the
+    rate; `feedback` is that with the residuals as $d$ and $|S|_\infty = 2$.
 
     The deviation is that of the jackknife over blocks of time.
 
@@ -84,12 +87,14 @@ def estimate_delay(
         base: Base parameters of the robot.
         observations: One or several recordings with the same delay.
         weights: Weights of the joints; the reciprocals of the largest forces if None.
-        commanded: The commanded motion of each recording, with its forces, filtered alike: the same
-            log, read with the commanded angles in place of the measured ones.
+        commanded: The commanded motion of each recording, with its forces, filtered
+            alike: the same log, read with the commanded angles in place of the measured
+                ones.
 
     Raises:
-        InputError: If weights are not known, the commanded motion has other samples, or the search
-            does not settle: the delay is longer than the motion's shortest swings.
+        InputError: If weights are not known, the commanded motion has other samples, or
+            the search does not settle: the delay is longer than the motion's shortest
+            swings.
     """
     problem, n = RegressionProblem(base, observations), base.model.robot.joints
     recordings = instruments = problem.recordings
@@ -97,14 +102,19 @@ def estimate_delay(
         instruments = RegressionProblem(base, commanded).recordings
         if [o.segments for o in instruments] != [o.segments for o in recordings]:
             raise InputError("`commanded` must have the samples of `observations`.")
-    w = (MaximumForces() if weights is None else weights)(base.model.robot, problem.factors)
+    w = (MaximumForces() if weights is None else weights)(
+        base.model.robot, problem.factors
+    )
     together = linalg.block_diag(np.eye(base.size), np.ones((n, 1)))
     p, seconds, step, damping = np.zeros(base.size), 0.0, 0.0, 1.0
     # Without a delay at first.
     start = np.eye(base.size + n)[:, : base.size]
     p = _equations(base, recordings, recordings, w, p).combined(start).solve()
     for _ in range(12):
-        moved = ([without_delay(o, seconds) for o in logs] for logs in (recordings, instruments))
+        moved = (
+            [without_delay(o, seconds) for o in logs]
+            for logs in (recordings, instruments)
+        )
         each = _equations(base, *moved, w, p)
         common = each.combined(together)
         x, deviation = common.solve(), float(np.sqrt(common.jackknife()[-1, -1]))
@@ -116,16 +126,22 @@ def estimate_delay(
             break
     else:
         raise InputError(
-            f"the delay does not settle (last change {1e3 * step:.3g} ms): crop the log to where "
+            f"the delay does not settle (last change {1e3 * step:.3g} ms): crop the "
+            "log to where "
             "the robot moves, and check angle columns and signs."
         )
-    delays, spread = each.solve()[base.size :], each.jackknife()[base.size :, base.size :]
+    delays, spread = (
+        each.solve()[base.size :],
+        each.jackknife()[base.size :, base.size :],
+    )
     contrast = np.eye(n)[1:] - np.eye(n)[:1]
     differences = contrast @ spread @ contrast.T
     p_value = joint_test(contrast @ delays, differences, BLOCKS - 1.0)[1]
     feedback = common.feedback(x) if commanded is None else 0.0
     limits = feedback, 0.1 * recordings[0].sample_time
-    return Delay(seconds, deviation, BLOCKS - 1.0, *limits, seconds - step + delays, p_value)
+    return Delay(
+        seconds, deviation, BLOCKS - 1.0, *limits, seconds - step + delays, p_value
+    )
 
 
 class _Equations(NamedTuple):
@@ -223,7 +239,9 @@ def without_delay(observations: Observations, seconds: float) -> Observations:
     mask, instants = np.array(observations.mask), observations.instants
     given = observations.motion
     motion = Motion(*(np.array(x, np.float64) for x in (given.q, given.qd, given.qdd)))
-    for (a, b), (r0, r1) in zip(observations.segments, observations.row_segments, strict=True):
+    for (a, b), (r0, r1) in zip(
+        observations.segments, observations.row_segments, strict=True
+    ):
         # Beyond the ends the nearest motion is used, in rows that do not count.
         at = np.clip(time[a:b] - seconds, time[a], time[b - 1])
         for x in (motion.q, motion.qd, motion.qdd):
@@ -233,7 +251,8 @@ def without_delay(observations: Observations, seconds: float) -> Observations:
         mask[r0:r1] &= ((rows >= first) & (rows < last))[:, None]
     if not mask.any(axis=0).all():
         raise InputError(
-            f"`{observations.name}` is too short for a delay of {seconds:g} s: no rows of some "
+            f"`{observations.name}` is too short for a delay of {seconds:g} s: no "
+            "rows of some "
             "joint are left."
         )
     return observations.replace(motion=motion, mask=mask)

@@ -19,7 +19,9 @@ FEWEST = 100
 def encoder_steps(recording: Recording) -> Float[np.ndarray, " joints"]:
     """Return the step of each angle [rad or m]; zero where the values lie on no grid."""
     angles = np.asarray(recording.angles)
-    changes = np.concatenate([np.diff(angles[a:b], axis=0) for a, b in recording.segments])
+    changes = np.concatenate(
+        [np.diff(angles[a:b], axis=0) for a, b in recording.segments]
+    )
     return np.array([_step(np.abs(x)) for x in changes.T])
 
 
@@ -42,9 +44,10 @@ def resolution_bias(
 ) -> Float[np.ndarray, " base"]:
     """Return the bias of base parameters that the encoders' resolution causes, in their units.
 
-    The filtered motion is taken for the true one, and the fitted model's forces for the true ones.
-    The angles are rounded as the encoders do, filtered, and the parameters estimated again: by how
-    much they change is the bias. Angles on no grid are not rounded.
+    The filtered motion is taken for the true one, and the fitted model's forces for the
+    true ones. The angles are rounded as the encoders do, filtered, and the parameters
+    estimated again: by how much they change is the bias. Angles on no grid are not
+    rounded.
     """
     robot, motion = fit.base.model.robot, observations.motion
     steps = encoder_steps(recording)
@@ -57,7 +60,11 @@ def resolution_bias(
 
     def estimate(angles: np.ndarray) -> np.ndarray:
         log = dataclasses.replace(
-            recording, angles=angles, velocities=None, forces=forces, forces_on_motor_side=False
+            recording,
+            angles=angles,
+            velocities=None,
+            forces=forces,
+            forces_on_motor_side=False,
         )
         o = observe(log, robot, observations.filter, observations.decimation)
         o = o.replace(mask=observations.mask)
@@ -67,14 +74,20 @@ def resolution_bias(
     return estimate(rounded) - estimate(exact)
 
 
-def resolution_note(fit: Fit, recording: Recording, observations: Observations) -> tuple[str, ...]:
+def resolution_note(
+    fit: Fit, recording: Recording, observations: Observations
+) -> tuple[str, ...]:
     """Return a sentence about parameters whose intervals the resolution makes wrong, or nothing."""
     # Biases grow with the square of the steps: small ones cannot matter.
-    matters = encoder_steps(recording) > 1e-5 * np.std(np.asarray(recording.angles), axis=0)
+    matters = encoder_steps(recording) > 1e-5 * np.std(
+        np.asarray(recording.angles), axis=0
+    )
     if recording.velocities is not None or not matters.any():
         return ()
     bias = np.abs(resolution_bias(fit, recording, observations))
-    ratio = bias / np.where(fit.standard_deviations > 0, fit.standard_deviations, np.inf)
+    ratio = bias / np.where(
+        fit.standard_deviations > 0, fit.standard_deviations, np.inf
+    )
     # From half a deviation on an interval of 95 % holds clearly less often.
     worst = np.argsort(-ratio)[: np.count_nonzero(ratio > 0.5)]
     if not len(worst):
@@ -82,7 +95,9 @@ def resolution_note(fit: Fit, recording: Recording, observations: Observations) 
     names = ", ".join(f"{fit.base.names[k]} by {ratio[k]:.1f}" for k in worst[:4])
     more = f", and {len(worst) - 4} more" if len(worst) > 4 else ""
     return (
-        "the encoders are so coarse that parameters are shifted, in standard deviations: "
-        f"{names}{more}. Their intervals are too narrow: move faster, lower the cut-off of the "
+        "the encoders are so coarse that parameters are shifted, in standard "
+        "deviations: "
+        f"{names}{more}. Their intervals are too narrow: move faster, lower the "
+        "cut-off of the "
         "filter, or leave slow rows out (`rows.min_speed`).",
     )

@@ -1,9 +1,10 @@
 """Rows of the regression and the triangular factors to which they are reduced.
 
-The rows of a joint depend only on the bodies beyond it. Columns and forces of a chunk of samples
-are filtered and decimated alike, and reduced to the R factor of a QR decomposition for each joint.
-Weights of the joints are applied to the factors afterwards, and recordings are added by stacking
-factors. The observation matrix is never held in memory.
+The rows of a joint depend only on the bodies beyond it. Columns and forces of a chunk
+of samples are filtered and decimated alike, and reduced to the R factor of a QR
+decomposition for each joint. Weights of the joints are applied to the factors
+afterwards, and recordings are added by stacking factors. The observation matrix is
+never held in memory.
 """
 
 import functools
@@ -32,7 +33,9 @@ class RowChunk(NamedTuple):
     rows: slice  # range of the recording's rows
     indices: Columns  # base parameters that can act on each joint
     columns: list[np.ndarray]  # columns of each joint [rows, indices of the joint]
-    forces: np.ndarray  # measured forces less those of a known tool [rows, joints], in [N m] or [N]
+    forces: (
+        np.ndarray
+    )  # measured forces less those of a known tool [rows, joints], in [N m] or [N]
     mask: np.ndarray  # rows that count for each joint [rows, joints]
 
     def part(self, selection: slice) -> "RowChunk":
@@ -55,7 +58,9 @@ class RowChunk(NamedTuple):
     def residuals(self, p: np.ndarray) -> Float[np.ndarray, "rows joints"]:
         """Return measured less predicted forces [N m or N]."""
         pairs = zip(self.columns, self.indices, strict=True)
-        return self.forces - np.stack([theta @ p[list(own)] for theta, own in pairs], axis=1)
+        return self.forces - np.stack(
+            [theta @ p[list(own)] for theta, own in pairs], axis=1
+        )
 
     def equations(self) -> list[np.ndarray]:
         """Return the masked rows `[columns, force]` of each joint."""
@@ -63,7 +68,9 @@ class RowChunk(NamedTuple):
         return [np.column_stack([theta, force])[kept] for theta, force, kept in joints]
 
 
-def row_chunks(base, observations: Observations, samples: int, wanted=None) -> Iterator[RowChunk]:
+def row_chunks(
+    base, observations: Observations, samples: int, wanted=None
+) -> Iterator[RowChunk]:
     """Yield the rows of a recording by chunks of so many samples, not yet divided (Eq. 26).
 
     Only the `wanted` ranges of rows are made, or all.
@@ -80,7 +87,9 @@ def row_chunks(base, observations: Observations, samples: int, wanted=None) -> I
 def without_tool(base: BaseParameters, motion: Motion, forces: AnyArray) -> np.ndarray:
     """Return measured forces less those of a known tool [N m or N]."""
     forces = np.asarray(forces)
-    return forces if base.model.robot.tool is None else forces - base.tool_forces(motion)
+    return (
+        forces if base.model.robot.tool is None else forces - base.tool_forces(motion)
+    )
 
 
 def divide_rows(edges: Sequence[int], rows: slice) -> Iterator[tuple[int, slice]]:
@@ -94,7 +103,9 @@ def divide_rows(edges: Sequence[int], rows: slice) -> Iterator[tuple[int, slice]
 class JointFactor(eqx.Module):
     r"""The R factor of $[\Theta_j \; Q_j]$, the rows of one joint and their forces."""
 
-    columns: tuple[int, ...] = eqx.field(static=True)  # base parameters that can act on the joint
+    columns: tuple[int, ...] = eqx.field(
+        static=True
+    )  # base parameters that can act on the joint
     # upper triangle, or fewer rows; its last column belongs to the forces
     R: Float[AnyArray, "height width"]
     rows: int = eqx.field(static=True)  # number of rows that it stands for
@@ -119,7 +130,9 @@ class Factors(eqx.Module):
     def __add__(self, other: "Factors") -> "Factors":
         """Return the factors of both sets of rows together."""
         pairs = zip(self.joints, other.joints, strict=True)
-        joints = (JointFactor(a.columns, a.append(b.R).R, a.rows + b.rows) for a, b in pairs)
+        joints = (
+            JointFactor(a.columns, a.append(b.R).R, a.rows + b.rows) for a, b in pairs
+        )
         return Factors(tuple(joints), self.size)
 
     @property
@@ -127,7 +140,9 @@ class Factors(eqx.Module):
         """Number of rows of each joint."""
         return np.array([j.rows for j in self.joints])
 
-    def weighted(self, weights: Float[AnyArray, " joints"]) -> tuple[np.ndarray, np.ndarray]:
+    def weighted(
+        self, weights: Float[AnyArray, " joints"]
+    ) -> tuple[np.ndarray, np.ndarray]:
         r"""Return matrix and right-hand side with the norms of $W \Theta_B p$, $W Q$ (Eq. 29)."""
         blocks = []
         for joint, w in zip(self.joints, np.asarray(weights), strict=True):
@@ -137,7 +152,9 @@ class Factors(eqx.Module):
         R = np.asarray(np.linalg.qr(np.vstack(blocks), mode="r"))
         return R[:, :-1], R[:, -1]
 
-    def residual_squares(self, p: Float[AnyArray, " base"]) -> Float[np.ndarray, " joints"]:
+    def residual_squares(
+        self, p: Float[AnyArray, " base"]
+    ) -> Float[np.ndarray, " joints"]:
         """Return the sum of the squared residuals of each joint [N² m² or N²]."""
         whole = np.append(p, -1.0)
         rests = [joint.R @ whole[[*joint.columns, -1]] for joint in self.joints]
@@ -151,7 +168,9 @@ class Factors(eqx.Module):
 
 def empty_factors(columns: Columns, size: int) -> Factors:
     """Return the factors of no rows, with the columns of each joint and the number of all."""
-    joints = (JointFactor(tuple(own), np.zeros((0, len(own) + 1)), 0) for own in columns)
+    joints = (
+        JointFactor(tuple(own), np.zeros((0, len(own) + 1)), 0) for own in columns
+    )
     return Factors(tuple(joints), size)
 
 

@@ -36,9 +36,10 @@ class FilterChoice(eqx.Module):
     Attributes:
         candidates: Filter and decimation of each candidate, in the given order.
         cutoffs: Cut-off frequencies of forces and columns [Hz].
-        errors: Held-out error of each candidate on each part of the log, relative to the forces.
-        correlations: Mean correlation of neighbouring rows of the residuals for each candidate:
-            near zero where rows are independent.
+        errors: Held-out error of each candidate on each part of the log, relative to
+            the forces.
+        correlations: Mean correlation of neighbouring rows of the residuals for each
+            candidate: near zero where rows are independent.
         best: Index of the chosen candidate.
     """
 
@@ -79,24 +80,28 @@ def choose_filter(
 ) -> FilterChoice:
     """Choose the filter with which a model predicts held-out parts of the log best.
 
-    With each candidate the model is fitted to all parts of the log but one, and predicts the forces
-    of that part from the candidate's own motion. Measured and predicted forces are compared in the
-    *widest* band of all candidates: a filter that hides unexplained forces gains nothing.
+    With each candidate the model is fitted to all parts of the log but one, and
+    predicts the forces of that part from the candidate's own motion. Measured and
+    predicted forces are compared in the *widest* band of all candidates: a filter that
+    hides unexplained forces gains nothing.
 
     Args:
         base: Base parameters of the robot.
         recordings: One or several logs.
-        candidates: Pairs of a filter and its decimation; by default zero-phase Butterworth filters
-            with nine cut-off frequencies from 1 Hz to a fifth of the sampling rate, but at most
-            100 Hz, each decimated to about five rows for each period.
+        candidates: Pairs of a filter and its decimation; by default zero-phase
+            Butterworth filters with nine cut-off frequencies from 1 Hz to a fifth of
+            the sampling rate, but at most 100 Hz, each decimated to about five rows for
+            each period.
         estimator: Estimator; by default least squares weighted by the largest forces.
-        criterion: "error" for the smallest error on held-out parts; "whiteness" for the smallest
-            correlation of neighbouring residuals, among those with at most 5 % more error.
+        criterion: "error" for the smallest error on held-out parts; "whiteness" for the
+            smallest correlation of neighbouring residuals, among those with at most 5 %
+            more error.
         min_speed: Speed of each joint below which its rows do not count [rad/s or m/s].
         progress: Callback, called with the completed fraction (0 to 1).
 
     Raises:
-        InputError: If there are no candidates, or a log and a candidate do not fit to each other.
+        InputError: If there are no candidates, or a log and a candidate do not fit to
+            each other.
     """
     logs = (recordings,) if isinstance(recordings, Recording) else tuple(recordings)
     if candidates is None:
@@ -120,7 +125,9 @@ def choose_filter(
         for o in (observe(log, robot, *candidate, min_speed) for log in logs):
             at = o.instants
             far = [(at >= a + edge) & (at < b - edge) for a, b in o.segments]
-            inner.append(o.replace(mask=np.asarray(o.mask) & np.any(far, axis=0)[:, None]))
+            inner.append(
+                o.replace(mask=np.asarray(o.mask) & np.any(far, axis=0)[:, None])
+            )
         return inner
 
     widest = inner_observations(candidates[int(np.argmax(cutoffs))])
@@ -130,7 +137,9 @@ def choose_filter(
         own = inner_observations(candidate)
         problem = RegressionProblem(base, own)
         if [o.samples for o in own] != [o.samples for o in widest]:
-            raise InputError("`candidates` leave different parts of the recordings: avoid gaps.")
+            raise InputError(
+                "`candidates` leave different parts of the recordings: avoid gaps."
+            )
         pairs = zip(widest, own, strict=True)
         # The candidate's motion, with forces and rows of the widest band.
         test = RegressionProblem(base, [o.replace(motion=x.motion) for o, x in pairs])
@@ -146,21 +155,27 @@ def choose_filter(
     return FilterChoice(tuple(candidates), cutoffs, *found, best)
 
 
-def _held_out_errors(problem, test, estimator: AbstractEstimator, squares) -> np.ndarray:
+def _held_out_errors(
+    problem, test, estimator: AbstractEstimator, squares
+) -> np.ndarray:
     """Return the errors on held-out parts, relative to the forces of all parts."""
     errors, folds = [], cross_validation_folds(problem.blocks)
     total = squares @ test.factors.force_squares / len(folds)
     for rest, part in folds:
         seen = RegressionProblem(problem.base, blocks=problem.blocks.select(rest))
         held_out = test.blocks.select(part).total
-        errors.append(squares @ held_out.residual_squares(estimator(seen).parameters) / total)
+        errors.append(
+            squares @ held_out.residual_squares(estimator(seen).parameters) / total
+        )
     return np.sqrt(errors)
 
 
 def _correlation(problem: RegressionProblem, estimator: AbstractEstimator) -> float:
     """Return the correlation of neighbouring rows of the residuals, as a mean of the joints."""
     power, product = np.zeros((2, problem.robot.joints))
-    for chunk, residuals in problem.residuals(np.asarray(estimator(problem).parameters)):
+    for chunk, residuals in problem.residuals(
+        np.asarray(estimator(problem).parameters)
+    ):
         e = np.where(chunk.mask, residuals, 0.0)
         power += np.sum(e**2, axis=0)
         product += np.sum(e[1:] * e[:-1], axis=0)
@@ -201,13 +216,17 @@ class EssentialParameters(eqx.Module):
         """Sentences for the user."""
         if not self.eliminated:
             return (str(self),)
-        return str(self), f"eliminated, and taken as zero: {', '.join(self.eliminated)}."
+        return str(
+            self
+        ), f"eliminated, and taken as zero: {', '.join(self.eliminated)}."
 
     def __str__(self):
         first, last = self.path[0], self.last
         return (
-            f"{last.remaining} of {first.remaining} base parameters are essential: with them alone "
-            f"the error on held-out blocks of time is {100 * last.held_out:.2f} % of the forces, "
+            f"{last.remaining} of {first.remaining} base parameters are essential: "
+            "with them alone "
+            f"the error on held-out blocks of time is {100 * last.held_out:.2f} % of "
+            "the forces, "
             f"with all {100 * first.held_out:.2f} %."
         )
 
@@ -221,15 +240,16 @@ def essential_parameters(
 ) -> EssentialParameters:
     """Eliminate the parameter with the largest relative standard deviation, again and again.
 
-    Held-out errors decide where to stop: at the fewest parameters whose error exceeds the smallest
-    on the path by `cost` at most. Standard deviations are those of the fit, scaled by the change of
-    those for independent rows (Pham and Gautier, 1991).
+    Held-out errors decide where to stop: at the fewest parameters whose error exceeds
+    the smallest on the path by `cost` at most. Standard deviations are those of the
+    fit, scaled by the change of those for independent rows (Pham and Gautier, 1991).
 
     Args:
         fit: Fit of all base parameters.
         observations: Observations of the fit.
         cost: Acceptable relative increase of the held-out error.
-        uncertainty: Method for the standard deviations; by default the spectral sandwich.
+        uncertainty: Method for the standard deviations; by default the spectral
+            sandwich.
 
     Raises:
         InputError: If `cost` is negative, or the observations are not those of the fit.
@@ -238,7 +258,9 @@ def essential_parameters(
         raise InputError(f"`cost` must be zero or more, but is {cost:g}.")
     problem = RegressionProblem(fit.base, observations)
     if [int(n) for n in problem.factors.rows] != list(fit.rows):
-        raise InputError("`observations` must be those of the fit, but they have other rows.")
+        raise InputError(
+            "`observations` must be those of the fit, but they have other rows."
+        )
     path, sets = _eliminate(fit, problem)
     most = (1 + cost) * min(step.held_out for step in path)
     kept = [k for k, step in zip(sets, path, strict=True) if step.held_out <= most][-1]
@@ -262,20 +284,28 @@ def _eliminate(fit: Fit, problem: RegressionProblem) -> tuple[list[Elimination],
     kept, ratio = list(range(fit.base.size)), np.empty(0)
     path, sets, name = [], [], ""
     while kept:
-        held_out = sum(squares @ x.residual_squares(_solve(A, b, kept)[0]) for A, b, x in folds)
+        held_out = sum(
+            squares @ x.residual_squares(_solve(A, b, kept)[0]) for A, b, x in folds
+        )
         sets.append(list(kept))
         path.append(Elimination(name, len(kept), float(np.sqrt(held_out / total))))
         p, B = _solve(R, z, kept)
         naive = np.sqrt(np.diag(naive_covariance(factors, weights, p, B)))
         if not ratio.size:
             known = np.isfinite(fit.standard_deviations) & (naive > 0)
-            ratio = np.where(known, fit.standard_deviations / np.where(known, naive, 1.0), np.inf)
-        relative = ratio[kept] * naive / np.maximum(np.abs(p[kept]), np.finfo(float).tiny)
+            ratio = np.where(
+                known, fit.standard_deviations / np.where(known, naive, 1.0), np.inf
+            )
+        relative = (
+            ratio[kept] * naive / np.maximum(np.abs(p[kept]), np.finfo(float).tiny)
+        )
         name = fit.base.names[kept.pop(int(np.argmax(relative)))]
     return path, sets
 
 
-def _solve(R: np.ndarray, z: np.ndarray, kept: list[int]) -> tuple[np.ndarray, np.ndarray]:
+def _solve(
+    R: np.ndarray, z: np.ndarray, kept: list[int]
+) -> tuple[np.ndarray, np.ndarray]:
     """Return least squares in some parameters, the others zero, and the inverse information."""
     p, B = np.zeros(R.shape[1]), np.zeros((R.shape[1], len(kept)))
     decomposition = Decomposition.of(R[:, kept], z)

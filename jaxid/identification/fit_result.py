@@ -77,12 +77,13 @@ class Fit(Summarised, eqx.Module):
         recordings: Names of the observations.
         notes: Sentences for the user.
         consistency: Properties of a physically consistent estimate.
-        full_parameters: Standard parameters, of an estimator that finds a complete set of them.
-        residual_spectra: Spectra of each joint's residuals, and their whiteness; None where only
-            factors of the rows were known.
+        full_parameters: Standard parameters, of an estimator that finds a complete set
+            of them.
+        residual_spectra: Spectra of each joint's residuals, and their whiteness; None
+            where only factors of the rows were known.
         date: Day on which the fit was made, like 2026-01-31; empty if it is not known.
-        blocks: Factors of the rows by contiguous blocks of time, for later functions; None if they
-            are not known.
+        blocks: Factors of the rows by contiguous blocks of time, for later functions;
+            None if they are not known.
         name: Name of the fit, such as `cold`; by default the names of its recordings.
     """
 
@@ -124,8 +125,9 @@ class Fit(Summarised, eqx.Module):
     def intervals(self, level: float = 0.95) -> Float[np.ndarray, "base 2"]:
         """Return confidence intervals of the parameters.
 
-        They tell how far noise can take the estimates of a model that is right: errors that every
-        recording of this kind would share (a wrong geometry, a missing effect) are not in them.
+        They tell how far noise can take the estimates of a model that is right: errors
+        that every recording of this kind would share (a wrong geometry, a missing
+        effect) are not in them.
 
         Args:
             level: Probability (0 to 1) that an interval contains the truth.
@@ -147,10 +149,13 @@ class Fit(Summarised, eqx.Module):
     def trust(self) -> tuple[Status, ...]:
         """Judgement of each estimate by its relative standard deviation.
 
-        `GOOD` up to 0.1, `DOUBTFUL` up to 0.5; `BAD` above, and for all that is undetermined.
+        `GOOD` up to 0.1, `DOUBTFUL` up to 0.5; `BAD` above, and for all that is
+        undetermined.
         """
         relative = self.relative_standard_deviations.copy()
-        relative[[k for direction in self.undetermined for k in direction.parts]] = np.inf
+        relative[[k for direction in self.undetermined for k in direction.parts]] = (
+            np.inf
+        )
         steps = np.searchsorted((TRUSTED, DOUBTFUL), relative)
         grades = Status.GOOD, Status.DOUBTFUL, Status.BAD
         return tuple(grades[k] for k in steps)
@@ -163,7 +168,9 @@ class Fit(Summarised, eqx.Module):
             InputError: If the fit does not hold its factors.
         """
         if self.blocks is None:
-            raise InputError(f"the fit `{self.name}` does not hold its factors: identify again.")
+            raise InputError(
+                f"the fit `{self.name}` does not hold its factors: identify again."
+            )
         return self.blocks
 
     @property
@@ -191,7 +198,8 @@ class Fit(Summarised, eqx.Module):
     def standard_parameters(self) -> Float[np.ndarray, " standard"]:
         """Standard parameters with the same forces.
 
-        Physical masses and inertias only if the estimator finds such (`full_parameters`).
+        Physical masses and inertias only if the estimator finds such
+        (`full_parameters`).
         """
         if self.full_parameters is not None:
             return np.asarray(self.full_parameters)
@@ -201,16 +209,23 @@ class Fit(Summarised, eqx.Module):
     def facts(self) -> list[tuple[str, str]]:
         """Rows, condition numbers, residual and trust, each with its word."""
         rows, numbers = self.rows, self.condition_numbers
-        good, fair, poor = map(self.trust.count, (Status.GOOD, Status.DOUBTFUL, Status.BAD))
+        good, fair, poor = map(
+            self.trust.count, (Status.GOOD, Status.DOUBTFUL, Status.BAD)
+        )
         fewest, most = min(rows), max(rows)
         return [
             ("rows per joint", str(most) if fewest == most else f"{fewest} to {most}"),
             (
                 "condition number",
-                f"{significant(numbers.raw, 4)} in SI units, {significant(numbers.weighted, 4)} "
-                f"weighted, {significant(numbers.scaled, 4)} weighted with columns of length one",
+                f"{significant(numbers.raw, 4)} in SI units, "
+                f"{significant(numbers.weighted, 4)} "
+                f"weighted, {significant(numbers.scaled, 4)} weighted with columns of "
+                "length one",
             ),
-            ("residual", f"{percent(self.residual, 3)} % of the forces (norms of all rows)"),
+            (
+                "residual",
+                f"{percent(self.residual, 3)} % of the forces (norms of all rows)",
+            ),
             (
                 "estimates",
                 f"{good} of {self.base.size} known to {100 * TRUSTED:g} %, {fair} to "
@@ -223,9 +238,16 @@ class Fit(Summarised, eqx.Module):
         """Combinations that the logs do not determine, and what to do about them."""
         base, count = self.base, len(self.undetermined)
         if not count:
-            return [Remark(f"These logs determine all {base.size} base parameters.", Status.GOOD)]
+            return [
+                Remark(
+                    f"These logs determine all {base.size} base parameters.",
+                    Status.GOOD,
+                )
+            ]
         some = f"{count} combination{'' if count == 1 else 's'}"
-        headline = f"NOT DETERMINED by these logs: {some} of the {base.size} base parameters."
+        headline = (
+            f"NOT DETERMINED by these logs: {some} of the {base.size} base parameters."
+        )
         remarks = [Remark(headline, Status.BAD)]
         for direction in self.undetermined:
             detail = "not moved at all"
@@ -235,20 +257,27 @@ class Fit(Summarised, eqx.Module):
             remarks.append(Remark(f"{direction.sentence(base)}.", Status.BAD, detail))
         advice = (
             "A combination counts as not determined if it leaves more than "
-            f"{100 * LARGEST_UNCERTAINTY:g} % of the whole forces open. Estimates of these "
-            "parameters mean nothing one by one, and the model may fail on other motions. Record "
-            "a motion that moves these joints in more poses, faster and in both directions, or "
+            f"{100 * LARGEST_UNCERTAINTY:g} % of the whole forces open. Estimates of "
+            "these "
+            "parameters mean nothing one by one, and the model may fail on other "
+            "motions. Record "
+            "a motion that moves these joints in more poses, faster and in both "
+            "directions, or "
             "leave effects out in `[model]`"
         )
         if isinstance(self.solution, Complete):
-            advice += '; `ridge = "cross_validated"` in `[estimator]` keeps small what is left open'
+            advice += (
+                '; `ridge = "cross_validated"` in `[estimator]` keeps small '
+                "what is left open"
+            )
         return [*remarks, Remark(advice)]
 
     def summary(self) -> Table:
         """Return a table of the estimates with their standard deviations.
 
-        Estimates are shown with the digits that their standard deviations leave meaningful. Beside
-        them are the standard deviations that independent rows would have, and the ratio to these.
+        Estimates are shown with the digits that their standard deviations leave
+        meaningful. Beside them are the standard deviations that independent rows would
+        have, and the ratio to these.
         """
         base, trust, ratios = self.base, self.trust, self.uncertainty.ratios
         values, deviations = with_deviations(self.parameters, self.standard_deviations)
@@ -268,8 +297,10 @@ class Fit(Summarised, eqx.Module):
                 Column("ratio", ratios, format=lambda x: significant(x, 2)),
             ]
             text = (
-                f"Standard deviations are {significant(float(np.median(finite)), 2)} times "
-                "(median) those of independent rows, because errors of neighbouring rows are "
+                f"Standard deviations are {significant(float(np.median(finite)), 2)} "
+                "times "
+                "(median) those of independent rows, because errors of neighbouring "
+                "rows are "
                 "correlated."
             )
             remarks.append(Remark(text))
@@ -284,7 +315,9 @@ class Fit(Summarised, eqx.Module):
         """
         robot = self.base.model.robot
         if motion.joints != robot.joints:
-            raise InputError(f"`motion` must be of {robot.joints} joints, not {motion.joints}.")
+            raise InputError(
+                f"`motion` must be of {robot.joints} joints, not {motion.joints}."
+            )
         return self.base.forces_in_numpy(self.parameters, motion)
 
     @property
@@ -301,8 +334,8 @@ class Fit(Summarised, eqx.Module):
             path: Path of the file; an existing file is replaced.
 
         Raises:
-            InputError: If the model holds something that no file can hold, such as a term with
-                functions in it.
+            InputError: If the model holds something that no file can hold, such as a
+                term with functions in it.
         """
         document = {"format": FORMAT, "version": VERSION, "checksum": self.checksum}
         write_text(path, json_text({**document, "model": self._content()}))
@@ -314,69 +347,98 @@ class Fit(Summarised, eqx.Module):
         try:
             to_json(self.estimator, refused=(Observations,))
         except InputError:
-            fit = dataclasses.replace(self, estimator=EstimatorInWords(str(self.estimator)))
+            fit = dataclasses.replace(
+                self, estimator=EstimatorInWords(str(self.estimator))
+            )
         return to_json(fit)
 
 
 def load(path: str | Path) -> Fit:
     """Read a fit from a model file, as `Fit.save` and `jaxid identify` write it.
 
-    Numbers are the same to the last bit, and everything works as it did after `identify`. Your own
-    terms are found if the module that defines them is imported; nothing in a file is executed.
+    Numbers are the same to the last bit, and everything works as it did after
+    `identify`. Your own terms are found if the module that defines them is imported;
+    nothing in a file is executed.
 
     Args:
         path: Path of the file.
 
     Raises:
         OSError: If the file cannot be read.
-        InputError: If it is no model file, of another version, or not as it was written.
+        InputError: If it is no model file, of another version, or not as it was
+            written.
     """
     try:
         document = read_json(path)
     except ValueError as error:
-        raise InputError(f"`{path}` is no model file: it cannot be read as JSON.") from error
+        raise InputError(
+            f"`{path}` is no model file: it cannot be read as JSON."
+        ) from error
     if not isinstance(document, dict) or document.get("format") != FORMAT:
         raise InputError(f"`{path}` is no model file, as `save` writes it.")
     if document.get("version") != VERSION:
         raise InputError(
-            f"`{path}` is a model file of version {document.get('version')!r:.20}, but this jaxid "
+            f"`{path}` is a model file of version {document.get('version')!r:.20}, "
+            "but this jaxid "
             f"reads version {VERSION}: identify again."
         )
     content = document.get("model")
     if document.get("checksum") != checksum_of(content):
-        raise InputError(f"`{path}` is damaged or was changed by hand: save the model again.")
+        raise InputError(
+            f"`{path}` is damaged or was changed by hand: save the model again."
+        )
     try:
         fit = from_json(content, Fit)
         _check(fit)
     except (ValueError, TypeError) as error:
         reason = " ".join(str(error).split()).rstrip(".")
-        raise InputError(f"`{path}` holds no model that can be used: {reason}.") from error
+        raise InputError(
+            f"`{path}` holds no model that can be used: {reason}."
+        ) from error
     return fit
 
 
 def checksum_of(content: Any) -> str:
     """Return the SHA-256 of plain JSON values, whatever their layout in a file."""
-    plain = json.dumps(content, sort_keys=True, separators=(",", ":"), ensure_ascii=True)
+    plain = json.dumps(
+        content, sort_keys=True, separators=(",", ":"), ensure_ascii=True
+    )
     return f"sha256:{hashlib.sha256(plain.encode()).hexdigest()}"
 
 
 def _check(fit: Fit) -> None:
     """Reject arrays of a file that do not belong to its robot."""
     n, joints = fit.base.size, fit.base.model.robot.joints
-    found = {"parameters": fit.parameters, "covariance": fit.covariance, "weights": fit.weights}
-    for (name, array), shape in zip(found.items(), ((n,), (n, n), (joints,)), strict=True):
+    found = {
+        "parameters": fit.parameters,
+        "covariance": fit.covariance,
+        "weights": fit.weights,
+    }
+    for (name, array), shape in zip(
+        found.items(), ((n,), (n, n), (joints,)), strict=True
+    ):
         if np.shape(array) != shape:
-            raise InputError(f"`{name}` must have the shape {shape}, but has {np.shape(array)}")
+            raise InputError(
+                f"`{name}` must have the shape {shape}, but has {np.shape(array)}"
+            )
     if not np.isfinite(fit.parameters).all():
         raise InputError("`parameters` must hold finite numbers")
     if not re.fullmatch(r"(\d{4}-\d{2}-\d{2})?", fit.date, re.ASCII):
         raise InputError(f"`date` must be like 2026-01-31, but is {fit.date!r:.40}")
-    for text in (fit.name, *fit.recordings, *fit.notes, *fit.base.names, *fit.base.units):
+    for text in (
+        fit.name,
+        *fit.recordings,
+        *fit.notes,
+        *fit.base.names,
+        *fit.base.units,
+    ):
         if not text.isprintable():
             raise InputError(f"the text {text!r:.40} must be printable")
 
 
-def interval_table(title: str, names, units, values, uncertainty: Uncertainty, remarks=()) -> Table:
+def interval_table(
+    title: str, names, units, values, uncertainty: Uncertainty, remarks=()
+) -> Table:
     """Return a table of estimates with their 95 % intervals."""
     estimates, half_widths = with_deviations(values, uncertainty.half_widths())
     return Table(

@@ -39,21 +39,24 @@ def identify(
 
     Args:
         base: Base parameters of the robot.
-        observations: Observations of one recording, or of several that are fitted together; logs
-            larger than memory come from `scan_log`. Or the regression problem of recordings, such
-            as that of several processes.
+        observations: Observations of one recording, or of several that are fitted
+            together; logs larger than memory come from `scan_log`. Or the regression
+            problem of recordings, such as that of several processes.
         estimator: Estimator; by default least squares weighted by the largest forces.
-        progress: Callback, called with the completed fraction (0 to 1) of a pass over a long log.
-        uncertainty: Method for the standard deviations; by default the spectral sandwich.
+        progress: Callback, called with the completed fraction (0 to 1) of a pass over a
+            long log.
+        uncertainty: Method for the standard deviations; by default the spectral
+            sandwich.
         name: Name of the fit, such as `cold`; by default the names of its recordings.
 
     Returns:
         The estimates; `undetermined` names what these recordings do not determine.
 
     Raises:
-        TypeError: If a model stands for base parameters, or a recording for observations.
-        InputError: If the observations belong to another number of joints, have fewer rows than
-            there are parameters, or weights are not known.
+        TypeError: If a model stands for base parameters, or a recording for
+            observations.
+        InputError: If the observations belong to another number of joints, have fewer
+            rows than there are parameters, or weights are not known.
     """
     problem = observations
     if not isinstance(problem, RegressionProblem):
@@ -71,13 +74,14 @@ def fit_problem(
 ) -> Fit:
     """Estimate the base parameters of a regression problem.
 
-    The other arguments are those of `identify`. Where only factors are known, standard deviations
-    come from the block jackknife.
+    The other arguments are those of `identify`. Where only factors are known, standard
+    deviations come from the block jackknife.
     """
     count = int(problem.factors.rows.sum())
     if count <= problem.base.size:
         raise InputError(
-            f"there are {count} rows for {problem.base.size} base parameters: record longer, or "
+            f"there are {count} rows for {problem.base.size} base parameters: record "
+            "longer, or "
             "leave out fewer rows."
         )
     estimator = estimator or WeightedLeastSquares()
@@ -100,9 +104,13 @@ def fit_problem(
     raw, _ = factors.weighted(np.ones(len(weights)))
     # Columns of length one.
     scaled = R / np.where(R.any(axis=0), np.linalg.norm(R, axis=0), 1.0)
-    numbers = [float(np.linalg.cond(x)) if x.any() else np.inf for x in (raw, R, scaled)]
+    numbers = [
+        float(np.linalg.cond(x)) if x.any() else np.inf for x in (raw, R, scaled)
+    ]
     method = SpectralSandwich() if uncertainty is None else uncertainty
-    errors, spectra = method(plain, dataclasses.replace(estimate, parameters=free), naive)
+    errors, spectra = method(
+        plain, dataclasses.replace(estimate, parameters=free), naive
+    )
     shrinkage = _shrinkage_notes(decomposition.values, estimate.solution)
     return Fit(
         base=base,
@@ -118,7 +126,9 @@ def fit_problem(
         estimator=estimator,
         solution=estimate.solution,
         consistency=estimate.consistency,
-        full_parameters=None if estimate.standard is None else np.asarray(estimate.standard),
+        full_parameters=None
+        if estimate.standard is None
+        else np.asarray(estimate.standard),
         recordings=problem.names,
         notes=(*base.notes, *shrinkage, *estimate.notes, *errors.notes),
         date=datetime.date.today().isoformat(),
@@ -132,19 +142,24 @@ def _check(base: Any, recordings: Sequence[Any]) -> None:
     wanted += [("observations", o, Observations, "observe(...)") for o in recordings]
     for name, value, kind, function in wanted:
         if not isinstance(value, kind):
-            raise TypeError(f"`{name}` must come from `{function}`, not `{type(value).__name__}`.")
+            raise TypeError(
+                f"`{name}` must come from `{function}`, not `{type(value).__name__}`."
+            )
     n = base.model.robot.joints
     for o in recordings:
         if o.joints != n:
-            raise InputError(f"`observations` of `{o.name}` have {o.joints} joints, the robot {n}.")
+            raise InputError(
+                f"`observations` of `{o.name}` have {o.joints} joints, the robot {n}."
+            )
 
 
 def naive_covariance(factors: Factors, weights, p, B, taken: float = 0.0) -> np.ndarray:
     r"""Return the covariance for independent rows and a variance of each joint.
 
     The estimates are $B \Theta^T W^2 Q$, so their covariance is
-    $B (\sum_j w_j^4 \sigma_j^2 \Theta_j^T \Theta_j) B$: right also where the weights are not the
-    reciprocals of the standard deviations. The rows determine so many (`taken`) parameters.
+    $B (\sum_j w_j^4 \sigma_j^2 \Theta_j^T \Theta_j) B$: right also where the weights
+    are not the reciprocals of the standard deviations. The rows determine so many
+    (`taken`) parameters.
     """
     free = 1.0 - taken / float(factors.rows.sum())
     total = np.zeros((B.shape[1], B.shape[1]))
@@ -155,7 +170,9 @@ def naive_covariance(factors: Factors, weights, p, B, taken: float = 0.0) -> np.
     return total
 
 
-def _shrinkage_notes(s: np.ndarray, solution: AbstractSpectralSolution) -> tuple[str, ...]:
+def _shrinkage_notes(
+    s: np.ndarray, solution: AbstractSpectralSolution
+) -> tuple[str, ...]:
     """Return what standard deviations leave out where a solution shrinks weak directions."""
     live = s > NUMERICAL * s.max(initial=0.0)
     halved = solution.inverse(s) * s**2 <= 0.5
@@ -163,6 +180,8 @@ def _shrinkage_notes(s: np.ndarray, solution: AbstractSpectralSolution) -> tuple
     if not pulled:
         return ()
     return (
-        f"the solution pulls {pulled} of {len(s)} directions of the parameters to less than half "
-        "of what the data say: standard deviations do not tell how far from the truth this is.",
+        f"the solution pulls {pulled} of {len(s)} directions of the parameters to "
+        "less than half "
+        "of what the data say: standard deviations do not tell how far from the truth "
+        "this is.",
     )

@@ -1,11 +1,12 @@
 """Factors of long logs: one compiled loop over the samples, on all cores of the processor.
 
-The loop evaluates the columns of a chunk, filters and decimates them to rows by matrix products
-with the impulse responses, and adds up the Gram matrix of each joint's rows; columns live only
-within an iteration, in float64. A Gram matrix of the columns themselves would lose twice the digits
-of their condition number. So a few parts of the log give a first triangle for each joint, and the
-pass adds up the products of columns times the inverse of this triangle: these are almost
-orthonormal, so that no digits are lost. The triangle of all rows follows from both.
+The loop evaluates the columns of a chunk, filters and decimates them to rows by matrix
+products with the impulse responses, and adds up the Gram matrix of each joint's rows;
+columns live only within an iteration, in float64. A Gram matrix of the columns
+themselves would lose twice the digits of their condition number. So a few parts of the
+log give a first triangle for each joint, and the pass adds up the products of columns
+times the inverse of this triangle: these are almost orthonormal, so that no digits are
+lost. The triangle of all rows follows from both.
 """
 
 import functools
@@ -112,22 +113,29 @@ def stream_blocks(
 ) -> list[Factors]:
     """Return the factors of blocks of time by the compiled loop, for logs of any length.
 
-    All cores share the log. Products are added up in the order of the pieces, so that the number of
-    cores changes no digit. `edges` are the first row of each block, and the end of the last one.
+    All cores share the log. Products are added up in the order of the pieces, so that
+    the number of cores changes no digit. `edges` are the first row of each block, and
+    the end of the last one.
     """
     mask, indices = np.asarray(observations.mask), base.acting_columns
     stream = _Stream(base, observations, edges, progress)
     blocks = []
-    for R, (first, last) in zip(stream.triangles(), itertools.pairwise(edges), strict=True):
+    for R, (first, last) in zip(
+        stream.triangles(), itertools.pairwise(edges), strict=True
+    ):
         joints = zip(indices, R, mask[first:last].sum(axis=0).tolist(), strict=True)
-        blocks.append(Factors(tuple(JointFactor(*joint) for joint in joints), base.size))
+        blocks.append(
+            Factors(tuple(JointFactor(*joint) for joint in joints), base.size)
+        )
     return blocks
 
 
 class _Stream:
     """Pass of one log through the compiled loop; see `stream_blocks`."""
 
-    def __init__(self, base: BaseParameters, observations: Observations, edges, progress):
+    def __init__(
+        self, base: BaseParameters, observations: Observations, edges, progress
+    ):
         stages, self._stride = _stages(observations), 1
         if all(len(response) == 1 for response, _ in stages):
             # Without filters the samples between the rows are not needed.
@@ -161,7 +169,9 @@ class _Stream:
             for r in range(rows.start, rows.stop, most):
                 end = min(r + most, rows.stop)
                 begin = a + edge + (r - r0) * factor - reach
-                samples = slice(begin, min(begin + self._samples_of(end - r), b), self._stride)
+                samples = slice(
+                    begin, min(begin + self._samples_of(end - r), b), self._stride
+                )
                 yield block, (r, end), samples
 
     def _samples_of(self, rows: int) -> int:
@@ -200,7 +210,9 @@ class _Stream:
                 break
             # The first look has missed what the pass has seen: now it is known.
             first = [r.T @ G @ r for r, G in zip(R, total, strict=True)]
-        return [[_root(G) @ r for G, r in zip(grams, R, strict=True)] for grams in blocks]
+        return [
+            [_root(G) @ r for G, r in zip(grams, R, strict=True)] for grams in blocks
+        ]
 
     def _first_grams(self, parts: int = 8) -> Grams:
         """Return the Gram matrices of a few parts of the log."""
@@ -211,14 +223,20 @@ class _Stream:
             stop = min(samples.stop, samples.start + self._samples_of(b - a))
             pieces.append((block, (a, b), slice(samples.start, stop, samples.step)))
         total = [np.zeros((width, width)) for width in self._widths]
-        self._add([total] * (len(self._edges) - 1), pieces, [np.eye(w) for w in self._widths])
+        self._add(
+            [total] * (len(self._edges) - 1), pieces, [np.eye(w) for w in self._widths]
+        )
         return total
 
-    def _add(self, blocks: list[Grams], pieces: list[Piece], mixing: Grams, progress=None) -> None:
+    def _add(
+        self, blocks: list[Grams], pieces: list[Piece], mixing: Grams, progress=None
+    ) -> None:
         """Add the Gram matrices of some pieces, and of the ends, to those of their blocks."""
         # One core adds up a piece; the next ones are read meanwhile.
         found = on_cores(lambda x: self._call(x, mixing), map(self._fill, pieces))
-        for done, ((block, _, _), grams) in enumerate(zip(pieces, found, strict=True), 1):
+        for done, ((block, _, _), grams) in enumerate(
+            zip(pieces, found, strict=True), 1
+        ):
             for total, G in zip(blocks[block], grams, strict=True):
                 total += G
             if progress is not None:
@@ -234,7 +252,9 @@ class _Stream:
         # The first rows come late, and do not count.
         mask = np.pad(self._mask[slice(*piece[1])], ((shape.delay, 0), (0, 0)))
         length = shape.iterations * shape.samples
-        together = np.hstack([np.asarray(x) for x in self._base.model.arguments(motion)])
+        together = np.hstack(
+            [np.asarray(x) for x in self._base.model.arguments(motion)]
+        )
         arrays = [
             _filled_up(np.asarray(x, np.float64), length)
             for x in (together, without_tool(self._base, motion, forces))
@@ -244,16 +264,25 @@ class _Stream:
 
     def _call(self, arrays: list[np.ndarray], mixing: Grams) -> Grams:
         """Return the Gram matrices of a piece."""
-        with double_precision(), jax.default_device(jax.local_devices(backend="cpu")[0]):
+        with (
+            double_precision(),
+            jax.default_device(jax.local_devices(backend="cpu")[0]),
+        ):
             return [np.asarray(G) for G in self._loop(*arrays, mixing, self._matrices)]
 
 
 def _filled_up(x: np.ndarray, length: int) -> np.ndarray:
     missing = max(0, length - len(x))
-    return np.pad(x, ((0, missing), (0, 0))) if missing else np.ascontiguousarray(x[:length])
+    return (
+        np.pad(x, ((0, missing), (0, 0)))
+        if missing
+        else np.ascontiguousarray(x[:length])
+    )
 
 
-def _similar(total: np.ndarray, first: np.ndarray, mixing: np.ndarray, ratio: float = 1e4) -> bool:
+def _similar(
+    total: np.ndarray, first: np.ndarray, mixing: np.ndarray, ratio: float = 1e4
+) -> bool:
     """Return whether the first look has shown the size of every direction that it has shown."""
     values, directions = np.linalg.eigh(mixing.T @ first @ mixing)
     shown = directions[:, values > 0.5]
@@ -276,7 +305,9 @@ def _root(G: np.ndarray) -> np.ndarray:
 
 
 @functools.lru_cache(maxsize=16)
-def _compiled(program: Program, acting: tuple[tuple[int, ...], ...], shape: LoopShape) -> Callable:
+def _compiled(
+    program: Program, acting: tuple[tuple[int, ...], ...], shape: LoopShape
+) -> Callable:
     """Return the loop, which is compiled when it is first called."""
     joints = len(acting)
     size = len(program.outputs) // joints
@@ -287,7 +318,10 @@ def _compiled(program: Program, acting: tuple[tuple[int, ...], ...], shape: Loop
 
     # Joints share columns: every distinct one is filtered once.
     distinct = {entry(j, k): j * size + k for j, own in enumerate(acting) for k in own}
-    first, rows = list(distinct.values()), {key: row for row, key in enumerate(distinct)}
+    first, rows = (
+        list(distinct.values()),
+        {key: row for row, key in enumerate(distinct)},
+    )
     places = [
         np.array([*(rows[entry(j, k)] for k in own), len(first) + j])
         for j, own in enumerate(acting)
@@ -296,7 +330,10 @@ def _compiled(program: Program, acting: tuple[tuple[int, ...], ...], shape: Loop
 
     def evaluate(motion: Array, forces: Array) -> list[Array]:
         packed = base_columns(*jnp.split(motion, len(motion) // joints))
-        columns = [jnp.broadcast_to(jnp.asarray(packed[i], float), motion.shape[1:]) for i in first]
+        columns = [
+            jnp.broadcast_to(jnp.asarray(packed[i], float), motion.shape[1:])
+            for i in first
+        ]
         return columns + list(forces)
 
     def run(motion, forces, mask, count, mixing, matrices) -> list[Array]:

@@ -1,8 +1,9 @@
 """Data sets that several processes read: distribution of files, and joining of factors.
 
-Processes, on one host or many, read recordings of their own and exchange only factors: some tens of
-kilobytes for each block of time. Factors are joined in a fixed order, so that every process gets
-the same answer. The cores of one process need no function: `identify` uses all of them.
+Processes, on one host or many, read recordings of their own and exchange only factors:
+some tens of kilobytes for each block of time. Factors are joined in a fixed order, so
+that every process gets the same answer. The cores of one process need no function:
+`identify` uses all of them.
 """
 
 import itertools
@@ -30,8 +31,9 @@ _calls = itertools.count()
 def shards(folder: str | Path) -> tuple[Path, ...]:
     """Return the Parquet files of a folder that this process reads; all in a single process.
 
-    Large files are assigned first, each to the process with the fewest bytes so far: all processes
-    come to the same assignment without exchange. Open each file with `scan_log`.
+    Large files are assigned first, each to the process with the fewest bytes so far:
+    all processes come to the same assignment without exchange. Open each file with
+    `scan_log`.
 
     Args:
         folder: Folder of the data set, which all processes see.
@@ -41,7 +43,9 @@ def shards(folder: str | Path) -> tuple[Path, ...]:
     """
     files = list(Path(folder).glob("*.parquet"))
     if not files:
-        raise InputError(f"`{folder}` holds no file `*.parquet`: check the folder of the data set.")
+        raise InputError(
+            f"`{folder}` holds no file `*.parquet`: check the folder of the data set."
+        )
     sizes, own = [0] * jax.process_count(), []
     for path in sorted(files, key=lambda p: (-p.stat().st_size, p)):
         process = sizes.index(min(sizes))
@@ -59,19 +63,23 @@ def factorise_across_processes(
 ) -> RegressionProblem:
     """Return the regression problem of the recordings of all processes: their joined factors.
 
-    Call it in every process after `jax.distributed.initialize`. Every process gets the same blocks,
-    in the order of the processes: `identify` gives the same fit everywhere. Of more than 64 blocks,
-    those of a process are joined with their neighbours in time.
+    Call it in every process after `jax.distributed.initialize`. Every process gets the
+    same blocks, in the order of the processes: `identify` gives the same fit
+    everywhere. Of more than 64 blocks, those of a process are joined with their
+    neighbours in time.
 
     Args:
         base: The base parameters, the same in all processes.
-        recordings: Recordings of this process alone, or none. `shards` distributes files.
+        recordings: Recordings of this process alone, or none. `shards` distributes
+            files.
         patience: Time to wait for the other processes [s].
-        progress: Callback, called with the completed fraction (0 to 1) of a pass over long logs.
+        progress: Callback, called with the completed fraction (0 to 1) of a pass over
+            long logs.
 
     Raises:
         RuntimeError: If another process is lost, or JAX's 64-bit mode is off.
-        TimeoutError: If another process does not arrive in time: it died, or still reads.
+        TimeoutError: If another process does not arrive in time: it died, or still
+            reads.
         InputError: If the processes' base parameters differ.
     """
     require_float64("factors across processes")
@@ -91,7 +99,9 @@ def factorise_across_processes(
         head = np.array([zlib.crc32(content), len(packed)])
         heads = multihost_utils.process_allgather(head)
         if (heads[:, 0] != heads[0, 0]).any():
-            raise InputError("`base` differs between the processes: use one robot and version.")
+            raise InputError(
+                "`base` differs between the processes: use one robot and version."
+            )
         filled = np.pad(packed, (0, heads[:, 1].max() - len(packed)))
         gathered = np.asarray(multihost_utils.process_allgather(filled))
         parts = []
@@ -101,7 +111,8 @@ def factorise_across_processes(
         return RegressionProblem(base, blocks=Blocks(tuple(parts)))
     except jax.errors.JaxRuntimeError as error:
         raise RuntimeError(
-            f"process {jax.process_index()} lost another one: look for the first error in the "
+            f"process {jax.process_index()} lost another one: look for the first "
+            "error in the "
             f"others' logs. ({str(error).splitlines()[0]})"
         ) from error
 
@@ -112,14 +123,18 @@ def _wait(patience: float) -> None:
 
     client = distributed.global_state.client
     if client is None:
-        raise RuntimeError("call `jax.distributed.initialize` first: there is no coordinator.")
+        raise RuntimeError(
+            "call `jax.distributed.initialize` first: there is no coordinator."
+        )
     try:
         client.wait_at_barrier(f"jaxid_factors_{next(_calls)}", int(1000 * patience))
     except jax.errors.JaxRuntimeError as error:
         if "DEADLINE_EXCEEDED" not in str(error):
             raise
         raise TimeoutError(
-            f"process {jax.process_index()} of {jax.process_count()} waited for the others' "
-            f"factors, but not all came within {patience:g} s: look for the first error in the "
+            f"process {jax.process_index()} of {jax.process_count()} waited for the "
+            "others' "
+            f"factors, but not all came within {patience:g} s: look for the first "
+            "error in the "
             f"others' logs, or raise `patience`. ({str(error).splitlines()[0]})"
         ) from error

@@ -37,11 +37,11 @@ class ModelChoice(Summarised, eqx.Module):
 
     Attributes:
         candidates: The candidates, in the given order.
-        errors: Error of each candidate on each part of the data, fitted to all other parts,
-            relative to the forces.
+        errors: Error of each candidate on each part of the data, fitted to all other
+            parts, relative to the forces.
         best: Index of the candidate that is chosen.
-        promise: Error to expect on further data of this kind, relative to the forces: each part was
-            predicted by the candidate that the other parts choose.
+        promise: Error to expect on further data of this kind, relative to the forces:
+            each part was predicted by the candidate that the other parts choose.
         parts: What was left out in turn, in words.
     """
 
@@ -78,9 +78,12 @@ class ModelChoice(Summarised, eqx.Module):
 
     def __str__(self):
         return (
-            f"`{self.chosen.name}` is the simplest model whose error exceeds the smallest one by "
-            "at most one deviation of the difference. On further data of this kind expect errors "
-            f"of {percent(self.promise)} % of the forces: {self.parts} were left out in turn, and "
+            f"`{self.chosen.name}` is the simplest model whose error exceeds the "
+            "smallest one by "
+            "at most one deviation of the difference. On further data of this kind "
+            "expect errors "
+            f"of {percent(self.promise)} % of the forces: {self.parts} were left out "
+            "in turn, and "
             "the choice was repeated without each."
         )
 
@@ -93,14 +96,15 @@ def choose_model(
 ) -> ModelChoice:
     """Choose the simplest model that predicts unseen parts of the data about as well as any.
 
-    Parts of time are left out in turn, or whole logs if there are at least four. Each candidate is
-    fitted to the rest and predicts the part. Of all candidates whose mean squared error exceeds the
-    smallest one by at most one standard deviation of the difference, the one with the fewest
-    parameters is chosen (Breiman et al., 1984). Of equally many parameters one whose friction has
-    memory is preferred by the same rule: no other says which force a joint at rest keeps, even
-    where no part holds rest. The promise comes from a second loop around this choice, so that
-    choosing does not make it too small. Lengths of presliding are those of the candidates: find
-    them before, with `identify_presliding`.
+    Parts of time are left out in turn, or whole logs if there are at least four. Each
+    candidate is fitted to the rest and predicts the part. Of all candidates whose mean
+    squared error exceeds the smallest one by at most one standard deviation of the
+    difference, the one with the fewest parameters is chosen (Breiman et al., 1984). Of
+    equally many parameters one whose friction has memory is preferred by the same rule:
+    no other says which force a joint at rest keeps, even where no part holds rest. The
+    promise comes from a second loop around this choice, so that choosing does not make
+    it too small. Lengths of presliding are those of the candidates: find them before,
+    with `identify_presliding`.
 
     Args:
         candidates: Models of one robot, and their estimators.
@@ -112,11 +116,17 @@ def choose_model(
     """
     if not candidates:
         raise InputError("`candidates` must hold at least one model, but is empty.")
-    logs = (observations,) if isinstance(observations, Observations) else tuple(observations)
+    logs = (
+        (observations,)
+        if isinstance(observations, Observations)
+        else tuple(observations)
+    )
     first, by_log = candidates[0], len(logs) >= 4
     folds = _folds(first.base, logs, by_log)
     # All candidates are judged with the weights of the first.
-    weights = first.estimator(RegressionProblem(first.base, blocks=Blocks(tuple(folds)))).weights
+    weights = first.estimator(
+        RegressionProblem(first.base, blocks=Blocks(tuple(folds)))
+    ).weights
     weights = np.asarray(weights) ** 2
     total = float(np.mean([weights @ fold.force_squares for fold in folds]))
     tables = []
@@ -143,13 +153,17 @@ def choose_model(
     )
 
 
-def _folds(base: BaseParameters, logs: Sequence[Observations], by_log: bool) -> list[Factors]:
+def _folds(
+    base: BaseParameters, logs: Sequence[Observations], by_log: bool
+) -> list[Factors]:
     """Return the factors of the parts that are left out in turn."""
     if by_log:
         return [RegressionProblem(base, [log]).factors for log in logs]
     blocks = RegressionProblem(base, logs).blocks
     if len(blocks.parts) < 3:
-        raise InputError("a choice of models needs at least three blocks of rows: record longer.")
+        raise InputError(
+            "a choice of models needs at least three blocks of rows: record longer."
+        )
     return [blocks.select(part).total for _, part in cross_validation_folds(blocks)]
 
 
@@ -162,9 +176,15 @@ def _held_out_squares(
     """
     found = np.zeros((len(folds), len(folds)))
     for i, k in itertools.combinations_with_replacement(range(len(folds)), 2):
-        rest = Blocks(tuple(x for number, x in enumerate(folds) if number not in (i, k)))
-        p = candidate.estimator(RegressionProblem(candidate.base, blocks=rest)).parameters
-        found[i, k], found[k, i] = (weights @ folds[n].residual_squares(p) for n in (k, i))
+        rest = Blocks(
+            tuple(x for number, x in enumerate(folds) if number not in (i, k))
+        )
+        p = candidate.estimator(
+            RegressionProblem(candidate.base, blocks=rest)
+        ).parameters
+        found[i, k], found[k, i] = (
+            weights @ folds[n].residual_squares(p) for n in (k, i)
+        )
     return found
 
 

@@ -30,8 +30,10 @@ class HeldOutErrors(eqx.Module):
     Attributes:
         linear: Error of the linear model relative to the forces.
         nonlinear: The same for nonlinear friction, its shapes found without the block.
-        gain: Relative reduction of the squared error by nonlinear friction; negative if it grows.
-        gain_deviation: Standard deviation of the gain, from the scatter between the blocks.
+        gain: Relative reduction of the squared error by nonlinear friction; negative if
+            it grows.
+        gain_deviation: Standard deviation of the gain, from the scatter between the
+            blocks.
     """
 
     linear: float
@@ -85,8 +87,12 @@ class NonlinearFit(eqx.Module):
         """The nonlinear fit if it pays, otherwise the linear one, with notes that say why."""
         fit, notes = self.linear, (str(self.held_out),)
         if self.held_out.pays:
-            rows = zip(self.names, self.shapes, self.shape_deviations, self.units, strict=True)
-            shown = ", ".join(f"{name} = {x:.3g} ± {s:.2g} {unit}" for name, x, s, unit in rows)
+            rows = zip(
+                self.names, self.shapes, self.shape_deviations, self.units, strict=True
+            )
+            shown = ", ".join(
+                f"{name} = {x:.3g} ± {s:.2g} {unit}" for name, x, s, unit in rows
+            )
             fit, notes = self.fit, (*notes, f"shapes of friction: {shown}.")
         return dataclasses.replace(fit, notes=(*fit.notes, *notes))
 
@@ -104,10 +110,14 @@ def identify_nonlinear(
     Both models are fitted again without each of five blocks of time, and tested on it.
 
     Args:
-        base: Base parameters of a model with shapes, such as those of `StribeckFriction`.
-        observations: Observations of one recording, or of several that are fitted together.
-        estimator: Estimator; by default weighted least squares and the shapes that terms propose.
-        linear: Base parameters of the linear model; by default the same model with its own shapes.
+        base: Base parameters of a model with shapes, such as those of
+            `StribeckFriction`.
+        observations: Observations of one recording, or of several that are fitted
+            together.
+        estimator: Estimator; by default weighted least squares and the shapes that
+            terms propose.
+        linear: Base parameters of the linear model; by default the same model with its
+            own shapes.
         progress: Callback, called with the completed fraction (0 to 1).
 
     Raises:
@@ -157,7 +167,9 @@ def _held_out_errors(blocks, search: ShapeSearch, weights, progress) -> HeldOutE
         _, left = eqx.filter_jit(search.fit)(x, search.row_weights(weights, kept))
         nonlinear = np.sum((search.row_weights(weights, 1.0 - kept) * left) ** 2)
         test = blocks.select(out).total
-        linear, forces = (squares @ y for y in (test.residual_squares(p), test.force_squares))
+        linear, forces = (
+            squares @ y for y in (test.residual_squares(p), test.force_squares)
+        )
         errors.append([linear, nonlinear, forces])
         if progress is not None:
             progress(len(errors) / len(folds))
@@ -229,29 +241,42 @@ def temperature_law(
         reference: Temperature to which the values belong [°C].
 
     Raises:
-        InputError: If there are fewer than two temperatures, or a fit has no such parameters.
+        InputError: If there are fewer than two temperatures, or a fit has no such
+            parameters.
     """
     warmer = np.asarray(temperatures, np.float64) - reference
     if warmer.shape != (len(fits),) or len(np.unique(warmer)) < 2:
-        raise InputError("`temperatures` must be one for each fit, at least two different.")
+        raise InputError(
+            "`temperatures` must be one for each fit, at least two different."
+        )
     robot = fits[0].base.model.robot
     names = tuple(name for name, _ in term.parameters(robot))
-    if len(names) != robot.joints or any(set(names) - set(fit.base.names) for fit in fits):
-        raise InputError(f"`term` must have one parameter for each joint, in all fits: {names}.")
+    if len(names) != robot.joints or any(
+        set(names) - set(fit.base.names) for fit in fits
+    ):
+        raise InputError(
+            f"`term` must have one parameter for each joint, in all fits: {names}."
+        )
     places = [[fit.base.names.index(name) for name in names] for fit in fits]
     f = np.array([fit.parameters[k] for fit, k in zip(fits, places, strict=True)])
-    s = np.array([fit.standard_deviations[k] for fit, k in zip(fits, places, strict=True)])
+    s = np.array(
+        [fit.standard_deviations[k] for fit, k in zip(fits, places, strict=True)]
+    )
     lines = np.full((len(names), 4), np.nan)
     for j in np.flatnonzero((f > 0).all(axis=0)):
         # Exact estimates of simulated logs get a tiny deviation.
         weights = 1.0 / np.maximum(s[:, j] / f[:, j], 1e-12)
-        line, covariance = np.polyfit(warmer, np.log(f[:, j]), 1, w=weights, cov="unscaled")
+        line, covariance = np.polyfit(
+            warmer, np.log(f[:, j]), 1, w=weights, cov="unscaled"
+        )
         lines[j] = *line, *np.sqrt(np.diag(covariance))
     slope, level, slope_deviation, level_deviation = lines.T
     values, rates = np.exp(level), -slope
     known = np.where(np.isfinite(rates), rates, 0.0)
     scaled = TemperatureScaled(term, known, reference, reference)
-    return TemperatureLaw(names, values, values * level_deviation, rates, slope_deviation, scaled)
+    return TemperatureLaw(
+        names, values, values * level_deviation, rates, slope_deviation, scaled
+    )
 
 
 LENGTHS = 3.0 ** np.arange(-9, 0)
@@ -263,12 +288,14 @@ def identify_presliding(
 ) -> BaseParameters:
     """Find the length of presliding friction of each joint.
 
-    The rows of a joint depend on its own length only, and are fitted alone. So one pass over the
-    data tries a length of every joint. The best of `LENGTHS` is improved in steps that get smaller.
+    The rows of a joint depend on its own length only, and are fitted alone. So one pass
+    over the data tries a length of every joint. The best of `LENGTHS` is improved in
+    steps that get smaller.
 
     Args:
         base: Base parameters of a model whose friction has the transition `Presliding`.
-        observations: Observations of one recording, or of several that are fitted together.
+        observations: Observations of one recording, or of several that are fitted
+            together.
 
     Returns:
         The same base parameters, with these lengths in `model.memory`.
@@ -277,11 +304,15 @@ def identify_presliding(
         InputError: If the model has no such friction.
     """
     if base.model.memory is None:
-        raise InputError("the `model` has no friction with the transition `Presliding`.")
+        raise InputError(
+            "the `model` has no friction with the transition `Presliding`."
+        )
     problem, joints = RegressionProblem(base, observations), base.model.robot.joints
     tried, found = [], []
 
-    def best_after(lengths: Float[np.ndarray, "lengths joints"]) -> Float[np.ndarray, " joints"]:
+    def best_after(
+        lengths: Float[np.ndarray, "lengths joints"],
+    ) -> Float[np.ndarray, " joints"]:
         """Try lengths; return the best one of all that were tried for each joint."""
         for one in lengths:
             tried.append(one)

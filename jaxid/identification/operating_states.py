@@ -55,12 +55,16 @@ class StatesFit(Summarised, eqx.Module):
     @property
     def units(self) -> tuple[str, ...]:
         """Units of all estimates."""
-        return tuple(self.base.units[k] for k in (*self.shared, *self.varying * len(self.states)))
+        return tuple(
+            self.base.units[k] for k in (*self.shared, *self.varying * len(self.states))
+        )
 
     def summary(self) -> Table:
         """Return a table of all estimates with their 95 % intervals."""
         title = "parameters that all states share, then those of each state"
-        return interval_table(title, self.names, self.units, self.parameters, self.uncertainty)
+        return interval_table(
+            title, self.names, self.units, self.parameters, self.uncertainty
+        )
 
     def fit(self, state: str) -> Fit:
         """Return the fit of one state: to validate, predict and report.
@@ -89,56 +93,74 @@ class StatesFit(Summarised, eqx.Module):
         """
         a, b = (self._indices(state)[list(self.varying)] for state in (first, second))
         cross = self.uncertainty.covariance[np.ix_(a, b)]
-        return compare_some(self.fit(first), self.fit(second), self.varying, cross, level)
+        return compare_some(
+            self.fit(first), self.fit(second), self.varying, cross, level
+        )
 
     @property
     def sharing(self) -> tuple[float, float]:
         """Statistic and p-value of a joint test whether the states agree on shared parameters.
 
-        The states' own estimates are compared with those of the first state. A small p-value says
-        that some of them have changed after all.
+        The states' own estimates are compared with those of the first state. A small
+        p-value says that some of them have changed after all.
         """
-        k = [k for k in self.shared if all(np.isfinite(f.covariance[k, k]) for f in self.fits)]
+        k = [
+            k
+            for k in self.shared
+            if all(np.isfinite(f.covariance[k, k]) for f in self.fits)
+        ]
         p = [fit.parameters[k] for fit in self.fits]
         first, *others = [fit.covariance[np.ix_(k, k)] for fit in self.fits]
-        covariance = linalg.block_diag(*others) + np.tile(first, (len(others), len(others)))
+        covariance = linalg.block_diag(*others) + np.tile(
+            first, (len(others), len(others))
+        )
         dof = min(float(np.min(fit.uncertainty.dof[k])) for fit in self.fits)
         return joint_test(np.concatenate([x - p[0] for x in p[1:]]), covariance, dof)
 
     def _indices(self, state: str) -> Int[np.ndarray, " base"]:
         if state not in self.states:
-            raise InputError(f"`state` must be one of {', '.join(self.states)}, but is `{state}`.")
+            raise InputError(
+                f"`state` must be one of {', '.join(self.states)}, but is `{state}`."
+            )
         return state_indices(self.base.size, self.varying, self.states.index(state))
 
 
-def identify_states(fits: Sequence[Fit], varying: Sequence[str] | None = None) -> StatesFit:
+def identify_states(
+    fits: Sequence[Fit], varying: Sequence[str] | None = None
+) -> StatesFit:
     """Identify a robot in several states at once: inertia is shared, friction is each state's.
 
-    The factors of the fits are combined, without another pass over the data. Shared parameters
-    become more precise than in any single fit, and so do those that vary, since what is mistaken
-    for friction in one state is determined by the others.
+    The factors of the fits are combined, without another pass over the data. Shared
+    parameters become more precise than in any single fit, and so do those that vary,
+    since what is mistaken for friction in one state is determined by the others.
 
     Args:
         fits: Fit of each state, with different names.
-        varying: Names of the base parameters that each state has for itself. If None, those that
-            store no energy: friction and offsets.
+        varying: Names of the base parameters that each state has for itself. If None,
+            those that store no energy: friction and offsets.
 
     Raises:
-        InputError: If there are fewer than two fits, two have the same name, base parameters
-            differ, or there is no such base parameter.
+        InputError: If there are fewer than two fits, two have the same name, base
+            parameters differ, or there is no such base parameter.
     """
     states = [fit.name for fit in fits]
     if len(states) < 2 or len(set(states)) < len(states):
-        raise InputError(f"`fits` must be two or more with different names: {', '.join(states)}.")
+        raise InputError(
+            f"`fits` must be two or more with different names: {', '.join(states)}."
+        )
     require_same_base(fits)
     fits = tuple(map(as_least_squares, fits))
     base = fits[0].base
     own = varying_parameters(base, varying)
     same = tuple(k for k in range(base.size) if k not in own)
-    return StatesFit(fits, same, own, *combine(fits, state_maps(base.size, own, len(fits))))
+    return StatesFit(
+        fits, same, own, *combine(fits, state_maps(base.size, own, len(fits)))
+    )
 
 
-def state_indices(size: int, varying: Sequence[int], state: int) -> Int[np.ndarray, " base"]:
+def state_indices(
+    size: int, varying: Sequence[int], state: int
+) -> Int[np.ndarray, " base"]:
     """Return the places of a state's parameters among all: shared ones, then those of each."""
     own = np.isin(np.arange(size), varying)
     indices = np.cumsum(~own) - 1
@@ -152,21 +174,25 @@ def state_maps(size: int, varying: Sequence[int], states: int) -> list[np.ndarra
     return [unit[state_indices(size, varying, state)] for state in range(states)]
 
 
-def varying_parameters(base: BaseParameters, varying: Sequence[str] | None) -> tuple[int, ...]:
+def varying_parameters(
+    base: BaseParameters, varying: Sequence[str] | None
+) -> tuple[int, ...]:
     """Return which base parameters each state has for itself; by default those without energy."""
     if varying is None:
         return tuple(np.flatnonzero(~stores_energy(base)).tolist())
     for name in varying:
         if name not in base.names:
-            raise InputError(f"`{name}` is none of `base.names` of `{base.model.robot.name}`.")
+            raise InputError(
+                f"`{name}` is none of `base.names` of `{base.model.robot.name}`."
+            )
     return tuple(k for k, x in enumerate(base.names) if x in varying)
 
 
 def stores_energy(base: BaseParameters) -> Bool[np.ndarray, " base"]:
     """Return which base parameters make kinetic or potential energy; friction and offsets do not.
 
-    Forces of the others neither depend on accelerations nor come from a potential, whatever the
-    terms of the model are called.
+    Forces of the others neither depend on accelerations nor come from a potential,
+    whatever the terms of the model are called.
     """
     model = base.model
     q, qdd = np.random.default_rng(0).uniform(-1.0, 1.0, (2, 3, model.robot.joints))

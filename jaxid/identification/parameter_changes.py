@@ -11,7 +11,14 @@ from scipy import special
 from jaxid.arrays import AnyArray, Bool, Float
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
-from jaxid.result_table import Column, Status, Summarised, Table, significant, with_deviations
+from jaxid.result_table import (
+    Column,
+    Status,
+    Summarised,
+    Table,
+    significant,
+    with_deviations,
+)
 
 from .combination import require_same_base, without_bounds
 from .fit_result import Fit
@@ -34,13 +41,13 @@ class Comparison(Summarised, eqx.Module):
     r"""Differences of the base parameters of two fits, and which are more than chance (Sec. 6).
 
     A parameter has changed if its difference is larger than its own uncertainty allows:
-    $|b_1 - b_2| > t \sqrt{s_1^2 + s_2^2}$. That one lies outside the other's interval says less:
-    two estimates of the same thing do so in one of six cases.
+    $|b_1 - b_2| > t \sqrt{s_1^2 + s_2^2}$. That one lies outside the other's interval
+    says less: two estimates of the same thing do so in one of six cases.
 
-    Many parameters are tested, and each test errs now and then. `CHANGED` are those that stay
-    significant with Holm's correction: if nothing has changed, the chance that *any* parameter is
-    called so is at most `1 - level`. `PERHAPS` are those whose own interval excludes zero, as one
-    in twenty does without any change.
+    Many parameters are tested, and each test errs now and then. `CHANGED` are those
+    that stay significant with Holm's correction: if nothing has changed, the chance
+    that *any* parameter is called so is at most `1 - level`. `PERHAPS` are those whose
+    own interval excludes zero, as one in twenty does without any change.
 
     Attributes:
         first: Fit of one state.
@@ -118,17 +125,27 @@ class Comparison(Summarised, eqx.Module):
     def groups(self) -> list[dict[str, Any]]:
         """A joint test for each kind of parameter, with Holm's correction for their number.
 
-        Each has `name`, the number of determined `parameters`, the `statistic` (about that number
-        where nothing has changed), its `p_value`, and whether the group has `changed`.
+        Each has `name`, the number of determined `parameters`, the `statistic` (about
+        that number where nothing has changed), its `p_value`, and whether the group has
+        `changed`.
         """
-        kinds, determined, known = np.array(self.kinds), self.determined, self.uncertainty
+        kinds, determined, known = (
+            np.array(self.kinds),
+            self.determined,
+            self.uncertainty,
+        )
         groups = []
         for name in dict.fromkeys(kinds.tolist()):
             k = np.flatnonzero(determined & (kinds == name))
             dof = float(np.min(known.dof[k], initial=np.inf))
             covariance = known.covariance[np.ix_(k, k)]
             statistic, p = joint_test(self.difference[k], covariance, dof)
-            found = {"name": name, "parameters": len(k), "statistic": statistic, "p_value": p}
+            found = {
+                "name": name,
+                "parameters": len(k),
+                "statistic": statistic,
+                "p_value": p,
+            }
             groups.append(found)
         adjusted = _holm(np.array([group["p_value"] for group in groups]))
         for group, p in zip(groups, adjusted.tolist(), strict=True):
@@ -141,7 +158,10 @@ class Comparison(Summarised, eqx.Module):
         a, b = (f.parameters[list(self.indices)] for f in (self.first, self.second))
         change, width = with_deviations(self.difference, half)
         signed = [x if x.startswith("-") else f"+{x}" for x in change]
-        tested, chance = len(verdicts) - verdicts.count(Verdict.UNKNOWN), 1.0 - self.level
+        tested, chance = (
+            len(verdicts) - verdicts.count(Verdict.UNKNOWN),
+            1.0 - self.level,
+        )
         return Table(
             f"{self.first.name} and {self.second.name}: {len(kinds)} base parameters",
             Column("#", list(range(1, len(half) + 1))),
@@ -152,14 +172,21 @@ class Comparison(Summarised, eqx.Module):
             Column("difference", signed, kind="number"),
             Column(f"± ({100 * self.level:g} %)", width, kind="number"),
             Column("verdict", [verdict.value for verdict in verdicts]),
-            status=[Status.DOUBTFUL if v is Verdict.CHANGED else Status.NEUTRAL for v in verdicts],
+            status=[
+                Status.DOUBTFUL if v is Verdict.CHANGED else Status.NEUTRAL
+                for v in verdicts
+            ],
             rules=[k for k in range(1, len(kinds)) if kinds[k] != kinds[k - 1]],
             remarks=[
-                f"{verdicts.count(Verdict.CHANGED)} of {tested} parameters have changed: if none "
-                f"had, the chance to call any of them so would be {100 * chance:.3g} % at most "
+                f"{verdicts.count(Verdict.CHANGED)} of {tested} parameters have "
+                "changed: if none "
+                f"had, the chance to call any of them so would be {100 * chance:.3g} "
+                "% at most "
                 "(Holm)",
-                f"{verdicts.count(Verdict.PERHAPS)} more have perhaps changed: zero lies outside "
-                f"the {100 * self.level:g} % interval of their difference; of {tested} parameters "
+                f"{verdicts.count(Verdict.PERHAPS)} more have perhaps changed: zero "
+                "lies outside "
+                f"the {100 * self.level:g} % interval of their difference; of "
+                f"{tested} parameters "
                 f"that never change, about {chance * tested:.2g} look so",
             ],
         )
@@ -169,7 +196,9 @@ class Comparison(Summarised, eqx.Module):
         groups = self.groups
         p_values = [group["p_value"] for group in groups]
         chances = ["< 1e-6" if p < 1e-6 else significant(p, 2) for p in p_values]
-        verdicts = [Verdict.CHANGED if g["changed"] else Verdict.UNCHANGED for g in groups]
+        verdicts = [
+            Verdict.CHANGED if g["changed"] else Verdict.UNCHANGED for g in groups
+        ]
         return Table(
             "all parameters of a kind at once",
             Column("kind", [group["name"] for group in groups]),
@@ -177,7 +206,9 @@ class Comparison(Summarised, eqx.Module):
             Column("statistic", [group["statistic"] for group in groups]),
             Column("chance\nwithout a change", chances, kind="number"),
             Column("verdict", [verdict.value for verdict in verdicts]),
-            status=[Status.DOUBTFUL if g["changed"] else Status.NEUTRAL for g in groups],
+            status=[
+                Status.DOUBTFUL if g["changed"] else Status.NEUTRAL for g in groups
+            ],
         )
 
     def tables(self) -> list[Table]:
@@ -196,7 +227,8 @@ def compare(first: Fit, second: Fit, level: float = LEVEL) -> Comparison:
         level: Confidence of intervals and tests, a fraction from 0 to 1.
 
     Raises:
-        InputError: If the fits are not of the same base parameters, or `level` is no fraction.
+        InputError: If the fits are not of the same base parameters, or `level` is no
+            fraction.
     """
     require_same_base((first, second))
     first, second = without_bounds(first), without_bounds(second)
@@ -207,7 +239,9 @@ def compare(first: Fit, second: Fit, level: float = LEVEL) -> Comparison:
 def compare_some(first: Fit, second: Fit, indices, cross, level: float) -> Comparison:
     """Compare some base parameters of two fits, whose estimates have a cross-covariance."""
     if not 0 < level < 1:
-        raise InputError(f"`level` must lie between 0 and 1, like 0.95, but is {level:g}.")
+        raise InputError(
+            f"`level` must lie between 0 and 1, like 0.95, but is {level:g}."
+        )
     k = list(indices)
     A, B = (fit.covariance[np.ix_(k, k)] for fit in (first, second))
     m, n = (fit.uncertainty.dof[k] for fit in (first, second))
@@ -238,8 +272,8 @@ def _holm(p: Float[np.ndarray, " tests"]) -> Float[np.ndarray, " tests"]:
 def joint_test(difference, covariance, dof: float) -> tuple[float, float]:
     r"""Test by $d^T C^{-1} d$ if differences are more than chance: statistic and p-value.
 
-    It is chi-squared where the covariance is exact, else Hotelling's $T^2$. All variances must be
-    finite and above zero; without differences nothing has changed.
+    It is chi-squared where the covariance is exact, else Hotelling's $T^2$. All
+    variances must be finite and above zero; without differences nothing has changed.
     """
     if not len(difference):
         return 0.0, 1.0
@@ -249,7 +283,10 @@ def joint_test(difference, covariance, dof: float) -> tuple[float, float]:
     # Smaller eigenvalues are rounding.
     kept = values > 1e-12 * values[-1]
     along = directions.T @ (difference / deviations)
-    statistic, size = float(np.sum(along[kept] ** 2 / values[kept])), int(np.count_nonzero(kept))
+    statistic, size = (
+        float(np.sum(along[kept] ** 2 / values[kept])),
+        int(np.count_nonzero(kept)),
+    )
     if not np.isfinite(dof):
         return statistic, float(special.chdtrc(size, statistic))
     rest = dof - size + 1.0

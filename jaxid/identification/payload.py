@@ -1,7 +1,8 @@
 """Loads between two runs: a payload that is not known, and gains of the drives from one that is.
 
-Currents times nominal torque constants are forces up to one factor for each joint. Masses scale
-with these factors alike, so that no single run tells them; a known load does.
+Currents times nominal torque constants are forces up to one factor for each joint.
+Masses scale with these factors alike, so that no single run tells them; a known load
+does.
 """
 
 from collections.abc import Sequence
@@ -38,12 +39,13 @@ class Payload(Summarised, eqx.Module):
 
     Attributes:
         body: Index of the body that carries it (0 is the first).
-        parameters: $(m, m r_c, A, B, C, D, E, F)$ about the origin of the body's frame: the
-            estimate, or the body nearest to it, in units of its uncertainty, that can exist.
+        parameters: $(m, m r_c, A, B, C, D, E, F)$ about the origin of the body's frame:
+            the estimate, or the body nearest to it, in units of its uncertainty, that
+            can exist.
         estimate: Estimate from the forces, whether such a body can exist or not.
         uncertainty: Uncertainty of the estimate.
-        distance: From the estimate to the parameters, in standard deviations: below 4 nothing
-            unusual; NaN where the runs do not determine all ten.
+        distance: From the estimate to the parameters, in standard deviations: below 4
+            nothing unusual; NaN where the runs do not determine all ten.
     """
 
     body: int = eqx.field(static=True)
@@ -82,7 +84,9 @@ class Payload(Summarised, eqx.Module):
         """Mass, centre of mass, and moments about it, with their uncertainty (`CENTRAL_NAMES`)."""
         with double_precision():
             p = jnp.asarray(self.parameters)
-            values, J = (np.asarray(f(p)) for f in (_about_centre, jax.jacfwd(_about_centre)))
+            values, J = (
+                np.asarray(f(p)) for f in (_about_centre, jax.jacfwd(_about_centre))
+            )
         C = self.uncertainty.covariance
         covariance = J @ np.where(np.isfinite(C), C, 0.0) @ J.T
         lost = np.any(J[:, ~np.isfinite(np.diag(C))] != 0.0, axis=1)
@@ -95,18 +99,22 @@ class Payload(Summarised, eqx.Module):
         if not np.isfinite(self.distance):
             status = Status.BAD
             text = (
-                "the logs do not determine all ten parameters of the payload: move the joints that "
+                "the logs do not determine all ten parameters of the payload: move "
+                "the joints that "
                 "carry it in more poses, faster, and alike in both runs."
             )
         elif self.distance > 0:
             status = Status.NEUTRAL if self.distance < 4.0 else Status.DOUBTFUL
             text = (
-                "the estimate itself belongs to no body: these are the parameters of the nearest "
+                "the estimate itself belongs to no body: these are the parameters of "
+                "the nearest "
                 f"one that could exist, {self.distance:.2g} standard deviations away."
             )
         remarks = [Remark(text, status)]
         title = "payload in the frame of its body; moments about the centre of mass"
-        return interval_table(title, CENTRAL_NAMES, CENTRAL_UNITS, *self.central, remarks)
+        return interval_table(
+            title, CENTRAL_NAMES, CENTRAL_UNITS, *self.central, remarks
+        )
 
 
 def identify_payload(
@@ -120,24 +128,27 @@ def identify_payload(
 ) -> Payload:
     """Identify a payload from a run without it and a run with it.
 
-    Both are fitted together. What the payload adds to the base parameters depends on its ten
-    parameters alone, and these are determined all ten although the last body's own are not: the
-    robot without the payload is known from the other run. Uncertainties of both runs count.
+    Both are fitted together. What the payload adds to the base parameters depends on
+    its ten parameters alone, and these are determined all ten although the last body's
+    own are not: the robot without the payload is known from the other run.
+    Uncertainties of both runs count.
 
     Args:
         unloaded: Fit of the run without the payload.
         loaded: Fit of the run with it.
         body: Index of the body that carries it; that of the end-effector if None.
-        mass: Mass of the payload [kg] if a scale has told it (to 0.1 %): the rest is then known
-            better.
-        varying: Names of base parameters that may differ between the runs beside the payload. If
-            None, friction and offsets: they change with load and temperature.
-        bounds: Bounds of the payload, such as `BodyBounds(mass_max=..., radius=...)`. If None,
-            wide ones from the robot's reach, which count only if the estimate could not exist.
+        mass: Mass of the payload [kg] if a scale has told it (to 0.1 %): the rest is
+            then known better.
+        varying: Names of base parameters that may differ between the runs beside the
+            payload. If None, friction and offsets: they change with load and
+            temperature.
+        bounds: Bounds of the payload, such as `BodyBounds(mass_max=..., radius=...)`.
+            If None, wide ones from the robot's reach, which count only if the estimate
+            could not exist.
 
     Raises:
-        InputError: If the runs have different base parameters or have seen the same data, or the
-            model does not have ten parameters for the body.
+        InputError: If the runs have different base parameters or have seen the same
+            data, or the model does not have ten parameters for the body.
         RuntimeError: If no body within the bounds was proved to be the nearest.
     """
     require_same_base((unloaded, loaded))
@@ -161,11 +172,16 @@ def identify_payload(
     if bounds is None:
         wide = BodyBounds.from_geometry(base.model.robot)
         bounds = BodyBounds(mass_max=np.max(wide.mass_max), radius=np.max(wide.radius))
-    # Estimates that are known too well, as those of noiseless data, leave no digits for a proof:
-    # a relative error of one percent of half the squared distance is good enough.
-    p, distance, error_bound = consistent_body(estimate, covariance, bounds, throw=False)
+    # Estimates that are known too well, as those of noiseless data, leave no digits for
+    # a proof: a relative error of one percent of half the squared distance is good
+    # enough.
+    p, distance, error_bound = consistent_body(
+        estimate, covariance, bounds, throw=False
+    )
     if not error_bound <= 0.01 * (1.0 + distance**2):
-        raise RuntimeError("no body was proved to be the nearest: are both runs of one robot?")
+        raise RuntimeError(
+            "no body was proved to be the nearest: are both runs of one robot?"
+        )
     return Payload(body, p, estimate, uncertainty, distance)
 
 
@@ -177,7 +193,9 @@ def body_columns(base: BaseParameters, body: int) -> Float[np.ndarray, "base 10"
     ten = [f"{name}{body + 1}" for name in INERTIAL_NAMES]
     for name in ten:
         if name not in names:
-            raise InputError(f"the model lacks `{name}` of body {body}: use `RigidBodies()`.")
+            raise InputError(
+                f"the model lacks `{name}` of body {body}: use `RigidBodies()`."
+            )
     unit = np.eye(base.model.size)[[names.index(name) for name in ten]]
     return np.asarray(base.from_standard(unit)).T
 
@@ -210,40 +228,55 @@ class DriveGains(Summarised, eqx.Module):
 
     def summary(self) -> Table:
         """Return a table of the gains with their 95 % intervals."""
-        units, title = ("1",) * len(self.joint_names), "true forces over those of the logs"
-        return interval_table(title, self.joint_names, units, self.gains, self.uncertainty)
+        units, title = (
+            ("1",) * len(self.joint_names),
+            "true forces over those of the logs",
+        )
+        return interval_table(
+            title, self.joint_names, units, self.gains, self.uncertainty
+        )
 
 
 def identify_drive_gains(
-    unloaded: Fit, loaded: Fit, load: Tool | float, *, varying: Sequence[str] | None = None
+    unloaded: Fit,
+    loaded: Fit,
+    load: Tool | float,
+    *,
+    varying: Sequence[str] | None = None,
 ) -> DriveGains:
     r"""Identify drive gains from a run without and a run with a known load.
 
-    The measured forces of joint $j$ are $c_j \Theta_j p$ with the reciprocal gain $c_j$. Noise is
-    in the measured forces, so least squares of *their* residuals are unbiased, and gains do not
-    shrink as they would if forces stood among the columns. Parameters that several joints feel tie
-    the gains to each other: joints that feel the load help those that hardly do.
+    The measured forces of joint $j$ are $c_j \Theta_j p$ with the reciprocal gain
+    $c_j$. Noise is in the measured forces, so least squares of *their* residuals are
+    unbiased, and gains do not shrink as they would if forces stood among the columns.
+    Parameters that several joints feel tie the gains to each other: joints that feel
+    the load help those that hardly do.
 
     Args:
         unloaded: Fit of the run without the load; forces by nominal gains.
         loaded: Fit of the run with it, and with the same nominal gains.
-        load: Load that was mounted between the runs. If only its mass [kg] on the end-effector is
-            given, its centre and inertia are identified too.
-        varying: Names of base parameters that may differ between the runs beside the load. If None,
-            friction and offsets.
+        load: Load that was mounted between the runs. If only its mass [kg] on the
+            end-effector is given, its centre and inertia are identified too.
+        varying: Names of base parameters that may differ between the runs beside the
+            load. If None, friction and offsets.
 
     Raises:
-        InputError: If the runs have different base parameters, motors turn more than one axis, the
-            robot has a known tool, or the load tells nothing about some gain.
+        InputError: If the runs have different base parameters, motors turn more than
+            one axis, the robot has a known tool, or the load tells nothing about some
+            gain.
     """
     require_same_base((unloaded, loaded))
     base = unloaded.base
     robot = base.model.robot
     A = np.asarray(robot.drives.reduction)
     if np.count_nonzero(A - np.diag(np.diag(A))):
-        raise InputError(f"motors of `{robot.name}` turn more than one axis: they have no gains.")
+        raise InputError(
+            f"motors of `{robot.name}` turn more than one axis: they have no gains."
+        )
     if robot.tool is not None:
-        raise InputError(f"`{robot.name}` has a known tool: leave it out (`tool=None`).")
+        raise InputError(
+            f"`{robot.name}` has a known tool: leave it out (`tool=None`)."
+        )
     fits = (as_least_squares(unloaded), as_least_squares(loaded))
     maps = state_maps(base.size, varying_parameters(base, varying), 2)
     if isinstance(load, Tool):
@@ -251,17 +284,28 @@ def identify_drive_gains(
     else:
         columns = body_columns(base, robot.tip_body)
         added, rest = load * columns[:, 0], columns[:, 1:]
-        maps = [np.hstack([E, known * rest]) for E, known in zip(maps, (0.0, 1.0), strict=True)]
+        maps = [
+            np.hstack([E, known * rest])
+            for E, known in zip(maps, (0.0, 1.0), strict=True)
+        ]
     offsets = (np.zeros(base.size), added)
     runs = list(zip(fits, maps, offsets, strict=True))
     size = maps[0].shape[1]
 
     def linearise(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        parts = [_linearise(f.time_blocks.total, f.weights, E, k, u) for f, E, k in runs]
+        parts = [
+            _linearise(f.time_blocks.total, f.weights, E, k, u) for f, E, k in runs
+        ]
         return np.concatenate([r for r, _ in parts]), np.vstack([J for _, J in parts])
 
     start = np.append(combine(fits, maps, offsets)[0], np.ones(robot.joints))
-    settings = {"method": "lm", "x_scale": "jac", "xtol": 1e-14, "ftol": 1e-14, "gtol": 1e-14}
+    settings = {
+        "method": "lm",
+        "x_scale": "jac",
+        "xtol": 1e-14,
+        "ftol": 1e-14,
+        "gtol": 1e-14,
+    }
     functions: list[Any] = [lambda u, k=k: linearise(u)[k] for k in range(2)]
     solution = optimize.least_squares(functions[0], start, functions[1], **settings)
     c = solution.x[size:]
@@ -270,7 +314,9 @@ def identify_drive_gains(
     B = decomposition.inverse_information()
     plausible = np.all((c > 1 / LARGEST) & (c < LARGEST))
     if decomposition.values[-1] <= NUMERICAL * decomposition.values[0] or not plausible:
-        raise InputError("the load does not tell all gains: take a heavier one, move every joint.")
+        raise InputError(
+            "the load does not tell all gains: take a heavier one, move every joint."
+        )
     blocks = []
     for fit, E, k in runs:
         for part in fit.time_blocks.parts:
@@ -279,10 +325,14 @@ def identify_drive_gains(
     covariance, dof = block_covariance(blocks, B)
     covariance = covariance[size:, size:] / c**2 / c[:, None] ** 2
     uncertainty = Uncertainty(covariance, np.full(robot.joints, dof), covariance)
-    return DriveGains(1.0 / c, uncertainty, maps[0] @ solution.x[:size], robot.joint_names)
+    return DriveGains(
+        1.0 / c, uncertainty, maps[0] @ solution.x[:size], robot.joint_names
+    )
 
 
-def _linearise(factors: Factors, weights, E, offset, unknowns) -> tuple[np.ndarray, np.ndarray]:
+def _linearise(
+    factors: Factors, weights, E, offset, unknowns
+) -> tuple[np.ndarray, np.ndarray]:
     """Return weighted predicted less measured forces, in nominal units, and their derivatives.
 
     The unknowns are those of the base parameters, then the reciprocal gains.
@@ -290,7 +340,9 @@ def _linearise(factors: Factors, weights, E, offset, unknowns) -> tuple[np.ndarr
     size = E.shape[1]
     p, c = E @ unknowns[:size] + offset, unknowns[size:]
     residuals, derivatives = [], []
-    for j, (joint, w) in enumerate(zip(factors.joints, np.asarray(weights), strict=True)):
+    for j, (joint, w) in enumerate(
+        zip(factors.joints, np.asarray(weights), strict=True)
+    ):
         own, R = list(joint.columns), w * joint.R
         forces = R[:, :-1] @ p[own]
         J = np.zeros((len(R), len(unknowns)))

@@ -21,15 +21,19 @@ Span = tuple[int, int, int]
 class RegressionProblem:
     r"""Linear equations $\Theta p = Q$ of some recordings, and the factors of their rows (Eq. 26).
 
-    Most estimators need only `blocks` or `factors`: one triangle for each joint. Estimators that
-    need the rows themselves, or residuals, iterate over `chunks`, in memory or from files alike.
-    Columns are kept between passes as long as they are few (`cached_numbers`).
+    Most estimators need only `blocks` or `factors`: one triangle for each joint.
+    Estimators that need the rows themselves, or residuals, iterate over `chunks`, in
+    memory or from files alike. Columns are kept between passes as long as they are few
+    (`cached_numbers`).
 
     Args:
         base: Base parameters, which are the unknowns.
-        recordings: Observations of one recording or several; none where only factors are known.
-        progress: Callback, called with the completed fraction (0 to 1) of a pass over long logs.
-        divisions: Number of blocks of time into which the rows of each recording are divided.
+        recordings: Observations of one recording or several; none where only factors
+            are known.
+        progress: Callback, called with the completed fraction (0 to 1) of a pass over
+            long logs.
+        divisions: Number of blocks of time into which the rows of each recording are
+            divided.
         blocks: Factors by blocks of time, if they were made before.
         names: Names of the recordings; by default their own.
     """
@@ -74,7 +78,9 @@ class RegressionProblem:
             return self._given
         self._require_samples()
         numbers = range(len(self.recordings))
-        return Blocks(tuple(part for number in numbers for part in self._blocks_of(number)))
+        return Blocks(
+            tuple(part for number in numbers for part in self._blocks_of(number))
+        )
 
     def _blocks_of(self, number: int) -> Sequence[Factors]:
         """Return the factors of a recording's blocks; for a long one the loop is compiled."""
@@ -94,7 +100,9 @@ class RegressionProblem:
     def _require_samples(self) -> None:
         """Check that the rows themselves are known."""
         if not self.recordings:
-            raise InputError("this estimate needs the rows themselves: `identify` the recordings.")
+            raise InputError(
+                "this estimate needs the rows themselves: `identify` the recordings."
+            )
 
     def with_base(self, base: BaseParameters) -> "RegressionProblem":
         """Return the problem of the same recordings with other base parameters.
@@ -116,8 +124,10 @@ class RegressionProblem:
         """Return the factors of transformed rows, by blocks of time.
 
         Args:
-            equations: Function from a chunk to the rows `[columns, force]` of each joint.
-            columns: Parameters to which these columns belong; by default those of the rows.
+            equations: Function from a chunk to the rows `[columns, force]` of each
+                joint.
+            columns: Parameters to which these columns belong; by default those of the
+                rows.
             chunks: Rows; by default all.
 
         Raises:
@@ -134,14 +144,17 @@ class RegressionProblem:
         """Yield the rows, recording by recording, in their order.
 
         Args:
-            spans: Rows that are needed, in their order; others may come too. By default all.
+            spans: Rows that are needed, in their order; others may come too. By default
+                all.
 
         Raises:
             InputError: If only factors are known.
         """
         self._require_samples()
         for number in range(len(self.recordings)):
-            wanted = None if spans is None else [(a, b) for k, a, b in spans if k == number]
+            wanted = (
+                None if spans is None else [(a, b) for k, a, b in spans if k == number]
+            )
             yield from self._chunks(number, wanted)
 
     def _chunks(self, number: int, wanted=None) -> Iterator[RowChunk]:
@@ -151,8 +164,12 @@ class RegressionProblem:
             return
         room = self.cached_numbers if wanted is None else -1
         kept, first = [], self._first_block(number)
-        for whole in row_chunks(self.base, self.recordings[number], self.samples_per_chunk, wanted):
-            for chunk in whole._replace(recording=number, block=first).divide(self._edges[number]):
+        for whole in row_chunks(
+            self.base, self.recordings[number], self.samples_per_chunk, wanted
+        ):
+            for chunk in whole._replace(recording=number, block=first).divide(
+                self._edges[number]
+            ):
                 room -= sum(x.size for x in chunk.columns)
                 kept = [*kept, chunk] if room >= 0 else []
                 yield chunk
@@ -167,9 +184,13 @@ class RegressionProblem:
         """Report the completed fraction of a pass, from that of one recording."""
         if self.progress is not None:
             sizes = [o.samples for o in self.recordings]
-            self.progress(min(1.0, (sum(sizes[:number]) + done * sizes[number]) / sum(sizes)))
+            self.progress(
+                min(1.0, (sum(sizes[:number]) + done * sizes[number]) / sum(sizes))
+            )
 
-    def residuals(self, p: np.ndarray, spans=None) -> Iterator[tuple[RowChunk, np.ndarray]]:
+    def residuals(
+        self, p: np.ndarray, spans=None
+    ) -> Iterator[tuple[RowChunk, np.ndarray]]:
         """Yield the rows with the residuals of some parameters [rows, joints]."""
         for chunk in self.chunks(spans):
             yield chunk, chunk.residuals(p)
@@ -179,7 +200,8 @@ class RegressionProblem:
 
         Args:
             p: Base parameters, which give each row its residual.
-            weight: Function from residuals, divided by their scale, to weights from 0 to 1.
+            weight: Function from residuals, divided by their scale, to weights from 0
+                to 1.
             scale: Size of each joint's residuals [joints], in [N m] or [N].
         """
 
@@ -201,10 +223,14 @@ def block_edges(observations: Observations, blocks: int) -> list[int]:
     return [0, *edges[1:], observations.rows]
 
 
-def cross_validation_folds(blocks: Blocks, count: int = 5) -> list[tuple[np.ndarray, np.ndarray]]:
+def cross_validation_folds(
+    blocks: Blocks, count: int = 5
+) -> list[tuple[np.ndarray, np.ndarray]]:
     """Return indices of all blocks but one contiguous part of time, and of that part; each once."""
     every = np.arange(len(blocks.parts))
     if len(every) < 2:
-        raise InputError("held-out errors need at least two blocks of rows: record longer.")
+        raise InputError(
+            "held-out errors need at least two blocks of rows: record longer."
+        )
     parts = np.array_split(every, min(count, len(every)))
     return [(np.setdiff1d(every, part), part) for part in parts]

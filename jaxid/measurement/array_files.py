@@ -33,10 +33,14 @@ def read_mat(path: Path) -> dict[str, np.ndarray]:
     with path.open("rb") as file:
         if b"\x89HDF" in file.read(516):
             # Version 7.3 is HDF5, in which the arrays are transposed.
-            return _named_arrays({name: array.T for name, array in read_hdf5(path).items()})
+            return _named_arrays(
+                {name: array.T for name, array in read_hdf5(path).items()}
+            )
     with readable(path.name, "MAT file"):
         content = loadmat(path, simplify_cells=True)
-    return _named_arrays({k: value for k, value in content.items() if not k.startswith("__")})
+    return _named_arrays(
+        {k: value for k, value in content.items() if not k.startswith("__")}
+    )
 
 
 def read_hdf5(path: Path) -> dict[str, np.ndarray]:
@@ -48,12 +52,18 @@ def read_hdf5(path: Path) -> dict[str, np.ndarray]:
 
 def with_elements(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Add the columns of arrays, named like `q[0]`."""
-    wide = {name: a for name, a in arrays.items() if a.ndim == 2 and a.shape[1] <= len(a)}
-    columns = {f"{name}[{k}]": a[:, k] for name, a in wide.items() for k in range(a.shape[1])}
+    wide = {
+        name: a for name, a in arrays.items() if a.ndim == 2 and a.shape[1] <= len(a)
+    }
+    columns = {
+        f"{name}[{k}]": a[:, k] for name, a in wide.items() for k in range(a.shape[1])
+    }
     return arrays | columns
 
 
-def _named_arrays(content: Mapping[str, Any], prefix: str = "") -> dict[str, np.ndarray]:
+def _named_arrays(
+    content: Mapping[str, Any], prefix: str = ""
+) -> dict[str, np.ndarray]:
     """Return arrays by name; those in a structure are named like `log.q`."""
     arrays: dict[str, np.ndarray] = {}
     for name, value in content.items():
@@ -62,7 +72,9 @@ def _named_arrays(content: Mapping[str, Any], prefix: str = "") -> dict[str, np.
         elif isinstance(value, np.ndarray) and value.ndim > 0:
             # Single rows, as MATLAB writes them, are columns here.
             arrays[prefix + name] = value.ravel() if 1 in value.shape else value
-        elif getattr(value, "ndim", 0) in (1, 2) and value.dtype.itemsize > 1:  # of HDF5
+        elif (
+            getattr(value, "ndim", 0) in (1, 2) and value.dtype.itemsize > 1
+        ):  # of HDF5
             arrays[prefix + name] = value[()]
     return arrays
 
@@ -78,7 +90,11 @@ def read_npz(path: Path) -> dict[str, np.ndarray]:
 def map_arrays(path: Path) -> dict[str, np.ndarray] | None:
     """Map the arrays of an NPZ file into memory; None if one is compressed or none is there."""
     arrays = {}
-    with readable(path.name, "NPZ file"), zipfile.ZipFile(path) as archive, path.open("rb") as file:
+    with (
+        readable(path.name, "NPZ file"),
+        zipfile.ZipFile(path) as archive,
+        path.open("rb") as file,
+    ):
         for entry in archive.infolist():
             if entry.compress_type != zipfile.ZIP_STORED:
                 return None

@@ -46,14 +46,21 @@ def read_bag(path: Path, selected: Collection[str]) -> list[Topic]:
     )
     latest, topics = types.get_typestore(types.Stores.LATEST), []
     kind = "bag that defines its messages"
-    with readable(path.name, kind), highlevel.AnyReader([path], default_typestore=latest) as bag:
+    with (
+        readable(path.name, kind),
+        highlevel.AnyReader([path], default_typestore=latest) as bag,
+    ):
         for name in dict.fromkeys(connection.topic for connection in bag.connections):
             raw = bag.messages([one for one in bag.connections if one.topic == name])
-            read = ((time, bag.deserialize(data, one.msgtype)) for one, time, data in raw)
+            read = (
+                (time, bag.deserialize(data, one.msgtype)) for one, time, data in raw
+            )
             if name in selected:
                 topics.append(_topic(name, read))
             else:
-                with contextlib.suppress(Exception):  # the bag may not define these messages
+                with contextlib.suppress(
+                    Exception
+                ):  # the bag may not define these messages
                     topics.append(_topic(name, itertools.islice(read, 1)))
     return topics
 
@@ -68,7 +75,9 @@ def _topic(name: str, messages: Iterable[tuple[int, Any]]) -> Topic:
         for field, elements, values in _fields(message, f"{name}.", {}):
             orders.setdefault(field, {}).setdefault(frozenset(elements), elements)
             for element, value in zip(elements, values, strict=True):
-                column = topic.columns.setdefault(field + element, (array("q"), array("d")))
+                column = topic.columns.setdefault(
+                    field + element, (array("q"), array("d"))
+                )
                 column[0].append(number)
                 column[1].append(value)
     topic.columns[name + RECORDED] = topic.recorded, topic.recorded
@@ -87,13 +96,21 @@ def _fields(
 ) -> Iterator[tuple[str, tuple[str, ...], Sequence[float]]]:
     """Yield names, elements and values of the numbers in a message and in those within it.
 
-    Texts called `name` or `joint_names` name the elements of all arrays of their length.
+    Texts called `name` or `joint_names` name the elements of all arrays of their
+    length.
     """
-    values = {field.name: getattr(message, field.name) for field in dataclasses.fields(message)}
+    values = {
+        field.name: getattr(message, field.name)
+        for field in dataclasses.fields(message)
+    }
     for key, texts in values.items():
         if re.search("(^|_)names?$", key) and isinstance(texts, list):
             elements = tuple(f".{text}" for text in texts)
-            names = {**names, len(texts): elements} if len({*elements}) == len(texts) else names
+            names = (
+                {**names, len(texts): elements}
+                if len({*elements}) == len(texts)
+                else names
+            )
     for key, value in values.items():
         field = prefix + key
         if isinstance(value, int | float):
@@ -103,7 +120,9 @@ def _fields(
         elif dataclasses.is_dataclass(value):
             yield from _fields(value, f"{field}.", names)
         elif isinstance(value, np.ndarray | list) and 0 < len(value) <= 1000:
-            elements = names.get(len(value)) or tuple(f"[{k}]" for k in range(len(value)))
+            elements = names.get(len(value)) or tuple(
+                f"[{k}]" for k in range(len(value))
+            )
             if isinstance(value, np.ndarray):
                 yield field, elements, value.tolist()
             elif dataclasses.is_dataclass(value[0]):
@@ -116,10 +135,12 @@ def join_topics(
 ) -> tuple[dict[str, Any], tuple[str, ...]]:
     """Return columns at the times of the first one, and notes.
 
-    The times are the stamps in the headers if all of the topics have them and no time of recording
-    is asked for. Columns with other times are interpolated linearly.
+    The times are the stamps in the headers if all of the topics have them and no time
+    of recording is asked for. Columns with other times are interpolated linearly.
     """
-    clock = next((x for x in names if x.endswith((STAMP, RECORDED)) or x == CLOCK), CLOCK)
+    clock = next(
+        (x for x in names if x.endswith((STAMP, RECORDED)) or x == CLOCK), CLOCK
+    )
     names = [name for name in names if name != clock]
     owners = {name: topic for topic in topics for name in topic.columns}
     stamped = clock != CLOCK or all(all(owners[name].stamps) for name in names)
@@ -127,25 +148,35 @@ def join_topics(
     times, values = {}, {}
     for name in names:
         rows, values[name] = map(np.asarray, owners[name].columns[name])
-        times[name] = np.asarray(owners[name].recorded if recorded else owners[name].stamps)[rows]
+        times[name] = np.asarray(
+            owners[name].recorded if recorded else owners[name].stamps
+        )[rows]
     first, main = times[names[0]], names[0].partition(".")[0]
     others = [name for name in names if not np.array_equal(times[name], first)]
     for name in others:
         values[name] = _interpolated(times[name], values[name], first)
-    kept = np.all([np.isfinite(values[name]) | (name not in others) for name in names], axis=0)
+    kept = np.all(
+        [np.isfinite(values[name]) | (name not in others) for name in names], axis=0
+    )
     if not kept.any():
-        raise InputError(f"the topics of `{source}` overlap nowhere in time: compare their clocks.")
+        raise InputError(
+            f"the topics of `{source}` overlap nowhere in time: compare their clocks."
+        )
     notes = [
         f"`{topic}` is interpolated linearly at the times of `{main}`"
         for topic in dict.fromkeys(name.partition(".")[0] for name in others)
     ]
     if left := int(np.sum(~kept)):
-        notes.append(f"{left} of {len(kept)} messages were left out: other topics pause there")
+        notes.append(
+            f"{left} of {len(kept)} messages were left out: other topics pause there"
+        )
     columns = {name: values[name][kept] for name in names}
     return {**columns, clock: pl.Series(first[kept].astype("M8[ns]"))}, tuple(notes)
 
 
-def _interpolated(times: np.ndarray, values: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+def _interpolated(
+    times: np.ndarray, values: np.ndarray, wanted: np.ndarray
+) -> np.ndarray:
     """Return values between others; NaN outside and in their pauses."""
     order = np.argsort(times, kind="stable")
     # Float64 holds nanoseconds only if they do not count from 1970.

@@ -24,50 +24,62 @@ PerJoint = tuple[float, ...] | None
 
 
 def _listed(value: Any) -> Any:
-    return value if value is None or isinstance(value, str | int | Unit) else tuple(value)
+    return (
+        value if value is None or isinstance(value, str | int | Unit) else tuple(value)
+    )
 
 
 class Columns(eqx.Module):
     """Columns of a log that hold the time, the angles and the forces of a robot.
 
-    A group of columns is a tuple of names, a pattern such as `"q{}"` (`{}` stands for the joints'
-    numbers, from 1 or from 0), a tuple of positions from 0 (files without a header), or one name:
-    that of the column of a single joint, or of a whole array (samples x joints), whose columns are
-    `"q[{}]"`. Fields of bags are `"/topic.field[{}]"`, or `"/topic.field.joint"` by names.
+    A group of columns is a tuple of names, a pattern such as `"q{}"` (`{}` stands for
+    the joints' numbers, from 1 or from 0), a tuple of positions from 0 (files without a
+    header), or one name: that of the column of a single joint, or of a whole array
+    (samples x joints), whose columns are `"q[{}]"`. Fields of bags are
+    `"/topic.field[{}]"`, or `"/topic.field.joint"` by names.
 
-    Angles become `sign * unit * value + offset`, velocities `sign * unit * value`, and forces
-    `sign * gain * torque constant * unit * value`. A unit is one for all joints, or one for each.
+    Angles become `sign * unit * value + offset`, velocities `sign * unit * value`, and
+    forces `sign * gain * torque constant * unit * value`. A unit is one for all joints,
+    or one for each.
 
     Attributes:
-        angles: Joint or motor angles; `{}` stands for the joints' numbers, from 1 or from 0.
+        angles: Joint or motor angles; `{}` stands for the joints' numbers, from 1 or
+            from 0.
         forces: Joint forces, motor torques or motor currents.
-        velocities: Measured velocities, on the same side as the angles, like `"dq{}"`; None if
-            there are none.
-        time: Time stamps; None for `sample_time`, or the clock of bags and LeRobot data sets.
+        velocities: Measured velocities, on the same side as the angles, like `"dq{}"`;
+            None if there are none.
+        time: Time stamps; None for `sample_time`, or the clock of bags and LeRobot data
+            sets.
         sample_time: Time between two rows [s], instead of time stamps, like `0.001`.
         time_unit: Unit of the stamps.
         angle_unit: Unit of the angles.
-        velocity_unit: Unit of the velocities, like `"rad/s"`; the angles' unit per second if
-            None.
+        velocity_unit: Unit of the velocities, like `"rad/s"`; the angles' unit per
+            second if None.
         force_unit: Unit of the forces; currents need `torque_constants`.
         torque_constants: Torque of each motor for its current [N m/A].
         angle_signs: +1 or -1 for each joint, for the angles and velocities.
         force_signs: +1 or -1 for each joint.
         angle_offsets: Offsets that are added to the angles [rad or m], like `0.0`.
-        force_gains: Ratio of the true forces to those of the log, as a known load tells.
-        angles_on_motor_side: Whether angles and velocities are the motors', before the gears.
+        force_gains: Ratio of the true forces to those of the log, as a known load
+            tells.
+        angles_on_motor_side: Whether angles and velocities are the motors', before the
+            gears.
         forces_on_motor_side: Whether forces are the motors', before the gears.
         unwrap: Whether angles jump by full turns, which is undone.
     """
 
     angles: Selection = eqx.field(static=True, converter=_listed)
     forces: Selection = eqx.field(static=True, converter=_listed)
-    velocities: Selection | None = eqx.field(static=True, converter=_listed, default=None)
+    velocities: Selection | None = eqx.field(
+        static=True, converter=_listed, default=None
+    )
     time: str | int | None = eqx.field(static=True, default=None)
     sample_time: float | None = eqx.field(static=True, converter=optional, default=None)
     time_unit: Unit = eqx.field(static=True, default=units.S)
     angle_unit: Units = eqx.field(static=True, converter=_listed, default=units.RAD)
-    velocity_unit: Units | None = eqx.field(static=True, converter=_listed, default=None)
+    velocity_unit: Units | None = eqx.field(
+        static=True, converter=_listed, default=None
+    )
     force_unit: Units = eqx.field(static=True, converter=_listed, default=units.NM)
     torque_constants: PerJoint = eqx.field(static=True, converter=_listed, default=None)
     angle_signs: PerJoint = eqx.field(static=True, converter=_listed, default=None)
@@ -81,7 +93,9 @@ class Columns(eqx.Module):
     def __check_init__(self) -> None:
         """Refuse contradictions."""
         if self.time is not None and self.sample_time is not None:
-            raise InputError("give `time` (a column) or `sample_time` [s], but not both.")
+            raise InputError(
+                "give `time` (a column) or `sample_time` [s], but not both."
+            )
         if self.sample_time is not None:
             positive_time(self.sample_time)
         self._require_unit("time_unit", Quantity.TIME)
@@ -91,11 +105,14 @@ class Columns(eqx.Module):
         self._require("angle_signs", lambda s: abs(s) == 1, "+1 or -1")
         self._require("force_signs", lambda s: abs(s) == 1, "+1 or -1")
         self._require("force_gains", lambda g: 0 < g < np.inf, "positive")
-        self._require("torque_constants", lambda c: c != 0 and np.isfinite(c), "finite, not zero")
+        self._require(
+            "torque_constants", lambda c: c != 0 and np.isfinite(c), "finite, not zero"
+        )
         current = any(u.quantity is Quantity.CURRENT for u in _each(self.force_unit))
         if current != (self.torque_constants is not None):
             raise InputError(
-                "`torque_constants` [N m/A] are needed if `force_unit` is a current, and only then."
+                "`torque_constants` [N m/A] are needed if `force_unit` is a current, "
+                "and only then."
             )
 
     def _require_unit(self, name: str, *allowed: Quantity) -> None:
@@ -110,7 +127,9 @@ class Columns(eqx.Module):
         values = getattr(self, name) or ()
         if not all(map(rule, values)):
             shown = ", ".join(f"{x:g}" for x in values)
-            raise InputError(f"`{name}` must be {words} for each joint, but is {shown}.")
+            raise InputError(
+                f"`{name}` must be {words} for each joint, but is {shown}."
+            )
 
     def to_si(
         self, angles: np.ndarray, velocities: np.ndarray | None, forces: np.ndarray
@@ -154,13 +173,16 @@ class Log:
         for table in self.tables:
             part = table.read((c for c in table.channels if c != "time"), start, stop)
             for channel, names in part.channels.items():
-                arrays[channel] = np.concatenate([part.numbers(name) for name in names], axis=1)
+                arrays[channel] = np.concatenate(
+                    [part.numbers(name) for name in names], axis=1
+                )
         angles = arrays["angles"]
         for channel, array in arrays.items():
             if array.shape[1] != angles.shape[1]:
                 raise InputError(
                     f"`{channel}` have {array.shape[1]} columns, but the angles in "
-                    f"`{self.tables[0].source}` have {angles.shape[1]}: name one for each joint."
+                    f"`{self.tables[0].source}` have {angles.shape[1]}: name one for "
+                    "each joint."
                 )
         return self.columns.to_si(angles, arrays.get("velocities"), arrays["forces"])
 
@@ -193,20 +215,30 @@ def open_log(
     With `lenient`, rows that cannot be read are no error: `Log.bad_rows` names them.
     """
     if velocities_path is not None and columns.velocities is None:
-        raise InputError("`velocities_path` is given, but `Columns.velocities` names no columns.")
+        raise InputError(
+            "`velocities_path` is given, but `Columns.velocities` names no columns."
+        )
     path = Path(path)
     files: dict[Path, dict[str, Selection | None]] = {}
-    paths = {"angles": path, "forces": forces_path, "velocities": velocities_path, "time": path}
+    paths = {
+        "angles": path,
+        "forces": forces_path,
+        "velocities": velocities_path,
+        "time": path,
+    }
     for channel, own in paths.items():
         selection = getattr(columns, channel)
         if selection is not None or (channel == "time" and columns.sample_time is None):
             files.setdefault(Path(own or path), {})[channel] = selection
-    tables = tuple(open_table(file, chosen, on_disk, lenient) for file, chosen in files.items())
+    tables = tuple(
+        open_table(file, chosen, on_disk, lenient) for file, chosen in files.items()
+    )
     first = tables[0]
     for table in tables:
         if table.rows != first.rows:
             raise InputError(
-                f"`{table.source}` has {table.rows} rows, but `{first.source}` has {first.rows}: "
+                f"`{table.source}` has {table.rows} rows, but `{first.source}` has "
+                f"{first.rows}: "
                 "files of one run must agree row by row."
             )
     return Log(tables, columns)

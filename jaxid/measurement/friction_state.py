@@ -24,7 +24,9 @@ class SamplesWithMemory(AbstractSamples):
     def __init__(self, source, law, segments):
         self.source, self.law, self.segments, self.starts = source, law, segments, {}
         for a, b in segments:
-            self.starts[a] = np.asarray(law.settled(source.read(slice(a, a + 1))[0].qd[0]))
+            self.starts[a] = np.asarray(
+                law.settled(source.read(slice(a, a + 1))[0].qd[0])
+            )
             for k in range(a, b, PART):
                 motion, _ = self.read(slice(k, min(k + PART + 1, b)))
                 self.starts[min(k + PART, b)] = np.asarray(motion.state)[-1]

@@ -20,7 +20,14 @@ import polars as pl
 
 from jaxid.errors import InputError
 
-from .array_files import map_arrays, read_hdf5, read_mat, read_npz, readable, with_elements
+from .array_files import (
+    map_arrays,
+    read_hdf5,
+    read_mat,
+    read_npz,
+    readable,
+    with_elements,
+)
 from .bags import BAGS, CLOCK, is_bag, join_topics, read_bag
 from .recording import LARGEST
 
@@ -41,12 +48,15 @@ class LogTable:
     """Channels of one file, in memory or on disk."""
 
     source: str  # name of the file, for messages
-    columns: Any  # columns, or whole arrays (samples x joints), by name; or a lazy frame
+    columns: (
+        Any  # columns, or whole arrays (samples x joints), by name; or a lazy frame
+    )
     # names of the columns of each channel, in the order of the joints
     channels: Mapping[str, tuple[str, ...]]
     first_row: int = 1  # number of the first row in the file, for messages
     unit: str = "row"  # name of a row, for messages: `line` in text files
-    # complaints about rows that cannot be read, by their numbers; None if the first one is an error
+    # complaints about rows that cannot be read, by their numbers; None if the first one
+    # is an error
     bad: dict[int, str] | None = None
     notes: tuple[str, ...] = ()  # remarks about how the columns were made
 
@@ -62,14 +72,17 @@ class LogTable:
             for name in others:
                 if (own := len(self.columns[name])) != rows:
                     raise InputError(
-                        f"`{name}` of `{self.source}` has {own} samples, but `{first}` has {rows}: "
+                        f"`{name}` of `{self.source}` has {own} samples, but "
+                        f"`{first}` has {rows}: "
                         "one row for each sample is needed."
                     )
         if rows == 0:
             raise InputError(f"`{self.source}` has no rows: is the log cut?")
         return rows
 
-    def read(self, channels: Iterable[str], start: int = 0, stop: int | None = None) -> "LogTable":
+    def read(
+        self, channels: Iterable[str], start: int = 0, stop: int | None = None
+    ) -> "LogTable":
         """Return some rows of some channels, in memory."""
         kept = {channel: self.channels[channel] for channel in channels}
         names = list(itertools.chain(*kept.values()))
@@ -87,25 +100,38 @@ class LogTable:
     def stamps(self) -> tuple[np.ndarray, bool]:
         """Return the time stamps, and whether they are dates (then in seconds).
 
-        Integers and dates count from the first of these rows: nanoseconds since 1970 do not fit
-        into float64, but their differences do.
+        Integers and dates count from the first of these rows: nanoseconds since 1970 do
+        not fit into float64, but their differences do.
         """
         (name,) = self.channels["time"]
         column = self.columns[name]
         if isinstance(column, pl.Series) and column.dtype.is_temporal():
-            fine = pl.Duration("ns") if column.dtype == pl.Duration else pl.Datetime("ns")
+            fine = (
+                pl.Duration("ns") if column.dtype == pl.Duration else pl.Datetime("ns")
+            )
             ticks = column.cast(fine).cast(pl.Int64)
             self._refuse_first(name, ticks.is_null().to_numpy(), ticks, "is empty")
             integers = ticks.to_numpy()
             return (integers - integers[0]) * 1e-9, True
-        if isinstance(column, pl.Series) and column.dtype.is_integer() and not column.null_count():
+        if (
+            isinstance(column, pl.Series)
+            and column.dtype.is_integer()
+            and not column.null_count()
+        ):
             column = column.to_numpy()
-        if isinstance(column, np.ndarray) and column.ndim == 1 and column.dtype.kind in "iu":
-            return (column.astype(np.int64) - np.int64(column[0])).astype(np.float64), False
+        if (
+            isinstance(column, np.ndarray)
+            and column.ndim == 1
+            and column.dtype.kind in "iu"
+        ):
+            return (column.astype(np.int64) - np.int64(column[0])).astype(
+                np.float64
+            ), False
         block = self.numbers(name)
         if block.shape[1] != 1:
             raise InputError(
-                f"`{name}` of `{self.source}` must be one column, but has {block.shape[1]}."
+                f"`{name}` of `{self.source}` must be one column, but has "
+                f"{block.shape[1]}."
             )
         return block[:, 0], False
 
@@ -121,7 +147,8 @@ class LogTable:
             array = np.zeros(0)
         if array.size == 0:
             raise InputError(
-                f"`{name}` of `{self.source}` must hold columns of real numbers, but holds "
+                f"`{name}` of `{self.source}` must hold columns of real numbers, but "
+                "holds "
                 f"{column.dtype} of shape {column.shape}."
             )
         array = np.array(array.reshape(len(array), -1), np.float64)
@@ -137,24 +164,34 @@ class LogTable:
                 numbers = column.str.strip_chars().cast(pl.Float64, strict=False)
         except pl.exceptions.PolarsError as error:
             raise InputError(
-                f"column `{name}` of `{self.source}` holds {column.dtype}: name one of numbers."
+                f"column `{name}` of `{self.source}` holds {column.dtype}: name one "
+                "of numbers."
             ) from error
         self._refuse_first(name, column.is_null().to_numpy(), column, "is empty")
-        self._refuse_first(name, numbers.is_null().to_numpy(), column, "is `{}`, no number")
+        self._refuse_first(
+            name, numbers.is_null().to_numpy(), column, "is `{}`, no number"
+        )
         return numbers.to_numpy()
 
-    def _refuse_first(self, name: str, bad: np.ndarray, column: Any, complaint: str) -> None:
+    def _refuse_first(
+        self, name: str, bad: np.ndarray, column: Any, complaint: str
+    ) -> None:
         rows = np.flatnonzero(bad)
         if self.bad is not None:
             for k in rows.tolist():
-                text = f"{self.unit} {k + self.first_row} (`{name}` {complaint.format(column[k])})"
+                text = (
+                    f"{self.unit} {k + self.first_row} (`{name}` "
+                    f"{complaint.format(column[k])})"
+                )
                 self.bad.setdefault(k + self.first_row, text)
         elif rows.size:
             first = int(rows[0])
             more = f" (and {rows.size - 1} more)" if rows.size > 1 else ""
             raise InputError(
-                f"column `{name}` of `{self.source}`, {self.unit} {first + self.first_row}, "
-                f"{complaint.format(column[first])}{more}: repair the log or remove those rows."
+                f"column `{name}` of `{self.source}`, {self.unit} "
+                f"{first + self.first_row}, "
+                f"{complaint.format(column[first])}{more}: repair the log or remove "
+                "those rows."
             )
 
 
@@ -164,12 +201,20 @@ def open_table(
     """Open a file; its suffix tells the format. With `lenient`, bad rows are collected."""
     if path.suffix.lower() in SUFFIXES and path.is_file():
         return _open_text(path, selections, on_disk, lenient)
-    chosen = itertools.chain(*(x if isinstance(x, tuple) else [x] for x in selections.values()))
-    columns, layout = _open_columns(path, on_disk, {str(x).partition(".")[0] for x in chosen})
+    chosen = itertools.chain(
+        *(x if isinstance(x, tuple) else [x] for x in selections.values())
+    )
+    columns, layout = _open_columns(
+        path, on_disk, {str(x).partition(".")[0] for x in chosen}
+    )
     channels, notes = layout.channels(selections), ()
     if isinstance(columns, list):
-        columns, notes = join_topics(path.name, columns, [*itertools.chain(*channels.values())])
-    return LogTable(path.name, columns, channels, bad={} if lenient else None, notes=notes)
+        columns, notes = join_topics(
+            path.name, columns, [*itertools.chain(*channels.values())]
+        )
+    return LogTable(
+        path.name, columns, channels, bad={} if lenient else None, notes=notes
+    )
 
 
 def summarise_columns(path: Path) -> str:
@@ -178,14 +223,18 @@ def summarise_columns(path: Path) -> str:
     return f"`{'`, `'.join(_shortened(layout.names))}`"
 
 
-def _open_columns(path: Path, on_disk: bool, topics: Collection[str] = ()) -> tuple[Any, "_Layout"]:
+def _open_columns(
+    path: Path, on_disk: bool, topics: Collection[str] = ()
+) -> tuple[Any, "_Layout"]:
     """Return the columns of a file (None of a text), or the topics of a bag; and names."""
     suffix, clock = path.suffix.lower(), ""
     if is_bag(path):
         columns, clock = read_bag(path, topics), CLOCK
         names = itertools.chain(*(topic.columns for topic in columns))
     elif not path.is_file():
-        raise InputError(f"`{path}` is no file and no bag of ROS 2: check the path of the log.")
+        raise InputError(
+            f"`{path}` is no file and no bag of ROS 2: check the path of the log."
+        )
     elif suffix in SUFFIXES:
         with path.open("rb") as file:
             return None, _detect_format(path.name, file.read(HEAD))
@@ -195,11 +244,17 @@ def _open_columns(path: Path, on_disk: bool, topics: Collection[str] = ()) -> tu
             names = columns.collect_schema().names()
         clock = "timestamp" if {"timestamp", "episode_index"} <= {*names} else ""
     elif suffix == ".npz":
-        columns = names = with_elements((map_arrays(path) if on_disk else None) or read_npz(path))
+        columns = names = with_elements(
+            (map_arrays(path) if on_disk else None) or read_npz(path)
+        )
     elif suffix in (".mat", ".h5", ".hdf5"):
-        columns = names = with_elements((read_mat if suffix == ".mat" else read_hdf5)(path))
+        columns = names = with_elements(
+            (read_mat if suffix == ".mat" else read_hdf5)(path)
+        )
     else:
-        known = ", ".join((*SUFFIXES, ".parquet", ".npz", ".mat", ".h5", ".hdf5", *BAGS))
+        known = ", ".join(
+            (*SUFFIXES, ".parquet", ".npz", ".mat", ".h5", ".hdf5", *BAGS)
+        )
         raise InputError(f"`{path.name}` must end in {known}: convert it.")
     return columns, _Layout(path.name, tuple(dict.fromkeys(names)), clock=clock)
 
@@ -207,7 +262,9 @@ def _open_columns(path: Path, on_disk: bool, topics: Collection[str] = ()) -> tu
 def _with_elements(frame: pl.LazyFrame) -> pl.LazyFrame:
     """Add the elements of lists, named like `action[0]`; episodes follow each other after 10 s."""
     schema, columns = frame.collect_schema(), []
-    kinds = {x: kind for x, kind in schema.items() if isinstance(kind, pl.List | pl.Array)}
+    kinds = {
+        x: kind for x, kind in schema.items() if isinstance(kind, pl.List | pl.Array)
+    }
     for name, values in (
         frame.select(list(kinds)).head(1).collect().to_dict(as_series=False).items()
     ):
@@ -250,10 +307,16 @@ class _Layout(NamedTuple):
 
     def channels(self, selections: Selections) -> dict[str, tuple[str, ...]]:
         """Return the names of the columns of each channel, each of which has its own."""
-        channels = {c: self._expand(c, selection) for c, selection in selections.items()}
+        channels = {
+            c: self._expand(c, selection) for c, selection in selections.items()
+        }
         names = [*itertools.chain(*channels.values())]
         if repeated := [name for name in names if names.count(name) > 1]:
-            owners = [f"`{channel}`" for channel in channels if repeated[0] in channels[channel]]
+            owners = [
+                f"`{channel}`"
+                for channel in channels
+                if repeated[0] in channels[channel]
+            ]
             raise InputError(
                 f"the column `{repeated[0]}` of `{self.source}` is used twice, for "
                 f"{' and '.join(owners)}: name the right one for each joint."
@@ -265,7 +328,8 @@ class _Layout(NamedTuple):
         if selection is None:
             if not self.clock:
                 raise InputError(
-                    f"`{self.source}` has no clock of its own: give `time` (its column of time "
+                    f"`{self.source}` has no clock of its own: give `time` (its "
+                    "column of time "
                     "stamps) or `sample_time` [s]."
                 )
             return (self.clock,)
@@ -277,7 +341,9 @@ class _Layout(NamedTuple):
             return (self._name(channel, selection),)
         pattern = re.escape(selection).replace(re.escape("{}"), r"(\d{1,18})")
         found = sorted(
-            (int(m[1]), m[0]) for name in self.names if (m := re.fullmatch(pattern, name))
+            (int(m[1]), m[0])
+            for name in self.names
+            if (m := re.fullmatch(pattern, name))
         )
         if not found:
             return (self._name(channel, selection.replace("{}", "1")),)
@@ -286,8 +352,10 @@ class _Layout(NamedTuple):
         first = min(numbers[0], 1)
         if numbers != list(range(first, first + len(numbers))):
             raise InputError(
-                f"the columns of `{self.source}` for `{channel}`, `{'`, `'.join(columns[:20])}`, "
-                f"must have the numbers from {first} to {first + len(numbers) - 1}: name each."
+                f"the columns of `{self.source}` for `{channel}`, "
+                f"`{'`, `'.join(columns[:20])}`, "
+                f"must have the numbers from {first} to {first + len(numbers) - 1}: "
+                "name each."
             )
         return tuple(columns)
 
@@ -300,12 +368,14 @@ class _Layout(NamedTuple):
         if isinstance(column, int) or not self.named:
             has = "columns" if self.named else "no header, and columns"
             raise InputError(
-                f"`{channel}` asks for column {column} of `{self.source}`, which has {has} from 0 "
+                f"`{channel}` asks for column {column} of `{self.source}`, which has "
+                f"{has} from 0 "
                 f"to {len(names) - 1}: give another position."
             )
         near = difflib.get_close_matches(column, _shortened(names), n=40, cutoff=0)
         raise InputError(
-            f"`{self.source}` has no column `{column}` for `{channel}`: name one of its columns, "
+            f"`{self.source}` has no column `{column}` for `{channel}`: name one of "
+            "its columns, "
             f"the closest first: `{'`, `'.join(near)}`."
         )
 
@@ -314,7 +384,8 @@ class _Layout(NamedTuple):
     ) -> dict[str, pl.Series]:
         """Return the cells of whole lines, of which `line` is the first.
 
-        Lines that are no rows are put into `bad`, and are empty then; without it they are an error.
+        Lines that are no rows are put into `bad`, and are empty then; without it they
+        are an error.
         """
         if self.separator == " ":
             rows = b"\n".join(b" ".join(row.split()) for row in rows.splitlines())
@@ -324,7 +395,8 @@ class _Layout(NamedTuple):
             for index, text in enumerate(rows.split(b"\n")):
                 if text.count(b'"') % 2:
                     raise InputError(
-                        f"line {index + line} of `{self.source}` opens a quotation: close it there."
+                        f"line {index + line} of `{self.source}` opens a quotation: "
+                        "close it there."
                     )
         try:
             frame = pl.read_csv(
@@ -335,11 +407,14 @@ class _Layout(NamedTuple):
                 encoding="utf8-lossy",
             )
         except pl.exceptions.PolarsError as error:
-            cells = [text.count(self.separator.encode()) + 1 for text in rows.split(b"\n")]
+            cells = [
+                text.count(self.separator.encode()) + 1 for text in rows.split(b"\n")
+            ]
             most = len(self.names)
             wrong = next((k for k, count in enumerate(cells) if count > most), 0)
             raise InputError(
-                f"line {wrong + line} of `{self.source}` has {cells[wrong]} cells, but there are "
+                f"line {wrong + line} of `{self.source}` has {cells[wrong]} cells, "
+                "but there are "
                 f"{most} columns: repair or remove that line."
             ) from error
         if self.decimal_comma:
@@ -348,14 +423,26 @@ class _Layout(NamedTuple):
 
     def _without_bad_lines(self, rows: bytes, line: int, bad: dict[int, str]) -> bytes:
         """Return lines with empty ones in place of those that are no rows, which go into `bad`."""
-        separator, count, lines = self.separator.encode(), len(self.names), rows.split(b"\n")
+        separator, count, lines = (
+            self.separator.encode(),
+            len(self.names),
+            rows.split(b"\n"),
+        )
         for k, text in enumerate(lines):
             # Separators between quotation marks are text.
-            cells = b"".join(text.split(b'"')[::2]).count(separator) + 1 if text.strip() else 0
+            cells = (
+                b"".join(text.split(b'"')[::2]).count(separator) + 1
+                if text.strip()
+                else 0
+            )
             is_open = text.count(b'"') % 2 == 1
             if cells == count and not is_open:
                 continue
-            odd = "an open quotation" if is_open else f"{cells} cells, but {count} columns"
+            odd = (
+                "an open quotation"
+                if is_open
+                else f"{cells} cells, but {count} columns"
+            )
             bad[line + k] = f"line {line + k} ({odd})"
             lines[k] = separator * (count - 1) if count > 1 else b'""'
         return b"\n".join(lines)
@@ -370,7 +457,9 @@ _conversions: dict[tuple, Path] = {}
 """Folders with the Parquet files of long text files."""
 
 
-def _open_text(path: Path, selections: Selections, on_disk: bool, lenient: bool) -> LogTable:
+def _open_text(
+    path: Path, selections: Selections, on_disk: bool, lenient: bool
+) -> LogTable:
     """Read the needed columns of a text file, or convert them to Parquet unless this was done."""
     with path.open("rb") as file:
         text = _detect_format(path.name, file.read(HEAD))
@@ -388,13 +477,22 @@ def _open_text(path: Path, selections: Selections, on_disk: bool, lenient: bool)
             for number, frame in enumerate(frames):
                 frame.write_parquet(folder / f"{number:09}.parquet")
             _conversions[key] = folder
-    return dataclasses.replace(table, columns=pl.scan_parquet(_conversions[key] / "*.parquet"))
+    return dataclasses.replace(
+        table, columns=pl.scan_parquet(_conversions[key] / "*.parquet")
+    )
 
 
-def _read_frames(file: BinaryIO, text: _Layout, table: LogTable) -> Iterator[pl.DataFrame]:
+def _read_frames(
+    file: BinaryIO, text: _Layout, table: LogTable
+) -> Iterator[pl.DataFrame]:
     """Yield the numbers of consecutive blocks of lines."""
     names = list(itertools.chain(*table.channels.values()))
-    stamps, exact, line, rest = table.channels.get("time", ()), None, table.first_row, b""
+    stamps, exact, line, rest = (
+        table.channels.get("time", ()),
+        None,
+        table.first_row,
+        b"",
+    )
     while data := file.read(BLOCK) + file.readline():
         data = rest + data
         rows = data.rstrip(b"\r\n")
@@ -423,23 +521,29 @@ def _detect_format(source: str, head: bytes) -> _Layout:
         raise InputError(f"`{source}` is text in UTF-16: save it again in UTF-8.")
     if b"\0" in head:
         raise InputError(
-            f"`{source}` is no text: a log is CSV, Parquet, NPZ, MAT, HDF5 or a bag of ROS, as its "
+            f"`{source}` is no text: a log is CSV, Parquet, NPZ, MAT, HDF5 or a bag "
+            "of ROS, as its "
             "suffix says."
         )
     first, _, _ = head.partition(b"\n")
     line = first.decode("utf-8-sig", errors="replace").strip("\r").lstrip("#% ")
     if not line.strip():
-        raise InputError(f"`{source}` must start with a header or with numbers, but is empty.")
+        raise InputError(
+            f"`{source}` must start with a header or with numbers, but is empty."
+        )
     separator = next((s for s in (";", "\t", ",", " ") if s in line.strip()), ",")
     line = " ".join(line.split()) if separator == " " else line
     cells = [cell.strip().strip('"') for cell in line.split(separator)]
-    filled = pl.Series([cell.replace(",", ".") for cell in cells if cell], dtype=pl.String)
+    filled = pl.Series(
+        [cell.replace(",", ".") for cell in cells if cell], dtype=pl.String
+    )
     named = filled.is_empty() or filled.cast(pl.Float64, strict=False).null_count() > 0
     names = cells if named else [str(i) for i in range(len(cells))]
     repeated = sorted({name for name in names if names.count(name) > 1})
     if repeated:
         raise InputError(
-            f"the header of `{source}` names the column `{repeated[0]}` twice: rename one of them."
+            f"the header of `{source}` names the column `{repeated[0]}` twice: rename "
+            "one of them."
         )
     comma = separator == ";" and re.search(rb"\d,\d", head) is not None
     mark = len(codecs.BOM_UTF8) if first.startswith(codecs.BOM_UTF8) else 0

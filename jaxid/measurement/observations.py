@@ -66,7 +66,8 @@ class Chunk(NamedTuple):
 class Observations(eqx.Module):
     """Motion and forces at the full rate, joint side, and the filters that turn them into rows.
 
-    The samples are in memory (`observe`, `Observations.of`) or stay on disk (`scan_log`).
+    The samples are in memory (`observe`, `Observations.of`) or stay on disk
+    (`scan_log`).
 
     Attributes:
         source: Motion and forces of the samples.
@@ -120,20 +121,26 @@ class Observations(eqx.Module):
             name: Name of the observations.
 
         Raises:
-            InputError: If shapes differ, values are not finite, or `sample_time` is not positive.
+            InputError: If shapes differ, values are not finite, or `sample_time` is not
+                positive.
         """
         arrays = {"q": q, "qd": qd, "qdd": qdd, "forces": forces}
         shape = np.shape(q)
-        data = {key: finite_channel(name, key, x, shape, 1) for key, x in arrays.items()}
+        data = {
+            key: finite_channel(name, key, x, shape, 1) for key, x in arrays.items()
+        }
         dt = positive_time(sample_time)
         filter = ZeroPhaseButterworth(math.inf) if filter is None else filter
         decimation = Subsample(1) if decimation is None else decimation
         segments = ((0, len(data["q"])),) if segments is None else tuple(segments)
         rows = sum(map(len, _row_samples(segments, filter.edge(dt), decimation.factor)))
-        counted = np.ones((rows, shape[1]), bool) if mask is None else np.asarray(mask, bool)
+        counted = (
+            np.ones((rows, shape[1]), bool) if mask is None else np.asarray(mask, bool)
+        )
         if counted.shape != (rows, shape[1]):
             raise InputError(
-                f"`mask` must have the shape {(rows, shape[1])}, but has {counted.shape}."
+                f"`mask` must have the shape {(rows, shape[1])}, but has "
+                f"{counted.shape}."
             )
         motion = Motion(data["q"], data["qd"], data["qdd"])
         return cls(
@@ -149,10 +156,14 @@ class Observations(eqx.Module):
 
     def replace(self, **changes: Any) -> "Observations":
         """Return the same observations with other fields; `motion` and `forces` are fields too."""
-        arrays = {key: changes.pop(key) for key in ("motion", "forces") if key in changes}
+        arrays = {
+            key: changes.pop(key) for key in ("motion", "forces") if key in changes
+        }
         if arrays:
             motion, forces = self.source.read_all()
-            changes["source"] = SamplesInMemory(**({"motion": motion, "forces": forces} | arrays))
+            changes["source"] = SamplesInMemory(
+                **({"motion": motion, "forces": forces} | arrays)
+            )
         return dataclasses.replace(self, **changes)
 
     @property
@@ -213,7 +224,9 @@ class Observations(eqx.Module):
         """Return the times of samples of each segment [s]."""
         dt = self.sample_time
         parts = zip(samples, self.segments, self.start_times, strict=True)
-        return np.concatenate([t + dt * (np.asarray(own) - a) for own, (a, _), t in parts])
+        return np.concatenate(
+            [t + dt * (np.asarray(own) - a) for own, (a, _), t in parts]
+        )
 
     def read(self, samples: slice) -> tuple[Motion, Float[AnyArray, "samples joints"]]:
         """Return motion and forces of some samples of one segment."""
@@ -222,12 +235,15 @@ class Observations(eqx.Module):
     def reduce(self, x: Float[AnyArray, "samples *columns"]) -> Any:
         """Turn forces or columns at all samples into rows: smooth, trim and decimate (Eq. 26).
 
-        Linear, and the same for every column: what holds between columns and forces at the samples
-        holds between the rows. JAX can compile and differentiate it.
+        Linear, and the same for every column: what holds between columns and forces at
+        the samples holds between the rows. JAX can compile and differentiate it.
         """
         edge = self.filter.edge(self.sample_time)
         every = slice(None)
-        parts = [self._reduce(slice(edge, b - a - edge), every, x[a:b]) for a, b in self.segments]
+        parts = [
+            self._reduce(slice(edge, b - a - edge), every, x[a:b])
+            for a, b in self.segments
+        ]
         return namespace(x).concatenate(parts)
 
     def _reduce(self, kept: slice, wanted: slice, x: AnyArray) -> Any:
@@ -238,9 +254,9 @@ class Observations(eqx.Module):
     ) -> tuple[Chunk, ...]:
         """Divide into parts of about so many samples, each with the overlap that its filters need.
 
-        For columns that do not fit into memory at the full rate: evaluate them at the motion of
-        `read(slice(*chunk.samples))`, and `chunk.reduce` gives the rows `slice(*chunk.rows)` of
-        `reduce`, up to rounding.
+        For columns that do not fit into memory at the full rate: evaluate them at the
+        motion of `read(slice(*chunk.samples))`, and `chunk.reduce` gives the rows
+        `slice(*chunk.rows)` of `reduce`, up to rounding.
 
         Args:
             samples: Number of samples of a part.
@@ -256,7 +272,9 @@ class Observations(eqx.Module):
             first, last = a + edge, b - edge
             ranges = [(r0, r1)] if wanted is None else wanted
             parts = [(max(r0, low), min(r1, high)) for low, high in ranges]
-            for start, end in ((k, high) for low, high in parts for k in range(low, high, step)):
+            for start, end in (
+                (k, high) for low, high in parts for k in range(low, high, step)
+            ):
                 stop = min(start + step, end)
                 # Decimation keeps its phase: its first input sample is a row.
                 skipped = max(0, start - r0 - -(-before // factor))
@@ -282,7 +300,9 @@ class Observations(eqx.Module):
             InputError: If `fraction` is not between 0 and 1, or a part has no rows.
         """
         if not 0 < fraction < 1:
-            raise InputError(f"`fraction` must lie between 0 and 1, but is {fraction:g}.")
+            raise InputError(
+                f"`fraction` must lie between 0 and 1, but is {fraction:g}."
+            )
         (a, b), first = self.segments[-1], self.start_times[0]
         last = self.start_times[-1] + (b - a - 1) * self.sample_time
         middle = float(first + fraction * (last - first))
@@ -290,7 +310,8 @@ class Observations(eqx.Module):
         masks = np.asarray(self.mask) & early, np.asarray(self.mask) & ~early
         if not all(mask.any(axis=0).all() for mask in masks):
             raise InputError(
-                f"`fraction` of {fraction:g} leaves no rows of some joint of `{self.name}`."
+                f"`fraction` of {fraction:g} leaves no rows of some joint of "
+                f"`{self.name}`."
             )
         return self.replace(mask=masks[0]), self.replace(mask=masks[1])
 
@@ -315,7 +336,9 @@ def joined(parts: Iterable[Any]) -> Any:
     return jax.tree.map(lambda *x: np.concatenate(x), *parts)
 
 
-def _row_samples(segments: Sequence[tuple[int, int]], edge: int, factor: int) -> list[range]:
+def _row_samples(
+    segments: Sequence[tuple[int, int]], edge: int, factor: int
+) -> list[range]:
     """Return the samples of each segment at which rows lie."""
     return [range(a + edge, b - edge, factor) for a, b in segments]
 
@@ -332,22 +355,25 @@ def observe(
 
     Args:
         recording: Recording of the robot.
-        robot: Robot, whose drives convert from motors to joints where the recording needs it.
+        robot: Robot, whose drives convert from motors to joints where the recording
+            needs it.
         filter: Filter of the motion, and of forces and columns.
         decimation: Decimation of forces and columns; every sample is a row if None.
-        min_speed: Speed of each joint below which its rows do not count [rad/s or m/s], since
-            stiction is not in the model.
+        min_speed: Speed of each joint below which its rows do not count [rad/s or m/s],
+            since stiction is not in the model.
         name: Name of the observations; the recording's if None.
 
     Raises:
-        InputError: If the numbers of joints differ, forces and columns would be aliased, nothing
-            is left between the edges of the segments, or some joint is never fast enough.
+        InputError: If the numbers of joints differ, forces and columns would be
+            aliased, nothing is left between the edges of the segments, or some joint is
+            never fast enough.
     """
     r, notes = recording, ()
     if r.velocities is not None and (unlike := unlike_derivatives(r)):
         numbers = ", ".join(str(j + 1) for j in unlike)
         notes = (
-            f"the velocities of channels {numbers} are not the derivatives of their angles: all "
+            f"the velocities of channels {numbers} are not the derivatives of their "
+            "angles: all "
             "velocities are taken from the angles",
         )
         r = dataclasses.replace(r, velocities=None)
@@ -362,17 +388,23 @@ def observe(
 
     name = r.name if name is None else name
     measured = r.velocities is not None
-    found = prepare(load, r.grid, r.joints, measured, robot, filter, decimation, min_speed, name)
+    found = prepare(
+        load, r.grid, r.joints, measured, robot, filter, decimation, min_speed, name
+    )
     return found.replace(notes=(*found.notes, *notes))
 
 
 def unlike_derivatives(recording: Recording) -> dict[int, float]:
     """Return the channels whose velocities do not make the way of their angles within 0.2 s.
 
-    Only channels whose way is well above the noise of their angles are judged. Each comes with the
-    factor by which its velocities are too large.
+    Only channels whose way is well above the noise of their angles are judged. Each
+    comes with the factor by which its velocities are too large.
     """
-    r, squares, products = recording, np.zeros((3, recording.joints)), np.zeros(recording.joints)
+    r, squares, products = (
+        recording,
+        np.zeros((3, recording.joints)),
+        np.zeros(recording.joints),
+    )
     steps = max(1, round(0.2 / r.sample_time))
     for a, b in r.grid.ranges:
         q, qd = np.asarray(r.angles)[a:b], np.asarray(r.velocities)[a:b]
@@ -401,11 +433,13 @@ def prepare(
 ) -> Observations:
     """Return observations of a log whose usable segments `load` reads and filters.
 
-    `measured` tells whether the log holds velocities; for the rest see `observe` and `scan_log`.
+    `measured` tells whether the log holds velocities; for the rest see `observe` and
+    `scan_log`.
     """
     if joints != robot.joints:
         raise InputError(
-            f"`{name}` has {joints} joints, but the robot `{robot.name}` has {robot.joints}: "
+            f"`{name}` has {joints} joints, but the robot `{robot.name}` has "
+            f"{robot.joints}: "
             "choose the columns of its joints, or the robot of this log."
         )
     decimation = Subsample(1) if decimation is None else decimation
@@ -423,15 +457,21 @@ def prepare(
     if not used:
         longest = max(b - a for a, b in grid.ranges)
         raise InputError(
-            f"the longest segment of `{name}` has {longest} samples at {1 / dt:.6g} Hz, "
-            f"but the filter takes {edge} at each end, and {FEWEST_ROWS * factor} more are needed: "
+            f"the longest segment of `{name}` has {longest} samples at {1 / dt:.6g} "
+            "Hz, "
+            f"but the filter takes {edge} at each end, and {FEWEST_ROWS * factor} "
+            "more are needed: "
             "record longer, raise `largest_gap`, lower `margin`, or check `time_unit`."
         )
     if short := len(grid.ranges) - len(used):
-        notes.append(f"{short} segment(s), shorter than the filter's edges, were left out")
+        notes.append(
+            f"{short} segment(s), shorter than the filter's edges, were left out"
+        )
     if measured and not filter.uses_velocities:
         kind = type(filter).__name__
-        notes.append(f"the measured velocities are not used: `{kind}` takes them from the angles")
+        notes.append(
+            f"the measured velocities are not used: `{kind}` takes them from the angles"
+        )
     rows = sum(map(len, _row_samples([*used], edge, factor)))
     observations = Observations(
         source=load([*used]),
@@ -459,21 +499,28 @@ def prepare(
     if slow.size:
         j = int(slow[0])
         raise InputError(
-            f"joint `{robot.joint_names[j]}` never reaches the speed {speeds[j]:g} of `min_speed` "
+            f"joint `{robot.joint_names[j]}` never reaches the speed {speeds[j]:g} of "
+            "`min_speed` "
             f"in `{name}`: take a smaller one, or a log in which it moves."
         )
     return observations.replace(mask=mask)
 
 
 def joint_side(
-    robot: Robot, log: Any, angles: AnyArray, velocities: AnyArray | None, forces: AnyArray
+    robot: Robot,
+    log: Any,
+    angles: AnyArray,
+    velocities: AnyArray | None,
+    forces: AnyArray,
 ) -> tuple[Any, ...]:
     """Convert angles, velocities, forces to the joints' side; `log`: a recording, or `Columns`."""
     angles, forces = np.asarray(angles), np.asarray(forces)
     velocities = None if velocities is None else np.asarray(velocities)
     if log.angles_on_motor_side:
         angles = robot.drives.joint_angles(angles)
-        velocities = None if velocities is None else robot.drives.joint_velocities(velocities)
+        velocities = (
+            None if velocities is None else robot.drives.joint_velocities(velocities)
+        )
     if log.forces_on_motor_side:
         forces = robot.drives.joint_forces(forces)
     return angles, velocities, forces

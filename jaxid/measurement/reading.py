@@ -16,7 +16,14 @@ from jaxid.robot.robot import Robot
 from .columns import Columns, Log, open_log
 from .filters import AbstractDecimation, AbstractFilter
 from .log_files import LogTable
-from .observations import AbstractSamples, Observations, Progress, joined, joint_side, prepare
+from .observations import (
+    AbstractSamples,
+    Observations,
+    Progress,
+    joined,
+    joint_side,
+    prepare,
+)
 from .recording import NeedsMemory, Recording, TimeGrid, consecutive, find_grid
 
 AT_ONCE = 65536
@@ -41,19 +48,21 @@ def read_recording(
     """Read a log from CSV (any separator), Parquet, NPZ, MAT, HDF5, or a bag of ROS 1 or 2.
 
     Args:
-        path: File with the angles, and with all other channels that have no file of their own.
+        path: File with the angles, and with all other channels that have no file of
+            their own.
         columns: Meaning of the columns.
         name: Name of the recording; the file's if None.
         forces_path: File with the forces.
         velocities_path: File with the velocities.
-        largest_gap: Longest pause that is bridged by interpolation, in sample times; longer ones
-            split the recording into segments.
+        largest_gap: Longest pause that is bridged by interpolation, in sample times;
+            longer ones split the recording into segments.
         bridged: Pause that is bridged in any case [s].
-        bad_rows: Fraction of the rows that may be bad: they are left out, and `notes` names them.
+        bad_rows: Fraction of the rows that may be bad: they are left out, and `notes`
+            names them.
 
     Raises:
-        InputError: If a file, a column, a number or the time is invalid; the message names file,
-            column and line.
+        InputError: If a file, a column, a number or the time is invalid; the message
+            names file, column and line.
     """
     log = open_log(path, columns, forces_path, velocities_path, lenient=True)
     angles, velocities, forces = log.read()
@@ -67,7 +76,8 @@ def read_recording(
     named += f"; and {len(bad) - NAMED} more" if len(bad) > NAMED else ""
     if len(bad) > bad_rows * rows:
         raise InputError(
-            f"{len(bad)} of {rows} rows are bad: {named}; repair the log, or let `bad_rows` be "
+            f"{len(bad)} of {rows} rows are bad: {named}; repair the log, or let "
+            "`bad_rows` be "
             f"above {len(bad) / rows:.2g} (fraction), which leaves them out."
         )
     if bad:
@@ -102,7 +112,8 @@ def _find_stray_stamps(time: np.ndarray, bad: dict[int, str], table: LogTable) -
         ahead = k == 0 or time[good[k + 1]] >= time[good[k - 1]]
         row = int(good[k] if ahead else good[k + 1])
         bad[row] = (
-            f"{table.unit} {row + table.first_row} (its time {time[row]:.9g} s is out of order)"
+            f"{table.unit} {row + table.first_row} (its time {time[row]:.9g} s is out "
+            "of order)"
         )
 
 
@@ -135,7 +146,9 @@ class SamplesOnDisk(AbstractSamples):
         """Return motion and forces of all segments; they must fit into memory."""
         return joined(self.read(slice(a, b)) for a, b in self.segments)
 
-    def read_rows(self, samples: slice) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
+    def read_rows(
+        self, samples: slice
+    ) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
         """Return angles, velocities and forces of a segment's samples as they were recorded."""
         k = self._segment(samples)
         behind = self.first_rows[k] - self.segments[k][0]
@@ -163,12 +176,13 @@ def scan_log(
 ) -> Observations:
     """Open a log that need not fit into memory: CSV, Parquet, or uncompressed NPZ.
 
-    The result equals that of `read_recording` and `observe`, but the samples stay on disk. The time
-    stamps are read once to find gaps; between gaps they must be uniform. With `min_speed`, the
-    motion is read once as well.
+    The result equals that of `read_recording` and `observe`, but the samples stay on
+    disk. The time stamps are read once to find gaps; between gaps they must be uniform.
+    With `min_speed`, the motion is read once as well.
 
     Args:
-        path: File with the angles, and with all other channels that have no file of their own.
+        path: File with the angles, and with all other channels that have no file of
+            their own.
         columns: Meaning of the columns.
         robot: Robot, whose drives convert from motors to joints.
         filter: Filter of the motion, and of forces and columns, with a finite memory.
@@ -180,13 +194,14 @@ def scan_log(
         largest_gap: Longest pause that is no gap, in sample times.
         start: Start of the part that counts, from the log's first row on [s].
         stop: End of the part that counts [s].
-        progress: Callback, called with the completed fraction (0 to 1) of the pass for `min_speed`.
+        progress: Callback, called with the completed fraction (0 to 1) of the pass for
+            `min_speed`.
 
     Raises:
-        NeedsMemory: If the filter needs the whole log at once, or rows must be moved or removed
-            to make the stamps uniform: use `read_recording`.
-        InputError: If the file is of another kind, its columns are not the robot's, forces and
-            columns would be aliased, or no samples are left.
+        NeedsMemory: If the filter needs the whole log at once, or rows must be moved or
+            removed to make the stamps uniform: use `read_recording`.
+        InputError: If the file is of another kind, its columns are not the robot's,
+            forces and columns would be aliased, or no samples are left.
     """
     if columns.unwrap:
         raise NeedsMemory("`unwrap` counts the turns of whole logs")
@@ -200,7 +215,9 @@ def scan_log(
         grid = TimeGrid(columns.sample_time, ((0, rows),))
     else:
         limits = largest_gap, 0.0
-        grid = find_grid(lambda: _stamps(log), source.name, limits, first_row, in_parts=True)
+        grid = find_grid(
+            lambda: _stamps(log), source.name, limits, first_row, in_parts=True
+        )
     grid = grid.cropped(start, stop, name)
 
     def load(segments: list[tuple[int, int]]) -> SamplesOnDisk:
@@ -213,7 +230,16 @@ def scan_log(
 
     joints = log.read(0, 1)[0].shape[1]
     return prepare(
-        load, grid, joints, measured, robot, filter, decimation, min_speed, name, progress
+        load,
+        grid,
+        joints,
+        measured,
+        robot,
+        filter,
+        decimation,
+        min_speed,
+        name,
+        progress,
     )
 
 
@@ -232,7 +258,8 @@ def _stamps(log: Log) -> Iterator[np.ndarray]:
 def filter_memory(filter: AbstractFilter, sample_time: float, measured: bool) -> int:
     """Return after how many samples a filter's motion no longer depends on an angle or velocity."""
     refusal = (
-        f"`{type(filter).__name__}` needs the whole log: take another filter, or `read_recording`."
+        f"`{type(filter).__name__}` needs the whole log: take another filter, "
+        "or `read_recording`."
     )
     half = 4096
     while half <= 2**20:

@@ -34,9 +34,11 @@ class Recording(eqx.Module):
 
     Attributes:
         time: Times of the samples, uniform within each segment [s].
-        angles: Angles of joints or motors, as the robot reported them, unfiltered [rad or m].
+        angles: Angles of joints or motors, as the robot reported them, unfiltered [rad
+            or m].
         forces: Forces of joints or motors [N m or N].
-        velocities: Measured velocities, on the angles' side [rad/s or m/s]; None if not measured.
+        velocities: Measured velocities, on the angles' side [rad/s or m/s]; None if not
+            measured.
         angles_on_motor_side: Whether angles and velocities are the motors'.
         forces_on_motor_side: Whether forces are the motors'.
         segments: Half-open ranges of samples without gaps.
@@ -74,8 +76,8 @@ class Recording(eqx.Module):
     ) -> "Recording":
         """Make a recording of arrays (samples x joints) in SI units, and check them.
 
-        Repeated stamps are removed, uneven ones are interpolated on a uniform grid, and gaps split
-        the recording into segments; `notes` says what was done.
+        Repeated stamps are removed, uneven ones are interpolated on a uniform grid, and
+        gaps split the recording into segments; `notes` says what was done.
 
         Args:
             angles: Angles of joints or motors [rad or m].
@@ -85,17 +87,20 @@ class Recording(eqx.Module):
             sample_time: Time between two samples [s].
             angles_on_motor_side: Whether angles and velocities are the motors'.
             forces_on_motor_side: Whether forces are the motors'.
-            largest_gap: Longest pause that is bridged by interpolation, in sample times.
+            largest_gap: Longest pause that is bridged by interpolation, in sample
+                times.
             bridged: Pause that is bridged in any case [s].
             name: Name of the log.
             first_row: Number of the first row in its file, for messages.
 
         Raises:
-            InputError: If shapes differ, a value is not finite, time runs backwards or does not
-                advance, or there are fewer than ten samples.
+            InputError: If shapes differ, a value is not finite, time runs backwards or
+                does not advance, or there are fewer than ten samples.
         """
         if not largest_gap > 1.0:
-            raise InputError(f"`largest_gap` must be above 1 sample time, but is {largest_gap:g}.")
+            raise InputError(
+                f"`largest_gap` must be above 1 sample time, but is {largest_gap:g}."
+            )
         channels = {"angles": angles, "forces": forces, "velocities": velocities}
         shape = np.shape(angles)
         data: dict[str, Any] = {
@@ -105,15 +110,19 @@ class Recording(eqx.Module):
         samples = len(data["angles"])
         if samples < FEWEST:
             raise InputError(
-                f"`{name}` has {samples} samples, but at least {FEWEST} are needed: is the log cut?"
+                f"`{name}` has {samples} samples, but at least {FEWEST} are needed: "
+                "is the log cut?"
             )
         if (time is None) == (sample_time is None):
-            raise InputError("a recording needs either `time` or `sample_time`, and not both.")
+            raise InputError(
+                "a recording needs either `time` or `sample_time`, and not both."
+            )
         if time is not None:
             stamps = np.array(time, np.float64)
             if stamps.shape != (samples,) or not np.isfinite(stamps).all():
                 raise InputError(
-                    f"`time` of `{name}` must hold {samples} finite stamps, but has shape "
+                    f"`time` of `{name}` must hold {samples} finite stamps, but has "
+                    "shape "
                     f"{stamps.shape} or stamps that are not finite."
                 )
             limits = largest_gap, bridged
@@ -154,7 +163,9 @@ class Recording(eqx.Module):
         starts = tuple(float(self.time[a]) for a, _ in self.segments)
         return TimeGrid(self.sample_time, self.segments, starts, self.notes)
 
-    def crop(self, start: float | int = -np.inf, stop: float | int = np.inf) -> "Recording":
+    def crop(
+        self, start: float | int = -np.inf, stop: float | int = np.inf
+    ) -> "Recording":
         """Return the part from `start` [s] on and before `stop` [s], on the clock of `time`.
 
         Raises:
@@ -172,7 +183,8 @@ class Recording(eqx.Module):
         cut = round(fraction * self.samples)
         if not FEWEST <= cut <= self.samples - FEWEST:
             raise InputError(
-                f"`fraction` must leave at least {FEWEST} samples on both sides, but {fraction:g} "
+                f"`fraction` must leave at least {FEWEST} samples on both sides, but "
+                f"{fraction:g} "
                 f"of the {self.samples} samples of `{self.name}` leaves {cut}."
             )
         return self._range(0, cut), self._range(cut, self.samples)
@@ -190,7 +202,8 @@ def finite_channel(
     array = np.array(value, np.float64)
     if array.ndim != 2 or array.shape != shape:
         raise InputError(
-            f"`{key}` of `{name}` must have one row for each sample and one column for each "
+            f"`{key}` of `{name}` must have one row for each sample and one column "
+            "for each "
             f"joint, like the angles with shape {shape}, but has shape {array.shape}."
         )
     bad = np.argwhere(~(np.abs(array) <= LARGEST))
@@ -198,7 +211,8 @@ def finite_channel(
         row, joint = (int(i) for i in bad[0])
         raise InputError(
             f"`{key}` of `{name}` must be finite and below {LARGEST:g}, but are "
-            f"{array[row, joint]:.3g} for joint {joint + 1} at row {row + first_row}: check the "
+            f"{array[row, joint]:.3g} for joint {joint + 1} at row {row + first_row}: "
+            "check the "
             "unit, or repair or remove that row."
         )
     return array
@@ -219,9 +233,9 @@ def consecutive(lengths: Iterable[int]) -> tuple[tuple[int, int], ...]:
 def remove_delay(recording: Recording, seconds: float) -> Recording:
     """Remove a delay of the forces, also by a fraction of a sample.
 
-    The forces stay as they are; the angles, which are smooth, are interpolated by cubic splines to
-    the instants at which the forces acted. Samples at the ends of segments for which there are no
-    angles are dropped.
+    The forces stay as they are; the angles, which are smooth, are interpolated by cubic
+    splines to the instants at which the forces acted. Samples at the ends of segments
+    for which there are no angles are dropped.
 
     Args:
         recording: Recording whose forces are delayed.
@@ -236,7 +250,8 @@ def remove_delay(recording: Recording, seconds: float) -> Recording:
     whole = [(a, b) for a, b in recording.segments if b - a - lost >= FEWEST]
     if not whole:
         raise InputError(
-            f"the delay is {seconds:g} s, but the longest segment of `{recording.name}` lasts "
+            f"the delay is {seconds:g} s, but the longest segment of "
+            f"`{recording.name}` lasts "
             f"{max(b - a for a, b in recording.segments) * recording.sample_time:g} s."
         )
     kept = [np.arange(a + early, b - late) for a, b in whole]
@@ -255,9 +270,14 @@ def remove_delay(recording: Recording, seconds: float) -> Recording:
         time=time[samples],
         angles=shift(recording.angles),
         forces=np.asarray(recording.forces)[samples],
-        velocities=None if recording.velocities is None else shift(recording.velocities),
+        velocities=None
+        if recording.velocities is None
+        else shift(recording.velocities),
         segments=consecutive(map(len, kept)),
-        notes=(*recording.notes, f"a delay of the forces of {1e3 * seconds:.4g} ms was removed"),
+        notes=(
+            *recording.notes,
+            f"a delay of the forces of {1e3 * seconds:.4g} ms was removed",
+        ),
     )
 
 
@@ -298,7 +318,8 @@ class TimeGrid(NamedTuple):
         if left < FEWEST:
             a, b = self.ranges[-1]
             raise InputError(
-                f"`{name}` has {left} samples from {start:g} s to {stop:g} s, but at least "
+                f"`{name}` has {left} samples from {start:g} s to {stop:g} s, but at "
+                "least "
                 f"{FEWEST} are needed: it lasts from {self.start_times[0]:g} s to "
                 f"{self.start_times[-1] + (b - a - 1) * dt:g} s."
             )
@@ -314,15 +335,17 @@ def find_grid(
 ) -> TimeGrid:
     """Find the uniform grid behind time stamps; the typical step is that of the first part.
 
-    `read` yields the finite stamps [s] in consecutive parts, and is called three times; `limits`
-    are the pauses that are bridged, in sample times and in seconds. Where `in_parts`, the log is
-    too large to move or remove rows.
+    `read` yields the finite stamps [s] in consecutive parts, and is called three times;
+    `limits` are the pauses that are bridged, in sample times and in seconds. Where
+    `in_parts`, the log is too large to move or remove rows.
     """
     first = next(iter(read()), np.zeros(0))
     steps = np.diff(first)
     steps = steps[steps > 0]
     if not steps.size:
-        raise InputError(f"time of `{source}` stands still: check the column of time stamps.")
+        raise InputError(
+            f"time of `{source}` stands still: check the column of time stamps."
+        )
     origin, typical = float(first[0]), float(np.median(steps))
     spread = 1.4826 * float(np.median(np.abs(steps - typical)))
     # A gap is a pause that neither the limit nor the usual jitter explains.
@@ -335,8 +358,10 @@ def find_grid(
         repeated = np.flatnonzero(steps <= REPEATED * typical)
         if in_parts and repeated.size:
             raise NeedsMemory(
-                f"rows of `{source}` repeat the time stamp of the row before, first at row "
-                f"{row + int(repeated[0]) + 1 + first_row}: remove them, or give `sample_time`."
+                f"rows of `{source}` repeat the time stamp of the row before, first "
+                "at row "
+                f"{row + int(repeated[0]) + 1 + first_row}: remove them, or give "
+                "`sample_time`."
             )
         gaps = np.flatnonzero(steps > limit)
         starts += (row + gaps + 1).tolist()
@@ -346,30 +371,41 @@ def find_grid(
         total = total + float(regular.sum())
         count = count + len(regular)
         rows = row + len(t)
-    # Stamps are rounded numbers: a round sample time that fits them as well is the true one.
+    # Stamps are rounded numbers: a round sample time that fits them as well is the true
+    # one.
     sample_time = total / count
     short = float(f"{sample_time:.6g}")
-    sample_time = short if abs(short - sample_time) * rows < 0.01 * sample_time else sample_time
+    sample_time = (
+        short if abs(short - sample_time) * rows < 0.01 * sample_time else sample_time
+    )
     lengths = np.diff([*starts, rows]).tolist()
     stretches = zip(starts, lengths, start_times, strict=True)
     kept = {(a, a + n): t for a, n, t in stretches if n >= 4}
     if not kept:
         raise InputError(
-            f"`{source}` has no four rows in sequence: its time stamps are {typical:.6g} s apart "
-            f"at the median, with {len(pauses)} gaps; check `time_unit`, or give `sample_time`."
+            f"`{source}` has no four rows in sequence: its time stamps are "
+            f"{typical:.6g} s apart "
+            f"at the median, with {len(pauses)} gaps; check `time_unit`, or give "
+            "`sample_time`."
         )
     notes = []
     if origin != 0:
-        notes.append(f"time counts from the first row, which was stamped {origin:.9g} s")
+        notes.append(
+            f"time counts from the first row, which was stamped {origin:.9g} s"
+        )
     if pauses:
         notes.append(
-            f"{len(pauses)} gap{'s' if len(pauses) > 1 else ''} in time, the first after "
-            f"{start_times[1] - pauses[0]:.6g} s, the longest of {max(pauses):.6g} s (sample time "
+            f"{len(pauses)} gap{'s' if len(pauses) > 1 else ''} in time, the first "
+            "after "
+            f"{start_times[1] - pauses[0]:.6g} s, the longest of {max(pauses):.6g} s "
+            "(sample time "
             f"{sample_time:.6g} s), split the log into segments; a `largest_gap` above "
             f"{max(pauses) / sample_time:.3g} would bridge them"
         )
     if lost := rows - sum(b - a for a, b in kept):
-        notes.append(f"{lost} rows between gaps are too few for a segment and were left out")
+        notes.append(
+            f"{lost} rows between gaps are too few for a segment and were left out"
+        )
     grid = TimeGrid(sample_time, tuple(kept), tuple(kept.values()), tuple(notes))
     grid = grid._replace(deviation=_deviation(grid, _linked(read(), origin)))
     if in_parts and not grid.is_exact:
@@ -380,7 +416,9 @@ def find_grid(
     return grid
 
 
-def _linked(parts: Iterable[np.ndarray], origin: float) -> Iterable[tuple[np.ndarray, int]]:
+def _linked(
+    parts: Iterable[np.ndarray], origin: float
+) -> Iterable[tuple[np.ndarray, int]]:
     """Yield the times of each part behind the last one before it, and the row of the first."""
     last, row = np.zeros(0), 0
     for part in parts:
@@ -389,19 +427,27 @@ def _linked(parts: Iterable[np.ndarray], origin: float) -> Iterable[tuple[np.nda
         last, row = t[-1:], row + len(t) - 1
 
 
-def _require_forward(stamps: np.ndarray, steps: np.ndarray, row: int, source: str) -> None:
+def _require_forward(
+    stamps: np.ndarray, steps: np.ndarray, row: int, source: str
+) -> None:
     back = np.flatnonzero(steps < 0)
     if back.size:
         i = int(back[0])
         raise InputError(
-            f"time of `{source}` runs backwards from {stamps[i]:.9g} s to {stamps[i + 1]:.9g} s at "
-            f"row {row + i + 1}: sort the log, or split it where the clock was set back."
+            f"time of `{source}` runs backwards from {stamps[i]:.9g} s to "
+            f"{stamps[i + 1]:.9g} s at "
+            f"row {row + i + 1}: sort the log, or split it where the clock was set "
+            "back."
         )
 
 
 def _deviation(grid: TimeGrid, parts: Iterable[tuple[np.ndarray, int]]) -> float:
     """Return the largest deviation from the grid [s]."""
-    (first, last), start, largest = np.transpose(grid.ranges), np.array(grid.start_times), 0.0
+    (first, last), start, largest = (
+        np.transpose(grid.ranges),
+        np.array(grid.start_times),
+        0.0,
+    )
     for t, row in parts:
         rows = row + np.arange(len(t))
         k = np.maximum(np.searchsorted(first, rows, "right") - 1, 0)
@@ -416,8 +462,9 @@ def _resampling(
 ) -> tuple[float, list[np.ndarray], list[str], Callable[[np.ndarray], np.ndarray]]:
     """Return how rows come to the uniform grid behind their time stamps.
 
-    That is the time between two samples [s]; times of each segment's samples [s]; remarks; and a
-    function of a channel's rows: its samples as they are, or interpolated by cubic splines.
+    That is the time between two samples [s]; times of each segment's samples [s];
+    remarks; and a function of a channel's rows: its samples as they are, or
+    interpolated by cubic splines.
     """
     _require_forward(stamps, np.diff(stamps), first_row, source)
     kept = np.flatnonzero(np.diff(stamps, prepend=-np.inf) > 0)
@@ -432,25 +479,33 @@ def _resampling(
     if removed := len(stamps) - len(kept):
         notes.insert(
             0,
-            f"{removed} of {len(stamps)} rows repeat the time stamp of the row before and were "
-            "removed; if every row is a sample, give `sample_time` instead of the time stamps",
+            f"{removed} of {len(stamps)} rows repeat the time stamp of the row before "
+            "and were "
+            "removed; if every row is a sample, give `sample_time` instead of the "
+            "time stamps",
         )
     counts = [b - a for a, b in grid.ranges]
     if not grid.is_exact:
         missing = -sum(counts)
-        counts = [int(np.floor((t[b - 1] - t[a]) / dt + 1e-3)) + 1 for a, b in grid.ranges]
+        counts = [
+            int(np.floor((t[b - 1] - t[a]) / dt + 1e-3)) + 1 for a, b in grid.ranges
+        ]
         missing += sum(counts)
         steps = np.diff(t) / dt
         if np.abs(steps - np.round(steps)).max() <= JITTER:
             notes.append(
-                f"{missing} missing sample{'s were' if missing > 1 else ' was'} interpolated by "
+                f"{missing} missing sample{'s were' if missing > 1 else ' was'} "
+                "interpolated by "
                 "cubic splines"
             )
         else:
             notes.append(
-                f"time stamps jitter by up to {100 * grid.deviation / dt:.1f} % of the sample "
-                f"time: resampled to a uniform grid of {dt:.6g} s by cubic splines; if the robot "
-                "samples uniformly and only the stamps are late, give `sample_time` instead"
+                f"time stamps jitter by up to {100 * grid.deviation / dt:.1f} % of "
+                "the sample "
+                f"time: resampled to a uniform grid of {dt:.6g} s by cubic splines; "
+                "if the robot "
+                "samples uniformly and only the stamps are late, give `sample_time` "
+                "instead"
             )
     starts = zip(grid.start_times, counts, strict=True)
     times = [start + dt * np.arange(count) for start, count in starts]
@@ -460,6 +515,8 @@ def _resampling(
         if grid.is_exact:
             return np.concatenate([x[a:b] for a, b in grid.ranges])
         segments = zip(grid.ranges, times, strict=True)
-        return np.concatenate([CubicSpline(t[a:b], x[a:b])(at) for (a, b), at in segments])
+        return np.concatenate(
+            [CubicSpline(t[a:b], x[a:b])(at) for (a, b), at in segments]
+        )
 
     return dt, times, notes, resample

@@ -1,8 +1,9 @@
 """A small compiler: from a function of a few scalars to fused XLA, NumPy, Python, or C.
 
-It knows nothing about robots. `trace` runs an ordinary JAX function on scalars that fold constants
-and merge equal expressions; the remaining sequence of operations is a `Program`. `lower` runs it in
-JAX, `evaluate` in NumPy, `to_python` on single floats; `c_writer.CWriter` writes it in C.
+It knows nothing about robots. `trace` runs an ordinary JAX function on scalars that
+fold constants and merge equal expressions; the remaining sequence of operations is a
+`Program`. `lower` runs it in JAX, `evaluate` in NumPy, `to_python` on single floats;
+`c_writer.CWriter` writes it in C.
 """
 
 from .jax_sincos import sine_cosine as sine_cosine

@@ -1,8 +1,8 @@
 """A scalar program on rows of samples, by blocks that stay in the processor's cache.
 
-If the results of a program are stacked where they are computed, XLA copies what each of them needs
-into its own loop. Here the results of a block leave a branch as separate arrays, and are put in
-place afterwards. An accelerator takes all samples at once.
+If the results of a program are stacked where they are computed, XLA copies what each of
+them needs into its own loop. Here the results of a block leave a branch as separate
+arrays, and are put in place afterwards. An accelerator takes all samples at once.
 """
 
 import functools
@@ -34,7 +34,9 @@ def block_results(program: Program, *arrays: Array) -> tuple[Array, ...]:
         whole = jnp.concatenate([x.T for x in arrays if x.ndim == 2])
         rows = iter(fenced(whole, hidden_one(whole[0, 0])))
         inputs = [
-            [next(rows) for _ in x.T] if x.ndim == 2 else [jnp.broadcast_to(y, (block,)) for y in x]
+            [next(rows) for _ in x.T]
+            if x.ndim == 2
+            else [jnp.broadcast_to(y, (block,)) for y in x]
             for x in arrays
         ]
         return lower(program, fence=True).run(inputs, primitives(whole[0]))
@@ -73,7 +75,8 @@ def _in_blocks(program: Program, *arrays: Array) -> Float[Array, "samples out"]:
         # The last block begins earlier, so that it is as long as the others.
         start = jnp.minimum(k * BLOCK, count - BLOCK)
         parts = [
-            jax.lax.dynamic_slice_in_dim(x, start, BLOCK) if x.ndim == 2 else x for x in arrays
+            jax.lax.dynamic_slice_in_dim(x, start, BLOCK) if x.ndim == 2 else x
+            for x in arrays
         ]
         part = _packed(block_results, program, *parts)
         return jax.lax.dynamic_update_slice_in_dim(out, part, start, axis=0)
@@ -106,7 +109,9 @@ def on_rows(program: Program, *arrays: Array) -> Float[Array, "samples out"]:
             whole = [None if was else x for x, was in zip(arrays, batched, strict=True)]
 
             def one(parts):
-                return run(*(w if x is None else x for x, w in zip(parts, whole, strict=True)))
+                return run(
+                    *(w if x is None else x for x, w in zip(parts, whole, strict=True))
+                )
 
             return jax.lax.map(one, each), True
         # All become samples, but for what is common to all.
@@ -117,7 +122,9 @@ def on_rows(program: Program, *arrays: Array) -> Float[Array, "samples out"]:
                 continue
             x = x if was else x[None]
             x = x[:, None] if common else x
-            rows.append(jnp.broadcast_to(x, (size, count, x.shape[-1])).reshape(-1, x.shape[-1]))
+            rows.append(
+                jnp.broadcast_to(x, (size, count, x.shape[-1])).reshape(-1, x.shape[-1])
+            )
         return run(*rows).reshape(size, count, -1), True
 
     return run(*differing_alike(arrays))
@@ -128,7 +135,8 @@ def row_products(
 ) -> list[Float[Array, "results results"]]:
     """Return the sums over samples of products of results; the results are never stored.
 
-    A group holds positions in the packed result whose values are multiplied with each other.
+    A group holds positions in the packed result whose values are multiplied with each
+    other.
     """
     count, dtype = len(arrays[0]), arrays[0].dtype
     if count == 0:
@@ -138,13 +146,16 @@ def row_products(
         found, packed = [], program.pack(rows)
         for group in groups:
             values = [packed[k] for k in group]
-            stacked = jnp.stack([counted * x for x in values]) if group else counted[:0, None]
+            stacked = (
+                jnp.stack([counted * x for x in values]) if group else counted[:0, None]
+            )
             found.append(stacked @ stacked.T)
         return found
 
     def by_chunks(evaluate, size: int, *arrays: Array) -> list[Array]:
         def step(k: Array, sums: list[Array]) -> list[Array]:
-            # The last chunk begins earlier; samples that were counted do not count again.
+            # The last chunk begins earlier; samples that were counted do not count
+            # again.
             start = jnp.minimum(k * size, count - size)
             counted = (start + jnp.arange(size) >= k * size).astype(dtype)
             parts = [jax.lax.dynamic_slice_in_dim(x, start, size) for x in arrays]
@@ -153,7 +164,9 @@ def row_products(
 
         sizes = [(len(group), len(group)) for group in groups]
         # `where`, see `differing_alike`.
-        empty = [jnp.where(ALWAYS, jnp.zeros(x, dtype), arrays[-1][0, 0]) for x in sizes]
+        empty = [
+            jnp.where(ALWAYS, jnp.zeros(x, dtype), arrays[-1][0, 0]) for x in sizes
+        ]
         return jax.lax.fori_loop(0, -(-count // size), step, empty)
 
     return jax.lax.platform_dependent(

@@ -1,9 +1,10 @@
 """A scalar program as plain C for a real-time controller.
 
-Sine, cosine and tanh come with the code: no branches, no tables, the same time for any number. The
-functions of C compilers branch on their argument and take several times as long. Ours work on short
-arrays of a fixed length, which compilers turn into vector instructions; since a controller's call
-waits for them, their chains of operations are short.
+Sine, cosine and tanh come with the code: no branches, no tables, the same time for any
+number. The functions of C compilers branch on their argument and take several times as
+long. Ours work on short arrays of a fixed length, which compilers turn into vector
+instructions; since a controller's call waits for them, their chains of operations are
+short.
 """
 
 import math
@@ -43,22 +44,30 @@ class CWriter:
     Args:
         double: Whether numbers are `double` (otherwise `float`).
         prefix: Prefix of the names of the library's functions.
-        programs: Programs that call the library, which is made for the largest number of angles in
-            one of them; the C compiler's own functions are called if there are none.
+        programs: Programs that call the library, which is made for the largest number
+            of angles in one of them; the C compiler's own functions are called if there
+            are none.
     """
 
-    def __init__(self, double: bool, prefix: str = "", programs: Sequence[Program] = ()):
+    def __init__(
+        self, double: bool, prefix: str = "", programs: Sequence[Program] = ()
+    ):
         self.double, self.prefix = double, prefix
         self.type, self._suffix = ("double", "") if double else ("float", "f")
         self._dtype = np.float64 if double else np.float32
-        # Fewer and longer pieces of pi/2 than in JAX, for a shorter chain and smaller angles.
-        own = DOUBLE._replace(pieces=half_pi(33, 2), limit=2.0**20) if double else SINGLE
+        # Fewer and longer pieces of pi/2 than in JAX, for a shorter chain and smaller
+        # angles.
+        own = (
+            DOUBLE._replace(pieces=half_pi(33, 2), limit=2.0**20) if double else SINGLE
+        )
         self._precision = own
         self.turns = own.limit / 4
         self.widths: dict[str, int] = {}
         for name, kinds in _LIBRARY.items():
             counts = [
-                len({node.operands for node in program.nodes if node.operation in kinds})
+                len(
+                    {node.operands for node in program.nodes if node.operation in kinds}
+                )
                 for program in programs
             ]
             largest = max(counts, default=0)
@@ -78,7 +87,9 @@ class CWriter:
         text = write(rounded, unique=True, trim="0") + self._suffix
         return f"({text})" if text.startswith("-") else text
 
-    def declaration(self, name: str, inputs: Sequence[str], outputs: Sequence[str]) -> str:
+    def declaration(
+        self, name: str, inputs: Sequence[str], outputs: Sequence[str]
+    ) -> str:
         """Write the prototype of a program's function, without a semicolon."""
         _check_names([name, *inputs, *outputs])
         arguments = [f"const {self.type} *{x}" for x in inputs]
@@ -90,19 +101,26 @@ class CWriter:
     ) -> str:
         """Write a program as the definition of a C function.
 
-        The function allocates nothing and has no loops, and its choices compile to selections: its
-        run time does not depend on the data, if that of the mathematical library does not. It takes
-        a pointer for each input, then one for each output, all to numbers in C order. Every entry
-        of an output is written, constants too. All inputs are read before an output is written, so
-        that they may share memory.
+        The function allocates nothing and has no loops, and its choices compile to
+        selections: its run time does not depend on the data, if that of the
+            mathematical library does not. It takes
+        a pointer for each input, then one for each output, all to numbers in C order.
+        Every entry of an output is written, constants too. All inputs are read before
+        an output is written, so that they may share memory.
         """
         lines = self._statements(program, inputs)
-        read = {node.place[0] for node in program.nodes if node.operation is Operation.INPUT}
+        read = {
+            node.place[0] for node in program.nodes if node.operation is Operation.INPUT
+        }
         lines += [f"(void){x};" for k, x in enumerate(inputs) if k not in read]
-        for output, entries in zip(outputs, program.split(program.outputs), strict=True):
+        for output, entries in zip(
+            outputs, program.split(program.outputs), strict=True
+        ):
             if not entries:
                 lines.append(f"(void){output};")
-            lines += [f"{output}[{k}] = {self._operand(x)};" for k, x in enumerate(entries)]
+            lines += [
+                f"{output}[{k}] = {self._operand(x)};" for k, x in enumerate(entries)
+            ]
         body = "\n".join(f"    {line}" for line in lines)
         return f"{self.declaration(name, inputs, outputs)}\n{{\n{body}\n}}\n"
 
@@ -118,7 +136,8 @@ class CWriter:
             # A NaN on either side must be kept, unlike in C's fmax and fmin.
             Operation.MAXIMUM: "(({0} > {1}) | ({0} != {0})) ? {0} : {1}",
             Operation.MINIMUM: "(({0} < {1}) | ({0} != {0})) ? {0} : {1}",
-            Operation.SIGN: f"({{0}} != {{0}}) ? {{0}} : ({self.type})(({{0}} > 0) - ({{0}} < 0))",
+            Operation.SIGN: f"({{0}} != {{0}}) ? {{0}} : ({self.type})(({{0}} > 0) - "
+            f"({{0}} < 0))",
             Operation.ABSOLUTE: f"fabs{self._suffix}({{0}})",
         }
         called = [kind for name in self.widths for kind in _LIBRARY[name]]
@@ -131,7 +150,9 @@ class CWriter:
         for stage in range(max(stages, default=0) + 1):
             nodes = [k for k, s in enumerate(stages) if s == stage]
             for name in self.widths:
-                batch = [k for k in nodes if program.nodes[k].operation in _LIBRARY[name]]
+                batch = [
+                    k for k in nodes if program.nodes[k].operation in _LIBRARY[name]
+                ]
                 lines += self._call(program, name, batch, stage) if batch else []
             for k in nodes:
                 node = program.nodes[k]
@@ -147,7 +168,9 @@ class CWriter:
                 lines.append(f"const {kind} t{k} = {text};")
         return lines
 
-    def _call(self, program: Program, name: str, nodes: Sequence[int], stage: int) -> list[str]:
+    def _call(
+        self, program: Program, name: str, nodes: Sequence[int], stage: int
+    ) -> list[str]:
         """Write a call of the library for several nodes, and its results as these nodes."""
         width = self.widths[name]
         arguments = list(dict.fromkeys(program.nodes[k].operands[0] for k in nodes))
@@ -199,20 +222,28 @@ class CWriter:
     def _polynomial(self, coefficients: Sequence[float], powers: Sequence[str]) -> str:
         """Write a polynomial in Estrin's scheme; its chain grows with the logarithm of the degree.
 
-        Coefficients begin with the lowest power; the `powers` are the names of x, x^2, x^4, ...
+        Coefficients begin with the lowest power; the `powers` are the names of x, x^2,
+        x^4, ...
         """
         terms = [self.number(c) for c in coefficients]
         for power in powers:
             pairs = [terms[k : k + 2] for k in range(0, len(terms), 2)]
-            terms = [f"({p[0]} + {power} * {p[1]})" if len(p) == 2 else p[0] for p in pairs]
+            terms = [
+                f"({p[0]} + {power} * {p[1]})" if len(p) == 2 else p[0] for p in pairs
+            ]
         return terms[0]
 
 
 def _check_names(names: list[str]) -> None:
     for name in names:
-        if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name) or _RESERVED.fullmatch(name):
+        if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name) or _RESERVED.fullmatch(
+            name
+        ):
             raise InputError(
-                f"names in C code must be identifiers of C and not reserved, but one is {name!r}."
+                "names in C code must be identifiers of C and not reserved, but one "
+                f"is {name!r}."
             )
     if len(set(names)) < len(names):
-        raise InputError(f"names in C code must differ from each other, but are {names}.")
+        raise InputError(
+            f"names in C code must differ from each other, but are {names}."
+        )

@@ -10,7 +10,18 @@ from jaxid.errors import InputError
 
 from .numpy_evaluation import evaluate
 from .program import Program, Reference, assemble, record
-from .scalar import Graph, Operand, Operation, Scalar, add, apply, divide, multiply, negate, select
+from .scalar import (
+    Graph,
+    Operand,
+    Operation,
+    Scalar,
+    add,
+    apply,
+    divide,
+    multiply,
+    negate,
+    select,
+)
 
 _UNARY: dict[Operation, Callable[[Operand, Operand], Operand]] = {
     Operation.ABSOLUTE: lambda x, y: apply(Operation.SIGN, x),
@@ -34,11 +45,13 @@ _UNARY: dict[Operation, Callable[[Operand, Operand], Operand]] = {
 """Derivatives of functions of one argument, by argument and result."""
 
 
-def pull_back(program: Program, weights: np.ndarray, *arrays: np.ndarray) -> list[np.ndarray]:
+def pull_back(
+    program: Program, weights: np.ndarray, *arrays: np.ndarray
+) -> list[np.ndarray]:
     """Return the derivative of a weighted sum of a program's results by each input, in NumPy.
 
-    Weights of the packed result, and arrays with the shapes of the inputs, are followed by any
-    batch axes.
+    Weights of the packed result, and arrays with the shapes of the inputs, are followed
+    by any batch axes.
     """
     return list(evaluate(gradient_program(program), *arrays, weights))
 
@@ -51,7 +64,9 @@ def gradient_program(program: Program) -> Program:
     """
     graph, number = Graph(), len(program.input_shapes)
     # Inputs are loaded before the first operation, so that they come first.
-    weights = [graph.node(Operation.INPUT, number, k) for k in range(len(program.outputs))]
+    weights = [
+        graph.node(Operation.INPUT, number, k) for k in range(len(program.outputs))
+    ]
     scalars = record(program, graph)
 
     def operand(x: Reference) -> Operand:
@@ -67,7 +82,9 @@ def gradient_program(program: Program) -> Program:
         if node.operation is Operation.INPUT:
             found[node.place] = slope
         elif slope != 0.0:
-            passed = _slopes(node.operation, tuple(map(operand, node.operands)), scalars[k], slope)
+            passed = _slopes(
+                node.operation, tuple(map(operand, node.operands)), scalars[k], slope
+            )
             for x, more in zip(node.operands, passed, strict=True):
                 if isinstance(x, int):
                     slopes[x] = add(slopes[x], more)

@@ -19,14 +19,16 @@ MAX_BYTES = 2**28
 def keep_compiled(folder: str | Path | None = None) -> Path | None:
     """Store compiled functions on disk, where the next process finds them.
 
-    The commands call it; call it first in a notebook. A cache that JAX was given otherwise
-    (`JAX_COMPILATION_CACHE_DIR`) stays in use. Functions lie in a folder of their own, which only
-    its owner can read or write, for JAX runs what it finds there. The least recently used ones are
-    removed when they take more than 256 MiB; no other file is ever touched.
+    The commands call it; call it first in a notebook. A cache that JAX was given
+    otherwise (`JAX_COMPILATION_CACHE_DIR`) stays in use. Functions lie in a folder of
+    their own, which only its owner can read or write, for JAX runs what it finds there.
+    The least recently used ones are removed when they take more than 256 MiB; no other
+    file is ever touched.
 
     Args:
-        folder: Folder above that of the cache. If None, the one in the environment variable
-            `JAXID_CACHE_DIR` (`off` turns the cache off), or `jaxid` in the user's cache folder.
+        folder: Folder above that of the cache. If None, the one in the environment
+            variable `JAXID_CACHE_DIR` (`off` turns the cache off), or `jaxid` in the
+            user's cache folder.
 
     Returns:
         Folder in use; None if the cache is off or nothing can be written there.
@@ -38,7 +40,12 @@ def keep_compiled(folder: str | Path | None = None) -> Path | None:
     if folder is None and present:
         return Path(present)
     variable = os.environ.get(VARIABLE)
-    turned_off = variable is not None and variable.strip().lower() in ("", "0", "off", "none")
+    turned_off = variable is not None and variable.strip().lower() in (
+        "",
+        "0",
+        "off",
+        "none",
+    )
     if folder is None and turned_off:
         return None
     above = Path(folder or variable or user_cache()).expanduser().absolute()
@@ -66,7 +73,9 @@ def user_cache() -> Path:
         return home / "Library" / "Caches" / "jaxid"
     if sys.platform == "win32":
         local = os.environ.get("LOCALAPPDATA")
-        return (Path(local) if local else home / "AppData" / "Local") / "jaxid" / "Cache"
+        return (
+            (Path(local) if local else home / "AppData" / "Local") / "jaxid" / "Cache"
+        )
     xdg = Path(os.environ.get("XDG_CACHE_HOME", ""))
     return (xdg if xdg.is_absolute() else home / ".cache") / "jaxid"
 
@@ -78,10 +87,14 @@ def _require_private(folder: Path) -> None:
             path.mkdir()
             path.chmod(0o700)
     status = folder.stat()
-    if hasattr(os, "getuid") and (status.st_uid != os.getuid() or status.st_mode & 0o022):
+    if hasattr(os, "getuid") and (
+        status.st_uid != os.getuid() or status.st_mode & 0o022
+    ):
         raise InputError(
-            f"`{folder}` belongs to somebody else, or others can write to it, but code from there "
-            f"is run: give {VARIABLE} a folder of your own, or turn the cache off with `off`."
+            f"`{folder}` belongs to somebody else, or others can write to it, but "
+            "code from there "
+            f"is run: give {VARIABLE} a folder of your own, or turn the cache off "
+            "with `off`."
         )
 
 
@@ -92,7 +105,9 @@ def _remove_oldest(folder: Path, max_bytes: int) -> None:
         with contextlib.suppress(FileNotFoundError):
             status = path.stat()
             if path.is_file():
-                files.append((max(status.st_atime, status.st_mtime), status.st_size, path))
+                files.append(
+                    (max(status.st_atime, status.st_mtime), status.st_size, path)
+                )
     size = sum(bytes_ for _, bytes_, _ in files)
     for _, bytes_, path in sorted(files):
         if size > max_bytes:

@@ -1,8 +1,8 @@
 """Sine and cosine together, by Cody-Waite reduction and polynomials.
 
-XLA's own pair costs several times as much in float64 on a CPU. The error, tested against exact
-series, is at most 1.5e-16 (float64) for |x| up to 3e9, or 1e-7 (float32) for |x| up to 1e5; beyond
-that, and for x infinite or NaN, the result is NaN.
+XLA's own pair costs several times as much in float64 on a CPU. The error, tested
+against exact series, is at most 1.5e-16 (float64) for |x| up to 3e9, or 1e-7 (float32)
+for |x| up to 1e5; beyond that, and for x infinite or NaN, the result is NaN.
 """
 
 import functools
@@ -36,11 +36,13 @@ class Precision(NamedTuple):
     pieces: tuple[float, ...]  # parts of pi/2, the largest first
     limit: float  # largest number of quarter turns
     sine: tuple[float, ...]  # coefficients of the sine's polynomial, lowest power first
-    cosine: tuple[float, ...]  # coefficients of the cosine's polynomial, lowest power first
+    cosine: tuple[
+        float, ...
+    ]  # coefficients of the cosine's polynomial, lowest power first
 
 
-# Minimax coefficients on |r| <= pi/4 (Remez exchange in 60 digits, then rounded), lowest power
-# of z = r^2 first: sin r = r + r z P(z) with relative error 4e-18, and
+# Minimax coefficients on |r| <= pi/4 (Remez exchange in 60 digits, then rounded),
+# lowest power of z = r^2 first: sin r = r + r z P(z) with relative error 4e-18, and
 # cos r = 1 - z/2 + z^2 Q(z) with relative error 6e-20; in float32 4e-9 and 1e-10.
 DOUBLE = Precision(
     half_pi(22, 3),
@@ -72,7 +74,9 @@ SINGLE = Precision(
 
 def _horner(coefficients: tuple[float, ...], z: Array) -> Array:
     last, *others = reversed(coefficients)
-    return functools.reduce(lambda total, c: total * z + c, others, jnp.full_like(z, last))
+    return functools.reduce(
+        lambda total, c: total * z + c, others, jnp.full_like(z, last)
+    )
 
 
 @jax.custom_jvp
@@ -84,7 +88,8 @@ def sine_cosine(x: Array) -> tuple[Array, Array]:
     r = x
     for piece in leading:
         r = r - turns * piece
-    # The steps above are exact; the rest is summed first, so that r is rounded only once.
+    # The steps above are exact; the rest is summed first, so that r is rounded only
+    # once.
     r = r - (turns * middle + turns * last)
     z = r * r
     s = r + r * (z * _horner(precision.sine, z))

@@ -62,14 +62,21 @@ class OperationCounts(NamedTuple):
 class Program:
     """A function as a sequence of scalar operations; made by `trace`.
 
-    Equality and hash are by identity, so that a program can be static metadata under `jit`.
+    Equality and hash are by identity, so that a program can be static metadata under
+    `jit`.
     """
 
-    input_shapes: tuple[tuple[int, ...], ...]  # shapes of the inputs, without batch axes
-    nodes: tuple[Node, ...] = field(repr=False)  # operations; each one reads only nodes before it
+    input_shapes: tuple[
+        tuple[int, ...], ...
+    ]  # shapes of the inputs, without batch axes
+    nodes: tuple[Node, ...] = field(
+        repr=False
+    )  # operations; each one reads only nodes before it
     # packed result: for each entry of each output, in order, a node or a constant
     outputs: tuple[Reference, ...] = field(repr=False)
-    output_shapes: tuple[tuple[int, ...], ...]  # shapes of the outputs, without batch axes
+    output_shapes: tuple[
+        tuple[int, ...], ...
+    ]  # shapes of the outputs, without batch axes
     structure: Any = field(repr=False)  # pyTree structure of the function's result
 
     @functools.cached_property
@@ -78,7 +85,9 @@ class Program:
         operations = Counter(node.operation for node in self.nodes)
 
         def count(*traits: str) -> int:
-            return sum(n for x, n in operations.items() if x.traits.intersection(traits))
+            return sum(
+                n for x, n in operations.items() if x.traits.intersection(traits)
+            )
 
         return OperationCounts(
             multiplications=operations[Operation.MULTIPLY],
@@ -105,7 +114,9 @@ class Program:
         """Nodes of the packed result, and for each entry the number of its node, or -1."""
         numbers: dict[int, int] = {}
         nodes = (x if isinstance(x, int) else None for x in self.outputs)
-        entries = [-1 if x is None else numbers.setdefault(x, len(numbers)) for x in nodes]
+        entries = [
+            -1 if x is None else numbers.setdefault(x, len(numbers)) for x in nodes
+        ]
         return tuple(numbers), np.array(entries, int)
 
     def pack(self, distinct: Sequence[Any]) -> list[Any]:
@@ -116,7 +127,9 @@ class Program:
     @functools.cached_property
     def nonzeros(self) -> Any:
         """Boolean arrays in the structure of the outputs, False where an entry is always 0."""
-        varies = np.array([not (isinstance(x, float) and x == 0) for x in self.outputs], bool)
+        varies = np.array(
+            [not (isinstance(x, float) and x == 0) for x in self.outputs], bool
+        )
         return self.unpack(varies)
 
     def split(self, packed: Any) -> list[Any]:
@@ -124,29 +137,38 @@ class Program:
         ends = np.cumsum([math.prod(shape) for shape in self.output_shapes], dtype=int)
         return [packed[a:b] for a, b in zip([0, *ends], ends, strict=False)]
 
-    def align(self, arrays: Sequence[Any], xp: ModuleType) -> tuple[list[Any], tuple[int, ...]]:
+    def align(
+        self, arrays: Sequence[Any], xp: ModuleType
+    ) -> tuple[list[Any], tuple[int, ...]]:
         """Return the inputs with their own axes merged and the batch behind; the batch's shape."""
         if len(arrays) != len(self.input_shapes):
             wanted = len(self.input_shapes)
-            raise InputError(f"The program takes {wanted} arrays, but got {len(arrays)}.")
+            raise InputError(
+                f"The program takes {wanted} arrays, but got {len(arrays)}."
+            )
         batches = []
         for k, (x, expected) in enumerate(zip(arrays, self.input_shapes, strict=True)):
             if x.shape[: len(expected)] != expected:
                 raise InputError(
-                    f"Input {k} must have shape {expected}, but has {x.shape}: put the batch last."
+                    f"Input {k} must have shape {expected}, but has {x.shape}: put "
+                    "the batch last."
                 )
             batches.append(x.shape[len(expected) :])
         batch = np.broadcast_shapes(*batches) if batches else ()
         entries = []
         for x, shape, own in zip(arrays, self.input_shapes, batches, strict=True):
             size, missing = math.prod(shape), (1,) * (len(batch) - len(own))
-            entries.append(xp.broadcast_to(x.reshape(size, *missing, *own), (size, *batch)))
+            entries.append(
+                xp.broadcast_to(x.reshape(size, *missing, *own), (size, *batch))
+            )
         return entries, batch
 
     def unpack(self, packed: Any) -> Any:
         """Return an array [entries, *batch] in the structure of the traced function's result."""
         parts = zip(self.split(packed), self.output_shapes, strict=True)
-        leaves = [entries.reshape((*shape, *packed.shape[1:])) for entries, shape in parts]
+        leaves = [
+            entries.reshape((*shape, *packed.shape[1:])) for entries, shape in parts
+        ]
         return jax.tree.unflatten(self.structure, leaves)
 
 
@@ -170,7 +192,9 @@ def assemble(
         else Node(s.operation, tuple(map(reference, s.operands)))
         for s in scalars
     )
-    return Program(input_shapes, nodes, tuple(map(reference, outputs)), output_shapes, structure)
+    return Program(
+        input_shapes, nodes, tuple(map(reference, outputs)), output_shapes, structure
+    )
 
 
 def record(program: Program, graph: Graph) -> list[Scalar]:
@@ -178,7 +202,10 @@ def record(program: Program, graph: Graph) -> list[Scalar]:
     scalars: list[Scalar] = []
     for node in program.nodes:
         is_input = node.operation is Operation.INPUT
-        known = (scalars[x] if isinstance(x, int) and not is_input else x for x in node.operands)
+        known = (
+            scalars[x] if isinstance(x, int) and not is_input else x
+            for x in node.operands
+        )
         scalars.append(graph.node(node.operation, *known))
     return scalars
 
@@ -188,4 +215,6 @@ def select_outputs(program: Program, entries: np.ndarray) -> Program:
     scalars = record(program, Graph())
     chosen = (program.outputs[k] for k in entries.ravel())
     outputs = [scalars[x] if isinstance(x, int) else x for x in chosen]
-    return assemble(program.input_shapes, outputs, (entries.shape,), jax.tree.structure(0))
+    return assemble(
+        program.input_shapes, outputs, (entries.shape,), jax.tree.structure(0)
+    )

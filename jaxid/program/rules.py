@@ -47,7 +47,9 @@ def with_derivatives_of(plain: Callable, run: Callable) -> Callable:
             return plain(*arrays)
 
         return jax.jvp(
-            of_moving, tuple(primals[k] for k in moving), tuple(tangents[k] for k in moving)
+            of_moving,
+            tuple(primals[k] for k in moving),
+            tuple(tangents[k] for k in moving),
         )
 
     found.defjvp(derivative, symbolic_zeros=True)
@@ -57,8 +59,8 @@ def with_derivatives_of(plain: Callable, run: Callable) -> Callable:
 def divided(function: Callable) -> Callable:
     """Return a function of arrays with one leading axis, which devices divide among themselves.
 
-    Each device computes what belongs to its part of the axis, and nothing moves between them: the
-    results have the same axis.
+    Each device computes what belongs to its part of the axis, and nothing moves between
+    them: the results have the same axis.
     """
 
     @custom_vmap
@@ -101,7 +103,9 @@ def _divisible(function: Callable, whole: Callable, constants: int) -> Callable:
         return mesh, part, jax.tree.map(lambda _: own, results), tuple(given)
 
     def rule(_: Any, arguments: Any, results: Any) -> str:
-        names = iter(f"{a}{b}" for a in string.ascii_lowercase for b in string.ascii_lowercase)
+        names = iter(
+            f"{a}{b}" for a in string.ascii_lowercase for b in string.ascii_lowercase
+        )
 
         def axes(x: Any, divided: bool) -> str:
             own = [next(names) for _ in x.shape]

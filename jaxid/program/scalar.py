@@ -1,14 +1,14 @@
 """Scalar expressions, simplified while they are built and again when all uses are known.
 
-Equal expressions are the same object: each one is looked up in the table of its `Graph` before it
-is made. A graph belongs to one trace and is freed with it.
+Equal expressions are the same object: each one is looked up in the table of its `Graph`
+before it is made. A graph belongs to one trace and is freed with it.
 
-The rules keep the value of every finite computation up to the rounding of one operation. They fold
-`0 x` and `x - x` to 0, so that a NaN or an infinity in x can disappear from the result: check
-inputs beforehand.
+The rules keep the value of every finite computation up to the rounding of one
+operation. They fold `0 x` and `x - x` to 0, so that a NaN or an infinity in x can
+disappear from the result: check inputs beforehand.
 
-With all uses known, `c x + c y` becomes `c (x + y)` where nothing else needs the products, and
-`-(x - y)` becomes `y - x` where nothing else needs the difference.
+With all uses known, `c x + c y` becomes `c (x + y)` where nothing else needs the
+products, and `-(x - y)` becomes `y - x` where nothing else needs the difference.
 """
 
 import enum
@@ -22,8 +22,9 @@ import numpy as np
 class Operation(enum.StrEnum):
     """A scalar operation; where JAX has the same elementwise primitive, its name is the value.
 
-    Traits serve simplification and counting: `odd`, `even`, `commutative`, `truth` (the result is a
-    truth value), `choice` (a selection), `function` (as expensive as a library's function).
+    Traits serve simplification and counting: `odd`, `even`, `commutative`, `truth` (the
+    result is a truth value), `choice` (a selection), `function` (as expensive as a
+    library's function).
     """
 
     numpy: Any  # function on NumPy arrays; `jax.numpy` has one of the same name
@@ -33,7 +34,11 @@ class Operation(enum.StrEnum):
     def __new__(cls, name: str, numpy: Any = None, infix: str = "", traits: str = ""):  # noqa: D102
         member = str.__new__(cls, name)
         member._value_ = name
-        member.numpy, member.infix, member.traits = numpy, infix, frozenset(traits.split())
+        member.numpy, member.infix, member.traits = (
+            numpy,
+            infix,
+            frozenset(traits.split()),
+        )
         return member
 
     INPUT = "input", None
@@ -78,7 +83,10 @@ class Operation(enum.StrEnum):
             return self.numpy(*operands).item()
 
     def spell(
-        self, operands: Sequence[str], formats: Mapping["Operation", str], suffix: str = ""
+        self,
+        operands: Sequence[str],
+        formats: Mapping["Operation", str],
+        suffix: str = "",
     ) -> str:
         """Write the operation as an expression of a programming language."""
         if self.infix:
@@ -209,7 +217,9 @@ def divide(x: Operand, y: Operand) -> Operand:
     if not isinstance(x, Scalar) and x == 0:
         return 0.0
     (x_negated, x), (y_negated, y) = _magnitude(x), _magnitude(y)
-    quotient = y.graph.node(Operation.DIVIDE, float(x) if not isinstance(x, Scalar) else x, y)
+    quotient = y.graph.node(
+        Operation.DIVIDE, float(x) if not isinstance(x, Scalar) else x, y
+    )
     return quotient if x_negated == y_negated else negate(quotient)
 
 
@@ -274,15 +284,22 @@ def apply(operation: Operation, *operands: Operand) -> Operand:
         result = graph.node(operation, x)
         return negate(result) if negated and "odd" in operation.traits else result
     if "commutative" in operation.traits:
-        operands = tuple(sorted(operands, key=lambda x: x.index if isinstance(x, Scalar) else -1))
-        if operation in (Operation.MAXIMUM, Operation.MINIMUM) and operands[0] is operands[1]:
+        operands = tuple(
+            sorted(operands, key=lambda x: x.index if isinstance(x, Scalar) else -1)
+        )
+        if (
+            operation in (Operation.MAXIMUM, Operation.MINIMUM)
+            and operands[0] is operands[1]
+        ):
             return operands[0]
     return graph.node(operation, *operands)
 
 
 def is_truth(x: Operand) -> bool:
     """Return whether x is a truth value, not a number."""
-    return "truth" in x.operation.traits if isinstance(x, Scalar) else isinstance(x, bool)
+    return (
+        "truth" in x.operation.traits if isinstance(x, Scalar) else isinstance(x, bool)
+    )
 
 
 def as_number(x: Operand) -> Operand:
@@ -366,7 +383,8 @@ class _Rewriting:
             elif scalar.operation is Operation.INPUT:
                 self.new[scalar] = scalar
             else:
-                # `_rebuild` would restore the canonical order, and with it the negation.
+                # `_rebuild` would restore the canonical order, and with it the
+                # negation.
                 operands = map(self._rewritten, scalar.operands)
                 self.new[scalar] = scalar.graph.node(scalar.operation, *operands)
         return [self._rewritten(x) for x in self.outputs]
@@ -397,24 +415,34 @@ class _Rewriting:
         products = [
             (k, x)
             for k, (_, x) in enumerate(terms)
-            if isinstance(x, Scalar) and self._is_used_once(x) and x.operation is Operation.MULTIPLY
+            if isinstance(x, Scalar)
+            and self._is_used_once(x)
+            and x.operation is Operation.MULTIPLY
         ]
         factored: list[_Term] = []
         used: set[int] = set()
         while True:
-            counts = Counter(f for k, x in products if k not in used for f in set(x.operands))
+            counts = Counter(
+                f for k, x in products if k not in used for f in set(x.operands)
+            )
             factor, count = max(
                 counts.items(), key=lambda c: (c[1], _order(c[0])), default=(0.0, 0)
             )
             if count < 2:
                 break
-            group = [(k, x) for k, x in products if k not in used and factor in x.operands]
-            rest = [(terms[k][0], self._rewritten(_cofactor(x, factor))) for k, x in group]
+            group = [
+                (k, x) for k, x in products if k not in used and factor in x.operands
+            ]
+            rest = [
+                (terms[k][0], self._rewritten(_cofactor(x, factor))) for k, x in group
+            ]
             used.update(k for k, _ in group)
             factored.append((False, multiply(self._rewritten(factor), _sum(rest))))
         if not used:
             return None
-        others = [(n, self._rewritten(x)) for k, (n, x) in enumerate(terms) if k not in used]
+        others = [
+            (n, self._rewritten(x)) for k, (n, x) in enumerate(terms) if k not in used
+        ]
         return others + factored
 
 

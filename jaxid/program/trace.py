@@ -1,8 +1,8 @@
 """Translation of a JAX function into a scalar program: its jaxpr runs on arrays of scalars.
 
-Primitives that only move entries of an array are written out for NumPy if they are common; the
-others (gather, scatter, dynamic slices) move the *positions* of the entries with JAX itself, and
-the entries follow.
+Primitives that only move entries of an array are written out for NumPy if they are
+common; the others (gather, scatter, dynamic slices) move the *positions* of the entries
+with JAX itself, and the entries follow.
 """
 
 import functools
@@ -60,7 +60,9 @@ def _pad(x: np.ndarray, filler: np.ndarray, *, padding_config) -> np.ndarray:
     for axis, (low, high, interior) in enumerate(padding_config):
         x = np.moveaxis(x, axis, 0)
         spread = max(len(x) + (len(x) - 1) * interior, 0)
-        padded = np.full((max(low, 0) + spread + max(high, 0), *x.shape[1:]), filler, x.dtype)
+        padded = np.full(
+            (max(low, 0) + spread + max(high, 0), *x.shape[1:]), filler, x.dtype
+        )
         padded[max(low, 0) : max(low, 0) + spread : interior + 1] = x
         x = np.moveaxis(padded[max(-low, 0) : len(padded) - max(-high, 0)], 0, axis)
     return x
@@ -115,12 +117,15 @@ def _on_numbers(equation: JaxprEqn, *operands: np.ndarray) -> list[np.ndarray]:
     if primitive in _IN_NUMPY and exact and len(operands) <= 3:
         with np.errstate(all="ignore"):
             result = _IN_NUMPY[primitive](*operands)
-            return [np.asarray(result, getattr(equation.outvars[0].aval, "dtype", None))]
+            return [
+                np.asarray(result, getattr(equation.outvars[0].aval, "dtype", None))
+            ]
     if primitive == "iota":
         shape, axis = params["shape"], params["dimension"]
         return [np.indices(shape, params["dtype"])[axis]]
     with jax.ensure_compile_time_eval():
-        # A NumPy array would take the precision of the process; a JAX array keeps its own.
+        # A NumPy array would take the precision of the process; a JAX array keeps its
+        # own.
         arrays = [jax.numpy.asarray(x, x.dtype) for x in operands]
         results = equation.primitive.bind(*arrays, **params)
         results = results if equation.primitive.multiple_results else [results]
@@ -140,7 +145,8 @@ def _move_by_index(
     (moved,) = _on_numbers(equation, *labels)
     if not ((moved >= 0) & (moved < start)).all():
         raise InputError(
-            f"`trace` met an index outside of its array in `{equation.primitive}`: correct it."
+            f"`trace` met an index outside of its array in `{equation.primitive}`: "
+            "correct it."
         )
     return np.concatenate(entries)[moved.astype(int)]
 
@@ -168,7 +174,8 @@ def _operation(operation: Operation) -> np.ufunc:
 
 
 _add, _subtract, _multiply = (
-    _each(f, 2) for f in (scalar.add, lambda x, y: scalar.add(x, scalar.negate(y)), scalar.multiply)
+    _each(f, 2)
+    for f in (scalar.add, lambda x, y: scalar.add(x, scalar.negate(y)), scalar.multiply)
 )
 _maximum, _minimum = _operation(Operation.MAXIMUM), _operation(Operation.MINIMUM)
 _select = _each(scalar.select, 3)
@@ -185,10 +192,16 @@ def _dot_general(x: np.ndarray, y: np.ndarray, *, dimension_numbers, **_) -> np.
     free_x = [k for k in range(x.ndim) if k not in (*contracted_x, *batch_x)]
     free_y = [k for k in range(y.ndim) if k not in (*contracted_y, *batch_y)]
     shared = [x.shape[k] for k in batch_x]
-    rows, columns = (math.prod(a.shape[k] for k in free) for a, free in ((x, free_x), (y, free_y)))
+    rows, columns = (
+        math.prod(a.shape[k] for k in free) for a, free in ((x, free_x), (y, free_y))
+    )
     terms = math.prod(x.shape[k] for k in contracted_x)
-    left = x.transpose((*batch_x, *free_x, *contracted_x)).reshape((*shared, rows, 1, terms))
-    right = y.transpose((*batch_y, *free_y, *contracted_y)).reshape((*shared, 1, columns, terms))
+    left = x.transpose((*batch_x, *free_x, *contracted_x)).reshape(
+        (*shared, rows, 1, terms)
+    )
+    right = y.transpose((*batch_y, *free_y, *contracted_y)).reshape(
+        (*shared, 1, columns, terms)
+    )
     total = _add.reduce(_multiply(left, right), axis=-1, initial=0.0)
     return np.asarray(total, object).reshape(
         (*shared, *(x.shape[k] for k in free_x), *(y.shape[k] for k in free_y))
@@ -225,7 +238,9 @@ _ARITHMETIC: dict[str, Callable] = {
         lambda total, next_c: _add(_multiply(total, x), next_c), reversed(c)
     ),
     "div": _each(scalar.divide, 2),
-    "rsqrt": _each(lambda x: scalar.divide(1.0, scalar.apply(Operation.SQUARE_ROOT, x)), 1),
+    "rsqrt": _each(
+        lambda x: scalar.divide(1.0, scalar.apply(Operation.SQUARE_ROOT, x)), 1
+    ),
     "pow": _each(scalar.power, 2),
     "integer_pow": lambda x, *, y: _each(lambda e: scalar.integer_power(e, y), 1)(x),
     "logistic": _each(
@@ -256,7 +271,8 @@ def _convert(x: np.ndarray, dtype: np.dtype) -> np.ndarray:
     if truth or np.issubdtype(dtype, np.floating):
         return np.asarray(_each(scalar.as_number, 1)(x), object)
     raise InputError(
-        f"`trace` cannot translate a conversion to {dtype}: a program computes with real numbers."
+        f"`trace` cannot translate a conversion to {dtype}: a program computes with "
+        "real numbers."
     )
 
 
@@ -274,7 +290,8 @@ def _translate(equation: JaxprEqn, operands: list[np.ndarray]) -> list[np.ndarra
         carriers = _INDEXED[name]
         if any(_is_symbolic(x) for k, x in enumerate(operands) if k not in carriers):
             raise InputError(
-                f"`trace` cannot translate `{name}` with a variable index: use constant integers."
+                f"`trace` cannot translate `{name}` with a variable index: use "
+                "constant integers."
             )
         if "add" in name:
             return [_scatter_add(equation, operands)]
@@ -283,26 +300,38 @@ def _translate(equation: JaxprEqn, operands: list[np.ndarray]) -> list[np.ndarra
         return [_select_n(operands[0], *map(_entries, operands[1:]))]
     aval: Any = equation.outvars[0].aval
     if name in ("div", "pow") and np.issubdtype(aval.dtype, np.integer):
-        raise InputError(f"`trace` cannot translate `{name}` of integers: use real numbers.")
+        raise InputError(
+            f"`trace` cannot translate `{name}` of integers: use real numbers."
+        )
     if name in _ARITHMETIC:
-        with_parameters = name in ("integer_pow", "dot_general", "reduce_sum", "reduce_prod")
+        with_parameters = name in (
+            "integer_pow",
+            "dot_general",
+            "reduce_sum",
+            "reduce_prod",
+        )
         parameters = equation.params if with_parameters else {}
         result = _ARITHMETIC[name](*map(_entries, operands), **parameters)
         results = result if equation.primitive.multiple_results else [result]
         return [np.asarray(x, object) for x in results]
-    reason = _UNSUPPORTED.get(name, "it is not elementwise arithmetic, a sum, or a move of entries")
+    reason = _UNSUPPORTED.get(
+        name, "it is not elementwise arithmetic, a sum, or a move of entries"
+    )
     raise InputError(f"`trace` cannot translate the JAX primitive `{name}`: {reason}.")
 
 
 def _known(constant: object) -> np.ndarray:
     if isinstance(constant, Tracer):
         raise InputError(
-            "`trace`: the function closes over a value that JAX is tracing: pass it as an input."
+            "`trace`: the function closes over a value that JAX is tracing: pass it "
+            "as an input."
         )
     return np.asarray(constant)
 
 
-def _run(jaxpr: Jaxpr, constants: list, arguments: list[np.ndarray]) -> list[np.ndarray]:
+def _run(
+    jaxpr: Jaxpr, constants: list, arguments: list[np.ndarray]
+) -> list[np.ndarray]:
     names = [*jaxpr.constvars, *jaxpr.invars]
     values = dict(zip(names, [*map(_known, constants), *arguments], strict=True))
 
@@ -318,7 +347,9 @@ def _run(jaxpr: Jaxpr, constants: list, arguments: list[np.ndarray]) -> list[np.
         if inner is not None and primitive not in _UNSUPPORTED:
             closed = isinstance(inner, ClosedJaxpr)
             results = _run(
-                inner.jaxpr if closed else inner, inner.consts if closed else [], operands
+                inner.jaxpr if closed else inner,
+                inner.consts if closed else [],
+                operands,
             )
         elif primitive in _MOVEMENTS:
             results = _MOVEMENTS[primitive](*operands, **equation.params)
@@ -331,7 +362,8 @@ def _run(jaxpr: Jaxpr, constants: list, arguments: list[np.ndarray]) -> list[np.
             results = _on_numbers(equation, *operands)
         dtype = object if symbolic else None
         values.update(
-            (name, np.asarray(x, dtype)) for name, x in zip(equation.outvars, results, strict=True)
+            (name, np.asarray(x, dtype))
+            for name, x in zip(equation.outvars, results, strict=True)
         )
     return [read(name) for name in jaxpr.outvars]
 
@@ -339,26 +371,34 @@ def _run(jaxpr: Jaxpr, constants: list, arguments: list[np.ndarray]) -> list[np.
 def trace(function: Callable, *inputs: tuple[int, ...] | np.ndarray) -> Program:
     """Translate a function of a few arrays into a scalar program.
 
-    The function is ordinary JAX: arithmetic, elementwise functions, `jnp.where` and comparisons,
-    sums, matrix products, and movements of entries; also `jvp`, `jacfwd`, `vjp` and
-    `linear_transpose` of these. Loops are Python loops, which the trace unrolls. Constants are
-    folded and equal expressions are merged.
+    The function is ordinary JAX: arithmetic, elementwise functions, `jnp.where` and
+    comparisons, sums, matrix products, and movements of entries; also `jvp`, `jacfwd`,
+    `vjp` and `linear_transpose` of these. Loops are Python loops, which the trace
+    unrolls. Constants are folded and equal expressions are merged.
 
-    The trace is in float64, whatever the precision of the process. Folding `0 x` to 0 hides a NaN
-    in x: check inputs beforehand.
+    The trace is in float64, whatever the precision of the process. Folding `0 x` to 0
+    hides a NaN in x: check inputs beforehand.
 
     Args:
         function: Function of one array for each input; returns any PyTree of arrays.
-        inputs: Shape of each argument, or an object array that mixes `FREE` entries with
-            numbers; the numbers become constants of the program.
+        inputs: Shape of each argument, or an object array that mixes `FREE` entries
+            with numbers; the numbers become constants of the program.
     """
     graph = Graph()
     arguments = []
     for number, given in enumerate(inputs):
-        template = np.full(given, FREE, object) if isinstance(given, tuple) else np.asarray(given)
+        template = (
+            np.full(given, FREE, object)
+            if isinstance(given, tuple)
+            else np.asarray(given)
+        )
         entries = np.empty(template.shape, object)
         for position, value in enumerate(template.ravel()):
-            free = graph.node(Operation.INPUT, number, position) if value is FREE else float(value)
+            free = (
+                graph.node(Operation.INPUT, number, position)
+                if value is FREE
+                else float(value)
+            )
             entries.flat[position] = free
         arguments.append(entries)
     with double_precision():

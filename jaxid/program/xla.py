@@ -1,8 +1,9 @@
 """A scalar program as a fused XLA computation on batch-last arrays.
 
-XLA's CPU backend fuses elementwise operations into the loops of their consumers, and copies a
-shared operation into each of them. A program of a thousand operations with hundreds of results
-would be computed many times over. A fence on a shared value stops that.
+XLA's CPU backend fuses elementwise operations into the loops of their consumers, and
+copies a shared operation into each of them. A program of a thousand operations with
+hundreds of results would be computed many times over. A fence on a shared value stops
+that.
 """
 
 import functools
@@ -33,8 +34,10 @@ Entries = Sequence[Array | Sequence[Array]]
 def hidden_one(reference: Array) -> Array:
     """Return (sign bit of a number | 1), which is 1 for any number, NaN included.
 
-    XLA does not copy divisions, since they are expensive, and x / 1 is exact, also for NaN and
-    infinities: division by a one that XLA cannot recognise is a fence. From JAX 0.12 on an
+    XLA does not copy divisions, since they are expensive, and x / 1 is exact, also for
+    NaN and
+    infinities: division by a one that XLA cannot recognise is a fence. From JAX 0.12 on
+        an
     optimization barrier does the same at no cost. The number is known only at run time.
     """
     width = 8 * reference.dtype.itemsize
@@ -52,8 +55,8 @@ def fenced(x: Array, one: Array | None) -> Array:
 def fenced_nodes(program: Program) -> frozenset[int]:
     """Return positions of the nodes that a fence pays for.
 
-    These are the nodes with (uses - 1) times the cost of computing them again > 6 operations;
-    between 0 and 30 the speed hardly depends on it.
+    These are the nodes with (uses - 1) times the cost of computing them again > 6
+    operations; between 0 and 30 the speed hardly depends on it.
     """
     free = (Operation.INPUT, Operation.NEGATE)
     costs, fenced = [], set()
@@ -70,8 +73,8 @@ def fenced_nodes(program: Program) -> frozenset[int]:
 class Lowered(eqx.Module):
     """A program on JAX arrays whose batch axes stand last.
 
-    Works under `jit`, `grad`, `jvp` and `vmap`, in the precision of the arrays. Call it inside
-    `jax.jit`: otherwise each operation is dispatched by itself.
+    Works under `jit`, `grad`, `jvp` and `vmap`, in the precision of the arrays. Call it
+    inside `jax.jit`: otherwise each operation is dispatched by itself.
     """
 
     program: Program = eqx.field(static=True)
@@ -81,7 +84,8 @@ class Lowered(eqx.Module):
     def __call__(self, *arrays: AnyArray) -> list[Array | float]:
         """Compute the packed result, from arrays of the inputs' shapes and then any batch axes.
 
-        For each entry of each output, in order, it is an array of the batch's shape or a constant.
+        For each entry of each output, in order, it is an array of the batch's shape or
+        a constant.
         """
         return self.program.pack(self.distinct(*arrays))
 
@@ -93,7 +97,9 @@ class Lowered(eqx.Module):
         """Return the inputs with their own axes merged and the whole batch behind; its shape."""
         dtype = jnp.result_type(*arrays, float) if arrays else jnp.result_type(float)
         if not jnp.issubdtype(dtype, jnp.floating):
-            raise InputError(f"A program computes with real numbers, but got arrays of {dtype}.")
+            raise InputError(
+                f"A program computes with real numbers, but got arrays of {dtype}."
+            )
         return self.program.align([jnp.asarray(x, dtype) for x in arrays], jnp)
 
     def dense(self, *arrays: AnyArray) -> Any:
@@ -103,12 +109,17 @@ class Lowered(eqx.Module):
         """
         dtype, batch = jnp.result_type(*arrays, float), self.entries(*arrays)[1]
         full = [jnp.broadcast_to(jnp.asarray(x, dtype), batch) for x in self(*arrays)]
-        return self.program.unpack(jnp.stack(full) if full else jnp.zeros((0, *batch), dtype))
+        return self.program.unpack(
+            jnp.stack(full) if full else jnp.zeros((0, *batch), dtype)
+        )
 
-    def run(self, entries: Entries, operations: dict[Operation, Callable]) -> tuple[Array, ...]:
+    def run(
+        self, entries: Entries, operations: dict[Operation, Callable]
+    ) -> tuple[Array, ...]:
         """Compute the distinct results that vary, with a function for each operation."""
         nodes = self.program.nodes
-        # The last input: XLA folds what depends on constants, such as parameters often are.
+        # The last input: XLA folds what depends on constants, such as parameters often
+        # are.
         firsts = [x[0] for x in reversed(entries) if len(x)]
         dtype = firsts[0].dtype if firsts else jnp.result_type(float)
         source = next((x for x in firsts if x.size), jnp.zeros((1,), dtype))
@@ -117,7 +128,10 @@ class Lowered(eqx.Module):
         angles = {n.uses[0]: None for n in nodes if n.operation in CIRCULAR}
         angles = [k for k in angles if nodes[k].operation is Operation.INPUT]
         if angles:
-            rows = [entries[number][entry] for number, entry in (nodes[k].place for k in angles)]
+            rows = [
+                entries[number][entry]
+                for number, entry in (nodes[k].place for k in angles)
+            ]
             sines, cosines = _circular(jnp.stack(rows), anchor)
             pairs = {k: (sines[row], cosines[row]) for row, k in enumerate(angles)}
         values: list[Array] = []
@@ -131,24 +145,30 @@ class Lowered(eqx.Module):
                     pairs[angle] = _circular(values[angle], anchor)
                 values.append(pairs[angle][node.operation is Operation.COSINE])
             else:
-                operands = [values[x] if isinstance(x, int) else x for x in node.operands]
+                operands = [
+                    values[x] if isinstance(x, int) else x for x in node.operands
+                ]
                 if node.operation is Operation.SELECT:
                     operands[1:] = [jnp.asarray(x, dtype) for x in operands[1:]]
                 value = operations[node.operation](*operands)
-                values.append(fenced(value, anchor) if position in self.fenced else value)
+                values.append(
+                    fenced(value, anchor) if position in self.fenced else value
+                )
         return tuple(values[k] for k in self.program.distinct[0])
 
 
 def primitives(like: Array) -> dict[Operation, Callable]:
     """Return the operations with JAX's own primitives for the arithmetic.
 
-    They skip the checks of types and shapes in array operators, so that a program is traced in a
-    fraction of the time. JAX differentiates operators faster: do not differentiate these. All have
-    the shape of one array.
+    They skip the checks of types and shapes in array operators, so that a program is
+    traced in a fraction of the time. JAX differentiates operators faster: do not
+    differentiate these. All have the shape of one array.
     """
 
     @functools.cache
-    def number(text: str) -> Array:  # plus and minus zero are equal, but not their texts
+    def number(
+        text: str,
+    ) -> Array:  # plus and minus zero are equal, but not their texts
         return jax.lax.full_like(like, float(text))
 
     def whole(x: Any) -> Array:
@@ -177,8 +197,12 @@ def lower(program: Program, fence: bool = True) -> Lowered:
 
 def on_any_platform(program: Program, evaluate: Callable, *arrays: AnyArray) -> Any:
     """Return `evaluate(lowered, *arrays)`, with fences where it runs on a CPU."""
-    fenced, plain = (functools.partial(evaluate, lower(program, fence)) for fence in (True, False))
-    return jax.lax.platform_dependent(*map(jnp.asarray, arrays), cpu=fenced, default=plain)
+    fenced, plain = (
+        functools.partial(evaluate, lower(program, fence)) for fence in (True, False)
+    )
+    return jax.lax.platform_dependent(
+        *map(jnp.asarray, arrays), cpu=fenced, default=plain
+    )
 
 
 @jax.custom_jvp

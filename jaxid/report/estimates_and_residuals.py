@@ -25,8 +25,8 @@ CEILING = 1000.0
 def parameter_figure(fit: Fit) -> Figure:
     """Return the relative standard deviations of all estimates, the best known ones first.
 
-    Beside them stand the estimates with their standard deviations. Values above 1000 % are drawn
-    at the edge.
+    Beside them stand the estimates with their standard deviations. Values above 1000 %
+    are drawn at the edge.
 
     Args:
         fit: Identified parameters.
@@ -44,9 +44,13 @@ def parameter_figure(fit: Fit) -> Figure:
     )
 
     def panel(shown: np.ndarray) -> Panel:
-        numbers = with_deviations(np.asarray(fit.parameters)[shown], fit.standard_deviations[shown])
+        numbers = with_deviations(
+            np.asarray(fit.parameters)[shown], fit.standard_deviations[shown]
+        )
         units = [fit.base.units[k] for k in shown]
-        texts = [f"{a} ± {b} {unit}" for a, b, unit in zip(*numbers, units, strict=True)]
+        texts = [
+            f"{a} ± {b} {unit}" for a, b, unit in zip(*numbers, units, strict=True)
+        ]
         curves = []
         for status, name, colour in grades:
             rows = [k for k, p in enumerate(shown) if fit.trust[p] is status]
@@ -75,8 +79,9 @@ def parameter_figure(fit: Fit) -> Figure:
 def comparison_figure(comparison: Comparison) -> Figure:
     """Return both estimates of every parameter with their intervals.
 
-    Each parameter is drawn relative to the farthest end of its two intervals, so that what is known
-    to lie away from zero stands there. A star marks the names of parameters that have changed.
+    Each parameter is drawn relative to the farthest end of its two intervals, so that
+    what is known to lie away from zero stands there. A star marks the names of
+    parameters that have changed.
 
     Args:
         comparison: Comparison of two fits.
@@ -101,7 +106,9 @@ def comparison_figure(comparison: Comparison) -> Figure:
         ):
             x, width = p[shown] / scale[shown], half[shown] / scale[shown]
             low, high = np.clip(x - width, -2.0, 2.0), np.clip(x + width, -2.0, 2.0)
-            said = [f"{comparison.names[i]}: {significant(float(p[i]), 4)}" for i in shown]
+            said = [
+                f"{comparison.names[i]}: {significant(float(p[i]), 4)}" for i in shown
+            ]
             rows = np.arange(len(shown)) + shift
             ends = {"low": low, "high": high, "texts": said}
             curves.append(Curve(x, rows, fit.name, colour, "intervals", **ends))
@@ -139,8 +146,8 @@ def _listing(title: str, panels: Sequence[Panel]) -> Figure:
 def filter_figure(choice: FilterChoice) -> Figure:
     """Return the held-out errors of all candidates, and the correlation of neighbouring residuals.
 
-    Thin lines are single parts of the log. Too low a cut-off removes motion that moves the robot,
-    too high a one lets noise into the accelerations.
+    Thin lines are single parts of the log. Too low a cut-off removes motion that moves
+    the robot, too high a one lets noise into the accelerations.
 
     Args:
         choice: Choice of a filter with all its candidates.
@@ -175,8 +182,8 @@ def filter_figure(choice: FilterChoice) -> Figure:
 def residual_figure(spectra: ResidualSpectra, robot: Robot) -> Figure:
     """Return the power of each joint's residuals against frequency, beside that of white noise.
 
-    The dashed line is the spectrum that white noise of the same power would have behind the
-    filters.
+    The dashed line is the spectrum that white noise of the same power would have behind
+    the filters.
 
     Args:
         spectra: Spectra of the residuals of a fit.
@@ -203,7 +210,10 @@ def residual_figure(spectra: ResidualSpectra, robot: Robot) -> Figure:
             log="xy" if np.any(density > 0) else "x",
         )
 
-    title = f"{robot.name}: residuals of {sum(spectra.white)} of {robot.joints} joints are white"
+    title = (
+        f"{robot.name}: residuals of {sum(spectra.white)} of {robot.joints} "
+        "joints are white"
+    )
     return _joint_figure(title, [panel(j) for j in range(robot.joints)])
 
 
@@ -221,8 +231,8 @@ def autocorrelation_figure(
     Args:
         errors: Errors on one recording.
         robot: Robot of the recording.
-        spectra: Spectra with the gain of the filters: the dashed line is the autocorrelation of
-            white noise behind them.
+        spectra: Spectra with the gain of the filters: the dashed line is the
+            autocorrelation of white noise behind them.
 
     Raises:
         InputError: If the numbers of joints differ.
@@ -239,7 +249,9 @@ def autocorrelation_figure(
         f = np.asarray(spectra.frequency)
         weights = np.gradient(f) * np.asarray(spectra.gain) ** 2
         filtered = np.cos(2.0 * np.pi * np.outer(lags, f)) @ weights / weights.sum()
-        white = [Curve(lags, filtered, "white noise behind the filters", GREY, dashed=True)]
+        white = [
+            Curve(lags, filtered, "white noise behind the filters", GREY, dashed=True)
+        ]
 
     def panel(j: int) -> Panel:
         limit, inside = np.full(count, limits[j]), "white residuals: 95 % within"
@@ -261,7 +273,9 @@ def autocorrelation_figure(
     return _joint_figure(title, [panel(j) for j in range(robot.joints)])
 
 
-def autocorrelation(errors: TorqueErrors, lags: int) -> Float[np.ndarray, "lags joints"]:
+def autocorrelation(
+    errors: TorqueErrors, lags: int
+) -> Float[np.ndarray, "lags joints"]:
     """Return the correlation of residuals with those some rows later, for lags from 0.
 
     Rows that do not count for a joint are left out; NaN where no pair of rows counts.

@@ -23,11 +23,15 @@ def side_by_side_table(plans: Sequence[ExcitationPlan]) -> Table:
     names = [c.name for c in criteria]
     numbers = [names.index(plan.criterion.name) + 1 for plan in plans]
     remarks = [
-        "`random` is the median of random motions that fill the same limits; the last row is the "
+        "`random` is the median of random motions that fill the same limits; the last "
+        "row is the "
         "geometric mean over the base parameters"
     ]
     for number, plan in zip(numbers, plans, strict=True):
-        doubts = [*plan.diagnosis, *(["stopped before its end"] if plan.interrupted else [])]
+        doubts = [
+            *plan.diagnosis,
+            *(["stopped before its end"] if plan.interrupted else []),
+        ]
         remarks += [Remark(f"by #{number}: {text}", Status.DOUBTFUL) for text in doubts]
     return Table(
         "motions that minimise one of the criteria each",
@@ -35,7 +39,9 @@ def side_by_side_table(plans: Sequence[ExcitationPlan]) -> Table:
         Column("criterion", [*names, "deviations, times smaller than random"]),
         Column("random", [*(float(c.before) for c in criteria), 1.0]),
         *(
-            Column(f"by #{k}", [*(float(c.after) for c in plan.criteria), plan.mean_gain])
+            Column(
+                f"by #{k}", [*(float(c.after) for c in plan.criteria), plan.mean_gain]
+            )
             for k, plan in zip(numbers, plans, strict=True)
         ),
         rules=[len(names)],
@@ -49,7 +55,8 @@ def plan_remarks(plan: ExcitationPlan) -> list[Remark]:
     rates = {"velocity": "/s", "acceleration": "/s²"}
     assumed = ", ".join(
         f"{name} of `{robot.joint_names[j]}` "
-        f"({float(getattr(limits, name)[j]):.4g} {robot.joint_unit(j)}{rates.get(name, '')})"
+        f"({float(getattr(limits, name)[j]):.4g} "
+        f"{robot.joint_unit(j)}{rates.get(name, '')})"
         for name, j in plan.limits.assumed
     )
     published = ", ".join(limits.assumed)
@@ -58,7 +65,9 @@ def plan_remarks(plan: ExcitationPlan) -> list[Remark]:
         published and f"Limits that nobody published, assumed: {published}",
         assumed and f"Assumed, because not given: {assumed}",
         vague and f"Deviations above {100 * VAGUE:g} % of the nominal value: {vague}",
-        "The search was stopped: `--resume` may find a better motion" if plan.interrupted else "",
+        "The search was stopped: `--resume` may find a better motion"
+        if plan.interrupted
+        else "",
     )
     found = [Remark(text, Status.DOUBTFUL) for text in doubts if text]
     start, then = plan.limits.basis.times(plan.samples)[:2]
@@ -68,8 +77,10 @@ def plan_remarks(plan: ExcitationPlan) -> list[Remark]:
         for j, s in enumerate(np.asarray(plan.noise).tolist())
     )
     text = (
-        f"Expected deviations are those of {plan.samples} samples in {plan.samples * step:.4g} s "
-        f"({1 / step:.4g} Hz), of one run, with white noise of the forces: standard deviation "
+        f"Expected deviations are those of {plan.samples} samples in "
+        f"{plan.samples * step:.4g} s "
+        f"({1 / step:.4g} Hz), of one run, with white noise of the forces: standard "
+        "deviation "
         f"{noise}; of n runs they are √n times smaller."
     )
     return [*plan.remarks, Remark(text), *found]
@@ -91,8 +102,8 @@ def write_excitation(
 ) -> list[Path]:
     """Write the page of a design; return the file.
 
-    The motion as it is played is drawn among the `shapes`. `settings` tell the origin of the design
-    as in `provenance`.
+    The motion as it is played is drawn among the `shapes`. `settings` tell the origin
+    of the design as in `provenance`.
     """
     robot = plan.base.model.robot
     with double_precision():
@@ -102,13 +113,21 @@ def write_excitation(
     speed, fastest = np.abs(np.asarray(motion.qd)), np.asarray(limits.velocity)
     used = 100.0 * speed / np.where(np.isfinite(fastest), fastest, np.max(speed))
     label = "speed [% of the limit]"
-    space = pose_figure(robot, motion.q, time=time, values=used, label=label, shapes=shapes)
-    figures = [joint_figure(robot, limits, time, motion), tip_figure(robot, time, motion)]
+    space = pose_figure(
+        robot, motion.q, time=time, values=used, label=label, shapes=shapes
+    )
+    figures = [
+        joint_figure(robot, limits, time, motion),
+        tip_figure(robot, time, motion),
+    ]
     criteria, deviations, *use = plan.tables()
     every = ordered((*plan_remarks(plan), *remarks))
     said = "Links are coloured by the speed of their joint."
     if shapes is not None:
-        said += " Pale shapes are those that were checked for collision; grey ones stand still."
+        said += (
+            " Pale shapes are those that were checked for collision; grey ones "
+            "stand still."
+        )
     text = "A random motion that fills the same limits is shown beside this one."
     page = render_page(
         f"{robot.name}: a motion to record",
@@ -120,7 +139,8 @@ def write_excitation(
             ("Expected standard deviations", [deviations]),
             provenance(settings),
         ],
-        f"Designed to determine {plan.base.size} base parameters of {robot.joints} joints.",
+        f"Designed to determine {plan.base.size} base parameters of {robot.joints} "
+        "joints.",
     )
     with atomic_folder(folder) as staging:
         (staging / "report.html").write_text(page, encoding="utf-8")
@@ -137,7 +157,13 @@ def headline(plan: ExcitationPlan, remarks: Sequence[Remark]) -> Remark:
         text = "Do not record this motion yet: what is marked ✗ comes first."
         return Remark(text, Status.BAD)
     if left := [r.text.split(":")[0] for r in remarks if ": not checked, as" in r.text]:
-        text = f"This motion keeps all limits that were checked; not checked: {', '.join(left)}."
+        text = (
+            "This motion keeps all limits that were checked; not checked: "
+            f"{', '.join(left)}."
+        )
         return Remark(text, Status.DOUBTFUL)
-    text = "A motion that can be recorded: it keeps all limits, and determines all parameters."
+    text = (
+        "A motion that can be recorded: it keeps all limits, and determines all "
+        "parameters."
+    )
     return Remark(text, Status.GOOD)

@@ -52,9 +52,13 @@ class Panel:
     x_range: tuple[float, float] | None = None
     y_range: tuple[float, float] | None = None
     x_names: Sequence[str] = ()  # names of the abscissas 0, 1, …, instead of numbers
-    y_names: Sequence[str] = ()  # names of the ordinates 0, 1, … from the top, instead of numbers
+    y_names: Sequence[
+        str
+    ] = ()  # names of the ordinates 0, 1, … from the top, instead of numbers
     beside: Sequence[str] = ()  # texts to the right of these names
-    levels: Sequence[tuple[str, float, str]] = ()  # thin lines across: `x` or `y`, value, colour
+    levels: Sequence[
+        tuple[str, float, str]
+    ] = ()  # thin lines across: `x` or `y`, value, colour
     # panels below this one with the same abscissa, smaller by their share
     below: Sequence["Panel"] = ()
     share: float = 1.0  # height relative to the first panel
@@ -78,7 +82,9 @@ class Panel:
 class Solids(NamedTuple):
     """Surfaces of triangles that move with the robot's bodies, or stand on the ground."""
 
-    vertices: Float[np.ndarray, "vertices 3"]  # vertices in the frames of their bodies [m]
+    vertices: Float[
+        np.ndarray, "vertices 3"
+    ]  # vertices in the frames of their bodies [m]
     bodies: Int[np.ndarray, " vertices"]  # body of each vertex; -1 is the ground
     faces: Int[np.ndarray, "faces 3"]  # vertices of each triangle
     # rotation and origin of each body at the frames of the scene, as [R r]
@@ -89,7 +95,9 @@ class Solids(NamedTuple):
         """Vertices in the frame of the ground [m]."""
         still = np.broadcast_to(np.eye(3, 4), (len(self.places), 1, 3, 4))
         places = np.concatenate([self.places, still], axis=1)[:, self.bodies]
-        return np.einsum("fvij,vj->fvi", places[..., :3], self.vertices) + places[..., 3]
+        return (
+            np.einsum("fvij,vj->fvi", places[..., :3], self.vertices) + places[..., 3]
+        )
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -97,14 +105,20 @@ class Scene:
     """Robot along a motion in space."""
 
     time: Float[np.ndarray, " samples"]  # instants of the samples [s]
-    points: Float[np.ndarray, "samples points 3"]  # origins of all bodies, and the end-effector [m]
-    links: tuple[int, ...]  # body from whose origin the line to each point leads; -1 for the ground
+    points: Float[
+        np.ndarray, "samples points 3"
+    ]  # origins of all bodies, and the end-effector [m]
+    links: tuple[
+        int, ...
+    ]  # body from whose origin the line to each point leads; -1 for the ground
     frames: Int[np.ndarray, " frames"]  # samples at which the page shows the robot
     poses: int = 6  # number of poses on paper
     # values of the joints at the samples, as colours; None for none
     values: Float[np.ndarray, "samples joints"] | None = None
     label: str = ""  # name of the values, with their unit
-    solids: Solids | None = None  # shapes of the robot and around it, on a page; None for none
+    solids: Solids | None = (
+        None  # shapes of the robot and around it, on a page; None for none
+    )
 
     @property
     def bones(self) -> Float[np.ndarray, "samples points 2 3"]:
@@ -116,7 +130,11 @@ class Scene:
     @property
     def mean(self) -> Float[np.ndarray, " samples"]:
         """Mean of the values of all joints."""
-        return np.zeros(len(self.time)) if self.values is None else self.values.mean(axis=1)
+        return (
+            np.zeros(len(self.time))
+            if self.values is None
+            else self.values.mean(axis=1)
+        )
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -130,7 +148,8 @@ class Figure:
         height: Height of each panel with those below it [inch].
         width: Width of all on paper [inch].
         scene: Robot in space, in place of panels.
-        bins: Pixel columns of a line on a page: of longer lines each column keeps its extremes.
+        bins: Pixel columns of a line on a page: of longer lines each column keeps its
+            extremes.
     """
 
     title: str
@@ -190,8 +209,8 @@ def decimate(
 ) -> tuple[Float[np.ndarray, " points"], Float[np.ndarray, " points"]]:
     """Return points of a line: all if they are few, else the least and largest of each bin.
 
-    A peak of one sample stays visible however long the log is. Gaps in time become NaN, at which
-    a line breaks; values that are NaN stay out of their bin.
+    A peak of one sample stays visible however long the log is. Gaps in time become NaN,
+    at which a line breaks; values that are NaN stay out of their bin.
     """
     t, y = np.asarray(time), np.asarray(values)
     if len(t) <= 2 * bins:
@@ -204,7 +223,9 @@ def decimate(
     least = np.fmin.reduceat(y, first)
     largest = np.fmax.reduceat(y, first)
     rising = ~(y[last] < y[first])
-    points = np.stack([np.where(rising, least, largest), np.where(rising, largest, least)], axis=1)
+    points = np.stack(
+        [np.where(rising, least, largest), np.where(rising, largest, least)], axis=1
+    )
     times = np.stack([t[first], t[last]], axis=1)
     gaps = np.flatnonzero(np.diff(place[first]) > 1) + 1
     times, points = (np.insert(x, gaps, np.nan, axis=0) for x in (times, points))

@@ -12,7 +12,15 @@ from jaxid.identification.consistency.estimator import Consistency
 from jaxid.identification.fit_result import Fit
 from jaxid.identification.uncertainty import ResidualSpectra
 from jaxid.model_validation import TorqueErrors
-from jaxid.result_table import Column, Remark, Status, Table, percent, significant, with_deviations
+from jaxid.result_table import (
+    Column,
+    Remark,
+    Status,
+    Table,
+    percent,
+    significant,
+    with_deviations,
+)
 from jaxid.robot.robot import Robot
 
 from .figure import Figure
@@ -43,14 +51,18 @@ def identification_page(report: Report, figures: Mapping[str, Figure]) -> str:
         *_physics(report, figures),
         ("Measured and predicted forces", _torques(figures, robot)),
         ("Parameters in words", _parameters(fit, figures["parameters"])),
-        ("Details", [folded(name, *blocks) for name, blocks in _details(report, figures)]),
+        (
+            "Details",
+            [folded(name, *blocks) for name, blocks in _details(report, figures)],
+        ),
     ]
     logs = f"{len(fit.recordings)} log{'' if len(fit.recordings) == 1 else 's'}"
     return render_page(
         f"{robot.name}: identified model",
         [*sections, provenance(settings)],
         f"{base.size} base parameters of {robot.joints} joints, from {logs}.",
-        "All numbers: result.json and parameters.csv beside this page. Lines of long logs show the "
+        "All numbers: result.json and parameters.csv beside this page. Lines of long "
+        "logs show the "
         "least and the largest value of each pixel column, so that no peak is lost.",
     )
 
@@ -60,7 +72,10 @@ def _three_numbers(report: Report) -> Markup:
     fit = report.fit
     logs, which = report.verification, "on motion that the fit has not seen"
     if not logs:
-        logs, which = report.identification, "on the motion of the fit: no other log was given"
+        logs, which = (
+            report.identification,
+            "on the motion of the fit: no other log was given",
+        )
     error = max(e.relative for e in logs)
     limits = np.searchsorted(np.array(RMS_ERROR) / 100.0, error)
     status = (Status.GOOD, Status.DOUBTFUL, Status.BAD)[int(limits)]
@@ -75,7 +90,11 @@ def _three_numbers(report: Report) -> Markup:
     return tiles(
         (f"{percent(error)} %", f"torque error (RMS) {which}", status),
         (second, meaning, Status.NEUTRAL),
-        (known, "parameters known to 10 %", Status.BAD if fit.undetermined else Status.NEUTRAL),
+        (
+            known,
+            "parameters known to 10 %",
+            Status.BAD if fit.undetermined else Status.NEUTRAL,
+        ),
     )
 
 
@@ -92,15 +111,23 @@ def _data(report: Report) -> Iterator[tuple[str, str]]:
             length = significant(float(time[-1] - time[0]))
             yield word, f"{e.name}: {length} s, {len(time)} rows of each joint"
     # A class `LeastSquares` is shown as "least squares".
-    estimator = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", type(fit.estimator).__name__).lower()
+    estimator = re.sub(
+        r"(?<=[a-z])(?=[A-Z])", " ", type(fit.estimator).__name__
+    ).lower()
     yield "estimator", estimator
     if fit.consistency is not None:
         mass = np.asarray(fit.consistency.bodies)[:, 0]
         loose = len(fit.consistency.masses_from_bounds)
         proof = f", of which {loose} bodies follow from bounds too" if loose else ""
-        yield "total mass of the moving bodies", f"{significant(float(mass.sum()))} kg{proof}"
+        yield (
+            "total mass of the moving bodies",
+            f"{significant(float(mass.sum()))} kg{proof}",
+        )
     else:
-        text = "forces tell combinations of masses only; physically consistent bodies have masses"
+        text = (
+            "forces tell combinations of masses only; physically consistent bodies "
+            "have masses"
+        )
         yield "total mass", text
     if report.claimed_mass:
         yield "total mass by the robot's file", f"{significant(report.claimed_mass)} kg"
@@ -108,18 +135,24 @@ def _data(report: Report) -> Iterator[tuple[str, str]]:
 
 def _physics(report: Report, figures: Mapping[str, Figure]) -> Iterator[Section]:
     """Yield what the model says of the robot: in motion, before and after, friction, weight."""
-    text = "Each link has the colour of the torque error of the joint that moves it, the path "
+    text = (
+        "Each link has the colour of the torque error of the joint that moves it, "
+        "the path "
+    )
     text += "of the end-effector that of the mean. Turn it, and move the slider."
     yield "The robot along the motion", [picture(figures["robot"], text)]
     if "before_and_after" in figures:
         text = (
-            "Torque errors with the parameters that the robot's file claims (friction and rotors "
+            "Torque errors with the parameters that the robot's file claims (friction "
+            "and rotors "
             "count as zero where it claims none), and with those that were identified."
         )
         yield "Before and after", [text, figures["before_and_after"]]
     text = (
-        "Lines: the model. Points: means over classes of speed of the measured forces, less all "
-        "that the model explains otherwise. Points far from their line ask for another shape."
+        "Lines: the model. Points: means over classes of speed of the measured "
+        "forces, less all "
+        "that the model explains otherwise. Points far from their line ask for "
+        "another shape."
     )
     yield "Friction", [text, figures["friction"]]
     log = report.verification[0] if report.verification else report.identification[0]
@@ -128,7 +161,9 @@ def _physics(report: Report, figures: Mapping[str, Figure]) -> Iterator[Section]
 
 def _torques(figures: Mapping[str, Figure], robot: Robot) -> list[Any]:
     """Return the figures of the recordings: with 42 panels at most, the first one unfolded."""
-    found: list[Any] = [figure for name, figure in figures.items() if name.startswith("torque_")]
+    found: list[Any] = [
+        figure for name, figure in figures.items() if name.startswith("torque_")
+    ]
     shown = found[: max(1, 42 // robot.joints)]
     # Many panels share the size of the page.
     bins = min(shown[0].bins, 28_000 // sum(len(figure.panels) for figure in shown))
@@ -136,7 +171,9 @@ def _torques(figures: Mapping[str, Figure], robot: Robot) -> list[Any]:
     folds = [folded(f.title, dataclasses.replace(f, title="")) for f in others]
     blocks: list[Any] = [first, *folds]
     if left := len(found) - len(shown):
-        blocks.append(f"{left} more recordings are not shown here; result.json has their errors.")
+        blocks.append(
+            f"{left} more recordings are not shown here; result.json has their errors."
+        )
     return blocks
 
 
@@ -144,14 +181,22 @@ def _parameters(fit: Fit, figure: Figure) -> list[Any]:
     """Return the meanings of all symbols, and the estimates with theirs."""
     base = fit.base
     text = (
-        "* together with what forces cannot tell apart from it: see its combination. A parameter "
+        "* together with what forces cannot tell apart from it: see its combination. "
+        "A parameter "
         "near zero is never known to a few percent, and that is no fault."
     )
     lengths = ", ".join(f"{name} = {value:.4g}" for name, value in base.lengths.items())
-    said = [text, *([f"In the combinations: {lengths} (m; m/s² for g)."] if lengths else [])]
+    said = [
+        text,
+        *([f"In the combinations: {lengths} (m; m/s² for g)."] if lengths else []),
+    ]
     doubts = [fit.determination] if fit.undetermined else []
     summary = f"All {base.size} estimates with 95 % intervals and combinations"
-    return [*doubts, glossary(base), folded(summary, parameter_table(fit), *said, figure)]
+    return [
+        *doubts,
+        glossary(base),
+        folded(summary, parameter_table(fit), *said, figure),
+    ]
 
 
 def _details(report: Report, figures: Mapping[str, Figure]) -> Iterator[Section]:
@@ -168,11 +213,19 @@ def _details(report: Report, figures: Mapping[str, Figure]) -> Iterator[Section]
     assumed = ", ".join(robot.limits.assumed) or "nothing"
     facts = [*about.facts, ("gravity [m/s²]", gravity), ("assumed", assumed)]
     notes = [Remark(note) for note in report.every_note]
-    yield "Task and notes", [Table("", facts=[f for f in task if f[1] is not None]), notes]
-    yield "Robot and drives", [Table("", *about.columns, facts=facts), *motor_tables(robot)]
+    yield (
+        "Task and notes",
+        [Table("", facts=[f for f in task if f[1] is not None]), notes],
+    )
+    yield (
+        "Robot and drives",
+        [Table("", *about.columns, facts=facts), *motor_tables(robot)],
+    )
     text = (
-        "Predicted less measured forces. Bars: the mean of their absolute values (Eq. 37, Fig. 10 "
-        "of the paper); points: their RMS. The offset is the mean error, which a constant of the "
+        "Predicted less measured forces. Bars: the mean of their absolute values (Eq. "
+        "37, Fig. 10 "
+        "of the paper); points: their RMS. The offset is the mean error, which a "
+        "constant of the "
         "log explains; RMS values at rest and in motion are about it."
     )
     tables = tuple(error_table(e, robot) for e in report.every_error)
@@ -181,8 +234,10 @@ def _details(report: Report, figures: Mapping[str, Figure]) -> Iterator[Section]
         yield "Bodies", [body_table(fit.consistency, robot.joint_names)]
     if fit.residual_spectra is not None:
         text = (
-            "The residuals of a good model are noise. Power at low frequencies, or residuals that "
-            "resemble their neighbours more than the filters explain (dashed), mean that an effect "
+            "The residuals of a good model are noise. Power at low frequencies, or "
+            "residuals that "
+            "resemble their neighbours more than the filters explain (dashed), mean "
+            "that an effect "
             "is missing."
         )
         shown = [figures["residuals"], figures["autocorrelation"]]
@@ -195,7 +250,9 @@ def parameter_table(fit: Fit) -> Table:
     """Return the base parameters in words, with their 95 % intervals."""
     base, (low, high) = fit.base, fit.intervals().T
     values, deviations = with_deviations(fit.parameters, fit.standard_deviations)
-    low, high = (with_deviations(ends, fit.standard_deviations)[0] for ends in (low, high))
+    low, high = (
+        with_deviations(ends, fit.standard_deviations)[0] for ends in (low, high)
+    )
     return Table(
         "",
         Column("#", list(range(1, base.size + 1))),
@@ -219,7 +276,8 @@ def motor_tables(robot: Robot) -> list[Table]:
     if drives.is_direct:
         return []
     turns = [
-        " + ".join(f"{row[j]:.6g} {robot.joint_names[j]}" for j in np.flatnonzero(row)) for row in A
+        " + ".join(f"{row[j]:.6g} {robot.joint_names[j]}" for j in np.flatnonzero(row))
+        for row in A
     ]
     columns = [
         Column("joint at\nmotor zero", np.asarray(drives.zero), "rad or m"),
@@ -251,7 +309,8 @@ def error_table(errors: TorqueErrors, robot: Robot) -> Table:
 def residual_table(spectra: ResidualSpectra, robot: Robot) -> Table:
     """Return whether the residuals of each joint are white, and where their power lies."""
     return Table(
-        f"residuals within the filters' band; white: departure below {percent(spectra.limit)} %",
+        "residuals within the filters' band; white: departure below "
+        f"{percent(spectra.limit)} %",
         Column("joint", robot.joint_names),
         Column("white", ["yes" if white else "no" for white in spectra.white]),
         Column("departure", spectra.departure, "%", percent),
@@ -275,7 +334,10 @@ def body_table(consistency: Consistency, names: Sequence[str]) -> Table:
         for k, axis in enumerate("xyz")
     ]
     price = f"{100 * consistency.residual_increase:.2g}"
-    proof = f"within {consistency.error_bound:.1e} of it, {consistency.iterations} iterations"
+    proof = (
+        f"within {consistency.error_bound:.1e} of it, {consistency.iterations} "
+        "iterations"
+    )
     loose = [k in bounded for k in range(len(names))]
     return Table(
         "physically consistent bodies",

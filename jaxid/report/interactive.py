@@ -48,10 +48,17 @@ def pack(content: bytes) -> str:
 def charts(figure: Figure) -> list[dict[str, Any]]:
     """Return the charts of a figure: titles, values, heights [px] and packed contents."""
     if figure.scene is not None:
-        return [{"title": "", "value": "", "height": 560, "content": _scene(figure.scene)}]
+        return [
+            {"title": "", "value": "", "height": 560, "content": _scene(figure.scene)}
+        ]
     height = figure.height * 96  # pixels of an inch on the page
     return [
-        {"title": p.title, "value": p.value, "height": height, "content": _panel(figure, p)}
+        {
+            "title": p.title,
+            "value": p.value,
+            "height": height,
+            "content": _panel(figure, p),
+        }
         for p in figure.panels
     ]
 
@@ -71,7 +78,12 @@ def _scene(scene: Scene) -> str:
     scale = {"colorscale": SCALE, "cmin": 0.0, "cmax": most} if coloured else {}
     bar = {"title": {"text": html.escape(scene.label), "side": "top"}, "thickness": 10}
     bar |= {"orientation": "h", "len": 0.6, "y": 0.0, "yanchor": "bottom"}
-    line = {"color": _floats(scene.mean), "width": 4, "showscale": coloured, "colorbar": bar}
+    line = {
+        "color": _floats(scene.mean),
+        "width": 4,
+        "showscale": coloured,
+        "colorbar": bar,
+    }
     trace = {"type": "scatter3d", "hoverinfo": "skip", "showlegend": False}
     tip = trace | {"mode": "lines", "line": line | scale, **_coordinates(path)}
     dots = {"size": 5, "color": PALE, "line": {"color": GREY, "width": 2}}
@@ -128,7 +140,9 @@ def _coordinates(points: np.ndarray) -> dict[str, Any]:
 def _panel(figure: Figure, panel: Panel) -> str:
     """Return the chart of a panel and those below it."""
     parts = panel.parts
-    layout: dict[str, Any] = {"xaxis": _x_axis(panel, f"y{len(parts)}" if panel.below else "y")}
+    layout: dict[str, Any] = {
+        "xaxis": _x_axis(panel, f"y{len(parts)}" if panel.below else "y")
+    }
     heights = np.array([part.share for part in parts])
     ends = np.cumsum(heights[::-1] / heights.sum())[::-1]
     traces, shapes = [], []
@@ -136,14 +150,21 @@ def _panel(figure: Figure, panel: Panel) -> str:
         number = str(k + 1) if k else ""
         bottom = ends[k + 1] + _GAP if k + 1 < len(parts) else 0.0
         layout[f"yaxis{number}"] = _y_axis(part) | {"domain": [bottom, ends[k]]}
-        own = [_trace(c, part, figure.bins) | {"yaxis": f"y{number}"} for c in part.curves]
+        own = [
+            _trace(c, part, figure.bins) | {"yaxis": f"y{number}"} for c in part.curves
+        ]
         traces += own
         shapes += [_level(level, number) for level in part.levels]
     for k, trace in enumerate(traces):
         # What all curves have in common is there once.
-        trace["x"] = next((j for j in range(k) if traces[j]["x"] == trace["x"]), trace["x"])
+        trace["x"] = next(
+            (j for j in range(k) if traces[j]["x"] == trace["x"]), trace["x"]
+        )
     lines = all(c.kind in ("line", "band") for part in parts for c in part.curves)
-    layout |= {"shapes": shapes, "hovermode": "x" if lines or panel.x_names else "closest"}
+    layout |= {
+        "shapes": shapes,
+        "hovermode": "x" if lines or panel.x_names else "closest",
+    }
     return pack(_json({"data": traces, "layout": layout}))
 
 
@@ -161,7 +182,9 @@ def _y_axis(panel: Panel) -> dict[str, Any]:
     return axis
 
 
-def _axis(label: str, limits: Sequence[float] | None, logarithmic: bool) -> dict[str, Any]:
+def _axis(
+    label: str, limits: Sequence[float] | None, logarithmic: bool
+) -> dict[str, Any]:
     axis: dict[str, Any] = {"title": {"text": html.escape(label)}}
     if logarithmic:
         axis |= {"type": "log", "exponentformat": "power"}
@@ -175,13 +198,21 @@ def _ticks(names: Sequence[str]) -> dict[str, Any]:
     if not names:
         return {}
     shown = [html.escape(name) for name in names]
-    return {"tickvals": [*range(len(names))], "ticktext": shown, "autotickangles": [0, 90]}
+    return {
+        "tickvals": [*range(len(names))],
+        "ticktext": shown,
+        "autotickangles": [0, 90],
+    }
 
 
 def _trace(curve: Curve, panel: Panel, bins: int) -> dict[str, Any]:
     unit = html.escape(panel.unit)
     label = html.escape(curve.name or panel.y or panel.title)
-    trace: dict[str, Any] = {"type": "scatter", "name": label, "legendgroup": curve.name}
+    trace: dict[str, Any] = {
+        "type": "scatter",
+        "name": label,
+        "legendgroup": curve.name,
+    }
     trace["hovertemplate"] = f"{label}: %{{y:.4~g}} {unit}<extra></extra>"
     texts = [html.escape(text) for text in curve.texts]
     if texts:
@@ -190,12 +221,21 @@ def _trace(curve: Curve, panel: Panel, bins: int) -> dict[str, Any]:
         case "band":
             x = np.concatenate([curve.x, np.flip(curve.x)])
             y = np.concatenate([curve.high, np.flip(curve.low)])
-            fill = {"fill": "toself", "hoverinfo": "skip", "line": {"width": 0}, "opacity": 0.35}
+            fill = {
+                "fill": "toself",
+                "hoverinfo": "skip",
+                "line": {"width": 0},
+                "opacity": 0.35,
+            }
             trace |= {"mode": "lines", "fillcolor": curve.colour, **fill}
             del trace["hovertemplate"]
         case "bars":
             x, y = curve.x, curve.y
-            trace |= {"type": "bar", "width": curve.width, "marker": {"color": curve.colour}}
+            trace |= {
+                "type": "bar",
+                "width": curve.width,
+                "marker": {"color": curve.colour},
+            }
             trace |= {"textposition": "none"}
         case "intervals":
             x, y = curve.x, curve.y
@@ -207,9 +247,16 @@ def _trace(curve: Curve, panel: Panel, bins: int) -> dict[str, Any]:
         case "points":
             x, y = curve.x, curve.y
             ring = {"color": GREY, "width": 1}
-            trace |= {"mode": "markers", "marker": {"color": curve.colour, "size": 7, "line": ring}}
+            trace |= {
+                "mode": "markers",
+                "marker": {"color": curve.colour, "size": 7, "line": ring},
+            }
         case _:
-            x, y = decimate(curve.x, curve.y, bins) if panel.in_time else (curve.x, curve.y)
+            x, y = (
+                decimate(curve.x, curve.y, bins)
+                if panel.in_time
+                else (curve.x, curve.y)
+            )
             dash = "dash" if curve.dashed else "solid"
             line = {"color": curve.colour, "width": 0.4 + curve.width, "dash": dash}
             mode = "lines+markers" if curve.marker else "lines"
@@ -220,9 +267,21 @@ def _trace(curve: Curve, panel: Panel, bins: int) -> dict[str, Any]:
 def _level(level: tuple[str, float, str], number: str) -> dict[str, Any]:
     which, value, colour = level
     line = {"color": colour, "width": 1, "dash": "dash" if value else "solid"}
-    shape = {"type": "line", "line": line, "xref": "x", "yref": f"y{number}", "layer": "below"}
+    shape = {
+        "type": "line",
+        "line": line,
+        "xref": "x",
+        "yref": f"y{number}",
+        "layer": "below",
+    }
     if which == "x":
-        return shape | {"x0": value, "x1": value, "yref": f"y{number} domain", "y0": 0, "y1": 1}
+        return shape | {
+            "x0": value,
+            "x1": value,
+            "yref": f"y{number} domain",
+            "y0": 0,
+            "y1": 1,
+        }
     return shape | {"y0": value, "y1": value, "xref": "x domain", "x0": 0, "x1": 1}
 
 

@@ -16,7 +16,17 @@ from jaxid.robot.forward_and_inverse_kinematics import placements, tip_placement
 from jaxid.robot.limits_and_drives import Limits
 from jaxid.robot.robot import Robot
 
-from .figure import CYCLE, MEASURED, PREDICTED, VERMILION, Curve, Figure, Panel, Scene, Solids
+from .figure import (
+    CYCLE,
+    MEASURED,
+    PREDICTED,
+    VERMILION,
+    Curve,
+    Figure,
+    Panel,
+    Scene,
+    Solids,
+)
 
 SPREAD = 40
 """Points on the ball at each end of a capsule."""
@@ -48,18 +58,26 @@ def joint_figure(
                 [Curve(time, np.asarray(values)[:, j], name, colour)],
                 title="" if rate else robot.joint_names[j],
                 y=f"{robot.joint_unit(j)}{rate}",
-                levels=[("y", float(x[j]), VERMILION) for x in ends if np.isfinite(float(x[j]))],
+                levels=[
+                    ("y", float(x[j]), VERMILION)
+                    for x in ends
+                    if np.isfinite(float(x[j]))
+                ],
             )
             for (name, rate, values, *ends), colour in zip(kinds, CYCLE, strict=False)
         )
-        return dataclasses.replace(first, below=below, x_range=(float(time[0]), float(time[-1])))
+        return dataclasses.replace(
+            first, below=below, x_range=(float(time[0]), float(time[-1]))
+        )
 
     title = f"{robot.name}: motion of the joints (dashed: limits)"
     panels = [panel(j) for j in range(robot.joints)]
     return Figure(title, panels, columns=min(3, robot.joints), height=3.2)
 
 
-def tip_figure(robot: Robot, time: Float[AnyArray, " samples"], motion: Motion) -> Figure:
+def tip_figure(
+    robot: Robot, time: Float[AnyArray, " samples"], motion: Motion
+) -> Figure:
     """Return position, speed and acceleration of the end-effector (Sec. 4).
 
     Args:
@@ -71,7 +89,9 @@ def tip_figure(robot: Robot, time: Float[AnyArray, " samples"], motion: Motion) 
         position, *rates = (np.asarray(x) for x in tip_motion(robot, motion))
     axes = [Curve(time, position[:, k], "xyz"[k], CYCLE[k]) for k in range(3)]
     panels = [Panel(axes, title="position", unit="m")]
-    for vectors, name, unit in zip(rates, ("speed", "acceleration"), ("m/s", "m/s²"), strict=True):
+    for vectors, name, unit in zip(
+        rates, ("speed", "acceleration"), ("m/s", "m/s²"), strict=True
+    ):
         values = np.linalg.norm(vectors, axis=1)
         most = f"up to {values.max():.3g} {unit}"
         panels.append(Panel([Curve(time, values)], title=name, value=most, unit=unit))
@@ -128,8 +148,8 @@ def pose_figure(
         robot: Robot to draw.
         q: Joint coordinates along a motion [rad or m].
         time: Instants of the samples [s]; without them the page counts samples.
-        values: Values of the joints that colour their links, and on average the path of the
-            end-effector, such as torque errors.
+        values: Values of the joints that colour their links, and on average the path of
+            the end-effector, such as torque errors.
         label: Name of these values, with their unit.
         poses: Number of poses on paper, evenly spaced from the first to the last.
         title: Title of the figure; the robot's name if None.
@@ -144,7 +164,9 @@ def pose_figure(
         values = np.maximum.reduceat(sizes, path, axis=0)
 
     def place(x):
-        return jnp.concatenate([placements(robot, x)[1], tip_placement(robot, x)[1][None]])
+        return jnp.concatenate(
+            [placements(robot, x)[1], tip_placement(robot, x)[1][None]]
+        )
 
     with double_precision():
         points = in_numpy(robot, place, q[path])
@@ -156,12 +178,18 @@ def pose_figure(
         poses=poses,
         values=values,
         label=label,
-        solids=None if shapes is None else _solids(robot, shapes, q[path][np.unique(shown)]),
+        solids=None
+        if shapes is None
+        else _solids(robot, shapes, q[path][np.unique(shown)]),
     )
-    return Figure(robot.name if title is None else title, height=2.6, width=7.5, scene=scene)
+    return Figure(
+        robot.name if title is None else title, height=2.6, width=7.5, scene=scene
+    )
 
 
-def _solids(robot: Robot, shapes: CollisionModel, q: Float[np.ndarray, "frames joints"]) -> Solids:
+def _solids(
+    robot: Robot, shapes: CollisionModel, q: Float[np.ndarray, "frames joints"]
+) -> Solids:
     """Return the surfaces of all shapes, and the places of the bodies in some poses."""
 
     def body_places(x):
@@ -176,22 +204,33 @@ def _solids(robot: Robot, shapes: CollisionModel, q: Float[np.ndarray, "frames j
     vertices, bodies, faces = [], [], []
     for body, points in clouds:
         hull = ConvexHull(points) if len(points) > 4 else None
-        faces.append((_SQUARE if hull is None else hull.simplices) + sum(map(len, vertices)))
+        faces.append(
+            (_SQUARE if hull is None else hull.simplices) + sum(map(len, vertices))
+        )
         vertices.append(points)
         bodies.append(np.full(len(points), body))
-    return Solids(np.concatenate(vertices), np.concatenate(bodies), np.concatenate(faces), places)
+    return Solids(
+        np.concatenate(vertices), np.concatenate(bodies), np.concatenate(faces), places
+    )
 
 
 def _capsule_points(capsule: Capsule) -> Float[np.ndarray, "points 3"]:
     """Return points on two spheres at the ends of a capsule, spread by the golden angle."""
-    turn, z = np.pi * (3 - 5**0.5) * np.arange(SPREAD), 1 - (2 * np.arange(SPREAD) + 1) / SPREAD
+    turn, z = (
+        np.pi * (3 - 5**0.5) * np.arange(SPREAD),
+        1 - (2 * np.arange(SPREAD) + 1) / SPREAD,
+    )
     ring = np.sqrt(1 - z**2)
-    ball = float(capsule.radius) * np.stack([ring * np.cos(turn), ring * np.sin(turn), z], axis=1)
+    ball = float(capsule.radius) * np.stack(
+        [ring * np.cos(turn), ring * np.sin(turn), z], axis=1
+    )
     ends = np.unique(np.stack([capsule.start, capsule.end]), axis=0)
     return (ends[:, None] + ball).reshape(-1, 3)
 
 
-def _obstacle_points(obstacle: HalfSpace | Box, size: float) -> Float[np.ndarray, "points 3"]:
+def _obstacle_points(
+    obstacle: HalfSpace | Box, size: float
+) -> Float[np.ndarray, "points 3"]:
     """Return the corners of a box, or of a square in a plane around the ground's origin."""
     signs = np.array([*itertools.product((-1.0, 1.0), repeat=3)])
     if isinstance(obstacle, Box):

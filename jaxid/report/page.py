@@ -10,7 +10,15 @@ from markupsafe import Markup
 from rich.console import Console
 from rich.text import Text
 
-from jaxid.result_table import Remark, Status, Table, in_html, macros, printable, versions
+from jaxid.result_table import (
+    Remark,
+    Status,
+    Table,
+    in_html,
+    macros,
+    printable,
+    versions,
+)
 
 from .figure import Figure
 from .interactive import charts, library
@@ -39,12 +47,16 @@ def render_page(
 
     Its figures are drawn by the browser, from data and a library that the page holds.
 
-    Blocks of a section are texts (paragraphs), tables, figures, a remark (the headline), lists of
-    remarks, tuples of blocks beside each other, and what `tiles`, `code` and `folded` return.
-    All texts are escaped.
+    Blocks of a section are texts (paragraphs), tables, figures, a remark (the
+    headline), lists of remarks, tuples of blocks beside each other, and what `tiles`,
+    `code` and `folded` return. All texts are escaped.
     """
     shown = [
-        (name, re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-"), [*map(_render, blocks)])
+        (
+            name,
+            re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-"),
+            [*map(_render, blocks)],
+        )
         for name, blocks in sections
     ]
     drawn = any('class="chart"' in block for *_, blocks in shown for block in blocks)
@@ -94,13 +106,18 @@ def folded(summary: str, *blocks: Any) -> Markup:
 def provenance(settings: Mapping[str, Any]) -> Section:
     """Return the last section of a page: how to get the same result again.
 
-    Of `settings`, `facts` (pairs of a word and a text), `command` and `experiment_text` are shown.
+    Of `settings`, `facts` (pairs of a word and a text), `command` and `experiment_text`
+    are shown.
     """
-    blocks: list[Any] = [Table("", facts=(*settings.get("facts", ()), *versions().items()))]
+    blocks: list[Any] = [
+        Table("", facts=(*settings.get("facts", ()), *versions().items()))
+    ]
     if settings.get("command"):
         blocks.append(code(str(settings["command"])))
     if settings.get("experiment_text"):
-        blocks.append(folded("The experiment file", code(str(settings["experiment_text"]))))
+        blocks.append(
+            folded("The experiment file", code(str(settings["experiment_text"])))
+        )
     return "To repeat this", blocks
 
 

@@ -23,7 +23,9 @@ def draw(figure: Figure) -> Drawing:
     rows = math.ceil(len(figure.panels) / figure.columns) or 2
     with matplotlib.style.context(STYLE):
         # The figure belongs to no window and no list of figures.
-        drawn = Drawing(figsize=(figure.width, 0.9 + figure.height * rows), layout="constrained")
+        drawn = Drawing(
+            figsize=(figure.width, 0.9 + figure.height * rows), layout="constrained"
+        )
         FigureCanvasAgg(drawn)
         drawn.suptitle(figure.title, x=0.01, ha="left", fontsize=12, fontweight="bold")
         if figure.scene is not None:
@@ -31,7 +33,9 @@ def draw(figure: Figure) -> Drawing:
             return drawn
         grid = drawn.add_gridspec(rows, figure.columns)
         for place, panel in enumerate(figure.panels):
-            drawn.align_ylabels(_draw_stack(drawn, grid[divmod(place, figure.columns)], panel))
+            drawn.align_ylabels(
+                _draw_stack(drawn, grid[divmod(place, figure.columns)], panel)
+            )
         labelled = [axes.get_legend_handles_labels() for axes in drawn.axes]
         entries = {name: x for pair in labelled for x, name in zip(*pair, strict=True)}
         drawn.legend(
@@ -91,7 +95,11 @@ def _draw_panel(axes: Axes, panel: Panel) -> None:
         axes.set_yticks(np.arange(len(panel.y_names)), panel.y_names)
         axes.set_ylim(len(panel.y_names) - 0.4, -0.6)
         axes.grid(visible=False, axis="y")
-        beside = {"transform": axes.get_yaxis_transform(), "va": "center", "fontsize": 7.5}
+        beside = {
+            "transform": axes.get_yaxis_transform(),
+            "va": "center",
+            "fontsize": 7.5,
+        }
         for place, text in enumerate(panel.beside):
             axes.text(1.03, float(place), text, color=GREY, **beside)
 
@@ -103,7 +111,9 @@ def _draw_curve(axes: Axes, curve: Curve, in_time: bool) -> None:
             axes.fill_between(curve.x, curve.low, curve.high, alpha=0.3, lw=0, **look)
         case "bars":
             bars = axes.bar(curve.x, curve.y, curve.width, **look)
-            axes.bar_label(bars, curve.texts, label_type="center", fontsize=7.5, color=INK)
+            axes.bar_label(
+                bars, curve.texts, label_type="center", fontsize=7.5, color=INK
+            )
         case "intervals":
             axes.hlines(curve.y, curve.low, curve.high, color=curve.colour, lw=1.4)
             axes.scatter(curve.x, curve.y, s=16, zorder=3, **look)
@@ -112,24 +122,35 @@ def _draw_curve(axes: Axes, curve: Curve, in_time: bool) -> None:
         case _:
             # As many bins as a line has pixel columns.
             points = decimate(curve.x, curve.y, 700) if in_time else (curve.x, curve.y)
-            look |= {"ls": "--" if curve.dashed else "-", "marker": "o" if curve.marker else ""}
+            look |= {
+                "ls": "--" if curve.dashed else "-",
+                "marker": "o" if curve.marker else "",
+            }
             axes.plot(*points, lw=curve.width, ms=2.6, **look)
 
 
 def _draw_scene(drawn: Drawing, scene: Scene) -> None:
     """Draw the robot in some poses, earlier ones paler, and the path of its end-effector."""
-    axes: Any = drawn.add_subplot(projection="3d", proj_type="ortho", elev=22.0, azim=-62.0)
+    axes: Any = drawn.add_subplot(
+        projection="3d", proj_type="ortho", elev=22.0, azim=-62.0
+    )
     tip = scene.points[:, -1]
-    path = Line3DCollection(np.stack([tip[:-1], tip[1:]], axis=1), color=VERMILION, lw=1.2)
+    path = Line3DCollection(
+        np.stack([tip[:-1], tip[1:]], axis=1), color=VERMILION, lw=1.2
+    )
     if scene.values is not None:
-        path = Line3DCollection(np.stack([tip[:-1], tip[1:]], axis=1), cmap="viridis", lw=1.4)
+        path = Line3DCollection(
+            np.stack([tip[:-1], tip[1:]], axis=1), cmap="viridis", lw=1.4
+        )
         path.set_array(scene.mean[:-1])
         drawn.colorbar(path, ax=axes, shrink=0.7, label=scene.label)
     axes.add_collection3d(path, autolim=False)
     poses = np.linspace(0, len(tip) - 1, min(scene.poses, len(tip))).round().astype(int)
     for place, k in enumerate(poses, 1):
         look = {"color": INK, "alpha": 0.16 + 0.84 * (place / len(poses)) ** 2}
-        axes.add_collection3d(Line3DCollection(scene.bones[k], lw=2.4, **look), autolim=False)
+        axes.add_collection3d(
+            Line3DCollection(scene.bones[k], lw=2.4, **look), autolim=False
+        )
         axes.scatter(*scene.points[k, :-1].T, s=18, **look)
     low, high = scene.bones.min(axis=(0, 1, 2)), scene.bones.max(axis=(0, 1, 2))
     axes.auto_scale_xyz(*np.stack([low, high], axis=1))

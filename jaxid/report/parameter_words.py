@@ -11,7 +11,10 @@ from jaxid.robot.robot import Robot
 BODY = {
     "m": "mass",
     **{f"m{a}": f"mass times {a} of the centre of mass" for a in "xyz"},
-    **{symbol: f"moment of inertia about {a}" for symbol, a in zip("ABC", "xyz", strict=True)},
+    **{
+        symbol: f"moment of inertia about {a}"
+        for symbol, a in zip("ABC", "xyz", strict=True)
+    },
     **{
         s: f"product of inertia in {p}"
         for s, p in zip("DEF", ("y, z", "x, z", "x, y"), strict=True)
@@ -45,7 +48,9 @@ def in_words(name: str, robot: Robot) -> tuple[str, str]:
         side, times, place = wave.groups()
         kind = "sine" if side[0] == "s" else "cosine"
         turns = "motor" if side[1] == "m" else "joint"
-        return f"ripple: {kind}, {times} times a turn of the {turns}", _joint(robot, place)
+        return f"ripple: {kind}, {times} times a turn of the {turns}", _joint(
+            robot, place
+        )
     found = re.fullmatch(r"([A-Za-z]+?)(\d+)", name)
     symbol, place = found.groups() if found else (name, "")
     if symbol in BODY:
@@ -62,7 +67,9 @@ def _joint(robot: Robot, place: str) -> str:
 
 def word_columns(base: BaseParameters) -> list[Column]:
     """Return columns with what each base parameter is, and of which body or joint."""
-    meanings, places = zip(*(in_words(name, base.model.robot) for name in base.names), strict=True)
+    meanings, places = zip(
+        *(in_words(name, base.model.robot) for name in base.names), strict=True
+    )
     mixed = np.any(np.asarray(base.kappa) != 0.0, axis=1)
     shown = [
         f"{text}\N{NO-BREAK SPACE}*" if more else text
@@ -80,9 +87,12 @@ def glossary(base: BaseParameters) -> Table:
         rows.setdefault(symbol, (f"{symbol}1, …", meaning, unit))
     symbols, meanings, units = zip(*rows.values(), strict=True)
     text = (
-        "Numbers count joints and bodies from the base. Masses times distances, and moments of "
-        "inertia, are about the origin of the body's frame, which lies on the axis of its joint, "
-        "and along the frame's axes. Friction and rotors are seen from the joint, behind the gear"
+        "Numbers count joints and bodies from the base. Masses times distances, and "
+        "moments of "
+        "inertia, are about the origin of the body's frame, which lies on the axis of "
+        "its joint, "
+        "and along the frame's axes. Friction and rotors are seen from the joint, "
+        "behind the gear"
     )
     return Table(
         "",

@@ -24,8 +24,8 @@ CLASSES = 24
 def friction_figure(fit: Fit, logs: Sequence[TorqueErrors]) -> Figure:
     """Return friction against speed for every joint, with 95 % bands.
 
-    Points are measured: means over classes of speed of all forces that the model does not explain
-    by anything but friction.
+    Points are measured: means over classes of speed of all forces that the model does
+    not explain by anything but friction.
 
     Args:
         fit: Identified parameters.
@@ -43,14 +43,19 @@ def friction_figure(fit: Fit, logs: Sequence[TorqueErrors]) -> Figure:
         curves = [Curve(v, y, "model", BLUE, width=1.4)]
         if np.isfinite(halves[:, j]).all():
             low, high = y - halves[:, j], y + halves[:, j]
-            curves.insert(0, Curve(v, y, "95 % band", MEASURED, "band", low=low, high=high))
+            curves.insert(
+                0, Curve(v, y, "95 % band", MEASURED, "band", low=low, high=high)
+            )
         places, means = _classes(logs, j, v, y)
-        curves.append(Curve(places, means, "measured, mean of a class of speed", GREY, "points"))
+        curves.append(
+            Curve(places, means, "measured, mean of a class of speed", GREY, "points")
+        )
         unit = robot.force_unit(j)
         return Panel(
             curves,
             title=shortened(robot.joint_names[j], 26),
-            value=f"{significant(float(np.interp(fastest[j], v, y)), 2)} {unit} at full speed",
+            value=f"{significant(float(np.interp(fastest[j], v, y)), 2)} {unit} at "
+            "full speed",
             x=f"speed [{robot.joint_unit(j)}/s]",
             y="friction",
             unit=unit,
@@ -61,7 +66,9 @@ def friction_figure(fit: Fit, logs: Sequence[TorqueErrors]) -> Figure:
     return Figure(f"{robot.name}: friction of the joints", panels, min(3, len(panels)))
 
 
-def _friction(fit: Fit, speeds: Float[np.ndarray, "speeds joints"]) -> tuple[np.ndarray, ...]:
+def _friction(
+    fit: Fit, speeds: Float[np.ndarray, "speeds joints"]
+) -> tuple[np.ndarray, ...]:
     """Return friction of joints that move alone, and half the widths of its 95 % intervals."""
     base, n = fit.base, speeds.shape[1]
     moving = np.zeros((len(speeds) + 1, n, n))
@@ -71,7 +78,9 @@ def _friction(fit: Fit, speeds: Float[np.ndarray, "speeds joints"]) -> tuple[np.
     own = theta.reshape(len(speeds) + 1, n, n, -1)[:, np.arange(n), np.arange(n)]
     # Without speed there is weight only.
     own = own[:-1] - own[-1]
-    variances = np.einsum("vjk,kl,vjl->vj", own, np.nan_to_num(fit.covariance, posinf=0.0), own)
+    variances = np.einsum(
+        "vjk,kl,vjl->vj", own, np.nan_to_num(fit.covariance, posinf=0.0), own
+    )
     unknown = ~np.isfinite(np.diag(fit.covariance))
     halves = 1.96 * np.sqrt(np.maximum(variances, 0.0))
     halves[:, np.any(own[..., unknown] != 0.0, axis=(0, 2))] = np.nan
@@ -86,7 +95,9 @@ def _classes(
     errors = np.concatenate([e.errors[:, j] for e in logs])
     kept = np.isfinite(errors)
     speeds, friction = speeds[kept], np.interp(speeds[kept], v, y) - errors[kept]
-    place = np.clip((CLASSES * (speeds / v[-1] + 1.0) / 2.0).astype(int), 0, CLASSES - 1)
+    place = np.clip(
+        (CLASSES * (speeds / v[-1] + 1.0) / 2.0).astype(int), 0, CLASSES - 1
+    )
     counts = np.bincount(place, minlength=CLASSES)
     shown = counts >= 5
     sums = (np.bincount(place, x, CLASSES)[shown] for x in (speeds, friction))
@@ -104,13 +115,20 @@ def gravity_figure(fit: Fit, log: TorqueErrors) -> Figure:
     robot, rows = fit.base.model.robot, _some(log)
     values = gravity_forces(fit, np.asarray(log.positions)[rows])
     curves = [
-        Curve(np.asarray(log.time)[rows], values[:, j], shortened(name, 26), CYCLE[j % len(CYCLE)])
+        Curve(
+            np.asarray(log.time)[rows],
+            values[:, j],
+            shortened(name, 26),
+            CYCLE[j % len(CYCLE)],
+        )
         for j, name in enumerate(robot.joint_names)
     ]
     unit = " or ".join(dict.fromkeys(robot.force_unit(j) for j in range(robot.joints)))
     panel = Panel(curves, y="force of the weight", unit=unit)
     return Figure(
-        f"Torque that carries the weight, along {shortened(log.name, 40)}", [panel], height=3.2
+        f"Torque that carries the weight, along {shortened(log.name, 40)}",
+        [panel],
+        height=3.2,
     )
 
 
@@ -119,7 +137,9 @@ def gravity_forces(
 ) -> Float[np.ndarray, "rows joints"]:
     """Return the forces of the drives against gravity at standstill [N m or N]."""
     base, model = fit.base, fit.base.model
-    bodies = [bool(t.body_parameters) for t in model.terms for _ in t.parameters(model.robot)]
+    bodies = [
+        bool(t.body_parameters) for t in model.terms for _ in t.parameters(model.robot)
+    ]
     p = np.where([bodies[k] for k in base.indices], fit.parameters, 0.0)
     return _steady_columns(base, q, np.zeros_like(q)) @ p
 
@@ -141,7 +161,9 @@ def _some(log: TorqueErrors) -> np.ndarray:
 def gravity_table(fit: Fit, log: TorqueErrors) -> Table:
     """Return the largest force against gravity of each joint along a recording."""
     robot = fit.base.model.robot
-    most = np.max(np.abs(gravity_forces(fit, np.asarray(log.positions)[_some(log)])), axis=0)
+    most = np.max(
+        np.abs(gravity_forces(fit, np.asarray(log.positions)[_some(log)])), axis=0
+    )
     # What is rounding is zero.
     most[most < 1e-9 * np.max(most)] = 0.0
     columns = [

@@ -14,9 +14,16 @@ import numpy as np
 
 from jaxid.arrays import AnyArray
 from jaxid.errors import InputError
-from jaxid.identification.estimators.regularisation_and_weights import LARGEST_UNCERTAINTY
+from jaxid.identification.estimators.regularisation_and_weights import (
+    LARGEST_UNCERTAINTY,
+)
 from jaxid.identification.fit_result import Fit, load
-from jaxid.identification.parameter_changes import LEVEL, Comparison, Verdict, parameter_kinds
+from jaxid.identification.parameter_changes import (
+    LEVEL,
+    Comparison,
+    Verdict,
+    parameter_kinds,
+)
 from jaxid.identification.uncertainty import Uncertainty
 from jaxid.io import atomic_folder, json_text, read_json
 from jaxid.model_validation import TorqueErrors
@@ -41,7 +48,15 @@ MODEL = "model.json"
 """File of a report that holds the fit, for `load` and `jaxid export`."""
 SCHEMAS = {
     f"{kind}.json": f"jaxid-{kind}/1"
-    for kind in ("result", "comparison", "payload", "gains", "states", "demo", "rollout")
+    for kind in (
+        "result",
+        "comparison",
+        "payload",
+        "gains",
+        "states",
+        "demo",
+        "rollout",
+    )
 }
 """Files that hold results, and the schemas in them."""
 Estimates = tuple[Sequence[str], Sequence[str], AnyArray, Uncertainty]
@@ -51,8 +66,9 @@ Estimates = tuple[Sequence[str], Sequence[str], AnyArray, Uncertainty]
 def write_report(folder: Path, report: Report, suffix: str = "") -> list[Path]:
     """Write `report.html`, `result.json`, `parameters.csv` and `model.json`; return them.
 
-    With a `suffix` (`svg`, `png` or `pdf`) each figure is also written to a file of that format. A
-    folder that exists keeps its other files; files of an earlier report in it are replaced.
+    With a `suffix` (`svg`, `png` or `pdf`) each figure is also written to a file of
+    that format. A folder that exists keeps its other files; files of an earlier report
+    in it are replaced.
     """
     record, figures = _record(report), _draw(report)
     page = identification_page(report, figures)
@@ -82,8 +98,13 @@ def _draw(report: Report) -> dict[str, Figure]:
         "robot": error_scene(report.fit, shown),
     }
     if report.claimed:
-        groups = (("by the robot's file", report.claimed), ("identified", report.every_error))
-        figures["before_and_after"] = bar_figure(groups, robot, "Torque errors before and after")
+        groups = (
+            ("by the robot's file", report.claimed),
+            ("identified", report.every_error),
+        )
+        figures["before_and_after"] = bar_figure(
+            groups, robot, "Torque errors before and after"
+        )
     if report.choice is not None:
         figures["filter"] = filter_figure(report.choice)
     if spectra is not None:
@@ -95,7 +116,9 @@ def _draw(report: Report) -> dict[str, Figure]:
             stem = safe_name(errors.name)
             more = (f"{stem}_{role}_{k}" for k in range(2, 10_000))
             # Unique also where case is ignored.
-            stem = next(x for x in (stem, f"{stem}_{role}", *more) if x.lower() not in used)
+            stem = next(
+                x for x in (stem, f"{stem}_{role}", *more) if x.lower() not in used
+            )
             used.add(stem.lower())
             title = errors.name if errors.name == role else f"{errors.name} ({role})"
             figures[f"torque_{stem}"] = torque_figure(errors, robot, title)
@@ -175,7 +198,10 @@ def write_comparison(
         "covariance_of_differences": comparison.uncertainty.covariance,
         "groups": comparison.groups,
     }
-    count = f"{comparison.verdicts.count(Verdict.CHANGED)} of {len(k)} parameters have changed"
+    count = (
+        f"{comparison.verdicts.count(Verdict.CHANGED)} of {len(k)} parameters "
+        "have changed"
+    )
     sections = [
         ("Result", [Remark(count), comparison.group_summary()]),
         ("Estimates side by side", [comparison_figure(comparison)]),
@@ -183,7 +209,9 @@ def write_comparison(
     ]
     title = f"{first.base.model.robot.name}: two runs compared"
     lead = f"{first.name} and {second.name}"
-    return _write_table(folder, "comparison", content, rows, render_page(title, sections, lead))
+    return _write_table(
+        folder, "comparison", content, rows, render_page(title, sections, lead)
+    )
 
 
 def write_estimates(
@@ -207,9 +235,13 @@ def write_estimates(
         "covariance": estimates[0][-1].covariance,
         **content,
     }
-    logs = Table("", facts=[(key, ", ".join(map(str, paths))) for key, paths in sources.items()])
+    logs = Table(
+        "", facts=[(key, ", ".join(map(str, paths))) for key, paths in sources.items()]
+    )
     blocks = [*([doubts] if doubts else []), *tables]
-    page = render_page(f"{kind.capitalize()}: results", [("Result", blocks), ("Logs", [logs])])
+    page = render_page(
+        f"{kind.capitalize()}: results", [("Result", blocks), ("Logs", [logs])]
+    )
     return _write_table(folder, kind, everything, rows, page)
 
 
@@ -226,7 +258,11 @@ def estimate_rows(estimates: Estimates) -> list[dict[str, Any]]:
 
 
 def _write_table(
-    folder: Path, stem: str, content: Mapping[str, Any], rows: list[dict[str, Any]], page: str
+    folder: Path,
+    stem: str,
+    content: Mapping[str, Any],
+    rows: list[dict[str, Any]],
+    page: str,
 ) -> list[Path]:
     names = ["report.html", f"{stem}.json", f"{stem}.csv"]
     with atomic_folder(folder) as staging:
@@ -276,7 +312,10 @@ def _entries(source: Any, names: str, **renamed: str) -> dict[str, Any]:
 
 def _rows(**columns: Any) -> list[dict[str, Any]]:
     """Return a dictionary for each row of some columns."""
-    values = (x.tolist() if isinstance(x, np.ndarray | jax.Array) else x for x in columns.values())
+    values = (
+        x.tolist() if isinstance(x, np.ndarray | jax.Array) else x
+        for x in columns.values()
+    )
     return [dict(zip(columns, row, strict=True)) for row in zip(*values, strict=True)]
 
 
@@ -397,7 +436,9 @@ def _robot_record(robot: Robot) -> dict[str, Any]:
         **_entries(robot, "name source"),
         "joints": _rows(
             name=robot.joint_names,
-            kind=["revolute" if revolute else "prismatic" for revolute in robot.revolute],
+            kind=[
+                "revolute" if revolute else "prismatic" for revolute in robot.revolute
+            ],
             unit=[robot.joint_unit(j) for j in joints],
             force_unit=[robot.force_unit(j) for j in joints],
             **_entries(robot.limits, limits),
@@ -414,7 +455,8 @@ def _error_record(errors: TorqueErrors, robot: Robot) -> dict[str, Any]:
             rows=np.asarray(errors.counted).sum(axis=0),
             **_entries(
                 errors,
-                "mean rms mean_percent rms_percent rms_relative offset rms_at_rest rms_in_motion",
+                "mean rms mean_percent rms_percent rms_relative offset rms_at_rest "
+                "rms_in_motion",
             ),
         ),
     }

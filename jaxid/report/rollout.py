@@ -27,7 +27,8 @@ class RolloutReport(NamedTuple):
     Attributes:
         fit: Identified servos.
         errors: Errors of free-running simulations.
-        windows: Errors of windows of one second that start from measured states [rad or m].
+        windows: Errors of windows of one second that start from measured states [rad or
+            m].
         unseen: Whether these logs were not used for the fit.
         samples: Number of MJCF files to draw.
         settings: Facts, command and text of the experiment file.
@@ -93,7 +94,11 @@ def motion_figure(errors: RolloutErrors, motion: int) -> Figure:
 
 
 def motion_panel(
-    name: str, time: np.ndarray, measured: np.ndarray, simulated: np.ndarray, counted: np.ndarray
+    name: str,
+    time: np.ndarray,
+    measured: np.ndarray,
+    simulated: np.ndarray,
+    counted: np.ndarray,
 ) -> Panel:
     """Return measured and simulated positions of a joint, and the errors of what counts below."""
     wrong = 1e3 * (simulated - measured)
@@ -111,11 +116,15 @@ def motion_panel(
 def rollout_verdict(errors: RolloutErrors) -> Remark:
     """Return in words whether the simulation is closer to the robot than a linear joint."""
     total, linear = errors.total(), errors.total("linear")
-    worse = [n for n, x, y in zip(errors.joint_names, total, linear, strict=True) if x >= y]
+    worse = [
+        n for n, x, y in zip(errors.joint_names, total, linear, strict=True) if x >= y
+    ]
     text = "The simulation moves more like the robot than a linear joint does"
     if worse:
         text = f"The simulation is no better than a linear joint ({', '.join(worse)})"
-    sizes = (", ".join(significant(1e3 * x) for x in values) for values in (total, linear))
+    sizes = (
+        ", ".join(significant(1e3 * x) for x in values) for values in (total, linear)
+    )
     return Remark(
         f"{text}: errors of {' instead of '.join(sizes)} mrad or mm",
         Status.DOUBTFUL if worse else Status.GOOD,
@@ -126,7 +135,9 @@ def rollout_page(report: RolloutReport, figures: Sequence[Figure]) -> str:
     """Return the page of an identification without torques as HTML."""
     fit, errors = report.fit, report.errors
     parameters = fit.summary()
-    simulators: list[Any] = ["No weight tells a stiffness: name it by `rollout.stiffness`."]
+    simulators: list[Any] = [
+        "No weight tells a stiffness: name it by `rollout.stiffness`."
+    ]
     if report.has_stiffness:
         simulators = [simulator_table(fit)]
     sections: list[Section] = [
@@ -136,9 +147,15 @@ def rollout_page(report: RolloutReport, figures: Sequence[Figure]) -> str:
         (
             "What the logs determine",
             [
-                "Positions tell torques only in units of the servo's stiffness. Parameters that "
+                "Positions tell torques only in units of the servo's stiffness. "
+                "Parameters that "
                 "the logs tell only together are merged.",
-                Table("", *parameters.columns, facts=parameters.facts, status=parameters.status),
+                Table(
+                    "",
+                    *parameters.columns,
+                    facts=parameters.facts,
+                    status=parameters.status,
+                ),
             ],
         ),
         ("For simulators", simulators),
@@ -183,7 +200,10 @@ def _record(report: RolloutReport, rows: list[dict[str, Any]]) -> dict[str, Any]
     if report.has_stiffness:
         values = simulator_values(fit)
         limits = values.pop("effort_limit")
-        simulators = {**values, "effort_limit": np.where(np.isfinite(limits), limits, -1.0)}
+        simulators = {
+            **values,
+            "effort_limit": np.where(np.isfinite(limits), limits, -1.0),
+        }
     return plain(
         {
             **header("rollout.json"),
@@ -198,7 +218,10 @@ def _record(report: RolloutReport, rows: list[dict[str, Any]]) -> dict[str, Any]
             "errors": {
                 "motions": errors.motions,
                 "unseen": report.unseen,
-                **{kind: errors.rms(kind) for kind in ("simulated", "linear", "command")},
+                **{
+                    kind: errors.rms(kind)
+                    for kind in ("simulated", "linear", "command")
+                },
                 "windows": report.windows,
             },
             "contacts": [c._asdict() for c in (*fit.contacts, *errors.contacts)],

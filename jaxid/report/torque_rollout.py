@@ -22,7 +22,8 @@ class TorqueRolloutReport(NamedTuple):
     Attributes:
         fit: Fit of rollouts.
         comparison: Errors beside those of other methods.
-        paths: Names of logs, with times, measured and simulated positions of their windows.
+        paths: Names of logs, with times, measured and simulated positions of their
+            windows.
         findings: Findings on the logs.
         notes: Notes on the experiment and the logs.
         settings: Command and text of the experiment file.
@@ -41,8 +42,13 @@ class TorqueRolloutReport(NamedTuple):
         found = self.comparison
         plain, *_, own = np.nan_to_num(found.errors[:, -1], nan=np.inf)
         closer = bool((own < plain).all())
-        text = f"Simulations are {'closer' if closer else 'no closer'} to the robot than with the "
-        sizes = (", ".join(significant(1e3 * x) for x in errors) for errors in (own, plain))
+        text = (
+            f"Simulations are {'closer' if closer else 'no closer'} to the robot "
+            "than with the "
+        )
+        sizes = (
+            ", ".join(significant(1e3 * x) for x in errors) for errors in (own, plain)
+        )
         text += f"fit of torques: errors after {found.horizons[-1]:g} s of "
         text += f"{' instead of '.join(sizes)} mrad or mm"
         other = f"Closest on these logs: {found.best}."
@@ -60,7 +66,9 @@ class TorqueRolloutReport(NamedTuple):
     def write(self, folder: Path) -> list[Path]:
         """Write the page, `rollout.json` and `rollout.csv`."""
         fit, free = self.fit, np.flatnonzero(self.fit.free)
-        names, units = ([x[k] for k in free] for x in (fit.rollout.names, fit.rollout.units))
+        names, units = (
+            [x[k] for k in free] for x in (fit.rollout.names, fit.rollout.units)
+        )
         rows = estimate_rows((names, units, fit.unknowns[free], fit.uncertainty))
         files = ["rollout.html", "rollout.json", "rollout.csv"]
         sections: list[Section] = [
@@ -79,7 +87,9 @@ class TorqueRolloutReport(NamedTuple):
 
     def _record(self, rows: list[dict[str, Any]]) -> dict[str, Any]:
         fit, found = self.fit, self.comparison
-        methods = zip(METHODS, found.parameters, found.errors, found.torque_errors, strict=True)
+        methods = zip(
+            METHODS, found.parameters, found.errors, found.torque_errors, strict=True
+        )
         keys = ("method", "parameters", "errors", "torque_errors")
         errors = {
             "unseen": found.unseen,

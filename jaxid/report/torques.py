@@ -33,8 +33,8 @@ def torque_figure(
 ) -> Figure:
     """Return measured and predicted forces of every joint, and their difference below.
 
-    Rows at both ends that count for no joint are left out; where a row within does not count for
-    a joint, the difference is left blank.
+    Rows at both ends that count for no joint are left out; where a row within does not
+    count for a joint, the difference is left blank.
 
     Args:
         errors: Errors on one recording.
@@ -62,7 +62,9 @@ def torque_figure(
 def _joint_panel(errors: TorqueErrors, robot: Robot, j: int, window: slice) -> Panel:
     unit, difference = robot.force_unit(j), errors.errors[window, j]
     time = np.asarray(errors.time)[window]
-    measured, predicted = (np.asarray(x)[window, j] for x in (errors.measured, errors.predicted))
+    measured, predicted = (
+        np.asarray(x)[window, j] for x in (errors.measured, errors.predicted)
+    )
     text = "no row counts"
     if np.isfinite(difference).any():
         fraction = errors.mean_percent[j] / 100.0
@@ -94,17 +96,20 @@ def require_joints(errors: TorqueErrors, robot: Robot) -> None:
     """Reject errors of another robot."""
     if errors.measured.shape[1] != robot.joints:
         raise InputError(
-            f"`errors` of `{errors.name}` must be of the {robot.joints} joints of `{robot.name}`."
+            f"`errors` of `{errors.name}` must be of the {robot.joints} joints of "
+            f"`{robot.name}`."
         )
 
 
 def error_figure(
-    identification: Sequence[TorqueErrors], verification: Sequence[TorqueErrors], robot: Robot
+    identification: Sequence[TorqueErrors],
+    verification: Sequence[TorqueErrors],
+    robot: Robot,
 ) -> Figure:
     """Return mean absolute errors as bars and RMS errors as points (Eq. 37, Fig. 10).
 
-    In percent of the largest forces; of the RMS of the measured forces if a largest one is not
-    known. Several recordings count as one.
+    In percent of the largest forces; of the RMS of the measured forces if a largest one
+    is not known. Several recordings count as one.
 
     Args:
         identification: Errors on the recordings of the fit.
@@ -123,24 +128,25 @@ def bar_figure(
 ) -> Figure:
     """Return mean absolute errors as bars and RMS errors as points, for some groups (Eq. 37).
 
-    In percent of the largest forces; of the RMS of the measured forces if a largest one is not
-    known. Recordings of one group count as one.
+    In percent of the largest forces; of the RMS of the measured forces if a largest one
+    is not known. Recordings of one group count as one.
 
     Args:
-        groups: Names, and errors on some recordings, like those of one estimator; groups without
-            recordings are left out.
+        groups: Names, and errors on some recordings, like those of one estimator;
+            groups without recordings are left out.
         robot: Robot of the recordings.
         title: Title of the figure; the robot's name if empty.
 
     Raises:
-        InputError: If there is no recording at all, there are too many groups, or the numbers of
-            joints differ.
+        InputError: If there is no recording at all, there are too many groups, or the
+            numbers of joints differ.
     """
     colours = (BLUE, ORANGE, GREEN, PURPLE)
     filled = [(name, recordings) for name, recordings in groups if recordings]
     if not 0 < len(filled) <= len(colours):
         raise InputError(
-            f"`groups` must hold 1 to {len(colours)} groups with errors, but holds {len(filled)}."
+            f"`groups` must hold 1 to {len(colours)} groups with errors, but holds "
+            f"{len(filled)}."
         )
     everything = [errors for _, recordings in filled for errors in recordings]
     for errors in everything:
@@ -149,7 +155,9 @@ def bar_figure(
     known = bool(np.isfinite(largest).all())
     width = min(0.36, 0.72 / len(filled))
     bars, points = [], []
-    for k, (colour, (label, recordings)) in enumerate(zip(colours, filled, strict=False)):
+    for k, (colour, (label, recordings)) in enumerate(
+        zip(colours, filled, strict=False)
+    ):
         mean, rms, force_rms = _pool(recordings)
         scale = 100.0 / (largest if known else np.maximum(force_rms, 1e-300))
         place = np.arange(n) + (k - 0.5 * (len(filled) - 1)) * (width + 0.02)
@@ -157,7 +165,9 @@ def bar_figure(
         written = texts if n * len(filled) <= 20 else ()
         average = percent(float(np.mean(mean * scale)) / 100.0)
         label = f"{label}: {average} % on average"
-        bars.append(Curve(place, mean * scale, label, colour, "bars", width, texts=written))
+        bars.append(
+            Curve(place, mean * scale, label, colour, "bars", width, texts=written)
+        )
         points.append(Curve(place, rms * scale, "RMS", colour, "points"))
     return Figure(
         title or f"{robot.name}: torque errors",

@@ -7,7 +7,9 @@ from typing import Any
 import numpy as np
 
 from jaxid.dynamics.terms import ConstantOffset, SquareRootFriction
-from jaxid.identification.estimators.regularisation_and_weights import LARGEST_UNCERTAINTY
+from jaxid.identification.estimators.regularisation_and_weights import (
+    LARGEST_UNCERTAINTY,
+)
 from jaxid.identification.filter_and_parameter_selection import FilterChoice
 from jaxid.identification.fit_result import Fit
 from jaxid.model_validation import Definiteness, TorqueErrors
@@ -37,12 +39,18 @@ class Report:
     identification: Sequence[TorqueErrors]  # errors on the logs of the fit
     verification: Sequence[TorqueErrors]  # errors on logs that the fit has not seen
     definiteness: Definiteness  # of the mass matrix
-    settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # origin of the result
+    settings: Mapping[str, Any] = dataclasses.field(
+        default_factory=dict
+    )  # origin of the result
     notes: Sequence[str] = ()  # notes on the logs, as sentences
-    doubts: Sequence[str] = ()  # findings on the logs that deserve attention, as sentences
+    doubts: Sequence[
+        str
+    ] = ()  # findings on the logs that deserve attention, as sentences
     # likely mistakes in the description of the logs or the robot, as sentences
     mistakes: Sequence[str] = ()
-    choice: FilterChoice | None = None  # choice of the filter, where it was left to the logs
+    choice: FilterChoice | None = (
+        None  # choice of the filter, where it was left to the logs
+    )
     # errors on all logs of the parameters that the robot's file claims; empty without
     claimed: Sequence[TorqueErrors] = ()
     claimed_mass: float = 0.0  # mass of all bodies that it claims [kg]; 0 without
@@ -56,7 +64,9 @@ class Report:
     def every_note(self) -> tuple[str, ...]:
         """Notes on the robot, the fit and the logs, each once."""
         fit = self.fit
-        return tuple(dict.fromkeys((*fit.base.model.robot.notes, *fit.notes, *self.notes)))
+        return tuple(
+            dict.fromkeys((*fit.base.model.robot.notes, *fit.notes, *self.notes))
+        )
 
 
 def verdict(report: Report) -> list[Remark]:
@@ -77,20 +87,25 @@ def verdict(report: Report) -> list[Remark]:
         ),
         Remark(
             f"Estimates: {dict(fit.facts)['estimates']}",
-            detail="Standard deviation over estimate. A parameter near zero is never known to a "
+            detail="Standard deviation over estimate. A parameter near zero is never "
+            "known to a "
             "few percent, and that is no fault: look at its interval.",
         ),
         Remark(
             str(definiteness),
             Status.GOOD if definiteness.positive_definite else Status.BAD,
-            f"Smallest eigenvalue over random poses: {eigenvalue} in SI units (Sec. 5). If it is "
-            "negative, do not simulate or control with this model where joints were not moved: "
+            f"Smallest eigenvalue over random poses: {eigenvalue} in SI units (Sec. "
+            "5). If it is "
+            "negative, do not simulate or control with this model where joints were "
+            "not moved: "
             '`kind = "consistent"` in `[estimator]` finds bodies that can exist.',
         ),
         Remark(
-            f"The condition number with columns of length one is {significant(condition, 3)}.",
+            "The condition number with columns of length one is "
+            f"{significant(condition, 3)}.",
             Status.GOOD if condition < LARGE_CONDITION else Status.DOUBTFUL,
-            f"Good: below {LARGE_CONDITION:g}. Above, some parameters are hard to tell apart.",
+            f"Good: below {LARGE_CONDITION:g}. Above, some parameters are hard to "
+            "tell apart.",
         ),
         *_judge_signs(fit),
         *_judge_bounds(fit),
@@ -98,7 +113,9 @@ def verdict(report: Report) -> list[Remark]:
     ]
     statuses = [remark.status for remark in found]
     if Status.BAD in statuses:
-        whole = Remark("Do not rely on this model yet: what is marked ✗ comes first.", Status.BAD)
+        whole = Remark(
+            "Do not rely on this model yet: what is marked ✗ comes first.", Status.BAD
+        )
     elif Status.DOUBTFUL in statuses:
         text = "A usable model; look at what is marked ! before you rely on it."
         whole = Remark(text, Status.DOUBTFUL)
@@ -111,10 +128,13 @@ def _judge_fit(fit: Fit, logs: Sequence[TorqueErrors]) -> Remark:
     """Judge how much of the forces a fit misses, unless that is white noise."""
     spectra, names = fit.residual_spectra, fit.base.model.robot.joint_names
     missed, found = 100 * _relative(logs), []
-    # Of a residual that is white, no part counts; of others about what departs from white noise.
+    # Of a residual that is white, no part counts; of others about what departs from
+    # white noise.
     coloured = np.ones(len(names))
     if spectra is not None:
-        coloured = np.clip(np.asarray(spectra.departure) - spectra.limit, 0.0, None) ** 0.5
+        coloured = (
+            np.clip(np.asarray(spectra.departure) - spectra.limit, 0.0, None) ** 0.5
+        )
         share = sum(coloured == 0)
         found = [f"the residuals of {share} of {len(names)} joints are white noise"]
     worst = int(np.argmax(missed * np.where(coloured > 0, 1.0, 1e-3)))
@@ -123,26 +143,38 @@ def _judge_fit(fit: Fit, logs: Sequence[TorqueErrors]) -> Remark:
     if status is Status.DOUBTFUL:
         found.append("some effect is not in the model, or the noise itself is coloured")
         status = Status.BAD if missed[worst] > FIT_ERROR[1] else status
-    text = f"The model misses up to {significant(missed[worst], 2)} % of the RMS forces that it "
+    text = (
+        f"The model misses up to {significant(missed[worst], 2)} % of the RMS "
+        "forces that it "
+    )
     return Remark(
         f"{text}was fitted to (joint `{names[worst]}`): {', '.join(found)}.",
         status,
-        f"Good: white noise, or up to {FIT_ERROR[0]:g} % that are not; tolerable: up to "
-        f"{FIT_ERROR[1]:g} %. Bartlett's test compares the cumulative spectrum with a straight "
-        "line. The intervals account for correlated residuals, not for what the model lacks.",
+        f"Good: white noise, or up to {FIT_ERROR[0]:g} % that are not; tolerable: up "
+        "to "
+        f"{FIT_ERROR[1]:g} %. Bartlett's test compares the cumulative spectrum with a "
+        "straight "
+        "line. The intervals account for correlated residuals, not for what the model "
+        "lacks.",
     )
 
 
 def _judge_friction(fit: Fit, logs: Sequence[TorqueErrors]) -> Iterator[Remark]:
     """Warn if errors on the logs of a fit depend on the speeds of the joints."""
     found = np.any([e.depend_on_speed for e in logs], axis=0)
-    names = [f"`{n}`" for n, x in zip(fit.base.model.robot.joint_names, found, strict=False) if x]
+    names = [
+        f"`{n}`"
+        for n, x in zip(fit.base.model.robot.joint_names, found, strict=False)
+        if x
+    ]
     if names:
         yield Remark(
-            f"Errors depend on speed (joints {', '.join(names)}): friction seems to have another "
+            f"Errors depend on speed (joints {', '.join(names)}): friction seems to "
+            "have another "
             "shape, and the intervals of its parameters may be too narrow.",
             Status.DOUBTFUL,
-            "Means over classes of speed agree between blocks of time: try `jaxid choose`.",
+            "Means over classes of speed agree between blocks of time: try `jaxid "
+            "choose`.",
         )
 
 
@@ -163,7 +195,9 @@ def _constant_share(logs: Sequence[TorqueErrors], joint: int) -> float:
     errors = [e.errors[:, joint] for e in logs]
     whole = float(sum(np.nansum(e**2) for e in errors))
     counts = [np.count_nonzero(np.isfinite(e)) for e in errors]
-    means = sum(n * np.nanmean(e) ** 2 for n, e in zip(counts, errors, strict=True) if n)
+    means = sum(
+        n * np.nanmean(e) ** 2 for n, e in zip(counts, errors, strict=True) if n
+    )
     return float(means) / whole if whole > 0 else 0.0
 
 
@@ -171,11 +205,16 @@ def _judge_new_motions(
     identification: Sequence[TorqueErrors], verification: Sequence[TorqueErrors]
 ) -> Remark:
     if not verification:
-        text = "The model was not validated on an unseen log: use `--verify` or `--split`."
+        text = (
+            "The model was not validated on an unseen log: use `--verify` or `--split`."
+        )
         return Remark(text, Status.DOUBTFUL)
     unseen = 100 * _relative(verification)
     worst = float(np.max(unseen))
-    text = f"On logs that the fit has not seen, it misses up to {significant(worst, 2)} % of the "
+    text = (
+        "On logs that the fit has not seen, it misses up to "
+        f"{significant(worst, 2)} % of the "
+    )
     text += "RMS forces"
     # Errors that do not matter may grow.
     ratios = unseen / np.maximum(100 * _relative(identification), 1e-9)
@@ -186,7 +225,10 @@ def _judge_new_motions(
     constant = _constant_share(verification, worst_joint)
     if worst > RMS_ERROR[0] and constant > OFFSET:
         share = significant(100 * constant, 2)
-        text += f"; {share} % of the squared error of joint {worst_joint + 1}, the worst, is a "
+        text += (
+            f"; {share} % of the squared error of joint {worst_joint + 1}, the "
+            "worst, is a "
+        )
         text += "constant of the log, such as an offset of a sensor"
     average = max(float(np.mean(e.mean_percent)) for e in verification)
     if np.isfinite(average):
@@ -195,8 +237,10 @@ def _judge_new_motions(
     if worst > RMS_ERROR[0] or ratio > UNSEEN_RATIO:
         status = Status.BAD if worst > RMS_ERROR[1] else Status.DOUBTFUL
     detail = (
-        f"Good: up to {RMS_ERROR[0]:g} % for every joint, and {UNSEEN_RATIO:g} times the errors of "
-        f"the fit where they exceed {MATERIAL:g} %; tolerable: up to {RMS_ERROR[1]:g} %. Mean "
+        f"Good: up to {RMS_ERROR[0]:g} % for every joint, and {UNSEEN_RATIO:g} times "
+        "the errors of "
+        f"the fit where they exceed {MATERIAL:g} %; tolerable: up to {RMS_ERROR[1]:g} "
+        "%. Mean "
         "errors by Eq. 37: the paper states below 1 %."
     )
     return Remark(f"{text}.", status, detail)
@@ -212,10 +256,13 @@ def _judge_signs(fit: Fit) -> Iterator[Remark]:
     below = np.asarray(fit.parameters) < -2.0 * fit.standard_deviations
     if names := [f"`{base.names[k]}`" for k in np.flatnonzero(alone & below)]:
         yield Remark(
-            f"Friction or rotor inertia comes out negative, as neither is: {', '.join(names)}.",
+            "Friction or rotor inertia comes out negative, as neither is: "
+            f"{', '.join(names)}.",
             Status.DOUBTFUL,
-            "Good: none below zero by more than two standard deviations. The model lacks an effect "
-            'of these joints, or a sign is wrong; `kind = "consistent"` in `[estimator]` keeps '
+            "Good: none below zero by more than two standard deviations. The model "
+            "lacks an effect "
+            'of these joints, or a sign is wrong; `kind = "consistent"` in '
+            "`[estimator]` keeps "
             "them from being negative.",
         )
 
@@ -229,10 +276,12 @@ def _judge_bounds(fit: Fit) -> Iterator[Remark]:
     status = Status.GOOD if price <= PRICE[0] else Status.DOUBTFUL
     status = Status.BAD if price > PRICE[1] else status
     yield Remark(
-        f"All bodies are physically consistent, for {significant(price, 2)} % larger residuals; "
+        f"All bodies are physically consistent, for {significant(price, 2)} % larger "
+        "residuals; "
         f"active bounds: {active}",
         status,
-        f"Good: up to {PRICE[0]:g} %; tolerable: up to {PRICE[1]:g} %. Above, the logs contradict "
+        f"Good: up to {PRICE[0]:g} %; tolerable: up to {PRICE[1]:g} %. Above, the "
+        "logs contradict "
         "the bounds: check `total_mass`, `mass_max`, units and signs.",
     )
 
@@ -249,8 +298,10 @@ def _judge_offsets(fit: Fit) -> Iterator[Remark]:
         if abs(value) - 2.0 * deviation > OFFSET * largest:
             unit = robot.force_unit(j)
             yield Remark(
-                f"Joint `{name}` has a constant force of {significant(value, 3)} {unit}, and its "
-                f"limit is {significant(largest, 3)} {unit}: is `gravity` right, or does a spring "
+                f"Joint `{name}` has a constant force of {significant(value, 3)} "
+                f"{unit}, and its "
+                f"limit is {significant(largest, 3)} {unit}: is `gravity` right, or "
+                "does a spring "
                 "or a cable pull?",
                 Status.DOUBTFUL,
                 f"Good: up to {100 * OFFSET:g} % of the largest force.",

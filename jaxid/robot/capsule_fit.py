@@ -18,7 +18,9 @@ from .rotations import rpy_rotation
 from .shapes import GROUND, Capsule
 from .urdf_tree import UrdfTree
 
-_SIGNS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+_SIGNS = np.array(
+    [[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)]
+)
 _ZERO = (0.0, 0.0, 0.0)
 
 
@@ -38,12 +40,13 @@ def fit_capsules(
 ) -> tuple[Capsule, ...]:
     """Fit capsules around the collision geometry of a URDF or MJCF file.
 
-    A link without collision geometry counts with its visual one. Spheres remain spheres, cylinders
-    get round ends, boxes and meshes a small capsule that holds all their corners. A capsule is
-    named after its link, with a number from the second on. Bodies are those of `load_urdf` with the
-    same arguments; a capsule of a link that stands on the ground belongs to the ground. Grippers
-    count even where `tip` leaves their joints out: held, like joints that mimic others, as near to
-    zero as they can be.
+    A link without collision geometry counts with its visual one. Spheres remain
+    spheres, cylinders get round ends, boxes and meshes a small capsule that holds all
+    their corners. A capsule is named after its link, with a number from the second on.
+    Bodies are those of `load_urdf` with the same arguments; a capsule of a link that
+    stands on the ground belongs to the ground. Grippers count even where `tip` leaves
+    their joints out: held, like joints that mimic others, as near to zero as they can
+    be.
 
     Args:
         path: URDF or MJCF file.
@@ -51,10 +54,10 @@ def fit_capsules(
         base: As in `load_urdf`.
         base_rotation: As in `load_urdf`.
         base_position: As in `load_urdf` [m].
-        packages: Folder that holds the packages of `package://` paths. If None, they are searched
-            in the folders above the file.
-        faults: Dictionary for why a link's geometry cannot be read, by link; if None, that is an
-            error.
+        packages: Folder that holds the packages of `package://` paths. If None, they
+            are searched in the folders above the file.
+        faults: Dictionary for why a link's geometry cannot be read, by link; if None,
+            that is an error.
 
     Raises:
         FileNotFoundError: If the file or a mesh does not exist.
@@ -86,7 +89,9 @@ def fit_capsules(
             ends = {"start": r + R @ start, "end": r + R @ end}
             found.append(Capsule(label, body, **ends, radius=radius))
     if not found and faults is None:
-        raise InputError(f"`{path}` has no collision geometry for the links that were asked for.")
+        raise InputError(
+            f"`{path}` has no collision geometry for the links that were asked for."
+        )
     return tuple(found)
 
 
@@ -98,19 +103,23 @@ def stand_in_capsules(robot: Robot, bodies: list[int]) -> list[Capsule]:
     found = []
     for body in bodies:
         name = "base" if body == GROUND else f"link of {robot.joint_names[body]}"
-        ends = [x for x, on in zip(offsets, carriers, strict=True) if on == body and x.any()]
+        ends = [
+            x for x, on in zip(offsets, carriers, strict=True) if on == body and x.any()
+        ]
         for number, end in enumerate(ends, 1):
             label = name if number == 1 else f"{name} {number}"
             found.append(Capsule(label, body, start=np.zeros(3), end=end, radius=stout))
     return found
 
 
-def enclose(points: Float[np.ndarray, "points 3"]) -> tuple[np.ndarray, np.ndarray, float]:
+def enclose(
+    points: Float[np.ndarray, "points 3"],
+) -> tuple[np.ndarray, np.ndarray, float]:
     """Return both ends [m] and the radius [m] of a small capsule around all points.
 
-    The direction and the place of the axis are searched from each of the principal directions. For
-    every axis the radius reaches the farthest point and the ends are as near as they can be, so all
-    points are inside, whatever the search finds.
+    The direction and the place of the axis are searched from each of the principal
+    directions. For every axis the radius reaches the farthest point and the ends are as
+    near as they can be, so all points are inside, whatever the search finds.
     """
     try:
         cloud = points[ConvexHull(points).vertices] if len(points) > 4 else points
@@ -123,7 +132,9 @@ def enclose(points: Float[np.ndarray, "points 3"]) -> tuple[np.ndarray, np.ndarr
     for k in range(3):
         frame = np.roll(directions, -k, axis=0)
         best = minimize(
-            lambda x, frame=frame: _volume(*_enclose_along(cloud, centre, frame, x, size)),
+            lambda x, frame=frame: _volume(
+                *_enclose_along(cloud, centre, frame, x, size)
+            ),
             np.zeros(4),
             method="Nelder-Mead",
             options={"maxiter": 400, "xatol": 1e-5, "fatol": 1e-6 * size**3},
@@ -154,13 +165,17 @@ def _enclose_along(
     return place + low * axis, place + high * axis, radius
 
 
-def _read_shapes(tree: UrdfTree, packages: str | Path | None, name: str) -> Iterator[Shape]:
+def _read_shapes(
+    tree: UrdfTree, packages: str | Path | None, name: str
+) -> Iterator[Shape]:
     """Yield the shapes of a link of a URDF file, in the frame of the link."""
     link = tree.links[name]
     for element in link.findall("collision") or link.findall("visual"):
         origin, geometry = element.find("origin"), element.find("geometry")
         inner = None if geometry is None else geometry.find("*")
-        points, radius = _read_shape(tree, packages, element if inner is None else inner)
+        points, radius = _read_shape(
+            tree, packages, element if inner is None else inner
+        )
         R = rpy_rotation(tree.numbers(origin, "rpy", _ZERO))
         yield tree.numbers(origin, "xyz", _ZERO) + points @ R.T, radius
 
@@ -174,7 +189,8 @@ def _read_shape(tree: UrdfTree, packages: str | Path | None, shape: Any) -> Shap
         return _vertices(tree, packages, shape) * scale, 0.0
     if shape.tag not in ("sphere", "cylinder", "capsule"):
         raise InputError(
-            f"{tree.place(shape)}: `{shape.tag}` is no box, cylinder, sphere, capsule or mesh."
+            f"{tree.place(shape)}: `{shape.tag}` is no box, cylinder, sphere, capsule "
+            "or mesh."
         )
     length = 0.0 if shape.tag == "sphere" else tree.numbers(shape, "length", (0.0,))[0]
     half = np.array([0.0, 0.0, 0.5 * length])
@@ -197,7 +213,8 @@ def _vertices(tree: UrdfTree, packages: str | Path | None, mesh: Any) -> np.ndar
     file = next(filter(Path.is_file, places), None)
     if file is None:
         raise FileNotFoundError(
-            f"{tree.place(mesh)}: the mesh `{name}` is not there: give its folder by `packages`."
+            f"{tree.place(mesh)}: the mesh `{name}` is not there: give its folder by "
+            "`packages`."
         )
     try:
         loaded = trimesh.load(str(file), force="mesh", process=False)

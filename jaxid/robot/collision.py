@@ -33,27 +33,29 @@ _POSES = 400
 class CollisionModel(Hashable):
     """Shapes, and the pairs of them that must stay apart.
 
-    Clearances are those of pairs of bodies: the least of all shapes that one and the other carry.
-    Capsules on the ground count by themselves, if their names differ in more than a number.
+    Clearances are those of pairs of bodies: the least of all shapes that one and the
+    other carry. Capsules on the ground count by themselves, if their names differ in
+    more than a number.
 
     Args:
         robot: Robot whose bodies carry the capsules.
         capsules: Capsules with different names.
         obstacles: Obstacles with different names.
-        pairs: Names of shapes to watch. If None: all pairs but those of one body, of neighbouring
-            bodies, of the ground with itself, and those that overlap in each of 400 random poses,
-            which the notes list.
+        pairs: Names of shapes to watch. If None: all pairs but those of one body, of
+            neighbouring bodies, of the ground with itself, and those that overlap in
+            each of 400 random poses, which the notes list.
 
     Attributes:
-        pairs: Indices of shapes to watch against each other: of a capsule and of another one, or
-            of an obstacle, which come after all capsules.
+        pairs: Indices of shapes to watch against each other: of a capsule and of
+            another one, or of an obstacle, which come after all capsules.
         groups: Places in `pairs` that one clearance is the least of.
-        room: Largest clearance of each group in random poses [m]; infinite for given pairs.
+        room: Largest clearance of each group in random poses [m]; infinite for given
+            pairs.
         notes: Pairs that were left out, in sentences.
 
     Raises:
-        InputError: If a name is missing or comes twice, a body does not exist, two obstacles are
-            paired, or there is no pair.
+        InputError: If a name is missing or comes twice, a body does not exist, two
+            obstacles are paired, or there is no pair.
     """
 
     capsules: tuple[Capsule, ...]
@@ -79,31 +81,47 @@ class CollisionModel(Hashable):
         for c in capsules:
             if not GROUND <= c.body < robot.joints:
                 bodies = f"from 0 to {robot.joints - 1}, or -1 for the ground"
-                raise InputError(f"`body` of capsule `{c.name}` must be {bodies}, but is {c.body}.")
+                raise InputError(
+                    f"`body` of capsule `{c.name}` must be {bodies}, but is {c.body}."
+                )
         self.notes = ()
         if pairs is not None:
             self._watch(pairs, names)
             return
-        every = CollisionModel(robot, capsules, obstacles, _meeting_pairs(robot, capsules, names))
+        every = CollisionModel(
+            robot, capsules, obstacles, _meeting_pairs(robot, capsules, names)
+        )
         best = every._largest_gaps(robot).tolist()
         room = dict(zip(every.pairs, best, strict=True))
         left = [pair for pair, gap in room.items() if gap <= 0]
         if left:
             said = ", ".join(f"{names[i]} and {names[k]}" for i, k in left)
-            self.notes = (f"not watched, for they overlap in every pose that was tried: {said}.",)
-        self._watch([(names[i], names[k]) for i, k in every.pairs if (i, k) not in left], names)
-        self.room = tuple(min(room[self.pairs[k]] for k in group) for group in self.groups)
+            self.notes = (
+                f"not watched, for they overlap in every pose that was tried: {said}.",
+            )
+        self._watch(
+            [(names[i], names[k]) for i, k in every.pairs if (i, k) not in left], names
+        )
+        self.room = tuple(
+            min(room[self.pairs[k]] for k in group) for group in self.groups
+        )
 
     def _watch(self, pairs: Sequence[Sequence[str]], names: list[str]) -> None:
         """Enter pairs by their names, and group them."""
         found = [_indices(names, len(self.capsules), pair) for pair in pairs]
         if not found:
-            raise InputError("a collision model needs at least one pair of shapes that can meet.")
+            raise InputError(
+                "a collision model needs at least one pair of shapes that can meet."
+            )
         # Pairs of capsules first, then obstacle by obstacle.
-        self.pairs = tuple(sorted(found, key=lambda p: max(p[1], len(self.capsules) - 1)))
+        self.pairs = tuple(
+            sorted(found, key=lambda p: max(p[1], len(self.capsules) - 1))
+        )
         groups: dict[tuple, list[int]] = {}
         for place, pair in enumerate(self.pairs):
-            groups.setdefault(tuple(self._owner(shape) for shape in pair), []).append(place)
+            groups.setdefault(tuple(self._owner(shape) for shape in pair), []).append(
+                place
+            )
         self.groups = tuple(map(tuple, groups.values()))
         self.room = (np.inf,) * len(self.groups)
 
@@ -126,9 +144,13 @@ class CollisionModel(Hashable):
             return own if alone else first.get(self._owner(shape), own)
 
         pairs = [(self.pairs[group[0]], len(group) == 1) for group in self.groups]
-        return tuple(f"{name(i, alone)} and {name(k, alone)}" for (i, k), alone in pairs)
+        return tuple(
+            f"{name(i, alone)} and {name(k, alone)}" for (i, k), alone in pairs
+        )
 
-    def ends(self, robot: Robot, q: Float[AnyArray, " joints"]) -> Float[Array, "capsules 2 3"]:
+    def ends(
+        self, robot: Robot, q: Float[AnyArray, " joints"]
+    ) -> Float[Array, "capsules 2 3"]:
         """Return the ends of all capsules' axes in the frame of the ground [m], for one pose."""
         rotations, origins = placements(robot, q)
         rows = []
@@ -165,8 +187,12 @@ class CollisionModel(Hashable):
         return jnp.take_along_axis(gathered, least, axis=-1)[..., 0]
 
     def slopes(
-        self, ends: Float[np.ndarray, "samples capsules 2 3"], chosen: Int[np.ndarray, " samples"]
-    ) -> tuple[Float[np.ndarray, " samples"], Float[np.ndarray, "samples capsules 2 3"]]:
+        self,
+        ends: Float[np.ndarray, "samples capsules 2 3"],
+        chosen: Int[np.ndarray, " samples"],
+    ) -> tuple[
+        Float[np.ndarray, " samples"], Float[np.ndarray, "samples capsules 2 3"]
+    ]:
         """Return one clearance of each sample [m], and its derivative by the ends, in NumPy."""
         filled, samples = self._filled[chosen], np.arange(len(ends))
         gaps = self._gaps(ends, np.repeat(samples, filled.shape[1]), filled.ravel())
@@ -177,7 +203,9 @@ class CollisionModel(Hashable):
             at = samples[pairs[:, 1] == k]
             i = pairs[at, 0]
             if k >= len(self.capsules):
-                found[at, i] = self.obstacles[k - len(self.capsules)].slopes(ends[at, i])
+                found[at, i] = self.obstacles[k - len(self.capsules)].slopes(
+                    ends[at, i]
+                )
                 continue
             first, second = ends[at, i], ends[at, k]
             a, b = closest_places(first[:, 0], first[:, 1], second[:, 0], second[:, 1])
@@ -197,7 +225,9 @@ class CollisionModel(Hashable):
         reach = np.sqrt(np.einsum("tci,tci->tc", half, half))
         apart = middle[:, i[inner]] - middle[:, k[inner]]
         most = np.full((len(ends), len(i)), np.inf)
-        most[:, inner] = np.sqrt(np.einsum("tpi,tpi->tp", apart, apart)) - self._sizes[inner]
+        most[:, inner] = (
+            np.sqrt(np.einsum("tpi,tpi->tp", apart, apart)) - self._sizes[inner]
+        )
         least = np.full(most.shape, -np.inf)
         least[:, inner] = most[:, inner] - reach[:, i[inner]] - reach[:, k[inner]]
         owner = np.zeros(len(i), int)
@@ -218,7 +248,9 @@ class CollisionModel(Hashable):
         i, k = self._indices[pairs].T
         inner, gaps = k < len(self.capsules), np.empty(len(pairs))
         first, second = ends[samples[inner], i[inner]], ends[samples[inner], k[inner]]
-        gaps[inner] = segment_distance(first[:, 0], first[:, 1], second[:, 0], second[:, 1])
+        gaps[inner] = segment_distance(
+            first[:, 0], first[:, 1], second[:, 0], second[:, 1]
+        )
         for number in np.unique(k[~inner]):
             at = k == number
             own = ends[samples[at], i[at]]
@@ -241,7 +273,9 @@ class CollisionModel(Hashable):
     def _filled(self) -> Int[np.ndarray, "groups pairs"]:
         """Places of each group's pairs, the first one repeated."""
         most = max(map(len, self.groups))
-        return np.array([[*group, *group[:1] * (most - len(group))] for group in self.groups])
+        return np.array(
+            [[*group, *group[:1] * (most - len(group))] for group in self.groups]
+        )
 
     def _largest_gaps(self, robot: Robot) -> Float[np.ndarray, " pairs"]:
         """Return the largest gap of each pair in random poses."""
@@ -250,7 +284,9 @@ class CollisionModel(Hashable):
         low = np.where(np.isfinite(low), low, -np.pi)
         high = np.where(np.isfinite(high), high, np.pi)
         random = np.random.default_rng(0)
-        q = random.uniform(np.minimum(low, high), np.maximum(low, high), (_POSES, robot.joints))
+        q = random.uniform(
+            np.minimum(low, high), np.maximum(low, high), (_POSES, robot.joints)
+        )
         with double_precision():
             ends = jax.jit(jax.vmap(lambda x: self.ends(robot, x)))(q)
         shape = (_POSES, len(self.pairs))
@@ -301,6 +337,7 @@ def _indices(names: list[str], capsules: int, pair: Sequence[str]) -> tuple[int,
     i, k = sorted(names.index(name) for name in pair)
     if i >= capsules or i == k:
         raise InputError(
-            f"`{pair[0]}` and `{pair[1]}` cannot meet: pair a capsule with another shape."
+            f"`{pair[0]}` and `{pair[1]}` cannot meet: pair a capsule with another "
+            "shape."
         )
     return i, k

@@ -1,12 +1,13 @@
 """Forward and inverse kinematics: placements of all frames, and coordinates along a path.
 
-Placements are written on 3-vectors for one sample: batch with `jax.vmap`, differentiate with
-`jax.grad`. Inverse kinematics is in NumPy: it evaluates few poses many times, where compiling would
-take longer than computing.
+Placements are written on 3-vectors for one sample: batch with `jax.vmap`, differentiate
+with `jax.grad`. Inverse kinematics is in NumPy: it evaluates few poses many times,
+where compiling would take longer than computing.
 
-A robot with redundant joints takes, of all coordinates that reach the pose, those nearest to a
-posture. That makes them a function of the pose alone: a closed path of the end-effector is a closed
-path of the joints, as smooth as the pose. All poses of a path are solved at once.
+A robot with redundant joints takes, of all coordinates that reach the pose, those
+nearest to a posture. That makes them a function of the pose alone: a closed path of the
+end-effector is a closed path of the joints, as smooth as the pose. All poses of a path
+are solved at once.
 """
 
 from typing import NamedTuple
@@ -62,16 +63,21 @@ def tip_placement(
     return R @ robot.tip_rotation, origins[robot.tip_body] + R @ robot.tip_offset
 
 
-def tip_jacobian(robot: Robot, q: Float[np.ndarray, "poses joints"]) -> tuple[np.ndarray, ...]:
+def tip_jacobian(
+    robot: Robot, q: Float[np.ndarray, "poses joints"]
+) -> tuple[np.ndarray, ...]:
     """Return attitudes and positions [m] of the end-effector, and their derivatives, in NumPy.
 
-    The derivatives are velocities of the origin and angular velocities by the rates of the joints.
+    The derivatives are velocities of the origin and angular velocities by the rates of
+    the joints.
     """
     poses, n = q.shape
     R = np.broadcast_to(np.eye(3), (poses, 3, 3))
     r = np.zeros((poses, 3))
     turn, slide, origin = (np.zeros((poses, n, 3)) for _ in range(3))
-    offset, rotation, axes = (np.asarray(x) for x in (robot.offset, robot.rotation, robot.axis))
+    offset, rotation, axes = (
+        np.asarray(x) for x in (robot.offset, robot.rotation, robot.axis)
+    )
     for i in robot.ancestors[robot.tip_body]:
         r = r + R @ offset[i]
         R = R @ rotation[i]
@@ -98,7 +104,8 @@ def tip_curvature(
 
     Attitudes count as rotation vectors from the attitude of the end-effector.
     """
-    # An earlier joint carries the later ones with it; of two turns, half of their bracket.
+    # An earlier joint carries the later ones with it; of two turns, half of their
+    # bracket.
     by_shift = np.einsum("pik,pjk->pij", np.cross(force[:, None], turn), shift)
     by_turn = np.einsum("pik,pjk->pij", np.cross(moment[:, None], turn), turn) / 2
     upper = np.triu(by_shift + by_turn)
@@ -113,16 +120,18 @@ def inverse_kinematics_along(
 ) -> Float[np.ndarray, "poses joints"]:
     """Return coordinates within the limits along a path of close positions [rad or m].
 
-    Columns of the `rotation` are the end-effector's axes on the ground. The search begins at the
-    preferred coordinates `posture`; the middle of the ranges if None.
+    Columns of the `rotation` are the end-effector's axes on the ground. The search
+    begins at the preferred coordinates `posture`; the middle of the ranges if None.
 
     Raises:
-        InputError: If the posture or the rotation is none, or the end-effector cannot follow the
-            path: the message says where, and why.
+        InputError: If the posture or the rotation is none, or the end-effector cannot
+            follow the path: the message says where, and why.
     """
     task = _task(robot, rotation, posture)
     q = _follow(task, positions)
-    missed = np.linalg.norm(_linearise(task, positions, q)[0].reshape(len(q), 2, 3), axis=2)
+    missed = np.linalg.norm(
+        _linearise(task, positions, q)[0].reshape(len(q), 2, 3), axis=2
+    )
     beyond = np.maximum(task.low - q, q - task.high) / task.half
     jumps = np.abs(np.diff(q, axis=0, prepend=q[:1]) / task.half).max(axis=1) > 0.25
     reached = missed.max(axis=1) <= _REACHED
@@ -133,13 +142,20 @@ def inverse_kinematics_along(
     k = int(failed[0])
     reason = "the joints would have to jump, for the pose is singular"
     if not reached[k]:
-        reason = f"it comes to within {missed[k, 0]:.3g} m and {missed[k, 1]:.3g} rad of the pose"
+        reason = (
+            f"it comes to within {missed[k, 0]:.3g} m and {missed[k, 1]:.3g} rad "
+            "of the pose"
+        )
     elif outside[k]:
-        reason = f"joint `{robot.joint_names[int(beyond[k].argmax())]}` leaves its range"
+        reason = (
+            f"joint `{robot.joint_names[int(beyond[k].argmax())]}` leaves its range"
+        )
     place = ", ".join(f"{x:.3f}" for x in positions[k])
     raise InputError(
-        f"`{robot.name}` cannot follow the path: at pose {k + 1} of {len(q)}, ({place}) m, "
-        f"{reason}; choose another posture, or a path nearer to the middle of its reach."
+        f"`{robot.name}` cannot follow the path: at pose {k + 1} of {len(q)}, "
+        f"({place}) m, "
+        f"{reason}; choose another posture, or a path nearer to the middle of its "
+        "reach."
     )
 
 
@@ -164,19 +180,28 @@ def _task(robot: Robot, rotation: Numbers, posture: Numbers | None) -> _Task:
         middle = np.clip(np.where(known, (high + low) / 2, 0.0), low, high)
     near = np.asarray(as_array("posture", middle if posture is None else posture))
     if near.shape != middle.shape:
-        raise InputError(f"`posture` must hold {robot.joints} numbers, but has shape {near.shape}.")
+        raise InputError(
+            f"`posture` must hold {robot.joints} numbers, but has shape {near.shape}."
+        )
     R = np.asarray(as_array("rotation", rotation))
     proper = R.shape == (3, 3) and np.abs(R.T @ R - np.eye(3)).max() < 1e-9
     if not proper or np.linalg.det(R) < 0:
-        raise InputError("`rotation` must be an orthonormal, right-handed matrix of 3 rows.")
+        raise InputError(
+            "`rotation` must be an orthonormal, right-handed matrix of 3 rows."
+        )
     return _Task(robot, R, near, half, low, high)
 
 
-def _linearise(task: _Task, positions: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, ...]:
+def _linearise(
+    task: _Task, positions: np.ndarray, q: np.ndarray
+) -> tuple[np.ndarray, ...]:
     """Return distances from poses [m, rad], their Jacobians by scaled joints, shift and turn."""
     R, r, shift, turn = tip_jacobian(task.robot, q)
     away = Rotation.from_matrix(R @ task.rotation.T).as_rotvec()
-    e, J = np.concatenate([r - positions, away], axis=1), np.concatenate([shift, turn], axis=2)
+    e, J = (
+        np.concatenate([r - positions, away], axis=1),
+        np.concatenate([shift, turn], axis=2),
+    )
     return e, np.swapaxes(J, 1, 2) * task.half, shift, turn
 
 
@@ -190,7 +215,8 @@ def _descend(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Go to the coordinates nearest to the posture, and to the multipliers of their poses.
 
-    Steps solve the linearised conditions, the last `newton` of them with the poses' curvature.
+    Steps solve the linearised conditions, the last `newton` of them with the poses'
+    curvature.
     """
     n = q.shape[1]
     K = np.zeros((len(q), n + 6, n + 6))
@@ -217,7 +243,9 @@ def _follow(task: _Task, positions: np.ndarray) -> np.ndarray:
     stride = np.floor(np.concatenate([[0.0], np.cumsum(way)]) / 0.03)
     first = np.flatnonzero(np.diff(stride, prepend=-1.0) > 0)
     places = np.unique(np.append(first, len(positions) - 1))
-    q, multipliers = _descend(task, positions[:1], task.posture[None], np.zeros((1, 6)), 60, 0)
+    q, multipliers = _descend(
+        task, positions[:1], task.posture[None], np.zeros((1, 6)), 60, 0
+    )
     steps = []
     for k in places:
         q, multipliers = _descend(task, positions[k : k + 1], q, multipliers, 0, 4)

@@ -18,13 +18,15 @@ HEAVIEST = 1e5
 class Inertia(eqx.Module):
     r"""Mass, centre of mass and inertia tensor of a body, or of many along leading axes.
 
-    The same body in other parametrisations: `parameters` are the ten numbers of the paper,
-    `pinocchio` those of Pinocchio, `moments` the six attributes of URDF's `<inertia>`.
+    The same body in other parametrisations: `parameters` are the ten numbers of the
+    paper, `pinocchio` those of Pinocchio, `moments` the six attributes of URDF's
+    `<inertia>`.
 
     Attributes:
         mass: Mass [kg].
         centre: Centre of mass in the frame of the body [m].
-        tensor: Inertia tensor about the centre of mass, along the axes of the frame [kg m²].
+        tensor: Inertia tensor about the centre of mass, along the axes of the frame [kg
+            m²].
     """
 
     mass: Float[AnyArray, "*batch"]
@@ -53,7 +55,9 @@ class Inertia(eqx.Module):
         squares = J[..., (0, 1, 2), (0, 1, 2)]
         products = -J[..., (1, 0, 0), (2, 2, 1)]
         parts = [m, m * self.centre, squares, products]
-        return namespace(self.mass, self.centre, self.tensor).concatenate(parts, axis=-1)
+        return namespace(self.mass, self.centre, self.tensor).concatenate(
+            parts, axis=-1
+        )
 
     @property
     def pinocchio(self) -> Float[AnyArray, "*batch 10"]:
@@ -67,7 +71,9 @@ class Inertia(eqx.Module):
         """Entries xx, xy, xz, yy, yz, zz of the tensor, the order of URDF [kg m²]."""
         return self.tensor[..., (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)]
 
-    def moved(self, rotation: Float[AnyArray, "3 3"], position: Float[AnyArray, "3"]) -> "Inertia":
+    def moved(
+        self, rotation: Float[AnyArray, "3 3"], position: Float[AnyArray, "3"]
+    ) -> "Inertia":
         """Return the same body in the frame in which its present frame is placed."""
         R = rotation
         return Inertia(self.mass, position + self.centre @ R.T, R @ self.tensor @ R.T)
@@ -87,10 +93,16 @@ class Inertia(eqx.Module):
         if not 0.0 <= m <= HEAVIEST:
             return f"its `mass` is {m:g} kg, but must be from 0 to {HEAVIEST:g} kg"
         if np.abs(r).max() > FARTHEST:
-            return f"its `centre_of_mass` is {np.abs(r).max():g} m away: is it in millimetres?"
+            return (
+                f"its `centre_of_mass` is {np.abs(r).max():g} m away: is it in "
+                "millimetres?"
+            )
         largest = np.abs(J).max()
         if largest > FAR**2 * max(m, 1.0):
-            return f"its `inertia` is {largest:g} kg m² at a mass of {m:g} kg: is it in kg mm²?"
+            return (
+                f"its `inertia` is {largest:g} kg m² at a mass of {m:g} kg: is it "
+                "in kg mm²?"
+            )
         if np.abs(J - J.T).max() > rounding * largest:
             return "its `inertia` is not symmetric"
         low, middle, high = np.linalg.eigvalsh(J)
@@ -98,7 +110,8 @@ class Inertia(eqx.Module):
         slack = rounding * max(abs(low), abs(high)) + 1e-4 * rounding * m
         if low < -slack or high > low + middle + slack:
             return (
-                f"its `inertia` has the principal moments {low:.3g}, {middle:.3g}, {high:.3g} "
+                f"its `inertia` has the principal moments {low:.3g}, {middle:.3g}, "
+                f"{high:.3g} "
                 "kg m², of which one is negative, or larger than the sum of the others"
             )
         return ""

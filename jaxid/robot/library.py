@@ -1,7 +1,8 @@
 """Robots from tables of Denavit-Hartenberg parameters, and the library `jid.robots`.
 
-The numbers of the library are in `library.toml`. `source` holds their origin, `limits.assumed` and
-`notes` those that nobody published. Limits that are not listed are infinite, drives are direct.
+The numbers of the library are in `library.toml`. `source` holds their origin,
+`limits.assumed` and `notes` those that nobody published. Limits that are not listed are
+infinite, drives are direct.
 """
 
 import functools
@@ -38,41 +39,49 @@ def from_dh(
 ) -> Robot:
     r"""Build a serial robot from one row (alpha, a, d) or (alpha, a, d, theta) for each joint.
 
-    In the **modified** convention (Craig, Khalil) row $i$ holds $\alpha_{i-1}, a_{i-1}, d_i$ and
-    $\theta_i$: $T_i = R_x(\alpha) D_x(a) R_z(\theta + q) D_z(d)$. Body $i$ has the frame $i$.
+    In the **modified** convention (Craig, Khalil) row $i$ holds $\alpha_{i-1}, a_{i-1},
+    d_i$ and $\theta_i$: $T_i = R_x(\alpha) D_x(a) R_z(\theta + q) D_z(d)$. Body $i$ has
+    the frame $i$.
 
-    In the **standard** (distal) convention row $i$ holds $\alpha_i, a_i, d_i$ and $\theta_i$:
-    $T_i = R_z(\theta + q) D_z(d) D_x(a) R_x(\alpha)$. Frame $i$ then lies on the axis of joint
-    $i + 1$, but a body's frame must lie on its own axis. So body $i$ has the frame $i - 1$,
-    turned by $\theta + q$; the rest of $T_i$ goes into the placement of the next body, and that of
-    the last row into the end-effector.
+    In the **standard** (distal) convention row $i$ holds $\alpha_i, a_i, d_i$ and
+    $\theta_i$: $T_i = R_z(\theta + q) D_z(d) D_x(a) R_x(\alpha)$. Frame $i$ then lies
+    on the axis of joint $i + 1$, but a body's frame must lie on its own axis. So body
+    $i$ has the frame $i - 1$, turned by $\theta + q$; the rest of $T_i$ goes into the
+    placement of the next body, and that of the last row into the end-effector.
 
-    In both, every joint's axis is the z axis of its body, and $q$ of a prismatic joint adds to $d$.
+    In both, every joint's axis is the z axis of its body, and $q$ of a prismatic joint
+    adds to $d$.
 
     Args:
-        rows: Twist alpha [rad], length a [m], offset d [m], and the angle theta [rad] at q = 0.
+        rows: Twist alpha [rad], length a [m], offset d [m], and the angle theta [rad]
+            at q = 0.
         convention: `"modified"` or `"standard"`.
         name: Name of the robot.
         revolute: For each joint whether it turns or slides; all turn if None.
         joint_names: Names of the joints; `joint1`, `joint2`, … if None.
-        base_rotation: Attitude of the table's base frame on the ground; upright if None.
+        base_rotation: Attitude of the table's base frame on the ground; upright if
+            None.
         base_position: Origin of that frame on the ground [m].
         tip_rotation: Attitude of the end-effector in the last frame of the table.
         tip_offset: Origin of the end-effector in the last frame of the table [m].
         notes: Changes and assumptions that were made, one sentence each.
-        fields: Further arguments of `Robot`: `gravity`, `limits`, `drives`, `tool`, `source`.
+        fields: Further arguments of `Robot`: `gravity`, `limits`, `drives`, `tool`,
+            `source`.
 
     Raises:
-        InputError: If the convention has another name, or the table has the wrong shape.
+        InputError: If the convention has another name, or the table has the wrong
+            shape.
     """
     if convention not in ("modified", "standard"):
         raise InputError(
-            f'`convention` must be "modified" (Craig) or "standard", but is "{convention}".'
+            '`convention` must be "modified" (Craig) or "standard", but is '
+            f'"{convention}".'
         )
     table = np.array(rows, dtype=np.float64)
     if table.ndim != 2 or table.shape[1] not in (3, 4) or not np.isfinite(table).all():
         raise InputError(
-            f"`rows` must hold rows of finite (alpha, a, d, theta), but has shape {table.shape}."
+            "`rows` must hold rows of finite (alpha, a, d, theta), but has shape "
+            f"{table.shape}."
         )
     n = len(table)
     table = np.column_stack([table, np.zeros(n)])[:, :4]
@@ -88,7 +97,11 @@ def from_dh(
         else:
             rotation[i], offset[i] = R @ turn, r
             R, r = twist, d * _Z + a * _X
-    end = np.eye(3) if tip_rotation is None else np.asarray(tip_rotation, dtype=np.float64)
+    end = (
+        np.eye(3)
+        if tip_rotation is None
+        else np.asarray(tip_rotation, dtype=np.float64)
+    )
     robot = Robot(
         name,
         revolute=revolute,
@@ -118,7 +131,9 @@ def _robot(key: str) -> Robot:
     revolute = tuple(entry.pop("revolute", (True,) * n))
     for name in limits.pop("degrees", ()):
         limits[name] = np.where(revolute, np.pi / 180, 1.0) * limits[name]
-    entry |= {name: tuple(entry[name]) for name in ("notes", "joint_names") if name in entry}
+    entry |= {
+        name: tuple(entry[name]) for name in ("notes", "joint_names") if name in entry
+    }
     assumed = tuple(limits.pop("assumed", ()))
     entry["limits"] = Limits(n, **limits, assumed=assumed)
     entry["drives"] = Drives(n, **drives)
@@ -134,9 +149,9 @@ def _robot(key: str) -> Robot:
 def tx90l_on_rail() -> Robot:
     """Return the seven-axis manipulator of the paper: a Stäubli TX90L on a horizontal rail along x.
 
-    The bodies' frames are those in which the paper's base parameters come out (Eq. 24): the z axis
-    of the bodies 3, 4 and 6 is turned onto their joints' axes, and body 5, the forearm, has its
-    origin at the elbow.
+    The bodies' frames are those in which the paper's base parameters come out (Eq. 24):
+    the z axis of the bodies 3, 4 and 6 is turned onto their joints' axes, and body 5,
+    the forearm, has its origin at the elbow.
     """
     return _robot("tx90l_on_rail")
 
@@ -144,8 +159,8 @@ def tx90l_on_rail() -> Robot:
 def tx90l_on_rail_collision() -> CollisionModel:
     """Return capsules of the TX90L on its rail, and the ground; they are assumed.
 
-    The shoulder's column moves with the rail; the wrist's capsule has a tool of 0.2 m beyond the
-    flange's joint.
+    The shoulder's column moves with the rail; the wrist's capsule has a tool of 0.2 m
+    beyond the flange's joint.
     """
     robot = tx90l_on_rail()
     entry = entries()["tx90l_on_rail_collision"]
@@ -156,9 +171,10 @@ def tx90l_on_rail_collision() -> CollisionModel:
 def tx40() -> Robot:
     """Return the Stäubli TX40, six axes, whose sixth motor turns with the fifth joint.
 
-    Its drives take the encoders' angles and motors' torques as they were recorded. Coordinates are
-    those of the published kinematic model, in which the arm lies flat at q = 0: joint 2 counts from
-    -90 degrees, joint 3 from +90 degrees of the manufacturer's zero, where the arm stands upright.
+    Its drives take the encoders' angles and motors' torques as they were recorded.
+    Coordinates are those of the published kinematic model, in which the arm lies flat
+    at q = 0: joint 2 counts from -90 degrees, joint 3 from +90 degrees of the
+    manufacturer's zero, where the arm stands upright.
     """
     return _robot("tx40")
 
@@ -186,9 +202,9 @@ def iiwa14() -> Robot:
 def kr300() -> Robot:
     """Return the KUKA KR300 R2500 ultra, six axes.
 
-    Coordinates are the link-side angles of the published recordings, as they stand in the files:
-    the angles that its authors add for their kinematic model, (0, -90, 90, 0, 0, 0) degrees, are in
-    the geometry. The drives take motor torques to the joints.
+    Coordinates are the link-side angles of the published recordings, as they stand in
+    the files: the angles that its authors add for their kinematic model, (0, -90, 90,
+    0, 0, 0) degrees, are in the geometry. The drives take motor torques to the joints.
     """
     return _robot("kr300")
 
@@ -206,7 +222,9 @@ def planar_arm(joints: int = 2, length: Numbers = 1.0) -> Robot:
         InputError: If there is no joint, or the lengths do not fit.
     """
     if joints < 1 or np.shape(length) not in ((), (joints,)):
-        raise InputError("`joints` must be at least 1, and `length` one number or one for each.")
+        raise InputError(
+            "`joints` must be at least 1, and `length` one number or one for each."
+        )
     lengths = np.broadcast_to(np.array(length, dtype=np.float64), (joints,))
     ends = np.outer(lengths, _X)
     return Robot(

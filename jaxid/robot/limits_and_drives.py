@@ -21,8 +21,8 @@ Batch = Float[AnyArray, "*batch joints"]
 class Limits(eqx.Module):
     """Limits of every joint, in the joint's own unit ([rad] or [m]); infinite where unknown.
 
-    Limits that are not given are infinite. JAX arrays are taken as they are, so that limits can be
-    traced and batched; all others are checked and copied.
+    Limits that are not given are infinite. JAX arrays are taken as they are, so that
+    limits can be traced and batched; all others are checked and copied.
 
     Args:
         joints: Number of joints; that of the given limits if None.
@@ -32,12 +32,12 @@ class Limits(eqx.Module):
         acceleration: Largest accelerations [rad/s² or m/s²].
         jerk: Largest jerks [rad/s³ or m/s³].
         force: Largest generalised forces [N m or N].
-        assumed: Names of fields whose numbers nobody published, or `field of joint` where only one
-            joint's number is assumed.
+        assumed: Names of fields whose numbers nobody published, or `field of joint`
+            where only one joint's number is assumed.
 
     Raises:
-        InputError: If a limit has the wrong length, is not positive although it is a magnitude, or
-            leaves a joint no range.
+        InputError: If a limit has the wrong length, is not positive although it is a
+            magnitude, or leaves a joint no range.
     """
 
     joints: dataclasses.InitVar[int | None] = None
@@ -59,58 +59,76 @@ class Limits(eqx.Module):
         for name, value in sizes.items():
             setattr(self, name, _magnitudes(name, value, n))
         low, high = self.position_min, self.position_max
-        if isinstance(low, np.ndarray) and isinstance(high, np.ndarray) and (low >= high).any():
+        if (
+            isinstance(low, np.ndarray)
+            and isinstance(high, np.ndarray)
+            and (low >= high).any()
+        ):
             j = int(np.flatnonzero(low >= high)[0])
             raise InputError(
-                f"`position_min` of joint {j + 1} must be below {high[j]:g}, but is {low[j]:g}."
+                f"`position_min` of joint {j + 1} must be below {high[j]:g}, but is "
+                f"{low[j]:g}."
             )
 
 
 class Drives(Hashable):
     r"""The motors of a robot: $q_M = A (q - q_0)$ and, by equal power, $Q = A^T M$ (Eq. 19).
 
-    For independent axes $A$ is the diagonal matrix of gear ratios; a wrist whose motors turn more
-    than one axis has entries beside the diagonal. Drives without arguments are direct.
+    For independent axes $A$ is the diagonal matrix of gear ratios; a wrist whose motors
+    turn more than one axis has entries beside the diagonal. Drives without arguments
+    are direct.
 
     Args:
         joints: Number of joints; that of the given values if None.
-        reduction: $A$, motor angle for joint angle: one gear ratio for each joint, or a matrix; [1]
-            for a revolute joint, [rad/m] for a rail.
+        reduction: $A$, motor angle for joint angle: one gear ratio for each joint, or a
+            matrix; [1] for a revolute joint, [rad/m] for a rail.
         zero: Joint angle $q_0$ at which the motor angles are zero [rad or m].
-        max_torques: Largest torque of each motor, on the motor's side [N m]; infinite if unknown.
-        rotor_inertia: Inertia of each motor, on the motor's side [kg m²]; NaN if unknown. It is
-            displayed only: the inertia that the joints feel is identified.
+        max_torques: Largest torque of each motor, on the motor's side [N m]; infinite
+            if unknown.
+        rotor_inertia: Inertia of each motor, on the motor's side [kg m²]; NaN if
+            unknown. It is displayed only: the inertia that the joints feel is
+            identified.
 
     Raises:
-        InputError: If a length is wrong, the matrix is not invertible, or a number is out of range.
+        InputError: If a length is wrong, the matrix is not invertible, or a number is
+            out of range.
     """
 
     joints: dataclasses.InitVar[int | None] = None
     _: dataclasses.KW_ONLY
-    reduction: Float[AnyArray, "joints joints"] = eqx.field(converter=given, default=None)
+    reduction: Float[AnyArray, "joints joints"] = eqx.field(
+        converter=given, default=None
+    )
     zero: PerJoint = eqx.field(converter=given, default=None)
     max_torques: PerJoint = eqx.field(converter=given, default=None)
     rotor_inertia: PerJoint = eqx.field(converter=given, default=None)
 
     def __post_init__(self, joints: int | None):
-        n = _count(joints, self.reduction, self.zero, self.max_torques, self.rotor_inertia)
+        n = _count(
+            joints, self.reduction, self.zero, self.max_torques, self.rotor_inertia
+        )
         matrix = np.eye(n) if self.reduction is None else self.reduction
         if not isinstance(matrix, jax.Array) or matrix.ndim != 2:
             matrix = np.array(matrix, dtype=np.float64)
             matrix = np.diag(matrix) if matrix.shape == (n,) else matrix
             if matrix.shape != (n, n) or not np.isfinite(matrix).all():
                 raise InputError(
-                    f"`reduction` must hold {n} or {n} x {n} finite ratios, not {matrix.shape}."
+                    f"`reduction` must hold {n} or {n} x {n} finite ratios, not "
+                    f"{matrix.shape}."
                 )
             largest = np.abs(matrix).max(axis=1)
             if not largest.all() or np.linalg.cond(matrix / largest[:, None]) > 1e8:
-                raise InputError("`reduction` must be invertible: is a gear ratio zero?")
+                raise InputError(
+                    "`reduction` must be invertible: is a gear ratio zero?"
+                )
         self.reduction = matrix
         self.zero = per_joint("zero", self.zero, n, 0.0)
         _require("zero", self.zero, np.isfinite, "finite")
         self.max_torques = _magnitudes("max_torques", self.max_torques, n)
         self.rotor_inertia = per_joint("rotor_inertia", self.rotor_inertia, n, np.nan)
-        _require("rotor_inertia", self.rotor_inertia, lambda x: ~(x < 0), "zero or more")
+        _require(
+            "rotor_inertia", self.rotor_inertia, lambda x: ~(x < 0), "zero or more"
+        )
 
     @property
     def is_direct(self) -> bool:
@@ -161,7 +179,9 @@ def _count(joints: int | None, *values: Numbers | None) -> int:
     """Return the number of joints: as given, or as many as the first of the values holds."""
     given = [np.shape(x) for x in values if x is not None]
     if joints is None and not any(given):
-        raise InputError("`joints` must be given where no list with one number for each joint is.")
+        raise InputError(
+            "`joints` must be given where no list with one number for each joint is."
+        )
     return next(shape[0] for shape in given if shape) if joints is None else joints
 
 
@@ -172,10 +192,13 @@ def per_joint(name: str, value: Numbers | None, joints: int, unknown: float) -> 
     """
     if isinstance(value, jax.Array):
         return value
-    array = np.full(joints, unknown) if value is None else np.array(value, dtype=np.float64)
+    array = (
+        np.full(joints, unknown) if value is None else np.array(value, dtype=np.float64)
+    )
     if array.shape != (joints,):
         raise InputError(
-            f"`{name}` must hold one number for each joint ({joints}), but has shape {array.shape}."
+            f"`{name}` must hold one number for each joint ({joints}), but has shape "
+            f"{array.shape}."
         )
     if not np.isnan(unknown):
         _require(name, array, lambda x: ~np.isnan(x), "a number")
@@ -192,7 +215,9 @@ def _require(name: str, values: AnyArray, rule: Any, words: str) -> None:
     """Check a rule that reads after "must be", unless the values are a JAX array."""
     if isinstance(values, np.ndarray) and not np.all(rule(values)):
         j = int(np.flatnonzero(~rule(values))[0])
-        raise InputError(f"`{name}` must be {words}, but that of joint {j + 1} is {values[j]:g}.")
+        raise InputError(
+            f"`{name}` must be {words}, but that of joint {j + 1} is {values[j]:g}."
+        )
 
 
 def range_fault(low: float, high: float, revolute: bool) -> str:
@@ -213,7 +238,9 @@ def far_notes(owner: str, lengths: Numbers) -> tuple[str, ...]:
     return (f"{owner} is {max(far):g} m: is the length in millimetres?",) if far else ()
 
 
-def limit_notes(names: Sequence[str], revolute: Sequence[bool], limits: Limits) -> Iterator[str]:
+def limit_notes(
+    names: Sequence[str], revolute: Sequence[bool], limits: Limits
+) -> Iterator[str]:
     """Yield notes on limits that may be in millimetres or in degrees per second."""
     low = limits.position_min
     high = limits.position_max
@@ -221,7 +248,9 @@ def limit_notes(names: Sequence[str], revolute: Sequence[bool], limits: Limits) 
     if not all(isinstance(x, np.ndarray) and x.ndim == 1 for x in (low, high, speeds)):
         return
     fast: dict[float, list[str]] = {}
-    for name, turns, speed, *ends in zip(names, revolute, speeds, low, high, strict=True):
+    for name, turns, speed, *ends in zip(
+        names, revolute, speeds, low, high, strict=True
+    ):
         if not turns:
             yield from far_notes(f"joint `{name}`: an end of its range", ends)
         elif 50.0 < speed < np.inf:
@@ -229,7 +258,8 @@ def limit_notes(names: Sequence[str], revolute: Sequence[bool], limits: Limits) 
     for speed, group in fast.items():
         yield (
             f"{owners('joint', group)}: a velocity of up to {speed:g} rad/s is "
-            f"{30 * speed / np.pi:.4g} turns a minute: is the limit in degrees per second, or none?"
+            f"{30 * speed / np.pi:.4g} turns a minute: is the limit in degrees per "
+            "second, or none?"
         )
 
 

@@ -27,16 +27,18 @@ def import_mujoco() -> Any:
 def mjcf_as_urdf(path: str | Path) -> tuple[Any, Float[np.ndarray, "3"], list[Loop]]:
     """Return the URDF element of an MJCF file, its gravity [m/s²], and its closed loops.
 
-    Each body is a link of its name, fixed to the frame of its last joint; each named site is a link
-    that is fixed to its body. A joint that an equality constraint couples to another mimics it.
-    Shapes are left out.
+    Each body is a link of its name, fixed to the frame of its last joint; each named
+    site is a link that is fixed to its body. A joint that an equality constraint
+    couples to another mimics it. Shapes are left out.
     """
     mujoco = import_mujoco()
     try:
         model = mujoco.MjModel.from_xml_path(str(path))
     except ValueError as error:
         said = " ".join(str(error).split()).rstrip(".")
-        raise InputError(f"`{path}`: MuJoCo cannot compile this file: {said}.") from error
+        raise InputError(
+            f"`{path}`: MuJoCo cannot compile this file: {said}."
+        ) from error
     tree = _Writer(mujoco, model)
     for body in range(1, model.nbody):
         tree.add_body(body)
@@ -45,10 +47,16 @@ def mjcf_as_urdf(path: str | Path) -> tuple[Any, Float[np.ndarray, "3"], list[Lo
     for constraint in np.flatnonzero(model.eq_active0):
         tree.add_constraint(int(constraint))
     weightless = model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_GRAVITY)
-    return tree.root, np.zeros(3) if weightless else np.array(model.opt.gravity), tree.loops
+    return (
+        tree.root,
+        np.zeros(3) if weightless else np.array(model.opt.gravity),
+        tree.loops,
+    )
 
 
-def mjcf_shapes(path: str | Path) -> dict[str, list[tuple[Float[np.ndarray, "points 3"], float]]]:
+def mjcf_shapes(
+    path: str | Path,
+) -> dict[str, list[tuple[Float[np.ndarray, "points 3"], float]]]:
     """Return points and radii [m] of the shapes of all bodies, as `mjcf_as_urdf` names them.
 
     Shapes that cannot collide count only where a body has no others.
@@ -65,14 +73,21 @@ def mjcf_shapes(path: str | Path) -> dict[str, list[tuple[Float[np.ndarray, "poi
         ):
             continue
         size, radius = model.geom_size[geom], 0.0
-        points = size * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+        points = size * np.array(
+            [[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]
+        )
         if kind in (kinds.mjGEOM_SPHERE, kinds.mjGEOM_CAPSULE, kinds.mjGEOM_CYLINDER):
             half = 0.0 if kind == kinds.mjGEOM_SPHERE else size[1]
-            points, radius = np.array([[0.0, 0.0, -half], [0.0, 0.0, half]]), float(size[0])
+            points, radius = (
+                np.array([[0.0, 0.0, -half], [0.0, 0.0, half]]),
+                float(size[0]),
+            )
         elif kind == kinds.mjGEOM_MESH:
             mesh = model.geom_dataid[geom]
             first = model.mesh_vertadr[mesh]
-            points = model.mesh_vert[first : first + model.mesh_vertnum[mesh]].astype(float)
+            points = model.mesh_vert[first : first + model.mesh_vertnum[mesh]].astype(
+                float
+            )
         name = "world" if body == 0 else model.body(body).name or f"body{body}"
         placed = model.geom_pos[geom] + points @ _matrix(model.geom_quat[geom]).T
         found.setdefault(name, []).append((placed, radius))
@@ -89,15 +104,21 @@ class _Writer:
         self._joints: dict[int, Any] = {}
         self._efforts = _largest_forces(mujoco, model)
         self.loops: list[Loop] = []
-        self.root: Any = E.robot(E.link(name="world"), name=model.names.split(b"\0")[0].decode())
+        self.root: Any = E.robot(
+            E.link(name="world"), name=model.names.split(b"\0")[0].decode()
+        )
 
     def _name(self, kind: str, index: int) -> str:
         """Return the name of a body, a joint or a constraint, or its number if it has none."""
         return getattr(self._model, kind)(index).name or f"{kind}{index}"
 
-    def _connect(self, joint: str, kind: str, ends: tuple[str, str], origin: Any) -> Any:
+    def _connect(
+        self, joint: str, kind: str, ends: tuple[str, str], origin: Any
+    ) -> Any:
         parent, child = ends
-        element = E.joint(E.parent(link=parent), E.child(link=child), origin, name=joint, type=kind)
+        element = E.joint(
+            E.parent(link=parent), E.child(link=child), origin, name=joint, type=kind
+        )
         self.root.append(element)
         return element
 
@@ -153,7 +174,11 @@ class _Writer:
             friction=exact_text(model.dof_frictionloss[dof]),
             armature=exact_text(model.dof_armature[dof]),
         )
-        return [E.axis(xyz=exact_text(model.jnt_axis[joint])), E.limit(**limit), dynamics]
+        return [
+            E.axis(xyz=exact_text(model.jnt_axis[joint])),
+            E.limit(**limit),
+            dynamics,
+        ]
 
     def add_site(self, site: int) -> None:
         """Write a site as a link; one without a name, or with that of a body, is left out."""
@@ -166,7 +191,11 @@ class _Writer:
 
     def add_constraint(self, i: int) -> None:
         """Write a constraint between joints as a mimic; note one that closes a loop."""
-        model, kinds, kind = self._model, self._mujoco.mjtEq, int(self._model.eq_type[i])
+        model, kinds, kind = (
+            self._model,
+            self._mujoco.mjtEq,
+            int(self._model.eq_type[i]),
+        )
         pair = [int(model.eq_obj1id[i]), int(model.eq_obj2id[i])]
         if kind == int(kinds.mjEQ_JOINT):
             self._add_mimic(pair[0], pair[1], model.eq_data[i, :5])
@@ -181,15 +210,25 @@ class _Writer:
     def _add_mimic(self, joint: int, other: int, polynomial: np.ndarray) -> None:
         """Write a joint's constraint; the polynomial is exact where the other joint is held."""
         model, start = self._model, self._model.qpos0
-        value, slope, mimicked = start[model.jnt_qposadr[joint]] + polynomial[0], 0.0, {}
+        value, slope, mimicked = (
+            start[model.jnt_qposadr[joint]] + polynomial[0],
+            0.0,
+            {},
+        )
         if other >= 0:
-            low, high = model.jnt_range[other] if model.jnt_limited[other] else (-np.inf, np.inf)
+            low, high = (
+                model.jnt_range[other]
+                if model.jnt_limited[other]
+                else (-np.inf, np.inf)
+            )
             held = min(max(0.0, low), high)
             shift = held - start[model.jnt_qposadr[other]]
             slope = polynomial[1]
             value += np.polyval(polynomial[::-1], shift) - polynomial[0] - slope * held
             mimicked = {"joint": self._joints[other].get("name")}
-        mimic = E.mimic(**mimicked, multiplier=exact_text(slope), offset=exact_text(value))
+        mimic = E.mimic(
+            **mimicked, multiplier=exact_text(slope), offset=exact_text(value)
+        )
         self._joints[joint].append(mimic)
 
 
@@ -205,7 +244,9 @@ def _largest_forces(mujoco: Any, model: Any) -> Float[np.ndarray, " joints"]:
         if model.actuator_forcelimited[i]:
             most = np.abs(model.actuator_forcerange[i]).max()
         elif model.actuator_ctrllimited[i] and plain:
-            most = np.abs(model.actuator_ctrlrange[i] * model.actuator_gainprm[i, 0]).max()
+            most = np.abs(
+                model.actuator_ctrlrange[i] * model.actuator_gainprm[i, 0]
+            ).max()
         total[model.actuator_trnid[i, 0]] += most * np.abs(model.actuator_gear[i, 0])
     total = np.where(total > 0.0, total, np.inf)
     ranges = np.abs(model.jnt_actfrcrange).max(axis=1)

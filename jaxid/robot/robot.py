@@ -25,8 +25,8 @@ class Tool(eqx.Module):
         body: Index of the body that carries it (0 is the first).
         mass: Mass [kg].
         centre_of_mass: Centre of mass in the frame of the body [m].
-        inertia: Inertia tensor about the centre of mass, along the body's axes [kg m²]; a point
-            mass if None.
+        inertia: Inertia tensor about the centre of mass, along the body's axes [kg m²];
+            a point mass if None.
 
     Raises:
         InputError: If the mass is not positive, or no body has such an inertia.
@@ -40,11 +40,15 @@ class Tool(eqx.Module):
 
     def __post_init__(self):
         self.mass = _checked("`mass` of the tool", self.mass, ())
-        self.centre_of_mass = _checked("`centre_of_mass` of the tool", self.centre_of_mass, (3,))
+        self.centre_of_mass = _checked(
+            "`centre_of_mass` of the tool", self.centre_of_mass, (3,)
+        )
         tensor = np.zeros((3, 3)) if self.inertia is None else self.inertia
         self.inertia = _checked("`inertia` of the tool", tensor, (3, 3))
         if not is_traced(self.mass) and self.mass <= 0:
-            raise InputError(f"`mass` of the tool must be positive, but is {self.mass:g} kg.")
+            raise InputError(
+                f"`mass` of the tool must be positive, but is {self.mass:g} kg."
+            )
         if reason := self.body_inertia.fault():
             raise InputError(f"the tool cannot exist: {reason}.")
 
@@ -62,17 +66,19 @@ class Tool(eqx.Module):
 class Robot(Summarised, eqx.Module):
     r"""An open kinematic chain or tree: joint $i$ moves body $i$ against its parent.
 
-    The frame of a body has its origin on the joint's axis. At $q_i = 0$ it is placed in its parent
-    at `offset` with the attitude `rotation`; a revolute joint turns it about `axis`, a prismatic
-    joint moves it along `axis`. Geometry may consist of NumPy arrays (constants of compiled code),
-    which are checked, or of JAX arrays (inputs: batches of geometries, derivatives with respect to
-    lengths), which are taken as they are.
+    The frame of a body has its origin on the joint's axis. At $q_i = 0$ it is placed in
+    its parent at `offset` with the attitude `rotation`; a revolute joint turns it about
+    `axis`, a prismatic joint moves it along `axis`. Geometry may consist of NumPy
+    arrays (constants of compiled code), which are checked, or of JAX arrays (inputs:
+    batches of geometries, derivatives with respect to lengths), which are taken as they
+    are.
 
     Args:
         name: Name of the robot.
         revolute: For each joint whether it turns; a prismatic joint slides.
         axis: Axes of the joints, in the frames of their bodies; of any length.
-        rotation: Attitudes of the bodies in their parents at $q = 0$: columns are the body's axes.
+        rotation: Attitudes of the bodies in their parents at $q = 0$: columns are the
+            body's axes.
         offset: Origins of the bodies in their parents at $q = 0$ [m].
         parent: Indices of the parent bodies, -1 for the ground; a serial chain if None.
         joint_names: Names of the joints; `joint1`, `joint2`, … if None.
@@ -87,8 +93,8 @@ class Robot(Summarised, eqx.Module):
         notes: Changes and assumptions that were made, one sentence each.
 
     Raises:
-        InputError: If shapes do not fit, a parent comes after its child, an axis is zero, or an
-            attitude is no rotation.
+        InputError: If shapes do not fit, a parent comes after its child, an axis is
+            zero, or an attitude is no rotation.
     """
 
     name: str = eqx.field(static=True)
@@ -99,30 +105,42 @@ class Robot(Summarised, eqx.Module):
     axis: Float[AnyArray, "*geometry joints 3"] = eqx.field(converter=given)
     rotation: Float[AnyArray, "*geometry joints 3 3"] = eqx.field(converter=given)
     offset: Float[AnyArray, "*geometry joints 3"] = eqx.field(converter=given)
-    gravity: Float[AnyArray, "*geometry 3"] = eqx.field(converter=given, default=GRAVITY)
+    gravity: Float[AnyArray, "*geometry 3"] = eqx.field(
+        converter=given, default=GRAVITY
+    )
     limits: Limits = eqx.field(converter=given, default=None)
     drives: Drives = eqx.field(converter=given, default=None)
     tool: Tool | None = None
     tip_body: int = eqx.field(static=True, converter=given, default=None)
     tip_rotation: Float[AnyArray, "3 3"] = eqx.field(converter=given, default=None)
-    tip_offset: Float[AnyArray, "3"] = eqx.field(converter=given, default=(0.0, 0.0, 0.0))
+    tip_offset: Float[AnyArray, "3"] = eqx.field(
+        converter=given, default=(0.0, 0.0, 0.0)
+    )
     source: str = eqx.field(static=True, default="")
     notes: tuple[str, ...] = eqx.field(static=True, default=())
 
     def __post_init__(self):
         n, names, parent = len(self.revolute), self.joint_names, self.parent
         if n == 0:
-            raise InputError("`revolute` must have one entry for each joint, but is empty.")
+            raise InputError(
+                "`revolute` must have one entry for each joint, but is empty."
+            )
         self.joint_names = tuple(names or (f"joint{i + 1}" for i in range(n)))
-        self.parent = tuple(range(-1, n - 1)) if parent is None else tuple(int(i) for i in parent)
+        self.parent = (
+            tuple(range(-1, n - 1)) if parent is None else tuple(int(i) for i in parent)
+        )
         self.revolute = tuple(bool(r) for r in self.revolute)
         self.axis = _checked("`axis`", self.axis, (n, 3))
         if isinstance(self.axis, np.ndarray):
             length = np.linalg.norm(self.axis, axis=-1, keepdims=True)
             if (length < 1e-9).any():
                 j = int(length.argmin()) + 1
-                raise InputError(f"`axis` of joint {j} is the zero vector: give it a direction.")
-            self.axis = np.where(np.abs(length - 1.0) > 1e-15, self.axis / length, self.axis)
+                raise InputError(
+                    f"`axis` of joint {j} is the zero vector: give it a direction."
+                )
+            self.axis = np.where(
+                np.abs(length - 1.0) > 1e-15, self.axis / length, self.axis
+            )
         self.rotation = _rotations("`rotation`", self.rotation, (n, 3, 3))
         self.offset = _checked("`offset`", self.offset, (n, 3))
         self.gravity = _checked("`gravity`", self.gravity, (3,))
@@ -139,9 +157,12 @@ class Robot(Summarised, eqx.Module):
     def _check_joints(self) -> None:
         """Reject names, parents and bodies that do not fit the number of joints."""
         n = len(self.revolute)
-        if len(self.parent) != n or any(not -1 <= p < i for i, p in enumerate(self.parent)):
+        if len(self.parent) != n or any(
+            not -1 <= p < i for i, p in enumerate(self.parent)
+        ):
             raise InputError(
-                f"`parent` must hold an earlier body, or -1, for each of {n}, but is {self.parent}."
+                f"`parent` must hold an earlier body, or -1, for each of {n}, but is "
+                f"{self.parent}."
             )
         if len(self.joint_names) != n or len(set(self.joint_names)) != n:
             raise InputError(
@@ -149,15 +170,20 @@ class Robot(Summarised, eqx.Module):
             )
         for name in (self.name, *self.joint_names):
             if not name.isprintable():
-                raise InputError(f"the name {name!r} must be printable: remove the characters.")
+                raise InputError(
+                    f"the name {name!r} must be printable: remove the characters."
+                )
         carrier = self.tip_body if self.tool is None else self.tool.body
         for field, body in (("tip_body", self.tip_body), ("tool.body", carrier)):
             if not 0 <= body < n:
-                raise InputError(f"`{field}` must be a body from 0 to {n - 1}, but is {body}.")
+                raise InputError(
+                    f"`{field}` must be a body from 0 to {n - 1}, but is {body}."
+                )
         for field, one in (("limits", self.limits.force), ("drives", self.drives.zero)):
             if one.shape[-1:] != (n,):
                 raise InputError(
-                    f"`{field}` must be of {n} joints, like the robot, but are of {one.shape[-1]}."
+                    f"`{field}` must be of {n} joints, like the robot, but are of "
+                    f"{one.shape[-1]}."
                 )
 
     def _far_notes(self) -> tuple[str, ...]:
@@ -169,7 +195,9 @@ class Robot(Summarised, eqx.Module):
         known = {place: r for place, r in lengths.items() if isinstance(r, np.ndarray)}
         for place, r in known.items():
             if np.abs(r).max() > FARTHEST:
-                raise InputError(f"{place} is {np.abs(r).max():g} m long: give it in metres.")
+                raise InputError(
+                    f"{place} is {np.abs(r).max():g} m long: give it in metres."
+                )
         return tuple(note for place, r in known.items() for note in far_notes(place, r))
 
     @property
@@ -202,8 +230,10 @@ class Robot(Summarised, eqx.Module):
         if not np.isfinite(forces).all():
             j = int(np.flatnonzero(~np.isfinite(forces))[0])
             raise InputError(
-                f"the largest force of joint `{self.joint_names[j]}` of `{self.name}` is not known:"
-                " give `limits.force` (joint side) or `drives.max_torques` (motor side)."
+                f"the largest force of joint `{self.joint_names[j]}` of `{self.name}` "
+                "is not known:"
+                " give `limits.force` (joint side) or `drives.max_torques` (motor "
+                "side)."
             )
         return forces
 
@@ -215,13 +245,15 @@ class Robot(Summarised, eqx.Module):
         """Return the robot with rounded quarter turns made exact, like 1.5708 for pi/2.
 
         Args:
-            tolerance: Entries of axes and attitudes this close to zero become zero [rad].
+            tolerance: Entries of axes and attitudes this close to zero become zero
+                [rad].
 
         Raises:
             InputError: If the tolerance is no small angle.
         """
         return self.replace(
-            axis=snapped(self.axis, tolerance), rotation=snapped_rotations(self.rotation, tolerance)
+            axis=snapped(self.axis, tolerance),
+            rotation=snapped_rotations(self.rotation, tolerance),
         )
 
     def mounted(
@@ -230,13 +262,16 @@ class Robot(Summarised, eqx.Module):
         """Return the robot on a base that is tilted and shifted; gravity stays as it is.
 
         Args:
-            rotation: Attitude of the former ground frame on the new ground; upright if None.
+            rotation: Attitude of the former ground frame on the new ground; upright if
+                None.
             position: Origin of the former ground frame on the new ground [m].
 
         Raises:
             InputError: If the attitude is no rotation, or the position no point.
         """
-        R = _rotations("`rotation`", np.eye(3) if rotation is None else rotation, (3, 3))
+        R = _rotations(
+            "`rotation`", np.eye(3) if rotation is None else rotation, (3, 3)
+        )
         r = _checked("`position`", position, (3,))
         on_ground = np.array(self.parent) < 0
         xp = namespace(R, r, self.rotation, self.offset)
@@ -262,15 +297,22 @@ class Robot(Summarised, eqx.Module):
         Args:
             mass: Mass [kg].
             centre_of_mass: Centre of mass in the end-effector's frame [m].
-            inertia: Inertia tensor about the centre of mass, along the end-effector's axes [kg m²];
-                a point mass if None.
+            inertia: Inertia tensor about the centre of mass, along the end-effector's
+                axes [kg m²]; a point mass if None.
 
         Raises:
             InputError: If the mass is not positive, or no body has such an inertia.
         """
-        own = Tool(self.tip_body, mass=mass, centre_of_mass=centre_of_mass, inertia=inertia)
+        own = Tool(
+            self.tip_body, mass=mass, centre_of_mass=centre_of_mass, inertia=inertia
+        )
         there = own.body_inertia.moved(self.tip_rotation, self.tip_offset)
-        tool = Tool(self.tip_body, mass=own.mass, centre_of_mass=there.centre, inertia=there.tensor)
+        tool = Tool(
+            self.tip_body,
+            mass=own.mass,
+            centre_of_mass=there.centre,
+            inertia=there.tensor,
+        )
         return self.replace(tool=tool)
 
     def joint_unit(self, joint: int) -> str:
@@ -286,10 +328,14 @@ class Robot(Summarised, eqx.Module):
         names = ("ground", *self.joint_names)
         units = [self.joint_unit(j) for j in range(self.joints)]
         limits = self.limits
-        facts = [("end-effector", f"on the body of `{self.joint_names[self.tip_body]}`")]
+        facts = [
+            ("end-effector", f"on the body of `{self.joint_names[self.tip_body]}`")
+        ]
         if self.tool is not None:
             carrier = self.joint_names[self.tool.body]
-            facts.append(("tool", f"{float(self.tool.mass):.3g} kg on the body of `{carrier}`"))
+            facts.append(
+                ("tool", f"{float(self.tool.mass):.3g} kg on the body of `{carrier}`")
+            )
         if self.source:
             facts.append(("source", self.source))
         return Table(
@@ -310,7 +356,11 @@ class Robot(Summarised, eqx.Module):
 
 def _checked(name: str, value: Numbers, shape: tuple[int, ...]) -> AnyArray:
     """Return a copy as an array of finite numbers; a JAX array may have leading axes."""
-    array = value if isinstance(value, jax.Array) else np.array(as_array(name, value), np.float64)
+    array = (
+        value
+        if isinstance(value, jax.Array)
+        else np.array(as_array(name, value), np.float64)
+    )
     if array.shape[array.ndim - len(shape) :] != shape or array.ndim < len(shape):
         raise InputError(f"{name} must have the shape {shape}, but has {array.shape}.")
     if isinstance(array, np.ndarray) and not np.isfinite(array).all():
@@ -323,5 +373,7 @@ def _rotations(name: str, value: Numbers, shape: tuple[int, ...]) -> AnyArray:
     if isinstance(R, np.ndarray):
         error = np.abs(np.swapaxes(R, -1, -2) @ R - np.eye(3)).max(axis=(-1, -2))
         if (error >= 1e-6).any() or (np.linalg.det(R) < 0).any():
-            raise InputError(f"{name} must hold orthonormal, right-handed rotation matrices.")
+            raise InputError(
+                f"{name} must hold orthonormal, right-handed rotation matrices."
+            )
     return R

@@ -1,7 +1,9 @@
 """Rotations by angles, exact at quarter turns, and rounded quarter turns made exact.
 
-A rounded quarter turn (1.5708 for pi/2) makes columns of the regressor that are only *nearly*
-dependent: one base parameter too many, at a condition number of 1e7. So the rank is decided with
+A rounded quarter turn (1.5708 for pi/2) makes columns of the regressor that are only
+*nearly*
+dependent: one base parameter too many, at a condition number of 1e7. So the rank is
+    decided with
 exact quarter turns ("snapping"); the robot itself keeps the angles of its file.
 """
 
@@ -26,8 +28,8 @@ def rotation_about(
 ) -> Float[AnyArray, "*batch 3 3"]:
     """Return the rotation about a unit vector by an angle [rad].
 
-    The part of a vector along the axis stays and the rest turns: in this form a constant axis
-    leaves the fewest operations.
+    The part of a vector along the axis stays and the rest turns: in this form a
+    constant axis leaves the fewest operations.
     """
     xp = namespace(axis, angle)
     along = axis[:, None] * axis[None, :]
@@ -53,7 +55,9 @@ def rpy_angles(rotation: Float[AnyArray, "3 3"]) -> Float[np.ndarray, "3"]:
     """Return roll, pitch and yaw [rad] of a rotation, as precise at a pitch of a quarter turn."""
     roll = float(np.arctan2(rotation[2, 1], rotation[2, 2]))
     R = np.asarray(rotation) @ axis_rotation((1.0, 0.0, 0.0), -roll)
-    return np.array([roll, np.arctan2(-R[2, 0], R[2, 2]), np.arctan2(-R[0, 1], R[1, 1])])
+    return np.array(
+        [roll, np.arctan2(-R[2, 0], R[2, 2]), np.arctan2(-R[0, 1], R[1, 1])]
+    )
 
 
 def snapped(
@@ -62,7 +66,8 @@ def snapped(
     """Return unit vectors whose entries within `tolerance` of zero are zero."""
     if not 0.0 <= tolerance < 0.1:
         raise InputError(
-            f"`snap_tolerance` must be an angle from 0 (off) to 0.1 rad, but is {tolerance:g}."
+            "`snap_tolerance` must be an angle from 0 (off) to 0.1 rad, but is "
+            f"{tolerance:g}."
         )
     x = np.asarray(vectors, np.float64)
     zeroed = np.where(np.abs(x) <= tolerance, 0.0, x)

@@ -1,8 +1,9 @@
 """Shapes of collision models: capsules on bodies, planes and boxes in the world.
 
-Distances are signed: negative where shapes overlap. They are differentiable everywhere. A square
-root is rounded near zero, so that a distance comes out at most `ROUNDING` too small, never too
-large. Where the closest points are not unique, the derivative is that at one pair of them.
+Distances are signed: negative where shapes overlap. They are differentiable everywhere.
+A square root is rounded near zero, so that a distance comes out at most `ROUNDING` too
+small, never too large. Where the closest points are not unique, the derivative is that
+at one pair of them.
 """
 
 from typing import Any
@@ -45,14 +46,24 @@ class Capsule(eqx.Module):
     radius: Float[AnyArray, ""]
 
     def __init__(
-        self, name: str, body: int, *, start: Numbers, end: Numbers | None = None, radius: Numbers
+        self,
+        name: str,
+        body: int,
+        *,
+        start: Numbers,
+        end: Numbers | None = None,
+        radius: Numbers,
     ):
         self.name, self.body = name, body
         self.start = _point(f"`start` of capsule `{name}`", start)
-        self.end = self.start if end is None else _point(f"`end` of capsule `{name}`", end)
+        self.end = (
+            self.start if end is None else _point(f"`end` of capsule `{name}`", end)
+        )
         self.radius = np.array(radius, np.float64)
         if not 0 < self.radius < np.inf:
-            raise InputError(f"`radius` of capsule `{name}` must be positive [m], not {radius}.")
+            raise InputError(
+                f"`radius` of capsule `{name}` must be positive [m], not {radius}."
+            )
 
 
 class HalfSpace(eqx.Module):
@@ -72,12 +83,18 @@ class HalfSpace(eqx.Module):
     height: Float[AnyArray, ""]
 
     def __init__(
-        self, name: str = "ground", *, normal: Numbers = (0.0, 0.0, 1.0), height: Numbers = 0.0
+        self,
+        name: str = "ground",
+        *,
+        normal: Numbers = (0.0, 0.0, 1.0),
+        height: Numbers = 0.0,
     ):
         n = _point(f"`normal` of `{name}`", normal)
         length = np.linalg.norm(n)
         if length < 1e-9 or not np.isfinite(height).all():
-            raise InputError(f"`{name}` needs a `normal` that is not zero, and a finite `height`.")
+            raise InputError(
+                f"`{name}` needs a `normal` that is not zero, and a finite `height`."
+            )
         self.name = name
         self.normal = n / length
         self.height = np.array(height, np.float64)
@@ -86,7 +103,9 @@ class HalfSpace(eqx.Module):
         """Return the signed distances of segments from the plane [m]: those of the lower ends."""
         return _smaller(start @ self.normal, end @ self.normal) - self.height
 
-    def slopes(self, ends: Float[np.ndarray, "segments 2 3"]) -> Float[np.ndarray, "segments 2 3"]:
+    def slopes(
+        self, ends: Float[np.ndarray, "segments 2 3"]
+    ) -> Float[np.ndarray, "segments 2 3"]:
         """Return the derivatives of the distances of segments by their ends, in NumPy."""
         heights = ends @ self.normal
         lower = heights[:, 0] < heights[:, 1]
@@ -100,7 +119,8 @@ class Box(eqx.Module):
         name: Name of the obstacle in messages.
         centre: Centre in the frame of the ground [m].
         size: Lengths of the edges [m].
-        rotation: Attitude, whose columns are the box's axes; that of the ground if None.
+        rotation: Attitude, whose columns are the box's axes; that of the ground if
+            None.
 
     Raises:
         InputError: If an edge is not positive, or the attitude is no rotation.
@@ -112,14 +132,21 @@ class Box(eqx.Module):
     rotation: Float[AnyArray, "3 3"]
 
     def __init__(
-        self, name: str, *, centre: Numbers, size: Numbers, rotation: Numbers | None = None
+        self,
+        name: str,
+        *,
+        centre: Numbers,
+        size: Numbers,
+        rotation: Numbers | None = None,
     ):
         R = np.eye(3) if rotation is None else np.array(rotation, np.float64)
         self.name, self.rotation = name, R
         self.centre = _point(f"`centre` of box `{name}`", centre)
         self.size = _point(f"`size` of box `{name}`", size)
         if (self.size <= 0).any():
-            raise InputError(f"`size` of box `{name}` must be positive [m], but is {size}.")
+            raise InputError(
+                f"`size` of box `{name}` must be positive [m], but is {size}."
+            )
         if R.shape != (3, 3) or not np.abs(R.T @ R - np.eye(3)).max() < 1e-6:
             raise InputError(f"`rotation` of box `{name}` is no rotation matrix.")
 
@@ -129,12 +156,14 @@ class Box(eqx.Module):
         R = jnp.asarray(self.rotation)
         centre = jnp.broadcast_to(self.centre @ self.rotation, start.shape)
         first, along = start @ R - centre, (end - start) @ R
-        # The distance is convex along the segment. Its minimum is found without derivatives: those
-        # of the place add nothing to that of the distance.
+        # The distance is convex along the segment. Its minimum is found without
+        # derivatives: those of the place add nothing to that of the distance.
         origin, direction = jax.lax.stop_gradient((first, along))
 
         def slope(place: Array) -> Array:
-            return jax.jvp(self._signed, (origin + place * direction,), (direction,))[1][..., None]
+            return jax.jvp(self._signed, (origin + place * direction,), (direction,))[
+                1
+            ][..., None]
 
         def halve(_: int | Array, interval: tuple[Array, Array]) -> tuple[Array, Array]:
             low, high = interval
@@ -144,15 +173,18 @@ class Box(eqx.Module):
 
         zero = jnp.zeros_like(origin[..., :1])
         low, high = jax.lax.fori_loop(0, 40, halve, (zero, zero + 1.0))
-        # In the box the deepest point lies where two faces are equally near. The derivative is then
-        # that mean of both sides' which a shift along the segment leaves as it is.
+        # In the box the deepest point lies where two faces are equally near. The
+        # derivative is then that mean of both sides' which a shift along the segment
+        # leaves as it is.
         falling, rising = slope(low), slope(high)
         turns = rising - falling
         share = jnp.clip(rising / jnp.where(turns > 0, turns, 1.0), 0.0, 1.0)[..., 0]
         before, after = (self._signed(first + place * along) for place in (low, high))
         return share * before + (1.0 - share) * after
 
-    def slopes(self, ends: Float[np.ndarray, "segments 2 3"]) -> Float[np.ndarray, "segments 2 3"]:
+    def slopes(
+        self, ends: Float[np.ndarray, "segments 2 3"]
+    ) -> Float[np.ndarray, "segments 2 3"]:
         """Return the derivatives of the distances of segments by their ends, in NumPy."""
         count = -(-len(ends) // 64) * 64  # few sizes, so that little is compiled
         padded = np.resize(ends, (count, 2, 3))
@@ -176,8 +208,8 @@ def _box_slopes(box: Box, start: Array, end: Array) -> tuple[Array, ...]:
 def _smaller(x: AnyArray, y: AnyArray) -> Any:
     """Return the smaller numbers, with the derivatives of one of both.
 
-    Derivatives of `jnp.minimum` ask which argument equals the result. None does where a compiler
-    rounds the two in different ways.
+    Derivatives of `jnp.minimum` ask which argument equals the result. None does where a
+    compiler rounds the two in different ways.
     """
     return namespace(x, y).where(x < y, x, y)
 
@@ -202,7 +234,8 @@ def closest_places(
 ) -> tuple[AnyArray, AnyArray]:
     """Return the places of the closest points along two segments, from 0 to 1, as constants.
 
-    Their derivatives add nothing to that of the distance, and they have none at parallel axes.
+    Their derivatives add nothing to that of the distance, and they have none at
+    parallel axes.
     """
     xp = namespace(start, end, other_start, other_end)
     ends = (start, end, other_start, other_end)
@@ -215,7 +248,9 @@ def closest_places(
         return xp.einsum("...i,...i->...", x, y)[..., None]
 
     def share(part: AnyArray, whole: AnyArray, usable: AnyArray) -> AnyArray:
-        return xp.where(usable, xp.clip(part / xp.where(usable, whole, 1.0), 0.0, 1.0), 0.0)
+        return xp.where(
+            usable, xp.clip(part / xp.where(usable, whole, 1.0), 0.0, 1.0), 0.0
+        )
 
     uu, vv, uv, ur, vr = dot(u, u), dot(v, v), dot(u, v), dot(u, r), dot(v, r)
     area = uu * vv - uv * uv

@@ -28,14 +28,16 @@ _LARGEST_ANGLE = 2 * np.pi + 0.01
 class UrdfTree:
     """Links and joints of a URDF or MJCF file; fixed and held links are merged into their bodies.
 
-    Only what kinematics and inertias need is read: an error in a mesh, a transmission or the
-    element of a simulator does no harm. Arguments and errors are those of `load_urdf`.
+    Only what kinematics and inertias need is read: an error in a mesh, a transmission
+    or the element of a simulator does no harm. Arguments and errors are those of
+    `load_urdf`.
 
     Attributes:
         links: Elements of the links, by name.
-        carriers: For each link its body (-1: ground) and its placement in the body's frame.
-        joints: Elements of the moving joints; `parent`, `axis`, `rotation` and `offset` as in
-            `Robot`.
+        carriers: For each link its body (-1: ground) and its placement in the body's
+            frame.
+        joints: Elements of the moving joints; `parent`, `axis`, `rotation` and `offset`
+            as in `Robot`.
         held: Elements of joints that mimic others.
         left_out: Elements of joints on moving bodies that lead to no link of the chain.
         loose: Names of links that float and move no joint, which are left out.
@@ -55,7 +57,11 @@ class UrdfTree:
         self.links = self._named(element, "link")
         self._joints = self._named(element, "joint")
         joints = self._joints.values()
-        if any(parent.get("link") == "world" for j in joints for parent in j.iterfind("parent")):
+        if any(
+            parent.get("link") == "world"
+            for j in joints
+            for parent in j.iterfind("parent")
+        ):
             # Simulators know this link, so that many files do not define it.
             self.links.setdefault("world", etree.Element("link", name="world"))
         self._below: dict[str, list[Any]] = {link: [] for link in self.links}
@@ -66,7 +72,8 @@ class UrdfTree:
         for argument, link in (("base", base), ("tip", tip)):
             if link is not None and link not in self.links:
                 raise InputError(
-                    f"`{argument}` must be a link of `{self.path}`, but is `{link}`; its links are "
+                    f"`{argument}` must be a link of `{self.path}`, but is `{link}`; "
+                    "its links are "
                     f"{listed(list(self.links))}."
                 )
         self.joints, self.parent = [], []
@@ -80,7 +87,9 @@ class UrdfTree:
         found: dict[str, Any] = {}
         for element in root.iterfind(tag):
             if (name := self._attribute(element, "name")) in found:
-                raise InputError(f"`{self.path}` has two {tag}s named `{name}`: rename one.")
+                raise InputError(
+                    f"`{self.path}` has two {tag}s named `{name}`: rename one."
+                )
             found[name] = element
         return found
 
@@ -91,12 +100,15 @@ class UrdfTree:
             if (end := joint.find(tag)) is None:
                 raise InputError(f"{self.place(joint)}: the joint has no `<{tag}>`.")
             if (link := self._attribute(end, "link")) not in self.links:
-                raise self.error(joint, f"connects link `{link}`, which the file does not define")
+                raise self.error(
+                    joint, f"connects link `{link}`, which the file does not define"
+                )
         parent, child = link_names(joint)
         if child in self._above:
             raise self.error(
                 joint,
-                f"moves link `{child}`, as `{self._above[child].get('name')}` does: remove one",
+                f"moves link `{child}`, as `{self._above[child].get('name')}` does: "
+                "remove one",
             )
         self._above[child] = joint
         self._below[parent].append(joint)
@@ -109,11 +121,13 @@ class UrdfTree:
             reached += [link_names(joint)[1] for joint in self._below[link]]
         if link := next((link for link in self.links if link not in reached), None):
             raise self.error(
-                self._above[link], "is part of a closed loop: remove one joint of the loop"
+                self._above[link],
+                "is part of a closed loop: remove one joint of the loop",
             )
         if len(roots) != 1:
             raise InputError(
-                f"`{self.path}` must have one root link, but has {listed(roots) or 'none'}: "
+                f"`{self.path}` must have one root link, but has "
+                f"{listed(roots) or 'none'}: "
                 "connect several by fixed joints."
             )
         return roots[0]
@@ -155,9 +169,14 @@ class UrdfTree:
             waiting += self._below[child][::-1]
         self.tip = max(length, key=lambda link: length[link]) if tip is None else tip
         if self.carriers[self.tip][0] < 0:
-            below = f"below link `{base}`" if tip is None else f"between links `{base}` and `{tip}`"
+            below = (
+                f"below link `{base}`"
+                if tip is None
+                else f"between links `{base}` and `{tip}`"
+            )
             raise InputError(
-                f"`{self.path}` has no moving joint {below}: choose another `base` or `tip`."
+                f"`{self.path}` has no moving joint {below}: choose another `base` or "
+                "`tip`."
             )
 
     def placed_links(self) -> dict[str, tuple[int, np.ndarray, np.ndarray]]:
@@ -168,7 +187,11 @@ class UrdfTree:
             body, R, r = placed[link]
             for joint in self._below[link]:
                 child = link_names(joint)[1]
-                if child not in placed and joint.get("type") in (*TURNING, "prismatic", "fixed"):
+                if child not in placed and joint.get("type") in (
+                    *TURNING,
+                    "prismatic",
+                    "fixed",
+                ):
                     rotation, offset = self.held_pose(joint)
                     placed[child] = body, R @ rotation, r + R @ offset
                     waiting.append(child)
@@ -182,7 +205,8 @@ class UrdfTree:
                 and len({self.carriers[e][0] for e in ends}) > 1
             ):
                 raise InputError(
-                    f"`{self.path}`: the constraint `{name}` between `{ends[0]}` and `{ends[1]}` "
+                    f"`{self.path}`: the constraint `{name}` between `{ends[0]}` and "
+                    f"`{ends[1]}` "
                     "closes a loop: avoid it (`tip`, `--tip`), or remove it."
                 )
 
@@ -195,7 +219,9 @@ class UrdfTree:
     def _moves_below(self, joint: Any) -> bool:
         """Return whether the link that a joint carries carries moving joints itself."""
         return any(
-            lower.get("type") != "fixed" for lower in self.branch(joint) if lower is not joint
+            lower.get("type") != "fixed"
+            for lower in self.branch(joint)
+            if lower is not joint
         )
 
     def held_at(self, joint: Any) -> float:
@@ -220,12 +246,16 @@ class UrdfTree:
             return R, r
         axis = self._axis(joint)
         turns = joint.get("type") in TURNING
-        return (R @ axis_rotation(axis, value), r) if turns else (R, r + R @ axis * value)
+        return (
+            (R @ axis_rotation(axis, value), r) if turns else (R, r + R @ axis * value)
+        )
 
     def range(self, joint: Any) -> tuple[float, float]:
         """Return the ends of a joint's range, infinite where unknown [rad or m]."""
         low, high = (self.limit(joint, key, np.nan) for key in ("lower", "upper"))
-        if joint.get("type") == "continuous" or not (np.isfinite(low) or np.isfinite(high)):
+        if joint.get("type") == "continuous" or not (
+            np.isfinite(low) or np.isfinite(high)
+        ):
             return -np.inf, np.inf
         # A missing bound is zero if the other one is given, as the URDF standard says.
         return 0.0 if np.isnan(low) else low, 0.0 if np.isnan(high) else high
@@ -236,7 +266,8 @@ class UrdfTree:
         while link != base:
             if link not in self._above:
                 raise InputError(
-                    f"`{self.path}`: no chain leads from `base` `{base}` to `tip` `{tip}`."
+                    f"`{self.path}`: no chain leads from `base` `{base}` to `tip` "
+                    f"`{tip}`."
                 )
             joints.append(self._above[link])
             link, _ = link_names(joints[-1])
@@ -244,9 +275,13 @@ class UrdfTree:
 
     def _origin(self, joint: Any) -> tuple[np.ndarray, np.ndarray]:
         """Return attitude and origin of a joint in its parent link."""
-        offset, rpy = (self.numbers(joint.find("origin"), key, _ZERO) for key in ("xyz", "rpy"))
+        offset, rpy = (
+            self.numbers(joint.find("origin"), key, _ZERO) for key in ("xyz", "rpy")
+        )
         if np.abs(rpy).max() > _LARGEST_ANGLE:
-            raise self.error(joint, f"has an `rpy` of {_words(rpy)}: give radians, not degrees")
+            raise self.error(
+                joint, f"has an `rpy` of {_words(rpy)}: give radians, not degrees"
+            )
         return rpy_rotation(rpy), offset
 
     def _axis(self, joint: Any) -> np.ndarray:
@@ -255,14 +290,21 @@ class UrdfTree:
         if kind not in (*TURNING, "prismatic"):
             cure = "make it fixed"
             if kind == "floating":
-                cure = f"hold the robot at its base (`base`, `--base {link_names(joint)[1]}`)"
+                cure = (
+                    "hold the robot at its base (`base`, `--base "
+                    f"{link_names(joint)[1]}`)"
+                )
             raise self.error(
-                joint, f"is {kind}, but must turn or slide: avoid it (`tip`, `--tip`), or {cure}"
+                joint,
+                f"is {kind}, but must turn or slide: avoid it (`tip`, `--tip`), or "
+                f"{cure}",
             )
         axis = self.numbers(joint.find("axis"), "xyz", (1.0, 0.0, 0.0))
         length = np.linalg.norm(axis)
         if length < 1e-9:
-            raise self.error(joint, "has the zero vector as its axis: give it a direction")
+            raise self.error(
+                joint, "has the zero vector as its axis: give it a direction"
+            )
         return without_rounding(axis / length)
 
     def bodies(self, *, check: bool = False) -> Float[np.ndarray, "joints 10"]:
@@ -274,7 +316,8 @@ class UrdfTree:
             inertia, fault = inertial
             if check and fault:
                 raise InputError(
-                    f"`{self.path}`: the inertial of link `{name}` belongs to no body: {fault}."
+                    f"`{self.path}`: the inertial of link `{name}` belongs to no "
+                    f"body: {fault}."
                 )
             parameters[body] += inertia.moved(R, r).parameters
         return parameters
@@ -288,7 +331,9 @@ class UrdfTree:
         moments = element.find("inertia")
         (mass,) = self.numbers(element.find("mass"), "value", (0.0,))
         rows = (("ixx", "ixy", "ixz"), ("ixy", "iyy", "iyz"), ("ixz", "iyz", "izz"))
-        tensor = np.array([[self.numbers(moments, key, (0.0,))[0] for key in row] for row in rows])
+        tensor = np.array(
+            [[self.numbers(moments, key, (0.0,))[0] for key in row] for row in rows]
+        )
         xyz, rpy = (self.numbers(origin, key, _ZERO) for key in ("xyz", "rpy"))
         R = rpy_rotation(rpy)
         fault = Inertia(mass, xyz, tensor).fault(rounding=0.01)
@@ -307,11 +352,18 @@ class UrdfTree:
 
     def _attribute(self, element: Any, key: str) -> str:
         if element.get(key) is None:
-            raise InputError(f"{self.place(element)}: `<{element.tag}>` needs the attribute {key}.")
+            raise InputError(
+                f"{self.place(element)}: `<{element.tag}>` needs the attribute {key}."
+            )
         return element.get(key)
 
     def numbers(
-        self, element: Any, key: str, default: tuple[float, ...], *, infinite: bool = False
+        self,
+        element: Any,
+        key: str,
+        default: tuple[float, ...],
+        *,
+        infinite: bool = False,
     ) -> np.ndarray:
         """Return the numbers of an attribute, or the default where the element lacks it."""
         text = None if element is None else element.get(key)
@@ -331,7 +383,9 @@ class UrdfTree:
 
     def limit(self, joint: Any, key: str, unknown: float) -> float:
         """Return a number of a joint's `<limit>`, which may be infinite."""
-        return float(self.numbers(joint.find("limit"), key, (unknown,), infinite=True)[0])
+        return float(
+            self.numbers(joint.find("limit"), key, (unknown,), infinite=True)[0]
+        )
 
 
 def link_names(joint: Any) -> tuple[str, str]:
@@ -347,7 +401,9 @@ def read_description(path: str | Path) -> tuple[Any, Numbers, list[Loop]]:
     if any("ros.org/" in e.tag and "xacro" in e.tag for e in robot.iter("*")):
         robot = _parse(path, _expanded(Path(path)))
     if robot.tag != "robot":
-        raise InputError(f"`{path}` is no URDF: its root is `<{robot.tag}>`, not `<robot>`.")
+        raise InputError(
+            f"`{path}` is no URDF: its root is `<{robot.tag}>`, not `<robot>`."
+        )
     return robot, GRAVITY, []
 
 
@@ -359,25 +415,37 @@ def is_mjcf(path: str | Path) -> bool:
 def _parse(path: str | Path, text: bytes | None = None) -> Any:
     """Return the root element of a file, or of a text made from it."""
     if not Path(path).is_file():
-        raise FileNotFoundError(f"the robot's file `{path}` does not exist: check its path.")
+        raise FileNotFoundError(
+            f"the robot's file `{path}` does not exist: check its path."
+        )
     # No entity of a file makes the parser read other files.
     parser = etree.XMLParser(resolve_entities=False, no_network=True, load_dtd=False)
     try:
-        return etree.fromstring(Path(path).read_bytes() if text is None else text, parser)
+        return etree.fromstring(
+            Path(path).read_bytes() if text is None else text, parser
+        )
     except etree.XMLSyntaxError as error:
         line = error.lineno or 1
-        raise InputError(f"`{path}`, line {line}: this is not XML ({error.msg}).") from error
+        raise InputError(
+            f"`{path}`, line {line}: this is not XML ({error.msg})."
+        ) from error
 
 
 def _expanded(path: Path) -> bytes:
     """Return a xacro file as the program `xacro` expands it."""
     command = f"`xacro {path} -o {path.name.split('.')[0]}.urdf`"
     if (program := shutil.which("xacro")) is None:
-        raise InputError(f"`{path}` is a xacro file: expand it by {command} (`pip install xacro`).")
+        raise InputError(
+            f"`{path}` is a xacro file: expand it by {command} (`pip install xacro`)."
+        )
     done = subprocess.run([program, str(path)], capture_output=True)
     if done.returncode:
-        said = done.stderr.decode(errors="replace").strip().splitlines() or ["no reason given"]
-        raise InputError(f"`{path}`: {command} fails: {said[0]}: give a file that it has expanded.")
+        said = done.stderr.decode(errors="replace").strip().splitlines() or [
+            "no reason given"
+        ]
+        raise InputError(
+            f"`{path}`: {command} fails: {said[0]}: give a file that it has expanded."
+        )
     return done.stdout
 
 

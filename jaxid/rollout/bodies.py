@@ -23,8 +23,8 @@ class Programs(NamedTuple):
 
     Attributes:
         bodies: Mass matrix and bias forces from positions and velocities.
-        derivatives: Both with their derivatives: of matrix and forces by positions, of the forces
-            by velocities.
+        derivatives: Both with their derivatives: of matrix and forces by positions, of
+            the forces by velocities.
         solve: Velocities in a stage, as in `stage_velocities`; None without coupling.
     """
 
@@ -68,7 +68,9 @@ class Bodies:
             by_q = jax.jacfwd(self.matrix_and_bias)(q, v)
             return *by_q, jax.jacfwd(lambda v: self.matrix_and_bias(q, v)[1])(v)
 
-        bodies, derivatives = (trace(f, (n,), (n,)) for f in (self.matrix_and_bias, derived))
+        bodies, derivatives = (
+            trace(f, (n,), (n,)) for f in (self.matrix_and_bias, derived)
+        )
         solve = None
         if self.coupled:
             matrix = np.full(bodies.nonzeros[0].shape, FREE)
@@ -86,10 +88,15 @@ class Bodies:
             if self.coupled:
                 M = in_numpy(model, model.inertia, path, shared=(p,))
                 own = np.diagonal(M, axis1=1, axis2=2)
-                forces = in_numpy(model, model.forces, path, qd, qdd, shared=(p,)) - own * qdd
+                forces = (
+                    in_numpy(model, model.forces, path, qd, qdd, shared=(p,))
+                    - own * qdd
+                )
                 inertia[k, :, :-1] = own.T
             else:
-                forces = in_numpy(model, model.forces, path, 0 * qd, 0 * qd, shared=(p,))
+                forces = in_numpy(
+                    model, model.forces, path, 0 * qd, 0 * qd, shared=(p,)
+                )
             load[k, :, :-1] = forces.T
         return motion.replace(load=load, inertia=inertia)
 

@@ -45,17 +45,21 @@ def sustained_errors(
 ) -> Float[np.ndarray, "motions joints samples"]:
     """Return errors averaged over half a second, of joints that do not move.
 
-    A joint that moves over more than the error is not held: there the error counts as zero.
+    A joint that moves over more than the error is not held: there the error counts as
+    zero.
     """
     mean, measured = np.empty_like(errors), np.asarray(motion.positions)
     for k, dt in enumerate(motion.sample_time):
         size = max(1, round(SUSTAINED / float(dt)))
         mean[k] = np.abs(uniform_filter1d(errors[k], size, axis=-1, mode="nearest"))
         high, low = (
-            f(measured[k], 2 * size, axis=-1) for f in (maximum_filter1d, minimum_filter1d)
+            f(measured[k], 2 * size, axis=-1)
+            for f in (maximum_filter1d, minimum_filter1d)
         )
         mean[k] *= high - low < np.maximum(mean[k], LEAST)
-    return mean * (np.arange(errors.shape[-1]) < np.array(motion.lengths)[:, None, None])
+    return mean * (
+        np.arange(errors.shape[-1]) < np.array(motion.lengths)[:, None, None]
+    )
 
 
 def contact_rows(
@@ -80,11 +84,13 @@ def contact_rows(
     return rows
 
 
-def typical_errors(motion: ServoMotion, mean: np.ndarray) -> Float[np.ndarray, " joints"]:
+def typical_errors(
+    motion: ServoMotion, mean: np.ndarray
+) -> Float[np.ndarray, " joints"]:
     """Return the usual size of averaged errors of each joint at rest, which contacts do not move.
 
-    It is the median of these errors over that of normal ones of unit variance. The median motion
-    counts, since contact may last in some of them.
+    It is the median of these errors over that of normal ones of unit variance. The
+    median motion counts, since contact may last in some of them.
     """
     typical = np.zeros(mean.shape[1])
     for j in range(len(typical)):
@@ -102,7 +108,9 @@ def contacts(
     rows = contact_rows(motion, errors, typical)
     for k, j in np.argwhere(rows.any(axis=2)):
         dt = float(motion.sample_time[k])
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], rows[k, j].astype(int), [0]])))
+        edges = np.flatnonzero(
+            np.diff(np.concatenate([[0], rows[k, j].astype(int), [0]]))
+        )
         for a, b in edges.reshape(-1, 2):
             peak = float(mean[k, j, a:b].max())
             start, stop = (float(motion.begin[k] + dt * i) for i in (a, b))

@@ -1,8 +1,8 @@
 """Joints that load each other: one simulation of all, and its exact sensitivities.
 
-In each step the bodies have the mass matrix and the bias forces of its predicted middle, and the
-servos take two implicit stages. Velocities are solved for until they agree with the joints that dry
-friction holds, or whose direction it changes.
+In each step the bodies have the mass matrix and the bias forces of its predicted
+middle, and the servos take two implicit stages. Velocities are solved for until they
+agree with the joints that dry friction holds, or whose direction it changes.
 """
 
 import dataclasses
@@ -53,8 +53,8 @@ class Path(NamedTuple):
         within: Velocities in the stages, zero where friction holds a joint.
         positions: Positions behind each step [steps, joints, motions].
         load: Bias forces of the bodies in each step; None without bodies.
-        M: Mass matrix of the bodies in each step [steps, joints, joints, motions]; None if they are
-            not coupled.
+        M: Mass matrix of the bodies in each step [steps, joints, joints, motions]; None
+            if they are not coupled.
     """
 
     before: State
@@ -66,17 +66,26 @@ class Path(NamedTuple):
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
 def _simulate(
-    programs: Programs | None, steps: int, theta: Array, motion: ServoMotion, hold: AnyArray
+    programs: Programs | None,
+    steps: int,
+    theta: Array,
+    motion: ServoMotion,
+    hold: AnyArray,
 ) -> Path:
     """Simulate all motions from their initial states, each with parameters of its own."""
     h = jnp.asarray(motion.sample_time)[None] / steps
-    share, ahead = jnp.array([1.0 - GAMMA, GAMMA]), jnp.array([(1.0 - GAMMA) / GAMMA, 1.0])
+    share, ahead = (
+        jnp.array([1.0 - GAMMA, GAMMA]),
+        jnp.array([(1.0 - GAMMA) / GAMMA, 1.0]),
+    )
 
     def step(states: tuple[State, Array], commands: Array):
         before, last = states
         M = load = None
         if programs is not None:
-            M, load = lower(programs.bodies).dense(*middle_of(before.q, before.w, last, h))
+            M, load = lower(programs.bodies).dense(
+                *middle_of(before.q, before.w, last, h)
+            )
             M = None if programs.solve is None else M
         rest = jnp.zeros_like(last)
 
@@ -87,11 +96,14 @@ def _simulate(
             return moved(state, u, x, inputs, h), (state, u)
 
         after, stages = jax.lax.scan(stage, before, (commands, share, ahead))
-        # Results are computed once; otherwise XLA computes `load` and `M` again for each joint.
+        # Results are computed once; otherwise XLA computes `load` and `M` again for
+        # each joint.
         return (after, before.w), (*stages, after.q, load, M)
 
     start = State(*jnp.moveaxis(jnp.asarray(motion.start), 0, -1))
-    commands = jax.vmap(lambda x, y: commands_of_stages(x.T, y, steps, hold)[0], (-1, 0), -1)
+    commands = jax.vmap(
+        lambda x, y: commands_of_stages(x.T, y, steps, hold)[0], (-1, 0), -1
+    )
     commands = commands(theta, motion)
     of_joints, by_step = tuple(theta), commands.reshape(-1, 2, *commands.shape[1:])
     return Path(*jax.lax.scan(step, (start, start.w), by_step)[1])
@@ -143,13 +155,20 @@ def _within(
 
 @functools.partial(jax.jit, static_argnums=5)
 def _partials(
-    theta: Array, motion: ServoMotion, hold: AnyArray, path: Path, others: Array, steps: int
+    theta: Array,
+    motion: ServoMotion,
+    hold: AnyArray,
+    path: Path,
+    others: Array,
+    steps: int,
 ) -> Partials:
     """Return the derivatives of the balance of forces in all stages of one motion [stages, ...]."""
     terms = path.before, path.within, others
     state, u, others = jax.tree.map(lambda x: jnp.reshape(x, (-1, len(theta))), terms)
     stages, by_delay = Stages.of(theta, motion, steps, hold)
-    return partials(state, u, theta, stages, by_delay, motion.sample_time / steps, others)
+    return partials(
+        state, u, theta, stages, by_delay, motion.sample_time / steps, others
+    )
 
 
 class _BodyTerms(NamedTuple):
@@ -200,7 +219,9 @@ class CoupledSimulator:
         theta = np.asarray(theta).reshape(-1, *np.shape(theta)[-2:])
         theta = np.repeat(theta.T, self.motion.motions // len(theta), axis=-1)
         with double_precision():
-            found = _simulate(programs, self.steps, jnp.asarray(theta), motion, np.array(self.hold))
+            found = _simulate(
+                programs, self.steps, jnp.asarray(theta), motion, np.array(self.hold)
+            )
             return jax.tree.map(np.asarray, found)
 
     def positions(self, path: Path) -> Float[np.ndarray, "motions joints samples"]:
@@ -214,11 +235,17 @@ class CoupledSimulator:
     ) -> Float[np.ndarray, "motions joints samples unknowns"]:
         """Return derivatives of the positions.
 
-        They are those by the free parameters, joint by joint, and then by the motion's initial
-        states.
+        They are those by the free parameters, joint by joint, and then by the motion's
+        initial states.
         """
-        motions, n, samples = self.motion.motions, len(theta), self.motion.positions.shape[-1]
-        found = [self.transitions(k, np.asarray(theta), path, free) for k in range(motions)]
+        motions, n, samples = (
+            self.motion.motions,
+            len(theta),
+            self.motion.positions.shape[-1],
+        )
+        found = [
+            self.transitions(k, np.asarray(theta), path, free) for k in range(motions)
+        ]
         size = self.motion.start[0].size
         state = np.zeros((motions, size + n, free.sum() + size))
         state[:, :size, -size:] = np.eye(size)
@@ -226,9 +253,13 @@ class CoupledSimulator:
         state[:, size:] = state[:, n : 2 * n]
         S = np.zeros((motions, n, samples, state.shape[-1]))
         S[:, :, 0] = state[:, :n]
-        blocks = [slice(k, min(k + BLOCK, samples - 1)) for k in range(0, samples - 1, BLOCK)]
+        blocks = [
+            slice(k, min(k + BLOCK, samples - 1)) for k in range(0, samples - 1, BLOCK)
+        ]
         places = ((k, rows) for rows in blocks for k in range(motions))
-        parts = on_cores(lambda place: found[place[0]](place[1]), places, ahead=2 * motions)
+        parts = on_cores(
+            lambda place: found[place[0]](place[1]), places, ahead=2 * motions
+        )
         for rows in blocks:
             own = [next(parts) for _ in range(motions)]
             T, C = (np.stack(x, axis=1) for x in zip(*own, strict=True))
@@ -244,9 +275,13 @@ class CoupledSimulator:
     ) -> Callable[[slice], tuple[np.ndarray, np.ndarray]]:
         """Return a function of some samples: derivatives of the state behind each sample time.
 
-        By the state before, with the velocities a step before, and by the free parameters.
+        By the state before, with the velocities a step before, and by the free
+        parameters.
         """
-        part, own = self.motion.part(motion), jax.tree.map(lambda x: x[..., motion], path)
+        part, own = (
+            self.motion.part(motion),
+            jax.tree.map(lambda x: x[..., motion], path),
+        )
         part = dataclasses.replace(part, lengths=(), names=())
         steps, h = self.steps, float(part.sample_time) / self.steps
         slope = (own.before.w - own.within) / (GAMMA * h)
@@ -261,7 +296,9 @@ class CoupledSimulator:
         def by_sample(x) -> np.ndarray:
             return np.asarray(x).reshape(-1, steps, *np.shape(x)[1:])
 
-        local = jax.tree.map(lambda x: by_sample(x).reshape(-1, steps, 2, x.shape[-1]), found)
+        local = jax.tree.map(
+            lambda x: by_sample(x).reshape(-1, steps, 2, x.shape[-1]), found
+        )
         within, slope, size = by_sample(own.within), by_sample(slope), part.start.size
 
         def one(rows: slice):
@@ -272,7 +309,9 @@ class CoupledSimulator:
                 derivatives = evaluate(self.bodies.programs.derivatives, *inside)
                 derivatives = (by_sample(np.moveaxis(x, -1, 0)) for x in derivatives)
                 terms = _BodyTerms(by_sample(M)[rows], *derivatives)
-            return _compose(theta, some, within[rows], slope[rows], terms, free, h, size)
+            return _compose(
+                theta, some, within[rows], slope[rows], terms, free, h, size
+            )
 
         return one
 
@@ -325,7 +364,9 @@ def _compose(
         A = at.resistance[..., None] * np.eye(n)
         if terms is not None:
             at_step = _BodyTerms(*(x[:, k] for x in terms))
-            by_q, by_v, by_w = _derivatives_of_bodies(theta, at, at_step, slope[:, k, s], h)
+            by_q, by_v, by_w = _derivatives_of_bodies(
+                theta, at, at_step, slope[:, k, s], h
+            )
             A += by_w * (moves & moves.swapaxes(1, 2))
             force += by_w @ w + by_q @ middle[0] + by_v @ middle[1]
         change = np.linalg.solve(A, force * moves)
@@ -345,13 +386,15 @@ def _derivatives_of_bodies(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return derivatives of the balance of forces by other joints [samples, joints, joints].
 
-    By positions and velocities in the middle of the step, and by velocities before the stage, less
-    those by velocities in it.
+    By positions and velocities in the middle of the step, and by velocities before the
+    stage, less those by velocities in it.
     """
     a, diagonal = theta[:, INDEX["a"], None], np.eye(len(theta), dtype=bool)
     by_force, by_load = (np.asarray(x)[..., None] for x in (at.by_force, at.by_load))
     by_inertia = np.asarray(at.by_inertia)[..., None] / (GAMMA * h)
     by_matrix = a * np.where(diagonal, by_inertia, by_force * slope[:, None])
-    by_q = np.einsum("tijl,tij->til", terms.M_by_q, by_matrix) + by_load * terms.load_by_q
+    by_q = (
+        np.einsum("tijl,tij->til", terms.M_by_q, by_matrix) + by_load * terms.load_by_q
+    )
     by_w = a * by_force * terms.M * ~diagonal / (GAMMA * h)
     return by_q, by_load * terms.load_by_v, by_w

@@ -14,11 +14,13 @@ class Slip(NamedTuple):
 
     Attributes:
         free: Whether a joint moves at the end of the stage: 1 or 0.
-        direction: Mean sign of the velocity: -1 or 1, or between them if the joint turns around.
+        direction: Mean sign of the velocity: -1 or 1, or between them if the joint
+            turns around.
         by_force: Derivative of the balance by the force.
         by_friction: Derivative by the friction.
         by_w: Derivative by the velocity before the stage.
-        by_inertia: Derivative by the inertia, which is part of the resistance, without that of `u`.
+        by_inertia: Derivative by the inertia, which is part of the resistance, without
+            that of `u`.
         by_resistance: Derivative by the resistance alone, without that of `u`.
     """
 
@@ -42,15 +44,16 @@ class Slip(NamedTuple):
     ) -> "Slip":
         """Return how joints slip that a force acts on.
 
-        A joint that comes to rest stays there if the force is less than the friction. Otherwise the
-        force turns it around, and friction acts in both directions, in each for its part of the
-        time.
+        A joint that comes to rest stays there if the force is less than the friction.
+        Otherwise the force turns it around, and friction acts in both directions, in
+        each for its part of the time.
 
         Args:
             force: Force on the joint, without friction.
             inertia: Inertia over the time of the stage.
             friction: Dry friction.
-            resistance: Decrease of the force with the velocity in the stage, with that of inertia.
+            resistance: Decrease of the force with the velocity in the stage, with that
+                of inertia.
             w: Velocity before the stage.
             ahead: Change of the velocity behind the stage over that in it.
         """

@@ -22,7 +22,8 @@ class RolloutErrors:
         simulated: Simulated positions.
         command: Commanded positions.
         linear: Simulation by the linear baseline.
-        counted: Whether a sample counts: behind the first half second, and without contact.
+        counted: Whether a sample counts: behind the first half second, and without
+            contact.
         contacts: Stretches in which something outside the model holds the robot.
     """
 
@@ -55,13 +56,18 @@ class RolloutErrors:
         columns = [Column(name, rms[:, j]) for j, name in enumerate(self.joint_names)]
         remarks = [
             Remark(
-                f"{c.name}: {self.joint_names[c.joint]} is held by something from {c.start:.1f} s "
-                f"to {c.stop:.1f} s (error {1e3 * c.error:.0f} mrad): contact? It does not count",
+                f"{c.name}: {self.joint_names[c.joint]} is held by something from "
+                f"{c.start:.1f} s "
+                f"to {c.stop:.1f} s (error {1e3 * c.error:.0f} mrad): contact? It "
+                "does not count",
                 Status.DOUBTFUL,
             )
             for c in self.contacts
         ]
-        title = "errors of free-running simulations, behind the first half second [mrad or mm]"
+        title = (
+            "errors of free-running simulations, behind the first half second "
+            "[mrad or mm]"
+        )
         return Table(title, Column("motion", self.motions), *columns, remarks=remarks)
 
     def __str__(self) -> str:

@@ -1,8 +1,9 @@
 """Identification of joints behind position servos, from commands and positions alone.
 
-Each choice of effects (gravity, friction by load, Stribeck friction, saturation, inertial torques)
-is made by motions that the fit has not seen: leave one out among those given. Whether commands are
-held or interpolated is decided by the errors of two fits of all joints together.
+Each choice of effects (gravity, friction by load, Stribeck friction, saturation,
+inertial torques) is made by motions that the fit has not seen: leave one out among
+those given. Whether commands are held or interpolated is decided by the errors of two
+fits of all joints together.
 """
 
 import dataclasses
@@ -48,7 +49,12 @@ SHORTEST = 5.0
 """Shortest part into which a log is divided [s]."""
 LIGHT = 0.02
 """Load, relative to the most loaded joint's, below which a joint counts as unloaded."""
-_STARTS = [(J, B, d) for J in (2e-4, 2e-3, 1e-2) for B in (0.01, 0.04, 0.15) for d in (0.0, 0.02)]
+_STARTS = [
+    (J, B, d)
+    for J in (2e-4, 2e-3, 1e-2)
+    for B in (0.01, 0.04, 0.15)
+    for d in (0.0, 0.02)
+]
 """Inertia, damping and delay from which searches may start."""
 
 
@@ -65,30 +71,32 @@ def identify_rollout(
 ) -> ServoFit:
     """Identify position-controlled joints so that a simulation moves like the robot.
 
-    No torque is needed. The logs are recordings whose `forces` are the commanded positions:
-    `jid.Recording.of(positions, commands, sample_time=…)`, or
+    No torque is needed. The logs are recordings whose `forces` are the commanded
+    positions: `jid.Recording.of(positions, commands, sample_time=…)`, or
     `jid.Columns(angles="position{}", forces="command{}")`.
 
-    Positions tell torques in units of the servo's stiffness: the parameters are ratios to it. With
-    bodies of known weight the stiffness itself follows where gravity acts on the joint, unless it
-    is given.
+    Positions tell torques in units of the servo's stiffness: the parameters are ratios
+    to it. With bodies of known weight the stiffness itself follows where gravity acts
+    on the joint, unless it is given.
 
     Args:
         logs: One or several recordings of the same robot and controller.
-        bodies: Model and parameters of the robot's bodies, often from its URDF file: their weight
-            loads the joints, and their inertial torques if that lowers the held-out errors (or
-            `coupled` says so). Without them a joint has a constant bias.
+        bodies: Model and parameters of the robot's bodies, often from its URDF file:
+            their weight loads the joints, and their inertial torques if that lowers the
+            held-out errors (or `coupled` says so). Without them a joint has a constant
+            bias.
         joint_names: Names of the joints; those of the model, or numbers, if None.
         time_step: Longest step of the simulation [s].
         saturation: Whether a largest torque of the servo is tried.
         friction: Whether friction that grows with load or falls with speed is tried.
-        integral: Whether integral action of the servos (PID instead of PD controllers) is tried.
-        stiffness: Known proportional gains of the servos, one for all or one for each joint, NaN
-            where unknown [N m/rad or N/m].
+        integral: Whether integral action of the servos (PID instead of PD controllers)
+            is tried.
+        stiffness: Known proportional gains of the servos, one for all or one for each
+            joint, NaN where unknown [N m/rad or N/m].
 
     Raises:
-        InputError: If logs differ in their joints, are too short, or do not move, or if the
-            stiffness does not fit the joints.
+        InputError: If logs differ in their joints, are too short, or do not move, or if
+            the stiffness does not fit the joints.
     """
     logs = [logs] if isinstance(logs, Recording) else list(logs)
     motion = ServoMotion.of(_divided(logs)).known()
@@ -126,14 +134,19 @@ def identify_rollout(
 def _divided(logs: Sequence[Recording]) -> list[Recording]:
     """Return logs, the long ones divided.
 
-    There are enough parts for the choice, and none is much longer than the others, to whose length
-    all are padded.
+    There are enough parts for the choice, and none is much longer than the others, to
+    whose length all are padded.
     """
-    usual, found = max(float(np.median([x.duration for x in logs])), FOLDS * SHORTEST), []
+    usual, found = (
+        max(float(np.median([x.duration for x in logs])), FOLDS * SHORTEST),
+        [],
+    )
     for log in logs:
         wanted = max(-(-FOLDS // len(logs)), round(log.duration / usual))
         parts = max(1, min(wanted, int(log.duration // SHORTEST)))
-        ends = np.linspace(float(log.time[0]), float(log.time[-1]) + log.sample_time, parts + 1)
+        ends = np.linspace(
+            float(log.time[0]), float(log.time[-1]) + log.sample_time, parts + 1
+        )
         found += [log.crop(float(a), float(b)) for a, b in itertools.pairwise(ends)]
     return found
 
@@ -144,7 +157,8 @@ def _require_motion(motion: ServoMotion) -> None:
         if still.any():
             joint = int(np.argmax(still)) + 1
             raise InputError(
-                f"`logs`: the {channel} of joint {joint} change by less than 1 mrad or 1 mm. "
+                f"`logs`: the {channel} of joint {joint} change by less than 1 mrad "
+                "or 1 mm. "
                 "Leave the joint out, or give logs in which it moves."
             )
 
@@ -158,19 +172,27 @@ def _joint_names(
     names = tuple(names or (f"joint {k + 1}" for k in range(count)))
     if len(names) != count:
         raise InputError(
-            f"`logs` have {count} joints, but the robot has {len(names)}: choose the columns of "
+            f"`logs` have {count} joints, but the robot has {len(names)}: choose the "
+            "columns of "
             "its joints, or the `tip` of the robot."
         )
     return names
 
 
-def _known_stiffness(stiffness: Numbers | None, joints: int) -> Float[np.ndarray, " joints"] | None:
+def _known_stiffness(
+    stiffness: Numbers | None, joints: int
+) -> Float[np.ndarray, " joints"] | None:
     if stiffness is None:
         return None
     given = np.asarray(stiffness, np.float64)
-    if given.shape not in ((), (joints,)) or (given <= 0.0).any() or np.isinf(given).any():
+    if (
+        given.shape not in ((), (joints,))
+        or (given <= 0.0).any()
+        or np.isinf(given).any()
+    ):
         raise InputError(
-            f"`stiffness` must be a positive number [N m/rad or N/m], or {joints} of them, one for "
+            f"`stiffness` must be a positive number [N m/rad or N/m], or {joints} of "
+            "them, one for "
             "each joint."
         )
     return np.broadcast_to(given, (joints,)).copy()
@@ -203,14 +225,18 @@ class _Search:
         linear: Parameters of the linear baseline.
     """
 
-    def __init__(self, simulator: ServoSimulator, integral: bool, stiffness: np.ndarray | None):
+    def __init__(
+        self, simulator: ServoSimulator, integral: bool, stiffness: np.ndarray | None
+    ):
         counted = np.asarray(simulator.motion.counted).sum(axis=-1)
         self.weights = 1.0 / np.maximum(counted, 1.0)
         joints = counted.shape[1]
         self.x = np.tile(START, (joints, 1))
         self.free = np.tile(mask(BASIC), (joints, 1))
         self.linear = self.x.copy()
-        self.known = np.zeros(joints, bool) if stiffness is None else np.isfinite(stiffness)
+        self.known = (
+            np.zeros(joints, bool) if stiffness is None else np.isfinite(stiffness)
+        )
         if stiffness is not None:
             self.x[self.known, INDEX["a"]] = 1.0 / stiffness[self.known]
         motion = simulator.motion
@@ -218,7 +244,9 @@ class _Search:
             motion = with_integral(motion, self.x, False)
         self.simulator = dataclasses.replace(simulator, motion=motion)
 
-    def run(self, loaded: bool, friction: bool, saturation: bool, integral: bool) -> None:
+    def run(
+        self, loaded: bool, friction: bool, saturation: bool, integral: bool
+    ) -> None:
         """Choose the effects of all joints.
 
         Args:
@@ -245,7 +273,11 @@ class _Search:
                 self.remove_contact()
 
     def solve(
-        self, x: np.ndarray, free: np.ndarray, iterations: int = 12, damping: float = 1e-2
+        self,
+        x: np.ndarray,
+        free: np.ndarray,
+        iterations: int = 12,
+        damping: float = 1e-2,
     ) -> Solution:
         """Fit candidates [candidates, joints, parameters] to all motions."""
         w = self.weights[:, None, :]
@@ -257,7 +289,9 @@ class _Search:
         def costs(x, k):
             return (w * self.simulator.costs(x)).sum(axis=0)
 
-        return minimise(moments, costs, x, free, (LOWER, UPPER), iterations, damping=damping)
+        return minimise(
+            moments, costs, x, free, (LOWER, UPPER), iterations, damping=damping
+        )
 
     def held_out(self, found: Solution, free: np.ndarray) -> np.ndarray:
         """Return logarithms of the mean square errors of motions left out, one at a time.
@@ -269,9 +303,14 @@ class _Search:
         """
         w = self.weights[:, None, :]
         _, g, H = self.simulator.moments(found.x)
-        left = found.gradient - w[..., None] * g, found.information - w[..., None, None] * H
+        left = (
+            found.gradient - w[..., None] * g,
+            found.information - w[..., None, None] * H,
+        )
         x = np.broadcast_to(found.x, g.shape)
-        step = bounded_step(*left, x, np.broadcast_to(free, x.shape), (LOWER, UPPER), 1e-3)
+        step = bounded_step(
+            *left, x, np.broadcast_to(free, x.shape), (LOWER, UPPER), 1e-3
+        )
         errors = self.simulator.costs(np.clip(x + step, LOWER, UPPER), each=True)
         return self._scores(errors)
 
@@ -279,7 +318,9 @@ class _Search:
         """Return logarithms of mean square errors, of sums [motions, candidates, joints]."""
         counted = np.asarray(self.simulator.motion.counted).sum(axis=-1)
         mean = squares / np.maximum(counted, 1.0)[:, None]
-        scores = np.log(np.minimum(np.nan_to_num(mean, nan=LARGEST), LARGEST) + RESOLUTION**2)
+        scores = np.log(
+            np.minimum(np.nan_to_num(mean, nan=LARGEST), LARGEST) + RESOLUTION**2
+        )
         return np.where((counted > 0)[:, None], scores, np.nan)
 
     def start(self) -> None:
@@ -288,7 +329,9 @@ class _Search:
         grid[..., [INDEX[k] for k in ("J", "B", "d")]] = np.array(_STARTS)[:, None]
         costs = (self.weights[:, None] * self.simulator.costs(grid)).sum(axis=0)
         best = np.argsort(costs, axis=0)[:3]
-        x = np.concatenate([np.take_along_axis(grid, best[..., None], axis=0), self.linear[None]])
+        x = np.concatenate(
+            [np.take_along_axis(grid, best[..., None], axis=0), self.linear[None]]
+        )
         x[3] = x[0]
         x[3][:, mask(("F", "a", "ki"))] = 0.0
         free = np.stack([self.free] * 3 + [np.tile(mask(LINEAR), (len(self.x), 1))])
@@ -302,12 +345,16 @@ class _Search:
 
         Damping counts up to the ratio `DAMPED`.
 
-        An oscillation that an initial state excites may imitate the rounding of an encoder.
+        An oscillation that an initial state excites may imitate the rounding of an
+        encoder.
         """
         best, scores = np.argmin(cost, axis=0), self._scores(self.simulator.costs(x))
         ratio = 0.5 * x[..., INDEX["B"]] / np.sqrt(x[..., INDEX["J"]])
         calm = np.lexsort((cost, -np.minimum(ratio, DAMPED)), axis=0)[0]
-        one, other = (np.take_along_axis(scores, k[None, None], axis=1)[:, 0] for k in (best, calm))
+        one, other = (
+            np.take_along_axis(scores, k[None, None], axis=1)[:, 0]
+            for k in (best, calm)
+        )
         return np.where(_lower(one, other), best, calm)
 
     def _take(self, x: np.ndarray, chosen: np.ndarray) -> None:
@@ -315,7 +362,9 @@ class _Search:
 
     def _weigh(self, x: np.ndarray) -> None:
         """Weigh motions by their own errors."""
-        self.weights = weights_of(self.simulator.motion, self.simulator.costs(x[None])[:, 0])
+        self.weights = weights_of(
+            self.simulator.motion, self.simulator.costs(x[None])[:, 0]
+        )
 
     def remove_contact(self) -> None:
         """Leave out the samples in which a joint is held by something that is not in the model."""
@@ -352,7 +401,8 @@ class _Search:
         chosen = np.zeros(len(self.x), int)
         for k in range(1, len(group)):
             current = np.take_along_axis(scores, chosen[None, None], axis=1)[:, 0]
-            # Effects that have been found stay: a known weight is not replaced by a bias.
+            # Effects that have been found stay: a known weight is not replaced by a
+            # bias.
             larger = np.array([set(group[c]) <= set(group[k]) for c in chosen])
             chosen = np.where(larger & _lower(scores[:, k], current), k, chosen)
         self._take(found.x, chosen)

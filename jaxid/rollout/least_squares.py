@@ -46,8 +46,9 @@ def minimise(
 ) -> Solution:
     """Minimise sums of squares over the free parameters, each problem with its own damping.
 
-    A parameter at a bound that its gradient would leave is held there for one step. Problems of one
-    index along the first axis are left alone as soon as each of them has converged once.
+    A parameter at a bound that its gradient would leave is held there for one step.
+    Problems of one index along the first axis are left alone as soon as each of them
+    has converged once.
 
     Args:
         moments: Costs and their derivatives at parameters of all problems.
@@ -57,7 +58,8 @@ def minimise(
         bounds: Lower and upper limits of the parameters.
         iterations: Largest number of steps.
         tolerance: Relative decrease of the cost below which a problem has converged.
-        damping: Damping of the first step, relative to the diagonal of the Gauss-Newton matrix.
+        damping: Damping of the first step, relative to the diagonal of the Gauss-Newton
+            matrix.
     """
     x = np.clip(x, *bounds)
     dampings, left = np.full(x.shape[:-1], damping), np.arange(len(x))
@@ -65,7 +67,9 @@ def minimise(
     cost, g, H = moments(x, left)
     for _ in range(iterations):
         own = [y[left] for y in (x, cost, g, H, free, dampings)]
-        x[left], dampings[left], converged = improve(costs, left, own, bounds, tolerance)
+        x[left], dampings[left], converged = improve(
+            costs, left, own, bounds, tolerance
+        )
         cost[left], g[left], H[left] = moments(x[left], left)
         done[left] |= converged
         left = left[~done[left].reshape(len(left), -1).all(axis=1)]
@@ -102,11 +106,13 @@ def bounded_step(
 ) -> np.ndarray:
     """Return damped Gauss-Newton steps of the free parameters within their bounds.
 
-    A parameter that would leave its bounds goes to them, and the others follow. Where derivatives
-    have overflowed, the step is zero.
+    A parameter that would leave its bounds goes to them, and the others follow. Where
+    derivatives have overflowed, the step is zero.
     """
     low, high = bounds
-    known = np.isfinite(information).all(axis=(-1, -2)) & np.isfinite(gradient).all(axis=-1)
+    known = np.isfinite(information).all(axis=(-1, -2)) & np.isfinite(gradient).all(
+        axis=-1
+    )
     known = np.asarray(known)
     information = np.where(known[..., None, None], information, 0.0)
     gradient = np.where(known[..., None], gradient, 0.0)
@@ -114,7 +120,10 @@ def bounded_step(
     scaled = information / size[..., None] / size[..., None, :]
     identity, more = np.eye(x.shape[-1]), np.asarray(damping)[..., None, None] + 1e-12
     held = ((x <= low) & (gradient > 0)) | ((x >= high) & (gradient < 0))
-    moving, step = (free & ~held & (size > 1e-140)).astype(float), np.zeros_like(gradient)
+    moving, step = (
+        (free & ~held & (size > 1e-140)).astype(float),
+        np.zeros_like(gradient),
+    )
     for _ in range(HELD):
         A = scaled * moving[..., None] * moving[..., None, :]
         A = A + identity * (more + (1.0 - moving)[..., None])
@@ -124,6 +133,8 @@ def bounded_step(
         leaves = (moving > 0) & ((x + step < low) | (x + step > high))
         if not leaves.any():
             break
-        step = np.where(leaves, np.clip(x + step, low, high) - x, np.where(moving > 0, 0.0, step))
+        step = np.where(
+            leaves, np.clip(x + step, low, high) - x, np.where(moving > 0, 0.0, step)
+        )
         moving = np.where(leaves, 0.0, moving)
     return step

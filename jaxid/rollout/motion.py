@@ -31,9 +31,11 @@ class ServoMotion(eqx.Module):
     Attributes:
         commands: Commanded positions, which begin before the samples.
         positions: Measured positions [motions, joints, samples].
-        load: Torques of the bodies between a sample, or step, and the next one [N m or N].
+        load: Torques of the bodies between a sample, or step, and the next one [N m or
+            N].
         inertia: Inertia of the bodies about each joint [kg m² or kg].
-        start: Initial positions and velocities, and integral actions of servos that have them.
+        start: Initial positions and velocities, and integral actions of servos that
+            have them.
         spread: Standard deviations of the initial states.
         acceleration: Initial accelerations.
         counted: Whether a sample counts in the fit.
@@ -61,10 +63,13 @@ class ServoMotion(eqx.Module):
         """Return the segments of logs whose `forces` are the commands.
 
         Raises:
-            InputError: If logs have different joints, or no segment lasts longer than a second.
+            InputError: If logs have different joints, or no segment lasts longer than a
+                second.
         """
         if len({log.joints for log in logs}) != 1:
-            raise InputError("`logs` must hold at least one log, and all with the same joints.")
+            raise InputError(
+                "`logs` must hold at least one log, and all with the same joints."
+            )
         parts = [
             (log, a, b)
             for log in logs
@@ -81,7 +86,10 @@ class ServoMotion(eqx.Module):
             filled = [np.pad(x, ((0, padded - len(x)), (0, 0)), "edge").T for x in rows]
             return np.stack(filled)
 
-        positions, times = stacked("angles"), np.array([log.sample_time for log, _, _ in parts])
+        positions, times = (
+            stacked("angles"),
+            np.array([log.sample_time for log, _, _ in parts]),
+        )
         index = np.arange(padded)
         first = np.ceil(SETTLING / times)[:, None]
         counted = (index >= first) & (index < np.array(lengths)[:, None])
@@ -100,7 +108,9 @@ class ServoMotion(eqx.Module):
             start=start,
             spread=spread,
             acceleration=acceleration,
-            counted=np.repeat(counted[:, None].astype(float), positions.shape[1], axis=1),
+            counted=np.repeat(
+                counted[:, None].astype(float), positions.shape[1], axis=1
+            ),
             sample_time=times,
             begin=np.array([float(log.time[a]) for log, a, _ in parts]),
             lengths=lengths,
@@ -138,13 +148,18 @@ class ServoMotion(eqx.Module):
         They begin with the states of the smoothed positions.
         """
         size = max(3, round(horizon / float(self.sample_time.mean())))
-        places = [(k, a) for k, n in enumerate(self.lengths) for a in range(0, n - size + 1, size)]
+        places = [
+            (k, a)
+            for k, n in enumerate(self.lengths)
+            for a in range(0, n - size + 1, size)
+        ]
         return self._from(places, size).replace(lengths=(size,) * len(places))
 
     def known(self) -> "ServoMotion":
         """Return the motions where commands are known, whatever the delay.
 
-        They begin later; at their ends samples do not count that late positions might decide.
+        They begin later; at their ends samples do not count that late positions might
+        decide.
         """
         samples, times = self.positions.shape[-1], np.asarray(self.sample_time)
         first = math.ceil(HISTORY / times.min())
@@ -159,13 +174,20 @@ class ServoMotion(eqx.Module):
 
         def cut(x: AnyArray, more: int = 0) -> np.ndarray:
             rows = (np.asarray(x)[k, :, a : a + more + size] for k, a in places)
-            filled = (np.pad(y, ((0, 0), (0, more + size - y.shape[1])), "edge") for y in rows)
+            filled = (
+                np.pad(y, ((0, 0), (0, more + size - y.shape[1])), "edge") for y in rows
+            )
             return np.stack(list(filled))
 
-        arrays = {x: cut(getattr(self, x)) for x in ("positions", "load", "inertia", "counted")}
+        arrays = {
+            x: cut(getattr(self, x))
+            for x in ("positions", "load", "inertia", "counted")
+        }
         states = [
             state_at(np.asarray(self.positions[k])[:, : self.lengths[k]], a, float(dt))
-            for (k, a), dt in zip(places, self.sample_time[[k for k, _ in places]], strict=True)
+            for (k, a), dt in zip(
+                places, self.sample_time[[k for k, _ in places]], strict=True
+            )
         ]
         start, spread, acceleration = (np.stack(x) for x in zip(*states, strict=True))
         index, first = np.array(places).T
@@ -197,8 +219,8 @@ def state_at(
 ) -> tuple[Float[np.ndarray, "2 joints"], Float[np.ndarray, "2 joints"], np.ndarray]:
     """Return positions and velocities at a sample, their deviations, and accelerations.
 
-    They are those of a parabola through the samples around it. At the start the velocity is that
-    of a line, and the position the measured one.
+    They are those of a parabola through the samples around it. At the start the
+    velocity is that of a line, and the position the measured one.
     """
     near = max(2, round(NEAR / dt))
     first, last = max(0, index - near), min(q.shape[1], index + near + 1)
@@ -214,7 +236,9 @@ def state_at(
     return state, spread, 2.0 * found[2] if inside else 0.0 * rate
 
 
-def smooth_rates(q: np.ndarray, dt: float, cutoff: float = 8.0) -> tuple[np.ndarray, ...]:
+def smooth_rates(
+    q: np.ndarray, dt: float, cutoff: float = 8.0
+) -> tuple[np.ndarray, ...]:
     """Return positions below a frequency [Hz] with their first and second derivatives."""
     from scipy.signal import butter, sosfiltfilt
 

@@ -25,16 +25,22 @@ ROUNDS = 25
 """Largest number of steps of the refinement."""
 
 
-def mean_squares(motion: ServoMotion, sums: np.ndarray) -> Float[np.ndarray, "motions joints"]:
+def mean_squares(
+    motion: ServoMotion, sums: np.ndarray
+) -> Float[np.ndarray, "motions joints"]:
     """Return mean square errors from sums over the samples that count; zero without any."""
     return sums / np.maximum(np.asarray(motion.counted).sum(axis=-1), 1.0)
 
 
-def weights_of(motion: ServoMotion, sums: np.ndarray) -> Float[np.ndarray, "motions joints"]:
+def weights_of(
+    motion: ServoMotion, sums: np.ndarray
+) -> Float[np.ndarray, "motions joints"]:
     """Weigh motions by their own errors, so that the worst one does not decide alone."""
     counted = np.asarray(motion.counted).sum(axis=-1)
     mean = mean_squares(motion, sums)
-    return np.where(counted > 0, 1.0 / (mean + RESOLUTION**2), 0.0) / np.maximum(counted, 1.0)
+    return np.where(counted > 0, 1.0 / (mean + RESOLUTION**2), 0.0) / np.maximum(
+        counted, 1.0
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,7 +50,8 @@ class Refinement:
     Attributes:
         simulator: Motions, with their initial states.
         parameters: Parameters of each joint.
-        free: Parameters that are estimated; the unknowns are these, then the initial states.
+        free: Parameters that are estimated; the unknowns are these, then the initial
+            states.
         path: Simulation of all motions.
     """
 
@@ -62,7 +69,9 @@ class Refinement:
     ) -> "Refinement":
         """Return simulated joints."""
         empty = np.zeros(0)
-        found = cls(simulator, parameters, free, Path(State(empty, empty), empty, empty))
+        found = cls(
+            simulator, parameters, free, Path(State(empty, empty), empty, empty)
+        )
         return found.with_unknowns([found.unknowns])[0]
 
     @property
@@ -81,9 +90,14 @@ class Refinement:
             theta[k, self.free] = z[:count]
             motions.append(motion.replace(start=z[count:].reshape(motion.start.shape)))
         spare = [motion] * (len(DAMPINGS) - len(motions))
-        every = every.replace(start=np.concatenate([x.start for x in (*motions, *spare)]))
+        every = every.replace(
+            start=np.concatenate([x.start for x in (*motions, *spare)])
+        )
         path = dataclasses.replace(self.simulator, motion=every).simulate(theta)
-        parts = [slice(k * motion.motions, (k + 1) * motion.motions) for k in range(len(motions))]
+        parts = [
+            slice(k * motion.motions, (k + 1) * motion.motions)
+            for k in range(len(motions))
+        ]
         return [
             Refinement(
                 dataclasses.replace(self.simulator, motion=own),
@@ -124,12 +138,16 @@ class Refinement:
     @cached_property
     def products(self) -> tuple[np.ndarray, np.ndarray]:
         """Sensitivities times residuals, and times themselves, of each motion and joint."""
-        # NumPy's matrix products wait long for cores that other programs use; those of JAX do not.
+        # NumPy's matrix products wait long for cores that other programs use; those of
+        # JAX do not.
         with double_precision():
             found = [
-                _products(S, r) for S, r in zip(self.sensitivities, self.residuals, strict=True)
+                _products(S, r)
+                for S, r in zip(self.sensitivities, self.residuals, strict=True)
             ]
-        g, H = (np.stack([np.asarray(x) for x in rows]) for rows in zip(*found, strict=True))
+        g, H = (
+            np.stack([np.asarray(x) for x in rows]) for rows in zip(*found, strict=True)
+        )
         return g, H
 
     def moments(self, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -137,7 +155,9 @@ class Refinement:
         count, each = int(self.free.sum()), self.simulator.motion.start[0].size
         size = count + len(weights) * each
         g, H = np.zeros(size), np.zeros((size, size))
-        for k, (w, own_g, own_H) in enumerate(zip(weights, *self.products, strict=True)):
+        for k, (w, own_g, own_H) in enumerate(
+            zip(weights, *self.products, strict=True)
+        ):
             own = np.r_[:count, count + k * each : count + (k + 1) * each]
             g[own] += w @ own_g
             H[np.ix_(own, own)] += np.tensordot(w, own_H, 1)
@@ -149,7 +169,9 @@ def _products(S: Array, r: Array) -> tuple[Array, Array]:
     return jnp.einsum("jtu,jt->ju", S, r), jnp.einsum("jtu,jtv->juv", S, S)
 
 
-def prepare(simulator: CoupledSimulator, parameters: np.ndarray, free: np.ndarray) -> None:
+def prepare(
+    simulator: CoupledSimulator, parameters: np.ndarray, free: np.ndarray
+) -> None:
     """Compile what the refinement of motions of this length needs."""
     found = Refinement.of(simulator, parameters, free)
     simulator.transitions(0, parameters, found.path, free)
@@ -186,7 +208,8 @@ def _descend(best: Refinement, fall: float) -> Refinement:
 
     Args:
         best: Start.
-        fall: Fall of the score, promised or found in a step, for which the search goes on.
+        fall: Fall of the score, promised or found in a step, for which the search goes
+            on.
     """
     motion, first, rows = best.simulator.motion, best.unknowns, np.nonzero(best.free)[1]
     count, wide = len(rows), np.full(len(first) - len(rows), np.inf)
@@ -197,7 +220,9 @@ def _descend(best: Refinement, fall: float) -> Refinement:
         weights, z = weights_of(motion, best.sums), best.unknowns
 
         def cost(found: Refinement, weights=weights) -> float:
-            squares = np.sum(weights * found.sums) + prior @ (found.unknowns - first) ** 2
+            squares = (
+                np.sum(weights * found.sums) + prior @ (found.unknowns - first) ** 2
+            )
             return float(squares) / weights.size
 
         g, H = best.moments(weights)

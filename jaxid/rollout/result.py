@@ -11,7 +11,14 @@ from scipy import special, stats
 from jaxid.arrays import AnyArray, Bool, Float
 from jaxid.identification.uncertainty.spectral import sandwich_of_columns
 from jaxid.measurement.recording import Recording
-from jaxid.result_table import Column, Remark, Status, Table, significant, with_deviations
+from jaxid.result_table import (
+    Column,
+    Remark,
+    Status,
+    Table,
+    significant,
+    with_deviations,
+)
 
 from .bodies import Bodies
 from .contact import Contact, contact_rows, contacts, sustained_errors, typical_errors
@@ -55,7 +62,9 @@ class Combination(NamedTuple):
 
     def interval(self, level: float = 0.95) -> tuple[float, float]:
         """Return the confidence interval."""
-        half = self.deviation * float(special.stdtrit(max(self.dof, 1.0), 0.5 + 0.5 * level))
+        half = self.deviation * float(
+            special.stdtrit(max(self.dof, 1.0), 0.5 + 0.5 * level)
+        )
         return self.value - half, self.value + half
 
 
@@ -81,7 +90,8 @@ class ServoFit:
         load: Mean absolute load of each joint in the logs [N m or N].
         notes: Doubts about the model, in sentences.
         hold_is_told: Whether the logs tell held commands from interpolated ones.
-        given_stiffness: Stiffness of each servo as far as it was given, else NaN [N m/rad or N/m].
+        given_stiffness: Stiffness of each servo as far as it was given, else NaN [N
+            m/rad or N/m].
     """
 
     joint_names: tuple[str, ...]
@@ -125,7 +135,8 @@ class ServoFit:
                 lacking.append(f"{name} {1e3 * rms:.2g}")
         notes = [
             f"{joint_names[j]}: {PARAMETERS[k].meaning} is at the limit of the search, "
-            f"{found.parameters[j, k]:.3g}: check signs, units and offsets of the commands"
+            f"{found.parameters[j, k]:.3g}: check signs, units and offsets of the "
+            "commands"
             for j, k in np.argwhere(found.free)
             # An integral gain of zero is none.
             if k in LIMITED and found.parameters[j, k] in (UPPER[k], LOWER[k])
@@ -133,7 +144,8 @@ class ServoFit:
         ]
         missing = (
             f"errors are larger than an encoder's rounding and change slowly "
-            f"({', '.join(lacking)} mrad or mm RMS): an effect is missing, such as other friction, "
+            f"({', '.join(lacking)} mrad or mm RMS): an effect is missing, such as "
+            "other friction, "
             f"play, elasticity{'' if found.free[:, INDEX['ki']].any() else ', integral action'} or "
             "load, and the parameters are those that imitate it best"
         )
@@ -177,7 +189,10 @@ class ServoFit:
         said = "held until the next one" if self.hold else "interpolated"
         if self.hold_is_told:
             return said
-        return f"{said}; if held, delays are half a sample time shorter: the logs do not tell"
+        return (
+            f"{said}; if held, delays are half a sample time shorter: the logs do "
+            "not tell"
+        )
 
     def _unit(self, c: Combination) -> str:
         """Return the unit of a parameter of a revolute or linear joint."""
@@ -202,7 +217,9 @@ class ServoFit:
         paths = self.paths(motion)
         return [path[:, :n].T for path, n in zip(paths, motion.lengths, strict=True)]
 
-    def paths(self, motion: ServoMotion, parameters: AnyArray | None = None) -> np.ndarray:
+    def paths(
+        self, motion: ServoMotion, parameters: AnyArray | None = None
+    ) -> np.ndarray:
         """Return simulated positions [motions, joints, samples], with loads at these positions."""
         x = np.asarray(self.parameters if parameters is None else parameters)
         if x[:, INDEX["ki"]].any():
@@ -224,7 +241,9 @@ class ServoFit:
         touched = contact_rows(motion, errors, self.typical)
         parts = range(motion.motions)
         lengths = motion.lengths
-        times = motion.begin[:, None] + np.outer(motion.sample_time, np.arange(max(lengths)))
+        times = motion.begin[:, None] + np.outer(
+            motion.sample_time, np.arange(max(lengths))
+        )
 
         def cut(x: AnyArray) -> tuple[np.ndarray, ...]:
             return tuple(np.asarray(x[k])[..., : lengths[k]] for k in parts)
@@ -250,11 +269,15 @@ class ServoFit:
             logs: Recordings whose `forces` are the commands.
             horizon: Length of the windows [s].
         """
-        windows = ServoMotion.of([logs] if isinstance(logs, Recording) else logs).windows(horizon)
+        windows = ServoMotion.of(
+            [logs] if isinstance(logs, Recording) else logs
+        ).windows(horizon)
         errors = self.paths(windows) - np.asarray(windows.positions)
         return np.sqrt(np.mean(errors**2, axis=(0, 2)))
 
-    def samples(self, count: int, seed: int = 0) -> Float[np.ndarray, "count joints parameters"]:
+    def samples(
+        self, count: int, seed: int = 0
+    ) -> Float[np.ndarray, "count joints parameters"]:
         """Return parameters drawn from their t distributions, within their limits.
 
         Args:
@@ -267,17 +290,23 @@ class ServoFit:
         size, vectors = np.linalg.eigh(self.covariance / deviation / deviation[:, None])
         root = vectors * np.sqrt(np.maximum(size, 0.0))
         normal = np.clip(random.normal(size=(count, len(root))) @ root.T, -7.0, 7.0)
-        draws[:, self.free] += deviation * special.stdtrit(self.dof, special.ndtr(normal))
+        draws[:, self.free] += deviation * special.stdtrit(
+            self.dof, special.ndtr(normal)
+        )
         return np.clip(draws, LOWER, UPPER)
 
     def summary(self) -> Table:
         """Return a table of what the logs determine, with 95 % intervals."""
         rows = self.combinations
-        values, deviations = with_deviations([c.value for c in rows], [c.deviation for c in rows])
+        values, deviations = with_deviations(
+            [c.value for c in rows], [c.deviation for c in rows]
+        )
         ends = np.array([c.interval() for c in rows]).reshape(-1, 2)
         low, high = (with_deviations(x, [c.deviation for c in rows])[0] for x in ends.T)
         size = np.array([abs(c.value) for c in rows])
-        clear = np.array([c.deviation for c in rows]) < UNDETERMINED * np.maximum(size, 1e-12)
+        clear = np.array([c.deviation for c in rows]) < UNDETERMINED * np.maximum(
+            size, 1e-12
+        )
         first = [k for k in range(1, len(rows)) if rows[k].joint != rows[k - 1].joint]
         K = ", ".join(
             f"{name} {significant(k)}"
@@ -288,14 +317,17 @@ class ServoFit:
             ("logs", ", ".join(dict.fromkeys(self.motions))),
             (
                 "errors",
-                "  ".join(significant(1e3 * x) for x in np.sqrt((self.rms**2).mean(axis=0)))
+                "  ".join(
+                    significant(1e3 * x) for x in np.sqrt((self.rms**2).mean(axis=0))
+                )
                 + "  mrad or mm RMS",
             ),
             ("commands", self._commands),
             ("stiffness", K or "not determined: all parameters are ratios to it"),
         ]
         remarks: list[Remark | str] = [
-            "positions determine inertias, friction, load and motor gain only in their ratios to "
+            "positions determine inertias, friction, load and motor gain only in "
+            "their ratios to "
             "the stiffness",
             *(Remark(note, Status.DOUBTFUL) for note in self.notes),
             *(
@@ -333,7 +365,8 @@ class _Rows(NamedTuple):
     Attributes:
         found: Refinement.
         weights: Weight of each motion's squared errors [motions, joints].
-        imitated: Initial states that imitate each parameter [motions, states, parameters].
+        imitated: Initial states that imitate each parameter [motions, states,
+            parameters].
         scores: Sensitivities times residuals [motions, parameters].
         information: Gauss-Newton matrix.
     """
@@ -351,7 +384,9 @@ class _Rows(NamedTuple):
         size, scores, imitated = found.simulator.motion.start[0].size, [], []
         information = np.zeros((int(found.free.sum()),) * 2)
         certainties = found.simulator.motion.certainty
-        for w, g, H, certainty in zip(weights, *found.products, certainties, strict=True):
+        for w, g, H, certainty in zip(
+            weights, *found.products, certainties, strict=True
+        ):
             own_g, own_H = w @ g, np.tensordot(w, H, 1)
             known = own_H[-size:, -size:] + np.diag(certainty.ravel())
             imitated.append(np.linalg.solve(known, own_H[-size:, :-size]))
@@ -368,11 +403,13 @@ class _Rows(NamedTuple):
             found += list(np.swapaxes(own - by_start @ start, 1, 2))
         return found
 
-    def covariance(self, columns: list, own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def covariance(
+        self, columns: list, own: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Return covariance and degrees of freedom if only some parameters are unknown.
 
-        The spectral sandwich, at least that of independent errors; where motions differ more than
-        it explains, their scatter.
+        The spectral sandwich, at least that of independent errors; where motions differ
+        more than it explains, their scatter.
         """
         motion, (motions, joints) = self.found.simulator.motion, self.weights.shape
         B, place = np.zeros_like(self.information), np.ix_(own, own)
@@ -389,7 +426,8 @@ class _Rows(NamedTuple):
             float(motion.sample_time.mean()),
         )
         variance, dof = (x[0] for x in found)
-        # The sandwich is blind where no error can show: there the information alone tells.
+        # The sandwich is blind where no error can show: there the information alone
+        # tells.
         samples = np.asarray(motion.counted).sum(axis=-1).max()
         variance = np.maximum(variance, np.diag(B) / max(float(samples), 1.0))
         size = np.sqrt(np.maximum(np.diag(B), 1e-300))
@@ -415,7 +453,8 @@ def systematic_error(r: np.ndarray, kept: np.ndarray, q: np.ndarray) -> float:
     neighbours = float(np.mean((r[:, 1:] * r[:, :-1])[both])) / rms**2
     steps = np.abs(np.diff(q, axis=-1)).ravel()
     steps = steps[steps > 1e-6]
-    # Most steps of a slow joint are the smallest one; interpolated logs have smaller ones, too.
+    # Most steps of a slow joint are the smallest one; interpolated logs have smaller
+    # ones, too.
     rounding = float(np.quantile(steps, 0.1)) / np.sqrt(12.0) if steps.size else 0.0
     return 0.0 if rms < SYSTEMATIC * rounding or neighbours < 0.5 else rms
 
@@ -438,7 +477,8 @@ def _determined(
     size = np.maximum(np.abs(x), 0.1 * SCALE[symbols])
     wider = special.stdtrit(every_dof, 0.975) / special.ndtri(0.975) / size
     own, kappa = _merge(
-        covariance * np.outer(wider, wider), np.maximum(np.abs(x), SCALE[symbols]) / size
+        covariance * np.outer(wider, wider),
+        np.maximum(np.abs(x), SCALE[symbols]) / size,
     )
     kappa = kappa * size[own][:, None] / size[None, :]
     reduced, dof = rows.covariance(columns, own)
@@ -470,8 +510,9 @@ def _merge(covariance: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, np.nd
         covariance: Covariance of the relative parameters.
         reach: Usual size of each, to which it may change if it is not determined.
 
-    A parameter is not determined if, with those before it known only by the logs, its deviation
-    exceeds `UNDETERMINED`: its column of the information's root adds almost nothing.
+    A parameter is not determined if, with those before it known only by the logs, its
+    deviation exceeds `UNDETERMINED`: its column of the information's root adds almost
+    nothing.
     """
     n = len(covariance)
     information = _inverse(covariance)

@@ -1,13 +1,14 @@
 r"""A joint behind a position servo: its forces in a step, and their exact derivatives.
 
-Positions alone tell torques only in units of the servo's stiffness $K$, which is divided out:
+Positions alone tell torques only in units of the servo's stiffness $K$, which is
+divided out:
 
-$J \ddot q + B \dot q + (F + \mu |a L| + F_s e^{-(\dot q/v_s)^2})\, \mathrm{sign}\, \dot q
-= \mathrm{sat}(e + s) - a L, \quad e = g c(t - d) + b - q, \quad \dot s = k_i e$
+$J \ddot q + B \dot q + (F + \mu |a L| + F_s e^{-(\dot q/v_s)^2})\, \mathrm{sign}\, \dot
+q = \mathrm{sat}(e + s) - a L, \quad e = g c(t - d) + b - q, \quad \dot s = k_i e$
 
-with the command $c$, the load torque $L$ of the bodies, and the integral action $s$. Dry friction
-is exact: it holds a joint at rest without creep. The steps are of second order and L-stable, so
-that $J \to 0$ is allowed.
+with the command $c$, the load torque $L$ of the bodies, and the integral action $s$.
+Dry friction is exact: it holds a joint at rest without creep. The steps are of second
+order and L-stable, so that $J \to 0$ is allowed.
 """
 
 import math
@@ -40,7 +41,8 @@ class ServoParameter(NamedTuple):
 
 PARAMETERS = (
     ServoParameter("J", "inertia / stiffness", "s²", 4e-3, 1e-7, 1.0, 2e-3),
-    # With less damping than 6 % of a step, a step may overshoot where friction then holds.
+    # With less damping than 6 % of a step, a step may overshoot where friction then
+    # holds.
     ServoParameter("B", "damping / stiffness", "s", 0.05, 1e-3, 5.0, 0.03),
     ServoParameter("d", "delay", "s", 0.01, -AHEAD, HISTORY, 0.01),
     ServoParameter("b", "bias / stiffness", "u", 0.0, -1.0, 1.0, 0.01),
@@ -56,15 +58,16 @@ PARAMETERS = (
 """Parameters of a joint, in the order of the arrays that hold them."""
 INDEX = {parameter.symbol: k for k, parameter in enumerate(PARAMETERS)}
 START, LOWER, UPPER, SCALE = (
-    np.array([getattr(x, key) for x in PARAMETERS]) for key in ("start", "lower", "upper", "scale")
+    np.array([getattr(x, key) for x in PARAMETERS])
+    for key in ("start", "lower", "upper", "scale")
 )
 
 
 def delayed_command(c: AnyArray, t: Array, hold: AnyArray) -> tuple[Array, Array]:
     """Return the commands of the two stages of each step between the instants `t`, in samples.
 
-    Commands are interpolated; or they are held until the next one, and count with their mean over
-    the step. Before the first they stand still.
+    Commands are interpolated; or they are held until the next one, and count with their
+    mean over the step. Before the first they stand still.
 
     Returns:
         The commands, and their changes by a delay of one sample.
@@ -85,7 +88,9 @@ def delayed_command(c: AnyArray, t: Array, hold: AnyArray) -> tuple[Array, Array
         whole = jnp.clip(jnp.floor(within), 0.0, len(c) - 2.0)
         k = whole.astype(int)
         before, change = c[k], c[k + 1] - c[k]
-        return before + (within - whole) * change, jnp.where(within == ends, -change, 0.0)
+        return before + (within - whole) * change, jnp.where(
+            within == ends, -change, 0.0
+        )
 
     return jax.lax.cond(hold, held, interpolated)
 
@@ -127,7 +132,9 @@ class Stages(NamedTuple):
         commands, by_delay = commands_of_stages(theta, motion, steps, hold)
         share = alternating(1.0 - GAMMA, GAMMA)
         ahead = alternating((1.0 - GAMMA) / GAMMA, 1.0)
-        stages = cls(commands, repeated(motion.load), repeated(motion.inertia), share, ahead)
+        stages = cls(
+            commands, repeated(motion.load), repeated(motion.inertia), share, ahead
+        )
         return stages, by_delay
 
 
@@ -147,7 +154,9 @@ def commands_of_stages(
         return delayed_command(command, instants - delay / motion.sample_time, hold)
 
     commands, by_delay = jax.vmap(of_joint, out_axes=1)(motion.commands, delay)
-    return gain[None] * commands + bias[None], gain[None] * by_delay / motion.sample_time
+    return gain[None] * commands + bias[None], gain[
+        None
+    ] * by_delay / motion.sample_time
 
 
 class State(NamedTuple):
@@ -206,7 +215,9 @@ class Forces(NamedTuple):
         inertia = (J + a * stages.inertia) / (GAMMA * h)
         resistance = inertia + B + inside * gain * GAMMA * h
         force = jnp.clip(drive, -um, um) - load
-        return cls(error, force, friction, inertia, resistance, inside, falling, gain, ki)
+        return cls(
+            error, force, friction, inertia, resistance, inside, falling, gain, ki
+        )
 
     def velocity(self, w: Array, stages: Stages) -> Array:
         """Return the velocities in a stage of joints that do not load each other."""
@@ -216,7 +227,9 @@ class Forces(NamedTuple):
 
     def slip(self, w: Array, stages: Stages, force: Array) -> Slip:
         """Return how joints slip under a force."""
-        return Slip.of(force, self.inertia, self.friction, self.resistance, w, stages.ahead)
+        return Slip.of(
+            force, self.inertia, self.friction, self.resistance, w, stages.ahead
+        )
 
 
 def moved(state: State, u: Array, x: Forces, stage: Stages, h: AnyArray) -> State:
@@ -309,7 +322,8 @@ def partials(
         stages: Inputs of the stages.
         by_delay: Derivatives of the commands by the delay.
         h: Time of a step [s].
-        others: Torques by the accelerations of other joints [stages, joints] [N m or N].
+        others: Torques by the accelerations of other joints [stages, joints] [N m or
+            N].
     """
     every, w = theta.T[:, None], state.w
     x = Forces.of(state, every, stages, h)

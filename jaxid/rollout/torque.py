@@ -1,8 +1,9 @@
 r"""Open-loop rollouts: recorded torques in, positions out, by multiple shooting.
 
-Windows of a given horizon start from measured states. The parameters are those for which their
-simulated ends lie on the measured positions: unlike a fit of torques at measured accelerations,
-it needs no second derivative, and errors that add up over the horizon count.
+Windows of a given horizon start from measured states. The parameters are those for
+which their simulated ends lie on the measured positions: unlike a fit of torques at
+measured accelerations, it needs no second derivative, and errors that add up over the
+horizon count.
 """
 
 import dataclasses
@@ -34,8 +35,8 @@ from .torque_windows import MARGIN, SLIDING, TorqueRows, Windows
 class TorqueRollout:
     """Robot whose recorded torques are applied, and the unknowns of its simulation.
 
-    The unknowns: base parameters, delay of the torques [s], gain of each joint's torque, friction
-    of each joint per torque.
+    The unknowns: base parameters, delay of the torques [s], gain of each joint's
+    torque, friction of each joint per torque.
 
     Attributes:
         base: Base parameters of the model.
@@ -62,7 +63,9 @@ class TorqueRollout:
         n = self.base.model.robot.joints
         return np.concatenate([np.asarray(p), np.zeros(1), np.ones(n), np.zeros(n)])
 
-    def errors(self, x: Array, windows: Windows) -> Float[Array, "steps joints windows"]:
+    def errors(
+        self, x: Array, windows: Windows
+    ) -> Float[Array, "steps joints windows"]:
         """Return simulated less measured positions, by the Runge-Kutta method of order four."""
         forces, h = jnp.asarray(windows.forces), self.sample_time
         margin = round(MARGIN / h)
@@ -75,8 +78,12 @@ class TorqueRollout:
         """Return predicted less measured torques at the measured motion; zero if not counted."""
         p, delay, gains, load = self._parts(x)
         count = len(rows.forces)
-        at = jnp.clip(jnp.arange(1.0 * count) - delay / rows.row_time, 0.0, count - 1.001)
-        forces, friction = (_between(jnp.asarray(y), at) for y in (rows.forces, rows.load))
+        at = jnp.clip(
+            jnp.arange(1.0 * count) - delay / rows.row_time, 0.0, count - 1.001
+        )
+        forces, friction = (
+            _between(jnp.asarray(y), at) for y in (rows.forces, rows.load)
+        )
         torques = gains[None] * forces - load[None] * friction
         return jnp.where(rows.counted, jnp.asarray(rows.columns) @ p - torques, 0.0)
 
@@ -98,7 +105,9 @@ class TorqueRollout:
             return Motion(*(np.asarray(y)[..., 0] for y in found))
 
         with double_precision():
-            return tuple(joined(simulated(o, *span) for span in o.segments) for o in logs)
+            return tuple(
+                joined(simulated(o, *span) for span in o.segments) for o in logs
+            )
 
     def _parts(self, x: Array) -> list[Array]:
         """Return base parameters, delay, gains, and friction by torque."""
@@ -122,7 +131,11 @@ class TorqueRollout:
         """
         h, acceleration = self.sample_time, self._acceleration
         p, _, gains, load = self._parts(x)
-        p, gains, load = self.base.to_standard(p)[:, None], gains[:, None], load[:, None]
+        p, gains, load = (
+            self.base.to_standard(p)[:, None],
+            gains[:, None],
+            load[:, None],
+        )
 
         def rate(state, inputs):
             q, qd = state
@@ -130,7 +143,9 @@ class TorqueRollout:
             # Gear friction grows with the torque that it carries.
             u = gains * u - load * jnp.abs(u) * jnp.tanh(qd / SLIDING)
             pulls = zip((bandwidth**2, 2.0 * bandwidth), measured, state, strict=False)
-            return qd, jnp.stack(acceleration(p, q, qd, u)) + sum(k * (m - y) for k, m, y in pulls)
+            return qd, jnp.stack(acceleration(p, q, qd, u)) + sum(
+                k * (m - y) for k, m, y in pulls
+            )
 
         def moved(state, rate, time):
             return jax.tree.map(lambda y, r: y + time * r, state, rate)
@@ -142,7 +157,9 @@ class TorqueRollout:
             k2 = rate(moved(state, k1, 0.5 * h), middle)
             k3 = rate(moved(state, k2, 0.5 * h), middle)
             k4 = rate(moved(state, k3, h), last)
-            mean = jax.tree.map(lambda a, b, c, d: (a + 2 * b + 2 * c + d) / 6, k1, k2, k3, k4)
+            mean = jax.tree.map(
+                lambda a, b, c, d: (a + 2 * b + 2 * c + d) / 6, k1, k2, k3, k4
+            )
             state = moved(state, mean, h)
             return state, (*state, k1[1])
 
@@ -154,7 +171,9 @@ class TorqueRollout:
         """Accelerations of many samples in scalar operations, which JAX differentiates."""
         model = self.base.model
         joints = (model.robot.joints,)
-        return lower(program_of(model, model.acceleration, (model.size,), *[joints] * 3), False)
+        return lower(
+            program_of(model, model.acceleration, (model.size,), *[joints] * 3), False
+        )
 
 
 def _between(series: Array, at: Array) -> Array:
@@ -166,7 +185,12 @@ def _between(series: Array, at: Array) -> Array:
 
 @functools.partial(jax.jit, static_argnums=0)
 def _follow(
-    rollout: TorqueRollout, x: Array, q: Array, qd: Array, forces: Array, bandwidth: Array | float
+    rollout: TorqueRollout,
+    x: Array,
+    q: Array,
+    qd: Array,
+    forces: Array,
+    bandwidth: Array | float,
 ) -> Sequence[Array]:
     """Return simulated positions, velocities and accelerations [samples, joints, segments]."""
     after = rollout._integrate(x, (q[0], qd[0]), (forces, q, qd), bandwidth)
@@ -214,10 +238,12 @@ class TorqueRolloutFit(Summarised):
         Args:
             observations: Logs, which the fit need not have seen.
             horizon: Length of the windows [s].
-            parameters: Other base parameters, without delay and gains, such as those of a fit of
-                torques; those of this fit if None.
+            parameters: Other base parameters, without delay and gains, such as those of
+                a fit of torques; those of this fit if None.
         """
-        logs = [observations] if isinstance(observations, Observations) else observations
+        logs = (
+            [observations] if isinstance(observations, Observations) else observations
+        )
         windows = Windows.of(logs, horizon, 0.04)
         x = self.unknowns if parameters is None else self.rollout.start(parameters)
         with double_precision():
@@ -257,7 +283,9 @@ class TorqueRolloutFit(Summarised):
 
         The arguments are those of `errors_at`.
         """
-        logs = [observations] if isinstance(observations, Observations) else observations
+        logs = (
+            [observations] if isinstance(observations, Observations) else observations
+        )
         x = self.unknowns if parameters is None else self.rollout.start(parameters)
         rows = TorqueRows.of(self.rollout.base, logs)
         with double_precision():
@@ -267,12 +295,17 @@ class TorqueRolloutFit(Summarised):
 
     def summary(self) -> Table:
         """Return a table of the estimates with 95 % intervals."""
-        names = [name for name, free in zip(self.rollout.names, self.free, strict=True) if free]
+        names = [
+            name
+            for name, free in zip(self.rollout.names, self.free, strict=True)
+            if free
+        ]
         deviations = self.uncertainty.standard_deviations
         values, shown = with_deviations(self.unknowns[self.free], deviations)
         half = self.uncertainty.half_widths()
         ends = [
-            with_deviations(self.unknowns[self.free] + s * half, deviations)[0] for s in (-1, 1)
+            with_deviations(self.unknowns[self.free] + s * half, deviations)[0]
+            for s in (-1, 1)
         ]
         errors = "  ".join(f"{1e3 * x:.3g}" for x in self.rms)
         return Table(
@@ -304,17 +337,22 @@ def identify_torque_rollout(
         base: Base parameters of the model; dry friction must be smooth.
         observations: Filtered logs with torques.
         horizon: Length of the windows [s].
-        gains: Whether the gains of the other joints' torques, relative to the first joint's, are
-            estimated. A gain common to all scales all parameters, and no log tells it.
+        gains: Whether the gains of the other joints' torques, relative to the first
+            joint's, are estimated. A gain common to all scales all parameters, and no
+            log tells it.
         load_friction: Whether friction that grows with the torque is estimated.
-        torque_rows: Whether errors of the torques at the measured motion count as well. Positions
-            and torques of each joint are divided by the standard deviation of their errors.
+        torque_rows: Whether errors of the torques at the measured motion count as well.
+            Positions and torques of each joint are divided by the standard deviation of
+            their errors.
         every: Number of samples from one that counts to the next.
 
     Raises:
-        InputError: If there is no window of the horizon, or the model cannot be simulated.
+        InputError: If there is no window of the horizon, or the model cannot be
+            simulated.
     """
-    logs = [observations] if isinstance(observations, Observations) else list(observations)
+    logs = (
+        [observations] if isinstance(observations, Observations) else list(observations)
+    )
     _require_simulation(base)
     rollout = TorqueRollout(base, logs[0].sample_time)
     windows = Windows.of(logs, horizon, 0.2 * horizon)
@@ -338,11 +376,14 @@ def identify_torque_rollout(
         r, J = objective.linearised(x, weights)
     if not np.isfinite(sizes).all():
         raise InputError(
-            "`observations`: the simulation diverges from the fit of torques: shorten `horizon`, "
+            "`observations`: the simulation diverges from the fit of torques: shorten "
+            "`horizon`, "
             "or choose terms of the model that these logs determine."
         )
     uncertainty = _uncertainty(r, J[free], objective.blocks)
-    return TorqueRolloutFit(rollout, x, free, uncertainty, horizon, sizes[:n], first, torque_rows)
+    return TorqueRolloutFit(
+        rollout, x, free, uncertainty, horizon, sizes[:n], first, torque_rows
+    )
 
 
 def _require_simulation(base: BaseParameters) -> None:
@@ -352,11 +393,13 @@ def _require_simulation(base: BaseParameters) -> None:
     if model.memory is not None or any(isinstance(x, HardSign) for x in leaves):
         raise InputError(
             "`base`: dry friction must be smooth in a simulation: use `Tanh(0.1)` "
-            "(`[model.coulomb] epsilon = 0.1` in an experiment file), no sign and no presliding."
+            "(`[model.coulomb] epsilon = 0.1` in an experiment file), no sign and no "
+            "presliding."
         )
     if model.robot.tool is not None:
         raise InputError(
-            "`base`: a known tool is not simulated: leave `tool` out, and it counts as part of the "
+            "`base`: a known tool is not simulated: leave `tool` out, and it counts "
+            "as part of the "
             "body that carries it."
         )
 
@@ -382,8 +425,8 @@ class _Objective:
     """Errors of positions in windows, and of torques if their rows are given, in one vector.
 
     Attributes:
-        kinds: Kind of each error: the joint of a position, joints + the joint of a torque; one
-            more if it does not count.
+        kinds: Kind of each error: the joint of a position, joints + the joint of a
+            torque; one more if it does not count.
         blocks: Part of the logs to which each error belongs.
     """
 
@@ -397,12 +440,15 @@ class _Objective:
     ):
         index, self._data = np.flatnonzero(free), (windows, rows)
         shape, n = windows.measured[every - 1 :: every].shape, len(windows.q)
-        parts = [np.broadcast_arrays(np.arange(n)[:, None], windows.blocks, np.zeros(shape))]
+        parts = [
+            np.broadcast_arrays(np.arange(n)[:, None], windows.blocks, np.zeros(shape))
+        ]
         if rows is not None:
             kinds = np.where(rows.counted, n + np.arange(n), 2 * n)
             parts.append(np.broadcast_arrays(kinds, rows.blocks[:, None], kinds))
         self.kinds, self.blocks, _ = (
-            np.concatenate([x.ravel() for x in each]) for each in zip(*parts, strict=True)
+            np.concatenate([x.ravel() for x in each])
+            for each in zip(*parts, strict=True)
         )
 
         def residuals(x, data, weights):
@@ -427,17 +473,25 @@ class _Objective:
 
     def sizes(self, x: np.ndarray) -> np.ndarray:
         """Return root mean squares of the errors of all joints' positions, then of torques."""
-        r = np.asarray(self._residuals(jnp.asarray(x), self._data, np.ones(len(self.kinds))))
+        r = np.asarray(
+            self._residuals(jnp.asarray(x), self._data, np.ones(len(self.kinds)))
+        )
         count = 2 * len(self._data[0].q) + 1
-        squares, counts = (np.bincount(self.kinds, y, count) for y in (r**2, np.ones(len(r))))
+        squares, counts = (
+            np.bincount(self.kinds, y, count) for y in (r**2, np.ones(len(r)))
+        )
         return np.sqrt(squares / np.maximum(counts, 1.0))[:-1]
 
-    def linearised(self, x: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def linearised(
+        self, x: np.ndarray, weights: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Return weighted errors, and their derivatives by all unknowns [unknowns, errors]."""
         r, J = self._derivatives(jnp.asarray(x), self._data, weights)
         return np.asarray(r), np.asarray(J)
 
-    def minimum(self, x: np.ndarray, weights: np.ndarray, free: np.ndarray, limits: tuple):
+    def minimum(
+        self, x: np.ndarray, weights: np.ndarray, free: np.ndarray, limits: tuple
+    ):
         """Return the unknowns with the least sum of squares."""
 
         def moments(x, _):

@@ -26,10 +26,12 @@ class MethodComparison(Summarised):
 
     Attributes:
         joint_names: Names of the joints.
-        parameters: Base parameters of each of `METHODS`; NaN where a simulation diverged.
+        parameters: Base parameters of each of `METHODS`; NaN where a simulation
+            diverged.
         horizons: Lengths of the windows [s].
         errors: Root mean square errors at the ends of windows [rad or m].
-        torque_errors: Root mean square errors of torques at the measured motion [N m or N].
+        torque_errors: Root mean square errors of torques at the measured motion [N m or
+            N].
         unseen: Whether no method has seen the logs of the errors.
     """
 
@@ -50,13 +52,19 @@ class MethodComparison(Summarised):
         """Return a table with the methods of each joint below each other."""
         n, count = len(self.joint_names), len(METHODS)
         least = np.nanargmin(self.errors[:, -1], axis=0)
-        where = "logs that no method has seen" if self.unseen else "the logs of the fits"
+        where = (
+            "logs that no method has seen" if self.unseen else "the logs of the fits"
+        )
         return Table(
             f"errors on {where}",
             Column("joint", [name for name in self.joint_names for _ in METHODS]),
             Column("method", METHODS * n),
             *(
-                Column(f"position\nafter {h:g} s", 1e3 * self.errors[:, k].T.ravel(), "mrad or mm")
+                Column(
+                    f"position\nafter {h:g} s",
+                    1e3 * self.errors[:, k].T.ravel(),
+                    "mrad or mm",
+                )
                 for k, h in enumerate(self.horizons)
             ),
             Column("torque", self.torque_errors.T.ravel(), "N m or N"),
@@ -70,15 +78,18 @@ class MethodComparison(Summarised):
 
 
 def compare_methods(
-    fit: TorqueRolloutFit, identification: Sequence[Observations], unseen: Sequence[Observations]
+    fit: TorqueRolloutFit,
+    identification: Sequence[Observations],
+    unseen: Sequence[Observations],
 ) -> MethodComparison:
     """Compare rollouts with methods for the same model and logs.
 
-    Least squares at the measured motion (`identify`); instrumental variables, whose instruments are
-    the columns at a simulated motion (Janot, Vandanjon, Gautier 2014); least squares at the
-    simulated motion (DIDIM: Gautier, Janot, Vandanjon 2013). The torques of the log drive this
-    simulation, and a controller of the bandwidth 2 / horizon keeps it near the measured motion:
-    without it, in windows, the simulated motion fits the torques with any parameters.
+    Least squares at the measured motion (`identify`); instrumental variables, whose
+    instruments are the columns at a simulated motion (Janot, Vandanjon, Gautier 2014);
+    least squares at the simulated motion (DIDIM: Gautier, Janot, Vandanjon 2013). The
+    torques of the log drive this simulation, and a controller of the bandwidth 2 /
+    horizon keeps it near the measured motion: without it, in windows, the simulated
+    motion fits the torques with any parameters.
 
     Args:
         fit: Fit of rollouts.
@@ -88,7 +99,9 @@ def compare_methods(
     base, logs = fit.rollout.base, tuple(identification)
 
     def instrumental(motions: tuple[Motion, ...]) -> np.ndarray:
-        return np.asarray(identify(base, logs, InstrumentalVariables(motions)).parameters)
+        return np.asarray(
+            identify(base, logs, InstrumentalVariables(motions)).parameters
+        )
 
     def didim(motions: tuple[Motion, ...]) -> np.ndarray:
         simulated = [o.replace(motion=m) for o, m in zip(logs, motions, strict=True)]

@@ -40,7 +40,9 @@ class Windows(NamedTuple):
     blocks: np.ndarray
 
     @classmethod
-    def of(cls, logs: Sequence[Observations], horizon: float, spacing: float) -> "Windows":
+    def of(
+        cls, logs: Sequence[Observations], horizon: float, spacing: float
+    ) -> "Windows":
         """Return windows of a horizon [s], whose starts are `spacing` [s] apart."""
         dt = logs[0].sample_time
         if any(abs(o.sample_time - dt) > 0.01 * dt for o in logs):
@@ -51,7 +53,9 @@ class Windows(NamedTuple):
             q, qd, forces = (np.asarray(x) for x in (o.motion.q, o.motion.qd, o.forces))
             edge = o.filter.edge(dt) + margin
             for a, b in o.segments:
-                starts = np.arange(a + edge, b - edge - steps, max(1, round(spacing / dt)))
+                starts = np.arange(
+                    a + edge, b - edge - steps, max(1, round(spacing / dt))
+                )
                 parts += [
                     (
                         q[k],
@@ -64,8 +68,12 @@ class Windows(NamedTuple):
                 ]
                 count += b - a
         if not parts:
-            raise InputError(f"`observations` hold no window of {horizon:g} s: shorten `horizon`.")
-        q0, qd0, u, measured, place = (np.stack(x, axis=-1) for x in zip(*parts, strict=True))
+            raise InputError(
+                f"`observations` hold no window of {horizon:g} s: shorten `horizon`."
+            )
+        q0, qd0, u, measured, place = (
+            np.stack(x, axis=-1) for x in zip(*parts, strict=True)
+        )
         return cls(q0, qd0, u, measured, place, place * BLOCKS // max(count, 1))
 
 
@@ -76,7 +84,8 @@ class TorqueRows(NamedTuple):
         columns: Base regressor [rows, joints, base].
         forces: Torques [rows, joints].
         load: Their sizes, with the signs of the joints' speeds.
-        counted: Whether a row counts: not near an end of a segment, where delays need others.
+        counted: Whether a row counts: not near an end of a segment, where delays need
+            others.
         row_time: Time between two rows [s].
         blocks: Part of the logs to which each row belongs.
     """
@@ -99,7 +108,17 @@ class TorqueRows(NamedTuple):
                 counted[[*range(a, a + margin), *range(b - margin, b)]] = False
             with double_precision():
                 columns = o.reduce(np.asarray(base.regressor(o.motion)))
-            parts.append((columns, o.reduce(forces), o.reduce(load), counted, samples + o.instants))
+            parts.append(
+                (
+                    columns,
+                    o.reduce(forces),
+                    o.reduce(load),
+                    counted,
+                    samples + o.instants,
+                )
+            )
             samples += o.samples
         theta, forces, load, counted, at = map(np.concatenate, zip(*parts, strict=True))
-        return cls(theta, forces, load, counted, logs[0].row_time, at * BLOCKS // samples)
+        return cls(
+            theta, forces, load, counted, logs[0].row_time, at * BLOCKS // samples
+        )

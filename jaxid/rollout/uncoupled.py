@@ -28,7 +28,9 @@ TOGETHER = 4
 """Candidates that are simulated at once."""
 
 
-def _stage(state: State, theta: Array, stage: Stages, h: AnyArray) -> tuple[State, Array]:
+def _stage(
+    state: State, theta: Array, stage: Stages, h: AnyArray
+) -> tuple[State, Array]:
     """Return the state behind a stage, and the velocity in it."""
     x = Forces.of(state, theta, stage, h)
     u = x.velocity(state.w, stage)
@@ -42,7 +44,9 @@ def _start(theta: Array, motion: ServoMotion, hold: AnyArray) -> State:
 
 
 @functools.partial(jax.jit, static_argnums=2)
-def _path(theta: Array, motion: ServoMotion, steps: int, hold: AnyArray) -> tuple[Array]:
+def _path(
+    theta: Array, motion: ServoMotion, steps: int, hold: AnyArray
+) -> tuple[Array]:
     """Simulate one motion; return its positions.
 
     Args:
@@ -67,11 +71,14 @@ def _path(theta: Array, motion: ServoMotion, steps: int, hold: AnyArray) -> tupl
 
 
 @functools.partial(jax.jit, static_argnums=2)
-def _moments(theta: Array, motion: ServoMotion, steps: int, hold: AnyArray) -> tuple[Array, ...]:
+def _moments(
+    theta: Array, motion: ServoMotion, steps: int, hold: AnyArray
+) -> tuple[Array, ...]:
     """Return sums of squared errors, half their gradients, and Gauss-Newton matrices.
 
-    Loads are held. In blocks, whose numbers stay in the processor's cache, the derivatives of all
-    stages are found at once; only their linear recursion runs in time.
+    Loads are held. In blocks, whose numbers stay in the processor's cache, the
+    derivatives of all stages are found at once; only their linear recursion runs in
+    time.
     """
     h, n, P = motion.sample_time / steps, len(theta), len(PARAMETERS)
 
@@ -99,7 +106,14 @@ def _moments(theta: Array, motion: ServoMotion, steps: int, hold: AnyArray) -> t
         factor = runs / found.resistance
         # One long last axis: `jnp.stack` takes twenty times as long.
         by_theta = jnp.concatenate([factor * x for x in found.by_theta], axis=-1)
-        rows = factor * found.by_q, factor * found.by_w, stages.share, stages.ahead, runs, by_theta
+        rows = (
+            factor * found.by_q,
+            factor * found.by_w,
+            stages.share,
+            stages.ahead,
+            runs,
+            by_theta,
+        )
         if before.integral is not None:
             growth = jnp.concatenate(found.growth, axis=-1)
             rows = *rows, factor * found.by_integral, found.rate, growth
@@ -137,7 +151,8 @@ def _moments(theta: Array, motion: ServoMotion, steps: int, hold: AnyArray) -> t
 class ServoSimulator:
     """Motions with the steps in which they are simulated.
 
-    Parameters have the shape [candidates, joints, parameters]; results have the motions first.
+    Parameters have the shape [candidates, joints, parameters]; results have the motions
+    first.
 
     Attributes:
         motion: Motions.
@@ -185,16 +200,26 @@ class ServoSimulator:
                 rows = jnp.asarray(own[chosen].reshape(TOGETHER * joints, -1))
                 found = function(rows, part, self.steps, np.array(self.hold))
             used = min(TOGETHER, count - first)
-            shaped = (np.asarray(x).reshape(TOGETHER, joints, *x.shape[1:]) for x in found)
+            shaped = (
+                np.asarray(x).reshape(TOGETHER, joints, *x.shape[1:]) for x in found
+            )
             return reduce(k, *(x[:used] for x in shaped))
 
-        places = [(k, c) for k in range(self.motion.motions) for c in range(0, count, TOGETHER)]
+        places = [
+            (k, c)
+            for k in range(self.motion.motions)
+            for c in range(0, count, TOGETHER)
+        ]
         # The first call compiles, and the others wait for it.
         results = [one(places[0]), *on_cores(one, places[1:])]
         joined = (np.concatenate(x) for x in zip(*results, strict=True))
-        return tuple(x.reshape(self.motion.motions, count, *x.shape[1:]) for x in joined)
+        return tuple(
+            x.reshape(self.motion.motions, count, *x.shape[1:]) for x in joined
+        )
 
-    def paths(self, theta: AnyArray) -> Float[np.ndarray, "motions candidates joints samples"]:
+    def paths(
+        self, theta: AnyArray
+    ) -> Float[np.ndarray, "motions candidates joints samples"]:
         """Return the simulated positions."""
         return self._map(_path, lambda k, q: (q,), theta)[0]
 
@@ -202,7 +227,9 @@ class ServoSimulator:
         """Return sums of squared errors; with `each`, parameters have the motions first, too."""
 
         def reduce(k: int, q: np.ndarray) -> tuple[np.ndarray]:
-            errors = (q - np.asarray(self.motion.positions[k])) * np.asarray(self.motion.counted[k])
+            errors = (q - np.asarray(self.motion.positions[k])) * np.asarray(
+                self.motion.counted[k]
+            )
             return (np.sum(errors**2, axis=-1),)
 
         return self._map(_path, reduce, theta, each=each)[0]

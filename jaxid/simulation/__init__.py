@@ -10,7 +10,11 @@ from .friction_and_disturbances import (
     SmoothFriction as SmoothFriction,
     TorqueRipple as TorqueRipple,
 )
-from .mechanics import FlexibleGear as FlexibleGear, RigidGear as RigidGear, Servo as Servo
+from .mechanics import (
+    FlexibleGear as FlexibleGear,
+    RigidGear as RigidGear,
+    Servo as Servo,
+)
 from .mujoco import MujocoRobot as MujocoRobot
 from .tx90l import (
     cad_tx90l_on_rail as cad_tx90l_on_rail,

@@ -25,8 +25,8 @@ FILES = ("experiment.toml", "identification.csv", "verification.csv", "truth.jso
 def virtual_panda(seed: int = 0) -> VirtualRobot:
     """Return a robot with the geometry of a Panda and random parameters.
 
-    Masses, rotors and friction vary by some 20 percent about plausible values; the bodies can
-    exist. Noise is 1 percent of the largest torques.
+    Masses, rotors and friction vary by some 20 percent about plausible values; the
+    bodies can exist. Noise is 1 percent of the largest torques.
 
     Args:
         seed: Seed of the parameters.
@@ -62,12 +62,18 @@ def virtual_panda(seed: int = 0) -> VirtualRobot:
     )
 
 
-def virtual_log(robot: VirtualRobot, name: str, periods: int, seed: tuple[int, int]) -> Recording:
+def virtual_log(
+    robot: VirtualRobot, name: str, periods: int, seed: tuple[int, int]
+) -> Recording:
     """Return a log of a random motion within the limits, with a period of 8 s, at 500 Hz."""
     first, second = np.random.SeedSequence(seed).generate_state(2, np.uint32).tolist()
-    motion = random_fourier_series(robot.robot, omega=2 * math.pi / 8.0, reach=0.9, seed=first)
+    motion = random_fourier_series(
+        robot.robot, omega=2 * math.pi / 8.0, reach=0.9, seed=first
+    )
     duration = periods * 8.0
-    return robot.measure(motion, duration=duration, sample_time=0.002, seed=second, name=name)
+    return robot.measure(
+        motion, duration=duration, sample_time=0.002, seed=second, name=name
+    )
 
 
 def write_example(folder: Path, seed: int = 0) -> list[Path]:
@@ -81,7 +87,8 @@ def write_example(folder: Path, seed: int = 0) -> list[Path]:
         Paths of the files.
 
     Raises:
-        InputError: If `folder` is a file, or contains one of the files with other content.
+        InputError: If `folder` is a file, or contains one of the files with other
+            content.
         RuntimeError: If JAX runs in single precision.
     """
     robot = virtual_panda(seed)
@@ -90,23 +97,40 @@ def write_example(folder: Path, seed: int = 0) -> list[Path]:
         for k, (file, periods) in enumerate(zip(FILES[1:3], (2, 1), strict=True)):
             path = staging / file
             _write_csv(path, virtual_log(robot, path.stem, periods, (seed, k + 1)))
-        text = json.dumps(_truth(robot, seed), indent=1, ensure_ascii=False, allow_nan=False)
+        text = json.dumps(
+            _truth(robot, seed), indent=1, ensure_ascii=False, allow_nan=False
+        )
         (staging / FILES[3]).write_text(f"{text}\n", encoding="utf-8")
         for file in FILES:
             present, content = folder / file, (staging / file).read_bytes()
-            if present.exists() and (not present.is_file() or present.read_bytes() != content):
+            if present.exists() and (
+                not present.is_file() or present.read_bytes() != content
+            ):
                 raise InputError(
-                    f"`{present}` exists with other content: choose another folder, or remove it."
+                    f"`{present}` exists with other content: choose another folder, "
+                    "or remove it."
                 )
     return [folder / file for file in FILES]
 
 
 def _write_csv(path: Path, recording: Recording) -> None:
     n = recording.joints
-    header = ["time", *(f"q{i + 1}" for i in range(n)), *(f"tau{i + 1}" for i in range(n))]
+    header = [
+        "time",
+        *(f"q{i + 1}" for i in range(n)),
+        *(f"tau{i + 1}" for i in range(n)),
+    ]
     columns = np.column_stack([recording.time, recording.angles, recording.forces])
     formats = ["%.3f", *["%.7f"] * n, *["%.4f"] * n]
-    np.savetxt(path, columns, formats, ",", header=",".join(header), comments="", encoding="utf-8")
+    np.savetxt(
+        path,
+        columns,
+        formats,
+        ",",
+        header=",".join(header),
+        comments="",
+        encoding="utf-8",
+    )
 
 
 def _truth(robot: VirtualRobot, seed: int) -> dict[str, object]:
@@ -115,7 +139,9 @@ def _truth(robot: VirtualRobot, seed: int) -> dict[str, object]:
     base = base_parameters(model)
     combined = np.asarray(base.from_standard(p))
     keys = ("name", "unit", "value")
-    standard = zip(model.parameter_names, model.parameter_units, p.tolist(), strict=True)
+    standard = zip(
+        model.parameter_names, model.parameter_units, p.tolist(), strict=True
+    )
     regrouped = zip(base.names, base.units, combined.tolist(), strict=True)
     return {
         "schema": "jaxid-truth/1",

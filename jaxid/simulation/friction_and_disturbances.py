@@ -1,8 +1,9 @@
 """Friction and disturbances of the drives, as they act in a simulation.
 
-A friction law is evaluated for the next time step, and gives a force that is affine in the speed at
-the step's end. Solving for that speed treats friction implicitly: however steep a law is near
-standstill, a joint that sticks stays where it is, and no small steps are needed.
+A friction law is evaluated for the next time step, and gives a force that is affine in
+the speed at the step's end. Solving for that speed treats friction implicitly: however
+steep a law is near standstill, a joint that sticks stays where it is, and no small
+steps are needed.
 """
 
 import dataclasses
@@ -51,8 +52,8 @@ class AbstractGearFriction(Hashable):
             step: Length of the step [s].
 
         Returns:
-            $F_0$, $s$, $z_0$ and $r$: friction is $F_0 + s \dot q^+$ [N m or N], while bristles
-            bend to $z_0 + r \dot q^+$ [rad or m].
+            $F_0$, $s$, $z_0$ and $r$: friction is $F_0 + s \dot q^+$ [N m or N], while
+            bristles bend to $z_0 + r \dot q^+$ [rad or m].
         """
 
     def scaled(self, viscous: Joints, dry: Joints) -> "AbstractGearFriction":
@@ -78,8 +79,8 @@ class AbstractGearFriction(Hashable):
 class SmoothFriction(AbstractGearFriction):
     r"""Friction of the model, with optional Stribeck friction near standstill (Eqs. 13, 14).
 
-    $d_v \dot q + d_c \tanh(\dot q / \epsilon) + f_s e^{-(\dot q / v_s)^2} \tanh(4 \dot q / v_s)$.
-    Nothing sticks.
+    $d_v \dot q + d_c \tanh(\dot q / \epsilon) + f_s e^{-(\dot q / v_s)^2} \tanh(4 \dot
+    q / v_s)$. Nothing sticks.
 
     Attributes:
         viscous: $d_v$ [N m s/rad or N s/m].
@@ -96,7 +97,9 @@ class SmoothFriction(AbstractGearFriction):
 
     def steady(self, qd):
         """Return the sum of all three parts."""
-        return self.viscous * qd + self.coulomb * jnp.tanh(qd / EPSILON) + self._fading(qd)
+        return (
+            self.viscous * qd + self.coulomb * jnp.tanh(qd / EPSILON) + self._fading(qd)
+        )
 
     def _fading(self, qd):
         relative = qd / self.stribeck_speed
@@ -116,16 +119,18 @@ class LuGreFriction(AbstractGearFriction):
 
     $F = \sigma_0 z + \sigma_1(\dot q) \dot z + d_v \dot q$ with
     $\dot z = \dot q - \sigma_0 |\dot q| z / g(\dot q)$ and
-    $g = d_c + (f_s - d_c) e^{-(\dot q / v_s)^2}$ (Canudas de Wit, Olsson, Åström and Lischinsky,
-    IEEE Trans. Automatic Control 40(3), 1995). The bristles' damping fades with speed like the
-    Stribeck part, which keeps the law passive (Olsson's thesis, Lund 1996).
+    $g = d_c + (f_s - d_c) e^{-(\dot q / v_s)^2}$ (Canudas de Wit, Olsson, Åström and
+    Lischinsky, IEEE Trans. Automatic Control 40(3), 1995). The bristles' damping fades
+    with speed like the Stribeck part, which keeps the law passive (Olsson's thesis,
+    Lund 1996).
 
     Attributes:
         viscous: $d_v$ [N m s/rad or N s/m].
         coulomb: $d_c$ [N m or N].
         breakaway: $f_s$, the largest force on a joint at rest [N m or N].
         stribeck_speed: $v_s$ [rad/s or m/s].
-        deflection: Deflection of the bristles when they let go, $f_s / \sigma_0$ [rad or m].
+        deflection: Deflection of the bristles when they let go, $f_s / \sigma_0$ [rad
+            or m].
         damping_time: $\sigma_1 / \sigma_0$ at rest [s].
     """
 
@@ -168,16 +173,17 @@ class LuGreFriction(AbstractGearFriction):
 class FrictionTemperature(eqx.Module):
     r"""Dependence of friction on temperature, and the heat of friction (Sec. 6).
 
-    Viscous friction is multiplied by $e^{-a (T - T_0)}$, the law of `TemperatureScaled`, and dry
-    friction by the same with its own rate. The gear stores heat: $t_h \dot T = R P - (T - T_a)$
-    with the friction's power $P$.
+    Viscous friction is multiplied by $e^{-a (T - T_0)}$, the law of
+    `TemperatureScaled`, and dry friction by the same with its own rate. The gear stores
+    heat: $t_h \dot T = R P - (T - T_a)$ with the friction's power $P$.
 
     Attributes:
         viscous_rate: $a$ of the viscous friction [1/K].
         dry_rate: $a$ of the dry friction [1/K].
         resistance: Thermal resistance $R$ from each gear to the air [K/W].
         time: Time constant $t_h$ [s].
-        reference: Temperature $T_0$ at which the friction is known, and $T_a$ of the air [°C].
+        reference: Temperature $T_0$ at which the friction is known, and $T_a$ of the
+            air [°C].
     """
 
     viscous_rate: Joints
@@ -191,7 +197,9 @@ class FrictionTemperature(eqx.Module):
         warmer = np.asarray(temperature) - self.reference
         return np.exp(-self.viscous_rate * warmer), np.exp(-self.dry_rate * warmer)
 
-    def warm_up(self, temperature: Joints, power: Joints, duration: float) -> np.ndarray:
+    def warm_up(
+        self, temperature: Joints, power: Joints, duration: float
+    ) -> np.ndarray:
         """Return temperatures [°C] after some time [s] with constant power of friction [W]."""
         final = self.reference + np.asarray(self.resistance) * np.asarray(power)
         return final + (np.asarray(temperature) - final) * np.exp(-duration / self.time)
@@ -226,7 +234,9 @@ class TorqueRipple(AbstractDisturbance):
 
     def forces(self, robot, q, qd):
         """Return a sine of the motor angle."""
-        return self.amplitude * jnp.sin(self.waves * robot.drives.motor_angles(q) + self.phase)
+        return self.amplitude * jnp.sin(
+            self.waves * robot.drives.motor_angles(q) + self.phase
+        )
 
 
 class CableForce(AbstractDisturbance):
@@ -246,4 +256,6 @@ class CableForce(AbstractDisturbance):
 
     def forces(self, robot, q, qd):
         """Return forces against the deflection and against the motion."""
-        return self.stiffness * (self.rest - q) - self.friction * jnp.tanh(qd / self.speed)
+        return self.stiffness * (self.rest - q) - self.friction * jnp.tanh(
+            qd / self.speed
+        )

@@ -32,15 +32,17 @@ class RigidGear(Hashable):
         Motors have the momentum $a \dot\theta^+ = b - \tau$ there.
 
         Args:
-            twist: Angle of the motor less that of the joint, at the step's start [rad or m].
+            twist: Angle of the motor less that of the joint, at the step's start [rad
+                or m].
             rate: Rate of the twist [rad/s or m/s].
             inertia: $a$, rotors and friction [N m s/rad or N s/m].
             drive: $b$, torques and momentum at the step's start [N m or N].
             step: Length of the step [s].
 
         Returns:
-            $f$, $c$, $w$ and $s$: the force on the joint is $\tau = f - c\,\dot q^+$ [N m or N],
-            while its motor turns at $\dot\theta^+ = w + s\,\dot q^+$ [rad/s or m/s].
+            $f$, $c$, $w$ and $s$: the force on the joint is $\tau = f - c\,\dot q^+$ [N
+            m or N], while its motor turns at $\dot\theta^+ = w + s\,\dot q^+$ [rad/s or
+            m/s].
         """
         none = 0.0 * drive
         return drive, inertia, none, none + 1.0
@@ -74,7 +76,10 @@ class FlexibleGear(RigidGear):
             touches = jnp.abs(ahead) > half
             force = self.stiffness * (twist - jnp.sign(ahead) * half) + slope * rate
             none = jnp.zeros_like(force)
-            force, slope = jnp.where(touches, force, none), jnp.where(touches, slope, none)
+            force, slope = (
+                jnp.where(touches, force, none),
+                jnp.where(touches, slope, none),
+            )
         # The motor's speed is eliminated from the force f + c (theta' - q').
         speed = (drive - force) / (inertia + slope)
         ratio = slope / (inertia + slope)
@@ -89,8 +94,9 @@ class FlexibleGear(RigidGear):
 class DriveTrain(Hashable):
     """Bodies, motors, gears and friction over one time step.
 
-    The step is implicit where forces are stiff (friction, gears) and of second order elsewhere:
-    positions move by half a step, velocities by a whole one with the forces there, positions by the
+    The step is implicit where forces are stiff (friction, gears) and of second order
+    elsewhere: positions move by half a step, velocities by a whole one with the forces
+        there, positions by the
     other half.
     """
 
@@ -108,18 +114,24 @@ class DriveTrain(Hashable):
         if tool is not None:
             known = np.zeros((model.robot.joints, 10))
             known[tool.body] = tool.parameters
-            M = M + projection_equation.rigid_body_mass_matrix(model.robot, jnp.asarray(known), q)
+            M = M + projection_equation.rigid_body_mass_matrix(
+                model.robot, jnp.asarray(known), q
+            )
             h = h + model.known_forces(q, qd, jnp.zeros_like(q))
         return jnp.concatenate([M.ravel(), h])
 
     def advance(
-        self, bodies: Float[AnyArray, " entries"], state: Float[AnyArray, "7 joints"], u: Joints
+        self,
+        bodies: Float[AnyArray, " entries"],
+        state: Float[AnyArray, "7 joints"],
+        u: Joints,
     ) -> Float[AnyArray, "9 joints"]:
         r"""Return the state after a step, and where mass matrix and bias are needed for the next.
 
-        The state is $(q, \dot q, \ddot q)$ of the joints, the same of the motors on the joint side,
-        and the deflections of the friction's bristles. Mass matrix and bias of the bodies are those
-        half a step ahead, $u$ the torques of the drives during the step.
+        The state is $(q, \dot q, \ddot q)$ of the joints, the same of the motors on the
+        joint side, and the deflections of the friction's bristles. Mass matrix and bias
+        of the bodies are those half a step ahead, $u$ the torques of the drives during
+        the step.
         """
         n, dt = u.shape[0], self.step
         M, h = bodies[: n * n].reshape(n, n), bodies[n * n :]
@@ -130,7 +142,9 @@ class DriveTrain(Hashable):
         for disturbance in self.disturbances:
             acting = acting + disturbance.forces(self.model.robot, *halfway)
         inertia, drive = self.rotors / dt + damping, self.rotors / dt * w + acting
-        force, slope, speed, ratio = self.gear.transmit(theta - q, w - qd, inertia, drive, dt)
+        force, slope, speed, ratio = self.gear.transmit(
+            theta - q, w - qd, inertia, drive, dt
+        )
         M = M - jnp.diag(self.rotors)
         new_qd = solve_symmetric(M / dt + jnp.diag(slope), M @ (qd / dt) + force - h)
         new_w = speed + ratio * new_qd
@@ -155,7 +169,9 @@ class SimulatedPlant:
         p = np.asarray(parameters, np.float64)
         bodies = program_of(drives, drives.inertia_and_bias, p.shape, (n,), (n,))
         self._bodies = to_python(bodies)
-        self._advance = to_python(program_of(drives, drives.advance, (n * n + n,), (7, n), (n,)))
+        self._advance = to_python(
+            program_of(drives, drives.advance, (n * n + n,), (7, n), (n,))
+        )
         self._drives, self._joints, self._p = drives, n, p.tolist()
 
     def start(self, q: Joints, qd: Joints, qdd: Joints) -> None:
@@ -184,8 +200,9 @@ class SimulatedPlant:
 class Servo(eqx.Module):
     r"""Controller of every joint by itself, at a fixed rate.
 
-    $u = Q_{m,d} + K_p e + K_d \dot e$ with the error $e$ of the encoder's angle. Its rate is a
-    difference behind a first-order low-pass; $u$ is constant until the next tick.
+    $u = Q_{m,d} + K_p e + K_d \dot e$ with the error $e$ of the encoder's angle. Its
+    rate is a difference behind a first-order low-pass; $u$ is constant until the next
+    tick.
 
     Attributes:
         proportional: $K_p$ [N m/rad or N/m].
@@ -237,7 +254,8 @@ def follow(
                 plant.step(u)
     except (ArithmeticError, ValueError) as failure:
         raise InputError(
-            f"the simulated robot diverged after {len(forces) * servo.sample_time:g} s: make the "
+            f"the simulated robot diverged after {len(forces) * servo.sample_time:g} "
+            "s: make the "
             "`servo` softer or `substeps` larger, and check that the bodies can exist."
         ) from failure
     q, qd, qdd = np.split(np.array(motion), 3, axis=1)

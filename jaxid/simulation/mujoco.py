@@ -19,11 +19,13 @@ from .virtual import VirtualRobot
 class MujocoRobot(VirtualRobot):
     """A virtual robot whose bodies, rotors and friction are simulated by MuJoCo.
 
-    Viscous friction is MuJoCo's damping, dry friction its friction loss, which holds a joint at
-    rest. Gears are rigid, and there are no disturbances. Sensors and servo are the virtual robot's.
+    Viscous friction is MuJoCo's damping, dry friction its friction loss, which holds a
+    joint at rest. Gears are rigid, and there are no disturbances. Sensors and servo are
+    the virtual robot's.
 
     Args:
-        virtual: Robot whose bodies, rotors and friction (at its present temperature) are simulated.
+        virtual: Robot whose bodies, rotors and friction (at its present temperature)
+            are simulated.
     """
 
     def __init__(self, virtual: VirtualRobot):
@@ -34,8 +36,8 @@ class MujocoRobot(VirtualRobot):
         """Return a simulation of the robot with a time step [s].
 
         Raises:
-            InputError: If the equations of motion contain more than bodies and rotors, or MuJoCo
-                is not installed.
+            InputError: If the equations of motion contain more than bodies and rotors,
+                or MuJoCo is not installed.
         """
         library, friction = import_mujoco(), self.present_friction
         text = mjcf_text(
@@ -60,7 +62,9 @@ class MujocoRobot(VirtualRobot):
         for term, p in model.split(self.values):
             known = term.body_parameters or term.drive_matrices(robot)[0].any()
             if not known and np.any(p):
-                raise InputError("MuJoCo knows only bodies and rotors: leave out other `terms`.")
+                raise InputError(
+                    "MuJoCo knows only bodies and rotors: leave out other `terms`."
+                )
         bodies = body_parameters(model, self.values)
         if robot.tool is not None:
             bodies[robot.tool.body] += np.asarray(robot.tool.parameters)

@@ -26,7 +26,9 @@ def preview_mjcf(robot: Robot, shapes: CollisionModel | None) -> str:
     """Return a robot as MJCF with its capsules and obstacles as shapes that touch nothing."""
     text = mjcf_text(robot, np.tile(_BODY, (robot.joints, 1)), {})
     root = etree.fromstring(text)
-    etree.SubElement(etree.SubElement(root, "default"), "geom", contype="0", conaffinity="0")
+    etree.SubElement(
+        etree.SubElement(root, "default"), "geom", contype="0", conaffinity="0"
+    )
     world = root.find("worldbody")
     etree.SubElement(world, "light", pos="0 0 3")
     bodies = [root.find(f".//body[@name='{name}_body']") for name in robot.joint_names]
@@ -60,25 +62,35 @@ def _obstacle(obstacle: HalfSpace | Box) -> dict[str, str]:
 
 def positions(trajectory: AbstractTrajectory) -> Float[np.ndarray, "pictures joints"]:
     """Return the positions of all pictures [rad or m]."""
-    return np.asarray(trajectory.motion(np.arange(0.0, float(trajectory.duration), 1 / RATE)).q)
+    return np.asarray(
+        trajectory.motion(np.arange(0.0, float(trajectory.duration), 1 / RATE)).q
+    )
 
 
-def play(robot: Robot, shapes: CollisionModel | None, trajectory: AbstractTrajectory) -> None:
+def play(
+    robot: Robot, shapes: CollisionModel | None, trajectory: AbstractTrajectory
+) -> None:
     """Show a motion in MuJoCo's viewer, again and again, until its window is closed.
 
     Raises:
         InputError: If MuJoCo is not installed, or there is no display.
     """
     mujoco = import_mujoco()
-    viewer, glfw = (import_extra(x, "mujoco", "a preview needs") for x in ("mujoco.viewer", "glfw"))
+    viewer, glfw = (
+        import_extra(x, "mujoco", "a preview needs") for x in ("mujoco.viewer", "glfw")
+    )
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         if not glfw.init():
-            raise InputError("a preview needs a display, and none is there: see the page's figure.")
+            raise InputError(
+                "a preview needs a display, and none is there: see the page's figure."
+            )
     model = mujoco.MjModel.from_xml_string(preview_mjcf(robot, shapes))
     data, rows = mujoco.MjData(model), positions(trajectory)
     at = [model.joint(name).qposadr[0] for name in robot.joint_names]
-    with viewer.launch_passive(model, data, show_left_ui=False, show_right_ui=False) as window:
+    with viewer.launch_passive(
+        model, data, show_left_ui=False, show_right_ui=False
+    ) as window:
         began = time.monotonic()
         while window.is_running():
             # It rests for a second before it begins again.

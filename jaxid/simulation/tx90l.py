@@ -1,8 +1,9 @@
 """The paper's robot as a virtual one: its published numbers are the truth, the rest is assumed.
 
-Published are six base parameters, cold and warm (Sec. 6), in the layout with seven parameters for
-each body; the masses of the arm's CAD model; and the largest motor torques of the first and the
-last axis. All else is plausible and assumed: this file is the list.
+Published are six base parameters, cold and warm (Sec. 6), in the layout with seven
+parameters for each body; the masses of the arm's CAD model; and the largest motor
+torques of the first and the last axis. All else is plausible and assumed: this file is
+the list.
 """
 
 import numpy as np
@@ -26,23 +27,27 @@ ROTORS = (12.0, 3.5, 2.0, 1.2, 0.35, 0.30, 0.01)
 """Inertia of the rotors on the joint side, assumed [kg m²; kg]."""
 
 
-def virtual_tx90l_on_rail(*, warm: bool = False, disturbed: bool = True) -> VirtualRobot:
+def virtual_tx90l_on_rail(
+    *, warm: bool = False, disturbed: bool = True
+) -> VirtualRobot:
     """Return the paper's robot: a TX90L on its rail, whose published parameters are the truth.
 
-    In the layout with seven parameters for each body, p_B(1), p_B(2), p_B(27), p_B(28), p_B(34) and
-    p_B(35) of its base parameters are the published ones, cold or warm. Bodies and gears can exist;
-    products of inertia vanish, as that layout assumes. The paper's two identifications differ
-    slightly in p_B(1) and p_B(2) too: so do the two robots, but `at` and `warmed` change friction
-    only.
+    In the layout with seven parameters for each body, p_B(1), p_B(2), p_B(27), p_B(28),
+    p_B(34) and p_B(35) of its base parameters are the published ones, cold or warm.
+    Bodies and gears can exist; products of inertia vanish, as that layout assumes. The
+    paper's two identifications differ slightly in p_B(1) and p_B(2) too: so do the two
+    robots, but `at` and `warmed` change friction only.
 
     Args:
         warm: Robot after half an hour of fast motion, instead of right after its start.
-        disturbed: Robot with stiction, Stribeck friction and torque ripple; otherwise with friction
-            as in the model. Encoder steps and noise of the torques are there in both cases.
+        disturbed: Robot with stiction, Stribeck friction and torque ripple; otherwise
+            with friction as in the model. Encoder steps and noise of the torques are
+            there in both cases.
     """
     robot = library.tx90l_on_rail()
     max_forces = np.asarray(robot.limits.force)
-    # Assumed, but for the first and the last, which follow from the published motor torques.
+    # Assumed, but for the first and the last, which follow from the published motor
+    # torques.
     ratios = np.array([3000.0 / 69.0, 100.0, 100.0, 80.0, 45.0, 45.0, 5.0])
     robot = robot.replace(
         drives=Drives(
@@ -53,7 +58,8 @@ def virtual_tx90l_on_rail(*, warm: bool = False, disturbed: bool = True) -> Virt
         ),
         notes=(
             *robot.notes[:2],
-            "assumed, since they are not published: the gear ratios, but for those of the rail and "
+            "assumed, since they are not published: the gear ratios, but for those of "
+            "the rail and "
             "the last axis, which follow from motor torques in the paper.",
         ),
     )
@@ -69,7 +75,9 @@ def virtual_tx90l_on_rail(*, warm: bool = False, disturbed: bool = True) -> Virt
             coloured_noise=np.zeros(7),
             motor_side=True,
         ),
-        disturbances=(TorqueRipple(0.01 * max_forces, np.full(7, 6.0), np.linspace(0, 6, 7)),),
+        disturbances=(
+            TorqueRipple(0.01 * max_forces, np.full(7, 6.0), np.linspace(0, 6, 7)),
+        ),
         heating=heating,
         temperature=np.full(7, TEMPERATURES[warm]),
     )
@@ -83,18 +91,23 @@ def cad_tx90l_on_rail() -> Float[np.ndarray, " standard"]:
     """
     errors = 1.0 + np.array([0.15, -0.12, 0.18, -0.10, 0.14, -0.18, 0.11])
     bodies = _bodies(COLD) * errors[:, None]
-    return np.concatenate([bodies.ravel(), np.zeros(14), np.array(ROTORS) * errors[::-1]])
+    return np.concatenate(
+        [bodies.ravel(), np.zeros(14), np.array(ROTORS) * errors[::-1]]
+    )
 
 
 def _bodies(published: dict[int, float]) -> Float[np.ndarray, "7 7"]:
     """Return seven parameters of each body: principal axes, published base parameters (Eq. 24)."""
     known = library.entries()["virtual_tx90l_on_rail"]
-    m, r, gyration = (np.array(known[name]) for name in ("masses", "centres", "gyration"))
+    m, r, gyration = (
+        np.array(known[name]) for name in ("masses", "centres", "gyration")
+    )
     # m4 r_c4z counts 20 times in p_B(1) and once in p_B(2): with l_2x = l_3z = 0.05 m.
     offset = m[3] * r[3, 2]
     m[0] = published[1] - m[1] - m[2] + 20.0 * offset - ROTORS[0]
     r[1, 0] = (published[2] - 0.05 * m[2] + offset) / m[1]
-    # Second moments about the origin without products: possible if each leaves room for all others.
+    # Second moments about the origin without products: possible if each leaves room for
+    # all others.
     spread = gyration**2 + np.count_nonzero(r, axis=1)[:, None] * r**2
     moments = m[:, None] * (spread.sum(axis=1, keepdims=True) - spread)
     return np.concatenate([m[:, None], m[:, None] * r, moments], axis=1)
@@ -102,18 +115,25 @@ def _bodies(published: dict[int, float]) -> Float[np.ndarray, "7 7"]:
 
 def _friction(robot: Robot) -> tuple[LuGreFriction, FrictionTemperature]:
     """Return cold friction and its fall: as of axis 2 where nothing is published."""
-    max_forces, max_speeds = np.asarray(robot.limits.force), np.asarray(robot.limits.velocity)
+    max_forces, max_speeds = (
+        np.asarray(robot.limits.force),
+        np.asarray(robot.limits.velocity),
+    )
     rise = TEMPERATURES[1] - TEMPERATURES[0]
     levels, rates, warm = [], [], []
-    # Fractions: cold friction of the axes 3 to 7 over the largest torques (at 1 rad/s), assumed.
+    # Fractions: cold friction of the axes 3 to 7 over the largest torques (at 1 rad/s),
+    # assumed.
     for numbers, fraction in (((27, 28), 0.02), ((34, 35), 0.04)):
         first, second = (WARM[k] / COLD[k] for k in numbers)
-        levels.append(np.array([*(COLD[k] for k in numbers), *(fraction * max_forces[2:])]))
+        levels.append(
+            np.array([*(COLD[k] for k in numbers), *(fraction * max_forces[2:])])
+        )
         factors = np.array([first, *(second,) * 6])
         rates.append(-np.log(factors) / rise)
         warm.append(levels[-1] * factors)
-    # RMS speeds, as fractions of the largest, at which the gears reach the warm temperature: those
-    # of random Fourier motions of 0.8 rad/s that use the limits. Assumed.
+    # RMS speeds, as fractions of the largest, at which the gears reach the warm
+    # temperature: those of random Fourier motions of 0.8 rad/s that use the limits.
+    # Assumed.
     speed = np.array([0.45, 0.24, 0.21, 0.24, 0.31, 0.17, 0.21]) * max_speeds
     # The mean size of a sine is 0.9 of its RMS.
     power = warm[0] * speed**2 + warm[1] * 0.9 * speed

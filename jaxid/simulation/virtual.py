@@ -34,7 +34,8 @@ def random_bodies(
 ) -> Float[np.ndarray, "joints 10"]:
     """Draw inertial parameters of bodies that can exist: clouds of point masses along the links.
 
-    A cloud reaches from the origin of the body's frame to the next joint, or to the end-effector.
+    A cloud reaches from the origin of the body's frame to the next joint, or to the
+    end-effector.
 
     Args:
         robot: Robot with its links.
@@ -59,9 +60,10 @@ class Sensors(eqx.Module):
 
     Attributes:
         encoder_step: Resolution of the logged angles [rad or m].
-        white_noise: Standard deviation of the white noise of the forces, on the joint side
-            [N m or N].
-        coloured_noise: Standard deviation of the coloured noise of the forces [N m or N].
+        white_noise: Standard deviation of the white noise of the forces, on the joint
+            side [N m or N].
+        coloured_noise: Standard deviation of the coloured noise of the forces [N m or
+            N].
         memory: Time constant of the coloured noise [s].
         motor_side: Whether the log contains angles and torques of the motors.
     """
@@ -117,11 +119,13 @@ class Tracking(eqx.Module):
     Attributes:
         time: Times of the samples [s].
         desired: Desired motion.
-        actual: True motion of the joints; accelerations, which jump, are the mean of both sides.
-        forces: Forces of the drives on the joint side, without the sensors' noise, as the mean of
-            before and after the sample [N m or N].
+        actual: True motion of the joints; accelerations, which jump, are the mean of
+            both sides.
+        forces: Forces of the drives on the joint side, without the sensors' noise, as
+            the mean of before and after the sample [N m or N].
         recording: Recording of the sensors.
-        saturated: Fraction of the servo's ticks at which a drive was at its limit, from 0 to 1.
+        saturated: Fraction of the servo's ticks at which a drive was at its limit, from
+            0 to 1.
     """
 
     time: Float[AnyArray, " samples"]
@@ -140,8 +144,8 @@ class Tracking(eqx.Module):
 class VirtualRobot(Hashable):
     """A robot whose parameters are known, with the imperfections of every measurement.
 
-    It can follow a motion without error (`measure`), which is fast, or by its servo (`track`),
-    where gears, stiction and disturbances act as in a machine.
+    It can follow a motion without error (`measure`), which is fast, or by its servo
+    (`track`), where gears, stiction and disturbances act as in a machine.
 
     Attributes:
         robot: Known properties of the robot.
@@ -166,14 +170,19 @@ class VirtualRobot(Hashable):
     temperature: Joints | None = None
 
     def __check_init__(self):
-        size, shape = self.bodies.size, None if self.heating is None else (self.robot.joints,)
+        size, shape = (
+            self.bodies.size,
+            None if self.heating is None else (self.robot.joints,),
+        )
         if self.values.shape != (size,):
             raise InputError(
-                f"`values` must hold {size} numbers for `terms`, but has shape {self.values.shape}."
+                f"`values` must hold {size} numbers for `terms`, but has shape "
+                f"{self.values.shape}."
             )
         if (None if self.temperature is None else self.temperature.shape) != shape:
             raise InputError(
-                "`temperature` must hold one number for each gear with `heating`, else None."
+                "`temperature` must hold one number for each gear with `heating`, "
+                "else None."
             )
 
     @property
@@ -224,7 +233,9 @@ class VirtualRobot(Hashable):
         Raises:
             InputError: If friction does not depend on temperature.
         """
-        return self.replace(temperature=np.full(self.robot.joints, temperature, np.float64))
+        return self.replace(
+            temperature=np.full(self.robot.joints, temperature, np.float64)
+        )
 
     def warming(
         self, trajectory: AbstractTrajectory, *, duration: float
@@ -245,29 +256,40 @@ class VirtualRobot(Hashable):
         require_float64("warming a virtual robot")
         heating = self.heating
         if heating is None:
-            raise InputError("friction does not depend on temperature: give the robot `heating`.")
+            raise InputError(
+                "friction does not depend on temperature: give the robot `heating`."
+            )
         # The power of friction is averaged over 2000 instants of the motion.
         _, motion = trajectory.sample(float(trajectory.duration) / 2000)
         steps = max(1, round(duration / 30.0))
         parts = [
-            self.friction.scaled(*x) for x in np.eye(2)[:, :, None] * np.ones(motion.qd[0].shape)
+            self.friction.scaled(*x)
+            for x in np.eye(2)[:, :, None] * np.ones(motion.qd[0].shape)
         ]
-        powers = [np.mean(in_numpy(x, x.steady, motion.qd) * motion.qd, axis=0) for x in parts]
+        powers = [
+            np.mean(in_numpy(x, x.steady, motion.qd) * motion.qd, axis=0) for x in parts
+        ]
         temperatures = [np.asarray(self.temperature)]
         for _ in range(steps):
             viscous, dry = heating.factors(temperatures[-1])
             power = viscous * powers[0] + dry * powers[1]
-            temperatures.append(heating.warm_up(temperatures[-1], power, duration / steps))
+            temperatures.append(
+                heating.warm_up(temperatures[-1], power, duration / steps)
+            )
         return np.linspace(0.0, duration, steps + 1), np.array(temperatures)
 
-    def warmed(self, trajectory: AbstractTrajectory, *, duration: float) -> "VirtualRobot":
+    def warmed(
+        self, trajectory: AbstractTrajectory, *, duration: float
+    ) -> "VirtualRobot":
         """Return the same robot after a motion has been repeated for some time; see `warming`.
 
         Args:
             trajectory: Repeated motion.
             duration: Duration [s]; the paper's robot is warm after 1800 s.
         """
-        return self.replace(temperature=self.warming(trajectory, duration=duration)[1][-1])
+        return self.replace(
+            temperature=self.warming(trajectory, duration=duration)[1][-1]
+        )
 
     def resistance(self, q: Joints, qd: Joints) -> Joints:
         """Return friction less disturbances of one sample, at constant speeds [N m or N]."""
@@ -279,7 +301,9 @@ class VirtualRobot(Hashable):
     def forces(self, motion: Motion) -> Float[np.ndarray, "samples joints"]:
         """Return the forces of the drives for a motion, with rigid gears [N m or N]."""
         arrays = [np.asarray(x, np.float64) for x in (motion.q, motion.qd, motion.qdd)]
-        forces = in_numpy(self.bodies, self.bodies.forces, *arrays, shared=(self.values,))
+        forces = in_numpy(
+            self.bodies, self.bodies.forces, *arrays, shared=(self.values,)
+        )
         if self.robot.tool is not None:
             forces = forces + in_numpy(self.bodies, self.bodies.known_forces, *arrays)
         return forces + in_numpy(self, self.resistance, *arrays[:2])
@@ -303,7 +327,9 @@ class VirtualRobot(Hashable):
             name: Name of the recording.
         """
         require_float64("a virtual measurement")
-        motion = trajectory.motion(sample_time * np.arange(round(duration / sample_time)))
+        motion = trajectory.motion(
+            sample_time * np.arange(round(duration / sample_time))
+        )
         forces = self.forces(motion)
         return self.sensors.record(
             self.robot, motion.q, forces, sample_time=sample_time, seed=seed, name=name
@@ -318,7 +344,10 @@ class VirtualRobot(Hashable):
             sample_time: Time between two ticks [s].
         """
         model, turns = self.bodies, np.array(self.robot.revolute)
-        q = np.random.default_rng(0).uniform(-np.pi, np.pi, (200, self.robot.joints)) * turns
+        q = (
+            np.random.default_rng(0).uniform(-np.pi, np.pi, (200, self.robot.joints))
+            * turns
+        )
         M = in_numpy(model, model.inertia, q, shared=(np.asarray(self.values),))
         inertia = np.diagonal(M, axis1=1, axis2=2).mean(axis=0)
         w = 2.0 * np.pi * 8.0
@@ -333,10 +362,13 @@ class VirtualRobot(Hashable):
         elastic = np.asarray(self.gear.twist(np.ones(self.robot.joints))) != 0.0
         if (elastic & ~(self.rotors > 0)).any():
             raise InputError(
-                "an elastic gear needs a motor with inertia: give `terms` a `RotorInertia`."
+                "an elastic gear needs a motor with inertia: give `terms` a "
+                "`RotorInertia`."
             )
         friction = self.present_friction
-        drives = DriveTrain(self.bodies, self.rotors, friction, self.gear, self.disturbances, step)
+        drives = DriveTrain(
+            self.bodies, self.rotors, friction, self.gear, self.disturbances, step
+        )
         return SimulatedPlant(drives, self.values)
 
     def track(
@@ -353,18 +385,18 @@ class VirtualRobot(Hashable):
     ) -> Tracking:
         """Follow a trajectory by a servo and record what the sensors measure.
 
-        The robot starts in the desired motion. Gears keep their temperature, since seconds do not
-        warm them: use `warmed` for that.
+        The robot starts in the desired motion. Gears keep their temperature, since
+        seconds do not warm them: use `warmed` for that.
 
         Args:
             trajectory: Desired motion.
             seed: Seed of the sensors' noise.
             servo: Controller; `self.servo()` if None.
-            feed_forward: Function from the desired motion to forces that are fed forward, such as
-                `fit.predict`; no feed-forward if None.
+            feed_forward: Function from the desired motion to forces that are fed
+                forward, such as `fit.predict`; no feed-forward if None.
             duration: Duration of the recording [s]; that of the trajectory if None.
-            sample_time: Sample time of the recording [s], a multiple of the servo's; that of the
-                servo if None.
+            sample_time: Sample time of the recording [s], a multiple of the servo's;
+                that of the servo if None.
             substeps: Steps of the simulation in one tick of the servo.
             name: Name of the recording.
 
@@ -380,7 +412,8 @@ class VirtualRobot(Hashable):
         every = max(round(sample_time / tick), 1)
         if not abs(every * tick - sample_time) < 1e-6 * tick or not duration >= tick:
             raise InputError(
-                f"`sample_time` must be a multiple of the servo's ({tick:g} s), and `duration` at "
+                f"`sample_time` must be a multiple of the servo's ({tick:g} s), and "
+                "`duration` at "
                 f"least that, but they are {sample_time:g} s and {duration:g} s."
             )
         time = tick * np.arange(round(duration / tick))
@@ -390,7 +423,8 @@ class VirtualRobot(Hashable):
             forward = np.asarray(feed_forward(desired), np.float64)
             if forward.shape != desired.q.shape or not np.isfinite(forward).all():
                 raise InputError(
-                    f"`feed_forward` must give finite forces of shape {desired.q.shape}, but gives "
+                    "`feed_forward` must give finite forces of shape "
+                    f"{desired.q.shape}, but gives "
                     f"shape {forward.shape}."
                 )
         limits = np.asarray(self.robot.known_max_forces)
@@ -403,6 +437,11 @@ class VirtualRobot(Hashable):
         kept = slice(None, None, every)
         forces = 0.5 * (forces + np.concatenate([forces[:1], forces[:-1]]))[kept]
         log = self.sensors.record(
-            self.robot, motors[kept], forces, sample_time=every * tick, seed=seed, name=name
+            self.robot,
+            motors[kept],
+            forces,
+            sample_time=every * tick,
+            seed=seed,
+            name=name,
         )
         return Tracking(time[kept], desired[kept], actual[kept], forces, log, saturated)

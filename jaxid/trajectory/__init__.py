@@ -13,7 +13,11 @@ from .fourier import (
     fourier_series as fourier_series,
     random_fourier_series as random_fourier_series,
 )
-from .leads import LeadsBasis as LeadsBasis, WithLeads as WithLeads, with_leads as with_leads
+from .leads import (
+    LeadsBasis as LeadsBasis,
+    WithLeads as WithLeads,
+    with_leads as with_leads,
+)
 from .prescribed_tip_path import (
     Circle as Circle,
     Line as Line,

@@ -27,8 +27,10 @@ class Controller(NamedTuple):
         """Reject a robot with another number of joints, or with a prismatic one."""
         if robot.joints != self.joints or not all(robot.revolute):
             raise InputError(
-                f"`controller` moves robots of {self.joints} revolute joints, but `{robot.name}` "
-                f"has {robot.joints} joint(s), {sum(robot.revolute)} of them revolute: leave the "
+                f"`controller` moves robots of {self.joints} revolute joints, but "
+                f"`{robot.name}` "
+                f"has {robot.joints} joint(s), {sum(robot.revolute)} of them "
+                "revolute: leave the "
                 "key out, and give `sample_time`."
             )
 
@@ -43,7 +45,8 @@ def write_urscript(
     q = trajectory.sample(sample_time)[1].q
     rows = ["[" + ", ".join(f"{x:.9f}" for x in row) + "]" for row in q.tolist()]
     lines = [
-        f"# Motion of `{robot.name}`: {len(rows)} positions [rad], one in {sample_time:.6g} s.",
+        f"# Motion of `{robot.name}`: {len(rows)} positions [rad], one in "
+        f"{sample_time:.6g} s.",
         "def play_motion():",
         f"  movej({rows[0]}, a=0.5, v=0.3)",
         *(f"  servoj({row}, 0, 0, {sample_time:.6g}, 0.1, 300)" for row in rows),
@@ -53,7 +56,9 @@ def write_urscript(
     write_text(path, "\n".join(lines) + "\n")
 
 
-def write_rsi(trajectory: AbstractTrajectory, robot: Robot, path: Path, sample_time: float) -> None:
+def write_rsi(
+    trajectory: AbstractTrajectory, robot: Robot, path: Path, sample_time: float
+) -> None:
     """Write a table of corrections for RSI: degrees from the first position, one row a cycle."""
     q = trajectory.sample(sample_time)[1].q
     turned = np.rad2deg(q - q[0])

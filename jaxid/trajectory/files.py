@@ -42,8 +42,12 @@ def save_trajectory(trajectory: AbstractTrajectory, path: str | Path) -> None:
     Raises:
         InputError: If a number is not finite, or the path is a folder.
     """
-    if not all(np.isfinite(np.asarray(leaf)).all() for leaf in jax.tree.leaves(trajectory)):
-        raise InputError("a `trajectory` with numbers that are not finite cannot be saved.")
+    if not all(
+        np.isfinite(np.asarray(leaf)).all() for leaf in jax.tree.leaves(trajectory)
+    ):
+        raise InputError(
+            "a `trajectory` with numbers that are not finite cannot be saved."
+        )
     content = {"format": FORMAT, "version": VERSION, "trajectory": to_json(trajectory)}
     write_text(path, json_text(content))
 
@@ -56,7 +60,8 @@ def load_trajectory(path: str | Path) -> AbstractTrajectory:
 
     Raises:
         FileNotFoundError: If the file does not exist.
-        InputError: If it holds no trajectory, or one of another version or an unknown kind.
+        InputError: If it holds no trajectory, or one of another version or an unknown
+            kind.
     """
     if not Path(path).is_file():
         raise FileNotFoundError(f"the trajectory file `{path}` does not exist.")
@@ -66,7 +71,8 @@ def load_trajectory(path: str | Path) -> AbstractTrajectory:
             raise InputError(f'its `format` is not "{FORMAT}"')
         if content.get("version") != VERSION:
             raise InputError(
-                f"it has version {content.get('version')}, but this package reads version "
+                f"it has version {content.get('version')}, but this package reads "
+                "version "
                 f"{VERSION}: load it with the package that wrote it"
             )
         return from_json(content.get("trajectory"), AbstractTrajectory, "trajectory")
@@ -76,11 +82,16 @@ def load_trajectory(path: str | Path) -> AbstractTrajectory:
 
 
 def write_csv(
-    trajectory: AbstractTrajectory, robot: Robot, path: str | Path, *, sample_time: float
+    trajectory: AbstractTrajectory,
+    robot: Robot,
+    path: str | Path,
+    *,
+    sample_time: float,
 ) -> None:
     """Write a table of samples: time, positions, velocities and accelerations of all joints.
 
-    The header names joint and unit: `time [s],q_joint1 [rad],...,qdd_joint1 [rad/s^2],...`.
+    The header names joint and unit: `time [s],q_joint1 [rad],...,qdd_joint1
+    [rad/s^2],...`.
 
     Args:
         trajectory: Trajectory, sampled from its start to its end.
@@ -89,8 +100,8 @@ def write_csv(
         sample_time: Largest time between two samples [s].
 
     Raises:
-        InputError: If the trajectory does not move the robot's joints, or `sample_time` is not
-            positive.
+        InputError: If the trajectory does not move the robot's joints, or `sample_time`
+            is not positive.
     """
     times, motion = _sample(trajectory, robot, sample_time)
     columns = {"time [s]": times}
@@ -102,18 +113,26 @@ def write_csv(
 
 
 def write_ros(
-    trajectory: AbstractTrajectory, robot: Robot, path: str | Path, *, sample_time: float
+    trajectory: AbstractTrajectory,
+    robot: Robot,
+    path: str | Path,
+    *,
+    sample_time: float,
 ) -> None:
     """Write the ROS 2 message `trajectory_msgs/JointTrajectory` as YAML, or as a bag (`.mcap`).
 
-    The bag holds the message on the topic of a `joint_trajectory_controller`, and needs the extra
-    `logs`. YAML begins with comments that say units and cycle, and how to bring the robot to the
-    start and publish the file. Arguments are those of `write_csv`, and so are the errors.
+    The bag holds the message on the topic of a `joint_trajectory_controller`, and needs
+    the extra `logs`. YAML begins with comments that say units and cycle, and how to
+    bring the robot to the start and publish the file. Arguments are those of
+    `write_csv`, and so are the errors.
     """
     times, motion = _sample(trajectory, robot, sample_time)
     rows = (np.asarray(x).tolist() for x in (motion.q, motion.qd, motion.qdd))
     names = list(robot.joint_names)
-    message = {"header": {"stamp": _ros_time(0.0), "frame_id": ""}, "joint_names": names}
+    message = {
+        "header": {"stamp": _ros_time(0.0), "frame_id": ""},
+        "joint_names": names,
+    }
     keys = ("positions", "velocities", "accelerations", "effort", "time_from_start")
     points = [
         dict(zip(keys, (*row, [], _ros_time(t)), strict=True))
@@ -123,14 +142,16 @@ def write_ros(
         _write_bag({**message, "points": points}, Path(path))
         return
     lines = [
-        f"# {MESSAGE} of `{robot.name}`: rad (revolute joints) or m (prismatic joints), and s;",
+        f"# {MESSAGE} of `{robot.name}`: rad (revolute joints) or m (prismatic "
+        "joints), and s;",
         f"# at most {sample_time:.6g} s from one point to the next.",
         "# Move the robot slowly to the first point, then:",
         f"#   ros2 topic pub --once {TOPIC} \\",
         f'#     {MESSAGE} "$(cat FILE)"',
         *(f"{key}: {json.dumps(value)}" for key, value in message.items()),
     ]
-    # JSON's values are YAML's values, but YAML 1.1 reads `1e-05`, without a point, as text.
+    # JSON's values are YAML's values, but YAML 1.1 reads `1e-05`, without a point, as
+    # text.
     texts = (f"- {json.dumps(point, allow_nan=False)}" for point in points)
     lines += ["points:", *(re.sub(r"(?<![.\d])(\d+)e", r"\1.0e", x) for x in texts)]
     write_text(path, "\n".join(lines) + "\n")
@@ -155,10 +176,16 @@ def _write_bag(message: dict[str, Any], path: Path) -> None:
     points = []
     for point in message["points"]:
         time = typed("builtin_interfaces/msg/Duration", **point["time_from_start"])
-        arrays = {k: np.array(x, np.float64) for k, x in point.items() if k != "time_from_start"}
+        arrays = {
+            k: np.array(x, np.float64)
+            for k, x in point.items()
+            if k != "time_from_start"
+        }
         name = "trajectory_msgs/msg/JointTrajectoryPoint"
         points.append(typed(name, **arrays, time_from_start=time))
-    whole = typed(MESSAGE, header=header, joint_names=message["joint_names"], points=points)
+    whole = typed(
+        MESSAGE, header=header, joint_names=message["joint_names"], points=points
+    )
     with atomic_folder(path.parent) as folder:
         bag, plugin = folder / "bag", rosbag2.StoragePlugin.MCAP
         with rosbag2.Writer(bag, version=9, storage_plugin=plugin) as writer:
@@ -178,7 +205,8 @@ def _sample(
 ) -> tuple[np.ndarray, Motion]:
     if trajectory.joints != robot.joints:
         raise InputError(
-            f"`trajectory` must move the {robot.joints} joints of `{robot.name}`, but moves "
+            f"`trajectory` must move the {robot.joints} joints of `{robot.name}`, but "
+            "moves "
             f"{trajectory.joints}."
         )
     return trajectory.sample(sample_time)

@@ -12,7 +12,13 @@ from jaxid.errors import InputError
 from jaxid.robot.limits_and_drives import Limits
 from jaxid.robot.robot import Robot
 
-from .trajectory import AbstractBasis, Envelope, LinearTrajectory, as_scalar, stand_outside
+from .trajectory import (
+    AbstractBasis,
+    Envelope,
+    LinearTrajectory,
+    as_scalar,
+    stand_outside,
+)
 
 
 class FourierBasis(AbstractBasis):
@@ -21,8 +27,8 @@ class FourierBasis(AbstractBasis):
     $$q_i(t) = q_{i,0} + \sum_{l=1}^{N} \left( \frac{a_{i,l}}{\omega l} \sin(\omega l t)
     - \frac{b_{i,l}}{\omega l} \cos(\omega l t) \right)$$
 
-    The coefficients of a joint are its offset $q_{i,0}$ [rad or m], all $a_{i,l}$ and all
-    $b_{i,l}$ [rad/s or m/s].
+    The coefficients of a joint are its offset $q_{i,0}$ [rad or m], all $a_{i,l}$ and
+    all $b_{i,l}$ [rad/s or m/s].
 
     Attributes:
         harmonics: Number of harmonics $N$.
@@ -37,16 +43,22 @@ class FourierBasis(AbstractBasis):
 
     def __check_init__(self):
         if self.harmonics < 1:
-            raise InputError(f"`harmonics` must be at least 1, but is {self.harmonics}.")
+            raise InputError(
+                f"`harmonics` must be at least 1, but is {self.harmonics}."
+            )
         if not is_traced(self.omega) and not 0 < self.omega < math.inf:
-            raise InputError(f"`omega` must be a positive frequency [rad/s], not {self.omega:g}.")
+            raise InputError(
+                f"`omega` must be a positive frequency [rad/s], not {self.omega:g}."
+            )
 
     @property
     def duration(self) -> Float[AnyArray, ""] | float:
         """Period [s]."""
         return 2 * math.pi / self.omega
 
-    def rows(self, t: Float[AnyArray, " samples"]) -> Float[AnyArray, "4 samples variables"]:
+    def rows(
+        self, t: Float[AnyArray, " samples"]
+    ) -> Float[AnyArray, "4 samples variables"]:
         """Return a constant, sines and cosines, and their derivatives."""
         xp = namespace(t, self.omega)
         w = self.omega * np.arange(1.0, self.harmonics + 1.0)[None]
@@ -65,8 +77,8 @@ class FourierBasis(AbstractBasis):
     def envelope(self, points: int) -> Envelope:
         r"""Return samples of a period: $\max |p| \le \max_k |p(t_k)| / \cos(\pi n / M)$.
 
-        The bound holds for every trigonometric polynomial of degree n at M > 2 n equidistant points
-        (Ehlich and Zeller).
+        The bound holds for every trigonometric polynomial of degree n at M > 2 n
+        equidistant points (Ehlich and Zeller).
         """
         points = max(points, 2 * self.harmonics + 1)
         rows = np.asarray(self.rows(self.times(points)))
@@ -94,10 +106,10 @@ class PeriodsBasis(AbstractBasis):
 class RestToRestBasis(PeriodsBasis):
     r"""Whole periods of a Fourier series between standstill and standstill.
 
-    Velocity $\sum_l a_{i,l}$ and acceleration $\omega \sum_l l\, b_{i,l}$ at the start of a period
-    are zero, which Eq. 34 as printed does not require. The coefficients of a joint are its offset
-    and those along the directions that keep both conditions. Before the start and after the end the
-    robot stands still.
+    Velocity $\sum_l a_{i,l}$ and acceleration $\omega \sum_l l\, b_{i,l}$ at the start
+    of a period are zero, which Eq. 34 as printed does not require. The coefficients of
+    a joint are its offset and those along the directions that keep both conditions.
+    Before the start and after the end the robot stands still.
 
     Attributes:
         harmonics: Number of harmonics, at least 2.
@@ -110,7 +122,9 @@ class RestToRestBasis(PeriodsBasis):
 
     def __check_init__(self):
         if self.harmonics < 2:
-            raise InputError(f"`harmonics` must be at least 2, but is {self.harmonics}.")
+            raise InputError(
+                f"`harmonics` must be at least 2, but is {self.harmonics}."
+            )
 
     @property
     def duration(self) -> Float[AnyArray, ""] | float:
@@ -121,12 +135,18 @@ class RestToRestBasis(PeriodsBasis):
     def directions(self) -> Float[np.ndarray, "coefficients variables"]:
         """Orthonormal coefficients of the series that keep a joint at rest at both ends."""
         order = np.arange(1.0, self.harmonics + 1.0)
-        a, b = (np.linalg.svd(x[None])[2][1:].T for x in (np.ones(self.harmonics), order))
+        a, b = (
+            np.linalg.svd(x[None])[2][1:].T for x in (np.ones(self.harmonics), order)
+        )
         return np.asarray(block_diag(np.ones((1, 1)), a, b))
 
-    def rows(self, t: Float[AnyArray, " samples"]) -> Float[AnyArray, "4 samples variables"]:
+    def rows(
+        self, t: Float[AnyArray, " samples"]
+    ) -> Float[AnyArray, "4 samples variables"]:
         """Return sines and cosines in the directions that keep the joint at rest at both ends."""
-        return stand_outside(lambda t: self.series.rows(t) @ self.directions, t, self.duration)
+        return stand_outside(
+            lambda t: self.series.rows(t) @ self.directions, t, self.duration
+        )
 
     def envelope(self, points: int) -> Envelope:
         """Return samples of a period, as for any series."""
@@ -158,23 +178,31 @@ def fourier_series(
 
 
 def random_fourier_series(
-    robot: Robot, *, omega: float, harmonics: int = 5, reach: float = 0.95, seed: int = 0
+    robot: Robot,
+    *,
+    omega: float,
+    harmonics: int = 5,
+    reach: float = 0.95,
+    seed: int = 0,
 ) -> LinearTrajectory:
     """Draw a Fourier series that uses the limits of every joint: a start for designs and tests.
 
-    The coefficients are normal random numbers divided by the order of their harmonic. Each joint is
-    scaled until it meets its tightest limit, and its offset is uniform in the range that is left.
-    The limits hold at all times. Unknown limits are assumed, see `complete_limits`.
+    The coefficients are normal random numbers divided by the order of their harmonic.
+    Each joint is scaled until it meets its tightest limit, and its offset is uniform in
+    the range that is left. The limits hold at all times. Unknown limits are assumed,
+    see `complete_limits`.
 
     Args:
-        robot: Robot whose limits of position, velocity and acceleration hold; forces are ignored.
+        robot: Robot whose limits of position, velocity and acceleration hold; forces
+            are ignored.
         omega: Ground frequency [rad/s].
         harmonics: Number of harmonics.
         reach: Fraction of every limit that may be used, from 0 to 1.
         seed: Seed of the coefficients and offsets.
 
     Raises:
-        InputError: If `omega` or `harmonics` is not positive, or `reach` not between 0 and 1.
+        InputError: If `omega` or `harmonics` is not positive, or `reach` not between 0
+            and 1.
     """
     if not 0 < reach <= 1:
         raise InputError(f"`reach` must be above 0 and at most 1, but is {reach:g}.")
@@ -183,7 +211,9 @@ def random_fourier_series(
     centre, half = 0.5 * (low + high), reach * 0.5 * (high - low)
 
     random = np.random.default_rng(seed)
-    a, b = random.standard_normal((2, robot.joints, harmonics)) / np.arange(1, harmonics + 1)
+    a, b = random.standard_normal((2, robot.joints, harmonics)) / np.arange(
+        1, harmonics + 1
+    )
     x = np.concatenate([np.zeros((robot.joints, 1)), a, b], axis=1)
     rows, factor = basis.envelope(512)
     q, qd, qdd = (x @ part.T for part in rows[:3])
@@ -200,8 +230,8 @@ def random_fourier_series(
 def complete_limits(robot: Robot) -> Limits:
     """Return the limits of a robot, with assumed positions, speeds and accelerations if unknown.
 
-    Assumed are: half a turn or 1 m to either side; 90 degrees/s or 0.5 m/s; the acceleration that
-    reaches the largest speed in 0.25 s.
+    Assumed are: half a turn or 1 m to either side; 90 degrees/s or 0.5 m/s; the
+    acceleration that reaches the largest speed in 0.25 s.
     """
     turns, limits = np.array(robot.revolute, bool), robot.limits
     half, speed = np.where(turns, math.pi, 1.0), np.where(turns, math.pi / 2, 0.5)

@@ -19,8 +19,8 @@ from .trajectory import AbstractTrajectory, Envelope, States, as_scalar, stand_o
 def _lead(state: Any, duration: Any, x: Any, sign: int = 1) -> tuple:
     r"""Return position, velocity, acceleration and jerk of a lead at times x from standstill [s].
 
-    The velocity is $\alpha x^2 + \beta x^3$. The lead meets a motion in a state (q, qd, qdd). A
-    lead-out (`sign` -1) is a lead-in (1) that is run backwards.
+    The velocity is $\alpha x^2 + \beta x^3$. The lead meets a motion in a state (q, qd,
+    qdd). A lead-out (`sign` -1) is a lead-in (1) that is run backwards.
     """
     q, qd, qdd = state
     alpha, beta = _cubic(sign * qd, qdd, duration)
@@ -33,15 +33,18 @@ def _lead(state: Any, duration: Any, x: Any, sign: int = 1) -> tuple:
 
 
 def _cubic(qd: Any, qdd: Any, duration: Any) -> tuple[Any, Any]:
-    return 3 * qd / duration**2 - qdd / duration, qdd / duration**2 - 2 * qd / duration**3
+    return (
+        3 * qd / duration**2 - qdd / duration,
+        qdd / duration**2 - 2 * qd / duration**3,
+    )
 
 
 class LeadsBasis(PeriodsBasis):
     """Fourier series with a lead-in and a lead-out; the coefficients are those of the series.
 
-    All joints start together and take the time `lead` into the series, and out of it at the end.
-    Limits and constraints hold in the leads as well, unlike with `with_leads`, which finds leads
-    for a given motion. One period between the leads is measured.
+    All joints start together and take the time `lead` into the series, and out of it at
+    the end. Limits and constraints hold in the leads as well, unlike with `with_leads`,
+    which finds leads for a given motion. One period between the leads is measured.
 
     Attributes:
         harmonics: Number of harmonics.
@@ -53,25 +56,33 @@ class LeadsBasis(PeriodsBasis):
         InputError: If one of them is not positive.
     """
 
-    lead: Float[AnyArray, ""] = eqx.field(converter=as_scalar, default=0.5, kw_only=True)
+    lead: Float[AnyArray, ""] = eqx.field(
+        converter=as_scalar, default=0.5, kw_only=True
+    )
 
     def __check_init__(self):
         if not is_traced(self.lead) and not 0 < self.lead < math.inf:
-            raise InputError(f"`lead` must be a positive time [s], but is {self.lead:g}.")
+            raise InputError(
+                f"`lead` must be a positive time [s], but is {self.lead:g}."
+            )
 
     @property
     def duration(self) -> Float[AnyArray, ""] | float:
         """Time from standstill to standstill [s]."""
         return self.periods * self.series.duration + 2 * self.lead
 
-    def rows(self, t: Float[AnyArray, " samples"]) -> Float[AnyArray, "4 samples variables"]:
+    def rows(
+        self, t: Float[AnyArray, " samples"]
+    ) -> Float[AnyArray, "4 samples variables"]:
         """Return the series, or the polynomials that lead into it and out of it."""
 
         def inside(t: AnyArray) -> AnyArray:
             xp = namespace(t, self.omega, self.lead)
             early, late = t < self.lead, t > self.duration - self.lead
             inner = self.series.rows(t - self.lead)
-            outer = xp.where(late[None, :, None], self._lead_rows(self.duration - t, -1), inner)
+            outer = xp.where(
+                late[None, :, None], self._lead_rows(self.duration - t, -1), inner
+            )
             return xp.where(early[None, :, None], self._lead_rows(t, 1), outer)
 
         return stand_outside(inside, t, self.duration)
@@ -84,8 +95,8 @@ class LeadsBasis(PeriodsBasis):
     def envelope(self, points: int) -> Envelope:
         """Return samples of a period, as for any series, and control points of the leads.
 
-        A polynomial lies within the range of its control points (Bernstein). A lead is split into
-        pieces, each of which is bounded by its own control points.
+        A polynomial lies within the range of its control points (Bernstein). A lead is
+        split into pieces, each of which is bounded by its own control points.
         """
         degree, pieces = 4, 8
         rows, factor = self.series.envelope(points)
@@ -97,7 +108,9 @@ class LeadsBasis(PeriodsBasis):
         starts = self.lead / pieces * np.arange(pieces)[:, None]
         t = starts + self.lead / pieces * u
         leads = [to_points @ self._lead_rows(x, sign) for x in t for sign in (1, -1)]
-        return tuple(np.concatenate(parts) for parts in zip(rows, *leads, strict=True)), factor
+        return tuple(
+            np.concatenate(parts) for parts in zip(rows, *leads, strict=True)
+        ), factor
 
     def times(self, samples: int) -> Float[np.ndarray, " samples"]:
         """Return equidistant times over one period between the leads [s]."""
@@ -113,8 +126,8 @@ class LeadsBasis(PeriodsBasis):
 class WithLeads(AbstractTrajectory):
     """A motion between a lead-in from standstill and a lead-out to standstill, smooth throughout.
 
-    Position, velocity and acceleration are continuous. Every joint takes its own time; all arrive
-    together. `with_leads` chooses the times within limits.
+    Position, velocity and acceleration are continuous. Every joint takes its own time;
+    all arrive together. `with_leads` chooses the times within limits.
 
     Attributes:
         inner: Motion between the leads.
@@ -145,7 +158,9 @@ class WithLeads(AbstractTrajectory):
         """Return the motion between the leads, and the leads; standstill outside."""
         begin, end = self.window
         time = t[:, None]
-        lead_in, lead_out = (jnp.asarray(x)[None] for x in (self.lead_in, self.lead_out))
+        lead_in, lead_out = (
+            jnp.asarray(x)[None] for x in (self.lead_in, self.lead_out)
+        )
         first = self.inner.states(jnp.reshape(self.start, 1))
         last = self.inner.states(jnp.reshape(self.start + self.length, 1))
         since = jnp.clip(time - begin + lead_in, 0.0, lead_in)
@@ -153,17 +168,21 @@ class WithLeads(AbstractTrajectory):
         early, late = _lead(first, lead_in, since), _lead(last, lead_out, left, -1)
         inner = self.inner.states(self.start + t - begin)
         parts = zip(early, inner, late, strict=False)
-        return tuple(jnp.where(time < begin, x, jnp.where(time > end, z, y)) for x, y, z in parts)
+        return tuple(
+            jnp.where(time < begin, x, jnp.where(time > end, z, y)) for x, y, z in parts
+        )
 
 
-def with_leads(series: AbstractTrajectory, robot: Robot, *, periods: int = 1) -> WithLeads:
+def with_leads(
+    series: AbstractTrajectory, robot: Robot, *, periods: int = 1
+) -> WithLeads:
     """Add a lead-in and a lead-out to a periodic motion, within the robot's limits.
 
-    The motion enters the period at the instant that makes the leads shortest. Limits of position,
-    velocity, acceleration and jerk hold in the leads at all times: extremes of the polynomials are
-    computed, not sampled. Unknown limits are assumed as in `random_fourier_series`. The robot must
-    be brought to the start of the lead-in, `motion(0.0).q`. Collisions in the leads are not
-    checked.
+    The motion enters the period at the instant that makes the leads shortest. Limits of
+    position, velocity, acceleration and jerk hold in the leads at all times: extremes
+    of the polynomials are computed, not sampled. Unknown limits are assumed as in
+    `random_fourier_series`. The robot must be brought to the start of the lead-in,
+    `motion(0.0).q`. Collisions in the leads are not checked.
 
     Args:
         series: Periodic motion, for instance of a `FourierBasis`.
@@ -171,14 +190,16 @@ def with_leads(series: AbstractTrajectory, robot: Robot, *, periods: int = 1) ->
         periods: Number of periods between the leads.
 
     Raises:
-        InputError: If there is no period, the motion is not one of this robot, or no instant of
-            the period can be reached within the limits; the message names the joint.
+        InputError: If there is no period, the motion is not one of this robot, or no
+            instant of the period can be reached within the limits; the message names
+            the joint.
     """
     if periods < 1:
         raise InputError(f"`periods` must be at least 1, but is {periods}.")
     if series.joints != robot.joints:
         raise InputError(
-            f"`series` must move the robot's {robot.joints} joints, but moves {series.joints}."
+            f"`series` must move the robot's {robot.joints} joints, but moves "
+            f"{series.joints}."
         )
     period = float(series.duration)
     phases = period * np.arange(360) / 360
@@ -195,11 +216,15 @@ def with_leads(series: AbstractTrajectory, robot: Robot, *, periods: int = 1) ->
         nearest = int(np.argmin(excess.max(axis=1)))
         joint = int(np.argmax(excess[nearest]))
         raise InputError(
-            "no instant of the period can be reached from standstill within the limits: at best "
+            "no instant of the period can be reached from standstill within the "
+            "limits: at best "
             f"joint `{robot.joint_names[joint]}` exceeds one of them by "
-            f"{100 * excess[nearest, joint]:.3g} %: take a motion that uses less of the limits."
+            f"{100 * excess[nearest, joint]:.3g} %: take a motion that uses less of "
+            "the limits."
         )
-    return WithLeads(series, phases[best], periods * period, lead_in[best], lead_out[best])
+    return WithLeads(
+        series, phases[best], periods * period, lead_in[best], lead_out[best]
+    )
 
 
 def _shortest_leads(

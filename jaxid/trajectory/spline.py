@@ -27,8 +27,8 @@ class PiecewisePolynomial(AbstractTrajectory):
 
     Attributes:
         times: Start of each polynomial, and the end of the last one [s].
-        coefficients: Coefficients of the powers of the time since a polynomial's start, highest
-            power first.
+        coefficients: Coefficients of the powers of the time since a polynomial's start,
+            highest power first.
     """
 
     times: Float[AnyArray, " knots"]
@@ -54,7 +54,9 @@ def _evaluate(
     times, coefficients, t = (xp.asarray(x) for x in (times, coefficients, t))
     # Written with `where`, because the derivative of `clip` at its ends is one half.
     clipped = xp.where(t < times[0], times[0], xp.where(t > times[-1], times[-1], t))
-    piece = xp.clip(xp.searchsorted(times, clipped, side="right") - 1, 0, len(times) - 2)
+    piece = xp.clip(
+        xp.searchsorted(times, clipped, side="right") - 1, 0, len(times) - 2
+    )
     x = (clipped - times[piece])[:, None]
     c = coefficients[:, piece]
     value, first, second, third = c[0], *(xp.zeros_like(c[0]) for _ in range(3))
@@ -64,15 +66,18 @@ def _evaluate(
         first = first * x + value
         value = value * x + coefficient
     inside = ((t >= times[0]) & (t <= times[-1]))[:, None]
-    return xp.stack([value, *(xp.where(inside, d, 0.0) for d in (first, second, third))])
+    return xp.stack(
+        [value, *(xp.where(inside, d, 0.0) for d in (first, second, third))]
+    )
 
 
 class RestToRestSplineBasis(AbstractBasis):
     """Quintic B-splines that stand still at both ends.
 
-    The coefficients of a joint are its start, the handles that attract the motion, and its end
-    [rad or m]: the motion stays within their range. Start and end are three control points each, so
-    that velocity and acceleration are zero there. The knots are equidistant.
+    The coefficients of a joint are its start, the handles that attract the motion, and
+    its end [rad or m]: the motion stays within their range. Start and end are three
+    control points each, so that velocity and acceleration are zero there. The knots are
+    equidistant.
 
     Attributes:
         points: Number of coefficients of a joint.
@@ -89,9 +94,13 @@ class RestToRestSplineBasis(AbstractBasis):
         if self.points < 2:
             raise InputError(f"`points` must be at least 2, but is {self.points}.")
         if not is_traced(self.duration) and not 0 < self.duration < np.inf:
-            raise InputError(f"`duration` must be positive [s], but is {self.duration:g}.")
+            raise InputError(
+                f"`duration` must be positive [s], but is {self.duration:g}."
+            )
 
-    def rows(self, t: Float[AnyArray, " samples"]) -> Float[AnyArray, "4 samples variables"]:
+    def rows(
+        self, t: Float[AnyArray, " samples"]
+    ) -> Float[AnyArray, "4 samples variables"]:
         """Return the motions of unit coefficients."""
         starts, coefficients = _unit_polynomials(self.points)
         derivatives = _evaluate(starts, coefficients, t / self.duration)
@@ -109,9 +118,12 @@ class RestToRestSplineBasis(AbstractBasis):
             degree = DEGREE - order
             knots = _clamped_knots(spans * finer, degree)
             count = len(knots) - degree - 1
-            # A spline of the coarse knots is one of the fine knots as well: interpolation finds its
-            # fine control points. At Greville's abscissae the system is well conditioned.
-            abscissae = np.array([knots[i + 1 : i + 1 + degree].mean() for i in range(count)])
+            # A spline of the coarse knots is one of the fine knots as well:
+            # interpolation finds its fine control points. At Greville's abscissae the
+            # system is well conditioned.
+            abscissae = np.array(
+                [knots[i + 1 : i + 1 + degree].mean() for i in range(count)]
+            )
             fine = BSpline.design_matrix(abscissae, knots, degree).toarray()
             values = np.asarray(self.rows(abscissae * self.duration)[order])
             rows.append(np.linalg.solve(fine, values))
@@ -126,15 +138,19 @@ def spline_through(points: Numbers, duration: float) -> LinearTrajectory:
         duration: Time from standstill to standstill [s].
 
     Raises:
-        InputError: If there are not at least two points, or the duration is not positive.
+        InputError: If there are not at least two points, or the duration is not
+            positive.
     """
     way = np.asarray(as_array("points", points), np.float64)
     if way.ndim != 2 or len(way) < 2 or not np.isfinite(way).all():
         raise InputError(
-            f"`points` must hold two or more rows of finite numbers, but has shape {way.shape}."
+            "`points` must hold two or more rows of finite numbers, but has shape "
+            f"{way.shape}."
         )
     rest = [(order, np.zeros(way.shape[1])) for order in (1, 2)]
-    spline = make_interp_spline(np.linspace(0.0, 1.0, len(way)), way, DEGREE, bc_type=(rest, rest))
+    spline = make_interp_spline(
+        np.linspace(0.0, 1.0, len(way)), way, DEGREE, bc_type=(rest, rest)
+    )
     # The first three control points are the start, and the last three are the end.
     handles = np.concatenate([way[:1], spline.c[3:-3], way[-1:]])
     return RestToRestSplineBasis(len(handles), duration).trajectory(handles.T)
@@ -143,8 +159,11 @@ def spline_through(points: Numbers, duration: float) -> LinearTrajectory:
 def spline_polynomials(spline: BSpline) -> Float[np.ndarray, "powers pieces columns"]:
     """Return the pieces of a clamped quintic spline in powers of the time since their start."""
     knots = spline.t[DEGREE:-DEGREE]
-    lower = [spline.derivative(k)(knots[:-1]) / math.factorial(k) for k in range(1, DEGREE)]
-    # The highest derivative jumps at the knots: rounding would decide which piece is evaluated.
+    lower = [
+        spline.derivative(k)(knots[:-1]) / math.factorial(k) for k in range(1, DEGREE)
+    ]
+    # The highest derivative jumps at the knots: rounding would decide which piece is
+    # evaluated.
     middle = 0.5 * (knots[:-1] + knots[1:])
     highest = spline.derivative(DEGREE)(middle) / math.factorial(DEGREE)
     return np.stack([highest, *lower[::-1], spline(knots[:-1])])
@@ -156,9 +175,13 @@ def _unit_polynomials(points: int) -> tuple[np.ndarray, np.ndarray]:
     unit = np.eye(points)
     control_points = np.concatenate([unit[:1], unit[:1], unit, unit[-1:], unit[-1:]])
     knots = _clamped_knots(points + 4 - DEGREE, DEGREE)
-    return knots[DEGREE:-DEGREE], spline_polynomials(BSpline(knots, control_points, DEGREE))
+    return knots[DEGREE:-DEGREE], spline_polynomials(
+        BSpline(knots, control_points, DEGREE)
+    )
 
 
 def _clamped_knots(spans: int, degree: int) -> np.ndarray:
     """Return equidistant knots of a clamped spline over [0, 1]."""
-    return np.concatenate([np.zeros(degree), np.linspace(0.0, 1.0, spans + 1), np.ones(degree)])
+    return np.concatenate(
+        [np.zeros(degree), np.linspace(0.0, 1.0, spans + 1), np.ones(degree)]
+    )

@@ -14,7 +14,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Array, Float, Hashable, is_traced, namespace, require_float64
+from jaxid.arrays import (
+    AnyArray,
+    Array,
+    Float,
+    Hashable,
+    is_traced,
+    namespace,
+    require_float64,
+)
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
 
@@ -48,12 +56,18 @@ class AbstractTrajectory(Hashable):
         """Number of joints."""
         return jax.eval_shape(lambda: self.motion(0.0)).q.shape[-1]
 
-    def jerk(self, t: Float[AnyArray, "*batch"] | float | int) -> Float[Array, "*batch joints"]:
+    def jerk(
+        self, t: Float[AnyArray, "*batch"] | float | int
+    ) -> Float[Array, "*batch joints"]:
         """Return the rate of change of the accelerations [rad/s³ or m/s³] at times [s]."""
         times = jnp.asarray(t, float)
-        return jax.jvp(lambda t: self.motion(t).qdd, (times,), (jnp.ones_like(times),))[1]
+        return jax.jvp(lambda t: self.motion(t).qdd, (times,), (jnp.ones_like(times),))[
+            1
+        ]
 
-    def sample(self, sample_time: float) -> tuple[Float[np.ndarray, " samples"], Motion]:
+    def sample(
+        self, sample_time: float
+    ) -> tuple[Float[np.ndarray, " samples"], Motion]:
         """Return times [s] from the start to the end, both included, and the motion at them.
 
         Args:
@@ -65,7 +79,9 @@ class AbstractTrajectory(Hashable):
         """
         require_float64("sampling a trajectory")
         if not 0 < sample_time < np.inf:
-            raise InputError(f"`sample_time` must be positive [s], but is {sample_time:g}.")
+            raise InputError(
+                f"`sample_time` must be positive [s], but is {sample_time:g}."
+            )
         duration = float(self.duration)
         # Rounding may make a duration slightly longer: that needs no further sample.
         steps = max(math.ceil(duration / sample_time * (1 - 1e-9)), 1)
@@ -82,32 +98,42 @@ def _motion(trajectory: AbstractTrajectory, t: Array) -> Motion:
 class Segments(AbstractTrajectory):
     """Trajectories that follow one another without a pause.
 
-    Before the start the motion is that of the first member, after the end that of the last one.
+    Before the start the motion is that of the first member, after the end that of the
+    last one.
 
     Attributes:
         members: Trajectories in the order in which they are run.
 
     Raises:
-        InputError: If there is no member, or one does not start as the one before it ends: with the
-            same coordinates, velocities and accelerations, up to 1e-6.
+        InputError: If there is no member, or one does not start as the one before it
+            ends: with the same coordinates, velocities and accelerations, up to 1e-6.
     """
 
     members: tuple[AbstractTrajectory, ...] = eqx.field(converter=tuple)
 
     def __check_init__(self):
         if not self.members:
-            raise InputError("`members` must hold at least one trajectory, but is empty.")
+            raise InputError(
+                "`members` must hold at least one trajectory, but is empty."
+            )
         if is_traced(self.members):
             return
         for k, (before, after) in enumerate(itertools.pairwise(self.members), 1):
             end, start = before.motion(before.duration), after.motion(0.0)
             if end.joints != start.joints:
-                raise InputError(f"`members` {k} and {k + 1} must move the same joints.")
-            for name, field in (("coordinate", "q"), ("velocity", "qd"), ("acceleration", "qdd")):
+                raise InputError(
+                    f"`members` {k} and {k + 1} must move the same joints."
+                )
+            for name, field in (
+                ("coordinate", "q"),
+                ("velocity", "qd"),
+                ("acceleration", "qdd"),
+            ):
                 jump = np.abs(np.subtract(getattr(start, field), getattr(end, field)))
                 if jump.max() > 1e-6:
                     raise InputError(
-                        f"the {name} of joint {int(jump.argmax()) + 1} jumps by {jump.max():.3g} "
+                        f"the {name} of joint {int(jump.argmax()) + 1} jumps by "
+                        f"{jump.max():.3g} "
                         f"between `members` {k} and {k + 1}: put a spline between them."
                     )
 
@@ -141,7 +167,10 @@ class PaddedToCycle(AbstractTrajectory):
     @property
     def duration(self) -> float:
         """First whole number of cycles in which the motion has ended [s]."""
-        return count_cycles(float(self.inner.duration), self.sample_time) * self.sample_time
+        return (
+            count_cycles(float(self.inner.duration), self.sample_time)
+            * self.sample_time
+        )
 
     def states(self, t: Float[AnyArray, " samples"]) -> States:
         """Return the motion, and its final pose after its end."""
@@ -161,11 +190,12 @@ Envelope = tuple[tuple[Float[np.ndarray, "rows variables"], ...], float]
 class AbstractBasis(eqx.Module):
     """A family of trajectories: functions of time that are the same for all joints.
 
-    The coefficients of a trajectory are a matrix x [joints, variables]. Limits of position,
-    velocity, acceleration and jerk are linear in them.
+    The coefficients of a trajectory are a matrix x [joints, variables]. Limits of
+    position, velocity, acceleration and jerk are linear in them.
 
     Attributes:
-        duration: Time from the start of the motion to its end; the period of a periodic one [s].
+        duration: Time from the start of the motion to its end; the period of a periodic
+            one [s].
     """
 
     if TYPE_CHECKING:
@@ -177,7 +207,9 @@ class AbstractBasis(eqx.Module):
         duration: eqx.AbstractVar[float]
 
     @abstractmethod
-    def rows(self, t: Float[AnyArray, " samples"]) -> Float[AnyArray, "4 samples variables"]:
+    def rows(
+        self, t: Float[AnyArray, " samples"]
+    ) -> Float[AnyArray, "4 samples variables"]:
         """Return position, velocity, acceleration and jerk of every function at times [s].
 
         Times in NumPy give rows in NumPy.
@@ -187,11 +219,13 @@ class AbstractBasis(eqx.Module):
     def envelope(self, points: int) -> Envelope:
         """Return rows whose largest value bounds the motion at all times, and their factor.
 
-        For coefficients x of a joint, |f(t) - c| <= factor * max |rows[k] @ x - c| at every time t,
-        where f is the derivative of order k (from 0 to 3) of the joint's motion and c any constant.
+        For coefficients x of a joint, |f(t) - c| <= factor * max |rows[k] @ x - c| at
+        every time t, where f is the derivative of order k (from 0 to 3) of the joint's
+        motion and c any constant.
 
         Args:
-            points: Approximate number of rows for each order; more rows give tighter bounds.
+            points: Approximate number of rows for each order; more rows give tighter
+                bounds.
         """
 
     def trajectory(self, x: Float[AnyArray, "joints variables"]) -> "LinearTrajectory":
@@ -214,19 +248,27 @@ class AbstractBasis(eqx.Module):
     def retimings(self) -> Float[np.ndarray, "retimings variables variables"]:
         """Return maps to the coefficients of the same motion begun later or run backwards.
 
-        Only maps that stay in the family are returned: a periodic motion may begin at any of 40
-        times, a motion between standstills may run backwards. The first map changes nothing. All of
-        them keep the limits of the joint.
+        Only maps that stay in the family are returned: a periodic motion may begin at
+        any of 40 times, a motion between standstills may run backwards. The first map
+        changes nothing. All of them keep the limits of the joint.
         """
         shifts, tolerance = 40, 1e-9
         part = -(-4 * self.variables // shifts)
         step = float(self.duration) / (shifts * part)
         rows = np.asarray(self.rows((np.arange(shifts * part) + 0.5) * step)[0])
         inverse, size = np.linalg.pinv(rows), np.abs(rows).max()
-        moved = [np.roll(r, k * part, axis=0) for r in (rows, rows[::-1]) for k in range(shifts)]
+        moved = [
+            np.roll(r, k * part, axis=0)
+            for r in (rows, rows[::-1])
+            for k in range(shifts)
+        ]
         maps = [(inverse @ wanted, wanted) for wanted in moved]
         return np.array(
-            [T for T, wanted in maps if np.abs(rows @ T - wanted).max() <= tolerance * size]
+            [
+                T
+                for T, wanted in maps
+                if np.abs(rows @ T - wanted).max() <= tolerance * size
+            ]
         )
 
 
@@ -253,7 +295,9 @@ class LinearTrajectory(AbstractTrajectory):
 
 
 def stand_outside(
-    rows: Callable[[AnyArray], AnyArray], t: Float[AnyArray, " samples"], duration: AnyArray | float
+    rows: Callable[[AnyArray], AnyArray],
+    t: Float[AnyArray, " samples"],
+    duration: AnyArray | float,
 ) -> Float[AnyArray, "4 samples variables"]:
     """Return rows of a motion that stands still before zero and after its duration [s]."""
     xp = namespace(t, as_scalar(duration))

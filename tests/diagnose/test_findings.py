@@ -68,9 +68,13 @@ def test_sane_logs_have_none_however_coarse(count):
 def test_joints_that_take_turns_stand_and_are_not_held():
     """They stop as gently as ever, and stand exactly, while others move."""
     way = np.concatenate([np.linspace(0, 1, 800), np.ones(400), np.linspace(1, 0, 800)])
-    turns = np.stack([np.roll(3 * way**2 - 2 * way**3, 250 * j) for j in range(7)], axis=1)
+    turns = np.stack(
+        [np.roll(3 * way**2 - 2 * way**3, 250 * j) for j in range(7)], axis=1
+    )
     turns[:, 1:] = np.where(T[:, None] < 1.25 * np.arange(1, 7), 0.0, turns[:, 1:])
-    assert [text for _, text in faults(turns, TAU[: len(turns)]) if "angle" in text] == []
+    assert [
+        text for _, text in faults(turns, TAU[: len(turns)]) if "angle" in text
+    ] == []
 
 
 def test_held_angles_are_named_with_their_times():
@@ -109,7 +113,10 @@ def test_turns_that_start_again_are_named(on_motor_side):
     ((joint, text),) = faults(angles, angles_on_motor_side=on_motor_side)
     owner = "the motor of joint" if on_motor_side else "joint"
     assert joint == 1
-    assert f"the angle of {owner} `{ROBOT.joint_names[1]}` jumps by a full turn (6.283)" in text
+    assert (
+        f"the angle of {owner} `{ROBOT.joint_names[1]}` jumps by a full turn (6.283)"
+        in text
+    )
     assert any("a full turn (360)" in text for _, text in faults(np.rad2deg(angles)))
 
 
@@ -139,7 +146,9 @@ def test_forces_that_are_cut_off_are_recognised(level):
 
 
 def lost(angles, **more):
-    return clock_findings(Recording.of(angles, TAU[: len(angles)], sample_time=DT, **more))
+    return clock_findings(
+        Recording.of(angles, TAU[: len(angles)], sample_time=DT, **more)
+    )
 
 
 @pytest.mark.parametrize("count", [0.0, 1e-4, 2e-3])
@@ -161,12 +170,15 @@ def test_slow_motion_in_increments_of_an_encoder_loses_no_rows():
 
 
 @pytest.mark.parametrize(
-    ("samples", "factor", "words"), [(0, 1, ""), (8, 1, " ms later"), (0, 2, "are 2 times")]
+    ("samples", "factor", "words"),
+    [(0, 1, ""), (8, 1, " ms later"), (0, 2, "are 2 times")],
 )
 def test_velocities_are_compared_with_the_angles(samples, factor, words):
     velocities = factor * np.roll(np.gradient(Q, DT, axis=0), samples, axis=0)
     log = Recording.of(Q, TAU, sample_time=DT, velocities=velocities)
-    found = [text for text in diagnose(log, ROBOT).findings if "the velocities of" in text]
+    found = [
+        text for text in diagnose(log, ROBOT).findings if "the velocities of" in text
+    ]
     assert all(words in text for text in found)
     assert len(found) == (7 if words else 0)
 

@@ -16,7 +16,8 @@ from jaxid.robot.limits_and_drives import Drives, Limits
 from jaxid.robot.robot import Robot
 from jaxid.trajectory.fourier import random_fourier_series
 
-# Forces of a joint act on its neighbours; the last two motors move the last joint together.
+# Forces of a joint act on its neighbours; the last two motors move the last joint
+# together.
 COUPLED = np.diag([50.0, -60.0, 40.0, 30.0])
 COUPLED[3, 2] = 30.0
 AXES = np.array([[0.0, 0, 1], [0, 1, 0], [0, 1, 0], [1, 0, 0]])
@@ -35,7 +36,9 @@ ROBOT = Robot(
     ),
     drives=Drives(4, reduction=COUPLED),
 )
-BASE = base_parameters(Model(ROBOT, (RigidBodies(), ViscousFriction(), CoulombFriction())))
+BASE = base_parameters(
+    Model(ROBOT, (RigidBodies(), ViscousFriction(), CoulombFriction()))
+)
 DT = 0.005
 
 
@@ -47,11 +50,15 @@ def motors():
     motion = random_fourier_series(ROBOT, omega=0.6, seed=5).motion(t)
     sizes = {"m": 2.0, "mx": 0.1, "my": 0.2, "mz": 0.3, "A": 0.1, "B": 0.1, "C": 0.1}
     sizes |= {"fv": 1.0, "fc": 2.0}
-    p = np.array([sizes.get(name.rstrip("0123456789"), 0.0) for name in model.parameter_names])
+    p = np.array(
+        [sizes.get(name.rstrip("0123456789"), 0.0) for name in model.parameter_names]
+    )
     forces = np.asarray(model.inverse_dynamics(p, motion))
     forces = forces + np.random.default_rng(0).normal(0.0, 0.3, forces.shape)
     drives = ROBOT.drives
-    return np.asarray(drives.motor_angles(motion.q)), np.asarray(drives.motor_torques(forces))
+    return np.asarray(drives.motor_angles(motion.q)), np.asarray(
+        drives.motor_torques(forces)
+    )
 
 
 def log_of(angles, forces, angles_on_motor_side=True, forces_on_motor_side=True):
@@ -109,18 +116,25 @@ def test_motors_columns_that_are_exchanged_are_found(motors, said):
 def test_units_and_sides_are_found(motors, said):
     angles, forces = motors
     (sentence,) = said(np.rad2deg(angles), forces)
-    assert "the angles of the log seem to be in deg (`recording.angle_unit`)" in sentence
+    assert (
+        "the angles of the log seem to be in deg (`recording.angle_unit`)" in sentence
+    )
     (sentence,) = said(angles, forces, angles_on_motor_side=False)
     assert "the angles of the log seem to be the motors' (`recording.side`" in sentence
     (sentence,) = said(angles, forces, forces_on_motor_side=False)
-    assert "the forces of the log seem to be the motors' (`recording.forces_side = \"mo" in sentence
+    assert (
+        "the forces of the log seem to be the motors' (`recording.forces_side = \"mo"
+        in sentence
+    )
 
 
 def test_whole_joints_and_zeros_of_angles_are_found(motors, said):
     angles, forces = motors
     order = [1, 0, 2, 3]
     (sentence,) = said(angles[:, order], forces[:, order])
-    assert sentence.startswith("angles and forces of joints `joint1` and `joint2` seem to be")
+    assert sentence.startswith(
+        "angles and forces of joints `joint1` and `joint2` seem to be"
+    )
     q = np.asarray(ROBOT.drives.joint_angles(angles)) - np.pi / 2 * (np.arange(4) == 2)
     (sentence,) = said(np.asarray(ROBOT.drives.motor_angles(q)), forces)
     assert sentence.startswith("the angle of joint `joint3` seems to lack 90 degrees")
@@ -132,7 +146,9 @@ def test_mistakes_of_any_amount_are_found(motors, said):
     (sentence,) = said(np.asarray(ROBOT.drives.motor_angles(q)), forces)
     assert "the angle of joint `joint3` seems to lack 17 degrees" in sentence
     (sentence,) = said(angles, forces * [1.0, 1.5, 1.0, 1.0])
-    assert sentence.startswith("the gain of the force of joint `joint2` seems to be 1.5")
+    assert sentence.startswith(
+        "the gain of the force of joint `joint2` seems to be 1.5"
+    )
     (sentence,) = said(angles[8:], forces[:-8])
     assert sentence.startswith(
         "the forces of the log seem to be late (`recording.force_delay = 0.0"
@@ -143,17 +159,21 @@ def test_logs_are_judged_together_and_the_wrong_one_is_named(motors):
     angles, forces = motors
     pairs = [log_of(angles, forces), log_of(angles, forces * [1.0, 1.0, 1.0, -1.0])]
     logs = [
-        observations.replace(name=name) for name, (_, observations) in zip("ab", pairs, strict=True)
+        observations.replace(name=name)
+        for name, (_, observations) in zip("ab", pairs, strict=True)
     ]
     examined = [
-        diagnose(log, ROBOT, observations=o) for (log, _), o in zip(pairs, logs, strict=True)
+        diagnose(log, ROBOT, observations=o)
+        for (log, _), o in zip(pairs, logs, strict=True)
     ]
     found, _ = mistakes_in_logs(examined, identify(BASE, logs))
     assert any(
         text.startswith("b: the sign of the force of joint `joint4` seems to be wrong")
         for text in found
     )
-    found, notes = mistakes_in_logs([examined[0], examined[0]], identify(BASE, logs[:1]))
+    found, notes = mistakes_in_logs(
+        [examined[0], examined[0]], identify(BASE, logs[:1])
+    )
     assert found == ()
     # With so much noise, not even twice of what is missed would be sure.
     assert "a zero that is off by 11 degrees (any joint)" in notes[0]
@@ -183,7 +203,9 @@ def described(**change):
     return mistakes
 
 
-@pytest.mark.parametrize("gravity", [(0.0, 0.0, 9.81), (9.81, 0.0, 0.0), (0.0, -9.81, 0.0)])
+@pytest.mark.parametrize(
+    "gravity", [(0.0, 0.0, 9.81), (9.81, 0.0, 0.0), (0.0, -9.81, 0.0)]
+)
 def test_gravity_is_named_and_not_a_sign(motors, gravity):
     (sentence,) = described(gravity=np.array(gravity))(motors)
     assert sentence.startswith("gravity seems to be [0, 0, -9.81] (`robot.gravity`)")
@@ -196,7 +218,9 @@ def test_an_axis_is_named_and_not_a_sign(motors, joint, axis, words):
     wrong = AXES.copy()
     wrong[joint] = axis
     (sentence,) = described(axis=wrong)(motors)
-    assert sentence.startswith(f"the axis of joint `joint{joint + 1}` seems to be {words}")
+    assert sentence.startswith(
+        f"the axis of joint `joint{joint + 1}` seems to be {words}"
+    )
 
 
 def test_what_no_single_mistake_explains_is_no_cure(motors):
@@ -209,10 +233,15 @@ def test_what_no_single_mistake_explains_is_no_cure(motors):
     assert "of joint `joint" in sentence
 
 
-@pytest.mark.parametrize(("factor", "words"), [(1e3, "all joints need"), (1e-3, "no joint needs")])
+@pytest.mark.parametrize(
+    ("factor", "words"), [(1e3, "all joints need"), (1e-3, "no joint needs")]
+)
 def test_forces_in_another_unit_are_one_doubt_and_not_four(motors, factor, words):
     log, o = log_of(motors[0], factor * motors[1])
     doubts = [w for w in diagnose(log, ROBOT, observations=o).findings if "force" in w]
     assert len(doubts) == 1
     assert doubts[0].startswith(words)
-    assert "check `recording.force_unit`, `forces_side` and `torque_constants`" in doubts[0]
+    assert (
+        "check `recording.force_unit`, `forces_side` and `torque_constants`"
+        in doubts[0]
+    )

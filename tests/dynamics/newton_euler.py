@@ -1,7 +1,7 @@
 """Newton's and Euler's laws in plain NumPy, in the frame of the ground, about centres of mass.
 
-It shares neither code nor wording with the package: no body frames, no projection, no moments about
-joint origins, no linearity in the parameters.
+It shares neither code nor wording with the package: no body frames, no projection, no
+moments about joint origins, no linearity in the parameters.
 """
 
 import numpy as np
@@ -20,7 +20,10 @@ def inverse_dynamics(tree, parameters, q, qd, qdd):
     """Generalized forces of one sample; bodies without mass (None) are skipped."""
     n = len(tree.parent)
     R, o, w, wd, a, z = ([None] * n for _ in range(6))
-    force, moment = np.zeros((n, 3)), np.zeros((n, 3))  # of the subtree, about the world's origin
+    force, moment = (
+        np.zeros((n, 3)),
+        np.zeros((n, 3)),
+    )  # of the subtree, about the world's origin
     for i, k in enumerate(tree.parent):
         Rp, op, wp, wdp, ap = (
             (np.eye(3), *np.zeros((4, 3))) if k < 0 else (R[k], o[k], w[k], wd[k], a[k])
@@ -45,14 +48,18 @@ def inverse_dynamics(tree, parameters, q, qd, qdd):
         c, Jc = R[i] @ c, R[i] @ Jc @ R[i].T
         ac = a[i] + np.cross(wd[i], c) + np.cross(w[i], np.cross(w[i], c))
         force[i] = m * (ac - tree.gravity)
-        moment[i] = Jc @ wd[i] + np.cross(w[i], Jc @ w[i]) + np.cross(o[i] + c, force[i])
+        moment[i] = (
+            Jc @ wd[i] + np.cross(w[i], Jc @ w[i]) + np.cross(o[i] + c, force[i])
+        )
     for i in reversed(range(n)):
         if tree.parent[i] >= 0:
             force[tree.parent[i]] += force[i]
             moment[tree.parent[i]] += moment[i]
     return np.array(
         [
-            z[i] @ (moment[i] - np.cross(o[i], force[i])) if tree.revolute[i] else z[i] @ force[i]
+            z[i] @ (moment[i] - np.cross(o[i], force[i]))
+            if tree.revolute[i]
+            else z[i] @ force[i]
             for i in range(n)
         ]
     )

@@ -1,8 +1,9 @@
 """The Projection Equation as Sec. 2 of the paper words it, for one sample.
 
-Positions are written down; velocities are their derivatives by time, Jacobians are derivatives of
-velocities by joint velocities, momenta are differentiated by time. Nothing is derived by hand, and
-only the centre-of-mass form is used for the forces; the print's Jacobian by q (Eqs. 5, 7) is by qd.
+Positions are written down; velocities are their derivatives by time, Jacobians are
+derivatives of velocities by joint velocities, momenta are differentiated by time.
+Nothing is derived by hand, and only the centre-of-mass form is used for the forces; the
+print's Jacobian by q (Eqs. 5, 7) is by qd.
 """
 
 import jax
@@ -20,9 +21,14 @@ def frames(tree, q):
     out = []
     for i, k in enumerate(tree.parent):
         K = np.cross(np.eye(3), tree.axis[i])
-        turned = np.eye(3) + jnp.sin(q[i]) * K + 2.0 * jnp.sin(0.5 * q[i]) ** 2 * (K @ K)
+        turned = (
+            np.eye(3) + jnp.sin(q[i]) * K + 2.0 * jnp.sin(0.5 * q[i]) ** 2 * (K @ K)
+        )
         R = tree.rotation[i] @ (turned if tree.revolute[i] else np.eye(3))
-        r = tree.offset[i] + (0.0 if tree.revolute[i] else 1.0) * (R @ tree.axis[i]) * q[i]
+        r = (
+            tree.offset[i]
+            + (0.0 if tree.revolute[i] else 1.0) * (R @ tree.axis[i]) * q[i]
+        )
         if k >= 0:
             R, r = out[k][0] @ R, out[k][1] + out[k][0] @ r
         out.append((R, r))
@@ -77,7 +83,9 @@ def momentum_form(tree, masses, centres, inertias, q, qd, qdd):
 
 def matrix_form(tree, masses, centres, inertias, q, qd, qdd):
     """Q of Eq. 4, with F_c from F_o by Eq. 7."""
-    rows, rates = along(lambda x, xd: centre_velocities(tree, centres, x, xd), q, qd, qdd)
+    rows, rates = along(
+        lambda x, xd: centre_velocities(tree, centres, x, xd), q, qd, qdd
+    )
     F_o = jax.jacfwd(lambda xd: origin_velocities(tree, q, xd))(qd)
     zero = np.zeros((3, 3))
     total = jnp.zeros(tree.joints)
@@ -108,11 +116,22 @@ def regressor(tree, q, qd, qdd):
     o1, o3, o6 = np.zeros((3, 1)), np.zeros((3, 3)), np.zeros((3, 6))
     columns = []
     for i, (R, _) in enumerate(frames(tree, q)):
-        v, w, vd, wd, g = rows[i, :3], rows[i, 3:], rates[i, :3], rates[i, 3:], R.T @ tree.gravity
+        v, w, vd, wd, g = (
+            rows[i, :3],
+            rows[i, 3:],
+            rates[i, :3],
+            rates[i, 3:],
+            R.T @ tree.gravity,
+        )
         W = cross(w)
-        inertial = jnp.block([[vd[:, None], cross(wd), o6], [o1, -cross(vd), _inertia_columns(wd)]])
+        inertial = jnp.block(
+            [[vd[:, None], cross(wd), o6], [o1, -cross(vd), _inertia_columns(wd)]]
+        )
         gyroscopic = jnp.block(
-            [[(W @ v)[:, None], W @ W, o6], [o1, -cross(W @ v), W @ _inertia_columns(w)]]
+            [
+                [(W @ v)[:, None], W @ W, o6],
+                [o1, -cross(W @ v), W @ _inertia_columns(w)],
+            ]
         )
         weight = jnp.block([[g[:, None], o3, o6], [o1, -cross(g), o6]])
         columns.append(F_o[i].T @ (inertial + gyroscopic - weight))

@@ -127,7 +127,10 @@ MODELS = {
     "paper": lambda: paper(SEVEN).model,
     "tree": lambda: Model(mixed_tree().robot(), (TEN, *DRIVES, ConstantOffset())),
     "coupled": lambda: Model(library.tx40(), (TEN, *DRIVES, CoupledDrives())),
-    **{f"random{s}": lambda s=s: Model(random_tree(s, 5).robot(), (TEN, *DRIVES)) for s in (1, 4)},
+    **{
+        f"random{s}": lambda s=s: Model(random_tree(s, 5).robot(), (TEN, *DRIVES))
+        for s in (1, 4)
+    },
 }
 
 
@@ -141,14 +144,22 @@ def test_base_parameters_give_the_forces_and_mass_matrix_of_the_standard_ones(na
     together[:, base.dependent] = base.kappa
     again = np.asarray(base.regressor(motion)) @ together
     columns = np.abs(full).max(axis=(0, 1))
-    assert (np.abs(again - full).max(axis=(0, 1)) <= 1e-12 * np.maximum(columns, 1.0)).all()
+    assert (
+        np.abs(again - full).max(axis=(0, 1)) <= 1e-12 * np.maximum(columns, 1.0)
+    ).all()
     p = np.random.default_rng(3).normal(size=base.model.size)
     p_base = base.from_standard(p)
     forces = base.model.inverse_dynamics(jnp.asarray(p), motion)
-    scale = float(jnp.abs(forces).max()) * float(1.0 + np.abs(base.kappa).max(initial=0.0))
-    np.testing.assert_allclose(base.inverse_dynamics(p_base, motion), forces, atol=1e-12 * scale)
+    scale = float(jnp.abs(forces).max()) * float(
+        1.0 + np.abs(base.kappa).max(initial=0.0)
+    )
+    np.testing.assert_allclose(
+        base.inverse_dynamics(p_base, motion), forces, atol=1e-12 * scale
+    )
     M = base.model.mass_matrix(jnp.asarray(p), motion.q)
-    np.testing.assert_allclose(base.mass_matrix(p_base, motion.q), M, atol=1e-12 * scale)
+    np.testing.assert_allclose(
+        base.mass_matrix(p_base, motion.q), M, atol=1e-12 * scale
+    )
 
 
 def test_standard_parameters_and_back():
@@ -160,7 +171,9 @@ def test_standard_parameters_and_back():
 @pytest.mark.parametrize("seed", range(6))
 def test_both_methods_agree_with_lapack_on_random_trees(seed):
     bodies = SEVEN if seed % 2 else TEN
-    model = Model(random_tree(seed, 2 + seed % 4).robot(), (bodies, *DRIVES, ConstantOffset()))
+    model = Model(
+        random_tree(seed, 2 + seed % 4).robot(), (bodies, *DRIVES, ConstantOffset())
+    )
     found = base_parameters(model, seed=seed)
     assert found.notes == ()
     assert found.indices == base_parameters(model, method="singular_values").indices
@@ -186,13 +199,17 @@ def test_millimetres_choose_the_same_columns(make):
     )
     powers = {"kg": 0, "kg m": 1, "kg m²": 2, "N m": 2, "N": 1, "N m s": 2, "N s/m": 0}
     length = np.array([powers[u] for u in model.parameter_units])
-    factor = 1e3 ** (length[list(metres.indices)][:, None] - length[list(metres.dependent)])
-    np.testing.assert_allclose(millimetres.kappa / factor, metres.kappa, rtol=1e-7, atol=1e-9)
+    factor = 1e3 ** (
+        length[list(metres.indices)][:, None] - length[list(metres.dependent)]
+    )
+    np.testing.assert_allclose(
+        millimetres.kappa / factor, metres.kappa, rtol=1e-7, atol=1e-9
+    )
 
 
 def test_identifiability_of_a_planar_arm():
-    # Only the moment about z and the first moments in the plane matter; a link's mass acts on the
-    # joint before it as a part of that link's parameters.
+    # Only the moment about z and the first moments in the plane matter; a link's mass
+    # acts on the joint before it as a part of that link's parameters.
     base = base_parameters(Model(library.planar_arm(2), (TEN,)))
     verdict = dict(zip(base.model.parameter_names, base.identifiability, strict=True))
     alone = {n for n, v in verdict.items() if v is Identifiability.ALONE}
@@ -212,8 +229,8 @@ def test_rank_decisions_do_not_depend_on_jaxs_precision():
 
 
 def test_frames_do_not_matter_with_all_ten_parameters():
-    # The forearm's frame at the wrist instead of the elbow: other parameters, as many of them; with
-    # seven per body the number changes from 44 to 43.
+    # The forearm's frame at the wrist instead of the elbow: other parameters, as many
+    # of them; with seven per body the number changes from 44 to 43.
     robot = paper_robot()
     offset = np.array(robot.offset)
     offset[4, 2], offset[5, 2] = offset[5, 2], 0.0

@@ -34,7 +34,9 @@ def test_blocks_of_any_number_of_samples(samples):
     np.testing.assert_allclose(jax.jit(MODEL.regressor)(in_jax(x)), columns, atol=1e-12)
     weights = np.array([0.5, 2.0])
     rows = (weights[:, None] * columns).reshape(-1, MODEL.size)
-    np.testing.assert_allclose(MODEL.gram(x, weights), rows.T @ rows, rtol=1e-11, atol=1e-10)
+    np.testing.assert_allclose(
+        MODEL.gram(x, weights), rows.T @ rows, rtol=1e-11, atol=1e-10
+    )
 
 
 def test_no_samples():
@@ -58,7 +60,9 @@ def test_leading_axes_of_parameters_and_motion_broadcast(samples):
     expected = MODEL.inverse_dynamics(P, x) * np.array([1.0, 2.0, 3.0])[:, None, None]
     assert MODEL.inverse_dynamics(many, x).shape == (3, samples, 2)
     for run in (MODEL.inverse_dynamics, jax.jit(MODEL.inverse_dynamics)):
-        np.testing.assert_allclose(run(jnp.asarray(many), in_jax(x)), expected, rtol=1e-12)
+        np.testing.assert_allclose(
+            run(jnp.asarray(many), in_jax(x)), expected, rtol=1e-12
+        )
         np.testing.assert_allclose(run(many, x), expected, rtol=1e-12)
     over_p = jax.jit(jax.vmap(MODEL.inverse_dynamics, (0, None)))
     np.testing.assert_allclose(over_p(many[:, 0], in_jax(x)), expected, rtol=1e-12)
@@ -92,7 +96,9 @@ def own_divisions(name):
     return program_of(MODEL, method, *shapes).counts.divisions
 
 
-@pytest.mark.parametrize("name", ["inverse_dynamics", "mass_matrix", "forward_dynamics", "gram"])
+@pytest.mark.parametrize(
+    "name", ["inverse_dynamics", "mass_matrix", "forward_dynamics", "gram"]
+)
 def test_a_gpu_gets_no_fences_and_no_host_callbacks(name):
     x = in_jax(motion(600))
     arguments = {
@@ -103,7 +109,8 @@ def test_a_gpu_gets_no_fences_and_no_host_callbacks(name):
     }[name]
     traced = jax.jit(getattr(MODEL, name)).trace(*arguments)
     text = traced.lower(lowering_platforms=("cuda",)).as_text()
-    # Quotients of the method itself: speeds over epsilon, and the solution for accelerations.
+    # Quotients of the method itself: speeds over epsilon, and the solution for
+    # accelerations.
     own = own_divisions(name)
     assert text.count("stablehlo.divide") == own
     assert "callback" not in text
@@ -134,7 +141,9 @@ def test_a_robot_of_many_joints_moves_as_its_definition_says():
     p = np.tile([2.0, 0.1, 0.0, 0.2, 0.3, 0.3, 0.2, 0.0, 0.0, 0.0], 18)
     x = motion(2, 18)
     forces = model.inverse_dynamics(p, x)
-    np.testing.assert_allclose(model.forward_dynamics(p, x.q, x.qd, forces), x.qdd, atol=1e-8)
+    np.testing.assert_allclose(
+        model.forward_dynamics(p, x.q, x.qd, forces), x.qdd, atol=1e-8
+    )
 
 
 @pytest.mark.parametrize("samples", [8, 300])
@@ -154,10 +163,14 @@ def test_the_samples_of_a_mesh_of_devices(samples):
     found = on_mesh(lambda x: MODEL.inverse_dynamics(P, x))
     np.testing.assert_allclose(found, MODEL.inverse_dynamics(P, x), rtol=1e-12)
     np.testing.assert_allclose(on_mesh(MODEL.regressor), MODEL.regressor(x), atol=1e-12)
-    sums = on_mesh(lambda x: jax.lax.psum(MODEL.gram(x), "d"), jax.sharding.PartitionSpec())
+    sums = on_mesh(
+        lambda x: jax.lax.psum(MODEL.gram(x), "d"), jax.sharding.PartitionSpec()
+    )
     np.testing.assert_allclose(sums, MODEL.gram(x), rtol=1e-11, atol=1e-11)
     slopes, expected = on_mesh(jax.grad(cost)), jax.grad(cost)(x)
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9), slopes, expected)
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9), slopes, expected
+    )
 
 
 @pytest.mark.parametrize("dtype", [jnp.bfloat16, jnp.float32])

@@ -48,12 +48,17 @@ def test_a_bound_method_goes_through_jit(name):
 
 
 def test_many_parameters_by_vmap():
-    found = jax.vmap(MODEL.inverse_dynamics, in_axes=(0, None))(jnp.stack([P, 3 * P]), MOTION)
+    found = jax.vmap(MODEL.inverse_dynamics, in_axes=(0, None))(
+        jnp.stack([P, 3 * P]), MOTION
+    )
     np.testing.assert_allclose(found[1], 3 * found[0], rtol=1e-12)
 
 
 def test_equal_models_have_equal_hashes_and_others_do_not():
-    same, other = Model(planar_arm(2)), Model(planar_arm(2).replace(gravity=np.zeros(3)))
+    same, other = (
+        Model(planar_arm(2)),
+        Model(planar_arm(2).replace(gravity=np.zeros(3))),
+    )
     assert hash(same.regressor) == hash(MODEL.regressor)
     assert hash(other.regressor) != hash(MODEL.regressor)
     assert hash(MODEL.tool_forces) != hash(MODEL.regressor)

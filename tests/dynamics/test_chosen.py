@@ -10,7 +10,10 @@ from jaxid.program import evaluate, trace
 def test_the_base_regressor_follows_from_the_regressors_program(name):
     base = jid.base_parameters(jid.Model(getattr(jid.robots, name)()))
     n = (base.model.robot.joints,)
-    program, traced = program_of(base, base.columns, n, n, n), trace(base.columns, n, n, n)
+    program, traced = (
+        program_of(base, base.columns, n, n, n),
+        trace(base.columns, n, n, n),
+    )
     assert program.counts.total <= traced.counts.total
     np.testing.assert_array_equal(program.nonzeros, traced.nonzeros)
     x = np.random.default_rng(0).normal(size=(3, *n, 5))

@@ -77,7 +77,9 @@ def case(model, unknowns):
     motion, still = Motion(q, qd, qdd), np.zeros_like(q)
     rest = model.inverse_dynamics(p, Motion(q, still, still))
     units = [np.broadcast_to(unit, q.shape) for unit in np.eye(N)]
-    pushed = [model.inverse_dynamics(p, Motion(q, still, unit)) - rest for unit in units]
+    pushed = [
+        model.inverse_dynamics(p, Motion(q, still, unit)) - rest for unit in units
+    ]
     found = {
         "theta": model.regressor(motion),
         "forces": model.inverse_dynamics(p, motion),
@@ -108,7 +110,9 @@ def test_mass_matrix_is_the_slope_of_the_forces(case):
 
 def test_mass_matrix_is_symmetric_and_positive_definite(case):
     M = np.asarray(case["mass"])
-    np.testing.assert_allclose(M, M.swapaxes(1, 2), rtol=0, atol=1e-14 * np.abs(M).max())
+    np.testing.assert_allclose(
+        M, M.swapaxes(1, 2), rtol=0, atol=1e-14 * np.abs(M).max()
+    )
     assert np.linalg.eigvalsh(M).min() > 0.1
 
 
@@ -139,7 +143,8 @@ def test_power_goes_into_energy_and_friction(model, unknowns, case):
         return qd, forces, jax.jvp(energy, (t,), (jnp.ones(()),))[1]
 
     qd, forces, stored = (
-        np.asarray(x) for x in trees.compiled(jax.vmap(balance))(jnp.linspace(0.0, 5.0, 7))
+        np.asarray(x)
+        for x in trees.compiled(jax.vmap(balance))(jnp.linspace(0.0, 5.0, 7))
     )
     u = unknowns
     lost = qd**2 @ u["fv"] + (qd * np.tanh(qd / EPSILON)) @ u["fc"] + qd @ u["fo"]
@@ -169,7 +174,16 @@ def test_principal_axes_leave_out_columns_and_nothing_else(model, case):
     assert trees.relative(seven.mass_matrix(p, q), expected) < 1e-13
     expected = full.potential_energy(ten.ravel(), q)
     assert trees.relative(seven.potential_energy(p, q), expected) < 1e-13
-    assert seven.parameter_names[:8] == ("m1", "mx1", "my1", "mz1", "A1", "B1", "C1", "m2")
+    assert seven.parameter_names[:8] == (
+        "m1",
+        "mx1",
+        "my1",
+        "mz1",
+        "A1",
+        "B1",
+        "C1",
+        "m2",
+    )
 
 
 def test_columns_stand_in_the_papers_order(model):
@@ -179,7 +193,9 @@ def test_columns_stand_in_the_papers_order(model):
     body = ("m", "mx", "my", "mz", "A", "B", "C", "D", "E", "F")
     assert names[:10] == tuple(f"{k}1" for k in body)
     assert names[30:40] == tuple(f"{k}4" for k in body)
-    assert names[40:] == tuple(f"{k}{i}" for k in ("fv", "fc", "Ia") for i in range(1, N + 1))
+    assert names[40:] == tuple(
+        f"{k}{i}" for k in ("fv", "fc", "Ia") for i in range(1, N + 1)
+    )
     assert plain.size == len(names) == len(plain.parameter_units) == 13 * N
     expected = ("kg", "kg m", "kg m", "kg m", *("kg m²",) * 6)
     assert plain.parameter_units[:10] == expected

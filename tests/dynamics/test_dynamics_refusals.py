@@ -89,7 +89,9 @@ def test_invalid_input_is_rejected_by_name(call, name):
 
 def test_instants_that_do_not_match():
     q = np.zeros((3, 5))
-    with pytest.raises(InputError, match=r"fit each other, .* \(3, 5\), \(2, 5\), \(3, 5\)"):
+    with pytest.raises(
+        InputError, match=r"fit each other, .* \(3, 5\), \(2, 5\), \(3, 5\)"
+    ):
         on_samples(MODEL, MODEL.columns, q, q[:2], q)
 
 
@@ -99,4 +101,6 @@ def test_lists_are_arrays():
     as_lists = Motion(*([[1.0] * 5] * 2 for _ in range(3)))
     np.testing.assert_array_equal(MODEL.inverse_dynamics(p, as_lists), expected)
     q = [1.0] * 5
-    np.testing.assert_array_equal(MODEL.mass_matrix(p, q), MODEL.mass_matrix(p, np.ones(5)))
+    np.testing.assert_array_equal(
+        MODEL.mass_matrix(p, q), MODEL.mass_matrix(p, np.ones(5))
+    )

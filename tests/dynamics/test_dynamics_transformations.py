@@ -49,7 +49,9 @@ def alone():
             "mass_matrix": mass,
             "bias_forces": MODEL.forces(P, q, qd, rest),
             "kinetic_energy": 0.5 * qd @ mass @ qd,
-            "potential_energy": sum(t.potential_columns(ROBOT, q) @ x for t, x in MODEL.split(P)),
+            "potential_energy": sum(
+                t.potential_columns(ROBOT, q) @ x for t, x in MODEL.split(P)
+            ),
         }
 
     return trees.compiled(methods)
@@ -65,7 +67,9 @@ def test_batch_axes_lead(batch, alone):
     for index in np.ndindex(*batch):
         one = Motion(*(x[index] for x in (motion.q, motion.qd, motion.qdd)))
         for name, value in alone(one).items():
-            np.testing.assert_allclose(found[name][index], value, rtol=1e-12, atol=1e-12)
+            np.testing.assert_allclose(
+                found[name][index], value, rtol=1e-12, atol=1e-12
+            )
 
 
 def _work(p, motion, axis, rotation, offset, gravity):
@@ -84,7 +88,9 @@ INPUTS = (P, MOTION, TREE.axis, TREE.rotation, TREE.offset, TREE.gravity)
 def slopes():
     """Gradient of the work by parameters, motion and geometry; and the work itself."""
     inputs = jax.tree.map(jnp.asarray, INPUTS)
-    return trees.compiled(jax.grad(_work, argnums=tuple(range(6))))(*inputs), trees.compiled(_work)
+    return trees.compiled(jax.grad(_work, argnums=tuple(range(6))))(
+        *inputs
+    ), trees.compiled(_work)
 
 
 def _turned(rotation, body, direction, h):
@@ -123,9 +129,13 @@ def test_gradients_are_central_differences(slopes):
     assert np.abs(MOTION.qd).min() > 0.05
     slope = sum(
         (g * d).sum()
-        for g, d in zip(jax.tree.leaves(gradient[1]), jax.tree.leaves(along), strict=True)
+        for g, d in zip(
+            jax.tree.leaves(gradient[1]), jax.tree.leaves(along), strict=True
+        )
     )
-    shifted = [jax.tree.map(lambda x, d, s=s: x + s * h * d, MOTION, along) for s in (1, -1)]
+    shifted = [
+        jax.tree.map(lambda x, d, s=s: x + s * h * d, MOTION, along) for s in (1, -1)
+    ]
     check(1, *shifted, slope)
 
     w = rng.normal(size=3)
@@ -150,7 +160,8 @@ def test_regressor_is_differentiable_by_the_motion():
         return jax.jvp(MODEL.columns, (q, qd, qdd), (dq, dqd, dqdd))[1]
 
     plus, minus = (
-        MODEL.regressor(Motion(q + s * dq, qd + s * dqd, qdd + s * dqdd)) for s in (h, -h)
+        MODEL.regressor(Motion(q + s * dq, qd + s * dqd, qdd + s * dqdd))
+        for s in (h, -h)
     )
     assert trees.relative(slope(q, qd, qdd), np.asarray(plus - minus) / (2 * h)) < 1e-7
 

@@ -120,7 +120,8 @@ def test_bodies_with_several_children_name_both_ends():
 
 
 def test_lengths_that_must_stay_equal_change_together():
-    # Joint 4 turns about the same line as joint 1 only because two offsets cancel each other.
+    # Joint 4 turns about the same line as joint 1 only because two offsets cancel each
+    # other.
     arm = Robot(
         "arm",
         revolute=(True, False, True, True),
@@ -131,7 +132,9 @@ def test_lengths_that_must_stay_equal_change_together():
     base = base_parameters(Model(arm, (TEN, *DRIVES)))
     assert "C1 + 2*l1x*mx2 + C2 - l1x^2*(m3 + m4) + Ia1" in base.expressions
     assert base.lengths == {"l1x": 0.3, "l3x": 0.2}
-    np.testing.assert_allclose(evaluated(base, base.lengths), combinations(base), atol=1e-12)
+    np.testing.assert_allclose(
+        evaluated(base, base.lengths), combinations(base), atol=1e-12
+    )
 
 
 def test_what_has_no_short_form_is_a_number():
@@ -150,13 +153,20 @@ MODELS = {
     "ur10": lambda: Model(library.ur10(), (TEN, *DRIVES, ConstantOffset())),
     "coupled": lambda: Model(library.tx40(), (TEN, *DRIVES, CoupledDrives())),
     "kr300": lambda: Model(library.kr300(), (TEN, *DRIVES)),
-    "panda": lambda: Model(library.panda(), (TEN, AsymmetricCoulombFriction(), ConstantOffset())),
+    "panda": lambda: Model(
+        library.panda(), (TEN, AsymmetricCoulombFriction(), ConstantOffset())
+    ),
     "tree": lambda: Model(mixed_tree().robot(), (TEN, *DRIVES, ConstantOffset())),
-    **{f"skew{s}": lambda s=s: Model(random_tree(s, 5).robot(), (TEN, *DRIVES)) for s in range(1)},
+    **{
+        f"skew{s}": lambda s=s: Model(random_tree(s, 5).robot(), (TEN, *DRIVES))
+        for s in range(1)
+    },
 }
 
 
-def stretched(robot: Robot, lengths: dict[str, float], seed: int) -> tuple[Robot, dict[str, float]]:
+def stretched(
+    robot: Robot, lengths: dict[str, float], seed: int
+) -> tuple[Robot, dict[str, float]]:
     """The robot with all its offsets and gravity changed at random, and the lengths it then has."""
     rng = np.random.default_rng(seed)
     offset = np.array(robot.offset) * rng.uniform(0.6, 1.6, (robot.joints, 3))
@@ -193,7 +203,9 @@ def test_letters_hold_for_robots_of_other_lengths(name):
     if name in SQUARE:
         np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-10)
         coefficients = [c for e in base.closed_forms[0] for _, c in e.terms]
-        assert all(isinstance(m.number, Fraction) for c in coefficients for m in c.monomials)
+        assert all(
+            isinstance(m.number, Fraction) for c in coefficients for m in c.monomials
+        )
     # A plain number is what has no short form: it need not hold for other lengths.
     place = {label: k for k, label in enumerate(model.parameter_names)}
     for row, expression in enumerate(base.closed_forms[0]):
@@ -231,7 +243,8 @@ def test_signs_fractions_brackets_and_shared_factors():
         ("p7", ((0.123456789, (a,)), (2.5e-7, (("c", 1),)))),
     )
     assert str(e) == (
-        "p1 - a*p2/(2*b^2) - a*(a + 2*c)*(p3 - p4) - 0.25*a*p5 - p6 + (0.123457*a + 2.5e-07*c)*p7"
+        "p1 - a*p2/(2*b^2) - a*(a + 2*c)*(p3 - p4) - 0.25*a*p5 - p6 + (0.123457*a + "
+        "2.5e-07*c)*p7"
     )
     found = values(e, {"a": 3.0, "b": 2.0, "c": 5.0})
     assert found["p2"] == pytest.approx(-0.375)

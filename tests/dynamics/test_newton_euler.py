@@ -17,7 +17,10 @@ SAMPLES = 4
 
 def _expected(tree, parameters, motion):
     return np.array(
-        [newton_euler.inverse_dynamics(tree, parameters, *x) for x in zip(*motion, strict=True)]
+        [
+            newton_euler.inverse_dynamics(tree, parameters, *x)
+            for x in zip(*motion, strict=True)
+        ]
     )
 
 

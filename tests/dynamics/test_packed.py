@@ -9,7 +9,12 @@ import pytest
 import jaxid as jid
 from jaxid.dynamics.dispatch import FEW
 
-TERMS = (jid.RigidBodies(), jid.ViscousFriction(), jid.ConstantOffset(), jid.RotorInertia())
+TERMS = (
+    jid.RigidBodies(),
+    jid.ViscousFriction(),
+    jid.ConstantOffset(),
+    jid.RotorInertia(),
+)
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +73,9 @@ def test_goes_through_jit_and_gradients(model):
 
 def test_refuses_batches_and_traced_geometry(model):
     motion = random_motion(model, 6)
-    with pytest.raises(ValueError, match=r"shape \[samples, joints\], but has \(2, 3, "):
+    with pytest.raises(
+        ValueError, match=r"shape \[samples, joints\], but has \(2, 3, "
+    ):
         model.packed_regressor(jax.tree.map(lambda x: x.reshape(2, 3, -1), motion))
 
     @eqx.filter_jit

@@ -13,15 +13,17 @@ from jaxid.dynamics.terms import RigidBodies
 BODIES = (RigidBodies(),)
 GEOMETRIES = 7
 SAMPLES = 3
-# Eight structures of 1 to 8 joints, seven geometries of each: 56 trees, with branches, several
-# roots, and both kinds of joints.
+# Eight structures of 1 to 8 joints, seven geometries of each: 56 trees, with branches,
+# several roots, and both kinds of joints.
 STRUCTURES = [(1, 11), (2, 13), (3, 14), (4, 38), (5, 23), (6, 22), (7, 31), (8, 12)]
 
 
 def _regressor(pinned: pin.Model, q, qd, qdd) -> np.ndarray:
     data = pinned.createData()
     n = pinned.nv
-    columns = pin.computeJointTorqueRegressor(pinned, data, q, qd, qdd).reshape(n, n, 10)
+    columns = pin.computeJointTorqueRegressor(pinned, data, q, qd, qdd).reshape(
+        n, n, 10
+    )
     return (columns[:, :, trees.FROM_PINOCCHIO] * trees.SIGNS).reshape(n, 10 * n)
 
 
@@ -31,14 +33,18 @@ def test_regressors_of_random_trees(joints, seed):
     rng = np.random.default_rng(seed)
     parent, revolute = trees.structure(rng, joints)
     family = [
-        trees.Tree(parent, revolute, *trees.geometry(rng, joints), rng.normal(size=3) * 9.81)
+        trees.Tree(
+            parent, revolute, *trees.geometry(rng, joints), rng.normal(size=3) * 9.81
+        )
         for _ in range(GEOMETRIES)
     ]
     motion = trees.random_motion(rng, GEOMETRIES, SAMPLES, joints)
     template = family[0].robot()
 
     def regressor(axis, rotation, offset, gravity, *state):
-        robot = template.replace(axis=axis, rotation=rotation, offset=offset, gravity=gravity)
+        robot = template.replace(
+            axis=axis, rotation=rotation, offset=offset, gravity=gravity
+        )
         return Model(robot, BODIES).regressor(Motion(*state))
 
     stacked = (
@@ -48,7 +54,9 @@ def test_regressors_of_random_trees(joints, seed):
     found = np.asarray(trees.compiled(jax.vmap(regressor))(*stacked, *motion))
     for k, tree in enumerate(family):
         pinned = tree.pinocchio()
-        expected = [_regressor(pinned, *(x[k, s] for x in motion)) for s in range(SAMPLES)]
+        expected = [
+            _regressor(pinned, *(x[k, s] for x in motion)) for s in range(SAMPLES)
+        ]
         assert trees.relative(found[k], np.array(expected)) < 1e-12
 
 
@@ -73,7 +81,10 @@ def test_forces_mass_matrix_bias_and_energies():
     forces = model.inverse_dynamics(p, Motion(q, qd, qdd))
     assert trees.relative(forces, each(pin.rnea, q, qd, qdd)) < 1e-13
     assert trees.relative(model.mass_matrix(p, q), each(crba, q)) < 1e-13
-    assert trees.relative(model.bias_forces(p, q, qd), each(pin.nonLinearEffects, q, qd)) < 1e-13
+    assert (
+        trees.relative(model.bias_forces(p, q, qd), each(pin.nonLinearEffects, q, qd))
+        < 1e-13
+    )
     kinetic = each(pin.computeKineticEnergy, q, qd)
     assert trees.relative(model.kinetic_energy(p, q, qd), kinetic) < 1e-13
     potential = model.potential_energy(p, q)

@@ -32,7 +32,9 @@ def test_forces_are_the_projected_momenta(case, form):
     tree, p, centred, motion = case
     expected = trees.compiled(lambda *x: form(tree, *centred, *x))(*motion)
     robot = tree.robot()
-    found = trees.compiled(lambda *x: projection_equation.rigid_body_forces(robot, p, *x))(*motion)
+    found = trees.compiled(
+        lambda *x: projection_equation.rigid_body_forces(robot, p, *x)
+    )(*motion)
     assert trees.relative(found, expected) < 1e-13
     literal = newton_euler.inverse_dynamics(tree, p, *(np.asarray(x) for x in motion))
     assert trees.relative(expected, literal) < 1e-13
@@ -42,7 +44,9 @@ def test_regressor_is_the_sum_of_the_three_matrices(case):
     tree, _, _, motion = case
     expected = trees.compiled(lambda *x: paper.regressor(tree, *x))(*motion)
     robot = tree.robot()
-    found = trees.compiled(lambda *x: projection_equation.rigid_body_regressor(robot, *x))(*motion)
+    found = trees.compiled(
+        lambda *x: projection_equation.rigid_body_regressor(robot, *x)
+    )(*motion)
     assert trees.relative(found.reshape(tree.joints, -1), expected) < 1e-13
 
 
@@ -50,7 +54,9 @@ def test_projection_is_the_jacobian_of_velocities_by_velocities(case):
     """Eqs. 5 and 7 with the joint velocities below the fraction."""
     tree, _, _, (q, qd, qdd) = case
     robot = tree.robot()
-    expected = trees.compiled(jax.jacfwd(lambda x: paper.origin_velocities(tree, q, x)))(qd)
+    expected = trees.compiled(
+        jax.jacfwd(lambda x: paper.origin_velocities(tree, q, x))
+    )(qd)
     partial = trees.compiled(
         lambda q, qd, qdd: jnp.stack(
             jax.jacfwd(projection_equation.partial_velocities(robot, q, qd, qdd))(qdd)
@@ -65,13 +71,17 @@ def test_body_motions_are_derivatives_of_positions(case):
     tree, _, _, (q, qd, qdd) = case
 
     def all_of(q, qd, qdd):
-        rows, rates = paper.along(lambda x, xd: paper.origin_velocities(tree, x, xd), q, qd, qdd)
+        rows, rates = paper.along(
+            lambda x, xd: paper.origin_velocities(tree, x, xd), q, qd, qdd
+        )
         weights = jnp.stack([R.T @ tree.gravity for R, _ in paper.frames(tree, q)])
         v, w = rows[:, :3], rows[:, 3:]
         return rates[:, :3] + jnp.cross(w, v) - weights, w, rates[:, 3:]
 
     robot = tree.robot()
-    found = trees.compiled(lambda *x: projection_equation.body_motions(robot, *x))(q, qd, qdd)
+    found = trees.compiled(lambda *x: projection_equation.body_motions(robot, *x))(
+        q, qd, qdd
+    )
     for mine, theirs in zip(
         zip(*found, strict=True), trees.compiled(all_of)(q, qd, qdd), strict=True
     ):
@@ -102,7 +112,8 @@ def test_momentum_matrix_and_tensor_hold_the_products_with_a_minus():
     w = jnp.asarray(rng.normal(size=3))
     j = body.parameters[4:]
     momentum = sum(
-        m * np.cross(x, np.cross(w, x)) for m, x in zip(body.masses, body.points, strict=True)
+        m * np.cross(x, np.cross(w, x))
+        for m, x in zip(body.masses, body.points, strict=True)
     )
     assert trees.relative(projection_equation.momentum_matrix(w) @ j, momentum) < 1e-14
     assert trees.relative(inertia_tensor(jnp.asarray(j)) @ w, momentum) < 1e-14

@@ -25,12 +25,17 @@ def with_dependent_columns(seed: int, rows: int, columns: int, rank: int) -> np.
 
 
 def first_columns_that_raise_the_rank(W: np.ndarray) -> tuple[int, ...]:
-    ranks = [0, *(np.linalg.matrix_rank(W[:, : k + 1], tol=1e-8) for k in range(W.shape[1]))]
+    ranks = [
+        0,
+        *(np.linalg.matrix_rank(W[:, : k + 1], tol=1e-8) for k in range(W.shape[1])),
+    ]
     return tuple(k for k in range(W.shape[1]) if ranks[k + 1] > ranks[k])
 
 
 @pytest.mark.parametrize("method", METHODS, ids=lambda m: m.__name__)
-@given(seed=st.integers(0, 10**6), columns=st.integers(2, 14), share=st.floats(0.0, 1.0))
+@given(
+    seed=st.integers(0, 10**6), columns=st.integers(2, 14), share=st.floats(0.0, 1.0)
+)
 @settings(max_examples=60, deadline=None)
 def test_columns_that_raise_the_rank_are_chosen(method, seed, columns, share):
     rank = 1 + int(share * (columns - 1))
@@ -83,7 +88,8 @@ def test_extremes(method, columns):
 
 
 def test_the_methods_differ_in_what_they_call_small():
-    # Gram-Schmidt sees a share of 1e-8 that is far above rounding; both must say how sure they are.
+    # Gram-Schmidt sees a share of 1e-8 that is far above rounding; both must say how
+    # sure they are.
     rng = np.random.default_rng(2)
     W = np.linalg.qr(rng.normal(size=(40, 4)))[0]
     nearly = np.column_stack([W, W[:, 0] + 1e-8 * rng.normal(size=40)])

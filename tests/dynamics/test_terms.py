@@ -105,11 +105,15 @@ class TestContract:
                 term.columns(robot, q, rest, rest),
             )
 
-        columns, forces, mass, bias, lift, still = (np.asarray(x) for x in parts(Q, QD, QDD))
+        columns, forces, mass, bias, lift, still = (
+            np.asarray(x) for x in parts(Q, QD, QDD)
+        )
         assert columns.shape == bias.shape == (N, size)
         assert lift.shape == (size, N)
         np.testing.assert_allclose(forces, columns @ p, rtol=1e-12, atol=1e-12)
-        np.testing.assert_allclose(mass @ QDD + bias @ p, forces, rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(
+            mass @ QDD + bias @ p, forces, rtol=1e-12, atol=1e-12
+        )
         if np.any(lift):
             np.testing.assert_allclose(lift.T, still, rtol=1e-12, atol=1e-12)
 
@@ -121,7 +125,9 @@ class TestContract:
             return (term.forces(robot, p, q, qd, qdd) ** 2).sum()
 
         batch = [np.stack([x, 0.0 * x]) for x in (Q, QD, QDD)]
-        slopes = trees.compiled(jax.vmap(jax.grad(work, argnums=(0, 1, 2, 3)), (0, 0, 0, None)))
+        slopes = trees.compiled(
+            jax.vmap(jax.grad(work, argnums=(0, 1, 2, 3)), (0, 0, 0, None))
+        )
         for slope in slopes(*batch, p):
             assert np.isfinite(np.asarray(slope)).all()
 
@@ -132,7 +138,9 @@ def test_the_contract_covers_every_term():
         for _, c in inspect.getmembers(terms, inspect.isclass)
         if issubclass(c, AbstractTerm) and not inspect.isabstract(c)
     }
-    assert members == {type(t) for t in ALL}, "add the new term to the list `ALL` of this file"
+    assert members == {type(t) for t in ALL}, (
+        "add the new term to the list `ALL` of this file"
+    )
 
 
 @pytest.mark.parametrize(
@@ -151,7 +159,9 @@ def test_the_contract_covers_every_term():
 def test_diagonal_terms(robot, term, diagonal, name, units):
     """Eqs. 13, 14, 17: one column for each joint, and only on that joint."""
     np.testing.assert_allclose(_columns(term, robot), np.diag(diagonal), rtol=1e-15)
-    assert term.parameters(robot) == tuple((f"{name}{i + 1}", u) for i, u in enumerate(units))
+    assert term.parameters(robot) == tuple(
+        (f"{name}{i + 1}", u) for i, u in enumerate(units)
+    )
 
 
 def test_asymmetric_friction_is_its_level_in_each_direction(robot):
@@ -183,7 +193,9 @@ def test_dead_zone_says_nothing_about_standstill(transition):
     np.testing.assert_array_equal(found[1:5], 0.0)
     assert found[0] < -0.99
     assert found[5] > 0.99
-    each = np.asarray(transition(dead_zone=np.array([0.2, 0.4]))(jnp.asarray([0.3, 0.3])))
+    each = np.asarray(
+        transition(dead_zone=np.array([0.2, 0.4]))(jnp.asarray([0.3, 0.3]))
+    )
     assert each[0] > 0.99
     assert each[1] == 0.0
 
@@ -197,7 +209,9 @@ def test_ripple_is_that_of_the_motors_and_joints(robot):
     motors = 0
     for i, k in enumerate((1, 6)):
         motors = motors + a[i] * np.sin(k * turned) + b[i] * np.cos(k * turned)
-    expected = REDUCTION.T @ motors + joint[0] * np.sin(2 * Q) + joint[1] * np.cos(2 * Q)
+    expected = (
+        REDUCTION.T @ motors + joint[0] * np.sin(2 * Q) + joint[1] * np.cos(2 * Q)
+    )
     gears = np.diag(REDUCTION)
     p = np.concatenate([gears * a[0], gears * b[0], gears * a[1], gears * b[1], *joint])
     np.testing.assert_allclose(_columns(term, robot) @ p, expected, rtol=1e-12)
@@ -215,7 +229,11 @@ def test_ripple_is_that_of_the_motors_and_joints(robot):
 def _motor_level(A, J, fv, fc, epsilon, qd, qdd):
     """A^T (J A qdd + fv A qd + fc s(A qd / a_ii)): every motor with its own rotor and friction."""
     own = np.diag(A)
-    motors = J * (A @ qdd) + fv * (A @ qd) + np.sign(own) * fc * np.tanh(A @ qd / own / epsilon)
+    motors = (
+        J * (A @ qdd)
+        + fv * (A @ qd)
+        + np.sign(own) * fc * np.tanh(A @ qd / own / epsilon)
+    )
     return A.T @ motors
 
 
@@ -230,7 +248,13 @@ def test_coupled_drives_are_the_motors_own_equations(which, robot):
     q, qd, qdd = rng.normal(size=(3, n)) * 0.02
     own = np.diag(A)
     model = Model(
-        robot, (RotorInertia(), ViscousFriction(), CoulombFriction(Tanh(0.01)), CoupledDrives())
+        robot,
+        (
+            RotorInertia(),
+            ViscousFriction(),
+            CoulombFriction(Tanh(0.01)),
+            CoupledDrives(),
+        ),
     )
     single = np.where(np.isin(np.arange(n), coupled), 0.0, fc * np.abs(own))
     p = np.concatenate(
@@ -247,7 +271,9 @@ def test_coupled_drives_are_the_motors_own_equations(which, robot):
         f"{name}{i + 1}" for name in ("Iam", "fvm", "fcm") for i in coupled
     )
     found = np.asarray(model.columns(*(jnp.asarray(x) for x in (q, qd, qdd)))) @ p
-    np.testing.assert_allclose(found, _motor_level(A, J, fv, fc, 0.01, qd, qdd), rtol=1e-12)
+    np.testing.assert_allclose(
+        found, _motor_level(A, J, fv, fc, 0.01, qd, qdd), rtol=1e-12
+    )
 
 
 def test_coupled_drives_of_the_tx40_are_the_published_columns():
@@ -260,7 +286,9 @@ def test_coupled_drives_of_the_tx40_are_the_published_columns():
     np.testing.assert_allclose(found, expected, rtol=1e-14)
     units = [unit for _, unit in CoupledDrives().parameters(tx40())]
     assert units == ["kg m²", "N m s", "N m"]
-    slide = dict(CoupledDrives().parameters(TREE.robot(drives=Drives(N, reduction=REDUCTION))))
+    slide = dict(
+        CoupledDrives().parameters(TREE.robot(drives=Drives(N, reduction=REDUCTION)))
+    )
     assert [slide[name] for name in ("Iam2", "fvm2", "fcm2")] == ["kg", "N s/m", "N"]
 
 
@@ -293,23 +321,33 @@ def test_warm_friction_is_smaller(robot):
     cold = TemperatureScaled(ViscousFriction(), rates)
     np.testing.assert_allclose(_columns(cold, robot), np.diag(QD), rtol=1e-15)
     warm = TemperatureScaled(ViscousFriction(), rates, temperature=45.0)
-    np.testing.assert_allclose(_columns(warm, robot), np.diag(np.exp(-20 * rates) * QD), rtol=1e-12)
+    np.testing.assert_allclose(
+        _columns(warm, robot), np.diag(np.exp(-20 * rates) * QD), rtol=1e-12
+    )
 
 
 def test_every_nonlinear_parameter_is_found_in_its_term():
     """Names are unique, and changing the value changes the columns."""
     wrapped = TemperatureScaled(StribeckFriction(), temperature=40.0)
-    assert [s.name for s in wrapped.nonlinear_parameters] == ["eps", "vs", "delta", "rate"]
+    assert [s.name for s in wrapped.nonlinear_parameters] == [
+        "eps",
+        "vs",
+        "delta",
+        "rate",
+    ]
     before = np.asarray(wrapped.columns(TREE.robot(), Q, 0.1 * QD, QDD))
     for shape in wrapped.nonlinear_parameters:
         other = eqx.tree_at(shape.value, wrapped, 1.5 * shape.value(wrapped))
-        assert np.any(np.asarray(other.columns(TREE.robot(), Q, 0.1 * QD, QDD)) != before)
+        assert np.any(
+            np.asarray(other.columns(TREE.robot(), Q, 0.1 * QD, QDD)) != before
+        )
     assert CoulombFriction(HardSign()).nonlinear_parameters == ()
 
 
 def test_base_parameters_see_friction_near_standstill():
     model = Model(
-        tx40(), (RigidBodies(), ViscousFriction(), StribeckFriction(0.02), RotorInertia())
+        tx40(),
+        (RigidBodies(), ViscousFriction(), StribeckFriction(0.02), RotorInertia()),
     )
     base = base_parameters(model)
     assert {f"fs{k}" for k in range(1, 7)} < set(base.names)
@@ -323,4 +361,6 @@ def test_a_coupled_motor_has_the_transition_of_its_own_joint():
     found = CoupledDrives(Tanh(widths)).columns(robot, Q, QD, QDD)
     for column, motor in zip(found[:, -2:].T, (1, 2), strict=True):
         ratios = REDUCTION[motor] / REDUCTION[motor, motor]
-        np.testing.assert_allclose(column, ratios * np.tanh(ratios @ QD / widths[motor]))
+        np.testing.assert_allclose(
+            column, ratios * np.tanh(ratios @ QD / widths[motor])
+        )

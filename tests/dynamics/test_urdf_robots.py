@@ -13,7 +13,10 @@ from jaxid.dynamics.terms import RigidBodies
 from jaxid.robot.urdf import load_urdf, urdf_parameters
 
 cmeel = pytest.importorskip("cmeel", reason="example-robot-data is not installed")
-ROBOTS = Path(next(iter(cmeel.__path__))).parent / "cmeel.prefix/share/example-robot-data/robots"
+ROBOTS = (
+    Path(next(iter(cmeel.__path__))).parent
+    / "cmeel.prefix/share/example-robot-data/robots"
+)
 SAMPLES = 3
 
 ARMS = [
@@ -29,7 +32,11 @@ ARMS = [
     ("finger_edu_description/robots/finger_edu.urdf", None, 3),
 ]
 TREES = [
-    ("tiago_description/robots/tiago_no_hand.urdf", None, 12),  # wheels, prismatic torso
+    (
+        "tiago_description/robots/tiago_no_hand.urdf",
+        None,
+        12,
+    ),  # wheels, prismatic torso
     ("solo_description/robots/solo.urdf", None, 8),  # four legs
     ("simple_humanoid_description/urdf/simple_humanoid.urdf", None, 29),
 ]

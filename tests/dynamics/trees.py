@@ -9,8 +9,9 @@ from scipy.spatial.transform import Rotation
 
 from jaxid.robot.robot import Robot
 
-# Column of Pinocchio's regressor (m, mx, my, mz, Ixx, Ixy, Iyy, Ixz, Iyz, Izz) for each of
-# (m, mx, my, mz, A, B, C, D, E, F). D, E, F are integrals, Pinocchio has the tensor's entries.
+# Column of Pinocchio's regressor (m, mx, my, mz, Ixx, Ixy, Iyy, Ixz, Iyz, Izz) for each
+# of (m, mx, my, mz, A, B, C, D, E, F). D, E, F are integrals, Pinocchio has the
+# tensor's entries.
 FROM_PINOCCHIO = [0, 1, 2, 3, 4, 6, 9, 8, 7, 5]
 SIGNS = np.array([1, 1, 1, 1, 1, 1, 1, -1, -1, -1.0])
 
@@ -53,11 +54,15 @@ class Tree:
             parent = 0 if self.parent[i] < 0 else ids[self.parent[i]]
             ids.append(model.addJoint(parent, joint(self.axis[i]), placement, f"j{i}"))
             if bodies is not None:
-                model.appendBodyToJoint(ids[-1], bodies[i].pinocchio(), pin.SE3.Identity())
+                model.appendBodyToJoint(
+                    ids[-1], bodies[i].pinocchio(), pin.SE3.Identity()
+                )
         return model
 
 
-def structure(rng: np.random.Generator, joints: int) -> tuple[tuple[int, ...], tuple[bool, ...]]:
+def structure(
+    rng: np.random.Generator, joints: int
+) -> tuple[tuple[int, ...], tuple[bool, ...]]:
     """Parents and kinds of joints: two of three new bodies hang on the last one."""
     parent = [-1]
     for i in range(1, joints):
@@ -65,7 +70,9 @@ def structure(rng: np.random.Generator, joints: int) -> tuple[tuple[int, ...], t
     return tuple(parent), tuple(bool(x) for x in rng.random(joints) < 0.65)
 
 
-def geometry(rng: np.random.Generator, joints: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def geometry(
+    rng: np.random.Generator, joints: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Arbitrary axes, attitudes and offsets."""
     axis = rng.normal(size=(joints, 3))
     axis /= np.linalg.norm(axis, axis=1)[:, None]
@@ -75,13 +82,18 @@ def geometry(rng: np.random.Generator, joints: int) -> tuple[np.ndarray, np.ndar
 
 def random_tree(seed: int, joints: int) -> Tree:
     rng = np.random.default_rng(seed)
-    return Tree(*structure(rng, joints), *geometry(rng, joints), rng.normal(size=3) * 9.81)
+    return Tree(
+        *structure(rng, joints), *geometry(rng, joints), rng.normal(size=3) * 9.81
+    )
 
 
 def bushy_tree(seed: int) -> Tree:
     """Three branches and two roots, depth first: Pinocchio's mass matrix asks for that order."""
     rng = np.random.default_rng(seed)
-    parent, revolute = (-1, 0, 1, 1, 0, 4, -1), (True, True, False, True, True, True, False)
+    parent, revolute = (
+        (-1, 0, 1, 1, 0, 4, -1),
+        (True, True, False, True, True, True, False),
+    )
     return Tree(parent, revolute, *geometry(rng, 7), rng.normal(size=3) * 9.81)
 
 
@@ -112,7 +124,8 @@ class Cloud:
         """About the centre of mass."""
         r = self.points - self.centre
         return sum(
-            m * (x @ x * np.eye(3) - np.outer(x, x)) for m, x in zip(self.masses, r, strict=True)
+            m * (x @ x * np.eye(3) - np.outer(x, x))
+            for m, x in zip(self.masses, r, strict=True)
         )
 
     @property
@@ -126,7 +139,9 @@ class Cloud:
         return pin.Inertia(self.mass, self.centre, self.inertia)
 
 
-def random_bodies(rng: np.random.Generator, joints: int, points: int = 6) -> list[Cloud]:
+def random_bodies(
+    rng: np.random.Generator, joints: int, points: int = 6
+) -> list[Cloud]:
     return [
         Cloud(rng.uniform(0.2, 2.0, points), rng.normal(size=(points, 3)) * 0.3 + 0.1)
         for _ in range(joints)
@@ -155,7 +170,11 @@ def relative(found: np.ndarray, expected: np.ndarray) -> float:
 def compiled(function):
     """Compiled without much optimisation, which takes longer than a few samples do.
 
-    The lambda is there for bound methods: those of an immutable module are not hashable.
+    The lambda is there for bound methods: those of an immutable module are not
+    hashable.
     """
-    options = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
+    options = {
+        "xla_backend_optimization_level": 0,
+        "xla_llvm_disable_expensive_passes": True,
+    }
     return jax.jit(lambda *args: function(*args), compiler_options=options)

@@ -46,7 +46,12 @@ def parents(free):
 def pendulum():
     """The base parameters of one joint, for designs that differ in their settings."""
     limits = Limits(
-        1, position_min=[-2.0], position_max=[2.0], velocity=[2.0], acceleration=[4.0], force=[9.0]
+        1,
+        position_min=[-2.0],
+        position_max=[2.0],
+        velocity=[2.0],
+        acceleration=[4.0],
+        force=[9.0],
     )
     return base_parameters(Model(library.planar_arm(1).replace(limits=limits)))
 
@@ -61,7 +66,9 @@ def excess():
     """A function of a plan: largest excess of its dense samples over the joints' limits."""
 
     def excess(plan):
-        motion = plan.trajectory.motion(np.linspace(0.0, float(plan.trajectory.duration), 8000))
+        motion = plan.trajectory.motion(
+            np.linspace(0.0, float(plan.trajectory.duration), 8000)
+        )
         own = plan.base.model.robot.limits
         q, qd, qdd = (np.asarray(x) for x in (motion.q, motion.qd, motion.qdd))
         beyond = q - own.position_max, own.position_min - q, abs(qd) - own.velocity

@@ -52,7 +52,9 @@ def problem(pendulum, constraints):
 
 @pytest.mark.parametrize("criterion", CRITERIA, ids=lambda c: c.name)
 def test_gradients_without_a_compiler_are_those_of_jax(pendulum, criterion):
-    one = ExcitationProblem(pendulum, BASIS, criterion=criterion, noise=np.ones(1), samples=100)
+    one = ExcitationProblem(
+        pendulum, BASIS, criterion=criterion, noise=np.ones(1), samples=100
+    )
     x = one.limits.random(jax.random.key(2), 3)
     for sharpness in (None, 4.0):
         values, gradients = one.value_and_gradient(x, sharpness, 64)
@@ -72,11 +74,14 @@ def test_derivatives_are_central_differences(problem):
     h, quotients = 1e-5, np.zeros_like(slopes)
     for k, e in enumerate(h * np.eye(x.shape[1])):
         near, far = (
-            [problem.linearise(x + s * m * e, watched)[0] for s in (1, -1)] for m in (1, 2)
+            [problem.linearise(x + s * m * e, watched)[0] for s in (1, -1)]
+            for m in (1, 2)
         )
         quotients[..., k] = (8 * (near[0] - near[1]) - (far[0] - far[1])) / (12 * h)
     # A force that passes through zero within the difference has no derivative there.
-    wrong = np.linalg.norm(slopes - quotients, axis=2) > 1e-6 * np.linalg.norm(slopes, axis=2)
+    wrong = np.linalg.norm(slopes - quotients, axis=2) > 1e-6 * np.linalg.norm(
+        slopes, axis=2
+    )
     assert (wrong.sum(axis=1) <= 2).all()
     assert np.linalg.norm(slopes) > 1.0
 
@@ -84,11 +89,18 @@ def test_derivatives_are_central_differences(problem):
 @pytest.mark.parametrize("criterion", CRITERIA, ids=lambda c: c.name)
 def test_forward_mode_is_reverse_mode(pendulum, criterion, constraints):
     problem = ExcitationProblem(
-        pendulum, BASIS, criterion=criterion, constraints=constraints, noise=np.ones(1), samples=100
+        pendulum,
+        BASIS,
+        criterion=criterion,
+        constraints=constraints,
+        noise=np.ones(1),
+        samples=100,
     )
     x = problem.random(jax.random.key(3))
     for function in (problem.value, problem.inequalities):
-        forward, reverse = (jax.jit(jac(function))(x) for jac in (jax.jacfwd, jax.jacrev))
+        forward, reverse = (
+            jax.jit(jac(function))(x) for jac in (jax.jacfwd, jax.jacrev)
+        )
         np.testing.assert_allclose(forward, reverse, atol=1e-9 * np.abs(reverse).max())
     assert np.isfinite(jax.jit(jax.hessian(problem.value))(x)).all()
 
@@ -106,7 +118,9 @@ def test_the_highest_peaks_are_watched(problem):
 
 def test_peaks_between_the_checked_instants_count(problem, pendulum):
     x = problem.random(jax.random.key(5))
-    motion = problem.trajectory(x).motion(np.linspace(0.0, BASIS.duration, 20 * CHECKED))
+    motion = problem.trajectory(x).motion(
+        np.linspace(0.0, BASIS.duration, 20 * CHECKED)
+    )
     robot = pendulum.model.robot
     finer = jax.jit(lambda m: [c(robot, m) for c in problem.constraints])(motion)
     finer = np.concatenate([np.asarray(values).max(axis=0) for values in finer])
@@ -124,7 +138,8 @@ def test_a_motion_is_made_as_small_as_its_constraints_need(problem):
     assert small.excess[0] <= 0.0
     rows = BASIS.rows(BASIS.instants(50))[0]
     size, whole = (
-        np.ptp(problem.limits.coefficients(np.asarray(y)) @ rows.T) for y in (small.x[0], x)
+        np.ptp(problem.limits.coefficients(np.asarray(y)) @ rows.T)
+        for y in (small.x[0], x)
     )
     larger = problem.limits.grid().shrink(x, float(1.01 * size / whole))
     assert evaluate(problem, larger[None]).excess[0] > 0.0
@@ -133,18 +148,28 @@ def test_a_motion_is_made_as_small_as_its_constraints_need(problem):
 def test_limits_of_force_are_those_that_were_given(problem, pendulum, constraints):
     weak = dataclasses.replace(pendulum.model.robot.limits, force=np.array([1.0]))
     given = ExcitationProblem(
-        pendulum, BASIS, weak, constraints=constraints[:1], noise=np.ones(1), samples=100
+        pendulum,
+        BASIS,
+        weak,
+        constraints=constraints[:1],
+        noise=np.ones(1),
+        samples=100,
     )
     x = problem.random(jax.random.key(7))
     # The robot's own limit of force is 9.
     highest = problem.checked(x)[:, 0].max() + 1.0
-    np.testing.assert_allclose(given.checked(x)[:, 0].max() + 1.0, 9.0 * highest, rtol=1e-6)
+    np.testing.assert_allclose(
+        given.checked(x)[:, 0].max() + 1.0, 9.0 * highest, rtol=1e-6
+    )
 
 
 def test_a_design_with_leads_keeps_all_constraints(
     problem, constraints, shapes, excess, monkeypatch
 ):
-    for stages in ("SCHEDULE", "CONSTRAINED"):  # the last stage alone has all to keep as well
+    for stages in (
+        "SCHEDULE",
+        "CONSTRAINED",
+    ):  # the last stage alone has all to keep as well
         monkeypatch.setattr(f"jaxid.excitation.search.{stages}", ())
     plan = minimise(problem, starts=2, generations=0, polish=0)
     assert plan.feasible

@@ -50,7 +50,12 @@ SHAPES = CollisionModel(
         HalfSpace("ground", normal=(0.0, 1.0, 0.0), height=-0.6),
         Box("table", centre=(0.7, -0.3, 0.1), size=(0.3, 0.4, 1.0)),
     ),
-    (("trunk", "forearm"), ("upper arm", "hand"), ("hand", "ground"), ("forearm", "table")),
+    (
+        ("trunk", "forearm"),
+        ("upper arm", "hand"),
+        ("hand", "ground"),
+        ("forearm", "table"),
+    ),
 )
 FAMILY = {
     "forces": ForceLimits(BASE, NOMINAL, ROOT @ ROOT.T),
@@ -78,8 +83,12 @@ def judged(name):
 @pytest.mark.parametrize("name", ["forces", "tip", "clearance"])
 def test_derivatives_are_central_differences(name):
     constraint = FAMILY[name]
-    direction = jnp.asarray(np.random.default_rng(1).standard_normal((3, *MOTION.q.shape)))
-    weight = np.random.default_rng(2).standard_normal((40, len(constraint.entries(ROBOT))))
+    direction = jnp.asarray(
+        np.random.default_rng(1).standard_normal((3, *MOTION.q.shape))
+    )
+    weight = np.random.default_rng(2).standard_normal(
+        (40, len(constraint.entries(ROBOT)))
+    )
 
     @jax.jit
     def total(parts):
@@ -89,9 +98,13 @@ def test_derivatives_are_central_differences(name):
     gradient = jax.jit(jax.grad(total))(at)
     h = 1e-5
     # Fourth order, so that only rounding is left.
-    near, far = (total(at + k * h * direction) - total(at - k * h * direction) for k in (1, 2))
+    near, far = (
+        total(at + k * h * direction) - total(at - k * h * direction) for k in (1, 2)
+    )
     wrong = float(jnp.sum(gradient * direction) - (8 * near - far) / (12 * h))
-    assert abs(wrong) <= 1e-6 * np.linalg.norm(gradient) * np.linalg.norm(direction) / 30
+    assert (
+        abs(wrong) <= 1e-6 * np.linalg.norm(gradient) * np.linalg.norm(direction) / 30
+    )
 
 
 @pytest.mark.parametrize("name", FAMILY)
@@ -111,9 +124,17 @@ def test_words_name_what_is_exceeded(name):
     constraint = FAMILY[name]
     entries, values = constraint.entries(ROBOT), judged(name)
     assert len({(e.name, e.least) for e in entries}) == len(entries)
-    for f, peak in zip(constraint.describe(ROBOT, values), values.max(axis=0), strict=True):
+    for f, peak in zip(
+        constraint.describe(ROBOT, values), values.max(axis=0), strict=True
+    ):
         assert f.excess == pytest.approx(peak * f.size)
-        word = "to spare" if f.value <= 0 else "falls short" if f.least else f"{100 * peak:.3g} %"
+        word = (
+            "to spare"
+            if f.value <= 0
+            else "falls short"
+            if f.least
+            else f"{100 * peak:.3g} %"
+        )
         assert word in str(f)
         assert f"{abs(f.excess):.3g} {f.unit}" in str(f)
         assert f"{f.limit:.4g} {f.unit}" in str(f)
@@ -122,7 +143,9 @@ def test_words_name_what_is_exceeded(name):
 def test_forces_are_the_regressors_with_tool_and_deviations():
     theta = np.asarray(BASE.regressor(MOTION))
     forces = theta @ NOMINAL + np.asarray(BASE.model.tool_forces(MOTION))
-    to_motors = np.hstack([np.eye(3), np.linalg.inv(ROBOT.drives.reduction)])[:, [0, 2, 3, 5]]
+    to_motors = np.hstack([np.eye(3), np.linalg.inv(ROBOT.drives.reduction)])[
+        :, [0, 2, 3, 5]
+    ]
     rows = np.einsum("sjb,jm->smb", theta, to_motors)
     deviation = np.sqrt(np.einsum("smb,bc,smc->sm", rows, ROOT @ ROOT.T, rows))
     expected = (np.abs(limited(forces)) + 2 * deviation) / (0.9 * LIMITS) - 1
@@ -137,7 +160,11 @@ def test_forces_are_the_regressors_with_tool_and_deviations():
 def test_a_joint_that_turns_round_may_need_friction_to_either_side():
     base = base_parameters(Model(ROBOT, (RigidBodies(), CoulombFriction(HardSign()))))
     p = np.random.default_rng(3).standard_normal(base.size)
-    p[[k for k, name in enumerate(base.names) if name.startswith("fc")]] = [5.0, 3.0, 1.0]
+    p[[k for k, name in enumerate(base.names) if name.startswith("fc")]] = [
+        5.0,
+        3.0,
+        1.0,
+    ]
     constraint = ForceLimits(base, p, margin=0.0)
 
     def needed(motion):
@@ -163,13 +190,17 @@ def test_a_joint_that_turns_round_may_need_friction_to_either_side():
 
 def test_the_tip_moves_as_its_difference_quotients():
     t, h = np.linspace(0.3, 4.0, 9), 1e-4
-    ahead, now, behind = (tip_motion(ROBOT, SERIES.motion(t + s * h)) for s in (1, 0, -1))
+    ahead, now, behind = (
+        tip_motion(ROBOT, SERIES.motion(t + s * h)) for s in (1, 0, -1)
+    )
     for order, atol in ((0, 1e-6), (1, 1e-5)):
         slope = (ahead[order] - behind[order]) / (2 * h)
         np.testing.assert_allclose(now[order + 1], slope, atol=atol)
     values = np.asarray(FAMILY["tip"](ROBOT, SERIES.motion(t)))
     sizes = [np.linalg.norm(x, axis=1) for x in now[1:]]
-    np.testing.assert_allclose([1.5, 8.0] * (1 + values[:, :2]), np.transpose(sizes), rtol=1e-6)
+    np.testing.assert_allclose(
+        [1.5, 8.0] * (1 + values[:, :2]), np.transpose(sizes), rtol=1e-6
+    )
     # The box counts in half edges.
     p = np.asarray(now[0])
     np.testing.assert_allclose(values[:, 2], (p[:, 0] - 0.4) / 0.35, atol=1e-10)

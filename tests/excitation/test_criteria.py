@@ -27,7 +27,9 @@ def sample(seed=0):
 
 
 def changed(information, D, h):
-    return Information(information.plain + h * D, information.weighted + h * D, information.sizes)
+    return Information(
+        information.plain + h * D, information.weighted + h * D, information.sizes
+    )
 
 
 @pytest.mark.parametrize("criterion", CRITERIA, ids=lambda c: c.name)
@@ -43,7 +45,9 @@ def test_gradients_are_central_differences(criterion, sharpness):
         D = D + D.T
         up, down = (value(changed(info, D, s * h)) for s in (1, -1))
         slope = float(up - down) / (2 * h)
-        assert abs(np.sum(total * D) - slope) <= 1e-6 * np.linalg.norm(total) * np.linalg.norm(D)
+        assert abs(np.sum(total * D) - slope) <= 1e-6 * np.linalg.norm(
+            total
+        ) * np.linalg.norm(D)
 
 
 @pytest.mark.parametrize("criterion", CRITERIA, ids=lambda c: c.name)
@@ -101,7 +105,13 @@ def test_compiled_information_is_that_of_all_samples(base, random):
     x = random.standard_normal((5, 2, basis.variables))
     weights, prior = np.array([0.1, 0.7]), 1e-3 * np.eye(base.size)
     plains, weighteds = informations(
-        base, basis, jnp.asarray(x), samples=50, measured=50, weights=weights, prior=prior
+        base,
+        basis,
+        jnp.asarray(x),
+        samples=50,
+        measured=50,
+        weights=weights,
+        prior=prior,
     )
     for k, one in enumerate(x):
         motion = basis.trajectory(one).motion(basis.times(50))

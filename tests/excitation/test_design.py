@@ -57,7 +57,8 @@ def test_keeps_limits_uses_them_and_beats_random_motions(designed, excess):
     d = {c.name: c for c in plan.criteria}[DOptimal.name]
     assert d.after < 0.9 * d.before
     assert plan.undetermined == ()
-    # Guaranteed for any rounding: the best motion so far is only replaced by a better one.
+    # Guaranteed for any rounding: the best motion so far is only replaced by a better
+    # one.
     assert all(after.best <= before.best for before, after in itertools.pairwise(seen))
     assert seen[-1].fraction == 1.0
     assert "use of the limits" in str(plan)
@@ -80,7 +81,9 @@ def test_the_mean_gain_leaves_out_what_stays_open(plan):
     )
     assert blind.undetermined == plan.base.names[:1]
     assert blind.gains[0] == 0.0
-    np.testing.assert_allclose(blind.mean_gain, np.exp(np.mean(np.log(blind.gains[1:]))))
+    np.testing.assert_allclose(
+        blind.mean_gain, np.exp(np.mean(np.log(blind.gains[1:])))
+    )
     assert plan.mean_gain > 1.2
 
 
@@ -106,7 +109,9 @@ def test_a_stopped_design_gives_its_best_and_another_goes_on_with_it(free, exces
     assert resumed.history[0] <= best * (1 + 1e-9)
     assert excess(resumed) <= 0.0
     with pytest.raises(ValueError, match="begin"):
-        minimise(free, begin=FourierBasis(4, 1.1).trajectory(np.zeros((2, 9))), **arguments)
+        minimise(
+            free, begin=FourierBasis(4, 1.1).trajectory(np.zeros((2, 9))), **arguments
+        )
 
 
 def test_a_design_says_how_it_ended(designed):
@@ -149,7 +154,10 @@ def test_the_problems_functions_are_those_of_the_motion(impossible, pendulum):
     direction = np.linspace(-1.0, 1.0, impossible.size)
     quotient = (value(x + 1e-6 * direction) - value(x - 1e-6 * direction)) / 2e-6
     assert float(slope @ direction) == pytest.approx(float(quotient), rel=1e-5)
-    violation, inequalities = jax.jit(impossible.violation), jax.jit(impossible.inequalities)
+    violation, inequalities = (
+        jax.jit(impossible.violation),
+        jax.jit(impossible.inequalities),
+    )
     q = impossible.trajectory(x).motion(np.linspace(0.0, BASIS.duration, 20_000)).q
     use = impossible.limits.use(impossible.limits.coefficients(np.asarray(x)))
     expected = max(float(np.max(q)) + 2.5, use.max() - 1.0)
@@ -164,13 +172,17 @@ def test_an_impossible_constraint_is_diagnosed(impossible, monkeypatch):
     for stages in ("SCHEDULE", "CONSTRAINED"):
         monkeypatch.setattr(f"jaxid.excitation.search.{stages}", ())
     effort = {"starts": 2, "generations": 0, "polish": 0}
-    with pytest.raises(ValueError, match=r"tilt of the tip exceeds its limit by 0\.[5-9]"):
+    with pytest.raises(
+        ValueError, match=r"tilt of the tip exceeds its limit by 0\.[5-9]"
+    ):
         minimise(impossible, **effort)
 
     def stop(progress):
         raise KeyboardInterrupt
 
-    with pytest.raises(KeyboardInterrupt, match=r"stopped before a motion kept all limits: tilt"):
+    with pytest.raises(
+        KeyboardInterrupt, match=r"stopped before a motion kept all limits: tilt"
+    ):
         minimise(impossible, progress=stop, **effort)
 
 
@@ -179,7 +191,9 @@ def test_earlier_information_is_added(pendulum):
     alone, after = (ExcitationProblem(pendulum, BASIS, prior=p) for p in (None, prior))
     x = np.linspace(-0.5, 0.5, after.size)
     expected = alone.information(x).weighted + prior
-    np.testing.assert_allclose(after.information(x).weighted, expected, rtol=1e-9, atol=1e-6)
+    np.testing.assert_allclose(
+        after.information(x).weighted, expected, rtol=1e-9, atol=1e-6
+    )
     value = after.criterion.value(after.information(x))
     assert float(np.exp(after.value(x))) == pytest.approx(value)
     with pytest.raises(ValueError, match="`prior`"):
@@ -188,7 +202,12 @@ def test_earlier_information_is_added(pendulum):
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("starts", 0), ("generations", -1), ("noise", np.array([-1.0])), ("prior", np.eye(2))],
+    [
+        ("starts", 0),
+        ("generations", -1),
+        ("noise", np.array([-1.0])),
+        ("prior", np.eye(2)),
+    ],
 )
 def test_refuses_what_makes_no_sense(pendulum, name, value):
     with pytest.raises(ValueError, match=f"`{name}`"):

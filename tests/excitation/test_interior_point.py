@@ -21,7 +21,9 @@ def problem(arm):
 
 def solved(limits, objective, *stages, constraints=0):
     grid, size = limits.grid(64), limits.scale.size
-    states = interior_point.begin(grid, 0.1 * RANDOM.standard_normal((3, size)), constraints)
+    states = interior_point.begin(
+        grid, 0.1 * RANDOM.standard_normal((3, size)), constraints
+    )
 
     def every(points, _):
         return [objective(y) for y in points]
@@ -58,10 +60,14 @@ def test_reaches_the_constrained_minimum_from_every_start(arm):
         none = np.zeros((0, len(y)))
         return Evaluation(0.5 * away @ H @ away, H @ away, none[:, 0], none)
 
-    states, G, c, bound = solved(limits, objective, (2.0, 1.0, 1e-3, 40), (1.0, 1.0, 1e-8, 200))
+    states, G, c, bound = solved(
+        limits, objective, (2.0, 1.0, 1e-3, 40), (1.0, 1.0, 1e-8, 200)
+    )
     best = by_scipy(wish, H, G, c, bound)
     assert best.success
-    np.testing.assert_allclose([x.evaluation.value for x in states], best.fun, rtol=1e-4)
+    np.testing.assert_allclose(
+        [x.evaluation.value for x in states], best.fun, rtol=1e-4
+    )
     assert (np.abs(np.array([x.y for x in states]) @ G.T - c) <= bound).all()
 
 
@@ -96,7 +102,9 @@ def test_keeps_constraints_that_are_not_linear(arm):
     best = by_scipy(wish, H, G, c, bound, ball)
     assert best.success
     assert best.fun > 1.02 * by_scipy(wish, H, G, c, bound).fun, "the ellipsoids bind"
-    np.testing.assert_allclose([x.evaluation.value for x in states], best.fun, rtol=1e-4)
+    np.testing.assert_allclose(
+        [x.evaluation.value for x in states], best.fun, rtol=1e-4
+    )
     assert max(x.evaluation.excess.max() for x in states) <= 1e-6
     assert (np.abs(np.array([x.y for x in states]) @ G.T - c) <= bound).all()
 

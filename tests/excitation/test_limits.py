@@ -24,7 +24,11 @@ def peaks(limits, x, samples=8000):
     q, qd, qdd = (part @ np.asarray(x).T for part in rows[:3])
     own = limits.limits
     middle = (own.position_max + own.position_min) / 2
-    use = (q - middle) / (own.position_max - middle), qd / own.velocity, qdd / own.acceleration
+    use = (
+        (q - middle) / (own.position_max - middle),
+        qd / own.velocity,
+        qdd / own.acceleration,
+    )
     return np.max(np.abs(use)) - 1.0
 
 

@@ -48,7 +48,9 @@ def test_each_joint_of_a_child_moves_as_in_a_parent(free, parents):
 
 
 def test_a_small_excess_does_not_outweigh_a_better_value():
-    best = Candidates(np.zeros((3, 1)), np.array([-1.0, -1.5, -1.6]), np.array([-0.1, 0.01, 1.0]))
+    best = Candidates(
+        np.zeros((3, 1)), np.array([-1.0, -1.5, -1.6]), np.array([-0.1, 0.01, 1.0])
+    )
     assert list(best.order()) == [0, 1, 2]
     assert list(best.promising()) == [1, 0, 2]
     assert 0.01 * PENALTY < 0.5
@@ -59,7 +61,9 @@ def test_the_best_of_two_generations_survive_and_none_twice():
         np.arange(3.0)[:, None], np.array([-1.0, -2.0, -3.0]), np.array([-1.0, -1, 0.2])
     )
     children = Candidates(
-        np.arange(10.0, 13.0)[:, None], np.array([-2.0, -1.5, np.inf]), np.array([-1.0, -1, np.inf])
+        np.arange(10.0, 13.0)[:, None],
+        np.array([-2.0, -1.5, np.inf]),
+        np.array([-1.0, -1, np.inf]),
     )
     best = parents.survivors(children)
     assert list(best.x[:, 0]) == [1.0, 11.0, 0.0]
@@ -70,7 +74,9 @@ def test_the_best_of_two_generations_survive_and_none_twice():
 def test_a_motion_is_enlarged_to_its_limits_only_where_that_is_better(pendulum):
     """A condition number may well become worse: what a polished motion gained would be lost."""
     for criterion in (ConditionNumber(), DOptimal()):
-        one = ExcitationProblem(pendulum, BASIS, criterion=criterion, noise=np.ones(1), samples=100)
+        one = ExcitationProblem(
+            pendulum, BASIS, criterion=criterion, noise=np.ones(1), samples=100
+        )
         x = 0.97 * np.asarray(one.limits.random(jax.random.key(8), 20))
         before, within = evaluate(one, x), evaluate_within_limits(one, x)
         assert (within.value <= before.value + 1e-9).all()

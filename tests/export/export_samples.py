@@ -12,7 +12,9 @@ def fit_of(model: jid.Model, p: np.ndarray, *, full: bool = False) -> jid.Fit:
     base = jid.base_parameters(model)
     fields = {"recordings": ("first", "second"), "date": "2026-01-31"}
     full_parameters = p if full else None
-    return virtual.fit_of(base, base.from_standard(p), full_parameters=full_parameters, **fields)
+    return virtual.fit_of(
+        base, base.from_standard(p), full_parameters=full_parameters, **fields
+    )
 
 
 def possible(model: jid.Model, seed: int = 0) -> np.ndarray:

@@ -16,7 +16,9 @@ from jaxid.dynamics.dispatch import in_numpy
 from jaxid.errors import InputError
 from jaxid.export.torque_program import exported_function, torque_program
 
-pytestmark = pytest.mark.skipif(shutil.which("gcc") is None, reason="no C compiler (gcc)")
+pytestmark = pytest.mark.skipif(
+    shutil.which("gcc") is None, reason="no C compiler (gcc)"
+)
 STRICT = ["-Wall", "-Wextra", "-pedantic", "-Werror", "-O1"]
 
 
@@ -33,13 +35,21 @@ def tree():
         offset=rng.normal(size=(4, 3)),
         gravity=(1.0, 2.0, -9.0),
     )
-    terms = (jid.RigidBodies(), jid.terms.LinearSpring(0.3), jid.terms.AsymmetricCoulombFriction())
+    terms = (
+        jid.RigidBodies(),
+        jid.terms.LinearSpring(0.3),
+        jid.terms.AsymmetricCoulombFriction(),
+    )
     return jid.Model(robot, terms)
 
 
 def railed():
     """A rail and two joints, without products of inertia."""
-    terms = (jid.RigidBodies(principal_axes=True), jid.CoulombFriction(), jid.RotorInertia())
+    terms = (
+        jid.RigidBodies(principal_axes=True),
+        jid.CoulombFriction(),
+        jid.RotorInertia(),
+    )
     robot = jid.Robot(
         "rail",
         revolute=(False, True, True),
@@ -69,7 +79,9 @@ def compiled(fit):
 
 
 def close(got, wanted, tolerance=1e-12):
-    np.testing.assert_allclose(got, wanted, rtol=0, atol=tolerance * np.abs(wanted).max())
+    np.testing.assert_allclose(
+        got, wanted, rtol=0, atol=tolerance * np.abs(wanted).max()
+    )
 
 
 def test_all_forms_agree_with_numpy(fit, compiled):
@@ -141,13 +153,17 @@ def test_the_file_compiles_without_warnings_and_checks_itself(small, tmp_path, d
         code, said = check(*language)
         assert code == 0, said
         assert "this build is right" in said
-    text = re.sub(r"(_torque_expected.*\n    \{)", r"\g<1>9", source.read_text("ascii"), count=1)
+    text = re.sub(
+        r"(_torque_expected.*\n    \{)", r"\g<1>9", source.read_text("ascii"), count=1
+    )
     source.write_text(text, "ascii")
     code, said = check("-std=c99")
     assert code == 1
     assert "WRONG" in said
     compiled, m = CompiledModel(small, double=double, flags=["-O1"]), motion(2, 50)
-    close(compiled.torque(m.q, m.qd, m.qdd), small.predict(m), 1e-12 if double else 1e-5)
+    close(
+        compiled.torque(m.q, m.qd, m.qdd), small.predict(m), 1e-12 if double else 1e-5
+    )
     with pytest.raises(InputError, match="7 axes"):
         jid.export_c(small, tmp_path, name="7 axes")
 
@@ -159,13 +175,16 @@ def test_the_header_says_what_it_is(small, tmp_path):
         "Model of 2026-01-31",
         "first, second",
         "0  joint1: turns, q in rad, tau in N m",
-        "void arm_torque(const double *q, const double *qd, const double *qdd, double *tau);",
+        "void arm_torque(const double *q, const double *qd, const double *qdd, double "
+        "*tau);",
         "#define ARM_JOINTS 2",
     ):
         assert text in header
     assert header.splitlines()[0].count("*/") == 0
     source = (tmp_path / "arm.c").read_text("ascii")
-    functions = source[source.index("void arm_torque") : source.index("#ifdef ARM_SELF_TEST")]
+    functions = source[
+        source.index("void arm_torque") : source.index("#ifdef ARM_SELF_TEST")
+    ]
     assert not re.search(r"\b(if|while|goto|switch)\b", functions)
 
 

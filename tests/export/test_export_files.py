@@ -69,7 +69,9 @@ def held(fit, m, *, drives):
 
 
 def close(found, wanted, tolerance):
-    np.testing.assert_allclose(found, wanted, rtol=0, atol=tolerance * np.abs(wanted).max())
+    np.testing.assert_allclose(
+        found, wanted, rtol=0, atol=tolerance * np.abs(wanted).max()
+    )
 
 
 def pinocchio_torques(pin, model, m):
@@ -78,7 +80,10 @@ def pinocchio_torques(pin, model, m):
         q = pin.neutral(model)
         for j, joint in enumerate(model.joints):
             if joint.nq == 2:
-                q[joint.idx_q : joint.idx_q + 2] = np.cos(v[0][j - 1]), np.sin(v[0][j - 1])
+                q[joint.idx_q : joint.idx_q + 2] = (
+                    np.cos(v[0][j - 1]),
+                    np.sin(v[0][j - 1]),
+                )
             elif joint.nq == 1:
                 q[joint.idx_q] = v[0][j - 1]
         order.append(pin.rnea(model, data, q, v[1], v[2]).copy())
@@ -102,7 +107,9 @@ def test_everything_else_in_the_urdf_is_untouched(fit, source, tmp_path):
 
     def rest(file):
         root = etree.parse(str(file), etree.XMLParser(remove_blank_text=True)).getroot()
-        for element in root.xpath("//inertial | //dynamics | //comment()[contains(., 'friction')]"):
+        for element in root.xpath(
+            "//inertial | //dynamics | //comment()[contains(., 'friction')]"
+        ):
             element.getparent().remove(element)
         for limit in root.iter("limit"):
             limit.attrib.pop("effort")
@@ -112,7 +119,10 @@ def test_everything_else_in_the_urdf_is_untouched(fit, source, tmp_path):
     text = path.read_text("utf-8")
     assert "<!-- kept -->" in text
     assert f"{fit.checksum}. Not in this file: Ia1, Ia2, Ia3, fo1, fo2, fo3." in text
-    assert path.read_bytes() == jid.export_urdf(fit, path, tmp_path / "b.urdf").read_bytes()
+    assert (
+        path.read_bytes()
+        == jid.export_urdf(fit, path, tmp_path / "b.urdf").read_bytes()
+    )
 
 
 FINGERS = """
@@ -159,7 +169,9 @@ def test_fingers_are_exported_once_to_pinocchio_and_mujoco(source, tmp_path, tip
 def test_an_mjcf_file_is_exported_to_both_formats(source, tmp_path):
     pin, mujoco = pytest.importorskip("pinocchio"), pytest.importorskip("mujoco")
     model = jid.Model(jid.load_urdf(source))
-    first = jid.export_mjcf(fit_of(model, possible(model), full=True), tmp_path / "first.xml")
+    first = jid.export_mjcf(
+        fit_of(model, possible(model), full=True), tmp_path / "first.xml"
+    )
     robot = jid.load_mjcf(first)
     assert robot.joint_names == model.robot.joint_names
     np.testing.assert_allclose(robot.offset, model.robot.offset, atol=1e-14)
@@ -167,9 +179,13 @@ def test_an_mjcf_file_is_exported_to_both_formats(source, tmp_path):
     expected = possible(model)[:30]
     np.testing.assert_allclose(jid.urdf_parameters(first), expected, rtol=0, atol=1e-13)
     fit, m = fit_of(jid.Model(robot), possible(model, 1), full=True), motion(3, 20)
-    there = pin.buildModelFromUrdf(str(jid.export_urdf(fit, first, tmp_path / "arm.urdf")))
+    there = pin.buildModelFromUrdf(
+        str(jid.export_urdf(fit, first, tmp_path / "arm.urdf"))
+    )
     close(pinocchio_torques(pin, there, m), held(fit, m, drives=False), 1e-12)
-    there = mujoco.MjModel.from_xml_path(str(jid.export_mjcf(fit, tmp_path / "arm.xml")))
+    there = mujoco.MjModel.from_xml_path(
+        str(jid.export_mjcf(fit, tmp_path / "arm.xml"))
+    )
     assert [there.joint(i).name for i in range(3)] == ["rail", "shoulder", "elbow"]
     close(mujoco_torques(mujoco, there, m), held(fit, m, drives=True), 1e-11)
 
@@ -181,7 +197,9 @@ def test_a_urdf_of_another_robot_is_refused(fit, source, tmp_path):
     source.write_text(URDF.replace("0 0.3 0", "0 0.4 0"), "utf-8")
     with pytest.raises(ValueError, match="`offset`"):
         jid.export_urdf(fit, source, tmp_path / "arm.urdf")
-    sliding = URDF.replace('name="elbow" type="revolute"', 'name="elbow" type="prismatic"')
+    sliding = URDF.replace(
+        'name="elbow" type="revolute"', 'name="elbow" type="prismatic"'
+    )
     assert sliding != URDF
     source.write_text(sliding, "utf-8")
     with pytest.raises(ValueError, match="joint `elbow` slides in"):
@@ -222,11 +240,15 @@ def test_pinocchio_parameters_are_those_of_its_inertias_and_regressor(fit, sourc
     model = pin.buildModelFromUrdf(str(source))
     for i, row in enumerate(rows):
         model.inertias[i + 1] = pin.Inertia.FromDynamicParameters(row)
-        np.testing.assert_allclose(model.inertias[i + 1].toDynamicParameters(), row, atol=1e-12)
+        np.testing.assert_allclose(
+            model.inertias[i + 1].toDynamicParameters(), row, atol=1e-12
+        )
     close(pinocchio_torques(pin, model, m), held(fit, m, drives=False), 1e-12)
 
 
-def test_the_exported_function_takes_any_number_of_samples_and_needs_no_jaxid(fit, tmp_path):
+def test_the_exported_function_takes_any_number_of_samples_and_needs_no_jaxid(
+    fit, tmp_path
+):
     exported, m = jid.export.exported_function(fit), motion(3, 30)
     close(exported.call(m.q, m.qd, m.qdd), fit.predict(m), 1e-13)
     if importlib.util.find_spec("flatbuffers") is None:
@@ -242,7 +264,13 @@ class Drag(jid.terms.AbstractTerm):
     """A damping term of a user, with one friction that depends on the direction."""
 
     def parameters(self, robot):
-        return (("d1", "N m s"), ("c2+", "N m"), ("c2-", "N m"), ("x3", "N m s²"), ("s1", "N m"))
+        return (
+            ("d1", "N m s"),
+            ("c2+", "N m"),
+            ("c2-", "N m"),
+            ("x3", "N m s²"),
+            ("s1", "N m"),
+        )
 
     def columns(self, robot, q, qd, qdd):
         one = np.eye(3)
@@ -254,7 +282,9 @@ class Drag(jid.terms.AbstractTerm):
 
 def test_joint_friction_is_read_from_the_terms_of_a_user(fit):
     model = jid.Model(fit.base.model.robot, (jid.RigidBodies(), Drag()))
-    p = np.concatenate([possible(jid.Model(model.robot, model.terms[:1])), [2.0, 4.0, 1.0, 9, 9]])
+    p = np.concatenate(
+        [possible(jid.Model(model.robot, model.terms[:1])), [2.0, 4.0, 1.0, 9, 9]]
+    )
     joints, _, left_out = joint_dynamics(fit_of(model, p, full=True))
     np.testing.assert_allclose(joints["damping"], [2.0, 0.0, 0.0], atol=1e-12)
     np.testing.assert_allclose(joints["friction"], [0.0, 2.5, 0.0], atol=1e-12)
@@ -275,7 +305,11 @@ def test_what_could_not_exist_is_refused_with_the_way_out(fit, tmp_path, write, 
     if case == "friction":
         p[30] = -0.1
     fit = dataclasses.replace(fit, full_parameters=None if case == "base" else p)
-    said = {"base": "only base parameters", "body": "body 2 cannot", "friction": "`damping`"}
+    said = {
+        "base": "only base parameters",
+        "body": "body 2 cannot",
+        "friction": "`damping`",
+    }
     with pytest.raises(ValueError, match=f"{said[case]}.*`jid.PhysicallyConsistent"):
         write(fit, tmp_path / "out")
     assert not (tmp_path / "out").exists()

@@ -27,17 +27,72 @@ from jaxid.result_table import Column, Remark, Table, printable
 from jaxid.trajectory.files import write_ros
 
 PARTS = [
-    *('"', "'", "\\", "*/", "/*", "//", "??/", "?", "\n", "\r", "\t", "\0", "#", "{}", "{{", "%"),
-    *("<script>", "</td>", "&lt;", "]]>", "-->", "--", "<!--", "[red]", "]", "=", ": ", "- ", "`"),
-    *("\x1b[2J", "\x1b]0;t\x07", "\x9b31m", "\u202e", "\x7f", "\ud800", "é", "²", "日", "a b", "x"),
-    *("#include <", "#define X system(1)", "$(id)", "$%s", "1e9", "&x", "*x", "!tag", "@"),
+    *(
+        '"',
+        "'",
+        "\\",
+        "*/",
+        "/*",
+        "//",
+        "??/",
+        "?",
+        "\n",
+        "\r",
+        "\t",
+        "\0",
+        "#",
+        "{}",
+        "{{",
+        "%",
+    ),
+    *(
+        "<script>",
+        "</td>",
+        "&lt;",
+        "]]>",
+        "-->",
+        "--",
+        "<!--",
+        "[red]",
+        "]",
+        "=",
+        ": ",
+        "- ",
+        "`",
+    ),
+    *(
+        "\x1b[2J",
+        "\x1b]0;t\x07",
+        "\x9b31m",
+        "\u202e",
+        "\x7f",
+        "\ud800",
+        "é",
+        "²",
+        "日",
+        "a b",
+        "x",
+    ),
+    *(
+        "#include <",
+        "#define X system(1)",
+        "$(id)",
+        "$%s",
+        "1e9",
+        "&x",
+        "*x",
+        "!tag",
+        "@",
+    ),
 ]
 
 
 def hostile(number, keep=lambda _: True):
     """Return random texts of dangerous parts."""
     random = np.random.default_rng(number)
-    texts = ("".join(random.choice(PARTS, random.integers(1, 6))) for _ in range(10 * number))
+    texts = (
+        "".join(random.choice(PARTS, random.integers(1, 6))) for _ in range(10 * number)
+    )
     return [text for text in texts if keep(text)][:number]
 
 
@@ -111,7 +166,9 @@ def test_xml(fit, tmp_path):
     consistent = dataclasses.replace(fit, full_parameters=possible(fit.base.model))
     for text in hostile(250, str.isprintable):
         path = tmp_path / "arm.xml"
-        jid.export.export_mjcf(dataclasses.replace(named(consistent, text), date=text), path)
+        jid.export.export_mjcf(
+            dataclasses.replace(named(consistent, text), date=text), path
+        )
         root = etree.parse(path).getroot()
         assert [x.get("name") for x in root.iter("joint")] == [text, f"{text}2"]
 

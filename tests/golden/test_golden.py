@@ -1,6 +1,7 @@
 """Golden results of the example, of exported models, and of a design with a fixed key.
 
-Those of measured robots are compared in `tests/real_data`, those of the demo in `test_demo.py`.
+Those of measured robots are compared in `tests/real_data`, those of the demo in
+`test_demo.py`.
 """
 
 import ctypes
@@ -55,7 +56,12 @@ def test_export_to_c(consistent, tmp_path):
     found = []
     for sample in np.random.default_rng(0).uniform(-1.5, 1.5, (5, 3, 7)):
         forces = np.empty(7)
-        torque(*(ctypes.c_void_p(x.ctypes.data) for x in (*np.ascontiguousarray(sample), forces)))
+        torque(
+            *(
+                ctypes.c_void_p(x.ctypes.data)
+                for x in (*np.ascontiguousarray(sample), forces)
+            )
+        )
         found.append(list(forces))
     compare("export_c", {"torques": found}, max(TOLERANCE, 1e-7))
 
@@ -67,11 +73,15 @@ def test_export_of_bodies(target, consistent, tmp_path):
     if target == "urdf":
         chain = "".join(
             f'<link name="l{k + 1}"/><joint name="joint{k + 1}" type="revolute">'
-            f'<parent link="l{k}"/><child link="l{k + 1}"/><origin xyz="{xyz}" rpy="{rpy} 0 0"/>'
-            '<axis xyz="0 0 1"/><limit lower="-3" upper="3" velocity="2" effort="80"/></joint>'
+            f'<parent link="l{k}"/><child link="l{k + 1}"/><origin xyz="{xyz}" '
+            f'rpy="{rpy} 0 0"/>'
+            '<axis xyz="0 0 1"/><limit lower="-3" upper="3" velocity="2" '
+            'effort="80"/></joint>'
             for k, (xyz, rpy) in enumerate(PANDA)
         )
-        (tmp_path / "own.urdf").write_text(f'<robot name="a"><link name="l0"/>{chain}</robot>')
+        (tmp_path / "own.urdf").write_text(
+            f'<robot name="a"><link name="l0"/>{chain}</robot>'
+        )
         extra = ("--urdf", tmp_path / "own.urdf")
     command("export", consistent, "--to", target, "-o", path, *extra)
     bodies = [
@@ -107,10 +117,19 @@ def test_design():
         acceleration=[4.0, 9.0],
         force=[80.0, 20.0],
     )
-    base = jid.base_parameters(jid.Model(jid.robots.planar_arm(2).replace(limits=limits)))
-    settings = {"harmonics": 3, "omega": 1.1, "starts": 3, "generations": 2, "samples": 200}
+    base = jid.base_parameters(
+        jid.Model(jid.robots.planar_arm(2).replace(limits=limits))
+    )
+    settings = {
+        "harmonics": 3,
+        "omega": 1.1,
+        "starts": 3,
+        "generations": 2,
+        "samples": 200,
+    }
     plan = jid.design_excitation(base, key=jax.random.key(3), **settings)
     assert plan.feasible
-    # A search ends in one of several optima that are nearly equal: its value is what counts.
+    # A search ends in one of several optima that are nearly equal: its value is what
+    # counts.
     (designed,) = [c for c in plan.criteria if c.name == plan.criterion.name]
     assert designed.after <= golden("design")["value"] * 1.02

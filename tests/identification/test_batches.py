@@ -41,14 +41,18 @@ def arrays(sets):
 
 
 def stacked(sets):
-    fields = [np.stack([getattr(o.motion, x) for o in sets]) for x in ("q", "qd", "qdd")]
+    fields = [
+        np.stack([getattr(o.motion, x) for o in sets]) for x in ("q", "qd", "qdd")
+    ]
     return jid.Motion(*fields), np.stack([o.forces for o in sets])
 
 
 def some_sets(base, count, **options):
     p = standard_parameters(base.model)
     return [
-        observations(base.model, p, samples=SAMPLES, noise=0.3, seed=k, noise_seed=k, **options)
+        observations(
+            base.model, p, samples=SAMPLES, noise=0.3, seed=k, noise_seed=k, **options
+        )
         for k in range(count)
     ]
 
@@ -58,7 +62,9 @@ def assert_same(fit, k, one):
     size = 1.0 / np.asarray(one.naive_standard_deviations)
     error = (np.asarray(fit.parameters[k]) - one.parameters) * size
     assert np.linalg.norm(error) < 1e-10 * np.linalg.norm(one.parameters * size)
-    np.testing.assert_allclose(fit.standard_deviations[k], one.naive_standard_deviations, rtol=1e-9)
+    np.testing.assert_allclose(
+        fit.standard_deviations[k], one.naive_standard_deviations, rtol=1e-9
+    )
     np.testing.assert_allclose(fit.residual_rms[k], one.residual_rms, rtol=1e-9)
 
 
@@ -85,7 +91,9 @@ def test_honest_deviations_of_many_draws(base, sets, arrays):
     draws = np.where(mask[:, None], draws, np.nan)
     fit = identify_batch(base, arrays[0], draws, weights, mask=mask, row_time=dt)
     assert fit.parameters.shape == (3, 3, base.size)
-    assert np.median(fit.standard_deviations[:2] / fit.naive_standard_deviations[:2]) > 1.5
+    assert (
+        np.median(fit.standard_deviations[:2] / fit.naive_standard_deviations[:2]) > 1.5
+    )
     # Too few rows.
     assert list(fit.determined) == [True, True, False]
     assert np.isfinite(fit.parameters).all()
@@ -94,7 +102,9 @@ def test_honest_deviations_of_many_draws(base, sets, arrays):
         fields = {"mask": mask[k], "forces": np.nan_to_num(draws[k, draw])}
         estimator = jid.WeightedLeastSquares(jid.estimators.GivenWeights(weights[k]))
         one = jid.identify(base, sets[k].replace(**fields), estimator)
-        np.testing.assert_allclose(fit.parameters[k, draw], one.parameters, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(
+            fit.parameters[k, draw], one.parameters, rtol=1e-9, atol=1e-9
+        )
         for name in ("standard_deviations", "naive_standard_deviations"):
             found = getattr(fit, name)[k, draw]
             np.testing.assert_allclose(found, getattr(one, name), rtol=1e-8)
@@ -112,20 +122,26 @@ def test_any_estimator_takes_batches(base, sets, arrays):
     assert np.asarray(fit.determined).all()
     one = jid.identify(base, sets[1].replace(mask=mask[1]), estimator)
     np.testing.assert_allclose(fit.parameters[1, 0], one.parameters, rtol=1e-8)
-    np.testing.assert_allclose(fit.standard_deviations[1, 0], one.standard_deviations, rtol=1e-8)
+    np.testing.assert_allclose(
+        fit.standard_deviations[1, 0], one.standard_deviations, rtol=1e-8
+    )
     np.testing.assert_allclose(fit.parameters[1, 1], 2 * one.parameters, rtol=1e-2)
 
 
 def test_draws_scatter_as_the_standard_deviations_say(base, arrays):
     m, forces = arrays[0][:1], arrays[1][:1]
     rng = np.random.default_rng(0)
-    fit = identify_batch(base, m, forces[:, None] + 5 * rng.normal(size=(1, 3000, SAMPLES, 2)))
+    fit = identify_batch(
+        base, m, forces[:, None] + 5 * rng.normal(size=(1, 3000, SAMPLES, 2))
+    )
     scatter = np.std(fit.parameters[0], axis=0, ddof=1)
     expected = np.sqrt(np.mean(np.asarray(fit.standard_deviations[0]) ** 2, axis=0))
     np.testing.assert_allclose(scatter, expected, rtol=4 / np.sqrt(2 * 3000))
 
 
-def test_data_sets_that_determine_too_little_are_marked_and_solved_like_alone(base, sets):
+def test_data_sets_that_determine_too_little_are_marked_and_solved_like_alone(
+    base, sets
+):
     weak = [sets[0], some_sets(base, 1, still=(1,))[0], sets[2]]
     fit = identify_batch(base, *stacked(weak))
     assert list(fit.determined) == [True, False, True]
@@ -135,7 +151,9 @@ def test_data_sets_that_determine_too_little_are_marked_and_solved_like_alone(ba
     assert 0 < known.sum() < base.size
     np.testing.assert_array_equal(np.isfinite(fit.standard_deviations[1]), known)
     honest = identify_batch(base, *stacked(weak), row_time=sets[0].sample_time)
-    np.testing.assert_allclose(honest.standard_deviations[1], one.standard_deviations, rtol=1e-6)
+    np.testing.assert_allclose(
+        honest.standard_deviations[1], one.standard_deviations, rtol=1e-6
+    )
 
 
 def test_nearly_dependent_columns_are_as_accurate_as_alone(base):
@@ -144,7 +162,9 @@ def test_nearly_dependent_columns_are_as_accurate_as_alone(base):
     fit = identify_batch(base, *stacked(sets))
     one = jid.identify(base, sets[0])
     assert one.condition_numbers.scaled > many_data_sets.WELL_CONDITIONED
-    np.testing.assert_allclose(fit.standard_deviations[0], one.naive_standard_deviations, rtol=1e-5)
+    np.testing.assert_allclose(
+        fit.standard_deviations[0], one.naive_standard_deviations, rtol=1e-5
+    )
     error = np.abs(np.asarray(fit.parameters[0]) - one.parameters)
     known = np.isfinite(one.naive_standard_deviations)
     assert (error[known] < 1e-3 * one.naive_standard_deviations[known]).all()
@@ -176,16 +196,21 @@ def test_a_gpu_solves_many_data_sets_at_once_without_callbacks(base):
         return identify_batch(base, motion, forces, WEIGHTS)
 
     traced = jax.jit(run).trace(jid.Motion(q, qd, qdd), forces)
-    texts = {p: traced.lower(lowering_platforms=(p,)).as_text() for p in ("cpu", "cuda")}
+    texts = {
+        p: traced.lower(lowering_platforms=(p,)).as_text() for p in ("cpu", "cuda")
+    }
     trips = {
-        p: {int(n) for n in re.findall(r"dense<(\d+)> : tensor<i64>", texts[p])} for p in texts
+        p: {int(n) for n in re.findall(r"dense<(\d+)> : tensor<i64>", texts[p])}
+        for p in texts
     }
     assert 500 in trips["cpu"]
     assert 7 in trips["cuda"]
     assert 500 not in trips["cuda"]
     assert "callback" not in texts["cuda"]
     # Fences are divisions.
-    assert texts["cuda"].count("stablehlo.divide") < 0.5 * texts["cpu"].count("stablehlo.divide")
+    assert texts["cuda"].count("stablehlo.divide") < 0.5 * texts["cpu"].count(
+        "stablehlo.divide"
+    )
 
 
 def test_data_sets_of_a_mesh_of_devices(base, arrays):
@@ -196,7 +221,9 @@ def test_data_sets_of_a_mesh_of_devices(base, arrays):
         return identify_batch(base, motion, forces, WEIGHTS).parameters
 
     run = jax.shard_map(found, mesh=mesh, in_specs=(sets, sets), out_specs=sets)
-    np.testing.assert_allclose(jax.jit(run)(*arrays), found(*arrays), rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(
+        jax.jit(run)(*arrays), found(*arrays), rtol=1e-9, atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("name", ["offset", "axis", "gravity"])
@@ -216,7 +243,9 @@ def test_derivatives_by_the_geometry_are_differences(base, sets, arrays, name):
     for tangent, *near in zip(tangents, *there, strict=True):
         a, b, c, d = map(np.asarray, near)
         quotient = (8 * (a - b) - (c - d)) / (12 * h)
-        np.testing.assert_allclose(tangent, quotient, atol=1e-6 * np.abs(quotient).max())
+        np.testing.assert_allclose(
+            tangent, quotient, atol=1e-6 * np.abs(quotient).max()
+        )
     slope = jax.grad(lambda x: found(x)[0].sum())(x)
     np.testing.assert_allclose(jnp.vdot(slope, direction), tangents[0].sum(), rtol=1e-9)
 
@@ -224,15 +253,21 @@ def test_derivatives_by_the_geometry_are_differences(base, sets, arrays, name):
 def test_all_numbers_of_a_model_may_be_inputs(base, arrays):
     found = eqx.filter_jit(identify_batch)(base, *arrays, WEIGHTS)
     known = identify_batch(base, *arrays, WEIGHTS)
-    np.testing.assert_allclose(found.parameters, known.parameters, rtol=1e-9, atol=1e-11)
+    np.testing.assert_allclose(
+        found.parameters, known.parameters, rtol=1e-9, atol=1e-11
+    )
     with pytest.raises(ValueError, match="`weights` must be given"):
         eqx.filter_jit(identify_batch)(base, *arrays)
 
 
 def test_robots_of_one_topology(base):
     own = base.model.robot
-    robots = [own.replace(offset=np.asarray(own.offset) * length) for length in (1.0, 1.75)]
-    bases = [jid.base_parameters(jid.Model(robot, base.model.terms)) for robot in robots]
+    robots = [
+        own.replace(offset=np.asarray(own.offset) * length) for length in (1.0, 1.75)
+    ]
+    bases = [
+        jid.base_parameters(jid.Model(robot, base.model.terms)) for robot in robots
+    ]
     sets = [some_sets(alone, 1)[0] for alone in bases]
     fit = identify_batch(base, *stacked(sets), robots=robots)
     for k, (alone, o) in enumerate(zip(bases, sets, strict=True)):
@@ -257,13 +292,17 @@ def test_refusals(base, arrays, samples, options, message):
 
 
 def test_bootstrap_agrees_with_the_scatter_of_blocks(base):
-    o = observations(base.model, standard_parameters(base.model), samples=12000, noise=2.0)
+    o = observations(
+        base.model, standard_parameters(base.model), samples=12000, noise=2.0
+    )
     order = np.random.default_rng(0).permutation(12000)
     o = o.replace(motion=o.motion[order], forces=o.forces[order])
     blocks = jid.RegressionProblem(base, [o], divisions=60).blocks
     with pytest.raises(ValueError, match="at least two blocks"):
         bootstrap(Blocks(blocks.parts[:1]), WEIGHTS, 50, jax.random.key(0))
-    fit = fit_problem(jid.RegressionProblem(base, blocks=blocks), jid.estimators.LeastSquares())
+    fit = fit_problem(
+        jid.RegressionProblem(base, blocks=blocks), jid.estimators.LeastSquares()
+    )
     draws = bootstrap(blocks, fit.weights, 4000, jax.random.key(0))
     np.testing.assert_allclose(
         np.mean(draws, axis=0), fit.parameters, atol=0.2 * fit.standard_deviations.max()

@@ -55,11 +55,16 @@ CUTOFFS = (0.5, 8.0, 16.0, 100.0)
 
 def test_a_filter_is_chosen_between_too_low_and_too_high(noisy_log):
     candidates = [
-        (jid.ZeroPhaseButterworth(f), jid.Subsample(max(1, int(1.0 / (5.0 * f * 0.004)))))
+        (
+            jid.ZeroPhaseButterworth(f),
+            jid.Subsample(max(1, int(1.0 / (5.0 * f * 0.004)))),
+        )
         for f in CUTOFFS
     ]
     told = []
-    found = jid.choose_filter(BASE, noisy_log, candidates, estimator=WLS, progress=told.append)
+    found = jid.choose_filter(
+        BASE, noisy_log, candidates, estimator=WLS, progress=told.append
+    )
     best = CUTOFFS[found.best]
     assert 4.0 <= best <= 32.0
     assert found.filter.cutoff == best
@@ -67,7 +72,9 @@ def test_a_filter_is_chosen_between_too_low_and_too_high(noisy_log):
     assert found.curve[-1] > 1.1 * found.curve.min()
     assert found.correlations[0] > found.correlations[-1]
     assert told[-1] == 1.0
-    white = jid.choose_filter(BASE, noisy_log, candidates, estimator=WLS, criterion="whiteness")
+    white = jid.choose_filter(
+        BASE, noisy_log, candidates, estimator=WLS, criterion="whiteness"
+    )
     np.testing.assert_array_equal(white.errors, found.errors)
     good = found.curve <= 1.05 * found.curve.min()
     expected = np.where(good, np.abs(found.correlations), np.inf)

@@ -35,7 +35,8 @@ def test_false_alarms_are_as_rare_as_promised():
         joint += found.groups[0]["p_value"] < 0.05
         outside = np.abs(found.difference) > stats.norm.ppf(0.975) * np.sqrt(np.diag(a))
         wrong += np.count_nonzero(outside)
-    # Binomial scatter: three standard deviations of a rate of 0.05 over 1500 draws are 0.017.
+    # Binomial scatter: three standard deviations of a rate of 0.05 over 1500 draws are
+    # 0.017.
     assert abs(alone / DRAWS / SIZE - 0.05) < 0.017
     assert abs(joint / DRAWS - 0.05) < 0.017
     assert 0.02 < family / DRAWS < 0.05 + 0.017
@@ -67,7 +68,9 @@ def test_a_change_is_found_where_it_is():
     assert [k for k, v in enumerate(found.verdicts) if v is Verdict.CHANGED] == [7]
     assert [g["name"] for g in found.groups if g["changed"]] == ["viscous friction"]
     small = jid.compare(fit(p, a), fit(p + 0.27 * change, b))
-    assert small.verdicts[7] is Verdict.PERHAPS, "2.2 deviations are no news among twelve"
+    assert small.verdicts[7] is Verdict.PERHAPS, (
+        "2.2 deviations are no news among twelve"
+    )
 
 
 def test_undetermined_parameters_are_left_out():

@@ -136,7 +136,9 @@ def base():
 
 
 def test_a_long_log_on_three_devices_without_asking(base, tmp_path, monkeypatch):
-    process = start(LONG, tmp_path / "3.npz", flags="--xla_force_host_platform_device_count=3")
+    process = start(
+        LONG, tmp_path / "3.npz", flags="--xla_force_host_platform_device_count=3"
+    )
     monkeypatch.setattr(jid.RegressionProblem, "compiled_samples", 1000)
     monkeypatch.setattr(long_logs, "PIECE", 2048)
     smooth, p = jid.ZeroPhaseButterworth(30.0), standard_parameters(base.model)
@@ -149,7 +151,9 @@ def test_a_long_log_on_three_devices_without_asking(base, tmp_path, monkeypatch)
 
 
 def test_data_sets_are_divided_as_the_inputs_are(tmp_path):
-    process = start(DIVIDED, tmp_path / "4.npz", flags="--xla_force_host_platform_device_count=4")
+    process = start(
+        DIVIDED, tmp_path / "4.npz", flags="--xla_force_host_platform_device_count=4"
+    )
     (output,) = finish(process)
     assert process.returncode == 0, output
     assert np.isfinite(np.load(tmp_path / "4.npz")["s"]).all()
@@ -162,12 +166,16 @@ def test_processes_read_their_own_shards(base, tmp_path):
     p = standard_parameters(base.model)
     columns = jid.Columns(angles="q{}", forces="tau{}", sample_time=1e-3)
     for k, samples in enumerate((9000, 3000, 2800)):
-        o = observations(base.model, p, samples=samples, noise=0.3, seed=k, noise_seed=k)
+        o = observations(
+            base.model, p, samples=samples, noise=0.3, seed=k, noise_seed=k
+        )
         arrays = {"q": o.motion.q, "tau": o.forces}
         frame = {f"{n}{j + 1}": x[:, j] for n, x in arrays.items() for j in range(2)}
         pl.DataFrame(frame).write_parquet(folder / f"{k}.parquet", row_group_size=1000)
     paths, port = [tmp_path / f"{k}.npz" for k in range(count)], free_port()
-    processes = [start(SHARDS, p, port, f"{k}/{count}", folder) for k, p in enumerate(paths)]
+    processes = [
+        start(SHARDS, p, port, f"{k}/{count}", folder) for k, p in enumerate(paths)
+    ]
     outputs = finish(*processes)
     assert [p.returncode for p in processes] == [0] * count, "\n\n".join(outputs)
     assert len(jid.devices.shards(folder)) == 3
@@ -185,7 +193,11 @@ def test_processes_read_their_own_shards(base, tmp_path):
 def test_a_process_that_dies_ends_the_others(tmp_path):
     """Whichever of the two notices first: this package's patience or JAX's own watch."""
     cases = {
-        (100, 3): "TimeoutError process 0 of 2 waited for the others' factors, but not all came",
+        (
+            100,
+            3,
+        ): "TimeoutError process 0 of 2 waited for the others' factors, but not all "
+        "came",
         (3, 100): "RuntimeError process 0 lost another one",
     }
     processes = []

@@ -78,7 +78,8 @@ def test_the_laws_cover_every_estimator(noisy):
         for _, c in inspect.getmembers(est, inspect.isclass)
         if issubclass(c, est.AbstractEstimator) and not inspect.isabstract(c)
     }
-    # Shapes of friction need a model with such friction; a description estimates nothing.
+    # Shapes of friction need a model with such friction; a description estimates
+    # nothing.
     family -= {est.NonlinearFriction, est.EstimatorInWords}
     assert family == {type(e) for e in tested}, "add the estimator to `members`"
 
@@ -87,16 +88,24 @@ def test_every_estimator_finds_the_truth_without_noise(base, member):
     p = standard_parameters(base.model)
     o = observations(base.model, p, samples=100)
     fit = jid.identify(base, o, members(o)[member[0]])
-    np.testing.assert_allclose(fit.parameters, base.from_standard(p), rtol=1e-7, atol=1e-7)
+    np.testing.assert_allclose(
+        fit.parameters, base.from_standard(p), rtol=1e-7, atol=1e-7
+    )
 
 
 def test_every_estimator_follows_its_forces_and_judges_itself(base, noisy, member):
     """Forces in other units, parameters and deviations in other units; the same undetermined."""
     (k, fit), c = member, 2.0**-13
-    other = jid.identify(base, noisy.replace(forces=c * noisy.forces), members(noisy, c)[k])
+    other = jid.identify(
+        base, noisy.replace(forces=c * noisy.forces), members(noisy, c)[k]
+    )
     size = c * np.abs(fit.parameters).max()
-    np.testing.assert_allclose(other.parameters, c * np.asarray(fit.parameters), 1e-9, 1e-9 * size)
-    np.testing.assert_allclose(other.standard_deviations, c * fit.standard_deviations, rtol=1e-8)
+    np.testing.assert_allclose(
+        other.parameters, c * np.asarray(fit.parameters), 1e-9, 1e-9 * size
+    )
+    np.testing.assert_allclose(
+        other.standard_deviations, c * fit.standard_deviations, rtol=1e-8
+    )
     assert other.undetermined == fit.undetermined
     truth = np.asarray(base.from_standard(standard_parameters(base.model)))
     z = (np.asarray(fit.parameters) - truth) / fit.standard_deviations
@@ -110,7 +119,9 @@ def test_every_estimator_goes_through_logs_in_parts(base, noisy, member, monkeyp
     k, whole = member
     parts = jid.identify(base, noisy, members(noisy)[k])
     np.testing.assert_allclose(parts.parameters, whole.parameters, rtol=1e-6, atol=1e-9)
-    np.testing.assert_allclose(parts.standard_deviations, whole.standard_deviations, rtol=1e-6)
+    np.testing.assert_allclose(
+        parts.standard_deviations, whole.standard_deviations, rtol=1e-6
+    )
 
 
 def alone(base, noisy, k):
@@ -137,20 +148,32 @@ def test_forces_that_add_up_give_parameters_that_do(base, noisy, estimator):
     first = np.asarray(noisy.forces)
     second = np.random.default_rng(4).normal(size=first.shape)
     logs = [noisy.replace(forces=x) for x in (first, second, first - 1.7 * second)]
-    p, q, total = (np.asarray(jid.identify(base, o, estimator).parameters) for o in logs)
-    np.testing.assert_allclose(total, p - 1.7 * q, rtol=1e-8, atol=1e-8 * np.abs(p).max())
+    p, q, total = (
+        np.asarray(jid.identify(base, o, estimator).parameters) for o in logs
+    )
+    np.testing.assert_allclose(
+        total, p - 1.7 * q, rtol=1e-8, atol=1e-8 * np.abs(p).max()
+    )
 
 
 def test_only_the_ratio_of_weights_counts(base, noisy):
-    one, other = (jid.identify(base, noisy, weighted(c * GIVEN)) for c in (1.0, 2.0**-40))
+    one, other = (
+        jid.identify(base, noisy, weighted(c * GIVEN)) for c in (1.0, 2.0**-40)
+    )
     np.testing.assert_allclose(other.parameters, one.parameters, rtol=1e-9)
-    np.testing.assert_allclose(other.standard_deviations, one.standard_deviations, rtol=1e-9)
+    np.testing.assert_allclose(
+        other.standard_deviations, one.standard_deviations, rtol=1e-9
+    )
 
 
 def test_order_division_and_rows_that_do_not_count_change_nothing(base, noisy):
     """Rows are samples, since nothing is filtered; masked rows may hold anything."""
     random = np.random.default_rng(1)
-    m, forces, order = noisy.motion, np.asarray(noisy.forces), random.permutation(noisy.samples)
+    m, forces, order = (
+        noisy.motion,
+        np.asarray(noisy.forces),
+        random.permutation(noisy.samples),
+    )
     mixed = noisy.replace(motion=m[order], forces=forces[order])
     one, other = (jid.identify(base, o, weighted(GIVEN)) for o in (noisy, mixed))
     np.testing.assert_allclose(other.parameters, one.parameters, rtol=1e-10)
@@ -178,16 +201,28 @@ ONES = np.ones((3, 20, 3))
 identify = inspect.unwrap(jid.identify)  # tests check annotations first, users do not
 REFUSALS = [
     (lambda base, o: jid.identify(base, o, weighted([np.nan, 1.0])), "`weights`"),
-    (lambda base, o: jid.identify(base, o, weighted(np.ones(3))), "`weights` must be 2 numbers"),
+    (
+        lambda base, o: jid.identify(base, o, weighted(np.ones(3))),
+        "`weights` must be 2 numbers",
+    ),
     (lambda base, o: est.Truncated(2.0), "`rcond`"),
     (lambda base, o: est.Ridge(np.nan), "`strength`"),
     (lambda base, o: est.Tukey(0.0), "`limit`"),
     (lambda base, o: jid.identify(base, o, est.RelativeTo(np.ones(5))), "`parameters`"),
-    (lambda base, o: jid.identify(base, o, est.InstrumentalVariables(())), "`references`"),
+    (
+        lambda base, o: jid.identify(base, o, est.InstrumentalVariables(())),
+        "`references`",
+    ),
     (lambda base, o: identify(base, o.motion), "`observations`"),
     (lambda base, o: identify(base.model, o), "`base`"),
-    (lambda base, o: jid.identify(base, o, LINEAR[0]).predict(jid.Motion(*ONES)), "`motion`"),
-    *[(lambda base, o, k=k: alone(base, o, k), "the rows themselves") for k in range(3, 8)],
+    (
+        lambda base, o: jid.identify(base, o, LINEAR[0]).predict(jid.Motion(*ONES)),
+        "`motion`",
+    ),
+    *[
+        (lambda base, o, k=k: alone(base, o, k), "the rows themselves")
+        for k in range(3, 8)
+    ],
 ]
 
 
@@ -201,9 +236,13 @@ def test_what_cannot_be_is_rejected(base, noisy, make, named):
 def test_a_loss_is_consistent_with_itself(loss):
     x = np.linspace(-8, 8, 4001)
     felt = x * loss.weight(x)
-    np.testing.assert_allclose(np.gradient(felt, x)[1:-1], loss.slope(x)[1:-1], atol=0.6)
+    np.testing.assert_allclose(
+        np.gradient(felt, x)[1:-1], loss.slope(x)[1:-1], atol=0.6
+    )
     smooth = np.abs(np.abs(x) - loss.limit) > 0.01
-    np.testing.assert_allclose(np.gradient(felt, x)[smooth], loss.slope(x)[smooth], atol=5e-3)
+    np.testing.assert_allclose(
+        np.gradient(felt, x)[smooth], loss.slope(x)[smooth], atol=5e-3
+    )
     # 95 % of the precision of least squares where the noise is normal.
     density = np.exp(-(x**2) / 2) / np.sqrt(2 * np.pi)
     slope, square = (np.trapezoid(y * density, x) for y in (loss.slope(x), felt**2))
@@ -218,7 +257,9 @@ def test_huber_minimises_its_loss(base, noisy):
     fit = jid.identify(base, o, estimator)
     theta, forces, joint = dense(base, o)
     r = forces - theta @ fit.parameters
-    scale = np.array([1.4826 * np.median(np.abs(r[joint == j])) for j in range(2)])[joint]
+    scale = np.array([1.4826 * np.median(np.abs(r[joint == j])) for j in range(2)])[
+        joint
+    ]
     size = np.asarray(fit.weights)[joint] * scale
     c = est.Huber().limit
 
@@ -246,7 +287,9 @@ def test_a_ridge_towards_a_prior_is_solved_as_numpy_does(base, noisy):
     np.testing.assert_allclose(fit.parameters, expected, rtol=1e-8)
     plain = jid.identify(base, noisy, ridge)
     truth = np.asarray(base.from_standard(standard_parameters(base.model)))
-    assert np.linalg.norm(fit.parameters - truth) < np.linalg.norm(plain.parameters - truth)
+    assert np.linalg.norm(fit.parameters - truth) < np.linalg.norm(
+        plain.parameters - truth
+    )
 
 
 @pytest.mark.parametrize(("loss", "gain"), [(est.Huber(), 3.0), (est.Tukey(), 5.0)])
@@ -255,7 +298,9 @@ def test_outliers_do_little(base, loss, gain):
     truth = np.asarray(base.from_standard(p))
     o = observations(base.model, p, samples=1500, noise=NOISE)
     wild = np.random.default_rng(5).random(1500) < 0.05
-    o = o.replace(forces=np.asarray(o.forces) + np.where(wild[:, None], [20.0, 4.0], 0.0))
+    o = o.replace(
+        forces=np.asarray(o.forces) + np.where(wild[:, None], [20.0, 4.0], 0.0)
+    )
     plain = jid.identify(base, o, jid.WeightedLeastSquares(MEASURED))
     fit = jid.identify(base, o, est.IterativelyReweighted(loss, MEASURED))
     size = plain.naive_standard_deviations
@@ -277,7 +322,9 @@ def test_correlated_joints_are_solved_as_numpy_does(base):
     r[mask] = forces - theta @ fit.parameters
     both = mask.all(axis=1)
     pair = np.mean(r[both, 0] * r[both, 1])
-    found = np.array([[np.nanmean(r[:, 0] ** 2), pair], [pair, np.nanmean(r[:, 1] ** 2)]])
+    found = np.array(
+        [[np.nanmean(r[:, 0] ** 2), pair], [pair, np.nanmean(r[:, 1] ** 2)]]
+    )
     np.testing.assert_allclose(found, S, rtol=0.15)
     time = np.broadcast_to(np.arange(400)[:, None], (400, 2))[mask]
     V = np.where(time[:, None] == time, found[joint[:, None], joint], 0.0)
@@ -288,7 +335,8 @@ def test_correlated_joints_are_solved_as_numpy_does(base):
 
 
 def test_instruments_take_the_bias_of_noisy_columns_away(base):
-    # Without tanh: what noise does to the mean of such a column, no instrument takes away.
+    # Without tanh: what noise does to the mean of such a column, no instrument takes
+    # away.
     terms = (jid.RigidBodies(), jid.ViscousFriction(), jid.ConstantOffset())
     base = jid.base_parameters(jid.Model(base.model.robot, terms))
     p = standard_parameters(base.model)
@@ -304,7 +352,9 @@ def test_instruments_take_the_bias_of_noisy_columns_away(base):
         random = np.random.default_rng(seed)
         noise = [s * random.standard_normal((3000, 2)) for s in (0.003, 0.1, 1.5)]
         m = clean.motion
-        o = clean.replace(motion=jid.Motion(m.q + noise[0], m.qd + noise[1], m.qdd + noise[2]))
+        o = clean.replace(
+            motion=jid.Motion(m.q + noise[0], m.qd + noise[1], m.qdd + noise[2])
+        )
         errors.append([jid.identify(base, o, x).parameters - truth for x in estimators])
     # Means over the draws, in units of what chance lets them scatter.
     bias = np.mean(errors, axis=0) / (np.std(errors, axis=0, ddof=1) / np.sqrt(12))

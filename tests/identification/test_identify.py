@@ -56,23 +56,31 @@ def test_least_squares_equal_numpy_on_the_dense_matrix(base, noisy, estimator, w
 def test_residual_variances_find_the_noise_of_each_joint(base, p):
     noise = np.array([0.5, 0.02])
     o = observations(base.model, p, samples=4000, noise=noise)
-    fit = jid.identify(base, o, jid.WeightedLeastSquares(jid.estimators.ResidualVariances()))
+    fit = jid.identify(
+        base, o, jid.WeightedLeastSquares(jid.estimators.ResidualVariances())
+    )
     np.testing.assert_allclose(1 / fit.weights, noise, rtol=0.05)
 
 
 @pytest.mark.parametrize("weights", [[1.0, 1.0], [0.2, 3.0]])
-def test_naive_covariance_is_that_of_independent_noise_of_each_joint(base, noisy, weights):
+def test_naive_covariance_is_that_of_independent_noise_of_each_joint(
+    base, noisy, weights
+):
     """Right also where weights are not the reciprocals of the standard deviations."""
     estimator = jid.WeightedLeastSquares(jid.estimators.GivenWeights(np.array(weights)))
     fit = jid.identify(base, noisy, estimator)
     theta, forces, joint = dense(base, noisy)
     squares = (theta @ fit.parameters - forces) ** 2
     free = 1.0 - base.size / len(forces)
-    variances = np.array([squares[joint == j].sum() / (free * np.sum(joint == j)) for j in (0, 1)])
+    variances = np.array(
+        [squares[joint == j].sum() / (free * np.sum(joint == j)) for j in (0, 1)]
+    )
     w = np.array(weights)[joint][:, None]
     gain = np.linalg.pinv(w * theta) * w.T
     expected = gain * variances[joint] @ gain.T
-    np.testing.assert_allclose(fit.uncertainty.naive_covariance, expected, rtol=1e-7, atol=1e-12)
+    np.testing.assert_allclose(
+        fit.uncertainty.naive_covariance, expected, rtol=1e-7, atol=1e-12
+    )
     independent = jid.uncertainty.IndependentRows()
     textbook = jid.identify(base, noisy, estimator, uncertainty=independent)
     np.testing.assert_allclose(textbook.covariance, fit.uncertainty.naive_covariance)
@@ -80,8 +88,14 @@ def test_naive_covariance_is_that_of_independent_noise_of_each_joint(base, noisy
 
 def test_a_known_tool_is_taken_off():
     arm = jid.robots.planar_arm(2, 0.4)
-    tool = {"mass": 1.5, "centre_of_mass": (0.05, 0.02, 0.0), "inertia": 0.01 * np.eye(3)}
-    bare, base = (jid.base_parameters(jid.Model(r)) for r in (arm, arm.with_tool(**tool)))
+    tool = {
+        "mass": 1.5,
+        "centre_of_mass": (0.05, 0.02, 0.0),
+        "inertia": 0.01 * np.eye(3),
+    }
+    bare, base = (
+        jid.base_parameters(jid.Model(r)) for r in (arm, arm.with_tool(**tool))
+    )
     p = standard_parameters(base.model)
     o = observations(base.model, p)
     fit = jid.identify(base, o, PLAIN)
@@ -97,16 +111,21 @@ def test_a_joint_that_never_moves_is_named_and_the_rest_is_right(base, p, still)
     assert {second, base.names.index("fc2")} <= named
     assert fit.undetermined[0].uncertainty == np.inf
     assert "fv2" in " ".join(d.sentence(base) for d in fit.undetermined)
-    np.testing.assert_allclose(fit.parameters[first], base.from_standard(p)[first], rtol=1e-8)
+    np.testing.assert_allclose(
+        fit.parameters[first], base.from_standard(p)[first], rtol=1e-8
+    )
     assert np.isinf(fit.standard_deviations[second])
     assert jid.validate(fit, still).errors[0].relative < 1e-10
     # However small the deviation, nothing undetermined is trusted.
     assert all(fit.trust[k] is Status.BAD for k in named)
-    assert set(jid.identify(base, observations(base.model, p), PLAIN).trust) == {Status.GOOD}
+    assert set(jid.identify(base, observations(base.model, p), PLAIN).trust) == {
+        Status.GOOD
+    }
 
 
 @pytest.mark.parametrize(
-    "solution", [jid.estimators.Complete(), jid.estimators.Truncated(), jid.estimators.Ridge()]
+    "solution",
+    [jid.estimators.Complete(), jid.estimators.Truncated(), jid.estimators.Ridge()],
 )
 def test_a_log_of_a_joint_that_stands_gives_no_absurd_estimates(base, p, solution):
     """From the recorded angles on, whose differences must not make columns out of rounding."""
@@ -128,13 +147,17 @@ def test_forces_that_are_all_zero_are_no_crash(base):
 
 
 def test_truncated_solution_leaves_weak_directions_at_zero(base, noisy):
-    d = Decomposition.of(*jid.RegressionProblem(base, [noisy]).factors.weighted(np.ones(2)))
+    d = Decomposition.of(
+        *jid.RegressionProblem(base, [noisy]).factors.weighted(np.ones(2))
+    )
     rcond = float(d.values[4] / d.values[0]) * 0.999
     along, full = (
         np.asarray(d.directions)
         @ (
             np.asarray(d.scale)
-            * jid.identify(base, noisy, jid.estimators.LeastSquares(solution)).parameters
+            * jid.identify(
+                base, noisy, jid.estimators.LeastSquares(solution)
+            ).parameters
         )
         for solution in (jid.estimators.Truncated(rcond), jid.estimators.Complete())
     )
@@ -143,7 +166,9 @@ def test_truncated_solution_leaves_weak_directions_at_zero(base, noisy):
 
 
 def test_ridge_solves_its_normal_equations_and_says_what_it_pulls(base, noisy):
-    fit = jid.identify(base, noisy, jid.estimators.LeastSquares(jid.estimators.Ridge(0.1)))
+    fit = jid.identify(
+        base, noisy, jid.estimators.LeastSquares(jid.estimators.Ridge(0.1))
+    )
     theta, forces, _ = dense(base, noisy)
     scale = np.linalg.norm(theta, axis=0)
     A = theta / scale
@@ -176,7 +201,9 @@ def test_cross_validation_pulls_only_where_data_are_poor(base, p):
     ],
 )
 def test_refusals(base, p, joints, force, samples, message):
-    robot = jid.robots.planar_arm(joints, 0.4).replace(limits=jid.Limits(joints, force=force))
+    robot = jid.robots.planar_arm(joints, 0.4).replace(
+        limits=jid.Limits(joints, force=force)
+    )
     other = jid.base_parameters(jid.Model(robot, base.model.terms))
     with pytest.raises(ValueError, match=message):
         jid.identify(other, observations(base.model, p, samples=samples))

@@ -18,7 +18,9 @@ from jaxid.io import from_json, to_json
 
 @pytest.fixture(scope="module")
 def fit():
-    robot = jid.robots.planar_arm(2, 0.4).replace(limits=jid.Limits(2, force=[40.0, 5.0]))
+    robot = jid.robots.planar_arm(2, 0.4).replace(
+        limits=jid.Limits(2, force=[40.0, 5.0])
+    )
     terms = (
         jid.RigidBodies(),
         jid.ViscousFriction(),
@@ -62,9 +64,14 @@ def test_a_consistent_fit_keeps_bodies_and_verdict(tmp_path):
     assert loaded.consistency.certified == fit.consistency.certified
 
 
-@pytest.mark.parametrize("number", [0.1, -0.0, 5e-324, 1.7976931348623157e308, np.inf, np.nan])
+@pytest.mark.parametrize(
+    "number", [0.1, -0.0, 5e-324, 1.7976931348623157e308, np.inf, np.nan]
+)
 def test_every_number_survives(number):
-    for value, kind in ((np.array([[number, 1.0]]), np.ndarray), (float(number), float)):
+    for value, kind in (
+        (np.array([[number, 1.0]]), np.ndarray),
+        (float(number), float),
+    ):
         again = from_json(json.loads(json.dumps(to_json(value), allow_nan=False)), kind)
         assert np.array(again).tobytes() == np.array(value).tobytes()
 
@@ -109,15 +116,24 @@ def test_an_estimator_with_functions_is_kept_in_words(fit, tmp_path):
         (lambda d: d.pop("model"), "damaged"),
         (lambda d: d.update(checksum="sha256:0"), "changed by hand"),
         (lambda d: d["model"]["parameters"]["float64"].append(1.0), "shape"),
-        (lambda d: d["model"].update(parameters={"float64": ["inf"] * 14}), "`parameters`"),
+        (
+            lambda d: d["model"].update(parameters={"float64": ["inf"] * 14}),
+            "`parameters`",
+        ),
         (lambda d: d["model"].update(extra=1), "other keys: .*'extra'"),
         (lambda d: d["model"].pop("base"), "other keys: .*'base'"),
         (lambda d: d["model"].update(kind="BaseParameters"), "not known"),
         (lambda d: d["model"].update(weights=None), "`weights` holds None"),
-        (lambda d: d["model"].update(weights={"float64": ["one", 1.0]}), "`weights` is no array"),
+        (
+            lambda d: d["model"].update(weights={"float64": ["one", 1.0]}),
+            "`weights` is no array",
+        ),
         (lambda d: d["model"].update(weights={"object": []}), "has the keys object"),
         (lambda d: d["model"].update(rows=[1.5, 2]), r"`rows\[0\]` holds 1.5"),
-        (lambda d: d["model"]["base"]["model"]["robot"].update(parent=[3, 0]), "`parent`"),
+        (
+            lambda d: d["model"]["base"]["model"]["robot"].update(parent=[3, 0]),
+            "`parent`",
+        ),
     ],
 )
 def test_a_wrong_model_file_is_refused_in_one_sentence(path, change, message):

@@ -17,7 +17,10 @@ ROBOT = jid.robots.planar_arm(2, 0.5).replace(limits=jid.Limits(force=[50.0, 8.0
 
 @pytest.fixture(scope="module")
 def candidates():
-    bases = {name: jid.base_parameters(jid.Model(ROBOT, terms)) for name, terms in MODELS.items()}
+    bases = {
+        name: jid.base_parameters(jid.Model(ROBOT, terms))
+        for name, terms in MODELS.items()
+    }
     return [jid.Candidate(name, base) for name, base in bases.items()]
 
 
@@ -55,13 +58,18 @@ def test_errors_are_those_of_fits_without_the_part(candidates):
         for k, left in enumerate(several):
             fit = jid.identify(candidate.base, [o for o in several if o is not left])
             errors = jid.validate(fit, left).errors[0].errors * weights
-            np.testing.assert_allclose(row[k] ** 2, np.sum(errors**2) / np.mean(forces), rtol=1e-8)
+            np.testing.assert_allclose(
+                row[k] ** 2, np.sum(errors**2) / np.mean(forces), rtol=1e-8
+            )
 
 
 def test_the_promise_is_what_comes(candidates):
     ratios = []
     for seed in range(100, 112):
-        train, later = logs("plain", 1, 400, 1.0, seed), logs("plain", 2, 400, 1.0, seed + 500)
+        train, later = (
+            logs("plain", 1, 400, 1.0, seed),
+            logs("plain", 2, 400, 1.0, seed + 500),
+        )
         choice = jid.choose_model(candidates, train)
         fit = jid.identify(choice.chosen.base, train)
         weights = 1.0 / np.asarray(ROBOT.max_forces)
@@ -76,12 +84,16 @@ def test_the_promise_is_what_comes(candidates):
 @pytest.mark.parametrize("memory", [0, 1])
 def test_of_equally_good_models_that_with_memory_is_chosen(memory):
     laws = [jid.terms.Tanh(), jid.terms.Presliding(0.01)][:: 1 - 2 * memory]
-    terms = [(jid.RigidBodies(), jid.ViscousFriction(), jid.CoulombFriction(x)) for x in laws]
+    terms = [
+        (jid.RigidBodies(), jid.ViscousFriction(), jid.CoulombFriction(x)) for x in laws
+    ]
     models = [jid.Model(ROBOT, x) for x in terms]
     names, p = models[0].parameter_names, virtual.standard_parameters(models[0])
     p[[names.index(x) for x in ("fc1", "fc2")]] = 0.0
     log = virtual.observations(models[0], p, samples=1500, noise=0.3)
-    choice = jid.choose_model([jid.Candidate("", jid.base_parameters(x)) for x in models], log)
+    choice = jid.choose_model(
+        [jid.Candidate("", jid.base_parameters(x)) for x in models], log
+    )
     assert choice.chosen.base.model.memory is not None
 
 

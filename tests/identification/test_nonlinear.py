@@ -11,7 +11,10 @@ import virtual
 
 import jaxid as jid
 from jaxid.identification.estimators import NonlinearFriction
-from jaxid.identification.estimators.variable_projection import ShapeSearch, select_shapes
+from jaxid.identification.estimators.variable_projection import (
+    ShapeSearch,
+    select_shapes,
+)
 
 ROBOT = jid.robots.planar_arm(3)
 TRUE_EPSILON, TRUE_SPEED = np.array([0.02, 0.05, 0.03]), np.array([0.2, 0.3, 0.15])
@@ -48,7 +51,9 @@ def test_shapes_are_found_again_through_filters():
     np.testing.assert_allclose(stribeck.speed, TRUE_SPEED, rtol=1e-3)
     assert stribeck.exponent == 2.0
     assert fit.residual < 1e-4
-    np.testing.assert_allclose(fit.parameters, START.from_standard(P), rtol=2e-3, atol=2e-3)
+    np.testing.assert_allclose(
+        fit.parameters, START.from_standard(P), rtol=2e-3, atol=2e-3
+    )
 
 
 def test_shapes_are_found_by_name():
@@ -63,7 +68,9 @@ def test_shapes_are_found_by_name():
 def test_what_is_left_is_that_of_the_model_with_these_shapes():
     """Fixed columns once and friction anew is the same as everything at once; masks count."""
     mask = np.random.default_rng(5).random((375, 3)) < 0.7
-    o = observations(filter=jid.ZeroPhaseButterworth(5.0, margin=0.0), every=4, mask=mask)
+    o = observations(
+        filter=jid.ZeroPhaseButterworth(5.0, margin=0.0), every=4, mask=mask
+    )
     logs = o, observations(samples=600, noise=0.3, seed=1)
     search, weights = search_of(START, *logs), np.array([1.0, 2.0, 3.0])
     x = np.array([0.01, 0.02, 0.03, 0.5, 0.2, 0.1])
@@ -83,21 +90,29 @@ def test_the_jacobian_is_that_of_what_is_left():
     left = jax.jit(lambda x: (rows * search.fit(x, rows)[1]).ravel())
     jacobian = jax.jit(jax.jacfwd(left))(x)
     steps = np.diag(1e-5 * x)
-    differences = np.stack([(left(x + s) - left(x - s)) / (2 * s.sum()) for s in steps], axis=1)
-    np.testing.assert_allclose(jacobian, differences, atol=1e-6 * np.abs(differences).max())
+    differences = np.stack(
+        [(left(x + s) - left(x - s)) / (2 * s.sum()) for s in steps], axis=1
+    )
+    np.testing.assert_allclose(
+        jacobian, differences, atol=1e-6 * np.abs(differences).max()
+    )
 
 
 def test_the_search_can_be_mapped_and_differentiated():
     """Draws of the forces side by side; the derivative by the forces is that of differences."""
     search = search_of(START, observations(samples=400))
     rng, weights = np.random.default_rng(6), np.ones(3)
-    draw, change = search.forces + rng.normal(scale=[[[0.1]], [[0.01]]], size=(2, 400, 3))
+    draw, change = search.forces + rng.normal(
+        scale=[[[0.1]], [[0.01]]], size=(2, 400, 3)
+    )
     change = change - search.forces
 
     def found(forces):
         return dataclasses.replace(search, forces=forces)(weights)[0]
 
-    before, first, after = jax.jit(jax.vmap(found))(jnp.stack([draw - change, draw, draw + change]))
+    before, first, after = jax.jit(jax.vmap(found))(
+        jnp.stack([draw - change, draw, draw + change])
+    )
     alone, slopes = jax.jit(lambda a, b: jax.jvp(found, (a,), (b,)))(draw, change)
     np.testing.assert_allclose(first, alone, rtol=1e-6)
     np.testing.assert_allclose(slopes, 0.5 * (after - before), rtol=0.01)
@@ -114,8 +129,11 @@ def test_deviations_of_shapes_agree_with_their_scatter():
     # 14 draws tell a deviation to 19 %: 1.6 is less than three of these.
     scatter = np.std(found, axis=0, ddof=1) / fit.shape_deviations
     assert np.abs(np.log(scatter)).max() < np.log(1.6)
-    assert (np.abs(fit.shapes - [*TRUE_EPSILON, *TRUE_SPEED]) < 4 * fit.shape_deviations).all()
-    # Unknown shapes make the levels of friction less certain, a second recording more certain.
+    assert (
+        np.abs(fit.shapes - [*TRUE_EPSILON, *TRUE_SPEED]) < 4 * fit.shape_deviations
+    ).all()
+    # Unknown shapes make the levels of friction less certain, a second recording more
+    # certain.
     known = jid.identify(fit.fit.base, o, WLS)
     ratio = fit.fit.standard_deviations / known.standard_deviations
     assert (ratio > 1 - 1e-9).all()
@@ -123,7 +141,8 @@ def test_deviations_of_shapes_agree_with_their_scatter():
 
 
 @pytest.mark.parametrize(
-    ("truth", "noise", "low", "high"), [(TRUTH, 0.05, 0.3, 1.0), (model(0.03), 0.5, -0.05, 0.05)]
+    ("truth", "noise", "low", "high"),
+    [(TRUTH, 0.05, 0.3, 1.0), (model(0.03), 0.5, -0.05, 0.05)],
 )
 def test_it_pays_where_friction_is_nonlinear_and_only_there(truth, noise, low, high):
     p = virtual.standard_parameters(truth, seed=3)

@@ -61,7 +61,9 @@ def test_all_ten_parameters_come_back_without_noise(base, exact):
     np.testing.assert_allclose(found.centre_of_mass, LOAD.centre_of_mass, atol=1e-8)
     np.testing.assert_allclose(found.tool.parameters, LOAD.parameters, atol=1e-8)
     held = jid.identify_payload(*exact, varying=[])
-    assert np.abs(held.parameters - LOAD.parameters).max() > 1e-3, "friction has changed"
+    assert np.abs(held.parameters - LOAD.parameters).max() > 1e-3, (
+        "friction has changed"
+    )
 
 
 def test_deviations_are_those_of_many_draws_and_carry_both_runs(base):
@@ -76,7 +78,8 @@ def test_deviations_are_those_of_many_draws_and_carry_both_runs(base):
         central.append(np.diag(known.covariance))
     scatter = np.var(draws, axis=0)
     ratio = np.mean(variances, axis=0) / scatter[:10]
-    # A variance from 20 draws scatters by sqrt(2 / 20) = 0.32, the mean of ten alike ones less.
+    # A variance from 20 draws scatters by sqrt(2 / 20) = 0.32, the mean of ten alike
+    # ones less.
     np.testing.assert_allclose(ratio, 1.0, atol=0.9)
     assert abs(ratio.mean() - 1.0) < 0.3
     assert abs(np.mean(np.mean(central, axis=0) / scatter[10:]) - 1.0) < 0.35
@@ -95,7 +98,9 @@ def test_gains_come_back(base):
         errors.append(found.gains - GAINS)
         sizes.append(found.uncertainty.standard_deviations)
     scatter = np.std(errors, axis=0)
-    assert (np.abs(np.mean(errors, axis=0)) < 4 * scatter / np.sqrt(16)).all(), "no shrinking"
+    assert (np.abs(np.mean(errors, axis=0)) < 4 * scatter / np.sqrt(16)).all(), (
+        "no shrinking"
+    )
     np.testing.assert_allclose(np.mean(sizes, axis=0) / scatter, 1.0, atol=0.6)
 
 
@@ -141,7 +146,9 @@ def test_a_delays_deviation_is_that_of_many_draws(base):
     found = [jid.estimate_delay(base, o) for o in logs]
     errors = np.array([d.seconds - 0.003 for d in found])
     sizes = np.array([d.standard_deviation for d in found])
-    assert abs(errors.mean()) < 4 * errors.std() / np.sqrt(8), "noise does not pull towards zero"
+    assert abs(errors.mean()) < 4 * errors.std() / np.sqrt(8), (
+        "noise does not pull towards zero"
+    )
     assert 0.5 < sizes.mean() / errors.std() < 2.0
     assert np.mean([d.p_value < 0.01 for d in found]) < 0.2
 
@@ -151,11 +158,16 @@ def in_closed_loop(seed, seconds=20.0, dt=0.005):
     inertia, weight, kp, kd, steps = 0.4, 6.0, 160.0, 16.0, 4
     rng, t = np.random.default_rng(seed), dt * np.arange(round(seconds / dt))
     w = 2 * np.pi * np.arange(1, 6) / 8
-    target, rate = (f(np.outer(t, w) + w) @ (x / w) for f, x in ((np.sin, 0.5), (np.cos, 0.5 * w)))
+    target, rate = (
+        f(np.outer(t, w) + w) @ (x / w) for f, x in ((np.sin, 0.5), (np.cos, 0.5 * w))
+    )
     unknown = np.convolve(rng.normal(size=len(t)), np.ones(20) / 20, "same")
     q, v, angles, forces = target[0], rate[0], np.zeros_like(t), np.zeros_like(t)
     for k in range(len(t)):
-        angles[k], forces[k] = q, kp * (target[k] - q) + kd * (rate[k] - v) + weight * np.sin(q)
+        angles[k], forces[k] = (
+            q,
+            kp * (target[k] - q) + kd * (rate[k] - v) + weight * np.sin(q),
+        )
         for _ in range(steps):
             h = dt / steps
             v += h * (forces[k] + 3.0 * unknown[k] - weight * np.sin(q)) / inertia
@@ -164,9 +176,15 @@ def in_closed_loop(seed, seconds=20.0, dt=0.005):
     held = 0.625 * forces + 0.375 * np.append(forces[0], forces[:-1])
     held += 0.02 * rng.normal(size=len(t))
     robot = jid.Robot(
-        "pendulum", revolute=(True,), axis=[(0, 1, 0)], rotation=[np.eye(3)], offset=[(0, 0, 0)]
+        "pendulum",
+        revolute=(True,),
+        axis=[(0, 1, 0)],
+        rotation=[np.eye(3)],
+        offset=[(0, 0, 0)],
     )
-    logs = (jid.Recording.of(x[:, None], held[:, None], time=t) for x in (angles, target))
+    logs = (
+        jid.Recording.of(x[:, None], held[:, None], time=t) for x in (angles, target)
+    )
     filters = jid.ZeroPhaseButterworth(10.0), jid.Subsample(5)
     return robot, [jid.observe(log, robot, *filters) for log in logs]
 
@@ -175,7 +193,9 @@ def test_disturbances_that_a_controller_answers_are_no_delay():
     held, commanded, bare = [], [], []
     for seed in range(8):
         robot, (measured, command) = in_closed_loop(seed)
-        base = jid.base_parameters(jid.Model(robot, (jid.RigidBodies(), jid.ConstantOffset())))
+        base = jid.base_parameters(
+            jid.Model(robot, (jid.RigidBodies(), jid.ConstantOffset()))
+        )
         weights = jid.estimators.GivenWeights([1.0])
         found = jid.estimate_delay(base, measured, weights)
         bare.append(abs(found.seconds) > 2.1 * found.standard_deviation)
@@ -222,5 +242,7 @@ def test_refusals(base, exact):
     drives = jid.Drives(3, reduction=[[9, 0, 0], [0, 9, 0], [0, 5, 9]])
     coupled = jid.Model(base.model.robot.replace(drives=drives), base.model.terms)
     fits = [dataclasses.replace(f, base=jid.base_parameters(coupled)) for f in exact]
-    with pytest.raises(ValueError, match="motors of `spatial arm` turn more than one axis"):
+    with pytest.raises(
+        ValueError, match="motors of `spatial arm` turn more than one axis"
+    ):
         jid.identify_drive_gains(*fits, LOAD)

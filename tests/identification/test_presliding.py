@@ -46,10 +46,16 @@ def log_of(samples=6000, noise=0.0, segments=None, filter=None, seed=4):
     segments = ((0, samples),) if segments is None else segments
     start = [np.tanh(np.asarray(m.qd[a]) / 0.01) for a, _ in segments]
     parts = zip(segments, start, strict=True)
-    s = np.concatenate([step_by_step(np.asarray(m.q)[a:b], LENGTHS, x) for (a, b), x in parts])
+    s = np.concatenate(
+        [step_by_step(np.asarray(m.q)[a:b], LENGTHS, x) for (a, b), x in parts]
+    )
     forces = rest.inverse_dynamics(p, m) + levels * s
     forces = forces + noise * np.random.default_rng(seed).normal(size=forces.shape)
-    options = {"sample_time": 10.0 / (samples - 1), "segments": segments, "filter": filter}
+    options = {
+        "sample_time": 10.0 / (samples - 1),
+        "segments": segments,
+        "filter": filter,
+    }
     return jid.Observations.of(m.q, m.qd, m.qdd, forces, **options), levels
 
 
@@ -60,12 +66,16 @@ def test_the_state_solves_the_differential_equation_and_does_not_depend_on_time(
     def change(t, s):
         return qd(t) / 0.3 * (1 - s * np.sign(qd(t)))
 
-    s = solve_ivp(change, (0, 6), [0.4], t_eval=t, rtol=1e-9, atol=1e-9, max_step=1e-3).y[0]
+    s = solve_ivp(
+        change, (0, 6), [0.4], t_eval=t, rtol=1e-9, atol=1e-9, max_step=1e-3
+    ).y[0]
     found = law.states(q[:, None], np.array([0.4]))[:, 0]
     np.testing.assert_allclose(found, s, atol=2e-3)
     # Standing still keeps it, and every other sample of one way leaves it the same.
     still = np.repeat(q, 3)[:, None]
-    np.testing.assert_allclose(law.states(still, np.array([0.4]))[::3, 0], found, atol=1e-12)
+    np.testing.assert_allclose(
+        law.states(still, np.array([0.4]))[::3, 0], found, atol=1e-12
+    )
     turns = np.flatnonzero(np.diff(np.sign(np.diff(q)))) + 1
     few = law.states(q[[0, *turns, -1], None], np.array([0.4]))[:, 0]
     np.testing.assert_allclose(few, found[[0, *turns, -1]], atol=1e-12)
@@ -74,7 +84,9 @@ def test_the_state_solves_the_differential_equation_and_does_not_depend_on_time(
 def test_batches_of_paths_and_jax_give_the_same():
     q = np.cumsum(np.random.default_rng(1).normal(size=(3, 50, 2)), axis=1) * 1e-3
     law, start = Presliding(length=LENGTHS), np.full((3, 2), -0.5)
-    wanted = np.stack([step_by_step(x, LENGTHS, y) for x, y in zip(q, start, strict=True)])
+    wanted = np.stack(
+        [step_by_step(x, LENGTHS, y) for x, y in zip(q, start, strict=True)]
+    )
     np.testing.assert_allclose(law.states(q, start), wanted, atol=1e-13)
     m = jid.Motion(q, 0 * q, 0 * q)
     model, p = model_of(law), virtual.standard_parameters(model_of(law))
@@ -105,7 +117,9 @@ def test_a_motor_that_turns_two_axes_has_a_state_of_its_own():
     model = jid.Model(ROBOT.replace(drives=drives), terms)
     q, qd = np.asarray(m.q), np.asarray(m.qd)
     start = np.tanh(qd[0] / 0.01), np.tanh(qd[0] @ A.T / 0.01)
-    joints, motors = (step_by_step(x, LENGTHS, s) for x, s in zip((q, q @ A.T), start, strict=True))
+    joints, motors = (
+        step_by_step(x, LENGTHS, s) for x, s in zip((q, q @ A.T), start, strict=True)
+    )
     names = model.parameter_names
     p = np.zeros(len(names))
     p[[names.index(x) for x in ("fc1", "fc2", "fcm2")]] = 2.0, 1.5, 0.7
@@ -140,10 +154,14 @@ def test_parts_of_a_log_streams_and_the_whole_agree(filtered):
     class Streamed(RegressionProblem):
         compiled_samples = 1
 
-    plain, streamed = (kind(base, log).factors for kind in (RegressionProblem, Streamed))
+    plain, streamed = (
+        kind(base, log).factors for kind in (RegressionProblem, Streamed)
+    )
     w = np.ones(2)
     for (R, z), (S, y) in [(plain.weighted(w), streamed.weighted(w))]:
-        np.testing.assert_allclose(S.T @ S, R.T @ R, rtol=1e-7, atol=1e-7 * np.abs(R.T @ R).max())
+        np.testing.assert_allclose(
+            S.T @ S, R.T @ R, rtol=1e-7, atol=1e-7 * np.abs(R.T @ R).max()
+        )
         np.testing.assert_allclose(S.T @ y, R.T @ z, rtol=1e-6, atol=1e-6)
     if not filtered:
         # What an independent loop gives is explained exactly, in both segments.
@@ -158,7 +176,9 @@ def test_presliding_of_another_law_is_found_with_coarse_encoders():
     bodies = random_bodies(ROBOT, np.array([4.0, 2.0]), np.random.default_rng(3))
     sensors = Sensors(2 * np.pi / 2**14, np.array([0.15, 0.06]), np.array([0.1, 0.04]))
     values = np.concatenate([bodies.ravel(), [0.4, 0.1]])
-    arm = VirtualRobot(ROBOT, (jid.RigidBodies(), jid.RotorInertia()), values, friction, sensors)
+    arm = VirtualRobot(
+        ROBOT, (jid.RigidBodies(), jid.RotorInertia()), values, friction, sensors
+    )
     logs, slow = [], None
     for seed in (1, 2):
         rng, points = np.random.default_rng(seed), []
@@ -166,9 +186,13 @@ def test_presliding_of_another_law_is_found_with_coarse_encoders():
             points += [point] * (7 if number % 4 == 0 else 1)
             if number % 4 == 2:
                 points += [point + 0.02 * rng.uniform(-1, 1, 2) for _ in range(2)]
-        run = arm.track(spline_through(np.array(points), 24.0), seed=seed, sample_time=2e-3)
+        run = arm.track(
+            spline_through(np.array(points), 24.0), seed=seed, sample_time=2e-3
+        )
         rows = jid.Subsample(5)
-        logs.append(jid.observe(run.recording, ROBOT, jid.ZeroPhaseButterworth(20.0), rows))
+        logs.append(
+            jid.observe(run.recording, ROBOT, jid.ZeroPhaseButterworth(20.0), rows)
+        )
         slow = np.abs(np.asarray(run.actual.qd)[logs[-1].instants]) < 0.05
     errors = []
     for transition in (Tanh(), Presliding()):

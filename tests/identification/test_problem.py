@@ -21,7 +21,10 @@ def recordings(base):
 
 @pytest.fixture(scope="module")
 def matrix(base, recordings):
-    return [np.concatenate(x) for x in zip(*(dense(base, o) for o in recordings), strict=True)]
+    return [
+        np.concatenate(x)
+        for x in zip(*(dense(base, o) for o in recordings), strict=True)
+    ]
 
 
 def test_factors_have_the_information_of_the_weighted_matrix(base, recordings, matrix):
@@ -47,15 +50,17 @@ def test_blocks_divide_time_and_sum_to_the_whole(base, recordings):
     few = blocks.condense(4)
     assert (len(blocks.parts), len(few.parts)) == (14, 4)
     whole = information(jid.RegressionProblem(base, recordings, divisions=1).factors)
-    parted = information(blocks.select(k for k in range(14) if k != 3).total) + information(
-        blocks.parts[3]
-    )
+    parted = information(
+        blocks.select(k for k in range(14) if k != 3).total
+    ) + information(blocks.parts[3])
     for found in (information(blocks.total), parted, information(few.total)):
         np.testing.assert_allclose(found, whole, rtol=1e-12, atol=1e-10)
 
 
 @pytest.mark.parametrize("cached", [0, 10**9])
-def test_passes_visit_every_row_that_the_factors_stand_for(base, recordings, matrix, cached):
+def test_passes_visit_every_row_that_the_factors_stand_for(
+    base, recordings, matrix, cached
+):
     problem = jid.RegressionProblem(base, recordings)
     problem.cached_numbers = cached
     assert problem.factors.rows.sum() == len(matrix[0])
@@ -80,7 +85,9 @@ def test_chunks_change_only_rounding(base):
         problem = jid.RegressionProblem(base, [o])
         problem.samples_per_chunk = samples
         chunks = problem.chunks()
-        parts.append(np.concatenate([np.hstack([*c.columns, c.forces]) for c in chunks]))
+        parts.append(
+            np.concatenate([np.hstack([*c.columns, c.forces]) for c in chunks])
+        )
     np.testing.assert_allclose(*parts, rtol=0, atol=1e-11 * np.abs(parts[0]).max())
 
 

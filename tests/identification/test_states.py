@@ -18,7 +18,12 @@ def observe(base, truths, seed=0, **options):
     return [
         dataclasses.replace(
             observations(
-                base.model, p, noise=NOISE, seed=k + 1, noise_seed=10 * seed + k, **options
+                base.model,
+                p,
+                noise=NOISE,
+                seed=k + 1,
+                noise_seed=10 * seed + k,
+                **options,
             ),
             name=name,
         )
@@ -52,7 +57,14 @@ def found(fits):
 
 def test_shared_and_own_parameters_equal_dense_least_squares(base, logs, fits, found):
     assert found.states == ("cold", "warm")
-    assert {base.names[k] for k in found.varying} == {"fv1", "fv2", "fc1", "fc2", "fo1", "fo2"}
+    assert {base.names[k] for k in found.varying} == {
+        "fv1",
+        "fv2",
+        "fc1",
+        "fc2",
+        "fo1",
+        "fo2",
+    }
     rows, forces, varying = [], [], list(found.varying)
     for k, o in enumerate(logs):
         theta, Q, joint = dense(base, o)
@@ -67,7 +79,10 @@ def test_shared_and_own_parameters_equal_dense_least_squares(base, logs, fits, f
     cold = found.fit("cold").parameters[varying]
     np.testing.assert_allclose(cold, expected[n : n + len(varying)], rtol=1e-9)
     assert (found.names[n], found.units[n]) == ("fv1 (cold)", "N m s")
-    errors = [jid.validate(f, logs[1]).errors[0].relative for f in (found.fit("warm"), fits[1])]
+    errors = [
+        jid.validate(f, logs[1]).errors[0].relative
+        for f in (found.fit("warm"), fits[1])
+    ]
     assert errors[0] < 1.02 * errors[1]
 
 
@@ -102,9 +117,17 @@ def test_changes_are_found_and_sharing_is_tested(base, truths, fits, found):
 
 
 def test_energy_is_a_matter_of_physics_not_of_names(base):
-    terms = (jid.RigidBodies(), jid.terms.LinearSpring(), jid.RotorInertia(), jid.CoulombFriction())
+    terms = (
+        jid.RigidBodies(),
+        jid.terms.LinearSpring(),
+        jid.RotorInertia(),
+        jid.CoulombFriction(),
+    )
     other = jid.base_parameters(jid.Model(jid.robots.planar_arm(2, 0.4), terms))
-    for one, storing, others in ((base, {"C1"}, {"fv1"}), (other, {"ks1", "Ia2"}, {"fc1"})):
+    for one, storing, others in (
+        (base, {"C1"}, {"fv1"}),
+        (other, {"ks1", "Ia2"}, {"fc1"}),
+    ):
         stored = dict(zip(one.names, stores_energy(one), strict=True))
         assert all(stored[name] for name in storing)
         assert not any(stored[name] for name in others)
@@ -112,7 +135,8 @@ def test_energy_is_a_matter_of_physics_not_of_names(base):
 
 def test_an_update_equals_the_joint_fit(base, truths):
     logs = [
-        observations(base.model, truths[0], noise=NOISE, seed=s, noise_seed=s) for s in range(3)
+        observations(base.model, truths[0], noise=NOISE, seed=s, noise_seed=s)
+        for s in range(3)
     ]
     one, two, three = (jid.identify(base, o) for o in logs)
     together, updated = jid.identify(base, logs[:2]), jid.update(one, two)
@@ -122,7 +146,9 @@ def test_an_update_equals_the_joint_fit(base, truths):
     assert updated.rows == together.rows
     np.testing.assert_allclose(updated.residual_rms, together.residual_rms, rtol=1e-9)
     all_three = jid.identify(base, logs).parameters
-    np.testing.assert_allclose(jid.update(updated, three).parameters, all_three, rtol=1e-11)
+    np.testing.assert_allclose(
+        jid.update(updated, three).parameters, all_three, rtol=1e-11
+    )
 
 
 def test_fits_with_weights_of_their_own_keep_them(base, truths, logs):
@@ -134,15 +160,24 @@ def test_fits_with_weights_of_their_own_keep_them(base, truths, logs):
     np.testing.assert_allclose(updated.parameters, combine((one, two), (E, E))[0])
     again = jid.update(updated, three)
     R, z = again.factor
-    np.testing.assert_allclose(np.linalg.lstsq(R, z, rcond=None)[0], again.parameters, rtol=1e-9)
-    for twice in (lambda: jid.update(again, one), lambda: jid.identify_payload(one, one)):
-        with pytest.raises(ValueError, match="have seen the same data, which would count twice"):
+    np.testing.assert_allclose(
+        np.linalg.lstsq(R, z, rcond=None)[0], again.parameters, rtol=1e-9
+    )
+    for twice in (
+        lambda: jid.update(again, one),
+        lambda: jid.identify_payload(one, one),
+    ):
+        with pytest.raises(
+            ValueError, match="have seen the same data, which would count twice"
+        ):
             twice()
 
 
 def test_a_fit_that_leaves_something_open_still_helps(base, truths):
     full = observations(base.model, truths[0], noise=NOISE, seed=1, noise_seed=1)
-    still = observations(base.model, truths[0], noise=NOISE, seed=2, noise_seed=2, still=(1,))
+    still = observations(
+        base.model, truths[0], noise=NOISE, seed=2, noise_seed=2, still=(1,)
+    )
     one, poor = jid.identify(base, full), jid.identify(base, still)
     assert np.isinf(np.diag(poor.covariance)).any()
     updated = jid.update(one, poor)

@@ -49,7 +49,9 @@ def agree(base, o, blocks=4) -> None:
     got = fast(base, o, blocks)
     expected = jid.RegressionProblem(base, [o], divisions=blocks).blocks
     np.testing.assert_array_equal(got.total.rows, expected.total.rows)
-    for a, b in zip((got.total, *got.parts), (expected.total, *expected.parts), strict=True):
+    for a, b in zip(
+        (got.total, *got.parts), (expected.total, *expected.parts), strict=True
+    ):
         assert distance(a, b) < 1e-12
     problems = (jid.RegressionProblem(base, blocks=x) for x in (got, expected))
     p, q = (fit_problem(x, jid.estimators.LeastSquares()).parameters for x in problems)
@@ -96,7 +98,9 @@ def test_a_known_tool(base):
     ],
 )
 def test_filtered_and_decimated(base, fields):
-    agree(base, changed(observed(base, samples=60000, filter=SMOOTH, every=7), **fields))
+    agree(
+        base, changed(observed(base, samples=60000, filter=SMOOTH, every=7), **fields)
+    )
 
 
 def test_nothing_depends_on_the_length_of_chunks(base, monkeypatch):

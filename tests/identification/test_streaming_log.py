@@ -29,7 +29,12 @@ def numbers(base):
 
 
 def frame(time, angles, forces):
-    columns = {"t": time, "q1": angles[:, 0], "q2": angles[:, 1], "more": np.zeros(len(time))}
+    columns = {
+        "t": time,
+        "q1": angles[:, 0],
+        "q2": angles[:, 1],
+        "more": np.zeros(len(time)),
+    }
     return pl.DataFrame(columns | {"tau1": forces[:, 0], "tau2": forces[:, 1]})
 
 
@@ -53,7 +58,9 @@ def short_parts(monkeypatch):
 
 
 def in_memory(base, path, decimation, filter=SMOOTH):
-    return jid.observe(jid.read_recording(path, COLUMNS), base.model.robot, filter, decimation)
+    return jid.observe(
+        jid.read_recording(path, COLUMNS), base.model.robot, filter, decimation
+    )
 
 
 def agree(base, log, o):
@@ -62,7 +69,8 @@ def agree(base, log, o):
     for x, y in zip(a.parts, b.parts, strict=True):
         A, B = (np.column_stack(f.weighted(np.ones(2))) for f in (x, y))
         norms = np.maximum(np.linalg.norm(B, axis=0), 1e-6)
-        # Parts of a log are filtered by themselves: second differences amplify rounding.
+        # Parts of a log are filtered by themselves: second differences amplify
+        # rounding.
         assert np.abs((A.T @ A - B.T @ B) / norms / norms[:, None]).max() < 1e-9
 
 
@@ -80,7 +88,9 @@ def test_mapped_arrays_and_other_files(base, numbers, parquet, tmp_path):
     robot = base.model.robot
     np.savez(tmp_path / "log.npz", t=time, q=np.asfortranarray(angles), tau=forces)
     columns = jid.Columns(angles="q", forces="tau", sample_time=DT)
-    mapped = scan_log(tmp_path / "log.npz", columns, robot, SMOOTH).read(slice(1000, 2000))
+    mapped = scan_log(tmp_path / "log.npz", columns, robot, SMOOTH).read(
+        slice(1000, 2000)
+    )
     expected = scan_log(parquet, COLUMNS, robot, SMOOTH).read(slice(1000, 2000))
     np.testing.assert_array_equal(mapped[0].qd, expected[0].qd)
     np.testing.assert_array_equal(mapped[1], forces[1000:2000])
@@ -90,7 +100,13 @@ def test_mapped_arrays_and_other_files(base, numbers, parquet, tmp_path):
     np.testing.assert_array_equal(log.read(slice(100, 200))[1], forces[100:200])
     frame(*(x[1:] for x in numbers)).write_csv(tmp_path / "less.csv")
     with pytest.raises(ValueError, match=r"`less.csv` has 19999 rows"):
-        scan_log(tmp_path / "q.csv", columns, robot, SMOOTH, forces_path=tmp_path / "less.csv")
+        scan_log(
+            tmp_path / "q.csv",
+            columns,
+            robot,
+            SMOOTH,
+            forces_path=tmp_path / "less.csv",
+        )
 
 
 def test_a_part_is_filtered_like_the_whole(base, parquet):
@@ -111,7 +127,9 @@ def test_a_part_is_filtered_like_the_whole(base, parquet):
 )
 def test_text_of_any_kind(base, numbers, tmp_path, separator, header, end, point):
     rows = np.column_stack([x[:3000] for x in numbers])
-    lines = [separator.join(f"{x:.9f}".replace(".", point) for x in row) for row in rows]
+    lines = [
+        separator.join(f"{x:.9f}".replace(".", point) for x in row) for row in rows
+    ]
     lines = [separator.join(["t", "q1", "q2", "tau1", "tau2"])] * header + lines
     path = tmp_path / "log.txt"
     path.write_bytes(end.join(lines).encode() + b"\n\n" * header)
@@ -148,7 +166,12 @@ def test_bad_rows_of_long_texts_are_named(base, text, row, complaint):
 @pytest.mark.usefixtures("short_parts")
 def test_gaps_slow_rows_and_limits_as_in_memory(base, numbers, tmp_path):
     time, angles, forces = numbers
-    time = time + 7.0 + 0.5 * (np.arange(SAMPLES) >= 9000) + 0.3 * (np.arange(SAMPLES) >= 9003)
+    time = (
+        time
+        + 7.0
+        + 0.5 * (np.arange(SAMPLES) >= 9000)
+        + 0.3 * (np.arange(SAMPLES) >= 9003)
+    )
     path = tmp_path / "log.npz"
     np.savez(path, t=time, q=angles, tau=forces)
     columns = jid.Columns(angles="q", forces="tau", time="t")

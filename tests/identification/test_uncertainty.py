@@ -5,7 +5,13 @@ import itertools
 import numpy as np
 import pytest
 from scipy import signal, special
-from virtual import dense, left_out_in_turn, observations, planar_base, standard_parameters
+from virtual import (
+    dense,
+    left_out_in_turn,
+    observations,
+    planar_base,
+    standard_parameters,
+)
 
 import jaxid as jid
 from jaxid.dynamics.dispatch import in_numpy
@@ -33,7 +39,10 @@ def by_definition(base, o, weights):
     A = (weights[:, None] * theta.reshape(-1, n, base.size)).reshape(-1, base.size)
     y = (forces.reshape(-1, n) * weights).ravel()
     inverse = np.linalg.inv(A.T @ A)
-    P, r = (A @ inverse).reshape(-1, n, base.size), (y - A @ (inverse @ A.T @ y)).reshape(-1, n)
+    P, r = (
+        (A @ inverse).reshape(-1, n, base.size),
+        (y - A @ (inverse @ A.T @ y)).reshape(-1, n),
+    )
     N = len(r)
     f = np.fft.rfftfreq(N, o.row_time)
     # Lines and their mirror images.
@@ -46,7 +55,9 @@ def by_definition(base, o, weights):
     phi = (within @ power) / (within @ (1 - h))
     weighted = Pf * np.sqrt(m / N)[:, None, None]
     covariance = np.einsum("fji,fj,fjk->ik", weighted, phi, weighted.conj()).real
-    C = np.einsum("fji,fg,fj->ijg", np.abs(weighted) ** 2, within, 1 / (within @ (1 - h)))
+    C = np.einsum(
+        "fji,fg,fj->ijg", np.abs(weighted) ** 2, within, 1 / (within @ (1 - h))
+    )
     x = C * power.T
     scatter = np.sum(x**2 * 2 / m, axis=(1, 2))
     return covariance, 4 * np.sum(x, axis=(1, 2)) ** 2 / scatter
@@ -54,7 +65,9 @@ def by_definition(base, o, weights):
 
 @pytest.mark.parametrize("samples", [400, 401])
 def test_the_sandwich_is_its_definition(base, samples):
-    o = observations(base.model, standard_parameters(base.model), samples=samples, noise=0.4)
+    o = observations(
+        base.model, standard_parameters(base.model), samples=samples, noise=0.4
+    )
     found, e = row_spectra(base, [o])
     covariance, dof = by_definition(base, o, np.asarray(e.weights))
     got, got_dof, _ = sandwich(*found)
@@ -63,7 +76,9 @@ def test_the_sandwich_is_its_definition(base, samples):
     size = np.sqrt(np.diag(covariance))
     # Pairs of parameters see the spectrum in bins.
     correlation = got / size / size[:, None]
-    np.testing.assert_allclose(correlation, covariance / size / size[:, None], atol=0.03)
+    np.testing.assert_allclose(
+        correlation, covariance / size / size[:, None], atol=0.03
+    )
     assert np.linalg.eigvalsh(correlation)[0] > 0
 
 
@@ -71,7 +86,9 @@ def coloured(random, shape, memory, dt):
     kept = np.exp(-dt / memory)
     start = kept * random.standard_normal((shape[0], 1, shape[2]))
     white = random.standard_normal(shape)
-    return signal.lfilter([np.sqrt(1 - kept**2)], [1, -kept], white, axis=1, zi=start)[0]
+    return signal.lfilter([np.sqrt(1 - kept**2)], [1, -kept], white, axis=1, zi=start)[
+        0
+    ]
 
 
 def coverage(base, recordings, memory, draws, seed=0):
@@ -107,7 +124,9 @@ def coverage(base, recordings, memory, draws, seed=0):
 def moved(samples, seed=0):
     """Sinusoids of 0.17 to 0.61 Hz, at 50 Hz."""
     w = 2 * np.pi * np.array([0.17, 0.29, 0.47, 0.61])[:, None]
-    a, phase = np.random.default_rng(seed).uniform([[[0.2]], [[0]]], [[[0.6]], [[6]]], (2, 4, 2))
+    a, phase = np.random.default_rng(seed).uniform(
+        [[[0.2]], [[0]]], [[[0.6]], [[6]]], (2, 4, 2)
+    )
     z = a * np.exp(1j * (w * 0.02 * np.arange(samples)[:, None, None] + phase))
     return jid.Motion(*(np.sum((1j * w) ** k * z, axis=1).imag for k in range(3)))
 
@@ -130,7 +149,12 @@ SLOW = np.abs(moved(1000).qd) > 0.3
 
 @pytest.mark.parametrize(
     "options",
-    [[{}], [{"seed": 1}, {"seed": 2}], [{"segments": ((0, 500), (500, 1000))}], [{"mask": SLOW}]],
+    [
+        [{}],
+        [{"seed": 1}, {"seed": 2}],
+        [{"segments": ((0, 500), (500, 1000))}],
+        [{"mask": SLOW}],
+    ],
     ids=["one", "two recordings", "a gap", "slow rows left out"],
 )
 @pytest.mark.parametrize("memory", [1e-6, 0.3])
@@ -151,10 +175,14 @@ def test_long_logs_in_stretches_agree_with_the_whole(base, monkeypatch):
     whole = jid.identify(base, o, ESTIMATOR)
     monkeypatch.setattr(spectral, "MAX_ROWS", 1500)
     divided = jid.identify(base, o, ESTIMATOR)
-    np.testing.assert_allclose(divided.standard_deviations, whole.standard_deviations, rtol=0.06)
+    np.testing.assert_allclose(
+        divided.standard_deviations, whole.standard_deviations, rtol=0.06
+    )
     monkeypatch.setattr(spectral, "MAX_SAMPLES", 8000)
     some = jid.identify(base, o, ESTIMATOR)
-    np.testing.assert_allclose(some.standard_deviations, whole.standard_deviations, rtol=0.15)
+    np.testing.assert_allclose(
+        some.standard_deviations, whole.standard_deviations, rtol=0.15
+    )
     assert np.median(whole.uncertainty.ratios) > 2
 
 
@@ -162,7 +190,9 @@ def test_errors_in_the_part_that_decides_make_intervals_wider(base):
     """A quick part at the start, with larger errors, decides the inertias of a slow log."""
     random, p = np.random.default_rng(5), standard_parameters(base.model)
     quick = np.where(np.arange(2000) < 100, 10.0, 1.0)[:, None]
-    q, qd, qdd = random.standard_normal((3, 2000, 2)) * quick * [[[1.0]], [[0.1]], [[1.0]]]
+    q, qd, qdd = (
+        random.standard_normal((3, 2000, 2)) * quick * [[[1.0]], [[0.1]], [[1.0]]]
+    )
     forces = np.asarray(base.model.inverse_dynamics(p, jid.Motion(q, qd, qdd)))
     held, alone = [], []
     for _ in range(30):
@@ -191,7 +221,9 @@ def test_intervals_and_whiteness_of_a_fit(base):
     with pytest.raises(ValueError, match="`level`"):
         fit.intervals(95.0)
     noise = np.stack([white[:, 0], slow[:, 1]], axis=1)
-    found = jid.identify(base, o.replace(forces=o.forces + noise), ESTIMATOR).residual_spectra
+    found = jid.identify(
+        base, o.replace(forces=o.forces + noise), ESTIMATOR
+    ).residual_spectra
     assert found.white == (True, False)
     assert found.low_frequency[1] > 0.5 > 0.2 > found.low_frequency[0]
     # One-sided densities: their area is the variance.
@@ -209,12 +241,16 @@ def test_factors_alone_are_judged_by_blocks(base):
     o = observations(base.model, standard_parameters(base.model), noise=0.3)
     blocks, fit = from_factors(base, o, 12)
     left_out = left_out_in_turn(blocks, fit.weights)
-    expected = np.sqrt(11 / 12 * np.sum((left_out - left_out.mean(axis=0)) ** 2, axis=0))
+    expected = np.sqrt(
+        11 / 12 * np.sum((left_out - left_out.mean(axis=0)) ** 2, axis=0)
+    )
     np.testing.assert_allclose(fit.standard_deviations, expected, rtol=1e-7)
     assert (fit.uncertainty.dof == 11).all()
     assert any("block jackknife" in note for note in fit.notes)
     _, one = from_factors(base, o, 1)
-    np.testing.assert_array_equal(one.standard_deviations, one.naive_standard_deviations)
+    np.testing.assert_array_equal(
+        one.standard_deviations, one.naive_standard_deviations
+    )
     assert any("only one block of time" in note for note in one.notes)
 
 

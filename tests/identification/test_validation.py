@@ -23,10 +23,14 @@ def test_errors_are_those_of_the_paper():
     e = errors()
     silent = dataclasses.replace(e, measured=np.asarray(e.measured) * [1.0, 0.0])
     np.testing.assert_array_equal(np.isnan(silent.rms_relative), [False, True])
-    by_hand = sum(np.abs(p - m) for p, m in zip(e.predicted, e.measured, strict=True)) / 50
+    by_hand = (
+        sum(np.abs(p - m) for p, m in zip(e.predicted, e.measured, strict=True)) / 50
+    )
     np.testing.assert_allclose(e.mean, by_hand)
     np.testing.assert_allclose(e.mean_percent, by_hand * [1.0, 20.0])
-    np.testing.assert_allclose(e.rms**2, np.var(e.errors, axis=0) + e.errors.mean(axis=0) ** 2)
+    np.testing.assert_allclose(
+        e.rms**2, np.var(e.errors, axis=0) + e.errors.mean(axis=0) ** 2
+    )
     relative = np.linalg.norm(e.predicted - e.measured) / np.linalg.norm(e.measured)
     np.testing.assert_allclose(e.relative, relative)
     assert dataclasses.replace(e, predicted=e.measured).relative == 0.0
@@ -56,7 +60,9 @@ def test_wrong_parameters_are_no_other_shape_of_friction():
     base = planar_base()
     p = standard_parameters(base.model)
     o = observations(base.model, p, samples=2000, noise=0.4)
-    wrong = np.asarray(base.from_standard(p)) * np.where(np.char.find(base.names, "fv") < 0, 1, 3)
+    wrong = np.asarray(base.from_standard(p)) * np.where(
+        np.char.find(base.names, "fv") < 0, 1, 3
+    )
     e = torque_errors(fit_of(base, wrong), o)
     as_unexplained = dataclasses.replace(e, unexplained=e.errors)
     assert all(as_unexplained.depend_on_speed)

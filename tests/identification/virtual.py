@@ -16,7 +16,9 @@ def standard_parameters(model: jid.Model, seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).uniform(0.2, 2.0, model.size)
 
 
-def motion(joints: int, samples: int, *, seed: int = 0, still: tuple[int, ...] = ()) -> jid.Motion:
+def motion(
+    joints: int, samples: int, *, seed: int = 0, still: tuple[int, ...] = ()
+) -> jid.Motion:
     """A few sinusoids for each joint; some joints can be kept still."""
     rng = np.random.default_rng(seed)
     t = np.linspace(0.0, 10.0, samples)[:, None]
@@ -49,7 +51,9 @@ def observations(
     m = motion(n, samples, seed=seed, still=still)
     forces = in_numpy(model, model.forces, m.q, m.qd, m.qdd, shared=(p,))
     forces = forces + in_numpy(model, model.known_forces, m.q, m.qd, m.qdd)
-    forces = forces + noise * np.random.default_rng(noise_seed).normal(size=forces.shape)
+    forces = forces + noise * np.random.default_rng(noise_seed).normal(
+        size=forces.shape
+    )
     dt = 10.0 / (samples - 1)
     if filter is None:
         filter = jid.ZeroPhaseButterworth(0.4 / dt, force_cutoff=math.inf, margin=0.0)
@@ -69,7 +73,9 @@ def dense(
     m, model = o.motion, base.model
     theta = in_numpy(model, model.columns, m.q, m.qd, m.qdd)[:, :, list(base.indices)]
     rows = o.reduce(theta)
-    forces = o.reduce(np.asarray(o.forces) - in_numpy(model, model.known_forces, m.q, m.qd, m.qdd))
+    forces = o.reduce(
+        np.asarray(o.forces) - in_numpy(model, model.known_forces, m.q, m.qd, m.qdd)
+    )
     keep = np.asarray(o.mask)
     joint = np.broadcast_to(np.arange(keep.shape[1]), keep.shape)
     return rows[keep], forces[keep], joint[keep]
@@ -85,7 +91,12 @@ def left_out_in_turn(blocks: Blocks, weights: np.ndarray) -> np.ndarray:
 
 def planar_base(joints: int = 2) -> jid.BaseParameters:
     """Base parameters of a planar arm with friction and offsets: twelve of two joints."""
-    terms = (jid.RigidBodies(), jid.ViscousFriction(), jid.CoulombFriction(), jid.ConstantOffset())
+    terms = (
+        jid.RigidBodies(),
+        jid.ViscousFriction(),
+        jid.CoulombFriction(),
+        jid.ConstantOffset(),
+    )
     limits = jid.Limits(joints, force=[40.0, 5.0, 2.0][:joints])
     return jid.base_parameters(
         jid.Model(jid.robots.planar_arm(joints, 0.4).replace(limits=limits), terms)

@@ -62,16 +62,21 @@ def test_smoothing_is_linear_and_acts_on_each_column_alone(filter):
 @every
 def test_constants_pass_unchanged_and_ramps_without_phase(filter):
     t = DT * np.arange(4000)
-    np.testing.assert_allclose(filter.smooth(np.full((4000, 1), 3.7), DT), 3.7, rtol=1e-10)
+    np.testing.assert_allclose(
+        filter.smooth(np.full((4000, 1), 3.7), DT), 3.7, rtol=1e-10
+    )
     edge = max(filter.edge(DT), 1)
     inner = slice(edge, -edge)
-    # What is left of the start after the edge is a part of the step that a ramp's end makes.
+    # What is left of the start after the edge is a part of the step that a ramp's end
+    # makes.
     np.testing.assert_allclose(filter.smooth(5 * t, DT)[inner], 5 * t[inner], atol=1e-2)
 
 
 @every
 @pytest.mark.parametrize("frequency", [0.5, 3.0, 12.0, 40.0])
-def test_sinusoids_pass_with_the_gain_of_the_formula_and_without_phase(filter, frequency):
+def test_sinusoids_pass_with_the_gain_of_the_formula_and_without_phase(
+    filter, frequency
+):
     low = filter.low_pass(DT)
     n, k = 20000, 2 * np.pi * frequency
     t = DT * np.arange(n)
@@ -86,7 +91,9 @@ def test_gains_are_the_formulas():
     f = np.array([0.1, 3.0, 15.0, 40.0])
     warped = np.tan(np.pi * f * DT) / np.tan(np.pi * 15 * DT)
     np.testing.assert_allclose(
-        ZeroPhaseButterworth(15).low_pass(DT).gain(f, DT), 1 / (1 + warped**8), rtol=1e-9
+        ZeroPhaseButterworth(15).low_pass(DT).gain(f, DT),
+        1 / (1 + warped**8),
+        rtol=1e-9,
     )
     warped = 2 / DT * np.tan(np.pi * f * DT) / 100
     np.testing.assert_allclose(
@@ -116,7 +123,10 @@ def test_memory_is_where_the_impulse_response_ends(filter, tolerance):
     rounding = 1e-15 * response.max()
     assert response[middle + n + 1 :].max() <= tolerance * response[middle] + rounding
     if n and tolerance > 1e-10:
-        assert response[middle + n - 30 : middle + n + 1].max() > 0.1 * tolerance * response[middle]
+        assert (
+            response[middle + n - 30 : middle + n + 1].max()
+            > 0.1 * tolerance * response[middle]
+        )
 
 
 @every
@@ -130,7 +140,9 @@ def test_motions_follow_the_desired_ones(filter):
     for j in range(3):
         for got, true in ((motion.q, q), (motion.qd, qd), (motion.qdd, qdd)):
             assert np.corrcoef(got[inner, j], true[inner, j])[0, 1] > 0.999
-        assert np.polyfit(qdd[inner, j], motion.qdd[inner, j], 1)[0] == pytest.approx(1, abs=5e-3)
+        assert np.polyfit(qdd[inner, j], motion.qdd[inner, j], 1)[0] == pytest.approx(
+            1, abs=5e-3
+        )
 
 
 @every
@@ -158,10 +170,17 @@ def test_butterworth_derivatives_are_of_fourth_order():
     inner = slice(100, -100)
     bound = (k * dt) ** 4 / 30 * 1.05
     assert np.abs(motion.qd[inner, 0] / k - gain * np.cos(k * t[inner])).max() < bound
-    assert np.abs(motion.qdd[inner, 0] / k**2 + gain * np.sin(k * t[inner])).max() < bound
+    assert (
+        np.abs(motion.qdd[inner, 0] / k**2 + gain * np.sin(k * t[inner])).max() < bound
+    )
     measured = filter.motion(q, 2 * k * np.cos(k * t)[:, None], dt)
-    assert np.abs(measured.qd[inner, 0] / k - 2 * gain * np.cos(k * t[inner])).max() < 1e-9
-    assert np.abs(measured.qdd[inner, 0] / k**2 + 2 * gain * np.sin(k * t[inner])).max() < 2 * bound
+    assert (
+        np.abs(measured.qd[inner, 0] / k - 2 * gain * np.cos(k * t[inner])).max() < 1e-9
+    )
+    assert (
+        np.abs(measured.qdd[inner, 0] / k**2 + 2 * gain * np.sin(k * t[inner])).max()
+        < 2 * bound
+    )
 
 
 def test_paper_filter_lags_and_attenuates_as_its_formula_says():
@@ -170,7 +189,9 @@ def test_paper_filter_lags_and_attenuates_as_its_formula_says():
     motion = PaperFilter(velocity=200.0).motion(np.sin(k * t)[:, None], None, DT)
     w = 2 / DT * math.tan(k * DT / 2)
     lag, gain, t = math.atan(w / 200), w / math.hypot(1, w / 200), t[4000:8000]
-    np.testing.assert_allclose(motion.qd[4000:8000, 0], gain * np.cos(k * t - lag), atol=1e-8 * k)
+    np.testing.assert_allclose(
+        motion.qd[4000:8000, 0], gain * np.cos(k * t - lag), atol=1e-8 * k
+    )
     assert lag / k == pytest.approx(1 / 200, rel=0.02)
     expected = -(w**2) / (1 + (w / 100) ** 2) * np.sin(k * t)
     np.testing.assert_allclose(motion.qdd[4000:8000, 0], expected, atol=1e-8 * k**2)
@@ -206,7 +227,10 @@ def periodic(periods, harmonics):
         (lambda: periodic(2.1, 5), "record whole periods"),
         (lambda: PaperFilter().edge(1 / 380), r"`velocity` .* faster than 381\.972 Hz"),
         (lambda: PaperFilter().motion(np.zeros((99, 1)), None, 1 / 380), "`velocity`"),
-        (lambda: ZeroPhaseButterworth(70).smooth(np.zeros((99, 1)), 0.008), "faster than 140 Hz"),
+        (
+            lambda: ZeroPhaseButterworth(70).smooth(np.zeros((99, 1)), 0.008),
+            "faster than 140 Hz",
+        ),
         (lambda: ZeroPhaseButterworth(5.0, 21), "`order`"),
         (lambda: ZeroPhaseButterworth(5.0, 2.5), "`order`"),
         (lambda: ZeroPhaseButterworth(1e-12).edge(DT), "`cutoff`"),
@@ -225,7 +249,8 @@ def test_refusals(make, complaint):
 def test_decimation_is_scipys_with_gain_one():
     x = np.random.default_rng(2).normal(size=(3000, 2, 2)).cumsum(axis=0)
     expected = signal.decimate(signal.decimate(x, 10, axis=0), 5, axis=0)
-    # Scipy runs sections or coefficients, and pads them otherwise, depending on its version.
+    # Scipy runs sections or coefficients, and pads them otherwise, depending on its
+    # version.
     got = Decimation((10, 5))(x) * 10 ** (-0.05 / 20 * 4)
     assert got.shape == (60, 2, 2)
     np.testing.assert_allclose(got[8:-8], expected[8:-8], atol=1e-2 * np.abs(x).max())

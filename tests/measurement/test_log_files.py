@@ -55,15 +55,21 @@ def test_text_files_of_any_separator(tmp_path, separator, header):
 
 def test_decimal_commas_numbers_from_zero_and_headers_of_savetxt(tmp_path):
     log = a_log()
-    cells = ["; ".join(f"{v:.17g}" for v in row) for row in zip(*log.values(), strict=True)]
+    cells = [
+        "; ".join(f"{v:.17g}" for v in row) for row in zip(*log.values(), strict=True)
+    ]
     path = tmp_path / "log.csv"
     path.write_text("\n".join(["; ".join(log), *cells]).replace(".", ","))
     check(read_recording(path, COLUMNS), log)
-    groups = {f"{g}_{j:02d}": log[f"{g}{j + 1}"] for g in ("q", "tau") for j in range(2)}
+    groups = {
+        f"{g}_{j:02d}": log[f"{g}{j + 1}"] for g in ("q", "tau") for j in range(2)
+    }
     write_csv(path, {"t": log["t"]} | groups)
     r = read_recording(path, Columns(angles="q_{}", forces="tau_{}", time="t"))
     np.testing.assert_array_equal(r.angles, stack(log, "q"))
-    np.savetxt(tmp_path / "log.txt", np.stack(list(log.values()), 1), header=" ".join(log))
+    np.savetxt(
+        tmp_path / "log.txt", np.stack(list(log.values()), 1), header=" ".join(log)
+    )
     recording = read_recording(tmp_path / "log.txt", COLUMNS)
     np.testing.assert_allclose(recording.forces, stack(log, "tau"), rtol=1e-15)
 
@@ -72,7 +78,9 @@ def test_decimal_commas_numbers_from_zero_and_headers_of_savetxt(tmp_path):
 @given(data=st.data(), joints=st.integers(1, 4), samples=st.integers(10, 20))
 def test_round_trip_of_all_formats(tmp_path_factory, data, joints, samples):
     folder = tmp_path_factory.mktemp("logs")
-    q, tau = (data.draw(arrays(np.float64, (samples, joints), elements=FINITE)) for _ in "ab")
+    q, tau = (
+        data.draw(arrays(np.float64, (samples, joints), elements=FINITE)) for _ in "ab"
+    )
     table = {f"q{j + 1}": q[:, j] for j in range(joints)}
     table |= {f"tau{j + 1}": tau[:, j] for j in range(joints)}
     pl.DataFrame(table).write_csv(folder / "a.csv")
@@ -113,7 +121,9 @@ def test_units_signs_offsets_and_constants(tmp_path):
     np.testing.assert_allclose(r.angles[:, 0], 1e-3 * q[:, 0] + 0.1, rtol=1e-14)
     np.testing.assert_allclose(r.angles[:, 1], np.pi - np.deg2rad(q[:, 1]), rtol=1e-14)
     np.testing.assert_allclose(r.velocities[:, 0], 1e-3 * dq[:, 0], rtol=1e-14)
-    np.testing.assert_allclose(r.velocities[:, 1], -dq[:, 1] * 2 * np.pi / 60, rtol=1e-14)
+    np.testing.assert_allclose(
+        r.velocities[:, 1], -dq[:, 1] * 2 * np.pi / 60, rtol=1e-14
+    )
     np.testing.assert_allclose(r.forces, tau * [-2.0, 0.5], rtol=1e-14)
     assert r.sample_time == 0.004
 
@@ -135,9 +145,17 @@ def test_nanoseconds_since_1970_keep_their_precision(tmp_path):
 def test_several_files(tmp_path):
     log = a_log()
     for group, name in {"q": "Joint_", "tau": "Joint_", "dq": "v"}.items():
-        write_csv(tmp_path / f"{group}.csv", {f"{name}{j}": log[f"{group}{j}"] for j in (1, 2)})
-    columns = Columns(angles="Joint_{}", forces="Joint_{}", velocities="v{}", sample_time=0.004)
-    paths = {"forces_path": tmp_path / "tau.csv", "velocities_path": tmp_path / "dq.csv"}
+        write_csv(
+            tmp_path / f"{group}.csv",
+            {f"{name}{j}": log[f"{group}{j}"] for j in (1, 2)},
+        )
+    columns = Columns(
+        angles="Joint_{}", forces="Joint_{}", velocities="v{}", sample_time=0.004
+    )
+    paths = {
+        "forces_path": tmp_path / "tau.csv",
+        "velocities_path": tmp_path / "dq.csv",
+    }
     r = read_recording(tmp_path / "q.csv", columns, "run", **paths)
     check(r, log)
     assert r.name == "run"
@@ -157,7 +175,10 @@ def refused(path, columns, *parts, **kwargs):
     ("q", "complaint"),
     [
         (np.repeat([[0.0, 0.0], [np.inf, -np.inf]], [3, 17], axis=0), "row 4"),
-        (np.full((20, 2), 0x7F800001, np.uint32).view(np.float32), "row 1"),  # signalling NaN
+        (
+            np.full((20, 2), 0x7F800001, np.uint32).view(np.float32),
+            "row 1",
+        ),  # signalling NaN
         (np.zeros((20, 0)), "(20, 0)"),
         (np.array(["a"] * 20), "real numbers"),
     ],
@@ -174,13 +195,23 @@ def test_missing_columns_name_the_others_and_the_closest(tmp_path):
     refused(path, wrong, "`log.csv`", "`tua1`", "`forces`", "`tau1`", "`dq2`")
     refused(path, Columns(angles="q{}", forces="tau{}", time="time"), "`time`", "`t`")
     refused(path, Columns(angles="q{}", forces="tau{}"), "`time`", "`sample_time`")
-    refused(path, Columns(angles=(1, 9), forces="tau{}", time="t"), "column 9", "from 0 to 6")
+    refused(
+        path,
+        Columns(angles=(1, 9), forces="tau{}", time="t"),
+        "column 9",
+        "from 0 to 6",
+    )
     refused(path, Columns("q{}", "q{}", time="t"), "`q1`", "`angles`", "`forces`")
     log = a_log(3)
     del log["q2"]
     path = write_csv(tmp_path / "hole.csv", log)
     refused(path, COLUMNS, "`q1`, `q3`", "from 1 to 2")
-    refused(path, Columns(angles=("q1", "q3"), forces="tau{}", time="t"), "3 columns", "have 2")
+    refused(
+        path,
+        Columns(angles=("q1", "q3"), forces="tau{}", time="t"),
+        "3 columns",
+        "have 2",
+    )
     path = write_csv(tmp_path / "double.csv", a_log() | {"q01": np.zeros(12)})
     refused(path, COLUMNS, "`q01`, `q1`", "`angles`")
     path = write_csv(tmp_path / "bare.csv", a_log(), header=False)
@@ -202,17 +233,26 @@ def test_missing_columns_name_the_others_and_the_closest(tmp_path):
         ("log.parquet", b"not parquet", "damaged"),
         ("log.npz", b"not npz", "`log.npz`"),
         ("log.mat", b"not mat at all" * 30, "damaged"),
-        ("log.mat", b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM" + b"\x00" * 512, "damaged"),
+        (
+            "log.mat",
+            b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM" + b"\x00" * 512,
+            "damaged",
+        ),
     ],
 )
 def test_damaged_files(tmp_path, name, content, complaint):
     path = tmp_path / name
     path.write_bytes(content)
-    refused(path, Columns(angles="q", forces="tau", sample_time=0.1), f"`{name}`", complaint)
+    refused(
+        path, Columns(angles="q", forces="tau", sample_time=0.1), f"`{name}`", complaint
+    )
 
 
 def test_quotations_may_hold_separators(tmp_path):
-    rows = ["t,q1,tau1,note", *(f'{0.01 * k:.2f},{k},1,"a ""still"", held"' for k in range(60))]
+    rows = [
+        "t,q1,tau1,note",
+        *(f'{0.01 * k:.2f},{k},1,"a ""still"", held"' for k in range(60)),
+    ]
     (tmp_path / "log.csv").write_text("\r\n".join(rows))
     assert read_recording(tmp_path / "log.csv", PLAIN).samples == 60
 
@@ -235,21 +275,35 @@ SPOILT = (
 @pytest.mark.parametrize("timed", [True, False])
 def test_bad_rows_are_left_out_and_counted(tmp_path, timed):
     t = 0.001 * np.arange(11_000)
-    rows = [[f"{x:.9g}" for x in row] for row in np.stack([t, np.sin(t), 1 + t, np.cos(t)], 1)]
+    rows = [
+        [f"{x:.9g}" for x in row]
+        for row in np.stack([t, np.sin(t), 1 + t, np.cos(t)], 1)
+    ]
     for k, spoil in enumerate(SPOILT):
         rows[1000 * k + 500] = spoil(rows[1000 * k + 500])
     lines = ["t,q1,other,tau1", *(",".join(row) for row in rows)]
     (tmp_path / "log.csv").write_text("\n".join(lines))
-    columns = PLAIN if timed else Columns(angles="q{}", forces="tau{}", sample_time=0.001)
+    columns = (
+        PLAIN if timed else Columns(angles="q{}", forces="tau{}", sample_time=0.001)
+    )
     recording = read_recording(tmp_path / "log.csv", columns, bridged=0.01)
     assert recording.segments == ((0, 11_000),)
-    np.testing.assert_allclose(recording.angles[:, 0], np.sin(recording.time), atol=1e-8)
-    np.testing.assert_allclose(recording.forces[:, 0], np.cos(recording.time), atol=1e-8)
+    np.testing.assert_allclose(
+        recording.angles[:, 0], np.sin(recording.time), atol=1e-8
+    )
+    np.testing.assert_allclose(
+        recording.forces[:, 0], np.cos(recording.time), atol=1e-8
+    )
     count = len(SPOILT) - (0 if timed else 2)
-    assert f"{count} of 11000 rows are bad and were left out: line 502 (" in recording.notes[0]
+    assert (
+        f"{count} of 11000 rows are bad and were left out: line 502 ("
+        in recording.notes[0]
+    )
     for k in range(count):
         assert f"line {1000 * k + 502} (" in recording.notes[0]
-    with pytest.raises(ValueError, match=f"{count} of 11000 rows are bad: line 502") as error:
+    with pytest.raises(
+        ValueError, match=f"{count} of 11000 rows are bad: line 502"
+    ) as error:
         read_recording(tmp_path / "log.csv", columns, bad_rows=0.0)
     assert "\n" not in str(error.value)
 
@@ -260,10 +314,17 @@ def test_lengths_and_shapes_must_agree(tmp_path):
     forces = write_csv(tmp_path / "tau.csv", {k: v[:-1] for k, v in log.items()})
     refused(path, COLUMNS, "11 rows", "has 12", forces_path=forces)
     refused(path, PLAIN, "`Columns.velocities`", velocities_path=forces)
-    refused(path, Columns("q{}", "tau{}", time="t", angle_offsets=(1.0,)), "`angle_offsets`")
+    refused(
+        path, Columns("q{}", "tau{}", time="t", angle_offsets=(1.0,)), "`angle_offsets`"
+    )
     short = write_csv(tmp_path / "short.csv", {k: v[:8] for k, v in log.items()})
     refused(short, COLUMNS, "8 samples", "at least 10")
-    np.savez(tmp_path / "lying.npz", t=np.arange(50.0), q=np.zeros((2, 50)), tau=np.zeros((2, 50)))
+    np.savez(
+        tmp_path / "lying.npz",
+        t=np.arange(50.0),
+        q=np.zeros((2, 50)),
+        tau=np.zeros((2, 50)),
+    )
     lying = Columns(angles="q", forces="tau", time="t")
     refused(tmp_path / "lying.npz", lying, "50 samples")
     refused(tmp_path / "none.csv", COLUMNS, "is no file")

@@ -36,8 +36,12 @@ def a_recording(gaps=()):
     for gap in gaps:
         t[gap:] += 0.5
     w = np.pi
-    q = np.stack([np.sin(w * t) + 0.3 * np.cos(3 * w * t), 0.5 * np.cos(2 * w * t)], axis=1)
-    qd = np.stack([w * np.cos(w * t) - 0.9 * w * np.sin(3 * w * t), -w * np.sin(2 * w * t)], 1)
+    q = np.stack(
+        [np.sin(w * t) + 0.3 * np.cos(3 * w * t), 0.5 * np.cos(2 * w * t)], axis=1
+    )
+    qd = np.stack(
+        [w * np.cos(w * t) - 0.9 * w * np.sin(3 * w * t), -w * np.sin(2 * w * t)], 1
+    )
     rng = np.random.default_rng(5)
     forces = np.sign(qd) + 2 * q + 0.3 * rng.normal(size=q.shape)
     return Recording.of(q, forces, velocities=qd, time=t)
@@ -61,7 +65,9 @@ def columns_of(o):
 
 @every
 @pytest.mark.parametrize("gaps", [(), (2500,), (2600, 2700, 4300)])
-def test_columns_and_forces_stay_aligned_in_one_or_many_chunks(filter, decimation, gaps):
+def test_columns_and_forces_stay_aligned_in_one_or_many_chunks(
+    filter, decimation, gaps
+):
     if isinstance(filter, PeriodicFourier):
         gaps = gaps[:1]
     o = observe(a_recording(gaps=gaps), a_robot(), filter, decimation)
@@ -99,7 +105,9 @@ def test_rows_lie_where_they_say():
         np.testing.assert_allclose(o.reduce(slow)[inner], expected[inner], atol=5e-3)
         np.testing.assert_array_equal(o.reduced_motion.q, o.motion.q[o.instants])
         for a, b in o.row_segments:
-            np.testing.assert_allclose(np.diff(o.reduced_time[a:b]), o.row_time, rtol=1e-9)
+            np.testing.assert_allclose(
+                np.diff(o.reduced_time[a:b]), o.row_time, rtol=1e-9
+            )
 
 
 def test_slow_rows_are_masked_for_their_joint_alone():
@@ -132,18 +140,52 @@ def test_motor_side_goes_through_the_drives(angles, forces):
 @pytest.mark.parametrize(
     ("joints", "dt", "settings", "complaint"),
     [
-        (3, DT, [ZeroPhaseButterworth(20.0)], "has 2 joints, but the robot `arm` has 3"),
-        (2, DT, [ZeroPhaseButterworth(20.0), Subsample(26)], "one of 25 samples at most"),
-        (2, DT, [ZeroPhaseButterworth(20.0, force_cutoff=np.inf), Subsample(2)], "Decimation"),
-        (2, DT, [ZeroPhaseButterworth(0.05)], "longest segment of `recording` has 6000 samples"),
-        (2, 1e-2 * DT, [ZeroPhaseButterworth(5.0)], "longest seg.* at 100000 Hz.*`time_unit`"),
-        (2, DT, [CASES[1][0], None, [0.0, 99.0]], "joint `joint2` never reaches the speed 99"),
+        (
+            3,
+            DT,
+            [ZeroPhaseButterworth(20.0)],
+            "has 2 joints, but the robot `arm` has 3",
+        ),
+        (
+            2,
+            DT,
+            [ZeroPhaseButterworth(20.0), Subsample(26)],
+            "one of 25 samples at most",
+        ),
+        (
+            2,
+            DT,
+            [ZeroPhaseButterworth(20.0, force_cutoff=np.inf), Subsample(2)],
+            "Decimation",
+        ),
+        (
+            2,
+            DT,
+            [ZeroPhaseButterworth(0.05)],
+            "longest segment of `recording` has 6000 samples",
+        ),
+        (
+            2,
+            1e-2 * DT,
+            [ZeroPhaseButterworth(5.0)],
+            "longest seg.* at 100000 Hz.*`time_unit`",
+        ),
+        (
+            2,
+            DT,
+            [CASES[1][0], None, [0.0, 99.0]],
+            "joint `joint2` never reaches the speed 99",
+        ),
         (2, DT, [CASES[1][0], None, [0.0]], "`min_speed`"),
     ],
 )
 def test_refusals(joints, dt, settings, complaint):
     with pytest.raises(ValueError, match=complaint):
-        observe(dataclasses.replace(a_recording(), sample_time=dt), a_robot(joints), *settings)
+        observe(
+            dataclasses.replace(a_recording(), sample_time=dt),
+            a_robot(joints),
+            *settings,
+        )
 
 
 def test_remarks_say_what_was_left_out():
@@ -152,7 +194,10 @@ def test_remarks_say_what_was_left_out():
     assert o.segments == ((0, 2500), (2500, 5950))
     assert o.time[2500] == pytest.approx(3.55)
     assert "1 segment(s), shorter" in o.notes[-1]
-    assert "measured velocities are not used" in observe(r, a_robot(), PaperFilter()).notes[-1]
+    assert (
+        "measured velocities are not used"
+        in observe(r, a_robot(), PaperFilter()).notes[-1]
+    )
 
 
 @pytest.mark.parametrize("noise", [0.0, 1e-3])
@@ -161,10 +206,14 @@ def test_velocities_that_are_no_derivatives_are_left_out(wrong, noise):
     """One channel is wrong; one that stands, with noise in both signals, is not judged."""
     r, rng = a_recording(gaps=(2500,)), np.random.default_rng(2)
     quiet = np.asarray(r.angles) * [1.0, 0.0] + noise * rng.normal(size=r.angles.shape)
-    good = np.asarray(r.velocities) * [1.0, 0.0] + 10 * noise * rng.normal(size=r.angles.shape)
+    good = np.asarray(r.velocities) * [1.0, 0.0] + 10 * noise * rng.normal(
+        size=r.angles.shape
+    )
     settings = a_robot(), ZeroPhaseButterworth(20.0)
     right = dataclasses.replace(r, angles=quiet, velocities=good)
-    assert not any("not the derivatives" in note for note in observe(right, *settings).notes)
+    assert not any(
+        "not the derivatives" in note for note in observe(right, *settings).notes
+    )
     bad = observe(dataclasses.replace(right, velocities=good * [wrong, 1.0]), *settings)
     assert "velocities of channels 1 are not the derivatives" in bad.notes[-1]
     without = observe(dataclasses.replace(right, velocities=None), *settings)
@@ -172,7 +221,9 @@ def test_velocities_that_are_no_derivatives_are_left_out(wrong, noise):
 
 
 def test_arrays_that_are_filtered_already_become_observations():
-    o = observe(a_recording(), a_robot(), ZeroPhaseButterworth(20.0, margin=0.0), Subsample(5))
+    o = observe(
+        a_recording(), a_robot(), ZeroPhaseButterworth(20.0, margin=0.0), Subsample(5)
+    )
     m = o.motion
     settings = {"filter": o.filter, "decimation": o.decimation, "mask": o.mask}
     same = Observations.of(m.q, m.qd, m.qdd, o.forces, sample_time=DT, **settings)
@@ -181,8 +232,20 @@ def test_arrays_that_are_filtered_already_become_observations():
     plain = Observations.of(m.q, m.qd, m.qdd, o.forces, sample_time=DT)
     assert plain.mask.all()
     np.testing.assert_array_equal(plain.reduced_forces, o.forces)
-    np.testing.assert_array_equal(plain.replace(forces=2 * o.forces).forces, 2 * o.forces)
-    for wrong in ({"sample_time": 0.0}, {"mask": np.ones((3, 2), bool)}, {"qd": m.qd[:5]}):
-        arrays = {"q": m.q, "qd": m.qd, "qdd": m.qdd, "forces": o.forces, "sample_time": DT}
+    np.testing.assert_array_equal(
+        plain.replace(forces=2 * o.forces).forces, 2 * o.forces
+    )
+    for wrong in (
+        {"sample_time": 0.0},
+        {"mask": np.ones((3, 2), bool)},
+        {"qd": m.qd[:5]},
+    ):
+        arrays = {
+            "q": m.q,
+            "qd": m.qd,
+            "qdd": m.qdd,
+            "forces": o.forces,
+            "sample_time": DT,
+        }
         with pytest.raises(ValueError, match=f"`{next(iter(wrong))}`"):
             Observations.of(**(arrays | wrong))

@@ -26,7 +26,8 @@ STATE = "control_msgs/msg/JointTrajectoryControllerState"
 ROS2.register(
     get_types_from_msg(
         "std_msgs/Header header\nstring[] joint_names\n"
-        "trajectory_msgs/JointTrajectoryPoint actual\ntrajectory_msgs/JointTrajectoryPoint output",
+        "trajectory_msgs/JointTrajectoryPoint "
+        "actual\ntrajectory_msgs/JointTrajectoryPoint output",
         STATE,
     )
 )
@@ -51,10 +52,14 @@ def header(store, time):
 
 def joint_state(store, time, names, *values):
     kind = store.types["sensor_msgs/msg/JointState"]
-    return kind(header(store, time), list(names), *(np.array(x, np.float64) for x in values))
+    return kind(
+        header(store, time), list(names), *(np.array(x, np.float64) for x in values)
+    )
 
 
-def states(store, shuffled=False, joints=JOINTS, lag=0, topic="/js", start=0, stop=SAMPLES):
+def states(
+    store, shuffled=False, joints=JOINTS, lag=0, topic="/js", start=0, stop=SAMPLES
+):
     """Return messages as (topic, time of recording, message)."""
     rng, messages = np.random.default_rng(1), []
     for k, row in enumerate(zip(*numbers(), strict=True)):
@@ -96,7 +101,9 @@ def write_mcap(path, messages, undefined=None):
             kind = message.__msgtype__
             if topic not in channels:
                 text, _ = ROS2.generate_msgdef(kind, ros_version=2)
-                written = ("", b"") if topic == undefined else ("ros2msg", text.encode())
+                written = (
+                    ("", b"") if topic == undefined else ("ros2msg", text.encode())
+                )
                 schema = writer.register_schema(kind, *written)
                 channels[topic] = writer.register_channel(topic, "cdr", schema)
             data = bytes(ROS2.serialize_cdr(message, kind))
@@ -130,7 +137,9 @@ def test_bags_of_all_kinds(tmp_path, kind, shuffled):
     check(read_recording(path, BY_PLACE))
     names = Columns(by_name("position"), by_name("effort"), by_name("velocity"))
     check(read_recording(path, names))
-    whole = Columns("/js.position", "/js.effort", "/js.velocity", time="/js.header.stamp")
+    whole = Columns(
+        "/js.position", "/js.effort", "/js.velocity", time="/js.header.stamp"
+    )
     check(read_recording(path, whole))
     late = read_recording(path, dataclasses.replace(BY_PLACE, time="/js.log_time"))
     np.testing.assert_array_equal(late.segments, [(0, SAMPLES)])
@@ -149,18 +158,43 @@ def refused(path, columns, *parts):
 
 def test_unknown_topics_and_fields_list_what_there_is(tmp_path):
     path = write_mcap(tmp_path / "a.mcap", states(ROS2) + states(ROS2, topic="/other"))
-    listed = "`/js.position[{}]`", "`/js.effort.wrist`", "`/other.position[{}]`", "`/js.log_time`"
-    refused(path, Columns("/joints.position[{}]", "/js.effort[{}]"), "`/joints.position", *listed)
-    refused(path, Columns("/js.positions[{}]", "/js.effort[{}]"), "`/js.positions", *listed)
-    refused(path, Columns("/js.position.hand", "/js.effort.wrist"), "`/js.position.hand`", *listed)
+    listed = (
+        "`/js.position[{}]`",
+        "`/js.effort.wrist`",
+        "`/other.position[{}]`",
+        "`/js.log_time`",
+    )
+    refused(
+        path,
+        Columns("/joints.position[{}]", "/js.effort[{}]"),
+        "`/joints.position",
+        *listed,
+    )
+    refused(
+        path, Columns("/js.positions[{}]", "/js.effort[{}]"), "`/js.positions", *listed
+    )
+    refused(
+        path,
+        Columns("/js.position.hand", "/js.effort.wrist"),
+        "`/js.position.hand`",
+        *listed,
+    )
 
 
 def test_two_robots_on_one_topic_are_told_apart(tmp_path):
     hand = states(ROS2, joints=("thumb", "index", "palm"), lag=900_000)
     mixed = write_mcap(tmp_path / "a.mcap", states(ROS2, shuffled=True) + hand)
-    refused(mixed, BY_PLACE, "`/js.position[1]`", "`/js.position.thumb`", "`/js.position.elbow`")
+    refused(
+        mixed,
+        BY_PLACE,
+        "`/js.position[1]`",
+        "`/js.position.thumb`",
+        "`/js.position.elbow`",
+    )
     check(
-        read_recording(mixed, Columns(by_name("position"), by_name("effort"), by_name("velocity")))
+        read_recording(
+            mixed, Columns(by_name("position"), by_name("effort"), by_name("velocity"))
+        )
     )
 
 
@@ -182,8 +216,14 @@ def test_topics_with_other_times_are_interpolated(tmp_path):
 
 
 def test_topics_that_share_their_times_are_not_interpolated(tmp_path):
-    path = write_mcap(tmp_path / "a.mcap", states(ROS2) + states(ROS2, True, topic="/e"))
-    check(read_recording(path, Columns("/js.position[{}]", "/e.effort", "/e.velocity[{}]")))
+    path = write_mcap(
+        tmp_path / "a.mcap", states(ROS2) + states(ROS2, True, topic="/e")
+    )
+    check(
+        read_recording(
+            path, Columns("/js.position[{}]", "/e.effort", "/e.velocity[{}]")
+        )
+    )
 
 
 def test_topics_without_common_times(tmp_path):
@@ -193,7 +233,10 @@ def test_topics_without_common_times(tmp_path):
 
 
 def trajectory_states():
-    kind, point = ROS2.types[STATE], ROS2.types["trajectory_msgs/msg/JointTrajectoryPoint"]
+    kind, point = (
+        ROS2.types[STATE],
+        ROS2.types["trajectory_msgs/msg/JointTrajectoryPoint"],
+    )
     passed = ROS2.types["builtin_interfaces/msg/Duration"](0, 0)
     for k, (q, qd, tau) in enumerate(zip(*numbers(), strict=True)):
         order, none = np.roll(np.arange(3), k), np.zeros(0)
@@ -215,7 +258,8 @@ def test_states_of_a_controller(tmp_path):
 
 def test_arrays_without_names_and_stamps(tmp_path):
     kind, layout = (
-        ROS2.types[f"std_msgs/msg/{x}"] for x in ("Float64MultiArray", "MultiArrayLayout")
+        ROS2.types[f"std_msgs/msg/{x}"]
+        for x in ("Float64MultiArray", "MultiArrayLayout")
     )
     rows = zip(*numbers(), strict=True)
     messages = [
@@ -223,7 +267,9 @@ def test_arrays_without_names_and_stamps(tmp_path):
         for k, row in enumerate(rows)
     ]
     path = write_mcap(tmp_path / "a.mcap", messages)
-    groups = [tuple(f"/raw.data[{k}]" for k in range(3 * g, 3 * g + 3)) for g in (0, 2, 1)]
+    groups = [
+        tuple(f"/raw.data[{k}]" for k in range(3 * g, 3 * g + 3)) for g in (0, 2, 1)
+    ]
     check(read_recording(path, Columns(*groups)))
     check(read_recording(path, Columns(*groups, sample_time=0.002)))
 
@@ -242,7 +288,9 @@ def write_lerobot(path, **kinds):
     angles, velocities, forces = numbers()
     pl.DataFrame(
         {
-            "observation.state": np.hstack([angles, velocities]).astype(np.float32).tolist(),
+            "observation.state": np.hstack([angles, velocities])
+            .astype(np.float32)
+            .tolist(),
             "action": forces.astype(np.float32).tolist(),
             "timestamp": np.float32(0.02 * (np.arange(SAMPLES) % 20)),
             "episode_index": np.arange(SAMPLES) // 20,
@@ -257,18 +305,26 @@ def write_lerobot(path, **kinds):
 def test_lerobot_data_sets(tmp_path, fixed):
     widths = {"observation.state": 6, "action": 3}
     kinds = {
-        n: pl.Array(pl.Float32, w) if fixed else pl.List(pl.Float32) for n, w in widths.items()
+        n: pl.Array(pl.Float32, w) if fixed else pl.List(pl.Float32)
+        for n, w in widths.items()
     }
     path = write_lerobot(tmp_path / "episode_000000.parquet", **kinds)
     state = [f"observation.state[{k}]" for k in range(6)]
     for forces in ("action", "action[{}]"):
         r = read_recording(path, Columns(state[:3], forces, state[3:]))
         assert r.segments == ((0, 20), (20, 40))
-        for found, values in zip((r.angles, r.velocities, r.forces), numbers(), strict=True):
+        for found, values in zip(
+            (r.angles, r.velocities, r.forces), numbers(), strict=True
+        ):
             np.testing.assert_array_equal(found, values.astype(np.float32))
         # Stamps are in single precision.
         np.testing.assert_allclose(np.diff(r.time[:20]), 0.02, atol=1e-7)
-    refused(path, Columns("observation.stat", "action"), "`observation.state[{}]`", "`action[{}]`")
+    refused(
+        path,
+        Columns("observation.stat", "action"),
+        "`observation.state[{}]`",
+        "`action[{}]`",
+    )
 
 
 def write_hdf5(path, **groups):
@@ -285,10 +341,16 @@ def test_hdf5(tmp_path):
     path = write_hdf5(tmp_path / "a.h5")
     clock = {"time": "arm.t", "time_unit": units.NS}
     check(read_recording(path, Columns("arm.q", "arm.tau", "arm.dq", **clock)))
-    check(read_recording(path, Columns("arm.q[{}]", "arm.tau[{}]", "arm.dq[{}]", **clock)))
+    check(
+        read_recording(path, Columns("arm.q[{}]", "arm.tau[{}]", "arm.dq[{}]", **clock))
+    )
     some = Columns(("arm.q[2]", "arm.q[0]"), ("arm.tau[2]", "arm.tau[0]"), **clock)
-    np.testing.assert_array_equal(read_recording(path, some).angles, numbers()[0][:, [2, 0]])
-    refused(path, Columns("arm.p", "arm.tau", **clock), "`arm.q`", "`arm.q[{}]`", "`arm.t`")
+    np.testing.assert_array_equal(
+        read_recording(path, some).angles, numbers()[0][:, [2, 0]]
+    )
+    refused(
+        path, Columns("arm.p", "arm.tau", **clock), "`arm.q`", "`arm.q[{}]`", "`arm.t`"
+    )
     refused(path, Columns("arm.q", "arm.tau"), "`a.h5`", "`time`", "`sample_time`")
 
 
@@ -303,7 +365,11 @@ def test_mat_of_version_7_3(tmp_path):
     with path.open("r+b") as file:
         file.write(b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM")
     check(read_recording(path, Columns("log.q", "log.tau", "log.dq", time="t")))
-    check(read_recording(path, Columns("log.q[{}]", "log.tau[{}]", "log.dq[{}]", time="t")))
+    check(
+        read_recording(
+            path, Columns("log.q[{}]", "log.tau[{}]", "log.dq[{}]", time="t")
+        )
+    )
 
 
 @pytest.mark.parametrize(("name", "package"), [("a.mcap", "rosbags"), ("a.h5", "h5py")])
@@ -311,7 +377,9 @@ def test_missing_packages_and_damaged_files(tmp_path, monkeypatch, name, package
     path = tmp_path / name
     path.write_bytes(b"damaged" * 20)
     refused(path, BY_PLACE, f"`{name}`", "damaged")
-    for module in [module for module in sys.modules if module.partition(".")[0] == package]:
+    for module in [
+        module for module in sys.modules if module.partition(".")[0] == package
+    ]:
         monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(ImportError):
         importlib.import_module(package)

@@ -26,14 +26,18 @@ def test_repeated_stamps_are_removed_and_counted():
     t = np.insert(0.01 * np.arange(100), [10, 50, 50], [0.09, 0.49, 0.49])
     r = recording(t)
     assert r.samples == 100
-    np.testing.assert_allclose(r.angles[:, 0], np.sin(0.03 * np.arange(100)), atol=1e-12)
+    np.testing.assert_allclose(
+        r.angles[:, 0], np.sin(0.03 * np.arange(100)), atol=1e-12
+    )
     assert "3 of 103 rows repeat the time stamp" in r.notes[0]
 
 
 def test_backward_stamps_are_refused_with_their_row():
     t = 0.01 * np.arange(100)
     t[40:] -= 0.2
-    with pytest.raises(ValueError, match=r"backwards from 0.39 s to 0.2 s at row 41: sort"):
+    with pytest.raises(
+        ValueError, match=r"backwards from 0.39 s to 0.2 s at row 41: sort"
+    ):
         recording(t)
 
 
@@ -48,7 +52,9 @@ def test_gaps_split(gaps, width, noise):
     rng = np.random.default_rng(len(gaps))
     steps = np.full(499, 0.002)
     steps[np.array(gaps) - 1] *= width
-    t = np.concatenate([[0], np.cumsum(steps)]) + 0.002 * noise * rng.uniform(-0.5, 0.5, 500)
+    t = np.concatenate([[0], np.cumsum(steps)]) + 0.002 * noise * rng.uniform(
+        -0.5, 0.5, 500
+    )
     r = recording(t - t[0])
     assert r.segments == tuple(zip([0, *gaps], [*gaps, 500], strict=True))
     assert r.sample_time == pytest.approx(0.002, rel=1e-2)
@@ -95,7 +101,10 @@ X = np.zeros((20, 2))
         ({"sample_time": 0.0}, "`sample_time` must be positive"),
         ({"sample_time": None, "time": np.arange(19.0)}, r"`time` .* shape \(19,\)"),
         ({"sample_time": None, "time": np.zeros(20)}, "stands still"),
-        ({"velocities": np.where(np.arange(20) == 3, np.inf, X.T).T}, "`velocities` .* row 4"),
+        (
+            {"velocities": np.where(np.arange(20) == 3, np.inf, X.T).T},
+            "`velocities` .* row 4",
+        ),
     ],
 )
 def test_shapes_and_values_are_checked(arguments, complaint):

@@ -5,7 +5,16 @@ import jax.numpy as jnp
 import numpy as np
 from hypothesis import strategies as st
 
-UNARY = (jnp.sin, jnp.cos, jnp.tanh, jnp.abs, lambda x: -x, lambda x: x * x, jnp.exp, lambda x: x)
+UNARY = (
+    jnp.sin,
+    jnp.cos,
+    jnp.tanh,
+    jnp.abs,
+    lambda x: -x,
+    lambda x: x * x,
+    jnp.exp,
+    lambda x: x,
+)
 BINARY = (
     jnp.add,
     jnp.subtract,
@@ -45,7 +54,11 @@ def random_functions(draw, smooth=False):
             # Bounded, so that a chain of exponentials and squares stays a number.
             values.append(binary[b](c * jnp.sin(unary[u](jnp.asarray(left))), right))
         matrix = jnp.outer(values[-1], x)
-        return {"vector": values[-1], "matrix": matrix @ matrix.T, "sum": jnp.sum(values[-2])}
+        return {
+            "vector": values[-1],
+            "matrix": matrix @ matrix.T,
+            "sum": jnp.sum(values[-2]),
+        }
 
     return function
 

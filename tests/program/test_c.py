@@ -16,8 +16,12 @@ from jaxid.errors import InputError
 from jaxid.program import evaluate, trace
 from jaxid.program.c_writer import CWriter
 
-pytestmark = pytest.mark.skipif(shutil.which("gcc") is None, reason="no C compiler (gcc)")
-HEAD = "#include <float.h>\n#include <math.h>\n#include <stdint.h>\n#include <string.h>\n"
+pytestmark = pytest.mark.skipif(
+    shutil.which("gcc") is None, reason="no C compiler (gcc)"
+)
+HEAD = (
+    "#include <float.h>\n#include <math.h>\n#include <stdint.h>\n#include <string.h>\n"
+)
 WARNINGS = ("-Wall", "-Wextra", "-pedantic", "-Werror", "-O1")
 
 
@@ -45,7 +49,9 @@ def compiled(tmp_path_factory):
     def compile_(program, double=True, language="c"):
         standard = {"c": "-std=c99", "c++": "-std=c++11"}[language]
         folder, text = tmp_path_factory.mktemp("c"), c_code(program, double=double)
-        run = ctypes.CDLL(str(compile_c(folder, text, standard, *WARNINGS, language=language))).run
+        run = ctypes.CDLL(
+            str(compile_c(folder, text, standard, *WARNINGS, language=language))
+        ).run
         dtype = np.float64 if double else np.float32
 
         def call(*inputs):
@@ -90,11 +96,15 @@ def test_every_operation_in_both_precisions_and_languages(compiled, double, lang
     program = trace(function, (2,), (3,))
     run, tolerance = compiled(program, double, language), 4e-16 if double else 1e-6
     for x in ([0.3, -0.4], [-1.2, 2.0], [0.7, 0.5]):
-        assert_equal_to_numpy(run, program, np.array(x), np.zeros(3), tolerance=tolerance)
+        assert_equal_to_numpy(
+            run, program, np.array(x), np.zeros(3), tolerance=tolerance
+        )
 
 
 def test_nan_is_kept_by_choices(compiled):
-    program = trace(lambda x, y: (jnp.maximum(x, y), jnp.minimum(x, y), jnp.sign(x + y)), (), ())
+    program = trace(
+        lambda x, y: (jnp.maximum(x, y), jnp.minimum(x, y), jnp.sign(x + y)), (), ()
+    )
     run = compiled(program)
     for x, y in ((np.nan, 1.0), (1.0, np.nan)):
         assert np.isnan(np.concatenate(run(x, y))).all()
@@ -122,7 +132,11 @@ def library(request, tmp_path_factory):
     double, flags = request.param
     program = trace(lambda x: (jnp.sin(x), jnp.cos(x), jnp.tanh(x)), (5,))
     writer = CWriter(double, "arm", [program])
-    text = HEAD + writer.library() + writer.definition(program, "run", ["x"], ["s", "c", "h"])
+    text = (
+        HEAD
+        + writer.library()
+        + writer.definition(program, "run", ["x"], ["s", "c", "h"])
+    )
     target = compile_c(tmp_path_factory.mktemp("library"), text, "-O2", *FLAGS[flags])
     opened, dtype = ctypes.CDLL(str(target)), np.float64 if double else np.float32
 
@@ -170,7 +184,9 @@ def test_no_branch_but_those_of_the_loops(library):
         pytest.skip("no objdump on this machine")
     command = ["objdump", "-d", "--no-show-raw-insn", str(library[2])]
     text = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-    blocks = [b for b in text.split("\n\n") if re.search("<(run|arm_)", b.split("\n")[0])]
+    blocks = [
+        b for b in text.split("\n\n") if re.search("<(run|arm_)", b.split("\n")[0])
+    ]
     jumps = re.findall(r"\sj(?!mp)[a-z]+\s", "".join(blocks))
     assert blocks
     assert len(jumps) <= 2, jumps

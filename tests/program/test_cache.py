@@ -69,7 +69,8 @@ def test_the_second_process_compiles_nothing(tmp_path):
     assert misses > 0
     stored = {f.name for f in folder.glob("*-cache")}
     assert stored
-    # A busy machine may store a trivial function too, but nothing stored is compiled again.
+    # A busy machine may store a trivial function too, but nothing stored is compiled
+    # again.
     assert run(folder.parent)[1] >= len(stored)
     assert stored <= {f.name for f in folder.iterdir()}
 
@@ -96,7 +97,9 @@ def test_the_least_recently_used_go_first_and_no_other_file(tmp_path, monkeypatc
     monkeypatch.setattr(cache, "MAX_BYTES", 2500)
     place, now = keep_compiled(tmp_path), time.time()
     others = [
-        folder / name for folder in (tmp_path, place) for name in ("thesis.tex", "-cache.zip")
+        folder / name
+        for folder in (tmp_path, place)
+        for name in ("thesis.tex", "-cache.zip")
     ]
     for age, path in enumerate([*others, *(place / f"{x}-cache" for x in "edcba")]):
         path.write_bytes(bytes(1000))

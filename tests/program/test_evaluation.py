@@ -38,7 +38,9 @@ def test_distinct_results_are_computed_once_and_constants_not_at_all():
     rows = evaluate_rows(program, np.arange(3.0))
     np.testing.assert_array_equal(rows, [np.arange(3.0)])
     expected = [[x, 0.0, x, 2.5] for x in range(3)]
-    np.testing.assert_array_equal(packed_entries(program, rows, np.arange(4)).T, expected)
+    np.testing.assert_array_equal(
+        packed_entries(program, rows, np.arange(4)).T, expected
+    )
 
 
 def test_inputs_are_not_changed():
@@ -49,7 +51,9 @@ def test_inputs_are_not_changed():
 
 
 def test_choices_as_results_and_as_operands_over_several_blocks():
-    program = trace(lambda x: (jnp.where(x > 0, x, 2.0), jnp.where(x > 0, x, -x) * 3.0), ())
+    program = trace(
+        lambda x: (jnp.where(x > 0, x, 2.0), jnp.where(x > 0, x, -x) * 3.0), ()
+    )
     x = np.linspace(-1, 1, 3001)
     a, b = evaluate(program, x)
     np.testing.assert_array_equal(a, np.where(x > 0, x, 2.0))
@@ -57,7 +61,9 @@ def test_choices_as_results_and_as_operands_over_several_blocks():
 
 
 def test_nan_and_infinity_are_kept_without_warnings():
-    program = trace(lambda x: (jnp.sin(x), 1.0 / x, jnp.sign(x), jnp.maximum(x, 0.0)), ())
+    program = trace(
+        lambda x: (jnp.sin(x), 1.0 / x, jnp.sign(x), jnp.maximum(x, 0.0)), ()
+    )
     sine, reciprocal, sign, maximum = evaluate(program, np.array([np.nan, np.inf, 0.0]))
     assert np.isnan(sine[:2]).all()
     assert np.isnan([reciprocal[0], sign[0], maximum[0]]).all()
@@ -83,21 +89,32 @@ def test_python_equals_numpy(function):
 
 def test_shared_values_and_long_lines_in_python():
     program, x = trace(chain, (3,), (3,)), samples(0, ())
-    np.testing.assert_allclose(to_python(program)(*x.tolist()), flat(program, *x), rtol=1e-12)
+    np.testing.assert_allclose(
+        to_python(program)(*x.tolist()), flat(program, *x), rtol=1e-12
+    )
 
 
 @pytest.mark.parametrize("x", [-2.0, -0.0, 0.0, 0.5, np.inf, np.nan])
 def test_choices_signs_and_constants_in_python(x):
     def function(x):
         y = jnp.where((x > 0) & ~(x > 1) | (x != x), x, -3.0)
-        return y, jnp.sign(x), jnp.maximum(x, 0.25), jnp.minimum(x, np.inf), jnp.abs(x), np.inf * x
+        return (
+            y,
+            jnp.sign(x),
+            jnp.maximum(x, 0.25),
+            jnp.minimum(x, np.inf),
+            jnp.abs(x),
+            np.inf * x,
+        )
 
     program = trace(function, ())
     np.testing.assert_array_equal(to_python(program)([x]), flat(program, np.array(x)))
 
 
 def test_python_returns_floats_and_raises_its_own_errors():
-    assert to_python(trace(lambda x: jnp.array([x[0], 0.0, -1.5]), (2,)))([2.0, 3.0]) == (
+    assert to_python(trace(lambda x: jnp.array([x[0], 0.0, -1.5]), (2,)))(
+        [2.0, 3.0]
+    ) == (
         2,
         0,
         -1.5,

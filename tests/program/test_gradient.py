@@ -33,12 +33,16 @@ def test_derivatives_are_those_of_jax(name):
     x, y = random.uniform(-0.9, 0.9, (2, 50)), random.uniform(-0.9, 0.9, 50)
     weights = random.standard_normal((len(program.outputs), 50))
     found = pull_back(program, weights, x, y)
-    expected = jax.vmap(lambda x, y, w: jax.vjp(function, x, y)[1](w))(x.T, y, weights.T)
+    expected = jax.vmap(lambda x, y, w: jax.vjp(function, x, y)[1](w))(
+        x.T, y, weights.T
+    )
     np.testing.assert_allclose(found[0], expected[0].T, atol=1e-12)
     np.testing.assert_allclose(found[1], expected[1], atol=1e-12)
 
 
 def test_what_is_constant_has_no_derivative():
-    program = trace(lambda x: jnp.stack([jnp.ones(()), 2.0 * x[0], jnp.zeros(())]), (2,))
+    program = trace(
+        lambda x: jnp.stack([jnp.ones(()), 2.0 * x[0], jnp.zeros(())]), (2,)
+    )
     (found,) = pull_back(program, np.ones((3, 4)), np.zeros((2, 4)))
     np.testing.assert_array_equal(found, [[2.0] * 4, [0.0] * 4])

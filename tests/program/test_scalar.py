@@ -87,7 +87,9 @@ def test_constants_are_computed_by_ieee_754():
 def test_signs_move_out_of_odd_functions_and_vanish_in_even_ones(x):
     assert apply(Operation.SINE, negate(x)) is negate(apply(Operation.SINE, x))
     assert apply(Operation.COSINE, negate(x)) is apply(Operation.COSINE, x)
-    assert apply(Operation.EXPONENTIAL, negate(x)) is not apply(Operation.EXPONENTIAL, x)
+    assert apply(Operation.EXPONENTIAL, negate(x)) is not apply(
+        Operation.EXPONENTIAL, x
+    )
 
 
 def test_powers_are_products(x):
@@ -130,14 +132,19 @@ def test_common_factors_and_negated_differences(function, size, counts):
     assert (c.multiplications, c.additions, c.negations) == counts
 
 
-@given(st.lists(st.tuples(*[st.integers(0, 4)] * 3), min_size=2, max_size=9), st.integers(0, 9))
+@given(
+    st.lists(st.tuples(*[st.integers(0, 4)] * 3), min_size=2, max_size=9),
+    st.integers(0, 9),
+)
 @settings(max_examples=30, deadline=None, derandomize=True)
 def test_sums_of_products_keep_their_value(terms, split):
     c = np.array([0.5, -0.3, 2.0, 1.7, 0.0])
 
     def function(x):
         def total(some):
-            return sum((-1) ** i * c[k] * x[i] * x[j] * (1.0 + x[i]) for i, j, k in some)
+            return sum(
+                (-1) ** i * c[k] * x[i] * x[j] * (1.0 + x[i]) for i, j, k in some
+            )
 
         first = total(terms[:split]) + jnp.zeros(())
         return jnp.stack([first, first - total(terms[split:]), jnp.sin(total(terms))])
@@ -159,5 +166,7 @@ def test_operations_of_a_seven_joint_regressor(monkeypatch):
     assert int(program.nonzeros.sum()) == 255
 
     p = np.random.default_rng(0).uniform(0.5, 1.5, (7, 10))
-    program = trace(lambda *x: jnp.einsum("jbk,bk->j", benchmark.regressor(*x), p), n, n, n)
+    program = trace(
+        lambda *x: jnp.einsum("jbk,bk->j", benchmark.regressor(*x), p), n, n, n
+    )
     assert program.counts.multiplications < 842 + 255

@@ -33,17 +33,30 @@ def test_a_program_equals_its_function(function):
         lambda a, b: jax.checkpoint(chain)(a, b),
         lambda a, b: jax.nn.relu(a) + jax.nn.sigmoid(b) + jax.nn.softplus(a),
         lambda a, b: jnp.where(jnp.abs(a) < 0.5, 0.0, jnp.sign(a) * (jnp.abs(a) - 0.5)),
-        lambda a, b: jax.jacfwd(lambda x: jnp.maximum(x, b) * jnp.clip(x, -0.2, 0.4))(a),
-        lambda a, b: jnp.where((a > 0) & ~(b > 0) | (a <= b), a, b) + (a >= b).astype(a.dtype),
+        lambda a, b: jax.jacfwd(lambda x: jnp.maximum(x, b) * jnp.clip(x, -0.2, 0.4))(
+            a
+        ),
+        lambda a, b: (
+            jnp.where((a > 0) & ~(b > 0) | (a <= b), a, b) + (a >= b).astype(a.dtype)
+        ),
         lambda a, b: jax.grad(lambda x: jnp.sum(x[np.array([2, 0, 2])] * b))(a),
         lambda a, b: a.at[1].set(b[2]).at[np.array([0, 0])].add(b[:2]),
         lambda a, b: jax.lax.dynamic_update_slice(a, b[:2], (1,)),
         lambda a, b: jnp.pad(a, (1, 2)) + jnp.tile(b, 2) + jnp.repeat(a, 2)[::-1],
         lambda a, b: tuple(a) + tuple(jnp.split(b, 3)),
         lambda a, b: jnp.einsum("ij,j,k->ik", jnp.outer(a, b), b, a),
-        lambda a, b: jnp.abs(a) ** 2.5 + a**-2 + jnp.arctan2(a, b) + jax.lax.rsqrt(b * b + 1.0),
-        lambda a, b: jnp.sqrt(a * a) + jnp.log1p(b * b) + jnp.prod(a) + jnp.trace(jnp.outer(a, b)),
-        lambda a, b: jax.grad(lambda x: jnp.sum(jnp.arcsin(0.5 * x) + jnp.tanh(b * x)))(a),
+        lambda a, b: (
+            jnp.abs(a) ** 2.5 + a**-2 + jnp.arctan2(a, b) + jax.lax.rsqrt(b * b + 1.0)
+        ),
+        lambda a, b: (
+            jnp.sqrt(a * a)
+            + jnp.log1p(b * b)
+            + jnp.prod(a)
+            + jnp.trace(jnp.outer(a, b))
+        ),
+        lambda a, b: jax.grad(lambda x: jnp.sum(jnp.arcsin(0.5 * x) + jnp.tanh(b * x)))(
+            a
+        ),
         lambda a, b: [np.arange(3.0), jnp.zeros((2, 0)), 2.0 * a],
     ],
 )
@@ -77,14 +90,19 @@ def test_constants_of_an_input_are_folded():
     program = trace(lambda r, q: r * q, known, (3,))
     assert program.counts.multiplications == 2
     q = np.array([2.0, 3.0, 4.0])
-    np.testing.assert_array_equal(evaluate(program, np.full(3, 7.0), q), [0.0, 21.0, 2.0])
+    np.testing.assert_array_equal(
+        evaluate(program, np.full(3, 7.0), q), [0.0, 21.0, 2.0]
+    )
 
 
 @pytest.mark.parametrize(
     ("function", "word"),
     [
         (lambda x: jax.lax.fori_loop(0, 3, lambda _, c: c * x[0], 1.0), "scan"),
-        (lambda x: jax.lax.while_loop(lambda c: c < 3, lambda c: c + x[0], 0.0), "while"),
+        (
+            lambda x: jax.lax.while_loop(lambda c: c < 3, lambda c: c + x[0], 0.0),
+            "while",
+        ),
         (lambda x: jax.lax.cond(x[0] > 0, lambda: x, lambda: -x), "cond"),
         (jnp.sort, "sort"),
         (jnp.max, "reduce_max"),
@@ -119,6 +137,8 @@ def test_constants_stay_in_float64_where_jax_runs_in_float32():
     with jax.enable_x64(False):
         program = trace(lambda x: (m @ x)[np.array([1, 0])] + third, (2,))
         found = evaluate(program, x)
-        slope = trace(lambda x: 0.1 * jax.grad(lambda y: jnp.sum(y[np.array([0, 0])]))(x), (2,))
+        slope = trace(
+            lambda x: 0.1 * jax.grad(lambda y: jnp.sum(y[np.array([0, 0])]))(x), (2,)
+        )
         assert evaluate(slope, np.ones(2))[0] == 0.2
     np.testing.assert_allclose(found, (m @ x)[::-1] + third, rtol=1e-15)

@@ -3,7 +3,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given, settings
-from sample_functions import SIZE, chain, every_operation, random_functions, reference, samples
+from sample_functions import (
+    SIZE,
+    chain,
+    every_operation,
+    random_functions,
+    reference,
+    samples,
+)
 
 from jaxid.errors import InputError
 from jaxid.program import evaluate, lower, trace
@@ -11,7 +18,9 @@ from jaxid.program.xla import fenced_nodes, hidden_one
 
 
 def close(a, b, rtol=1e-12, atol=1e-12):
-    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=rtol, atol=atol), a, b)
+    jax.tree.map(
+        lambda x, y: np.testing.assert_allclose(x, y, rtol=rtol, atol=atol), a, b
+    )
 
 
 @given(random_functions())
@@ -49,11 +58,17 @@ def test_values_derivatives_and_batches():
     a, b = jnp.asarray(x[0]), jnp.asarray(x[1])
     close(jax.jit(lowered.dense)(a, b), original(a, b))
     gradient = jax.jit(jax.grad(lambda *x: loss(lowered.dense, *x), (0, 1)))
-    close(gradient(a, b), jax.jit(jax.grad(lambda *x: loss(original, *x), (0, 1)))(a, b))
-    one, other = (jax.jit(lambda *x, f=f: jax.jvp(f, x, x)) for f in (lowered.dense, original))
+    close(
+        gradient(a, b), jax.jit(jax.grad(lambda *x: loss(original, *x), (0, 1)))(a, b)
+    )
+    one, other = (
+        jax.jit(lambda *x, f=f: jax.jvp(f, x, x)) for f in (lowered.dense, original)
+    )
     close(one(a, b), other(a, b))
     hessian = jax.jit(jax.hessian(lambda a: loss(lowered.dense, a, b[:, :1])))(a[:, :1])
-    close(hessian, jax.jit(jax.hessian(lambda a: loss(original, a, b[:, :1])))(a[:, :1]))
+    close(
+        hessian, jax.jit(jax.hessian(lambda a: loss(original, a, b[:, :1])))(a[:, :1])
+    )
     mapped = jax.jit(jax.vmap(lowered.dense, in_axes=-1, out_axes=-1))(a, b)
     close(mapped, original(a, b))
 
@@ -82,7 +97,9 @@ def test_xla_does_not_fold_the_division_away():
     program = trace(chain, (3,), (3,))
     x = samples(0, (64,))
     text = jax.jit(lower(program, True).dense).lower(*x).compile().as_text()
-    circular = [k for k in fenced_nodes(program) if program.nodes[k].operation in ("sin", "cos")]
+    circular = [
+        k for k in fenced_nodes(program) if program.nodes[k].operation in ("sin", "cos")
+    ]
     # Sines are stacked behind one fence, cosines behind another.
     assert text.count(" divide(") == len(fenced_nodes(program)) - len(circular) + 2
 
@@ -90,12 +107,17 @@ def test_xla_does_not_fold_the_division_away():
 @pytest.mark.parametrize("fence", [False, True])
 def test_single_precision_stays_single(fence):
     lowered = lower(
-        trace(lambda a, b: chain(a, b) + jnp.where(a > 0, 1.0, 0.0)[:, None], (3,), (3,)), fence
+        trace(
+            lambda a, b: chain(a, b) + jnp.where(a > 0, 1.0, 0.0)[:, None], (3,), (3,)
+        ),
+        fence,
     )
     x = samples(4, (5,)).astype(np.float32)
     packed = jax.jit(lowered)(*x)
     assert {p.dtype for p in packed} == {np.dtype(np.float32)}
-    close(jax.jit(lowered.dense)(*x), evaluate(lowered.program, *x), rtol=1e-5, atol=1e-5)
+    close(
+        jax.jit(lowered.dense)(*x), evaluate(lowered.program, *x), rtol=1e-5, atol=1e-5
+    )
 
 
 @pytest.mark.parametrize("batch", [(), (0,), (2, 3)])

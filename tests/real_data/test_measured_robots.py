@@ -21,10 +21,14 @@ def identify(shared_data, tmp_path, capsys):
     """Run `jaxid identify` on logs, compare with golden results, return result and messages."""
 
     def identify(case, experiment, *words):
-        words = [shared_data / word if word.endswith(".csv") else word for word in words]
+        words = [
+            shared_data / word if word.endswith(".csv") else word for word in words
+        ]
         command("identify", HERE / experiment, *words, "-o", tmp_path / "report")
         compare(case, numbers_of_report(tmp_path / "report"))
-        found = json.loads((tmp_path / "report" / "result.json").read_text(encoding="utf-8"))
+        found = json.loads(
+            (tmp_path / "report" / "result.json").read_text(encoding="utf-8")
+        )
         return found, " ".join(capsys.readouterr().out.split())
 
     return identify
@@ -43,9 +47,13 @@ def test_tx40_as_a_whole(identify):
 
 
 def test_tx40_split_in_time(identify):
-    found, _ = identify("tx40", "tx40.toml", "tx40/motor_position.csv", "--split", "0.6")
+    found, _ = identify(
+        "tx40", "tx40.toml", "tx40/motor_position.csv", "--split", "0.6"
+    )
     train, test = (
-        np.array([joint["mean_percent"] for joint in found["errors"][role][0]["joints"]])
+        np.array(
+            [joint["mean_percent"] for joint in found["errors"][role][0]["joints"]]
+        )
         for role in ("identification", "verification")
     )
     assert train.mean() <= 1.15
@@ -87,7 +95,11 @@ def test_kr300_is_said_to_be_undetermined_and_a_ridge_transfers(identify, shared
     weights = described.estimation.plain.weights
     plain = jid.identify(described.base, first, jid.WeightedLeastSquares(weights))
     errors = jid.validate(plain, others).errors
-    assert all(a.relative > 1.3 * b["relative"] for a, b in zip(errors, ridge, strict=True))
+    assert all(
+        a.relative > 1.3 * b["relative"] for a, b in zip(errors, ridge, strict=True)
+    )
     rms = [np.mean([j["rms_relative"] for j in e["joints"]]) for e in ridge]
     rms += [float(e.rms_relative.mean()) for e in errors]
-    np.testing.assert_allclose(rms, [0.26, 0.25, 0.50, 0.39], atol=0.005)  # as in the README
+    np.testing.assert_allclose(
+        rms, [0.26, 0.25, 0.50, 0.39], atol=0.005
+    )  # as in the README

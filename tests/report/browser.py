@@ -12,7 +12,8 @@ import urllib.request
 from pathlib import Path
 
 CHROMIUM = next(
-    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
+    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))),
+    None,
 )
 FLAGS = [
     "--headless=new",
@@ -73,7 +74,10 @@ class Browser:
 
     def evaluate(self, expression: str):
         found = self.call(
-            "Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True
+            "Runtime.evaluate",
+            expression=expression,
+            returnByValue=True,
+            awaitPromise=True,
         )
         if "exceptionDetails" in found:
             raise RuntimeError(found["exceptionDetails"])
@@ -90,7 +94,10 @@ class Browser:
         """Open a file, wait until its figures can be drawn, and add the functions of the tests."""
         self.errors.clear()
         self.call("Page.navigate", url=path.resolve().as_uri())
-        ready = "document.documentElement.dataset.ready === '' || !document.querySelector('.chart')"
+        ready = (
+            "document.documentElement.dataset.ready === '' || "
+            "!document.querySelector('.chart')"
+        )
         self.wait(f"document.readyState === 'complete' && ({ready})")
         self.call("Runtime.evaluate", expression=FUNCTIONS)
 
@@ -111,12 +118,16 @@ class Browser:
             "height": height or box["height"],
             "scale": 1,
         }
-        shot = self.call("Page.captureScreenshot", captureBeyondViewport=True, clip=clip)
+        shot = self.call(
+            "Page.captureScreenshot", captureBeyondViewport=True, clip=clip
+        )
         path.write_bytes(base64.b64decode(shot["data"]))
 
     def pdf(self, path: Path) -> None:
         path.write_bytes(
-            base64.b64decode(self.call("Page.printToPDF", preferCSSPageSize=True)["data"])
+            base64.b64decode(
+                self.call("Page.printToPDF", preferCSSPageSize=True)["data"]
+            )
         )
 
     def close(self) -> None:

@@ -52,7 +52,9 @@ def validated():
     virtual = jid.VirtualRobot(
         robot=robot,
         terms=(jid.RigidBodies(),),
-        values=random_bodies(robot, np.array([8.0, 2.0]), np.random.default_rng(0)).ravel(),
+        values=random_bodies(
+            robot, np.array([8.0, 2.0]), np.random.default_rng(0)
+        ).ravel(),
         friction=SmoothFriction(np.array([3.0, 0.2]), np.array([5.0, 0.4])),
         sensors=Sensors(
             encoder_step=1e-6,
@@ -64,7 +66,9 @@ def validated():
     observations = []
     for seed, name in ((1, "first/run"), (2, "second")):
         motion = jid.random_fourier_series(robot, omega=1.5, seed=seed)
-        log = virtual.measure(motion, duration=4.0, sample_time=0.005, seed=seed, name=name)
+        log = virtual.measure(
+            motion, duration=4.0, sample_time=0.005, seed=seed, name=name
+        )
         observations.append(jid.observe(log, robot, jid.ZeroPhaseButterworth(10.0)))
     base = jid.base_parameters(virtual.model)
     fit = jid.identify(base, observations[0], jid.estimators.LeastSquares())
@@ -86,7 +90,9 @@ def changed(fit):
     """The comparison with the same robot, warm: a third of the rail's friction."""
     p = np.array(fit.parameters)
     p[fit.base.names.index("fv1")] /= 3.0
-    return jid.compare(fit, dataclasses.replace(fit, parameters=p, recordings=("warm",)))
+    return jid.compare(
+        fit, dataclasses.replace(fit, parameters=p, recordings=("warm",))
+    )
 
 
 @pytest.fixture(scope="session")

@@ -56,7 +56,10 @@ def test_shapes_move_with_the_robot(browser, tmp_path):
         "{ const s = document.querySelector('.player input'); s.value = 12;"
         " s.dispatchEvent(new Event('input')); }"
     )
-    shown = "((d) => [d.x, d.y, d.z].map((a) => [...a]))(document.querySelector('.chart').data[2])"
+    shown = (
+        "((d) => [d.x, d.y, d.z].map((a) => "
+        "[...a]))(document.querySelector('.chart').data[2])"
+    )
     found = np.transpose(browser.evaluate(shown))
     np.testing.assert_allclose(found, figure.scene.solids.placed[12], atol=4e-4)
     assert browser.evaluate("faults()") == []
@@ -90,12 +93,25 @@ def test_zooming_one_joint_with_the_mouse_zooms_all(opened):
     assert first == second
     left, right, height = opened.evaluate("firstPanel()")
     middle = 0.5 * (left + right)
-    steps = [("Moved", left, 0), ("Pressed", left, 1), ("Moved", middle, 1), ("Moved", right, 1)]
+    steps = [
+        ("Moved", left, 0),
+        ("Pressed", left, 1),
+        ("Moved", middle, 1),
+        ("Moved", right, 1),
+    ]
     for kind, x, buttons in (*steps, ("Released", right, 0)):
         button = "none" if kind == "Moved" else "left"
-        event = {"x": x, "y": height, "button": button, "buttons": buttons, "clickCount": 1}
+        event = {
+            "x": x,
+            "y": height,
+            "button": button,
+            "buttons": buttons,
+            "clickCount": 1,
+        }
         opened.call("Input.dispatchMouseEvent", type=f"mouse{kind}", **event)
-    opened.wait(f"ranges().every((range) => range[0] > {first[0]} && range[1] < {first[1]})")
+    opened.wait(
+        f"ranges().every((range) => range[0] > {first[0]} && range[1] < {first[1]})"
+    )
     expected = [0.75 * first[0] + 0.25 * first[1], 0.25 * first[0] + 0.75 * first[1]]
     for zoomed in opened.evaluate("ranges()"):
         assert zoomed == pytest.approx(expected, abs=0.02)
@@ -123,9 +139,14 @@ def test_paper_has_every_figure_and_what_was_folded(browser, pages, tmp_path):
     browser.wait("document.querySelectorAll('.chart:not(.drawn)').length === 0")
     assert browser.errors == []
     # After printing the page is as it was.
-    assert browser.evaluate("document.querySelectorAll('details:not([open])').length") == folded
+    assert (
+        browser.evaluate("document.querySelectorAll('details:not([open])').length")
+        == folded
+    )
     if shutil.which("pdftotext"):
         command = ["pdftotext", "-layout", tmp_path / "page.pdf", "-"]
-        text = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+        text = subprocess.run(
+            command, capture_output=True, text=True, check=True
+        ).stdout
         assert "Residuals" in text
         assert "frequency [Hz]" in text

@@ -35,7 +35,10 @@ def curve(panel, name):
 
 def unpacked(figure):
     """What the browser reads: the content of each chart."""
-    return [json.loads(gzip.decompress(base64.b64decode(c["content"]))) for c in charts(figure)]
+    return [
+        json.loads(gzip.decompress(base64.b64decode(c["content"])))
+        for c in charts(figure)
+    ]
 
 
 def numbers(packed):
@@ -65,7 +68,9 @@ def test_torques_show_what_was_measured_and_predicted(fit, validation):
     for j, (unit, word) in enumerate((("N", "force"), ("N m", "torque"))):
         upper, lower = figure.panels[j].parts
         np.testing.assert_array_equal(curve(upper, "measured").y, errors.measured[:, j])
-        np.testing.assert_array_equal(curve(upper, "predicted").y, errors.predicted[:, j])
+        np.testing.assert_array_equal(
+            curve(upper, "predicted").y, errors.predicted[:, j]
+        )
         np.testing.assert_array_equal(lower.curves[0].y, errors.errors[:, j])
         assert upper.title == robot.joint_names[j]
         assert (upper.y_label, lower.y_label) == (f"{word} [{unit}]", f"[{unit}]")
@@ -97,10 +102,14 @@ def test_long_names_fit_on_the_page(errors_of):
     joints = 3
     names = tuple(f"a_long_name_of_the_joint_number_{i}" for i in range(joints))
     robot = arm_of(joints).replace(joint_names=names)
-    errors = errors_of(joints, name="a recording with a name that goes on and on and on and on")
+    errors = errors_of(
+        joints, name="a recording with a name that goes on and on and on and on"
+    )
     f, half = np.linspace(0.0, 20.0, 50), np.full(joints, 0.5)
     density = np.random.default_rng(0).exponential(size=(joints, 50))
-    spectra = ResidualSpectra(f, density, 1.0 / (1.0 + (f / 10) ** 4), half, 0.1, half, 9.5)
+    spectra = ResidualSpectra(
+        f, density, 1.0 / (1.0 + (f / 10) ** 4), half, 0.1, half, 9.5
+    )
     require_everything_inside(jid.plot.torques(errors, robot))
     require_everything_inside(jid.plot.errors((errors,), (errors,), robot))
     require_everything_inside(jid.plot.residuals(spectra, robot))
@@ -163,15 +172,24 @@ def test_gaps_in_time_break_the_line_and_missing_values_stay_out(rows):
 def test_shapes_are_closed_surfaces_that_move_with_the_bodies():
     robot, q = arm_of(2), np.array([[0.0, 0.0], [0.4, -0.9], [1.1, 0.2]])
     rod = Capsule("rod", 1, start=(0.1, 0.0, 0.0), end=(0.9, 0.0, 0.0), radius=0.1)
-    ball, turned = Capsule("ball", 0, start=(0.5, 0.1, 0.0), radius=0.2), np.eye(3)[[1, 2, 0]]
+    ball, turned = (
+        Capsule("ball", 0, start=(0.5, 0.1, 0.0), radius=0.2),
+        np.eye(3)[[1, 2, 0]],
+    )
     box = Box("table", centre=(0.0, 3.0, 0.0), size=(0.2, 0.4, 0.6), rotation=turned)
     floor = HalfSpace("floor", normal=(0.0, 0.6, 0.8), height=-2.0)
     shapes = CollisionModel(robot, [rod, ball], [box, floor])
     solids = pose_figure(robot, q, shapes=shapes).scene.solids
-    placed, ends = solids.placed, np.asarray(jax.vmap(lambda x: shapes.ends(robot, x))(q))
+    placed, ends = (
+        solids.placed,
+        np.asarray(jax.vmap(lambda x: shapes.ends(robot, x))(q)),
+    )
     for pose in range(3):
         for body, capsule in enumerate(("ball", "rod")):
-            (start, end), points = ends[pose, 1 - body], placed[pose][solids.bodies == body]
+            (start, end), points = (
+                ends[pose, 1 - body],
+                placed[pose][solids.bodies == body],
+            )
             along = end - start
             t = np.clip((points - start) @ along / max(along @ along, 1e-9), 0.0, 1.0)
             far = np.linalg.norm(points - start - t[:, None] * along, axis=1)
@@ -182,9 +200,12 @@ def test_shapes_are_closed_surfaces_that_move_with_the_bodies():
     still = placed[0][solids.bodies == GROUND]
     np.testing.assert_array_equal(still, placed[2][solids.bodies == GROUND])
     corners = (still[:8] - [0.0, 3.0, 0.0]) @ turned
-    np.testing.assert_allclose(np.abs(corners), np.tile([0.1, 0.2, 0.3], (8, 1)), atol=1e-12)
+    np.testing.assert_allclose(
+        np.abs(corners), np.tile([0.1, 0.2, 0.3], (8, 1)), atol=1e-12
+    )
     np.testing.assert_allclose(still[8:] @ [0.0, 0.6, 0.8], -2.0, atol=1e-12)
-    # Every edge of a closed surface belongs to two triangles; the square's border to one.
+    # Every edge of a closed surface belongs to two triangles; the square's border to
+    # one.
     edges = np.sort(solids.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     _, counts = np.unique(edges, axis=0, return_counts=True)
     assert sorted(counts)[:5] == [1, 1, 1, 1, 2]
@@ -206,8 +227,12 @@ def test_the_robot_in_space_is_a_chain_to_its_tip_coloured_by_values(motion):
     elbow = np.hypot(np.cos(first), np.sin(first))
     planar = np.hypot(np.cos(first) + np.cos(both), np.sin(first) + np.sin(both))
     lines = figure.scene.bones
-    np.testing.assert_allclose(np.linalg.norm(lines[:, 1, 1], axis=1), elbow, atol=1e-12)
-    np.testing.assert_allclose(np.linalg.norm(lines[:, -1, 1], axis=1), planar, atol=1e-12)
+    np.testing.assert_allclose(
+        np.linalg.norm(lines[:, 1, 1], axis=1), elbow, atol=1e-12
+    )
+    np.testing.assert_allclose(
+        np.linalg.norm(lines[:, -1, 1], axis=1), planar, atol=1e-12
+    )
     np.testing.assert_array_equal(lines[:, 1:, 0], lines[:, :-1, 1], err_msg="a chain")
     (shown,) = unpacked(figure)
     frames = shown["frames"]
@@ -216,9 +241,12 @@ def test_the_robot_in_space_is_a_chain_to_its_tip_coloured_by_values(motion):
     x = numbers(pose["x"]).reshape(-1, 3)
     np.testing.assert_allclose(x[:, :2], lines[7, :, :, 0], atol=1e-6)
     assert np.isnan(x[:, 2]).all()
-    # The line from each joint has that joint's colour; the one from the ground has none.
+    # The line from each joint has that joint's colour; the one from the ground has
+    # none.
     np.testing.assert_allclose(colours[::3], [0.0, T[7], 2.0 * T[7]], atol=1e-6)
-    np.testing.assert_allclose(numbers(shown["data"][0]["line"]["color"]), 1.5 * T, atol=1e-6)
+    np.testing.assert_allclose(
+        numbers(shown["data"][0]["line"]["color"]), 1.5 * T, atol=1e-6
+    )
     require_everything_inside(figure)
 
 
@@ -226,7 +254,9 @@ def test_motions_are_drawn_between_their_limits(motion):
     robot = arm_of(2)
     limits = jid.Limits(2, velocity=[2.0, np.inf])
     for j, panel in enumerate(jid.plot.joints(robot, limits, T, motion).panels):
-        for part, values in zip(panel.parts, (motion.q, motion.qd, motion.qdd), strict=True):
+        for part, values in zip(
+            panel.parts, (motion.q, motion.qd, motion.qdd), strict=True
+        ):
             np.testing.assert_array_equal(part.curves[0].y, values[:, j])
         assert [len(part.levels) for part in panel.parts] == [0, 2 - 2 * j, 0]
     position, speed, _ = jid.plot.end_effector(robot, T, motion).panels
@@ -242,11 +272,15 @@ def test_friction_is_that_of_the_estimates_and_of_the_log(fit, validation):
     for j, panel in enumerate(figure.panels, 1):
         model, points = curve(panel, "model"), panel.curves[-1]
         fast = np.abs(model.x) > 0.1
-        expected = estimates[f"fv{j}"] * model.x + estimates[f"fc{j}"] * np.sign(model.x)
+        expected = estimates[f"fv{j}"] * model.x + estimates[f"fc{j}"] * np.sign(
+            model.x
+        )
         np.testing.assert_allclose(model.y[fast], expected[fast], rtol=1e-6)
         fast = np.abs(points.x) > 0.2 * model.x.max()
         own = np.interp(points.x[fast], model.x, model.y)
-        np.testing.assert_allclose(points.y[fast], own, atol=0.15 * np.abs(model.y).max())
+        np.testing.assert_allclose(
+            points.y[fast], own, atol=0.15 * np.abs(model.y).max()
+        )
         band = curve(panel, "95 % band")
         assert (band.low <= model.y).all()
         assert (band.high >= model.y).all()
@@ -266,7 +300,11 @@ def test_weight_is_the_slope_of_the_potential_energy(fit):
     ("name", "words", "place"),
     [
         ("C1", "moment of inertia about z", "body 1, moved by joint rail"),
-        ("my2", "mass times y of the centre of mass", "body 2, moved by joint swing_$1_$"),
+        (
+            "my2",
+            "mass times y of the centre of mass",
+            "body 2, moved by joint swing_$1_$",
+        ),
         ("D2", "product of inertia in y, z", "body 2, moved by joint swing_$1_$"),
         ("fo1", "constant offset: of the sensor, or of friction", "joint rail"),
         ("sm2_1", "ripple: sine, 2 times a turn of the motor", "joint rail"),
@@ -304,7 +342,9 @@ def test_autocorrelation_is_that_of_the_plain_formula(errors_of):
     for j in range(2):
         kept = np.where(counted[:, j], e[:, j] - e[counted[:, j], j].mean(), np.nan)
         products = [np.nanmean(kept[: 400 - k] * kept[k:]) for k in range(6)]
-        np.testing.assert_allclose(found[:, j], np.array(products) / products[0], atol=1e-12)
+        np.testing.assert_allclose(
+            found[:, j], np.array(products) / products[0], atol=1e-12
+        )
     assert abs(found[1] - 0.7).max() < 0.12
     figure = jid.plot.autocorrelation(errors, arm_of(2))
     drawn = curve(figure.panels[0], "residuals").y

@@ -91,7 +91,10 @@ def test_every_parameter_stands_there_with_the_numbers_of_the_result(written, fi
         for title, key in (("estimate", "estimate"), ("95 %\nto", "high_95")):
             shown_digits = cells[title].strip()
             step = 10.0 ** -len(shown_digits.partition(".")[2])
-            assert abs(float(shown_digits) - row[key]) <= 0.51 * step, (row["name"], title)
+            assert abs(float(shown_digits) - row[key]) <= 0.51 * step, (
+                row["name"],
+                title,
+            )
 
 
 def test_every_block_is_written_and_escaped(errors_of):
@@ -118,8 +121,14 @@ def test_every_block_is_written_and_escaped(errors_of):
     assert EVIL not in "".join(found.links)
 
 
-def test_texts_of_a_page_have_no_backticks_and_notebooks_show_the_same_tables(fit, changed):
-    found = read(render_page("a", [("b", ["look at `key`", [Remark("and `name`", detail="`x`")]])]))
+def test_texts_of_a_page_have_no_backticks_and_notebooks_show_the_same_tables(
+    fit, changed
+):
+    found = read(
+        render_page(
+            "a", [("b", ["look at `key`", [Remark("and `name`", detail="`x`")]])]
+        )
+    )
     assert "`" not in found.text
     assert "look at key" in found.text
     (table,) = Reader(fit._repr_html_()).tables
@@ -133,7 +142,8 @@ def test_the_verdict_follows_what_was_found(fit, validation):
     good = verdict(Report(fit, (first,), (second,), validation.definiteness))
     assert Status.BAD not in [remark.status for remark in good]
     assert good[0].status is max(
-        (r.status for r in good[1:] if r.status is not Status.NEUTRAL), key=list(Status).index
+        (r.status for r in good[1:] if r.status is not Status.NEUTRAL),
+        key=list(Status).index,
     )
     bad = dataclasses.replace(second, predicted=second.predicted + 20.0)
     found = verdict(Report(fit, (first,), (bad,), validation.definiteness))
@@ -158,10 +168,16 @@ def test_negative_friction_is_named(fit, validation):
         p[friction] = deviations * fit.standard_deviations[friction]
         sick = dataclasses.replace(fit, parameters=p.copy())
         texts = [
-            r.text for r in verdict(Report(sick, validation.errors, (), validation.definiteness))
+            r.text
+            for r in verdict(
+                Report(sick, validation.errors, (), validation.definiteness)
+            )
         ]
         assert (
-            any(f"comes out negative, as neither is: `{names[friction]}`" in t for t in texts)
+            any(
+                f"comes out negative, as neither is: `{names[friction]}`" in t
+                for t in texts
+            )
             == said
         )
 
@@ -174,7 +190,9 @@ def test_a_fit_that_misses_more_than_noise_is_doubted_and_then_rejected(
     fit, validation, share, departure, status
 ):
     first, second = validation.errors
-    spectra = eqx.tree_at(lambda s: s.departure, fit.residual_spectra, np.full(2, departure))
+    spectra = eqx.tree_at(
+        lambda s: s.departure, fit.residual_spectra, np.full(2, departure)
+    )
     wave = np.sin(np.asarray(first.time))[:, None] * first.force_rms
     missed = dataclasses.replace(first, predicted=first.predicted + 1.4 * share * wave)
     judged = dataclasses.replace(fit, residual_spectra=spectra)
@@ -192,7 +210,9 @@ def test_mistakes_come_first_and_decide(fit, validation):
 
 def test_a_weight_that_gravity_does_not_explain_is_pointed_out(fit):
     robot = fit.base.model.robot
-    base = SimpleNamespace(model=SimpleNamespace(robot=robot), names=("m1", "fo1", "fo2"))
+    base = SimpleNamespace(
+        model=SimpleNamespace(robot=robot), names=("m1", "fo1", "fo2")
+    )
     limits = np.asarray(robot.known_max_forces)
     for share, spread, count in ((0.1, 0.0, 0), (-0.8, 0.3, 0), (-0.8, 0.0, 1)):
         p = np.array([1e6, share * limits[0], 0.01 * limits[1]])
@@ -205,7 +225,8 @@ def test_a_weight_that_gravity_does_not_explain_is_pointed_out(fit):
 
 
 @pytest.mark.parametrize(
-    ("price", "status"), [(0.05, Status.GOOD), (0.5, Status.DOUBTFUL), (19.0, Status.BAD)]
+    ("price", "status"),
+    [(0.05, Status.GOOD), (0.5, Status.DOUBTFUL), (19.0, Status.BAD)],
 )
 def test_bounds_that_the_log_contradicts_are_not_good(consistent, price, status):
     costly = dataclasses.replace(consistent.consistency, residual_increase=price)

@@ -24,7 +24,9 @@ from jaxid.report.verdict import Report
 @pytest.fixture
 def quick(monkeypatch):
     """Figures and pages are tested elsewhere."""
-    monkeypatch.setattr(Figure, "save", lambda figure, path: path.write_bytes(b"figure"))
+    monkeypatch.setattr(
+        Figure, "save", lambda figure, path: path.write_bytes(b"figure")
+    )
     monkeypatch.setattr(result_files, "identification_page", lambda *_: "page")
 
 
@@ -43,7 +45,9 @@ def load(folder):
     def refuse(token):
         raise AssertionError(f"{token} is no JSON")
 
-    return json.loads((folder / "result.json").read_text("utf-8"), parse_constant=refuse)
+    return json.loads(
+        (folder / "result.json").read_text("utf-8"), parse_constant=refuse
+    )
 
 
 def names(folder):
@@ -51,7 +55,14 @@ def names(folder):
 
 
 def test_writes_all_files_with_their_parents(written):
-    figures = ("autocorrelation", "errors", "friction", "gravity", "parameters", "residuals")
+    figures = (
+        "autocorrelation",
+        "errors",
+        "friction",
+        "gravity",
+        "parameters",
+        "residuals",
+    )
     figures += ("robot",)
     figures += ("torque_first-run", "torque_second")
     expected = ["model.json", "parameters.csv", "report.html", "result.json"]
@@ -133,8 +144,12 @@ def test_a_new_report_takes_the_place_of_the_old_one(tmp_path, fit, validation, 
 def test_recordings_of_one_name_keep_their_figures_apart(
     tmp_path, fit, validation, quick, errors_of
 ):
-    same = tuple(dataclasses.replace(errors_of(2), name=name) for name in ("Run", "run", "run"))
-    report(tmp_path, fit, validation, "svg", identification=same[:1], verification=same[1:])
+    same = tuple(
+        dataclasses.replace(errors_of(2), name=name) for name in ("Run", "run", "run")
+    )
+    report(
+        tmp_path, fit, validation, "svg", identification=same[:1], verification=same[1:]
+    )
     figures = [n for n in names(tmp_path) if n.startswith("torque")]
     assert len({n.lower() for n in figures}) == 3
     assert "torque_run_verification.svg" in figures
@@ -142,10 +157,16 @@ def test_recordings_of_one_name_keep_their_figures_apart(
 
 def test_comparisons_hold_the_numbers_exactly(tmp_path, changed):
     files = write_comparison(tmp_path / "out", changed)
-    assert [p.name for p in files] == ["report.html", "comparison.json", "comparison.csv"]
+    assert [p.name for p in files] == [
+        "report.html",
+        "comparison.json",
+        "comparison.csv",
+    ]
     content = json.loads(files[1].read_text(encoding="utf-8"))
     assert content["schema"] == "jaxid-comparison/1"
-    assert [r["difference"] for r in content["parameters"]] == changed.difference.tolist()
+    assert [
+        r["difference"] for r in content["parameters"]
+    ] == changed.difference.tolist()
     assert content["groups"][1]["changed"] is True
     with files[2].open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))

@@ -12,7 +12,9 @@ def transform(rotation, offset):
 
 
 def about(axis, angle):
-    return transform(Rotation.from_rotvec(np.asarray(axis) * angle).as_matrix(), np.zeros(3))
+    return transform(
+        Rotation.from_rotvec(np.asarray(axis) * angle).as_matrix(), np.zeros(3)
+    )
 
 
 def along(axis, length):

@@ -70,7 +70,9 @@ def coal_capsule(coal, start, end, radius):
 
 def a_box():
     R = library.tx90l_on_rail().rotation[2]
-    turn = np.array([[np.cos(0.4), -np.sin(0.4), 0], [np.sin(0.4), np.cos(0.4), 0], [0, 0, 1]])
+    turn = np.array(
+        [[np.cos(0.4), -np.sin(0.4), 0], [np.sin(0.4), np.cos(0.4), 0], [0, 0, 1]]
+    )
     return Box("box", centre=(0.2, -0.1, 0.3), size=(0.6, 0.4, 0.8), rotation=turn @ R)
 
 
@@ -107,13 +109,18 @@ def test_ends_are_where_plain_numpy_puts_them():
     ends = np.asarray(model.ends(robot, q))
     for capsule, (start, end) in zip(model.capsules, ends, strict=True):
         T = poses[capsule.body] if capsule.body >= 0 else np.eye(4)
-        np.testing.assert_allclose(start, T[:3, :3] @ capsule.start + T[:3, 3], atol=1e-13)
+        np.testing.assert_allclose(
+            start, T[:3, :3] @ capsule.start + T[:3, 3], atol=1e-13
+        )
         np.testing.assert_allclose(end, T[:3, :3] @ capsule.end + T[:3, 3], atol=1e-13)
 
 
 def test_pairs_are_found_where_none_are_named():
     robot = library.planar_arm(3)
-    links = [Capsule(f"link {i}", i, start=(0, 0, 0), end=(1, 0, 0), radius=0.05) for i in range(3)]
+    links = [
+        Capsule(f"link {i}", i, start=(0, 0, 0), end=(1, 0, 0), radius=0.05)
+        for i in range(3)
+    ]
     hub = Capsule("hub", -1, start=(0, 0, 0), radius=0.1)
     floor = HalfSpace("floor", normal=(0, 1, 0), height=-9.0)
     names = CollisionModel(robot, [*links, hub], [floor]).pair_names
@@ -130,7 +137,10 @@ def test_pairs_are_found_where_none_are_named():
     [
         (segment_distance, segments(2)),
         (a_box().distance, segments(6)[:2] * 1.5),
-        (HalfSpace("wall", normal=(1.0, 2.0, 0.5), height=0.3).distance, segments(6)[:2] * 1.5),
+        (
+            HalfSpace("wall", normal=(1.0, 2.0, 0.5), height=0.3).distance,
+            segments(6)[:2] * 1.5,
+        ),
     ],
 )
 def test_derivatives_are_difference_quotients(distance, ends):

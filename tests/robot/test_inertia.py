@@ -25,7 +25,9 @@ def test_parameters_are_those_of_pinocchio(inertia):
     for k in range(5):
         oracle = pin.Inertia(inertia.mass[k], inertia.centre[k], inertia.tensor[k])
         expected = oracle.toDynamicParameters()
-        np.testing.assert_allclose(inertia.pinocchio[k], expected, rtol=1e-12, atol=1e-14)
+        np.testing.assert_allclose(
+            inertia.pinocchio[k], expected, rtol=1e-12, atol=1e-14
+        )
 
 
 @pytest.mark.parametrize("to", [np.asarray, jnp.asarray])

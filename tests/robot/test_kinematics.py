@@ -22,8 +22,14 @@ DOWN = np.diag([1.0, -1.0, -1.0])
 
 
 def within(robot, seed, count):
-    low, high = np.asarray(robot.limits.position_min), np.asarray(robot.limits.position_max)
-    low, high = np.where(np.isfinite(low), low, -np.pi), np.where(np.isfinite(high), high, np.pi)
+    low, high = (
+        np.asarray(robot.limits.position_min),
+        np.asarray(robot.limits.position_max),
+    )
+    low, high = (
+        np.where(np.isfinite(low), low, -np.pi),
+        np.where(np.isfinite(high), high, np.pi),
+    )
     return np.random.default_rng(seed).uniform(low, high, (count, robot.joints))
 
 
@@ -57,7 +63,9 @@ def test_the_tip_can_be_differentiated_by_coordinates_and_lengths():
         return tip_placement(arm.replace(offset=offset), q)[1][:2]
 
     q = jnp.array([0.3, 0.4])
-    by_offset, by_q = jax.jit(jax.jacfwd(tip, argnums=(0, 1)))(jnp.asarray(arm.offset), q)
+    by_offset, by_q = jax.jit(jax.jacfwd(tip, argnums=(0, 1)))(
+        jnp.asarray(arm.offset), q
+    )
     assert by_offset[1, 1, 0] == pytest.approx(np.sin(0.3), abs=1e-14)
     np.testing.assert_allclose(by_q[:, 1], [-np.sin(0.7), np.cos(0.7)], atol=1e-14)
 
@@ -74,13 +82,19 @@ def test_the_jacobian_and_curvature_are_difference_quotients():
         return now[:3, 3] - r[0], turned
 
     def work(steps):
-        return sum(x[0] @ y for x, y in zip((force, moment), shifted(steps), strict=True))
+        return sum(
+            x[0] @ y for x, y in zip((force, moment), shifted(steps), strict=True)
+        )
 
     curvature = tip_curvature(shift, turn, force, moment)[0]
     for i, a in enumerate(h * np.eye(7)):
         ahead, behind = shifted(a), shifted(-a)
-        np.testing.assert_allclose((ahead[0] - behind[0]) / (2 * h), shift[0, i], atol=1e-9)
-        np.testing.assert_allclose((ahead[1] - behind[1]) / (2 * h), turn[0, i], atol=1e-9)
+        np.testing.assert_allclose(
+            (ahead[0] - behind[0]) / (2 * h), shift[0, i], atol=1e-9
+        )
+        np.testing.assert_allclose(
+            (ahead[1] - behind[1]) / (2 * h), turn[0, i], atol=1e-9
+        )
         for k in range(7):
             a, b = 10 * h * np.eye(7)[i], 10 * h * np.eye(7)[k]
             mixed = work(a + b) - work(a - b) - work(b - a) + work(-a - b)
@@ -89,7 +103,9 @@ def test_the_jacobian_and_curvature_are_difference_quotients():
 
 def test_a_closed_path_of_the_tip_is_a_closed_path_of_the_joints():
     angle = np.linspace(0.0, 2 * np.pi, 200)
-    circle = np.stack([0.3 * np.cos(angle), 0.7 + 0 * angle, 0.6 + 0.2 * np.sin(angle)], axis=1)
+    circle = np.stack(
+        [0.3 * np.cos(angle), 0.7 + 0 * angle, 0.6 + 0.2 * np.sin(angle)], axis=1
+    )
     q = inverse_kinematics_along(RAIL, circle, DOWN)
     np.testing.assert_allclose(q[0], q[-1], atol=1e-9)
     assert np.abs(np.diff(q, axis=0)).max() < 0.1
@@ -111,7 +127,9 @@ def test_of_all_coordinates_they_are_the_nearest_to_the_posture():
 
 
 def test_says_where_a_path_cannot_be_followed():
-    with pytest.raises(ValueError, match=r"pose 1 of 1, .* comes to within .* m and .* rad"):
+    with pytest.raises(
+        ValueError, match=r"pose 1 of 1, .* comes to within .* m and .* rad"
+    ):
         inverse_kinematics_along(library.ur10(), np.array([[1.9, 0.0, 0.3]]), np.eye(3))
     line = np.linspace([1.5, 0.5, 0.0], [3.5, 0.5, 0.0], 6)
     with pytest.raises(ValueError, match=r"pose 5 of 6, .* comes to within"):

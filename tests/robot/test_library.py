@@ -15,11 +15,18 @@ from forward_kinematics import (
 
 from jaxid.dynamics.base import base_parameters
 from jaxid.dynamics.model import Model
-from jaxid.dynamics.terms import CoulombFriction, RigidBodies, RotorInertia, ViscousFriction
+from jaxid.dynamics.terms import (
+    CoulombFriction,
+    RigidBodies,
+    RotorInertia,
+    ViscousFriction,
+)
 from jaxid.robot import library
 from jaxid.robot.urdf import load_urdf
 
-SHARE = "cmeel.prefix/share/example-robot-data/robots/ur_description/urdf/ur10_robot.urdf"
+SHARE = (
+    "cmeel.prefix/share/example-robot-data/robots/ur_description/urdf/ur10_robot.urdf"
+)
 RAIL = library.tx90l_on_rail()
 
 
@@ -47,7 +54,12 @@ def test_rail_robot_is_the_published_chain_on_a_rail(facts):
 
 def test_rail_robot_has_the_papers_base_parameters():
     """44 of 70, and the regrouping of Eq. 24: a test of the frames, which decide its form."""
-    terms = (RigidBodies(principal_axes=True), ViscousFriction(), CoulombFriction(), RotorInertia())
+    terms = (
+        RigidBodies(principal_axes=True),
+        ViscousFriction(),
+        CoulombFriction(),
+        RotorInertia(),
+    )
     base = base_parameters(Model(RAIL, terms))
     names = base.model.parameter_names
     assert len(names) == 70
@@ -57,7 +69,9 @@ def test_rail_robot_has_the_papers_base_parameters():
         for row in base.kappa[:2]
     ]
     assert base.names[:2] == ("m1", "mx2")
-    assert regrouped[0] == pytest.approx({"m2": 1.0, "m3": 1.0, "mz4": -20.0, "Ia1": 1.0})
+    assert regrouped[0] == pytest.approx(
+        {"m2": 1.0, "m3": 1.0, "mz4": -20.0, "Ia1": 1.0}
+    )
     assert regrouped[1] == pytest.approx({"m3": 0.05, "mz4": -1.0})
 
 
@@ -65,7 +79,9 @@ def test_rail_robot_has_the_papers_base_parameters():
 def test_arms_from_tables_are_their_tables(facts, name):
     robot = getattr(library, name)()
     q = random_configuration(robot, 0)
-    expected = dh_frames(facts[name]["rows"], q, facts[name]["convention"].split()[0])[-1]
+    expected = dh_frames(facts[name]["rows"], q, facts[name]["convention"].split()[0])[
+        -1
+    ]
     expected[:3, 3] += facts[name].get("flange_d", 0.0) * expected[:3, 2]
     np.testing.assert_allclose(tip_transform(robot, q), expected, atol=1e-13)
 
@@ -107,7 +123,9 @@ def test_kr300_takes_the_recorded_angles_as_they_are(facts):
     robot = library.kr300()
     q = random_configuration(robot, 0)
     model_q = q + np.deg2rad([0.0, -90.0, 90.0, 0.0, 0.0, 0.0])
-    frames = about([1.0, 0.0, 0.0], np.pi) @ dh_frames(facts["kr300"]["rows"], model_q, "standard")
+    frames = about([1.0, 0.0, 0.0], np.pi) @ dh_frames(
+        facts["kr300"]["rows"], model_q, "standard"
+    )
     np.testing.assert_allclose(tip_transform(robot, q), frames[-1], atol=1e-13)
     assert np.diag(robot.drives.reduction).tolist() == facts["kr300"]["gear"]
     assert not robot.drives.zero.any()
@@ -115,11 +133,16 @@ def test_kr300_takes_the_recorded_angles_as_they_are(facts):
 
 def test_tx40_and_its_drives_are_those_of_the_data(shared_data, facts):
     robot, known = library.tx40(), facts["tx40"]
-    urdf = load_urdf(shared_data / "tx40" / "tx40_mdh_modified.urdf", tip="link_6").snapped()
+    urdf = load_urdf(
+        shared_data / "tx40" / "tx40_mdh_modified.urdf", tip="link_6"
+    ).snapped()
     q = random_configuration(robot, 0)
-    np.testing.assert_allclose(body_transforms(robot, q), body_transforms(urdf, q), atol=1e-13)
+    np.testing.assert_allclose(
+        body_transforms(robot, q), body_transforms(urdf, q), atol=1e-13
+    )
     assert robot.limits.force.tolist() == urdf.limits.force.tolist()
-    # The manufacturer's angles with the table's theta give the same arm as the drives' angles.
+    # The manufacturer's angles with the table's theta give the same arm as the drives'
+    # angles.
     A = np.diag(np.array(known["gear"], dtype=float))
     A[5, 4] = 32.0
     file = shared_data / "tx40" / "motor_position.csv"

@@ -61,7 +61,9 @@ def mujoco_forces(path, names, motion, held=None):
     """Forces of MuJoCo at named joints without friction, rotors and constraints."""
     model = mujoco.MjModel.from_xml_path(str(path))
     off = mujoco.mjtDisableBit
-    model.opt.disableflags |= off.mjDSBL_CONSTRAINT | off.mjDSBL_DAMPER | off.mjDSBL_SPRING
+    model.opt.disableflags |= (
+        off.mjDSBL_CONSTRAINT | off.mjDSBL_DAMPER | off.mjDSBL_SPRING
+    )
     model.dof_armature[:] = 0.0
     data, forces = mujoco.MjData(model), []
     for name, value in (held or {}).items():
@@ -94,8 +96,12 @@ def test_forces_limits_and_gravity_are_those_of_mujoco(write):
     # The left finger is held at 0.01 m: 0.1 + 2 x 0.01 + 30 x 0.01^2.
     assert_same_forces(path, robot, random_motion(4), {"right": 0.123})
     limits = robot.limits
-    np.testing.assert_allclose(limits.position_min, [*np.deg2rad([-100]), -np.inf, -0.3, 0.01])
-    np.testing.assert_allclose(limits.position_max, [*np.deg2rad([160]), np.inf, 0.4, 0.05])
+    np.testing.assert_allclose(
+        limits.position_min, [*np.deg2rad([-100]), -np.inf, -0.3, 0.01]
+    )
+    np.testing.assert_allclose(
+        limits.position_max, [*np.deg2rad([160]), np.inf, 0.4, 0.05]
+    )
     assert limits.force.tolist() == [150.0, np.inf, 70.0, np.inf]
     held, loose = robot.notes[:2]
     assert "`right`: held at 0.123 (mimic of joint `left`)" in held
@@ -129,8 +135,12 @@ def test_switched_off_gravity_is_none(write):
 
 
 def test_a_free_robot_is_held_at_its_base(write):
-    free = ARM.replace('<body name="table" pos="0 0 0.4" euler="10 20 30">', "<body name='table'>")
-    free = free.replace("<body name='table'>", "<body name='table'><freejoint name='root'/>")
+    free = ARM.replace(
+        '<body name="table" pos="0 0 0.4" euler="10 20 30">', "<body name='table'>"
+    )
+    free = free.replace(
+        "<body name='table'>", "<body name='table'><freejoint name='root'/>"
+    )
     path = write(free)
     with pytest.raises(InputError, match=r"joint `root` is floating.*`--base table`"):
         jid.load_mjcf(path)
@@ -140,9 +150,15 @@ def test_a_free_robot_is_held_at_its_base(write):
 
 
 REFUSED = {
-    "a ball joint": (ARM.replace('name="lift"', 'name="lift" type="ball"'), "joint `lift` is ball"),
+    "a ball joint": (
+        ARM.replace('name="lift"', 'name="lift" type="ball"'),
+        "joint `lift` is ball",
+    ),
     "a loop": (
-        ARM.replace("<equality>", '<equality><connect body1="ram" body2="table" anchor="0 0 0"/>'),
+        ARM.replace(
+            "<equality>",
+            '<equality><connect body1="ram" body2="table" anchor="0 0 0"/>',
+        ),
         "`equality0` between `ram` and `table` closes a loop",
     ),
     "a mesh that is missing": (

@@ -1,5 +1,10 @@
 import numpy as np
-from forward_kinematics import body_transforms, from_rpy, random_configuration, tip_transform
+from forward_kinematics import (
+    body_transforms,
+    from_rpy,
+    random_configuration,
+    tip_transform,
+)
 from hypothesis import given, settings, strategies as st
 
 from jaxid.robot.library import panda
@@ -32,11 +37,15 @@ def test_mounting_moves_every_body_by_the_same_placement(seed):
 def test_a_tool_at_the_end_effector_weighs_where_the_end_effector_is():
     R = from_rpy([0.4, -0.3, 0.9], [0, 0, 0])[:3, :3]
     robot = panda().replace(tip_rotation=R)
-    carried = robot.with_tool(mass=2.0, centre_of_mass=(0.01, 0.02, 0.05), inertia=INERTIA)
+    carried = robot.with_tool(
+        mass=2.0, centre_of_mass=(0.01, 0.02, 0.05), inertia=INERTIA
+    )
     q = random_configuration(robot, 3)
     on_ground = tip_transform(robot, q) @ [0.01, 0.02, 0.05, 1.0]
     body = body_transforms(robot, q)[carried.tool.body]
-    np.testing.assert_allclose(body @ [*carried.tool.centre_of_mass, 1.0], on_ground, atol=1e-14)
+    np.testing.assert_allclose(
+        body @ [*carried.tool.centre_of_mass, 1.0], on_ground, atol=1e-14
+    )
     kept = body[:3, :3] @ carried.tool.inertia @ body[:3, :3].T
     tip = tip_transform(robot, q)[:3, :3]
     np.testing.assert_allclose(kept, tip @ INERTIA @ tip.T, atol=1e-15)

@@ -14,7 +14,12 @@ from jaxid.robot.limits_and_drives import Drives, Limits
 from jaxid.robot.robot import Robot, Tool
 from jaxid.robot.urdf import load_urdf, urdf_parameters
 
-ARM = {"revolute": (True,), "axis": [(0, 0, 1)], "rotation": [np.eye(3)], "offset": [(0, 0, 0)]}
+ARM = {
+    "revolute": (True,),
+    "axis": [(0, 0, 1)],
+    "rotation": [np.eye(3)],
+    "offset": [(0, 0, 0)],
+}
 LOAD = {"mass": 1.0, "centre_of_mass": (0.0, 0.0, 0.1)}
 ROD = {"start": (0, 0, 0), "end": (1, 0, 0), "radius": 0.1}
 STANDARD = {"convention": "standard"}
@@ -37,7 +42,10 @@ CALLS = [
     (lambda: Robot("arm", **ARM, tool=Tool(2, **LOAD)), "`tool.body`"),
     (lambda: Robot("arm", **ARM, tip_rotation=2 * np.eye(3)), "`tip_rotation`"),
     (lambda: Robot("arm", **{**ARM, "axis": [(0, 0, 0)]}), "`axis` of joint 1"),
-    (lambda: Robot("arm", **{**ARM, "offset": [(0, 0, 1e4)]}), "`offset` of joint `joint1`"),
+    (
+        lambda: Robot("arm", **{**ARM, "offset": [(0, 0, 1e4)]}),
+        "`offset` of joint `joint1`",
+    ),
     (lambda: planar_arm(3).replace(parent=(-1, 1, 0)), "`parent`"),
     (lambda: planar_arm(3).replace(joint_names=("a", "b")), "`joint_names`"),
     (lambda: planar_arm(3).replace(limits=Limits(2)), "`limits`"),
@@ -46,25 +54,54 @@ CALLS = [
     (lambda: planar_arm().max_forces, "`limits.force`"),
     (lambda: planar_arm(0), "`joints`"),
     (lambda: Tool(0, **{**LOAD, "mass": 0.0}), "`mass`"),
-    (lambda: Tool(0, **{**LOAD, "centre_of_mass": (0.0, 0.0, 3e3)}), "`centre_of_mass`"),
-    (lambda: Tool(0, **LOAD, inertia=np.triu(np.ones((3, 3)))), "`inertia` is not symmetric"),
+    (
+        lambda: Tool(0, **{**LOAD, "centre_of_mass": (0.0, 0.0, 3e3)}),
+        "`centre_of_mass`",
+    ),
+    (
+        lambda: Tool(0, **LOAD, inertia=np.triu(np.ones((3, 3)))),
+        "`inertia` is not symmetric",
+    ),
     (lambda: Tool(0, **LOAD, inertia=np.diag([1.0, 1.0, 2.1])), "`inertia`.*principal"),
     (lambda: Capsule("a", 0, start=(0, 0), radius=0.1), "`start`"),
     (lambda: Capsule("a", 0, start=(0, 0, 0), radius=0.0), "`radius`"),
     (lambda: Box("b", centre=(0, 0, 0), size=(1, 0, 1)), "`size`"),
-    (lambda: Box("b", centre=(0, 0, 0), size=(1, 1, 1), rotation=np.ones((3, 3))), "`rotation`"),
+    (
+        lambda: Box("b", centre=(0, 0, 0), size=(1, 1, 1), rotation=np.ones((3, 3))),
+        "`rotation`",
+    ),
     (lambda: HalfSpace("h", normal=(0, 0, 0)), "`normal`"),
-    (lambda: CollisionModel(panda(), [Capsule("a", 7, **ROD)]), "`body` of capsule `a`"),
-    (lambda: CollisionModel(panda(), [Capsule("a", 0, **ROD)] * 2), "two shapes are named `a`"),
+    (
+        lambda: CollisionModel(panda(), [Capsule("a", 7, **ROD)]),
+        "`body` of capsule `a`",
+    ),
+    (
+        lambda: CollisionModel(panda(), [Capsule("a", 0, **ROD)] * 2),
+        "two shapes are named `a`",
+    ),
     (lambda: CollisionModel(panda(), [Capsule("a", 0, **ROD)]), "at least one pair"),
-    (lambda: CollisionModel(panda(), [Capsule("a", 0, **ROD)], pairs=[("a", "c")]), "`c`"),
-    (lambda: CollisionModel(panda(), [], [HalfSpace("f"), HalfSpace("g")], [("f", "g")]), "`f`"),
+    (
+        lambda: CollisionModel(panda(), [Capsule("a", 0, **ROD)], pairs=[("a", "c")]),
+        "`c`",
+    ),
+    (
+        lambda: CollisionModel(
+            panda(), [], [HalfSpace("f"), HalfSpace("g")], [("f", "g")]
+        ),
+        "`f`",
+    ),
     (lambda: from_dh(np.zeros((2, 4)), convention="craig"), "`convention`"),
     (lambda: from_dh([(0.0, 1.0)], **STANDARD), "`rows`"),
     (lambda: from_dh(np.zeros((2, 4)), **STANDARD, revolute=(True,)), "`axis`"),
     (lambda: from_dh(np.zeros((2, 4)), **STANDARD).snapped(1.0), "`snap_tolerance`"),
-    (lambda: inverse_kinematics_along(panda(), np.ones((1, 3)), 2 * np.eye(3)), "rotation"),
-    (lambda: inverse_kinematics_along(panda(), np.ones((1, 3)), np.eye(3), [0.0]), "`posture`"),
+    (
+        lambda: inverse_kinematics_along(panda(), np.ones((1, 3)), 2 * np.eye(3)),
+        "rotation",
+    ),
+    (
+        lambda: inverse_kinematics_along(panda(), np.ones((1, 3)), np.eye(3), [0.0]),
+        "`posture`",
+    ),
 ]
 
 
@@ -85,7 +122,10 @@ FILES = {
         "joint `root` is floating.*`--tip`.*`--base base`",
     ),
     "a planar joint": (arm(kind="planar"), "joint `j1` is planar.*`--tip`"),
-    "two parents": (two(link("b"), joint("j2", "base", "b"), joint("j3", "a", "b")), "`j3` moves"),
+    "two parents": (
+        two(link("b"), joint("j2", "base", "b"), joint("j3", "a", "b")),
+        "`j3` moves",
+    ),
     "a loop without root": (
         robot(link("a"), link("b"), joint("j1", "a", "b"), joint("j2", "b", "a")),
         "joint `j2` is part of a closed loop",
@@ -95,28 +135,47 @@ FILES = {
         "joint `j3` is part of a closed loop",
     ),
     "several roots": (two(link("lost")), "one root link, but has `base`, `lost`"),
-    "a missing link": (two(joint("j2", "a", "nowhere")), "joint `j2` connects link `nowhere`"),
+    "a missing link": (
+        two(joint("j2", "a", "nowhere")),
+        "joint `j2` connects link `nowhere`",
+    ),
     "a zero axis": (arm(axis="0 0 0"), "joint `j1` has the zero vector"),
     "words for numbers": (arm(xyz="0 zero 0"), 'line 5: `xyz` .*"0 zero 0"'),
-    "a limit that is none": (arm(inner='<limit lower="nan" upper="1"/>'), "line 5: `lower`"),
-    "a range upside down": (arm(inner='<limit lower="1" upper="-1"/>'), "`j1` ranges from 1 to -1"),
-    "a range in degrees": (arm(inner='<limit lower="-170" upper="170"/>'), "`j1` .*not degrees"),
+    "a limit that is none": (
+        arm(inner='<limit lower="nan" upper="1"/>'),
+        "line 5: `lower`",
+    ),
+    "a range upside down": (
+        arm(inner='<limit lower="1" upper="-1"/>'),
+        "`j1` ranges from 1 to -1",
+    ),
+    "a range in degrees": (
+        arm(inner='<limit lower="-170" upper="170"/>'),
+        "`j1` .*not degrees",
+    ),
     "a rail in millimetres": (
         arm(kind="prismatic", inner='<limit lower="0" upper="1500"/>'),
         "joint `j1` ranges to 1500 m, .* in metres",
     ),
-    "an attitude in degrees": (arm(rpy="90 0 0"), "joint `j1` has an `rpy` of 90 0 0: .*degrees"),
+    "an attitude in degrees": (
+        arm(rpy="90 0 0"),
+        "joint `j1` has an `rpy` of 90 0 0: .*degrees",
+    ),
     "a place far away": (arm(xyz="0 0 1e300"), "`offset` of joint `j1` .* metres"),
     "nothing that moves": (arm(kind="fixed"), "no moving joint below link `base`"),
     "no links": (robot(), "one root link, but has none"),
-    "no child": (arm().replace('<child link="a"/>', ""), "line 5: the joint has no `<child>`"),
+    "no child": (
+        arm().replace('<child link="a"/>', ""),
+        "line 5: the joint has no `<child>`",
+    ),
     "two links of one name": (two(link("a")), "two links named `a`"),
     "a control character": (arm().replace('name="j1"', 'name="j&#9;1"'), "printable"),
     "broken XML": (arm().replace("</joint>", ""), "line 6: this is not XML"),
     "another language": ("<sdf><model/></sdf>", "its root is `<sdf>`"),
     "a xacro file": (
         arm().replace(
-            "<joint", '<xacro:arm xmlns:xacro="http://www.ros.org/wiki/xacro" n="1"/><joint'
+            "<joint",
+            '<xacro:arm xmlns:xacro="http://www.ros.org/wiki/xacro" n="1"/><joint',
         ),
         "xacro file: expand it",
     ),
@@ -145,7 +204,10 @@ def test_joints_that_the_chain_avoids_do_no_harm(tmp_path):
     ("options", "sentence"),
     [
         ({"tip": "hand"}, "`tip` must be a link of .* its links are `base`, `a`"),
-        ({"base": "a", "tip": "base"}, "no chain leads from `base` `a` to `tip` `base`"),
+        (
+            {"base": "a", "tip": "base"},
+            "no chain leads from `base` `a` to `tip` `base`",
+        ),
         ({"tip": "base"}, "no moving joint between links `base` and `base`"),
         ({"base_rotation": [[2, 0, 0], [0, 1, 0], [0, 0, 1]]}, "`rotation`"),
         ({"gravity": (0.0, 9.81)}, "`gravity`"),
@@ -163,11 +225,35 @@ def test_options_that_do_not_fit_the_file(tmp_path, options, sentence):
 ROUND = (1e-2, 0, 0, 1e-2, 0, 1e-2)
 IMPOSSIBLE = {
     "a negative mass": (-5.0, (0, 0, 0), (0, 0, 0), ROUND, "`mass` is -5 kg"),
-    "a negative moment": (1.0, (0, 0, 0), (0, 0, 0), (-1, 0, 0, 1, 0, 1), "moments -1, 1, 1"),
-    "a flat triangle": (1.0, (0, 0, 0), (0, 0, 0), (1, 0, 0, 1, 0, 3), "larger than the sum"),
+    "a negative moment": (
+        1.0,
+        (0, 0, 0),
+        (0, 0, 0),
+        (-1, 0, 0, 1, 0, 1),
+        "moments -1, 1, 1",
+    ),
+    "a flat triangle": (
+        1.0,
+        (0, 0, 0),
+        (0, 0, 0),
+        (1, 0, 0, 1, 0, 3),
+        "larger than the sum",
+    ),
     "millimetres": (1.0, (0, 0, 0), (0, 0, 0), (1e4, 0, 0, 1e4, 0, 1e4), "kg mm²"),
-    "a centre far away": (1.0, (0, 3e3, 0), (0, 0, 0), ROUND, "`centre_of_mass` is 3000 m"),
-    "degrees": (1.0, (0, 0, 0), (0, 90, 0), ROUND, "`rpy` is 0 90 0, which are degrees"),
+    "a centre far away": (
+        1.0,
+        (0, 3e3, 0),
+        (0, 0, 0),
+        ROUND,
+        "`centre_of_mass` is 3000 m",
+    ),
+    "degrees": (
+        1.0,
+        (0, 0, 0),
+        (0, 90, 0),
+        ROUND,
+        "`rpy` is 0 90 0, which are degrees",
+    ),
 }
 
 
@@ -175,7 +261,9 @@ IMPOSSIBLE = {
 def test_inertials_that_cannot_exist_are_noted_and_not_used(tmp_path, case):
     *claimed, sentence = case
     path = tmp_path / "arm.urdf"
-    path.write_text(robot(link("base"), link("a", inertial(*claimed)), joint("j1", "base", "a")))
+    path.write_text(
+        robot(link("base"), link("a", inertial(*claimed)), joint("j1", "base", "a"))
+    )
     with pytest.raises(InputError, match=f"link `a` .*{sentence}"):
         urdf_parameters(path)
     (note,) = load_urdf(path).notes
@@ -193,7 +281,11 @@ def test_inertials_that_cannot_exist_are_noted_and_not_used(tmp_path, case):
 )
 def test_geometry_that_cannot_be_read(tmp_path, geometry, message):
     path = tmp_path / "arm.urdf"
-    text = "" if geometry is None else f"<collision><geometry>{geometry}</geometry></collision>"
+    text = (
+        ""
+        if geometry is None
+        else f"<collision><geometry>{geometry}</geometry></collision>"
+    )
     path.write_text(robot(link("base"), link("a", text), joint("j1", "base", "a")))
     with pytest.raises(InputError, match=message):
         fit_capsules(path)
@@ -204,7 +296,10 @@ def test_geometry_that_cannot_be_read(tmp_path, geometry, message):
     [
         ({"inner": '<limit velocity="180"/>'}, "180 rad/s .* in degrees"),
         ({"xyz": "0 0 300"}, "`offset` of joint `j1` is 300 m: .* millimetres"),
-        ({"kind": "prismatic", "inner": '<limit lower="0" upper="500"/>'}, "`j1`.* 500 m"),
+        (
+            {"kind": "prismatic", "inner": '<limit lower="0" upper="500"/>'},
+            "`j1`.* 500 m",
+        ),
     ],
 )
 def test_suspicious_units_are_noted(tmp_path, options, note):

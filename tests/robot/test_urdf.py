@@ -35,7 +35,11 @@ TREES = {
 }
 CHAINS = {
     "panda": ("panda_description/urdf/panda.urdf", None, "panda_hand"),
-    "baxter": ("baxter_description/urdf/baxter.urdf", "torso", "left_gripper_base_link"),
+    "baxter": (
+        "baxter_description/urdf/baxter.urdf",
+        "torso",
+        "left_gripper_base_link",
+    ),
     "ur5": ("ur_description/urdf/ur5_robot.urdf", None, "tool0"),
 }
 
@@ -100,7 +104,9 @@ def test_real_chains_agree_with_pinocchio(file, base, tip):
     ground = np.eye(4) if base is None else np.linalg.inv(oracle.frame(base))
     expected = ground @ np.array([oracle.joint(name) for name in ours.joint_names])
     np.testing.assert_allclose(body_transforms(ours, q), expected, atol=1e-10)
-    np.testing.assert_allclose(tip_transform(ours, q), ground @ oracle.frame(tip), atol=1e-10)
+    np.testing.assert_allclose(
+        tip_transform(ours, q), ground @ oracle.frame(tip), atol=1e-10
+    )
 
 
 def test_panda_of_the_library_is_the_panda_of_the_file():
@@ -108,14 +114,17 @@ def test_panda_of_the_library_is_the_panda_of_the_file():
 
     urdf = load_urdf(FOLDER / CHAINS["panda"][0], tip="panda_link8")
     q = random_configuration(urdf, 2)
-    np.testing.assert_allclose(tip_transform(panda(), q), tip_transform(urdf, q), atol=1e-12)
+    np.testing.assert_allclose(
+        tip_transform(panda(), q), tip_transform(urdf, q), atol=1e-12
+    )
 
 
 # Snapping.
 
 
 def test_a_rounded_quarter_turn_costs_no_base_parameter(write):
-    # Two vertical axes, but only as vertical and parallel as the angle is a quarter turn.
+    # Two vertical axes, but only as vertical and parallel as the angle is a quarter
+    # turn.
     def arm_of(angle):
         return robot(
             *(link(name) for name in ("base", "wall", "a", "b")),
@@ -132,7 +141,11 @@ def test_a_rounded_quarter_turn_costs_no_base_parameter(write):
     assert base(rounded).size == base(exact).size == base(rounded.snapped()).size == 4
     assert base(rounded).expressions == base(exact).expressions
     # Forces keep the geometry of the file.
-    assert 1e-6 < np.abs(np.asarray(rounded.rotation) - np.asarray(exact.rotation)).max() < 1e-5
+    assert (
+        1e-6
+        < np.abs(np.asarray(rounded.rotation) - np.asarray(exact.rotation)).max()
+        < 1e-5
+    )
     np.testing.assert_array_equal(rounded.snapped().rotation, exact.rotation)
     assert rounded.notes == exact.notes
 
@@ -182,7 +195,18 @@ def test_parameters_of_a_chain_hold_what_is_fixed_to_it_and_no_more(write):
         joint("to_finger", "a", "finger", "prismatic"),
     )
     p = urdf_parameters(write(text), tip="a")
-    assert p.tolist() == [4.0, 0.0, 6.0, 0.0, 2.0 + 18.0, 2.0, 2.0 + 18.0, 0.0, 0.0, 0.0]
+    assert p.tolist() == [
+        4.0,
+        0.0,
+        6.0,
+        0.0,
+        2.0 + 18.0,
+        2.0,
+        2.0 + 18.0,
+        0.0,
+        0.0,
+        0.0,
+    ]
 
 
 def test_a_body_without_mass_is_noted_and_counts_as_massless(write):
@@ -202,11 +226,17 @@ def test_a_body_without_mass_is_noted_and_counts_as_massless(write):
         ("revolute", 'lower="-1e16" upper="1e16"', (-np.inf, np.inf, np.inf, np.inf)),
         ("revolute", 'effort="9"', (-np.inf, np.inf, np.inf, 9)),
         ("continuous", 'lower="-1" upper="1" effort="9"', (-np.inf, np.inf, np.inf, 9)),
-        ("revolute", 'lower="0" upper="0" velocity="0" effort="-1"', (-np.inf, *(np.inf,) * 3)),
+        (
+            "revolute",
+            'lower="0" upper="0" velocity="0" effort="-1"',
+            (-np.inf, *(np.inf,) * 3),
+        ),
     ],
 )
 def test_limits(write, kind, limit, expected):
-    limits = load_urdf(write(arm(kind=kind, inner=f"<limit {limit}/>" if limit else ""))).limits
+    limits = load_urdf(
+        write(arm(kind=kind, inner=f"<limit {limit}/>" if limit else ""))
+    ).limits
     read = (limits.position_min, limits.position_max, limits.velocity, limits.force)
     assert [values.item() for values in read] == list(expected)
 
@@ -222,8 +252,12 @@ def test_defaults_of_name_and_axis(write):
 
 HAND = robot(
     *map(link, ("base", "palm")),
-    link("left", inertial(0.2, (0.0, 0.01, 0.02), (0, 0, 0), (1e-4, 0, 0, 1e-4, 0, 1e-4))),
-    link("right", inertial(0.3, (0.1, 0.0, 0.02), (0, 0, 0), (2e-4, 0, 0, 2e-4, 0, 2e-4))),
+    link(
+        "left", inertial(0.2, (0.0, 0.01, 0.02), (0, 0, 0), (1e-4, 0, 0, 1e-4, 0, 1e-4))
+    ),
+    link(
+        "right", inertial(0.3, (0.1, 0.0, 0.02), (0, 0, 0), (2e-4, 0, 0, 2e-4, 0, 2e-4))
+    ),
     joint("wrist", "base", "palm", "continuous"),
     joint(
         "left",
@@ -257,7 +291,9 @@ def test_a_mimic_joint_is_held_where_its_joint_puts_it(write):
     parameters = urdf_parameters(path).reshape(-1, 10)
     for name, p in zip(ours.joint_names, parameters, strict=True):
         expected = reduced.inertias[reduced.getJointId(name)].toDynamicParameters()
-        np.testing.assert_allclose(Inertia.from_parameters(p).pinocchio, expected, atol=1e-14)
+        np.testing.assert_allclose(
+            Inertia.from_parameters(p).pinocchio, expected, atol=1e-14
+        )
 
 
 def test_a_mimic_of_nothing_is_held_at_its_offset(write):
@@ -315,22 +351,28 @@ def test_an_effort_that_holds_the_arm_is_no_nonsense(write):
     body = inertial(2.0, (0.5, 0, 0), (0, 0, 0), (0.1, 0, 0, 0.1, 0, 0.1))
     limit = '<limit lower="-2" upper="2" velocity="3" effort="9"/>'
     path = write(
-        robot(link("base"), link("a", body), joint("j1", "base", "a", axis="0 1 0", inner=limit))
+        robot(
+            link("base"),
+            link("a", body),
+            joint("j1", "base", "a", axis="0 1 0", inner=limit),
+        )
     )
     assert load_urdf(path).notes == ()
     hung = load_urdf(path, gravity=(0.0, 0.0, -9.81 * 5))
     assert "`j1`: an effort of 9 N m is far below the 49 N m" in hung.notes[0]
 
 
-XACRO = HAND.replace("<robot", '<robot xmlns:xacro="http://www.ros.org/wiki/xacro"').replace(
-    "</robot>", '<xacro:property name="x" value="1"/></robot>'
-)
+XACRO = HAND.replace(
+    "<robot", '<robot xmlns:xacro="http://www.ros.org/wiki/xacro"'
+).replace("</robot>", '<xacro:property name="x" value="1"/></robot>')
 
 
 def test_a_xacro_file_is_expanded_by_the_program(write, tmp_path, monkeypatch):
     path = write(XACRO, "arm.urdf.xacro")
     monkeypatch.setenv("PATH", str(tmp_path / "bin"))
-    with pytest.raises(InputError, match=r"`xacro .*arm.urdf.xacro -o arm.urdf`.*pip install"):
+    with pytest.raises(
+        InputError, match=r"`xacro .*arm.urdf.xacro -o arm.urdf`.*pip install"
+    ):
         load_urdf(path)
     (tmp_path / "bin").mkdir()
     program = tmp_path / "bin" / "xacro"

@@ -88,13 +88,19 @@ def test_capsules_hold_the_geometry_on_its_bodies(tmp_path):
     assert names == ["base", "upper", "upper 2", "plate", "tool"]
     assert [c.body for c in capsules] == [-1, 0, 0, 0, 1]
     ground, upper, ball, plate, tool = capsules
-    np.testing.assert_allclose([ground.start, ground.end], [[0, 0, 0.8], [0, 0, 1.2]], atol=1e-12)
-    np.testing.assert_allclose(sorted([upper.start[0], upper.end[0]]), [0.0, 0.6], atol=1e-12)
+    np.testing.assert_allclose(
+        [ground.start, ground.end], [[0, 0, 0.8], [0, 0, 1.2]], atol=1e-12
+    )
+    np.testing.assert_allclose(
+        sorted([upper.start[0], upper.end[0]]), [0.0, 0.6], atol=1e-12
+    )
     np.testing.assert_allclose(ball.start, [0, 0, 0.1], atol=1e-12)
     assert float(ball.radius) == 0.08
     signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
     corners = signs * [0.05, 0.15, 0.01]
-    turn = np.array([[np.cos(0.3), -np.sin(0.3), 0], [np.sin(0.3), np.cos(0.3), 0], [0, 0, 1]])
+    turn = np.array(
+        [[np.cos(0.3), -np.sin(0.3), 0], [np.sin(0.3), np.cos(0.3), 0], [0, 0, 1]]
+    )
     placed = corners @ turn.T + [0.6, 0, 0]
     assert outside(placed, plate.start, plate.end, plate.radius).max() <= 1e-9
     assert float(plate.radius) < 0.06
@@ -113,7 +119,8 @@ def test_a_mesh_is_held_whole(tmp_path):
     mesh.export(meshes / "tool.stl")
     path = written(
         tmp_path,
-        '<mesh filename="package://arm_description/meshes/tool.stl" scale="0.001 0.001 0.001"/>',
+        '<mesh filename="package://arm_description/meshes/tool.stl" scale="0.001 '
+        '0.001 0.001"/>',
     )
     tool = fit_capsules(path)[-1]
     points = 0.001 * np.asarray(mesh.vertices)
@@ -126,16 +133,24 @@ def test_a_mesh_is_held_whole(tmp_path):
 
 def test_grippers_that_the_chain_leaves_out_count_as_bodies_that_collide(tmp_path):
     fingers = "".join(
-        f'<link name="{name}"><collision><geometry><sphere radius="0.01"/></geometry></collision>'
-        f'</link><joint name="j{name}" type="prismatic"><parent link="tool"/><child link="{name}"/>'
-        f'<origin xyz="0 {y} 0.1"/><axis xyz="0 1 0"/><limit lower="0.02" upper="0.04"/></joint>'
+        f'<link name="{name}"><collision><geometry><sphere '
+        'radius="0.01"/></geometry></collision>'
+        f'</link><joint name="j{name}" type="prismatic"><parent link="tool"/><child '
+        f'link="{name}"/>'
+        f'<origin xyz="0 {y} 0.1"/><axis xyz="0 1 0"/><limit lower="0.02" '
+        'upper="0.04"/></joint>'
         for name, y in (("left", 0.1), ("right", -0.1))
     )
     path = written(tmp_path)
     path.write_text(path.read_text().replace("</robot>", f"{fingers}</robot>"))
     arm = load_urdf(path, tip="tool")
     found = {c.name: c for c in fit_capsules(path, tip="tool")}
-    assert found["left"].body == found["right"].body == found["tool"].body == arm.joints - 1
+    assert (
+        found["left"].body
+        == found["right"].body
+        == found["tool"].body
+        == arm.joints - 1
+    )
     # They are held as near to zero as they can be.
     shift = np.array(found["left"].start) - found["tool"].start
     np.testing.assert_allclose(np.linalg.norm(shift), np.hypot(0.12, 0.1), atol=1e-9)

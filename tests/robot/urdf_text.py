@@ -12,23 +12,38 @@ def link(name, inertial=""):
 def inertial(mass, xyz, rpy, inertia):
     ixx, ixy, ixz, iyy, iyz, izz = inertia
     return (
-        f'<inertial><origin xyz="{numbers(xyz)}" rpy="{numbers(rpy)}"/><mass value="{mass}"/>'
-        f'<inertia ixx="{ixx}" ixy="{ixy}" ixz="{ixz}" iyy="{iyy}" iyz="{iyz}" izz="{izz}"/>'
+        f'<inertial><origin xyz="{numbers(xyz)}" rpy="{numbers(rpy)}"/><mass '
+        f'value="{mass}"/>'
+        f'<inertia ixx="{ixx}" ixy="{ixy}" ixz="{ixz}" iyy="{iyy}" iyz="{iyz}" '
+        f'izz="{izz}"/>'
         "</inertial>"
     )
 
 
 def joint(
-    name, parent, child, kind="revolute", *, xyz="0 0 0", rpy="0 0 0", axis="0 0 1", inner=""
+    name,
+    parent,
+    child,
+    kind="revolute",
+    *,
+    xyz="0 0 0",
+    rpy="0 0 0",
+    axis="0 0 1",
+    inner="",
 ):
     return (
         f'<joint name="{name}" type="{kind}"><origin xyz="{xyz}" rpy="{rpy}"/>'
-        f'<parent link="{parent}"/><child link="{child}"/><axis xyz="{axis}"/>{inner}</joint>'
+        f'<parent link="{parent}"/><child link="{child}"/><axis '
+        f'xyz="{axis}"/>{inner}</joint>'
     )
 
 
 def robot(*parts):
-    return '<?xml version="1.0"?>\n<robot name="arm">\n' + "\n".join(parts) + "\n</robot>\n"
+    return (
+        '<?xml version="1.0"?>\n<robot name="arm">\n'
+        + "\n".join(parts)
+        + "\n</robot>\n"
+    )
 
 
 def arm(**options):

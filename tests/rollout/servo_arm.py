@@ -71,7 +71,9 @@ def commands(seed, duration=40.0, rate=50.0):
     q = np.zeros((len(t), 2))
     for j in range(2):
         for f in (0.1, 0.23, 0.5, 0.9, 1.6):
-            q[:, j] += 0.25 / (1 + 2 * f) * np.sin(2 * np.pi * (f * t + random.uniform()))
+            q[:, j] += (
+                0.25 / (1 + 2 * f) * np.sin(2 * np.pi * (f * t + random.uniform()))
+            )
     envelope = np.clip(np.minimum(t, 2.0) / 2.0, 0.0, 1.0)[:, None]
     held = (t % 12.0) > 10.0
     for k in np.flatnonzero(held):
@@ -91,7 +93,9 @@ def log(
     limit=1e3,
 ):
     """Return a log of 50 Hz; commands are held until the next one and reach the servo late."""
-    model = mujoco.MjModel.from_xml_string(model_text(stiffer, step, friction, ki, limit))
+    model = mujoco.MjModel.from_xml_string(
+        model_text(stiffer, step, friction, ki, limit)
+    )
     data, sent = mujoco.MjData(model), commands(seed, duration)
     every, late, measured = round(0.02 / step), round(DELAY / step), np.zeros_like(sent)
     data.qpos[:] = sent[0]

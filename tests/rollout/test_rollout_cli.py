@@ -43,7 +43,16 @@ def folder(tmp_path_factory):
 
 def test_a_report_without_torques(folder, monkeypatch):
     monkeypatch.chdir(folder)
-    words = ["rollout", "experiment.toml", "a.csv", "b.csv", "--verify", "unseen.csv", "-o", "out"]
+    words = [
+        "rollout",
+        "experiment.toml",
+        "a.csv",
+        "b.csv",
+        "--verify",
+        "unseen.csv",
+        "-o",
+        "out",
+    ]
     done = CliRunner().invoke(app, words, catch_exceptions=False)
     assert done.exit_code == 0, done.output
     found = json.loads((folder / "out" / "rollout.json").read_text())
@@ -62,11 +71,22 @@ def test_known_gains_and_integral_action_of_a_servo_without_it(folder, monkeypat
     monkeypatch.chdir(folder)
     text = FILE.replace("samples = 2", "stiffness = [12.0, nan]\nintegral = true")
     (folder / "pid.toml").write_text(text)
-    words = ["rollout", "pid.toml", "a.csv", "b.csv", "--verify", "unseen.csv", "-o", "pid"]
+    words = [
+        "rollout",
+        "pid.toml",
+        "a.csv",
+        "b.csv",
+        "--verify",
+        "unseen.csv",
+        "-o",
+        "pid",
+    ]
     done = CliRunner().invoke(app, words, catch_exceptions=False)
     assert done.exit_code == 0, done.output
     found = json.loads((folder / "pid" / "rollout.json").read_text())
-    np.testing.assert_allclose(found["simulators"]["stiffness"], servo_arm.KP, rtol=0.02)
+    np.testing.assert_allclose(
+        found["simulators"]["stiffness"], servo_arm.KP, rtol=0.02
+    )
     assert found["simulators"]["stiffness"][0] == 12.0
     assert np.max(found["simulators"]["integral_gain"]) < 0.1
     assert np.max(found["errors"]["simulated"]) < 1e-3
@@ -106,14 +126,25 @@ def driven(tmp_path_factory):
         log = driven_pendulum.log(seed)
         columns = {"time": log.time}
         for j in range(2):
-            columns[f"q{j + 1}"], columns[f"tau{j + 1}"] = log.angles[:, j], log.forces[:, j]
+            columns[f"q{j + 1}"], columns[f"tau{j + 1}"] = (
+                log.angles[:, j],
+                log.forces[:, j],
+            )
         pl.DataFrame(columns).write_csv(folder / f"log{seed}.csv")
     return folder
 
 
 def test_a_report_with_torques(driven, monkeypatch):
     monkeypatch.chdir(driven)
-    words = ["rollout", "experiment.toml", "log0.csv", "--verify", "log1.csv", "-o", "out"]
+    words = [
+        "rollout",
+        "experiment.toml",
+        "log0.csv",
+        "--verify",
+        "log1.csv",
+        "-o",
+        "out",
+    ]
     done = CliRunner().invoke(app, words, catch_exceptions=False)
     assert done.exit_code == 0, done.output
     assert "Simulations are closer to the robot" in done.output
@@ -131,7 +162,10 @@ def test_a_report_with_torques(driven, monkeypatch):
 
 
 def test_settings_of_the_other_kind_of_logs_are_rejected(driven, folder, monkeypatch):
-    for place, text, key in ((driven, TORQUES, "samples = 2"), (folder, FILE, "horizon = 0.1")):
+    for place, text, key in (
+        (driven, TORQUES, "samples = 2"),
+        (folder, FILE, "horizon = 0.1"),
+    ):
         monkeypatch.chdir(place)
         (place / "other.toml").write_text(f"{text}{key}\n")
         log = "log0.csv" if place is driven else "a.csv"
@@ -143,7 +177,9 @@ def test_settings_of_the_other_kind_of_logs_are_rejected(driven, folder, monkeyp
 
 def test_dry_friction_with_torques_must_be_smooth(driven, monkeypatch):
     monkeypatch.chdir(driven)
-    (driven / "hard.toml").write_text(TORQUES.replace("coulomb = false", "coulomb.hard = true"))
+    (driven / "hard.toml").write_text(
+        TORQUES.replace("coulomb = false", "coulomb.hard = true")
+    )
     done = CliRunner().invoke(app, ["rollout", "hard.toml", "log0.csv", "-o", "none"])
     assert done.exit_code != 0
     assert "epsilon = 0.1" in str(done.exception)

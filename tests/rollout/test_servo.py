@@ -32,7 +32,9 @@ from jaxid.rollout.uncoupled import ServoSimulator
 def _one_joint(commands, load=0.0, **parameters):
     """Return a simulator of one joint and its parameters [1, 1, parameters]."""
     sent = np.asarray(commands, float)[:, None]
-    motion = ServoMotion.of([jid.Recording.of(0 * sent + sent[0], sent, sample_time=0.02)])
+    motion = ServoMotion.of(
+        [jid.Recording.of(0 * sent + sent[0], sent, sample_time=0.02)]
+    )
     motion = motion.replace(load=np.full_like(motion.load, load))
     x = START.copy()
     for symbol, value in parameters.items():
@@ -105,7 +107,9 @@ def _arm(bodies, hold, ki=0.0):
 CASES = [(x, hold, 0.0) for x in (None, False, True) for hold in (False, True)]
 
 
-@pytest.mark.parametrize(("coupled", "hold", "ki"), [*CASES, (None, False, 4.0), (True, True, 4.0)])
+@pytest.mark.parametrize(
+    ("coupled", "hold", "ki"), [*CASES, (None, False, 4.0), (True, True, 4.0)]
+)
 def test_sensitivities_agree_with_differences(coupled, hold, ki):
     bodies = None if coupled is None else servo_arm.bodies(coupled)
     simulator, x, free = _arm(bodies, hold, ki)
@@ -122,10 +126,13 @@ def test_sensitivities_agree_with_differences(coupled, hold, ki):
         ends = path(x + step, 0.0), path(x - step, 0.0)
         difference = (ends[0] - ends[1]) / (2 * step[joint, symbol])
         error, scale = np.abs(S[..., k] - difference), np.abs(difference).max()
-        # A kink within a step shifts single samples; differences of positions are rounded, and
-        # integral actions sum this up.
+        # A kink within a step shifts single samples; differences of positions are
+        # rounded, and integral actions sum this up.
         rounding = (16 if ki > 0.0 else 1) * np.finfo(float).eps / step[joint, symbol]
-        assert np.quantile(error, 0.98) < 1e-6 * max(scale, 1e-3) + rounding, (joint, symbol)
+        assert np.quantile(error, 0.98) < 1e-6 * max(scale, 1e-3) + rounding, (
+            joint,
+            symbol,
+        )
     size = simulator.motion.start[0].size
     for k in range(size):
         start = np.zeros_like(simulator.motion.start[0])
@@ -143,9 +150,9 @@ def test_the_search_has_the_gauss_newton_matrix_of_uncoupled_joints(ki):
     alone = ServoSimulator(simulator.motion, 0.01, True)
     r = (alone.paths(x[None])[0, 0] - simulator.motion.positions[0]) * counted
     cost, g, H = (z[0, 0] for z in alone.moments(x[None]))
-    of_start = jax.jacfwd(lambda x: balanced_integral(x, simulator.motion.part(0), np.array(True)))(
-        x
-    )
+    of_start = jax.jacfwd(
+        lambda x: balanced_integral(x, simulator.motion.part(0), np.array(True))
+    )(x)
     for j in range(2):
         own = S[j, :, j * len(START) : (j + 1) * len(START)]
         if ki > 0.0:
@@ -161,7 +168,11 @@ def test_joints_that_shake_each_other_move_as_in_mujoco():
     """Steps of 10 and 2.5 ms, against MuJoCo's of 0.1 ms with nearly rigid friction."""
     K = np.array(servo_arm.KP)
     x = np.tile(START, (2, 1))
-    values = {"J": np.array(servo_arm.ARMATURE) / K, "B": servo_arm.DAMPING / K, "a": 1.0 / K}
+    values = {
+        "J": np.array(servo_arm.ARMATURE) / K,
+        "B": servo_arm.DAMPING / K,
+        "a": 1.0 / K,
+    }
     values |= {"F": servo_arm.FRICTION / K, "d": servo_arm.DELAY - 5e-5, "b": 0.0}
     for symbol, value in values.items():
         x[:, INDEX[symbol]] = value
@@ -172,7 +183,9 @@ def test_joints_that_shake_each_other_move_as_in_mujoco():
     for step in (0.01, 0.0025):
         simulator = CoupledSimulator(motion, step, True, servo_arm.bodies(True))
         path = simulator.positions(simulator.simulate(x))[0, :, : len(log.angles)]
-        errors.append(np.sqrt(np.mean((path - np.asarray(log.angles).T) ** 2, axis=1)).max())
+        errors.append(
+            np.sqrt(np.mean((path - np.asarray(log.angles).T) ** 2, axis=1)).max()
+        )
     assert errors[0] < 2e-4
     assert errors[1] < 2e-5
 
@@ -183,9 +196,13 @@ def test_a_joint_that_turns_around_keeps_its_velocity():
     one = (jnp.array([y]) for y in (force, inertia, friction, inertia, w))
     slip = Slip.of(*one, jnp.ones(1))
     u = (force + inertia * w - friction * float(slip.direction[0])) / inertia
-    rest = w * inertia / (friction - force)  # part of the stage until the joint is at rest
+    rest = (
+        w * inertia / (friction - force)
+    )  # part of the stage until the joint is at rest
     assert u == pytest.approx((force + friction) * (1.0 - rest) / inertia)
-    held = Slip.of(*(jnp.array([y]) for y in (-0.5, inertia, friction, inertia, 0.01)), jnp.ones(1))
+    held = Slip.of(
+        *(jnp.array([y]) for y in (-0.5, inertia, friction, inertia, 0.01)), jnp.ones(1)
+    )
     assert float(held.free[0]) == 0.0
 
 
@@ -217,7 +234,12 @@ def test_the_batch_of_least_squares_respects_bounds():
     free = np.array([[True, True], [True, False]])
     bounds = np.full(2, -1.0), np.full(2, 1.0)
     found = minimise(
-        moments, lambda *x: moments(*x)[0], np.zeros((2, 2)), free, bounds, tolerance=1e-14
+        moments,
+        lambda *x: moments(*x)[0],
+        np.zeros((2, 2)),
+        free,
+        bounds,
+        tolerance=1e-14,
     )
     np.testing.assert_allclose(found.x, [[0.5, 1.0], [-1.0, 0.0]], atol=1e-6)
 
@@ -229,7 +251,9 @@ def test_the_arms_parameters_are_found(fit):
         np.testing.assert_allclose(fit.of_parameter(symbol), values, rtol=0.02)
     assert fit.hold
     assert fit.bodies.coupled
-    np.testing.assert_allclose(fit.of_parameter("J")[1], servo_arm.ARMATURE[1] / K[1], rtol=0.02)
+    np.testing.assert_allclose(
+        fit.of_parameter("J")[1], servo_arm.ARMATURE[1] / K[1], rtol=0.02
+    )
     assert fit.stiffness[1] == pytest.approx(K[1], rel=0.01)
     assert fit.notes == ()
 
@@ -256,7 +280,10 @@ def test_windows_know_the_commands_before_them():
     simulator, x = _one_joint(0.01 * np.arange(400), J=4e-3, B=0.05, d=0.09, F=0.01)
     motion = simulator.motion.replace(positions=simulator.paths(x)[0])
     windows = motion.windows(1.0)
-    errors = dataclasses.replace(simulator, motion=windows).paths(x)[:, 0] - windows.positions
+    errors = (
+        dataclasses.replace(simulator, motion=windows).paths(x)[:, 0]
+        - windows.positions
+    )
     assert np.abs(errors[1:]).max() < 1e-4
 
 
@@ -278,7 +305,9 @@ def test_samples_have_the_deviations_and_degrees_of_freedom_of_the_fit(fit):
     few = dataclasses.replace(fit, dof=np.full_like(fit.dof, 3.0))
     draws = few.samples(4000, seed=1)[:, fit.free] - fit.parameters[fit.free]
     low, high = np.quantile(draws, [0.025, 0.975], axis=0)
-    half = 3.182 * np.sqrt(np.diag(fit.covariance))  # 97.5 % of Student's t, three degrees
+    half = 3.182 * np.sqrt(
+        np.diag(fit.covariance)
+    )  # 97.5 % of Student's t, three degrees
     inside = fit.parameters[fit.free] - 20 * half > LOWER[np.nonzero(fit.free)[1]]
     np.testing.assert_allclose(0.5 * (high - low)[inside], half[inside], rtol=0.1)
     assert inside.sum() > 3
@@ -290,7 +319,9 @@ def test_mujoco_moves_like_the_simulation(fit, tmp_path):
     _require_motion_of_mujoco(paths[0], servo_arm.log(9, duration=20.0))
     values = simulator_values(fit)
     np.testing.assert_allclose(values["armature"][1], servo_arm.ARMATURE[1], rtol=0.02)
-    assert "other joints" in str(simulator_table(fit)) or np.isfinite(fit.stiffness).all()
+    assert (
+        "other joints" in str(simulator_table(fit)) or np.isfinite(fit.stiffness).all()
+    )
 
 
 def _require_motion_of_mujoco(path, log):
@@ -331,7 +362,12 @@ def test_integral_action_is_found_and_exported(tmp_path):
 
 def test_integral_action_of_a_servo_that_saturates_is_found():
     logs = [servo_arm.log(k, duration=20.0, ki=3.0, limit=1.6) for k in (0, 1)]
-    options = {"friction": False, "time_step": 0.005, "integral": True, "stiffness": servo_arm.KP}
+    options = {
+        "friction": False,
+        "time_step": 0.005,
+        "integral": True,
+        "stiffness": servo_arm.KP,
+    }
     found = jid.identify_rollout(logs, servo_arm.bodies(), **options)
     np.testing.assert_allclose(found.of_parameter("ki"), 3.0, rtol=0.02)
     limit = simulator_values(found)["effort_limit"]
@@ -354,7 +390,9 @@ def test_deviations_are_at_least_those_of_independent_errors():
     found.__dict__["residuals"] = alternating * simulator.motion.counted
     rows = _Rows.of(found)
     covariance, _ = rows.covariance(rows.columns, np.arange(8))
-    independent = np.diag(np.linalg.inv(rows.information)) / simulator.motion.counted[0, 0].sum()
+    independent = (
+        np.diag(np.linalg.inv(rows.information)) / simulator.motion.counted[0, 0].sum()
+    )
     assert (np.diag(covariance) > 0.999 * independent).all()
 
 
@@ -365,13 +403,19 @@ def test_stiffness_and_delay_of_a_slow_ramp_are_merged():
         sent = speed * 0.02 * np.arange(500)
         simulator, x = _one_joint(sent, J=1e-4, B=0.06, d=0.02, F=0.01)
         path = simulator.paths(x)[0, 0, 0][: len(sent)]
-        measured = step * np.round((path + random.uniform(-step, step, len(path))) / step)
-        logs.append(jid.Recording.of(measured[:, None], sent[:, None], sample_time=0.02))
+        measured = step * np.round(
+            (path + random.uniform(-step, step, len(path))) / step
+        )
+        logs.append(
+            jid.Recording.of(measured[:, None], sent[:, None], sample_time=0.02)
+        )
     found = jid.identify_rollout(logs, friction=False, saturation=False)
     (lag,) = [c for c in found.combinations if "B" in c.name.split()[0]]
     assert " d" in lag.name
     low, high = lag.interval(0.999)
-    truth = float(lag.coefficients[0, INDEX["B"]] * 0.06 + lag.coefficients[0, INDEX["d"]] * 0.02)
+    truth = float(
+        lag.coefficients[0, INDEX["B"]] * 0.06 + lag.coefficients[0, INDEX["d"]] * 0.02
+    )
     assert low < truth < high
 
 
@@ -407,13 +451,18 @@ def test_logs_that_cannot_be_used_are_rejected():
 def test_contact_in_a_log_of_the_fit_is_left_out_and_named():
     """It lasts so long that the errors' mean square is that of the contact."""
     blocked = servo_arm.log(9, duration=80.0, block=0.05)
-    # A log of twice the usual length is divided; times are those of its clock all the same.
+    # A log of twice the usual length is divided; times are those of its clock all the
+    # same.
     blocked = dataclasses.replace(blocked, time=blocked.time + 5.0)
     logs = [servo_arm.log(0), servo_arm.log(2), servo_arm.log(3), blocked]
-    found = jid.identify_rollout(logs, servo_arm.bodies(), friction=False, saturation=False)
+    found = jid.identify_rollout(
+        logs, servo_arm.bodies(), friction=False, saturation=False
+    )
     assert {(c.name, c.joint) for c in found.contacts} == {("motion 9", 1)}
     K = servo_arm.KP[1]
-    assert found.of_parameter("F")[1] == pytest.approx(servo_arm.FRICTION[1] / K, rel=0.05)
+    assert found.of_parameter("F")[1] == pytest.approx(
+        servo_arm.FRICTION[1] / K, rel=0.05
+    )
     again = found.validate(blocked).contacts
     starts, stops = (
         [f(getattr(c, key) for c in x) for x in (found.contacts, again)]
@@ -429,5 +478,7 @@ def test_contact_needs_a_joint_that_does_not_move():
     simulator, _ = _one_joint(sent)
     motion = simulator.motion
     errors = np.full_like(motion.positions, 0.1)
-    assert contacts(motion.replace(positions=motion.sent), errors, np.array([0.01])) == ()
+    assert (
+        contacts(motion.replace(positions=motion.sent), errors, np.array([0.01])) == ()
+    )
     assert len(contacts(motion, errors, np.array([0.01]))) == 1

@@ -41,7 +41,9 @@ def logs(base):
 def test_late_torques_are_found_and_the_simulation_is_closer(base, logs):
     found, other = jid.rollout.identify_torque_rollout(base, logs[0]), logs[1]
     assert found.errors_at(other, 0.2).max() < 2e-3
-    assert (found.errors_at(other, 0.2) < 0.2 * found.errors_at(other, 0.2, found.start)).all()
+    assert (
+        found.errors_at(other, 0.2) < 0.2 * found.errors_at(other, 0.2, found.start)
+    ).all()
     delay = float(found.unknowns[base.size])
     # A held torque is half a sample later than an interpolated one.
     assert delay == pytest.approx(driven_pendulum.LATE + 0.001, abs=5e-4)
@@ -69,7 +71,9 @@ def test_simulated_windows_start_on_the_measured_positions(base, logs):
     np.testing.assert_array_equal(simulated[starts], measured[starts])
     assert np.isnan(simulated[starts + steps + 1]).all()
     places = np.searchsorted(logs[1].time, time + 1e-9) - 1
-    np.testing.assert_allclose(measured, np.asarray(logs[1].motion.q)[places], atol=1e-12)
+    np.testing.assert_allclose(
+        measured, np.asarray(logs[1].motion.q)[places], atol=1e-12
+    )
     sizes = np.sqrt(np.mean((simulated - measured)[starts + steps] ** 2, axis=0))
     np.testing.assert_allclose(sizes, found.errors_at(logs[1], 0.2), rtol=0.3)
 
@@ -104,13 +108,17 @@ def test_derivatives_agree_with_differences(base, logs):
             ends = [function(jnp.asarray(x + s * step), data) for s in (1, -1)]
             difference = np.asarray(ends[0] - ends[1]) / 2e-6
             scale = max(np.abs(difference).max(), 1e-3)
-            np.testing.assert_allclose(np.asarray(J)[..., k], difference, atol=1e-6 * scale)
+            np.testing.assert_allclose(
+                np.asarray(J)[..., k], difference, atol=1e-6 * scale
+            )
 
 
 def test_what_cannot_be_simulated_is_rejected(base, logs):
     robot = base.model.robot
     hard = jid.Model(robot, (*TERMS, jid.CoulombFriction(HardSign())))
-    tool = dataclasses.replace(robot, tool=jid.Tool(1, mass=0.1, centre_of_mass=[0.0, 0.0, -0.1]))
+    tool = dataclasses.replace(
+        robot, tool=jid.Tool(1, mass=0.1, centre_of_mass=[0.0, 0.0, -0.1])
+    )
     for model, name in ((hard, "Tanh"), (jid.Model(tool, TERMS), "tool")):
         with pytest.raises(jid.InputError, match=f"`{name}"):
             jid.rollout.identify_torque_rollout(jid.base_parameters(model), logs[0])

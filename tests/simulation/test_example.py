@@ -22,7 +22,9 @@ def example(tmp_path_factory):
     return folder
 
 
-@pytest.mark.parametrize("robot", [library.panda(), library.tx90l_on_rail()], ids=lambda r: r.name)
+@pytest.mark.parametrize(
+    "robot", [library.panda(), library.tx90l_on_rail()], ids=lambda r: r.name
+)
 def test_random_bodies_could_exist(robot):
     masses = np.linspace(1.0, 5.0, robot.joints)
     bodies = random_bodies(robot, masses, np.random.default_rng(0))
@@ -51,8 +53,11 @@ def test_the_truth_is_found_again(example):
     rows = truth["base_parameters"]
     assert [r["name"] for r in rows] == list(base.names)
     values = np.array([r["value"] for r in rows])
-    np.testing.assert_allclose(values, base.from_standard(virtual.parameters), rtol=1e-12)
-    # Noise with memory and friction beyond the model make deviations larger than they are said.
+    np.testing.assert_allclose(
+        values, base.from_standard(virtual.parameters), rtol=1e-12
+    )
+    # Noise with memory and friction beyond the model make deviations larger than they
+    # are said.
     z = (np.asarray(fit.parameters) - values) / fit.standard_deviations
     assert np.abs(z).max() < 8
     assert np.sqrt(np.mean(z**2)) < 2.5

@@ -57,7 +57,9 @@ def test_temperature_scales_viscous_and_dry_friction_apart(friction):
     whole = friction.scaled(0.5 * ones, 2.0 * ones).steady(FAST)
     parts = 0.5 * viscous.steady(FAST) + 2.0 * dry.steady(FAST)
     np.testing.assert_allclose(whole, parts, rtol=1e-12)
-    np.testing.assert_allclose(friction.scaled(ones, 2.0 * ones).parameters[3:], 2.0 * COULOMB)
+    np.testing.assert_allclose(
+        friction.scaled(ones, 2.0 * ones).parameters[3:], 2.0 * COULOMB
+    )
 
 
 @pytest.mark.parametrize("gear", GEARS)
@@ -79,7 +81,9 @@ def test_what_the_motor_loses_the_joint_gets(gear, twist):
 def test_a_gear_that_is_wound_up_holds_its_load(gear):
     load = np.array([2.0, -0.3, 1.0])
     if gear.twist(load).any():
-        felt = gear.transmit(gear.twist(load), jnp.zeros(3), np.full(3, 1e12), np.zeros(3), STEP)
+        felt = gear.transmit(
+            gear.twist(load), jnp.zeros(3), np.full(3, 1e12), np.zeros(3), STEP
+        )
         np.testing.assert_allclose(felt[0], load, rtol=1e-6)
 
 
@@ -89,7 +93,9 @@ def test_ripple_goes_round_with_the_motor():
     q = np.random.default_rng(0).normal(size=6)
     turn = robot.drives.joint_velocities(np.full(6, 2 * np.pi))
     forces = np.asarray(ripple.forces(robot, q, 0.0 * q))
-    np.testing.assert_allclose(ripple.forces(robot, q + turn, 0.0 * q), forces, atol=1e-9)
+    np.testing.assert_allclose(
+        ripple.forces(robot, q + turn, 0.0 * q), forces, atol=1e-9
+    )
     assert np.abs(forces).max() <= 0.5
 
 
@@ -97,5 +103,9 @@ def test_cables_pull_back_and_rub():
     robot = library.tx40()
     cable = CableForce(np.full(6, 2.0), np.full(6, 0.1), np.full(6, 0.3))
     q = np.full(6, 0.6)
-    np.testing.assert_allclose(cable.forces(robot, q, np.ones(6)), -1.0 - 0.3, rtol=1e-12)
-    np.testing.assert_allclose(cable.forces(robot, q, -np.ones(6)), -1.0 + 0.3, rtol=1e-12)
+    np.testing.assert_allclose(
+        cable.forces(robot, q, np.ones(6)), -1.0 - 0.3, rtol=1e-12
+    )
+    np.testing.assert_allclose(
+        cable.forces(robot, q, -np.ones(6)), -1.0 + 0.3, rtol=1e-12
+    )

@@ -62,28 +62,43 @@ def moved(machine, u, steps, ramp=1):
 def test_forward_dynamics_is_the_inverse_of_inverse_dynamics():
     robot, random = library.planar_arm(3), np.random.default_rng(0)
     bodies = random_bodies(robot, np.linspace(20.0, 2.0, 3), random)
-    model, p = Model(robot), np.concatenate([bodies.ravel(), random.uniform(0.1, 1.0, 9)])
+    model, p = (
+        Model(robot),
+        np.concatenate([bodies.ravel(), random.uniform(0.1, 1.0, 9)]),
+    )
     q, qd, qdd = random.normal(size=(3, 20, 3))
     forces = model.inverse_dynamics(p, Motion(q, qd, qdd))
-    np.testing.assert_allclose(model.forward_dynamics(p, q, qd, forces), qdd, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(
+        model.forward_dynamics(p, q, qd, forces), qdd, rtol=1e-9, atol=1e-9
+    )
 
 
-@pytest.mark.parametrize("gear", [RigidGear(), FlexibleGear(np.array([4e4, 400.0]), ZERO)])
+@pytest.mark.parametrize(
+    "gear", [RigidGear(), FlexibleGear(np.array([4e4, 400.0]), ZERO)]
+)
 def test_energy_is_kept_without_friction(gear):
     machine = plant(gear=gear)
     start = np.array([0.2, 2.0])
-    machine.start(start, ZERO, np.asarray(MODEL.forward_dynamics(PARAMETERS, start, ZERO, ZERO)))
+    machine.start(
+        start, ZERO, np.asarray(MODEL.forward_dynamics(PARAMETERS, start, ZERO, ZERO))
+    )
     q, qd, _ = moved(machine, ZERO, 4000)
-    energy = MODEL.kinetic_energy(PARAMETERS, q, qd) + MODEL.potential_energy(PARAMETERS, q)
+    energy = MODEL.kinetic_energy(PARAMETERS, q, qd) + MODEL.potential_energy(
+        PARAMETERS, q
+    )
     swing = np.ptp(np.asarray(MODEL.potential_energy(PARAMETERS, q)))
     elastic = 0.02 if isinstance(gear, FlexibleGear) else 0.0
     assert np.abs(energy - energy[0]).max() < (2e-4 + elastic) * swing
     if not elastic:
         # By a Runge-Kutta method of high order.
         def rate(_, x):
-            return np.concatenate([x[2:], MODEL.forward_dynamics(PARAMETERS, x[:2], x[2:], ZERO)])
+            return np.concatenate(
+                [x[2:], MODEL.forward_dynamics(PARAMETERS, x[:2], x[2:], ZERO)]
+            )
 
-        exact = solve_ivp(rate, (0, 1.0), [*start, 0, 0], method="DOP853", rtol=1e-10).y[:2, -1]
+        exact = solve_ivp(
+            rate, (0, 1.0), [*start, 0, 0], method="DOP853", rtol=1e-10
+        ).y[:2, -1]
         np.testing.assert_allclose(q[999], exact, atol=2e-5)
 
 
@@ -127,7 +142,8 @@ def test_an_elastic_gear_swings_as_its_eigenvalues_say():
     machine = plant(gear=FlexibleGear(stiffness, ZERO))
     # Small motions about the hanging pendulum: joints, then motors.
     M = block_diag(
-        np.asarray(MODEL.mass_matrix(PARAMETERS, ZERO)) - np.diag(rotors), np.diag(rotors)
+        np.asarray(MODEL.mass_matrix(PARAMETERS, ZERO)) - np.diag(rotors),
+        np.diag(rotors),
     )
     spring = np.diag(stiffness)
     K = np.block([[spring, -spring], [-spring, spring]])

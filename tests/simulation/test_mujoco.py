@@ -36,17 +36,22 @@ def ur10(tool=False):
 )
 def test_forces_of_a_motion_are_mujocos(virtual):
     virtual = virtual.replace(
-        friction=SmoothFriction(virtual.present_friction.viscous, 0.0 * virtual.friction.coulomb),
+        friction=SmoothFriction(
+            virtual.present_friction.viscous, 0.0 * virtual.friction.coulomb
+        ),
         heating=None,
         temperature=None,
     )
     n = virtual.robot.joints
     motion = Motion(*np.random.default_rng(1).normal(size=(3, 50, n)))
     ours, theirs = virtual.forces(motion), MujocoRobot(virtual).forces(motion)
-    np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-9 * np.abs(theirs).max())
+    np.testing.assert_allclose(
+        ours, theirs, rtol=1e-9, atol=1e-9 * np.abs(theirs).max()
+    )
 
 
-# Tolerances are those of docs/virtual_robot.md: MuJoCo's dry friction is a constraint, ours a tanh.
+# Tolerances are those of docs/virtual_robot.md: MuJoCo's dry friction is a constraint,
+# ours a tanh.
 @pytest.mark.parametrize(("dry", "tolerance"), [(0.0, 0.001), (1.0, 0.01)])
 def test_the_same_experiment_gives_the_same_torques(dry, tolerance):
     virtual = virtual_tx90l_on_rail(disturbed=False)
@@ -77,7 +82,8 @@ def test_mujocos_data_lead_to_the_true_parameters():
     base = jid.base_parameters(virtual.model)
     rows = jid.Subsample(20)
     fit = jid.identify(
-        base, jid.observe(run.recording, virtual.robot, jid.ZeroPhaseButterworth(20.0), rows)
+        base,
+        jid.observe(run.recording, virtual.robot, jid.ZeroPhaseButterworth(20.0), rows),
     )
     truth = np.asarray(base.from_standard(virtual.parameters))
     wanted = np.asarray(base.inverse_dynamics(truth, run.actual))
@@ -85,7 +91,9 @@ def test_mujocos_data_lead_to_the_true_parameters():
     assert (error < 2e-3 * np.asarray(virtual.robot.max_forces)).all()
     masses = np.array([n.startswith(("m", "Ia")) for n in base.names])
     np.testing.assert_allclose(
-        np.asarray(fit.parameters)[masses], truth[masses], atol=0.02 * np.abs(truth[masses]).max()
+        np.asarray(fit.parameters)[masses],
+        truth[masses],
+        atol=0.02 * np.abs(truth[masses]).max(),
     )
 
 

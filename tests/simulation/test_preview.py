@@ -23,7 +23,9 @@ def shapes():
     capsules = [Capsule("stand", -1, start=(0, 0, 0), end=(0, 0, 0.2), radius=0.1)]
     for body in range(7):
         start, end = (0.1, 0.0, -0.05), (0.0, 0.1, 0.05 * body)
-        capsules.append(Capsule(f"link {body}", body, start=start, end=end, radius=0.05))
+        capsules.append(
+            Capsule(f"link {body}", body, start=start, end=end, radius=0.05)
+        )
     capsules.append(Capsule("<ball> & 'tool'", 6, start=(0.0, 0.0, 0.3), radius=0.08))
     box = Box("table", centre=(0.6, 0.0, 0.2), size=(0.8, 1.2, 0.4), rotation=TURNED)
     floor = HalfSpace("floor", normal=(0.1, 0.0, 1.0), height=-0.2)
@@ -45,8 +47,12 @@ def test_shapes_are_where_they_are_checked(shapes):
             np.testing.assert_allclose(geom.xpos, 0.5 * (start + end), atol=1e-12)
             half = 0.5 * (end - start)
             half *= np.sign(half @ axis) or 1.0  # both ends of a capsule are alike
-            np.testing.assert_allclose(axis if half.any() else 0.0 * axis, half, atol=1e-12)
-            assert model.geom(capsule.name).size[0] == pytest.approx(float(capsule.radius))
+            np.testing.assert_allclose(
+                axis if half.any() else 0.0 * axis, half, atol=1e-12
+            )
+            assert model.geom(capsule.name).size[0] == pytest.approx(
+                float(capsule.radius)
+            )
     box, floor = data.geom("table"), data.geom("floor")
     np.testing.assert_allclose(box.xpos, [0.6, 0.0, 0.2], atol=1e-12)
     np.testing.assert_allclose(box.xmat.reshape(3, 3), TURNED, atol=1e-12)
@@ -89,22 +95,31 @@ def test_the_viewer_shows_the_motion_in_time(shapes, monkeypatch):
     monkeypatch.setattr(preview, "time", clock)
     motion = random_fourier_series(PANDA, omega=0.8, seed=0)
     preview.play(PANDA, shapes, motion)
-    # One look at the clock begins; after 7.85 s and a pause of 1 s the motion begins again.
+    # One look at the clock begins; after 7.85 s and a pause of 1 s the motion begins
+    # again.
     times = np.array([1.5, 3.0, 4.5, 6.0, 7.5, 9.0, 10.5, 12.0])
     times = np.minimum(times % (float(motion.duration) + 1.0), float(motion.duration))
     speed = np.abs(np.asarray(motion.motion(np.linspace(0, 7, 99)).qd)).max()
     expected = np.asarray(motion.motion(times).q)
-    np.testing.assert_allclose(windows[0].poses, expected, rtol=0, atol=2 * speed / preview.RATE)
+    np.testing.assert_allclose(
+        windows[0].poses, expected, rtol=0, atol=2 * speed / preview.RATE
+    )
 
 
 @pytest.mark.parametrize(
     ("module", "found", "said"),
     [
         ("mujoco", None, r'the package `mujoco`: install it \(`pip install "jaxid-rob'),
-        ("glfw", SimpleNamespace(init=lambda: False), "a preview needs a display, and none"),
+        (
+            "glfw",
+            SimpleNamespace(init=lambda: False),
+            "a preview needs a display, and none",
+        ),
     ],
 )
-def test_without_mujoco_or_display_one_sentence_says_so(monkeypatch, module, found, said):
+def test_without_mujoco_or_display_one_sentence_says_so(
+    monkeypatch, module, found, said
+):
     monkeypatch.setitem(sys.modules, module, found)
     monkeypatch.setitem(sys.modules, "mujoco.viewer", SimpleNamespace())
     with pytest.raises(InputError, match=said):

@@ -29,7 +29,10 @@ def feeding(virtual, parameters):
 @pytest.fixture(scope="module")
 def run(virtual, motion):
     return virtual.track(
-        motion, feed_forward=feeding(virtual, virtual.parameters), duration=DURATION, seed=1
+        motion,
+        feed_forward=feeding(virtual, virtual.parameters),
+        duration=DURATION,
+        seed=1,
     )
 
 
@@ -40,7 +43,10 @@ def rms(x):
 def test_a_better_model_tracks_better(virtual, motion, run):
     alone = virtual.track(motion, duration=DURATION, seed=1)
     cad = virtual.track(
-        motion, feed_forward=feeding(virtual, cad_tx90l_on_rail()), duration=DURATION, seed=1
+        motion,
+        feed_forward=feeding(virtual, cad_tx90l_on_rail()),
+        duration=DURATION,
+        seed=1,
     )
     errors = [np.mean(rms(r.tracking_error)[:6]) for r in (alone, cad, run)]
     assert errors[0] > errors[1] > 3 * errors[2]
@@ -72,15 +78,21 @@ def test_the_log_is_on_the_motors_side_in_steps_of_the_encoders(virtual, run):
     np.testing.assert_allclose(lines, np.round(lines), atol=1e-6)
     drives = virtual.robot.drives
     np.testing.assert_allclose(
-        drives.joint_angles(log.angles), run.actual.q, atol=step / drives.reduction[6, 6]
+        drives.joint_angles(log.angles),
+        run.actual.q,
+        atol=step / drives.reduction[6, 6],
     )
-    noise = (np.asarray(drives.joint_forces(log.forces)) - run.forces) / virtual.robot.max_forces
+    noise = (
+        np.asarray(drives.joint_forces(log.forces)) - run.forces
+    ) / virtual.robot.max_forces
     np.testing.assert_allclose(rms(noise), 0.01, rtol=0.1)
 
 
 def test_a_log_can_be_slower_than_the_servo(virtual, motion, run):
     known = feeding(virtual, virtual.parameters)
-    again = virtual.track(motion, feed_forward=known, duration=DURATION, sample_time=0.004, seed=1)
+    again = virtual.track(
+        motion, feed_forward=known, duration=DURATION, sample_time=0.004, seed=1
+    )
     np.testing.assert_array_equal(again.actual.q, run.actual.q[::4])
     assert again.recording.sample_time == pytest.approx(0.004)
 
@@ -96,7 +108,10 @@ def test_drives_do_not_give_more_than_they_can(virtual, motion):
 REFUSALS = [
     ("`sample_time`", lambda v, m: v.track(m, sample_time=0.0015, seed=0)),
     ("`duration`", lambda v, m: v.track(m, duration=0.0, seed=0)),
-    ("`feed_forward`", lambda v, m: v.track(m, feed_forward=lambda x: x.q[:, :3], seed=0)),
+    (
+        "`feed_forward`",
+        lambda v, m: v.track(m, feed_forward=lambda x: x.q[:, :3], seed=0),
+    ),
     ("`temperature`", lambda v, m: v.replace(temperature=None)),
     ("`values`", lambda v, m: v.replace(values=np.ones(3))),
     ("`temperature`", lambda v, m: v.replace(heating=None, temperature=None).at(30.0)),

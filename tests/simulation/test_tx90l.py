@@ -29,10 +29,14 @@ def test_published_base_parameters_come_out(base, warm, published):
 def test_temperature_leads_from_cold_to_warm_friction(base):
     cold, warm = (virtual_tx90l_on_rail(warm=w) for w in (False, True))
     heated = np.asarray(base.from_standard(cold.at(45.0).parameters))
-    np.testing.assert_allclose(heated[26:40], base.from_standard(warm.parameters)[26:40], rtol=1e-9)
+    np.testing.assert_allclose(
+        heated[26:40], base.from_standard(warm.parameters)[26:40], rtol=1e-9
+    )
     between = np.asarray(base.from_standard(cold.at(30.0).parameters))
     assert WARM[27] < between[26] < COLD[27]
-    np.testing.assert_allclose(between[:26], base.from_standard(cold.parameters)[:26], rtol=1e-12)
+    np.testing.assert_allclose(
+        between[:26], base.from_standard(cold.parameters)[:26], rtol=1e-12
+    )
 
 
 def test_half_an_hour_of_motion_warms_it_up(base):

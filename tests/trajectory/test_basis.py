@@ -31,7 +31,9 @@ def test_each_order_is_the_derivative_of_the_one_before(basis):
     before, rows, after = (basis.rows(x) for x in (t - h, t, t + h))
     for k in range(3):
         slope = (after[k] - before[k]) / (2 * h)
-        np.testing.assert_allclose(rows[k + 1], slope, atol=1e-6 * np.abs(rows[k + 1]).max())
+        np.testing.assert_allclose(
+            rows[k + 1], slope, atol=1e-6 * np.abs(rows[k + 1]).max()
+        )
 
 
 def test_the_trajectory_is_the_rows_times_the_coefficients(basis):
@@ -41,7 +43,9 @@ def test_the_trajectory_is_the_rows_times_the_coefficients(basis):
     motion = trajectory.motion(t)
     expected = (motion.q, motion.qd, motion.qdd, trajectory.jerk(t))
     for rows, values in zip(basis.rows(t), expected, strict=True):
-        np.testing.assert_allclose(rows @ x.T, values, atol=1e-10 * np.abs(values).max())
+        np.testing.assert_allclose(
+            rows @ x.T, values, atol=1e-10 * np.abs(values).max()
+        )
 
 
 @pytest.mark.parametrize("points", [16, 512])
@@ -74,23 +78,32 @@ def test_a_periodic_motion_begins_later_or_runs_backwards():
     assert len(maps) == 80
     np.testing.assert_allclose(maps[0], np.eye(PERIODIC.variables), atol=1e-12)
     for k in (1, 7, 39):
-        later, backwards = (PERIODIC.rows(t) @ (x @ T.T).T for T in (maps[k], maps[40 + k]))
+        later, backwards = (
+            PERIODIC.rows(t) @ (x @ T.T).T for T in (maps[k], maps[40 + k])
+        )
         np.testing.assert_allclose(later, PERIODIC.rows(t - k * step) @ x.T, atol=1e-9)
         turned = PERIODIC.rows(k * step - t) @ x.T
         turned[1::2] *= -1
         np.testing.assert_allclose(backwards, turned, atol=1e-9)
 
 
-@pytest.mark.parametrize("basis", BETWEEN_RESTS[:2], ids=lambda basis: type(basis).__name__)
+@pytest.mark.parametrize(
+    "basis", BETWEEN_RESTS[:2], ids=lambda basis: type(basis).__name__
+)
 def test_a_motion_between_standstills_only_runs_backwards(basis):
     maps, x = basis.retimings(), coefficients(basis)
     t = np.linspace(0.0, basis.duration, 41)
     assert len(maps) == 2
     np.testing.assert_allclose(maps[0], np.eye(basis.variables), atol=1e-8)
-    ahead, turned = basis.rows(t) @ x.T, basis.rows(basis.duration - t) @ (x @ maps[1].T).T
+    ahead, turned = (
+        basis.rows(t) @ x.T,
+        basis.rows(basis.duration - t) @ (x @ maps[1].T).T,
+    )
     for order, sign in enumerate((1.0, -1.0, 1.0)):
         scale = np.abs(ahead[order]).max()
-        np.testing.assert_allclose(turned[order], sign * ahead[order], atol=1e-7 * scale)
+        np.testing.assert_allclose(
+            turned[order], sign * ahead[order], atol=1e-7 * scale
+        )
 
 
 def test_a_fourier_series_is_the_papers_sum():
@@ -98,9 +111,13 @@ def test_a_fourier_series_is_the_papers_sum():
     a, b = random.standard_normal((2, 3, 4))
     offset, k = random.standard_normal(3), np.arange(1, 5)
     expected = (
-        offset + a @ (np.sin(0.8 * k * t) / (0.8 * k)) - b @ (np.cos(0.8 * k * t) / (0.8 * k))
+        offset
+        + a @ (np.sin(0.8 * k * t) / (0.8 * k))
+        - b @ (np.cos(0.8 * k * t) / (0.8 * k))
     )
-    np.testing.assert_allclose(fourier_series(offset, a, b, 0.8).motion(t).q, expected, atol=1e-14)
+    np.testing.assert_allclose(
+        fourier_series(offset, a, b, 0.8).motion(t).q, expected, atol=1e-14
+    )
 
 
 def test_leads_are_checked_and_one_period_between_them_is_measured():

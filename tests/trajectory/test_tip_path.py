@@ -25,7 +25,8 @@ def test_the_path_lies_on_one_inclined_plane_within_the_cube():
     away = places - [0.0, 0.65, 0.65]
     assert np.abs(away).max() < 0.25
     np.testing.assert_allclose(away[:, 0], away[:, 2], atol=1e-12)
-    # Corners a tenth of the diagonal inside; circles of 80 % of the edge and of a tenth of that.
+    # Corners a tenth of the diagonal inside; circles of 80 % of the edge and of a tenth
+    # of that.
     np.testing.assert_allclose(np.abs(away).max(axis=0), 0.2, atol=1e-6)
     radii = [piece.radius for piece in PATH.pieces if np.isfinite(piece.radius)]
     assert radii == pytest.approx([0.2, 0.02])
@@ -55,5 +56,7 @@ def test_the_attitude_is_held_and_the_joints_stay_within_their_limits(followed):
     assert (np.abs(motion.qd) <= limits.velocity).all()
     assert (np.abs(motion.qdd) <= limits.acceleration).all()
     fast = iso9283_path([0.0, 0.65, 0.65], 0.5, DOWN, speed=3.0, acceleration=40.0)
-    with pytest.raises(ValueError, match=r"joint `\w+` would need .* times its largest"):
+    with pytest.raises(
+        ValueError, match=r"joint `\w+` would need .* times its largest"
+    ):
         joint_path(ROBOT, fast, posture=BENT)

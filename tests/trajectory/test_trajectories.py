@@ -58,13 +58,17 @@ def chain() -> Segments:
 FAMILY = {
     "series": series(),
     "with leads": with_leads(series(), ARM, periods=2),
-    "leads of a basis": LeadsBasis(5, 0.8).trajectory(np.asarray(series().coefficients)),
+    "leads of a basis": LeadsBasis(5, 0.8).trajectory(
+        np.asarray(series().coefficients)
+    ),
     "spline by handles": RestToRestSplineBasis(6, 2.5).trajectory(POINTS.T),
     "padded": PaddedToCycle(spline_through(POINTS, 4.0), 0.03),
     "segments": chain(),
     "path of the end-effector": joint_path(
         library.tx90l_on_rail(),
-        TipPath((Line(np.array([0.2, 0.45, 0.65]), np.array([0.0, 0.65, 0.65])),), DOWN),
+        TipPath(
+            (Line(np.array([0.2, 0.45, 0.65]), np.array([0.0, 0.65, 0.65])),), DOWN
+        ),
         posture=[0.0, 1.57, 0.3, 1.6, 0.0, 0.5, 0.0],
     ),
 }
@@ -93,7 +97,9 @@ def test_any_shape_of_times_and_jit():
     trajectory, t = FAMILY["with leads"], np.linspace(0.0, 3.0, 6)
     assert trajectory.motion(0.5).q.shape == (trajectory.joints,)
     folded = jax.jit(lambda x: trajectory.motion(x).qdd)(t.reshape(2, 3))
-    np.testing.assert_allclose(folded.reshape(6, -1), trajectory.motion(t).qdd, atol=1e-9)
+    np.testing.assert_allclose(
+        folded.reshape(6, -1), trajectory.motion(t).qdd, atol=1e-9
+    )
 
 
 @pytest.mark.parametrize("name", FAMILY)
@@ -114,10 +120,14 @@ def test_splines_pass_their_points_and_keep_to_the_range_of_their_handles():
     assert (q >= POINTS.min(axis=0) - 1e-12).all()
 
 
-@pytest.mark.parametrize(("harmonics", "seed", "reach"), [(1, 0, 1.0), (5, 1, 0.5), (20, 2, 1.0)])
+@pytest.mark.parametrize(
+    ("harmonics", "seed", "reach"), [(1, 0, 1.0), (5, 1, 0.5), (20, 2, 1.0)]
+)
 def test_random_series_keep_and_use_limits_on_a_finer_grid(harmonics, seed, reach):
     robot = library.tx90l_on_rail()
-    s = random_fourier_series(robot, omega=0.8, harmonics=harmonics, reach=reach, seed=seed)
+    s = random_fourier_series(
+        robot, omega=0.8, harmonics=harmonics, reach=reach, seed=seed
+    )
     m = jax.tree.map(np.asarray, s.motion(np.arange(5_000) * s.duration / 5_000))
     lim = robot.limits
     middle = 0.5 * (lim.position_min + lim.position_max)
@@ -129,8 +139,11 @@ def test_random_series_keep_and_use_limits_on_a_finer_grid(harmonics, seed, reac
         np.abs(m.qdd).max(0) / lim.acceleration,
     ]
     assert np.max(use) <= reach + 1e-9
-    # Every joint meets its tightest limit, up to the bound for what lies between grid points.
-    assert np.max(use, axis=0).min() > reach * (math.cos(math.pi * harmonics / 512) - 1e-3)
+    # Every joint meets its tightest limit, up to the bound for what lies between grid
+    # points.
+    assert np.max(use, axis=0).min() > reach * (
+        math.cos(math.pi * harmonics / 512) - 1e-3
+    )
 
 
 def test_unknown_limits_are_assumed_as_documented():
@@ -152,7 +165,9 @@ def test_leads_keep_the_limits_and_follow_the_series_between():
         times = np.linspace(0.0, float(led.duration), 5_000)
         m, lim = jax.tree.map(np.asarray, led.motion(times)), robot.limits
         assert np.max([m.q - lim.position_max, lim.position_min - m.q]) <= 1e-8
-        assert np.max(np.abs([m.qd / lim.velocity, m.qdd / lim.acceleration])) <= 1 + 1e-8
+        assert (
+            np.max(np.abs([m.qd / lim.velocity, m.qdd / lim.acceleration])) <= 1 + 1e-8
+        )
         assert (np.abs(np.asarray(led.jerk(times))) / lim.jerk).max() <= 1 + 1e-6
         begin, end = (float(x) for x in led.window)
         assert end - begin == pytest.approx(2 * inner.duration)
@@ -193,12 +208,18 @@ SIDE = Line(np.zeros(3), np.array([1.0, 0.0, 0.0]))
         (lambda: Segments(()), "`members`"),
         (jump(1e-3), r"coordinate of joint \d"),
         (jump(0.0), "velocity of joint"),
-        (lambda: Segments((series(), series(PANDA))), "`members` 1 and 2 must move the same"),
+        (
+            lambda: Segments((series(), series(PANDA))),
+            "`members` 1 and 2 must move the same",
+        ),
         (lambda: iso9283_path([0.0, 0.0], 1.0, DOWN), "centre"),
         (lambda: TipPath((SIDE,), DOWN, speed=0.0), "speed"),
         (lambda: TipPath((), DOWN), "pieces"),
         (lambda: TipPath((SIDE, SIDE), DOWN), "piece 2 of `pieces`"),
-        (lambda: TipPath((Line(np.zeros(3), np.zeros(3)),), DOWN), "piece 1 of `pieces`"),
+        (
+            lambda: TipPath((Line(np.zeros(3), np.zeros(3)),), DOWN),
+            "piece 1 of `pieces`",
+        ),
     ],
 )
 def test_refuses(make, name):
@@ -220,7 +241,10 @@ def test_files_that_hold_no_trajectory_are_refused(tmp_path):
     for change, name in (
         ({"format": "other"}, "`format`"),
         ({"trajectory": {**inner, "kind": "Waltz"}}, "`Waltz`"),
-        ({"trajectory": {**inner, "coefficients": "fast"}}, r"`trajectory\.coefficients`"),
+        (
+            {"trajectory": {**inner, "coefficients": "fast"}},
+            r"`trajectory\.coefficients`",
+        ),
     ):
         path.write_text(json.dumps({**good, **change}))
         with pytest.raises(ValueError, match=name):
@@ -237,7 +261,9 @@ def test_a_table_has_units_and_exact_numbers(tmp_path):
     times, motion = trajectory.sample(0.01)
     expected = np.column_stack([times, motion.q, motion.qd, motion.qdd])
     np.testing.assert_array_equal(table.to_numpy(), expected)
-    with pytest.raises(ValueError, match="`trajectory` must move the 6 joints of `UR10`"):
+    with pytest.raises(
+        ValueError, match="`trajectory` must move the 6 joints of `UR10`"
+    ):
         write_csv(series(), library.ur10(), tmp_path / "t.csv", sample_time=0.1)
 
 
@@ -254,10 +280,16 @@ def test_a_bag_of_ros_2_holds_the_motion_bit_by_bit(tmp_path):
     assert connection.msgtype == "trajectory_msgs/msg/JointTrajectory"
     assert tuple(message.joint_names) == robot.joint_names
     times, expected = motion.sample(0.01)
-    for name, short in (("positions", "q"), ("velocities", "qd"), ("accelerations", "qdd")):
+    for name, short in (
+        ("positions", "q"),
+        ("velocities", "qd"),
+        ("accelerations", "qdd"),
+    ):
         found = [getattr(point, name) for point in message.points]
         np.testing.assert_array_equal(found, getattr(expected, short))
-    found = [p.time_from_start.sec + 1e-9 * p.time_from_start.nanosec for p in message.points]
+    found = [
+        p.time_from_start.sec + 1e-9 * p.time_from_start.nanosec for p in message.points
+    ]
     np.testing.assert_allclose(found, times, rtol=0, atol=1e-9)
     # The independent reader of MCAP finds the same bytes.
     reader = pytest.importorskip("mcap.reader")
@@ -276,9 +308,15 @@ def test_universal_robots_play_every_position_in_turn(tmp_path):
     assert head.startswith("# Motion of `UR10`: 983 positions [rad], one in 0.008 s")
     assert (first, stop, end) == ("def play_motion():", "  stopj(2.0)", "end")
     pattern = re.compile(r"  servoj\(\[(.*)\], 0, 0, 0\.008, 0\.1, 300\)")
-    rows = [[float(x) for x in pattern.fullmatch(line)[1].split(", ")] for line in played]
+    rows = [
+        [float(x) for x in pattern.fullmatch(line)[1].split(", ")] for line in played
+    ]
     np.testing.assert_allclose(rows, motion.sample(0.008)[1].q, rtol=0, atol=5.1e-10)
-    assert start == f"  movej({played[0].partition('(')[2].partition(', 0, 0')[0]}, a=0.5, v=0.3)"
+    assert (
+        start
+        == f"  movej({played[0].partition('(')[2].partition(', 0, 0')[0]}, a=0.5, "
+        "v=0.3)"
+    )
     assert "e-" not in "".join(played)
 
 
@@ -289,19 +327,25 @@ def test_rsi_gets_degrees_from_the_start(tmp_path):
     table = pl.read_csv(tmp_path / "motion.rsi.csv")
     assert table.columns == [f"AK.A{k} [deg]" for k in range(1, 7)]
     q = motion.sample(0.004)[1].q
-    np.testing.assert_allclose(table.to_numpy() * np.pi / 180, q - q[0], rtol=0, atol=1e-14)
+    np.testing.assert_allclose(
+        table.to_numpy() * np.pi / 180, q - q[0], rtol=0, atol=1e-14
+    )
 
 
 @pytest.mark.parametrize("robot", [library.tx90l_on_rail(), library.panda()])
 def test_a_controller_refuses_another_robot(robot):
-    with pytest.raises(InputError, match="`controller` moves robots of 6 revolute joints, but `"):
+    with pytest.raises(
+        InputError, match="`controller` moves robots of 6 revolute joints, but `"
+    ):
         CONTROLLERS["universal_robots"].require(robot)
 
 
 def test_ros_messages_parse_back(tmp_path):
     yaml = pytest.importorskip("yaml")
     # Tiny numbers and separators in names survive.
-    tiny = fourier_series(np.full(2, 1e-7), np.full((2, 2), 1e-12), np.full((2, 2), 3.0), 0.8)
+    tiny = fourier_series(
+        np.full(2, 1e-7), np.full((2, 2), 1e-12), np.full((2, 2), 3.0), 0.8
+    )
     names = ('rail, "x"', "1e-5: b # c")
     robot = ARM.replace(joint_names=names)
     write_ros(tiny, robot, tmp_path / "t.yaml", sample_time=0.5)

@@ -19,12 +19,13 @@ PRINCIPAL = 7
 class RigidBodies(AbstractTerm):
     r"""Inertia and gravity of the bodies by the Projection Equation (Eqs. 1-12).
 
-    Ten parameters for each body: mass $m$ [kg], first moment $m r_c$ [kg m], and the moments
-    $A, B, C, D, E, F$ [kg m²] of $J^o$ about the origin of the body's frame (Eq. 9).
+    Ten parameters for each body: mass $m$ [kg], first moment $m r_c$ [kg m], and the
+    moments $A, B, C, D, E, F$ [kg m²] of $J^o$ about the origin of the body's frame
+    (Eq. 9).
 
     Attributes:
-        principal_axes: Whether $D, E, F$ are left out, as in the paper (Eq. 12), which leaves seven
-            for each body.
+        principal_axes: Whether $D, E, F$ are left out, as in the paper (Eq. 12), which
+            leaves seven for each body.
     """
 
     principal_axes: bool = eqx.field(static=True, default=False)
@@ -36,15 +37,21 @@ class RigidBodies(AbstractTerm):
 
     def parameters(self, robot: Robot) -> tuple[tuple[str, str], ...]:
         """Return `m1`, `mx1`, … `F1`, then those of the next body."""
-        each = list(zip(INERTIAL_NAMES, INERTIAL_UNITS, strict=True))[: self.body_parameters]
-        return tuple((f"{name}{i + 1}", unit) for i in range(robot.joints) for name, unit in each)
+        each = list(zip(INERTIAL_NAMES, INERTIAL_UNITS, strict=True))[
+            : self.body_parameters
+        ]
+        return tuple(
+            (f"{name}{i + 1}", unit) for i in range(robot.joints) for name, unit in each
+        )
 
     def columns(self, robot, q, qd, qdd):
         r"""Return the columns $[\Theta_1 \dots \Theta_n]$ (Eq. 11)."""
         theta = projection_equation.rigid_body_regressor(robot, q, qd, qdd)
         return theta[:, :, : self.body_parameters].reshape(robot.joints, -1)
 
-    def all_ten(self, robot: Robot, p: Float[AnyArray, " columns"]) -> Float[AnyArray, "joints 10"]:
+    def all_ten(
+        self, robot: Robot, p: Float[AnyArray, " columns"]
+    ) -> Float[AnyArray, "joints 10"]:
         """Return ten parameters of all bodies, with zeros for those that are left out."""
         bodies = p.reshape(robot.joints, self.body_parameters)
         if not self.principal_axes:
@@ -54,11 +61,15 @@ class RigidBodies(AbstractTerm):
 
     def forces(self, robot, p, q, qd, qdd):
         """Return the projected wrenches of all bodies, without forming the regressor (Eq. 11)."""
-        return projection_equation.rigid_body_forces(robot, self.all_ten(robot, p), q, qd, qdd)
+        return projection_equation.rigid_body_forces(
+            robot, self.all_ten(robot, p), q, qd, qdd
+        )
 
     def mass_matrix(self, robot, p, q):
         """Return the mass matrix of the bodies (Eq. 38)."""
-        return projection_equation.rigid_body_mass_matrix(robot, self.all_ten(robot, p), q)
+        return projection_equation.rigid_body_mass_matrix(
+            robot, self.all_ten(robot, p), q
+        )
 
     @property
     def spatial_form(self) -> "SpatialBodies":
@@ -82,7 +93,9 @@ class SpatialBodies(RigidBodies):
 
     def forces(self, robot, p, q, qd, qdd):
         """Return the generalised forces of all bodies (Eq. 11)."""
-        return spatial_dynamics.spatial_forces(robot, self.all_ten(robot, p), q, qd, qdd)
+        return spatial_dynamics.spatial_forces(
+            robot, self.all_ten(robot, p), q, qd, qdd
+        )
 
     def mass_matrix(self, robot, p, q):
         """Return the mass matrix of the bodies (Eq. 38)."""
@@ -90,7 +103,9 @@ class SpatialBodies(RigidBodies):
 
     def mass_and_bias(self, robot, p, q, qd):
         """Return the mass matrix of the bodies and their bias forces (Eq. 38)."""
-        return spatial_dynamics.spatial_mass_and_bias(robot, self.all_ten(robot, p), q, qd)
+        return spatial_dynamics.spatial_mass_and_bias(
+            robot, self.all_ten(robot, p), q, qd
+        )
 
 
 class RotorInertia(AbstractTerm):
@@ -107,10 +122,11 @@ class RotorInertia(AbstractTerm):
 class TorqueRipple(AbstractTerm):
     r"""Forces that repeat with the turns of the motors or of the joints.
 
-    Cogging, commutation and gears that run out of true: $\sin k\varphi_i$ and $\cos k\varphi_i$ for
-    each multiple $k$ of a turn, where $\varphi_i$ is the motor's angle $(A q)_i$ (Eq. 19) or the
-    joint's. The parameters of motor 1 at $k$ = 2 are `sm2_1` and `cm2_1`, those of joint 1 `sj2_1`
-    and `cj2_1` [N m or N], all on the side of the joints.
+    Cogging, commutation and gears that run out of true: $\sin k\varphi_i$ and $\cos
+    k\varphi_i$ for each multiple $k$ of a turn, where $\varphi_i$ is the motor's angle
+    $(A q)_i$ (Eq. 19) or the joint's. The parameters of motor 1 at $k$ = 2 are `sm2_1`
+    and `cm2_1`, those of joint 1 `sj2_1` and `cj2_1` [N m or N], all on the side of the
+    joints.
 
     Attributes:
         motor: Multiples of a motor's turn.
@@ -123,7 +139,9 @@ class TorqueRipple(AbstractTerm):
     def __check_init__(self):
         multiples = (*self.motor, *self.joint)
         if not multiples or not all(isinstance(k, int) and k > 0 for k in multiples):
-            raise InputError(f"`TorqueRipple` needs positive whole multiples, not {multiples}.")
+            raise InputError(
+                f"`TorqueRipple` needs positive whole multiples, not {multiples}."
+            )
 
     def parameters(self, robot):
         """Return names and units: for each multiple the sines, then the cosines."""
@@ -139,7 +157,9 @@ class TorqueRipple(AbstractTerm):
         """Return sines and cosines of the angles; coupled motors act on all axes they turn."""
         A, eye = np.asarray(robot.drives.reduction), np.eye(robot.joints)
         ratios = A / np.where(np.diag(A) == 0, 1.0, np.diag(A))[:, None]
-        waves = [(A @ q, ratios.T, k) for k in self.motor] + [(q, eye, k) for k in self.joint]
+        waves = [(A @ q, ratios.T, k) for k in self.motor] + [
+            (q, eye, k) for k in self.joint
+        ]
         parts = [
             matrix * wave(k * angles)[None]
             for angles, matrix, k in waves
@@ -164,7 +184,8 @@ class LinearSpring(AbstractTerm):
     Its parameters are the stiffnesses `ks1`, … [N m/rad or N/m].
 
     Attributes:
-        rest: Position without force [rad or m]; an unknown one appears as a `ConstantOffset`.
+        rest: Position without force [rad or m]; an unknown one appears as a
+            `ConstantOffset`.
     """
 
     rest: float | Joints = eqx.field(converter=one_or_each, default=0.0)

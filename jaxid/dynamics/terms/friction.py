@@ -8,7 +8,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Float, Hashable, Joints, matching, namespace, one_or_each
+from jaxid.arrays import (
+    AnyArray,
+    Float,
+    Hashable,
+    Joints,
+    matching,
+    namespace,
+    one_or_each,
+)
 from jaxid.dynamics import projection_equation
 from jaxid.errors import InputError
 from jaxid.robot.inertia import INERTIAL_NAMES
@@ -43,8 +51,8 @@ class Tanh(AbstractTransition):
     r"""The smooth transition $\tanh(\dot q / \epsilon_c)$ (Eq. 14).
 
     Attributes:
-        epsilon: Speed of the transition, one for all joints or one for each, in the joint's own
-            unit [rad/s or m/s].
+        epsilon: Speed of the transition, one for all joints or one for each, in the
+            joint's own unit [rad/s or m/s].
         dead_zone: Speed below which there is no force, likewise [rad/s or m/s].
     """
 
@@ -52,9 +60,12 @@ class Tanh(AbstractTransition):
     dead_zone: EachJoint = eqx.field(converter=one_or_each, default=0.0)
 
     def __check_init__(self):
-        if not isinstance(self.epsilon, jax.Array) and not np.all(np.asarray(self.epsilon) > 0):
+        if not isinstance(self.epsilon, jax.Array) and not np.all(
+            np.asarray(self.epsilon) > 0
+        ):
             raise InputError(
-                f"`epsilon` must be positive, but is {self.epsilon}: `HardSign` has no width."
+                f"`epsilon` must be positive, but is {self.epsilon}: `HardSign` has "
+                "no width."
             )
 
     def __call__(self, qd):
@@ -85,15 +96,19 @@ class HardSign(AbstractTransition):
 class Presliding(AbstractTransition):
     r"""Dry friction with memory: a state that follows the motion, and that rest keeps.
 
-    A joint deforms its contacts before it slides: the state $s$ between -1 and 1 obeys Dahl's law
-    $\mathrm{d}s = (\mathrm{d}q - s\,|\mathrm{d}q|) / \delta$ (Dahl, AIAA Journal 14(12), 1976).
-    It depends on the path alone, not on time. Where no path is known, as at single samples and in
-    the design of motions, the state is that of steady motion.
+    A joint deforms its contacts before it slides: the state $s$ between -1 and 1 obeys
+    Dahl's law $\mathrm{d}s = (\mathrm{d}q - s\,|\mathrm{d}q|) / \delta$ (Dahl, AIAA
+    Journal 14(12), 1976). It depends on the path alone, not on time. Where no path is
+    known, as at single samples and in the design of motions, the state is that of
+    steady motion.
 
     Attributes:
-        length: Length $\delta$ of the deformation, one for all joints or one for each [rad or m].
-        steady: Transition that gives the state of steady motion, and that at the start of a path.
-        motors: Turns of motors for those of joints, if motors turn several axes: they have states.
+        length: Length $\delta$ of the deformation, one for all joints or one for each
+            [rad or m].
+        steady: Transition that gives the state of steady motion, and that at the start
+            of a path.
+        motors: Turns of motors for those of joints, if motors turn several axes: they
+            have states.
         state: State at one sample, where it is known.
     """
 
@@ -103,19 +118,25 @@ class Presliding(AbstractTransition):
     state: States | None = None
 
     def __check_init__(self):
-        if not isinstance(self.length, jax.Array) and not np.all(np.asarray(self.length) > 0):
+        if not isinstance(self.length, jax.Array) and not np.all(
+            np.asarray(self.length) > 0
+        ):
             raise InputError(f"`length` must be positive, but is {self.length}.")
 
     def __call__(self, qd):
         """Return the state: where it is not known, that of steady motion."""
-        return self.steady(qd) if self.state is None else self.state[..., : qd.shape[-1]]
+        return (
+            self.steady(qd) if self.state is None else self.state[..., : qd.shape[-1]]
+        )
 
     def of_motors(self, speeds: Joints) -> Joints:
         """Return the states of the motors: where they are not known, those of steady motion."""
         s = None if self.motors is None else self.state
         return self.steady(speeds) if s is None else s[..., speeds.shape[-1] :]
 
-    def settled(self, qd: Float[AnyArray, "*batch joints"]) -> Float[AnyArray, "*batch states"]:
+    def settled(
+        self, qd: Float[AnyArray, "*batch joints"]
+    ) -> Float[AnyArray, "*batch states"]:
         """Return the states of steady motion."""
         return self._with_motors(qd, self.steady)
 
@@ -123,7 +144,9 @@ class Presliding(AbstractTransition):
         """Return a function of the joints, followed by that of their motors."""
         if self.motors is None:
             return function(x)
-        return namespace(x).concatenate([function(x), function(x @ self.motors.T)], axis=-1)
+        return namespace(x).concatenate(
+            [function(x), function(x @ self.motors.T)], axis=-1
+        )
 
     def _strain(self, change: AnyArray) -> AnyArray:
         """Return steps of joints and motors, relative to their lengths [1]."""
@@ -137,7 +160,9 @@ class Presliding(AbstractTransition):
         return way + (s - way) * jnp.exp(-jnp.abs(strain))
 
     def states(
-        self, q: Float[AnyArray, "*batch samples joints"], start: Float[AnyArray, "*batch states"]
+        self,
+        q: Float[AnyArray, "*batch samples joints"],
+        start: Float[AnyArray, "*batch states"],
     ) -> Float[AnyArray, "*batch samples states"]:
         """Return the states along a path, from that at its first sample."""
         xp = namespace(q)
@@ -146,7 +171,8 @@ class Presliding(AbstractTransition):
         s = xp.concatenate([xp.asarray(start)[None], xp.sign(strain) * (1 - kept)])
         kept = xp.concatenate([xp.zeros_like(s[:1]), kept])
         reach = 1
-        # Each turn joins twice as many steps to one, which is affine in the state before it.
+        # Each turn joins twice as many steps to one, which is affine in the state
+        # before it.
         while reach < len(s):
             s = xp.concatenate([s[:reach], s[reach:] + kept[reach:] * s[:-reach]])
             kept = xp.concatenate([kept[:reach], kept[reach:] * kept[:-reach]])
@@ -157,13 +183,15 @@ class Presliding(AbstractTransition):
 class Reversal(AbstractTransition):
     """Another transition that keeps one direction near standstill, for bounds of forces.
 
-    At a reversal dry friction jumps, at an instant that no grid of samples contains. Between the
-    two sides of this class lies every force on the way, and both change smoothly.
+    At a reversal dry friction jumps, at an instant that no grid of samples contains.
+    Between the two sides of this class lies every force on the way, and both change
+    smoothly.
 
     Attributes:
         own: Transition elsewhere.
         side: Direction that is kept near standstill, 1 or -1.
-        width: Speeds up to which it is kept; at twice these it has faded [rad/s or m/s].
+        width: Speeds up to which it is kept; at twice these it has faded [rad/s or
+            m/s].
     """
 
     own: AbstractTransition
@@ -173,7 +201,9 @@ class Reversal(AbstractTransition):
     def __call__(self, qd):
         """Return the other transition, drawn to the side."""
         one = jnp.ones_like(qd)
-        near = jnp.minimum(one, jnp.maximum(0 * one, 2 * one - jnp.abs(qd) / self.width))
+        near = jnp.minimum(
+            one, jnp.maximum(0 * one, 2 * one - jnp.abs(qd) / self.width)
+        )
         near = near**2 * (3 - 2 * near)
         value = self.own(qd)
         return value + near * (self.side - value)
@@ -190,14 +220,17 @@ class AbstractDryFriction(AbstractTerm):
     """Friction with a `transition` from one direction of motion to the other."""
 
     transition: eqx.AbstractVar[AbstractTransition]
-    # Where not, it is identified only if chosen: `CoulombFriction` determines it better.
+    # Where not, it is identified only if chosen: `CoulombFriction` determines it
+    # better.
     determines_transition: ClassVar[bool] = True
 
     @property
     def nonlinear_parameters(self):
         """Those of the transition."""
         own = (x.inside("transition") for x in self.transition.nonlinear_parameters)
-        return tuple(x._replace(default=x.default and self.determines_transition) for x in own)
+        return tuple(
+            x._replace(default=x.default and self.determines_transition) for x in own
+        )
 
 
 class ViscousFriction(AbstractTerm):
@@ -214,8 +247,8 @@ class ViscousFriction(AbstractTerm):
 class AsymmetricViscousFriction(AbstractTerm):
     """Friction that grows with speed, at one rate for each direction of motion.
 
-    It takes the place of `ViscousFriction`. Its parameters are `fvp1`, … for positive, then `fvn1`,
-    … for negative speeds [N m s or N s/m].
+    It takes the place of `ViscousFriction`. Its parameters are `fvp1`, … for positive,
+    then `fvn1`, … for negative speeds [N m s or N s/m].
     """
 
     symbols = (("fvp", "N m s", "N s/m"), ("fvn", "N m s", "N s/m"))
@@ -224,7 +257,9 @@ class AsymmetricViscousFriction(AbstractTerm):
     def columns(self, robot, q, qd, qdd):
         """Return the diagonal matrices of speeds in either direction."""
         size = jnp.abs(qd)
-        return jnp.concatenate([jnp.diag(0.5 * (qd + size)), jnp.diag(0.5 * (qd - size))], axis=1)
+        return jnp.concatenate(
+            [jnp.diag(0.5 * (qd + size)), jnp.diag(0.5 * (qd - size))], axis=1
+        )
 
 
 class CoulombFriction(AbstractDryFriction):
@@ -242,9 +277,9 @@ class CoulombFriction(AbstractDryFriction):
 class AsymmetricCoulombFriction(AbstractDryFriction):
     """Dry friction with one level for each direction of motion.
 
-    It takes the place of `CoulombFriction` together with `ConstantOffset`, whose columns its own
-    columns span. Its parameters are `fcp1`, … for positive, then `fcn1`, … for negative speeds
-    [N m or N].
+    It takes the place of `CoulombFriction` together with `ConstantOffset`, whose
+    columns its own columns span. Its parameters are `fcp1`, … for positive, then
+    `fcn1`, … for negative speeds [N m or N].
     """
 
     transition: AbstractTransition = Tanh()
@@ -259,14 +294,17 @@ class AsymmetricCoulombFriction(AbstractDryFriction):
         if isinstance(dead_zone, jax.Array) or np.any(dead_zone):
             # Within a dead zone both fractions vanish, as the force does.
             moving = jnp.where(s == 0.0, s, jnp.ones_like(s))
-        return jnp.concatenate([jnp.diag(0.5 * (moving + s)), jnp.diag(0.5 * (s - moving))], axis=1)
+        return jnp.concatenate(
+            [jnp.diag(0.5 * (moving + s)), jnp.diag(0.5 * (s - moving))], axis=1
+        )
 
 
 class SquareRootFriction(AbstractDryFriction):
     r"""Friction that grows more slowly than speed.
 
-    $\sqrt{|\dot q_i| / v_1} \tanh(\dot q_i / \epsilon)$: with $v_1$ = 1 rad/s or 1 m/s, its
-    parameters `fr1`, … are the forces at that speed [N m or N]. It is used beside dry and viscous
+    $\sqrt{|\dot q_i| / v_1} \tanh(\dot q_i / \epsilon)$: with $v_1$ = 1 rad/s or 1 m/s,
+    its parameters `fr1`, … are the forces at that speed [N m or N]. It is used beside
+    dry and viscous
     friction: greased gears often lie between the two.
     """
 
@@ -284,12 +322,14 @@ class SquareRootFriction(AbstractDryFriction):
 class StribeckFriction(AbstractDryFriction):
     r"""Dry friction that falls from a static level to Coulomb's as a joint gets moving.
 
-    $(f_c + f_s e^{-|\dot q / v_s|^\delta}) \tanh(\dot q / \epsilon)$ with $f_c$ and $f_s$ unknown:
-    `fc1`, … at speed, then `fs1`, … that is added near standstill [N m or N].
-    It takes the place of `CoulombFriction`. (Armstrong-Hélouvry, Dupont and Canudas de Wit, 1994.)
+    $(f_c + f_s e^{-|\dot q / v_s|^\delta}) \tanh(\dot q / \epsilon)$ with $f_c$ and
+    $f_s$ unknown: `fc1`, … at speed, then `fs1`, … that is added near standstill [N m
+    or N]. It takes the place of `CoulombFriction`. (Armstrong-Hélouvry, Dupont and
+    Canudas de Wit, 1994.)
 
     Attributes:
-        speed: Stribeck's speed $v_s$, one for all joints or one for each [rad/s or m/s].
+        speed: Stribeck's speed $v_s$, one for all joints or one for each [rad/s or
+            m/s].
         exponent: Exponent $\delta$, likewise [1].
         transition: Transition from one direction of motion to the other.
     """
@@ -305,8 +345,12 @@ class StribeckFriction(AbstractDryFriction):
         sign = self.transition(qd)
         relative = qd / matching("speed", self.speed, qd)
         # The small number keeps the logarithm finite at standstill.
-        power = 0.5 * matching("exponent", self.exponent, qd) * jnp.log(relative**2 + 1e-30)
-        return jnp.concatenate([jnp.diag(sign), jnp.diag(sign * jnp.exp(-jnp.exp(power)))], axis=1)
+        power = (
+            0.5 * matching("exponent", self.exponent, qd) * jnp.log(relative**2 + 1e-30)
+        )
+        return jnp.concatenate(
+            [jnp.diag(sign), jnp.diag(sign * jnp.exp(-jnp.exp(power)))], axis=1
+        )
 
     @property
     def nonlinear_parameters(self):
@@ -321,14 +365,14 @@ class StribeckFriction(AbstractDryFriction):
 class LoadFriction(AbstractDryFriction):
     r"""Dry friction in proportion to the weight on a joint, $|g_i(q)| \tanh(\dot q_i / \epsilon)$.
 
-    It is used beside `CoulombFriction`. The load is that of gravity alone, so that forces stay
-    linear in the accelerations; it follows from bodies that are known roughly: from CAD, or from an
-    earlier fit without this term.
+    It is used beside `CoulombFriction`. The load is that of gravity alone, so that
+    forces stay linear in the accelerations; it follows from bodies that are known
+    roughly: from CAD, or from an earlier fit without this term.
 
     Attributes:
-        bodies: Parameters of the bodies, ten each in the paper's order: one row for each body, or
-            standard parameters that begin with them, as those of a fit whose model begins with
-            `RigidBodies`.
+        bodies: Parameters of the bodies, ten each in the paper's order: one row for
+            each body, or standard parameters that begin with them, as those of a fit
+            whose model begins with `RigidBodies`.
         transition: Transition from one direction of motion to the other.
     """
 
@@ -352,7 +396,8 @@ class LoadFriction(AbstractDryFriction):
         given = np.size(self.bodies)
         if given < size:
             raise InputError(
-                f"`bodies` must begin with ten numbers for each body, but holds only {given}."
+                "`bodies` must begin with ten numbers for each body, but holds only "
+                f"{given}."
             )
         return self.bodies.ravel()[:size].reshape(robot.joints, -1)
 
@@ -403,20 +448,24 @@ class TemperatureScaled(AbstractTerm):
     def nonlinear_parameters(self):
         """Those of the term, and `rate1`, … [1/K] if chosen: it takes more than one recording."""
         inner = (x.inside("term") for x in self.term.nonlinear_parameters)
-        return (*inner, NonlinearParameter("rate", ("1/K", "1/K"), ("rate",), default=False))
+        return (
+            *inner,
+            NonlinearParameter("rate", ("1/K", "1/K"), ("rate",), default=False),
+        )
 
 
 class CoupledDrives(AbstractTerm):
     r"""Contributions beside the diagonal of motors that turn more than one axis.
 
-    A motor whose row of the reduction has further entries beside that of its own joint feels
-    its rotor inertia and friction on all of these axes. The diagonal parts belong to
-    `RotorInertia`, `ViscousFriction` and `CoulombFriction` of the axes; this term has the parts
-    beside the diagonal, and the Coulomb friction of the motor's own motion.
+    A motor whose row of the reduction has further entries beside that of its own joint
+    feels its rotor inertia and friction on all of these axes. The diagonal parts belong
+    to `RotorInertia`, `ViscousFriction` and `CoulombFriction` of the axes; this term
+    has the parts beside the diagonal, and the Coulomb friction of the motor's own
+    motion.
 
     Attributes:
-        transition: Transition of the Coulomb friction, at speeds measured on the side of the
-            motor's own joint [rad/s or m/s].
+        transition: Transition of the Coulomb friction, at speeds measured on the side
+            of the motor's own joint [rad/s or m/s].
     """
 
     transition: AbstractTransition = Tanh()
@@ -432,7 +481,8 @@ class CoupledDrives(AbstractTerm):
         if not np.diag(A).all():
             motor = int(np.flatnonzero(np.diag(A) == 0)[0]) + 1
             raise InputError(
-                f"`drives.reduction`: motor {motor} does not turn joint {motor}: reorder its rows."
+                f"`drives.reduction`: motor {motor} does not turn joint {motor}: "
+                "reorder its rows."
             )
         return tuple(
             (i, A[i] / A[i, i])
@@ -446,7 +496,8 @@ class CoupledDrives(AbstractTerm):
         couplings = self.couplings(robot)
         if not couplings:
             raise InputError(
-                f"the drives of `{robot.name}` are not coupled: leave `CoupledDrives` out, or give "
+                f"the drives of `{robot.name}` are not coupled: leave `CoupledDrives` "
+                "out, or give "
                 "`drives.reduction` entries beside its diagonal."
             )
         return tuple(
@@ -463,8 +514,11 @@ class CoupledDrives(AbstractTerm):
             inertia.append(beside.astype(qdd.dtype) @ qdd)
             viscous.append(beside.astype(qd.dtype) @ qd)
             r = ratios.astype(qd.dtype)
-            # The motor's speed takes the place of its joint's, whose transition width it has.
-            speeds = jnp.stack([jnp.dot(r, qd) if j == i else qd[j] for j in range(len(r))])
+            # The motor's speed takes the place of its joint's, whose transition width
+            # it has.
+            speeds = jnp.stack(
+                [jnp.dot(r, qd) if j == i else qd[j] for j in range(len(r))]
+            )
             dry.append(r * self.transition.of_motors(speeds)[i])
         return jnp.stack([*inertia, *viscous, *dry], axis=1)
 

@@ -21,7 +21,8 @@ class NonlinearParameter(NamedTuple):
     Attributes:
         name: Name without the joint's number.
         units: Units for a revolute and a prismatic joint.
-        path: Attributes that lead to it, from the term (or transition) that declares it.
+        path: Attributes that lead to it, from the term (or transition) that declares
+            it.
         default: Whether it is identified unless `NonlinearFriction` names others.
     """
 
@@ -42,15 +43,16 @@ class NonlinearParameter(NamedTuple):
 class AbstractTerm(eqx.Module):
     """One effect in the equations of motion that is linear in unknown parameters.
 
-    A new effect is one class with `columns`, and with `symbols` or the method `parameters`;
-    regressor, inverse dynamics, mass matrix, base parameters and compiled forms follow from them.
+    A new effect is one class with `columns`, and with `symbols` or the method
+    `parameters`; regressor, inverse dynamics, mass matrix, base parameters and compiled
+    forms follow from them.
 
     Attributes:
-        symbols: For each block of parameters with one for each joint the name without the joint's
-            number, and the units for a revolute and a prismatic joint.
-        roles: Physical role of each block of parameters, if the term has one or more blocks with
-            one parameter for each joint: rotor inertia, viscous or dry friction, or friction by
-            load. Parameters with a role cannot be negative.
+        symbols: For each block of parameters with one for each joint the name without
+            the joint's number, and the units for a revolute and a prismatic joint.
+        roles: Physical role of each block of parameters, if the term has one or more
+            blocks with one parameter for each joint: rotor inertia, viscous or dry
+            friction, or friction by load. Parameters with a role cannot be negative.
     """
 
     symbols: ClassVar[tuple[tuple[str, str, str], ...]] = ()
@@ -71,7 +73,12 @@ class AbstractTerm(eqx.Module):
         """Return the generalised forces [N m or N] of unit parameters, for one sample."""
 
     def forces(
-        self, robot: Robot, p: Float[AnyArray, " columns"], q: Joints, qd: Joints, qdd: Joints
+        self,
+        robot: Robot,
+        p: Float[AnyArray, " columns"],
+        q: Joints,
+        qd: Joints,
+        qdd: Joints,
     ) -> Joints:
         """Return the generalised forces [N m or N] of given parameters, for one sample."""
         return self.columns(robot, q, qd, qdd) @ p
@@ -87,7 +94,9 @@ class AbstractTerm(eqx.Module):
         self, robot: Robot, p: Float[AnyArray, " columns"], q: Joints, qd: Joints
     ) -> tuple[Float[AnyArray, "joints joints"], Joints]:
         """Return the mass matrix, and the generalised forces without accelerations (Eq. 38)."""
-        return self.mass_matrix(robot, p, q), self.forces(robot, p, q, qd, jnp.zeros_like(q))
+        return self.mass_matrix(robot, p, q), self.forces(
+            robot, p, q, qd, jnp.zeros_like(q)
+        )
 
     def potential_columns(self, robot: Robot, q: Joints) -> Float[AnyArray, " columns"]:
         """Return the potential energy [J] of unit parameters; zero unless energy is stored."""
@@ -111,7 +120,9 @@ class AbstractTerm(eqx.Module):
                 bounds[k * robot.joints : (k + 1) * robot.joints] = 0.0
         return bounds
 
-    def drive_matrices(self, robot: Robot) -> Float[np.ndarray, "2 joints joints columns"]:
+    def drive_matrices(
+        self, robot: Robot
+    ) -> Float[np.ndarray, "2 joints joints columns"]:
         """Return the drives' inertia and viscous friction of unit parameters.
 
         Both are symmetric and cannot be negative for any motion.

@@ -18,11 +18,11 @@ class BodyBounds(eqx.Module):
 
     Attributes:
         mass_max: Largest mass of each body [kg], like `50.0`.
-        radius: Radius of the sphere about the origin of each body's frame that holds it [m], like
-            `0.6`.
+        radius: Radius of the sphere about the origin of each body's frame that holds it
+            [m], like `0.6`.
         mass_min: Smallest mass of each body [kg], like `0.5`.
-        centre_min: Lower corners of boxes for the centres of mass [m], like `[-0.2, -0.2, 0.0]`;
-            -inf for none.
+        centre_min: Lower corners of boxes for the centres of mass [m], like `[-0.2,
+            -0.2, 0.0]`; -inf for none.
         centre_max: Upper corners [m], like `[0.2, 0.2, 0.5]`; inf for none.
         ellipsoid_centre: Centres of ellipsoids that hold the centres of mass [m], like
             `[0.0, 0.0, 0.2]`.
@@ -34,10 +34,18 @@ class BodyBounds(eqx.Module):
     mass_max: Float[np.ndarray, " bodies"] = eqx.field(converter=given)
     radius: Float[np.ndarray, " bodies"] = eqx.field(converter=given)
     mass_min: Float[np.ndarray, " bodies"] = eqx.field(converter=given, default=0.0)
-    centre_min: Float[np.ndarray, "bodies 3"] = eqx.field(converter=given, default=-np.inf)
-    centre_max: Float[np.ndarray, "bodies 3"] = eqx.field(converter=given, default=np.inf)
-    ellipsoid_centre: Float[np.ndarray, "bodies 3"] = eqx.field(converter=given, default=0.0)
-    ellipsoid_axes: Float[np.ndarray, "bodies 3"] = eqx.field(converter=given, default=np.inf)
+    centre_min: Float[np.ndarray, "bodies 3"] = eqx.field(
+        converter=given, default=-np.inf
+    )
+    centre_max: Float[np.ndarray, "bodies 3"] = eqx.field(
+        converter=given, default=np.inf
+    )
+    ellipsoid_centre: Float[np.ndarray, "bodies 3"] = eqx.field(
+        converter=given, default=0.0
+    )
+    ellipsoid_axes: Float[np.ndarray, "bodies 3"] = eqx.field(
+        converter=given, default=np.inf
+    )
     total_mass: float | None = eqx.field(converter=optional, default=None)
 
     def __post_init__(self):
@@ -58,7 +66,9 @@ class BodyBounds(eqx.Module):
             if not good.all():
                 k = np.argwhere(~good)[0, 0]
                 value = getattr(self, name)[k]
-                raise InputError(f"`{name}` must be {rule}, but body {k + 1} has {value}.")
+                raise InputError(
+                    f"`{name}` must be {rule}, but body {k + 1} has {value}."
+                )
         total = self.total_mass
         if total is not None and not low.sum() < total < high.sum():
             span = f"{low.sum():g} to {high.sum():g} kg"
@@ -69,8 +79,9 @@ class BodyBounds(eqx.Module):
     def from_geometry(cls, robot: Robot) -> "BodyBounds":
         """Return wide bounds for a robot of which only the geometry is known.
 
-        A body extends beyond its neighbouring joints by at most a quarter of the robot's reach, and
-        weighs at most 100 kg times the square of the reach in metres.
+        A body extends beyond its neighbouring joints by at most a quarter of the
+        robot's reach, and weighs at most 100 kg times the square of the reach in
+        metres.
 
         Args:
             robot: Robot whose bodies are bounded.
@@ -130,7 +141,8 @@ class BodyBounds(eqx.Module):
         axes = np.where(known, self.ellipsoid_axes, radius)
         regions = (middle, axes), (0.0, radius)
         point, edge = 0.5 * (low + high), 0.1 * (high - low)
-        # Alternating projections onto the ellipsoid, the sphere and the box, each a little smaller.
+        # Alternating projections onto the ellipsoid, the sphere and the box, each a
+        # little smaller.
         for _ in range(200):
             for middle, axes in regions:
                 away = point - middle
@@ -142,7 +154,9 @@ class BodyBounds(eqx.Module):
             inside &= np.linalg.norm((point - middle) / axes, axis=1) < 0.99
         if not inside.all():
             k = int(np.argmin(inside))
-            raise InputError(f"no centre of mass of body {k + 1} fits its bounds: widen them.")
+            raise InputError(
+                f"no centre of mass of body {k + 1} fits its bounds: widen them."
+            )
         return point
 
 
@@ -150,22 +164,25 @@ def _of_each(name: str, value: Numbers, bodies: int, *shape: int) -> np.ndarray:
     """Return numbers of each body, given for each or for all."""
     array = np.array(value, np.float64)
     if np.isnan(array).any() or array.shape not in ((), shape, (bodies, *shape)):
-        raise InputError(f"`{name}` must be for all or each of {bodies} bodies: {value}.")
+        raise InputError(
+            f"`{name}` must be for all or each of {bodies} bodies: {value}."
+        )
     return np.broadcast_to(array, (bodies, *shape)).copy()
 
 
 class EntropicPull(eqx.Module):
     r"""Pull of the bodies towards those of a prior, along directions that the data do not see.
 
-    It adds $\gamma \sum_k \left( \mathrm{tr}(\Pi_{0k}^{-1} \Pi_k) - \ln \det \Pi_k \right)$ to half
-    the squared residuals in units of the noise: the Bregman divergence of pseudo-inertias, which
-    does not depend on frames or units, and which keeps bodies away from the boundary of physical
-    consistency.
+    It adds $\gamma \sum_k \left( \mathrm{tr}(\Pi_{0k}^{-1} \Pi_k) - \ln \det \Pi_k
+    \right)$ to half the squared residuals in units of the noise: the Bregman divergence
+    of pseudo-inertias, which does not depend on frames or units, and which keeps bodies
+    away from the boundary of physical consistency.
 
     Attributes:
-        bodies: Parameters $(m, m r_c, A, B, C, D, E, F)$ of the prior's bodies; None for balls of
-            medium size.
-        strength: Factor $\gamma$: 1 is weak, and already gives the mass matrix a margin.
+        bodies: Parameters $(m, m r_c, A, B, C, D, E, F)$ of the prior's bodies; None
+            for balls of medium size.
+        strength: Factor $\gamma$: 1 is weak, and already gives the mass matrix a
+            margin.
     """
 
     bodies: Float[AnyArray, "bodies 10"] | None = None
@@ -174,15 +191,21 @@ class EntropicPull(eqx.Module):
     def __check_init__(self):
         if not 0.0 < self.strength < np.inf:
             raise InputError(f"`strength` must be positive, but is {self.strength}.")
-        if self.bodies is not None and not (consistency_margin(self.bodies) > 0.0).all():
+        if (
+            self.bodies is not None
+            and not (consistency_margin(self.bodies) > 0.0).all()
+        ):
             k = int(np.argmin(consistency_margin(self.bodies))) + 1
-            raise InputError(f"body {k} of the prior's `bodies` needs a mass and an inertia.")
+            raise InputError(
+                f"body {k} of the prior's `bodies` needs a mass and an inertia."
+            )
 
 
 class ParameterPrior(eqx.Module):
     r"""Standard parameters that are known roughly, each with its own standard deviation (a ridge).
 
-    It adds $\frac12 \sum_i (p_i - p_{0i})^2 / \sigma_i^2$ to half the squares in units of noise.
+    It adds $\frac12 \sum_i (p_i - p_{0i})^2 / \sigma_i^2$ to half the squares in units
+    of noise.
 
     Attributes:
         parameters: Standard parameters.
@@ -194,5 +217,10 @@ class ParameterPrior(eqx.Module):
 
     def __check_init__(self):
         deviations = np.asarray(self.deviations)
-        if np.shape(self.parameters) != deviations.shape or not (deviations > 0.0).all():
-            raise InputError("`deviations` must be positive and as many as `parameters`.")
+        if (
+            np.shape(self.parameters) != deviations.shape
+            or not (deviations > 0.0).all()
+        ):
+            raise InputError(
+                "`deviations` must be positive and as many as `parameters`."
+            )

@@ -22,7 +22,13 @@ from jaxid.arrays import (
 from jaxid.dynamics.base import BaseParameters, Identifiability
 from jaxid.errors import InputError
 
-from ..estimators import AbstractEstimator, AbstractWeights, Complete, Estimate, MaximumForces
+from ..estimators import (
+    AbstractEstimator,
+    AbstractWeights,
+    Complete,
+    Estimate,
+    MaximumForces,
+)
 from . import solver
 from .bounds_and_priors import BodyBounds, EntropicPull, ParameterPrior
 from .program import (
@@ -37,7 +43,8 @@ from .program import (
 from .pseudo_inertia import consistency_margin, pseudo_inertia
 
 UNPROVED = (
-    "the squared residuals may exceed the smallest possible ones by {:.1e} of them; at most "
+    "the squared residuals may exceed the smallest possible ones by {:.1e} of them; "
+    "at most "
     f"{2 * solver.TOLERANCE:.0e} is a proof of the optimum."
 )
 """Message where the optimum was not proved."""
@@ -48,14 +55,19 @@ class Consistency(eqx.Module):
 
     Attributes:
         bodies: Parameters $(m, m r_c, A, B, C, D, E, F)$ of all bodies.
-        margins: Distances of the bodies from the boundary of physical consistency (0 to 1).
+        margins: Distances of the bodies from the boundary of physical consistency (0 to
+            1).
         bounds: Bounds of the bodies.
-        residual_increase: Relative increase of the norm of the weighted residuals by the bounds.
+        residual_increase: Relative increase of the norm of the weighted residuals by
+            the bounds.
         error_bound: Bound of the objective's relative distance to the optimum.
-        certified: Whether the error bound is below its tolerance: a proof of the optimum.
+        certified: Whether the error bound is below its tolerance: a proof of the
+            optimum.
         iterations: Number of iterations of the search.
-        determined: Standard parameters that the data determine alone, without the bounds.
-        masses_from_bounds: Bodies (0 is the first) whose masses reflect bounds or priors.
+        determined: Standard parameters that the data determine alone, without the
+            bounds.
+        masses_from_bounds: Bodies (0 is the first) whose masses reflect bounds or
+            priors.
         active: Names of the active bounds.
     """
 
@@ -74,12 +86,16 @@ class Consistency(eqx.Module):
     def findings(self) -> tuple[str, ...]:
         """Sentences about the effect of the bounds on residuals and parameters."""
         percent = 100 * self.residual_increase
-        found = [f"the weighted residuals are {percent:.2g} % larger than without bounds."]
+        found = [
+            f"the weighted residuals are {percent:.2g} % larger than without bounds."
+        ]
         if self.masses_from_bounds:
             names = ", ".join(f"m{k + 1}" for k in self.masses_from_bounds)
             found.append(
-                f"forces do not determine the masses {names} alone: their values, and parameters "
-                "that depend on them, reflect the bounds; base parameters and forces do not."
+                f"forces do not determine the masses {names} alone: their values, and "
+                "parameters "
+                "that depend on them, reflect the bounds; base parameters and forces "
+                "do not."
             )
         if self.active:
             found.append(f"active bounds: {'; '.join(self.active)}.")
@@ -89,17 +105,21 @@ class Consistency(eqx.Module):
 class PhysicallyConsistent(AbstractEstimator):
     r"""Weighted least squares over the standard parameters of bodies that can exist.
 
-    Every body's pseudo-inertia is positive semidefinite, masses and spheres are bounded, friction
-    and rotor inertias are nonnegative, and coupled drives have semidefinite matrices. The optimum
-    is found with an error bound, and the mass matrix is positive definite in every pose. Masses
-    that forces cannot tell apart reflect the bounds: `fit.consistency` names them.
+    Every body's pseudo-inertia is positive semidefinite, masses and spheres are
+    bounded, friction and rotor inertias are nonnegative, and coupled drives have
+    semidefinite matrices. The optimum is found with an error bound, and the mass matrix
+    is positive definite in every pose. Masses that forces cannot tell apart reflect the
+    bounds: `fit.consistency` names them.
 
     Attributes:
-        weights: Weights of the joints; by default the reciprocals of the largest forces (Eq. 30).
+        weights: Weights of the joints; by default the reciprocals of the largest forces
+            (Eq. 30).
         bounds: Bounds of the bodies; wide ones from the robot's geometry if None.
-        margin: Fraction (0 to 1) of a nominal ball that every body contains: the mass matrix
-            exceeds that fraction of the nominal balls' mass matrix in every pose.
-        pull: Pull towards the bodies of a prior, along directions that the data do not see.
+        margin: Fraction (0 to 1) of a nominal ball that every body contains: the mass
+            matrix exceeds that fraction of the nominal balls' mass matrix in every
+            pose.
+        pull: Pull towards the bodies of a prior, along directions that the data do not
+            see.
         prior: Standard parameters that are known roughly.
         throw: Whether an optimum without proof is an error; otherwise it is a note.
     """
@@ -126,7 +146,9 @@ class PhysicallyConsistent(AbstractEstimator):
         free = Estimate.solve(rows, weights, Complete())
         R, z = rows.factors.weighted(weights)
         feasible = self.feasible_set(base)
-        data, program = self.program(np, base, feasible, R, z, int(rows.factors.rows.sum()))
+        data, program = self.program(
+            np, base, feasible, R, z, int(rows.factors.rows.sum())
+        )
         optimum, error_bound = _solve(program, self.throw)
         p = feasible.standard_parameters(np, data, optimum.y)
         parameters = np.asarray(base.from_standard(p))
@@ -134,7 +156,9 @@ class PhysicallyConsistent(AbstractEstimator):
         bodies = np.pad(bodies, ((0, 0), (0, 10 - bodies.shape[1])))
         ours = float(np.linalg.norm(R @ parameters - z))
         best = float(np.linalg.norm(R @ free.parameters - z))
-        determined = np.array([x is Identifiability.ALONE for x in base.identifiability])
+        determined = np.array(
+            [x is Identifiability.ALONE for x in base.identifiability]
+        )
         lost = (k for k, own in enumerate(feasible.bodies) if not determined[own[0]])
         found = Consistency(
             bodies=bodies,
@@ -152,7 +176,8 @@ class PhysicallyConsistent(AbstractEstimator):
             *free.notes,
             f"physically consistent: {feasible.bounds}.",
             *found.findings,
-            "standard deviations are those of the estimate without bounds: where bounds are "
+            "standard deviations are those of the estimate without bounds: where "
+            "bounds are "
             "active, estimates scatter less.",
             *([] if optimum.certified else [UNPROVED.format(error_bound)]),
         )
@@ -201,13 +226,16 @@ def _solve(program: ConeProgram, throw: bool) -> tuple[solver.Optimum, float]:
     error_bound = float(optimum.error / max(optimum.value, program.scale))
     if throw and not optimum.certified:
         raise RuntimeError(
-            f"no physically consistent estimate with a proof: {UNPROVED.format(error_bound)} "
+            "no physically consistent estimate with a proof: "
+            f"{UNPROVED.format(error_bound)} "
             "Widen the bounds, or accept it with `throw=False`."
         )
     return optimum, error_bound
 
 
-def _active_bounds(base, feasible, program, optimum: solver.Optimum, bodies) -> tuple[str, ...]:
+def _active_bounds(
+    base, feasible, program, optimum: solver.Optimum, bodies
+) -> tuple[str, ...]:
     """Name the bounds that keep the estimate from a better one."""
 
     def numbers(chosen: np.ndarray) -> str:
@@ -218,7 +246,9 @@ def _active_bounds(base, feasible, program, optimum: solver.Optimum, bodies) -> 
     tight = solver.prices(program, optimum) > 0.01
     linear, drives = np.split(tight, [program.bodies * len(labels)])
     pairs = zip(labels, linear.reshape(program.bodies, -1).T, strict=True)
-    found = [f"{label} of body {numbers(active)}" for label, active in pairs if active.any()]
+    found = [
+        f"{label} of body {numbers(active)}" for label, active in pairs if active.any()
+    ]
     names = base.model.parameter_names
     for label, active in (("0", drives[:n]), ("their largest value", drives[n:])):
         if active.any():
@@ -246,8 +276,9 @@ def consistent_body(
         throw: Whether an optimum without proof is an error.
 
     Returns:
-        Parameters of the body; its distance from the estimate in standard deviations (below 4 is
-        not unusual); bound of half the squared distance's distance to the optimum.
+        Parameters of the body; its distance from the estimate in standard deviations
+        (below 4 is not unusual); bound of half the squared distance's distance to the
+        optimum.
 
     Raises:
         InputError: If the covariance is not positive definite.
@@ -259,7 +290,9 @@ def consistent_body(
     try:
         L = np.linalg.cholesky(C / size[:, None] / size)
     except np.linalg.LinAlgError as error:
-        raise InputError("`covariance` must be positive definite, but is not.") from error
+        raise InputError(
+            "`covariance` must be positive definite, but is not."
+        ) from error
     A = np.linalg.inv(L) / size
     b = A @ estimate
     feasible = FeasibleSet((tuple(range(10)),), (), (), bounds, np.zeros((1, 4, 4)), ())
@@ -275,7 +308,8 @@ class ConsistentBatch(eqx.Module):
     Attributes:
         standard: Standard parameters: complete bodies, friction, rotors.
         parameters: Base parameters.
-        residual_increases: Relative increases of the norms of the residuals by the bounds.
+        residual_increases: Relative increases of the norms of the residuals by the
+            bounds.
         error_bounds: Bounds of the objectives' relative distances to their optima.
         certified: Whether the bounds are within the tolerance.
         iterations: Numbers of iterations.
@@ -292,9 +326,10 @@ class ConsistentBatch(eqx.Module):
 class ConsistentSolver(Hashable):
     """Physically consistent estimates of one model: a function of arrays for `jit` and `vmap`.
 
-    The factors are those of `Factors.weighted`: their rows are weighted already, so the weights of
-    the estimator do not count. Equal solvers share their compiled functions. The solver is a loop
-    whose length depends on the data: there are no reverse-mode gradients.
+    The factors are those of `Factors.weighted`: their rows are weighted already, so the
+    weights of the estimator do not count. Equal solvers share their compiled functions.
+    The solver is a loop whose length depends on the data: there are no reverse-mode
+    gradients.
 
     Attributes:
         base: Base parameters of the factors' columns.
@@ -353,8 +388,8 @@ def consistent_batch(
 ) -> ConsistentBatch:
     """Estimate physically consistent parameters from the triangular factors of many data sets.
 
-    It is `ConsistentSolver`, compiled once for each model, estimator and shape, and spread over the
-    cores of the processor.
+    It is `ConsistentSolver`, compiled once for each model, estimator and shape, and
+    spread over the cores of the processor.
 
     Args:
         base: Base parameters of the factors' columns.
@@ -368,9 +403,15 @@ def consistent_batch(
         RuntimeError: If JAX's 64-bit mode is off.
     """
     count = len(R)
-    if not count or R.shape[-1] != base.size or z.shape != R.shape[:-1] or rows.shape != (count,):
+    if (
+        not count
+        or R.shape[-1] != base.size
+        or z.shape != R.shape[:-1]
+        or rows.shape != (count,)
+    ):
         raise InputError(
-            f"`R`, `z` and `rows` must have the shapes [datasets, height, {base.size}], [datasets, "
+            "`R`, `z` and `rows` must have the shapes [datasets, height, "
+            f"{base.size}], [datasets, "
             f"height] and [datasets], but have {R.shape}, {z.shape} and {rows.shape}."
         )
     arrays = np.asarray(R), np.asarray(z), np.asarray(rows)
@@ -385,7 +426,9 @@ def consistent_batch(
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _solve_many(one: ConsistentSolver, R: Array, z: Array, rows: Array) -> ConsistentBatch:
+def _solve_many(
+    one: ConsistentSolver, R: Array, z: Array, rows: Array
+) -> ConsistentBatch:
     def solve(together: int | None, *data: Array) -> ConsistentBatch:
         return jax.lax.map(lambda x: one(*x), data, batch_size=together)
 

@@ -1,8 +1,9 @@
 r"""Least squares over the parameters of bodies that can exist, as a small convex program.
 
-The variables are those of the bodies, equally many for each, then those of the drives. Bodies are
-measured in their largest masses and the radii of their spheres, drives in their largest values: all
-variables lie between -1 and 1. Distances to an optimum are then bounded, and units do not matter.
+The variables are those of the bodies, equally many for each, then those of the drives.
+Bodies are measured in their largest masses and the radii of their spheres, drives in
+their largest values: all variables lie between -1 and 1. Distances to an optimum are
+then bounded, and units do not matter.
 """
 
 from types import ModuleType
@@ -28,8 +29,8 @@ Number = Float[AnyArray, "*batch"] | np.floating
 class Coupling(NamedTuple):
     """Parameters of coupled drives that form one positive semidefinite matrix.
 
-    `basis` holds the matrices of unit parameters [columns, axes, axes], and `diagonal` for each
-    axis the parameter on the matrix's diagonal.
+    `basis` holds the matrices of unit parameters [columns, axes, axes], and `diagonal`
+    for each axis the parameter on the matrix's diagonal.
     """
 
     columns: tuple[int, ...]
@@ -83,18 +84,24 @@ class FeasibleSet(NamedTuple):
         """Return the units of the scaled variables: zero for drives without effect."""
         norms = xp.linalg.norm(data.A[:, np.array(self.drives, int)], axis=0)
         has_effect = norms > 1e-9 * xp.max(norms, initial=0.0)
-        # Upper bound: ten times the parameter that alone would produce all measured forces.
+        # Upper bound: ten times the parameter that alone would produce all measured
+        # forces.
         largest = 10.0 * xp.linalg.norm(data.b) / xp.where(has_effect, norms, 1.0)
         largest = xp.where(has_effect, largest, 0.0)
         for coupling in self.couplings:
-            # A matrix with a zero on its diagonal is never definite: take the others' bound there.
+            # A matrix with a zero on its diagonal is never definite: take the others'
+            # bound there.
             places = self.drive_places(coupling.columns)
             most = xp.max(largest[places])
             here = np.isin(np.arange(len(self.drives)), places)
-            largest = xp.where(here & (largest <= 0.0), xp.maximum(most, 1e-12), largest)
+            largest = xp.where(
+                here & (largest <= 0.0), xp.maximum(most, 1e-12), largest
+            )
         return xp.concatenate([self.body_scales.ravel(), largest])
 
-    def standard_parameters(self, xp: ModuleType, data: ScaledRows, y: Values) -> Values:
+    def standard_parameters(
+        self, xp: ModuleType, data: ScaledRows, y: Values
+    ) -> Values:
         """Return the standard parameters of scaled variables; columns without bounds are solved."""
         p = y * self.scales(xp, data)
         if self.free:
@@ -115,7 +122,8 @@ class FeasibleSet(NamedTuple):
     def linear_bounds(self) -> tuple[list[str], np.ndarray, np.ndarray]:
         """Return names, coefficients and constants of the bodies' linear bounds, scaled.
 
-        A bound holds where coefficients times a body's scaled variables plus constant is positive.
+        A bound holds where coefficients times a body's scaled variables plus constant
+        is positive.
         """
         bounds, w, K = self.bounds, self.width, len(self.bodies)
         mass, L = bounds.mass_max, bounds.radius
@@ -145,12 +153,18 @@ def feasible_set(model: Model, bounds: BodyBounds, margin: float = 0.0) -> Feasi
     starts = np.cumsum([0, *sizes[:-1]])
     widths = [term.body_parameters for term in model.terms]
     if not any(widths):
-        raise InputError("the model has no bodies to make consistent: add `RigidBodies()`.")
+        raise InputError(
+            "the model has no bodies to make consistent: add `RigidBodies()`."
+        )
     if len(bounds.radius) != robot.joints:
-        raise InputError(f"`bounds` must be those of the {robot.joints} bodies of the robot.")
+        raise InputError(
+            f"`bounds` must be those of the {robot.joints} bodies of the robot."
+        )
     lower = np.concatenate([term.lower_bounds(robot) for term in model.terms])
     first = next(k for k, width in enumerate(widths) if width)
-    columns = starts[first] + np.arange(sizes[first]).reshape(robot.joints, widths[first])
+    columns = starts[first] + np.arange(sizes[first]).reshape(
+        robot.joints, widths[first]
+    )
     others = np.setdiff1d(np.arange(model.size), columns)
     return FeasibleSet(
         bodies=tuple(tuple(row) for row in columns.tolist()),
@@ -174,18 +188,24 @@ def nominal_bodies(bounds: BodyBounds) -> np.ndarray:
 def _couplings(model: Model) -> tuple[Coupling, ...]:
     """Return the matrices of inertias, and of viscous friction, of drives that couple axes."""
     robot, found = model.robot, []
-    total = np.concatenate([term.drive_matrices(robot) for term in model.terms], axis=-1)
+    total = np.concatenate(
+        [term.drive_matrices(robot) for term in model.terms], axis=-1
+    )
     for kind, matrix in zip(("RotorInertia", "ViscousFriction"), total, strict=True):
         count, labels = connected_components((matrix != 0).any(axis=-1), directed=False)
         groups = [np.flatnonzero(labels == k) for k in range(count)]
         for group in (group for group in groups if len(group) > 1):
             if len(group) > 4:
-                raise InputError(f"drives may couple 4 axes, but `{robot.name}` has more.")
+                raise InputError(
+                    f"drives may couple 4 axes, but `{robot.name}` has more."
+                )
             inside = matrix[np.ix_(group, group)]
             columns = np.flatnonzero(inside.any(axis=(0, 1)))
             alone = [columns[inside[k, k, columns] != 0] for k in range(len(group))]
             if not all(map(len, alone)):
-                raise InputError(f"coupled drives need the drives' own columns: add `{kind}()`.")
+                raise InputError(
+                    f"coupled drives need the drives' own columns: add `{kind}()`."
+                )
             basis = np.moveaxis(inside[:, :, columns], -1, 0)
             diagonal = tuple(int(own[0]) for own in alone)
             found.append(Coupling(tuple(columns.tolist()), basis, diagonal))
@@ -202,27 +222,39 @@ def scaled_rows(xp: ModuleType, base: BaseParameters, R, z, rows) -> ScaledRows:
     combination = np.zeros((base.size, base.model.size))
     combination[range(base.size), base.indices] = 1.0
     combination[:, list(base.dependent)] = np.asarray(base.kappa)
-    return ScaledRows((R @ combination) / noise, z / noise, 0.5 * xp.asarray(rows, float))
+    return ScaledRows(
+        (R @ combination) / noise, z / noise, 0.5 * xp.asarray(rows, float)
+    )
 
 
 class ConeProgram(eqx.Module):
     r"""$\min \frac12 |A y - b|^2$ over bodies, drives and their couplings."""
 
-    A: Float[AnyArray, "*batch height variables"]  # columns without bounds are projected out
+    A: Float[
+        AnyArray, "*batch height variables"
+    ]  # columns without bounds are projected out
     b: Float[AnyArray, "*batch height"]
     floors: Float[AnyArray, "*batch bodies 4 4"]  # lower bounds of the pseudo-inertias
-    rows: Float[AnyArray, "*batch bodies rows width"]  # linear inequalities of each body
+    rows: Float[
+        AnyArray, "*batch bodies rows width"
+    ]  # linear inequalities of each body
     offsets: Float[AnyArray, "*batch bodies rows"]  # and their constants
-    # Further positive semidefinite matrices: contributions of the variables that take part in them,
-    # unit vectors of these variables, and constants, which are ones where a matrix is smaller than
-    # four.
+    # Further positive semidefinite matrices: contributions of the variables that take
+    # part in them, unit vectors of these variables, and constants, which are ones where
+    # a matrix is smaller than four.
     couplings: Float[AnyArray, "*batch members couplings 4 4"]
     members: Float[AnyArray, "*batch members variables"]
     fillings: Float[AnyArray, "*batch couplings 4 4"]
-    equal: Float[AnyArray, "*batch equal variables"]  # functions that keep their value at the start
+    equal: Float[
+        AnyArray, "*batch equal variables"
+    ]  # functions that keep their value at the start
     pull: Number  # strength of the pull towards the prior's bodies; 0 for none
-    prior: Float[AnyArray, "*batch bodies 4 4"]  # inverses of the prior's pseudo-inertias
-    diameters: Float[AnyArray, "*batch variables"]  # bounds of distances of feasible values
+    prior: Float[
+        AnyArray, "*batch bodies 4 4"
+    ]  # inverses of the prior's pseudo-inertias
+    diameters: Float[
+        AnyArray, "*batch variables"
+    ]  # bounds of distances of feasible values
     scale: Number  # value of the objective that counts as 1
     start: Float[AnyArray, "*batch variables"]  # strictly feasible variables
 
@@ -252,13 +284,17 @@ class ConeProgram(eqx.Module):
         S, s = self.slacks(np, np.asarray(self.start))
         smallest = np.linalg.eigvalsh(S).min()
         if not (smallest > 0 and s.min() > 0):
-            raise InputError("no ball lies within all bounds: widen them, or lower `margin`.")
+            raise InputError(
+                "no ball lies within all bounds: widen them, or lower `margin`."
+            )
 
     def slacks(self, xp: ModuleType, y: Values) -> tuple[Values, Values]:
         """Return the semidefinite matrices and the nonnegative functions of variables."""
         S, s = self.linear(xp, y)
         constant = xp.ravel(self.offsets), xp.zeros(self.drives), xp.ones(self.drives)
-        return S + xp.concatenate([-self.floors, self.fillings]), s + xp.concatenate(constant)
+        return S + xp.concatenate([-self.floors, self.fillings]), s + xp.concatenate(
+            constant
+        )
 
     def linear(self, xp: ModuleType, y: Values) -> tuple[Values, Values]:
         """Return the linear parts of `slacks`."""
@@ -281,7 +317,9 @@ class ConeProgram(eqx.Module):
         return y + xp.tensordot(self.couplings, Z[self.bodies :], 3) @ self.members
 
 
-def cone_program(xp, feasible, data: ScaledRows, strength=0.0, prior=None) -> ConeProgram:
+def cone_program(
+    xp, feasible, data: ScaledRows, strength=0.0, prior=None
+) -> ConeProgram:
     """Return the convex program of least squares, with a pull towards the bodies of a prior."""
     bounds, units = feasible.bounds, feasible.scales(xp, data)
     K, w, n = len(feasible.bodies), feasible.width, len(feasible.drives)
@@ -310,7 +348,9 @@ def cone_program(xp, feasible, data: ScaledRows, strength=0.0, prior=None) -> Co
         equal=equal,
         pull=xp.asarray(float(strength)),
         prior=np.zeros((K, 4, 4)) if prior is None else np.linalg.inv(prior * shrink),
-        diameters=np.concatenate([np.tile([1, 2, 2, 2, *[1.0] * 6][:w], K), np.ones(n)]),
+        diameters=np.concatenate(
+            [np.tile([1, 2, 2, 2, *[1.0] * 6][:w], K), np.ones(n)]
+        ),
         scale=xp.asarray(data.scale) + 4.0 * K * strength,
         start=_start(xp, feasible, A, b, prior),
     )
@@ -321,7 +361,11 @@ def _coupled(xp: ModuleType, feasible: FeasibleSet, largest: Values):
 
     The units of the drives' variables are `largest`.
     """
-    w, bounds, unit_vectors = feasible.width, feasible.bounds, np.eye(len(feasible.order))
+    w, bounds, unit_vectors = (
+        feasible.width,
+        feasible.bounds,
+        np.eye(len(feasible.order)),
+    )
     # At first no matrix: there may be none.
     matrices, fillings = [np.zeros((len(unit_vectors), 0, 4, 4))], [np.zeros((0, 4, 4))]
     members: set[int] = set()

@@ -1,12 +1,13 @@
 r"""Pseudo-inertias: the ten inertial parameters of a body as one symmetric 4x4 matrix.
 
-A body with density $\rho$ has $\Pi = \int (r; 1)(r; 1)^T \rho\, dV$: second moments $\Sigma$, first
-moment and mass. Ten numbers belong to some distribution of positive masses if and only if $\Pi$ is
-positive semidefinite (Wensing, Kim, Slotine, 2018), which includes the triangle inequality of the
-principal moments of inertia.
+A body with density $\rho$ has $\Pi = \int (r; 1)(r; 1)^T \rho\, dV$: second moments
+$\Sigma$, first moment and mass. Ten numbers belong to some distribution of positive
+masses if and only if $\Pi$ is positive semidefinite (Wensing, Kim, Slotine, 2018),
+which includes the triangle inequality of the principal moments of inertia.
 
-The last part of the file is arithmetic on stacks of such matrices, for NumPy and JAX alike. The
-loops over four rows are unrolled: a stack takes a few dozen array operations and no call of LAPACK.
+The last part of the file is arithmetic on stacks of such matrices, for NumPy and JAX
+alike. The loops over four rows are unrolled: a stack takes a few dozen array operations
+and no call of LAPACK.
 """
 
 from types import ModuleType
@@ -34,25 +35,32 @@ for _k, (_i, _j) in enumerate(((1, 2), (0, 2), (0, 1))):
 _ROWS, _COLUMNS = np.triu_indices(4, 1)
 
 
-def pseudo_inertia(bodies: Float[AnyArray, "*batch 10"]) -> Float[AnyArray, "*batch 4 4"]:
+def pseudo_inertia(
+    bodies: Float[AnyArray, "*batch 10"],
+) -> Float[AnyArray, "*batch 4 4"]:
     r"""Return the pseudo-inertia $\begin{pmatrix} \Sigma & m r_c \\ m r_c^T & m \end{pmatrix}$.
 
     The second moments are $\Sigma = \frac12 \mathrm{tr}(J^o) I - J^o$ [kg m²].
 
     Args:
-        bodies: Parameters $(m, m r_c, A, B, C, D, E, F)$ about the origin of the body's frame.
+        bodies: Parameters $(m, m r_c, A, B, C, D, E, F)$ about the origin of the body's
+            frame.
     """
     p = as_array("bodies", bodies)
     return namespace(p).tensordot(p, BASIS.astype(p.dtype), 1)
 
 
-def inertial_parameters(pseudo: Float[AnyArray, "*batch 4 4"]) -> Float[AnyArray, "*batch 10"]:
+def inertial_parameters(
+    pseudo: Float[AnyArray, "*batch 4 4"],
+) -> Float[AnyArray, "*batch 10"]:
     """Return the parameters $(m, m r_c, A, B, C, D, E, F)$ of pseudo-inertias."""
     P, xp = pseudo, namespace(pseudo)
     xx, yy, zz = P[..., 0, 0], P[..., 1, 1], P[..., 2, 2]
     first_moments = (P[..., k, 3] for k in range(3))
     products = P[..., 1, 2], P[..., 0, 2], P[..., 0, 1]
-    return xp.stack([P[..., 3, 3], *first_moments, yy + zz, xx + zz, xx + yy, *products], axis=-1)
+    return xp.stack(
+        [P[..., 3, 3], *first_moments, yy + zz, xx + zz, xx + yy, *products], axis=-1
+    )
 
 
 def ball(mass: np.ndarray, centre: np.ndarray, radius: np.ndarray) -> np.ndarray:
@@ -65,11 +73,14 @@ def ball(mass: np.ndarray, centre: np.ndarray, radius: np.ndarray) -> np.ndarray
     return P * mass[..., None, None]
 
 
-def consistency_margin(bodies: Float[AnyArray, "*batch 10"]) -> Float[np.ndarray, "*batch"]:
+def consistency_margin(
+    bodies: Float[AnyArray, "*batch 10"],
+) -> Float[np.ndarray, "*batch"]:
     r"""Return the distances of bodies from the boundary of physical consistency.
 
-    It is the smallest eigenvalue of the pseudo-inertia after its diagonal is scaled to one: at most
-    1, independent of units, 0 for a flat body, negative for a body that cannot exist.
+    It is the smallest eigenvalue of the pseudo-inertia after its diagonal is scaled to
+    one: at most 1, independent of units, 0 for a flat body, negative for a body that
+        cannot exist.
     """
     P = pseudo_inertia(np.asarray(bodies))
     size = np.sqrt(np.abs(np.diagonal(P, axis1=-2, axis2=-1)))
@@ -80,13 +91,14 @@ def consistency_margin(bodies: Float[AnyArray, "*batch 10"]) -> Float[np.ndarray
 class LogCholesky(eqx.Module):
     r"""Log-Cholesky coordinates of bodies: any ten numbers are a body that can exist.
 
-    The pseudo-inertia of a body is $U U^T$ with an upper triangle $U$ whose diagonal is positive
-    (Rucker, Wensing, Smooth Parameterization of Rigid-Body Inertia, 2022). Its logarithms and its
-    other entries are free: an optimiser of any kind stays within the possible bodies.
+    The pseudo-inertia of a body is $U U^T$ with an upper triangle $U$ whose diagonal is
+    positive (Rucker, Wensing, Smooth Parameterization of Rigid-Body Inertia, 2022). Its
+    logarithms and its other entries are free: an optimiser of any kind stays within the
+    possible bodies.
 
     Attributes:
-        coordinates: For each body the logarithms of the diagonal of $U$, then the entries above it
-            row by row; any real numbers.
+        coordinates: For each body the logarithms of the diagonal of $U$, then the
+            entries above it row by row; any real numbers.
     """
 
     coordinates: Float[AnyArray, "*batch 10"]
@@ -96,20 +108,26 @@ class LogCholesky(eqx.Module):
         """Return the coordinates of bodies that can exist, with $(m, m r_c, A, ..., F)$ each.
 
         Args:
-            bodies: Parameters of each body along the last axis, or of all bodies in a row.
+            bodies: Parameters of each body along the last axis, or of all bodies in a
+                row.
 
         Raises:
-            InputError: If there are not ten numbers for each body, or a body cannot exist, or is
-                flat: points and plates lie at infinity.
+            InputError: If there are not ten numbers for each body, or a body cannot
+                exist, or is flat: points and plates lie at infinity.
         """
         p = as_array("bodies", bodies)
         if p.shape[-1:] != (10,):
             if p.ndim != 1 or p.size % 10:
-                raise InputError(f"`bodies` must hold ten numbers each, but has shape {p.shape}.")
+                raise InputError(
+                    f"`bodies` must hold ten numbers each, but has shape {p.shape}."
+                )
             p = p.reshape(-1, 10)
-        if not is_traced(p) and not np.all(np.asarray(consistency_margin(np.asarray(p))) > 0):
+        if not is_traced(p) and not np.all(
+            np.asarray(consistency_margin(np.asarray(p))) > 0
+        ):
             raise InputError(
-                "`bodies` must be able to exist, with a volume: use `PhysicallyConsistent`, or the "
+                "`bodies` must be able to exist, with a volume: use "
+                "`PhysicallyConsistent`, or the "
                 "bodies of a URDF file."
             )
         # The upper triangle is a lower one with the axes in reverse order.
@@ -150,7 +168,8 @@ def _cholesky(xp: ModuleType, P: Values) -> list[list[Values]]:
 def pivots(xp: ModuleType, P: Values) -> Values:
     """Return the pivots of matrices [matrices, 4, 4, *more] on a leading axis.
 
-    All of them are positive where a matrix is positive definite; their product is the determinant.
+    All of them are positive where a matrix is positive definite; their product is the
+    determinant.
     """
     found = [P[:, 0, 0]]
     for _ in range(P.shape[1] - 1):

@@ -1,15 +1,18 @@
 r"""A primal-dual interior point method for `ConeProgram`, in NumPy or compiled by JAX.
 
-Newton's method solves the perturbed optimality conditions $S Z = \mu I$, $s z = \mu$; a pull
-towards a prior's bodies ends with $S Z = \gamma I$ instead. The direction is that of Helmberg,
-Kojima and Monteiro with Mehrotra's predictor and corrector. The corrector is computed once more
-with the products of its own changes, and the longer step is taken: it saves three iterations of
-fourteen for one more solution of a factored system. One step length serves both sides, since in a
+Newton's method solves the perturbed optimality conditions $S Z = \mu I$, $s z = \mu$; a
+pull towards a prior's bodies ends with $S Z = \gamma I$ instead. The direction is that
+of Helmberg, Kojima and Monteiro with Mehrotra's predictor and corrector. The corrector
+is computed once more with the products of its own changes, and the longer step is
+taken: it saves three iterations of fourteen for one more solution of a factored system.
+    One step length serves both sides, since in a
 quadratic program they are tied together. The variables are feasible from the start.
 
-Certificate: for any feasible $y$ and any $Z, z \succeq 0$ with $r = \nabla f(y) - F^*(Z) - G^T z$,
-convexity gives $f(y) - f^* \le \langle S, Z \rangle + s^T z + \sum_i |r_i| d_i$, where $d_i$ bounds
-the distance between two feasible values of $y_i$. Nothing in it is estimated.
+Certificate: for any feasible $y$ and any $Z, z \succeq 0$ with $r = \nabla f(y) -
+    F^*(Z) - G^T z$,
+convexity gives $f(y) - f^* \le \langle S, Z \rangle + s^T z + \sum_i |r_i| d_i$, where
+$d_i$ bounds the distance between two feasible values of $y_i$. Nothing in it is
+estimated.
 """
 
 from collections.abc import Callable
@@ -30,7 +33,9 @@ from .pseudo_inertia import BASIS, Values, inverse, pivots, symmetric_part
 TOLERANCE = 2.5e-7
 """Error bound of a certified optimum, relative to objective and scale together."""
 MAX_ITERATIONS = 50
-STEPS = np.array([1.0, *1.0 - np.geomspace(0.01, 0.64, 13), 0.28, 0.2, 0.13, 0.08, 0.04, 0.01])
+STEPS = np.array(
+    [1.0, *1.0 - np.geomspace(0.01, 0.64, 13), 0.28, 0.2, 0.13, 0.08, 0.04, 0.01]
+)
 """Steps that are tried, as fractions of the longest that the linear inequalities allow."""
 TINY = 1e-14
 
@@ -38,8 +43,8 @@ TINY = 1e-14
 class Optimum(eqx.Module):
     """Result of the interior point method: half the squared residuals, with a bound of the error.
 
-    It is certified if the bound is within the tolerance. The multipliers are those of the linear
-    inequalities, `matrices` those of the semidefinite ones.
+    It is certified if the bound is within the tolerance. The multipliers are those of
+    the linear inequalities, `matrices` those of the semidefinite ones.
     """
 
     y: Float[AnyArray, "*batch variables"]
@@ -127,12 +132,15 @@ def _solve(xp: ModuleType, p: ConeProgram, loop: Callable) -> Optimum:
 def prices(p: ConeProgram, optimum: Optimum) -> Float[np.ndarray, " linear"]:
     """Return by how much the objective would fall without each linear bound, to second order.
 
-    It is in units of half a squared standard deviation, whatever the units of the bounds.
+    It is in units of half a squared standard deviation, whatever the units of the
+    bounds.
     """
     S, s = p.slacks(np, np.asarray(optimum.y))
     z, Z = np.asarray(optimum.multipliers), np.asarray(optimum.matrices)
     curvature = p.A.T @ p.A * (1.0 + TINY * np.eye(p.A.shape[-1]))
-    solve = _newton_solver(np, p, curvature + _barriers(np, p, inverse(np, S), Z, z / s))
+    solve = _newton_solver(
+        np, p, curvature + _barriers(np, p, inverse(np, S), Z, z / s)
+    )
     rows = np.stack([p.linear(np, y)[1] for y in np.eye(p.A.shape[-1])], axis=1)
     compliance = np.array([row @ solve(row) for row in rows])
     # Without the bound's own part of the curvature, and then a step of Newton's method.
@@ -152,8 +160,8 @@ def _point(xp: ModuleType, p: ConeProgram, y: Values, Z: Values, z: Values) -> _
         normal = xp.linalg.solve(p.equal @ p.equal.T, p.equal @ residual)
         residual = residual - p.equal.T @ normal
     value = 0.5 * rest @ rest
-    # The duality gap of the matrices; if pulled, with the eigenvalues of S Z / pull, all one at the
-    # optimum: their sum less that of one and of their logarithms.
+    # The duality gap of the matrices; if pulled, with the eigenvalues of S Z / pull,
+    # all one at the optimum: their sum less that of one and of their logarithms.
     product = xp.sum(S * Z, axis=(-2, -1))
     gap, pulled = product[: p.bodies], p.pull > 0
     logs = sum(xp.sum(xp.log(pivots(xp, M[: p.bodies])), axis=0) for M in (S, Z))
@@ -170,7 +178,9 @@ def _targets(xp: ModuleType, p: ConeProgram) -> Values:
     return xp.concatenate(strengths)[:, None, None]
 
 
-def _step(xp: ModuleType, p: ConeProgram, gram: Values, x: _Point) -> tuple[_Point, Values]:
+def _step(
+    xp: ModuleType, p: ConeProgram, gram: Values, x: _Point
+) -> tuple[_Point, Values]:
     """Take the longer step of two correctors; return the new point and the step length."""
     inverse_S, ratio, target = inverse(xp, x.S), x.z / x.s, _targets(xp, p)
     solve = _newton_solver(xp, p, gram + _barriers(xp, p, inverse_S, x.Z, ratio))
@@ -250,10 +260,14 @@ def _barriers(xp: ModuleType, p: ConeProgram, inverse_S, Z, ratio) -> Values:
     bodies = flat[None] @ _products(xp, inverse_S[:K], Z[:K]) @ flat.T[None]
     count = K * p.rows.shape[-2]
     linear = xp.reshape(ratio[:count], (K, -1))
-    bodies = symmetric_part(xp, bodies) + xp.einsum("kri,kr,krj->kij", p.rows, linear, p.rows)
+    bodies = symmetric_part(xp, bodies) + xp.einsum(
+        "kri,kr,krj->kij", p.rows, linear, p.rows
+    )
     bodies = bodies * (1.0 + TINY * np.eye(w))[None]
     drives = xp.diag((1.0 + TINY) * (ratio[count : count + n] + ratio[count + n :]))
-    block_diagonal = scipy.linalg.block_diag if xp is np else jax.scipy.linalg.block_diag
+    block_diagonal = (
+        scipy.linalg.block_diag if xp is np else jax.scipy.linalg.block_diag
+    )
     flat = xp.reshape(p.couplings, (*p.couplings.shape[:2], 16))
     mixed = xp.einsum("ikx,kxy->iky", flat, _products(xp, inverse_S[K:], Z[K:]))
     more = symmetric_part(xp, xp.tensordot(mixed, flat, ((1, 2), (1, 2))))
@@ -266,7 +280,9 @@ def _products(xp: ModuleType, inverse_S: Values, Z: Values) -> Values:
     return xp.reshape(product, (-1, 16, 16))
 
 
-def _newton_solver(xp: ModuleType, p: ConeProgram, H: Values) -> Callable[[Values], Values]:
+def _newton_solver(
+    xp: ModuleType, p: ConeProgram, H: Values
+) -> Callable[[Values], Values]:
     """Return the solver of Newton's equations within the equality constraints."""
     linalg = scipy.linalg if xp is np else jax.scipy.linalg
     try:

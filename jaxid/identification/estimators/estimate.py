@@ -28,7 +28,9 @@ class Channel(NamedTuple):
     """
 
     columns: tuple[int, ...]  # base parameters of the equations
-    instruments: np.ndarray  # $z_t$ [rows, columns]: for least squares the equations themselves
+    instruments: (
+        np.ndarray
+    )  # $z_t$ [rows, columns]: for least squares the equations themselves
     equations: np.ndarray  # $\theta_t$ [rows, columns], weighted
     disturbance: np.ndarray  # $u_t$ [rows]: residuals, weighted
     counted: int  # number of rows that count
@@ -41,7 +43,9 @@ one channel for each joint."""
 
 def weighted_joints(chunk: RowChunk, weights: AnyArray) -> Iterator[tuple]:
     """Yield parameters, weighted columns, weights of the rows, and count of each joint."""
-    joints = zip(chunk.indices, chunk.columns, chunk.mask.T, np.asarray(weights), strict=True)
+    joints = zip(
+        chunk.indices, chunk.columns, chunk.mask.T, np.asarray(weights), strict=True
+    )
     for own, theta, mask, weight in joints:
         rows = np.where(mask, weight, 0.0)
         yield tuple(own), rows[:, None] * theta, rows, int(mask.sum())
@@ -52,7 +56,9 @@ def joint_rows(weights: Float[AnyArray, " joints"]) -> Influence:
 
     def channels(chunk: RowChunk, residuals: np.ndarray) -> Iterator[Channel]:
         joints = zip(weighted_joints(chunk, weights), residuals.T, strict=True)
-        return (Channel(own, theta, theta, w * r, n) for (own, theta, w, n), r in joints)
+        return (
+            Channel(own, theta, theta, w * r, n) for (own, theta, w, n), r in joints
+        )
 
     return channels
 
@@ -60,26 +66,29 @@ def joint_rows(weights: Float[AnyArray, " joints"]) -> Influence:
 class Estimate(eqx.Module):
     r"""Estimate of an estimator, with what its uncertainty is computed from.
 
-    Near the estimate, a disturbance $e_t$ of the rows moves it by $B \sum_t Z_t^T u(e_t)$:
-    `inverse` is $B$, and `influence` returns $Z$ and $u$. Uncertainties follow from these alone, so
-    estimators never compute them.
+    Near the estimate, a disturbance $e_t$ of the rows moves it by $B \sum_t Z_t^T
+    u(e_t)$: `inverse` is $B$, and `influence` returns $Z$ and $u$. Uncertainties follow
+    from these alone, so estimators never compute them.
 
     Attributes:
-        base: Base parameters: those of the problem, unless the estimator has found constants of the
-            model's terms.
+        base: Base parameters: those of the problem, unless the estimator has found
+            constants of the model's terms.
         parameters: Estimated base parameters.
         weights: Weights of the joints' rows [1/(N m) or 1/N].
         blocks: Factors of the rows with their final weights.
-        inverse: Inverse of the information, or its substitute; zero for fixed parameters.
-        influence: Function from some rows and their residuals to weighted equations (`Channel`).
+        inverse: Inverse of the information, or its substitute; zero for fixed
+            parameters.
+        influence: Function from some rows and their residuals to weighted equations
+            (`Channel`).
         solution: Solution of the weighted system.
-        standard: Standard parameters, of an estimator that finds a complete set of them.
+        standard: Standard parameters, of an estimator that finds a complete set of
+            them.
         notes: Sentences for the user.
         consistency: `Consistency` of a physically consistent estimate, or None.
-        unbounded: Parameters without bounds, whose residuals the uncertainty is computed from;
-            `parameters` themselves if None.
-        effective_parameters: Number of parameters that the rows determine, in fractions where the
-            solution is regularised; computed from `inverse` if None.
+        unbounded: Parameters without bounds, whose residuals the uncertainty is
+            computed from; `parameters` themselves if None.
+        effective_parameters: Number of parameters that the rows determine, in fractions
+            where the solution is regularised; computed from `inverse` if None.
     """
 
     base: BaseParameters
@@ -127,19 +136,23 @@ class Estimate(eqx.Module):
 class AbstractEstimator(eqx.Module):
     """An estimator of base parameters.
 
-    An estimator takes a `RegressionProblem` and returns an `Estimate`. The problem offers:
+    An estimator takes a `RegressionProblem` and returns an `Estimate`. The problem
+    offers:
 
-    * `problem.base`, `problem.robot`: the base parameters, with the model and the robot;
-    * `problem.factors`: for each joint the R factor of its columns and forces, which is sufficient
-      for least squares with weights of the joints; `problem.blocks`: the same by contiguous blocks
-      of time, for cross-validation;
-    * `problem.chunks()`, `problem.residuals(p)`, `problem.fold(...)`, `problem.reweighted(...)`:
-      passes over the rows, where these are known (else an `InputError`);
+    * `problem.base`, `problem.robot`: the base parameters, with the model and the
+      robot;
+    * `problem.factors`: for each joint the R factor of its columns and forces, which is
+      sufficient for least squares with weights of the joints; `problem.blocks`: the
+      same by contiguous blocks of time, for cross-validation;
+    * `problem.chunks()`, `problem.residuals(p)`, `problem.fold(...)`,
+      `problem.reweighted(...)`: passes over the rows, where these are known (else an
+      `InputError`);
     * `problem.with_base(base)`: the same recordings with other columns.
 
-    `Estimate.solve` returns the estimate of weighted least squares; use `dataclasses.replace` where
-    parts differ. `identify` computes uncertainties, condition numbers and undetermined directions
-    from the estimate, alike for all estimators.
+    `Estimate.solve` returns the estimate of weighted least squares; use
+    `dataclasses.replace` where parts differ. `identify` computes uncertainties,
+    condition numbers and undetermined directions from the estimate, alike for all
+    estimators.
     """
 
     @abstractmethod
@@ -147,8 +160,9 @@ class AbstractEstimator(eqx.Module):
         """Return the estimate of a regression problem.
 
         Raises:
-            InputError: If weights are not known, the estimator needs rows and only factors are
-                known, or its settings do not fit the model or the recordings.
+            InputError: If weights are not known, the estimator needs rows and only
+                factors are known, or its settings do not fit the model or the
+                recordings.
         """
 
 
@@ -163,7 +177,9 @@ class EstimatorInWords(AbstractEstimator):
 
     def __call__(self, problem):
         """Reject the problem: only a description is left."""
-        raise InputError(f"the `estimator` is only described, create it again: {self.words:.200}")
+        raise InputError(
+            f"the `estimator` is only described, create it again: {self.words:.200}"
+        )
 
     def __str__(self):
         return self.words

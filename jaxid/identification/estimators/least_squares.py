@@ -48,7 +48,8 @@ class WeightedLeastSquares(AbstractEstimator):
     """Least squares whose rows are weighted by joint (Eqs. 29-33).
 
     Attributes:
-        weights: Weights of the joints; by default the reciprocals of the largest forces (Eq. 30).
+        weights: Weights of the joints; by default the reciprocals of the largest forces
+            (Eq. 30).
         solution: Solution of the system.
     """
 
@@ -64,8 +65,9 @@ class WeightedLeastSquares(AbstractEstimator):
 class GeneralisedLeastSquares(AbstractEstimator):
     """Least squares with the full covariance of the joints' residuals (Aitken).
 
-    Residuals of neighbouring joints are often correlated: an error of the model acts on several.
-    The covariance is computed from the residuals of weighted least squares, and again from its own.
+    Residuals of neighbouring joints are often correlated: an error of the model acts on
+    several. The covariance is computed from the residuals of weighted least squares,
+    and again from its own.
 
     Attributes:
         solution: Solution of the system.
@@ -86,7 +88,9 @@ class GeneralisedLeastSquares(AbstractEstimator):
 
             def equations(chunk, influence=influence, weights=weights):
                 """Return the combinations of joints, as if they were the joints' own rows."""
-                mixed = zip(influence(chunk, chunk.forces), weights, chunk.mask.T, strict=True)
+                mixed = zip(
+                    influence(chunk, chunk.forces), weights, chunk.mask.T, strict=True
+                )
                 return [np.column_stack(x[2:4])[mask] / w for x, w, mask in mixed]
 
             blocks = problem.fold(equations, [tuple(range(size))] * n)
@@ -107,7 +111,8 @@ def _residual_covariance(problem: RegressionProblem, p: np.ndarray) -> np.ndarra
     S = products / np.maximum(counts, 1.0)
     size = np.sqrt(np.maximum(np.diag(S), np.finfo(float).tiny))
     values, directions = np.linalg.eigh(S / size / size[:, None])
-    # Pairs that count at different instants may give a matrix that is not positive definite.
+    # Pairs that count at different instants may give a matrix that is not positive
+    # definite.
     definite = (directions * np.maximum(values, 1e-6)) @ directions.T
     return definite * size * size[:, None]
 
@@ -165,8 +170,8 @@ class Huber(AbstractLoss):
     """Huber's loss (1964): linear beyond a limit.
 
     Attributes:
-        limit: Standard deviations up to which a residual counts fully; the default loses 5 % of
-            precision for normal noise.
+        limit: Standard deviations up to which a residual counts fully; the default
+            loses 5 % of precision for normal noise.
     """
 
     limit: float = eqx.field(static=True, default=1.345)
@@ -184,8 +189,8 @@ class Tukey(AbstractLoss):
     """Tukey's biweight loss: constant beyond a limit, so that large residuals do not count.
 
     Attributes:
-        limit: Standard deviations from which a residual does not count; the default loses 5 % of
-            precision for normal noise.
+        limit: Standard deviations from which a residual does not count; the default
+            loses 5 % of precision for normal noise.
     """
 
     limit: float = eqx.field(static=True, default=4.685)
@@ -203,17 +208,20 @@ class Tukey(AbstractLoss):
 class IterativelyReweighted(AbstractEstimator):
     """Weighted least squares in which rows with large residuals count less (M-estimation).
 
-    For outliers and friction reversals. The scale of each joint's residuals is taken from their
-    median size, every row gets a weight by its own residual, and the system is solved again until
-    the forces no longer change. Tukey's loss starts from Huber's estimate. Filters that spread an
-    outlier over many rows hide it: filter forces little and leave outliers to this estimator.
+    For outliers and friction reversals. The scale of each joint's residuals is taken
+    from their median size, every row gets a weight by its own residual, and the system
+    is solved again until the forces no longer change. Tukey's loss starts from Huber's
+    estimate. Filters that spread an outlier over many rows hide it: filter forces
+    little and leave outliers to this estimator.
 
     Attributes:
         loss: Loss function.
-        weights: Weights of the joints; by default the reciprocals of the largest forces (Eq. 30).
+        weights: Weights of the joints; by default the reciprocals of the largest forces
+            (Eq. 30).
         solution: Solution of each system.
         iterations: Largest number of iterations.
-        tolerance: Relative change of the forces, in units of the residuals, that ends them.
+        tolerance: Relative change of the forces, in units of the residuals, that ends
+            them.
     """
 
     loss: AbstractLoss = Huber()
@@ -242,7 +250,9 @@ class IterativelyReweighted(AbstractEstimator):
         scale = _residual_scale(problem, p)
         slopes = np.zeros(len(scale))
         for chunk, residuals in problem.residuals(p):
-            slopes += np.sum(np.where(chunk.mask, self.loss.slope(residuals / scale), 0.0), axis=0)
+            slopes += np.sum(
+                np.where(chunk.mask, self.loss.slope(residuals / scale), 0.0), axis=0
+            )
         slope = np.maximum(slopes / np.maximum(problem.factors.rows, 1), 0.1)
         blocks = problem.reweighted(p, self.loss.weight, scale)
         solution = self.solution.choose(blocks, weights)
@@ -256,8 +266,10 @@ class IterativelyReweighted(AbstractEstimator):
         notes = ()
         if change > self.tolerance:
             notes = (
-                f"the robust estimate still changed by {100 * change:.2g} % of the residuals after "
-                f"{self.iterations} iterations: there are too many outliers to tell them apart.",
+                f"the robust estimate still changed by {100 * change:.2g} % of the "
+                "residuals after "
+                f"{self.iterations} iterations: there are too many outliers to tell "
+                "them apart.",
             )
         return dataclasses.replace(
             Estimate.solve(problem, weights * np.sqrt(slope), solution),
@@ -289,17 +301,20 @@ def _residual_scale(problem: RegressionProblem, p: np.ndarray) -> np.ndarray:
 class InstrumentalVariables(AbstractEstimator):
     r"""Weighted least squares with the columns of a motion without noise (IDIM-IV).
 
-    Noise of the encoders enters the regressor: least squares then see columns that are too large,
-    and bias their parameters towards zero, however long the log is. With the columns $Z$ of the
-    commanded motion, which has no such noise, $\hat p = (Z^T W^2 \Theta)^{-1} Z^T W^2 Q$ has no
-    such bias. The reference need not be followed exactly: it must be similar, and independent of
-    the encoders' noise. The instruments are kept in memory.
+    Noise of the encoders enters the regressor: least squares then see columns that are
+    too large, and bias their parameters towards zero, however long the log is. With the
+    columns $Z$ of the commanded motion, which has no such noise, $\hat p = (Z^T W^2
+    \Theta)^{-1} Z^T W^2 Q$ has no such bias. The reference need not be followed
+    exactly: it must be similar, and independent of the encoders' noise. The instruments
+        are kept in memory.
 
     Attributes:
-        references: Commanded trajectory of each recording, or one for all; or motions at their
-            samples, such as simulated ones.
-        weights: Weights of the joints; by default the reciprocals of the largest forces (Eq. 30).
-        starts: Time stamps of the recordings at which the trajectories began [s], or one for all.
+        references: Commanded trajectory of each recording, or one for all; or motions
+            at their samples, such as simulated ones.
+        weights: Weights of the joints; by default the reciprocals of the largest forces
+            (Eq. 30).
+        starts: Time stamps of the recordings at which the trajectories began [s], or
+            one for all.
     """
 
     references: tuple[AbstractTrajectory | Motion, ...]
@@ -313,14 +328,18 @@ class InstrumentalVariables(AbstractEstimator):
         given = {"references": self.references, "starts": self.starts}
         for name, values in given.items():
             if len(values) not in (1, len(recordings)):
-                raise InputError(f"`{name}` must hold one entry for all or each of the recordings.")
+                raise InputError(
+                    f"`{name}` must hold one entry for all or each of the recordings."
+                )
         each = [x * len(recordings) if len(x) == 1 else x for x in given.values()]
         triples = zip(recordings, *each, strict=True)
         instruments = [_columns(problem.base, *triple) for triple in triples]
 
         def influence(chunk: RowChunk, residuals: np.ndarray) -> Iterator[Channel]:
             joints = weighted_joints(chunk, weights)
-            triples = zip(joints, instruments[chunk.recording], residuals.T, strict=True)
+            triples = zip(
+                joints, instruments[chunk.recording], residuals.T, strict=True
+            )
             return (
                 Channel(own, w[:, None] * Z[chunk.rows], theta, w * r, count)
                 for (own, theta, w, count), Z, r in triples
@@ -346,7 +365,10 @@ class InstrumentalVariables(AbstractEstimator):
 
 
 def _columns(
-    base, observations: Observations, reference: AbstractTrajectory | Motion, start: float
+    base,
+    observations: Observations,
+    reference: AbstractTrajectory | Motion,
+    start: float,
 ) -> tuple[np.ndarray, ...]:
     """Return the columns of a reference for each joint, filtered like those of the recording."""
     known = isinstance(reference, Motion)
@@ -361,14 +383,16 @@ def _columns(
 class RelativeTo(AbstractEstimator):
     r"""Another estimator, applied to the forces that a prior does not explain.
 
-    A regularised solution, which keeps badly determined parameters small, then keeps them near
-    those of the prior instead: a ridge towards a CAD model minimises
-    $\|W (Q - \Theta p)\|^2 + \lambda^2 \|D (p - p_0)\|^2$. Without regularisation nothing changes.
-    For a pull of whole bodies (a Bregman divergence) see `PhysicallyConsistent` and `EntropicPull`.
+    A regularised solution, which keeps badly determined parameters small, then keeps
+    them near those of the prior instead: a ridge towards a CAD model minimises
+    $\|W (Q - \Theta p)\|^2 + \lambda^2 \|D (p - p_0)\|^2$. Without regularisation
+    nothing changes. For a pull of whole bodies (a Bregman divergence) see
+    `PhysicallyConsistent` and `EntropicPull`.
 
     Attributes:
         parameters: Standard parameters of the prior, in the model's order.
-        estimator: Estimator; by default weighted least squares with a cross-validated ridge.
+        estimator: Estimator; by default weighted least squares with a cross-validated
+            ridge.
     """
 
     parameters: Float[AnyArray, " standard"]
@@ -380,7 +404,9 @@ class RelativeTo(AbstractEstimator):
         """Subtract the prior's forces, estimate, and add the prior."""
         size = problem.base.model.size
         if np.shape(self.parameters) != (size,):
-            raise InputError(f"`parameters` must be the {size} standard parameters of the model.")
+            raise InputError(
+                f"`parameters` must be the {size} standard parameters of the model."
+            )
         prior = np.asarray(self.parameters)
         found = self.estimator(_RelativeProblem(problem, prior))
         origin = np.asarray(found.base.from_standard(prior))
@@ -417,4 +443,6 @@ def _subtract_forces(blocks: Blocks, p: np.ndarray) -> Blocks:
         R[:, -1] -= R[:, :-1] @ p[list(joint.columns)]
         return dataclasses.replace(joint, R=R)
 
-    return jax.tree.map(subtracted, blocks, is_leaf=lambda x: isinstance(x, JointFactor))
+    return jax.tree.map(
+        subtracted, blocks, is_leaf=lambda x: isinstance(x, JointFactor)
+    )

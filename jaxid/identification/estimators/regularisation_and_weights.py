@@ -26,21 +26,27 @@ LARGEST_UNCERTAINTY = 0.1
 class Decomposition(eqx.Module):
     """Singular value decomposition of the weighted observation matrix with columns of length one.
 
-    Scaled columns make the result independent of units. Columns of zeros or of rounding stay zero.
+    Scaled columns make the result independent of units. Columns of zeros or of rounding
+    stay zero.
     """
 
     scale: Float[np.ndarray, " base"]  # lengths of the columns
     values: Float[np.ndarray, " base"]  # singular values, in falling order
     # right singular vectors of the scaled parameters, as rows
     directions: Float[np.ndarray, "base base"]
-    forces: Float[np.ndarray, " base"]  # weighted forces along the left singular vectors
+    forces: Float[
+        np.ndarray, " base"
+    ]  # weighted forces along the left singular vectors
     rest: float  # norm of the forces that the columns cannot explain
 
     @classmethod
     def of(cls, R: AnyArray, z: AnyArray) -> "Decomposition":
         """Decompose a weighted factor and its right-hand side."""
         missing = max(0, np.shape(R)[1] - len(R))
-        R, z = np.pad(np.asarray(R), ((0, missing), (0, 0))), np.pad(np.asarray(z), (0, missing))
+        R, z = (
+            np.pad(np.asarray(R), ((0, missing), (0, 0))),
+            np.pad(np.asarray(z), (0, missing)),
+        )
         norms = np.linalg.norm(R, axis=0)
         # Shorter columns are rounding: units may differ by less.
         present = norms > 1e-13 * norms.max(initial=0.0)
@@ -75,7 +81,8 @@ def inverse_information(
 ) -> tuple[Array, Array]:
     """Return the inverse of an information, and a bound of its root's condition number.
 
-    Columns are scaled to length one, and a ridge of rounding's size keeps the factor from failing.
+    Columns are scaled to length one, and a ridge of rounding's size keeps the factor
+    from failing.
     """
     size = whole.shape[-1]
     square = jnp.diagonal(whole)
@@ -99,7 +106,8 @@ class AbstractSolution(eqx.Module):
 class AbstractSpectralSolution(AbstractSolution):
     r"""A solution that treats each direction by its singular value.
 
-    The parameters are $B \Theta^T W^2 Q$, where $B$ is a substitute of the inverse information.
+    The parameters are $B \Theta^T W^2 Q$, where $B$ is a substitute of the inverse
+    information.
     """
 
     @abstractmethod
@@ -123,14 +131,17 @@ class Truncated(AbstractSpectralSolution):
     """Only well-determined directions; along the others the parameters are zero.
 
     Attributes:
-        rcond: Smallest singular value that is kept, relative to the largest, with scaled columns.
+        rcond: Smallest singular value that is kept, relative to the largest, with
+            scaled columns.
     """
 
     rcond: float = eqx.field(static=True, default=1e-2)
 
     def __check_init__(self):
         if not 0.0 <= self.rcond < 1.0:
-            raise InputError(f"`rcond` must be at least 0 and below 1, but is {self.rcond}.")
+            raise InputError(
+                f"`rcond` must be at least 0 and below 1, but is {self.rcond}."
+            )
 
     def inverse(self, values):
         """Return the inverse squares; zero for weak directions."""
@@ -143,15 +154,17 @@ class Ridge(AbstractSpectralSolution):
     """Least squares that pull weak directions towards zero (Tikhonov).
 
     Attributes:
-        strength: Singular value, relative to the largest and with scaled columns, at which
-            parameters are halved.
+        strength: Singular value, relative to the largest and with scaled columns, at
+            which parameters are halved.
     """
 
     strength: float = eqx.field(static=True, default=1e-2)
 
     def __check_init__(self):
         if not 0.0 <= self.strength < np.inf:
-            raise InputError(f"`strength` must be finite and at least 0, but is {self.strength}.")
+            raise InputError(
+                f"`strength` must be finite and at least 0, but is {self.strength}."
+            )
 
     def inverse(self, values):
         """Return bounded inverse squares."""
@@ -162,9 +175,9 @@ class Ridge(AbstractSpectralSolution):
 class CrossValidated(AbstractSolution):
     """The strongest of several solutions whose held-out error is about the smallest.
 
-    Each solution is computed without one contiguous block of time and tested on it. Of those whose
-    error lies within one standard error of the smallest, the strongest is taken: neighbouring
-    blocks are similar, and other motions are not.
+    Each solution is computed without one contiguous block of time and tested on it. Of
+    those whose error lies within one standard error of the smallest, the strongest is
+    taken: neighbouring blocks are similar, and other motions are not.
 
     Attributes:
         candidates: Solutions, from the weakest to the strongest.
@@ -212,7 +225,9 @@ class GivenWeights(AbstractWeights):
         w = np.asarray(self.weights)
         good = w.shape == (robot.joints,) and np.isfinite(w).all()
         if not good or w.min() < 0 or not w.any():
-            raise InputError(f"`weights` must be {robot.joints} numbers from 0, not all zero: {w}.")
+            raise InputError(
+                f"`weights` must be {robot.joints} numbers from 0, not all zero: {w}."
+            )
         return w
 
 
@@ -228,8 +243,8 @@ class ResidualVariances(AbstractWeights):
     """Reciprocals of the residuals' standard deviations, found iteratively.
 
     Attributes:
-        iterations: Number of times that weights and parameters are computed in turn; with 0 the
-            weights are the reciprocals of the RMS values of the forces.
+        iterations: Number of times that weights and parameters are computed in turn;
+            with 0 the weights are the reciprocals of the RMS values of the forces.
     """
 
     iterations: int = eqx.field(static=True, default=5)
@@ -255,9 +270,11 @@ class UndeterminedDirection(eqx.Module):
     Attributes:
         parts: Indices of the base parameters in it, the largest first.
         shares: Their fractions, as they count in the forces; the largest is 1.
-        singular_value: Singular value of the scaled observation matrix, relative to the largest.
-        uncertainty: Standard deviation of the forces that the parameters of this combination make
-            one by one, relative to all forces; infinite if the combination was not moved.
+        singular_value: Singular value of the scaled observation matrix, relative to the
+            largest.
+        uncertainty: Standard deviation of the forces that the parameters of this
+            combination make one by one, relative to all forces; infinite if the
+            combination was not moved.
     """
 
     parts: tuple[int, ...] = eqx.field(static=True)
@@ -278,12 +295,13 @@ class UndeterminedDirection(eqx.Module):
 def undetermined(blocks: Blocks, weights, decomposition: Decomposition):
     r"""Return the directions in which the data leave more open than they tell.
 
-    Scale the parameters so that each of them alone makes forces of its own column's length. A step
-    along a singular direction changes the forces by the singular value $s$ only. The noise along it
-    is taken from how much contiguous blocks of time disagree about it, so that coloured noise and
-    errors of the model count: the sum $g_k$ of residuals times the direction's forces over block
-    $k$ gives the deviation $\sqrt{\sum g_k^2 K/(K-1)} / s^2$. Where parameters may thus make forces
-    of a tenth of the whole recording that cancel each other, the direction is not determined.
+    Scale the parameters so that each of them alone makes forces of its own column's
+    length. A step along a singular direction changes the forces by the singular value
+    $s$ only. The noise along it is taken from how much contiguous blocks of time
+    disagree about it, so that coloured noise and errors of the model count: the sum
+    $g_k$ of residuals times the direction's forces over block $k$ gives the deviation
+    $\sqrt{\sum g_k^2 K/(K-1)} / s^2$. Where parameters may thus make forces of a tenth
+    of the whole recording that cancel each other, the direction is not determined.
     """
     s, V = decomposition.values, decomposition.directions
     size = np.hypot(np.linalg.norm(decomposition.forces), decomposition.rest)

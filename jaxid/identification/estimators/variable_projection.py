@@ -1,7 +1,8 @@
 r"""Nonlinear friction by variable projection: shapes of friction laws beside linear parameters.
 
-For shapes $x$ the best linear parameters are $c = N^+ z$, where $N = [A \; \Phi(x)]$, so the
-residual $r = z - N c$ is a function of the shapes alone (Golub and Pereyra, 1973). Everything is
+For shapes $x$ the best linear parameters are $c = N^+ z$, where $N = [A \; \Phi(x)]$,
+so the residual $r = z - N c$ is a function of the shapes alone (Golub and Pereyra,
+1973). Everything is
 JAX: the search can be compiled, mapped over draws of the forces, and differentiated.
 """
 
@@ -33,15 +34,16 @@ STEPS = 60
 class NonlinearFriction(AbstractEstimator):
     """Estimator of epsilons, Stribeck speeds and other shapes, and then of all parameters.
 
-    The weights of the joints are those of the linear estimator at the shapes of the model; with the
-    shapes found, it estimates again. The base parameters of the fit are those of the model with
-    these shapes. Standard deviations assume that the shapes are known: `identify_nonlinear` also
-    accounts for their uncertainty, and compares the result with the linear model.
+    The weights of the joints are those of the linear estimator at the shapes of the
+    model; with the shapes found, it estimates again. The base parameters of the fit are
+    those of the model with these shapes. Standard deviations assume that the shapes are
+    known: `identify_nonlinear` also accounts for their uncertainty, and compares the
+        result with the linear model.
 
     Attributes:
         linear: Estimator of the linear parameters.
-        shapes: Names of the shapes that are identified, such as `("vs", "delta")`; by default
-            those that the terms propose. The others keep their values.
+        shapes: Names of the shapes that are identified, such as `("vs", "delta")`; by
+            default those that the terms propose. The others keep their values.
     """
 
     linear: AbstractEstimator = WeightedLeastSquares()
@@ -49,7 +51,9 @@ class NonlinearFriction(AbstractEstimator):
 
     def __call__(self, problem):
         """Search for the shapes, and estimate with them."""
-        search, x, notes = self.search(problem, np.asarray(self.linear(problem).weights))
+        search, x, notes = self.search(
+            problem, np.asarray(self.linear(problem).weights)
+        )
         base = search.shapes.set(problem.base, x)
         estimate = self.linear(problem.with_base(base))
         return dataclasses.replace(estimate, notes=(*estimate.notes, *notes))
@@ -62,8 +66,10 @@ class NonlinearFriction(AbstractEstimator):
         notes = ()
         if not converged:
             notes = (
-                f"the search for the shapes of friction has not converged in {STEPS} steps: the "
-                "logs hardly determine some of them; look at their standard deviations, or select "
+                f"the search for the shapes of friction has not converged in {STEPS} "
+                "steps: the "
+                "logs hardly determine some of them; look at their standard "
+                "deviations, or select "
                 "fewer.",
             )
         return search, np.asarray(x), notes
@@ -105,25 +111,35 @@ class Shapes(eqx.Module):
     def values(self) -> Float[np.ndarray, " shapes"]:
         """Shapes of the model; one that is not positive is rejected."""
         terms, n = self.model.terms, (self.model.robot.joints,)
-        given = [np.asarray(shape.value(terms[i]), np.float64) for i, shape in self.members]
+        given = [
+            np.asarray(shape.value(terms[i]), np.float64) for i, shape in self.members
+        ]
         x = np.concatenate([np.broadcast_to(value, n) for value in given])
         if not (x > 0).all():
             name, _ = self.parameters[int(np.argmin(x))]
-            raise InputError(f"`{name}` must start at a positive number, not at {x.min():g}.")
+            raise InputError(
+                f"`{name}` must start at a positive number, not at {x.min():g}."
+            )
         return x
 
     def set_in_terms(self, x: Float[AnyArray, " shapes"]) -> tuple[AbstractTerm, ...]:
         """Return the terms of the model with other shapes."""
         changed = list(self.model.terms)
-        for (i, shape), row in zip(self.members, x.reshape(len(self.members), -1), strict=True):
+        for (i, shape), row in zip(
+            self.members, x.reshape(len(self.members), -1), strict=True
+        ):
             changed[i] = eqx.tree_at(shape.value, changed[i], row)
         return tuple(changed)
 
-    def set(self, base: BaseParameters, x: Float[AnyArray, " shapes"]) -> BaseParameters:
+    def set(
+        self, base: BaseParameters, x: Float[AnyArray, " shapes"]
+    ) -> BaseParameters:
         """Return the base parameters of the model with other shapes: the same combinations."""
         return eqx.tree_at(lambda b: b.model.terms, base, self.set_in_terms(x))
 
-    def columns(self, x: AnyArray, q: AnyArray, qd: AnyArray, qdd: AnyArray) -> jax.Array:
+    def columns(
+        self, x: AnyArray, q: AnyArray, qd: AnyArray, qdd: AnyArray
+    ) -> jax.Array:
         """Return the shaped terms' columns of a sample [joints, columns]."""
         terms = self.set_in_terms(x)
         parts = [terms[i].columns(self.model.robot, q, qd, qdd) for i in self._terms]
@@ -137,22 +153,27 @@ def select_shapes(base: BaseParameters, names: Sequence[str] = ()) -> Shapes:
         InputError: If there are none.
     """
     if base.model.memory is not None:
-        raise InputError("shapes are not searched for beside `Presliding`: take `Tanh`.")
+        raise InputError(
+            "shapes are not searched for beside `Presliding`: take `Tanh`."
+        )
     members = []
     for i, term in enumerate(base.model.terms):
         for shape in term.nonlinear_parameters:
             chosen = shape.name in names if names else shape.default
             members += [(i, shape)] * chosen
     if not members or not {shape.name for _, shape in members} >= set(names):
-        raise InputError("the `model` has no friction with such `shapes`: use `StribeckFriction`.")
+        raise InputError(
+            "the `model` has no friction with such `shapes`: use `StribeckFriction`."
+        )
     return Shapes(base.model, tuple(members))
 
 
 class ShapeSearch(eqx.Module):
     """Search for the shapes that explain the rows of some recordings best.
 
-    It is a function of JAX: `eqx.filter_jit(search)(weights)`. Replace `forces` to map over draws
-    or to differentiate by the measurements. Only friction is evaluated and filtered again.
+    It is a function of JAX: `eqx.filter_jit(search)(weights)`. Replace `forces` to map
+    over draws or to differentiate by the measurements. Only friction is evaluated and
+    filtered again.
     """
 
     shapes: Shapes  # shapes to be found
@@ -160,7 +181,9 @@ class ShapeSearch(eqx.Module):
     recordings: tuple[Observations, ...]  # observations whose rows they are
     # columns that do not depend on shapes; zero in rows that do not count
     fixed: Float[AnyArray, "rows joints base"]
-    forces: Float[AnyArray, "rows joints"]  # measured forces of the rows [N m or N], likewise
+    forces: Float[
+        AnyArray, "rows joints"
+    ]  # measured forces of the rows [N m or N], likewise
     counted: Float[AnyArray, "rows joints"]  # one for rows that count, otherwise zero
     blocks: AnyArray  # block of time of each row
     # joint, base parameter, and column of the shaped terms, of what depends on shapes
@@ -177,32 +200,43 @@ class ShapeSearch(eqx.Module):
         forces, counted = np.zeros((2, *fixed.shape[:2]))
         blocks = np.zeros(len(fixed), int)
         for chunk in problem.chunks():
-            rows = slice(*(starts[chunk.recording] + [chunk.rows.start, chunk.rows.stop]))
-            for j, (own, columns) in enumerate(zip(chunk.indices, chunk.columns, strict=True)):
+            rows = slice(
+                *(starts[chunk.recording] + [chunk.rows.start, chunk.rows.stop])
+            )
+            for j, (own, columns) in enumerate(
+                zip(chunk.indices, chunk.columns, strict=True)
+            ):
                 kept = [i for i, k in enumerate(own) if k not in place]
                 fixed[rows, j, [own[i] for i in kept]] = columns[:, kept]
             counted[rows], blocks[rows] = chunk.mask, chunk.block
             forces[rows] = chunk.forces
         fixed *= counted[..., None]
         entries = [
-            (j, k, place[k]) for j, own in enumerate(base.acting_columns) for k in own if k in place
+            (j, k, place[k])
+            for j, own in enumerate(base.acting_columns)
+            for k in own
+            if k in place
         ]
         known = shapes, shapes.values, problem.recordings
         return cls(*known, fixed, forces * counted, counted, blocks, tuple(entries))
 
     def __call__(
-        self, weights: Float[AnyArray, " joints"], kept: Float[AnyArray, " blocks"] | None = None
+        self,
+        weights: Float[AnyArray, " joints"],
+        kept: Float[AnyArray, " blocks"] | None = None,
     ) -> tuple[Float[Array, " shapes"], Array]:
         """Search by Levenberg-Marquardt over logarithms; return shapes, and whether it converged.
 
-        It begins at the model's shapes, and at the best of a few multiples of them, and keeps the
-        better end: from one start, a Stribeck speed can stop at ten times its value. Where the rows
-        hardly determine a shape, a weak pull keeps it near that of the model: as strong as one row
-        that tells that it differs by a factor of ten.
+        It begins at the model's shapes, and at the best of a few multiples of them, and
+        keeps the better end: from one start, a Stribeck speed can stop at ten times its
+        value. Where the rows hardly determine a shape, a weak pull keeps it near that
+        of the model: as strong as one row that tells that it differs by a factor of
+        ten.
 
         Args:
             weights: Weight of each joint [1/(N m) or 1/N].
-            kept: One for each block of time that counts, zero for others; by default all count.
+            kept: One for each block of time that counts, zero for others; by default
+                all count.
         """
         # Fits without nonlinear friction do not wait for it.
         import optimistix as optx
@@ -222,11 +256,14 @@ class ShapeSearch(eqx.Module):
         def search(u: Array, _) -> tuple[Array, Array]:
             deviation = jnp.sqrt(jnp.sum(weighted(u) ** 2) / jnp.maximum(count, 1.0))
             scale = jnp.maximum(deviation, 1e-150)
-            found = optx.least_squares(left, solver, u, args=scale, max_steps=STEPS, throw=False)
+            found = optx.least_squares(
+                left, solver, u, args=scale, max_steps=STEPS, throw=False
+            )
             return found.value, found.result == optx.RESULTS.successful
 
         def from_start(begin: Array) -> tuple[Array, Array, Array]:
-            # Twice: the strength of the pull depends on the noise, which is known at the end only.
+            # Twice: the strength of the pull depends on the noise, which is known at
+            # the end only.
             u, successes = jax.lax.scan(search, jnp.log(begin / start), length=2)
             return u, successes[-1], jnp.sum(weighted(u) ** 2)
 
@@ -235,11 +272,15 @@ class ShapeSearch(eqx.Module):
         best = jnp.argmin(squares)
         return start * jnp.exp(ends[best]), successes[best]
 
-    def _best_multiples(self, rows: Float[AnyArray, "rows joints"]) -> Float[Array, " shapes"]:
+    def _best_multiples(
+        self, rows: Float[AnyArray, "rows joints"]
+    ) -> Float[Array, " shapes"]:
         """Return for each joint the multiples of its shapes that explain its own rows best."""
         kinds = len(self.shapes.members)
         multiples = np.ones((3 ** min(kinds, 2), kinds, 1))
-        multiples[:, :2, 0] = list(itertools.product((0.2, 1.0, 5.0), repeat=min(kinds, 2)))
+        multiples[:, :2, 0] = list(
+            itertools.product((0.2, 1.0, 5.0), repeat=min(kinds, 2))
+        )
         grid = jnp.reshape(self.start, (1, kinds, -1)) * multiples
 
         def squares(x: Array) -> Array:
@@ -256,16 +297,22 @@ class ShapeSearch(eqx.Module):
     def columns(self, x: Float[AnyArray, " shapes"]) -> Float[Array, "rows entries"]:
         """Return the rows of everything that depends on shapes."""
         joint, _, column = self._entries
-        rows = _filtered_columns(jnp.asarray(x), self.shapes, self.recordings, joint, column)
+        rows = _filtered_columns(
+            jnp.asarray(x), self.shapes, self.recordings, joint, column
+        )
         return rows * jnp.asarray(self.counted)[:, joint]
 
     @property
     def _entries(self) -> list[np.ndarray]:
         return [np.array(part) for part in zip(*self.entries, strict=True)]
 
-    def information(self, rows: Float[AnyArray, "rows joints"]) -> Float[Array, "base base"]:
+    def information(
+        self, rows: Float[AnyArray, "rows joints"]
+    ) -> Float[Array, "base base"]:
         """Return the products of the fixed columns of rows with these weights."""
-        weighted = (jnp.asarray(self.fixed) * rows[..., None]).reshape(-1, self.fixed.shape[-1])
+        weighted = (jnp.asarray(self.fixed) * rows[..., None]).reshape(
+            -1, self.fixed.shape[-1]
+        )
         return weighted.T @ weighted
 
     def fit(
@@ -283,7 +330,11 @@ class ShapeSearch(eqx.Module):
         """
         own = self.columns(x)
         joint, place, _ = self._entries
-        fixed, forces, squares = jnp.asarray(self.fixed), jnp.asarray(self.forces), rows**2
+        fixed, forces, squares = (
+            jnp.asarray(self.fixed),
+            jnp.asarray(self.forces),
+            rows**2,
+        )
 
         def predict(c: Array) -> Array:
             whole = jnp.zeros_like(forces).at[:, joint].add(own * c[place][None])
@@ -295,14 +346,22 @@ class ShapeSearch(eqx.Module):
             return jnp.einsum("rjk,rj->k", fixed, weighted).at[place].add(along)
 
         information = self.information(rows) if information is None else information
-        spread = jnp.zeros((*rows.shape, len(place))).at[:, joint, np.arange(len(place))].set(own)
+        spread = (
+            jnp.zeros((*rows.shape, len(place)))
+            .at[:, joint, np.arange(len(place))]
+            .set(own)
+        )
         spread = (spread * squares[..., None]).reshape(-1, len(place))
         cross = spread.T @ fixed.reshape(-1, fixed.shape[-1])
-        both = jnp.where(joint == joint[:, None], own.T @ (own * squares[:, joint]), 0.0)
+        both = jnp.where(
+            joint == joint[:, None], own.T @ (own * squares[:, joint]), 0.0
+        )
         information = information.at[place].add(cross).at[:, place].add(cross.T)
         information = information.at[place[:, None], place].add(both)
         size = len(information)
-        inverse, _ = inverse_information(jax.lax.stop_gradient(information), RIDGE * size)
+        inverse, _ = inverse_information(
+            jax.lax.stop_gradient(information), RIDGE * size
+        )
 
         def refine(c: Array) -> Array:
             return c + inverse @ project(forces - predict(c))

@@ -17,11 +17,12 @@ class Uncertainty(eqx.Module):
     """Uncertainty of estimates.
 
     Attributes:
-        covariance: Covariance of the estimates; infinite variances where nothing is known.
+        covariance: Covariance of the estimates; infinite variances where nothing is
+            known.
         dof: Degrees of freedom of each variance: few of them make intervals wider.
         naive_covariance: Covariance if the rows were independent, as in textbooks.
-        jackknife: Standard deviations by the block jackknife, as a cross-check; None where there
-            are not enough blocks.
+        jackknife: Standard deviations by the block jackknife, as a cross-check; None
+            where there are not enough blocks.
         notes: Sentences for the user.
     """
 
@@ -58,7 +59,9 @@ class Uncertainty(eqx.Module):
             InputError: If `level` is not between 0 and 1.
         """
         if not 0 < level < 1:
-            raise InputError(f"`level` must lie between 0 and 1, like 0.95, but is {level:g}.")
+            raise InputError(
+                f"`level` must lie between 0 and 1, like 0.95, but is {level:g}."
+            )
         dof = np.clip(self.dof, 1.0, 1e6)
         return self.standard_deviations * special.stdtrit(dof, 0.5 + 0.5 * level)
 
@@ -66,17 +69,19 @@ class Uncertainty(eqx.Module):
 class ResidualSpectra(eqx.Module):
     """Spectra of the residuals of each joint, after filters and decimation.
 
-    Whiteness is judged within the band of the filters, with their gain and the leverage of the fit
-    divided out: the cumulative periodogram is compared with a straight line (Bartlett's test).
+    Whiteness is judged within the band of the filters, with their gain and the leverage
+    of the fit divided out: the cumulative periodogram is compared with a straight line
+    (Bartlett's test).
 
     Attributes:
         frequency: Frequencies of the lines [Hz].
         density: Smoothed power of each joint [N² m²/Hz or N²/Hz].
         gain: Gain (0 to 1) of filter and decimation at each line.
-        departure: Largest distance (0 to 1) of the cumulative periodogram from a straight line.
+        departure: Largest distance (0 to 1) of the cumulative periodogram from a
+            straight line.
         limit: Departure that white residuals exceed once in twenty.
-        low_frequency: Fraction (0 to 1) of each joint's power below a tenth of the band; 0.1 if
-            white.
+        low_frequency: Fraction (0 to 1) of each joint's power below a tenth of the
+            band; 0.1 if white.
         band: End of the band [Hz].
     """
 
@@ -99,7 +104,10 @@ class AbstractUncertainty(eqx.Module):
 
     @abstractmethod
     def __call__(
-        self, problem: RegressionProblem, estimate: Estimate, naive: Float[np.ndarray, "base base"]
+        self,
+        problem: RegressionProblem,
+        estimate: Estimate,
+        naive: Float[np.ndarray, "base base"],
     ) -> tuple[Uncertainty, ResidualSpectra | None]:
         """Return the uncertainty, and spectra of the residuals if the method computes them.
 

@@ -1,9 +1,10 @@
 r"""The spectral sandwich: variances of estimates from rows whose errors are correlated in time.
 
-An estimate is linear in the errors, $\hat p_i - p_i = \sum_{jt} P_{ijt} e_{jt}$, so its variance
-is $\sum_{jf} K_{ijf} \phi_j(f)$ with $K = |FFT_t P|^2 / N$ and the spectrum $\phi_j$ of the errors.
-The periodogram of the residuals is smoothed over a window of lines and divided by $1 - h_{jf}$,
-with the leverage $h$ of each line: the fit has explained that fraction of the errors.
+An estimate is linear in the errors, $\hat p_i - p_i = \sum_{jt} P_{ijt} e_{jt}$, so its
+variance is $\sum_{jf} K_{ijf} \phi_j(f)$ with $K = |FFT_t P|^2 / N$ and the spectrum
+$\phi_j$ of the errors. The periodogram of the residuals is smoothed over a window of
+lines and divided by $1 - h_{jf}$, with the leverage $h$ of each line: the fit has
+explained that fraction of the errors.
 """
 
 import dataclasses
@@ -40,26 +41,32 @@ BIN_EDGES = np.concatenate([np.arange(0.0, 1.0, 0.05), 1.15 ** np.arange(0, 80)]
 class SpectralSandwich(AbstractUncertainty):
     """Spectral sandwich: right for errors that are correlated from row to row (default).
 
-    Errors are assumed stationary and independent between joints, recordings, and parts of a log on
-    both sides of a gap. Where the errors are larger in the part of a log that decides a parameter,
-    the block jackknife gives more than chance allows: then its deviation counts. It needs one pass
-    over the rows. Of logs of more than `MAX_SAMPLES` some evenly spread stretches are transformed:
-    these give the ratio to the naive values. Where only factors are known, the block jackknife
-    takes the place of all.
+    Errors are assumed stationary and independent between joints, recordings, and parts
+    of a log on both sides of a gap. Where the errors are larger in the part of a log
+    that decides a parameter, the block jackknife gives more than chance allows: then
+    its deviation counts. It needs one pass over the rows. Of logs of more than
+    `MAX_SAMPLES` some evenly spread stretches are transformed: these give the ratio to
+    the naive values. Where only factors are known, the block jackknife takes the place
+    of all.
     """
 
     def __call__(self, problem, estimate, naive):
         """Return the sandwich, wider where the jackknife contradicts it."""
         if not problem.recordings:
             found, _ = BlockJackknife()(problem, estimate, naive)
-            note = "standard deviations come from the block jackknife: only factors were given."
+            note = (
+                "standard deviations come from the block jackknife: only factors "
+                "were given."
+            )
             return dataclasses.replace(found, notes=found.notes or (note,)), None
         lines, pairs, complete = row_spectra(problem, estimate)
         covariance, dof, white = sandwich(lines, pairs)
         exact = np.diag(naive)
         if not complete:
             known = (white > 0) & np.isfinite(exact)
-            ratio = np.sqrt(np.divide(exact, white, out=np.ones_like(white), where=known))
+            ratio = np.sqrt(
+                np.divide(exact, white, out=np.ones_like(white), where=known)
+            )
             covariance = covariance * ratio * ratio[:, None]
         unknown = np.isinf(exact)
         covariance[unknown, unknown] = np.inf
@@ -87,24 +94,37 @@ def _widened(found: Uncertainty, estimate: Estimate) -> Uncertainty:
 class Lines(NamedTuple):
     r"""Spectra of all stretches of one length, added up.
 
-    A stretch is a contiguous, equidistant part of the rows, which is transformed at once.
+    A stretch is a contiguous, equidistant part of the rows, which is transformed at
+    once.
     """
 
-    length: int  # rows of a stretch; shorter ones are padded with rows that do not count
+    length: (
+        int  # rows of a stretch; shorter ones are padded with rows that do not count
+    )
     row_time: float
     frequency: np.ndarray
     multiplicity: np.ndarray
     gain: np.ndarray
     bins: np.ndarray
-    energy: np.ndarray  # $|\sum_t (B z_t)_i e^{-i \omega t}|^2 m / N$ [base, channels, lines]
-    leverage: np.ndarray  # fraction (0 to 1) of each line explained by the fit [channels, lines]
+    energy: (
+        np.ndarray
+    )  # $|\sum_t (B z_t)_i e^{-i \omega t}|^2 m / N$ [base, channels, lines]
+    leverage: (
+        np.ndarray
+    )  # fraction (0 to 1) of each line explained by the fit [channels, lines]
     power: np.ndarray  # periodogram of the disturbances [channels, lines]
-    residual: np.ndarray  # periodogram of the residuals [joints, lines], in [N² m²] or [N²]
-    exposure: np.ndarray  # stretches, weighted by the fraction of each channel's rows that count
+    residual: (
+        np.ndarray
+    )  # periodogram of the residuals [joints, lines], in [N² m²] or [N²]
+    exposure: (
+        np.ndarray
+    )  # stretches, weighted by the fraction of each channel's rows that count
     stretches: np.ndarray  # number of stretches, as an array without axes
 
     @classmethod
-    def empty(cls, length: int, observations: Observations, sizes: tuple[int, int]) -> "Lines":
+    def empty(
+        cls, length: int, observations: Observations, sizes: tuple[int, int]
+    ) -> "Lines":
         """Return the lines of no stretch yet, for some sizes (base parameters, channels)."""
         row_time, (base, channels) = observations.row_time, sizes
         frequency = fft.rfftfreq(length, row_time)
@@ -119,7 +139,12 @@ class Lines(NamedTuple):
         bins = np.searchsorted(BIN_EDGES, frequency, side="right")
         known = frequency, multiplicity(length)[:count], gain[:count], bins
         joints = observations.mask.shape[1]
-        shapes = (base, channels, count), (channels, count), (channels, count), (joints, count)
+        shapes = (
+            (base, channels, count),
+            (channels, count),
+            (channels, count),
+            (joints, count),
+        )
         sums = map(np.zeros, (*shapes, channels, ()))
         return cls(length, row_time, *known, *sums)
 
@@ -132,9 +157,9 @@ def row_spectra(problem: RegressionProblem, estimate: Estimate):
     """Transform every stretch of the rows in one pass.
 
     Returns:
-        Spectra of every length of stretches; for each channel its columns of $B$ and the products
-        of its instruments, summed over the lines of each bin [bins, columns, columns]; whether all
-        rows were transformed.
+        Spectra of every length of stretches; for each channel its columns of $B$ and
+        the products of its instruments, summed over the lines of each bin [bins,
+        columns, columns]; whether all rows were transformed.
     """
     stretches, complete = _divide(problem)
     kinds = {(b - a, problem.recordings[number].row_time) for number, a, b in stretches}
@@ -156,10 +181,16 @@ def row_spectra(problem: RegressionProblem, estimate: Estimate):
                     yield (number, a, b), chunk.part(own), residuals[own]
 
     def channels() -> Iterator[tuple[Lines, int, Sequence[Channel]]]:
-        for (number, a, b), group in itertools.groupby(pieces_of_stretches(), lambda x: x[0]):
+        for (number, a, b), group in itertools.groupby(
+            pieces_of_stretches(), lambda x: x[0]
+        ):
             o, parts = problem.recordings[number], [(chunk, r) for _, chunk, r in group]
-            pieces = [estimate.influence(chunk, residuals) for chunk, residuals in parts]
-            new = Lines.empty(lengths[b - a, o.row_time], o, (len(B), parts[0][1].shape[1]))
+            pieces = [
+                estimate.influence(chunk, residuals) for chunk, residuals in parts
+            ]
+            new = Lines.empty(
+                lengths[b - a, o.row_time], o, (len(B), parts[0][1].shape[1])
+            )
             lines = found.setdefault((new.length, o.row_time, len(new.frequency)), new)
             r = np.concatenate([np.where(chunk.mask, r, 0.0) for chunk, r in parts])
             lines.residual[...] += np.abs(lines.transform(r.T)) ** 2 / lines.length
@@ -168,10 +199,14 @@ def row_spectra(problem: RegressionProblem, estimate: Estimate):
             for c, own in enumerate(zip(*pieces, strict=True)):
                 yield lines, c, own
 
-    # This thread makes the rows of the next stretch while others transform the channels of one.
+    # This thread makes the rows of the next stretch while others transform the channels
+    # of one.
     others = max(1, (os.cpu_count() or 1) - 1)
     transformed = on_cores(
-        lambda x: (*x[:2], _channel(x[0], B, x[2])), channels(), others, problem.robot.joints
+        lambda x: (*x[:2], _channel(x[0], B, x[2])),
+        channels(),
+        others,
+        problem.robot.joints,
     )
     for lines, c, (own, energy, leverage, power, exposure, products) in transformed:
         lines.energy[:, c] += energy
@@ -210,15 +245,17 @@ def _channel(lines: Lines, inverse: np.ndarray, parts: Sequence[Channel]) -> tup
     for k, (a, b) in zip(present, itertools.pairwise([*starts, len(m)]), strict=True):
         both = Z[:, 2 * a : 2 * b]
         products[k] = both @ both.T
-    power = np.abs(lines.transform(np.concatenate([x.disturbance for x in parts]))) ** 2 / n
+    power = (
+        np.abs(lines.transform(np.concatenate([x.disturbance for x in parts]))) ** 2 / n
+    )
     return own, energy, leverage, power, sum(x.counted for x in parts) / n, products
 
 
 def _divide(problem: RegressionProblem) -> tuple[list[Span], bool]:
     """Divide recordings into stretches; return whether they hold all rows.
 
-    Rows of different stretches count as independent: the relative error is about the correlation
-    time of the noise over the length of a stretch.
+    Rows of different stretches count as independent: the relative error is about the
+    correlation time of the noise over the length of a stretch.
     """
     samples = sum(o.samples for o in problem.recordings)
     complete = samples <= MAX_SAMPLES
@@ -228,7 +265,9 @@ def _divide(problem: RegressionProblem) -> tuple[list[Span], bool]:
         for a, b in o.row_segments:
             if complete:
                 parts = np.array_split(np.arange(a, b), math.ceil((b - a) / most))
-                stretches += [(number, int(part[0]), int(part[-1]) + 1) for part in parts]
+                stretches += [
+                    (number, int(part[0]), int(part[-1]) + 1) for part in parts
+                ]
             else:
                 # Equal lengths have fast transforms.
                 stretches += [(number, k, min(k + most, b)) for k in range(a, b, most)]
@@ -242,8 +281,9 @@ def _divide(problem: RegressionProblem) -> tuple[list[Span], bool]:
 def window_sums(frequency: Float[np.ndarray, " lines"], longest: float):
     """Return functions that sum arrays over windows of lines, and over the windows with a line.
 
-    A window reaches 30 % of its frequency to either side, at least 0.25 Hz and four lines of the
-    longest stretch [s]. The functions take NumPy and JAX arrays, with the lines as last axis.
+    A window reaches 30 % of its frequency to either side, at least 0.25 Hz and four
+    lines of the longest stretch [s]. The functions take NumPy and JAX arrays, with the
+    lines as last axis.
     """
     order = np.argsort(frequency, kind="stable")
     place = np.argsort(order, kind="stable")
@@ -251,7 +291,8 @@ def window_sums(frequency: Float[np.ndarray, " lines"], longest: float):
     half = np.maximum(max(0.25, 4.0 / longest), 0.3 * f)
     low = np.searchsorted(f, f - half * (1 + 1e-9), side="left")
     high = np.searchsorted(f, f + half * (1 + 1e-9), side="right")
-    # Both ends of a window rise with its middle: the windows around a line are neighbours.
+    # Both ends of a window rise with its middle: the windows around a line are
+    # neighbours.
     first = np.searchsorted(high, np.arange(len(f)), side="right")
     last = np.searchsorted(low, np.arange(len(f)), side="right")
 
@@ -259,8 +300,12 @@ def window_sums(frequency: Float[np.ndarray, " lines"], longest: float):
         def total(x: AnyArray) -> AnyArray:
             sums = x[..., order].cumsum(axis=-1)
             flat = (*(1,) * (x.ndim - 1), -1)
-            before = sums[..., np.maximum(low - 1, 0)] * (low > 0).astype(float).reshape(flat)
-            after = sums[..., np.maximum(high - 1, 0)] * (high > 0).astype(float).reshape(flat)
+            before = sums[..., np.maximum(low - 1, 0)] * (low > 0).astype(
+                float
+            ).reshape(flat)
+            after = sums[..., np.maximum(high - 1, 0)] * (high > 0).astype(
+                float
+            ).reshape(flat)
             return (after - before)[..., place]
 
         return total
@@ -271,11 +316,14 @@ def window_sums(frequency: Float[np.ndarray, " lines"], longest: float):
 class SpectralTable:
     r"""The sandwich as a linear map of periodograms, $var_i = \sum_{jf} C_{ijf} I_{jf}$.
 
-    Computed once for a design and applied to many draws; in NumPy, or in JAX where `xp` is
-    `jax.numpy`. The other arguments are those of `Lines`, of all lengths of stretches together.
+    Computed once for a design and applied to many draws; in NumPy, or in JAX where `xp`
+    is `jax.numpy`. The other arguments are those of `Lines`, of all lengths of
+    stretches together.
     """
 
-    def __init__(self, xp, frequency, multiplicity, energy, leverage, exposure, longest):
+    def __init__(
+        self, xp, frequency, multiplicity, energy, leverage, exposure, longest
+    ):
         self._xp = xp
         self._sums, transposed_sums = window_sums(frequency, longest)
         self._half = half = 0.5 * multiplicity[None]
@@ -307,9 +355,13 @@ class SpectralTable:
         """Return variances and degrees of freedom for periodograms [draws, channels, lines]."""
         xp, terms = self._xp, list(enumerate(self._maps))
         variance: Any = sum(power[:, c] @ C.T for c, C in terms)
-        squares: Any = sum((power[:, c] * self._scatter[c][None]) ** 2 @ (C**2).T for c, C in terms)
+        squares: Any = sum(
+            (power[:, c] * self._scatter[c][None]) ** 2 @ (C**2).T for c, C in terms
+        )
         positive = squares > 0
-        dof = xp.where(positive, 4.0 * variance**2 / xp.where(positive, squares, 1.0), xp.inf)
+        dof = xp.where(
+            positive, 4.0 * variance**2 / xp.where(positive, squares, 1.0), xp.inf
+        )
         return variance, dof
 
 
@@ -370,11 +422,14 @@ def residual_spectra(lines: Sequence[Lines]) -> ResidualSpectra:
     )
 
 
-def sandwich_of_columns(xp, own, weights, inverse, p, columns, forces, exposure, row_time: float):
+def sandwich_of_columns(
+    xp, own, weights, inverse, p, columns, forces, exposure, row_time: float
+):
     """Return variances and degrees of freedom of estimates `p` [draws, base], in NumPy or JAX.
 
-    Columns [columns, rows] and forces [draws, rows] of each joint are zero where a row does not
-    count; the columns belong to its own parameters; `exposure` is the fraction of rows that count.
+    Columns [columns, rows] and forces [draws, rows] of each joint are zero where a row
+    does not count; the columns belong to its own parameters; `exposure` is the fraction
+    of rows that count.
     """
     length = columns[0].shape[-1]
     frequency, m = fft.rfftfreq(length, row_time), multiplicity(length)

@@ -1,8 +1,9 @@
 """The two sides that every filter has, recursive low-passes, and decimation.
 
-A regressor's columns are not band-limited (friction has edges), so the columns must be filtered
-like the forces, or parameters that are coupled with friction are biased. Hence a filter has two
-sides that belong together: `motion` for the angles, `smooth` for forces and columns.
+A regressor's columns are not band-limited (friction has edges), so the columns must be
+filtered like the forces, or parameters that are coupled with friction are biased. Hence
+a filter has two sides that belong together: `motion` for the angles, `smooth` for
+forces and columns.
 """
 
 import abc
@@ -39,7 +40,8 @@ class LowPass(eqx.Module):
     """Recursive filter that runs forward and backward: no phase, gain one for constants.
 
     Attributes:
-        sections: Second-order sections of one direction, as in scipy; everything passes if empty.
+        sections: Second-order sections of one direction, as in scipy; everything passes
+            if empty.
         cutoff: Frequency at which the gain of both directions falls below 1/2 [Hz].
     """
 
@@ -63,11 +65,15 @@ class LowPass(eqx.Module):
         width = max(1, 2**22 // len(flat))
         for start in range(0, flat.shape[1], width):
             block = np.ascontiguousarray(flat[:, start : start + width].T)
-            block = signal.sosfiltfilt(sos, block, axis=1, padtype="odd", padlen=padding)
+            block = signal.sosfiltfilt(
+                sos, block, axis=1, padtype="odd", padlen=padding
+            )
             out[:, start : start + width] = block.T
         return out.reshape(x.shape)
 
-    def gain(self, frequency: Float[AnyArray, " lines"], sample_time: float) -> np.ndarray:
+    def gain(
+        self, frequency: Float[AnyArray, " lines"], sample_time: float
+    ) -> np.ndarray:
         """Return the gain for sinusoids of some frequencies [Hz]."""
         if not self.sections:
             return np.ones_like(frequency)
@@ -83,13 +89,18 @@ class LowPass(eqx.Module):
         if slowest == 0:
             return 2 * len(sos)
         if tolerance > 1e-6:
-            samples = math.ceil(math.log(1e-3 * tolerance) / math.log(slowest)) + 4 * len(sos)
+            samples = math.ceil(
+                math.log(1e-3 * tolerance) / math.log(slowest)
+            ) + 4 * len(sos)
             impulse = np.zeros(samples)
             impulse[0] = 1.0
             one_way = signal.sosfilt(sos, impulse)
-            two_way = np.abs(signal.correlate(one_way, one_way, method="fft"))[samples - 1 :]
+            two_way = np.abs(signal.correlate(one_way, one_way, method="fft"))[
+                samples - 1 :
+            ]
             return int(np.flatnonzero(two_way > tolerance * two_way[0])[-1]) + 1
-        # Rounding hides smaller tails: continue the slowest pole (multiplied by the time it lasts).
+        # Rounding hides smaller tails: continue the slowest pole (multiplied by the
+        # time it lasts).
         near = self.memory(2e-6)
         return near + math.ceil(1.1 * math.log(tolerance / 2e-6) / math.log(slowest))
 
@@ -101,7 +112,9 @@ def _filter_both_ways(sos: np.ndarray, x: Array, padding: int) -> Array:
     extended = jnp.concatenate([before, x, after])
     steady = signal.sosfilt_zi(sos)
 
-    def step(state: list[tuple[Array, Array]], x: Array) -> tuple[list[tuple[Array, Array]], Array]:
+    def step(
+        state: list[tuple[Array, Array]], x: Array
+    ) -> tuple[list[tuple[Array, Array]], Array]:
         following = []
         for (b0, b1, b2, _, a1, a2), (first, second) in zip(sos, state, strict=True):
             y = b0 * x + first
@@ -117,7 +130,9 @@ def _filter_both_ways(sos: np.ndarray, x: Array, padding: int) -> Array:
     return one_way(one_way(extended, False), True)[padding : padding + len(x)]
 
 
-def butterworth(cutoff: float, order: int, sample_time: float, name: str = "cutoff") -> LowPass:
+def butterworth(
+    cutoff: float, order: int, sample_time: float, name: str = "cutoff"
+) -> LowPass:
     """Return a Butterworth filter, to be run forward and backward; `cutoff` [Hz] is scipy's."""
     if math.isinf(cutoff):
         return LowPass((), math.inf)
@@ -139,8 +154,10 @@ def require_cutoff(name: str, cutoff: float, sample_time: float) -> None:
     rate = 1 / sample_time
     if not 1e-5 * rate <= cutoff < 0.5 * rate:
         raise InputError(
-            f"`{name}` of {cutoff:.6g} Hz must be below half of the sampling rate of {rate:.6g} Hz "
-            f"(and above 1e-5 of it): log faster than {2 * cutoff:.6g} Hz, or check `time_unit`."
+            f"`{name}` of {cutoff:.6g} Hz must be below half of the sampling rate of "
+            f"{rate:.6g} Hz "
+            f"(and above 1e-5 of it): log faster than {2 * cutoff:.6g} Hz, or check "
+            "`time_unit`."
         )
 
 
@@ -148,7 +165,8 @@ class AbstractFilter(eqx.Module):
     """Filter of a log: motion from the angles, and the band of forces and columns.
 
     Attributes:
-        uses_velocities: Whether measured velocities, if there are any, enter the motion.
+        uses_velocities: Whether measured velocities, if there are any, enter the
+            motion.
     """
 
     uses_velocities: ClassVar[bool] = True
@@ -185,7 +203,9 @@ def check_settings(filter: AbstractFilter, *positive: str) -> None:
     for name, (rule, words) in rules.items():
         value = getattr(filter, name, None)
         if value is not None and not rule(value):
-            raise InputError(f"`{name}` of `{owner}` must be {words}, but is {value:g}.")
+            raise InputError(
+                f"`{name}` of `{owner}` must be {words}, but is {value:g}."
+            )
 
 
 def settled_edge(margin: float | None, sample_time: float, *filters: LowPass) -> int:
@@ -239,7 +259,9 @@ class Subsample(AbstractDecimation):
 
     def __check_init__(self) -> None:
         if self.step < 1:
-            raise InputError(f"`step` must be a whole number from 1 on, but is {self.step}.")
+            raise InputError(
+                f"`step` must be a whole number from 1 on, but is {self.step}."
+            )
 
     @property
     def stages(self) -> tuple[int, ...]:  # noqa: D102
@@ -252,7 +274,8 @@ class Subsample(AbstractDecimation):
         rate = 1.0 / (sample_time * self.step)
         if self.step > 1 and cutoff > 0.5 * rate:
             raise InputError(
-                f"`Subsample({self.step})` leaves {rate:.6g} Hz, but a cut-off of {cutoff:.6g} Hz "
+                f"`Subsample({self.step})` leaves {rate:.6g} Hz, but a cut-off of "
+                f"{cutoff:.6g} Hz "
                 f"needs more than {2 * cutoff:.6g} Hz: take one of "
                 f"{max(1, math.floor(0.5 / (cutoff * sample_time)))} samples at most, "
                 "a lower cut-off, or `Decimation`."
@@ -266,9 +289,9 @@ def _factors(values: Iterable[float | int]) -> tuple[int, ...]:
 class Decimation(AbstractDecimation):
     """Decimation in stages with a zero-phase low-pass before each: for any filter, or none.
 
-    The low-pass filters are Chebyshev filters of order eight with 0.05 dB ripple at 0.8 of half of
-    the new rate, forward and backward, with gain one for constants (where scipy's `decimate` keeps
-    the ripple's 0.989).
+    The low-pass filters are Chebyshev filters of order eight with 0.05 dB ripple at 0.8
+    of half of the new rate, forward and backward, with gain one for constants (where
+    scipy's `decimate` keeps the ripple's 0.989).
 
     Attributes:
         factors: Factors of the stages, 13 or less each.
@@ -279,7 +302,8 @@ class Decimation(AbstractDecimation):
     def __check_init__(self) -> None:
         if not self.factors or min(self.factors) < 1 or max(self.factors) > 13:
             raise InputError(
-                f"`factors` must be from 1 to 13 each, but are {self.factors}: take several stages."
+                f"`factors` must be from 1 to 13 each, but are {self.factors}: take "
+                "several stages."
             )
 
     @property

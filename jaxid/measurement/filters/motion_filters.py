@@ -27,21 +27,24 @@ from .filter import (
 class ZeroPhaseButterworth(AbstractFilter):
     """Butterworth low-pass, forward and backward, then central differences of fourth order.
 
-    Measured velocities, if there are any, are filtered like the angles and differentiated once;
-    otherwise the angles are differentiated twice. With an infinite `cutoff` nothing is filtered.
+    Measured velocities, if there are any, are filtered like the angles and
+    differentiated once; otherwise the angles are differentiated twice. With an infinite
+    `cutoff` nothing is filtered.
 
     Attributes:
         cutoff: Cut-off of angles and velocities, of one direction as in scipy [Hz].
         order: Order of one direction.
-        force_cutoff: Cut-off of forces and columns [Hz], like `20.0`; `cutoff` if None; infinite if
-            decimation alone shall limit their band.
-        margin: Time to drop at both ends of a segment [s], like `0.1`; until the filter has settled
-            if None.
+        force_cutoff: Cut-off of forces and columns [Hz], like `20.0`; `cutoff` if None;
+            infinite if decimation alone shall limit their band.
+        margin: Time to drop at both ends of a segment [s], like `0.1`; until the filter
+            has settled if None.
     """
 
     cutoff: float = eqx.field(static=True, converter=float)
     order: int = eqx.field(static=True, converter=integer("order"), default=4)
-    force_cutoff: float | None = eqx.field(static=True, converter=optional, default=None)
+    force_cutoff: float | None = eqx.field(
+        static=True, converter=optional, default=None
+    )
     margin: float | None = eqx.field(static=True, converter=optional, default=None)
 
     def __check_init__(self) -> None:
@@ -65,28 +68,31 @@ class ZeroPhaseButterworth(AbstractFilter):
 
     def edge(self, sample_time: float) -> int:  # noqa: D102
         motion = butterworth(self.cutoff, self.order, sample_time)
-        return settled_edge(self.margin, sample_time, motion, self.low_pass(sample_time))
+        return settled_edge(
+            self.margin, sample_time, motion, self.low_pass(sample_time)
+        )
 
 
 class PaperFilter(AbstractFilter):
     r"""The paper's differentiating filter $G(s) = s / (s / \omega_f + 1)$ (Eq. 25).
 
-    Velocities are $G q$ with the cut-off `velocity`: causal, so they lag by about $1/\omega_f$.
-    Accelerations are filtered forward and backward with the cut-off `acceleration`; since
-    $G(s) G(-s) = -s^2 / (1 - s^2 / \omega_f^2)$, the result on $q$ is *minus* the acceleration and
-    its sign is changed. Forces and columns are filtered by the low-pass $1 / (s / \omega_f + 1)$
-    forward and backward with the cut-off `acceleration`, since the paper is silent about them.
-    Angles stay as measured, and measured velocities are not used.
+    Velocities are $G q$ with the cut-off `velocity`: causal, so they lag by about
+    $1/\omega_f$. Accelerations are filtered forward and backward with the cut-off
+    `acceleration`; since $G(s) G(-s) = -s^2 / (1 - s^2 / \omega_f^2)$, the result on
+    $q$ is *minus* the acceleration and its sign is changed. Forces and columns are
+    filtered by the low-pass $1 / (s / \omega_f + 1)$ forward and backward with the
+    cut-off `acceleration`, since the paper is silent about them. Angles stay as
+    measured, and measured velocities are not used.
 
-    The paper does not say how $G$ was made discrete. Here it is the bilinear transform: its delay
-    is the analogue filter's at every sampling rate (backward differences add half a sample), it is
-    stable, and below half of the sampling rate it does not ring.
+    The paper does not say how $G$ was made discrete. Here it is the bilinear transform:
+    its delay is the analogue filter's at every sampling rate (backward differences add
+    half a sample), it is stable, and below half of the sampling rate it does not ring.
 
     Attributes:
         velocity: Cut-off of the velocities [rad/s].
         acceleration: Cut-off of accelerations, forces and columns [rad/s].
-        margin: Time to drop at both ends of a segment [s], like `0.1`; until the filter has settled
-            if None.
+        margin: Time to drop at both ends of a segment [s], like `0.1`; until the filter
+            has settled if None.
     """
 
     uses_velocities: ClassVar[bool] = False
@@ -111,31 +117,38 @@ class PaperFilter(AbstractFilter):
 
     def edge(self, sample_time: float) -> int:  # noqa: D102
         motion = _first_order("velocity", self.velocity, sample_time)
-        return settled_edge(self.margin, sample_time, motion, self.low_pass(sample_time))
+        return settled_edge(
+            self.margin, sample_time, motion, self.low_pass(sample_time)
+        )
 
 
 class PeriodicFourier(AbstractFilter):
     """Fourier series, fitted to the angles of a periodic motion and differentiated exactly.
 
-    Each segment has a series of its own, by least squares over all of its samples, which must span
-    at least one period. Forces and columns are not averaged over the periods: least squares do
-    that, and the scatter between the periods tells the uncertainty. They are filtered by a
+    Each segment has a series of its own, by least squares over all of its samples,
+    which must span at least one period. Forces and columns are not averaged over the
+    periods: least squares do that, and the scatter between the periods tells the
+        uncertainty. They are filtered by a
     zero-phase Butterworth low-pass. Measured velocities are not used.
 
     Attributes:
         period: Period of the motion [s], like `10.0`.
-        harmonics: Number of harmonics, like `5`; that of the planned trajectory or a few more.
-        force_harmonics: Cut-off of forces and columns, in harmonics, like `50`; ten times
-            `harmonics` if None, infinite if decimation alone shall limit their band.
+        harmonics: Number of harmonics, like `5`; that of the planned trajectory or a
+            few more.
+        force_harmonics: Cut-off of forces and columns, in harmonics, like `50`; ten
+            times `harmonics` if None, infinite if decimation alone shall limit their
+            band.
         order: Order of the low-pass, of one direction.
-        margin: Time to drop at both ends of a segment [s], like `0.1`; until the filter has settled
-            if None.
+        margin: Time to drop at both ends of a segment [s], like `0.1`; until the filter
+            has settled if None.
     """
 
     uses_velocities: ClassVar[bool] = False
     period: float = eqx.field(static=True, converter=float)
     harmonics: int = eqx.field(static=True, converter=integer("harmonics"))
-    force_harmonics: float | None = eqx.field(static=True, converter=optional, default=None)
+    force_harmonics: float | None = eqx.field(
+        static=True, converter=optional, default=None
+    )
     order: int = eqx.field(static=True, converter=integer("order"), default=4)
     margin: float | None = eqx.field(static=True, converter=optional, default=None)
 
@@ -146,8 +159,10 @@ class PeriodicFourier(AbstractFilter):
         t = sample_time * np.arange(len(angles))
         if len(t) * sample_time < (1 - 1e-9) * self.period:
             raise InputError(
-                f"`period` of `PeriodicFourier` is {self.period:g} s, but a segment of the log "
-                f"lasts {len(t) * sample_time:g} s: record whole periods, or use another filter."
+                f"`period` of `PeriodicFourier` is {self.period:g} s, but a segment "
+                "of the log "
+                f"lasts {len(t) * sample_time:g} s: record whole periods, or use "
+                "another filter."
             )
         require_cutoff("harmonics / period", self.harmonics / self.period, sample_time)
         w = 2 * math.pi / self.period * np.arange(1, self.harmonics + 1)
@@ -161,8 +176,10 @@ class PeriodicFourier(AbstractFilter):
         if wrong.size:
             j = int(wrong[0])
             raise InputError(
-                f"the angles of joint {j + 1} leave a Fourier series by {left[j] / moved[j]:.0%} "
-                "of their motion (RMS): correct `period` or `harmonics`, or crop the log."
+                f"the angles of joint {j + 1} leave a Fourier series by "
+                f"{left[j] / moved[j]:.0%} "
+                "of their motion (RMS): correct `period` or `harmonics`, or crop the "
+                "log."
             )
         a = series[1 : self.harmonics + 1]
         b = series[self.harmonics + 1 :]
@@ -170,7 +187,11 @@ class PeriodicFourier(AbstractFilter):
         return Motion(q, c @ (W * a) - s @ (W * b), -s @ (W**2 * a) - c @ (W**2 * b))
 
     def low_pass(self, sample_time: float) -> LowPass:  # noqa: D102
-        lines = 10.0 * self.harmonics if self.force_harmonics is None else self.force_harmonics
+        lines = (
+            10.0 * self.harmonics
+            if self.force_harmonics is None
+            else self.force_harmonics
+        )
         name = "force_harmonics / period"
         return butterworth(lines / self.period, self.order, sample_time, name)
 

@@ -11,7 +11,9 @@ from jaxid.identification.consistency.pseudo_inertia import (
 )
 
 BOUNDS = jid.consistency.BodyBounds(mass_max=10.0, radius=0.5)
-BODY = inertial_parameters(ball(np.array(3.0), np.array([0.0, 0.1, 0.2]), np.array(0.12)))
+BODY = inertial_parameters(
+    ball(np.array(3.0), np.array([0.0, 0.1, 0.2]), np.array(0.12))
+)
 
 
 def test_it_is_the_integral_of_points():
@@ -22,15 +24,21 @@ def test_it_is_the_integral_of_points():
     body = [m.sum(), *(m @ r), J[0, 0], J[1, 1], J[2, 2], -J[1, 2], -J[0, 2], -J[0, 1]]
     points = np.column_stack([r, np.ones(8)])
     P = jid.consistency.pseudo_inertia(np.array(body))
-    np.testing.assert_allclose(P, np.einsum("k,ki,kj->ij", m, points, points), rtol=1e-12)
+    np.testing.assert_allclose(
+        P, np.einsum("k,ki,kj->ij", m, points, points), rtol=1e-12
+    )
     np.testing.assert_allclose(inertial_parameters(P), body, rtol=1e-12)
 
 
 def test_the_order_is_that_of_tools():
-    tool = jid.Tool(0, mass=2.0, centre_of_mass=(0.1, -0.2, 0.3), inertia=0.08 * np.eye(3))
+    tool = jid.Tool(
+        0, mass=2.0, centre_of_mass=(0.1, -0.2, 0.3), inertia=0.08 * np.eye(3)
+    )
     radius = np.sqrt(0.08 / 2.0 * 5 / 2)
     P = ball(np.array(2.0), np.array([0.1, -0.2, 0.3]), np.array(radius))
-    np.testing.assert_allclose(jid.consistency.pseudo_inertia(tool.parameters), P, rtol=1e-12)
+    np.testing.assert_allclose(
+        jid.consistency.pseudo_inertia(tool.parameters), P, rtol=1e-12
+    )
 
 
 @pytest.mark.parametrize(
@@ -48,7 +56,9 @@ def test_triangle_inequality_and_centre_of_mass_decide(first_moment, moments, po
 
 
 def test_a_body_moves_as_little_as_its_errors_allow():
-    found, distance, _ = jid.consistency.consistent_body(BODY, 1e-4 * np.eye(10), BOUNDS)
+    found, distance, _ = jid.consistency.consistent_body(
+        BODY, 1e-4 * np.eye(10), BOUNDS
+    )
     np.testing.assert_allclose(found, BODY, atol=1e-4)
     assert distance < 0.05
     wrong = BODY.copy()

@@ -47,7 +47,9 @@ def test_the_mass_matrix_is_definite_where_least_squares_fail(panda, consistent)
     np.testing.assert_allclose(found.residual_increase, increase, rtol=1e-6)
     assert 0 < increase < 0.1
     full = consistent.full_parameters
-    np.testing.assert_allclose(base.from_standard(full), consistent.parameters, rtol=1e-9)
+    np.testing.assert_allclose(
+        base.from_standard(full), consistent.parameters, rtol=1e-9
+    )
     names = base.model.parameter_names
     drives = [k for k, name in enumerate(names) if name[:2] in ("fv", "fc", "Ia")]
     assert (full[drives] >= 0).all()
@@ -88,7 +90,10 @@ def test_coupled_drives_are_definite():
 def test_bounds_hold_and_are_named(panda):
     base, _, o = panda
     bounds = jid.consistency.BodyBounds.from_geometry(base.model.robot).replace(
-        mass_max=[8, 8, 8, 2, 8, 8, 8], mass_min=0.2, centre_max=[np.inf, 0.01, 0.2], total_mass=20
+        mass_max=[8, 8, 8, 2, 8, 8, 8],
+        mass_min=0.2,
+        centre_max=[np.inf, 0.01, 0.2],
+        total_mass=20,
     )
     fit = jid.identify(base, o, jid.PhysicallyConsistent(WEIGHTS, bounds))
     m, h = fit.consistency.bodies[:, 0], fit.consistency.bodies[:, 1:4]
@@ -111,7 +116,9 @@ def test_a_strong_pull_leads_to_its_bodies(panda, consistent):
         fit = jid.identify(base, o, jid.PhysicallyConsistent(WEIGHTS, pull=pull))
         gaps.append(np.abs(fit.consistency.bodies - bodies).max())
         if strength == 1.0:
-            smallest = [jid.validate(x, o).definiteness.smallest for x in (consistent, fit)]
+            smallest = [
+                jid.validate(x, o).definiteness.smallest for x in (consistent, fit)
+            ]
             assert smallest[1] > smallest[0] > 0
     assert gaps[0] > gaps[1] > gaps[2]
     assert gaps[2] < 0.05 * gaps[0]
@@ -127,7 +134,9 @@ def test_a_parameter_prior_counts(panda):
 
 
 def bounds(**change):
-    return lambda: jid.consistency.BodyBounds.from_geometry(jid.robots.panda()).replace(**change)
+    return lambda: jid.consistency.BodyBounds.from_geometry(jid.robots.panda()).replace(
+        **change
+    )
 
 
 def coupled_without_rotors():

@@ -20,8 +20,12 @@ BODIES = np.stack(
 
 
 def test_bodies_are_found_again():
-    np.testing.assert_allclose(LogCholesky.of(BODIES).parameters, BODIES, rtol=1e-12, atol=1e-15)
-    np.testing.assert_allclose(LogCholesky.of(BODIES.ravel()).parameters, BODIES, rtol=1e-12)
+    np.testing.assert_allclose(
+        LogCholesky.of(BODIES).parameters, BODIES, rtol=1e-12, atol=1e-15
+    )
+    np.testing.assert_allclose(
+        LogCholesky.of(BODIES.ravel()).parameters, BODIES, rtol=1e-12
+    )
     assert LogCholesky.of(BODIES[0]).parameters.shape == (10,)
 
 
@@ -30,7 +34,10 @@ def test_any_coordinates_are_a_body():
     p = np.asarray(LogCholesky(jnp.asarray(x)).parameters)
     assert (consistency_margin(p) > 0).all()
     assert (p[:, 0] > 0).all()
-    assert all((np.linalg.eigvalsh(x.tensor) > 0).all() for x in map(Inertia.from_parameters, p))
+    assert all(
+        (np.linalg.eigvalsh(x.tensor) > 0).all()
+        for x in map(Inertia.from_parameters, p)
+    )
 
 
 def test_what_cannot_exist_is_refused():
@@ -50,14 +57,18 @@ def test_a_fit_through_a_rollout_stays_possible():
     def motion(chart):
         def step(state, tau):
             q, qd = state
-            qd = qd + 0.01 * model.forward_dynamics(chart.parameters.ravel(), q, qd, tau)
+            qd = qd + 0.01 * model.forward_dynamics(
+                chart.parameters.ravel(), q, qd, tau
+            )
             return (q + 0.01 * qd, qd), q
 
         return jax.lax.scan(step, (jnp.zeros(2), jnp.zeros(2)), forces)[1]
 
     measured = motion(truth)
     start = LogCholesky(truth.coordinates + 0.5)
-    loss = jax.jit(jax.value_and_grad(lambda chart: jnp.sum((motion(chart) - measured) ** 2)))
+    loss = jax.jit(
+        jax.value_and_grad(lambda chart: jnp.sum((motion(chart) - measured) ** 2))
+    )
     chart, values = start, []
     for _ in range(20):
         value, slope = loss(chart)

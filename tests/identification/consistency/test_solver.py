@@ -9,7 +9,11 @@ from arms import TERMS
 
 import jaxid as jid
 from jaxid.identification.consistency import consistency_margin, solver
-from jaxid.identification.consistency.program import cone_program, feasible_set, nominal_bodies
+from jaxid.identification.consistency.program import (
+    cone_program,
+    feasible_set,
+    nominal_bodies,
+)
 
 PLANAR = jid.robots.planar_arm(2, 0.5)
 
@@ -22,9 +26,13 @@ def case(robot, terms=TERMS, margin=0.0, **bounds):
 
 CASES = {
     "a seven-axis arm": lambda: case(jid.robots.panda()),
-    "coupled drives": lambda: case(jid.robots.tx40(), (*TERMS, jid.terms.CoupledDrives())),
+    "coupled drives": lambda: case(
+        jid.robots.tx40(), (*TERMS, jid.terms.CoupledDrives())
+    ),
     "a rail": lambda: case(jid.robots.tx90l_on_rail()),
-    "seven parameters": lambda: case(PLANAR, (jid.RigidBodies(principal_axes=True), *TERMS[1:])),
+    "seven parameters": lambda: case(
+        PLANAR, (jid.RigidBodies(principal_axes=True), *TERMS[1:])
+    ),
     "all bounds": lambda: case(
         PLANAR,
         mass_min=1.0,
@@ -52,7 +60,9 @@ def test_the_optimum_is_a_conic_solvers(name):
     np.testing.assert_allclose(data.A @ ours, data.A @ p, atol=5e-3 * np.sqrt(value))
 
 
-@pytest.mark.parametrize(("name", "strength"), [("coupled drives", 0.0), ("all bounds", 3.0)])
+@pytest.mark.parametrize(
+    ("name", "strength"), [("coupled drives", 0.0), ("all bounds", 3.0)]
+)
 def test_the_bound_holds_on_the_way(name, strength, monkeypatch):
     base, feasible = CASES[name]()
     prior = nominal_bodies(feasible.bounds) if strength else None
@@ -76,7 +86,9 @@ def test_the_bound_holds_on_the_way(name, strength, monkeypatch):
 
 def test_coupled_drives_in_jax_are_those_in_numpy():
     drives = jid.Drives(reduction=[[50.0, 0.0], [-50.0, 60.0]])
-    base, feasible = case(PLANAR.replace(drives=drives), (*TERMS, jid.terms.CoupledDrives()))
+    base, feasible = case(
+        PLANAR.replace(drives=drives), (*TERMS, jid.terms.CoupledDrives())
+    )
     assert len(feasible.couplings) == 2
     R, z, rows = arms.factor(base, 3, 0.2, 100)
     one = jid.consistency.ConsistentSolver(base)
@@ -87,10 +99,15 @@ def test_coupled_drives_in_jax_are_those_in_numpy():
     assert compiled.certified
     assert optimum.certified
     np.testing.assert_allclose(data.A @ compiled.standard, data.A @ p, atol=1e-3)
-    np.testing.assert_allclose(compiled.parameters, base.from_standard(p), rtol=1e-3, atol=1e-4)
+    np.testing.assert_allclose(
+        compiled.parameters, base.from_standard(p), rtol=1e-3, atol=1e-4
+    )
     for own, beside in (("Ia", "Iam"), ("fv", "fvm")):
         found = dict(zip(base.model.parameter_names, compiled.standard, strict=True))
-        matrix = [[found[f"{own}1"], found[f"{beside}2"]], [found[f"{beside}2"], found[f"{own}2"]]]
+        matrix = [
+            [found[f"{own}1"], found[f"{beside}2"]],
+            [found[f"{beside}2"], found[f"{own}2"]],
+        ]
         assert np.linalg.eigvalsh(matrix)[0] >= 0
 
 
@@ -113,11 +130,15 @@ def test_a_batch_is_its_data_sets_one_by_one():
         data, program = estimator.program(np, base, feasible, R[k], z[k], rows[k])
         optimum = solver.solve_in_numpy(program)
         p = feasible.standard_parameters(np, data, optimum.y)
-        np.testing.assert_allclose(many.parameters[k], base.from_standard(p), rtol=1e-3, atol=1e-4)
+        np.testing.assert_allclose(
+            many.parameters[k], base.from_standard(p), rtol=1e-3, atol=1e-4
+        )
         free = np.linalg.norm(data.b[base.size :])
         price = np.sqrt(2.0 * optimum.value) / free - 1.0
         np.testing.assert_allclose(many.residual_increases[k], price, atol=1e-6)
     assert many.certified.all()
-    assert (consistency_margin(np.asarray(many.standard)[:, :20].reshape(2, 2, 10)) > 0).all()
+    assert (
+        consistency_margin(np.asarray(many.standard)[:, :20].reshape(2, 2, 10)) > 0
+    ).all()
     with pytest.raises(ValueError, match="`R`, `z` and `rows` must have the shapes"):
         jid.consistency.consistent_batch(base, R[:, :, :-1], z, rows)
