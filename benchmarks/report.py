@@ -41,7 +41,7 @@ def main():
     jax.config.update("jax_enable_x64", True)
     import jaxid as jid
     from jaxid.report.result_files import write_report
-    from jaxid.report.verdict import Report
+    from jaxid.validation.verdict import Report
 
     robot = jid.robots.panda()
     model = jid.Model(robot)

@@ -434,7 +434,7 @@ def judged(cases, folder):
     from rich.console import Console
 
     from jaxid.experiment import identify_logs  # private: what the command line runs
-    from jaxid.report.verdict import verdict
+    from jaxid.validation.verdict import verdict
 
     experiment, paths = written(cases, folder)
     with (

@@ -6,7 +6,6 @@ from . import (
     trajectory as trajectories,  # noqa: F401
     units as units,
 )
-from .diagnosis import diagnose as diagnose
 from .dynamics import terms as terms
 from .dynamics.base import (
     BaseParameters as BaseParameters,
@@ -78,7 +77,6 @@ from .measurement.filters import (
 from .measurement.observations import Observations as Observations, observe as observe
 from .measurement.reading import read_recording as read_recording, scan_log as scan_log
 from .measurement.recording import Recording as Recording
-from .model_validation import validate as validate
 from .program.jax_compilation_cache import keep_compiled as keep_compiled
 from .robot import (
     collision as collision,
@@ -95,3 +93,5 @@ from .robot.urdf import (
 from .rollout.identify import identify_rollout as identify_rollout
 from .simulation.virtual import VirtualRobot as VirtualRobot
 from .trajectory import random_fourier_series as random_fourier_series
+from .validation.diagnosis import diagnose as diagnose
+from .validation.torque_errors import validate as validate

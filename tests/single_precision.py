@@ -23,8 +23,8 @@ jax.config.update("jax_enable_x64", DOUBLE)
 from virtual import observations, standard_parameters
 
 import jaxid as jid
-from jaxid.model_validation import validate
 from jaxid.trajectory.fourier import fourier_series
+from jaxid.validation.torque_errors import validate
 
 URDF = """<robot name="r"><link name="a"/><link name="b"/><link name="c"/>
 <joint name="j" type="revolute"><parent link="a"/><child link="b"/><axis xyz="0 0 1"/>

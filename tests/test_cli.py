@@ -411,7 +411,7 @@ def test_slips_are_found_in_a_part_of_a_long_log(folder, words, monkeypatch):
 
 def test_errors_of_many_rows_are_of_every_nth(folder, first, words, monkeypatch):
     monkeypatch.setattr("jaxid.experiment.experiment.LONG", 500)
-    monkeypatch.setattr("jaxid.model_validation.ROWS", 100)
+    monkeypatch.setattr("jaxid.validation.torque_errors.ROWS", 100)
     said = words("identify", "experiment.toml", "a.csv", "-o", "long")
     assert "torque errors and figures take one of every 3 of its 2" in said
     short, long = (

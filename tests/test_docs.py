@@ -18,8 +18,6 @@ import polars as pl
 import pytest
 
 import jaxid as jid
-from jaxid.diagnosis.diagnosis import SURE
-from jaxid.diagnosis.mistakes import BAD
 from jaxid.dynamics.dispatch import in_numpy
 from jaxid.experiment.decoder import check_names, decode
 from jaxid.experiment.experiment import TABLES
@@ -28,9 +26,11 @@ from jaxid.identification.estimators.regularisation_and_weights import (
     LARGEST_UNCERTAINTY,
 )
 from jaxid.identification.fit_result import DOUBTFUL, TRUSTED
-from jaxid.model_validation import POSES
-from jaxid.report.verdict import FIT_ERROR, LARGE_CONDITION, RMS_ERROR, UNSEEN_RATIO
 from jaxid.simulation.virtual import random_bodies
+from jaxid.validation.diagnosis import SURE
+from jaxid.validation.mistakes import BAD
+from jaxid.validation.torque_errors import POSES
+from jaxid.validation.verdict import FIT_ERROR, LARGE_CONDITION, RMS_ERROR, UNSEEN_RATIO
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]

@@ -51,11 +51,11 @@ from jaxid.report.result_files import (
     write_estimates,
     write_report,
 )
-from jaxid.report.verdict import verdict
 from jaxid.result_table import Remark, Status, Table, significant
 from jaxid.robot.inertia import INERTIAL_NAMES, INERTIAL_UNITS
 from jaxid.simulation import preview
 from jaxid.trajectory.files import load_trajectory
+from jaxid.validation.verdict import verdict
 
 from . import process
 from .options import command_line, open_console

@@ -12,7 +12,7 @@ import jaxid as jid
 from jaxid.arrays import Float, on_cores
 from jaxid.excitation.design import DesignProgress
 from jaxid.identification.parameter_changes import Comparison
-from jaxid.model_validation import Validation
+from jaxid.validation.torque_errors import Validation
 
 HARMONICS, OMEGA, SAMPLES = 5, 0.8, 800
 """Fourier series of the paper: order, fundamental frequency [rad/s], samples of a period."""

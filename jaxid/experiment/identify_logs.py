@@ -11,8 +11,6 @@ import numpy as np
 from rich.console import Console
 from rich.progress import Progress, TimeElapsedColumn
 
-from jaxid.diagnosis import Diagnosis, diagnose
-from jaxid.diagnosis.diagnosis import mistakes_in_logs
 from jaxid.errors import InputError
 from jaxid.excitation.design import DesignProgress
 from jaxid.identification.combination import (
@@ -35,15 +33,16 @@ from jaxid.identification.problem import RegressionProblem
 from jaxid.measurement.bags import is_bag
 from jaxid.measurement.observations import Observations
 from jaxid.measurement.recording import NeedsMemory, Recording
-from jaxid.model_validation import (
+from jaxid.report.result_files import read_fit
+from jaxid.validation.diagnosis import Diagnosis, diagnose, mistakes_in_logs
+from jaxid.validation.torque_errors import (
     TorqueErrors,
     Validation,
     comparison_step,
     torque_errors,
     validate,
 )
-from jaxid.report.result_files import read_fit
-from jaxid.report.verdict import Report
+from jaxid.validation.verdict import Report
 
 from .decoder import within
 from .experiment import Experiment

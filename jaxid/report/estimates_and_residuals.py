@@ -11,9 +11,9 @@ from jaxid.identification.filter_and_parameter_selection import FilterChoice
 from jaxid.identification.fit_result import DOUBTFUL, TRUSTED, Fit
 from jaxid.identification.parameter_changes import Comparison, Verdict
 from jaxid.identification.uncertainty import ResidualSpectra
-from jaxid.model_validation import TorqueErrors
 from jaxid.result_table import Status, percent, shortened, significant, with_deviations
 from jaxid.robot.robot import Robot
+from jaxid.validation.torque_errors import TorqueErrors
 
 from .figure import BLUE, GREY, MEASURED, ORANGE, PALE, VERMILION, Curve, Figure, Panel
 from .torques import require_joints

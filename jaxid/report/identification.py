@@ -11,7 +11,6 @@ from markupsafe import Markup
 from jaxid.identification.consistency.estimator import Consistency
 from jaxid.identification.fit_result import Fit
 from jaxid.identification.uncertainty import ResidualSpectra
-from jaxid.model_validation import TorqueErrors
 from jaxid.result_table import (
     Column,
     Remark,
@@ -22,12 +21,13 @@ from jaxid.result_table import (
     with_deviations,
 )
 from jaxid.robot.robot import Robot
+from jaxid.validation.torque_errors import TorqueErrors
+from jaxid.validation.verdict import RMS_ERROR, Report, verdict
 
 from .figure import Figure
 from .page import Section, folded, picture, provenance, render_page, tiles
 from .parameter_words import glossary, word_columns
 from .physics import gravity_table
-from .verdict import RMS_ERROR, Report, verdict
 
 
 def identification_page(report: Report, figures: Mapping[str, Figure]) -> str:

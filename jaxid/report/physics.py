@@ -9,8 +9,8 @@ from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.dispatch import in_numpy
 from jaxid.dynamics.motion import Motion
 from jaxid.identification.fit_result import Fit
-from jaxid.model_validation import TorqueErrors
 from jaxid.result_table import Column, Table, percent, shortened, significant
+from jaxid.validation.torque_errors import TorqueErrors
 
 from .figure import BLUE, CYCLE, GREY, MEASURED, Curve, Figure, Panel
 from .motion import pose_figure

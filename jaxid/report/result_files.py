@@ -26,9 +26,10 @@ from jaxid.identification.parameter_changes import (
 )
 from jaxid.identification.uncertainty import Uncertainty
 from jaxid.io import atomic_folder, json_text, read_json
-from jaxid.model_validation import TorqueErrors
 from jaxid.result_table import Remark, Status, Table, versions
 from jaxid.robot.robot import Robot
+from jaxid.validation.torque_errors import TorqueErrors
+from jaxid.validation.verdict import Report, verdict
 
 from .estimates_and_residuals import (
     autocorrelation_figure,
@@ -42,7 +43,6 @@ from .identification import identification_page
 from .page import render_page
 from .physics import error_scene, friction_figure, gravity_figure
 from .torques import bar_figure, error_figure, torque_figure
-from .verdict import Report, verdict
 
 MODEL = "model.json"
 """File of a report that holds the fit, for `load` and `jaxid export`."""

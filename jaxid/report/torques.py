@@ -6,9 +6,9 @@ import numpy as np
 
 from jaxid.arrays import Float
 from jaxid.errors import InputError
-from jaxid.model_validation import TorqueErrors
 from jaxid.result_table import percent, shortened, significant
 from jaxid.robot.robot import Robot
+from jaxid.validation.torque_errors import TorqueErrors
 
 from .figure import (
     BLUE,

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 import jaxid as jid
-from jaxid.model_validation import TorqueErrors
 from jaxid.report.result_files import write_report
-from jaxid.report.verdict import Report
 from jaxid.simulation.friction_and_disturbances import SmoothFriction
 from jaxid.simulation.virtual import Sensors, random_bodies
+from jaxid.validation.torque_errors import TorqueErrors
+from jaxid.validation.verdict import Report
 
 
 @pytest.fixture(scope="session")

@@ -12,8 +12,8 @@ import pytest
 
 import jaxid as jid
 from jaxid.report.page import code, folded, picture, render_page
-from jaxid.report.verdict import Report, _judge_bounds, _judge_offsets, verdict
 from jaxid.result_table import Column, Remark, Status, Table
+from jaxid.validation.verdict import Report, _judge_bounds, _judge_offsets, verdict
 
 EVIL = "<script>alert('&\"')</script>"  # as in conftest.py
 

@@ -18,7 +18,7 @@ from jaxid.report.result_files import (
     write_comparison,
     write_report,
 )
-from jaxid.report.verdict import Report
+from jaxid.validation.verdict import Report
 
 
 @pytest.fixture

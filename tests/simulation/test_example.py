@@ -9,10 +9,10 @@ from jaxid.errors import InputError
 from jaxid.experiment.experiment import load_experiment
 from jaxid.identification.consistency.pseudo_inertia import pseudo_inertia
 from jaxid.identification.identify import identify
-from jaxid.model_validation import validate
 from jaxid.robot import library
 from jaxid.simulation.example import FILES, virtual_panda, write_example
 from jaxid.simulation.virtual import random_bodies
+from jaxid.validation.torque_errors import validate
 
 
 @pytest.fixture(scope="module")

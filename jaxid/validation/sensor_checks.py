@@ -9,8 +9,9 @@ from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics.motion import Motion
 from jaxid.measurement.observations import unlike_derivatives
 from jaxid.measurement.recording import Recording
-from jaxid.model_validation import STANDING
 from jaxid.robot.robot import Robot
+
+from .torque_errors import STANDING
 
 LATE = 1.5
 """Samples by which velocities may stand later than the derivatives of the angles."""

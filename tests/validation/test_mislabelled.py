@@ -3,8 +3,6 @@
 import numpy as np
 import pytest
 
-from jaxid.diagnosis import diagnose
-from jaxid.diagnosis.diagnosis import mistakes_in_logs
 from jaxid.dynamics.base import base_parameters
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.terms import CoulombFriction, RigidBodies, ViscousFriction
@@ -15,6 +13,7 @@ from jaxid.measurement.recording import Recording
 from jaxid.robot.limits_and_drives import Drives, Limits
 from jaxid.robot.robot import Robot
 from jaxid.trajectory.fourier import random_fourier_series
+from jaxid.validation.diagnosis import diagnose, mistakes_in_logs
 
 # Forces of a joint act on its neighbours; the last two motors move the last joint
 # together.

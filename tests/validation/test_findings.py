@@ -5,17 +5,17 @@ import dataclasses
 import numpy as np
 import pytest
 
-from jaxid.diagnosis import diagnose
-from jaxid.diagnosis.checks_without_model import (
+from jaxid.measurement.recording import Recording
+from jaxid.robot.library import panda, planar_arm
+from jaxid.robot.limits_and_drives import Drives
+from jaxid.trajectory.fourier import random_fourier_series
+from jaxid.validation.diagnosis import diagnose
+from jaxid.validation.sensor_checks import (
     channel_findings,
     clock_findings,
     stuck_findings,
     unit_findings,
 )
-from jaxid.measurement.recording import Recording
-from jaxid.robot.library import panda, planar_arm
-from jaxid.robot.limits_and_drives import Drives
-from jaxid.trajectory.fourier import random_fourier_series
 
 ROBOT = panda().replace(drives=Drives(7, reduction=[100.0, -100, 100, 100, 50, 50, 50]))
 DT = 0.005

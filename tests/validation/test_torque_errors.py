@@ -7,7 +7,7 @@ import pytest
 from virtual import fit_of, observations, planar_base, standard_parameters
 
 import jaxid as jid
-from jaxid.model_validation import TorqueErrors, definiteness, torque_errors
+from jaxid.validation.torque_errors import TorqueErrors, definiteness, torque_errors
 
 
 def errors(counted=None):

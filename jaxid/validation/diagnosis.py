@@ -27,14 +27,14 @@ from jaxid.result_table import (
 )
 from jaxid.robot.robot import Robot
 
-from .checks_without_model import (
+from .mistakes import INSTANTS, likely_mistakes
+from .sensor_checks import (
     LogStatistics,
     channel_findings,
     clock_findings,
     limit_findings,
     stuck_findings,
 )
-from .mistakes import INSTANTS, likely_mistakes
 
 SURE = 3.0
 """Standard deviations beyond which a sign is certain."""

@@ -12,8 +12,9 @@ from jaxid.identification.estimators.regularisation_and_weights import (
 )
 from jaxid.identification.filter_and_parameter_selection import FilterChoice
 from jaxid.identification.fit_result import Fit
-from jaxid.model_validation import Definiteness, TorqueErrors
 from jaxid.result_table import Remark, Status, significant
+
+from .torque_errors import Definiteness, TorqueErrors
 
 RMS_ERROR = (5.0, 50.0)
 """RMS errors on new motions that are good, and tolerable [% of the RMS force, worst joint]."""

@@ -1,0 +1,1 @@
+"""Validation: torque errors, checks of sensors, mistakes in the description, verdict."""
