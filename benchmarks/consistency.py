@@ -75,9 +75,9 @@ class Arm:
             terms.append(jid.terms.CoupledDrives())
         self.model = jid.Model(robot, tuple(terms))
         self.base = jid.base_parameters(self.model)
-        motion = jid.random_fourier_series(robot, omega=0.8, seed=0).motion(
-            np.linspace(0, 7.8, SAMPLES, endpoint=False)
-        )
+        motion = jid.trajectories.random_fourier_series(
+            robot, omega=0.8, seed=0
+        ).motion(np.linspace(0, 7.8, SAMPLES, endpoint=False))
         self.theta = np.asarray(self.base.regressor(motion))
 
     def truth(self, trial):
@@ -419,7 +419,9 @@ def weights(_, quick):
     for trial in range(count):
         logs = []
         for seed in (2 * trial, 2 * trial + 1):
-            motion = jid.random_fourier_series(robot, omega=0.6, reach=0.9, seed=seed)
+            motion = jid.trajectories.random_fourier_series(
+                robot, omega=0.6, reach=0.9, seed=seed
+            )
             recording = virtual.measure(
                 motion, duration=20.0, sample_time=0.01, seed=seed
             )

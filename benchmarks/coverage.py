@@ -79,7 +79,9 @@ def observations(base, p, seed, encoder, phase=0.0):
 
     robot = base.model.robot
     t = np.arange(round(DURATION * RATE)) / RATE
-    m = jid.random_fourier_series(robot, omega=0.2 * math.pi, seed=seed).motion(t)
+    m = jid.trajectories.random_fourier_series(
+        robot, omega=0.2 * math.pi, seed=seed
+    ).motion(t)
     forces = np.asarray(base.model.inverse_dynamics(p, m))
     q = np.asarray(m.q)
     if encoder:

@@ -1,6 +1,6 @@
 """Designs of excitation motions: quality and cost, without and with constraints.
 
-    python benchmarks/excitation.py [PART ...] [--quick] [--keys 3] [--polish 0 4] ...
+    python benchmarks/excitation.py [PART ...] [--quick] [--keys 3] ...
 
 Robot: rail + TX90L, rigid bodies (seven parameters each: 44 base parameters; ten: 57),
     viscous and
@@ -15,8 +15,8 @@ those in this motion, and of that the mean over 15 random motions
 * cond: condition number of the unweighted information (Eq. 36). d7, d10: D-optimal
   designs for 44 and 57 parameters. panda: both criteria for the Panda.
 * capsules-cond, capsules-d: at least 0.03 m between the robot's capsules and shapes; 8
-  starts, 4 generations, 2 polished.
-* rest: motions that start and stop at rest; 8 starts, 8 generations, 2 polished.
+  starts, 4 generations.
+* rest: motions that start and stop at rest; 8 starts, 8 generations.
 * forces: forces of the nominal parameters below, with a payload of 6 kg, at most 90 %
   of the limits; free: the same without this constraint.
 * step: one value and gradient against forward differences of the same function, 800
@@ -90,7 +90,7 @@ class Evaluation:
     def __init__(self, bases):
         self.robot, self.bases = bases[0].model.robot, bases
         random = (
-            jid.random_fourier_series(
+            jid.trajectories.random_fourier_series(
                 self.robot, omega=0.8, harmonics=5, reach=1.0, seed=seed
             )
             for seed in range(15)
@@ -143,7 +143,7 @@ def design(name, base, figures, keys, options, **settings):
     found = []
     settings = {"starts": options.starts, "generations": options.generations} | settings
     if options.quick:
-        settings |= {"starts": 2, "generations": 0, "polish": 0}
+        settings |= {"starts": 2, "generations": 0}
     for key in keys:
         wall, cpu = time.perf_counter(), time.process_time()
         plan = jid.design_excitation(
@@ -153,7 +153,7 @@ def design(name, base, figures, keys, options, **settings):
         found.append(figures(plan) | {"wall": wall, "CPU": cpu})
         print(f"  key {key}: {words(found[-1])}", flush=True)
     medians = {k: np.median([f[k] for f in found]) for k in found[0]}
-    print(f"{name}, {settings['polish']} polished: median {words(medians)}")
+    print(f"{name}: median {words(medians)}")
     for best, function in (("least", min), ("most", max)):
         print(f"  {best} {words({k: function(f[k] for f in found) for k in found[0]})}")
 
@@ -164,12 +164,12 @@ def words(figures):
 
 
 def unconstrained(part, keys, options):
-    """Design without constraints, with and without polishing."""
+    """Design without constraints."""
     if part == "panda":
         base = jid.base_parameters(jid.Model(jid.robots.panda()))
         for criterion in (jid.criteria.DOptimal(), jid.criteria.ConditionNumber()):
             value = lambda plan, c=criterion: {c.name: c.value(plan.information)}  # noqa: E731
-            design("Panda", base, value, keys, options, criterion=criterion, polish=0)
+            design("Panda", base, value, keys, options, criterion=criterion)
         return
     base = base_of(part != "d10")
     evaluation = Evaluation([base])
@@ -181,8 +181,7 @@ def unconstrained(part, keys, options):
         found = {"cond": condition(plan), "gain": evaluation.gains(plan.trajectory)[0]}
         return found | {"violation": evaluation.violation(plan.trajectory)}
 
-    for polish in options.polish:
-        design(part, base, figures, keys, options, criterion=criteria, polish=polish)
+    design(part, base, figures, keys, options, criterion=criteria)
 
 
 def constrained(part, keys, options):
@@ -191,7 +190,7 @@ def constrained(part, keys, options):
         base_of(axes, payload=part in ("forces", "free")) for axes in (True, False)
     ]
     evaluation, robot = Evaluation(bases), bases[0].model.robot
-    settings = {"starts": 8, "generations": 8 if part == "rest" else 4, "polish": 2}
+    settings = {"starts": 8, "generations": 8 if part == "rest" else 4}
     p = nominal_parameters(robot)
     shapes = jid.robots.tx90l_on_rail_collision()
     if part.startswith("capsules"):
@@ -250,14 +249,12 @@ def step():
 
 
 def batch(sizes):
-    """Time a whole search of several starts, without generations and polishing."""
-    from jaxid.excitation.design import minimise  # private: solve one problem twice
-
+    """Time a whole search of several starts, without generations."""
     problem = jid.ExcitationProblem(base_of(True))
     for starts in sizes:
         for _ in range(2):  # the first one compiles
             wall, cpu = time.perf_counter(), time.process_time()
-            minimise(problem, starts=starts, generations=0, polish=0)
+            jid.excitation.minimise(problem, starts=starts, generations=0)
             wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
         rate = f"{starts / wall:.2f} starts per second"
         print(f"batch of {starts}: {rate} ({wall:.2f} s, CPU {cpu:.2f} s)", flush=True)
@@ -275,14 +272,11 @@ def main():
     parser.add_argument("--first", type=int, default=0, help="the first key")
     parser.add_argument("--starts", type=int, default=32)
     parser.add_argument("--generations", type=int, default=12)
-    parser.add_argument(
-        "--polish", type=int, nargs="+", default=[0, 4], help="0: no polishing"
-    )
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     jid.keep_compiled()
     if options.quick:
-        options.parts, options.keys, options.polish = ["d7", "rest", "step"], 1, [0]
+        options.parts, options.keys = ["d7", "rest", "step"], 1
     keys = range(options.first, options.first + options.keys)
     for part in options.parts:
         if part in FREE:

@@ -330,7 +330,9 @@ def round_of_jobs(seed):
     import jaxid as jid
 
     base = planar_base(np.random.default_rng(seed).uniform(0.3, 0.6, 2))
-    series = jid.random_fourier_series(base.model.robot, omega=0.8, seed=seed)
+    series = jid.trajectories.random_fourier_series(
+        base.model.robot, omega=0.8, seed=seed
+    )
     motion = series.motion(0.002 * np.arange(4000))
     forces = np.asarray(base.model.inverse_dynamics(np.ones(base.model.size), motion))
     noise = np.random.default_rng(seed).normal(0.0, 0.1, (8, *forces.shape))
@@ -347,7 +349,6 @@ def round_of_jobs(seed):
         "harmonics": 2,
         "starts": 2,
         "generations": 0,
-        "polish": 0,
         "samples": 100,
     }
     jid.design_excitation(base, key=jax.random.key(seed), **settings)

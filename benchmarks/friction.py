@@ -386,7 +386,9 @@ def fourier(name, rng):
     import jaxid as jid
 
     _, robot, _, torques = arm(name)
-    series = jid.random_fourier_series(robot, omega=0.6, seed=int(rng.integers(2**31)))
+    series = jid.trajectories.random_fourier_series(
+        robot, omega=0.6, seed=int(rng.integers(2**31))
+    )
     m = series.motion(np.arange(0.0, 20.0, 0.01))
     m = jid.Motion(*(np.asarray(x) for x in (m.q, m.qd, m.qdd)))
     rigid = torques(m)

@@ -25,7 +25,9 @@ def logs(jid, robot, model, duration):
     bodies = random_bodies(robot, np.linspace(6.0, 1.0, robot.joints), random).ravel()
     p = np.concatenate([bodies, np.ones(model.size - len(bodies))])
     for seed in (1, 2):
-        motion = jid.random_fourier_series(robot, omega=0.5, seed=seed).motion(t)
+        motion = jid.trajectories.random_fourier_series(
+            robot, omega=0.5, seed=seed
+        ).motion(t)
         forces = np.array(model.inverse_dynamics(p, motion))
         noise = 0.02 * np.abs(forces).max(axis=0) * random.standard_normal(forces.shape)
         arrays = (np.asarray(x) for x in (motion.q, motion.qd, motion.qdd))

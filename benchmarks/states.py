@@ -70,7 +70,9 @@ class Rig:
 
     def __init__(self, model: jid.Model, omega: float, seed: int, late: float = 0.0):
         self.robot = model.robot
-        trajectory = jid.random_fourier_series(self.robot, omega=omega, seed=seed)
+        trajectory = jid.trajectories.random_fourier_series(
+            self.robot, omega=omega, seed=seed
+        )
         t = np.arange(0.0, 4 * np.pi / omega, SAMPLE_TIME)
         self.motion, self.late = trajectory.motion(t), trajectory.motion(t - late)
         self.model = model

@@ -107,7 +107,7 @@ def observed(robot: jid.Robot, recording: jid.Recording) -> jid.Observations:
 def single_axes(virtual, seed: int) -> tuple[jid.Observations, ...]:
     """Return a log of each axis alone."""
     robot = virtual.model.robot
-    whole = jid.random_fourier_series(
+    whole = jid.trajectories.random_fourier_series(
         robot, omega=2 * np.pi / ALONE, reach=0.9, seed=seed
     )
     logs = []

@@ -82,7 +82,7 @@ def without_dry_friction(virtual):
 
 def tracked(machine, virtual, which, seed=None, **how):
     """Run an experiment with the true model fed forward."""
-    trajectory = jid.random_fourier_series(
+    trajectory = jid.trajectories.random_fourier_series(
         virtual.robot, omega=0.8, reach=0.5, seed=which
     )
 
@@ -102,7 +102,9 @@ def agreement(virtual):
     """Print the first table."""
     most = np.asarray(virtual.robot.max_forces)
     smooth = without_dry_friction(virtual)
-    trajectory = jid.random_fourier_series(virtual.robot, omega=0.8, reach=0.5, seed=1)
+    trajectory = jid.trajectories.random_fourier_series(
+        virtual.robot, omega=0.8, reach=0.5, seed=1
+    )
     motion = trajectory.motion(np.linspace(0.0, DURATION, 500))
     apart = np.abs(
         smooth.forces(motion) - jid.simulation.MujocoRobot(smooth).forces(motion)
@@ -162,7 +164,9 @@ def calibration(virtual):
     """Print the third table."""
     base = jid.base_parameters(virtual.model)
     truth = np.asarray(base.from_standard(virtual.parameters))
-    trajectory = jid.random_fourier_series(virtual.robot, omega=0.8, reach=0.5, seed=1)
+    trajectory = jid.trajectories.random_fourier_series(
+        virtual.robot, omega=0.8, reach=0.5, seed=1
+    )
 
     def followed(seed):
         return virtual.measure(
@@ -206,7 +210,9 @@ def filters(virtual):
         virtual.sensors, encoder_step=1e-11, white_noise=0.0 * most
     )
     quiet = virtual.replace(sensors=perfect)
-    series = jid.random_fourier_series(virtual.robot, omega=0.8, reach=0.5, seed=1)
+    series = jid.trajectories.random_fourier_series(
+        virtual.robot, omega=0.8, reach=0.5, seed=1
+    )
     led = jid.trajectories.with_leads(series, virtual.robot, periods=2)
     columns = (
         "median error [sd]",

@@ -16,7 +16,9 @@ def main() -> None:
     jax.config.update("jax_enable_x64", True)
     robot = jid.robots.tx90l_on_rail()
     time = np.linspace(0.0, 7.85, 400)
-    motion = jid.random_fourier_series(robot, omega=OMEGA, seed=3).motion(time)
+    motion = jid.trajectories.random_fourier_series(robot, omega=OMEGA, seed=3).motion(
+        time
+    )
     figure = jid.plot.poses(
         robot, motion.q, time, poses=4, title="TX90L on rail: a motion"
     )

@@ -1,6 +1,7 @@
 """Public names of `jaxid`, in the order of the pipeline; the package loads them when used."""
 
 from . import (
+    excitation as excitation,
     rollout as rollout,
     simulation as simulation,
     trajectory as trajectories,  # noqa: F401
@@ -22,10 +23,7 @@ from .dynamics.terms import (
 )
 from .errors import InputError as InputError
 from .excitation import constraints as constraints, criteria as criteria
-from .excitation.design import (
-    design_excitation as design_excitation,
-    minimise as minimise,
-)
+from .excitation.design import design_excitation as design_excitation
 from .excitation.design_result import ExcitationPlan as ExcitationPlan
 from .excitation.problem import ExcitationProblem as ExcitationProblem
 from .export.c_code import export_c as export_c
@@ -92,6 +90,5 @@ from .robot.urdf import (
 )
 from .rollout.identify import identify_rollout as identify_rollout
 from .simulation.virtual import VirtualRobot as VirtualRobot
-from .trajectory import random_fourier_series as random_fourier_series
 from .validation.diagnosis import diagnose as diagnose
 from .validation.torque_errors import validate as validate

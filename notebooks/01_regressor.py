@@ -61,7 +61,7 @@ print("columns that act in motion:", np.flatnonzero(np.any(turning != 0, axis=0)
 # does not move the bodies before it: their columns are zero in its row. Below is one sample of $\Theta$.
 
 # %%
-series = jid.random_fourier_series(robot, omega=0.8, seed=1)
+series = jid.trajectories.random_fourier_series(robot, omega=0.8, seed=1)
 t = np.linspace(0.0, series.duration, 400)
 motion = series.motion(t)
 theta = np.asarray(model.regressor(motion))

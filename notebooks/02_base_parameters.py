@@ -120,7 +120,7 @@ plt.show()
 random = np.random.default_rng(0)
 p = random.normal(size=base.model.size)
 p_B = np.asarray(base.from_standard(p))
-motion = jid.random_fourier_series(robot, omega=0.8, seed=3).motion(
+motion = jid.trajectories.random_fourier_series(robot, omega=0.8, seed=3).motion(
     np.linspace(0, 7, 50)
 )
 full = np.asarray(base.model.regressor(motion)) @ p

@@ -64,7 +64,6 @@ plans = {
         criterion=criterion,
         starts=8,
         generations=12,
-        polish=0,
         samples=400,
         key=jax.random.key(1),
     )
@@ -105,19 +104,19 @@ plt.show()
 # motion, but hardly smaller deviations. The deviations of the other two designs are far below those of all random motions.
 
 # %%
-from jaxid.excitation.criteria import information, standard_deviations
-
 measured = np.linspace(0, 2 * np.pi / 0.8, 400, endpoint=False)
 
 
 def conditioned(trajectory):
     """Condition number of a motion, and the standard deviations it gives."""
-    gram = information(base, trajectory.motion(measured), 1.0 / noise)
-    return np.linalg.cond(gram.plain), standard_deviations(gram.weighted)
+    gram = jid.criteria.information(base, trajectory.motion(measured), 1.0 / noise)
+    return np.linalg.cond(gram.plain), jid.criteria.standard_deviations(gram.weighted)
 
 
 random = [
-    conditioned(jid.random_fourier_series(robot, omega=0.8, harmonics=4, seed=k))
+    conditioned(
+        jid.trajectories.random_fourier_series(robot, omega=0.8, harmonics=4, seed=k)
+    )
     for k in range(60)
 ]
 unit = np.exp(np.median([np.log(s) for _, s in random], axis=0))

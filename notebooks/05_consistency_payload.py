@@ -52,9 +52,9 @@ truth = np.concatenate([bodies.ravel(), 0.02 * largest, 0.03 * largest])
 def observations(p, seed, noise=0.05, duration=8.0):
     """A log of a random motion of the arm with the parameters p."""
     t = np.arange(0.0, duration, 0.004)
-    motion = jid.random_fourier_series(robot, omega=2 * np.pi / 8.0, seed=seed).motion(
-        t
-    )
+    motion = jid.trajectories.random_fourier_series(
+        robot, omega=2 * np.pi / 8.0, seed=seed
+    ).motion(t)
     forces = np.asarray(base.model.inverse_dynamics(p, motion))
     forces = forces + noise * largest * np.random.default_rng(seed).normal(
         size=forces.shape

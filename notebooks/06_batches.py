@@ -56,7 +56,9 @@ print(f"{base.size} base parameters: {', '.join(base.names)}")
 # %%
 step = 0.01
 t = np.arange(0.0, 8.0, step)
-motion = jid.random_fourier_series(robot, omega=2 * np.pi / 8.0, seed=2).motion(t)
+motion = jid.trajectories.random_fourier_series(
+    robot, omega=2 * np.pi / 8.0, seed=2
+).motion(t)
 exact = np.asarray(base.model.inverse_dynamics(truth, motion))
 kept = np.exp(-step / 0.03)
 noise = np.random.default_rng(3).normal(size=(2000, len(t) + 20, 2))
@@ -157,7 +159,9 @@ plt.show()
 fleet = np.random.default_rng(4)
 count = 1000
 short = np.arange(0.0, 8.0, 0.04)
-asked = jid.random_fourier_series(robot, omega=2 * np.pi / 8.0, seed=5).motion(short)
+asked = jid.trajectories.random_fourier_series(
+    robot, omega=2 * np.pi / 8.0, seed=5
+).motion(short)
 asked = jid.Motion(
     *(np.broadcast_to(x, (count, *x.shape)) for x in (asked.q, asked.qd, asked.qdd))
 )

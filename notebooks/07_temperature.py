@@ -28,7 +28,8 @@ plt.style.use("notebook.mplstyle")
 cold = jid.simulation.virtual_tx90l_on_rail()
 robot = cold.robot
 motions = [
-    jid.random_fourier_series(robot, omega=0.8, seed=k, reach=0.9) for k in (1, 2, 3)
+    jid.trajectories.random_fourier_series(robot, omega=0.8, seed=k, reach=0.9)
+    for k in (1, 2, 3)
 ]
 times, temperatures = cold.warming(motions[0], duration=3600.0)
 

@@ -58,7 +58,6 @@ plan = jid.design_excitation(
     basis=jid.trajectories.RestToRestBasis(5, 0.8),
     starts=8,
     generations=4,
-    polish=0,
     key=jax.random.key(2),
 )
 print(
@@ -112,7 +111,7 @@ print(
 
 # %%
 fit = jid.identify(base, observations, jid.PhysicallyConsistent())
-other = jid.random_fourier_series(robot, omega=1.0, seed=5, reach=0.8)
+other = jid.trajectories.random_fourier_series(robot, omega=1.0, seed=5, reach=0.8)
 unseen = jid.observe(
     yours.track(other, seed=2).recording,
     robot,

@@ -2,7 +2,7 @@
 # # 09 · Your own solver
 #
 # The design of a motion is an `ExcitationProblem`: functions of one vector that run under `jit`, `vmap`, `grad` and `jvp`. This notebook puts five solvers of
-# other packages around the same problem, and compares what they find with `jid.minimise`.
+# other packages around the same problem, and compares what they find with `jid.excitation.minimise`.
 
 # %%
 # %matplotlib inline
@@ -170,8 +170,8 @@ solvers = {
 # %% [markdown]
 # ## What they find
 #
-# All begin from the same four random motions. `jid.minimise(problem, solver)` makes what a solver returns keep all limits for all times, and takes the best: the
-# numbers below are those of motions that can be recorded. Without a solver it takes its own: interior points, generations, and a last polish.
+# All begin from the same four random motions. `jid.excitation.minimise(problem, solver)` makes what a solver returns keep all limits for all times, and takes the best: the
+# numbers below are those of motions that can be recorded. Without a solver it takes its own: interior points and generations.
 
 
 # %%
@@ -185,10 +185,12 @@ effort = {"starts": 4, "key": jax.random.key(1)}
 plans, times = {}, {}
 for name, solver in solvers.items():
     plans[name], times[name] = seconds(
-        lambda solver=solver: jid.minimise(problem, solver, throw=False, **effort)
+        lambda solver=solver: jid.excitation.minimise(
+            problem, solver, throw=False, **effort
+        )
     )
-ours = "jid.minimise"
-plans[ours], times[ours] = seconds(lambda: jid.minimise(problem, **effort))
+ours = "jid.excitation.minimise"
+plans[ours], times[ours] = seconds(lambda: jid.excitation.minimise(problem, **effort))
 for name, plan in plans.items():
     kept = "keeps all limits" if plan.feasible else "exceeds a limit"
     print(
@@ -204,7 +206,9 @@ axes.barh(names[::-1], values[::-1], color=colours[::-1])
 for k, value in enumerate(values[::-1]):
     axes.text(value + 0.005, k, f"{value:.3f}", va="center", fontsize=8)
 axes.set_xlim(0.9, None)
-axes.set_xlabel("mean axis of the confidence ellipsoid, relative to jid.minimise")
+axes.set_xlabel(
+    "mean axis of the confidence ellipsoid, relative to jid.excitation.minimise"
+)
 axes.grid(axis="y", visible=False)
 plt.show()
 
@@ -214,7 +218,7 @@ plt.show()
 # %%
 figure, panels = plt.subplots(1, 2, figsize=(11, 3.2))
 panels[0].plot(plans[ours].history, ".-")
-panels[0].set_xlabel("step of jid.minimise")
+panels[0].set_xlabel("step of jid.excitation.minimise")
 panels[0].set_ylabel("mean axis of the ellipsoid")
 t = np.linspace(0, 2 * np.pi / 0.8, 400)
 for name, style in ((ours, "-"), ("SciPy SLSQP", "--")):
@@ -244,7 +248,7 @@ print("shape of the Hessian:", jax.jit(jax.hessian(problem.value))(x).shape)
 # ## What you learned
 #
 # * An `ExcitationProblem` is four functions of one vector; any solver fits around them.
-# * `jid.minimise(problem, solver)` turns what a solver finds into a motion that keeps its limits for all times, with tables and files like any other design.
+# * `jid.excitation.minimise(problem, solver)` turns what a solver finds into a motion that keeps its limits for all times, with tables and files like any other design.
 # * From four starts, SLSQP and BFGS come within some percent of ours; the generations make the rest.
 #
 # The guide: [excitation](../docs/excitation.md). Next: [no torque in the log](10_no_torque.ipynb).

@@ -128,7 +128,6 @@ def designed():
         harmonics=2,
         omega=1.0,
         starts=2,
-        polish=1,
         generations=0,
         samples=50,
         key=key,

@@ -60,7 +60,9 @@ GAINS = np.array([1.2, 0.85, 1.05])
 
 def write(path, model, p, seed, gains=1.0, late=0.0):
     """Ten seconds of a random motion with a little noise."""
-    trajectory = jid.random_fourier_series(model.robot, omega=1.2, seed=seed)
+    trajectory = jid.trajectories.random_fourier_series(
+        model.robot, omega=1.2, seed=seed
+    )
     t = np.arange(0.0, 10.0, 0.005)
     felt = trajectory.motion(t - late)
     forces = in_numpy(model, model.forces, felt.q, felt.qd, felt.qdd, shared=(p,))
@@ -298,7 +300,9 @@ def test_friction_with_memory_from_the_log_to_the_report(shop, run, words):  # n
     p[:30] = random_bodies(
         model.robot, np.array([3.0, 2.0, 1.0]), np.random.default_rng(0)
     ).ravel()
-    motion = jid.random_fourier_series(model.robot, omega=1.2, seed=8).motion(t)
+    motion = jid.trajectories.random_fourier_series(
+        model.robot, omega=1.2, seed=8
+    ).motion(t)
     forces = model.inverse_dynamics(
         p, jid.Motion(*map(np.asarray, (motion.q, motion.qd, motion.qdd)))
     )

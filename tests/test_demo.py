@@ -14,7 +14,7 @@ from jaxid.identification.parameter_changes import Verdict
 
 @pytest.fixture(scope="module")
 def found():
-    motion = jid.random_fourier_series(
+    motion = jid.trajectories.random_fourier_series(
         jid.robots.tx90l_on_rail(), omega=0.8, reach=0.7, seed=1
     )
     return run_study(0, lambda name, fraction: None, periods=1, motion=motion)

@@ -111,7 +111,7 @@ def _log(model: jid.Model, p, seed: int, alone: int | None = None) -> jid.Record
     """A log of all joints, or of one that moves alone."""
     n = model.robot.joints
     still = np.zeros(n) if alone is None else np.arange(n) != alone
-    series = jid.random_fourier_series(model.robot, omega=0.9, seed=seed)
+    series = jid.trajectories.random_fourier_series(model.robot, omega=0.9, seed=seed)
     motion = jax.tree.map(
         lambda x: np.asarray(x) * (1 - still), series.motion(STEP * np.arange(SAMPLES))
     )

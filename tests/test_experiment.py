@@ -235,7 +235,9 @@ def test_filters_and_rows(load):
 
 
 def test_estimators_of_files(load, tmp_path):
-    motion = jid.random_fourier_series(jid.robots.planar_arm(2), omega=1.0, seed=3)
+    motion = jid.trajectories.random_fourier_series(
+        jid.robots.planar_arm(2), omega=1.0, seed=3
+    )
     jid.trajectories.save_trajectory(motion, tmp_path / "motion.json")
     text = (
         '[estimator]\nkind = "instrumental"\nreference = '

@@ -78,7 +78,7 @@ def model_file(tmp_path_factory):
     base = jid.base_parameters(
         jid.Model(ARM, (jid.RigidBodies(), jid.ViscousFriction()))
     )
-    series = jid.random_fourier_series(ARM, omega=0.8, harmonics=2, seed=0)
+    series = jid.trajectories.random_fourier_series(ARM, omega=0.8, harmonics=2, seed=0)
     motion = series.motion(0.01 * np.arange(300))
     forces = base.model.inverse_dynamics(np.ones(base.model.size), motion)
     log = jid.Recording.of(motion.q, forces, sample_time=0.01)

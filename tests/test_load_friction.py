@@ -44,7 +44,9 @@ def test_coefficients_are_found(experiment, seed):
     coefficients = np.array([0.1, 0.15, 0.25])
     p = np.concatenate([np.ravel(bodies), rest, coefficients])
     t = np.arange(0.0, 20.0, 0.01)
-    motion = jid.random_fourier_series(robot, omega=0.6, seed=seed).motion(t)
+    motion = jid.trajectories.random_fourier_series(robot, omega=0.6, seed=seed).motion(
+        t
+    )
     forces = in_numpy(truth, truth.forces, motion.q, motion.qd, motion.qdd, shared=(p,))
     forces = forces + rng.normal(0.0, [0.1, 0.2, 0.1], forces.shape)
     o = jid.Observations.of(motion.q, motion.qd, motion.qdd, forces, sample_time=0.01)

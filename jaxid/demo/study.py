@@ -185,7 +185,6 @@ def _design(
             ),
             starts=2,
             generations=0,
-            polish=0,
             samples=SAMPLES,
             key=jax.random.key(seed),
             progress=report,

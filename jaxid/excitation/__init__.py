@@ -1,1 +1,13 @@
-"""Excitation: motions that determine the base parameters well; problem, solver, design (Eq. 36)."""
+"""Design of motions that determine the base parameters well (Eq. 36)."""
+
+from . import constraints as constraints, criteria as criteria
+from .design import (
+    DesignProgress as DesignProgress,
+    design_excitation as design_excitation,
+    minimise as minimise,
+)
+from .design_result import (
+    DesignStatus as DesignStatus,
+    ExcitationPlan as ExcitationPlan,
+)
+from .problem import ExcitationProblem as ExcitationProblem

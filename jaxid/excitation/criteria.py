@@ -124,12 +124,10 @@ class AbstractCriterion(eqx.Module):
     Attributes:
         name: Name of the number in tables.
         weighted: Whether the noise of the joints and earlier information count.
-        extreme: Whether it has an extreme of eigenvalues, which can be made smooth.
     """
 
     name: ClassVar[str]
     weighted: ClassVar[bool] = True
-    extreme: ClassVar[bool] = True
 
     @abstractmethod
     def __call__(
@@ -189,7 +187,6 @@ class DOptimal(AbstractCriterion):
     """
 
     name: ClassVar[str] = "D: mean axis of the confidence ellipsoid"
-    extreme: ClassVar[bool] = False
 
     def __call__(
         self, information: Information, sharpness: Sharpness = None
@@ -214,7 +211,6 @@ class AOptimal(AbstractCriterion):
     """
 
     name: ClassVar[str] = "A: rms of the scaled deviations"
-    extreme: ClassVar[bool] = False
     sizes: Float[AnyArray, " base"] | None = None
 
     def __call__(
@@ -243,15 +239,15 @@ class EOptimal(AbstractCriterion):
         return 0.5 * jnp.asarray(spectral(log_largest_inverse, scaled, sharpness))
 
 
-CRITERIA = (
-    ConditionNumber(),
-    ConditionNumber(weighted=True),
-    ConditionNumber(weighted=True, scaled=True),
-    DOptimal(),
-    AOptimal(),
-    EOptimal(),
-)
-"""All criteria, in the order of the tables."""
+CRITERIA: dict[str, AbstractCriterion] = {
+    "condition_number": ConditionNumber(),
+    "weighted_condition_number": ConditionNumber(weighted=True),
+    "scaled_condition_number": ConditionNumber(weighted=True, scaled=True),
+    "d_optimal": DOptimal(),
+    "a_optimal": AOptimal(),
+    "e_optimal": EOptimal(),
+}
+"""All criteria by the values of the key `criterion`, in the order of the tables."""
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))

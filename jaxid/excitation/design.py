@@ -81,8 +81,8 @@ def design_excitation(
         prior: Information of earlier experiments in the same noise, the inverse of
             their covariance; the design adds to it.
         samples: Number of measured samples of one run of the motion.
-        settings: Arguments of `minimise`: `solver`, `starts`, `generations`, `polish`,
-            `key`, `nominal`, `progress`, `begin`, `seconds`, `throw`.
+        settings: Arguments of `minimise`: `solver`, `starts`, `generations`, `key`,
+            `nominal`, `progress`, `begin`, `seconds`, `throw`.
 
     Raises:
         InputError: If arguments do not fit, or no motion keeps all constraints: the
@@ -110,7 +110,6 @@ def minimise(
     *,
     starts: int = 32,
     generations: int = 12,
-    polish: int = 4,
     key: PRNGKeyArray | None = None,
     nominal: Float[AnyArray, " base"] | None = None,
     progress: Callable[[DesignProgress], None] | None = None,
@@ -121,10 +120,9 @@ def minimise(
     """Solve an excitation problem from many starts.
 
     Random motions are improved together by an interior point method, and so are their
-    descendants, which move some joints as one parent and some as the other; the best of
-    them are polished one by one. With constraints the search starts from small motions
-    that keep them, so that there is a result after seconds. Ctrl-C ends the design with
-    the best motion so far.
+    descendants, which move some joints as one parent and some as the other. With
+    constraints the search starts from small motions that keep them, so that there is a
+    result after seconds. Ctrl-C ends the design with the best motion so far.
 
     Args:
         problem: Problem to be solved.
@@ -133,7 +131,6 @@ def minimise(
             limits of the joints for all times, and the best motion is taken.
         starts: Number of random motions to start from.
         generations: Number of generations.
-        polish: Number of the best motions that are polished.
         key: Key of the random motions; `jax.random.key(0)` if None.
         nominal: Base parameters as far as they are known, NaN where not, for relative
             deviations.
@@ -148,20 +145,18 @@ def minimise(
         InputError: If a number is too small, or no motion keeps all constraints.
         KeyboardInterrupt: If Ctrl-C came before a motion kept all constraints.
     """
-    least = {
-        "starts": (starts, 1),
-        "generations": (generations, 0),
-        "polish": (polish, 0),
-    }
-    for name, (value, low) in least.items():
-        if value < low:
-            raise InputError(f"`{name}` must be at least {low}, but is {value}.")
+    for name, value, minimum in (
+        ("starts", starts, 1),
+        ("generations", generations, 0),
+    ):
+        if value < minimum:
+            raise InputError(f"`{name}` must be at least {minimum}, but is {value}.")
     key = jax.random.key(0) if key is None else key
     if begin is not None and begin.coefficients.shape != problem.limits.shape:
         raise InputError("`begin` must be a motion of the problem's basis.")
     x = None if begin is None else problem.limits.scaled(begin.coefficients)
     if solver is None:
-        search = Search(problem, key, starts, generations, polish, x, seconds)
+        search = Search(problem, key, starts, generations, x, seconds)
         status = _run(search, problem, seconds, progress)
         best, first, history = search.best, search.first, search.history
     else:

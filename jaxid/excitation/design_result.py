@@ -106,7 +106,7 @@ class ExcitationPlan(Summarised, eqx.Module):
         with double_precision():
             return tuple(
                 Comparison(c.name, c.value(self.reference), c.value(self.information))
-                for c in CRITERIA
+                for c in CRITERIA.values()
             )
 
     @property

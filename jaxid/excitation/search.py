@@ -2,9 +2,8 @@
 
 The children of the motions found are improved in the same way, and of parents and
 children the best survive. In the end limits are kept on a finer grid, so that less of
-them is left unused, and the best motions are polished one by one. Where there are
-constraints, all starts are small motions that keep them, so that there is a result
-after seconds.
+them is left unused. Where there are constraints, all starts are small motions that keep
+them, so that there is a result after seconds.
 """
 
 import time
@@ -20,7 +19,6 @@ from jaxid.dynamics.motion import Motion
 from . import interior_point
 from .coefficient_limits import scale_samples
 from .interior_point import Evaluation, Stage, State
-from .polish import polish
 from .problem import (
     PENALTY,
     SEARCHED,
@@ -89,13 +87,11 @@ class Search:
         key: PRNGKeyArray,
         starts: int,
         generations: int,
-        polished: int,
         begin: Float[np.ndarray, " scaled"] | None = None,
         seconds: float | None = None,
     ):
         self._problem, self._generations = problem, generations
         self._random = np.random.default_rng(np.asarray(jax.random.key_data(key)))
-        self._polished = min(polished, starts)
         self._began, self._seconds = time.monotonic(), seconds
         x = problem.limits.random(key, starts)
         if problem.constraints:
@@ -109,7 +105,7 @@ class Search:
         self._x, self.history = x, [self.best.best_value]
         self._schedule = CONSTRAINED if problem.constraints else SCHEDULE
         batches = -(-starts // BATCH)
-        self.steps = batches * (len(self._schedule) + 1) + generations + self._polished
+        self.steps = batches * (len(self._schedule) + 1) + generations
 
     @property
     def feasible(self) -> bool:
@@ -187,7 +183,7 @@ class Search:
             yield self._done(task)
 
     def _finish(self) -> Iterator[str]:
-        """Keep limits on a finer grid, then polish the best motions."""
+        """Keep limits on a finer grid."""
         problem, task = self._problem, "keeping the limits closely"
         promising = self.best.promising()
         for start in range(
@@ -199,14 +195,10 @@ class Search:
                 yield task
             self._take(states, places)
             yield self._done(task)
-        for place in self.best.promising()[: self._polished]:
-            yield "polishing the best"
-            self._replace([place], polish(problem, np.asarray(self.best.x[place])))
-            yield self._done("polishing the best")
 
     @property
     def _is_late(self) -> bool:
-        """Whether only the time for the fine grid and for polishing is left."""
+        """Whether only the time for the fine grid is left."""
         return self._seconds is not None and self.spent > 0.65
 
     def _take(self, states: list[State], places: np.ndarray) -> None:

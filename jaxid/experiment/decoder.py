@@ -6,13 +6,14 @@ init` prints. The function may be a class of the package. Of other functions, ar
 before the `*` come from elsewhere and are no keys.
 """
 
+import dataclasses
 import difflib
 import inspect
 import json
 import math
 import re
 import typing
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from operator import ge, gt, le, lt
 from typing import Annotated, Any, Literal, NamedTuple
@@ -48,6 +49,19 @@ class Bounds(NamedTuple):
                 raise InputError(
                     f"`{place}` must be {words} {bound:.10g}, but is {value}."
                 )
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class OneOf:
+    """Names that a text may have, given as `Annotated[str, OneOf(CRITERIA)]`."""
+
+    names: Collection[str]
+
+    def check(self, value: str, place: str) -> None:
+        """Reject a text that is none of the names."""
+        if value not in self.names:
+            shown = json.dumps(value, ensure_ascii=False)
+            raise InputError(f"`{place}` must be {quoted(self.names)}, but is {shown}.")
 
 
 Positive = Annotated[float, Bounds(above=0.0)]
@@ -250,7 +264,9 @@ def _is_array(option: Any) -> bool:
 def _describe(option: Any) -> str:
     origin, arguments = typing.get_origin(option), typing.get_args(option)
     if origin is Annotated and not table_of(option):
-        return _describe(arguments[0])
+        rule = arguments[1]
+        is_name = isinstance(rule, OneOf)
+        return quoted(rule.names) if is_name else _describe(arguments[0])
     if origin is Literal:
         return quoted(arguments)
     if origin in (list, tuple):

@@ -137,7 +137,6 @@ def design_motion(
             criterion=table.objective,
             starts=table.starts,
             generations=table.generations,
-            polish=min(table.polish, table.starts),
             progress=progress,
             begin=preparation.begin,
             seconds=table.time if seconds is None else seconds,
@@ -150,10 +149,10 @@ def design_motion(
 def compare_criteria(
     experiment: Experiment, progress: Callable[[DesignProgress], None]
 ) -> list[ExcitationPlan]:
-    """Design by every criterion, from few starts and without polishing, until Ctrl-C."""
+    """Design by every criterion, from few starts, until Ctrl-C."""
     plans, table = [], experiment.excitation
     preparation = prepare_design(experiment, None)
-    for number, criterion in enumerate(CRITERIA, 1):
+    for number, criterion in enumerate(CRITERIA.values(), 1):
 
         def tell(step: DesignProgress, number: int = number) -> None:
             task = f"criterion {number} of {len(CRITERIA)}: {step.task}"
@@ -166,7 +165,6 @@ def compare_criteria(
                     criterion=criterion,
                     starts=min(8, table.starts),
                     generations=min(4, table.generations),
-                    polish=0,
                     progress=tell,
                     throw=False,
                     **_settings(experiment, preparation, bool(criterion.weighted)),

@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-import typing
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
 
@@ -23,20 +22,10 @@ from jaxid.trajectory.leads import LeadsBasis
 from jaxid.trajectory.spline import RestToRestSplineBasis
 from jaxid.trajectory.trajectory import AbstractBasis, count_cycles
 
-from .decoder import Bounds, Count, Finite, Positive, Vector
+from .decoder import Bounds, Count, Finite, OneOf, Positive, Vector
 from .robot_tables import RobotSource, joint_number
 
 Corner = tuple[float, float, float]
-CriterionName = Literal[
-    "condition_number",
-    "weighted_condition_number",
-    "scaled_condition_number",
-    "d_optimal",
-    "a_optimal",
-    "e_optimal",
-]
-"""Names of all criteria, in their order."""
-ControllerName = Literal["franka", "kuka_fri", "kuka_rsi", "universal_robots"]
 
 
 def capsule(
@@ -225,14 +214,13 @@ class Excitation:
             default 1 % of the largest forces.
         starts: Number of random motions to start from.
         generations: Number of times that the motions found have children.
-        polish: Number of the best motions that are polished.
         time: Time for the search [s], like `60.0`; by default all of its steps are
             done.
         seed: Seed of the random motions.
         sample_time: Time between two rows of the written table, the controller's cycle
             [s], like `0.004`; by default that of the controller, or of the samples.
-        controller: Controller that plays the motion, for its cycle and its file, like
-            "universal_robots"; or franka, kuka_fri, kuka_rsi.
+        controller: Controller that plays the motion, for its cycle and its file:
+            franka, kuka_fri, kuka_rsi or universal_robots, like `"universal_robots"`.
         ros: Kind of the file for ROS 2: "yaml" or "mcap" (a bag).
         nominal: Folder of an earlier result of `jaxid identify`, to compare with, like
             `"report"`.
@@ -247,7 +235,7 @@ class Excitation:
             `[[-1.0, -1.0, 0.1], [1.0, 1.0, 1.5]]`.
     """
 
-    criterion: CriterionName = "d_optimal"
+    criterion: Annotated[str, OneOf(CRITERIA)] = "d_optimal"
     harmonics: Annotated[int, Bounds(least=1, most=50)] = 5
     omega: Annotated[float, Bounds(above=0.0, most=1000.0)] = 0.8
     rest: bool = False
@@ -257,11 +245,10 @@ class Excitation:
     noise: list[Annotated[float, Bounds(above=0.0, below=1e9)]] | None = None
     starts: Count = 32
     generations: Annotated[int, Bounds(least=0, most=10_000)] = 12
-    polish: Annotated[int, Bounds(least=0, most=10_000)] = 4
     time: Positive | None = None
     seed: Annotated[int, Bounds(least=0, most=2**32 - 1)] = 0
     sample_time: Annotated[float, Bounds(least=1e-5)] | None = None
-    controller: ControllerName | None = None
+    controller: Annotated[str, OneOf(CONTROLLERS)] | None = None
     ros: Literal["yaml", "mcap"] = "yaml"
     nominal: str | None = None
     earlier: tuple[str, ...] = ()
@@ -273,7 +260,7 @@ class Excitation:
     @property
     def objective(self) -> AbstractCriterion:
         """Criterion of that name."""
-        return CRITERIA[typing.get_args(CriterionName).index(self.criterion)]
+        return CRITERIA[self.criterion]
 
     @property
     def cycle(self) -> float | None:

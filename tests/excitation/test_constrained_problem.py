@@ -50,7 +50,7 @@ def problem(pendulum, constraints):
     )
 
 
-@pytest.mark.parametrize("criterion", CRITERIA, ids=lambda c: c.name)
+@pytest.mark.parametrize("criterion", CRITERIA.values(), ids=CRITERIA)
 def test_gradients_without_a_compiler_are_those_of_jax(pendulum, criterion):
     one = ExcitationProblem(
         pendulum, BASIS, criterion=criterion, noise=np.ones(1), samples=100
@@ -86,7 +86,7 @@ def test_derivatives_are_central_differences(problem):
     assert np.linalg.norm(slopes) > 1.0
 
 
-@pytest.mark.parametrize("criterion", CRITERIA, ids=lambda c: c.name)
+@pytest.mark.parametrize("criterion", CRITERIA.values(), ids=CRITERIA)
 def test_forward_mode_is_reverse_mode(pendulum, criterion, constraints):
     problem = ExcitationProblem(
         pendulum,
@@ -171,7 +171,7 @@ def test_a_design_with_leads_keeps_all_constraints(
         "CONSTRAINED",
     ):  # the last stage alone has all to keep as well
         monkeypatch.setattr(f"jaxid.excitation.search.{stages}", ())
-    plan = minimise(problem, starts=2, generations=0, polish=0)
+    plan = minimise(problem, starts=2, generations=0)
     assert plan.feasible
     assert excess(plan) <= 0.0
     robot, end = problem.base.model.robot, float(plan.trajectory.duration)

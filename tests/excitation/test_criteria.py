@@ -1,5 +1,7 @@
 """Contract of every criterion, and each against its textbook formula in NumPy."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -32,7 +34,30 @@ def changed(information, D, h):
     )
 
 
-@pytest.mark.parametrize("criterion", CRITERIA, ids=lambda c: c.name)
+@pytest.mark.parametrize("criterion", CRITERIA.values(), ids=CRITERIA)
+def test_every_criterion_falls_with_information_and_uses_only_what_it_declares(
+    criterion,
+):
+    """Contract of the family: a unique title, less for four times the information."""
+    titles = [member.name for member in CRITERIA.values()]
+    assert titles.count(criterion.name) == 1
+    info = sample()
+    value = criterion.value(info)
+    assert np.isfinite(value)
+    assert value > 0.0
+    twice = Information(4.0 * info.plain, 4.0 * info.weighted, info.sizes)
+    assert criterion.value(twice) <= value * (1.0 + 1e-9)
+    stretch = np.diag(np.linspace(1.0, 3.0, SIZE))
+    for field, is_used in (
+        ("plain", not criterion.weighted),
+        ("weighted", criterion.weighted),
+    ):
+        other = stretch @ getattr(info, field) @ stretch
+        change = dataclasses.replace(info, **{field: other + np.eye(SIZE)})
+        assert (criterion.value(change) != value) == is_used
+
+
+@pytest.mark.parametrize("criterion", CRITERIA.values(), ids=CRITERIA)
 @pytest.mark.parametrize("sharpness", [None, 8.0])
 def test_gradients_are_central_differences(criterion, sharpness):
     info = jax.tree.map(jnp.asarray, sample())
@@ -50,7 +75,7 @@ def test_gradients_are_central_differences(criterion, sharpness):
         ) * np.linalg.norm(D)
 
 
-@pytest.mark.parametrize("criterion", CRITERIA, ids=lambda c: c.name)
+@pytest.mark.parametrize("criterion", CRITERIA.values(), ids=CRITERIA)
 def test_smooth_values_lie_above_the_exact_ones_and_approach_them(criterion):
     info = jax.tree.map(jnp.asarray, sample())
     exact, blunt, sharp = (float(criterion(info, p)) for p in (None, 4.0, 100.0))
@@ -71,7 +96,7 @@ def test_values_are_the_textbooks():
         members.AOptimal.name: np.sqrt(np.trace(np.linalg.inv(S @ V @ S)) / SIZE),
         members.EOptimal.name: np.sqrt(np.linalg.norm(np.linalg.inv(S @ V @ S), 2)),
     }
-    found = {criterion.name: criterion.value(info) for criterion in CRITERIA}
+    found = {criterion.name: criterion.value(info) for criterion in CRITERIA.values()}
     assert found == pytest.approx(expected, rel=1e-8)
 
 

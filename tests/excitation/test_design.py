@@ -15,7 +15,7 @@ from jaxid.excitation.design_result import DesignStatus
 from jaxid.excitation.problem import ExcitationProblem
 from jaxid.trajectory.fourier import FourierBasis
 
-EFFORT = {"starts": 3, "generations": 1, "polish": 1}
+EFFORT = {"starts": 3, "generations": 1}
 BASIS = FourierBasis(2, 1.1)
 
 
@@ -95,7 +95,7 @@ def test_a_stopped_design_gives_its_best_and_another_goes_on_with_it(free, exces
         if len(seen) == 40:
             raise KeyboardInterrupt
 
-    arguments = {"key": jax.random.key(3), "starts": 2, "generations": 0, "polish": 0}
+    arguments = {"key": jax.random.key(3), "starts": 2, "generations": 0}
     stopped = minimise(free, progress=stop, **arguments)
     assert stopped.interrupted
     assert excess(stopped) <= 0.0
@@ -171,7 +171,7 @@ def test_an_impossible_constraint_is_diagnosed(impossible, monkeypatch):
     # The last stage alone finds the least excess of so simple a problem.
     for stages in ("SCHEDULE", "CONSTRAINED"):
         monkeypatch.setattr(f"jaxid.excitation.search.{stages}", ())
-    effort = {"starts": 2, "generations": 0, "polish": 0}
+    effort = {"starts": 2, "generations": 0}
     with pytest.raises(
         ValueError, match=r"tilt of the tip exceeds its limit by 0\.[5-9]"
     ):

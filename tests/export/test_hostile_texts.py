@@ -153,7 +153,7 @@ def test_html():
 
 def test_toml_and_yaml(fit, tmp_path):
     robot, path = fit.base.model.robot, tmp_path / "motion.yaml"
-    motion = jid.random_fourier_series(robot, omega=1.0, harmonics=1)
+    motion = jid.trajectories.random_fourier_series(robot, omega=1.0, harmonics=1)
     for text in hostile(1000, lambda x: "\ud800" not in x):
         assert tomllib.loads(f"a = {toml_text(text)}\nb = 1") == {"a": text, "b": 1}
     for text in hostile(250, str.isprintable):

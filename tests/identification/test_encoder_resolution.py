@@ -16,7 +16,7 @@ BASE = jid.base_parameters(
     jid.Model(ARM, (jid.RigidBodies(), jid.ViscousFriction(), jid.CoulombFriction()))
 )
 T = 0.002 * np.arange(5000)
-MOTION = jid.random_fourier_series(ARM, omega=0.7, seed=1).motion(T)
+MOTION = jid.trajectories.random_fourier_series(ARM, omega=0.7, seed=1).motion(T)
 P = np.linspace(0.5, 1.5, BASE.size)
 FORCES = np.asarray(BASE.inverse_dynamics(P, MOTION))
 

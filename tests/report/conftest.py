@@ -65,7 +65,7 @@ def validated():
     )
     observations = []
     for seed, name in ((1, "first/run"), (2, "second")):
-        motion = jid.random_fourier_series(robot, omega=1.5, seed=seed)
+        motion = jid.trajectories.random_fourier_series(robot, omega=1.5, seed=seed)
         log = virtual.measure(
             motion, duration=4.0, sample_time=0.005, seed=seed, name=name
         )
@@ -101,7 +101,7 @@ def consistent():
     robot = jid.robots.planar_arm(2, 0.4)
     model = jid.Model(robot, (jid.RigidBodies(), jid.ViscousFriction()))
     t = np.arange(0.0, 6.0, 0.01)
-    motion = jid.random_fourier_series(robot, omega=1.5, seed=0).motion(t)
+    motion = jid.trajectories.random_fourier_series(robot, omega=1.5, seed=0).motion(t)
     p = np.zeros(model.size)
     p[[0, 1, 6, 5, 10, 11, 16, 15]] = [2.0, 0.4, 0.11, 0.11, 1.0, 0.2, 0.06, 0.06]
     p[-2:] = [0.3, -0.3]
