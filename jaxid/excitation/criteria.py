@@ -77,16 +77,18 @@ def informations(
 
     Motions are evaluated at `samples`, which stand for those that are `measured`.
     """
-    rows = base.joint_regressor
-    motion = np.asarray(basis.rows(basis.times(samples))[:3])
-    arrays = [jnp.einsum("sk,bjk->jbs", part, x) for part in motion]
-    plain = jnp.zeros((x.shape[0], rows.size, rows.size), x.dtype)
+    regressor = base.joint_regressor
+    rows = np.asarray(basis.rows(basis.times(samples)))
+    q, qd, qdd = (jnp.einsum("sk,bjk->jbs", part, x) for part in rows[:3])
+    columns_by_joint = regressor(q, qd, qdd)
+
+    plain = jnp.zeros((x.shape[0], regressor.size, regressor.size), x.dtype)
     weighted = plain
-    for own, columns, w in zip(rows.columns, rows(*arrays), weights, strict=True):
-        k = np.array(own, int)
-        gram = measured / samples * jnp.asarray(_gram(columns))
-        plain = plain.at[:, k[:, None], k].add(gram)
-        weighted = weighted.at[:, k[:, None], k].add(w**2 * gram)
+    for joint, columns in enumerate(columns_by_joint):
+        place = np.ix_(regressor.columns[joint], regressor.columns[joint])
+        gram = measured / samples * _gram(columns)
+        plain = plain.at[:, *place].add(gram)
+        weighted = weighted.at[:, *place].add(weights[joint] ** 2 * gram)
     return plain, weighted + prior[None]
 
 

@@ -311,17 +311,27 @@ def _draw_children(
     x: np.ndarray,
     random: np.random.Generator,
 ) -> np.ndarray:
-    starts, (joints, _) = len(x), problem.limits.shape
-    ahead = random.integers(1, max(starts, 2), starts)
+    """Draw one child of each motion with another one."""
+    starts = len(x)
+    joints, variables = problem.limits.shape
+    numbers = np.arange(starts)
+    offsets = random.integers(1, max(starts, 2), starts)
+
     # Half of the second parents are not retimed: motions of one descent fit together
     # already.
-    which = random.integers(0, len(retimings), starts)
-    T = retimings[np.where(random.random(starts) < 0.5, 0, which)]
-    mates = problem.limits.coefficients(x[(np.arange(starts) + ahead) % starts])
-    second = np.einsum("bvw,bjw->bjv", T, mates) / np.asarray(problem.limits.scale)
+    retiming_numbers = random.integers(0, len(retimings), starts)
+    is_unchanged = random.random(starts) < 0.5
+    maps = retimings[np.where(is_unchanged, 0, retiming_numbers)]
+    coefficients = problem.limits.coefficients(x[(numbers + offsets) % starts])
+    retimed = np.einsum("bvw,bjw->bjv", maps, coefficients)
+    second_parents = retimed / np.asarray(problem.limits.scale)
+
     # A child has this expected fraction of joints from its second parent, and at least
     # one.
-    share = random.uniform(0.1, 0.5, (starts, 1))
-    taken = random.random((starts, joints)) < share
-    taken[np.arange(starts), random.integers(0, joints, starts)] = True
-    return np.where(taken[:, :, None], second, x.reshape(second.shape)).reshape(x.shape)
+    fractions = random.uniform(0.1, 0.5, (starts, 1))
+    is_from_second = random.random((starts, joints)) < fractions
+    is_from_second[numbers, random.integers(0, joints, starts)] = True
+
+    first_parents = x.reshape(starts, joints, variables)
+    children = np.where(is_from_second[:, :, None], second_parents, first_parents)
+    return children.reshape(x.shape)
