@@ -11,23 +11,24 @@ import enum
 import functools
 import html
 import importlib.metadata
+import io
 import math
 import platform
 import re
 import shutil
-import textwrap
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
-Lines = Iterator[list[tuple[str, "Status | str"]]]
-"""Lines of text, as parts with a style each."""
 MISSING = "–"  # noqa: RUF001
 """Text in place of a number that is not known."""
-
-_CONTROLS = re.compile(
+SHORT_DECIMALS = range(-3, 9)
+"""Decimals of numbers that are written without exponent; -3 are three digits too many."""
+MIN_TEXT_WIDTH = 12
+"""Characters of a line to which a column of texts may be folded."""
+UNSEEN_CHARACTERS = re.compile(
     r"[\x00-\x08\x0b-\x1f\x7f-\x9f\xad\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff\ud800-\udfff]"
 )
 """Controls, marks of direction and others that nobody sees, and halves of characters."""
@@ -42,9 +43,20 @@ class Status(enum.Enum):
     NEUTRAL = "·"
 
 
+STYLES = {
+    Status.GOOD: "green",
+    Status.DOUBTFUL: "yellow",
+    Status.BAD: "red",
+    Status.NEUTRAL: "dim",
+}
+"""Styles of the marks in a terminal."""
+
+
 def printable(text: str) -> str:
     """Return a text whose control and escape sequences are spelled out: no terminal obeys them."""
-    return _CONTROLS.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
+    return UNSEEN_CHARACTERS.sub(
+        lambda match: match[0].encode("unicode_escape").decode(), text
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,6 +77,11 @@ class Remark:
         stop = "" if self.text.endswith((".", "?", "!")) else "."
         object.__setattr__(self, "text", printable(self.text + stop))
         object.__setattr__(self, "detail", printable(self.detail))
+
+    @property
+    def line(self) -> str:
+        """The sentence, and its explanation in brackets."""
+        return f"{self.text} ({self.detail})" if self.detail else self.text
 
 
 def in_html(macro: str, *arguments: Any) -> str:
@@ -102,51 +119,61 @@ def macros(template: Path) -> Any:
 
 def significant(value: float, digits: int = 3) -> str:
     """Return a number with so many significant digits, and a dash for NaN."""
-    if not math.isfinite(value):
-        return MISSING if math.isnan(value) else ("∞" if value > 0 else "-∞")
-    value = float(f"{value:.{digits - 1}e}")
-    if value == 0:
+    if math.isnan(value):
+        return MISSING
+    if math.isinf(value):
+        return "∞" if value > 0 else "-∞"
+    scientific = f"{value:.{digits - 1}e}"
+    # The exponent after rounding: 9.996 is 10.0.
+    rounded = float(scientific)
+    if rounded == 0:
         return "0"
-    decimals = digits - 1 - math.floor(math.log10(abs(value)))
-    if not -3 <= decimals <= 8:
-        return f"{value:.{digits - 1}e}"
-    return f"{value:.{max(decimals, 0)}f}"
+    decimals = digits - 1 - _exponent(rounded)
+    if decimals not in SHORT_DECIMALS:
+        return scientific
+    return f"{rounded:.{max(decimals, 0)}f}"
+
+
+def _exponent(value: float) -> int:
+    """Return the power of ten of the first digit."""
+    return math.floor(math.log10(abs(value)))
 
 
 def percent(fraction: float, digits: int = 2) -> str:
     """Return a fraction in percent, without the sign; whole numbers above 100."""
     value = 100.0 * fraction
-    if math.isfinite(value) and abs(value) >= 100:
-        return f"{value:.0f}" if abs(value) < 1e4 else f"{value:.0e}"
-    return significant(value, digits)
+    if not math.isfinite(value) or abs(value) < 100:
+        return significant(value, digits)
+    return f"{value:.0f}" if abs(value) < 1e4 else f"{value:.0e}"
 
 
 def with_deviation(value: float, deviation: float) -> tuple[str, str]:
     """Return an estimate and its standard deviation, both to the deviation's second digit."""
-    if not (math.isfinite(deviation) and deviation > 0 and math.isfinite(value)):
+    if not (math.isfinite(value) and math.isfinite(deviation) and deviation > 0):
         return significant(value, 4), significant(deviation, 2)
-    decimals = 1 - math.floor(math.log10(float(f"{deviation:.1e}")))
-    if not -3 <= decimals <= 8:
+    decimals = 1 - _exponent(float(f"{deviation:.1e}"))
+    if decimals not in SHORT_DECIMALS:
         return significant(value, 5), significant(deviation, 2)
-    decimals = max(decimals, 0)
-    return f"{value:.{decimals}f}", f"{deviation:.{decimals}f}"
+    digits = max(decimals, 0)
+    return f"{value:.{digits}f}", f"{deviation:.{digits}f}"
 
 
 def with_deviations(values: Any, deviations: Any) -> tuple[list[str], list[str]]:
     """Return estimates and their deviations as texts for two columns, rounded together."""
     pairs = [
-        with_deviation(float(v), float(d))
-        for v, d in zip(values, deviations, strict=True)
+        with_deviation(float(value), float(deviation))
+        for value, deviation in zip(values, deviations, strict=True)
     ]
     return [pair[0] for pair in pairs], [pair[1] for pair in pairs]
 
 
-def shortened(text: str, longest: int) -> str:
+def shortened(text: str, max_length: int) -> str:
     """Return a text whose middle is left out if it is longer than its place."""
-    if len(text) <= longest:
+    if len(text) <= max_length:
         return text
-    head = (longest - 1) * 2 // 3
-    return f"{text[:head]}…{text[head + 1 - longest :]}"
+    head = (max_length - 1) * 2 // 3
+    tail = max_length - 1 - head
+    return f"{text[:head]}…{text[-tail:]}"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -170,34 +197,49 @@ class Column:
     kind: Literal["number", "text", "code", ""] = ""
 
     def __post_init__(self) -> None:
-        listed = isinstance(self.values, list | tuple)
-        values = self.values if listed else np.asarray(self.values).tolist()
-        values = tuple(x.item() if isinstance(x, np.generic) else x for x in values)
-        values = tuple(printable(x) if isinstance(x, str) else x for x in values)
-        object.__setattr__(self, "values", values)
+        values = self.values
+        if not isinstance(values, list | tuple):
+            values = np.asarray(values).tolist()
+        cells = tuple(map(_plain_cell, values))
+        object.__setattr__(self, "values", cells)
         object.__setattr__(self, "name", printable(self.name))
         if not self.kind:
-            numeric = bool(values) and all(isinstance(x, int | float) for x in values)
+            numeric = bool(cells) and all(isinstance(x, int | float) for x in cells)
             object.__setattr__(self, "kind", "number" if numeric else "text")
 
     @property
     def header(self) -> list[str]:
         """Lines of the header: the name, and the unit in brackets."""
-        return [*self.name.split("\n"), *([f"[{self.unit}]"] if self.unit else [])]
+        lines = self.name.split("\n")
+        return [*lines, f"[{self.unit}]"] if self.unit else lines
 
     @property
     def texts(self) -> list[str]:
         """Formatted values; numbers have blanks behind them so that their points are aligned."""
         texts = [
-            self.format(x) if isinstance(x, float) else str(x) for x in self.values
+            self.format(value) if isinstance(value, float) else str(value)
+            for value in self.values
         ]
         if self.kind != "number":
             return texts
-        tails = [len(s) - s.index(".") if "." in s else 0 for s in texts]
-        longest = max(tails, default=0)
+        decimals = [len(text.partition(".")[2]) + ("." in text) for text in texts]
+        width = max(decimals, default=0)
         return [
-            s + " " * (longest - tail) for s, tail in zip(texts, tails, strict=True)
+            text + " " * (width - length)
+            for text, length in zip(texts, decimals, strict=True)
         ]
+
+    @property
+    def width(self) -> int:
+        """Characters of the longest line."""
+        return max(map(len, (*self.header, *self.texts)))
+
+
+def _plain_cell(value: Any) -> Any:
+    """Return a value of a column as a number of Python, or as a printable text."""
+    if isinstance(value, np.generic):
+        return value.item()
+    return printable(value) if isinstance(value, str) else value
 
 
 class Summarised:
@@ -254,11 +296,18 @@ class Table:
     def text(self, width: int | None = None) -> str:
         """Return the table as plain text, in lines as wide as the terminal or `width`.
 
-        The widest columns of texts are shortened to fit, remarks are wrapped.
+        Columns of texts and remarks are folded to fit; numbers never are.
         """
-        return "\n".join(
-            "".join(part for part, _ in line).rstrip() for line in self.lines(width)
+        from rich.console import Console
+
+        if width is None:
+            width = shutil.get_terminal_size((100, 24)).columns
+        console = Console(
+            file=io.StringIO(), width=width, color_system=None, force_terminal=False
         )
+        with console.capture() as capture:
+            console.print(self, crop=False)
+        return "\n".join(map(str.rstrip, capture.get().splitlines()))
 
     def __str__(self) -> str:
         return self.text()
@@ -266,90 +315,85 @@ class Table:
     def _repr_html_(self) -> str:
         return in_html("notebook", self)
 
-    def lines(self, width: int | None = None) -> Lines:
-        """Yield the lines of the text as parts with a style each, for renderers with colours.
+    def __rich_console__(self, console: Any, options: Any) -> Iterator[Any]:
+        """Yield title, facts, columns and remarks, with empty lines between the last three."""
+        from rich.text import Text
 
-        A style is a `Status`, `title`, `header`, `dim`, or empty.
-        """
-        width = shutil.get_terminal_size((100, 24)).columns if width is None else width
-        indent = max((len(word) for word, _ in self.facts), default=0) + 2
-        facts = [(word.ljust(indent), "dim", text) for word, text in self.facts]
-        remarks = [
-            (
-                f"{r.status.value}  ",
-                r.status,
-                f"{r.text} ({r.detail})" if r.detail else r.text,
-            )
-            for r in self.remarks
-        ]
-        groups = (_hanging(facts, width), self._grid(width), _hanging(remarks, width))
-        filled = [lines for lines in map(list, groups) if lines]
-        for line in _wrapped(self.title, width) if self.title else ():
-            yield [(line, "title")]
-        for k, lines in enumerate(filled):
-            if k:
-                yield []
-            yield from lines
+        parts = []
+        if self.facts:
+            facts = [(Text(word, "dim"), text) for word, text in self.facts]
+            parts.append(_two_columns(facts))
+        if self.columns:
+            parts.append(self._grid())
+        if self.remarks:
+            remarks = [(_mark(remark.status), remark.line) for remark in self.remarks]
+            parts.append(_two_columns(remarks))
 
-    def _grid(self, width: int) -> Lines:
-        if not self.columns:
-            return
-        texts, headers = zip(*((c.texts, c.header) for c in self.columns), strict=True)
-        widths = [
-            max(map(len, (*h, *cells))) for h, cells in zip(headers, texts, strict=True)
-        ]
-        right = [column.kind == "number" for column in self.columns]
-        margin = 3 if self.status else 0
-        _shrink(widths, right, width - margin)
+        if self.title:
+            yield Text(self.title, "bold")
+        for number, part in enumerate(parts):
+            if number:
+                yield Text()
+            yield part
 
-        def line(cells: Sequence[str]) -> str:
-            places = zip(map(shortened, cells, widths), widths, right, strict=True)
-            return "  ".join(
-                s.rjust(w) if number else s.ljust(w) for s, w, number in places
-            )
+    def _grid(self) -> Any:
+        """Return marks and columns as a table of `rich`, which folds texts to fit."""
+        from rich.rule import Rule
+        from rich.table import Table as Grid
+        from rich.text import Text
 
-        height = max(map(len, headers))
-        padded = ([""] * (height - len(header)) + header for header in headers)
-        for head in zip(*padded, strict=True):
-            yield [(" " * margin + line(head), "header")]
-        for k, row in enumerate(zip(*texts, strict=True)):
+        grid = Grid(box=None, padding=(0, 2, 0, 0), pad_edge=False)
+        if self.status:
+            grid.add_column()
+        cells = []
+        for column in self.columns:
+            texts = column.texts
+            width = max(map(len, (*column.header, *texts)))
+            header = Text("\n".join(column.header), "bold")
+            if column.kind == "number":
+                header.justify = "right"
+                # Blanks before a number, not its justification, which would take
+                # those behind it away.
+                texts = [text.rjust(width) for text in texts]
+                grid.add_column(header, min_width=width, no_wrap=True)
+            else:
+                min_width = min(width, MIN_TEXT_WIDTH)
+                grid.add_column(header, min_width=min_width, overflow="fold")
+            cells.append(map(Text, texts))
+
+        for k, row in enumerate(zip(*cells, strict=True)):
             if k in self.rules:
-                yield [
-                    (
-                        "─" * min(width, margin + sum(widths) + 2 * len(widths) - 2),
-                        "dim",
-                    )
-                ]
-            mark = self.status[k] if self.status else Status.NEUTRAL
-            yield [(f"{mark.value}  "[:margin], mark), (line(row), "")]
+                grid.add_row(*[Rule(style="dim")] * len(grid.columns))
+            mark = [_mark(self.status[k])] if self.status else []
+            grid.add_row(*mark, *row)
+        return grid
 
 
-def _hanging(entries: Iterable[tuple[str, Any, str]], width: int) -> Lines:
-    """Yield texts, each beside its head of some style."""
-    for head, style, text in entries:
-        for k, line in enumerate(_wrapped(text, width - len(head))):
-            yield [(" " * len(head) if k else head, style), (line, "")]
+def _two_columns(rows: Iterable[tuple[Any, str]]) -> Any:
+    """Return heads, such as words or marks, and the texts beside them as a table of `rich`."""
+    from rich.table import Table as Grid
+    from rich.text import Text
+
+    grid = Grid.grid(padding=(0, 2, 0, 0))
+    grid.add_column(no_wrap=True)
+    grid.add_column(overflow="fold")
+    for head, text in rows:
+        grid.add_row(head, Text(text))
+    return grid
 
 
-def _wrapped(text: str, width: int) -> list[str]:
-    return textwrap.wrap(text, max(width, 20), break_on_hyphens=False) or [""]
+def _mark(status: Status) -> Any:
+    """Return the mark of a status, in its colour."""
+    from rich.text import Text
 
-
-def _shrink(widths: list[int], numbers: Sequence[bool], available: int) -> None:
-    """Shorten the widest columns of texts until a line fits, to 12 characters at least."""
-    texts = [k for k, number in enumerate(numbers) if not number]
-    while sum(widths) + 2 * (len(widths) - 1) > available and texts:
-        widest = max(texts, key=lambda k: widths[k])
-        if widths[widest] <= 12:
-            return
-        widths[widest] -= 1
+    return Text(status.value, STYLES[status])
 
 
 def versions() -> dict[str, str]:
     """Return the versions of the software that computed a result."""
     try:
-        own = importlib.metadata.version("jaxid-robotics")
+        jaxid_version = importlib.metadata.version("jaxid-robotics")
     except importlib.metadata.PackageNotFoundError:
-        own = "not installed"
+        jaxid_version = "not installed"
     others = {name: importlib.metadata.version(name) for name in ("jax", "numpy")}
-    return {"jaxid": own, **others, "python": platform.python_version()}
+    return {"jaxid": jaxid_version, **others, "python": platform.python_version()}

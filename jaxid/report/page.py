@@ -23,15 +23,6 @@ from jaxid.result_table import (
 from .figure import Figure
 from .interactive import charts, library
 
-STYLES = {
-    Status.GOOD: "green",
-    Status.DOUBTFUL: "yellow",
-    Status.BAD: "red",
-    Status.NEUTRAL: "dim",
-    **{style: style for style in ("dim", "")},
-    **dict.fromkeys(("title", "header"), "bold"),
-}
-"""Styles of the parts of a table's lines in the terminal."""
 Section = tuple[str, Sequence[Any]]
 """Title, which the table of contents shows, and blocks as `render_page` takes them."""
 _macros = functools.partial(macros, Path(__file__).parent / "templates" / "page.html")
@@ -125,9 +116,8 @@ def show(console: Console, *tables: Table) -> None:
     """Print tables, each with an empty line before it."""
     for table in tables:
         console.print()
-        for line in table.lines(console.width):
-            text = Text.assemble(*((part, STYLES[style]) for part, style in line))
-            console.print(text, soft_wrap=True)
+        # Numbers are not cut where a line is too short for them.
+        console.print(table, crop=False)
 
 
 def show_remarks(console: Console, remarks: Iterable[Remark | str]) -> None:

@@ -1,4 +1,4 @@
-"""Tables: numbers as text, alignment, units, widths, CSV; and what stands in those of results."""
+"""Tables: numbers as text, alignment, units, widths; and what stands in those of results."""
 
 import io
 
@@ -72,15 +72,22 @@ def test_text_is_aligned_marked_and_no_wider_than_asked():
     assert units.split() == ["joint", "[N", "m]", "[%]"]
     assert first.startswith("✓  rail")
     assert second.startswith("!  a joint with")
-    assert set(rule) == {"─"}
+    assert set(rule) == {"─", " "}
     assert first.index(".") == second.index("100") + 3, "points stand below each other"
     assert second.endswith(MISSING)
     assert text[9].startswith("✗  a sentence")
     assert text[-1] == "·  another."
     assert max(map(len, text)) <= 60
-    narrow = table().text(40)
-    assert "…" in narrow
-    assert max(map(len, narrow.splitlines())) <= 40
+    narrow = table().text(40).splitlines()
+    assert max(map(len, narrow)) <= 40
+    head, tail = narrow[7:9]
+    assert f"{head[3:22].strip()} {tail.strip()}" == table().rows[1][0]
+
+
+def test_numbers_are_never_cut():
+    numbers = [f"{k}.0123456789" for k in range(10)]
+    wide = Table("", *(Column("n", [x], kind="number") for x in numbers))
+    assert wide.text(30).split() == ["n"] * 10 + numbers
 
 
 def test_the_terminal_shows_the_same_letters_in_colour():
