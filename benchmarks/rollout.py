@@ -39,6 +39,7 @@ import mujoco
 import numpy as np
 import timing
 from timing import Row, hand_over
+from torque_methods import parameters_by_method
 
 import jaxid as jid
 from jaxid.dynamics.terms import Tanh
@@ -159,7 +160,6 @@ def authors_rate(y: dict[str, float], x: np.ndarray, u: np.ndarray) -> np.ndarra
 
 VARIANTS = {
     "rollouts": {},
-    "rollouts and torque rows": {"torque_rows": True},
     "rollouts, gains, load friction": {"gains": True, "load_friction": True},
 }
 """Options of identifications of the pendulum."""
@@ -200,11 +200,9 @@ def pendulum(quick: bool) -> None:
         for n in ("1.0", "1.1", "2.0", "3.0"):
             values = [authors_errors(authors(n), unseen, h) for h in HORIZONS]
             print_errors(f"authors {n}", values)
-        compared = jid.rollout.compare_methods(plain, seen, unseen)
-        for word, values in zip(
-            jid.rollout.METHODS[:-1], compared.errors, strict=False
-        ):
-            print_errors(word, values)
+        bandwidth = 2.0 / plain.horizon
+        for word, p in parameters_by_method(base, seen, bandwidth).items():
+            print_errors(word, [plain.errors_at(unseen, h, p) for h in HORIZONS])
         for word, fit in found.items():
             print_errors(word, [fit.errors_at(unseen, h) for h in HORIZONS])
         print_errors(
@@ -215,16 +213,16 @@ def pendulum(quick: bool) -> None:
             "rollouts, fitted to these logs",
             [own.errors_at(unseen, h) for h in HORIZONS],
         )
-        squares = []
+        squares: dict[str, list] = {}
         for k in range(0 if quick else 4):
             rest = [*seen[:k], *seen[k + 1 :]]
             fit = jid.rollout.identify_torque_rollout(base, rest)
-            squares.append(
-                jid.rollout.compare_methods(fit, rest, [seen[k]]).errors ** 2
-            )
-        means = np.sqrt(np.mean(squares, axis=0)) if squares else ()
-        for word, values in zip(jid.rollout.METHODS, means, strict=False):
-            print_errors(f"{word}, each left out", values)
+            methods = {**parameters_by_method(base, rest, bandwidth), "rollouts": None}
+            for word, p in methods.items():
+                errors = [fit.errors_at([seen[k]], h, p) for h in HORIZONS]
+                squares.setdefault(word, []).append(np.square(errors))
+        for word, values in squares.items():
+            print_errors(f"{word}, each left out", np.sqrt(np.mean(values, axis=0)))
 
 
 def print_errors(word: str, values) -> None:

@@ -277,8 +277,6 @@ class Rollout:
             first joint's, are identified.
         load_friction: With torques: whether friction that grows with the torque is
             identified.
-        torque_rows: With torques: whether errors of torques count beside those of
-            positions.
     """
 
     bodies: bool | None = None
@@ -291,7 +289,6 @@ class Rollout:
     horizon: Positive = 0.2
     gains: bool = False
     load_friction: bool = False
-    torque_rows: bool = False
 
     def options(self, torques: bool) -> dict[str, Any]:
         """Return the settings for logs of torques, or of commands.

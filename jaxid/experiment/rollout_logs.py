@@ -7,7 +7,7 @@ from jaxid.errors import InputError
 from jaxid.report.rollout import RolloutReport
 from jaxid.report.torque_rollout import TorqueRolloutReport
 from jaxid.result_table import Remark, Status
-from jaxid.rollout import compare_methods, identify_rollout, identify_torque_rollout
+from jaxid.rollout import identify_rollout, identify_torque_rollout
 
 from .decoder import within
 from .experiment import Experiment
@@ -54,7 +54,7 @@ def _with_commands(experiment, logs, verify, options, settings, stage) -> Rollou
 def _with_torques(
     experiment, logs, verify, options, settings, stage
 ) -> TorqueRolloutReport:
-    """Identify the model of `jaxid identify`, beside other methods."""
+    """Identify the model of `jaxid identify` by simulations under the recorded torques."""
     if experiment.load_transition is not None:
         raise InputError(
             f"{experiment.path.name}: give `rollout.load_friction`, not `model.load`."
@@ -68,12 +68,9 @@ def _with_torques(
     seen, unseen = observations[: len(logs)], observations[len(logs) :]
     stage("identifying")
     fit = identify_torque_rollout(base, seen, **options)
-    stage("comparing methods")
-    comparison = compare_methods(fit, seen, unseen)
     stage("simulating")
-    paths = [(log.name, *fit.simulate(log)) for log in unseen or seen]
     doubts = [Remark(text, Status.DOUBTFUL) for text in findings(loaded)]
     notes = [*experiment.notes, *(note for o in observations for note in o.notes)]
     return TorqueRolloutReport(
-        fit, comparison, paths, doubts, [*map(Remark, notes)], settings
+        fit, unseen or seen, bool(unseen), doubts, [*map(Remark, notes)], settings
     )

@@ -1,14 +1,17 @@
-"""Report of rollouts with torques: measured and simulated windows, beside other methods."""
+"""Report of rollouts with torques: measured and simulated windows, errors, parameters."""
 
+import dataclasses
+import functools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from jaxid.io import atomic_folder
-from jaxid.result_table import Remark, Status, Table, significant
-from jaxid.rollout import METHODS, MethodComparison, TorqueRolloutFit
+from jaxid.measurement.observations import Observations
+from jaxid.result_table import Column, Remark, Status, Table, significant
+from jaxid.rollout import TorqueRolloutFit
 
 from .figure import Figure
 from .page import Section, provenance, render_page
@@ -16,52 +19,61 @@ from .result_files import estimate_rows, header, plain, write_csv, write_json
 from .rollout import SHOWN, motion_panel
 
 
-class TorqueRolloutReport(NamedTuple):
+@dataclasses.dataclass(frozen=True, eq=False)
+class TorqueRolloutReport:
     """Content of the report.
 
     Attributes:
         fit: Fit of rollouts.
-        comparison: Errors beside those of other methods.
-        paths: Names of logs, with times, measured and simulated positions of their
-            windows.
+        logs: Logs of the errors.
+        unseen: Whether the fit has not seen these logs.
         findings: Findings on the logs.
         notes: Notes on the experiment and the logs.
         settings: Command and text of the experiment file.
     """
 
     fit: TorqueRolloutFit
-    comparison: MethodComparison
-    paths: Sequence[tuple[str, np.ndarray, np.ndarray, np.ndarray]]
+    logs: Sequence[Observations]
+    unseen: bool
     findings: list[Remark]
     notes: list[Remark]
     settings: Mapping[str, Any]
 
+    @functools.cached_property
+    def errors(self) -> np.ndarray:
+        """Errors after a horizon: of the fit of torques, and of rollouts [rad or m]."""
+        fit = self.fit
+        return np.array(
+            [fit.errors_at(self.logs, fit.horizon, p) for p in (fit.start, None)]
+        )
+
     @property
     def verdict(self) -> Remark:
         """Whether simulations are closer to the robot than those of the fit of torques."""
-        found = self.comparison
-        plain, *_, own = np.nan_to_num(found.errors[:, -1], nan=np.inf)
-        closer = bool((own < plain).all())
-        text = (
-            f"Simulations are {'closer' if closer else 'no closer'} to the robot "
-            "than with the "
+        torque_fit, rollouts = np.nan_to_num(self.errors, nan=np.inf)
+        is_closer = bool((rollouts < torque_fit).all())
+        return Remark(
+            f"Simulations are {'closer' if is_closer else 'no closer'} to the robot "
+            f"than with the fit of torques: errors after {self.fit.horizon:g} s of "
+            f"{_in_milli(rollouts)} instead of {_in_milli(torque_fit)} mrad or mm",
+            Status.GOOD if is_closer else Status.DOUBTFUL,
         )
-        sizes = (
-            ", ".join(significant(1e3 * x) for x in errors) for errors in (own, plain)
+
+    def error_table(self) -> Table:
+        """Return the errors of each joint after a horizon."""
+        place = "logs that the fit has not seen" if self.unseen else "logs of the fit"
+        torque_fit, rollouts = 1e3 * self.errors
+        return Table(
+            f"errors after {self.fit.horizon:g} s on {place}",
+            Column("joint", self.fit.joint_names),
+            Column("fit of torques", torque_fit, "mrad or mm"),
+            Column("rollouts", rollouts, "mrad or mm"),
         )
-        text += f"fit of torques: errors after {found.horizons[-1]:g} s of "
-        text += f"{' instead of '.join(sizes)} mrad or mm"
-        other = f"Closest on these logs: {found.best}."
-        detail = "" if found.best == METHODS[-1] else other
-        return Remark(text, Status.GOOD if closer else Status.DOUBTFUL, detail)
 
     def tables(self) -> list[Table]:
-        """Return estimates, and errors of all methods."""
-        return [
-            self.fit.summary(),
-            self.comparison.summary(),
-            Table("", remarks=[*self.notes, *self.findings]),
-        ]
+        """Return estimates and errors."""
+        remarks = [*self.notes, *self.findings]
+        return [self.fit.summary(), self.error_table(), Table("", remarks=remarks)]
 
     def write(self, folder: Path) -> list[Path]:
         """Write the page, `rollout.json` and `rollout.csv`."""
@@ -73,8 +85,8 @@ class TorqueRolloutReport(NamedTuple):
         files = ["rollout.html", "rollout.json", "rollout.csv"]
         sections: list[Section] = [
             ("Verdict", [self.verdict, self.findings]),
-            ("Errors", [self.comparison.summary()]),
-            ("Measured and simulated motion", [*map(self._figure, self.paths[:SHOWN])]),
+            ("Errors", [self.error_table()]),
+            ("Measured and simulated motion", [*map(self._figure, self.logs[:SHOWN])]),
             ("Parameters", [fit.summary(), self.notes]),
             provenance(self.settings),
         ]
@@ -86,33 +98,38 @@ class TorqueRolloutReport(NamedTuple):
         return [folder / name for name in files]
 
     def _record(self, rows: list[dict[str, Any]]) -> dict[str, Any]:
-        fit, found = self.fit, self.comparison
-        methods = zip(
-            METHODS, found.parameters, found.errors, found.torque_errors, strict=True
-        )
-        keys = ("method", "parameters", "errors", "torque_errors")
+        fit = self.fit
+        torque_fit, rollouts = self.errors
         errors = {
-            "unseen": found.unseen,
-            "horizons": found.horizons,
-            "base_parameters": fit.rollout.base.names,
-            "methods": [dict(zip(keys, method, strict=True)) for method in methods],
+            "unseen": self.unseen,
+            "fit_of_torques": torque_fit,
+            "rollouts": rollouts,
         }
         content = {
             "kind": "torques",
-            "joints": found.joint_names,
+            "joints": fit.joint_names,
             "horizon": fit.horizon,
-            "torque_rows": fit.torque_rows,
             "parameters": rows,
             "covariance": fit.uncertainty.covariance,
             "rms": fit.rms,
             "errors": errors,
-            "notes": [r.text for r in (*self.findings, *self.notes)],
+            "notes": [remark.text for remark in (*self.findings, *self.notes)],
         }
         return plain({**header("rollout.json"), **content})
 
-    def _figure(self, path: tuple[str, np.ndarray, np.ndarray, np.ndarray]) -> Figure:
-        name, time, measured, simulated = path
-        joints = zip(self.comparison.joint_names, measured.T, simulated.T, strict=True)
-        panels = [motion_panel(j, time, q, y, np.isfinite(y)) for j, q, y in joints]
-        title = f"{name}: measured, and simulated in windows of {self.fit.horizon:g} s"
+    def _figure(self, log: Observations) -> Figure:
+        time, measured, simulated = self.fit.simulate(log)
+        panels = [
+            motion_panel(name, time, q, simulated_q, np.isfinite(simulated_q))
+            for name, q, simulated_q in zip(
+                self.fit.joint_names, measured.T, simulated.T, strict=True
+            )
+        ]
+        horizon = f"{self.fit.horizon:g} s"
+        title = f"{log.name}: measured, and simulated in windows of {horizon}"
         return Figure(title, panels, columns=2, height=3.6)
+
+
+def _in_milli(errors: np.ndarray) -> str:
+    """Return errors in thousandths of their unit."""
+    return ", ".join(significant(1e3 * error) for error in errors)

@@ -10,8 +10,3 @@ from .torque import (
     TorqueRolloutFit as TorqueRolloutFit,
     identify_torque_rollout as identify_torque_rollout,
 )
-from .torque_methods import (
-    METHODS as METHODS,
-    MethodComparison as MethodComparison,
-    compare_methods as compare_methods,
-)

@@ -17,18 +17,17 @@ import numpy as np
 from jaxid.arrays import AnyArray, Array, Float, double_precision
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.dispatch import program_of
-from jaxid.dynamics.motion import Motion
 from jaxid.dynamics.terms import HardSign
 from jaxid.errors import InputError
 from jaxid.identification.identify import identify
 from jaxid.identification.uncertainty import Uncertainty
 from jaxid.identification.uncertainty.blocks import block_covariance
-from jaxid.measurement.observations import Observations, joined
+from jaxid.measurement.observations import Observations
 from jaxid.program.xla import lower
 from jaxid.result_table import Column, Summarised, Table, with_deviations
 
 from .least_squares import minimise
-from .torque_windows import MARGIN, SLIDING, TorqueRows, Windows
+from .torque_windows import MARGIN, SLIDING, Windows
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,105 +65,56 @@ class TorqueRollout:
     def errors(
         self, x: Array, windows: Windows
     ) -> Float[Array, "steps joints windows"]:
-        """Return simulated less measured positions, by the Runge-Kutta method of order four."""
-        forces, h = jnp.asarray(windows.forces), self.sample_time
-        margin = round(MARGIN / h)
-        at = margin + jnp.arange(len(forces) - 2.0 * margin) - self._parts(x)[1] / h
-        late = _between(forces, jnp.clip(at, 0.0, len(forces) - 1.001))
-        start = jnp.asarray(windows.q), jnp.asarray(windows.qd)
-        return self._integrate(x, start, (late,))[0] - windows.measured
-
-    def torque_errors(self, x: Array, rows: TorqueRows) -> Float[Array, "rows joints"]:
-        """Return predicted less measured torques at the measured motion; zero if not counted."""
-        p, delay, gains, load = self._parts(x)
-        count = len(rows.forces)
-        at = jnp.clip(
-            jnp.arange(1.0 * count) - delay / rows.row_time, 0.0, count - 1.001
-        )
-        forces, friction = (
-            _between(jnp.asarray(y), at) for y in (rows.forces, rows.load)
-        )
-        torques = gains[None] * forces - load[None] * friction
-        return jnp.where(rows.counted, jnp.asarray(rows.columns) @ p - torques, 0.0)
-
-    def follow(
-        self, p: AnyArray, logs: Sequence[Observations], bandwidth: float
-    ) -> tuple[Motion, ...]:
-        """Return simulations of whole logs, which a controller keeps near the measured motions.
-
-        Args:
-            p: Base parameters.
-            logs: Filtered logs with torques.
-            bandwidth: Double pole of the closed loop [rad/s].
-        """
-
-        def simulated(o: Observations, a: int, b: int) -> Motion:
-            m, forces = o.read(slice(a, b))
-            inputs = (np.asarray(y)[..., None] for y in (m.q, m.qd, forces))
-            found = _follow(self, jnp.asarray(self.start(p)), *inputs, float(bandwidth))
-            return Motion(*(np.asarray(y)[..., 0] for y in found))
-
-        with double_precision():
-            return tuple(
-                joined(simulated(o, *span) for span in o.segments) for o in logs
-            )
+        """Return simulated less measured positions."""
+        forces = jnp.asarray(windows.forces)
+        _, delay, _, _ = self._parts(x)
+        margin = round(MARGIN / self.sample_time)
+        steps = jnp.arange(len(forces) - 2.0 * margin)
+        samples = margin + steps - delay / self.sample_time
+        delayed_forces = _between(forces, jnp.clip(samples, 0.0, len(forces) - 1.001))
+        return self._positions(x, windows, delayed_forces) - windows.measured
 
     def _parts(self, x: Array) -> list[Array]:
         """Return base parameters, delay, gains, and friction by torque."""
         n = self.base.model.robot.joints
         return jnp.split(x, np.cumsum([self.base.size, 1, n]))
 
-    def _integrate(
-        self,
-        x: Array,
-        start: tuple[Array, Array],
-        inputs: tuple[Array, ...],
-        bandwidth: Array | float = 0.0,
-    ) -> Sequence[Array]:
-        """Return positions and velocities behind each step, and accelerations before it.
+    def _positions(
+        self, x: Array, windows: Windows, forces: Array
+    ) -> Float[Array, "steps joints windows"]:
+        """Return simulated positions, by the Runge-Kutta method of order four."""
+        step_size = self.sample_time
+        base_parameters, _, gains, load_friction = self._parts(x)
+        p = self.base.to_standard(base_parameters)[:, None]
+        acceleration = self._acceleration
 
-        Args:
-            x: Unknowns.
-            start: Initial positions and velocities [joints, windows].
-            inputs: Torques, and positions and velocities to follow, if any.
-            bandwidth: Double pole of the controller that follows [rad/s].
-        """
-        h, acceleration = self.sample_time, self._acceleration
-        p, _, gains, load = self._parts(x)
-        p, gains, load = (
-            self.base.to_standard(p)[:, None],
-            gains[:, None],
-            load[:, None],
-        )
-
-        def rate(state, inputs):
+        def rate(state, measured_forces):
             q, qd = state
-            u, *measured = inputs
+            driving = gains[:, None] * measured_forces
             # Gear friction grows with the torque that it carries.
-            u = gains * u - load * jnp.abs(u) * jnp.tanh(qd / SLIDING)
-            pulls = zip((bandwidth**2, 2.0 * bandwidth), measured, state, strict=False)
-            return qd, jnp.stack(acceleration(p, q, qd, u)) + sum(
-                k * (m - y) for k, m, y in pulls
-            )
+            friction = load_friction[:, None] * jnp.abs(driving)
+            forces = driving - friction * jnp.tanh(qd / SLIDING)
+            return qd, jnp.stack(acceleration(p, q, qd, forces))
 
-        def moved(state, rate, time):
+        def advance(state, rate, time):
             return jax.tree.map(lambda y, r: y + time * r, state, rate)
 
-        def step(state, inputs):
-            first, last = inputs
-            middle = jax.tree.map(lambda a, b: 0.5 * (a + b), first, last)
-            k1 = rate(state, first)
-            k2 = rate(moved(state, k1, 0.5 * h), middle)
-            k3 = rate(moved(state, k2, 0.5 * h), middle)
-            k4 = rate(moved(state, k3, h), last)
-            mean = jax.tree.map(
+        def step(state, end_forces):
+            first_forces, last_forces = end_forces
+            middle_forces = 0.5 * (first_forces + last_forces)
+            k1 = rate(state, first_forces)
+            k2 = rate(advance(state, k1, 0.5 * step_size), middle_forces)
+            k3 = rate(advance(state, k2, 0.5 * step_size), middle_forces)
+            k4 = rate(advance(state, k3, step_size), last_forces)
+            mean_rate = jax.tree.map(
                 lambda a, b, c, d: (a + 2 * b + 2 * c + d) / 6, k1, k2, k3, k4
             )
-            state = moved(state, mean, h)
-            return state, (*state, k1[1])
+            state = advance(state, mean_rate, step_size)
+            return state, state[0]
 
-        ends = ([y[part] for y in inputs] for part in (slice(-1), slice(1, None)))
-        return jax.lax.scan(step, start, tuple(ends))[1]
+        start = jnp.asarray(windows.q), jnp.asarray(windows.qd)
+        _, positions = jax.lax.scan(step, start, (forces[:-1], forces[1:]))
+        return positions
 
     @functools.cached_property
     def _acceleration(self) -> Callable:
@@ -183,21 +133,6 @@ def _between(series: Array, at: Array) -> Array:
     return series[k] + part * (series[k + 1] - series[k])
 
 
-@functools.partial(jax.jit, static_argnums=0)
-def _follow(
-    rollout: TorqueRollout,
-    x: Array,
-    q: Array,
-    qd: Array,
-    forces: Array,
-    bandwidth: Array | float,
-) -> Sequence[Array]:
-    """Return simulated positions, velocities and accelerations [samples, joints, segments]."""
-    after = rollout._integrate(x, (q[0], qd[0]), (forces, q, qd), bandwidth)
-    begun = (jnp.concatenate([y[:1], z]) for y, z in zip((q, qd), after, strict=False))
-    return (*begun, jnp.concatenate([after[2], after[2][-1:]]))
-
-
 @dataclasses.dataclass(frozen=True)
 class TorqueRolloutFit(Summarised):
     """Parameters for which open-loop simulations follow the measured positions.
@@ -210,7 +145,6 @@ class TorqueRolloutFit(Summarised):
         horizon: Horizon of the windows [s].
         rms: Errors of the identification over the windows [rad or m].
         start: Base parameters of the fit of torques from which the search started.
-        torque_rows: Whether errors of torques counted as well.
     """
 
     rollout: TorqueRollout
@@ -220,7 +154,11 @@ class TorqueRolloutFit(Summarised):
     horizon: float
     rms: Float[np.ndarray, " joints"]
     start: Float[np.ndarray, " base"]
-    torque_rows: bool = False
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the joints."""
+        return self.rollout.base.model.robot.joint_names
 
     @property
     def parameters(self) -> Float[np.ndarray, " base"]:
@@ -274,25 +212,6 @@ class TorqueRolloutFit(Summarised):
         )
         return time, measured, simulated
 
-    def torque_errors(
-        self,
-        observations: Sequence[Observations] | Observations,
-        parameters: AnyArray | None = None,
-    ) -> Float[np.ndarray, " joints"]:
-        """Return the root mean square error of torques at the measured motion [N m or N].
-
-        The arguments are those of `errors_at`.
-        """
-        logs = (
-            [observations] if isinstance(observations, Observations) else observations
-        )
-        x = self.unknowns if parameters is None else self.rollout.start(parameters)
-        rows = TorqueRows.of(self.rollout.base, logs)
-        with double_precision():
-            errors = np.asarray(self.rollout.torque_errors(jnp.asarray(x), rows))
-            gains = np.asarray(self.rollout._parts(jnp.asarray(x))[2])
-        return np.sqrt(np.sum(errors**2, axis=0) / rows.counted.sum(axis=0)) / gains
-
     def summary(self) -> Table:
         """Return a table of the estimates with 95 % intervals."""
         names = [
@@ -326,7 +245,6 @@ def identify_torque_rollout(
     horizon: float = 0.2,
     gains: bool = False,
     load_friction: bool = False,
-    torque_rows: bool = False,
     every: int = 5,
 ) -> TorqueRolloutFit:
     """Identify a robot so that its simulation under recorded torques follows the positions.
@@ -341,9 +259,6 @@ def identify_torque_rollout(
             joint's, are estimated. A gain common to all scales all parameters, and no
             log tells it.
         load_friction: Whether friction that grows with the torque is estimated.
-        torque_rows: Whether errors of the torques at the measured motion count as well.
-            Positions and torques of each joint are divided by the standard deviation of
-            their errors.
         every: Number of samples from one that counts to the next.
 
     Raises:
@@ -356,33 +271,25 @@ def identify_torque_rollout(
     _require_simulation(base)
     rollout = TorqueRollout(base, logs[0].sample_time)
     windows = Windows.of(logs, horizon, 0.2 * horizon)
-    rows = TorqueRows.of(base, logs) if torque_rows else None
-    first, n = np.asarray(identify(base, logs).parameters), base.model.robot.joints
-    free = np.concatenate(
-        [np.ones(base.size + 1), np.full(n, gains), np.full(n, load_friction)]
-    ).astype(bool)
+    joints = base.model.robot.joints
+    torque_fit = np.asarray(identify(base, logs).parameters)
+    start = rollout.start(torque_fit)
+    is_free = np.repeat([True, gains, load_friction], [base.size + 1, joints, joints])
     # All torques, masses and friction can be scaled together: the first gain is 1.
-    free[base.size + 1] = False
-    objective = _Objective(rollout, windows, rows, free, every)
-    x, limits = rollout.start(first), _limits(rollout.start(first), base.size)
-    # At first positions count alone.
-    weights = objective.weights(np.repeat([1.0, np.inf], n))
+    is_free[base.size + 1] = False
+    objective = _Objective(rollout, windows, is_free, every)
     with double_precision():
-        x = objective.minimum(x, weights, free, limits)
-        for _ in range(2 if torque_rows else 0):
-            weights = objective.weights(objective.sizes(x))
-            x = objective.minimum(x, weights, free, limits)
-        sizes = objective.sizes(x)
-        r, J = objective.linearised(x, weights)
-    if not np.isfinite(sizes).all():
+        unknowns = objective.minimum(start, _limits(start, base.size))
+        residuals, jacobian = objective.linearised(unknowns)
+    rms = objective.rms_by_joint(residuals)
+    if not np.isfinite(rms).all():
         raise InputError(
             "`observations`: the simulation diverges from the fit of torques: shorten "
-            "`horizon`, "
-            "or choose terms of the model that these logs determine."
+            "`horizon`, or choose terms of the model that these logs determine."
         )
-    uncertainty = _uncertainty(r, J[free], objective.blocks)
+    uncertainty = _uncertainty(residuals, jacobian[is_free], objective.blocks)
     return TorqueRolloutFit(
-        rollout, x, free, uncertainty, horizon, sizes[:n], first, torque_rows
+        rollout, unknowns, is_free, uncertainty, horizon, rms, torque_fit
     )
 
 
@@ -399,8 +306,7 @@ def _require_simulation(base: BaseParameters) -> None:
     if model.robot.tool is not None:
         raise InputError(
             "`base`: a known tool is not simulated: leave `tool` out, and it counts "
-            "as part of the "
-            "body that carries it."
+            "as part of the body that carries it."
         )
 
 
@@ -422,11 +328,10 @@ def _limits(start: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 class _Objective:
-    """Errors of positions in windows, and of torques if their rows are given, in one vector.
+    """Errors of positions in windows, in one vector.
 
     Attributes:
-        kinds: Kind of each error: the joint of a position, joints + the joint of a
-            torque; one more if it does not count.
+        joints: Joint of each error.
         blocks: Part of the logs to which each error belongs.
     """
 
@@ -434,72 +339,55 @@ class _Objective:
         self,
         rollout: TorqueRollout,
         windows: Windows,
-        rows: TorqueRows | None,
-        free: np.ndarray,
+        is_free: np.ndarray,
         every: int,
     ):
-        index, self._data = np.flatnonzero(free), (windows, rows)
-        shape, n = windows.measured[every - 1 :: every].shape, len(windows.q)
-        parts = [
-            np.broadcast_arrays(np.arange(n)[:, None], windows.blocks, np.zeros(shape))
-        ]
-        if rows is not None:
-            kinds = np.where(rows.counted, n + np.arange(n), 2 * n)
-            parts.append(np.broadcast_arrays(kinds, rows.blocks[:, None], kinds))
-        self.kinds, self.blocks, _ = (
-            np.concatenate([x.ravel() for x in each])
-            for each in zip(*parts, strict=True)
-        )
+        shape = windows.measured[every - 1 :: every].shape
+        joint_numbers = np.arange(len(windows.q))[:, None]
+        self.joints = np.broadcast_to(joint_numbers, shape).ravel()
+        self.blocks = np.broadcast_to(windows.blocks, shape).ravel()
+        self._is_free = is_free
+        self._windows = windows
+        free_unknowns = np.flatnonzero(is_free)
 
-        def residuals(x, data, weights):
-            windows, rows = data
-            found = [rollout.errors(x, windows)[every - 1 :: every].ravel()]
-            if rows is not None:
-                found.append(rollout.torque_errors(x, rows).ravel())
-            return weights * jnp.concatenate(found)
+        def residuals(x, windows):
+            return rollout.errors(x, windows)[every - 1 :: every].ravel()
 
-        def derivatives(x, *inputs):
+        def derivatives(x, windows):
             def along(direction):
-                return jax.jvp(lambda x: residuals(x, *inputs), (x,), (direction,))
+                return jax.jvp(lambda x: residuals(x, windows), (x,), (direction,))
 
-            r, found = jax.vmap(along, out_axes=(None, 0))(jnp.eye(len(x))[index])
-            return r, jnp.zeros((len(x), len(r))).at[index].set(found)
+            directions = jnp.eye(len(x))[free_unknowns]
+            values, rows = jax.vmap(along, out_axes=(None, 0))(directions)
+            jacobian = jnp.zeros((len(x), len(values)))
+            return values, jacobian.at[free_unknowns].set(rows)
 
-        self._residuals, self._derivatives = jax.jit(residuals), jax.jit(derivatives)
+        self._residuals = jax.jit(residuals)
+        self._derivatives = jax.jit(derivatives)
 
-    def weights(self, sizes: np.ndarray) -> np.ndarray:
-        """Return the reciprocal size of each error; zero if it does not count."""
-        return np.append(1.0 / np.maximum(sizes, 1e-12), 0.0)[self.kinds]
+    def rms_by_joint(self, residuals: np.ndarray) -> Float[np.ndarray, " joints"]:
+        """Return the root mean square of the errors of each joint."""
+        sums = np.bincount(self.joints, residuals**2)
+        return np.sqrt(sums / np.bincount(self.joints))
 
-    def sizes(self, x: np.ndarray) -> np.ndarray:
-        """Return root mean squares of the errors of all joints' positions, then of torques."""
-        r = np.asarray(
-            self._residuals(jnp.asarray(x), self._data, np.ones(len(self.kinds)))
-        )
-        count = 2 * len(self._data[0].q) + 1
-        squares, counts = (
-            np.bincount(self.kinds, y, count) for y in (r**2, np.ones(len(r)))
-        )
-        return np.sqrt(squares / np.maximum(counts, 1.0))[:-1]
+    def linearised(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return errors, and their derivatives by all unknowns [unknowns, errors]."""
+        residuals, jacobian = self._derivatives(jnp.asarray(x), self._windows)
+        return np.asarray(residuals), np.asarray(jacobian)
 
-    def linearised(
-        self, x: np.ndarray, weights: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return weighted errors, and their derivatives by all unknowns [unknowns, errors]."""
-        r, J = self._derivatives(jnp.asarray(x), self._data, weights)
-        return np.asarray(r), np.asarray(J)
-
-    def minimum(
-        self, x: np.ndarray, weights: np.ndarray, free: np.ndarray, limits: tuple
-    ):
+    def minimum(self, start: np.ndarray, limits: tuple) -> np.ndarray:
         """Return the unknowns with the least sum of squares."""
 
         def moments(x, _):
-            r, J = self.linearised(x[0], weights)
-            return np.array([np.sum(r**2)]), (J @ r)[None], (J @ J.T)[None]
+            residuals, jacobian = self.linearised(x[0])
+            square_sum = np.array([np.sum(residuals**2)])
+            gradient = (jacobian @ residuals)[None]
+            return square_sum, gradient, (jacobian @ jacobian.T)[None]
 
         def costs(x, _):
-            r = np.asarray(self._residuals(jnp.asarray(x[0]), self._data, weights))
-            return np.nan_to_num(np.array([np.sum(r**2)]), nan=np.inf)
+            residuals = np.asarray(self._residuals(jnp.asarray(x[0]), self._windows))
+            square_sum = np.array([np.sum(residuals**2)])
+            return np.nan_to_num(square_sum, nan=np.inf)
 
-        return minimise(moments, costs, x[None], free[None], limits, 25, 1e-5).x[0]
+        is_free = self._is_free[None]
+        return minimise(moments, costs, start[None], is_free, limits, 25, 1e-5).x[0]

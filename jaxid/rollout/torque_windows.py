@@ -1,12 +1,11 @@
-"""Windows of logs with torques that are simulated, and rows of their torques."""
+"""Windows of logs with torques that are simulated."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from jaxid.arrays import AnyArray, Bool, Float, double_precision
-from jaxid.dynamics.base import BaseParameters
+from jaxid.arrays import AnyArray, Float
 from jaxid.errors import InputError
 from jaxid.measurement.observations import Observations
 
@@ -75,50 +74,3 @@ class Windows(NamedTuple):
             np.stack(x, axis=-1) for x in zip(*parts, strict=True)
         )
         return cls(q0, qd0, u, measured, place, place * BLOCKS // max(count, 1))
-
-
-class TorqueRows(NamedTuple):
-    """Inverse dynamics of logs at the measured motion, filtered and decimated.
-
-    Attributes:
-        columns: Base regressor [rows, joints, base].
-        forces: Torques [rows, joints].
-        load: Their sizes, with the signs of the joints' speeds.
-        counted: Whether a row counts: not near an end of a segment, where delays need
-            others.
-        row_time: Time between two rows [s].
-        blocks: Part of the logs to which each row belongs.
-    """
-
-    columns: Float[AnyArray, "rows joints base"]
-    forces: Float[AnyArray, "rows joints"]
-    load: Float[AnyArray, "rows joints"]
-    counted: Bool[AnyArray, "rows joints"]
-    row_time: float
-    blocks: np.ndarray
-
-    @classmethod
-    def of(cls, base: BaseParameters, logs: Sequence[Observations]) -> "TorqueRows":
-        """Return the rows of some logs."""
-        parts, samples, margin = [], 0, round(MARGIN / logs[0].row_time)
-        for o in logs:
-            forces, counted = np.asarray(o.forces), np.array(o.mask)
-            load = np.abs(forces) * np.tanh(np.asarray(o.motion.qd) / SLIDING)
-            for a, b in o.row_segments:
-                counted[[*range(a, a + margin), *range(b - margin, b)]] = False
-            with double_precision():
-                columns = o.reduce(np.asarray(base.regressor(o.motion)))
-            parts.append(
-                (
-                    columns,
-                    o.reduce(forces),
-                    o.reduce(load),
-                    counted,
-                    samples + o.instants,
-                )
-            )
-            samples += o.samples
-        theta, forces, load, counted, at = map(np.concatenate, zip(*parts, strict=True))
-        return cls(
-            theta, forces, load, counted, logs[0].row_time, at * BLOCKS // samples
-        )
