@@ -11,6 +11,7 @@ import equinox as eqx
 import tomlkit
 
 from jaxid.dynamics.base import BaseParameters
+from jaxid.dynamics.terms import TERMS
 from jaxid.errors import InputError
 from jaxid.identification.model_selection import Candidate, ModelChoice, choose_model
 from jaxid.identification.nonlinear_friction import identify_presliding
@@ -21,13 +22,16 @@ from .identify_logs import Stages, load_log, select_filter
 
 Changes = dict[str, dict[str, Any]]
 """Keys that differ from those of a file, by their tables."""
-EFFECTS: dict[str, Changes] = {
-    "root of speed": {"model": {"square_root": True}},
-    "Stribeck": {"model": {"coulomb": {"stribeck": 0.1}}},
-    "presliding": {"model": {"coulomb": {"presliding": True}}},
-    "viscous by direction": {"model": {"viscous": "asymmetric"}},
-    "springs": {"model": {"springs": True}},
+KEYS: dict[str, dict[str, Any]] = {
+    "viscous_asymmetric": {"viscous": "asymmetric"},
+    "stribeck": {"coulomb": {"stribeck": 0.1}},
 }
+"""Keys of `[model]` for terms that are no switches."""
+EFFECTS: dict[str, Changes] = {
+    term.choice: {"model": KEYS.get(name, {name: True})}
+    for name, term in TERMS.items()
+    if term.choice
+} | {"presliding": {"model": {"coulomb": {"presliding": True}}}}
 """Effects that the model may have beside those that each model has."""
 PLAIN = "viscous, dry"
 ESTIMATORS: dict[str, Changes] = {

@@ -1,6 +1,7 @@
 """The tables `[model]`, `[recording]`, `[filter]` and `[rows]` of an experiment file."""
 
 import dataclasses
+import inspect
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -115,8 +116,12 @@ def _speed(
     return speeds if isinstance(value, list) else float(value)
 
 
+SWITCHES = {name: term for name, term in terms.TERMS.items() if term.is_switch}
+"""Terms that a key of `[model]` with their name adds, like `springs = true`."""
+
+
 @dataclasses.dataclass(frozen=True)
-class Effects:
+class AbstractEffects:
     """Effects that the model has beside the rigid bodies.
 
     Attributes:
@@ -124,7 +129,6 @@ class Effects:
             12).
         viscous: Whether friction grows with speed; "asymmetric": at one rate for each
             direction.
-        square_root: Whether friction grows with the square root of speed, too.
         load: Whether dry friction grows with the weight on a joint, too; the bodies are
             those that are identified, until both agree.
         motor_ripple: Multiples of the motors' turns at which their torques ripple, like
@@ -133,7 +137,6 @@ class Effects:
         rotor_inertia: Whether the motors' rotors are felt through the gears.
         offset: Whether there is a constant force at each joint (sensor offsets); by
             default unless dry friction is asymmetric.
-        springs: Whether there is a linear spring at each joint (counterbalances).
         coupled_drives: Whether motors turn several axes; by default where the matrix of
             `[drives]` has entries beside its diagonal.
         coulomb: Dry friction, as a table; or none, like `false`.
@@ -141,13 +144,11 @@ class Effects:
 
     principal_axes: bool = False
     viscous: bool | Literal["asymmetric"] = True
-    square_root: bool = False
     load: bool = False
     motor_ripple: tuple[Count, ...] = ()
     joint_ripple: tuple[Count, ...] = ()
     rotor_inertia: bool = True
     offset: bool | None = None
-    springs: bool = False
     coupled_drives: bool | None = None
     coulomb: bool | DryFriction | None = None
 
@@ -163,18 +164,20 @@ class Effects:
         if self.viscous == "asymmetric":
             viscous = terms.AsymmetricViscousFriction()
         ripples = bool(self.motor_ripple or self.joint_ripple)
-        chosen = (
-            terms.RigidBodies(principal_axes=self.principal_axes),
-            viscous,
-            self.coulomb is not False and dry.term(robot),
-            self.square_root and terms.SquareRootFriction(dry.transition(robot)),
-            self.rotor_inertia and terms.RotorInertia(),
-            ripples and terms.TorqueRipple(self.motor_ripple, self.joint_ripple),
-            offset and terms.ConstantOffset(),
-            coupled and terms.CoupledDrives(dry.transition(robot)),
-            self.springs and terms.LinearSpring(),
-        )
-        return tuple(term for term in chosen if not isinstance(term, bool))
+        transition = dry.transition(robot)
+        chosen = {
+            "bodies": terms.RigidBodies(principal_axes=self.principal_axes),
+            "viscous": viscous,
+            "coulomb": self.coulomb is not False and dry.term(robot),
+            "rotor_inertia": self.rotor_inertia and terms.RotorInertia(),
+            "ripple": ripples
+            and terms.TorqueRipple(self.motor_ripple, self.joint_ripple),
+            "offset": offset and terms.ConstantOffset(),
+            "coupled_drives": coupled and terms.CoupledDrives(transition),
+        }
+        for name, switch in SWITCHES.items():
+            chosen[name] = getattr(self, name) and switch.with_transition(transition)
+        return tuple(chosen[name] for name in terms.TERMS if chosen.get(name))
 
     def load_transition(self, robot: Robot) -> terms.AbstractTransition | None:
         """Return the transition of friction by load; None without it.
@@ -195,6 +198,18 @@ class Effects:
             return self.build(robot)
         coulomb = dataclasses.replace(self.coulomb, stribeck=None)
         return dataclasses.replace(self, coulomb=coulomb).build(robot)
+
+
+Effects = dataclasses.make_dataclass(
+    "Effects",
+    [(name, bool, False) for name in SWITCHES],
+    bases=(AbstractEffects,),
+    frozen=True,
+)
+Effects.__doc__ = f"{inspect.getdoc(AbstractEffects)}\n" + "\n".join(
+    f"    {name}: {(inspect.getdoc(term) or '').splitlines()[0]}"
+    for name, term in SWITCHES.items()
+)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxid.dynamics.terms import ConstantOffset, SquareRootFriction
+from jaxid.dynamics.terms import ConstantOffset
 from jaxid.identification.estimators.regularisation_and_weights import (
     LARGEST_UNCERTAINTY,
 )
@@ -250,7 +250,7 @@ def _judge_new_motions(
 def _judge_signs(fit: Fit) -> Iterator[Remark]:
     """Name friction and rotor inertias that are negative beyond two deviations."""
     base, robot = fit.base, fit.base.model.robot
-    if any(isinstance(term, SquareRootFriction) for term in base.model.terms):
+    if any(term.shares_friction for term in base.model.terms):
         return  # only the sum of all friction cannot be negative
     least = np.concatenate([term.lower_bounds(robot) for term in base.model.terms])
     alone = ~np.any(np.asarray(base.kappa), axis=1) & (least[list(base.indices)] == 0.0)
@@ -292,9 +292,9 @@ def _judge_offsets(fit: Fit) -> Iterator[Remark]:
     robot = fit.base.model.robot
     estimates = zip(np.asarray(fit.parameters), fit.standard_deviations, strict=True)
     values = dict(zip(fit.base.names, estimates, strict=True))
-    (symbol, *_), *_ = ConstantOffset.symbols
+    (offset,) = ConstantOffset.joint_parameters
     for j, name in enumerate(robot.joint_names):
-        value, deviation = map(float, values.get(f"{symbol}{j + 1}", (0.0, 0.0)))
+        value, deviation = map(float, values.get(f"{offset.name}{j + 1}", (0.0, 0.0)))
         largest = float(robot.known_max_forces[j])
         if abs(value) - 2.0 * deviation > OFFSET * largest:
             unit = robot.force_unit(j)

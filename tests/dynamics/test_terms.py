@@ -32,6 +32,7 @@ from jaxid.dynamics.terms import (
     ViscousFriction,
 )
 from jaxid.errors import InputError
+from jaxid.report.parameter_words import in_words
 from jaxid.robot.library import tx40
 from jaxid.robot.limits_and_drives import Drives
 
@@ -88,6 +89,11 @@ class TestContract:
         assert len(set(names)) == len(names) > 0
         assert all(name.isidentifier() and unit for name, unit in parameters)
 
+    def test_every_parameter_has_words_for_the_report(self, term, robot):
+        model = Model(robot, (term,))
+        for name in model.parameter_names:
+            assert "your own" not in in_words(name, model)[0]
+
     def test_everything_fits_and_is_linear(self, term, robot):
         """Shapes, forces = columns p, mass matrix = slope, potential's slope = forces at rest."""
         size = len(term.parameters(robot))
@@ -141,6 +147,7 @@ def test_the_contract_covers_every_term():
     assert members == {type(t) for t in ALL}, (
         "add the new term to the list `ALL` of this file"
     )
+    assert members == set(terms.TERMS.values()), "add the new term to `TERMS`"
 
 
 @pytest.mark.parametrize(

@@ -1,26 +1,50 @@
 """Terms of a model: effects in the equations of motion that are linear in unknown parameters."""
 
-from .bodies_rotors_springs import (
+from .drives_and_springs import (
     ConstantOffset as ConstantOffset,
+    CoupledDrives as CoupledDrives,
     LinearSpring as LinearSpring,
-    RigidBodies as RigidBodies,
     RotorInertia as RotorInertia,
     TorqueRipple as TorqueRipple,
 )
-from .friction import (
+from .dry_friction_transitions import (
     AbstractTransition as AbstractTransition,
+    HardSign as HardSign,
+    Presliding as Presliding,
+    Reversal as Reversal,
+    Tanh as Tanh,
+)
+from .friction import (
     AsymmetricCoulombFriction as AsymmetricCoulombFriction,
     AsymmetricViscousFriction as AsymmetricViscousFriction,
     CoulombFriction as CoulombFriction,
-    CoupledDrives as CoupledDrives,
-    HardSign as HardSign,
     LoadFriction as LoadFriction,
-    Presliding as Presliding,
-    Reversal as Reversal,
     SquareRootFriction as SquareRootFriction,
     StribeckFriction as StribeckFriction,
-    Tanh as Tanh,
     TemperatureScaled as TemperatureScaled,
     ViscousFriction as ViscousFriction,
 )
-from .term import AbstractTerm as AbstractTerm, NonlinearParameter as NonlinearParameter
+from .rigid_bodies import RigidBodies as RigidBodies
+from .term import (
+    AbstractTerm as AbstractTerm,
+    JointParameter as JointParameter,
+    NonlinearParameter as NonlinearParameter,
+)
+
+TERMS: dict[str, type[AbstractTerm]] = {
+    "bodies": RigidBodies,
+    "viscous": ViscousFriction,
+    "viscous_asymmetric": AsymmetricViscousFriction,
+    "coulomb": CoulombFriction,
+    "coulomb_asymmetric": AsymmetricCoulombFriction,
+    "stribeck": StribeckFriction,
+    "square_root": SquareRootFriction,
+    "load": LoadFriction,
+    "rotor_inertia": RotorInertia,
+    "ripple": TorqueRipple,
+    "offset": ConstantOffset,
+    "coupled_drives": CoupledDrives,
+    "springs": LinearSpring,
+    "temperature": TemperatureScaled,
+}
+"""All terms by name, in the order in which a model of an experiment file has them."""

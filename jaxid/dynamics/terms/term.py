@@ -2,7 +2,7 @@
 
 import functools
 from abc import abstractmethod
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple, Self
 
 import equinox as eqx
 import jax
@@ -11,8 +11,6 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Float, Joints
 from jaxid.robot.robot import Robot
-
-Role = Literal["inertia", "viscous", "dry", "load"] | None
 
 
 class NonlinearParameter(NamedTuple):
@@ -40,31 +38,65 @@ class NonlinearParameter(NamedTuple):
         return self._replace(path=(attribute, *self.path))
 
 
+class JointParameter(NamedTuple):
+    """Parameter of which a term has one for each joint.
+
+    Attributes:
+        name: Name without the joint's number.
+        meaning: Meaning in a few words, for reports.
+        units: Units for a revolute and a prismatic joint.
+        role: Role in the physics of a drive: inertia of the rotor, viscous or dry
+            friction, or friction by load. A parameter with a role cannot be negative.
+    """
+
+    name: str
+    meaning: str
+    units: tuple[str, str]
+    role: Literal["inertia", "viscous", "dry", "load"] | None = None
+
+
 class AbstractTerm(eqx.Module):
     """One effect in the equations of motion that is linear in unknown parameters.
 
-    A new effect is one class with `columns`, and with `symbols` or the method
-    `parameters`; regressor, inverse dynamics, mass matrix, base parameters and compiled
-    forms follow from them.
+    A new effect is one class with `columns`, and with `joint_parameters` or the methods
+    `parameters` and `meanings`; regressor, inverse dynamics, mass matrix, base
+    parameters and compiled forms follow from them.
 
     Attributes:
-        symbols: For each block of parameters with one for each joint the name without
-            the joint's number, and the units for a revolute and a prismatic joint.
-        roles: Physical role of each block of parameters, if the term has one or more
-            blocks with one parameter for each joint: rotor inertia, viscous or dry
-            friction, or friction by load. Parameters with a role cannot be negative.
+        joint_parameters: Parameters of which the term has one for each joint, in the
+            order of the columns: those of all joints for the first, then for the second.
+        is_switch: Whether the experiment file adds the term by its name in `TERMS`, like
+            `springs = true`, beside any other terms.
+        choice: Name of the effect in the comparison of models by `jaxid choose`; empty
+            if it is not tried there.
+        shares_friction: Whether the term is a part of the friction beside which other
+            parts may be negative, since only the sum of all parts cannot.
     """
 
-    symbols: ClassVar[tuple[tuple[str, str, str], ...]] = ()
-    roles: ClassVar[tuple[Role, ...]] = ()
+    joint_parameters: ClassVar[tuple[JointParameter, ...]] = ()
+    is_switch: ClassVar[bool] = False
+    choice: ClassVar[str] = ""
+    shares_friction: ClassVar[bool] = False
+
+    @classmethod
+    def with_transition(cls, transition: Any) -> Self:
+        """Return the term as a switch adds it; dry friction takes the transition."""
+        return cls()
 
     def parameters(self, robot: Robot) -> tuple[tuple[str, str], ...]:
         """Return name and unit of each parameter, in the order of the columns."""
-        return tuple(
-            (f"{name}{i + 1}", turning if revolute else sliding)
-            for name, turning, sliding in self.symbols
-            for i, revolute in enumerate(robot.revolute)
-        )
+        parameters = []
+        for parameter in self.joint_parameters:
+            turning, sliding = parameter.units
+            for i, revolute in enumerate(robot.revolute, 1):
+                unit = turning if revolute else sliding
+                parameters.append((f"{parameter.name}{i}", unit))
+        return tuple(parameters)
+
+    @property
+    def meanings(self) -> dict[str, str]:
+        """Meanings of the parameters in words, by their names without numbers."""
+        return {x.name: x.meaning for x in self.joint_parameters}
 
     @abstractmethod
     def columns(
@@ -115,8 +147,8 @@ class AbstractTerm(eqx.Module):
     def lower_bounds(self, robot: Robot) -> Float[np.ndarray, " columns"]:
         """Return lower bounds of the parameters: 0, or -inf where both signs are possible."""
         bounds = np.full(len(self.parameters(robot)), -np.inf)
-        for k, role in enumerate(self.roles):
-            if role is not None:
+        for k, parameter in enumerate(self.joint_parameters):
+            if parameter.role is not None:
                 bounds[k * robot.joints : (k + 1) * robot.joints] = 0.0
         return bounds
 
@@ -129,9 +161,12 @@ class AbstractTerm(eqx.Module):
         """
         n = robot.joints
         matrices = np.zeros((2, n, n, len(self.parameters(robot))))
-        for k, role in enumerate(self.roles):
-            if role in ("inertia", "viscous"):
-                own = np.arange(n)
-                kind = int(role == "viscous")
-                matrices[kind, own, own, k * n + own] = 1.0 / self.roles.count(role)
+        joints = np.arange(n)
+        roles = [parameter.role for parameter in self.joint_parameters]
+        for kind, role in enumerate(("inertia", "viscous")):
+            for k in range(len(roles)):
+                if roles[k] == role:
+                    # Parameters of several directions of motion share the friction.
+                    share = 1.0 / roles.count(role)
+                    matrices[kind, joints, joints, k * n + joints] = share
         return matrices

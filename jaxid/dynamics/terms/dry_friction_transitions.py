@@ -1,0 +1,213 @@
+"""Transitions of dry friction between the directions of motion, with and without memory."""
+
+from abc import abstractmethod
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxid.arrays import (
+    AnyArray,
+    Float,
+    Hashable,
+    Joints,
+    matching,
+    namespace,
+    one_or_each,
+)
+from jaxid.errors import InputError
+
+from .term import NonlinearParameter
+
+EachJoint = float | Float[AnyArray, "..."]
+"""One number for all joints, or one for each."""
+States = Float[AnyArray, " states"]
+"""States of friction with memory."""
+
+
+class AbstractTransition(Hashable):
+    """Transition of dry friction from one direction of motion to the other."""
+
+    @abstractmethod
+    def __call__(self, qd: Joints) -> Joints:
+        """Return a number between -1 and 1 for each speed [rad/s or m/s]."""
+
+    def of_motors(self, speeds: Joints) -> Joints:
+        """Return the same for the speeds of the motors, on the side of their own joints."""
+        return self(speeds)
+
+    @property
+    def nonlinear_parameters(self) -> tuple[NonlinearParameter, ...]:
+        """Parameters that `identify_nonlinear` can identify."""
+        return ()
+
+
+class Tanh(AbstractTransition):
+    r"""The smooth transition $\tanh(\dot q / \epsilon_c)$ (Eq. 14).
+
+    Attributes:
+        epsilon: Speed of the transition, one for all joints or one for each, in the
+            joint's own unit [rad/s or m/s].
+        dead_zone: Speed below which there is no force, likewise [rad/s or m/s].
+    """
+
+    epsilon: EachJoint = eqx.field(converter=one_or_each, default=0.01)
+    dead_zone: EachJoint = eqx.field(converter=one_or_each, default=0.0)
+
+    def __check_init__(self):
+        if not isinstance(self.epsilon, jax.Array) and not np.all(
+            np.asarray(self.epsilon) > 0
+        ):
+            raise InputError(
+                f"`epsilon` must be positive, but is {self.epsilon}: `HardSign` has "
+                "no width."
+            )
+
+    def __call__(self, qd):
+        """Return the smooth sign of the speed."""
+        sign = jnp.tanh(qd / matching("epsilon", self.epsilon, qd))
+        return _outside_dead_zone(self.dead_zone, qd, sign)
+
+    @property
+    def nonlinear_parameters(self):
+        """`eps1`, … [rad/s or m/s]."""
+        return (NonlinearParameter("eps", ("rad/s", "m/s"), ("epsilon",)),)
+
+
+class HardSign(AbstractTransition):
+    """The sign of the speed, which is undefined at standstill: use a dead zone there.
+
+    Attributes:
+        dead_zone: Speed below which there is no force [rad/s or m/s].
+    """
+
+    dead_zone: EachJoint = eqx.field(converter=one_or_each, default=0.0)
+
+    def __call__(self, qd):
+        """Return the sign of the speed."""
+        return _outside_dead_zone(self.dead_zone, qd, jnp.sign(qd))
+
+
+class Presliding(AbstractTransition):
+    r"""Dry friction with memory: a state that follows the motion, and that rest keeps.
+
+    A joint deforms its contacts before it slides: the state $s$ between -1 and 1 obeys
+    Dahl's law $\mathrm{d}s = (\mathrm{d}q - s\,|\mathrm{d}q|) / \delta$ (Dahl, AIAA
+    Journal 14(12), 1976). It depends on the path alone, not on time. Where no path is
+    known, as at single samples and in the design of motions, the state is that of
+    steady motion.
+
+    Attributes:
+        length: Length $\delta$ of the deformation, one for all joints or one for each
+            [rad or m].
+        steady: Transition that gives the state of steady motion, and that at the start
+            of a path.
+        motors: Turns of motors for those of joints, if motors turn several axes: they
+            have states.
+        state: State at one sample, where it is known.
+    """
+
+    length: EachJoint = eqx.field(converter=one_or_each, default=1e-3)
+    steady: AbstractTransition = Tanh()
+    motors: Float[AnyArray, "joints joints"] | None = None
+    state: States | None = None
+
+    def __check_init__(self):
+        if not isinstance(self.length, jax.Array) and not np.all(
+            np.asarray(self.length) > 0
+        ):
+            raise InputError(f"`length` must be positive, but is {self.length}.")
+
+    def __call__(self, qd):
+        """Return the state: where it is not known, that of steady motion."""
+        return (
+            self.steady(qd) if self.state is None else self.state[..., : qd.shape[-1]]
+        )
+
+    def of_motors(self, speeds: Joints) -> Joints:
+        """Return the states of the motors: where they are not known, those of steady motion."""
+        s = None if self.motors is None else self.state
+        return self.steady(speeds) if s is None else s[..., speeds.shape[-1] :]
+
+    def settled(
+        self, qd: Float[AnyArray, "*batch joints"]
+    ) -> Float[AnyArray, "*batch states"]:
+        """Return the states of steady motion."""
+        return self._with_motors(qd, self.steady)
+
+    def _with_motors(self, x: AnyArray, function: Any) -> AnyArray:
+        """Return a function of the joints, followed by that of their motors."""
+        if self.motors is None:
+            return function(x)
+        return namespace(x).concatenate(
+            [function(x), function(x @ self.motors.T)], axis=-1
+        )
+
+    def _strain(self, change: AnyArray) -> AnyArray:
+        """Return steps of joints and motors, relative to their lengths [1]."""
+        length = namespace(change).broadcast_to(self.length, change.shape)
+        return self._with_motors(change, lambda x: x / length)
+
+    def advance(self, q_before: Joints, q: Joints, s: States) -> States:
+        """Return the state behind a step of one direction [rad or m], from that before it."""
+        strain = self._strain(q - q_before)
+        way = jnp.sign(strain)
+        return way + (s - way) * jnp.exp(-jnp.abs(strain))
+
+    def states(
+        self,
+        q: Float[AnyArray, "*batch samples joints"],
+        start: Float[AnyArray, "*batch states"],
+    ) -> Float[AnyArray, "*batch samples states"]:
+        """Return the states along a path, from that at its first sample."""
+        xp = namespace(q)
+        strain = self._strain(xp.diff(xp.moveaxis(q, -2, 0), axis=0))
+        kept = xp.exp(-xp.abs(strain))
+        s = xp.concatenate([xp.asarray(start)[None], xp.sign(strain) * (1 - kept)])
+        kept = xp.concatenate([xp.zeros_like(s[:1]), kept])
+        reach = 1
+        # Each turn joins twice as many steps to one, which is affine in the state
+        # before it.
+        while reach < len(s):
+            s = xp.concatenate([s[:reach], s[reach:] + kept[reach:] * s[:-reach]])
+            kept = xp.concatenate([kept[:reach], kept[reach:] * kept[:-reach]])
+            reach *= 2
+        return xp.moveaxis(s, 0, -2)
+
+
+class Reversal(AbstractTransition):
+    """Another transition that keeps one direction near standstill, for bounds of forces.
+
+    At a reversal dry friction jumps, at an instant that no grid of samples contains.
+    Between the two sides of this class lies every force on the way, and both change
+    smoothly.
+
+    Attributes:
+        own: Transition elsewhere.
+        side: Direction that is kept near standstill, 1 or -1.
+        width: Speeds up to which it is kept; at twice these it has faded [rad/s or
+            m/s].
+    """
+
+    own: AbstractTransition
+    side: float
+    width: Joints
+
+    def __call__(self, qd):
+        """Return the other transition, drawn to the side."""
+        one = jnp.ones_like(qd)
+        near = jnp.minimum(
+            one, jnp.maximum(0 * one, 2 * one - jnp.abs(qd) / self.width)
+        )
+        near = near**2 * (3 - 2 * near)
+        value = self.own(qd)
+        return value + near * (self.side - value)
+
+
+def _outside_dead_zone(dead_zone: Any, qd: Any, value: Any) -> Any:
+    if not isinstance(dead_zone, jax.Array) and not np.any(dead_zone):
+        return value
+    moves = jnp.abs(qd) > matching("dead_zone", dead_zone, qd)
+    return jnp.where(moves, value, jnp.zeros_like(value))
