@@ -35,7 +35,7 @@ from jaxid.identification.nonlinear_friction import (
 )
 from jaxid.identification.problem import RegressionProblem
 from jaxid.measurement.columns import Columns
-from jaxid.measurement.filters import AbstractDecimation, AbstractFilter
+from jaxid.measurement.filters import FILTERS, AbstractDecimation, AbstractFilter
 from jaxid.measurement.log_files import estimated_rows, summarise_columns
 from jaxid.measurement.observations import Observations, Progress, observe
 from jaxid.measurement.reading import read_recording, scan_log
@@ -48,7 +48,6 @@ from .decoder import call, check_names, within
 from .estimator_table import Estimation, build_estimation, decode_estimator
 from .excitation_tables import Collision, Excitation, Surroundings
 from .model_and_log_tables import (
-    FILTERS,
     Effects,
     Logs,
     Rollout,

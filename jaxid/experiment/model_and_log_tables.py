@@ -22,6 +22,7 @@ from .decoder import (
     Bounds,
     Count,
     Magnitude,
+    OneOf,
     Positive,
     call,
     decode,
@@ -29,17 +30,11 @@ from .decoder import (
     within,
 )
 
-FILTERS: dict[str, type[filters.AbstractFilter]] = {
-    "butterworth": filters.ZeroPhaseButterworth,
-    "paper": filters.PaperFilter,
-    "periodic": filters.PeriodicFourier,
-}
 FASTEST = 100.0
 """Speed that no joint exceeds [rad/s or m/s]."""
 CUTOFF = 10.0
 """Cut-off of the filter where the file says nothing [Hz]."""
 
-FilterKind = Literal["butterworth", "paper", "periodic"]
 Side = Literal["joint", "motor"]
 
 
@@ -380,14 +375,15 @@ def build_filters(
             "about five times the highest frequency of the motion."
         )
         return [filters.ZeroPhaseButterworth(CUTOFF)], [note]
-    kind = decode_value(table.get("kind", ""), FilterKind, "filter.kind")
+    name = Annotated[str, OneOf(filters.FILTERS)]
+    kind = decode_value(table.get("kind", ""), name, "filter.kind")
     keys = {name: value for name, value in table.items() if name != "kind"}
     tables = [keys]
     if isinstance(keys.get("cutoff"), list):
         tables = [{**keys, "cutoff": cutoff} for cutoff in keys["cutoff"]]
     if not tables:
         raise InputError("`filter.cutoff` must be a number, or a list to choose from.")
-    return [call(FILTERS[kind], one, "filter") for one in tables], []
+    return [call(filters.FILTERS[kind], one, "filter") for one in tables], []
 
 
 def build_rows(

@@ -20,6 +20,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 
 from jaxid.io import union_members
+from jaxid.measurement.filters import FILTERS
 from jaxid.robot.robot import Robot
 from jaxid.robot.urdf import load_urdf
 from jaxid.robot.urdf_tree import is_mjcf
@@ -28,7 +29,7 @@ from jaxid.units import Unit
 from .decoder import Key, keys_of
 from .estimator_table import KINDS
 from .experiment import TABLES
-from .model_and_log_tables import CUTOFF, FILTERS, SIDES, DryFriction
+from .model_and_log_tables import CUTOFF, SIDES, DryFriction
 from .robot_tables import known_load
 
 WIDTH, COLUMN = 100, 38
@@ -124,14 +125,16 @@ def _table(
     if name == "filter":
         lines += _entry("kind", json.dumps(values["kind"]), "", True)
     known = {*SIDES, "tool"}
-    for number, function in enumerate(functions):
-        if name == "filter" and number > 0:
+    kinds = {filter: kind for kind, filter in FILTERS.items()}
+    for function in functions:
+        kind = kinds.get(function)
+        is_active = active and kind in (None, values.get("kind"))
+        if kind is not None and not is_active:
             # Keys of the other kinds of filters are comments.
-            active, kind = False, list(FILTERS)[number]
             lines += ["#", *_entry("kind", json.dumps(kind), _summary(function), False)]
         for key in keys_of(function).values():
             if key.name not in known:
-                shown = active and key.name not in OF_KINDS
+                shown = is_active and key.name not in OF_KINDS
                 lines += _key(key, joints, values.get(key.name), shown)
         known |= {*keys_of(function)}
     return "\n".join(lines) + "\n"

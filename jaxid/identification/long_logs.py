@@ -22,7 +22,7 @@ import numpy as np
 from jaxid.arrays import AnyArray, Array, Float, double_precision, on_cores
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.dispatch import program_of
-from jaxid.measurement.filters import LowPass
+from jaxid.measurement.filters import AbstractLowPass
 from jaxid.measurement.observations import Observations, Progress
 from jaxid.program import Program, lower
 
@@ -61,10 +61,8 @@ def _stages(observations: Observations) -> tuple[Stage, ...]:
     return tuple(stages)
 
 
-def impulse_response(low_pass: LowPass) -> Float[np.ndarray, " lags"]:
+def impulse_response(low_pass: AbstractLowPass) -> Float[np.ndarray, " lags"]:
     """Return the response to an impulse in the middle, until it has decayed on both sides."""
-    if not low_pass.sections:
-        return np.ones(1)
     half = low_pass.memory()
     return low_pass(np.eye(1, 6 * half + 1, 3 * half)[0])[2 * half : 4 * half + 1]
 

@@ -16,6 +16,7 @@ COLUMNS = jid.Columns(angles="q{}", forces="tau{}", time="t")
 SAMPLES = 20000
 DT = 1e-3
 SMOOTH = jid.ZeroPhaseButterworth(30.0, margin=0.3)
+FILTERS = [SMOOTH, jid.filters.SavitzkyGolay(0.06)]
 EVERY = jid.Subsample(15)
 
 
@@ -74,13 +75,14 @@ def agree(base, log, o):
         assert np.abs((A.T @ A - B.T @ B) / norms / norms[:, None]).max() < 1e-9
 
 
+@pytest.mark.parametrize("filter", FILTERS)
 @pytest.mark.parametrize("long", [1000, 100_000])
-def test_parquet_compiled_and_in_numpy(base, parquet, monkeypatch, long):
+def test_parquet_compiled_and_in_numpy(base, parquet, monkeypatch, long, filter):
     monkeypatch.setattr(jid.RegressionProblem, "samples_per_chunk", 3000)
     monkeypatch.setattr(jid.RegressionProblem, "compiled_samples", long)
     monkeypatch.setattr(long_logs, "PIECE", 4096)
-    log = scan_log(parquet, COLUMNS, base.model.robot, SMOOTH, EVERY)
-    agree(base, log, in_memory(base, parquet, EVERY))
+    log = scan_log(parquet, COLUMNS, base.model.robot, filter, EVERY)
+    agree(base, log, in_memory(base, parquet, EVERY, filter))
 
 
 def test_mapped_arrays_and_other_files(base, numbers, parquet, tmp_path):
@@ -109,9 +111,10 @@ def test_mapped_arrays_and_other_files(base, numbers, parquet, tmp_path):
         )
 
 
-def test_a_part_is_filtered_like_the_whole(base, parquet):
-    log = scan_log(parquet, COLUMNS, base.model.robot, SMOOTH)
-    whole = in_memory(base, parquet, None).motion
+@pytest.mark.parametrize("filter", FILTERS)
+def test_a_part_is_filtered_like_the_whole(base, parquet, filter):
+    log = scan_log(parquet, COLUMNS, base.model.robot, filter)
+    whole = in_memory(base, parquet, None, filter).motion
     for a, b in ((0, 500), (7000, 9000), (SAMPLES - 300, SAMPLES)):
         part, _ = log.read(slice(a, b))
         np.testing.assert_allclose(part.q, whole.q[a:b], atol=1e-13)

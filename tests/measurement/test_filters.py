@@ -13,10 +13,11 @@ from jaxid.measurement.filters import (
     Decimation,
     PaperFilter,
     PeriodicFourier,
+    SavitzkyGolay,
     Subsample,
     ZeroPhaseButterworth,
 )
-from jaxid.measurement.filters.filter import butterworth
+from jaxid.measurement.filters.low_pass import butterworth
 
 DT = 0.001
 OMEGA = 0.8
@@ -27,6 +28,8 @@ FILTERS = [
     ZeroPhaseButterworth(30, order=3, force_cutoff=np.inf),
     PaperFilter(),
     PeriodicFourier(PERIOD, 5),
+    SavitzkyGolay(0.04),
+    SavitzkyGolay(0.1, order=4, margin=0.0),
 ]
 every = pytest.mark.parametrize("filter", FILTERS, ids=lambda f: type(f).__name__)
 
@@ -41,13 +44,14 @@ def fourier(t, seed=1, joints=3, harmonics=5):
     return q, c @ a.T + s @ b.T, -s @ (a * wl).T + c @ (b * wl).T
 
 
-def test_the_laws_cover_every_filter():
+def test_the_laws_cover_every_filter_and_each_has_a_name():
     members = {
         c
         for _, c in inspect.getmembers(filters, inspect.isclass)
         if issubclass(c, AbstractFilter) and not inspect.isabstract(c)
     }
     assert members == {type(f) for f in FILTERS}, "add the filter to the list `FILTERS`"
+    assert members == {*filters.FILTERS.values()}, "give the filter a name"
 
 
 @every
@@ -183,6 +187,32 @@ def test_butterworth_derivatives_are_of_fourth_order():
     )
 
 
+def test_savitzky_golay_is_scipys_and_exact_for_polynomials():
+    t = DT * np.arange(400)
+    x = np.random.default_rng(0).normal(size=(400, 2))
+    cubic = np.stack([t**3 - t, 2.0 * t**2], axis=1)
+    filter, inner = SavitzkyGolay(0.05), slice(25, -25)
+    for values in (x, cubic):
+        motion = filter.motion(values, None, DT)
+        for k, found in enumerate((motion.q, motion.qd, motion.qdd)):
+            expected = signal.savgol_filter(values, 51, 3, k, DT, axis=0)
+            bound = 1e-12 * DT**-k
+            np.testing.assert_allclose(found[inner], expected[inner], atol=bound)
+        np.testing.assert_allclose(filter.smooth(values, DT), motion.q, atol=1e-14)
+    exact = np.stack([6.0 * t, np.full(400, 4.0)], axis=1)
+    np.testing.assert_allclose(motion.qdd[inner], exact[inner], atol=1e-8)
+    measured = filter.motion(cubic, 2.0 * motion.qd, DT)
+    np.testing.assert_allclose(measured.qdd[50:-50], 2.0 * exact[50:-50], atol=1e-6)
+
+
+def test_the_cutoff_is_where_the_gain_is_one_half():
+    for filter in FILTERS:
+        low = filter.low_pass(DT)
+        if np.isfinite(low.cutoff):
+            gain = low.gain(np.array([low.cutoff]), DT)
+            np.testing.assert_allclose(gain, 0.5, atol=1e-3)
+
+
 def test_paper_filter_lags_and_attenuates_as_its_formula_says():
     """Forward and backward, G(s) G(-s) gives minus the acceleration: its sign is turned."""
     t, k = DT * np.arange(16000), 20.0
@@ -237,6 +267,10 @@ def periodic(periods, harmonics):
         (lambda: PaperFilter(10.0, 400.0).edge(0.01), "`acceleration`"),
         (lambda: PeriodicFourier(np.inf, 5).edge(DT), "`force_harmonics / period`"),
         (lambda: PeriodicFourier(1.0, 2.5), "`harmonics`"),
+        (lambda: SavitzkyGolay(0.0), "`window` of `SavitzkyGolay`"),
+        (lambda: SavitzkyGolay(0.1, order=1), "`order`"),
+        (lambda: SavitzkyGolay(0.002).edge(DT), r"`window` of 0\.002 s has 3 samples"),
+        (lambda: SavitzkyGolay(np.inf).edge(DT), "`window`"),
         (lambda: Subsample(0), "`step`"),
         (lambda: Decimation((10, 20)), "`factors`"),
     ],

@@ -1,14 +1,27 @@
 """Filters: motion from measured angles, one low-pass for forces and columns, and decimation."""
 
-from .filter import (
+from .decimation import (
     AbstractDecimation as AbstractDecimation,
-    AbstractFilter as AbstractFilter,
     Decimation as Decimation,
-    LowPass as LowPass,
     Subsample as Subsample,
+)
+from .filter import AbstractFilter as AbstractFilter
+from .low_pass import (
+    AbstractLowPass as AbstractLowPass,
+    Convolution as Convolution,
+    RecursiveLowPass as RecursiveLowPass,
 )
 from .motion_filters import (
     PaperFilter as PaperFilter,
     PeriodicFourier as PeriodicFourier,
+    SavitzkyGolay as SavitzkyGolay,
     ZeroPhaseButterworth as ZeroPhaseButterworth,
 )
+
+FILTERS: dict[str, type[AbstractFilter]] = {
+    "butterworth": ZeroPhaseButterworth,
+    "savitzky_golay": SavitzkyGolay,
+    "paper": PaperFilter,
+    "periodic": PeriodicFourier,
+}
+"""Filters by the names that the experiment file has for them."""

@@ -5,6 +5,7 @@ from typing import ClassVar
 
 import equinox as eqx
 import numpy as np
+from numpy.polynomial import legendre
 from scipy import signal
 
 from jaxid.arrays import Float, optional
@@ -12,16 +13,26 @@ from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
 
 from .filter import (
-    SETTLED,
     AbstractFilter,
-    LowPass,
-    butterworth,
-    check_settings,
     integer,
-    require_cutoff,
+    require_margin,
+    require_order,
+    require_positive,
     settled_edge,
-    unit_gain_sections,
 )
+from .low_pass import (
+    SETTLED,
+    AbstractLowPass,
+    Convolution,
+    butterworth,
+    correlate,
+    kernel_gain,
+    recursive,
+    require_cutoff,
+)
+
+MAX_WINDOW = 10**5
+"""Samples of the longest window of a polynomial."""
 
 
 class ZeroPhaseButterworth(AbstractFilter):
@@ -48,7 +59,9 @@ class ZeroPhaseButterworth(AbstractFilter):
     margin: float | None = eqx.field(static=True, converter=optional, default=None)
 
     def __check_init__(self) -> None:
-        check_settings(self, "cutoff", "force_cutoff")
+        require_positive(self, "cutoff", "force_cutoff")
+        require_order(self)
+        require_margin(self)
 
     def motion(self, angles, velocities, sample_time) -> Motion:  # noqa: D102
         smooth = butterworth(self.cutoff, self.order, sample_time)
@@ -61,7 +74,7 @@ class ZeroPhaseButterworth(AbstractFilter):
         change = smooth(velocities - velocities[0])
         return Motion(q, velocities[0] + change, first_difference(change, sample_time))
 
-    def low_pass(self, sample_time: float) -> LowPass:  # noqa: D102
+    def low_pass(self, sample_time: float) -> AbstractLowPass:  # noqa: D102
         if self.force_cutoff is None:
             return butterworth(self.cutoff, self.order, sample_time)
         return butterworth(self.force_cutoff, self.order, sample_time, "force_cutoff")
@@ -71,6 +84,81 @@ class ZeroPhaseButterworth(AbstractFilter):
         return settled_edge(
             self.margin, sample_time, motion, self.low_pass(sample_time)
         )
+
+
+class SavitzkyGolay(AbstractFilter):
+    """Polynomials, fitted to the samples around each sample and differentiated there.
+
+    The positions, velocities and accelerations are the value and the derivatives of the
+    polynomial in the middle of its window. Forces and columns are smoothed by the same
+    polynomial. Measured velocities, if there are any, are filtered like the angles and
+    differentiated once. The filter has a finite impulse response: nothing outside the
+    window matters. Its gain falls more slowly than that of a Butterworth filter.
+
+    Attributes:
+        window: Duration of the window [s], like `0.1`.
+        order: Degree of the polynomial.
+        margin: Time to drop at both ends of a segment [s], like `0.1`; half of the
+            window if None.
+    """
+
+    window: float = eqx.field(static=True, converter=float)
+    order: int = eqx.field(static=True, converter=integer("order"), default=3)
+    margin: float | None = eqx.field(static=True, converter=optional, default=None)
+
+    def __check_init__(self) -> None:
+        require_positive(self, "window")
+        require_order(self, min_order=2)  # a lower one has no second derivative
+        require_margin(self)
+
+    def motion(self, angles, velocities, sample_time) -> Motion:  # noqa: D102
+        # From the first sample on, so that a joint at rest stays exactly at rest.
+        path = angles - angles[0]
+        q = angles[0] + self._derivative(path, 0, sample_time)
+        if velocities is None:
+            qd = self._derivative(path, 1, sample_time)
+            return Motion(q, qd, self._derivative(path, 2, sample_time))
+        change = velocities - velocities[0]
+        qd = velocities[0] + self._derivative(change, 0, sample_time)
+        return Motion(q, qd, self._derivative(change, 1, sample_time))
+
+    def low_pass(self, sample_time: float) -> AbstractLowPass:  # noqa: D102
+        kernel = self._kernel(0, sample_time)
+        return Convolution(tuple(kernel.tolist()), half_gain(kernel, sample_time))
+
+    def edge(self, sample_time: float) -> int:  # noqa: D102
+        return settled_edge(self.margin, sample_time, self.low_pass(sample_time))
+
+    def _derivative(self, x: np.ndarray, times: int, sample_time: float) -> np.ndarray:
+        return correlate(x, self._kernel(times, sample_time))
+
+    def _kernel(self, derivative: int, sample_time: float) -> np.ndarray:
+        """Return the weights of the samples in a derivative of the polynomial."""
+        # An odd number of samples, so that one of them is in the middle.
+        samples = 2 * round(0.5 * min(self.window / sample_time, MAX_WINDOW)) + 1
+        if not self.order < samples < MAX_WINDOW:
+            raise InputError(
+                f"`window` of {self.window:.6g} s has {samples} samples or more at "
+                f"{1 / sample_time:.6g} Hz, but more than {self.order} (`order`) and "
+                f"less than {MAX_WINDOW} are needed: change it, or check `time_unit`."
+            )
+        # Legendre polynomials: powers, as in `scipy.signal.savgol_coeffs`, lose digits.
+        half = samples // 2
+        basis = legendre.legvander(np.arange(-half, half + 1) / half, self.order)
+        derivatives = legendre.legder(np.eye(self.order + 1), derivative)
+        in_the_middle = legendre.legval(0.0, derivatives)
+        return (
+            in_the_middle @ np.linalg.pinv(basis) / (half * sample_time) ** derivative
+        )
+
+
+def half_gain(kernel: np.ndarray, sample_time: float) -> float:
+    """Return the lowest frequency at which the gain of a weighted mean is 1/2 [Hz]."""
+    # Sixteen lines for each oscillation that fits into the kernel.
+    frequency = np.linspace(0.0, 0.5 / sample_time, 8 * len(kernel) + 1)
+    gain = kernel_gain(kernel, frequency, sample_time)
+    k = int(np.argmax(gain < 0.5))
+    return float(np.interp(0.5, gain[[k, k - 1]], frequency[[k, k - 1]]))
 
 
 class PaperFilter(AbstractFilter):
@@ -101,7 +189,8 @@ class PaperFilter(AbstractFilter):
     margin: float | None = eqx.field(static=True, converter=optional, default=None)
 
     def __check_init__(self) -> None:
-        check_settings(self, "velocity", "acceleration")
+        require_positive(self, "velocity", "acceleration")
+        require_margin(self)
 
     def motion(self, angles, velocities, sample_time) -> Motion:  # noqa: D102
         way = angles - angles[0]
@@ -112,7 +201,7 @@ class PaperFilter(AbstractFilter):
         minus = signal.filtfilt(b, a, way, axis=0, padtype="odd", padlen=padding)
         return Motion(angles, qd, -minus)
 
-    def low_pass(self, sample_time: float) -> LowPass:  # noqa: D102
+    def low_pass(self, sample_time: float) -> AbstractLowPass:  # noqa: D102
         return _first_order("acceleration", self.acceleration, sample_time)
 
     def edge(self, sample_time: float) -> int:  # noqa: D102
@@ -153,7 +242,9 @@ class PeriodicFourier(AbstractFilter):
     margin: float | None = eqx.field(static=True, converter=optional, default=None)
 
     def __check_init__(self) -> None:
-        check_settings(self, "period", "harmonics", "force_harmonics")
+        require_positive(self, "period", "harmonics", "force_harmonics")
+        require_order(self)
+        require_margin(self)
 
     def motion(self, angles, velocities, sample_time) -> Motion:  # noqa: D102
         t = sample_time * np.arange(len(angles))
@@ -186,7 +277,7 @@ class PeriodicFourier(AbstractFilter):
         W = w[:, None]
         return Motion(q, c @ (W * a) - s @ (W * b), -s @ (W**2 * a) - c @ (W**2 * b))
 
-    def low_pass(self, sample_time: float) -> LowPass:  # noqa: D102
+    def low_pass(self, sample_time: float) -> AbstractLowPass:  # noqa: D102
         lines = (
             10.0 * self.harmonics
             if self.force_harmonics is None
@@ -208,10 +299,10 @@ def _bilinear(
     return np.asarray(b), np.asarray(a)
 
 
-def _first_order(name: str, omega: float, sample_time: float) -> LowPass:
+def _first_order(name: str, omega: float, sample_time: float) -> AbstractLowPass:
     r"""Return $1 / (s / \omega + 1)$, forward and backward."""
     sos = signal.tf2sos(*_bilinear(name, [1.0], omega, sample_time))
-    return LowPass(unit_gain_sections(sos), omega / (2 * math.pi))
+    return recursive(np.asarray(sos), omega / (2 * math.pi))
 
 
 def first_difference(

@@ -1,0 +1,227 @@
+"""Zero-phase low-passes: recursive ones, run forward and backward, and convolutions."""
+
+import abc
+import math
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy import ndimage, signal
+
+from jaxid.arrays import AnyArray, Array, Float, namespace
+from jaxid.errors import InputError
+
+SETTLED = 1e-4
+"""Fraction of the impulse response's peak below which the start of a log no longer matters."""
+MIN_CLEAR_TAIL = 2e-6
+"""Fraction of the peak above which rounding does not hide the impulse response."""
+BLOCK_SIZE = 2**22
+"""Numbers that are filtered at once."""
+
+
+class AbstractLowPass(eqx.Module):
+    """Linear filter without phase, and with gain one for constants.
+
+    Attributes:
+        cutoff: Frequency at which the gain falls below 1/2 [Hz]; infinite if everything
+            passes.
+    """
+
+    cutoff: eqx.AbstractVar[float]
+
+    @abc.abstractmethod
+    def __call__(self, x: Float[AnyArray, "samples *columns"]) -> Any:
+        """Filter along the first axis; arrays of JAX stay such, and can be differentiated."""
+
+    @abc.abstractmethod
+    def gain(
+        self, frequency: Float[AnyArray, " lines"], sample_time: float
+    ) -> np.ndarray:
+        """Return the size of the gain for sinusoids of some frequencies [Hz]."""
+
+    @abc.abstractmethod
+    def memory(self, tolerance: float = 1e-14) -> int:
+        """Return after how many samples the impulse response stays below a fraction of its peak."""
+
+
+class Convolution(AbstractLowPass):
+    """Weighted mean of the samples around each sample, with odd extensions at the ends.
+
+    Attributes:
+        kernel: Weights of the samples, from the earliest to the latest: an odd number.
+        cutoff: Frequency at which the gain falls below 1/2 [Hz]; infinite if everything
+            passes.
+    """
+
+    kernel: tuple[float, ...] = eqx.field(static=True)
+    cutoff: float = eqx.field(static=True)
+
+    def __call__(self, x):  # noqa: D102
+        x = float_array(x)
+        if len(self.kernel) == 1 or x.size == 0:
+            return x  # the gain for constants is one
+        return correlate(x, np.array(self.kernel))
+
+    def gain(self, frequency, sample_time):  # noqa: D102
+        return kernel_gain(np.array(self.kernel), frequency, sample_time)
+
+    def memory(self, tolerance=1e-14):  # noqa: D102
+        return len(self.kernel) // 2
+
+
+def correlate(x: Any, kernel: np.ndarray) -> Any:
+    """Return sums of the samples around each sample, times an odd number of weights."""
+    half = len(kernel) // 2
+    extended = odd_extension(x, half)
+    if not isinstance(x, jax.Array):
+        return ndimage.correlate1d(extended, kernel, axis=0)[half : half + len(x)]
+
+    def correlate_column(column: Array) -> Array:
+        precision = jax.lax.Precision.HIGHEST
+        return jnp.correlate(column, kernel, mode="valid", precision=precision)
+
+    columns = extended.reshape(len(extended), -1)
+    return jax.vmap(correlate_column, 1, 1)(columns).reshape(x.shape)
+
+
+def kernel_gain(
+    kernel: np.ndarray, frequency: Float[AnyArray, " lines"], sample_time: float
+) -> np.ndarray:
+    """Return the size of the gain of a weighted mean for some frequencies [Hz]."""
+    angular = 2 * math.pi * np.asarray(frequency) * sample_time
+    _, response = signal.freqz(kernel, worN=angular)
+    return np.abs(response)
+
+
+class RecursiveLowPass(AbstractLowPass):
+    """Recursive filter that runs forward and backward, as scipy's `sosfiltfilt`.
+
+    Attributes:
+        sections: Second-order sections of one direction, as in scipy.
+        cutoff: Frequency at which the gain of both directions falls below 1/2 [Hz].
+    """
+
+    sections: tuple[tuple[float, ...], ...] = eqx.field(static=True)
+    cutoff: float = eqx.field(static=True)
+
+    def __call__(self, x):  # noqa: D102
+        x = float_array(x)
+        if x.size == 0:
+            return x
+        sos = np.array(self.sections)
+        padding = min(3 * (2 * len(sos) + 1), len(x) - 1)
+        columns = x.reshape(len(x), -1)
+        if isinstance(columns, jax.Array):
+            return _filter_both_ways(sos, columns, padding).reshape(x.shape)
+
+        # By blocks of columns, which keep scipy's copies small.
+        result = np.empty_like(columns)
+        width = max(1, BLOCK_SIZE // len(columns))
+        for start in range(0, columns.shape[1], width):
+            block = slice(start, start + width)
+            rows = np.ascontiguousarray(columns[:, block].T)
+            filtered = signal.sosfiltfilt(sos, rows, padtype="odd", padlen=padding)
+            result[:, block] = filtered.T
+        return result.reshape(x.shape)
+
+    def gain(self, frequency, sample_time):  # noqa: D102
+        angular = 2 * math.pi * np.asarray(frequency) * sample_time
+        _, response = signal.sosfreqz(np.array(self.sections), angular)
+        return np.abs(response) ** 2
+
+    def memory(self, tolerance=1e-14):  # noqa: D102
+        sos = np.array(self.sections)
+        radius = max(np.abs(np.roots(s[3:])).max(initial=0.0) for s in sos)
+        if radius == 0:
+            return 2 * len(sos)
+        clear_tail = max(tolerance, MIN_CLEAR_TAIL)
+        memory = _clear_memory(sos, radius, clear_tail)
+        if tolerance < clear_tail:
+            # Rounding hides smaller tails, which decay like the slowest pole. The margin
+            # is for poles of that radius that are multiple.
+            decay = math.log(tolerance / clear_tail) / math.log(radius)
+            memory += math.ceil(1.1 * decay)
+        return memory
+
+
+def _clear_memory(sos: np.ndarray, radius: float, tolerance: float) -> int:
+    """Return the memory from the impulse response, by the radius of the slowest pole."""
+    duration = math.log(1e-3 * tolerance) / math.log(radius)
+    samples = math.ceil(duration) + 4 * len(sos)
+    impulse = np.zeros(samples)
+    impulse[0] = 1.0
+    forward = signal.sosfilt(sos, impulse)
+    both_ways = np.abs(signal.correlate(forward, forward, method="fft"))
+    tail = both_ways[samples - 1 :]
+    return int(np.flatnonzero(tail > tolerance * tail[0])[-1]) + 1
+
+
+def _filter_both_ways(sos: np.ndarray, x: Array, padding: int) -> Array:
+    """Filter forward and backward with odd extensions, as `scipy.signal.sosfiltfilt` does."""
+    extended = odd_extension(x, padding)
+    steady_states = signal.sosfilt_zi(sos)
+
+    def step(states, x):
+        next_states = []
+        for (b0, b1, b2, _, a1, a2), (first, second) in zip(sos, states, strict=True):
+            y = b0 * x + first
+            next_states.append((b1 * x - a1 * y + second, b2 * x - a2 * y))
+            x = y
+        return next_states, x
+
+    def one_way(x: Array, reverse: bool) -> Array:
+        start = x[-1] if reverse else x[0]
+        states = [(first * start, second * start) for first, second in steady_states]
+        return jax.lax.scan(step, states, x, reverse=reverse, unroll=4)[1]
+
+    forward = one_way(extended, reverse=False)
+    both_ways = one_way(forward, reverse=True)
+    return both_ways[padding : padding + len(x)]
+
+
+def odd_extension(x: Any, samples: int) -> Any:
+    """Extend both ends by samples that are mirrored at the end's time and value."""
+    padding = [(samples, samples)] + [(0, 0)] * (x.ndim - 1)
+    return namespace(x).pad(x, padding, mode="reflect", reflect_type="odd")
+
+
+def float_array(x: Any) -> Any:
+    """Return an array of JAX as it is, and another one in double precision."""
+    return x if isinstance(x, jax.Array) else np.asarray(x, np.float64)
+
+
+ALL_PASS = Convolution((1.0,), math.inf)
+"""Low-pass that changes nothing."""
+
+
+def butterworth(
+    cutoff: float, order: int, sample_time: float, name: str = "cutoff"
+) -> AbstractLowPass:
+    """Return a Butterworth filter, to be run forward and backward; `cutoff` [Hz] is scipy's."""
+    if math.isinf(cutoff):
+        return ALL_PASS
+    require_cutoff(name, cutoff, sample_time)
+    sos = signal.butter(order, cutoff, output="sos", fs=1.0 / sample_time)
+    return recursive(np.asarray(sos, np.float64), cutoff)
+
+
+def recursive(sos: np.ndarray, cutoff: float) -> RecursiveLowPass:
+    """Return second-order sections as a filter whose gain for constants is one."""
+    gain = np.prod(sos[:, :3].sum(axis=1) / sos[:, 3:].sum(axis=1))
+    sos = sos.copy()
+    sos[0, :3] /= gain
+    sections = tuple(tuple(row) for row in sos.tolist())
+    return RecursiveLowPass(sections, cutoff)
+
+
+def require_cutoff(name: str, cutoff: float, sample_time: float) -> None:
+    """Refuse a cut-off [Hz] that does not suit the sampling rate."""
+    rate = 1 / sample_time
+    if not 1e-5 * rate <= cutoff < 0.5 * rate:
+        raise InputError(
+            f"`{name}` of {cutoff:.6g} Hz must be below half of the sampling rate of "
+            f"{rate:.6g} Hz (and above 1e-5 of it): log faster than {2 * cutoff:.6g} "
+            "Hz, or check `time_unit`."
+        )
