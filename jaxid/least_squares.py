@@ -1,0 +1,160 @@
+"""Least squares of a function that is not linear, within bounds; batched by `jax.vmap`."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import optimistix as optx
+
+from jaxid.arrays import AnyArray, Array, Bool, Float
+
+Residuals = Callable[[Array, Any], Array]
+"""Function of the unknowns and of other arguments that returns errors [rows]."""
+
+
+class Minimum(NamedTuple):
+    """Unknowns for which the sum of squares is smallest.
+
+    Attributes:
+        x: Unknowns.
+        converged: Whether the search has ended by itself.
+    """
+
+    x: Float[Array, " unknowns"]
+    converged: Bool[Array, ""]
+
+
+def minimise_squares(
+    residuals: Residuals,
+    start: Float[AnyArray, " unknowns"],
+    lower: AnyArray | float = -jnp.inf,
+    upper: AnyArray | float = jnp.inf,
+    *,
+    args: Any = None,
+    rtol: float = 1e-8,
+    max_steps: int = 100,
+) -> Minimum:
+    """Minimise the sum of squares of residuals within bounds.
+
+    Args:
+        residuals: Differentiable function of the unknowns and of `args`.
+        start: Unknowns at which the search starts; brought within the bounds.
+        lower: Smallest unknowns.
+        upper: Largest unknowns.
+        args: Other arguments of `residuals`.
+        rtol: Relative decrease of the sum of squares below which the search ends.
+        max_steps: Largest number of steps.
+    """
+    lower, upper = jnp.asarray(lower), jnp.asarray(upper)
+    solution = optx.least_squares(
+        residuals,
+        BoundedLevenbergMarquardt(rtol=rtol),
+        jnp.clip(jnp.asarray(start), lower, upper),
+        args=args,
+        options={"lower": lower, "upper": upper},
+        max_steps=max_steps,
+        throw=False,
+    )
+    return Minimum(solution.value, solution.result == optx.RESULTS.successful)
+
+
+class _Linearisation(NamedTuple):
+    """Residuals and their derivatives at the unknowns, and how the search goes on.
+
+    Attributes:
+        residuals: Residuals [rows].
+        jacobian: Their derivatives [rows, unknowns].
+        damping: Damping of the next step, relative to the columns of the Jacobian.
+        decrease: Relative decrease of the sum of squares by the last step that was
+            taken.
+    """
+
+    residuals: Float[Array, " rows"]
+    jacobian: Float[Array, "rows unknowns"]
+    damping: Float[Array, ""]
+    decrease: Float[Array, ""]
+
+
+class BoundedLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
+    """Levenberg-Marquardt with bounds, in the scales of the Jacobian's columns.
+
+    An unknown at a bound that its gradient would leave stays there for one step; a step
+    beyond a bound ends there. Steps that do not lower the sum of squares are not taken,
+    and the damping grows. The bounds are the options `lower` and `upper` of
+    `optimistix.least_squares`, whose other solvers have none.
+    """
+
+    rtol: float = 1e-8
+    atol: float = 0.0
+    norm: Callable[[Any], Array] = optx.max_norm
+    start_damping: float = 1e-3
+    max_damping: float = 1e9
+
+    def init(self, fn, y, args, options, f_struct, aux_struct, tags):
+        """Return the first linearisation."""
+        values, jacobian = _linearise(fn, y, args)
+        damping = jnp.asarray(self.start_damping, y.dtype)
+        return _Linearisation(values, jacobian, damping, jnp.asarray(1.0, y.dtype))
+
+    def step(self, fn, y, args, options, state, tags):
+        """Take one step, or none if it does not lower the sum of squares."""
+        lower, upper = options["lower"], options["upper"]
+        trial = jnp.clip(y + _damped_step(y, state, lower, upper), lower, upper)
+        values, jacobian = _linearise(fn, trial, args)
+        cost = jnp.sum(state.residuals**2)
+        decrease = cost - jnp.sum(values**2)
+        is_better = decrease > 0
+
+        factor = jnp.where(is_better, 0.1, 10.0)
+        accepted = _Linearisation(
+            values,
+            jacobian,
+            jnp.maximum(state.damping * factor, 1e-12),
+            decrease / jnp.maximum(cost, jnp.finfo(y.dtype).tiny),
+        )
+        refused = state._replace(damping=state.damping * factor)
+        following = jax.tree.map(
+            lambda a, b: jnp.where(is_better, a, b), accepted, refused
+        )
+        return jnp.where(is_better, trial, y), following, None
+
+    def terminate(self, fn, y, args, options, state, tags):
+        """Return whether the last step changed little, or no step lowers the sum."""
+        has_settled = state.decrease < self.rtol
+        is_stuck = state.damping > self.max_damping
+        return has_settled | is_stuck, optx.RESULTS.successful
+
+    def postprocess(self, fn, y, aux, args, options, state, tags, result):
+        """Return the unknowns as they are."""
+        return y, aux, {}
+
+
+def _linearise(fn, y: Array, args: Any) -> tuple[Array, Array]:
+    """Return residuals and their derivatives by the unknowns."""
+
+    def residuals(y):
+        return fn(y, args)[0]
+
+    values, derivative = jax.linearize(residuals, y)
+    columns = jax.vmap(derivative)(jnp.eye(y.size, dtype=y.dtype))
+    return values, columns.T
+
+
+def _damped_step(
+    y: Array, state: _Linearisation, lower: Array, upper: Array
+) -> Float[Array, " unknowns"]:
+    """Return the damped Gauss-Newton step of the unknowns that no bound holds."""
+    gradient = state.jacobian.T @ state.residuals
+    is_held = ((y <= lower) & (gradient > 0)) | ((y >= upper) & (gradient < 0))
+    lengths = jnp.linalg.norm(state.jacobian, axis=0)
+    scales = jnp.where(lengths > 0, lengths, 1.0)
+    columns = jnp.where(is_held[None], 0.0, state.jacobian / scales[None])
+    # The damping as rows of their own: unlike normal equations, these keep all digits.
+    damping_rows = jnp.sqrt(state.damping) * jnp.eye(y.size, dtype=y.dtype)
+    rows = jnp.concatenate([columns, damping_rows])
+    targets = jnp.concatenate([-state.residuals, jnp.zeros_like(y)])
+    operator = lx.MatrixLinearOperator(rows)
+    scaled_step = lx.linear_solve(operator, targets, lx.QR(), throw=False).value
+    return scaled_step / scales
