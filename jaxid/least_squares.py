@@ -20,10 +20,14 @@ class Minimum(NamedTuple):
     Attributes:
         x: Unknowns.
         converged: Whether the search has ended by itself.
+        residuals: Residuals at the unknowns.
+        jacobian: Their derivatives.
     """
 
     x: Float[Array, " unknowns"]
     converged: Bool[Array, ""]
+    residuals: Float[Array, " rows"]
+    jacobian: Float[Array, "rows unknowns"]
 
 
 def minimise_squares(
@@ -57,7 +61,9 @@ def minimise_squares(
         max_steps=max_steps,
         throw=False,
     )
-    return Minimum(solution.value, solution.result == optx.RESULTS.successful)
+    converged = solution.result == optx.RESULTS.successful
+    end = solution.stats["end"]
+    return Minimum(solution.value, converged, end.residuals, end.jacobian)
 
 
 class _Linearisation(NamedTuple):
@@ -127,8 +133,8 @@ class BoundedLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         return has_settled | is_stuck, optx.RESULTS.successful
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
-        """Return the unknowns as they are."""
-        return y, aux, {}
+        """Return the unknowns, and the linearisation there."""
+        return y, aux, {"end": state}
 
 
 def _linearise(fn, y: Array, args: Any) -> tuple[Array, Array]:

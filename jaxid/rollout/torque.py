@@ -22,11 +22,11 @@ from jaxid.errors import InputError
 from jaxid.identification.identify import identify
 from jaxid.identification.uncertainty import Uncertainty
 from jaxid.identification.uncertainty.blocks import block_covariance
+from jaxid.least_squares import minimise_squares
 from jaxid.measurement.observations import Observations
 from jaxid.program.xla import lower
 from jaxid.result_table import Column, Summarised, Table, with_deviations
 
-from .least_squares import minimise
 from .torque_windows import MARGIN, SLIDING, Windows
 
 
@@ -277,17 +277,35 @@ def identify_torque_rollout(
     is_free = np.repeat([True, gains, load_friction], [base.size + 1, joints, joints])
     # All torques, masses and friction can be scaled together: the first gain is 1.
     is_free[base.size + 1] = False
-    objective = _Objective(rollout, windows, is_free, every)
+    free_unknowns = np.flatnonzero(is_free)
+
+    def residuals(values, windows):
+        unknowns = jnp.asarray(start).at[free_unknowns].set(values)
+        return rollout.errors(unknowns, windows)[every - 1 :: every].ravel()
+
+    lower, upper = _limits(rollout)
     with double_precision():
-        unknowns = objective.minimum(start, _limits(start, base.size))
-        residuals, jacobian = objective.linearised(unknowns)
-    rms = objective.rms_by_joint(residuals)
+        minimum = minimise_squares(
+            residuals,
+            start[is_free],
+            lower[is_free],
+            upper[is_free],
+            args=windows,
+            rtol=1e-5,
+            max_steps=50,
+        )
+    unknowns = start.copy()
+    unknowns[is_free] = minimum.x
+    errors = np.asarray(minimum.residuals).reshape(-1, joints, windows.q.shape[1])
+    rms = np.sqrt(np.mean(errors**2, axis=(0, 2)))
     if not np.isfinite(rms).all():
         raise InputError(
             "`observations`: the simulation diverges from the fit of torques: shorten "
             "`horizon`, or choose terms of the model that these logs determine."
         )
-    uncertainty = _uncertainty(residuals, jacobian[is_free], objective.blocks)
+    blocks = np.broadcast_to(windows.blocks, errors.shape).ravel()
+    jacobian = np.asarray(minimum.jacobian)
+    uncertainty = _uncertainty(errors.ravel(), jacobian, blocks)
     return TorqueRolloutFit(
         rollout, unknowns, is_free, uncertainty, horizon, rms, torque_fit
     )
@@ -310,84 +328,29 @@ def _require_simulation(base: BaseParameters) -> None:
         )
 
 
-def _uncertainty(r: np.ndarray, J: np.ndarray, part: np.ndarray) -> Uncertainty:
+def _uncertainty(
+    residuals: np.ndarray, jacobian: np.ndarray, block_numbers: np.ndarray
+) -> Uncertainty:
     """Return the uncertainty from residuals, their derivatives, and parts of the logs."""
-    blocks = [(J[:, part == k].T, r[part == k]) for k in np.unique(part)]
-    inverse = np.linalg.pinv(J @ J.T, rcond=1e-12, hermitian=True)
-    covariance, dof = block_covariance(blocks, inverse)
-    return Uncertainty(covariance, np.full(len(J), dof), inverse * float(np.mean(r**2)))
+    blocks = [
+        (jacobian[block_numbers == k], residuals[block_numbers == k])
+        for k in np.unique(block_numbers)
+    ]
+    information = jacobian.T @ jacobian
+    inverse = np.linalg.pinv(information, rcond=1e-12, hermitian=True)
+    covariance, degrees_of_freedom = block_covariance(blocks, inverse)
+    naive_covariance = inverse * float(np.mean(residuals**2))
+    return Uncertainty(
+        covariance, np.full(len(inverse), degrees_of_freedom), naive_covariance
+    )
 
 
-def _limits(start: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
+def _limits(rollout: TorqueRollout) -> tuple[np.ndarray, np.ndarray]:
     """Return limits of the unknowns: delays within the margin, positive gains."""
-    wide = np.full(len(start), np.inf)
-    low, high = -wide, wide.copy()
-    low[size], high[size] = -0.8 * MARGIN, 0.8 * MARGIN
-    low[size + 1 :] = 0.0
-    return low, high
-
-
-class _Objective:
-    """Errors of positions in windows, in one vector.
-
-    Attributes:
-        joints: Joint of each error.
-        blocks: Part of the logs to which each error belongs.
-    """
-
-    def __init__(
-        self,
-        rollout: TorqueRollout,
-        windows: Windows,
-        is_free: np.ndarray,
-        every: int,
-    ):
-        shape = windows.measured[every - 1 :: every].shape
-        joint_numbers = np.arange(len(windows.q))[:, None]
-        self.joints = np.broadcast_to(joint_numbers, shape).ravel()
-        self.blocks = np.broadcast_to(windows.blocks, shape).ravel()
-        self._is_free = is_free
-        self._windows = windows
-        free_unknowns = np.flatnonzero(is_free)
-
-        def residuals(x, windows):
-            return rollout.errors(x, windows)[every - 1 :: every].ravel()
-
-        def derivatives(x, windows):
-            def along(direction):
-                return jax.jvp(lambda x: residuals(x, windows), (x,), (direction,))
-
-            directions = jnp.eye(len(x))[free_unknowns]
-            values, rows = jax.vmap(along, out_axes=(None, 0))(directions)
-            jacobian = jnp.zeros((len(x), len(values)))
-            return values, jacobian.at[free_unknowns].set(rows)
-
-        self._residuals = jax.jit(residuals)
-        self._derivatives = jax.jit(derivatives)
-
-    def rms_by_joint(self, residuals: np.ndarray) -> Float[np.ndarray, " joints"]:
-        """Return the root mean square of the errors of each joint."""
-        sums = np.bincount(self.joints, residuals**2)
-        return np.sqrt(sums / np.bincount(self.joints))
-
-    def linearised(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return errors, and their derivatives by all unknowns [unknowns, errors]."""
-        residuals, jacobian = self._derivatives(jnp.asarray(x), self._windows)
-        return np.asarray(residuals), np.asarray(jacobian)
-
-    def minimum(self, start: np.ndarray, limits: tuple) -> np.ndarray:
-        """Return the unknowns with the least sum of squares."""
-
-        def moments(x, _):
-            residuals, jacobian = self.linearised(x[0])
-            square_sum = np.array([np.sum(residuals**2)])
-            gradient = (jacobian @ residuals)[None]
-            return square_sum, gradient, (jacobian @ jacobian.T)[None]
-
-        def costs(x, _):
-            residuals = np.asarray(self._residuals(jnp.asarray(x[0]), self._windows))
-            square_sum = np.array([np.sum(residuals**2)])
-            return np.nan_to_num(square_sum, nan=np.inf)
-
-        is_free = self._is_free[None]
-        return minimise(moments, costs, start[None], is_free, limits, 25, 1e-5).x[0]
+    delay = rollout.base.size
+    lower = np.full(len(rollout.names), -np.inf)
+    upper = np.full(len(rollout.names), np.inf)
+    lower[delay] = -0.8 * MARGIN
+    upper[delay] = 0.8 * MARGIN
+    lower[delay + 1 :] = 0.0
+    return lower, upper
