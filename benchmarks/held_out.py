@@ -78,12 +78,12 @@ def fits(base: jid.BaseParameters, train: jid.Observations, *, quick: bool):
     yield (
         "essential parameters",
         essential.fit,
-        f"{essential.last.remaining} of {base.size}",
+        f"{essential.last_step.remaining} of {base.size}",
     )
     if quick:
         return
     for name, other in (("epsilons", base), ("Stribeck", stribeck(base))):
-        found = jid.identify_nonlinear(other, train, linear=base)
+        found = jid.identify_nonlinear_friction(other, train, linear=base)
         verdict = f"{-found.held_out.gain:+.0%} ± {found.held_out.gain_deviation:.0%}"
         pays = "pays" if found.held_out.pays else "does not pay"
         yield f"{name}, as found", found.fit, f"{pays}: {verdict}"

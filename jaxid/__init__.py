@@ -1,9 +1,9 @@
 """Identification of the dynamic parameters of robots: the public API, in the order of the pipeline.
 
 Everything else is in namespaces: `terms`, `filters`, `units`, `estimators`,
-`uncertainty`, `consistency`, `excitation`, `criteria`, `constraints`, `trajectories`,
-`collision`, `simulation`, `devices`, `export`; the built-in robots are in `robots`, the figures in
-`plot`.
+`friction_laws`, `uncertainty`, `consistency`, `excitation`, `criteria`, `constraints`,
+`trajectories`, `collision`, `simulation`, `devices`, `export`; the built-in robots are
+in `robots`, the figures in `plot`.
 """
 
 import importlib as _importlib

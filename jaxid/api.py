@@ -35,35 +35,33 @@ from .export.simulators import export_mjcf as export_mjcf, export_urdf as export
 from .identification import (
     consistency as consistency,
     estimators as estimators,
+    friction_laws as friction_laws,
     many_processes as devices,  # noqa: F401
     uncertainty as uncertainty,
 )
 from .identification.combination import update as update
 from .identification.consistency import PhysicallyConsistent as PhysicallyConsistent
 from .identification.delay import estimate_delay as estimate_delay
+from .identification.drive_gains import identify_drive_gains as identify_drive_gains
 from .identification.estimators import WeightedLeastSquares as WeightedLeastSquares
-from .identification.filter_and_parameter_selection import (
-    choose_filter as choose_filter,
-    essential_parameters as essential_parameters,
-)
+from .identification.filter_selection import choose_filter as choose_filter
 from .identification.fit_result import Fit as Fit, load as load
+from .identification.friction_laws import (
+    identify_nonlinear_friction as identify_nonlinear_friction,
+    identify_presliding as identify_presliding,
+)
 from .identification.identify import identify as identify
 from .identification.many_data_sets import identify_batch as identify_batch
 from .identification.model_selection import (
-    Candidate as Candidate,
+    ModelCandidate as ModelCandidate,
     choose_model as choose_model,
-)
-from .identification.nonlinear_friction import (
-    identify_nonlinear as identify_nonlinear,
-    identify_presliding as identify_presliding,
-    temperature_law as temperature_law,
 )
 from .identification.operating_states import identify_states as identify_states
 from .identification.parameter_changes import compare as compare
-from .identification.payload import (
-    identify_drive_gains as identify_drive_gains,
-    identify_payload as identify_payload,
+from .identification.parameter_elimination import (
+    essential_parameters as essential_parameters,
 )
+from .identification.payload import identify_payload as identify_payload
 from .identification.problem import RegressionProblem as RegressionProblem
 from .measurement import filters as filters
 from .measurement.columns import Columns as Columns

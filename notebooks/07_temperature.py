@@ -126,7 +126,9 @@ several = [
     *(jid.identify(base, observed(cold.at(T), 0, int(T))) for T in steps[1:-1]),
     fits["warm"],
 ]
-law = jid.temperature_law(several, steps, jid.ViscousFriction(), reference=20.0)
+law = jid.friction_laws.temperature_law(
+    several, steps, jid.ViscousFriction(), reference=20.0
+)
 figure, axes = plt.subplots(figsize=(11, 3.4))
 T = np.linspace(15, 50, 50)
 for j in range(4):

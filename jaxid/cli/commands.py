@@ -30,6 +30,7 @@ from jaxid.experiment.template import toml_text
 from jaxid.export.c_code import export_c
 from jaxid.export.simulators import export_mjcf, export_pinocchio, export_urdf
 from jaxid.export.torque_program import export_jax
+from jaxid.identification.drive_gains import identify_drive_gains
 from jaxid.identification.fit_result import Fit
 from jaxid.identification.identify import identify as estimate
 from jaxid.identification.operating_states import identify_states
@@ -37,7 +38,6 @@ from jaxid.identification.parameter_changes import compare as compare_fits
 from jaxid.identification.payload import (
     CENTRAL_NAMES,
     CENTRAL_UNITS,
-    identify_drive_gains,
     identify_payload,
 )
 from jaxid.io import require_writable, write_text

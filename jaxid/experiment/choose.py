@@ -13,8 +13,12 @@ import tomlkit
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.terms import TERMS
 from jaxid.errors import InputError
-from jaxid.identification.model_selection import Candidate, ModelChoice, choose_model
-from jaxid.identification.nonlinear_friction import identify_presliding
+from jaxid.identification.friction_laws import identify_presliding
+from jaxid.identification.model_selection import (
+    ModelCandidate,
+    ModelChoice,
+    choose_model,
+)
 from jaxid.measurement.observations import Observations, Progress
 
 from .experiment import Experiment, parse_experiment
@@ -70,15 +74,17 @@ def choose_variant(
             variant = parse_experiment(_changed(experiment.text, own), experiment.path)
         except InputError:
             continue  # an effect that this robot cannot have
-        candidates.append(Candidate(name, variant.base, variant.estimation.estimator))
+        candidates.append(
+            ModelCandidate(name, variant.base, variant.estimation.estimator)
+        )
     candidates = _with_lengths(candidates, observations)
     choice = choose_model(candidates, observations, progress=progress)
     return choice, _changed(experiment.text, changes[choice.chosen.name])
 
 
 def _with_lengths(
-    candidates: list[Candidate], observations: Sequence[Observations]
-) -> list[Candidate]:
+    candidates: list[ModelCandidate], observations: Sequence[Observations]
+) -> list[ModelCandidate]:
     """Return candidates with the lengths of presliding of the one with the most parameters."""
     preslide = [c.base for c in candidates if c.base.model.memory is not None]
     if not preslide:

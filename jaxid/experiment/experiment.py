@@ -22,17 +22,15 @@ from jaxid.dynamics.terms import (
 from jaxid.errors import InputError
 from jaxid.identification.consistency import BodyBounds, PhysicallyConsistent
 from jaxid.identification.estimators import NonlinearFriction
-from jaxid.identification.filter_and_parameter_selection import (
-    FilterCandidate,
-    essential_parameters,
-)
+from jaxid.identification.filter_selection import FilterCandidate
 from jaxid.identification.fit_result import Fit
-from jaxid.identification.identify import fit_problem
-from jaxid.identification.nonlinear_friction import (
-    identify_nonlinear,
+from jaxid.identification.friction_laws import (
+    identify_nonlinear_friction,
     identify_presliding,
-    presliding_note,
 )
+from jaxid.identification.friction_laws.presliding_lengths import presliding_note
+from jaxid.identification.identify import fit_problem
+from jaxid.identification.parameter_elimination import essential_parameters
 from jaxid.identification.problem import RegressionProblem
 from jaxid.measurement.columns import Columns
 from jaxid.measurement.filters import FILTERS, AbstractDecimation, AbstractFilter
@@ -125,7 +123,7 @@ class Experiment:
         if self.linear is not None:
             linear = base_parameters(Model(self.robot, self.linear))
             estimator = NonlinearFriction(chosen.plain)
-            found = identify_nonlinear(
+            found = identify_nonlinear_friction(
                 self.base, logs, estimator, linear=linear, progress=progress
             )
             return found.better

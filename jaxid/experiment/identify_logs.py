@@ -23,7 +23,7 @@ from jaxid.identification.combination import (
 from jaxid.identification.consistency import PhysicallyConsistent
 from jaxid.identification.encoder_resolution import resolution_note
 from jaxid.identification.estimators import AbstractEstimator, Complete, GivenWeights
-from jaxid.identification.filter_and_parameter_selection import (
+from jaxid.identification.filter_selection import (
     FilterChoice,
     choose_filter,
 )

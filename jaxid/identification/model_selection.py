@@ -17,8 +17,13 @@ from .estimators import AbstractEstimator, WeightedLeastSquares
 from .factors import Blocks, Factors
 from .problem import RegressionProblem, cross_validation_folds
 
+MIN_LOGS = 4
+"""Number of logs from which whole logs are left out, instead of parts of time."""
+MIN_BLOCKS = 3
+"""Blocks of rows without which nothing remains for a fit once two are left out."""
 
-class Candidate(NamedTuple):
+
+class ModelCandidate(NamedTuple):
     """A model and an estimator.
 
     Attributes:
@@ -45,14 +50,14 @@ class ModelChoice(Summarised, eqx.Module):
         parts: What was left out in turn, in words.
     """
 
-    candidates: tuple[Candidate, ...]
+    candidates: tuple[ModelCandidate, ...]
     errors: Float[AnyArray, "candidates parts"]
     best: int = eqx.field(static=True)
     promise: float
     parts: str = eqx.field(static=True)
 
     @property
-    def chosen(self) -> Candidate:
+    def chosen(self) -> ModelCandidate:
         """The candidate that is chosen."""
         return self.candidates[self.best]
 
@@ -61,17 +66,23 @@ class ModelChoice(Summarised, eqx.Module):
         squares = np.square(self.errors)
         means = squares.mean(axis=1)
         order = np.argsort(means).tolist()
-        excess, deviations = _excess(squares)
-        half = 0.5 / np.sqrt(means)
-        columns = np.sqrt(means), half * excess, half * deviations
-        error, above, deviation = (x[order].tolist() for x in columns)
+        excess = _excess(squares)
+        # A small change of a square root is half of it over the root.
+        slopes = 0.5 / np.sqrt(means)
         return Table(
             "models by their errors on parts that were left out",
             Column("model", [self.candidates[k].name for k in order]),
             Column("parameters", [self.candidates[k].base.size for k in order]),
-            Column("error", error, "%", percent),
-            Column("above the best", above, "%", percent),
-            Column("one deviation", deviation, "%", percent),
+            Column("error", np.sqrt(means)[order].tolist(), "%", percent),
+            Column(
+                "above the best", (slopes * excess.mean)[order].tolist(), "%", percent
+            ),
+            Column(
+                "one deviation",
+                (slopes * excess.deviation)[order].tolist(),
+                "%",
+                percent,
+            ),
             remarks=[Remark(str(self))],
             status=[Status.GOOD if k == self.best else Status.NEUTRAL for k in order],
         )
@@ -79,17 +90,15 @@ class ModelChoice(Summarised, eqx.Module):
     def __str__(self):
         return (
             f"`{self.chosen.name}` is the simplest model whose error exceeds the "
-            "smallest one by "
-            "at most one deviation of the difference. On further data of this kind "
-            "expect errors "
-            f"of {percent(self.promise)} % of the forces: {self.parts} were left out "
-            "in turn, and "
-            "the choice was repeated without each."
+            "smallest one by at most one deviation of the difference. On further data "
+            f"of this kind expect errors of {percent(self.promise)} % of the forces: "
+            f"{self.parts} were left out in turn, and the choice was repeated without "
+            "each."
         )
 
 
 def choose_model(
-    candidates: Sequence[Candidate],
+    candidates: Sequence[ModelCandidate],
     observations: Observations | Sequence[Observations],
     *,
     progress: Progress | None = None,
@@ -116,93 +125,116 @@ def choose_model(
     """
     if not candidates:
         raise InputError("`candidates` must hold at least one model, but is empty.")
-    logs = (
-        (observations,)
-        if isinstance(observations, Observations)
-        else tuple(observations)
-    )
-    first, by_log = candidates[0], len(logs) >= 4
-    folds = _folds(first.base, logs, by_log)
+    is_one_log = isinstance(observations, Observations)
+    logs = (observations,) if is_one_log else tuple(observations)
+    by_log = len(logs) >= MIN_LOGS
+
     # All candidates are judged with the weights of the first.
-    weights = first.estimator(
-        RegressionProblem(first.base, blocks=Blocks(tuple(folds)))
-    ).weights
-    weights = np.asarray(weights) ** 2
-    total = float(np.mean([weights @ fold.force_squares for fold in folds]))
+    first = candidates[0]
+    parts = _parts(first.base, logs, by_log)
+    problem = RegressionProblem(first.base, blocks=Blocks(parts))
+    weights = np.asarray(first.estimator(problem).weights)
+    joint_weights = weights**2
+    forces = float(np.mean([joint_weights @ part.force_squares for part in parts]))
     tables = []
     for number, candidate in enumerate(candidates):
-        folds = folds if number == 0 else _folds(candidate.base, logs, by_log)
-        tables.append(_held_out_squares(candidate, folds, weights) / total)
+        if candidate is not first:
+            parts = _parts(candidate.base, logs, by_log)
+        tables.append(_held_out_squares(candidate, parts, joint_weights) / forces)
         if progress is not None:
             progress((number + 1) / len(candidates))
     table = np.array(tables)
-    parts = table.shape[1]
-    alone = np.arange(parts)
-    squares = table[:, alone, alone]
-    ranks = [(c.base.size, c.base.model.memory is None) for c in candidates]
-    outer = []
-    for out in alone:
-        rest = np.setdiff1d(alone, [out])
-        outer.append(squares[_simplest(table[:, out, rest], ranks), out])
+
+    count = len(parts)
+    squares = np.diagonal(table, axis1=1, axis2=2)
+    best = _simplest(squares, candidates)
     return ModelChoice(
-        tuple(candidates),
-        np.sqrt(squares),
-        _simplest(squares, ranks),
-        float(np.sqrt(np.mean(outer))),
-        f"{parts} logs" if by_log else f"{parts} parts of time",
+        candidates=tuple(candidates),
+        errors=np.sqrt(squares),
+        best=best,
+        promise=_promise(table, candidates),
+        parts=f"{count} logs" if by_log else f"{count} parts of time",
     )
 
 
-def _folds(
+def _parts(
     base: BaseParameters, logs: Sequence[Observations], by_log: bool
-) -> list[Factors]:
+) -> tuple[Factors, ...]:
     """Return the factors of the parts that are left out in turn."""
     if by_log:
-        return [RegressionProblem(base, [log]).factors for log in logs]
+        return tuple(RegressionProblem(base, [log]).factors for log in logs)
     blocks = RegressionProblem(base, logs).blocks
-    if len(blocks.parts) < 3:
+    if len(blocks.parts) < MIN_BLOCKS:
         raise InputError(
             "a choice of models needs at least three blocks of rows: record longer."
         )
-    return [blocks.select(part).total for _, part in cross_validation_folds(blocks)]
+    folds = cross_validation_folds(blocks)
+    return tuple(blocks.select(test_part).total for _, test_part in folds)
 
 
 def _held_out_squares(
-    candidate: Candidate, folds: list[Factors], weights: np.ndarray
-) -> np.ndarray:
-    """Return the squared errors on the second part of fits without both [parts, parts].
+    candidate: ModelCandidate, parts: Sequence[Factors], joint_weights: np.ndarray
+) -> Float[np.ndarray, "parts parts"]:
+    """Return the squared errors on the second part of fits without both.
 
     On the diagonal only that part was left out.
     """
-    found = np.zeros((len(folds), len(folds)))
-    for i, k in itertools.combinations_with_replacement(range(len(folds)), 2):
-        rest = Blocks(
-            tuple(x for number, x in enumerate(folds) if number not in (i, k))
-        )
-        p = candidate.estimator(
-            RegressionProblem(candidate.base, blocks=rest)
-        ).parameters
-        found[i, k], found[k, i] = (
-            weights @ folds[n].residual_squares(p) for n in (k, i)
-        )
-    return found
+    squares = np.zeros((len(parts), len(parts)))
+    numbers = range(len(parts))
+    for i, k in itertools.combinations_with_replacement(numbers, 2):
+        training = tuple(parts[n] for n in numbers if n not in (i, k))
+        problem = RegressionProblem(candidate.base, blocks=Blocks(training))
+        p = candidate.estimator(problem).parameters
+        squares[i, k] = joint_weights @ parts[k].residual_squares(p)
+        squares[k, i] = joint_weights @ parts[i].residual_squares(p)
+    return squares
 
 
-def _excess(squares: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return by how much squared errors exceed the smallest ones, and standard deviations of it."""
-    differences = squares - squares[np.argmin(squares.mean(axis=1))]
-    deviations = differences.std(axis=1, ddof=1) / np.sqrt(squares.shape[1])
-    return differences.mean(axis=1), deviations
+def _promise(table: np.ndarray, candidates: Sequence[ModelCandidate]) -> float:
+    """Return the error on parts of the candidates that the other parts choose.
 
-
-def _simplest(squares: np.ndarray, ranks: Sequence[tuple[int, bool]]) -> int:
-    """Return the candidate of the lowest rank that is about as good as the best one.
-
-    The last comparison is between candidates with equally many parameters.
+    The table has the squared errors on the second part of fits without both
+    [candidates, parts, parts].
     """
-    good = np.arange(len(squares))
-    for key in zip(*ranks, strict=True):
-        excess, deviations = _excess(squares[good])
-        good = good[excess <= deviations]
-        good = good[np.array(key)[good] == min(np.array(key)[good])]
-    return int(good[np.argmin(squares[good].mean(axis=1))])
+    squares = []
+    numbers = range(table.shape[1])
+    for outer in numbers:
+        others = [n for n in numbers if n != outer]
+        best = _simplest(table[:, outer, others], candidates)
+        squares.append(table[best, outer, outer])
+    return float(np.sqrt(np.mean(squares)))
+
+
+class Excess(NamedTuple):
+    """Squared errors above those of the best candidate."""
+
+    mean: Float[np.ndarray, " candidates"]
+    deviation: Float[np.ndarray, " candidates"]  # standard deviation of the mean
+
+
+def _excess(squares: Float[np.ndarray, "candidates parts"]) -> Excess:
+    """Return by how much squared errors exceed the smallest ones."""
+    best = np.argmin(squares.mean(axis=1))
+    differences = squares - squares[best]
+    deviations = differences.std(axis=1, ddof=1) / np.sqrt(squares.shape[1])
+    return Excess(differences.mean(axis=1), deviations)
+
+
+def _simplest(
+    squares: Float[np.ndarray, "candidates parts"],
+    candidates: Sequence[ModelCandidate],
+) -> int:
+    """Return the simplest of the candidates that are about as good as the best one.
+
+    The second comparison is between candidates with equally many parameters.
+    """
+    sizes = np.array([c.base.size for c in candidates])
+    lacks_memory = np.array([c.base.model.memory is None for c in candidates])
+    remaining = np.arange(len(candidates))
+    for rank in (sizes, lacks_memory):
+        excess = _excess(squares[remaining])
+        remaining = remaining[excess.mean <= excess.deviation]
+        ranks = rank[remaining]
+        remaining = remaining[ranks == ranks.min()]
+    means = squares[remaining].mean(axis=1)
+    return int(remaining[np.argmin(means)])

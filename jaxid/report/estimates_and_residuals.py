@@ -7,7 +7,7 @@ import numpy as np
 from scipy.signal import fftconvolve
 
 from jaxid.arrays import Float
-from jaxid.identification.filter_and_parameter_selection import FilterChoice
+from jaxid.identification.filter_selection import FilterChoice
 from jaxid.identification.fit_result import DOUBTFUL, TRUSTED, Fit
 from jaxid.identification.parameter_changes import Comparison, Verdict
 from jaxid.identification.uncertainty import ResidualSpectra

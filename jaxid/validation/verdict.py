@@ -10,7 +10,7 @@ from jaxid.dynamics.terms import ConstantOffset
 from jaxid.identification.estimators.regularisation_and_weights import (
     LARGEST_UNCERTAINTY,
 )
-from jaxid.identification.filter_and_parameter_selection import FilterChoice
+from jaxid.identification.filter_selection import FilterChoice
 from jaxid.identification.fit_result import Fit
 from jaxid.result_table import Remark, Status, significant
 

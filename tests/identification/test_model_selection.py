@@ -21,7 +21,7 @@ def candidates():
         name: jid.base_parameters(jid.Model(ROBOT, terms))
         for name, terms in MODELS.items()
     }
-    return [jid.Candidate(name, base) for name, base in bases.items()]
+    return [jid.ModelCandidate(name, base) for name, base in bases.items()]
 
 
 def logs(truth, count=1, samples=1500, noise=0.3, seed=0):
@@ -92,7 +92,7 @@ def test_of_equally_good_models_that_with_memory_is_chosen(memory):
     p[[names.index(x) for x in ("fc1", "fc2")]] = 0.0
     log = virtual.observations(models[0], p, samples=1500, noise=0.3)
     choice = jid.choose_model(
-        [jid.Candidate("", jid.base_parameters(x)) for x in models], log
+        [jid.ModelCandidate("", jid.base_parameters(x)) for x in models], log
     )
     assert choice.chosen.base.model.memory is not None
 

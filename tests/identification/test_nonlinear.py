@@ -10,8 +10,8 @@ import pytest
 import virtual
 
 import jaxid as jid
-from jaxid.identification.estimators import NonlinearFriction
-from jaxid.identification.estimators.variable_projection import (
+from jaxid.identification.estimators import (
+    NonlinearFriction,
     ShapeSearch,
     select_shapes,
 )
@@ -125,7 +125,7 @@ def test_deviations_of_shapes_agree_with_their_scatter():
         search = search_of(START, observations(samples=600, noise=0.3, noise_seed=seed))
         found.append(eqx.filter_jit(search)(np.ones(3))[0])
     o = observations(samples=600, noise=0.3)
-    fit = jid.identify_nonlinear(START, o, NonlinearFriction(WLS))
+    fit = jid.identify_nonlinear_friction(START, o, NonlinearFriction(WLS))
     # 14 draws tell a deviation to 19 %: 1.6 is less than three of these.
     scatter = np.std(found, axis=0, ddof=1) / fit.shape_deviations
     assert np.abs(np.log(scatter)).max() < np.log(1.6)
@@ -148,7 +148,9 @@ def test_it_pays_where_friction_is_nonlinear_and_only_there(truth, noise, low, h
     p = virtual.standard_parameters(truth, seed=3)
     o = virtual.observations(truth, p, samples=1000, noise=noise)
     linear = jid.base_parameters(model(0.03))
-    whole = jid.identify_nonlinear(START, o, NonlinearFriction(WLS), linear=linear)
+    whole = jid.identify_nonlinear_friction(
+        START, o, NonlinearFriction(WLS), linear=linear
+    )
     assert whole.held_out.pays == (truth is TRUTH)
     assert low < whole.held_out.gain < high
     assert whole.better.base is (whole.fit if truth is TRUTH else whole.linear).base
@@ -178,7 +180,9 @@ def test_friction_falls_with_temperature_as_fits_at_several_tell():
         p = virtual.standard_parameters(truth, seed=4)
         o = virtual.observations(truth, p, samples=600, noise=0.3, noise_seed=seed)
         fits.append(jid.identify(base, o, WLS))
-    law = jid.temperature_law(fits, (15.0, 30.0, 45.0), jid.ViscousFriction())
+    law = jid.friction_laws.temperature_law(
+        fits, (15.0, 30.0, 45.0), jid.ViscousFriction()
+    )
     assert (np.abs(law.rates - rates) < 4 * law.rate_deviations).all()
     assert law.rate_deviations.max() < 0.005
     assert (np.abs(law.values - p[-3:]) < 4 * law.value_deviations).all()
@@ -187,4 +191,4 @@ def test_friction_falls_with_temperature_as_fits_at_several_tell():
         ((15.0, 30.0, 45.0), jid.terms.StribeckFriction(), "`term`"),
     ):
         with pytest.raises(ValueError, match=named):
-            jid.temperature_law(fits, temperatures, term)
+            jid.friction_laws.temperature_law(fits, temperatures, term)

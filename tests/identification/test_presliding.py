@@ -10,7 +10,9 @@ from scipy.integrate import solve_ivp
 import jaxid as jid
 from jaxid.dynamics.terms import CoulombFriction, Presliding, SquareRootFriction, Tanh
 from jaxid.errors import InputError
-from jaxid.identification.nonlinear_friction import LENGTHS as LENGTHS_TRIED
+from jaxid.identification.friction_laws.presliding_lengths import (
+    LENGTHS as LENGTHS_TRIED,
+)
 from jaxid.identification.problem import RegressionProblem
 from jaxid.measurement.friction_state import PART, SamplesWithMemory, with_memory
 from jaxid.simulation.friction_and_disturbances import LuGreFriction
@@ -208,7 +210,7 @@ def test_presliding_of_another_law_is_found_with_coarse_encoders():
 def test_what_cannot_have_memory_says_so():
     base, (log, _) = jid.base_parameters(model_of(Presliding())), log_of(400)
     with pytest.raises(InputError, match="Presliding"):
-        jid.identify_nonlinear(base, log)
+        jid.identify_nonlinear_friction(base, log)
     m = log.motion
     with pytest.raises(InputError, match="memory"):
         jid.identify_batch(

@@ -40,7 +40,7 @@ class AbstractTransition(Hashable):
 
     @property
     def nonlinear_parameters(self) -> tuple[NonlinearParameter, ...]:
-        """Parameters that `identify_nonlinear` can identify."""
+        """Parameters that `identify_nonlinear_friction` can identify."""
         return ()
 
 

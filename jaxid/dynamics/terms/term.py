@@ -136,7 +136,7 @@ class AbstractTerm(eqx.Module):
 
     @property
     def nonlinear_parameters(self) -> tuple[NonlinearParameter, ...]:
-        """Parameters that `identify_nonlinear` can identify; none for most terms."""
+        """Parameters that `identify_nonlinear_friction` can identify; none for most terms."""
         return ()
 
     @property

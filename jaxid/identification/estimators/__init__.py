@@ -6,6 +6,7 @@ from .estimate import (
     Estimate as Estimate,
     EstimatorInWords as EstimatorInWords,
 )
+from .friction_shapes import select_shapes as select_shapes
 from .least_squares import (
     AbstractLoss as AbstractLoss,
     GeneralisedLeastSquares as GeneralisedLeastSquares,
@@ -32,5 +33,4 @@ from .regularisation_and_weights import (
 from .variable_projection import (
     NonlinearFriction as NonlinearFriction,
     ShapeSearch as ShapeSearch,
-    select_shapes as select_shapes,
 )
