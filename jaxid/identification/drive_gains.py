@@ -12,7 +12,8 @@ import equinox as eqx
 import numpy as np
 from scipy import optimize
 
-from jaxid.arrays import AnyArray, Float, Int
+from jaxid.arrays import AnyArray, Float
+from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
 from jaxid.result_table import Summarised, Table
 from jaxid.robot.robot import Robot, Tool
@@ -89,45 +90,43 @@ def identify_drive_gains(
     require_same_base((unloaded, loaded))
     robot = unloaded.base.model.robot
     _require_gains(robot)
-    runs = _runs(as_least_squares(unloaded), as_least_squares(loaded), load, varying)
+    fits = (as_least_squares(unloaded), as_least_squares(loaded))
+    maps, offsets = _parameter_maps(unloaded.base, load, varying)
+    start_parameters, _ = combine(fits, maps, offsets)
 
-    start_parameters, _ = combine(
-        [run.fit for run in runs],
-        [run.parameter_map for run in runs],
-        [run.offset for run in runs],
-    )
-    start = np.append(start_parameters, np.ones(robot.joints))
-    rows = _stack([run.rows(run.fit.time_blocks.total) for run in runs])
+    parts = []
+    for fit, parameter_map, offset in zip(fits, maps, offsets, strict=True):
+        for factors in fit.time_blocks.parts:
+            parts.append(_rows(factors, fit.weights, parameter_map, offset))
+    rows = Rows(*map(np.concatenate, zip(*parts, strict=True)))
     solution = optimize.least_squares(
-        rows.residuals,
-        start,
-        rows.jacobian,
+        lambda unknowns: rows.linearise(unknowns)[0],
+        np.append(start_parameters, np.ones(robot.joints)),
+        lambda unknowns: rows.linearise(unknowns)[1],
         method="lm",
         x_scale="jac",
         xtol=TOLERANCE,
         ftol=TOLERANCE,
         gtol=TOLERANCE,
     )
-    unknowns = solution.x
-    size = rows.columns.shape[1]
-    reciprocals = unknowns[size:]
-    decomposition = Decomposition.of(rows.jacobian(unknowns), -rows.residuals(unknowns))
+    size = len(start_parameters)
+    reciprocals = solution.x[size:]
+    residuals, jacobian = rows.linearise(solution.x)
+    decomposition = Decomposition.of(jacobian, -residuals)
     _require_determined(decomposition, reciprocals)
 
-    blocks = []
-    for run in runs:
-        for part in run.fit.time_blocks.parts:
-            block = run.rows(part)
-            blocks.append((block.jacobian(unknowns), block.residuals(unknowns)))
-    inverse = decomposition.inverse_information()
-    covariance, dof = block_covariance(blocks, inverse)
+    blocks = [part.linearise(solution.x) for part in parts]
+    covariance, dof = block_covariance(
+        [(jacobian, residuals) for residuals, jacobian in blocks],
+        decomposition.inverse_information(),
+    )
     # The gain 1 / c changes by -1 / c² times a small change of c.
-    squares = reciprocals**2
-    of_gains = covariance[size:, size:] / squares / squares[:, None]
+    slopes = -1.0 / reciprocals**2
+    covariance = slopes[:, None] * covariance[size:, size:] * slopes
     return DriveGains(
         gains=1.0 / reciprocals,
-        uncertainty=Uncertainty(of_gains, np.full(robot.joints, dof), of_gains),
-        parameters=runs[0].parameter_map @ unknowns[:size],
+        uncertainty=Uncertainty(covariance, np.full(robot.joints, dof), covariance),
+        parameters=maps[0] @ solution.x[:size],
         joint_names=robot.joint_names,
     )
 
@@ -145,9 +144,7 @@ def _require_gains(robot: Robot) -> None:
         )
 
 
-def _require_determined(
-    decomposition: Decomposition, reciprocals: Float[np.ndarray, " joints"]
-) -> None:
+def _require_determined(decomposition: Decomposition, reciprocals: np.ndarray) -> None:
     """Check that the runs determine all gains, and that these are plausible."""
     values = decomposition.values
     is_determined = values[-1] > NUMERICAL * values[0]
@@ -159,87 +156,57 @@ def _require_determined(
 
 
 class Rows(NamedTuple):
-    """Weighted rows, whose forces are in nominal units.
+    """Weighted rows, whose measured forces are in nominal units.
 
     The unknowns are those of the base parameters, then the reciprocal gains.
     """
 
-    columns: Float[np.ndarray, "rows unknowns"]
-    offsets: Float[np.ndarray, " rows"]  # forces of a known load
-    forces: Float[np.ndarray, " rows"]  # measured ones
-    joints: Int[np.ndarray, " rows"]
+    columns: np.ndarray  # [rows, unknowns]
+    known_forces: np.ndarray  # forces of a known load
+    measured_forces: np.ndarray
+    joints: np.ndarray  # one for the joint of each row, otherwise zero [rows, joints]
 
-    def predict(self, unknowns: np.ndarray) -> Float[np.ndarray, " rows"]:
-        """Return the forces in true units."""
-        return self.columns @ unknowns[: self.columns.shape[1]] + self.offsets
-
-    def reciprocals(self, unknowns: np.ndarray) -> Float[np.ndarray, " rows"]:
-        """Return the reciprocal gain of each row."""
-        return unknowns[self.columns.shape[1] :][self.joints]
-
-    def residuals(self, unknowns: np.ndarray) -> Float[np.ndarray, " rows"]:
-        """Return predicted less measured forces."""
-        return self.reciprocals(unknowns) * self.predict(unknowns) - self.forces
-
-    def jacobian(self, unknowns: np.ndarray) -> Float[np.ndarray, "rows all_unknowns"]:
-        """Return the derivatives of the residuals by the unknowns."""
-        joints = len(unknowns) - self.columns.shape[1]
-        by_parameters = self.reciprocals(unknowns)[:, None] * self.columns
-        by_reciprocals = np.eye(joints)[self.joints] * self.predict(unknowns)[:, None]
-        return np.hstack([by_parameters, by_reciprocals])
+    def linearise(self, unknowns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return predicted less measured forces, and their derivatives by the unknowns."""
+        size = self.columns.shape[1]
+        reciprocals = self.joints @ unknowns[size:]
+        forces = self.columns @ unknowns[:size] + self.known_forces
+        by_parameters = reciprocals[:, None] * self.columns
+        by_reciprocals = forces[:, None] * self.joints
+        residuals = reciprocals * forces - self.measured_forces
+        return residuals, np.hstack([by_parameters, by_reciprocals])
 
 
-class Run(NamedTuple):
-    """A run whose base parameters are a map of the unknowns plus an offset."""
-
-    fit: Fit
-    parameter_map: Float[np.ndarray, "base unknowns"]
-    offset: Float[np.ndarray, " base"]
-
-    def rows(self, factors: Factors) -> Rows:
-        """Return the weighted rows of some factors of the run."""
-        weights = np.asarray(self.fit.weights)
-        columns = []
-        forces = []
-        for joint, weight in zip(factors.joints, weights, strict=True):
-            R = weight * joint.R
-            dense = np.zeros((len(R), factors.size))
-            dense[:, list(joint.columns)] = R[:, :-1]
-            columns.append(dense)
-            forces.append(R[:, -1])
-        heights = [len(x) for x in forces]
-        matrix = np.vstack(columns)
-        return Rows(
-            columns=matrix @ self.parameter_map,
-            offsets=matrix @ self.offset,
-            forces=np.concatenate(forces),
-            joints=np.repeat(np.arange(len(heights)), heights),
+def _rows(factors: Factors, weights, parameter_map, offset) -> Rows:
+    """Return the rows of some factors; base parameters are the map times unknowns plus offset."""
+    parts = []
+    for number, joint in enumerate(factors.joints):
+        R = weights[number] * joint.R
+        columns = R[:, :-1]
+        parameters = list(joint.columns)
+        of_joint = np.zeros((len(R), len(factors.joints)))
+        of_joint[:, number] = 1.0
+        parts.append(
+            Rows(
+                columns=columns @ parameter_map[parameters],
+                known_forces=columns @ offset[parameters],
+                measured_forces=R[:, -1],
+                joints=of_joint,
+            )
         )
+    return Rows(*map(np.concatenate, zip(*parts, strict=True)))
 
 
-def _runs(
-    unloaded: Fit, loaded: Fit, load: Tool | float, varying: Sequence[str] | None
-) -> list[Run]:
-    """Return both runs as functions of the same unknowns."""
-    base = unloaded.base
+def _parameter_maps(
+    base: BaseParameters, load: Tool | float, varying: Sequence[str] | None
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Return maps and offsets from common unknowns to the base parameters of both runs."""
     maps = state_maps(base.size, varying_parameters(base, varying), 2)
+    nothing = np.zeros(base.size)
     if isinstance(load, Tool):
-        offset = body_columns(base, load.body) @ load.parameters
-    else:
-        # The other nine parameters of the load are unknowns, too.
-        columns = body_columns(base, base.model.robot.tip_body)
-        offset = load * columns[:, 0]
-        others = columns[:, 1:]
-        maps = [
-            np.hstack([maps[0], np.zeros_like(others)]),
-            np.hstack([maps[1], others]),
-        ]
-    return [
-        Run(unloaded, maps[0], np.zeros(base.size)),
-        Run(loaded, maps[1], offset),
-    ]
-
-
-def _stack(parts: Sequence[Rows]) -> Rows:
-    """Return the rows of several parts together."""
-    return Rows(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
+        return maps, [nothing, body_columns(base, load.body) @ load.parameters]
+    # The other nine parameters of the load are unknowns, too.
+    columns = body_columns(base, base.model.robot.tip_body)
+    others = columns[:, 1:]
+    maps = [np.hstack([maps[0], 0.0 * others]), np.hstack([maps[1], others])]
+    return maps, [nothing, load * columns[:, 0]]
