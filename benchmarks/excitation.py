@@ -274,7 +274,7 @@ def main():
     parser.add_argument("--generations", type=int, default=12)
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
-    jid.keep_compiled()
+    jid.enable_compilation_cache()
     if options.quick:
         options.parts, options.keys = ["d7", "rest", "step"], 1
     keys = range(options.first, options.first + options.keys)

@@ -158,7 +158,7 @@ def readers(folder):
         "log.npz": log,
         "log.parquet": log,
         "arm.urdf": jid.load_urdf,
-        "model.json": jid.load,
+        "model.json": jid.load_fit,
         "experiment.toml": load_experiment,
     }
 

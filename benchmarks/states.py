@@ -356,7 +356,7 @@ def delay(draws: int) -> list[str]:
         together = jid.identify(base, others).parameters
         earlier, *later = (jid.identify(base, o) for o in others)
         for run in later:
-            earlier = jid.update(earlier, run)
+            earlier = jid.combine_fits(earlier, run)
         apart.append(
             np.linalg.norm(earlier.parameters - together) / np.linalg.norm(together)
         )

@@ -1,8 +1,8 @@
-"""Identification of the dynamic parameters of robots: the public API, in the order of the pipeline.
+"""Identification of the dynamic parameters of robots, in the order of the pipeline.
 
 Everything else is in namespaces: `terms`, `filters`, `units`, `estimators`,
 `friction_laws`, `uncertainty`, `consistency`, `excitation`, `criteria`, `constraints`,
-`trajectories`, `collision`, `simulation`, `devices`, `export`; the built-in robots are
+`trajectories`, `collision`, `simulation`, `multihost`, `export`; the built-in robots are
 in `robots`, the figures in `plot`.
 """
 

@@ -36,16 +36,16 @@ from .identification import (
     consistency as consistency,
     estimators as estimators,
     friction_laws as friction_laws,
-    many_processes as devices,  # noqa: F401
+    multihost as multihost,
     uncertainty as uncertainty,
 )
-from .identification.combination import update as update
+from .identification.combination import combine_fits as combine_fits
 from .identification.consistency import PhysicallyConsistent as PhysicallyConsistent
 from .identification.delay import estimate_delay as estimate_delay
 from .identification.drive_gains import identify_drive_gains as identify_drive_gains
 from .identification.estimators import WeightedLeastSquares as WeightedLeastSquares
 from .identification.filter_selection import choose_filter as choose_filter
-from .identification.fit_result import Fit as Fit, load as load
+from .identification.fit_result import Fit as Fit, load_fit as load_fit
 from .identification.friction_laws import (
     identify_nonlinear_friction as identify_nonlinear_friction,
     identify_presliding as identify_presliding,
@@ -73,7 +73,9 @@ from .measurement.filters import (
 from .measurement.observations import Observations as Observations, observe as observe
 from .measurement.reading import read_recording as read_recording, scan_log as scan_log
 from .measurement.recording import Recording as Recording
-from .program.jax_compilation_cache import keep_compiled as keep_compiled
+from .program.jax_compilation_cache import (
+    enable_compilation_cache as enable_compilation_cache,
+)
 from .robot import (
     collision as collision,
     library as robots,  # noqa: F401

@@ -169,7 +169,7 @@ plt.show()
 # %%
 with tempfile.TemporaryDirectory() as folder:
     fit.save(Path(folder) / "arm.json")
-    again = jid.load(Path(folder) / "arm.json")
+    again = jid.load_fit(Path(folder) / "arm.json")
     print(
         "saved and loaded, bit by bit:",
         np.array_equal(again.parameters, fit.parameters),

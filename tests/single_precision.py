@@ -99,7 +99,7 @@ def numbers_of(path):
 
 def loaded():
     plain().save(FOLDER / "arm.json")
-    return jid.load(FOLDER / "arm.json").parameters
+    return jid.load_fit(FOLDER / "arm.json").parameters
 
 
 def angles_along_path():
@@ -157,7 +157,7 @@ CASES = {
     ),
     "factorise_across_processes": lambda: (
         jid.identification.identify.fit_problem(
-            jid.devices.factorise_across_processes(base, [cold]),
+            jid.multihost.factorise_across_processes(base, [cold]),
             jid.estimators.LeastSquares(),
         ).parameters
     ),
@@ -165,7 +165,7 @@ CASES = {
         jid.essential_parameters(plain(), cold).fit.parameters
     ),
     "identify_states": lambda: jid.identify_states(runs()).parameters,
-    "update": lambda: jid.update(*runs()).parameters,
+    "update": lambda: jid.combine_fits(*runs()).parameters,
     "compare": lambda: jid.compare(plain(), jid.identify(base, warm)).difference,
     "validate": lambda: [e.relative for e in validate(plain(), [warm]).errors],
     "predict": lambda: plain().predict(cold.motion),

@@ -312,7 +312,7 @@ def test_friction_with_memory_from_the_log_to_the_report(shop, run, words):  # n
     said = words(
         "identify", "memory.toml", "memory.csv", "-o", "report", "--split", "0.6"
     )
-    fit = jid.load("report/model.json")
+    fit = jid.load_fit("report/model.json")
     np.testing.assert_allclose(fit.base.model.memory.length, 0.05, rtol=0.1)
     shown = re.findall(
         r"joint\d (0\.\d+) rad", said[said.index("lengths of presliding") :]

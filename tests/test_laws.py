@@ -100,7 +100,7 @@ def test_a_model_file_is_the_one_that_was_written_or_refused(
         path = Path(folder) / "arm.json"
         path.write_bytes(data)
         try:
-            fit, refused = jid.load(path), None
+            fit, refused = jid.load_fit(path), None
         except ValueError as error:
             fit, refused = None, error
     if fit is None:
@@ -109,4 +109,4 @@ def test_a_model_file_is_the_one_that_was_written_or_refused(
         return
     # Spaces between values mean nothing.
     assert json.loads(data) == json.loads(good)
-    np.testing.assert_array_equal(fit.parameters, jid.load(model_file).parameters)
+    np.testing.assert_array_equal(fit.parameters, jid.load_fit(model_file).parameters)

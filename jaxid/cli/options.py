@@ -81,11 +81,11 @@ def start(*reads: Path, output: Path | None = None, force: bool = False) -> Cons
     import jax
 
     from jaxid.io import require_writable
-    from jaxid.program.jax_compilation_cache import keep_compiled
+    from jaxid.program.jax_compilation_cache import enable_compilation_cache
     from jaxid.report.result_files import SCHEMAS, schema_of
 
     jax.config.update("jax_enable_x64", True)
-    keep_compiled()
+    enable_compilation_cache()
     if output is not None:
         empty = not output.is_dir() or not any(output.iterdir())
         if output.exists() and not output.is_dir():

@@ -14,10 +14,10 @@ from rich.progress import Progress, TimeElapsedColumn
 from jaxid.errors import InputError
 from jaxid.excitation.design import DesignProgress
 from jaxid.identification.combination import (
+    combine_fits,
     replace_estimates,
     require_same_base,
     share_rows,
-    update,
     without_bounds,
 )
 from jaxid.identification.consistency import PhysicallyConsistent
@@ -242,7 +242,9 @@ def read_runs(
             doubts += mistakes_in_logs([diagnosis for *_, diagnosis in logs], fits[-1])[
                 0
             ]
-        runs.append(dataclasses.replace(functools.reduce(update, fits), name=name))
+        runs.append(
+            dataclasses.replace(functools.reduce(combine_fits, fits), name=name)
+        )
     return runs, doubts
 
 
@@ -359,7 +361,7 @@ def _add_reports(
         )
     estimator = experiment.estimation.estimator
     fit = functools.reduce(
-        update, [*(earlier_run(experiment, p) for p in reports), fit]
+        combine_fits, [*(earlier_run(experiment, p) for p in reports), fit]
     )
     if isinstance(estimator, PhysicallyConsistent):
         rows = RegressionProblem(fit.base, blocks=fit.time_blocks, names=fit.recordings)

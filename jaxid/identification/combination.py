@@ -115,7 +115,7 @@ def combine(fits: Sequence[Fit], maps, offsets=None) -> tuple[np.ndarray, Uncert
     return decomposition.solve(), Uncertainty(covariance, dof, covariance)
 
 
-def update(earlier: Fit, later: Fit, name: str | None = None) -> Fit:
+def combine_fits(earlier: Fit, later: Fit, name: str | None = None) -> Fit:
     """Add a later fit to an earlier one, as if both had been identified together.
 
     The estimates are those of the joint fit to rounding, and only factors are needed:

@@ -353,7 +353,7 @@ class Fit(Summarised, eqx.Module):
         return to_json(fit)
 
 
-def load(path: str | Path) -> Fit:
+def load_fit(path: str | Path) -> Fit:
     """Read a fit from a model file, as `Fit.save` and `jaxid identify` write it.
 
     Numbers are the same to the last bit, and everything works as it did after

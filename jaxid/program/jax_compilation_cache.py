@@ -16,7 +16,7 @@ MAX_BYTES = 2**28
 """Maximum size of the cache [bytes]: some hundreds of functions."""
 
 
-def keep_compiled(folder: str | Path | None = None) -> Path | None:
+def enable_compilation_cache(folder: str | Path | None = None) -> Path | None:
     """Store compiled functions on disk, where the next process finds them.
 
     The commands call it; call it first in a notebook. A cache that JAX was given

@@ -17,7 +17,7 @@ from jaxid.errors import InputError
 from jaxid.identification.estimators.regularisation_and_weights import (
     LARGEST_UNCERTAINTY,
 )
-from jaxid.identification.fit_result import Fit, load
+from jaxid.identification.fit_result import Fit, load_fit
 from jaxid.identification.parameter_changes import (
     LEVEL,
     Comparison,
@@ -156,7 +156,7 @@ def read_fit(report: Path) -> Fit:
         raise InputError(
             f"`{report}` must be a folder of `jaxid identify`, but holds no `{MODEL}`."
         )
-    return load(path)
+    return load_fit(path)
 
 
 def read_faults(report: Path) -> list[str]:

@@ -20,7 +20,7 @@ from jaxid.cli.options import Terminal
 from jaxid.errors import InputError
 from jaxid.experiment.template import toml_text
 from jaxid.export import c_code
-from jaxid.identification.fit_result import checksum_of, load
+from jaxid.identification.fit_result import checksum_of, load_fit
 from jaxid.program.c_writer import CWriter
 from jaxid.report.page import render_page
 from jaxid.result_table import Column, Remark, Table, printable
@@ -191,7 +191,7 @@ def test_names_of_robots_and_texts_of_model_files(fit, tmp_path):
             lying = {**document, "model": content, "checksum": checksum_of(content)}
             path.write_text(json.dumps(lying))
             with pytest.raises(InputError, match=r"printable|date"):
-                load(path)
+                load_fit(path)
     for text in hostile(100, lambda x: not x.isprintable()):
         with pytest.raises(InputError, match="must be printable"):
             fit.base.model.robot.replace(name=text)

@@ -46,7 +46,7 @@ def same(a, b):
 
 
 def test_everything_comes_back_bit_for_bit(fit, path):
-    loaded = jid.load(path)
+    loaded = jid.load_fit(path)
     same(loaded, fit)
     assert loaded.checksum == fit.checksum
     assert loaded.date == fit.date != ""
@@ -59,7 +59,7 @@ def test_a_consistent_fit_keeps_bodies_and_verdict(tmp_path):
     base = planar_base()
     log = observations(base.model, standard_parameters(base.model), noise=0.1)
     fit = jid.identify(base, log, jid.PhysicallyConsistent(throw=False))
-    loaded = jid.load(fit.save(tmp_path / "arm.json"))
+    loaded = jid.load_fit(fit.save(tmp_path / "arm.json"))
     same(loaded, fit)
     assert loaded.consistency.certified == fit.consistency.certified
 
@@ -101,7 +101,7 @@ def test_only_known_classes_of_the_family_are_looked_up():
 def test_an_estimator_with_functions_is_kept_in_words(fit, tmp_path):
     log = observations(fit.base.model, standard_parameters(fit.base.model))
     fit = dataclasses.replace(fit, estimator=EstimatorOfOnesOwn())
-    loaded = jid.load(fit.save(tmp_path / "arm.json"))
+    loaded = jid.load_fit(fit.save(tmp_path / "arm.json"))
     assert str(loaded.estimator) == str(fit.estimator)
     assert loaded.checksum == fit.checksum
     with pytest.raises(ValueError, match="`estimator`"):
@@ -144,7 +144,7 @@ def test_a_wrong_model_file_is_refused_in_one_sentence(path, change, message):
         document["checksum"] = checksum_of(document["model"])
     path.write_text(json.dumps(document), encoding="utf-8")
     with pytest.raises(ValueError, match=message) as error:
-        jid.load(path)
+        jid.load_fit(path)
     assert str(path) in str(error.value)
 
 
@@ -153,4 +153,4 @@ def test_other_documents_are_refused(tmp_path, text):
     path = tmp_path / "arm.json"
     path.write_text(text, encoding="utf-8")
     with pytest.raises(ValueError, match="is no model file"):
-        jid.load(path)
+        jid.load_fit(path)

@@ -228,5 +228,5 @@ def test_what_cannot_have_memory_says_so():
 def test_a_model_file_keeps_the_memory(tmp_path):
     log, _ = log_of(1000)
     fit = jid.identify(jid.base_parameters(model_of(Presliding(LENGTHS))), log)
-    again = jid.load(fit.save(tmp_path / "model.json"))
+    again = jid.load_fit(fit.save(tmp_path / "model.json"))
     np.testing.assert_array_equal(again.predict(log.motion), fit.predict(log.motion))

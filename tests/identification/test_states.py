@@ -139,7 +139,7 @@ def test_an_update_equals_the_joint_fit(base, truths):
         for s in range(3)
     ]
     one, two, three = (jid.identify(base, o) for o in logs)
-    together, updated = jid.identify(base, logs[:2]), jid.update(one, two)
+    together, updated = jid.identify(base, logs[:2]), jid.combine_fits(one, two)
     np.testing.assert_allclose(updated.parameters, together.parameters, rtol=1e-11)
     deviations = updated.standard_deviations
     np.testing.assert_allclose(deviations, together.standard_deviations, rtol=0.2)
@@ -147,7 +147,7 @@ def test_an_update_equals_the_joint_fit(base, truths):
     np.testing.assert_allclose(updated.residual_rms, together.residual_rms, rtol=1e-9)
     all_three = jid.identify(base, logs).parameters
     np.testing.assert_allclose(
-        jid.update(updated, three).parameters, all_three, rtol=1e-11
+        jid.combine_fits(updated, three).parameters, all_three, rtol=1e-11
     )
 
 
@@ -156,15 +156,15 @@ def test_fits_with_weights_of_their_own_keep_them(base, truths, logs):
     third = observations(base.model, truths[0], noise=NOISE, seed=3, noise_seed=3)
     one, two, three = (jid.identify(base, o, estimator) for o in (*logs, third))
     assert np.abs(one.weights / two.weights - 1).max() > 1e-6
-    updated, E = jid.update(one, two), np.eye(base.size)
+    updated, E = jid.combine_fits(one, two), np.eye(base.size)
     np.testing.assert_allclose(updated.parameters, combine((one, two), (E, E))[0])
-    again = jid.update(updated, three)
+    again = jid.combine_fits(updated, three)
     R, z = again.factor
     np.testing.assert_allclose(
         np.linalg.lstsq(R, z, rcond=None)[0], again.parameters, rtol=1e-9
     )
     for twice in (
-        lambda: jid.update(again, one),
+        lambda: jid.combine_fits(again, one),
         lambda: jid.identify_payload(one, one),
     ):
         with pytest.raises(
@@ -180,7 +180,7 @@ def test_a_fit_that_leaves_something_open_still_helps(base, truths):
     )
     one, poor = jid.identify(base, full), jid.identify(base, still)
     assert np.isinf(np.diag(poor.covariance)).any()
-    updated = jid.update(one, poor)
+    updated = jid.combine_fits(one, poor)
     together = jid.identify(base, [full, still])
     np.testing.assert_allclose(updated.parameters, together.parameters, rtol=1e-8)
     assert np.isfinite(updated.covariance).all()
@@ -195,7 +195,7 @@ def test_a_fit_that_leaves_something_open_still_helps(base, truths):
 def test_other_estimates_are_solved_again_from_their_factors(base, logs, fits):
     robust = jid.identify(base, logs[0], jid.estimators.IterativelyReweighted())
     assert not robust.is_least_squares
-    updated = [jid.update(one, fits[1]).parameters for one in (robust, fits[0])]
+    updated = [jid.combine_fits(one, fits[1]).parameters for one in (robust, fits[0])]
     np.testing.assert_allclose(*updated, rtol=1e-9)
 
 

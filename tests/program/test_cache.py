@@ -12,13 +12,13 @@ import pytest
 
 from jaxid.errors import InputError
 from jaxid.program import jax_compilation_cache as cache
-from jaxid.program.jax_compilation_cache import keep_compiled
+from jaxid.program.jax_compilation_cache import enable_compilation_cache
 
 SCRIPT = """
 import jax, numpy as np
 jax.config.update("jax_enable_x64", True)
-from jaxid.program.jax_compilation_cache import keep_compiled
-print(keep_compiled())
+from jaxid.program.jax_compilation_cache import enable_compilation_cache
+print(enable_compilation_cache())
 hits = []
 jax.monitoring.register_event_listener(lambda name, **_: hits.append(name))
 
@@ -77,25 +77,27 @@ def test_the_second_process_compiles_nothing(tmp_path):
 
 def test_it_can_be_moved_and_turned_off(updates, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    assert keep_compiled() == tmp_path / "jaxid" / "compiled"
+    assert enable_compilation_cache() == tmp_path / "jaxid" / "compiled"
     assert updates["jax_compilation_cache_dir"] == str(tmp_path / "jaxid" / "compiled")
-    assert keep_compiled(tmp_path / "other") == tmp_path / "other" / "compiled"
+    assert (
+        enable_compilation_cache(tmp_path / "other") == tmp_path / "other" / "compiled"
+    )
     updates.clear()
     for off in ("", "0", "OFF", "none"):
         monkeypatch.setenv(cache.VARIABLE, off)
-        assert keep_compiled() is None
+        assert enable_compilation_cache() is None
     (tmp_path / "file").write_text("")
-    assert keep_compiled(tmp_path / "file" / "cache") is None
+    assert enable_compilation_cache(tmp_path / "file" / "cache") is None
     present = property(lambda _: str(tmp_path))
     monkeypatch.setattr(type(jax.config), "jax_compilation_cache_dir", present)
-    assert keep_compiled() == tmp_path
+    assert enable_compilation_cache() == tmp_path
     assert not updates
 
 
 @pytest.mark.usefixtures("updates")
 def test_the_least_recently_used_go_first_and_no_other_file(tmp_path, monkeypatch):
     monkeypatch.setattr(cache, "MAX_BYTES", 2500)
-    place, now = keep_compiled(tmp_path), time.time()
+    place, now = enable_compilation_cache(tmp_path), time.time()
     others = [
         folder / name
         for folder in (tmp_path, place)
@@ -104,7 +106,7 @@ def test_the_least_recently_used_go_first_and_no_other_file(tmp_path, monkeypatc
     for age, path in enumerate([*others, *(place / f"{x}-cache" for x in "edcba")]):
         path.write_bytes(bytes(1000))
         os.utime(path, (now - 1000 * age, now - 1000 * age))
-    keep_compiled(tmp_path)
+    enable_compilation_cache(tmp_path)
     assert sorted(p.name for p in place.glob("*-cache")) == ["d-cache", "e-cache"]
     assert all(path.exists() for path in others)
 
@@ -114,7 +116,7 @@ def test_the_least_recently_used_go_first_and_no_other_file(tmp_path, monkeypatc
 def test_only_its_owner_can_write_to_it(tmp_path, monkeypatch):
     before = os.umask(0)
     try:
-        place = keep_compiled(tmp_path / "deep" / "cache")
+        place = enable_compilation_cache(tmp_path / "deep" / "cache")
     finally:
         os.umask(before)
     made = [place, *place.parents][:3]
@@ -122,8 +124,8 @@ def test_only_its_owner_can_write_to_it(tmp_path, monkeypatch):
     for folder in made[:2]:
         folder.chmod(0o770)
         with pytest.raises(InputError, match="others can write to it"):
-            keep_compiled(tmp_path / "deep" / "cache")
+            enable_compilation_cache(tmp_path / "deep" / "cache")
         folder.chmod(0o700)
     monkeypatch.setattr(os, "getuid", lambda: place.stat().st_uid + 1)
     with pytest.raises(InputError, match="belongs to somebody else"):
-        keep_compiled(tmp_path / "deep" / "cache")
+        enable_compilation_cache(tmp_path / "deep" / "cache")

@@ -21,7 +21,7 @@ import jax, numpy as np
 jax.config.update("jax_enable_x64", True)
 import jaxid as jid
 from virtual import observations, standard_parameters
-from jaxid.identification.many_processes import factorise_across_processes
+from jaxid.identification.multihost import factorise_across_processes
 
 if len(sys.argv) > 3:
     # Before anything else: making a robot may already start JAX.
@@ -70,7 +70,7 @@ np.testing.assert_allclose(fit.parameters, alone.parameters, rtol=1e-10)
 SHARDS = """
 from pathlib import Path
 columns = jid.Columns(angles="q{}", forces="tau{}", sample_time=1e-3)
-paths = jid.devices.shards(sys.argv[4])
+paths = jid.multihost.shards(sys.argv[4])
 assert 1 <= len(paths) <= 2, paths
 logs = [jid.scan_log(p, columns, base.model.robot, jid.ZeroPhaseButterworth(20.0)) for p in paths]
 problem = factorise_across_processes(base, logs, patience=60.0)
@@ -178,10 +178,10 @@ def test_processes_read_their_own_shards(base, tmp_path):
     ]
     outputs = finish(*processes)
     assert [p.returncode for p in processes] == [0] * count, "\n\n".join(outputs)
-    assert len(jid.devices.shards(folder)) == 3
+    assert len(jid.multihost.shards(folder)) == 3
     logs = [
         jid.scan_log(p, columns, base.model.robot, jid.ZeroPhaseButterworth(20.0))
-        for p in jid.devices.shards(folder)
+        for p in jid.multihost.shards(folder)
     ]
     fit = jid.identify(base, logs, jid.estimators.LeastSquares())
     results = list(map(np.load, paths))
