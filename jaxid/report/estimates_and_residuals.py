@@ -15,7 +15,8 @@ from jaxid.result_table import Status, percent, shortened, significant, with_dev
 from jaxid.robot.robot import Robot
 from jaxid.validation.torque_errors import TorqueErrors
 
-from .figure import BLUE, GREY, MEASURED, ORANGE, PALE, VERMILION, Curve, Figure, Panel
+from .figure import Figure
+from .figure_elements import BLUE, GREY, MEASURED, ORANGE, PALE, VERMILION, Curve, Panel
 from .torques import require_joints
 
 CEILING = 1000.0

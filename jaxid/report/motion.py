@@ -16,13 +16,13 @@ from jaxid.robot.forward_and_inverse_kinematics import placements, tip_placement
 from jaxid.robot.limits_and_drives import Limits
 from jaxid.robot.robot import Robot
 
-from .figure import (
+from .figure import Figure
+from .figure_elements import (
     CYCLE,
     MEASURED,
     PREDICTED,
     VERMILION,
     Curve,
-    Figure,
     Panel,
     Scene,
     Solids,

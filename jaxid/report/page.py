@@ -20,7 +20,7 @@ from jaxid.result_table import (
     versions,
 )
 
-from .figure import Figure
+from .figure_elements import Drawing
 from .interactive import charts, library
 
 Section = tuple[str, Sequence[Any]]
@@ -66,7 +66,7 @@ def _render(block: Any) -> Markup:
             return Markup(in_html("headline", block))
         case Table():
             return Markup(in_html("table", block))
-        case Figure():
+        case Drawing():
             return picture(block)
         case tuple():
             return macros.abreast(*map(_render, block))
@@ -74,7 +74,7 @@ def _render(block: Any) -> Markup:
             return Markup(in_html("remarks", block))
 
 
-def picture(figure: Figure, caption: str = "") -> Markup:
+def picture(figure: Drawing, caption: str = "") -> Markup:
     """Return a block with a figure, and a text below it."""
     return _macros().figure(figure, charts(figure), caption)
 

@@ -8,75 +8,97 @@ import matplotlib.style
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure as Drawing
+from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatter, MaxNLocator
 from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
-from .figure import GREY, INK, VERMILION, Curve, Figure, Panel, Scene, decimate
+from .figure_elements import (
+    GREY,
+    INK,
+    VERMILION,
+    Curve,
+    Drawing,
+    Panel,
+    Scene,
+    decimate,
+)
 
 STYLE = ["default", Path(__file__).with_name("figures.mplstyle")]
 """Settings of matplotlib, which stay within this module."""
+LINE_BINS = 700
+"""Bins of a long line, about as many as it has pixel columns."""
+TITLE_HEIGHT = 0.9
+"""Height of title and legend [inch]."""
+SMALL_SIZE = 7.5
+"""Size of the texts beside names and on bars [pt]."""
+DATED_ENTRIES = {"png": "Software", "pdf": "CreationDate", "svg": "Date"}
+"""Entry of a file that differs from day to day, or with the version of matplotlib."""
 
 
-def draw(figure: Figure) -> Drawing:
+def draw(drawing: Drawing) -> Figure:
     """Return a figure as matplotlib draws it."""
-    rows = math.ceil(len(figure.panels) / figure.columns) or 2
+    # A scene is as high as two rows of panels.
+    rows = math.ceil(len(drawing.panels) / drawing.columns) or 2
+    size = (drawing.width, TITLE_HEIGHT + drawing.height * rows)
     with matplotlib.style.context(STYLE):
         # The figure belongs to no window and no list of figures.
-        drawn = Drawing(
-            figsize=(figure.width, 0.9 + figure.height * rows), layout="constrained"
+        figure = Figure(figsize=size, layout="constrained")
+        FigureCanvasAgg(figure)
+        figure.suptitle(
+            drawing.title, x=0.01, ha="left", fontsize=12, fontweight="bold"
         )
-        FigureCanvasAgg(drawn)
-        drawn.suptitle(figure.title, x=0.01, ha="left", fontsize=12, fontweight="bold")
-        if figure.scene is not None:
-            _draw_scene(drawn, figure.scene)
-            return drawn
-        grid = drawn.add_gridspec(rows, figure.columns)
-        for place, panel in enumerate(figure.panels):
-            drawn.align_ylabels(
-                _draw_stack(drawn, grid[divmod(place, figure.columns)], panel)
-            )
-        labelled = [axes.get_legend_handles_labels() for axes in drawn.axes]
-        entries = {name: x for pair in labelled for x, name in zip(*pair, strict=True)}
-        drawn.legend(
-            [entries[name] for name, _ in figure.legend],
-            [name for name, _ in figure.legend],
-            loc="outside lower left",
-            ncols=4,
-        )
-    return drawn
+        if drawing.scene is not None:
+            _draw_scene(figure, drawing.scene)
+            return figure
+        grid = figure.add_gridspec(rows, drawing.columns)
+        for number, panel in enumerate(drawing.panels):
+            cell = grid[divmod(number, drawing.columns)]
+            figure.align_ylabels(_draw_stack(figure, cell, panel))
+        _draw_legend(figure, drawing)
+    return figure
 
 
-def save(figure: Figure, file: Any, suffix: str) -> None:
+def save(drawing: Drawing, file: Any, suffix: str) -> None:
     """Write a figure as PNG, PDF or SVG, without time or version in the file."""
-    unwanted = {"png": "Software", "pdf": "CreationDate"}.get(suffix, "Date")
-    drawn = draw(figure)
+    figure = draw(drawing)
+    metadata = {DATED_ENTRIES.get(suffix, "Date"): None}
     with matplotlib.style.context([*STYLE, {"svg.fonttype": "none"}]):
-        drawn.savefig(file, format=suffix, dpi=130, metadata={unwanted: None})
+        figure.savefig(file, format=suffix, dpi=130, metadata=metadata)
 
 
-def _draw_stack(drawn: Drawing, cell: Any, panel: Panel) -> list[Axes]:
+def _draw_legend(figure: Figure, drawing: Drawing) -> None:
+    """Draw one legend for all panels."""
+    handles = {}
+    for axes in figure.axes:
+        handles |= dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
+    names = [curve.name for curve in drawing.legend]
+    figure.legend(
+        [handles[name] for name in names], names, loc="outside lower left", ncols=4
+    )
+
+
+def _draw_stack(figure: Figure, cell: Any, panel: Panel) -> list[Axes]:
     """Draw a panel and those below it, and return their axes."""
     shares = [part.share for part in panel.parts]
-    stack = cell.subgridspec(len(shares), 1, height_ratios=shares)
-    found: list[Axes] = []
-    for k, part in enumerate(panel.parts):
-        axes = drawn.add_subplot(stack[k], sharex=found[0] if found else None)
+    grid = cell.subgridspec(len(shares), 1, height_ratios=shares)
+    stack: list[Axes] = []
+    for number, part in enumerate(panel.parts):
+        axes = figure.add_subplot(grid[number], sharex=stack[0] if stack else None)
         _draw_panel(axes, part)
-        last = k + 1 == len(shares)
-        axes.tick_params(labelbottom=last)
-        axes.set_xlabel(part.x if last else "")
-        found.append(axes)
-    return found
+        axes.tick_params(labelbottom=False)
+        stack.append(axes)
+    stack[-1].tick_params(labelbottom=True)
+    stack[-1].set_xlabel(panel.parts[-1].x)
+    return stack
 
 
 def _draw_panel(axes: Axes, panel: Panel) -> None:
-    for which in panel.log:
-        getattr(axes, f"set_{which}scale")("log")
-        getattr(axes, f"{which}axis").set_major_formatter(LogFormatter())
-    for which, level, colour in panel.levels:
-        line = axes.axvline if which == "x" else axes.axhline
-        line(level, color=colour, lw=0.7, ls="--" if level else "-", zorder=1)
+    for letter in panel.log:
+        axes.set(**{f"{letter}scale": "log"})
+        getattr(axes, f"{letter}axis").set_major_formatter(LogFormatter())
+    for direction, value, colour in panel.levels:
+        line = axes.axvline if direction == "x" else axes.axhline
+        line(value, color=colour, lw=0.7, ls="--" if value else "-", zorder=1)
     for curve in panel.curves:
         _draw_curve(axes, curve, panel.in_time)
     axes.set_title(panel.title, loc="left", fontweight="bold")
@@ -87,72 +109,89 @@ def _draw_panel(axes: Axes, panel: Panel) -> None:
     if panel.share < 1.0:
         axes.yaxis.set_major_locator(MaxNLocator(3, symmetric=True))
     if panel.x_names:
-        tilted = len(panel.x_names) > 10 or max(map(len, panel.x_names)) > 12
-        turn = {"rotation": 35, "ha": "right"} if tilted else {}
-        axes.set_xticks(np.arange(len(panel.x_names)), panel.x_names, **turn)
-        axes.grid(visible=False, axis="x")
+        _name_abscissas(axes, panel.x_names)
     if panel.y_names:
-        axes.set_yticks(np.arange(len(panel.y_names)), panel.y_names)
-        axes.set_ylim(len(panel.y_names) - 0.4, -0.6)
-        axes.grid(visible=False, axis="y")
-        beside = {
-            "transform": axes.get_yaxis_transform(),
-            "va": "center",
-            "fontsize": 7.5,
-        }
-        for place, text in enumerate(panel.beside):
-            axes.text(1.03, float(place), text, color=GREY, **beside)
+        _name_ordinates(axes, panel)
+
+
+def _name_abscissas(axes: Axes, names: Any) -> None:
+    """Write names instead of numbers, tilted where they are many or long."""
+    axes.set_xticks(np.arange(len(names)), names)
+    if len(names) > 10 or max(map(len, names)) > 12:
+        axes.tick_params("x", labelrotation=35)
+        for label in axes.get_xticklabels():
+            label.set_horizontalalignment("right")
+    axes.grid(visible=False, axis="x")
+
+
+def _name_ordinates(axes: Axes, panel: Panel) -> None:
+    """Write names instead of numbers, from the top, and texts to the right of the panel."""
+    axes.set_yticks(np.arange(len(panel.y_names)), panel.y_names)
+    axes.set_ylim(len(panel.y_names) - 0.4, -0.6)
+    axes.grid(visible=False, axis="y")
+    place = axes.get_yaxis_transform()
+    for row, text in enumerate(panel.beside):
+        axes.text(
+            1.03,
+            row,
+            text,
+            color=GREY,
+            transform=place,
+            va="center",
+            fontsize=SMALL_SIZE,
+        )
 
 
 def _draw_curve(axes: Axes, curve: Curve, in_time: bool) -> None:
+    x = curve.x
+    y = curve.y
     look: dict[str, Any] = {"color": curve.colour, "label": curve.name or "_"}
     match curve.kind:
         case "band":
-            axes.fill_between(curve.x, curve.low, curve.high, alpha=0.3, lw=0, **look)
+            axes.fill_between(x, curve.low, curve.high, alpha=0.3, lw=0, **look)
         case "bars":
-            bars = axes.bar(curve.x, curve.y, curve.width, **look)
+            bars = axes.bar(x, y, curve.width, **look)
             axes.bar_label(
-                bars, curve.texts, label_type="center", fontsize=7.5, color=INK
+                bars, curve.texts, label_type="center", fontsize=SMALL_SIZE, color=INK
             )
         case "intervals":
-            axes.hlines(curve.y, curve.low, curve.high, color=curve.colour, lw=1.4)
-            axes.scatter(curve.x, curve.y, s=16, zorder=3, **look)
+            axes.hlines(y, curve.low, curve.high, color=curve.colour, lw=1.4)
+            axes.scatter(x, y, s=16, zorder=3, **look)
         case "points":
-            axes.scatter(curve.x, curve.y, s=16, zorder=3, **look)
-        case _:
-            # As many bins as a line has pixel columns.
-            points = decimate(curve.x, curve.y, 700) if in_time else (curve.x, curve.y)
-            look |= {
-                "ls": "--" if curve.dashed else "-",
-                "marker": "o" if curve.marker else "",
-            }
-            axes.plot(*points, lw=curve.width, ms=2.6, **look)
+            axes.scatter(x, y, s=16, zorder=3, **look)
+        case "line":
+            if in_time:
+                x, y = decimate(x, y, LINE_BINS)
+            dashes = "--" if curve.dashed else "-"
+            marker = "o" if curve.marker else ""
+            axes.plot(x, y, lw=curve.width, ls=dashes, marker=marker, ms=2.6, **look)
 
 
-def _draw_scene(drawn: Drawing, scene: Scene) -> None:
+def _draw_scene(figure: Figure, scene: Scene) -> None:
     """Draw the robot in some poses, earlier ones paler, and the path of its end-effector."""
-    axes: Any = drawn.add_subplot(
+    axes: Any = figure.add_subplot(
         projection="3d", proj_type="ortho", elev=22.0, azim=-62.0
     )
     tip = scene.points[:, -1]
-    path = Line3DCollection(
-        np.stack([tip[:-1], tip[1:]], axis=1), color=VERMILION, lw=1.2
-    )
-    if scene.values is not None:
-        path = Line3DCollection(
-            np.stack([tip[:-1], tip[1:]], axis=1), cmap="viridis", lw=1.4
-        )
+    steps = np.stack([tip[:-1], tip[1:]], axis=1)
+    if scene.values is None:
+        path = Line3DCollection(steps, color=VERMILION, lw=1.2)
+    else:
+        path = Line3DCollection(steps, cmap="viridis", lw=1.4)
         path.set_array(scene.mean[:-1])
-        drawn.colorbar(path, ax=axes, shrink=0.7, label=scene.label)
+        figure.colorbar(path, ax=axes, shrink=0.7, label=scene.label)
     axes.add_collection3d(path, autolim=False)
-    poses = np.linspace(0, len(tip) - 1, min(scene.poses, len(tip))).round().astype(int)
-    for place, k in enumerate(poses, 1):
-        look = {"color": INK, "alpha": 0.16 + 0.84 * (place / len(poses)) ** 2}
-        axes.add_collection3d(
-            Line3DCollection(scene.bones[k], lw=2.4, **look), autolim=False
-        )
-        axes.scatter(*scene.points[k, :-1].T, s=18, **look)
-    low, high = scene.bones.min(axis=(0, 1, 2)), scene.bones.max(axis=(0, 1, 2))
+
+    count = min(scene.poses, len(tip))
+    poses = np.linspace(0, len(tip) - 1, count).round().astype(int)
+    for number, pose in enumerate(poses, 1):
+        opacity = 0.16 + 0.84 * (number / count) ** 2
+        bones = Line3DCollection(scene.bones[pose], lw=2.4, color=INK, alpha=opacity)
+        axes.add_collection3d(bones, autolim=False)
+        axes.scatter(*scene.points[pose, :-1].T, s=18, color=INK, alpha=opacity)
+
+    low = scene.bones.min(axis=(0, 1, 2))
+    high = scene.bones.max(axis=(0, 1, 2))
     axes.auto_scale_xyz(*np.stack([low, high], axis=1))
     axes.set_aspect("equal")
     axes.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")

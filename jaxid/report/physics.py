@@ -12,7 +12,8 @@ from jaxid.identification.fit_result import Fit
 from jaxid.result_table import Column, Table, percent, shortened, significant
 from jaxid.validation.torque_errors import TorqueErrors
 
-from .figure import BLUE, CYCLE, GREY, MEASURED, Curve, Figure, Panel
+from .figure import Figure
+from .figure_elements import BLUE, CYCLE, GREY, MEASURED, Curve, Panel
 from .motion import pose_figure
 
 ROWS = 2000

@@ -13,7 +13,8 @@ from jaxid.io import atomic_folder
 from jaxid.result_table import Column, Remark, Status, Table, significant
 from jaxid.rollout import PARAMETERS, RolloutErrors, ServoFit
 
-from .figure import ERROR, GREY, MEASURED, PREDICTED, Curve, Figure, Panel
+from .figure import Figure
+from .figure_elements import ERROR, GREY, MEASURED, PREDICTED, Curve, Panel
 from .page import Section, provenance, render_page
 from .result_files import header, plain, write_csv, write_json
 

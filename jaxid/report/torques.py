@@ -10,7 +10,8 @@ from jaxid.result_table import percent, shortened, significant
 from jaxid.robot.robot import Robot
 from jaxid.validation.torque_errors import TorqueErrors
 
-from .figure import (
+from .figure import Figure
+from .figure_elements import (
     BLUE,
     ERROR,
     GREEN,
@@ -20,7 +21,6 @@ from .figure import (
     PREDICTED,
     PURPLE,
     Curve,
-    Figure,
     Panel,
 )
 

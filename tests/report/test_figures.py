@@ -14,7 +14,7 @@ import pytest
 import jaxid as jid
 from jaxid.identification.uncertainty import ResidualSpectra
 from jaxid.report.estimates_and_residuals import autocorrelation
-from jaxid.report.figure import BLUE, ORANGE, decimate
+from jaxid.report.figure_elements import BLUE, ORANGE, decimate
 from jaxid.report.interactive import charts, library
 from jaxid.report.motion import pose_figure
 from jaxid.report.parameter_words import in_words
@@ -42,7 +42,7 @@ def unpacked(figure):
 
 
 def numbers(packed):
-    return np.frombuffer(base64.b64decode(packed["bdata"]), packed["dtype"])
+    return np.frombuffer(base64.b64decode(packed["floats"]), "<f4")
 
 
 def require_everything_inside(shown):
@@ -77,24 +77,26 @@ def test_torques_show_what_was_measured_and_predicted(fit, validation):
         said = upper.value.split(f" {unit} = ")[1].split(" %")[0]
         assert float(said) == pytest.approx(errors.mean_percent[j], rel=0.06)
     require_everything_inside(figure)
-    names = [name for name, _ in figure.legend]
+    names = [curve.name for curve in figure.legend]
     for shown, j in zip(unpacked(figure), range(2), strict=True):
-        assert [trace["name"] for trace in shown["data"]] == names
-        y = numbers(shown["data"][0]["y"])
+        assert [drawn["name"] for drawn in shown["curves"]] == names
+        y = numbers(shown["curves"][0]["y"])
         np.testing.assert_array_equal(y, errors.measured[:, j].astype("f4"))
-        assert [trace["yaxis"] for trace in shown["data"]] == ["y", "y", "y2"]
+        assert [drawn["panel"] for drawn in shown["curves"]] == [0, 0, 1]
 
 
 def test_a_page_keeps_the_peaks_of_a_long_log(errors_of):
     errors = errors_of(2, rows=60_000)
     errors.predicted[40_001, 1] = 1e4
     _, second = unpacked(jid.plot.torques(errors, arm_of(2)))
-    measured, predicted, difference = (numbers(trace["y"]) for trace in second["data"])
+    measured, predicted, difference = (
+        numbers(drawn["y"]) for drawn in second["curves"]
+    )
     assert len(measured) <= 4000
     assert predicted.max() == np.float32(1e4)
     assert difference.max() == np.float32(errors.errors[:, 1].max())
-    assert [second["data"][k]["x"] for k in (1, 2)] == [0, 0], "the same abscissas"
-    times = numbers(second["data"][0]["x"])
+    assert [second["curves"][k]["x"] for k in (1, 2)] == [0, 0], "the same abscissas"
+    times = numbers(second["curves"][0]["x"])
     assert abs(times[np.argmax(predicted)] - errors.time[40_001]) < 2 * 600.0 / 2000
 
 
@@ -244,9 +246,7 @@ def test_the_robot_in_space_is_a_chain_to_its_tip_coloured_by_values(motion):
     # The line from each joint has that joint's colour; the one from the ground has
     # none.
     np.testing.assert_allclose(colours[::3], [0.0, T[7], 2.0 * T[7]], atol=1e-6)
-    np.testing.assert_allclose(
-        numbers(shown["data"][0]["line"]["color"]), 1.5 * T, atol=1e-6
-    )
+    np.testing.assert_allclose(numbers(shown["mean"]), 1.5 * T, atol=1e-6)
     require_everything_inside(figure)
 
 

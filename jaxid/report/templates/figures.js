@@ -3,7 +3,9 @@
 (async () => {
   const charts = [...document.querySelectorAll(".chart")];
   const coarse = matchMedia("(hover: none)").matches;
-  const grey = "#7b8794", faint = "rgba(123, 135, 148, 0.28)";
+  const grey = "#7b8794", pale = "#d5dae0", sky = "#56B4E9", faint = "rgba(123, 135, 148, 0.28)";
+  const fromSmallToLarge = [[0, sky], [0.5, "#E69F00"], [1, "#D55E00"]];
+  const gap = 0.05; // between panels with one abscissa, relative to their height
   const options = {
     displaylogo: false, responsive: false, scrollZoom: false,
     displayModeBar: true,
@@ -12,6 +14,7 @@
   };
 
   const optionsOf = (chart) => (chart.content.frames ? { ...options, modeBarButtons: [["toImage", "resetCameraDefault3d"]] } : options);
+  const escaped = (text) => text.replace(/[&<>"']/g, (letter) => `&#${letter.charCodeAt(0)};`);
 
   async function unpack(text) {
     const bytes = Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
@@ -19,25 +22,128 @@
     return new Response(stream).text();
   }
 
-  function axis(own) {
-    const title = { ...own.title, font: { size: 12 }, standoff: 6 };
+  // Numbers come in single precision, as bytes.
+  function numbers(key, value) {
+    if (!value || value.floats === undefined) return value;
+    return new Float32Array(Uint8Array.from(atob(value.floats), (c) => c.charCodeAt(0)).buffer);
+  }
+
+  const looks = {
+    line: ({ colour, width, dashed, marker }) => ({
+      mode: marker ? "lines+markers" : "lines", marker: { size: 4 },
+      line: { color: colour, width: 0.4 + width, dash: dashed ? "dash" : "solid" },
+    }),
+    points: ({ colour }) => ({ mode: "markers", marker: { color: colour, size: 7, line: { color: grey, width: 1 } } }),
+    bars: ({ colour, width }) => ({ type: "bar", width, marker: { color: colour }, textposition: "none" }),
+    band: ({ x, low, high, colour }) => ({
+      mode: "lines", x: [...x, ...[...x].reverse()], y: [...high, ...[...low].reverse()],
+      fill: "toself", fillcolor: colour, line: { width: 0 }, opacity: 0.35, hoverinfo: "skip", hovertemplate: undefined,
+    }),
+    intervals: ({ x, low, high, colour }) => ({
+      mode: "markers", marker: { color: colour, size: 7 },
+      error_x: {
+        type: "data", symmetric: false, width: 0, thickness: 1.6, color: colour,
+        array: high.map((end, k) => end - x[k]), arrayminus: low.map((end, k) => x[k] - end),
+      },
+    }),
+  };
+
+  const axisNumber = (panel) => (panel ? String(panel + 1) : "");
+
+  function traceOf(curve, { panels, curves }) {
+    if (Number.isInteger(curve.x)) curve.x = curves[curve.x].x;
+    const panel = panels[curve.panel], label = escaped(curve.name || panel.y || panel.title);
+    const hover = curve.texts.length ? "%{text}" : `${label}: %{y:.4~g} ${escaped(panel.unit)}`;
+    return {
+      type: "scatter", name: label, legendgroup: curve.name, x: curve.x, y: curve.y, yaxis: `y${axisNumber(curve.panel)}`,
+      text: curve.texts.map(escaped), hovertemplate: `${hover}<extra></extra>`, ...looks[curve.kind](curve),
+    };
+  }
+
+  function axis(label, range, logarithmic, names) {
+    const title = { text: escaped(label), font: { size: 12 }, standoff: 6 };
     const look = { gridcolor: faint, zeroline: false, linecolor: grey, automargin: true };
-    return { ticks: "outside", ticklen: 3, tickcolor: grey, ...look, ...own, title };
+    return {
+      ticks: "outside", ticklen: 3, tickcolor: grey, ...look, title,
+      ...(logarithmic && { type: "log", exponentformat: "power" }),
+      ...(range && { range: logarithmic ? range.map(Math.log10) : range }),
+      ...(names.length && { tickvals: [...names.keys()], ticktext: names.map(escaped), autotickangles: [0, 90] }),
+    };
+  }
+
+  function axesOf(panels) {
+    const [{ x, x_range, log, x_names }] = panels, total = panels.reduce((sum, panel) => sum + panel.share, 0);
+    const axes = { xaxis: { ...axis(x, x_range, log.includes("x"), x_names), anchor: `y${axisNumber(panels.length - 1)}` } };
+    let top = 1;
+    panels.forEach((panel, k) => {
+      const bottom = Math.max(0, top - panel.share / total), names = panel.y_names;
+      axes[`yaxis${axisNumber(k)}`] = {
+        ...axis(panel.y_label, panel.y_range, panel.log.includes("y"), names), domain: [k + 1 < panels.length ? bottom + gap : 0, top],
+        ...(names.length && { range: [names.length - 0.4, -0.6] }), ...(panel.share < 1 && { nticks: 4 }),
+      };
+      top = bottom;
+    });
+    return axes;
+  }
+
+  function levelOf([which, value, colour], panel) {
+    const line = { color: colour, width: 1, dash: value ? "dash" : "solid" }, y = `y${axisNumber(panel)}`;
+    const across = which === "x" ? { x0: value, x1: value, y0: 0, y1: 1 } : { x0: 0, x1: 1, y0: value, y1: value };
+    const axes = which === "x" ? { xref: "x", yref: `${y} domain` } : { xref: "x domain", yref: y };
+    return { type: "line", layer: "below", line, ...across, ...axes };
+  }
+
+  function panelsOf({ panels, curves }) {
+    const lines = curves.every((curve) => curve.kind === "line" || curve.kind === "band");
+    const shapes = panels.flatMap((panel, k) => panel.levels.map((level) => levelOf(level, k)));
+    return { ...axesOf(panels), shapes, hovermode: lines || panels[0].x_names.length ? "x" : "closest" };
+  }
+
+  // Vertices of the shapes at a frame, one list for each axis; the ground has no place.
+  function placed({ vertices, bodies, places }, frame) {
+    return [0, 1, 2].map((i) => vertices.map((v, n) => {
+      const at = places[frame][bodies[n]];
+      return at ? at[4 * i] * v[0] + at[4 * i + 1] * v[1] + at[4 * i + 2] * v[2] + at[4 * i + 3] : v[i];
+    }));
+  }
+
+  // The path of the end-effector, the robot and the shapes around it.
+  function bodiesOf({ path, mean, label, largest, frames }) {
+    const scale = largest === null ? {} : { colorscale: fromSmallToLarge, cmin: 0, cmax: largest };
+    const title = { text: escaped(label), side: "top" };
+    const colorbar = { title, thickness: 10, orientation: "h", len: 0.6, y: 0, yanchor: "bottom" };
+    const trace = { type: "scatter3d", hoverinfo: "skip", showlegend: false };
+    const line = { color: mean, width: 4, showscale: largest !== null, colorbar, ...scale };
+    const marker = { size: 5, color: pale, line: { color: grey, width: 2 } };
+    const traces = [
+      { ...trace, mode: "lines", ...path, line },
+      { ...trace, mode: "lines+markers", line: { width: 14, color: grey, ...scale }, marker },
+    ];
+    if (frames.solids) {
+      const { faces, bodies } = frames.solids, [x, y, z] = placed(frames.solids, 0);
+      const [i, j, k] = [0, 1, 2].map((corner) => faces.map((face) => face[corner]));
+      const facecolor = i.map((vertex) => (bodies[vertex] < 0 ? grey : sky));
+      traces.push({ ...trace, type: "mesh3d", x, y, z, i, j, k, facecolor, opacity: 0.25, lighting: { ambient: 0.9 } });
+    }
+    return traces;
+  }
+
+  function sceneOf(chart) {
+    const plane = { gridcolor: grey, zerolinecolor: grey, backgroundcolor: "rgba(0,0,0,0)" };
+    const away = widthOf(chart) < 500 ? 1.35 : 1, eye = { x: away * 1.2, y: away * -1.5, z: away * 0.7 };
+    const scene = { aspectmode: "data", camera: { eye }, domain: { x: [0, 1], y: [0.12, 1] }, dragmode: "turntable" };
+    ["x", "y", "z"].forEach((name, k) => {
+      scene[`${name}axis`] = { ...plane, title: { text: `${name} [m]` }, range: chart.content.ranges[k] };
+    });
+    return scene;
   }
 
   function layoutOf(chart) {
-    const own = chart.content.layout, layout = { ...own };
-    for (const key of Object.keys(own)) if (/axis/.test(key)) layout[key] = axis(own[key]);
-    if (own.scene) {
-      const plane = { gridcolor: grey, zerolinecolor: grey, backgroundcolor: "rgba(0,0,0,0)" };
-      layout.scene = { ...own.scene, dragmode: "turntable" };
-      const { x, y, z } = own.scene.camera.eye, away = widthOf(chart) < 500 ? 1.35 : 1;
-      layout.scene.camera = { eye: { x: away * x, y: away * y, z: away * z } };
-      for (const key of ["xaxis", "yaxis", "zaxis"]) layout.scene[key] = { ...plane, ...own.scene[key] };
-    }
-    const margin = own.scene ? { l: 0, r: 0, t: 0, b: 0 } : { l: 52, r: 8, t: coarse ? 28 : 8, b: 40 };
+    const inSpace = Boolean(chart.content.frames);
+    const layout = inSpace ? { scene: sceneOf(chart) } : panelsOf(chart.content);
+    const margin = inSpace ? { l: 0, r: 0, t: 0, b: 0 } : { l: 52, r: 8, t: coarse ? 28 : 8, b: 40 };
     return {
-      ...layout, margin, showlegend: false, dragmode: own.scene ? undefined : coarse ? false : "zoom",
+      ...layout, margin, showlegend: false, dragmode: inSpace ? undefined : coarse ? false : "zoom",
       paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)", modebar: { bgcolor: "rgba(0,0,0,0)" }, bargap: 0.2, barmode: "overlay",
       font: { family: getComputedStyle(document.body).fontFamily, size: 12, color: grey },
       width: widthOf(chart), height: parseFloat(chart.style.height),
@@ -58,8 +164,8 @@
   function draw(chart) {
     if (drawn(chart)) return;
     chart.classList.add("drawn");
-    const { data, frames } = chart.content;
-    for (const trace of data) if (Number.isInteger(trace.x)) trace.x = data[trace.x].x;
+    const { content } = chart, { frames } = content;
+    const data = frames ? bodiesOf(content) : content.curves.map((curve) => traceOf(curve, content));
     Plotly.newPlot(chart, data, layoutOf(chart), optionsOf(chart));
     for (const button of chart.closest("figure").querySelectorAll("[data-curve][aria-pressed=false]"))
       show(chart, button.dataset.curve, false);
@@ -109,12 +215,6 @@
     slider.value = "0";
     chart.after(bar);
     let timer = 0;
-    function placed({ vertices, bodies, places }, k) {
-      return [0, 1, 2].map((i) => vertices.map((v, n) => {
-        const at = places[k][bodies[n]];
-        return at ? at[4 * i] * v[0] + at[4 * i + 1] * v[1] + at[4 * i + 2] * v[2] + at[4 * i + 3] : v[i];
-      }));
-    }
     function pose(k) {
       const { x, y, z } = frames.points[k];
       const change = { x: [x], y: [y], z: [z] };
@@ -156,7 +256,7 @@
     const code = document.createElement("script");
     code.textContent = await unpack(document.getElementById("library").textContent);
     document.head.append(code);
-    await Promise.all(charts.map(async (chart) => { chart.content = JSON.parse(await unpack(chart.dataset.chart)); }));
+    await Promise.all(charts.map(async (chart) => { chart.content = JSON.parse(await unpack(chart.dataset.chart), numbers); }));
   } catch (error) {
     charts.forEach((chart) => { chart.textContent = "This figure needs a browser of 2023 or later."; });
     throw error;

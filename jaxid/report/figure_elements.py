@@ -1,0 +1,218 @@
+"""Elements of figures: curves in panels, and a robot in space. How they look is told elsewhere.
+
+`templates/figures.js` draws them on pages, `paper.py` for papers and notebooks.
+"""
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from jaxid.arrays import AnyArray, Float, Int
+
+# The palette of Okabe and Ito, which colour-blind readers can tell apart.
+BLUE = "#0072B2"
+ORANGE = "#E69F00"
+VERMILION = "#D55E00"
+GREEN = "#009E73"
+PURPLE = "#CC79A7"
+SKY = "#56B4E9"
+INK = "#22262b"
+GREY = "#7b8794"
+PALE = "#d5dae0"
+MEASURED = "#9aa6b2"
+PREDICTED = VERMILION
+ERROR = BLUE
+CYCLE = (BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY, GREY)
+"""Colours of joints in one panel."""
+GAP_RATIO = 1.5
+"""Time between two samples, relative to the median, from which a line has a gap."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Curve:
+    """Line, points, bars, band or intervals in a panel."""
+
+    x: Any  # abscissas
+    y: Any  # ordinates
+    name: str = ""  # entry of the legend; curves of one name are one entry
+    colour: str = BLUE  # colour of all its parts
+    # a band lies between `low` and `high`, intervals lie along x between them
+    kind: Literal["line", "points", "bars", "band", "intervals"] = "line"
+    width: float = 1.0  # width of the line [pt], or of the bars
+    dashed: bool = False  # whether the line is dashed
+    marker: bool = False  # whether a line has dots
+    low: Any = None  # lower ends
+    high: Any = None  # upper ends
+    texts: Sequence[str] = ()  # text of each point; of bars written on them
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Panel:
+    """Axes with curves."""
+
+    curves: Sequence[Curve]  # what is drawn, the first one at the back
+    title: str = ""  # title, such as the name of a joint
+    value: str = ""  # measured value beside the title
+    x: str = "time [s]"  # label of the abscissa
+    y: str = ""  # label of the ordinate
+    unit: str = ""  # unit of the ordinate
+    log: str = ""  # logarithmic axes: `x`, `y` or both
+    # limits of abscissa and ordinate; those of the curves if None
+    x_range: tuple[float, float] | None = None
+    y_range: tuple[float, float] | None = None
+    # names of the abscissas 0, 1, …, instead of numbers
+    x_names: Sequence[str] = ()
+    # names of the ordinates 0, 1, … from the top, instead of numbers
+    y_names: Sequence[str] = ()
+    beside: Sequence[str] = ()  # texts to the right of these names
+    # thin lines across: `x` or `y`, value, colour
+    levels: Sequence[tuple[str, float, str]] = ()
+    # panels below this one with the same abscissa, smaller by their share
+    below: Sequence["Panel"] = ()
+    share: float = 1.0  # height relative to the first panel
+
+    @property
+    def parts(self) -> tuple["Panel", ...]:
+        """This panel and those below it."""
+        return (self, *self.below)
+
+    @property
+    def in_time(self) -> bool:
+        """Whether the abscissa is time, in which lines have gaps and may be long."""
+        return self.x.startswith("time")
+
+    @property
+    def y_label(self) -> str:
+        """Label of the ordinate with its unit."""
+        return f"{self.y} [{self.unit}]".lstrip() if self.unit else self.y
+
+
+class Solids(NamedTuple):
+    """Surfaces of triangles that move with the robot's bodies, or stand on the ground."""
+
+    # vertices in the frames of their bodies [m]
+    vertices: Float[np.ndarray, "vertices 3"]
+    bodies: Int[np.ndarray, " vertices"]  # body of each vertex; -1 is the ground
+    faces: Int[np.ndarray, "faces 3"]  # vertices of each triangle
+    # rotation and origin of each body at the frames of the scene, as [R r]
+    places: Float[np.ndarray, "frames bodies 3 4"]
+
+    @property
+    def placed(self) -> Float[np.ndarray, "frames vertices 3"]:
+        """Vertices in the frame of the ground [m]."""
+        ground = np.broadcast_to(np.eye(3, 4), (len(self.places), 1, 3, 4))
+        # Body -1, the ground, is the last one.
+        places = np.concatenate([self.places, ground], axis=1)[:, self.bodies]
+        rotated = np.einsum("fvij,vj->fvi", places[..., :3], self.vertices)
+        return rotated + places[..., 3]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Scene:
+    """Robot along a motion in space."""
+
+    time: Float[np.ndarray, " samples"]  # instants of the samples [s]
+    # origins of all bodies, and the end-effector [m]
+    points: Float[np.ndarray, "samples points 3"]
+    # body from whose origin the line to each point leads; -1 for the ground
+    links: tuple[int, ...]
+    frames: Int[np.ndarray, " frames"]  # samples at which the page shows the robot
+    poses: int = 6  # number of poses on paper
+    # values of the joints at the samples, as colours; None for none
+    values: Float[np.ndarray, "samples joints"] | None = None
+    label: str = ""  # name of the values, with their unit
+    # shapes of the robot and around it, on a page; None for none
+    solids: Solids | None = None
+
+    @property
+    def bones(self) -> Float[np.ndarray, "samples points 2 3"]:
+        """Lines from joint to joint, and to the end-effector."""
+        ground = np.zeros_like(self.points[:, :1])
+        # Link -1, the ground, is the last point.
+        starts = np.concatenate([self.points, ground], axis=1)[:, list(self.links)]
+        return np.stack([starts, self.points], axis=2)
+
+    @property
+    def mean(self) -> Float[np.ndarray, " samples"]:
+        """Mean of the values of all joints."""
+        if self.values is None:
+            return np.zeros(len(self.time))
+        return self.values.mean(axis=1)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Drawing:
+    """Panels with a title and one legend, or a robot in space.
+
+    Attributes:
+        title: Title above all panels.
+        panels: Panels, in rows from the left.
+        columns: Panels beside each other, where there is room.
+        height: Height of each panel with those below it [inch].
+        width: Width of all on paper [inch].
+        scene: Robot in space, in place of panels.
+        bins: Pixel columns of a line on a page: of longer lines each column keeps its
+            extremes.
+    """
+
+    title: str
+    panels: Sequence[Panel] = ()
+    columns: int = 1
+    height: float = 2.1
+    width: float = 11.0
+    scene: Scene | None = None
+    bins: int = 2000
+
+    @property
+    def parts(self) -> Iterator[Panel]:
+        """All panels, each followed by those below it."""
+        return (part for panel in self.panels for part in panel.parts)
+
+    @property
+    def legend(self) -> list[Curve]:
+        """The first curve of each name."""
+        entries: dict[str, Curve] = {}
+        for part in self.parts:
+            for curve in part.curves:
+                entries.setdefault(curve.name, curve)
+        entries.pop("", None)
+        return list(entries.values())
+
+
+def decimate(
+    time: Float[AnyArray, " rows"], values: Float[AnyArray, " rows"], bins: int
+) -> tuple[Float[np.ndarray, " points"], Float[np.ndarray, " points"]]:
+    """Return points of a line: all if they are few, else the least and largest of each bin.
+
+    A peak of one sample stays visible however long the log is. Gaps in time become NaN,
+    at which a line breaks; values that are NaN stay out of their bin.
+    """
+    times = np.asarray(time)
+    ordinates = np.asarray(values)
+    if len(times) < 2:
+        return times, ordinates
+    if len(times) <= 2 * bins:
+        steps = np.diff(times)
+        gaps = np.flatnonzero(steps > GAP_RATIO * np.median(steps)) + 1
+        return np.insert(times, gaps, np.nan), np.insert(ordinates, gaps, np.nan)
+
+    fractions = (times - times[0]) / (times[-1] - times[0])
+    row_bins = np.minimum((bins * fractions).astype(int), bins - 1)
+    first = np.flatnonzero(np.diff(row_bins, prepend=-1))
+    last = np.append(first[1:], len(times)) - 1
+    low = np.fmin.reduceat(ordinates, first)
+    high = np.fmax.reduceat(ordinates, first)
+
+    # Two points for each bin, in the order that follows the line from end to end.
+    falling = ordinates[last] < ordinates[first]
+    starts = np.where(falling, high, low)
+    ends = np.where(falling, low, high)
+    gaps = np.flatnonzero(np.diff(row_bins[first]) > 1) + 1
+    bin_times = np.stack([times[first], times[last]], axis=1)
+    bin_values = np.stack([starts, ends], axis=1)
+    return (
+        np.insert(bin_times, gaps, np.nan, axis=0).ravel(),
+        np.insert(bin_values, gaps, np.nan, axis=0).ravel(),
+    )
