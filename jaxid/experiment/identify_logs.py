@@ -30,7 +30,7 @@ from jaxid.identification.filter_selection import (
 from jaxid.identification.fit_result import Fit
 from jaxid.identification.identify import fit_problem
 from jaxid.identification.problem import RegressionProblem
-from jaxid.measurement.bags import is_bag
+from jaxid.measurement.log_files import is_bag_folder
 from jaxid.measurement.observations import Observations
 from jaxid.measurement.recording import NeedsMemory, Recording
 from jaxid.report.result_files import read_fit
@@ -186,7 +186,7 @@ def _without_bounds(experiment: Experiment) -> AbstractEstimator:
 
 def is_report(path: Path) -> bool:
     """Return whether a folder is an earlier report, and no bag."""
-    return path.is_dir() and not is_bag(path)
+    return path.is_dir() and not is_bag_folder(path)
 
 
 def earlier_run(experiment: Experiment, folder: Path) -> Fit:

@@ -1,7 +1,7 @@
 """Meaning and units of the columns of a log, and logs in SI units."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from jaxid.errors import InputError
 from jaxid.robot.limits_and_drives import per_joint
 from jaxid.units import Quantity, Unit
 
-from .log_files import LogTable, Selection, open_table
+from .log_files import LogTable, Selection, open_log_file
 from .recording import positive_time
 
 Units = Unit | tuple[Unit, ...]
@@ -171,11 +171,11 @@ class Log:
         """Return angles, velocities and forces of some rows, on the sides they were recorded."""
         arrays: dict[str, np.ndarray] = {}
         for table in self.tables:
-            part = table.read((c for c in table.channels if c != "time"), start, stop)
+            channels = [channel for channel in table.channels if channel != "time"]
+            part = table.read(channels, start, stop)
             for channel, names in part.channels.items():
-                arrays[channel] = np.concatenate(
-                    [part.numbers(name) for name in names], axis=1
-                )
+                blocks = [part.numbers(name) for name in names]
+                arrays[channel] = np.concatenate(blocks, axis=1)
         angles = arrays["angles"]
         for channel, array in arrays.items():
             if array.shape[1] != angles.shape[1]:
@@ -189,16 +189,16 @@ class Log:
     @property
     def bad_rows(self) -> dict[int, str]:
         """Complaints about rows that were read and are bad, by their positions."""
-        return {
-            k - table.first_row: f"{text} of `{table.source}`"
-            for table in self.tables
-            for k, text in (table.bad or {}).items()
-        }
+        complaints = {}
+        for table in self.tables:
+            for number, text in (table.bad_rows or {}).items():
+                complaints[number - table.first_row] = f"{text} of `{table.source}`"
+        return complaints
 
     def stamps(self, start: int = 0, stop: int | None = None) -> np.ndarray:
         """Return time stamps [s]; integers and dates count from `start`."""
-        stamps, dates = self.tables[0].read(("time",), start, stop).stamps()
-        return stamps if dates else stamps * self.columns.time_unit.factor
+        table = self.tables[0].read(("time",), start, stop)
+        return table.stamps(self.columns.time_unit.factor)
 
 
 def open_log(
@@ -208,37 +208,43 @@ def open_log(
     velocities_path: str | Path | None = None,
     *,
     on_disk: bool = False,
-    lenient: bool = False,
+    is_lenient: bool = False,
 ) -> Log:
     """Open the files of a log; with `on_disk`, texts and arrays stay on the disk.
 
-    With `lenient`, rows that cannot be read are no error: `Log.bad_rows` names them.
+    Rows that cannot be read are an error, unless `is_lenient`: then `Log.bad_rows`
+    names them.
     """
     if velocities_path is not None and columns.velocities is None:
         raise InputError(
             "`velocities_path` is given, but `Columns.velocities` names no columns."
         )
-    path = Path(path)
-    files: dict[Path, dict[str, Selection | None]] = {}
-    paths = {
-        "angles": path,
-        "forces": forces_path,
-        "velocities": velocities_path,
-        "time": path,
+    channels = {
+        "angles": (path, columns.angles),
+        "forces": (forces_path or path, columns.forces),
     }
-    for channel, own in paths.items():
-        selection = getattr(columns, channel)
-        if selection is not None or (channel == "time" and columns.sample_time is None):
-            files.setdefault(Path(own or path), {})[channel] = selection
-    tables = tuple(
-        open_table(file, chosen, on_disk, lenient) for file, chosen in files.items()
-    )
+    if columns.velocities is not None:
+        channels["velocities"] = (velocities_path or path, columns.velocities)
+    if columns.time is not None or columns.sample_time is None:
+        channels["time"] = (path, columns.time)
+
+    selections: dict[Path, dict[str, Selection | None]] = {}
+    for channel, (file_path, selection) in channels.items():
+        selections.setdefault(Path(file_path), {})[channel] = selection
+    tables = []
+    for file_path, file_selections in selections.items():
+        file = open_log_file(file_path, file_selections)
+        names = file.channels(file_selections)
+        tables.append(file.table(names, on_disk, is_lenient))
+    _require_equal_rows(tables)
+    return Log(tuple(tables), columns)
+
+
+def _require_equal_rows(tables: Sequence[LogTable]) -> None:
     first = tables[0]
     for table in tables:
         if table.rows != first.rows:
             raise InputError(
                 f"`{table.source}` has {table.rows} rows, but `{first.source}` has "
-                f"{first.rows}: "
-                "files of one run must agree row by row."
+                f"{first.rows}: files of one run must agree row by row."
             )
-    return Log(tables, columns)

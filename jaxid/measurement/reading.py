@@ -64,7 +64,7 @@ def read_recording(
         InputError: If a file, a column, a number or the time is invalid; the message
             names file, column and line.
     """
-    log = open_log(path, columns, forces_path, velocities_path, lenient=True)
+    log = open_log(path, columns, forces_path, velocities_path, is_lenient=True)
     angles, velocities, forces = log.read()
     time = None if columns.sample_time is not None else log.stamps()
     bad = log.bad_rows

@@ -19,9 +19,9 @@ JITTER = 0.05
 """Largest deviation of stamps from a uniform grid, in sample times, that is ignored."""
 REPEATED = 0.1
 """Distance of two stamps, in sample times, up to which their rows are one sample, logged twice."""
-LARGEST = 1e30
+MAX_NUMBER = 1e30
 """Largest number in a log, in any unit: its square still is finite."""
-FEWEST = 10
+MIN_SAMPLES = 10
 """Smallest number of samples that can be filtered."""
 
 
@@ -108,9 +108,9 @@ class Recording(eqx.Module):
             for key, x in channels.items()
         }
         samples = len(data["angles"])
-        if samples < FEWEST:
+        if samples < MIN_SAMPLES:
             raise InputError(
-                f"`{name}` has {samples} samples, but at least {FEWEST} are needed: "
+                f"`{name}` has {samples} samples, but at least {MIN_SAMPLES} are needed: "
                 "is the log cut?"
             )
         if (time is None) == (sample_time is None):
@@ -181,9 +181,9 @@ class Recording(eqx.Module):
             InputError: If a part has fewer than ten samples.
         """
         cut = round(fraction * self.samples)
-        if not FEWEST <= cut <= self.samples - FEWEST:
+        if not MIN_SAMPLES <= cut <= self.samples - MIN_SAMPLES:
             raise InputError(
-                f"`fraction` must leave at least {FEWEST} samples on both sides, but "
+                f"`fraction` must leave at least {MIN_SAMPLES} samples on both sides, but "
                 f"{fraction:g} "
                 f"of the {self.samples} samples of `{self.name}` leaves {cut}."
             )
@@ -206,11 +206,11 @@ def finite_channel(
             "for each "
             f"joint, like the angles with shape {shape}, but has shape {array.shape}."
         )
-    bad = np.argwhere(~(np.abs(array) <= LARGEST))
+    bad = np.argwhere(~(np.abs(array) <= MAX_NUMBER))
     if bad.size:
         row, joint = (int(i) for i in bad[0])
         raise InputError(
-            f"`{key}` of `{name}` must be finite and below {LARGEST:g}, but are "
+            f"`{key}` of `{name}` must be finite and below {MAX_NUMBER:g}, but are "
             f"{array[row, joint]:.3g} for joint {joint + 1} at row {row + first_row}: "
             "check the "
             "unit, or repair or remove that row."
@@ -247,7 +247,7 @@ def remove_delay(recording: Recording, seconds: float) -> Recording:
     require_finite_delay(seconds)
     lost = math.ceil(abs(seconds) / recording.sample_time - 1e-9)
     early, late = (lost, 0) if seconds > 0 else (0, lost)
-    whole = [(a, b) for a, b in recording.segments if b - a - lost >= FEWEST]
+    whole = [(a, b) for a, b in recording.segments if b - a - lost >= MIN_SAMPLES]
     if not whole:
         raise InputError(
             f"the delay is {seconds:g} s, but the longest segment of "
@@ -315,12 +315,12 @@ class TimeGrid(NamedTuple):
                 ranges.append((a + low, a + high))
                 times.append(t + low * dt)
         left = sum(b - a for a, b in ranges)
-        if left < FEWEST:
+        if left < MIN_SAMPLES:
             a, b = self.ranges[-1]
             raise InputError(
                 f"`{name}` has {left} samples from {start:g} s to {stop:g} s, but at "
                 "least "
-                f"{FEWEST} are needed: it lasts from {self.start_times[0]:g} s to "
+                f"{MIN_SAMPLES} are needed: it lasts from {self.start_times[0]:g} s to "
                 f"{self.start_times[-1] + (b - a - 1) * dt:g} s."
             )
         return self._replace(ranges=tuple(ranges), start_times=tuple(times))

@@ -15,7 +15,7 @@ from jaxid.identification.fit_result import Fit
 from jaxid.measurement.filters import ZeroPhaseButterworth
 from jaxid.measurement.observations import Observations, Progress, observe
 from jaxid.measurement.reading import AT_ONCE, SamplesOnDisk
-from jaxid.measurement.recording import FEWEST, Recording, consecutive
+from jaxid.measurement.recording import MIN_SAMPLES, Recording, consecutive
 from jaxid.result_table import (
     MISSING,
     Column,
@@ -275,7 +275,7 @@ def _excerpt(log: Observations, source: SamplesOnDisk) -> Recording:
         for (first, last), time in zip(log.segments, log.start_times, strict=True):
             a = max(first, start)
             b = min(last, start + length)
-            if b - a >= FEWEST:
+            if b - a >= MIN_SAMPLES:
                 parts.append(source.read_rows(slice(a, b)))
                 times.append(time + dt * (np.arange(a, b) - first))
     angles, velocities, forces = zip(*parts, strict=True)

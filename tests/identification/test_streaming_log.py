@@ -8,7 +8,7 @@ from virtual import motion, standard_parameters
 import jaxid as jid
 from jaxid.dynamics.dispatch import in_numpy
 from jaxid.identification import long_logs
-from jaxid.measurement import log_files
+from jaxid.measurement.log_files import text_files
 from jaxid.measurement.reading import scan_log
 from jaxid.measurement.recording import NeedsMemory
 
@@ -54,7 +54,7 @@ def text(parquet, tmp_path):
 
 @pytest.fixture
 def short_parts(monkeypatch):
-    monkeypatch.setattr(log_files, "BLOCK", 5000)
+    monkeypatch.setattr(text_files, "BLOCK_SIZE", 5000)
     monkeypatch.setattr("jaxid.measurement.reading.AT_ONCE", 3000)
 
 
@@ -152,8 +152,8 @@ def test_text_of_any_kind(base, numbers, tmp_path, separator, header, end, point
         ("15,x,0,0,0,0", "is `x`, no number"),
         ("15,0,,0,0,0", "is empty"),
         ("15,0,nan,0,0,0", "is not finite"),
-        ('15,0,",0,0,0', "opens a quotation"),
-        ("1,2,3,4,5,6,7", "line 15001 of `log.csv` has 7 cells, but there are 6"),
+        ('15,0,",0,0,0', "an open quotation"),
+        ("1,2,3,4,5,6,7", "line 15001 of `log.csv` is no row .7 cells, but 6 columns"),
     ],
 )
 def test_bad_rows_of_long_texts_are_named(base, text, row, complaint):

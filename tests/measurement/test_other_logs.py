@@ -3,6 +3,7 @@
 import dataclasses
 import importlib
 import sys
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -11,11 +12,14 @@ import pytest
 from mcap.writer import Writer as McapWriter
 from rosbags import rosbag1, rosbag2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from scipy.io import savemat
 
 from jaxid import units
 from jaxid.measurement.columns import Columns
+from jaxid.measurement.log_files import READERS, open_log_file
 from jaxid.measurement.reading import read_recording
 
+ROOT = Path(__file__).resolve().parents[2]
 JOINTS = ("shoulder", "elbow", "wrist")
 SAMPLES = 40
 START = 1_700_000_000_123_456_789
@@ -394,3 +398,62 @@ def test_turns_are_unwrapped(tmp_path):
     columns = Columns("q", "tau", sample_time=0.01, angle_unit=units.DEG, unwrap=True)
     found = read_recording(tmp_path / "a.npz", columns).angles
     np.testing.assert_allclose(found, angles, atol=1e-12)
+
+
+def write_table(path):
+    """Write the numbers as text or Parquet."""
+    groups = zip(("q", "dq", "tau"), numbers(), strict=True)
+    columns = {f"{name}{j}": x[:, j] for name, x in groups for j in range(3)}
+    table = pl.DataFrame({"t": START + STEP * np.arange(SAMPLES), **columns})
+    if path.suffix == ".parquet":
+        table.write_parquet(path)
+    else:
+        separators = {".csv": ",", ".tsv": "\t", ".txt": " ", ".dat": ";"}
+        table.write_csv(path, separator=separators[path.suffix])
+    return path
+
+
+def write_arrays(path):
+    """Write the numbers as whole arrays."""
+    content = dict(zip(("q", "dq", "tau"), numbers(), strict=True))
+    content["t"] = START + STEP * np.arange(SAMPLES)
+    if path.suffix == ".npz":
+        np.savez(path, **content)
+    elif path.suffix == ".mat":
+        savemat(path, content)
+    else:
+        with h5py.File(path, "w") as file:
+            file.update(content)
+    return path
+
+
+def write_db3(path):
+    (file,) = write_ros2(path.with_suffix(""), states(ROS2)).glob("*.db3")
+    return file
+
+
+TABLE = Columns("q{}", "tau{}", "dq{}", time="t", time_unit=units.NS)
+ARRAYS = Columns("q", "tau", "dq", time="t", time_unit=units.NS)
+READ_AS = {
+    **dict.fromkeys((".csv", ".tsv", ".txt", ".dat"), (write_table, TABLE)),
+    ".parquet": (write_table, TABLE),
+    **dict.fromkeys((".npz", ".mat", ".h5", ".hdf5"), (write_arrays, ARRAYS)),
+    ".mcap": (lambda path: write_mcap(path, states(ROS2)), BY_PLACE),
+    ".bag": (lambda path: write_ros1(path, states(ROS1)), BY_PLACE),
+    ".db3": (write_db3, BY_PLACE),
+}
+
+
+@pytest.mark.parametrize("suffix", list(READERS))
+def test_every_reader_gives_the_table_that_was_written(tmp_path, suffix):
+    write, columns = READ_AS[suffix]
+    path = write(tmp_path / f"log{suffix}")
+    check(read_recording(path, columns))
+
+    file = open_log_file(path, {})
+    assert f"`{suffix}`" in (ROOT / "docs" / "data.md").read_text(), "name it there"
+    assert len(set(file.names)) == len(file.names) > 3
+    assert file.estimated_rows() in (0, pytest.approx(SAMPLES, abs=1))
+    refused(path, Columns("hip", columns.forces, sample_time=0.1), "`hip`", path.name)
+    (tmp_path / f"cut{suffix}").write_bytes(b"")
+    refused(tmp_path / f"cut{suffix}", columns, f"`cut{suffix}`")

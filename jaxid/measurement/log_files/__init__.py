@@ -1,0 +1,15 @@
+"""Log files as tables of columns: texts, Parquet, arrays, and bags."""
+
+from .log_file import (
+    AbstractLogFile as AbstractLogFile,
+    Selection as Selection,
+    Selections as Selections,
+)
+from .log_table import LogTable as LogTable
+from .readers import (
+    READERS as READERS,
+    estimated_rows as estimated_rows,
+    is_bag_folder as is_bag_folder,
+    open_log_file as open_log_file,
+    summarise_columns as summarise_columns,
+)

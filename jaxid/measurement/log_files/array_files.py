@@ -1,0 +1,146 @@
+"""Files of arrays: NPZ, MAT of any version, and HDF5."""
+
+import abc
+import functools
+import zipfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxid.io import import_extra
+
+from .log_file import AbstractLogFile, Channels
+from .log_table import LogTable, readable
+
+
+class AbstractArrayFile(AbstractLogFile):
+    """File of arrays (samples, or samples x joints), whose columns are named like `q[0]`."""
+
+    @abc.abstractmethod
+    def load(self) -> dict[str, np.ndarray]:
+        """Return the arrays of the file by their names."""
+
+    @functools.cached_property
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Arrays of the file, and the columns of matrices."""
+        arrays = self.load()
+        columns = {}
+        for name, array in arrays.items():
+            # A matrix with more columns than rows is no log.
+            if array.ndim == 2 and array.shape[1] <= len(array):
+                for k in range(array.shape[1]):
+                    columns[f"{name}[{k}]"] = array[:, k]
+        return arrays | columns
+
+    @property
+    def names(self) -> Sequence[str]:  # noqa: D102
+        return tuple(self.arrays)
+
+    def table(self, channels: Channels, on_disk: bool, is_lenient: bool) -> LogTable:  # noqa: D102
+        bad_rows = {} if is_lenient else None
+        return LogTable(self.path.name, self.arrays, channels, bad_rows=bad_rows)
+
+
+class NpzFile(AbstractArrayFile):
+    """NPZ file of NumPy; arrays that are not compressed stay on the disk."""
+
+    def load(self):  # noqa: D102
+        return map_arrays(self.path) or read_npz(self.path)
+
+    def estimated_rows(self):  # noqa: D102
+        arrays = map_arrays(self.path) or {}
+        return max(map(len, arrays.values()), default=0)
+
+
+class MatFile(AbstractArrayFile):
+    """MAT file of MATLAB, of any version."""
+
+    def load(self):  # noqa: D102
+        return read_mat(self.path)
+
+
+class Hdf5File(AbstractArrayFile):
+    """HDF5 file; arrays in a group are named like `log.q`."""
+
+    def load(self):  # noqa: D102
+        return read_hdf5(self.path)
+
+
+def read_mat(path: Path) -> dict[str, np.ndarray]:
+    """Read the arrays of a MAT file of any version."""
+    from scipy.io import loadmat
+
+    with path.open("rb") as file:
+        head = file.read(516)
+    if b"\x89HDF" in head:
+        # Version 7.3 is HDF5, in which the arrays are transposed.
+        transposed = {name: array.T for name, array in read_hdf5(path).items()}
+        return _named_arrays(transposed)
+    with readable(path.name, "MAT file"):
+        content = loadmat(path, simplify_cells=True)
+    variables = {name: x for name, x in content.items() if not name.startswith("__")}
+    return _named_arrays(variables)
+
+
+def read_hdf5(path: Path) -> dict[str, np.ndarray]:
+    """Read the arrays of an HDF5 file but its images; those in a group are named like `log.q`."""
+    h5py = import_extra("h5py", "logs", f"`{path.name}` is read by")
+    with readable(path.name, "HDF5 file"), h5py.File(path, "r") as file:
+        return _named_arrays(file)
+
+
+def _named_arrays(
+    content: Mapping[str, Any], prefix: str = ""
+) -> dict[str, np.ndarray]:
+    """Return arrays by name; those in a structure are named like `log.q`."""
+    arrays: dict[str, np.ndarray] = {}
+    for key, value in content.items():
+        name = prefix + key
+        if isinstance(value, Mapping):
+            arrays |= _named_arrays(value, f"{name}.")
+        elif isinstance(value, np.ndarray) and value.ndim > 0:
+            # Single rows, as MATLAB writes them, are columns here.
+            arrays[name] = value.ravel() if 1 in value.shape else value
+        elif is_hdf5_array(value):
+            arrays[name] = value[()]
+    return arrays
+
+
+def is_hdf5_array(value: Any) -> bool:
+    """Return whether a value of an HDF5 file is an array of numbers, and no image."""
+    dimensions = getattr(value, "ndim", 0)
+    return dimensions in (1, 2) and value.dtype.itemsize > 1
+
+
+def read_npz(path: Path) -> dict[str, np.ndarray]:
+    """Read the arrays of an NPZ file; objects, which could run code, are rejected."""
+    kind = "NPZ file of plain arrays (`numpy.savez`, without objects)"
+    with readable(path.name, kind), path.open("rb") as file, np.load(file) as archive:
+        # A member that NumPy did not write comes as bytes, which are left out.
+        return _named_arrays({name: archive[name] for name in archive.files})
+
+
+def map_arrays(path: Path) -> dict[str, np.ndarray] | None:
+    """Map the arrays of an NPZ file into memory; None if one is compressed or none is there."""
+    arrays = {}
+    with (
+        readable(path.name, "NPZ file"),
+        zipfile.ZipFile(path) as archive,
+        path.open("rb") as file,
+    ):
+        for entry in archive.infolist():
+            if entry.compress_type != zipfile.ZIP_STORED:
+                return None
+            # Behind a local header of 30 bytes, whose last four tell the lengths of the
+            # two texts that follow it.
+            file.seek(entry.header_offset + 26)
+            lengths = np.frombuffer(file.read(4), "<u2")
+            file.seek(entry.header_offset + 30 + int(lengths.sum()))
+            np.lib.format.read_magic(file)
+            shape, is_fortran, dtype = np.lib.format.read_array_header_1_0(file)
+            order = "F" if is_fortran else "C"
+            array = np.memmap(path, dtype, "r", file.tell(), shape, order)
+            arrays[entry.filename.removesuffix(".npy")] = array
+    return _named_arrays(arrays) or None

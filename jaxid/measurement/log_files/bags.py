@@ -1,0 +1,274 @@
+"""Bags of ROS 1 and ROS 2 as columns, named like `/joint_states.position.shoulder`."""
+
+import contextlib
+import dataclasses
+import functools
+import itertools
+import re
+from array import array
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import polars as pl
+
+from jaxid.errors import InputError
+from jaxid.io import import_extra
+
+from .log_file import AbstractLogFile, Channels, Selections
+from .log_table import LogTable, readable
+
+STAMP = ".header.stamp"
+"""Field of a topic with the times of measurement."""
+RECORDING_TIME = ".log_time"
+"""Field of a topic with the times of recording."""
+CLOCK = "time"
+"""Column of the times that is taken if none is named."""
+MAX_ELEMENTS = 1000
+"""Elements of the largest array that is no picture or point cloud."""
+MAX_STEP_RATIO = 3.0
+"""Distance of two messages, in typical ones, up to which values between are interpolated."""
+
+
+class BagFile(AbstractLogFile):
+    """Bag of ROS, with fields of messages as columns."""
+
+    @functools.cached_property
+    def topics(self) -> "list[Topic]":
+        """Topics of the bag: all messages of those that are needed, one of each other."""
+        return read_bag(self.path, selected_topics(self.selections))
+
+    @property
+    def names(self) -> Sequence[str]:  # noqa: D102
+        return list(itertools.chain(*(topic.columns for topic in self.topics)))
+
+    @property
+    def clock(self) -> str:  # noqa: D102
+        return CLOCK
+
+    def table(self, channels: Channels, on_disk: bool, is_lenient: bool) -> LogTable:  # noqa: D102
+        names = list(itertools.chain(*channels.values()))
+        columns, notes = join_topics(self.path.name, self.topics, names)
+        bad_rows = {} if is_lenient else None
+        return LogTable(
+            self.path.name, columns, channels, bad_rows=bad_rows, notes=notes
+        )
+
+
+def selected_topics(selections: Selections) -> set[str]:
+    """Return the topics of columns, which are the parts of their names before a point."""
+    topics = set()
+    for selection in selections.values():
+        columns = selection if isinstance(selection, tuple) else [selection]
+        topics |= {str(column).partition(".")[0] for column in columns}
+    return topics
+
+
+class Topic(NamedTuple):
+    """Messages of a topic."""
+
+    stamps: array  # times of measurement [ns]; zeros if the messages have none
+    recording_times: array  # [ns]
+    columns: dict[str, tuple[array, array]]  # numbers of messages, and their values
+
+    def times(self, are_recorded: bool) -> np.ndarray:
+        """Return the times of recording of all messages, or those of measurement [ns]."""
+        return np.asarray(self.recording_times if are_recorded else self.stamps)
+
+
+class Field(NamedTuple):
+    """Numbers of one field of a message."""
+
+    name: str
+    elements: tuple[str, ...]  # endings of the name, such as `[0]` or `.shoulder`
+    values: Sequence[float]
+
+
+def read_bag(path: Path, selected: Collection[str]) -> list[Topic]:
+    """Read the messages of selected topics, and one message of each other topic."""
+    purpose = f"`{path.name}` is read by"
+    typesys = import_extra("rosbags.typesys", "logs", purpose)
+    highlevel = import_extra("rosbags.highlevel", "logs", purpose)
+    types = typesys.get_typestore(typesys.Stores.LATEST)
+    topics = []
+    with (
+        readable(path.name, "bag that defines its messages"),
+        highlevel.AnyReader([path], default_typestore=types) as bag,
+    ):
+        for name in dict.fromkeys(connection.topic for connection in bag.connections):
+            messages = _messages(bag, name)
+            if name in selected:
+                topics.append(_topic(name, messages))
+            else:
+                # The bag need not define messages that are not needed.
+                with contextlib.suppress(Exception):
+                    topics.append(_topic(name, itertools.islice(messages, 1)))
+    return topics
+
+
+def _messages(bag: Any, topic: str) -> Iterator[tuple[int, Any]]:
+    """Yield the messages of a topic with their times of recording [ns]."""
+    connections = [x for x in bag.connections if x.topic == topic]
+    for connection, time, data in bag.messages(connections):
+        yield time, bag.deserialize(data, connection.msgtype)
+
+
+def _topic(name: str, messages: Iterable[tuple[int, Any]]) -> Topic:
+    """Collect the numbers of messages by column."""
+    topic = Topic(array("q"), array("q"), {})
+    # Elements of each field in the order of their first message, by the set of them.
+    variants: dict[str, dict[frozenset[str], tuple[str, ...]]] = {}
+    for number, (time, message) in enumerate(messages):
+        topic.stamps.append(_stamp(message))
+        topic.recording_times.append(time)
+        for field in _fields(message, f"{name}.", {}):
+            orders = variants.setdefault(field.name, {})
+            orders.setdefault(frozenset(field.elements), field.elements)
+            for element, value in zip(field.elements, field.values, strict=True):
+                column = field.name + element
+                empty = (array("q"), array("d"))
+                rows, values = topic.columns.setdefault(column, empty)
+                rows.append(number)
+                values.append(value)
+
+    times = topic.recording_times
+    topic.columns[name + RECORDING_TIME] = times, times
+    for field, orders in variants.items():
+        _name_by_position(topic, field, [*orders.values()])
+    return topic
+
+
+def _stamp(message: Any) -> int:
+    """Return the time of measurement in the header of a message [ns]; 0 without one."""
+    header = getattr(message, "header", None)
+    stamp = getattr(header, "stamp", None)
+    return 0 if stamp is None else stamp.sec * 10**9 + stamp.nanosec
+
+
+def _name_by_position(
+    topic: Topic, field: str, orders: Sequence[tuple[str, ...]]
+) -> None:
+    """Give the elements of a field positions; remove those that mean nothing.
+
+    Positions mean nothing if messages differ in their elements, as those of two robots
+    on one topic do.
+    """
+    columns = topic.columns
+    if len(orders) == 1:
+        for k, element in enumerate(orders[0]):
+            if element:
+                columns[f"{field}[{k}]"] = columns[field + element]
+        return
+    for element in itertools.chain(*orders):
+        if element.startswith("["):
+            columns.pop(field + element, None)
+
+
+def _fields(
+    message: Any, prefix: str, element_names: Mapping[int, tuple[str, ...]]
+) -> Iterator[Field]:
+    """Yield the fields with numbers of a message and of those within it.
+
+    Texts called `name` or `joint_names` name the elements of all arrays of their
+    length: `element_names` holds them by their number.
+    """
+    values = {x.name: getattr(message, x.name) for x in dataclasses.fields(message)}
+    for key, texts in values.items():
+        if re.search("(^|_)names?$", key) and isinstance(texts, list):
+            elements = tuple(f".{text}" for text in texts)
+            if len(set(elements)) == len(texts):
+                element_names = {**element_names, len(texts): elements}
+    for key, value in values.items():
+        name = prefix + key
+        if isinstance(value, int | float):
+            yield Field(name, ("",), (value,))
+        elif hasattr(value, "nanosec"):
+            yield Field(name, ("",), (value.sec + 1e-9 * value.nanosec,))
+        elif dataclasses.is_dataclass(value):
+            yield from _fields(value, f"{name}.", element_names)
+        elif isinstance(value, np.ndarray | list) and 0 < len(value) <= MAX_ELEMENTS:
+            yield from _array_fields(value, name, element_names)
+
+
+def _array_fields(
+    values: Any, name: str, element_names: Mapping[int, tuple[str, ...]]
+) -> Iterator[Field]:
+    """Yield the fields of an array of numbers, or of a list of messages."""
+    positions = tuple(f"[{k}]" for k in range(len(values)))
+    elements = element_names.get(len(values)) or positions
+    if isinstance(values, np.ndarray):
+        yield Field(name, elements, values.tolist())
+    elif dataclasses.is_dataclass(values[0]):
+        for element, item in zip(elements, values, strict=True):
+            yield from _fields(item, f"{name}{element}.", element_names)
+
+
+def join_topics(
+    source: str, topics: Sequence[Topic], names: Sequence[str]
+) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """Return columns at the times of the first one, and notes.
+
+    The times are the stamps in the headers if all of the topics have them and no time
+    of recording is asked for. Columns with other times are interpolated linearly.
+    """
+    clocks = [x for x in names if x.endswith((STAMP, RECORDING_TIME)) or x == CLOCK]
+    clock = clocks[0] if clocks else CLOCK
+    names = [name for name in names if name != clock]
+    owners = {name: topic for topic in topics for name in topic.columns}
+    are_stamped = all(all(owners[name].stamps) for name in names)
+    are_recorded = clock.endswith(RECORDING_TIME) or (
+        clock == CLOCK and not are_stamped
+    )
+
+    times = {}
+    values = {}
+    for name in names:
+        rows, numbers = owners[name].columns[name]
+        times[name] = owners[name].times(are_recorded)[np.asarray(rows)]
+        values[name] = np.asarray(numbers)
+
+    joint_times = times[names[0]]
+    is_common = np.ones(len(joint_times), bool)
+    foreign_topics = []
+    for name in names:
+        if not np.array_equal(times[name], joint_times):
+            values[name] = _interpolated(times[name], values[name], joint_times)
+            is_common &= np.isfinite(values[name])
+            foreign_topics.append(name.partition(".")[0])
+    if not is_common.any():
+        raise InputError(
+            f"the topics of `{source}` overlap nowhere in time: compare their clocks."
+        )
+
+    main_topic = names[0].partition(".")[0]
+    notes = [
+        f"`{topic}` is interpolated linearly at the times of `{main_topic}`"
+        for topic in dict.fromkeys(foreign_topics)
+    ]
+    lost_messages = int(np.sum(~is_common))
+    if lost_messages:
+        notes.append(
+            f"{lost_messages} of {len(is_common)} messages were left out: other "
+            "topics pause there"
+        )
+    columns = {name: values[name][is_common] for name in names}
+    dates = pl.Series(joint_times[is_common].astype("M8[ns]"))
+    return {**columns, clock: dates}, tuple(notes)
+
+
+def _interpolated(
+    times: np.ndarray, values: np.ndarray, targets: np.ndarray
+) -> np.ndarray:
+    """Return values at other times; NaN outside and in pauses."""
+    order = np.argsort(times, kind="stable")
+    # Float64 holds nanoseconds only if they do not count from 1970.
+    x = (times[order] - targets[0]).astype(np.float64)
+    target_x = (targets - targets[0]).astype(np.float64)
+    result = np.interp(target_x, x, values[order], left=np.nan, right=np.nan)
+
+    steps = np.diff(x, prepend=x[0])
+    next_index = np.minimum(np.searchsorted(x, target_x), len(x) - 1)
+    is_long = steps[next_index] > MAX_STEP_RATIO * np.median(steps)
+    is_between = x[next_index] != target_x
+    return np.where(is_long & is_between, np.nan, result)

@@ -1,0 +1,143 @@
+"""The parts that every reader of log files has, and the selection of columns by names."""
+
+import abc
+import difflib
+import itertools
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+from jaxid.errors import InputError
+
+from .log_table import LogTable
+
+Selection = str | int | tuple[str | int, ...]
+"""A name, a pattern with `{}` for the joint's number, a position from 0, or several."""
+Selections = Mapping[str, Selection | None]
+"""Selections by channel; None is the clock that some kinds of files have."""
+Channels = Mapping[str, tuple[str, ...]]
+"""Names of the columns of each channel, in the order of the joints."""
+
+
+class AbstractLogFile(abc.ABC):
+    """A log file, whose columns have names; those that are needed are read.
+
+    Attributes:
+        path: Path of the file.
+        selections: Columns that will be read; a reader may leave out all others.
+    """
+
+    def __init__(self, path: Path, selections: Selections):
+        self.path = path
+        self.selections = selections
+
+    @property
+    @abc.abstractmethod
+    def names(self) -> Sequence[str]:
+        """Names of the columns; their positions if there is no header."""
+
+    @abc.abstractmethod
+    def table(self, channels: Channels, on_disk: bool, is_lenient: bool) -> LogTable:
+        """Return the columns of some channels; on the disk if they can stay there.
+
+        Rows that cannot be read are an error, unless `is_lenient`: then `bad_rows` of
+        the table names them.
+        """
+
+    @property
+    def clock(self) -> str:
+        """Column of time stamps that is taken if none is named; empty if there is none."""
+        return ""
+
+    @property
+    def has_header(self) -> bool:
+        """Whether the file names its columns."""
+        return True
+
+    def estimated_rows(self) -> int:
+        """Estimate the number of rows; 0 if they cannot be read in parts."""
+        return 0
+
+    def channels(self, selections: Selections) -> Channels:
+        """Return the names of the columns of each channel, none of them for two channels."""
+        channels = {}
+        for channel, selection in selections.items():
+            channels[channel] = self._selected_names(channel, selection)
+        names = [*itertools.chain(*channels.values())]
+        repeated = [name for name in names if names.count(name) > 1]
+        if repeated:
+            owners = [f"`{c}`" for c in channels if repeated[0] in channels[c]]
+            raise InputError(
+                f"the column `{repeated[0]}` of `{self.path.name}` is used twice, for "
+                f"{' and '.join(owners)}: name the right one for each joint."
+            )
+        return channels
+
+    def _selected_names(
+        self, channel: str, selection: Selection | None
+    ) -> tuple[str, ...]:
+        """Return the names of the columns of a selection, in the order of the joints."""
+        if selection is None:
+            return (self._clock_name(),)
+        if isinstance(selection, tuple):
+            return tuple(self._name(channel, column) for column in selection)
+        has_elements = f"{selection}[0]" in self.names
+        if has_elements and selection not in self.names:
+            selection = f"{selection}[{{}}]"
+        if isinstance(selection, str) and "{}" in selection:
+            return self._numbered_names(channel, selection)
+        return (self._name(channel, selection),)
+
+    def _clock_name(self) -> str:
+        if not self.clock:
+            raise InputError(
+                f"`{self.path.name}` has no clock of its own: give `time` (its column "
+                "of time stamps) or `sample_time` [s]."
+            )
+        return self.clock
+
+    def _numbered_names(self, channel: str, pattern: str) -> tuple[str, ...]:
+        """Return the columns whose names differ in their numbers only, in their order."""
+        expression = re.escape(pattern).replace(re.escape("{}"), r"(\d{1,18})")
+        matches = [re.fullmatch(expression, name) for name in self.names]
+        columns = sorted((int(match[1]), match[0]) for match in matches if match)
+        if not columns:
+            # Its error names the closest columns.
+            return (self._name(channel, pattern.replace("{}", "1")),)
+        numbers = [number for number, _ in columns]
+        names = [name for _, name in columns]
+        first = min(numbers[0], 1)
+        last = first + len(numbers) - 1
+        if numbers != list(range(first, last + 1)):
+            raise InputError(
+                f"the columns of `{self.path.name}` for `{channel}`, "
+                f"`{'`, `'.join(names[:20])}`, must have the numbers from {first} to "
+                f"{last}: name each."
+            )
+        return tuple(names)
+
+    def _name(self, channel: str, column: str | int) -> str:
+        """Return the name of a column that is named itself, or by its position."""
+        names = self.names
+        if isinstance(column, int) and 0 <= column < len(names):
+            return names[column]
+        if self.has_header and column in names:
+            return str(column)
+        if isinstance(column, int) or not self.has_header:
+            words = "columns" if self.has_header else "no header, and columns"
+            raise InputError(
+                f"`{channel}` asks for column {column} of `{self.path.name}`, which "
+                f"has {words} from 0 to {len(names) - 1}: give another position."
+            )
+        candidates = joined_elements(names)
+        closest = difflib.get_close_matches(column, candidates, n=40, cutoff=0)
+        raise InputError(
+            f"`{self.path.name}` has no column `{column}` for `{channel}`: name one "
+            f"of its columns, the closest first: `{'`, `'.join(closest)}`."
+        )
+
+
+def joined_elements(names: Iterable[str]) -> list[str]:
+    """Return names, with one for all elements of an array, like `q[{}]`."""
+    patterns = [re.sub(r"\[\d+\]$", "[{}]", name) for name in names]
+    return list(dict.fromkeys(patterns))

@@ -1,0 +1,194 @@
+"""Channels of a log file as numbers, and complaints about rows that hold none."""
+
+import contextlib
+import dataclasses
+import functools
+import itertools
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any
+
+import numpy as np
+import polars as pl
+
+from jaxid.errors import InputError
+
+from ..recording import MAX_NUMBER
+
+
+@contextlib.contextmanager
+def readable(source: str, kind: str) -> Iterator[None]:
+    """Report a file that a library cannot read as damaged."""
+    try:
+        yield
+    except InputError:
+        raise
+    except (Exception, pl.exceptions.PanicException) as error:
+        # Of many kinds: it depends on which bytes are damaged.
+        text = " ".join(str(error).split())[:200].rstrip(".")
+        reason = text or type(error).__name__
+        raise InputError(
+            f"`{source}` is no {kind}, or is damaged: {reason}."
+        ) from error
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class LogTable:
+    """Channels of one file, in memory or on disk.
+
+    Attributes:
+        source: Name of the file, for messages.
+        columns: Columns, or whole arrays (samples x joints), by name; or a lazy frame.
+        channels: Names of the columns of each channel, in the order of the joints.
+        first_row: Number of the first row in the file, for messages.
+        unit: Name of a row, for messages: `line` in text files.
+        bad_rows: Complaints about rows that cannot be read, by their numbers; None if
+            the first one is an error.
+        notes: Remarks about how the columns were made.
+    """
+
+    source: str
+    columns: Any
+    channels: Mapping[str, tuple[str, ...]]
+    first_row: int = 1
+    unit: str = "row"
+    bad_rows: dict[int, str] | None = None
+    notes: tuple[str, ...] = ()
+
+    @functools.cached_property
+    def rows(self) -> int:
+        """Number of rows."""
+        if isinstance(self.columns, pl.LazyFrame):
+            with readable(self.source, "Parquet file"):
+                rows = int(self.columns.select(pl.len()).collect().item())
+        else:
+            rows = self._common_length()
+        if rows == 0:
+            raise InputError(f"`{self.source}` has no rows: is the log cut?")
+        return rows
+
+    def _common_length(self) -> int:
+        first, *others = itertools.chain(*self.channels.values())
+        length = len(self.columns[first])
+        for name in others:
+            samples = len(self.columns[name])
+            if samples != length:
+                raise InputError(
+                    f"`{name}` of `{self.source}` has {samples} samples, but `{first}` "
+                    f"has {length}: one row for each sample is needed."
+                )
+        return length
+
+    def read(
+        self, channels: Iterable[str], start: int = 0, stop: int | None = None
+    ) -> "LogTable":
+        """Return some rows of some channels, in memory."""
+        subset = {channel: self.channels[channel] for channel in channels}
+        names = list(itertools.chain(*subset.values()))
+        if isinstance(self.columns, pl.LazyFrame):
+            length = None if stop is None else stop - start
+            with readable(self.source, "Parquet file"):
+                frame = self.columns.select(names).slice(start, length).collect()
+            columns = frame.to_dict(as_series=True)
+        else:
+            columns = {name: self.columns[name][start:stop] for name in names}
+        row = self.first_row + start
+        return dataclasses.replace(
+            self, columns=columns, channels=subset, first_row=row
+        )
+
+    def stamps(self, unit: float) -> np.ndarray:
+        """Return the time stamps [s] of a unit [s]; dates have their own.
+
+        Integers and dates count from the first of these rows: nanoseconds since 1970 do
+        not fit into float64, but their differences do.
+        """
+        (name,) = self.channels["time"]
+        column = self.columns[name]
+        if isinstance(column, pl.Series) and column.dtype.is_temporal():
+            ticks = nanoseconds(column)
+            self._refuse_first(name, ticks.is_null().to_numpy(), ticks, "is empty")
+            integers = ticks.to_numpy()
+            return (integers - integers[0]) * 1e-9
+        integers = integer_array(column)
+        if integers is not None:
+            elapsed = (integers - integers[0]).astype(np.float64)
+            return elapsed * unit
+        block = self.numbers(name)
+        if block.shape[1] != 1:
+            raise InputError(
+                f"`{name}` of `{self.source}` must be one column, but has "
+                f"{block.shape[1]}."
+            )
+        return block[:, 0] * unit
+
+    def numbers(self, name: str) -> np.ndarray:
+        """Return a column as finite numbers (samples x columns)."""
+        column = self.columns[name]
+        if isinstance(column, pl.Series):
+            array = self._series_numbers(name, column)
+        elif column.dtype.kind in "iufb" and column.ndim <= 2:
+            with np.errstate(invalid="ignore"):  # signalling NaN
+                array = np.asarray(column, np.float64)
+        else:
+            array = np.zeros(0)
+        if array.size == 0:
+            raise InputError(
+                f"`{name}` of `{self.source}` must hold columns of real numbers, but "
+                f"holds {column.dtype} of shape {column.shape}."
+            )
+        array = np.array(array.reshape(len(array), -1), np.float64)
+        size = np.abs(array).max(axis=1)
+        complaint = "is not finite, or larger than any sensor tells ({} in size)"
+        self._refuse_first(name, ~(size <= MAX_NUMBER), size, complaint)
+        return array
+
+    def _series_numbers(self, name: str, column: pl.Series) -> np.ndarray:
+        try:
+            numbers = column.cast(pl.Float64, strict=False)
+            if column.dtype == pl.String and numbers.null_count():
+                numbers = column.str.strip_chars().cast(pl.Float64, strict=False)
+        except pl.exceptions.PolarsError as error:
+            raise InputError(
+                f"column `{name}` of `{self.source}` holds {column.dtype}: name one "
+                "of numbers."
+            ) from error
+        is_empty = column.is_null().to_numpy()
+        self._refuse_first(name, is_empty, column, "is empty")
+        is_text = numbers.is_null().to_numpy()
+        self._refuse_first(name, is_text, column, "is `{}`, no number")
+        return numbers.to_numpy()
+
+    def _refuse_first(
+        self, name: str, is_bad: np.ndarray, column: Any, complaint: str
+    ) -> None:
+        """Refuse the first bad row of a column, or collect complaints about all of them."""
+        rows = np.flatnonzero(is_bad).tolist()
+        if self.bad_rows is not None:
+            for k in rows:
+                number = k + self.first_row
+                words = f"`{name}` {complaint.format(column[k])}"
+                self.bad_rows.setdefault(number, f"{self.unit} {number} ({words})")
+        elif rows:
+            number = rows[0] + self.first_row
+            others = f" (and {len(rows) - 1} more)" if len(rows) > 1 else ""
+            raise InputError(
+                f"column `{name}` of `{self.source}`, {self.unit} {number}, "
+                f"{complaint.format(column[rows[0]])}{others}: repair the log or "
+                "remove those rows."
+            )
+
+
+def nanoseconds(column: pl.Series) -> pl.Series:
+    """Return dates as integers [ns]."""
+    is_duration = column.dtype == pl.Duration
+    kind = pl.Duration("ns") if is_duration else pl.Datetime("ns")
+    return column.cast(kind).cast(pl.Int64)
+
+
+def integer_array(column: Any) -> np.ndarray | None:
+    """Return a column of integers as an array; None if it is another one."""
+    if isinstance(column, pl.Series):
+        is_whole = column.dtype.is_integer() and not column.null_count()
+        return column.to_numpy().astype(np.int64) if is_whole else None
+    is_whole = column.dtype.kind in "iu" and column.ndim == 1
+    return column.astype(np.int64) if is_whole else None

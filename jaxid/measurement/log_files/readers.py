@@ -1,0 +1,60 @@
+"""Readers of log files by the suffixes of their names."""
+
+import contextlib
+from pathlib import Path
+
+from jaxid.errors import InputError
+
+from .array_files import Hdf5File, MatFile, NpzFile
+from .bags import BagFile
+from .log_file import AbstractLogFile, Selections, joined_elements
+from .parquet_files import ParquetFile
+from .text_files import TextFile
+
+READERS: dict[str, type[AbstractLogFile]] = {
+    ".csv": TextFile,
+    ".tsv": TextFile,
+    ".txt": TextFile,
+    ".dat": TextFile,
+    ".parquet": ParquetFile,
+    ".npz": NpzFile,
+    ".mat": MatFile,
+    ".h5": Hdf5File,
+    ".hdf5": Hdf5File,
+    ".mcap": BagFile,
+    ".bag": BagFile,
+    ".db3": BagFile,
+}
+"""Readers by suffix."""
+
+
+def open_log_file(path: Path, selections: Selections) -> AbstractLogFile:
+    """Open a file, from which some columns will be read; its suffix tells the format."""
+    if is_bag_folder(path):
+        return BagFile(path, selections)
+    if not path.is_file():
+        raise InputError(
+            f"`{path}` is no file and no bag of ROS 2: check the path of the log."
+        )
+    reader = READERS.get(path.suffix.lower())
+    if reader is None:
+        raise InputError(f"`{path.name}` must end in {', '.join(READERS)}: convert it.")
+    return reader(path, selections)
+
+
+def is_bag_folder(path: Path) -> bool:
+    """Return whether a folder is a bag of ROS 2."""
+    return (path / "metadata.yaml").is_file()
+
+
+def summarise_columns(path: Path) -> str:
+    """Return the names of the columns of a file, as messages show them."""
+    names = open_log_file(path, {}).names
+    return f"`{'`, `'.join(joined_elements(names))}`"
+
+
+def estimated_rows(path: Path) -> int:
+    """Estimate the number of rows of a file; 0 if it cannot be read in parts."""
+    with contextlib.suppress(InputError, OSError):
+        return open_log_file(path, {}).estimated_rows()
+    return 0
