@@ -235,28 +235,9 @@ class Clearance(AbstractConstraint):
 
     def __call__(self, robot: Robot, motion: Motion) -> Float[Array, "*batch values"]:
         """Return the missing distance of each pair."""
-        gaps = self.model.clearances(self._axes(robot, motion.q))
-        return (namespace(gaps).broadcast_to(self.distances, gaps.shape) - gaps) / 0.1
-
-    def _axes(
-        self, robot: Robot, q: AnyArray
-    ) -> Float[AnyArray, "*batch capsules 2 3"]:
         ends = eqx.Partial(self.model.ends, robot)
-        run = on_samples if isinstance(q, jax.Array) or q.ndim != 2 else in_numpy
-        return run(ends, ends.__call__, q)
-
-    def linearise(
-        self, robot: Robot, motion: Motion, chosen: Int[np.ndarray, " samples"]
-    ) -> tuple[
-        Float[np.ndarray, " samples"], list[Float[np.ndarray, "samples joints"]]
-    ]:
-        """Return one missing distance of each sample, and its derivatives, in NumPy."""
-        gaps, slopes = self.model.slopes(
-            np.asarray(self._axes(robot, motion.q)), chosen
-        )
-        ends = eqx.Partial(self.model.ends, robot)
-        (by_q,) = _pull(ends, ends.__call__, slopes / -0.1, np.asarray(motion.q))
-        return (self.distances[chosen] - gaps) / 0.1, [by_q]
+        gaps = self.model.clearances(on_samples(ends, ends.__call__, motion.q))
+        return (jnp.broadcast_to(self.distances, gaps.shape) - gaps) / 0.1
 
     def entries(self, robot: Robot) -> tuple[Finding, ...]:
         """Return the pairs."""

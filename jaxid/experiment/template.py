@@ -21,9 +21,9 @@ import numpy as np
 
 from jaxid.io import union_members
 from jaxid.measurement.filters import FILTERS
+from jaxid.robot.description_files import is_mjcf
 from jaxid.robot.robot import Robot
 from jaxid.robot.urdf import load_urdf
-from jaxid.robot.urdf_tree import is_mjcf
 from jaxid.units import Unit
 
 from .decoder import Key, keys_of

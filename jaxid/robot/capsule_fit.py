@@ -1,9 +1,7 @@
 """Capsules around the links of a robot: of their geometry, or along the lines between joints."""
 
-import itertools
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import minimize
@@ -12,20 +10,13 @@ from scipy.spatial import ConvexHull, QhullError
 from jaxid.arrays import Float, Numbers
 from jaxid.errors import InputError
 
-from .mjcf import mjcf_shapes
+from .collision_geometry import Shape, link_shapes, mjcf_shapes
 from .robot import Robot
-from .rotations import rpy_rotation
 from .shapes import GROUND, Capsule
-from .urdf_tree import UrdfTree
+from .urdf_tree import ORIGIN, UrdfTree
 
-_SIGNS = np.array(
-    [[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)]
-)
-_ZERO = (0.0, 0.0, 0.0)
-
-
-Shape = tuple[Float[np.ndarray, "points 3"], float]
-"""Points and a radius: all that is within it of their convex hull, in the frame of a link [m]."""
+STAND_IN_SHARE = 0.07
+"""Radius of a capsule for a body of unknown shape, relative to the length of the robot."""
 
 
 def fit_capsules(
@@ -34,7 +25,7 @@ def fit_capsules(
     tip: str | None = None,
     base: str | None = None,
     base_rotation: Numbers | None = None,
-    base_position: Numbers = _ZERO,
+    base_position: Numbers = ORIGIN,
     packages: str | Path | None = None,
     faults: dict[str, str] | None = None,
 ) -> tuple[Capsule, ...]:
@@ -66,159 +57,145 @@ def fit_capsules(
     tree = UrdfTree(path, base=base, tip=tip)
     mount = np.eye(3) if base_rotation is None else np.array(base_rotation, np.float64)
     place = np.array(base_position, np.float64)
-    compiled = mjcf_shapes(path) if tree.compiled else None
-    found: list[Capsule] = []
-    for name, (body, R, r) in tree.placed_links().items():
+    compiled_shapes = mjcf_shapes(path) if tree.compiled else {}
+
+    capsules: list[Capsule] = []
+    for link, (body, rotation, position) in tree.placed_links().items():
         if body == GROUND:
-            R, r = mount @ R, place + mount @ r
+            rotation = mount @ rotation
+            position = place + mount @ position
+        shapes = compiled_shapes.get(link, [])
         try:
-            if compiled is None:
-                shapes = list(_read_shapes(tree, packages, name))
-            else:
-                shapes = compiled.get(name, [])
+            if not tree.compiled:
+                shapes = list(link_shapes(tree, packages, link))
         except (OSError, InputError) as error:
             if faults is None:
                 raise
-            faults[name] = str(error)
-            continue
-        for number, (points, radius) in enumerate(shapes, 1):
-            start, end = points[[0, -1]]
-            if radius == 0.0:
-                start, end, radius = enclose(points)
-            label = name if number == 1 else f"{name} {number}"
-            ends = {"start": r + R @ start, "end": r + R @ end}
-            found.append(Capsule(label, body, **ends, radius=radius))
-    if not found and faults is None:
+            faults[link] = str(error)
+        for number, shape in enumerate(shapes, 1):
+            label = link if number == 1 else f"{link} {number}"
+            axis = _around(shape)
+            capsule = Capsule(
+                label,
+                body,
+                start=position + rotation @ axis.start,
+                end=position + rotation @ axis.end,
+                radius=axis.radius,
+            )
+            capsules.append(capsule)
+    if not capsules and faults is None:
         raise InputError(
             f"`{path}` has no collision geometry for the links that were asked for."
         )
-    return tuple(found)
+    return tuple(capsules)
 
 
 def stand_in_capsules(robot: Robot, bodies: list[int]) -> list[Capsule]:
     """Return stout capsules for bodies of unknown shape, about the lines between their joints."""
-    offsets = [np.asarray(x) for x in (*robot.offset, robot.tip_offset)]
+    offsets = [np.asarray(offset) for offset in (*robot.offset, robot.tip_offset)]
     carriers = (*robot.parent, robot.tip_body)
-    stout = 0.07 * sum(float(np.linalg.norm(x)) for x in offsets)
-    found = []
+    robot_length = sum(float(np.linalg.norm(offset)) for offset in offsets)
+    radius = STAND_IN_SHARE * robot_length
+
+    capsules = []
     for body in bodies:
-        name = "base" if body == GROUND else f"link of {robot.joint_names[body]}"
-        ends = [
-            x for x, on in zip(offsets, carriers, strict=True) if on == body and x.any()
-        ]
-        for number, end in enumerate(ends, 1):
-            label = name if number == 1 else f"{name} {number}"
-            found.append(Capsule(label, body, start=np.zeros(3), end=end, radius=stout))
-    return found
+        link = "base" if body == GROUND else f"link of {robot.joint_names[body]}"
+        number = 0
+        for carrier, end in zip(carriers, offsets, strict=True):
+            if carrier != body or not end.any():
+                continue
+            number += 1
+            label = link if number == 1 else f"{link} {number}"
+            capsules.append(
+                Capsule(label, body, start=np.zeros(3), end=end, radius=radius)
+            )
+    return capsules
 
 
-def enclose(
-    points: Float[np.ndarray, "points 3"],
-) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return both ends [m] and the radius [m] of a small capsule around all points.
+class Segment(NamedTuple):
+    """Axis and radius of a capsule.
+
+    Attributes:
+        start: One end of the axis [m].
+        end: The other end [m].
+        radius: Radius [m].
+    """
+
+    start: Float[np.ndarray, "3"]
+    end: Float[np.ndarray, "3"]
+    radius: float
+
+    @property
+    def volume(self) -> float:
+        """Volume of the capsule [m³]."""
+        length = float(np.linalg.norm(self.end - self.start))
+        return np.pi * self.radius**2 * (length + 4 / 3 * self.radius)
+
+
+def _around(shape: Shape) -> Segment:
+    """Return a capsule around a shape."""
+    if shape.radius == 0.0:
+        return enclose(shape.points)
+    return Segment(shape.points[0], shape.points[-1], shape.radius)
+
+
+def enclose(points: Float[np.ndarray, "points 3"]) -> Segment:
+    """Return a small capsule around all points.
 
     The direction and the place of the axis are searched from each of the principal
     directions. For every axis the radius reaches the farthest point and the ends are as
-    near as they can be, so all points are inside, whatever the search finds.
+    near as they can be, so all points are inside, whatever the search finds. (The
+    smallest cylinder is no help: a capsule about its axis is up to six times larger.)
     """
-    try:
-        cloud = points[ConvexHull(points).vertices] if len(points) > 4 else points
-    except QhullError:  # a flat cloud
-        cloud = points
-    centre = 0.5 * (cloud.max(axis=0) + cloud.min(axis=0))
-    _, _, directions = np.linalg.svd(cloud - cloud.mean(axis=0), full_matrices=True)
-    size = max(float(np.ptp(cloud, axis=0).max()), 1e-9)
-    found = []
+    hull = _hull_points(points)
+    size = max(float(np.ptp(hull, axis=0).max()), 1e-9)
+    _, _, directions = np.linalg.svd(hull - hull.mean(axis=0), full_matrices=True)
+    options = {"maxiter": 400, "xatol": 1e-5, "fatol": 1e-6 * size**3}
+
+    capsules = []
     for k in range(3):
         frame = np.roll(directions, -k, axis=0)
-        best = minimize(
-            lambda x, frame=frame: _volume(
-                *_enclose_along(cloud, centre, frame, x, size)
-            ),
-            np.zeros(4),
-            method="Nelder-Mead",
-            options={"maxiter": 400, "xatol": 1e-5, "fatol": 1e-6 * size**3},
-        )
-        found.append(_enclose_along(cloud, centre, frame, best.x, size))
-    return min(found, key=lambda capsule: _volume(*capsule))
+
+        def volume(x: np.ndarray, frame: np.ndarray = frame) -> float:
+            return _capsule_about_axis(hull, frame, x).volume
+
+        search = minimize(volume, np.zeros(4), method="Nelder-Mead", options=options)
+        capsules.append(_capsule_about_axis(hull, frame, search.x))
+    return min(capsules, key=lambda capsule: capsule.volume)
 
 
-def _volume(start: np.ndarray, end: np.ndarray, radius: float) -> float:
-    return np.pi * radius**2 * (float(np.linalg.norm(end - start)) + 4 / 3 * radius)
+def _hull_points(points: np.ndarray) -> np.ndarray:
+    """Return the corners of the convex hull; all points if they are few or in a plane."""
+    if len(points) <= 4:
+        return points
+    try:
+        return points[ConvexHull(points).vertices]
+    except QhullError:
+        return points
 
 
-def _enclose_along(
-    cloud: np.ndarray, centre: np.ndarray, frame: np.ndarray, x: np.ndarray, size: float
-) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return the capsule about an axis near the first of three directions, turned and shifted."""
-    axis = frame[0] + x[0] * frame[1] + x[1] * frame[2]
+def _capsule_about_axis(
+    points: np.ndarray, frame: np.ndarray, change: np.ndarray
+) -> Segment:
+    """Return the smallest capsule about an axis that is turned and shifted from the first of three.
+
+    The first two changes turn the axis, the other two shift it from the centre of the
+    points, relative to their size.
+    """
+    low = points.min(axis=0)
+    high = points.max(axis=0)
+    size = max(float((high - low).max()), 1e-9)
+    axis = frame[0] + change[0] * frame[1] + change[1] * frame[2]
     axis = axis / np.linalg.norm(axis)
-    place = centre + size * (x[2] * frame[1] + x[3] * frame[2])
-    along = (cloud - place) @ axis
-    away = np.linalg.norm(cloud - place - along[:, None] * axis, axis=1)
+    place = 0.5 * (low + high) + size * (change[2] * frame[1] + change[3] * frame[2])
+
+    along = (points - place) @ axis
+    away = np.linalg.norm(points - place - along[:, None] * axis, axis=1)
     # Rounding must leave no point outside.
     radius = float(away.max()) * (1 + 1e-9) + 1e-12
     reach = np.sqrt(np.maximum(radius**2 - away**2, 0.0))
-    low, high = (along + reach).min(), (along - reach).max()
-    if low > high:
-        low = high = 0.5 * (low + high)
-    return place + low * axis, place + high * axis, radius
-
-
-def _read_shapes(
-    tree: UrdfTree, packages: str | Path | None, name: str
-) -> Iterator[Shape]:
-    """Yield the shapes of a link of a URDF file, in the frame of the link."""
-    link = tree.links[name]
-    for element in link.findall("collision") or link.findall("visual"):
-        origin, geometry = element.find("origin"), element.find("geometry")
-        inner = None if geometry is None else geometry.find("*")
-        points, radius = _read_shape(
-            tree, packages, element if inner is None else inner
-        )
-        R = rpy_rotation(tree.numbers(origin, "rpy", _ZERO))
-        yield tree.numbers(origin, "xyz", _ZERO) + points @ R.T, radius
-
-
-def _read_shape(tree: UrdfTree, packages: str | Path | None, shape: Any) -> Shape:
-    """Return one shape in its own frame."""
-    if shape.tag == "box":
-        return _SIGNS * tree.numbers(shape, "size", _ZERO), 0.0
-    if shape.tag == "mesh":
-        scale = tree.numbers(shape, "scale", (1.0, 1.0, 1.0))
-        return _vertices(tree, packages, shape) * scale, 0.0
-    if shape.tag not in ("sphere", "cylinder", "capsule"):
-        raise InputError(
-            f"{tree.place(shape)}: `{shape.tag}` is no box, cylinder, sphere, capsule "
-            "or mesh."
-        )
-    length = 0.0 if shape.tag == "sphere" else tree.numbers(shape, "length", (0.0,))[0]
-    half = np.array([0.0, 0.0, 0.5 * length])
-    return np.array([-half, half]), float(tree.numbers(shape, "radius", (0.0,))[0])
-
-
-def _vertices(tree: UrdfTree, packages: str | Path | None, mesh: Any) -> np.ndarray:
-    import trimesh  # loaded where there are meshes
-
-    path, name = Path(tree.path), mesh.get("filename") or ""
-    scheme, _, rest = name.rpartition("://")
-    files, folders = [Path(rest)], [path.parent]
-    if scheme == "package":
-        # A package may lie in a folder of its name, or the file in the package itself.
-        files.append(Path(*files[0].parts[1:]))
-        folders = [path.parent, *path.absolute().parents]
-    if packages is not None:
-        folders = [Path(packages)]
-    places = (folder / file for folder, file in itertools.product(folders, files))
-    file = next(filter(Path.is_file, places), None)
-    if file is None:
-        raise FileNotFoundError(
-            f"{tree.place(mesh)}: the mesh `{name}` is not there: give its folder by "
-            "`packages`."
-        )
-    try:
-        loaded = trimesh.load(str(file), force="mesh", process=False)
-        vertices = np.asarray(loaded.vertices, np.float64)  # pyright: ignore[reportAttributeAccessIssue]
-    except Exception as error:  # readers of many formats raise many exceptions
-        raise InputError(f"`{file}` is no mesh that can be read: {error}.") from error
-    return vertices
+    start = (along + reach).min()
+    end = (along - reach).max()
+    if start > end:
+        start = end = 0.5 * (start + end)
+    return Segment(place + start * axis, place + end * axis, radius)

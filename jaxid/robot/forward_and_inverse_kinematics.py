@@ -6,8 +6,8 @@ where compiling would take longer than computing.
 
 A robot with redundant joints takes, of all coordinates that reach the pose, those
 nearest to a posture. That makes them a function of the pose alone: a closed path of the
-end-effector is a closed path of the joints, as smooth as the pose. All poses of a path
-are solved at once.
+end-effector is a closed path of the joints, as smooth as the pose. They are found by
+Newton's method on the Lagrangian of this problem, for all poses of a path at once.
 """
 
 from typing import NamedTuple
@@ -16,14 +16,22 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from jaxid.arrays import AnyArray, Float, Numbers, as_array
+from jaxid.arrays import AnyArray, Float, Int, Numbers, as_array
 from jaxid.errors import InputError
 
 from .robot import Robot
 from .rotations import rotation_about
 
-_REACHED = 1e-9
-"""Distance at which a pose is reached [m, and rad], and slack of a range relative to its half."""
+POSE_TOLERANCE = 1e-9
+"""Distance at which a pose is reached [m, and rad]."""
+RANGE_TOLERANCE = 1e-9
+"""Excess over the end of a joint's range that is rounding, relative to half the range."""
+MAX_JUMP = 0.25
+"""Largest motion of a joint between neighbouring poses, relative to half its range."""
+MAX_STEP = 0.2
+"""Largest step of the search, relative to half of a joint's range."""
+STRIDE = 0.03
+"""Distance of the poses that are solved one after the other [m]."""
 
 
 def placement_in_parent(
@@ -63,40 +71,51 @@ def tip_placement(
     return R @ robot.tip_rotation, origins[robot.tip_body] + R @ robot.tip_offset
 
 
-def tip_jacobian(
-    robot: Robot, q: Float[np.ndarray, "poses joints"]
-) -> tuple[np.ndarray, ...]:
-    """Return attitudes and positions [m] of the end-effector, and their derivatives, in NumPy.
+class TipJacobian(NamedTuple):
+    """Placements of the end-effector in some poses, and their derivatives by the joints.
 
-    The derivatives are velocities of the origin and angular velocities by the rates of
-    the joints.
+    Attributes:
+        rotation: Attitudes on the ground.
+        position: Positions on the ground [m].
+        velocity: Velocities of the origin by the rates of the joints.
+        turn: Angular velocities by the rates of the joints.
     """
-    poses, n = q.shape
-    R = np.broadcast_to(np.eye(3), (poses, 3, 3))
-    r = np.zeros((poses, 3))
-    turn, slide, origin = (np.zeros((poses, n, 3)) for _ in range(3))
-    offset, rotation, axes = (
-        np.asarray(x) for x in (robot.offset, robot.rotation, robot.axis)
-    )
+
+    rotation: Float[np.ndarray, "poses 3 3"]
+    position: Float[np.ndarray, "poses 3"]
+    velocity: Float[np.ndarray, "poses joints 3"]
+    turn: Float[np.ndarray, "poses joints 3"]
+
+
+def tip_jacobian(robot: Robot, q: Float[np.ndarray, "poses joints"]) -> TipJacobian:
+    """Return placements of the end-effector and their derivatives, in NumPy."""
+    offset = np.asarray(robot.offset)
+    rotation = np.asarray(robot.rotation)
+    axis = np.asarray(robot.axis)
+
+    R = np.broadcast_to(np.eye(3), (len(q), 3, 3))
+    r = np.zeros((len(q), 3))
+    origin, turn, slide = np.zeros((3, *q.shape, 3))
     for i in robot.ancestors[robot.tip_body]:
         r = r + R @ offset[i]
         R = R @ rotation[i]
-        along = R @ axes[i]
+        direction = R @ axis[i]
         origin[:, i] = r
         if robot.revolute[i]:
-            turn[:, i] = along
-            R = R @ rotation_about(axes[i], q[:, i])
+            turn[:, i] = direction
+            R = R @ rotation_about(axis[i], q[:, i])
         else:
-            slide[:, i] = along
-            r = r + along * q[:, i, None]
-    tip = r + R @ np.asarray(robot.tip_offset)
-    shift = slide + np.cross(turn, tip[:, None] - origin)
-    return R @ np.asarray(robot.tip_rotation), tip, shift, turn
+            slide[:, i] = direction
+            r = r + direction * q[:, i, None]
+
+    position = r + R @ np.asarray(robot.tip_offset)
+    lever = position[:, None] - origin
+    velocity = slide + np.cross(turn, lever)
+    return TipJacobian(R @ np.asarray(robot.tip_rotation), position, velocity, turn)
 
 
 def tip_curvature(
-    shift: Float[np.ndarray, "poses joints 3"],
-    turn: Float[np.ndarray, "poses joints 3"],
+    tip: TipJacobian,
     force: Float[np.ndarray, "poses 3"],
     moment: Float[np.ndarray, "poses 3"],
 ) -> Float[np.ndarray, "poses joints joints"]:
@@ -104,11 +123,13 @@ def tip_curvature(
 
     Attitudes count as rotation vectors from the attitude of the end-effector.
     """
-    # An earlier joint carries the later ones with it; of two turns, half of their
-    # bracket.
-    by_shift = np.einsum("pik,pjk->pij", np.cross(force[:, None], turn), shift)
-    by_turn = np.einsum("pik,pjk->pij", np.cross(moment[:, None], turn), turn) / 2
-    upper = np.triu(by_shift + by_turn)
+    # An earlier joint carries the later ones with it, so that half of the matrix is
+    # enough. Two turns in a row differ from their sum by half of their bracket.
+    force_arm = np.cross(force[:, None], tip.turn)
+    moment_arm = np.cross(moment[:, None], tip.turn)
+    of_position = np.einsum("pik,pjk->pij", force_arm, tip.velocity)
+    of_attitude = np.einsum("pik,pjk->pij", moment_arm, tip.turn) / 2
+    upper = np.triu(of_position + of_attitude)
     return upper + np.swapaxes(np.triu(upper, 1), 1, 2)
 
 
@@ -127,129 +148,163 @@ def inverse_kinematics_along(
         InputError: If the posture or the rotation is none, or the end-effector cannot
             follow the path: the message says where, and why.
     """
-    task = _task(robot, rotation, posture)
-    q = _follow(task, positions)
-    missed = np.linalg.norm(
-        _linearise(task, positions, q)[0].reshape(len(q), 2, 3), axis=2
-    )
-    beyond = np.maximum(task.low - q, q - task.high) / task.half
-    jumps = np.abs(np.diff(q, axis=0, prepend=q[:1]) / task.half).max(axis=1) > 0.25
-    reached = missed.max(axis=1) <= _REACHED
-    outside = beyond.max(axis=1) > _REACHED
-    failed = np.flatnonzero(~reached | jumps | outside)
-    if not len(failed):
-        return np.clip(q, task.low, task.high)
-    k = int(failed[0])
-    reason = "the joints would have to jump, for the pose is singular"
-    if not reached[k]:
-        reason = (
-            f"it comes to within {missed[k, 0]:.3g} m and {missed[k, 1]:.3g} rad "
-            "of the pose"
-        )
-    elif outside[k]:
-        reason = (
-            f"joint `{robot.joint_names[int(beyond[k].argmax())]}` leaves its range"
-        )
-    place = ", ".join(f"{x:.3f}" for x in positions[k])
-    raise InputError(
-        f"`{robot.name}` cannot follow the path: at pose {k + 1} of {len(q)}, "
-        f"({place}) m, "
-        f"{reason}; choose another posture, or a path nearer to the middle of its "
-        "reach."
-    )
+    task = _tip_task(robot, rotation, posture)
+    q = _follow_path(task, positions)
+    _require_followed(task, positions, q)
+    return np.clip(q, task.low, task.high)
 
 
-class _Task(NamedTuple):
+class _TipTask(NamedTuple):
     """Robot, attitude of its end-effector, preferred coordinates, half of the ranges, limits."""
 
     robot: Robot
     rotation: Float[np.ndarray, "3 3"]
     posture: Float[np.ndarray, " joints"]
-    half: Float[np.ndarray, " joints"]
+    half_range: Float[np.ndarray, " joints"]
     low: Float[np.ndarray, " joints"]
     high: Float[np.ndarray, " joints"]
 
 
-def _task(robot: Robot, rotation: Numbers, posture: Numbers | None) -> _Task:
-    """Return the checked task of a robot; joints without limits get a range of their own."""
+class _Iterate(NamedTuple):
+    """Coordinates of some poses, and the multipliers of the conditions on their placements."""
+
+    q: Float[np.ndarray, "poses joints"]
+    multipliers: Float[np.ndarray, "poses 6"]
+
+
+def _tip_task(robot: Robot, rotation: Numbers, posture: Numbers | None) -> _TipTask:
+    """Return the checked task of a robot; joints without limits get half a turn, or a metre."""
     low = np.asarray(robot.limits.position_min)
     high = np.asarray(robot.limits.position_max)
-    known = np.isfinite(low) & np.isfinite(high)
+    limited = np.isfinite(low) & np.isfinite(high)
     with np.errstate(invalid="ignore"):
-        half = np.where(known, (high - low) / 2, np.where(robot.revolute, np.pi, 1.0))
-        middle = np.clip(np.where(known, (high + low) / 2, 0.0), low, high)
-    near = np.asarray(as_array("posture", middle if posture is None else posture))
-    if near.shape != middle.shape:
+        default_range = np.where(robot.revolute, np.pi, 1.0)
+        half_range = np.where(limited, (high - low) / 2, default_range)
+        middle = np.clip(np.where(limited, (high + low) / 2, 0.0), low, high)
+
+    goal = np.asarray(as_array("posture", middle if posture is None else posture))
+    if goal.shape != middle.shape:
         raise InputError(
-            f"`posture` must hold {robot.joints} numbers, but has shape {near.shape}."
+            f"`posture` must hold {robot.joints} numbers, but has shape {goal.shape}."
         )
     R = np.asarray(as_array("rotation", rotation))
-    proper = R.shape == (3, 3) and np.abs(R.T @ R - np.eye(3)).max() < 1e-9
-    if not proper or np.linalg.det(R) < 0:
+    orthonormal = R.shape == (3, 3) and np.abs(R.T @ R - np.eye(3)).max() < 1e-9
+    if not orthonormal or np.linalg.det(R) < 0:
         raise InputError(
             "`rotation` must be an orthonormal, right-handed matrix of 3 rows."
         )
-    return _Task(robot, R, near, half, low, high)
+    return _TipTask(robot, R, goal, half_range, low, high)
 
 
-def _linearise(
-    task: _Task, positions: np.ndarray, q: np.ndarray
-) -> tuple[np.ndarray, ...]:
-    """Return distances from poses [m, rad], their Jacobians by scaled joints, shift and turn."""
-    R, r, shift, turn = tip_jacobian(task.robot, q)
-    away = Rotation.from_matrix(R @ task.rotation.T).as_rotvec()
-    e, J = (
-        np.concatenate([r - positions, away], axis=1),
-        np.concatenate([shift, turn], axis=2),
-    )
-    return e, np.swapaxes(J, 1, 2) * task.half, shift, turn
-
-
-def _descend(
-    task: _Task,
-    positions: np.ndarray,
-    q: np.ndarray,
-    multipliers: np.ndarray,
-    gauss: int,
-    newton: int,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Go to the coordinates nearest to the posture, and to the multipliers of their poses.
-
-    Steps solve the linearised conditions, the last `newton` of them with the poses'
-    curvature.
-    """
-    n = q.shape[1]
-    K = np.zeros((len(q), n + 6, n + 6))
-    K[:, n:, n:] = -1e-11 * np.eye(6)
-    for k in range(gauss + newton):
-        e, J, shift, turn = _linearise(task, positions, q)
-        K[:, :n, :n], K[:, :n, n:], K[:, n:, :n] = np.eye(n), np.swapaxes(J, 1, 2), J
-        if k >= gauss:
-            H = tip_curvature(shift, turn, multipliers[:, :3], multipliers[:, 3:])
-            K[:, :n, :n] += H * (task.half[:, None] * task.half)
-        slope = (q - task.posture) / task.half + np.einsum("pij,pi->pj", J, multipliers)
-        step = np.linalg.solve(K, np.concatenate([slope, e], axis=1)[..., None])[..., 0]
-        # At most a tenth of a joint's range.
-        step /= np.maximum(1.0, np.abs(step[:, :n]).max(axis=1, keepdims=True) / 0.2)
-        q = q - task.half * step[:, :n]
-        multipliers = multipliers - step[:, n:]
-    return q, multipliers
-
-
-def _follow(task: _Task, positions: np.ndarray) -> np.ndarray:
+def _follow_path(task: _TipTask, positions: np.ndarray) -> np.ndarray:
     """Return coordinates at all poses: stride by stride, then all between at once."""
-    # Strides of about 0.03 m, with both ends.
-    way = np.linalg.norm(np.diff(positions, axis=0), axis=1)
-    stride = np.floor(np.concatenate([[0.0], np.cumsum(way)]) / 0.03)
-    first = np.flatnonzero(np.diff(stride, prepend=-1.0) > 0)
-    places = np.unique(np.append(first, len(positions) - 1))
-    q, multipliers = _descend(
-        task, positions[:1], task.posture[None], np.zeros((1, 6)), 60, 0
+    start = positions[:1]
+    iterate = _Iterate(task.posture[None], np.zeros((1, 6)))
+    # Far from the pose the curvature misleads.
+    for _ in range(60):
+        iterate = _newton_step(task, start, iterate, curved=False)
+
+    nodes = _ends_of_strides(positions)
+    solutions = []
+    for k in nodes:
+        iterate = _newton_steps(task, positions[k : k + 1], iterate, 4)
+        solutions.append(np.concatenate([iterate.q[0], iterate.multipliers[0]]))
+
+    places = np.arange(len(positions))
+    columns = [np.interp(places, nodes, x) for x in np.transpose(solutions)]
+    guess = np.stack(columns, axis=1)
+    iterate = _Iterate(guess[:, :-6], guess[:, -6:])
+    return _newton_steps(task, positions, iterate, 6).q
+
+
+def _ends_of_strides(positions: np.ndarray) -> Int[np.ndarray, " strides"]:
+    """Return the places of poses about a `STRIDE` apart along a path, with both ends."""
+    distances = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    lengths = np.concatenate([[0.0], np.cumsum(distances)])
+    _, starts = np.unique(np.floor(lengths / STRIDE), return_index=True)
+    return np.unique(np.append(starts, len(positions) - 1))
+
+
+def _newton_steps(
+    task: _TipTask, positions: np.ndarray, iterate: _Iterate, count: int
+) -> _Iterate:
+    for _ in range(count):
+        iterate = _newton_step(task, positions, iterate)
+    return iterate
+
+
+def _newton_step(
+    task: _TipTask, positions: np.ndarray, iterate: _Iterate, curved: bool = True
+) -> _Iterate:
+    """Go to the coordinates nearest to the posture of those that reach the poses.
+
+    The step solves the linearised conditions, if wanted with the curvature of the
+    placements.
+    """
+    q, multipliers = iterate
+    n = q.shape[1]
+    tip = tip_jacobian(task.robot, q)
+    J = np.concatenate([tip.velocity, tip.turn], axis=2) * task.half_range[:, None]
+    H = np.eye(n)
+    if curved:
+        scale = np.outer(task.half_range, task.half_range)
+        H = H + scale * tip_curvature(tip, multipliers[:, :3], multipliers[:, 3:])
+
+    matrix = np.zeros((len(q), n + 6, n + 6))
+    matrix[:, :n, :n] = H
+    matrix[:, :n, n:] = J
+    matrix[:, n:, :n] = np.swapaxes(J, 1, 2)
+    # Solvable at singular poses, too.
+    matrix[:, n:, n:] = -1e-11 * np.eye(6)
+
+    pull = np.einsum("pji,pi->pj", J, multipliers)
+    slope = (q - task.posture) / task.half_range + pull
+    right_side = np.concatenate([slope, _pose_errors(task, positions, tip)], axis=1)
+    step = np.linalg.solve(matrix, right_side[..., None])[..., 0]
+    size = np.abs(step[:, :n]).max(axis=1, keepdims=True)
+    step /= np.maximum(1.0, size / MAX_STEP)
+    return _Iterate(q - task.half_range * step[:, :n], multipliers - step[:, n:])
+
+
+def _pose_errors(
+    task: _TipTask, positions: np.ndarray, tip: TipJacobian
+) -> Float[np.ndarray, "poses 6"]:
+    """Return the differences from the poses: of positions [m], then of attitudes [rad]."""
+    turn = Rotation.from_matrix(tip.rotation @ task.rotation.T).as_rotvec()
+    return np.concatenate([tip.position - positions, turn], axis=1)
+
+
+def _require_followed(task: _TipTask, positions: np.ndarray, q: np.ndarray) -> None:
+    """Reject coordinates that miss a pose, leave their range or jump."""
+    robot = task.robot
+    errors = _pose_errors(task, positions, tip_jacobian(robot, q))
+    distances = np.linalg.norm(errors[:, :3], axis=1)
+    angles = np.linalg.norm(errors[:, 3:], axis=1)
+    excess = np.maximum(task.low - q, q - task.high) / task.half_range
+    changes = np.abs(np.diff(q, axis=0, prepend=q[:1]) / task.half_range)
+
+    reached = np.maximum(distances, angles) <= POSE_TOLERANCE
+    in_range = excess.max(axis=1) <= RANGE_TOLERANCE
+    continuous = changes.max(axis=1) <= MAX_JUMP
+    failures = np.flatnonzero(~(reached & in_range & continuous))
+    if not failures.size:
+        return
+
+    k = int(failures[0])
+    if not reached[k]:
+        reason = (
+            f"it comes to within {distances[k]:.3g} m and {angles[k]:.3g} rad of the "
+            "pose"
+        )
+    elif not in_range[k]:
+        reason = (
+            f"joint `{robot.joint_names[int(excess[k].argmax())]}` leaves its range"
+        )
+    else:
+        reason = "the joints would have to jump, for the pose is singular"
+    place = ", ".join(f"{x:.3f}" for x in positions[k])
+    raise InputError(
+        f"`{robot.name}` cannot follow the path: at pose {k + 1} of {len(q)}, "
+        f"({place}) m, {reason}; choose another posture, or a path nearer to the "
+        "middle of its reach."
     )
-    steps = []
-    for k in places:
-        q, multipliers = _descend(task, positions[k : k + 1], q, multipliers, 0, 4)
-        steps.append(np.concatenate([q[0], multipliers[0]]))
-    every = np.arange(len(positions))
-    guess = np.stack([np.interp(every, places, x) for x in np.transpose(steps)], axis=1)
-    return _descend(task, positions, guess[:, :-6], guess[:, -6:], 0, 6)[0]

@@ -5,13 +5,13 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Float, Numbers, as_array, is_traced, namespace
 
-from .limits_and_drives import FAR, FARTHEST
+from .limits_and_drives import DOUBTFUL_LENGTH, MAX_LENGTH
 
 AXES = "xyz"
 INERTIAL_NAMES = ("m", *(f"m{a}" for a in AXES), *"ABCDEF")
 """Inertial parameters of a body in the paper's order (Eq. 9)."""
 INERTIAL_UNITS = ("kg", *("kg m",) * 3, *("kg m²",) * 6)
-HEAVIEST = 1e5
+MAX_MASS = 1e5
 """Largest mass of a body of a robot [kg]."""
 
 
@@ -41,23 +41,25 @@ class Inertia(eqx.Module):
     @classmethod
     def from_parameters(cls, p: Float[AnyArray, "*batch 10"]) -> "Inertia":
         """Return the inertia of ten `parameters` (Eq. 9); its centre is zero where its mass is."""
-        m, h = p[..., 0], p[..., 1:4]
         xp = namespace(p)
-        r = xp.where((m != 0)[..., None], h / xp.where(m != 0, m, 1.0)[..., None], 0.0)
-        J = inertia_tensor(p[..., 4:])
-        return cls(m, r, J - m[..., None, None] * _moments_of_points(r))
+        mass = p[..., 0]
+        has_mass = (mass != 0)[..., None]
+        centre = p[..., 1:4] / xp.where(has_mass, mass[..., None], 1.0)
+        centre = xp.where(has_mass, centre, 0.0)
+        point_masses = mass[..., None, None] * _moments_of_points(centre)
+        return cls(mass, centre, inertia_tensor(p[..., 4:]) - point_masses)
 
     @property
     def parameters(self) -> Float[AnyArray, "*batch 10"]:
         """Ten parameters $(m, m r_c, A, B, C, D, E, F)$ about the frame's origin (Eqs. 8, 9)."""
-        m = self.mass[..., None]
-        J = self.tensor + m[..., None] * _moments_of_points(self.centre)
-        squares = J[..., (0, 1, 2), (0, 1, 2)]
-        products = -J[..., (1, 0, 0), (2, 2, 1)]
-        parts = [m, m * self.centre, squares, products]
-        return namespace(self.mass, self.centre, self.tensor).concatenate(
-            parts, axis=-1
-        )
+        mass = self.mass[..., None]
+        point_mass = mass[..., None] * _moments_of_points(self.centre)
+        tensor = self.tensor + point_mass
+        moments = tensor[..., (0, 1, 2), (0, 1, 2)]
+        products = -tensor[..., (1, 0, 0), (2, 2, 1)]
+        parts = [mass, mass * self.centre, moments, products]
+        xp = namespace(self.mass, self.centre, self.tensor)
+        return xp.concatenate(parts, axis=-1)
 
     @property
     def pinocchio(self) -> Float[AnyArray, "*batch 10"]:
@@ -85,34 +87,32 @@ class Inertia(eqx.Module):
         """
         if is_traced(self):
             return ""
-        m = float(self.mass)
-        r = np.asarray(self.centre)
-        J = np.asarray(self.tensor)
-        if not (np.isfinite(m) and np.isfinite(r).all() and np.isfinite(J).all()):
+        mass = float(self.mass)
+        centre = np.asarray(self.centre)
+        tensor = np.asarray(self.tensor)
+        if not all(np.isfinite(part).all() for part in (mass, centre, tensor)):
             return "its `mass`, `centre_of_mass` or `inertia` is not finite"
-        if not 0.0 <= m <= HEAVIEST:
-            return f"its `mass` is {m:g} kg, but must be from 0 to {HEAVIEST:g} kg"
-        if np.abs(r).max() > FARTHEST:
+        if not 0.0 <= mass <= MAX_MASS:
+            return f"its `mass` is {mass:g} kg, but must be from 0 to {MAX_MASS:g} kg"
+        distance = np.abs(centre).max()
+        if distance > MAX_LENGTH:
+            return f"its `centre_of_mass` is {distance:g} m away: is it in millimetres?"
+        moment = np.abs(tensor).max()
+        if moment > DOUBTFUL_LENGTH**2 * max(mass, 1.0):
             return (
-                f"its `centre_of_mass` is {np.abs(r).max():g} m away: is it in "
-                "millimetres?"
-            )
-        largest = np.abs(J).max()
-        if largest > FAR**2 * max(m, 1.0):
-            return (
-                f"its `inertia` is {largest:g} kg m² at a mass of {m:g} kg: is it "
+                f"its `inertia` is {moment:g} kg m² at a mass of {mass:g} kg: is it "
                 "in kg mm²?"
             )
-        if np.abs(J - J.T).max() > rounding * largest:
+        if np.abs(tensor - tensor.T).max() > rounding * moment:
             return "its `inertia` is not symmetric"
-        low, middle, high = np.linalg.eigvalsh(J)
-        # A millimetre's worth of a point mass is what files round away.
-        slack = rounding * max(abs(low), abs(high)) + 1e-4 * rounding * m
+        low, middle, high = np.linalg.eigvalsh(tensor)
+        # Files round away a millimetre's worth of a point mass.
+        slack = rounding * max(abs(low), abs(high)) + 1e-4 * rounding * mass
         if low < -slack or high > low + middle + slack:
             return (
                 f"its `inertia` has the principal moments {low:.3g}, {middle:.3g}, "
-                f"{high:.3g} "
-                "kg m², of which one is negative, or larger than the sum of the others"
+                f"{high:.3g} kg m², of which one is negative, or larger than the sum "
+                "of the others"
             )
         return ""
 

@@ -1,7 +1,7 @@
 """Limits and drives of a robot's joints, and numbers that may be in other units."""
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -11,8 +11,12 @@ import numpy as np
 from jaxid.arrays import AnyArray, Float, Hashable, Numbers, given, namespace
 from jaxid.errors import InputError
 
-FAR, FARTHEST = 10.0, 1000.0
-"""Lengths that may be in millimetres, and that no robot has [m]."""
+DOUBTFUL_LENGTH = 10.0
+"""Length from which on the unit may be a millimetre [m]."""
+MAX_LENGTH = 1000.0
+"""Length that no robot reaches [m]."""
+DOUBTFUL_SPEED = 50.0
+"""Speed from which on the unit may be a degree per second [rad/s]."""
 
 PerJoint = Float[AnyArray, " joints"]
 Batch = Float[AnyArray, "*batch joints"]
@@ -51,24 +55,17 @@ class Limits(eqx.Module):
     assumed: tuple[str, ...] = eqx.field(static=True, default=())
 
     def __post_init__(self, joints: int | None):
-        magnitudes = ("velocity", "acceleration", "jerk", "force")
-        sizes = {name: getattr(self, name) for name in magnitudes}
-        n = _count(joints, self.position_min, self.position_max, *sizes.values())
-        self.position_min = per_joint("position_min", self.position_min, n, -np.inf)
-        self.position_max = per_joint("position_max", self.position_max, n, np.inf)
-        for name, value in sizes.items():
+        names = ("velocity", "acceleration", "jerk", "force")
+        magnitudes = {name: getattr(self, name) for name in names}
+        n = _count(joints, self.position_min, self.position_max, *magnitudes.values())
+        low = per_joint("position_min", self.position_min, n, -np.inf)
+        high = per_joint("position_max", self.position_max, n, np.inf)
+        self.position_min = low
+        self.position_max = high
+        for name, value in magnitudes.items():
             setattr(self, name, _magnitudes(name, value, n))
-        low, high = self.position_min, self.position_max
-        if (
-            isinstance(low, np.ndarray)
-            and isinstance(high, np.ndarray)
-            and (low >= high).any()
-        ):
-            j = int(np.flatnonzero(low >= high)[0])
-            raise InputError(
-                f"`position_min` of joint {j + 1} must be below {high[j]:g}, but is "
-                f"{low[j]:g}."
-            )
+        if isinstance(low, np.ndarray) and isinstance(high, np.ndarray):
+            _require_ranges(low, high)
 
 
 class Drives(Hashable):
@@ -107,21 +104,7 @@ class Drives(Hashable):
         n = _count(
             joints, self.reduction, self.zero, self.max_torques, self.rotor_inertia
         )
-        matrix = np.eye(n) if self.reduction is None else self.reduction
-        if not isinstance(matrix, jax.Array) or matrix.ndim != 2:
-            matrix = np.array(matrix, dtype=np.float64)
-            matrix = np.diag(matrix) if matrix.shape == (n,) else matrix
-            if matrix.shape != (n, n) or not np.isfinite(matrix).all():
-                raise InputError(
-                    f"`reduction` must hold {n} or {n} x {n} finite ratios, not "
-                    f"{matrix.shape}."
-                )
-            largest = np.abs(matrix).max(axis=1)
-            if not largest.all() or np.linalg.cond(matrix / largest[:, None]) > 1e8:
-                raise InputError(
-                    "`reduction` must be invertible: is a gear ratio zero?"
-                )
-        self.reduction = matrix
+        self.reduction = _reduction_matrix(self.reduction, n)
         self.zero = per_joint("zero", self.zero, n, 0.0)
         _require("zero", self.zero, np.isfinite, "finite")
         self.max_torques = _magnitudes("max_torques", self.max_torques, n)
@@ -133,8 +116,8 @@ class Drives(Hashable):
     @property
     def is_direct(self) -> bool:
         """Whether motors and joints coincide: unit gears and no offset."""
-        eye = np.eye(len(self.zero))
-        return np.array_equal(self.reduction, eye) and not np.any(self.zero)
+        unit_gears = np.eye(len(self.zero))
+        return np.array_equal(self.reduction, unit_gears) and not np.any(self.zero)
 
     @property
     def _inverse(self) -> Float[AnyArray, "joints joints"]:
@@ -171,18 +154,41 @@ class Drives(Hashable):
     def max_forces(self) -> PerJoint:
         r"""Largest generalised forces of the motors, $|A|^T M_{max}$ [N m or N] (Eq. 30)."""
         weights = np.abs(self.reduction)
-        used = np.where(weights > 0, self.max_torques[:, None], 0.0)
-        return (weights * used).sum(axis=0)
+        # A motor without largest torque does not limit joints that it does not turn.
+        torques = np.where(weights > 0, self.max_torques[:, None], 0.0)
+        return (weights * torques).sum(axis=0)
+
+
+def _reduction_matrix(reduction: Any, joints: int) -> AnyArray:
+    """Check gear ratios and return them as a matrix; a matrix of JAX is taken as it is."""
+    if isinstance(reduction, jax.Array) and reduction.ndim == 2:
+        return reduction
+    if reduction is None:
+        return np.eye(joints)
+    matrix = np.array(reduction, dtype=np.float64)
+    if matrix.shape == (joints,):
+        matrix = np.diag(matrix)
+    if matrix.shape != (joints, joints) or not np.isfinite(matrix).all():
+        raise InputError(
+            f"`reduction` must hold {joints} or {joints} x {joints} finite ratios, not "
+            f"{matrix.shape}."
+        )
+    row_sizes = np.abs(matrix).max(axis=1, keepdims=True)
+    if not row_sizes.all() or np.linalg.cond(matrix / row_sizes) > 1e8:
+        raise InputError("`reduction` must be invertible: is a gear ratio zero?")
+    return matrix
 
 
 def _count(joints: int | None, *values: Numbers | None) -> int:
     """Return the number of joints: as given, or as many as the first of the values holds."""
-    given = [np.shape(x) for x in values if x is not None]
-    if joints is None and not any(given):
-        raise InputError(
-            "`joints` must be given where no list with one number for each joint is."
-        )
-    return next(shape[0] for shape in given if shape) if joints is None else joints
+    if joints is not None:
+        return joints
+    for value in values:
+        if value is not None and np.shape(value):
+            return np.shape(value)[0]
+    raise InputError(
+        "`joints` must be given where no list with one number for each joint is."
+    )
 
 
 def per_joint(name: str, value: Numbers | None, joints: int, unknown: float) -> Any:
@@ -192,9 +198,9 @@ def per_joint(name: str, value: Numbers | None, joints: int, unknown: float) -> 
     """
     if isinstance(value, jax.Array):
         return value
-    array = (
-        np.full(joints, unknown) if value is None else np.array(value, dtype=np.float64)
-    )
+    array = np.array(unknown if value is None else value, dtype=np.float64)
+    if value is None:
+        array = np.full(joints, unknown)
     if array.shape != (joints,):
         raise InputError(
             f"`{name}` must hold one number for each joint ({joints}), but has shape "
@@ -213,54 +219,70 @@ def _magnitudes(name: str, value: Numbers | None, joints: int) -> Any:
 
 def _require(name: str, values: AnyArray, rule: Any, words: str) -> None:
     """Check a rule that reads after "must be", unless the values are a JAX array."""
-    if isinstance(values, np.ndarray) and not np.all(rule(values)):
-        j = int(np.flatnonzero(~rule(values))[0])
+    if not isinstance(values, np.ndarray):
+        return
+    faults = np.flatnonzero(~rule(values))
+    if faults.size:
+        joint = faults[0]
         raise InputError(
-            f"`{name}` must be {words}, but that of joint {j + 1} is {values[j]:g}."
+            f"`{name}` must be {words}, but that of joint {joint + 1} is "
+            f"{values[joint]:g}."
+        )
+
+
+def _require_ranges(low: np.ndarray, high: np.ndarray) -> None:
+    """Reject ranges whose lower end is not below the upper one."""
+    faults = np.flatnonzero(low >= high)
+    if faults.size:
+        joint = faults[0]
+        raise InputError(
+            f"`position_min` of joint {joint + 1} must be below {high[joint]:g}, but "
+            f"is {low[joint]:g}."
         )
 
 
 def range_fault(low: float, high: float, revolute: bool) -> str:
     """Return why no joint has such a range [rad or m], as the predicate of a sentence; or ""."""
-    ends = [x for x in (low, high) if np.isfinite(x)]
-    far = max(ends, key=abs, default=0.0)
-    if abs(far) <= (8 * np.pi if revolute else FARTHEST):
+    ends = [end for end in (low, high) if np.isfinite(end)]
+    end = max(ends, key=abs, default=0.0)
+    max_end = 8 * np.pi if revolute else MAX_LENGTH
+    if abs(end) <= max_end:
         return ""
     if revolute:
-        return f"ranges to {far:g} rad, which is {abs(far) / (2 * np.pi):.3g} turns"
-    return f"ranges to {far:g} m, which no robot does"
+        return f"ranges to {end:g} rad, which is {abs(end) / (2 * np.pi):.3g} turns"
+    return f"ranges to {end:g} m, which no robot does"
 
 
-def far_notes(owner: str, lengths: Numbers) -> tuple[str, ...]:
+def length_notes(owner: str, lengths: Numbers) -> list[str]:
     """Return a note if the largest of some lengths [m] may be in millimetres."""
     sizes = np.abs(np.asarray(lengths, np.float64))
-    far = sizes[np.isfinite(sizes) & (sizes > FAR)].tolist()
-    return (f"{owner} is {max(far):g} m: is the length in millimetres?",) if far else ()
+    length = sizes[np.isfinite(sizes)].max(initial=0.0)
+    if length <= DOUBTFUL_LENGTH:
+        return []
+    return [f"{owner} is {length:g} m: is the length in millimetres?"]
 
 
 def limit_notes(
     names: Sequence[str], revolute: Sequence[bool], limits: Limits
-) -> Iterator[str]:
-    """Yield notes on limits that may be in millimetres or in degrees per second."""
-    low = limits.position_min
-    high = limits.position_max
-    speeds = limits.velocity
-    if not all(isinstance(x, np.ndarray) and x.ndim == 1 for x in (low, high, speeds)):
-        return
-    fast: dict[float, list[str]] = {}
-    for name, turns, speed, *ends in zip(
-        names, revolute, speeds, low, high, strict=True
-    ):
+) -> list[str]:
+    """Return notes on limits that may be in millimetres or in degrees per second."""
+    rows = (limits.position_min, limits.position_max, limits.velocity)
+    if not all(isinstance(row, np.ndarray) and row.ndim == 1 for row in rows):
+        return []
+    notes = []
+    joints_by_speed: dict[float, list[str]] = {}
+    for name, turns, low, high, speed in zip(names, revolute, *rows, strict=True):
         if not turns:
-            yield from far_notes(f"joint `{name}`: an end of its range", ends)
-        elif 50.0 < speed < np.inf:
-            fast.setdefault(float(speed), []).append(name)
-    for speed, group in fast.items():
-        yield (
-            f"{owners('joint', group)}: a velocity of up to {speed:g} rad/s is "
+            notes += length_notes(f"joint `{name}`: an end of its range", (low, high))
+        elif DOUBTFUL_SPEED < speed < np.inf:
+            joints_by_speed.setdefault(float(speed), []).append(name)
+    for speed, joints in joints_by_speed.items():
+        notes.append(
+            f"{owners('joint', joints)}: a velocity of up to {speed:g} rad/s is "
             f"{30 * speed / np.pi:.4g} turns a minute: is the limit in degrees per "
             "second, or none?"
         )
+    return notes
 
 
 def owners(kind: str, names: Sequence[str]) -> str:
@@ -270,5 +292,5 @@ def owners(kind: str, names: Sequence[str]) -> str:
 
 def listed(names: Sequence[str]) -> str:
     """Return names in backticks, the first eight of them."""
-    shown = ", ".join(f"`{name}`" for name in names[:8])
-    return shown if len(names) <= 8 else f"{shown} and {len(names) - 8} more"
+    words = ", ".join(f"`{name}`" for name in names[:8])
+    return words if len(names) <= 8 else f"{words} and {len(names) - 8} more"

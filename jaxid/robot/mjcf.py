@@ -15,7 +15,7 @@ from .rotations import axis_rotation, rpy_angles
 
 Loop = tuple[str, str, str]
 """Name of a constraint that closes a loop, and the two bodies that it connects."""
-_KINDS = ("floating", "ball", "prismatic", "revolute")
+JOINT_TYPES = ("floating", "ball", "prismatic", "revolute")
 """Types of joints in MuJoCo's order."""
 
 
@@ -35,9 +35,9 @@ def mjcf_as_urdf(path: str | Path) -> tuple[Any, Float[np.ndarray, "3"], list[Lo
     try:
         model = mujoco.MjModel.from_xml_path(str(path))
     except ValueError as error:
-        said = " ".join(str(error).split()).rstrip(".")
+        reason = " ".join(str(error).split()).rstrip(".")
         raise InputError(
-            f"`{path}`: MuJoCo cannot compile this file: {said}."
+            f"`{path}`: MuJoCo cannot compile this file: {reason}."
         ) from error
     tree = _Writer(mujoco, model)
     for body in range(1, model.nbody):
@@ -46,126 +46,144 @@ def mjcf_as_urdf(path: str | Path) -> tuple[Any, Float[np.ndarray, "3"], list[Lo
         tree.add_site(site)
     for constraint in np.flatnonzero(model.eq_active0):
         tree.add_constraint(int(constraint))
-    weightless = model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_GRAVITY)
-    return (
-        tree.root,
-        np.zeros(3) if weightless else np.array(model.opt.gravity),
-        tree.loops,
-    )
+
+    gravity = np.array(model.opt.gravity)
+    if model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_GRAVITY):
+        gravity = np.zeros(3)
+    return tree.root, gravity, tree.loops
 
 
-def mjcf_shapes(
-    path: str | Path,
-) -> dict[str, list[tuple[Float[np.ndarray, "points 3"], float]]]:
-    """Return points and radii [m] of the shapes of all bodies, as `mjcf_as_urdf` names them.
+def body_name(model: Any, body: int) -> str:
+    """Return the name of a body of a compiled model, or its number if it has none."""
+    return model.body(body).name or f"body{body}"
 
-    Shapes that cannot collide count only where a body has no others.
-    """
-    mujoco = import_mujoco()
-    model = mujoco.MjModel.from_xml_path(str(path))
-    kinds, found = mujoco.mjtGeom, {}
-    colliding = (model.geom_contype | model.geom_conaffinity) != 0
-    for geom in range(model.ngeom):
-        body, kind = int(model.geom_bodyid[geom]), int(model.geom_type[geom])
-        own = model.geom_bodyid == body
-        if kind in (kinds.mjGEOM_PLANE, kinds.mjGEOM_HFIELD, kinds.mjGEOM_SDF) or (
-            not colliding[geom] and colliding[own].any()
-        ):
-            continue
-        size, radius = model.geom_size[geom], 0.0
-        points = size * np.array(
-            [[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]
-        )
-        if kind in (kinds.mjGEOM_SPHERE, kinds.mjGEOM_CAPSULE, kinds.mjGEOM_CYLINDER):
-            half = 0.0 if kind == kinds.mjGEOM_SPHERE else size[1]
-            points, radius = (
-                np.array([[0.0, 0.0, -half], [0.0, 0.0, half]]),
-                float(size[0]),
-            )
-        elif kind == kinds.mjGEOM_MESH:
-            mesh = model.geom_dataid[geom]
-            first = model.mesh_vertadr[mesh]
-            points = model.mesh_vert[first : first + model.mesh_vertnum[mesh]].astype(
-                float
-            )
-        name = "world" if body == 0 else model.body(body).name or f"body{body}"
-        placed = model.geom_pos[geom] + points @ _matrix(model.geom_quat[geom]).T
-        found.setdefault(name, []).append((placed, radius))
-    return found
+
+def rotation_of_quaternion(quaternion: np.ndarray) -> Float[np.ndarray, "3 3"]:
+    """Return the rotation of MuJoCo's quaternion (w, x, y, z)."""
+    return Rotation.from_quat(np.roll(quaternion, -1)).as_matrix()
+
+
+def exact_text(values: Numbers | float) -> str:
+    """Write numbers with all their digits."""
+    numbers = np.ravel(np.asarray(values, np.float64)).tolist()
+    return " ".join(repr(number) for number in numbers)
 
 
 class _Writer:
-    """Writer of the links and joints of a compiled model."""
+    """Writer of the links and joints of a compiled model.
+
+    Attributes:
+        root: Element of the robot.
+        loops: Constraints that close loops.
+    """
 
     def __init__(self, mujoco: Any, model: Any):
         self._mujoco = mujoco
         self._model = model
-        self._links = ["world"]
+        self._links = ["world"]  # of the bodies, in MuJoCo's order
         self._joints: dict[int, Any] = {}
         self._efforts = _largest_forces(mujoco, model)
         self.loops: list[Loop] = []
-        self.root: Any = E.robot(
-            E.link(name="world"), name=model.names.split(b"\0")[0].decode()
-        )
+        name = model.names.split(b"\0")[0].decode()
+        self.root: Any = E.robot(E.link(name="world"), name=name)
 
     def _name(self, kind: str, index: int) -> str:
-        """Return the name of a body, a joint or a constraint, or its number if it has none."""
+        """Return the name of a joint or a constraint, or its number if it has none."""
         return getattr(self._model, kind)(index).name or f"{kind}{index}"
 
     def _connect(
-        self, joint: str, kind: str, ends: tuple[str, str], origin: Any
+        self, name: str, kind: str, parent: str, child: str, origin: Any
     ) -> Any:
-        parent, child = ends
-        element = E.joint(
-            E.parent(link=parent), E.child(link=child), origin, name=joint, type=kind
-        )
+        """Write a joint between two links."""
+        ends = E.parent(link=parent), E.child(link=child)
+        element = E.joint(*ends, origin, name=name, type=kind)
         self.root.append(element)
         return element
 
     def add_body(self, body: int) -> None:
         """Write the joints of a body, one after the other, and its link with the inertia."""
-        model, name = self._model, self._name("body", body)
-        link = self._links[model.body_parentid[body]]
-        R, r = _matrix(model.body_quat[body]), model.body_pos[body]
-        mount, mount_kind = f"{name} mount", "fixed"
-        first = int(model.body_jntadr[body])
-        for i in range(first, first + int(model.body_jntnum[body])):
-            joint, kind = self._name("joint", i), _KINDS[model.jnt_type[i]]
-            if kind == "floating":
-                mount, mount_kind = joint, kind
+        model = self._model
+        name = body_name(model, body)
+        parent = self._links[model.body_parentid[body]]
+        R = rotation_of_quaternion(model.body_quat[body])
+        r = model.body_pos[body]
+        mount = f"{name} mount"
+        mount_type = "fixed"
+        for joint in self._joints_of(body):
+            if JOINT_TYPES[model.jnt_type[joint]] == "floating":
+                mount = self._name("joint", joint)
+                mount_type = "floating"
                 continue
-            if kind == "revolute" and not model.jnt_limited[i]:
-                kind = "continuous"
-            r = r + R @ model.jnt_pos[i]
-            # The file describes the pose at `ref`, a URDF the one at zero.
-            ref = model.qpos0[model.jnt_qposadr[i]]
-            if kind == "prismatic":
-                r = r - R @ model.jnt_axis[i] * ref
-            elif ref:
-                R = R @ axis_rotation(model.jnt_axis[i], -ref)
-            moved = f"{joint} frame"
-            self.root.append(E.link(name=moved))
-            self._joints[i] = self._connect(joint, kind, (link, moved), _origin(R, r))
-            self._joints[i].extend(self._properties(i))
-            link, R, r = moved, np.eye(3), -model.jnt_pos[i]
-        element: Any = E.link(name=name)
+            R, r = self._joint_placement(joint, R, r)
+            parent = self._add_joint(joint, parent, _origin(R, r))
+            R = np.eye(3)
+            r = -model.jnt_pos[joint]
+
+        link: Any = E.link(name=name)
         if model.body_mass[body] or model.body_inertia[body].any():
-            xx, yy, zz = map(exact_text, model.body_inertia[body])
-            place = _origin(_matrix(model.body_iquat[body]), model.body_ipos[body])
-            mass = E.mass(value=exact_text(model.body_mass[body]))
-            products = dict.fromkeys(("ixy", "ixz", "iyz"), "0")
-            moments = E.inertia(ixx=xx, iyy=yy, izz=zz, **products)
-            element.append(E.inertial(place, mass, moments))
-        self.root.append(element)
+            link.append(self._inertial(body))
+        self.root.append(link)
         self._links.append(name)
-        self._connect(mount, mount_kind, (link, name), _origin(R, r))
+        self._connect(mount, mount_type, parent, name, _origin(R, r))
+
+    def _joints_of(self, body: int) -> range:
+        first = int(self._model.body_jntadr[body])
+        return range(first, first + int(self._model.body_jntnum[body]))
+
+    def _joint_placement(
+        self, joint: int, rotation: np.ndarray, position: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return attitude and origin of a joint's frame, where its body is placed so at `ref`.
+
+        An MJCF file describes the pose at `ref`, a URDF file that at zero.
+        """
+        model = self._model
+        axis = model.jnt_axis[joint]
+        ref = model.qpos0[model.jnt_qposadr[joint]]
+        position = position + rotation @ model.jnt_pos[joint]
+        if JOINT_TYPES[model.jnt_type[joint]] == "prismatic":
+            position = position - rotation @ axis * ref
+        elif ref:
+            rotation = rotation @ axis_rotation(axis, -ref)
+        return rotation, position
+
+    def _add_joint(self, joint: int, parent: str, origin: Any) -> str:
+        """Write a joint and an empty link that it moves; return the name of the link."""
+        kind = JOINT_TYPES[self._model.jnt_type[joint]]
+        if kind == "revolute" and not self._model.jnt_limited[joint]:
+            kind = "continuous"
+        name = self._name("joint", joint)
+        link = f"{name} frame"
+        self.root.append(E.link(name=link))
+        element = self._connect(name, kind, parent, link, origin)
+        element.extend(self._properties(joint))
+        self._joints[joint] = element
+        return link
+
+    def _inertial(self, body: int) -> Any:
+        """Return mass, centre of mass and principal moments of a body."""
+        model = self._model
+        R = rotation_of_quaternion(model.body_iquat[body])
+        xx, yy, zz = model.body_inertia[body]
+        return E.inertial(
+            _origin(R, model.body_ipos[body]),
+            E.mass(value=exact_text(model.body_mass[body])),
+            E.inertia(
+                ixx=exact_text(xx),
+                iyy=exact_text(yy),
+                izz=exact_text(zz),
+                **dict.fromkeys(("ixy", "ixz", "iyz"), "0"),
+            ),
+        )
 
     def _properties(self, joint: int) -> list[Any]:
         """Return a joint's axis, range, largest force, friction and rotor inertia."""
         model = self._model
         limit: dict[str, str] = {}
         if model.jnt_limited[joint]:
-            limit["lower"], limit["upper"] = map(exact_text, model.jnt_range[joint])
+            low, high = model.jnt_range[joint]
+            limit["lower"] = exact_text(low)
+            limit["upper"] = exact_text(high)
         if np.isfinite(self._efforts[joint]):
             limit["effort"] = exact_text(self._efforts[joint])
         dof = model.jnt_dofadr[joint]
@@ -174,94 +192,92 @@ class _Writer:
             friction=exact_text(model.dof_frictionloss[dof]),
             armature=exact_text(model.dof_armature[dof]),
         )
-        return [
-            E.axis(xyz=exact_text(model.jnt_axis[joint])),
-            E.limit(**limit),
-            dynamics,
-        ]
+        axis = E.axis(xyz=exact_text(model.jnt_axis[joint]))
+        return [axis, E.limit(**limit), dynamics]
 
     def add_site(self, site: int) -> None:
         """Write a site as a link; one without a name, or with that of a body, is left out."""
-        model, name = self._model, self._model.site(site).name
-        if name and name not in self._links:
-            self.root.append(E.link(name=name))
-            origin = _origin(_matrix(model.site_quat[site]), model.site_pos[site])
-            ends = (self._links[model.site_bodyid[site]], name)
-            self._connect(f"{name} site", "fixed", ends, origin)
+        model = self._model
+        name = model.site(site).name
+        if not name or name in self._links:
+            return
+        self.root.append(E.link(name=name))
+        R = rotation_of_quaternion(model.site_quat[site])
+        origin = _origin(R, model.site_pos[site])
+        body_link = self._links[model.site_bodyid[site]]
+        self._connect(f"{name} site", "fixed", body_link, name, origin)
 
-    def add_constraint(self, i: int) -> None:
+    def add_constraint(self, constraint: int) -> None:
         """Write a constraint between joints as a mimic; note one that closes a loop."""
-        model, kinds, kind = (
-            self._model,
-            self._mujoco.mjtEq,
-            int(self._model.eq_type[i]),
-        )
-        pair = [int(model.eq_obj1id[i]), int(model.eq_obj2id[i])]
+        model = self._model
+        kinds = self._mujoco.mjtEq
+        kind = int(model.eq_type[constraint])
+        pair = [int(model.eq_obj1id[constraint]), int(model.eq_obj2id[constraint])]
         if kind == int(kinds.mjEQ_JOINT):
-            self._add_mimic(pair[0], pair[1], model.eq_data[i, :5])
+            self._add_mimic(*pair, model.eq_data[constraint, :5])
         elif kind in (int(kinds.mjEQ_CONNECT), int(kinds.mjEQ_WELD)):
-            if int(model.eq_objtype[i]) == int(self._mujoco.mjtObj.mjOBJ_SITE):
+            if model.eq_objtype[constraint] == int(self._mujoco.mjtObj.mjOBJ_SITE):
                 pair = [int(model.site_bodyid[site]) for site in pair]
             # A mocap body is moved by a program: it is no part of the robot.
             if (model.body_mocapid[pair] < 0).all():
                 first, second = (self._links[body] for body in pair)
-                self.loops.append((self._name("equality", i), first, second))
+                self.loops.append((self._name("equality", constraint), first, second))
 
-    def _add_mimic(self, joint: int, other: int, polynomial: np.ndarray) -> None:
-        """Write a joint's constraint; the polynomial is exact where the other joint is held."""
-        model, start = self._model, self._model.qpos0
-        value, slope, mimicked = (
-            start[model.jnt_qposadr[joint]] + polynomial[0],
-            0.0,
-            {},
-        )
-        if other >= 0:
-            low, high = (
-                model.jnt_range[other]
-                if model.jnt_limited[other]
-                else (-np.inf, np.inf)
-            )
+    def _add_mimic(self, joint: int, master: int, polynomial: np.ndarray) -> None:
+        """Write a constraint of a joint; it is exact where the mimicked joint is held.
+
+        The polynomial gives the joint's coordinate, as the difference from its `ref`, of
+        that of the mimicked one.
+        """
+        model = self._model
+        attributes = {}
+        slope = 0.0
+        change = polynomial[0]
+        if master >= 0:
+            low, high = -np.inf, np.inf
+            if model.jnt_limited[master]:
+                low, high = model.jnt_range[master]
             held = min(max(0.0, low), high)
-            shift = held - start[model.jnt_qposadr[other]]
+            shift = held - model.qpos0[model.jnt_qposadr[master]]
             slope = polynomial[1]
-            value += np.polyval(polynomial[::-1], shift) - polynomial[0] - slope * held
-            mimicked = {"joint": self._joints[other].get("name")}
-        mimic = E.mimic(
-            **mimicked, multiplier=exact_text(slope), offset=exact_text(value)
-        )
-        self._joints[joint].append(mimic)
+            change = np.polyval(polynomial[::-1], shift) - slope * held
+            attributes["joint"] = self._joints[master].get("name")
+        ref = model.qpos0[model.jnt_qposadr[joint]]
+        attributes["multiplier"] = exact_text(slope)
+        attributes["offset"] = exact_text(ref + change)
+        self._joints[joint].append(E.mimic(**attributes))
 
 
 def _largest_forces(mujoco: Any, model: Any) -> Float[np.ndarray, " joints"]:
     """Return the largest forces of the actuators on each joint; infinite where unknown."""
+    transmissions = mujoco.mjtTrn
+    joint_kinds = (
+        int(transmissions.mjTRN_JOINT),
+        int(transmissions.mjTRN_JOINTINPARENT),
+    )
     total = np.zeros(model.njnt)
-    joints = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
-    for i in range(model.nu):
-        if int(model.actuator_trntype[i]) not in joints:
-            continue
-        most = np.inf
-        plain = int(model.actuator_biastype[i]) == int(mujoco.mjtBias.mjBIAS_NONE)
-        if model.actuator_forcelimited[i]:
-            most = np.abs(model.actuator_forcerange[i]).max()
-        elif model.actuator_ctrllimited[i] and plain:
-            most = np.abs(
-                model.actuator_ctrlrange[i] * model.actuator_gainprm[i, 0]
-            ).max()
-        total[model.actuator_trnid[i, 0]] += most * np.abs(model.actuator_gear[i, 0])
+    for actuator in range(model.nu):
+        if int(model.actuator_trntype[actuator]) in joint_kinds:
+            joint = model.actuator_trnid[actuator, 0]
+            gear = np.abs(model.actuator_gear[actuator, 0])
+            total[joint] += _largest_input(mujoco, model, actuator) * gear
     total = np.where(total > 0.0, total, np.inf)
-    ranges = np.abs(model.jnt_actfrcrange).max(axis=1)
-    return np.where(model.jnt_actfrclimited, np.minimum(total, ranges), total)
+    joint_limits = np.abs(model.jnt_actfrcrange).max(axis=1)
+    return np.where(model.jnt_actfrclimited, np.minimum(total, joint_limits), total)
 
 
-def _matrix(quaternion: np.ndarray) -> Float[np.ndarray, "3 3"]:
-    """Return the rotation of MuJoCo's quaternion (w, x, y, z)."""
-    return Rotation.from_quat(np.roll(quaternion, -1)).as_matrix()
+def _largest_input(mujoco: Any, model: Any, actuator: int) -> float:
+    """Return the largest force of an actuator before its gear; infinite where unknown."""
+    if model.actuator_forcelimited[actuator]:
+        return np.abs(model.actuator_forcerange[actuator]).max()
+    # Other actuators have a bias, such as that of a position servo.
+    is_motor = int(model.actuator_biastype[actuator]) == int(mujoco.mjtBias.mjBIAS_NONE)
+    if is_motor and model.actuator_ctrllimited[actuator]:
+        gain = model.actuator_gainprm[actuator, 0]
+        return np.abs(model.actuator_ctrlrange[actuator] * gain).max()
+    return np.inf
 
 
 def _origin(R: Float[np.ndarray, "3 3"], r: Float[np.ndarray, "3"]) -> Any:
+    """Return the element of a placement."""
     return E.origin(xyz=exact_text(r), rpy=exact_text(rpy_angles(R)))
-
-
-def exact_text(values: Numbers | float) -> str:
-    """Write numbers with all their digits."""
-    return " ".join(map(repr, np.ravel(np.asarray(values, np.float64)).tolist()))

@@ -12,7 +12,7 @@ from jaxid.errors import InputError
 from jaxid.result_table import Column, Summarised, Table
 
 from .inertia import Inertia
-from .limits_and_drives import FARTHEST, Drives, Limits, far_notes, limit_notes
+from .limits_and_drives import MAX_LENGTH, Drives, Limits, length_notes, limit_notes
 from .rotations import SNAP_TOLERANCE, snapped, snapped_rotations
 
 GRAVITY = (0.0, 0.0, -9.81)
@@ -120,46 +120,48 @@ class Robot(Summarised, eqx.Module):
     notes: tuple[str, ...] = eqx.field(static=True, default=())
 
     def __post_init__(self):
-        n, names, parent = len(self.revolute), self.joint_names, self.parent
+        n = len(self.revolute)
         if n == 0:
             raise InputError(
                 "`revolute` must have one entry for each joint, but is empty."
             )
-        self.joint_names = tuple(names or (f"joint{i + 1}" for i in range(n)))
-        self.parent = (
-            tuple(range(-1, n - 1)) if parent is None else tuple(int(i) for i in parent)
-        )
-        self.revolute = tuple(bool(r) for r in self.revolute)
-        self.axis = _checked("`axis`", self.axis, (n, 3))
-        if isinstance(self.axis, np.ndarray):
-            length = np.linalg.norm(self.axis, axis=-1, keepdims=True)
-            if (length < 1e-9).any():
-                j = int(length.argmin()) + 1
-                raise InputError(
-                    f"`axis` of joint {j} is the zero vector: give it a direction."
-                )
-            self.axis = np.where(
-                np.abs(length - 1.0) > 1e-15, self.axis / length, self.axis
-            )
+        self._set_defaults(n)
+        self.joint_names = tuple(self.joint_names)
+        self.parent = tuple(int(body) for body in self.parent)
+        self.revolute = tuple(bool(turns) for turns in self.revolute)
+        self.axis = _unit_axes(_checked("`axis`", self.axis, (n, 3)))
         self.rotation = _rotations("`rotation`", self.rotation, (n, 3, 3))
         self.offset = _checked("`offset`", self.offset, (n, 3))
         self.gravity = _checked("`gravity`", self.gravity, (3,))
-        self.limits = Limits(n) if self.limits is None else self.limits
-        self.drives = Drives(n) if self.drives is None else self.drives
-        self.tip_body = n - 1 if self.tip_body is None else self.tip_body
-        tip_rotation = np.eye(3) if self.tip_rotation is None else self.tip_rotation
-        self.tip_rotation = _rotations("`tip_rotation`", tip_rotation, (3, 3))
+        self.tip_rotation = _rotations("`tip_rotation`", self.tip_rotation, (3, 3))
         self.tip_offset = _checked("`tip_offset`", self.tip_offset, (3,))
         self._check_joints()
+
         doubts = limit_notes(self.joint_names, self.revolute, self.limits)
-        self.notes = tuple(dict.fromkeys((*self.notes, *self._far_notes(), *doubts)))
+        notes = (*self.notes, *self._length_notes(), *doubts)
+        # A copy finds the notes of its original again.
+        self.notes = tuple(dict.fromkeys(notes))
+
+    def _set_defaults(self, joints: int) -> None:
+        """Fill in what follows from the number of joints where it is not given."""
+        if not self.joint_names:
+            self.joint_names = tuple(f"joint{i + 1}" for i in range(joints))
+        if self.parent is None:
+            self.parent = tuple(range(-1, joints - 1))
+        if self.limits is None:
+            self.limits = Limits(joints)
+        if self.drives is None:
+            self.drives = Drives(joints)
+        if self.tip_body is None:
+            self.tip_body = joints - 1
+        if self.tip_rotation is None:
+            self.tip_rotation = np.eye(3)
 
     def _check_joints(self) -> None:
         """Reject names, parents and bodies that do not fit the number of joints."""
         n = len(self.revolute)
-        if len(self.parent) != n or any(
-            not -1 <= p < i for i, p in enumerate(self.parent)
-        ):
+        in_order = all(-1 <= p < i for i, p in enumerate(self.parent))
+        if len(self.parent) != n or not in_order:
             raise InputError(
                 f"`parent` must hold an earlier body, or -1, for each of {n}, but is "
                 f"{self.parent}."
@@ -173,32 +175,37 @@ class Robot(Summarised, eqx.Module):
                 raise InputError(
                     f"the name {name!r} must be printable: remove the characters."
                 )
-        carrier = self.tip_body if self.tool is None else self.tool.body
-        for field, body in (("tip_body", self.tip_body), ("tool.body", carrier)):
+        bodies = {"tip_body": self.tip_body}
+        if self.tool is not None:
+            bodies["tool.body"] = self.tool.body
+        for field, body in bodies.items():
             if not 0 <= body < n:
                 raise InputError(
                     f"`{field}` must be a body from 0 to {n - 1}, but is {body}."
                 )
-        for field, one in (("limits", self.limits.force), ("drives", self.drives.zero)):
-            if one.shape[-1:] != (n,):
+        numbers = {"limits": self.limits.force, "drives": self.drives.zero}
+        for field, per_joint in numbers.items():
+            if per_joint.shape[-1:] != (n,):
                 raise InputError(
                     f"`{field}` must be of {n} joints, like the robot, but are of "
-                    f"{one.shape[-1]}."
+                    f"{per_joint.shape[-1]}."
                 )
 
-    def _far_notes(self) -> tuple[str, ...]:
+    def _length_notes(self) -> list[str]:
         """Reject offsets that no robot has, and return notes on those that may be in mm."""
         lengths = {"`tip_offset`": self.tip_offset}
         if self.offset.ndim == 2:
-            places = [f"`offset` of joint `{name}`" for name in self.joint_names]
-            lengths |= dict(zip(places, self.offset, strict=True))
-        known = {place: r for place, r in lengths.items() if isinstance(r, np.ndarray)}
-        for place, r in known.items():
-            if np.abs(r).max() > FARTHEST:
-                raise InputError(
-                    f"{place} is {np.abs(r).max():g} m long: give it in metres."
-                )
-        return tuple(note for place, r in known.items() for note in far_notes(place, r))
+            for name, offset in zip(self.joint_names, self.offset, strict=True):
+                lengths[f"`offset` of joint `{name}`"] = offset
+        notes = []
+        for owner, offset in lengths.items():
+            if not isinstance(offset, np.ndarray):
+                continue
+            length = np.abs(offset).max()
+            if length > MAX_LENGTH:
+                raise InputError(f"{owner} is {length:g} m long: give it in metres.")
+            notes += length_notes(owner, offset)
+        return notes
 
     @property
     def joints(self) -> int:
@@ -209,8 +216,9 @@ class Robot(Summarised, eqx.Module):
     def ancestors(self) -> tuple[tuple[int, ...], ...]:
         """For every body the joints that move it, from the ground to its own."""
         chains: list[tuple[int, ...]] = []
-        for i, p in enumerate(self.parent):
-            chains.append((i,) if p < 0 else (*chains[p], i))
+        for joint, parent in enumerate(self.parent):
+            parent_chain = chains[parent] if parent >= 0 else ()
+            chains.append((*parent_chain, joint))
         return tuple(chains)
 
     @property
@@ -231,9 +239,8 @@ class Robot(Summarised, eqx.Module):
             j = int(np.flatnonzero(~np.isfinite(forces))[0])
             raise InputError(
                 f"the largest force of joint `{self.joint_names[j]}` of `{self.name}` "
-                "is not known:"
-                " give `limits.force` (joint side) or `drives.max_torques` (motor "
-                "side)."
+                "is not known: give `limits.force` (joint side) or "
+                "`drives.max_torques` (motor side)."
             )
         return forces
 
@@ -269,18 +276,20 @@ class Robot(Summarised, eqx.Module):
         Raises:
             InputError: If the attitude is no rotation, or the position no point.
         """
-        R = _rotations(
-            "`rotation`", np.eye(3) if rotation is None else rotation, (3, 3)
-        )
+        upright = np.eye(3) if rotation is None else rotation
+        R = _rotations("`rotation`", upright, (3, 3))
         r = _checked("`position`", position, (3,))
-        on_ground = np.array(self.parent) < 0
         xp = namespace(R, r, self.rotation, self.offset)
+        rotations = R @ self.rotation
+        offsets = xp.broadcast_to(r, self.offset.shape) + self.offset @ R.T
+
+        # Only bodies on the ground move: the others are placed in their parents.
+        on_ground = np.array(self.parent) < 0
         moves = np.broadcast_to(on_ground[:, None], self.offset.shape)
         turns = np.broadcast_to(on_ground[:, None, None], self.rotation.shape)
-        shift = xp.broadcast_to(r, self.offset.shape)
         return self.replace(
-            rotation=xp.where(turns, R @ self.rotation, self.rotation),
-            offset=xp.where(moves, shift + self.offset @ R.T, self.offset),
+            rotation=xp.where(turns, rotations, self.rotation),
+            offset=xp.where(moves, offsets, self.offset),
         )
 
     def with_tool(
@@ -303,15 +312,15 @@ class Robot(Summarised, eqx.Module):
         Raises:
             InputError: If the mass is not positive, or no body has such an inertia.
         """
-        own = Tool(
+        at_tip = Tool(
             self.tip_body, mass=mass, centre_of_mass=centre_of_mass, inertia=inertia
         )
-        there = own.body_inertia.moved(self.tip_rotation, self.tip_offset)
+        load = at_tip.body_inertia.moved(self.tip_rotation, self.tip_offset)
         tool = Tool(
             self.tip_body,
-            mass=own.mass,
-            centre_of_mass=there.centre,
-            inertia=there.tensor,
+            mass=load.mass,
+            centre_of_mass=load.centre,
+            inertia=load.tensor,
         )
         return self.replace(tool=tool)
 
@@ -328,14 +337,12 @@ class Robot(Summarised, eqx.Module):
         names = ("ground", *self.joint_names)
         units = [self.joint_unit(j) for j in range(self.joints)]
         limits = self.limits
-        facts = [
-            ("end-effector", f"on the body of `{self.joint_names[self.tip_body]}`")
-        ]
+        tip_carrier = self.joint_names[self.tip_body]
+        facts = [("end-effector", f"on the body of `{tip_carrier}`")]
         if self.tool is not None:
             carrier = self.joint_names[self.tool.body]
-            facts.append(
-                ("tool", f"{float(self.tool.mass):.3g} kg on the body of `{carrier}`")
-            )
+            mass = float(self.tool.mass)
+            facts.append(("tool", f"{mass:.3g} kg on the body of `{carrier}`"))
         if self.source:
             facts.append(("source", self.source))
         return Table(
@@ -356,11 +363,9 @@ class Robot(Summarised, eqx.Module):
 
 def _checked(name: str, value: Numbers, shape: tuple[int, ...]) -> AnyArray:
     """Return a copy as an array of finite numbers; a JAX array may have leading axes."""
-    array = (
-        value
-        if isinstance(value, jax.Array)
-        else np.array(as_array(name, value), np.float64)
-    )
+    array = value
+    if not isinstance(value, jax.Array):
+        array = np.array(as_array(name, value), np.float64)
     if array.shape[array.ndim - len(shape) :] != shape or array.ndim < len(shape):
         raise InputError(f"{name} must have the shape {shape}, but has {array.shape}.")
     if isinstance(array, np.ndarray) and not np.isfinite(array).all():
@@ -368,7 +373,22 @@ def _checked(name: str, value: Numbers, shape: tuple[int, ...]) -> AnyArray:
     return array
 
 
+def _unit_axes(axes: AnyArray) -> AnyArray:
+    """Return axes of length one; arrays of JAX are taken as they are."""
+    if not isinstance(axes, np.ndarray):
+        return axes
+    length = np.linalg.norm(axes, axis=-1, keepdims=True)
+    if (length < 1e-9).any():
+        joint = int(length.argmin()) + 1
+        raise InputError(
+            f"`axis` of joint {joint} is the zero vector: give it a direction."
+        )
+    # A unit vector keeps its digits.
+    return np.where(np.abs(length - 1.0) > 1e-15, axes / length, axes)
+
+
 def _rotations(name: str, value: Numbers, shape: tuple[int, ...]) -> AnyArray:
+    """Return a copy as rotation matrices; a JAX array is taken as it is."""
     R = _checked(name, value, shape)
     if isinstance(R, np.ndarray):
         error = np.abs(np.swapaxes(R, -1, -2) @ R - np.eye(3)).max(axis=(-1, -2))

@@ -1,10 +1,9 @@
 """Rotations by angles, exact at quarter turns, and rounded quarter turns made exact.
 
 A rounded quarter turn (1.5708 for pi/2) makes columns of the regressor that are only
-*nearly*
-dependent: one base parameter too many, at a condition number of 1e7. So the rank is
-    decided with
-exact quarter turns ("snapping"); the robot itself keeps the angles of its file.
+*nearly* dependent: one base parameter too many, at a condition number of 1e7. So the
+rank is decided with exact quarter turns ("snapping"); the robot itself keeps the angles
+of its file.
 """
 
 import numpy as np
@@ -19,8 +18,9 @@ SNAP_TOLERANCE = 1e-4
 def skew(a: Float[AnyArray, "3"]) -> Float[AnyArray, "3 3"]:
     r"""Return the matrix $\tilde a$ with $\tilde a b = a \times b$ (Eq. 3)."""
     x, y, z = a[0], a[1], a[2]
-    o = 0.0 * x
-    return namespace(a).array([[o, -z, y], [z, o, -x], [-y, x, o]])
+    zero = 0.0 * x
+    rows = [[zero, -z, y], [z, zero, -x], [-y, x, zero]]
+    return namespace(a).array(rows)
 
 
 def rotation_about(
@@ -55,9 +55,9 @@ def rpy_angles(rotation: Float[AnyArray, "3 3"]) -> Float[np.ndarray, "3"]:
     """Return roll, pitch and yaw [rad] of a rotation, as precise at a pitch of a quarter turn."""
     roll = float(np.arctan2(rotation[2, 1], rotation[2, 2]))
     R = np.asarray(rotation) @ axis_rotation((1.0, 0.0, 0.0), -roll)
-    return np.array(
-        [roll, np.arctan2(-R[2, 0], R[2, 2]), np.arctan2(-R[0, 1], R[1, 1])]
-    )
+    pitch = np.arctan2(-R[2, 0], R[2, 2])
+    yaw = np.arctan2(-R[0, 1], R[1, 1])
+    return np.array([roll, pitch, yaw])
 
 
 def snapped(
@@ -69,22 +69,26 @@ def snapped(
             "`snap_tolerance` must be an angle from 0 (off) to 0.1 rad, but is "
             f"{tolerance:g}."
         )
-    x = np.asarray(vectors, np.float64)
-    zeroed = np.where(np.abs(x) <= tolerance, 0.0, x)
-    return without_rounding(zeroed / np.linalg.norm(zeroed, axis=-1, keepdims=True))
+    entries = np.asarray(vectors, np.float64)
+    entries = np.where(np.abs(entries) <= tolerance, 0.0, entries)
+    lengths = np.linalg.norm(entries, axis=-1, keepdims=True)
+    return without_rounding(entries / lengths)
 
 
 def snapped_rotations(
     rotations: Float[AnyArray, "*shape 3 3"], tolerance: float
 ) -> Float[np.ndarray, "*shape 3 3"]:
     """Return rotations whose entries within `tolerance` of zero are zero, rotations as before."""
-    R, zeroed = np.asarray(rotations, np.float64), snapped(rotations, tolerance)
-    U, _, Vt = np.linalg.svd(zeroed)
-    changed = (np.abs(R - zeroed) > 1e-14).any(axis=(-2, -1), keepdims=True)
-    return np.where(changed, without_rounding(U @ Vt), R)
+    R = np.asarray(rotations, np.float64)
+    rows = snapped(rotations, tolerance)
+    U, _, Vt = np.linalg.svd(rows)
+    nearest_rotation = without_rounding(U @ Vt)
+    changes = (np.abs(R - rows) > 1e-14).any(axis=(-2, -1), keepdims=True)
+    return np.where(changes, nearest_rotation, R)
 
 
 def without_rounding(values: np.ndarray) -> np.ndarray:
     """Set entries to 0, 1 or -1 that differ only by rounding, like 6e-17 for cos(pi/2)."""
-    nearest = np.clip(np.round(values), -1.0, 1.0)
-    return np.where(np.abs(values - nearest) <= 1e-14, nearest, values) + 0.0
+    integers = np.clip(np.round(values), -1.0, 1.0)
+    entries = np.where(np.abs(values - integers) <= 1e-14, integers, values)
+    return entries + 0.0  # makes -0.0 positive

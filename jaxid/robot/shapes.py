@@ -6,14 +6,14 @@ small, never too large. Where the closest points are not unique, the derivative 
 at one pair of them.
 """
 
-from typing import Any
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Array, Float, Numbers, namespace
+from jaxid.arrays import AnyArray, Array, Float, Numbers
 from jaxid.errors import InputError
 
 GROUND = -1
@@ -54,11 +54,12 @@ class Capsule(eqx.Module):
         end: Numbers | None = None,
         radius: Numbers,
     ):
-        self.name, self.body = name, body
-        self.start = _point(f"`start` of capsule `{name}`", start)
-        self.end = (
-            self.start if end is None else _point(f"`end` of capsule `{name}`", end)
-        )
+        self.name = name
+        self.body = body
+        self.start = _finite_point(f"`start` of capsule `{name}`", start)
+        self.end = self.start
+        if end is not None:
+            self.end = _finite_point(f"`end` of capsule `{name}`", end)
         self.radius = np.array(radius, np.float64)
         if not 0 < self.radius < np.inf:
             raise InputError(
@@ -89,27 +90,19 @@ class HalfSpace(eqx.Module):
         normal: Numbers = (0.0, 0.0, 1.0),
         height: Numbers = 0.0,
     ):
-        n = _point(f"`normal` of `{name}`", normal)
-        length = np.linalg.norm(n)
+        direction = _finite_point(f"`normal` of `{name}`", normal)
+        length = np.linalg.norm(direction)
         if length < 1e-9 or not np.isfinite(height).all():
             raise InputError(
                 f"`{name}` needs a `normal` that is not zero, and a finite `height`."
             )
         self.name = name
-        self.normal = n / length
+        self.normal = direction / length
         self.height = np.array(height, np.float64)
 
     def distance(self, start: Vectors, end: Vectors) -> Lengths:
         """Return the signed distances of segments from the plane [m]: those of the lower ends."""
         return _smaller(start @ self.normal, end @ self.normal) - self.height
-
-    def slopes(
-        self, ends: Float[np.ndarray, "segments 2 3"]
-    ) -> Float[np.ndarray, "segments 2 3"]:
-        """Return the derivatives of the distances of segments by their ends, in NumPy."""
-        heights = ends @ self.normal
-        lower = heights[:, 0] < heights[:, 1]
-        return np.stack([lower, ~lower], axis=1)[:, :, None] * self.normal
 
 
 class Box(eqx.Module):
@@ -140,9 +133,10 @@ class Box(eqx.Module):
         rotation: Numbers | None = None,
     ):
         R = np.eye(3) if rotation is None else np.array(rotation, np.float64)
-        self.name, self.rotation = name, R
-        self.centre = _point(f"`centre` of box `{name}`", centre)
-        self.size = _point(f"`size` of box `{name}`", size)
+        self.name = name
+        self.rotation = R
+        self.centre = _finite_point(f"`centre` of box `{name}`", centre)
+        self.size = _finite_point(f"`size` of box `{name}`", size)
         if (self.size <= 0).any():
             raise InputError(
                 f"`size` of box `{name}` must be positive [m], but is {size}."
@@ -152,46 +146,32 @@ class Box(eqx.Module):
 
     def distance(self, start: Vectors, end: Vectors) -> Lengths:
         """Return the signed distances of segments' deepest or nearest points [m]."""
-        start, end = jnp.asarray(start), jnp.asarray(end)
         R = jnp.asarray(self.rotation)
         centre = jnp.broadcast_to(self.centre @ self.rotation, start.shape)
-        first, along = start @ R - centre, (end - start) @ R
-        # The distance is convex along the segment. Its minimum is found without
-        # derivatives: those of the place add nothing to that of the distance.
+        first = start @ R - centre
+        along = (end - start) @ R
+        # The minimum is found without derivatives: those of its place add nothing to
+        # that of the distance.
         origin, direction = jax.lax.stop_gradient((first, along))
 
         def slope(place: Array) -> Array:
-            return jax.jvp(self._signed, (origin + place * direction,), (direction,))[
-                1
-            ][..., None]
+            point = origin + place * direction
+            _, derivative = jax.jvp(self._signed, (point,), (direction,))
+            return derivative[..., None]
 
-        def halve(_: int | Array, interval: tuple[Array, Array]) -> tuple[Array, Array]:
-            low, high = interval
-            middle = 0.5 * (low + high)
-            falls = slope(middle) < 0
-            return jnp.where(falls, middle, low), jnp.where(falls, high, middle)
-
-        zero = jnp.zeros_like(origin[..., :1])
-        low, high = jax.lax.fori_loop(0, 40, halve, (zero, zero + 1.0))
+        low, high = _bisect(slope, jnp.zeros_like(origin[..., :1]))
         # In the box the deepest point lies where two faces are equally near. The
         # derivative is then that mean of both sides' which a shift along the segment
         # leaves as it is.
-        falling, rising = slope(low), slope(high)
-        turns = rising - falling
-        share = jnp.clip(rising / jnp.where(turns > 0, turns, 1.0), 0.0, 1.0)[..., 0]
-        before, after = (self._signed(first + place * along) for place in (low, high))
-        return share * before + (1.0 - share) * after
+        rising = slope(high)
+        turn = rising - slope(low)
+        share = jnp.clip(rising / jnp.where(turn > 0, turn, 1.0), 0.0, 1.0)[..., 0]
+        distance_before = self._signed(first + low * along)
+        distance_after = self._signed(first + high * along)
+        return share * distance_before + (1.0 - share) * distance_after
 
-    def slopes(
-        self, ends: Float[np.ndarray, "segments 2 3"]
-    ) -> Float[np.ndarray, "segments 2 3"]:
-        """Return the derivatives of the distances of segments by their ends, in NumPy."""
-        count = -(-len(ends) // 64) * 64  # few sizes, so that little is compiled
-        padded = np.resize(ends, (count, 2, 3))
-        found = _box_slopes(self, jnp.asarray(padded[:, 0]), jnp.asarray(padded[:, 1]))
-        return np.stack([np.asarray(x) for x in found], axis=1)[: len(ends)]
-
-    def _signed(self, point: Array) -> Any:
+    def _signed(self, point: Array) -> Array:
+        """Return the signed distances of points in the frame of the box [m]."""
         beyond = jnp.abs(point) - jnp.broadcast_to(0.5 * self.size, point.shape)
         x, y, z = jnp.unstack(-beyond, axis=-1)
         depth = _smaller(_smaller(x, y), z)
@@ -199,70 +179,77 @@ class Box(eqx.Module):
         return _rounded_norm(outside) - jnp.where(depth > 0, depth, 0.0)
 
 
-@eqx.filter_jit
-def _box_slopes(box: Box, start: Array, end: Array) -> tuple[Array, ...]:
-    distance, pull = jax.vjp(box.distance, start, end)
-    return pull(jnp.ones_like(distance))
+def segment_distance(
+    start: Vectors, end: Vectors, other_start: Vectors, other_end: Vectors
+) -> Lengths:
+    """Return the distance between segments, which may be parallel, touch, or be points [m]."""
+    u = end - start
+    v = other_end - other_start
+    r = start - other_start
+    # Derivatives of the closest places add nothing to that of the distance, and they
+    # have none at parallel axes.
+    a, b = _closest_places(*jax.lax.stop_gradient((u, v, r)))
+    return _rounded_norm(r + a * u - b * v)
 
 
-def _smaller(x: AnyArray, y: AnyArray) -> Any:
+def _closest_places(u: Vectors, v: Vectors, r: Vectors) -> tuple[Array, Array]:
+    """Return the places of the closest points along two segments, from 0 to 1.
+
+    The segments have the directions u and v, and r is the difference of their starts.
+    """
+    uu = _dot(u, u)
+    vv = _dot(v, v)
+    uv = _dot(u, v)
+    ur = _dot(u, r)
+    vr = _dot(v, r)
+    determinant = uu * vv - uv * uv
+    # Axes count as parallel below this square of the sine between them.
+    crossing = determinant > 1e-12 * uu * vv
+    a = _fraction(uv * vr - ur * vv, determinant, crossing)
+    b = _fraction(uv * a + vr, vv, vv > 0)
+    # The nearest point to a clipped one; for parallel axes any start will do.
+    a = _fraction(uv * b - ur, uu, uu > 0)
+    return a, _fraction(uv * a + vr, vv, vv > 0)
+
+
+def _dot(x: Vectors, y: Vectors) -> Array:
+    return jnp.einsum("...i,...i->...", x, y)[..., None]
+
+
+def _fraction(numerator: Array, denominator: Array, usable: Array) -> Array:
+    """Return a ratio clipped to the range from 0 to 1; zero where it is not usable."""
+    ratio = numerator / jnp.where(usable, denominator, 1.0)
+    return jnp.where(usable, jnp.clip(ratio, 0.0, 1.0), 0.0)
+
+
+def _bisect(slope: Callable[[Array], Array], zero: Array) -> tuple[Array, Array]:
+    """Return ends of intervals around the minima of convex functions from 0 to 1."""
+
+    def halve(_: Array, interval: tuple[Array, Array]) -> tuple[Array, Array]:
+        low, high = interval
+        middle = 0.5 * (low + high)
+        falls = slope(middle) < 0
+        return jnp.where(falls, middle, low), jnp.where(falls, high, middle)
+
+    return jax.lax.fori_loop(0, 40, halve, (zero, zero + 1.0))
+
+
+def _smaller(x: AnyArray, y: AnyArray) -> Array:
     """Return the smaller numbers, with the derivatives of one of both.
 
     Derivatives of `jnp.minimum` ask which argument equals the result. None does where a
     compiler rounds the two in different ways.
     """
-    return namespace(x, y).where(x < y, x, y)
+    return jnp.where(x < y, x, y)
 
 
-def _rounded_norm(vector: Vectors) -> Any:
+def _rounded_norm(vector: Vectors) -> Array:
     """Return lengths of vectors, smooth at zero and there at most `ROUNDING` too small [m]."""
-    xp = namespace(vector)
-    return xp.sqrt(xp.einsum("...i,...i->...", vector, vector) + ROUNDING**2) - ROUNDING
+    square = jnp.einsum("...i,...i->...", vector, vector)
+    return jnp.sqrt(square + ROUNDING**2) - ROUNDING
 
 
-def segment_distance(
-    start: Vectors, end: Vectors, other_start: Vectors, other_end: Vectors
-) -> Lengths:
-    """Return the distance between segments, which may be parallel, touch, or be points [m]."""
-    u, v = end - start, other_end - other_start
-    a, b = closest_places(start, end, other_start, other_end)
-    return _rounded_norm(start + a * u - other_start - b * v)
-
-
-def closest_places(
-    start: Vectors, end: Vectors, other_start: Vectors, other_end: Vectors
-) -> tuple[AnyArray, AnyArray]:
-    """Return the places of the closest points along two segments, from 0 to 1, as constants.
-
-    Their derivatives add nothing to that of the distance, and they have none at
-    parallel axes.
-    """
-    xp = namespace(start, end, other_start, other_end)
-    ends = (start, end, other_start, other_end)
-    if xp is jnp:
-        ends = jax.lax.stop_gradient(tuple(map(jnp.asarray, ends)))
-    start, end, other_start, other_end = ends
-    u, v, r = end - start, other_end - other_start, start - other_start
-
-    def dot(x: AnyArray, y: AnyArray) -> AnyArray:
-        return xp.einsum("...i,...i->...", x, y)[..., None]
-
-    def share(part: AnyArray, whole: AnyArray, usable: AnyArray) -> AnyArray:
-        return xp.where(
-            usable, xp.clip(part / xp.where(usable, whole, 1.0), 0.0, 1.0), 0.0
-        )
-
-    uu, vv, uv, ur, vr = dot(u, u), dot(v, v), dot(u, v), dot(u, r), dot(v, r)
-    area = uu * vv - uv * uv
-    # Axes count as parallel below this square of the sine between them.
-    a = share(uv * vr - ur * vv, area, area > 1e-12 * uu * vv)
-    b = share(uv * a + vr, vv, vv > 0)
-    # The nearest point to a clipped one; for parallel axes any start will do.
-    a = share(uv * b - ur, uu, uu > 0)
-    return a, share(uv * a + vr, vv, vv > 0)
-
-
-def _point(name: str, value: Numbers) -> np.ndarray:
+def _finite_point(name: str, value: Numbers) -> np.ndarray:
     point = np.array(value, np.float64)
     if point.shape != (3,) or not np.isfinite(point).all():
         raise InputError(f"{name} must hold three finite numbers, but is {value}.")

@@ -1,7 +1,7 @@
 """Robots from URDF and MJCF files, and the parameters that such a file claims."""
 
-from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -10,11 +10,14 @@ from jaxid.errors import InputError
 
 from .forward_and_inverse_kinematics import tip_jacobian
 from .inertia import Inertia
-from .limits_and_drives import FAR, Limits, owners, range_fault
+from .limits_and_drives import DOUBTFUL_LENGTH, Limits, owners, range_fault
 from .robot import Robot
-from .urdf_tree import TURNING, UrdfTree
+from .urdf_tree import ORIGIN, TURNING, UrdfTree
 
-_ZERO = (0.0, 0.0, 0.0)
+MIN_EFFORT_SHARE = 0.25
+"""Effort, relative to what gravity needs, below which its unit is doubtful."""
+UNLIMITED_RANGE = 2e4
+"""Range of a joint that turns without end [rad]."""
 
 
 def load_urdf(
@@ -24,7 +27,7 @@ def load_urdf(
     base: str | None = None,
     gravity: Numbers | None = None,
     base_rotation: Numbers | None = None,
-    base_position: Numbers = _ZERO,
+    base_position: Numbers = ORIGIN,
 ) -> Robot:
     """Load a robot from a URDF, xacro or MJCF file; `urdf_parameters` reads its inertias.
 
@@ -85,7 +88,7 @@ def load_urdf(
     except InputError as error:
         raise InputError(f"`{path}`: {error}") from error
     robot = robot.mounted(base_rotation, base_position)
-    return robot.replace(notes=(*robot.notes, *_weight_notes(robot, tree.bodies())))
+    return robot.replace(notes=(*robot.notes, *_effort_notes(robot, tree.bodies())))
 
 
 load_mjcf = load_urdf
@@ -103,9 +106,8 @@ def urdf_parameters(
 
     Ten for each body of `load_urdf` with the same arguments, in the order of its
     joints: (m, m r_c, A, B, C, D, E, F) about the body's origin. Links on fixed joints
-        are added to the
-    body that carries them; links without inertia count as massless. Links below a
-    moving joint that `tip` leaves out are left out.
+    are added to the body that carries them; links without inertia count as massless.
+    Links below a moving joint that `tip` leaves out are left out.
 
     Args:
         path: URDF or MJCF file.
@@ -130,118 +132,146 @@ def joint_parameters(
     Arguments and errors are those of `load_urdf`.
     """
     tree = UrdfTree(path, base=base, tip=tip)
-    return {
-        key: np.array(
-            [tree.numbers(j.find("dynamics"), key, (0.0,))[0] for j in tree.joints]
-        )
-        for key in ("armature", "damping", "friction")
-    }
+    parameters = {}
+    for key in ("armature", "damping", "friction"):
+        elements = [joint.find("dynamics") for joint in tree.joints]
+        values = [tree.numbers(element, key, (0.0,))[0] for element in elements]
+        parameters[key] = np.array(values)
+    return parameters
 
 
 def _limits(tree: UrdfTree) -> tuple[Limits, list[str]]:
-    values = np.full((4, len(tree.joints)), np.inf)
-    values[0] = -np.inf
+    """Return the limits of all joints, and notes on those that are taken as unknown."""
+    joints = len(tree.joints)
+    low = np.full(joints, -np.inf)
+    high = np.full(joints, np.inf)
+    magnitudes = {
+        "velocity": np.full(joints, np.inf),
+        "effort": np.full(joints, np.inf),
+    }
     unknown: dict[str, list[str]] = {}
     for i, joint in enumerate(tree.joints):
         name = joint.get("name")
-        turns = joint.get("type") in TURNING
-        low, high = tree.range(joint)
-        if low == high == 0.0:
+        ends = _checked_range(tree, joint)
+        if ends == (0.0, 0.0):
             unknown.setdefault("a range from 0 to 0", []).append(name)
-        elif not (turns and high - low >= 2e4):  # such a joint turns without end
-            if fault := range_fault(low, high, turns):
-                unit = "radians, not degrees" if turns else "metres"
-                raise tree.error(joint, f"{fault}: its limits must be in {unit}")
-            if low >= high:
-                raise tree.error(
-                    joint, f"ranges from {low:g} to {high:g}: exchange the ends"
-                )
-            values[:2, i] = low, high
-        for k, key in enumerate(("velocity", "effort"), 2):
+        else:
+            low[i], high[i] = ends
+        for key, values in magnitudes.items():
             value = tree.limit(joint, key, np.inf)
             if value > 0.0:
-                values[k, i] = value
+                values[i] = value
             else:
                 unknown.setdefault(f"{key} {value:g}", []).append(name)
-    low, high, speed, force = values
-    limits = Limits(position_min=low, position_max=high, velocity=speed, force=force)
+    limits = Limits(
+        position_min=low,
+        position_max=high,
+        velocity=magnitudes["velocity"],
+        force=magnitudes["effort"],
+    )
     notes = [
-        f"{owners('joint', who)}: {what} is taken as unknown."
-        for what, who in unknown.items()
+        f"{owners('joint', joints)}: {limit} is taken as unknown."
+        for limit, joints in unknown.items()
     ]
     return limits, notes
 
 
-def _held_notes(tree: UrdfTree) -> Iterator[str]:
-    """Yield notes on joints that are held, and on objects that are no part of the robot."""
+def _checked_range(tree: UrdfTree, joint: Any) -> tuple[float, float]:
+    """Return the ends of a joint's range, which are equal only if both are zero."""
+    turns = joint.get("type") in TURNING
+    low, high = tree.range(joint)
+    if low == high == 0.0:
+        return low, high
+    if turns and high - low >= UNLIMITED_RANGE:
+        return -np.inf, np.inf
+    fault = range_fault(low, high, turns)
+    if fault:
+        unit = "radians, not degrees" if turns else "metres"
+        raise tree.error(joint, f"{fault}: its limits must be in {unit}")
+    if low >= high:
+        raise tree.error(joint, f"ranges from {low:g} to {high:g}: exchange the ends")
+    return low, high
+
+
+def _held_notes(tree: UrdfTree) -> list[str]:
+    """Return notes on joints that are held, and on objects that are no part of the robot."""
     groups: dict[tuple[str, str], list[str]] = {}
     for joint in tree.held:
         master = joint.find("mimic").get("joint", "")
-        groups.setdefault((master, f"{tree.held_at(joint):.4g}"), []).append(
-            joint.get("name")
-        )
-    for (master, value), names in groups.items():
+        position = f"{tree.held_at(joint):.4g}"
+        groups.setdefault((master, position), []).append(joint.get("name"))
+    notes = []
+    for (master, position), names in groups.items():
         cause = f"mimic of joint `{master}`" if master else "constraint"
-        yield (
-            f"{owners('joint', names)}: held at {value} ({cause}); the links belong "
-            "to the bodies "
-            "that carry them."
+        notes.append(
+            f"{owners('joint', names)}: held at {position} ({cause}); the links belong "
+            "to the bodies that carry them."
         )
     if tree.loose:
-        yield f"{owners('link', tree.loose)}: left out, as objects that float freely."
+        links = owners("link", tree.loose)
+        notes.append(f"{links}: left out, as objects that float freely.")
+    return notes
 
 
-def _inertial_notes(tree: UrdfTree) -> Iterator[str]:
-    """Yield notes on bodies without mass, and on links that cannot exist."""
-    inertials = {
-        n: tree.inertial(n) for n, (body, _, _) in tree.carriers.items() if body >= 0
-    }
-    massive = {
-        tree.carriers[n][0] for n, found in inertials.items() if found and found[0].mass
-    }
-    if light := [j.get("name") for i, j in enumerate(tree.joints) if i not in massive]:
-        yield (
-            f"{owners('joint', light)}: the body has no mass; `urdf_parameters` "
-            "takes zero."
+def _inertial_notes(tree: UrdfTree) -> list[str]:
+    """Return notes on bodies without mass, and on links that cannot exist."""
+    masses = np.zeros(len(tree.joints))
+    faults = {}
+    for link, placement in tree.carriers.items():
+        inertial = tree.inertial(link) if placement.body >= 0 else None
+        if inertial is not None:
+            inertia, faults[link] = inertial
+            masses[placement.body] += abs(inertia.mass)
+    notes = []
+    light_bodies = [tree.joints[i].get("name") for i in np.flatnonzero(masses == 0.0)]
+    if light_bodies:
+        notes.append(
+            f"{owners('joint', light_bodies)}: the body has no mass; "
+            "`urdf_parameters` takes zero."
         )
-    for name, inertial in inertials.items():
-        if inertial is not None and inertial[1]:
-            yield (
-                f"link `{name}`: its inertial, which identification does not need, "
-                "belongs to no "
-                f"body: {inertial[1]}."
+    for link, fault in faults.items():
+        if fault:
+            notes.append(
+                f"link `{link}`: its inertial, which identification does not need, "
+                f"belongs to no body: {fault}."
             )
+    return notes
 
 
-def _weight_notes(
-    robot: Robot, bodies: Float[np.ndarray, "joints 10"]
-) -> Iterator[str]:
-    """Yield notes on joints that cannot hold a fraction of what gravity needs with these bodies."""
+def _effort_notes(robot: Robot, bodies: Float[np.ndarray, "joints 10"]) -> list[str]:
+    """Return notes on joints that cannot hold a fraction of what gravity needs with these bodies."""
     if is_traced(robot):
-        return
-    low, high = (
-        np.asarray(x) for x in (robot.limits.position_min, robot.limits.position_max)
-    )
+        return []
+    forces = np.abs(_gravity_forces(robot, bodies)).max(axis=0)
+    efforts = np.asarray(robot.limits.force)
+    notes = []
+    for joint in np.flatnonzero(efforts < MIN_EFFORT_SHARE * forces):
+        unit = robot.force_unit(joint)
+        notes.append(
+            f"joint `{robot.joint_names[joint]}`: an effort of {efforts[joint]:.3g} "
+            f"{unit} is far below the {forces[joint]:.3g} {unit} that gravity needs "
+            "with the inertias of the file: are its units right?"
+        )
+    return notes
+
+
+def _gravity_forces(
+    robot: Robot, bodies: Float[np.ndarray, "joints 10"]
+) -> Float[np.ndarray, "poses joints"]:
+    """Return the forces that bodies need at rest in random poses [N m or N]."""
+    low = np.asarray(robot.limits.position_min)
+    high = np.asarray(robot.limits.position_max)
     ends = np.where(robot.revolute, np.pi, 0.0)
-    low, high = (
-        np.where(np.isfinite(low), low, -ends),
-        np.where(np.isfinite(high), high, ends),
-    )
+    low = np.where(np.isfinite(low), low, -ends)
+    high = np.where(np.isfinite(high), high, ends)
     q = np.random.default_rng(0).uniform(low, high, (64, robot.joints))
+
     forces = np.zeros(q.shape)
-    for body, inertia in enumerate(map(Inertia.from_parameters, bodies)):
-        if inertia.mass > 0.0 and np.abs(inertia.centre).max() < FAR:
-            carried = robot.replace(tip_body=body, tip_offset=inertia.centre)
-            forces -= inertia.mass * (tip_jacobian(carried, q)[2] @ robot.gravity)
-    needed = np.abs(forces).max(axis=0)
-    for j, (name, most) in enumerate(
-        zip(robot.joint_names, robot.limits.force, strict=True)
-    ):
-        if most < 0.25 * needed[j]:
-            unit = robot.force_unit(j)
-            yield (
-                f"joint `{name}`: an effort of {most:.3g} {unit} is far below the "
-                f"{needed[j]:.3g} "
-                f"{unit} that gravity needs with the inertias of the file: are its "
-                "units right?"
-            )
+    for body, parameters in enumerate(bodies):
+        inertia = Inertia.from_parameters(parameters)
+        # A centre of mass that is so far away is in millimetres.
+        if inertia.mass > 0.0 and np.abs(inertia.centre).max() < DOUBTFUL_LENGTH:
+            at_centre = robot.replace(tip_body=body, tip_offset=inertia.centre)
+            velocity = tip_jacobian(at_centre, q).velocity
+            forces -= inertia.mass * (velocity @ robot.gravity)
+    return forces

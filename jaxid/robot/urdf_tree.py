@@ -1,28 +1,41 @@
-"""Links and joints of URDF, xacro and MJCF files."""
+"""Links and joints of URDF, xacro and MJCF files, merged into the bodies of a robot."""
 
-import shutil
-import subprocess
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
 
-from jaxid.arrays import Float, Numbers
+from jaxid.arrays import Float
 from jaxid.errors import InputError
 
+from .description_files import is_mjcf, read_description
 from .inertia import Inertia
 from .limits_and_drives import listed
-from .mjcf import Loop, mjcf_as_urdf
-from .robot import GRAVITY
+from .mjcf import Loop
 from .rotations import axis_rotation, rpy_rotation, without_rounding
 
 TURNING = ("revolute", "continuous")
 """Types of joints that turn."""
-_ZERO = (0.0, 0.0, 0.0)
-_LARGEST_ANGLE = 2 * np.pi + 0.01
+ORIGIN = (0.0, 0.0, 0.0)
+"""Position, or roll, pitch and yaw, where a file states none."""
+MAX_ANGLE = 2 * np.pi + 0.01
 """Largest roll, pitch or yaw that can be in radians; a full turn may be rounded [rad]."""
+
+
+class Placement(NamedTuple):
+    """Attitude and origin of a link in the frame of the body that carries it.
+
+    Attributes:
+        body: Index of the body; -1 for the ground.
+        rotation: Attitude; its columns are the axes of the link.
+        position: Origin of the link [m].
+    """
+
+    body: int
+    rotation: Float[np.ndarray, "3 3"]
+    position: Float[np.ndarray, "3"]
 
 
 class UrdfTree:
@@ -34,8 +47,7 @@ class UrdfTree:
 
     Attributes:
         links: Elements of the links, by name.
-        carriers: For each link its body (-1: ground) and its placement in the body's
-            frame.
+        carriers: For each link its placement on the body that carries it.
         joints: Elements of the moving joints; `parent`, `axis`, `rotation` and `offset`
             as in `Robot`.
         held: Elements of joints that mimic others.
@@ -51,64 +63,66 @@ class UrdfTree:
         self.path = str(path)
         self.root, self.gravity, loops = read_description(path)
         self.compiled = is_mjcf(path)
-        element = self.root
-        name = element.get("name") or Path(path).stem
+        name = self.root.get("name") or Path(path).stem
         self.name = "".join(c if c.isprintable() else " " for c in name)
-        self.links = self._named(element, "link")
-        self._joints = self._named(element, "joint")
-        joints = self._joints.values()
-        if any(
-            parent.get("link") == "world"
-            for j in joints
-            for parent in j.iterfind("parent")
-        ):
+        self.links = self._named("link")
+        self._joints = self._named("joint")
+        if self.root.find("joint/parent[@link='world']") is not None:
             # Simulators know this link, so that many files do not define it.
             self.links.setdefault("world", etree.Element("link", name="world"))
         self._below: dict[str, list[Any]] = {link: [] for link in self.links}
         self._above: dict[str, Any] = {}
-        for joint in joints:
+        for joint in self._joints.values():
             self._add(joint)
+
         root = self._find_root()
         for argument, link in (("base", base), ("tip", tip)):
             if link is not None and link not in self.links:
                 raise InputError(
                     f"`{argument}` must be a link of `{self.path}`, but is `{link}`; "
-                    "its links are "
-                    f"{listed(list(self.links))}."
+                    f"its links are {listed(list(self.links))}."
                 )
-        self.joints, self.parent = [], []
-        self.axis, self.rotation, self.offset = [], [], []
-        self.held, self.left_out, self.loose = [], [], []
+        self.joints = []
+        self.parent = []
+        self.axis = []
+        self.rotation = []
+        self.offset = []
+        self.held = []
+        self.left_out = []
+        self.loose = []
+        self.carriers: dict[str, Placement] = {}
         self._merge(root if base is None else base, tip)
-        self._refuse(loops)
+        self._refuse_loops(loops)
 
-    def _named(self, root: Any, tag: str) -> dict[str, Any]:
+    def _named(self, tag: str) -> dict[str, Any]:
         """Return the elements of a tag by their names."""
-        found: dict[str, Any] = {}
-        for element in root.iterfind(tag):
-            if (name := self._attribute(element, "name")) in found:
+        elements: dict[str, Any] = {}
+        for element in self.root.iterfind(tag):
+            name = self._attribute(element, "name")
+            if name in elements:
                 raise InputError(
                     f"`{self.path}` has two {tag}s named `{name}`: rename one."
                 )
-            found[name] = element
-        return found
+            elements[name] = element
+        return elements
 
     def _add(self, joint: Any) -> None:
         """Enter a joint between the links that it connects."""
         self._attribute(joint, "type")
         for tag in ("parent", "child"):
-            if (end := joint.find(tag)) is None:
+            end = joint.find(tag)
+            if end is None:
                 raise InputError(f"{self.place(joint)}: the joint has no `<{tag}>`.")
-            if (link := self._attribute(end, "link")) not in self.links:
+            link = self._attribute(end, "link")
+            if link not in self.links:
                 raise self.error(
                     joint, f"connects link `{link}`, which the file does not define"
                 )
         parent, child = link_names(joint)
         if child in self._above:
+            other = self._above[child].get("name")
             raise self.error(
-                joint,
-                f"moves link `{child}`, as `{self._above[child].get('name')}` does: "
-                "remove one",
+                joint, f"moves link `{child}`, as `{other}` does: remove one"
             )
         self._above[child] = joint
         self._below[parent].append(joint)
@@ -116,98 +130,103 @@ class UrdfTree:
     def _find_root(self) -> str:
         """Return the only link that no joint moves."""
         roots = [link for link in self.links if link not in self._above]
-        reached = list(roots)
-        for link in reached:
-            reached += [link_names(joint)[1] for joint in self._below[link]]
-        if link := next((link for link in self.links if link not in reached), None):
-            raise self.error(
-                self._above[link],
-                "is part of a closed loop: remove one joint of the loop",
-            )
+        reachable = list(roots)
+        for link in reachable:
+            reachable += [link_names(joint)[1] for joint in self._below[link]]
+        for link in self.links:
+            if link not in reachable:
+                raise self.error(
+                    self._above[link],
+                    "is part of a closed loop: remove one joint of the loop",
+                )
         if len(roots) != 1:
             raise InputError(
                 f"`{self.path}` must have one root link, but has "
-                f"{listed(roots) or 'none'}: "
-                "connect several by fixed joints."
+                f"{listed(roots) or 'none'}: connect several by fixed joints."
             )
         return roots[0]
 
     def _merge(self, base: str, tip: str | None) -> None:
         """Merge links on fixed joints into the bodies that carry them, depth first."""
         chain = None if tip is None else self._chain(base, tip)
-        self.carriers = {base: (-1, np.eye(3), np.zeros(3))}
-        length = {base: (0, 0)}
-        waiting = self._below[base][::-1]
-        while waiting:
-            joint = waiting.pop()
-            fixed, mimic = joint.get("type") == "fixed", joint.find("mimic")
+        self.carriers[base] = Placement(-1, np.eye(3), np.zeros(3))
+        # Numbers of moving joints and of links on the way from the base.
+        lengths = {base: (0, 0)}
+        stack = self._below[base][::-1]
+        while stack:
+            joint = stack.pop()
             parent, child = link_names(joint)
-            body, R, r = self.carriers[parent]
+            fixed = joint.get("type") == "fixed"
             if not fixed and chain is not None and joint not in chain:
-                self.left_out += [joint] * (body >= 0)
+                if self.carriers[parent].body >= 0:
+                    self.left_out.append(joint)
                 continue
             if joint.get("type") == "floating" and not self._moves_below(joint):
                 self.loose.append(child)
                 continue
-            rotation, offset = self._origin(joint)
-            if mimic is not None and not fixed:
-                fixed, (rotation, offset) = True, self.held_pose(joint)
+            if not fixed and joint.find("mimic") is not None:
+                fixed = True
                 self.held.append(joint)
-            r = r + R @ offset
-            R = without_rounding(R @ rotation)
             if fixed:
-                self.carriers[child] = (body, R, r)
+                self.carriers[child] = self._held_placement(joint)
             else:
-                self.axis.append(self._axis(joint))
-                self.carriers[child] = (len(self.joints), np.eye(3), np.zeros(3))
-                self.joints.append(joint)
-                self.parent.append(body)
-                self.rotation.append(R)
-                self.offset.append(r)
-            moving, links = length[parent]
-            length[child] = (moving + (not fixed), links + 1)
-            waiting += self._below[child][::-1]
-        self.tip = max(length, key=lambda link: length[link]) if tip is None else tip
-        if self.carriers[self.tip][0] < 0:
-            below = (
-                f"below link `{base}`"
-                if tip is None
-                else f"between links `{base}` and `{tip}`"
-            )
+                self._add_body(joint)
+            moving, links = lengths[parent]
+            lengths[child] = (moving + (not fixed), links + 1)
+            stack += self._below[child][::-1]
+
+        self.tip = tip or max(lengths, key=lambda link: lengths[link])
+        if self.carriers[self.tip].body < 0:
+            way = f"below link `{base}`"
+            if tip is not None:
+                way = f"between links `{base}` and `{tip}`"
             raise InputError(
-                f"`{self.path}` has no moving joint {below}: choose another `base` or "
+                f"`{self.path}` has no moving joint {way}: choose another `base` or "
                 "`tip`."
             )
 
-    def placed_links(self) -> dict[str, tuple[int, np.ndarray, np.ndarray]]:
-        """Return `carriers` with all links below them, whose joints are held where left out."""
-        placed = dict(self.carriers)
-        waiting = list(placed)
-        for link in waiting:
-            body, R, r = placed[link]
-            for joint in self._below[link]:
-                child = link_names(joint)[1]
-                if child not in placed and joint.get("type") in (
-                    *TURNING,
-                    "prismatic",
-                    "fixed",
-                ):
-                    rotation, offset = self.held_pose(joint)
-                    placed[child] = body, R @ rotation, r + R @ offset
-                    waiting.append(child)
-        return placed
+    def _add_body(self, joint: Any) -> None:
+        """Enter the body that a joint moves."""
+        parent, child = link_names(joint)
+        rotation, offset = self._origin(joint)
+        carrier = _placed(self.carriers[parent], rotation, offset)
+        self.axis.append(self._axis(joint))
+        self.carriers[child] = Placement(len(self.joints), np.eye(3), np.zeros(3))
+        self.joints.append(joint)
+        self.parent.append(carrier.body)
+        self.rotation.append(carrier.rotation)
+        self.offset.append(carrier.position)
 
-    def _refuse(self, loops: Iterable[Loop]) -> None:
+    def _held_placement(self, joint: Any) -> Placement:
+        """Return the placement of the link that a fixed or held joint carries."""
+        parent, _ = link_names(joint)
+        return _placed(self.carriers[parent], *self.held_pose(joint))
+
+    def placed_links(self) -> dict[str, Placement]:
+        """Return `carriers` with all links below them, whose joints are held where left out."""
+        placements = dict(self.carriers)
+        links = list(placements)
+        for link in links:
+            body, R, r = placements[link]
+            for joint in self._below[link]:
+                _, child = link_names(joint)
+                movable = joint.get("type") in (*TURNING, "prismatic", "fixed")
+                if movable and child not in placements:
+                    rotation, offset = self.held_pose(joint)
+                    placements[child] = Placement(body, R @ rotation, r + R @ offset)
+                    links.append(child)
+        return placements
+
+    def _refuse_loops(self, loops: Iterable[Loop]) -> None:
         """Reject constraints that close a loop between bodies of the robot."""
-        for name, *ends in loops:
-            if (
-                all(e in self.carriers for e in ends)
-                and len({self.carriers[e][0] for e in ends}) > 1
-            ):
+        for name, first, second in loops:
+            if first not in self.carriers or second not in self.carriers:
+                continue
+            if self.carriers[first].body != self.carriers[second].body:
                 raise InputError(
-                    f"`{self.path}`: the constraint `{name}` between `{ends[0]}` and "
-                    f"`{ends[1]}` "
-                    "closes a loop: avoid it (`tip`, `--tip`), or remove it."
+                    f"`{self.path}`: the constraint `{name}` between `{first}` and "
+                    f"`{second}` closes a loop: avoid it (`tip`, `--tip`), or remove "
+                    "it."
                 )
 
     def branch(self, joint: Any) -> Iterator[Any]:
@@ -218,51 +237,55 @@ class UrdfTree:
 
     def _moves_below(self, joint: Any) -> bool:
         """Return whether the link that a joint carries carries moving joints itself."""
-        return any(
-            lower.get("type") != "fixed"
-            for lower in self.branch(joint)
-            if lower is not joint
-        )
+        _, *lower_joints = self.branch(joint)
+        return any(lower.get("type") != "fixed" for lower in lower_joints)
 
     def held_at(self, joint: Any) -> float:
         """Return the coordinate nearest to zero that range and mimicked joint allow [rad or m]."""
-        factor, offset, passed = 1.0, 0.0, []
-        while (mimic := joint.find("mimic")) is not None:
-            passed.append(joint)
+        factor = 1.0
+        offset = 0.0
+        chain = []
+        while joint is not None and joint not in chain:
+            chain.append(joint)
+            mimic = joint.find("mimic")
+            if mimic is None:
+                low, high = self.range(joint)
+                return offset + factor * min(max(0.0, low), high)
             offset += factor * float(self.numbers(mimic, "offset", (0.0,))[0])
-            if (name := mimic.get("joint")) is None:
-                return offset
             factor *= float(self.numbers(mimic, "multiplier", (1.0,))[0])
-            if (joint := self._joints.get(name)) is None or joint in passed:
-                return offset
-        low, high = self.range(joint)
-        return offset + factor * min(max(0.0, low), high)
+            joint = self._joints.get(mimic.get("joint"))
+        # A constraint without a joint, with an unknown one, or a circle of mimics.
+        return offset
 
-    def held_pose(self, joint: Any) -> tuple[np.ndarray, np.ndarray]:
+    def held_pose(
+        self, joint: Any
+    ) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
         """Return attitude and origin [m] in its parent of the link that a held joint carries."""
         R, r = self._origin(joint)
+        if joint.get("type") == "fixed":
+            return R, r
         value = self.held_at(joint)
         if value == 0.0:
             return R, r
         axis = self._axis(joint)
-        turns = joint.get("type") in TURNING
-        return (
-            (R @ axis_rotation(axis, value), r) if turns else (R, r + R @ axis * value)
-        )
+        if joint.get("type") in TURNING:
+            return R @ axis_rotation(axis, value), r
+        return R, r + R @ axis * value
 
     def range(self, joint: Any) -> tuple[float, float]:
         """Return the ends of a joint's range, infinite where unknown [rad or m]."""
-        low, high = (self.limit(joint, key, np.nan) for key in ("lower", "upper"))
-        if joint.get("type") == "continuous" or not (
-            np.isfinite(low) or np.isfinite(high)
-        ):
+        low = self.limit(joint, "lower", np.nan)
+        high = self.limit(joint, "upper", np.nan)
+        limited = np.isfinite(low) or np.isfinite(high)
+        if joint.get("type") == "continuous" or not limited:
             return -np.inf, np.inf
         # A missing bound is zero if the other one is given, as the URDF standard says.
         return 0.0 if np.isnan(low) else low, 0.0 if np.isnan(high) else high
 
     def _chain(self, base: str, tip: str) -> list[Any]:
         """Return the joints between two links."""
-        joints, link = [], tip
+        joints = []
+        link = tip
         while link != base:
             if link not in self._above:
                 raise InputError(
@@ -270,30 +293,30 @@ class UrdfTree:
                     f"`{tip}`."
                 )
             joints.append(self._above[link])
-            link, _ = link_names(joints[-1])
+            link, _ = link_names(self._above[link])
         return joints
 
-    def _origin(self, joint: Any) -> tuple[np.ndarray, np.ndarray]:
+    def _origin(
+        self, joint: Any
+    ) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
         """Return attitude and origin of a joint in its parent link."""
-        offset, rpy = (
-            self.numbers(joint.find("origin"), key, _ZERO) for key in ("xyz", "rpy")
-        )
-        if np.abs(rpy).max() > _LARGEST_ANGLE:
+        element = joint.find("origin")
+        offset = self.numbers(element, "xyz", ORIGIN)
+        rpy = self.numbers(element, "rpy", ORIGIN)
+        if np.abs(rpy).max() > MAX_ANGLE:
             raise self.error(
                 joint, f"has an `rpy` of {_words(rpy)}: give radians, not degrees"
             )
         return rpy_rotation(rpy), offset
 
-    def _axis(self, joint: Any) -> np.ndarray:
+    def _axis(self, joint: Any) -> Float[np.ndarray, "3"]:
         """Return the unit vector of a moving joint's axis."""
         kind = joint.get("type")
         if kind not in (*TURNING, "prismatic"):
             cure = "make it fixed"
             if kind == "floating":
-                cure = (
-                    "hold the robot at its base (`base`, `--base "
-                    f"{link_names(joint)[1]}`)"
-                )
+                _, child = link_names(joint)
+                cure = f"hold the robot at its base (`base`, `--base {child}`)"
             raise self.error(
                 joint,
                 f"is {kind}, but must turn or slide: avoid it (`tip`, `--tip`), or "
@@ -310,16 +333,17 @@ class UrdfTree:
     def bodies(self, *, check: bool = False) -> Float[np.ndarray, "joints 10"]:
         """Return the parameters of all bodies; reject links that cannot exist if asked to."""
         parameters = np.zeros((len(self.joints), 10))
-        for name, (body, R, r) in self.carriers.items():
-            if body < 0 or (inertial := self.inertial(name)) is None:
+        for link, (body, rotation, position) in self.carriers.items():
+            inertial = self.inertial(link)
+            if body < 0 or inertial is None:
                 continue
             inertia, fault = inertial
             if check and fault:
                 raise InputError(
-                    f"`{self.path}`: the inertial of link `{name}` belongs to no "
+                    f"`{self.path}`: the inertial of link `{link}` belongs to no "
                     f"body: {fault}."
                 )
-            parameters[body] += inertia.moved(R, r).parameters
+            parameters[body] += inertia.moved(rotation, position).parameters
         return parameters
 
     def inertial(self, link: str) -> tuple[Inertia, str] | None:
@@ -327,19 +351,20 @@ class UrdfTree:
         element = self.links[link].find("inertial")
         if element is None:
             return None
-        origin = element.find("origin")
-        moments = element.find("inertia")
         (mass,) = self.numbers(element.find("mass"), "value", (0.0,))
-        rows = (("ixx", "ixy", "ixz"), ("ixy", "iyy", "iyz"), ("ixz", "iyz", "izz"))
-        tensor = np.array(
-            [[self.numbers(moments, key, (0.0,))[0] for key in row] for row in rows]
-        )
-        xyz, rpy = (self.numbers(origin, key, _ZERO) for key in ("xyz", "rpy"))
-        R = rpy_rotation(rpy)
-        fault = Inertia(mass, xyz, tensor).fault(rounding=0.01)
-        if np.abs(rpy).max() > _LARGEST_ANGLE:
+        moments = element.find("inertia")
+        keys = ("ixx", "ixy", "ixz", "ixy", "iyy", "iyz", "ixz", "iyz", "izz")
+        entries = [self.numbers(moments, key, (0.0,))[0] for key in keys]
+        tensor = np.reshape(entries, (3, 3))
+        origin = element.find("origin")
+        centre = self.numbers(origin, "xyz", ORIGIN)
+        rpy = self.numbers(origin, "rpy", ORIGIN)
+
+        fault = Inertia(mass, centre, tensor).fault(rounding=0.01)
+        if np.abs(rpy).max() > MAX_ANGLE:
             fault = f"its `rpy` is {_words(rpy)}, which are degrees, not radians"
-        return Inertia(mass, xyz, R @ tensor @ R.T), fault
+        R = rpy_rotation(rpy)
+        return Inertia(mass, centre, R @ tensor @ R.T), fault
 
     def place(self, element: Any) -> str:
         """Return file and line of an element, for messages."""
@@ -373,19 +398,19 @@ class UrdfTree:
             array = np.array([float(word) for word in text.split()])
         except ValueError:
             array = np.zeros(0)
-        wrong = np.isnan(array) if infinite else ~np.isfinite(array)
-        if array.shape != (len(default),) or wrong.any():
+        valid = ~np.isnan(array) if infinite else np.isfinite(array)
+        if array.shape != (len(default),) or not valid.all():
+            words = "number" if len(default) == 1 else "numbers"
             raise InputError(
                 f"{self.place(element)}: `{key}` must hold {len(default)} finite "
-                f'{"number" if len(default) == 1 else "numbers"}, but is "{text}".'
+                f'{words}, but is "{text}".'
             )
         return array
 
     def limit(self, joint: Any, key: str, unknown: float) -> float:
         """Return a number of a joint's `<limit>`, which may be infinite."""
-        return float(
-            self.numbers(joint.find("limit"), key, (unknown,), infinite=True)[0]
-        )
+        element = joint.find("limit")
+        return float(self.numbers(element, key, (unknown,), infinite=True)[0])
 
 
 def link_names(joint: Any) -> tuple[str, str]:
@@ -393,60 +418,12 @@ def link_names(joint: Any) -> tuple[str, str]:
     return joint.find("parent").get("link"), joint.find("child").get("link")
 
 
-def read_description(path: str | Path) -> tuple[Any, Numbers, list[Loop]]:
-    """Return the URDF element of a URDF, xacro or MJCF file, its gravity, and its closed loops."""
-    robot = _parse(path)
-    if robot.tag == "mujoco":
-        return mjcf_as_urdf(path)
-    if any("ros.org/" in e.tag and "xacro" in e.tag for e in robot.iter("*")):
-        robot = _parse(path, _expanded(Path(path)))
-    if robot.tag != "robot":
-        raise InputError(
-            f"`{path}` is no URDF: its root is `<{robot.tag}>`, not `<robot>`."
-        )
-    return robot, GRAVITY, []
-
-
-def is_mjcf(path: str | Path) -> bool:
-    """Return whether a file describes its robot as MJCF."""
-    return _parse(path).tag == "mujoco"
-
-
-def _parse(path: str | Path, text: bytes | None = None) -> Any:
-    """Return the root element of a file, or of a text made from it."""
-    if not Path(path).is_file():
-        raise FileNotFoundError(
-            f"the robot's file `{path}` does not exist: check its path."
-        )
-    # No entity of a file makes the parser read other files.
-    parser = etree.XMLParser(resolve_entities=False, no_network=True, load_dtd=False)
-    try:
-        return etree.fromstring(
-            Path(path).read_bytes() if text is None else text, parser
-        )
-    except etree.XMLSyntaxError as error:
-        line = error.lineno or 1
-        raise InputError(
-            f"`{path}`, line {line}: this is not XML ({error.msg})."
-        ) from error
-
-
-def _expanded(path: Path) -> bytes:
-    """Return a xacro file as the program `xacro` expands it."""
-    command = f"`xacro {path} -o {path.name.split('.')[0]}.urdf`"
-    if (program := shutil.which("xacro")) is None:
-        raise InputError(
-            f"`{path}` is a xacro file: expand it by {command} (`pip install xacro`)."
-        )
-    done = subprocess.run([program, str(path)], capture_output=True)
-    if done.returncode:
-        said = done.stderr.decode(errors="replace").strip().splitlines() or [
-            "no reason given"
-        ]
-        raise InputError(
-            f"`{path}`: {command} fails: {said[0]}: give a file that it has expanded."
-        )
-    return done.stdout
+def _placed(
+    carrier: Placement, rotation: np.ndarray, position: np.ndarray
+) -> Placement:
+    """Return the placement on a body of what is placed on one of its links."""
+    body, R, r = carrier
+    return Placement(body, without_rounding(R @ rotation), r + R @ position)
 
 
 def _words(values: np.ndarray) -> str:

@@ -73,27 +73,27 @@ def test_the_tip_can_be_differentiated_by_coordinates_and_lengths():
 def test_the_jacobian_and_curvature_are_difference_quotients():
     robot = fingers(RAIL)
     q, h = within(robot, 5, 1)[0], 1e-5
-    R, r, shift, turn = tip_jacobian(robot, q[None])
+    tip = tip_jacobian(robot, q[None])
     force, moment = np.random.default_rng(0).standard_normal((2, 1, 3))
 
     def shifted(steps):
         now = tip_transform(robot, q + steps)
-        turned = Rotation.from_matrix(now[:3, :3] @ R[0].T).as_rotvec()
-        return now[:3, 3] - r[0], turned
+        turned = Rotation.from_matrix(now[:3, :3] @ tip.rotation[0].T).as_rotvec()
+        return now[:3, 3] - tip.position[0], turned
 
     def work(steps):
         return sum(
             x[0] @ y for x, y in zip((force, moment), shifted(steps), strict=True)
         )
 
-    curvature = tip_curvature(shift, turn, force, moment)[0]
+    curvature = tip_curvature(tip, force, moment)[0]
     for i, a in enumerate(h * np.eye(7)):
         ahead, behind = shifted(a), shifted(-a)
         np.testing.assert_allclose(
-            (ahead[0] - behind[0]) / (2 * h), shift[0, i], atol=1e-9
+            (ahead[0] - behind[0]) / (2 * h), tip.velocity[0, i], atol=1e-9
         )
         np.testing.assert_allclose(
-            (ahead[1] - behind[1]) / (2 * h), turn[0, i], atol=1e-9
+            (ahead[1] - behind[1]) / (2 * h), tip.turn[0, i], atol=1e-9
         )
         for k in range(7):
             a, b = 10 * h * np.eye(7)[i], 10 * h * np.eye(7)[k]
@@ -121,9 +121,10 @@ def test_of_all_coordinates_they_are_the_nearest_to_the_posture():
     q = inverse_kinematics_along(RAIL, pose[None, :3, 3], pose[:3, :3], posture)[0]
     np.testing.assert_allclose(tip_transform(RAIL, q), pose, atol=2e-9)
     half = (RAIL.limits.position_max - RAIL.limits.position_min) / 2
-    _, _, shift, turn = tip_jacobian(RAIL, q[None])
-    free = np.linalg.svd(np.concatenate([shift[0], turn[0]], axis=1).T * half)[2][-1]
-    assert abs(free @ ((q - posture) / half)) < 1e-7
+    tip = tip_jacobian(RAIL, q[None])
+    by_joints = np.concatenate([tip.velocity[0], tip.turn[0]], axis=1).T
+    redundant_motion = np.linalg.svd(by_joints * half)[2][-1]
+    assert abs(redundant_motion @ ((q - posture) / half)) < 1e-7
 
 
 def test_says_where_a_path_cannot_be_followed():

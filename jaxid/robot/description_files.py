@@ -1,0 +1,70 @@
+"""Files that describe robots: URDF, xacro, and MJCF as the URDF of the same tree."""
+
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Any
+
+from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
+
+from jaxid.arrays import Numbers
+from jaxid.errors import InputError
+
+from .mjcf import Loop, mjcf_as_urdf
+from .robot import GRAVITY
+
+
+def read_description(path: str | Path) -> tuple[Any, Numbers, list[Loop]]:
+    """Return the URDF element of a URDF, xacro or MJCF file, its gravity, and its closed loops."""
+    robot = _parse(path)
+    if robot.tag == "mujoco":
+        return mjcf_as_urdf(path)
+    if any("ros.org/" in e.tag and "xacro" in e.tag for e in robot.iter("*")):
+        robot = _parse(path, _expand_xacro(Path(path)))
+    if robot.tag != "robot":
+        raise InputError(
+            f"`{path}` is no URDF: its root is `<{robot.tag}>`, not `<robot>`."
+        )
+    return robot, GRAVITY, []
+
+
+def is_mjcf(path: str | Path) -> bool:
+    """Return whether a file describes its robot as MJCF."""
+    return _parse(path).tag == "mujoco"
+
+
+def _parse(path: str | Path, text: bytes | None = None) -> Any:
+    """Return the root element of a file, or of a text made from it."""
+    if not Path(path).is_file():
+        raise FileNotFoundError(
+            f"the robot's file `{path}` does not exist: check its path."
+        )
+    if text is None:
+        text = Path(path).read_bytes()
+    # No entity of a file makes the parser read other files.
+    parser = etree.XMLParser(resolve_entities=False, no_network=True, load_dtd=False)
+    try:
+        return etree.fromstring(text, parser)
+    except etree.XMLSyntaxError as error:
+        line = error.lineno or 1
+        raise InputError(
+            f"`{path}`, line {line}: this is not XML ({error.msg})."
+        ) from error
+
+
+def _expand_xacro(path: Path) -> bytes:
+    """Return a xacro file as the program `xacro` expands it."""
+    command = f"`xacro {path} -o {path.name.split('.')[0]}.urdf`"
+    program = shutil.which("xacro")
+    if program is None:
+        raise InputError(
+            f"`{path}` is a xacro file: expand it by {command} (`pip install xacro`)."
+        )
+    process = subprocess.run([program, str(path)], capture_output=True)
+    if process.returncode:
+        lines = process.stderr.decode(errors="replace").strip().splitlines()
+        reason = lines[0] if lines else "no reason given"
+        raise InputError(
+            f"`{path}`: {command} fails: {reason}: give a file that it has expanded."
+        )
+    return process.stdout
