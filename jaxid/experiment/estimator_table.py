@@ -1,5 +1,6 @@
 """The table `[estimator]` of an experiment file: how rows become parameters."""
 
+import inspect
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -12,35 +13,44 @@ from jaxid.identification import estimators
 from jaxid.identification.consistency import (
     BodyBounds,
     EntropicPull,
-    PhysicallyConsistent,
     consistency_margin,
 )
-from jaxid.identification.uncertainty import (
-    AbstractUncertainty,
-    BlockJackknife,
-    IndependentRows,
-    SpectralSandwich,
-)
+from jaxid.identification.estimators.regularisation_and_weights import default_weights
+from jaxid.identification.estimators_by_name import ESTIMATORS, LOSSES
+from jaxid.identification.uncertainty import UNCERTAINTIES, AbstractUncertainty
 from jaxid.trajectory.files import load_trajectory
 
 from .decoder import Bounds, Fraction, Magnitude, decode, keys_of, quoted
 from .robot_tables import RobotSource, named
 
-UNCERTAINTIES = {
-    "spectral": SpectralSandwich,
-    "jackknife": BlockJackknife,
-    "independent": IndependentRows,
-}
 SOLUTION = ("ridge", "truncate", "prior")
-KINDS: dict[str, tuple[str, ...]] = {
-    "weighted": ("weights", *SOLUTION, "essential", "nonlinear_friction"),
-    "least_squares": (*SOLUTION, "essential", "nonlinear_friction"),
-    "huber": ("weights", *SOLUTION, "essential", "limit"),
-    "tukey": ("weights", *SOLUTION, "essential", "limit"),
-    "correlated": SOLUTION,
-    "instrumental": ("weights", "reference", "reference_start"),
-    "consistent": ("weights", "prior", "margin", "pull", *keys_of(BodyBounds)),
+KEYS_OF_SETTINGS: dict[str, tuple[str, ...]] = {
+    "weights": ("weights",),
+    "solution": SOLUTION,
+    "loss": ("limit",),
+    "references": ("reference",),
+    "starts": ("reference_start",),
+    "bounds": tuple(keys_of(BodyBounds)),
+    "margin": ("margin",),
+    "pull": ("prior", "pull"),
 }
+"""Keys from which each setting of an estimator is made."""
+KINDS_OF_KEYS = {
+    "essential": ("weighted", "least_squares", "huber", "tukey"),
+    "nonlinear_friction": ("weighted", "least_squares"),
+}
+"""Kinds of estimators with which a method that repeats the estimate goes together."""
+
+
+def keys_of_kind(kind: str) -> tuple[str, ...]:
+    """Return the keys of one kind of estimator, apart from those of all kinds."""
+    settings = inspect.signature(ESTIMATORS[kind]).parameters
+    keys = [key for name in settings for key in KEYS_OF_SETTINGS.get(name, ())]
+    methods = [key for key, kinds in KINDS_OF_KEYS.items() if kind in kinds]
+    return (*keys, *methods)
+
+
+KINDS = {kind: keys_of_kind(kind) for kind in ESTIMATORS}
 """Keys of each kind of estimator; others are for all kinds."""
 ALTERNATIVES = (
     ("nonlinear_friction", ("prior", "uncertainty", "essential")),
@@ -60,7 +70,7 @@ class Estimation(NamedTuple):
     # held-out error that leaving out parameters may cost (fraction); None to keep all
     essential: float | None
     nonlinear: bool  # whether the shape of friction is sought too
-    notes: list[str]  # assumptions, in sentences
+    notes: tuple[str, ...]  # assumptions, in sentences
 
 
 def decode_estimator(table: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -167,20 +177,14 @@ def build_estimation(
         InputError: If keys do not go together, or a file cannot be read.
     """
     robot = model.robot
-    joint_weights: estimators.AbstractWeights = estimators.ResidualVariances()
-    notes = []
-    if weights != "residual_variances" and kind not in ("least_squares", "correlated"):
+    joint_weights, notes = default_weights(robot)
+    if weights == "residual_variances" or kind in ("least_squares", "correlated"):
+        joint_weights, notes = estimators.ResidualVariances(), ()
+    elif weights == "maximum_forces":
         try:
             _ = robot.max_forces
-            joint_weights = estimators.MaximumForces()
         except InputError as error:
-            if weights is not None:
-                raise InputError(f'`weights = "maximum_forces"`: {error}') from error
-            notes.append(
-                "the largest forces of the joints are not known: joints are weighted "
-                "by the "
-                "residuals' variances."
-            )
+            raise InputError(f'`weights = "maximum_forces"`: {error}') from error
     solution: estimators.AbstractSolution = estimators.Complete()
     if truncate is not None:
         solution = estimators.Truncated(truncate)
@@ -192,47 +196,39 @@ def build_estimation(
     bodies = None if prior is None else source.parameters(folder)
     if prior is not None and bodies is None:
         raise InputError("`prior` needs a robot with `robot.urdf` or `robot.mjcf`.")
+    settings: dict[str, Any] = {"weights": joint_weights, "solution": solution}
     match kind:
-        case "weighted":
-            estimator = plain
         case "least_squares":
-            estimator = plain = estimators.LeastSquares(solution)
-        case "huber" | "tukey":
-            loss = estimators.Huber if kind == "huber" else estimators.Tukey
-            chosen = loss() if limit is None else loss(limit)
-            estimator = estimators.IterativelyReweighted(
-                chosen, joint_weights, solution
-            )
-        case "correlated":
-            estimator = estimators.GeneralisedLeastSquares(solution)
+            plain = estimators.LeastSquares(solution)
+        case "huber" | "tukey" if limit is not None:
+            settings["loss"] = LOSSES[kind](limit)
         case "instrumental":
             if reference is None:
                 raise InputError(
                     '`reference` is missing: `kind = "instrumental"` needs it.'
                 )
-            names = [reference] if isinstance(reference, str) else reference
-            references = tuple(load_trajectory(folder / name) for name in names)
-            starts = (
-                reference_start
-                if isinstance(reference_start, list)
-                else [reference_start]
-            )
-            estimator = estimators.InstrumentalVariables(
-                references, joint_weights, tuple(starts)
-            )
+            files = [reference] if isinstance(reference, str) else reference
+            one_start = not isinstance(reference_start, list)
+            starts = [reference_start] if one_start else reference_start
+            settings["references"] = tuple(load_trajectory(folder / x) for x in files)
+            settings["starts"] = tuple(starts)
         case "consistent":
             if bodies is None:
                 bodies = _possible_bodies(source, folder)
-            entropic = EntropicPull(bodies, pull) if pull else None
             if "ellipsoid_centre" in bounds and "ellipsoid_axes" not in bounds:
                 raise InputError(
                     "`ellipsoid_centre` needs `ellipsoid_axes`: the half axes [m]."
                 )
-            limits = (
-                BodyBounds.from_geometry(robot).replace(**bounds) if bounds else None
-            )
-            given = joint_weights, limits, margin or 0.0, entropic
-            estimator = PhysicallyConsistent(*given, throw=False)
+            if bounds:
+                settings["bounds"] = BodyBounds.from_geometry(robot).replace(**bounds)
+            settings["margin"] = margin or 0.0
+            settings["pull"] = EntropicPull(bodies, pull) if pull else None
+            settings["throw"] = False
+    build = ESTIMATORS[kind]
+    fitting = {
+        k: settings[k] for k in inspect.signature(build).parameters if k in settings
+    }
+    estimator = build(**fitting)
     if bodies is not None and kind != "consistent":
         if isinstance(solution, estimators.Complete):
             raise InputError(

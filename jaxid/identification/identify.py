@@ -17,6 +17,7 @@ from .estimators.regularisation_and_weights import (
     NUMERICAL,
     AbstractSpectralSolution,
     Decomposition,
+    default_weights,
     undetermined,
 )
 from .factors import Factors
@@ -42,7 +43,8 @@ def identify(
         observations: Observations of one recording, or of several that are fitted
             together; logs larger than memory come from `scan_log`. Or the regression
             problem of recordings, such as that of several processes.
-        estimator: Estimator; by default least squares weighted by the largest forces.
+        estimator: Estimator; by default least squares weighted by the largest forces,
+            or by the variances of the residuals if these forces are not known.
         progress: Callback, called with the completed fraction (0 to 1) of a pass over a
             long log.
         uncertainty: Method for the standard deviations; by default the spectral
@@ -53,15 +55,18 @@ def identify(
         The estimates; `undetermined` names what these recordings do not determine.
 
     Raises:
-        TypeError: If a model stands for base parameters, or a recording for
-            observations.
+        TypeError: If a model is passed instead of base parameters, or a recording
+            instead of observations.
         InputError: If the observations belong to another number of joints, have fewer
-            rows than there are parameters, or weights are not known.
+            rows than there are parameters, or the estimator needs weights that are not
+            known.
     """
-    problem = observations
-    if not isinstance(problem, RegressionProblem):
-        recordings = tuple(problem) if isinstance(problem, Iterable) else (problem,)
-        _check(base, recordings)
+    if isinstance(observations, RegressionProblem):
+        problem = observations
+    else:
+        is_sequence = isinstance(observations, Iterable)
+        recordings = tuple(observations) if is_sequence else (observations,)
+        _check_arguments(base, recordings)
         problem = RegressionProblem(base, recordings, progress)
     fit = fit_problem(problem, estimator, uncertainty)
     return fit if name is None else dataclasses.replace(fit, name=name)
@@ -77,111 +82,144 @@ def fit_problem(
     The other arguments are those of `identify`. Where only factors are known, standard
     deviations come from the block jackknife.
     """
-    count = int(problem.factors.rows.sum())
-    if count <= problem.base.size:
-        raise InputError(
-            f"there are {count} rows for {problem.base.size} base parameters: record "
-            "longer, or "
-            "leave out fewer rows."
-        )
-    estimator = estimator or WeightedLeastSquares()
+    _require_more_rows_than_parameters(problem)
+    weight_notes = ()
+    if estimator is None:
+        joint_weights, weight_notes = default_weights(problem.robot)
+        estimator = WeightedLeastSquares(joint_weights)
+    if uncertainty is None:
+        uncertainty = SpectralSandwich()
+
     estimate = estimator(problem)
-    base, blocks = estimate.base, estimate.blocks
-    # Residuals are those of all rows, whatever weights the estimator gave them.
-    plain = problem if base is problem.base else problem.with_base(base)
-    p, weights = np.asarray(estimate.parameters), np.asarray(estimate.weights)
-    squares = plain.factors.residual_squares(p)
-    forces = float(np.sqrt(plain.factors.force_squares.sum()))
-    factors = plain.factors if blocks is plain.blocks else blocks.total
+    base, weights = estimate.base, estimate.weights
+    # An estimator may choose other columns, and weight single rows.
+    rows = problem if base is problem.base else problem.with_base(base)
+    has_row_weights = estimate.blocks is not rows.blocks
+    factors = estimate.blocks.total if has_row_weights else rows.factors
     R, z = factors.weighted(weights)
     decomposition = Decomposition.of(R, z)
-    B, taken = np.asarray(estimate.inverse), estimate.effective_parameters
-    taken = float(np.sum((R @ B) * R)) if taken is None else taken
-    free = p if estimate.unbounded is None else np.asarray(estimate.unbounded)
-    naive = naive_covariance(factors, weights, free, B, taken)
-    unknown = decomposition.unknown
-    naive[unknown, unknown] = np.inf
-    raw, _ = factors.weighted(np.ones(len(weights)))
-    # Columns of length one.
-    scaled = R / np.where(R.any(axis=0), np.linalg.norm(R, axis=0), 1.0)
-    numbers = [
-        float(np.linalg.cond(x)) if x.any() else np.inf for x in (raw, R, scaled)
-    ]
-    method = SpectralSandwich() if uncertainty is None else uncertainty
-    errors, spectra = method(
-        plain, dataclasses.replace(estimate, parameters=free), naive
+    unbounded = estimate.without_bounds()
+    naive = naive_covariance(
+        factors,
+        weights,
+        unbounded.parameters,
+        unbounded.inverse,
+        unbounded.number_of_parameters(R),
     )
-    shrinkage = _shrinkage_notes(decomposition.values, estimate.solution)
+    naive[decomposition.unknown, decomposition.unknown] = np.inf
+    errors, spectra = uncertainty(rows, unbounded, naive)
+
+    # Residuals are those of all rows, whatever weights the estimator gave them.
+    squares = rows.factors.residual_squares(estimate.parameters)
+    force_norm = np.sqrt(rows.factors.force_squares.sum())
+    relative_residual = (
+        np.sqrt(squares.sum()) / force_norm if force_norm > 0 else np.inf
+    )
+    shrinkage_notes = _shrinkage_notes(decomposition.values, estimate.solution)
     return Fit(
         base=base,
-        parameters=p,
+        parameters=estimate.parameters,
         uncertainty=errors,
         weights=weights,
-        condition_numbers=ConditionNumbers(*numbers),
-        rows=tuple(int(n) for n in plain.factors.rows),
-        residual_rms=np.sqrt(squares / np.maximum(plain.factors.rows, 1)),
+        condition_numbers=_condition_numbers(factors, R),
+        rows=tuple(rows.factors.rows.tolist()),
+        residual_rms=np.sqrt(squares / np.maximum(rows.factors.rows, 1)),
         residual_spectra=spectra,
-        residual=float(np.sqrt(squares.sum()) / forces) if forces > 0 else np.inf,
-        undetermined=undetermined(blocks, weights, decomposition),
+        residual=float(relative_residual),
+        undetermined=undetermined(estimate.blocks, weights, decomposition),
         estimator=estimator,
         solution=estimate.solution,
         consistency=estimate.consistency,
-        full_parameters=None
-        if estimate.standard is None
-        else np.asarray(estimate.standard),
+        full_parameters=estimate.standard,
         recordings=problem.names,
-        notes=(*base.notes, *shrinkage, *estimate.notes, *errors.notes),
+        notes=(
+            *base.notes,
+            *weight_notes,
+            *shrinkage_notes,
+            *estimate.notes,
+            *errors.notes,
+        ),
         date=datetime.date.today().isoformat(),
-        blocks=plain.blocks,
+        blocks=rows.blocks,
         name=", ".join(problem.names),
     )
 
 
-def _check(base: Any, recordings: Sequence[Any]) -> None:
-    wanted = [("base", base, BaseParameters, "base_parameters(model)")]
-    wanted += [("observations", o, Observations, "observe(...)") for o in recordings]
-    for name, value, kind, function in wanted:
-        if not isinstance(value, kind):
-            raise TypeError(
-                f"`{name}` must come from `{function}`, not `{type(value).__name__}`."
-            )
-    n = base.model.robot.joints
-    for o in recordings:
-        if o.joints != n:
+def _check_arguments(base: Any, recordings: Sequence[Any]) -> None:
+    """Reject arguments of another type, and recordings of another number of joints."""
+    _require_type("base", base, BaseParameters, "base_parameters(model)")
+    joints = base.model.robot.joints
+    for recording in recordings:
+        _require_type("observations", recording, Observations, "observe(...)")
+        if recording.joints != joints:
             raise InputError(
-                f"`observations` of `{o.name}` have {o.joints} joints, the robot {n}."
+                f"`observations` of `{recording.name}` have {recording.joints} joints, "
+                f"the robot {joints}."
             )
 
 
-def naive_covariance(factors: Factors, weights, p, B, taken: float = 0.0) -> np.ndarray:
+def _require_type(name: str, value: Any, kind: type, function: str) -> None:
+    if not isinstance(value, kind):
+        raise TypeError(
+            f"`{name}` must come from `{function}`, not `{type(value).__name__}`."
+        )
+
+
+def _require_more_rows_than_parameters(problem: RegressionProblem) -> None:
+    count = int(problem.factors.rows.sum())
+    if count <= problem.base.size:
+        raise InputError(
+            f"there are {count} rows for {problem.base.size} base parameters: record "
+            "longer, or leave out fewer rows."
+        )
+
+
+def _condition_numbers(factors: Factors, weighted: np.ndarray) -> ConditionNumbers:
+    unweighted, _ = factors.weighted(np.ones(len(factors.joints)))
+    lengths = np.linalg.norm(weighted, axis=0)
+    scaled = weighted / np.where(lengths > 0, lengths, 1.0)
+    matrices = unweighted, weighted, scaled
+    return ConditionNumbers(
+        *(float(np.linalg.cond(x)) if x.any() else np.inf for x in matrices)
+    )
+
+
+def naive_covariance(
+    factors: Factors,
+    weights: np.ndarray,
+    parameters: np.ndarray,
+    inverse: np.ndarray,
+    effective_parameters: float = 0.0,
+) -> np.ndarray:
     r"""Return the covariance for independent rows and a variance of each joint.
 
     The estimates are $B \Theta^T W^2 Q$, so their covariance is
-    $B (\sum_j w_j^4 \sigma_j^2 \Theta_j^T \Theta_j) B$: right also where the weights
-    are not the reciprocals of the standard deviations. The rows determine so many
-    (`taken`) parameters.
+    $B (\sum_j w_j^4 \sigma_j^2 \Theta_j^T \Theta_j) B$. This is right also where the
+    weights are not the reciprocals of the standard deviations.
     """
-    free = 1.0 - taken / float(factors.rows.sum())
-    total = np.zeros((B.shape[1], B.shape[1]))
-    squares = factors.residual_squares(p)
-    for joint, w, square in zip(factors.joints, weights, squares, strict=True):
-        gain = w**2 * np.asarray(joint.R)[:, :-1] @ B[list(joint.columns)]
-        total += square / max(joint.rows * free, 1.0) * (gain.T @ gain)
-    return total
+    # Each joint pays for the parameters by its share of the rows.
+    remaining_share = 1.0 - effective_parameters / float(factors.rows.sum())
+    squares = factors.residual_squares(parameters)
+    covariance = np.zeros(inverse.shape)
+    for joint, weight, square in zip(factors.joints, weights, squares, strict=True):
+        variance = square / max(joint.rows * remaining_share, 1.0)
+        columns = np.asarray(joint.R)[:, :-1]
+        gain = weight**2 * columns @ inverse[list(joint.columns)]
+        covariance += variance * (gain.T @ gain)
+    return covariance
 
 
 def _shrinkage_notes(
-    s: np.ndarray, solution: AbstractSpectralSolution
+    values: np.ndarray, solution: AbstractSpectralSolution
 ) -> tuple[str, ...]:
-    """Return what standard deviations leave out where a solution shrinks weak directions."""
-    live = s > NUMERICAL * s.max(initial=0.0)
-    halved = solution.inverse(s) * s**2 <= 0.5
-    pulled = np.count_nonzero(live & halved)
-    if not pulled:
+    """Return what standard deviations leave out if a solution shrinks weak directions."""
+    visible = values > NUMERICAL * values.max(initial=0.0)
+    fractions = solution.inverse(values) * values**2
+    count = np.count_nonzero(visible & (fractions <= 0.5))
+    if not count:
         return ()
     return (
-        f"the solution pulls {pulled} of {len(s)} directions of the parameters to "
-        "less than half "
-        "of what the data say: standard deviations do not tell how far from the truth "
-        "this is.",
+        f"the solution pulls {count} of {len(values)} directions of the parameters to "
+        "less than half of what the data say: standard deviations do not tell how far "
+        "from the truth this is.",
     )

@@ -11,6 +11,7 @@ from virtual import dense, observations, planar_base, standard_parameters
 
 import jaxid as jid
 from jaxid.identification.estimators.regularisation_and_weights import Decomposition
+from jaxid.identification.estimators_by_name import ESTIMATORS
 from jaxid.identification.factors import Factors
 from jaxid.trajectory.trajectory import AbstractTrajectory
 
@@ -91,6 +92,24 @@ def test_every_estimator_finds_the_truth_without_noise(base, member):
     np.testing.assert_allclose(
         fit.parameters, base.from_standard(p), rtol=1e-7, atol=1e-7
     )
+
+
+@pytest.fixture(scope="module")
+def possible_bodies(base, noisy):
+    """Standard parameters of bodies that can exist, well within all bounds."""
+    consistent = jid.PhysicallyConsistent(margin=0.1)
+    return np.asarray(jid.identify(base, noisy, consistent).full_parameters)
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_every_estimator_of_the_dict_finds_the_truth_without_noise(
+    base, possible_bodies, name
+):
+    o = observations(base.model, possible_bodies, samples=100)
+    needed = {"instrumental": {"references": (Known(o.motion, o.sample_time),)}}
+    fit = jid.identify(base, o, ESTIMATORS[name](**needed.get(name, {})))
+    truth = base.from_standard(possible_bodies)
+    np.testing.assert_allclose(fit.parameters, truth, rtol=1e-6, atol=1e-6)
 
 
 def test_every_estimator_follows_its_forces_and_judges_itself(base, noisy, member):

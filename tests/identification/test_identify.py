@@ -62,6 +62,21 @@ def test_residual_variances_find_the_noise_of_each_joint(base, p):
     np.testing.assert_allclose(1 / fit.weights, noise, rtol=0.05)
 
 
+def test_a_robot_without_force_limits_is_weighted_by_residuals_and_says_so():
+    base = jid.base_parameters(jid.Model(jid.robots.planar_arm(2)))
+    o = observations(base.model, standard_parameters(base.model), noise=0.1)
+    fit = jid.identify(base, o)
+    variances = jid.WeightedLeastSquares(jid.estimators.ResidualVariances())
+    np.testing.assert_array_equal(
+        fit.parameters, jid.identify(base, o, variances).parameters
+    )
+    (note,) = fit.notes
+    assert "weighted by the residuals" in note
+    # An estimator of the user's is not changed: the error names the cure.
+    with pytest.raises(jid.InputError, match=r"weights=.*ResidualVariances\(\)"):
+        jid.identify(base, o, jid.WeightedLeastSquares())
+
+
 @pytest.mark.parametrize("weights", [[1.0, 1.0], [0.2, 3.0]])
 def test_naive_covariance_is_that_of_independent_noise_of_each_joint(
     base, noisy, weights
@@ -197,7 +212,6 @@ def test_cross_validation_pulls_only_where_data_are_poor(base, p):
     [
         (3, [40.0, 5.0, 2.0], 40, "have 2 joints, the robot 3"),
         (2, [40.0, 5.0], 5, "10 rows for 12 base parameters: record longer"),
-        (2, [40.0, np.inf], 40, "largest force of joint `joint2` .* is not known"),
     ],
 )
 def test_refusals(base, p, joints, force, samples, message):

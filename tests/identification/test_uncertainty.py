@@ -15,7 +15,7 @@ from virtual import (
 
 import jaxid as jid
 from jaxid.dynamics.dispatch import in_numpy
-from jaxid.identification.uncertainty import spectral
+from jaxid.identification.uncertainty import UNCERTAINTIES, spectral
 from jaxid.identification.uncertainty.spectral import SpectralTable, sandwich
 
 ESTIMATOR = jid.WeightedLeastSquares(jid.estimators.ResidualVariances(0))
@@ -229,6 +229,23 @@ def test_intervals_and_whiteness_of_a_fit(base):
     # One-sided densities: their area is the variance.
     area = np.trapezoid(found.density, found.frequency, axis=1)
     np.testing.assert_allclose(area, [1.0, 0.8], rtol=0.1)
+
+
+@pytest.mark.parametrize("name", UNCERTAINTIES)
+def test_every_uncertainty_knows_white_noise_and_what_is_undetermined(base, name):
+    """White errors are independent: all methods agree, each as well as it can."""
+    p = standard_parameters(base.model)
+    o = observations(base.model, p, noise=np.array([0.5, 0.1]), samples=2000)
+    method = UNCERTAINTIES[name]()
+    errors = jid.identify(base, o, ESTIMATOR, uncertainty=method).uncertainty
+    assert 0.6 < np.median(errors.ratios) < 1.6
+    assert np.linalg.eigvalsh(errors.covariance)[0] > 0
+    assert (errors.dof >= 1.0).all()
+    half_widths = errors.half_widths()
+    assert (half_widths > 1.9 * errors.standard_deviations).all()
+    still = observations(base.model, p, noise=0.1, still=(1,))
+    fit = jid.identify(base, still, ESTIMATOR, uncertainty=method)
+    assert np.isinf(fit.standard_deviations[base.names.index("fv2")])
 
 
 def from_factors(base, o, divisions):

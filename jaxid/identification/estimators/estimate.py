@@ -1,5 +1,6 @@
 """Estimates, the influence of single rows on them, and the family of estimators."""
 
+import dataclasses
 from abc import abstractmethod
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
@@ -41,24 +42,38 @@ Influence = Callable[[RowChunk, np.ndarray], Iterator[Channel]]
 one channel for each joint."""
 
 
-def weighted_joints(chunk: RowChunk, weights: AnyArray) -> Iterator[tuple]:
-    """Yield parameters, weighted columns, weights of the rows, and count of each joint."""
-    joints = zip(
+class WeightedJoint(NamedTuple):
+    """Rows of one joint with their weights."""
+
+    columns: tuple[int, ...]  # base parameters that can act on the joint
+    equations: np.ndarray  # weighted columns of the regressor [rows, columns]
+    weights: np.ndarray  # weight of each row [rows]; zero if it does not count
+    counted: int  # number of rows that count
+
+
+def weighted_joints(chunk: RowChunk, weights: AnyArray) -> Iterator[WeightedJoint]:
+    """Yield the rows of each joint with their weights."""
+    for columns, theta, mask, weight in zip(
         chunk.indices, chunk.columns, chunk.mask.T, np.asarray(weights), strict=True
-    )
-    for own, theta, mask, weight in joints:
-        rows = np.where(mask, weight, 0.0)
-        yield tuple(own), rows[:, None] * theta, rows, int(mask.sum())
+    ):
+        row_weights = np.where(mask, weight, 0.0)
+        equations = row_weights[:, None] * theta
+        yield WeightedJoint(tuple(columns), equations, row_weights, int(mask.sum()))
 
 
 def joint_rows(weights: Float[AnyArray, " joints"]) -> Influence:
     """Return the influence of rows that are weighted by joint: one channel for each joint."""
 
     def channels(chunk: RowChunk, residuals: np.ndarray) -> Iterator[Channel]:
-        joints = zip(weighted_joints(chunk, weights), residuals.T, strict=True)
-        return (
-            Channel(own, theta, theta, w * r, n) for (own, theta, w, n), r in joints
-        )
+        joints = weighted_joints(chunk, weights)
+        for joint, residual in zip(joints, residuals.T, strict=True):
+            yield Channel(
+                columns=joint.columns,
+                instruments=joint.equations,
+                equations=joint.equations,
+                disturbance=joint.weights * residual,
+                counted=joint.counted,
+            )
 
     return channels
 
@@ -88,20 +103,20 @@ class Estimate(eqx.Module):
         unbounded: Parameters without bounds, whose residuals the uncertainty is
             computed from; `parameters` themselves if None.
         effective_parameters: Number of parameters that the rows determine, in fractions
-            where the solution is regularised; computed from `inverse` if None.
+            if the solution is regularised; computed from `inverse` if None.
     """
 
     base: BaseParameters
-    parameters: Float[AnyArray, " base"]
-    weights: Float[AnyArray, " joints"]
+    parameters: Float[np.ndarray, " base"] = eqx.field(converter=np.asarray)
+    weights: Float[np.ndarray, " joints"] = eqx.field(converter=np.asarray)
     blocks: Blocks
-    inverse: Float[AnyArray, "base base"]
+    inverse: Float[np.ndarray, "base base"] = eqx.field(converter=np.asarray)
     influence: Influence
     solution: AbstractSpectralSolution = Complete()
-    standard: Float[AnyArray, " standard"] | None = None
+    standard: Float[np.ndarray, " standard"] | None = None
     notes: tuple[str, ...] = eqx.field(static=True, default=())
     consistency: Any = None
-    unbounded: Float[AnyArray, " base"] | None = None
+    unbounded: Float[np.ndarray, " base"] | None = None
     effective_parameters: float | None = None
 
     @classmethod
@@ -118,19 +133,31 @@ class Estimate(eqx.Module):
             weights: Weights of the joints' rows [1/(N m) or 1/N].
             solution: Solution of the weighted system.
         """
-        chosen = solution.choose(problem.blocks, weights)
+        spectral_solution = solution.choose(problem.blocks, weights)
         decomposition = Decomposition.of(*problem.factors.weighted(weights))
-        inverse = chosen.inverse(decomposition.values)
+        inverse = spectral_solution.inverse(decomposition.values)
         return cls(
             base=problem.base,
             parameters=decomposition.solve(inverse),
-            weights=np.asarray(weights),
+            weights=weights,
             blocks=problem.blocks,
             inverse=decomposition.inverse_information(inverse),
             influence=joint_rows(weights),
-            solution=chosen,
+            solution=spectral_solution,
             effective_parameters=float(np.sum(inverse * decomposition.values**2)),
         )
+
+    def without_bounds(self) -> "Estimate":
+        """Return the estimate whose parameters have no bounds."""
+        if self.unbounded is None:
+            return self
+        return dataclasses.replace(self, parameters=self.unbounded)
+
+    def number_of_parameters(self, R: np.ndarray) -> float:
+        """Return how many parameters the rows with a weighted factor `R` determine."""
+        if self.effective_parameters is not None:
+            return self.effective_parameters
+        return float(np.sum((R @ self.inverse) * R))
 
 
 class AbstractEstimator(eqx.Module):

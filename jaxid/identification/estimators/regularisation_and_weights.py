@@ -1,6 +1,7 @@
 """The weighted system (Eqs. 29-33): weights of the joints, decomposition, and solutions."""
 
 from abc import abstractmethod
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -236,7 +237,14 @@ class MaximumForces(AbstractWeights):
 
     def __call__(self, robot, factors):
         """Return the reciprocals; reject a robot whose largest forces are not known."""
-        return 1.0 / np.asarray(robot.max_forces)
+        try:
+            return 1.0 / np.asarray(robot.max_forces)
+        except InputError as error:
+            rule = str(error).removesuffix(".")
+            raise InputError(
+                f"{rule}, or weight joints by their residuals: "
+                "`weights=jid.estimators.ResidualVariances()`."
+            ) from error
 
 
 class ResidualVariances(AbstractWeights):
@@ -262,6 +270,24 @@ class ResidualVariances(AbstractWeights):
         # Finite also for a joint without any force or residual.
         floor = max(1e-9 * float(deviations.max()), 1e-100)
         return 1.0 / np.maximum(deviations, floor)
+
+
+class DefaultWeights(NamedTuple):
+    """Weights of a robot's joints if the user has chosen none."""
+
+    weights: AbstractWeights
+    notes: tuple[str, ...]  # sentences for the user
+
+
+def default_weights(robot: Robot) -> DefaultWeights:
+    """Return weights by the largest forces (Eq. 30), or by residuals if these are unknown."""
+    if np.isfinite(robot.known_max_forces).all():
+        return DefaultWeights(MaximumForces(), ())
+    note = (
+        "the largest forces of the joints are not known: joints are weighted by the "
+        "residuals' variances."
+    )
+    return DefaultWeights(ResidualVariances(), (note,))
 
 
 class UndeterminedDirection(eqx.Module):

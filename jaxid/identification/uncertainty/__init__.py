@@ -8,3 +8,10 @@ from .result import (
     Uncertainty as Uncertainty,
 )
 from .spectral import SpectralSandwich as SpectralSandwich
+
+UNCERTAINTIES: dict[str, type[AbstractUncertainty]] = {
+    "spectral": SpectralSandwich,
+    "jackknife": BlockJackknife,
+    "independent": IndependentRows,
+}
+"""Methods of standard deviations, by the names of experiment files."""
