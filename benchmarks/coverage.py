@@ -125,7 +125,7 @@ class Study:
         self.bias = np.asarray(self.estimate.parameters) - self.truth
         e = self.estimate
         self.w = np.asarray(e.weights)
-        ((lines,), _, _) = row_spectra(self.rows, e)
+        (lines,) = row_spectra(self.rows, e).lines
         self.lines, self.table = lines, SpectralTable.of([lines])
         count, n = self.o.rows, base.model.robot.joints
         A = np.zeros((count, n, base.size))

@@ -2,7 +2,7 @@
 
 Everything else is in namespaces: `terms`, `filters`, `units`, `estimators`,
 `friction_laws`, `uncertainty`, `consistency`, `excitation`, `criteria`, `constraints`,
-`trajectories`, `collision`, `simulation`, `multihost`, `export`; the built-in robots are
+`trajectories`, `collision`, `simulation`, `export`; the built-in robots are
 in `robots`, the figures in `plot`.
 """
 

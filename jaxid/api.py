@@ -36,7 +36,6 @@ from .identification import (
     consistency as consistency,
     estimators as estimators,
     friction_laws as friction_laws,
-    multihost as multihost,
     uncertainty as uncertainty,
 )
 from .identification.combination import combine_fits as combine_fits

@@ -155,12 +155,6 @@ CASES = {
     "bootstrap": lambda: jid.uncertainty.bootstrap(
         jid.RegressionProblem(base, [cold]).blocks, np.ones(2), 20, key
     ),
-    "factorise_across_processes": lambda: (
-        jid.identification.identify.fit_problem(
-            jid.multihost.factorise_across_processes(base, [cold]),
-            jid.estimators.LeastSquares(),
-        ).parameters
-    ),
     "essential_parameters": lambda: (
         jid.essential_parameters(plain(), cold).fit.parameters
     ),
@@ -185,7 +179,6 @@ CASES = {
 REFUSED = (
     "identify_batch",
     "bootstrap",
-    "factorise_across_processes",
     "design_excitation",
 )
 """Cases that compute in JAX, which must not do so in float32."""

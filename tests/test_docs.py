@@ -194,8 +194,6 @@ def given(tmp_path_factory):
 def test_python_in_a_page_runs(page, given, monkeypatch):
     folder, names = given
     monkeypatch.chdir(folder)
-    # One process is a cluster of its own, which needs no coordinator.
-    monkeypatch.setattr(jax.distributed, "initialize", lambda *_, **__: None)
     names = {**names, "__name__": "__main__"}
     for k, block in enumerate(_blocks(page, "python")):
         exec(compile(block, f"{page.name}, block {k + 1}", "exec"), names)

@@ -10,7 +10,7 @@ the common one.
 
 import dataclasses
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -23,24 +23,27 @@ from .fit_result import Fit
 from .identify import fit_problem
 from .problem import RegressionProblem
 from .uncertainty import Uncertainty
-from .uncertainty.blocks import solve_blocks
+from .uncertainty.blocks import block_covariance, residual_blocks
 
 
 def require_same_base(fits: Sequence[Fit]) -> None:
     """Check that fits have the same base parameters."""
-    first, a = fits[0], fits[0].base
+    first = fits[0]
     for fit in fits[1:]:
-        b = fit.base
-        same = a.names == b.names and a.indices == b.indices
-        if not same or not np.allclose(a.kappa, b.kappa, rtol=1e-6, atol=1e-9):
-            others = sorted({*a.names} ^ {*b.names})
-            differs = (
-                f"`{others[0]}` is in one of them only" if others else "lengths differ"
-            )
-            pair = f"`{first.name}` and `{fit.name}`"
-            raise InputError(
-                f"{pair} have different base parameters ({differs}): use one model."
-            )
+        base, other = first.base, fit.base
+        has_same_columns = base.names == other.names and base.indices == other.indices
+        if has_same_columns and np.allclose(
+            base.kappa, other.kappa, rtol=1e-6, atol=1e-9
+        ):
+            continue
+        differing_names = sorted({*base.names} ^ {*other.names})
+        difference = "lengths differ"
+        if differing_names:
+            difference = f"`{differing_names[0]}` is in one of them only"
+        raise InputError(
+            f"`{first.name}` and `{fit.name}` have different base parameters "
+            f"({difference}): use one model."
+        )
 
 
 def as_least_squares(fit: Fit) -> Fit:
@@ -53,10 +56,10 @@ def as_least_squares(fit: Fit) -> Fit:
     if fit.is_least_squares:
         return fit
     problem = RegressionProblem(fit.base, blocks=fit.blocks, names=fit.recordings)
-    plain = fit_problem(problem, WeightedLeastSquares(GivenWeights(fit.weights)))
+    solution = fit_problem(problem, WeightedLeastSquares(GivenWeights(fit.weights)))
     if fit.consistency is not None:
-        plain = replace_estimates(plain, plain.parameters, fit.uncertainty)
-    return dataclasses.replace(plain, name=fit.name)
+        solution = replace_estimates(solution, solution.parameters, fit.uncertainty)
+    return dataclasses.replace(solution, name=fit.name)
 
 
 def without_bounds(fit: Fit) -> Fit:
@@ -80,39 +83,53 @@ def combine(fits: Sequence[Fit], maps, offsets=None) -> tuple[np.ndarray, Uncert
     """
     for one, other in itertools.combinations(fits, 2):
         if share_rows(one.time_blocks, other.time_blocks):
-            names = f"`{one.name}` and `{other.name}`"
             raise InputError(
-                f"{names} have seen the same data, which would count twice."
+                f"`{one.name}` and `{other.name}` have seen the same data, which would "
+                "count twice."
             )
-    offsets = offsets or [np.zeros(fit.base.size) for fit in fits]
-    factors, rows = [fit.factor for fit in fits], []
-    for (R, z), E, c in zip(factors, maps, offsets, strict=True):
-        rows.append(np.column_stack([R @ E, z - R @ c]))
-    triangle = np.asarray(np.linalg.qr(np.vstack(rows), mode="r"))
-    decomposition = Decomposition.of(triangle[:, :-1], triangle[:, -1])
+    if offsets is None:
+        offsets = [np.zeros(fit.base.size) for fit in fits]
+    factors = [fit.factor for fit in fits]
+    matrices = []
+    sides = []
+    for (R, z), E, offset in zip(factors, maps, offsets, strict=True):
+        matrices.append(R @ E)
+        sides.append(z - R @ offset)
+    decomposition = Decomposition.of(np.vstack(matrices), np.concatenate(sides))
     B = decomposition.inverse_information()
-    covariance, scatter = np.zeros_like(B), np.zeros(len(B))
+
+    covariance = np.zeros_like(B)
+    scatter = np.zeros(len(B))
     for fit, (R, _), E in zip(fits, factors, maps, strict=True):
-        C, dof = fit.covariance, fit.uncertainty.dof
-        if not np.isfinite(C).all():
-            # The fit alone does not determine everything, so not all of its estimates
-            # have a variance. The effect of its errors on others follows from blocks of
-            # time.
-            parts = [part.weighted(fit.weights) for part in fit.time_blocks.parts]
-            _, C, few = solve_blocks(parts)
-            dof = np.full(len(C), few)
+        fit_covariance, dof = _finite_covariance(fit)
         A = B @ E.T @ R.T @ R
-        part = A @ C @ A.T
+        part = A @ fit_covariance @ A.T
         covariance += part
         # The degrees of freedom of a sum are a mean of those of its terms.
-        weights = A**2 * np.diag(C)
-        whole = np.maximum(weights.sum(axis=1), 1e-300)
-        scatter += np.diag(part) ** 2 * (weights / dof).sum(axis=1) / whole
-    with np.errstate(divide="ignore", invalid="ignore"):
-        dof = np.where(scatter > 0, np.diag(covariance) ** 2 / scatter, np.inf)
-    unknown = decomposition.unknown
-    covariance[unknown, unknown] = np.inf
-    return decomposition.solve(), Uncertainty(covariance, dof, covariance)
+        shares = A**2 * np.diag(fit_covariance)
+        mean = (shares / dof).sum(axis=1) / np.maximum(shares.sum(axis=1), 1e-300)
+        scatter += np.diag(part) ** 2 * mean
+    total_dof = np.full(len(B), np.inf)
+    has_scatter = scatter > 0
+    variances = np.diag(covariance)[has_scatter]
+    total_dof[has_scatter] = variances**2 / scatter[has_scatter]
+    covariance[decomposition.unknown, decomposition.unknown] = np.inf
+    return decomposition.solve(), Uncertainty(covariance, total_dof, covariance)
+
+
+def _finite_covariance(fit: Fit) -> tuple[np.ndarray, np.ndarray]:
+    """Return the covariance of a fit's estimates and degrees of freedom.
+
+    A fit that does not determine everything has no variance of some estimates. The
+    effect of its errors on others follows from its blocks of time.
+    """
+    if np.isfinite(fit.covariance).all():
+        return np.asarray(fit.covariance), np.asarray(fit.uncertainty.dof)
+    decomposition = Decomposition.of(*fit.factor)
+    blocks = residual_blocks(fit.time_blocks, fit.weights, decomposition.solve())
+    inverse = decomposition.inverse_information()
+    covariance, dof = block_covariance(blocks, inverse)
+    return covariance, np.full(len(covariance), dof)
 
 
 def combine_fits(earlier: Fit, later: Fit, name: str | None = None) -> Fit:
@@ -132,18 +149,23 @@ def combine_fits(earlier: Fit, later: Fit, name: str | None = None) -> Fit:
             data.
     """
     require_same_base((earlier, later))
-    earlier, later = as_least_squares(earlier), as_least_squares(later)
+    earlier = as_least_squares(earlier)
+    later = as_least_squares(later)
     identity = np.eye(earlier.base.size)
-    p, uncertainty = combine((earlier, later), (identity, identity))
+    parameters, uncertainty = combine((earlier, later), (identity, identity))
     # The later rows are scaled so that they keep their weights under those of the
     # earlier fit.
     scaled = later.time_blocks.scale_joints(later.weights / earlier.weights)
-    blocks = Blocks((*earlier.time_blocks.parts, *scaled.parts))
-    names = (*earlier.recordings, *later.recordings)
-    problem = RegressionProblem(earlier.base, blocks=blocks, names=names)
+    problem = RegressionProblem(
+        earlier.base,
+        blocks=Blocks((*earlier.time_blocks.parts, *scaled.parts)),
+        names=(*earlier.recordings, *later.recordings),
+    )
     fit = fit_problem(problem, WeightedLeastSquares(GivenWeights(earlier.weights)))
-    name = f"{earlier.name}, {later.name}" if name is None else name
-    return replace_estimates(dataclasses.replace(fit, name=name), p, uncertainty)
+    if name is None:
+        name = f"{earlier.name}, {later.name}"
+    fit = dataclasses.replace(fit, name=name)
+    return replace_estimates(fit, parameters, uncertainty)
 
 
 def share_rows(first: Blocks, second: Blocks) -> bool:
@@ -153,21 +175,22 @@ def share_rows(first: Blocks, second: Blocks) -> bool:
     the columns and forces do, whatever the weights. Two blocks must agree: one may be a
     robot at rest.
     """
-    ours, theirs = list(_column_norms(first)), list(_column_norms(second))
-    equal = sum(
-        any(
-            m == n and a.shape == b.shape and np.abs(a - b).max() <= 1e-9
-            for n, b in theirs
-        )
-        for m, a in ours
-    )
-    return equal >= max(1, min(2, len(ours), len(theirs)))
+    ours = _column_norms(first)
+    theirs = _column_norms(second)
+    count = sum(any(_are_equal(a, b) for b in theirs) for a in ours)
+    return count >= max(1, min(2, len(ours), len(theirs)))
 
 
-def _column_norms(blocks: Blocks) -> Iterator[tuple[list[int], np.ndarray]]:
-    """Yield the numbers of rows of each block, and the norms relative to the joint's largest."""
+def _are_equal(first: np.ndarray, second: np.ndarray) -> bool:
+    return first.shape == second.shape and np.abs(first - second).max() <= 1e-9
+
+
+def _column_norms(blocks: Blocks) -> list[np.ndarray]:
+    """Return each block's rows and norms, relative to the joint's largest."""
+    block_norms = []
     for part in blocks.parts:
         if part.rows.any():
             norms = [np.linalg.norm(joint.R, axis=0) for joint in part.joints]
             relative = [x / max(x.max(initial=0.0), 1e-300) for x in norms]
-            yield part.rows.tolist(), np.concatenate(relative)
+            block_norms.append(np.concatenate([part.rows, *relative]))
+    return block_norms

@@ -33,16 +33,16 @@ class RowChunk(NamedTuple):
     rows: slice  # range of the recording's rows
     indices: Columns  # base parameters that can act on each joint
     columns: list[np.ndarray]  # columns of each joint [rows, indices of the joint]
-    forces: (
-        np.ndarray
-    )  # measured forces less those of a known tool [rows, joints], in [N m] or [N]
+    # measured forces less those of a known tool [rows, joints], in [N m] or [N]
+    forces: np.ndarray
     mask: np.ndarray  # rows that count for each joint [rows, joints]
 
-    def part(self, selection: slice) -> "RowChunk":
-        """Return some of the rows, counted from the first of the chunk."""
-        start = self.rows.start
+    def part(self, rows: slice) -> "RowChunk":
+        """Return the rows of a range of the recording, which lies within the chunk."""
+        offset = self.rows.start
+        selection = slice(rows.start - offset, rows.stop - offset)
         return self._replace(
-            rows=slice(start + selection.start, start + selection.stop),
+            rows=rows,
             columns=[x[selection] for x in self.columns],
             forces=self.forces[selection],
             mask=self.mask[selection],
@@ -50,65 +50,87 @@ class RowChunk(NamedTuple):
 
     def divide(self, edges: Sequence[int]) -> "Iterator[RowChunk]":
         """Yield the parts that lie in each block of time, by the first rows of the blocks."""
-        start = self.rows.start
-        for block, own in divide_rows(edges, self.rows):
-            part = self.part(slice(own.start - start, own.stop - start))
-            yield part._replace(block=self.block + block)
+        for block, rows in divide_rows(edges, self.rows):
+            yield self.part(rows)._replace(block=self.block + block)
 
     def residuals(self, p: np.ndarray) -> Float[np.ndarray, "rows joints"]:
         """Return measured less predicted forces [N m or N]."""
-        pairs = zip(self.columns, self.indices, strict=True)
-        return self.forces - np.stack(
-            [theta @ p[list(own)] for theta, own in pairs], axis=1
-        )
+        predicted_forces = [
+            theta @ p[list(indices)]
+            for theta, indices in zip(self.columns, self.indices, strict=True)
+        ]
+        return self.forces - np.stack(predicted_forces, axis=1)
 
     def equations(self) -> list[np.ndarray]:
-        """Return the masked rows `[columns, force]` of each joint."""
+        """Return the rows `[columns, force]` of each joint that count."""
         joints = zip(self.columns, self.forces.T, self.mask.T, strict=True)
-        return [np.column_stack([theta, force])[kept] for theta, force, kept in joints]
+        return [np.column_stack([theta, force])[mask] for theta, force, mask in joints]
+
+
+def join_chunks(chunks: Sequence[RowChunk]) -> RowChunk:
+    """Return the rows of chunks that follow each other in one recording."""
+    columns = [
+        np.concatenate(x) for x in zip(*(c.columns for c in chunks), strict=True)
+    ]
+    return chunks[0]._replace(
+        rows=slice(chunks[0].rows.start, chunks[-1].rows.stop),
+        columns=columns,
+        forces=np.concatenate([chunk.forces for chunk in chunks]),
+        mask=np.concatenate([chunk.mask for chunk in chunks]),
+    )
 
 
 def row_chunks(
-    base, observations: Observations, samples: int, wanted=None
+    base: BaseParameters,
+    observations: Observations,
+    samples: int,
+    ranges: Sequence[tuple[int, int]] | None = None,
 ) -> Iterator[RowChunk]:
     """Yield the rows of a recording by chunks of so many samples, not yet divided (Eq. 26).
 
-    Only the `wanted` ranges of rows are made, or all.
+    Only some ranges of rows are made, or all.
     """
-    mask, indices = np.asarray(observations.mask), base.acting_columns
-    for chunk in observations.chunks(samples, wanted):
+    mask = np.asarray(observations.mask)
+    for chunk in observations.chunks(samples, ranges):
         motion, forces = observations.read(slice(*chunk.samples))
         forces = without_tool(base, motion, forces)
-        columns = [chunk.reduce(theta) for theta in base.regressor_rows(motion)]
         rows = slice(*chunk.rows)
-        yield RowChunk(0, 0, rows, indices, columns, chunk.reduce(forces), mask[rows])
+        yield RowChunk(
+            recording=0,
+            block=0,
+            rows=rows,
+            indices=base.acting_columns,
+            columns=[chunk.reduce(theta) for theta in base.regressor_rows(motion)],
+            forces=chunk.reduce(forces),
+            mask=mask[rows],
+        )
 
 
 def without_tool(base: BaseParameters, motion: Motion, forces: AnyArray) -> np.ndarray:
     """Return measured forces less those of a known tool [N m or N]."""
     forces = np.asarray(forces)
-    return (
-        forces if base.model.robot.tool is None else forces - base.tool_forces(motion)
-    )
+    if base.model.robot.tool is None:
+        return forces
+    return forces - base.tool_forces(motion)
 
 
 def divide_rows(edges: Sequence[int], rows: slice) -> Iterator[tuple[int, slice]]:
     """Yield each block of time that some rows reach into, with its part of the rows."""
-    for block, (low, high) in enumerate(itertools.pairwise(edges)):
-        a, b = max(low, rows.start), min(high, rows.stop)
-        if a < b:
-            yield block, slice(a, b)
+    for block, (first, end) in enumerate(itertools.pairwise(edges)):
+        start = max(first, rows.start)
+        stop = min(end, rows.stop)
+        if start < stop:
+            yield block, slice(start, stop)
 
 
 class JointFactor(eqx.Module):
     r"""The R factor of $[\Theta_j \; Q_j]$, the rows of one joint and their forces."""
 
-    columns: tuple[int, ...] = eqx.field(
-        static=True
-    )  # base parameters that can act on the joint
+    # base parameters that can act on the joint
+    columns: tuple[int, ...] = eqx.field(static=True)
     # upper triangle, or fewer rows; its last column belongs to the forces
     R: Float[AnyArray, "height width"]
-    rows: int = eqx.field(static=True)  # number of rows that it stands for
+    rows: int = eqx.field(static=True)  # number of rows that were reduced to R
 
     def append(self, rows: Float[AnyArray, "height width"]) -> "JointFactor":
         """Return the factor after more rows `[columns, force]`."""
@@ -129,25 +151,25 @@ class Factors(eqx.Module):
 
     def __add__(self, other: "Factors") -> "Factors":
         """Return the factors of both sets of rows together."""
-        pairs = zip(self.joints, other.joints, strict=True)
-        joints = (
-            JointFactor(a.columns, a.append(b.R).R, a.rows + b.rows) for a, b in pairs
-        )
+        joints = []
+        for ours, theirs in zip(self.joints, other.joints, strict=True):
+            R = ours.append(theirs.R).R
+            joints.append(JointFactor(ours.columns, R, ours.rows + theirs.rows))
         return Factors(tuple(joints), self.size)
 
     @property
     def rows(self) -> np.ndarray:
         """Number of rows of each joint."""
-        return np.array([j.rows for j in self.joints])
+        return np.array([joint.rows for joint in self.joints])
 
     def weighted(
         self, weights: Float[AnyArray, " joints"]
     ) -> tuple[np.ndarray, np.ndarray]:
         r"""Return matrix and right-hand side with the norms of $W \Theta_B p$, $W Q$ (Eq. 29)."""
         blocks = []
-        for joint, w in zip(self.joints, np.asarray(weights), strict=True):
+        for joint, weight in zip(self.joints, np.asarray(weights), strict=True):
             block = np.zeros((len(joint.R), self.size + 1))
-            block[:, [*joint.columns, -1]] = w * joint.R
+            block[:, [*joint.columns, -1]] = weight * joint.R
             blocks.append(block)
         R = np.asarray(np.linalg.qr(np.vstack(blocks), mode="r"))
         return R[:, :-1], R[:, -1]
@@ -156,9 +178,13 @@ class Factors(eqx.Module):
         self, p: Float[AnyArray, " base"]
     ) -> Float[np.ndarray, " joints"]:
         """Return the sum of the squared residuals of each joint [N² m² or N²]."""
-        whole = np.append(p, -1.0)
-        rests = [joint.R @ whole[[*joint.columns, -1]] for joint in self.joints]
-        return np.array([np.sum(rest**2) for rest in rests])
+        # The factors hold columns and forces: `columns @ p - forces`.
+        coefficients = np.append(p, -1.0)
+        squares = []
+        for joint in self.joints:
+            residuals = joint.R @ coefficients[[*joint.columns, -1]]
+            squares.append(np.sum(residuals**2))
+        return np.array(squares)
 
     @property
     def force_squares(self) -> Float[np.ndarray, " joints"]:
@@ -168,9 +194,10 @@ class Factors(eqx.Module):
 
 def empty_factors(columns: Columns, size: int) -> Factors:
     """Return the factors of no rows, with the columns of each joint and the number of all."""
-    joints = (
-        JointFactor(tuple(own), np.zeros((0, len(own) + 1)), 0) for own in columns
-    )
+    joints = []
+    for indices in columns:
+        no_rows = np.zeros((0, len(indices) + 1))
+        joints.append(JointFactor(tuple(indices), no_rows, 0))
     return Factors(tuple(joints), size)
 
 
@@ -184,23 +211,17 @@ class Blocks(eqx.Module):
         """The factors of all rows."""
         return functools.reduce(operator.add, self.parts)
 
-    def select(self, chosen: Iterable[int | np.integer]) -> "Blocks":
+    def select(self, numbers: Iterable[int | np.integer]) -> "Blocks":
         """Return some of the blocks."""
-        return Blocks(tuple(self.parts[k] for k in chosen))
+        return Blocks(tuple(self.parts[k] for k in numbers))
 
     def scale_joints(self, factors: Float[AnyArray, " joints"]) -> "Blocks":
         """Return the factors of rows that are multiplied by one factor for each joint."""
         parts = []
         for part in self.parts:
-            pairs = zip(part.joints, np.asarray(factors), strict=True)
-            joints = (JointFactor(j.columns, x * j.R, j.rows) for j, x in pairs)
+            joints = [
+                JointFactor(joint.columns, factor * joint.R, joint.rows)
+                for joint, factor in zip(part.joints, np.asarray(factors), strict=True)
+            ]
             parts.append(Factors(tuple(joints), part.size))
         return Blocks(tuple(parts))
-
-    def condense(self, most: int) -> "Blocks":
-        """Return the same rows in at most so many blocks; neighbours are joined in pairs."""
-        parts = self.parts
-        while len(parts) > most:
-            pairs = (parts[k : k + 2] for k in range(0, len(parts), 2))
-            parts = tuple(Blocks(pair).total for pair in pairs)
-        return Blocks(parts)

@@ -1,7 +1,8 @@
 """The regression problem of identification: one pass over the rows makes all its factors."""
 
 import functools
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,8 +15,13 @@ from jaxid.robot.robot import Robot
 from .factors import Blocks, Columns, Factors, RowChunk, empty_factors, row_chunks
 from .long_logs import stream_blocks, suits
 
-Span = tuple[int, int, int]
-"""Index of a recording, and the half-open range of some of its rows."""
+
+class Span(NamedTuple):
+    """Half-open range of some rows of a recording."""
+
+    recording: int  # index of the recording
+    start: int
+    stop: int
 
 
 class RegressionProblem:
@@ -55,16 +61,17 @@ class RegressionProblem:
         blocks: Blocks | None = None,
         names: Sequence[str] | None = None,
     ):
-        self.base, self.progress = base, progress
-        alone = isinstance(recordings, Observations)
-        given = (recordings,) if alone else tuple(recordings)
+        if isinstance(recordings, Observations):
+            recordings = (recordings,)
         law = base.model.memory
-        self.recordings = tuple(with_memory(o, law) for o in given)
-        own = (o.name for o in self.recordings)
-        self.names = tuple(own if names is None else names)
-        self._given = blocks
+        self.base = base
+        self.progress = progress
+        self.recordings = tuple(with_memory(o, law) for o in recordings)
+        names = [o.name for o in self.recordings] if names is None else names
+        self.names = tuple(names)
+        self._initial_blocks = blocks
         self._edges = [block_edges(o, divisions) for o in self.recordings]
-        self._cache: dict[int, list[RowChunk]] = {}
+        self._cached_chunks: dict[int, list[RowChunk]] = {}
 
     @property
     def robot(self) -> Robot:
@@ -74,23 +81,20 @@ class RegressionProblem:
     @functools.cached_property
     def blocks(self) -> Blocks:
         """The factors by contiguous blocks of time, made by the first pass over the rows."""
-        if self._given is not None:
-            return self._given
+        if self._initial_blocks is not None:
+            return self._initial_blocks
         self._require_samples()
-        numbers = range(len(self.recordings))
-        return Blocks(
-            tuple(part for number in numbers for part in self._blocks_of(number))
-        )
-
-    def _blocks_of(self, number: int) -> Sequence[Factors]:
-        """Return the factors of a recording's blocks; for a long one the loop is compiled."""
-        recording, edges = self.recordings[number], self._edges[number]
-        if recording.samples >= self.compiled_samples and suits(recording):
-            report = functools.partial(self._report, number)
-            return stream_blocks(self.base, recording, edges, report)
-        folded = self.fold(RowChunk.equations, chunks=self._chunks(number))
-        first = self._first_block(number)
-        return folded.parts[first : first + len(edges) - 1]
+        parts = []
+        for number, recording in enumerate(self.recordings):
+            # For a long recording it pays to compile the pass.
+            if recording.samples >= self.compiled_samples and suits(recording):
+                report = functools.partial(self._report, number)
+                edges = self._edges[number]
+                parts += stream_blocks(self.base, recording, edges, report)
+            else:
+                columns = self.base.acting_columns
+                parts += self._reduce(number, RowChunk.equations, columns)
+        return Blocks(tuple(parts))
 
     @functools.cached_property
     def factors(self) -> Factors:
@@ -119,7 +123,6 @@ class RegressionProblem:
         self,
         equations: Callable[[RowChunk], Sequence[np.ndarray]],
         columns: Columns | None = None,
-        chunks: Iterable[RowChunk] | None = None,
     ) -> Blocks:
         """Return the factors of transformed rows, by blocks of time.
 
@@ -128,17 +131,29 @@ class RegressionProblem:
                 joint.
             columns: Parameters to which these columns belong; by default those of the
                 rows.
-            chunks: Rows; by default all.
 
         Raises:
             InputError: If only factors are known.
         """
+        self._require_samples()
         columns = self.base.acting_columns if columns is None else columns
-        empty = empty_factors(columns, self.base.size)
-        parts = [empty] * self._first_block(len(self.recordings))
-        for chunk in self.chunks() if chunks is None else chunks:
-            parts[chunk.block] = parts[chunk.block].append(equations(chunk))
+        parts = []
+        for number in range(len(self.recordings)):
+            parts += self._reduce(number, equations, columns)
         return Blocks(tuple(parts))
+
+    def _reduce(self, number: int, equations: Callable, columns: Columns):
+        """Return the factors of one recording's blocks of time."""
+        empty = empty_factors(columns, self.base.size)
+        parts = [empty] * (len(self._edges[number]) - 1)
+        first_block = self._first_block(number)
+        for chunk in self.recording_chunks(number):
+            block = chunk.block - first_block
+            parts[block] = parts[block].append(equations(chunk))
+        return parts
+
+    def _first_block(self, number: int) -> int:
+        return sum(len(edges) - 1 for edges in self._edges[:number])
 
     def chunks(self, spans: Sequence[Span] | None = None) -> Iterator[RowChunk]:
         """Yield the rows, recording by recording, in their order.
@@ -152,47 +167,44 @@ class RegressionProblem:
         """
         self._require_samples()
         for number in range(len(self.recordings)):
-            wanted = (
-                None if spans is None else [(a, b) for k, a, b in spans if k == number]
-            )
-            yield from self._chunks(number, wanted)
+            ranges = None
+            if spans is not None:
+                ranges = [(x.start, x.stop) for x in spans if x.recording == number]
+            yield from self.recording_chunks(number, ranges)
 
-    def _chunks(self, number: int, wanted=None) -> Iterator[RowChunk]:
+    def recording_chunks(
+        self, number: int, ranges: Sequence[tuple[int, int]] | None = None
+    ) -> Iterator[RowChunk]:
         """Yield the rows of one recording; keep them if they are all made and few."""
-        if number in self._cache:
-            yield from self._cache[number]
+        if number in self._cached_chunks:
+            yield from self._cached_chunks[number]
             return
-        room = self.cached_numbers if wanted is None else -1
-        kept, first = [], self._first_block(number)
-        for whole in row_chunks(
-            self.base, self.recordings[number], self.samples_per_chunk, wanted
-        ):
-            for chunk in whole._replace(recording=number, block=first).divide(
-                self._edges[number]
-            ):
-                room -= sum(x.size for x in chunk.columns)
-                kept = [*kept, chunk] if room >= 0 else []
+        recording = self.recordings[number]
+        numbers = recording.rows * sum(map(len, self.base.acting_columns))
+        is_kept = ranges is None and numbers <= self.cached_numbers
+        first_block = self._first_block(number)
+        chunks = []
+        for rows in row_chunks(self.base, recording, self.samples_per_chunk, ranges):
+            rows = rows._replace(recording=number, block=first_block)
+            for chunk in rows.divide(self._edges[number]):
+                if is_kept:
+                    chunks.append(chunk)
                 yield chunk
-            self._report(number, whole.rows.stop / self.recordings[number].rows)
-        if room >= 0:
-            self._cache[number], self.cached_numbers = kept, room
-
-    def _first_block(self, number: int) -> int:
-        return sum(len(edges) - 1 for edges in self._edges[:number])
+            self._report(number, rows.rows.stop / recording.rows)
+        if is_kept:
+            self._cached_chunks[number] = chunks
+            self.cached_numbers -= numbers
 
     def _report(self, number: int, done: float) -> None:
         """Report the completed fraction of a pass, from that of one recording."""
         if self.progress is not None:
             sizes = [o.samples for o in self.recordings]
-            self.progress(
-                min(1.0, (sum(sizes[:number]) + done * sizes[number]) / sum(sizes))
-            )
+            samples = sum(sizes[:number]) + done * sizes[number]
+            self.progress(min(1.0, samples / sum(sizes)))
 
-    def residuals(
-        self, p: np.ndarray, spans=None
-    ) -> Iterator[tuple[RowChunk, np.ndarray]]:
+    def residuals(self, p: np.ndarray) -> Iterator[tuple[RowChunk, np.ndarray]]:
         """Yield the rows with the residuals of some parameters [rows, joints]."""
-        for chunk in self.chunks(spans):
+        for chunk in self.chunks():
             yield chunk, chunk.residuals(p)
 
     def reweighted(self, p: np.ndarray, weight: Callable, scale: np.ndarray) -> Blocks:
@@ -206,9 +218,9 @@ class RegressionProblem:
         """
 
         def equations(chunk: RowChunk) -> list[np.ndarray]:
-            root = np.sqrt(weight(chunk.residuals(p) / scale))
-            parts = zip(chunk.equations(), root.T, chunk.mask.T, strict=True)
-            return [w[kept, None] * rows for rows, w, kept in parts]
+            row_weights = np.sqrt(weight(chunk.residuals(p) / scale))
+            joints = zip(chunk.equations(), row_weights.T, chunk.mask.T, strict=True)
+            return [roots[mask, None] * rows for rows, roots, mask in joints]
 
         return self.fold(equations)
 
@@ -218,19 +230,19 @@ def block_edges(observations: Observations, blocks: int) -> list[int]:
 
     All blocks have equally many rows that count.
     """
-    counted = np.flatnonzero(np.asarray(observations.mask).any(axis=1))
-    edges = [int(part[0]) for part in np.array_split(counted, blocks) if len(part)]
-    return [0, *edges[1:], observations.rows]
+    rows = np.flatnonzero(np.asarray(observations.mask).any(axis=1))
+    parts = [part for part in np.array_split(rows, blocks) if len(part)]
+    return [0, *(int(part[0]) for part in parts[1:]), observations.rows]
 
 
 def cross_validation_folds(
     blocks: Blocks, count: int = 5
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """Return indices of all blocks but one contiguous part of time, and of that part; each once."""
-    every = np.arange(len(blocks.parts))
-    if len(every) < 2:
+    numbers = np.arange(len(blocks.parts))
+    if len(numbers) < 2:
         raise InputError(
             "held-out errors need at least two blocks of rows: record longer."
         )
-    parts = np.array_split(every, min(count, len(every)))
-    return [(np.setdiff1d(every, part), part) for part in parts]
+    parts = np.array_split(numbers, min(count, len(numbers)))
+    return [(np.setdiff1d(numbers, part), part) for part in parts]

@@ -16,7 +16,11 @@ from virtual import (
 import jaxid as jid
 from jaxid.dynamics.dispatch import in_numpy
 from jaxid.identification.uncertainty import UNCERTAINTIES, spectral
-from jaxid.identification.uncertainty.spectral import SpectralTable, sandwich
+from jaxid.identification.uncertainty.spectral import (
+    SpectralTable,
+    sandwich,
+    white_variances,
+)
 
 ESTIMATOR = jid.WeightedLeastSquares(jid.estimators.ResidualVariances(0))
 
@@ -29,7 +33,7 @@ def base():
 def row_spectra(base, recordings):
     problem = jid.RegressionProblem(base, recordings)
     estimate = ESTIMATOR(problem)
-    return spectral.row_spectra(problem, estimate)[:2], estimate
+    return spectral.row_spectra(problem, estimate), estimate
 
 
 def by_definition(base, o, weights):
@@ -70,7 +74,7 @@ def test_the_sandwich_is_its_definition(base, samples):
     )
     found, e = row_spectra(base, [o])
     covariance, dof = by_definition(base, o, np.asarray(e.weights))
-    got, got_dof, _ = sandwich(*found)
+    got, got_dof = sandwich(found)
     np.testing.assert_allclose(np.diag(got), np.diag(covariance), rtol=1e-8)
     np.testing.assert_allclose(got_dof, dof, rtol=1e-8)
     size = np.sqrt(np.diag(covariance))
@@ -94,7 +98,8 @@ def coloured(random, shape, memory, dt):
 def coverage(base, recordings, memory, draws, seed=0):
     """Share of draws in which the 95 % interval holds the truth, by parameter; naive likewise."""
     random = np.random.default_rng(seed)
-    (lines, _), e = row_spectra(base, recordings)
+    spectra, e = row_spectra(base, recordings)
+    lines = spectra.lines
     w, inverse = np.asarray(e.weights), np.asarray(e.inverse)
     columns = [np.zeros((o.rows, len(w), base.size)) for o in recordings]
     for chunk in jid.RegressionProblem(base, recordings).chunks():
@@ -201,7 +206,7 @@ def test_errors_in_the_part_that_decides_make_intervals_wider(base):
         fit = jid.identify(base, o, ESTIMATOR)
         errors = np.abs(fit.parameters - base.from_standard(p))
         held.append(errors <= fit.uncertainty.half_widths())
-        covariance, *_ = sandwich(*row_spectra(base, [o])[0])
+        covariance, _ = sandwich(row_spectra(base, [o])[0])
         alone.append(errors <= 1.96 * np.sqrt(np.diag(covariance)))
     assert np.mean(alone) < 0.75
     assert 0.88 < np.mean(held) < 0.99
@@ -279,11 +284,12 @@ def test_many_gaps_cost_no_memory_and_change_little(base, monkeypatch):
     noise = coloured(np.random.default_rng(8), (1, o.rows, 2), 0.1, o.row_time)[0]
     o = o.replace(forces=o.forces + noise)
     shared, _ = row_spectra(base, [o])
-    assert [x.stretches for x in shared[0]] == [8]
+    assert [x.stretches for x in shared.lines] == [8]
     monkeypatch.setattr(spectral, "MAX_LENGTHS", 8)
     apart, _ = row_spectra(base, [o])
-    assert len(apart[0]) == 8
-    one, other = sandwich(*shared), sandwich(*apart)
-    ratio = np.sqrt(np.diag(one[0]) / np.diag(other[0]))
+    assert len(apart.lines) == 8
+    (one, _), (other, _) = sandwich(shared), sandwich(apart)
+    ratio = np.sqrt(np.diag(one) / np.diag(other))
     np.testing.assert_allclose(ratio, 1.0, atol=0.1)
-    np.testing.assert_allclose(one[2], other[2], rtol=1e-9)
+    white = [white_variances(spectra.lines) for spectra in (shared, apart)]
+    np.testing.assert_allclose(*white, rtol=1e-9)

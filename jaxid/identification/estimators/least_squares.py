@@ -2,7 +2,7 @@
 
 import dataclasses
 from abc import abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 import equinox as eqx
 import jax
@@ -16,7 +16,7 @@ from jaxid.measurement.observations import Observations, SamplesInMemory
 from jaxid.trajectory.trajectory import AbstractTrajectory
 
 from ..factors import Blocks, JointFactor, RowChunk
-from ..problem import RegressionProblem, Span
+from ..problem import RegressionProblem
 from .estimate import AbstractEstimator, Channel, Estimate, Influence, weighted_joints
 from .regularisation_and_weights import (
     NUMERICAL,
@@ -430,9 +430,9 @@ class _RelativeProblem(RegressionProblem):
     def with_base(self, base: BaseParameters) -> RegressionProblem:
         return _RelativeProblem(self._whole.with_base(base), self._prior)
 
-    def chunks(self, spans: Sequence[Span] | None = None):
-        for chunk, forces in self._whole.residuals(self._origin, spans):
-            yield chunk._replace(forces=forces)
+    def recording_chunks(self, number, ranges=None):
+        for chunk in self._whole.recording_chunks(number, ranges):
+            yield chunk._replace(forces=chunk.residuals(self._origin))
 
 
 def _subtract_forces(blocks: Blocks, p: np.ndarray) -> Blocks:

@@ -16,10 +16,10 @@ from ..estimators.regularisation_and_weights import (
     inverse_information,
 )
 from ..factors import Blocks
-from .result import AbstractUncertainty, Uncertainty
+from .result import AbstractUncertainty, Uncertainty, rescale_covariance
 
-Block = tuple[Float[np.ndarray, "_ unknowns"], Float[np.ndarray, " _"]]
-"""Derivatives of a block's weighted residuals by the unknowns, and the residuals."""
+ResidualBlock = tuple[Float[np.ndarray, "_ unknowns"], Float[np.ndarray, " _"]]
+"""Derivatives of a block's weighted forces by the unknowns, and the residuals."""
 
 
 class BlockJackknife(AbstractUncertainty):
@@ -36,18 +36,13 @@ class BlockJackknife(AbstractUncertainty):
         if deviations is None:
             note = (
                 "standard deviations assume independent rows, and are too small where "
-                "errors of "
-                "neighbouring rows are correlated: there is only one block of time."
+                "errors of neighbouring rows are correlated: there is only one block "
+                "of time."
             )
             dof = np.full(len(naive), np.inf)
             return Uncertainty(naive, dof, naive, None, (note,)), None
-        size = np.sqrt(np.diag(naive))
-        known = np.isfinite(size) & (size > 0)
-        ratio = np.divide(deviations, size, out=np.zeros_like(size), where=known)
-        covariance = np.where(np.isfinite(naive), naive, 0.0) * ratio * ratio[:, None]
-        unknown = np.isinf(size)
-        covariance[unknown, unknown] = np.inf
-        dof = np.full(len(naive), float(len(estimate.blocks.parts) - 1))
+        covariance = rescale_covariance(naive, deviations)
+        dof = np.full(len(naive), len(estimate.blocks.parts) - 1.0)
         return Uncertainty(covariance, dof, naive, deviations), None
 
 
@@ -55,16 +50,24 @@ def jackknife(estimate: Estimate) -> Float[np.ndarray, " base"] | None:
     """Return standard deviations by the block jackknife; None for a single block of time."""
     if len(estimate.blocks.parts) < 2:
         return None
-    parts = [part.weighted(estimate.weights) for part in estimate.blocks.parts]
-    p = np.asarray(estimate.parameters)
-    covariance, _ = block_covariance(
-        [(R, z - R @ p) for R, z in parts], estimate.inverse
-    )
+    blocks = residual_blocks(estimate.blocks, estimate.weights, estimate.parameters)
+    covariance, _ = block_covariance(blocks, estimate.inverse)
     return np.sqrt(np.diag(covariance))
 
 
+def residual_blocks(
+    blocks: Blocks, weights: AnyArray, parameters: AnyArray
+) -> list[ResidualBlock]:
+    """Return the weighted factor of each block of time, and its residuals."""
+    residuals = []
+    for part in blocks.parts:
+        R, z = part.weighted(weights)
+        residuals.append((R, z - R @ parameters))
+    return residuals
+
+
 def block_covariance(
-    blocks: Sequence[Block], inverse: AnyArray
+    blocks: Sequence[ResidualBlock], inverse: AnyArray
 ) -> tuple[np.ndarray, float]:
     r"""Return the block jackknife's covariance of an estimate, and its degrees of freedom.
 
@@ -73,27 +76,22 @@ def block_covariance(
     covariance has at most the rank of the number of blocks less one: it serves single
     unknowns, and tests of a few.
     """
-    B, count = np.asarray(inverse), len(blocks)
-    size = np.sqrt(np.maximum(np.diag(B), 0.0))
-    scale = np.where(size > 0, size, 1.0)
-    scaled = B / scale / scale[:, None]
-    moved = []
-    for J, r in blocks:
-        rows = J * scale
-        step = np.eye(len(B)) - scaled @ (rows.T @ rows)
-        moved.append(np.linalg.lstsq(step, scaled @ (rows.T @ r), rcond=None)[0])
-    steps = scale * (np.array(moved) - np.mean(moved, axis=0))
-    return (count - 1) / count * steps.T @ steps, count - 1.0
+    B = np.asarray(inverse)
+    # The least squares below compare unknowns, which must not depend on their units.
+    sizes = np.sqrt(np.maximum(np.diag(B), 0.0))
+    scale = np.where(sizes > 0, sizes, 1.0)
+    scaled_inverse = B / np.outer(scale, scale)
 
-
-def solve_blocks(blocks: Sequence[Block]) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return least squares of weighted blocks, the jackknife's covariance and its dof.
-
-    The blocks are derivatives by the unknowns and right-hand sides.
-    """
-    decomposition = Decomposition.of(*map(np.concatenate, zip(*blocks, strict=True)))
-    x, B = decomposition.solve(), decomposition.inverse_information()
-    return x, *block_covariance([(J, z - J @ x) for J, z in blocks], B)
+    steps = []
+    for derivatives, residuals in blocks:
+        rows = derivatives * scale
+        remaining_part = np.eye(len(B)) - scaled_inverse @ (rows.T @ rows)
+        gradient = scaled_inverse @ (rows.T @ residuals)
+        step, *_ = np.linalg.lstsq(remaining_part, gradient, rcond=None)
+        steps.append(scale * step)
+    dof = len(steps) - 1.0
+    deviations = np.array(steps) - np.mean(steps, axis=0)
+    return dof / len(steps) * deviations.T @ deviations, dof
 
 
 def bootstrap(
@@ -126,24 +124,28 @@ def bootstrap(
         raise InputError(
             "`blocks` must hold at least two blocks of time, but holds one."
         )
-    whole = Decomposition.of(*blocks.total.weighted(weights))
-    start = whole.solve()
-    information, gradients = [], []
-    for part in blocks.parts:
-        R, z = part.weighted(weights)
-        R = R / whole.scale
-        information.append(R.T @ R)
-        gradients.append(R.T @ (z - R @ (start * whole.scale)))
-    drawn = jax.random.randint(key, (draws, count), 0, count)
-    counts = np.apply_along_axis(
-        np.bincount, 1, np.asarray(drawn), minlength=count
-    ).astype(float)
-    total = np.tensordot(counts, np.array(information), 1)
+    decomposition = Decomposition.of(*blocks.total.weighted(weights))
+    start = decomposition.solve()
+    scale = decomposition.scale
+    # Products of the blocks' rows, as if all columns had length one.
+    information = []
+    gradients = []
+    for R, residuals in residual_blocks(blocks, weights, start):
+        rows = R / scale
+        information.append(rows.T @ rows)
+        gradients.append(rows.T @ residuals)
+
+    numbers = jax.random.randint(key, (draws, count), 0, count)
+    is_drawn = np.asarray(numbers)[:, :, None] == np.arange(count)
+    occurrences = is_drawn.sum(axis=1).astype(float)
+    total = np.tensordot(occurrences, np.array(information), 1)
     inverse, condition = jax.vmap(inverse_information)(jnp.asarray(total))
-    step = jnp.einsum("dij,dj->di", inverse, counts @ np.array(gradients))
-    poor = int(np.sum(~(np.asarray(condition) < 1 / np.sqrt(RIDGE))))
-    if poor:
+    is_open = ~(np.asarray(condition) < 1 / np.sqrt(RIDGE))
+    if is_open.any():
         raise InputError(
-            f"{poor} of {draws} draws leave parameters open: take longer `blocks`."
+            f"{is_open.sum()} of {draws} draws leave parameters open: take longer "
+            "`blocks`."
         )
-    return jnp.asarray(start)[None] + step / whole.scale[None]
+    total_gradients = occurrences @ np.array(gradients)
+    steps = np.einsum("dij,dj->di", np.asarray(inverse), total_gradients)
+    return jnp.asarray(start + steps / scale)

@@ -46,8 +46,10 @@ class Uncertainty(eqx.Module):
     def ratios(self) -> Float[np.ndarray, " base"]:
         """Standard deviations relative to the naive ones; NaN where nothing is known."""
         naive = self.naive_standard_deviations
-        known, ratios = np.isfinite(naive) & (naive > 0), np.full_like(naive, np.nan)
-        return np.divide(self.standard_deviations, naive, out=ratios, where=known)
+        has_scale = np.isfinite(naive) & (naive > 0)
+        ratios = np.full_like(naive, np.nan)
+        ratios[has_scale] = self.standard_deviations[has_scale] / naive[has_scale]
+        return ratios
 
     def half_widths(self, level: float = 0.95) -> Float[np.ndarray, " base"]:
         """Return half the widths of confidence intervals, by the t distribution.
@@ -64,6 +66,26 @@ class Uncertainty(eqx.Module):
             )
         dof = np.clip(self.dof, 1.0, 1e6)
         return self.standard_deviations * special.stdtrit(dof, 0.5 + 0.5 * level)
+
+
+def rescale_covariance(
+    covariance: Float[np.ndarray, "base base"], deviations: Float[np.ndarray, " base"]
+) -> Float[np.ndarray, "base base"]:
+    """Return the covariance with the same correlations and other standard deviations.
+
+    Infinite variances, of parameters that are undetermined, stay infinite.
+    """
+    original_deviations = np.sqrt(np.diag(covariance))
+    undetermined = np.isinf(original_deviations)
+    has_scale = (original_deviations > 0) & ~undetermined
+
+    scale = np.zeros_like(original_deviations)
+    scale[has_scale] = deviations[has_scale] / original_deviations[has_scale]
+
+    finite_part = np.where(np.isfinite(covariance), covariance, 0.0)
+    rescaled = np.outer(scale, scale) * finite_part
+    rescaled[undetermined, undetermined] = np.inf
+    return rescaled
 
 
 class ResidualSpectra(eqx.Module):
