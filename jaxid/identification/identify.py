@@ -200,7 +200,8 @@ def naive_covariance(
     # Each joint pays for the parameters by its share of the rows.
     remaining_share = 1.0 - effective_parameters / float(factors.rows.sum())
     squares = factors.residual_squares(parameters)
-    covariance = np.zeros(inverse.shape)
+    unknowns = inverse.shape[1]
+    covariance = np.zeros((unknowns, unknowns))
     for joint, weight, square in zip(factors.joints, weights, squares, strict=True):
         variance = square / max(joint.rows * remaining_share, 1.0)
         columns = np.asarray(joint.R)[:, :-1]
