@@ -20,7 +20,7 @@ from jaxid.identification.estimators_by_name import ESTIMATORS, LOSSES
 from jaxid.identification.uncertainty import UNCERTAINTIES, AbstractUncertainty
 from jaxid.trajectory.files import load_trajectory
 
-from .decoder import Bounds, Fraction, Magnitude, decode, keys_of, quoted
+from .decoder import Bounds, Fraction, Magnitude, OneOf, decode, keys_of, quoted
 from .robot_tables import RobotSource, named
 
 SOLUTION = ("ridge", "truncate", "prior")
@@ -112,22 +112,14 @@ def build_estimation(
     folder: Path,
     bounds: dict[str, Any],
     *,
-    kind: Literal[
-        "weighted",
-        "least_squares",
-        "huber",
-        "tukey",
-        "correlated",
-        "instrumental",
-        "consistent",
-    ] = "consistent",
+    kind: Annotated[str, OneOf(ESTIMATORS)] = "consistent",
     weights: Literal["maximum_forces", "residual_variances"] | None = None,
     ridge: Fraction | Literal["cross_validated"] | None = None,
     truncate: Fraction | None = None,
     prior: Literal["urdf", "mjcf"] | None = None,
     essential: Annotated[float, Bounds(least=0.0, below=1.0)] | None = None,
     nonlinear_friction: bool = False,
-    uncertainty: Literal["spectral", "jackknife", "independent"] = "spectral",
+    uncertainty: Annotated[str, OneOf(UNCERTAINTIES)] = "spectral",
     limit: float | None = None,
     reference: str | list[str] | None = None,
     reference_start: float | list[float] = 0.0,
