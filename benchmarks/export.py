@@ -42,10 +42,6 @@ import timing
 
 import jaxid as jid
 from jaxid.dynamics.projection_equation import partial_velocities  # private: Eq. 38
-from jaxid.export.torque_program import (
-    body_parameters,
-    torque_program,
-)  # private: counts, timing
 from jaxid.program import trace  # private: other forms of the same torques
 from jaxid.program.c_writer import CWriter  # private: C of other forms
 from jaxid.program.scalar import Operation  # private: number of angles
@@ -129,12 +125,15 @@ def projected_mass_matrix(model, p, q):
     rest = jnp.zeros_like(q)
     F = jax.jacfwd(partial_velocities(model.robot, q, rest, rest))(rest)
     total = jnp.zeros((len(q), len(q)))
-    for term, own in model.split(p):
-        if not term.body_parameters:
-            total = total + term.mass_matrix(model.robot, own, q)
-    for f, (m, x, y, z, A, B, C, D, E, G) in zip(
-        F, body_parameters(model, p).tolist(), strict=True
-    ):
+    bodies = np.zeros((len(q), 10))
+    for term, values in model.split(p):
+        if term.body_parameters:
+            rows = np.asarray(values).reshape(len(q), -1)
+            bodies[:, : term.body_parameters] += rows
+        else:
+            total = total + term.mass_matrix(model.robot, values, q)
+    for f, body in zip(F, bodies.tolist(), strict=True):
+        m, x, y, z, A, B, C, D, E, G = body
         h = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
         J = np.array([[A, -G, -E], [-G, B, -D], [-E, -D, C]])
         total = total + f.T @ (np.block([[m * np.eye(3), -h], [h, J]]) @ f)
@@ -153,7 +152,7 @@ def programs(model, p):
             lambda q, qd, qdd: inertia(q) @ qdd + model.bias(x, q, qd), one, one, one
         )
 
-    factored = torque_program(fit)
+    factored = jid.export.torque_program(fit)
     angles = len({x.operands for x in factored.nodes if x.operation is Operation.SINE})
     found = {
         FACTORED: factored,
@@ -328,7 +327,7 @@ def time_worst(name, arm, quick):
     fit = fit_of(model, random.uniform(0.1, 1.0, model.size))
     one = (model.robot.joints,)
     nothing = trace(lambda q, qd, qdd: q[0], one, one, one)
-    found = {FACTORED: torque_program(fit), "nothing": nothing}
+    found = {FACTORED: jid.export.torque_program(fit), "nothing": nothing}
     states = states_of(model.robot, random, 1024)
     calls = 10_000 if quick else 1_000_000
     out, took = np.zeros((1024, model.robot.joints)), np.zeros(calls)
@@ -360,7 +359,7 @@ def published(name, arm, quick):
         robot = jid.from_dh(table, convention="modified", name=arm_name)
         model = jid.Model(robot, (jid.RigidBodies(),))
         fit = fit_of(model, np.random.default_rng(0).uniform(0.1, 1.0, model.size))
-        counts = torque_program(fit).counts
+        counts = jid.export.torque_program(fit).counts
         print(f"{arm_name}: {counts}; {fit.base.size} base parameters")
 
 

@@ -261,7 +261,6 @@ def arm(name):
     import pinocchio as pin
 
     import jaxid as jid
-    from jaxid.robot.urdf import urdf_parameters
 
     folder = (
         Path(next(iter(cmeel.__path__))).parent
@@ -275,7 +274,7 @@ def arm(name):
         samples = zip(motion.q, motion.qd, motion.qdd, strict=True)
         return np.array([pin.rnea(model, data, *map(np.asarray, x)) for x in samples])
 
-    return path, jid.load_urdf(path), urdf_parameters(path), torques
+    return path, jid.load_urdf(path), jid.robots.urdf_parameters(path), torques
 
 
 def moves(joints, rng, step=1e-3, count=24):

@@ -30,14 +30,13 @@ def study(robot, file, bits, draws, cutoff):
     """Return coverage of all, of friction, with exact angles; the largest bias, and warnings."""
     import jaxid as jid
     from jaxid.identification.encoder_resolution import resolution_bias
-    from jaxid.robot.urdf import urdf_parameters
 
     arm = jid.load_urdf(file)
     n, law = arm.joints, jid.CoulombFriction(jid.terms.Tanh(0.01))
     terms = (jid.RigidBodies(), jid.ViscousFriction(), law, jid.ConstantOffset())
     base = jid.base_parameters(jid.Model(arm, terms))
     log = closed_loop.simulate(file, bits=None, noise=0.0)
-    bodies = urdf_parameters(file)
+    bodies = jid.robots.urdf_parameters(file)
     truth = base.from_standard(np.concatenate([bodies, *log.friction, np.zeros(n)]))
     size = np.sqrt(np.mean(log.forces**2, axis=0))
     estimator = jid.WeightedLeastSquares(jid.estimators.GivenWeights(1 / size))

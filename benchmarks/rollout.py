@@ -87,7 +87,7 @@ def so101_logs(names) -> list[jid.Recording]:
 def so101(quick: bool) -> None:
     path = so101_file()
     model = jid.Model(jid.load_urdf(path), (jid.RigidBodies(),))
-    bodies = jid.rollout.Bodies(model, jid.urdf_parameters(path))
+    bodies = jid.rollout.Bodies(model, jid.robots.urdf_parameters(path))
     start = time.time()
     fit = jid.identify_rollout(so101_logs(SEEN), bodies)
     elapsed = time.time() - start
@@ -305,7 +305,7 @@ def arm_bodies(text: str) -> jid.rollout.Bodies:
         path = Path(folder) / "arm.xml"
         path.write_text(text)
         model = jid.Model(jid.load_mjcf(path), (jid.RigidBodies(),))
-        return jid.rollout.Bodies(model, jid.urdf_parameters(path), coupled=True)
+        return jid.rollout.Bodies(model, jid.robots.urdf_parameters(path), coupled=True)
 
 
 def arm_logs(
@@ -449,7 +449,9 @@ def band(quick: bool) -> None:
         fit = jid.identify_rollout(arm_logs(seed), bodies, **FINE)
         options = {"samples": count, "timestep": STEP}
         with tempfile.TemporaryDirectory() as folder:
-            files = jid.export_servo_mjcf(fit, Path(folder) / "arm.xml", **options)
+            files = jid.export.export_servo_mjcf(
+                fit, Path(folder) / "arm.xml", **options
+            )
             models = [mujoco.MjModel.from_xml_path(str(p)) for p in files[1:]]
         paths = []
         for model in models:
@@ -590,7 +592,7 @@ def sysid(quick: bool) -> list[Row]:
     rows = [sysid_row("joint 2", both_sets(quick, [1]))]
     if not quick:
         model = jid.Model(jid.load_urdf(so101_file()), (jid.RigidBodies(),))
-        bodies = jid.rollout.Bodies(model, jid.urdf_parameters(so101_file()))
+        bodies = jid.rollout.Bodies(model, jid.robots.urdf_parameters(so101_file()))
         rows.append(sysid_row("joints 1 to 5", both_sets(quick), bodies))
     return rows
 

@@ -30,7 +30,10 @@ def truth(base, file, friction):
     """Return the base parameters of a simulated robot."""
     import jaxid as jid
 
-    model, bodies = base.model, np.asarray(jid.urdf_parameters(str(file))).ravel()
+    model, bodies = (
+        base.model,
+        np.asarray(jid.robots.urdf_parameters(str(file))).ravel(),
+    )
     p = dict.fromkeys(model.parameter_names, 0.0)
     p |= dict(zip(model.parameter_names, bodies, strict=False))
     for j, (viscous, dry) in enumerate(np.asarray(friction).T, 1):

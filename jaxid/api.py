@@ -2,6 +2,7 @@
 
 from . import (
     excitation as excitation,
+    export as export,
     rollout as rollout,
     simulation as simulation,
     trajectory as trajectories,  # noqa: F401
@@ -26,12 +27,11 @@ from .excitation import constraints as constraints, criteria as criteria
 from .excitation.design import design_excitation as design_excitation
 from .excitation.design_result import ExcitationPlan as ExcitationPlan
 from .excitation.problem import ExcitationProblem as ExcitationProblem
-from .export.c_code import export_c as export_c
-from .export.servo import (
-    export_servo_mjcf as export_servo_mjcf,
-    simulator_table as simulator_table,
+from .export import (
+    export_c as export_c,
+    export_mjcf as export_mjcf,
+    export_urdf as export_urdf,
 )
-from .export.simulators import export_mjcf as export_mjcf, export_urdf as export_urdf
 from .identification import (
     consistency as consistency,
     estimators as estimators,
@@ -75,18 +75,11 @@ from .measurement.recording import Recording as Recording
 from .program.jax_compilation_cache import (
     enable_compilation_cache as enable_compilation_cache,
 )
-from .robot import (
-    collision as collision,
-    library as robots,  # noqa: F401
-)
+from .robot import collision as collision, robots as robots
 from .robot.library import from_dh as from_dh
 from .robot.limits_and_drives import Drives as Drives, Limits as Limits
 from .robot.robot import Robot as Robot, Tool as Tool
-from .robot.urdf import (
-    load_mjcf as load_mjcf,
-    load_urdf as load_urdf,
-    urdf_parameters as urdf_parameters,
-)
+from .robot.urdf import load_mjcf as load_mjcf, load_urdf as load_urdf
 from .rollout.identify import identify_rollout as identify_rollout
 from .simulation.virtual import VirtualRobot as VirtualRobot
 from .validation.diagnosis import diagnose as diagnose

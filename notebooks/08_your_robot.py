@@ -74,7 +74,7 @@ jid.plot.joints(robot, limits, time, motion)
 # this model does not describe.
 
 # %%
-cad = jid.urdf_parameters("arm.urdf").reshape(3, 10)
+cad = jid.robots.urdf_parameters("arm.urdf").reshape(3, 10)
 rotors = np.array([0.4, 0.5, 0.15])
 yours = jid.VirtualRobot(
     robot=robot,
@@ -176,7 +176,7 @@ with tempfile.TemporaryDirectory() as folder:
     )
 
     better = jid.export_urdf(fit, "arm.urdf", Path(folder) / "identified.urdf")
-    bodies = jid.urdf_parameters(better).reshape(3, 10)
+    bodies = jid.robots.urdf_parameters(better).reshape(3, 10)
     same = np.allclose(bodies, fit.consistency.bodies, atol=1e-6)
     print("the new URDF file holds the identified bodies:", same)
 

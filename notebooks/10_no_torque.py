@@ -88,7 +88,7 @@ body = np.array([0.6, 0.6 * 0.15, 0.0, 0.0, 0.001, own, own, 0.0, 0.0, 0.0])
 bodies = jid.rollout.Bodies(jid.Model(robot, (jid.RigidBodies(),)), body)
 fit = jid.identify_rollout(logs, bodies, joint_names=["lift"])
 print(fit)
-print(jid.simulator_table(fit))
+print(jid.export.simulator_table(fit))
 
 # %% [markdown]
 # The robot has a stiffness of 15 N m/rad, damping 1.0 N m s/rad, an armature of 0.04 kg m² and 0.2 N m of friction. MuJoCo computes positions half a step late, so
@@ -145,6 +145,6 @@ print(slow_fit)
 # * Commands and encoders tell a simulation, in units of the servo's stiffness.
 # * A known weight tells the stiffness itself.
 # * Parameters that a log tells only together are reported together.
-# * `jid.export_servo_mjcf` writes the robot for MuJoCo, with as many draws from the estimates' distribution as you wish.
+# * `jid.export.export_servo_mjcf` writes the robot for MuJoCo, with as many draws from the estimates' distribution as you wish.
 #
 # The guide: [my robot logs no torque](../docs/rollout.md).

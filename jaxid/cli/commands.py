@@ -27,9 +27,13 @@ from jaxid.experiment.experiment import Experiment, load_experiment
 from jaxid.experiment.robot_tables import joint_number
 from jaxid.experiment.rollout_logs import identify_rollouts
 from jaxid.experiment.template import toml_text
-from jaxid.export.c_code import export_c
-from jaxid.export.simulators import export_mjcf, export_pinocchio, export_urdf
-from jaxid.export.torque_program import export_jax
+from jaxid.export import (
+    export_c,
+    export_jax,
+    export_mjcf,
+    export_pinocchio,
+    export_urdf,
+)
 from jaxid.identification.drive_gains import identify_drive_gains
 from jaxid.identification.fit_result import Fit
 from jaxid.identification.identify import identify as estimate

@@ -1,13 +1,18 @@
 """Export of an identified model: C for controllers, files for simulators, vectors for tools."""
 
 from .c_code import export_c as export_c
-from .simulators import (
-    export_mjcf as export_mjcf,
-    export_pinocchio as export_pinocchio,
-    export_urdf as export_urdf,
-    pinocchio_parameters as pinocchio_parameters,
-)
-from .torque_program import (
+from .feed_forward import torque_program as torque_program
+from .identified_urdf import export_urdf as export_urdf
+from .jax_function import (
     export_jax as export_jax,
     exported_function as exported_function,
+)
+from .mujoco_model import export_mjcf as export_mjcf
+from .pinocchio_inertias import (
+    export_pinocchio as export_pinocchio,
+    pinocchio_parameters as pinocchio_parameters,
+)
+from .servo_actuators import (
+    export_servo_mjcf as export_servo_mjcf,
+    simulator_table as simulator_table,
 )

@@ -4,6 +4,7 @@ import inspect
 import json
 import math
 import re
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,7 +15,10 @@ from jaxid.io import atomic_folder, fill_template
 from jaxid.program import Program, evaluate, trace
 from jaxid.program.c_writer import CWriter
 
-from .torque_program import other_forces, torques
+from .feed_forward import other_forces, torques
+
+TEST_SAMPLES = 4
+"""Number of states at which the self-test of a file compares its functions."""
 
 
 class CFunction(NamedTuple):
@@ -67,99 +71,99 @@ def export_c(
     return Path(folder) / f"{name}.c"
 
 
-def c_functions(fit: Fit) -> tuple[CFunction, ...]:
+def c_functions(fit: Fit) -> list[CFunction]:
     """Return all functions of a model, with its estimates as constants."""
-    model, base = fit.base.model, fit.base
-    one, rest = (model.robot.joints,), np.zeros(model.robot.joints)
-    torque, others, law = torques(fit), other_forces(fit), model.memory
-    relaxed = None if law is None else np.zeros(model.input_shapes[-1])
+    model = fit.base.model
+    shapes = {"p": (fit.base.size,), "s": model.input_shapes[-1]}
+    functions = []
+    for name, (summary, output, function) in _definitions(fit).items():
+        inputs = tuple(inspect.signature(function).parameters)
+        if model.memory is None:
+            inputs = tuple(x for x in inputs if x != "s")
+        input_shapes = [shapes.get(x, (model.robot.joints,)) for x in inputs]
+        program = trace(function, *input_shapes)
+        functions.append(CFunction(name, summary, program, inputs, output))
+    return functions
+
+
+def _definitions(fit: Fit) -> dict[str, tuple[str, str, Callable]]:
+    """Return summary, output and definition for one sample of each function, by name."""
+    base = fit.base
+    model = base.model
+    torque = torques(fit)
+    others = other_forces(fit)
+    rest = np.zeros(model.robot.joints)
+    relaxed = None if model.memory is None else np.zeros(model.input_shapes[-1])
     # Only the base parameters: composite bodies have fewer operations then.
-    own = np.asarray(base.to_standard(np.asarray(fit.parameters, np.float64)))
+    standard = np.asarray(base.to_standard(np.asarray(fit.parameters, np.float64)))
+
+    def torque_of_parameters(q, qd, qdd, p, s=None):
+        return base.columns(q, qd, qdd, s) @ p
+
+    def torque_of_masses(q, qd, qdd, s=None):
+        return model.inertia(standard, q) @ qdd + model.bias(standard, q, qd, s)
+
+    def mass_matrix(q):
+        return model.inertia(standard, q)
+
+    def bias(q, qd, s=None):
+        return torque(q, qd, rest, s)
+
+    def gravity(q):
+        return torque(q, rest, rest, relaxed)
+
+    def friction(q, qd, s=None):
+        return others(q, qd, rest, s) - others(q, rest, rest, relaxed)
 
     functions = {
         "torque": (
             "Feed-forward torques on base parameters (Eq. 39, factored)",
+            "tau",
             torque,
         ),
         "torque_of_parameters": (
             "The same for given base parameters p, as Theta_B p (Eq. 39)",
-            lambda q, qd, qdd, p, s=None: base.columns(q, qd, qdd, s) @ p,
+            "tau",
+            torque_of_parameters,
         ),
         "torque_of_masses": (
             "The same as M qdd + h, with M by composite bodies (Eq. 38)",
-            lambda q, qd, qdd, s=None: (
-                model.inertia(own, q) @ qdd + model.bias(own, q, qd, s)
-            ),
+            "tau",
+            torque_of_masses,
         ),
         "mass_matrix": (
             "Mass matrix M, rotors included, row by row (Eq. 38)",
-            lambda q: model.inertia(own, q),
+            "m",
+            mass_matrix,
         ),
         "bias": (
             "Forces h without accelerations: Coriolis, gravity, friction (Eq. 38)",
-            lambda q, qd, s=None: torque(q, qd, rest, s),
+            "h",
+            bias,
         ),
-        "gravity": (
-            "Forces at rest: gravity, springs, offsets",
-            lambda q: torque(q, rest, rest, relaxed),
-        ),
+        "gravity": ("Forces at rest: gravity, springs, offsets", "tau", gravity),
         "friction": (
             "Friction: the forces that motion adds to those at rest",
-            lambda q, qd, s=None: (
-                others(q, qd, rest, s) - others(q, rest, rest, relaxed)
-            ),
+            "tau",
+            friction,
         ),
-        "regressor": ("Base regressor Theta_B, row by row (Eq. 23)", base.columns),
+        "regressor": (
+            "Base regressor Theta_B, row by row (Eq. 23)",
+            "theta",
+            base.columns,
+        ),
     }
-    if law is not None:
-        functions["advance"] = (
-            "State of dry friction behind a step of the joints",
-            law.advance,
-        )
-    outputs = {
-        "mass_matrix": "m",
-        "bias": "h",
-        "regressor": "theta",
-        "advance": "s_next",
-    }
-    written = []
-    for name, (summary, function) in functions.items():
-        inputs = (x for x in inspect.signature(function).parameters if x != "s" or law)
-        inputs = tuple(inputs)
-        shapes = {"p": (base.size,), "s": model.input_shapes[-1]}
-        program = trace(function, *(shapes.get(x, one) for x in inputs))
-        written.append(
-            CFunction(name, summary, program, inputs, outputs.get(name, "tau"))
-        )
-    return tuple(written)
+    if model.memory is not None:
+        summary = "State of dry friction behind a step of the joints"
+        functions["advance"] = (summary, "s_next", model.memory.advance)
+    return functions
 
 
 def c_texts(
-    fit: Fit, writer: CWriter, functions: tuple[CFunction, ...]
+    fit: Fit, writer: CWriter, functions: Sequence[CFunction]
 ) -> dict[str, str]:
     """Return the texts of the header and of the C file, by their suffixes."""
     model = fit.base.model
-    random, samples = np.random.default_rng(0), 4
-    # The self-test compares all functions with their results in Python.
-    used = dict.fromkeys(x for f in functions for x in f.inputs if x != "p")
-    states = {
-        x: np.round(random.uniform(-2.0, 2.0, (samples, model.robot.joints)), 3)
-        for x in used
-    }
-    given = {
-        **states,
-        "p": np.tile(np.asarray(fit.parameters, np.float64), (samples, 1)),
-    }
-    tables = {x: rows.tolist() for x, rows in states.items()}
-    for function in functions:
-        arrays = [given[x] for x in function.inputs]
-        if not writer.double:
-            arrays = [x.astype(np.float32).astype(np.float64) for x in arrays]
-        result = np.asarray(evaluate(function.program, *(x.T for x in arrays)))
-        rows = np.broadcast_to(
-            result.reshape(function.size, -1), (function.size, samples)
-        ).T
-        tables[f"{function.name}_expected"] = rows.tolist()
     values = {
         "fit": fit,
         "robot": model.robot,
@@ -170,16 +174,48 @@ def c_texts(
         "terms": ", ".join(type(term).__name__ for term in model.terms),
         "gravity": ", ".join(f"{x:g}" for x in np.asarray(model.robot.gravity)),
         "has_memory": model.memory is not None,
-        "tables": tables,
-        "samples": samples,
+        "tables": _test_tables(fit, writer, functions),
+        "samples": TEST_SAMPLES,
         "tolerance": "1e-10" if writer.double else "0.002",
         "ascii": _ascii,
         "quoted": json.dumps,
     }
     templates = Path(__file__).parent / "templates"
     return {
-        x: fill_template(templates / f"arm{x}.jinja", **values) for x in (".h", ".c")
+        suffix: fill_template(templates / f"arm{suffix}.jinja", **values)
+        for suffix in (".h", ".c")
     }
+
+
+def _test_tables(
+    fit: Fit, writer: CWriter, functions: Sequence[CFunction]
+) -> dict[str, list[list[float]]]:
+    """Return random states and the results of all functions, for the self-test of the file."""
+    random = np.random.default_rng(0)
+    shape = (TEST_SAMPLES, fit.base.model.robot.joints)
+    inputs = dict.fromkeys(x for function in functions for x in function.inputs)
+    arrays = {}
+    tables = {}
+    for name in inputs:
+        if name == "p":
+            parameters = np.asarray(fit.parameters, np.float64)
+            arrays[name] = np.tile(parameters, (TEST_SAMPLES, 1))
+        else:
+            arrays[name] = np.round(random.uniform(-2.0, 2.0, shape), 3)
+            tables[name] = arrays[name].tolist()
+    if not writer.double:
+        arrays = {
+            name: array.astype(np.float32).astype(np.float64)
+            for name, array in arrays.items()
+        }
+    for function in functions:
+        arguments = [arrays[name].T for name in function.inputs]
+        result = np.asarray(evaluate(function.program, *arguments))
+        # A constant result has one sample only.
+        rows = result.reshape(function.size, -1)
+        rows = np.broadcast_to(rows, (function.size, TEST_SAMPLES))
+        tables[f"{function.name}_expected"] = rows.T.tolist()
+    return tables
 
 
 def _ascii(text: str) -> str:

@@ -8,7 +8,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxid.arrays import Float
-from jaxid.export.servo import export_servo_mjcf, simulator_table, simulator_values
+from jaxid.export.servo_actuators import (
+    export_servo_mjcf,
+    simulator_table,
+    simulator_values,
+)
 from jaxid.io import atomic_folder
 from jaxid.result_table import Column, Remark, Status, Table, significant
 from jaxid.rollout import PARAMETERS, RolloutErrors, ServoFit

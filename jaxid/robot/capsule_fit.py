@@ -139,6 +139,51 @@ def _around(shape: Shape) -> Segment:
     return Segment(shape.points[0], shape.points[-1], shape.radius)
 
 
+class AxisSearch(NamedTuple):
+    """Capsules around points, about axes near a direction.
+
+    Attributes:
+        points: Points [m].
+        centre: Centre of the box around them [m].
+        size: Longest edge of that box [m].
+        frame: The direction, and two directions at right angles to it, as rows.
+    """
+
+    points: Float[np.ndarray, "points 3"]
+    centre: Float[np.ndarray, "3"]
+    size: float
+    frame: Float[np.ndarray, "3 3"]
+
+    def volume(self, change: Float[np.ndarray, "4"]) -> float:
+        """Return the volume of the capsule about an axis [m³]."""
+        return self.capsule(change).volume
+
+    def capsule(self, change: Float[np.ndarray, "4"]) -> Segment:
+        """Return the smallest capsule about an axis.
+
+        Args:
+            change: Two numbers that turn the axis from the direction, and two that shift
+                it from the centre, relative to the size.
+        """
+        direction = self.frame[0]
+        sideways = self.frame[1:]
+        axis = direction + change[:2] @ sideways
+        axis = axis / np.linalg.norm(axis)
+        place = self.centre + self.size * (change[2:] @ sideways)
+
+        differences = self.points - place
+        along = differences @ axis
+        away = np.linalg.norm(differences - along[:, None] * axis, axis=1)
+        # Rounding must leave no point outside.
+        radius = float(away.max()) * (1 + 1e-9) + 1e-12
+        reach = np.sqrt(np.maximum(radius**2 - away**2, 0.0))
+        start = (along + reach).min()
+        end = (along - reach).max()
+        if start > end:
+            start = end = 0.5 * (start + end)
+        return Segment(place + start * axis, place + end * axis, radius)
+
+
 def enclose(points: Float[np.ndarray, "points 3"]) -> Segment:
     """Return a small capsule around all points.
 
@@ -148,19 +193,20 @@ def enclose(points: Float[np.ndarray, "points 3"]) -> Segment:
     smallest cylinder is no help: a capsule about its axis is up to six times larger.)
     """
     hull = _hull_points(points)
-    size = max(float(np.ptp(hull, axis=0).max()), 1e-9)
+    low = hull.min(axis=0)
+    high = hull.max(axis=0)
+    centre = 0.5 * (high + low)
+    size = max(float((high - low).max()), 1e-9)
     _, _, directions = np.linalg.svd(hull - hull.mean(axis=0), full_matrices=True)
     options = {"maxiter": 400, "xatol": 1e-5, "fatol": 1e-6 * size**3}
 
     capsules = []
     for k in range(3):
-        frame = np.roll(directions, -k, axis=0)
-
-        def volume(x: np.ndarray, frame: np.ndarray = frame) -> float:
-            return _capsule_about_axis(hull, frame, x).volume
-
-        search = minimize(volume, np.zeros(4), method="Nelder-Mead", options=options)
-        capsules.append(_capsule_about_axis(hull, frame, search.x))
+        search = AxisSearch(hull, centre, size, np.roll(directions, -k, axis=0))
+        optimum = minimize(
+            search.volume, np.zeros(4), method="Nelder-Mead", options=options
+        )
+        capsules.append(search.capsule(optimum.x))
     return min(capsules, key=lambda capsule: capsule.volume)
 
 
@@ -172,30 +218,3 @@ def _hull_points(points: np.ndarray) -> np.ndarray:
         return points[ConvexHull(points).vertices]
     except QhullError:
         return points
-
-
-def _capsule_about_axis(
-    points: np.ndarray, frame: np.ndarray, change: np.ndarray
-) -> Segment:
-    """Return the smallest capsule about an axis that is turned and shifted from the first of three.
-
-    The first two changes turn the axis, the other two shift it from the centre of the
-    points, relative to their size.
-    """
-    low = points.min(axis=0)
-    high = points.max(axis=0)
-    size = max(float((high - low).max()), 1e-9)
-    axis = frame[0] + change[0] * frame[1] + change[1] * frame[2]
-    axis = axis / np.linalg.norm(axis)
-    place = 0.5 * (low + high) + size * (change[2] * frame[1] + change[3] * frame[2])
-
-    along = (points - place) @ axis
-    away = np.linalg.norm(points - place - along[:, None] * axis, axis=1)
-    # Rounding must leave no point outside.
-    radius = float(away.max()) * (1 + 1e-9) + 1e-12
-    reach = np.sqrt(np.maximum(radius**2 - away**2, 0.0))
-    start = (along + reach).min()
-    end = (along - reach).max()
-    if start > end:
-        start = end = 0.5 * (start + end)
-    return Segment(place + start * axis, place + end * axis, radius)

@@ -228,6 +228,7 @@ def _ends_of_strides(positions: np.ndarray) -> Int[np.ndarray, " strides"]:
 def _newton_steps(
     task: _TipTask, positions: np.ndarray, iterate: _Iterate, count: int
 ) -> _Iterate:
+    """Take some steps with the curvature of the placements."""
     for _ in range(count):
         iterate = _newton_step(task, positions, iterate)
     return iterate
@@ -241,29 +242,41 @@ def _newton_step(
     The step solves the linearised conditions, if wanted with the curvature of the
     placements.
     """
-    q, multipliers = iterate
-    n = q.shape[1]
-    tip = tip_jacobian(task.robot, q)
-    J = np.concatenate([tip.velocity, tip.turn], axis=2) * task.half_range[:, None]
-    H = np.eye(n)
+    joints = task.robot.joints
+    scale = task.half_range
+    tip = tip_jacobian(task.robot, iterate.q)
+    errors = _pose_errors(task, positions, tip)
+    jacobian = np.concatenate([tip.velocity, tip.turn], axis=2) * scale[:, None]
+    hessian = np.eye(joints)
     if curved:
-        scale = np.outer(task.half_range, task.half_range)
-        H = H + scale * tip_curvature(tip, multipliers[:, :3], multipliers[:, 3:])
+        force = iterate.multipliers[:, :3]
+        moment = iterate.multipliers[:, 3:]
+        hessian = hessian + np.outer(scale, scale) * tip_curvature(tip, force, moment)
 
-    matrix = np.zeros((len(q), n + 6, n + 6))
-    matrix[:, :n, :n] = H
-    matrix[:, :n, n:] = J
-    matrix[:, n:, :n] = np.swapaxes(J, 1, 2)
-    # Solvable at singular poses, too.
-    matrix[:, n:, n:] = -1e-11 * np.eye(6)
-
-    pull = np.einsum("pji,pi->pj", J, multipliers)
-    slope = (q - task.posture) / task.half_range + pull
-    right_side = np.concatenate([slope, _pose_errors(task, positions, tip)], axis=1)
+    pull = np.einsum("pji,pi->pj", jacobian, iterate.multipliers)
+    slope = (iterate.q - task.posture) / scale + pull
+    right_side = np.concatenate([slope, errors], axis=1)
+    matrix = _saddle_point_matrix(hessian, jacobian)
     step = np.linalg.solve(matrix, right_side[..., None])[..., 0]
-    size = np.abs(step[:, :n]).max(axis=1, keepdims=True)
+    size = np.abs(step[:, :joints]).max(axis=1, keepdims=True)
     step /= np.maximum(1.0, size / MAX_STEP)
-    return _Iterate(q - task.half_range * step[:, :n], multipliers - step[:, n:])
+    q = iterate.q - scale * step[:, :joints]
+    return _Iterate(q, iterate.multipliers - step[:, joints:])
+
+
+def _saddle_point_matrix(
+    hessian: np.ndarray, jacobian: Float[np.ndarray, "poses joints 6"]
+) -> Float[np.ndarray, "poses unknowns unknowns"]:
+    """Return the matrix of the conditions of an optimum under linear constraints."""
+    poses, joints, conditions = jacobian.shape
+    size = joints + conditions
+    matrix = np.zeros((poses, size, size))
+    matrix[:, :joints, :joints] = hessian
+    matrix[:, :joints, joints:] = jacobian
+    matrix[:, joints:, :joints] = np.swapaxes(jacobian, 1, 2)
+    # Singular poses have a solution, too.
+    matrix[:, joints:, joints:] = -1e-11 * np.eye(conditions)
+    return matrix
 
 
 def _pose_errors(

@@ -55,11 +55,11 @@ class Inertia(eqx.Module):
         mass = self.mass[..., None]
         point_mass = mass[..., None] * _moments_of_points(self.centre)
         tensor = self.tensor + point_mass
-        moments = tensor[..., (0, 1, 2), (0, 1, 2)]
-        products = -tensor[..., (1, 0, 0), (2, 2, 1)]
-        parts = [mass, mass * self.centre, moments, products]
+        A, B, C = (tensor[..., k, k] for k in range(3))
+        D, E, F = (-tensor[..., i, k] for i, k in ((1, 2), (0, 2), (0, 1)))
+        moments = namespace(tensor).stack([A, B, C, D, E, F], axis=-1)
         xp = namespace(self.mass, self.centre, self.tensor)
-        return xp.concatenate(parts, axis=-1)
+        return xp.concatenate([mass, mass * self.centre, moments], axis=-1)
 
     @property
     def pinocchio(self) -> Float[AnyArray, "*batch 10"]:

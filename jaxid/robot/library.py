@@ -15,12 +15,14 @@ import numpy as np
 from jaxid.arrays import Numbers
 from jaxid.errors import InputError
 
-from .collision import Capsule, CollisionModel, HalfSpace
+from .collision_model import CollisionModel
 from .limits_and_drives import Drives, Limits
 from .robot import Robot
 from .rotations import axis_rotation, rpy_rotation
+from .shapes import Capsule, HalfSpace
 
-_X, _, _Z = np.eye(3)
+X, _, Z = np.eye(3)
+"""Axes of a frame."""
 
 
 def from_dh(
@@ -84,33 +86,36 @@ def from_dh(
             f"{table.shape}."
         )
     n = len(table)
-    table = np.column_stack([table, np.zeros(n)])[:, :4]
-    revolute = (True,) * n if revolute is None else revolute
+    if table.shape[1] == 3:
+        table = np.column_stack([table, np.zeros(n)])
 
-    rotation, offset = np.empty((n, 3, 3)), np.empty((n, 3))
-    R, r = np.eye(3), np.zeros(3)
+    rotation = np.empty((n, 3, 3))
+    offset = np.empty((n, 3))
+    # Placement of the last frame of the table in the body of its row.
+    R = np.eye(3)
+    r = np.zeros(3)
     for i, (alpha, a, d, theta) in enumerate(table):
-        twist = axis_rotation(_X, alpha)
-        turn = axis_rotation(_Z, theta)
+        twist = axis_rotation(X, alpha)
+        turn = axis_rotation(Z, theta)
         if convention == "modified":
-            rotation[i], offset[i] = twist @ turn, a * _X + d * (twist @ _Z)
+            rotation[i] = twist @ turn
+            offset[i] = a * X + d * (twist @ Z)
         else:
-            rotation[i], offset[i] = R @ turn, r
-            R, r = twist, d * _Z + a * _X
-    end = (
-        np.eye(3)
-        if tip_rotation is None
-        else np.asarray(tip_rotation, dtype=np.float64)
-    )
+            rotation[i] = R @ turn
+            offset[i] = r
+            R = twist
+            r = d * Z + a * X
+
+    tip_in_frame = np.eye(3) if tip_rotation is None else np.array(tip_rotation, float)
     robot = Robot(
         name,
-        revolute=revolute,
-        axis=np.tile(_Z, (n, 1)),
+        revolute=(True,) * n if revolute is None else revolute,
+        axis=np.tile(Z, (n, 1)),
         rotation=rotation,
         offset=offset,
         joint_names=joint_names,
-        tip_rotation=R @ end,
-        tip_offset=r + R @ np.asarray(tip_offset, dtype=np.float64),
+        tip_rotation=R @ tip_in_frame,
+        tip_offset=r + R @ np.array(tip_offset, float),
         notes=notes,
         **fields,
     )
@@ -126,24 +131,34 @@ def entries() -> dict[str, dict[str, Any]]:
 def _robot(key: str) -> Robot:
     """Return a robot of `library.toml`."""
     entry = dict(entries()[key])
-    limits, drives = (dict(entry.pop(name, {})) for name in ("limits", "drives"))
-    n = len(entry.get("dh") or entry["offset"])
-    revolute = tuple(entry.pop("revolute", (True,) * n))
+    joints = len(entry.get("dh") or entry["offset"])
+    revolute = tuple(entry.pop("revolute", (True,) * joints))
+    entry["limits"] = _limits(entry.get("limits", {}), revolute)
+    entry["drives"] = Drives(joints, **entry.get("drives", {}))
+    for name in ("notes", "joint_names"):
+        entry[name] = tuple(entry.get(name, ()))
+    if "dh" in entry:
+        units = (np.pi / 180, 1.0, 1.0, np.pi / 180)
+        rows = np.array(entry.pop("dh")) * units
+        base_angles = np.deg2rad(entry.pop("base_rpy", np.zeros(3)))
+        return from_dh(
+            rows,
+            revolute=revolute,
+            base_rotation=rpy_rotation(base_angles),
+            **entry,
+        )
+    angles = np.deg2rad(entry.pop("rpy", np.zeros((joints, 3))))
+    rotation = [rpy_rotation(rpy) for rpy in angles]
+    return Robot(revolute=revolute, rotation=rotation, **entry)
+
+
+def _limits(table: dict[str, Any], revolute: tuple[bool, ...]) -> Limits:
+    """Return the limits of a robot of `library.toml`."""
+    limits = dict(table)
     for name in limits.pop("degrees", ()):
         limits[name] = np.where(revolute, np.pi / 180, 1.0) * limits[name]
-    entry |= {
-        name: tuple(entry[name]) for name in ("notes", "joint_names") if name in entry
-    }
     assumed = tuple(limits.pop("assumed", ()))
-    entry["limits"] = Limits(n, **limits, assumed=assumed)
-    entry["drives"] = Drives(n, **drives)
-    if "dh" not in entry:
-        angles = np.deg2rad(entry.pop("rpy", np.zeros((n, 3))))
-        rotation = [rpy_rotation(rpy) for rpy in angles]
-        return Robot(revolute=revolute, rotation=rotation, **entry)
-    rows = np.array(entry.pop("dh")) * (np.pi / 180, 1.0, 1.0, np.pi / 180)
-    base = rpy_rotation(np.deg2rad(entry.pop("base_rpy", np.zeros(3))))
-    return from_dh(rows, revolute=revolute, base_rotation=base, **entry)
+    return Limits(len(revolute), **limits, assumed=assumed)
 
 
 def tx90l_on_rail() -> Robot:
@@ -226,11 +241,11 @@ def planar_arm(joints: int = 2, length: Numbers = 1.0) -> Robot:
             "`joints` must be at least 1, and `length` one number or one for each."
         )
     lengths = np.broadcast_to(np.array(length, dtype=np.float64), (joints,))
-    ends = np.outer(lengths, _X)
+    ends = np.outer(lengths, X)
     return Robot(
         f"planar arm, {joints} joints",
         revolute=(True,) * joints,
-        axis=np.tile(_Z, (joints, 1)),
+        axis=np.tile(Z, (joints, 1)),
         rotation=np.tile(np.eye(3), (joints, 1, 1)),
         offset=np.vstack([np.zeros((1, 3)), ends[:-1]]),
         gravity=(0.0, -9.81, 0.0),

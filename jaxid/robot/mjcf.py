@@ -214,7 +214,8 @@ class _Writer:
         kind = int(model.eq_type[constraint])
         pair = [int(model.eq_obj1id[constraint]), int(model.eq_obj2id[constraint])]
         if kind == int(kinds.mjEQ_JOINT):
-            self._add_mimic(*pair, model.eq_data[constraint, :5])
+            joint, master = pair
+            self._add_mimic(joint, master, model.eq_data[constraint, :5])
         elif kind in (int(kinds.mjEQ_CONNECT), int(kinds.mjEQ_WELD)):
             if model.eq_objtype[constraint] == int(self._mujoco.mjtObj.mjOBJ_SITE):
                 pair = [int(model.site_bodyid[site]) for site in pair]

@@ -363,8 +363,9 @@ class Robot(Summarised, eqx.Module):
 
 def _checked(name: str, value: Numbers, shape: tuple[int, ...]) -> AnyArray:
     """Return a copy as an array of finite numbers; a JAX array may have leading axes."""
-    array = value
-    if not isinstance(value, jax.Array):
+    if isinstance(value, jax.Array):
+        array: AnyArray = value
+    else:
         array = np.array(as_array(name, value), np.float64)
     if array.shape[array.ndim - len(shape) :] != shape or array.ndim < len(shape):
         raise InputError(f"{name} must have the shape {shape}, but has {array.shape}.")

@@ -170,7 +170,7 @@ class Box(eqx.Module):
         distance_after = self._signed(first + high * along)
         return share * distance_before + (1.0 - share) * distance_after
 
-    def _signed(self, point: Array) -> Array:
+    def _signed(self, point: Vectors) -> Array:
         """Return the signed distances of points in the frame of the box [m]."""
         beyond = jnp.abs(point) - jnp.broadcast_to(0.5 * self.size, point.shape)
         x, y, z = jnp.unstack(-beyond, axis=-1)

@@ -245,7 +245,8 @@ def _effort_notes(robot: Robot, bodies: Float[np.ndarray, "joints 10"]) -> list[
     forces = np.abs(_gravity_forces(robot, bodies)).max(axis=0)
     efforts = np.asarray(robot.limits.force)
     notes = []
-    for joint in np.flatnonzero(efforts < MIN_EFFORT_SHARE * forces):
+    joints = np.flatnonzero(efforts < MIN_EFFORT_SHARE * forces)
+    for joint in joints.tolist():
         unit = robot.force_unit(joint)
         notes.append(
             f"joint `{robot.joint_names[joint]}`: an effort of {efforts[joint]:.3g} "

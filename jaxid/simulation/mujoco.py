@@ -9,8 +9,8 @@ import numpy as np
 from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
-from jaxid.export.simulators import mjcf_text
-from jaxid.export.torque_program import body_parameters
+from jaxid.export.feed_forward import body_parameters
+from jaxid.export.mujoco_model import mjcf_text
 from jaxid.robot.mjcf import import_mujoco
 
 from .virtual import VirtualRobot

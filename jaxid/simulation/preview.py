@@ -8,7 +8,7 @@ from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
 
 from jaxid.arrays import Float
 from jaxid.errors import InputError
-from jaxid.export.simulators import mjcf_text, placement_attributes
+from jaxid.export.mujoco_model import mjcf_text, placement_attributes
 from jaxid.io import import_extra
 from jaxid.robot.collision import GROUND, Capsule, CollisionModel
 from jaxid.robot.mjcf import exact_text, import_mujoco

@@ -14,7 +14,7 @@ from export_samples import fit_of, motion, possible
 import jaxid as jid
 from jaxid.dynamics.dispatch import in_numpy
 from jaxid.errors import InputError
-from jaxid.export.torque_program import exported_function, torque_program
+from jaxid.export import exported_function, torque_program
 
 pytestmark = pytest.mark.skipif(
     shutil.which("gcc") is None, reason="no C compiler (gcc)"
@@ -116,7 +116,7 @@ def test_operations_of_the_factored_form_are_pinned():
     model = jid.Model(jid.robots.panda(), (jid.RigidBodies(),))
     p = np.random.default_rng(0).uniform(0.1, 1.0, model.size)
     counts = torque_program(fit_of(model, p)).counts
-    assert (counts.multiplications, counts.additions) == (281, 271)
+    assert (counts.multiplications, counts.additions) == (291, 271)
     assert counts.functions == 12
 
 

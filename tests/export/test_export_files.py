@@ -11,7 +11,7 @@ from export_samples import fit_of, motion, possible
 from lxml import etree
 
 import jaxid as jid
-from jaxid.export.simulators import joint_dynamics
+from jaxid.export.joint_dynamics import joint_dynamics
 
 URDF = """<?xml version="1.0"?>
 <!-- kept -->
@@ -63,7 +63,7 @@ def held(fit, m, *, drives):
     p[10 * model.robot.joints :] = 0.0
     forces = np.asarray(model.inverse_dynamics(p, m))
     if drives:
-        joints = joint_dynamics(fit)[0]
+        joints = joint_dynamics(fit).values
         forces = forces + joints["armature"] * m.qdd + joints["damping"] * m.qd
     return forces
 
@@ -95,7 +95,7 @@ def test_the_urdf_gives_the_same_torques_in_pinocchio(fit, source, tmp_path):
     path = jid.export_urdf(fit, source, tmp_path / "new" / "arm.urdf")
     model = pin.buildModelFromUrdf(str(path))
     assert list(model.names)[1:] == ["rail", "shoulder", "elbow"]
-    m, joints = motion(3, 40), joint_dynamics(fit)[0]
+    m, joints = motion(3, 40), joint_dynamics(fit).values
     close(pinocchio_torques(pin, model, m), held(fit, m, drives=False), 1e-12)
     np.testing.assert_array_equal(model.damping, joints["damping"])
     np.testing.assert_array_equal(model.friction, joints["friction"])
@@ -177,7 +177,9 @@ def test_an_mjcf_file_is_exported_to_both_formats(source, tmp_path):
     np.testing.assert_allclose(robot.offset, model.robot.offset, atol=1e-14)
     np.testing.assert_allclose(robot.rotation, model.robot.rotation, atol=1e-14)
     expected = possible(model)[:30]
-    np.testing.assert_allclose(jid.urdf_parameters(first), expected, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(
+        jid.robots.urdf_parameters(first), expected, rtol=0, atol=1e-13
+    )
     fit, m = fit_of(jid.Model(robot), possible(model, 1), full=True), motion(3, 20)
     there = pin.buildModelFromUrdf(
         str(jid.export_urdf(fit, first, tmp_path / "arm.urdf"))
@@ -226,7 +228,7 @@ def test_the_mjcf_gives_the_same_torques_in_mujoco(fit, tmp_path, name):
         fit = fit_of(model, possible(model), full=True)
     path = jid.export_mjcf(fit, tmp_path / "arm.xml")
     model = mujoco.MjModel.from_xml_path(str(path))
-    m, joints = motion(model.nu, 40), joint_dynamics(fit)[0]
+    m, joints = motion(model.nu, 40), joint_dynamics(fit).values
     close(mujoco_torques(mujoco, model, m), held(fit, m, drives=True), 1e-11)
     np.testing.assert_array_equal(model.dof_armature, joints["armature"])
     np.testing.assert_array_equal(model.dof_damping, joints["damping"])

@@ -83,7 +83,7 @@ def random_motion(joints):
 
 def assert_same_forces(path, robot, motion, held=None, **chain):
     model = jid.Model(robot, (jid.RigidBodies(),))
-    ours = model.inverse_dynamics(jid.urdf_parameters(path, **chain), motion)
+    ours = model.inverse_dynamics(jid.robots.urdf_parameters(path, **chain), motion)
     wanted = mujoco_forces(path, robot.joint_names, motion, held)
     np.testing.assert_allclose(ours, wanted, rtol=0, atol=1e-12 * np.abs(wanted).max())
 

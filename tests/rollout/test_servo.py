@@ -10,7 +10,11 @@ import pytest
 import servo_arm
 
 import jaxid as jid
-from jaxid.export.servo import export_servo_mjcf, simulator_table, simulator_values
+from jaxid.export.servo_actuators import (
+    export_servo_mjcf,
+    simulator_table,
+    simulator_values,
+)
 from jaxid.rollout.contact import contacts
 from jaxid.rollout.coupled import CoupledSimulator
 from jaxid.rollout.dry_friction import Slip

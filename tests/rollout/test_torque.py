@@ -69,7 +69,7 @@ def test_simulated_windows_start_on_the_measured_positions(base, logs):
 def test_rollouts_take_the_bias_of_noisy_encoders_away(path, base):
     log = _observed(base, 0, late=-0.001, noise=3e-4)
     fit = jid.rollout.identify_torque_rollout(base, log)
-    bodies = jid.urdf_parameters(path)
+    bodies = jid.robots.urdf_parameters(path)
     truth = np.asarray(base.from_standard([*bodies, *driven_pendulum.DAMPING]))
     torque_fit, rollouts = (
         np.linalg.norm(p - truth) / np.linalg.norm(truth)

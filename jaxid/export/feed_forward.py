@@ -1,0 +1,65 @@
+"""The feed-forward of a controller as a scalar program with few operations (Eq. 39)."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxid.arrays import AnyArray, Float
+from jaxid.dynamics.model import Model
+from jaxid.identification.fit_result import Fit
+from jaxid.program import Program, trace
+
+from .equivalent_description import simplest_description
+
+
+def body_parameters(
+    model: Model, p: Float[AnyArray, " standard"]
+) -> Float[np.ndarray, "joints 10"]:
+    """Return ten parameters of each body, with zeros for those that the model leaves out."""
+    bodies = np.zeros((model.robot.joints, 10))
+    for term, values in model.split(np.asarray(p, np.float64)):
+        if term.body_parameters:
+            rows = np.asarray(values).reshape(model.robot.joints, -1)
+            bodies[:, : term.body_parameters] += rows
+    return bodies
+
+
+def other_forces(fit: Fit) -> Callable[..., Any]:
+    """Return the function of one sample that gives the forces of all terms but the bodies."""
+    model = fit.base.model
+
+    def forces(q, qd, qdd, s=None):
+        with_state = model if s is None else model.with_memory(state=s)
+        total = jnp.zeros_like(q)
+        for term, p in with_state.split(fit.standard_parameters):
+            if not term.body_parameters:
+                total = total + term.forces(model.robot, p, q, qd, qdd)
+        return total
+
+    return forces
+
+
+def torques(fit: Fit) -> Callable[..., Any]:
+    """Return the function of one sample that gives the forces of a fit in few operations."""
+    model = fit.base.model
+    bodies = body_parameters(model, fit.standard_parameters)
+    description = simplest_description(model.robot, bodies)
+    others = other_forces(fit)
+
+    def forces(q, qd, qdd, s=None):
+        return description.forces(q, qd, qdd) + others(q, qd, qdd, s)
+
+    return forces
+
+
+def torque_program(fit: Fit) -> Program:
+    """Return the program of the feed-forward on base parameters (Eq. 39).
+
+    Its `counts` are the numbers of operations, which `export_c` writes as C.
+
+    Args:
+        fit: Identified model.
+    """
+    return trace(torques(fit), *fit.base.model.input_shapes)

@@ -1,0 +1,178 @@
+"""The URDF file of a robot with the identified model in it."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
+from lxml.builder import E  # pyright: ignore[reportMissingModuleSource]
+
+from jaxid.arrays import Float
+from jaxid.errors import InputError
+from jaxid.identification.fit_result import Fit
+from jaxid.io import write_bytes
+from jaxid.robot.inertia import Inertia
+from jaxid.robot.mjcf import exact_text
+from jaxid.robot.robot import Robot
+from jaxid.robot.rotations import rpy_angles
+from jaxid.robot.urdf import load_urdf
+from jaxid.robot.urdf_tree import UrdfTree, link_names
+
+from .joint_dynamics import (
+    JointDynamics,
+    feasible_bodies,
+    joint_dynamics,
+    origin_comment,
+)
+
+COMMENT_START = " Inertias and friction: model of "
+"""Beginning of the comment in a URDF file that names the model."""
+
+
+def export_urdf(
+    fit: Fit,
+    source: str | Path,
+    path: str | Path,
+    *,
+    tip: str | None = None,
+    base: str | None = None,
+) -> Path:
+    """Write a robot's own URDF file with the identified model in it.
+
+    Replaced are the inertial of each link that a joint moves, with all that is fixed to
+    it (fixed links then have none), the damping and the dry friction of each joint, and
+    its effort where a largest force is known. Joints on identified bodies that the
+    robot does not have, such as fingers, become fixed where the robot holds them,
+    because the bodies contain their links. A URDF describes no rotor inertias, no
+    offsets and no width of a tanh: a comment names what is left out. Meshes, names and
+    all else stay as they are.
+
+    Args:
+        fit: Physically consistent fit.
+        source: URDF file of the robot; from a xacro or MJCF file, its expanded form is
+            written.
+        path: Path of the new file.
+        tip: Last link, as in `load_urdf`.
+        base: First link, as in `load_urdf`.
+
+    Raises:
+        FileNotFoundError: If the source does not exist.
+        InputError: If the bodies of the fit cannot exist, or the file describes another
+            robot.
+    """
+    robot = fit.base.model.robot
+    bodies = feasible_bodies(fit, "a URDF file")
+    _require_same_robot(robot, load_urdf(source, tip=tip, base=base), source)
+    tree = UrdfTree(source, tip=tip, base=base)
+    dynamics = joint_dynamics(fit)
+    _replace_comment(tree.root, fit, (*dynamics.rotors, *dynamics.left_out))
+    _replace_inertials(tree, bodies)
+    _write_joints(tree, robot, dynamics)
+    document = tree.root.getroottree()
+    text = etree.tostring(document, xml_declaration=True, encoding="utf-8")
+    write_bytes(path, text + b"\n")
+    return Path(path)
+
+
+def _replace_comment(root: Any, fit: Fit, left_out: tuple[str, ...]) -> None:
+    """Name the model in a comment, in place of the comment of an earlier export."""
+    for comment in root.xpath("comment()"):
+        if comment.text.startswith(COMMENT_START):
+            root.remove(comment)
+    root.insert(0, etree.Comment(COMMENT_START + origin_comment(fit, left_out)))
+
+
+def _replace_inertials(tree: UrdfTree, bodies: Float[np.ndarray, "joints 10"]) -> None:
+    """Write the bodies into the links that joints move, and take them from links fixed to these."""
+    links = _fix_other_joints(tree)
+    links += [name for name, carrier in tree.carriers.items() if carrier.body >= 0]
+    body_links = [link_names(joint)[1] for joint in tree.joints]
+    inertials = dict(zip(body_links, bodies, strict=True))
+    for name in links:
+        link = tree.links[name]
+        for element in link.findall("inertial"):
+            link.remove(element)
+        if name in inertials:
+            link.insert(0, _inertial(inertials[name]))
+
+
+def _fix_other_joints(tree: UrdfTree) -> list[str]:
+    """Fix the joints on identified bodies that the robot does not have; return links below them."""
+    branches = [joint for first in tree.left_out for joint in tree.branch(first)]
+    for joint in (*tree.held, *branches):
+        if joint.get("type") == "fixed":
+            continue
+        rotation, position = tree.held_pose(joint)
+        joint.set("type", "fixed")
+        for mimic in joint.findall("mimic"):
+            joint.remove(mimic)
+        origin = _child(joint, "origin")
+        origin.set("xyz", exact_text(position))
+        origin.set("rpy", exact_text(rpy_angles(rotation)))
+    return [link_names(joint)[1] for joint in branches]
+
+
+def _write_joints(tree: UrdfTree, robot: Robot, dynamics: JointDynamics) -> None:
+    """Write the friction and the largest forces of the joints that the robot has."""
+    efforts = np.asarray(robot.known_max_forces)
+    for i, joint in enumerate(tree.joints):
+        element = _child(joint, "dynamics")
+        for quantity in ("damping", "friction"):
+            element.set(quantity, exact_text(dynamics.values[quantity][i]))
+        if np.isfinite(efforts[i]):
+            _child(joint, "limit").set("effort", exact_text(efforts[i]))
+    # A URDF must have both; MJCF has no speeds.
+    for limit in tree.root.iterfind("joint/limit"):
+        for key in ("effort", "velocity"):
+            limit.set(key, limit.get(key, "1e9"))
+
+
+def _require_same_robot(robot: Robot, described: Robot, source: str | Path) -> None:
+    """Reject a file of another robot; how the robot is mounted is not in the file."""
+    if robot.joint_names != described.joint_names:
+        raise InputError(
+            f"`{source}` has the joints {', '.join(described.joint_names)}, but the "
+            f"fit has {', '.join(robot.joint_names)}: give the file of this robot, or "
+            "its `tip`."
+        )
+    for joint, name in enumerate(robot.joint_names):
+        turns = robot.revolute[joint]
+        if turns != described.revolute[joint]:
+            words = ("slides", "turns")
+            raise InputError(
+                f"joint `{name}` {words[not turns]} in `{source}`, but {words[turns]} "
+                "in the robot of the fit: give its own file."
+            )
+    all_bodies = np.arange(robot.joints)
+    bodies_on_bodies = np.flatnonzero(np.array(robot.parent) >= 0)
+    rows = {
+        "axis": all_bodies,
+        "rotation": bodies_on_bodies,
+        "offset": bodies_on_bodies,
+    }
+    for quantity, bodies in rows.items():
+        ours = np.asarray(getattr(robot, quantity))[bodies]
+        theirs = np.asarray(getattr(described, quantity))[bodies]
+        if not np.allclose(ours, theirs, rtol=0.0, atol=1e-3):
+            raise InputError(
+                f"`{source}` has another `{quantity}` than the robot of the fit: give "
+                "its own file."
+            )
+
+
+def _inertial(p: Float[np.ndarray, "10"]) -> Any:
+    """Return the element of a body, in the frame of its link."""
+    inertia = Inertia.from_parameters(p)
+    names = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+    moments = [exact_text(moment) for moment in inertia.moments]
+    return E.inertial(
+        E.origin(xyz=exact_text(inertia.centre), rpy="0 0 0"),
+        E.mass(value=exact_text(inertia.mass)),
+        E.inertia(**dict(zip(names, moments, strict=True))),
+    )
+
+
+def _child(element: Any, tag: str) -> Any:
+    """Return the child of a tag, which is added if it is missing."""
+    child = element.find(tag)
+    return etree.SubElement(element, tag) if child is None else child

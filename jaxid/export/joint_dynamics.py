@@ -1,0 +1,142 @@
+"""Bodies that can exist, and inertia and friction at the joints, as simulators need them."""
+
+import re
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxid.arrays import Float, double_precision
+from jaxid.dynamics.terms import AbstractTerm
+from jaxid.errors import InputError
+from jaxid.identification.consistency.pseudo_inertia import consistency_margin
+from jaxid.identification.fit_result import Fit
+from jaxid.result_table import printable
+from jaxid.robot.robot import Robot
+
+from .feed_forward import body_parameters
+
+PROBES = 6
+"""Number of states at which the columns of a term are compared with a joint's dynamics."""
+PROBE_SPEEDS = (20.0, 80.0)
+"""Speeds of these states, beyond the transition of dry friction [rad/s or m/s]."""
+
+
+class JointDynamics(NamedTuple):
+    """Inertia and friction at the joints, as far as simulators can describe them.
+
+    Attributes:
+        values: The `armature` [kg m² or kg], `damping` [N m s/rad or N s/m] and dry
+            `friction` [N m or N] of all joints.
+        rotors: Names of the parameters in `armature`.
+        left_out: Names of the parameters in none of the three.
+    """
+
+    values: dict[str, Float[np.ndarray, " joints"]]
+    rotors: tuple[str, ...]
+    left_out: tuple[str, ...]
+
+
+def joint_dynamics(fit: Fit) -> JointDynamics:
+    r"""Return inertia and friction at the joints, as far as simulators can describe them.
+
+    They follow from the columns of the terms: a parameter belongs to a joint if its
+    forces, as the mean of both directions, are $a \ddot q_j + b \dot q_j + c\,
+    \mathrm{sign}(\dot q_j)$ at all speeds beyond the transition of dry friction.
+    """
+    model = fit.base.model
+    robot = model.robot
+    total = np.zeros((3, robot.joints))
+    rotors = []
+    left_out = [] if model.memory is None else ["the memory of dry friction"]
+    for term, p in model.split(fit.standard_parameters):
+        if term.body_parameters:
+            continue
+        coefficients = _joint_coefficients(term, robot)
+        total += coefficients @ np.asarray(p)
+        for k, (name, _) in enumerate(term.parameters(robot)):
+            if coefficients[0, :, k].any():
+                rotors.append(name)
+            if not coefficients[:, :, k].any():
+                left_out.append(name)
+    armature, damping, friction = total
+    values = {"armature": armature, "damping": damping, "friction": friction}
+    return JointDynamics(values, tuple(rotors), tuple(left_out))
+
+
+def _joint_coefficients(
+    term: AbstractTerm, robot: Robot
+) -> Float[np.ndarray, "3 joints columns"]:
+    """Return inertia, viscous and dry friction of unit parameters; zeros if they are neither."""
+    random = np.random.default_rng(0)
+    n = robot.joints
+    q, qdd = random.uniform(-1.0, 1.0, (2, PROBES, n))
+    speeds = random.uniform(*PROBE_SPEEDS, (PROBES, n))
+    qd = speeds * random.choice([-1.0, 1.0], (PROBES, n))
+
+    columns = []
+    with double_precision():
+        for x, v, a in zip(q, qd, qdd, strict=True):
+            forward = np.asarray(term.columns(robot, x, v, a))
+            backward = np.asarray(term.columns(robot, x, -v, -a))
+            columns.append(0.5 * (forward - backward))
+    columns = np.array(columns)
+
+    coefficients = np.zeros((3, n, columns.shape[2]))
+    is_used = np.any(columns, axis=0)
+    for joint, k in zip(*np.nonzero(is_used), strict=True):
+        if np.count_nonzero(is_used[:, k]) > 1:
+            continue
+        velocity = qd[:, joint]
+        basis = np.stack([qdd[:, joint], velocity, np.sign(velocity)], axis=1)
+        forces = columns[:, joint, k]
+        solution = np.linalg.lstsq(basis, forces)[0]
+        if np.abs(basis @ solution - forces).max() < 1e-9:
+            coefficients[:, joint, k] = solution.round(12)
+    return coefficients
+
+
+def feasible_bodies(fit: Fit, target: str) -> Float[np.ndarray, "joints 10"]:
+    """Return ten parameters of each body; reject bodies and friction that cannot exist.
+
+    Args:
+        fit: Identified model.
+        target: File that needs them, for the error.
+
+    Raises:
+        InputError: If the fit is not physically consistent.
+    """
+    cure = (
+        "identify with `jid.PhysicallyConsistent()` (in the experiment file: "
+        '`[estimator]` `kind = "consistent"`)'
+    )
+    if fit.full_parameters is None:
+        raise InputError(
+            f"{target} needs all parameters, but the fit knows only base parameters: "
+            f"{cure}."
+        )
+    bodies = body_parameters(fit.base.model, fit.standard_parameters)
+    # Rounding may reach slightly below zero.
+    margins = np.asarray(consistency_margin(bodies))
+    feasible = (margins >= -1e-9) & (bodies[:, 0] > 0)
+    if not feasible.all():
+        body = int(np.argmin(feasible)) + 1
+        raise InputError(
+            f"{target} needs bodies that can exist, but body {body} cannot: {cure}."
+        )
+    for quantity, values in joint_dynamics(fit).values.items():
+        if (values < 0).any():
+            joint = fit.base.model.robot.joint_names[int(np.argmin(values))]
+            raise InputError(
+                f"{target} needs `{quantity}` >= 0, but `{joint}` has "
+                f"{values.min():g}: {cure}."
+            )
+    return bodies
+
+
+def origin_comment(fit: Fit, left_out: tuple[str, ...]) -> str:
+    """Return what the comment of a file says about the model, and what the file lacks."""
+    text = f"{fit.date or 'an unknown day'}, {fit.checksum}. "
+    if left_out:
+        text += f"Not in this file: {', '.join(left_out)}. "
+    # Two hyphens would end the comment.
+    return re.sub("-(?=-)", "- ", printable(text))

@@ -1,0 +1,127 @@
+"""The identified model as an MJCF file for MuJoCo."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
+from lxml.builder import E  # pyright: ignore[reportMissingModuleSource]
+from scipy.spatial.transform import Rotation
+
+from jaxid.arrays import AnyArray, Float, Joints
+from jaxid.identification.fit_result import Fit
+from jaxid.io import write_text
+from jaxid.robot.inertia import Inertia
+from jaxid.robot.mjcf import exact_text
+from jaxid.robot.robot import Robot
+
+from .joint_dynamics import feasible_bodies, joint_dynamics, origin_comment
+
+ATTRIBUTES = {"armature": "armature", "damping": "damping", "friction": "frictionloss"}
+"""Attributes of MJCF for the quantities of `joint_dynamics`."""
+
+
+def export_mjcf(fit: Fit, path: str | Path) -> Path:
+    """Write the model for MuJoCo: geometry, bodies, rotors, friction, limits, motors.
+
+    Rotor inertias are `armature`, viscous friction is `damping`, dry friction is
+    `frictionloss` (without the width of a tanh: MuJoCo's own dry friction holds a joint
+    at rest). A comment in the file names what MJCF cannot describe. A known tool is not
+    included.
+
+    Args:
+        fit: Physically consistent fit.
+        path: Path of the file; an existing file is replaced.
+
+    Raises:
+        InputError: If the bodies of the fit cannot exist.
+    """
+    bodies = feasible_bodies(fit, "an MJCF file")
+    dynamics = joint_dynamics(fit)
+    comment = f" Model of {origin_comment(fit, dynamics.left_out)}"
+    robot = fit.base.model.robot
+    write_text(path, mjcf_text(robot, bodies, dynamics.values, comment=comment))
+    return Path(path)
+
+
+def mjcf_text(
+    robot: Robot,
+    bodies: Float[AnyArray, "joints 10"],
+    dynamics: Mapping[str, Joints],
+    timestep: float = 0.001,
+    comment: str = "",
+) -> str:
+    """Return a robot, its bodies and the `joint_dynamics` as MJCF.
+
+    Each body has ten parameters in the paper's order, and is named after its joint.
+    Quantities that `dynamics` does not hold are zero.
+    """
+    root: Any = E.mujoco(model=robot.name)
+    if comment:
+        root.append(etree.Comment(comment))
+    gravity = exact_text(robot.gravity)
+    root.append(E.compiler(angle="radian", autolimits="true"))
+    root.append(E.option(gravity=gravity, timestep=exact_text(timestep)))
+    world = etree.SubElement(root, "worldbody")
+    actuators = etree.SubElement(root, "actuator")
+
+    elements: list[Any] = []
+    for i, parent in enumerate(robot.parent):
+        body = E.body(
+            _inertial(np.asarray(bodies)[i]),
+            _joint(robot, i, dynamics),
+            name=f"{robot.joint_names[i]}_body",
+            **placement_attributes(robot.offset[i], robot.rotation[i]),
+        )
+        parent_element = elements[parent] if parent >= 0 else world
+        parent_element.append(body)
+        elements.append(body)
+        actuators.append(_motor(robot, i))
+    tip = placement_attributes(robot.tip_offset, robot.tip_rotation)
+    elements[robot.tip_body].append(E.site(name="tip", **tip))
+    return etree.tostring(root, pretty_print=True, encoding="unicode")
+
+
+def _inertial(p: Float[np.ndarray, "10"]) -> Any:
+    """Return the element of a body's mass, centre of mass and moments of inertia."""
+    inertia = Inertia.from_parameters(p)
+    # In MuJoCo's order: xx, yy, zz, xy, xz, yz.
+    moments = inertia.tensor[(0, 1, 2, 0, 0, 1), (0, 1, 2, 1, 2, 2)]
+    return E.inertial(
+        pos=exact_text(inertia.centre),
+        mass=exact_text(inertia.mass),
+        fullinertia=exact_text(moments),
+    )
+
+
+def _joint(robot: Robot, i: int, dynamics: Mapping[str, Joints]) -> Any:
+    """Return the element of a joint, with its range where both ends are known."""
+    element: Any = E.joint(
+        name=robot.joint_names[i],
+        type="hinge" if robot.revolute[i] else "slide",
+        axis=exact_text(robot.axis[i]),
+    )
+    for quantity, attribute in ATTRIBUTES.items():
+        if quantity in dynamics and dynamics[quantity][i]:
+            element.set(attribute, exact_text(dynamics[quantity][i]))
+    ends = np.array([robot.limits.position_min[i], robot.limits.position_max[i]])
+    if np.isfinite(ends).all():
+        element.set("range", exact_text(ends))
+    return element
+
+
+def _motor(robot: Robot, i: int) -> Any:
+    """Return the element of a joint's motor, with its largest force where it is known."""
+    name = robot.joint_names[i]
+    element: Any = E.motor(name=f"{name}_motor", joint=name)
+    force = np.asarray(robot.known_max_forces)[i]
+    if np.isfinite(force):
+        element.set("ctrlrange", exact_text((-force, force)))
+    return element
+
+
+def placement_attributes(offset: AnyArray, rotation: AnyArray) -> dict[str, str]:
+    """Return the attributes of a placement; MuJoCo's quaternions are (w, x, y, z)."""
+    quaternion = Rotation.from_matrix(np.asarray(rotation)).as_quat(canonical=True)
+    return {"pos": exact_text(offset), "quat": exact_text(np.roll(quaternion, 1))}

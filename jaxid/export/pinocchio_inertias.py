@@ -1,0 +1,53 @@
+"""The identified model in the order of Pinocchio."""
+
+from pathlib import Path
+
+import numpy as np
+
+from jaxid.arrays import Float
+from jaxid.identification.fit_result import Fit
+from jaxid.io import json_text, write_text
+from jaxid.robot.inertia import Inertia
+
+from .feed_forward import body_parameters
+from .joint_dynamics import joint_dynamics
+
+
+def pinocchio_parameters(fit: Fit) -> Float[np.ndarray, "joints 10"]:
+    r"""Return the bodies' parameters in Pinocchio's order, about the origins of the joint frames.
+
+    Each row is an argument of `pinocchio.Inertia.FromDynamicParameters` and fits the
+    columns of Pinocchio's `computeJointTorqueRegressor`:
+    $(m, m r_c, I_{xx}, I_{xy}, I_{yy}, I_{xz}, I_{yz}, I_{zz})$. The rows stand in the
+    order of the robot's joints. The forces are those of the fit even if the bodies
+    cannot exist.
+
+    Args:
+        fit: Identified model.
+    """
+    bodies = body_parameters(fit.base.model, fit.standard_parameters)
+    return np.asarray(Inertia.from_parameters(bodies).pinocchio)
+
+
+def export_pinocchio(fit: Fit, path: str | Path) -> Path:
+    """Write the bodies in Pinocchio's order, and inertia and friction at the joints, as JSON.
+
+    Args:
+        fit: Identified model.
+        path: Path of the file; an existing file is replaced.
+    """
+    dynamics = joint_dynamics(fit)
+    rows = pinocchio_parameters(fit).tolist()
+    joints = []
+    for i, name in enumerate(fit.base.model.robot.joint_names):
+        at_joint = {key: float(values[i]) for key, values in dynamics.values.items()}
+        joints.append({"name": name, "parameters": rows[i], **at_joint})
+    content = {
+        "model": fit.checksum,
+        "date": fit.date,
+        "names": ["m", "mx", "my", "mz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz"],
+        "joints": joints,
+        "left_out": list(dynamics.left_out),
+    }
+    write_text(path, json_text(content))
+    return Path(path)

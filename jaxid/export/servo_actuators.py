@@ -1,0 +1,267 @@
+"""Identified servos for simulators: MJCF files, and the numbers that Isaac Lab takes."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
+from lxml.builder import E  # pyright: ignore[reportMissingModuleSource]
+
+from jaxid.arrays import AnyArray, Float, Numbers
+from jaxid.errors import InputError
+from jaxid.io import write_text
+from jaxid.result_table import Column, Table
+from jaxid.robot.mjcf import exact_text
+from jaxid.rollout.bodies import Bodies
+from jaxid.rollout.result import ServoFit
+from jaxid.rollout.servo import INDEX, START
+
+from .feed_forward import body_parameters
+from .mujoco_model import mjcf_text
+
+STICKING = "0.99 0.9999 0.001"
+"""Impedance with which MuJoCo's dry friction holds a joint almost without creep."""
+UNITS = {
+    "stiffness": ("N m/rad", "N/m"),
+    "damping": ("N m s/rad", "N s/m"),
+    "armature": ("kg m²", "kg"),
+    "friction": ("N m", "N"),
+    "effort_limit": ("N m", "N"),
+    "delay": ("s", "s"),
+    "offset": ("rad", "m"),
+    "integral_gain": ("N m/(rad s)", "N/(m s)"),
+}
+"""Units of `simulator_values` at joints that turn, and at joints that slide."""
+
+
+def servo_stiffness(
+    fit: ServoFit, stiffness: Numbers | None = None
+) -> Float[np.ndarray, " joints"]:
+    """Return the stiffness of each servo: given, that of the fit, or that of the other joints.
+
+    Args:
+        fit: Identified servos.
+        stiffness: Stiffness, one for all joints or one for each [N m/rad or N/m]; that
+            of the fit where it is None or NaN.
+
+    Raises:
+        InputError: If no joint tells its stiffness and none is given.
+    """
+    values = fit.stiffness.copy()
+    if stiffness is not None:
+        given_values = np.broadcast_to(np.asarray(stiffness, np.float64), values.shape)
+        values = np.where(np.isnan(given_values), values, given_values)
+    is_known = np.isfinite(values)
+    if not is_known.any():
+        raise InputError(
+            "`stiffness` [N m/rad] is needed: no known weight tells it, and positions "
+            "tell ratios to it only. Any number gives the same motion of a robot "
+            "without bodies."
+        )
+    return np.where(is_known, values, np.median(values[is_known]))
+
+
+def simulator_values(
+    fit: ServoFit, stiffness: Numbers | None = None, parameters: AnyArray | None = None
+) -> dict[str, Float[np.ndarray, " joints"]]:
+    """Return the numbers of each joint that simulators of actuators take.
+
+    The damping is the sum of friction and of the servo's own: positions do not tell
+    them apart. Friction that grows with load is included at the mean load of the logs.
+
+    Args:
+        fit: Identified servos.
+        stiffness: Stiffness of each servo [N m/rad or N/m]; that of the fit if None.
+        parameters: Other parameters of the joints, such as a draw from their
+            distribution.
+
+    Returns:
+        `stiffness`, `damping`, `armature`, `friction`, `effort_limit` (infinite
+        without), `delay` [s], `offset` of the command, and `integral_gain`.
+    """
+    rows = fit.parameters if parameters is None else np.asarray(parameters)
+    ratios = {symbol: rows[:, k] for symbol, k in INDEX.items()}
+    K = servo_stiffness(fit, stiffness)
+    if stiffness is None:
+        # A draw has its own stiffness where the weight tells it.
+        is_drawn = np.isfinite(fit.stiffness) & fit.free[:, INDEX["a"]]
+        K = np.where(is_drawn, 1.0 / np.maximum(ratios["a"], 1e-9), K)
+    inertia = np.maximum(K * ratios["J"] - _body_inertias(fit, ratios["a"]), 0.0)
+    friction = ratios["F"] + ratios["mu"] * np.abs(ratios["a"]) * fit.load
+    saturates = ratios["um"] < START[INDEX["um"]]
+    return {
+        "stiffness": K,
+        "damping": K * ratios["B"],
+        "armature": inertia,
+        "friction": K * friction,
+        "effort_limit": np.where(saturates, K * ratios["um"], np.inf),
+        "delay": ratios["d"],
+        "offset": ratios["b"],
+        "integral_gain": K * ratios["ki"],
+    }
+
+
+def _body_inertias(
+    fit: ServoFit, compliance: Float[np.ndarray, " joints"]
+) -> Float[np.ndarray, " joints"]:
+    """Return the inertias of the bodies that servos' inertias contain [kg m² or kg].
+
+    A simulator adds the inertia of the bodies, so that it must not count twice. Where
+    coupled bodies load a joint, its inertia is without them.
+    """
+    joints = len(fit.joint_names)
+    if fit.bodies is None:
+        return np.zeros(joints)
+    bodies = fit.bodies
+    mass_matrix = bodies.model.mass_matrix(bodies.parameters, np.zeros(joints))
+    without_bodies = bodies.coupled & (compliance > 0)
+    return np.where(without_bodies, 0.0, np.diag(np.asarray(mass_matrix)))
+
+
+def simulator_table(fit: ServoFit, stiffness: Numbers | None = None) -> Table:
+    """Return the numbers of each joint for Isaac Lab, MuJoCo Playground and others.
+
+    Args:
+        fit: Identified servos.
+        stiffness: Stiffness of each servo [N m/rad or N/m]; that of the fit if None.
+    """
+    values = simulator_values(fit, stiffness)
+    units = _units(fit)
+    columns = [
+        Column(name.replace("_", " "), value, units[name])
+        for name, value in values.items()
+        if name != "integral_gain" or value.any()
+    ]
+    remarks = []
+    if (values["delay"] < 0).any():
+        remarks.append(
+            "a negative delay means that positions are stamped later than commands: "
+            "use 0"
+        )
+    if not fit.hold:
+        remarks.append(
+            "the delay counts for interpolated commands: held ones are later by half "
+            "a step"
+        )
+    return Table(
+        "actuators of simulators",
+        Column("joint", fit.joint_names),
+        *columns,
+        Column("stiffness from", _stiffness_sources(fit, stiffness)),
+        remarks=remarks,
+    )
+
+
+def _units(fit: ServoFit) -> dict[str, str]:
+    """Return the units of `simulator_values`; those of both kinds if some joint may slide."""
+    if fit.bodies is None or all(fit.bodies.model.robot.revolute):
+        return {name: unit for name, (unit, _) in UNITS.items()}
+    return {name: " or ".join(dict.fromkeys(pair)) for name, pair in UNITS.items()}
+
+
+def _stiffness_sources(fit: ServoFit, stiffness: Numbers | None) -> list[str]:
+    """Return where the stiffness of each joint is from."""
+    is_given = np.zeros(len(fit.joint_names), bool)
+    for numbers in (stiffness, fit.given_stiffness):
+        if numbers is not None:
+            is_given |= np.isfinite(np.asarray(numbers, np.float64))
+    follows_from_weight = np.isfinite(fit.stiffness)
+    sources = np.where(follows_from_weight, "weight", "other joints")
+    return np.where(is_given, "given", sources).tolist()
+
+
+def export_servo_mjcf(
+    fit: ServoFit,
+    path: str | Path,
+    *,
+    stiffness: Numbers | None = None,
+    samples: int = 0,
+    seed: int = 0,
+    timestep: float = 0.002,
+) -> list[Path]:
+    """Write the robot for MuJoCo, with its identified servos as position actuators.
+
+    Controls are the commanded positions, one each in the order of the joints. MJCF has
+    no delay of commands and no bias: both are in a comment and in `<custom>` numbers
+    (`delay`, `offset`). Servos with integral action are `mujoco.pid` plugins, which
+    come with MuJoCo. They start without integral: wait until loaded joints have
+    settled, or set `data.act`.
+
+    Args:
+        fit: Identified servos of a robot whose bodies are known.
+        path: Path of the file.
+        stiffness: Stiffness of each servo [N m/rad or N/m]; that of the fit if None.
+        samples: Number of further files, `NAME_000.xml` …, drawn from the estimates'
+            distribution.
+        seed: Seed of the draws.
+        timestep: Time step of the simulation [s].
+
+    Raises:
+        InputError: If the fit has no bodies, or the stiffness is not known.
+    """
+    if fit.bodies is None:
+        raise InputError(
+            "`fit` has no bodies: identify with `bodies`, or use `simulator_table`."
+        )
+    path = Path(path)
+    paths = [path, *(path.with_stem(f"{path.stem}_{k:03d}") for k in range(samples))]
+    draws = [fit.parameters, *fit.samples(samples, seed)]
+    for file, parameters in zip(paths, draws, strict=True):
+        values = simulator_values(fit, stiffness, parameters)
+        write_text(file, _servo_mjcf(fit.bodies, fit.joint_names, values, timestep))
+    return paths
+
+
+def _servo_mjcf(
+    bodies: Bodies,
+    joint_names: tuple[str, ...],
+    values: dict[str, Float[np.ndarray, " joints"]],
+    timestep: float,
+) -> str:
+    """Return a robot with position actuators of these values as MJCF."""
+    model = bodies.model
+    rigid_bodies = body_parameters(model, np.asarray(bodies.parameters))
+    comment = " Delays [s] and offsets in <custom>. "
+    text = mjcf_text(model.robot, rigid_bodies, values, timestep, comment)
+    root = etree.fromstring(text)
+    root.find("option").set("integrator", "implicitfast")
+    for joint in root.iter("joint"):
+        # MuJoCo takes no stiffer friction than that of two time steps.
+        joint.set("solreffriction", f"{2.0 * timestep!r} 1")
+        joint.set("solimpfriction", STICKING)
+
+    actuators = root.find("actuator")
+    actuators.clear()
+    for k, name in enumerate(joint_names):
+        servo = {quantity: float(numbers[k]) for quantity, numbers in values.items()}
+        actuators.append(_actuator(name, servo))
+    if values["integral_gain"].any():
+        root.append(E.extension(E.plugin(plugin="mujoco.pid")))
+    root.append(
+        E.custom(
+            E.numeric(name="delay", data=exact_text(values["delay"])),
+            E.numeric(name="offset", data=exact_text(values["offset"])),
+        )
+    )
+    return etree.tostring(root, pretty_print=True, encoding="unicode")
+
+
+def _actuator(joint: str, servo: dict[str, float]) -> Any:
+    """Return the element of a joint's servo."""
+    gain = exact_text(servo["stiffness"])
+    if servo["integral_gain"] > 0.0:
+        integral_gain = exact_text(servo["integral_gain"])
+        element: Any = E.plugin(
+            E.config(key="kp", value=gain),
+            E.config(key="ki", value=integral_gain),
+            name=joint,
+            joint=joint,
+            plugin="mujoco.pid",
+            actdim="1",
+        )
+    else:
+        element = E.position(name=joint, joint=joint, kp=gain)
+    limit = servo["effort_limit"]
+    if np.isfinite(limit):
+        element.set("forcerange", exact_text((-limit, limit)))
+    return element

@@ -1,0 +1,268 @@
+"""Collision models: capsules on a robot's bodies, obstacles of its world, and their clearances."""
+
+import itertools
+import re
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxid.arrays import AnyArray, Array, Float, Hashable, double_precision
+from jaxid.errors import InputError
+
+from .forward_and_inverse_kinematics import placements
+from .robot import Robot
+from .shapes import GROUND, Box, Capsule, HalfSpace, segment_distance
+
+POSES = 400
+"""Number of random poses in which pairs are tried."""
+
+
+class CollisionModel(Hashable):
+    """Shapes, and the pairs of them that must stay apart.
+
+    Clearances are those of pairs of bodies: the least of all shapes that one and the
+    other carry. Capsules on the ground count by themselves, if their names differ in
+    more than a number.
+
+    Args:
+        robot: Robot whose bodies carry the capsules.
+        capsules: Capsules with different names.
+        obstacles: Obstacles with different names.
+        pairs: Names of shapes to watch. If None: all pairs but those of one body, of
+            neighbouring bodies, of the ground with itself, and those that overlap in
+            each of 400 random poses, which the notes list.
+
+    Attributes:
+        pairs: Indices of shapes to watch against each other: of a capsule and of
+            another one, or of an obstacle, which come after all capsules.
+        groups: Places in `pairs` that one clearance is the least of.
+        room: Largest clearance of each group in random poses [m]; infinite for given
+            pairs.
+        notes: Pairs that were left out, in sentences.
+
+    Raises:
+        InputError: If a name is missing or comes twice, a body does not exist, two
+            obstacles are paired, or there is no pair.
+    """
+
+    capsules: tuple[Capsule, ...]
+    obstacles: tuple[HalfSpace | Box, ...]
+    pairs: tuple[tuple[int, int], ...] = eqx.field(static=True)
+    groups: tuple[tuple[int, ...], ...] = eqx.field(static=True)
+    room: tuple[float, ...] = eqx.field(static=True)
+    notes: tuple[str, ...] = eqx.field(static=True)
+
+    def __init__(
+        self,
+        robot: Robot,
+        capsules: Sequence[Capsule],
+        obstacles: Sequence[HalfSpace | Box] = (),
+        pairs: Sequence[Sequence[str]] | None = None,
+    ):
+        self.capsules = tuple(capsules)
+        self.obstacles = tuple(obstacles)
+        self.notes = ()
+        _check_shapes(robot, self.capsules, self._names)
+        if pairs is None:
+            meeting_pairs = _meeting_pairs(robot, self.capsules, len(obstacles))
+            self.pairs = self._ordered(meeting_pairs)
+            largest_gaps = self._largest_gaps(robot) if self.pairs else []
+            room = dict(zip(self.pairs, largest_gaps, strict=True))
+            overlaps = [pair for pair in self.pairs if room[pair] <= 0]
+            self.pairs = tuple(pair for pair in self.pairs if room[pair] > 0)
+            self.notes = self._overlap_notes(overlaps)
+        else:
+            self.pairs = self._ordered([self._indices(pair) for pair in pairs])
+            room = dict.fromkeys(self.pairs, np.inf)
+        if not self.pairs:
+            raise InputError(
+                "a collision model needs at least one pair of shapes that can meet."
+            )
+        self.groups = self._groups()
+        self.room = tuple(
+            min(room[self.pairs[place]] for place in group) for group in self.groups
+        )
+
+    @property
+    def _names(self) -> list[str]:
+        """Names of all shapes, in the order of their indices."""
+        return [shape.name for shape in (*self.capsules, *self.obstacles)]
+
+    @property
+    def pair_names(self) -> tuple[str, ...]:
+        """Names of each clearance's shapes; of several, those of the bodies' first capsules."""
+        shape_names = self._names
+        body_names: dict[int | str, str] = {}
+        for shape, capsule in enumerate(self.capsules):
+            body_names.setdefault(self._owner(shape), _stem(capsule.name))
+
+        names = []
+        for group in self.groups:
+            pair = self.pairs[group[0]]
+            words = [shape_names[shape] for shape in pair]
+            if len(group) > 1:
+                for side, shape in enumerate(pair):
+                    words[side] = body_names.get(self._owner(shape), words[side])
+            names.append(" and ".join(words))
+        return tuple(names)
+
+    def ends(
+        self, robot: Robot, q: Float[AnyArray, " joints"]
+    ) -> Float[Array, "capsules 2 3"]:
+        """Return the ends of all capsules' axes in the frame of the ground [m], for one pose."""
+        rotations, origins = placements(robot, q)
+        # The ground comes last, where its index -1 leads.
+        rotations = jnp.concatenate([rotations, jnp.eye(3)[None]])
+        origins = jnp.concatenate([origins, jnp.zeros((1, 3))])
+        bodies = np.array([capsule.body for capsule in self.capsules])
+        axes = [jnp.stack([capsule.start, capsule.end]) for capsule in self.capsules]
+        points = jnp.einsum("cij,cej->cei", rotations[bodies], jnp.stack(axes))
+        return points + jnp.broadcast_to(origins[bodies][:, None], points.shape)
+
+    @eqx.filter_jit
+    def clearance(
+        self, robot: Robot, q: Float[AnyArray, "*batch joints"]
+    ) -> Float[AnyArray, "*batch groups"]:
+        """Return the distance between the surfaces of every pair, negative where they overlap [m].
+
+        Args:
+            robot: Robot whose bodies carry the capsules.
+            q: Joint coordinates [rad or m].
+        """
+        poses = jnp.reshape(jnp.asarray(q), (-1, robot.joints))
+        ends = jax.vmap(lambda pose: self.ends(robot, pose))(poses)
+        return self.clearances(ends).reshape(*q.shape[:-1], len(self.groups))
+
+    @eqx.filter_jit
+    def clearances(
+        self, ends: Float[AnyArray, "*batch capsules 2 3"]
+    ) -> Float[Array, "*batch groups"]:
+        """Return the clearances [m] for given ends of all axes on the ground [m]."""
+        gaps = jax.vmap(self._gaps)(jnp.reshape(ends, (-1, *ends.shape[-3:])))
+        # All groups get the same number of pairs: the first one is repeated.
+        size = max(len(group) for group in self.groups)
+        places = [group + group[:1] * (size - len(group)) for group in self.groups]
+        grouped = gaps[:, np.array(places)]
+        # The derivative is that of one pair, also where several are equally near.
+        nearest = jnp.argmin(jax.lax.stop_gradient(grouped), axis=-1, keepdims=True)
+        clearances = jnp.take_along_axis(grouped, nearest, axis=-1)[..., 0]
+        return clearances.reshape(*ends.shape[:-3], len(self.groups))
+
+    def _gaps(self, ends: Float[Array, "capsules 2 3"]) -> Float[Array, " pairs"]:
+        """Return the distance between the surfaces of each of the `pairs` in one pose [m]."""
+        start = ends[:, 0]
+        end = ends[:, 1]
+        radii = jnp.stack([jnp.asarray(capsule.radius) for capsule in self.capsules])
+        first, second = np.array(self.pairs).T
+        # Distances from the axes of the first shapes, in the order of the pairs.
+        distances = []
+        is_capsule = second < len(self.capsules)
+        if is_capsule.any():
+            i = first[is_capsule]
+            k = second[is_capsule]
+            between_axes = segment_distance(start[i], end[i], start[k], end[k])
+            distances.append(between_axes - radii[k])
+        for number, obstacle in enumerate(self.obstacles, len(self.capsules)):
+            i = first[second == number]
+            if i.size:
+                distances.append(obstacle.distance(start[i], end[i]))
+        return jnp.concatenate(distances) - radii[first]
+
+    def _largest_gaps(self, robot: Robot) -> list[float]:
+        """Return the largest gap of each pair in random poses [m]."""
+        low = np.asarray(robot.limits.position_min)
+        high = np.asarray(robot.limits.position_max)
+        low = np.where(np.isfinite(low), low, -np.pi)
+        high = np.where(np.isfinite(high), high, np.pi)
+        random = np.random.default_rng(0)
+        size = (POSES, robot.joints)
+        q = random.uniform(np.minimum(low, high), np.maximum(low, high), size)
+
+        def gaps(pose: Array) -> Array:
+            return self._gaps(self.ends(robot, pose))
+
+        with double_precision():
+            gaps_of_poses = jax.jit(jax.vmap(gaps))(q)
+        return np.asarray(gaps_of_poses).max(axis=0).tolist()
+
+    def _ordered(self, pairs: Sequence[tuple[int, int]]) -> tuple[tuple[int, int], ...]:
+        """Return pairs of capsules first, then those of each obstacle."""
+        last_capsule = len(self.capsules) - 1
+        return tuple(sorted(pairs, key=lambda pair: max(pair[1], last_capsule)))
+
+    def _groups(self) -> tuple[tuple[int, ...], ...]:
+        """Return the places of the pairs of each two bodies."""
+        groups: dict[tuple, list[int]] = {}
+        for place, pair in enumerate(self.pairs):
+            owners = tuple(self._owner(shape) for shape in pair)
+            groups.setdefault(owners, []).append(place)
+        return tuple(tuple(group) for group in groups.values())
+
+    def _owner(self, shape: int) -> int | str:
+        """Return the body, or the name of the thing on the ground, to which a shape belongs."""
+        if shape >= len(self.capsules):
+            return self.obstacles[shape - len(self.capsules)].name
+        capsule = self.capsules[shape]
+        return _stem(capsule.name) if capsule.body == GROUND else capsule.body
+
+    def _overlap_notes(self, pairs: Sequence[tuple[int, int]]) -> tuple[str, ...]:
+        if not pairs:
+            return ()
+        names = self._names
+        words = ", ".join(f"{names[i]} and {names[k]}" for i, k in pairs)
+        return (
+            f"not watched, for they overlap in every pose that was tried: {words}.",
+        )
+
+    def _indices(self, pair: Sequence[str]) -> tuple[int, int]:
+        """Return the indices of two shapes by their names, in ascending order."""
+        names = self._names
+        for name in pair:
+            if name not in names:
+                words = ", ".join(f"`{shape}`" for shape in names)
+                raise InputError(f"`{name}` is none of the shapes {words}.")
+        i, k = sorted(names.index(name) for name in pair)
+        if i >= len(self.capsules) or i == k:
+            raise InputError(
+                f"`{pair[0]}` and `{pair[1]}` cannot meet: pair a capsule with another "
+                "shape."
+            )
+        return i, k
+
+
+def _check_shapes(robot: Robot, capsules: Sequence[Capsule], names: list[str]) -> None:
+    """Reject names that come twice, and bodies that the robot does not have."""
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError(f"two shapes are named `{name}`: rename one.")
+    for capsule in capsules:
+        if not GROUND <= capsule.body < robot.joints:
+            raise InputError(
+                f"`body` of capsule `{capsule.name}` must be from 0 to "
+                f"{robot.joints - 1}, or -1 for the ground, but is {capsule.body}."
+            )
+
+
+def _meeting_pairs(
+    robot: Robot, capsules: Sequence[Capsule], obstacles: int
+) -> list[tuple[int, int]]:
+    """Return the pairs of shapes on bodies that are neither one nor neighbours."""
+    bodies = [capsule.body for capsule in capsules] + [GROUND] * obstacles
+    parents = [None if body == GROUND else robot.parent[body] for body in bodies]
+    pairs = []
+    for i, k in itertools.combinations(range(len(bodies)), 2):
+        if i >= len(capsules) or bodies[i] == bodies[k]:
+            continue
+        neighbours = bodies[k] == parents[i] or bodies[i] == parents[k]
+        # An obstacle is not part of the base that carries the first body.
+        if k >= len(capsules) or not neighbours:
+            pairs.append((i, k))
+    return pairs
+
+
+def _stem(name: str) -> str:
+    """Return the name of a capsule's link, without the number of the capsule."""
+    return re.sub(r" \d+$", "", name)
