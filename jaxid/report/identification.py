@@ -156,7 +156,7 @@ def _physics(report: Report, figures: Mapping[str, Figure]) -> Iterator[Section]
     )
     yield "Friction", [text, figures["friction"]]
     log = report.verification[0] if report.verification else report.identification[0]
-    yield "Weight", [gravity_table(report.fit, log), figures["gravity"]]
+    yield "Gravity", [gravity_table(report.fit, log), figures["gravity"]]
 
 
 def _torques(figures: Mapping[str, Figure], robot: Robot) -> list[Any]:

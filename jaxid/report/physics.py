@@ -1,4 +1,4 @@
-"""Figures of what a model says of its robot: friction, weight, and what its file claimed."""
+"""Figures of what a model says of its robot: friction, gravity, and errors along a motion."""
 
 from collections.abc import Sequence
 
@@ -16,10 +16,14 @@ from .figure import Figure
 from .figure_elements import BLUE, CYCLE, GREY, MEASURED, Curve, Panel
 from .motion import pose_figure
 
-ROWS = 2000
-"""Largest number of poses whose weight is computed."""
-CLASSES = 24
+MAX_POSES = 2000
+"""Largest number of poses whose gravity torques are computed."""
+SPEED_CLASSES = 24
 """Classes of speed whose mean friction is shown."""
+MIN_CLASS_ROWS = 5
+"""Smallest number of rows whose mean friction is shown."""
+ROUNDING = 1e-9
+"""Gravity torque that is zero but for rounding, relative to that of the heaviest joint."""
 
 
 def friction_figure(fit: Fit, logs: Sequence[TorqueErrors]) -> Figure:
@@ -33,115 +37,145 @@ def friction_figure(fit: Fit, logs: Sequence[TorqueErrors]) -> Figure:
         logs: Errors on some recordings.
     """
     robot = fit.base.model.robot
-    fastest = np.max([np.max(np.abs(e.speeds), axis=0) for e in logs], axis=0)
-    shape = np.linspace(-1.0, 1.0, 81)
+    max_speeds = np.max([np.max(np.abs(log.speeds), axis=0) for log in logs], axis=0)
     # Denser near standstill, where friction changes most.
-    speeds = (np.sign(shape) * shape**2)[:, None] * fastest
-    values, halves = _friction(fit, speeds)
+    grid = np.linspace(-1.0, 1.0, 81)
+    speeds = np.outer(np.sign(grid) * grid**2, max_speeds)
+    columns = _friction_columns(fit.base, speeds)
+    friction = columns @ np.asarray(fit.parameters)
+    half_widths = _half_widths(fit, columns)
 
-    def panel(j: int) -> Panel:
-        v, y = speeds[:, j], values[:, j]
-        curves = [Curve(v, y, "model", BLUE, width=1.4)]
-        if np.isfinite(halves[:, j]).all():
-            low, high = y - halves[:, j], y + halves[:, j]
-            curves.insert(
-                0, Curve(v, y, "95 % band", MEASURED, "band", low=low, high=high)
-            )
-        places, means = _classes(logs, j, v, y)
-        curves.append(
-            Curve(places, means, "measured, mean of a class of speed", GREY, "points")
-        )
+    measured_speeds = np.concatenate([np.asarray(log.speeds) for log in logs])
+    errors = np.concatenate([log.errors for log in logs])
+    panels = []
+    for j in np.flatnonzero(max_speeds):
+        model = Curve(speeds[:, j], friction[:, j], "model", BLUE, width=1.4)
+        curves = [model, _measured_friction(model, measured_speeds[:, j], errors[:, j])]
+        if np.isfinite(half_widths[:, j]).all():
+            curves.insert(0, _confidence_band(model, half_widths[:, j]))
         unit = robot.force_unit(j)
-        return Panel(
-            curves,
-            title=shortened(robot.joint_names[j], 26),
-            value=f"{significant(float(np.interp(fastest[j], v, y)), 2)} {unit} at "
-            "full speed",
-            x=f"speed [{robot.joint_unit(j)}/s]",
-            y="friction",
-            unit=unit,
-            levels=[("y", 0.0, GREY)],
+        at_max_speed = significant(friction[-1, j], 2)
+        panels.append(
+            Panel(
+                curves,
+                title=shortened(robot.joint_names[j], 26),
+                value=f"{at_max_speed} {unit} at full speed",
+                x=f"speed [{robot.joint_unit(j)}/s]",
+                y="friction",
+                unit=unit,
+                levels=[("y", 0.0, GREY)],
+            )
         )
-
-    panels = [panel(j) for j in range(robot.joints) if fastest[j] > 0]
     return Figure(f"{robot.name}: friction of the joints", panels, min(3, len(panels)))
 
 
-def _friction(
-    fit: Fit, speeds: Float[np.ndarray, "speeds joints"]
-) -> tuple[np.ndarray, ...]:
-    """Return friction of joints that move alone, and half the widths of its 95 % intervals."""
-    base, n = fit.base, speeds.shape[1]
-    moving = np.zeros((len(speeds) + 1, n, n))
-    moving[:-1, np.arange(n), np.arange(n)] = speeds
-    qd = moving.reshape(-1, n)
+def _friction_columns(
+    base: BaseParameters, speeds: Float[np.ndarray, "speeds joints"]
+) -> Float[np.ndarray, "speeds joints base"]:
+    """Return the columns of the friction of joints that move alone."""
+    count, joints = speeds.shape
+    # Each joint moves alone at each speed; in the last sample all stand still.
+    alone = np.arange(joints)
+    qd = np.zeros((count + 1, joints, joints))
+    qd[:-1, alone, alone] = speeds
+    qd = qd.reshape(-1, joints)
     theta = _steady_columns(base, np.zeros_like(qd), qd)
-    own = theta.reshape(len(speeds) + 1, n, n, -1)[:, np.arange(n), np.arange(n)]
-    # Without speed there is weight only.
-    own = own[:-1] - own[-1]
-    variances = np.einsum(
-        "vjk,kl,vjl->vj", own, np.nan_to_num(fit.covariance, posinf=0.0), own
-    )
-    unknown = ~np.isfinite(np.diag(fit.covariance))
-    halves = 1.96 * np.sqrt(np.maximum(variances, 0.0))
-    halves[:, np.any(own[..., unknown] != 0.0, axis=(0, 2))] = np.nan
-    return own @ np.asarray(fit.parameters), halves
+    columns = theta.reshape(count + 1, joints, joints, -1)[:, alone, alone]
+    # At standstill there is gravity only.
+    return columns[:-1] - columns[-1]
 
 
-def _classes(
-    logs: Sequence[TorqueErrors], j: int, v: np.ndarray, y: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mean speeds of classes, and the means of measured friction in them."""
-    speeds = np.concatenate([np.asarray(e.speeds)[:, j] for e in logs])
-    errors = np.concatenate([e.errors[:, j] for e in logs])
-    kept = np.isfinite(errors)
-    speeds, friction = speeds[kept], np.interp(speeds[kept], v, y) - errors[kept]
-    place = np.clip(
-        (CLASSES * (speeds / v[-1] + 1.0) / 2.0).astype(int), 0, CLASSES - 1
-    )
-    counts = np.bincount(place, minlength=CLASSES)
-    shown = counts >= 5
-    sums = (np.bincount(place, x, CLASSES)[shown] for x in (speeds, friction))
-    speed, force = (x / counts[shown] for x in sums)
-    return speed, force
+def _half_widths(
+    fit: Fit, columns: Float[np.ndarray, "speeds joints base"]
+) -> Float[np.ndarray, "speeds joints"]:
+    """Return half the widths of 95 % intervals; NaN where the logs do not determine them."""
+    covariance = np.nan_to_num(fit.covariance, posinf=0.0)
+    variances = np.einsum("vjk,kl,vjl->vj", columns, covariance, columns)
+    half_widths = 1.96 * np.sqrt(np.maximum(variances, 0.0))
+    undetermined = ~np.isfinite(np.diag(fit.covariance))
+    is_affected = np.any(columns[..., undetermined] != 0.0, axis=(0, 2))
+    half_widths[:, is_affected] = np.nan
+    return half_widths
+
+
+def _confidence_band(model: Curve, half_widths: np.ndarray) -> Curve:
+    low = model.y - half_widths
+    high = model.y + half_widths
+    return Curve(model.x, model.y, "95 % band", MEASURED, "band", low=low, high=high)
+
+
+def _measured_friction(model: Curve, speeds: np.ndarray, errors: np.ndarray) -> Curve:
+    """Return means of measured friction over classes of speed.
+
+    Measured friction is that of the model less the torque errors.
+    """
+    counted = np.isfinite(errors)
+    speeds = speeds[counted]
+    friction = np.interp(speeds, model.x, model.y) - errors[counted]
+    max_speed = model.x[-1]
+    edges = np.linspace(-max_speed, max_speed, SPEED_CLASSES + 1)
+    classes = np.digitize(speeds, edges[1:-1])
+
+    counts = np.bincount(classes, minlength=SPEED_CLASSES)
+    shown = counts >= MIN_CLASS_ROWS
+    mean_speeds = np.bincount(classes, speeds, SPEED_CLASSES)[shown] / counts[shown]
+    mean_friction = np.bincount(classes, friction, SPEED_CLASSES)[shown] / counts[shown]
+    name = "measured, mean of a class of speed"
+    return Curve(mean_speeds, mean_friction, name, GREY, "points")
 
 
 def gravity_figure(fit: Fit, log: TorqueErrors) -> Figure:
-    """Return the torque that carries the weight of the robot along a recording.
+    """Return the torques of gravity along a recording.
 
     Args:
         fit: Identified parameters.
         log: Errors on the recording, with its positions.
     """
-    robot, rows = fit.base.model.robot, _some(log)
-    values = gravity_forces(fit, np.asarray(log.positions)[rows])
+    robot = fit.base.model.robot
+    rows = _sparse_rows(log)
+    time = np.asarray(log.time)[rows]
+    torques = gravity_forces(fit, np.asarray(log.positions)[rows])
     curves = [
-        Curve(
-            np.asarray(log.time)[rows],
-            values[:, j],
-            shortened(name, 26),
-            CYCLE[j % len(CYCLE)],
-        )
+        Curve(time, torques[:, j], shortened(name, 26), CYCLE[j % len(CYCLE)])
         for j, name in enumerate(robot.joint_names)
     ]
-    unit = " or ".join(dict.fromkeys(robot.force_unit(j) for j in range(robot.joints)))
-    panel = Panel(curves, y="force of the weight", unit=unit)
-    return Figure(
-        f"Torque that carries the weight, along {shortened(log.name, 40)}",
-        [panel],
-        height=3.2,
-    )
+    units = dict.fromkeys(robot.force_unit(j) for j in range(robot.joints))
+    panel = Panel(curves, y="gravity", unit=" or ".join(units))
+    title = f"Torques of gravity, along {shortened(log.name, 40)}"
+    return Figure(title, [panel], height=3.2)
+
+
+def gravity_table(fit: Fit, log: TorqueErrors) -> Table:
+    """Return the largest force against gravity of each joint along a recording."""
+    robot = fit.base.model.robot
+    q = np.asarray(log.positions)[_sparse_rows(log)]
+    largest = np.max(np.abs(gravity_forces(fit, q)), axis=0)
+    largest[largest < ROUNDING * np.max(largest)] = 0.0
+    columns = [
+        Column("joint", robot.joint_names),
+        Column("largest torque\nof gravity", largest),
+        Column("unit", [robot.force_unit(j) for j in range(robot.joints)]),
+    ]
+    shares = largest / np.asarray(log.max_forces)
+    if np.isfinite(shares).all():
+        columns.append(Column("of the largest\nthe drive has", shares, "%", percent))
+    return Table("", *columns)
 
 
 def gravity_forces(
     fit: Fit, q: Float[np.ndarray, "rows joints"]
 ) -> Float[np.ndarray, "rows joints"]:
     """Return the forces of the drives against gravity at standstill [N m or N]."""
-    base, model = fit.base, fit.base.model
-    bodies = [
-        bool(t.body_parameters) for t in model.terms for _ in t.parameters(model.robot)
-    ]
-    p = np.where([bodies[k] for k in base.indices], fit.parameters, 0.0)
+    base = fit.base
+    model = base.model
+    # Friction and offsets act at standstill, too, and are no part of gravity.
+    of_bodies = np.concatenate(
+        [
+            np.full(len(term.parameters(model.robot)), bool(term.body_parameters))
+            for term in model.terms
+        ]
+    )
+    p = np.where(of_bodies[list(base.indices)], fit.parameters, 0.0)
     return _steady_columns(base, q, np.zeros_like(q)) @ p
 
 
@@ -153,42 +187,26 @@ def _steady_columns(base: BaseParameters, q: np.ndarray, qd: np.ndarray) -> np.n
     return in_numpy(base, base.columns, *base.model.arguments(motion))
 
 
-def _some(log: TorqueErrors) -> np.ndarray:
-    """Return rows of a recording in which its slow changes are seen."""
+def _sparse_rows(log: TorqueErrors) -> np.ndarray:
+    """Return rows of a recording that show its slow changes."""
     rows = len(log.time)
-    return np.unique(np.linspace(0, rows - 1, min(rows, ROWS)).round().astype(int))
-
-
-def gravity_table(fit: Fit, log: TorqueErrors) -> Table:
-    """Return the largest force against gravity of each joint along a recording."""
-    robot = fit.base.model.robot
-    most = np.max(
-        np.abs(gravity_forces(fit, np.asarray(log.positions)[_some(log)])), axis=0
-    )
-    # What is rounding is zero.
-    most[most < 1e-9 * np.max(most)] = 0.0
-    columns = [
-        Column("joint", robot.joint_names),
-        Column("largest torque\nof the weight", most),
-        Column("unit", [robot.force_unit(j) for j in range(robot.joints)]),
-    ]
-    share = most / np.asarray(log.max_forces)
-    if np.isfinite(share).all():
-        columns.append(Column("of the largest\nthe drive has", share, "%", percent))
-    return Table("", *columns)
+    count = min(rows, MAX_POSES)
+    return np.unique(np.linspace(0, rows - 1, count).round().astype(int))
 
 
 def error_scene(fit: Fit, log: TorqueErrors) -> Figure:
     """Return the robot along a recording, coloured by the torque errors of its joints."""
-    robot, largest = fit.base.model.robot, np.asarray(log.max_forces)
-    known = bool(np.isfinite(largest).all())
-    scale = largest if known else np.maximum(log.force_rms, 1e-300)
-    what = "largest torque" if known else "RMS torque"
+    robot = fit.base.model.robot
+    scale = np.asarray(log.max_forces)
+    reference = "largest torque"
+    if not np.isfinite(scale).all():
+        scale = np.maximum(log.force_rms, np.finfo(float).tiny)
+        reference = "RMS torque"
     return pose_figure(
         robot,
         np.asarray(log.positions),
         title=f"{robot.name} along {shortened(log.name, 40)}",
         time=np.asarray(log.time),
         values=100.0 * log.errors / scale,
-        label=f"torque error [% of {what}]",
+        label=f"torque error [% of {reference}]",
     )
