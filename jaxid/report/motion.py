@@ -2,6 +2,8 @@
 
 import dataclasses
 import itertools
+from collections.abc import Iterable
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -28,9 +30,17 @@ from .figure_elements import (
     Solids,
 )
 
-SPREAD = 40
+BALL_POINTS = 40
 """Points on the ball at each end of a capsule."""
-_SQUARE = np.array([[0, 1, 2], [1, 2, 3]])
+GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
+"""Angle between neighbouring points of a ball that spreads them evenly [rad]."""
+MAX_PATH_POINTS = 1500
+"""Largest number of points of the path of an end-effector."""
+MAX_FRAMES = 150
+"""Largest number of poses of a robot on a page."""
+PLANE_SIZE = 0.7
+"""Half the side of the square that shows a plane, relative to the reach of the robot."""
+SQUARE_FACES = np.array([[0, 1, 2], [1, 2, 3]])
 """Triangles of a square whose corners are listed row by row."""
 
 
@@ -45,34 +55,38 @@ def joint_figure(
         time: Instants of the samples [s].
         motion: Motion at the samples.
     """
-    speed, acceleration = np.asarray(limits.velocity), np.asarray(limits.acceleration)
     kinds = (
-        ("position", "", motion.q, limits.position_min, limits.position_max),
-        ("velocity", "/s", motion.qd, -speed, speed),
-        ("acceleration", "/s²", motion.qdd, -acceleration, acceleration),
+        ("position", "", motion.q, (limits.position_min, limits.position_max)),
+        ("velocity", "/s", motion.qd, (-limits.velocity, limits.velocity)),
+        (
+            "acceleration",
+            "/s²",
+            motion.qdd,
+            (-limits.acceleration, limits.acceleration),
+        ),
     )
-
-    def panel(j: int) -> Panel:
-        first, *below = (
-            Panel(
-                [Curve(time, np.asarray(values)[:, j], name, colour)],
-                title="" if rate else robot.joint_names[j],
-                y=f"{robot.joint_unit(j)}{rate}",
-                levels=[
-                    ("y", float(x[j]), VERMILION)
-                    for x in ends
-                    if np.isfinite(float(x[j]))
-                ],
+    panels = []
+    for j, joint_name in enumerate(robot.joint_names):
+        stack = []
+        for (name, rate, values, bounds), colour in zip(kinds, CYCLE, strict=False):
+            curve = Curve(time, np.asarray(values)[:, j], name, colour)
+            unit = f"{robot.joint_unit(j)}{rate}"
+            levels = _limit_lines(bound[j] for bound in bounds)
+            stack.append(Panel([curve], y=unit, levels=levels))
+        panels.append(
+            dataclasses.replace(
+                stack[0],
+                title=joint_name,
+                x_range=(float(time[0]), float(time[-1])),
+                below=stack[1:],
             )
-            for (name, rate, values, *ends), colour in zip(kinds, CYCLE, strict=False)
         )
-        return dataclasses.replace(
-            first, below=below, x_range=(float(time[0]), float(time[-1]))
-        )
-
     title = f"{robot.name}: motion of the joints (dashed: limits)"
-    panels = [panel(j) for j in range(robot.joints)]
     return Figure(title, panels, columns=min(3, robot.joints), height=3.2)
+
+
+def _limit_lines(bounds: Iterable[Any]) -> list[tuple[str, float, str]]:
+    return [("y", float(bound), VERMILION) for bound in bounds if np.isfinite(bound)]
 
 
 def tip_figure(
@@ -86,16 +100,24 @@ def tip_figure(
         motion: Motion of the joints at the samples.
     """
     with double_precision():
-        position, *rates = (np.asarray(x) for x in tip_motion(robot, motion))
-    axes = [Curve(time, position[:, k], "xyz"[k], CYCLE[k]) for k in range(3)]
-    panels = [Panel(axes, title="position", unit="m")]
-    for vectors, name, unit in zip(
-        rates, ("speed", "acceleration"), ("m/s", "m/s²"), strict=True
-    ):
-        values = np.linalg.norm(vectors, axis=1)
-        most = f"up to {values.max():.3g} {unit}"
-        panels.append(Panel([Curve(time, values)], title=name, value=most, unit=unit))
+        position, velocity, acceleration = tip_motion(robot, motion)
+    curves = [
+        Curve(time, np.asarray(position)[:, k], axis, CYCLE[k])
+        for k, axis in enumerate("xyz")
+    ]
+    panels = [
+        Panel(curves, title="position", unit="m"),
+        _size_panel("speed", "m/s", time, velocity),
+        _size_panel("acceleration", "m/s²", time, acceleration),
+    ]
     return Figure(f"{robot.name}: motion of the end-effector", panels, columns=3)
+
+
+def _size_panel(name: str, unit: str, time: AnyArray, vectors: AnyArray) -> Panel:
+    """Return the length of vectors over time."""
+    sizes = np.linalg.norm(np.asarray(vectors), axis=1)
+    largest = f"up to {sizes.max():.3g} {unit}"
+    return Panel([Curve(time, sizes)], title=name, value=largest, unit=unit)
 
 
 def filtered_figure(
@@ -114,20 +136,21 @@ def filtered_figure(
         filtered: Motion that the filter makes of measured positions.
         joint: Index of the joint, from 0.
     """
+    unit = robot.joint_unit(joint)
     panels = []
-    for name, rate, *pair in (
-        ("velocity", "/s", desired.qd, filtered.qd),
-        ("acceleration", "/s²", desired.qdd, filtered.qdd),
+    for name, rate_unit, desired_rate, filtered_rate in (
+        ("velocity", f"{unit}/s", desired.qd, filtered.qd),
+        ("acceleration", f"{unit}/s²", desired.qdd, filtered.qdd),
     ):
-        unit = f"{robot.joint_unit(joint)}{rate}"
-        wanted, measured = (np.asarray(x)[:, joint] for x in pair)
-        rms = float(np.sqrt(np.mean((measured - wanted) ** 2)))
+        reference = np.asarray(desired_rate)[:, joint]
+        measured = np.asarray(filtered_rate)[:, joint]
+        rms = float(np.sqrt(np.mean((measured - reference) ** 2)))
         curves = [
-            Curve(time, wanted, "desired", MEASURED, width=2.4),
+            Curve(time, reference, "desired", MEASURED, width=2.4),
             Curve(time, measured, "filtered", PREDICTED),
         ]
-        said = f"RMS difference {rms:.3g} {unit}"
-        panels.append(Panel(curves, title=name, value=said, unit=unit))
+        difference = f"RMS difference {rms:.3g} {rate_unit}"
+        panels.append(Panel(curves, title=name, value=difference, unit=rate_unit))
     title = f"{robot.name}: {robot.joint_names[joint]}, desired and filtered"
     return Figure(title, panels)
 
@@ -156,35 +179,45 @@ def pose_figure(
         shapes: Shapes of robot and surroundings that the page shows.
     """
     q = np.atleast_2d(np.asarray(q, np.float64))
-    path = np.unique(np.linspace(0, len(q) - 1, min(1500, len(q))).round().astype(int))
-    shown = np.linspace(0, len(path) - 1, min(150, len(path))).round().astype(int)
+    time = np.arange(len(q)) if time is None else np.asarray(time)
+    rows = even_indices(len(q), MAX_PATH_POINTS)
+    frames = even_indices(len(rows), MAX_FRAMES)
     if values is not None:
-        # Each point stands for all samples up to the next.
+        # Each point has the largest value of all samples up to the next point.
         sizes = np.nan_to_num(np.abs(np.asarray(values, np.float64)))
-        values = np.maximum.reduceat(sizes, path, axis=0)
-
-    def place(x):
-        return jnp.concatenate(
-            [placements(robot, x)[1], tip_placement(robot, x)[1][None]]
-        )
-
-    with double_precision():
-        points = in_numpy(robot, place, q[path])
+        values = np.maximum.reduceat(sizes, rows, axis=0)
     scene = Scene(
-        time=np.asarray(np.arange(len(q)) if time is None else time)[path],
-        points=points,
+        time=time[rows],
+        points=_points(robot, q[rows]),
         links=(*robot.parent, robot.tip_body),
-        frames=np.unique(shown),
+        frames=frames,
         poses=poses,
         values=values,
         label=label,
-        solids=None
-        if shapes is None
-        else _solids(robot, shapes, q[path][np.unique(shown)]),
+        solids=None if shapes is None else _solids(robot, shapes, q[rows[frames]]),
     )
-    return Figure(
-        robot.name if title is None else title, height=2.6, width=7.5, scene=scene
-    )
+    title = robot.name if title is None else title
+    return Figure(title, height=2.6, width=7.5, scene=scene)
+
+
+def even_indices(count: int, max_count: int) -> np.ndarray:
+    """Return indices of at most `max_count` of `count` entries, the first and the last among them."""
+    places = np.linspace(0, count - 1, min(max_count, count))
+    return np.unique(places.round().astype(int))
+
+
+def _points(
+    robot: Robot, q: Float[np.ndarray, "samples joints"]
+) -> Float[np.ndarray, "samples points 3"]:
+    """Return the origins of all bodies, and the end-effector [m]."""
+
+    def points(sample):
+        _, origins = placements(robot, sample)
+        _, tip = tip_placement(robot, sample)
+        return jnp.concatenate([origins, tip[None]])
+
+    with double_precision():
+        return in_numpy(robot, points, q)
 
 
 def _solids(
@@ -192,51 +225,53 @@ def _solids(
 ) -> Solids:
     """Return the surfaces of all shapes, and the places of the bodies in some poses."""
 
-    def body_places(x):
-        rotations, origins = placements(robot, x)
+    def body_places(sample):
+        rotations, origins = placements(robot, sample)
         return jnp.concatenate([rotations, origins[:, :, None]], axis=2)
 
     with double_precision():
         places = in_numpy(robot, body_places, q)
-    size = 0.7 * float(np.linalg.norm(places[..., 3], axis=2).max())
-    clouds = [(c.body, _capsule_points(c)) for c in shapes.capsules]
-    clouds += [(GROUND, _obstacle_points(x, size)) for x in shapes.obstacles]
-    vertices, bodies, faces = [], [], []
-    for body, points in clouds:
-        hull = ConvexHull(points) if len(points) > 4 else None
-        faces.append(
-            (_SQUARE if hull is None else hull.simplices) + sum(map(len, vertices))
-        )
-        vertices.append(points)
-        bodies.append(np.full(len(points), body))
+    reach = float(np.linalg.norm(places[..., 3], axis=2).max())
+    clouds = [(capsule.body, _capsule_points(capsule)) for capsule in shapes.capsules]
+    for obstacle in shapes.obstacles:
+        clouds.append((GROUND, _obstacle_points(obstacle, PLANE_SIZE * reach)))
+
+    faces = []
+    first_vertex = 0
+    for _, points in clouds:
+        is_square = len(points) == 4
+        hull_faces = SQUARE_FACES if is_square else ConvexHull(points).simplices
+        faces.append(hull_faces + first_vertex)
+        first_vertex += len(points)
     return Solids(
-        np.concatenate(vertices), np.concatenate(bodies), np.concatenate(faces), places
+        vertices=np.concatenate([points for _, points in clouds]),
+        bodies=np.concatenate([np.full(len(points), body) for body, points in clouds]),
+        faces=np.concatenate(faces),
+        places=places,
     )
 
 
 def _capsule_points(capsule: Capsule) -> Float[np.ndarray, "points 3"]:
     """Return points on two spheres at the ends of a capsule, spread by the golden angle."""
-    turn, z = (
-        np.pi * (3 - 5**0.5) * np.arange(SPREAD),
-        1 - (2 * np.arange(SPREAD) + 1) / SPREAD,
-    )
-    ring = np.sqrt(1 - z**2)
-    ball = float(capsule.radius) * np.stack(
-        [ring * np.cos(turn), ring * np.sin(turn), z], axis=1
-    )
+    number = np.arange(BALL_POINTS)
+    angle = GOLDEN_ANGLE * number
+    z = 1.0 - (2.0 * number + 1.0) / BALL_POINTS
+    ring = np.sqrt(1.0 - z**2)
+    sphere = np.stack([ring * np.cos(angle), ring * np.sin(angle), z], axis=1)
+    # A ball is a capsule whose ends are one.
     ends = np.unique(np.stack([capsule.start, capsule.end]), axis=0)
-    return (ends[:, None] + ball).reshape(-1, 3)
+    return (ends[:, None] + float(capsule.radius) * sphere).reshape(-1, 3)
 
 
 def _obstacle_points(
     obstacle: HalfSpace | Box, size: float
 ) -> Float[np.ndarray, "points 3"]:
     """Return the corners of a box, or of a square in a plane around the ground's origin."""
-    signs = np.array([*itertools.product((-1.0, 1.0), repeat=3)])
+    signs = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
     if isinstance(obstacle, Box):
         corners = 0.5 * signs * np.asarray(obstacle.size)
         return np.asarray(obstacle.centre) + corners @ np.asarray(obstacle.rotation).T
-    # The other two axes of a frame whose first one is the normal.
     normal = np.asarray(obstacle.normal)
+    # The other two axes of a frame whose first one is the normal.
     axes = np.linalg.svd(normal[None])[2][1:]
     return normal * np.asarray(obstacle.height) + size * signs[::2, :2] @ axes

@@ -14,7 +14,7 @@ from jaxid.validation.torque_errors import TorqueErrors
 
 from .figure import Figure
 from .figure_elements import BLUE, CYCLE, GREY, MEASURED, Curve, Panel
-from .motion import pose_figure
+from .motion import even_indices, pose_figure
 
 MAX_POSES = 2000
 """Largest number of poses whose gravity torques are computed."""
@@ -132,7 +132,7 @@ def gravity_figure(fit: Fit, log: TorqueErrors) -> Figure:
         log: Errors on the recording, with its positions.
     """
     robot = fit.base.model.robot
-    rows = _sparse_rows(log)
+    rows = even_indices(len(log.time), MAX_POSES)
     time = np.asarray(log.time)[rows]
     torques = gravity_forces(fit, np.asarray(log.positions)[rows])
     curves = [
@@ -148,7 +148,7 @@ def gravity_figure(fit: Fit, log: TorqueErrors) -> Figure:
 def gravity_table(fit: Fit, log: TorqueErrors) -> Table:
     """Return the largest force against gravity of each joint along a recording."""
     robot = fit.base.model.robot
-    q = np.asarray(log.positions)[_sparse_rows(log)]
+    q = np.asarray(log.positions)[even_indices(len(log.time), MAX_POSES)]
     largest = np.max(np.abs(gravity_forces(fit, q)), axis=0)
     largest[largest < ROUNDING * np.max(largest)] = 0.0
     columns = [
@@ -185,13 +185,6 @@ def _steady_columns(base: BaseParameters, q: np.ndarray, qd: np.ndarray) -> np.n
     state = None if law is None else np.asarray(law.settled(qd))
     motion = Motion(q, qd, np.zeros_like(q), state)
     return in_numpy(base, base.columns, *base.model.arguments(motion))
-
-
-def _sparse_rows(log: TorqueErrors) -> np.ndarray:
-    """Return rows of a recording that show its slow changes."""
-    rows = len(log.time)
-    count = min(rows, MAX_POSES)
-    return np.unique(np.linspace(0, rows - 1, count).round().astype(int))
 
 
 def error_scene(fit: Fit, log: TorqueErrors) -> Figure:

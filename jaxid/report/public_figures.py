@@ -7,13 +7,7 @@ explore, or `.png`, `.pdf` or `.svg`; `matplotlib()` returns a
 `matplotlib.figure.Figure`; notebooks show a picture.
 """
 
-from .estimates_and_residuals import (
-    autocorrelation_figure as autocorrelation,
-    comparison_figure as comparison,
-    filter_figure as filter_choice,
-    parameter_figure as parameters,
-    residual_figure as residuals,
-)
+from .estimates import comparison_figure as comparison, parameter_figure as parameters
 from .motion import (
     filtered_figure as filtered,
     joint_figure as joints,
@@ -21,6 +15,11 @@ from .motion import (
     tip_figure as end_effector,
 )
 from .physics import friction_figure as friction, gravity_figure as gravity
+from .residuals import (
+    autocorrelation_figure as autocorrelation,
+    filter_figure as filter_choice,
+    residual_figure as residuals,
+)
 from .torques import (
     bar_figure as bars,
     error_figure as errors,

@@ -31,17 +31,12 @@ from jaxid.robot.robot import Robot
 from jaxid.validation.torque_errors import TorqueErrors
 from jaxid.validation.verdict import Report, verdict
 
-from .estimates_and_residuals import (
-    autocorrelation_figure,
-    comparison_figure,
-    filter_figure,
-    parameter_figure,
-    residual_figure,
-)
+from .estimates import comparison_figure, parameter_figure
 from .figure import Figure
 from .identification import identification_page
 from .page import render_page
 from .physics import error_scene, friction_figure, gravity_figure
+from .residuals import autocorrelation_figure, filter_figure, residual_figure
 from .torques import bar_figure, error_figure, torque_figure
 
 MODEL = "model.json"

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from jaxid.arrays import Float
 from jaxid.errors import InputError
 from jaxid.result_table import percent, shortened, significant
 from jaxid.robot.robot import Robot
@@ -23,6 +22,13 @@ from .figure_elements import (
     Curve,
     Panel,
 )
+
+MAX_JOINTS_IN_TWO_COLUMNS = 16
+"""Largest number of joints whose panels stand in two columns; more stand in three."""
+MAX_BARS_WITH_NUMBERS = 20
+"""Largest number of bars on which their values are written."""
+GROUP_COLOURS = (BLUE, ORANGE, GREEN, PURPLE)
+"""Colours of the groups of recordings beside each other."""
 
 
 def torque_figure(
@@ -46,50 +52,62 @@ def torque_figure(
         InputError: If the numbers of joints differ.
     """
     require_joints(errors, robot)
-    shown = range(robot.joints) if joints is None else tuple(joints)
-    counted = np.flatnonzero(np.asarray(errors.counted).any(axis=1))
-    window = slice(counted[0], counted[-1] + 1)
+    joints = range(robot.joints) if joints is None else joints
+    rows = np.flatnonzero(np.asarray(errors.counted).any(axis=1))
+    window = slice(rows[0], rows[-1] + 1)
+    panels = [_joint_panel(errors, robot, j, window) for j in joints]
+    if len(panels) <= 2:
+        columns = 1
+    else:
+        columns = 2 if len(panels) <= MAX_JOINTS_IN_TWO_COLUMNS else 3
     name = shortened(errors.name if title is None else title, 40)
     return Figure(
         f"{name}: relative error {percent(errors.relative)} %",
-        [_joint_panel(errors, robot, j, window) for j in shown],
-        columns=1 if len(shown) <= 2 else 2 if len(shown) <= 16 else 3,
+        panels,
+        columns,
         height=2.6,
-        width=11.0 if len(shown) <= 16 else 15.0,
+        width=15.0 if columns == 3 else 11.0,
     )
 
 
 def _joint_panel(errors: TorqueErrors, robot: Robot, j: int, window: slice) -> Panel:
-    unit, difference = robot.force_unit(j), errors.errors[window, j]
+    """Return forces of a joint, with the errors in a panel below."""
+    unit = robot.force_unit(j)
     time = np.asarray(errors.time)[window]
-    measured, predicted = (
-        np.asarray(x)[window, j] for x in (errors.measured, errors.predicted)
-    )
-    text = "no row counts"
-    if np.isfinite(difference).any():
-        fraction = errors.mean_percent[j] / 100.0
-        text = f"mean |e| {significant(errors.mean[j], 2)} {unit}"
-        text += f" = {percent(fraction)} % of max" if np.isfinite(fraction) else ""
-    largest = float(np.fmax.reduce(np.abs(difference), initial=0.0))
+    measured = np.asarray(errors.measured)[window, j]
+    predicted = np.asarray(errors.predicted)[window, j]
+    difference = errors.errors[window, j]
+    limit = 1.1 * (np.fmax.reduce(np.abs(difference), initial=0.0) or 1.0)
     below = Panel(
         [Curve(time, difference, "predicted - measured", ERROR, width=0.6)],
         unit=unit,
-        y_range=(-1.1 * (largest or 1.0), 1.1 * (largest or 1.0)),
+        y_range=(-limit, limit),
         levels=[("y", 0.0, GREY)],
         share=0.4,
     )
+    # A single row has no duration.
+    end = time[-1] if len(time) > 1 else time[0] + 1.0
     return Panel(
         [
             Curve(time, measured, "measured", MEASURED, width=1.9),
             Curve(time, predicted, "predicted", PREDICTED, width=0.8),
         ],
         title=shortened(robot.joint_names[j], 26),
-        value=text,
+        value=_mean_error_text(errors, j, unit),
         y="torque" if robot.revolute[j] else "force",
         unit=unit,
-        x_range=(float(time[0]), float(time[-1] if len(time) > 1 else time[0] + 1.0)),
+        x_range=(float(time[0]), float(end)),
         below=[below],
     )
+
+
+def _mean_error_text(errors: TorqueErrors, j: int, unit: str) -> str:
+    """Return the mean error of a joint, and its share of the largest force if that is known."""
+    if not np.isfinite(errors.errors[:, j]).any():
+        return "no row counts"
+    text = f"mean |e| {significant(errors.mean[j], 2)} {unit}"
+    fraction = errors.mean_percent[j] / 100.0
+    return f"{text} = {percent(fraction)} % of max" if np.isfinite(fraction) else text
 
 
 def require_joints(errors: TorqueErrors, robot: Robot) -> None:
@@ -141,57 +159,66 @@ def bar_figure(
         InputError: If there is no recording at all, there are too many groups, or the
             numbers of joints differ.
     """
-    colours = (BLUE, ORANGE, GREEN, PURPLE)
-    filled = [(name, recordings) for name, recordings in groups if recordings]
-    if not 0 < len(filled) <= len(colours):
+    groups = [(name, recordings) for name, recordings in groups if recordings]
+    if not 0 < len(groups) <= len(GROUP_COLOURS):
         raise InputError(
-            f"`groups` must hold 1 to {len(colours)} groups with errors, but holds "
-            f"{len(filled)}."
+            f"`groups` must hold 1 to {len(GROUP_COLOURS)} groups with errors, but "
+            f"holds {len(groups)}."
         )
-    everything = [errors for _, recordings in filled for errors in recordings]
-    for errors in everything:
-        require_joints(errors, robot)
-    largest, n = np.asarray(everything[0].max_forces), robot.joints
-    known = bool(np.isfinite(largest).all())
-    width = min(0.36, 0.72 / len(filled))
-    bars, points = [], []
-    for k, (colour, (label, recordings)) in enumerate(
-        zip(colours, filled, strict=False)
-    ):
-        mean, rms, force_rms = _pool(recordings)
-        scale = 100.0 / (largest if known else np.maximum(force_rms, 1e-300))
-        place = np.arange(n) + (k - 0.5 * (len(filled) - 1)) * (width + 0.02)
-        texts = [percent(x / 100.0) for x in mean * scale]
-        written = texts if n * len(filled) <= 20 else ()
-        average = percent(float(np.mean(mean * scale)) / 100.0)
-        label = f"{label}: {average} % on average"
-        bars.append(
-            Curve(place, mean * scale, label, colour, "bars", width, texts=written)
-        )
-        points.append(Curve(place, rms * scale, "RMS", colour, "points"))
+    for _, recordings in groups:
+        for errors in recordings:
+            require_joints(errors, robot)
+
+    max_forces = np.asarray(groups[0][1][0].max_forces)
+    reference = "the largest force"
+    if not np.isfinite(max_forces).all():
+        max_forces = None
+        reference = "RMS force"
+    joints = robot.joints
+    width = min(0.36, 0.72 / len(groups))
+    bars = []
+    points = []
+    for k, (name, recordings) in enumerate(groups):
+        colour = GROUP_COLOURS[k]
+        places = np.arange(joints) + (k - 0.5 * (len(groups) - 1)) * (width + 0.02)
+        mean, rms = _pooled_percents(recordings, max_forces)
+        texts = [percent(value / 100.0) for value in mean]
+        if joints * len(groups) > MAX_BARS_WITH_NUMBERS:
+            texts = []
+        legend = f"{name}: {percent(float(np.mean(mean)) / 100.0)} % on average"
+        bars.append(Curve(places, mean, legend, colour, "bars", width, texts=texts))
+        points.append(Curve(places, rms, "RMS", colour, "points"))
+    panel = Panel(
+        [*bars, *points],
+        x="",
+        y="mean |error|",
+        unit=f"% of {reference}",
+        x_range=(-0.6, joints - 0.4),
+        x_names=[shortened(name, 20) for name in robot.joint_names],
+    )
     return Figure(
         title or f"{robot.name}: torque errors",
-        [
-            Panel(
-                [*bars, *points],
-                x="",
-                y="mean |error|",
-                unit=f"% of {'the largest force' if known else 'RMS force'}",
-                x_range=(-0.6, n - 0.4),
-                x_names=[shortened(name, 20) for name in robot.joint_names],
-            )
-        ],
+        [panel],
         height=3.5,
-        width=max(7.6, min(2.0 + 1.1 * n, 15.4)),
+        width=max(7.6, min(2.0 + 1.1 * joints, 15.4)),
     )
 
 
-def _pool(recordings: Sequence[TorqueErrors]) -> Float[np.ndarray, "3 joints"]:
-    """Return mean and RMS of the errors, and RMS of the forces, as if all were one recording."""
-    e = np.concatenate([r.errors for r in recordings])
-    counted = np.concatenate([np.asarray(r.counted) for r in recordings])
-    forces = np.concatenate([np.asarray(r.measured) for r in recordings])
+def _pooled_percents(
+    recordings: Sequence[TorqueErrors], max_forces: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return mean and RMS errors [%], as if all recordings were one."""
+    errors = np.concatenate([log.errors for log in recordings])
+    counted = np.isfinite(errors)
     rows = np.maximum(counted.sum(axis=0), 1)
-    e, forces = (np.where(counted, x, 0.0) for x in (e, forces))
-    squares = [(x**2).sum(axis=0) / rows for x in (e, forces)]
-    return np.stack([np.abs(e).sum(axis=0) / rows, *np.sqrt(squares)])
+
+    def mean(values: np.ndarray) -> np.ndarray:
+        return np.where(counted, values, 0.0).sum(axis=0) / rows
+
+    scale = max_forces
+    if scale is None:
+        forces = np.concatenate([np.asarray(log.measured) for log in recordings])
+        scale = np.maximum(np.sqrt(mean(forces**2)), np.finfo(float).tiny)
+    mean_error = mean(np.abs(errors))
+    rms_error = np.sqrt(mean(errors**2))
+    return 100.0 * mean_error / scale, 100.0 * rms_error / scale

@@ -13,12 +13,12 @@ import pytest
 
 import jaxid as jid
 from jaxid.identification.uncertainty import ResidualSpectra
-from jaxid.report.estimates_and_residuals import autocorrelation
 from jaxid.report.figure_elements import BLUE, ORANGE, decimate
 from jaxid.report.interactive import charts, library
 from jaxid.report.motion import pose_figure
 from jaxid.report.parameter_words import in_words
 from jaxid.report.physics import gravity_forces
+from jaxid.report.residuals import autocorrelation
 from jaxid.robot.collision import GROUND, Box, Capsule, CollisionModel, HalfSpace
 
 T = np.linspace(0.0, 2.0, 101)
