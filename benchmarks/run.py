@@ -3,9 +3,8 @@
     python benchmarks/run.py                    # all figures of speed, about 25 minutes
     python benchmarks/run.py peers streaming    # only these scripts
     python benchmarks/run.py --methods          # also the quality of the methods: hours
-    python benchmarks/run.py --resume           # only what this machine has not
-    measured today python benchmarks/run.py --check            # everything small: does
-    it still run?
+    python benchmarks/run.py --resume           # only what is not measured today
+    python benchmarks/run.py --check            # everything small: does it still run?
 
 Each script leaves its figures in `measured/NAME.json`, with machine, versions and date,
 as soon as it ends; all of them are written as tables to `results/measured.md`. A script
@@ -55,6 +54,7 @@ class Script(NamedTuple):
 
 SPEED = (
     Script("peers", 2),
+    Script("speed_table", 10),
     Script("surface", 4),
     Script("fences", 2),
     Script("compile", 2),

@@ -7,7 +7,13 @@ in `robots`, the figures in `plot`.
 """
 
 import importlib as _importlib
+import importlib.metadata as _metadata
 import typing as _typing
+
+try:
+    __version__ = _metadata.version("jaxid-robotics")
+except _metadata.PackageNotFoundError:
+    __version__ = "not installed"
 
 if _typing.TYPE_CHECKING:
     from jaxid.api import *  # noqa: F403

@@ -12,6 +12,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+import patience
 import polars as pl
 import pytest
 
@@ -465,7 +466,7 @@ def test_a_signal_ends_a_command_at_once_and_leaves_nothing(folder, moment, numb
     )
     time.sleep(moment)
     process.send_signal(number)
-    said = process.communicate(timeout=60)[1]
+    said = process.communicate(timeout=patience.SECONDS)[1]
     assert process.returncode == 128 + number, said
     # Before it stand the checks that cannot be made.
     assert said.splitlines()[-1].startswith("jaxid: stopped")

@@ -14,6 +14,7 @@ from types import SimpleNamespace
 import equinox as eqx
 import mujoco
 import numpy as np
+import patience
 import pytest
 
 from jaxid.cli import app as cli
@@ -223,7 +224,8 @@ def test_a_stopped_search_leaves_its_best_motion_and_another_goes_on(tmp_path, n
     process = subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **settings
     )
-    motion, until = tmp_path / "run" / "motion.json", time.monotonic() + 120
+    motion = tmp_path / "run" / "motion.json"
+    until = time.monotonic() + patience.SECONDS
     while not motion.exists() and process.poll() is None and time.monotonic() < until:
         time.sleep(0.005)
     process.send_signal(number)

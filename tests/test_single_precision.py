@@ -12,6 +12,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import patience
 
 SCRIPT = Path(__file__).with_name("single_precision.py")
 ROUNDED = {"trajectory": 1e-5, "dynamics": 1e-5}
@@ -29,7 +30,7 @@ def test_float32_is_refused_or_gives_the_numbers_of_float64(tmp_path):
     )
     processes = [subprocess.Popen(command, env=environment) for command in commands]
     try:
-        assert [p.wait(timeout=300) for p in processes] == [0, 0]
+        assert [p.wait(timeout=patience.SECONDS) for p in processes] == [0, 0]
     finally:
         for p in processes:
             p.kill()

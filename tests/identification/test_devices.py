@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import patience
 import pytest
 from virtual import observations, standard_parameters
 
@@ -74,15 +75,6 @@ def start(script, *arguments, flags):
     )
 
 
-def finish(*processes):
-    try:
-        return [p.communicate(timeout=120)[0] for p in processes]
-    finally:
-        for p in processes:
-            p.kill()
-            p.wait()
-
-
 def assert_same(found, p, deviations, rows):
     error = np.linalg.norm((found["p"] - p) / deviations)
     assert error < 1e-12 * np.linalg.norm(p / deviations)
@@ -105,7 +97,7 @@ def test_a_long_log_on_three_devices_without_asking(base, tmp_path, monkeypatch)
     smooth, p = jid.ZeroPhaseButterworth(30.0), standard_parameters(base.model)
     o = observations(base.model, p, samples=20011, noise=0.3, filter=smooth, every=15)
     fit = jid.identify(base, o, jid.estimators.LeastSquares())
-    (output,) = finish(process)
+    (output,) = patience.outputs([process])
     assert process.returncode == 0, output
     found = np.load(tmp_path / "3.npz")
     assert_same(found, fit.parameters, fit.naive_standard_deviations, fit.rows)
@@ -115,6 +107,6 @@ def test_data_sets_are_divided_as_the_inputs_are(tmp_path):
     process = start(
         DIVIDED, tmp_path / "4.npz", flags="--xla_force_host_platform_device_count=4"
     )
-    (output,) = finish(process)
+    (output,) = patience.outputs([process])
     assert process.returncode == 0, output
     assert np.isfinite(np.load(tmp_path / "4.npz")["s"]).all()

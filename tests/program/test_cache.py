@@ -8,6 +8,7 @@ import time
 from pathlib import Path
 
 import jax
+import patience
 import pytest
 
 from jaxid.errors import InputError
@@ -55,7 +56,7 @@ def run(folder):
         env={**environment, cache.VARIABLE: str(folder)},
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=patience.SECONDS,
         check=True,
     )
     where, counts = done.stdout.splitlines()

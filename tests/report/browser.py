@@ -11,6 +11,8 @@ import time
 import urllib.request
 from pathlib import Path
 
+import patience
+
 CHROMIUM = next(
     filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))),
     None,
@@ -51,7 +53,7 @@ class Browser:
 
     def _port(self) -> str:
         file = Path(self.folder.name) / "DevToolsActivePort"
-        for _ in range(600):
+        for _ in range(20 * patience.SECONDS):
             if file.is_file() and (lines := file.read_text().split()):
                 return lines[0]
             time.sleep(0.05)
@@ -61,7 +63,7 @@ class Browser:
         number = next(self.numbers)
         self.socket.send(json.dumps({"id": number, "method": method, "params": params}))
         while True:
-            answer = json.loads(self.socket.recv(timeout=120))
+            answer = json.loads(self.socket.recv(timeout=patience.SECONDS))
             params = answer.get("params", {})
             if answer.get("method") == "Runtime.exceptionThrown":
                 self.errors.append(params["exceptionDetails"])
@@ -102,7 +104,7 @@ class Browser:
         self.call("Runtime.evaluate", expression=FUNCTIONS)
 
     def wait(self, condition: str) -> None:
-        for _ in range(600):
+        for _ in range(20 * patience.SECONDS):
             if self.evaluate(condition):
                 return
             time.sleep(0.05)
