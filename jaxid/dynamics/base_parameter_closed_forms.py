@@ -24,7 +24,7 @@ from jaxid.arrays import Float
 from jaxid.program import FREE, evaluate, trace
 from jaxid.robot.inertia import AXES
 from jaxid.robot.robot import Robot
-from jaxid.units import Dimension, dimension
+from jaxid.units.dimensions import Dimension, dimension
 
 from .base_parameter_expressions import Coefficient, Expression, Monomial
 from .model import Model

@@ -14,7 +14,7 @@ import numpy as np
 import scipy.linalg
 
 from jaxid.arrays import AnyArray, Float
-from jaxid.units import length_power
+from jaxid.units.dimensions import length_power
 
 from .dispatch import in_numpy
 from .model import Model

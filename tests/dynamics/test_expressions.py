@@ -25,7 +25,7 @@ from jaxid.dynamics.terms import (
 )
 from jaxid.robot import library
 from jaxid.robot.robot import Robot
-from jaxid.units import Dimension, dimension, length_power
+from jaxid.units.dimensions import Dimension, dimension, length_power
 
 DRIVES = (ViscousFriction(), CoulombFriction(), RotorInertia())
 SEVEN, TEN = RigidBodies(principal_axes=True), RigidBodies()

@@ -1,8 +1,7 @@
-"""Units of the columns of a log, with their factors to SI units; dimensions of parameters."""
+"""Units of the columns of a log, with their factors to SI units."""
 
 import dataclasses
 import enum
-from typing import NamedTuple
 
 import numpy as np
 
@@ -65,8 +64,16 @@ N = Unit("N", 1.0, Quantity.FORCE)
 A = Unit("A", 1.0, Quantity.CURRENT)
 MA = Unit("mA", 1e-3, Quantity.CURRENT)
 
-ALL = tuple(known for known in vars().values() if isinstance(known, Unit))
-"""All named units."""
+UNITS = {
+    unit.symbol: unit
+    for unit in (
+        *(S, MS, US, NS),
+        *(RAD, DEG, REV, M, MM),
+        *(RAD_PER_S, DEG_PER_S, RPM, M_PER_S, MM_PER_S),
+        *(NM, N, A, MA),
+    )
+}
+"""All named units, by their symbols."""
 
 
 def unit(symbol: str) -> Unit:
@@ -75,49 +82,8 @@ def unit(symbol: str) -> Unit:
     Raises:
         InputError: If no unit has this symbol.
     """
-    units = {known.symbol: known for known in ALL}
-    if symbol not in units:
+    if symbol not in UNITS:
         raise InputError(
-            f"`{symbol}` is no known unit: write one of {', '.join(units)}."
+            f"`{symbol}` is no known unit: write one of {', '.join(UNITS)}."
         )
-    return units[symbol]
-
-
-class Dimension(NamedTuple):
-    """Exponents of kilogram, metre and second in a unit."""
-
-    kilogram: int
-    metre: int
-    second: int
-
-
-_KNOWN = {
-    "1": Dimension(0, 0, 0),
-    "rad": Dimension(0, 0, 0),
-    "kg": Dimension(1, 0, 0),
-    "m": Dimension(0, 1, 0),
-    "s": Dimension(0, 0, 1),
-    "N": Dimension(1, 1, -2),
-    "J": Dimension(1, 2, -2),
-    "W": Dimension(1, 2, -3),
-}
-_SUPERSCRIPTS = {"²": 2, "³": 3, "⁴": 4}
-
-
-def dimension(unit: str) -> Dimension | None:
-    """Return the dimension of a unit such as `N m s/rad`, or None if it is not known."""
-    total = np.zeros(3, int)
-    for position, part in enumerate(unit.split("/")):
-        for factor in part.replace("(", " ").replace(")", " ").split():
-            power = _SUPERSCRIPTS.get(factor[-1], 1)
-            name = factor[:-1] if factor[-1] in _SUPERSCRIPTS else factor
-            if name not in _KNOWN:
-                return None
-            total += (power if position == 0 else -power) * np.array(_KNOWN[name])
-    return Dimension(*(int(x) for x in total))
-
-
-def length_power(unit: str) -> int:
-    """Return the power of length in a unit: 2 in kg m² and in N m; 0 if it is not known."""
-    found = dimension(unit)
-    return 0 if found is None else found.metre
+    return UNITS[symbol]

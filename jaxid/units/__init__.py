@@ -1,0 +1,26 @@
+"""Units of the columns of a log: `jid.units.DEG`, `jid.units.unit("deg")`."""
+
+from .measured_units import (
+    DEG as DEG,
+    DEG_PER_S as DEG_PER_S,
+    M_PER_S as M_PER_S,
+    MA as MA,
+    MM as MM,
+    MM_PER_S as MM_PER_S,
+    MS as MS,
+    NM as NM,
+    NS as NS,
+    RAD as RAD,
+    RAD_PER_S as RAD_PER_S,
+    REV as REV,
+    RPM as RPM,
+    UNITS as UNITS,
+    US as US,
+    A as A,
+    M as M,
+    N as N,
+    Quantity as Quantity,
+    S as S,
+    Unit as Unit,
+    unit as unit,
+)
