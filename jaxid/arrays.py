@@ -34,6 +34,12 @@ AnyArray = jax.Array | np.ndarray
 Joints = Float[AnyArray, " joints"]
 """One number for each joint."""
 
+Vector3 = Float[AnyArray, "3"]
+"""A point or a direction in space."""
+
+Matrix3 = Float[AnyArray, "3 3"]
+"""A rotation, or an inertia tensor."""
+
 # NumPy's own `ArrayLike` turns tuples away when types are checked at run time.
 Numbers = AnyArray | Sequence[Any] | float | int
 """Array argument of a user: an array, nested lists or tuples, or one number."""

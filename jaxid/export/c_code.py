@@ -91,29 +91,30 @@ def _definitions(fit: Fit) -> dict[str, tuple[str, str, Callable]]:
     base = fit.base
     model = base.model
     torque = torques(fit)
-    others = other_forces(fit)
+    remaining_forces = other_forces(fit)
     rest = np.zeros(model.robot.joints)
-    relaxed = None if model.memory is None else np.zeros(model.input_shapes[-1])
+    relaxed_state = None if model.memory is None else np.zeros(model.input_shapes[-1])
     # Only the base parameters: composite bodies have fewer operations then.
-    standard = np.asarray(base.to_standard(np.asarray(fit.parameters, np.float64)))
+    parameters = np.asarray(base.to_standard(np.asarray(fit.parameters, np.float64)))
 
     def torque_of_parameters(q, qd, qdd, p, s=None):
         return base.columns(q, qd, qdd, s) @ p
 
     def torque_of_masses(q, qd, qdd, s=None):
-        return model.inertia(standard, q) @ qdd + model.bias(standard, q, qd, s)
+        return model.inertia(parameters, q) @ qdd + model.bias(parameters, q, qd, s)
 
     def mass_matrix(q):
-        return model.inertia(standard, q)
+        return model.inertia(parameters, q)
 
     def bias(q, qd, s=None):
         return torque(q, qd, rest, s)
 
     def gravity(q):
-        return torque(q, rest, rest, relaxed)
+        return torque(q, rest, rest, relaxed_state)
 
     def friction(q, qd, s=None):
-        return others(q, qd, rest, s) - others(q, rest, rest, relaxed)
+        at_rest = remaining_forces(q, rest, rest, relaxed_state)
+        return remaining_forces(q, qd, rest, s) - at_rest
 
     functions = {
         "torque": (

@@ -16,12 +16,13 @@ import dataclasses
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from jaxid.arrays import AnyArray, Float, Joints
+from jaxid.arrays import AnyArray, Float, Joints, Vector3
 from jaxid.dynamics import projection_equation
 from jaxid.identification.consistency.pseudo_inertia import (
     inertial_parameters,
     pseudo_inertia,
 )
+from jaxid.robot.inertia import BodyParameters
 from jaxid.robot.robot import Robot
 
 MIN_DISTANCE = 1e-9
@@ -40,24 +41,19 @@ class Description:
 
     robot: Robot
     bodies: Float[np.ndarray, "joints 4 4"]
-    zeros: Float[np.ndarray, " joints"]
+    zeros: Joints
 
     @property
     def cost(self) -> int:
         """Estimate of the operations: numbers that are not zero, weighted by experience."""
         robot = self.robot
-        # A length counts only in a frame that turns.
-        in_turning_frame = np.zeros(robot.joints, bool)
-        for body, parent in enumerate(robot.parent):
-            if parent >= 0:
-                in_turning_frame[body] = (
-                    robot.revolute[parent] or in_turning_frame[parent]
-                )
-        lengths = np.abs(np.asarray(robot.offset))[in_turning_frame]
-        is_present = lengths > 1e-12
-        is_one = np.abs(lengths - 1.0) < 1e-12
-        of_frames = 4 * is_present.any(axis=1).sum() + 6 * is_present.sum()
-        return int(of_frames - 3 * is_one.sum() + np.count_nonzero(self.bodies))
+        has_length = np.abs(np.asarray(robot.offset)) > 1e-12
+        total = np.count_nonzero(self.bodies)
+        for body, (*ancestors, _) in enumerate(robot.ancestors):
+            # A length counts only in a frame that turns.
+            if any(robot.revolute[ancestor] for ancestor in ancestors):
+                total += 4 * has_length[body].any() + 6 * has_length[body].sum()
+        return int(total)
 
     def forces(self, q: AnyArray, qd: AnyArray, qdd: AnyArray) -> Joints:
         """Return the generalised forces of the bodies at one sample [N m or N] (Eq. 11)."""
@@ -124,23 +120,23 @@ class Description:
         return dataclasses.replace(self, bodies=bodies, zeros=zeros)
 
 
-def simplest_description(
-    robot: Robot, parameters: Float[np.ndarray, "joints 10"]
-) -> Description:
+def simplest_description(robot: Robot, parameters: BodyParameters) -> Description:
     """Return a description of a robot, with ten parameters of each body, of few operations."""
     inertias = np.asarray(pseudo_inertia(parameters))
     frames = Description(robot, inertias, np.zeros(robot.joints))
-    best = frames.carry_inward()
+    description = frames.carry_inward()
     for body in range(robot.joints):
         for distance in _distances_to_neighbours(frames.robot, body):
             candidate = frames.slide(body, distance)
-            if candidate.carry_inward().cost < best.cost:
+            if candidate.carry_inward().cost < description.cost:
                 frames = candidate
-                best = candidate.carry_inward()
+                description = candidate.carry_inward()
     for body in set(range(robot.joints)) - set(robot.parent):
         if robot.revolute[body]:
-            best = min(best, best.turn_last(body), key=lambda x: x.cost)
-    return best
+            description = min(
+                description, description.turn_last(body), key=lambda x: x.cost
+            )
+    return description
 
 
 def _distances_to_neighbours(robot: Robot, body: int) -> list[float]:
@@ -156,7 +152,7 @@ def _distances_to_neighbours(robot: Robot, body: int) -> list[float]:
 
 
 def _on_axis(
-    inertia: Float[np.ndarray, "4 4"], axis: Float[np.ndarray, "3"]
+    inertia: Float[np.ndarray, "4 4"], axis: Vector3
 ) -> Float[np.ndarray, "4 4"]:
     """Return the part of a pseudo-inertia that a turn about an axis does not change."""
     part = np.zeros((4, 4))

@@ -10,13 +10,12 @@ from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics.model import Model
 from jaxid.identification.fit_result import Fit
 from jaxid.program import Program, trace
+from jaxid.robot.inertia import BodyParameters
 
 from .equivalent_description import simplest_description
 
 
-def body_parameters(
-    model: Model, p: Float[AnyArray, " standard"]
-) -> Float[np.ndarray, "joints 10"]:
+def body_parameters(model: Model, p: Float[AnyArray, " standard"]) -> BodyParameters:
     """Return ten parameters of each body, with zeros for those that the model leaves out."""
     bodies = np.zeros((model.robot.joints, 10))
     for term, values in model.split(np.asarray(p, np.float64)):
@@ -46,10 +45,10 @@ def torques(fit: Fit) -> Callable[..., Any]:
     model = fit.base.model
     bodies = body_parameters(model, fit.standard_parameters)
     description = simplest_description(model.robot, bodies)
-    others = other_forces(fit)
+    remaining_forces = other_forces(fit)
 
     def forces(q, qd, qdd, s=None):
-        return description.forces(q, qd, qdd) + others(q, qd, qdd, s)
+        return description.forces(q, qd, qdd) + remaining_forces(q, qd, qdd, s)
 
     return forces
 

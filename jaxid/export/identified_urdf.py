@@ -11,7 +11,7 @@ from jaxid.arrays import Float
 from jaxid.errors import InputError
 from jaxid.identification.fit_result import Fit
 from jaxid.io import write_bytes
-from jaxid.robot.inertia import Inertia
+from jaxid.robot.inertia import BodyParameters, Inertia
 from jaxid.robot.mjcf import exact_text
 from jaxid.robot.robot import Robot
 from jaxid.robot.rotations import rpy_angles
@@ -65,7 +65,7 @@ def export_urdf(
     _require_same_robot(robot, load_urdf(source, tip=tip, base=base), source)
     tree = UrdfTree(source, tip=tip, base=base)
     dynamics = joint_dynamics(fit)
-    _replace_comment(tree.root, fit, (*dynamics.rotors, *dynamics.left_out))
+    _replace_comment(tree.root, fit, (*dynamics.rotors, *dynamics.omissions))
     _replace_inertials(tree, bodies)
     _write_joints(tree, robot, dynamics)
     document = tree.root.getroottree()
@@ -82,7 +82,7 @@ def _replace_comment(root: Any, fit: Fit, left_out: tuple[str, ...]) -> None:
     root.insert(0, etree.Comment(COMMENT_START + origin_comment(fit, left_out)))
 
 
-def _replace_inertials(tree: UrdfTree, bodies: Float[np.ndarray, "joints 10"]) -> None:
+def _replace_inertials(tree: UrdfTree, bodies: BodyParameters) -> None:
     """Write the bodies into the links that joints move, and take them from links fixed to these."""
     links = _fix_other_joints(tree)
     links += [name for name, carrier in tree.carriers.items() if carrier.body >= 0]
@@ -98,8 +98,8 @@ def _replace_inertials(tree: UrdfTree, bodies: Float[np.ndarray, "joints 10"]) -
 
 def _fix_other_joints(tree: UrdfTree) -> list[str]:
     """Fix the joints on identified bodies that the robot does not have; return links below them."""
-    branches = [joint for first in tree.left_out for joint in tree.branch(first)]
-    for joint in (*tree.held, *branches):
+    branches = [joint for first in tree.side_joints for joint in tree.branch(first)]
+    for joint in (*tree.mimics, *branches):
         if joint.get("type") == "fixed":
             continue
         rotation, position = tree.held_pose(joint)
@@ -151,9 +151,9 @@ def _require_same_robot(robot: Robot, described: Robot, source: str | Path) -> N
         "offset": bodies_on_bodies,
     }
     for quantity, bodies in rows.items():
-        ours = np.asarray(getattr(robot, quantity))[bodies]
-        theirs = np.asarray(getattr(described, quantity))[bodies]
-        if not np.allclose(ours, theirs, rtol=0.0, atol=1e-3):
+        fit_numbers = np.asarray(getattr(robot, quantity))[bodies]
+        file_numbers = np.asarray(getattr(described, quantity))[bodies]
+        if not np.allclose(fit_numbers, file_numbers, rtol=0.0, atol=1e-3):
             raise InputError(
                 f"`{source}` has another `{quantity}` than the robot of the fit: give "
                 "its own file."

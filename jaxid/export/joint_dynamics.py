@@ -5,12 +5,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxid.arrays import Float, double_precision
+from jaxid.arrays import Float, Joints, double_precision
 from jaxid.dynamics.terms import AbstractTerm
 from jaxid.errors import InputError
 from jaxid.identification.consistency.pseudo_inertia import consistency_margin
 from jaxid.identification.fit_result import Fit
 from jaxid.result_table import printable
+from jaxid.robot.inertia import BodyParameters
 from jaxid.robot.robot import Robot
 
 from .feed_forward import body_parameters
@@ -28,12 +29,12 @@ class JointDynamics(NamedTuple):
         values: The `armature` [kg m² or kg], `damping` [N m s/rad or N s/m] and dry
             `friction` [N m or N] of all joints.
         rotors: Names of the parameters in `armature`.
-        left_out: Names of the parameters in none of the three.
+        omissions: Names of the parameters in none of the three.
     """
 
-    values: dict[str, Float[np.ndarray, " joints"]]
+    values: dict[str, Joints]
     rotors: tuple[str, ...]
-    left_out: tuple[str, ...]
+    omissions: tuple[str, ...]
 
 
 def joint_dynamics(fit: Fit) -> JointDynamics:
@@ -47,7 +48,7 @@ def joint_dynamics(fit: Fit) -> JointDynamics:
     robot = model.robot
     total = np.zeros((3, robot.joints))
     rotors = []
-    left_out = [] if model.memory is None else ["the memory of dry friction"]
+    omissions = [] if model.memory is None else ["the memory of dry friction"]
     for term, p in model.split(fit.standard_parameters):
         if term.body_parameters:
             continue
@@ -57,10 +58,14 @@ def joint_dynamics(fit: Fit) -> JointDynamics:
             if coefficients[0, :, k].any():
                 rotors.append(name)
             if not coefficients[:, :, k].any():
-                left_out.append(name)
+                omissions.append(name)
     armature, damping, friction = total
-    values = {"armature": armature, "damping": damping, "friction": friction}
-    return JointDynamics(values, tuple(rotors), tuple(left_out))
+    values: dict[str, Joints] = {
+        "armature": armature,
+        "damping": damping,
+        "friction": friction,
+    }
+    return JointDynamics(values, tuple(rotors), tuple(omissions))
 
 
 def _joint_coefficients(
@@ -95,7 +100,7 @@ def _joint_coefficients(
     return coefficients
 
 
-def feasible_bodies(fit: Fit, target: str) -> Float[np.ndarray, "joints 10"]:
+def feasible_bodies(fit: Fit, target: str) -> BodyParameters:
     """Return ten parameters of each body; reject bodies and friction that cannot exist.
 
     Args:
@@ -133,10 +138,10 @@ def feasible_bodies(fit: Fit, target: str) -> Float[np.ndarray, "joints 10"]:
     return bodies
 
 
-def origin_comment(fit: Fit, left_out: tuple[str, ...]) -> str:
+def origin_comment(fit: Fit, omissions: tuple[str, ...]) -> str:
     """Return what the comment of a file says about the model, and what the file lacks."""
     text = f"{fit.date or 'an unknown day'}, {fit.checksum}. "
-    if left_out:
-        text += f"Not in this file: {', '.join(left_out)}. "
+    if omissions:
+        text += f"Not in this file: {', '.join(omissions)}. "
     # Two hyphens would end the comment.
     return re.sub("-(?=-)", "- ", printable(text))

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from jaxid.arrays import AnyArray, Float, Joints
 from jaxid.identification.fit_result import Fit
 from jaxid.io import write_text
-from jaxid.robot.inertia import Inertia
+from jaxid.robot.inertia import BodyParameters, Inertia
 from jaxid.robot.mjcf import exact_text
 from jaxid.robot.robot import Robot
 
@@ -39,7 +39,7 @@ def export_mjcf(fit: Fit, path: str | Path) -> Path:
     """
     bodies = feasible_bodies(fit, "an MJCF file")
     dynamics = joint_dynamics(fit)
-    comment = f" Model of {origin_comment(fit, dynamics.left_out)}"
+    comment = f" Model of {origin_comment(fit, dynamics.omissions)}"
     robot = fit.base.model.robot
     write_text(path, mjcf_text(robot, bodies, dynamics.values, comment=comment))
     return Path(path)
@@ -47,7 +47,7 @@ def export_mjcf(fit: Fit, path: str | Path) -> Path:
 
 def mjcf_text(
     robot: Robot,
-    bodies: Float[AnyArray, "joints 10"],
+    bodies: BodyParameters,
     dynamics: Mapping[str, Joints],
     timestep: float = 0.001,
     comment: str = "",

@@ -4,16 +4,15 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxid.arrays import Float
 from jaxid.identification.fit_result import Fit
 from jaxid.io import json_text, write_text
-from jaxid.robot.inertia import Inertia
+from jaxid.robot.inertia import BodyParameters, Inertia
 
 from .feed_forward import body_parameters
 from .joint_dynamics import joint_dynamics
 
 
-def pinocchio_parameters(fit: Fit) -> Float[np.ndarray, "joints 10"]:
+def pinocchio_parameters(fit: Fit) -> BodyParameters:
     r"""Return the bodies' parameters in Pinocchio's order, about the origins of the joint frames.
 
     Each row is an argument of `pinocchio.Inertia.FromDynamicParameters` and fits the
@@ -47,7 +46,7 @@ def export_pinocchio(fit: Fit, path: str | Path) -> Path:
         "date": fit.date,
         "names": ["m", "mx", "my", "mz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz"],
         "joints": joints,
-        "left_out": list(dynamics.left_out),
+        "left_out": list(dynamics.omissions),
     }
     write_text(path, json_text(content))
     return Path(path)

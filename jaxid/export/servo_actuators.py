@@ -7,7 +7,7 @@ import numpy as np
 from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
 from lxml.builder import E  # pyright: ignore[reportMissingModuleSource]
 
-from jaxid.arrays import AnyArray, Float, Numbers
+from jaxid.arrays import AnyArray, Joints, Numbers
 from jaxid.errors import InputError
 from jaxid.io import write_text
 from jaxid.result_table import Column, Table
@@ -34,9 +34,7 @@ UNITS = {
 """Units of `simulator_values` at joints that turn, and at joints that slide."""
 
 
-def servo_stiffness(
-    fit: ServoFit, stiffness: Numbers | None = None
-) -> Float[np.ndarray, " joints"]:
+def servo_stiffness(fit: ServoFit, stiffness: Numbers | None = None) -> Joints:
     """Return the stiffness of each servo: given, that of the fit, or that of the other joints.
 
     Args:
@@ -63,7 +61,7 @@ def servo_stiffness(
 
 def simulator_values(
     fit: ServoFit, stiffness: Numbers | None = None, parameters: AnyArray | None = None
-) -> dict[str, Float[np.ndarray, " joints"]]:
+) -> dict[str, Joints]:
     """Return the numbers of each joint that simulators of actuators take.
 
     The damping is the sum of friction and of the servo's own: positions do not tell
@@ -88,22 +86,20 @@ def simulator_values(
         K = np.where(is_drawn, 1.0 / np.maximum(ratios["a"], 1e-9), K)
     inertia = np.maximum(K * ratios["J"] - _body_inertias(fit, ratios["a"]), 0.0)
     friction = ratios["F"] + ratios["mu"] * np.abs(ratios["a"]) * fit.load
-    saturates = ratios["um"] < START[INDEX["um"]]
+    is_limited = ratios["um"] < START[INDEX["um"]]
     return {
         "stiffness": K,
         "damping": K * ratios["B"],
         "armature": inertia,
         "friction": K * friction,
-        "effort_limit": np.where(saturates, K * ratios["um"], np.inf),
+        "effort_limit": np.where(is_limited, K * ratios["um"], np.inf),
         "delay": ratios["d"],
         "offset": ratios["b"],
         "integral_gain": K * ratios["ki"],
     }
 
 
-def _body_inertias(
-    fit: ServoFit, compliance: Float[np.ndarray, " joints"]
-) -> Float[np.ndarray, " joints"]:
+def _body_inertias(fit: ServoFit, compliance: Joints) -> Joints:
     """Return the inertias of the bodies that servos' inertias contain [kg m² or kg].
 
     A simulator adds the inertia of the bodies, so that it must not count twice. Where
@@ -215,7 +211,7 @@ def export_servo_mjcf(
 def _servo_mjcf(
     bodies: Bodies,
     joint_names: tuple[str, ...],
-    values: dict[str, Float[np.ndarray, " joints"]],
+    values: dict[str, Joints],
     timestep: float,
 ) -> str:
     """Return a robot with position actuators of these values as MJCF."""

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.spatial import ConvexHull, QhullError
 
-from jaxid.arrays import Float, Numbers
+from jaxid.arrays import AnyArray, Float, Matrix3, Numbers, Vector3
 from jaxid.errors import InputError
 
 from .collision_geometry import Shape, link_shapes, mjcf_shapes
@@ -121,8 +121,8 @@ class Segment(NamedTuple):
         radius: Radius [m].
     """
 
-    start: Float[np.ndarray, "3"]
-    end: Float[np.ndarray, "3"]
+    start: Vector3
+    end: Vector3
     radius: float
 
     @property
@@ -150,9 +150,9 @@ class AxisSearch(NamedTuple):
     """
 
     points: Float[np.ndarray, "points 3"]
-    centre: Float[np.ndarray, "3"]
+    centre: Vector3
     size: float
-    frame: Float[np.ndarray, "3 3"]
+    frame: Matrix3
 
     def volume(self, change: Float[np.ndarray, "4"]) -> float:
         """Return the volume of the capsule about an axis [m³]."""
@@ -172,19 +172,19 @@ class AxisSearch(NamedTuple):
         place = self.centre + self.size * (change[2:] @ sideways)
 
         differences = self.points - place
-        along = differences @ axis
-        away = np.linalg.norm(differences - along[:, None] * axis, axis=1)
+        heights = differences @ axis
+        distances = np.linalg.norm(differences - heights[:, None] * axis, axis=1)
         # Rounding must leave no point outside.
-        radius = float(away.max()) * (1 + 1e-9) + 1e-12
-        reach = np.sqrt(np.maximum(radius**2 - away**2, 0.0))
-        start = (along + reach).min()
-        end = (along - reach).max()
+        radius = float(distances.max()) * (1 + 1e-9) + 1e-12
+        reach = np.sqrt(np.maximum(radius**2 - distances**2, 0.0))
+        start = (heights + reach).min()
+        end = (heights - reach).max()
         if start > end:
             start = end = 0.5 * (start + end)
         return Segment(place + start * axis, place + end * axis, radius)
 
 
-def enclose(points: Float[np.ndarray, "points 3"]) -> Segment:
+def enclose(points: Float[AnyArray, "points 3"]) -> Segment:
     """Return a small capsule around all points.
 
     The direction and the place of the axis are searched from each of the principal
@@ -192,7 +192,7 @@ def enclose(points: Float[np.ndarray, "points 3"]) -> Segment:
     near as they can be, so all points are inside, whatever the search finds. (The
     smallest cylinder is no help: a capsule about its axis is up to six times larger.)
     """
-    hull = _hull_points(points)
+    hull = _hull_points(np.asarray(points))
     low = hull.min(axis=0)
     high = hull.max(axis=0)
     centre = 0.5 * (high + low)

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxid.arrays import Float
+from jaxid.arrays import AnyArray, Float, Matrix3, Vector3
 from jaxid.errors import InputError
 
 from .mjcf import body_name, import_mujoco, rotation_of_quaternion
@@ -26,7 +26,7 @@ class Shape(NamedTuple):
         radius: Radius [m].
     """
 
-    points: Float[np.ndarray, "points 3"]
+    points: Float[AnyArray, "points 3"]
     radius: float
 
     @classmethod
@@ -35,9 +35,7 @@ class Shape(NamedTuple):
         half = np.array([0.0, 0.0, 0.5 * length])
         return cls(np.array([-half, half]), radius)
 
-    def placed(
-        self, rotation: Float[np.ndarray, "3 3"], position: Float[np.ndarray, "3"]
-    ) -> "Shape":
+    def placed(self, rotation: Matrix3, position: Vector3) -> "Shape":
         """Return the shape in the frame in which its present frame is placed."""
         return Shape(position + self.points @ rotation.T, self.radius)
 
@@ -139,13 +137,13 @@ def mjcf_shapes(path: str | Path) -> dict[str, list[Shape]]:
     model = mujoco.MjModel.from_xml_path(str(path))
     kinds = mujoco.mjtGeom
     unbounded = (kinds.mjGEOM_PLANE, kinds.mjGEOM_HFIELD, kinds.mjGEOM_SDF)
-    collides = (model.geom_contype | model.geom_conaffinity) != 0
+    is_solid = (model.geom_contype | model.geom_conaffinity) != 0
 
     shapes: dict[str, list[Shape]] = {}
     for geom in range(model.ngeom):
         body = int(model.geom_bodyid[geom])
-        body_collides = collides[model.geom_bodyid == body].any()
-        if model.geom_type[geom] in unbounded or (body_collides and not collides[geom]):
+        body_is_solid = is_solid[model.geom_bodyid == body].any()
+        if model.geom_type[geom] in unbounded or (body_is_solid and not is_solid[geom]):
             continue
         rotation = rotation_of_quaternion(model.geom_quat[geom])
         shape = _geom_shape(mujoco, model, geom)

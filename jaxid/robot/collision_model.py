@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Array, Float, Hashable, double_precision
+from jaxid.arrays import AnyArray, Array, Float, Hashable, Joints, double_precision
 from jaxid.errors import InputError
 
 from .forward_and_inverse_kinematics import placements
@@ -109,9 +109,7 @@ class CollisionModel(Hashable):
             names.append(" and ".join(words))
         return tuple(names)
 
-    def ends(
-        self, robot: Robot, q: Float[AnyArray, " joints"]
-    ) -> Float[Array, "capsules 2 3"]:
+    def ends(self, robot: Robot, q: Joints) -> Float[Array, "capsules 2 3"]:
         """Return the ends of all capsules' axes in the frame of the ground [m], for one pose."""
         rotations, origins = placements(robot, q)
         # The ground comes last, where its index -1 leads.
@@ -145,10 +143,12 @@ class CollisionModel(Hashable):
         # All groups get the same number of pairs: the first one is repeated.
         size = max(len(group) for group in self.groups)
         places = [group + group[:1] * (size - len(group)) for group in self.groups]
-        grouped = gaps[:, np.array(places)]
+        gaps_of_groups = gaps[:, np.array(places)]
         # The derivative is that of one pair, also where several are equally near.
-        nearest = jnp.argmin(jax.lax.stop_gradient(grouped), axis=-1, keepdims=True)
-        clearances = jnp.take_along_axis(grouped, nearest, axis=-1)[..., 0]
+        minimum = jnp.argmin(
+            jax.lax.stop_gradient(gaps_of_groups), axis=-1, keepdims=True
+        )
+        clearances = jnp.take_along_axis(gaps_of_groups, minimum, axis=-1)[..., 0]
         return clearances.reshape(*ends.shape[:-3], len(self.groups))
 
     def _gaps(self, ends: Float[Array, "capsules 2 3"]) -> Float[Array, " pairs"]:

@@ -16,7 +16,16 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from jaxid.arrays import AnyArray, Float, Int, Numbers, as_array
+from jaxid.arrays import (
+    AnyArray,
+    Float,
+    Int,
+    Joints,
+    Matrix3,
+    Numbers,
+    Vector3,
+    as_array,
+)
 from jaxid.errors import InputError
 
 from .robot import Robot
@@ -36,7 +45,7 @@ STRIDE = 0.03
 
 def placement_in_parent(
     robot: Robot, body: int, q: Float[AnyArray, ""]
-) -> tuple[Float[AnyArray, "3 3"], Float[AnyArray, "3"]]:
+) -> tuple[Matrix3, Vector3]:
     """Return attitude and origin [m] of a body in its parent, moved by its joint's coordinate."""
     R = robot.rotation[body]
     r = robot.offset[body]
@@ -47,7 +56,7 @@ def placement_in_parent(
 
 
 def placements(
-    robot: Robot, q: Float[AnyArray, " joints"]
+    robot: Robot, q: Joints
 ) -> tuple[Float[AnyArray, "joints 3 3"], Float[AnyArray, "joints 3"]]:
     """Return attitudes and origins [m] of all bodies in the frame of the ground."""
     q = jnp.asarray(q)
@@ -62,9 +71,7 @@ def placements(
     return jnp.stack(rotations), jnp.stack(origins)
 
 
-def tip_placement(
-    robot: Robot, q: Float[AnyArray, " joints"]
-) -> tuple[Float[AnyArray, "3 3"], Float[AnyArray, "3"]]:
+def tip_placement(robot: Robot, q: Joints) -> tuple[Matrix3, Vector3]:
     """Return attitude and position [m] of the end-effector in the frame of the ground."""
     rotations, origins = placements(robot, q)
     R = rotations[robot.tip_body]
@@ -158,7 +165,7 @@ class _TipTask(NamedTuple):
     """Robot, attitude of its end-effector, preferred coordinates, half of the ranges, limits."""
 
     robot: Robot
-    rotation: Float[np.ndarray, "3 3"]
+    rotation: Matrix3
     posture: Float[np.ndarray, " joints"]
     half_range: Float[np.ndarray, " joints"]
     low: Float[np.ndarray, " joints"]
@@ -176,11 +183,11 @@ def _tip_task(robot: Robot, rotation: Numbers, posture: Numbers | None) -> _TipT
     """Return the checked task of a robot; joints without limits get half a turn, or a metre."""
     low = np.asarray(robot.limits.position_min)
     high = np.asarray(robot.limits.position_max)
-    limited = np.isfinite(low) & np.isfinite(high)
+    is_limited = np.isfinite(low) & np.isfinite(high)
     with np.errstate(invalid="ignore"):
         default_range = np.where(robot.revolute, np.pi, 1.0)
-        half_range = np.where(limited, (high - low) / 2, default_range)
-        middle = np.clip(np.where(limited, (high + low) / 2, 0.0), low, high)
+        half_range = np.where(is_limited, (high - low) / 2, default_range)
+        middle = np.clip(np.where(is_limited, (high + low) / 2, 0.0), low, high)
 
     goal = np.asarray(as_array("posture", middle if posture is None else posture))
     if goal.shape != middle.shape:
@@ -296,20 +303,20 @@ def _require_followed(task: _TipTask, positions: np.ndarray, q: np.ndarray) -> N
     excess = np.maximum(task.low - q, q - task.high) / task.half_range
     changes = np.abs(np.diff(q, axis=0, prepend=q[:1]) / task.half_range)
 
-    reached = np.maximum(distances, angles) <= POSE_TOLERANCE
-    in_range = excess.max(axis=1) <= RANGE_TOLERANCE
-    continuous = changes.max(axis=1) <= MAX_JUMP
-    failures = np.flatnonzero(~(reached & in_range & continuous))
+    is_reached = np.maximum(distances, angles) <= POSE_TOLERANCE
+    is_in_range = excess.max(axis=1) <= RANGE_TOLERANCE
+    is_continuous = changes.max(axis=1) <= MAX_JUMP
+    failures = np.flatnonzero(~(is_reached & is_in_range & is_continuous))
     if not failures.size:
         return
 
     k = int(failures[0])
-    if not reached[k]:
+    if not is_reached[k]:
         reason = (
             f"it comes to within {distances[k]:.3g} m and {angles[k]:.3g} rad of the "
             "pose"
         )
-    elif not in_range[k]:
+    elif not is_in_range[k]:
         reason = (
             f"joint `{robot.joint_names[int(excess[k].argmax())]}` leaves its range"
         )

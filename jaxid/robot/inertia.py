@@ -3,7 +3,16 @@
 import equinox as eqx
 import numpy as np
 
-from jaxid.arrays import AnyArray, Float, Numbers, as_array, is_traced, namespace
+from jaxid.arrays import (
+    AnyArray,
+    Float,
+    Matrix3,
+    Numbers,
+    Vector3,
+    as_array,
+    is_traced,
+    namespace,
+)
 
 from .limits_and_drives import DOUBTFUL_LENGTH, MAX_LENGTH
 
@@ -11,6 +20,8 @@ AXES = "xyz"
 INERTIAL_NAMES = ("m", *(f"m{a}" for a in AXES), *"ABCDEF")
 """Inertial parameters of a body in the paper's order (Eq. 9)."""
 INERTIAL_UNITS = ("kg", *("kg m",) * 3, *("kg m²",) * 6)
+BodyParameters = Float[AnyArray, "joints 10"]
+"""Ten inertial parameters of each body of a robot."""
 MAX_MASS = 1e5
 """Largest mass of a body of a robot [kg]."""
 
@@ -73,9 +84,7 @@ class Inertia(eqx.Module):
         """Entries xx, xy, xz, yy, yz, zz of the tensor, the order of URDF [kg m²]."""
         return self.tensor[..., (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)]
 
-    def moved(
-        self, rotation: Float[AnyArray, "3 3"], position: Float[AnyArray, "3"]
-    ) -> "Inertia":
+    def moved(self, rotation: Matrix3, position: Vector3) -> "Inertia":
         """Return the same body in the frame in which its present frame is placed."""
         R = rotation
         return Inertia(self.mass, position + self.centre @ R.T, R @ self.tensor @ R.T)

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from jaxid.arrays import AnyArray, Float, Hashable, Numbers, given, namespace
+from jaxid.arrays import AnyArray, Float, Hashable, Joints, Numbers, given, namespace
 from jaxid.errors import InputError
 
 DOUBTFUL_LENGTH = 10.0
@@ -18,7 +18,6 @@ MAX_LENGTH = 1000.0
 DOUBTFUL_SPEED = 50.0
 """Speed from which on the unit may be a degree per second [rad/s]."""
 
-PerJoint = Float[AnyArray, " joints"]
 Batch = Float[AnyArray, "*batch joints"]
 
 
@@ -46,12 +45,12 @@ class Limits(eqx.Module):
 
     joints: dataclasses.InitVar[int | None] = None
     _: dataclasses.KW_ONLY
-    position_min: PerJoint = eqx.field(converter=given, default=None)
-    position_max: PerJoint = eqx.field(converter=given, default=None)
-    velocity: PerJoint = eqx.field(converter=given, default=None)
-    acceleration: PerJoint = eqx.field(converter=given, default=None)
-    jerk: PerJoint = eqx.field(converter=given, default=None)
-    force: PerJoint = eqx.field(converter=given, default=None)
+    position_min: Joints = eqx.field(converter=given, default=None)
+    position_max: Joints = eqx.field(converter=given, default=None)
+    velocity: Joints = eqx.field(converter=given, default=None)
+    acceleration: Joints = eqx.field(converter=given, default=None)
+    jerk: Joints = eqx.field(converter=given, default=None)
+    force: Joints = eqx.field(converter=given, default=None)
     assumed: tuple[str, ...] = eqx.field(static=True, default=())
 
     def __post_init__(self, joints: int | None):
@@ -96,9 +95,9 @@ class Drives(Hashable):
     reduction: Float[AnyArray, "joints joints"] = eqx.field(
         converter=given, default=None
     )
-    zero: PerJoint = eqx.field(converter=given, default=None)
-    max_torques: PerJoint = eqx.field(converter=given, default=None)
-    rotor_inertia: PerJoint = eqx.field(converter=given, default=None)
+    zero: Joints = eqx.field(converter=given, default=None)
+    max_torques: Joints = eqx.field(converter=given, default=None)
+    rotor_inertia: Joints = eqx.field(converter=given, default=None)
 
     def __post_init__(self, joints: int | None):
         n = _count(
@@ -151,7 +150,7 @@ class Drives(Hashable):
         return forces @ self._inverse
 
     @property
-    def max_forces(self) -> PerJoint:
+    def max_forces(self) -> Joints:
         r"""Largest generalised forces of the motors, $|A|^T M_{max}$ [N m or N] (Eq. 30)."""
         weights = np.abs(self.reduction)
         # A motor without largest torque does not limit joints that it does not turn.

@@ -7,7 +7,7 @@ import numpy as np
 from lxml.builder import E  # pyright: ignore[reportMissingModuleSource]
 from scipy.spatial.transform import Rotation
 
-from jaxid.arrays import Float, Numbers
+from jaxid.arrays import Joints, Matrix3, Numbers, Vector3
 from jaxid.errors import InputError
 from jaxid.io import import_extra
 
@@ -24,7 +24,7 @@ def import_mujoco() -> Any:
     return import_extra("mujoco", "mujoco", "MJCF files and simulations need")
 
 
-def mjcf_as_urdf(path: str | Path) -> tuple[Any, Float[np.ndarray, "3"], list[Loop]]:
+def mjcf_as_urdf(path: str | Path) -> tuple[Any, Vector3, list[Loop]]:
     """Return the URDF element of an MJCF file, its gravity [m/s²], and its closed loops.
 
     Each body is a link of its name, fixed to the frame of its last joint; each named
@@ -58,7 +58,7 @@ def body_name(model: Any, body: int) -> str:
     return model.body(body).name or f"body{body}"
 
 
-def rotation_of_quaternion(quaternion: np.ndarray) -> Float[np.ndarray, "3 3"]:
+def rotation_of_quaternion(quaternion: np.ndarray) -> Matrix3:
     """Return the rotation of MuJoCo's quaternion (w, x, y, z)."""
     return Rotation.from_quat(np.roll(quaternion, -1)).as_matrix()
 
@@ -131,8 +131,8 @@ class _Writer:
         return range(first, first + int(self._model.body_jntnum[body]))
 
     def _joint_placement(
-        self, joint: int, rotation: np.ndarray, position: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
+        self, joint: int, rotation: Matrix3, position: Vector3
+    ) -> tuple[Matrix3, Vector3]:
         """Return attitude and origin of a joint's frame, where its body is placed so at `ref`.
 
         An MJCF file describes the pose at `ref`, a URDF file that at zero.
@@ -249,7 +249,7 @@ class _Writer:
         self._joints[joint].append(E.mimic(**attributes))
 
 
-def _largest_forces(mujoco: Any, model: Any) -> Float[np.ndarray, " joints"]:
+def _largest_forces(mujoco: Any, model: Any) -> Joints:
     """Return the largest forces of the actuators on each joint; infinite where unknown."""
     transmissions = mujoco.mjtTrn
     joint_kinds = (
@@ -279,6 +279,6 @@ def _largest_input(mujoco: Any, model: Any, actuator: int) -> float:
     return np.inf
 
 
-def _origin(R: Float[np.ndarray, "3 3"], r: Float[np.ndarray, "3"]) -> Any:
+def _origin(R: Matrix3, r: Vector3) -> Any:
     """Return the element of a placement."""
     return E.origin(xyz=exact_text(r), rpy=exact_text(rpy_angles(R)))

@@ -7,7 +7,18 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from jaxid.arrays import AnyArray, Float, Numbers, as_array, given, is_traced, namespace
+from jaxid.arrays import (
+    AnyArray,
+    Float,
+    Joints,
+    Matrix3,
+    Numbers,
+    Vector3,
+    as_array,
+    given,
+    is_traced,
+    namespace,
+)
 from jaxid.errors import InputError
 from jaxid.result_table import Column, Summarised, Table
 
@@ -35,8 +46,8 @@ class Tool(eqx.Module):
     body: int = eqx.field(static=True)
     _: dataclasses.KW_ONLY
     mass: Float[AnyArray, ""] = eqx.field(converter=given)
-    centre_of_mass: Float[AnyArray, "3"] = eqx.field(converter=given)
-    inertia: Float[AnyArray, "3 3"] = eqx.field(converter=given, default=None)
+    centre_of_mass: Vector3 = eqx.field(converter=given)
+    inertia: Matrix3 = eqx.field(converter=given, default=None)
 
     def __post_init__(self):
         self.mass = _checked("`mass` of the tool", self.mass, ())
@@ -112,10 +123,8 @@ class Robot(Summarised, eqx.Module):
     drives: Drives = eqx.field(converter=given, default=None)
     tool: Tool | None = None
     tip_body: int = eqx.field(static=True, converter=given, default=None)
-    tip_rotation: Float[AnyArray, "3 3"] = eqx.field(converter=given, default=None)
-    tip_offset: Float[AnyArray, "3"] = eqx.field(
-        converter=given, default=(0.0, 0.0, 0.0)
-    )
+    tip_rotation: Matrix3 = eqx.field(converter=given, default=None)
+    tip_offset: Vector3 = eqx.field(converter=given, default=(0.0, 0.0, 0.0))
     source: str = eqx.field(static=True, default="")
     notes: tuple[str, ...] = eqx.field(static=True, default=())
 
@@ -222,13 +231,13 @@ class Robot(Summarised, eqx.Module):
         return tuple(chains)
 
     @property
-    def known_max_forces(self) -> Float[AnyArray, " joints"]:
+    def known_max_forces(self) -> Joints:
         """Largest force of every joint, infinite where it is not known [N m or N]."""
         forces = np.asarray(self.limits.force)
         return np.where(np.isfinite(forces), forces, self.drives.max_forces)
 
     @property
-    def max_forces(self) -> Float[AnyArray, " joints"]:
+    def max_forces(self) -> Joints:
         """Largest force of every joint: its limit, or else that of its motors [N m or N] (Eq. 30).
 
         Raises:
@@ -276,8 +285,8 @@ class Robot(Summarised, eqx.Module):
         Raises:
             InputError: If the attitude is no rotation, or the position no point.
         """
-        upright = np.eye(3) if rotation is None else rotation
-        R = _rotations("`rotation`", upright, (3, 3))
+        attitude = np.eye(3) if rotation is None else rotation
+        R = _rotations("`rotation`", attitude, (3, 3))
         r = _checked("`position`", position, (3,))
         xp = namespace(R, r, self.rotation, self.offset)
         rotations = R @ self.rotation

@@ -8,14 +8,14 @@ of its file.
 
 import numpy as np
 
-from jaxid.arrays import AnyArray, Float, Numbers, namespace
+from jaxid.arrays import AnyArray, Float, Matrix3, Numbers, Vector3, namespace
 from jaxid.errors import InputError
 
 SNAP_TOLERANCE = 1e-4
 """Default difference from a quarter turn that counts as rounding [rad]."""
 
 
-def skew(a: Float[AnyArray, "3"]) -> Float[AnyArray, "3 3"]:
+def skew(a: Vector3) -> Matrix3:
     r"""Return the matrix $\tilde a$ with $\tilde a b = a \times b$ (Eq. 3)."""
     x, y, z = a[0], a[1], a[2]
     zero = 0.0 * x
@@ -24,7 +24,7 @@ def skew(a: Float[AnyArray, "3"]) -> Float[AnyArray, "3 3"]:
 
 
 def rotation_about(
-    axis: Float[AnyArray, "3"], angle: Float[AnyArray, "*batch"]
+    axis: Vector3, angle: Float[AnyArray, "*batch"]
 ) -> Float[AnyArray, "*batch 3 3"]:
     """Return the rotation about a unit vector by an angle [rad].
 
@@ -32,26 +32,26 @@ def rotation_about(
     constant axis leaves the fewest operations.
     """
     xp = namespace(axis, angle)
-    along = axis[:, None] * axis[None, :]
+    projection = axis[:, None] * axis[None, :]
     cosine = xp.cos(angle)[..., None, None]
     sine = xp.sin(angle)[..., None, None]
-    return along + cosine * (np.eye(3) - along) + sine * skew(axis)
+    return projection + cosine * (np.eye(3) - projection) + sine * skew(axis)
 
 
-def axis_rotation(axis: Numbers, angle: float) -> Float[np.ndarray, "3 3"]:
+def axis_rotation(axis: Numbers, angle: float) -> Matrix3:
     """Return the rotation about a unit vector by an angle [rad], exact for quarter turns."""
     R = rotation_about(np.asarray(axis, np.float64), np.asarray(angle))
     return without_rounding(np.asarray(R))
 
 
-def rpy_rotation(rpy: Numbers) -> Float[np.ndarray, "3 3"]:
+def rpy_rotation(rpy: Numbers) -> Matrix3:
     """Return the rotation by roll, pitch and yaw [rad] about the fixed axes x, y, z, as in URDF."""
     roll, pitch, yaw = np.asarray(rpy, dtype=np.float64)
     x, y, z = np.eye(3)
     return axis_rotation(z, yaw) @ axis_rotation(y, pitch) @ axis_rotation(x, roll)
 
 
-def rpy_angles(rotation: Float[AnyArray, "3 3"]) -> Float[np.ndarray, "3"]:
+def rpy_angles(rotation: Matrix3) -> Vector3:
     """Return roll, pitch and yaw [rad] of a rotation, as precise at a pitch of a quarter turn."""
     roll = float(np.arctan2(rotation[2, 1], rotation[2, 2]))
     R = np.asarray(rotation) @ axis_rotation((1.0, 0.0, 0.0), -roll)
@@ -87,7 +87,7 @@ def snapped_rotations(
     return np.where(changes, nearest_rotation, R)
 
 
-def without_rounding(values: np.ndarray) -> np.ndarray:
+def without_rounding(values: AnyArray) -> np.ndarray:
     """Set entries to 0, 1 or -1 that differ only by rounding, like 6e-17 for cos(pi/2)."""
     integers = np.clip(np.round(values), -1.0, 1.0)
     entries = np.where(np.abs(values - integers) <= 1e-14, integers, values)

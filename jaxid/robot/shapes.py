@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Array, Float, Numbers
+from jaxid.arrays import AnyArray, Array, Float, Matrix3, Numbers, Vector3
 from jaxid.errors import InputError
 
 GROUND = -1
@@ -41,8 +41,8 @@ class Capsule(eqx.Module):
 
     name: str = eqx.field(static=True)
     body: int = eqx.field(static=True)
-    start: Float[AnyArray, "3"]
-    end: Float[AnyArray, "3"]
+    start: Vector3
+    end: Vector3
     radius: Float[AnyArray, ""]
 
     def __init__(
@@ -80,7 +80,7 @@ class HalfSpace(eqx.Module):
     """
 
     name: str = eqx.field(static=True)
-    normal: Float[AnyArray, "3"]
+    normal: Vector3
     height: Float[AnyArray, ""]
 
     def __init__(
@@ -120,9 +120,9 @@ class Box(eqx.Module):
     """
 
     name: str = eqx.field(static=True)
-    centre: Float[AnyArray, "3"]
-    size: Float[AnyArray, "3"]
-    rotation: Float[AnyArray, "3 3"]
+    centre: Vector3
+    size: Vector3
+    rotation: Matrix3
 
     def __init__(
         self,
@@ -149,10 +149,10 @@ class Box(eqx.Module):
         R = jnp.asarray(self.rotation)
         centre = jnp.broadcast_to(self.centre @ self.rotation, start.shape)
         first = start @ R - centre
-        along = (end - start) @ R
+        extent = (end - start) @ R
         # The minimum is found without derivatives: those of its place add nothing to
         # that of the distance.
-        origin, direction = jax.lax.stop_gradient((first, along))
+        origin, direction = jax.lax.stop_gradient((first, extent))
 
         def slope(place: Array) -> Array:
             point = origin + place * direction
@@ -161,22 +161,22 @@ class Box(eqx.Module):
 
         low, high = _bisect(slope, jnp.zeros_like(origin[..., :1]))
         # In the box the deepest point lies where two faces are equally near. The
-        # derivative is then that mean of both sides' which a shift along the segment
+        # derivative is then that mean of both sides' which a shift extent the segment
         # leaves as it is.
         rising = slope(high)
         turn = rising - slope(low)
         share = jnp.clip(rising / jnp.where(turn > 0, turn, 1.0), 0.0, 1.0)[..., 0]
-        distance_before = self._signed(first + low * along)
-        distance_after = self._signed(first + high * along)
+        distance_before = self._signed(first + low * extent)
+        distance_after = self._signed(first + high * extent)
         return share * distance_before + (1.0 - share) * distance_after
 
     def _signed(self, point: Vectors) -> Array:
         """Return the signed distances of points in the frame of the box [m]."""
-        beyond = jnp.abs(point) - jnp.broadcast_to(0.5 * self.size, point.shape)
-        x, y, z = jnp.unstack(-beyond, axis=-1)
+        excess = jnp.abs(point) - jnp.broadcast_to(0.5 * self.size, point.shape)
+        x, y, z = jnp.unstack(-excess, axis=-1)
         depth = _smaller(_smaller(x, y), z)
-        outside = jnp.where(beyond > 0, beyond, 0.0)
-        return _rounded_norm(outside) - jnp.where(depth > 0, depth, 0.0)
+        outside_part = jnp.where(excess > 0, excess, 0.0)
+        return _rounded_norm(outside_part) - jnp.where(depth > 0, depth, 0.0)
 
 
 def segment_distance(

@@ -5,11 +5,11 @@ from typing import Any
 
 import numpy as np
 
-from jaxid.arrays import AnyArray, Float, Numbers, is_traced
+from jaxid.arrays import AnyArray, Float, Joints, Numbers, is_traced
 from jaxid.errors import InputError
 
 from .forward_and_inverse_kinematics import tip_jacobian
-from .inertia import Inertia
+from .inertia import BodyParameters, Inertia
 from .limits_and_drives import DOUBTFUL_LENGTH, Limits, owners, range_fault
 from .robot import Robot
 from .urdf_tree import ORIGIN, TURNING, UrdfTree
@@ -126,7 +126,7 @@ def urdf_parameters(
 
 def joint_parameters(
     path: str | Path, *, tip: str | None = None, base: str | None = None
-) -> dict[str, Float[np.ndarray, " joints"]]:
+) -> dict[str, Joints]:
     """Return `armature`, `damping` and dry `friction` that a file claims, zero where it does not.
 
     Arguments and errors are those of `load_urdf`.
@@ -196,7 +196,7 @@ def _checked_range(tree: UrdfTree, joint: Any) -> tuple[float, float]:
 def _held_notes(tree: UrdfTree) -> list[str]:
     """Return notes on joints that are held, and on objects that are no part of the robot."""
     groups: dict[tuple[str, str], list[str]] = {}
-    for joint in tree.held:
+    for joint in tree.mimics:
         master = joint.find("mimic").get("joint", "")
         position = f"{tree.held_at(joint):.4g}"
         groups.setdefault((master, position), []).append(joint.get("name"))
@@ -207,8 +207,8 @@ def _held_notes(tree: UrdfTree) -> list[str]:
             f"{owners('joint', names)}: held at {position} ({cause}); the links belong "
             "to the bodies that carry them."
         )
-    if tree.loose:
-        links = owners("link", tree.loose)
+    if tree.objects:
+        links = owners("link", tree.objects)
         notes.append(f"{links}: left out, as objects that float freely.")
     return notes
 
@@ -238,7 +238,7 @@ def _inertial_notes(tree: UrdfTree) -> list[str]:
     return notes
 
 
-def _effort_notes(robot: Robot, bodies: Float[np.ndarray, "joints 10"]) -> list[str]:
+def _effort_notes(robot: Robot, bodies: BodyParameters) -> list[str]:
     """Return notes on joints that cannot hold a fraction of what gravity needs with these bodies."""
     if is_traced(robot):
         return []
@@ -257,7 +257,7 @@ def _effort_notes(robot: Robot, bodies: Float[np.ndarray, "joints 10"]) -> list[
 
 
 def _gravity_forces(
-    robot: Robot, bodies: Float[np.ndarray, "joints 10"]
+    robot: Robot, bodies: BodyParameters
 ) -> Float[np.ndarray, "poses joints"]:
     """Return the forces that bodies need at rest in random poses [N m or N]."""
     low = np.asarray(robot.limits.position_min)

@@ -7,11 +7,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
 
-from jaxid.arrays import Float
+from jaxid.arrays import Matrix3, Vector3
 from jaxid.errors import InputError
 
 from .description_files import is_mjcf, read_description
-from .inertia import Inertia
+from .inertia import BodyParameters, Inertia
 from .limits_and_drives import listed
 from .mjcf import Loop
 from .rotations import axis_rotation, rpy_rotation, without_rounding
@@ -34,8 +34,8 @@ class Placement(NamedTuple):
     """
 
     body: int
-    rotation: Float[np.ndarray, "3 3"]
-    position: Float[np.ndarray, "3"]
+    rotation: Matrix3
+    position: Vector3
 
 
 class UrdfTree:
@@ -50,9 +50,9 @@ class UrdfTree:
         carriers: For each link its placement on the body that carries it.
         joints: Elements of the moving joints; `parent`, `axis`, `rotation` and `offset`
             as in `Robot`.
-        held: Elements of joints that mimic others.
-        left_out: Elements of joints on moving bodies that lead to no link of the chain.
-        loose: Names of links that float and move no joint, which are left out.
+        mimics: Elements of joints that mimic others.
+        side_joints: Elements of joints on moving bodies that lead to no link of the chain.
+        objects: Names of links that float and move no joint, which are left out.
         tip: Name of the end-effector's link.
         compiled: Whether the file is MJCF, whose shapes are no elements of the links.
     """
@@ -87,9 +87,9 @@ class UrdfTree:
         self.axis = []
         self.rotation = []
         self.offset = []
-        self.held = []
-        self.left_out = []
-        self.loose = []
+        self.mimics = []
+        self.side_joints = []
+        self.objects = []
         self.carriers: dict[str, Placement] = {}
         self._merge(root if base is None else base, tip)
         self._refuse_loops(loops)
@@ -130,11 +130,11 @@ class UrdfTree:
     def _find_root(self) -> str:
         """Return the only link that no joint moves."""
         roots = [link for link in self.links if link not in self._above]
-        reachable = list(roots)
-        for link in reachable:
-            reachable += [link_names(joint)[1] for joint in self._below[link]]
+        tree_links = list(roots)
+        for link in tree_links:
+            tree_links += [link_names(joint)[1] for joint in self._below[link]]
         for link in self.links:
-            if link not in reachable:
+            if link not in tree_links:
                 raise self.error(
                     self._above[link],
                     "is part of a closed loop: remove one joint of the loop",
@@ -156,23 +156,23 @@ class UrdfTree:
         while stack:
             joint = stack.pop()
             parent, child = link_names(joint)
-            fixed = joint.get("type") == "fixed"
-            if not fixed and chain is not None and joint not in chain:
+            is_fixed = joint.get("type") == "fixed"
+            if not is_fixed and chain is not None and joint not in chain:
                 if self.carriers[parent].body >= 0:
-                    self.left_out.append(joint)
+                    self.side_joints.append(joint)
                 continue
             if joint.get("type") == "floating" and not self._moves_below(joint):
-                self.loose.append(child)
+                self.objects.append(child)
                 continue
-            if not fixed and joint.find("mimic") is not None:
-                fixed = True
-                self.held.append(joint)
-            if fixed:
+            if not is_fixed and joint.find("mimic") is not None:
+                is_fixed = True
+                self.mimics.append(joint)
+            if is_fixed:
                 self.carriers[child] = self._held_placement(joint)
             else:
                 self._add_body(joint)
-            moving, links = lengths[parent]
-            lengths[child] = (moving + (not fixed), links + 1)
+            joints, links = lengths[parent]
+            lengths[child] = (joints + (not is_fixed), links + 1)
             stack += self._below[child][::-1]
 
         self.tip = tip or max(lengths, key=lambda link: lengths[link])
@@ -210,8 +210,8 @@ class UrdfTree:
             body, R, r = placements[link]
             for joint in self._below[link]:
                 _, child = link_names(joint)
-                movable = joint.get("type") in (*TURNING, "prismatic", "fixed")
-                if movable and child not in placements:
+                is_readable = joint.get("type") in (*TURNING, "prismatic", "fixed")
+                if is_readable and child not in placements:
                     rotation, offset = self.held_pose(joint)
                     placements[child] = Placement(body, R @ rotation, r + R @ offset)
                     links.append(child)
@@ -257,9 +257,7 @@ class UrdfTree:
         # A constraint without a joint, with an unknown one, or a circle of mimics.
         return offset
 
-    def held_pose(
-        self, joint: Any
-    ) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
+    def held_pose(self, joint: Any) -> tuple[Matrix3, Vector3]:
         """Return attitude and origin [m] in its parent of the link that a held joint carries."""
         R, r = self._origin(joint)
         if joint.get("type") == "fixed":
@@ -276,8 +274,8 @@ class UrdfTree:
         """Return the ends of a joint's range, infinite where unknown [rad or m]."""
         low = self.limit(joint, "lower", np.nan)
         high = self.limit(joint, "upper", np.nan)
-        limited = np.isfinite(low) or np.isfinite(high)
-        if joint.get("type") == "continuous" or not limited:
+        has_limit = np.isfinite(low) or np.isfinite(high)
+        if joint.get("type") == "continuous" or not has_limit:
             return -np.inf, np.inf
         # A missing bound is zero if the other one is given, as the URDF standard says.
         return 0.0 if np.isnan(low) else low, 0.0 if np.isnan(high) else high
@@ -296,9 +294,7 @@ class UrdfTree:
             link, _ = link_names(self._above[link])
         return joints
 
-    def _origin(
-        self, joint: Any
-    ) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
+    def _origin(self, joint: Any) -> tuple[Matrix3, Vector3]:
         """Return attitude and origin of a joint in its parent link."""
         element = joint.find("origin")
         offset = self.numbers(element, "xyz", ORIGIN)
@@ -309,7 +305,7 @@ class UrdfTree:
             )
         return rpy_rotation(rpy), offset
 
-    def _axis(self, joint: Any) -> Float[np.ndarray, "3"]:
+    def _axis(self, joint: Any) -> Vector3:
         """Return the unit vector of a moving joint's axis."""
         kind = joint.get("type")
         if kind not in (*TURNING, "prismatic"):
@@ -330,7 +326,7 @@ class UrdfTree:
             )
         return without_rounding(axis / length)
 
-    def bodies(self, *, check: bool = False) -> Float[np.ndarray, "joints 10"]:
+    def bodies(self, *, check: bool = False) -> BodyParameters:
         """Return the parameters of all bodies; reject links that cannot exist if asked to."""
         parameters = np.zeros((len(self.joints), 10))
         for link, (body, rotation, position) in self.carriers.items():
@@ -398,8 +394,8 @@ class UrdfTree:
             array = np.array([float(word) for word in text.split()])
         except ValueError:
             array = np.zeros(0)
-        valid = ~np.isnan(array) if infinite else np.isfinite(array)
-        if array.shape != (len(default),) or not valid.all():
+        is_number = ~np.isnan(array) if infinite else np.isfinite(array)
+        if array.shape != (len(default),) or not is_number.all():
             words = "number" if len(default) == 1 else "numbers"
             raise InputError(
                 f"{self.place(element)}: `{key}` must hold {len(default)} finite "
@@ -418,9 +414,7 @@ def link_names(joint: Any) -> tuple[str, str]:
     return joint.find("parent").get("link"), joint.find("child").get("link")
 
 
-def _placed(
-    carrier: Placement, rotation: np.ndarray, position: np.ndarray
-) -> Placement:
+def _placed(carrier: Placement, rotation: Matrix3, position: Vector3) -> Placement:
     """Return the placement on a body of what is placed on one of its links."""
     body, R, r = carrier
     return Placement(body, without_rounding(R @ rotation), r + R @ position)
