@@ -143,11 +143,14 @@ def _distances_to_neighbours(robot: Robot, body: int) -> list[float]:
     """Return where along the axis the origin is nearest to that of the parent, or of a child."""
     if not robot.revolute[body]:
         return []
+    offset = np.asarray(robot.offset)
     axis = np.asarray(robot.axis[body])
-    to_parent = -(np.asarray(robot.rotation[body]) @ axis) @ robot.offset[body]
-    children = [child for child, p in enumerate(robot.parent) if p == body]
-    to_children = [axis @ robot.offset[child] for child in children]
-    distances = dict.fromkeys(float(x) for x in (to_parent, *to_children))
+    axis_in_parent = np.asarray(robot.rotation[body]) @ axis
+    distances = [-float(axis_in_parent @ offset[body])]
+    for child, parent in enumerate(robot.parent):
+        if parent == body:
+            distances.append(float(axis @ offset[child]))
+    distances = dict.fromkeys(distances)
     return [distance for distance in distances if abs(distance) > MIN_DISTANCE]
 
 

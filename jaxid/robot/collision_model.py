@@ -139,17 +139,21 @@ class CollisionModel(Hashable):
         self, ends: Float[AnyArray, "*batch capsules 2 3"]
     ) -> Float[Array, "*batch groups"]:
         """Return the clearances [m] for given ends of all axes on the ground [m]."""
-        gaps = jax.vmap(self._gaps)(jnp.reshape(ends, (-1, *ends.shape[-3:])))
+        *batch, capsules, _, _ = ends.shape
+        gaps = jax.vmap(self._gaps)(jnp.reshape(ends, (-1, capsules, 2, 3)))
         # All groups get the same number of pairs: the first one is repeated.
         size = max(len(group) for group in self.groups)
-        places = [group + group[:1] * (size - len(group)) for group in self.groups]
+        places = []
+        for group in self.groups:
+            padding = group[:1] * (size - len(group))
+            places.append(group + padding)
         gaps_of_groups = gaps[:, np.array(places)]
         # The derivative is that of one pair, also where several are equally near.
         minimum = jnp.argmin(
             jax.lax.stop_gradient(gaps_of_groups), axis=-1, keepdims=True
         )
         clearances = jnp.take_along_axis(gaps_of_groups, minimum, axis=-1)[..., 0]
-        return clearances.reshape(*ends.shape[:-3], len(self.groups))
+        return clearances.reshape(*batch, len(self.groups))
 
     def _gaps(self, ends: Float[Array, "capsules 2 3"]) -> Float[Array, " pairs"]:
         """Return the distance between the surfaces of each of the `pairs` in one pose [m]."""

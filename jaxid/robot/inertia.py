@@ -22,6 +22,14 @@ INERTIAL_NAMES = ("m", *(f"m{a}" for a in AXES), *"ABCDEF")
 INERTIAL_UNITS = ("kg", *("kg m",) * 3, *("kg m²",) * 6)
 BodyParameters = Float[AnyArray, "joints 10"]
 """Ten inertial parameters of each body of a robot."""
+SQUARES = ((0, 1, 2), (0, 1, 2))
+"""Rows and columns of A, B and C in the inertia tensor (Eq. 9)."""
+PRODUCTS = ((1, 0, 0), (2, 2, 1))
+"""Rows and columns of D, E and F, whose signs are opposite."""
+URDF_ORDER = ((0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2))
+"""Rows and columns of xx, xy, xz, yy, yz, zz."""
+PINOCCHIO_ORDER = ((0, 0, 1, 0, 1, 2), (0, 1, 1, 2, 2, 2))
+"""Rows and columns of xx, xy, yy, xz, yz, zz."""
 MAX_MASS = 1e5
 """Largest mass of a body of a robot [kg]."""
 
@@ -66,23 +74,24 @@ class Inertia(eqx.Module):
         mass = self.mass[..., None]
         point_mass = mass[..., None] * _moments_of_points(self.centre)
         tensor = self.tensor + point_mass
-        A, B, C = (tensor[..., k, k] for k in range(3))
-        D, E, F = (-tensor[..., i, k] for i, k in ((1, 2), (0, 2), (0, 1)))
-        moments = namespace(tensor).stack([A, B, C, D, E, F], axis=-1)
+        squares = tensor[..., *SQUARES]
+        products = -tensor[..., *PRODUCTS]
         xp = namespace(self.mass, self.centre, self.tensor)
-        return xp.concatenate([mass, mass * self.centre, moments], axis=-1)
+        parts = [mass, mass * self.centre, squares, products]
+        return xp.concatenate(parts, axis=-1)
 
     @property
     def pinocchio(self) -> Float[AnyArray, "*batch 10"]:
         """Dynamic parameters $(m, m r_c, I_{xx}, I_{xy}, I_{yy}, I_{xz}, I_{yz}, I_{zz})$."""
         p = self.parameters
-        J = inertia_tensor(p[..., 4:])[..., (0, 0, 1, 0, 1, 2), (0, 1, 1, 2, 2, 2)]
-        return namespace(p).concatenate([p[..., :4], J], axis=-1)
+        tensor = inertia_tensor(p[..., 4:])
+        moments = tensor[..., *PINOCCHIO_ORDER]
+        return namespace(p).concatenate([p[..., :4], moments], axis=-1)
 
     @property
     def moments(self) -> Float[AnyArray, "*batch 6"]:
         """Entries xx, xy, xz, yy, yz, zz of the tensor, the order of URDF [kg m²]."""
-        return self.tensor[..., (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)]
+        return self.tensor[..., *URDF_ORDER]
 
     def moved(self, rotation: Matrix3, position: Vector3) -> "Inertia":
         """Return the same body in the frame in which its present frame is placed."""

@@ -217,12 +217,14 @@ class _Writer:
             joint, master = pair
             self._add_mimic(joint, master, model.eq_data[constraint, :5])
         elif kind in (int(kinds.mjEQ_CONNECT), int(kinds.mjEQ_WELD)):
-            if model.eq_objtype[constraint] == int(self._mujoco.mjtObj.mjOBJ_SITE):
+            between_sites = int(self._mujoco.mjtObj.mjOBJ_SITE)
+            if model.eq_objtype[constraint] == between_sites:
                 pair = [int(model.site_bodyid[site]) for site in pair]
             # A mocap body is moved by a program: it is no part of the robot.
             if (model.body_mocapid[pair] < 0).all():
-                first, second = (self._links[body] for body in pair)
-                self.loops.append((self._name("equality", constraint), first, second))
+                name = self._name("equality", constraint)
+                first, second = pair
+                self.loops.append((name, self._links[first], self._links[second]))
 
     def _add_mimic(self, joint: int, master: int, polynomial: np.ndarray) -> None:
         """Write a constraint of a joint; it is exact where the mimicked joint is held.
@@ -238,10 +240,11 @@ class _Writer:
             low, high = -np.inf, np.inf
             if model.jnt_limited[master]:
                 low, high = model.jnt_range[master]
-            held = min(max(0.0, low), high)
-            shift = held - model.qpos0[model.jnt_qposadr[master]]
+            coordinate = min(max(0.0, low), high)
+            master_ref = model.qpos0[model.jnt_qposadr[master]]
             slope = polynomial[1]
-            change = np.polyval(polynomial[::-1], shift) - slope * held
+            value = np.polyval(polynomial[::-1], coordinate - master_ref)
+            change = value - slope * coordinate
             attributes["joint"] = self._joints[master].get("name")
         ref = model.qpos0[model.jnt_qposadr[joint]]
         attributes["multiplier"] = exact_text(slope)

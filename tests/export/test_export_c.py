@@ -78,23 +78,23 @@ def compiled(fit):
     return CompiledModel(fit, flags=["-O0"])
 
 
-def close(got, wanted, tolerance=1e-12):
+def close(values, expected, tolerance=1e-12):
     np.testing.assert_allclose(
-        got, wanted, rtol=0, atol=tolerance * np.abs(wanted).max()
+        values, expected, rtol=0, atol=tolerance * np.abs(expected).max()
     )
 
 
 def test_all_forms_agree_with_numpy(fit, compiled):
     base, model = fit.base, fit.base.model
     m = motion(model.robot.joints, 300)
-    wanted, p = fit.predict(m), fit.standard_parameters
+    expected, p = fit.predict(m), fit.standard_parameters
     state, p_b = (m.q, m.qd, m.qdd), np.tile(np.asarray(fit.parameters), (300, 1))
-    for found in (
+    for torques in (
         compiled.torque(*state),
         compiled.torque_of_parameters(*state, p_b),
         compiled.torque_of_masses(*state),
     ):
-        close(found, wanted)
+        close(torques, expected)
     close(compiled.regressor(*state), in_numpy(base, base.columns, *state))
     close(compiled.mass_matrix(m.q), in_numpy(model, model.inertia, m.q, shared=(p,)))
 
@@ -150,16 +150,16 @@ def test_the_file_compiles_without_warnings_and_checks_itself(small, tmp_path, d
         return done.returncode, done.stdout
 
     for language in (("-std=c99",), ("-x", "c++", "-std=c++11")):
-        code, said = check(*language)
-        assert code == 0, said
-        assert "this build is right" in said
+        code, output = check(*language)
+        assert code == 0, output
+        assert "this build is right" in output
     text = re.sub(
         r"(_torque_expected.*\n    \{)", r"\g<1>9", source.read_text("ascii"), count=1
     )
     source.write_text(text, "ascii")
-    code, said = check("-std=c99")
+    code, output = check("-std=c99")
     assert code == 1
-    assert "WRONG" in said
+    assert "WRONG" in output
     compiled, m = CompiledModel(small, double=double, flags=["-O1"]), motion(2, 50)
     close(
         compiled.torque(m.q, m.qd, m.qdd), small.predict(m), 1e-12 if double else 1e-5
@@ -193,8 +193,8 @@ def test_numbers_that_are_not_finite_give_nan(compiled, fit):
     for bad in (np.nan, np.inf, 1e30):
         q = np.zeros((1, n))
         q[0, 2] = bad
-        found = compiled.torque(q, np.zeros((1, n)), np.zeros((1, n)))
-        assert np.isnan(found).any()
+        torques = compiled.torque(q, np.zeros((1, n)), np.zeros((1, n)))
+        assert np.isnan(torques).any()
 
 
 @pytest.mark.parametrize("double", [True, False])
@@ -207,14 +207,14 @@ def test_friction_with_memory_follows_the_path_in_c_as_in_numpy(tmp_path, double
     q = np.sin(t * [1.1, 2.3]) * np.minimum(t, 3.0)  # ends with a slow part
     q[200:260] = q[200]
     m = jid.Motion(q, np.gradient(q, 0.015, axis=0), np.cos(3 * t) * [2.0, 1.0])
-    wanted = fit.predict(m)
+    expected = fit.predict(m)
     compiled = CompiledModel(fit, double=double, flags=["-O1"])
     s = [np.tanh(m.qd[:1] / 0.01)]
     for before, now in itertools.pairwise(q):
         s.append(compiled.advance(before[None], now[None], s[-1]))
     s, p = np.concatenate(s), np.tile(np.asarray(fit.parameters), (len(q), 1))
     tolerance = 1e-12 if double else 2e-4
-    for found in (
+    for torques in (
         compiled.torque(q, m.qd, m.qdd, s),
         compiled.torque_of_parameters(q, m.qd, m.qdd, p, s),
         compiled.torque_of_masses(q, m.qd, m.qdd, s),
@@ -222,7 +222,7 @@ def test_friction_with_memory_follows_the_path_in_c_as_in_numpy(tmp_path, double
         + compiled.torque(q, m.qd, m.qdd, s)
         - compiled.torque(q, m.qd, 0 * q, s),
     ):
-        close(found, wanted, tolerance)
+        close(torques, expected, tolerance)
     # At rest dry friction holds what the path has left.
     held = compiled.torque(q, 0 * q, 0 * q, s) - compiled.gravity(q)
     levels = [fit.base.names.index(f"fc{j}") for j in (1, 2)]
@@ -234,4 +234,4 @@ def test_friction_with_memory_follows_the_path_in_c_as_in_numpy(tmp_path, double
     subprocess.run([str(tmp_path / "check")], check=True, capture_output=True)
     if double:
         out = exported_function(fit).call(q, m.qd, m.qdd, s)
-        close(out, wanted)
+        close(out, expected)

@@ -68,9 +68,9 @@ def held(fit, m, *, drives):
     return forces
 
 
-def close(found, wanted, tolerance):
+def close(values, expected, tolerance):
     np.testing.assert_allclose(
-        found, wanted, rtol=0, atol=tolerance * np.abs(wanted).max()
+        values, expected, rtol=0, atol=tolerance * np.abs(expected).max()
     )
 
 
@@ -212,12 +212,13 @@ def test_a_urdf_of_another_robot_is_refused(fit, source, tmp_path):
 def mujoco_torques(mujoco, model, m):
     flags = mujoco.mjtDisableBit
     model.opt.disableflags |= flags.mjDSBL_FRICTIONLOSS | flags.mjDSBL_LIMIT
-    data, found = mujoco.MjData(model), []
+    data = mujoco.MjData(model)
+    torques = []
     for q, qd, qdd in zip(m.q, m.qd, m.qdd, strict=True):
         data.qpos[:], data.qvel[:], data.qacc[:] = q, qd, qdd
         mujoco.mj_inverse(model, data)
-        found.append(data.qfrc_inverse.copy())
-    return np.array(found)
+        torques.append(data.qfrc_inverse.copy())
+    return np.array(torques)
 
 
 @pytest.mark.parametrize("name", ["small", "panda"])

@@ -26,10 +26,10 @@ def brute_force(a, b, c, d):
 @pytest.mark.parametrize("scale", [1.0, 1e-6])
 def test_segments_agree_with_points_on_them_and_are_never_too_far(scale):
     ends = segments(0, 50, scale)
-    found = np.asarray(segment_distance(*ends))
+    distances = np.asarray(segment_distance(*ends))
     expected = np.array([brute_force(*ends[:, k]) for k in range(50)])
-    assert (found <= expected + 1e-15).all()
-    assert (found >= expected - 6e-3 * scale - 2 * ROUNDING).all()
+    assert (distances <= expected + 1e-15).all()
+    assert (distances >= expected - 6e-3 * scale - 2 * ROUNDING).all()
 
 
 SPECIAL = {
@@ -79,7 +79,7 @@ def a_box():
 def test_boxes_agree_with_coal():
     coal = pytest.importorskip("coal")
     box, ends = a_box(), segments(5, 80)[:2] * 1.5
-    found = np.asarray(box.distance(*map(jnp.asarray, ends)))
+    distances = np.asarray(box.distance(*map(jnp.asarray, ends)))
     place = coal.Transform3s(np.ascontiguousarray(box.rotation), box.centre)
     compared = 0
     for k in range(80):
@@ -88,9 +88,9 @@ def test_boxes_agree_with_coal():
         expected = coal.distance(*capsule, coal.Box(*box.size), place, request, result)
         if expected > 1e-3:
             compared += 1
-            assert found[k] == pytest.approx(expected, abs=3e-6)
+            assert distances[k] == pytest.approx(expected, abs=3e-6)
         else:
-            assert found[k] < 2e-3
+            assert distances[k] < 2e-3
     assert compared > 20
 
 
@@ -98,8 +98,8 @@ def test_the_depth_in_a_box_is_that_to_the_nearest_face():
     box = Box("box", centre=(0, 0, 0), size=(2, 2, 2))
     starts = np.array([[0.0, 0.0, 0.9], [0.0, 0.7, 0.0], [-3.0, 0.2, 0.1]])
     ends = np.array([*starts[:2], [3.0, 0.2, 0.1]])
-    found = jax.jit(lambda *x: box.distance(*x))(starts, ends)
-    np.testing.assert_allclose(found, [-0.1, -0.3, -0.8], atol=2e-6)
+    distances = jax.jit(lambda *x: box.distance(*x))(starts, ends)
+    np.testing.assert_allclose(distances, [-0.1, -0.3, -0.8], atol=2e-6)
 
 
 def test_ends_are_where_plain_numpy_puts_them():

@@ -41,8 +41,8 @@ def test_parameters_have_a_way_back(inertia, to):
 def test_a_moved_body_is_that_of_pinocchio(inertia):
     inertia = jax.tree.map(lambda x: x[0], inertia)
     R, r = pin.exp3(np.array([0.3, -0.5, 0.2])), np.array([0.1, 0.2, -0.4])
-    own = pin.Inertia(float(inertia.mass), inertia.centre, inertia.tensor)
-    expected = own.se3Action(pin.SE3(R, r)).toDynamicParameters()
+    peer = pin.Inertia(float(inertia.mass), inertia.centre, inertia.tensor)
+    expected = peer.se3Action(pin.SE3(R, r)).toDynamicParameters()
     np.testing.assert_allclose(inertia.moved(R, r).pinocchio, expected, atol=1e-13)
     J = inertia.tensor
     moments = [J[0, 0], J[0, 1], J[0, 2], J[1, 1], J[1, 2], J[2, 2]]

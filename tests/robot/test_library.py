@@ -88,9 +88,9 @@ def test_arms_from_tables_are_their_tables(facts, name):
 
 @pytest.mark.parametrize("name", ["panda", "ur10e", "lbr_iiwa14"])
 def test_published_limits(facts, name):
-    known = facts[name]
+    published = facts[name]
     limits = getattr(library, name.removeprefix("lbr_"))().limits
-    speed = known.get("qd_max", np.deg2rad(known.get("qd_max_deg", [])))
+    speed = published.get("qd_max", np.deg2rad(published.get("qd_max_deg", [])))
     np.testing.assert_allclose(limits.velocity, speed)
     for key, ours in (
         ("q_max", limits.position_max),
@@ -99,8 +99,8 @@ def test_published_limits(facts, name):
         ("jerk_max", limits.jerk),
         ("tau_max", limits.force),
     ):
-        if key in known:
-            np.testing.assert_allclose(ours, known[key])
+        if key in published:
+            np.testing.assert_allclose(ours, published[key])
 
 
 def test_ur10_has_the_limits_of_its_urdf():
@@ -132,7 +132,7 @@ def test_kr300_takes_the_recorded_angles_as_they_are(facts):
 
 
 def test_tx40_and_its_drives_are_those_of_the_data(shared_data, facts):
-    robot, known = library.tx40(), facts["tx40"]
+    robot, published = library.tx40(), facts["tx40"]
     urdf = load_urdf(
         shared_data / "tx40" / "tx40_mdh_modified.urdf", tip="link_6"
     ).snapped()
@@ -143,14 +143,16 @@ def test_tx40_and_its_drives_are_those_of_the_data(shared_data, facts):
     assert robot.limits.force.tolist() == urdf.limits.force.tolist()
     # The manufacturer's angles with the table's theta give the same arm as the drives'
     # angles.
-    A = np.diag(np.array(known["gear"], dtype=float))
+    A = np.diag(np.array(published["gear"], dtype=float))
     A[5, 4] = 32.0
     file = shared_data / "tx40" / "motor_position.csv"
     motor = np.loadtxt(file, delimiter=",", skiprows=1, max_rows=20000)[::500]
     q = robot.drives.joint_angles(motor)
     assert ((q > robot.limits.position_min) & (q < robot.limits.position_max)).all()
-    with_theta = dh_frames(known["rows"], np.linalg.solve(A, motor[7]), "modified")[-1]
-    with_theta[2, 3] += known["base_z"]
+    with_theta = dh_frames(published["rows"], np.linalg.solve(A, motor[7]), "modified")[
+        -1
+    ]
+    with_theta[2, 3] += published["base_z"]
     np.testing.assert_allclose(tip_transform(robot, q[7]), with_theta, atol=1e-12)
 
 

@@ -84,8 +84,10 @@ def random_motion(joints):
 def assert_same_forces(path, robot, motion, held=None, **chain):
     model = jid.Model(robot, (jid.RigidBodies(),))
     ours = model.inverse_dynamics(jid.robots.urdf_parameters(path, **chain), motion)
-    wanted = mujoco_forces(path, robot.joint_names, motion, held)
-    np.testing.assert_allclose(ours, wanted, rtol=0, atol=1e-12 * np.abs(wanted).max())
+    expected = mujoco_forces(path, robot.joint_names, motion, held)
+    np.testing.assert_allclose(
+        ours, expected, rtol=0, atol=1e-12 * np.abs(expected).max()
+    )
 
 
 def test_forces_limits_and_gravity_are_those_of_mujoco(write):

@@ -46,6 +46,6 @@ def test_a_tool_at_the_end_effector_weighs_where_the_end_effector_is():
     np.testing.assert_allclose(
         body @ [*carried.tool.centre_of_mass, 1.0], on_ground, atol=1e-14
     )
-    kept = body[:3, :3] @ carried.tool.inertia @ body[:3, :3].T
+    expected = body[:3, :3] @ carried.tool.inertia @ body[:3, :3].T
     tip = tip_transform(robot, q)[:3, :3]
-    np.testing.assert_allclose(kept, tip @ INERTIA @ tip.T, atol=1e-15)
+    np.testing.assert_allclose(expected, tip @ INERTIA @ tip.T, atol=1e-15)

@@ -144,15 +144,15 @@ def test_grippers_that_the_chain_leaves_out_count_as_bodies_that_collide(tmp_pat
     path = written(tmp_path)
     path.write_text(path.read_text().replace("</robot>", f"{fingers}</robot>"))
     arm = load_urdf(path, tip="tool")
-    found = {c.name: c for c in fit_capsules(path, tip="tool")}
+    capsules = {c.name: c for c in fit_capsules(path, tip="tool")}
     assert (
-        found["left"].body
-        == found["right"].body
-        == found["tool"].body
+        capsules["left"].body
+        == capsules["right"].body
+        == capsules["tool"].body
         == arm.joints - 1
     )
     # They are held as near to zero as they can be.
-    shift = np.array(found["left"].start) - found["tool"].start
+    shift = np.array(capsules["left"].start) - capsules["tool"].start
     np.testing.assert_allclose(np.linalg.norm(shift), np.hypot(0.12, 0.1), atol=1e-9)
 
 
