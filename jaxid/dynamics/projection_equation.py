@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxid.arrays import AnyArray, Float, Joints
-from jaxid.robot.forward_and_inverse_kinematics import placement_in_parent, placements
+from jaxid.robot.forward_kinematics import placement_in_parent, placements
 from jaxid.robot.inertia import inertia_tensor
 from jaxid.robot.robot import Robot
 from jaxid.robot.rotations import skew

@@ -21,7 +21,7 @@ from jaxid.dynamics.terms import AbstractTransition, Reversal
 from jaxid.errors import InputError
 from jaxid.program.gradient import pull_back
 from jaxid.robot.collision import CollisionModel
-from jaxid.robot.forward_and_inverse_kinematics import tip_placement
+from jaxid.robot.forward_kinematics import tip_placement
 from jaxid.robot.robot import Robot
 from jaxid.trajectory.fourier import complete_limits
 

@@ -14,7 +14,7 @@ from jaxid.dynamics.dispatch import in_numpy
 from jaxid.dynamics.motion import Motion
 from jaxid.excitation.constraints import tip_motion
 from jaxid.robot.collision import GROUND, Box, Capsule, CollisionModel, HalfSpace
-from jaxid.robot.forward_and_inverse_kinematics import placements, tip_placement
+from jaxid.robot.forward_kinematics import placements, tip_placement
 from jaxid.robot.limits_and_drives import Limits
 from jaxid.robot.robot import Robot
 

@@ -12,7 +12,7 @@ import numpy as np
 from jaxid.arrays import AnyArray, Array, Float, Hashable, Joints, double_precision
 from jaxid.errors import InputError
 
-from .forward_and_inverse_kinematics import placements
+from .forward_kinematics import placements
 from .robot import Robot
 from .shapes import GROUND, Box, Capsule, HalfSpace, segment_distance
 

@@ -8,7 +8,7 @@ import numpy as np
 from jaxid.arrays import AnyArray, Float, Joints, Numbers, is_traced
 from jaxid.errors import InputError
 
-from .forward_and_inverse_kinematics import tip_jacobian
+from .forward_kinematics import tip_jacobian
 from .inertia import BodyParameters, Inertia
 from .limits_and_drives import DOUBTFUL_LENGTH, Limits, owners, range_fault
 from .robot import Robot

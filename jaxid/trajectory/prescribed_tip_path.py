@@ -9,7 +9,7 @@ from scipy.interpolate import make_interp_spline
 
 from jaxid.arrays import AnyArray, Float, Numbers, as_array
 from jaxid.errors import InputError
-from jaxid.robot.forward_and_inverse_kinematics import inverse_kinematics_along
+from jaxid.robot.inverse_kinematics import inverse_kinematics_along
 from jaxid.robot.robot import Robot
 
 from .spline import PiecewisePolynomial, spline_polynomials

@@ -8,13 +8,13 @@ from jax import numpy as jnp
 from scipy.spatial.transform import Rotation
 
 from jaxid.robot import library
-from jaxid.robot.forward_and_inverse_kinematics import (
-    inverse_kinematics_along,
+from jaxid.robot.forward_kinematics import (
     placements,
     tip_curvature,
     tip_jacobian,
     tip_placement,
 )
+from jaxid.robot.inverse_kinematics import inverse_kinematics_along
 from jaxid.robot.limits_and_drives import Limits
 
 RAIL = library.tx90l_on_rail()

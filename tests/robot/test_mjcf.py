@@ -124,7 +124,7 @@ def test_a_site_is_a_tip_and_leaves_the_fingers_out(write):
     for name, value in zip(robot.joint_names, q, strict=True):
         data.joint(name).qpos = value
     mujoco.mj_forward(model, data)
-    from jaxid.robot.forward_and_inverse_kinematics import tip_placement
+    from jaxid.robot.forward_kinematics import tip_placement
 
     R, r = tip_placement(robot, q)
     np.testing.assert_allclose(r, data.site("flange").xpos, atol=1e-14)

@@ -9,7 +9,7 @@ from urdf_text import arm, inertial, joint, link, robot
 from jaxid.errors import InputError
 from jaxid.robot.capsule_fit import fit_capsules
 from jaxid.robot.collision import Box, Capsule, CollisionModel, HalfSpace
-from jaxid.robot.forward_and_inverse_kinematics import inverse_kinematics_along
+from jaxid.robot.inverse_kinematics import inverse_kinematics_along
 from jaxid.robot.library import from_dh, panda, planar_arm
 from jaxid.robot.limits_and_drives import Drives, Limits
 from jaxid.robot.robot import Robot, Tool

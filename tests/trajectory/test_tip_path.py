@@ -6,7 +6,7 @@ import pytest
 
 from jaxid.excitation.constraints import tip_motion
 from jaxid.robot import library
-from jaxid.robot.forward_and_inverse_kinematics import tip_placement
+from jaxid.robot.forward_kinematics import tip_placement
 from jaxid.trajectory.prescribed_tip_path import iso9283_path, joint_path
 
 ROBOT = library.tx90l_on_rail()

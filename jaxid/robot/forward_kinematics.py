@@ -1,0 +1,113 @@
+"""Forward kinematics: placements of all frames, and their derivatives by the joints.
+
+Placements are written on 3-vectors for one sample: batch with `jax.vmap`, differentiate
+with `jax.grad`. The Jacobian of the end-effector is in NumPy, for many poses at once,
+where compiling would take longer than computing.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxid.arrays import AnyArray, Float, Joints, Matrix3, Vector3
+
+from .robot import Robot
+from .rotations import rotation_about
+
+
+def placement_in_parent(
+    robot: Robot, body: int, q: Float[AnyArray, ""]
+) -> tuple[Matrix3, Vector3]:
+    """Return attitude and origin [m] of a body in its parent, moved by its joint's coordinate."""
+    R = robot.rotation[body]
+    r = robot.offset[body]
+    axis = robot.axis[body]
+    if robot.revolute[body]:
+        return R @ rotation_about(axis, q), r
+    return R, r + R @ axis * q
+
+
+def placements(
+    robot: Robot, q: Joints
+) -> tuple[Float[AnyArray, "joints 3 3"], Float[AnyArray, "joints 3"]]:
+    """Return attitudes and origins [m] of all bodies in the frame of the ground."""
+    q = jnp.asarray(q)
+    rotations, origins = [], []
+    for i, parent in enumerate(robot.parent):
+        R, r = placement_in_parent(robot, i, q[i])
+        if parent >= 0:
+            R = rotations[parent] @ R
+            r = origins[parent] + rotations[parent] @ r
+        rotations.append(R)
+        origins.append(r)
+    return jnp.stack(rotations), jnp.stack(origins)
+
+
+def tip_placement(robot: Robot, q: Joints) -> tuple[Matrix3, Vector3]:
+    """Return attitude and position [m] of the end-effector in the frame of the ground."""
+    rotations, origins = placements(robot, q)
+    R = rotations[robot.tip_body]
+    return R @ robot.tip_rotation, origins[robot.tip_body] + R @ robot.tip_offset
+
+
+class TipJacobian(NamedTuple):
+    """Placements of the end-effector in some poses, and their derivatives by the joints.
+
+    Attributes:
+        rotation: Attitudes on the ground.
+        position: Positions on the ground [m].
+        velocity: Velocities of the origin by the rates of the joints.
+        turn: Angular velocities by the rates of the joints.
+    """
+
+    rotation: Float[np.ndarray, "poses 3 3"]
+    position: Float[np.ndarray, "poses 3"]
+    velocity: Float[np.ndarray, "poses joints 3"]
+    turn: Float[np.ndarray, "poses joints 3"]
+
+
+def tip_jacobian(robot: Robot, q: Float[np.ndarray, "poses joints"]) -> TipJacobian:
+    """Return placements of the end-effector and their derivatives, in NumPy."""
+    offset = np.asarray(robot.offset)
+    rotation = np.asarray(robot.rotation)
+    axis = np.asarray(robot.axis)
+
+    R = np.broadcast_to(np.eye(3), (len(q), 3, 3))
+    r = np.zeros((len(q), 3))
+    origin, turn, slide = np.zeros((3, *q.shape, 3))
+    for i in robot.ancestors[robot.tip_body]:
+        r = r + R @ offset[i]
+        R = R @ rotation[i]
+        direction = R @ axis[i]
+        origin[:, i] = r
+        if robot.revolute[i]:
+            turn[:, i] = direction
+            R = R @ rotation_about(axis[i], q[:, i])
+        else:
+            slide[:, i] = direction
+            r = r + direction * q[:, i, None]
+
+    position = r + R @ np.asarray(robot.tip_offset)
+    lever = position[:, None] - origin
+    velocity = slide + np.cross(turn, lever)
+    return TipJacobian(R @ np.asarray(robot.tip_rotation), position, velocity, turn)
+
+
+def tip_curvature(
+    tip: TipJacobian,
+    force: Float[np.ndarray, "poses 3"],
+    moment: Float[np.ndarray, "poses 3"],
+) -> Float[np.ndarray, "poses joints joints"]:
+    """Return the second derivatives of the placement by the joints, times force and moment.
+
+    Attitudes count as rotation vectors from the attitude of the end-effector.
+    """
+    # An earlier joint carries the later ones with it, so that half of the matrix is
+    # enough. Two turns in a row differ from their sum by half of their bracket.
+    force_arm = np.cross(force[:, None], tip.turn)
+    moment_arm = np.cross(moment[:, None], tip.turn)
+    of_position = np.einsum("pik,pjk->pij", force_arm, tip.velocity)
+    of_attitude = np.einsum("pik,pjk->pij", moment_arm, tip.turn) / 2
+    upper = np.triu(of_position + of_attitude)
+    return upper + np.swapaxes(np.triu(upper, 1), 1, 2)
