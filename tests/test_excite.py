@@ -72,7 +72,10 @@ seed = 5
 FREE = EXPERIMENT.replace("[4]", "[4]\nforce = [inf]").replace(
     "seed", "noise = [0.12]\nseed"
 )
-STAGES = {"SCHEDULE": search.SCHEDULE, "CONSTRAINED": search.CONSTRAINED}
+STAGES = {
+    "SCHEDULE": search.SCHEDULE,
+    "CONSTRAINED_SCHEDULE": search.CONSTRAINED_SCHEDULE,
+}
 LINK = """<link name="l{k}"><inertial><origin xyz="0 0 0.2"/><mass value="1"/><inertia ixx="0.1"
  iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial>{shape}</link>"""
 SHAPE = """<collision><origin xyz="0 0 0.2"/><geometry><cylinder radius="0.04" length="0.3"/>

@@ -15,14 +15,29 @@ from jaxid.robot.limits_and_drives import Limits
 from jaxid.trajectory.fourier import FourierBasis
 from jaxid.trajectory.trajectory import AbstractBasis, LinearTrajectory
 
+from .candidates import (
+    Candidates,
+    criterion_values,
+    evaluate,
+    evaluate_within_limits,
+    shrink_to_constraints,
+)
 from .constraints import AbstractConstraint
 from .criteria import AbstractCriterion
-from .design_result import SETTLED, DesignStatus, ExcitationPlan
-from .problem import ExcitationProblem, evaluate, evaluate_within_limits
-from .search import Search
+from .design_result import DesignStatus, ExcitationPlan
+from .problem import ExcitationProblem
+from .search import count_steps, first_motions, search
 
 Solver = Callable[[ExcitationProblem, Float[AnyArray, "starts scaled"]], AnyArray]
 """A solver of excitation problems: from random motions to better ones."""
+
+
+SEARCH_SHARE = 0.65
+"""Share of a limited time after which only the limits are kept more closely."""
+MIN_IMPROVEMENT = 2e-3
+"""Relative improvement in the last quarter of the steps below which a design has converged."""
+MAX_SHRUNK = 4
+"""Motions that are made smaller where none keeps all constraints."""
 
 
 class DesignProgress(NamedTuple):
@@ -151,69 +166,109 @@ def minimise(
     ):
         if value < minimum:
             raise InputError(f"`{name}` must be at least {minimum}, but is {value}.")
-    key = jax.random.key(0) if key is None else key
     if begin is not None and begin.coefficients.shape != problem.limits.shape:
         raise InputError("`begin` must be a motion of the problem's basis.")
-    x = None if begin is None else problem.limits.scaled(begin.coefficients)
+    key = jax.random.key(0) if key is None else key
+    x = problem.limits.random(key, starts)
+    values = criterion_values(problem, x)
+    median_motion = x[np.argsort(values)[starts // 2]]
     if solver is None:
-        search = Search(problem, key, starts, generations, x, seconds)
-        status = _run(search, problem, seconds, progress)
-        best, first, history = search.best, search.first, search.history
+        random = np.random.default_rng(np.asarray(jax.random.key_data(key)))
+        outcome = _run_search(problem, x, begin, generations, random, seconds, progress)
     else:
-        x = problem.limits.random(key, starts)
-        random = evaluate(problem, x)
-        best = evaluate_within_limits(problem, solver(problem, x))
-        status, first = DesignStatus.GIVEN, random.value
-        history = [one.best_value for one in (random, best)]
-    x = np.asarray(best.x[int(best.order()[0])])
-    median = int(np.argsort(np.asarray(first))[starts // 2])
+        outcome = _run_solver(problem, x, solver)
+    motion = outcome.best.best_motion
+    unknown = np.full(problem.base.size, np.nan)
     plan = ExcitationPlan(
         base=problem.base,
-        trajectory=problem.trajectory(x),
+        trajectory=problem.trajectory(motion),
         criterion=problem.criterion,
         limits=problem.limits,
-        information=problem.information(x),
-        reference=problem.information(problem.limits.random(key, starts)[median]),
+        information=problem.information(motion),
+        reference=problem.information(median_motion),
         noise=problem.noise,
         samples=problem.samples,
-        findings=tuple(problem.findings(x)),
-        nominal=np.full(problem.base.size, np.nan)
-        if nominal is None
-        else np.asarray(nominal),
-        status=status,
-        history=np.asarray(history),
+        findings=tuple(problem.findings(motion)),
+        nominal=unknown if nominal is None else np.asarray(nominal),
+        status=outcome.status,
+        history=np.asarray(outcome.history),
     )
     if throw and not plan.feasible:
-        unkept = "; ".join(plan.diagnosis)
-        if status is DesignStatus.STOPPED:
+        excess = "; ".join(plan.diagnosis)
+        if plan.interrupted:
             raise KeyboardInterrupt(
-                f"stopped before a motion kept all limits: {unkept}"
+                f"stopped before a motion kept all limits: {excess}"
             )
-        raise InputError(f"no motion was found that keeps all limits: {unkept}")
+        raise InputError(f"no motion was found that keeps all limits: {excess}")
     return plan
 
 
-def _run(
-    search: Search,
+class Outcome(NamedTuple):
+    """What a search or another solver has found."""
+
+    best: Candidates
+    history: list[float]  # value of the criterion of the best motion after each step
+    status: DesignStatus
+
+
+def _run_solver(
+    problem: ExcitationProblem, x: Float[np.ndarray, "starts scaled"], solver: Solver
+) -> Outcome:
+    """Improve motions by a given solver, then make them keep the limits of the joints."""
+    best = evaluate_within_limits(problem, solver(problem, x))
+    history = [evaluate(problem, x).best_value, best.best_value]
+    return Outcome(best, history, DesignStatus.GIVEN)
+
+
+def _run_search(
     problem: ExcitationProblem,
+    x: Float[np.ndarray, "starts scaled"],
+    begin: LinearTrajectory | None,
+    generations: int,
+    random: np.random.Generator,
     seconds: float | None,
     progress: Callable[[DesignProgress], None] | None,
-) -> DesignStatus:
+) -> Outcome:
     """Do all steps of a search, or those until the time is over or Ctrl-C."""
-    until = math.inf if seconds is None else time.monotonic() + seconds
+    start_time = time.monotonic()
+    duration = math.inf if seconds is None else seconds
+    deadline = start_time + SEARCH_SHARE * duration
+    if problem.constraints:
+        x = first_motions(problem, random, x)
+    if begin is not None:
+        x[0] = problem.limits.scaled(begin.coefficients)
+    # With constraints the search looks for one motion that keeps them first.
+    best = evaluate_within_limits(problem, x[:1] if problem.constraints else x)
+    steps = count_steps(problem, len(x), generations)
+    history = []
     try:
-        for task in search.run():
+        for step in search(problem, x, best, generations, random, deadline):
+            best = step.best
+            history.append(best.best_value)
+            elapsed = time.monotonic() - start_time
             if progress is not None:
-                x = search.best.x[int(search.best.order()[0])]
-                known = search.history[-1], search.feasible, problem.trajectory(x)
-                progress(DesignProgress(search.spent, task, *known))
-            if time.monotonic() > until and search.feasible:
+                done = (len(history) - 1) / steps
+                fraction = min(done if seconds is None else elapsed / seconds, 1.0)
+                trajectory = problem.trajectory(best.best_motion)
+                value = best.best_value
+                progress(
+                    DesignProgress(
+                        fraction, step.task, value, best.is_feasible, trajectory
+                    )
+                )
+            if elapsed > duration and best.is_feasible:
                 break
     except KeyboardInterrupt:
-        return DesignStatus.STOPPED
-    search.finish()
-    history = search.history
-    improved = (
-        history[-1] < (1.0 - SETTLED) * history[len(history) - 1 - len(history) // 4]
-    )
-    return DesignStatus.IMPROVING if improved else DesignStatus.CONVERGED
+        return Outcome(best, history, DesignStatus.STOPPED)
+    if not best.is_feasible:
+        for place in best.order()[:MAX_SHRUNK]:
+            smaller = shrink_to_constraints(problem, best.x[place])
+            best = best.improved(np.array([place]), smaller)
+    return Outcome(best, history, _status(history))
+
+
+def _status(history: list[float]) -> DesignStatus:
+    """Return whether the last quarter of the steps improved the motion."""
+    before = history[len(history) - 1 - len(history) // 4]
+    is_improving = history[-1] < (1.0 - MIN_IMPROVEMENT) * before
+    return DesignStatus.IMPROVING if is_improving else DesignStatus.CONVERGED

@@ -31,8 +31,6 @@ from .criteria import CRITERIA, AbstractCriterion, Information, standard_deviati
 
 VAGUE = 0.5
 """Relative standard deviation above which a parameter counts as hardly determined."""
-SETTLED = 2e-3
-"""Relative improvement in the last quarter of the steps below which a design has converged."""
 
 
 class DesignStatus(enum.StrEnum):
@@ -253,7 +251,8 @@ class ExcitationPlan(Summarised, eqx.Module):
 def _findings_table(findings: tuple[Finding, ...]) -> Table:
     """Return a table of how near a motion comes to the limits of constraints."""
     limits = [
-        f"{'≥' if one.least else '≤'} {one.limit:.4g} {one.unit}" for one in findings
+        f"{'≥' if one.is_lower_limit else '≤'} {one.limit:.4g} {one.unit}"
+        for one in findings
     ]
     used = [
         f"{100 * x.used:.1f}" if math.isfinite(x.used) else MISSING for x in findings

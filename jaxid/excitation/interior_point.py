@@ -22,15 +22,16 @@ from jaxid.arrays import Float
 
 from .coefficient_limits import Grid
 
-STIFFNESS = 0.3  # initial curvature: small, so that first steps are large
+INITIAL_CURVATURE = 0.3  # small, so that first steps are large
 TO_BOUNDARY = 0.995  # fraction of the way to the next limit that a step may go
 DECREASE = 1e-4  # fraction of the promised decrease that a step must give
-DAMPING = (
-    0.1  # fraction of the expected curvature along a step below which it is damped
-)
+DAMPING = 0.1  # fraction of the expected curvature below which a step is damped
 PATIENCE = 8  # refused steps in a row after which the curvature is forgotten
 COOLING = 0.9  # factor of the barrier after a good step
-INSIDE = 0.985  # fraction of the bound within which a stage starts
+MIN_GOOD_LENGTH = 0.1  # length from which a step is a good one
+START_FRACTION = 0.985  # fraction of the bound within which a stage starts
+CENTRALITY = 1e3  # factor by which multipliers may differ from the central path
+RIDGE = 1e-9  # added to the matrix, relative to its mean diagonal entry
 
 
 class Evaluation(NamedTuple):
@@ -50,28 +51,30 @@ are any.
 """
 
 
-class State(NamedTuple):
-    """State of one start.
+class Parts(NamedTuple):
+    """The numbers of inequalities by their kinds."""
 
-    `y`, `slack`, `evaluation` and `duals` are the present point, `step`, `dual_step`,
-    `length` and `dual_length` the next trial, `slope` is the derivative of the merit
-    along the step, `refused` counts refused steps in a row, and `fresh` says that the
-    point is yet to be evaluated.
-    """
+    limits: Float[np.ndarray, " limits"]
+    constraints: Float[np.ndarray, " constraints"]
+    slack: Float[np.ndarray, " slacks"]
+
+
+class Iterate(NamedTuple):
+    """Present point of one start, with its multipliers, and the step that is tried next."""
 
     y: Float[np.ndarray, " scaled"]
     slack: Float[np.ndarray, " slacks"]
     evaluation: Evaluation
-    duals: Inequalities
-    curvature: Float[np.ndarray, "scaled scaled"]
-    barrier: float
+    duals: Inequalities  # multipliers
+    curvature: Float[np.ndarray, "scaled scaled"]  # of the Lagrangian
+    barrier: float  # weight of the logarithmic barrier
     step: Float[np.ndarray, " scaled_and_slack"]
     dual_step: Inequalities
-    length: float = 0.0
+    length: float = 0.0  # fraction of the step that is tried
     dual_length: float = 0.0
-    slope: float = 0.0
-    refused: int = 0
-    fresh: bool = True
+    slope: float = 0.0  # derivative of the merit along the step
+    refusals: int = 0  # refused steps in a row
+    needs_evaluation: bool = True  # whether the point itself is to be evaluated next
 
     @property
     def trial(self) -> Float[np.ndarray, " scaled"]:
@@ -84,7 +87,7 @@ class Stage(NamedTuple):
 
     bound: float  # multiple to which limits are relaxed or tightened
     barrier: float  # weight of the logarithmic barrier at the start
-    least: float  # weight below which the barrier does not fall
+    min_barrier: float  # weight below which the barrier does not fall
     iterations: int  # largest number of iterations
     sharpness: float = 4.0  # sharpness of smooth extremes in the objective
     penalty: float = 10.0  # penalty of the slack by which constraints are exceeded
@@ -92,190 +95,269 @@ class Stage(NamedTuple):
 
 def begin(
     grid: Grid, y: Float[np.ndarray, "starts scaled"], constraints: int = 0
-) -> list[State]:
-    """Return the state of some starts before the first stage, with a number of constraints."""
-    size, slack = np.shape(y)[1], np.zeros(1 if constraints else 0)
+) -> list[Iterate]:
+    """Return the iterates of some starts before the first stage, with a number of constraints."""
+    size = np.shape(y)[1]
+    slack = np.zeros(1 if constraints else 0)
     duals = np.zeros(2 * grid.c.size + constraints + len(slack))
-    none = Evaluation(
-        0.0, np.zeros(size), np.zeros(constraints), np.zeros((constraints, size))
-    )
-    curvature, step = STIFFNESS * np.eye(size), np.zeros(size + len(slack))
+    no_slopes = np.zeros((constraints, size))
+    evaluation = Evaluation(0.0, np.zeros(size), np.zeros(constraints), no_slopes)
+    curvature = INITIAL_CURVATURE * np.eye(size)
+    step = np.zeros(size + len(slack))
     return [
-        State(np.array(x), slack, none, duals, curvature, 0.0, step, duals) for x in y
+        Iterate(np.array(point), slack, evaluation, duals, curvature, 0.0, step, duals)
+        for point in y
     ]
 
 
 def run(
     grid: Grid,
     objective: Callable[[np.ndarray, Sequence[int]], Sequence[Evaluation]],
-    states: list[State],
+    iterates: list[Iterate],
     stage: Stage,
-) -> list[State]:
+) -> list[Iterate]:
     """Move the starts inside the bound of a stage, then iterate until all have converged.
 
     The objective evaluates points [points, scaled] of starts with these numbers.
     """
-    states = [_begin_stage(grid, stage, one) for one in states]
+    iterates = [_begin_stage(grid, stage, iterate) for iterate in iterates]
     for _ in range(stage.iterations):
-        active = [k for k, one in enumerate(states) if not _has_converged(stage, one)]
+        active = [
+            k for k, each in enumerate(iterates) if not _has_converged(stage, each)
+        ]
         if not active:
             break
-        found = objective(np.array([states[k].trial for k in active]), active)
-        for k, evaluation in zip(active, found, strict=True):
+        points = np.array([iterates[k].trial for k in active])
+        evaluations = objective(points, active)
+        for k, evaluation in zip(active, evaluations, strict=True):
             with np.errstate(all="ignore"):
-                states[k] = _update(grid, stage, states[k], evaluation)
-    return states
+                iterates[k] = _update(grid, stage, iterates[k], evaluation)
+    return iterates
 
 
-def _has_converged(stage: Stage, one: State) -> bool:
+def _has_converged(stage: Stage, iterate: Iterate) -> bool:
     """Return whether the promised decrease is rounding."""
-    settled = one.barrier <= stage.least and not one.fresh
-    return settled and abs(one.slope) <= 1e-14 * (1.0 + abs(one.evaluation.value))
+    if iterate.barrier > stage.min_barrier or iterate.needs_evaluation:
+        return False
+    return abs(iterate.slope) <= 1e-14 * (1.0 + abs(iterate.evaluation.value))
 
 
-def _begin_stage(grid: Grid, stage: Stage, one: State) -> State:
+def _begin_stage(grid: Grid, stage: Stage, iterate: Iterate) -> Iterate:
     """Move one start inside the bound, with multipliers on the central path."""
-    y = np.asarray(grid.scale_into_limits(one.y, INSIDE * (stage.bound * grid.bound)))
-    central, duals = stage.barrier / _room(grid, stage, y), np.array(one.duals)
-    limits = duals[: len(central)]
-    moved = not limits.any() or (y != one.y).any()
-    limits[:] = central if moved else np.clip(limits, central / 1e3, central * 1e3)
-    return one._replace(
+    bound = START_FRACTION * (stage.bound * grid.bound)
+    y = np.asarray(grid.scale_into_limits(iterate.y, bound))
+    central = stage.barrier / _limit_room(grid, stage, y)
+    duals = np.array(iterate.duals)
+    limit_duals = duals[: len(central)]
+    if not limit_duals.any() or (y != iterate.y).any():
+        limit_duals[:] = central
+    else:
+        limit_duals[:] = _near_central(limit_duals, central)
+    return iterate._replace(
         y=y,
         duals=duals,
         barrier=stage.barrier,
-        step=np.zeros_like(one.step),
+        step=np.zeros_like(iterate.step),
         length=0.0,
-        fresh=True,
+        needs_evaluation=True,
     )
 
 
-def _update(grid: Grid, stage: Stage, old: State, evaluation: Evaluation) -> State:
+def _update(
+    grid: Grid, stage: Stage, iterate: Iterate, evaluation: Evaluation
+) -> Iterate:
     """Take the step of one start, or shorten it."""
-    trial = old.trial
-    slack = _cheapest_slack(old.slack, evaluation.excess, stage.penalty, old.barrier)
-    room = _room(grid, stage, trial, slack.sum() - evaluation.excess, slack)
-    if old.fresh:
-        duals = old.barrier / room
-        duals[: 2 * grid.c.size] = old.duals[: 2 * grid.c.size]
-        begun = old._replace(y=trial, slack=slack, evaluation=evaluation, duals=duals)
-        return _directed(grid, stage, begun._replace(refused=0, fresh=False), room)
-    before = _room(
-        grid, stage, old.y, old.slack.sum() - old.evaluation.excess, old.slack
+    slack = _cheapest_slack(stage, iterate, evaluation.excess)
+    room = _room(grid, stage, iterate.trial, evaluation, slack)
+    if iterate.needs_evaluation:
+        duals = iterate.barrier / room
+        limits = slice(2 * grid.c.size)
+        duals[limits] = iterate.duals[limits]
+        evaluated = iterate._replace(
+            y=iterate.trial,
+            slack=slack,
+            evaluation=evaluation,
+            duals=duals,
+            refusals=0,
+            needs_evaluation=False,
+        )
+        return _with_step(grid, stage, evaluated, room)
+
+    present_room = _room(grid, stage, iterate.y, iterate.evaluation, iterate.slack)
+    merit = _merit(stage, iterate, iterate.evaluation, iterate.slack, present_room)
+    trial_merit = _merit(stage, iterate, evaluation, slack, room)
+    promised = DECREASE * iterate.length * iterate.slope
+    rounding = 1e-10 * abs(merit)
+    is_finite = math.isfinite(evaluation.value) and bool(
+        np.isfinite(evaluation.gradient).all()
     )
-    merit = _merit(old.evaluation, old.slack, before, stage.penalty, old.barrier)
-    new = _merit(evaluation, slack, room, stage.penalty, old.barrier)
-    promised = DECREASE * old.length * old.slope
-    finite = math.isfinite(evaluation.value) and np.isfinite(evaluation.gradient).all()
-    if finite and new <= merit + promised + 1e-10 * abs(merit):
-        return _directed(grid, stage, _taken(stage, old, slack, evaluation, room), room)
-    if old.refused >= PATIENCE:
-        flat = np.eye(len(trial)) * np.trace(old.curvature) / len(trial)
-        return _directed(grid, stage, old._replace(curvature=flat, refused=0), before)
-    # A refused step is shortened to the minimum of a parabola through what is known.
-    shorter = -old.slope * old.length**2 / (2 * (new - merit - old.slope * old.length))
-    least, most = 0.1 * old.length, 0.5 * old.length
-    shorter = float(np.clip(shorter, least, most)) if math.isfinite(shorter) else least
-    return old._replace(length=shorter, refused=old.refused + 1)
+    if is_finite and trial_merit <= merit + promised + rounding:
+        taken = _take_step(stage, iterate, slack, evaluation, room)
+        return _with_step(grid, stage, taken, room)
+    if iterate.refusals >= PATIENCE:
+        size = len(iterate.y)
+        mean_curvature = np.trace(iterate.curvature) / size
+        forgetful = iterate._replace(
+            curvature=np.eye(size) * mean_curvature, refusals=0
+        )
+        return _with_step(grid, stage, forgetful, present_room)
+    length = _shorter_length(iterate, trial_merit - merit)
+    return iterate._replace(length=length, refusals=iterate.refusals + 1)
 
 
-def _taken(
+def _shorter_length(iterate: Iterate, increase: float) -> float:
+    """Return the length to the minimum of a parabola through what is known of the merit."""
+    length = iterate.length
+    slope = iterate.slope
+    minimum = -slope * length**2 / (2 * (increase - slope * length))
+    if not math.isfinite(minimum):
+        return 0.1 * length
+    return float(np.clip(minimum, 0.1 * length, 0.5 * length))
+
+
+def _take_step(
     stage: Stage,
-    old: State,
+    iterate: Iterate,
     slack: np.ndarray,
     evaluation: Evaluation,
     room: Inequalities,
-) -> State:
-    """Return the state of one start after its step was taken."""
-    barrier = max(stage.least, old.barrier * (COOLING if old.length > 0.1 else 1.0))
-    central = barrier / room
-    duals = np.clip(
-        old.duals + old.dual_length * old.dual_step, central / 1e3, central * 1e3
-    )
+) -> Iterate:
+    """Return one start after its step was taken."""
+    cooling = COOLING if iterate.length > MIN_GOOD_LENGTH else 1.0
+    barrier = max(stage.min_barrier, iterate.barrier * cooling)
+    duals = iterate.duals + iterate.dual_length * iterate.dual_step
+    duals = _near_central(duals, barrier / room)
+
     # Curvature is that of the Lagrangian: of the value and of constraints that bend.
-    change = evaluation.gradient - old.evaluation.gradient
-    _, bending, _ = _parts(duals, evaluation)
-    change = change + bending @ (evaluation.slopes - old.evaluation.slopes)
-    return old._replace(
-        y=old.trial,
+    constraint_duals = _split(duals, evaluation).constraints
+    change = evaluation.gradient - iterate.evaluation.gradient
+    bending = evaluation.slopes - iterate.evaluation.slopes
+    change = change + constraint_duals @ bending
+    curvature = _damped_bfgs(iterate.curvature, iterate.trial - iterate.y, change)
+    return iterate._replace(
+        y=iterate.trial,
         slack=slack,
         evaluation=evaluation,
         duals=duals,
-        curvature=_damped_bfgs(old.curvature, old.trial - old.y, change),
+        curvature=curvature,
         barrier=barrier,
-        refused=0,
+        refusals=0,
     )
 
 
-def _directed(grid: Grid, stage: Stage, state: State, room: Inequalities) -> State:
+def _with_step(
+    grid: Grid, stage: Stage, iterate: Iterate, room: Inequalities
+) -> Iterate:
     """Return one start with the step to the barrier's minimum, and how far it may go."""
-    evaluation, size, slacks, R = (
-        state.evaluation,
-        len(state.y),
-        len(state.slack),
-        grid.R,
-    )
-    joints, _, variables = R.shape
-    ratio, central = state.duals / room, state.barrier / room
-    stiffness, of_constraints, of_slack = _parts(ratio, evaluation)
-    push, pull, spare = _parts(central, evaluation)
-    stiff = of_constraints[:, None] * evaluation.slopes
-    H = np.zeros((size + slacks, size + slacks))
-    H[:size, :size] = state.curvature + evaluation.slopes.T @ stiff
-    weighted = R * stiffness.reshape(2, *grid.c.shape).sum(axis=0)[:, :, None]
-    for j, block in enumerate(np.swapaxes(R, 1, 2) @ weighted):
-        place = slice(j * variables, (j + 1) * variables)
-        H[place, place] += block
-    ridge = 1e-9 * np.trace(H[:size, :size]) / size
-    up, down = push.reshape(2, *grid.c.shape)
-    away = np.einsum("jrk,jr->jk", R, up - down).reshape(size)
-    downhill = -(evaluation.gradient + away + pull @ evaluation.slopes)
-    if slacks:
-        H[:size, size] = H[size, :size] = -stiff.sum(axis=0)
-        H[size, size] = of_constraints.sum() + of_slack[0]
-        downhill = np.concatenate([downhill, pull.sum() - stage.penalty + spare])
-    H[np.diag_indices(size + slacks)] += ridge
-    try:
-        factor = scipy.linalg.cho_factor(H, lower=True, check_finite=False)
-        step = scipy.linalg.cho_solve(factor, downhill, check_finite=False)
-    except np.linalg.LinAlgError:
-        step = np.full(size + slacks, np.nan)
-    if not np.isfinite(step).all():
-        # Where rounding makes the matrix indefinite, its diagonal alone decides.
-        step = downhill / np.diagonal(H)
-    rows, more = (
-        np.einsum("jrk,jk->jr", R, step[:size].reshape(joints, variables)),
-        step[size:],
-    )
-    bent = evaluation.slopes @ step[:size] - more.sum()
-    change = np.concatenate([rows.ravel(), -rows.ravel(), bent, -more])
-    dual_step = central - state.duals + ratio * change
-    return state._replace(
+    stiffness = iterate.duals / room
+    central = iterate.barrier / room
+    downhill = _downhill(grid, stage, iterate, central)
+    step = _solve(_barrier_hessian(grid, iterate, stiffness), downhill)
+    change = _change_of_inequalities(grid, iterate, step)
+    dual_step = central - iterate.duals + stiffness * change
+    return iterate._replace(
         step=step,
         dual_step=dual_step,
-        length=_longest(change, room),
-        dual_length=_longest(-dual_step, state.duals),
+        length=_longest_step(change, room),
+        dual_length=_longest_step(-dual_step, iterate.duals),
         slope=-float(downhill @ step),
     )
 
 
-def _room(grid: Grid, stage: Stage, y: np.ndarray, *more: np.ndarray) -> Inequalities:
-    """Return the distances from the limits of the joints, followed by those of what is given."""
-    away = (grid.rows(y) - grid.c).ravel()
+def _barrier_hessian(
+    grid: Grid, iterate: Iterate, stiffness: Inequalities
+) -> Float[np.ndarray, "scaled_and_slack scaled_and_slack"]:
+    """Return the curvature of the objective with its barrier."""
+    slopes = iterate.evaluation.slopes
+    size = len(iterate.y)
+    parts = _split(stiffness, iterate.evaluation)
+    stiff_slopes = parts.constraints[:, None] * slopes
+    H = np.zeros((len(iterate.step), len(iterate.step)))
+    H[:size, :size] = iterate.curvature + slopes.T @ stiff_slopes
+
+    # Limits couple the variables of one joint only.
+    row_stiffness = parts.limits.reshape(2, *grid.c.shape).sum(axis=0)
+    blocks = np.swapaxes(grid.R, 1, 2) @ (grid.R * row_stiffness[:, :, None])
+    variables = grid.R.shape[2]
+    for joint, block in enumerate(blocks):
+        place = slice(joint * variables, (joint + 1) * variables)
+        H[place, place] += block
+    ridge = RIDGE * np.trace(H[:size, :size]) / size
+    if len(parts.slack):
+        coupling = -stiff_slopes.sum(axis=0)
+        H[:size, size] = coupling
+        H[size, :size] = coupling
+        H[size, size] = parts.constraints.sum() + parts.slack[0]
+    H[np.diag_indices(len(H))] += ridge
+    return H
+
+
+def _downhill(
+    grid: Grid, stage: Stage, iterate: Iterate, central: Inequalities
+) -> Float[np.ndarray, " scaled_and_slack"]:
+    """Return the negative gradient of the objective with its barrier."""
+    evaluation = iterate.evaluation
+    parts = _split(central, evaluation)
+    up, down = parts.limits.reshape(2, *grid.c.shape)
+    by_limits = np.einsum("jrk,jr->jk", grid.R, up - down).reshape(-1)
+    by_constraints = parts.constraints @ evaluation.slopes
+    downhill = -(evaluation.gradient + by_limits + by_constraints)
+    if not len(parts.slack):
+        return downhill
+    by_slack = parts.constraints.sum() - stage.penalty + parts.slack
+    return np.concatenate([downhill, by_slack])
+
+
+def _solve(H: np.ndarray, downhill: np.ndarray) -> np.ndarray:
+    """Return the Newton step; where rounding makes the matrix indefinite, by its diagonal."""
+    try:
+        factor = scipy.linalg.cho_factor(H, lower=True, check_finite=False)
+        step = scipy.linalg.cho_solve(factor, downhill, check_finite=False)
+    except np.linalg.LinAlgError:
+        step = np.full(len(H), np.nan)
+    return step if np.isfinite(step).all() else downhill / np.diagonal(H)
+
+
+def _change_of_inequalities(
+    grid: Grid, iterate: Iterate, step: np.ndarray
+) -> Inequalities:
+    """Return by how much a step reduces the distance from each bound."""
+    size = len(iterate.y)
+    slack_step = step[size:]
+    rows = grid.rows(step[:size]).ravel()
+    by_constraints = iterate.evaluation.slopes @ step[:size] - slack_step.sum()
+    return np.concatenate([rows, -rows, by_constraints, -slack_step])
+
+
+def _limit_room(grid: Grid, stage: Stage, y: np.ndarray) -> np.ndarray:
+    """Return the distances from the limits of the joints."""
+    rows = (grid.rows(y) - grid.c).ravel()
     bound = stage.bound * grid.bound
-    return np.concatenate([bound - away, bound + away, *more])
+    return np.concatenate([bound - rows, bound + rows])
 
 
-def _parts(
-    x: Inequalities, evaluation: Evaluation
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _room(
+    grid: Grid, stage: Stage, y: np.ndarray, evaluation: Evaluation, slack: np.ndarray
+) -> Inequalities:
+    """Return the distances from all bounds."""
+    limit_room = _limit_room(grid, stage, y)
+    return np.concatenate([limit_room, slack.sum() - evaluation.excess, slack])
+
+
+def _split(numbers: Inequalities, evaluation: Evaluation) -> Parts:
     """Return the numbers of limits, constraints and slack."""
     constraints = len(evaluation.excess)
-    slack = len(x) - (constraints > 0)
-    return x[: slack - constraints], x[slack - constraints : slack], x[slack:]
+    slack = len(numbers) - (constraints > 0)
+    limits = slack - constraints
+    return Parts(numbers[:limits], numbers[limits:slack], numbers[slack:])
 
 
-def _longest(change: Inequalities, room: Inequalities) -> float:
+def _near_central(duals: np.ndarray, central: np.ndarray) -> np.ndarray:
+    """Return multipliers that are not too far from the central path."""
+    return np.clip(duals, central / CENTRALITY, central * CENTRALITY)
+
+
+def _longest_step(change: Inequalities, room: Inequalities) -> float:
     """Return the longest step, at most 1, that stays inside all bounds."""
     return min(1.0, TO_BOUNDARY / float((change / room).max(initial=1e-12)))
 
@@ -283,44 +365,50 @@ def _longest(change: Inequalities, room: Inequalities) -> float:
 def _damped_bfgs(B: np.ndarray, s: np.ndarray, change: np.ndarray) -> np.ndarray:
     """Return the damped BFGS update, which stays positive definite [1, procedure 18.2]."""
     Bs = B @ s
-    expected, actual = float(s @ Bs), float(s @ change)
+    expected = float(s @ Bs)
+    actual = float(s @ change)
     if not expected > 1e-16:
         return B
     damped = DAMPING * expected
-    mix = 1.0 if actual >= damped else (expected - damped) / (expected - actual)
+    mix = 1.0
+    if actual < damped:
+        mix = (expected - damped) / (expected - actual)
     r = mix * change + (1.0 - mix) * Bs
-    new = B - np.outer(Bs, Bs / expected) + np.outer(r, r / (s @ r))
-    return new if np.isfinite(new).all() else B
+    update = B - np.outer(Bs, Bs / expected) + np.outer(r, r / (s @ r))
+    return update if np.isfinite(update).all() else B
 
 
 def _cheapest_slack(
-    like: np.ndarray, excess: np.ndarray, penalty: float, barrier: float
-) -> np.ndarray:
+    stage: Stage, iterate: Iterate, excess: Float[np.ndarray, " constraints"]
+) -> Float[np.ndarray, " slacks"]:
     """Return the slack of least cost, with the barrier that keeps all constraints below it.
 
     So a step may exceed a constraint that bends: the slack follows, and is penalised.
     """
-    if not len(like):
-        return like
+    if not len(iterate.slack):
+        return iterate.slack
+    barrier = iterate.barrier
     # From below, where the largest term alone balances the penalty, Newton's method
     # grows to it.
-    x = max(0.0, float(excess.max())) + barrier / penalty
+    slack = max(0.0, float(excess.max())) + barrier / stage.penalty
     for _ in range(12):
-        room = np.append(x - excess, x)
-        pull = (barrier / room).sum() - penalty
-        x += max(0.0, pull / (barrier / room**2).sum())
-    return np.array([x])
+        room = np.append(slack - excess, slack)
+        slope = (barrier / room).sum() - stage.penalty
+        slack += max(0.0, slope / (barrier / room**2).sum())
+    return np.array([slack])
 
 
 def _merit(
+    stage: Stage,
+    iterate: Iterate,
     evaluation: Evaluation,
     slack: np.ndarray,
     room: Inequalities,
-    penalty: float,
-    barrier: float,
 ) -> float:
     """Return the merit function, which a step must decrease."""
-    logs = sum(
-        float(np.log(np.maximum(x, 1e-300)).sum()) for x in _parts(room, evaluation)
-    )
-    return evaluation.value + penalty * float(slack.sum()) - barrier * logs
+    logarithms = [
+        float(np.log(np.maximum(part, 1e-300)).sum())
+        for part in _split(room, evaluation)
+    ]
+    penalty = stage.penalty * float(slack.sum())
+    return evaluation.value + penalty - iterate.barrier * sum(logarithms)

@@ -6,30 +6,37 @@ them is left unused. Where there are constraints, all starts are small motions t
 them, so that there is a result after seconds.
 """
 
+import math
 import time
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Generator, Sequence
+from functools import partial
+from typing import NamedTuple
 
-import jax
 import numpy as np
 
-from jaxid.arrays import Float, PRNGKeyArray
+from jaxid.arrays import Float
 from jaxid.dynamics.motion import Motion
 
 from . import interior_point
-from .coefficient_limits import scale_samples
-from .interior_point import Evaluation, Stage, State
-from .problem import (
-    PENALTY,
-    SEARCHED,
+from .candidates import (
+    EXCESS_PENALTY,
     Candidates,
-    ExcitationProblem,
-    evaluate,
     evaluate_within_limits,
     shrink_to_constraints,
 )
+from .coefficient_limits import scale_samples
+from .criterion_gradient import value_and_gradient
+from .interior_point import Evaluation, Iterate, Stage
+from .problem import MARGIN, SEARCH_SAMPLES, ExcitationProblem
+from .watched_constraints import (
+    WatchedValues,
+    count_watched,
+    linearise,
+    watch,
+    watched_excess,
+)
 
-FINE = 256
+FINE_SAMPLES = 256
 """Rows of each order by which limits are kept in the end."""
 
 SCHEDULE = (
@@ -48,7 +55,7 @@ SCHEDULE = (
 )
 """Relaxed limits, then the limits (0.998 leaves room for rounding); slightly relaxed once more;
 sharper in the end."""
-CONSTRAINED = (
+CONSTRAINED_SCHEDULE = (
     Stage(1.25, 1e-2, 1e-3, 50),
     Stage(0.998, 1e-3, 1e-4, 75, 4.0, 30.0),
     Stage(0.998, 1e-4, 1e-6, 75, 20.0, 100.0),
@@ -58,168 +65,202 @@ CONSTRAINED = (
     Stage(0.998, 1e-4, 1e-6, 50, 20.0, 100.0),
 )
 """The same where there are constraints: exceeding them becomes more and more expensive."""
-EVALUATED = frozenset({5, 7, 10, 11})
-"""Stages without constraints whose results are compared with the best so far."""
-GENERATION = Stage(0.998, 1e-3, 1e-6, 150, 20.0, 100.0)
+GENERATION_STAGE = Stage(0.998, 1e-3, 1e-6, 150, 20.0, 100.0)
 """Improvement of children."""
-LAST = Stage(0.998, 1e-4, 1e-6, 300, 20.0, 100.0)
-"""Last improvement, on the fine grid."""
+FINE_STAGE = Stage(0.998, 1e-4, 1e-6, 300, 20.0, 100.0)
+"""Improvement in the end, on the fine grid."""
 BATCH = 8
 """Starts that are improved together."""
 PART = 25
-"""Iterations after which the peaks of constraints are found anew."""
+"""Iterations of one step, after which the peaks of constraints are found anew."""
+CHILD_TRIES = 16
+"""Children of each motion of which the most promising is improved."""
 
 
-class Search:
-    """A search that may be stopped after each step.
+class Step(NamedTuple):
+    """State of a search before a step, and after the last one."""
 
-    Attributes:
-        first: Values of the random motions.
-        best: Best motions so far.
-        history: Value of the criterion for the best motion, before the first step and
-            after each.
-        steps: Number of steps without a limit of time.
+    task: str  # task of the step, in words
+    best: Candidates  # best motions so far
+
+
+Search = Generator[Step, None, Candidates]
+"""A part of a search: it yields steps, and returns the best motions."""
+
+
+def schedule_of(problem: ExcitationProblem) -> tuple[Stage, ...]:
+    """Return the stages that improve the starts."""
+    return CONSTRAINED_SCHEDULE if problem.constraints else SCHEDULE
+
+
+def count_steps(problem: ExcitationProblem, starts: int, generations: int) -> int:
+    """Return the number of steps of a search without a deadline."""
+    once = (*schedule_of(problem), FINE_STAGE)
+    stages = (*once, *(GENERATION_STAGE,) * generations)
+    steps_of_batch = sum(math.ceil(stage.iterations / PART) for stage in stages)
+    return steps_of_batch * math.ceil(starts / BATCH)
+
+
+def search(
+    problem: ExcitationProblem,
+    x: Float[np.ndarray, "starts scaled"],
+    best: Candidates,
+    generations: int,
+    random: np.random.Generator,
+    deadline: float = math.inf,
+) -> Generator[Step, None, None]:
+    """Improve motions; yield the best so far before each step and after the last one.
+
+    Args:
+        problem: Problem to be solved.
+        x: Motions to start from.
+        best: The same motions within limits; with constraints the first one alone.
+        generations: Number of generations.
+        random: Generator of the children.
+        deadline: Time of `time.monotonic` after which only the fine grid follows [s].
     """
+    starts = np.arange(len(x))
+    batches = np.split(starts, range(BATCH, len(x), BATCH))
+    if problem.constraints:
+        best = yield from _find_feasible_motion(problem, x, best)
+        x = np.asarray(best.x)
+        # One motion is improved alone, so that there is a good result soon.
+        batches = [starts[:1], *np.split(starts[1:], range(BATCH, len(x) - 1, BATCH))]
 
-    def __init__(
-        self,
-        problem: ExcitationProblem,
-        key: PRNGKeyArray,
-        starts: int,
-        generations: int,
-        begin: Float[np.ndarray, " scaled"] | None = None,
-        seconds: float | None = None,
-    ):
-        self._problem, self._generations = problem, generations
-        self._random = np.random.default_rng(np.asarray(jax.random.key_data(key)))
-        self._began, self._seconds = time.monotonic(), seconds
-        x = problem.limits.random(key, starts)
-        if problem.constraints:
-            self.first = problem.value_and_gradient(x, None, problem.samples)[0]
-            x = first_motions(problem, self._random, x)
-        else:
-            self.first = evaluate(problem, x).value
-        if begin is not None:
-            x[0] = begin
-        self.best = evaluate_within_limits(problem, x[:1] if problem.constraints else x)
-        self._x, self.history = x, [self.best.best_value]
-        self._schedule = CONSTRAINED if problem.constraints else SCHEDULE
-        batches = -(-starts // BATCH)
-        self.steps = batches * (len(self._schedule) + 1) + generations
+    for places in batches:
+        if len(places) and time.monotonic() < deadline:
+            best = yield from _improve_batch(problem, x, best, places, deadline)
+    for _ in range(generations):
+        if time.monotonic() < deadline:
+            best = yield from _improve_children(problem, best, random, deadline)
 
-    @property
-    def feasible(self) -> bool:
-        """Whether the best motion so far keeps all constraints."""
-        return bool((self.best.broken == 0).any())
+    order = best.promising()
+    if time.monotonic() >= deadline:
+        order = order[:BATCH]
+    for places in np.split(order, range(BATCH, len(order), BATCH)):
+        step = Step("keeping the limits closely", best)
+        iterates = _begin(problem, FINE_SAMPLES, best.x[places])
+        iterates = yield from _improve(
+            problem, FINE_SAMPLES, iterates, FINE_STAGE, step
+        )
+        best = _take(problem, best, places, iterates)
+    yield Step("keeping the limits closely", best)
 
-    @property
-    def spent(self) -> float:
-        """Fraction of the time that is spent; that of the steps where time is not limited."""
-        if self._seconds is None:
-            return min((len(self.history) - 1) / self.steps, 1.0)
-        return min((time.monotonic() - self._began) / self._seconds, 1.0)
 
-    def run(self) -> Iterator[str]:
-        """Search, and yield what it does next at the beginning and after each step."""
-        problem = self._problem
-        if problem.constraints:
-            yield from self._start_batches()
-        else:
-            yield "searching from many starts"
-        for places in self._batches():
-            yield from self._improve_batch(places)
-        for _ in range(self._generations):
-            if self._is_late:
-                break
-            children = crossover(problem, np.asarray(self.best.x), self._random)
-            found = [*self.best.x]
-            for start in range(0, len(found), BATCH):
-                states = _begin(problem, SEARCHED, children[start : start + BATCH])
-                for _ in _improve(problem, SEARCHED, states, GENERATION):
-                    if self._is_late:
-                        break
-                    yield "improving descendants"
-                found[start : start + BATCH] = [one.y for one in states]
-            self.best = self.best.survivors(
-                evaluate_within_limits(problem, np.array(found))
-            )
-            yield self._done("improving descendants")
-        yield from self._finish()
+def _find_feasible_motion(
+    problem: ExcitationProblem, x: np.ndarray, best: Candidates
+) -> Search:
+    """Look for one motion that keeps all constraints; return it before the other starts."""
+    for motion in x[1:]:
+        if best.is_feasible:
+            break
+        yield Step("looking for a first motion that keeps all limits", best)
+        best = best.survivors(shrink_to_constraints(problem, motion))
+    unknown = np.full(len(x), np.inf)
+    starts = Candidates(x, unknown, unknown)
+    return starts.improved(np.array([0]), best.at(best.order()[:1]))
 
-    def _batches(self) -> Iterator[np.ndarray]:
-        """Yield the places of starts; with constraints the first batch is one start alone."""
-        every = np.arange(len(self._x))
-        first = 1 if self._problem.constraints else 0
-        for batch in (
-            every[:first],
-            *np.split(every[first:], range(BATCH, len(every), BATCH)),
-        ):
-            if len(batch) and not self._is_late:
-                yield batch
 
-    def _start_batches(self) -> Iterator[str]:
-        """Look for a first motion that keeps all constraints, then for more."""
-        yield "looking for a first motion that keeps all limits"
-        for x in self._x[1:]:
-            if self.feasible:
-                break
-            self.best = self.best.survivors(shrink_to_constraints(self._problem, x))
-            yield self._done("looking for a first motion that keeps all limits")
-        first, unknown = self.best.order()[:1], np.full(len(self._x), np.inf)
-        found = Candidates(*(part[first] for part in self.best))
-        self.best = Candidates(self._x, unknown, unknown).placed([0], found)
-        self._x = self.best.x
+def _improve_batch(
+    problem: ExcitationProblem,
+    x: np.ndarray,
+    best: Candidates,
+    places: np.ndarray,
+    deadline: float,
+) -> Search:
+    """Run all stages for the starts at some places; return the best motions."""
+    iterates = _begin(problem, SEARCH_SAMPLES, x[places])
+    for stage in schedule_of(problem):
+        step = Step("searching from many starts", best)
+        iterates = yield from _improve(
+            problem, SEARCH_SAMPLES, iterates, stage, step, deadline
+        )
+        if stage.bound < 1.0:
+            best = _take(problem, best, places, iterates)
+        if time.monotonic() >= deadline:
+            break
+    return best
 
-    def _improve_batch(self, places: np.ndarray) -> Iterator[str]:
-        task = "searching from many starts"
-        states = _begin(self._problem, SEARCHED, self._x[places])
-        for number, stage in enumerate(self._schedule):
-            for _ in _improve(self._problem, SEARCHED, states, stage):
-                if self._is_late:
-                    return
-                yield task
-            if number in EVALUATED or (self._problem.constraints and stage.bound < 1.0):
-                self._take(states, places)
-            yield self._done(task)
 
-    def _finish(self) -> Iterator[str]:
-        """Keep limits on a finer grid."""
-        problem, task = self._problem, "keeping the limits closely"
-        promising = self.best.promising()
-        for start in range(
-            0, len(promising) if self._seconds is None else BATCH, BATCH
-        ):
-            places = promising[start : start + BATCH]
-            states = _begin(problem, FINE, self.best.x[places])
-            for _ in _improve(problem, FINE, states, LAST):
-                yield task
-            self._take(states, places)
-            yield self._done(task)
+def _improve_children(
+    problem: ExcitationProblem,
+    best: Candidates,
+    random: np.random.Generator,
+    deadline: float,
+) -> Search:
+    """Improve one child of each motion; return the best of parents and children."""
+    step = Step("improving descendants", best)
+    children = crossover(problem, np.asarray(best.x), random)
+    motions = []
+    for start in range(0, len(children), BATCH):
+        iterates = _begin(problem, SEARCH_SAMPLES, children[start : start + BATCH])
+        iterates = yield from _improve(
+            problem, SEARCH_SAMPLES, iterates, GENERATION_STAGE, step, deadline
+        )
+        motions += [iterate.y for iterate in iterates]
+    return best.survivors(evaluate_within_limits(problem, np.array(motions)))
 
-    @property
-    def _is_late(self) -> bool:
-        """Whether only the time for the fine grid is left."""
-        return self._seconds is not None and self.spent > 0.65
 
-    def _take(self, states: list[State], places: np.ndarray) -> None:
-        """Replace the motions at some places by those of states that are better."""
-        x = np.array([one.y for one in states])
-        self._replace(places, evaluate_within_limits(self._problem, x))
+def _begin(
+    problem: ExcitationProblem, samples: int, x: Float[np.ndarray, "starts scaled"]
+) -> list[Iterate]:
+    """Return the iterates at some motions."""
+    grid = problem.limits.grid(samples)
+    return interior_point.begin(grid, np.asarray(x), count_watched(problem))
 
-    def _replace(self, places: Any, found: Candidates) -> None:
-        """Replace the motions at some places by better ones."""
-        self.best = self.best.improved(self.best.placed(places, found))
 
-    def _done(self, task: str) -> str:
-        self.history.append(self.best.best_value)
-        return task
+def _improve(
+    problem: ExcitationProblem,
+    samples: int,
+    iterates: list[Iterate],
+    stage: Stage,
+    step: Step,
+    deadline: float = math.inf,
+) -> Generator[Step, None, list[Iterate]]:
+    """Run one stage in parts; yield before each; return the iterates.
 
-    def finish(self) -> None:
-        """Make motions smaller where no other keeps all constraints."""
-        if self.best.broken.all():
-            for place in self.best.order()[:4]:
-                small = shrink_to_constraints(self._problem, self.best.x[place])
-                self._replace([place], small)
+    The peaks of constraints are found anew for each part.
+    """
+    grid = problem.limits.grid(samples)
+    for start in range(0, stage.iterations, PART):
+        yield step
+        if time.monotonic() >= deadline:
+            break
+        watched = [watch(problem, iterate.y) for iterate in iterates]
+        objective = partial(_evaluate, problem, stage.sharpness, watched)
+        cooled = stage.barrier * interior_point.COOLING**start
+        part = stage._replace(
+            barrier=max(stage.min_barrier, cooled),
+            iterations=min(PART, stage.iterations - start),
+        )
+        iterates = interior_point.run(grid, objective, iterates, part)
+    return iterates
+
+
+def _evaluate(
+    problem: ExcitationProblem,
+    sharpness: float,
+    watched: Sequence[list[WatchedValues]],
+    y: Float[np.ndarray, "points scaled"],
+    starts: Sequence[int],
+) -> list[Evaluation]:
+    """Return criterion and constraints at points of these starts."""
+    samples = scale_samples(SEARCH_SAMPLES, problem.basis)
+    values, gradients = value_and_gradient(problem, y, sharpness, samples)
+    excess, slopes = linearise(problem, y, [watched[start] for start in starts])
+    parts = zip(values.tolist(), gradients, excess + MARGIN, slopes, strict=True)
+    return [Evaluation(*each) for each in parts]
+
+
+def _take(
+    problem: ExcitationProblem,
+    best: Candidates,
+    places: np.ndarray,
+    iterates: list[Iterate],
+) -> Candidates:
+    """Return the best motions, at some places those of iterates where they are better."""
+    x = np.array([iterate.y for iterate in iterates])
+    return best.improved(places, evaluate_within_limits(problem, x))
 
 
 def first_motions(
@@ -232,57 +273,30 @@ def first_motions(
     They have the shapes of given motions, about poses at which the robot may stand
     still.
     """
-    limits, robot = problem.limits.limits, problem.base.model.robot
-    low, high = np.asarray(limits.position_min), np.asarray(limits.position_max)
-    places = random.uniform(0.1, 0.9, (1000, robot.joints))
+    limits = problem.limits.limits
+    low = np.asarray(limits.position_min)
+    high = np.asarray(limits.position_max)
+    places = random.uniform(0.1, 0.9, (1000, len(low)))
     q = low + places * (high - low)
-    still = Motion(q, np.zeros_like(q), np.zeros_like(q))
-    values = [
-        np.asarray(c(problem.robot, still)).max(axis=1) for c in problem.constraints
-    ]
-    good = np.argsort(np.max(values, axis=0))[: len(x)]
-    fill = problem.limits.grid().fill
-    many = [
-        np.asarray(fill(y, place, size))
-        for size in (0.6, 0.4, 0.3, 0.2, 0.15, 0.1, 0.05)
-        for y, place in zip(x, places[good], strict=True)
-    ]
-    excess = np.array([problem.watched_excess(y) for y in many])
-    best = np.argsort(np.maximum(excess, 0.0), kind="stable")[: len(x)]
-    return np.array(many)[best]
+    rest = Motion(q, np.zeros_like(q), np.zeros_like(q))
+    values = [np.asarray(c(problem.robot, rest)) for c in problem.constraints]
+    excess = np.max([each.max(axis=1) for each in values], axis=0)
+    good_places = places[np.argsort(excess)[: len(x)]]
 
-
-def _begin(problem: ExcitationProblem, points: int, x: Any) -> list[State]:
-    return interior_point.begin(
-        problem.limits.grid(points), np.asarray(x), problem.conditions
-    )
-
-
-def _improve(
-    problem: ExcitationProblem, points: int, states: list[State], stage: Stage
-) -> Iterator[None]:
-    """Run one stage in parts, on the list of states; peaks of constraints are found anew."""
-    grid = problem.limits.grid(points)
-    for start in range(0, stage.iterations, PART):
-        barrier = max(stage.least, stage.barrier * interior_point.COOLING**start)
-        count = min(PART, stage.iterations - start)
-        watched = [problem.watched(one.y) for one in states]
-
-        def objective(
-            y: np.ndarray, active: Any, watched: Any = watched
-        ) -> list[Evaluation]:
-            return problem.evaluate(y, stage.sharpness, [watched[k] for k in active])
-
-        now = stage._replace(barrier=barrier, iterations=count)
-        states[:] = interior_point.run(grid, objective, states, now)
-        yield
+    grid = problem.limits.grid()
+    motions = []
+    for size in (0.6, 0.4, 0.3, 0.2, 0.15, 0.1, 0.05):
+        for motion, place in zip(x, good_places, strict=True):
+            motions.append(np.asarray(grid.fill(motion, place, size)))
+    violation = [max(watched_excess(problem, motion), 0.0) for motion in motions]
+    order = np.argsort(violation, kind="stable")
+    return np.array(motions)[order[: len(x)]]
 
 
 def crossover(
     problem: ExcitationProblem,
     x: Float[np.ndarray, "starts scaled"],
     random: np.random.Generator,
-    tries: int = 16,
 ) -> Float[np.ndarray, "starts scaled"]:
     """Return one child of each motion with another one: the most promising of several.
 
@@ -292,17 +306,20 @@ def crossover(
     period begins or which way it runs, so that two good motions may fit together at one
     shift only: many children are tried.
     """
-    retimings, count = problem.basis.retimings(), scale_samples(SEARCHED, problem.basis)
-    best, least = np.array(x), np.full(len(x), np.inf)
-    for _ in range(tries):
+    retimings = problem.basis.retimings()
+    samples = scale_samples(SEARCH_SAMPLES, problem.basis)
+    best_children = np.array(x)
+    best_values = np.full(len(x), np.inf)
+    for _ in range(CHILD_TRIES):
         children = _draw_children(problem, retimings, x, random)
-        value = problem.value_and_gradient(children, None, count)[0]
+        values, _ = value_and_gradient(problem, children, None, samples)
         if problem.constraints:
-            excess = np.array([problem.watched_excess(y) for y in children])
-            value = value + PENALTY * np.maximum(excess, 0.0)
-        better = value < least
-        best[better], least[better] = children[better], value[better]
-    return best
+            excess = np.array([watched_excess(problem, child) for child in children])
+            values = values + EXCESS_PENALTY * np.maximum(excess, 0.0)
+        is_better = values < best_values
+        best_children[is_better] = children[is_better]
+        best_values[is_better] = values[is_better]
+    return best_children
 
 
 def _draw_children(

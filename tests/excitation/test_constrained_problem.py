@@ -8,18 +8,23 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxid.excitation.candidates import evaluate, shrink_to_constraints
 from jaxid.excitation.constraints import Clearance, ForceLimits, TipLimits
 from jaxid.excitation.criteria import CRITERIA
+from jaxid.excitation.criterion_gradient import value_and_gradient
 from jaxid.excitation.design import minimise
 from jaxid.excitation.problem import (
-    CHECKED,
-    EVERY,
-    MARGIN,
-    PEAKS,
-    WATCHED,
+    CHECKED_INSTANTS,
+    COARSE_STEP,
+    WATCHED_INSTANTS,
     ExcitationProblem,
-    evaluate,
-    shrink_to_constraints,
+)
+from jaxid.excitation.watched_constraints import (
+    PEAKS,
+    count_watched,
+    linearise,
+    watch,
+    watched_excess,
 )
 from jaxid.robot.collision import Capsule, CollisionModel, HalfSpace
 from jaxid.trajectory.leads import LeadsBasis
@@ -50,6 +55,11 @@ def problem(pendulum, constraints):
     )
 
 
+def checked(problem, x):
+    """All constraints of one motion at all checked instants."""
+    return np.concatenate(problem.constraint_values(x), axis=1)
+
+
 @pytest.mark.parametrize("criterion", CRITERIA.values(), ids=CRITERIA)
 def test_gradients_without_a_compiler_are_those_of_jax(pendulum, criterion):
     one = ExcitationProblem(
@@ -57,7 +67,7 @@ def test_gradients_without_a_compiler_are_those_of_jax(pendulum, criterion):
     )
     x = one.limits.random(jax.random.key(2), 3)
     for sharpness in (None, 4.0):
-        values, gradients = one.value_and_gradient(x, sharpness, 64)
+        values, gradients = value_and_gradient(one, x, sharpness, 64)
         function = functools.partial(one.value, sharpness=sharpness, samples=64)
         expected = jax.vmap(jax.value_and_grad(function))(x)
         np.testing.assert_allclose(values, expected[0], rtol=1e-11)
@@ -67,14 +77,14 @@ def test_gradients_without_a_compiler_are_those_of_jax(pendulum, criterion):
 
 def test_derivatives_are_central_differences(problem):
     x = np.asarray(problem.limits.random(jax.random.key(2), 2))
-    watched = [problem.watched(y) for y in x]
-    values, slopes = problem.linearise(x, watched)
-    assert slopes.shape == (2, problem.conditions, x.shape[1])
-    assert problem.conditions == values.shape[1] == (len(WATCHED) + PEAKS) * 3
+    watched = [watch(problem, y) for y in x]
+    values, slopes = linearise(problem, x, watched)
+    assert slopes.shape == (2, count_watched(problem), x.shape[1])
+    assert values.shape[1] == (len(WATCHED_INSTANTS) + PEAKS) * 3
     h, quotients = 1e-5, np.zeros_like(slopes)
     for k, e in enumerate(h * np.eye(x.shape[1])):
         near, far = (
-            [problem.linearise(x + s * m * e, watched)[0] for s in (1, -1)]
+            [linearise(problem, x + s * m * e, watched)[0] for s in (1, -1)]
             for m in (1, 2)
         )
         quotients[..., k] = (8 * (near[0] - near[1]) - (far[0] - far[1])) / (12 * h)
@@ -107,25 +117,25 @@ def test_forward_mode_is_reverse_mode(pendulum, criterion, constraints):
 
 def test_the_highest_peaks_are_watched(problem):
     x = problem.limits.random(jax.random.key(4), 1)[0]
-    values = problem.checked(x)
-    assert values.shape == (CHECKED, 3)
-    (found,) = problem.linearise(x[None], [problem.watched(x)])[0]
+    values = checked(problem, x)
+    assert values.shape == (CHECKED_INSTANTS, 3)
+    (found,) = linearise(problem, x[None], [watch(problem, x)])[0]
     found = found.reshape(3, -1).max(axis=1)
-    np.testing.assert_allclose(found, values[::EVERY].max(axis=0), atol=1e-9)
-    (evaluation,) = problem.evaluate(x[None], None, [problem.watched(x)])
-    np.testing.assert_allclose(evaluation.excess.max() - MARGIN, found.max(), atol=1e-9)
+    np.testing.assert_allclose(found, values[::COARSE_STEP].max(axis=0), atol=1e-9)
+    at_watched_instants = values[WATCHED_INSTANTS].max()
+    assert watched_excess(problem, x) == pytest.approx(at_watched_instants, abs=1e-9)
 
 
 def test_peaks_between_the_checked_instants_count(problem, pendulum):
     x = problem.random(jax.random.key(5))
     motion = problem.trajectory(x).motion(
-        np.linspace(0.0, BASIS.duration, 20 * CHECKED)
+        np.linspace(0.0, BASIS.duration, 20 * CHECKED_INSTANTS)
     )
     robot = pendulum.model.robot
     finer = jax.jit(lambda m: [c(robot, m) for c in problem.constraints])(motion)
     finer = np.concatenate([np.asarray(values).max(axis=0) for values in finer])
     found = np.array([f.value for f in problem.findings(x)])
-    assert (found >= problem.checked(x).max(axis=0)).all()
+    assert (found >= checked(problem, x).max(axis=0)).all()
     np.testing.assert_allclose(found, finer, atol=2e-7)
     assert problem.excess(x) == pytest.approx(found.max(), abs=1e-6)
     assert float(problem.violation(x)) == pytest.approx(found.max(), abs=1e-9)
@@ -157,9 +167,9 @@ def test_limits_of_force_are_those_that_were_given(problem, pendulum, constraint
     )
     x = problem.random(jax.random.key(7))
     # The robot's own limit of force is 9.
-    highest = problem.checked(x)[:, 0].max() + 1.0
+    highest = checked(problem, x)[:, 0].max() + 1.0
     np.testing.assert_allclose(
-        given.checked(x)[:, 0].max() + 1.0, 9.0 * highest, rtol=1e-6
+        checked(given, x)[:, 0].max() + 1.0, 9.0 * highest, rtol=1e-6
     )
 
 
@@ -168,7 +178,7 @@ def test_a_design_with_leads_keeps_all_constraints(
 ):
     for stages in (
         "SCHEDULE",
-        "CONSTRAINED",
+        "CONSTRAINED_SCHEDULE",
     ):  # the last stage alone has all to keep as well
         monkeypatch.setattr(f"jaxid.excitation.search.{stages}", ())
     plan = minimise(problem, starts=2, generations=0)

@@ -123,7 +123,7 @@ def test_a_sample_is_judged_by_itself_and_under_jit_and_vmap(name):
 def test_words_name_what_is_exceeded(name):
     constraint = FAMILY[name]
     entries, values = constraint.entries(ROBOT), judged(name)
-    assert len({(e.name, e.least) for e in entries}) == len(entries)
+    assert len({(e.name, e.is_lower_limit) for e in entries}) == len(entries)
     for f, peak in zip(
         constraint.describe(ROBOT, values), values.max(axis=0), strict=True
     ):
@@ -132,7 +132,7 @@ def test_words_name_what_is_exceeded(name):
             "to spare"
             if f.value <= 0
             else "falls short"
-            if f.least
+            if f.is_lower_limit
             else f"{100 * peak:.3g} %"
         )
         assert word in str(f)

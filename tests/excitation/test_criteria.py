@@ -12,11 +12,10 @@ from jaxid.excitation.criteria import (
     CRITERIA,
     Information,
     information,
-    informations,
-    log_condition,
-    spectral,
     standard_deviations,
 )
+from jaxid.excitation.criteria.functions_of_eigenvalues import log_condition, spectral
+from jaxid.excitation.criteria.information_matrix import information_of_coefficients
 from jaxid.trajectory.fourier import FourierBasis
 
 SIZE = 7
@@ -129,7 +128,7 @@ def test_compiled_information_is_that_of_all_samples(base, random):
     basis = FourierBasis(3, 1.2)
     x = random.standard_normal((5, 2, basis.variables))
     weights, prior = np.array([0.1, 0.7]), 1e-3 * np.eye(base.size)
-    plains, weighteds = informations(
+    batch = information_of_coefficients(
         base,
         basis,
         jnp.asarray(x),
@@ -137,6 +136,7 @@ def test_compiled_information_is_that_of_all_samples(base, random):
         measured=50,
         weights=weights,
         prior=prior,
+        sizes=np.ones(base.size),
     )
     for k, one in enumerate(x):
         motion = basis.trajectory(one).motion(basis.times(50))
@@ -145,8 +145,8 @@ def test_compiled_information_is_that_of_all_samples(base, random):
         weighted = np.einsum("sji,j,sjk->ik", theta, weights**2, theta) + prior
         exact = information(base, motion, weights, prior)
         for got, asked in (
-            (plains[k], plain),
-            (weighteds[k], weighted),
+            (batch.plain[k], plain),
+            (batch.weighted[k], weighted),
             (exact.plain, plain),
             (exact.weighted, weighted),
         ):

@@ -169,7 +169,7 @@ def test_the_problems_functions_are_those_of_the_motion(impossible, pendulum):
 
 def test_an_impossible_constraint_is_diagnosed(impossible, monkeypatch):
     # The last stage alone finds the least excess of so simple a problem.
-    for stages in ("SCHEDULE", "CONSTRAINED"):
+    for stages in ("SCHEDULE", "CONSTRAINED_SCHEDULE"):
         monkeypatch.setattr(f"jaxid.excitation.search.{stages}", ())
     effort = {"starts": 2, "generations": 0}
     with pytest.raises(

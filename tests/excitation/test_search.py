@@ -3,14 +3,14 @@
 import jax
 import numpy as np
 
-from jaxid.excitation.criteria import ConditionNumber, DOptimal
-from jaxid.excitation.problem import (
-    PENALTY,
+from jaxid.excitation.candidates import (
+    EXCESS_PENALTY,
     Candidates,
-    ExcitationProblem,
     evaluate,
     evaluate_within_limits,
 )
+from jaxid.excitation.criteria import ConditionNumber, DOptimal
+from jaxid.excitation.problem import ExcitationProblem
 from jaxid.excitation.search import crossover
 from jaxid.trajectory.fourier import FourierBasis
 
@@ -53,7 +53,7 @@ def test_a_small_excess_does_not_outweigh_a_better_value():
     )
     assert list(best.order()) == [0, 1, 2]
     assert list(best.promising()) == [1, 0, 2]
-    assert 0.01 * PENALTY < 0.5
+    assert 0.01 * EXCESS_PENALTY < 0.5
 
 
 def test_the_best_of_two_generations_survive_and_none_twice():
@@ -72,7 +72,7 @@ def test_the_best_of_two_generations_survive_and_none_twice():
 
 
 def test_a_motion_is_enlarged_to_its_limits_only_where_that_is_better(pendulum):
-    """A condition number may well become worse: what a polished motion gained would be lost."""
+    """A condition number may well become worse: what a search has gained would be lost."""
     for criterion in (ConditionNumber(), DOptimal()):
         one = ExcitationProblem(
             pendulum, BASIS, criterion=criterion, noise=np.ones(1), samples=100

@@ -1,0 +1,172 @@
+"""The best motions of a search so far, and how a motion is made to keep its limits."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxid.arrays import AnyArray, Float
+
+from .problem import MAX_COARSE_EXCESS, ExcitationProblem
+
+EXCESS_PENALTY = 3.0
+"""Penalty of a relative excess beside the criterion's logarithm, where it is to be improved."""
+MAX_GROWTH = 1.05
+"""Factor by which a motion is enlarged to fill its limits."""
+SLIGHT_SHRINKAGES = (0.9995, 0.998, 0.995, 0.99, 0.98, 0.96, 0.93, 0.9)
+"""Factors by which a motion is made smaller that exceeds its constraints a little."""
+SHRINKAGE_STEP = 0.05
+"""Step of the factors by which a motion is made smaller until it keeps its constraints."""
+SAME_VALUE = 2e-5
+"""Difference of the criterion's logarithm below which two motions count as the same one."""
+
+
+class Candidates(NamedTuple):
+    """The best motion of each start so far, certified to keep the limits of the joints."""
+
+    x: Float[AnyArray, "starts scaled"]  # scaled coefficients
+    value: Float[AnyArray, " starts"]  # logarithm of the criterion, exact
+    # relative excess of the worst constraint; not positive where all are kept
+    excess: Float[AnyArray, " starts"]
+
+    @property
+    def violation(self) -> Float[np.ndarray, " starts"]:
+        """Excess where a constraint is not kept; zero elsewhere."""
+        return np.maximum(np.asarray(self.excess), 0.0)
+
+    @property
+    def is_feasible(self) -> bool:
+        """Whether one of the motions keeps all constraints."""
+        return bool((self.violation == 0).any())
+
+    @property
+    def best_value(self) -> float:
+        """Value of the criterion itself for the best motion."""
+        return float(np.exp(self.value[self.order()[0]]))
+
+    @property
+    def best_motion(self) -> Float[np.ndarray, " scaled"]:
+        """Scaled coefficients of the best motion."""
+        return np.asarray(self.x[self.order()[0]])
+
+    def order(self) -> np.ndarray:
+        """Return the starts from best to worst; motions that keep their constraints come first."""
+        return np.lexsort((np.asarray(self.value), self.violation))
+
+    def promising(self) -> np.ndarray:
+        """Return the starts, the most promising first: a small excess is soon mended."""
+        penalty = EXCESS_PENALTY * self.violation
+        return np.argsort(np.asarray(self.value) + penalty, kind="stable")
+
+    def at(self, places: Any) -> "Candidates":
+        """Return the motions at some places."""
+        return Candidates(*(np.asarray(part)[places] for part in self))
+
+    def improved(self, places: np.ndarray, others: "Candidates") -> "Candidates":
+        """Return the same motions, with others at some places where those are better."""
+        present = self.at(places)
+        is_smaller = others.violation < present.violation
+        is_as_small = others.violation == present.violation
+        is_better = is_smaller | (is_as_small & (others.value < present.value))
+
+        candidates = Candidates(*(np.array(part) for part in self))
+        for part, values in zip(candidates, others, strict=True):
+            part[places[is_better]] = np.asarray(values)[is_better]
+        return candidates
+
+    def survivors(self, others: "Candidates") -> "Candidates":
+        """Return as many of both together as these are, the best first, duplicates last."""
+        pairs = zip(self, others, strict=True)
+        both = Candidates(*(np.concatenate(pair) for pair in pairs))
+        order = both.order()
+        value_steps = np.diff(both.value[order], prepend=np.nan)
+        violation_steps = np.diff(both.violation[order], prepend=np.nan)
+        is_duplicate = (value_steps <= SAME_VALUE) & (violation_steps == 0.0)
+        order = np.concatenate([order[~is_duplicate], order[is_duplicate]])
+        return both.at(order[: len(self.value)])
+
+
+def criterion_values(
+    problem: ExcitationProblem, x: Float[AnyArray, "starts scaled"]
+) -> Float[np.ndarray, " starts"]:
+    """Return the exact logarithms of the criterion."""
+    values = []
+    for motion in np.asarray(x):
+        information = jax.tree.map(jnp.asarray, problem.information(motion))
+        values.append(float(problem.criterion(information)))
+    return np.array(values)
+
+
+def evaluate(
+    problem: ExcitationProblem, x: Float[AnyArray, "starts scaled"]
+) -> Candidates:
+    """Return motions as they are, with their exact values."""
+    x = np.asarray(x)
+    values = criterion_values(problem, x)
+    excess = np.array([problem.excess(motion) for motion in x])
+    is_finite = np.isfinite(values) & ~np.isnan(excess)
+    values = np.where(is_finite, values, np.inf)
+    return Candidates(x, values, np.where(is_finite, excess, np.inf))
+
+
+def evaluate_within_limits(
+    problem: ExcitationProblem, x: Float[AnyArray, "starts scaled"]
+) -> Candidates:
+    """Return motions after they were made to keep the limits of the joints for all times.
+
+    Where they almost keep the other constraints, they are made smaller until they do;
+    without constraints they fill their limits where that is better.
+    """
+
+    def evaluate_scaled(growth: float) -> Candidates:
+        motions = []
+        for motion in np.asarray(x):
+            scaled = grid.scale_into_limits(motion, growth=growth)
+            motions.append(_shrink_slightly(problem, np.asarray(scaled)))
+        return evaluate(problem, np.array(motions))
+
+    grid = problem.limits.grid()
+    candidates = evaluate_scaled(1.0)
+    if problem.constraints:
+        return candidates
+    # A larger motion mostly has more information, but a condition number may well
+    # become worse by it.
+    larger = evaluate_scaled(MAX_GROWTH)
+    return candidates.improved(np.arange(len(larger.x)), larger)
+
+
+def _shrink_slightly(problem: ExcitationProblem, motion: np.ndarray) -> np.ndarray:
+    """Return a motion that exceeds its constraints a little so small that it keeps them."""
+    if not 0.0 < problem.excess(motion) <= MAX_COARSE_EXCESS:
+        return motion
+    grid = problem.limits.grid()
+    for factor in SLIGHT_SHRINKAGES:
+        smaller = np.asarray(grid.shrink(motion, factor))
+        if problem.excess(smaller) <= 0.0:
+            return smaller
+    return motion
+
+
+def shrink_to_constraints(
+    problem: ExcitationProblem, x: Float[AnyArray, " scaled"]
+) -> Candidates:
+    """Return a motion made so small that it keeps all constraints; unchanged if no size does."""
+    x = np.asarray(x)
+    grid = problem.limits.grid()
+
+    def is_kept(factor: float) -> bool:
+        return problem.excess(grid.shrink(x, factor)) <= 0.0
+
+    factors = np.arange(1.0 - SHRINKAGE_STEP, 0.0, -SHRINKAGE_STEP)
+    low = next((factor for factor in factors if is_kept(factor)), None)
+    if low is None:
+        return evaluate(problem, x[None])
+    high = low + SHRINKAGE_STEP
+    for _ in range(6):
+        middle = 0.5 * (low + high)
+        if is_kept(middle):
+            low = middle
+        else:
+            high = middle
+    return evaluate(problem, grid.shrink(x, low)[None])

@@ -1,0 +1,6 @@
+"""Constraints of a motion beside the limits of the joints: forces, end-effector, collisions."""
+
+from .clearance import Clearance as Clearance
+from .constraint import AbstractConstraint as AbstractConstraint, Finding as Finding
+from .force_limits import ForceLimits as ForceLimits
+from .tip_limits import TipLimits as TipLimits, tip_motion as tip_motion

@@ -1,0 +1,154 @@
+"""A constraint of a motion: how far each limited quantity is above its limit, and in words."""
+
+import math
+from abc import abstractmethod
+from collections.abc import Callable
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxid.arrays import AnyArray, Array, Float, Int
+from jaxid.dynamics.motion import Motion
+from jaxid.robot.robot import Robot
+
+BLOCK = 96
+"""Samples for which derivatives are compiled: those that the search watches of one motion."""
+
+
+class Finding(NamedTuple):
+    """A limited quantity, and how far a motion is from the limit.
+
+    Attributes:
+        name: Name of the quantity, as it reads in a sentence: `torque of joint 3`.
+        size: Physical size of a constraint's value of 1.
+        unit: Physical unit.
+        limit: Limit of the quantity in this unit; NaN if it has no name.
+        is_lower_limit: Whether the quantity must not fall below the limit, rather than
+            not rise above it.
+        note: Origin of the limit: `12 less a margin of 50 %`.
+        value: Relative excess over the limit; negative or zero where it is kept.
+        usage: Function of the relative excess that returns the used fraction of the
+            limit.
+    """
+
+    name: str
+    size: float
+    unit: str
+    limit: float = math.nan
+    is_lower_limit: bool = False
+    note: str = ""
+    value: float = math.nan
+    usage: Callable[[float], float] = lambda value: 1.0 + value
+
+    @property
+    def excess(self) -> float:
+        """Excess over the limit in physical units."""
+        return self.value * self.size
+
+    @property
+    def used(self) -> float:
+        """Used fraction of the limit, from 0 to 1; NaN where that means nothing."""
+        return self.usage(self.value)
+
+    @property
+    def reached(self) -> float:
+        """Physical quantity where it is nearest to its limit, or furthest beyond it."""
+        sign = -1.0 if self.is_lower_limit else 1.0
+        return self.limit + sign * self.excess
+
+    def __str__(self) -> str:
+        """Return one sentence."""
+        amount = f"{abs(self.excess):.3g} {self.unit}"
+        if self.value <= 0:
+            text = f"{self.name} keeps its limit with {amount} to spare"
+        elif self.is_lower_limit:
+            text = f"{self.name} falls short of its limit by {amount}"
+        else:
+            percentage = f"{100 * self.value:.3g} %"
+            text = f"{self.name} exceeds its limit by {amount} ({percentage})"
+        if math.isnan(self.limit):
+            return text
+        word = "least" if self.is_lower_limit else "most"
+        note = f" ({self.note})" if self.note else ""
+        return f"{text}: at {word} {self.limit:.4g} {self.unit}{note}"
+
+
+ValuesAndSlopes = tuple[
+    Float[np.ndarray, " samples"], list[Float[np.ndarray, "samples joints"]]
+]
+"""One value of each sample, and its derivatives by q, qd, qdd.
+
+Derivatives by qd and qdd may be left out where values depend on q only.
+"""
+Linearisation = Callable[[Motion, Int[np.ndarray, " samples"]], ValuesAndSlopes]
+"""Function of a motion, with one axis of samples, and of the entry that counts at each sample."""
+
+
+class AbstractConstraint(eqx.Module):
+    """Limits on a motion that are not linear in the joints' motion.
+
+    Each sample of a motion is evaluated by itself, so that solvers can ask for values
+    and derivatives at any instants. Values are smooth where possible, and relative: in
+    units of the limit, or of another size that `entries` names.
+    """
+
+    @abstractmethod
+    def __call__(self, robot: Robot, motion: Motion) -> Float[Array, "*batch values"]:
+        """Return the excess over each limit at each sample; zero or negative where it is kept.
+
+        Runs under `jit`, `vmap` and derivatives with respect to the motion.
+
+        Args:
+            robot: Robot that moves.
+            motion: Joint motion with any leading axes.
+        """
+
+    @abstractmethod
+    def entries(self, robot: Robot) -> tuple[Finding, ...]:
+        """Return the limited quantities in the order of the values, without their values."""
+
+    def linearisation(self, robot: Robot) -> Linearisation:
+        """Return a function in NumPy of a motion and the entry that counts at each sample.
+
+        It returns the values of the entries and their derivatives. This one is compiled
+        by JAX; a constraint that knows its derivatives in NumPy returns its own.
+
+        Args:
+            robot: Robot that moves.
+        """
+
+        @jax.jit
+        def linearise_block(entries: Array, *motion: Array) -> tuple[Array, ...]:
+            def value(*motion: Array) -> Array:
+                values = self(robot, Motion(*motion))
+                return jnp.take_along_axis(values, entries[:, None], axis=1)[:, 0]
+
+            values, pull = jax.vjp(value, *motion)
+            return values, *pull(jnp.ones_like(values))
+
+        def linearise(motion: Motion, entries: np.ndarray) -> ValuesAndSlopes:
+            # Samples are repeated up to whole blocks: another number would compile
+            # anew.
+            samples = len(entries)
+            blocks = math.ceil(samples / BLOCK)
+            places = np.resize(np.arange(samples), (blocks, BLOCK))
+            arrays = (entries, motion.q, motion.qd, motion.qdd)
+            results = [linearise_block(*(x[rows] for x in arrays)) for rows in places]
+            values, *slopes = (
+                np.concatenate(parts)[:samples] for parts in zip(*results, strict=True)
+            )
+            return values, slopes
+
+        return linearise
+
+    def describe(
+        self, robot: Robot, values: Float[AnyArray, "*batch values"]
+    ) -> list[Finding]:
+        """Return the limited quantities with the largest of their values."""
+        entries = self.entries(robot)
+        peaks = np.asarray(values).reshape(-1, len(entries)).max(axis=0)
+        pairs = zip(entries, peaks.tolist(), strict=True)
+        return [entry._replace(value=peak) for entry, peak in pairs]

@@ -1,0 +1,220 @@
+"""Limits of the joints' forces and of the motors' torques, by nominal parameters."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxid.arrays import AnyArray, Array, Float, as_array, namespace
+from jaxid.dynamics.base import BaseParameters
+from jaxid.dynamics.dispatch import in_numpy, on_samples, program_of
+from jaxid.dynamics.model import Coordinates
+from jaxid.dynamics.motion import Motion
+from jaxid.dynamics.terms import AbstractTransition, Reversal
+from jaxid.errors import InputError
+from jaxid.program.gradient import pull_back
+from jaxid.robot.robot import Robot
+from jaxid.trajectory.fourier import complete_limits
+
+from .constraint import (
+    AbstractConstraint,
+    Finding,
+    Linearisation,
+    ValuesAndSlopes,
+)
+
+REVERSAL_SPEED = 0.02
+"""Fraction of a joint's largest speed below which it may be about to reverse."""
+SMOOTHING = 1e-12
+"""Standard deviation at zero, where it is made smooth, as a fraction of the limit."""
+
+
+def _numbers(name: str, x: Any) -> np.ndarray | None:
+    return None if x is None else np.array(as_array(name, x), np.float64)
+
+
+class ForceLimits(AbstractConstraint):
+    r"""Limits of the joints' forces and of the motors' torques, with room for their uncertainty.
+
+    $$|Q_i| + k\,\sigma_i \le (1 - m)\,Q_{i,max}$$
+
+    The forces are those of nominal parameters; their standard deviation is that of the
+    nominal parameters, propagated through the regressor. Near standstill dry friction
+    counts in the direction that is worse: a joint that reverses passes through both,
+    between any two samples. Joints and motors without a limit are left out.
+
+    Attributes:
+        base: Base parameters.
+        parameters: Nominal values of the base parameters: of a CAD model, or of an
+            earlier fit.
+        covariance: Covariance of the nominal values; None if they count as known.
+        margin: Unused fraction $m$ of the limits, from 0 to 1.
+        deviations: Number $k$ of standard deviations that must fit below the limits.
+
+    Raises:
+        InputError: If there is not one number for each base parameter, or the
+            covariance is not finite.
+    """
+
+    base: BaseParameters
+    parameters: Float[AnyArray, " base"] = eqx.field(
+        converter=lambda x: _numbers("parameters", x)
+    )
+    covariance: Float[AnyArray, "base base"] | None = eqx.field(
+        converter=lambda x: _numbers("covariance", x), default=None
+    )
+    margin: float = 0.1
+    deviations: float = eqx.field(converter=float, default=2.0)
+
+    def __check_init__(self):
+        size = self.base.size
+        parameters = np.asarray(self.parameters)
+        if parameters.shape != (size,) or not np.isfinite(parameters).all():
+            raise InputError(
+                "`parameters` must hold one finite number for each base parameter "
+                f"({size}), but has shape {parameters.shape}: `base.from_standard` "
+                "makes them of standard ones."
+            )
+        covariance = self.covariance
+        if covariance is None:
+            return
+        is_finite = covariance.shape == (size, size) and np.isfinite(covariance).all()
+        rounding = 1e-9 * np.abs(covariance).max()
+        if not is_finite or np.linalg.eigvalsh(covariance)[0] < -rounding:
+            raise InputError(
+                f"`covariance` must be a finite matrix of {size} rows and columns "
+                "without negative eigenvalues."
+            )
+
+    def __call__(self, robot: Robot, motion: Motion) -> Float[Array, "*batch values"]:
+        """Return the relative excess over each limit."""
+        limits, to_limited = self._limited(robot)
+        forces = self._forces(motion)
+        xp = namespace(forces)
+        size = xp.max(xp.abs(forces @ to_limited), axis=-2)
+        if self.covariance is not None:
+            regressor = self.base.regressor(motion)
+            rows = xp.einsum("...jb,jm->...mb", regressor, to_limited)
+            variance = xp.einsum("...mb,bc,...mc->...m", rows, self.covariance, rows)
+            variance = xp.maximum(variance, 0.0)
+            smoothing = xp.broadcast_to((SMOOTHING * limits) ** 2, variance.shape)
+            size = size + self.deviations * xp.sqrt(variance + smoothing)
+        return size / xp.broadcast_to(limits, size.shape) - 1.0
+
+    def _limited(self, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
+        """Return all limits, and the matrix from joint forces to what they limit."""
+        limits = self._all_limits(robot)
+        has_limit = np.isfinite(limits)
+        to_motors = np.linalg.inv(np.asarray(robot.drives.reduction))
+        to_limited = np.concatenate([np.eye(robot.joints), to_motors], axis=1)
+        return (1 - self.margin) * limits[has_limit], to_limited[:, has_limit]
+
+    def _forces(self, motion: Motion) -> Float[AnyArray, "*batch 3 joints"]:
+        """Return `forces` at all samples."""
+        arrays = (motion.q, motion.qd, motion.qdd)
+        if isinstance(motion.q, jax.Array) or motion.q.ndim != 2:
+            return on_samples(self, self.forces, *arrays)
+        # Rows of samples in NumPy need no compiler.
+        return in_numpy(self, self.forces, *arrays)
+
+    def linearisation(self, robot: Robot) -> Linearisation:
+        """Return a function of relative excesses and their derivatives, in NumPy."""
+        limits, to_limited = self._limited(robot)
+
+        def linearise(motion: Motion, entries: np.ndarray) -> ValuesAndSlopes:
+            shares = to_limited[:, entries].T
+            sample_limits = limits[entries]
+            size, slopes = self._largest_forces(motion, shares, sample_limits)
+            if self.covariance is not None:
+                spread = self._deviations(motion, shares, sample_limits)
+                size = size + spread[0]
+                slopes = [x + y for x, y in zip(slopes, spread[1], strict=True)]
+            return size / sample_limits - 1.0, slopes
+
+        return linearise
+
+    def _largest_forces(
+        self, motion: Motion, shares: np.ndarray, limits: np.ndarray
+    ) -> ValuesAndSlopes:
+        """Return the largest size of a force at each sample, and slopes over the limit."""
+        samples = np.arange(len(limits))
+        forces = np.einsum("tsj,tj->ts", self._forces(motion), shares)
+        side = np.abs(forces).argmax(axis=1)
+        largest = forces[samples, side]
+        weights = np.zeros((len(samples), 3, shares.shape[1]))
+        weights[samples, side] = shares * (np.sign(largest) / limits)[:, None]
+        arrays = (motion.q, motion.qd, motion.qdd)
+        slopes = _pull_back(self, self.forces, weights, *arrays)
+        return np.abs(largest), slopes
+
+    def _deviations(
+        self, motion: Motion, shares: np.ndarray, limits: np.ndarray
+    ) -> ValuesAndSlopes:
+        """Return the room for the uncertainty at each sample, and slopes over the limit."""
+        base = self.base
+        rows = np.einsum("tjb,tj->tb", np.asarray(base.regressor(motion)), shares)
+        products = rows @ self.covariance
+        variance = np.maximum((rows * products).sum(axis=1), 0.0)
+        deviation = np.sqrt(variance + (SMOOTHING * limits) ** 2)
+        slope = self.deviations / deviation / limits
+        weights = shares[:, :, None] * (products * slope[:, None])[:, None]
+        arrays = base.model.arguments(motion)
+        slopes = _pull_back(base, base.columns, weights, *arrays)
+        return self.deviations * deviation, slopes
+
+    def forces(
+        self, q: Coordinates, qd: Coordinates, qdd: Coordinates
+    ) -> Float[Array, "3 joints"]:
+        """Return the forces of one sample: as expected, and with dry friction to either side."""
+        model = self.base.model
+        p = self.base.to_standard(jnp.asarray(self.parameters))
+        speeds = REVERSAL_SPEED * np.asarray(complete_limits(model.robot).velocity)
+
+        def is_transition(part: Any) -> bool:
+            return isinstance(part, AbstractTransition)
+
+        def reverse(side: float) -> Any:
+            def replace(part: Any) -> Any:
+                return Reversal(part, side, speeds) if is_transition(part) else part
+
+            return jax.tree.map(replace, model, is_leaf=is_transition)
+
+        models = (model, reverse(1.0), reverse(-1.0))
+        forces = [jnp.asarray(each.forces(p, q, qd, qdd)) for each in models]
+        return jnp.stack(forces) + model.known_forces(q, qd, qdd)[None]
+
+    def entries(self, robot: Robot) -> tuple[Finding, ...]:
+        """Return the forces and torques that have a limit."""
+        quantities = [
+            (f"the force of joint `{name}`", robot.force_unit(joint))
+            for joint, name in enumerate(robot.joint_names)
+        ]
+        for motor in range(1, robot.joints + 1):
+            quantities.append((f"the torque of motor {motor}", "N m"))
+        entries = []
+        limits = self._all_limits(robot).tolist()
+        for (name, unit), limit in zip(quantities, limits, strict=True):
+            margin = f"{limit:.4g} less a margin of {100 * self.margin:.4g} %"
+            note = margin if self.margin else ""
+            reduced = (1 - self.margin) * limit
+            if np.isfinite(limit):
+                entries.append(Finding(name, reduced, unit, reduced, note=note))
+        return tuple(entries)
+
+    @staticmethod
+    def _all_limits(robot: Robot) -> np.ndarray:
+        """Return the limits of all joints, then of all motors [N m or N]."""
+        return np.concatenate([robot.limits.force, robot.drives.max_torques])
+
+
+def _pull_back(
+    owner: eqx.Module, definition: Callable, weights: np.ndarray, *arrays: AnyArray
+) -> list[Float[np.ndarray, "samples joints"]]:
+    """Return derivatives of weighted results of a method for one sample, for rows of samples."""
+    program = program_of(owner, definition, *(x.shape[1:] for x in arrays))
+    packed_weights = weights.reshape(len(weights), -1).T
+    columns = (np.asarray(x).T for x in arrays)
+    return [slopes.T for slopes in pull_back(program, packed_weights, *columns)]

@@ -1,0 +1,134 @@
+"""Information of a motion about the base parameters (Eq. 36)."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxid.arrays import AnyArray, Array, Float, namespace
+from jaxid.dynamics.base import BaseParameters
+from jaxid.dynamics.motion import Motion
+from jaxid.trajectory.trajectory import AbstractBasis
+
+RANK_TOLERANCE = 1e-12
+"""Eigenvalue, relative to the largest one, below which a direction has no information."""
+MIN_SHARE = 1e-3
+"""Component in such a direction above which a parameter takes part in it."""
+
+
+class Information(eqx.Module):
+    r"""Information of an experiment, as criteria need it.
+
+    Attributes:
+        plain: The paper's $\Lambda = \Theta_B^T \Theta_B$ (Eq. 36).
+        weighted: The same in units of the noise, $\Theta_B^T W^2 \Theta_B$, plus prior
+            information; its inverse is the covariance of weighted least squares.
+        sizes: Typical size of each parameter, in its unit.
+    """
+
+    plain: Float[AnyArray, "*batch base base"]
+    weighted: Float[AnyArray, "*batch base base"]
+    sizes: Float[AnyArray, " base"]
+
+
+def information(
+    base: BaseParameters,
+    motion: Motion,
+    weights: Float[AnyArray, " joints"],
+    prior: Float[AnyArray, "base base"] | None = None,
+    sizes: Float[AnyArray, " base"] | None = None,
+) -> Information:
+    """Return the information of one motion, computed in NumPy (Eq. 36).
+
+    Args:
+        base: Base parameters.
+        motion: All samples that will be measured.
+        weights: Inverse standard deviation of each joint's noise [1/(N m) or 1/N].
+        prior: Information of earlier experiments; none if None.
+        sizes: Typical size of each parameter; one if None.
+    """
+    shape = (base.size, base.size)
+    plain = np.zeros(shape)
+    weighted = np.zeros(shape) if prior is None else np.array(prior, np.float64)
+    rows_by_joint = base.regressor_rows(motion)
+    joints = zip(base.acting_columns, rows_by_joint, np.asarray(weights), strict=True)
+    for columns, rows, weight in joints:
+        gram = rows.T @ rows
+        place = np.ix_(columns, columns)
+        plain[place] += gram
+        weighted[place] += weight**2 * gram
+    return Information(plain, weighted, np.ones(base.size) if sizes is None else sizes)
+
+
+def information_of_coefficients(
+    base: BaseParameters,
+    basis: AbstractBasis,
+    x: Float[AnyArray, "starts joints variables"],
+    *,
+    samples: int,
+    measured: int,
+    weights: Float[AnyArray, " joints"],
+    prior: Float[AnyArray, "base base"],
+    sizes: Float[AnyArray, " base"],
+) -> Information:
+    """Return the information of many trajectories, under `jit` and derivatives (Eq. 36).
+
+    Motions are evaluated at `samples`, which stand for those that are `measured`.
+    """
+    regressor = base.joint_regressor
+    rows = np.asarray(basis.rows(basis.times(samples)))
+    q, qd, qdd = (jnp.einsum("sk,bjk->jbs", part, x) for part in rows[:3])
+    columns_by_joint = regressor(q, qd, qdd)
+
+    plain = jnp.zeros((x.shape[0], regressor.size, regressor.size), x.dtype)
+    weighted = plain
+    for joint, columns in enumerate(columns_by_joint):
+        place = np.ix_(regressor.columns[joint], regressor.columns[joint])
+        gram = measured / samples * _gram(columns)
+        plain = plain.at[:, *place].add(gram)
+        weighted = weighted.at[:, *place].add(weights[joint] ** 2 * gram)
+    return Information(plain, weighted + prior[None], sizes)
+
+
+@jax.custom_jvp
+def _gram(
+    columns: Float[Array, "starts columns samples"],
+) -> Float[Array, "starts columns columns"]:
+    """Return products of columns; the derivative takes one product instead of two."""
+    return jnp.einsum("bis,bjs->bij", columns, columns)
+
+
+@_gram.defjvp
+def _gram_derivative(primals: tuple, tangents: tuple) -> tuple:
+    (columns,) = primals
+    (tangent,) = tangents
+    product = jnp.einsum("bis,bjs->bij", tangent, columns)
+    return _gram(columns), product + jnp.swapaxes(product, 1, 2)
+
+
+def standard_deviations(
+    weighted: Float[AnyArray, "base base"],
+) -> Float[np.ndarray, " base"]:
+    """Return standard deviations from weighted information; infinite where undetermined."""
+    scaled, scale = scale_to_unit_diagonal(np.asarray(weighted, np.float64))
+    eigenvalues, directions = np.linalg.eigh(scaled)
+    is_blind = eigenvalues < RANK_TOLERANCE * eigenvalues[-1]
+
+    squares = directions[:, ~is_blind] ** 2
+    variances = (squares / eigenvalues[None, ~is_blind]).sum(axis=1)
+    deviations = scale * np.sqrt(variances)
+
+    # A parameter is undetermined if it takes part in a direction without information.
+    shares = np.abs(directions[:, is_blind])
+    is_undetermined = (shares > MIN_SHARE).any(axis=1)
+    return np.where(is_undetermined, np.inf, deviations)
+
+
+def scale_to_unit_diagonal(matrix: AnyArray) -> tuple[Any, Any]:
+    """Return the matrix with ones on its diagonal, and the factor of each row and column."""
+    xp = namespace(matrix)
+    diagonal = xp.diagonal(matrix)
+    scale = 1.0 / xp.sqrt(xp.where(diagonal > 0, diagonal, 1.0))
+    return scale[:, None] * matrix * scale[None], scale

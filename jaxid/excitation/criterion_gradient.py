@@ -1,0 +1,100 @@
+"""Criterion of several motions and its derivatives, in NumPy: nothing is compiled.
+
+A search asks for these thousands of times, of few samples.
+"""
+
+import numpy as np
+
+from jaxid.arrays import Float
+from jaxid.program.gradient import pull_back
+
+from .problem import ExcitationProblem
+
+
+def value_and_gradient(
+    problem: ExcitationProblem,
+    x: Float[np.ndarray, "starts scaled"],
+    sharpness: float | None,
+    samples: int,
+) -> tuple[Float[np.ndarray, " starts"], Float[np.ndarray, "starts scaled"]]:
+    """Return the logarithms of the criterion and their derivatives by each motion.
+
+    Motions are evaluated at `samples`, which stand for all that will be measured.
+    """
+    rows = problem.sample_rows(samples)
+    coefficients = problem.limits.coefficients(x)
+    motion = [np.einsum("sk,bjk->jbs", part, coefficients) for part in rows]
+    regressor = problem.regressor
+    columns = [np.swapaxes(each, 0, 1) for each in regressor.in_numpy(*motion)]
+    weight = problem.samples / samples
+
+    plain, weighted = _information(problem, columns, weight)
+    values, by_plain, by_weighted = _criterion_and_slopes(
+        problem, plain, weighted, sharpness
+    )
+    by_columns = _slopes_by_columns(problem, columns, weight, by_plain, by_weighted)
+    packed = by_columns.reshape(-1, *by_columns.shape[2:])
+    by_motion = pull_back(regressor.program, packed, *motion)
+
+    by_coefficients = np.zeros_like(coefficients)
+    for slopes, part in zip(by_motion, rows, strict=True):
+        by_coefficients += np.einsum("jbs,sk->bjk", slopes, part)
+    gradient = by_coefficients * np.asarray(problem.limits.scale)
+    return values, gradient.reshape(x.shape)
+
+
+def _information(
+    problem: ExcitationProblem, columns: list[np.ndarray], weight: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return plain and weighted information from each joint's columns of the regressor."""
+    shape = (columns[0].shape[0], problem.base.size, problem.base.size)
+    plain = np.zeros(shape)
+    weighted = np.zeros(shape)
+    numbers_by_joint = problem.regressor.columns
+    for joint, each in enumerate(columns):
+        numbers = numbers_by_joint[joint]
+        place = np.ix_(numbers, numbers)
+        gram = weight * (each @ np.swapaxes(each, 1, 2))
+        plain[:, *place] += gram
+        weighted[:, *place] += problem.weights[joint] ** 2 * gram
+    return plain, weighted + problem.prior
+
+
+def _criterion_and_slopes(
+    problem: ExcitationProblem,
+    plain: np.ndarray,
+    weighted: np.ndarray,
+    sharpness: float | None,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the criterion of each motion, and its derivatives by both matrices."""
+    values = np.zeros(len(plain))
+    by_plain = np.zeros_like(plain)
+    by_weighted = np.zeros_like(weighted)
+    for k, matrices in enumerate(zip(plain, weighted, strict=True)):
+        value, slopes = problem.criterion_and_slopes(*matrices, sharpness)
+        values[k] = value
+        by_plain[k] = slopes[0]
+        by_weighted[k] = slopes[1]
+    return values, by_plain, by_weighted
+
+
+def _slopes_by_columns(
+    problem: ExcitationProblem,
+    columns: list[np.ndarray],
+    weight: float,
+    by_plain: np.ndarray,
+    by_weighted: np.ndarray,
+) -> Float[np.ndarray, "joints base starts samples"]:
+    """Return derivatives by the entries of the regressor."""
+    starts, _, samples = columns[0].shape
+    slopes = np.zeros((len(columns), problem.base.size, starts, samples))
+    numbers_by_joint = problem.regressor.columns
+    for joint, each in enumerate(columns):
+        numbers = numbers_by_joint[joint]
+        place = np.ix_(numbers, numbers)
+        by_gram = by_plain[:, *place]
+        by_gram = by_gram + problem.weights[joint] ** 2 * by_weighted[:, *place]
+        # Each column is in the product twice.
+        symmetric = weight * (by_gram + np.swapaxes(by_gram, 1, 2))
+        slopes[joint, list(numbers)] = np.swapaxes(symmetric @ each, 0, 1)
+    return slopes
