@@ -38,7 +38,7 @@ from jaxid.report.excitation import plan_remarks
 from jaxid.trajectory.controllers import CONTROLLERS
 from jaxid.trajectory.files import load_trajectory, save_trajectory
 from jaxid.trajectory.fourier import FourierBasis, fourier_series
-from jaxid.trajectory.leads import LeadsBasis
+from jaxid.trajectory.lead_in_and_out import LeadsBasis
 from jaxid.trajectory.spline import RestToRestSplineBasis
 
 PENDULUM = """\

@@ -204,7 +204,7 @@ def minimise(
 
 
 class Outcome(NamedTuple):
-    """What a search or another solver has found."""
+    """Result of a search or of another solver."""
 
     best: Candidates
     history: list[float]  # value of the criterion of the best motion after each step

@@ -26,7 +26,7 @@ from jaxid.trajectory.files import (
     write_ros,
 )
 from jaxid.trajectory.fourier import FourierBasis, complete_limits
-from jaxid.trajectory.leads import WithLeads, with_leads
+from jaxid.trajectory.lead_in_and_out import WithLeads, with_leads
 from jaxid.trajectory.trajectory import (
     AbstractTrajectory,
     LinearTrajectory,

@@ -18,7 +18,7 @@ from jaxid.robot.robot import Robot
 from jaxid.robot.rotations import rpy_rotation
 from jaxid.trajectory.controllers import CONTROLLERS
 from jaxid.trajectory.fourier import FourierBasis, RestToRestBasis
-from jaxid.trajectory.leads import LeadsBasis
+from jaxid.trajectory.lead_in_and_out import LeadsBasis
 from jaxid.trajectory.spline import RestToRestSplineBasis
 from jaxid.trajectory.trajectory import AbstractBasis, count_cycles
 

@@ -13,7 +13,7 @@ from .fourier import (
     fourier_series as fourier_series,
     random_fourier_series as random_fourier_series,
 )
-from .leads import (
+from .lead_in_and_out import (
     LeadsBasis as LeadsBasis,
     WithLeads as WithLeads,
     with_leads as with_leads,
@@ -35,5 +35,4 @@ from .trajectory import (
     AbstractTrajectory as AbstractTrajectory,
     LinearTrajectory as LinearTrajectory,
     PaddedToCycle as PaddedToCycle,
-    Segments as Segments,
 )

@@ -5,7 +5,7 @@ import math
 
 import equinox as eqx
 import numpy as np
-from scipy.linalg import block_diag
+from scipy.linalg import block_diag, null_space
 
 from jaxid.arrays import AnyArray, Float, is_traced, namespace
 from jaxid.errors import InputError
@@ -63,16 +63,17 @@ class FourierBasis(AbstractBasis):
         xp = namespace(t, self.omega)
         w = self.omega * np.arange(1.0, self.harmonics + 1.0)[None]
         phase = t[:, None] * w
-        sin, cos = xp.sin(phase), xp.cos(phase)
+        sin = xp.sin(phase)
+        cos = xp.cos(phase)
         one = xp.ones_like(phase[:, :1])
-        return xp.stack(
-            [
-                xp.concatenate([one, sin / w, -cos / w], axis=1),
-                xp.concatenate([0 * one, cos, sin], axis=1),
-                xp.concatenate([0 * one, -sin * w, cos * w], axis=1),
-                xp.concatenate([0 * one, -cos * w**2, -sin * w**2], axis=1),
-            ]
+        zero = xp.zeros_like(one)
+        orders = (
+            [one, sin / w, -cos / w],
+            [zero, cos, sin],
+            [zero, -sin * w, cos * w],
+            [zero, -cos * w**2, -sin * w**2],
         )
+        return xp.stack([xp.concatenate(parts, axis=1) for parts in orders])
 
     def envelope(self, points: int) -> Envelope:
         r"""Return samples of a period: $\max |p| \le \max_k |p(t_k)| / \cos(\pi n / M)$.
@@ -134,19 +135,20 @@ class RestToRestBasis(PeriodsBasis):
     @property
     def directions(self) -> Float[np.ndarray, "coefficients variables"]:
         """Orthonormal coefficients of the series that keep a joint at rest at both ends."""
-        order = np.arange(1.0, self.harmonics + 1.0)
-        a, b = (
-            np.linalg.svd(x[None])[2][1:].T for x in (np.ones(self.harmonics), order)
-        )
+        orders = np.arange(1.0, self.harmonics + 1.0)
+        a = null_space(np.ones((1, self.harmonics)))
+        b = null_space(orders[None])
         return np.asarray(block_diag(np.ones((1, 1)), a, b))
 
     def rows(
         self, t: Float[AnyArray, " samples"]
     ) -> Float[AnyArray, "4 samples variables"]:
         """Return sines and cosines in the directions that keep the joint at rest at both ends."""
-        return stand_outside(
-            lambda t: self.series.rows(t) @ self.directions, t, self.duration
-        )
+
+        def series_rows(t: AnyArray) -> AnyArray:
+            return self.series.rows(t) @ self.directions
+
+        return stand_outside(series_rows, t, self.duration)
 
     def envelope(self, points: int) -> Envelope:
         """Return samples of a period, as for any series."""
@@ -206,24 +208,36 @@ def random_fourier_series(
     """
     if not 0 < reach <= 1:
         raise InputError(f"`reach` must be above 0 and at most 1, but is {reach:g}.")
-    basis, limits = FourierBasis(harmonics, omega), complete_limits(robot)
-    low, high = np.asarray(limits.position_min), np.asarray(limits.position_max)
-    centre, half = 0.5 * (low + high), reach * 0.5 * (high - low)
+    basis = FourierBasis(harmonics, omega)
+    limits = complete_limits(robot)
+    low = np.asarray(limits.position_min)
+    high = np.asarray(limits.position_max)
+    half_range = reach * 0.5 * (high - low)
 
     random = np.random.default_rng(seed)
-    a, b = random.standard_normal((2, robot.joints, harmonics)) / np.arange(
-        1, harmonics + 1
-    )
+    amplitudes = random.standard_normal((2, robot.joints, harmonics))
+    a, b = amplitudes / np.arange(1, harmonics + 1)
     x = np.concatenate([np.zeros((robot.joints, 1)), a, b], axis=1)
+
+    # Each joint meets its tightest limit, also between the points of the envelope.
     rows, factor = basis.envelope(512)
     q, qd, qdd = (x @ part.T for part in rows[:3])
-    middle, swing = 0.5 * (q.max(1) + q.min(1)), 0.5 * factor * np.ptp(q, axis=1)
-    scale = half / swing
-    for peaks, most in ((qd, limits.velocity), (qdd, limits.acceleration)):
-        scale = np.minimum(scale, reach * most / (factor * np.abs(peaks).max(1)))
-    left = np.maximum(half - scale * swing, 0.0)
+    centre = 0.5 * (q.max(axis=1) + q.min(axis=1))
+    swing = 0.5 * factor * np.ptp(q, axis=1)
+    speed = factor * np.abs(qd).max(axis=1)
+    acceleration = factor * np.abs(qdd).max(axis=1)
+    scale = np.min(
+        [
+            half_range / swing,
+            reach * limits.velocity / speed,
+            reach * limits.acceleration / acceleration,
+        ],
+        axis=0,
+    )
+    room = np.maximum(half_range - scale * swing, 0.0)
+    shift = random.uniform(-1.0, 1.0, robot.joints) * room
     x *= scale[:, None]
-    x[:, 0] = centre - scale * middle + random.uniform(-1.0, 1.0, robot.joints) * left
+    x[:, 0] = 0.5 * (low + high) - scale * centre + shift
     return basis.trajectory(x)
 
 
@@ -233,19 +247,24 @@ def complete_limits(robot: Robot) -> Limits:
     Assumed are: half a turn or 1 m to either side; 90 degrees/s or 0.5 m/s; the
     acceleration that reaches the largest speed in 0.25 s.
     """
-    turns, limits = np.array(robot.revolute, bool), robot.limits
-    half, speed = np.where(turns, math.pi, 1.0), np.where(turns, math.pi / 2, 0.5)
-    low, high = np.asarray(limits.position_min), np.asarray(limits.position_max)
-    has_low, has_high = np.isfinite(low), np.isfinite(high)
+    limits = robot.limits
+    is_revolute = np.array(robot.revolute, bool)
+    half_range = np.where(is_revolute, math.pi, 1.0)
+    speed = np.where(is_revolute, math.pi / 2, 0.5)
+    low = np.asarray(limits.position_min)
+    high = np.asarray(limits.position_max)
+    has_low = np.isfinite(low)
+    has_high = np.isfinite(high)
+
     # A range that is open on one side is as long as one that is open on both.
-    lowest = np.where(has_low, low, np.where(has_high, high - 2 * half, -half))
-    highest = np.where(has_high, high, np.where(has_low, low + 2 * half, half))
+    assumed_low = np.where(has_high, high - 2 * half_range, -half_range)
+    assumed_high = np.where(has_low, low + 2 * half_range, half_range)
     velocity = np.where(np.isfinite(limits.velocity), limits.velocity, speed)
-    known = np.isfinite(limits.acceleration)
+    has_acceleration = np.isfinite(limits.acceleration)
     return dataclasses.replace(
         limits,
-        position_min=lowest,
-        position_max=highest,
+        position_min=np.where(has_low, low, assumed_low),
+        position_max=np.where(has_high, high, assumed_high),
         velocity=velocity,
-        acceleration=np.where(known, limits.acceleration, velocity / 0.25),
+        acceleration=np.where(has_acceleration, limits.acceleration, velocity / 0.25),
     )

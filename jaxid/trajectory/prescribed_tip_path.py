@@ -1,18 +1,28 @@
 """Paths of the end-effector in space, the path of ISO 9283, and the joints' motion along a path."""
 
 import itertools
+import math
 from typing import ClassVar
 
 import equinox as eqx
 import numpy as np
-from scipy.interpolate import make_interp_spline
 
 from jaxid.arrays import AnyArray, Float, Numbers, as_array
 from jaxid.errors import InputError
 from jaxid.robot.inverse_kinematics import inverse_kinematics_along
 from jaxid.robot.robot import Robot
 
-from .spline import PiecewisePolynomial, spline_polynomials
+from .spline import (
+    DEGREE,
+    PiecewisePolynomial,
+    interpolate_at_rest,
+    spline_polynomials,
+)
+
+SAMPLE_TIME = 0.01
+"""Largest time between two poses of the inverse kinematics [s]."""
+MIN_SPANS = 12
+"""Smallest number of spans of the spline along one piece."""
 
 
 class Line(eqx.Module):
@@ -74,6 +84,11 @@ class Circle(eqx.Module):
         return np.asarray(self.centre) + np.cos(angle) * first + np.sin(angle) * second
 
 
+UNIT_SPEED = 15.0 / 8.0
+UNIT_ACCELERATION = 10.0 / np.sqrt(3.0)
+"""Largest speed and acceleration of the polynomial over a unit length in unit time."""
+
+
 class TipPath(eqx.Module):
     """Curves that the end-effector follows one after the other, at rest where they meet.
 
@@ -106,35 +121,32 @@ class TipPath(eqx.Module):
                 raise InputError(f"`{name}` must be positive, but is {limit:g}.")
         if not self.pieces:
             raise InputError("`pieces` must hold at least one piece, but is empty.")
-        ends = [piece.at(np.array([0.0, 1.0])) for piece in self.pieces]
-        for k, piece in enumerate(self.pieces):
-            gap = float(np.linalg.norm(ends[k][0] - ends[k - 1][1])) if k else 0.0
+        place = None
+        for number, piece in enumerate(self.pieces, 1):
+            start, end = piece.at(np.array([0.0, 1.0]))
+            gap = 0.0 if place is None else float(np.linalg.norm(start - place))
             if gap > 1e-9:
                 raise InputError(
-                    f"piece {k + 1} of `pieces` starts {gap:.3g} m from where the one "
+                    f"piece {number} of `pieces` starts {gap:.3g} m from where the one "
                     "before ends."
                 )
             if not 0 < piece.length < np.inf:
                 raise InputError(
-                    f"piece {k + 1} of `pieces` must have a length, but it is "
+                    f"piece {number} of `pieces` must have a length, but it is "
                     f"{piece.length:g} m."
                 )
+            place = end
 
     @property
     def durations(self) -> tuple[float, ...]:
         """Time of each piece [s]: the shortest that keeps speed and acceleration."""
-        # Largest speed and acceleration of the polynomial, over a unit length in unit
-        # time.
-        speed, acceleration = 15.0 / 8.0, 10.0 / np.sqrt(3.0)
-        return tuple(
-            max(
-                speed
-                * p.length
-                / min(self.speed, np.sqrt(self.acceleration * p.radius)),
-                np.sqrt(acceleration * p.length / self.acceleration),
-            )
-            for p in self.pieces
-        )
+        durations = []
+        for piece in self.pieces:
+            max_speed = min(self.speed, np.sqrt(self.acceleration * piece.radius))
+            by_speed = UNIT_SPEED * piece.length / max_speed
+            by_acceleration = UNIT_ACCELERATION * piece.length / self.acceleration
+            durations.append(max(by_speed, np.sqrt(by_acceleration)))
+        return tuple(durations)
 
     @property
     def duration(self) -> float:
@@ -146,14 +158,15 @@ class TipPath(eqx.Module):
     ) -> Float[np.ndarray, "samples 3"]:
         """Return positions of the end-effector [m] at times [s]; it stands still outside."""
         t = np.asarray(t)
-        starts = np.concatenate([[0.0], np.cumsum(self.durations)[:-1]])
-        piece = np.clip(
-            np.searchsorted(starts, t, side="right") - 1, 0, len(starts) - 1
-        )
+        ends = np.cumsum(self.durations)
+        starts = ends - self.durations
+        pieces = np.searchsorted(starts[1:], t, side="right")
         places = np.empty((len(t), 3))
-        for k, curve in enumerate(self.pieces):
-            u = np.clip((t[piece == k] - starts[k]) / self.durations[k], 0.0, 1.0)
-            places[piece == k] = curve.at(u**3 * (10.0 + u * (6.0 * u - 15.0)))
+        for number, curve in enumerate(self.pieces):
+            is_on_curve = pieces == number
+            time = t[is_on_curve] - starts[number]
+            u = np.clip(time / self.durations[number], 0.0, 1.0)
+            places[is_on_curve] = curve.at(u**3 * (10.0 + u * (6.0 * u - 15.0)))
         return places
 
 
@@ -191,21 +204,31 @@ def iso9283_path(
     c = as_array("centre", centre)
     if c.shape != (3,):
         raise InputError("`centre` must hold three numbers [m].")
-    rising = np.eye(3)[leans_along] + np.eye(3)[2]
-    level = np.eye(3)[1 - leans_along]
+    x, y, z = np.eye(3)
+    rising = (x, y)[leans_along] + z
+    level = (y, x)[leans_along]
     # The corners lie a tenth of the diagonal inside, so that 80 % of the half edges are
     # left.
-    large, small = 0.8 * edge / 2, 0.08 * edge / 2
-    u, v = large * rising, large * level
-    p2, p3, p4, p5 = c + u + v, c - u + v, c - u - v, c + u - v
+    large = 0.8 * edge / 2
+    small = 0.08 * edge / 2
+    u = large * rising
+    v = large * level
+    p2 = c + u + v
+    p3 = c - u + v
+    p4 = c - u - v
+    p5 = c + u - v
     up = rising / np.sqrt(2.0)
-    corners = (c, p2, p3, p4, p5, p2, p4, c, c + large * up)
+    top = c + large * up
+    small_top = c + small * up
+
+    corners = (c, p2, p3, p4, p5, p2, p4, c, top)
+    lines = [Line(start, end) for start, end in itertools.pairwise(corners)]
     pieces = (
-        *(Line(a, b) for a, b in itertools.pairwise(corners)),
+        *lines,
         Circle(c, large * up, large * level),
-        Line(c + large * up, c + small * up),
+        Line(top, small_top),
         Circle(c, small * up, small * level),
-        Line(c + small * up, c),
+        Line(small_top, c),
     )
     return TipPath(pieces, rotation, speed, acceleration)
 
@@ -227,39 +250,58 @@ def joint_path(
         InputError: If the path cannot be followed, or a joint would have to move faster
             than it can.
     """
-    counts = [max(12, int(np.ceil(time / 0.01))) for time in path.durations]
-    ends = np.concatenate([[0.0], np.cumsum(path.durations)])
-    pairs = zip(itertools.pairwise(ends), counts, strict=True)
-    instants = [np.linspace(a, b, count + 1) for (a, b), count in pairs]
-    times = np.concatenate([*(t[:-1] for t in instants), ends[-1:]])
+    instants = _instants(path)
+    # Each piece ends where the next one starts.
+    times = np.concatenate([*(t[:-1] for t in instants), instants[-1][-1:]])
     q = inverse_kinematics_along(robot, path.positions(times), path.rotation, posture)
-    rest = [(order, np.zeros(robot.joints)) for order in (1, 2)]
-    knots, polynomials, begin = [], [], 0
-    for t, count in zip(instants, counts, strict=True):
-        nodes = q[begin : begin + count + 1]
-        spline = make_interp_spline(t - t[0], nodes, 5, bc_type=(rest, rest))
-        knots.append(t[0] + spline.t[5:-6])
+    knots = []
+    polynomials = []
+    begin = 0
+    for t in instants:
+        nodes = q[begin : begin + len(t)]
+        spline = interpolate_at_rest(t - t[0], nodes)
+        knots.append(t[0] + spline.t[DEGREE : -DEGREE - 1])
         polynomials.append(spline_polynomials(spline))
-        begin += count
+        begin += len(t) - 1
     coefficients = np.concatenate(polynomials, axis=1)
+    _require_speeds(robot, path, coefficients)
+    return PiecewisePolynomial(np.concatenate([*knots, times[-1:]]), coefficients)
+
+
+def _instants(path: TipPath) -> list[np.ndarray]:
+    """Return equidistant times over each piece of a path, its ends included [s]."""
+    ends = np.cumsum([0.0, *path.durations])
+    instants = []
+    for start, end in itertools.pairwise(ends):
+        count = max(MIN_SPANS, math.ceil((end - start) / SAMPLE_TIME))
+        instants.append(np.linspace(start, end, count + 1))
+    return instants
+
+
+def _require_speeds(
+    robot: Robot,
+    path: TipPath,
+    coefficients: Float[np.ndarray, "powers pieces joints"],
+) -> None:
+    """Reject a path on which a joint would have to move faster than it can."""
     # Velocities and accelerations at the knots are coefficients.
-    speed = np.abs(coefficients[-2]).max(axis=0) / np.asarray(robot.limits.velocity)
-    acceleration = np.abs(2 * coefficients[-3]).max(axis=0) / np.asarray(
-        robot.limits.acceleration
-    )
+    speeds = np.abs(coefficients[-2]).max(axis=0)
+    accelerations = np.abs(2 * coefficients[-3]).max(axis=0)
+    used_speed = speeds / np.asarray(robot.limits.velocity)
+    used_acceleration = accelerations / np.asarray(robot.limits.acceleration)
     # A path that is run f times slower needs a fraction 1/f of speeds and 1/f² of
     # accelerations.
-    slower = np.maximum(speed, np.sqrt(acceleration))
-    j = int(slower.argmax())
-    if slower[j] > 1.001:
-        name = "speed" if speed[j] == slower[j] else "acceleration"
-        f = 1.01 * slower[j]
-        raise InputError(
-            f"joint `{robot.joint_names[j]}` would need "
-            f"{max(speed[j], acceleration[j]):.2f} times "
-            f"its largest {name}: give the path a `speed` of {path.speed / f:.3g} m/s "
-            "and an "
-            f"`acceleration` of {path.acceleration / f**2:.3g} m/s², or choose "
-            "another posture."
-        )
-    return PiecewisePolynomial(np.concatenate([*knots, ends[-1:]]), coefficients)
+    slowdowns = np.maximum(used_speed, np.sqrt(used_acceleration))
+    joint = int(slowdowns.argmax())
+    if slowdowns[joint] <= 1.001:
+        return
+    is_speed = used_speed[joint] == slowdowns[joint]
+    quantity = "speed" if is_speed else "acceleration"
+    excess = max(used_speed[joint], used_acceleration[joint])
+    slowdown = 1.01 * slowdowns[joint]
+    raise InputError(
+        f"joint `{robot.joint_names[joint]}` would need {excess:.2f} times its largest "
+        f"{quantity}: give the path a `speed` of {path.speed / slowdown:.3g} m/s and "
+        f"an `acceleration` of {path.acceleration / slowdown**2:.3g} m/s², or choose "
+        "another posture."
+    )

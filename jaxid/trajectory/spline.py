@@ -52,23 +52,26 @@ def _evaluate(
     """Return a `PiecewisePolynomial` and three derivatives, constant outside its times [s]."""
     xp = namespace(times, coefficients, t)
     times, coefficients, t = (xp.asarray(x) for x in (times, coefficients, t))
+    start = times[0]
+    end = times[-1]
     # Written with `where`, because the derivative of `clip` at its ends is one half.
-    clipped = xp.where(t < times[0], times[0], xp.where(t > times[-1], times[-1], t))
-    piece = xp.clip(
-        xp.searchsorted(times, clipped, side="right") - 1, 0, len(times) - 2
-    )
-    x = (clipped - times[piece])[:, None]
-    c = coefficients[:, piece]
-    value, first, second, third = c[0], *(xp.zeros_like(c[0]) for _ in range(3))
-    for coefficient in c[1:]:
+    clipped = xp.where(t < start, start, xp.where(t > end, end, t))
+    pieces = xp.searchsorted(times, clipped, side="right") - 1
+    pieces = xp.clip(pieces, 0, len(times) - 2)
+
+    # Horner's scheme for the polynomial and its derivatives.
+    x = (clipped - times[pieces])[:, None]
+    powers = coefficients[:, pieces]
+    value = powers[0]
+    first = second = third = xp.zeros_like(value)
+    for coefficient in powers[1:]:
         third = third * x + 3 * second
         second = second * x + 2 * first
         first = first * x + value
         value = value * x + coefficient
-    inside = ((t >= times[0]) & (t <= times[-1]))[:, None]
-    return xp.stack(
-        [value, *(xp.where(inside, d, 0.0) for d in (first, second, third))]
-    )
+    is_moving = ((t >= start) & (t <= end))[:, None]
+    derivatives = [xp.where(is_moving, each, 0.0) for each in (first, second, third)]
+    return xp.stack([value, *derivatives])
 
 
 class RestToRestSplineBasis(AbstractBasis):
@@ -112,22 +115,20 @@ class RestToRestSplineBasis(AbstractBasis):
         The more knots it is written with, the closer they lie to it.
         """
         spans = self.points + 4 - DEGREE
-        finer = max(1, round(points / max(spans, 1)))
-        rows = []
+        refinement = max(1, round(points / max(spans, 1)))
+        control_points = []
         for order in range(4):
             degree = DEGREE - order
-            knots = _clamped_knots(spans * finer, degree)
-            count = len(knots) - degree - 1
+            knots = _clamped_knots(spans * refinement, degree)
             # A spline of the coarse knots is one of the fine knots as well:
-            # interpolation finds its fine control points. At Greville's abscissae the
-            # system is well conditioned.
-            abscissae = np.array(
-                [knots[i + 1 : i + 1 + degree].mean() for i in range(count)]
-            )
-            fine = BSpline.design_matrix(abscissae, knots, degree).toarray()
+            # interpolation finds its fine control points. At Greville's abscissae, the
+            # means of `degree` knots, the system is well conditioned.
+            windows = np.lib.stride_tricks.sliding_window_view(knots[1:-1], degree)
+            abscissae = windows.mean(axis=1)
+            matrix = BSpline.design_matrix(abscissae, knots, degree).toarray()
             values = np.asarray(self.rows(abscissae * self.duration)[order])
-            rows.append(np.linalg.solve(fine, values))
-        return tuple(rows), 1.0
+            control_points.append(np.linalg.solve(matrix, values))
+        return tuple(control_points), 1.0
 
 
 def spline_through(points: Numbers, duration: float) -> LinearTrajectory:
@@ -141,32 +142,38 @@ def spline_through(points: Numbers, duration: float) -> LinearTrajectory:
         InputError: If there are not at least two points, or the duration is not
             positive.
     """
-    way = np.asarray(as_array("points", points), np.float64)
-    if way.ndim != 2 or len(way) < 2 or not np.isfinite(way).all():
+    rows = np.asarray(as_array("points", points), np.float64)
+    if rows.ndim != 2 or len(rows) < 2 or not np.isfinite(rows).all():
         raise InputError(
             "`points` must hold two or more rows of finite numbers, but has shape "
-            f"{way.shape}."
+            f"{rows.shape}."
         )
-    rest = [(order, np.zeros(way.shape[1])) for order in (1, 2)]
-    spline = make_interp_spline(
-        np.linspace(0.0, 1.0, len(way)), way, DEGREE, bc_type=(rest, rest)
-    )
+    spline = interpolate_at_rest(np.linspace(0.0, 1.0, len(rows)), rows)
     # The first three control points are the start, and the last three are the end.
-    handles = np.concatenate([way[:1], spline.c[3:-3], way[-1:]])
+    handles = np.concatenate([rows[:1], spline.c[3:-3], rows[-1:]])
     return RestToRestSplineBasis(len(handles), duration).trajectory(handles.T)
+
+
+def interpolate_at_rest(
+    t: Float[np.ndarray, " points"], points: Float[np.ndarray, "points joints"]
+) -> BSpline:
+    """Return the quintic spline through points at some times that stands still at both ends."""
+    rest = [(order, np.zeros(points.shape[1])) for order in (1, 2)]
+    return make_interp_spline(t, points, DEGREE, bc_type=(rest, rest))
 
 
 def spline_polynomials(spline: BSpline) -> Float[np.ndarray, "powers pieces columns"]:
     """Return the pieces of a clamped quintic spline in powers of the time since their start."""
     knots = spline.t[DEGREE:-DEGREE]
-    lower = [
-        spline.derivative(k)(knots[:-1]) / math.factorial(k) for k in range(1, DEGREE)
-    ]
-    # The highest derivative jumps at the knots: rounding would decide which piece is
-    # evaluated.
-    middle = 0.5 * (knots[:-1] + knots[1:])
-    highest = spline.derivative(DEGREE)(middle) / math.factorial(DEGREE)
-    return np.stack([highest, *lower[::-1], spline(knots[:-1])])
+    starts = knots[:-1]
+    middles = 0.5 * (knots[:-1] + knots[1:])
+    powers = []
+    for order in reversed(range(DEGREE + 1)):
+        # The highest derivative jumps at the knots: rounding would decide which piece
+        # is evaluated.
+        instants = middles if order == DEGREE else starts
+        powers.append(spline(instants, order) / math.factorial(order))
+    return np.stack(powers)
 
 
 @functools.cache

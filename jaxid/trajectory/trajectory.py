@@ -3,7 +3,6 @@
 In a family each joint's motion is a basis of functions times the joint's coefficients.
 """
 
-import itertools
 import math
 from abc import abstractmethod
 from collections.abc import Callable
@@ -19,12 +18,16 @@ from jaxid.arrays import (
     Array,
     Float,
     Hashable,
-    is_traced,
     namespace,
     require_float64,
 )
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
+
+SHIFTS = 40
+"""Times of a period at which a periodic motion may begin."""
+RETIMING_TOLERANCE = 1e-9
+"""Relative error up to which a motion that begins at another time is one of the family."""
 
 States = tuple[Float[AnyArray, "samples joints"], ...]
 """Positions, velocities and accelerations."""
@@ -61,9 +64,9 @@ class AbstractTrajectory(Hashable):
     ) -> Float[Array, "*batch joints"]:
         """Return the rate of change of the accelerations [rad/s³ or m/s³] at times [s]."""
         times = jnp.asarray(t, float)
-        return jax.jvp(lambda t: self.motion(t).qdd, (times,), (jnp.ones_like(times),))[
-            1
-        ]
+        ones = jnp.ones_like(times)
+        _, jerk = jax.jvp(lambda t: self.motion(t).qdd, (times,), (ones,))
+        return jerk
 
     def sample(
         self, sample_time: float
@@ -95,64 +98,6 @@ def _motion(trajectory: AbstractTrajectory, t: Array) -> Motion:
     return Motion(*(x.reshape(*t.shape, -1) for x in states))
 
 
-class Segments(AbstractTrajectory):
-    """Trajectories that follow one another without a pause.
-
-    Before the start the motion is that of the first member, after the end that of the
-    last one.
-
-    Attributes:
-        members: Trajectories in the order in which they are run.
-
-    Raises:
-        InputError: If there is no member, or one does not start as the one before it
-            ends: with the same coordinates, velocities and accelerations, up to 1e-6.
-    """
-
-    members: tuple[AbstractTrajectory, ...] = eqx.field(converter=tuple)
-
-    def __check_init__(self):
-        if not self.members:
-            raise InputError(
-                "`members` must hold at least one trajectory, but is empty."
-            )
-        if is_traced(self.members):
-            return
-        for k, (before, after) in enumerate(itertools.pairwise(self.members), 1):
-            end, start = before.motion(before.duration), after.motion(0.0)
-            if end.joints != start.joints:
-                raise InputError(
-                    f"`members` {k} and {k + 1} must move the same joints."
-                )
-            for name, field in (
-                ("coordinate", "q"),
-                ("velocity", "qd"),
-                ("acceleration", "qdd"),
-            ):
-                jump = np.abs(np.subtract(getattr(start, field), getattr(end, field)))
-                if jump.max() > 1e-6:
-                    raise InputError(
-                        f"the {name} of joint {int(jump.argmax()) + 1} jumps by "
-                        f"{jump.max():.3g} "
-                        f"between `members` {k} and {k + 1}: put a spline between them."
-                    )
-
-    @property
-    def duration(self) -> Float[AnyArray, ""] | float:
-        """Total time of all members [s]."""
-        return sum(member.duration for member in self.members)
-
-    def states(self, t: Float[AnyArray, " samples"]) -> States:
-        """Return the states of the member that runs at each time."""
-        begin, states = 0.0, self.members[0].states(t)
-        for before, member in itertools.pairwise(self.members):
-            begin = begin + before.duration
-            later = (t >= begin)[:, None]
-            pairs = zip(states, member.states(t - begin), strict=True)
-            states = tuple(jnp.where(later, y, x) for x, y in pairs)
-        return states
-
-
 class PaddedToCycle(AbstractTrajectory):
     """A motion that ends at rest, padded with its final pose to a whole number of cycles.
 
@@ -167,10 +112,8 @@ class PaddedToCycle(AbstractTrajectory):
     @property
     def duration(self) -> float:
         """First whole number of cycles in which the motion has ended [s]."""
-        return (
-            count_cycles(float(self.inner.duration), self.sample_time)
-            * self.sample_time
-        )
+        cycles = count_cycles(float(self.inner.duration), self.sample_time)
+        return cycles * self.sample_time
 
     def states(self, t: Float[AnyArray, " samples"]) -> States:
         """Return the motion, and its final pose after its end."""
@@ -252,24 +195,22 @@ class AbstractBasis(eqx.Module):
         any of 40 times, a motion between standstills may run backwards. The first map
         changes nothing. All of them keep the limits of the joint.
         """
-        shifts, tolerance = 40, 1e-9
-        part = -(-4 * self.variables // shifts)
-        step = float(self.duration) / (shifts * part)
-        rows = np.asarray(self.rows((np.arange(shifts * part) + 0.5) * step)[0])
-        inverse, size = np.linalg.pinv(rows), np.abs(rows).max()
-        moved = [
-            np.roll(r, k * part, axis=0)
-            for r in (rows, rows[::-1])
-            for k in range(shifts)
-        ]
-        maps = [(inverse @ wanted, wanted) for wanted in moved]
-        return np.array(
-            [
-                T
-                for T, wanted in maps
-                if np.abs(rows @ T - wanted).max() <= tolerance * size
-            ]
-        )
+        # So many equidistant times determine the coefficients, and shifts hit them.
+        samples_per_shift = math.ceil(4 * self.variables / SHIFTS)
+        samples = SHIFTS * samples_per_shift
+        step = float(self.duration) / samples
+        rows = np.asarray(self.rows((np.arange(samples) + 0.5) * step)[0])
+        inverse = np.linalg.pinv(rows)
+        tolerance = RETIMING_TOLERANCE * np.abs(rows).max()
+
+        maps = []
+        for direction in (rows, rows[::-1]):
+            for shift in range(SHIFTS):
+                retimed = np.roll(direction, shift * samples_per_shift, axis=0)
+                to_retimed = inverse @ retimed
+                if np.abs(rows @ to_retimed - retimed).max() <= tolerance:
+                    maps.append(to_retimed)
+        return np.array(maps)
 
 
 class LinearTrajectory(AbstractTrajectory):
@@ -302,7 +243,9 @@ def stand_outside(
     """Return rows of a motion that stands still before zero and after its duration [s]."""
     xp = namespace(t, as_scalar(duration))
     # Written with `where`, because the derivative of `clip` at its ends is one half.
-    inner = rows(xp.where(t < 0.0, 0.0, xp.where(t > duration, duration, t)))
-    inside = ((t >= 0.0) & (t <= duration))[None, :, None]
-    position = np.array([True, False, False, False])[:, None, None]
-    return xp.where(position | inside, inner, 0.0)
+    is_before = t < 0.0
+    is_after = t > duration
+    times = xp.where(is_before, 0.0, xp.where(is_after, duration, t))
+    is_moving = ~(is_before | is_after)[None, :, None]
+    is_position = np.array([True, False, False, False])[:, None, None]
+    return xp.where(is_position | is_moving, rows(times), 0.0)

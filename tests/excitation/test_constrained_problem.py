@@ -27,7 +27,7 @@ from jaxid.excitation.watched_constraints import (
     watched_excess,
 )
 from jaxid.robot.collision import Capsule, CollisionModel, HalfSpace
-from jaxid.trajectory.leads import LeadsBasis
+from jaxid.trajectory.lead_in_and_out import LeadsBasis
 
 BASIS = LeadsBasis(3, 1.1, lead=0.4)
 

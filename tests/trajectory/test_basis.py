@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jaxid.trajectory.fourier import FourierBasis, RestToRestBasis, fourier_series
-from jaxid.trajectory.leads import LeadsBasis
+from jaxid.trajectory.lead_in_and_out import LeadsBasis
 from jaxid.trajectory.spline import RestToRestSplineBasis
 
 PERIODIC = FourierBasis(5, 0.8)

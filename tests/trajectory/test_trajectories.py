@@ -21,7 +21,6 @@ from jaxid.trajectory import (
     PaddedToCycle,
     RestToRestBasis,
     RestToRestSplineBasis,
-    Segments,
     TipPath,
     fourier_series,
     iso9283_path,
@@ -49,12 +48,6 @@ def series(robot=ARM, seed=0, reach=1.0) -> LinearTrajectory:
     return random_fourier_series(robot, omega=0.8, reach=reach, seed=seed)
 
 
-def chain() -> Segments:
-    middle = REST.trajectory(series().coefficients @ REST.directions)
-    start = middle.motion(0.0).q
-    return Segments((spline_through([POINTS[-1], start], 1.5), middle))
-
-
 FAMILY = {
     "series": series(),
     "with leads": with_leads(series(), ARM, periods=2),
@@ -63,7 +56,6 @@ FAMILY = {
     ),
     "spline by handles": RestToRestSplineBasis(6, 2.5).trajectory(POINTS.T),
     "padded": PaddedToCycle(spline_through(POINTS, 4.0), 0.03),
-    "segments": chain(),
     "path of the end-effector": joint_path(
         library.tx90l_on_rail(),
         TipPath(
@@ -84,7 +76,7 @@ def test_derivatives_belong_together_nothing_jumps_and_ends_are_at_rest(name):
     for x, rate in (("q", now.qd), ("qd", now.qdd), ("qdd", trajectory.jerk(times))):
         quotient = (getattr(ahead, x) - getattr(behind, x)) / (2 * h)
         near = np.abs(quotient - rate)[5:-5] <= 1e-5 * (1 + np.abs(rate).max())
-        # The jerk of leads and segments jumps where they meet.
+        # The jerk of leads jumps where they meet the series.
         assert near.mean() > (0.999 if x != "qdd" else 0.98), (x, near.mean())
         step = np.abs(np.diff(getattr(now, x), axis=0)).max()
         assert step <= 1.5 * np.diff(times).max() * np.abs(rate).max() + 1e-12
@@ -177,14 +169,6 @@ def test_leads_keep_the_limits_and_follow_the_series_between():
         assert begin < 1.0
 
 
-def jump(change):
-    """Two members of which the second is changed at its start."""
-    spline = spline_through(POINTS, 1.0)
-    x = np.array(series().coefficients)
-    x[:, 0] += POINTS[-1] - np.asarray(series().motion(0.0).q) + change
-    return lambda: Segments((spline, FourierBasis(5, 0.8).trajectory(x)))
-
-
 LAZY = PANDA.replace(limits=Limits(7, acceleration=[*[10.0] * 6, 1e-3]))
 SIDE = Line(np.zeros(3), np.array([1.0, 0.0, 0.0]))
 
@@ -205,13 +189,6 @@ SIDE = Line(np.zeros(3), np.array([1.0, 0.0, 0.0]))
         (lambda: RestToRestSplineBasis(1, 1.0), "`points`"),
         (lambda: RestToRestSplineBasis(5, -1.0), "`duration`"),
         (lambda: series().sample(0.0), "`sample_time`"),
-        (lambda: Segments(()), "`members`"),
-        (jump(1e-3), r"coordinate of joint \d"),
-        (jump(0.0), "velocity of joint"),
-        (
-            lambda: Segments((series(), series(PANDA))),
-            "`members` 1 and 2 must move the same",
-        ),
         (lambda: iso9283_path([0.0, 0.0], 1.0, DOWN), "centre"),
         (lambda: TipPath((SIDE,), DOWN, speed=0.0), "speed"),
         (lambda: TipPath((), DOWN), "pieces"),

@@ -3,11 +3,10 @@
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Array, Float, namespace
+from jaxid.arrays import AnyArray, Float, namespace
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.motion import Motion
 from jaxid.trajectory.trajectory import AbstractBasis
@@ -86,26 +85,10 @@ def information_of_coefficients(
     weighted = plain
     for joint, columns in enumerate(columns_by_joint):
         place = np.ix_(regressor.columns[joint], regressor.columns[joint])
-        gram = measured / samples * _gram(columns)
+        gram = measured / samples * jnp.einsum("bis,bjs->bij", columns, columns)
         plain = plain.at[:, *place].add(gram)
         weighted = weighted.at[:, *place].add(weights[joint] ** 2 * gram)
     return Information(plain, weighted + prior[None], sizes)
-
-
-@jax.custom_jvp
-def _gram(
-    columns: Float[Array, "starts columns samples"],
-) -> Float[Array, "starts columns columns"]:
-    """Return products of columns; the derivative takes one product instead of two."""
-    return jnp.einsum("bis,bjs->bij", columns, columns)
-
-
-@_gram.defjvp
-def _gram_derivative(primals: tuple, tangents: tuple) -> tuple:
-    (columns,) = primals
-    (tangent,) = tangents
-    product = jnp.einsum("bis,bjs->bij", tangent, columns)
-    return _gram(columns), product + jnp.swapaxes(product, 1, 2)
 
 
 def standard_deviations(

@@ -1,7 +1,8 @@
 """Leads: from standstill into a periodic motion and out of it, within the limits of the joints."""
 
 import math
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -16,27 +17,37 @@ from .fourier import PeriodsBasis, complete_limits
 from .trajectory import AbstractTrajectory, Envelope, States, as_scalar, stand_outside
 
 
-def _lead(state: Any, duration: Any, x: Any, sign: int = 1) -> tuple:
+def _lead(state: Sequence[Any], duration: Any, x: Any, sign: int = 1) -> list:
     r"""Return position, velocity, acceleration and jerk of a lead at times x from standstill [s].
 
     The velocity is $\alpha x^2 + \beta x^3$. The lead meets a motion in a state (q, qd,
     qdd). A lead-out (`sign` -1) is a lead-in (1) that is run backwards.
     """
     q, qd, qdd = state
-    alpha, beta = _cubic(sign * qd, qdd, duration)
-    return (
-        q + alpha * (x**3 - duration**3) / 3 + beta * (x**4 - duration**4) / 4,
+    alpha, beta = _velocity_coefficients(sign * qd, qdd, duration)
+    by_alpha = (x**3 - duration**3) / 3
+    by_beta = (x**4 - duration**4) / 4
+    return [
+        q + alpha * by_alpha + beta * by_beta,
         sign * (alpha * x**2 + beta * x**3),
         2 * alpha * x + 3 * beta * x**2,
         sign * (2 * alpha + 6 * beta * x),
-    )
+    ]
 
 
-def _cubic(qd: Any, qdd: Any, duration: Any) -> tuple[Any, Any]:
-    return (
-        3 * qd / duration**2 - qdd / duration,
-        qdd / duration**2 - 2 * qd / duration**3,
-    )
+def _velocity_coefficients(qd: Any, qdd: Any, duration: Any) -> tuple[Any, Any]:
+    """Return the coefficients of the square and the cube of time in the velocity."""
+    alpha = 3 * qd / duration**2 - qdd / duration
+    beta = qdd / duration**2 - 2 * qd / duration**3
+    return alpha, beta
+
+
+LEAD_DEGREE = 4
+"""Degree of a lead's position as a polynomial of time."""
+ENVELOPE_PIECES = 8
+"""Pieces of a lead that are bounded by their own control points."""
+PHASES = 360
+"""Instants of the period at which `with_leads` tries to enter and leave it."""
 
 
 class LeadsBasis(PeriodsBasis):
@@ -76,16 +87,16 @@ class LeadsBasis(PeriodsBasis):
     ) -> Float[AnyArray, "4 samples variables"]:
         """Return the series, or the polynomials that lead into it and out of it."""
 
-        def inside(t: AnyArray) -> AnyArray:
+        def moving(t: AnyArray) -> AnyArray:
             xp = namespace(t, self.omega, self.lead)
-            early, late = t < self.lead, t > self.duration - self.lead
-            inner = self.series.rows(t - self.lead)
-            outer = xp.where(
-                late[None, :, None], self._lead_rows(self.duration - t, -1), inner
-            )
-            return xp.where(early[None, :, None], self._lead_rows(t, 1), outer)
+            is_early = (t < self.lead)[None, :, None]
+            is_late = (t > self.duration - self.lead)[None, :, None]
+            series = self.series.rows(t - self.lead)
+            lead_out = self._lead_rows(self.duration - t, -1)
+            rows = xp.where(is_late, lead_out, series)
+            return xp.where(is_early, self._lead_rows(t, 1), rows)
 
-        return stand_outside(inside, t, self.duration)
+        return stand_outside(moving, t, self.duration)
 
     def _lead_rows(self, x: AnyArray, sign: int) -> AnyArray:
         """Return the rows of the lead-in (1) or lead-out (-1) at times from standstill."""
@@ -98,19 +109,16 @@ class LeadsBasis(PeriodsBasis):
         A polynomial lies within the range of its control points (Bernstein). A lead is
         split into pieces, each of which is bounded by its own control points.
         """
-        degree, pieces = 4, 8
         rows, factor = self.series.envelope(points)
-        u, order = np.linspace(0.0, 1.0, degree + 1), np.arange(degree + 1)
-        binomials = np.array([math.comb(degree, k) for k in order])
-        to_points = np.linalg.inv(
-            binomials * u[:, None] ** order * (1 - u[:, None]) ** (degree - order)
-        )
-        starts = self.lead / pieces * np.arange(pieces)[:, None]
-        t = starts + self.lead / pieces * u
-        leads = [to_points @ self._lead_rows(x, sign) for x in t for sign in (1, -1)]
-        return tuple(
-            np.concatenate(parts) for parts in zip(rows, *leads, strict=True)
-        ), factor
+        to_points = _to_control_points(LEAD_DEGREE)
+        fractions = np.linspace(0.0, 1.0, LEAD_DEGREE + 1)
+        duration = self.lead / ENVELOPE_PIECES
+        parts = [rows]
+        for piece in range(ENVELOPE_PIECES):
+            t = duration * (piece + fractions)
+            for sign in (1, -1):
+                parts.append(to_points @ self._lead_rows(t, sign))
+        return tuple(np.concatenate(x) for x in zip(*parts, strict=True)), factor
 
     def times(self, samples: int) -> Float[np.ndarray, " samples"]:
         """Return equidistant times over one period between the leads [s]."""
@@ -121,6 +129,15 @@ class LeadsBasis(PeriodsBasis):
         period, lead = float(self.series.duration), float(self.lead)
         t = np.arange(points) * ((period + 2 * lead) / (points - 1))
         return np.where(t > lead + period, t + (self.periods - 1) * period, t)
+
+
+def _to_control_points(degree: int) -> Float[np.ndarray, "points samples"]:
+    """Return the matrix from equidistant values of a polynomial to its control points."""
+    orders = np.arange(degree + 1)
+    u = np.linspace(0.0, 1.0, degree + 1)[:, None]
+    binomials = np.array([math.comb(degree, order) for order in orders])
+    bernstein = binomials * u**orders * (1 - u) ** (degree - orders)
+    return np.linalg.inv(bernstein)
 
 
 class WithLeads(AbstractTrajectory):
@@ -158,19 +175,23 @@ class WithLeads(AbstractTrajectory):
         """Return the motion between the leads, and the leads; standstill outside."""
         begin, end = self.window
         time = t[:, None]
-        lead_in, lead_out = (
-            jnp.asarray(x)[None] for x in (self.lead_in, self.lead_out)
-        )
+        lead_in = jnp.asarray(self.lead_in)[None]
+        lead_out = jnp.asarray(self.lead_out)[None]
         first = self.inner.states(jnp.reshape(self.start, 1))
         last = self.inner.states(jnp.reshape(self.start + self.length, 1))
-        since = jnp.clip(time - begin + lead_in, 0.0, lead_in)
-        left = jnp.clip(end + lead_out - time, 0.0, lead_out)
-        early, late = _lead(first, lead_in, since), _lead(last, lead_out, left, -1)
-        inner = self.inner.states(self.start + t - begin)
-        parts = zip(early, inner, late, strict=False)
-        return tuple(
-            jnp.where(time < begin, x, jnp.where(time > end, z, y)) for x, y, z in parts
-        )
+        from_start = jnp.clip(time - begin + lead_in, 0.0, lead_in)
+        to_end = jnp.clip(end + lead_out - time, 0.0, lead_out)
+
+        inner_states = self.inner.states(self.start + t - begin)
+        in_states = _lead(first, lead_in, from_start)
+        out_states = _lead(last, lead_out, to_end, -1)
+        states = []
+        for inner, early, late in zip(
+            inner_states, in_states, out_states, strict=False
+        ):
+            after_start = jnp.where(time > end, late, inner)
+            states.append(jnp.where(time < begin, early, after_start))
+        return tuple(states)
 
 
 def with_leads(
@@ -202,57 +223,68 @@ def with_leads(
             f"{series.joints}."
         )
     period = float(series.duration)
-    phases = period * np.arange(360) / 360
+    phases = period * np.arange(PHASES) / PHASES
     with double_precision():
-        at = series.motion(phases)
-    q, qd, qdd = (np.asarray(x) for x in (at.q, at.qd, at.qdd))
+        motion = series.motion(phases)
+    q, qd, qdd = (np.asarray(x) for x in (motion.q, motion.qd, motion.qdd))
     limits = complete_limits(robot)
-    lead_in, excess_in = _shortest_leads(q, qd, qdd, limits)
-    lead_out, excess_out = _shortest_leads(q, -qd, qdd, limits)
-    total = lead_in.max(axis=1) + lead_out.max(axis=1)
+    lead_in = _shortest_leads(q, qd, qdd, limits)
+    lead_out = _shortest_leads(q, -qd, qdd, limits)
+    total = lead_in.duration.max(axis=1) + lead_out.duration.max(axis=1)
     best = int(np.argmin(total))
     if not np.isfinite(total[best]):
-        excess = np.maximum(excess_in, excess_out)
+        excess = np.maximum(lead_in.excess, lead_out.excess)
         nearest = int(np.argmin(excess.max(axis=1)))
         joint = int(np.argmax(excess[nearest]))
         raise InputError(
             "no instant of the period can be reached from standstill within the "
-            "limits: at best "
-            f"joint `{robot.joint_names[joint]}` exceeds one of them by "
-            f"{100 * excess[nearest, joint]:.3g} %: take a motion that uses less of "
+            f"limits: at best joint `{robot.joint_names[joint]}` exceeds one of them "
+            f"by {100 * excess[nearest, joint]:.3g} %: take a motion that uses less of "
             "the limits."
         )
     return WithLeads(
-        series, phases[best], periods * period, lead_in[best], lead_out[best]
+        series,
+        phases[best],
+        periods * period,
+        lead_in.duration[best],
+        lead_out.duration[best],
     )
+
+
+class ShortestLeads(NamedTuple):
+    """Leads to every phase of a motion."""
+
+    duration: Float[np.ndarray, "phases joints"]  # infinite where there is none [s]
+    excess: Float[np.ndarray, "phases joints"]  # least relative excess over a limit
 
 
 def _shortest_leads(
     q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, limits: Limits
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the shortest lead of every phase and joint within the limits, and the least excess.
-
-    The duration is infinite where there is none.
-    """
+) -> ShortestLeads:
+    """Return the shortest lead to every phase and joint within the limits."""
     T = np.geomspace(0.02, 10.0, 120)[:, None, None]
-    alpha, beta = _cubic(qd, qdd, T)
+    alpha, beta = _velocity_coefficients(qd, qdd, T)
     # The extremes lie where the next derivative is zero, or at the ends.
     with np.errstate(divide="ignore", invalid="ignore"):
-        instants = [-alpha / beta, -2 * alpha / (3 * beta), -alpha / (3 * beta)]
-    inner = [np.where(np.isfinite(x) & (x > 0) & (x < T), x, T) for x in instants]
-    found = [_lead((q, qd, qdd), T, x) for x in (0 * T, *inner, T)]
-    place, speed, rate, jerk = (np.stack(values) for values in zip(*found, strict=True))
-    low, high = np.asarray(limits.position_min), np.asarray(limits.position_max)
-    middle, half = 0.5 * (low + high), 0.5 * (high - low)
-    use = np.max(
-        [
-            (place.max(0) - middle) / half,
-            (middle - place.min(0)) / half,
-            np.abs(speed).max(0) / limits.velocity,
-            np.abs(rate).max(0) / limits.acceleration,
-            np.abs(jerk).max(0) / limits.jerk,
-        ],
-        axis=0,
+        extremes = [-alpha / beta, -2 * alpha / (3 * beta), -alpha / (3 * beta)]
+    instants = [0 * T, T]
+    for x in extremes:
+        is_within = np.isfinite(x) & (x > 0) & (x < T)
+        instants.append(np.where(is_within, x, T))
+    leads = [_lead((q, qd, qdd), T, x) for x in instants]
+    position, speed, acceleration, jerk = (
+        np.stack(parts) for parts in zip(*leads, strict=True)
     )
-    durations = np.where(use - 1.0 <= 1e-9, T, np.inf).min(axis=0)
-    return durations, use.min(axis=0) - 1.0
+
+    low = np.asarray(limits.position_min)
+    high = np.asarray(limits.position_max)
+    distance = np.abs(position - 0.5 * (low + high))
+    used_fractions = (
+        distance.max(axis=0) / (0.5 * (high - low)),
+        np.abs(speed).max(axis=0) / limits.velocity,
+        np.abs(acceleration).max(axis=0) / limits.acceleration,
+        np.abs(jerk).max(axis=0) / limits.jerk,
+    )
+    excess = np.max(used_fractions, axis=0) - 1.0
+    duration = np.where(excess <= 1e-9, T, np.inf).min(axis=0)
+    return ShortestLeads(duration, excess.min(axis=0))
