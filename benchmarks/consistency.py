@@ -147,11 +147,9 @@ class Arm:
 
 def program(base, factor, estimator):
     """Return feasible set, data and program of one fit."""
-    import numpy as np
-
     feasible = estimator.feasible_set(base)
     # private: the program, which the conic solver shares
-    data, one = estimator.program(np, base, feasible, *factor)
+    data, one = estimator.program(base, feasible, *factor)
     return feasible, data, one
 
 

@@ -3,7 +3,8 @@
 import cvxpy as cp
 import numpy as np
 
-from jaxid.identification.consistency.program import FeasibleSet, ScaledRows
+from jaxid.identification.consistency.feasible_set import FeasibleSet
+from jaxid.identification.consistency.scaled_rows import ScaledRows
 
 
 def problem(

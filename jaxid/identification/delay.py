@@ -22,6 +22,12 @@ from .problem import RegressionProblem
 
 BLOCKS = 20
 """Blocks of time of all recordings together, from which the uncertainty is computed."""
+MAX_ROUNDS = 12
+SAMPLES_PER_CHUNK = 8192
+RESOLUTION = 0.1
+"""Error that no log shows, in samples."""
+MAX_SENSITIVITY = 2.0
+"""How much a sensible control loop amplifies disturbances at most."""
 
 
 class Delay(eqx.Module):
@@ -53,11 +59,10 @@ class Delay(eqx.Module):
         Args:
             level: Probability (0 to 1) that the interval contains the true delay.
         """
-        half = self.standard_deviation * float(
-            special.stdtrit(self.dof, 0.5 + 0.5 * level)
-        )
-        half += self.feedback + self.resolution
-        return self.seconds - half, self.seconds + half
+        quantile = float(special.stdtrit(self.dof, 0.5 + 0.5 * level))
+        half_width = quantile * self.standard_deviation
+        half_width += self.feedback + self.resolution
+        return self.seconds - half_width, self.seconds + half_width
 
 
 def estimate_delay(
@@ -76,10 +81,10 @@ def estimate_delay(
     Disturbances that move a controlled robot are in its forces and in its motion. With
     the commanded motion, which knows nothing of them, its regressor and rates are the
     instruments: the estimate is consistent. Without it, disturbances $d$ reach the
-        forces of the motion as $S d$
-    with the sensitivity $S$ of the loop, and shift the estimate by at most
-    $|S|_\infty\, |d|\, |\dot d| / |r|^2$, where $r$ is what the parameters leave of the
-    rate; `feedback` is that with the residuals as $d$ and $|S|_\infty = 2$.
+    forces of the motion as $S d$ with the sensitivity $S$ of the loop, and shift the
+    estimate by at most $|S|_\infty\, |d|\, |\dot d| / |r|^2$, where $r$ is what the
+    parameters leave of the rate; `feedback` is that with the residuals as $d$ and
+    $|S|_\infty = 2$.
 
     The deviation is that of the jackknife over blocks of time.
 
@@ -89,58 +94,69 @@ def estimate_delay(
         weights: Weights of the joints; the reciprocals of the largest forces if None.
         commanded: The commanded motion of each recording, with its forces, filtered
             alike: the same log, read with the commanded angles in place of the measured
-                ones.
+            ones.
 
     Raises:
         InputError: If weights are not known, the commanded motion has other samples, or
             the search does not settle: the delay is longer than the motion's shortest
             swings.
     """
-    problem, n = RegressionProblem(base, observations), base.model.robot.joints
-    recordings = instruments = problem.recordings
+    problem = RegressionProblem(base, observations)
+    recordings = problem.recordings
+    instruments = recordings
     if commanded is not None:
         instruments = RegressionProblem(base, commanded).recordings
         if [o.segments for o in instruments] != [o.segments for o in recordings]:
             raise InputError("`commanded` must have the samples of `observations`.")
-    w = (MaximumForces() if weights is None else weights)(
-        base.model.robot, problem.factors
-    )
-    together = linalg.block_diag(np.eye(base.size), np.ones((n, 1)))
-    p, seconds, step, damping = np.zeros(base.size), 0.0, 0.0, 1.0
-    # Without a delay at first.
-    start = np.eye(base.size + n)[:, : base.size]
-    p = _equations(base, recordings, recordings, w, p).combined(start).solve()
-    for _ in range(12):
-        moved = (
-            [without_delay(o, seconds) for o in logs]
-            for logs in (recordings, instruments)
-        )
-        each = _equations(base, *moved, w, p)
-        common = each.combined(together)
-        x, deviation = common.solve(), float(np.sqrt(common.jackknife()[-1, -1]))
-        # Steps that go to and fro become shorter.
-        damping *= 0.5 if x[-1] * step < 0 else 1.0
-        p, step = x[:-1], damping * float(x[-1])
+    weights = weights or MaximumForces()
+    w = weights(base.model.robot, problem.factors)
+    joints = len(w)
+    sample_time = recordings[0].sample_time
+    no_delay = np.eye(base.size + joints)[:, : base.size]
+    common_delay = linalg.block_diag(np.eye(base.size), np.ones((joints, 1)))
+
+    start = _equations(base, recordings, recordings, w, np.zeros(base.size))
+    p = start.combine(no_delay).solve()
+    seconds = 0.0
+    step = 0.0
+    damping = 1.0
+    for _ in range(MAX_ROUNDS):
+        shifted = [without_delay(o, seconds) for o in recordings]
+        shifted_instruments = shifted
+        if commanded is not None:
+            shifted_instruments = [without_delay(o, seconds) for o in instruments]
+        each_delay = _equations(base, shifted, shifted_instruments, w, p)
+        equations = each_delay.combine(common_delay)
+        solution = equations.solve()
+        deviation = float(np.sqrt(equations.jackknife()[-1, -1]))
+        if solution[-1] * step < 0:
+            # Steps that go to and fro become shorter.
+            damping *= 0.5
+        step = damping * float(solution[-1])
         seconds += step
-        if abs(step) <= max(0.02 * deviation, 1e-6 * recordings[0].sample_time):
+        p = solution[:-1]
+        if abs(step) <= max(0.02 * deviation, 1e-6 * sample_time):
             break
     else:
         raise InputError(
             f"the delay does not settle (last change {1e3 * step:.3g} ms): crop the "
-            "log to where "
-            "the robot moves, and check angle columns and signs."
+            "log to where the robot moves, and check angle columns and signs."
         )
-    delays, spread = (
-        each.solve()[base.size :],
-        each.jackknife()[base.size :, base.size :],
+
+    delays = each_delay.solve()[base.size :]
+    covariance = each_delay.jackknife()[base.size :, base.size :]
+    contrast = np.eye(joints)[1:] - np.eye(joints)[:1]
+    _, p_value = joint_test(
+        contrast @ delays, contrast @ covariance @ contrast.T, BLOCKS - 1.0
     )
-    contrast = np.eye(n)[1:] - np.eye(n)[:1]
-    differences = contrast @ spread @ contrast.T
-    p_value = joint_test(contrast @ delays, differences, BLOCKS - 1.0)[1]
-    feedback = common.feedback(x) if commanded is None else 0.0
-    limits = feedback, 0.1 * recordings[0].sample_time
     return Delay(
-        seconds, deviation, BLOCKS - 1.0, *limits, seconds - step + delays, p_value
+        seconds=seconds,
+        standard_deviation=deviation,
+        dof=BLOCKS - 1.0,
+        feedback=equations.feedback(solution) if commanded is None else 0.0,
+        resolution=RESOLUTION * sample_time,
+        of_joints=seconds - step + delays,
+        p_value=p_value,
     )
 
 
@@ -151,18 +167,22 @@ class _Equations(NamedTuple):
     squares: np.ndarray  # regressor times regressor
     rates: np.ndarray  # rates of the regressor times rates of the regressor
 
-    def combined(self, columns: np.ndarray) -> "_Equations":
+    def combine(self, columns: np.ndarray) -> "_Equations":
         """Return the equations for parameters of which the present ones are combinations."""
-        whole = linalg.block_diag(columns, 1.0)
-        squares, rates = (whole.T @ x @ whole for x in (self.squares, self.rates))
-        return _Equations(columns.T @ self.products @ whole, squares, rates)
+        with_forces = linalg.block_diag(columns, 1.0)
+        return _Equations(
+            products=columns.T @ self.products @ with_forces,
+            squares=with_forces.T @ self.squares @ with_forces,
+            rates=with_forces.T @ self.rates @ with_forces,
+        )
 
     def solve(self, without: int | None = None) -> np.ndarray:
         """Return the parameters, from all blocks or without one of them."""
         total = self.products.sum(axis=0)
-        total = total if without is None else total - self.products[without]
-        scale = np.sqrt(np.diag(self.squares)[:-1])
-        scale = 1.0 / np.where(scale > 0, scale, np.inf)
+        if without is not None:
+            total = total - self.products[without]
+        lengths = np.sqrt(np.diag(self.squares)[:-1])
+        scale = 1.0 / np.where(lengths > 0, lengths, np.inf)
         A = scale[:, None] * total[:, :-1] * scale
         return scale * np.linalg.lstsq(A, scale * total[:, -1], rcond=1e-12)[0]
 
@@ -172,16 +192,17 @@ class _Equations(NamedTuple):
         estimates = np.array([self.solve(block) for block in range(count)])
         return (count - 1) ** 2 / count * np.cov(estimates.T)
 
-    def feedback(self, x: np.ndarray) -> float:
+    def feedback(self, parameters: np.ndarray) -> float:
         """Return the largest effect of fed-back disturbances on the last parameter."""
-        residual = np.append(x, -1.0)
-        squares = (residual @ y @ residual for y in (self.squares, self.rates))
-        size, rate = (np.sqrt(max(float(x), 0.0)) for x in squares)
-        G = self.squares[:-1, :-1]
-        others = np.linalg.lstsq(G[:-1, :-1], G[:-1, -1], rcond=1e-14)[0]
-        left = float(G[-1, -1] - G[:-1, -1] @ others)
-        # A sensible control loop amplifies disturbances twice at most.
-        return 2.0 * size * rate / left if left > 0 else np.inf
+        residual = np.append(parameters, -1.0)
+        disturbance = np.sqrt(max(residual @ self.squares @ residual, 0.0))
+        rate = np.sqrt(max(residual @ self.rates @ residual, 0.0))
+        gram = self.squares[:-1, :-1]
+        others = np.linalg.lstsq(gram[:-1, :-1], gram[:-1, -1], rcond=1e-14)[0]
+        remainder = float(gram[-1, -1] - gram[:-1, -1] @ others)
+        if remainder <= 0:
+            return np.inf
+        return float(MAX_SENSITIVITY * disturbance * rate / remainder)
 
 
 def _equations(
@@ -192,24 +213,31 @@ def _equations(
     p: np.ndarray,
 ) -> _Equations:
     """Return the normal equations of the parameters and of a delay of each joint."""
-    m = base.size + len(w)
-    products, every = np.zeros((BLOCKS, m, m + 1)), sum(o.rows for o in recordings)
-    squares, rates, done = np.zeros((m + 1, m + 1)), np.zeros((m + 1, m + 1)), 0
-    for o, c in zip(recordings, instruments, strict=True):
+    size = base.size + len(w) + 1
+    products = np.zeros((BLOCKS, size - 1, size))
+    squares = np.zeros((size, size))
+    rates = np.zeros((size, size))
+    total_rows = sum(o.rows for o in recordings)
+    first_row = 0
+    for o, instrument in zip(recordings, instruments, strict=True):
         spacing = o.sample_time * o.decimation.factor
-        for chunk in o.chunks(8192):
-            first, stop = chunk.rows
-            kept = np.asarray(o.mask)[first:stop, :, None]
-            X = kept * _rows(base, o, chunk, w, p)
-            Z = X if c is o else kept * _rows(base, c, chunk, w, p)
-            blocks = (done + np.arange(first, stop)) * BLOCKS // every
+        for chunk in o.chunks(SAMPLES_PER_CHUNK):
+            rows = np.arange(*chunk.rows)
+            mask = np.asarray(o.mask)[rows]
+            X = mask[..., None] * _rows(base, o, chunk, w, p)
+            Z = X
+            if instrument is not o:
+                Z = mask[..., None] * _rows(base, instrument, chunk, w, p)
+            blocks = (first_row + rows) * BLOCKS // total_rows
             for block in np.unique(blocks):
-                z, x = (y[blocks == block].reshape(-1, m + 1) for y in (Z, X))
+                x = X[blocks == block].reshape(-1, size)
+                z = Z[blocks == block].reshape(-1, size)
                 products[block] += z[:, :-1].T @ x
             squares += np.tensordot(X, X, ((0, 1), (0, 1)))
-            change = np.diff(X, axis=0)[(kept[1:] & kept[:-1])[..., 0]] / spacing
+            is_pair = mask[1:] & mask[:-1]
+            change = np.diff(X, axis=0)[is_pair] / spacing
             rates += change.T @ change
-        done += o.rows
+        first_row += o.rows
     return _Equations(products, squares, rates)
 
 
@@ -218,41 +246,40 @@ def _rows(
 ) -> Float[np.ndarray, "rows joints columns"]:
     """Return weighted rows: base parameters, delay of each joint, forces."""
     motion, forces = o.read(slice(*chunk.samples))
-    rate = np.gradient(base.forces_in_numpy(p, motion), o.sample_time, axis=0)
-    n, size = len(w), base.size
-    columns = np.zeros((len(rate), n, size + n + 1))
-    rows = zip(base.acting_columns, base.regressor_rows(motion), strict=True)
-    for joint, (own, values) in enumerate(rows):
-        columns[:, joint, own] = values
-        columns[:, joint, size + joint] = -rate[:, joint]
+    rates = np.gradient(base.forces_in_numpy(p, motion), o.sample_time, axis=0)
+    joints = len(w)
+    columns = np.zeros((*rates.shape, base.size + joints + 1))
+    for joint, values in enumerate(base.regressor_rows(motion)):
+        columns[:, joint, list(base.acting_columns[joint])] = values
+        columns[:, joint, base.size + joint] = -rates[:, joint]
     columns[..., -1] = np.asarray(forces) - base.tool_forces(motion)
-    reduced = chunk.reduce(columns.reshape(len(rate), -1))
-    return w[:, None] * reduced.reshape(-1, n, size + n + 1)
+    rows = chunk.reduce(columns.reshape(len(rates), -1))
+    return w[:, None] * rows.reshape(-1, joints, columns.shape[-1])
 
 
 def without_delay(observations: Observations, seconds: float) -> Observations:
     """Remove a delay of the forces [s], like `remove_delay`: rows near the ends are left out."""
     require_finite_delay(seconds)
-    time, dt = observations.time, observations.sample_time
-    lost = math.ceil(abs(seconds) / dt - 1e-9)
+    time = observations.time
+    dt = observations.sample_time
+    samples = math.ceil(abs(seconds) / dt - 1e-9)
     edge = observations.filter.edge(dt)
-    mask, instants = np.array(observations.mask), observations.instants
-    given = observations.motion
-    motion = Motion(*(np.array(x, np.float64) for x in (given.q, given.qd, given.qdd)))
-    for (a, b), (r0, r1) in zip(
-        observations.segments, observations.row_segments, strict=True
-    ):
+    instants = observations.instants
+    counts = np.zeros(len(instants), bool)
+    source = observations.motion
+    channels = [np.array(x, np.float64) for x in (source.q, source.qd, source.qdd)]
+    for a, b in observations.segments:
         # Beyond the ends the nearest motion is used, in rows that do not count.
-        at = np.clip(time[a:b] - seconds, time[a], time[b - 1])
-        for x in (motion.q, motion.qd, motion.qdd):
-            x[a:b] = CubicSpline(time[a:b], x[a:b])(at)
-        first, last = (a + edge + lost, b) if seconds > 0 else (a, b - edge - lost)
-        rows = instants[r0:r1]
-        mask[r0:r1] &= ((rows >= first) & (rows < last))[:, None]
+        times = np.clip(time[a:b] - seconds, time[a], time[b - 1])
+        for channel in channels:
+            channel[a:b] = CubicSpline(time[a:b], channel[a:b])(times)
+        first = a + edge + samples if seconds > 0 else a
+        stop = b if seconds > 0 else b - edge - samples
+        counts |= (instants >= first) & (instants < stop)
+    mask = np.asarray(observations.mask) & counts[:, None]
     if not mask.any(axis=0).all():
         raise InputError(
             f"`{observations.name}` is too short for a delay of {seconds:g} s: no "
-            "rows of some "
-            "joint are left."
+            "rows of some joint are left."
         )
-    return observations.replace(motion=motion, mask=mask)
+    return observations.replace(motion=Motion(*channels), mask=mask)

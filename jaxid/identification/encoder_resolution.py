@@ -12,31 +12,38 @@ from .estimators import GivenWeights, WeightedLeastSquares
 from .fit_result import Fit
 from .problem import RegressionProblem
 
-FEWEST = 100
+MIN_CHANGES = 100
 """Changes of an angle from which its steps are looked for."""
+MAX_COUNT = 20.0
+"""Steps of one change up to which text that is rounded tells that they are whole."""
+MIN_RATIO = 0.5
+"""Bias, in deviations, from which a 95 % interval holds clearly less often."""
+MAX_NAMES = 4
+"""Parameters that a note names."""
 
 
 def encoder_steps(recording: Recording) -> Float[np.ndarray, " joints"]:
     """Return the step of each angle [rad or m]; zero where the values lie on no grid."""
     angles = np.asarray(recording.angles)
-    changes = np.concatenate(
-        [np.diff(angles[a:b], axis=0) for a, b in recording.segments]
-    )
-    return np.array([_step(np.abs(x)) for x in changes.T])
+    segments = [np.diff(angles[a:b], axis=0) for a, b in recording.segments]
+    changes = np.abs(np.concatenate(segments))
+    return np.array([_step(column) for column in changes.T])
 
 
 def _step(changes: np.ndarray) -> float:
-    # What is left after adding and subtracting in binary is no change.
-    real = np.sort(changes[changes > 1e-12 * max(changes.max(initial=0.0), 1e-300)])
-    if len(real) < FEWEST:
+    """Return the common divisor of some changes; zero if there is none."""
+    # Adding and subtracting in binary leaves tiny numbers that are no change.
+    rounding = 1e-12 * max(changes.max(initial=0.0), 1e-300)
+    changes = np.sort(changes[changes > rounding])
+    if len(changes) < MIN_CHANGES:
         return 0.0
-    counts = real / real[0]
-    # Of more steps rounded text does not tell that their number is whole.
-    counts = counts[counts < 20.0]
-    whole = np.abs(counts - np.round(counts)) < 0.1
-    if len(counts) < FEWEST or whole.mean() < 0.99:
+    counts = changes / changes[0]
+    is_small = counts < MAX_COUNT
+    counts = counts[is_small]
+    is_whole = np.abs(counts - np.round(counts)) < 0.1
+    if len(counts) < MIN_CHANGES or is_whole.mean() < 0.99:
         return 0.0
-    return float(np.sum(real[: len(counts)]) / np.sum(np.round(counts)))
+    return float(np.sum(changes[is_small]) / np.sum(np.round(counts)))
 
 
 def resolution_bias(
@@ -49,14 +56,16 @@ def resolution_bias(
     estimated again: by how much they change is the bias. Angles on no grid are not
     rounded.
     """
-    robot, motion = fit.base.model.robot, observations.motion
-    steps = encoder_steps(recording)
+    robot = fit.base.model.robot
+    motion = observations.motion
     forces = fit.predict(motion) + fit.base.tool_forces(motion)
-    exact = np.asarray(motion.q)
+    angles = np.asarray(motion.q)
     if recording.angles_on_motor_side:
-        exact = np.asarray(robot.drives.motor_angles(exact))
+        angles = np.asarray(robot.drives.motor_angles(angles))
+    steps = encoder_steps(recording)
     grid = np.where(steps > 0, steps, 1.0)
-    rounded = np.where(steps > 0, np.round(exact / grid) * grid, exact)
+    rounded_angles = np.where(steps > 0, np.round(angles / grid) * grid, angles)
+    estimator = WeightedLeastSquares(GivenWeights(np.asarray(fit.weights)))
 
     def estimate(angles: np.ndarray) -> np.ndarray:
         log = dataclasses.replace(
@@ -68,10 +77,9 @@ def resolution_bias(
         )
         o = observe(log, robot, observations.filter, observations.decimation)
         o = o.replace(mask=observations.mask)
-        estimator = WeightedLeastSquares(GivenWeights(np.asarray(fit.weights)))
         return np.asarray(estimator(RegressionProblem(fit.base, o)).parameters)
 
-    return estimate(rounded) - estimate(exact)
+    return estimate(rounded_angles) - estimate(angles)
 
 
 def resolution_note(
@@ -79,25 +87,21 @@ def resolution_note(
 ) -> tuple[str, ...]:
     """Return a sentence about parameters whose intervals the resolution makes wrong, or nothing."""
     # Biases grow with the square of the steps: small ones cannot matter.
-    matters = encoder_steps(recording) > 1e-5 * np.std(
-        np.asarray(recording.angles), axis=0
-    )
-    if recording.velocities is not None or not matters.any():
+    ranges = np.std(np.asarray(recording.angles), axis=0)
+    is_coarse = encoder_steps(recording) > 1e-5 * ranges
+    if recording.velocities is not None or not is_coarse.any():
         return ()
     bias = np.abs(resolution_bias(fit, recording, observations))
-    ratio = bias / np.where(
-        fit.standard_deviations > 0, fit.standard_deviations, np.inf
-    )
-    # From half a deviation on an interval of 95 % holds clearly less often.
-    worst = np.argsort(-ratio)[: np.count_nonzero(ratio > 0.5)]
+    deviations = fit.standard_deviations
+    ratio = bias / np.where(deviations > 0, deviations, np.inf)
+    worst = np.argsort(-ratio)[: np.count_nonzero(ratio > MIN_RATIO)]
     if not len(worst):
         return ()
-    names = ", ".join(f"{fit.base.names[k]} by {ratio[k]:.1f}" for k in worst[:4])
-    more = f", and {len(worst) - 4} more" if len(worst) > 4 else ""
+    names = [f"{fit.base.names[k]} by {ratio[k]:.1f}" for k in worst[:MAX_NAMES]]
+    if len(worst) > MAX_NAMES:
+        names.append(f"and {len(worst) - MAX_NAMES} more")
     return (
         "the encoders are so coarse that parameters are shifted, in standard "
-        "deviations: "
-        f"{names}{more}. Their intervals are too narrow: move faster, lower the "
-        "cut-off of the "
-        "filter, or leave slow rows out (`rows.min_speed`).",
+        f"deviations: {', '.join(names)}. Their intervals are too narrow: move faster, "
+        "lower the cut-off of the filter, or leave slow rows out (`rows.min_speed`).",
     )

@@ -48,22 +48,25 @@ class StatesFit(Summarised, eqx.Module):
     @property
     def names(self) -> tuple[str, ...]:
         """Names of all estimates, like `m1` and `fv1 (cold)`."""
-        names = self.base.names
-        own = (f"{names[k]} ({state})" for state in self.states for k in self.varying)
-        return (*(names[k] for k in self.shared), *own)
+        names = [self.base.names[k] for k in self.shared]
+        for state in self.states:
+            names += [f"{self.base.names[k]} ({state})" for k in self.varying]
+        return tuple(names)
 
     @property
     def units(self) -> tuple[str, ...]:
         """Units of all estimates."""
-        return tuple(
-            self.base.units[k] for k in (*self.shared, *self.varying * len(self.states))
-        )
+        indices = (*self.shared, *self.varying * len(self.states))
+        return tuple(self.base.units[k] for k in indices)
 
     def summary(self) -> Table:
         """Return a table of all estimates with their 95 % intervals."""
-        title = "parameters that all states share, then those of each state"
         return interval_table(
-            title, self.names, self.units, self.parameters, self.uncertainty
+            "parameters that all states share, then those of each state",
+            self.names,
+            self.units,
+            self.parameters,
+            self.uncertainty,
         )
 
     def fit(self, state: str) -> Fit:
@@ -72,10 +75,13 @@ class StatesFit(Summarised, eqx.Module):
         Raises:
             InputError: If there is no such state.
         """
-        k, known = self._indices(state), self.uncertainty
-        C = known.covariance[np.ix_(k, k)]
+        k = self._indices(state)
         fit = self.fits[self.states.index(state)]
-        uncertainty = Uncertainty(C, known.dof[k], fit.uncertainty.naive_covariance)
+        uncertainty = Uncertainty(
+            covariance=self.uncertainty.covariance[np.ix_(k, k)],
+            dof=self.uncertainty.dof[k],
+            naive_covariance=fit.uncertainty.naive_covariance,
+        )
         return replace_estimates(fit, self.parameters[k], uncertainty)
 
     def compare(self, first: str, second: str, level: float = LEVEL) -> Comparison:
@@ -91,8 +97,9 @@ class StatesFit(Summarised, eqx.Module):
         Raises:
             InputError: If there is no such state, or `level` is no fraction.
         """
-        a, b = (self._indices(state)[list(self.varying)] for state in (first, second))
-        cross = self.uncertainty.covariance[np.ix_(a, b)]
+        first_indices = self._indices(first)[list(self.varying)]
+        second_indices = self._indices(second)[list(self.varying)]
+        cross = self.uncertainty.covariance[np.ix_(first_indices, second_indices)]
         return compare_some(
             self.fit(first), self.fit(second), self.varying, cross, level
         )
@@ -104,18 +111,17 @@ class StatesFit(Summarised, eqx.Module):
         The states' own estimates are compared with those of the first state. A small
         p-value says that some of them have changed after all.
         """
-        k = [
-            k
-            for k in self.shared
-            if all(np.isfinite(f.covariance[k, k]) for f in self.fits)
-        ]
-        p = [fit.parameters[k] for fit in self.fits]
-        first, *others = [fit.covariance[np.ix_(k, k)] for fit in self.fits]
-        covariance = linalg.block_diag(*others) + np.tile(
-            first, (len(others), len(others))
-        )
-        dof = min(float(np.min(fit.uncertainty.dof[k])) for fit in self.fits)
-        return joint_test(np.concatenate([x - p[0] for x in p[1:]]), covariance, dof)
+        variances = np.array([np.diag(fit.covariance) for fit in self.fits])
+        is_determined = np.isfinite(variances).all(axis=0)
+        k = [index for index in self.shared if is_determined[index]]
+        first, *others = self.fits
+        differences = [fit.parameters[k] - first.parameters[k] for fit in others]
+        covariances = [fit.covariance[np.ix_(k, k)] for fit in self.fits]
+        # The errors of the first state are in all differences.
+        common = np.tile(covariances[0], (len(others), len(others)))
+        covariance = linalg.block_diag(*covariances[1:]) + common
+        dof = np.min([fit.uncertainty.dof[k] for fit in self.fits], initial=np.inf)
+        return joint_test(np.concatenate(differences), covariance, float(dof))
 
     def _indices(self, state: str) -> Int[np.ndarray, " base"]:
         if state not in self.states:
@@ -143,18 +149,22 @@ def identify_states(
         InputError: If there are fewer than two fits, two have the same name, base
             parameters differ, or there is no such base parameter.
     """
-    states = [fit.name for fit in fits]
-    if len(states) < 2 or len(set(states)) < len(states):
+    names = [fit.name for fit in fits]
+    if len(names) < 2 or len(set(names)) < len(names):
         raise InputError(
-            f"`fits` must be two or more with different names: {', '.join(states)}."
+            f"`fits` must be two or more with different names: {', '.join(names)}."
         )
     require_same_base(fits)
     fits = tuple(map(as_least_squares, fits))
     base = fits[0].base
-    own = varying_parameters(base, varying)
-    same = tuple(k for k in range(base.size) if k not in own)
+    indices = varying_parameters(base, varying)
+    parameters, uncertainty = combine(fits, state_maps(base.size, indices, len(fits)))
     return StatesFit(
-        fits, same, own, *combine(fits, state_maps(base.size, own, len(fits)))
+        fits=fits,
+        shared=tuple(k for k in range(base.size) if k not in indices),
+        varying=indices,
+        parameters=parameters,
+        uncertainty=uncertainty,
     )
 
 
@@ -162,9 +172,11 @@ def state_indices(
     size: int, varying: Sequence[int], state: int
 ) -> Int[np.ndarray, " base"]:
     """Return the places of a state's parameters among all: shared ones, then those of each."""
-    own = np.isin(np.arange(size), varying)
-    indices = np.cumsum(~own) - 1
-    indices[own] = size + (state - 1) * own.sum() + np.arange(own.sum())
+    is_varying = np.isin(np.arange(size), varying)
+    count = np.count_nonzero(is_varying)
+    indices = np.cumsum(~is_varying) - 1
+    start = size - count + state * count
+    indices[is_varying] = np.arange(start, start + count)
     return indices
 
 
@@ -185,7 +197,7 @@ def varying_parameters(
             raise InputError(
                 f"`{name}` is none of `base.names` of `{base.model.robot.name}`."
             )
-    return tuple(k for k, x in enumerate(base.names) if x in varying)
+    return tuple(k for k, name in enumerate(base.names) if name in varying)
 
 
 def stores_energy(base: BaseParameters) -> Bool[np.ndarray, " base"]:
@@ -195,12 +207,14 @@ def stores_energy(base: BaseParameters) -> Bool[np.ndarray, " base"]:
     whatever the terms of the model are called.
     """
     model = base.model
-    q, qdd = np.random.default_rng(0).uniform(-1.0, 1.0, (2, 3, model.robot.joints))
-    rest = np.zeros_like(q)
-    moving, still = (in_numpy(base, base.columns, q, rest, a) for a in (qdd, rest))
-    kinetic = np.abs(moving - still).max(axis=(0, 1)) > 0
-    energies = [
-        in_numpy(model, model.potential, q, shared=(p,))
-        for p in np.eye(model.size)[list(base.indices)]
-    ]
-    return kinetic | (np.ptp(np.array(energies), axis=1) > 0)
+    shape = (2, 3, model.robot.joints)
+    q, qdd = np.random.default_rng(0).uniform(-1.0, 1.0, shape)
+    zeros = np.zeros_like(q)
+    moving = in_numpy(base, base.columns, q, zeros, qdd)
+    resting = in_numpy(base, base.columns, q, zeros, zeros)
+    has_inertia = np.abs(moving - resting).max(axis=(0, 1)) > 0
+
+    unit_vectors = np.eye(model.size)[list(base.indices)]
+    energies = [in_numpy(model, model.potential, q, shared=(p,)) for p in unit_vectors]
+    has_potential = np.ptp(energies, axis=1) > 0
+    return has_inertia | has_potential

@@ -2,6 +2,7 @@
 
 import enum
 import re
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -68,18 +69,20 @@ class Comparison(Summarised, eqx.Module):
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the parameters."""
-        return tuple(self.first.base.names[k] for k in self.indices)
+        return self._select(self.first.base.names)
 
     @property
     def units(self) -> tuple[str, ...]:
         """Units of the parameters."""
-        return tuple(self.first.base.units[k] for k in self.indices)
+        return self._select(self.first.base.units)
 
     @property
     def kinds(self) -> tuple[str, ...]:
         """Kind of each parameter, such as `viscous friction`."""
-        kinds = parameter_kinds(self.first.base)
-        return tuple(kinds[k] for k in self.indices)
+        return self._select(parameter_kinds(self.first.base))
+
+    def _select(self, words: Sequence[str]) -> tuple[str, ...]:
+        return tuple(words[k] for k in self.indices)
 
     @property
     def determined(self) -> Bool[np.ndarray, " compared"]:
@@ -107,17 +110,17 @@ class Comparison(Summarised, eqx.Module):
     @property
     def adjusted_p_values(self) -> Float[np.ndarray, " compared"]:
         """The same with Holm's correction for the number of parameters that are tested."""
-        p, tested = self.p_values, np.flatnonzero(self.determined)
-        adjusted = np.ones_like(p)
-        adjusted[tested] = _holm(p[tested])
+        adjusted = np.ones(len(self.indices))
+        adjusted[self.determined] = _holm(self.p_values[self.determined])
         return adjusted
 
     @property
     def verdicts(self) -> tuple[Verdict, ...]:
         """Verdict about each parameter."""
+        chance = 1.0 - self.level
         verdicts = np.full(len(self.indices), Verdict.UNCHANGED)
-        verdicts[self.p_values <= 1.0 - self.level] = Verdict.PERHAPS
-        verdicts[self.adjusted_p_values <= 1.0 - self.level] = Verdict.CHANGED
+        verdicts[self.p_values <= chance] = Verdict.PERHAPS
+        verdicts[self.adjusted_p_values <= chance] = Verdict.CHANGED
         verdicts[~self.determined] = Verdict.UNKNOWN
         return tuple(verdicts)
 
@@ -129,86 +132,86 @@ class Comparison(Summarised, eqx.Module):
         that number where nothing has changed), its `p_value`, and whether the group has
         `changed`.
         """
-        kinds, determined, known = (
-            np.array(self.kinds),
-            self.determined,
-            self.uncertainty,
-        )
+        kinds = np.array(self.kinds)
         groups = []
         for name in dict.fromkeys(kinds.tolist()):
-            k = np.flatnonzero(determined & (kinds == name))
-            dof = float(np.min(known.dof[k], initial=np.inf))
-            covariance = known.covariance[np.ix_(k, k)]
-            statistic, p = joint_test(self.difference[k], covariance, dof)
-            found = {
-                "name": name,
-                "parameters": len(k),
-                "statistic": statistic,
-                "p_value": p,
-            }
-            groups.append(found)
+            members = np.flatnonzero(self.determined & (kinds == name))
+            statistic, p_value = joint_test(
+                self.difference[members],
+                self.uncertainty.covariance[np.ix_(members, members)],
+                float(np.min(self.uncertainty.dof[members], initial=np.inf)),
+            )
+            groups.append(
+                {
+                    "name": name,
+                    "parameters": len(members),
+                    "statistic": statistic,
+                    "p_value": p_value,
+                }
+            )
         adjusted = _holm(np.array([group["p_value"] for group in groups]))
-        for group, p in zip(groups, adjusted.tolist(), strict=True):
-            group["changed"] = p <= 1.0 - self.level
+        for group, p_value in zip(groups, adjusted.tolist(), strict=True):
+            group["changed"] = p_value <= 1.0 - self.level
         return groups
 
     def summary(self) -> Table:
         """Return a table of both estimates, their differences with intervals, and verdicts."""
-        verdicts, kinds, half = self.verdicts, self.kinds, self.half_widths
-        a, b = (f.parameters[list(self.indices)] for f in (self.first, self.second))
-        change, width = with_deviations(self.difference, half)
-        signed = [x if x.startswith("-") else f"+{x}" for x in change]
-        tested, chance = (
-            len(verdicts) - verdicts.count(Verdict.UNKNOWN),
-            1.0 - self.level,
-        )
+        kinds = self.kinds
+        verdicts = self.verdicts
+        half_widths = self.half_widths
+        differences, digits = with_deviations(self.difference, half_widths)
+        estimates = []
+        for fit in (self.first, self.second):
+            values = fit.parameters[list(self.indices)]
+            estimates.append(with_deviations(values, half_widths)[0])
+        percent = f"{100 * self.level:g} %"
         return Table(
             f"{self.first.name} and {self.second.name}: {len(kinds)} base parameters",
-            Column("#", list(range(1, len(half) + 1))),
+            Column("#", list(range(1, len(kinds) + 1))),
             Column("parameter", self.names),
             Column("unit", self.units),
-            Column(self.first.name, with_deviations(a, half)[0], kind="number"),
-            Column(self.second.name, with_deviations(b, half)[0], kind="number"),
-            Column("difference", signed, kind="number"),
-            Column(f"± ({100 * self.level:g} %)", width, kind="number"),
+            Column(self.first.name, estimates[0], kind="number"),
+            Column(self.second.name, estimates[1], kind="number"),
+            Column("difference", _with_sign(differences), kind="number"),
+            Column(f"± ({percent})", digits, kind="number"),
             Column("verdict", [verdict.value for verdict in verdicts]),
-            status=[
-                Status.DOUBTFUL if v is Verdict.CHANGED else Status.NEUTRAL
-                for v in verdicts
-            ],
+            status=[_status(verdict is Verdict.CHANGED) for verdict in verdicts],
             rules=[k for k in range(1, len(kinds)) if kinds[k] != kinds[k - 1]],
-            remarks=[
-                f"{verdicts.count(Verdict.CHANGED)} of {tested} parameters have "
-                "changed: if none "
-                f"had, the chance to call any of them so would be {100 * chance:.3g} "
-                "% at most "
-                "(Holm)",
-                f"{verdicts.count(Verdict.PERHAPS)} more have perhaps changed: zero "
-                "lies outside "
-                f"the {100 * self.level:g} % interval of their difference; of "
-                f"{tested} parameters "
-                f"that never change, about {chance * tested:.2g} look so",
-            ],
+            remarks=self._remarks(),
         )
+
+    def _remarks(self) -> list[str]:
+        """Return the numbers of changes, and those to expect by chance."""
+        verdicts = self.verdicts
+        tests = len(verdicts) - verdicts.count(Verdict.UNKNOWN)
+        chance = 1.0 - self.level
+        return [
+            f"{verdicts.count(Verdict.CHANGED)} of {tests} parameters have changed: if "
+            "none had, the chance to call any of them so would be "
+            f"{100 * chance:.3g} % at most (Holm)",
+            f"{verdicts.count(Verdict.PERHAPS)} more have perhaps changed: zero lies "
+            f"outside the {100 * self.level:g} % interval of their difference; of "
+            f"{tests} parameters that never change, about {chance * tests:.2g} look so",
+        ]
 
     def group_summary(self) -> Table:
         """Return a table of the joint test of each kind of parameter."""
         groups = self.groups
-        p_values = [group["p_value"] for group in groups]
-        chances = ["< 1e-6" if p < 1e-6 else significant(p, 2) for p in p_values]
-        verdicts = [
-            Verdict.CHANGED if g["changed"] else Verdict.UNCHANGED for g in groups
-        ]
+        chances = []
+        verdicts = []
+        for group in groups:
+            p_value = group["p_value"]
+            chances.append("< 1e-6" if p_value < 1e-6 else significant(p_value, 2))
+            verdict = Verdict.CHANGED if group["changed"] else Verdict.UNCHANGED
+            verdicts.append(verdict.value)
         return Table(
             "all parameters of a kind at once",
             Column("kind", [group["name"] for group in groups]),
             Column("parameters", [group["parameters"] for group in groups]),
             Column("statistic", [group["statistic"] for group in groups]),
             Column("chance\nwithout a change", chances, kind="number"),
-            Column("verdict", [verdict.value for verdict in verdicts]),
-            status=[
-                Status.DOUBTFUL if g["changed"] else Status.NEUTRAL for g in groups
-            ],
+            Column("verdict", verdicts),
+            status=[_status(group["changed"]) for group in groups],
         )
 
     def tables(self) -> list[Table]:
@@ -231,26 +234,36 @@ def compare(first: Fit, second: Fit, level: float = LEVEL) -> Comparison:
             fraction.
     """
     require_same_base((first, second))
-    first, second = without_bounds(first), without_bounds(second)
-    none = np.zeros((first.base.size, first.base.size))
-    return compare_some(first, second, range(first.base.size), none, level)
+    size = first.base.size
+    return compare_some(
+        without_bounds(first),
+        without_bounds(second),
+        range(size),
+        np.zeros((size, size)),
+        level,
+    )
 
 
-def compare_some(first: Fit, second: Fit, indices, cross, level: float) -> Comparison:
+def compare_some(
+    first: Fit, second: Fit, indices: Sequence[int], cross: np.ndarray, level: float
+) -> Comparison:
     """Compare some base parameters of two fits, whose estimates have a cross-covariance."""
     if not 0 < level < 1:
         raise InputError(
             f"`level` must lie between 0 and 1, like 0.95, but is {level:g}."
         )
     k = list(indices)
-    A, B = (fit.covariance[np.ix_(k, k)] for fit in (first, second))
-    m, n = (fit.uncertainty.dof[k] for fit in (first, second))
-    a, b = np.diag(A), np.diag(B)
-    # Degrees of freedom of a sum of two variances (Welch, Satterthwaite).
+    first_covariance = first.covariance[np.ix_(k, k)]
+    second_covariance = second.covariance[np.ix_(k, k)]
+    # Infinite variances make numbers that are none.
     with np.errstate(invalid="ignore", divide="ignore"):
-        covariance = A + B - cross - cross.T
-        dof = (a + b) ** 2 / (a**2 / m + b**2 / n)
-    dof = np.where(np.isnan(dof), np.inf, dof)
+        covariance = first_covariance + second_covariance - cross - cross.T
+        dof = _dof_of_sum(
+            np.diag(first_covariance),
+            np.diag(second_covariance),
+            first.uncertainty.dof[k],
+            second.uncertainty.dof[k],
+        )
     return Comparison(
         first=first,
         second=second,
@@ -261,15 +274,34 @@ def compare_some(first: Fit, second: Fit, indices, cross, level: float) -> Compa
     )
 
 
+def _dof_of_sum(
+    a: np.ndarray, b: np.ndarray, dof_a: np.ndarray, dof_b: np.ndarray
+) -> np.ndarray:
+    """Return the degrees of freedom of sums of two variances (Welch, Satterthwaite)."""
+    dof = (a + b) ** 2 / (a**2 / dof_a + b**2 / dof_b)
+    return np.where(np.isnan(dof), np.inf, dof)
+
+
+def _with_sign(numbers: Sequence[str]) -> list[str]:
+    return [x if x.startswith("-") else f"+{x}" for x in numbers]
+
+
+def _status(has_changed: bool) -> Status:
+    return Status.DOUBTFUL if has_changed else Status.NEUTRAL
+
+
 def _holm(p: Float[np.ndarray, " tests"]) -> Float[np.ndarray, " tests"]:
     """Return p-values that are corrected for the number of tests."""
-    order, adjusted = np.argsort(p, kind="stable"), np.ones_like(p)
-    steps = p[order] * np.arange(len(p), 0, -1)
-    adjusted[order] = np.minimum(np.maximum.accumulate(steps), 1.0)
+    order = np.argsort(p, kind="stable")
+    products = p[order] * np.arange(len(p), 0, -1)
+    adjusted = np.ones_like(p)
+    adjusted[order] = np.minimum(np.maximum.accumulate(products), 1.0)
     return adjusted
 
 
-def joint_test(difference, covariance, dof: float) -> tuple[float, float]:
+def joint_test(
+    difference: np.ndarray, covariance: np.ndarray, dof: float
+) -> tuple[float, float]:
     r"""Test by $d^T C^{-1} d$ if differences are more than chance: statistic and p-value.
 
     It is chi-squared where the covariance is exact, else Hotelling's $T^2$. All
@@ -281,26 +313,24 @@ def joint_test(difference, covariance, dof: float) -> tuple[float, float]:
     correlation = covariance / deviations / deviations[:, None]
     values, directions = np.linalg.eigh(0.5 * (correlation + correlation.T))
     # Smaller eigenvalues are rounding.
-    kept = values > 1e-12 * values[-1]
-    along = directions.T @ (difference / deviations)
-    statistic, size = (
-        float(np.sum(along[kept] ** 2 / values[kept])),
-        int(np.count_nonzero(kept)),
-    )
+    is_sound = values > 1e-12 * values[-1]
+    size = int(np.count_nonzero(is_sound))
+    projections = directions.T @ (difference / deviations)
+    statistic = float(np.sum(projections[is_sound] ** 2 / values[is_sound]))
     if not np.isfinite(dof):
         return statistic, float(special.chdtrc(size, statistic))
-    rest = dof - size + 1.0
-    if rest <= 0:
+    f_dof = dof - size + 1.0
+    if f_dof <= 0:
         return statistic, 1.0
-    return statistic, float(special.fdtrc(size, rest, statistic * rest / (dof * size)))
+    f_ratio = statistic * f_dof / (dof * size)
+    return statistic, float(special.fdtrc(size, f_dof, f_ratio))
 
 
 def parameter_kinds(base: BaseParameters) -> tuple[str, ...]:
     """Return for each base parameter the term of its leading parameter, as `viscous friction`."""
     model = base.model
-    kinds = [
-        re.sub(r"(?<=[a-z])(?=[A-Z])", " ", type(term).__name__).lower()
-        for term in model.terms
-        for _ in term.parameters(model.robot)
-    ]
+    kinds = []
+    for term in model.terms:
+        words = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", type(term).__name__).lower()
+        kinds += [words] * len(term.parameters(model.robot))
     return tuple(kinds[k] for k in base.indices)

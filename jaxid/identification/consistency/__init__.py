@@ -3,14 +3,15 @@
 from .bounds_and_priors import (
     BodyBounds as BodyBounds,
     EntropicPull as EntropicPull,
-    ParameterPrior as ParameterPrior,
+)
+from .consistent_batch import (
+    ConsistentBatch as ConsistentBatch,
+    ConsistentSolver as ConsistentSolver,
+    consistent_batch as consistent_batch,
 )
 from .estimator import (
     Consistency as Consistency,
-    ConsistentBatch as ConsistentBatch,
-    ConsistentSolver as ConsistentSolver,
     PhysicallyConsistent as PhysicallyConsistent,
-    consistent_batch as consistent_batch,
     consistent_body as consistent_body,
 )
 from .pseudo_inertia import (

@@ -1,4 +1,4 @@
-"""Prior knowledge about bodies: bounds of masses and sizes, a CAD model, a data sheet."""
+"""Prior knowledge about bodies: bounds of masses and sizes, or bodies of a CAD model."""
 
 import dataclasses
 from typing import Any
@@ -11,6 +11,11 @@ from jaxid.errors import InputError
 from jaxid.robot.robot import Robot
 
 from .pseudo_inertia import consistency_margin
+
+MASS_PER_SQUARED_REACH = 100.0
+"""Largest mass of a body, relative to the square of the robot's reach [kg/m²]."""
+OVERHANG = 0.25
+"""How far bodies extend beyond their joints, relative to the robot's reach."""
 
 
 class BodyBounds(eqx.Module):
@@ -51,29 +56,37 @@ class BodyBounds(eqx.Module):
     def __post_init__(self):
         bodies = max(np.size(self.mass_max), np.size(self.radius))
         for name in ("mass_max", "radius", "mass_min"):
-            setattr(self, name, _of_each(name, getattr(self, name), bodies))
+            setattr(self, name, _of_each_body(name, getattr(self, name), bodies))
         for name in ("centre_min", "centre_max", "ellipsoid_centre", "ellipsoid_axes"):
-            setattr(self, name, _of_each(name, getattr(self, name), bodies, 3))
-        low, high, radius = self.mass_min, self.mass_max, self.radius
-        rules = (
-            ("mass_max", "positive and finite", (high > 0) & np.isfinite(high)),
-            ("radius", "positive and finite", (radius > 0) & np.isfinite(radius)),
-            ("ellipsoid_axes", "positive", self.ellipsoid_axes > 0),
-            ("mass_min", "at least 0 and below `mass_max`", (low >= 0) & (low < high)),
-            ("centre_min", "below `centre_max`", self.centre_min < self.centre_max),
+            setattr(self, name, _of_each_body(name, getattr(self, name), bodies, 3))
+        low = self.mass_min
+        high = self.mass_max
+        radius = self.radius
+        axes = self.ellipsoid_axes
+        is_box = self.centre_min < self.centre_max
+        self._require("mass_max", "positive and finite", (high > 0) & (high < np.inf))
+        self._require("radius", "positive and finite", (radius > 0) & (radius < np.inf))
+        self._require("ellipsoid_axes", "positive", axes > 0)
+        self._require(
+            "mass_min", "at least 0 and below `mass_max`", (low >= 0) & (low < high)
         )
-        for name, rule, good in rules:
-            if not good.all():
-                k = np.argwhere(~good)[0, 0]
-                value = getattr(self, name)[k]
-                raise InputError(
-                    f"`{name}` must be {rule}, but body {k + 1} has {value}."
-                )
+        self._require("centre_min", "below `centre_max`", is_box)
         total = self.total_mass
         if total is not None and not low.sum() < total < high.sum():
-            span = f"{low.sum():g} to {high.sum():g} kg"
-            raise InputError(f"`total_mass` must be from {span}, but is {total:g} kg.")
+            raise InputError(
+                f"`total_mass` must be from {low.sum():g} to {high.sum():g} kg, but is "
+                f"{total:g} kg."
+            )
         _ = self.inner_centres
+
+    def _require(self, name: str, rule: str, is_good: Bool[np.ndarray, "..."]) -> None:
+        """Check the rule of a field, and name the first body that breaks it."""
+        if not is_good.all():
+            body = np.argwhere(~is_good)[0, 0]
+            raise InputError(
+                f"`{name}` must be {rule}, but body {body + 1} has "
+                f"{getattr(self, name)[body]}."
+            )
 
     @classmethod
     def from_geometry(cls, robot: Robot) -> "BodyBounds":
@@ -86,17 +99,21 @@ class BodyBounds(eqx.Module):
         Args:
             robot: Robot whose bodies are bounded.
         """
-        offset = np.linalg.norm(np.asarray(robot.offset), axis=1)
-        tip = float(np.linalg.norm(np.asarray(robot.tip_offset)))
-        chains = [offset[list(chain)].sum() for chain in robot.ancestors]
-        chains[robot.tip_body] += tip
+        lengths = np.linalg.norm(np.asarray(robot.offset), axis=1)
+        tip_length = float(np.linalg.norm(np.asarray(robot.tip_offset)))
+        chains = [lengths[list(chain)].sum() for chain in robot.ancestors]
+        chains[robot.tip_body] += tip_length
         reach = float(max(chains)) or 1.0
-        farthest = offset.copy()
-        farthest[robot.tip_body] = max(farthest[robot.tip_body], tip)
+        # Distance of each body's origin to the farthest of its neighbouring joints.
+        extents = lengths.copy()
+        extents[robot.tip_body] = max(extents[robot.tip_body], tip_length)
         for body, parent in enumerate(robot.parent):
             if parent >= 0:
-                farthest[parent] = max(farthest[parent], offset[body])
-        return cls(100.0 * reach**2, farthest + 0.25 * reach)
+                extents[parent] = max(extents[parent], lengths[body])
+        return cls(
+            mass_max=MASS_PER_SQUARED_REACH * reach**2,
+            radius=extents + OVERHANG * reach,
+        )
 
     def replace(self, **fields: Any) -> "BodyBounds":
         """Return a copy with some bounds replaced; scalars count for all bodies.
@@ -107,20 +124,19 @@ class BodyBounds(eqx.Module):
         return dataclasses.replace(self, **fields)
 
     def __str__(self):
-        def span(values: AnyArray) -> str:
-            low, high = float(np.min(values)), float(np.max(values))
-            return f"{high:.3g}" if low == high else f"{low:.3g} to {high:.3g}"
-
-        boxes = np.isfinite(self.centre_min) | np.isfinite(self.centre_max)
         parts = [
-            f"masses up to {span(self.mass_max)} kg",
-            f"bodies within {span(self.radius)} m of the origins of their frames",
-            f"masses from {span(self.mass_min)} kg" if np.any(self.mass_min) else "",
-            "centres of mass in boxes" if boxes.any() else "",
-            "centres of mass in ellipsoids" if self.has_ellipsoid.any() else "",
-            "" if self.total_mass is None else f"{self.total_mass:.4g} kg together",
+            f"masses up to {_span(self.mass_max)} kg",
+            f"bodies within {_span(self.radius)} m of the origins of their frames",
         ]
-        return ", ".join(filter(None, parts))
+        if np.any(self.mass_min):
+            parts.append(f"masses from {_span(self.mass_min)} kg")
+        if np.isfinite([self.centre_min, self.centre_max]).any():
+            parts.append("centres of mass in boxes")
+        if self.has_ellipsoid.any():
+            parts.append("centres of mass in ellipsoids")
+        if self.total_mass is not None:
+            parts.append(f"{self.total_mass:.4g} kg together")
+        return ", ".join(parts)
 
     @property
     def has_ellipsoid(self) -> Bool[np.ndarray, " bodies"]:
@@ -134,34 +150,44 @@ class BodyBounds(eqx.Module):
         Raises:
             InputError: If there are none for some body.
         """
-        radius, known = self.radius[:, None], self.has_ellipsoid[:, None]
+        radius = self.radius[:, None]
+        has_ellipsoid = self.has_ellipsoid[:, None]
         low = np.maximum(self.centre_min, -radius)
         high = np.minimum(self.centre_max, radius)
-        middle = np.where(known, self.ellipsoid_centre, 0.0)
-        axes = np.where(known, self.ellipsoid_axes, radius)
-        regions = (middle, axes), (0.0, radius)
-        point, edge = 0.5 * (low + high), 0.1 * (high - low)
+        edge = 0.1 * (high - low)
+        centre = np.where(has_ellipsoid, self.ellipsoid_centre, 0.0)
+        axes = np.where(has_ellipsoid, self.ellipsoid_axes, radius)
+        ellipsoids = ((centre, axes), (0.0, radius))
+        point = 0.5 * (low + high)
         # Alternating projections onto the ellipsoid, the sphere and the box, each a
         # little smaller.
         for _ in range(200):
-            for middle, axes in regions:
-                away = point - middle
-                size = np.linalg.norm(away / axes, axis=1, keepdims=True) / 0.9
-                point = middle + away / np.maximum(size, 1.0)
+            for centre, axes in ellipsoids:
+                offset = point - centre
+                size = np.linalg.norm(offset / axes, axis=1, keepdims=True) / 0.9
+                point = centre + offset / np.maximum(size, 1.0)
             point = np.clip(point, low + edge, high - edge)
-        inside = ((low < point) & (point < high)).all(axis=1)
-        for middle, axes in regions:
-            inside &= np.linalg.norm((point - middle) / axes, axis=1) < 0.99
-        if not inside.all():
-            k = int(np.argmin(inside))
+
+        is_inside = ((low < point) & (point < high)).all(axis=1)
+        for centre, axes in ellipsoids:
+            is_inside &= np.linalg.norm((point - centre) / axes, axis=1) < 0.99
+        if not is_inside.all():
+            body = int(np.argmin(is_inside))
             raise InputError(
-                f"no centre of mass of body {k + 1} fits its bounds: widen them."
+                f"no centre of mass of body {body + 1} fits its bounds: widen them."
             )
         return point
 
 
-def _of_each(name: str, value: Numbers, bodies: int, *shape: int) -> np.ndarray:
-    """Return numbers of each body, given for each or for all."""
+def _span(values: np.ndarray) -> str:
+    """Return the range of some numbers in words."""
+    low = f"{np.min(values):.3g}"
+    high = f"{np.max(values):.3g}"
+    return high if np.ptp(values) == 0 else f"{low} to {high}"
+
+
+def _of_each_body(name: str, value: Numbers, bodies: int, *shape: int) -> np.ndarray:
+    """Return numbers of each body, from numbers for each or for all."""
     array = np.array(value, np.float64)
     if np.isnan(array).any() or array.shape not in ((), shape, (bodies, *shape)):
         raise InputError(
@@ -191,36 +217,11 @@ class EntropicPull(eqx.Module):
     def __check_init__(self):
         if not 0.0 < self.strength < np.inf:
             raise InputError(f"`strength` must be positive, but is {self.strength}.")
-        if (
-            self.bodies is not None
-            and not (consistency_margin(self.bodies) > 0.0).all()
-        ):
-            k = int(np.argmin(consistency_margin(self.bodies))) + 1
+        if self.bodies is None:
+            return
+        margins = consistency_margin(self.bodies)
+        if not (margins > 0.0).all():
             raise InputError(
-                f"body {k} of the prior's `bodies` needs a mass and an inertia."
-            )
-
-
-class ParameterPrior(eqx.Module):
-    r"""Standard parameters that are known roughly, each with its own standard deviation (a ridge).
-
-    It adds $\frac12 \sum_i (p_i - p_{0i})^2 / \sigma_i^2$ to half the squares in units
-    of noise.
-
-    Attributes:
-        parameters: Standard parameters.
-        deviations: Their standard deviations; infinite where nothing is known.
-    """
-
-    parameters: Float[AnyArray, " standard"]
-    deviations: Float[AnyArray, " standard"]
-
-    def __check_init__(self):
-        deviations = np.asarray(self.deviations)
-        if (
-            np.shape(self.parameters) != deviations.shape
-            or not (deviations > 0.0).all()
-        ):
-            raise InputError(
-                "`deviations` must be positive and as many as `parameters`."
+                f"body {np.argmin(margins) + 1} of the prior's `bodies` needs a mass "
+                "and an inertia."
             )

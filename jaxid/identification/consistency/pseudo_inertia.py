@@ -6,11 +6,10 @@ masses if and only if $\Pi$ is positive semidefinite (Wensing, Kim, Slotine, 201
 which includes the triangle inequality of the principal moments of inertia.
 
 The last part of the file is arithmetic on stacks of such matrices, for NumPy and JAX
-alike. The loops over four rows are unrolled: a stack takes a few dozen array operations
-and no call of LAPACK.
+alike. Its loops over four rows take a few dozen array operations for a whole stack:
+calls of LAPACK for each matrix would make batches half as fast.
 """
 
-from types import ModuleType
 from typing import Any
 
 import equinox as eqx
@@ -24,15 +23,24 @@ Values = Any
 """Arrays of NumPy or JAX, and NumPy scalars."""
 
 
-BASIS = np.zeros((10, 4, 4))
+def _unit_pseudo_inertias() -> np.ndarray:
+    """Return the pseudo-inertias of unit parameters [parameter, row, column]."""
+    basis = np.zeros((10, 4, 4))
+    basis[0, 3, 3] = 1.0
+    for axis, (row, column) in enumerate(((1, 2), (0, 2), (0, 1))):
+        basis[1 + axis, axis, 3] = 1.0
+        basis[1 + axis, 3, axis] = 1.0
+        # A moment of inertia is the sum of two second moments.
+        basis[4 + axis, range(3), range(3)] = 0.5
+        basis[4 + axis, axis, axis] = -0.5
+        basis[7 + axis, row, column] = 1.0
+        basis[7 + axis, column, row] = 1.0
+    return basis
+
+
+BASIS = _unit_pseudo_inertias()
 r"""Pseudo-inertias of unit parameters $(m, m r_c, A, B, C, D, E, F)$."""
-BASIS[0, 3, 3] = 1.0
-for _k, (_i, _j) in enumerate(((1, 2), (0, 2), (0, 1))):
-    BASIS[1 + _k, _k, 3] = BASIS[1 + _k, 3, _k] = 1.0
-    BASIS[4 + _k, range(3), range(3)] = 0.5
-    BASIS[4 + _k, _k, _k] = -0.5
-    BASIS[7 + _k, _i, _j] = BASIS[7 + _k, _j, _i] = 1.0
-_ROWS, _COLUMNS = np.triu_indices(4, 1)
+UPPER_TRIANGLE = np.triu_indices(4, 1)
 
 
 def pseudo_inertia(
@@ -54,13 +62,13 @@ def inertial_parameters(
     pseudo: Float[AnyArray, "*batch 4 4"],
 ) -> Float[AnyArray, "*batch 10"]:
     """Return the parameters $(m, m r_c, A, B, C, D, E, F)$ of pseudo-inertias."""
-    P, xp = pseudo, namespace(pseudo)
-    xx, yy, zz = P[..., 0, 0], P[..., 1, 1], P[..., 2, 2]
-    first_moments = (P[..., k, 3] for k in range(3))
-    products = P[..., 1, 2], P[..., 0, 2], P[..., 0, 1]
-    return xp.stack(
-        [P[..., 3, 3], *first_moments, yy + zz, xx + zz, xx + yy, *products], axis=-1
-    )
+    xx, yy, zz = (pseudo[..., k, k] for k in range(3))
+    mass = pseudo[..., 3, 3]
+    first_moments = [pseudo[..., k, 3] for k in range(3)]
+    moments = [yy + zz, xx + zz, xx + yy]
+    products = [pseudo[..., 1, 2], pseudo[..., 0, 2], pseudo[..., 0, 1]]
+    parameters = [mass, *first_moments, *moments, *products]
+    return namespace(pseudo).stack(parameters, axis=-1)
 
 
 def ball(mass: np.ndarray, centre: np.ndarray, radius: np.ndarray) -> np.ndarray:
@@ -68,7 +76,8 @@ def ball(mass: np.ndarray, centre: np.ndarray, radius: np.ndarray) -> np.ndarray
     P = np.empty((*mass.shape, 4, 4))
     P[..., :3, :3] = radius[..., None, None] ** 2 / 5.0 * np.eye(3)
     P[..., :3, :3] += centre[..., :, None] * centre[..., None, :]
-    P[..., :3, 3] = P[..., 3, :3] = centre
+    P[..., :3, 3] = centre
+    P[..., 3, :3] = centre
     P[..., 3, 3] = 1.0
     return P * mass[..., None, None]
 
@@ -85,7 +94,8 @@ def consistency_margin(
     P = pseudo_inertia(np.asarray(bodies))
     size = np.sqrt(np.abs(np.diagonal(P, axis1=-2, axis2=-1)))
     scale = 1.0 / np.where(size > 0, size, 1.0)
-    return np.linalg.eigvalsh(P * scale[..., :, None] * scale[..., None, :])[..., 0]
+    scaled = P * scale[..., :, None] * scale[..., None, :]
+    return np.linalg.eigvalsh(scaled)[..., 0]
 
 
 class LogCholesky(eqx.Module):
@@ -122,80 +132,58 @@ class LogCholesky(eqx.Module):
                     f"`bodies` must hold ten numbers each, but has shape {p.shape}."
                 )
             p = p.reshape(-1, 10)
-        if not is_traced(p) and not np.all(
-            np.asarray(consistency_margin(np.asarray(p))) > 0
-        ):
+        if not is_traced(p) and not (consistency_margin(p) > 0).all():
             raise InputError(
                 "`bodies` must be able to exist, with a volume: use "
-                "`PhysicallyConsistent`, or the "
-                "bodies of a URDF file."
+                "`PhysicallyConsistent`, or the bodies of a URDF file."
             )
         # The upper triangle is a lower one with the axes in reverse order.
         reverse = (Ellipsis, slice(None, None, -1), slice(None, None, -1))
-        U = jnp.linalg.cholesky(jnp.asarray(pseudo_inertia(p))[reverse])[reverse]
+        P = jnp.asarray(pseudo_inertia(p))
+        U = jnp.linalg.cholesky(P[reverse])[reverse]
         diagonal = jnp.diagonal(U, axis1=-2, axis2=-1)
-        above = U[..., _ROWS, _COLUMNS]
+        above = U[(..., *UPPER_TRIANGLE)]
         return cls(jnp.concatenate([jnp.log(diagonal), above], axis=-1))
 
     @property
     def parameters(self) -> Float[AnyArray, "*batch 10"]:
         """Parameters $(m, m r_c, A, B, C, D, E, F)$ of each body."""
         x = jnp.asarray(self.coordinates)
-        U = jnp.exp(x[..., :4, None]) * jnp.eye(4, dtype=x.dtype).reshape(
-            (1,) * (x.ndim - 1) + (4, 4)
-        )
-        U = U.at[..., _ROWS, _COLUMNS].set(x[..., 4:])
+        U = jnp.zeros((*x.shape[:-1], 4, 4), x.dtype)
+        U = U.at[(..., *np.diag_indices(4))].set(jnp.exp(x[..., :4]))
+        U = U.at[(..., *UPPER_TRIANGLE)].set(x[..., 4:])
         return inertial_parameters(U @ jnp.swapaxes(U, -1, -2))
 
 
-def _cholesky(xp: ModuleType, P: Values) -> list[list[Values]]:
-    """Return the entries of the lower triangles; NaN where a matrix is not positive definite."""
-    n = P.shape[-1]
-    L: list[list[Values]] = [[P[..., 0, 0]] * n for _ in range(n)]
-    for j in range(n):
-        pivot = P[..., j, j]
-        for k in range(j):
-            pivot = pivot - L[j][k] ** 2
-        L[j][j] = xp.sqrt(pivot)
-        for i in range(j + 1, n):
-            entry = P[..., i, j]
-            for k in range(j):
-                entry = entry - L[i][k] * L[j][k]
-            L[i][j] = entry / L[j][j]
-    return L
-
-
-def pivots(xp: ModuleType, P: Values) -> Values:
+def pivots(P: Values) -> Values:
     """Return the pivots of matrices [matrices, 4, 4, *more] on a leading axis.
 
     All of them are positive where a matrix is positive definite; their product is the
     determinant.
     """
-    found = [P[:, 0, 0]]
-    for _ in range(P.shape[1] - 1):
+    size = P.shape[1]
+    pivots = []
+    for _ in range(size):
+        pivot = P[:, 0, 0]
+        pivots.append(pivot)
         column = P[:, 1:, 0]
-        P = P[:, 1:, 1:] - column[:, :, None] * (column / P[:, :1, 0])[:, None]
-        found.append(P[:, 0, 0])
-    return xp.stack(found)
+        multiples = column / pivot[:, None]
+        P = P[:, 1:, 1:] - column[:, :, None] * multiples[:, None]
+    return namespace(P).stack(pivots)
 
 
-def inverse(xp: ModuleType, P: Values) -> Values:
-    """Return the inverses of positive definite matrices."""
-    L = _cholesky(xp, P)
-    n = P.shape[-1]
-    zero = xp.zeros_like(P[..., 0, 0])
-    rows = [[zero] * n for _ in range(n)]
-    for j in range(n):
-        rows[j][j] = 1.0 / L[j][j]
-        for i in range(j + 1, n):
-            total = zero
-            for k in range(j, i):
-                total = total + L[i][k] * rows[k][j]
-            rows[i][j] = -total / L[i][i]
-    M = xp.stack([xp.stack(row, axis=-1) for row in rows], axis=-2)
-    return xp.swapaxes(M, -1, -2) @ M
+def inverse(P: Values) -> Values:
+    """Return the inverses of positive definite matrices, by one sweep for each row."""
+    for k, unit_vector in enumerate(np.eye(4)):
+        pivot = P[:, k, k]
+        others = 1.0 - unit_vector
+        vector = P[:, k] * others[None] + unit_vector[None]
+        multiples = vector / pivot[:, None]
+        block = P * np.outer(others, others)[None]
+        P = block - vector[:, :, None] * multiples[:, None]
+    return -P
 
 
-def symmetric_part(xp: ModuleType, P: Values) -> Values:
+def symmetric_part(P: Values) -> Values:
     """Return the symmetric parts of matrices."""
-    return 0.5 * (P + xp.swapaxes(P, -1, -2))
+    return 0.5 * (P + namespace(P).swapaxes(P, -1, -2))

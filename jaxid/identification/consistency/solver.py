@@ -1,22 +1,24 @@
 r"""A primal-dual interior point method for `ConeProgram`, in NumPy or compiled by JAX.
 
+The solver is our own for three reasons: it is compiled and mapped over data sets by
+JAX, it proves how far its result is from the optimum, and a fit takes milliseconds
+(`benchmarks/consistency.py` compares it with CLARABEL).
+
 Newton's method solves the perturbed optimality conditions $S Z = \mu I$, $s z = \mu$; a
 pull towards a prior's bodies ends with $S Z = \gamma I$ instead. The direction is that
 of Helmberg, Kojima and Monteiro with Mehrotra's predictor and corrector. The corrector
 is computed once more with the products of its own changes, and the longer step is
 taken: it saves three iterations of fourteen for one more solution of a factored system.
-    One step length serves both sides, since in a
-quadratic program they are tied together. The variables are feasible from the start.
+One step length serves both sides, since in a quadratic program they are tied together.
+The variables are feasible from the start.
 
 Certificate: for any feasible $y$ and any $Z, z \succeq 0$ with $r = \nabla f(y) -
-    F^*(Z) - G^T z$,
-convexity gives $f(y) - f^* \le \langle S, Z \rangle + s^T z + \sum_i |r_i| d_i$, where
-$d_i$ bounds the distance between two feasible values of $y_i$. Nothing in it is
-estimated.
+F^*(Z) - G^T z$, convexity gives $f(y) - f^* \le \langle S, Z \rangle + s^T z + \sum_i
+|r_i| d_i$, where $d_i$ bounds the distance between two feasible values of $y_i$.
+Nothing in it is estimated.
 """
 
 from collections.abc import Callable
-from types import ModuleType
 from typing import NamedTuple
 
 import equinox as eqx
@@ -25,19 +27,28 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
 
-from jaxid.arrays import AnyArray, Bool, Float, Int
+from jaxid.arrays import AnyArray, Bool, Float, Int, namespace
 
-from .program import ConeProgram, Number
+from .cone_program import ConeProgram, Number
 from .pseudo_inertia import BASIS, Values, inverse, pivots, symmetric_part
 
 TOLERANCE = 2.5e-7
 """Error bound of a certified optimum, relative to objective and scale together."""
 MAX_ITERATIONS = 50
-STEPS = np.array(
+MAX_STALLS = 4
+"""Iterations without progress after which the search ends."""
+MIN_LENGTH = 1e-8
+"""Length of a step below which the search ends."""
+STEP_FRACTIONS = np.array(
     [1.0, *1.0 - np.geomspace(0.01, 0.64, 13), 0.28, 0.2, 0.13, 0.08, 0.04, 0.01]
 )
 """Steps that are tried, as fractions of the longest that the linear inequalities allow."""
-TINY = 1e-14
+BOUNDARY_FRACTION = 0.99
+"""Fraction of the longest step that is taken: slacks stay positive."""
+RIDGE = 1e-14
+"""Relative increase of diagonals, by less than rounding: factors do not fail."""
+TINY = 1e-300
+"""Keeps ratios finite."""
 
 
 class Optimum(eqx.Module):
@@ -56,77 +67,121 @@ class Optimum(eqx.Module):
     matrices: Float[AnyArray, "*batch cones 4 4"]
 
 
-class _Point(NamedTuple):
+class Point(NamedTuple):
     """Variables, slacks, multipliers, and their distance from the optimum."""
+
+    y: Values
+    S: Values  # slacks of the semidefinite inequalities
+    s: Values  # slacks of the linear inequalities
+    Z: Values  # multipliers of the semidefinite inequalities
+    z: Values  # multipliers of the linear inequalities
+    residual: Values  # of the optimality conditions
+    value: Values
+    error: Values
+
+
+class Direction(NamedTuple):
+    """Changes of variables, slacks and multipliers."""
 
     y: Values
     S: Values
     s: Values
     Z: Values
     z: Values
-    residual: Values
-    value: Values
-    error: Values
 
 
-_Direction = tuple[Values, ...]
-"""Changes of `y`, `S`, `s`, `Z` and `z`."""
+class Search(NamedTuple):
+    """State of the iteration."""
+
+    point: Point
+    best: Point
+    iterations: Values
+    stalls: Values  # iterations since the best point
+    has_finished: Values
 
 
 def solve_in_numpy(program: ConeProgram) -> Optimum:
     """Solve one program in NumPy: some tens of milliseconds, and nothing to compile."""
 
-    def loop(goes_on: Callable, iterate: Callable, state: tuple) -> tuple:
-        while goes_on(state):
-            state = iterate(state)
-        return state
+    def loop(goes_on: Callable, iterate: Callable, search: Search) -> Search:
+        while goes_on(search):
+            search = iterate(search)
+        return search
 
     with np.errstate(all="ignore"):
-        return _solve(np, program, loop)
+        return _solve(program, loop)
 
 
 @jax.jit
 def solve_compiled(program: ConeProgram) -> Optimum:
     """Solve one program; works under `jit` and `vmap`."""
-    return _solve(jnp, jax.tree.map(jnp.asarray, program), jax.lax.while_loop)
+    return _solve(jax.tree.map(jnp.asarray, program), jax.lax.while_loop)
 
 
-def _solve(xp: ModuleType, p: ConeProgram, loop: Callable) -> Optimum:
-    """Iterate until certified, or until four iterations have brought no progress."""
-    # The diagonal is raised by less than rounding.
-    gram = (p.A.T @ p.A) * (1.0 + TINY * np.eye(p.A.shape[-1]))
+def _solve(p: ConeProgram, loop: Callable) -> Optimum:
+    """Iterate until certified, or until some iterations have brought no progress."""
+    xp = p.xp
+    gram = _gram(p)
 
-    def is_certified(value: Values, error: Values) -> Values:
-        return error <= TOLERANCE * (p.scale + value)
+    def is_certified(point: Point) -> Values:
+        return point.error <= TOLERANCE * (p.scale + point.value)
 
-    def iterate(state: tuple) -> tuple:
-        point, best, iterations, stalled, _ = state
-        point, length = _step(xp, p, gram, point)
-        better = point.error < best[-1]
-        new = point.y, point.z, point.Z, point.value, point.error
-        best = tuple(xp.where(better, a, b) for a, b in zip(new, best, strict=True))
-        stalled, iterations = xp.where(better, 0, stalled + 1), iterations + 1
-        finished = (
-            is_certified(point.value, point.error)
+    def iterate(search: Search) -> Search:
+        point, length = _step(p, gram, search.point)
+        is_better = point.error < search.best.error
+        best = _select(is_better, point, search.best)
+        stalls = xp.where(is_better, 0, search.stalls + 1)
+        iterations = search.iterations + 1
+        has_finished = (
+            is_certified(point)
             | ~xp.isfinite(point.error)
-            | (length < 1e-8)
-            | (stalled >= 4)
+            | (length < MIN_LENGTH)
+            | (stalls >= MAX_STALLS)
             | (iterations >= MAX_ITERATIONS)
         )
-        return point, best, iterations, stalled, finished
+        return Search(point, best, iterations, stalls, has_finished)
 
-    S, s = p.slacks(xp, p.start)
-    inverse_S, rest = inverse(xp, S), p.A @ p.start - p.b
-    # Multipliers on the start's central path, as large as its gradient.
-    force = xp.linalg.norm(p.adjoint(xp, inverse_S, 1.0 / s))
-    most = (0.5 * rest @ rest + TINY) / p.complementarity
-    mu = xp.clip(xp.linalg.norm(rest @ p.A) / force, 1e-6 * most, most)
-    Z = xp.maximum(_targets(xp, p), mu) * inverse_S
-    first, zero = _point(xp, p, p.start, Z, mu / s), xp.zeros((), int)
-    best = first.y, first.z, first.Z, first.value, first.error
-    final = loop(lambda state: ~state[-1], iterate, (first, best, zero, zero, zero > 0))
-    _, (y, z, Z, value, error), iterations, _, _ = final
-    return Optimum(y, value, error, is_certified(value, error), iterations, z, Z)
+    start = _start(p)
+    zero = xp.zeros((), int)
+    search = Search(start, start, zero, zero, zero > 0)
+    search = loop(lambda search: ~search.has_finished, iterate, search)
+    best = search.best
+    return Optimum(
+        y=best.y,
+        value=best.value,
+        error=best.error,
+        certified=is_certified(best),
+        iterations=search.iterations,
+        multipliers=best.z,
+        matrices=best.Z,
+    )
+
+
+def _gram(p: ConeProgram) -> Values:
+    return (p.A.T @ p.A) * (1.0 + RIDGE * np.eye(p.A.shape[-1]))
+
+
+def _select(condition: Values, first: NamedTuple, second: NamedTuple):
+    """Return one of two tuples of arrays."""
+    xp = namespace(condition)
+    pairs = zip(first, second, strict=True)
+    return type(first)(*(xp.where(condition, a, b) for a, b in pairs))
+
+
+def _start(p: ConeProgram) -> Point:
+    """Return the program's start with multipliers on its central path.
+
+    They are as large as the gradient of the objective.
+    """
+    xp = p.xp
+    S, s = p.slacks(p.start)
+    inverse_S = inverse(S)
+    rest = p.A @ p.start - p.b
+    force = xp.linalg.norm(p.adjoint(inverse_S, 1.0 / s))
+    max_mu = (0.5 * rest @ rest + RIDGE) / p.complementarity
+    mu = xp.clip(xp.linalg.norm(rest @ p.A) / force, 1e-6 * max_mu, max_mu)
+    Z = xp.maximum(_targets(p), mu) * inverse_S
+    return _point(p, p.start, Z, mu / s)
 
 
 def prices(p: ConeProgram, optimum: Optimum) -> Float[np.ndarray, " linear"]:
@@ -135,171 +190,228 @@ def prices(p: ConeProgram, optimum: Optimum) -> Float[np.ndarray, " linear"]:
     It is in units of half a squared standard deviation, whatever the units of the
     bounds.
     """
-    S, s = p.slacks(np, np.asarray(optimum.y))
-    z, Z = np.asarray(optimum.multipliers), np.asarray(optimum.matrices)
-    curvature = p.A.T @ p.A * (1.0 + TINY * np.eye(p.A.shape[-1]))
-    solve = _newton_solver(
-        np, p, curvature + _barriers(np, p, inverse(np, S), Z, z / s)
-    )
-    rows = np.stack([p.linear(np, y)[1] for y in np.eye(p.A.shape[-1])], axis=1)
+    S, s = p.slacks(np.asarray(optimum.y))
+    z = np.asarray(optimum.multipliers)
+    ratio = z / s
+    barriers = _barriers(p, inverse(S), np.asarray(optimum.matrices), ratio)
+    solve = _newton_solver(p, _gram(p) + barriers)
+    unit_vectors = np.eye(p.A.shape[-1])
+    rows = np.stack([p.linear(y)[1] for y in unit_vectors], axis=1)
     compliance = np.array([row @ solve(row) for row in rows])
     # Without the bound's own part of the curvature, and then a step of Newton's method.
-    compliance = compliance / np.maximum(1.0 - z / s * compliance, 1e-12)
+    compliance = compliance / np.maximum(1.0 - ratio * compliance, 1e-12)
     return 0.5 * z * np.maximum(z * compliance - s, 0.0)
 
 
-def _point(xp: ModuleType, p: ConeProgram, y: Values, Z: Values, z: Values) -> _Point:
+def _point(p: ConeProgram, y: Values, Z: Values, z: Values) -> Point:
     """Compute slacks, the residual of the optimality conditions, and the error bound."""
-    S, s = p.slacks(xp, y)
+    xp = p.xp
+    S, s = p.slacks(y)
     rest = p.A @ y - p.b
-    more = xp.zeros_like(p.fillings)
-    pull = p.adjoint(xp, xp.concatenate([p.pull * p.prior, more]), xp.zeros_like(z))
-    residual = rest @ p.A + pull - p.adjoint(xp, Z, z)
+    pull = xp.concatenate([p.pull * p.prior, xp.zeros_like(p.fillings)])
+    residual = rest @ p.A + p.adjoint(pull, xp.zeros_like(z)) - p.adjoint(Z, z)
     if p.equal.shape[0]:
         # Differences of feasible variables are orthogonal to the equality constraints.
         normal = xp.linalg.solve(p.equal @ p.equal.T, p.equal @ residual)
         residual = residual - p.equal.T @ normal
-    value = 0.5 * rest @ rest
-    # The duality gap of the matrices; if pulled, with the eigenvalues of S Z / pull,
-    # all one at the optimum: their sum less that of one and of their logarithms.
-    product = xp.sum(S * Z, axis=(-2, -1))
-    gap, pulled = product[: p.bodies], p.pull > 0
-    logs = sum(xp.sum(xp.log(pivots(xp, M[: p.bodies])), axis=0) for M in (S, Z))
-    strength = 4.0 * xp.log(xp.where(pulled, p.pull, 1.0))
-    gap = xp.where(pulled, gap - 4.0 * p.pull - p.pull * (logs - strength), gap)
-    gap = xp.sum(gap) + xp.sum(product[p.bodies :])
-    error = gap + s @ z + xp.sum(xp.abs(residual) * p.diameters)
-    return _Point(y, S, s, Z, z, residual, value, error)
+    gap = _matrix_gap(p, S, Z) + s @ z
+    error = gap + xp.sum(xp.abs(residual) * p.diameters)
+    return Point(y, S, s, Z, z, residual, 0.5 * rest @ rest, error)
 
 
-def _targets(xp: ModuleType, p: ConeProgram) -> Values:
+def _matrix_gap(p: ConeProgram, S: Values, Z: Values) -> Values:
+    """Return the duality gap of the semidefinite inequalities.
+
+    With a pull, the eigenvalues of S Z / pull are all one at the optimum: the gap is
+    their sum less that of ones and of their logarithms.
+    """
+    xp = p.xp
+    products = xp.sum(S * Z, axis=(-2, -1))
+    bodies = products[: p.bodies]
+    log_S = xp.sum(xp.log(pivots(S[: p.bodies])), axis=0)
+    log_Z = xp.sum(xp.log(pivots(Z[: p.bodies])), axis=0)
+    is_pulled = p.pull > 0
+    log_pull = 4.0 * xp.log(xp.where(is_pulled, p.pull, 1.0))
+    logarithms = log_S + log_Z - log_pull
+    pulled_gap = bodies - 4.0 * p.pull - p.pull * logarithms
+    gap = xp.where(is_pulled, pulled_gap, bodies)
+    return xp.sum(gap) + xp.sum(products[p.bodies :])
+
+
+def _targets(p: ConeProgram) -> Values:
     """Return the products of slacks and multipliers at the optimum: the pull's strength."""
-    strengths = [xp.ones(p.bodies) * p.pull, xp.zeros(len(p.fillings))]
-    return xp.concatenate(strengths)[:, None, None]
+    xp = p.xp
+    bodies = xp.ones(p.bodies) * p.pull
+    others = xp.zeros(len(p.fillings))
+    return xp.concatenate([bodies, others])[:, None, None]
 
 
-def _step(
-    xp: ModuleType, p: ConeProgram, gram: Values, x: _Point
-) -> tuple[_Point, Values]:
-    """Take the longer step of two correctors; return the new point and the step length."""
-    inverse_S, ratio, target = inverse(xp, x.S), x.z / x.s, _targets(xp, p)
-    solve = _newton_solver(xp, p, gram + _barriers(xp, p, inverse_S, x.Z, ratio))
+class Newton(NamedTuple):
+    """Newton's equations at a point, factored."""
 
-    def direction(rZ: Values, rz: Values, right: Values) -> _Direction:
+    p: ConeProgram
+    x: Point
+    inverse_S: Values  # noqa: N815
+    solve: Callable[[Values], Values]
+
+    def direction(self, rZ: Values, rz: Values, right: Values) -> Direction:
         """Return the direction of a right-hand side of the optimality conditions."""
-        dy = solve(right)
-        dS, ds = p.linear(xp, dy)
-        dZ = rZ - symmetric_part(xp, inverse_S @ dS @ x.Z)
-        return dy, dS, ds, dZ, rz - ratio * ds
+        y = self.solve(right)
+        S, s = self.p.linear(y)
+        Z = rZ - symmetric_part(self.inverse_S @ S @ self.x.Z)
+        z = rz - self.x.z / self.x.s * s
+        return Direction(y, S, s, Z, z)
 
-    def toward(mu: Values, second_Z: Values, second_z: Values) -> _Direction:
+    def centre(self, mu: Values, second_Z: Values, second_z: Values) -> Direction:
         """Return the direction towards products `target + mu`, less second-order terms."""
-        rZ = (target + mu) * inverse_S - x.Z - second_Z
-        rz = mu / x.s - x.z - second_z
-        return direction(rZ, rz, p.adjoint(xp, rZ, rz) - x.residual)
+        targets = _targets(self.p) + mu
+        rZ = targets * self.inverse_S - self.x.Z - second_Z
+        rz = mu / self.x.s - self.x.z - second_z
+        right = self.p.adjoint(rZ, rz) - self.x.residual
+        return self.direction(rZ, rz, right)
 
-    def correct(mu: Values, d: _Direction) -> _Direction:
-        """Return the direction with the products of changes along `d`."""
-        _, dS, ds, dZ, dz = d
-        return toward(mu, symmetric_part(xp, inverse_S @ dS @ dZ), ds * dz / x.s)
+    def correct(self, mu: Values, d: Direction) -> Direction:
+        """Return the direction with the products of changes along another direction."""
+        second_Z = symmetric_part(self.inverse_S @ d.S @ d.Z)
+        return self.centre(mu, second_Z, d.s * d.z / self.x.s)
 
-    def complementarity(S: Values, s: Values, Z: Values, z: Values) -> Values:
-        matrices = xp.sum(S * Z) - 4.0 * p.bodies * p.pull
-        return (xp.maximum(matrices, 0.0) + s @ z) / p.complementarity
-
-    mu = complementarity(*x[1:5]) + 1e-300
-    predictor = toward(0.0, 0.0, 0.0)
-    # The predictor only decides how much to centre: a coarser choice of steps suffices.
-    a = _length(xp, STEPS[::3], x, predictor)
-    moved = [u + a * v for u, v in zip(x[1:5], predictor[1:], strict=True)]
-    ahead = complementarity(*moved)
-    centre = xp.clip((ahead / mu) ** 3, 1e-6, 1.0)
-    centre = xp.where(a < 0.1, xp.maximum(centre, 0.5), centre)
-    first = correct(centre * mu, predictor)
-    second = correct(centre * mu, first)
-    lengths = _length(xp, STEPS, x, first), _length(xp, STEPS, x, second)
-    longer = lengths[1] > lengths[0]
-    d = tuple(xp.where(longer, b, a) for a, b in zip(first, second, strict=True))
-    length = xp.maximum(*lengths)
-
-    def refined() -> tuple[Values, ...]:
+    def refine(self, d: Direction) -> Direction:
         """Remove what rounding has left of the optimality conditions."""
-        dy, _, _, dZ, dz = d
-        rest = p.adjoint(xp, dZ, dz) - x.residual - (p.A @ dy) @ p.A
-        more = direction(xp.zeros_like(dZ), xp.zeros_like(dz), rest)
-        total = tuple(a + b for a, b in zip(d, more, strict=True))
-        return *total, _length(xp, STEPS, x, total)
+        adjoint = self.p.adjoint(d.Z, d.z)
+        rest = adjoint - self.x.residual - (self.p.A @ d.y) @ self.p.A
+        zeros = self.p.xp.zeros_like
+        correction = self.direction(zeros(d.Z), zeros(d.z), rest)
+        return Direction(*(a + b for a, b in zip(d, correction, strict=True)))
+
+
+def _newton(p: ConeProgram, gram: Values, x: Point) -> Newton:
+    """Factor Newton's equations at a point."""
+    inverse_S = inverse(x.S)
+    barriers = _barriers(p, inverse_S, x.Z, x.z / x.s)
+    return Newton(p, x, inverse_S, _newton_solver(p, gram + barriers))
+
+
+def _step(p: ConeProgram, gram: Values, x: Point) -> tuple[Point, Values]:
+    """Take the longer step of two correctors; return the new point and the step length."""
+    xp = p.xp
+    newton = _newton(p, gram, x)
+    predictor = newton.centre(0.0, 0.0, 0.0)
+    mu = _centring(p, x, predictor)
+    first = newton.correct(mu, predictor)
+    second = newton.correct(mu, first)
+    first_length = _length(STEP_FRACTIONS, x, first)
+    second_length = _length(STEP_FRACTIONS, x, second)
+    d = _select(second_length > first_length, second, first)
+    length = xp.maximum(first_length, second_length)
+
+    def refined() -> tuple[Direction, Values]:
+        refined = newton.refine(d)
+        return refined, _length(STEP_FRACTIONS, x, refined)
 
     # Near the boundary rounding leaves a residual that the error bound counts.
-    wanted = (x.error <= 1e-3 * (p.scale + x.value)) & (
-        xp.sum(xp.abs(x.residual) * p.diameters) > 0.1 * x.error
-    )
+    is_near = x.error <= 1e-3 * (p.scale + x.value)
+    residual_part = xp.sum(xp.abs(x.residual) * p.diameters)
+    needs_refinement = is_near & (residual_part > 0.1 * x.error)
     if xp is np:
-        dy, _, _, dZ, dz, length = refined() if wanted else (*d, length)
+        d, length = refined() if needs_refinement else (d, length)
     else:
-        dy, _, _, dZ, dz, length = jax.lax.cond(wanted, refined, lambda: (*d, length))
-    a = 0.99 * length
-    return _point(xp, p, x.y + a * dy, x.Z + a * dZ, x.z + a * dz), a
+        d, length = jax.lax.cond(needs_refinement, refined, lambda: (d, length))
+    length = BOUNDARY_FRACTION * length
+    y = x.y + length * d.y
+    return _point(p, y, x.Z + length * d.Z, x.z + length * d.z), length
 
 
-def _length(xp: ModuleType, steps: np.ndarray, x: _Point, d: _Direction) -> Values:
+def _centring(p: ConeProgram, x: Point, predictor: Direction) -> Values:
+    """Return the product of slacks and multipliers to aim at, by Mehrotra's rule."""
+    xp = p.xp
+    mu = _complementarity(p, x.S, x.s, x.Z, x.z) + TINY
+    # The predictor only decides how much to centre: a coarser choice of steps suffices.
+    length = _length(STEP_FRACTIONS[::3], x, predictor)
+    mu_ahead = _complementarity(
+        p,
+        x.S + length * predictor.S,
+        x.s + length * predictor.s,
+        x.Z + length * predictor.Z,
+        x.z + length * predictor.z,
+    )
+    fraction = xp.clip((mu_ahead / mu) ** 3, 1e-6, 1.0)
+    fraction = xp.where(length < 0.1, xp.maximum(fraction, 0.5), fraction)
+    return fraction * mu
+
+
+def _complementarity(p: ConeProgram, S, s, Z, z) -> Values:
+    """Return the mean product of slacks and multipliers, beyond that of the pull."""
+    xp = p.xp
+    matrices = xp.sum(S * Z) - 4.0 * p.bodies * p.pull
+    return (xp.maximum(matrices, 0.0) + s @ z) / p.complementarity
+
+
+def _length(fractions: np.ndarray, x: Point, d: Direction) -> Values:
     """Return the longest of some steps that leaves everything positive."""
-    _, dS, ds, dZ, dz = d
-    fastest = xp.maximum(xp.max(-ds / x.s), xp.max(-dz / x.z))
-    lengths = steps * xp.minimum(1.0, 1.0 / xp.maximum(fastest, 1e-300))
-    matrices, changes = xp.concatenate([x.S, x.Z]), xp.concatenate([dS, dZ])
-    tried = matrices[..., None] + changes[..., None] * lengths[None, None, None]
-    good = xp.all(pivots(xp, tried) > 0, axis=(0, 1))
-    return xp.where(xp.any(good), lengths[xp.argmax(good)], 0.0)
+    xp = namespace(x.y)
+    fastest = xp.maximum(xp.max(-d.s / x.s), xp.max(-d.z / x.z))
+    lengths = fractions * xp.minimum(1.0, 1.0 / xp.maximum(fastest, TINY))
+    matrices = xp.concatenate([x.S, x.Z])[..., None]
+    changes = xp.concatenate([d.S, d.Z])[..., None]
+    ends = matrices + changes * lengths[None, None, None]
+    is_positive = xp.all(pivots(ends) > 0, axis=(0, 1))
+    return xp.where(xp.any(is_positive), lengths[xp.argmax(is_positive)], 0.0)
 
 
-def _barriers(xp: ModuleType, p: ConeProgram, inverse_S, Z, ratio) -> Values:
-    """Return the contribution of the bounds to the matrix of Newton's equations."""
-    K, w, n = p.bodies, p.width, p.drives
-    flat = BASIS[:w].reshape(w, 16)
-    bodies = flat[None] @ _products(xp, inverse_S[:K], Z[:K]) @ flat.T[None]
-    count = K * p.rows.shape[-2]
-    linear = xp.reshape(ratio[:count], (K, -1))
-    bodies = symmetric_part(xp, bodies) + xp.einsum(
-        "kri,kr,krj->kij", p.rows, linear, p.rows
-    )
-    bodies = bodies * (1.0 + TINY * np.eye(w))[None]
-    drives = xp.diag((1.0 + TINY) * (ratio[count : count + n] + ratio[count + n :]))
-    block_diagonal = (
-        scipy.linalg.block_diag if xp is np else jax.scipy.linalg.block_diag
-    )
-    flat = xp.reshape(p.couplings, (*p.couplings.shape[:2], 16))
-    mixed = xp.einsum("ikx,kxy->iky", flat, _products(xp, inverse_S[K:], Z[K:]))
-    more = symmetric_part(xp, xp.tensordot(mixed, flat, ((1, 2), (1, 2))))
-    return block_diagonal(*bodies, drives) + p.members.T @ more @ p.members
+def _barriers(p: ConeProgram, inverse_S: Values, Z: Values, ratio: Values) -> Values:
+    """Return the contribution of the bounds to the matrix of Newton's equations.
+
+    The ratio is that of multipliers to slacks of the linear inequalities.
+    """
+    xp = p.xp
+    products = _products(inverse_S, Z)
+    basis = BASIS[: p.width].reshape(p.width, 16)
+    semidefinite = basis[None] @ products[: p.bodies] @ basis.T[None]
+    count = p.bodies * p.rows.shape[-2]
+    ratio_of_bodies = xp.reshape(ratio[:count], (p.bodies, -1))
+    linear = xp.einsum("kri,kr,krj->kij", p.rows, ratio_of_bodies, p.rows)
+    bodies = symmetric_part(semidefinite) + linear
+    bodies = bodies * (1.0 + RIDGE * np.eye(p.width))[None]
+
+    lower = ratio[count : count + p.drives]
+    upper = ratio[count + p.drives :]
+    drives = xp.diag((1.0 + RIDGE) * (lower + upper))
+    linalg = scipy.linalg if xp is np else jax.scipy.linalg
+    diagonal_blocks = linalg.block_diag(*bodies, drives)
+
+    couplings = xp.reshape(p.couplings, (*p.couplings.shape[:2], 16))
+    mixed = xp.einsum("ikx,kxy->iky", couplings, products[p.bodies :])
+    coupled = xp.tensordot(mixed, couplings, ((1, 2), (1, 2)))
+    return diagonal_blocks + p.members.T @ symmetric_part(coupled) @ p.members
 
 
-def _products(xp: ModuleType, inverse_S: Values, Z: Values) -> Values:
+def _products(inverse_S: Values, Z: Values) -> Values:
     r"""Return matrices $M$ with $e^T M g = \mathrm{tr}(E S^{-1} G Z)$ for flattened $E$ and $G$."""
+    xp = namespace(Z)
     product = inverse_S[:, None, :, :, None] * Z[:, :, None, None, :]
     return xp.reshape(product, (-1, 16, 16))
 
 
-def _newton_solver(
-    xp: ModuleType, p: ConeProgram, H: Values
-) -> Callable[[Values], Values]:
+def _newton_solver(p: ConeProgram, H: Values) -> Callable[[Values], Values]:
     """Return the solver of Newton's equations within the equality constraints."""
+    xp = p.xp
     linalg = scipy.linalg if xp is np else jax.scipy.linalg
     try:
         factor = linalg.cho_factor(H, lower=True, check_finite=False)
     except np.linalg.LinAlgError:
-        return lambda r: np.full_like(r, np.nan)
+        return lambda right: np.full_like(right, np.nan)
 
-    def solve(r: Values) -> Values:
-        return linalg.cho_solve(factor, r, check_finite=False)
+    def solve(right: Values) -> Values:
+        return linalg.cho_solve(factor, right, check_finite=False)
 
     if not p.equal.shape[0]:
         return solve
     normal = xp.stack([solve(row) for row in p.equal], axis=1)
     square = p.equal @ normal
 
-    def within(r: Values) -> Values:
-        unconstrained = solve(r)
-        return unconstrained - normal @ xp.linalg.solve(square, p.equal @ unconstrained)
+    def solve_within(right: Values) -> Values:
+        unconstrained = solve(right)
+        violation = p.equal @ unconstrained
+        return unconstrained - normal @ xp.linalg.solve(square, violation)
 
-    return within
+    return solve_within

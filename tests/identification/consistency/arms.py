@@ -4,7 +4,7 @@ import numpy as np
 
 import jaxid as jid
 from jaxid.dynamics.dispatch import in_numpy
-from jaxid.identification.consistency.program import ScaledRows, scaled_rows
+from jaxid.identification.consistency.scaled_rows import ScaledRows, scaled_rows
 from jaxid.simulation.virtual import random_bodies
 
 TERMS = (
@@ -44,4 +44,4 @@ def factor(base, seed, noise=0.05, samples=200) -> tuple[np.ndarray, np.ndarray,
 
 
 def data(base, seed, noise=0.05) -> ScaledRows:
-    return scaled_rows(np, base, *factor(base, seed, noise))
+    return scaled_rows(base, *factor(base, seed, noise))

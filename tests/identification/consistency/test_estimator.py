@@ -8,7 +8,7 @@ from virtual import observations
 
 import jaxid as jid
 from jaxid.identification.consistency import solver
-from jaxid.identification.consistency.program import feasible_set, nominal_bodies
+from jaxid.identification.consistency.feasible_set import feasible_set, nominal_bodies
 from jaxid.identification.consistency.pseudo_inertia import inertial_parameters
 
 WEIGHTS = jid.estimators.ResidualVariances(0)
@@ -122,15 +122,6 @@ def test_a_strong_pull_leads_to_its_bodies(panda, consistent):
             assert smallest[1] > smallest[0] > 0
     assert gaps[0] > gaps[1] > gaps[2]
     assert gaps[2] < 0.05 * gaps[0]
-
-
-def test_a_parameter_prior_counts(panda):
-    base, p, o = panda
-    deviations = np.full(base.model.size, np.inf)
-    deviations[0] = 1e-4
-    prior = jid.consistency.ParameterPrior(p, deviations)
-    fit = jid.identify(base, o, jid.PhysicallyConsistent(WEIGHTS, prior=prior))
-    np.testing.assert_allclose(fit.consistency.bodies[0, 0], p[0], atol=1e-3)
 
 
 def bounds(**change):

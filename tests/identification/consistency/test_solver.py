@@ -9,11 +9,8 @@ from arms import TERMS
 
 import jaxid as jid
 from jaxid.identification.consistency import consistency_margin, solver
-from jaxid.identification.consistency.program import (
-    cone_program,
-    feasible_set,
-    nominal_bodies,
-)
+from jaxid.identification.consistency.cone_program import cone_program
+from jaxid.identification.consistency.feasible_set import feasible_set, nominal_bodies
 
 PLANAR = jid.robots.planar_arm(2, 0.5)
 
@@ -51,12 +48,12 @@ CASES = {
 def test_the_optimum_is_a_conic_solvers(name):
     base, feasible = CASES[name]()
     data = arms.data(base, 3, 0.2)
-    optimum = solver.solve_in_numpy(cone_program(np, feasible, data))
+    optimum = solver.solve_in_numpy(cone_program(feasible, data))
     value, p = conic.optimum(feasible, data)
     assert optimum.certified
     assert optimum.iterations <= 30
     assert abs(optimum.value - value) <= 1e-6 * value
-    ours = feasible.standard_parameters(np, data, optimum.y)
+    ours = feasible.standard_parameters(data, optimum.y)
     np.testing.assert_allclose(data.A @ ours, data.A @ p, atol=5e-3 * np.sqrt(value))
 
 
@@ -66,10 +63,10 @@ def test_the_optimum_is_a_conic_solvers(name):
 def test_the_bound_holds_on_the_way(name, strength, monkeypatch):
     base, feasible = CASES[name]()
     prior = nominal_bodies(feasible.bounds) if strength else None
-    program = cone_program(np, feasible, arms.data(base, 7, 0.3), strength, prior)
+    program = cone_program(feasible, arms.data(base, 7, 0.3), strength, prior)
 
     def objective(y):
-        S = program.slacks(np, y)[0][: program.bodies]
+        S = program.slacks(y)[0][: program.bodies]
         away = program.A @ y - program.b
         along = np.einsum("kab,kab->k", program.prior, S)
         return 0.5 * away @ away + strength * np.sum(along - np.linalg.slogdet(S)[1])
@@ -93,9 +90,9 @@ def test_coupled_drives_in_jax_are_those_in_numpy():
     R, z, rows = arms.factor(base, 3, 0.2, 100)
     one = jid.consistency.ConsistentSolver(base)
     compiled = one(R, z, rows)
-    data, program = one.estimator.program(np, base, feasible, R, z, rows)
+    data, program = one.estimator.program(base, feasible, R, z, rows)
     optimum = solver.solve_in_numpy(program)
-    p = feasible.standard_parameters(np, data, optimum.y)
+    p = feasible.standard_parameters(data, optimum.y)
     assert compiled.certified
     assert optimum.certified
     np.testing.assert_allclose(data.A @ compiled.standard, data.A @ p, atol=1e-3)
@@ -127,9 +124,9 @@ def test_a_batch_is_its_data_sets_one_by_one():
     np.testing.assert_allclose(alone.standard, many.standard, rtol=1e-6, atol=1e-9)
     assert (np.abs(alone.iterations - many.iterations) <= 2).all()
     for k in range(2):
-        data, program = estimator.program(np, base, feasible, R[k], z[k], rows[k])
+        data, program = estimator.program(base, feasible, R[k], z[k], rows[k])
         optimum = solver.solve_in_numpy(program)
-        p = feasible.standard_parameters(np, data, optimum.y)
+        p = feasible.standard_parameters(data, optimum.y)
         np.testing.assert_allclose(
             many.parameters[k], base.from_standard(p), rtol=1e-3, atol=1e-4
         )

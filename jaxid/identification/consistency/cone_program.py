@@ -1,0 +1,289 @@
+r"""Least squares over the parameters of bodies that can exist, as a small convex program.
+
+The variables are those of the bodies, equally many for each, then those of the drives.
+Bodies are measured in their largest masses and the radii of their spheres, drives in
+their largest values: all variables lie between -1 and 1. Distances to an optimum are
+then bounded, and units do not matter.
+"""
+
+from types import ModuleType
+from typing import NamedTuple
+
+import equinox as eqx
+import numpy as np
+
+from jaxid.arrays import AnyArray, Float, namespace
+from jaxid.errors import InputError
+
+from .bounds_and_priors import BodyBounds
+from .feasible_set import FeasibleSet
+from .pseudo_inertia import BASIS, Values, ball, inertial_parameters
+from .scaled_rows import ScaledRows
+
+Number = Float[AnyArray, "*batch"] | np.floating
+"""One number of a problem, or one for each of a batch."""
+
+START_DRIVE = 0.02
+"""Parameters of the drives at the start, in their largest values."""
+START_COUPLING = 1e-3
+"""Entries beside the diagonal of coupled drives at the start, relative to the others."""
+PRIOR_SHARE = 0.98
+"""How near the start lies to bodies of a prior that satisfy all bounds."""
+
+
+class ConeProgram(eqx.Module):
+    r"""$\min \frac12 |A y - b|^2$ over bodies, drives and their couplings."""
+
+    A: Float[AnyArray, "*batch height variables"]  # without the unbounded columns
+    b: Float[AnyArray, "*batch height"]
+    floors: Float[AnyArray, "*batch bodies 4 4"]  # lower bounds of the pseudo-inertias
+    # linear inequalities of each body, and their constants
+    rows: Float[AnyArray, "*batch bodies rows width"]
+    offsets: Float[AnyArray, "*batch bodies rows"]
+    # Further positive semidefinite matrices: contributions of the variables that take
+    # part in them, unit vectors of these variables, and constants, which are ones where
+    # a matrix is smaller than four.
+    couplings: Float[AnyArray, "*batch members couplings 4 4"]
+    members: Float[AnyArray, "*batch members variables"]
+    fillings: Float[AnyArray, "*batch couplings 4 4"]
+    # functions that keep their value at the start
+    equal: Float[AnyArray, "*batch equal variables"]
+    pull: Number  # strength of the pull towards the prior's bodies; 0 for none
+    prior: Float[AnyArray, "*batch bodies 4 4"]  # inverses of its pseudo-inertias
+    diameters: Float[AnyArray, "*batch variables"]  # of the sets of feasible values
+    scale: Number  # value of the objective that counts as 1
+    start: Float[AnyArray, "*batch variables"]  # strictly feasible variables
+
+    @property
+    def xp(self) -> ModuleType:
+        """NumPy, or JAX's: that of the arrays."""
+        return namespace(self.A)
+
+    @property
+    def bodies(self) -> int:
+        """Number of bodies."""
+        return self.rows.shape[-3]
+
+    @property
+    def width(self) -> int:
+        """Number of variables of a body."""
+        return self.rows.shape[-1]
+
+    @property
+    def drives(self) -> int:
+        """Number of variables of the drives."""
+        return self.A.shape[-1] - self.bodies * self.width
+
+    @property
+    def basis(self) -> np.ndarray:
+        """Flattened pseudo-inertias of a body's unit variables."""
+        return BASIS[: self.width].reshape(self.width, 16)
+
+    @property
+    def complementarity(self) -> int:
+        """Sum of the sizes of all cones."""
+        matrices = 4 * (self.bodies + self.fillings.shape[-3])
+        return matrices + self.bodies * self.rows.shape[-2] + 2 * self.drives
+
+    def require_interior(self) -> None:
+        """Check that the start lies strictly inside all bounds."""
+        S, s = self.slacks(self.start)
+        smallest = np.linalg.eigvalsh(S).min()
+        if not (smallest > 0 and s.min() > 0):
+            raise InputError(
+                "no ball lies within all bounds: widen them, or lower `margin`."
+            )
+
+    def slacks(self, y: Values) -> tuple[Values, Values]:
+        """Return the semidefinite matrices and the nonnegative functions of variables."""
+        xp = self.xp
+        S, s = self.linear(y)
+        matrices = xp.concatenate([-self.floors, self.fillings])
+        drives = [xp.zeros(self.drives), xp.ones(self.drives)]
+        return S + matrices, s + xp.concatenate([xp.ravel(self.offsets), *drives])
+
+    def linear(self, y: Values) -> tuple[Values, Values]:
+        """Return the linear parts of `slacks`."""
+        xp = self.xp
+        count = self.bodies * self.width
+        bodies = xp.reshape(y[:count], (self.bodies, self.width))
+        drives = y[count:]
+        S = xp.reshape(bodies @ self.basis, (self.bodies, 4, 4))
+        coupled = xp.tensordot(self.members @ y, self.couplings, 1)
+        s = xp.einsum("kri,ki->kr", self.rows, bodies)
+        return (
+            xp.concatenate([S, coupled]),
+            xp.concatenate([xp.ravel(s), drives, -drives]),
+        )
+
+    def adjoint(self, Z: Values, z: Values) -> Values:
+        """Apply the transpose of `linear`."""
+        xp = self.xp
+        count = self.bodies * self.rows.shape[-2]
+        z_bodies = xp.reshape(z[:count], (self.bodies, -1))
+        z_lower = z[count : count + self.drives]
+        z_upper = z[count + self.drives :]
+        bodies = xp.reshape(Z[: self.bodies], (self.bodies, 16)) @ self.basis.T
+        bodies = bodies + xp.einsum("kri,kr->ki", self.rows, z_bodies)
+        coupled = xp.tensordot(self.couplings, Z[self.bodies :], 3) @ self.members
+        return xp.concatenate([xp.ravel(bodies), z_lower - z_upper]) + coupled
+
+
+class Cone(NamedTuple):
+    """A further positive semidefinite matrix, filled up to size four with ones."""
+
+    places: np.ndarray  # variables that take part
+    basis: Values  # their contributions [places, 4, 4]
+    filling: np.ndarray
+
+
+def cone_program(
+    feasible: FeasibleSet, data: ScaledRows, strength: float = 0.0, prior=None
+) -> ConeProgram:
+    """Return the convex program of least squares, with a pull towards the bodies of a prior."""
+    xp = namespace(data.A)
+    bounds = feasible.bounds
+    count = len(feasible.bodies)
+    scales = feasible.scales(data)
+    A = data.A[:, np.array(feasible.order)] * scales[None]
+    b = data.b
+    if feasible.unbounded:
+        columns, inverse = feasible.unbounded_columns(data)
+        A = A - columns @ (inverse @ (columns.T @ A))
+        b = b - columns @ (inverse @ (columns.T @ b))
+
+    lengths = np.ones((count, 4))
+    lengths[:, :3] = bounds.radius[:, None]
+    products = lengths[:, :, None] * lengths[:, None, :]
+    pseudo_scales = products * bounds.mass_max[:, None, None]
+    inverse_prior = np.zeros((count, 4, 4))
+    if prior is not None:
+        inverse_prior = np.linalg.inv(prior / pseudo_scales)
+
+    _, rows, offsets = feasible.linear_bounds()
+    drive_scales = scales[count * feasible.width :]
+    cones = [*_ellipsoids(feasible), *_drive_matrices(feasible, drive_scales)]
+    members = np.unique([place for cone in cones for place in cone.places]).astype(int)
+    # At first no matrix: there may be none.
+    couplings = [np.zeros((len(members), 0, 4, 4))]
+    for cone in cones:
+        is_member = (members[:, None] == cone.places).astype(float)
+        couplings.append(xp.tensordot(is_member, cone.basis, 1)[:, None])
+    fillings = [cone.filling for cone in cones]
+    body_diameters = [1, 2, 2, 2, 1, 1, 1, 1, 1, 1][: feasible.width]
+    return ConeProgram(
+        A=A,
+        b=b,
+        floors=feasible.floors / pseudo_scales,
+        rows=rows,
+        offsets=offsets,
+        couplings=xp.concatenate(couplings, axis=1),
+        members=np.eye(A.shape[1])[members],
+        fillings=np.reshape(fillings, (-1, 4, 4)),
+        equal=_total_mass(feasible),
+        pull=xp.asarray(float(strength)),
+        prior=inverse_prior,
+        diameters=np.array([*body_diameters * count, *[1.0] * len(feasible.drives)]),
+        scale=xp.asarray(data.scale) + 4.0 * count * strength,
+        start=_start(feasible, A, b, prior),
+    )
+
+
+def _total_mass(feasible: FeasibleSet) -> np.ndarray:
+    """Return the row of the total mass, or none where it is not known [rows, variables]."""
+    bounds = feasible.bounds
+    if bounds.total_mass is None:
+        return np.zeros((0, len(feasible.order)))
+    row = np.zeros((1, len(feasible.order)))
+    end = len(feasible.bodies) * feasible.width
+    row[0, : end : feasible.width] = bounds.mass_max / bounds.total_mass
+    return row
+
+
+def _ellipsoids(feasible: FeasibleSet) -> list[Cone]:
+    """Return matrices that are definite for centres of mass in their ellipsoids."""
+    bounds = feasible.bounds
+    cones = []
+    for body in np.flatnonzero(bounds.has_ellipsoid):
+        axes = bounds.ellipsoid_axes[body] / bounds.radius[body]
+        centre = bounds.ellipsoid_centre[body] / bounds.radius[body]
+        # A Schur complement: the mass on the diagonal, the first moments beside it.
+        basis = np.zeros((4, 4, 4))
+        basis[0] = np.diag([*axes**2, 1.0])
+        basis[0, :3, 3] = -centre
+        basis[0, 3, :3] = -centre
+        basis[1:, :3, 3] = np.eye(3)
+        basis[1:, 3, :3] = np.eye(3)
+        places = body * feasible.width + np.arange(4)
+        cones.append(Cone(places, basis, np.zeros((4, 4))))
+    return cones
+
+
+def _drive_matrices(feasible: FeasibleSet, drive_scales: Values) -> list[Cone]:
+    """Return the matrices of coupled drives, whose diagonals are scaled to one."""
+    xp = namespace(drive_scales)
+    start = len(feasible.bodies) * feasible.width
+    cones = []
+    for coupling in feasible.couplings:
+        places = feasible.drive_places(coupling.columns)
+        diagonal = drive_scales[feasible.drive_places(coupling.diagonal)]
+        size = 1.0 / xp.sqrt(diagonal)
+        units = drive_scales[places][:, None, None]
+        basis = units * coupling.basis * size[None, :, None] * size[None, None, :]
+        missing = 4 - len(coupling.diagonal)
+        basis = xp.pad(basis, ((0, 0), (0, missing), (0, missing)))
+        filling = np.diag(np.arange(4) >= 4 - missing).astype(float)
+        cones.append(Cone(start + places, basis, filling))
+    return cones
+
+
+def _start(feasible: FeasibleSet, A: Values, b: Values, prior) -> Values:
+    """Return balls at inner centres of mass, as heavy as fits the forces, and some friction.
+
+    Where a prior's bodies satisfy all bounds the start lies close to them.
+    """
+    xp = namespace(A)
+    bounds = feasible.bounds
+    floors = inertial_parameters(feasible.floors)[:, : feasible.width]
+    floors = floors / feasible.body_scales
+    balls = _unit_balls(bounds)[:, : feasible.width]
+    min_masses = np.maximum(bounds.mass_min / bounds.mass_max, floors[:, 0])
+    drives = np.full(len(feasible.drives), START_DRIVE)
+    if bounds.total_mass is None:
+        forces = A @ xp.asarray(np.concatenate([balls.ravel(), 0.0 * drives]))
+        fraction = (forces @ b) / xp.maximum(forces @ forces, 1e-300)
+        fraction = xp.clip(fraction, 0.02, 0.5)
+    else:
+        share = bounds.total_mass / bounds.mass_max.sum()
+        min_share = np.average(min_masses, weights=bounds.mass_max)
+        fraction = (share - min_share) / (1.0 - min_share)
+    masses = xp.asarray(min_masses) + fraction * xp.asarray(1.0 - min_masses)
+    bodies = floors + (masses - floors[:, 0])[:, None] * balls
+    if prior is not None and bounds.total_mass is None:
+        bodies = _move_to_prior(feasible, bodies, prior)
+
+    for coupling in feasible.couplings:
+        beside = tuple(k for k in coupling.columns if k not in coupling.diagonal)
+        drives[feasible.drive_places(beside)] *= START_COUPLING
+    return xp.concatenate([xp.ravel(bodies), xp.asarray(drives)])
+
+
+def _unit_balls(bounds: BodyBounds) -> np.ndarray:
+    """Return the parameters of balls of mass one within unit spheres, one for each body."""
+    centre = bounds.inner_centres / bounds.radius[:, None]
+    # Half of the second moment that the sphere leaves; that of a ball is 3/5 m r².
+    variance = 0.5 * (1.0 - np.sum(centre**2, axis=1))
+    radius = np.sqrt(variance * 5.0 / 3.0)
+    return inertial_parameters(ball(np.ones(len(centre)), centre, radius))
+
+
+def _move_to_prior(feasible: FeasibleSet, bodies: Values, prior: np.ndarray) -> Values:
+    """Move bodies towards those of a prior where these satisfy all bounds."""
+    parameters = inertial_parameters(prior)[:, : feasible.width] / feasible.body_scales
+    _, rows, offsets = feasible.linear_bounds()
+    slacks = np.einsum("kri,ki->kr", rows, parameters) + offsets
+    is_inside = (slacks >= 0).all(axis=1)
+    is_inside &= np.linalg.eigvalsh(prior - feasible.floors)[:, 0] >= 0
+    is_inside &= ~feasible.bounds.has_ellipsoid
+    share = np.where(is_inside, PRIOR_SHARE, 0.0)[:, None]
+    return (1.0 - share) * bodies + share * parameters

@@ -1,0 +1,162 @@
+"""Physically consistent parameters of many data sets, compiled by JAX."""
+
+import functools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxid.arrays import (
+    AnyArray,
+    Array,
+    Bool,
+    Float,
+    Hashable,
+    Int,
+    content,
+    in_parts,
+    require_float64,
+)
+from jaxid.dynamics.base import BaseParameters
+from jaxid.errors import InputError
+
+from . import solver
+from .estimator import PhysicallyConsistent
+
+CPU_PART = 16
+"""Data sets of one compiled call on a processor: each core gets calls of its own."""
+ACCELERATOR_BATCH = 256
+"""Data sets that an accelerator solves in step."""
+
+
+class ConsistentBatch(eqx.Module):
+    """Physically consistent parameters of one or many data sets.
+
+    Attributes:
+        standard: Standard parameters: complete bodies, friction, rotors.
+        parameters: Base parameters.
+        residual_increases: Relative increases of the norms of the residuals by the
+            bounds.
+        error_bounds: Bounds of the objectives' relative distances to their optima.
+        certified: Whether the bounds are within the tolerance.
+        iterations: Numbers of iterations.
+    """
+
+    standard: Float[AnyArray, "*datasets standard"]
+    parameters: Float[AnyArray, "*datasets base"]
+    residual_increases: Float[AnyArray, "*datasets"]
+    error_bounds: Float[AnyArray, "*datasets"]
+    certified: Bool[AnyArray, "*datasets"]
+    iterations: Int[AnyArray, "*datasets"]
+
+
+class ConsistentSolver(Hashable):
+    """Physically consistent estimates of one model: a function of arrays for `jit` and `vmap`.
+
+    The factors are those of `Factors.weighted`: their rows are weighted already, so the
+    weights of the estimator do not count. Equal solvers share their compiled functions.
+    The solver is a loop whose length depends on the data: there are no reverse-mode
+    gradients.
+
+    Attributes:
+        base: Base parameters of the factors' columns.
+        estimator: Bounds, margin and prior; by default wide bounds.
+    """
+
+    base: BaseParameters
+    estimator: PhysicallyConsistent = PhysicallyConsistent()
+
+    __hash__ = Hashable.__hash__
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, ConsistentSolver) and content(self) == content(other)
+
+    def __call__(
+        self,
+        R: Float[AnyArray, "height base"],
+        z: Float[AnyArray, " height"],
+        rows: Int[AnyArray, ""] | int,
+    ) -> ConsistentBatch:
+        """Return the estimate of one data set.
+
+        Args:
+            R: Upper triangle of the weighted rows.
+            z: Weighted forces, of the same decomposition.
+            rows: Number of rows behind the factor.
+
+        Raises:
+            InputError: If the bounds do not fit the model.
+        """
+        require_float64("a physically consistent estimate")
+        R = jnp.asarray(R)
+        z = jnp.asarray(z)
+        feasible = self.estimator.feasible_set(self.base)
+        data, program = self.estimator.program(self.base, feasible, R, z, rows)
+        optimum = solver.solve_compiled(program)
+        p = feasible.standard_parameters(data, optimum.y)
+        residuals = data.b - data.A @ p
+        free_residuals = data.b[self.base.size :]
+        free_square = jnp.maximum(free_residuals @ free_residuals, 1e-300)
+        return ConsistentBatch(
+            standard=p,
+            parameters=self.base.from_standard(p),
+            residual_increases=jnp.sqrt(residuals @ residuals / free_square) - 1.0,
+            error_bounds=optimum.error / jnp.maximum(optimum.value, program.scale),
+            certified=jnp.asarray(optimum.certified),
+            iterations=jnp.asarray(optimum.iterations),
+        )
+
+
+def consistent_batch(
+    base: BaseParameters,
+    R: Float[AnyArray, "datasets height base"],
+    z: Float[AnyArray, "datasets height"],
+    rows: Int[AnyArray, " datasets"],
+    estimator: PhysicallyConsistent | None = None,
+) -> ConsistentBatch:
+    """Estimate physically consistent parameters from the triangular factors of many data sets.
+
+    It is `ConsistentSolver`, compiled once for each model, estimator and shape, and
+    spread over the cores of the processor.
+
+    Args:
+        base: Base parameters of the factors' columns.
+        R: Upper triangles of the weighted rows.
+        z: Weighted forces, of the same decompositions.
+        rows: Numbers of rows behind the factors.
+        estimator: Bounds, margin and prior; wide bounds if None.
+
+    Raises:
+        InputError: If shapes do not fit, or bounds leave no body.
+        RuntimeError: If JAX's 64-bit mode is off.
+    """
+    count = len(R)
+    has_factors = count > 0 and R.shape[-1] == base.size and z.shape == R.shape[:-1]
+    if not has_factors or rows.shape != (count,):
+        raise InputError(
+            "`R`, `z` and `rows` must have the shapes [datasets, height, "
+            f"{base.size}], [datasets, height] and [datasets], but have {R.shape}, "
+            f"{z.shape} and {rows.shape}."
+        )
+    estimator = estimator or PhysicallyConsistent()
+    arrays = (np.asarray(R), np.asarray(z), np.asarray(rows))
+    feasible = estimator.feasible_set(base)
+    _, program = estimator.program(base, feasible, *(x[0] for x in arrays))
+    program.require_interior()
+    one = ConsistentSolver(base, estimator)
+    size = CPU_PART if jax.default_backend() == "cpu" else count
+    return in_parts(lambda part: _solve_many(one, *part), arrays, size)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _solve_many(
+    one: ConsistentSolver, R: Array, z: Array, rows: Array
+) -> ConsistentBatch:
+    def solve(batch_size: int | None, *data: Array) -> ConsistentBatch:
+        return jax.lax.map(lambda x: one(*x), data, batch_size=batch_size)
+
+    # A core gains nothing from solving data sets in step: it waits for the slowest.
+    one_by_one = functools.partial(solve, None)
+    in_step = functools.partial(solve, ACCELERATOR_BATCH)
+    return jax.lax.platform_dependent(R, z, rows, cpu=one_by_one, default=in_step)

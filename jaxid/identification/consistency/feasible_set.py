@@ -1,0 +1,213 @@
+"""Feasible parameters: bodies that can exist, friction that brakes, rotors with inertia."""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from scipy.sparse.csgraph import connected_components
+
+from jaxid.arrays import namespace
+from jaxid.dynamics.model import Model
+from jaxid.errors import InputError
+from jaxid.robot.inertia import AXES
+
+from .bounds_and_priors import BodyBounds
+from .pseudo_inertia import Values, ball
+from .scaled_rows import ScaledRows
+
+MAX_COUPLED_AXES = 4
+"""Axes that drives may couple: all semidefinite matrices of a program have size four."""
+MEDIUM_MASS = 0.05
+"""Mass of a body of medium size, within the range of its bounds."""
+MAX_DRIVE_RATIO = 10.0
+"""Bound of a drive's parameter, relative to the one that alone explains all forces."""
+
+
+class Coupling(NamedTuple):
+    """Parameters of coupled drives that form one positive semidefinite matrix."""
+
+    columns: tuple[int, ...]
+    basis: np.ndarray  # matrices of unit parameters [columns, axes, axes]
+    diagonal: tuple[int, ...]  # parameter on the matrix's diagonal, for each axis
+
+
+class LinearBounds(NamedTuple):
+    """Linear bounds of the bodies, in scaled variables.
+
+    A bound holds where its row times a body's variables plus its offset is positive.
+    """
+
+    names: list[str]
+    rows: np.ndarray  # [bodies, bounds, width]
+    offsets: np.ndarray  # [bodies, bounds]
+
+
+class FeasibleSet(NamedTuple):
+    """Feasible parameters: consistent bodies, dissipative friction, nonnegative rotor inertias."""
+
+    bodies: tuple[tuple[int, ...], ...]  # columns of each body's parameters
+    drives: tuple[int, ...]  # columns that are nonnegative
+    unbounded: tuple[int, ...]  # columns without bounds
+    bounds: BodyBounds
+    floors: np.ndarray  # pseudo-inertias that those of the bodies exceed
+    couplings: tuple[Coupling, ...]
+
+    @property
+    def width(self) -> int:
+        """Number of parameters of each body."""
+        return len(self.bodies[0])
+
+    @property
+    def body_scales(self) -> np.ndarray:
+        """Largest mass of each body, and its products with the radius and the squared radius."""
+        mass = self.bounds.mass_max[:, None]
+        radius = self.bounds.radius[:, None]
+        powers = np.array([0, 1, 1, 1, 2, 2, 2, 2, 2, 2])[: self.width]
+        return mass * radius**powers
+
+    @property
+    def order(self) -> list[int]:
+        """Columns in the order of the scaled variables."""
+        return [*sum(self.bodies, ()), *self.drives]
+
+    def drive_places(self, columns: tuple[int, ...]) -> np.ndarray:
+        """Return the positions of some columns among those of the drives."""
+        return np.array([self.drives.index(k) for k in columns], int)
+
+    def scales(self, data: ScaledRows) -> Values:
+        """Return the units of the scaled variables: zero for drives without effect."""
+        xp = namespace(data.A)
+        norms = xp.linalg.norm(data.A[:, np.array(self.drives, int)], axis=0)
+        has_effect = norms > 1e-9 * xp.max(norms, initial=0.0)
+        safe_norms = xp.where(has_effect, norms, 1.0)
+        max_values = MAX_DRIVE_RATIO * xp.linalg.norm(data.b) / safe_norms
+        max_values = xp.where(has_effect, max_values, 0.0)
+        for coupling in self.couplings:
+            # A matrix with a zero on its diagonal is never definite: take the others'
+            # bound there.
+            places = self.drive_places(coupling.columns)
+            is_coupled = np.isin(np.arange(len(self.drives)), places)
+            substitute = xp.maximum(xp.max(max_values[places]), 1e-12)
+            is_zero = is_coupled & (max_values <= 0.0)
+            max_values = xp.where(is_zero, substitute, max_values)
+        return xp.concatenate([self.body_scales.ravel(), max_values])
+
+    def standard_parameters(self, data: ScaledRows, y: Values) -> Values:
+        """Return the standard parameters of scaled variables; columns without bounds are solved."""
+        p = y * self.scales(data)
+        if self.unbounded:
+            columns, inverse = self.unbounded_columns(data)
+            rest = data.b - data.A[:, np.array(self.order)] @ p
+            solution = inverse @ (columns.T @ rest)
+            p = namespace(data.A).concatenate([p, solution])
+        return p[np.argsort([*self.order, *self.unbounded])]
+
+    def unbounded_columns(self, data: ScaledRows) -> tuple[Values, Values]:
+        """Return the columns without bounds, and the inverse of their Gram matrix."""
+        xp = namespace(data.A)
+        columns = data.A[:, np.array(self.unbounded, int)]
+        norms = xp.linalg.norm(columns, axis=0)
+        scale = 1.0 / xp.where(norms > 0, norms, 1.0)
+        gram = (scale[:, None] * (columns.T @ columns)) * scale[None]
+        inverse = xp.linalg.inv(gram + 1e-13 * np.eye(len(self.unbounded)))
+        return columns, scale[:, None] * inverse * scale[None]
+
+    def linear_bounds(self) -> LinearBounds:
+        """Return the linear bounds of the bodies, in scaled variables."""
+        bounds = self.bounds
+        count = len(self.bodies)
+        unit = np.eye(self.width)
+        mass = np.tile(unit[0], (count, 1))
+        # Half the trace of the inertia is the second moment about the origin.
+        second_moment = 0.5 * np.sum(unit[4:7], axis=0)
+        names = ["largest mass", "sphere"]
+        rows = [-mass, mass - second_moment]
+        offsets = [np.ones(count), np.zeros(count)]
+        if np.any(bounds.mass_min):
+            names.append("smallest mass")
+            rows.append(mass)
+            offsets.append(-bounds.mass_min / bounds.mass_max)
+        sides = (("lower", 1.0, bounds.centre_min), ("upper", -1.0, bounds.centre_max))
+        for side, sign, corners in sides:
+            for axis in range(3):
+                is_bounded = np.isfinite(corners[:, axis])
+                if not is_bounded.any():
+                    continue
+                corner = np.where(is_bounded, corners[:, axis], 0.0) / bounds.radius
+                row = sign * (unit[1 + axis] - corner[:, None] * mass)
+                names.append(f"{side} {AXES[axis]} of the centre of mass")
+                rows.append(np.where(is_bounded[:, None], row, 0.0))
+                offsets.append(np.where(is_bounded, 0.0, 1.0))
+        return LinearBounds(names, np.stack(rows, axis=1), np.stack(offsets, axis=1))
+
+
+def feasible_set(model: Model, bounds: BodyBounds, margin: float = 0.0) -> FeasibleSet:
+    """Return the feasible parameters of a model; bodies contain a fraction of nominal balls."""
+    robot = model.robot
+    widths = [term.body_parameters for term in model.terms]
+    if not any(widths):
+        raise InputError(
+            "the model has no bodies to make consistent: add `RigidBodies()`."
+        )
+    if len(bounds.radius) != robot.joints:
+        raise InputError(
+            f"`bounds` must be those of the {robot.joints} bodies of the robot."
+        )
+    number = next(k for k, width in enumerate(widths) if width)
+    sizes = [len(term.parameters(robot)) for term in model.terms]
+    start = sum(sizes[:number])
+    columns = np.arange(start, start + sizes[number]).reshape(robot.joints, -1)
+
+    others = np.setdiff1d(np.arange(model.size), columns)
+    lower = np.concatenate([term.lower_bounds(robot) for term in model.terms])
+    is_drive = lower[others] == 0.0
+    return FeasibleSet(
+        bodies=tuple(tuple(row) for row in columns.tolist()),
+        drives=tuple(others[is_drive].tolist()),
+        unbounded=tuple(others[~is_drive].tolist()),
+        bounds=bounds,
+        floors=margin * nominal_bodies(bounds),
+        couplings=tuple(_couplings(model)),
+    )
+
+
+def nominal_bodies(bounds: BodyBounds) -> np.ndarray:
+    """Return the pseudo-inertias of balls of medium size within the bounds."""
+    low = bounds.mass_min
+    high = bounds.mass_max
+    mass = np.clip(MEDIUM_MASS * high, low + MEDIUM_MASS * (high - low), high)
+    centre = bounds.inner_centres
+    distance = np.sum((centre / bounds.radius[:, None]) ** 2, axis=1)
+    return ball(mass, centre, 0.5 * bounds.radius * np.sqrt(1.0 - distance))
+
+
+def _couplings(model: Model) -> Iterator[Coupling]:
+    """Yield the matrices of inertias, and of viscous friction, of drives that couple axes."""
+    robot = model.robot
+    matrices = [term.drive_matrices(robot) for term in model.terms]
+    inertia, friction = np.concatenate(matrices, axis=-1)
+    for kind, matrix in (("RotorInertia", inertia), ("ViscousFriction", friction)):
+        count, labels = connected_components((matrix != 0).any(axis=-1), directed=False)
+        for label in range(count):
+            axes = np.flatnonzero(labels == label)
+            if len(axes) > MAX_COUPLED_AXES:
+                raise InputError(
+                    f"drives may couple 4 axes, but `{robot.name}` has more."
+                )
+            if len(axes) > 1:
+                yield _coupling(kind, matrix[np.ix_(axes, axes)])
+
+
+def _coupling(kind: str, matrix: np.ndarray) -> Coupling:
+    """Return the coupling of some axes from their matrix [axes, axes, parameters]."""
+    columns = np.flatnonzero(matrix.any(axis=(0, 1)))
+    diagonal = []
+    for axis in range(len(matrix)):
+        own_columns = np.flatnonzero(matrix[axis, axis])
+        if not len(own_columns):
+            raise InputError(
+                f"coupled drives need the drives' own columns: add `{kind}()`."
+            )
+        diagonal.append(int(own_columns[0]))
+    basis = np.moveaxis(matrix[:, :, columns], -1, 0)
+    return Coupling(tuple(columns.tolist()), basis, tuple(diagonal))

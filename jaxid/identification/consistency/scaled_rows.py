@@ -1,0 +1,39 @@
+"""Rows of all standard parameters, in units of the noise."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxid.arrays import namespace
+from jaxid.dynamics.base import BaseParameters
+
+from .pseudo_inertia import Values
+
+MIN_NOISE = 1e-3
+"""Noise below this fraction of the forces is not credible."""
+
+
+class ScaledRows(NamedTuple):
+    r"""Rows $|A p - b|^2$ of all standard parameters, in units of the noise.
+
+    `scale` is half the number of rows: about half the squared residuals at the optimum.
+    """
+
+    A: Values
+    b: Values
+    scale: Values
+
+
+def scaled_rows(base: BaseParameters, R: Values, z: Values, rows: Values) -> ScaledRows:
+    """Divide the weighted triangle of so many rows by the standard deviation of its residuals."""
+    xp = namespace(R)
+    rest = z[base.size :]
+    dof = xp.maximum(xp.asarray(rows - base.size, float), 1.0)
+    min_variance = MIN_NOISE**2 * (z @ z) / (dof + base.size)
+    variance = xp.maximum((rest @ rest) / dof, min_variance)
+    noise = xp.sqrt(xp.where(variance > 0, variance, 1.0))
+    combination = np.zeros((base.size, base.model.size))
+    combination[range(base.size), base.indices] = 1.0
+    combination[:, list(base.dependent)] = np.asarray(base.kappa)
+    A = (R @ combination) / noise
+    return ScaledRows(A, z / noise, 0.5 * xp.asarray(rows, float))
