@@ -170,15 +170,14 @@ class ShapeSearch(eqx.Module):
             block_mask: One for each block of time that counts, zero for others; by
                 default all count.
         """
-        # Fits without nonlinear friction do not wait for it.
-        import optimistix as optx
+        # Fits without nonlinear friction do not wait for optimistix.
+        from jaxid.least_squares import minimise_squares
 
         start = jnp.asarray(self.start)
         rows = self.row_weights(weights, block_mask)
         row_count = jnp.sum(jnp.where(rows > 0, 1.0, 0.0))
         dof = jnp.maximum(row_count - float(self.fixed.shape[-1]), 1.0)
         information = self.fixed_information(rows)
-        solver = optx.LevenbergMarquardt(rtol=1e-4, atol=1e-3)
 
         def weighted_residuals(logarithms: Array) -> Array:
             shapes = start * jnp.exp(logarithms)
@@ -192,15 +191,10 @@ class ShapeSearch(eqx.Module):
         def search(logarithms: Array, _) -> tuple[Array, Array]:
             squares = jnp.sum(weighted_residuals(logarithms) ** 2)
             noise = jnp.maximum(jnp.sqrt(squares / dof), 1e-150)
-            solution = optx.least_squares(
-                pulled_residuals,
-                solver,
-                logarithms,
-                args=noise,
-                max_steps=MAX_STEPS,
-                throw=False,
+            minimum = minimise_squares(
+                pulled_residuals, logarithms, args=noise, rtol=1e-6, max_steps=MAX_STEPS
             )
-            return solution.value, solution.result == optx.RESULTS.successful
+            return minimum.x, minimum.converged
 
         def search_twice(first_shapes: Array) -> tuple[Array, Array, Array]:
             # The strength of the pull depends on the noise, which is known at the end
