@@ -113,7 +113,8 @@ def estimate_delay(
     joints = len(w)
     sample_time = recordings[0].sample_time
     no_delay = np.eye(base.size + joints)[:, : base.size]
-    common_delay = linalg.block_diag(np.eye(base.size), np.ones((joints, 1)))
+    together = linalg.block_diag(np.eye(base.size), np.ones((joints, 1)))
+    common_delay = np.asarray(together)
 
     start = _equations(base, recordings, recordings, w, np.zeros(base.size))
     p = start.combine(no_delay).solve()
@@ -167,9 +168,9 @@ class _Equations(NamedTuple):
     squares: np.ndarray  # regressor times regressor
     rates: np.ndarray  # rates of the regressor times rates of the regressor
 
-    def combine(self, columns: np.ndarray) -> "_Equations":
+    def combine(self, columns: AnyArray) -> "_Equations":
         """Return the equations for parameters of which the present ones are combinations."""
-        with_forces = linalg.block_diag(columns, 1.0)
+        with_forces = np.asarray(linalg.block_diag(columns, 1.0))
         return _Equations(
             products=columns.T @ self.products @ with_forces,
             squares=with_forces.T @ self.squares @ with_forces,
@@ -195,22 +196,25 @@ class _Equations(NamedTuple):
     def feedback(self, parameters: np.ndarray) -> float:
         """Return the largest effect of fed-back disturbances on the last parameter."""
         residual = np.append(parameters, -1.0)
-        disturbance = np.sqrt(max(residual @ self.squares @ residual, 0.0))
-        rate = np.sqrt(max(residual @ self.rates @ residual, 0.0))
-        gram = self.squares[:-1, :-1]
-        others = np.linalg.lstsq(gram[:-1, :-1], gram[:-1, -1], rcond=1e-14)[0]
-        remainder = float(gram[-1, -1] - gram[:-1, -1] @ others)
+        square = max(residual @ self.squares @ residual, 0.0)
+        rate_square = max(residual @ self.rates @ residual, 0.0)
+        # What the other parameters leave of the rate, whose column is the last but one.
+        gram = self.squares[:-2, :-2]
+        products = self.squares[:-2, -2]
+        others = np.linalg.lstsq(gram, products, rcond=1e-14)[0]
+        remainder = float(self.squares[-2, -2] - products @ others)
         if remainder <= 0:
             return np.inf
-        return float(MAX_SENSITIVITY * disturbance * rate / remainder)
+        disturbances = np.sqrt(square) * np.sqrt(rate_square)
+        return float(MAX_SENSITIVITY * disturbances / remainder)
 
 
 def _equations(
     base: BaseParameters,
     recordings: Sequence[Observations],
     instruments: Sequence[Observations],
-    w: np.ndarray,
-    p: np.ndarray,
+    w,
+    p,
 ) -> _Equations:
     """Return the normal equations of the parameters and of a delay of each joint."""
     size = base.size + len(w) + 1
@@ -242,19 +246,23 @@ def _equations(
 
 
 def _rows(
-    base: BaseParameters, o: Observations, chunk: Chunk, w: np.ndarray, p: np.ndarray
+    base: BaseParameters, o: Observations, chunk: Chunk, w, p
 ) -> Float[np.ndarray, "rows joints columns"]:
     """Return weighted rows: base parameters, delay of each joint, forces."""
     motion, forces = o.read(slice(*chunk.samples))
-    rates = np.gradient(base.forces_in_numpy(p, motion), o.sample_time, axis=0)
+    predictions = base.forces_in_numpy(p, motion)
+    rates = np.gradient(predictions, o.sample_time, axis=0)
+    samples = len(rates)
     joints = len(w)
-    columns = np.zeros((*rates.shape, base.size + joints + 1))
+    width = base.size + joints + 1
+    columns = np.zeros((samples, joints, width))
     for joint, values in enumerate(base.regressor_rows(motion)):
-        columns[:, joint, list(base.acting_columns[joint])] = values
+        parameters = list(base.acting_columns[joint])
+        columns[:, joint, parameters] = values
         columns[:, joint, base.size + joint] = -rates[:, joint]
     columns[..., -1] = np.asarray(forces) - base.tool_forces(motion)
-    rows = chunk.reduce(columns.reshape(len(rates), -1))
-    return w[:, None] * rows.reshape(-1, joints, columns.shape[-1])
+    rows = chunk.reduce(columns.reshape(samples, -1))
+    return w[:, None] * rows.reshape(-1, joints, width)
 
 
 def without_delay(observations: Observations, seconds: float) -> Observations:

@@ -100,9 +100,9 @@ def identify_drive_gains(
             parts.append(_rows(factors, fit.weights, parameter_map, offset))
     rows = Rows(*map(np.concatenate, zip(*parts, strict=True)))
     solution = optimize.least_squares(
-        lambda unknowns: rows.linearise(unknowns)[0],
+        lambda u: rows.linearise(u)[0],
         np.append(start_parameters, np.ones(robot.joints)),
-        lambda unknowns: rows.linearise(unknowns)[1],
+        lambda u: rows.linearise(u)[1],  # pyright: ignore[reportArgumentType]
         method="lm",
         x_scale="jac",
         xtol=TOLERANCE,
@@ -144,7 +144,7 @@ def _require_gains(robot: Robot) -> None:
         )
 
 
-def _require_determined(decomposition: Decomposition, reciprocals: np.ndarray) -> None:
+def _require_determined(decomposition: Decomposition, reciprocals) -> None:
     """Check that the runs determine all gains, and that these are plausible."""
     values = decomposition.values
     is_determined = values[-1] > NUMERICAL * values[0]
@@ -207,6 +207,8 @@ def _parameter_maps(
         return maps, [nothing, body_columns(base, load.body) @ load.parameters]
     # The other nine parameters of the load are unknowns, too.
     columns = body_columns(base, base.model.robot.tip_body)
+    of_mass = columns[:, 0]
     others = columns[:, 1:]
-    maps = [np.hstack([maps[0], 0.0 * others]), np.hstack([maps[1], others])]
-    return maps, [nothing, load * columns[:, 0]]
+    without_load = np.hstack([maps[0], 0.0 * others])
+    with_load = np.hstack([maps[1], others])
+    return [without_load, with_load], [nothing, load * of_mass]

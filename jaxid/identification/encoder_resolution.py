@@ -30,7 +30,7 @@ def encoder_steps(recording: Recording) -> Float[np.ndarray, " joints"]:
     return np.array([_step(column) for column in changes.T])
 
 
-def _step(changes: np.ndarray) -> float:
+def _step(changes) -> float:
     """Return the common divisor of some changes; zero if there is none."""
     # Adding and subtracting in binary leaves tiny numbers that are no change.
     rounding = 1e-12 * max(changes.max(initial=0.0), 1e-300)
@@ -67,7 +67,7 @@ def resolution_bias(
     rounded_angles = np.where(steps > 0, np.round(angles / grid) * grid, angles)
     estimator = WeightedLeastSquares(GivenWeights(np.asarray(fit.weights)))
 
-    def estimate(angles: np.ndarray) -> np.ndarray:
+    def estimate(angles):
         log = dataclasses.replace(
             recording,
             angles=angles,

@@ -174,7 +174,7 @@ def _held_out_errors(
     problem: RegressionProblem,
     test: RegressionProblem,
     estimator: AbstractEstimator,
-    joint_weights: np.ndarray,
+    joint_weights,
 ) -> np.ndarray:
     """Return the error on each part of time, relative to the forces of all parts.
 
@@ -201,6 +201,8 @@ def _neighbour_correlation(
     products = np.zeros(problem.robot.joints)
     for chunk, residuals in problem.residuals(parameters):
         residuals = np.where(chunk.mask, residuals, 0.0)
+        neighbours = residuals[1:] * residuals[:-1]
         squares += np.sum(residuals**2, axis=0)
-        products += np.sum(residuals[1:] * residuals[:-1], axis=0)
-    return float(np.mean(products / np.where(squares > 0, squares, 1.0)))
+        products += np.sum(neighbours, axis=0)
+    correlations = products / np.where(squares > 0, squares, 1.0)
+    return float(np.mean(correlations))

@@ -173,7 +173,7 @@ def _parts(
 
 
 def _held_out_squares(
-    candidate: ModelCandidate, parts: Sequence[Factors], joint_weights: np.ndarray
+    candidate: ModelCandidate, parts: Sequence[Factors], joint_weights
 ) -> Float[np.ndarray, "parts parts"]:
     """Return the squared errors on the second part of fits without both.
 
@@ -190,7 +190,7 @@ def _held_out_squares(
     return squares
 
 
-def _promise(table: np.ndarray, candidates: Sequence[ModelCandidate]) -> float:
+def _promise(table, candidates: Sequence[ModelCandidate]) -> float:
     """Return the error on parts of the candidates that the other parts choose.
 
     The table has the squared errors on the second part of fits without both

@@ -112,16 +112,17 @@ class StatesFit(Summarised, eqx.Module):
         p-value says that some of them have changed after all.
         """
         variances = np.array([np.diag(fit.covariance) for fit in self.fits])
-        is_determined = np.isfinite(variances).all(axis=0)
+        is_determined = np.all(np.isfinite(variances), axis=0)
         k = [index for index in self.shared if is_determined[index]]
-        first, *others = self.fits
-        differences = [fit.parameters[k] - first.parameters[k] for fit in others]
-        covariances = [fit.covariance[np.ix_(k, k)] for fit in self.fits]
+        parameters = np.array([fit.parameters[k] for fit in self.fits])
+        differences = parameters[1:] - parameters[0]
+        first, *others = [fit.covariance[np.ix_(k, k)] for fit in self.fits]
         # The errors of the first state are in all differences.
-        common = np.tile(covariances[0], (len(others), len(others)))
-        covariance = linalg.block_diag(*covariances[1:]) + common
-        dof = np.min([fit.uncertainty.dof[k] for fit in self.fits], initial=np.inf)
-        return joint_test(np.concatenate(differences), covariance, float(dof))
+        common = np.tile(first, (len(others), len(others)))
+        covariance = linalg.block_diag(*others) + common
+        dof = [fit.uncertainty.dof[k] for fit in self.fits]
+        min_dof = float(np.min(dof, initial=np.inf))
+        return joint_test(differences.ravel(), covariance, min_dof)
 
     def _indices(self, state: str) -> Int[np.ndarray, " base"]:
         if state not in self.states:
@@ -212,7 +213,8 @@ def stores_energy(base: BaseParameters) -> Bool[np.ndarray, " base"]:
     zeros = np.zeros_like(q)
     moving = in_numpy(base, base.columns, q, zeros, qdd)
     resting = in_numpy(base, base.columns, q, zeros, zeros)
-    has_inertia = np.abs(moving - resting).max(axis=(0, 1)) > 0
+    inertial_forces = np.abs(moving - resting)
+    has_inertia = inertial_forces.max(axis=(0, 1)) > 0
 
     unit_vectors = np.eye(model.size)[list(base.indices)]
     energies = [in_numpy(model, model.potential, q, shared=(p,)) for p in unit_vectors]

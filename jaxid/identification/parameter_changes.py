@@ -245,7 +245,7 @@ def compare(first: Fit, second: Fit, level: float = LEVEL) -> Comparison:
 
 
 def compare_some(
-    first: Fit, second: Fit, indices: Sequence[int], cross: np.ndarray, level: float
+    first: Fit, second: Fit, indices: Sequence[int], cross: AnyArray, level: float
 ) -> Comparison:
     """Compare some base parameters of two fits, whose estimates have a cross-covariance."""
     if not 0 < level < 1:
@@ -274,9 +274,7 @@ def compare_some(
     )
 
 
-def _dof_of_sum(
-    a: np.ndarray, b: np.ndarray, dof_a: np.ndarray, dof_b: np.ndarray
-) -> np.ndarray:
+def _dof_of_sum(a, b, dof_a, dof_b) -> np.ndarray:
     """Return the degrees of freedom of sums of two variances (Welch, Satterthwaite)."""
     dof = (a + b) ** 2 / (a**2 / dof_a + b**2 / dof_b)
     return np.where(np.isnan(dof), np.inf, dof)
@@ -300,7 +298,7 @@ def _holm(p: Float[np.ndarray, " tests"]) -> Float[np.ndarray, " tests"]:
 
 
 def joint_test(
-    difference: np.ndarray, covariance: np.ndarray, dof: float
+    difference: AnyArray, covariance: AnyArray, dof: float
 ) -> tuple[float, float]:
     r"""Test by $d^T C^{-1} d$ if differences are more than chance: statistic and p-value.
 

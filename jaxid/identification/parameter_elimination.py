@@ -123,13 +123,14 @@ def essential_parameters(
 
 def _elimination_order(fit: Fit, factors: Factors) -> list[int]:
     """Return the base parameters in the order in which they are eliminated."""
-    R, z = factors.weighted(fit.weights)
+    weights = np.asarray(fit.weights)
+    R, z = factors.weighted(weights)
     remaining = list(range(fit.base.size))
     inflation = None
     order = []
     while remaining:
         p, inverse = _solve(R, z, remaining)
-        covariance = naive_covariance(factors, fit.weights, p, inverse)
+        covariance = naive_covariance(factors, weights, p, inverse)
         naive_deviations = np.sqrt(np.diag(covariance))
         if inflation is None:
             inflation = _inflation(fit.standard_deviations, naive_deviations)
@@ -139,7 +140,7 @@ def _elimination_order(fit: Fit, factors: Factors) -> list[int]:
     return order
 
 
-def _inflation(deviations: np.ndarray, naive_deviations: np.ndarray) -> np.ndarray:
+def _inflation(deviations, naive_deviations) -> np.ndarray:
     """Return the ratio of deviations to those of independent rows; infinite if unknown."""
     has_ratio = np.isfinite(deviations) & (naive_deviations > 0)
     inflation = np.full_like(deviations, np.inf)
@@ -163,9 +164,7 @@ def _held_out_errors(
     return np.sqrt(squares / total).tolist()
 
 
-def _solve(
-    R: np.ndarray, z: np.ndarray, parameters: list[int]
-) -> tuple[np.ndarray, np.ndarray]:
+def _solve(R, z, parameters: list[int]) -> tuple[np.ndarray, np.ndarray]:
     """Return least squares in some parameters, the others zero, and the inverse information."""
     decomposition = Decomposition.of(R[:, parameters], z)
     p = np.zeros(R.shape[1])

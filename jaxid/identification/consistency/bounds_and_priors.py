@@ -179,7 +179,7 @@ class BodyBounds(eqx.Module):
         return point
 
 
-def _span(values: np.ndarray) -> str:
+def _span(values) -> str:
     """Return the range of some numbers in words."""
     low = f"{np.min(values):.3g}"
     high = f"{np.max(values):.3g}"

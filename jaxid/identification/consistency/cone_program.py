@@ -119,14 +119,20 @@ class ConeProgram(eqx.Module):
     def adjoint(self, Z: Values, z: Values) -> Values:
         """Apply the transpose of `linear`."""
         xp = self.xp
+        z_bodies, z_lower, z_upper = self.split_linear(z)
+        flat = xp.reshape(Z[: self.bodies], (self.bodies, 16))
+        linear = xp.einsum("kri,kr->ki", self.rows, z_bodies)
+        bodies = flat @ self.basis.T + linear
+        coupled = xp.tensordot(self.couplings, Z[self.bodies :], 3)
+        y = xp.concatenate([xp.ravel(bodies), z_lower - z_upper])
+        return y + coupled @ self.members
+
+    def split_linear(self, z: Values) -> tuple[Values, Values, Values]:
+        """Return numbers of the linear inequalities: of bodies, and of both limits of drives."""
         count = self.bodies * self.rows.shape[-2]
-        z_bodies = xp.reshape(z[:count], (self.bodies, -1))
-        z_lower = z[count : count + self.drives]
-        z_upper = z[count + self.drives :]
-        bodies = xp.reshape(Z[: self.bodies], (self.bodies, 16)) @ self.basis.T
-        bodies = bodies + xp.einsum("kri,kr->ki", self.rows, z_bodies)
-        coupled = xp.tensordot(self.couplings, Z[self.bodies :], 3) @ self.members
-        return xp.concatenate([xp.ravel(bodies), z_lower - z_upper]) + coupled
+        middle = count + self.drives
+        bodies = self.xp.reshape(z[:count], (self.bodies, -1))
+        return bodies, z[count:middle], z[middle:]
 
 
 class Cone(NamedTuple):
@@ -219,7 +225,7 @@ def _ellipsoids(feasible: FeasibleSet) -> list[Cone]:
     return cones
 
 
-def _drive_matrices(feasible: FeasibleSet, drive_scales: Values) -> list[Cone]:
+def _drive_matrices(feasible: FeasibleSet, drive_scales) -> list[Cone]:
     """Return the matrices of coupled drives, whose diagonals are scaled to one."""
     xp = namespace(drive_scales)
     start = len(feasible.bodies) * feasible.width
@@ -228,8 +234,8 @@ def _drive_matrices(feasible: FeasibleSet, drive_scales: Values) -> list[Cone]:
         places = feasible.drive_places(coupling.columns)
         diagonal = drive_scales[feasible.drive_places(coupling.diagonal)]
         size = 1.0 / xp.sqrt(diagonal)
-        units = drive_scales[places][:, None, None]
-        basis = units * coupling.basis * size[None, :, None] * size[None, None, :]
+        products = size[:, None] * size[None]
+        basis = drive_scales[places][:, None, None] * coupling.basis * products[None]
         missing = 4 - len(coupling.diagonal)
         basis = xp.pad(basis, ((0, 0), (0, missing), (0, missing)))
         filling = np.diag(np.arange(4) >= 4 - missing).astype(float)
@@ -237,20 +243,19 @@ def _drive_matrices(feasible: FeasibleSet, drive_scales: Values) -> list[Cone]:
     return cones
 
 
-def _start(feasible: FeasibleSet, A: Values, b: Values, prior) -> Values:
+def _start(feasible: FeasibleSet, A, b, prior) -> Values:
     """Return balls at inner centres of mass, as heavy as fits the forces, and some friction.
 
     Where a prior's bodies satisfy all bounds the start lies close to them.
     """
     xp = namespace(A)
     bounds = feasible.bounds
-    floors = inertial_parameters(feasible.floors)[:, : feasible.width]
-    floors = floors / feasible.body_scales
+    floors = _scale(feasible, feasible.floors)
     balls = _unit_balls(bounds)[:, : feasible.width]
     min_masses = np.maximum(bounds.mass_min / bounds.mass_max, floors[:, 0])
     drives = np.full(len(feasible.drives), START_DRIVE)
     if bounds.total_mass is None:
-        forces = A @ xp.asarray(np.concatenate([balls.ravel(), 0.0 * drives]))
+        forces = A[:, : balls.size] @ xp.asarray(balls.ravel())
         fraction = (forces @ b) / xp.maximum(forces @ forces, 1e-300)
         fraction = xp.clip(fraction, 0.02, 0.5)
     else:
@@ -268,7 +273,7 @@ def _start(feasible: FeasibleSet, A: Values, b: Values, prior) -> Values:
     return xp.concatenate([xp.ravel(bodies), xp.asarray(drives)])
 
 
-def _unit_balls(bounds: BodyBounds) -> np.ndarray:
+def _unit_balls(bounds: BodyBounds) -> AnyArray:
     """Return the parameters of balls of mass one within unit spheres, one for each body."""
     centre = bounds.inner_centres / bounds.radius[:, None]
     # Half of the second moment that the sphere leaves; that of a ball is 3/5 m r².
@@ -277,13 +282,19 @@ def _unit_balls(bounds: BodyBounds) -> np.ndarray:
     return inertial_parameters(ball(np.ones(len(centre)), centre, radius))
 
 
-def _move_to_prior(feasible: FeasibleSet, bodies: Values, prior: np.ndarray) -> Values:
+def _scale(feasible: FeasibleSet, pseudo) -> AnyArray:
+    """Return the scaled variables of some pseudo-inertias [bodies, width]."""
+    parameters = inertial_parameters(pseudo)[:, : feasible.width]
+    return parameters / feasible.body_scales
+
+
+def _move_to_prior(feasible: FeasibleSet, bodies, prior) -> Values:
     """Move bodies towards those of a prior where these satisfy all bounds."""
-    parameters = inertial_parameters(prior)[:, : feasible.width] / feasible.body_scales
+    parameters = _scale(feasible, prior)
     _, rows, offsets = feasible.linear_bounds()
     slacks = np.einsum("kri,ki->kr", rows, parameters) + offsets
-    is_inside = (slacks >= 0).all(axis=1)
-    is_inside &= np.linalg.eigvalsh(prior - feasible.floors)[:, 0] >= 0
+    eigenvalues = np.linalg.eigvalsh(prior - feasible.floors)
+    is_inside = (slacks >= 0).all(axis=1) & (eigenvalues >= 0).all(axis=1)
     is_inside &= ~feasible.bounds.has_ellipsoid
     share = np.where(is_inside, PRIOR_SHARE, 0.0)[:, None]
     return (1.0 - share) * bodies + share * parameters

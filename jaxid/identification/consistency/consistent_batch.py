@@ -9,7 +9,6 @@ import numpy as np
 
 from jaxid.arrays import (
     AnyArray,
-    Array,
     Bool,
     Float,
     Hashable,
@@ -150,10 +149,8 @@ def consistent_batch(
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _solve_many(
-    one: ConsistentSolver, R: Array, z: Array, rows: Array
-) -> ConsistentBatch:
-    def solve(batch_size: int | None, *data: Array) -> ConsistentBatch:
+def _solve_many(one: ConsistentSolver, R, z, rows) -> ConsistentBatch:
+    def solve(batch_size: int | None, *data) -> ConsistentBatch:
         return jax.lax.map(lambda x: one(*x), data, batch_size=batch_size)
 
     # A core gains nothing from solving data sets in step: it waits for the slowest.

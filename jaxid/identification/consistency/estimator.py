@@ -216,11 +216,11 @@ def _active_bounds(
     feasible: FeasibleSet,
     program: ConeProgram,
     optimum: solver.Optimum,
-    bodies: np.ndarray,
+    bodies,
 ) -> tuple[str, ...]:
     """Name the bounds that keep the estimate from a better one."""
 
-    def numbers(is_active: np.ndarray) -> str:
+    def numbers(is_active) -> str:
         return ", ".join(str(body + 1) for body in np.flatnonzero(is_active))
 
     is_tight = solver.prices(program, optimum) > MIN_PRICE

@@ -198,7 +198,7 @@ def _couplings(model: Model) -> Iterator[Coupling]:
                 yield _coupling(kind, matrix[np.ix_(axes, axes)])
 
 
-def _coupling(kind: str, matrix: np.ndarray) -> Coupling:
+def _coupling(kind: str, matrix) -> Coupling:
     """Return the coupling of some axes from their matrix [axes, axes, parameters]."""
     columns = np.flatnonzero(matrix.any(axis=(0, 1)))
     diagonal = []

@@ -27,11 +27,13 @@ class ScaledRows(NamedTuple):
 def scaled_rows(base: BaseParameters, R: Values, z: Values, rows: Values) -> ScaledRows:
     """Divide the weighted triangle of so many rows by the standard deviation of its residuals."""
     xp = namespace(R)
-    rest = z[base.size :]
+    residuals = z[base.size :]
     dof = xp.maximum(xp.asarray(rows - base.size, float), 1.0)
     min_variance = MIN_NOISE**2 * (z @ z) / (dof + base.size)
-    variance = xp.maximum((rest @ rest) / dof, min_variance)
+    variance = (residuals @ residuals) / dof
+    variance = xp.maximum(variance, min_variance)
     noise = xp.sqrt(xp.where(variance > 0, variance, 1.0))
+    # Base parameters as combinations of the standard ones.
     combination = np.zeros((base.size, base.model.size))
     combination[range(base.size), base.indices] = 1.0
     combination[:, list(base.dependent)] = np.asarray(base.kappa)

@@ -19,7 +19,8 @@ Nothing in it is estimated.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from types import ModuleType
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -30,7 +31,7 @@ import scipy.linalg
 from jaxid.arrays import AnyArray, Bool, Float, Int, namespace
 
 from .cone_program import ConeProgram, Number
-from .pseudo_inertia import BASIS, Values, inverse, pivots, symmetric_part
+from .pseudo_inertia import Values, inverse, pivots, symmetric_part
 
 TOLERANCE = 2.5e-7
 """Error bound of a certified optimum, relative to objective and scale together."""
@@ -123,7 +124,7 @@ def _solve(p: ConeProgram, loop: Callable) -> Optimum:
     xp = p.xp
     gram = _gram(p)
 
-    def is_certified(point: Point) -> Values:
+    def is_certified(point: Point):
         return point.error <= TOLERANCE * (p.scale + point.value)
 
     def iterate(search: Search) -> Search:
@@ -161,7 +162,7 @@ def _gram(p: ConeProgram) -> Values:
     return (p.A.T @ p.A) * (1.0 + RIDGE * np.eye(p.A.shape[-1]))
 
 
-def _select(condition: Values, first: NamedTuple, second: NamedTuple):
+def _select(condition, first: Any, second: Any) -> Any:
     """Return one of two tuples of arrays."""
     xp = namespace(condition)
     pairs = zip(first, second, strict=True)
@@ -177,9 +178,10 @@ def _start(p: ConeProgram) -> Point:
     S, s = p.slacks(p.start)
     inverse_S = inverse(S)
     rest = p.A @ p.start - p.b
+    gradient = xp.linalg.norm(rest @ p.A)
     force = xp.linalg.norm(p.adjoint(inverse_S, 1.0 / s))
     max_mu = (0.5 * rest @ rest + RIDGE) / p.complementarity
-    mu = xp.clip(xp.linalg.norm(rest @ p.A) / force, 1e-6 * max_mu, max_mu)
+    mu = xp.clip(gradient / force, 1e-6 * max_mu, max_mu)
     Z = xp.maximum(_targets(p), mu) * inverse_S
     return _point(p, p.start, Z, mu / s)
 
@@ -190,36 +192,40 @@ def prices(p: ConeProgram, optimum: Optimum) -> Float[np.ndarray, " linear"]:
     It is in units of half a squared standard deviation, whatever the units of the
     bounds.
     """
-    S, s = p.slacks(np.asarray(optimum.y))
-    z = np.asarray(optimum.multipliers)
+    S, s = p.slacks(optimum.y)
+    z = optimum.multipliers
     ratio = z / s
-    barriers = _barriers(p, inverse(S), np.asarray(optimum.matrices), ratio)
+    barriers = _barriers(p, inverse(S), optimum.matrices, ratio)
     solve = _newton_solver(p, _gram(p) + barriers)
     unit_vectors = np.eye(p.A.shape[-1])
-    rows = np.stack([p.linear(y)[1] for y in unit_vectors], axis=1)
-    compliance = np.array([row @ solve(row) for row in rows])
+    columns = [p.linear(y)[1] for y in unit_vectors]
+    compliance = np.array([row @ solve(row) for row in np.transpose(columns)])
     # Without the bound's own part of the curvature, and then a step of Newton's method.
-    compliance = compliance / np.maximum(1.0 - ratio * compliance, 1e-12)
-    return 0.5 * z * np.maximum(z * compliance - s, 0.0)
+    curvature = np.maximum(1.0 - ratio * compliance, 1e-12)
+    step = z * compliance / curvature - s
+    return 0.5 * z * np.maximum(step, 0.0)
 
 
-def _point(p: ConeProgram, y: Values, Z: Values, z: Values) -> Point:
+def _point(p: ConeProgram, y, Z, z) -> Point:
     """Compute slacks, the residual of the optimality conditions, and the error bound."""
     xp = p.xp
     S, s = p.slacks(y)
     rest = p.A @ y - p.b
-    pull = xp.concatenate([p.pull * p.prior, xp.zeros_like(p.fillings)])
-    residual = rest @ p.A + p.adjoint(pull, xp.zeros_like(z)) - p.adjoint(Z, z)
+    prior = p.pull * p.prior
+    pull = xp.concatenate([prior, xp.zeros_like(p.fillings)])
+    gradient = rest @ p.A + p.adjoint(pull, xp.zeros_like(z))
+    residual = gradient - p.adjoint(Z, z)
     if p.equal.shape[0]:
         # Differences of feasible variables are orthogonal to the equality constraints.
         normal = xp.linalg.solve(p.equal @ p.equal.T, p.equal @ residual)
         residual = residual - p.equal.T @ normal
     gap = _matrix_gap(p, S, Z) + s @ z
     error = gap + xp.sum(xp.abs(residual) * p.diameters)
-    return Point(y, S, s, Z, z, residual, 0.5 * rest @ rest, error)
+    value = 0.5 * rest @ rest
+    return Point(y, S, s, Z, z, residual, value, error)
 
 
-def _matrix_gap(p: ConeProgram, S: Values, Z: Values) -> Values:
+def _matrix_gap(p: ConeProgram, S, Z) -> Values:
     """Return the duality gap of the semidefinite inequalities.
 
     With a pull, the eigenvalues of S Z / pull are all one at the optimum: the gap is
@@ -228,11 +234,11 @@ def _matrix_gap(p: ConeProgram, S: Values, Z: Values) -> Values:
     xp = p.xp
     products = xp.sum(S * Z, axis=(-2, -1))
     bodies = products[: p.bodies]
-    log_S = xp.sum(xp.log(pivots(S[: p.bodies])), axis=0)
-    log_Z = xp.sum(xp.log(pivots(Z[: p.bodies])), axis=0)
     is_pulled = p.pull > 0
-    log_pull = 4.0 * xp.log(xp.where(is_pulled, p.pull, 1.0))
-    logarithms = log_S + log_Z - log_pull
+    log_pull = xp.log(xp.where(is_pulled, p.pull, 1.0))
+    log_det_S = xp.sum(xp.log(pivots(S)), axis=0)
+    log_det_Z = xp.sum(xp.log(pivots(Z)), axis=0)
+    logarithms = (log_det_S + log_det_Z)[: p.bodies] - 4.0 * log_pull
     pulled_gap = bodies - 4.0 * p.pull - p.pull * logarithms
     gap = xp.where(is_pulled, pulled_gap, bodies)
     return xp.sum(gap) + xp.sum(products[p.bodies :])
@@ -284,14 +290,14 @@ class Newton(NamedTuple):
         return Direction(*(a + b for a, b in zip(d, correction, strict=True)))
 
 
-def _newton(p: ConeProgram, gram: Values, x: Point) -> Newton:
+def _newton(p: ConeProgram, gram, x: Point) -> Newton:
     """Factor Newton's equations at a point."""
     inverse_S = inverse(x.S)
     barriers = _barriers(p, inverse_S, x.Z, x.z / x.s)
     return Newton(p, x, inverse_S, _newton_solver(p, gram + barriers))
 
 
-def _step(p: ConeProgram, gram: Values, x: Point) -> tuple[Point, Values]:
+def _step(p: ConeProgram, gram, x: Point) -> tuple[Point, Values]:
     """Take the longer step of two correctors; return the new point and the step length."""
     xp = p.xp
     newton = _newton(p, gram, x)
@@ -346,62 +352,64 @@ def _complementarity(p: ConeProgram, S, s, Z, z) -> Values:
     return (xp.maximum(matrices, 0.0) + s @ z) / p.complementarity
 
 
-def _length(fractions: np.ndarray, x: Point, d: Direction) -> Values:
+def _length(fractions, x: Point, d: Direction) -> Values:
     """Return the longest of some steps that leaves everything positive."""
     xp = namespace(x.y)
-    fastest = xp.maximum(xp.max(-d.s / x.s), xp.max(-d.z / x.z))
-    lengths = fractions * xp.minimum(1.0, 1.0 / xp.maximum(fastest, TINY))
-    matrices = xp.concatenate([x.S, x.Z])[..., None]
-    changes = xp.concatenate([d.S, d.Z])[..., None]
-    ends = matrices + changes * lengths[None, None, None]
+    speeds = xp.concatenate([-d.s / x.s, -d.z / x.z])
+    # The linear inequalities hold up to the reciprocal of the largest speed.
+    lengths = fractions / xp.maximum(xp.max(speeds), 1.0)
+    matrices = xp.concatenate([x.S, x.Z])
+    changes = xp.concatenate([d.S, d.Z])
+    steps = changes[..., None] * lengths[None, None, None]
+    ends = matrices[..., None] + steps
     is_positive = xp.all(pivots(ends) > 0, axis=(0, 1))
-    return xp.where(xp.any(is_positive), lengths[xp.argmax(is_positive)], 0.0)
+    longest = lengths[xp.argmax(is_positive)]
+    return xp.where(xp.any(is_positive), longest, 0.0)
 
 
-def _barriers(p: ConeProgram, inverse_S: Values, Z: Values, ratio: Values) -> Values:
+def _barriers(p: ConeProgram, inverse_S, Z, ratio) -> Values:
     """Return the contribution of the bounds to the matrix of Newton's equations.
 
     The ratio is that of multipliers to slacks of the linear inequalities.
     """
     xp = p.xp
     products = _products(inverse_S, Z)
-    basis = BASIS[: p.width].reshape(p.width, 16)
-    semidefinite = basis[None] @ products[: p.bodies] @ basis.T[None]
-    count = p.bodies * p.rows.shape[-2]
-    ratio_of_bodies = xp.reshape(ratio[:count], (p.bodies, -1))
-    linear = xp.einsum("kri,kr,krj->kij", p.rows, ratio_of_bodies, p.rows)
+    semidefinite = p.basis[None] @ products[: p.bodies] @ p.basis.T[None]
+    of_bodies, lower, upper = p.split_linear(ratio)
+    linear = xp.einsum("kri,kr,krj->kij", p.rows, of_bodies, p.rows)
     bodies = symmetric_part(semidefinite) + linear
-    bodies = bodies * (1.0 + RIDGE * np.eye(p.width))[None]
-
-    lower = ratio[count : count + p.drives]
-    upper = ratio[count + p.drives :]
+    ridge = 1.0 + RIDGE * np.eye(p.width)
     drives = xp.diag((1.0 + RIDGE) * (lower + upper))
-    linalg = scipy.linalg if xp is np else jax.scipy.linalg
-    diagonal_blocks = linalg.block_diag(*bodies, drives)
+    blocks = _linalg(p).block_diag(*(bodies * ridge[None]), drives)
 
     couplings = xp.reshape(p.couplings, (*p.couplings.shape[:2], 16))
     mixed = xp.einsum("ikx,kxy->iky", couplings, products[p.bodies :])
     coupled = xp.tensordot(mixed, couplings, ((1, 2), (1, 2)))
-    return diagonal_blocks + p.members.T @ symmetric_part(coupled) @ p.members
+    return blocks + p.members.T @ symmetric_part(coupled) @ p.members
 
 
-def _products(inverse_S: Values, Z: Values) -> Values:
+def _linalg(p: ConeProgram) -> ModuleType:
+    """Return SciPy's linear algebra, or JAX's."""
+    return scipy.linalg if p.xp is np else jax.scipy.linalg
+
+
+def _products(inverse_S, Z) -> Values:
     r"""Return matrices $M$ with $e^T M g = \mathrm{tr}(E S^{-1} G Z)$ for flattened $E$ and $G$."""
     xp = namespace(Z)
     product = inverse_S[:, None, :, :, None] * Z[:, :, None, None, :]
     return xp.reshape(product, (-1, 16, 16))
 
 
-def _newton_solver(p: ConeProgram, H: Values) -> Callable[[Values], Values]:
+def _newton_solver(p: ConeProgram, H) -> Callable[[Values], Values]:
     """Return the solver of Newton's equations within the equality constraints."""
     xp = p.xp
-    linalg = scipy.linalg if xp is np else jax.scipy.linalg
+    linalg = _linalg(p)
     try:
         factor = linalg.cho_factor(H, lower=True, check_finite=False)
     except np.linalg.LinAlgError:
         return lambda right: np.full_like(right, np.nan)
 
-    def solve(right: Values) -> Values:
+    def solve(right):
         return linalg.cho_solve(factor, right, check_finite=False)
 
     if not p.equal.shape[0]:
@@ -409,7 +417,7 @@ def _newton_solver(p: ConeProgram, H: Values) -> Callable[[Values], Values]:
     normal = xp.stack([solve(row) for row in p.equal], axis=1)
     square = p.equal @ normal
 
-    def solve_within(right: Values) -> Values:
+    def solve_within(right):
         unconstrained = solve(right)
         violation = p.equal @ unconstrained
         return unconstrained - normal @ xp.linalg.solve(square, violation)

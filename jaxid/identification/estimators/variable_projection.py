@@ -179,16 +179,16 @@ class ShapeSearch(eqx.Module):
         dof = jnp.maximum(row_count - float(self.fixed.shape[-1]), 1.0)
         information = self.fixed_information(rows)
 
-        def weighted_residuals(logarithms: Array) -> Array:
+        def weighted_residuals(logarithms):
             shapes = start * jnp.exp(logarithms)
             _, residuals = self.fit(shapes, rows, information)
             return rows * residuals
 
-        def pulled_residuals(logarithms: Array, noise: Array) -> Array:
+        def pulled_residuals(logarithms, noise):
             residuals = weighted_residuals(logarithms) / noise
             return jnp.append(residuals, logarithms / np.log(10.0))
 
-        def search(logarithms: Array, _) -> tuple[Array, Array]:
+        def search(logarithms, _) -> tuple[Array, Array]:
             squares = jnp.sum(weighted_residuals(logarithms) ** 2)
             noise = jnp.maximum(jnp.sqrt(squares / dof), 1e-150)
             minimum = minimise_squares(
@@ -196,7 +196,7 @@ class ShapeSearch(eqx.Module):
             )
             return minimum.x, minimum.converged
 
-        def search_twice(first_shapes: Array) -> tuple[Array, Array, Array]:
+        def search_twice(first_shapes) -> tuple[Array, Array, Array]:
             # The strength of the pull depends on the noise, which is known at the end
             # only.
             logarithms, successes = jax.lax.scan(
@@ -221,7 +221,7 @@ class ShapeSearch(eqx.Module):
         ratios[:, :2, 0] = combinations
         shapes = jnp.asarray(jnp.reshape(self.start, (1, kinds, -1)) * ratios)
 
-        def joint_squares(x: Array) -> Array:
+        def joint_squares(x):
             _, residuals = self.fit(x.ravel(), rows)
             return jnp.sum((rows * residuals) ** 2, axis=0)
 
@@ -273,11 +273,11 @@ class ShapeSearch(eqx.Module):
         forces = jnp.asarray(self.forces)
         squares = rows**2
 
-        def predict(c: Array) -> Array:
+        def predict(c):
             shaped = columns * c[parameter][None]
             return jnp.zeros_like(forces).at[:, joint].add(shaped) + fixed @ c
 
-        def project(residuals: Array) -> Array:
+        def project(residuals):
             """Return the products of all columns with weighted residuals."""
             weighted = squares * residuals
             shaped = jnp.sum(columns * weighted[:, joint], axis=0)
@@ -291,7 +291,7 @@ class ShapeSearch(eqx.Module):
             jax.lax.stop_gradient(information), RIDGE * size
         )
 
-        def refine(c: Array) -> Array:
+        def refine(c):
             return c + inverse @ project(forces - predict(c))
 
         c = jax.lax.stop_gradient(refine(refine(jnp.zeros(size))))
@@ -300,17 +300,18 @@ class ShapeSearch(eqx.Module):
         return c, forces - predict(c)
 
     def _add_shaped_columns(
-        self, information: Array, columns: Array, squares: Array
+        self, information, columns, squares
     ) -> Float[Array, "base base"]:
         """Add the products of the columns that depend on shapes, with all columns."""
         joint, parameter, _ = np.array(self.entries).T
-        entries = np.arange(len(parameter))
+        count = len(parameter)
         fixed = jnp.asarray(self.fixed)
-        spread = jnp.zeros((*squares.shape, len(entries)))
-        spread = spread.at[:, joint, entries].set(columns)
-        weighted = (spread * squares[..., None]).reshape(-1, len(entries))
-        with_fixed = weighted.T @ fixed.reshape(-1, fixed.shape[-1])
-        products = columns.T @ (columns * squares[:, joint])
+        weighted = columns * squares[:, joint]
+        spread = jnp.zeros((*squares.shape, count))
+        spread = spread.at[:, joint, np.arange(count)].set(weighted)
+        flat = spread.reshape(-1, count)
+        with_fixed = flat.T @ fixed.reshape(-1, fixed.shape[-1])
+        products = columns.T @ weighted
         # Columns of different joints are never in one row.
         with_each_other = jnp.where(joint == joint[:, None], products, 0.0)
         information = information.at[parameter].add(with_fixed)
@@ -327,7 +328,7 @@ def _dense_columns(chunk: RowChunk, size: int) -> Float[np.ndarray, "rows joints
 
 
 def _filter_columns(
-    x: Array, shapes: Shapes, recordings: tuple[Observations, ...], joint, column
+    x, shapes: Shapes, recordings: tuple[Observations, ...], joint, column
 ) -> Float[Array, "rows entries"]:
     """Return the filtered columns of the terms with shapes, in the rows of these joints."""
     parts = []
@@ -348,8 +349,8 @@ def _(primals, tangents):
     kinds = len(shapes.kinds)
     directions = jnp.repeat(jnp.eye(kinds), shapes.size // kinds, axis=1)
 
-    def differentiate(direction: Array) -> tuple[Array, Array]:
-        def columns(x: Array) -> Array:
+    def differentiate(direction) -> tuple[Array, Array]:
+        def columns(x):
             return _filter_columns(x, shapes, recordings, joint, column)
 
         return jax.jvp(columns, (x,), (direction,))

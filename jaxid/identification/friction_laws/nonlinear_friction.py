@@ -165,7 +165,7 @@ def _leading_part(uncertainty: Uncertainty, size: int) -> Uncertainty:
 
 
 def _add_shape_slopes(
-    base: BaseParameters, shapes: Shapes, values: np.ndarray, parameters: np.ndarray
+    base: BaseParameters, shapes: Shapes, values, parameters
 ) -> BaseParameters:
     """Return base parameters with small changes of the shapes as further parameters."""
     model = base.model
@@ -181,7 +181,7 @@ def _add_shape_slopes(
 
 
 def _held_out_errors(
-    blocks: Blocks, search: ShapeSearch, weights: np.ndarray, progress: Progress | None
+    blocks: Blocks, search: ShapeSearch, weights, progress: Progress | None
 ) -> HeldOutErrors:
     """Test both models on blocks that neither their fits nor the search have used."""
     folds = cross_validation_folds(blocks)
@@ -203,7 +203,7 @@ def _held_out_errors(
 
 
 def _test_squares(
-    blocks: Blocks, search: ShapeSearch, weights: np.ndarray, training, test
+    blocks: Blocks, search: ShapeSearch, weights, training, test
 ) -> tuple[float, float, float]:
     """Return squared errors of the linear and nonlinear model, and squared forces."""
     training_mask = np.zeros(len(blocks.parts))

@@ -93,9 +93,7 @@ def temperature_law(
     )
 
 
-def _exponential(
-    warming: np.ndarray, estimates: np.ndarray, deviations: np.ndarray
-) -> tuple[float, ...]:
+def _exponential(warming, estimates, deviations) -> tuple[float, ...]:
     """Return rate, its deviation, value at the reference, and its deviation."""
     relative_deviations = np.maximum(deviations / estimates, MIN_RELATIVE_DEVIATION)
     line, covariance = np.polyfit(
