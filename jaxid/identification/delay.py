@@ -168,7 +168,7 @@ class _Equations(NamedTuple):
     squares: np.ndarray  # regressor times regressor
     rates: np.ndarray  # rates of the regressor times rates of the regressor
 
-    def combine(self, columns: AnyArray) -> "_Equations":
+    def combine(self, columns: np.ndarray) -> "_Equations":
         """Return the equations for parameters of which the present ones are combinations."""
         with_forces = np.asarray(linalg.block_diag(columns, 1.0))
         return _Equations(
