@@ -82,7 +82,8 @@ def start(*reads: Path, output: Path | None = None, force: bool = False) -> Cons
 
     from jaxid.io import require_writable
     from jaxid.program.jax_compilation_cache import enable_compilation_cache
-    from jaxid.report.result_files import SCHEMAS, schema_of
+    from jaxid.report.result_files import schema_of
+    from jaxid.report.result_records import SCHEMAS
 
     jax.config.update("jax_enable_x64", True)
     enable_compilation_cache()

@@ -10,7 +10,8 @@ from jaxid.io import atomic_folder
 from jaxid.report.excitation import side_by_side_table
 from jaxid.report.identification import parameter_table
 from jaxid.report.page import Section, folded, picture, render_page
-from jaxid.report.result_files import SCHEMAS, write_json
+from jaxid.report.result_files import write_json
+from jaxid.report.result_records import SCHEMAS
 from jaxid.result_table import (
     MISSING,
     Column,

@@ -20,7 +20,8 @@ from jaxid.rollout import PARAMETERS, RolloutErrors, ServoFit
 from .figure import Figure
 from .figure_elements import ERROR, GREY, MEASURED, PREDICTED, Curve, Panel
 from .page import Section, provenance, render_page
-from .result_files import header, plain, write_csv, write_json
+from .result_files import write_csv, write_json
+from .result_records import header, plain
 
 SHOWN = 6
 """Motions whose figures the page shows."""

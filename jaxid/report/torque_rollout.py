@@ -15,7 +15,8 @@ from jaxid.rollout import TorqueRolloutFit
 
 from .figure import Figure
 from .page import Section, provenance, render_page
-from .result_files import estimate_rows, header, plain, write_csv, write_json
+from .result_files import estimate_rows, write_csv, write_json
+from .result_records import header, plain
 from .rollout import SHOWN, motion_panel
 
 

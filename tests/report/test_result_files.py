@@ -11,13 +11,12 @@ from jaxid.identification.parameter_changes import Verdict, compare
 from jaxid.report import result_files
 from jaxid.report.figure import Figure
 from jaxid.report.result_files import (
-    consistency_record,
-    plain,
     read_fit,
     safe_name,
     write_comparison,
     write_report,
 )
+from jaxid.report.result_records import consistency_record, plain
 from jaxid.validation.verdict import Report
 
 
