@@ -29,25 +29,19 @@ from .page import Section, folded, picture, provenance, render_page, tiles
 from .parameter_words import glossary, word_columns
 from .physics import gravity_table
 
+MAX_PANELS = 42
+"""Largest number of joints, of all recordings together, whose forces the page shows."""
+MAX_BINS = 28_000
+"""Pixel columns of all these panels together, which bound the size of the page."""
+
 
 def identification_page(report: Report, figures: Mapping[str, Figure]) -> str:
     """Return the page of an identification as HTML: what matters first, then the details."""
-    fit, settings = report.fit, report.settings
-    base, robot = fit.base, fit.base.model.robot
-    overall, *criteria = verdict(report)
-    open_points = [r for r in criteria if r.status in (Status.BAD, Status.DOUBTFUL)]
-    others = [r for r in criteria if r not in open_points]
+    fit = report.fit
+    base = fit.base
+    robot = base.model.robot
     sections = [
-        (
-            "At a glance",
-            [
-                overall,
-                _three_numbers(report),
-                Table("", facts=_data(report)),
-                *([open_points] if open_points else []),
-                folded("What else was checked", others),
-            ],
-        ),
+        ("At a glance", _glance(report)),
         *_physics(report, figures),
         ("Measured and predicted forces", _torques(figures, robot)),
         ("Parameters in words", _parameters(fit, figures["parameters"])),
@@ -55,43 +49,63 @@ def identification_page(report: Report, figures: Mapping[str, Figure]) -> str:
             "Details",
             [folded(name, *blocks) for name, blocks in _details(report, figures)],
         ),
+        provenance(report.settings),
     ]
-    logs = f"{len(fit.recordings)} log{'' if len(fit.recordings) == 1 else 's'}"
+    logs = len(fit.recordings)
+    plural = "" if logs == 1 else "s"
     return render_page(
         f"{robot.name}: identified model",
-        [*sections, provenance(settings)],
-        f"{base.size} base parameters of {robot.joints} joints, from {logs}.",
+        sections,
+        f"{base.size} base parameters of {robot.joints} joints, from {logs} log{plural}.",
         "All numbers: result.json and parameters.csv beside this page. Lines of long "
-        "logs show the "
-        "least and the largest value of each pixel column, so that no peak is lost.",
+        "logs show the least and the largest value of each pixel column, so that no "
+        "peak is lost.",
     )
 
 
+def _glance(report: Report) -> list[Any]:
+    """Return verdict, three numbers, the data, and what deserves attention."""
+    overall, *criteria = verdict(report)
+    doubts = []
+    others = []
+    for remark in criteria:
+        is_doubt = remark.status in (Status.BAD, Status.DOUBTFUL)
+        (doubts if is_doubt else others).append(remark)
+    return [
+        overall,
+        _three_numbers(report),
+        Table("", facts=_data(report)),
+        *([doubts] if doubts else []),
+        folded("What else was checked", others),
+    ]
+
+
 def _three_numbers(report: Report) -> Markup:
-    """Return the torque error, the mean error of the worst joint, and the known parameters."""
+    """Return the torque error, the mean error of the worst joint, and the trusted parameters."""
     fit = report.fit
-    logs, which = report.verification, "on motion that the fit has not seen"
+    logs = report.verification
+    motion = "on motion that the fit has not seen"
     if not logs:
-        logs, which = (
-            report.identification,
-            "on the motion of the fit: no other log was given",
-        )
-    error = max(e.relative for e in logs)
-    limits = np.searchsorted(np.array(RMS_ERROR) / 100.0, error)
-    status = (Status.GOOD, Status.DOUBTFUL, Status.BAD)[int(limits)]
-    worst = np.max([e.mean_percent for e in logs], axis=0)
-    second, joint = f"{significant(fit.condition_numbers.scaled)}", ""
+        logs = report.identification
+        motion = "on the motion of the fit: no other log was given"
+    error = max(log.relative for log in logs)
+    grade = int(np.searchsorted(RMS_ERROR, 100.0 * error))
+    status = (Status.GOOD, Status.DOUBTFUL, Status.BAD)[grade]
+
+    number = significant(fit.condition_numbers.scaled)
     meaning = "condition number: how well the motion tells the parameters apart"
-    if np.isfinite(worst).all():
-        joint = fit.base.model.robot.joint_names[int(np.argmax(worst))]
-        second = f"{percent(float(np.max(worst)) / 100.0)} %"
+    mean_percents = np.max([log.mean_percent for log in logs], axis=0)
+    if np.isfinite(mean_percents).all():
+        worst = int(np.argmax(mean_percents))
+        joint = fit.base.model.robot.joint_names[worst]
+        number = f"{percent(float(mean_percents[worst]) / 100.0)} %"
         meaning = f"mean error of the worst joint, {joint}, of its largest torque"
-    known = f"{fit.trust.count(Status.GOOD)} of {fit.base.size}"
+    trusted = f"{fit.trust.count(Status.GOOD)} of {fit.base.size}"
     return tiles(
-        (f"{percent(error)} %", f"torque error (RMS) {which}", status),
-        (second, meaning, Status.NEUTRAL),
+        (f"{percent(error)} %", f"torque error (RMS) {motion}", status),
+        (number, meaning, Status.NEUTRAL),
         (
-            known,
+            trusted,
             "parameters known to 10 %",
             Status.BAD if fit.undetermined else Status.NEUTRAL,
         ),
@@ -100,59 +114,57 @@ def _three_numbers(report: Report) -> Markup:
 
 def _data(report: Report) -> Iterator[tuple[str, str]]:
     """Yield robot, logs, estimator and total mass, each with its word."""
-    fit, robot = report.fit, report.fit.base.model.robot
+    fit = report.fit
+    robot = fit.base.model.robot
     yield "robot", f"{robot.name}, {robot.joints} joints"
-    for word, logs in (
-        ("identified with", report.identification),
-        ("verified with", report.verification),
-    ):
-        for e in logs:
-            time = np.asarray(e.time)
-            length = significant(float(time[-1] - time[0]))
-            yield word, f"{e.name}: {length} s, {len(time)} rows of each joint"
+    for log in report.identification:
+        yield "identified with", _log_size(log)
+    for log in report.verification:
+        yield "verified with", _log_size(log)
     # A class `LeastSquares` is shown as "least squares".
-    estimator = re.sub(
-        r"(?<=[a-z])(?=[A-Z])", " ", type(fit.estimator).__name__
-    ).lower()
-    yield "estimator", estimator
-    if fit.consistency is not None:
-        mass = np.asarray(fit.consistency.bodies)[:, 0]
-        loose = len(fit.consistency.masses_from_bounds)
-        proof = f", of which {loose} bodies follow from bounds too" if loose else ""
+    words = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", type(fit.estimator).__name__)
+    yield "estimator", words.lower()
+    if fit.consistency is None:
         yield (
-            "total mass of the moving bodies",
-            f"{significant(float(mass.sum()))} kg{proof}",
+            "total mass",
+            "forces tell combinations of masses only; physically consistent bodies "
+            "have masses",
         )
     else:
-        text = (
-            "forces tell combinations of masses only; physically consistent bodies "
-            "have masses"
+        mass = significant(float(np.asarray(fit.consistency.bodies)[:, 0].sum()))
+        bounded = len(fit.consistency.masses_from_bounds)
+        origin = (
+            f", of which {bounded} bodies follow from bounds too" if bounded else ""
         )
-        yield "total mass", text
+        yield "total mass of the moving bodies", f"{mass} kg{origin}"
     if report.claimed_mass:
         yield "total mass by the robot's file", f"{significant(report.claimed_mass)} kg"
 
 
+def _log_size(log: TorqueErrors) -> str:
+    """Return name, duration and rows of a log."""
+    duration = significant(float(log.time[-1] - log.time[0]))
+    return f"{log.name}: {duration} s, {len(log.time)} rows of each joint"
+
+
 def _physics(report: Report, figures: Mapping[str, Figure]) -> Iterator[Section]:
-    """Yield what the model says of the robot: in motion, before and after, friction, weight."""
+    """Yield what the model says of the robot: in motion, before and after, friction, gravity."""
     text = (
-        "Each link has the colour of the torque error of the joint that moves it, "
-        "the path "
+        "Each link has the colour of the torque error of the joint that moves it, the "
+        "path of the end-effector that of the mean. Turn it, and move the slider."
     )
-    text += "of the end-effector that of the mean. Turn it, and move the slider."
     yield "The robot along the motion", [picture(figures["robot"], text)]
     if "before_and_after" in figures:
         text = (
             "Torque errors with the parameters that the robot's file claims (friction "
-            "and rotors "
-            "count as zero where it claims none), and with those that were identified."
+            "and rotors count as zero where it claims none), and with those that were "
+            "identified."
         )
         yield "Before and after", [text, figures["before_and_after"]]
     text = (
         "Lines: the model. Points: means over classes of speed of the measured "
-        "forces, less all "
-        "that the model explains otherwise. Points far from their line ask for "
-        "another shape."
+        "forces, less all that the model explains otherwise. Points far from their "
+        "line ask for another shape."
     )
     yield "Friction", [text, figures["friction"]]
     log = report.verification[0] if report.verification else report.identification[0]
@@ -160,105 +172,106 @@ def _physics(report: Report, figures: Mapping[str, Figure]) -> Iterator[Section]
 
 
 def _torques(figures: Mapping[str, Figure], robot: Robot) -> list[Any]:
-    """Return the figures of the recordings: with 42 panels at most, the first one unfolded."""
-    found: list[Any] = [
-        figure for name, figure in figures.items() if name.startswith("torque_")
-    ]
-    shown = found[: max(1, 42 // robot.joints)]
+    """Return the figures of the recordings, the first one unfolded."""
+    logs = [figure for name, figure in figures.items() if name.startswith("torque_")]
+    shown = logs[: max(1, MAX_PANELS // robot.joints)]
     # Many panels share the size of the page.
-    bins = min(shown[0].bins, 28_000 // sum(len(figure.panels) for figure in shown))
-    first, *others = (dataclasses.replace(figure, bins=bins) for figure in shown)
-    folds = [folded(f.title, dataclasses.replace(f, title="")) for f in others]
-    blocks: list[Any] = [first, *folds]
-    if left := len(found) - len(shown):
-        blocks.append(
-            f"{left} more recordings are not shown here; result.json has their errors."
-        )
+    panels = sum(len(figure.panels) for figure in shown)
+    bins = min(shown[0].bins, MAX_BINS // panels)
+    blocks: list[Any] = [dataclasses.replace(shown[0], bins=bins)]
+    for figure in shown[1:]:
+        untitled = dataclasses.replace(figure, title="", bins=bins)
+        blocks.append(folded(figure.title, untitled))
+    omitted = len(logs) - len(shown)
+    if omitted:
+        text = f"{omitted} more recordings are not shown here; result.json has their errors."
+        blocks.append(text)
     return blocks
 
 
 def _parameters(fit: Fit, figure: Figure) -> list[Any]:
     """Return the meanings of all symbols, and the estimates with theirs."""
     base = fit.base
-    text = (
+    notes = [
         "* together with what forces cannot tell apart from it: see its combination. "
-        "A parameter "
-        "near zero is never known to a few percent, and that is no fault."
-    )
-    lengths = ", ".join(f"{name} = {value:.4g}" for name, value in base.lengths.items())
-    said = [
-        text,
-        *([f"In the combinations: {lengths} (m; m/s² for g)."] if lengths else []),
+        "A parameter near zero is never known to a few percent, and that is no fault."
     ]
-    doubts = [fit.determination] if fit.undetermined else []
+    if base.lengths:
+        lengths = [f"{name} = {value:.4g}" for name, value in base.lengths.items()]
+        notes.append(f"In the combinations: {', '.join(lengths)} (m; m/s² for g).")
     summary = f"All {base.size} estimates with 95 % intervals and combinations"
     return [
-        *doubts,
+        *([fit.determination] if fit.undetermined else []),
         glossary(base),
-        folded(summary, parameter_table(fit), *said, figure),
+        folded(summary, parameter_table(fit), *notes, figure),
     ]
 
 
 def _details(report: Report, figures: Mapping[str, Figure]) -> Iterator[Section]:
     """Yield what experts ask for."""
-    fit, settings, robot = report.fit, report.settings, report.fit.base.model.robot
-    task = [
-        ("experiment", settings.get("experiment")),
-        *((key, settings.get(key)) for key in ("split", "filter", "decimation")),
-        ("estimator", fit.estimator),
-        *fit.facts[:-1],
-    ]
-    about = robot.summary()
-    gravity = ", ".join(f"{x:g}" for x in np.asarray(robot.gravity))
-    assumed = ", ".join(robot.limits.assumed) or "nothing"
-    facts = [*about.facts, ("gravity [m/s²]", gravity), ("assumed", assumed)]
+    fit = report.fit
+    robot = fit.base.model.robot
     notes = [Remark(note) for note in report.every_note]
-    yield (
-        "Task and notes",
-        [Table("", facts=[f for f in task if f[1] is not None]), notes],
-    )
-    yield (
-        "Robot and drives",
-        [Table("", *about.columns, facts=facts), *motor_tables(robot)],
-    )
+    yield "Task and notes", [Table("", facts=_task(report)), notes]
+
+    summary = robot.summary()
+    gravity = ", ".join(f"{x:g}" for x in np.asarray(robot.gravity))
+    assumptions = ", ".join(robot.limits.assumed) or "nothing"
+    facts = [*summary.facts, ("gravity [m/s²]", gravity), ("assumed", assumptions)]
+    table = Table("", *summary.columns, facts=facts)
+    yield "Robot and drives", [table, *motor_tables(robot)]
+
     text = (
         "Predicted less measured forces. Bars: the mean of their absolute values (Eq. "
-        "37, Fig. 10 "
-        "of the paper); points: their RMS. The offset is the mean error, which a "
-        "constant of the "
-        "log explains; RMS values at rest and in motion are about it."
+        "37, Fig. 10 of the paper); points: their RMS. The offset is the mean error, "
+        "which a constant of the log explains; RMS values at rest and in motion are "
+        "about it."
     )
-    tables = tuple(error_table(e, robot) for e in report.every_error)
+    tables = tuple(error_table(errors, robot) for errors in report.every_error)
     yield "Torque errors", [text, figures["errors"], tables]
     if fit.consistency is not None:
         yield "Bodies", [body_table(fit.consistency, robot.joint_names)]
     if fit.residual_spectra is not None:
         text = (
             "The residuals of a good model are noise. Power at low frequencies, or "
-            "residuals that "
-            "resemble their neighbours more than the filters explain (dashed), mean "
-            "that an effect "
-            "is missing."
+            "residuals that resemble their neighbours more than the filters explain "
+            "(dashed), mean that an effect is missing."
         )
-        shown = [figures["residuals"], figures["autocorrelation"]]
-        yield "Residuals", [text, *shown, residual_table(fit.residual_spectra, robot)]
+        table = residual_table(fit.residual_spectra, robot)
+        yield (
+            "Residuals",
+            [text, figures["residuals"], figures["autocorrelation"], table],
+        )
     if "filter" in figures:
         yield "Choice of the filter", [figures["filter"]]
 
 
+def _task(report: Report) -> list[tuple[str, Any]]:
+    """Return the settings of an identification, and facts of its fit."""
+    settings = report.settings
+    facts = [
+        (key, settings[key])
+        for key in ("experiment", "split", "filter", "decimation")
+        if settings.get(key) is not None
+    ]
+    # The last fact counts trusted estimates, as the top of the page does.
+    return [*facts, ("estimator", report.fit.estimator), *report.fit.facts[:-1]]
+
+
 def parameter_table(fit: Fit) -> Table:
     """Return the base parameters in words, with their 95 % intervals."""
-    base, (low, high) = fit.base, fit.intervals().T
-    values, deviations = with_deviations(fit.parameters, fit.standard_deviations)
-    low, high = (
-        with_deviations(ends, fit.standard_deviations)[0] for ends in (low, high)
-    )
+    base = fit.base
+    standard_deviations = fit.standard_deviations
+    intervals = fit.intervals()
+    estimates, deviations = with_deviations(fit.parameters, standard_deviations)
+    low, _ = with_deviations(intervals[:, 0], standard_deviations)
+    high, _ = with_deviations(intervals[:, 1], standard_deviations)
     return Table(
         "",
         Column("#", list(range(1, base.size + 1))),
         Column("parameter", base.names),
         *word_columns(base),
-        Column("estimate", values, kind="number"),
+        Column("estimate", estimates, kind="number"),
         Column("±", deviations, kind="number"),
         Column("unit", base.units),
         Column("95 %\nfrom", low, kind="number"),
@@ -272,21 +285,24 @@ def parameter_table(fit: Fit) -> Table:
 def motor_tables(robot: Robot) -> list[Table]:
     """Return the motors of a robot, if it has gears or couplings: their joints and properties."""
     drives = robot.drives
-    A = np.asarray(robot.drives.reduction)
     if drives.is_direct:
         return []
-    turns = [
-        " + ".join(f"{row[j]:.6g} {robot.joint_names[j]}" for j in np.flatnonzero(row))
-        for row in A
-    ]
+    turns = []
+    for row in np.asarray(drives.reduction):
+        joints = np.flatnonzero(row)
+        turns.append(" + ".join(f"{row[j]:.6g} {robot.joint_names[j]}" for j in joints))
     columns = [
-        Column("joint at\nmotor zero", np.asarray(drives.zero), "rad or m"),
-        Column("largest\ntorque", np.asarray(drives.max_torques), "N m"),
-        Column("rotor\ninertia", np.asarray(drives.rotor_inertia), "kg m²"),
+        Column("motor", list(range(1, robot.joints + 1))),
+        Column("turns", turns),
     ]
-    known = (c for c in columns if np.isfinite(c.values).any() and np.any(c.values))
-    numbers = Column("motor", list(range(1, robot.joints + 1)))
-    return [Table("motors", numbers, Column("turns", turns), *known)]
+    for name, values, unit in (
+        ("joint at\nmotor zero", drives.zero, "rad or m"),
+        ("largest\ntorque", drives.max_torques, "N m"),
+        ("rotor\ninertia", drives.rotor_inertia, "kg m²"),
+    ):
+        if np.isfinite(values).any() and np.any(values):
+            columns.append(Column(name, np.asarray(values), unit))
+    return [Table("motors", *columns)]
 
 
 def error_table(errors: TorqueErrors, robot: Robot) -> Table:
@@ -308,48 +324,46 @@ def error_table(errors: TorqueErrors, robot: Robot) -> Table:
 
 def residual_table(spectra: ResidualSpectra, robot: Robot) -> Table:
     """Return whether the residuals of each joint are white, and where their power lies."""
+    limit = percent(spectra.limit)
+    low_power = f"power below {0.1 * spectra.band:.2g} Hz\n(white: 10 %)"
     return Table(
-        "residuals within the filters' band; white: departure below "
-        f"{percent(spectra.limit)} %",
+        f"residuals within the filters' band; white: departure below {limit} %",
         Column("joint", robot.joint_names),
         Column("white", ["yes" if white else "no" for white in spectra.white]),
         Column("departure", spectra.departure, "%", percent),
-        Column(
-            f"power below {0.1 * spectra.band:.2g} Hz\n(white: 10 %)",
-            spectra.low_frequency,
-            "%",
-            percent,
-        ),
+        Column(low_power, spectra.low_frequency, "%", percent),
         status=[Status.GOOD if white else Status.DOUBTFUL for white in spectra.white],
     )
 
 
 def body_table(consistency: Consistency, names: Sequence[str]) -> Table:
     """Return mass, centre of mass and margin of each body, and the effect of the bounds."""
-    mass = np.asarray(consistency.bodies)[:, 0]
-    bounded = consistency.masses_from_bounds
-    centre = np.asarray(consistency.bodies)[:, 1:4] / mass[:, None]
-    axes = [
+    bodies = np.asarray(consistency.bodies)
+    mass = bodies[:, 0]
+    centre = bodies[:, 1:4] / mass[:, None]
+    centre_columns = [
         Column(f"{axis} of\ncentre", centre[:, k], "m", lambda x: significant(x, 2))
         for k, axis in enumerate("xyz")
     ]
-    price = f"{100 * consistency.residual_increase:.2g}"
-    proof = (
-        f"within {consistency.error_bound:.1e} of it, {consistency.iterations} "
-        "iterations"
-    )
-    loose = [k in bounded for k in range(len(names))]
+    is_bounded = [k in consistency.masses_from_bounds for k in range(len(names))]
+    price = f"{100 * consistency.residual_increase:.2g} %"
+    error_bound = f"{consistency.error_bound:.1e}"
     return Table(
         "physically consistent bodies",
         Column("body of joint", names),
         Column("mass", mass, "kg"),
-        *axes,
+        *centre_columns,
         Column("margin", consistency.margins, "%", percent),
-        Column("mass follows from", ["bounds too" if x else "forces" for x in loose]),
-        status=[Status.DOUBTFUL if x else Status.GOOD for x in loose],
+        Column(
+            "mass follows from", ["bounds too" if x else "forces" for x in is_bounded]
+        ),
+        status=[Status.DOUBTFUL if x else Status.GOOD for x in is_bounded],
         facts=[
-            ("price", f"{price} % larger weighted residuals than without bounds"),
-            ("optimum", proof),
+            ("price", f"{price} larger weighted residuals than without bounds"),
+            (
+                "optimum",
+                f"within {error_bound} of it, {consistency.iterations} iterations",
+            ),
             ("active bounds", "; ".join(consistency.active) or "none"),
         ],
     )
