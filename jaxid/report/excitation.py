@@ -7,12 +7,14 @@ from typing import Any
 import numpy as np
 
 from jaxid.arrays import double_precision
+from jaxid.dynamics.motion import Motion
 from jaxid.excitation.design_result import VAGUE, ExcitationPlan
 from jaxid.io import atomic_folder
 from jaxid.result_table import Column, Remark, Status, Table, significant
 from jaxid.robot.collision import CollisionModel
 from jaxid.trajectory.trajectory import AbstractTrajectory
 
+from .figure import Figure
 from .motion import joint_figure, pose_figure, tip_figure
 from .page import picture, provenance, render_page
 
@@ -20,30 +22,27 @@ from .page import picture, provenance, render_page
 def side_by_side_table(plans: Sequence[ExcitationPlan]) -> Table:
     """Return all criteria of motions that minimise one of them each, and their deviations."""
     criteria = plans[0].criteria
-    names = [c.name for c in criteria]
-    numbers = [names.index(plan.criterion.name) + 1 for plan in plans]
-    remarks = [
-        "`random` is the median of random motions that fill the same limits; the last "
-        "row is the "
-        "geometric mean over the base parameters"
-    ]
-    for number, plan in zip(numbers, plans, strict=True):
-        doubts = [
-            *plan.diagnosis,
-            *(["stopped before its end"] if plan.interrupted else []),
-        ]
-        remarks += [Remark(f"by #{number}: {text}", Status.DOUBTFUL) for text in doubts]
-    return Table(
-        "motions that minimise one of the criteria each",
+    names = [criterion.name for criterion in criteria]
+    columns = [
         Column("#", [*map(str, range(1, len(names) + 1)), ""], kind="number"),
         Column("criterion", [*names, "deviations, times smaller than random"]),
-        Column("random", [*(float(c.before) for c in criteria), 1.0]),
-        *(
-            Column(
-                f"by #{k}", [*(float(c.after) for c in plan.criteria), plan.mean_gain]
-            )
-            for k, plan in zip(numbers, plans, strict=True)
-        ),
+        Column("random", [*(float(criterion.before) for criterion in criteria), 1.0]),
+    ]
+    remarks: list[Remark | str] = [
+        "`random` is the median of random motions that fill the same limits; the last "
+        "row is the geometric mean over the base parameters"
+    ]
+    for plan in plans:
+        number = names.index(plan.criterion.name) + 1
+        values = [float(criterion.after) for criterion in plan.criteria]
+        columns.append(Column(f"by #{number}", [*values, plan.mean_gain]))
+        doubts = list(plan.diagnosis)
+        if plan.interrupted:
+            doubts.append("stopped before its end")
+        remarks += [Remark(f"by #{number}: {x}", Status.DOUBTFUL) for x in doubts]
+    return Table(
+        "motions that minimise one of the criteria each",
+        *columns,
         rules=[len(names)],
         remarks=remarks,
     )
@@ -51,39 +50,47 @@ def side_by_side_table(plans: Sequence[ExcitationPlan]) -> Table:
 
 def plan_remarks(plan: ExcitationPlan) -> list[Remark]:
     """Return what must be known of a design, what it assumes, and what it leaves vague."""
-    robot, limits = plan.base.model.robot, plan.limits.limits
-    rates = {"velocity": "/s", "acceleration": "/s²"}
-    assumed = ", ".join(
-        f"{name} of `{robot.joint_names[j]}` "
-        f"({float(getattr(limits, name)[j]):.4g} "
-        f"{robot.joint_unit(j)}{rates.get(name, '')})"
-        for name, j in plan.limits.assumed
-    )
-    published = ", ".join(limits.assumed)
-    vague = ", ".join(plan.vague)
-    doubts = (
-        published and f"Limits that nobody published, assumed: {published}",
-        assumed and f"Assumed, because not given: {assumed}",
-        vague and f"Deviations above {100 * VAGUE:g} % of the nominal value: {vague}",
-        "The search was stopped: `--resume` may find a better motion"
-        if plan.interrupted
-        else "",
-    )
-    found = [Remark(text, Status.DOUBTFUL) for text in doubts if text]
-    start, then = plan.limits.basis.times(plan.samples)[:2]
-    step = float(then - start)
+    robot = plan.base.model.robot
+    start, second = plan.limits.basis.times(plan.samples)[:2]
+    step = float(second - start)
     noise = ", ".join(
-        f"{significant(s)} {robot.force_unit(j)}"
-        for j, s in enumerate(np.asarray(plan.noise).tolist())
+        f"{significant(float(deviation))} {robot.force_unit(j)}"
+        for j, deviation in enumerate(plan.noise)
     )
-    text = (
+    deviations = Remark(
         f"Expected deviations are those of {plan.samples} samples in "
-        f"{plan.samples * step:.4g} s "
-        f"({1 / step:.4g} Hz), of one run, with white noise of the forces: standard "
-        "deviation "
-        f"{noise}; of n runs they are √n times smaller."
+        f"{plan.samples * step:.4g} s ({1 / step:.4g} Hz), of one run, with white noise "
+        f"of the forces: standard deviation {noise}; of n runs they are √n times "
+        "smaller."
     )
-    return [*plan.remarks, Remark(text), *found]
+
+    doubts = []
+    unpublished = ", ".join(plan.limits.limits.assumed)
+    if unpublished:
+        doubts.append(f"Limits that nobody published, assumed: {unpublished}")
+    if plan.limits.assumed:
+        doubts.append(f"Assumed, because not given: {_assumed_limits(plan)}")
+    if plan.vague:
+        threshold = f"{100 * VAGUE:g} %"
+        doubts.append(
+            f"Deviations above {threshold} of the nominal value: {', '.join(plan.vague)}"
+        )
+    if plan.interrupted:
+        doubts.append("The search was stopped: `--resume` may find a better motion")
+    doubtful = [Remark(text, Status.DOUBTFUL) for text in doubts]
+    return [*plan.remarks, deviations, *doubtful]
+
+
+def _assumed_limits(plan: ExcitationPlan) -> str:
+    """Return the limits that were assumed, with their values and joints."""
+    robot = plan.base.model.robot
+    rate_units = {"velocity": "/s", "acceleration": "/s²"}
+    texts = []
+    for name, j in plan.limits.assumed:
+        value = float(getattr(plan.limits.limits, name)[j])
+        unit = f"{robot.joint_unit(j)}{rate_units.get(name, '')}"
+        texts.append(f"{name} of `{robot.joint_names[j]}` ({value:.4g} {unit})")
+    return ", ".join(texts)
 
 
 def ordered(remarks: Iterable[Remark]) -> list[Remark]:
@@ -106,45 +113,69 @@ def write_excitation(
     of the design as in `provenance`.
     """
     robot = plan.base.model.robot
-    with double_precision():
-        time = np.linspace(0.0, float(played.duration), 801)
-        motion = played.motion(time)
-    limits = plan.limits.limits
-    speed, fastest = np.abs(np.asarray(motion.qd)), np.asarray(limits.velocity)
-    used = 100.0 * speed / np.where(np.isfinite(fastest), fastest, np.max(speed))
-    label = "speed [% of the limit]"
-    space = pose_figure(
-        robot, motion.q, time=time, values=used, label=label, shapes=shapes
-    )
-    figures = [
-        joint_figure(robot, limits, time, motion),
-        tip_figure(robot, time, motion),
-    ]
-    criteria, deviations, *use = plan.tables()
-    every = ordered((*plan_remarks(plan), *remarks))
-    said = "Links are coloured by the speed of their joint."
+    caption = "Links are coloured by the speed of their joint."
     if shapes is not None:
-        said += (
+        caption += (
             " Pale shapes are those that were checked for collision; grey ones "
             "stand still."
         )
-    text = "A random motion that fills the same limits is shown beside this one."
+    with double_precision():
+        time = np.linspace(0.0, float(played.duration), 801)
+        motion = played.motion(time)
+    criteria, deviations, *use = plan.tables()
+    sections = [
+        (
+            "Verdict",
+            [headline(plan, remarks), ordered((*plan_remarks(plan), *remarks))],
+        ),
+        (
+            "The motion",
+            [
+                picture(_speed_scene(plan, time, motion, shapes), caption),
+                joint_figure(robot, plan.limits.limits, time, motion),
+                tip_figure(robot, time, motion),
+            ],
+        ),
+        ("Use of the limits", use),
+        (
+            "Gain over a random motion",
+            [
+                "A random motion that fills the same limits is shown beside this one.",
+                criteria,
+            ],
+        ),
+        ("Expected standard deviations", [deviations]),
+        provenance(settings),
+    ]
     page = render_page(
         f"{robot.name}: a motion to record",
-        [
-            ("Verdict", [headline(plan, remarks), every]),
-            ("The motion", [picture(space, said), *figures]),
-            ("Use of the limits", use),
-            ("Gain over a random motion", [text, criteria]),
-            ("Expected standard deviations", [deviations]),
-            provenance(settings),
-        ],
+        sections,
         f"Designed to determine {plan.base.size} base parameters of {robot.joints} "
         "joints.",
     )
     with atomic_folder(folder) as staging:
         (staging / "report.html").write_text(page, encoding="utf-8")
     return [folder / "report.html"]
+
+
+def _speed_scene(
+    plan: ExcitationPlan,
+    time: np.ndarray,
+    motion: Motion,
+    shapes: CollisionModel | None,
+) -> Figure:
+    """Return the robot among shapes, coloured by the speeds of its joints."""
+    speeds = np.abs(np.asarray(motion.qd))
+    limits = np.asarray(plan.limits.limits.velocity)
+    scale = np.where(np.isfinite(limits), limits, np.max(speeds))
+    return pose_figure(
+        plan.base.model.robot,
+        motion.q,
+        time=time,
+        values=100.0 * speeds / scale,
+        label="speed [% of the limit]",
+        shapes=shapes,
+    )
 
 
 def headline(plan: ExcitationPlan, remarks: Sequence[Remark]) -> Remark:
@@ -156,14 +187,19 @@ def headline(plan: ExcitationPlan, remarks: Sequence[Remark]) -> Remark:
     if any(remark.status is Status.BAD for remark in remarks):
         text = "Do not record this motion yet: what is marked ✗ comes first."
         return Remark(text, Status.BAD)
-    if left := [r.text.split(":")[0] for r in remarks if ": not checked, as" in r.text]:
-        text = (
+    unchecked = [
+        remark.text.split(":")[0]
+        for remark in remarks
+        if ": not checked, as" in remark.text
+    ]
+    if unchecked:
+        return Remark(
             "This motion keeps all limits that were checked; not checked: "
-            f"{', '.join(left)}."
+            f"{', '.join(unchecked)}.",
+            Status.DOUBTFUL,
         )
-        return Remark(text, Status.DOUBTFUL)
-    text = (
+    return Remark(
         "A motion that can be recorded: it keeps all limits, and determines all "
-        "parameters."
+        "parameters.",
+        Status.GOOD,
     )
-    return Remark(text, Status.GOOD)

@@ -42,17 +42,14 @@ def render_page(
     headline), lists of remarks, tuples of blocks beside each other, and what `tiles`,
     `code` and `folded` return. All texts are escaped.
     """
-    shown = [
-        (
-            name,
-            re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-"),
-            [*map(_render, blocks)],
-        )
-        for name, blocks in sections
-    ]
-    drawn = any('class="chart"' in block for *_, blocks in shown for block in blocks)
-    code = library() if drawn else ""
-    return printable(str(_macros().page(title, shown, lead, footer, code)))
+    contents = []
+    for name, blocks in sections:
+        anchor = re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")
+        contents.append((name, anchor, [_render(block) for block in blocks]))
+    # The library is large: pages without figures do without.
+    has_figures = any('class="chart"' in "".join(blocks) for _, _, blocks in contents)
+    code = library() if has_figures else ""
+    return printable(str(_macros().page(title, contents, lead, footer, code)))
 
 
 def _render(block: Any) -> Markup:
@@ -100,15 +97,14 @@ def provenance(settings: Mapping[str, Any]) -> Section:
     Of `settings`, `facts` (pairs of a word and a text), `command` and `experiment_text`
     are shown.
     """
-    blocks: list[Any] = [
-        Table("", facts=(*settings.get("facts", ()), *versions().items()))
-    ]
-    if settings.get("command"):
-        blocks.append(code(str(settings["command"])))
-    if settings.get("experiment_text"):
-        blocks.append(
-            folded("The experiment file", code(str(settings["experiment_text"])))
-        )
+    facts = (*settings.get("facts", ()), *versions().items())
+    blocks: list[Any] = [Table("", facts=facts)]
+    command = settings.get("command")
+    if command:
+        blocks.append(code(str(command)))
+    experiment = settings.get("experiment_text")
+    if experiment:
+        blocks.append(folded("The experiment file", code(str(experiment))))
     return "To repeat this", blocks
 
 
