@@ -2,8 +2,7 @@
 
 import enum
 import functools
-import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Literal
 
 import equinox as eqx
@@ -18,10 +17,11 @@ from jaxid.result_table import MISSING, Column, Remark, Status, Summarised, Tabl
 from .base_parameter_expressions import Expression
 from .dispatch import in_numpy, on_samples, program_of
 from .model import Coordinates, Model
-from .motion import Motion
+from .motion import Motion, as_motion
 from .packed_regressor import JointRegressor, PackedRegressor
 from .rank import (
     Dependence,
+    Regrouped,
     gram_schmidt,
     random_regressor,
     regrouping,
@@ -29,6 +29,19 @@ from .rank import (
 )
 
 Parameters = Float[AnyArray, " base"] | Sequence[float | int]
+
+
+METHODS: dict[str, Callable[[Float[AnyArray, "rows columns"]], Dependence]] = {
+    "gram_schmidt": gram_schmidt,
+    "singular_values": singular_values,
+}
+"""Methods that decide which columns depend on others."""
+MIN_SHARE = 5e-4
+"""Fraction of an independent column that must be new."""
+MIN_GAP = 1e3
+"""Ratio of the new parts of independent and of dependent columns."""
+MAX_UNEXPLAINED = 1e-9
+"""Fraction of a dependent column that may remain unexplained."""
 
 
 class Identifiability(enum.Enum):
@@ -85,8 +98,8 @@ class BaseParameters(Summarised, Hashable):
         """Expressions in letters, and the values of these, computed when first needed (Eq. 24)."""
         from .base_parameter_closed_forms import closed_forms
 
-        model, kappa = _snapped(self.model), np.asarray(self.kappa)
-        return closed_forms(model, self.indices, self.dependent, kappa)
+        kappa = np.asarray(self.kappa, np.float64)
+        return closed_forms(_snapped(self.model), self.indices, self.dependent, kappa)
 
     @property
     def expressions(self) -> tuple[str, ...]:
@@ -115,8 +128,8 @@ class BaseParameters(Summarised, Hashable):
         if name != "columns":
             return None
         program = program_of(self.model, self.model.columns, *shapes)
-        (shape,) = program.output_shapes
-        entries = np.arange(math.prod(shape)).reshape(shape)
+        joints, columns = program.output_shapes[0]
+        entries = np.arange(joints * columns).reshape(joints, columns)
         return select_outputs(program, entries[:, np.array(self.indices, int)])
 
     @property
@@ -173,8 +186,9 @@ class BaseParameters(Summarised, Hashable):
         self, p: Float[AnyArray, "*batch standard"] | Sequence[Any]
     ) -> Float[AnyArray, "*batch base"]:
         r"""Return the base parameters $p_B = p_1 + \kappa p_2$ (Eq. 22)."""
-        p = _one_each("standard", p, self.model.size)
-        first, second = np.array(self.indices), np.array(self.dependent, dtype=int)
+        p = _as_parameters("standard", p, self.model.size)
+        first = np.array(self.indices)
+        second = np.array(self.dependent, int)
         return p[..., first] + p[..., second] @ self.kappa.T
 
     def to_standard(
@@ -185,19 +199,26 @@ class BaseParameters(Summarised, Hashable):
         They are no physical masses and inertias, but give the same forces and mass
         matrix.
         """
-        p = _one_each("base", p, self.size)
-        shape, places = (*p.shape[:-1], self.model.size), np.array(self.indices)
+        p = _as_parameters("base", p, self.size)
+        shape = (*p.shape[:-1], self.model.size)
+        places = np.array(self.indices)
         if isinstance(p, np.ndarray):
-            full = np.zeros(shape)
-            full[..., places] = p
-            return full
+            standard = np.zeros(shape)
+            standard[..., places] = p
+            return standard
         return jnp.zeros(shape, p.dtype).at[..., places].set(p)
 
     def inverse_dynamics(
-        self, p: Parameters, motion: Motion
+        self, p: Parameters, *motion: Motion | Coordinates
     ) -> Float[AnyArray, "*batch joints"]:
-        r"""Return the generalised forces $\Theta_B p_B$ [N m or N] (Eq. 39)."""
-        return on_samples(self, self.forces, *self.model.arguments(motion), shared=(p,))
+        r"""Return the generalised forces $\Theta_B p_B$ [N m or N] (Eq. 39).
+
+        Args:
+            p: Base parameters.
+            motion: A motion, or joint coordinates, velocities and accelerations.
+        """
+        arguments = self.model.arguments(as_motion(*motion))
+        return on_samples(self, self.forces, *arguments, shared=(p,))
 
     def mass_matrix(
         self, p: Parameters, q: Coordinates
@@ -208,26 +229,30 @@ class BaseParameters(Summarised, Hashable):
     @property
     def identifiability(self) -> tuple[Identifiability, ...]:
         """Identifiability of every standard parameter: alone, in combination, or not at all."""
-        verdict = [Identifiability.NONE] * self.model.size
-        mixed = np.asarray(self.kappa) != 0.0
+        identifiability = [Identifiability.NONE] * self.model.size
+        combines = np.asarray(self.kappa) != 0.0
         for row, k in enumerate(self.indices):
-            alone = not mixed[row].any()
-            verdict[k] = Identifiability.ALONE if alone else Identifiability.COMBINED
+            is_combined = combines[row].any()
+            identifiability[k] = (
+                Identifiability.COMBINED if is_combined else Identifiability.ALONE
+            )
         for column, k in enumerate(self.dependent):
-            if mixed[:, column].any():
-                verdict[k] = Identifiability.COMBINED
-        return tuple(verdict)
+            if combines[:, column].any():
+                identifiability[k] = Identifiability.COMBINED
+        return tuple(identifiability)
 
     def summary(self) -> Table:
         """Return a table of the base parameters, with their combinations and units."""
+        names = self.model.parameter_names
         facts = []
         for kind in Identifiability:
-            each = zip(self.model.parameter_names, self.identifiability, strict=True)
-            found = [name for name, verdict in each if verdict is kind]
-            facts.append((f"{kind.value} ({len(found)})", ", ".join(found) or MISSING))
-        if lengths := ", ".join(
-            f"{name} = {value:.4g}" for name, value in self.lengths.items()
-        ):
+            verdicts = zip(names, self.identifiability, strict=True)
+            members = [name for name, verdict in verdicts if verdict is kind]
+            facts.append(
+                (f"{kind.value} ({len(members)})", ", ".join(members) or MISSING)
+            )
+        lengths = ", ".join(f"{x} = {value:.4g}" for x, value in self.lengths.items())
+        if lengths:
             facts.append(("lengths", f"{lengths} (m; m/s² for g)"))
         count = f"{self.size} base parameters of {self.model.size} standard parameters"
         return Table(
@@ -241,7 +266,10 @@ class BaseParameters(Summarised, Hashable):
         )
 
 
-def _one_each(kind: str, p: Numbers, size: int) -> Float[AnyArray, "*batch parameters"]:
+def _as_parameters(
+    kind: str, p: Numbers, size: int
+) -> Float[AnyArray, "*batch parameters"]:
+    """Return parameters as an array with this number of them along its last axis."""
     # What is no array of JAX stays in NumPy, and in float64 where JAX runs in float32.
     p = as_array("p", p)
     if p.shape[-1:] != (size,):
@@ -277,55 +305,62 @@ def base_parameters(
     Raises:
         InputError: If there is no such method.
     """
-    methods = {"gram_schmidt": gram_schmidt, "singular_values": singular_values}
-    if method not in methods:
+    if method not in METHODS:
         raise InputError(
-            f"`method` must be one of {', '.join(methods)}, but is {method!r}."
+            f"`method` must be one of {', '.join(METHODS)}, but is {method!r}."
         )
     W, scale = random_regressor(_snapped(model), seed)
-    found = methods.pop(method)(W)
-    ((_, check),) = methods.items()
-    other = check(W)
-    kappa, left, new = regrouping(W, found.independent, found.dependent)
-    first, second = np.array(found.independent, int), np.array(found.dependent, int)
-    kappa = kappa * scale[first][:, None] / scale[second]
-    weakest = model.parameter_names[first[np.argmin(new)]] if len(new) else ""
-    notes = _doubts(found, other, left, weakest)
-    independent, dependent, smallest, largest = found
+    dependence = METHODS[method](W)
+    (other_method,) = set(METHODS) - {method}
+    cross_check = METHODS[other_method](W)
+
+    first = np.array(dependence.independent, int)
+    second = np.array(dependence.dependent, int)
+    regrouped = regrouping(W, first, second)
+    kappa = regrouped.kappa * scale[first][:, None] / scale[second]
     return BaseParameters(
-        model, independent, dependent, kappa, smallest, largest, notes
+        model,
+        dependence.independent,
+        dependence.dependent,
+        kappa,
+        dependence.smallest_independent,
+        dependence.largest_dependent,
+        tuple(_doubts(model, dependence, cross_check, regrouped)),
     )
 
 
 def _snapped(model: Model) -> Model:
+    """Return the model of a robot whose rounded quarter turns are exact."""
     return Model(model.robot.snapped(), model.terms)
 
 
 def _doubts(
-    found: Dependence, other: Dependence, left: float, weakest: str
-) -> tuple[str, ...]:
-    notes = []
-    if found.independent != other.independent:
-        notes.append(
-            "the two ways to choose base parameters disagree "
-            f"({len(found.independent)} and "
-            f"{len(other.independent)}): the geometry is nearly degenerate, or angles "
-            "are rounded."
+    model: Model, dependence: Dependence, cross_check: Dependence, regrouped: Regrouped
+) -> Iterator[str]:
+    """Yield doubts about the choice of base parameters, in sentences."""
+    count = len(dependence.independent)
+    if dependence.independent != cross_check.independent:
+        yield (
+            f"the two ways to choose base parameters disagree ({count} and "
+            f"{len(cross_check.independent)}): the geometry is nearly degenerate, or "
+            "angles are rounded."
         )
-    if found.smallest_independent < 5e-4:
-        notes.append(
-            f"`{weakest}` is barely a base parameter: only "
-            f"{found.smallest_independent:.1e} of its "
-            "column is new, because of a length near zero or an angle like 1.571 "
-            "instead of pi/2, "
-            "which `robot.snapped(1e-3)` (`snap_tolerance`) makes exact."
+    if dependence.smallest_independent < MIN_SHARE:
+        column = dependence.independent[int(np.argmin(regrouped.shares))]
+        yield (
+            f"`{model.parameter_names[column]}` is barely a base parameter: only "
+            f"{dependence.smallest_independent:.1e} of its column is new, because of a "
+            "length near zero or an angle like 1.571 instead of pi/2, which "
+            "`robot.snapped(1e-3)` (`snap_tolerance`) makes exact."
         )
-    if found.dependent and found.gap < 1e3:
-        notes.append(
+    if dependence.dependent and dependence.gap < MIN_GAP:
+        yield (
             "independent and dependent columns are not clearly apart: their new parts "
-            "are "
-            f"{found.smallest_independent:.1e} and {found.largest_dependent:.1e}."
+            f"are {dependence.smallest_independent:.1e} and "
+            f"{dependence.largest_dependent:.1e}."
         )
-    if left > 1e-9:
-        notes.append(f"a dependent column is explained only to {left:.1e} of its size.")
-    return tuple(notes)
+    if regrouped.unexplained > MAX_UNEXPLAINED:
+        yield (
+            f"a dependent column is explained only to {regrouped.unexplained:.1e} of "
+            "its size."
+        )

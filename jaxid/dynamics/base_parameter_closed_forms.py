@@ -36,18 +36,30 @@ from .rank import (
     row_units,
 )
 
-_POWERS = np.arange(-2, 3)
+POWERS = np.arange(-2, 3)
 """Exponents of a length that are tried."""
-_SCALES = np.array([0.55, 0.75, 1.3, 1.7])
+SCALES = np.array([0.55, 0.75, 1.3, 1.7])
 """Factors of a length that is varied alone."""
-_FITTED, _CHECKED = 40, 8
-"""Numbers of random geometries for fits and for checks."""
-_FITS = 1e-9
+FITS = 40
+"""Number of random geometries for fits."""
+CHECKS = 8
+"""Number of other random geometries, for checks."""
+GEOMETRIES_AT_ONCE = 32
+"""Number of geometries at which the regressor is evaluated together."""
+MAX_ERROR = 1e-9
 """Relative error up to which a closed form fits."""
-_SMALL = 1e-7
+MAX_ERROR_OF_ROBOT = 1e-6
+"""The same at the robot's own geometry, whose lengths may be small."""
+MIN_SHARE = 1e-7
 """Relative size below which a power or a factor is nothing but rounding."""
-_NOTHING = 1e-12
+ROUNDING = 1e-12
 """Relative size below which a length, gravity or a column counts as zero."""
+MAX_PRODUCTS = 20_000
+"""Number of products of powers above which none are tried."""
+MAX_CANDIDATES = 24
+"""Number of products of the right dimension above which none are fitted."""
+MAX_MONOMIALS = 6
+"""Number of monomials above which a coefficient has no short form."""
 
 
 def closed_forms(
@@ -57,144 +69,199 @@ def closed_forms(
     kappa: Float[np.ndarray, "base dependent"],
 ) -> tuple[tuple[Expression, ...], dict[str, float]]:
     r"""Return base parameters as combinations of standard ones, and the values of the letters."""
-    kappa = np.asarray(kappa, np.float64)
-    names, units = model.parameter_names, [dimension(u) for u in model.parameter_units]
-    finder = _Finder(model, independent, dependent)
+    names = model.parameter_names
+    dimensions = [dimension(unit) for unit in model.parameter_units]
+    search = CoefficientSearch(model, independent, dependent)
     expressions = []
-    for row, first in enumerate(independent):
-        terms = [(first, Coefficient((Monomial(Fraction(1)),)))]
-        for column, second in enumerate(dependent):
-            own, other = units[first], units[second]
-            difference = None
-            if own is not None and other is not None:
-                difference = np.subtract(own, other)
-            coefficient = finder.coefficient(
-                row, column, difference, kappa[row, column]
-            )
+    for row, leader in enumerate(independent):
+        terms = {leader: Coefficient((Monomial(Fraction(1)),))}
+        for column, other in enumerate(dependent):
+            value = float(kappa[row, column])
+            quotient = _quotient(dimensions[leader], dimensions[other])
+            coefficient = search.coefficient(row, column, quotient, value)
             if coefficient is not None:
-                terms.append((second, coefficient))
-        terms.sort(key=lambda term: term[0])
-        expressions.append(Expression(tuple((names[k], c) for k, c in terms)))
-    used = {name for e in expressions for name in e.symbols}
-    lengths = {x.name: x.value for x in finder.lengths if x.name in used}
+                terms[other] = coefficient
+        in_order = ((names[k], terms[k]) for k in sorted(terms))
+        expressions.append(Expression(tuple(in_order)))
+
+    symbols = {symbol for expression in expressions for symbol in expression.symbols}
+    lengths = {x.name: x.value for x in search.lengths if x.name in symbols}
     return tuple(expressions), lengths
 
 
-class _Finder:
-    """Values of the matrix at all geometries, from which one coefficient is found at a time."""
+def _quotient(
+    numerator: Dimension | None, denominator: Dimension | None
+) -> np.ndarray | None:
+    """Return the dimension of a quotient; None if one of them is unknown."""
+    if numerator is None or denominator is None:
+        return None
+    return np.subtract(numerator, denominator)
+
+
+class CoefficientSearch:
+    """Values of the matrix at many geometries, from which one coefficient is found at a time."""
 
     def __init__(
         self, model: Model, independent: tuple[int, ...], dependent: tuple[int, ...]
     ):
         matrix = Regrouping(model, independent, dependent)
         lengths = changing_lengths(model.robot, matrix) if dependent else ()
-        rng = np.random.default_rng(3)
-        base = draws(matrix, lengths, 1, rng)
-        alone = np.repeat(base, len(lengths) * len(_SCALES), axis=0)
-        for k in range(len(lengths)):
-            alone[k * len(_SCALES) : (k + 1) * len(_SCALES), k] *= _SCALES
-        values = np.concatenate(
-            [base, alone, draws(matrix, lengths, _FITTED + _CHECKED, rng)]
-        )
-        found, self.right = matrix(lengths, values)
-        found = np.where(np.isfinite(found), found, 0.0)
+        generator = np.random.default_rng(3)
+        start = draws(matrix, lengths, 1, generator)
+        variations = _vary_each(start)
+        geometries = draws(matrix, lengths, FITS + CHECKS, generator)
+
+        values = np.concatenate([start, variations, geometries])
+        kappa, self._is_valid = matrix(lengths, values)
+        kappa = np.where(np.isfinite(kappa), kappa, 0.0)
+
         self.lengths: tuple[Length, ...] = lengths
+        # All lengths are of size one in the robot's own units.
         self._units = np.array([matrix.unit(x) for x in lengths])
-        self._entry_units = (
-            matrix.units[matrix.independent, None] / matrix.units[matrix.dependent]
-        )
-        self._values = np.array([x.value for x in lengths]) / self._units
+        self._robot_lengths = np.array([x.value for x in lengths]) / self._units
+        row_unit = matrix.units[matrix.independent]
+        self._entry_units = row_unit[:, None] / matrix.units[matrix.dependent]
+
         scaled = values / self._units
-        fitted, checked = slice(1 + len(alone), -_CHECKED), slice(-_CHECKED, None)
-        self._fitted, self._checked = ((scaled[x], found[x]) for x in (fitted, checked))
-        # For each length and power its fraction when this length alone varies.
-        shares = []
-        for k in range(len(lengths)):
-            rows = [0, *range(1 + k * len(_SCALES), 1 + (k + 1) * len(_SCALES))]
-            powers = scaled[rows, k, None] ** _POWERS
-            factors = np.abs(
-                np.linalg.solve(powers, found[rows].reshape(len(rows), -1))
-            )
-            shares.append(
-                factors / np.maximum(factors.max(axis=0), np.finfo(float).tiny)
-            )
-        self._shares = np.array(shares).reshape(
-            len(lengths), len(_POWERS), *found.shape[1:]
-        )
+        fits = slice(1 + len(variations), -CHECKS)
+        self._fit_lengths = scaled[fits]
+        self._fit_kappa = kappa[fits]
+        self._check_lengths = scaled[-CHECKS:]
+        self._check_kappa = kappa[-CHECKS:]
+        self._shares = _shares_of_powers(scaled, kappa)
 
     def coefficient(
-        self, row: int, column: int, difference: np.ndarray | None, value: float
+        self, row: int, column: int, quotient: np.ndarray | None, value: float
     ) -> Coefficient | None:
-        """Return the coefficient of a dependent column in a base parameter; None if it is zero."""
-        x, kappa = self._fitted
-        y = kappa[:, row, column]
-        # A coefficient without a short form is a number.
-        whole = (
-            Fraction(round(value)) if abs(abs(value) - 1.0) < _FITS else float(value)
-        )
-        number = Coefficient((Monomial(whole),)) if value else None
-        if not self.right or not y.any():
-            return number
-        powers = self._candidates(row, column, difference)
-        if not 0 < len(powers) <= 24:
-            return number
-        numbers, needed = np.zeros(0), np.zeros(1, bool)
-        while not needed.all():
-            numbers = np.linalg.lstsq(_products(x, powers), y, rcond=None)[0]
-            needed = np.abs(numbers) > _SMALL * np.abs(numbers).max()
-            powers = powers[needed]
-        if len(powers) > 6:
-            return number
-        numbers = np.array([float(_simple(factor)) for factor in numbers])
-        x, kappa = self._checked
-        checks = kappa[:, row, column]
-        error = np.abs(_products(x, powers) @ numbers - checks).max()
-        unit = self._entry_units[row, column]
-        own = float((_products(self._values[None], powers) @ numbers)[0]) * unit
-        if error > _FITS * np.abs(checks).max() or abs(own - value) > 1e-6 * max(
-            abs(value), unit
-        ):
-            return number
-        return self._written(numbers, powers, unit)
+        """Return the coefficient of a dependent column in a base parameter; None if it is zero.
 
-    def _candidates(
-        self, row: int, column: int, difference: np.ndarray | None
+        Args:
+            row: Number of the base parameter.
+            column: Number of the dependent column.
+            quotient: Dimension of the coefficient; None if it is unknown.
+            value: Value for the robot itself.
+        """
+        if self._is_valid and self._fit_kappa[:, row, column].any():
+            powers = self._possible_powers(row, column, quotient)
+            if 0 < len(powers) <= MAX_CANDIDATES:
+                powers, factors = self._fit(row, column, powers)
+                if len(powers) <= MAX_MONOMIALS and self._is_right(
+                    row, column, powers, factors, value
+                ):
+                    return self._in_si_units(
+                        powers, factors, self._entry_units[row, column]
+                    )
+        # A coefficient without a short form is a number.
+        if value == 0.0:
+            return None
+        is_sign = abs(abs(value) - 1.0) < MAX_ERROR
+        return Coefficient((Monomial(Fraction(round(value)) if is_sign else value),))
+
+    def _possible_powers(
+        self, row: int, column: int, quotient: np.ndarray | None
     ) -> np.ndarray:
-        possible = self._shares[:, :, row, column] > _SMALL
-        choices = [_POWERS[p] for p in possible]
-        if np.prod([len(c) for c in choices], dtype=float) > 20_000:
-            return np.zeros((0, len(self.lengths)), int)
-        found = list(itertools.product(*choices))
-        powers = np.array(found, int).reshape(len(found), len(self.lengths))
-        if difference is None:
+        """Return the exponents [products, lengths] of the products that can occur."""
+        occurs = self._shares[:, :, row, column] > MIN_SHARE
+        exponents = [POWERS[x] for x in occurs]
+        count = len(self.lengths)
+        if math.prod(len(x) for x in exponents) > MAX_PRODUCTS:
+            return np.zeros((0, count), int)
+        powers = np.array(list(itertools.product(*exponents)), int).reshape(-1, count)
+        if quotient is None:
             return powers
         dimensions = np.array([x.dimension for x in self.lengths], int).reshape(-1, 3)
-        return powers[(powers @ dimensions == difference).all(axis=1)]
+        fits = (powers @ dimensions == quotient).all(axis=1)
+        return powers[fits]
 
-    def _written(
-        self, numbers: np.ndarray, powers: np.ndarray, unit: float
+    def _fit(
+        self, row: int, column: int, powers: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the products that are needed, and their factors."""
+        values = self._fit_kappa[:, row, column]
+        while True:
+            products = _products(self._fit_lengths, powers)
+            factors = np.linalg.lstsq(products, values, rcond=None)[0]
+            counts = np.abs(factors) > MIN_SHARE * np.abs(factors).max()
+            powers = powers[counts]
+            if counts.all():
+                return powers, np.array([float(_simple(x)) for x in factors])
+
+    def _is_right(
+        self,
+        row: int,
+        column: int,
+        powers: np.ndarray,
+        factors: np.ndarray,
+        value: float,
+    ) -> bool:
+        """Return whether a closed form holds at other geometries and for the robot itself."""
+        checks = self._check_kappa[:, row, column]
+        errors = np.abs(_products(self._check_lengths, powers) @ factors - checks)
+        if errors.max() > MAX_ERROR * np.abs(checks).max():
+            return False
+        unit = self._entry_units[row, column]
+        (robot_value,) = _products(self._robot_lengths[None], powers) @ factors
+        error = abs(float(robot_value) * unit - value)
+        return error <= MAX_ERROR_OF_ROBOT * max(abs(value), unit)
+
+    def _in_si_units(
+        self, powers: np.ndarray, factors: np.ndarray, unit: float
     ) -> Coefficient:
-        """Return numbers in the robot's own units in SI units, as simple fractions if they are."""
+        """Return a coefficient in the robot's own units in SI units, with simple fractions."""
         monomials = []
-        for number, exponents in zip(numbers[::-1], powers[::-1], strict=True):
-            symbols = tuple(
-                (x.name, int(e))
-                for x, e in zip(self.lengths, exponents, strict=True)
-                if e
-            )
+        for exponents, factor in zip(powers[::-1], factors[::-1], strict=True):
+            symbols = []
+            for length, exponent in zip(self.lengths, exponents, strict=True):
+                if exponent:
+                    symbols.append((length.name, int(exponent)))
             # With the right dimension the units of lengths and of the entry cancel.
-            factor = unit / float(np.prod(self._units ** exponents.astype(float)))
-            monomials.append(Monomial(_simple(float(number) * factor), symbols))
+            unit_of_lengths = float(np.prod(self._units ** exponents.astype(float)))
+            number = _simple(float(factor) * unit / unit_of_lengths)
+            monomials.append(Monomial(number, tuple(symbols)))
         return Coefficient(tuple(monomials))
 
 
+def _vary_each(
+    start: Float[np.ndarray, "1 lengths"],
+) -> Float[np.ndarray, "cases lengths"]:
+    """Return geometries in which one length at a time has other values."""
+    count = start.shape[1]
+    values = np.repeat(start, count * len(SCALES), axis=0)
+    for k in range(count):
+        rows = slice(k * len(SCALES), (k + 1) * len(SCALES))
+        values[rows, k] *= SCALES
+    return values
+
+
+def _shares_of_powers(
+    scaled: Float[np.ndarray, "cases lengths"],
+    kappa: Float[np.ndarray, "cases base dependent"],
+) -> Float[np.ndarray, "lengths powers base dependent"]:
+    """Return for each length and power its share in the entries when this length alone varies."""
+    count = scaled.shape[1]
+    shares = np.zeros((count, len(POWERS), *kappa.shape[1:]))
+    for k in range(count):
+        first = 1 + k * len(SCALES)
+        rows = [0, *range(first, first + len(SCALES))]
+        powers = scaled[rows, k, None] ** POWERS
+        # As many powers as values: they are solved for exactly.
+        factors = np.linalg.solve(powers, kappa[rows].reshape(len(rows), -1))
+        sizes = np.abs(factors)
+        largest = np.maximum(sizes.max(axis=0), np.finfo(float).tiny)
+        shares[k] = (sizes / largest).reshape(shares.shape[1:])
+    return shares
+
+
 def _products(x: np.ndarray, powers: np.ndarray) -> np.ndarray:
+    """Return products of powers of lengths [cases, products]."""
     return np.prod(x[:, None, :] ** powers.astype(float), axis=-1)
 
 
 def _simple(number: float) -> Fraction | float:
+    """Return the fraction with a small denominator that a number is, or the number."""
     nearest = Fraction(number).limit_denominator(12)
-    return nearest if nearest and abs(number - float(nearest)) < _FITS else number
+    is_fraction = nearest != 0 and abs(number - float(nearest)) < MAX_ERROR
+    return nearest if is_fraction else number
 
 
 @dataclass(frozen=True)
@@ -206,6 +273,11 @@ class Length:
     # numbers of the geometry that it sets, each with its multiple of the value
     entries: tuple[tuple[int, float], ...]
     dimension: Dimension  # dimension of a length, or of an acceleration
+
+    @property
+    def offset(self) -> int:
+        """Number of the body whose offset has the length as a component."""
+        return self.entries[0][0] // 3
 
 
 class Regrouping:
@@ -219,33 +291,38 @@ class Regrouping:
     def __init__(
         self, model: Model, independent: tuple[int, ...], dependent: tuple[int, ...]
     ):
-        self.independent, self.dependent = (
-            np.array(independent, int),
-            np.array(dependent, int),
-        )
         robot = model.robot
+        self.independent = np.array(independent, int)
+        self.dependent = np.array(dependent, int)
         self.size = characteristic_length(model)
         self.gravity = float(np.linalg.norm(np.asarray(robot.gravity)))
-        offset, gravity = (
-            np.array(x, np.float64) for x in (robot.offset, robot.gravity)
-        )
-        offset[np.abs(offset) < _NOTHING * self.size] = 0.0
-        gravity[np.abs(gravity) < _NOTHING * max(self.gravity, _NOTHING)] = 0.0
-        self.geometry = np.concatenate([offset.ravel(), gravity])
         self.units = column_units(model)
         self._rows = row_units(model)
+
+        offset = np.array(robot.offset, np.float64).ravel()
+        offset[np.abs(offset) < ROUNDING * self.size] = 0.0
+        gravity = np.array(robot.gravity, np.float64)
+        gravity[np.abs(gravity) < ROUNDING * max(self.gravity, ROUNDING)] = 0.0
+        self.geometry = np.concatenate([offset, gravity])
+
         samples = math.ceil(1.5 * model.size / robot.joints) + 2
         motion = random_motion(model, samples, seed=1)
         self._motion = [np.asarray(x).T for x in (motion.q, motion.qd, motion.qdd)]
-        varying = np.zeros(len(self.geometry), object)
-        varying[self.geometry != 0.0] = FREE
-        n = robot.joints
+        self._program = self._trace(model)
 
-        def columns(q, qd, qdd, x):
-            moved = robot.replace(offset=x[: 3 * n].reshape(n, 3), gravity=x[3 * n :])
-            return Model(moved, model.terms).columns(q, qd, qdd)
+    def _trace(self, model: Model):
+        """Return the program of the regressor, with numbers of the geometry as inputs."""
+        n = model.robot.joints
+        # What is zero stays zero.
+        variables = np.zeros(len(self.geometry), object)
+        variables[self.geometry != 0.0] = FREE
 
-        self._program = trace(columns, (n,), (n,), (n,), varying)
+        def columns(q, qd, qdd, geometry):
+            offset = geometry[: 3 * n].reshape(n, 3)
+            robot = model.robot.replace(offset=offset, gravity=geometry[3 * n :])
+            return Model(robot, model.terms).columns(q, qd, qdd)
+
+        return trace(columns, (n,), (n,), (n,), variables)
 
     def unit(self, length: Length) -> float:
         """Return a value of typical size: the robot's size, or gravity."""
@@ -263,81 +340,100 @@ class Regrouping:
         for column, length in enumerate(lengths):
             for entry, factor in length.entries:
                 geometries[:, entry] = factor * values[:, column]
-        found, right = [], True
+
+        matrices = []
+        is_right = True
+        ends = range(GEOMETRIES_AT_ONCE, len(geometries), GEOMETRIES_AT_ONCE)
+        for block in np.split(geometries, ends):
+            for W in self._regressors(block):
+                kappa, unexplained, shares = regrouping(
+                    W, self.independent, self.dependent
+                )
+                matrices.append(kappa)
+                is_right &= unexplained < MAX_ERROR
+                is_right &= shares.min(initial=1.0) >= MAX_ERROR
+        return np.array(matrices), bool(is_right)
+
+    def _regressors(
+        self, geometries: Float[np.ndarray, "cases numbers"]
+    ) -> Float[np.ndarray, "cases rows standard"]:
+        """Return the stacked regressors of several geometries, free of units."""
         joints, samples = self._motion[0].shape
-        for block in np.split(geometries, range(32, len(geometries), 32)):
-            motion = [np.tile(x, len(block)) for x in self._motion]
-            theta = evaluate(
-                self._program, *motion, np.repeat(block.T, samples, axis=1)
-            )
-            theta = theta * self._rows[:, None, None] * self.units[:, None]
-            theta = theta.reshape(joints, -1, len(block), samples).transpose(2, 0, 3, 1)
-            for W in theta.reshape(len(block), joints * samples, -1):
-                kappa, left, new = regrouping(W, self.independent, self.dependent)
-                found.append(kappa)
-                right = right and left < _FITS and new.min(initial=1.0) >= _FITS
-        return np.array(found), bool(right)
+        cases = len(geometries)
+        motions = [np.tile(x, cases) for x in self._motion]
+        numbers = np.repeat(geometries.T, samples, axis=1)
+        theta = evaluate(self._program, *motions, numbers)
+        theta = theta * self._rows[:, None, None] * self.units[:, None]
+        by_case = theta.reshape(joints, -1, cases, samples).transpose(2, 0, 3, 1)
+        return by_case.reshape(cases, joints * samples, -1)
 
 
 def draws(
     matrix: Regrouping,
     lengths: tuple[Length, ...],
     cases: int,
-    rng: np.random.Generator,
+    generator: np.random.Generator,
 ) -> Float[np.ndarray, "cases lengths"]:
     """Return random values of lengths, all of the robot's size, so that small ones have effect."""
     units = np.array([math.copysign(matrix.unit(x), x.value) for x in lengths])
-    return rng.uniform(0.5, 1.5, (cases, len(lengths))) * units
+    return generator.uniform(0.5, 1.5, (cases, len(lengths))) * units
 
 
 def changing_lengths(robot: Robot, matrix: Regrouping) -> tuple[Length, ...]:
     """Return the lengths that can vary without changing which columns are independent.
 
-    Where single ones cannot, the geometry has a coincidence, such as two equal lengths
-    that make axes meet: then those of one offset, equal ones, or all of them vary
-    together. Lengths that cannot vary at all get no name.
+    Some geometries have a coincidence, such as two equal lengths that make axes meet,
+    which is lost if one of them varies. Lengths of one offset, equal lengths, or all
+    of them then vary together. Lengths that cannot vary at all get no name.
     """
-    rng = np.random.default_rng(2)
-    single = named_lengths(robot, matrix)
+    generator = np.random.default_rng(2)
 
-    def possible(lengths: tuple[Length, ...]) -> bool:
-        return matrix(lengths, draws(matrix, lengths, 2, rng))[1]
+    def can_vary(lengths: tuple[Length, ...]) -> bool:
+        _, is_right = matrix(lengths, draws(matrix, lengths, 2, generator))
+        return is_right
 
-    if possible(single):
-        return single
-    free: tuple[Length, ...] = ()
-    rigid: list[Length] = []
-    for length in single:
-        if possible((*free, length)):
-            free += (length,)
+    components = named_lengths(robot, matrix)
+    if can_vary(components):
+        return components
+
+    variables: tuple[Length, ...] = ()
+    constants: list[Length] = []
+    for length in components:
+        if can_vary((*variables, length)):
+            variables += (length,)
         elif not length.dimension.second:
-            rigid.append(length)
-    same: tuple[Callable[[Length], object], ...] = (
-        lambda x: x.entries[0][0] // 3,  # lengths of one offset
-        lambda x: f"{abs(x.value):.9e}",  # equal ones
-        lambda _: 0,
+            constants.append(length)
+
+    ties: tuple[Callable[[Length], object], ...] = (
+        lambda x: x.offset,
+        lambda x: f"{abs(x.value):.9e}",  # equal lengths
+        lambda _: 0,  # all of them
     )
-    for key in same:
-        for _, members in itertools.groupby(sorted(rigid, key=key), key):
-            together = tuple(members)
-            if len(together) > 1 and possible((*free, _tied(together, robot))):
-                free += (_tied(together, robot),)
-                rigid = [x for x in rigid if x not in together]
-    return tuple(sorted(free, key=lambda x: x.entries))
+    for tie in ties:
+        for _, group in itertools.groupby(sorted(constants, key=tie), tie):
+            members = tuple(group)
+            if len(members) == 1:
+                continue
+            length = _tied(members, robot)
+            if can_vary((*variables, length)):
+                variables += (length,)
+                constants = [x for x in constants if x not in members]
+    return tuple(sorted(variables, key=lambda x: x.entries))
 
 
 def named_lengths(robot: Robot, matrix: Regrouping) -> tuple[Length, ...]:
     """Return every component of an offset that is not zero, and gravity."""
-    n = robot.joints
+    offset, gravity = np.split(matrix.geometry, [3 * robot.joints])
     lengths = []
-    for entry in np.flatnonzero(matrix.geometry[: 3 * n]):
-        body, axis = divmod(int(entry), 3)
-        value = float(matrix.geometry[entry])
+    for entry in np.flatnonzero(offset).tolist():
+        body, axis = divmod(entry, 3)
         name = offset_name(robot, body) + AXES[axis]
-        lengths.append(Length(name, value, ((int(entry), 1.0),), Dimension(0, 1, 0)))
+        value = float(offset[entry])
+        lengths.append(Length(name, value, ((entry, 1.0),), Dimension(0, 1, 0)))
     if matrix.gravity > 0.0:
-        direction = matrix.geometry[3 * n :] / matrix.gravity
-        entries = tuple((3 * n + k, float(x)) for k, x in enumerate(direction) if x)
+        direction = gravity / matrix.gravity
+        axes = np.flatnonzero(direction).tolist()
+        entries = tuple((len(offset) + k, float(direction[k])) for k in axes)
         lengths.append(Length("g", matrix.gravity, entries, Dimension(0, 1, -2)))
     return tuple(lengths)
 
@@ -345,21 +441,18 @@ def named_lengths(robot: Robot, matrix: Regrouping) -> tuple[Length, ...]:
 def offset_name(robot: Robot, body: int) -> str:
     """Return the name of the offset of a body: `l3`, or `l3_5` if body 3 has several children."""
     parent = robot.parent[body]
-    alone = robot.parent.count(parent) == 1
-    return f"l{parent + 1}" if alone else f"l{parent + 1}_{body + 1}"
+    is_only_child = robot.parent.count(parent) == 1
+    return f"l{parent + 1}" if is_only_child else f"l{parent + 1}_{body + 1}"
 
 
 def _tied(lengths: tuple[Length, ...], robot: Robot) -> Length:
     """Return several lengths that vary together: a whole offset, or multiples of the first."""
-    values = np.array([x.value for x in lengths])
-    bodies = {x.entries[0][0] // 3 for x in lengths}
-    whole = len(bodies) == 1
-    name = offset_name(robot, bodies.pop()) if whole else lengths[0].name
-    if whole and len(lengths) == 2:
-        name += "".join(x.name[-1] for x in lengths)
-    value = float(np.linalg.norm(values)) if whole else lengths[0].value
-    entries = tuple(
-        (x.entries[0][0], float(v / value))
-        for x, v in zip(lengths, values, strict=True)
-    )
+    values = [x.value for x in lengths]
+    name = lengths[0].name
+    value = lengths[0].value
+    if len({x.offset for x in lengths}) == 1:
+        axes = "".join(x.name[-1] for x in lengths) if len(lengths) == 2 else ""
+        name = offset_name(robot, lengths[0].offset) + axes
+        value = float(np.linalg.norm(values))
+    entries = tuple((x.entries[0][0], x.value / value) for x in lengths)
     return Length(name, value, entries, Dimension(0, 1, 0))

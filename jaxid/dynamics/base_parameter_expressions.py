@@ -5,6 +5,7 @@ products of lengths, or a number where there is no short form.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 
@@ -19,6 +20,32 @@ class Monomial:
     # names of the lengths and their exponents, which are not zero
     powers: tuple[tuple[str, int], ...] = ()
 
+    def divided_by(self, factor: "Monomial") -> "Monomial":
+        """Return the quotient of two monomials."""
+        exponents = dict(self.powers)
+        for name, exponent in factor.powers:
+            exponents[name] = exponents.get(name, 0) - exponent
+        powers = tuple((name, e) for name, e in exponents.items() if e)
+        return Monomial(self.number / factor.number, powers)
+
+    def quotient(self) -> tuple[list[str], list[str]]:
+        """Return the factors of numerator and denominator; the number must be positive."""
+        numerator, denominator = [], []
+        if isinstance(self.number, float):
+            numerator.append(f"{self.number:.6g}")
+        else:
+            # Factors of one are not written.
+            if self.number.numerator != 1:
+                numerator.append(str(self.number.numerator))
+            if self.number.denominator != 1:
+                denominator.append(str(self.number.denominator))
+        for name, exponent in self.powers:
+            size = abs(exponent)
+            power = name if size == 1 else f"{name}^{size}"
+            side = numerator if exponent > 0 else denominator
+            side.append(power)
+        return numerator, denominator
+
 
 @dataclass(frozen=True)
 class Coefficient:
@@ -29,41 +56,36 @@ class Coefficient:
     @property
     def symbols(self) -> tuple[str, ...]:
         """Names of the lengths that occur."""
-        return tuple(
-            dict.fromkeys(name for m in self.monomials for name, _ in m.powers)
-        )
+        names = (name for m in self.monomials for name, _ in m.powers)
+        return tuple(dict.fromkeys(names))
 
-    def factored(self) -> tuple[bool, Monomial, tuple[Monomial, ...]]:
-        """Return whether it is negative, its common factor, and the remaining sum."""
-        numbers = [m.number for m in self.monomials]
-        common = Fraction(1)
-        if all(isinstance(x, Fraction) for x in numbers):
-            fractions = [Fraction(x) for x in numbers]
-            common = Fraction(
-                math.gcd(*(x.numerator for x in fractions)),
-                math.lcm(*(x.denominator for x in fractions)),
-            )
-        elif len(numbers) == 1:
-            common = abs(numbers[0])
-        negative = numbers[0] < 0
+    @property
+    def is_negative(self) -> bool:
+        """Whether the first monomial is negative."""
+        return self.monomials[0].number < 0
+
+    def common_factor(self) -> Monomial:
+        """Return the positive factor that all monomials have in common."""
         exponents = [dict(m.powers) for m in self.monomials]
-        least = {s: min(e.get(s, 0) for e in exponents) for s in self.symbols}
-        rest = tuple(
-            Monomial(
-                (-m.number if negative else m.number) / common,
-                tuple(
-                    (s, e.get(s, 0) - least[s])
-                    for s in least
-                    if e.get(s, 0) != least[s]
-                ),
-            )
-            for m, e in zip(self.monomials, exponents, strict=True)
-        )
-        return (
-            negative,
-            Monomial(common, tuple((s, e) for s, e in least.items() if e)),
-            rest,
-        )
+        smallest = {s: min(e.get(s, 0) for e in exponents) for s in self.symbols}
+        powers = tuple((name, e) for name, e in smallest.items() if e)
+        return Monomial(_common_number([m.number for m in self.monomials]), powers)
+
+    def factored(self) -> tuple[Monomial, tuple[Monomial, ...]]:
+        """Return the common factor, and the remaining sum, whose first sign is positive."""
+        factor = self.common_factor()
+        sign = -1 if self.is_negative else 1
+        divisor = Monomial(sign * factor.number, factor.powers)
+        return factor, tuple(m.divided_by(divisor) for m in self.monomials)
+
+
+def _common_number(numbers: Sequence[Number]) -> Number:
+    """Return the largest number of which all are whole multiples; 1 for several floats."""
+    fractions = [x for x in numbers if isinstance(x, Fraction)]
+    if len(fractions) == len(numbers):
+        numerator = math.gcd(*(x.numerator for x in fractions))
+        return Fraction(numerator, math.lcm(*(x.denominator for x in fractions)))
+    return abs(numbers[0]) if len(numbers) == 1 else Fraction(1)
 
 
 @dataclass(frozen=True)
@@ -81,65 +103,49 @@ class Expression:
 
     def __str__(self):
         # Parameters that share a factor are put in one bracket, at the place of the
-        # first of them.
+        # first of them. A parameter without a factor stands alone.
         groups: dict[tuple, list[tuple[bool, str]]] = {}
         for name, coefficient in self.terms:
-            negative, factor, rest = coefficient.factored()
-            alone = coefficient.symbols == () and factor.number == 1
-            key = (factor, rest, name if alone else "")
-            groups.setdefault(key, []).append((negative, name))
-        return _sum([_part(factor, rest, g) for (factor, rest, _), g in groups.items()])
+            factor, remainder = coefficient.factored()
+            is_one = not coefficient.symbols and factor.number == 1
+            key = (factor, remainder, name if is_one else "")
+            groups.setdefault(key, []).append((coefficient.is_negative, name))
+
+        parts = []
+        for (factor, remainder, _), members in groups.items():
+            is_negative = members[0][0]
+            signs = [(sign != is_negative, name) for sign, name in members]
+            parts.append((is_negative, _write_product(factor, remainder, signs)))
+        return _write_sum(parts)
 
 
-def _part(
-    factor: Monomial, rest: tuple[Monomial, ...], members: list[tuple[bool, str]]
-) -> tuple[bool, str]:
-    """Return whether a group of parameters with one factor is negative, and its text."""
-    negative = members[0][0]
-    names = _sum([(sign != negative, name) for sign, name in members])
-    above, below = _factors(factor)
-    if len(rest) > 1:
-        inner = (
-            (m.number < 0, _factors(Monomial(abs(m.number), m.powers))) for m in rest
-        )
-        above.append(
-            f"({_sum([(sign, _product(*factors)) for sign, factors in inner])})"
-        )
-    return negative, _product(
-        [*above, f"({names})" if len(members) > 1 else names], below
-    )
+def _write_product(
+    factor: Monomial, remainder: Sequence[Monomial], members: list[tuple[bool, str]]
+) -> str:
+    """Write a factor times a sum of monomials times a sum of parameters with their signs."""
+    numerator, denominator = factor.quotient()
+    if len(remainder) > 1:
+        monomials = []
+        for m in remainder:
+            size = Monomial(abs(m.number), m.powers)
+            monomials.append((m.number < 0, _write_quotient(*size.quotient())))
+        numerator.append(f"({_write_sum(monomials)})")
+    names = _write_sum(members)
+    numerator.append(f"({names})" if len(members) > 1 else names)
+    return _write_quotient(numerator, denominator)
 
 
-def _factors(monomial: Monomial) -> tuple[list[str], list[str]]:
-    """Return numerator and denominator; the number must not be negative."""
-    above, below = [], []
-    if isinstance(monomial.number, Fraction):
-        above += (
-            [str(monomial.number.numerator)] if monomial.number.numerator != 1 else []
-        )
-        below += (
-            [str(monomial.number.denominator)]
-            if monomial.number.denominator != 1
-            else []
-        )
-    else:
-        above.append(f"{monomial.number:.6g}")
-    for name, exponent in monomial.powers:
-        power = name if abs(exponent) == 1 else f"{name}^{abs(exponent)}"
-        (above if exponent > 0 else below).append(power)
-    return above, below
-
-
-def _product(above: list[str], below: list[str]) -> str:
-    text = "*".join(above) or "1"
-    if not below:
+def _write_quotient(numerator: list[str], denominator: list[str]) -> str:
+    """Write the quotient of two products of factors."""
+    text = "*".join(numerator) or "1"
+    if not denominator:
         return text
-    return f"{text}/{below[0]}" if len(below) == 1 else f"{text}/({'*'.join(below)})"
+    divisor = "*".join(denominator)
+    return f"{text}/({divisor})" if len(denominator) > 1 else f"{text}/{divisor}"
 
 
-def _sum(parts: list[tuple[bool, str]]) -> str:
-    text = ""
-    for negative, part in parts:
-        sign = ("-" if negative else "") if not text else (" - " if negative else " + ")
-        text += sign + part
-    return text
+def _write_sum(parts: list[tuple[bool, str]]) -> str:
+    """Write a sum of parts, each of them with whether it is negative."""
+    text = "".join(f" {'-' if negative else '+'} {part}" for negative, part in parts)
+    # A minus in front stands without a space, a plus is left out.
+    return text.removeprefix(" + ") if text.startswith(" + ") else f"-{text[3:]}"

@@ -46,17 +46,18 @@ class OpenModel(eqx.Module):
     def call(self, numbers: Float[AnyArray, " numbers"], *arguments: AnyArray) -> Array:
         """Call the method of the model with these numbers."""
         leaves, structure = jax.tree.flatten(self.model)
-        begun = 0
+        start = 0
         for leaf, positions in self.places:
-            fixed = leaves[leaf]
-            order = np.arange(fixed.size)
-            order[list(positions)] = fixed.size + np.arange(len(positions))
-            own = numbers[begun : begun + len(positions)]
-            leaves[leaf] = jnp.concatenate([fixed.ravel(), own])[order].reshape(
-                fixed.shape
-            )
-            begun += len(positions)
-        return getattr(jax.tree.unflatten(structure, leaves), self.method)(*arguments)
+            constants = leaves[leaf]
+            stop = start + len(positions)
+            # Each entry of the leaf is one of its constants, or one of the numbers.
+            order = np.arange(constants.size)
+            order[list(positions)] = constants.size + np.arange(len(positions))
+            entries = jnp.concatenate([constants.ravel(), numbers[start:stop]])
+            leaves[leaf] = entries[order].reshape(constants.shape)
+            start = stop
+        model = jax.tree.unflatten(structure, leaves)
+        return getattr(model, self.method)(*arguments)
 
 
 def opened(
@@ -67,41 +68,44 @@ def opened(
     All other numbers stay constants of a program. The numbers are those of each model.
     """
     leaves, structure = jax.tree.flatten(model)
-    each = [leaves, *map(jax.tree.leaves, others)]
-    places, numbers = [], []
-    for k, values in enumerate(zip(*each, strict=True)):
-        traced = is_traced(values)
-        if traced:
-            leaves[k] = np.zeros(np.shape(values[0]), values[0].dtype)
+    leaves_of_models = [leaves, *map(jax.tree.leaves, others)]
+    places = []
+    numbers: list[AnyArray] = [np.zeros((len(leaves_of_models), 0))]
+    for k, values in enumerate(zip(*leaves_of_models, strict=True)):
+        if is_traced(values):
+            stack = jnp.stack
+            leaves[k] = np.zeros(values[0].shape, values[0].dtype)
             positions = np.arange(leaves[k].size)
         else:
+            stack = np.stack
             rows = np.array([np.ravel(x) for x in values])
             positions = np.flatnonzero((rows != rows[0]).any(axis=0))
         if len(positions):
-            stack = jnp.stack if traced else np.stack
-            numbers.append(stack([x.ravel()[positions] for x in values]))
             places.append((k, tuple(positions.tolist())))
-    closed = jax.tree.unflatten(structure, leaves)
-    join = jnp.concatenate if is_traced(numbers) else np.concatenate
-    together = join([np.zeros((len(each), 0)), *numbers], axis=1)
-    return OpenModel(closed, method, tuple(places)), together
+            numbers.append(stack([x.ravel()[positions] for x in values]))
+    closed_model = jax.tree.unflatten(structure, leaves)
+    concatenate = jnp.concatenate if is_traced(numbers) else np.concatenate
+    return OpenModel(closed_model, method, tuple(places)), concatenate(numbers, axis=1)
 
 
-FEW = 4096
+MAX_SAMPLES_IN_NUMPY = 4096
 """Number of samples up to which NumPy is faster than compiling and running XLA."""
-KEPT = 64
+CACHE_SIZE = 64
 """Number of programs that are kept, of the models that were used last."""
-LONG = {"inertia": 16, "acceleration": 16}
-"""Joints beyond which the program of a method, which grows with their square, is not compiled."""
+MAX_JOINTS = {"inertia": 16, "acceleration": 16}
+"""Joints up to which the program of a method, which grows with their square, is compiled."""
 
 
 def spatial_form(owner: Any) -> Any:
     """Return a model, or what holds one, whose methods for one sample are few array operations."""
 
-    def has(x: Any) -> bool:
-        return hasattr(x, "spatial_form")
+    def has_spatial_form(part: Any) -> bool:
+        return hasattr(part, "spatial_form")
 
-    return jax.tree.map(lambda x: x.spatial_form if has(x) else x, owner, is_leaf=has)
+    def transform(part: Any) -> Any:
+        return part.spatial_form if has_spatial_form(part) else part
+
+    return jax.tree.map(transform, owner, is_leaf=has_spatial_form)
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,12 +125,14 @@ class SampleMethod:
     def program(self) -> Program:
         """Program of the method, traced when first needed."""
         derive = getattr(self.owner, "derived_program", None)
-        name, shapes = self.definition.__name__, self.shapes
-        program = None if derive is None else derive(name, *shapes)
-        return trace(self.definition, *shapes) if program is None else program
+        if derive is not None:
+            program = derive(self.definition.__name__, *self.shapes)
+            if program is not None:
+                return program
+        return trace(self.definition, *self.shapes)
 
     @functools.cached_property
-    def plain(self) -> Callable:
+    def spatial_definition(self) -> Callable:
         """The method in spatial form; a function that is no method of the owner, as it is."""
         if getattr(self.definition, "__self__", None) is not self.owner:
             return self.definition
@@ -134,26 +140,29 @@ class SampleMethod:
 
     @property
     def is_long(self) -> bool:
-        """Whether the spatial form takes the place of the program, which would be long."""
+        """Whether the spatial form is used instead of the program, which would be long."""
+        if self.spatial_definition is self.definition:
+            return False
         joints = self.shapes[-1][0]
-        is_own = self.plain is not self.definition
         name = getattr(self.owner, "method", self.definition.__name__)
-        return is_own and joints > LONG.get(name, math.inf)
+        return joints > MAX_JOINTS.get(name, math.inf)
 
     @functools.cached_property
     def output_shape(self) -> tuple[int, ...]:
         """Shape of the result for one sample."""
         if not self.is_long:
             return self.program.output_shapes[0]
-        samples = [jnp.zeros(x) for x in self.shapes]
-        return jax.eval_shape(lambda *x: self.plain(*x), *samples).shape
+        sample = [jnp.zeros(shape) for shape in self.shapes]
+        return jax.eval_shape(lambda *x: self.spatial_definition(*x), *sample).shape
 
     @functools.cached_property
     def on_rows(self) -> Callable:
         """The method on rows of samples: [samples, ...] from arrays as in `on_rows`."""
-        run = plain = functools.partial(plain_rows, self.plain)
+        run = spatial = functools.partial(definition_on_rows, self.spatial_definition)
         if not self.is_long:
-            run = with_derivatives_of(plain, functools.partial(on_rows, self.program))
+            # The program is the fastest; its derivatives are those of the spatial form.
+            program = functools.partial(on_rows, self.program)
+            run = with_derivatives_of(spatial, program)
         return lambda *arrays: run(*arrays).reshape(-1, *self.output_shape)
 
     @functools.cached_property
@@ -162,23 +171,29 @@ class SampleMethod:
         return jax.jit(self.on_rows)
 
 
-def plain_rows(plain: Callable, *arrays: Array) -> Float[Array, "samples out"]:
+def definition_on_rows(
+    definition: Callable, *arrays: Array
+) -> Float[Array, "samples out"]:
     """Apply a function of one sample to arrays as in `on_rows`, in memory that does not grow."""
 
-    def one(parts: list[Array]) -> Array:
-        own = iter(parts)
-        return jnp.ravel(plain(*(next(own) if x.ndim == 2 else x for x in arrays)))
-
-    samples = [x for x in arrays if x.ndim == 2]
-    if len(samples[0]) == 1:
-        return one([x[0] for x in samples])[None]
+    def on_one_sample(rows: list[Array]) -> Array:
+        remaining = iter(rows)
+        arguments = [next(remaining) if x.ndim == 2 else x for x in arrays]
+        return jnp.ravel(definition(*arguments))
 
     def in_blocks(samples: list[Array]) -> Array:
-        return jax.lax.map(jax.checkpoint(one), samples, batch_size=BLOCK)
+        # Without checkpoints a gradient would store the intermediates of all blocks.
+        on_block = jax.checkpoint(on_one_sample)
+        return jax.lax.map(on_block, samples, batch_size=BLOCK)
 
-    if len(samples[0]) <= BLOCK:
-        return jax.vmap(one)(samples)
-    return jax.lax.platform_dependent(samples, cpu=in_blocks, default=jax.vmap(one))
+    samples = [x for x in arrays if x.ndim == 2]
+    count = len(samples[0])
+    if count == 1:
+        return on_one_sample([x[0] for x in samples])[None]
+    at_once = jax.vmap(on_one_sample)
+    if count <= BLOCK:
+        return at_once(samples)
+    return jax.lax.platform_dependent(samples, cpu=in_blocks, default=at_once)
 
 
 _methods: OrderedDict[tuple, SampleMethod] = OrderedDict()
@@ -193,7 +208,7 @@ def method_of(
     with _lock:
         method = _methods.setdefault(key, SampleMethod(owner, definition, shapes))
         _methods.move_to_end(key)
-        while len(_methods) > KEPT:
+        while len(_methods) > CACHE_SIZE:
             _methods.popitem(last=False)
     return method
 
@@ -218,76 +233,105 @@ def on_samples(
     axes too.
     """
     if is_traced(owner):
-        owner, (numbers,) = opened(definition.__name__, owner)
-        definition, shared = owner.call, (numbers, *shared)
+        model, (numbers,) = opened(definition.__name__, owner)
+        return on_samples(model, model.call, *samples, shared=(numbers, *shared))
+
     arrays = [*(as_array("p", x) for x in shared), *samples]
+    batch = _batch_shape(arrays)
+    method = method_of(owner, definition, *(x.shape[-1:] for x in arrays))
+    dtype = jnp.result_type(*(x.dtype for x in arrays), float)
+    in_jax = [x for x in arrays if isinstance(x, jax.Array)]
+    if is_traced(arrays):
+        inputs = [jnp.asarray(x, dtype) for x in arrays]
+        return _over_batches(method.on_rows, batch, inputs, len(shared))
+
+    devices = {device for x in in_jax for device in x.devices()}
+    is_on_one_cpu = len(devices) <= 1 and all(d.platform == "cpu" for d in devices)
+    is_small = math.prod(batch) <= MAX_SAMPLES_IN_NUMPY and not method.is_long
+    if is_small and is_on_one_cpu:
+        rows = _rows_in_numpy(method.program, arrays, batch)
+        results = rows.reshape((*batch, *method.output_shape))
+        with jax.default_device(*devices or (None,)):
+            return jnp.asarray(results, dtype) if in_jax else results
+
+    inputs = [jnp.asarray(x, dtype) for x in arrays]
+    results = _over_batches(method.compiled, batch, inputs, len(shared))
+    return results if in_jax else np.asarray(results)
+
+
+def _batch_shape(arrays: list[AnyArray]) -> tuple[int, ...]:
+    """Return the shape to which the leading axes of arrays are broadcast."""
     try:
-        batch = np.broadcast_shapes(*(x.shape[:-1] for x in arrays))
+        return np.broadcast_shapes(*(x.shape[:-1] for x in arrays))
     except ValueError:
         shapes = ", ".join(str(x.shape) for x in arrays)
         raise InputError(
             "leading axes of parameters and motion must fit each other, but shapes "
             f"are {shapes}."
         ) from None
-    shapes = tuple(x.shape[-1:] for x in arrays)
-    method = method_of(owner, definition, *shapes)
-    in_jax = [x for x in arrays if isinstance(x, jax.Array)]
-    known = not is_traced(arrays)
-    few = known and not method.is_long and math.prod(batch) <= FEW
-    devices = {d for x in in_jax for d in x.devices()} if known else set()
-    dtype = jnp.result_type(*(x.dtype for x in arrays), float)
-    if few and len(devices) <= 1 and all(d.platform == "cpu" for d in devices):
-        out = _in_numpy(method.program, arrays, batch).reshape(
-            (*batch, *method.output_shape)
-        )
-        with jax.default_device(*devices or (None,)):
-            return jnp.asarray(out, dtype) if in_jax else out
-    run = method.compiled if known else method.on_rows
-    out = _over_batches(
-        run, batch, [jnp.asarray(x, dtype) for x in arrays], len(shared)
-    )
-    return np.asarray(out) if known and not in_jax else out
 
 
-def _in_numpy(program: Program, arrays: list, batch: tuple[int, ...]) -> np.ndarray:
-    """Return the packed results [samples, results] in NumPy, in the precision of the arrays."""
+def _rows_in_numpy(
+    program: Program, arrays: list[AnyArray], batch: tuple[int, ...]
+) -> Float[np.ndarray, "samples results"]:
+    """Return the packed results of all samples in NumPy, in the precision of the arrays."""
+    inputs = []
+    for x in arrays:
+        entries = np.moveaxis(np.asarray(x, np.float64), -1, 0)
+        absent_axes = (1,) * (len(batch) + 1 - x.ndim)
+        inputs.append(entries.reshape(len(entries), *absent_axes, *entries.shape[1:]))
+
+    distinct = evaluate_rows(program, *inputs)
+    entries = np.arange(len(program.outputs))
     dtype = np.result_type(*(x.dtype for x in arrays), np.float32)
-    given = [np.moveaxis(np.asarray(x, np.float64), -1, 0) for x in arrays]
-    rank = len(batch) + 1
-    given = [x.reshape(len(x), *(1,) * (rank - x.ndim), *x.shape[1:]) for x in given]
-    rows, entries = evaluate_rows(program, *given), np.arange(len(program.outputs))
-    out = np.empty((rows.shape[1], len(entries)), dtype)
-    for start in range(0, len(out), BLOCK):
-        part = slice(start, start + BLOCK)
-        out[part] = packed_entries(program, rows[:, part], entries).T
-    return out
+    results = np.empty((distinct.shape[1], len(entries)), dtype)
+    # Blocks stay in the processor's cache while they are transposed.
+    for start in range(0, len(results), BLOCK):
+        block = slice(start, start + BLOCK)
+        results[block] = packed_entries(program, distinct[:, block], entries).T
+    return results
 
 
 def _over_batches(
     run: Callable, batch: tuple[int, ...], arrays: list[Array], shared: int
 ) -> Array:
-    """Apply a function of rows of samples, by `vmap` over the leading axes of parameters."""
-    ranks = [x.ndim - 1 for x in arrays[:shared]]
-    if not any(ranks):
-        rows = [jnp.broadcast_to(x, (*batch, x.shape[-1])) for x in arrays[shared:]]
-        rows = [x.reshape(math.prod(batch), x.shape[-1]) for x in rows]
-        out = run(*arrays[:shared], *rows)
-        return out if len(batch) == 1 else out.reshape((*batch, *out.shape[1:]))
-    rank = len(batch)
-    full = [x.reshape(*(1,) * (rank + 1 - x.ndim), *x.shape) for x in arrays]
-    axes = [0 if x.shape[0] > 1 else None for x in full]
-    inner = [x if a == 0 else x[0] for x, a in zip(full, axes, strict=True)]
-    if all(a is None for a in axes):
-        return _over_batches(run, batch[1:], inner, shared)[None]
+    """Apply a function of rows of samples, by `vmap` over the leading axes of parameters.
 
-    def one(*parts: Array) -> Array:
-        given = [
+    The first arrays, of this number, are parameters; the others are samples.
+    """
+    if all(x.ndim == 1 for x in arrays[:shared]):
+        return _over_samples(run, batch, arrays[:shared], arrays[shared:])
+
+    rank = len(batch) + 1
+    arrays = [x.reshape((1,) * (rank - x.ndim) + x.shape) for x in arrays]
+    axes = [0 if len(x) > 1 else None for x in arrays]
+    parts = [x if axis == 0 else x[0] for x, axis in zip(arrays, axes, strict=True)]
+    if all(axis is None for axis in axes):
+        return _over_batches(run, batch[1:], parts, shared)[None]
+
+    def over_other_axes(*parts: Array) -> Array:
+        # Parameters that have no other batch are vectors again.
+        vectors = [
             x.reshape(x.shape[-1:]) if math.prod(x.shape[:-1]) == 1 else x
             for x in parts
         ]
-        return _over_batches(run, batch[1:], given, shared)
+        return _over_batches(run, batch[1:], vectors, shared)
 
-    return jax.vmap(one, axes)(*inner)
+    return jax.vmap(over_other_axes, axes)(*parts)
+
+
+def _over_samples(
+    run: Callable, batch: tuple[int, ...], parameters: list[Array], samples: list[Array]
+) -> Array:
+    """Apply a function of rows to samples of any batch shape, with parameters in common."""
+    rows = []
+    for x in samples:
+        size = x.shape[-1]
+        rows.append(jnp.broadcast_to(x, (*batch, size)).reshape(math.prod(batch), size))
+    results = run(*parameters, *rows)
+    if len(batch) == 1:
+        return results
+    return results.reshape((*batch, *results.shape[1:]))
 
 
 def in_numpy(
@@ -297,11 +341,13 @@ def in_numpy(
     shared: tuple[AnyArray, ...] = (),
 ) -> np.ndarray:
     """Apply a method for one sample to rows of samples in NumPy: float64, never compiled."""
-    arguments = [np.asarray(x, np.float64) for x in shared]
-    arguments += [np.asarray(x, np.float64).T for x in samples]
-    shapes = (*(x.shape for x in shared), *(x.shape[1:] for x in samples))
-    out = evaluate(program_of(owner, definition, *shapes), *arguments)
-    return np.moveaxis(np.broadcast_to(out, (*out.shape[:-1], len(samples[0]))), -1, 0)
+    parameters = [np.asarray(x, np.float64) for x in shared]
+    columns = [np.asarray(x, np.float64).T for x in samples]
+    shapes = [x.shape for x in parameters] + [x.shape[:1] for x in columns]
+    results = evaluate(program_of(owner, definition, *shapes), *parameters, *columns)
+    # A result that does not depend on the samples is the same for all of them.
+    results = np.broadcast_to(results, (*results.shape[:-1], len(samples[0])))
+    return np.moveaxis(results, -1, 0)
 
 
 def solve_symmetric(A: Float[AnyArray, "joints joints"], b: Joints) -> Joints:
@@ -310,20 +356,23 @@ def solve_symmetric(A: Float[AnyArray, "joints joints"], b: Joints) -> Joints:
     Only the lower triangle of A, which is definite, is read. A program has no loops.
     """
     n = b.shape[0]
-    scaled = [[A[i, j] for j in range(i + 1)] for i in range(n)]
-    lower_rows = [[A[i, j] for j in range(i)] for i in range(n)]
+    L, LD = {}, {}
     for j in range(n):
         for i in range(j, n):
+            entry = A[i, j]
             for k in range(j):
-                scaled[i][j] = scaled[i][j] - scaled[i][k] * lower_rows[j][k]
+                entry = entry - LD[i, k] * L[j, k]
+            LD[i, j] = entry
             if i > j:
-                lower_rows[i][j] = scaled[i][j] / scaled[j][j]
+                L[i, j] = entry / LD[j, j]
+
     x = [b[i] for i in range(n)]
     for i in range(n):
         for k in range(i):
-            x[i] = x[i] - lower_rows[i][k] * x[k]
-    x = [x[i] / scaled[i][i] for i in range(n)]
+            x[i] = x[i] - L[i, k] * x[k]
+    for i in range(n):
+        x[i] = x[i] / LD[i, i]
     for i in reversed(range(n)):
         for k in range(i + 1, n):
-            x[i] = x[i] - lower_rows[k][i] * x[k]
+            x[i] = x[i] - L[k, i] * x[k]
     return jnp.stack(x)

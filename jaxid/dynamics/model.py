@@ -16,7 +16,7 @@ from jaxid.robot.robot import Robot
 
 from . import projection_equation
 from .dispatch import on_samples, solve_symmetric, spatial_form
-from .motion import Motion
+from .motion import Motion, as_motion, as_state
 from .packed_regressor import PackedRegressor, gram
 from .terms import (
     AbstractTerm,
@@ -33,8 +33,9 @@ Parameters = Float[AnyArray, " standard"] | Sequence[float | int]
 DEFAULT_TERMS = (RigidBodies(), ViscousFriction(), CoulombFriction(), RotorInertia())
 
 
-def _has_memory(x: Any) -> bool:
-    return isinstance(x, Presliding)
+def _has_memory(part: Any) -> bool:
+    """Return whether a part of a term is the law of friction with memory."""
+    return isinstance(part, Presliding)
 
 
 class Model(Hashable):
@@ -61,9 +62,9 @@ class Model(Hashable):
         if not self.terms:
             raise InputError("`terms` must hold at least one term, but is empty.")
         if len(set(names)) != len(names):
-            twice = next(n for n in names if names.count(n) > 1)
+            name = next(name for name in names if names.count(name) > 1)
             raise InputError(
-                f"`terms` must not contribute the same parameter twice, but `{twice}` "
+                f"`terms` must not contribute the same parameter twice, but `{name}` "
                 "comes twice."
             )
 
@@ -101,10 +102,12 @@ class Model(Hashable):
                 f"`p` must hold {sum(sizes)} standard parameters, but has shape "
                 f"{p.shape}."
             )
-        ends = np.cumsum(sizes)
-        return [
-            (t, p[e - s : e]) for t, s, e in zip(self.terms, sizes, ends, strict=True)
-        ]
+        parts = []
+        start = 0
+        for term, size in zip(self.terms, sizes, strict=True):
+            parts.append((term, p[start : start + size]))
+            start += size
+        return parts
 
     @property
     def memory(self) -> Presliding | None:
@@ -113,11 +116,8 @@ class Model(Hashable):
         Raises:
             InputError: If terms have different lengths.
         """
-        laws = {
-            x
-            for x in jax.tree.leaves(self.terms, is_leaf=_has_memory)
-            if _has_memory(x)
-        }
+        parts = jax.tree.leaves(self.terms, is_leaf=_has_memory)
+        laws = {part for part in parts if _has_memory(part)}
         if len(laws) > 1:
             raise InputError("all terms with `Presliding` must have the same one.")
         return next(iter(laws), None)
@@ -125,16 +125,19 @@ class Model(Hashable):
     @property
     def input_shapes(self) -> list[tuple[int, ...]]:
         """Shapes of the arguments of `columns`."""
-        rest, law = np.zeros(self.robot.joints), self.memory
-        return [rest.shape] * 3 + ([] if law is None else [law.settled(rest).shape])
+        rest = np.zeros(self.robot.joints)
+        law = self.memory
+        states = [] if law is None else [law.settled(rest).shape]
+        return [rest.shape] * 3 + states
 
     def with_memory(self, **changes: Any) -> "Model":
         """Return the model with other fields of `memory`, such as `length` or `state`."""
-        leaves, tree = jax.tree.flatten(self.terms, is_leaf=_has_memory)
-        leaves = [
-            dataclasses.replace(x, **changes) if _has_memory(x) else x for x in leaves
-        ]
-        return dataclasses.replace(self, terms=jax.tree.unflatten(tree, leaves))
+
+        def change(part: Any) -> Any:
+            return dataclasses.replace(part, **changes) if _has_memory(part) else part
+
+        terms = jax.tree.map(change, self.terms, is_leaf=_has_memory)
+        return dataclasses.replace(self, terms=terms)
 
     def arguments(self, motion: Motion) -> tuple[AnyArray, ...]:
         """Return the arguments of `columns` at a motion: with the state if friction has memory.
@@ -143,13 +146,16 @@ class Model(Hashable):
         time.
         """
         self.check(motion.q)
-        law, qd, s = self.memory, motion.qd, motion.state
+        law = self.memory
+        state = motion.state
         if law is None:
-            return motion.q, qd, motion.qdd
-        if s is None:
-            s = law.settled(qd if qd.ndim == 1 else qd[..., 0, :])
-            s = s if qd.ndim == 1 else law.states(motion.q, s)
-        return motion.q, qd, motion.qdd, s
+            return motion.q, motion.qd, motion.qdd
+        if state is None and motion.qd.ndim == 1:
+            state = law.settled(motion.qd)
+        elif state is None:
+            start = law.settled(motion.qd[..., 0, :])
+            state = law.states(motion.q, start)
+        return motion.q, motion.qd, motion.qdd, state
 
     def columns(self, q, qd, qdd, s=None) -> Float[AnyArray, "joints standard"]:
         r"""Return the regressor $\Theta$ of one sample by definition (Eqs. 16, 18)."""
@@ -160,10 +166,9 @@ class Model(Hashable):
 
     def forces(self, p, q, qd, qdd, s=None) -> Joints:
         """Return the generalised forces of one sample by definition (Eqs. 11, 15)."""
-        own = self if s is None else self.with_memory(state=s)
-        return reduce(
-            add, (t.forces(self.robot, x, q, qd, qdd) for t, x in own.split(p))
-        )
+        model = self if s is None else self.with_memory(state=s)
+        parts = model.split(p)
+        return reduce(add, (t.forces(self.robot, x, q, qd, qdd) for t, x in parts))
 
     def inertia(self, p, q) -> Float[AnyArray, "joints joints"]:
         """Return the mass matrix of one sample by definition (Eq. 38)."""
@@ -193,11 +198,9 @@ class Model(Hashable):
         tool = self.robot.tool
         if tool is None:
             return jnp.zeros_like(q)
-        known = tool.parameters
-        bodies = range(self.robot.joints)
-        p = namespace(known).stack(
-            [known if i == tool.body else np.zeros(10) for i in bodies]
-        )
+        bodies = [np.zeros(10)] * self.robot.joints
+        bodies[tool.body] = tool.parameters
+        p = namespace(tool.parameters).stack(bodies)
         return projection_equation.rigid_body_forces(self.robot, p, q, qd, qdd)
 
     def regressor(self, motion: Motion) -> Float[AnyArray, "*batch joints standard"]:
@@ -237,15 +240,17 @@ class Model(Hashable):
         return gram(self, self.columns, weights, *self.arguments(motion))
 
     def inverse_dynamics(
-        self, p: Parameters, motion: Motion
+        self, p: Parameters, *motion: Motion | Coordinates
     ) -> Float[AnyArray, "*batch joints"]:
         r"""Return the generalised forces $\Theta p$ [N m or N], without forming $\Theta$ (Eq. 16).
 
         Args:
             p: Standard parameters.
-            motion: Joint motion at any number of instants.
+            motion: A motion at any number of instants, or joint coordinates, velocities
+                and accelerations.
         """
-        return on_samples(self, self.forces, *self.arguments(motion), shared=(p,))
+        arguments = self.arguments(as_motion(*motion))
+        return on_samples(self, self.forces, *arguments, shared=(p,))
 
     def mass_matrix(
         self, p: Parameters, q: Coordinates
@@ -259,36 +264,47 @@ class Model(Hashable):
         return on_samples(self, self.inertia, self.check(q), shared=(p,))
 
     def bias_forces(
-        self, p: Parameters, q: Coordinates, qd: Coordinates
+        self, p: Parameters, *state: Motion | Coordinates
     ) -> Float[AnyArray, "*batch joints"]:
         r"""Return the forces $h(q, \dot q)$ at zero acceleration [N m or N] (Eq. 38).
 
         Args:
             p: Standard parameters.
-            q: Joint coordinates [rad or m].
-            qd: Joint velocities [rad/s or m/s].
+            state: A motion, whose accelerations do not matter, or joint coordinates and
+                velocities.
         """
+        q, qd = as_state(*state)
         return on_samples(self, self.bias, self.check(q), self.check(qd), shared=(p,))
 
     def forward_dynamics(
-        self, p: Parameters, q: Coordinates, qd: Coordinates, forces: Coordinates
+        self, p: Parameters, *state_and_forces: Motion | Coordinates
     ) -> Float[AnyArray, "*batch joints"]:
         r"""Return the accelerations $M^{-1} (Q_m - h)$ that forces cause (Eq. 38).
 
         Args:
             p: Standard parameters of bodies that can exist.
-            q: Joint coordinates [rad or m].
-            qd: Joint velocities [rad/s or m/s].
-            forces: Generalised forces of the drives [N m or N].
+            state_and_forces: A motion, whose accelerations do not matter, or joint
+                coordinates and velocities; then the generalised forces of the drives
+                [N m or N].
         """
+        *state, forces = state_and_forces
+        q, qd = as_state(*state)
         samples = (self.check(x) for x in (q, qd, forces))
         return on_samples(self, self.acceleration, *samples, shared=(p,))
 
     def kinetic_energy(
-        self, p: Parameters, q: Coordinates, qd: Coordinates
+        self, p: Parameters, *state: Motion | Coordinates
     ) -> Float[AnyArray, "*batch"]:
-        r"""Return the kinetic energy $\frac12 \dot q^T M \dot q$ [J]."""
-        M, qd = self.mass_matrix(p, q), self.check(qd)
+        r"""Return the kinetic energy $\frac12 \dot q^T M \dot q$ [J].
+
+        Args:
+            p: Standard parameters.
+            state: A motion, whose accelerations do not matter, or joint coordinates and
+                velocities.
+        """
+        q, qd = as_state(*state)
+        M = self.mass_matrix(p, q)
+        qd = self.check(qd)
         return 0.5 * jnp.einsum("...i,...ij,...j->...", qd, M, qd)
 
     def potential_energy(
@@ -312,8 +328,7 @@ class Model(Hashable):
         if q.shape[-1:] != (self.robot.joints,):
             raise InputError(
                 f"`motion` must have {self.robot.joints} joints along its last axis, "
-                "but has shape "
-                f"{q.shape}."
+                f"but has shape {q.shape}."
             )
         return q
 
@@ -324,6 +339,7 @@ class SpatialModel(Model):
     def acceleration(self, p, q, qd, forces):
         """Return the accelerations of one sample that forces cause (Eq. 38)."""
         parts = [t.mass_and_bias(self.robot, x, q, qd) for t, x in self.split(p)]
-        masses, biases = zip(*parts, strict=True)
-        factor = jax.scipy.linalg.cho_factor(reduce(add, masses))
-        return jax.scipy.linalg.cho_solve(factor, forces - reduce(add, biases))
+        M = reduce(add, (mass for mass, _ in parts))
+        h = reduce(add, (bias for _, bias in parts))
+        factor = jax.scipy.linalg.cho_factor(M)
+        return jax.scipy.linalg.cho_solve(factor, forces - h)

@@ -37,3 +37,16 @@ class Motion(eqx.Module):
     def joints(self) -> int:
         """Number of joints."""
         return self.q.shape[-1]
+
+
+def as_motion(*motion: Any) -> Motion:
+    """Return a motion that is given as such, or as coordinates and their two derivatives."""
+    return motion[0] if isinstance(motion[0], Motion) else Motion(*motion)
+
+
+def as_state(*state: Any) -> tuple[Any, Any]:
+    """Return coordinates and velocities of a motion, or those that are given instead of it."""
+    if isinstance(state[0], Motion):
+        return state[0].q, state[0].qd
+    q, qd = state
+    return q, qd

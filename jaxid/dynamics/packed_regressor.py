@@ -24,7 +24,7 @@ from jaxid.program import (
 )
 from jaxid.program.blocks import row_products
 
-from .dispatch import FEW, KEPT, program_of
+from .dispatch import CACHE_SIZE, MAX_SAMPLES_IN_NUMPY, program_of
 
 
 class JointRegressor(eqx.Module):
@@ -39,54 +39,61 @@ class JointRegressor(eqx.Module):
         self, owner: eqx.Module, definition: Callable, *shapes: tuple[int, ...]
     ):
         self.program = program_of(owner, definition, *shapes)
-        rows = np.asarray(self.program.nonzeros)
-        self.columns = tuple(tuple(np.flatnonzero(row).tolist()) for row in rows)
-        self.size = rows.shape[1]
+        nonzeros = np.asarray(self.program.nonzeros)
+        self.columns = tuple(tuple(np.flatnonzero(row).tolist()) for row in nonzeros)
+        self.size = nonzeros.shape[1]
+
+    @property
+    def entries(self) -> tuple[tuple[int, ...], ...]:
+        """For each joint the positions of its columns in the packed result."""
+        return tuple(
+            tuple(joint * self.size + column for column in columns)
+            for joint, columns in enumerate(self.columns)
+        )
 
     def __call__(
-        self, *arrays: AnyArray, fence: bool | None = None
+        self, *arrays: AnyArray, fence: bool = False
     ) -> list[Float[Array, "*batch columns samples"]]:
         """Return the columns of each joint, from arguments whose batch and samples stand last."""
-        packed = lower(self.program, fence)(*arrays)
-        like = jnp.zeros(jnp.shape(arrays[0])[1:], jnp.result_type(*arrays, float))
+        values = lower(self.program, fence)(*arrays)
+        dtype = jnp.result_type(*arrays, float)
+        *batch, samples = jnp.shape(arrays[0])[1:]
 
-        def row(x: Array | float) -> Array:
-            return jnp.broadcast_to(jnp.asarray(x, like.dtype), like.shape)
-
-        none = jnp.zeros((*like.shape[:-1], 0, *like.shape[-1:]), like.dtype)
-        rows = [
-            [row(packed[joint * self.size + k]) for k in own]
-            for joint, own in enumerate(self.columns)
-        ]
-        return [jnp.stack(own, axis=-2) if own else none for own in rows]
+        joints = []
+        for entries in self.entries:
+            if not entries:
+                joints.append(jnp.zeros((*batch, 0, samples), dtype))
+                continue
+            columns = [jnp.asarray(values[entry], dtype) for entry in entries]
+            columns = [jnp.broadcast_to(x, (*batch, samples)) for x in columns]
+            joints.append(jnp.stack(columns, axis=-2))
+        return joints
 
     def gram(
         self, weights: AnyArray, *arrays: AnyArray
     ) -> Float[Array, "columns columns"]:
         r"""Return $\sum_k \Theta_k^T W^2 \Theta_k$ over samples, without storing the columns."""
-        groups = tuple(
-            tuple(j * self.size + k for k in own) for j, own in enumerate(self.columns)
-        )
-        whole = jnp.zeros((self.size, self.size), arrays[0].dtype)
-        sums = row_products(self.program, groups, *map(jnp.asarray, arrays))
-        for own, w, products in zip(self.columns, weights, sums, strict=True):
-            k = np.array(own, int)
-            whole = whole.at[k[:, None], k].add(w**2 * products)
-        return whole
+        products = row_products(self.program, self.entries, *map(jnp.asarray, arrays))
+        total = jnp.zeros((self.size, self.size), arrays[0].dtype)
+        for columns, weight, product in zip(
+            self.columns, weights, products, strict=True
+        ):
+            place = np.array(columns, int)
+            total = total.at[place[:, None], place].add(weight**2 * product)
+        return total
 
     def in_numpy(self, *arrays: AnyArray) -> list[Float[np.ndarray, "columns samples"]]:
         """Return the columns of each joint, evaluated in NumPy."""
-        batch, program, found = np.shape(arrays[0])[1:], self.program, []
-        rows = evaluate_rows(program, *arrays)
-        for joint, own in enumerate(self.columns):
-            entries = joint * self.size + np.array(own, int)
-            found.append(
-                packed_entries(program, rows, entries).reshape(len(own), *batch)
-            )
-        return found
+        batch = np.shape(arrays[0])[1:]
+        distinct = evaluate_rows(self.program, *arrays)
+        joints = []
+        for entries in self.entries:
+            values = packed_entries(self.program, distinct, np.array(entries, int))
+            joints.append(values.reshape(len(entries), *batch))
+        return joints
 
 
-@functools.lru_cache(maxsize=KEPT)
+@functools.lru_cache(maxsize=CACHE_SIZE)
 def _compiled_gram(regressor: JointRegressor) -> Callable:
     return jax.jit(regressor.gram)
 
@@ -95,9 +102,9 @@ def gram(
     owner: eqx.Module, definition: Callable, weights: AnyArray | None, *arrays: AnyArray
 ) -> Float[Array, "columns columns"]:
     """Return the Gram matrix of a model's columns over a motion; see `Model.gram`."""
-    n = _require_rows(owner, arrays[0])
-    weights = np.ones(n) if weights is None else as_array("weights", weights)
-    regressor = JointRegressor(owner, definition, *((n,) for _ in arrays))
+    joints = _require_rows(owner, arrays[0])
+    weights = np.ones(joints) if weights is None else as_array("weights", weights)
+    regressor = JointRegressor(owner, definition, *((joints,) for _ in arrays))
     run = regressor.gram if is_traced(arrays, weights) else _compiled_gram(regressor)
     return run(jnp.asarray(weights, arrays[0].dtype), *arrays)
 
@@ -138,11 +145,12 @@ class PackedRegressor(eqx.Module):
         arrays = [x.T for x in samples]
         program = program_of(owner, definition, *(x.shape[:1] for x in arrays))
         self.places = _places(program)
-        self.samples, self.columns = len(samples[0]), program.output_shapes[0][1]
-        many = self.samples > FEW or is_traced(arrays)
-        self.values = tuple(
-            _compiled(program)(*arrays) if many else evaluate_rows(program, *arrays)
-        )
+        self.samples = len(samples[0])
+        self.columns = program.output_shapes[0][1]
+        if self.samples > MAX_SAMPLES_IN_NUMPY or is_traced(arrays):
+            self.values = tuple(_compiled(program)(*arrays))
+        else:
+            self.values = tuple(evaluate_rows(program, *arrays))
 
     def matrix(self) -> Float[np.ndarray, "rows columns"]:
         """Return the whole matrix in Fortran's order: all samples of joint 1, of joint 2, etc.
@@ -150,26 +158,30 @@ class PackedRegressor(eqx.Module):
         `packed.matrix().reshape(joints, samples, columns)` is a view by joint and
         sample.
         """
-        dtype = np.result_type(*(x.dtype for x in self.values), np.float32)
-        out = np.zeros((self.columns, len(self.places), self.samples), dtype)
         values = jax.device_get(self.values)
+        dtype = np.result_type(*(x.dtype for x in self.values), np.float32)
+        matrix = np.zeros((self.columns, len(self.places), self.samples), dtype)
         for joint, places in enumerate(self.places):
-            for k, x in places:
-                out[k, joint] = values[x] if isinstance(x, int) else x
-        return out.reshape(self.columns, -1).T
+            for column, place in places:
+                constant = isinstance(place, float)
+                matrix[column, joint] = place if constant else values[place]
+        return matrix.reshape(self.columns, -1).T
 
 
-@functools.lru_cache(maxsize=KEPT)
+@functools.lru_cache(maxsize=CACHE_SIZE)
 def _places(program: Program) -> tuple[tuple[tuple[int, int | float], ...], ...]:
     """Return the `places` of a packed regressor; what is always zero has none."""
-    entries = program.pack(range(len(program.distinct[0])))
-    rows = np.array(entries, object).reshape(program.output_shapes[0])
-    return tuple(
-        tuple((k, x) for k, x in enumerate(row) if isinstance(x, int) or x != 0)
-        for row in rows
-    )
+    numbers = range(len(program.distinct[0]))
+    entries = np.array(program.pack(numbers), object).reshape(program.output_shapes[0])
+    places = []
+    for row in entries:
+        # An `int` numbers an array of values, a `float` is a constant.
+        is_nonzero = [isinstance(x, int) or x != 0 for x in row]
+        columns = np.flatnonzero(is_nonzero).tolist()
+        places.append(tuple((column, row[column]) for column in columns))
+    return tuple(places)
 
 
-@functools.lru_cache(maxsize=KEPT)
+@functools.lru_cache(maxsize=CACHE_SIZE)
 def _compiled(program: Program) -> Callable:
     return jax.jit(functools.partial(on_any_platform, program, Lowered.distinct))

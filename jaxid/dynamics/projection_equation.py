@@ -37,12 +37,18 @@ def body_motions(
         a, w, wd = motions[parent] if parent >= 0 else ground
         R, r = placement_in_parent(robot, i, q[i])
         axis = robot.axis[i]
+        # The parent carries the body ...
         a = R.T @ (a + (skew(wd) + skew(w) @ skew(w)) @ r)
-        w, wd = R.T @ w, R.T @ wd
+        w_parent = R.T @ w
+        wd_parent = R.T @ wd
+        # ... and the joint moves it relative to the parent.
         if robot.revolute[i]:
-            w, wd = w + axis * qd[i], wd + axis * qdd[i] + jnp.cross(w, axis) * qd[i]
+            w = w_parent + axis * qd[i]
+            wd = wd_parent + axis * qdd[i] + jnp.cross(w_parent, axis) * qd[i]
         else:
-            a = a + axis * qdd[i] + 2.0 * jnp.cross(w, axis) * qd[i]
+            w = w_parent
+            wd = wd_parent
+            a = a + axis * qdd[i] + 2.0 * jnp.cross(w_parent, axis) * qd[i]
         motions.append((a, w, wd))
     return motions
 
@@ -123,41 +129,47 @@ def rigid_body_mass_matrix(
     """
     n = robot.joints
     frames = [placement_in_parent(robot, i, q[i]) for i in range(n)]
-    composite = [(p[i][0], p[i][1:4], inertia_tensor(p[i][4:])) for i in range(n)]
-    M: list[list] = [[np.zeros(()) for _ in range(n)] for _ in range(n)]
+    bodies = composite_bodies(robot, p, frames)
+    M: list[list] = [[jnp.zeros(())] * n for _ in range(n)]
     for i in reversed(range(n)):
-        m, h, J = composite[i]
+        m, h, J = bodies[i]
         axis = robot.axis[i]
-        force, moment = (
-            (-jnp.cross(h, axis), J @ axis)
-            if robot.revolute[i]
-            else (m * axis, jnp.cross(h, axis))
-        )
+        if robot.revolute[i]:
+            force = -jnp.cross(h, axis)
+            moment = J @ axis
+        else:
+            force = m * axis
+            moment = jnp.cross(h, axis)
         j = i
-        while True:
-            M[i][j] = M[j][i] = jnp.dot(
-                robot.axis[j], moment if robot.revolute[j] else force
-            )
+        while j >= 0:
+            component = moment if robot.revolute[j] else force
+            M[i][j] = M[j][i] = jnp.dot(robot.axis[j], component)
             R, r = frames[j]
-            j = robot.parent[j]
-            if j < 0:
-                break
             force = R @ force
             moment = R @ moment + jnp.cross(r, force)
+            j = robot.parent[j]
+    return jnp.stack([jnp.stack(row) for row in M])
+
+
+def composite_bodies(
+    robot: Robot, p: Float[AnyArray, "joints 10"], frames: list[tuple]
+) -> list[tuple[AnyArray, Vector, Float[AnyArray, "3 3"]]]:
+    """Return mass, first moment and inertia of all that each joint carries, in its body's frame."""
+    n = robot.joints
+    bodies = [(p[i][0], p[i][1:4], inertia_tensor(p[i][4:])) for i in range(n)]
+    for i in reversed(range(n)):
         parent = robot.parent[i]
-        if parent >= 0:
-            R, r = frames[i]
-            h = R @ h
-            # Steiner, with r x h terms since h is measured from the old origin.
-            J = (
-                R @ J @ R.T
-                - skew(r) @ skew(h)
-                - skew(h) @ skew(r)
-                - m * (skew(r) @ skew(r))
-            )
-            mp, hp, Jp = composite[parent]
-            composite[parent] = (mp + m, hp + h + m * r, Jp + J)
-    return jnp.stack([jnp.stack([jnp.asarray(x) for x in row]) for row in M])
+        if parent < 0:
+            continue
+        m, h, J = bodies[i]
+        R, r = frames[i]
+        h = R @ h
+        # Steiner, with r x h terms since h is measured from the body's own origin.
+        shift = skew(r) @ skew(h) + skew(h) @ skew(r) + m * (skew(r) @ skew(r))
+        J = R @ J @ R.T - shift
+        m_parent, h_parent, J_parent = bodies[parent]
+        bodies[parent] = (m_parent + m, h_parent + h + m * r, J_parent + J)
+    return bodies
 
 
 def potential_energy_columns(robot: Robot, q: Joints) -> Float[AnyArray, "joints 10"]:

@@ -47,35 +47,34 @@ def gram_schmidt(
 
     A dependent column uses up no direction, unlike in a plain QR decomposition without
     pivoting, and every column is measured against its own norm. So near-degenerate
-    geometry is still told
-    apart: an elbow offset of a micrometre.
+    geometry is still resolved: an elbow offset of a micrometre.
     """
-    rows, columns = W.shape
     W = np.asarray(W, np.float64)
+    rows, columns = W.shape
     norms = np.linalg.norm(W, axis=0)
-    largest = norms.max(initial=0.0)
+    min_norm = ROUNDING * norms.max(initial=0.0)
     Q = np.zeros((rows, min(rows, columns)))
+    shares = np.zeros(columns)  # fractions of columns that earlier ones do not explain
     independent: list[int] = []
-    dependent: list[int] = []
-    new, old = [np.inf], [0.0]
     for k in range(columns):
-        w, share = W[:, k], 0.0
-        if norms[k] > ROUNDING * largest and len(independent) < rows:
-            w = w / norms[k]
-            basis = Q[:, : len(independent)]
-            # Twice is enough unless almost nothing is left; the third pass costs
-            # little.
-            for _ in range(3):
-                w = w - basis @ (basis.T @ w)
-            share = float(np.linalg.norm(w))
-        if share > tolerance:
-            Q[:, len(independent)] = w / share
+        rank = len(independent)
+        if norms[k] <= min_norm or rank == rows:
+            continue
+        w = W[:, k] / norms[k]
+        # Twice is enough unless almost nothing remains; the third pass costs little.
+        for _ in range(3):
+            w = w - Q[:, :rank] @ (Q[:, :rank].T @ w)
+        shares[k] = np.linalg.norm(w)
+        if shares[k] > tolerance:
+            Q[:, rank] = w / shares[k]
             independent.append(k)
-            new.append(share)
-        else:
-            dependent.append(k)
-            old.append(share)
-    return Dependence(tuple(independent), tuple(dependent), min(new), max(old))
+
+    dependent = [k for k in range(columns) if k not in set(independent)]
+    smallest = shares[independent].min(initial=np.inf)
+    largest = shares[dependent].max(initial=0.0)
+    return Dependence(
+        tuple(independent), tuple(dependent), float(smallest), float(largest)
+    )
 
 
 def singular_values(
@@ -84,78 +83,109 @@ def singular_values(
     """Find the null space by a singular value decomposition, the paper's alternative method.
 
     The rank is where the singular values fall by the largest factor. A column depends
-    on earlier ones if some vector of the null space ends there: the null space is
-    brought into that form by a QR decomposition with its columns reversed.
+    on earlier ones if some vector of the null space ends there.
     """
-    W = np.asarray(W, np.float64)
-    columns = W.shape[1]
-    norms = np.linalg.norm(W, axis=0)
-    live = norms > ROUNDING * norms.max(initial=0.0)
-    scaled = np.where(live, W / np.where(live, norms, 1.0), 0.0)
+    scaled, norms = scale_columns(W)
+    columns = len(norms)
     # The triangular factor has the same singular values and null space, and few rows.
-    _, s, Vt = np.linalg.svd(np.linalg.qr(scaled, mode="r"), full_matrices=True)
-    s = np.concatenate([s, np.zeros(columns - len(s))]) / max(
-        s[0], np.finfo(float).tiny
-    )
-    floored = np.maximum(s, 1e-14)  # all below are rounding
-    certain = int(np.count_nonzero(s > tolerance))
-    drops = floored[:-1] / floored[1:]
-    possible = np.arange(1, columns) >= certain
-    rank = (
-        certain
-        if not possible.any()
-        else 1 + int(np.argmax(np.where(possible, drops, 0.0)))
-    )
-    rank = min(rank, np.count_nonzero(live))
-    null = Vt[rank:]
-    dependent: list[int] = []
-    # Eliminate from the last column backwards: a pivot found there is where a vector
-    # ends.
-    for k in reversed(range(columns)):
-        if not len(null):
-            break
-        pivot = null[:, k]
-        if np.linalg.norm(pivot) < 1e-8:
-            continue
-        dependent.append(k)
-        Q = np.linalg.qr(pivot[:, None], mode="complete").Q
-        null = (Q.T @ null)[1:]
-    independent = tuple(k for k in range(columns) if k not in set(dependent))
+    triangle = np.linalg.qr(scaled, mode="r")
+    _, s, Vt = np.linalg.svd(triangle, full_matrices=True)
+    s = np.concatenate([s, np.zeros(columns - len(s))])
+    s = s / max(s[0], np.finfo(float).tiny)
+
+    rank = min(_rank_at_largest_fall(s, tolerance), np.count_nonzero(norms))
+    dependent = _ends_of_null_vectors(Vt[rank:])
+    independent = tuple(k for k in range(columns) if k not in dependent)
     smallest = float(s[rank - 1]) if rank else np.inf
     largest = float(s[rank]) if rank < columns else 0.0
-    return Dependence(independent, tuple(sorted(dependent)), smallest, largest)
+    return Dependence(independent, dependent, smallest, largest)
+
+
+def _rank_at_largest_fall(s: np.ndarray, tolerance: float) -> int:
+    """Return the rank: all above the tolerance count, and then those before the largest fall."""
+    min_rank = int(np.count_nonzero(s > tolerance))
+    ranks = np.arange(1, len(s))
+    is_possible = ranks >= min_rank
+    if not is_possible.any():
+        return min_rank
+    floored = np.maximum(s, 1e-14)  # all below are rounding
+    falls = floored[:-1] / floored[1:]
+    return int(ranks[np.argmax(np.where(is_possible, falls, 0.0))])
+
+
+def _ends_of_null_vectors(
+    null_space: Float[np.ndarray, "vectors columns"],
+) -> tuple[int, ...]:
+    """Return the columns at which vectors of the null space end, when all are in echelon form."""
+    ends: list[int] = []
+    # Eliminate from the last column backwards: a pivot found there is where a vector
+    # ends.
+    for k in reversed(range(null_space.shape[1])):
+        if not len(null_space):
+            break
+        pivot = null_space[:, k]
+        if np.linalg.norm(pivot) < 1e-8:
+            continue
+        ends.append(k)
+        Q = np.linalg.qr(pivot[:, None], mode="complete").Q
+        null_space = (Q.T @ null_space)[1:]
+    return tuple(sorted(ends))
+
+
+def scale_columns(
+    W: Float[AnyArray, "rows columns"],
+) -> tuple[Float[np.ndarray, "rows columns"], Float[np.ndarray, " columns"]]:
+    """Return a matrix with columns of length one, and their lengths before.
+
+    Columns that are nothing but rounding become zero, and so does their length.
+    """
+    W = np.asarray(W, np.float64)
+    norms = np.linalg.norm(W, axis=0)
+    norms = np.where(norms > ROUNDING * norms.max(initial=0.0), norms, 0.0)
+    divisors = np.where(norms > 0, norms, np.inf)
+    return W / divisors, norms
+
+
+class Regrouped(NamedTuple):
+    r"""Dependent columns as combinations of independent ones: $\hat\Theta_2 = \hat\Theta_1 \kappa$."""
+
+    kappa: Float[np.ndarray, "base dependent"]  # factors of the independent columns
+    unexplained: float  # largest fraction of a dependent column that kappa misses
+    # fractions of the independent columns that those before them do not explain
+    shares: Float[np.ndarray, " base"]
 
 
 def regrouping(
     W: Float[AnyArray, "rows columns"],
     independent: Sequence[int] | np.ndarray,
     dependent: Sequence[int] | np.ndarray,
-) -> tuple[Float[np.ndarray, "base dependent"], float, Float[np.ndarray, " base"]]:
+) -> Regrouped:
     r"""Return $\kappa$ with $\hat\Theta_2 = \hat\Theta_1 \kappa$, and how exact it is (Eq. 22).
 
-    A dependent column is a combination of independent columns before it. Beside
-    $\kappa$ come the largest fraction of a dependent column that it does not explain,
-    and the fraction of each independent column that those before it do not explain.
+    A dependent column is a combination of independent columns before it.
     """
-    W = np.asarray(W, np.float64)
-    norms = np.linalg.norm(W, axis=0)
-    live = norms > ROUNDING * norms.max(initial=0.0)
-    scale = np.where(live, norms, 1.0)
-    W = np.where(live, W / scale, 0.0)
-    first, second = np.array(independent, int), np.array(dependent, int)
-    W1, W2 = W[:, first], W[:, second]
+    first = np.array(independent, int)
+    second = np.array(dependent, int)
+    scaled, norms = scale_columns(W)
+    W1 = scaled[:, first]
+    W2 = scaled[:, second]
     Q, R = np.linalg.qr(W1)
-    new = np.abs(np.diag(R))
+    shares = np.abs(np.diag(R))
+    is_before = first[:, None] < second
     kappa = np.zeros((len(first), len(second)))
-    if len(first) and new.min() > ROUNDING:
+    if len(first) and shares.min() > ROUNDING:
         # The second step takes out most of the rounding that poor conditioning
         # amplifies.
         for _ in range(2):
-            left = np.where(first[:, None] < second, Q.T @ (W2 - W1 @ kappa), 0.0)
-            kappa = kappa + scipy.linalg.solve_triangular(R, left)
-    unexplained = float(np.linalg.norm(W2 - W1 @ kappa, axis=0).max(initial=0.0))
+            residuals = np.where(is_before, Q.T @ (W2 - W1 @ kappa), 0.0)
+            kappa = kappa + scipy.linalg.solve_triangular(R, residuals)
+    unexplained = np.linalg.norm(W2 - W1 @ kappa, axis=0).max(initial=0.0)
+
     kappa = np.where(np.abs(kappa) > 1e-9, kappa, 0.0)
-    return kappa * scale[second] / scale[first][:, None], unexplained, new
+    # Columns of nothing but rounding stay as they are.
+    scale = np.where(norms > 0, norms, 1.0)
+    kappa = kappa * scale[second] / scale[first][:, None]
+    return Regrouped(kappa, float(unexplained), shares)
 
 
 def random_regressor(
@@ -182,7 +212,10 @@ def random_motion(model: Model, samples: int, seed: int) -> Motion:
     """
     rng = np.random.default_rng(seed)
     shape = (samples, model.robot.joints)
-    q, qd, qdd = (rng.uniform(-s, s, shape) * row_units(model) for s in (3.0, 3.0, 6.0))
+    units = row_units(model)
+    q = rng.uniform(-3.0, 3.0, shape) * units
+    qd = rng.uniform(-3.0, 3.0, shape) * units
+    qdd = rng.uniform(-6.0, 6.0, shape) * units
     qd[1::2] *= 1e-3 ** rng.uniform(0.0, 1.0, qd[1::2].shape)
     return Motion(q, qd, qdd)
 

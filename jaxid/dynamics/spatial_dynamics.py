@@ -8,6 +8,8 @@ bodies a joint moves (Featherstone, Rigid Body Dynamics Algorithms, Secs. 2, 5, 
 form compiles soon, is differentiated fast, and takes the geometry as an input.
 """
 
+from typing import Any, NamedTuple
+
 import jax.numpy as jnp
 import numpy as np
 
@@ -19,22 +21,30 @@ Bodies = Float[AnyArray, "joints 10"]
 Spatial = Float[Array, "joints 6"]
 
 
-def _constants() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the cross products of vectors and of motions, and inertias of unit parameters."""
-    skew = np.stack([np.cross(e, np.eye(3)).T for e in np.eye(3)], axis=-1)
-    crossing = np.zeros((6, 6, 6))
-    crossing[:3, :3, :3] = crossing[3:, :3, 3:] = crossing[3:, 3:, :3] = skew
-    inertia = np.zeros((6, 6, 10))
-    inertia[3:, 3:, 0] = np.eye(3)
-    inertia[:3, 3:, 1:4] = skew
-    inertia[3:, :3, 1:4] = -skew
-    inertia[:3, :3, 4:] = np.moveaxis(np.asarray(inertia_tensor(np.eye(6))), 0, -1)
-    return skew, crossing, inertia
+def _motion_products(skew: np.ndarray) -> Float[np.ndarray, "6 6 6"]:
+    r"""Return the matrices $v \times$ of unit motions, along the last axis."""
+    products = np.zeros((6, 6, 6))
+    products[:3, :3, :3] = skew
+    products[3:, :3, 3:] = skew
+    products[3:, 3:, :3] = skew
+    return products
 
 
-SKEW, CROSS, INERTIA = _constants()
-r"""$\tilde a$ of unit vectors, $v \times$ of unit motions, and spatial inertias of unit parameters
-$(m, m r_c, A, B, C, D, E, F)$, which stand along the last axis."""
+def _unit_inertias(skew: np.ndarray) -> Float[np.ndarray, "6 6 10"]:
+    r"""Return the spatial inertias of unit parameters $(m, m r_c, A, B, C, D, E, F)$."""
+    inertias = np.zeros((6, 6, 10))
+    inertias[3:, 3:, 0] = np.eye(3)
+    inertias[:3, 3:, 1:4] = skew
+    inertias[3:, :3, 1:4] = -skew
+    moments = np.asarray(inertia_tensor(np.eye(6)))
+    inertias[:3, :3, 4:] = np.moveaxis(moments, 0, -1)
+    return inertias
+
+
+SKEW = np.stack([np.cross(axis, np.eye(3)).T for axis in np.eye(3)], axis=-1)
+r"""Matrices $\tilde a$ of unit vectors, along the last axis."""
+CROSS = _motion_products(SKEW)
+INERTIA = _unit_inertias(SKEW)
 
 
 def _combine(matrices: np.ndarray, x: AnyArray) -> Array:
@@ -60,58 +70,84 @@ def all_placements(robot: Robot, q: Joints) -> Float[Array, "joints 4 4"]:
 
     Each turn of the loop doubles the number of joints that a placement passes over.
     """
-    kind, dtype = np.array(robot.revolute, float)[:, None, None], q.dtype
+    dtype = q.dtype
+    local = jnp.concatenate(
+        [_relative_placements(robot, q), _bottom_rows(robot, dtype)], 1
+    )
+    placements = local
+    above = np.array(robot.parent)
+    while (above >= 0).any():
+        # The placements of the bodies above, for each body; the ground's is one.
+        has_body = above >= 0
+        choice = np.eye(robot.joints)[above] * has_body[:, None]
+        ground = np.eye(4) * ~has_body[:, None, None]
+        chosen = jnp.tensordot(jnp.asarray(choice, dtype), placements, 1)
+        placements = (chosen + jnp.asarray(ground, dtype)) @ placements
+        above = np.where(has_body, above[above], -1)
+    return placements
+
+
+def _bottom_rows(robot: Robot, dtype: Any) -> Float[Array, "joints 1 4"]:
+    """Return the last rows of homogeneous matrices."""
+    return jnp.asarray(np.broadcast_to(np.eye(4)[3:], (robot.joints, 1, 4)), dtype)
+
+
+def _relative_placements(robot: Robot, q: Joints) -> Float[Array, "joints 3 4"]:
+    """Return rotation and position of each body in its parent's frame."""
+    dtype = q.dtype
     axis, rotation, offset = (
         jnp.asarray(x, dtype) for x in (robot.axis, robot.rotation, robot.offset)
     )
-    turns, slides = jnp.asarray(kind, dtype), jnp.asarray(1.0 - kind, dtype)
-    along = axis[:, :, None] * axis[:, None, :]
-    across = turns * (jnp.eye(3, dtype=dtype)[None] - along)
+    is_revolute = np.array(robot.revolute)[:, None, None]
+    turns = jnp.asarray(is_revolute, dtype)
+    slides = jnp.asarray(~is_revolute, dtype)
     angle = q[:, None, None]
-    turn = jnp.eye(3, dtype=dtype)[None] + (jnp.cos(angle) - 1) * across
+
+    # Rodrigues: I + sin(q) [axis] + (1 - cos(q)) [axis]^2, if the joint turns.
+    identity = jnp.eye(3, dtype=dtype)[None]
+    along = axis[:, :, None] * axis[:, None, :]
+    across = turns * (identity - along)
+    turn = identity + (jnp.cos(angle) - 1) * across
     turn = turn + turns * jnp.sin(angle) * _combine(SKEW, axis)
-    moved = jnp.concatenate([turn, slides * angle * axis[:, :, None]], axis=2)
-    placed = rotation @ moved + jnp.pad(offset[:, :, None], ((0, 0), (0, 0), (3, 0)))
-    bottom = np.broadcast_to(np.eye(4)[3:], (robot.joints, 1, 4))
-    placed = jnp.concatenate([placed, jnp.asarray(bottom, dtype)], axis=1)
-    above = np.array(robot.parent)
-    while (above >= 0).any():
-        # The rows of parents; the ground's is one.
-        outer = jnp.asarray(np.eye(len(above))[above] * (above >= 0)[:, None], dtype)
-        ground = np.eye(4) * (above < 0)[:, None, None]
-        placed = (jnp.tensordot(outer, placed, 1) + jnp.asarray(ground, dtype)) @ placed
-        above = np.where(above >= 0, above[above], -1)
-    return placed
+
+    shift = slides * angle * axis[:, :, None]
+    moved = rotation @ jnp.concatenate([turn, shift], axis=2)
+    return moved + jnp.pad(offset[:, :, None], ((0, 0), (0, 0), (3, 0)))
 
 
-GroundMotion = tuple[Float[Array, "joints 6 6"], Spatial, Spatial, Spatial]
-"""Matrices that carry wrenches from the bodies' frames to the ground (transposed, motions back);
-motion of what a joint moves at unit speed; velocities, and accelerations less
-gravity."""
+class GroundMotion(NamedTuple):
+    """Motion of all bodies in spatial vectors about the origin of the ground."""
+
+    carry: Float[Array, "joints 6 6"]  # wrenches of the bodies' frames to the ground
+    joints: Spatial  # motions of what the joints move, at unit speed
+    v: Spatial  # velocities of the bodies
+    a: Spatial  # accelerations of the bodies, less gravity
 
 
 def ground_motion(robot: Robot, q: Joints, qd: Joints, qdd: Joints) -> GroundMotion:
     """Return placements, velocities and accelerations of all bodies."""
-    placed, dtype = all_placements(robot, q), q.dtype
-    R = placed[:, :3, :3]
-    arm = _combine(SKEW, placed[:, :3, 3]) @ R
-    carry = jnp.concatenate(
-        [
-            jnp.concatenate([R, arm], axis=2),
-            jnp.concatenate([jnp.zeros_like(R), R], axis=2),
-        ],
-        axis=1,
-    )
-    turns, axis = np.array(robot.revolute)[:, None], jnp.asarray(robot.axis, dtype)
-    turning, sliding = jnp.where(turns, axis, 0.0), jnp.where(turns, 0.0, axis)
+    dtype = q.dtype
+    placements = all_placements(robot, q)
+    R = placements[:, :3, :3]
+    arm = _combine(SKEW, placements[:, :3, 3]) @ R
+    upper = jnp.concatenate([R, arm], axis=2)
+    lower = jnp.concatenate([jnp.zeros_like(R), R], axis=2)
+    carry = jnp.concatenate([upper, lower], axis=1)
+
+    is_revolute = np.array(robot.revolute)[:, None]
+    axis = jnp.asarray(robot.axis, dtype)
+    turning = jnp.where(is_revolute, axis, 0.0)
+    sliding = jnp.where(is_revolute, 0.0, axis)
+    angular = _times(R, turning)
     linear = _times(arm, turning) + _times(R, sliding)
-    joints = jnp.concatenate([_times(R, turning), linear], axis=1)
+    joints = jnp.concatenate([angular, linear], axis=1)
+
     moved = jnp.asarray(moved_by(robot), dtype)
     speeds = joints * qd[:, None]
     v = moved @ speeds
     a = moved @ (joints * qdd[:, None] + _times(_combine(CROSS, v), speeds))
     gravity = jnp.concatenate([jnp.zeros(3, dtype), jnp.asarray(robot.gravity, dtype)])
-    return carry, joints, v, a - gravity[None]
+    return GroundMotion(carry, joints, v, a - gravity[None])
 
 
 def ground_inertias(p: Bodies, carry: Array) -> Float[Array, "joints 6 6"]:
@@ -123,24 +159,29 @@ def spatial_forces(
     robot: Robot, p: Bodies, q: Joints, qd: Joints, qdd: Joints
 ) -> Joints:
     """Return the generalised forces of all bodies [N m or N] (Eq. 11)."""
-    x = ground_motion(robot, q, qd, qdd)
-    return _projected_wrenches(robot, ground_inertias(p, x[0]), x)
+    motion = ground_motion(robot, q, qd, qdd)
+    return _project_forces(robot, ground_inertias(p, motion.carry), motion)
 
 
 def spatial_mass_and_bias(
     robot: Robot, p: Bodies, q: Joints, qd: Joints
 ) -> tuple[Float[Array, "joints joints"], Joints]:
     """Return the mass matrix of the bodies by composite bodies, and the bias forces (Eq. 38)."""
-    x = ground_motion(robot, q, qd, jnp.zeros_like(q))
-    inertias, moved = ground_inertias(p, x[0]), jnp.asarray(moved_by(robot), q.dtype)
+    motion = ground_motion(robot, q, qd, jnp.zeros_like(q))
+    inertias = ground_inertias(p, motion.carry)
+    moved = jnp.asarray(moved_by(robot), q.dtype)
     composite = jnp.tensordot(moved.T, inertias, 1)
-    M = moved * (_times(composite, x[1]) @ x[1].T)
-    M = M + (M * jnp.asarray(1.0 - np.eye(len(q)), q.dtype)).T
-    return M, _projected_wrenches(robot, inertias, x)
+    momenta = _times(composite, motion.joints)
+    # A joint feels the momenta of those that it carries; the matrix is symmetric.
+    lower = moved * (momenta @ motion.joints.T)
+    off_diagonal = jnp.asarray(1.0 - np.eye(len(q)), q.dtype)
+    M = lower + (lower * off_diagonal).T
+    return M, _project_forces(robot, inertias, motion)
 
 
-def _projected_wrenches(robot: Robot, inertias: Array, x: GroundMotion) -> Joints:
-    _, joints, v, a = x
+def _project_forces(robot: Robot, inertias: Array, motion: GroundMotion) -> Joints:
+    """Return the forces of the joints that move the bodies (Newton and Euler)."""
+    _, joints, v, a = motion
     rates = jnp.einsum("nji,nj->ni", _combine(CROSS, v), _times(inertias, v))
     wrenches = _times(inertias, a) - rates
     beyond = jnp.asarray(moved_by(robot).T, joints.dtype) @ wrenches
@@ -152,9 +193,11 @@ def spatial_regressor(
 ) -> Float[Array, "joints joints 10"]:
     """Return the regressor of every body (Eq. 11): joints, then bodies and their columns."""
     carry, joints, v, a = ground_motion(robot, q, qd, qdd)
-    v, a = (jnp.einsum("nji,nj->ni", carry, x) for x in (v, a))
+    v_body, a_body = (jnp.einsum("nji,nj->ni", carry, x) for x in (v, a))
     unit = jnp.asarray(INERTIA, q.dtype)
-    momenta, rates = (jnp.einsum("ijk,nj->nik", unit, x) for x in (v, a))
-    wrenches = rates - jnp.swapaxes(_combine(CROSS, v), 1, 2) @ momenta
-    found = jnp.einsum("js,bsk->jbk", joints, carry @ wrenches)
-    return jnp.asarray(moved_by(robot).T, q.dtype)[:, :, None] * found
+    momenta = jnp.einsum("ijk,nj->nik", unit, v_body)
+    rates = jnp.einsum("ijk,nj->nik", unit, a_body)
+    turned = jnp.swapaxes(_combine(CROSS, v_body), 1, 2) @ momenta
+    wrenches = carry @ (rates - turned)
+    columns = jnp.einsum("js,bsk->jbk", joints, wrenches)
+    return jnp.asarray(moved_by(robot).T, q.dtype)[:, :, None] * columns

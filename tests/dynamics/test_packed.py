@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jaxid as jid
-from jaxid.dynamics.dispatch import FEW
+from jaxid.dynamics.dispatch import MAX_SAMPLES_IN_NUMPY
 
 TERMS = (
     jid.RigidBodies(),
@@ -27,7 +27,7 @@ def random_motion(model, samples):
     return jid.Motion(*x)
 
 
-@pytest.mark.parametrize("samples", [1, FEW + 3])
+@pytest.mark.parametrize("samples", [1, MAX_SAMPLES_IN_NUMPY + 3])
 @pytest.mark.parametrize("in_jax", [False, True])
 def test_the_matrix_is_the_dense_one(model, samples, in_jax):
     base = jid.base_parameters(model)

@@ -69,27 +69,28 @@ class TorqueRipple(AbstractTerm):
 
     def parameters(self, robot):
         """Return names and units: for each multiple the sines, then the cosines."""
-        waves = [("m", k) for k in self.motor] + [("j", k) for k in self.joint]
+        units = ["N m" if is_revolute else "N" for is_revolute in robot.revolute]
         return tuple(
-            (f"{wave}{side}{k}_{i + 1}", "N m" if turns else "N")
-            for side, k in waves
-            for wave in "sc"
-            for i, turns in enumerate(robot.revolute)
+            (f"{wave}_{i}", unit)
+            for wave in self.meanings
+            for i, unit in enumerate(units, 1)
         )
 
     def columns(self, robot, q, qd, qdd):
         """Return sines and cosines of the angles; coupled motors act on all axes they turn."""
-        A, eye = np.asarray(robot.drives.reduction), np.eye(robot.joints)
-        ratios = A / np.where(np.diag(A) == 0, 1.0, np.diag(A))[:, None]
-        waves = [(A @ q, ratios.T, k) for k in self.motor] + [
-            (q, eye, k) for k in self.joint
-        ]
-        parts = [
-            matrix * wave(k * angles)[None]
-            for angles, matrix, k in waves
-            for wave in (jnp.sin, jnp.cos)
-        ]
-        return jnp.concatenate(parts, axis=1)
+        A = np.asarray(robot.drives.reduction)
+        diagonal = np.where(np.diag(A) == 0, 1.0, np.diag(A))
+        ratios = A / diagonal[:, None]
+        blocks = []
+        for k in self.motor:
+            angles = k * (A @ q)
+            blocks += [
+                ratios.T * jnp.sin(angles)[None],
+                ratios.T * jnp.cos(angles)[None],
+            ]
+        for k in self.joint:
+            blocks += [jnp.diag(jnp.sin(k * q)), jnp.diag(jnp.cos(k * q))]
+        return jnp.concatenate(blocks, axis=1)
 
 
 class CoupledDrives(AbstractTerm):
@@ -122,11 +123,12 @@ class CoupledDrives(AbstractTerm):
                 f"`drives.reduction`: motor {motor} does not turn joint {motor}: "
                 "reorder its rows."
             )
-        return tuple(
-            (i, A[i] / A[i, i])
-            for i in range(robot.joints)
-            if (np.abs(np.delete(A[i], i)) > 1e-12 * scale).any()
-        )
+        couplings = []
+        for i in range(robot.joints):
+            other_axes = np.abs(np.delete(A[i], i))
+            if (other_axes > 1e-12 * scale).any():
+                couplings.append((i, A[i] / A[i, i]))
+        return tuple(couplings)
 
     @property
     def meanings(self):
@@ -144,8 +146,7 @@ class CoupledDrives(AbstractTerm):
         if not couplings:
             raise InputError(
                 f"the drives of `{robot.name}` are not coupled: leave `CoupledDrives` "
-                "out, or give "
-                "`drives.reduction` entries beside its diagonal."
+                "out, or give `drives.reduction` entries beside its diagonal."
             )
         return tuple(
             (f"{name}{i + 1}", unit_r if robot.revolute[i] else unit_p)
@@ -155,18 +156,19 @@ class CoupledDrives(AbstractTerm):
 
     def columns(self, robot, q, qd, qdd):
         """Return inertia and viscous parts beside the diagonal, and Coulomb parts of motors."""
-        inertia, viscous, dry = [], [], []
+        inertia = []
+        viscous = []
+        dry = []
         for i, ratios in self.couplings(robot):
-            beside = _beside_diagonal(ratios)
-            inertia.append(beside.astype(qdd.dtype) @ qdd)
-            viscous.append(beside.astype(qd.dtype) @ qd)
+            off_diagonal = _off_diagonal(ratios)
+            inertia.append(off_diagonal.astype(qdd.dtype) @ qdd)
+            viscous.append(off_diagonal.astype(qd.dtype) @ qd)
+            # The width of the transition is that of the motor's own joint: the motor's
+            # speed is put in its place.
             r = ratios.astype(qd.dtype)
-            # The motor's speed takes the place of its joint's, whose transition width
-            # it has.
-            speeds = jnp.stack(
-                [jnp.dot(r, qd) if j == i else qd[j] for j in range(len(r))]
-            )
-            dry.append(r * self.transition.of_motors(speeds)[i])
+            speeds = [qd[j] for j in range(len(r))]
+            speeds[i] = jnp.dot(r, qd)
+            dry.append(r * self.transition.of_motors(jnp.stack(speeds))[i])
         return jnp.stack([*inertia, *viscous, *dry], axis=1)
 
     def lower_bounds(self, robot):
@@ -176,11 +178,13 @@ class CoupledDrives(AbstractTerm):
     def drive_matrices(self, robot):
         """Return the matrices beside the diagonals of the coupled motors."""
         couplings = self.couplings(robot)
-        n, found = robot.joints, len(couplings)
-        matrices = np.zeros((2, n, n, 3 * found))
-        for place, (_, ratios) in enumerate(couplings):
-            beside = _beside_diagonal(ratios)
-            matrices[0, :, :, place] = matrices[1, :, :, found + place] = beside
+        n = robot.joints
+        count = len(couplings)
+        matrices = np.zeros((2, n, n, 3 * count))
+        for k, (_, ratios) in enumerate(couplings):
+            off_diagonal = _off_diagonal(ratios)
+            matrices[0, :, :, k] = off_diagonal
+            matrices[1, :, :, count + k] = off_diagonal
         return matrices
 
 
@@ -224,5 +228,6 @@ class LinearSpring(AbstractTerm):
         return 0.5 * (q - self.rest) ** 2
 
 
-def _beside_diagonal(ratios: np.ndarray) -> Float[np.ndarray, "joints joints"]:
+def _off_diagonal(ratios: np.ndarray) -> Float[np.ndarray, "joints joints"]:
+    """Return the products of the ratios of two different axes."""
     return np.outer(ratios, ratios) * (1.0 - np.eye(len(ratios)))

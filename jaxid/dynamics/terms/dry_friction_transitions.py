@@ -57,8 +57,8 @@ class Tanh(AbstractTransition):
     dead_zone: EachJoint = eqx.field(converter=one_or_each, default=0.0)
 
     def __check_init__(self):
-        if not isinstance(self.epsilon, jax.Array) and not np.all(
-            np.asarray(self.epsilon) > 0
+        if not (
+            isinstance(self.epsilon, jax.Array) or np.all(np.asarray(self.epsilon) > 0)
         ):
             raise InputError(
                 f"`epsilon` must be positive, but is {self.epsilon}: `HardSign` has "
@@ -115,21 +115,22 @@ class Presliding(AbstractTransition):
     state: States | None = None
 
     def __check_init__(self):
-        if not isinstance(self.length, jax.Array) and not np.all(
-            np.asarray(self.length) > 0
+        if not (
+            isinstance(self.length, jax.Array) or np.all(np.asarray(self.length) > 0)
         ):
             raise InputError(f"`length` must be positive, but is {self.length}.")
 
     def __call__(self, qd):
         """Return the state: where it is not known, that of steady motion."""
-        return (
-            self.steady(qd) if self.state is None else self.state[..., : qd.shape[-1]]
-        )
+        if self.state is None:
+            return self.steady(qd)
+        return self.state[..., : qd.shape[-1]]
 
     def of_motors(self, speeds: Joints) -> Joints:
         """Return the states of the motors: where they are not known, those of steady motion."""
-        s = None if self.motors is None else self.state
-        return self.steady(speeds) if s is None else s[..., speeds.shape[-1] :]
+        if self.motors is None or self.state is None:
+            return self.steady(speeds)
+        return self.state[..., speeds.shape[-1] :]
 
     def settled(
         self, qd: Float[AnyArray, "*batch joints"]
@@ -141,9 +142,8 @@ class Presliding(AbstractTransition):
         """Return a function of the joints, followed by that of their motors."""
         if self.motors is None:
             return function(x)
-        return namespace(x).concatenate(
-            [function(x), function(x @ self.motors.T)], axis=-1
-        )
+        parts = [function(x), function(x @ self.motors.T)]
+        return namespace(x).concatenate(parts, axis=-1)
 
     def _strain(self, change: AnyArray) -> AnyArray:
         """Return steps of joints and motors, relative to their lengths [1]."""
@@ -153,8 +153,8 @@ class Presliding(AbstractTransition):
     def advance(self, q_before: Joints, q: Joints, s: States) -> States:
         """Return the state behind a step of one direction [rad or m], from that before it."""
         strain = self._strain(q - q_before)
-        way = jnp.sign(strain)
-        return way + (s - way) * jnp.exp(-jnp.abs(strain))
+        direction = jnp.sign(strain)
+        return direction + (s - direction) * jnp.exp(-jnp.abs(strain))
 
     def states(
         self,
@@ -164,15 +164,19 @@ class Presliding(AbstractTransition):
         """Return the states along a path, from that at its first sample."""
         xp = namespace(q)
         strain = self._strain(xp.diff(xp.moveaxis(q, -2, 0), axis=0))
-        kept = xp.exp(-xp.abs(strain))
-        s = xp.concatenate([xp.asarray(start)[None], xp.sign(strain) * (1 - kept)])
-        kept = xp.concatenate([xp.zeros_like(s[:1]), kept])
+        # A step maps the state s before it to memory * s + s_behind.
+        memory = xp.exp(-xp.abs(strain))
+        s_behind = xp.sign(strain) * (1 - memory)
+        s = xp.concatenate([xp.asarray(start)[None], s_behind])
+        memory = xp.concatenate([xp.zeros_like(s[:1]), memory])
+        # Each turn joins twice as many steps to one.
         reach = 1
-        # Each turn joins twice as many steps to one, which is affine in the state
-        # before it.
         while reach < len(s):
-            s = xp.concatenate([s[:reach], s[reach:] + kept[reach:] * s[:-reach]])
-            kept = xp.concatenate([kept[:reach], kept[reach:] * kept[:-reach]])
+            s_before = s[:-reach]
+            memory_before = memory[:-reach]
+            s = xp.concatenate([s[:reach], s[reach:] + memory[reach:] * s_before])
+            joined = memory[reach:] * memory_before
+            memory = xp.concatenate([memory[:reach], joined])
             reach *= 2
         return xp.moveaxis(s, 0, -2)
 
@@ -185,28 +189,28 @@ class Reversal(AbstractTransition):
     smoothly.
 
     Attributes:
-        own: Transition elsewhere.
+        transition: Transition elsewhere.
         side: Direction that is kept near standstill, 1 or -1.
         width: Speeds up to which it is kept; at twice these it has faded [rad/s or
             m/s].
     """
 
-    own: AbstractTransition
+    transition: AbstractTransition
     side: float
     width: Joints
 
     def __call__(self, qd):
         """Return the other transition, drawn to the side."""
         one = jnp.ones_like(qd)
-        near = jnp.minimum(
-            one, jnp.maximum(0 * one, 2 * one - jnp.abs(qd) / self.width)
-        )
-        near = near**2 * (3 - 2 * near)
-        value = self.own(qd)
-        return value + near * (self.side - value)
+        nearness = 2 * one - jnp.abs(qd) / self.width
+        nearness = jnp.minimum(one, jnp.maximum(0 * one, nearness))
+        share = nearness**2 * (3 - 2 * nearness)
+        value = self.transition(qd)
+        return value + share * (self.side - value)
 
 
-def _outside_dead_zone(dead_zone: Any, qd: Any, value: Any) -> Any:
+def _outside_dead_zone(dead_zone: EachJoint, qd: Joints, value: Joints) -> Joints:
+    """Return a value for speeds beyond the dead zone, and zero within it."""
     if not isinstance(dead_zone, jax.Array) and not np.any(dead_zone):
         return value
     moves = jnp.abs(qd) > matching("dead_zone", dead_zone, qd)

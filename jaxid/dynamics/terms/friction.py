@@ -33,10 +33,11 @@ class AbstractDryFriction(AbstractTerm):
     @property
     def nonlinear_parameters(self):
         """Those of the transition."""
-        own = (x.inside("transition") for x in self.transition.nonlinear_parameters)
-        return tuple(
-            x._replace(default=x.default and self.determines_transition) for x in own
-        )
+        parameters = []
+        for x in self.transition.nonlinear_parameters:
+            is_default = x.default and self.determines_transition
+            parameters.append(x.inside("transition")._replace(default=is_default))
+        return tuple(parameters)
 
 
 class ViscousFriction(AbstractTerm):
@@ -72,10 +73,10 @@ class AsymmetricViscousFriction(AbstractTerm):
 
     def columns(self, robot, q, qd, qdd):
         """Return the diagonal matrices of speeds in either direction."""
-        size = jnp.abs(qd)
-        return jnp.concatenate(
-            [jnp.diag(0.5 * (qd + size)), jnp.diag(0.5 * (qd - size))], axis=1
-        )
+        speed = jnp.abs(qd)
+        forwards = jnp.diag(0.5 * (qd + speed))
+        backwards = jnp.diag(0.5 * (qd - speed))
+        return jnp.concatenate([forwards, backwards], axis=1)
 
 
 class CoulombFriction(AbstractDryFriction):
@@ -115,9 +116,9 @@ class AsymmetricCoulombFriction(AbstractDryFriction):
         if isinstance(dead_zone, jax.Array) or np.any(dead_zone):
             # Within a dead zone both fractions vanish, as the force does.
             moving = jnp.where(s == 0.0, s, jnp.ones_like(s))
-        return jnp.concatenate(
-            [jnp.diag(0.5 * (moving + s)), jnp.diag(0.5 * (s - moving))], axis=1
-        )
+        forwards = jnp.diag(0.5 * (moving + s))
+        backwards = jnp.diag(0.5 * (s - moving))
+        return jnp.concatenate([forwards, backwards], axis=1)
 
 
 class SquareRootFriction(AbstractDryFriction):
@@ -176,14 +177,12 @@ class StribeckFriction(AbstractDryFriction):
     def columns(self, robot, q, qd, qdd):
         """Return the diagonal matrices of smooth signs, and of those that fade with speed."""
         sign = self.transition(qd)
-        relative = qd / matching("speed", self.speed, qd)
+        relative_speed = qd / matching("speed", self.speed, qd)
+        exponent = matching("exponent", self.exponent, qd)
         # The small number keeps the logarithm finite at standstill.
-        power = (
-            0.5 * matching("exponent", self.exponent, qd) * jnp.log(relative**2 + 1e-30)
-        )
-        return jnp.concatenate(
-            [jnp.diag(sign), jnp.diag(sign * jnp.exp(-jnp.exp(power)))], axis=1
-        )
+        power = jnp.exp(0.5 * exponent * jnp.log(relative_speed**2 + 1e-30))
+        static = sign * jnp.exp(-power)
+        return jnp.concatenate([jnp.diag(sign), jnp.diag(static)], axis=1)
 
     @property
     def nonlinear_parameters(self):
@@ -225,13 +224,13 @@ class LoadFriction(AbstractDryFriction):
         self._bodies(robot)
         return super().parameters(robot)
 
-    def _bodies(self, robot: Robot) -> AnyArray:
+    def _bodies(self, robot: Robot) -> Float[AnyArray, "joints 10"]:
+        """Return the parameters of the bodies, one row for each."""
         size = robot.joints * len(INERTIAL_NAMES)
-        given = np.size(self.bodies)
-        if given < size:
+        if np.size(self.bodies) < size:
             raise InputError(
                 "`bodies` must begin with ten numbers for each body, but holds only "
-                f"{given}."
+                f"{np.size(self.bodies)}."
             )
         return self.bodies.ravel()[:size].reshape(robot.joints, -1)
 
@@ -271,8 +270,8 @@ class TemperatureScaled(AbstractTerm):
 
     def columns(self, robot, q, qd, qdd):
         """Return those of the term, scaled joint by joint."""
-        warmer = jnp.asarray(self.temperature, qd.dtype) - self.reference
-        scale = jnp.broadcast_to(jnp.exp(-self.rate * warmer), qd.shape)
+        rise = jnp.asarray(self.temperature, qd.dtype) - self.reference
+        scale = jnp.broadcast_to(jnp.exp(-self.rate * rise), qd.shape)
         return scale[:, None] * self.term.columns(robot, q, qd, qdd)
 
     def lower_bounds(self, robot):
@@ -286,8 +285,5 @@ class TemperatureScaled(AbstractTerm):
     @property
     def nonlinear_parameters(self):
         """Those of the term, and `rate1`, … [1/K] if chosen: it takes more than one recording."""
-        inner = (x.inside("term") for x in self.term.nonlinear_parameters)
-        return (
-            *inner,
-            NonlinearParameter("rate", ("1/K", "1/K"), ("rate",), default=False),
-        )
+        rate = NonlinearParameter("rate", ("1/K", "1/K"), ("rate",), default=False)
+        return (*(x.inside("term") for x in self.term.nonlinear_parameters), rate)

@@ -52,12 +52,10 @@ class RigidBodies(AbstractTerm):
 
     def parameters(self, robot: Robot) -> tuple[tuple[str, str], ...]:
         """Return `m1`, `mx1`, … `F1`, then those of the next body."""
-        each = list(zip(INERTIAL_NAMES, INERTIAL_UNITS, strict=True))[
-            : self.body_parameters
-        ]
-        return tuple(
-            (f"{name}{i + 1}", unit) for i in range(robot.joints) for name, unit in each
-        )
+        pairs = zip(INERTIAL_NAMES, INERTIAL_UNITS, strict=True)
+        of_body = list(pairs)[: self.body_parameters]
+        bodies = range(1, robot.joints + 1)
+        return tuple((f"{name}{i}", unit) for i in bodies for name, unit in of_body)
 
     def columns(self, robot, q, qd, qdd):
         r"""Return the columns $[\Theta_1 \dots \Theta_n]$ (Eq. 11)."""
@@ -93,9 +91,8 @@ class RigidBodies(AbstractTerm):
 
     def potential_columns(self, robot, q):
         """Return the potential energy of masses and first moments."""
-        return projection_equation.potential_energy_columns(robot, q)[
-            :, : self.body_parameters
-        ].ravel()
+        columns = projection_equation.potential_energy_columns(robot, q)
+        return columns[:, : self.body_parameters].ravel()
 
 
 class SpatialBodies(RigidBodies):
