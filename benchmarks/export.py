@@ -41,10 +41,6 @@ import numpy as np
 import timing
 
 import jaxid as jid
-from jaxid.dynamics.projection_equation import partial_velocities  # private: Eq. 38
-from jaxid.program import trace  # private: other forms of the same torques
-from jaxid.program.c_writer import CWriter  # private: C of other forms
-from jaxid.program.scalar import Operation  # private: number of angles
 
 FLAGS = {"O2": ["-O2"], "O3": ["-O3", "-march=native"]}
 FRICTION = (jid.ViscousFriction(), jid.CoulombFriction(), jid.RotorInertia())
@@ -123,7 +119,7 @@ def fit_of(model, p):
 def projected_mass_matrix(model, p, q):
     """Return M as the paper forms it: the sum of F^T M_i F of all bodies (Eq. 38)."""
     rest = jnp.zeros_like(q)
-    F = jax.jacfwd(partial_velocities(model.robot, q, rest, rest))(rest)
+    F = jax.jacfwd(jid.dynamics.partial_velocities(model.robot, q, rest, rest))(rest)
     total = jnp.zeros((len(q), len(q)))
     bodies = np.zeros((len(q), 10))
     for term, values in model.split(p):
@@ -148,21 +144,23 @@ def programs(model, p):
     numbers = np.asarray(fit.parameters)
 
     def eq38(x, inertia):
-        return trace(
+        return jid.program.trace(
             lambda q, qd, qdd: inertia(q) @ qdd + model.bias(x, q, qd), one, one, one
         )
 
     factored = jid.export.torque_program(fit)
-    angles = len({x.operands for x in factored.nodes if x.operation is Operation.SINE})
+    angles = len({x.operands for x in factored.nodes if x.operation == "sin"})
     found = {
         FACTORED: factored,
-        ALONE: trace(
+        ALONE: jid.program.trace(
             lambda q, qd, qdd: jnp.sin(q[-angles:]) + jnp.cos(q[-angles:]),
             one,
             one,
             one,
         ),
-        "Eq. 39 literal": trace(lambda *s: base.columns(*s) @ numbers, one, one, one),
+        "Eq. 39 literal": jid.program.trace(
+            lambda *s: base.columns(*s) @ numbers, one, one, one
+        ),
     }
     for name, x in (("base", own), ("all", full)):
         composite = eq38(x, lambda q, x=x: model.inertia(x, q))
@@ -176,7 +174,7 @@ def build(found, flags):
     """Compile all forms of a model as one library."""
     names = {name: f"form{k}" for k, name in enumerate(found)}
     text = "#define _POSIX_C_SOURCE 199309L\n#include <float.h>\n#include <math.h>\n"
-    writer = CWriter(True, "arm", [*found.values()])
+    writer = jid.program.CWriter(True, "arm", [*found.values()])
     text += "#include <stdint.h>\n#include <string.h>\n" + writer.library()
     for name, program in found.items():
         text += writer.definition(program, names[name], ["q", "qd", "qdd"], ["tau"])
@@ -326,7 +324,7 @@ def time_worst(name, arm, quick):
     random = np.random.default_rng(0)
     fit = fit_of(model, random.uniform(0.1, 1.0, model.size))
     one = (model.robot.joints,)
-    nothing = trace(lambda q, qd, qdd: q[0], one, one, one)
+    nothing = jid.program.trace(lambda q, qd, qdd: q[0], one, one, one)
     found = {FACTORED: jid.export.torque_program(fit), "nothing": nothing}
     states = states_of(model.robot, random, 1024)
     calls = 10_000 if quick else 1_000_000

@@ -17,7 +17,7 @@ import numpy as np
 import timing
 from timing import Row, hand_over
 
-from jaxid.program import lower, trace  # private: the compiler itself
+import jaxid as jid
 
 JOINTS = 7
 FENCES = (False, True)
@@ -91,12 +91,12 @@ def compiled(lowered, inputs):
 
 def measure(samples, turns):
     """Return times for each sample [ns] of all turns and compile times [s], without and with."""
-    program = trace(regressor, (JOINTS,), (JOINTS,), (JOINTS,))
+    program = jid.program.trace(regressor, (JOINTS,), (JOINTS,), (JOINTS,))
     generator = np.random.default_rng(0)
     inputs = [jnp.asarray(x) for x in generator.uniform(-1, 1, (3, JOINTS, samples))]
     print(f"seven-joint regressor: {program.counts}")
     runs, compiling = zip(
-        *(compiled(lower(program, x), inputs) for x in FENCES), strict=True
+        *(compiled(jid.program.lower(program, x), inputs) for x in FENCES), strict=True
     )
     for plain, fenced in zip(*(run(*inputs) for run in runs), strict=True):
         np.testing.assert_allclose(fenced, plain, rtol=1e-11, atol=1e-11)

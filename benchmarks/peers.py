@@ -66,10 +66,10 @@ def inverse_dynamics(model, p, state):
 
 def count_operations(model):
     """Return the counts of operations of a model's regressor."""
-    from jaxid.dynamics.dispatch import program_of  # private: counts of operations
+    import jaxid as jid
 
     n = (model.robot.joints,)
-    return program_of(model, model.columns, n, n, n).counts
+    return jid.program.trace(model.columns, n, n, n).counts
 
 
 def per_sample(times, samples):

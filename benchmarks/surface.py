@@ -50,15 +50,14 @@ def motion(samples, joints=7):
     return jid.Motion(*map(jnp.asarray, draws))
 
 
-def packed_form(model, definition, *shapes):
+def packed_form(definition, *shapes):
     """Return the batch-last program of a method of a model."""
     import jax
 
-    from jaxid.dynamics.dispatch import program_of  # private: the form that is compared
-    from jaxid.program import lower  # private: the form that is compared
+    import jaxid as jid
 
-    program = program_of(model, definition, *shapes)
-    lowered, (nodes, _) = lower(program), program.distinct
+    program = jid.program.trace(definition, *shapes)
+    lowered, (nodes, _) = jid.program.lower(program), program.distinct
     first = [program.outputs.index(k) for k in nodes]
 
     def run(*arrays):
@@ -100,8 +99,8 @@ def dynamics(model, p, quick):
     import jax
 
     n = (7,)
-    forces = packed_form(model, model.forces, p.shape, n, n, n)
-    columns = packed_form(model, model.columns, n, n, n)
+    forces = packed_form(model.forces, p.shape, n, n, n)
+    columns = packed_form(model.columns, n, n, n)
     for samples in (64, 2048) if quick else (64, 2048, 16384, 100000):
         x = motion(samples)
         last = [a.T + 0 for a in (x.q, x.qd, x.qdd)]

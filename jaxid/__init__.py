@@ -1,6 +1,6 @@
 """Identification of the dynamic parameters of robots, in the order of the pipeline.
 
-Everything else is in namespaces: `terms`, `filters`, `units`, `estimators`,
+Everything else is in namespaces: `program`, `dynamics`, `terms`, `filters`, `units`, `estimators`,
 `friction_laws`, `uncertainty`, `consistency`, `excitation`, `criteria`, `constraints`,
 `trajectories`, `collision`, `simulation`, `export`; the built-in robots are
 in `robots`, the figures in `plot`.

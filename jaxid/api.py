@@ -1,8 +1,10 @@
 """Public names of `jaxid`, in the order of the pipeline; the package loads them when used."""
 
 from . import (
+    dynamics as dynamics,
     excitation as excitation,
     export as export,
+    program as program,
     rollout as rollout,
     simulation as simulation,
     trajectory as trajectories,  # noqa: F401

@@ -44,10 +44,10 @@ for kind in ("RigidBodies", "ViscousFriction", "CoulombFriction", "RotorInertia"
 # moments (they cause moments); its moments of inertia have no effect until it rotates.
 
 # %%
-from jaxid.dynamics.projection_equation import body_regressor
-
-at_rest = body_regressor(a=np.array([0, 0, 9.81]), w=np.zeros(3), wd=np.zeros(3))
-turning = body_regressor(
+at_rest = jid.dynamics.body_regressor(
+    a=np.array([0, 0, 9.81]), w=np.zeros(3), wd=np.zeros(3)
+)
+turning = jid.dynamics.body_regressor(
     a=np.array([0, 0, 9.81]), w=np.array([0, 0, 2.0]), wd=np.array([1.0, 0, 0])
 )
 print("columns that act at rest:  ", np.flatnonzero(np.any(at_rest != 0, axis=0)))

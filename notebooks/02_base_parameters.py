@@ -90,11 +90,12 @@ plt.show()
 # agree: Gram-Schmidt in column order, and the gap in the singular values.
 
 # %%
-from jaxid.dynamics.rank import random_regressor
-
-W, scale = random_regressor(base.model, 0)
-scaled = np.linalg.svd(W, compute_uv=False)
-raw = np.linalg.svd(W / scale, compute_uv=False)
+rng = np.random.default_rng(0)
+motion = jid.Motion(*rng.uniform(-3.0, 3.0, (3, 50, base.model.robot.joints)))
+theta = np.asarray(base.model.regressor(motion)).reshape(-1, base.model.size)
+sizes = np.linalg.norm(theta, axis=0)
+scaled = np.linalg.svd(theta / np.where(sizes > 0, sizes, 1.0), compute_uv=False)
+raw = np.linalg.svd(theta, compute_uv=False)
 print(f"least independent column: {base.smallest_independent:.2g} of it is new")
 print(f"most doubtful dependent column: {base.largest_dependent:.1g}")
 print("doubts:", base.notes or "none")

@@ -47,7 +47,8 @@ class Model(Hashable):
     respect to the robot's geometry. NumPy arrays give NumPy arrays; arrays of JAX stay
     on their device. For few samples a method runs in NumPy at once; for many it is
     compiled for the robot, whose numbers are then constants: write
-    `jax.jit(model.regressor)` rather than pass the model to what is compiled.
+    `jax.jit(model.regressor)` rather than pass the model to what is compiled. Inverse
+    and forward dynamics take a `Motion` or its arrays, one after the other.
 
     Attributes:
         robot: Known geometry, limits and drives.

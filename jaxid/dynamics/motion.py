@@ -5,9 +5,11 @@ from typing import Any
 import equinox as eqx
 
 from jaxid.arrays import AnyArray, Float, as_array
+from jaxid.errors import InputError
 
 
 def _coordinates(value: Any) -> AnyArray:
+    """Return a list as an array."""
     # Only lists: trees of what is no array, such as `in_axes` of `vmap`, stay as they
     # are.
     return as_array("motion", value) if isinstance(value, list | tuple) else value
@@ -40,13 +42,33 @@ class Motion(eqx.Module):
 
 
 def as_motion(*motion: Any) -> Motion:
-    """Return a motion that is given as such, or as coordinates and their two derivatives."""
-    return motion[0] if isinstance(motion[0], Motion) else Motion(*motion)
+    """Return a motion that is given as such, or as coordinates and their two derivatives.
+
+    Raises:
+        InputError: If there is neither a motion nor three arrays.
+    """
+    if isinstance(motion[0], Motion) and len(motion) == 1:
+        return motion[0]
+    if len(motion) != 3:
+        raise InputError(
+            "`motion` must be a `Motion`, or coordinates, velocities and "
+            f"accelerations, but {len(motion)} arrays are given."
+        )
+    return Motion(*motion)
 
 
 def as_state(*state: Any) -> tuple[Any, Any]:
-    """Return coordinates and velocities of a motion, or those that are given instead of it."""
-    if isinstance(state[0], Motion):
+    """Return coordinates and velocities of a motion, or those that are given instead of it.
+
+    Raises:
+        InputError: If there is neither a motion nor two arrays.
+    """
+    if isinstance(state[0], Motion) and len(state) == 1:
         return state[0].q, state[0].qd
+    if len(state) != 2:
+        raise InputError(
+            "`state` must be a `Motion`, or coordinates and velocities, but "
+            f"{len(state)} arrays are given."
+        )
     q, qd = state
     return q, qd

@@ -3,9 +3,10 @@
 It knows nothing about robots. `trace` runs an ordinary JAX function on scalars that
 fold constants and merge equal expressions; the remaining sequence of operations is a
 `Program`. `lower` runs it in JAX, `evaluate` in NumPy, `to_python` on single floats;
-`c_writer.CWriter` writes it in C.
+`CWriter` writes it in C.
 """
 
+from .c_writer import CWriter as CWriter
 from .jax_sincos import sine_cosine as sine_cosine
 from .numpy_evaluation import (
     evaluate as evaluate,

@@ -27,23 +27,23 @@ def block_results(program: Program, *arrays: Array) -> tuple[Array, ...]:
 
     Inputs are [entries] if all samples have them in common, else [samples, entries].
     """
-    block = next(len(x) for x in arrays if x.ndim == 2)
+    size = next(len(x) for x in arrays if x.ndim == 2)
 
     def evaluate(arrays: tuple[Array, ...]) -> tuple[Array, ...]:
         # Transposed once, behind a fence of its own.
-        whole = jnp.concatenate([x.T for x in arrays if x.ndim == 2])
-        rows = iter(fenced(whole, hidden_one(whole[0, 0])))
-        inputs = [
-            [next(rows) for _ in x.T]
-            if x.ndim == 2
-            else [jnp.broadcast_to(y, (block,)) for y in x]
-            for x in arrays
-        ]
-        return lower(program, fence=True).run(inputs, primitives(whole[0]))
+        stacked = jnp.concatenate([x.T for x in arrays if x.ndim == 2])
+        rows = iter(fenced(stacked, hidden_one(stacked[0, 0])))
+        inputs = []
+        for x in arrays:
+            if x.ndim == 2:
+                inputs.append([next(rows) for _ in x.T])
+            else:
+                inputs.append([jnp.broadcast_to(entry, (size,)) for entry in x])
+        return lower(program, fence=True).run(inputs, primitives(stacked[0]))
 
     # Results of a branch are stored: what uses them does not compute them again.
     first = arrays[-1][0, 0]
-    nothing = tuple(jnp.broadcast_to(first, (block,)) for _ in program.distinct[0])
+    nothing = tuple(jnp.broadcast_to(first, (size,)) for _ in program.distinct[0])
     return jax.lax.cond(hidden_one(first) > 0, evaluate, lambda _: nothing, arrays)
 
 
@@ -55,35 +55,38 @@ def results_at_once(program: Program, *arrays: Array) -> tuple[Array, ...]:
     return lower(program, fence=False).run(inputs, primitives(like))
 
 
-def _packed(
+def _pack(
     results: Callable[..., tuple[Array, ...]], program: Program, *arrays: Array
 ) -> Float[Array, "samples out"]:
     """Return distinct results in the order of the packed result, with its constants."""
-    packed = program.pack(results(program, *arrays))
     like = jnp.zeros(len(arrays[-1]), arrays[-1].dtype)
-    full = [jax.lax.full_like(like, x) if isinstance(x, float) else x for x in packed]
-    return jnp.stack(full, axis=1)
+    columns = []
+    for x in program.pack(results(program, *arrays)):
+        columns.append(jax.lax.full_like(like, x) if isinstance(x, float) else x)
+    return jnp.stack(columns, axis=1)
 
 
 def _in_blocks(program: Program, *arrays: Array) -> Float[Array, "samples out"]:
     """Return the packed result of each sample, block by block."""
     count = len(arrays[-1])
     if count <= BLOCK:
-        return _packed(block_results, program, *arrays)
+        return _pack(block_results, program, *arrays)
 
     def step(k: Array, out: Array) -> Array:
         # The last block begins earlier, so that it is as long as the others.
         start = jnp.minimum(k * BLOCK, count - BLOCK)
-        parts = [
-            jax.lax.dynamic_slice_in_dim(x, start, BLOCK) if x.ndim == 2 else x
-            for x in arrays
-        ]
-        part = _packed(block_results, program, *parts)
-        return jax.lax.dynamic_update_slice_in_dim(out, part, start, axis=0)
+        parts = [_slice_samples(x, start, BLOCK) for x in arrays]
+        block = _pack(block_results, program, *parts)
+        return jax.lax.dynamic_update_slice_in_dim(out, block, start, axis=0)
 
     # All of it is overwritten.
     empty = jnp.broadcast_to(arrays[-1][0, 0], (count, len(program.outputs)))
     return jax.lax.fori_loop(0, -(-count // BLOCK), step, empty)
+
+
+def _slice_samples(x: Array, start: Array, size: int) -> Array:
+    """Return some samples of an input; one that all samples have in common stays as it is."""
+    return jax.lax.dynamic_slice_in_dim(x, start, size) if x.ndim == 2 else x
 
 
 def on_rows(program: Program, *arrays: Array) -> Float[Array, "samples out"]:
@@ -97,37 +100,47 @@ def on_rows(program: Program, *arrays: Array) -> Float[Array, "samples out"]:
     @custom_vmap
     def run(*arrays: Array) -> Array:
         in_blocks = functools.partial(_in_blocks, program)
-        at_once = functools.partial(_packed, results_at_once, program)
+        at_once = functools.partial(_pack, results_at_once, program)
         return jax.lax.platform_dependent(*arrays, cpu=in_blocks, default=at_once)
 
     @run.def_vmap
-    def batch(size: int, batched: list[bool], *arrays: Array) -> tuple[Array, bool]:
-        count = arrays[-1].shape[int(batched[-1])]
-        own = [x.ndim - was == 1 for x, was in zip(arrays, batched, strict=True)]
-        if count >= BLOCK and any(a and b for a, b in zip(own, batched, strict=True)):
-            each = [x if was else None for x, was in zip(arrays, batched, strict=True)]
-            whole = [None if was else x for x, was in zip(arrays, batched, strict=True)]
+    def batch(size: int, is_batched: list[bool], *arrays: Array) -> tuple[Array, bool]:
+        inputs = list(zip(arrays, is_batched, strict=True))
+        count = arrays[-1].shape[int(is_batched[-1])]
+        # Parameters are vectors, with the axis of the batch matrices.
+        has_own_parameters = any(x.ndim == 2 and batched for x, batched in inputs)
+        if has_own_parameters and count >= BLOCK:
+            return _one_after_the_other(run, inputs), True
 
-            def one(parts):
-                return run(
-                    *(w if x is None else x for x, w in zip(parts, whole, strict=True))
-                )
-
-            return jax.lax.map(one, each), True
         # All become samples, but for what is common to all.
         rows = []
-        for x, was, common in zip(arrays, batched, own, strict=True):
-            if common and not was:
+        for x, batched in inputs:
+            is_common = x.ndim - batched == 1
+            if is_common and not batched:
                 rows.append(x)
                 continue
-            x = x if was else x[None]
-            x = x[:, None] if common else x
+            x = x if batched else x[None]
+            x = x[:, None] if is_common else x
+            entries = x.shape[-1]
             rows.append(
-                jnp.broadcast_to(x, (size, count, x.shape[-1])).reshape(-1, x.shape[-1])
+                jnp.broadcast_to(x, (size, count, entries)).reshape(-1, entries)
             )
         return run(*rows).reshape(size, count, -1), True
 
     return run(*differing_alike(arrays))
+
+
+def _one_after_the_other(
+    run: Callable, inputs: list[tuple[Array, bool]]
+) -> Float[Array, "batch samples out"]:
+    """Call a function for each element of a batch, with inputs that have one or not."""
+    elements = [x for x, batched in inputs if batched]
+
+    def on_element(parts: list[Array]) -> Array:
+        remaining = iter(parts)
+        return run(*(next(remaining) if batched else x for x, batched in inputs))
+
+    return jax.lax.map(on_element, elements)
 
 
 def row_products(
@@ -138,35 +151,35 @@ def row_products(
     A group holds positions in the packed result whose values are multiplied with each
     other.
     """
-    count, dtype = len(arrays[0]), arrays[0].dtype
+    count = len(arrays[0])
+    dtype = arrays[0].dtype
     if count == 0:
         return [jnp.zeros((len(group), len(group)), dtype) for group in groups]
 
-    def products(rows: tuple[Array, ...], counted: Array) -> list[Array]:
-        found, packed = [], program.pack(rows)
+    def products(results: tuple[Array, ...], counts: Array) -> list[Array]:
+        values = program.pack(results)
+        matrices = []
         for group in groups:
-            values = [packed[k] for k in group]
-            stacked = (
-                jnp.stack([counted * x for x in values]) if group else counted[:0, None]
-            )
-            found.append(stacked @ stacked.T)
-        return found
+            columns = [counts * values[k] for k in group]
+            stacked = jnp.stack(columns) if group else counts[:0, None]
+            matrices.append(stacked @ stacked.T)
+        return matrices
 
-    def by_chunks(evaluate, size: int, *arrays: Array) -> list[Array]:
+    def by_chunks(evaluate: Callable, size: int, *arrays: Array) -> list[Array]:
         def step(k: Array, sums: list[Array]) -> list[Array]:
             # The last chunk begins earlier; samples that were counted do not count
             # again.
             start = jnp.minimum(k * size, count - size)
-            counted = (start + jnp.arange(size) >= k * size).astype(dtype)
-            parts = [jax.lax.dynamic_slice_in_dim(x, start, size) for x in arrays]
-            own = products(evaluate(program, *parts), counted)
-            return [a + b for a, b in zip(sums, own, strict=True)]
+            counts = (start + jnp.arange(size) >= k * size).astype(dtype)
+            parts = [_slice_samples(x, start, size) for x in arrays]
+            terms = products(evaluate(program, *parts), counts)
+            return [a + b for a, b in zip(sums, terms, strict=True)]
 
-        sizes = [(len(group), len(group)) for group in groups]
-        # `where`, see `differing_alike`.
-        empty = [
-            jnp.where(ALWAYS, jnp.zeros(x, dtype), arrays[-1][0, 0]) for x in sizes
-        ]
+        empty = []
+        for group in groups:
+            zeros = jnp.zeros((len(group), len(group)), dtype)
+            # `where`, see `differing_alike`.
+            empty.append(jnp.where(ALWAYS, zeros, arrays[-1][0, 0]))
         return jax.lax.fori_loop(0, -(-count // size), step, empty)
 
     return jax.lax.platform_dependent(

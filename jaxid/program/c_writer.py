@@ -22,12 +22,12 @@ from .jax_sincos import DOUBLE, SINGLE, half_pi
 from .program import Program, Reference
 from .scalar import Operation
 
-_LIBRARY = {
+LIBRARY = {
     "sine_cosine": (Operation.SINE, Operation.COSINE),
     "tanh": (Operation.HYPERBOLIC_TANGENT,),
 }
 """Operations that each function of the library computes for many numbers at once."""
-_RESERVED = re.compile(
+RESERVED = re.compile(
     "alignas|alignof|and|asm|auto|bool|break|case|catch|char|class|const|constexpr|continue|default|"
     "delete|do|double|else|enum|explicit|export|extern|false|float|for|friend|goto|if|inline|int|"
     "long|mutable|namespace|new|not|operator|or|private|protected|public|register|restrict|return|"
@@ -52,28 +52,24 @@ class CWriter:
     def __init__(
         self, double: bool, prefix: str = "", programs: Sequence[Program] = ()
     ):
-        self.double, self.prefix = double, prefix
-        self.type, self._suffix = ("double", "") if double else ("float", "f")
+        self.double = double
+        self.prefix = prefix
+        self.type = "double" if double else "float"
+        self._suffix = "" if double else "f"
         self._dtype = np.float64 if double else np.float32
         # Fewer and longer pieces of pi/2 than in JAX, for a shorter chain and smaller
         # angles.
-        own = (
-            DOUBLE._replace(pieces=half_pi(33, 2), limit=2.0**20) if double else SINGLE
+        pieces = half_pi(33, 2)
+        self._precision = (
+            DOUBLE._replace(pieces=pieces, limit=2.0**20) if double else SINGLE
         )
-        self._precision = own
-        self.turns = own.limit / 4
+        self.turns = self._precision.limit / 4
         self.widths: dict[str, int] = {}
-        for name, kinds in _LIBRARY.items():
-            counts = [
-                len(
-                    {node.operands for node in program.nodes if node.operation in kinds}
-                )
-                for program in programs
-            ]
-            largest = max(counts, default=0)
-            if largest:
+        for name, operations in LIBRARY.items():
+            calls = max((_count_calls(x, operations) for x in programs), default=0)
+            if calls:
                 # Compilers make vector instructions of an even number.
-                self.widths[name] = largest + largest % 2
+                self.widths[name] = calls + calls % 2
 
     def number(self, x: float) -> str:
         """Write a number with as many digits as its precision needs."""
@@ -82,8 +78,10 @@ class CWriter:
             return "NAN"
         if np.isinf(rounded):
             return "INFINITY" if x > 0 else "(-INFINITY)"
-        scientific = abs(x) > 1e6 or 0 < abs(x) < 1e-4
-        write = np.format_float_scientific if scientific else np.format_float_positional
+        is_scientific = abs(x) > 1e6 or 0 < abs(x) < 1e-4
+        write = (
+            np.format_float_scientific if is_scientific else np.format_float_positional
+        )
         text = write(rounded, unique=True, trim="0") + self._suffix
         return f"({text})" if text.startswith("-") else text
 
@@ -103,90 +101,108 @@ class CWriter:
 
         The function allocates nothing and has no loops, and its choices compile to
         selections: its run time does not depend on the data, if that of the
-            mathematical library does not. It takes
-        a pointer for each input, then one for each output, all to numbers in C order.
-        Every entry of an output is written, constants too. All inputs are read before
-        an output is written, so that they may share memory.
+        mathematical library does not. It takes a pointer for each input, then one for
+        each output, all to numbers in C order. Every entry of an output is written,
+        constants too. All inputs are read before an output is written, so that they may
+        share memory.
         """
         lines = self._statements(program, inputs)
-        read = {
-            node.place[0] for node in program.nodes if node.operation is Operation.INPUT
-        }
-        lines += [f"(void){x};" for k, x in enumerate(inputs) if k not in read]
+        places = [x.place for x in program.nodes if x.operation is Operation.INPUT]
+        numbers = {number for number, _ in places}
+        lines += [f"(void){x};" for k, x in enumerate(inputs) if k not in numbers]
         for output, entries in zip(
             outputs, program.split(program.outputs), strict=True
         ):
             if not entries:
                 lines.append(f"(void){output};")
-            lines += [
-                f"{output}[{k}] = {self._operand(x)};" for k, x in enumerate(entries)
-            ]
+            for k, x in enumerate(entries):
+                lines.append(f"{output}[{k}] = {self._operand(x)};")
         body = "\n".join(f"    {line}" for line in lines)
         return f"{self.declaration(name, inputs, outputs)}\n{{\n{body}\n}}\n"
 
     def _operand(self, x: Reference) -> str:
+        """Write the variable of a node, or a constant."""
         return f"t{x}" if isinstance(x, int) else self.number(x)
 
     def _statements(self, program: Program, inputs: Sequence[str]) -> list[str]:
         """Write one line for each node; functions of the library are called together."""
-        formats = {
+        stages = self._stages(program)
+        lines: list[str] = []
+        for stage in range(max(stages, default=0) + 1):
+            nodes = [k for k, number in enumerate(stages) if number == stage]
+            for name in self.widths:
+                calls = [k for k in nodes if self._function(program, k) == name]
+                if calls:
+                    lines += self._call(program, name, calls, stage)
+            for k in nodes:
+                if self._function(program, k) is None:
+                    lines.append(self._statement(program, k, inputs))
+        return lines
+
+    def _function(self, program: Program, k: int) -> str | None:
+        """Return the name of the library's function that computes a node, if one does."""
+        operation = program.nodes[k].operation
+        return next((x for x in self.widths if operation in LIBRARY[x]), None)
+
+    def _stages(self, program: Program) -> list[int]:
+        """Return the number of library functions on the longest chain up to each node.
+
+        Functions of the same stage do not need each other and are called together.
+        """
+        stages: list[int] = []
+        for k, node in enumerate(program.nodes):
+            before = max((stages[i] for i in node.uses), default=0)
+            stages.append(before + (self._function(program, k) is not None))
+        return stages
+
+    def _statement(self, program: Program, k: int, inputs: Sequence[str]) -> str:
+        """Write the line of a node that the library does not compute."""
+        node = program.nodes[k]
+        if node.operation is Operation.INPUT:
+            number, entry = node.place
+            text = f"{inputs[number]}[{entry}]"
+        else:
+            operands = [self._operand(x) for x in node.operands]
+            text = node.operation.spell(operands, self._formats, self._suffix)
+        kind = "int" if "truth" in node.operation.traits else self.type
+        return f"const {kind} t{k} = {text};"
+
+    @property
+    def _formats(self) -> dict[Operation, str]:
+        """Operations that C writes in its own way."""
+        sign = f"({self.type})(({{0}} > 0) - ({{0}} < 0))"
+        return {
             Operation.NEGATE: "-{0}",
             Operation.NOT: "!{0}",
             Operation.SELECT: "{0} ? {1} : {2}",
             # A NaN on either side must be kept, unlike in C's fmax and fmin.
             Operation.MAXIMUM: "(({0} > {1}) | ({0} != {0})) ? {0} : {1}",
             Operation.MINIMUM: "(({0} < {1}) | ({0} != {0})) ? {0} : {1}",
-            Operation.SIGN: f"({{0}} != {{0}}) ? {{0}} : ({self.type})(({{0}} > 0) - "
-            f"({{0}} < 0))",
+            Operation.SIGN: f"({{0}} != {{0}}) ? {{0}} : {sign}",
             Operation.ABSOLUTE: f"fabs{self._suffix}({{0}})",
         }
-        called = [kind for name in self.widths for kind in _LIBRARY[name]]
-        # The number of library functions on the longest chain before each node.
-        stages: list[int] = []
-        for node in program.nodes:
-            before = max((stages[k] for k in node.uses), default=0)
-            stages.append(before + (node.operation in called))
-        lines: list[str] = []
-        for stage in range(max(stages, default=0) + 1):
-            nodes = [k for k, s in enumerate(stages) if s == stage]
-            for name in self.widths:
-                batch = [
-                    k for k in nodes if program.nodes[k].operation in _LIBRARY[name]
-                ]
-                lines += self._call(program, name, batch, stage) if batch else []
-            for k in nodes:
-                node = program.nodes[k]
-                if node.operation in called:
-                    continue
-                if node.operation is Operation.INPUT:
-                    number, entry = node.place
-                    text = f"{inputs[number]}[{entry}]"
-                else:
-                    operands = [self._operand(x) for x in node.operands]
-                    text = node.operation.spell(operands, formats, self._suffix)
-                kind = "int" if "truth" in node.operation.traits else self.type
-                lines.append(f"const {kind} t{k} = {text};")
-        return lines
 
     def _call(
         self, program: Program, name: str, nodes: Sequence[int], stage: int
     ) -> list[str]:
         """Write a call of the library for several nodes, and its results as these nodes."""
         width = self.widths[name]
-        arguments = list(dict.fromkeys(program.nodes[k].operands[0] for k in nodes))
-        filled = [self._operand(x) for x in arguments]
-        filled += [self.number(0.0)] * (width - len(arguments))
+        operands = list(dict.fromkeys(program.nodes[k].operands[0] for k in nodes))
+        # The library always computes as many numbers.
+        idle = [self.number(0.0)] * (width - len(operands))
+        arguments = ", ".join([*map(self._operand, operands), *idle])
         label = f"t{name[0]}{stage}"
-        results = [f"{label}a", f"{label}b"][: len(_LIBRARY[name])]
+        results = [f"{label}a", f"{label}b"][: len(LIBRARY[name])]
+        arrays = ", ".join(f"{x}[{width}]" for x in results)
         lines = [
-            f"const {self.type} {label}[{width}] = {{{', '.join(filled)}}};",
-            f"{self.type} {', '.join(f'{x}[{width}]' for x in results)};",
+            f"const {self.type} {label}[{width}] = {{{arguments}}};",
+            f"{self.type} {arrays};",
             f"{self.prefix}_{name}({label}, {', '.join(results)});",
         ]
         for k in nodes:
             operation, (x,) = program.nodes[k]
             result = results[operation is Operation.COSINE]
-            lines.append(f"const {self.type} t{k} = {result}[{arguments.index(x)}];")
+            lines.append(f"const {self.type} t{k} = {result}[{operands.index(x)}];")
         return lines
 
     def library(self) -> str:
@@ -227,18 +243,22 @@ class CWriter:
         """
         terms = [self.number(c) for c in coefficients]
         for power in powers:
-            pairs = [terms[k : k + 2] for k in range(0, len(terms), 2)]
-            terms = [
-                f"({p[0]} + {power} * {p[1]})" if len(p) == 2 else p[0] for p in pairs
-            ]
+            pairs = zip(terms[::2], terms[1::2], strict=False)
+            sums = [f"({low} + {power} * {high})" for low, high in pairs]
+            terms = sums + terms[2 * len(sums) :]
         return terms[0]
 
 
+def _count_calls(program: Program, operations: Sequence[Operation]) -> int:
+    """Return the number of different arguments of some operations in a program."""
+    return len({x.operands for x in program.nodes if x.operation in operations})
+
+
 def _check_names(names: list[str]) -> None:
+    """Reject names that C does not allow, or that occur twice."""
     for name in names:
-        if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name) or _RESERVED.fullmatch(
-            name
-        ):
+        is_identifier = re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name)
+        if not is_identifier or RESERVED.fullmatch(name):
             raise InputError(
                 "names in C code must be identifiers of C and not reserved, but one "
                 f"is {name!r}."

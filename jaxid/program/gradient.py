@@ -1,6 +1,7 @@
 """The derivative of a scalar program, as another one: backwards through its operations."""
 
 import functools
+import math
 from collections.abc import Callable
 
 import jax
@@ -9,7 +10,7 @@ import numpy as np
 from jaxid.errors import InputError
 
 from .numpy_evaluation import evaluate
-from .program import Program, Reference, assemble, record
+from .program import Program, assemble, record
 from .scalar import (
     Graph,
     Operand,
@@ -62,40 +63,49 @@ def gradient_program(program: Program) -> Program:
 
     Its last input holds the weights, one for each packed result.
     """
-    graph, number = Graph(), len(program.input_shapes)
+    graph = Graph()
+    shapes = program.input_shapes
     # Inputs are loaded before the first operation, so that they come first.
     weights = [
-        graph.node(Operation.INPUT, number, k) for k in range(len(program.outputs))
+        graph.node(Operation.INPUT, len(shapes), k) for k in range(len(program.outputs))
     ]
     scalars = record(program, graph)
+    slopes = _slopes_of_nodes(program, scalars, weights)
 
-    def operand(x: Reference) -> Operand:
-        return scalars[x] if isinstance(x, int) else x
+    places = {
+        node.place: k
+        for k, node in enumerate(program.nodes)
+        if node.operation is Operation.INPUT
+    }
+    outputs = []
+    for number, shape in enumerate(shapes):
+        for entry in range(math.prod(shape)):
+            # What has no effect is no node.
+            k = places.get((number, entry))
+            outputs.append(0.0 if k is None else slopes[k])
+    structure = jax.tree.structure((0,) * len(shapes))
+    return assemble((*shapes, (len(weights),)), outputs, shapes, structure)
 
+
+def _slopes_of_nodes(
+    program: Program, scalars: list[Scalar], weights: list[Scalar]
+) -> list[Operand]:
+    """Return the derivative of the weighted sum of results by each node (reverse mode)."""
     slopes: list[Operand] = [0.0] * len(scalars)
     for weight, x in zip(weights, program.outputs, strict=True):
         if isinstance(x, int):
             slopes[x] = add(slopes[x], weight)
-    found: dict[tuple[int, int], Operand] = {}
+
     for k in reversed(range(len(scalars))):
-        node, slope = program.nodes[k], slopes[k]
-        if node.operation is Operation.INPUT:
-            found[node.place] = slope
-        elif slope != 0.0:
-            passed = _slopes(
-                node.operation, tuple(map(operand, node.operands)), scalars[k], slope
-            )
-            for x, more in zip(node.operands, passed, strict=True):
-                if isinstance(x, int):
-                    slopes[x] = add(slopes[x], more)
-    shapes = program.input_shapes
-    outputs = [
-        found.get((i, entry), 0.0)
-        for i, shape in enumerate(shapes)
-        for entry in range(int(np.prod(shape)))
-    ]
-    structure = jax.tree.structure((0,) * len(shapes))
-    return assemble((*shapes, (len(program.outputs),)), outputs, shapes, structure)
+        node = program.nodes[k]
+        if node.operation is Operation.INPUT or slopes[k] == 0.0:
+            continue
+        operands = tuple(scalars[x] if isinstance(x, int) else x for x in node.operands)
+        shares = _slopes(node.operation, operands, scalars[k], slopes[k])
+        for x, share in zip(node.operands, shares, strict=True):
+            if isinstance(x, int):
+                slopes[x] = add(slopes[x], share)
+    return slopes
 
 
 def _slopes(
@@ -136,4 +146,5 @@ def _slopes(
 
 
 def _root_of_one_minus_square(x: Operand) -> Operand:
+    """Return the cosine of the arc sine of x."""
     return apply(Operation.SQUARE_ROOT, add(1.0, negate(multiply(x, x))))

@@ -5,7 +5,6 @@ against exact series, is at most 1.5e-16 (float64) for |x| up to 3e9, or 1e-7 (f
 for |x| up to 1e5; beyond that, and for x infinite or NaN, the result is NaN.
 """
 
-import functools
 import math
 from fractions import Fraction
 from typing import NamedTuple
@@ -21,13 +20,14 @@ _HALF_PI = Fraction("1.57079632679489661923132169163975144209858469968755291")
 
 def half_pi(bits: int, count: int) -> tuple[float, ...]:
     """Return pi/2 as a sum of numbers with so few bits that whole multiples of each are exact."""
-    rest, pieces = _HALF_PI, []
+    pieces = []
+    remainder = _HALF_PI
     for _ in range(count):
-        scale = Fraction(2) ** (bits - math.frexp(rest)[1])
-        piece = Fraction(int(rest * scale)) / scale
+        scale = Fraction(2) ** (bits - math.frexp(remainder)[1])
+        piece = Fraction(int(remainder * scale)) / scale
         pieces.append(float(piece))
-        rest -= piece
-    return (*pieces, float(rest))
+        remainder -= piece
+    return (*pieces, float(remainder))
 
 
 class Precision(NamedTuple):
@@ -36,9 +36,7 @@ class Precision(NamedTuple):
     pieces: tuple[float, ...]  # parts of pi/2, the largest first
     limit: float  # largest number of quarter turns
     sine: tuple[float, ...]  # coefficients of the sine's polynomial, lowest power first
-    cosine: tuple[
-        float, ...
-    ]  # coefficients of the cosine's polynomial, lowest power first
+    cosine: tuple[float, ...]  # the same for the cosine
 
 
 # Minimax coefficients on |r| <= pi/4 (Remez exchange in 60 digits, then rounded),
@@ -73,10 +71,12 @@ SINGLE = Precision(
 
 
 def _horner(coefficients: tuple[float, ...], z: Array) -> Array:
-    last, *others = reversed(coefficients)
-    return functools.reduce(
-        lambda total, c: total * z + c, others, jnp.full_like(z, last)
-    )
+    """Evaluate a polynomial whose lowest power comes first."""
+    *others, highest = coefficients
+    total = jnp.full_like(z, highest)
+    for coefficient in reversed(others):
+        total = total * z + coefficient
+    return total
 
 
 @jax.custom_jvp
@@ -92,15 +92,18 @@ def sine_cosine(x: Array) -> tuple[Array, Array]:
     # once.
     r = r - (turns * middle + turns * last)
     z = r * r
-    s = r + r * (z * _horner(precision.sine, z))
-    c = 1 - (0.5 * z - z * z * _horner(precision.cosine, z))
+    sine = r + r * (z * _horner(precision.sine, z))
+    cosine = 1 - (0.5 * z - z * z * _horner(precision.cosine, z))
+
+    # Each quarter turn more makes a cosine of a sine, and a negative sine of a cosine.
     quarter = turns - 4 * jnp.floor(turns * 0.25)
-    swapped = (quarter == 1) | (quarter == 3)
-    sine, cosine = jnp.where(swapped, c, s), jnp.where(swapped, s, c)
-    sine = jnp.where(quarter >= 2, -sine, sine)
-    cosine = jnp.where((quarter == 1) | (quarter == 2), -cosine, cosine)
-    known = jnp.abs(turns) <= precision.limit
-    return jnp.where(known, sine, jnp.nan), jnp.where(known, cosine, jnp.nan)
+    is_swapped = (quarter == 1) | (quarter == 3)
+    first = jnp.where(is_swapped, cosine, sine)
+    second = jnp.where(is_swapped, sine, cosine)
+    first = jnp.where(quarter >= 2, -first, first)
+    second = jnp.where((quarter == 1) | (quarter == 2), -second, second)
+    is_exact = jnp.abs(turns) <= precision.limit
+    return jnp.where(is_exact, first, jnp.nan), jnp.where(is_exact, second, jnp.nan)
 
 
 @sine_cosine.defjvp

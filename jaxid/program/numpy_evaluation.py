@@ -2,17 +2,15 @@
 
 NumPy is for few samples, and for decisions that must not depend on the precision in
 which JAX runs; it computes in float64. Floats are for a loop in which each sample needs
-the one before, such as a
-simulation: NumPy would pay its overhead for every operation and XLA take seconds to
-    compile,
-whereas Python runs a program of a thousand operations in some thirty microseconds at
-once.
+the one before, such as a simulation: NumPy would pay its overhead for every operation
+and XLA take seconds to compile, whereas Python runs a program of a thousand operations
+in some thirty microseconds at once.
 """
 
 import functools
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -21,14 +19,30 @@ from jaxid.arrays import AnyArray
 from .program import Program, Reference
 from .scalar import Operation
 
-_BLOCK = 2048
+PYTHON_FORMATS = {
+    Operation.NEGATE: "-{0}",
+    Operation.NOT: "not {0}",
+    Operation.SELECT: "{1} if {0} else {2}",
+    Operation.MAXIMUM: "{0} if {0} > {1} or {0} != {0} else {1}",
+    Operation.MINIMUM: "{0} if {0} < {1} or {0} != {0} else {1}",
+    Operation.SIGN: "1.0 if {0} > 0.0 else -1.0 if {0} < 0.0 else {0}",
+    Operation.POWER: "{0} ** {1}",
+}
+"""Operations that Python writes in its own way."""
+MAX_LENGTH = 200
+"""Number of characters up to which an expression is written within another one."""
+BLOCK = 2048
 """Samples at a time, so that intermediate values stay in the processor's cache."""
 
 
-_Plan = tuple[tuple[tuple[int, int, int], ...], Callable[[list[np.ndarray]], None], int]
-"""Cell, input's number and entry's position for each entry that is read; function that does all
-operations on the cells; number of cells. Those of the results come first, others are
-reused."""
+class Plan(NamedTuple):
+    """A program as one function on cells of memory, of which several nodes share each."""
+
+    loads: tuple[
+        tuple[int, int, int], ...
+    ]  # cell, number of its input, and entry there
+    run: Callable[[list[np.ndarray]], None]  # all operations, on the cells
+    cells: int  # number of cells; those of the results come first
 
 
 def evaluate(program: Program, *arrays: AnyArray) -> Any:
@@ -47,38 +61,28 @@ def packed_entries(
     program: Program, rows: np.ndarray, entries: np.ndarray
 ) -> np.ndarray:
     """Return some entries of the packed result [entries, samples] from its distinct values."""
-    found, number = (
-        np.empty((len(entries), rows.shape[1])),
-        program.distinct[1][entries],
-    )
-    varies = number >= 0
-    found[varies] = rows[number[varies]]
+    numbers = program.distinct[1][entries]
+    varies = numbers >= 0
+    values = np.empty((len(entries), rows.shape[1]))
+    values[varies] = rows[numbers[varies]]
     constants = [program.outputs[k] for k in entries[~varies]]
-    found[~varies] = np.array(constants, float)[:, None]
-    return found
+    values[~varies] = np.array(constants, float)[:, None]
+    return values
 
 
 @functools.lru_cache(maxsize=64)
-def _plan(program: Program) -> _Plan:
-    results = {node: k for k, node in enumerate(program.distinct[0])}
-    last_use = {
-        k: position for position, node in enumerate(program.nodes) for k in node.uses
-    }
-    cell, idle, cells, loads = dict(results), [], len(results), []
-    # Written as one function, since a loop over the operations takes as long as a short
-    # operation.
-    lines, scope, names = [], {"where": _select, "inf": np.inf, "nan": np.nan}, {}
+def _plan(program: Program) -> Plan:
+    """Write a program as one function: a loop over operations takes as long as short ones."""
+    cells, count = _allocate_cells(program)
+    loads = []
+    lines = []
+    names = {}
+    scope = {"where": _select, "inf": np.inf, "nan": np.nan}
     for position, node in enumerate(program.nodes):
-        if position not in cell:
-            if idle:
-                cell[position] = idle.pop()
-            else:
-                cell[position], cells = cells, cells + 1
-        own = f"c{cell[position]}"
+        cell = f"c{cells[position]}"
+        names[position] = cell
         if node.operation is Operation.INPUT:
-            number, entry = node.place
-            loads.append((cell[position], number, entry))
-            names[position] = own
+            loads.append((cells[position], *node.place))
             continue
         operands = ", ".join(
             names[x] if isinstance(x, int) else repr(x) for x in node.operands
@@ -89,21 +93,41 @@ def _plan(program: Program) -> _Plan:
             names[position] = f"t{position}"
             lines.append(f"t{position} = {function}({operands})")
         else:
-            names[position] = own
-            lines.append(f"{function}({operands}, out={own})")
-        # Only now: no operation may overwrite an operand that it still reads.
-        idle += [
-            cell[k]
-            for k in set(node.uses)
-            if last_use[k] == position and k not in results
-        ]
-    unpack = "".join(f"c{k}, " for k in range(cells))
+            lines.append(f"{function}({operands}, out={cell})")
+    unpack = "".join(f"c{k}, " for k in range(count))
     body = "".join(f"    {line}\n" for line in lines)
     exec(f"def run(cells):\n    [{unpack}] = cells\n{body}", scope)
-    return tuple(loads), scope["run"], cells
+    return Plan(tuple(loads), scope["run"], count)
+
+
+def _allocate_cells(program: Program) -> tuple[list[int], int]:
+    """Return the cell of each node, and the number of cells; results keep theirs."""
+    results = {node: k for k, node in enumerate(program.distinct[0])}
+    last_use = {}
+    for position, node in enumerate(program.nodes):
+        for operand in node.uses:
+            last_use[operand] = position
+
+    cells = []
+    idle_cells = []
+    count = len(results)
+    for position, node in enumerate(program.nodes):
+        if position in results:
+            cells.append(results[position])
+        elif idle_cells:
+            cells.append(idle_cells.pop())
+        else:
+            cells.append(count)
+            count += 1
+        # Only now: no operation may overwrite an operand that it still reads.
+        for operand in set(node.uses):
+            if last_use[operand] == position and operand not in results:
+                idle_cells.append(cells[operand])
+    return cells, count
 
 
 def _select(condition, if_true, if_false, out: np.ndarray) -> np.ndarray:
+    """Choose like `np.where`, into an array that is there already."""
     np.copyto(out, if_false)
     np.copyto(out, if_true, where=condition)
     return out
@@ -113,20 +137,21 @@ def _evaluate(
     program: Program, arrays: tuple[AnyArray, ...]
 ) -> tuple[np.ndarray, tuple[int, ...]]:
     """Return the distinct results that vary [results, samples], and the batch's shape."""
-    loads, run, count = _plan(program)
+    loads, run, cell_count = _plan(program)
     aligned, batch = program.align([np.asarray(x, np.float64) for x in arrays], np)
     samples = math.prod(batch)
     inputs = [x.reshape(len(x), samples) for x in aligned]
-    table = np.empty((len(program.distinct[0]), samples))
-    scratch = np.empty((count - len(table), min(samples, _BLOCK)))
+    results = np.empty((len(program.distinct[0]), samples))
+    scratch = np.empty((cell_count - len(results), min(samples, BLOCK)))
     with np.errstate(all="ignore"):
-        for start in range(0, samples, _BLOCK):
-            block = slice(start, min(start + _BLOCK, samples))
-            cells = [*table[:, block], *scratch[:, : block.stop - block.start]]
-            for target, number, entry in loads:
-                cells[target][:] = inputs[number][entry, block]
+        for start in range(0, samples, BLOCK):
+            block = slice(start, min(start + BLOCK, samples))
+            size = block.stop - block.start
+            cells = [*results[:, block], *scratch[:, :size]]
+            for cell, number, entry in loads:
+                cells[cell][:] = inputs[number][entry, block]
             run(cells)
-    return table, batch
+    return results, batch
 
 
 def to_python(program: Program) -> Callable[..., tuple[float, ...]]:
@@ -136,54 +161,46 @@ def to_python(program: Program) -> Callable[..., tuple[float, ...]]:
     outputs, one after the other. Division by zero, and functions outside their domain,
     raise Python's own errors, where NumPy gives infinities and NaN.
     """
-    formats = {
-        Operation.NEGATE: "-{0}",
-        Operation.NOT: "not {0}",
-        Operation.SELECT: "{1} if {0} else {2}",
-        Operation.MAXIMUM: "{0} if {0} > {1} or {0} != {0} else {1}",
-        Operation.MINIMUM: "{0} if {0} < {1} or {0} != {0} else {1}",
-        Operation.SIGN: "1.0 if {0} > 0.0 else -1.0 if {0} < 0.0 else {0}",
-        Operation.POWER: "{0} ** {1}",
-    }
     repeating = (Operation.MAXIMUM, Operation.MINIMUM, Operation.SIGN)
     repeated = {
         k for node in program.nodes if node.operation in repeating for k in node.uses
     }
-    lines = [
-        f"({''.join(f'x{k}_{entry}, ' for entry in range(math.prod(shape)))}) = x{k}"
-        for k, shape in enumerate(program.input_shapes)
-        if math.prod(shape)
-    ]
+    lines = []
+    for k, shape in enumerate(program.input_shapes):
+        entries = "".join(f"x{k}_{entry}, " for entry in range(math.prod(shape)))
+        if entries:
+            lines.append(f"({entries}) = x{k}")
+
     spelled: list[str] = []
-
-    def spell(x: Reference) -> str:
-        if isinstance(x, int):
-            return spelled[x]
-        # Python has no literals for infinities and NaN: `math` has their names.
-        return f"({x!r})" if math.isfinite(x) else f"({'-' if x < 0 else ''}{abs(x)!s})"
-
     for position, node in enumerate(program.nodes):
         if node.operation is Operation.INPUT:
             number, entry = node.place
             spelled.append(f"x{number}_{entry}")
             continue
-        text = node.operation.spell([spell(x) for x in node.operands], formats)
+        operands = [_spell(x, spelled) for x in node.operands]
+        text = node.operation.spell(operands, PYTHON_FORMATS)
         # A value that is needed once is written where it is needed, unless the line
         # gets long.
-        if (
-            program.uses[position] == 1
-            and position not in repeated
-            and len(text) <= 200
-        ):
+        is_needed_once = program.uses[position] == 1 and position not in repeated
+        if is_needed_once and len(text) <= MAX_LENGTH:
             spelled.append(f"({text})")
         else:
             lines.append(f"t{position} = {text}")
             spelled.append(f"t{position}")
-    results = "".join(f"{spell(x)}, " for x in program.outputs)
+
+    results = "".join(f"{_spell(x, spelled)}, " for x in program.outputs)
     names = ", ".join(f"x{k}" for k in range(len(program.input_shapes)))
     body = "".join(f"    {line}\n" for line in lines)
-    scope = {
-        name: getattr(math, name) for name in dir(math) if not name.startswith("_")
-    }
+    scope = {name: x for name, x in vars(math).items() if not name.startswith("_")}
     exec(f"def run({names}):\n{body}    return ({results})\n", scope)
     return scope["run"]
+
+
+def _spell(x: Reference, nodes: list[str]) -> str:
+    """Write an operand in Python, from the texts of the nodes before."""
+    if isinstance(x, int):
+        return nodes[x]
+    if math.isfinite(x):
+        return f"({x!r})"
+    # Python has no literals for infinities and NaN: `math` has their names.
+    return f"({'-' if x < 0 else ''}{abs(x)!s})"

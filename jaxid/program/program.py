@@ -66,18 +66,15 @@ class Program:
     `jit`.
     """
 
-    input_shapes: tuple[
-        tuple[int, ...], ...
-    ]  # shapes of the inputs, without batch axes
-    nodes: tuple[Node, ...] = field(
-        repr=False
-    )  # operations; each one reads only nodes before it
+    # shapes of the inputs, without batch axes
+    input_shapes: tuple[tuple[int, ...], ...]
+    # operations; each one reads only nodes before it
+    nodes: tuple[Node, ...] = field(repr=False)
     # packed result: for each entry of each output, in order, a node or a constant
     outputs: tuple[Reference, ...] = field(repr=False)
-    output_shapes: tuple[
-        tuple[int, ...], ...
-    ]  # shapes of the outputs, without batch axes
-    structure: Any = field(repr=False)  # pyTree structure of the function's result
+    # shapes of the outputs, without batch axes
+    output_shapes: tuple[tuple[int, ...], ...]
+    structure: Any = field(repr=False)  # tree structure of the function's result
 
     @functools.cached_property
     def counts(self) -> OperationCounts:
@@ -85,9 +82,8 @@ class Program:
         operations = Counter(node.operation for node in self.nodes)
 
         def count(*traits: str) -> int:
-            return sum(
-                n for x, n in operations.items() if x.traits.intersection(traits)
-            )
+            members = [x for x in operations if x.traits.intersection(traits)]
+            return sum(operations[x] for x in members)
 
         return OperationCounts(
             multiplications=operations[Operation.MULTIPLY],
@@ -101,23 +97,18 @@ class Program:
     @functools.cached_property
     def uses(self) -> tuple[int, ...]:
         """Number of nodes and outputs that read each node."""
-        uses = [0] * len(self.nodes)
-        for k in (k for node in self.nodes for k in node.uses):
-            uses[k] += 1
-        for x in self.outputs:
-            if isinstance(x, int):
-                uses[x] += 1
-        return tuple(uses)
+        counts = Counter(x for x in self.outputs if isinstance(x, int))
+        for node in self.nodes:
+            counts.update(node.uses)
+        return tuple(counts[k] for k in range(len(self.nodes)))
 
     @functools.cached_property
     def distinct(self) -> tuple[tuple[int, ...], np.ndarray]:
         """Nodes of the packed result, and for each entry the number of its node, or -1."""
-        numbers: dict[int, int] = {}
-        nodes = (x if isinstance(x, int) else None for x in self.outputs)
-        entries = [
-            -1 if x is None else numbers.setdefault(x, len(numbers)) for x in nodes
-        ]
-        return tuple(numbers), np.array(entries, int)
+        nodes = dict.fromkeys(x for x in self.outputs if isinstance(x, int))
+        numbers = {node: number for number, node in enumerate(nodes)}
+        entries = [numbers[x] if isinstance(x, int) else -1 for x in self.outputs]
+        return tuple(nodes), np.array(entries, int)
 
     def pack(self, distinct: Sequence[Any]) -> list[Any]:
         """Return the packed result from its distinct values; constants are floats."""
@@ -127,10 +118,8 @@ class Program:
     @functools.cached_property
     def nonzeros(self) -> Any:
         """Boolean arrays in the structure of the outputs, False where an entry is always 0."""
-        varies = np.array(
-            [not (isinstance(x, float) and x == 0) for x in self.outputs], bool
-        )
-        return self.unpack(varies)
+        nonzeros = [isinstance(x, int) or x != 0.0 for x in self.outputs]
+        return self.unpack(np.array(nonzeros, bool))
 
     def split(self, packed: Any) -> list[Any]:
         """Split values of the packed entries into those of each output."""
@@ -141,26 +130,27 @@ class Program:
         self, arrays: Sequence[Any], xp: ModuleType
     ) -> tuple[list[Any], tuple[int, ...]]:
         """Return the inputs with their own axes merged and the batch behind; the batch's shape."""
-        if len(arrays) != len(self.input_shapes):
-            wanted = len(self.input_shapes)
+        count = len(self.input_shapes)
+        if len(arrays) != count:
             raise InputError(
-                f"The program takes {wanted} arrays, but got {len(arrays)}."
+                f"The program takes {count} arrays, but got {len(arrays)}."
             )
         batches = []
-        for k, (x, expected) in enumerate(zip(arrays, self.input_shapes, strict=True)):
-            if x.shape[: len(expected)] != expected:
+        for k, (x, shape) in enumerate(zip(arrays, self.input_shapes, strict=True)):
+            if x.shape[: len(shape)] != shape:
                 raise InputError(
-                    f"Input {k} must have shape {expected}, but has {x.shape}: put "
-                    "the batch last."
+                    f"Input {k} must have shape {shape}, but has {x.shape}: put the "
+                    "batch last."
                 )
-            batches.append(x.shape[len(expected) :])
+            batches.append(x.shape[len(shape) :])
         batch = np.broadcast_shapes(*batches) if batches else ()
+
         entries = []
-        for x, shape, own in zip(arrays, self.input_shapes, batches, strict=True):
-            size, missing = math.prod(shape), (1,) * (len(batch) - len(own))
-            entries.append(
-                xp.broadcast_to(x.reshape(size, *missing, *own), (size, *batch))
-            )
+        for x, shape, axes in zip(arrays, self.input_shapes, batches, strict=True):
+            size = math.prod(shape)
+            absent_axes = (1,) * (len(batch) - len(axes))
+            rows = x.reshape(size, *absent_axes, *axes)
+            entries.append(xp.broadcast_to(rows, (size, *batch)))
         return entries, batch
 
     def unpack(self, packed: Any) -> Any:
@@ -186,35 +176,33 @@ def assemble(
     def reference(x: Operand) -> Reference:
         return place[x.index] if isinstance(x, Scalar) else float(x)
 
-    nodes = tuple(
-        Node(s.operation, s.operands)
-        if s.operation is Operation.INPUT
-        else Node(s.operation, tuple(map(reference, s.operands)))
-        for s in scalars
-    )
-    return Program(
-        input_shapes, nodes, tuple(map(reference, outputs)), output_shapes, structure
-    )
+    nodes = []
+    for scalar in scalars:
+        # The operands of an input are its number and entry.
+        operands = scalar.operands
+        if scalar.operation is not Operation.INPUT:
+            operands = tuple(map(reference, operands))
+        nodes.append(Node(scalar.operation, operands))
+    results = tuple(map(reference, outputs))
+    return Program(input_shapes, tuple(nodes), results, output_shapes, structure)
 
 
 def record(program: Program, graph: Graph) -> list[Scalar]:
     """Write the nodes of a program into a graph; return the scalar of each."""
     scalars: list[Scalar] = []
     for node in program.nodes:
-        is_input = node.operation is Operation.INPUT
-        known = (
-            scalars[x] if isinstance(x, int) and not is_input else x
-            for x in node.operands
-        )
-        scalars.append(graph.node(node.operation, *known))
+        operands: list[Any] = list(node.operands)
+        if node.operation is not Operation.INPUT:
+            operands = [scalars[x] if isinstance(x, int) else x for x in operands]
+        scalars.append(graph.node(node.operation, *operands))
     return scalars
 
 
 def select_outputs(program: Program, entries: np.ndarray) -> Program:
     """Return a program that computes only some results of a program."""
     scalars = record(program, Graph())
-    chosen = (program.outputs[k] for k in entries.ravel())
-    outputs = [scalars[x] if isinstance(x, int) else x for x in chosen]
+    references = [program.outputs[k] for k in entries.ravel()]
+    outputs = [scalars[x] if isinstance(x, int) else x for x in references]
     return assemble(
         program.input_shapes, outputs, (entries.shape,), jax.tree.structure(0)
     )

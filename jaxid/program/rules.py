@@ -1,6 +1,7 @@
 """Rules that JAX follows in place of its own: for derivatives, `vmap`, and many devices."""
 
 import functools
+import itertools
 import string
 from collections.abc import Callable
 from typing import Any
@@ -30,30 +31,31 @@ def differing_alike(arrays: tuple[Array, ...]) -> tuple[Array, ...]:
     return tuple(jnp.where(ALWAYS, x, like) for x in arrays)
 
 
-def with_derivatives_of(plain: Callable, run: Callable) -> Callable:
+def with_derivatives_of(definition: Callable, run: Callable) -> Callable:
     """Return a function of arrays whose derivatives are those of another definition of it.
 
-    Only along inputs that move the other definition is differentiated.
+    The other definition is differentiated only by inputs that have a tangent.
     """
-    found = jax.custom_jvp(run)
+    function = jax.custom_jvp(run)
 
     def derivative(primals: tuple, tangents: tuple) -> tuple:
-        moving = [k for k, x in enumerate(tangents) if not isinstance(x, SymbolicZero)]
+        has_tangent = [not isinstance(x, SymbolicZero) for x in tangents]
+        variables = [k for k, tangent in enumerate(has_tangent) if tangent]
 
-        def of_moving(*given: Array) -> Any:
+        def of_variables(*values: Array) -> Any:
             arrays = list(primals)
-            for k, x in zip(moving, given, strict=True):
-                arrays[k] = x
-            return plain(*arrays)
+            for k, value in zip(variables, values, strict=True):
+                arrays[k] = value
+            return definition(*arrays)
 
         return jax.jvp(
-            of_moving,
-            tuple(primals[k] for k in moving),
-            tuple(tangents[k] for k in moving),
+            of_variables,
+            tuple(primals[k] for k in variables),
+            tuple(tangents[k] for k in variables),
         )
 
-    found.defjvp(derivative, symbolic_zeros=True)
-    return found
+    function.defjvp(derivative, symbolic_zeros=True)
+    return function
 
 
 def divided(function: Callable) -> Callable:
@@ -69,50 +71,64 @@ def divided(function: Callable) -> Callable:
             # `shard_map` has divided the arrays already.
             return function(*arrays)
         program, shapes = jax.make_jaxpr(function, return_shape=True)(*arrays)
-        constants = program.consts
+        count = len(program.consts)
 
         # JAX divides functions without constants only: they become arguments.
-        def whole(*given: Array) -> Any:
-            known, arrays = given[: len(constants)], given[len(constants) :]
-            out = jaxpr_as_fun(ClosedJaxpr(program.jaxpr, known))(*arrays)
-            return jax.tree.unflatten(jax.tree.structure(shapes), out)
+        def without_constants(*arguments: Array) -> Any:
+            closed = ClosedJaxpr(program.jaxpr, arguments[:count])
+            results = jaxpr_as_fun(closed)(*arguments[count:])
+            return jax.tree.unflatten(jax.tree.structure(shapes), results)
 
-        return _divisible(function, whole, len(constants))(*constants, *arrays)
+        on_devices = _divisible(function, without_constants, count)
+        return on_devices(*program.consts, *arrays)
 
     @run.def_vmap
-    def batch(size: int, batched: list[bool], *arrays: Array) -> tuple[Any, Any]:
-        out = jax.vmap(function, [0 if x else None for x in batched])(*arrays)
-        return out, jax.tree.map(lambda _: True, out)
+    def batch(size: int, is_batched: list[bool], *arrays: Array) -> tuple[Any, Any]:
+        axes = [0 if batched else None for batched in is_batched]
+        results = jax.vmap(function, axes)(*arrays)
+        return results, jax.tree.map(lambda _: True, results)
 
     return with_derivatives_of(function, lambda *arrays: run(*differing_alike(arrays)))
 
 
-def _divisible(function: Callable, whole: Callable, constants: int) -> Callable:
-    """Return a function whose arguments behind some constants have one leading axis."""
-    divisible = custom_partitioning(whole)
+def _divisible(function: Callable, on_all: Callable, constants: int) -> Callable:
+    """Return a function whose arguments behind some constants have one leading axis.
+
+    Args:
+        function: Function of the arrays, for one device.
+        on_all: The same as a function of constants and arrays.
+        constants: Number of constants.
+    """
+    divisible = custom_partitioning(on_all)
 
     def partition(mesh: Any, arguments: Any, results: Any) -> tuple:
+        # The leading axis of the first array that is divided.
         specs = [x.sharding.spec[:1] for x in arguments[constants:]]
-        leading = next((x for x in specs if any(x)), ())
-        own, same = (NamedSharding(mesh, PartitionSpec(*x)) for x in (leading, ()))
-        given = [same if k < constants else own for k in range(len(arguments))]
+        leading = next((spec for spec in specs if any(spec)), ())
+        by_parts = NamedSharding(mesh, PartitionSpec(*leading))
+        on_each = NamedSharding(mesh, PartitionSpec())
+        arrays = len(arguments) - constants
+        shardings = (on_each,) * constants + (by_parts,) * arrays
 
-        def part(*given: Array) -> Any:
-            return function(*given[constants:])
+        def on_part(*arguments: Array) -> Any:
+            return function(*arguments[constants:])
 
-        return mesh, part, jax.tree.map(lambda _: own, results), tuple(given)
+        return mesh, on_part, jax.tree.map(lambda _: by_parts, results), shardings
 
     def rule(_: Any, arguments: Any, results: Any) -> str:
-        names = iter(
-            f"{a}{b}" for a in string.ascii_lowercase for b in string.ascii_lowercase
-        )
+        """Name the axes: all arrays share the leading one, and no others."""
+        letters = itertools.product(string.ascii_lowercase, repeat=2)
+        names = map("".join, letters)
 
-        def axes(x: Any, divided: bool) -> str:
-            own = [next(names) for _ in x.shape]
-            return " ".join(["lead", *own[1:]] if divided else own)
+        def axes(x: Any, is_array: bool) -> str:
+            words = list(itertools.islice(names, len(x.shape)))
+            if is_array:
+                words[:1] = ["lead"]
+            return " ".join(words)
 
-        given = ", ".join(axes(x, k >= constants) for k, x in enumerate(arguments))
-        return f"{given} -> {', '.join(axes(x, True) for x in results)}"
+        inputs = [axes(x, k >= constants) for k, x in enumerate(arguments)]
+        outputs = [axes(x, is_array=True) for x in results]
+        return f"{', '.join(inputs)} -> {', '.join(outputs)}"
 
     divisible.def_partition(partition=partition, sharding_rule=rule)
     return divisible

@@ -13,10 +13,15 @@ products, and `-(x - y)` becomes `y - x` where nothing else needs the difference
 
 import enum
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, overload
 
 import numpy as np
+
+MIN_FACTOR = 1e-300
+"""Size above which constant factors are merged: below, digits would be lost."""
+MAX_FACTOR = 1e300
+"""Size below which constant factors are merged: above, they would be infinite."""
 
 
 class Operation(enum.StrEnum):
@@ -34,11 +39,9 @@ class Operation(enum.StrEnum):
     def __new__(cls, name: str, numpy: Any = None, infix: str = "", traits: str = ""):  # noqa: D102
         member = str.__new__(cls, name)
         member._value_ = name
-        member.numpy, member.infix, member.traits = (
-            numpy,
-            infix,
-            frozenset(traits.split()),
-        )
+        member.numpy = numpy
+        member.infix = infix
+        member.traits = frozenset(traits.split())
         return member
 
     INPUT = "input", None
@@ -164,9 +167,11 @@ def add(x: Operand, y: Operand) -> Operand:
         negated, x = _magnitude(x)
         total = x.graph.node(Operation.ADD, x, -float(y) if negated else float(y))
         return negate(total) if negated else total
-    (x_negated, x), (y_negated, y) = _magnitude(x), _magnitude(y)
+    x_negated, x = _magnitude(x)
+    y_negated, y = _magnitude(y)
     if x.index > y.index:
-        x, y, x_negated, y_negated = y, x, y_negated, x_negated
+        x, y = y, x
+        x_negated, y_negated = y_negated, x_negated
     if x is y:
         if x_negated != y_negated:
             return 0.0
@@ -185,7 +190,8 @@ def multiply(x: Operand, y: Operand) -> Operand:
         x, y = y, x
     if not isinstance(x, Scalar) and x == 0:
         return 0.0
-    (x_negated, x), (y_negated, y) = _magnitude(x), _magnitude(y)
+    x_negated, x = _magnitude(x)
+    y_negated, y = _magnitude(y)
     if not isinstance(x, Scalar):
         product = _scale(float(x), y)
     else:
@@ -196,12 +202,13 @@ def multiply(x: Operand, y: Operand) -> Operand:
 
 
 def _scale(factor: float, x: Scalar) -> Scalar:
+    """Return a positive number times x; a number in x is merged unless it leaves the range."""
     if factor == 1:
         return x
     if x.operation is Operation.MULTIPLY and not isinstance(x.operands[0], Scalar):
-        merged = factor * x.operands[0]
-        if 1e-300 < merged < 1e300:
-            return _scale(merged, x.operands[1])
+        product = factor * x.operands[0]
+        if MIN_FACTOR < product < MAX_FACTOR:
+            return _scale(product, x.operands[1])
     return x.graph.node(Operation.MULTIPLY, factor, x)
 
 
@@ -211,15 +218,15 @@ def divide(x: Operand, y: Operand) -> Operand:
         if not isinstance(x, Scalar):
             return Operation.DIVIDE.on_constants(float(x), float(y))
         reciprocal = Operation.DIVIDE.on_constants(1.0, float(y))
-        if 1e-300 < abs(reciprocal) < 1e300:
+        if MIN_FACTOR < abs(reciprocal) < MAX_FACTOR:
             return multiply(reciprocal, x)
         return x.graph.node(Operation.DIVIDE, x, float(y))
     if not isinstance(x, Scalar) and x == 0:
         return 0.0
-    (x_negated, x), (y_negated, y) = _magnitude(x), _magnitude(y)
-    quotient = y.graph.node(
-        Operation.DIVIDE, float(x) if not isinstance(x, Scalar) else x, y
-    )
+    x_negated, x = _magnitude(x)
+    y_negated, y = _magnitude(y)
+    numerator = x if isinstance(x, Scalar) else float(x)
+    quotient = y.graph.node(Operation.DIVIDE, numerator, y)
     return quotient if x_negated == y_negated else negate(quotient)
 
 
@@ -227,7 +234,8 @@ def integer_power(x: Operand, exponent: int) -> Operand:
     """Return a whole power of x by repeated squaring."""
     if exponent < 0:
         return divide(1.0, integer_power(x, -exponent))
-    power, square = 1.0, x
+    power: Operand = 1.0
+    square = x
     while exponent:
         if exponent & 1:
             power = multiply(power, square)
@@ -254,23 +262,25 @@ def select(condition: Operand, if_true: Operand, if_false: Operand) -> Operand:
     if if_true == if_false:
         return if_true
     if is_truth(if_true):
-        chosen = logic(Operation.AND, condition, if_true)
-        other = logic(Operation.AND, logic(Operation.NOT, condition), if_false)
-        return logic(Operation.OR, chosen, other)
+        first = logic(Operation.AND, condition, if_true)
+        second = logic(Operation.AND, logic(Operation.NOT, condition), if_false)
+        return logic(Operation.OR, first, second)
     return condition.graph.node(Operation.SELECT, condition, if_true, if_false)
 
 
 def logic(operation: Operation, *operands: Operand) -> Operand:
     """Combine truth values by `AND`, `OR` or `NOT`."""
-    unknown = [x for x in operands if isinstance(x, Scalar)]
     if operation is Operation.NOT:
         return apply(operation, *operands)
-    decisive = operation is Operation.OR
-    if any(bool(x) is decisive for x in operands if not isinstance(x, Scalar)):
-        return decisive
-    if len(unknown) == 2 and unknown[0] is not unknown[1]:
-        return apply(operation, *unknown)
-    return unknown[0] if unknown else not decisive
+    # A true constant decides OR, a false one AND; any other constant has no effect.
+    decision = operation is Operation.OR
+    constants = [bool(x) for x in operands if not isinstance(x, Scalar)]
+    if decision in constants:
+        return decision
+    scalars = [x for x in operands if isinstance(x, Scalar)]
+    if len(scalars) == 2 and scalars[0] is not scalars[1]:
+        return apply(operation, *scalars)
+    return scalars[0] if scalars else not decision
 
 
 def apply(operation: Operation, *operands: Operand) -> Operand:
@@ -284,22 +294,23 @@ def apply(operation: Operation, *operands: Operand) -> Operand:
         result = graph.node(operation, x)
         return negate(result) if negated and "odd" in operation.traits else result
     if "commutative" in operation.traits:
-        operands = tuple(
-            sorted(operands, key=lambda x: x.index if isinstance(x, Scalar) else -1)
-        )
-        if (
-            operation in (Operation.MAXIMUM, Operation.MINIMUM)
-            and operands[0] is operands[1]
-        ):
+        operands = tuple(sorted(operands, key=_index))
+        is_extremum = operation in (Operation.MAXIMUM, Operation.MINIMUM)
+        if is_extremum and operands[0] is operands[1]:
             return operands[0]
     return graph.node(operation, *operands)
 
 
+def _index(x: Operand) -> int:
+    """Return a key that sorts constants first, then expressions by age."""
+    return x.index if isinstance(x, Scalar) else -1
+
+
 def is_truth(x: Operand) -> bool:
     """Return whether x is a truth value, not a number."""
-    return (
-        "truth" in x.operation.traits if isinstance(x, Scalar) else isinstance(x, bool)
-    )
+    if not isinstance(x, Scalar):
+        return isinstance(x, bool)
+    return "truth" in x.operation.traits
 
 
 def as_number(x: Operand) -> Operand:
@@ -323,31 +334,34 @@ _Term = tuple[bool, Operand]
 
 def live_scalars(outputs: Sequence[Operand]) -> list[Scalar]:
     """Return the scalars that the outputs need, each one after its operands."""
-    seen, stack = {}, [x for x in outputs if isinstance(x, Scalar)]
+    scalars: dict[int, Scalar] = {}
+    stack = [x for x in outputs if isinstance(x, Scalar)]
     while stack:
         scalar = stack.pop()
-        if scalar.index not in seen:
-            seen[scalar.index] = scalar
+        if scalar.index not in scalars:
+            scalars[scalar.index] = scalar
             stack += [x for x in scalar.operands if isinstance(x, Scalar)]
-    return [seen[index] for index in sorted(seen)]
+    # Operands are older than what they are used for.
+    return [scalars[index] for index in sorted(scalars)]
 
 
 def rewrite(outputs: Sequence[Operand]) -> list[Operand]:
     """Return the same outputs with fewer operations, or unchanged if none can be saved."""
-    best = list(outputs)
+    outputs = list(outputs)
     while True:
-        factored = _Rewriting(best).factor_sums()
-        if _work(factored) >= _work(best):
-            return _Rewriting(best).turn_negated_differences()
-        best = factored
+        factored = Rewriting(outputs).factor_sums()
+        if _count_operations(factored) >= _count_operations(outputs):
+            return Rewriting(outputs).turn_negated_differences()
+        outputs = factored
 
 
-def _work(outputs: Sequence[Operand]) -> int:
-    free = (Operation.INPUT, Operation.NEGATE)
-    return sum(x.operation not in free for x in live_scalars(outputs))
+def _count_operations(outputs: Sequence[Operand]) -> int:
+    """Return the number of operations that cost something."""
+    idle = (Operation.INPUT, Operation.NEGATE)
+    return sum(x.operation not in idle for x in live_scalars(outputs))
 
 
-class _Rewriting:
+class Rewriting:
     """One pass over the scalars of some outputs, operands first."""
 
     def __init__(self, outputs: Sequence[Operand]):
@@ -356,50 +370,58 @@ class _Rewriting:
         self.uses = Counter(x for x in outputs if isinstance(x, Scalar))
         for scalar in self.scalars:
             self.uses.update(x for x in scalar.operands if isinstance(x, Scalar))
-        self.new: dict[Scalar, Operand] = {}
+        self.replacements: dict[Scalar, Operand] = {}
 
     def factor_sums(self) -> list[Operand]:
-        inner = {
-            x
-            for scalar in self.scalars
-            if scalar.operation in _SUMS
-            for x in scalar.operands
-            if self._is_used_once(x) and x.operation in _SUMS
-        }
+        """Draw common factors out of sums; a sum inside another one is a part of it."""
+        summands = set()
+        for scalar in self.scalars:
+            if scalar.operation in _SUMS:
+                summands.update(filter(self._is_sum_used_once, scalar.operands))
         for scalar in self.scalars:
             terms = None
-            if scalar.operation in _SUMS and scalar not in inner:
-                terms = self._factor(_flatten_sum(scalar, inner))
-            self.new[scalar] = self._rebuild(scalar) if terms is None else _sum(terms)
-        return [self._rewritten(x) for x in self.outputs]
+            if scalar.operation in _SUMS and scalar not in summands:
+                terms = self._factor(_flatten_sum(scalar, summands))
+            self.replacements[scalar] = (
+                self._rebuild(scalar) if terms is None else _sum(terms)
+            )
+        return [self._replacement(x) for x in self.outputs]
 
     def turn_negated_differences(self) -> list[Operand]:
+        """Write `-(x - y)` as `y - x`."""
         for scalar in self.scalars:
             (x, *_) = scalar.operands
             negates = scalar.operation is Operation.NEGATE and self._is_used_once(x)
             if negates and x.operation is Operation.SUBTRACT:
-                left, right = map(self._rewritten, x.operands)
-                self.new[scalar] = scalar.graph.node(Operation.SUBTRACT, right, left)
+                left, right = map(self._replacement, x.operands)
+                self.replacements[scalar] = scalar.graph.node(
+                    Operation.SUBTRACT, right, left
+                )
             elif scalar.operation is Operation.INPUT:
-                self.new[scalar] = scalar
+                self.replacements[scalar] = scalar
             else:
                 # `_rebuild` would restore the canonical order, and with it the
                 # negation.
-                operands = map(self._rewritten, scalar.operands)
-                self.new[scalar] = scalar.graph.node(scalar.operation, *operands)
-        return [self._rewritten(x) for x in self.outputs]
+                operands = map(self._replacement, scalar.operands)
+                self.replacements[scalar] = scalar.graph.node(
+                    scalar.operation, *operands
+                )
+        return [self._replacement(x) for x in self.outputs]
 
-    def _rewritten(self, x: Operand) -> Operand:
-        return self.new[x] if isinstance(x, Scalar) else x
+    def _replacement(self, x: Operand) -> Operand:
+        return self.replacements[x] if isinstance(x, Scalar) else x
 
     def _is_used_once(self, x: Operand) -> bool:
         return isinstance(x, Scalar) and self.uses[x] == 1
+
+    def _is_sum_used_once(self, x: Operand) -> bool:
+        return self._is_used_once(x) and x.operation in _SUMS
 
     def _rebuild(self, scalar: Scalar) -> Operand:
         """Return the same operation on rewritten operands."""
         if scalar.operation is Operation.INPUT:
             return scalar
-        operands = [self._rewritten(x) for x in scalar.operands]
+        operands = [self._replacement(x) for x in scalar.operands]
         if scalar.operation is Operation.ADD:
             return add(*operands)
         if scalar.operation is Operation.SUBTRACT:
@@ -412,54 +434,56 @@ class _Rewriting:
 
     def _factor(self, terms: list[_Term]) -> list[_Term] | None:
         """Draw common factors out of products that nothing else needs; None if there are none."""
-        products = [
-            (k, x)
-            for k, (_, x) in enumerate(terms)
-            if isinstance(x, Scalar)
-            and self._is_used_once(x)
-            and x.operation is Operation.MULTIPLY
-        ]
-        factored: list[_Term] = []
-        used: set[int] = set()
+        products = {}
+        for k, (_, x) in enumerate(terms):
+            if self._is_used_once(x) and x.operation is Operation.MULTIPLY:
+                products[k] = x
+
+        sums: list[_Term] = []
+        factored: set[int] = set()
         while True:
-            counts = Counter(
-                f for k, x in products if k not in used for f in set(x.operands)
-            )
-            factor, count = max(
-                counts.items(), key=lambda c: (c[1], _order(c[0])), default=(0.0, 0)
-            )
-            if count < 2:
+            factor = _most_common_factor(products.values())
+            if factor is None:
                 break
-            group = [
-                (k, x) for k, x in products if k not in used and factor in x.operands
-            ]
-            rest = [
-                (terms[k][0], self._rewritten(_cofactor(x, factor))) for k, x in group
-            ]
-            used.update(k for k, _ in group)
-            factored.append((False, multiply(self._rewritten(factor), _sum(rest))))
-        if not used:
+            group = [k for k, x in products.items() if factor in x.operands]
+            cofactors = []
+            for k in group:
+                is_negative, _ = terms[k]
+                cofactor = self._replacement(_cofactor(products.pop(k), factor))
+                cofactors.append((is_negative, cofactor))
+            sums.append((False, multiply(self._replacement(factor), _sum(cofactors))))
+            factored.update(group)
+        if not sums:
             return None
-        others = [
-            (n, self._rewritten(x)) for k, (n, x) in enumerate(terms) if k not in used
-        ]
-        return others + factored
+        others = []
+        for k, (is_negative, x) in enumerate(terms):
+            if k not in factored:
+                others.append((is_negative, self._replacement(x)))
+        return others + sums
 
 
-def _flatten_sum(x: Scalar, inner: set[Scalar]) -> list[_Term]:
+def _most_common_factor(products: Iterable[Scalar]) -> Operand | None:
+    """Return the factor of most products; None if no two have one in common."""
+    counts = Counter(factor for x in products for factor in set(x.operands))
+    factors = (factor for factor, count in counts.items() if count > 1)
+    return max(factors, key=lambda x: (counts[x], _order(x)), default=None)
+
+
+def _flatten_sum(x: Scalar, summands: set[Scalar]) -> list[_Term]:
     """Return the terms of a sum, with those of the sums inside it."""
-    stack: list[tuple[Operand, bool, bool]] = [(x, False, True)]
+    left, right = x.operands
+    is_difference = x.operation is Operation.SUBTRACT
+    stack: list[_Term] = [(is_difference, right), (False, left)]
     terms: list[_Term] = []
     while stack:
-        term, negated, outermost = stack.pop()
-        if isinstance(term, Scalar) and (outermost or term in inner):
+        is_negative, term = stack.pop()
+        if isinstance(term, Scalar) and term in summands:
             left, right = term.operands
-            stack += [
-                (right, negated != (term.operation is Operation.SUBTRACT), False),
-                (left, negated, False),
-            ]
+            is_difference = term.operation is Operation.SUBTRACT
+            stack.append((is_negative != is_difference, right))
+            stack.append((is_negative, left))
         else:
-            terms.append((negated, term))
+            terms.append((is_negative, term))
     return terms
 
 
@@ -469,12 +493,14 @@ def _order(x: Operand) -> float:
 
 
 def _cofactor(product: Scalar, factor: Operand) -> Operand:
+    """Return the other factor of a product."""
     x, y = product.operands
     return y if x is factor or x == factor else x
 
 
 def _sum(terms: list[_Term]) -> Operand:
+    """Add terms from left to right."""
     total: Operand = 0.0
-    for negated, x in terms:
-        total = add(total, negate(x) if negated else x)
+    for is_negative, x in terms:
+        total = add(total, negate(x) if is_negative else x)
     return total

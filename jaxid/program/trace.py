@@ -45,26 +45,29 @@ def _is_symbolic(x: np.ndarray) -> bool:
 
 
 def _broadcast(x: np.ndarray, *_, shape, broadcast_dimensions, **__) -> np.ndarray:
-    placed = [1] * len(shape)
+    """Give an array the axes of a shape, at these positions, and repeat it along the others."""
+    aligned = [1] * len(shape)
     for source, target in enumerate(broadcast_dimensions):
-        placed[target] = x.shape[source]
-    return np.broadcast_to(x.reshape(placed), shape)
+        aligned[target] = x.shape[source]
+    return np.broadcast_to(x.reshape(aligned), shape)
 
 
 def _slice(x: np.ndarray, *, start_indices, limit_indices, strides) -> np.ndarray:
+    """Cut a part out of an array."""
     steps = strides or (1,) * x.ndim
     return x[tuple(map(slice, start_indices, limit_indices, steps))]
 
 
 def _pad(x: np.ndarray, filler: np.ndarray, *, padding_config) -> np.ndarray:
-    for axis, (low, high, interior) in enumerate(padding_config):
+    """Put a number before, behind and between the entries; negative counts cut entries off."""
+    for axis, (before, behind, between) in enumerate(padding_config):
         x = np.moveaxis(x, axis, 0)
-        spread = max(len(x) + (len(x) - 1) * interior, 0)
-        padded = np.full(
-            (max(low, 0) + spread + max(high, 0), *x.shape[1:]), filler, x.dtype
-        )
-        padded[max(low, 0) : max(low, 0) + spread : interior + 1] = x
-        x = np.moveaxis(padded[max(-low, 0) : len(padded) - max(-high, 0)], 0, axis)
+        start = max(before, 0)
+        stop = start + max(len(x) + (len(x) - 1) * between, 0)
+        padded = np.full((stop + max(behind, 0), *x.shape[1:]), filler, x.dtype)
+        padded[start : stop : between + 1] = x
+        part = padded[max(-before, 0) : len(padded) - max(-behind, 0)]
+        x = np.moveaxis(part, 0, axis)
     return x
 
 
@@ -111,37 +114,42 @@ _INDEXED = {
 
 def _on_numbers(equation: JaxprEqn, *operands: np.ndarray) -> list[np.ndarray]:
     """Run one equation on known numbers, in NumPy where it suffices, also inside another trace."""
-    primitive, params = equation.primitive.name, equation.params
+    name = equation.primitive.name
+    if name == "iota":
+        indices = np.indices(equation.params["shape"], equation.params["dtype"])
+        return [indices[equation.params["dimension"]]]
     # Division of whole numbers differs.
-    exact = primitive != "div" or operands[0].dtype == np.float64
-    if primitive in _IN_NUMPY and exact and len(operands) <= 3:
+    is_exact = name != "div" or operands[0].dtype == np.float64
+    if name in _IN_NUMPY and is_exact and len(operands) <= 3:
+        dtype = getattr(equation.outvars[0].aval, "dtype", None)
         with np.errstate(all="ignore"):
-            result = _IN_NUMPY[primitive](*operands)
-            return [
-                np.asarray(result, getattr(equation.outvars[0].aval, "dtype", None))
-            ]
-    if primitive == "iota":
-        shape, axis = params["shape"], params["dimension"]
-        return [np.indices(shape, params["dtype"])[axis]]
+            return [np.asarray(_IN_NUMPY[name](*operands), dtype)]
     with jax.ensure_compile_time_eval():
         # A NumPy array would take the precision of the process; a JAX array keeps its
         # own.
         arrays = [jax.numpy.asarray(x, x.dtype) for x in operands]
-        results = equation.primitive.bind(*arrays, **params)
-        results = results if equation.primitive.multiple_results else [results]
-        return [np.asarray(x) for x in results]
+        results = equation.primitive.bind(*arrays, **equation.params)
+        return [np.asarray(x) for x in _as_list(equation, results)]
+
+
+def _as_list(equation: JaxprEqn, results: Any) -> list:
+    """Return the results of an equation as a list."""
+    return list(results) if equation.primitive.multiple_results else [results]
 
 
 def _move_by_index(
     equation: JaxprEqn, carriers: tuple[int, ...], operands: list[np.ndarray]
 ) -> np.ndarray:
     """Move entries to the places that the indices among the operands give."""
-    entries, labels, start = [], list(operands), 0
+    entries = []
+    labels = list(operands)
+    start = 0
     for k in carriers:
-        entries.append(_entries(operands[k]).ravel())
-        positions = np.arange(start, start + operands[k].size, dtype=np.float64)
-        labels[k] = positions.reshape(operands[k].shape)
-        start += operands[k].size
+        x = operands[k]
+        entries.append(_entries(x).ravel())
+        labels[k] = np.arange(start, start + x.size, dtype=float).reshape(x.shape)
+        start += x.size
+    # JAX moves the labels; the entries follow them.
     (moved,) = _on_numbers(equation, *labels)
     if not ((moved >= 0) & (moved < start)).all():
         raise InputError(
@@ -152,103 +160,125 @@ def _move_by_index(
 
 
 def _scatter_add(equation: JaxprEqn, operands: list[np.ndarray]) -> np.ndarray:
-    """Add entries at known places, as the transpose of a gather does."""
+    """Add entries at constant places, as the transpose of a gather does."""
     target, indices, updates = operands
     total = target.astype(object).copy()
+    zeros = np.zeros(target.shape)
     for k, update in enumerate(updates.astype(object).ravel()):
-        one = np.zeros(updates.size)
-        one[k] = 1
-        zeros = np.zeros(target.shape)
-        (places,) = _on_numbers(equation, zeros, indices, one.reshape(updates.shape))
-        for place in np.argwhere(places):
-            total[tuple(place)] = _add(total[tuple(place)], update)
+        # Where JAX adds a one, the update is added.
+        mark = np.zeros(updates.size)
+        mark[k] = 1
+        (marks,) = _on_numbers(equation, zeros, indices, mark.reshape(updates.shape))
+        for place in map(tuple, np.argwhere(marks)):
+            total[place] = _add(total[place], update)
     return total
 
 
 def _each(function: Callable, operands: int) -> np.ufunc:
+    """Return a function of scalars as one of arrays of them."""
     return np.frompyfunc(function, operands, 1)
 
 
 def _operation(operation: Operation) -> np.ufunc:
+    """Return an operation on arrays of scalars."""
     return _each(lambda *x: scalar.apply(operation, *x), operation.numpy.nin)
 
 
-_add, _subtract, _multiply = (
-    _each(f, 2)
-    for f in (scalar.add, lambda x, y: scalar.add(x, scalar.negate(y)), scalar.multiply)
-)
-_maximum, _minimum = _operation(Operation.MAXIMUM), _operation(Operation.MINIMUM)
+_add = _each(scalar.add, 2)
+_subtract = _each(lambda x, y: scalar.add(x, scalar.negate(y)), 2)
+_multiply = _each(scalar.multiply, 2)
+_divide = _each(scalar.divide, 2)
+_negate = _each(scalar.negate, 1)
+_maximum = _operation(Operation.MAXIMUM)
+_minimum = _operation(Operation.MINIMUM)
 _select = _each(scalar.select, 3)
+_square_root = _operation(Operation.SQUARE_ROOT)
+_exponential = _operation(Operation.EXPONENTIAL)
 
 
 def _reduce(function: np.ufunc, x: np.ndarray, axes: Sequence, initial: float) -> Any:
+    """Combine the entries along some axes."""
     for axis in sorted(axes, reverse=True):
         x = function.reduce(x, axis=axis, initial=initial)
     return x
 
 
 def _dot_general(x: np.ndarray, y: np.ndarray, *, dimension_numbers, **_) -> np.ndarray:
-    (contracted_x, contracted_y), (batch_x, batch_y) = dimension_numbers
-    free_x = [k for k in range(x.ndim) if k not in (*contracted_x, *batch_x)]
-    free_y = [k for k in range(y.ndim) if k not in (*contracted_y, *batch_y)]
-    shared = [x.shape[k] for k in batch_x]
-    rows, columns = (
-        math.prod(a.shape[k] for k in free) for a, free in ((x, free_x), (y, free_y))
-    )
-    terms = math.prod(x.shape[k] for k in contracted_x)
-    left = x.transpose((*batch_x, *free_x, *contracted_x)).reshape(
-        (*shared, rows, 1, terms)
-    )
-    right = y.transpose((*batch_y, *free_y, *contracted_y)).reshape(
-        (*shared, 1, columns, terms)
-    )
-    total = _add.reduce(_multiply(left, right), axis=-1, initial=0.0)
-    return np.asarray(total, object).reshape(
-        (*shared, *(x.shape[k] for k in free_x), *(y.shape[k] for k in free_y))
-    )
+    """Multiply arrays, and add the products along their contracted axes."""
+    contracted_axes, batch_axes = dimension_numbers
+    x, rows = _as_matrices(x, contracted_axes[0], batch_axes[0])
+    y, columns = _as_matrices(y, contracted_axes[1], batch_axes[1])
+    products = _multiply(x[..., :, None, :], y[..., None, :, :])
+    sums = np.asarray(_add.reduce(products, axis=-1, initial=0.0), object)
+    return sums.reshape(*x.shape[:-2], *rows, *columns)
+
+
+def _as_matrices(
+    x: np.ndarray, contracted: Sequence[int], batch: Sequence[int]
+) -> tuple[np.ndarray, tuple[int, ...]]:
+    """Return an array as [*batch, others, contracted], and the shape of its other axes."""
+    others = [k for k in range(x.ndim) if k not in (*contracted, *batch)]
+    shape = tuple(x.shape[k] for k in others)
+    in_order = x.transpose((*batch, *others, *contracted))
+    terms = math.prod(x.shape[k] for k in contracted)
+    batch_shape = in_order.shape[: len(batch)]
+    return in_order.reshape(*batch_shape, math.prod(shape), terms), shape
+
+
+def _polynomial(x: np.ndarray, *coefficients: np.ndarray, **_) -> np.ndarray:
+    """Evaluate a polynomial whose constant comes first, by Horner's scheme."""
+    total, *others = reversed(coefficients)
+    for coefficient in others:
+        total = _add(_multiply(total, x), coefficient)
+    return total
+
+
+def _logistic(x: np.ndarray) -> np.ndarray:
+    """Return 1 / (1 + exp(-x))."""
+    return _divide(1.0, _add(1.0, _exponential(_negate(x))))
+
+
+def _integer_power(x: np.ndarray, *, y: int) -> np.ndarray:
+    """Return a whole power of each entry."""
+    return _each(lambda entry: scalar.integer_power(entry, y), 1)(x)
 
 
 def _select_n(which: np.ndarray, *cases: np.ndarray) -> np.ndarray:
+    """Choose between arrays, entry by entry."""
     if not _is_symbolic(which):
         return np.choose(np.broadcast_to(which, cases[0].shape).astype(int), cases)
     return np.asarray(_select(which, cases[1], cases[0]), object)
 
 
+_COMPARISONS = (
+    Operation.LESS,
+    Operation.LESS_EQUAL,
+    Operation.EQUAL,
+    Operation.NOT_EQUAL,
+)
 _ELEMENTARY = [
-    o
-    for o in Operation
-    if "function" in o.traits
-    or o in (Operation.LESS, Operation.LESS_EQUAL, Operation.EQUAL, Operation.NOT_EQUAL)
-    or o in (Operation.ABSOLUTE, Operation.SIGN)
+    *(operation for operation in Operation if "function" in operation.traits),
+    *_COMPARISONS,
+    Operation.ABSOLUTE,
+    Operation.SIGN,
 ]
+_LOGIC = (Operation.AND, Operation.OR, Operation.NOT)
 _ARITHMETIC: dict[str, Callable] = {
     **{o.value: _operation(o) for o in _ELEMENTARY},
-    **{
-        o.value: _each(functools.partial(scalar.logic, o), o.numpy.nin)
-        for o in (Operation.AND, Operation.OR, Operation.NOT)
-    },
+    **{o.value: _each(functools.partial(scalar.logic, o), o.numpy.nin) for o in _LOGIC},
     "add": _add,
     "add_any": _add,
     "sub": _subtract,
     "mul": _multiply,
-    "neg": _each(scalar.negate, 1),
+    "neg": _negate,
     "square": lambda x: _multiply(x, x),
     "one_minus_square": lambda x: _multiply(_add(1.0, x), _subtract(1.0, x)),
-    "polynomial": lambda x, *c, **_: functools.reduce(
-        lambda total, next_c: _add(_multiply(total, x), next_c), reversed(c)
-    ),
-    "div": _each(scalar.divide, 2),
-    "rsqrt": _each(
-        lambda x: scalar.divide(1.0, scalar.apply(Operation.SQUARE_ROOT, x)), 1
-    ),
+    "polynomial": _polynomial,
+    "div": _divide,
+    "rsqrt": lambda x: _divide(1.0, _square_root(x)),
     "pow": _each(scalar.power, 2),
-    "integer_pow": lambda x, *, y: _each(lambda e: scalar.integer_power(e, y), 1)(x),
-    "logistic": _each(
-        lambda x: scalar.divide(
-            1.0, scalar.add(1.0, scalar.apply(Operation.EXPONENTIAL, scalar.negate(x)))
-        ),
-        1,
-    ),
+    "integer_pow": _integer_power,
+    "logistic": _logistic,
     "max": _maximum,
     "min": _minimum,
     "clamp": lambda low, x, high: _minimum(_maximum(low, x), high),
@@ -260,15 +290,18 @@ _ARITHMETIC: dict[str, Callable] = {
     "optimization_barrier": lambda *x: list(x),
     "tie": lambda _, x: x,
 }
+_WITH_PARAMETERS = ("integer_pow", "dot_general", "reduce_sum", "reduce_prod")
+"""Primitives whose parameters decide about the result."""
 
 
 def _convert(x: np.ndarray, dtype: np.dtype) -> np.ndarray:
+    """Convert an array to another type."""
     if not _is_symbolic(x):
         return x.astype(dtype)
     if dtype.kind == "b":
         return np.asarray(_each(scalar.as_truth, 1)(x), object)
-    truth = all(scalar.is_truth(e) for e in x.flat)
-    if truth or np.issubdtype(dtype, np.floating):
+    holds_truth_values = all(scalar.is_truth(entry) for entry in x.flat)
+    if holds_truth_values or np.issubdtype(dtype, np.floating):
         return np.asarray(_each(scalar.as_number, 1)(x), object)
     raise InputError(
         f"`trace` cannot translate a conversion to {dtype}: a program computes with "
@@ -304,23 +337,17 @@ def _translate(equation: JaxprEqn, operands: list[np.ndarray]) -> list[np.ndarra
             f"`trace` cannot translate `{name}` of integers: use real numbers."
         )
     if name in _ARITHMETIC:
-        with_parameters = name in (
-            "integer_pow",
-            "dot_general",
-            "reduce_sum",
-            "reduce_prod",
-        )
-        parameters = equation.params if with_parameters else {}
-        result = _ARITHMETIC[name](*map(_entries, operands), **parameters)
-        results = result if equation.primitive.multiple_results else [result]
-        return [np.asarray(x, object) for x in results]
+        parameters = equation.params if name in _WITH_PARAMETERS else {}
+        results = _ARITHMETIC[name](*map(_entries, operands), **parameters)
+        return [np.asarray(x, object) for x in _as_list(equation, results)]
     reason = _UNSUPPORTED.get(
         name, "it is not elementwise arithmetic, a sum, or a move of entries"
     )
     raise InputError(f"`trace` cannot translate the JAX primitive `{name}`: {reason}.")
 
 
-def _known(constant: object) -> np.ndarray:
+def _as_constant(constant: object) -> np.ndarray:
+    """Return a constant of a traced function in NumPy."""
     if isinstance(constant, Tracer):
         raise InputError(
             "`trace`: the function closes over a value that JAX is tracing: pass it "
@@ -332,40 +359,47 @@ def _known(constant: object) -> np.ndarray:
 def _run(
     jaxpr: Jaxpr, constants: list, arguments: list[np.ndarray]
 ) -> list[np.ndarray]:
-    names = [*jaxpr.constvars, *jaxpr.invars]
-    values = dict(zip(names, [*map(_known, constants), *arguments], strict=True))
+    """Run a jaxpr on arrays of scalars or numbers, one equation after the other."""
+    values: dict[Any, np.ndarray] = {}
+    for name, constant in zip(jaxpr.constvars, constants, strict=True):
+        values[name] = _as_constant(constant)
+    values.update(zip(jaxpr.invars, arguments, strict=True))
 
     def read(name) -> np.ndarray:
         return np.asarray(name.val) if isinstance(name, Literal) else values[name]
 
     for equation in jaxpr.eqns:
-        primitive = equation.primitive.name
         operands = [read(name) for name in equation.invars]
-        keys = ("jaxpr", "call_jaxpr", "fun_jaxpr")
-        inner = next((equation.params[k] for k in keys if k in equation.params), None)
-        symbolic = any(_is_symbolic(x) for x in operands)
-        if inner is not None and primitive not in _UNSUPPORTED:
-            closed = isinstance(inner, ClosedJaxpr)
-            results = _run(
-                inner.jaxpr if closed else inner,
-                inner.consts if closed else [],
-                operands,
-            )
-        elif primitive in _MOVEMENTS:
-            results = _MOVEMENTS[primitive](*operands, **equation.params)
-            results = results if equation.primitive.multiple_results else [results]
-        elif primitive == "convert_element_type":
-            results = [_convert(operands[0], np.dtype(equation.params["new_dtype"]))]
-        elif symbolic:
-            results = _translate(equation, operands)
-        else:
-            results = _on_numbers(equation, *operands)
-        dtype = object if symbolic else None
-        values.update(
-            (name, np.asarray(x, dtype))
-            for name, x in zip(equation.outvars, results, strict=True)
-        )
+        results = _run_equation(equation, operands)
+        dtype = object if any(map(_is_symbolic, operands)) else None
+        for name, result in zip(equation.outvars, results, strict=True):
+            values[name] = np.asarray(result, dtype)
     return [read(name) for name in jaxpr.outvars]
+
+
+def _run_equation(equation: JaxprEqn, operands: list[np.ndarray]) -> list[np.ndarray]:
+    """Run one equation: a call of another jaxpr, a move of entries, or arithmetic."""
+    name = equation.primitive.name
+    jaxpr = _called_jaxpr(equation)
+    if jaxpr is not None:
+        if isinstance(jaxpr, ClosedJaxpr):
+            return _run(jaxpr.jaxpr, jaxpr.consts, operands)
+        return _run(jaxpr, [], operands)
+    if name in _MOVEMENTS:
+        return _as_list(equation, _MOVEMENTS[name](*operands, **equation.params))
+    if name == "convert_element_type":
+        return [_convert(operands[0], np.dtype(equation.params["new_dtype"]))]
+    if any(map(_is_symbolic, operands)):
+        return _translate(equation, operands)
+    return _on_numbers(equation, *operands)
+
+
+def _called_jaxpr(equation: JaxprEqn) -> Any:
+    """Return the jaxpr that an equation such as a compiled function calls, else None."""
+    if equation.primitive.name in _UNSUPPORTED:
+        return None
+    keys = ("jaxpr", "call_jaxpr", "fun_jaxpr")
+    return next((equation.params[k] for k in keys if k in equation.params), None)
 
 
 def trace(function: Callable, *inputs: tuple[int, ...] | np.ndarray) -> Program:
@@ -385,27 +419,28 @@ def trace(function: Callable, *inputs: tuple[int, ...] | np.ndarray) -> Program:
             with numbers; the numbers become constants of the program.
     """
     graph = Graph()
-    arguments = []
-    for number, given in enumerate(inputs):
-        template = (
-            np.full(given, FREE, object)
-            if isinstance(given, tuple)
-            else np.asarray(given)
-        )
-        entries = np.empty(template.shape, object)
-        for position, value in enumerate(template.ravel()):
-            free = (
-                graph.node(Operation.INPUT, number, position)
-                if value is FREE
-                else float(value)
-            )
-            entries.flat[position] = free
-        arguments.append(entries)
+    arguments = [_argument(graph, k, x) for k, x in enumerate(inputs)]
     with double_precision():
         avals = [jax.ShapeDtypeStruct(x.shape, np.float64) for x in arguments]
         jaxpr, result = jax.make_jaxpr(function, return_shape=True)(*avals)
         leaves = _run(jaxpr.jaxpr, jaxpr.consts, arguments)
     outputs = [scalar.as_number(e) for x in leaves for e in _entries(x).ravel()]
-    shapes = tuple(x.shape for x in arguments)
-    structure = jax.tree.structure(result)
-    return assemble(shapes, outputs, tuple(np.shape(x) for x in leaves), structure)
+    input_shapes = tuple(x.shape for x in arguments)
+    output_shapes = tuple(np.shape(x) for x in leaves)
+    return assemble(input_shapes, outputs, output_shapes, jax.tree.structure(result))
+
+
+def _argument(
+    graph: Graph, number: int, description: tuple[int, ...] | np.ndarray
+) -> np.ndarray:
+    """Return an input of the function as an array of scalars and numbers."""
+    if isinstance(description, tuple):
+        description = np.full(description, FREE, object)
+    description = np.asarray(description)
+    entries = np.empty(description.shape, object)
+    for position, value in enumerate(description.ravel()):
+        if value is FREE:
+            entries.flat[position] = graph.node(Operation.INPUT, number, position)
+        else:
+            entries.flat[position] = float(value)
+    return entries

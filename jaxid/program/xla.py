@@ -24,8 +24,12 @@ from .scalar import Operation
 ELEMENTWISE: dict[Operation, Callable] = {
     o: getattr(jnp, o.numpy.__name__) for o in Operation if o is not Operation.INPUT
 }
-HOLDS = jax.__version_info__ >= (0, 12)
+BARRIER_HOLDS = jax.__version_info__ >= (0, 12)
 """Whether an optimization barrier stops XLA's CPU backend."""
+MIN_SAVING = 6
+"""Number of operations that a fence must save."""
+FUNCTION_COST = 20
+"""Cost of a function such as tanh, in additions."""
 CIRCULAR = (Operation.SINE, Operation.COSINE)
 Entries = Sequence[Array | Sequence[Array]]
 """Entries of each input, in order: arrays of the batch's shape."""
@@ -35,10 +39,9 @@ def hidden_one(reference: Array) -> Array:
     """Return (sign bit of a number | 1), which is 1 for any number, NaN included.
 
     XLA does not copy divisions, since they are expensive, and x / 1 is exact, also for
-    NaN and
-    infinities: division by a one that XLA cannot recognise is a fence. From JAX 0.12 on
-        an
-    optimization barrier does the same at no cost. The number is known only at run time.
+    NaN and infinities: division by a one that XLA cannot recognise is a fence. From JAX
+    0.12 on an optimization barrier does the same at no cost. The number is known only
+    at run time.
     """
     width = 8 * reference.dtype.itemsize
     bits = jax.lax.stop_gradient(reference).view(f"uint{width}")
@@ -49,7 +52,7 @@ def fenced(x: Array, one: Array | None) -> Array:
     """Return a value behind a fence (none if `one` is None): XLA does not compute it again."""
     if one is None:
         return x
-    return jax.lax.optimization_barrier(x) if HOLDS else x / one
+    return jax.lax.optimization_barrier(x) if BARRIER_HOLDS else x / one
 
 
 def fenced_nodes(program: Program) -> frozenset[int]:
@@ -58,16 +61,23 @@ def fenced_nodes(program: Program) -> frozenset[int]:
     These are the nodes with (uses - 1) times the cost of computing them again > 6
     operations; between 0 and 30 the speed hardly depends on it.
     """
-    free = (Operation.INPUT, Operation.NEGATE)
-    costs, fenced = [], set()
+    costs = []  # operations that compute each node again, from the fences before it
+    nodes = set()
     for k, node in enumerate(program.nodes):
-        own = 20 if "function" in node.operation.traits else node.operation not in free
-        cost = own + sum(costs[i] for i in node.uses)
-        if "truth" not in node.operation.traits and cost * (program.uses[k] - 1) > 6:
-            fenced.add(k)
+        cost = _cost(node.operation) + sum(costs[i] for i in node.uses)
+        is_number = "truth" not in node.operation.traits
+        if is_number and cost * (program.uses[k] - 1) > MIN_SAVING:
+            nodes.add(k)
             cost = 0
         costs.append(cost)
-    return frozenset(fenced)
+    return frozenset(nodes)
+
+
+def _cost(operation: Operation) -> int:
+    """Return the cost of an operation, relative to that of an addition."""
+    if operation in (Operation.INPUT, Operation.NEGATE):
+        return 0
+    return FUNCTION_COST if "function" in operation.traits else 1
 
 
 class Lowered(eqx.Module):
@@ -107,11 +117,11 @@ class Lowered(eqx.Module):
 
         Constants cost memory and time here; prefer the packed result.
         """
-        dtype, batch = jnp.result_type(*arrays, float), self.entries(*arrays)[1]
-        full = [jnp.broadcast_to(jnp.asarray(x, dtype), batch) for x in self(*arrays)]
-        return self.program.unpack(
-            jnp.stack(full) if full else jnp.zeros((0, *batch), dtype)
-        )
+        dtype = jnp.result_type(*arrays, float)
+        _, batch = self.entries(*arrays)
+        rows = [jnp.broadcast_to(jnp.asarray(x, dtype), batch) for x in self(*arrays)]
+        packed = jnp.stack(rows) if rows else jnp.zeros((0, *batch), dtype)
+        return self.program.unpack(packed)
 
     def run(
         self, entries: Entries, operations: dict[Operation, Callable]
@@ -123,38 +133,48 @@ class Lowered(eqx.Module):
         firsts = [x[0] for x in reversed(entries) if len(x)]
         dtype = firsts[0].dtype if firsts else jnp.result_type(float)
         source = next((x for x in firsts if x.size), jnp.zeros((1,), dtype))
-        anchor = hidden_one(source[(0,) * source.ndim]) if self.fence else None
-        pairs = {}
-        angles = {n.uses[0]: None for n in nodes if n.operation in CIRCULAR}
-        angles = [k for k in angles if nodes[k].operation is Operation.INPUT]
-        if angles:
-            rows = [
-                entries[number][entry]
-                for number, entry in (nodes[k].place for k in angles)
-            ]
-            sines, cosines = _circular(jnp.stack(rows), anchor)
-            pairs = {k: (sines[row], cosines[row]) for row, k in enumerate(angles)}
+        one = hidden_one(source[(0,) * source.ndim]) if self.fence else None
+
+        pairs = self._sines_and_cosines(entries, one)
         values: list[Array] = []
         for position, node in enumerate(nodes):
             if node.operation is Operation.INPUT:
                 number, entry = node.place
                 values.append(entries[number][entry])
-            elif node.operation in CIRCULAR:
+                continue
+            if node.operation in CIRCULAR:
                 (angle,) = node.uses
                 if angle not in pairs:
-                    pairs[angle] = _circular(values[angle], anchor)
-                values.append(pairs[angle][node.operation is Operation.COSINE])
-            else:
-                operands = [
-                    values[x] if isinstance(x, int) else x for x in node.operands
-                ]
-                if node.operation is Operation.SELECT:
-                    operands[1:] = [jnp.asarray(x, dtype) for x in operands[1:]]
-                value = operations[node.operation](*operands)
-                values.append(
-                    fenced(value, anchor) if position in self.fenced else value
-                )
+                    pairs[angle] = _circular(values[angle], one)
+                sine, cosine = pairs[angle]
+                values.append(sine if node.operation is Operation.SINE else cosine)
+                continue
+            operands = [values[x] if isinstance(x, int) else x for x in node.operands]
+            if node.operation is Operation.SELECT:
+                # Both choices may be constants, which have no precision of their own.
+                operands[1:] = [jnp.asarray(x, dtype) for x in operands[1:]]
+            value = operations[node.operation](*operands)
+            is_fenced = position in self.fenced
+            values.append(fenced(value, one) if is_fenced else value)
         return tuple(values[k] for k in self.program.distinct[0])
+
+    def _sines_and_cosines(
+        self, entries: Entries, one: Array | None
+    ) -> dict[int, tuple[Array, Array]]:
+        """Compute sine and cosine of all inputs that are angles together."""
+        nodes = self.program.nodes
+        angles = []
+        for node in nodes:
+            if node.operation not in CIRCULAR or node.uses[0] in angles:
+                continue
+            if nodes[node.uses[0]].operation is Operation.INPUT:
+                angles.append(node.uses[0])
+        if not angles:
+            return {}
+        places = [nodes[angle].place for angle in angles]
+        stacked = jnp.stack([entries[number][entry] for number, entry in places])
+        sines, cosines = _circular(stacked, one)
+        return {angle: (sines[k], cosines[k]) for k, angle in enumerate(angles)}
 
 
 def primitives(like: Array) -> dict[Operation, Callable]:
@@ -165,17 +185,19 @@ def primitives(like: Array) -> dict[Operation, Callable]:
     differentiate these. All have the shape of one array.
     """
 
+    # By text: plus and minus zero are equal, but not their texts.
     @functools.cache
-    def number(
-        text: str,
-    ) -> Array:  # plus and minus zero are equal, but not their texts
+    def constant(text: str) -> Array:
         return jax.lax.full_like(like, float(text))
 
-    def whole(x: Any) -> Array:
-        return number(repr(x)) if isinstance(x, float) else x
-
     def on_arrays(primitive: Callable) -> Callable:
-        return lambda *operands: primitive(*map(whole, operands))
+        def apply(*operands: Array | float) -> Array:
+            arrays = [
+                constant(repr(x)) if isinstance(x, float) else x for x in operands
+            ]
+            return primitive(*arrays)
+
+        return apply
 
     return ELEMENTWISE | {
         Operation.ADD: on_arrays(jax.lax.add),
@@ -197,19 +219,18 @@ def lower(program: Program, fence: bool = True) -> Lowered:
 
 def on_any_platform(program: Program, evaluate: Callable, *arrays: AnyArray) -> Any:
     """Return `evaluate(lowered, *arrays)`, with fences where it runs on a CPU."""
-    fenced, plain = (
-        functools.partial(evaluate, lower(program, fence)) for fence in (True, False)
-    )
     return jax.lax.platform_dependent(
-        *map(jnp.asarray, arrays), cpu=fenced, default=plain
+        *map(jnp.asarray, arrays),
+        cpu=functools.partial(evaluate, lower(program, fence=True)),
+        default=functools.partial(evaluate, lower(program, fence=False)),
     )
 
 
 @jax.custom_jvp
-def _circular(x: Array, anchor: Array | None) -> tuple[Array, Array]:
+def _circular(x: Array, one: Array | None) -> tuple[Array, Array]:
     """Return sine and cosine behind fences; their derivatives are made from the fenced values."""
     sine, cosine = sine_cosine(x)
-    return fenced(sine, anchor), fenced(cosine, anchor)
+    return fenced(sine, one), fenced(cosine, one)
 
 
 @_circular.defjvp

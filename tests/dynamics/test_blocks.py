@@ -146,6 +146,22 @@ def test_a_robot_of_many_joints_moves_as_its_definition_says():
     )
 
 
+def test_a_motion_and_its_arrays_give_the_same():
+    x = motion(3)
+    for name, arrays in (
+        ("inverse_dynamics", (x.q, x.qd, x.qdd)),
+        ("bias_forces", (x.q, x.qd)),
+        ("kinetic_energy", (x.q, x.qd)),
+    ):
+        method = getattr(MODEL, name)
+        np.testing.assert_array_equal(method(P, x), method(P, *arrays))
+        with pytest.raises(jid.InputError, match=r"but 4 arrays"):
+            method(P, x.q, x.qd, x.qdd, x.q)
+    np.testing.assert_array_equal(
+        MODEL.forward_dynamics(P, x, x.qdd), MODEL.forward_dynamics(P, x.q, x.qd, x.qdd)
+    )
+
+
 @pytest.mark.parametrize("samples", [8, 300])
 def test_the_samples_of_a_mesh_of_devices(samples):
     """Branches and loops agree on what differs along a mesh, whichever argument differs."""
