@@ -196,13 +196,15 @@ class CoefficientSearch:
     ) -> bool:
         """Return whether a closed form holds at other geometries and for the robot itself."""
         checks = self._check_kappa[:, row, column]
-        errors = np.abs(_products(self._check_lengths, powers) @ factors - checks)
-        if errors.max() > MAX_ERROR * np.abs(checks).max():
+        predictions = _products(self._check_lengths, powers) @ factors
+        max_error = np.abs(predictions - checks).max()
+        if max_error > MAX_ERROR * np.abs(checks).max():
             return False
+
         unit = self._entry_units[row, column]
-        (robot_value,) = _products(self._robot_lengths[None], powers) @ factors
-        error = abs(float(robot_value) * unit - value)
-        return error <= MAX_ERROR_OF_ROBOT * max(abs(value), unit)
+        (prediction,) = _products(self._robot_lengths[None], powers) @ factors
+        error = abs(prediction * unit - value)
+        return bool(error <= MAX_ERROR_OF_ROBOT * max(abs(value), unit))
 
     def _in_si_units(
         self, powers: np.ndarray, factors: np.ndarray, unit: float
@@ -358,14 +360,17 @@ class Regrouping:
         self, geometries: Float[np.ndarray, "cases numbers"]
     ) -> Float[np.ndarray, "cases rows standard"]:
         """Return the stacked regressors of several geometries, free of units."""
-        joints, samples = self._motion[0].shape
         cases = len(geometries)
+        joints, samples = self._motion[0].shape
         motions = [np.tile(x, cases) for x in self._motion]
         numbers = np.repeat(geometries.T, samples, axis=1)
         theta = evaluate(self._program, *motions, numbers)
-        theta = theta * self._rows[:, None, None] * self.units[:, None]
-        by_case = theta.reshape(joints, -1, cases, samples).transpose(2, 0, 3, 1)
-        return by_case.reshape(cases, joints * samples, -1)
+        units = self._rows[:, None] * self.units
+        theta = theta * units[:, :, None]
+        # [joints, columns, cases, samples] -> [cases, joints and samples, columns]
+        theta = theta.reshape(joints, -1, cases, samples)
+        theta = theta.transpose(2, 0, 3, 1)
+        return theta.reshape(cases, joints * samples, -1)
 
 
 def draws(
@@ -447,12 +452,16 @@ def offset_name(robot: Robot, body: int) -> str:
 
 def _tied(lengths: tuple[Length, ...], robot: Robot) -> Length:
     """Return several lengths that vary together: a whole offset, or multiples of the first."""
-    values = [x.value for x in lengths]
     name = lengths[0].name
     value = lengths[0].value
-    if len({x.offset for x in lengths}) == 1:
-        axes = "".join(x.name[-1] for x in lengths) if len(lengths) == 2 else ""
-        name = offset_name(robot, lengths[0].offset) + axes
-        value = float(np.linalg.norm(values))
-    entries = tuple((x.entries[0][0], x.value / value) for x in lengths)
-    return Length(name, value, entries, Dimension(0, 1, 0))
+    offsets = {x.offset for x in lengths}
+    if len(offsets) == 1:
+        name = offset_name(robot, offsets.pop())
+        value = math.hypot(*(x.value for x in lengths))
+        if len(lengths) == 2:
+            name += "".join(x.name[-1] for x in lengths)
+    entries = []
+    for length in lengths:
+        (entry, _), *_ = length.entries
+        entries.append((entry, length.value / value))
+    return Length(name, value, tuple(entries), Dimension(0, 1, 0))

@@ -89,11 +89,12 @@ def singular_values(
     columns = len(norms)
     # The triangular factor has the same singular values and null space, and few rows.
     triangle = np.linalg.qr(scaled, mode="r")
-    _, s, Vt = np.linalg.svd(triangle, full_matrices=True)
-    s = np.concatenate([s, np.zeros(columns - len(s))])
-    s = s / max(s[0], np.finfo(float).tiny)
+    _, values, Vt = np.linalg.svd(triangle, full_matrices=True)
+    s = np.zeros(columns)
+    s[: len(values)] = values / max(values[0], np.finfo(float).tiny)
 
-    rank = min(_rank_at_largest_fall(s, tolerance), np.count_nonzero(norms))
+    max_rank = np.count_nonzero(norms)
+    rank = min(_rank_at_largest_fall(s, tolerance), max_rank)
     dependent = _ends_of_null_vectors(Vt[rank:])
     independent = tuple(k for k in range(columns) if k not in dependent)
     smallest = float(s[rank - 1]) if rank else np.inf

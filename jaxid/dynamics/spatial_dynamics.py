@@ -105,14 +105,16 @@ def _relative_placements(robot: Robot, q: Joints) -> Float[Array, "joints 3 4"]:
 
     # Rodrigues: I + sin(q) [axis] + (1 - cos(q)) [axis]^2, if the joint turns.
     identity = jnp.eye(3, dtype=dtype)[None]
-    along = axis[:, :, None] * axis[:, None, :]
+    axis_column = axis[:, :, None]
+    along = axis_column * axis[:, None, :]
     across = turns * (identity - along)
     turn = identity + (jnp.cos(angle) - 1) * across
     turn = turn + turns * jnp.sin(angle) * _combine(SKEW, axis)
 
-    shift = slides * angle * axis[:, :, None]
-    moved = rotation @ jnp.concatenate([turn, shift], axis=2)
-    return moved + jnp.pad(offset[:, :, None], ((0, 0), (0, 0), (3, 0)))
+    shift = slides * angle * axis_column
+    moved = jnp.concatenate([turn, shift], axis=2)
+    last_column = ((0, 0), (0, 0), (3, 0))
+    return rotation @ moved + jnp.pad(offset[:, :, None], last_column)
 
 
 class GroundMotion(NamedTuple):
@@ -193,11 +195,14 @@ def spatial_regressor(
 ) -> Float[Array, "joints joints 10"]:
     """Return the regressor of every body (Eq. 11): joints, then bodies and their columns."""
     carry, joints, v, a = ground_motion(robot, q, qd, qdd)
-    v_body, a_body = (jnp.einsum("nji,nj->ni", carry, x) for x in (v, a))
-    unit = jnp.asarray(INERTIA, q.dtype)
-    momenta = jnp.einsum("ijk,nj->nik", unit, v_body)
-    rates = jnp.einsum("ijk,nj->nik", unit, a_body)
-    turned = jnp.swapaxes(_combine(CROSS, v_body), 1, 2) @ momenta
-    wrenches = carry @ (rates - turned)
+    v_body = jnp.einsum("nji,nj->ni", carry, v)
+    a_body = jnp.einsum("nji,nj->ni", carry, a)
+    unit_inertias = jnp.asarray(INERTIA, q.dtype)
+    momenta = jnp.einsum("ijk,nj->nik", unit_inertias, v_body)
+    rates = jnp.einsum("ijk,nj->nik", unit_inertias, a_body)
+    crosses = jnp.swapaxes(_combine(CROSS, v_body), 1, 2)
+    wrenches = carry @ (rates - crosses @ momenta)
     columns = jnp.einsum("js,bsk->jbk", joints, wrenches)
-    return jnp.asarray(moved_by(robot).T, q.dtype)[:, :, None] * columns
+    # A joint feels only the bodies that it moves.
+    is_moved = jnp.asarray(moved_by(robot).T, q.dtype)
+    return is_moved[:, :, None] * columns

@@ -64,10 +64,12 @@ def _pad(x: np.ndarray, filler: np.ndarray, *, padding_config) -> np.ndarray:
         x = np.moveaxis(x, axis, 0)
         start = max(before, 0)
         stop = start + max(len(x) + (len(x) - 1) * between, 0)
-        padded = np.full((stop + max(behind, 0), *x.shape[1:]), filler, x.dtype)
+        size = stop + max(behind, 0)
+        padded = np.full((size, *x.shape[1:]), filler, x.dtype)
         padded[start : stop : between + 1] = x
-        part = padded[max(-before, 0) : len(padded) - max(-behind, 0)]
-        x = np.moveaxis(part, 0, axis)
+        first = max(-before, 0)
+        end = size - max(-behind, 0)
+        x = np.moveaxis(padded[first:end], 0, axis)
     return x
 
 
