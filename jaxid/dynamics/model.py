@@ -199,7 +199,7 @@ class Model(Hashable):
         tool = self.robot.tool
         if tool is None:
             return jnp.zeros_like(q)
-        bodies = [np.zeros(10)] * self.robot.joints
+        bodies: list[AnyArray] = [np.zeros(10)] * self.robot.joints
         bodies[tool.body] = tool.parameters
         p = namespace(tool.parameters).stack(bodies)
         return projection_equation.rigid_body_forces(self.robot, p, q, qd, qdd)
@@ -278,7 +278,7 @@ class Model(Hashable):
         return on_samples(self, self.bias, self.check(q), self.check(qd), shared=(p,))
 
     def forward_dynamics(
-        self, p: Parameters, *state_and_forces: Motion | Coordinates
+        self, p: Parameters, *state_and_forces: Any
     ) -> Float[AnyArray, "*batch joints"]:
         r"""Return the accelerations $M^{-1} (Q_m - h)$ that forces cause (Eq. 38).
 

@@ -14,7 +14,7 @@ products, and `-(x - y)` becomes `y - x` where nothing else needs the difference
 import enum
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, overload
+from typing import Any, TypeGuard, overload
 
 import numpy as np
 
@@ -411,7 +411,7 @@ class Rewriting:
     def _replacement(self, x: Operand) -> Operand:
         return self.replacements[x] if isinstance(x, Scalar) else x
 
-    def _is_used_once(self, x: Operand) -> bool:
+    def _is_used_once(self, x: Operand) -> TypeGuard[Scalar]:
         return isinstance(x, Scalar) and self.uses[x] == 1
 
     def _is_sum_used_once(self, x: Operand) -> bool:
