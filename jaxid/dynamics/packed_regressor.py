@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Array, Float, as_array, is_traced
+from jaxid.arrays import AnyArray, Array, Float, Int, as_array, is_traced
 from jaxid.errors import InputError
 from jaxid.program import (
     Lowered,
@@ -27,6 +27,13 @@ from jaxid.program.blocks import row_products
 from .dispatch import CACHE_SIZE, MAX_SAMPLES_IN_NUMPY, program_of
 
 
+@functools.lru_cache(maxsize=CACHE_SIZE)
+def _nonzero_columns(program: Program) -> tuple[tuple[int, ...], ...]:
+    """Return for each joint the columns of a regressor that are not always zero."""
+    nonzeros = np.asarray(program.nonzeros)
+    return tuple(tuple(np.flatnonzero(row).tolist()) for row in nonzeros)
+
+
 class JointRegressor(eqx.Module):
     """Compiled regressor, evaluated joint by joint in the columns that can act on the joint."""
 
@@ -39,17 +46,16 @@ class JointRegressor(eqx.Module):
         self, owner: eqx.Module, definition: Callable, *shapes: tuple[int, ...]
     ):
         self.program = program_of(owner, definition, *shapes)
-        nonzeros = np.asarray(self.program.nonzeros)
-        self.columns = tuple(tuple(np.flatnonzero(row).tolist()) for row in nonzeros)
-        self.size = nonzeros.shape[1]
+        self.columns = _nonzero_columns(self.program)
+        self.size = self.program.output_shapes[0][1]
 
     @property
-    def entries(self) -> tuple[tuple[int, ...], ...]:
+    def entries(self) -> list[Int[np.ndarray, " columns"]]:
         """For each joint the positions of its columns in the packed result."""
-        return tuple(
-            tuple(joint * self.size + column for column in columns)
+        return [
+            joint * self.size + np.array(columns, int)
             for joint, columns in enumerate(self.columns)
-        )
+        ]
 
     def __call__(
         self, *arrays: AnyArray, fence: bool = False
@@ -61,7 +67,7 @@ class JointRegressor(eqx.Module):
 
         joints = []
         for entries in self.entries:
-            if not entries:
+            if not len(entries):
                 joints.append(jnp.zeros((*batch, 0, samples), dtype))
                 continue
             columns = [jnp.asarray(values[entry], dtype) for entry in entries]
@@ -73,7 +79,8 @@ class JointRegressor(eqx.Module):
         self, weights: AnyArray, *arrays: AnyArray
     ) -> Float[Array, "columns columns"]:
         r"""Return $\sum_k \Theta_k^T W^2 \Theta_k$ over samples, without storing the columns."""
-        products = row_products(self.program, self.entries, *map(jnp.asarray, arrays))
+        groups = tuple(tuple(entries.tolist()) for entries in self.entries)
+        products = row_products(self.program, groups, *map(jnp.asarray, arrays))
         total = jnp.zeros((self.size, self.size), arrays[0].dtype)
         for columns, weight, product in zip(
             self.columns, weights, products, strict=True
@@ -88,7 +95,7 @@ class JointRegressor(eqx.Module):
         distinct = evaluate_rows(self.program, *arrays)
         joints = []
         for entries in self.entries:
-            values = packed_entries(self.program, distinct, np.array(entries, int))
+            values = packed_entries(self.program, distinct, entries)
             joints.append(values.reshape(len(entries), *batch))
         return joints
 

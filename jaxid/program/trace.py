@@ -212,7 +212,7 @@ def _dot_general(x: np.ndarray, y: np.ndarray, *, dimension_numbers, **_) -> np.
     y, columns = _as_matrices(y, contracted_axes[1], batch_axes[1])
     products = _multiply(x[..., :, None, :], y[..., None, :, :])
     sums = np.asarray(_add.reduce(products, axis=-1, initial=0.0), object)
-    return sums.reshape(*x.shape[:-2], *rows, *columns)
+    return sums.reshape((*x.shape[:-2], *rows, *columns))
 
 
 def _as_matrices(
