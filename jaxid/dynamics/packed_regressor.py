@@ -170,8 +170,8 @@ class PackedRegressor(eqx.Module):
         matrix = np.zeros((self.columns, len(self.places), self.samples), dtype)
         for joint, places in enumerate(self.places):
             for column, place in places:
-                constant = isinstance(place, float)
-                matrix[column, joint] = place if constant else values[place]
+                is_constant = isinstance(place, float)
+                matrix[column, joint] = place if is_constant else values[place]
         return matrix.reshape(self.columns, -1).T
 
 

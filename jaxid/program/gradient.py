@@ -134,11 +134,13 @@ def _slopes(
         case Operation.SELECT:
             return 0.0, select(x[0], slope, 0.0), select(x[0], 0.0, slope)
         case Operation.POWER:
-            lower = apply(Operation.POWER, x[0], add(x[1], -1.0))
-            base = multiply(slope, multiply(x[1], lower))
-            if not isinstance(x[1], Scalar):
-                return base, 0.0
-            return base, multiply(slope, multiply(y, apply(Operation.LOGARITHM, x[0])))
+            base, exponent = x
+            reduced_power = apply(Operation.POWER, base, add(exponent, -1.0))
+            by_base = multiply(slope, multiply(exponent, reduced_power))
+            if not isinstance(exponent, Scalar):
+                return by_base, 0.0
+            logarithm = apply(Operation.LOGARITHM, base)
+            return by_base, multiply(slope, multiply(y, logarithm))
         case Operation.ARC_TANGENT_2:
             share = divide(slope, add(multiply(x[0], x[0]), multiply(x[1], x[1])))
             return multiply(share, x[1]), negate(multiply(share, x[0]))

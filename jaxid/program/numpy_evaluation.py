@@ -161,34 +161,37 @@ def to_python(program: Program) -> Callable[..., tuple[float, ...]]:
     outputs, one after the other. Division by zero, and functions outside their domain,
     raise Python's own errors, where NumPy gives infinities and NaN.
     """
-    repeating = (Operation.MAXIMUM, Operation.MINIMUM, Operation.SIGN)
-    repeated = {
-        k for node in program.nodes if node.operation in repeating for k in node.uses
-    }
+    # What these operations read stands several times in their expressions.
+    readers = (Operation.MAXIMUM, Operation.MINIMUM, Operation.SIGN)
+    operands_of_readers = set()
+    for node in program.nodes:
+        if node.operation in readers:
+            operands_of_readers.update(node.uses)
     lines = []
     for k, shape in enumerate(program.input_shapes):
         entries = "".join(f"x{k}_{entry}, " for entry in range(math.prod(shape)))
         if entries:
             lines.append(f"({entries}) = x{k}")
 
-    spelled: list[str] = []
+    texts: list[str] = []
     for position, node in enumerate(program.nodes):
         if node.operation is Operation.INPUT:
             number, entry = node.place
-            spelled.append(f"x{number}_{entry}")
+            texts.append(f"x{number}_{entry}")
             continue
-        operands = [_spell(x, spelled) for x in node.operands]
+        operands = [_spell(x, texts) for x in node.operands]
         text = node.operation.spell(operands, PYTHON_FORMATS)
         # A value that is needed once is written where it is needed, unless the line
         # gets long.
-        is_needed_once = program.uses[position] == 1 and position not in repeated
-        if is_needed_once and len(text) <= MAX_LENGTH:
-            spelled.append(f"({text})")
+        is_read_once = program.uses[position] == 1
+        is_read_once &= position not in operands_of_readers
+        if is_read_once and len(text) <= MAX_LENGTH:
+            texts.append(f"({text})")
         else:
             lines.append(f"t{position} = {text}")
-            spelled.append(f"t{position}")
+            texts.append(f"t{position}")
 
-    results = "".join(f"{_spell(x, spelled)}, " for x in program.outputs)
+    results = "".join(f"{_spell(x, texts)}, " for x in program.outputs)
     names = ", ".join(f"x{k}" for k in range(len(program.input_shapes)))
     body = "".join(f"    {line}\n" for line in lines)
     scope = {name: x for name, x in vars(math).items() if not name.startswith("_")}

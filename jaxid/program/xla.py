@@ -161,7 +161,7 @@ class Lowered(eqx.Module):
     def _sines_and_cosines(
         self, entries: Entries, one: Array | None
     ) -> dict[int, tuple[Array, Array]]:
-        """Compute sine and cosine of all inputs that are angles together."""
+        """Compute sine and cosine of all inputs that are angles in one call."""
         nodes = self.program.nodes
         angles = []
         for node in nodes:
