@@ -6,7 +6,6 @@ from .identified_urdf import export_urdf as export_urdf
 from .jax_function import (
     export_jax as export_jax,
     exported_function as exported_function,
-    torque_program as torque_program,
 )
 from .mujoco_model import export_mjcf as export_mjcf
 from .pinocchio_inertias import (
