@@ -57,6 +57,7 @@ def fit_capsules(
     tree = UrdfTree(path, base=base, tip=tip)
     mount = np.eye(3) if base_rotation is None else np.array(base_rotation, np.float64)
     place = np.array(base_position, np.float64)
+    # MuJoCo has read the shapes of an MJCF file; those of a URDF are read here.
     compiled_shapes = mjcf_shapes(path) if tree.compiled else {}
 
     capsules: list[Capsule] = []

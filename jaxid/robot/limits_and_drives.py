@@ -54,6 +54,7 @@ class Limits(eqx.Module):
     assumed: tuple[str, ...] = eqx.field(static=True, default=())
 
     def __post_init__(self, joints: int | None):
+        # All but the ends of the ranges are sizes, which must be positive.
         names = ("velocity", "acceleration", "jerk", "force")
         magnitudes = {name: getattr(self, name) for name in names}
         n = _count(joints, self.position_min, self.position_max, *magnitudes.values())
@@ -63,6 +64,7 @@ class Limits(eqx.Module):
         self.position_max = high
         for name, value in magnitudes.items():
             setattr(self, name, _magnitudes(name, value, n))
+        # Traced limits have no values to compare.
         if isinstance(low, np.ndarray) and isinstance(high, np.ndarray):
             _require_ranges(low, high)
 
@@ -107,10 +109,10 @@ class Drives(Hashable):
         self.zero = per_joint("zero", self.zero, n, 0.0)
         _require("zero", self.zero, np.isfinite, "finite")
         self.max_torques = _magnitudes("max_torques", self.max_torques, n)
-        self.rotor_inertia = per_joint("rotor_inertia", self.rotor_inertia, n, np.nan)
-        _require(
-            "rotor_inertia", self.rotor_inertia, lambda x: ~(x < 0), "zero or more"
-        )
+        rotor_inertia = per_joint("rotor_inertia", self.rotor_inertia, n, np.nan)
+        # NaN, which is not negative, is an unknown inertia.
+        _require("rotor_inertia", rotor_inertia, lambda x: ~(x < 0), "zero or more")
+        self.rotor_inertia = rotor_inertia
 
     @property
     def is_direct(self) -> bool:
@@ -172,6 +174,7 @@ def _reduction_matrix(reduction: Any, joints: int) -> AnyArray:
             f"`reduction` must hold {joints} or {joints} x {joints} finite ratios, not "
             f"{matrix.shape}."
         )
+    # Gear ratios of different sizes are no sign of a singular matrix.
     row_sizes = np.abs(matrix).max(axis=1, keepdims=True)
     if not row_sizes.all() or np.linalg.cond(matrix / row_sizes) > 1e8:
         raise InputError("`reduction` must be invertible: is a gear ratio zero?")

@@ -107,6 +107,7 @@ class _Writer:
         parent = self._links[model.body_parentid[body]]
         R = rotation_of_quaternion(model.body_quat[body])
         r = model.body_pos[body]
+        # The link of the body itself follows its last joint.
         mount = f"{name} mount"
         mount_type = "fixed"
         for joint in self._joints_of(body):
@@ -116,6 +117,7 @@ class _Writer:
                 continue
             R, r = self._joint_placement(joint, R, r)
             parent = self._add_joint(joint, parent, _origin(R, r))
+            # The frame of the joint is that of the body, at the joint's place.
             R = np.eye(3)
             r = -model.jnt_pos[joint]
 
@@ -150,6 +152,7 @@ class _Writer:
     def _add_joint(self, joint: int, parent: str, origin: Any) -> str:
         """Write a joint and an empty link that it moves; return the name of the link."""
         kind = JOINT_TYPES[self._model.jnt_type[joint]]
+        # A URDF's revolute joint must have a range.
         if kind == "revolute" and not self._model.jnt_limited[joint]:
             kind = "continuous"
         name = self._name("joint", joint)

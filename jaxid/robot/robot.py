@@ -138,6 +138,7 @@ class Robot(Summarised, eqx.Module):
         self.joint_names = tuple(self.joint_names)
         self.parent = tuple(int(body) for body in self.parent)
         self.revolute = tuple(bool(turns) for turns in self.revolute)
+        # Arrays of JAX may have leading axes, for batches of geometries.
         self.axis = _unit_axes(_checked("`axis`", self.axis, (n, 3)))
         self.rotation = _rotations("`rotation`", self.rotation, (n, 3, 3))
         self.offset = _checked("`offset`", self.offset, (n, 3))
@@ -179,6 +180,7 @@ class Robot(Summarised, eqx.Module):
             raise InputError(
                 f"`joint_names` must be {n} different names, but is {self.joint_names}."
             )
+        # Names are written to files and terminals.
         for name in (self.name, *self.joint_names):
             if not name.isprintable():
                 raise InputError(

@@ -87,6 +87,7 @@ def load_urdf(
         )
     except InputError as error:
         raise InputError(f"`{path}`: {error}") from error
+    # Gravity needs other forces where the robot is mounted at an angle.
     robot = robot.mounted(base_rotation, base_position)
     return robot.replace(notes=(*robot.notes, *_effort_notes(robot, tree.bodies())))
 
@@ -152,11 +153,10 @@ def _limits(tree: UrdfTree) -> tuple[Limits, list[str]]:
     unknown: dict[str, list[str]] = {}
     for i, joint in enumerate(tree.joints):
         name = joint.get("name")
-        ends = _checked_range(tree, joint)
-        if ends == (0.0, 0.0):
+        low[i], high[i] = _checked_range(tree, joint)
+        if tree.range(joint) == (0.0, 0.0):
             unknown.setdefault("a range from 0 to 0", []).append(name)
-        else:
-            low[i], high[i] = ends
+        # Files often state zero for what nobody has looked up.
         for key, values in magnitudes.items():
             value = tree.limit(joint, key, np.inf)
             if value > 0.0:
@@ -177,12 +177,11 @@ def _limits(tree: UrdfTree) -> tuple[Limits, list[str]]:
 
 
 def _checked_range(tree: UrdfTree, joint: Any) -> tuple[float, float]:
-    """Return the ends of a joint's range, which are equal only if both are zero."""
+    """Return the ends of a joint's range; infinite if it turns without end, or both are zero."""
     turns = joint.get("type") in TURNING
     low, high = tree.range(joint)
-    if low == high == 0.0:
-        return low, high
-    if turns and high - low >= UNLIMITED_RANGE:
+    is_unlimited = turns and high - low >= UNLIMITED_RANGE
+    if is_unlimited or low == high == 0.0:
         return -np.inf, np.inf
     fault = range_fault(low, high, turns)
     if fault:

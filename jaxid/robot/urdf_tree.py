@@ -149,6 +149,7 @@ class UrdfTree:
     def _merge(self, base: str, tip: str | None) -> None:
         """Merge links on fixed joints into the bodies that carry them, depth first."""
         chain = None if tip is None else self._chain(base, tip)
+        # A stack that holds joints in reverse order gives them in that of the file.
         self.carriers[base] = Placement(-1, np.eye(3), np.zeros(3))
         # Numbers of moving joints and of links on the way from the base.
         lengths = {base: (0, 0)}
@@ -158,6 +159,7 @@ class UrdfTree:
             parent, child = link_names(joint)
             is_fixed = joint.get("type") == "fixed"
             if not is_fixed and chain is not None and joint not in chain:
+                # What the base carries beside the chain is no part of any body.
                 if self.carriers[parent].body >= 0:
                     self.side_joints.append(joint)
                 continue
