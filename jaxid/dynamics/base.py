@@ -11,14 +11,14 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Float, Hashable, Joints, Numbers, as_array
 from jaxid.errors import InputError
-from jaxid.program import Program, select_outputs
+from jaxid.program import Program, Shape, select_outputs
 from jaxid.result_table import MISSING, Column, Remark, Status, Summarised, Table
 
 from .base_parameter_expressions import Expression
 from .dispatch import in_numpy, on_samples, program_of
 from .model import Coordinates, Model
 from .motion import Motion, as_motion
-from .packed_regressor import JointRegressor, PackedRegressor
+from .packed_regressor import Columns, JointRegressor, PackedRegressor
 from .rank import (
     Dependence,
     Regrouped,
@@ -69,8 +69,8 @@ class BaseParameters(Summarised, Hashable):
     """
 
     model: Model
-    indices: tuple[int, ...] = eqx.field(static=True)
-    dependent: tuple[int, ...] = eqx.field(static=True)
+    indices: Columns = eqx.field(static=True)
+    dependent: Columns = eqx.field(static=True)
     kappa: Float[AnyArray, "base dependent"]
     smallest_independent: float
     largest_dependent: float
@@ -123,7 +123,7 @@ class BaseParameters(Summarised, Hashable):
         """Return the mass matrix of one sample by definition (Eq. 38)."""
         return self.model.inertia(self.to_standard(p), q)
 
-    def derived_program(self, name: str, *shapes: tuple[int, ...]) -> Program | None:
+    def derived_program(self, name: str, *shapes: Shape) -> Program | None:
         """Return the program of `columns`, which selects columns of the model's; else None."""
         if name != "columns":
             return None
@@ -139,7 +139,7 @@ class BaseParameters(Summarised, Hashable):
         return JointRegressor(self, self.columns, n, n, n)
 
     @property
-    def acting_columns(self) -> tuple[tuple[int, ...], ...]:
+    def acting_columns(self) -> tuple[Columns, ...]:
         """For each joint the base parameters that can act on it."""
         return self.joint_regressor.columns
 

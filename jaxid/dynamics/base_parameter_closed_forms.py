@@ -28,6 +28,7 @@ from jaxid.units.dimensions import Dimension, dimension
 
 from .base_parameter_expressions import Coefficient, Expression, Monomial
 from .model import Model
+from .packed_regressor import Columns
 from .rank import (
     characteristic_length,
     column_units,
@@ -64,8 +65,8 @@ MAX_MONOMIALS = 6
 
 def closed_forms(
     model: Model,
-    independent: tuple[int, ...],
-    dependent: tuple[int, ...],
+    independent: Columns,
+    dependent: Columns,
     kappa: Float[np.ndarray, "base dependent"],
 ) -> tuple[tuple[Expression, ...], dict[str, float]]:
     r"""Return base parameters as combinations of standard ones, and the values of the letters."""
@@ -101,9 +102,7 @@ def _quotient(
 class CoefficientSearch:
     """Values of the matrix at many geometries, from which one coefficient is found at a time."""
 
-    def __init__(
-        self, model: Model, independent: tuple[int, ...], dependent: tuple[int, ...]
-    ):
+    def __init__(self, model: Model, independent: Columns, dependent: Columns):
         matrix = Regrouping(model, independent, dependent)
         lengths = changing_lengths(model.robot, matrix) if dependent else ()
         generator = np.random.default_rng(3)
@@ -290,9 +289,7 @@ class Regrouping:
     geometries together.
     """
 
-    def __init__(
-        self, model: Model, independent: tuple[int, ...], dependent: tuple[int, ...]
-    ):
+    def __init__(self, model: Model, independent: Columns, dependent: Columns):
         robot = model.robot
         self.independent = np.array(independent, int)
         self.dependent = np.array(dependent, int)

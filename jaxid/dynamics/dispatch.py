@@ -30,7 +30,7 @@ from jaxid.arrays import (
     is_traced,
 )
 from jaxid.errors import InputError
-from jaxid.program import Program, evaluate, evaluate_rows, packed_entries, trace
+from jaxid.program import Program, Shape, evaluate, evaluate_rows, packed_entries, trace
 from jaxid.program.blocks import BLOCK, on_rows
 from jaxid.program.rules import with_derivatives_of
 
@@ -119,7 +119,7 @@ class SampleMethod:
 
     owner: Any  # model, whose numbers become constants of the program
     definition: Callable  # method of the model for one sample
-    shapes: tuple[tuple[int, ...], ...]  # shapes of the method's arguments
+    shapes: tuple[Shape, ...]  # shapes of the method's arguments
 
     @functools.cached_property
     def program(self) -> Program:
@@ -148,7 +148,7 @@ class SampleMethod:
         return joints > MAX_JOINTS.get(name, math.inf)
 
     @functools.cached_property
-    def output_shape(self) -> tuple[int, ...]:
+    def output_shape(self) -> Shape:
         """Shape of the result for one sample."""
         if not self.is_long:
             return self.program.output_shapes[0]
@@ -200,9 +200,7 @@ _methods: OrderedDict[tuple, SampleMethod] = OrderedDict()
 _lock = threading.Lock()
 
 
-def method_of(
-    owner: eqx.Module, definition: Callable, *shapes: tuple[int, ...]
-) -> SampleMethod:
+def method_of(owner: eqx.Module, definition: Callable, *shapes: Shape) -> SampleMethod:
     """Return a method of a model of known geometry; those that were used last are kept."""
     key = (definition.__name__, shapes, *content(owner))
     with _lock:
@@ -213,9 +211,7 @@ def method_of(
     return method
 
 
-def program_of(
-    owner: eqx.Module, definition: Callable, *shapes: tuple[int, ...]
-) -> Program:
+def program_of(owner: eqx.Module, definition: Callable, *shapes: Shape) -> Program:
     """Return the scalar program of a method of a model; see `method_of`."""
     return method_of(owner, definition, *shapes).program
 
@@ -259,7 +255,7 @@ def on_samples(
     return results if in_jax else np.asarray(results)
 
 
-def _batch_shape(arrays: list[AnyArray]) -> tuple[int, ...]:
+def _batch_shape(arrays: list[AnyArray]) -> Shape:
     """Return the shape to which the leading axes of arrays are broadcast."""
     try:
         return np.broadcast_shapes(*(x.shape[:-1] for x in arrays))
@@ -272,7 +268,7 @@ def _batch_shape(arrays: list[AnyArray]) -> tuple[int, ...]:
 
 
 def _rows_in_numpy(
-    program: Program, arrays: list[AnyArray], batch: tuple[int, ...]
+    program: Program, arrays: list[AnyArray], batch: Shape
 ) -> Float[np.ndarray, "samples results"]:
     """Return the packed results of all samples in NumPy, in the precision of the arrays."""
     inputs = []
@@ -293,7 +289,7 @@ def _rows_in_numpy(
 
 
 def _over_batches(
-    run: Callable, batch: tuple[int, ...], arrays: list[Array], shared: int
+    run: Callable, batch: Shape, arrays: list[Array], shared: int
 ) -> Array:
     """Apply a function of rows of samples, by `vmap` over the leading axes of parameters.
 
@@ -321,7 +317,7 @@ def _over_batches(
 
 
 def _over_samples(
-    run: Callable, batch: tuple[int, ...], parameters: list[Array], samples: list[Array]
+    run: Callable, batch: Shape, parameters: list[Array], samples: list[Array]
 ) -> Array:
     """Apply a function of rows to samples of any batch shape, with parameters in common."""
     rows = []

@@ -12,6 +12,7 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Float, Hashable, Joints, as_array, namespace
 from jaxid.errors import InputError
+from jaxid.program import Shape
 from jaxid.robot.robot import Robot
 
 from . import projection_equation
@@ -124,7 +125,7 @@ class Model(Hashable):
         return next(iter(laws), None)
 
     @property
-    def input_shapes(self) -> list[tuple[int, ...]]:
+    def input_shapes(self) -> list[Shape]:
         """Shapes of the arguments of `columns`."""
         rest = np.zeros(self.robot.joints)
         law = self.memory

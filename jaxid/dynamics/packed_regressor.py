@@ -17,6 +17,7 @@ from jaxid.errors import InputError
 from jaxid.program import (
     Lowered,
     Program,
+    Shape,
     evaluate_rows,
     lower,
     on_any_platform,
@@ -26,9 +27,12 @@ from jaxid.program.blocks import row_products
 
 from .dispatch import CACHE_SIZE, MAX_SAMPLES_IN_NUMPY, program_of
 
+Columns = tuple[int, ...]
+"""Positions of columns, in order."""
+
 
 @functools.lru_cache(maxsize=CACHE_SIZE)
-def _nonzero_columns(program: Program) -> tuple[tuple[int, ...], ...]:
+def _nonzero_columns(program: Program) -> tuple[Columns, ...]:
     """Return for each joint the columns of a regressor that are not always zero."""
     nonzeros = np.asarray(program.nonzeros)
     return tuple(tuple(np.flatnonzero(row).tolist()) for row in nonzeros)
@@ -39,12 +43,10 @@ class JointRegressor(eqx.Module):
 
     program: Program = eqx.field(static=True)  # program of the regressor
     # for each joint the columns that can act on it
-    columns: tuple[tuple[int, ...], ...] = eqx.field(static=True)
+    columns: tuple[Columns, ...] = eqx.field(static=True)
     size: int = eqx.field(static=True)  # number of columns
 
-    def __init__(
-        self, owner: eqx.Module, definition: Callable, *shapes: tuple[int, ...]
-    ):
+    def __init__(self, owner: eqx.Module, definition: Callable, *shapes: Shape):
         self.program = program_of(owner, definition, *shapes)
         self.columns = _nonzero_columns(self.program)
         self.size = self.program.output_shapes[0][1]

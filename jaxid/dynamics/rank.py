@@ -19,6 +19,7 @@ from jaxid.units.dimensions import length_power
 from .dispatch import in_numpy
 from .model import Model
 from .motion import Motion
+from .packed_regressor import Columns
 
 ROUNDING = 1e-12
 """Fraction of the largest column below which a column is nothing but rounding."""
@@ -27,8 +28,8 @@ ROUNDING = 1e-12
 class Dependence(NamedTuple):
     """Independent and dependent columns of a matrix, and how clear the distinction is."""
 
-    independent: tuple[int, ...]  # columns that no earlier ones can replace, in order
-    dependent: tuple[int, ...]  # other columns, in order
+    independent: Columns  # columns that no earlier ones can replace, in order
+    dependent: Columns  # other columns, in order
     smallest_independent: float  # smallest measure of independence among the first
     largest_dependent: float  # largest measure among the second
 
@@ -116,7 +117,7 @@ def _rank_at_largest_fall(s: np.ndarray, tolerance: float) -> int:
 
 def _ends_of_null_vectors(
     null_space: Float[np.ndarray, "vectors columns"],
-) -> tuple[int, ...]:
+) -> Columns:
     """Return the columns at which vectors of the null space end, when all are in echelon form."""
     ends: list[int] = []
     # Eliminate from the last column backwards: a pivot found there is where a vector

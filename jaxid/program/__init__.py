@@ -17,6 +17,7 @@ from .numpy_evaluation import (
 from .program import (
     OperationCounts as OperationCounts,
     Program as Program,
+    Shape as Shape,
     select_outputs as select_outputs,
 )
 from .trace import FREE as FREE, trace as trace

@@ -16,7 +16,7 @@ import numpy as np
 
 from jaxid.arrays import AnyArray
 
-from .program import Program, Reference
+from .program import Program, Reference, Shape
 from .scalar import Operation
 
 PYTHON_FORMATS = {
@@ -135,7 +135,7 @@ def _select(condition, if_true, if_false, out: np.ndarray) -> np.ndarray:
 
 def _evaluate(
     program: Program, arrays: tuple[AnyArray, ...]
-) -> tuple[np.ndarray, tuple[int, ...]]:
+) -> tuple[np.ndarray, Shape]:
     """Return the distinct results that vary [results, samples], and the batch's shape."""
     loads, run, cell_count = _plan(program)
     aligned, batch = program.align([np.asarray(x, np.float64) for x in arrays], np)

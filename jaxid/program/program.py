@@ -15,6 +15,8 @@ from jaxid.errors import InputError
 
 from .scalar import Graph, Operand, Operation, Scalar, live_scalars, rewrite
 
+Shape = tuple[int, ...]
+"""Shape of an array."""
 Reference = int | float
 """An operand or a result: the position of a node (int) or a constant (float)."""
 
@@ -67,13 +69,13 @@ class Program:
     """
 
     # shapes of the inputs, without batch axes
-    input_shapes: tuple[tuple[int, ...], ...]
+    input_shapes: tuple[Shape, ...]
     # operations; each one reads only nodes before it
     nodes: tuple[Node, ...] = field(repr=False)
     # packed result: for each entry of each output, in order, a node or a constant
     outputs: tuple[Reference, ...] = field(repr=False)
     # shapes of the outputs, without batch axes
-    output_shapes: tuple[tuple[int, ...], ...]
+    output_shapes: tuple[Shape, ...]
     structure: Any = field(repr=False)  # tree structure of the function's result
 
     @functools.cached_property
@@ -126,9 +128,7 @@ class Program:
         ends = np.cumsum([math.prod(shape) for shape in self.output_shapes], dtype=int)
         return [packed[a:b] for a, b in zip([0, *ends], ends, strict=False)]
 
-    def align(
-        self, arrays: Sequence[Any], xp: ModuleType
-    ) -> tuple[list[Any], tuple[int, ...]]:
+    def align(self, arrays: Sequence[Any], xp: ModuleType) -> tuple[list[Any], Shape]:
         """Return the inputs with their own axes merged and the batch behind; the batch's shape."""
         count = len(self.input_shapes)
         if len(arrays) != count:
@@ -163,9 +163,9 @@ class Program:
 
 
 def assemble(
-    input_shapes: tuple[tuple[int, ...], ...],
+    input_shapes: tuple[Shape, ...],
     outputs: Sequence[Operand],
-    output_shapes: tuple[tuple[int, ...], ...],
+    output_shapes: tuple[Shape, ...],
     structure: Any,
 ) -> Program:
     """Make a program of the part of a graph that the outputs need."""

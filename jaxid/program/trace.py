@@ -19,7 +19,7 @@ from jaxid.arrays import double_precision
 from jaxid.errors import InputError
 
 from . import scalar
-from .program import Program, assemble
+from .program import Program, Shape, assemble
 from .scalar import Graph, Operation
 
 FREE = object()
@@ -217,7 +217,7 @@ def _dot_general(x: np.ndarray, y: np.ndarray, *, dimension_numbers, **_) -> np.
 
 def _as_matrices(
     x: np.ndarray, contracted: Sequence[int], batch: Sequence[int]
-) -> tuple[np.ndarray, tuple[int, ...]]:
+) -> tuple[np.ndarray, Shape]:
     """Return an array as [*batch, others, contracted], and the shape of its other axes."""
     others = [k for k in range(x.ndim) if k not in (*contracted, *batch)]
     shape = tuple(x.shape[k] for k in others)
@@ -404,7 +404,7 @@ def _called_jaxpr(equation: JaxprEqn) -> Any:
     return next((equation.params[k] for k in keys if k in equation.params), None)
 
 
-def trace(function: Callable, *inputs: tuple[int, ...] | np.ndarray) -> Program:
+def trace(function: Callable, *inputs: Shape | np.ndarray) -> Program:
     """Translate a function of a few arrays into a scalar program.
 
     The function is ordinary JAX: arithmetic, elementwise functions, `jnp.where` and
@@ -432,9 +432,7 @@ def trace(function: Callable, *inputs: tuple[int, ...] | np.ndarray) -> Program:
     return assemble(input_shapes, outputs, output_shapes, jax.tree.structure(result))
 
 
-def _argument(
-    graph: Graph, number: int, description: tuple[int, ...] | np.ndarray
-) -> np.ndarray:
+def _argument(graph: Graph, number: int, description: Shape | np.ndarray) -> np.ndarray:
     """Return an input of the function as an array of scalars and numbers."""
     if isinstance(description, tuple):
         description = np.full(description, FREE, object)

@@ -18,7 +18,7 @@ from jaxid.arrays import AnyArray, Array
 from jaxid.errors import InputError
 
 from .jax_sincos import sine_cosine
-from .program import Program
+from .program import Program, Shape
 from .scalar import Operation
 
 ELEMENTWISE: dict[Operation, Callable] = {
@@ -103,7 +103,7 @@ class Lowered(eqx.Module):
         """Compute the distinct results that vary, from the same arrays."""
         return self.run(self.entries(*arrays)[0], ELEMENTWISE)
 
-    def entries(self, *arrays: AnyArray) -> tuple[list[Array], tuple[int, ...]]:
+    def entries(self, *arrays: AnyArray) -> tuple[list[Array], Shape]:
         """Return the inputs with their own axes merged and the whole batch behind; its shape."""
         dtype = jnp.result_type(*arrays, float) if arrays else jnp.result_type(float)
         if not jnp.issubdtype(dtype, jnp.floating):
