@@ -1,4 +1,4 @@
-"""Base parameters: the combinations of standard parameters that forces determine (Eqs. 20-24)."""
+"""Base parameters: combinations of parameters that forces determine (Eqs. 20-24)."""
 
 import enum
 import functools
@@ -53,7 +53,7 @@ class Identifiability(enum.Enum):
 
 
 class BaseParameters(Summarised, Hashable):
-    r"""A model regrouped to its base parameters: $\hat\Theta_1 (p_1 + \kappa p_2) = Q_m$ (Eq. 22).
+    r"""A model with base parameters: $\hat\Theta_1 (p_1 + \kappa p_2) = Q_m$ (Eq. 22).
 
     Attributes:
         model: The model with all its standard parameters.
@@ -95,7 +95,7 @@ class BaseParameters(Summarised, Hashable):
 
     @functools.cached_property
     def closed_forms(self) -> tuple[tuple[Expression, ...], dict[str, float]]:
-        """Expressions in letters, and the values of these, computed when first needed (Eq. 24)."""
+        """Expressions in letters, and the values of these (Eq. 24)."""
         from .base_parameter_closed_forms import closed_forms
 
         kappa = np.asarray(self.kappa, np.float64)
@@ -124,7 +124,7 @@ class BaseParameters(Summarised, Hashable):
         return self.model.inertia(self.to_standard(p), q)
 
     def derived_program(self, name: str, *shapes: Shape) -> Program | None:
-        """Return the program of `columns`, which selects columns of the model's; else None."""
+        """Return the program of `columns`, made from the model's; else None."""
         if name != "columns":
             return None
         program = program_of(self.model, self.model.columns, *shapes)
@@ -134,7 +134,7 @@ class BaseParameters(Summarised, Hashable):
 
     @property
     def joint_regressor(self) -> JointRegressor:
-        """Base regressor for many samples, joint by joint, for programs in JAX (Eq. 23)."""
+        """Base regressor of many samples, joint by joint, for JAX (Eq. 23)."""
         n = (self.model.robot.joints,)
         return JointRegressor(self, self.columns, n, n, n)
 
@@ -146,7 +146,7 @@ class BaseParameters(Summarised, Hashable):
     def regressor_rows(
         self, motion: Motion
     ) -> list[Float[np.ndarray, "samples columns"]]:
-        """Return each joint's row of the base regressor in its `acting_columns`, in NumPy (Eq. 23).
+        """Return each joint's rows of the base regressor in NumPy (Eq. 23).
 
         Args:
             motion: Joint motion [samples, joints].
@@ -158,11 +158,11 @@ class BaseParameters(Summarised, Hashable):
     def forces_in_numpy(
         self, p: Float[AnyArray, " base"], motion: Motion
     ) -> Float[np.ndarray, "samples joints"]:
-        r"""Return the generalised forces $\Theta_B p_B$ [N m or N] in float64 (Eq. 39)."""
+        r"""Return the forces $\Theta_B p_B$ [N m or N] in float64 (Eq. 39)."""
         return in_numpy(self, self.forces, *self.model.arguments(motion), shared=(p,))
 
     def tool_forces(self, motion: Motion) -> Float[np.ndarray, "samples joints"]:
-        """Return the forces of the known tool [N m or N] in float64; zero without a tool."""
+        """Return the forces of the known tool [N m or N] in float64."""
         if self.model.robot.tool is None:
             return np.zeros(motion.q.shape)
         return in_numpy(
@@ -174,7 +174,7 @@ class BaseParameters(Summarised, Hashable):
         return on_samples(self, self.columns, *self.model.arguments(motion))
 
     def packed_regressor(self, motion: Motion) -> PackedRegressor:
-        r"""Return the stacked base regressor of many samples without its zeros (Eqs. 23, 26).
+        r"""Return the stacked base regressor without its zeros (Eqs. 23, 26).
 
         Raises:
             InputError: If the motion does not have one axis of samples, or JAX is
@@ -194,10 +194,10 @@ class BaseParameters(Summarised, Hashable):
     def to_standard(
         self, p: Float[AnyArray, "*batch base"] | Sequence[Any]
     ) -> Float[AnyArray, "*batch standard"]:
-        """Return the standard parameters with the same forces whose dependent ones are zero.
+        """Return standard parameters with the same forces.
 
-        They are no physical masses and inertias, but give the same forces and mass
-        matrix.
+        The dependent ones are zero. They are no physical masses and inertias, but give
+        the same forces and mass matrix.
         """
         p = _as_parameters("base", p, self.size)
         shape = (*p.shape[:-1], self.model.size)
@@ -223,12 +223,12 @@ class BaseParameters(Summarised, Hashable):
     def mass_matrix(
         self, p: Parameters, q: Coordinates
     ) -> Float[AnyArray, "*batch joints joints"]:
-        """Return the mass matrix, which base parameters determine completely (Eq. 38)."""
+        """Return the mass matrix, which base parameters determine (Eq. 38)."""
         return on_samples(self, self.inertia, self.model.check(q), shared=(p,))
 
     @property
     def identifiability(self) -> tuple[Identifiability, ...]:
-        """Identifiability of every standard parameter: alone, in combination, or not at all."""
+        """Identifiability of every standard parameter."""
         identifiability = [Identifiability.NONE] * self.model.size
         combines = np.asarray(self.kappa) != 0.0
         for row, k in enumerate(self.indices):

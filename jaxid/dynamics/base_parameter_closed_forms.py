@@ -1,4 +1,4 @@
-r"""Closed forms of base parameters: their coefficients in letters, from the geometry (Eq. 24).
+r"""Closed forms of base parameters: their coefficients in letters (Eq. 24).
 
 The paper calls the symbolic analysis of base parameters manual and thus time-consuming
 (Sec. 3). Here every length is varied on its own first, which gives the powers with
@@ -69,7 +69,7 @@ def closed_forms(
     dependent: Columns,
     kappa: Float[np.ndarray, "base dependent"],
 ) -> tuple[tuple[Expression, ...], dict[str, float]]:
-    r"""Return base parameters as combinations of standard ones, and the values of the letters."""
+    r"""Return base parameters in letters, and the values of the letters."""
     names = model.parameter_names
     dimensions = [dimension(unit) for unit in model.parameter_units]
     search = CoefficientSearch(model, independent, dependent)
@@ -100,7 +100,7 @@ def _quotient(
 
 
 class CoefficientSearch:
-    """Values of the matrix at many geometries, from which one coefficient is found at a time."""
+    """Search of closed forms, one coefficient at a time, from many geometries."""
 
     def __init__(self, model: Model, independent: Columns, dependent: Columns):
         matrix = Regrouping(model, independent, dependent)
@@ -132,7 +132,7 @@ class CoefficientSearch:
     def coefficient(
         self, row: int, column: int, quotient: np.ndarray | None, value: float
     ) -> Coefficient | None:
-        """Return the coefficient of a dependent column in a base parameter; None if it is zero.
+        """Return the coefficient of a dependent column; None if it is zero.
 
         Args:
             row: Number of the base parameter.
@@ -193,7 +193,7 @@ class CoefficientSearch:
         factors: np.ndarray,
         value: float,
     ) -> bool:
-        """Return whether a closed form holds at other geometries and for the robot itself."""
+        """Return whether a form holds at other geometries and for the robot."""
         checks = self._check_kappa[:, row, column]
         predictions = _products(self._check_lengths, powers) @ factors
         max_error = np.abs(predictions - checks).max()
@@ -208,7 +208,7 @@ class CoefficientSearch:
     def _in_si_units(
         self, powers: np.ndarray, factors: np.ndarray, unit: float
     ) -> Coefficient:
-        """Return a coefficient in the robot's own units in SI units, with simple fractions."""
+        """Convert a coefficient from the robot's own units to SI units."""
         monomials = []
         for exponents, factor in zip(powers[::-1], factors[::-1], strict=True):
             symbols = []
@@ -238,7 +238,7 @@ def _shares_of_powers(
     scaled: Float[np.ndarray, "cases lengths"],
     kappa: Float[np.ndarray, "cases base dependent"],
 ) -> Float[np.ndarray, "lengths powers base dependent"]:
-    """Return for each length and power its share in the entries when this length alone varies."""
+    """Return the share of each power of a length that varies alone."""
     count = scaled.shape[1]
     shares = np.zeros((count, len(POWERS), *kappa.shape[1:]))
     for k in range(count):
@@ -282,7 +282,7 @@ class Length:
 
 
 class Regrouping:
-    r"""The matrix $\kappa$ of a fixed choice of columns, as a function of the geometry (Eq. 22).
+    r"""The matrix $\kappa$ of chosen columns, as a function of the geometry (Eq. 22).
 
     It is in the robot's own units (see `column_units`). The geometry is the vector of
     all offsets and of gravity. The regressor is traced once and evaluated at many
@@ -310,7 +310,7 @@ class Regrouping:
         self._program = self._trace(model)
 
     def _trace(self, model: Model):
-        """Return the program of the regressor, with numbers of the geometry as inputs."""
+        """Return the regressor's program, with the geometry as an input."""
         n = model.robot.joints
         # What is zero stays zero.
         variables = np.zeros(len(self.geometry), object)
@@ -330,7 +330,7 @@ class Regrouping:
     def __call__(
         self, lengths: tuple[Length, ...], values: Float[np.ndarray, "cases lengths"]
     ) -> tuple[Float[np.ndarray, "cases base dependent"], bool]:
-        """Return the matrix for other lengths, and whether the choice of columns is right at all.
+        """Return the matrix for other lengths, and whether the columns are right.
 
         It is if the dependent columns follow from earlier independent ones, and those
         are independent.
@@ -376,7 +376,7 @@ def draws(
     cases: int,
     generator: np.random.Generator,
 ) -> Float[np.ndarray, "cases lengths"]:
-    """Return random values of lengths, all of the robot's size, so that small ones have effect."""
+    """Return random values of lengths, all of the robot's size."""
     units = np.array([math.copysign(matrix.unit(x), x.value) for x in lengths])
     return generator.uniform(0.5, 1.5, (cases, len(lengths))) * units
 
@@ -441,14 +441,14 @@ def named_lengths(robot: Robot, matrix: Regrouping) -> tuple[Length, ...]:
 
 
 def offset_name(robot: Robot, body: int) -> str:
-    """Return the name of the offset of a body: `l3`, or `l3_5` if body 3 has several children."""
+    """Return the name of a body's offset, such as `l3`, or `l3_5` with siblings."""
     parent = robot.parent[body]
     is_only_child = robot.parent.count(parent) == 1
     return f"l{parent + 1}" if is_only_child else f"l{parent + 1}_{body + 1}"
 
 
 def _tied(lengths: tuple[Length, ...], robot: Robot) -> Length:
-    """Return several lengths that vary together: a whole offset, or multiples of the first."""
+    """Return several lengths as one that varies: an offset, or a multiple."""
     name = lengths[0].name
     value = lengths[0].value
     offsets = {x.offset for x in lengths}

@@ -29,7 +29,7 @@ class Monomial:
         return Monomial(self.number / factor.number, powers)
 
     def quotient(self) -> tuple[list[str], list[str]]:
-        """Return the factors of numerator and denominator; the number must be positive."""
+        """Return the factors of numerator and denominator of a positive monomial."""
         numerator, denominator = [], []
         if isinstance(self.number, float):
             numerator.append(f"{self.number:.6g}")
@@ -72,7 +72,7 @@ class Coefficient:
         return Monomial(_common_number([m.number for m in self.monomials]), powers)
 
     def factored(self) -> tuple[Monomial, tuple[Monomial, ...]]:
-        """Return the common factor, and the remaining sum, whose first sign is positive."""
+        """Return the common factor, and the remaining sum, which begins with a plus."""
         factor = self.common_factor()
         sign = -1 if self.is_negative else 1
         divisor = Monomial(sign * factor.number, factor.powers)
@@ -80,7 +80,7 @@ class Coefficient:
 
 
 def _common_number(numbers: Sequence[Number]) -> Number:
-    """Return the largest number of which all are whole multiples; 1 for several floats."""
+    """Return the largest common divisor of fractions; 1 for several floats."""
     fractions = [x for x in numbers if isinstance(x, Fraction)]
     if len(fractions) == len(numbers):
         numerator = math.gcd(*(x.numerator for x in fractions))
@@ -90,7 +90,7 @@ def _common_number(numbers: Sequence[Number]) -> Number:
 
 @dataclass(frozen=True)
 class Expression:
-    """A base parameter as a combination of standard parameters; `str` makes it readable."""
+    """A base parameter as a combination of standard parameters."""
 
     # Standard parameters in the order of their columns, with their coefficients. The
     # first one leads the base parameter and has the coefficient 1
@@ -122,7 +122,7 @@ class Expression:
 def _write_product(
     factor: Monomial, remainder: Sequence[Monomial], members: list[tuple[bool, str]]
 ) -> str:
-    """Write a factor times a sum of monomials times a sum of parameters with their signs."""
+    """Write a factor times a sum of monomials times a sum of parameters."""
     numerator, denominator = factor.quotient()
     if len(remainder) > 1:
         monomials = []

@@ -1,4 +1,4 @@
-"""Methods for one sample applied to many: in NumPy for few samples, in compiled blocks for many.
+"""Methods for one sample applied to many: in NumPy, or in compiled blocks.
 
 A method of a model is traced once into a scalar program, with numbers of the model that
 JAX is tracing, or in which models differ, as inputs; the programs of the models that
@@ -36,7 +36,7 @@ from jaxid.program.rules import with_derivatives_of
 
 
 class OpenModel(eqx.Module):
-    """A method of a model for one sample, whose first argument are numbers of the model."""
+    """A method for one sample, whose first argument are numbers of the model."""
 
     model: eqx.Module  # model; in the place of these numbers it has any others
     method: str = eqx.field(static=True)  # name of the method
@@ -63,7 +63,7 @@ class OpenModel(eqx.Module):
 def opened(
     method: str, model: eqx.Module, *others: eqx.Module
 ) -> tuple[OpenModel, Float[AnyArray, "models numbers"]]:
-    """Return a method whose inputs are the numbers that JAX is tracing, or in which models differ.
+    """Return a method with numbers of the model as inputs: traced, or different ones.
 
     All other numbers stay constants of a program. The numbers are those of each model.
     """
@@ -93,11 +93,11 @@ MAX_SAMPLES_IN_NUMPY = 4096
 CACHE_SIZE = 64
 """Number of programs that are kept, of the models that were used last."""
 MAX_JOINTS = {"inertia": 16, "acceleration": 16}
-"""Joints up to which the program of a method, which grows with their square, is compiled."""
+"""Joints up to which a program is compiled that grows with the square of their number."""
 
 
 def spatial_form(owner: Any) -> Any:
-    """Return a model, or what holds one, whose methods for one sample are few array operations."""
+    """Return a model, or what holds one, with methods of few array operations."""
 
     def has_spatial_form(part: Any) -> bool:
         return hasattr(part, "spatial_form")
@@ -133,14 +133,14 @@ class SampleMethod:
 
     @functools.cached_property
     def spatial_definition(self) -> Callable:
-        """The method in spatial form; a function that is no method of the owner, as it is."""
+        """The method in spatial form, or a function that has no such form."""
         if getattr(self.definition, "__self__", None) is not self.owner:
             return self.definition
         return getattr(spatial_form(self.owner), self.definition.__name__)
 
     @property
     def is_long(self) -> bool:
-        """Whether the spatial form is used instead of the program, which would be long."""
+        """Whether the program would be long, and the spatial form is used."""
         if self.spatial_definition is self.definition:
             return False
         joints = self.shapes[-1][0]
@@ -174,7 +174,7 @@ class SampleMethod:
 def definition_on_rows(
     definition: Callable, *arrays: Array
 ) -> Float[Array, "samples out"]:
-    """Apply a function of one sample to arrays as in `on_rows`, in memory that does not grow."""
+    """Apply a function of one sample to arrays as in `on_rows`, block by block."""
 
     def on_one_sample(rows: list[Array]) -> Array:
         remaining = iter(rows)
@@ -201,7 +201,7 @@ _lock = threading.Lock()
 
 
 def method_of(owner: eqx.Module, definition: Callable, *shapes: Shape) -> SampleMethod:
-    """Return a method of a model of known geometry; those that were used last are kept."""
+    """Return a method of a model; those that were used last are kept."""
     key = (definition.__name__, shapes, *content(owner))
     with _lock:
         method = _methods.setdefault(key, SampleMethod(owner, definition, shapes))
@@ -270,7 +270,7 @@ def _batch_shape(arrays: list[AnyArray]) -> Shape:
 def _rows_in_numpy(
     program: Program, arrays: list[AnyArray], batch: Shape
 ) -> Float[np.ndarray, "samples results"]:
-    """Return the packed results of all samples in NumPy, in the precision of the arrays."""
+    """Return the packed results of all samples in NumPy."""
     inputs = []
     for x in arrays:
         entries = np.moveaxis(np.asarray(x, np.float64), -1, 0)
@@ -291,7 +291,7 @@ def _rows_in_numpy(
 def _over_batches(
     run: Callable, batch: Shape, arrays: list[Array], shared: int
 ) -> Array:
-    """Apply a function of rows of samples, by `vmap` over the leading axes of parameters.
+    """Apply a function of rows, by `vmap` over the leading axes of parameters.
 
     The first arrays, of this number, are parameters; the others are samples.
     """
@@ -319,7 +319,7 @@ def _over_batches(
 def _over_samples(
     run: Callable, batch: Shape, parameters: list[Array], samples: list[Array]
 ) -> Array:
-    """Apply a function of rows to samples of any batch shape, with parameters in common."""
+    """Apply a function of rows to samples with any batch axes."""
     rows = []
     for x in samples:
         size = x.shape[-1]
@@ -336,7 +336,7 @@ def in_numpy(
     *samples: AnyArray,
     shared: tuple[AnyArray, ...] = (),
 ) -> np.ndarray:
-    """Apply a method for one sample to rows of samples in NumPy: float64, never compiled."""
+    """Apply a method for one sample to rows of samples in NumPy, in float64."""
     parameters = [np.asarray(x, np.float64) for x in shared]
     columns = [np.asarray(x, np.float64).T for x in samples]
     shapes = [x.shape for x in parameters] + [x.shape[:1] for x in columns]
@@ -347,7 +347,7 @@ def in_numpy(
 
 
 def solve_symmetric(A: Float[AnyArray, "joints joints"], b: Joints) -> Joints:
-    r"""Solve $A x = b$ by $A = L D L^T$, without square roots or pivoting, entry by entry.
+    r"""Solve $A x = b$ by $A = L D L^T$, without square roots or pivoting.
 
     Only the lower triangle of A, which is definite, is read. A program has no loops.
     """

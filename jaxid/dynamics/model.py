@@ -113,7 +113,7 @@ class Model(Hashable):
 
     @property
     def memory(self) -> Presliding | None:
-        """Law of the friction that depends on the path of the joints; None without such friction.
+        """Law of the friction with memory; None without such friction.
 
         Raises:
             InputError: If terms have different lengths.
@@ -133,7 +133,7 @@ class Model(Hashable):
         return [rest.shape] * 3 + states
 
     def with_memory(self, **changes: Any) -> "Model":
-        """Return the model with other fields of `memory`, such as `length` or `state`."""
+        """Return the model with other fields of `memory`, such as `length`."""
 
         def change(part: Any) -> Any:
             return dataclasses.replace(part, **changes) if _has_memory(part) else part
@@ -142,7 +142,7 @@ class Model(Hashable):
         return dataclasses.replace(self, terms=terms)
 
     def arguments(self, motion: Motion) -> tuple[AnyArray, ...]:
-        """Return the arguments of `columns` at a motion: with the state if friction has memory.
+        """Return the arguments of `columns`: with the state if friction has memory.
 
         Where a motion does not have the state, its samples are a path in the order of
         time.
@@ -214,7 +214,7 @@ class Model(Hashable):
         return on_samples(self, self.columns, *self.arguments(motion))
 
     def packed_regressor(self, motion: Motion) -> PackedRegressor:
-        r"""Return the stacked regressor $\bar\Theta$ of many samples without its zeros (Eq. 26).
+        r"""Return the stacked regressor $\bar\Theta$ without its zeros (Eq. 26).
 
         Several times as fast as `regressor`, whose dense matrix costs more than its
         entries.
@@ -231,7 +231,7 @@ class Model(Hashable):
     def gram(
         self, motion: Motion, weights: Joints | None = None
     ) -> Float[AnyArray, "standard standard"]:
-        r"""Return the information $\sum_k \Theta_k^T W^2 \Theta_k$ of a motion (Eq. 29).
+        r"""Return the information $\sum_k \Theta_k^T W^2 \Theta_k$ (Eq. 29).
 
         Takes a small part of the time of the regressor, which is never held in memory.
 
@@ -244,7 +244,7 @@ class Model(Hashable):
     def inverse_dynamics(
         self, p: Parameters, *motion: Motion | Coordinates
     ) -> Float[AnyArray, "*batch joints"]:
-        r"""Return the generalised forces $\Theta p$ [N m or N], without forming $\Theta$ (Eq. 16).
+        r"""Return the forces $\Theta p$ [N m or N], without forming $\Theta$ (Eq. 16).
 
         Args:
             p: Standard parameters.
@@ -312,7 +312,7 @@ class Model(Hashable):
     def potential_energy(
         self, p: Parameters, q: Coordinates
     ) -> Float[AnyArray, "*batch"]:
-        """Return the potential energy of gravity and springs [J], zero at the ground's origin."""
+        """Return the potential energy [J], zero at the ground's origin."""
         return on_samples(self, self.potential, self.check(q), shared=(p,))
 
     def tool_forces(self, motion: Motion) -> Float[AnyArray, "*batch joints"]:
@@ -321,7 +321,7 @@ class Model(Hashable):
         return on_samples(self, self.known_forces, motion.q, motion.qd, motion.qdd)
 
     def check(self, q: Coordinates) -> Float[AnyArray, "*batch joints"]:
-        """Return coordinates as an array with one number for each joint along the last axis.
+        """Return coordinates as an array with one number for each joint.
 
         Raises:
             InputError: If the last axis has another length.
@@ -336,7 +336,7 @@ class Model(Hashable):
 
 
 class SpatialModel(Model):
-    """A model by spatial vectors, for derivatives and for geometry that JAX is tracing."""
+    """A model by spatial vectors, for derivatives and traced geometry."""
 
     def acceleration(self, p, q, qd, forces):
         """Return the accelerations of one sample that forces cause (Eq. 38)."""

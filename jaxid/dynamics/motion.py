@@ -31,7 +31,7 @@ class Motion(eqx.Module):
     state: Float[AnyArray, "*batch states"] | None = None
 
     def __getitem__(self, index) -> "Motion":
-        """Return the motion at some of its instants, by an index of the leading axis."""
+        """Return the motion at some instants, by an index of the leading axis."""
         state = None if self.state is None else self.state[index]
         return Motion(self.q[index], self.qd[index], self.qdd[index], state)
 
@@ -42,7 +42,7 @@ class Motion(eqx.Module):
 
 
 def as_motion(*motion: Any) -> Motion:
-    """Return a motion that is given as such, or as coordinates and their two derivatives.
+    """Return a motion that is given as such, or as its three arrays.
 
     Raises:
         InputError: If there is neither a motion nor three arrays.
@@ -58,7 +58,7 @@ def as_motion(*motion: Any) -> Motion:
 
 
 def as_state(*state: Any) -> tuple[Any, Any]:
-    """Return coordinates and velocities of a motion, or those that are given instead of it.
+    """Return coordinates and velocities, given as such or in a motion.
 
     Raises:
         InputError: If there is neither a motion nor two arrays.

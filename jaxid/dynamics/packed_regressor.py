@@ -1,4 +1,4 @@
-"""Regressor of many samples without its zeros: evaluated joint by joint, or stacked and packed.
+"""Regressor of many samples without its zeros: joint by joint, or stacked.
 
 A joint feels only the bodies beyond it, so most entries of a regressor are zero for
 every motion.
@@ -39,7 +39,7 @@ def _nonzero_columns(program: Program) -> tuple[Columns, ...]:
 
 
 class JointRegressor(eqx.Module):
-    """Compiled regressor, evaluated joint by joint in the columns that can act on the joint."""
+    """Regressor joint by joint, in the columns that can act on the joint."""
 
     program: Program = eqx.field(static=True)  # program of the regressor
     # for each joint the columns that can act on it
@@ -62,7 +62,7 @@ class JointRegressor(eqx.Module):
     def __call__(
         self, *arrays: AnyArray, fence: bool = False
     ) -> list[Float[Array, "*batch columns samples"]]:
-        """Return the columns of each joint, from arguments whose batch and samples stand last."""
+        """Return the columns of each joint, from arguments with samples last."""
         values = lower(self.program, fence)(*arrays)
         dtype = jnp.result_type(*arrays, float)
         *batch, samples = jnp.shape(arrays[0])[1:]
@@ -80,7 +80,7 @@ class JointRegressor(eqx.Module):
     def gram(
         self, weights: AnyArray, *arrays: AnyArray
     ) -> Float[Array, "columns columns"]:
-        r"""Return $\sum_k \Theta_k^T W^2 \Theta_k$ over samples, without storing the columns."""
+        r"""Return $\sum_k \Theta_k^T W^2 \Theta_k$, without storing the columns."""
         groups = tuple(tuple(entries.tolist()) for entries in self.entries)
         products = row_products(self.program, groups, *map(jnp.asarray, arrays))
         total = jnp.zeros((self.size, self.size), arrays[0].dtype)
@@ -162,7 +162,7 @@ class PackedRegressor(eqx.Module):
             self.values = tuple(evaluate_rows(program, *arrays))
 
     def matrix(self) -> Float[np.ndarray, "rows columns"]:
-        """Return the whole matrix in Fortran's order: all samples of joint 1, of joint 2, etc.
+        """Return the whole matrix: all samples of joint 1, of joint 2, etc.
 
         `packed.matrix().reshape(joints, samples, columns)` is a view by joint and
         sample.

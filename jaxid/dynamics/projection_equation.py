@@ -25,7 +25,7 @@ Vector = Float[AnyArray, "3"]
 def body_motions(
     robot: Robot, q: Joints, qd: Joints, qdd: Joints
 ) -> list[tuple[Vector, Vector, Vector]]:
-    r"""Return the motion of every body in its own frame: $(a, \omega, \dot\omega)$ (Eqs. 6, 8).
+    r"""Return $(a, \omega, \dot\omega)$ of every body in its own frame (Eqs. 6, 8).
 
     Returns:
         For each body the acceleration of its origin less gravity [m/s²], its angular
@@ -54,7 +54,7 @@ def body_motions(
 
 
 def partial_velocities(robot: Robot, q: Joints, qd: Joints, qdd: Joints):
-    r"""Return the map $\ddot q \to (a, \dot\omega)$, whose slope is $F_{o,i}$ (Eqs. 5, 7)."""
+    r"""Return $\ddot q \to (a, \dot\omega)$, whose slope is $F_{o,i}$ (Eqs. 5, 7)."""
 
     def accelerations(x):
         return [jnp.concatenate([a, wd]) for a, _, wd in body_motions(robot, q, qd, x)]
@@ -63,7 +63,7 @@ def partial_velocities(robot: Robot, q: Joints, qd: Joints, qdd: Joints):
 
 
 def momentum_matrix(w: Vector) -> Float[AnyArray, "3 6"]:
-    r"""Return $[\Omega\;|\;-\hat\Omega]$, which maps $(A, ..., F)$ to $J^o\omega$ (Eq. 9)."""
+    r"""Return $[\Omega\;|\;-\hat\Omega]$: $(A, ..., F) \to J^o\omega$ (Eq. 9)."""
     x, y, z = w[0], w[1], w[2]
     o = 0.0 * x
     return jnp.array([[x, o, o, o, -z, -y], [o, y, o, -z, o, -x], [o, o, z, -y, -x, o]])
@@ -106,7 +106,7 @@ def rigid_body_regressor(
 def rigid_body_forces(
     robot: Robot, p: Float[AnyArray, "joints 10"], q: Joints, qd: Joints, qdd: Joints
 ) -> Joints:
-    r"""Return the generalised forces $\sum_i F_{o,i}^T \bar\Theta_i p_i$ [N m or N] (Eq. 11).
+    r"""Return the forces $\sum_i F_{o,i}^T \bar\Theta_i p_i$ [N m or N] (Eq. 11).
 
     The projection is the transpose of the map that gives the accelerations: it is
     applied, and the Jacobian is never built.
@@ -120,7 +120,7 @@ def rigid_body_forces(
 def rigid_body_mass_matrix(
     robot: Robot, p: Float[AnyArray, "joints 10"], q: Joints
 ) -> Float[AnyArray, "joints joints"]:
-    r"""Return the mass matrix $\sum_i F_{o,i}^T M_i F_{o,i}$ (Eq. 38) by composite bodies.
+    r"""Return the mass matrix $\sum_i F_{o,i}^T M_i F_{o,i}$ (Eq. 38).
 
     All bodies beyond a joint move as one when that joint alone moves. Mass, first
     moment and inertia of these composite bodies are summed from the tips to the ground;
@@ -154,7 +154,7 @@ def rigid_body_mass_matrix(
 def composite_bodies(
     robot: Robot, p: Float[AnyArray, "joints 10"], frames: list[tuple]
 ) -> list[tuple[AnyArray, Vector, Float[AnyArray, "3 3"]]]:
-    """Return mass, first moment and inertia of all that each joint carries, in its body's frame."""
+    """Return mass, first moment and inertia of all that each joint carries."""
     n = robot.joints
     bodies = [(p[i][0], p[i][1:4], inertia_tensor(p[i][4:])) for i in range(n)]
     for i in reversed(range(n)):

@@ -26,7 +26,7 @@ ROUNDING = 1e-12
 
 
 class Dependence(NamedTuple):
-    """Independent and dependent columns of a matrix, and how clear the distinction is."""
+    """Independent and dependent columns, and how clear the distinction is."""
 
     independent: Columns  # columns that no earlier ones can replace, in order
     dependent: Columns  # other columns, in order
@@ -44,7 +44,7 @@ class Dependence(NamedTuple):
 def gram_schmidt(
     W: Float[AnyArray, "rows columns"], tolerance: float = 1e-9
 ) -> Dependence:
-    """Orthogonalise the columns in order, twice, each relative to its own norm (Eq. 20).
+    """Orthogonalise the columns in order, each relative to its norm (Eq. 20).
 
     A dependent column uses up no direction, unlike in a plain QR decomposition without
     pivoting, and every column is measured against its own norm. So near-degenerate
@@ -81,9 +81,10 @@ def gram_schmidt(
 def singular_values(
     W: Float[AnyArray, "rows columns"], tolerance: float = 1e-6
 ) -> Dependence:
-    """Find the null space by a singular value decomposition, the paper's alternative method.
+    """Find the null space by a singular value decomposition.
 
-    The rank is where the singular values fall by the largest factor. A column depends
+    It is the paper's alternative method. The rank is where the singular values fall by
+    the largest factor. A column depends
     on earlier ones if some vector of the null space ends there.
     """
     scaled, norms = scale_columns(W)
@@ -104,7 +105,7 @@ def singular_values(
 
 
 def _rank_at_largest_fall(s: np.ndarray, tolerance: float) -> int:
-    """Return the rank: all above the tolerance count, and then those before the largest fall."""
+    """Return the rank, behind which singular values fall the most."""
     min_rank = int(np.count_nonzero(s > tolerance))
     ranks = np.arange(1, len(s))
     is_possible = ranks >= min_rank
@@ -118,7 +119,7 @@ def _rank_at_largest_fall(s: np.ndarray, tolerance: float) -> int:
 def _ends_of_null_vectors(
     null_space: Float[np.ndarray, "vectors columns"],
 ) -> Columns:
-    """Return the columns at which vectors of the null space end, when all are in echelon form."""
+    """Return the columns at which vectors of the null space end."""
     ends: list[int] = []
     # Eliminate from the last column backwards: a pivot found there is where a vector
     # ends.
@@ -149,7 +150,7 @@ def scale_columns(
 
 
 class Regrouped(NamedTuple):
-    r"""Dependent columns as combinations of independent ones: $\hat\Theta_2 = \hat\Theta_1 \kappa$."""
+    r"""Dependent columns by independent ones: $\hat\Theta_2 = \hat\Theta_1 \kappa$."""
 
     kappa: Float[np.ndarray, "base dependent"]  # factors of the independent columns
     unexplained: float  # largest fraction of a dependent column that kappa misses
@@ -162,7 +163,7 @@ def regrouping(
     independent: Sequence[int] | np.ndarray,
     dependent: Sequence[int] | np.ndarray,
 ) -> Regrouped:
-    r"""Return $\kappa$ with $\hat\Theta_2 = \hat\Theta_1 \kappa$, and how exact it is (Eq. 22).
+    r"""Return $\kappa$ with $\hat\Theta_2 = \hat\Theta_1 \kappa$ (Eq. 22).
 
     A dependent column is a combination of independent columns before it.
     """
@@ -193,7 +194,7 @@ def regrouping(
 def random_regressor(
     model: Model, seed: int
 ) -> tuple[Float[np.ndarray, "rows standard"], Float[np.ndarray, " standard"]]:
-    r"""Return the regressor at random motions, stacked and free of units: $\Theta_{QR}$ (Eq. 20).
+    r"""Return the regressor $\Theta_{QR}$ at random motions, free of units (Eq. 20).
 
     Lengths are measured in the robot's own size, so that metres or millimetres make no
     difference. It is computed in float64, whatever the precision in which JAX runs.
@@ -223,17 +224,17 @@ def random_motion(model: Model, samples: int, seed: int) -> Motion:
 
 
 def row_units(model: Model) -> Float[np.ndarray, " joints"]:
-    """Return the unit of each joint's coordinate: 1 rad, or the size of the robot [m]."""
+    """Return the units of the coordinates: 1 rad, or the robot's size [m]."""
     return np.where(np.array(model.robot.revolute), 1.0, characteristic_length(model))
 
 
 def column_units(model: Model) -> Float[np.ndarray, " standard"]:
-    """Return the unit of each parameter: the robot's size to the power of length in its unit."""
+    """Return the units of the parameters: powers of the robot's size."""
     size = characteristic_length(model)
     return np.array([size ** length_power(unit) for unit in model.parameter_units])
 
 
 def characteristic_length(model: Model) -> float:
-    """Return the size of the robot: the largest distance between neighbouring joints [m], or 1."""
+    """Return the largest distance between neighbouring joints [m], or 1."""
     distances = np.linalg.norm(np.asarray(model.robot.offset), axis=-1)
     return float(distances.max()) if distances.any() else 1.0

@@ -1,4 +1,4 @@
-r"""Dynamics of the bodies as few operations on whole arrays, whatever the number of joints.
+r"""Dynamics of the bodies by spatial vectors: few operations on whole arrays.
 
 The Projection Equation of `projection_equation` follows the tree body by body: traced
 into scalar operations it is the fastest program for many samples, but a long one. Here
@@ -31,7 +31,7 @@ def _motion_products(skew: np.ndarray) -> Float[np.ndarray, "6 6 6"]:
 
 
 def _unit_inertias(skew: np.ndarray) -> Float[np.ndarray, "6 6 10"]:
-    r"""Return the spatial inertias of unit parameters $(m, m r_c, A, B, C, D, E, F)$."""
+    r"""Return the inertias of unit parameters $(m, m r_c, A, B, C, D, E, F)$."""
     inertias = np.zeros((6, 6, 10))
     inertias[3:, 3:, 0] = np.eye(3)
     inertias[:3, 3:, 1:4] = skew
@@ -168,7 +168,7 @@ def spatial_forces(
 def spatial_mass_and_bias(
     robot: Robot, p: Bodies, q: Joints, qd: Joints
 ) -> tuple[Float[Array, "joints joints"], Joints]:
-    """Return the mass matrix of the bodies by composite bodies, and the bias forces (Eq. 38)."""
+    """Return the mass matrix and the bias forces of the bodies (Eq. 38)."""
     motion = ground_motion(robot, q, qd, jnp.zeros_like(q))
     inertias = ground_inertias(p, motion.carry)
     moved = jnp.asarray(moved_by(robot), q.dtype)
@@ -193,7 +193,7 @@ def _project_forces(robot: Robot, inertias: Array, motion: GroundMotion) -> Join
 def spatial_regressor(
     robot: Robot, q: Joints, qd: Joints, qdd: Joints
 ) -> Float[Array, "joints joints 10"]:
-    """Return the regressor of every body (Eq. 11): joints, then bodies and their columns."""
+    """Return the regressor of every body (Eq. 11)."""
     carry, joints, v, a = ground_motion(robot, q, qd, qdd)
     v_body = jnp.einsum("nji,nj->ni", carry, v)
     a_body = jnp.einsum("nji,nj->ni", carry, a)

@@ -48,7 +48,7 @@ def block_results(program: Program, *arrays: Array) -> tuple[Array, ...]:
 
 
 def results_at_once(program: Program, *arrays: Array) -> tuple[Array, ...]:
-    """Return the distinct results of samples without fences, as an accelerator computes them."""
+    """Return the distinct results of samples, without fences."""
     count = next(len(x) for x in arrays if x.ndim == 2)
     inputs = [[jnp.broadcast_to(row, (count,)) for row in x.T] for x in arrays]
     like = jnp.zeros(count, arrays[-1].dtype)
@@ -85,7 +85,7 @@ def _in_blocks(program: Program, *arrays: Array) -> Float[Array, "samples out"]:
 
 
 def _slice_samples(x: Array, start: Array, size: int) -> Array:
-    """Return some samples of an input; one that all samples have in common stays as it is."""
+    """Return some samples of an input, unless all samples have it in common."""
     return jax.lax.dynamic_slice_in_dim(x, start, size) if x.ndim == 2 else x
 
 
@@ -146,7 +146,7 @@ def _one_after_the_other(
 def row_products(
     program: Program, groups: tuple[tuple[int, ...], ...], *arrays: Array
 ) -> list[Float[Array, "results results"]]:
-    """Return the sums over samples of products of results; the results are never stored.
+    """Return sums over samples of products of results, which are not stored.
 
     A group holds positions in the packed result whose values are multiplied with each
     other.

@@ -125,7 +125,7 @@ class CWriter:
         return f"t{x}" if isinstance(x, int) else self.number(x)
 
     def _statements(self, program: Program, inputs: Sequence[str]) -> list[str]:
-        """Write one line for each node; functions of the library are called together."""
+        """Write one line for each node, and calls of the library."""
         stages = self._stages(program)
         lines: list[str] = []
         for stage in range(max(stages, default=0) + 1):
@@ -140,7 +140,7 @@ class CWriter:
         return lines
 
     def _function(self, program: Program, k: int) -> str | None:
-        """Return the name of the library's function that computes a node, if one does."""
+        """Return the library's function that computes a node, else None."""
         operation = program.nodes[k].operation
         return next((x for x in self.widths if operation in LIBRARY[x]), None)
 
@@ -185,7 +185,7 @@ class CWriter:
     def _call(
         self, program: Program, name: str, nodes: Sequence[int], stage: int
     ) -> list[str]:
-        """Write a call of the library for several nodes, and its results as these nodes."""
+        """Write a call of the library for several nodes."""
         width = self.widths[name]
         operands = list(dict.fromkeys(program.nodes[k].operands[0] for k in nodes))
         # The library always computes as many numbers.
@@ -206,7 +206,7 @@ class CWriter:
         return lines
 
     def library(self) -> str:
-        """Write the functions `{prefix}_sine_cosine` and `{prefix}_tanh` that are needed."""
+        """Write the functions `sine_cosine` and `tanh`, if they are needed."""
         if not self.widths:
             return ""
         bits, mantissa, bias = (64, 52, 1023) if self.double else (32, 23, 127)
@@ -236,7 +236,7 @@ class CWriter:
         )
 
     def _polynomial(self, coefficients: Sequence[float], powers: Sequence[str]) -> str:
-        """Write a polynomial in Estrin's scheme; its chain grows with the logarithm of the degree.
+        """Write a polynomial in Estrin's scheme, whose chain is short.
 
         Coefficients begin with the lowest power; the `powers` are the names of x, x^2,
         x^4, ...

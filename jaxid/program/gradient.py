@@ -1,4 +1,4 @@
-"""The derivative of a scalar program, as another one: backwards through its operations."""
+"""The derivative of a scalar program, as another one (reverse mode)."""
 
 import functools
 import math
@@ -49,7 +49,7 @@ _UNARY: dict[Operation, Callable[[Operand, Operand], Operand]] = {
 def pull_back(
     program: Program, weights: np.ndarray, *arrays: np.ndarray
 ) -> list[np.ndarray]:
-    """Return the derivative of a weighted sum of a program's results by each input, in NumPy.
+    """Return the derivative of a weighted sum of results by each input.
 
     Weights of the packed result, and arrays with the shapes of the inputs, are followed
     by any batch axes.
@@ -90,7 +90,7 @@ def gradient_program(program: Program) -> Program:
 def _slopes_of_nodes(
     program: Program, scalars: list[Scalar], weights: list[Scalar]
 ) -> list[Operand]:
-    """Return the derivative of the weighted sum of results by each node (reverse mode)."""
+    """Return the derivative of the weighted sum by each node (reverse mode)."""
     slopes: list[Operand] = [0.0] * len(scalars)
     for weight, x in zip(weights, program.outputs, strict=True):
         if isinstance(x, int):

@@ -81,7 +81,7 @@ def user_cache() -> Path:
 
 
 def _require_private(folder: Path) -> None:
-    """Check that a folder is the user's own; make it and those above it if they are missing."""
+    """Check that a folder is the user's own; make it if it is missing."""
     for path in reversed([folder, *folder.parents]):
         with contextlib.suppress(FileExistsError):
             path.mkdir()
@@ -99,7 +99,7 @@ def _require_private(folder: Path) -> None:
 
 
 def _remove_oldest(folder: Path, max_bytes: int) -> None:
-    """Remove the least recently used files; other processes may do so at the same time."""
+    """Remove the least recently used files."""
     files = []
     for path in folder.glob("*-cache"):
         with contextlib.suppress(FileNotFoundError):

@@ -19,7 +19,7 @@ _HALF_PI = Fraction("1.57079632679489661923132169163975144209858469968755291")
 
 
 def half_pi(bits: int, count: int) -> tuple[float, ...]:
-    """Return pi/2 as a sum of numbers with so few bits that whole multiples of each are exact."""
+    """Return pi/2 as a sum of numbers with few bits, for exact multiples."""
     pieces = []
     remainder = _HALF_PI
     for _ in range(count):
@@ -81,7 +81,7 @@ def _horner(coefficients: tuple[float, ...], z: Array) -> Array:
 
 @jax.custom_jvp
 def sine_cosine(x: Array) -> tuple[Array, Array]:
-    """Compute (sin x, cos x) of angles [rad]: up to 3e9 in float64, 1e5 in float32, else NaN."""
+    """Compute (sin x, cos x) of angles [rad], up to 3e9 (float32: 1e5)."""
     precision = DOUBLE if x.dtype == np.float64 else SINGLE
     turns = jnp.round(x * float(1 / _HALF_PI))
     *leading, middle, last = precision.pieces

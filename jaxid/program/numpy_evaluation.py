@@ -36,7 +36,7 @@ BLOCK = 2048
 
 
 class Plan(NamedTuple):
-    """A program as one function on cells of memory, of which several nodes share each."""
+    """A program as one function on cells of memory, which nodes share."""
 
     loads: tuple[
         tuple[int, int, int], ...
@@ -46,21 +46,21 @@ class Plan(NamedTuple):
 
 
 def evaluate(program: Program, *arrays: AnyArray) -> Any:
-    """Compute the outputs of a program, in the structure of the traced function, in NumPy."""
+    """Compute the outputs of a program in NumPy, as the function returns them."""
     rows, batch = _evaluate(program, arrays)
     entries = packed_entries(program, rows, np.arange(len(program.outputs)))
     return program.unpack(entries.reshape(len(entries), *batch))
 
 
 def evaluate_rows(program: Program, *arrays: AnyArray) -> np.ndarray:
-    """Compute the distinct results of a program that vary, in NumPy: [results, samples]."""
+    """Compute the distinct results that vary in NumPy: [results, samples]."""
     return _evaluate(program, arrays)[0]
 
 
 def packed_entries(
     program: Program, rows: np.ndarray, entries: np.ndarray
 ) -> np.ndarray:
-    """Return some entries of the packed result [entries, samples] from its distinct values."""
+    """Return some entries [entries, samples] of the packed result."""
     numbers = program.distinct[1][entries]
     varies = numbers >= 0
     values = np.empty((len(entries), rows.shape[1]))
@@ -72,7 +72,7 @@ def packed_entries(
 
 @functools.lru_cache(maxsize=64)
 def _plan(program: Program) -> Plan:
-    """Write a program as one function: a loop over operations takes as long as short ones."""
+    """Write a program as one function, since a loop would cost as much."""
     cells, count = _allocate_cells(program)
     loads = []
     lines = []
@@ -136,7 +136,7 @@ def _select(condition, if_true, if_false, out: np.ndarray) -> np.ndarray:
 def _evaluate(
     program: Program, arrays: tuple[AnyArray, ...]
 ) -> tuple[np.ndarray, Shape]:
-    """Return the distinct results that vary [results, samples], and the batch's shape."""
+    """Return the results that vary [results, samples], and the batch."""
     loads, run, cell_count = _plan(program)
     aligned, batch = program.align([np.asarray(x, np.float64) for x in arrays], np)
     samples = math.prod(batch)

@@ -1,4 +1,4 @@
-"""A scalar program: a sequence of scalar operations without branches, and its results."""
+"""A scalar program: a sequence of scalar operations, and its results."""
 
 import functools
 import math
@@ -22,7 +22,7 @@ Reference = int | float
 
 
 class Node(NamedTuple):
-    """An operation; an `INPUT` has the input's number and the entry's position as operands."""
+    """An operation; the operands of an `INPUT` are its number and entry."""
 
     operation: Operation
     operands: tuple[Reference, ...]
@@ -106,7 +106,7 @@ class Program:
 
     @functools.cached_property
     def distinct(self) -> tuple[tuple[int, ...], np.ndarray]:
-        """Nodes of the packed result, and for each entry the number of its node, or -1."""
+        """Nodes of the packed result, and for each entry its number, or -1."""
         nodes = dict.fromkeys(x for x in self.outputs if isinstance(x, int))
         numbers = {node: number for number, node in enumerate(nodes)}
         entries = [numbers[x] if isinstance(x, int) else -1 for x in self.outputs]
@@ -119,7 +119,7 @@ class Program:
 
     @functools.cached_property
     def nonzeros(self) -> Any:
-        """Boolean arrays in the structure of the outputs, False where an entry is always 0."""
+        """Boolean outputs, False where an entry is always 0."""
         nonzeros = [isinstance(x, int) or x != 0.0 for x in self.outputs]
         return self.unpack(np.array(nonzeros, bool))
 
@@ -129,7 +129,7 @@ class Program:
         return [packed[a:b] for a, b in zip([0, *ends], ends, strict=False)]
 
     def align(self, arrays: Sequence[Any], xp: ModuleType) -> tuple[list[Any], Shape]:
-        """Return the inputs with their own axes merged and the batch behind; the batch's shape."""
+        """Return the inputs as [entries, *batch], and the batch's shape."""
         count = len(self.input_shapes)
         if len(arrays) != count:
             raise InputError(
@@ -154,7 +154,7 @@ class Program:
         return entries, batch
 
     def unpack(self, packed: Any) -> Any:
-        """Return an array [entries, *batch] in the structure of the traced function's result."""
+        """Return an array [entries, *batch] as the function returns it."""
         parts = zip(self.split(packed), self.output_shapes, strict=True)
         leaves = [
             entries.reshape((*shape, *packed.shape[1:])) for entries, shape in parts

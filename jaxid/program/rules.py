@@ -1,4 +1,4 @@
-"""Rules that JAX follows in place of its own: for derivatives, `vmap`, and many devices."""
+"""Rules for JAX: derivatives, `vmap`, and many devices."""
 
 import functools
 import itertools
@@ -18,11 +18,11 @@ from jax.sharding import NamedSharding, PartitionSpec
 from jaxid.arrays import Array
 
 ALWAYS = np.array(True)
-"""Condition of a `where` whose result only differs along as many axes as its other branch."""
+"""Condition of a `where` whose other branch only adds axes of `shard_map`."""
 
 
 def differing_alike(arrays: tuple[Array, ...]) -> tuple[Array, ...]:
-    """Return arrays that all differ along the axes of `shard_map` along which one of them does.
+    """Return arrays that all differ along the same axes of `shard_map`.
 
     The results of branches and loops must not depend on which input differs.
     """
@@ -32,7 +32,7 @@ def differing_alike(arrays: tuple[Array, ...]) -> tuple[Array, ...]:
 
 
 def with_derivatives_of(definition: Callable, run: Callable) -> Callable:
-    """Return a function of arrays whose derivatives are those of another definition of it.
+    """Return a function of arrays with the derivatives of another definition.
 
     The other definition is differentiated only by inputs that have a tangent.
     """
@@ -59,7 +59,7 @@ def with_derivatives_of(definition: Callable, run: Callable) -> Callable:
 
 
 def divided(function: Callable) -> Callable:
-    """Return a function of arrays with one leading axis, which devices divide among themselves.
+    """Return a function of arrays whose leading axis devices divide.
 
     Each device computes what belongs to its part of the axis, and nothing moves between
     them: the results have the same axis.

@@ -1,4 +1,4 @@
-"""Scalar expressions, simplified while they are built and again when all uses are known.
+"""Scalar expressions, simplified when they are built and once more at the end.
 
 Equal expressions are the same object: each one is looked up in the table of its `Graph`
 before it is made. A graph belongs to one trace and is freed with it.
@@ -25,7 +25,7 @@ MAX_FACTOR = 1e300
 
 
 class Operation(enum.StrEnum):
-    """A scalar operation; where JAX has the same elementwise primitive, its name is the value.
+    """A scalar operation, with the name of JAX's elementwise primitive.
 
     Traits serve simplification and counting: `odd`, `even`, `commutative`, `truth` (the
     result is a truth value), `choice` (a selection), `function` (as expensive as a
@@ -36,7 +36,9 @@ class Operation(enum.StrEnum):
     infix: str  # operator between two operands in Python and C; empty if there is none
     traits: frozenset[str]
 
-    def __new__(cls, name: str, numpy: Any = None, infix: str = "", traits: str = ""):  # noqa: D102
+    def __new__(  # noqa: D102
+        cls, name: str, numpy: Any = None, infix: str = "", traits: str = ""
+    ):
         member = str.__new__(cls, name)
         member._value_ = name
         member.numpy = numpy
@@ -81,7 +83,7 @@ class Operation(enum.StrEnum):
     LOGARITHM_OF_ONE_PLUS = "log1p", np.log1p, "", "function"
 
     def on_constants(self, *operands: float | bool) -> float | bool:
-        """Compute the operation on numbers by the rules of IEEE 754 (1/0 is infinite)."""
+        """Compute the operation on numbers as IEEE 754 does (1/0 is infinite)."""
         with np.errstate(all="ignore"):
             return self.numpy(*operands).item()
 
@@ -108,7 +110,7 @@ class Graph:
         self._table = {}
 
     def node(self, operation: Operation, *operands: object) -> "Scalar":
-        """Return the expression, making it if it is new; new ones are numbered in order."""
+        """Return the expression, numbered in order when it is first needed."""
         key = (operation, *operands)
         scalar = self._table.get(key)
         if scalar is None:
@@ -156,7 +158,7 @@ def negate(x: Operand) -> Operand:
 
 
 def add(x: Operand, y: Operand) -> Operand:
-    """Return x + y, ordered so that x + y, y + x and -(-x - y) are one node, up to its sign."""
+    """Return x + y, so that x + y, y + x and -(-x - y) are one node."""
     if not isinstance(x, Scalar):
         if not isinstance(y, Scalar):
             return float(x + y)
@@ -202,7 +204,7 @@ def multiply(x: Operand, y: Operand) -> Operand:
 
 
 def _scale(factor: float, x: Scalar) -> Scalar:
-    """Return a positive number times x; a number in x is merged unless it leaves the range."""
+    """Return a positive number times x, merged with a number in x."""
     if factor == 1:
         return x
     if x.operation is Operation.MULTIPLY and not isinstance(x.operands[0], Scalar):
@@ -284,7 +286,7 @@ def logic(operation: Operation, *operands: Operand) -> Operand:
 
 
 def apply(operation: Operation, *operands: Operand) -> Operand:
-    """Apply any other operation; signs move out of odd functions and vanish in even ones."""
+    """Apply any other operation; signs leave odd and even functions."""
     constants = [x for x in operands if not isinstance(x, Scalar)]
     if len(constants) == len(operands):
         return operation.on_constants(*constants)
@@ -346,7 +348,7 @@ def live_scalars(outputs: Sequence[Operand]) -> list[Scalar]:
 
 
 def rewrite(outputs: Sequence[Operand]) -> list[Operand]:
-    """Return the same outputs with fewer operations, or unchanged if none can be saved."""
+    """Return the same outputs with fewer operations, where some can be saved."""
     outputs = list(outputs)
     while True:
         factored = Rewriting(outputs).factor_sums()
@@ -433,7 +435,7 @@ class Rewriting:
         return scalar.graph.node(scalar.operation, *operands)
 
     def _factor(self, terms: list[_Term]) -> list[_Term] | None:
-        """Draw common factors out of products that nothing else needs; None if there are none."""
+        """Draw common factors out of products; None if there are none."""
         products = {}
         for k, (_, x) in enumerate(terms):
             if self._is_used_once(x) and x.operation is Operation.MULTIPLY:
@@ -488,7 +490,7 @@ def _flatten_sum(x: Scalar, summands: set[Scalar]) -> list[_Term]:
 
 
 def _order(x: Operand) -> float:
-    """Return a key that breaks ties reproducibly: constants first, then older expressions."""
+    """Return a key that breaks ties: constants first, then older expressions."""
     return -float(x.index) if isinstance(x, Scalar) else 1.0 + abs(x)
 
 

@@ -1,5 +1,6 @@
-"""Translation of a JAX function into a scalar program: its jaxpr runs on arrays of scalars.
+"""Translation of a JAX function into a scalar program.
 
+The jaxpr of the function runs on arrays whose entries are scalars of a graph.
 Primitives that only move entries of an array are written out for NumPy if they are
 common; the others (gather, scatter, dynamic slices) move the *positions* of the entries
 with JAX itself, and the entries follow.
@@ -45,7 +46,7 @@ def _is_symbolic(x: np.ndarray) -> bool:
 
 
 def _broadcast(x: np.ndarray, *_, shape, broadcast_dimensions, **__) -> np.ndarray:
-    """Give an array the axes of a shape, at these positions, and repeat it along the others."""
+    """Put the axes of an array at some positions, and repeat it along the others."""
     aligned = [1] * len(shape)
     for source, target in enumerate(broadcast_dimensions):
         aligned[target] = x.shape[source]
@@ -59,7 +60,7 @@ def _slice(x: np.ndarray, *, start_indices, limit_indices, strides) -> np.ndarra
 
 
 def _pad(x: np.ndarray, filler: np.ndarray, *, padding_config) -> np.ndarray:
-    """Put a number before, behind and between the entries; negative counts cut entries off."""
+    """Put a number before, behind and between the entries, or cut them off."""
     for axis, (before, behind, between) in enumerate(padding_config):
         x = np.moveaxis(x, axis, 0)
         start = max(before, 0)
@@ -115,7 +116,7 @@ _INDEXED = {
 
 
 def _on_numbers(equation: JaxprEqn, *operands: np.ndarray) -> list[np.ndarray]:
-    """Run one equation on known numbers, in NumPy where it suffices, also inside another trace."""
+    """Run one equation on numbers, in NumPy where it suffices."""
     name = equation.primitive.name
     if name == "iota":
         indices = np.indices(equation.params["shape"], equation.params["dtype"])
@@ -218,7 +219,7 @@ def _dot_general(x: np.ndarray, y: np.ndarray, *, dimension_numbers, **_) -> np.
 def _as_matrices(
     x: np.ndarray, contracted: Sequence[int], batch: Sequence[int]
 ) -> tuple[np.ndarray, Shape]:
-    """Return an array as [*batch, others, contracted], and the shape of its other axes."""
+    """Return an array as [*batch, others, contracted], and its other axes."""
     others = [k for k in range(x.ndim) if k not in (*contracted, *batch)]
     shape = tuple(x.shape[k] for k in others)
     in_order = x.transpose((*batch, *others, *contracted))
@@ -397,7 +398,7 @@ def _run_equation(equation: JaxprEqn, operands: list[np.ndarray]) -> list[np.nda
 
 
 def _called_jaxpr(equation: JaxprEqn) -> Any:
-    """Return the jaxpr that an equation such as a compiled function calls, else None."""
+    """Return the jaxpr that an equation calls, else None."""
     if equation.primitive.name in _UNSUPPORTED:
         return None
     keys = ("jaxpr", "call_jaxpr", "fun_jaxpr")

@@ -49,7 +49,7 @@ def hidden_one(reference: Array) -> Array:
 
 
 def fenced(x: Array, one: Array | None) -> Array:
-    """Return a value behind a fence (none if `one` is None): XLA does not compute it again."""
+    """Return a value behind a fence, unless `one` is None."""
     if one is None:
         return x
     return jax.lax.optimization_barrier(x) if BARRIER_HOLDS else x / one
@@ -92,7 +92,7 @@ class Lowered(eqx.Module):
     fenced: frozenset[int] = eqx.field(static=True)  # positions of these nodes
 
     def __call__(self, *arrays: AnyArray) -> list[Array | float]:
-        """Compute the packed result, from arrays of the inputs' shapes and then any batch axes.
+        """Compute the packed result, from arrays with batch axes last.
 
         For each entry of each output, in order, it is an array of the batch's shape or
         a constant.
@@ -104,7 +104,7 @@ class Lowered(eqx.Module):
         return self.run(self.entries(*arrays)[0], ELEMENTWISE)
 
     def entries(self, *arrays: AnyArray) -> tuple[list[Array], Shape]:
-        """Return the inputs with their own axes merged and the whole batch behind; its shape."""
+        """Return the inputs as [entries, *batch], and the batch's shape."""
         dtype = jnp.result_type(*arrays, float) if arrays else jnp.result_type(float)
         if not jnp.issubdtype(dtype, jnp.floating):
             raise InputError(
@@ -126,7 +126,7 @@ class Lowered(eqx.Module):
     def run(
         self, entries: Entries, operations: dict[Operation, Callable]
     ) -> tuple[Array, ...]:
-        """Compute the distinct results that vary, with a function for each operation."""
+        """Compute the results that vary, with a function for each operation."""
         nodes = self.program.nodes
         # The last input: XLA folds what depends on constants, such as parameters often
         # are.
@@ -228,7 +228,7 @@ def on_any_platform(program: Program, evaluate: Callable, *arrays: AnyArray) -> 
 
 @jax.custom_jvp
 def _circular(x: Array, one: Array | None) -> tuple[Array, Array]:
-    """Return sine and cosine behind fences; their derivatives are made from the fenced values."""
+    """Return sine and cosine behind fences, also for their derivatives."""
     sine, cosine = sine_cosine(x)
     return fenced(sine, one), fenced(cosine, one)
 

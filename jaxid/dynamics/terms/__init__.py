@@ -1,4 +1,4 @@
-"""Terms of a model: effects in the equations of motion that are linear in unknown parameters."""
+"""Terms of a model: effects that are linear in unknown parameters."""
 
 from .drives_and_springs import (
     ConstantOffset as ConstantOffset,

@@ -13,7 +13,7 @@ from .term import AbstractTerm, JointParameter
 
 
 class RotorInertia(AbstractTerm):
-    r"""Inertia `Ia1`, … of the motors' rotors through the gear: $i_{Gk}^2 C_{M,k}$ (Eq. 17)."""
+    r"""Inertia of the rotors through the gears, $i_{Gk}^2 C_{M,k}$ (Eq. 17)."""
 
     joint_parameters = (
         JointParameter(
@@ -77,7 +77,7 @@ class TorqueRipple(AbstractTerm):
         )
 
     def columns(self, robot, q, qd, qdd):
-        """Return sines and cosines of the angles; coupled motors act on all axes they turn."""
+        """Return sines and cosines, on all axes that a motor turns."""
         A = np.asarray(robot.drives.reduction)
         diagonal = np.where(np.diag(A) == 0, 1.0, np.diag(A))
         ratios = A / diagonal[:, None]
@@ -110,7 +110,7 @@ class CoupledDrives(AbstractTerm):
     transition: AbstractTransition = Tanh()
 
     def couplings(self, robot: Robot) -> tuple[tuple[int, np.ndarray], ...]:
-        """Return the motors that turn several axes, with ratios relative to their own joint.
+        """Return the motors that turn several axes, with their relative ratios.
 
         Raises:
             InputError: If the motors are not in the order of their joints.
@@ -141,7 +141,11 @@ class CoupledDrives(AbstractTerm):
 
     def parameters(self, robot):
         """Return `Iam6`, `fvm6`, `fcm6` for a coupled motor 6."""
-        kinds = (("Iam", "kg m²", "kg"), ("fvm", "N m s", "N s/m"), ("fcm", "N m", "N"))
+        kinds = (
+            ("Iam", "kg m²", "kg"),
+            ("fvm", "N m s", "N s/m"),
+            ("fcm", "N m", "N"),
+        )
         couplings = self.couplings(robot)
         if not couplings:
             raise InputError(
@@ -155,7 +159,7 @@ class CoupledDrives(AbstractTerm):
         )
 
     def columns(self, robot, q, qd, qdd):
-        """Return inertia and viscous parts beside the diagonal, and Coulomb parts of motors."""
+        """Return inertia and viscous friction off the diagonal, and Coulomb parts."""
         inertia = []
         viscous = []
         dry = []
@@ -189,7 +193,7 @@ class CoupledDrives(AbstractTerm):
 
 
 class ConstantOffset(AbstractTerm):
-    """A constant force `fo1`, … at each joint: a sensor's offset, or uneven friction."""
+    """A constant force `fo1`, … at each joint: an offset, or uneven friction."""
 
     joint_parameters = (
         JointParameter(
@@ -203,7 +207,7 @@ class ConstantOffset(AbstractTerm):
 
 
 class LinearSpring(AbstractTerm):
-    """A spring at each joint that pulls it to a rest position, such as a counterbalance.
+    """A spring at each joint that pulls it to a position of rest.
 
     Its parameters are the stiffnesses `ks1`, … [N m/rad or N/m].
 

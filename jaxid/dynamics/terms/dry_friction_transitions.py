@@ -1,4 +1,4 @@
-"""Transitions of dry friction between the directions of motion, with and without memory."""
+"""Transitions of dry friction between the directions of motion."""
 
 from abc import abstractmethod
 from typing import Any
@@ -35,7 +35,7 @@ class AbstractTransition(Hashable):
         """Return a number between -1 and 1 for each speed [rad/s or m/s]."""
 
     def of_motors(self, speeds: Joints) -> Joints:
-        """Return the same for the speeds of the motors, on the side of their own joints."""
+        """Return the same for the motors' speeds, on the side of their joints."""
         return self(speeds)
 
     @property
@@ -127,7 +127,7 @@ class Presliding(AbstractTransition):
         return self.state[..., : qd.shape[-1]]
 
     def of_motors(self, speeds: Joints) -> Joints:
-        """Return the states of the motors: where they are not known, those of steady motion."""
+        """Return the states of the motors, or those of steady motion."""
         if self.motors is None or self.state is None:
             return self.steady(speeds)
         return self.state[..., speeds.shape[-1] :]
@@ -151,7 +151,7 @@ class Presliding(AbstractTransition):
         return self._with_motors(change, lambda x: x / length)
 
     def advance(self, q_before: Joints, q: Joints, s: States) -> States:
-        """Return the state behind a step of one direction [rad or m], from that before it."""
+        """Return the state behind a step of one direction [rad or m]."""
         strain = self._strain(q - q_before)
         direction = jnp.sign(strain)
         return direction + (s - direction) * jnp.exp(-jnp.abs(strain))
@@ -182,7 +182,7 @@ class Presliding(AbstractTransition):
 
 
 class Reversal(AbstractTransition):
-    """Another transition that keeps one direction near standstill, for bounds of forces.
+    """Another transition that keeps one direction near standstill.
 
     At a reversal dry friction jumps, at an instant that no grid of samples contains.
     Between the two sides of this class lies every force on the way, and both change

@@ -1,4 +1,4 @@
-"""Friction terms: viscous, Coulomb, Stribeck, root of speed, by load, by temperature."""
+"""Friction: viscous, Coulomb, Stribeck, root of speed, load, temperature."""
 
 from typing import Any, ClassVar
 
@@ -41,7 +41,7 @@ class AbstractDryFriction(AbstractTerm):
 
 
 class ViscousFriction(AbstractTerm):
-    r"""Friction `fv1`, … that grows with speed, $\mathrm{diag}\{\dot q_i\}$ (Eq. 13)."""
+    r"""Friction `fv1`, … with speed, $\mathrm{diag}\{\dot q_i\}$ (Eq. 13)."""
 
     joint_parameters = (
         JointParameter(
@@ -80,7 +80,7 @@ class AsymmetricViscousFriction(AbstractTerm):
 
 
 class CoulombFriction(AbstractDryFriction):
-    r"""Dry friction `fc1`, …, $\mathrm{diag}\{\tanh(\dot q_i / \epsilon_c)\}$ (Eq. 14)."""
+    r"""Dry friction, $\mathrm{diag}\{\tanh(\dot q_i / \epsilon_c)\}$ (Eq. 14)."""
 
     transition: AbstractTransition = Tanh()
     joint_parameters = (
@@ -175,7 +175,7 @@ class StribeckFriction(AbstractDryFriction):
     )
 
     def columns(self, robot, q, qd, qdd):
-        """Return the diagonal matrices of smooth signs, and of those that fade with speed."""
+        """Return the diagonal matrices of smooth and of fading signs."""
         sign = self.transition(qd)
         relative_speed = qd / matching("speed", self.speed, qd)
         exponent = matching("exponent", self.exponent, qd)
@@ -186,7 +186,7 @@ class StribeckFriction(AbstractDryFriction):
 
     @property
     def nonlinear_parameters(self):
-        """Those of the transition, `vs1`, … [rad/s or m/s], and `delta1`, … if chosen."""
+        """Those of the transition, speeds `vs1`, …, and `delta1`, … if chosen."""
         return (
             *super().nonlinear_parameters,
             NonlinearParameter("vs", ("rad/s", "m/s"), ("speed",)),
@@ -195,7 +195,7 @@ class StribeckFriction(AbstractDryFriction):
 
 
 class LoadFriction(AbstractDryFriction):
-    r"""Dry friction in proportion to the weight on a joint, $|g_i(q)| \tanh(\dot q_i / \epsilon)$.
+    r"""Dry friction by load, $|g_i(q)| \tanh(\dot q_i / \epsilon)$.
 
     It is used beside `CoulombFriction`. The load is that of gravity alone, so that
     forces stay linear in the accelerations; it follows from bodies that are known
@@ -243,7 +243,7 @@ class LoadFriction(AbstractDryFriction):
 
 
 class TemperatureScaled(AbstractTerm):
-    r"""Friction that falls as the joints get warm: another term times $e^{-a (T - T_0)}$.
+    r"""Friction that falls with temperature: a term times $e^{-a (T - T_0)}$.
 
     The parameters are those at the temperature $T_0$.
 
@@ -284,6 +284,6 @@ class TemperatureScaled(AbstractTerm):
 
     @property
     def nonlinear_parameters(self):
-        """Those of the term, and `rate1`, … [1/K] if chosen: it takes more than one recording."""
+        """Those of the term, and `rate1`, … [1/K] if chosen."""
         rate = NonlinearParameter("rate", ("1/K", "1/K"), ("rate",), default=False)
         return (*(x.inside("term") for x in self.term.nonlinear_parameters), rate)

@@ -65,7 +65,7 @@ class RigidBodies(AbstractTerm):
     def all_ten(
         self, robot: Robot, p: Float[AnyArray, " columns"]
     ) -> Float[AnyArray, "joints 10"]:
-        """Return ten parameters of all bodies, with zeros for those that are left out."""
+        """Return all ten parameters of the bodies, with zeros where left out."""
         bodies = p.reshape(robot.joints, self.body_parameters)
         if not self.principal_axes:
             return bodies
@@ -73,7 +73,7 @@ class RigidBodies(AbstractTerm):
         return jnp.concatenate([bodies, zeros.astype(bodies.dtype)], axis=1)
 
     def forces(self, robot, p, q, qd, qdd):
-        """Return the projected wrenches of all bodies, without forming the regressor (Eq. 11)."""
+        """Return the projected wrenches of all bodies (Eq. 11)."""
         return projection_equation.rigid_body_forces(
             robot, self.all_ten(robot, p), q, qd, qdd
         )

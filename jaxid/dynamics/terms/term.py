@@ -14,7 +14,7 @@ from jaxid.robot.robot import Robot
 
 
 class NonlinearParameter(NamedTuple):
-    """Positive number of a friction law in which forces are not linear, one for each joint.
+    """Positive number of a friction law in which forces are not linear.
 
     Attributes:
         name: Name without the joint's number.
@@ -30,11 +30,11 @@ class NonlinearParameter(NamedTuple):
     default: bool = True
 
     def value(self, owner: Any) -> Any:
-        """Return the current value in its term: a scalar, or one number for each joint."""
+        """Return the value in its term: a scalar, or one for each joint."""
         return functools.reduce(getattr, self.path, owner)
 
     def inside(self, attribute: str) -> "NonlinearParameter":
-        """Return the parameter as seen from a term that holds its owner as an attribute."""
+        """Return the parameter as seen from a term that holds its owner."""
         return self._replace(path=(attribute, *self.path))
 
 
@@ -64,9 +64,9 @@ class AbstractTerm(eqx.Module):
 
     Attributes:
         joint_parameters: Parameters of which the term has one for each joint, in the
-            order of the columns: those of all joints for the first, then for the second.
-        is_switch: Whether the experiment file adds the term by its name in `TERMS`, like
-            `springs = true`, beside any other terms.
+            order of the columns: the first one for all joints, then the second one.
+        is_switch: Whether the experiment file adds the term by its name in `TERMS`,
+            like `springs = true`, beside any other terms.
         choice: Name of the effect in the comparison of models by `jaxid choose`; empty
             if it is not tried there.
         shares_friction: Whether the term is a part of the friction beside which other
@@ -102,7 +102,7 @@ class AbstractTerm(eqx.Module):
     def columns(
         self, robot: Robot, q: Joints, qd: Joints, qdd: Joints
     ) -> Float[AnyArray, "joints columns"]:
-        """Return the generalised forces [N m or N] of unit parameters, for one sample."""
+        """Return the forces [N m or N] of unit parameters for one sample."""
 
     def forces(
         self,
@@ -112,7 +112,7 @@ class AbstractTerm(eqx.Module):
         qd: Joints,
         qdd: Joints,
     ) -> Joints:
-        """Return the generalised forces [N m or N] of given parameters, for one sample."""
+        """Return the forces [N m or N] of parameters for one sample."""
         return self.columns(robot, q, qd, qdd) @ p
 
     def mass_matrix(
@@ -125,27 +125,27 @@ class AbstractTerm(eqx.Module):
     def mass_and_bias(
         self, robot: Robot, p: Float[AnyArray, " columns"], q: Joints, qd: Joints
     ) -> tuple[Float[AnyArray, "joints joints"], Joints]:
-        """Return the mass matrix, and the generalised forces without accelerations (Eq. 38)."""
+        """Return the mass matrix and the bias forces (Eq. 38)."""
         return self.mass_matrix(robot, p, q), self.forces(
             robot, p, q, qd, jnp.zeros_like(q)
         )
 
     def potential_columns(self, robot: Robot, q: Joints) -> Float[AnyArray, " columns"]:
-        """Return the potential energy [J] of unit parameters; zero unless energy is stored."""
+        """Return the potential energy [J] of unit parameters."""
         return jnp.zeros(len(self.parameters(robot)), q.dtype)
 
     @property
     def nonlinear_parameters(self) -> tuple[NonlinearParameter, ...]:
-        """Parameters that `identify_nonlinear_friction` can identify; none for most terms."""
+        """Parameters that `identify_nonlinear_friction` can identify."""
         return ()
 
     @property
     def body_parameters(self) -> int:
-        """Number of inertial parameters of each body in this term; zero unless it has bodies."""
+        """Number of inertial parameters of each body; zero without bodies."""
         return 0
 
     def lower_bounds(self, robot: Robot) -> Float[np.ndarray, " columns"]:
-        """Return lower bounds of the parameters: 0, or -inf where both signs are possible."""
+        """Return lower bounds: 0, or -inf where both signs are possible."""
         bounds = np.full(len(self.parameters(robot)), -np.inf)
         for k, parameter in enumerate(self.joint_parameters):
             if parameter.role is not None:
