@@ -1,4 +1,4 @@
-"""Export of an identified model: C for controllers, files for simulators, vectors for tools."""
+"""Export of an identified model: C for controllers, files for simulators."""
 
 from .c_code import export_c as export_c
 from .feed_forward import torque_program as torque_program

@@ -44,11 +44,11 @@ class CFunction(NamedTuple):
 def export_c(
     fit: Fit, folder: str | Path, *, name: str = "arm", double: bool = True
 ) -> Path:
-    """Write the model as one C99 file and its header, for a real-time controller (Eqs. 38, 39).
+    """Write the model as one C99 file and its header (Eqs. 38, 39).
 
-    The file needs no library, allocates nothing and does not branch on data, so that
-    every call takes the same time. It compiles as C++ too. A known tool is not
-    included, as in `Fit.predict`.
+    They are for a real-time controller. The file needs no library, allocates nothing
+    and does not branch on data, so that every call takes the same time. It compiles as
+    C++ too. A known tool is not included, as in `Fit.predict`.
 
     Args:
         fit: Identified model.
@@ -87,7 +87,7 @@ def c_functions(fit: Fit) -> list[CFunction]:
 
 
 def _definitions(fit: Fit) -> dict[str, tuple[str, str, Callable]]:
-    """Return summary, output and definition for one sample of each function, by name."""
+    """Return summary, output and definition of each function, by name."""
     base = fit.base
     model = base.model
     torque = torques(fit)
@@ -191,7 +191,7 @@ def c_texts(
 def _test_tables(
     fit: Fit, writer: CWriter, functions: Sequence[CFunction]
 ) -> dict[str, list[list[float]]]:
-    """Return random states and the results of all functions, for the self-test of the file."""
+    """Return random states and the results of all functions, for the self-test."""
     random = np.random.default_rng(0)
     shape = (TEST_SAMPLES, fit.base.model.robot.joints)
     inputs = dict.fromkeys(x for function in functions for x in function.inputs)

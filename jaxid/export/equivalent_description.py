@@ -45,7 +45,7 @@ class Description:
 
     @property
     def cost(self) -> int:
-        """Estimate of the operations: numbers that are not zero, weighted by experience."""
+        """Estimate of the operations: weighted numbers that are not zero."""
         robot = self.robot
         has_length = np.abs(np.asarray(robot.offset)) > 1e-12
         total = np.count_nonzero(self.bodies)
@@ -56,13 +56,13 @@ class Description:
         return int(total)
 
     def forces(self, q: AnyArray, qd: AnyArray, qdd: AnyArray) -> Joints:
-        """Return the generalised forces of the bodies at one sample [N m or N] (Eq. 11)."""
+        """Return the forces of the bodies at one sample [N m or N] (Eq. 11)."""
         p = inertial_parameters(_with_44_bits(self.bodies))
         angles = q + self.zeros
         return projection_equation.rigid_body_forces(self.robot, p, angles, qd, qdd)
 
     def carry_inward(self) -> "Description":
-        """Move what moves alike with the parent to the parent: the base parameters (Eq. 22).
+        """Move what moves like the parent to the parent: base parameters (Eq. 22).
 
         For a revolute joint that is matter on the axis (mass, first and second moment
         along it), for a prismatic one the second moments.
@@ -98,7 +98,7 @@ class Description:
         return dataclasses.replace(self, robot=moved, bodies=bodies)
 
     def turn_last(self, body: int) -> "Description":
-        """Turn the frame of a last body about its joint until a first moment is zero."""
+        """Turn the frame of a last body about its axis until a first moment is zero."""
         axis = np.asarray(self.robot.axis[body])
         inertia = self.bodies[body]
         moment = _across(axis, inertia[:3, 3])
@@ -121,7 +121,7 @@ class Description:
 
 
 def simplest_description(robot: Robot, parameters: BodyParameters) -> Description:
-    """Return a description of a robot, with ten parameters of each body, of few operations."""
+    """Return a description of a robot and its bodies that takes few operations."""
     inertias = np.asarray(pseudo_inertia(parameters))
     frames = Description(robot, inertias, np.zeros(robot.joints))
     description = frames.carry_inward()
@@ -140,7 +140,7 @@ def simplest_description(robot: Robot, parameters: BodyParameters) -> Descriptio
 
 
 def _distances_to_neighbours(robot: Robot, body: int) -> list[float]:
-    """Return where along the axis the origin is nearest to that of the parent, or of a child."""
+    """Return the distances along the axis to the origins of parent and children."""
     if not robot.revolute[body]:
         return []
     offset = np.asarray(robot.offset)

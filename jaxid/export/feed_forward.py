@@ -16,7 +16,7 @@ from .equivalent_description import simplest_description
 
 
 def body_parameters(model: Model, p: Float[AnyArray, " standard"]) -> BodyParameters:
-    """Return ten parameters of each body, with zeros for those that the model leaves out."""
+    """Return ten parameters of each body; zeros if the model leaves some out."""
     bodies = np.zeros((model.robot.joints, 10))
     for term, values in model.split(np.asarray(p, np.float64)):
         if term.body_parameters:
@@ -26,7 +26,7 @@ def body_parameters(model: Model, p: Float[AnyArray, " standard"]) -> BodyParame
 
 
 def other_forces(fit: Fit) -> Callable[..., Any]:
-    """Return the function of one sample that gives the forces of all terms but the bodies."""
+    """Return the function of one sample for the forces of all other terms."""
     model = fit.base.model
 
     def forces(q, qd, qdd, s=None):
@@ -41,7 +41,7 @@ def other_forces(fit: Fit) -> Callable[..., Any]:
 
 
 def torques(fit: Fit) -> Callable[..., Any]:
-    """Return the function of one sample that gives the forces of a fit in few operations."""
+    """Return the function of one sample for the forces of a fit."""
     model = fit.base.model
     bodies = body_parameters(model, fit.standard_parameters)
     description = simplest_description(model.robot, bodies)

@@ -39,13 +39,13 @@ def export_urdf(
 ) -> Path:
     """Write a robot's own URDF file with the identified model in it.
 
-    Replaced are the inertial of each link that a joint moves, with all that is fixed to
-    it (fixed links then have none), the damping and the dry friction of each joint, and
-    its effort where a largest force is known. Joints on identified bodies that the
-    robot does not have, such as fingers, become fixed where the robot holds them,
-    because the bodies contain their links. A URDF describes no rotor inertias, no
-    offsets and no width of a tanh: a comment names what is left out. Meshes, names and
-    all else stay as they are.
+    Each link that a joint moves gets the inertial of its body, which contains all that
+    is fixed to the link (fixed links then have none). Each joint gets its damping and
+    dry friction, and its effort where a largest force is known. Joints on identified
+    bodies that the robot does not have, such as fingers, become fixed where the robot
+    holds them, because the bodies contain their links. A URDF describes no rotor
+    inertias, no offsets and no width of a tanh: a comment names what is left out.
+    Meshes, names and all else stay as they are.
 
     Args:
         fit: Physically consistent fit.
@@ -83,7 +83,7 @@ def _replace_comment(root: Any, fit: Fit, left_out: tuple[str, ...]) -> None:
 
 
 def _replace_inertials(tree: UrdfTree, bodies: BodyParameters) -> None:
-    """Write the bodies into the links that joints move, and take them from links fixed to these."""
+    """Write the bodies into the links that joints move; no fixed link has one."""
     links = _fix_other_joints(tree)
     links += [name for name, carrier in tree.carriers.items() if carrier.body >= 0]
     body_links = [link_names(joint)[1] for joint in tree.joints]
@@ -97,7 +97,7 @@ def _replace_inertials(tree: UrdfTree, bodies: BodyParameters) -> None:
 
 
 def _fix_other_joints(tree: UrdfTree) -> list[str]:
-    """Fix the joints on identified bodies that the robot does not have; return links below them."""
+    """Fix joints on the bodies that the robot does not have; return their links."""
     branches = [joint for first in tree.side_joints for joint in tree.branch(first)]
     for joint in (*tree.mimics, *branches):
         if joint.get("type") == "fixed":

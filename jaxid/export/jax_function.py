@@ -17,7 +17,7 @@ from .feed_forward import torque_program
 
 
 def exported_function(fit: Fit) -> export.Exported:
-    """Return the forces of any number of samples as an exported function of JAX (Eq. 39).
+    """Return the forces of samples as an exported function of JAX (Eq. 39).
 
     `exported.call(q, qd, qdd)` takes arrays [samples, joints] of float64 and returns
     forces of the same shape (with friction that has memory also its states, as

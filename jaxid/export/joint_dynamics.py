@@ -1,4 +1,4 @@
-"""Bodies that can exist, and inertia and friction at the joints, as simulators need them."""
+"""Bodies that can exist, and inertia and friction at the joints, for simulators."""
 
 import re
 from typing import NamedTuple
@@ -17,7 +17,7 @@ from jaxid.robot.robot import Robot
 from .feed_forward import body_parameters
 
 PROBES = 6
-"""Number of states at which the columns of a term are compared with a joint's dynamics."""
+"""Number of states at which a term is compared with a joint's dynamics."""
 PROBE_SPEEDS = (20.0, 80.0)
 """Speeds of these states, beyond the transition of dry friction [rad/s or m/s]."""
 
@@ -38,7 +38,7 @@ class JointDynamics(NamedTuple):
 
 
 def joint_dynamics(fit: Fit) -> JointDynamics:
-    r"""Return inertia and friction at the joints, as far as simulators can describe them.
+    r"""Return inertia and friction at the joints, as far as simulators know them.
 
     They follow from the columns of the terms: a parameter belongs to a joint if its
     forces, as the mean of both directions, are $a \ddot q_j + b \dot q_j + c\,
@@ -71,26 +71,19 @@ def joint_dynamics(fit: Fit) -> JointDynamics:
 def _joint_coefficients(
     term: AbstractTerm, robot: Robot
 ) -> Float[np.ndarray, "3 joints columns"]:
-    """Return inertia, viscous and dry friction of unit parameters; zeros if they are neither."""
+    """Return inertia, viscous and dry friction of unit parameters, or zeros."""
     random = np.random.default_rng(0)
     n = robot.joints
     q, qdd = random.uniform(-1.0, 1.0, (2, PROBES, n))
     speeds = random.uniform(*PROBE_SPEEDS, (PROBES, n))
     qd = speeds * random.choice([-1.0, 1.0], (PROBES, n))
 
-    columns = []
-    with double_precision():
-        for x, v, a in zip(q, qd, qdd, strict=True):
-            forward = np.asarray(term.columns(robot, x, v, a))
-            backward = np.asarray(term.columns(robot, x, -v, -a))
-            columns.append(0.5 * (forward - backward))
-    columns = np.array(columns)
-
+    columns = _odd_columns(term, robot, q, qd, qdd)
     coefficients = np.zeros((3, n, columns.shape[2]))
     is_used = np.any(columns, axis=0)
-    for joint, k in zip(*np.nonzero(is_used), strict=True):
-        if np.count_nonzero(is_used[:, k]) > 1:
-            continue
+    # A simulator knows no parameter that acts on several joints.
+    acts_on_one_joint = np.count_nonzero(is_used, axis=0) == 1
+    for joint, k in np.argwhere(is_used & acts_on_one_joint):
         velocity = qd[:, joint]
         basis = np.stack([qdd[:, joint], velocity, np.sign(velocity)], axis=1)
         forces = columns[:, joint, k]
@@ -98,6 +91,22 @@ def _joint_coefficients(
         if np.abs(basis @ solution - forces).max() < 1e-9:
             coefficients[:, joint, k] = solution.round(12)
     return coefficients
+
+
+def _odd_columns(
+    term: AbstractTerm, robot: Robot, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray
+) -> Float[np.ndarray, "probes joints columns"]:
+    """Return the part of a term's columns that changes its sign with the motion.
+
+    Springs and offsets drop out, and friction is the mean of both directions.
+    """
+    columns = []
+    with double_precision():
+        for x, v, a in zip(q, qd, qdd, strict=True):
+            forward = np.asarray(term.columns(robot, x, v, a))
+            backward = np.asarray(term.columns(robot, x, -v, -a))
+            columns.append(0.5 * (forward - backward))
+    return np.array(columns)
 
 
 def feasible_bodies(fit: Fit, target: str) -> BodyParameters:
@@ -139,7 +148,7 @@ def feasible_bodies(fit: Fit, target: str) -> BodyParameters:
 
 
 def origin_comment(fit: Fit, omissions: tuple[str, ...]) -> str:
-    """Return what the comment of a file says about the model, and what the file lacks."""
+    """Return a comment on the model, and on what the file lacks."""
     text = f"{fit.date or 'an unknown day'}, {fit.checksum}. "
     if omissions:
         text += f"Not in this file: {', '.join(omissions)}. "

@@ -112,7 +112,7 @@ def _joint(robot: Robot, i: int, dynamics: Mapping[str, Joints]) -> Any:
 
 
 def _motor(robot: Robot, i: int) -> Any:
-    """Return the element of a joint's motor, with its largest force where it is known."""
+    """Return the element of a joint's motor, with its largest force if known."""
     name = robot.joint_names[i]
     element: Any = E.motor(name=f"{name}_motor", joint=name)
     force = np.asarray(robot.known_max_forces)[i]

@@ -13,11 +13,11 @@ from .joint_dynamics import joint_dynamics
 
 
 def pinocchio_parameters(fit: Fit) -> BodyParameters:
-    r"""Return the bodies' parameters in Pinocchio's order, about the origins of the joint frames.
+    r"""Return the parameters of bodies in Pinocchio's order, about joint frames.
 
     Each row is an argument of `pinocchio.Inertia.FromDynamicParameters` and fits the
     columns of Pinocchio's `computeJointTorqueRegressor`:
-    $(m, m r_c, I_{xx}, I_{xy}, I_{yy}, I_{xz}, I_{yz}, I_{zz})$. The rows stand in the
+    $(m, m r_c, I_{xx}, I_{xy}, I_{yy}, I_{xz}, I_{yz}, I_{zz})$. The rows are in the
     order of the robot's joints. The forces are those of the fit even if the bodies
     cannot exist.
 
@@ -29,7 +29,7 @@ def pinocchio_parameters(fit: Fit) -> BodyParameters:
 
 
 def export_pinocchio(fit: Fit, path: str | Path) -> Path:
-    """Write the bodies in Pinocchio's order, and inertia and friction at the joints, as JSON.
+    """Write the bodies in Pinocchio's order, and the joints' dynamics, as JSON.
 
     Args:
         fit: Identified model.

@@ -1,4 +1,4 @@
-"""Identified servos for simulators: MJCF files, and the numbers that Isaac Lab takes."""
+"""Identified servos for simulators: MJCF files, and numbers for Isaac Lab."""
 
 from pathlib import Path
 from typing import Any
@@ -35,7 +35,7 @@ UNITS = {
 
 
 def servo_stiffness(fit: ServoFit, stiffness: Numbers | None = None) -> Joints:
-    """Return the stiffness of each servo: given, that of the fit, or that of the other joints.
+    """Return the stiffness of each servo: as given, of the fit, or of other joints.
 
     Args:
         fit: Identified servos.
@@ -79,6 +79,7 @@ def simulator_values(
     """
     rows = fit.parameters if parameters is None else np.asarray(parameters)
     ratios = {symbol: rows[:, k] for symbol, k in INDEX.items()}
+    # Parameters are in units of the stiffness, which positions alone do not tell.
     K = servo_stiffness(fit, stiffness)
     if stiffness is None:
         # A draw has its own stiffness where the weight tells it.
@@ -149,7 +150,7 @@ def simulator_table(fit: ServoFit, stiffness: Numbers | None = None) -> Table:
 
 
 def _units(fit: ServoFit) -> dict[str, str]:
-    """Return the units of `simulator_values`; those of both kinds if some joint may slide."""
+    """Return the units of `simulator_values`; both kinds if some joint may slide."""
     if fit.bodies is None or all(fit.bodies.model.robot.revolute):
         return {name: unit for name, (unit, _) in UNITS.items()}
     return {name: " or ".join(dict.fromkeys(pair)) for name, pair in UNITS.items()}

@@ -1,1 +1,1 @@
-"""Known properties of a robot: joints, geometry, limits, drives; from URDF, DH or the library."""
+"""Known properties of a robot, from URDF, MJCF, DH or the library."""

@@ -1,4 +1,4 @@
-"""Capsules around the links of a robot: of their geometry, or along the lines between joints."""
+"""Capsules around the links of a robot, from their geometry or from its joints."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -16,7 +16,7 @@ from .shapes import GROUND, Capsule
 from .urdf_tree import ORIGIN, UrdfTree
 
 STAND_IN_SHARE = 0.07
-"""Radius of a capsule for a body of unknown shape, relative to the length of the robot."""
+"""Radius of a capsule for an unknown shape, relative to the robot's length."""
 
 
 def fit_capsules(
@@ -92,7 +92,7 @@ def fit_capsules(
 
 
 def stand_in_capsules(robot: Robot, bodies: list[int]) -> list[Capsule]:
-    """Return stout capsules for bodies of unknown shape, about the lines between their joints."""
+    """Return capsules between the joints of bodies whose shape is unknown."""
     offsets = [np.asarray(offset) for offset in (*robot.offset, robot.tip_offset)]
     carriers = (*robot.parent, robot.tip_body)
     robot_length = sum(float(np.linalg.norm(offset)) for offset in offsets)
@@ -163,8 +163,8 @@ class AxisSearch(NamedTuple):
         """Return the smallest capsule about an axis.
 
         Args:
-            change: Two numbers that turn the axis from the direction, and two that shift
-                it from the centre, relative to the size.
+            change: Two numbers that turn the axis from the direction, and two that
+                shift it from the centre, relative to the size.
         """
         direction = self.frame[0]
         sideways = self.frame[1:]
@@ -212,7 +212,7 @@ def enclose(points: Float[AnyArray, "points 3"]) -> Segment:
 
 
 def _hull_points(points: np.ndarray) -> np.ndarray:
-    """Return the corners of the convex hull; all points if they are few or in a plane."""
+    """Return the corners of the hull; all points if they are few or in a plane."""
     if len(points) <= 4:
         return points
     try:

@@ -1,4 +1,4 @@
-"""Collision models: capsules on a robot's bodies, obstacles of its world, and their clearances."""
+"""Capsules on a robot's bodies, obstacles of its world, and their clearances."""
 
 from .capsule_fit import fit_capsules as fit_capsules
 from .collision_model import CollisionModel as CollisionModel

@@ -1,4 +1,4 @@
-"""Geometry of the links of URDF and MJCF files: boxes, cylinders, spheres, capsules, meshes."""
+"""Boxes, cylinders, spheres, capsules and meshes of URDF and MJCF files."""
 
 import itertools
 from collections.abc import Iterator
@@ -43,7 +43,7 @@ class Shape(NamedTuple):
 def link_shapes(
     tree: UrdfTree, packages: str | Path | None, link: str
 ) -> Iterator[Shape]:
-    """Yield the shapes of a link of a URDF file; the visual ones if none is for collisions.
+    """Yield the collision shapes of a link of a URDF file, or else its visual ones.
 
     Args:
         tree: Tree of the file.

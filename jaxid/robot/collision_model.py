@@ -1,4 +1,4 @@
-"""Collision models: capsules on a robot's bodies, obstacles of its world, and their clearances."""
+"""Clearances of capsules on a robot's bodies, and of obstacles of its world."""
 
 import itertools
 import re
@@ -23,9 +23,9 @@ POSES = 400
 class CollisionModel(Hashable):
     """Shapes, and the pairs of them that must stay apart.
 
-    Clearances are those of pairs of bodies: the least of all shapes that one and the
-    other carry. Capsules on the ground count by themselves, if their names differ in
-    more than a number.
+    A clearance is the smallest distance between the shapes of two bodies. Capsules on
+    the ground count as bodies of their own, if their names differ in more than a
+    number.
 
     Args:
         robot: Robot whose bodies carry the capsules.
@@ -93,7 +93,7 @@ class CollisionModel(Hashable):
 
     @property
     def pair_names(self) -> tuple[str, ...]:
-        """Names of each clearance's shapes; of several, those of the bodies' first capsules."""
+        """Names of each clearance's two shapes; of the first ones if they are more."""
         shape_names = self._names
         body_names: dict[int | str, str] = {}
         for shape, capsule in enumerate(self.capsules):
@@ -110,7 +110,7 @@ class CollisionModel(Hashable):
         return tuple(names)
 
     def ends(self, robot: Robot, q: Joints) -> Float[Array, "capsules 2 3"]:
-        """Return the ends of all capsules' axes in the frame of the ground [m], for one pose."""
+        """Return the ends of all capsules' axes on the ground in one pose [m]."""
         rotations, origins = placements(robot, q)
         # The ground comes last, where its index -1 leads.
         rotations = jnp.concatenate([rotations, jnp.eye(3)[None]])
@@ -124,7 +124,7 @@ class CollisionModel(Hashable):
     def clearance(
         self, robot: Robot, q: Float[AnyArray, "*batch joints"]
     ) -> Float[AnyArray, "*batch groups"]:
-        """Return the distance between the surfaces of every pair, negative where they overlap [m].
+        """Return the clearances of poses, negative where shapes overlap [m].
 
         Args:
             robot: Robot whose bodies carry the capsules.
@@ -156,7 +156,7 @@ class CollisionModel(Hashable):
         return clearances.reshape(*batch, len(self.groups))
 
     def _gaps(self, ends: Float[Array, "capsules 2 3"]) -> Float[Array, " pairs"]:
-        """Return the distance between the surfaces of each of the `pairs` in one pose [m]."""
+        """Return the distance between the surfaces of each pair in one pose [m]."""
         start = ends[:, 0]
         end = ends[:, 1]
         radii = jnp.stack([jnp.asarray(capsule.radius) for capsule in self.capsules])
@@ -206,13 +206,14 @@ class CollisionModel(Hashable):
         return tuple(tuple(group) for group in groups.values())
 
     def _owner(self, shape: int) -> int | str:
-        """Return the body, or the name of the thing on the ground, to which a shape belongs."""
+        """Return the body, or the thing on the ground, to which a shape belongs."""
         if shape >= len(self.capsules):
             return self.obstacles[shape - len(self.capsules)].name
         capsule = self.capsules[shape]
         return _stem(capsule.name) if capsule.body == GROUND else capsule.body
 
     def _overlap_notes(self, pairs: Sequence[tuple[int, int]]) -> tuple[str, ...]:
+        """Return a note on pairs that overlap in all random poses, if there are any."""
         if not pairs:
             return ()
         names = self._names

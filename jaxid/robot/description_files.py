@@ -15,7 +15,7 @@ from .robot import GRAVITY
 
 
 def read_description(path: str | Path) -> tuple[Any, Numbers, list[Loop]]:
-    """Return the URDF element of a URDF, xacro or MJCF file, its gravity, and its closed loops."""
+    """Return the URDF element of a robot's file, its gravity, and its closed loops."""
     robot = _parse(path)
     if robot.tag == "mujoco":
         return mjcf_as_urdf(path)

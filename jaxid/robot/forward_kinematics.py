@@ -19,7 +19,7 @@ from .rotations import rotation_about
 def placement_in_parent(
     robot: Robot, body: int, q: Float[AnyArray, ""]
 ) -> tuple[Matrix3, Vector3]:
-    """Return attitude and origin [m] of a body in its parent, moved by its joint's coordinate."""
+    """Return attitude and origin [m] of a body in its parent at a coordinate."""
     R = robot.rotation[body]
     r = robot.offset[body]
     axis = robot.axis[body]
@@ -45,14 +45,14 @@ def placements(
 
 
 def tip_placement(robot: Robot, q: Joints) -> tuple[Matrix3, Vector3]:
-    """Return attitude and position [m] of the end-effector in the frame of the ground."""
+    """Return attitude and position [m] of the end-effector on the ground."""
     rotations, origins = placements(robot, q)
     R = rotations[robot.tip_body]
     return R @ robot.tip_rotation, origins[robot.tip_body] + R @ robot.tip_offset
 
 
 class TipJacobian(NamedTuple):
-    """Placements of the end-effector in some poses, and their derivatives by the joints.
+    """Placements of the end-effector, and their derivatives by the joints.
 
     Attributes:
         rotation: Attitudes on the ground.
@@ -99,7 +99,7 @@ def tip_curvature(
     force: Float[np.ndarray, "poses 3"],
     moment: Float[np.ndarray, "poses 3"],
 ) -> Float[np.ndarray, "poses joints joints"]:
-    """Return the second derivatives of the placement by the joints, times force and moment.
+    """Return second derivatives of the placement, times a force and a moment.
 
     Attitudes count as rotation vectors from the attitude of the end-effector.
     """

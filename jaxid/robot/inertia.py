@@ -1,4 +1,4 @@
-"""Inertia of a body: mass, centre of mass and inertia tensor, and their other parametrisations."""
+"""Mass, centre of mass and inertia tensor of a body, in several parametrisations."""
 
 import equinox as eqx
 import numpy as np
@@ -35,7 +35,7 @@ MAX_MASS = 1e5
 
 
 class Inertia(eqx.Module):
-    r"""Mass, centre of mass and inertia tensor of a body, or of many along leading axes.
+    r"""Mass, centre of mass and inertia tensor, with any leading axes.
 
     The same body in other parametrisations: `parameters` are the ten numbers of the
     paper, `pinocchio` those of Pinocchio, `moments` the six attributes of URDF's
@@ -59,7 +59,7 @@ class Inertia(eqx.Module):
 
     @classmethod
     def from_parameters(cls, p: Float[AnyArray, "*batch 10"]) -> "Inertia":
-        """Return the inertia of ten `parameters` (Eq. 9); its centre is zero where its mass is."""
+        """Return the inertia of ten parameters (Eq. 9); its centre is 0 without mass."""
         xp = namespace(p)
         mass = p[..., 0]
         has_mass = (mass != 0)[..., None]
@@ -70,7 +70,7 @@ class Inertia(eqx.Module):
 
     @property
     def parameters(self) -> Float[AnyArray, "*batch 10"]:
-        """Ten parameters $(m, m r_c, A, B, C, D, E, F)$ about the frame's origin (Eqs. 8, 9)."""
+        """Parameters $(m, m r_c, A, B, C, D, E, F)$ about the origin (Eqs. 8, 9)."""
         mass = self.mass[..., None]
         point_mass = mass[..., None] * _moments_of_points(self.centre)
         tensor = self.tensor + point_mass
@@ -82,7 +82,7 @@ class Inertia(eqx.Module):
 
     @property
     def pinocchio(self) -> Float[AnyArray, "*batch 10"]:
-        """Dynamic parameters $(m, m r_c, I_{xx}, I_{xy}, I_{yy}, I_{xz}, I_{yz}, I_{zz})$."""
+        """Parameters $(m, m r_c, I_{xx}, I_{xy}, I_{yy}, I_{xz}, I_{yz}, I_{zz})$."""
         p = self.parameters
         tensor = inertia_tensor(p[..., 4:])
         moments = tensor[..., *PINOCCHIO_ORDER]
@@ -99,9 +99,10 @@ class Inertia(eqx.Module):
         return Inertia(self.mass, position + self.centre @ R.T, R @ self.tensor @ R.T)
 
     def fault(self, rounding: float = 1e-9) -> str:
-        """Return why this single body cannot exist; an empty text if it can, or if JAX traces it.
+        """Return why this single body cannot exist; an empty text if it can.
 
-        An error of the moments is no fault up to a fraction `rounding` of the largest.
+        Of a body that JAX traces nothing is known. An error of the moments is no fault
+        up to a fraction `rounding` of the largest.
         """
         if is_traced(self):
             return ""

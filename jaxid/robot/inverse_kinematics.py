@@ -22,7 +22,7 @@ from .robot import Robot
 POSE_TOLERANCE = 1e-9
 """Distance at which a pose is reached [m, and rad]."""
 RANGE_TOLERANCE = 1e-9
-"""Excess over the end of a joint's range that is rounding, relative to half the range."""
+"""Excess over the end of a range that is rounding, relative to half the range."""
 MAX_JUMP = 0.25
 """Largest motion of a joint between neighbouring poses, relative to half its range."""
 MAX_STEP = 0.2
@@ -43,8 +43,8 @@ def inverse_kinematics_along(
     begins at the preferred coordinates `posture`; the middle of the ranges if None.
 
     Raises:
-        InputError: If the posture or the rotation is none, or the end-effector cannot
-            follow the path: the message says where, and why.
+        InputError: If the posture has another length, the rotation is no rotation, or
+            the end-effector cannot follow the path: the message says where, and why.
     """
     task = _tip_task(robot, rotation, posture)
     q = _follow_path(task, positions)
@@ -53,7 +53,7 @@ def inverse_kinematics_along(
 
 
 class _TipTask(NamedTuple):
-    """Robot, attitude of its end-effector, preferred coordinates, half of the ranges, limits."""
+    """Robot, attitude of its tip, preferred coordinates, half ranges and limits."""
 
     robot: Robot
     rotation: Matrix3
@@ -64,14 +64,14 @@ class _TipTask(NamedTuple):
 
 
 class _Iterate(NamedTuple):
-    """Coordinates of some poses, and the multipliers of the conditions on their placements."""
+    """Coordinates of some poses, and the multipliers of their placements."""
 
     q: Float[np.ndarray, "poses joints"]
     multipliers: Float[np.ndarray, "poses 6"]
 
 
 def _tip_task(robot: Robot, rotation: Numbers, posture: Numbers | None) -> _TipTask:
-    """Return the checked task of a robot; joints without limits get half a turn, or a metre."""
+    """Return the checked task; joints without limits get half a turn, or a metre."""
     low = np.asarray(robot.limits.position_min)
     high = np.asarray(robot.limits.position_max)
     is_limited = np.isfinite(low) & np.isfinite(high)
@@ -116,7 +116,7 @@ def _follow_path(task: _TipTask, positions: np.ndarray) -> np.ndarray:
 
 
 def _ends_of_strides(positions: np.ndarray) -> Int[np.ndarray, " strides"]:
-    """Return the places of poses about a `STRIDE` apart along a path, with both ends."""
+    """Return the indices of poses about a `STRIDE` apart, with both ends."""
     distances = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     lengths = np.concatenate([[0.0], np.cumsum(distances)])
     _, starts = np.unique(np.floor(lengths / STRIDE), return_index=True)
@@ -135,10 +135,10 @@ def _newton_steps(
 def _newton_step(
     task: _TipTask, positions: np.ndarray, iterate: _Iterate, curved: bool = True
 ) -> _Iterate:
-    """Go to the coordinates nearest to the posture of those that reach the poses.
+    """Take a step towards the coordinates that reach the poses nearest to the posture.
 
-    The step solves the linearised conditions, if wanted with the curvature of the
-    placements.
+    It solves the linearised conditions of an optimum, with the curvature of the
+    placements if `curved`.
     """
     joints = task.robot.joints
     scale = task.half_range
@@ -180,7 +180,7 @@ def _saddle_point_matrix(
 def _pose_errors(
     task: _TipTask, positions: np.ndarray, tip: TipJacobian
 ) -> Float[np.ndarray, "poses 6"]:
-    """Return the differences from the poses: of positions [m], then of attitudes [rad]."""
+    """Return the differences of positions [m] and of attitudes [rad] from poses."""
     turn = Rotation.from_matrix(tip.rotation @ task.rotation.T).as_rotvec()
     return np.concatenate([tip.position - positions, turn], axis=1)
 

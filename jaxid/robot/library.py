@@ -39,7 +39,7 @@ def from_dh(
     notes: tuple[str, ...] = (),
     **fields: Any,
 ) -> Robot:
-    r"""Build a serial robot from one row (alpha, a, d) or (alpha, a, d, theta) for each joint.
+    r"""Build a serial robot from a row (alpha, a, d, theta) for each joint.
 
     In the **modified** convention (Craig, Khalil) row $i$ holds $\alpha_{i-1}, a_{i-1},
     d_i$ and $\theta_i$: $T_i = R_x(\alpha) D_x(a) R_z(\theta + q) D_z(d)$. Body $i$ has
@@ -162,11 +162,11 @@ def _limits(table: dict[str, Any], revolute: tuple[bool, ...]) -> Limits:
 
 
 def tx90l_on_rail() -> Robot:
-    """Return the seven-axis manipulator of the paper: a Stäubli TX90L on a horizontal rail along x.
+    """Return the seven-axis manipulator of the paper: a Stäubli TX90L on a rail.
 
-    The bodies' frames are those in which the paper's base parameters come out (Eq. 24):
-    the z axis of the bodies 3, 4 and 6 is turned onto their joints' axes, and body 5,
-    the forearm, has its origin at the elbow.
+    The rail is horizontal, along x. The bodies' frames are those in which the paper's
+    base parameters come out (Eq. 24): the z axis of the bodies 3, 4 and 6 is turned
+    onto their joints' axes, and body 5, the forearm, has its origin at the elbow.
     """
     return _robot("tx90l_on_rail")
 
@@ -210,7 +210,7 @@ def panda() -> Robot:
 
 
 def iiwa14() -> Robot:
-    """Return the KUKA LBR iiwa 14 R820, seven axes; frames as in its URDF, all upright at q = 0."""
+    """Return the KUKA LBR iiwa 14 R820, seven axes, with the frames of its URDF."""
     return _robot("iiwa14")
 
 

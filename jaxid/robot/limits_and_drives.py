@@ -22,7 +22,7 @@ Batch = Float[AnyArray, "*batch joints"]
 
 
 class Limits(eqx.Module):
-    """Limits of every joint, in the joint's own unit ([rad] or [m]); infinite where unknown.
+    """Limits of every joint, in its own unit ([rad] or [m]); infinite where unknown.
 
     Limits that are not given are infinite. JAX arrays are taken as they are, so that
     limits can be traced and batched; all others are checked and copied.
@@ -70,7 +70,7 @@ class Limits(eqx.Module):
 
 
 class Drives(Hashable):
-    r"""The motors of a robot: $q_M = A (q - q_0)$ and, by equal power, $Q = A^T M$ (Eq. 19).
+    r"""Motors: $q_M = A (q - q_0)$ and, by equal power, $Q = A^T M$ (Eq. 19).
 
     For independent axes $A$ is the diagonal matrix of gear ratios; a wrist whose motors
     turn more than one axis has entries beside the diagonal. Drives without arguments
@@ -122,9 +122,11 @@ class Drives(Hashable):
 
     @property
     def _inverse(self) -> Float[AnyArray, "joints joints"]:
+        """Joint angle for motor angle."""
         return namespace(self.reduction).linalg.inv(self.reduction)
 
     def _zeros(self, like: AnyArray) -> AnyArray:
+        """Return `zero` in the shape of a batch of angles."""
         return namespace(like, self.zero).broadcast_to(self.zero, like.shape)
 
     def joint_angles(self, motor_angles: Batch) -> Batch:
@@ -132,7 +134,7 @@ class Drives(Hashable):
         return self.joint_velocities(motor_angles) + self._zeros(motor_angles)
 
     def joint_velocities(self, motor_velocities: Batch) -> Batch:
-        """Return joint velocities [rad/s or m/s] of motor velocities [rad/s], or accelerations."""
+        """Return joint velocities, or accelerations, of those of the motors."""
         return motor_velocities @ self._inverse.T
 
     def joint_forces(self, motor_torques: Batch) -> Batch:
@@ -153,7 +155,7 @@ class Drives(Hashable):
 
     @property
     def max_forces(self) -> Joints:
-        r"""Largest generalised forces of the motors, $|A|^T M_{max}$ [N m or N] (Eq. 30)."""
+        r"""Largest forces of the motors, $|A|^T M_{max}$ [N m or N] (Eq. 30)."""
         weights = np.abs(self.reduction)
         # A motor without largest torque does not limit joints that it does not turn.
         torques = np.where(weights > 0, self.max_torques[:, None], 0.0)
@@ -161,7 +163,7 @@ class Drives(Hashable):
 
 
 def _reduction_matrix(reduction: Any, joints: int) -> AnyArray:
-    """Check gear ratios and return them as a matrix; a matrix of JAX is taken as it is."""
+    """Check gear ratios and return them as a matrix; one of JAX stays as it is."""
     if isinstance(reduction, jax.Array) and reduction.ndim == 2:
         return reduction
     if reduction is None:
@@ -182,7 +184,7 @@ def _reduction_matrix(reduction: Any, joints: int) -> AnyArray:
 
 
 def _count(joints: int | None, *values: Numbers | None) -> int:
-    """Return the number of joints: as given, or as many as the first of the values holds."""
+    """Return the number of joints: as given, or that of the first values."""
     if joints is not None:
         return joints
     for value in values:
@@ -196,7 +198,7 @@ def _count(joints: int | None, *values: Numbers | None) -> int:
 def per_joint(name: str, value: Numbers | None, joints: int, unknown: float) -> Any:
     """Check and copy one number for each joint; JAX arrays are taken as they are.
 
-    `unknown` stands in place of None; if it is NaN, the values may contain NaN.
+    None becomes `unknown` for all joints; if that is NaN, the values may contain NaN.
     """
     if isinstance(value, jax.Array):
         return value
@@ -214,6 +216,7 @@ def per_joint(name: str, value: Numbers | None, joints: int, unknown: float) -> 
 
 
 def _magnitudes(name: str, value: Numbers | None, joints: int) -> Any:
+    """Check and copy one positive number for each joint; infinite if None."""
     values = per_joint(name, value, joints, np.inf)
     _require(name, values, lambda x: x > 0, "positive")
     return values
@@ -244,7 +247,7 @@ def _require_ranges(low: np.ndarray, high: np.ndarray) -> None:
 
 
 def range_fault(low: float, high: float, revolute: bool) -> str:
-    """Return why no joint has such a range [rad or m], as the predicate of a sentence; or ""."""
+    """Return a predicate that says why no joint has such a range; or ""."""
     ends = [end for end in (low, high) if np.isfinite(end)]
     end = max(ends, key=abs, default=0.0)
     max_end = 8 * np.pi if revolute else MAX_LENGTH

@@ -1,4 +1,4 @@
-"""The kinematic tree of an MJCF file, as MuJoCo compiles it (extra `mujoco`), written as a URDF."""
+"""The kinematic tree of an MJCF file, which MuJoCo compiles, written as a URDF."""
 
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,7 @@ def import_mujoco() -> Any:
 
 
 def mjcf_as_urdf(path: str | Path) -> tuple[Any, Vector3, list[Loop]]:
-    """Return the URDF element of an MJCF file, its gravity [m/s²], and its closed loops.
+    """Return an MJCF file as a URDF element, its gravity [m/s²], and closed loops.
 
     Each body is a link of its name, fixed to the frame of its last joint; each named
     site is a link that is fixed to its body. A joint that an equality constraint
@@ -101,7 +101,7 @@ class _Writer:
         return element
 
     def add_body(self, body: int) -> None:
-        """Write the joints of a body, one after the other, and its link with the inertia."""
+        """Write the joints of a body, one by one, and its link with the inertia."""
         model = self._model
         name = body_name(model, body)
         parent = self._links[model.body_parentid[body]]
@@ -129,15 +129,17 @@ class _Writer:
         self._connect(mount, mount_type, parent, name, _origin(R, r))
 
     def _joints_of(self, body: int) -> range:
+        """Return the indices of the joints that move a body in its parent."""
         first = int(self._model.body_jntadr[body])
         return range(first, first + int(self._model.body_jntnum[body]))
 
     def _joint_placement(
         self, joint: int, rotation: Matrix3, position: Vector3
     ) -> tuple[Matrix3, Vector3]:
-        """Return attitude and origin of a joint's frame, where its body is placed so at `ref`.
+        """Return attitude and origin of a joint's frame from the placement of its body.
 
-        An MJCF file describes the pose at `ref`, a URDF file that at zero.
+        An MJCF file describes the pose at the coordinate `ref`, a URDF file that at
+        zero.
         """
         model = self._model
         axis = model.jnt_axis[joint]
@@ -150,7 +152,7 @@ class _Writer:
         return rotation, position
 
     def _add_joint(self, joint: int, parent: str, origin: Any) -> str:
-        """Write a joint and an empty link that it moves; return the name of the link."""
+        """Write a joint and an empty link that it moves; return the link's name."""
         kind = JOINT_TYPES[self._model.jnt_type[joint]]
         # A URDF's revolute joint must have a range.
         if kind == "revolute" and not self._model.jnt_limited[joint]:
@@ -199,7 +201,7 @@ class _Writer:
         return [axis, E.limit(**limit), dynamics]
 
     def add_site(self, site: int) -> None:
-        """Write a site as a link; one without a name, or with that of a body, is left out."""
+        """Write a site as a link, if its name is not empty and not that of a body."""
         model = self._model
         name = model.site(site).name
         if not name or name in self._links:
@@ -232,8 +234,8 @@ class _Writer:
     def _add_mimic(self, joint: int, master: int, polynomial: np.ndarray) -> None:
         """Write a constraint of a joint; it is exact where the mimicked joint is held.
 
-        The polynomial gives the joint's coordinate, as the difference from its `ref`, of
-        that of the mimicked one.
+        The polynomial gives the joint's coordinate, as the difference from its `ref`,
+        of that of the mimicked one.
         """
         model = self._model
         attributes = {}
@@ -256,7 +258,7 @@ class _Writer:
 
 
 def _largest_forces(mujoco: Any, model: Any) -> Joints:
-    """Return the largest forces of the actuators on each joint; infinite where unknown."""
+    """Return the largest force of actuators on each joint; infinite if unknown."""
     transmissions = mujoco.mjtTrn
     joint_kinds = (
         int(transmissions.mjTRN_JOINT),
@@ -274,7 +276,7 @@ def _largest_forces(mujoco: Any, model: Any) -> Joints:
 
 
 def _largest_input(mujoco: Any, model: Any, actuator: int) -> float:
-    """Return the largest force of an actuator before its gear; infinite where unknown."""
+    """Return the largest force of an actuator before its gear; infinite if unknown."""
     if model.actuator_forcelimited[actuator]:
         return np.abs(model.actuator_forcerange[actuator]).max()
     # Other actuators have a bias, such as that of a position servo.

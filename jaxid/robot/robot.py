@@ -70,7 +70,7 @@ class Tool(eqx.Module):
 
     @property
     def parameters(self) -> Float[AnyArray, "10"]:
-        """The ten parameters $(m, m r_c, A, B, C, D, E, F)$ about the body's origin (Eqs. 8, 9)."""
+        """Parameters $(m, m r_c, A, B, C, D, E, F)$ about the origin (Eqs. 8, 9)."""
         return self.body_inertia.parameters
 
 
@@ -203,7 +203,7 @@ class Robot(Summarised, eqx.Module):
                 )
 
     def _length_notes(self) -> list[str]:
-        """Reject offsets that no robot has, and return notes on those that may be in mm."""
+        """Reject offsets that no robot has; return notes on some that may be in mm."""
         lengths = {"`tip_offset`": self.tip_offset}
         if self.offset.ndim == 2:
             for name, offset in zip(self.joint_names, self.offset, strict=True):
@@ -240,7 +240,7 @@ class Robot(Summarised, eqx.Module):
 
     @property
     def max_forces(self) -> Joints:
-        """Largest force of every joint: its limit, or else that of its motors [N m or N] (Eq. 30).
+        """Largest force of every joint: its limit, or that of its motors (Eq. 30).
 
         Raises:
             InputError: If neither is known for some joint.
@@ -277,7 +277,7 @@ class Robot(Summarised, eqx.Module):
     def mounted(
         self, rotation: Numbers | None = None, position: Numbers = (0.0, 0.0, 0.0)
     ) -> "Robot":
-        """Return the robot on a base that is tilted and shifted; gravity stays as it is.
+        """Return the robot on a base that is tilted and shifted in the same gravity.
 
         Args:
             rotation: Attitude of the former ground frame on the new ground; upright if
@@ -310,7 +310,7 @@ class Robot(Summarised, eqx.Module):
         centre_of_mass: Numbers,
         inertia: Numbers | None = None,
     ) -> "Robot":
-        """Return the robot with a known load at its end-effector, in place of the load it had.
+        """Return the robot with another known load, at its end-effector.
 
         For a load elsewhere: `robot.replace(tool=Tool(body, ...))`.
 
@@ -373,7 +373,7 @@ class Robot(Summarised, eqx.Module):
 
 
 def _checked(name: str, value: Numbers, shape: tuple[int, ...]) -> AnyArray:
-    """Return a copy as an array of finite numbers; a JAX array may have leading axes."""
+    """Return an array of finite numbers; that of JAX may have leading axes."""
     if isinstance(value, jax.Array):
         array: AnyArray = value
     else:

@@ -39,20 +39,20 @@ def rotation_about(
 
 
 def axis_rotation(axis: Numbers, angle: float) -> Matrix3:
-    """Return the rotation about a unit vector by an angle [rad], exact for quarter turns."""
+    """Return the rotation about a unit vector [rad], exact for quarter turns."""
     R = rotation_about(np.asarray(axis, np.float64), np.asarray(angle))
     return without_rounding(np.asarray(R))
 
 
 def rpy_rotation(rpy: Numbers) -> Matrix3:
-    """Return the rotation by roll, pitch and yaw [rad] about the fixed axes x, y, z, as in URDF."""
+    """Return the rotation by roll, pitch and yaw [rad] about x, y, z, as in URDF."""
     roll, pitch, yaw = np.asarray(rpy, dtype=np.float64)
     x, y, z = np.eye(3)
     return axis_rotation(z, yaw) @ axis_rotation(y, pitch) @ axis_rotation(x, roll)
 
 
 def rpy_angles(rotation: Matrix3) -> Vector3:
-    """Return roll, pitch and yaw [rad] of a rotation, as precise at a pitch of a quarter turn."""
+    """Return roll, pitch and yaw [rad], precise at a pitch of a quarter turn, too."""
     roll = float(np.arctan2(rotation[2, 1], rotation[2, 2]))
     R = np.asarray(rotation) @ axis_rotation((1.0, 0.0, 0.0), -roll)
     pitch = np.arctan2(-R[2, 0], R[2, 2])
@@ -78,7 +78,7 @@ def snapped(
 def snapped_rotations(
     rotations: Float[AnyArray, "*shape 3 3"], tolerance: float
 ) -> Float[np.ndarray, "*shape 3 3"]:
-    """Return rotations whose entries within `tolerance` of zero are zero, rotations as before."""
+    """Return nearest rotations whose entries within `tolerance` of zero are zero."""
     R = np.asarray(rotations, np.float64)
     rows = snapped(rotations, tolerance)
     U, _, Vt = np.linalg.svd(rows)
@@ -88,7 +88,7 @@ def snapped_rotations(
 
 
 def without_rounding(values: AnyArray) -> np.ndarray:
-    """Set entries to 0, 1 or -1 that differ only by rounding, like 6e-17 for cos(pi/2)."""
+    """Set entries to 0, 1 or -1 that differ only by rounding, like cos(pi/2)."""
     integers = np.clip(np.round(values), -1.0, 1.0)
     entries = np.where(np.abs(values - integers) <= 1e-14, integers, values)
     return entries + 0.0  # makes -0.0 positive

@@ -26,7 +26,7 @@ Lengths = Float[AnyArray, "*batch"]
 
 
 class Capsule(eqx.Module):
-    """All points within a radius of a segment on a body; a sphere if its ends are one point.
+    """All points within a radius of a segment; a sphere if its ends are one point.
 
     Args:
         name: Name of the capsule in messages.
@@ -68,7 +68,7 @@ class Capsule(eqx.Module):
 
 
 class HalfSpace(eqx.Module):
-    """The solid on one side of a plane: the floor (z = 0 by default), a wall, a ceiling.
+    """The solid on one side of a plane: the floor (z = 0), a wall, a ceiling.
 
     Args:
         name: Name of the obstacle in messages.
@@ -101,7 +101,7 @@ class HalfSpace(eqx.Module):
         self.height = np.array(height, np.float64)
 
     def distance(self, start: Vectors, end: Vectors) -> Lengths:
-        """Return the signed distances of segments from the plane [m]: those of the lower ends."""
+        """Return the signed distances of segments' lower ends from the plane [m]."""
         return _smaller(start @ self.normal, end @ self.normal) - self.height
 
 
@@ -182,7 +182,7 @@ class Box(eqx.Module):
 def segment_distance(
     start: Vectors, end: Vectors, other_start: Vectors, other_end: Vectors
 ) -> Lengths:
-    """Return the distance between segments, which may be parallel, touch, or be points [m]."""
+    """Return the distance between segments, which may touch or be points [m]."""
     u = end - start
     v = other_end - other_start
     r = start - other_start
@@ -213,6 +213,7 @@ def _closest_places(u: Vectors, v: Vectors, r: Vectors) -> tuple[Array, Array]:
 
 
 def _dot(x: Vectors, y: Vectors) -> Array:
+    """Return scalar products, with an axis of length one."""
     return jnp.einsum("...i,...i->...", x, y)[..., None]
 
 
@@ -235,7 +236,7 @@ def _bisect(slope: Callable[[Array], Array], zero: Array) -> tuple[Array, Array]
 
 
 def _smaller(x: AnyArray, y: AnyArray) -> Array:
-    """Return the smaller numbers, with the derivatives of one of both.
+    """Return the smaller of two numbers, with its derivative.
 
     Derivatives of `jnp.minimum` ask which argument equals the result. None does where a
     compiler rounds the two in different ways.
@@ -244,12 +245,13 @@ def _smaller(x: AnyArray, y: AnyArray) -> Array:
 
 
 def _rounded_norm(vector: Vectors) -> Array:
-    """Return lengths of vectors, smooth at zero and there at most `ROUNDING` too small [m]."""
+    """Return lengths of vectors, smooth at zero and up to `ROUNDING` too small [m]."""
     square = jnp.einsum("...i,...i->...", vector, vector)
     return jnp.sqrt(square + ROUNDING**2) - ROUNDING
 
 
 def _finite_point(name: str, value: Numbers) -> np.ndarray:
+    """Check and copy a point."""
     point = np.array(value, np.float64)
     if point.shape != (3,) or not np.isfinite(point).all():
         raise InputError(f"{name} must hold three finite numbers, but is {value}.")

@@ -29,7 +29,7 @@ def load_urdf(
     base_rotation: Numbers | None = None,
     base_position: Numbers = ORIGIN,
 ) -> Robot:
-    """Load a robot from a URDF, xacro or MJCF file; `urdf_parameters` reads its inertias.
+    """Load a robot from a URDF, xacro or MJCF file, without its inertias.
 
     Joints turn (revolute, continuous) or slide (prismatic) about any axis. The frame of
     a body is the frame of the link that its joint moves. Links on fixed joints become
@@ -103,7 +103,7 @@ def urdf_parameters(
     base: str | None = None,
     check: bool = True,
 ) -> Float[AnyArray, " inertial"]:
-    """Return the inertial parameters that a URDF or MJCF file claims, often from CAD (Eq. 9).
+    """Return the inertial parameters that a URDF or MJCF file claims (Eq. 9).
 
     Ten for each body of `load_urdf` with the same arguments, in the order of its
     joints: (m, m r_c, A, B, C, D, E, F) about the body's origin. Links on fixed joints
@@ -128,9 +128,9 @@ def urdf_parameters(
 def joint_parameters(
     path: str | Path, *, tip: str | None = None, base: str | None = None
 ) -> dict[str, Joints]:
-    """Return `armature`, `damping` and dry `friction` that a file claims, zero where it does not.
+    """Return `armature`, `damping` and dry `friction` that a file claims.
 
-    Arguments and errors are those of `load_urdf`.
+    They are zero where it claims none. Arguments and errors are those of `load_urdf`.
     """
     tree = UrdfTree(path, base=base, tip=tip)
     parameters = {}
@@ -177,7 +177,7 @@ def _limits(tree: UrdfTree) -> tuple[Limits, list[str]]:
 
 
 def _checked_range(tree: UrdfTree, joint: Any) -> tuple[float, float]:
-    """Return the ends of a joint's range; infinite if it turns without end, or both are zero."""
+    """Return a joint's range; infinite if it turns without end, or both ends are 0."""
     turns = joint.get("type") in TURNING
     low, high = tree.range(joint)
     is_unlimited = turns and high - low >= UNLIMITED_RANGE
@@ -193,7 +193,7 @@ def _checked_range(tree: UrdfTree, joint: Any) -> tuple[float, float]:
 
 
 def _held_notes(tree: UrdfTree) -> list[str]:
-    """Return notes on joints that are held, and on objects that are no part of the robot."""
+    """Return notes on joints that are held, and on objects beside the robot."""
     groups: dict[tuple[str, str], list[str]] = {}
     for joint in tree.mimics:
         master = joint.find("mimic").get("joint", "")
@@ -238,7 +238,7 @@ def _inertial_notes(tree: UrdfTree) -> list[str]:
 
 
 def _effort_notes(robot: Robot, bodies: BodyParameters) -> list[str]:
-    """Return notes on joints that cannot hold a fraction of what gravity needs with these bodies."""
+    """Return notes on joints that cannot hold a fraction of these bodies."""
     if is_traced(robot):
         return []
     forces = np.abs(_gravity_forces(robot, bodies)).max(axis=0)

@@ -21,7 +21,7 @@ TURNING = ("revolute", "continuous")
 ORIGIN = (0.0, 0.0, 0.0)
 """Position, or roll, pitch and yaw, where a file states none."""
 MAX_ANGLE = 2 * np.pi + 0.01
-"""Largest roll, pitch or yaw that can be in radians; a full turn may be rounded [rad]."""
+"""Largest angle that can be in radians; a full turn may be rounded [rad]."""
 
 
 class Placement(NamedTuple):
@@ -39,11 +39,11 @@ class Placement(NamedTuple):
 
 
 class UrdfTree:
-    """Links and joints of a URDF or MJCF file; fixed and held links are merged into their bodies.
+    """Links and joints of a URDF or MJCF file, merged into bodies.
 
-    Only what kinematics and inertias need is read: an error in a mesh, a transmission
-    or the element of a simulator does no harm. Arguments and errors are those of
-    `load_urdf`.
+    Links on fixed or held joints become part of the body that carries them. Only what
+    kinematics and inertias need is read: an error in a mesh, a transmission or the
+    element of a simulator does no harm. Arguments and errors are those of `load_urdf`.
 
     Attributes:
         links: Elements of the links, by name.
@@ -51,7 +51,8 @@ class UrdfTree:
         joints: Elements of the moving joints; `parent`, `axis`, `rotation` and `offset`
             as in `Robot`.
         mimics: Elements of joints that mimic others.
-        side_joints: Elements of joints on moving bodies that lead to no link of the chain.
+        side_joints: Elements of joints on moving bodies that lead to no link of the
+            chain.
         objects: Names of links that float and move no joint, which are left out.
         tip: Name of the end-effector's link.
         compiled: Whether the file is MJCF, whose shapes are no elements of the links.
@@ -205,7 +206,7 @@ class UrdfTree:
         return _placed(self.carriers[parent], *self.held_pose(joint))
 
     def placed_links(self) -> dict[str, Placement]:
-        """Return `carriers` with all links below them, whose joints are held where left out."""
+        """Return `carriers`, and links on joints that the chain leaves out."""
         placements = dict(self.carriers)
         links = list(placements)
         for link in links:
@@ -243,7 +244,11 @@ class UrdfTree:
         return any(lower.get("type") != "fixed" for lower in lower_joints)
 
     def held_at(self, joint: Any) -> float:
-        """Return the coordinate nearest to zero that range and mimicked joint allow [rad or m]."""
+        """Return the coordinate at which a joint is held [rad or m].
+
+        It is as near to zero as the range of the joint allows, or that of the joint
+        that it mimics.
+        """
         factor = 1.0
         offset = 0.0
         chain = []
@@ -260,7 +265,7 @@ class UrdfTree:
         return offset
 
     def held_pose(self, joint: Any) -> tuple[Matrix3, Vector3]:
-        """Return attitude and origin [m] in its parent of the link that a held joint carries."""
+        """Return attitude and origin [m] of a held joint's link in its parent."""
         R, r = self._origin(joint)
         if joint.get("type") == "fixed":
             return R, r
@@ -329,7 +334,7 @@ class UrdfTree:
         return without_rounding(axis / length)
 
     def bodies(self, *, check: bool = False) -> BodyParameters:
-        """Return the parameters of all bodies; reject links that cannot exist if asked to."""
+        """Return the parameters of all bodies; reject impossible links if asked to."""
         parameters = np.zeros((len(self.joints), 10))
         for link, (body, rotation, position) in self.carriers.items():
             inertial = self.inertial(link)
@@ -345,7 +350,7 @@ class UrdfTree:
         return parameters
 
     def inertial(self, link: str) -> tuple[Inertia, str] | None:
-        """Return a link's inertia in its own frame, and why no body has it; None if it has none."""
+        """Return a link's inertia in its own frame and why no body has it; or None."""
         element = self.links[link].find("inertial")
         if element is None:
             return None
@@ -370,10 +375,11 @@ class UrdfTree:
         return f"`{self.path}`, line {line}" if line else f"`{self.path}`"
 
     def error(self, joint: Any, complaint: str) -> InputError:
-        """Return an error about a joint: one sentence that names the file and the joint."""
+        """Return an error about a joint, which names the file and the joint."""
         return InputError(f"`{self.path}`: joint `{joint.get('name')}` {complaint}.")
 
     def _attribute(self, element: Any, key: str) -> str:
+        """Return an attribute that an element must have."""
         if element.get(key) is None:
             raise InputError(
                 f"{self.place(element)}: `<{element.tag}>` needs the attribute {key}."
@@ -388,7 +394,7 @@ class UrdfTree:
         *,
         infinite: bool = False,
     ) -> np.ndarray:
-        """Return the numbers of an attribute, or the default where the element lacks it."""
+        """Return the numbers of an attribute, or the default if it is missing."""
         text = None if element is None else element.get(key)
         if text is None:
             return np.array(default)
@@ -423,4 +429,5 @@ def _placed(carrier: Placement, rotation: Matrix3, position: Vector3) -> Placeme
 
 
 def _words(values: np.ndarray) -> str:
+    """Return numbers as they are shown in messages."""
     return " ".join(f"{x:g}" for x in values)
