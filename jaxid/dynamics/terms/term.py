@@ -2,7 +2,7 @@
 
 import functools
 from abc import abstractmethod
-from typing import Any, ClassVar, Literal, NamedTuple, Self
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -79,7 +79,7 @@ class AbstractTerm(eqx.Module):
     shares_friction: ClassVar[bool] = False
 
     @classmethod
-    def with_transition(cls, transition: Any) -> Self:
+    def with_transition(cls, transition: Any) -> "AbstractTerm":
         """Return the term as a switch adds it; dry friction takes the transition."""
         return cls()
 
