@@ -49,6 +49,9 @@ from jaxid.rollout.motion import ServoMotion
 from jaxid.rollout.servo import INDEX, LOWER, SCALE, START, UPPER
 from jaxid.rollout.uncoupled import ServoSimulator
 
+# Otherwise MuJoCo writes its warnings into a file in the working folder.
+mujoco.set_mju_user_warning(print)
+
 try:
     import mujoco.sysid as peer
 except ImportError:  # older versions of MuJoCo

@@ -48,3 +48,18 @@ def shared_data() -> Path:
     if not folder.is_dir():
         pytest.skip("measured data (../shared/data beside the project) are not here")
     return folder
+
+
+@pytest.fixture(scope="session", autouse=True)
+def warnings_of_mujoco():
+    """Fail if a simulation of MuJoCo was unstable, of which it would write into a file."""
+    try:
+        import mujoco
+    except ImportError:
+        yield
+        return
+    warnings = []
+    mujoco.set_mju_user_warning(warnings.append)
+    yield
+    mujoco.set_mju_user_warning(None)
+    assert not warnings

@@ -545,23 +545,6 @@ def test_ctrl_c_among_the_criteria_shows_those_that_are_done(
     assert f"stopped after 1 of {len(CRITERIA)} criteria" in out
 
 
-def test_play_shows_the_written_motion_among_its_shapes(tmp_path, run, monkeypatch):
-    arm(tmp_path)
-    command = ["excite", tmp_path / "arm.toml", "-o", tmp_path / "motion.csv", "--play"]
-    code, out, err = run(*command)
-    assert (code, out) == (2, "")
-    assert "motion.json` is not there: `--play` shows a motion that was designed" in err
-    rest = fourier_series(np.zeros(3), np.zeros((3, 1)), np.ones((3, 1)), 1.0)
-    save_trajectory(rest, tmp_path / "motion.json")
-    shown = []
-    monkeypatch.setattr("jaxid.simulation.preview.play", lambda *x: shown.append(x))
-    assert run(*command)[0] == 0
-    ((robot, shapes, motion),) = shown
-    assert robot.joints == 3
-    assert {"l1", "floor"} <= {s.name for s in (*shapes.capsules, *shapes.obstacles)}
-    assert eqx.tree_equal(motion, load_trajectory(tmp_path / "motion.json"))
-
-
 def test_ctrl_c_before_a_motion_keeps_all_limits(written, run, monkeypatch):
     def stopped(*_):
         raise KeyboardInterrupt

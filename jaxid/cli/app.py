@@ -149,12 +149,6 @@ def excite(
         bool,
         typer.Option("--all-criteria", help="Show what each of the criteria buys."),
     ] = False,
-    play: Annotated[
-        bool,
-        typer.Option(
-            "--play", help="Show the motion that was written in MuJoCo's viewer."
-        ),
-    ] = False,
 ) -> None:
     """Design the motion to record, within the limits of the joints.
 
@@ -167,9 +161,6 @@ def excite(
     console = options.start(experiment)
     from . import commands
 
-    if play:
-        commands.show_motion(experiment, output)
-        return
     options.refuse_foreign_table(output)
     commands.excite(console, experiment, output, resume, time, all_criteria)
 

@@ -57,8 +57,6 @@ from jaxid.report.result_files import (
 )
 from jaxid.result_table import Remark, Status, Table, significant
 from jaxid.robot.inertia import INERTIAL_NAMES, INERTIAL_UNITS
-from jaxid.simulation import preview
-from jaxid.trajectory.files import load_trajectory
 from jaxid.validation.verdict import verdict
 
 from . import process
@@ -209,18 +207,6 @@ def excite(
         raise typer.Exit(STOPPED)
     if verdict.status is Status.BAD:
         raise typer.Exit(UNUSABLE)
-
-
-def show_motion(path: Path, output: Path) -> None:
-    """Show a motion that was written in MuJoCo's viewer, among the shapes that were checked."""
-    experiment, written = load_experiment(path), output.with_suffix(".json")
-    if not written.is_file():
-        raise InputError(
-            f"`{written}` is not there: `--play` shows a motion that was designed."
-        )
-    preview.play(
-        experiment.robot, experiment.surroundings.shapes, load_trajectory(written)
-    )
 
 
 class _BestMotion:

@@ -2,19 +2,13 @@
 
 from .example import virtual_panda as virtual_panda, write_example as write_example
 from .friction_and_disturbances import (
-    AbstractDisturbance as AbstractDisturbance,
     AbstractGearFriction as AbstractGearFriction,
-    CableForce as CableForce,
     FrictionTemperature as FrictionTemperature,
     LuGreFriction as LuGreFriction,
     SmoothFriction as SmoothFriction,
     TorqueRipple as TorqueRipple,
 )
-from .mechanics import (
-    FlexibleGear as FlexibleGear,
-    RigidGear as RigidGear,
-    Servo as Servo,
-)
+from .mechanics import Servo as Servo
 from .mujoco import MujocoRobot as MujocoRobot
 from .tx90l import (
     cad_tx90l_on_rail as cad_tx90l_on_rail,

@@ -3,10 +3,12 @@
 import json
 import math
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from jaxid.dynamics.base import base_parameters
 from jaxid.dynamics.terms import ConstantOffset, RigidBodies, RotorInertia
@@ -20,6 +22,9 @@ from .friction_and_disturbances import SmoothFriction
 from .virtual import Sensors, VirtualRobot, random_bodies
 
 FILES = ("experiment.toml", "identification.csv", "verification.csv", "truth.json")
+"""Names of the files of an example."""
+PERIOD = 8.0
+"""Period of the motions of its logs [s]."""
 
 
 def virtual_panda(seed: int = 0) -> VirtualRobot:
@@ -33,7 +38,8 @@ def virtual_panda(seed: int = 0) -> VirtualRobot:
     """
     robot = library.panda()
     random = np.random.default_rng([seed, 0])
-    n, largest = robot.joints, np.asarray(robot.max_forces)
+    n = robot.joints
+    max_forces = np.asarray(robot.max_forces)
 
     def vary(values: np.ndarray) -> np.ndarray:
         return values * random.uniform(0.8, 1.2, n)
@@ -41,13 +47,13 @@ def virtual_panda(seed: int = 0) -> VirtualRobot:
     masses = vary(np.array([3.4, 2.2, 2.6, 2.4, 1.6, 1.3, 0.6]))  # [kg]
     bodies = random_bodies(robot, masses, random)
     friction = SmoothFriction(
-        viscous=vary(0.02 * largest),
-        coulomb=vary(0.03 * largest),
-        stribeck=0.005 * largest,  # friction near standstill that no model has
+        viscous=vary(0.02 * max_forces),
+        coulomb=vary(0.03 * max_forces),
+        stribeck=0.005 * max_forces,  # friction near standstill that no model has
         stribeck_speed=0.05,
     )
     rotors = vary(np.array([0.6, 0.6, 0.45, 0.45, 0.2, 0.2, 0.15]))  # [kg m²]
-    offsets = 0.01 * largest * random.uniform(-1.0, 1.0, n)
+    offsets = 0.01 * max_forces * random.uniform(-1.0, 1.0, n)
     return VirtualRobot(
         robot=robot,
         terms=(RigidBodies(), RotorInertia(), ConstantOffset()),
@@ -55,8 +61,8 @@ def virtual_panda(seed: int = 0) -> VirtualRobot:
         friction=friction,
         sensors=Sensors(
             encoder_step=2 * math.pi / 2**19,
-            white_noise=0.009 * largest,
-            coloured_noise=0.004 * largest,
+            white_noise=0.009 * max_forces,
+            coloured_noise=0.004 * max_forces,
             memory=0.02,
         ),
     )
@@ -66,13 +72,16 @@ def virtual_log(
     robot: VirtualRobot, name: str, periods: int, seed: tuple[int, int]
 ) -> Recording:
     """Return a log of a random motion within the limits, with a period of 8 s, at 500 Hz."""
-    first, second = np.random.SeedSequence(seed).generate_state(2, np.uint32).tolist()
+    seeds = np.random.SeedSequence(seed).generate_state(2, np.uint32).tolist()
     motion = random_fourier_series(
-        robot.robot, omega=2 * math.pi / 8.0, reach=0.9, seed=first
+        robot.robot, omega=2 * math.pi / PERIOD, reach=0.9, seed=seeds[0]
     )
-    duration = periods * 8.0
     return robot.measure(
-        motion, duration=duration, sample_time=0.002, seed=second, name=name
+        motion,
+        duration=periods * PERIOD,
+        sample_time=0.002,
+        seed=seeds[1],
+        name=name,
     )
 
 
@@ -92,69 +101,73 @@ def write_example(folder: Path, seed: int = 0) -> list[Path]:
         RuntimeError: If JAX runs in single precision.
     """
     robot = virtual_panda(seed)
+    experiment, identification, verification, truth = FILES
+    periods = {identification: 2, verification: 1}
     with atomic_folder(folder) as staging:
-        shutil.copyfile(Path(__file__).with_suffix(".toml"), staging / FILES[0])
-        for k, (file, periods) in enumerate(zip(FILES[1:3], (2, 1), strict=True)):
+        shutil.copyfile(Path(__file__).with_suffix(".toml"), staging / experiment)
+        for k, (file, count) in enumerate(periods.items()):
             path = staging / file
-            _write_csv(path, virtual_log(robot, path.stem, periods, (seed, k + 1)))
-        text = json.dumps(
-            _truth(robot, seed), indent=1, ensure_ascii=False, allow_nan=False
-        )
-        (staging / FILES[3]).write_text(f"{text}\n", encoding="utf-8")
+            _write_csv(path, virtual_log(robot, path.stem, count, (seed, k + 1)))
+        content = _truth(robot, seed)
+        text = json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False)
+        (staging / truth).write_text(f"{text}\n", encoding="utf-8")
         for file in FILES:
-            present, content = folder / file, (staging / file).read_bytes()
-            if present.exists() and (
-                not present.is_file() or present.read_bytes() != content
-            ):
-                raise InputError(
-                    f"`{present}` exists with other content: choose another folder, "
-                    "or remove it."
-                )
+            _require_no_other(folder / file, (staging / file).read_bytes())
     return [folder / file for file in FILES]
 
 
+def _require_no_other(path: Path, content: bytes) -> None:
+    """Refuse to overwrite a file with other content."""
+    if path.is_file() and path.read_bytes() == content:
+        return
+    if path.exists():
+        raise InputError(
+            f"`{path}` exists with other content: choose another folder, or remove it."
+        )
+
+
 def _write_csv(path: Path, recording: Recording) -> None:
-    n = recording.joints
-    header = [
-        "time",
-        *(f"q{i + 1}" for i in range(n)),
-        *(f"tau{i + 1}" for i in range(n)),
-    ]
-    columns = np.column_stack([recording.time, recording.angles, recording.forces])
-    formats = ["%.3f", *["%.7f"] * n, *["%.4f"] * n]
+    joints = range(1, recording.joints + 1)
+    names = ["time", *(f"q{i}" for i in joints), *(f"tau{i}" for i in joints)]
+    columns = [recording.time, recording.angles, recording.forces]
+    formats = ["%.3f", *["%.7f"] * len(joints), *["%.4f"] * len(joints)]
     np.savetxt(
         path,
-        columns,
+        np.column_stack(columns),
         formats,
-        ",",
-        header=",".join(header),
+        delimiter=",",
+        header=",".join(names),
         comments="",
         encoding="utf-8",
     )
 
 
 def _truth(robot: VirtualRobot, seed: int) -> dict[str, object]:
+    """Return the true parameters, and what no model of the experiment contains."""
     friction: Any = robot.friction
-    model, p = robot.model, np.asarray(robot.parameters)
+    sensors = robot.sensors
+    model = robot.model
+    p = np.asarray(robot.parameters)
     base = base_parameters(model)
-    combined = np.asarray(base.from_standard(p))
-    keys = ("name", "unit", "value")
-    standard = zip(
-        model.parameter_names, model.parameter_units, p.tolist(), strict=True
-    )
-    regrouped = zip(base.names, base.units, combined.tolist(), strict=True)
     return {
         "schema": "jaxid-truth/1",
         "robot": model.robot.name,
         "seed": seed,
-        "base_parameters": [dict(zip(keys, row, strict=True)) for row in regrouped],
-        "standard_parameters": [dict(zip(keys, row, strict=True)) for row in standard],
+        "base_parameters": _rows(base.names, base.units, base.from_standard(p)),
+        "standard_parameters": _rows(model.parameter_names, model.parameter_units, p),
         "beyond_the_model": {
             "stribeck_friction": np.asarray(friction.stribeck).tolist(),
             "stribeck_speed": friction.stribeck_speed,
-            "encoder_step": robot.sensors.encoder_step,
-            "white_noise": np.asarray(robot.sensors.white_noise).tolist(),
-            "coloured_noise": np.asarray(robot.sensors.coloured_noise).tolist(),
-            "noise_memory": robot.sensors.memory,
+            "encoder_step": sensors.encoder_step,
+            "white_noise": np.asarray(sensors.white_noise).tolist(),
+            "coloured_noise": np.asarray(sensors.coloured_noise).tolist(),
+            "noise_memory": sensors.memory,
         },
     }
+
+
+def _rows(
+    names: Sequence[str], units: Sequence[str], values: ArrayLike
+) -> list[dict[str, Any]]:
+    rows = zip(names, units, np.asarray(values).tolist(), strict=True)
+    return [{"name": name, "unit": unit, "value": x} for name, unit, x in rows]

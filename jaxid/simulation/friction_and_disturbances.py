@@ -1,4 +1,4 @@
-"""Friction and disturbances of the drives, as they act in a simulation.
+"""Friction and torque ripple of the drives, as they act in a simulation.
 
 A friction law is evaluated for the next time step, and gives a force that is affine in
 the speed at the step's end. Solving for that speed treats friction implicitly: however
@@ -8,7 +8,7 @@ steps are needed.
 
 import dataclasses
 from abc import abstractmethod
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -20,6 +20,19 @@ from jaxid.robot.robot import Robot
 
 EPSILON = 0.01
 """Width of the smooth sign in the model's columns of dry friction [rad/s or m/s]."""
+
+
+class FrictionStep(NamedTuple):
+    r"""Friction during a time step, affine in the speed $\dot q^+$ at its end.
+
+    Friction is `force` + `slope` $\dot q^+$ [N m or N], while the bristles bend to
+    `deflection` + `deflection_slope` $\dot q^+$ [rad or m].
+    """
+
+    force: Joints
+    slope: Joints
+    deflection: Joints
+    deflection_slope: Joints
 
 
 class AbstractGearFriction(Hashable):
@@ -41,19 +54,15 @@ class AbstractGearFriction(Hashable):
 
     @abstractmethod
     def over_step(
-        self, qd: Joints, expected: Joints, z: Joints, step: float
-    ) -> tuple[Joints, Joints, Joints, Joints]:
-        r"""Return friction during the next step, affine in the speed $\dot q^+$ at its end.
+        self, qd: Joints, expected_qd: Joints, z: Joints, step: float
+    ) -> FrictionStep:
+        """Return friction during the next step.
 
         Args:
             qd: Speeds at its start [rad/s or m/s].
-            expected: Expected speeds at its end [rad/s or m/s].
+            expected_qd: Expected speeds at its end [rad/s or m/s].
             z: Deflections of the bristles at its start [rad or m].
             step: Length of the step [s].
-
-        Returns:
-            $F_0$, $s$, $z_0$ and $r$: friction is $F_0 + s \dot q^+$ [N m or N], while
-            bristles bend to $z_0 + r \dot q^+$ [rad or m].
         """
 
     def scaled(self, viscous: Joints, dry: Joints) -> "AbstractGearFriction":
@@ -97,21 +106,22 @@ class SmoothFriction(AbstractGearFriction):
 
     def steady(self, qd):
         """Return the sum of all three parts."""
-        return (
-            self.viscous * qd + self.coulomb * jnp.tanh(qd / EPSILON) + self._fading(qd)
-        )
+        dry = self.coulomb * jnp.tanh(qd / EPSILON) + self._stribeck_part(qd)
+        return self.viscous * qd + dry
 
-    def _fading(self, qd):
-        relative = qd / self.stribeck_speed
-        return self.stribeck * jnp.exp(-(relative**2)) * jnp.tanh(4.0 * relative)
-
-    def over_step(self, qd, expected, z, step):
+    def over_step(self, qd, expected_qd, z, step):
         """Return the tangent at the expected speed, with the mean viscous part over the step."""
-        sign = jnp.tanh(expected / EPSILON)
+        sign = jnp.tanh(expected_qd / EPSILON)
         slope = self.coulomb / EPSILON * (1.0 - sign**2)
-        dry = self.coulomb * sign + self._fading(expected)
-        force = dry - slope * expected + 0.5 * self.viscous * qd
-        return force, slope + 0.5 * self.viscous, z, 0.0 * z
+        dry = self.coulomb * sign + self._stribeck_part(expected_qd)
+        half_viscous = 0.5 * self.viscous
+        force = dry - slope * expected_qd + half_viscous * qd
+        return FrictionStep(force, slope + half_viscous, z, 0.0 * z)
+
+    def _stribeck_part(self, qd):
+        """Return the part near standstill."""
+        x = qd / self.stribeck_speed
+        return self.stribeck * jnp.exp(-(x**2)) * jnp.tanh(4.0 * x)
 
 
 class LuGreFriction(AbstractGearFriction):
@@ -142,32 +152,41 @@ class LuGreFriction(AbstractGearFriction):
     deflection: Joints | float = 5e-4
     damping_time: float = 3e-3
 
-    def _level(self, qd):
-        fading = jnp.exp(-((qd / self.stribeck_speed) ** 2))
-        return self.coulomb + (self.breakaway - self.coulomb) * fading, fading
+    def steady(self, qd):
+        """Return the Stribeck curve, with the model's smooth sign at the origin."""
+        return self.viscous * qd + self._dry_level(qd) * jnp.tanh(qd / EPSILON)
+
+    def settled(self, qd):
+        """Return the deflections that belong to the friction at these speeds."""
+        return self._dry_level(qd) / self._stiffness * jnp.sign(qd)
+
+    def over_step(self, qd, expected_qd, z, step):
+        """Return friction of bristles that bend with the final speed and yield at the expected."""
+        stiffness = self._stiffness
+        yielding = (
+            step * stiffness * jnp.abs(expected_qd) / self._dry_level(expected_qd)
+        )
+        # Share of the deflection that is left after the step.
+        share = 1.0 / (1.0 + yielding)
+        damping = self.damping_time * stiffness * self._stribeck_share(expected_qd)
+        total_stiffness = (stiffness + damping / step) * share
+        half_viscous = 0.5 * self.viscous
+        force = total_stiffness * z - damping / step * z + half_viscous * qd
+        slope = total_stiffness * step + half_viscous
+        return FrictionStep(force, slope, share * z, share * step)
+
+    def _stribeck_share(self, qd):
+        """Return the share of the Stribeck part that a speed leaves: one at rest."""
+        return jnp.exp(-((qd / self.stribeck_speed) ** 2))
+
+    def _dry_level(self, qd):
+        """Return the level of dry friction at a speed [N m or N]."""
+        extra = self.breakaway - self.coulomb
+        return self.coulomb + extra * self._stribeck_share(qd)
 
     @property
     def _stiffness(self) -> Joints:
         return self.breakaway / self.deflection
-
-    def steady(self, qd):
-        """Return the Stribeck curve, with the model's smooth sign at the origin."""
-        level, _ = self._level(qd)
-        return self.viscous * qd + level * jnp.tanh(qd / EPSILON)
-
-    def settled(self, qd):
-        """Return the deflections that belong to the friction at these speeds."""
-        level, _ = self._level(qd)
-        return level / self._stiffness * jnp.sign(qd)
-
-    def over_step(self, qd, expected, z, step):
-        """Return friction of bristles that bend with the final speed and yield at the expected."""
-        level, fading = self._level(expected)
-        kept = 1.0 / (1.0 + step * self._stiffness * jnp.abs(expected) / level)
-        damping = self.damping_time * self._stiffness * fading
-        bent = (self._stiffness + damping / step) * kept
-        force = bent * z - damping / step * z + 0.5 * self.viscous * qd
-        return force, bent * step + 0.5 * self.viscous, kept * z, kept * step
 
 
 class FrictionTemperature(eqx.Module):
@@ -205,22 +224,10 @@ class FrictionTemperature(eqx.Module):
         return final + (np.asarray(temperature) - final) * np.exp(-duration / self.time)
 
 
-class AbstractDisturbance(Hashable):
-    """Force beside those of the drives; the measured torques do not contain it."""
-
-    @abstractmethod
-    def forces(self, robot: Robot, q: Joints, qd: Joints) -> Joints:
-        """Return the forces on the joints [N m or N].
-
-        Args:
-            robot: Robot with its gears.
-            q: Positions of the motors, on the joint side [rad or m].
-            qd: Speeds of the motors, on the joint side [rad/s or m/s].
-        """
-
-
-class TorqueRipple(AbstractDisturbance):
+class TorqueRipple(Hashable):
     """Ripple of the motor torques along the motor angle: cogging and commutation errors.
+
+    It acts beside the forces of the drives; the measured torques do not contain it.
 
     Attributes:
         amplitude: Amplitude on the joint side [N m or N].
@@ -232,30 +239,7 @@ class TorqueRipple(AbstractDisturbance):
     waves: Joints
     phase: Joints
 
-    def forces(self, robot, q, qd):
-        """Return a sine of the motor angle."""
-        return self.amplitude * jnp.sin(
-            self.waves * robot.drives.motor_angles(q) + self.phase
-        )
-
-
-class CableForce(AbstractDisturbance):
-    """Force of cables along the arm, or of a cable chain: a soft spring with friction.
-
-    Attributes:
-        stiffness: Stiffness [N m/rad or N/m].
-        rest: Position without spring force [rad or m].
-        friction: Friction of the cables [N m or N].
-        speed: Speed from which on friction has its full size [rad/s or m/s].
-    """
-
-    stiffness: Joints
-    rest: Joints
-    friction: Joints
-    speed: float = 0.02
-
-    def forces(self, robot, q, qd):
-        """Return forces against the deflection and against the motion."""
-        return self.stiffness * (self.rest - q) - self.friction * jnp.tanh(
-            qd / self.speed
-        )
+    def forces(self, robot: Robot, q: Joints) -> Joints:
+        """Return a sine of the motor angles, for angles of the joints [rad or m]."""
+        angles = self.waves * robot.drives.motor_angles(q) + self.phase
+        return self.amplitude * jnp.sin(angles)

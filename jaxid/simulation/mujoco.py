@@ -1,7 +1,8 @@
 """The same experiment on MuJoCo, which is independent of this package (extra `mujoco`)."""
 
+import contextlib
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -20,8 +21,7 @@ class MujocoRobot(VirtualRobot):
     """A virtual robot whose bodies, rotors and friction are simulated by MuJoCo.
 
     Viscous friction is MuJoCo's damping, dry friction its friction loss, which holds a
-    joint at rest. Gears are rigid, and there are no disturbances. Sensors and servo are
-    the virtual robot's.
+    joint at rest. There is no torque ripple. Sensors and servo are the virtual robot's.
 
     Args:
         virtual: Robot whose bodies, rotors and friction (at its present temperature)
@@ -39,33 +39,40 @@ class MujocoRobot(VirtualRobot):
             InputError: If the equations of motion contain more than bodies and rotors,
                 or MuJoCo is not installed.
         """
-        library, friction = import_mujoco(), self.present_friction
-        text = mjcf_text(
-            self.robot,
-            self._bodies_with_tool(),
-            {
-                "armature": self.rotors,
-                "damping": np.asarray(friction.viscous),
-                "friction": np.asarray(friction.coulomb),
-            },
-            timestep=step,
-        )
-        model = library.MjModel.from_xml_string(text)
-        model.opt.integrator = library.mjtIntegrator.mjINT_IMPLICITFAST
+        mujoco = import_mujoco()
+        friction = self.present_friction
+        rotors = np.diagonal(self._drive_inertia())
+        joints = {
+            "armature": rotors,
+            "damping": np.asarray(friction.viscous),
+            "friction": np.asarray(friction.coulomb),
+        }
+        bodies = self._bodies_with_tool()
+        text = mjcf_text(self.robot, bodies, joints, timestep=step)
+        model = mujoco.MjModel.from_xml_string(text)
+        model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         # The virtual robot has no end stops either.
-        model.opt.disableflags |= library.mjtDisableBit.mjDSBL_LIMIT
+        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_LIMIT
         return MujocoPlant(model, self.robot.joint_names)
+
+    def _drive_inertia(self) -> Float[np.ndarray, "joints joints"]:
+        """Return the inertia of the rotors on the joint side [kg m² or kg]."""
+        matrices = [
+            term.drive_matrices(self.robot)[0] @ np.asarray(p)
+            for term, p in self.bodies.split(self.values)
+        ]
+        return np.sum(matrices, axis=0)
 
     def _bodies_with_tool(self) -> Float[np.ndarray, "joints 10"]:
         """Return ten parameters of each body, with a known tool."""
-        robot, model = self.robot, self.bodies
-        for term, p in model.split(self.values):
-            known = term.body_parameters or term.drive_matrices(robot)[0].any()
-            if not known and np.any(p):
+        robot = self.robot
+        for term, p in self.bodies.split(self.values):
+            has_rotors = term.drive_matrices(robot)[0].any()
+            if not (term.body_parameters or has_rotors) and np.any(p):
                 raise InputError(
                     "MuJoCo knows only bodies and rotors: leave out other `terms`."
                 )
-        bodies = body_parameters(model, self.values)
+        bodies = body_parameters(self.bodies, self.values)
         if robot.tool is not None:
             bodies[robot.tool.body] += np.asarray(robot.tool.parameters)
         return bodies
@@ -85,39 +92,62 @@ class MujocoPlant:
     """One simulation of MuJoCo, with joints in the order of the robot."""
 
     def __init__(self, model: Any, joint_names: Sequence[str]):
-        self._library, self._model = import_mujoco(), model
-        self._data = self._library.MjData(model)
+        self._mujoco = import_mujoco()
+        self._model = model
+        self._data = self._mujoco.MjData(model)
         # MuJoCo numbers the joints of a tree branch by branch.
-        self._at = np.array([model.joint(name).qposadr[0] for name in joint_names])
+        addresses = [model.joint(name).qposadr[0] for name in joint_names]
+        self._addresses = np.array(addresses)
 
     def start(self, q: AnyArray, qd: AnyArray, qdd: AnyArray) -> None:
         """Put the robot into a motion."""
-        self._library.mj_resetData(self._model, self._data)
+        self._mujoco.mj_resetData(self._model, self._data)
         self._set(q, qd, qdd)
 
     def _set(self, q: AnyArray, qd: AnyArray, qdd: AnyArray) -> None:
-        data, at = self._data, self._at
-        data.qpos[at], data.qvel[at], data.qacc[at] = q, qd, qdd
-        data.qacc_warmstart[at] = qdd
+        data = self._data
+        data.qpos[self._addresses] = q
+        data.qvel[self._addresses] = qd
+        data.qacc[self._addresses] = qdd
+        data.qacc_warmstart[self._addresses] = qdd
 
     def step(self, u: Sequence[float]) -> None:
-        """Move on by one step with constant torques of the drives [N m or N]."""
-        self._data.qfrc_applied[self._at] = u
-        self._library.mj_step(self._model, self._data)
+        """Move on by one step with constant torques of the drives [N m or N].
 
-    def read(self) -> tuple[list[float], list[float]]:
-        """Return angles of the motors; positions, velocities, accelerations of the joints."""
-        data, at = self._data, self._at
-        q = data.qpos[at].tolist()
-        return q, [*q, *data.qvel[at].tolist(), *data.qacc[at].tolist()]
+        Raises:
+            ArithmeticError: If the simulation becomes unstable.
+        """
+        self._data.qfrc_applied[self._addresses] = u
+        with mujoco_warnings(self._mujoco) as warnings:
+            self._mujoco.mj_step(self._model, self._data)
+        if warnings:
+            raise ArithmeticError(warnings[0])
+
+    def read(self) -> list[float]:
+        """Return positions, velocities and accelerations of the joints, in this order."""
+        data = self._data
+        arrays = (data.qpos, data.qvel, data.qacc)
+        return np.concatenate([x[self._addresses] for x in arrays]).tolist()
 
     def inverse(self, motion: Motion) -> Float[np.ndarray, "samples joints"]:
         """Return forces of a motion without dry friction [N m or N]."""
         forces = np.empty(motion.q.shape)
         self._model.dof_frictionloss[:] = 0.0
         arrays = [np.asarray(x) for x in (motion.q, motion.qd, motion.qdd)]
-        for k, instant in enumerate(zip(*arrays, strict=True)):
-            self._set(*instant)
-            self._library.mj_inverse(self._model, self._data)
-            forces[k] = self._data.qfrc_inverse[self._at]
+        for k, (q, qd, qdd) in enumerate(zip(*arrays, strict=True)):
+            self._set(q, qd, qdd)
+            self._mujoco.mj_inverse(self._model, self._data)
+            forces[k] = self._data.qfrc_inverse[self._addresses]
         return forces
+
+
+@contextlib.contextmanager
+def mujoco_warnings(mujoco: Any) -> Iterator[list[str]]:
+    """Collect MuJoCo's warnings; else it writes them into a file in the working folder."""
+    warnings: list[str] = []
+    previous = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(warnings.append)
+    try:
+        yield warnings
+    finally:
+        mujoco.set_mju_user_warning(previous)

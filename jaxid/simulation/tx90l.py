@@ -46,8 +46,7 @@ def virtual_tx90l_on_rail(
     """
     robot = library.tx90l_on_rail()
     max_forces = np.asarray(robot.limits.force)
-    # Assumed, but for the first and the last, which follow from the published motor
-    # torques.
+    # Assumed, but for the first and the last, which follow from published motor torques.
     ratios = np.array([3000.0 / 69.0, 100.0, 100.0, 80.0, 45.0, 45.0, 5.0])
     robot = robot.replace(
         drives=Drives(
@@ -59,8 +58,7 @@ def virtual_tx90l_on_rail(
         notes=(
             *robot.notes[:2],
             "assumed, since they are not published: the gear ratios, but for those of "
-            "the rail and "
-            "the last axis, which follow from motor torques in the paper.",
+            "the rail and the last axis, which follow from motor torques in the paper.",
         ),
     )
     friction, heating = _friction(robot)
@@ -75,9 +73,7 @@ def virtual_tx90l_on_rail(
             coloured_noise=np.zeros(7),
             motor_side=True,
         ),
-        disturbances=(
-            TorqueRipple(0.01 * max_forces, np.full(7, 6.0), np.linspace(0, 6, 7)),
-        ),
+        ripple=TorqueRipple(0.01 * max_forces, np.full(7, 6.0), np.linspace(0, 6, 7)),
         heating=heating,
         temperature=np.full(7, TEMPERATURES[warm]),
     )
@@ -98,50 +94,61 @@ def cad_tx90l_on_rail() -> Float[np.ndarray, " standard"]:
 
 def _bodies(published: dict[int, float]) -> Float[np.ndarray, "7 7"]:
     """Return seven parameters of each body: principal axes, published base parameters (Eq. 24)."""
-    known = library.entries()["virtual_tx90l_on_rail"]
-    m, r, gyration = (
-        np.array(known[name]) for name in ("masses", "centres", "gyration")
-    )
+    entry = library.entries()["virtual_tx90l_on_rail"]
+    m = np.array(entry["masses"])
+    r = np.array(entry["centres"])
+    gyration = np.array(entry["gyration"])
     # m4 r_c4z counts 20 times in p_B(1) and once in p_B(2): with l_2x = l_3z = 0.05 m.
-    offset = m[3] * r[3, 2]
-    m[0] = published[1] - m[1] - m[2] + 20.0 * offset - ROTORS[0]
-    r[1, 0] = (published[2] - 0.05 * m[2] + offset) / m[1]
+    moment = m[3] * r[3, 2]
+    other_masses = m[1] + m[2] + ROTORS[0] - 20.0 * moment
+    m[0] = published[1] - other_masses
+    first_moment = published[2] - 0.05 * m[2] + moment
+    r[1, 0] = first_moment / m[1]
     # Second moments about the origin without products: possible if each leaves room for
     # all others.
-    spread = gyration**2 + np.count_nonzero(r, axis=1)[:, None] * r**2
-    moments = m[:, None] * (spread.sum(axis=1, keepdims=True) - spread)
+    shares = np.count_nonzero(r, axis=1)[:, None]
+    spread = gyration**2 + shares * r**2
+    planes = spread.sum(axis=1, keepdims=True) - spread
+    moments = m[:, None] * planes
     return np.concatenate([m[:, None], m[:, None] * r, moments], axis=1)
 
 
 def _friction(robot: Robot) -> tuple[LuGreFriction, FrictionTemperature]:
     """Return cold friction and its fall: as of axis 2 where nothing is published."""
-    max_forces, max_speeds = (
-        np.asarray(robot.limits.force),
-        np.asarray(robot.limits.velocity),
-    )
-    rise = TEMPERATURES[1] - TEMPERATURES[0]
-    levels, rates, warm = [], [], []
+    max_forces = np.asarray(robot.limits.force)
+    max_speeds = np.asarray(robot.limits.velocity)
     # Fractions: cold friction of the axes 3 to 7 over the largest torques (at 1 rad/s),
     # assumed.
-    for numbers, fraction in (((27, 28), 0.02), ((34, 35), 0.04)):
-        first, second = (WARM[k] / COLD[k] for k in numbers)
-        levels.append(
-            np.array([*(COLD[k] for k in numbers), *(fraction * max_forces[2:])])
-        )
-        factors = np.array([first, *(second,) * 6])
-        rates.append(-np.log(factors) / rise)
-        warm.append(levels[-1] * factors)
+    viscous = np.array([COLD[27], COLD[28], *(0.02 * max_forces[2:])])
+    dry = np.array([COLD[34], COLD[35], *(0.04 * max_forces[2:])])
+    viscous_factors = _warm_factors(27, 28)
+    dry_factors = _warm_factors(34, 35)
+    rise = TEMPERATURES[1] - TEMPERATURES[0]
+
     # RMS speeds, as fractions of the largest, at which the gears reach the warm
     # temperature: those of random Fourier motions of 0.8 rad/s that use the limits.
     # Assumed.
     speed = np.array([0.45, 0.24, 0.21, 0.24, 0.31, 0.17, 0.21]) * max_speeds
     # The mean size of a sine is 0.9 of its RMS.
-    power = warm[0] * speed**2 + warm[1] * 0.9 * speed
+    dry_power = dry * dry_factors * 0.9 * speed
+    power = viscous * viscous_factors * speed**2 + dry_power
     friction = LuGreFriction(
-        viscous=levels[0],
-        coulomb=levels[1],
-        breakaway=1.15 * levels[1],  # these three are assumed
+        viscous=viscous,
+        coulomb=dry,
+        breakaway=1.15 * dry,  # these three are assumed
         stribeck_speed=np.array([0.01, *(0.03,) * 6]),
         deflection=np.array([2e-4, *(5e-4,) * 6]),
     )
-    return friction, FrictionTemperature(rates[0], rates[1], rise / power)
+    heating = FrictionTemperature(
+        viscous_rate=-np.log(viscous_factors) / rise,
+        dry_rate=-np.log(dry_factors) / rise,
+        resistance=rise / power,
+    )
+    return friction, heating
+
+
+def _warm_factors(first: int, second: int) -> Float[np.ndarray, "7"]:
+    """Return warm over cold friction of all axes, by two numbers of base parameters."""
+    factor_1 = WARM[first] / COLD[first]
+    factor_2 = WARM[second] / COLD[second]
+    return np.array([factor_1, *(factor_2,) * 6])

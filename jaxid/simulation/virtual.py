@@ -21,12 +21,23 @@ from jaxid.robot.robot import Robot
 from jaxid.trajectory.trajectory import AbstractTrajectory
 
 from .friction_and_disturbances import (
-    AbstractDisturbance,
     AbstractGearFriction,
     FrictionTemperature,
     SmoothFriction,
+    TorqueRipple,
 )
-from .mechanics import DriveTrain, RigidGear, Servo, SimulatedPlant, follow
+from .mechanics import DriveTrain, Servo, SimulatedPlant, follow
+
+SERVO_FREQUENCY = 8.0
+"""Natural frequency of a servo's joints [Hz]."""
+SERVO_POSES = 200
+"""Random poses of the mean inertia for which a servo is made."""
+WARMING_STEP = 30.0
+"""Time after which the power of friction is evaluated again [s]."""
+CLOUD_POINTS = 12
+"""Point masses of a random body: enough to fill all directions."""
+CLOUD_WIDTH = 0.05
+"""Standard deviation of point masses from the line along a link [m]."""
 
 
 def random_bodies(
@@ -42,16 +53,19 @@ def random_bodies(
         masses: Masses of the bodies [kg].
         random: Random number generator.
     """
-    points = 12  # enough to fill all directions
     bodies = np.empty((robot.joints, 10))
     for i, mass in enumerate(np.asarray(masses)):
         children = [c for c, parent in enumerate(robot.parent) if parent == i]
-        end = robot.offset[children[0]] if children else robot.tip_offset
-        along = random.uniform(0.0, 1.0, (points, 1))
-        r = along * np.asarray(end) + 0.05 * random.standard_normal((points, 3))
-        m = random.dirichlet(np.full(points, 3.0)) * mass
-        r = np.append(r, np.ones((points, 1)), axis=1)
-        bodies[i] = inertial_parameters(np.einsum("k,ki,kj->ij", m, r, r))
+        end = np.asarray(robot.offset[children[0]] if children else robot.tip_offset)
+        fractions = random.uniform(0.0, 1.0, (CLOUD_POINTS, 1))
+        scatter = random.standard_normal((CLOUD_POINTS, 3))
+        r = fractions * end + CLOUD_WIDTH * scatter
+        shares = random.dirichlet(np.full(CLOUD_POINTS, 3.0))
+        m = shares * mass
+        ones = np.ones((CLOUD_POINTS, 1))
+        homogeneous = np.append(r, ones, axis=1)
+        pseudo_inertia = np.einsum("k,ki,kj->ij", m, homogeneous, homogeneous)
+        bodies[i] = inertial_parameters(pseudo_inertia)
     return bodies
 
 
@@ -91,13 +105,11 @@ class Sensors(eqx.Module):
     ) -> Recording:
         """Make a recording of true angles [rad or m] and forces [N m or N] of the joint side."""
         random = np.random.default_rng(seed)
-        angles, forces = np.asarray(angles), np.asarray(forces)
+        angles = np.asarray(angles)
+        forces = np.asarray(forces)
         white, drive = random.standard_normal((2, *forces.shape))
-        kept = np.exp(-sample_time / self.memory)
         initial = random.standard_normal((1, forces.shape[1]))
-        coloured, _ = signal.lfilter(
-            [np.sqrt(1.0 - kept**2)], [1.0, -kept], drive, axis=0, zi=kept * initial
-        )
+        coloured = _coloured(drive, initial, np.exp(-sample_time / self.memory))
         forces = forces + white * np.asarray(self.white_noise)
         forces = forces + coloured * np.asarray(self.coloured_noise)
         if self.motor_side:
@@ -111,6 +123,15 @@ class Sensors(eqx.Module):
             forces_on_motor_side=self.motor_side,
             name=name,
         )
+
+
+def _coloured(white: np.ndarray, initial: np.ndarray, memory: float) -> np.ndarray:
+    """Return noise of the same variance that keeps a fraction of itself over a sample."""
+    gain = np.sqrt(1.0 - memory**2)
+    noise, _ = signal.lfilter(
+        [gain], [1.0, -memory], white, axis=0, zi=memory * initial
+    )
+    return noise
 
 
 class Tracking(eqx.Module):
@@ -145,7 +166,7 @@ class VirtualRobot(Hashable):
     """A robot whose parameters are known, with the imperfections of every measurement.
 
     It can follow a motion without error (`measure`), which is fast, or by its servo
-    (`track`), where gears, stiction and disturbances act as in a machine.
+    (`track`), where stiction and torque ripple act as in a machine.
 
     Attributes:
         robot: Known properties of the robot.
@@ -153,8 +174,7 @@ class VirtualRobot(Hashable):
         values: Parameters of these terms.
         friction: Friction of the gears, at the reference temperature.
         sensors: Sensors of its logs.
-        gear: Gears between motors and joints.
-        disturbances: Further forces.
+        ripple: Ripple of the motor torques; none if None.
         heating: Dependence of friction on temperature; none if None.
         temperature: Temperatures of the gears [°C]; None without `heating`.
     """
@@ -164,22 +184,20 @@ class VirtualRobot(Hashable):
     values: Float[AnyArray, " parameters"]
     friction: AbstractGearFriction
     sensors: Sensors
-    gear: RigidGear = RigidGear()
-    disturbances: tuple[AbstractDisturbance, ...] = ()
+    ripple: TorqueRipple | None = None
     heating: FrictionTemperature | None = None
     temperature: Joints | None = None
 
     def __check_init__(self):
-        size, shape = (
-            self.bodies.size,
-            None if self.heating is None else (self.robot.joints,),
-        )
+        size = self.bodies.size
         if self.values.shape != (size,):
             raise InputError(
                 f"`values` must hold {size} numbers for `terms`, but has shape "
                 f"{self.values.shape}."
             )
-        if (None if self.temperature is None else self.temperature.shape) != shape:
+        gears = None if self.heating is None else (self.robot.joints,)
+        shape = None if self.temperature is None else self.temperature.shape
+        if shape != gears:
             raise InputError(
                 "`temperature` must hold one number for each gear with `heating`, "
                 "else None."
@@ -189,13 +207,6 @@ class VirtualRobot(Hashable):
     def bodies(self) -> Model:
         """Equations of motion without friction."""
         return Model(self.robot, self.terms)
-
-    @property
-    def rotors(self) -> Float[np.ndarray, " joints"]:
-        """Inertia of the rotors on the joint side [kg m² or kg]."""
-        parts = self.bodies.split(self.values)
-        inertia = sum(t.drive_matrices(self.robot)[0] @ np.asarray(x) for t, x in parts)
-        return np.diagonal(np.asarray(inertia))
 
     @property
     def present_friction(self) -> AbstractGearFriction:
@@ -216,13 +227,13 @@ class VirtualRobot(Hashable):
         return np.concatenate([first, self.present_friction.parameters, *others])
 
     def replace(self, **fields: Any) -> "VirtualRobot":
-        """Return a copy with some fields replaced: such as another gear."""
+        """Return a copy with some fields replaced, such as another friction."""
         return dataclasses.replace(self, **fields)
 
     def undisturbed(self) -> "VirtualRobot":
-        """Return the robot of the model: smooth friction, rigid gears, and sensor noise only."""
-        plain = SmoothFriction(self.friction.viscous, self.friction.coulomb)
-        return self.replace(friction=plain, gear=RigidGear(), disturbances=())
+        """Return the robot of the model: smooth friction, and sensor noise only."""
+        friction = SmoothFriction(self.friction.viscous, self.friction.coulomb)
+        return self.replace(friction=friction, ripple=None)
 
     def at(self, temperature: Joints | float) -> "VirtualRobot":
         """Return the same robot with gears of another temperature.
@@ -261,21 +272,20 @@ class VirtualRobot(Hashable):
             )
         # The power of friction is averaged over 2000 instants of the motion.
         _, motion = trajectory.sample(float(trajectory.duration) / 2000)
-        steps = max(1, round(duration / 30.0))
-        parts = [
-            self.friction.scaled(*x)
-            for x in np.eye(2)[:, :, None] * np.ones(motion.qd[0].shape)
-        ]
-        powers = [
-            np.mean(in_numpy(x, x.steady, motion.qd) * motion.qd, axis=0) for x in parts
-        ]
-        temperatures = [np.asarray(self.temperature)]
+        ones = np.ones(self.robot.joints)
+        viscous_friction = self.friction.scaled(ones, 0.0 * ones)
+        dry_friction = self.friction.scaled(0.0 * ones, ones)
+        viscous_power = mean_power(viscous_friction, motion)
+        dry_power = mean_power(dry_friction, motion)
+
+        steps = max(1, round(duration / WARMING_STEP))
+        temperature = np.asarray(self.temperature)
+        temperatures = [temperature]
         for _ in range(steps):
-            viscous, dry = heating.factors(temperatures[-1])
-            power = viscous * powers[0] + dry * powers[1]
-            temperatures.append(
-                heating.warm_up(temperatures[-1], power, duration / steps)
-            )
+            viscous, dry = heating.factors(temperature)
+            power = viscous * viscous_power + dry * dry_power
+            temperature = heating.warm_up(temperature, power, duration / steps)
+            temperatures.append(temperature)
         return np.linspace(0.0, duration, steps + 1), np.array(temperatures)
 
     def warmed(
@@ -287,16 +297,15 @@ class VirtualRobot(Hashable):
             trajectory: Repeated motion.
             duration: Duration [s]; the paper's robot is warm after 1800 s.
         """
-        return self.replace(
-            temperature=self.warming(trajectory, duration=duration)[1][-1]
-        )
+        _, temperatures = self.warming(trajectory, duration=duration)
+        return self.replace(temperature=temperatures[-1])
 
     def resistance(self, q: Joints, qd: Joints) -> Joints:
-        """Return friction less disturbances of one sample, at constant speeds [N m or N]."""
-        forces = self.present_friction.steady(qd)
-        for disturbance in self.disturbances:
-            forces = forces - disturbance.forces(self.robot, q, qd)
-        return forces
+        """Return friction less ripple of one sample, at constant speeds [N m or N]."""
+        friction = self.present_friction.steady(qd)
+        if self.ripple is None:
+            return friction
+        return friction - self.ripple.forces(self.robot, q)
 
     def forces(self, motion: Motion) -> Float[np.ndarray, "samples joints"]:
         """Return the forces of the drives for a motion, with rigid gears [N m or N]."""
@@ -343,32 +352,23 @@ class VirtualRobot(Hashable):
         Args:
             sample_time: Time between two ticks [s].
         """
-        model, turns = self.bodies, np.array(self.robot.revolute)
-        q = (
-            np.random.default_rng(0).uniform(-np.pi, np.pi, (200, self.robot.joints))
-            * turns
-        )
+        model = self.bodies
+        random = np.random.default_rng(0)
+        shape = (SERVO_POSES, self.robot.joints)
+        angles = random.uniform(-np.pi, np.pi, shape)
+        q = angles * np.array(self.robot.revolute)
         M = in_numpy(model, model.inertia, q, shared=(np.asarray(self.values),))
-        inertia = np.diagonal(M, axis1=1, axis2=2).mean(axis=0)
-        w = 2.0 * np.pi * 8.0
-        return Servo(w**2 * inertia, 2.0 * w * inertia, sample_time)
+        diagonals = np.diagonal(M, axis1=1, axis2=2)
+        inertia = diagonals.mean(axis=0)
+        omega = 2.0 * np.pi * SERVO_FREQUENCY
+        stiffness = omega**2 * inertia
+        damping = 2.0 * omega * inertia
+        return Servo(stiffness, damping, sample_time)
 
     def plant(self, step: float) -> Any:
-        """Return a simulation of the robot with a time step [s]: `start`, `step`, `read`.
-
-        Raises:
-            InputError: If an elastic gear has a motor without inertia.
-        """
-        elastic = np.asarray(self.gear.twist(np.ones(self.robot.joints))) != 0.0
-        if (elastic & ~(self.rotors > 0)).any():
-            raise InputError(
-                "an elastic gear needs a motor with inertia: give `terms` a "
-                "`RotorInertia`."
-            )
+        """Return a simulation of the robot with a time step [s]: `start`, `step`, `read`."""
         friction = self.present_friction
-        drives = DriveTrain(
-            self.bodies, self.rotors, friction, self.gear, self.disturbances, step
-        )
+        drives = DriveTrain(self.bodies, friction, self.ripple, step)
         return SimulatedPlant(drives, self.values)
 
     def track(
@@ -409,39 +409,62 @@ class VirtualRobot(Hashable):
         tick = servo.sample_time
         duration = float(trajectory.duration) if duration is None else duration
         sample_time = tick if sample_time is None else sample_time
-        every = max(round(sample_time / tick), 1)
-        if not abs(every * tick - sample_time) < 1e-6 * tick or not duration >= tick:
+        ticks_per_sample = max(round(sample_time / tick), 1)
+        is_multiple = abs(ticks_per_sample * tick - sample_time) < 1e-6 * tick
+        if not is_multiple or not duration >= tick:
             raise InputError(
                 f"`sample_time` must be a multiple of the servo's ({tick:g} s), and "
-                "`duration` at "
-                f"least that, but they are {sample_time:g} s and {duration:g} s."
+                f"`duration` at least that, but they are {sample_time:g} s and "
+                f"{duration:g} s."
             )
         time = tick * np.arange(round(duration / tick))
         desired = jax.tree.map(np.asarray, trajectory.motion(time))
-        forward = np.zeros(desired.q.shape)
-        if feed_forward is not None:
-            forward = np.asarray(feed_forward(desired), np.float64)
-            if forward.shape != desired.q.shape or not np.isfinite(forward).all():
-                raise InputError(
-                    "`feed_forward` must give finite forces of shape "
-                    f"{desired.q.shape}, but gives "
-                    f"shape {forward.shape}."
-                )
         limits = np.asarray(self.robot.known_max_forces)
-        resolution = self.sensors.resolution(self.robot)
-        plant = self.plant(tick / substeps)
-        actual, motors, forces = follow(
-            plant, servo, desired, forward, limits, resolution, substeps
+        run = follow(
+            self.plant(tick / substeps),
+            servo,
+            desired,
+            forward_forces(feed_forward, desired),
+            limits,
+            self.sensors.resolution(self.robot),
+            substeps,
         )
-        saturated = (np.abs(forces) >= limits).mean(axis=0)
-        kept = slice(None, None, every)
-        forces = 0.5 * (forces + np.concatenate([forces[:1], forces[:-1]]))[kept]
+        saturated = (np.abs(run.forces) >= limits).mean(axis=0)
+
+        samples = slice(None, None, ticks_per_sample)
+        # Forces are constant between ticks: the mean of before and after a sample.
+        before = np.concatenate([run.forces[:1], run.forces[:-1]])
+        forces = (0.5 * (run.forces + before))[samples]
+        actual = run.motion[samples]
         log = self.sensors.record(
             self.robot,
-            motors[kept],
+            actual.q,
             forces,
-            sample_time=every * tick,
+            sample_time=ticks_per_sample * tick,
             seed=seed,
             name=name,
         )
-        return Tracking(time[kept], desired[kept], actual[kept], forces, log, saturated)
+        return Tracking(time[samples], desired[samples], actual, forces, log, saturated)
+
+
+def mean_power(
+    friction: AbstractGearFriction, motion: Motion
+) -> Float[np.ndarray, " joints"]:
+    """Return the mean power of friction in a motion [W]."""
+    forces = in_numpy(friction, friction.steady, motion.qd)
+    return np.mean(forces * motion.qd, axis=0)
+
+
+def forward_forces(
+    feed_forward: Callable[[Motion], AnyArray] | None, desired: Motion
+) -> Float[np.ndarray, "samples joints"]:
+    """Return the forces that are fed forward [N m or N]."""
+    if feed_forward is None:
+        return np.zeros(desired.q.shape)
+    forces = np.asarray(feed_forward(desired), np.float64)
+    if forces.shape != desired.q.shape or not np.isfinite(forces).all():
+        raise InputError(
+            f"`feed_forward` must give finite forces of shape {desired.q.shape}, but "
+            f"gives shape {forces.shape}."
+        )
+    return forces

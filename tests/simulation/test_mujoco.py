@@ -7,7 +7,9 @@ import jaxid as jid
 from jaxid.dynamics.motion import Motion
 from jaxid.dynamics.terms import ConstantOffset, RigidBodies, RotorInertia
 from jaxid.robot import library
+from jaxid.robot.limits_and_drives import Limits
 from jaxid.simulation.friction_and_disturbances import SmoothFriction
+from jaxid.simulation.mechanics import Servo
 from jaxid.simulation.tx90l import virtual_tx90l_on_rail
 from jaxid.simulation.virtual import Sensors, VirtualRobot, random_bodies
 from jaxid.trajectory.fourier import random_fourier_series
@@ -103,3 +105,19 @@ def test_what_mujoco_does_not_know_is_refused():
     other = virtual.replace(terms=(*virtual.terms, ConstantOffset()), values=values)
     with pytest.raises(ValueError, match="`terms`"):
         MujocoRobot(other).plant(1e-3)
+
+
+def test_an_unstable_simulation_is_an_error_and_writes_no_file(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    virtual = ur10()
+    plant = MujocoRobot(virtual).plant(1e-3)
+    plant.start(*np.zeros((3, 6)))
+    with pytest.raises(ArithmeticError, match="unstable"):
+        plant.step([1e300] * 6)
+    without_limits = virtual.robot.replace(limits=Limits(6))
+    stiff = Servo(np.full(6, 1e12), np.full(6, 1e12))
+    motion = random_fourier_series(virtual.robot, omega=0.8, seed=1)
+    robot = MujocoRobot(virtual.replace(robot=without_limits))
+    with pytest.raises(ValueError, match=r"diverged .* `servo`"):
+        robot.track(motion, servo=stiff, duration=0.5, seed=0)
+    assert not list(tmp_path.iterdir())
