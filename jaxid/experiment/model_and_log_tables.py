@@ -13,7 +13,7 @@ from jaxid.errors import InputError
 from jaxid.measurement import filters
 from jaxid.measurement.columns import Columns
 from jaxid.measurement.log_files import Selection
-from jaxid.measurement.reading import BAD_ROWS
+from jaxid.measurement.reading import MAX_BAD_ROWS
 from jaxid.robot.limits_and_drives import per_joint
 from jaxid.robot.robot import Robot
 from jaxid.units import Unit
@@ -236,7 +236,7 @@ class Logs:
     commands: Selection | None = None
     force_delay: float = 0.0
     largest_gap: Annotated[float, Bounds(above=1.0)] = 1.75
-    bad_rows: Annotated[float, Bounds(least=0.0, below=1.0)] = BAD_ROWS
+    bad_rows: Annotated[float, Bounds(least=0.0, below=1.0)] = MAX_BAD_ROWS
     start: float | dict[str, float] = -np.inf
     stop: float | dict[str, float] = np.inf
 

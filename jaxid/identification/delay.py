@@ -13,8 +13,9 @@ from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
-from jaxid.measurement.observations import Chunk, Observations
+from jaxid.measurement.observations import Observations
 from jaxid.measurement.recording import require_finite_delay
+from jaxid.measurement.samples import Chunk
 
 from .estimators import AbstractWeights, MaximumForces
 from .parameter_changes import joint_test

@@ -8,11 +8,10 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
-from jaxid import units
 from jaxid.arrays import optional
 from jaxid.errors import InputError
 from jaxid.robot.limits_and_drives import per_joint
-from jaxid.units import Quantity, Unit
+from jaxid.units import NM, RAD, Quantity, S, Unit
 
 from .log_files import LogTable, Selection, open_log_file
 from .recording import positive_time
@@ -75,12 +74,12 @@ class Columns(eqx.Module):
     )
     time: str | int | None = eqx.field(static=True, default=None)
     sample_time: float | None = eqx.field(static=True, converter=optional, default=None)
-    time_unit: Unit = eqx.field(static=True, default=units.S)
-    angle_unit: Units = eqx.field(static=True, converter=_listed, default=units.RAD)
+    time_unit: Unit = eqx.field(static=True, default=S)
+    angle_unit: Units = eqx.field(static=True, converter=_listed, default=RAD)
     velocity_unit: Units | None = eqx.field(
         static=True, converter=_listed, default=None
     )
-    force_unit: Units = eqx.field(static=True, converter=_listed, default=units.NM)
+    force_unit: Units = eqx.field(static=True, converter=_listed, default=NM)
     torque_constants: PerJoint = eqx.field(static=True, converter=_listed, default=None)
     angle_signs: PerJoint = eqx.field(static=True, converter=_listed, default=None)
     force_signs: PerJoint = eqx.field(static=True, converter=_listed, default=None)
@@ -108,7 +107,7 @@ class Columns(eqx.Module):
         self._require(
             "torque_constants", lambda c: c != 0 and np.isfinite(c), "finite, not zero"
         )
-        current = any(u.quantity is Quantity.CURRENT for u in _each(self.force_unit))
+        current = any(u.quantity is Quantity.CURRENT for u in _units(self.force_unit))
         if current != (self.torque_constants is not None):
             raise InputError(
                 "`torque_constants` [N m/A] are needed if `force_unit` is a current, "
@@ -116,7 +115,7 @@ class Columns(eqx.Module):
             )
 
     def _require_unit(self, name: str, *allowed: Quantity) -> None:
-        for one in _each(getattr(self, name)):
+        for one in _units(getattr(self, name)):
             if one.quantity not in allowed:
                 raise InputError(
                     f"`{name}` must measure {' or '.join(q.value for q in allowed)}, "
@@ -135,27 +134,33 @@ class Columns(eqx.Module):
         self, angles: np.ndarray, velocities: np.ndarray | None, forces: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
         """Convert the numbers of a log to SI units (samples x joints)."""
+        joints = angles.shape[1]
 
-        def each(name: str, default: float = 1.0) -> np.ndarray:
-            value = getattr(self, name)
-            if isinstance(value, Unit):
-                return np.full(angles.shape[1], value.factor)
-            if name.endswith("unit"):
-                value = tuple(one.factor for one in value)
-            return per_joint(name, value, angles.shape[1], default)
+        def factors(name: str) -> np.ndarray:
+            unit = getattr(self, name)
+            if isinstance(unit, Unit):
+                return np.full(joints, unit.factor)
+            return per_joint(name, [one.factor for one in unit], joints, 1.0)
 
-        signs = each("angle_signs")
-        scale = signs * each("angle_unit")
+        def values(name: str, default: float = 1.0) -> np.ndarray:
+            return per_joint(name, getattr(self, name), joints, default)
+
+        signs = values("angle_signs")
+        angle_scale = signs * factors("angle_unit")
         if velocities is not None:
-            own = self.velocity_unit is not None
-            velocities = velocities * (signs * each("velocity_unit") if own else scale)
-        gains = each("force_unit") * each("force_signs") * each("force_gains")
-        forces = forces * (gains * each("torque_constants"))
-        return angles * scale + each("angle_offsets", 0.0), velocities, forces
+            velocity_scale = angle_scale
+            if self.velocity_unit is not None:
+                velocity_scale = signs * factors("velocity_unit")
+            velocities = velocities * velocity_scale
+        gains = factors("force_unit") * values("force_signs") * values("force_gains")
+        force_scale = gains * values("torque_constants")
+        offsets = values("angle_offsets", 0.0)
+        return angles * angle_scale + offsets, velocities, forces * force_scale
 
 
-def _each(given: Units | None) -> tuple[Unit, ...]:
-    return (given,) if isinstance(given, Unit) else given or ()
+def _units(units: Units | None) -> tuple[Unit, ...]:
+    """Return one unit or several as a tuple; an empty one if there is none."""
+    return (units,) if isinstance(units, Unit) else units or ()
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -219,7 +224,7 @@ def open_log(
         raise InputError(
             "`velocities_path` is given, but `Columns.velocities` names no columns."
         )
-    channels = {
+    channels: dict[str, tuple[str | Path, Selection | None]] = {
         "angles": (path, columns.angles),
         "forces": (forces_path or path, columns.forces),
     }
@@ -235,7 +240,8 @@ def open_log(
     for file_path, file_selections in selections.items():
         file = open_log_file(file_path, file_selections)
         names = file.channels(file_selections)
-        tables.append(file.table(names, on_disk, is_lenient))
+        bad_rows = {} if is_lenient else None
+        tables.append(file.table(names, on_disk, bad_rows))
     _require_equal_rows(tables)
     return Log(tuple(tables), columns)
 

@@ -5,9 +5,10 @@ import numpy as np
 from jaxid.dynamics.motion import Motion
 from jaxid.dynamics.terms import Presliding
 
-from .observations import AbstractSamples, Observations, SamplesInMemory, joined
+from .observations import Observations
+from .samples import AbstractSamples, SamplesInMemory, joined
 
-PART = 16384
+PART_SIZE = 16384
 """Samples after which the state is kept, for reading parts of a log."""
 
 
@@ -22,21 +23,26 @@ class SamplesWithMemory(AbstractSamples):
     starts: dict[int, np.ndarray]
 
     def __init__(self, source, law, segments):
-        self.source, self.law, self.segments, self.starts = source, law, segments, {}
+        self.source = source
+        self.law = law
+        self.segments = segments
+        self.starts = {}
         for a, b in segments:
-            self.starts[a] = np.asarray(
-                law.settled(source.read(slice(a, a + 1))[0].qd[0])
-            )
-            for k in range(a, b, PART):
-                motion, _ = self.read(slice(k, min(k + PART + 1, b)))
-                self.starts[min(k + PART, b)] = np.asarray(motion.state)[-1]
+            motion, _ = source.read(slice(a, a + 1))
+            self.starts[a] = np.asarray(law.settled(motion.qd[0]))
+            for start in range(a, b, PART_SIZE):
+                stop = min(start + PART_SIZE, b)
+                motion, _ = self.read(slice(start, min(stop + 1, b)))
+                self.starts[stop] = np.asarray(motion.state)[-1]
 
     def read(self, samples):  # noqa: D102
-        begin = max(k for k in self.starts if k <= samples.start)
-        motion, forces = self.source.read(slice(begin, samples.stop))
-        state = self.law.states(np.asarray(motion.q, np.float64), self.starts[begin])
-        kept = slice(samples.start - begin, None, samples.step)
-        return Motion(motion.q, motion.qd, motion.qdd, state)[kept], forces[kept]
+        start = max(k for k in self.starts if k <= samples.start)
+        motion, forces = self.source.read(slice(start, samples.stop))
+        q = np.asarray(motion.q, np.float64)
+        state = self.law.states(q, self.starts[start])
+        motion = Motion(motion.q, motion.qd, motion.qdd, state)
+        part = slice(samples.start - start, None, samples.step)
+        return motion[part], forces[part]
 
     def read_all(self):  # noqa: D102
         return joined(self.read(slice(a, b)) for a, b in self.segments)
@@ -46,9 +52,10 @@ def with_memory(observations: Observations, law: Presliding | None) -> Observati
     """Return the same observations with the states of friction with memory, if there is any."""
     if law is None:
         return observations
-    plain = observations.source
-    plain = plain.source if isinstance(plain, SamplesWithMemory) else plain
-    source = SamplesWithMemory(plain, law, observations.segments)
-    if isinstance(plain, SamplesInMemory):
+    samples = observations.source
+    if isinstance(samples, SamplesWithMemory):
+        samples = samples.source
+    source = SamplesWithMemory(samples, law, observations.segments)
+    if isinstance(samples, SamplesInMemory):
         source = SamplesInMemory(*source.read_all())
     return observations.replace(source=source)

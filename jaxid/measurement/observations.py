@@ -1,14 +1,11 @@
 """Observations: motion and forces of a log, and the filters that turn them into rows (Eq. 26)."""
 
-import abc
 import dataclasses
-import functools
 import math
-from collections.abc import Callable, Iterable, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import equinox as eqx
-import jax
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -19,48 +16,30 @@ from jaxid.robot.limits_and_drives import per_joint
 from jaxid.robot.robot import Robot
 
 from .filters import AbstractDecimation, AbstractFilter, Subsample, ZeroPhaseButterworth
-from .recording import Recording, TimeGrid, consecutive, finite_channel, positive_time
+from .recording import (
+    Recording,
+    consecutive,
+    finite_channel,
+    positive_time,
+    unlike_derivatives,
+)
+from .samples import (
+    AbstractSamples,
+    Chunk,
+    Overlap,
+    SamplesInMemory,
+    joined,
+    joint_side,
+)
+from .time_grid import TimeGrid
 
-FEWEST_ROWS = 4
+MIN_ROWS = 4
 """Smallest number of rows for which a segment is used."""
+MIN_SEGMENT = 5
+"""Smallest number of samples of a segment: differences of fourth order need them."""
 
 Progress = Callable[[float], None]
 """Callback, called with the completed fraction (0 to 1)."""
-
-
-class AbstractSamples(eqx.Module):
-    """Motion and forces at the full rate, joint side, in memory or on disk."""
-
-    @abc.abstractmethod
-    def read(self, samples: slice) -> tuple[Motion, Float[AnyArray, "samples joints"]]:
-        """Return motion and forces of some samples of one segment."""
-
-    @abc.abstractmethod
-    def read_all(self) -> tuple[Motion, Float[AnyArray, "samples joints"]]:
-        """Return motion and forces of all segments."""
-
-
-class SamplesInMemory(AbstractSamples):
-    """Filtered motion and unfiltered forces [N m or N] as arrays."""
-
-    motion: Motion
-    forces: Float[AnyArray, "samples joints"]
-
-    def read(self, samples):  # noqa: D102
-        return self.motion[samples], np.asarray(self.forces)[samples]
-
-    def read_all(self):  # noqa: D102
-        return self.motion, self.forces
-
-
-class Chunk(NamedTuple):
-    """Part of the observations whose columns fit into memory."""
-
-    # half-open range of samples whose columns are needed (rows and overlap)
-    samples: tuple[int, int]
-    rows: tuple[int, int]  # half-open range of the resulting rows
-    # function that turns columns at these samples into these rows
-    reduce: Callable[[AnyArray], np.ndarray]
 
 
 class Observations(eqx.Module):
@@ -133,14 +112,12 @@ class Observations(eqx.Module):
         filter = ZeroPhaseButterworth(math.inf) if filter is None else filter
         decimation = Subsample(1) if decimation is None else decimation
         segments = ((0, len(data["q"])),) if segments is None else tuple(segments)
-        rows = sum(map(len, _row_samples(segments, filter.edge(dt), decimation.factor)))
-        counted = (
-            np.ones((rows, shape[1]), bool) if mask is None else np.asarray(mask, bool)
-        )
-        if counted.shape != (rows, shape[1]):
+        row_samples = _row_samples(segments, filter.edge(dt), decimation.factor)
+        mask_shape = (sum(map(len, row_samples)), shape[1])
+        mask = np.ones(mask_shape, bool) if mask is None else np.asarray(mask, bool)
+        if mask.shape != mask_shape:
             raise InputError(
-                f"`mask` must have the shape {(rows, shape[1])}, but has "
-                f"{counted.shape}."
+                f"`mask` must have the shape {mask_shape}, but has {mask.shape}."
             )
         motion = Motion(data["q"], data["qd"], data["qdd"])
         return cls(
@@ -149,20 +126,17 @@ class Observations(eqx.Module):
             decimation=decimation,
             segments=segments,
             start_times=tuple(a * dt for a, _ in segments),
-            mask=counted,
+            mask=mask,
             sample_time=dt,
             name=name,
         )
 
     def replace(self, **changes: Any) -> "Observations":
         """Return the same observations with other fields; `motion` and `forces` are fields too."""
-        arrays = {
-            key: changes.pop(key) for key in ("motion", "forces") if key in changes
-        }
-        if arrays:
+        if "motion" in changes or "forces" in changes:
             motion, forces = self.source.read_all()
             changes["source"] = SamplesInMemory(
-                **({"motion": motion, "forces": forces} | arrays)
+                changes.pop("motion", motion), changes.pop("forces", forces)
             )
         return dataclasses.replace(self, **changes)
 
@@ -222,11 +196,12 @@ class Observations(eqx.Module):
 
     def _times(self, samples: Sequence[range]) -> np.ndarray:
         """Return the times of samples of each segment [s]."""
-        dt = self.sample_time
-        parts = zip(samples, self.segments, self.start_times, strict=True)
-        return np.concatenate(
-            [t + dt * (np.asarray(own) - a) for own, (a, _), t in parts]
-        )
+        parts = []
+        for indices, (a, _), start in zip(
+            samples, self.segments, self.start_times, strict=True
+        ):
+            parts.append(start + self.sample_time * (np.asarray(indices) - a))
+        return np.concatenate(parts)
 
     def read(self, samples: slice) -> tuple[Motion, Float[AnyArray, "samples joints"]]:
         """Return motion and forces of some samples of one segment."""
@@ -239,18 +214,19 @@ class Observations(eqx.Module):
         the samples holds between the rows. JAX can compile and differentiate it.
         """
         edge = self.filter.edge(self.sample_time)
-        every = slice(None)
-        parts = [
-            self._reduce(slice(edge, b - a - edge), every, x[a:b])
-            for a, b in self.segments
-        ]
+        parts = []
+        for a, b in self.segments:
+            inner_samples = slice(edge, b - a - edge)
+            parts.append(self._reduce(inner_samples, slice(None), x[a:b]))
         return namespace(x).concatenate(parts)
 
-    def _reduce(self, kept: slice, wanted: slice, x: AnyArray) -> Any:
-        return self.decimation(self.filter.smooth(x, self.sample_time)[kept])[wanted]
+    def _reduce(self, samples: slice, rows: slice, x: AnyArray) -> Any:
+        """Smooth, take the samples between the edges, decimate, and take some rows."""
+        smooth = self.filter.smooth(x, self.sample_time)
+        return self.decimation(smooth[samples])[rows]
 
     def chunks(
-        self, samples: int = 16384, wanted: Sequence[tuple[int, int]] | None = None
+        self, samples: int = 16384, row_ranges: Sequence[tuple[int, int]] | None = None
     ) -> tuple[Chunk, ...]:
         """Divide into parts of about so many samples, each with the overlap that its filters need.
 
@@ -260,32 +236,24 @@ class Observations(eqx.Module):
 
         Args:
             samples: Number of samples of a part.
-            wanted: Half-open ranges of the rows that are needed; all if None.
+            row_ranges: Half-open ranges of the rows that are needed; all if None.
         """
-        factor = self.decimation.factor
-        edge = self.filter.edge(self.sample_time)
-        low_pass = self.filter.low_pass(self.sample_time)
-        before = self.decimation.memory()
-        after = low_pass.memory()
-        chunks, step = [], max(1, samples // factor)
-        for (a, b), (r0, r1) in zip(self.segments, self.row_segments, strict=True):
-            first, last = a + edge, b - edge
-            ranges = [(r0, r1)] if wanted is None else wanted
-            parts = [(max(r0, low), min(r1, high)) for low, high in ranges]
-            for start, end in (
-                (k, high) for low, high in parts for k in range(low, high, step)
-            ):
-                stop = min(start + step, end)
-                # Decimation keeps its phase: its first input sample is a row.
-                skipped = max(0, start - r0 - -(-before // factor))
-                low = first + skipped * factor
-                high = min(last, first + (stop - 1 - r0) * factor + before + 1)
-                begin = max(a, low - after)
-                final = min(b, high + after)
-                kept = slice(low - begin, high - begin)
-                rows = slice(start - r0 - skipped, stop - r0 - skipped)
-                reduce = functools.partial(self._reduce, kept, rows)
-                chunks.append(Chunk((begin, final), (start, stop), reduce))
+        overlap = Overlap(
+            edge=self.filter.edge(self.sample_time),
+            smoothing=self.filter.low_pass(self.sample_time).memory(),
+            decimation=self.decimation.memory(),
+            factor=self.decimation.factor,
+        )
+        reduce = self._reduce
+        step = max(1, samples // overlap.factor)
+        chunks = []
+        for segment, segment_rows in zip(self.segments, self.row_segments, strict=True):
+            first_row, end_row = segment_rows
+            for start, stop in [segment_rows] if row_ranges is None else row_ranges:
+                stop = min(stop, end_row)
+                for row in range(max(start, first_row), stop, step):
+                    rows = (row, min(row + step, stop))
+                    chunks.append(overlap.chunk(segment, first_row, rows, reduce))
         return tuple(chunks)
 
     def split(self, fraction: float) -> tuple["Observations", "Observations"]:
@@ -303,17 +271,21 @@ class Observations(eqx.Module):
             raise InputError(
                 f"`fraction` must lie between 0 and 1, but is {fraction:g}."
             )
-        (a, b), first = self.segments[-1], self.start_times[0]
-        last = self.start_times[-1] + (b - a - 1) * self.sample_time
-        middle = float(first + fraction * (last - first))
-        early = self.reduced_time[:, None] < middle
-        masks = np.asarray(self.mask) & early, np.asarray(self.mask) & ~early
-        if not all(mask.any(axis=0).all() for mask in masks):
-            raise InputError(
-                f"`fraction` of {fraction:g} leaves no rows of some joint of "
-                f"`{self.name}`."
-            )
-        return self.replace(mask=masks[0]), self.replace(mask=masks[1])
+        a, b = self.segments[-1]
+        start_time = self.start_times[0]
+        end_time = self.start_times[-1] + (b - a - 1) * self.sample_time
+        middle = float(start_time + fraction * (end_time - start_time))
+        is_early = self.reduced_time[:, None] < middle
+        mask = np.asarray(self.mask)
+        early = self.replace(mask=mask & is_early)
+        late = self.replace(mask=mask & ~is_early)
+        for part in (early, late):
+            if not part.mask.any(axis=0).all():
+                raise InputError(
+                    f"`fraction` of {fraction:g} leaves no rows of some joint of "
+                    f"`{self.name}`."
+                )
+        return early, late
 
     @property
     def reduced_time(self) -> Float[np.ndarray, " rows"]:
@@ -329,18 +301,6 @@ class Observations(eqx.Module):
     def reduced_motion(self) -> Motion:
         """Motion at the rows' instants, for figures: columns are reduced, not the motion."""
         return self.motion[self.instants]
-
-
-def joined(parts: Iterable[Any]) -> Any:
-    """Return trees of arrays, such as motions and forces, one behind the other."""
-    return jax.tree.map(lambda *x: np.concatenate(x), *parts)
-
-
-def _row_samples(
-    segments: Sequence[tuple[int, int]], edge: int, factor: int
-) -> list[range]:
-    """Return the samples of each segment at which rows lie."""
-    return [range(a + edge, b - edge, factor) for a, b in segments]
 
 
 def observe(
@@ -368,62 +328,48 @@ def observe(
             aliased, nothing is left between the edges of the segments, or some joint is
             never fast enough.
     """
-    r, notes = recording, ()
-    if r.velocities is not None and (unlike := unlike_derivatives(r)):
-        numbers = ", ".join(str(j + 1) for j in unlike)
-        notes = (
-            f"the velocities of channels {numbers} are not the derivatives of their "
-            "angles: all "
-            "velocities are taken from the angles",
-        )
-        r = dataclasses.replace(r, velocities=None)
+    notes = ()
+    if recording.velocities is not None:
+        wrong_channels = unlike_derivatives(recording)
+        if wrong_channels:
+            numbers = ", ".join(str(j + 1) for j in wrong_channels)
+            note = (
+                f"the velocities of channels {numbers} are not the derivatives of "
+                "their angles: all velocities are taken from the angles"
+            )
+            notes = (note,)
+            recording = dataclasses.replace(recording, velocities=None)
 
-    def load(segments: list[tuple[int, int]]) -> SamplesInMemory:
-        q, qd, forces = joint_side(robot, r, r.angles, r.velocities, r.forces)
+    def load(segments: Sequence[tuple[int, int]]) -> SamplesInMemory:
+        q, qd, forces = joint_side(
+            robot, recording, recording.angles, recording.velocities, recording.forces
+        )
         parts = []
         for a, b in segments:
-            measured = None if qd is None else qd[a:b]
-            parts.append((filter.motion(q[a:b], measured, r.sample_time), forces[a:b]))
+            segment_qd = None if qd is None else qd[a:b]
+            motion = filter.motion(q[a:b], segment_qd, recording.sample_time)
+            parts.append((motion, forces[a:b]))
         return SamplesInMemory(*joined(parts))
 
-    name = r.name if name is None else name
-    measured = r.velocities is not None
-    found = prepare(
-        load, r.grid, r.joints, measured, robot, filter, decimation, min_speed, name
+    observations = prepare(
+        load,
+        recording.grid,
+        recording.joints,
+        recording.velocities is not None,
+        robot,
+        filter,
+        decimation,
+        min_speed,
+        recording.name if name is None else name,
     )
-    return found.replace(notes=(*found.notes, *notes))
-
-
-def unlike_derivatives(recording: Recording) -> dict[int, float]:
-    """Return the channels whose velocities do not make the way of their angles within 0.2 s.
-
-    Only channels whose way is well above the noise of their angles are judged. Each
-    comes with the factor by which its velocities are too large.
-    """
-    r, squares, products = (
-        recording,
-        np.zeros((3, recording.joints)),
-        np.zeros(recording.joints),
-    )
-    steps = max(1, round(0.2 / r.sample_time))
-    for a, b in r.grid.ranges:
-        q, qd = np.asarray(r.angles)[a:b], np.asarray(r.velocities)[a:b]
-        way = r.sample_time * np.cumsum(0.5 * (qd[1:] + qd[:-1]), axis=0)
-        ends = np.concatenate([np.zeros((1, r.joints)), way])
-        moved, expected = q[steps:] - q[:-steps], ends[steps:] - ends[:-steps]
-        noise = np.diff(q, 2, axis=0)
-        products += np.sum(moved * expected, axis=0)
-        squares += [np.sum(x**2, axis=0) for x in (moved - expected, moved, noise)]
-    wrong, way, noise = squares
-    unlike = np.flatnonzero((wrong > 0.2**2 * way) & (way > 10.0**2 * noise)).tolist()
-    return {k: float(products[k] / way[k]) for k in unlike}
+    return observations.replace(notes=(*observations.notes, *notes))
 
 
 def prepare(
-    load: Callable[[list[tuple[int, int]]], AbstractSamples],
+    load: Callable[[Sequence[tuple[int, int]]], AbstractSamples],
     grid: TimeGrid,
     joints: int,
-    measured: bool,
+    has_velocities: bool,
     robot: Robot,
     filter: AbstractFilter,
     decimation: AbstractDecimation | None,
@@ -433,94 +379,101 @@ def prepare(
 ) -> Observations:
     """Return observations of a log whose usable segments `load` reads and filters.
 
-    `measured` tells whether the log holds velocities; for the rest see `observe` and
-    `scan_log`.
+    For the other arguments see `observe` and `scan_log`.
     """
     if joints != robot.joints:
         raise InputError(
             f"`{name}` has {joints} joints, but the robot `{robot.name}` has "
-            f"{robot.joints}: "
-            "choose the columns of its joints, or the robot of this log."
+            f"{robot.joints}: choose the columns of its joints, or the robot of this "
+            "log."
         )
     decimation = Subsample(1) if decimation is None else decimation
     dt = grid.sample_time
-    factor = decimation.factor
-    notes = [*grid.notes]
     decimation.check(filter.low_pass(dt).cutoff, dt)
     edge = filter.edge(dt)
-    fewest = 2 * edge + (FEWEST_ROWS - 1) * factor + 1
-    used = {
-        ends: t
-        for ends, t in zip(grid.ranges, grid.start_times, strict=True)
-        if ends[1] - ends[0] >= max(fewest, 5)
-    }
-    if not used:
-        longest = max(b - a for a, b in grid.ranges)
-        raise InputError(
-            f"the longest segment of `{name}` has {longest} samples at {1 / dt:.6g} "
-            "Hz, "
-            f"but the filter takes {edge} at each end, and {FEWEST_ROWS * factor} "
-            "more are needed: "
-            "record longer, raise `largest_gap`, lower `margin`, or check `time_unit`."
-        )
-    if short := len(grid.ranges) - len(used):
-        notes.append(
-            f"{short} segment(s), shorter than the filter's edges, were left out"
-        )
-    if measured and not filter.uses_velocities:
+    grid = _usable_segments(grid, edge, decimation.factor, name)
+    notes = grid.notes
+    if has_velocities and not filter.uses_velocities:
         kind = type(filter).__name__
-        notes.append(
+        note = (
             f"the measured velocities are not used: `{kind}` takes them from the angles"
         )
-    rows = sum(map(len, _row_samples([*used], edge, factor)))
+        notes = (*notes, note)
+    rows = sum(map(len, _row_samples(grid.ranges, edge, decimation.factor)))
     observations = Observations(
-        source=load([*used]),
+        source=load(grid.ranges),
         filter=filter,
         decimation=decimation,
-        segments=consecutive(b - a for a, b in used),
-        start_times=tuple(used.values()),
+        segments=consecutive(b - a for a, b in grid.ranges),
+        start_times=grid.start_times,
         mask=np.broadcast_to(True, (rows, joints)),
         sample_time=dt,
         name=name,
-        notes=tuple(notes),
+        notes=notes,
     )
     if min_speed is None:
         return observations
     speeds = per_joint("min_speed", np.asarray(min_speed, np.float64), joints, 0.0)
-    instants, parts = observations.instants, []
-    for chunk in observations.chunks(65536):
-        k = instants[slice(*chunk.rows)].tolist()
-        motion, _ = observations.read(slice(k[0], k[-1] + 1, factor))
-        parts.append(np.abs(np.asarray(motion.qd)) >= speeds)
-        if progress is not None:
-            progress(chunk.rows[1] / rows)
-    mask = np.concatenate(parts)
-    slow = np.flatnonzero(~mask.any(axis=0))
-    if slow.size:
-        j = int(slow[0])
+    mask = _speed_mask(observations, speeds, progress)
+    slow_joints = np.flatnonzero(~mask.any(axis=0)).tolist()
+    if slow_joints:
+        j = slow_joints[0]
         raise InputError(
             f"joint `{robot.joint_names[j]}` never reaches the speed {speeds[j]:g} of "
-            "`min_speed` "
-            f"in `{name}`: take a smaller one, or a log in which it moves."
+            f"`min_speed` in `{name}`: take a smaller one, or a log in which it moves."
         )
     return observations.replace(mask=mask)
 
 
-def joint_side(
-    robot: Robot,
-    log: Any,
-    angles: AnyArray,
-    velocities: AnyArray | None,
-    forces: AnyArray,
-) -> tuple[Any, ...]:
-    """Convert angles, velocities, forces to the joints' side; `log`: a recording, or `Columns`."""
-    angles, forces = np.asarray(angles), np.asarray(forces)
-    velocities = None if velocities is None else np.asarray(velocities)
-    if log.angles_on_motor_side:
-        angles = robot.drives.joint_angles(angles)
-        velocities = (
-            None if velocities is None else robot.drives.joint_velocities(velocities)
+def _usable_segments(grid: TimeGrid, edge: int, factor: int, name: str) -> TimeGrid:
+    """Return the segments that are long enough for a filter with edges, and rows."""
+    row_samples = (MIN_ROWS - 1) * factor + 1
+    min_samples = max(2 * edge + row_samples, MIN_SEGMENT)
+    segments = {
+        (a, b): t
+        for (a, b), t in zip(grid.ranges, grid.start_times, strict=True)
+        if b - a >= min_samples
+    }
+    if not segments:
+        samples = max(b - a for a, b in grid.ranges)
+        raise InputError(
+            f"the longest segment of `{name}` has {samples} samples at "
+            f"{1 / grid.sample_time:.6g} Hz, but the filter takes {edge} at each end, "
+            f"and {MIN_ROWS * factor} more are needed: record longer, raise "
+            "`largest_gap`, lower `margin`, or check `time_unit`."
         )
-    if log.forces_on_motor_side:
-        forces = robot.drives.joint_forces(forces)
-    return angles, velocities, forces
+    notes = grid.notes
+    lost_segments = len(grid.ranges) - len(segments)
+    if lost_segments:
+        note = (
+            f"{lost_segments} segment(s), shorter than the filter's edges, were left "
+            "out"
+        )
+        notes = (*notes, note)
+    return grid._replace(
+        ranges=tuple(segments), start_times=tuple(segments.values()), notes=notes
+    )
+
+
+def _speed_mask(
+    observations: Observations, speeds: np.ndarray, progress: Progress | None
+) -> Bool[np.ndarray, "rows joints"]:
+    """Return the rows at which each joint is as fast as its speed."""
+    instants = observations.instants
+    factor = observations.decimation.factor
+    masks = []
+    for chunk in observations.chunks(65536):
+        samples = instants[slice(*chunk.rows)]
+        first, last = int(samples[0]), int(samples[-1])
+        motion, _ = observations.read(slice(first, last + 1, factor))
+        masks.append(np.abs(np.asarray(motion.qd)) >= speeds)
+        if progress is not None:
+            progress(chunk.rows[1] / observations.rows)
+    return np.concatenate(masks)
+
+
+def _row_samples(
+    segments: Sequence[tuple[int, int]], edge: int, factor: int
+) -> list[range]:
+    """Return the samples of each segment at which rows lie."""
+    return [range(a + edge, b - edge, factor) for a, b in segments]

@@ -1,7 +1,7 @@
 """Logs read as a whole, or in parts with overlap for the filters: larger than memory."""
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import equinox as eqx
@@ -16,22 +16,21 @@ from jaxid.robot.robot import Robot
 from .columns import Columns, Log, open_log
 from .filters import AbstractDecimation, AbstractFilter
 from .log_files import LogTable
-from .observations import (
-    AbstractSamples,
-    Observations,
-    Progress,
-    joined,
-    joint_side,
-    prepare,
-)
-from .recording import NeedsMemory, Recording, TimeGrid, consecutive, find_grid
+from .observations import Observations, Progress, prepare
+from .recording import Recording, consecutive
+from .samples import AbstractSamples, joined, joint_side
+from .time_grid import NeedsMemory, TimeGrid, find_grid
 
-AT_ONCE = 65536
+PART_SIZE = 65536
 """Samples that are read at once."""
-BAD_ROWS = 1e-3
+MAX_BAD_ROWS = 1e-3
 """Fraction of the rows of a log that may be bad."""
-NAMED = 20
+MAX_NAMED_ROWS = 20
 """Bad rows that are named."""
+IMPULSE = 1e-3
+"""Size of the impulse by which the memory of a filter is found [rad or m]."""
+MAX_HALF_MEMORY = 2**20
+"""Samples within which a filter must have settled, or it needs whole logs."""
 
 
 def read_recording(
@@ -43,7 +42,7 @@ def read_recording(
     velocities_path: str | Path | None = None,
     largest_gap: float | int = 1.75,
     bridged: float = 0.0,
-    bad_rows: float = BAD_ROWS,
+    bad_rows: float = MAX_BAD_ROWS,
 ) -> Recording:
     """Read a log from CSV (any separator), Parquet, NPZ, MAT, HDF5, or a bag of ROS 1 or 2.
 
@@ -66,34 +65,38 @@ def read_recording(
     """
     log = open_log(path, columns, forces_path, velocities_path, is_lenient=True)
     angles, velocities, forces = log.read()
-    time = None if columns.sample_time is not None else log.stamps()
-    bad = log.bad_rows
-    if time is not None:
-        _find_stray_stamps(time, bad, log.tables[0])
-    rows, sample_time = len(angles), columns.sample_time
-    notes = tuple(note for table in log.tables for note in table.notes)
-    named = "; ".join(text for _, text in sorted(bad.items())[:NAMED])
-    named += f"; and {len(bad) - NAMED} more" if len(bad) > NAMED else ""
-    if len(bad) > bad_rows * rows:
+    rows = len(angles)
+    sample_time = columns.sample_time
+    stamps = log.stamps() if sample_time is None else None
+    complaints = log.bad_rows
+    if stamps is not None:
+        complaints |= _stray_stamps(stamps, complaints, log.tables[0])
+    notes = [note for table in log.tables for note in table.notes]
+    if len(complaints) > bad_rows * rows:
         raise InputError(
-            f"{len(bad)} of {rows} rows are bad: {named}; repair the log, or let "
-            "`bad_rows` be "
-            f"above {len(bad) / rows:.2g} (fraction), which leaves them out."
+            f"{len(complaints)} of {rows} rows are bad: {_listed(complaints)}; repair "
+            f"the log, or let `bad_rows` be above {len(complaints) / rows:.2g} "
+            "(fraction), which leaves them out."
         )
-    if bad:
-        kept = np.setdiff1d(np.arange(rows), [*bad])
-        if time is None:
-            time, sample_time = (columns.sample_time or 0.0) * np.arange(rows), None
-        angles, forces, time = angles[kept], forces[kept], time[kept]
-        velocities = None if velocities is None else velocities[kept]
-        left = "is bad and was" if len(bad) == 1 else "are bad and were"
-        notes += (f"{len(bad)} of {rows} rows {left} left out: {named}",)
-    angles = np.unwrap(angles, axis=0) if columns.unwrap else angles
+    if complaints:
+        if stamps is None:
+            # Rows that are left out leave gaps.
+            stamps = (sample_time or 0.0) * np.arange(rows)
+            sample_time = None
+        good_rows = np.setdiff1d(np.arange(rows), [*complaints])
+        stamps = stamps[good_rows]
+        angles = angles[good_rows]
+        forces = forces[good_rows]
+        velocities = None if velocities is None else velocities[good_rows]
+        verb = "is bad and was" if len(complaints) == 1 else "are bad and were"
+        notes.append(
+            f"{len(complaints)} of {rows} rows {verb} left out: {_listed(complaints)}"
+        )
     recording = Recording.of(
-        angles,
+        np.unwrap(angles, axis=0) if columns.unwrap else angles,
         forces,
         velocities=velocities,
-        time=time,
+        time=stamps,
         sample_time=sample_time,
         angles_on_motor_side=columns.angles_on_motor_side,
         forces_on_motor_side=columns.forces_on_motor_side,
@@ -105,16 +108,30 @@ def read_recording(
     return dataclasses.replace(recording, notes=(*notes, *recording.notes))
 
 
-def _find_stray_stamps(time: np.ndarray, bad: dict[int, str], table: LogTable) -> None:
-    """Add rows to the bad ones whose stamp alone is out of order."""
-    good = np.setdiff1d(np.arange(len(time)), [*bad])
-    for k in np.flatnonzero(np.diff(time[good]) < 0).tolist():
-        ahead = k == 0 or time[good[k + 1]] >= time[good[k - 1]]
-        row = int(good[k] if ahead else good[k + 1])
-        bad[row] = (
-            f"{table.unit} {row + table.first_row} (its time {time[row]:.9g} s is out "
-            "of order)"
+def _listed(complaints: dict[int, str]) -> str:
+    """Return complaints about rows as a sentence lists them, the first rows first."""
+    texts = [text for _, text in sorted(complaints.items())]
+    others = len(texts) - MAX_NAMED_ROWS
+    words = "; ".join(texts[:MAX_NAMED_ROWS])
+    return f"{words}; and {others} more" if others > 0 else words
+
+
+def _stray_stamps(
+    stamps: np.ndarray, complaints: dict[int, str], table: LogTable
+) -> dict[int, str]:
+    """Return complaints about rows whose stamp alone is out of order."""
+    good_rows = np.setdiff1d(np.arange(len(stamps)), [*complaints])
+    good_stamps = stamps[good_rows]
+    strays = {}
+    for k in np.flatnonzero(np.diff(good_stamps) < 0).tolist():
+        # Without a stamp that is too late, the next one would be in order.
+        is_late = k == 0 or good_stamps[k + 1] >= good_stamps[k - 1]
+        row = int(good_rows[k if is_late else k + 1])
+        strays[row] = (
+            f"{table.unit} {row + table.first_row} (its time {stamps[row]:.9g} s is "
+            "out of order)"
         )
+    return strays
 
 
 class SamplesOnDisk(AbstractSamples):
@@ -133,14 +150,15 @@ class SamplesOnDisk(AbstractSamples):
 
     def read(self, samples: slice) -> tuple[Motion, np.ndarray]:
         """Return motion and forces of some samples of one segment, joint side."""
-        begin, end = self.segments[self._segment(samples)]
-        a = max(begin, samples.start - self.overlap)
-        b = min(end, samples.stop + self.overlap)
-        rows = self.read_rows(slice(a, b))
-        angles, velocities, forces = joint_side(self.robot, self.log.columns, *rows)
-        motion = self.filter.motion(angles, velocities, self.sample_time)
-        wanted = slice(samples.start - a, samples.stop - a, samples.step)
-        return motion[wanted], forces[wanted]
+        segment = self.segments[self._segment(samples)]
+        # With the neighbours that the filter needs.
+        start = max(segment[0], samples.start - self.overlap)
+        stop = min(segment[1], samples.stop + self.overlap)
+        rows = self.read_rows(slice(start, stop))
+        q, qd, forces = joint_side(self.robot, self.log.columns, *rows)
+        motion = self.filter.motion(q, qd, self.sample_time)
+        part = slice(samples.start - start, samples.stop - start, samples.step)
+        return motion[part], forces[part]
 
     def read_all(self) -> tuple[Motion, np.ndarray]:
         """Return motion and forces of all segments; they must fit into memory."""
@@ -151,10 +169,12 @@ class SamplesOnDisk(AbstractSamples):
     ) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
         """Return angles, velocities and forces of a segment's samples as they were recorded."""
         k = self._segment(samples)
-        behind = self.first_rows[k] - self.segments[k][0]
-        return self.log.read(behind + samples.start, behind + samples.stop)
+        segment_start, _ = self.segments[k]
+        shift = self.first_rows[k] - segment_start
+        return self.log.read(samples.start + shift, samples.stop + shift)
 
     def _segment(self, samples: slice) -> int:
+        """Return the number of the segment that holds some samples."""
         return sum(a <= samples.start for a, _ in self.segments) - 1
 
 
@@ -206,34 +226,35 @@ def scan_log(
     if columns.unwrap:
         raise NeedsMemory("`unwrap` counts the turns of whole logs")
     log = open_log(path, columns, forces_path, velocities_path, on_disk=True)
-    rows = log.tables[0].rows
-    first_row = log.tables[0].first_row
-    source = Path(path)
-    measured = columns.velocities is not None
-    name = printable(source.stem) if name is None else name
+    table = log.tables[0]
+    has_velocities = columns.velocities is not None
+    name = printable(Path(path).stem) if name is None else name
     if columns.sample_time is not None:
-        grid = TimeGrid(columns.sample_time, ((0, rows),))
+        grid = TimeGrid(columns.sample_time, ((0, table.rows),))
     else:
-        limits = largest_gap, 0.0
         grid = find_grid(
-            lambda: _stamps(log), source.name, limits, first_row, in_parts=True
+            lambda: _stamps(log),
+            Path(path).name,
+            (largest_gap, 0.0),
+            table.first_row,
+            in_parts=True,
         )
     grid = grid.cropped(start, stop, name)
 
-    def load(segments: list[tuple[int, int]]) -> SamplesOnDisk:
-        overlap = filter_memory(filter, grid.sample_time, measured)
-        first_rows = tuple(a for a, _ in segments)
-        segments_here = consecutive(b - a for a, b in segments)
+    def load(ranges: Sequence[tuple[int, int]]) -> SamplesOnDisk:
+        overlap = filter_memory(filter, grid.sample_time, has_velocities)
+        segments = consecutive(b - a for a, b in ranges)
+        first_rows = tuple(a for a, _ in ranges)
         return SamplesOnDisk(
-            log, robot, filter, overlap, segments_here, first_rows, grid.sample_time
+            log, robot, filter, overlap, segments, first_rows, grid.sample_time
         )
 
-    joints = log.read(0, 1)[0].shape[1]
+    first_angles, _, _ = log.read(0, 1)
     return prepare(
         load,
         grid,
-        joints,
-        measured,
+        first_angles.shape[1],
+        has_velocities,
         robot,
         filter,
         decimation,
@@ -245,34 +266,39 @@ def scan_log(
 
 def _stamps(log: Log) -> Iterator[np.ndarray]:
     """Yield the time stamps in parts [s]."""
-    last = 0.0
-    for start in range(0, log.tables[0].rows, AT_ONCE):
+    rows = log.tables[0].rows
+    previous_time = 0.0
+    for start in range(0, rows, PART_SIZE):
         # Integers and dates count from a part's first row: the row before links parts.
-        part = log.stamps(max(0, start - 1), min(start + AT_ONCE, log.tables[0].rows))
-        if start:
-            part = (part - part[0] + last)[1:]
-        last = float(part[-1])
+        first = max(0, start - 1)
+        part = log.stamps(first, min(start + PART_SIZE, rows))
+        if start > 0:
+            part = (part - part[0] + previous_time)[1:]
+        previous_time = float(part[-1])
         yield part
 
 
-def filter_memory(filter: AbstractFilter, sample_time: float, measured: bool) -> int:
+def filter_memory(
+    filter: AbstractFilter, sample_time: float, has_velocities: bool
+) -> int:
     """Return after how many samples a filter's motion no longer depends on an angle or velocity."""
-    refusal = (
-        f"`{type(filter).__name__}` needs the whole log: take another filter, "
-        "or `read_recording`."
-    )
-    half = 4096
-    while half <= 2**20:
-        impulse = 1e-3 * (np.arange(2 * half + 1) == half)[:, None]
+    half_length = 4096
+    while half_length <= MAX_HALF_MEMORY:
+        impulse = np.zeros((2 * half_length + 1, 1))
+        impulse[half_length] = IMPULSE
+        velocities = impulse if has_velocities else None
         try:
-            motion = filter.motion(impulse, impulse if measured else None, sample_time)
-        except ValueError as error:
-            raise NeedsMemory(refusal) from error
-        size = np.abs(np.hstack([motion.q, motion.qd, motion.qdd]))
-        last, _ = np.nonzero(size > 1e-13 * size.max(axis=0))
-        reach = int(np.abs(last - half).max(initial=0))
-        if reach < half // 2:
+            motion = filter.motion(impulse, velocities, sample_time)
+        except ValueError:
+            break
+        response = np.abs(np.hstack([motion.q, motion.qd, motion.qdd]))
+        samples, _ = np.nonzero(response > 1e-13 * response.max(axis=0))
+        reach = int(np.abs(samples - half_length).max(initial=0))
+        if reach < half_length // 2:
             # The part below rounding decays at the same rate.
             return int(1.3 * reach) + 4
-        half *= 4
-    raise NeedsMemory(refusal)
+        half_length *= 4
+    raise NeedsMemory(
+        f"`{type(filter).__name__}` needs the whole log: take another filter, or "
+        "`read_recording`."
+    )

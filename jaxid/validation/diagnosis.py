@@ -14,7 +14,7 @@ from jaxid.identification.estimators import GivenWeights
 from jaxid.identification.fit_result import Fit
 from jaxid.measurement.filters import ZeroPhaseButterworth
 from jaxid.measurement.observations import Observations, Progress, observe
-from jaxid.measurement.reading import AT_ONCE, SamplesOnDisk
+from jaxid.measurement.reading import PART_SIZE, SamplesOnDisk
 from jaxid.measurement.recording import MIN_SAMPLES, Recording, consecutive
 from jaxid.result_table import (
     MISSING,
@@ -205,7 +205,7 @@ def diagnose(
     for a, b in whole.segments:
         # Differences at the ends of parts are not central: logs in memory are taken at
         # once.
-        step = AT_ONCE if isinstance(whole.source, SamplesOnDisk) else b - a
+        step = PART_SIZE if isinstance(whole.source, SamplesOnDisk) else b - a
         for start in range(a, b, step):
             samples = slice(start, min(start + step, b))
             statistics.add(*whole.read(samples), whole.sample_time)

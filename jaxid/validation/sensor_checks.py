@@ -7,8 +7,7 @@ from scipy import ndimage
 
 from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics.motion import Motion
-from jaxid.measurement.observations import unlike_derivatives
-from jaxid.measurement.recording import Recording
+from jaxid.measurement.recording import Recording, unlike_derivatives
 from jaxid.robot.robot import Robot
 
 from .torque_errors import STANDING

@@ -14,7 +14,7 @@ from jaxid.identification.friction_laws.presliding_lengths import (
     LENGTHS as LENGTHS_TRIED,
 )
 from jaxid.identification.problem import RegressionProblem
-from jaxid.measurement.friction_state import PART, SamplesWithMemory, with_memory
+from jaxid.measurement.friction_state import PART_SIZE, SamplesWithMemory, with_memory
 from jaxid.simulation.friction_and_disturbances import LuGreFriction
 from jaxid.simulation.virtual import Sensors, VirtualRobot, random_bodies
 from jaxid.trajectory.spline import spline_through
@@ -141,13 +141,19 @@ def test_a_joint_that_does_not_move_is_taken_to_slide_at_once():
 @pytest.mark.parametrize("filtered", [False, True])
 def test_parts_of_a_log_streams_and_the_whole_agree(filtered):
     cut = jid.ZeroPhaseButterworth(20.0) if filtered else None
-    samples = 3 * PART + 100
-    log, _ = log_of(samples, segments=((0, PART + 7), (PART + 7, samples)), filter=cut)
+    samples = 3 * PART_SIZE + 100
+    log, _ = log_of(
+        samples, segments=((0, PART_SIZE + 7), (PART_SIZE + 7, samples)), filter=cut
+    )
     law = Presliding(LENGTHS)
     base = jid.base_parameters(model_of(law))
     source = SamplesWithMemory(log.source, law, log.segments)
     whole = with_memory(log, law).motion.state
-    for a, b, step in ((0, 5, 1), (PART - 3, PART + 7, 2), (PART + 7, samples, 50)):
+    for a, b, step in (
+        (0, 5, 1),
+        (PART_SIZE - 3, PART_SIZE + 7, 2),
+        (PART_SIZE + 7, samples, 50),
+    ):
         part, forces = source.read(slice(a, b, step))
         np.testing.assert_allclose(part.state, whole[a:b:step], atol=1e-12)
         np.testing.assert_array_equal(forces, np.asarray(log.forces)[a:b:step])

@@ -55,7 +55,7 @@ def text(parquet, tmp_path):
 @pytest.fixture
 def short_parts(monkeypatch):
     monkeypatch.setattr(text_files, "BLOCK_SIZE", 5000)
-    monkeypatch.setattr("jaxid.measurement.reading.AT_ONCE", 3000)
+    monkeypatch.setattr("jaxid.measurement.reading.PART_SIZE", 3000)
 
 
 def in_memory(base, path, decimation, filter=SMOOTH):

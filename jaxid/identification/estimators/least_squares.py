@@ -12,7 +12,8 @@ from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
-from jaxid.measurement.observations import Observations, SamplesInMemory
+from jaxid.measurement.observations import Observations
+from jaxid.measurement.samples import SamplesInMemory
 from jaxid.trajectory.trajectory import AbstractTrajectory
 
 from ..factors import Blocks, JointFactor, RowChunk

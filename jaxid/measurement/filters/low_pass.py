@@ -91,8 +91,7 @@ def kernel_gain(
 ) -> np.ndarray:
     """Return the size of the gain of a weighted mean for some frequencies [Hz]."""
     angular = 2 * math.pi * np.asarray(frequency) * sample_time
-    _, response = signal.freqz(kernel, worN=angular)
-    return np.abs(response)
+    return np.abs(np.polyval(kernel, np.exp(1j * angular)))
 
 
 class RecursiveLowPass(AbstractLowPass):
@@ -153,9 +152,11 @@ def _clear_memory(sos: np.ndarray, radius: float, tolerance: float) -> int:
     impulse = np.zeros(samples)
     impulse[0] = 1.0
     forward = signal.sosfilt(sos, impulse)
-    both_ways = np.abs(signal.correlate(forward, forward, method="fft"))
-    tail = both_ways[samples - 1 :]
-    return int(np.flatnonzero(tail > tolerance * tail[0])[-1]) + 1
+    both_ways = signal.correlate(forward, forward, method="fft")
+    tail = np.abs(both_ways[samples - 1 :])
+    is_above = tail > tolerance * tail[0]
+    last_sample = np.flatnonzero(is_above)[-1]
+    return int(last_sample) + 1
 
 
 def _filter_both_ways(sos: np.ndarray, x: Array, padding: int) -> Array:
@@ -192,7 +193,7 @@ def float_array(x: Any) -> Any:
     return x if isinstance(x, jax.Array) else np.asarray(x, np.float64)
 
 
-ALL_PASS = Convolution((1.0,), math.inf)
+ALL_PASS = Convolution(kernel=(1.0,), cutoff=math.inf)
 """Low-pass that changes nothing."""
 
 
@@ -213,7 +214,7 @@ def recursive(sos: np.ndarray, cutoff: float) -> RecursiveLowPass:
     sos = sos.copy()
     sos[0, :3] /= gain
     sections = tuple(tuple(row) for row in sos.tolist())
-    return RecursiveLowPass(sections, cutoff)
+    return RecursiveLowPass(sections=sections, cutoff=cutoff)
 
 
 def require_cutoff(name: str, cutoff: float, sample_time: float) -> None:

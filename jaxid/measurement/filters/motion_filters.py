@@ -31,6 +31,8 @@ from .low_pass import (
     require_cutoff,
 )
 
+MAX_SERIES_ERROR = 0.05
+"""Largest error of a Fourier series, relative to the motion (RMS)."""
 MAX_WINDOW = 10**5
 """Samples of the longest window of a polynomial."""
 
@@ -66,13 +68,15 @@ class ZeroPhaseButterworth(AbstractFilter):
     def motion(self, angles, velocities, sample_time) -> Motion:  # noqa: D102
         smooth = butterworth(self.cutoff, self.order, sample_time)
         # From the first sample on, so that a joint at rest stays exactly at rest.
-        way = smooth(angles - angles[0])
-        q = angles[0] + way
+        path = smooth(angles - angles[0])
+        q = angles[0] + path
         if velocities is None:
-            qd = first_difference(way, sample_time)
-            return Motion(q, qd, second_difference(way, sample_time))
+            qd = first_difference(path, sample_time)
+            qdd = second_difference(path, sample_time)
+            return Motion(q, qd, qdd)
         change = smooth(velocities - velocities[0])
-        return Motion(q, velocities[0] + change, first_difference(change, sample_time))
+        qd = velocities[0] + change
+        return Motion(q, qd, first_difference(change, sample_time))
 
     def low_pass(self, sample_time: float) -> AbstractLowPass:  # noqa: D102
         if self.force_cutoff is None:
@@ -117,14 +121,16 @@ class SavitzkyGolay(AbstractFilter):
         q = angles[0] + self._derivative(path, 0, sample_time)
         if velocities is None:
             qd = self._derivative(path, 1, sample_time)
-            return Motion(q, qd, self._derivative(path, 2, sample_time))
+            qdd = self._derivative(path, 2, sample_time)
+            return Motion(q, qd, qdd)
         change = velocities - velocities[0]
         qd = velocities[0] + self._derivative(change, 0, sample_time)
         return Motion(q, qd, self._derivative(change, 1, sample_time))
 
     def low_pass(self, sample_time: float) -> AbstractLowPass:  # noqa: D102
         kernel = self._kernel(0, sample_time)
-        return Convolution(tuple(kernel.tolist()), half_gain(kernel, sample_time))
+        cutoff = half_gain(kernel, sample_time)
+        return Convolution(kernel=tuple(kernel.tolist()), cutoff=cutoff)
 
     def edge(self, sample_time: float) -> int:  # noqa: D102
         return settled_edge(self.margin, sample_time, self.low_pass(sample_time))
@@ -193,12 +199,12 @@ class PaperFilter(AbstractFilter):
         require_margin(self)
 
     def motion(self, angles, velocities, sample_time) -> Motion:  # noqa: D102
-        way = angles - angles[0]
+        path = angles - angles[0]
         b, a = _bilinear("velocity", [1.0, 0.0], self.velocity, sample_time)
-        qd = np.asarray(signal.lfilter(b, a, way, axis=0))
+        qd = np.asarray(signal.lfilter(b, a, path, axis=0))
         b, a = _bilinear("acceleration", [1.0, 0.0], self.acceleration, sample_time)
         padding = min(len(angles) - 1, self.low_pass(sample_time).memory(SETTLED))
-        minus = signal.filtfilt(b, a, way, axis=0, padtype="odd", padlen=padding)
+        minus = signal.filtfilt(b, a, path, axis=0, padtype="odd", padlen=padding)
         return Motion(angles, qd, -minus)
 
     def low_pass(self, sample_time: float) -> AbstractLowPass:  # noqa: D102
@@ -217,8 +223,8 @@ class PeriodicFourier(AbstractFilter):
     Each segment has a series of its own, by least squares over all of its samples,
     which must span at least one period. Forces and columns are not averaged over the
     periods: least squares do that, and the scatter between the periods tells the
-        uncertainty. They are filtered by a
-    zero-phase Butterworth low-pass. Measured velocities are not used.
+    uncertainty. They are filtered by a zero-phase Butterworth low-pass. Measured
+    velocities are not used.
 
     Attributes:
         period: Period of the motion [s], like `10.0`.
@@ -248,46 +254,53 @@ class PeriodicFourier(AbstractFilter):
 
     def motion(self, angles, velocities, sample_time) -> Motion:  # noqa: D102
         t = sample_time * np.arange(len(angles))
-        if len(t) * sample_time < (1 - 1e-9) * self.period:
+        duration = len(t) * sample_time
+        if duration < (1 - 1e-9) * self.period:
             raise InputError(
-                f"`period` of `PeriodicFourier` is {self.period:g} s, but a segment "
-                "of the log "
-                f"lasts {len(t) * sample_time:g} s: record whole periods, or use "
-                "another filter."
+                f"`period` of `PeriodicFourier` is {self.period:g} s, but a segment of "
+                f"the log lasts {duration:g} s: record whole periods, or use another "
+                "filter."
             )
         require_cutoff("harmonics / period", self.harmonics / self.period, sample_time)
-        w = 2 * math.pi / self.period * np.arange(1, self.harmonics + 1)
-        s, c = np.sin(np.outer(t, w)), np.cos(np.outer(t, w))
-        basis = np.hstack([np.ones((len(t), 1)), s, c])
+        omega = 2 * math.pi / self.period * np.arange(1, self.harmonics + 1)
+        sines = np.sin(np.outer(t, omega))
+        cosines = np.cos(np.outer(t, omega))
+        basis = np.hstack([np.ones((len(t), 1)), sines, cosines])
         series = np.linalg.lstsq(basis, angles - angles[0], rcond=None)[0]
         q = angles[0] + basis @ series
-        moved = angles.std(axis=0)
-        left = np.sqrt(np.mean((angles - q) ** 2, axis=0))
-        wrong = np.flatnonzero(left > 0.05 * np.maximum(moved, 0.05 * moved.max()))
-        if wrong.size:
-            j = int(wrong[0])
-            raise InputError(
-                f"the angles of joint {j + 1} leave a Fourier series by "
-                f"{left[j] / moved[j]:.0%} "
-                "of their motion (RMS): correct `period` or `harmonics`, or crop the "
-                "log."
-            )
+        _require_series(angles, q)
         a = series[1 : self.harmonics + 1]
         b = series[self.harmonics + 1 :]
-        W = w[:, None]
-        return Motion(q, c @ (W * a) - s @ (W * b), -s @ (W**2 * a) - c @ (W**2 * b))
+        w = omega[:, None]
+        qd = cosines @ (w * a) - sines @ (w * b)
+        qdd = -sines @ (w**2 * a) - cosines @ (w**2 * b)
+        return Motion(q, qd, qdd)
 
     def low_pass(self, sample_time: float) -> AbstractLowPass:  # noqa: D102
-        lines = (
-            10.0 * self.harmonics
-            if self.force_harmonics is None
-            else self.force_harmonics
-        )
+        harmonics = self.force_harmonics
+        if harmonics is None:
+            harmonics = 10.0 * self.harmonics
         name = "force_harmonics / period"
-        return butterworth(lines / self.period, self.order, sample_time, name)
+        return butterworth(harmonics / self.period, self.order, sample_time, name)
 
     def edge(self, sample_time: float) -> int:  # noqa: D102
         return settled_edge(self.margin, sample_time, self.low_pass(sample_time))
+
+
+def _require_series(angles: np.ndarray, q: np.ndarray) -> None:
+    """Refuse angles that are no Fourier series of the period."""
+    motion = angles.std(axis=0)
+    error = np.sqrt(np.mean((angles - q) ** 2, axis=0))
+    # A joint that hardly moves shows nothing but the steps of its encoder.
+    reference = np.maximum(motion, MAX_SERIES_ERROR * motion.max())
+    wrong_joints = np.flatnonzero(error > MAX_SERIES_ERROR * reference).tolist()
+    if wrong_joints:
+        j = wrong_joints[0]
+        raise InputError(
+            f"the angles of joint {j + 1} leave a Fourier series by "
+            f"{error[j] / motion[j]:.0%} of their motion (RMS): correct `period` or "
+            "`harmonics`, or crop the log."
+        )
 
 
 def _bilinear(
@@ -311,7 +324,9 @@ def first_difference(
     """Return central differences of fourth order; of second order next to the ends."""
     # At 125 Hz those of second order would lose 1 % of a velocity at 5 Hz.
     d = np.gradient(x, sample_time, axis=0, edge_order=2)
-    d[2:-2] = (8 * (x[3:-1] - x[1:-3]) - (x[4:] - x[:-4])) / (12 * sample_time)
+    nearest = x[3:-1] - x[1:-3]
+    second_nearest = x[4:] - x[:-4]
+    d[2:-2] = (8 * nearest - second_nearest) / (12 * sample_time)
     return d
 
 
@@ -319,9 +334,15 @@ def second_difference(
     x: Float[np.ndarray, "samples joints"], sample_time: float
 ) -> Float[np.ndarray, "samples joints"]:
     """Return second differences of fourth order; of second next to the ends, constant at them."""
+    before = x[1:-3]
+    middle = x[2:-2]
+    after = x[3:-1]
+    second_nearest = x[4:] + x[:-4]
+    difference = 16 * (after + before) - second_nearest - 30 * middle
+
     d = np.empty_like(x)
     d[1:-1] = (x[2:] - 2 * x[1:-1] + x[:-2]) / sample_time**2
-    inner = 16 * (x[3:-1] + x[1:-3]) - (x[4:] + x[:-4]) - 30 * x[2:-2]
-    d[2:-2] = inner / (12 * sample_time**2)
-    d[0], d[-1] = d[1], d[-2]
+    d[2:-2] = difference / (12 * sample_time**2)
+    d[0] = d[1]
+    d[-1] = d[-2]
     return d

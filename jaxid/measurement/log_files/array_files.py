@@ -12,7 +12,7 @@ import numpy as np
 from jaxid.io import import_extra
 
 from .log_file import AbstractLogFile, Channels
-from .log_table import LogTable, readable
+from .log_table import BadRows, LogTable, readable
 
 
 class AbstractArrayFile(AbstractLogFile):
@@ -38,8 +38,7 @@ class AbstractArrayFile(AbstractLogFile):
     def names(self) -> Sequence[str]:  # noqa: D102
         return tuple(self.arrays)
 
-    def table(self, channels: Channels, on_disk: bool, is_lenient: bool) -> LogTable:  # noqa: D102
-        bad_rows = {} if is_lenient else None
+    def table(self, channels: Channels, on_disk: bool, bad_rows: BadRows) -> LogTable:  # noqa: D102
         return LogTable(self.path.name, self.arrays, channels, bad_rows=bad_rows)
 
 

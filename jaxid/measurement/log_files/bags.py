@@ -17,7 +17,7 @@ from jaxid.errors import InputError
 from jaxid.io import import_extra
 
 from .log_file import AbstractLogFile, Channels, Selections
-from .log_table import LogTable, readable
+from .log_table import BadRows, LogTable, readable
 
 STAMP = ".header.stamp"
 """Field of a topic with the times of measurement."""
@@ -47,22 +47,49 @@ class BagFile(AbstractLogFile):
     def clock(self) -> str:  # noqa: D102
         return CLOCK
 
-    def table(self, channels: Channels, on_disk: bool, is_lenient: bool) -> LogTable:  # noqa: D102
+    def table(self, channels: Channels, on_disk: bool, bad_rows: BadRows) -> LogTable:  # noqa: D102
         names = list(itertools.chain(*channels.values()))
         columns, notes = join_topics(self.path.name, self.topics, names)
-        bad_rows = {} if is_lenient else None
         return LogTable(
             self.path.name, columns, channels, bad_rows=bad_rows, notes=notes
         )
 
 
 def selected_topics(selections: Selections) -> set[str]:
-    """Return the topics of columns, which are the parts of their names before a point."""
+    """Return the topics of columns."""
     topics = set()
     for selection in selections.values():
         columns = selection if isinstance(selection, tuple) else [selection]
-        topics |= {str(column).partition(".")[0] for column in columns}
+        topics |= set(map(topic_of, columns))
     return topics
+
+
+def topic_of(column: str | int | None) -> str:
+    """Return the topic of a column: the part of its name before a point."""
+    return str(column).partition(".")[0]
+
+
+class TimeSeries(NamedTuple):
+    """Values of a field and their times."""
+
+    times: np.ndarray  # [ns]
+    values: np.ndarray
+
+    def interpolated(self, targets: np.ndarray) -> np.ndarray:
+        """Return values at other times [ns]; NaN outside and in pauses."""
+        order = np.argsort(self.times, kind="stable")
+        # Float64 holds nanoseconds only if they do not count from 1970.
+        t = (self.times[order] - targets[0]).astype(np.float64)
+        target_t = (targets - targets[0]).astype(np.float64)
+        values = np.interp(target_t, t, self.values[order], left=np.nan, right=np.nan)
+
+        steps = np.diff(t, prepend=t[0])
+        is_pause = steps > MAX_STEP_RATIO * np.median(steps)
+        # The step that ends at or after each target.
+        index = np.searchsorted(t, target_t)
+        index = np.minimum(index, len(t) - 1)
+        is_between = t[index] != target_t
+        return np.where(is_pause[index] & is_between, np.nan, values)
 
 
 class Topic(NamedTuple):
@@ -72,9 +99,11 @@ class Topic(NamedTuple):
     recording_times: array  # [ns]
     columns: dict[str, tuple[array, array]]  # numbers of messages, and their values
 
-    def times(self, are_recorded: bool) -> np.ndarray:
-        """Return the times of recording of all messages, or those of measurement [ns]."""
-        return np.asarray(self.recording_times if are_recorded else self.stamps)
+    def time_series(self, column: str, are_recorded: bool) -> TimeSeries:
+        """Return the values of a column by the times of recording, or of measurement."""
+        rows, values = map(np.asarray, self.columns[column])
+        times = self.recording_times if are_recorded else self.stamps
+        return TimeSeries(np.asarray(times)[rows], values)
 
 
 class Field(NamedTuple):
@@ -216,35 +245,36 @@ def join_topics(
     clock = clocks[0] if clocks else CLOCK
     names = [name for name in names if name != clock]
     owners = {name: topic for topic in topics for name in topic.columns}
-    are_stamped = all(all(owners[name].stamps) for name in names)
-    are_recorded = clock.endswith(RECORDING_TIME) or (
-        clock == CLOCK and not are_stamped
-    )
+    are_recorded = clock.endswith(RECORDING_TIME)
+    if clock == CLOCK:
+        are_recorded = not all(all(owners[name].stamps) for name in names)
 
-    times = {}
-    values = {}
-    for name in names:
-        rows, numbers = owners[name].columns[name]
-        times[name] = owners[name].times(are_recorded)[np.asarray(rows)]
-        values[name] = np.asarray(numbers)
-
-    joint_times = times[names[0]]
-    is_common = np.ones(len(joint_times), bool)
-    foreign_topics = []
-    for name in names:
-        if not np.array_equal(times[name], joint_times):
-            values[name] = _interpolated(times[name], values[name], joint_times)
-            is_common &= np.isfinite(values[name])
-            foreign_topics.append(name.partition(".")[0])
+    fields = {name: owners[name].time_series(name, are_recorded) for name in names}
+    times = fields[names[0]].times
+    foreign_names = [x for x in names if not np.array_equal(fields[x].times, times)]
+    values = {name: fields[name].values for name in names}
+    is_common = np.ones(len(times), bool)
+    for name in foreign_names:
+        values[name] = fields[name].interpolated(times)
+        is_common &= np.isfinite(values[name])
     if not is_common.any():
         raise InputError(
             f"the topics of `{source}` overlap nowhere in time: compare their clocks."
         )
+    columns: dict[str, Any] = {name: values[name][is_common] for name in names}
+    columns[clock] = pl.Series(times[is_common].astype("M8[ns]"))
+    return columns, _join_notes(names[0], foreign_names, is_common)
 
-    main_topic = names[0].partition(".")[0]
+
+def _join_notes(
+    main_name: str, foreign_names: Sequence[str], is_common: np.ndarray
+) -> tuple[str, ...]:
+    """Return remarks about topics with other times, and messages that were left out."""
+    main_topic = topic_of(main_name)
+    foreign_topics = dict.fromkeys(map(topic_of, foreign_names))
     notes = [
         f"`{topic}` is interpolated linearly at the times of `{main_topic}`"
-        for topic in dict.fromkeys(foreign_topics)
+        for topic in foreign_topics
     ]
     lost_messages = int(np.sum(~is_common))
     if lost_messages:
@@ -252,23 +282,4 @@ def join_topics(
             f"{lost_messages} of {len(is_common)} messages were left out: other "
             "topics pause there"
         )
-    columns = {name: values[name][is_common] for name in names}
-    dates = pl.Series(joint_times[is_common].astype("M8[ns]"))
-    return {**columns, clock: dates}, tuple(notes)
-
-
-def _interpolated(
-    times: np.ndarray, values: np.ndarray, targets: np.ndarray
-) -> np.ndarray:
-    """Return values at other times; NaN outside and in pauses."""
-    order = np.argsort(times, kind="stable")
-    # Float64 holds nanoseconds only if they do not count from 1970.
-    x = (times[order] - targets[0]).astype(np.float64)
-    target_x = (targets - targets[0]).astype(np.float64)
-    result = np.interp(target_x, x, values[order], left=np.nan, right=np.nan)
-
-    steps = np.diff(x, prepend=x[0])
-    next_index = np.minimum(np.searchsorted(x, target_x), len(x) - 1)
-    is_long = steps[next_index] > MAX_STEP_RATIO * np.median(steps)
-    is_between = x[next_index] != target_x
-    return np.where(is_long & is_between, np.nan, result)
+    return tuple(notes)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from jaxid.errors import InputError
 
-from .log_table import LogTable
+from .log_table import BadRows, LogTable
 
 Selection = str | int | tuple[str | int, ...]
 """A name, a pattern with `{}` for the joint's number, a position from 0, or several."""
@@ -37,11 +37,11 @@ class AbstractLogFile(abc.ABC):
         """Names of the columns; their positions if there is no header."""
 
     @abc.abstractmethod
-    def table(self, channels: Channels, on_disk: bool, is_lenient: bool) -> LogTable:
+    def table(self, channels: Channels, on_disk: bool, bad_rows: BadRows) -> LogTable:
         """Return the columns of some channels; on the disk if they can stay there.
 
-        Rows that cannot be read are an error, unless `is_lenient`: then `bad_rows` of
-        the table names them.
+        Complaints about rows that cannot be read go into `bad_rows`, by their numbers;
+        the first one is an error if that is None.
         """
 
     @property

@@ -14,6 +14,9 @@ from jaxid.errors import InputError
 
 from ..recording import MAX_NUMBER
 
+BadRows = dict[int, str] | None
+"""Complaints about rows that cannot be read, by their numbers; None if each is an error."""
+
 
 @contextlib.contextmanager
 def readable(source: str, kind: str) -> Iterator[None]:
@@ -51,7 +54,7 @@ class LogTable:
     channels: Mapping[str, tuple[str, ...]]
     first_row: int = 1
     unit: str = "row"
-    bad_rows: dict[int, str] | None = None
+    bad_rows: BadRows = None
     notes: tuple[str, ...] = ()
 
     @functools.cached_property

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import polars as pl
 
 from .log_file import AbstractLogFile, Channels
-from .log_table import LogTable, readable
+from .log_table import BadRows, LogTable, readable
 
 PAUSE = 10.0
 """Time from one episode of a data set to the next [s]: a gap in any log."""
@@ -34,8 +34,7 @@ class ParquetFile(AbstractLogFile):
     def clock(self) -> str:  # noqa: D102
         return "timestamp" if has_episodes(self.frame) else ""
 
-    def table(self, channels: Channels, on_disk: bool, is_lenient: bool) -> LogTable:  # noqa: D102
-        bad_rows = {} if is_lenient else None
+    def table(self, channels: Channels, on_disk: bool, bad_rows: BadRows) -> LogTable:  # noqa: D102
         return LogTable(self.path.name, self.frame, channels, bad_rows=bad_rows)
 
     def estimated_rows(self) -> int:  # noqa: D102

@@ -19,7 +19,7 @@ import polars as pl
 from jaxid.errors import InputError
 
 from .log_file import AbstractLogFile, Channels
-from .log_table import LogTable, readable
+from .log_table import BadRows, LogTable, readable
 
 HEAD_SIZE = 65536
 """Bytes from which the format is detected."""
@@ -54,19 +54,22 @@ class TextFormat(NamedTuple):
             frame = frame.select(pl.all().str.replace(",", ".", literal=True))
         return frame.to_dict(as_series=True)
 
-    def bad_lines(self, lines: Sequence[bytes]) -> dict[int, str]:
+    def bad_lines(self, block: bytes) -> dict[int, str]:
         """Return complaints about lines that are no rows, by their positions."""
         separator = self.separator.encode()
         columns = len(self.names)
+        is_suspect = count_per_line(block, separator) != columns - 1
+        if b'"' in block:
+            is_suspect |= count_per_line(block, b'"') > 0
+        suspects = np.flatnonzero(is_suspect).tolist()
+        lines = block.split(b"\n") if suspects else []
         complaints = {}
-        for k, line in enumerate(lines):
+        for k in suspects:
             # Separators between quotation marks are text.
-            text = b"".join(line.split(b'"')[::2]) if b'"' in line else line
-            cells = text.count(separator) + 1
-            if line.count(b'"') % 2:
+            text = b"".join(lines[k].split(b'"')[::2])
+            cells = text.count(separator) + 1 if lines[k].strip() else 0
+            if lines[k].count(b'"') % 2:
                 complaints[k] = "an open quotation"
-            elif not line or line.isspace():
-                complaints[k] = f"0 cells, but {columns} columns"
             elif cells != columns:
                 complaints[k] = f"{cells} cells, but {columns} columns"
         return complaints
@@ -97,14 +100,14 @@ class TextFile(AbstractLogFile):
         head = self._head()
         return self.path.stat().st_size * head.count(b"\n") // max(len(head), 1)
 
-    def table(self, channels: Channels, on_disk: bool, is_lenient: bool) -> LogTable:  # noqa: D102
+    def table(self, channels: Channels, on_disk: bool, bad_rows: BadRows) -> LogTable:  # noqa: D102
         table = LogTable(
             self.path.name,
             columns={},
             channels=channels,
             first_row=2 if self.has_header else 1,
             unit="line",
-            bad_rows={} if is_lenient else None,
+            bad_rows=bad_rows,
         )
         if on_disk:
             columns = pl.scan_parquet(self._parquet_folder(table) / "*.parquet")
@@ -153,25 +156,27 @@ class TextFile(AbstractLogFile):
             raise InputError(f"`{self.path.name}` has no rows: is the log cut?")
 
     def _cells(
-        self, block: bytes, first_line: int, bad_rows: dict[int, str] | None
+        self, block: bytes, first_line: int, bad_rows: BadRows
     ) -> dict[str, pl.Series]:
         """Return the cells of whole lines; those of lines that are no rows are empty."""
-        source, separator = self.path.name, self.format.separator
-        lines = block.split(b"\n")
-        if separator == " ":
-            lines = [b" ".join(line.split()) for line in lines]
-        complaints = self.format.bad_lines(lines)
-        for k, complaint in complaints.items():
-            number = first_line + k
-            if bad_rows is None:
-                raise InputError(
-                    f"line {number} of `{source}` is no row ({complaint}): repair or "
-                    "remove that line."
-                )
-            bad_rows[number] = f"line {number} ({complaint})"
-            lines[k] = self.format.empty_line()
-        with readable(source, "table of text"):
-            return self.format.read_lines(b"\n".join(lines))
+        if self.format.separator == " ":
+            lines = block.split(b"\n")
+            block = b"\n".join(b" ".join(line.split()) for line in lines)
+        complaints = self.format.bad_lines(block)
+        if complaints:
+            lines = block.split(b"\n")
+            for k, complaint in complaints.items():
+                number = first_line + k
+                if bad_rows is None:
+                    raise InputError(
+                        f"line {number} of `{self.path.name}` is no row ({complaint}): "
+                        "repair or remove that line."
+                    )
+                bad_rows[number] = f"line {number} ({complaint})"
+                lines[k] = self.format.empty_line()
+            block = b"\n".join(lines)
+        with readable(self.path.name, "table of text"):
+            return self.format.read_lines(block)
 
 
 def line_blocks(file: BinaryIO) -> Iterator[bytes]:
@@ -183,6 +188,16 @@ def line_blocks(file: BinaryIO) -> Iterator[bytes]:
         blank_lines = block[len(rows) :].partition(b"\n")[2] if rows else block
         if rows:
             yield rows
+
+
+def count_per_line(block: bytes, character: bytes) -> np.ndarray:
+    """Return how often each line of a text holds a character."""
+    text = np.frombuffer(block, np.uint8)
+    line_ends = np.flatnonzero(text == ord("\n"))
+    positions = np.flatnonzero(text == ord(character))
+    # Positions before the end of each line.
+    counts = np.searchsorted(positions, np.append(line_ends, len(text)))
+    return np.diff(counts, prepend=0)
 
 
 def _ticks(part: LogTable, name: str, numbers: np.ndarray) -> Any:

@@ -1,0 +1,117 @@
+"""Motion and forces of a log at the full rate, in memory or on disk."""
+
+import abc
+import functools
+import math
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from jaxid.arrays import AnyArray, Float
+from jaxid.dynamics.motion import Motion
+from jaxid.robot.robot import Robot
+
+
+class AbstractSamples(eqx.Module):
+    """Motion and forces at the full rate, joint side, in memory or on disk."""
+
+    @abc.abstractmethod
+    def read(self, samples: slice) -> tuple[Motion, Float[AnyArray, "samples joints"]]:
+        """Return motion and forces of some samples of one segment."""
+
+    @abc.abstractmethod
+    def read_all(self) -> tuple[Motion, Float[AnyArray, "samples joints"]]:
+        """Return motion and forces of all segments."""
+
+
+class SamplesInMemory(AbstractSamples):
+    """Filtered motion and unfiltered forces [N m or N] as arrays."""
+
+    motion: Motion
+    forces: Float[AnyArray, "samples joints"]
+
+    def read(self, samples):  # noqa: D102
+        return self.motion[samples], np.asarray(self.forces)[samples]
+
+    def read_all(self):  # noqa: D102
+        return self.motion, self.forces
+
+
+class Chunk(NamedTuple):
+    """Part of the observations whose columns fit into memory."""
+
+    # half-open range of samples whose columns are needed (rows and overlap)
+    samples: tuple[int, int]
+    rows: tuple[int, int]  # half-open range of the resulting rows
+    # function that turns columns at these samples into these rows
+    reduce: Callable[[AnyArray], np.ndarray]
+
+
+class Overlap(NamedTuple):
+    """Samples that filters need beside those of the rows."""
+
+    edge: int  # samples to drop at both ends of a segment
+    smoothing: int  # memory of the filter of columns
+    decimation: int  # memory of the filters of the decimation
+    factor: int  # samples for each row
+
+    def chunk(
+        self,
+        segment: tuple[int, int],
+        first_row: int,
+        rows: tuple[int, int],
+        reduce: Callable[[slice, slice, AnyArray], Any],
+    ) -> Chunk:
+        """Return the part of a segment for some rows.
+
+        Args:
+            segment: Samples of the segment.
+            first_row: First row of the segment.
+            rows: Rows.
+            reduce: Function of the samples between the edges, the rows among them, and
+                columns that returns the rows.
+        """
+        start = rows[0] - first_row
+        stop = rows[1] - first_row
+        # Decimation keeps its phase: its first input sample is a row.
+        extra_rows = math.ceil(self.decimation / self.factor)
+        input_row = max(0, start - extra_rows)
+
+        first_sample = segment[0] + self.edge
+        last_sample = first_sample + (stop - 1) * self.factor
+        low = first_sample + input_row * self.factor
+        high = min(segment[1] - self.edge, last_sample + self.decimation + 1)
+        begin = max(segment[0], low - self.smoothing)
+        end = min(segment[1], high + self.smoothing)
+
+        inputs = slice(low - begin, high - begin)
+        outputs = slice(start - input_row, stop - input_row)
+        return Chunk((begin, end), rows, functools.partial(reduce, inputs, outputs))
+
+
+def joined(parts: Iterable[Any]) -> Any:
+    """Return trees of arrays, such as motions and forces, one behind the other."""
+    return jax.tree.map(lambda *x: np.concatenate(x), *parts)
+
+
+def joint_side(
+    robot: Robot,
+    log: Any,
+    angles: AnyArray,
+    velocities: AnyArray | None,
+    forces: AnyArray,
+) -> tuple[Any, ...]:
+    """Convert angles, velocities, forces to the joints' side; `log`: a recording, or `Columns`."""
+    drives = robot.drives
+    q = np.asarray(angles)
+    qd = None if velocities is None else np.asarray(velocities)
+    forces = np.asarray(forces)
+    if log.angles_on_motor_side:
+        q = drives.joint_angles(q)
+        qd = None if qd is None else drives.joint_velocities(qd)
+    if log.forces_on_motor_side:
+        forces = drives.joint_forces(forces)
+    return q, qd, forces

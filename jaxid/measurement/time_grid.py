@@ -1,0 +1,337 @@
+"""The uniform grid behind the time stamps of a log, its gaps, and resampling onto it."""
+
+from collections.abc import Callable, Iterable, Iterator
+from typing import NamedTuple
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from jaxid.errors import InputError
+
+MAX_JITTER = 0.05
+"""Largest deviation of stamps from a uniform grid, in sample times, that is ignored."""
+MIN_STEP = 0.1
+"""Distance of two stamps, in sample times, up to which their rows are one sample, logged twice."""
+MIN_SEGMENT = 4
+"""Smallest number of rows without a gap that can be a segment."""
+MIN_SAMPLES = 10
+"""Smallest number of samples that can be filtered."""
+
+
+class NeedsMemory(InputError):  # noqa: N818 (the name says what to do)
+    """A log that can be read only as a whole; the message gives the reason."""
+
+
+class TimeGrid(NamedTuple):
+    """Uniform stretches of a log: half-open ranges of rows, and the times at which they start [s].
+
+    The `deviation` is the largest one of the stamps from the grid [s].
+    """
+
+    sample_time: float
+    ranges: tuple[tuple[int, int], ...]
+    start_times: tuple[float, ...] = (0.0,)
+    notes: tuple[str, ...] = ()
+    deviation: float = 0.0
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether the rows lie on the grid as they are."""
+        return self.deviation <= MAX_JITTER * self.sample_time
+
+    def cropped(self, start: float, stop: float, name: str) -> "TimeGrid":
+        """Return the part from `start` [s] on and before `stop` [s]."""
+        dt = self.sample_time
+        ranges = []
+        start_times = []
+        for (a, b), t in zip(self.ranges, self.start_times, strict=True):
+            # A time on the grid counts as such in spite of rounding.
+            bounds = np.ceil((np.array([start, stop]) - t) / dt - 1e-6)
+            low, high = np.clip(bounds, 0, b - a).astype(int).tolist()
+            if low < high:
+                ranges.append((a + low, a + high))
+                start_times.append(t + low * dt)
+        samples = sum(b - a for a, b in ranges)
+        if samples < MIN_SAMPLES:
+            a, b = self.ranges[-1]
+            end = self.start_times[-1] + (b - a - 1) * dt
+            raise InputError(
+                f"`{name}` has {samples} samples from {start:g} s to {stop:g} s, but "
+                f"at least {MIN_SAMPLES} are needed: it lasts from "
+                f"{self.start_times[0]:g} s to {end:g} s."
+            )
+        return self._replace(ranges=tuple(ranges), start_times=tuple(start_times))
+
+
+class StepStatistics(NamedTuple):
+    """Time from one row to the next, as the first part of a log has it."""
+
+    origin: float  # first stamp [s]
+    median: float  # [s]
+    deviation: float  # robust standard deviation [s]
+
+    def gap_limit(self, limits: tuple[float, float]) -> float:
+        """Return the longest pause that is no gap [s].
+
+        A gap is a pause that neither the limits, in sample times and in seconds, nor
+        the jitter explain.
+        """
+        longest_step = self.median + 8.0 * self.deviation
+        return max(limits[0] * self.median, limits[1], longest_step)
+
+    @property
+    def largest_regular(self) -> float:
+        """Longest step at which no row is missing [s]."""
+        return 1.5 * self.median + 8.0 * self.deviation
+
+
+class Stretches(NamedTuple):
+    """Stretches of rows between gaps."""
+
+    starts: list[int]  # first row of each
+    start_times: list[float]  # [s]
+    pauses: list[float]  # gaps between them [s]
+    rows: int  # number of rows of the log
+    sample_time: float  # mean step without missing rows [s]
+
+
+def find_grid(
+    read: Callable[[], Iterable[np.ndarray]],
+    source: str,
+    limits: tuple[float, float],
+    first_row: int,
+    in_parts: bool = False,
+) -> TimeGrid:
+    """Find the uniform grid behind time stamps; the typical step is that of the first part.
+
+    `read` yields the finite stamps [s] in consecutive parts, and is called three times;
+    `limits` are the pauses that are bridged, in sample times and in seconds. Where
+    `in_parts`, the log is too large to move or remove rows.
+    """
+    steps = _step_statistics(next(iter(read()), np.zeros(0)), source)
+    stretches = _find_stretches(
+        read, source, steps, steps.gap_limit(limits), first_row, in_parts
+    )
+    sample_time = _round_time(stretches.sample_time, stretches.rows)
+    ends = [*stretches.starts[1:], stretches.rows]
+    segments = {
+        (a, b): t
+        for a, b, t in zip(stretches.starts, ends, stretches.start_times, strict=True)
+        if b - a >= MIN_SEGMENT
+    }
+    if not segments:
+        raise InputError(
+            f"`{source}` has no four rows in sequence: its time stamps are "
+            f"{steps.median:.6g} s apart at the median, with {len(stretches.pauses)} "
+            "gaps; check `time_unit`, or give `sample_time`."
+        )
+    grid = TimeGrid(sample_time, tuple(segments), tuple(segments.values()))
+    notes = _gap_notes(grid, stretches, steps.origin)
+    deviation = _deviation(grid, _linked(read(), steps.origin))
+    grid = grid._replace(notes=notes, deviation=deviation)
+    if in_parts and not grid.is_exact:
+        raise NeedsMemory(
+            f"time stamps of `{source}` leave a uniform grid of {sample_time:.6g} s by "
+            f"{grid.deviation:.6g} s: give `sample_time` if only the stamps are late."
+        )
+    return grid
+
+
+def _step_statistics(stamps: np.ndarray, source: str) -> StepStatistics:
+    steps = np.diff(stamps)
+    steps = steps[steps > 0]
+    if not steps.size:
+        raise InputError(
+            f"time of `{source}` stands still: check the column of time stamps."
+        )
+    median = float(np.median(steps))
+    absolute_deviation = float(np.median(np.abs(steps - median)))
+    return StepStatistics(float(stamps[0]), median, 1.4826 * absolute_deviation)
+
+
+def _find_stretches(
+    read: Callable[[], Iterable[np.ndarray]],
+    source: str,
+    statistics: StepStatistics,
+    gap_limit: float,
+    first_row: int,
+    in_parts: bool,
+) -> Stretches:
+    """Return the stretches between gaps, and refuse time that runs backwards."""
+    starts = [0]
+    start_times = [0.0]
+    pauses = []
+    rows = 0
+    regular_time = 0.0
+    regular_steps = 0
+    for t, row in _linked(read(), statistics.origin):
+        steps = np.diff(t)
+        _require_forward(t + statistics.origin, steps, row + first_row, source)
+        repeated = np.flatnonzero(steps <= MIN_STEP * statistics.median)
+        if in_parts and repeated.size:
+            number = row + int(repeated[0]) + 1 + first_row
+            raise NeedsMemory(
+                f"rows of `{source}` repeat the time stamp of the row before, first "
+                f"at row {number}: remove them, or give `sample_time`."
+            )
+        gaps = np.flatnonzero(steps > gap_limit)
+        starts += (row + gaps + 1).tolist()
+        start_times += t[gaps + 1].tolist()
+        pauses += steps[gaps].tolist()
+        regular = steps[steps < statistics.largest_regular]
+        regular_time += float(regular.sum())
+        regular_steps += len(regular)
+        rows = row + len(t)
+    return Stretches(starts, start_times, pauses, rows, regular_time / regular_steps)
+
+
+def _round_time(sample_time: float, rows: int) -> float:
+    """Return a round sample time if it fits stamps, which are rounded numbers, as well."""
+    round_time = float(f"{sample_time:.6g}")
+    shift = abs(round_time - sample_time) * rows
+    return round_time if shift < 0.01 * sample_time else sample_time
+
+
+def _gap_notes(grid: TimeGrid, stretches: Stretches, origin: float) -> tuple[str, ...]:
+    """Return remarks about the start, the gaps and the rows between them."""
+    notes = []
+    pauses = stretches.pauses
+    if origin != 0:
+        notes.append(
+            f"time counts from the first row, which was stamped {origin:.9g} s"
+        )
+    if pauses:
+        first_gap = stretches.start_times[1] - pauses[0]
+        notes.append(
+            f"{len(pauses)} gap{'s' if len(pauses) > 1 else ''} in time, the first "
+            f"after {first_gap:.6g} s, the longest of {max(pauses):.6g} s (sample time "
+            f"{grid.sample_time:.6g} s), split the log into segments; a `largest_gap` "
+            f"above {max(pauses) / grid.sample_time:.3g} would bridge them"
+        )
+    lost_rows = stretches.rows - sum(b - a for a, b in grid.ranges)
+    if lost_rows:
+        notes.append(
+            f"{lost_rows} rows between gaps are too few for a segment and were left out"
+        )
+    return tuple(notes)
+
+
+def _linked(
+    parts: Iterable[np.ndarray], origin: float
+) -> Iterator[tuple[np.ndarray, int]]:
+    """Yield the times of each part after the last one before it, and the row of the first."""
+    previous_time = np.zeros(0)
+    row = 0
+    for part in parts:
+        t = np.concatenate([previous_time, part - origin])
+        yield t, row
+        previous_time = t[-1:]
+        row += len(t) - 1
+
+
+def _require_forward(
+    stamps: np.ndarray, steps: np.ndarray, row: int, source: str
+) -> None:
+    back = np.flatnonzero(steps < 0)
+    if back.size:
+        i = int(back[0])
+        raise InputError(
+            f"time of `{source}` runs backwards from {stamps[i]:.9g} s to "
+            f"{stamps[i + 1]:.9g} s at row {row + i + 1}: sort the log, or split it "
+            "where the clock was set back."
+        )
+
+
+def _deviation(grid: TimeGrid, parts: Iterable[tuple[np.ndarray, int]]) -> float:
+    """Return the largest deviation of times from the grid [s]."""
+    starts, ends = np.transpose(grid.ranges)
+    start_times = np.array(grid.start_times)
+    deviation = 0.0
+    for t, row in parts:
+        rows = row + np.arange(len(t))
+        segment = np.maximum(np.searchsorted(starts, rows, "right") - 1, 0)
+        grid_times = start_times[segment] + grid.sample_time * (rows - starts[segment])
+        is_inside = (starts[segment] <= rows) & (rows < ends[segment])
+        deviations = np.abs(t - grid_times)[is_inside]
+        deviation = max(deviation, float(deviations.max(initial=0.0)))
+    return deviation
+
+
+class Resampling(NamedTuple):
+    """Way of the rows of a log onto the uniform grid behind their time stamps."""
+
+    rows: np.ndarray  # rows that count: repeated ones do not
+    stamps: np.ndarray  # their times from the first row on [s]
+    grid: TimeGrid
+    times: list[np.ndarray]  # times of each segment's samples [s]
+    notes: tuple[str, ...]
+
+    def __call__(self, x: np.ndarray) -> np.ndarray:
+        """Return the samples of a channel: its rows, or interpolated by cubic splines."""
+        x = x[self.rows]
+        ranges = self.grid.ranges
+        if self.grid.is_exact:
+            return np.concatenate([x[a:b] for a, b in ranges])
+        segments = [
+            CubicSpline(self.stamps[a:b], x[a:b])(times)
+            for (a, b), times in zip(ranges, self.times, strict=True)
+        ]
+        return np.concatenate(segments)
+
+
+def resampling(
+    stamps: np.ndarray, source: str, limits: tuple[float, float], first_row: int
+) -> Resampling:
+    """Find the way of rows onto the uniform grid behind their time stamps [s]."""
+    _require_forward(stamps, np.diff(stamps), first_row, source)
+    rows = _distinct_rows(stamps)
+    distinct_stamps = stamps[rows]
+    grid = find_grid(lambda: [distinct_stamps], source, limits, first_row)
+    t = distinct_stamps - stamps[0]
+    dt = grid.sample_time
+    counts = [b - a for a, b in grid.ranges]
+    if not grid.is_exact:
+        counts = [int((t[b - 1] - t[a]) / dt + 1e-3) + 1 for a, b in grid.ranges]
+    times = [
+        start + dt * np.arange(count)
+        for start, count in zip(grid.start_times, counts, strict=True)
+    ]
+
+    notes = grid.notes
+    repeated_rows = len(stamps) - len(rows)
+    if repeated_rows:
+        note = (
+            f"{repeated_rows} of {len(stamps)} rows repeat the time stamp of the row "
+            "before and were removed; if every row is a sample, give `sample_time` "
+            "instead of the time stamps"
+        )
+        notes = (note, *notes)
+    if not grid.is_exact:
+        missing_samples = sum(counts) - sum(b - a for a, b in grid.ranges)
+        notes = (*notes, _interpolation_note(t, grid, missing_samples))
+    return Resampling(rows, t, grid, times, notes)
+
+
+def _distinct_rows(stamps: np.ndarray) -> np.ndarray:
+    """Return the rows that do not repeat the stamp of the row before."""
+    rows = np.flatnonzero(np.diff(stamps, prepend=-np.inf) > 0)
+    if len(rows) == 1:
+        return rows
+    steps = np.diff(stamps[rows])
+    is_distinct = steps > MIN_STEP * float(np.median(steps))
+    return rows[np.append(True, is_distinct)]
+
+
+def _interpolation_note(t: np.ndarray, grid: TimeGrid, missing_samples: int) -> str:
+    """Return why the samples had to be interpolated: missing ones, or jitter."""
+    dt = grid.sample_time
+    steps = np.diff(t) / dt
+    if np.abs(steps - np.round(steps)).max() <= MAX_JITTER:
+        verb = "s were" if missing_samples > 1 else " was"
+        return f"{missing_samples} missing sample{verb} interpolated by cubic splines"
+    return (
+        f"time stamps jitter by up to {100 * grid.deviation / dt:.1f} % of the sample "
+        f"time: resampled to a uniform grid of {dt:.6g} s by cubic splines; if the "
+        "robot samples uniformly and only the stamps are late, give `sample_time` "
+        "instead"
+    )
