@@ -277,15 +277,15 @@ class Observations(eqx.Module):
         middle = float(start_time + fraction * (end_time - start_time))
         is_early = self.reduced_time[:, None] < middle
         mask = np.asarray(self.mask)
-        early = self.replace(mask=mask & is_early)
-        late = self.replace(mask=mask & ~is_early)
-        for part in (early, late):
+        first_part = self.replace(mask=mask & is_early)
+        second_part = self.replace(mask=mask & ~is_early)
+        for part in (first_part, second_part):
             if not part.mask.any(axis=0).all():
                 raise InputError(
                     f"`fraction` of {fraction:g} leaves no rows of some joint of "
                     f"`{self.name}`."
                 )
-        return early, late
+        return first_part, second_part
 
     @property
     def reduced_time(self) -> Float[np.ndarray, " rows"]:

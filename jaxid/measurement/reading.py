@@ -72,31 +72,20 @@ def read_recording(
     if stamps is not None:
         complaints |= _stray_stamps(stamps, complaints, log.tables[0])
     notes = [note for table in log.tables for note in table.notes]
-    if len(complaints) > bad_rows * rows:
-        raise InputError(
-            f"{len(complaints)} of {rows} rows are bad: {_listed(complaints)}; repair "
-            f"the log, or let `bad_rows` be above {len(complaints) / rows:.2g} "
-            "(fraction), which leaves them out."
-        )
+    good_rows = slice(None)
     if complaints:
-        if stamps is None:
-            # Rows that are left out leave gaps.
-            stamps = (sample_time or 0.0) * np.arange(rows)
-            sample_time = None
         good_rows = np.setdiff1d(np.arange(rows), [*complaints])
-        stamps = stamps[good_rows]
-        angles = angles[good_rows]
-        forces = forces[good_rows]
-        velocities = None if velocities is None else velocities[good_rows]
-        verb = "is bad and was" if len(complaints) == 1 else "are bad and were"
-        notes.append(
-            f"{len(complaints)} of {rows} rows {verb} left out: {_listed(complaints)}"
-        )
+        notes.append(_bad_row_note(complaints, rows, bad_rows))
+        if sample_time is not None:
+            # Rows that are left out leave gaps, which only stamps can tell.
+            stamps = sample_time * np.arange(rows)
+            sample_time = None
+    angles = angles[good_rows]
     recording = Recording.of(
         np.unwrap(angles, axis=0) if columns.unwrap else angles,
-        forces,
-        velocities=velocities,
-        time=stamps,
+        forces[good_rows],
+        velocities=None if velocities is None else velocities[good_rows],
+        time=None if stamps is None else stamps[good_rows],
         sample_time=sample_time,
         angles_on_motor_side=columns.angles_on_motor_side,
         forces_on_motor_side=columns.forces_on_motor_side,
@@ -108,12 +97,20 @@ def read_recording(
     return dataclasses.replace(recording, notes=(*notes, *recording.notes))
 
 
-def _listed(complaints: dict[int, str]) -> str:
-    """Return complaints about rows as a sentence lists them, the first rows first."""
+def _bad_row_note(complaints: dict[int, str], rows: int, max_share: float) -> str:
+    """Return a remark about the rows that are left out; refuse too many of them."""
+    count = len(complaints)
     texts = [text for _, text in sorted(complaints.items())]
-    others = len(texts) - MAX_NAMED_ROWS
     words = "; ".join(texts[:MAX_NAMED_ROWS])
-    return f"{words}; and {others} more" if others > 0 else words
+    if count > MAX_NAMED_ROWS:
+        words = f"{words}; and {count - MAX_NAMED_ROWS} more"
+    if count > max_share * rows:
+        raise InputError(
+            f"{count} of {rows} rows are bad: {words}; repair the log, or let "
+            f"`bad_rows` be above {count / rows:.2g} (fraction), which leaves them out."
+        )
+    verb = "is bad and was" if count == 1 else "are bad and were"
+    return f"{count} of {rows} rows {verb} left out: {words}"
 
 
 def _stray_stamps(

@@ -254,7 +254,8 @@ def unlike_derivatives(recording: Recording) -> dict[int, float]:
     for a, b in recording.grid.ranges:
         q = np.asarray(recording.angles)[a:b]
         qd = np.asarray(recording.velocities)[a:b]
-        integral = dt * np.cumsum(0.5 * (qd[1:] + qd[:-1]), axis=0)
+        mean_qd = 0.5 * (qd[1:] + qd[:-1])
+        integral = dt * np.cumsum(mean_qd, axis=0)
         integral = np.concatenate([np.zeros_like(q[:1]), integral])
         way = q[steps:] - q[:-steps]
         expected_way = integral[steps:] - integral[:-steps]

@@ -46,8 +46,9 @@ class TimeGrid(NamedTuple):
         start_times = []
         for (a, b), t in zip(self.ranges, self.start_times, strict=True):
             # A time on the grid counts as such in spite of rounding.
-            bounds = np.ceil((np.array([start, stop]) - t) / dt - 1e-6)
-            low, high = np.clip(bounds, 0, b - a).astype(int).tolist()
+            steps = (np.array([start, stop]) - t) / dt
+            bounds = np.clip(np.ceil(steps - 1e-6), 0, b - a)
+            low, high = bounds.astype(int).tolist()
             if low < high:
                 ranges.append((a + low, a + high))
                 start_times.append(t + low * dt)
@@ -202,11 +203,13 @@ def _gap_notes(grid: TimeGrid, stretches: Stretches, origin: float) -> tuple[str
         )
     if pauses:
         first_gap = stretches.start_times[1] - pauses[0]
+        longest_pause = max(pauses)
+        plural = "s" if len(pauses) > 1 else ""
         notes.append(
-            f"{len(pauses)} gap{'s' if len(pauses) > 1 else ''} in time, the first "
-            f"after {first_gap:.6g} s, the longest of {max(pauses):.6g} s (sample time "
-            f"{grid.sample_time:.6g} s), split the log into segments; a `largest_gap` "
-            f"above {max(pauses) / grid.sample_time:.3g} would bridge them"
+            f"{len(pauses)} gap{plural} in time, the first after {first_gap:.6g} s, "
+            f"the longest of {longest_pause:.6g} s (sample time {grid.sample_time:.6g} s), "
+            "split the log into segments; a `largest_gap` above "
+            f"{longest_pause / grid.sample_time:.3g} would bridge them"
         )
     lost_rows = stretches.rows - sum(b - a for a, b in grid.ranges)
     if lost_rows:
@@ -291,7 +294,8 @@ def resampling(
     dt = grid.sample_time
     counts = [b - a for a, b in grid.ranges]
     if not grid.is_exact:
-        counts = [int((t[b - 1] - t[a]) / dt + 1e-3) + 1 for a, b in grid.ranges]
+        durations = [t[b - 1] - t[a] for a, b in grid.ranges]
+        counts = [int(duration / dt + 1e-3) + 1 for duration in durations]
     times = [
         start + dt * np.arange(count)
         for start, count in zip(grid.start_times, counts, strict=True)

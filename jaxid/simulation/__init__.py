@@ -1,7 +1,7 @@
 """Virtual robots: experiments whose truth is known, on our own physics or on MuJoCo."""
 
 from .example import virtual_panda as virtual_panda, write_example as write_example
-from .friction_and_disturbances import (
+from .friction_and_ripple import (
     AbstractGearFriction as AbstractGearFriction,
     FrictionTemperature as FrictionTemperature,
     LuGreFriction as LuGreFriction,

@@ -18,7 +18,7 @@ from jaxid.measurement.recording import Recording
 from jaxid.robot import library
 from jaxid.trajectory.fourier import random_fourier_series
 
-from .friction_and_disturbances import SmoothFriction
+from .friction_and_ripple import SmoothFriction
 from .virtual import Sensors, VirtualRobot, random_bodies
 
 FILES = ("experiment.toml", "identification.csv", "verification.csv", "truth.json")

@@ -15,7 +15,7 @@ from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
 from jaxid.program import to_python
 
-from .friction_and_disturbances import AbstractGearFriction, TorqueRipple
+from .friction_and_ripple import AbstractGearFriction, TorqueRipple
 
 RATE_FILTER_TIME = 2e-3
 """Time constant of the low-pass of a servo's rates [s]."""
@@ -108,7 +108,9 @@ class SimulatedPlant:
         """Move on by one step with constant torques of the drives [N m or N]."""
         n = self._joints
         state = self._state
-        bodies = self._bodies(self._p, state[4 * n : 5 * n], state[5 * n :])
+        q_ahead = state[4 * n : 5 * n]
+        qd_ahead = state[5 * n :]
+        bodies = self._bodies(self._p, q_ahead, qd_ahead)
         self._state = self._advance(bodies, state[: 4 * n], u)
 
     def read(self) -> Sequence[float]:
@@ -190,7 +192,8 @@ def follow(
             rate = [
                 memory * rate[i] + rate_gain * (error[i] - before[i]) for i in joints
             ]
-            u = [known[i] + kp[i] * error[i] + kd[i] * rate[i] for i in joints]
+            undamped_u = [known[i] + kp[i] * error[i] for i in joints]
+            u = [undamped_u[i] + kd[i] * rate[i] for i in joints]
             u = [min(max(u[i], -limit[i]), limit[i]) for i in joints]
             states.append(list(state))
             forces.append(u)

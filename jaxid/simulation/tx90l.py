@@ -14,7 +14,7 @@ from jaxid.robot import library
 from jaxid.robot.limits_and_drives import Drives
 from jaxid.robot.robot import Robot
 
-from .friction_and_disturbances import FrictionTemperature, LuGreFriction, TorqueRipple
+from .friction_and_ripple import FrictionTemperature, LuGreFriction, TorqueRipple
 from .virtual import Sensors, VirtualRobot
 
 COLD = {1: 273.40, 2: 1.68, 27: 248.41, 28: 41.26, 34: 312.50, 35: 18.24}

@@ -20,7 +20,7 @@ from jaxid.measurement.recording import Recording
 from jaxid.robot.robot import Robot
 from jaxid.trajectory.trajectory import AbstractTrajectory
 
-from .friction_and_disturbances import (
+from .friction_and_ripple import (
     AbstractGearFriction,
     FrictionTemperature,
     SmoothFriction,

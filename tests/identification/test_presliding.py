@@ -15,7 +15,7 @@ from jaxid.identification.friction_laws.presliding_lengths import (
 )
 from jaxid.identification.problem import RegressionProblem
 from jaxid.measurement.friction_state import PART_SIZE, SamplesWithMemory, with_memory
-from jaxid.simulation.friction_and_disturbances import LuGreFriction
+from jaxid.simulation.friction_and_ripple import LuGreFriction
 from jaxid.simulation.virtual import Sensors, VirtualRobot, random_bodies
 from jaxid.trajectory.spline import spline_through
 

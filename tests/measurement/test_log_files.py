@@ -181,12 +181,14 @@ def refused(path, columns, *parts, **kwargs):
         ),  # signalling NaN
         (np.zeros((20, 0)), "(20, 0)"),
         (np.array(["a"] * 20), "real numbers"),
+        (np.full((20, 2), None), "without objects"),
     ],
 )
 def test_arrays_that_no_sensor_measures(tmp_path, q, complaint):
     np.savez(tmp_path / "log.npz", q=q, tau=np.zeros((20, 2)))
     columns = Columns(angles="q", forces="tau", sample_time=0.1)
-    refused(tmp_path / "log.npz", columns, "`q`", "`log.npz`", complaint)
+    name = "`log.npz`" if "objects" in complaint else "`q`"
+    refused(tmp_path / "log.npz", columns, name, "`log.npz`", complaint)
 
 
 def test_missing_columns_name_the_others_and_the_closest(tmp_path):

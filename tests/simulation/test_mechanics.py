@@ -9,7 +9,7 @@ from jaxid.dynamics.motion import Motion
 from jaxid.dynamics.terms import RigidBodies, RotorInertia
 from jaxid.robot import library
 from jaxid.robot.robot import Robot
-from jaxid.simulation.friction_and_disturbances import LuGreFriction, SmoothFriction
+from jaxid.simulation.friction_and_ripple import LuGreFriction, SmoothFriction
 from jaxid.simulation.mechanics import DriveTrain, SimulatedPlant
 from jaxid.simulation.virtual import random_bodies
 

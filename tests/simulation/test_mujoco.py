@@ -8,7 +8,7 @@ from jaxid.dynamics.motion import Motion
 from jaxid.dynamics.terms import ConstantOffset, RigidBodies, RotorInertia
 from jaxid.robot import library
 from jaxid.robot.limits_and_drives import Limits
-from jaxid.simulation.friction_and_disturbances import SmoothFriction
+from jaxid.simulation.friction_and_ripple import SmoothFriction
 from jaxid.simulation.mechanics import Servo
 from jaxid.simulation.tx90l import virtual_tx90l_on_rail
 from jaxid.simulation.virtual import Sensors, VirtualRobot, random_bodies

@@ -110,7 +110,8 @@ class RecursiveLowPass(AbstractLowPass):
         if x.size == 0:
             return x
         sos = np.array(self.sections)
-        padding = min(3 * (2 * len(sos) + 1), len(x) - 1)
+        taps = 2 * len(sos) + 1
+        padding = min(3 * taps, len(x) - 1)  # as scipy's
         columns = x.reshape(len(x), -1)
         if isinstance(columns, jax.Array):
             return _filter_both_ways(sos, columns, padding).reshape(x.shape)
@@ -132,7 +133,8 @@ class RecursiveLowPass(AbstractLowPass):
 
     def memory(self, tolerance=1e-14):  # noqa: D102
         sos = np.array(self.sections)
-        radius = max(np.abs(np.roots(s[3:])).max(initial=0.0) for s in sos)
+        poles = np.concatenate([np.roots(denominator) for denominator in sos[:, 3:]])
+        radius = np.abs(poles).max(initial=0.0)
         if radius == 0:
             return 2 * len(sos)
         clear_tail = max(tolerance, MIN_CLEAR_TAIL)
@@ -168,7 +170,9 @@ def _filter_both_ways(sos: np.ndarray, x: Array, padding: int) -> Array:
         next_states = []
         for (b0, b1, b2, _, a1, a2), (first, second) in zip(sos, states, strict=True):
             y = b0 * x + first
-            next_states.append((b1 * x - a1 * y + second, b2 * x - a2 * y))
+            next_first = b1 * x - a1 * y + second
+            next_second = b2 * x - a2 * y
+            next_states.append((next_first, next_second))
             x = y
         return next_states, x
 
@@ -210,9 +214,10 @@ def butterworth(
 
 def recursive(sos: np.ndarray, cutoff: float) -> RecursiveLowPass:
     """Return second-order sections as a filter whose gain for constants is one."""
-    gain = np.prod(sos[:, :3].sum(axis=1) / sos[:, 3:].sum(axis=1))
+    numerators = sos[:, :3].sum(axis=1)
+    denominators = sos[:, 3:].sum(axis=1)
     sos = sos.copy()
-    sos[0, :3] /= gain
+    sos[0, :3] /= np.prod(numerators / denominators)
     sections = tuple(tuple(row) for row in sos.tolist())
     return RecursiveLowPass(sections=sections, cutoff=cutoff)
 

@@ -141,7 +141,9 @@ class SavitzkyGolay(AbstractFilter):
     def _kernel(self, derivative: int, sample_time: float) -> np.ndarray:
         """Return the weights of the samples in a derivative of the polynomial."""
         # An odd number of samples, so that one of them is in the middle.
-        samples = 2 * round(0.5 * min(self.window / sample_time, MAX_WINDOW)) + 1
+        steps = min(self.window / sample_time, MAX_WINDOW)
+        half = round(0.5 * steps)
+        samples = 2 * half + 1
         if not self.order < samples < MAX_WINDOW:
             raise InputError(
                 f"`window` of {self.window:.6g} s has {samples} samples or more at "
@@ -149,8 +151,8 @@ class SavitzkyGolay(AbstractFilter):
                 f"less than {MAX_WINDOW} are needed: change it, or check `time_unit`."
             )
         # Legendre polynomials: powers, as in `scipy.signal.savgol_coeffs`, lose digits.
-        half = samples // 2
-        basis = legendre.legvander(np.arange(-half, half + 1) / half, self.order)
+        places = np.arange(-half, half + 1) / half
+        basis = legendre.legvander(places, self.order)
         derivatives = legendre.legder(np.eye(self.order + 1), derivative)
         in_the_middle = legendre.legval(0.0, derivatives)
         return (
@@ -164,7 +166,8 @@ def half_gain(kernel: np.ndarray, sample_time: float) -> float:
     frequency = np.linspace(0.0, 0.5 / sample_time, 8 * len(kernel) + 1)
     gain = kernel_gain(kernel, frequency, sample_time)
     k = int(np.argmax(gain < 0.5))
-    return float(np.interp(0.5, gain[[k, k - 1]], frequency[[k, k - 1]]))
+    neighbours = [k, k - 1]
+    return float(np.interp(0.5, gain[neighbours], frequency[neighbours]))
 
 
 class PaperFilter(AbstractFilter):
@@ -262,7 +265,8 @@ class PeriodicFourier(AbstractFilter):
                 "filter."
             )
         require_cutoff("harmonics / period", self.harmonics / self.period, sample_time)
-        omega = 2 * math.pi / self.period * np.arange(1, self.harmonics + 1)
+        numbers = np.arange(1, self.harmonics + 1)
+        omega = 2 * math.pi / self.period * numbers
         sines = np.sin(np.outer(t, omega))
         cosines = np.cos(np.outer(t, omega))
         basis = np.hstack([np.ones((len(t), 1)), sines, cosines])
@@ -341,7 +345,8 @@ def second_difference(
     difference = 16 * (after + before) - second_nearest - 30 * middle
 
     d = np.empty_like(x)
-    d[1:-1] = (x[2:] - 2 * x[1:-1] + x[:-2]) / sample_time**2
+    second_order = x[2:] - 2 * x[1:-1] + x[:-2]
+    d[1:-1] = second_order / sample_time**2
     d[2:-2] = difference / (12 * sample_time**2)
     d[0] = d[1]
     d[-1] = d[-2]

@@ -122,7 +122,7 @@ def read_npz(path: Path) -> dict[str, np.ndarray]:
 
 
 def map_arrays(path: Path) -> dict[str, np.ndarray] | None:
-    """Map the arrays of an NPZ file into memory; None if one is compressed or none is there."""
+    """Map the arrays of an NPZ file into memory; None if one cannot be, or none is there."""
     arrays = {}
     with (
         readable(path.name, "NPZ file"),
@@ -139,6 +139,8 @@ def map_arrays(path: Path) -> dict[str, np.ndarray] | None:
             file.seek(entry.header_offset + 30 + int(lengths.sum()))
             np.lib.format.read_magic(file)
             shape, is_fortran, dtype = np.lib.format.read_array_header_1_0(file)
+            if dtype.hasobject:
+                return None  # bytes of a file are no objects
             order = "F" if is_fortran else "C"
             array = np.memmap(path, dtype, "r", file.tell(), shape, order)
             arrays[entry.filename.removesuffix(".npy")] = array
