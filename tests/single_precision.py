@@ -147,9 +147,6 @@ CASES = {
     "Huber": lambda: (
         jid.identify(base, cold, jid.estimators.IterativelyReweighted()).parameters
     ),
-    "GeneralisedLeastSquares": lambda: (
-        jid.identify(base, cold, jid.estimators.GeneralisedLeastSquares()).parameters
-    ),
     "PhysicallyConsistent": lambda: consistent().parameters,
     "identify_batch": batch,
     "bootstrap": lambda: jid.uncertainty.bootstrap(

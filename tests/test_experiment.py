@@ -202,7 +202,6 @@ ESTIMATORS = {
     'kind = "tukey"\nlimit = 4\nridge = 0.1': jid.estimators.IterativelyReweighted(
         jid.estimators.Tukey(4.0), VARIANCES, jid.estimators.Ridge(0.1)
     ),
-    'kind = "correlated"': jid.estimators.GeneralisedLeastSquares(),
     'kind = "consistent"\npull = 2\nmargin = 0.01': jid.PhysicallyConsistent(
         VARIANCES,
         margin=0.01,

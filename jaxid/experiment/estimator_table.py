@@ -136,8 +136,7 @@ def build_estimation(
         kind: "consistent": weighted least squares over bodies that can exist;
             "weighted": without that; "least_squares": every newton metre counts the
             same; "huber", "tukey": rows that the model cannot explain count less, or
-            not at all; "correlated": for residuals that joints have in common;
-            "instrumental": for noisy angles. Without it, what the other keys belong to.
+            not at all; "instrumental": for noisy angles. Without it, what the other keys belong to.
         weights: Weights of the joints: "maximum_forces" (Eq. 30), the default where
             they are known; or "residual_variances": what the model leaves unexplained.
         ridge: Strength of a pull of undetermined combinations towards zero, relative to
@@ -170,7 +169,7 @@ def build_estimation(
     """
     robot = model.robot
     joint_weights, notes = default_weights(robot)
-    if weights == "residual_variances" or kind in ("least_squares", "correlated"):
+    if weights == "residual_variances" or kind == "least_squares":
         joint_weights, notes = estimators.ResidualVariances(), ()
     elif weights == "maximum_forces":
         try:

@@ -7,7 +7,6 @@ from .consistency import PhysicallyConsistent
 from .estimators import (
     AbstractEstimator,
     AbstractLoss,
-    GeneralisedLeastSquares,
     Huber,
     InstrumentalVariables,
     IterativelyReweighted,
@@ -23,7 +22,6 @@ ESTIMATORS: dict[str, Callable[..., AbstractEstimator]] = {
     "least_squares": LeastSquares,
     "huber": functools.partial(IterativelyReweighted, loss=Huber()),
     "tukey": functools.partial(IterativelyReweighted, loss=Tukey()),
-    "correlated": GeneralisedLeastSquares,
     "instrumental": InstrumentalVariables,
     "consistent": PhysicallyConsistent,
 }

@@ -34,37 +34,60 @@ PIECE = 32768
 """Samples that are passed to the loop at once."""
 TILE = 16
 """Rows of a banded matrix product: more multiply more zeros, fewer use the processor less."""
+MAX_COST = 256
+"""Products for each row and column of a filter up to which a matrix product pays."""
+MAX_LAGS = 16384
+"""Length of a filter's response up to which a matrix product pays."""
 
 Grams = list[np.ndarray]
 """For each joint the products of its columns and forces with each other."""
-Stage = tuple[np.ndarray, int]
-"""Zero-phase filter, as its response of odd length to an impulse, and a decimation factor."""
+
+
+class Stage(NamedTuple):
+    """Zero-phase filter, and the decimation after it."""
+
+    response: np.ndarray  # response to an impulse, of odd length
+    factor: int
 
 
 def suits(observations: Observations) -> bool:
     """Return whether the filters of a log are short enough to compile for."""
-    sizes = [(len(response), factor) for response, factor in _stages(observations)]
+    stages = _stages(observations)
     # A filter is a matrix product of so many products for each row and column.
-    cost = sum(lags / factor for lags, factor in sizes)
-    return cost <= 256 and max((lags for lags, _ in sizes), default=1) <= 16384
+    cost = sum(len(stage.response) / stage.factor for stage in stages)
+    max_lags = max((len(stage.response) for stage in stages), default=1)
+    return cost <= MAX_COST and max_lags <= MAX_LAGS
 
 
-def _stages(observations: Observations) -> tuple[Stage, ...]:
+def _stages(observations: Observations) -> list[Stage]:
     """Return the stages of decimation that change something, the first one with the filter."""
-    filter, decimation = observations.filter, observations.decimation
-    before, stages = impulse_response(filter.low_pass(observations.sample_time)), []
+    decimation = observations.decimation
+    low_pass = observations.filter.low_pass(observations.sample_time)
+    filter_response = impulse_response(low_pass)
+    stages = []
     for k, factor in enumerate(decimation.stages):
-        response = np.convolve(before, impulse_response(decimation.low_pass(k)))
+        response = impulse_response(decimation.low_pass(k))
+        if k == 0:
+            response = np.convolve(filter_response, response)
         if factor > 1 or len(response) > 1:
-            stages.append((response, factor))
-        before = np.ones(1)
-    return tuple(stages)
+            stages.append(Stage(response, factor))
+    return stages
 
 
 def impulse_response(low_pass: AbstractLowPass) -> Float[np.ndarray, " lags"]:
     """Return the response to an impulse in the middle, until it has decayed on both sides."""
     half = low_pass.memory()
-    return low_pass(np.eye(1, 6 * half + 1, 3 * half)[0])[2 * half : 4 * half + 1]
+    impulse = np.zeros(6 * half + 1)
+    impulse[3 * half] = 1.0
+    return low_pass(impulse)[2 * half : 4 * half + 1]
+
+
+class StageShape(NamedTuple):
+    """Sizes of a stage of the loop."""
+
+    factor: int  # decimation factor
+    lags: int  # length of the response
+    delay: int  # rows by which its results come late
 
 
 class LoopShape(NamedTuple):
@@ -73,34 +96,39 @@ class LoopShape(NamedTuple):
     samples: int  # samples of an iteration
     rows: int  # rows of an iteration
     iterations: int  # largest number of iterations of a call
-    factors: tuple[int, ...]  # decimation factor of each stage
-    lags: tuple[int, ...]  # length of the response of each stage
-    delays: tuple[int, ...]  # rows by which the results of each stage come late
-    delay: int  # rows at the start of a call that stand for nothing yet
+    stages: tuple[StageShape, ...]
+    delay: int  # rows at the start of a call that hold no data yet
     reach: int  # samples before, and after, a row's instant on which it depends
 
     @classmethod
     def of(cls, stages: Sequence[Stage], chunk: int) -> "LoopShape":
         """Return the sizes for some stages and about so many samples of an iteration."""
-        factors = tuple(factor for _, factor in stages)
-        lags = tuple(len(response) for response, _ in stages)
-        later = whole = math.prod(factors)
-        delays, delay, reach = [], 0, 0
-        for n, factor in zip(lags, factors, strict=True):
-            reach += whole // later * (n // 2)
-            later //= factor
+        factor = math.prod(stage.factor for stage in stages)
+        later_factor = factor
+        shapes = []
+        delay = 0
+        reach = 0
+        for stage in stages:
+            lags = len(stage.response)
+            reach += factor // later_factor * (lags // 2)
+            later_factor //= stage.factor
             # Later stages must get complete rows.
-            rows = -(-max(0, n - factor) // (factor * later))
-            delays.append(later * rows)
+            missing_samples = max(0, lags - stage.factor)
+            rows = math.ceil(missing_samples / (stage.factor * later_factor))
+            shapes.append(StageShape(stage.factor, lags, later_factor * rows))
             delay += rows
-        rows = max(1, round(chunk / whole))
-        samples = rows * whole
-        sizes = samples, rows, max(1, PIECE // samples)
-        return cls(*sizes, factors, lags, tuple(delays), delay, reach)
+        rows = max(1, round(chunk / factor))
+        samples = rows * factor
+        iterations = max(1, PIECE // samples)
+        return cls(samples, rows, iterations, tuple(shapes), delay, reach)
 
 
-Piece = tuple[int, tuple[int, int], slice]
-"""Consecutive rows that the loop adds up in one call: their block, range, and samples."""
+class Piece(NamedTuple):
+    """Consecutive rows that the loop adds up in one call."""
+
+    block: int  # index of their block of time
+    rows: slice
+    samples: slice  # samples on which they depend
 
 
 def stream_blocks(
@@ -115,263 +143,319 @@ def stream_blocks(
     the number of cores changes no digit. `edges` are the first row of each block, and
     the end of the last one.
     """
-    mask, indices = np.asarray(observations.mask), base.acting_columns
-    stream = _Stream(base, observations, edges, progress)
+    mask = np.asarray(observations.mask)
+    triangles = _Stream(base, observations, edges).triangles(progress)
     blocks = []
-    for R, (first, last) in zip(
-        stream.triangles(), itertools.pairwise(edges), strict=True
-    ):
-        joints = zip(indices, R, mask[first:last].sum(axis=0).tolist(), strict=True)
-        blocks.append(
-            Factors(tuple(JointFactor(*joint) for joint in joints), base.size)
-        )
+    for R, (start, stop) in zip(triangles, itertools.pairwise(edges), strict=True):
+        counts = mask[start:stop].sum(axis=0).tolist()
+        joints = map(JointFactor, base.acting_columns, R, counts)
+        blocks.append(Factors(tuple(joints), base.size))
     return blocks
 
 
+class _Pass(NamedTuple):
+    """Result of one pass over a log."""
+
+    triangles: list[list[np.ndarray]]  # R factor for each block and joint
+    total: Grams  # products of all rows
+    is_accurate: bool  # whether the first look has shown the size of every direction
+
+
 class _Stream:
-    """Pass of one log through the compiled loop; see `stream_blocks`."""
+    """A log and its compiled loop; see `stream_blocks`."""
 
     def __init__(
-        self, base: BaseParameters, observations: Observations, edges, progress
+        self, base: BaseParameters, observations: Observations, edges: Sequence[int]
     ):
-        stages, self._stride = _stages(observations), 1
-        if all(len(response) == 1 for response, _ in stages):
+        stages = _stages(observations)
+        self._stride = 1
+        if all(len(stage.response) == 1 for stage in stages):
             # Without filters the samples between the rows are not needed.
-            self._stride, stages = math.prod(factor for _, factor in stages), ()
-        self._base, self._observations = base, observations
-        self._edges, self._progress = list(edges), progress
-        self._widths = [len(columns) + 1 for columns in base.acting_columns]
+            self._stride = math.prod(stage.factor for stage in stages)
+            stages = []
+        self._base = base
+        self._observations = observations
+        self._edges = list(edges)
         self._mask = np.asarray(observations.mask)
         self._shape = LoopShape.of(stages, CHUNK)
-        # Each makes the rows of a tile of consecutive samples.
-        self._matrices = [
-            np.stack([np.pad(h, (k * f, (TILE - 1 - k) * f)) for k in range(TILE)])
-            for h, f in stages
-        ]
-        columns = program_of(base, base.columns, *base.model.input_shapes)
-        self._loop = _compiled(columns, tuple(base.acting_columns), self._shape)
-        segments = range(len(observations.segments))
-        self._pieces = [piece for k in segments for piece in self._divide(k)]
-        self._ends = list(self._reduce_ends())
+        self._matrices = [_banded_matrix(stage) for stage in stages]
+        program = program_of(base, base.columns, *base.model.input_shapes)
+        self._loop = _compile_loop(program, tuple(base.acting_columns), self._shape)
+        self._pieces: list[Piece] = []
+        for segment in range(len(observations.segments)):
+            self._pieces += self._divide(segment)
+        self._end_rows = list(self._rows_of_ends())
 
     def _divide(self, segment: int) -> Iterator[Piece]:
         """Yield the pieces of the rows of a segment that do not depend on its ends."""
-        o, shape, reach = self._observations, self._shape, self._shape.reach
-        (a, b), (r0, r1) = o.segments[segment], o.row_segments[segment]
-        factor, edge = o.decimation.factor, o.filter.edge(o.sample_time)
-        away = max(reach - edge, o.decimation.memory(), 0)
-        low = r0 + -(-away // factor)
-        high = min(r0 + (b - a - 2 * edge - 1 - away) // factor + 1, r1)
-        most = shape.iterations * shape.rows - shape.delay
+        recording = self._observations
+        reach = self._shape.reach
+        start, stop = recording.segments[segment]
+        first_row, end_row = recording.row_segments[segment]
+        factor = recording.decimation.factor
+        edge = recording.filter.edge(recording.sample_time)
+        # A row must be so far from the ends of what the filter has left.
+        distance = max(reach - edge, recording.decimation.memory(), 0)
+        low = first_row + math.ceil(distance / factor)
+        samples = stop - start - 2 * edge - distance
+        high = min(first_row + (samples - 1) // factor + 1, end_row)
+        max_rows = self._shape.iterations * self._shape.rows - self._shape.delay
         for block, rows in divide_rows(self._edges, slice(low, high)):
-            for r in range(rows.start, rows.stop, most):
-                end = min(r + most, rows.stop)
-                begin = a + edge + (r - r0) * factor - reach
-                samples = slice(
-                    begin, min(begin + self._samples_of(end - r), b), self._stride
+            for row in range(rows.start, rows.stop, max_rows):
+                next_row = min(row + max_rows, rows.stop)
+                begin = start + edge + (row - first_row) * factor - reach
+                end = min(begin + self._samples_of(next_row - row), stop)
+                yield Piece(
+                    block, slice(row, next_row), slice(begin, end, self._stride)
                 )
-                yield block, (r, end), samples
 
     def _samples_of(self, rows: int) -> int:
-        shape = self._shape
-        return -(-(rows + shape.delay) // shape.rows) * shape.samples * self._stride
+        """Return the number of samples of the iterations that make so many rows."""
+        iterations = math.ceil((rows + self._shape.delay) / self._shape.rows)
+        return iterations * self._shape.samples * self._stride
 
-    def _reduce_ends(self) -> Iterator[tuple[int, list[np.ndarray]]]:
+    def _rows_of_ends(self) -> Iterator[tuple[int, list[np.ndarray]]]:
         """Yield block and equations of the rows that no piece covers, reduced in NumPy."""
-        outer = np.ones(len(self._mask), bool)
-        for _, rows, _ in self._pieces:
-            outer[slice(*rows)] = False
-        changes = np.flatnonzero(np.diff(np.r_[False, outer, False])).tolist()
-        runs = list(zip(changes[::2], changes[1::2], strict=True))
+        is_end = np.ones(len(self._mask), bool)
+        for piece in self._pieces:
+            is_end[piece.rows] = False
+        changes = np.flatnonzero(np.diff(np.r_[False, is_end, False]))
+        ranges = changes.reshape(-1, 2).tolist()
         samples = max(4096, 2 * self._shape.reach)
-        for chunk in row_chunks(self._base, self._observations, samples, runs):
-            mask = chunk.mask & outer[chunk.rows, None]
+        for chunk in row_chunks(self._base, self._observations, samples, ranges):
+            mask = chunk.mask & is_end[chunk.rows, None]
             for part in chunk._replace(mask=mask).divide(self._edges):
                 yield part.block, part.equations()
 
-    def triangles(self) -> list[list[np.ndarray]]:
+    def triangles(self, progress: Progress | None) -> list[list[np.ndarray]]:
         """Return an R factor of columns and forces for each block and joint."""
-        first, R, blocks = self._first_grams(), [], []
-        for _ in range(2):
-            R = []
-            for G in first:
-                norms = np.sqrt(np.diag(G))
-                scale = np.where(norms > 0, norms, max(norms.max(initial=0.0), 1.0))
-                # A triangle that is never singular.
-                regular = G / scale / scale[:, None] + 1e-13 * np.eye(len(G))
-                R.append(np.linalg.cholesky(regular).T * scale)
-            mixing = [np.linalg.inv(r) for r in R]
-            blocks = [[np.zeros((w, w)) for w in self._widths] for _ in self._edges[1:]]
-            self._add(blocks, self._pieces, mixing, self._progress)
-            total = [np.sum(parts, axis=0) for parts in zip(*blocks, strict=True)]
-            if all(_similar(*x) for x in zip(total, first, mixing, strict=True)):
-                break
-            # The first look has missed what the pass has seen: now it is known.
-            first = [r.T @ G @ r for r, G in zip(R, total, strict=True)]
-        return [
-            [_root(G) @ r for G, r in zip(grams, R, strict=True)] for grams in blocks
-        ]
+        result = self._pass(self._first_grams(), progress)
+        if not result.is_accurate:
+            # The pass has shown directions that the first look has missed.
+            result = self._pass(result.total, progress)
+        return result.triangles
 
     def _first_grams(self, parts: int = 8) -> Grams:
         """Return the Gram matrices of a few parts of the log."""
-        step, pieces = max(1, len(self._pieces) // parts), []
-        for block, (a, b), samples in self._pieces[step // 2 :: step]:
+        step = max(1, len(self._pieces) // parts)
+        pieces = []
+        for piece in self._pieces[step // 2 :: step]:
             # As many rows of a piece as an iteration has.
-            b = min(b, a + self._shape.rows)
-            stop = min(samples.stop, samples.start + self._samples_of(b - a))
-            pieces.append((block, (a, b), slice(samples.start, stop, samples.step)))
-        total = [np.zeros((width, width)) for width in self._widths]
-        self._add(
-            [total] * (len(self._edges) - 1), pieces, [np.eye(w) for w in self._widths]
-        )
-        return total
+            start = piece.rows.start
+            stop = min(piece.rows.stop, start + self._shape.rows)
+            begin = piece.samples.start
+            end = min(piece.samples.stop, begin + self._samples_of(stop - start))
+            samples = slice(begin, end, self._stride)
+            pieces.append(Piece(piece.block, slice(start, stop), samples))
+        mixing = [np.eye(len(columns) + 1) for columns in self._base.acting_columns]
+        grams = [matrices for _, matrices in self._grams(pieces, mixing)]
+        return _sum_by_joint(grams)
 
-    def _add(
-        self, blocks: list[Grams], pieces: list[Piece], mixing: Grams, progress=None
-    ) -> None:
-        """Add the Gram matrices of some pieces, and of the ends, to those of their blocks."""
-        # One core adds up a piece; the next ones are read meanwhile.
-        found = on_cores(lambda x: self._call(x, mixing), map(self._fill, pieces))
-        for done, ((block, _, _), grams) in enumerate(
-            zip(pieces, found, strict=True), 1
-        ):
+    def _pass(self, first: Grams, progress: Progress | None) -> _Pass:
+        """Reduce all rows, given about what the products of all rows are."""
+        triangles = [_regular_triangle(G) for G in first]
+        mixing = [np.linalg.inv(R) for R in triangles]
+        blocks = [[np.zeros_like(R) for R in triangles] for _ in self._edges[1:]]
+        for block, grams in self._grams(self._pieces, mixing, progress):
             for total, G in zip(blocks[block], grams, strict=True):
                 total += G
+        totals = _sum_by_joint(blocks)
+        roots = [[_root(G) for G in block] for block in blocks]
+        joints = zip(totals, first, mixing, strict=True)
+        return _Pass(
+            [[a @ R for a, R in zip(x, triangles, strict=True)] for x in roots],
+            [R.T @ G @ R for R, G in zip(triangles, totals, strict=True)],
+            all(_shows_every_direction(*joint) for joint in joints),
+        )
+
+    def _grams(
+        self, pieces: list[Piece], mixing: Grams, progress: Progress | None = None
+    ) -> Iterator[tuple[int, Grams]]:
+        """Yield block and Gram matrices of some pieces, and of the ends."""
+        # One core adds up a piece; the next ones are read meanwhile.
+        results = on_cores(lambda x: self._call(x, mixing), map(self._fill, pieces))
+        for k, (piece, grams) in enumerate(zip(pieces, results, strict=True), 1):
+            yield piece.block, grams
             if progress is not None:
-                progress(done / len(pieces))
-        for block, equations in self._ends:
-            for total, rows, mix in zip(blocks[block], equations, mixing, strict=True):
-                mixed = rows @ mix
-                total += mixed.T @ mixed
+                progress(k / len(pieces))
+        for block, equations in self._end_rows:
+            mixed = [rows @ mix for rows, mix in zip(equations, mixing, strict=True)]
+            yield block, [rows.T @ rows for rows in mixed]
 
     def _fill(self, piece: Piece) -> list[np.ndarray]:
         """Read the arrays of one piece, filled up to the shape of the loop."""
-        (motion, forces), shape = self._observations.read(piece[2]), self._shape
+        shape = self._shape
+        motion, forces = self._observations.read(piece.samples)
+        forces = without_tool(self._base, motion, forces)
+        arguments = [np.asarray(x) for x in self._base.model.arguments(motion)]
         # The first rows come late, and do not count.
-        mask = np.pad(self._mask[slice(*piece[1])], ((shape.delay, 0), (0, 0)))
-        length = shape.iterations * shape.samples
-        together = np.hstack(
-            [np.asarray(x) for x in self._base.model.arguments(motion)]
-        )
-        arrays = [
-            _filled_up(np.asarray(x, np.float64), length)
-            for x in (together, without_tool(self._base, motion, forces))
+        mask = np.pad(self._mask[piece.rows], ((shape.delay, 0), (0, 0)))
+        samples = shape.iterations * shape.samples
+        return [
+            _fill_up(np.asarray(np.hstack(arguments), np.float64), samples),
+            _fill_up(np.asarray(forces, np.float64), samples),
+            _fill_up(mask, shape.iterations * shape.rows),
+            np.asarray(math.ceil(len(mask) / shape.rows), np.int32),
         ]
-        arrays.append(_filled_up(mask, shape.iterations * shape.rows))
-        return [*arrays, np.asarray(-(-len(mask) // shape.rows), np.int32)]
 
     def _call(self, arrays: list[np.ndarray], mixing: Grams) -> Grams:
         """Return the Gram matrices of a piece."""
-        with (
-            double_precision(),
-            jax.default_device(jax.local_devices(backend="cpu")[0]),
-        ):
+        cpu = jax.local_devices(backend="cpu")[0]
+        with double_precision(), jax.default_device(cpu):
             return [np.asarray(G) for G in self._loop(*arrays, mixing, self._matrices)]
 
 
-def _filled_up(x: np.ndarray, length: int) -> np.ndarray:
-    missing = max(0, length - len(x))
-    return (
-        np.pad(x, ((0, missing), (0, 0)))
-        if missing
-        else np.ascontiguousarray(x[:length])
-    )
+def _banded_matrix(stage: Stage) -> np.ndarray:
+    """Return the matrix that makes the rows of a tile of consecutive samples."""
+    rows = []
+    for k in range(TILE):
+        margins = k * stage.factor, (TILE - 1 - k) * stage.factor
+        rows.append(np.pad(stage.response, margins))
+    return np.stack(rows)
 
 
-def _similar(
+def _sum_by_joint(grams: list[Grams]) -> Grams:
+    return [np.sum(matrices, axis=0) for matrices in zip(*grams, strict=True)]
+
+
+def _fill_up(x: np.ndarray, length: int) -> np.ndarray:
+    """Return an array of so many rows, filled up with zeros."""
+    missing_rows = max(0, length - len(x))
+    if missing_rows:
+        return np.pad(x, ((0, missing_rows), (0, 0)))
+    return np.ascontiguousarray(x[:length])
+
+
+def _shows_every_direction(
     total: np.ndarray, first: np.ndarray, mixing: np.ndarray, ratio: float = 1e4
 ) -> bool:
     """Return whether the first look has shown the size of every direction that it has shown."""
     values, directions = np.linalg.eigh(mixing.T @ first @ mixing)
-    shown = directions[:, values > 0.5]
-    if not shown.shape[1]:
+    visible_directions = directions[:, values > 0.5]
+    if not visible_directions.shape[1]:
         return not total.any()
-    sizes = np.linalg.eigvalsh(shown.T @ total @ shown)
-    middle = np.median(sizes)
-    return bool(np.linalg.norm(total) <= ratio * middle and sizes[0] * ratio > middle)
+    sizes = np.linalg.eigvalsh(visible_directions.T @ total @ visible_directions)
+    typical_size = np.median(sizes)
+    is_small_enough = np.linalg.norm(total) <= ratio * typical_size
+    return bool(is_small_enough and sizes[0] * ratio > typical_size)
+
+
+def _regular_triangle(G: np.ndarray) -> np.ndarray:
+    """Return a triangle whose square is about G, and which is never singular."""
+    norms = np.sqrt(np.diag(G))
+    scale = np.where(norms > 0, norms, max(norms.max(initial=0.0), 1.0))
+    regular = G / np.outer(scale, scale) + 1e-13 * np.eye(len(G))
+    return np.linalg.cholesky(regular).T * scale
 
 
 def _root(G: np.ndarray) -> np.ndarray:
     """Return an upper triangle whose square is G, which may be singular; zero columns stay zero."""
     root = np.zeros_like(G)
-    live = np.flatnonzero(np.diag(G) > 0)
-    own = np.ix_(live, live)
-    values, directions = np.linalg.eigh(G[own])
+    columns = np.flatnonzero(np.diag(G) > 0)
+    places = np.ix_(columns, columns)
+    values, directions = np.linalg.eigh(G[places])
     rows = np.sqrt(np.maximum(values, 0.0))[:, None] * directions.T
-    root[own] = np.linalg.qr(rows, mode="r")
+    root[places] = np.linalg.qr(rows, mode="r")
     return root
 
 
+class _DistinctColumns(NamedTuple):
+    """Columns that the loop filters; joints share them."""
+
+    outputs: list[int]  # outputs of the program, every distinct expression once
+    # rows of each joint's columns and force among the filtered ones
+    places: list[np.ndarray]
+
+    @classmethod
+    def of(
+        cls, program: Program, acting: tuple[tuple[int, ...], ...]
+    ) -> "_DistinctColumns":
+        """Return the distinct columns that act on joints."""
+        size = len(program.outputs) // len(acting)
+        outputs: dict[str, int] = {}
+        names = []
+        for j, columns in enumerate(acting):
+            names.append([repr(program.outputs[j * size + k]) for k in columns])
+            for k, name in zip(columns, names[-1], strict=True):
+                outputs[name] = j * size + k
+        rows = {name: row for row, name in enumerate(outputs)}
+        places = []
+        for j, joint_names in enumerate(names):
+            columns = [rows[name] for name in joint_names]
+            places.append(np.array([*columns, len(outputs) + j]))
+        return cls(list(outputs.values()), places)
+
+
 @functools.lru_cache(maxsize=16)
-def _compiled(
+def _compile_loop(
     program: Program, acting: tuple[tuple[int, ...], ...], shape: LoopShape
 ) -> Callable:
     """Return the loop, which is compiled when it is first called."""
     joints = len(acting)
-    size = len(program.outputs) // joints
+    distinct = _DistinctColumns.of(program, acting)
     base_columns = lower(program, fence=True)
-
-    def entry(j: int, k: int) -> str:
-        return repr(program.outputs[j * size + k])
-
-    # Joints share columns: every distinct one is filtered once.
-    distinct = {entry(j, k): j * size + k for j, own in enumerate(acting) for k in own}
-    first, rows = (
-        list(distinct.values()),
-        {key: row for row, key in enumerate(distinct)},
-    )
-    places = [
-        np.array([*(rows[entry(j, k)] for k in own), len(first) + j])
-        for j, own in enumerate(acting)
-    ]
-    height = len(first) + joints
+    height = len(distinct.outputs) + joints
+    zeros = [jnp.zeros(shape.samples)] * height
 
     def evaluate(motion: Array, forces: Array) -> list[Array]:
         packed = base_columns(*jnp.split(motion, len(motion) // joints))
-        columns = [
-            jnp.broadcast_to(jnp.asarray(packed[i], float), motion.shape[1:])
-            for i in first
-        ]
+        columns = []
+        for output in distinct.outputs:
+            column = jnp.asarray(packed[output], float)
+            columns.append(jnp.broadcast_to(column, motion.shape[1:]))
         return columns + list(forces)
 
     def run(motion, forces, mask, count, mixing, matrices) -> list[Array]:
         def iteration(k: Array, state: tuple) -> tuple:
-            carried, grams = state
-            parts = [_part(x, k, shape.samples) for x in (motion, forces)]
+            tails, grams = state
+            motion_part = _iteration_part(motion, k, shape.samples)
+            forces_part = _iteration_part(forces, k, shape.samples)
             # Results of a branch are stored: no consumer computes them again.
-            columns = jax.lax.cond(count > 0, evaluate, lambda *_: nothing, *parts)
-            new = jnp.stack(columns)
-            left = []
-            stages = zip(carried, matrices, shape.factors, shape.lags, strict=True)
-            for before, H, factor, lags in stages:
-                joined = jnp.concatenate([before, new], axis=1)
-                left.append(joined[:, new.shape[1] :])
-                tiles, rows = [], new.shape[1] // factor
-                # A banded matrix product, tile by tile.
-                for low in range(0, rows, TILE):
-                    height = min(TILE, rows - low)
-                    window = (height - 1) * factor + lags
-                    part = joined[:, low * factor : low * factor + window]
-                    tiles.append(part @ H[:height, :window].T)
-                new = jnp.concatenate(tiles, axis=1)
-            counted = _part(mask, k, shape.rows).astype(new.dtype)
+            columns = jax.lax.cond(
+                count > 0, evaluate, lambda *_: zeros, motion_part, forces_part
+            )
+            rows = jnp.stack(columns)
+            next_tails = []
+            for tail, matrix, stage in zip(tails, matrices, shape.stages, strict=True):
+                samples = jnp.concatenate([tail, rows], axis=1)
+                next_tails.append(samples[:, rows.shape[1] :])
+                count_of_rows = rows.shape[1] // stage.factor
+                rows = _filter_and_decimate(samples, matrix, stage, count_of_rows)
+            weights = _iteration_part(mask, k, shape.rows).astype(rows.dtype)
             sums = []
-            for j, own in enumerate(places):
-                own_rows = new[own] if carried else jnp.stack([columns[i] for i in own])
-                rows = mixing[j].T @ (own_rows * counted[j][None])
-                sums.append(grams[j] + rows @ rows.T)
-            return left, sums
+            for gram, mix, places, weight in zip(
+                grams, mixing, distinct.places, weights, strict=True
+            ):
+                # Without stages a joint's columns are taken before they are stored.
+                joint_rows = (
+                    rows[places] if tails else jnp.stack([columns[i] for i in places])
+                )
+                mixed = mix.T @ (joint_rows * weight[None])
+                sums.append(gram + mixed @ mixed.T)
+            return next_tails, sums
 
-        nothing = [jnp.zeros(shape.samples)] * height
-        sizes = zip(shape.delays, shape.factors, strict=True)
-        carried = [jnp.zeros((height, delay * factor)) for delay, factor in sizes]
-        grams = [jnp.zeros((len(own), len(own))) for own in places]
-        return jax.lax.fori_loop(0, count, iteration, (carried, grams))[1]
+        tails = [jnp.zeros((height, x.delay * x.factor)) for x in shape.stages]
+        grams = [jnp.zeros((len(x), len(x))) for x in distinct.places]
+        return jax.lax.fori_loop(0, count, iteration, (tails, grams))[1]
 
     return jax.jit(run)
 
 
-def _part(x: AnyArray, k: Array, length: int) -> Array:
+def _iteration_part(x: AnyArray, k: Array, length: int) -> Array:
     """Return the samples of one iteration, on the last axis."""
     start = (k * length, jnp.zeros_like(k))
     return jax.lax.dynamic_slice(x, start, (length, x.shape[1])).T
+
+
+def _filter_and_decimate(
+    samples: Array, matrix: Array, stage: StageShape, rows: int
+) -> Array:
+    """Return rows of samples by a banded matrix product, tile by tile."""
+    tiles = []
+    for row in range(0, rows, TILE):
+        height = min(TILE, rows - row)
+        width = (height - 1) * stage.factor + stage.lags
+        start = row * stage.factor
+        window = samples[:, start : start + width]
+        tiles.append(window @ matrix[:height, :width].T)
+    return jnp.concatenate(tiles, axis=1)

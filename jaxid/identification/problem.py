@@ -12,7 +12,7 @@ from jaxid.measurement.friction_state import with_memory
 from jaxid.measurement.observations import Observations, Progress
 from jaxid.robot.robot import Robot
 
-from .factors import Blocks, Columns, Factors, RowChunk, empty_factors, row_chunks
+from .factors import Blocks, Factors, RowChunk, empty_factors, row_chunks
 from .long_logs import stream_blocks, suits
 
 
@@ -92,8 +92,7 @@ class RegressionProblem:
                 edges = self._edges[number]
                 parts += stream_blocks(self.base, recording, edges, report)
             else:
-                columns = self.base.acting_columns
-                parts += self._reduce(number, RowChunk.equations, columns)
+                parts += self._reduce(number, RowChunk.equations)
         return Blocks(tuple(parts))
 
     @functools.cached_property
@@ -122,29 +121,25 @@ class RegressionProblem:
     def fold(
         self,
         equations: Callable[[RowChunk], Sequence[np.ndarray]],
-        columns: Columns | None = None,
     ) -> Blocks:
         """Return the factors of transformed rows, by blocks of time.
 
         Args:
             equations: Function from a chunk to the rows `[columns, force]` of each
                 joint.
-            columns: Parameters to which these columns belong; by default those of the
-                rows.
 
         Raises:
             InputError: If only factors are known.
         """
         self._require_samples()
-        columns = self.base.acting_columns if columns is None else columns
         parts = []
         for number in range(len(self.recordings)):
-            parts += self._reduce(number, equations, columns)
+            parts += self._reduce(number, equations)
         return Blocks(tuple(parts))
 
-    def _reduce(self, number: int, equations: Callable, columns: Columns):
+    def _reduce(self, number: int, equations: Callable) -> list[Factors]:
         """Return the factors of one recording's blocks of time."""
-        empty = empty_factors(columns, self.base.size)
+        empty = empty_factors(self.base.acting_columns, self.base.size)
         parts = [empty] * (len(self._edges[number]) - 1)
         first_block = self._first_block(number)
         for chunk in self.recording_chunks(number):

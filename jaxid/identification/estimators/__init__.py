@@ -8,14 +8,9 @@ from .estimate import (
 )
 from .friction_shapes import select_shapes as select_shapes
 from .least_squares import (
-    AbstractLoss as AbstractLoss,
-    GeneralisedLeastSquares as GeneralisedLeastSquares,
-    Huber as Huber,
     InstrumentalVariables as InstrumentalVariables,
-    IterativelyReweighted as IterativelyReweighted,
     LeastSquares as LeastSquares,
     RelativeTo as RelativeTo,
-    Tukey as Tukey,
     WeightedLeastSquares as WeightedLeastSquares,
 )
 from .regularisation_and_weights import (
@@ -29,6 +24,12 @@ from .regularisation_and_weights import (
     ResidualVariances as ResidualVariances,
     Ridge as Ridge,
     Truncated as Truncated,
+)
+from .robust import (
+    AbstractLoss as AbstractLoss,
+    Huber as Huber,
+    IterativelyReweighted as IterativelyReweighted,
+    Tukey as Tukey,
 )
 from .variable_projection import (
     NonlinearFriction as NonlinearFriction,

@@ -42,37 +42,27 @@ Influence = Callable[[RowChunk, np.ndarray], Iterator[Channel]]
 one channel for each joint."""
 
 
-class WeightedJoint(NamedTuple):
-    """Rows of one joint with their weights."""
-
-    columns: tuple[int, ...]  # base parameters that can act on the joint
-    equations: np.ndarray  # weighted columns of the regressor [rows, columns]
-    weights: np.ndarray  # weight of each row [rows]; zero if it does not count
-    counted: int  # number of rows that count
-
-
-def weighted_joints(chunk: RowChunk, weights: AnyArray) -> Iterator[WeightedJoint]:
-    """Yield the rows of each joint with their weights."""
-    for columns, theta, mask, weight in zip(
-        chunk.indices, chunk.columns, chunk.mask.T, np.asarray(weights), strict=True
-    ):
-        row_weights = np.where(mask, weight, 0.0)
-        equations = row_weights[:, None] * theta
-        yield WeightedJoint(tuple(columns), equations, row_weights, int(mask.sum()))
-
-
 def joint_rows(weights: Float[AnyArray, " joints"]) -> Influence:
     """Return the influence of rows that are weighted by joint: one channel for each joint."""
 
     def channels(chunk: RowChunk, residuals: np.ndarray) -> Iterator[Channel]:
-        joints = weighted_joints(chunk, weights)
-        for joint, residual in zip(joints, residuals.T, strict=True):
+        joints = zip(
+            chunk.indices,
+            chunk.columns,
+            residuals.T,
+            chunk.mask.T,
+            np.asarray(weights),
+            strict=True,
+        )
+        for columns, theta, residual, mask, weight in joints:
+            row_weights = np.where(mask, weight, 0.0)
+            equations = row_weights[:, None] * theta
             yield Channel(
-                columns=joint.columns,
-                instruments=joint.equations,
-                equations=joint.equations,
-                disturbance=joint.weights * residual,
-                counted=joint.counted,
+                columns=tuple(columns),
+                instruments=equations,
+                equations=equations,
+                disturbance=row_weights * residual,
+                counted=int(mask.sum()),
             )
 
     return channels

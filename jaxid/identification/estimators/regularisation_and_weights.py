@@ -22,6 +22,8 @@ RIDGE = 64 * np.finfo(float).eps
 """Ridge of the products of columns of length one, which may depend on each other."""
 LARGEST_UNCERTAINTY = 0.1
 """Fraction of the forces by which an undetermined combination may be wrong."""
+MIN_SHARE = 0.3
+"""Share of the largest parameter of a combination from which another one is named."""
 
 
 class Decomposition(eqx.Module):
@@ -43,57 +45,60 @@ class Decomposition(eqx.Module):
     @classmethod
     def of(cls, R: AnyArray, z: AnyArray) -> "Decomposition":
         """Decompose a weighted factor and its right-hand side."""
-        missing = max(0, np.shape(R)[1] - len(R))
-        R, z = (
-            np.pad(np.asarray(R), ((0, missing), (0, 0))),
-            np.pad(np.asarray(z), (0, missing)),
-        )
+        R = np.asarray(R)
+        z = np.asarray(z)
+        # Of fewer rows than columns there are as many singular values as columns.
+        missing_rows = max(0, R.shape[1] - len(R))
+        R = np.pad(R, ((0, missing_rows), (0, 0)))
+        z = np.pad(z, (0, missing_rows))
         norms = np.linalg.norm(R, axis=0)
         # Shorter columns are rounding: units may differ by less.
-        present = norms > 1e-13 * norms.max(initial=0.0)
-        scale = np.where(present, norms, 1.0)
-        U, s, Vt = np.linalg.svd(np.where(present, R / scale, 0.0), full_matrices=False)
+        is_visible = norms > 1e-13 * norms.max(initial=0.0)
+        scale = np.where(is_visible, norms, 1.0)
+        scaled = np.where(is_visible, R / scale, 0.0)
+        U, values, directions = np.linalg.svd(scaled, full_matrices=False)
         forces = U.T @ z
         rest = float(np.sqrt(max(z @ z - forces @ forces, 0.0)))
-        return cls(scale, s, Vt, forces, rest)
+        return cls(scale, values, directions, forces, rest)
 
     @property
     def unknown(self) -> Bool[np.ndarray, " base"]:
         """Which parameters take part in directions that are only rounding."""
-        s = self.values
-        null = self.directions[s <= NUMERICAL * s.max(initial=0.0)]
-        return np.sum(null**2, axis=0) > 1e-8
+        is_rounding = self.values <= NUMERICAL * self.values.max(initial=0.0)
+        return np.sum(self.directions[is_rounding] ** 2, axis=0) > 1e-8
 
     def solve(self, inverse: np.ndarray | None = None) -> np.ndarray:
         """Return the parameters, by a substitute of 1 / value² for each direction (`Complete`)."""
-        inverse = Complete().inverse(self.values) if inverse is None else inverse
-        along = inverse * self.values * self.forces
-        return self.directions.T @ along / self.scale
+        if inverse is None:
+            inverse = Complete().inverse(self.values)
+        along_directions = inverse * self.values * self.forces
+        return self.directions.T @ along_directions / self.scale
 
     def inverse_information(self, inverse: np.ndarray | None = None) -> np.ndarray:
         """Return the inverse of the information in the parameters' units; see `solve`."""
-        inverse = Complete().inverse(self.values) if inverse is None else inverse
-        V = self.directions / self.scale
-        return (V.T * inverse) @ V
+        if inverse is None:
+            inverse = Complete().inverse(self.values)
+        directions = self.directions / self.scale
+        return (directions.T * inverse) @ directions
 
 
 def inverse_information(
-    whole: Float[Array, "base base"], ridge: float = RIDGE
+    information: Float[Array, "base base"], ridge: float = RIDGE
 ) -> tuple[Array, Array]:
     """Return the inverse of an information, and a bound of its root's condition number.
 
     Columns are scaled to length one, and a ridge of rounding's size keeps the factor
     from failing.
     """
-    size = whole.shape[-1]
-    square = jnp.diagonal(whole)
-    scale = 1.0 / jnp.sqrt(jnp.where(square > 0, square, 1.0))
-    scaled = scale[:, None] * whole * scale[None] + ridge * np.eye(size)
-    L = jnp.linalg.cholesky(scaled)
-    Li = jax.lax.linalg.triangular_solve(L, jnp.eye(size), left_side=True, lower=True)
-    bound = jnp.sqrt(size * jnp.sum(Li**2))
-    Li = Li * scale[None]
-    return Li.T @ Li, jnp.where(jnp.isfinite(bound), bound, jnp.inf)
+    size = information.shape[-1]
+    squares = jnp.diagonal(information)
+    scale = 1.0 / jnp.sqrt(jnp.where(squares > 0, squares, 1.0))
+    scaled = scale[:, None] * information * scale[None]
+    L = jnp.linalg.cholesky(scaled + ridge * np.eye(size))
+    root = jax.lax.linalg.triangular_solve(L, jnp.eye(size), left_side=True, lower=True)
+    bound = jnp.sqrt(size * jnp.sum(root**2))
+    root = root * scale[None]
+    return root.T @ root, jnp.where(jnp.isfinite(bound), bound, jnp.inf)
 
 
 class AbstractSolution(eqx.Module):
@@ -146,9 +151,10 @@ class Truncated(AbstractSpectralSolution):
 
     def inverse(self, values):
         """Return the inverse squares; zero for weak directions."""
-        s = np.asarray(values)
-        kept = s > max(self.rcond, NUMERICAL) * s.max(initial=0.0)
-        return np.where(kept, 1.0 / np.where(kept, s, 1.0) ** 2, 0.0)
+        values = np.asarray(values)
+        limit = max(self.rcond, NUMERICAL) * values.max(initial=0.0)
+        is_strong = values > limit
+        return np.where(is_strong, 1.0 / np.where(is_strong, values, 1.0) ** 2, 0.0)
 
 
 class Ridge(AbstractSpectralSolution):
@@ -169,8 +175,9 @@ class Ridge(AbstractSpectralSolution):
 
     def inverse(self, values):
         """Return bounded inverse squares."""
-        s = np.asarray(values)
-        return 1.0 / (s**2 + (max(self.strength, NUMERICAL) * s.max(initial=0.0)) ** 2)
+        values = np.asarray(values)
+        halving_value = max(self.strength, NUMERICAL) * values.max(initial=0.0)
+        return 1.0 / (values**2 + halving_value**2)
 
 
 class CrossValidated(AbstractSolution):
@@ -190,18 +197,21 @@ class CrossValidated(AbstractSolution):
 
     def choose(self, blocks, weights):
         """Test every candidate on every block; reject a single block."""
-        squares, count = np.asarray(weights) ** 2, len(blocks.parts)
+        squared_weights = np.asarray(weights) ** 2
+        count = len(blocks.parts)
         errors = np.empty((len(self.candidates), count))
-        for k, (rest, part) in enumerate(cross_validation_folds(blocks, count)):
-            d = Decomposition.of(*blocks.select(rest).total.weighted(weights))
+        for k, (others, part) in enumerate(cross_validation_folds(blocks, count)):
+            training = blocks.select(others).total
+            decomposition = Decomposition.of(*training.weighted(weights))
             held_out = blocks.select(part).total
             for i, candidate in enumerate(self.candidates):
-                p = d.solve(candidate.inverse(d.values))
-                errors[i, k] = squares @ held_out.residual_squares(p)
+                p = decomposition.solve(candidate.inverse(decomposition.values))
+                errors[i, k] = squared_weights @ held_out.residual_squares(p)
         total = errors.sum(axis=1)
         best = int(np.argmin(total))
-        margin = errors[best].std(ddof=1) * np.sqrt(errors.shape[1])
-        return self.candidates[int(np.flatnonzero(total <= total[best] + margin).max())]
+        standard_error = errors[best].std(ddof=1) * np.sqrt(count)
+        is_as_good = total <= total[best] + standard_error
+        return self.candidates[int(np.flatnonzero(is_as_good).max())]
 
 
 class AbstractWeights(eqx.Module):
@@ -223,13 +233,14 @@ class GivenWeights(AbstractWeights):
 
     def __call__(self, robot, factors):
         """Return the weights; reject those that are not one number for each joint."""
-        w = np.asarray(self.weights)
-        good = w.shape == (robot.joints,) and np.isfinite(w).all()
-        if not good or w.min() < 0 or not w.any():
+        weights = np.asarray(self.weights)
+        is_one_each = weights.shape == (robot.joints,) and np.isfinite(weights).all()
+        if not is_one_each or weights.min() < 0 or not weights.any():
             raise InputError(
-                f"`weights` must be {robot.joints} numbers from 0, not all zero: {w}."
+                f"`weights` must be {robot.joints} numbers from 0, not all zero: "
+                f"{weights}."
             )
-        return w
+        return weights
 
 
 class MaximumForces(AbstractWeights):
@@ -318,7 +329,9 @@ class UndeterminedDirection(eqx.Module):
         return f"{', '.join(names[:-1])} and {names[-1]} cannot be told apart"
 
 
-def undetermined(blocks: Blocks, weights, decomposition: Decomposition):
+def undetermined(
+    blocks: Blocks, weights: AnyArray, decomposition: Decomposition
+) -> tuple[UndeterminedDirection, ...]:
     r"""Return the directions in which the data leave more open than they tell.
 
     Scale the parameters so that each of them alone makes forces of its own column's
@@ -329,25 +342,34 @@ def undetermined(blocks: Blocks, weights, decomposition: Decomposition):
     $\sqrt{\sum g_k^2 K/(K-1)} / s^2$. Where parameters may thus make forces of a tenth
     of the whole recording that cancel each other, the direction is not determined.
     """
-    s, V = decomposition.values, decomposition.directions
-    size = np.hypot(np.linalg.norm(decomposition.forces), decomposition.rest)
-    inverse, p = Complete().inverse(s), decomposition.solve()
-    sums = np.zeros(len(s))
+    values = decomposition.values
+    force_norm = np.hypot(np.linalg.norm(decomposition.forces), decomposition.rest)
+    p = decomposition.solve()
+    squares = np.zeros(len(values))
     for part in blocks.parts:
         R, z = part.weighted(weights)
-        sums += (V @ ((R.T @ (R @ p - z)) / decomposition.scale)) ** 2
+        gradient = R.T @ (R @ p - z) / decomposition.scale
+        squares += (decomposition.directions @ gradient) ** 2
     count = len(blocks.parts)
-    deviations = np.sqrt(sums * count / max(count - 1, 1)) * inverse
-    floor = np.finfo(float).eps * size
-    forces = max(size, np.finfo(float).tiny)
-    uncertainty = np.where(inverse > 0, np.maximum(deviations, floor) / forces, np.inf)
-    found = []
+    inverse = Complete().inverse(values)
+    deviations = np.sqrt(squares * count / max(count - 1, 1)) * inverse
+    rounding = np.finfo(float).eps * force_norm
+    uncertainty = np.maximum(deviations, rounding)
+    uncertainty = uncertainty / max(force_norm, np.finfo(float).tiny)
+    uncertainty[inverse == 0] = np.inf
+
+    directions = []
     for k in np.flatnonzero(uncertainty > LARGEST_UNCERTAINTY)[::-1]:
-        order = np.argsort(-np.abs(V[k]), kind="stable")
-        share = V[k, order] / V[k, order[0]]
-        # Parameters below 0.3 of the largest one are left out.
-        large = np.abs(share) >= 0.3
-        parts = tuple(order[large].tolist()), tuple(share[large].tolist())
-        numbers = float(s[k] / s[0]), float(uncertainty[k])
-        found.append(UndeterminedDirection(*parts, *numbers))
-    return tuple(found)
+        direction = decomposition.directions[k]
+        order = np.argsort(-np.abs(direction), kind="stable")
+        shares = direction[order] / direction[order[0]]
+        is_part = np.abs(shares) >= MIN_SHARE
+        directions.append(
+            UndeterminedDirection(
+                parts=tuple(order[is_part].tolist()),
+                shares=tuple(shares[is_part].tolist()),
+                singular_value=float(values[k] / values[0]),
+                uncertainty=float(uncertainty[k]),
+            )
+        )
+    return tuple(directions)
