@@ -116,7 +116,8 @@ class Study:
         import jaxid as jid
 
         # private: the table of a design, which many draws share
-        from jaxid.identification.uncertainty.spectral import SpectralTable, row_spectra
+        from jaxid.identification.uncertainty.spectra_of_rows import row_spectra
+        from jaxid.identification.uncertainty.spectral import SpectralTable
 
         self.o = observations(base, p, seed, encoder)
         self.rows = jid.RegressionProblem(base, [self.o])

@@ -11,7 +11,7 @@ from virtual import left_out_in_turn, observations, standard_parameters
 
 import jaxid as jid
 from jaxid.arrays import in_parts
-from jaxid.identification import many_data_sets
+from jaxid.identification.batch_solution import MAX_CONDITION
 from jaxid.identification.factors import Blocks
 from jaxid.identification.identify import fit_problem
 from jaxid.identification.many_data_sets import identify_batch
@@ -161,7 +161,7 @@ def test_nearly_dependent_columns_are_as_accurate_as_alone(base):
     sets = [o.replace(motion=jax.tree.map(lambda x: 3e-5 * x, o.motion)) for o in sets]
     fit = identify_batch(base, *stacked(sets))
     one = jid.identify(base, sets[0])
-    assert one.condition_numbers.scaled > many_data_sets.WELL_CONDITIONED
+    assert one.condition_numbers.scaled > MAX_CONDITION
     np.testing.assert_allclose(
         fit.standard_deviations[0], one.naive_standard_deviations, rtol=1e-5
     )

@@ -15,7 +15,7 @@ from virtual import (
 
 import jaxid as jid
 from jaxid.dynamics.dispatch import in_numpy
-from jaxid.identification.uncertainty import UNCERTAINTIES, spectral
+from jaxid.identification.uncertainty import UNCERTAINTIES, spectra_of_rows
 from jaxid.identification.uncertainty.spectral import (
     SpectralTable,
     sandwich,
@@ -33,7 +33,7 @@ def base():
 def row_spectra(base, recordings):
     problem = jid.RegressionProblem(base, recordings)
     estimate = ESTIMATOR(problem)
-    return spectral.row_spectra(problem, estimate), estimate
+    return spectra_of_rows.row_spectra(problem, estimate), estimate
 
 
 def by_definition(base, o, weights):
@@ -178,12 +178,12 @@ def test_long_logs_in_stretches_agree_with_the_whole(base, monkeypatch):
     noise = coloured(np.random.default_rng(3), (1, 24000, 2), 0.3, 0.02)[0]
     o = o.replace(forces=o.forces + noise)
     whole = jid.identify(base, o, ESTIMATOR)
-    monkeypatch.setattr(spectral, "MAX_ROWS", 1500)
+    monkeypatch.setattr(spectra_of_rows, "MAX_ROWS", 1500)
     divided = jid.identify(base, o, ESTIMATOR)
     np.testing.assert_allclose(
         divided.standard_deviations, whole.standard_deviations, rtol=0.06
     )
-    monkeypatch.setattr(spectral, "MAX_SAMPLES", 8000)
+    monkeypatch.setattr(spectra_of_rows, "MAX_SAMPLES", 8000)
     some = jid.identify(base, o, ESTIMATOR)
     np.testing.assert_allclose(
         some.standard_deviations, whole.standard_deviations, rtol=0.15
@@ -285,7 +285,7 @@ def test_many_gaps_cost_no_memory_and_change_little(base, monkeypatch):
     o = o.replace(forces=o.forces + noise)
     shared, _ = row_spectra(base, [o])
     assert [x.stretches for x in shared.lines] == [8]
-    monkeypatch.setattr(spectral, "MAX_LENGTHS", 8)
+    monkeypatch.setattr(spectra_of_rows, "MAX_LENGTHS", 8)
     apart, _ = row_spectra(base, [o])
     assert len(apart.lines) == 8
     (one, _), (other, _) = sandwich(shared), sandwich(apart)
