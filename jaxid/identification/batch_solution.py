@@ -181,7 +181,7 @@ def _solve_one(
 ) -> BatchFit:
     """Solve one data set by the products of its rows."""
     samples = len(data_set.motion.q)
-    weights = data_set.weights
+    weights = jnp.asarray(data_set.weights)
     rows = _Rows(
         [np.array(k, int) for k in regressor.columns],
         columns,
@@ -262,10 +262,12 @@ def _naive_deviations(
 ) -> Array:
     """Return deviations for independent rows; see `naive_covariance`."""
     explained_share = rows.size / jnp.maximum(counts.sum(), 1.0)
-    remaining_rows = counts * jnp.maximum(1.0 - explained_share, 0.0)
-    variances = squares / jnp.maximum(remaining_rows, 1.0)[None]
+    remaining_share = jnp.maximum(1.0 - explained_share, 0.0)
+    remaining_rows = jnp.maximum(counts * remaining_share, 1.0)
+    variances = squares / remaining_rows[None]
     effects = []
     for k, gram, weight in zip(rows.parameters, grams, rows.weights, strict=True):
         gain = inverse[:, k] * weight**2
         effects.append(jnp.sum((gain @ gram) * gain, axis=-1))
-    return jnp.sqrt(jnp.maximum(variances @ jnp.stack(effects), 0.0))
+    parameter_variances = variances @ jnp.stack(effects)
+    return jnp.sqrt(jnp.maximum(parameter_variances, 0.0))

@@ -107,8 +107,9 @@ def combine(fits: Sequence[Fit], maps, offsets=None) -> tuple[np.ndarray, Uncert
         covariance += part
         # The degrees of freedom of a sum are a mean of those of its terms.
         shares = A**2 * np.diag(fit_covariance)
-        mean = (shares / dof).sum(axis=1) / np.maximum(shares.sum(axis=1), 1e-300)
-        scatter += np.diag(part) ** 2 * mean
+        total_shares = np.maximum(shares.sum(axis=1), 1e-300)
+        mean_inverse_dof = (shares / dof).sum(axis=1) / total_shares
+        scatter += np.diag(part) ** 2 * mean_inverse_dof
     total_dof = np.full(len(B), np.inf)
     has_scatter = scatter > 0
     variances = np.diag(covariance)[has_scatter]

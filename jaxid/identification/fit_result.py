@@ -39,10 +39,14 @@ from .estimators.regularisation_and_weights import (
 from .factors import Blocks
 from .uncertainty.result import ResidualSpectra, Uncertainty
 
-TRUSTED, DOUBTFUL = 0.1, 0.5
-"""Relative standard deviations up to which an estimate is trusted, or doubtful, as fractions."""
-FORMAT, VERSION = "jaxid model", 1
-"""Entries of a model file that tell what it is."""
+TRUSTED = 0.1
+"""Relative standard deviation (fraction) up to which an estimate is trusted."""
+DOUBTFUL = 0.5
+"""Relative standard deviation (fraction) up to which an estimate is only doubtful."""
+FORMAT = "jaxid model"
+"""Entry of a model file that tells what it is."""
+VERSION = 1
+"""Version of the entries of a model file."""
 
 
 class ConditionNumbers(eqx.Module):
@@ -135,15 +139,17 @@ class Fit(Summarised, eqx.Module):
         Raises:
             InputError: If `level` is not between 0 and 1.
         """
-        half, p = self.uncertainty.half_widths(level), self.parameters
-        return np.stack([p - half, p + half], axis=1)
+        half_widths = self.uncertainty.half_widths(level)
+        lower = self.parameters - half_widths
+        return np.stack([lower, self.parameters + half_widths], axis=1)
 
     @property
     def relative_standard_deviations(self) -> Float[np.ndarray, " base"]:
         """Standard deviations relative to the sizes of the estimates."""
-        size = np.abs(self.parameters)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return np.where(size > 0, self.standard_deviations / size, np.inf)
+        sizes = np.abs(self.parameters)
+        ratios = np.full_like(sizes, np.inf)
+        np.divide(self.standard_deviations, sizes, out=ratios, where=sizes > 0)
+        return ratios
 
     @property
     def trust(self) -> tuple[Status, ...]:
@@ -152,12 +158,11 @@ class Fit(Summarised, eqx.Module):
         `GOOD` up to 0.1, `DOUBTFUL` up to 0.5; `BAD` above, and for all that is
         undetermined.
         """
-        relative = self.relative_standard_deviations.copy()
-        relative[[k for direction in self.undetermined for k in direction.parts]] = (
-            np.inf
-        )
-        steps = np.searchsorted((TRUSTED, DOUBTFUL), relative)
+        deviations = self.relative_standard_deviations.copy()
+        for direction in self.undetermined:
+            deviations[list(direction.parts)] = np.inf
         grades = Status.GOOD, Status.DOUBTFUL, Status.BAD
+        steps = np.searchsorted((TRUSTED, DOUBTFUL), deviations)
         return tuple(grades[k] for k in steps)
 
     @property
@@ -186,8 +191,8 @@ class Fit(Summarised, eqx.Module):
     def is_least_squares(self) -> bool:
         """Whether the estimates are weighted least squares of the rows, up to rounding."""
         R, z = self.factor
-        away = self.parameters - Decomposition.of(R, z).solve()
-        return bool(np.linalg.norm(R @ away) <= 1e-7 * np.linalg.norm(z))
+        difference = self.parameters - Decomposition.of(R, z).solve()
+        return bool(np.linalg.norm(R @ difference) <= 1e-7 * np.linalg.norm(z))
 
     @property
     def condition_number(self) -> float:
@@ -208,19 +213,18 @@ class Fit(Summarised, eqx.Module):
     @property
     def facts(self) -> list[tuple[str, str]]:
         """Rows, condition numbers, residual and trust, each with its word."""
-        rows, numbers = self.rows, self.condition_numbers
-        good, fair, poor = map(
-            self.trust.count, (Status.GOOD, Status.DOUBTFUL, Status.BAD)
-        )
-        fewest, most = min(rows), max(rows)
+        numbers = self.condition_numbers
+        counts = {grade: self.trust.count(grade) for grade in Status}
+        rows = f"{min(self.rows)} to {max(self.rows)}"
+        if min(self.rows) == max(self.rows):
+            rows = str(self.rows[0])
         return [
-            ("rows per joint", str(most) if fewest == most else f"{fewest} to {most}"),
+            ("rows per joint", rows),
             (
                 "condition number",
                 f"{significant(numbers.raw, 4)} in SI units, "
-                f"{significant(numbers.weighted, 4)} "
-                f"weighted, {significant(numbers.scaled, 4)} weighted with columns of "
-                "length one",
+                f"{significant(numbers.weighted, 4)} weighted, "
+                f"{significant(numbers.scaled, 4)} weighted with columns of length one",
             ),
             (
                 "residual",
@@ -228,25 +232,24 @@ class Fit(Summarised, eqx.Module):
             ),
             (
                 "estimates",
-                f"{good} of {self.base.size} known to {100 * TRUSTED:g} %, {fair} to "
-                f"{100 * DOUBTFUL:g} %, {poor} worse or undetermined",
+                f"{counts[Status.GOOD]} of {self.base.size} known to "
+                f"{100 * TRUSTED:g} %, {counts[Status.DOUBTFUL]} to "
+                f"{100 * DOUBTFUL:g} %, {counts[Status.BAD]} worse or undetermined",
             ),
         ]
 
     @property
     def determination(self) -> list[Remark]:
         """Combinations that the logs do not determine, and what to do about them."""
-        base, count = self.base, len(self.undetermined)
+        size = self.base.size
+        count = len(self.undetermined)
         if not count:
-            return [
-                Remark(
-                    f"These logs determine all {base.size} base parameters.",
-                    Status.GOOD,
-                )
-            ]
-        some = f"{count} combination{'' if count == 1 else 's'}"
+            text = f"These logs determine all {size} base parameters."
+            return [Remark(text, Status.GOOD)]
+        combinations = "1 combination" if count == 1 else f"{count} combinations"
         headline = (
-            f"NOT DETERMINED by these logs: {some} of the {base.size} base parameters."
+            f"NOT DETERMINED by these logs: {combinations} of the {size} base "
+            "parameters."
         )
         remarks = [Remark(headline, Status.BAD)]
         for direction in self.undetermined:
@@ -254,21 +257,19 @@ class Fit(Summarised, eqx.Module):
             if np.isfinite(direction.uncertainty):
                 detail = f"leaves {percent(direction.uncertainty)} % of the forces open"
             detail += f"; singular value {direction.singular_value:.1e} of the largest"
-            remarks.append(Remark(f"{direction.sentence(base)}.", Status.BAD, detail))
+            sentence = f"{direction.sentence(self.base)}."
+            remarks.append(Remark(sentence, Status.BAD, detail))
         advice = (
             "A combination counts as not determined if it leaves more than "
             f"{100 * LARGEST_UNCERTAINTY:g} % of the whole forces open. Estimates of "
-            "these "
-            "parameters mean nothing one by one, and the model may fail on other "
-            "motions. Record "
-            "a motion that moves these joints in more poses, faster and in both "
-            "directions, or "
-            "leave effects out in `[model]`"
+            "these parameters mean nothing one by one, and the model may fail on other "
+            "motions. Record a motion that moves these joints in more poses, faster "
+            "and in both directions, or leave effects out in `[model]`"
         )
         if isinstance(self.solution, Complete):
             advice += (
-                '; `ridge = "cross_validated"` in `[estimator]` keeps small '
-                "what is left open"
+                '; `ridge = "cross_validated"` in `[estimator]` keeps small what is '
+                "left open"
             )
         return [*remarks, Remark(advice)]
 
@@ -279,7 +280,7 @@ class Fit(Summarised, eqx.Module):
         meaningful. Beside them are the standard deviations that independent rows would
         have, and the ratio to these.
         """
-        base, trust, ratios = self.base, self.trust, self.uncertainty.ratios
+        base = self.base
         values, deviations = with_deviations(self.parameters, self.standard_deviations)
         columns = [
             Column("#", list(range(1, base.size + 1))),
@@ -289,23 +290,28 @@ class Fit(Summarised, eqx.Module):
             Column("unit", base.units),
             Column("±", self.relative_standard_deviations, "%", percent),
         ]
-        remarks, finite = [*self.determination], ratios[np.isfinite(ratios)]
-        if np.any(np.abs(finite - 1.0) > 1e-9):
+        remarks = self.determination
+        ratios = self.uncertainty.ratios
+        finite_ratios = ratios[np.isfinite(ratios)]
+        if np.any(np.abs(finite_ratios - 1.0) > 1e-9):
             naive = self.naive_standard_deviations
             columns += [
                 Column("naive ±", naive, format=lambda x: significant(x, 2)),
                 Column("ratio", ratios, format=lambda x: significant(x, 2)),
             ]
+            typical_ratio = significant(float(np.median(finite_ratios)), 2)
             text = (
-                f"Standard deviations are {significant(float(np.median(finite)), 2)} "
-                "times "
-                "(median) those of independent rows, because errors of neighbouring "
-                "rows are "
-                "correlated."
+                f"Standard deviations are {typical_ratio} times (median) those of "
+                "independent rows, because errors of neighbouring rows are correlated."
             )
-            remarks.append(Remark(text))
-        title = f"{base.model.robot.name}: {base.size} base parameters"
-        return Table(title, *columns, facts=self.facts, status=trust, remarks=remarks)
+            remarks = [*remarks, Remark(text)]
+        return Table(
+            f"{base.model.robot.name}: {base.size} base parameters",
+            *columns,
+            facts=self.facts,
+            status=self.trust,
+            remarks=remarks,
+        )
 
     def predict(self, motion: Motion) -> Float[np.ndarray, "samples joints"]:
         """Return the forces of a motion, without a known tool's [N m or N] (Eq. 39).
@@ -379,8 +385,7 @@ def load_fit(path: str | Path) -> Fit:
     if document.get("version") != VERSION:
         raise InputError(
             f"`{path}` is a model file of version {document.get('version')!r:.20}, "
-            "but this jaxid "
-            f"reads version {VERSION}: identify again."
+            f"but this jaxid reads version {VERSION}: identify again."
         )
     content = document.get("model")
     if document.get("checksum") != checksum_of(content):
@@ -400,23 +405,20 @@ def load_fit(path: str | Path) -> Fit:
 
 def checksum_of(content: Any) -> str:
     """Return the SHA-256 of plain JSON values, whatever their layout in a file."""
-    plain = json.dumps(
-        content, sort_keys=True, separators=(",", ":"), ensure_ascii=True
-    )
-    return f"sha256:{hashlib.sha256(plain.encode()).hexdigest()}"
+    text = json.dumps(content, sort_keys=True, separators=(",", ":"), ensure_ascii=True)
+    return f"sha256:{hashlib.sha256(text.encode()).hexdigest()}"
 
 
 def _check(fit: Fit) -> None:
     """Reject arrays of a file that do not belong to its robot."""
-    n, joints = fit.base.size, fit.base.model.robot.joints
-    found = {
-        "parameters": fit.parameters,
-        "covariance": fit.covariance,
-        "weights": fit.weights,
+    n = fit.base.size
+    joints = fit.base.model.robot.joints
+    arrays = {
+        "parameters": (fit.parameters, (n,)),
+        "covariance": (fit.covariance, (n, n)),
+        "weights": (fit.weights, (joints,)),
     }
-    for (name, array), shape in zip(
-        found.items(), ((n,), (n, n), (joints,)), strict=True
-    ):
+    for name, (array, shape) in arrays.items():
         if np.shape(array) != shape:
             raise InputError(
                 f"`{name}` must have the shape {shape}, but has {np.shape(array)}"
@@ -425,13 +427,9 @@ def _check(fit: Fit) -> None:
         raise InputError("`parameters` must hold finite numbers")
     if not re.fullmatch(r"(\d{4}-\d{2}-\d{2})?", fit.date, re.ASCII):
         raise InputError(f"`date` must be like 2026-01-31, but is {fit.date!r:.40}")
-    for text in (
-        fit.name,
-        *fit.recordings,
-        *fit.notes,
-        *fit.base.names,
-        *fit.base.units,
-    ):
+    base = fit.base
+    texts = [fit.name, *fit.recordings, *fit.notes, *base.names, *base.units]
+    for text in texts:
         if not text.isprintable():
             raise InputError(f"the text {text!r:.40} must be printable")
 

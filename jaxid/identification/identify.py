@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxid.arrays import AnyArray
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
 from jaxid.measurement.observations import Observations, Progress
@@ -186,8 +187,8 @@ def _condition_numbers(factors: Factors, weighted: np.ndarray) -> ConditionNumbe
 
 def naive_covariance(
     factors: Factors,
-    weights: np.ndarray,
-    parameters: np.ndarray,
+    weights: AnyArray,
+    parameters: AnyArray,
     inverse: np.ndarray,
     effective_parameters: float = 0.0,
 ) -> np.ndarray:
@@ -202,7 +203,9 @@ def naive_covariance(
     squares = factors.residual_squares(parameters)
     unknowns = inverse.shape[1]
     covariance = np.zeros((unknowns, unknowns))
-    for joint, weight, square in zip(factors.joints, weights, squares, strict=True):
+    for joint, weight, square in zip(
+        factors.joints, np.asarray(weights), squares, strict=True
+    ):
         variance = square / max(joint.rows * remaining_share, 1.0)
         columns = np.asarray(joint.R)[:, :-1]
         gain = weight**2 * columns @ inverse[list(joint.columns)]

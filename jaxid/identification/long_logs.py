@@ -198,16 +198,17 @@ class _Stream:
         distance = max(reach - edge, recording.decimation.memory(), 0)
         low = first_row + math.ceil(distance / factor)
         samples = stop - start - 2 * edge - distance
-        high = min(first_row + (samples - 1) // factor + 1, end_row)
-        max_rows = self._shape.iterations * self._shape.rows - self._shape.delay
+        high = min(first_row + math.ceil(samples / factor), end_row)
+        call_rows = self._shape.iterations * self._shape.rows
+        max_rows = call_rows - self._shape.delay
         for block, rows in divide_rows(self._edges, slice(low, high)):
             for row in range(rows.start, rows.stop, max_rows):
                 next_row = min(row + max_rows, rows.stop)
-                begin = start + edge + (row - first_row) * factor - reach
+                instant = start + edge + (row - first_row) * factor
+                begin = instant - reach
                 end = min(begin + self._samples_of(next_row - row), stop)
-                yield Piece(
-                    block, slice(row, next_row), slice(begin, end, self._stride)
-                )
+                samples_of_rows = slice(begin, end, self._stride)
+                yield Piece(block, slice(row, next_row), samples_of_rows)
 
     def _samples_of(self, rows: int) -> int:
         """Return the number of samples of the iterations that make so many rows."""
@@ -219,8 +220,11 @@ class _Stream:
         is_end = np.ones(len(self._mask), bool)
         for piece in self._pieces:
             is_end[piece.rows] = False
-        changes = np.flatnonzero(np.diff(np.r_[False, is_end, False]))
-        ranges = changes.reshape(-1, 2).tolist()
+        # Starts and stops of the runs of such rows alternate.
+        changes = np.flatnonzero(np.diff(np.pad(is_end, 1)))
+        starts = changes[::2].tolist()
+        stops = changes[1::2].tolist()
+        ranges = list(zip(starts, stops, strict=True))
         samples = max(4096, 2 * self._shape.reach)
         for chunk in row_chunks(self._base, self._observations, samples, ranges):
             mask = chunk.mask & is_end[chunk.rows, None]
@@ -273,11 +277,12 @@ class _Stream:
     ) -> Iterator[tuple[int, Grams]]:
         """Yield block and Gram matrices of some pieces, and of the ends."""
         # One core adds up a piece; the next ones are read meanwhile.
-        results = on_cores(lambda x: self._call(x, mixing), map(self._fill, pieces))
-        for k, (piece, grams) in enumerate(zip(pieces, results, strict=True), 1):
-            yield piece.block, grams
+        arrays = map(self._fill, pieces)
+        results = on_cores(lambda x: self._call(x, mixing), arrays)
+        for k, grams in enumerate(results):
+            yield pieces[k].block, grams
             if progress is not None:
-                progress(k / len(pieces))
+                progress((k + 1) / len(pieces))
         for block, equations in self._end_rows:
             mixed = [rows @ mix for rows, mix in zip(equations, mixing, strict=True)]
             yield block, [rows.T @ rows for rows in mixed]
@@ -291,11 +296,13 @@ class _Stream:
         # The first rows come late, and do not count.
         mask = np.pad(self._mask[piece.rows], ((shape.delay, 0), (0, 0)))
         samples = shape.iterations * shape.samples
+        rows = shape.iterations * shape.rows
+        iterations = math.ceil(len(mask) / shape.rows)
         return [
             _fill_up(np.asarray(np.hstack(arguments), np.float64), samples),
             _fill_up(np.asarray(forces, np.float64), samples),
-            _fill_up(mask, shape.iterations * shape.rows),
-            np.asarray(math.ceil(len(mask) / shape.rows), np.int32),
+            _fill_up(mask, rows),
+            np.asarray(iterations, np.int32),
         ]
 
     def _call(self, arrays: list[np.ndarray], mixing: Grams) -> Grams:
@@ -334,7 +341,8 @@ def _shows_every_direction(
     visible_directions = directions[:, values > 0.5]
     if not visible_directions.shape[1]:
         return not total.any()
-    sizes = np.linalg.eigvalsh(visible_directions.T @ total @ visible_directions)
+    visible_total = visible_directions.T @ total @ visible_directions
+    sizes = np.linalg.eigvalsh(visible_total)
     typical_size = np.median(sizes)
     is_small_enough = np.linalg.norm(total) <= ratio * typical_size
     return bool(is_small_enough and sizes[0] * ratio > typical_size)

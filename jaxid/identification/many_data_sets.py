@@ -179,7 +179,7 @@ def _solve_again(
 ) -> BatchFit:
     """Solve the data sets that are not well conditioned by orthogonal factors, one by one."""
     fit = jax.tree.map(np.array, fit)
-    for k in np.flatnonzero(~fit.determined):
+    for k in np.flatnonzero(~fit.determined).tolist():
         data_set = jax.tree.map(lambda x, k=k: np.asarray(x)[k : k + 1], batch)
         if data_set.mask is not None and data_set.mask.sum() <= base.size:
             fit.parameters[k] = 0.0

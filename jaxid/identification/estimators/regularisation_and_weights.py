@@ -95,10 +95,17 @@ def inverse_information(
     scale = 1.0 / jnp.sqrt(jnp.where(squares > 0, squares, 1.0))
     scaled = scale[:, None] * information * scale[None]
     L = jnp.linalg.cholesky(scaled + ridge * np.eye(size))
-    root = jax.lax.linalg.triangular_solve(L, jnp.eye(size), left_side=True, lower=True)
-    bound = jnp.sqrt(size * jnp.sum(root**2))
-    root = root * scale[None]
-    return root.T @ root, jnp.where(jnp.isfinite(bound), bound, jnp.inf)
+    scaled_root = jax.lax.linalg.triangular_solve(
+        L,
+        jnp.eye(size),
+        left_side=True,
+        lower=True,
+    )
+    bound = jnp.sqrt(size * jnp.sum(scaled_root**2))
+    # The factor of a singular information is NaN.
+    bound = jnp.where(jnp.isfinite(bound), bound, jnp.inf)
+    root = scaled_root * scale[None]
+    return root.T @ root, bound
 
 
 class AbstractSolution(eqx.Module):
@@ -205,13 +212,15 @@ class CrossValidated(AbstractSolution):
             decomposition = Decomposition.of(*training.weighted(weights))
             held_out = blocks.select(part).total
             for i, candidate in enumerate(self.candidates):
-                p = decomposition.solve(candidate.inverse(decomposition.values))
+                inverse = candidate.inverse(decomposition.values)
+                p = decomposition.solve(inverse)
                 errors[i, k] = squared_weights @ held_out.residual_squares(p)
         total = errors.sum(axis=1)
         best = int(np.argmin(total))
         standard_error = errors[best].std(ddof=1) * np.sqrt(count)
         is_as_good = total <= total[best] + standard_error
-        return self.candidates[int(np.flatnonzero(is_as_good).max())]
+        strongest = int(np.flatnonzero(is_as_good).max())
+        return self.candidates[strongest]
 
 
 class AbstractWeights(eqx.Module):

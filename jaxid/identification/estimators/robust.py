@@ -1,6 +1,7 @@
 """Robust estimation: rows with large residuals count less, or not at all."""
 
 import dataclasses
+import math
 from abc import abstractmethod
 from collections.abc import Iterator
 
@@ -160,8 +161,10 @@ class IterativelyReweighted(AbstractEstimator):
         solution = self.solution.choose(blocks, weights)
         parameters = decomposition.solve(solution.inverse(decomposition.values))
         residual_norm = float(np.linalg.norm(z - R @ parameters))
+        if residual_norm == 0:
+            return parameters, 0.0
         step_norm = float(np.linalg.norm(R @ (parameters - p)))
-        return parameters, step_norm / residual_norm if residual_norm > 0 else 0.0
+        return parameters, step_norm / residual_norm
 
     def _mean_slopes(self, problem: RegressionProblem, p, scale) -> np.ndarray:
         """Return the mean slope of the loss at the residuals of each joint, at least 0.1."""
@@ -175,14 +178,15 @@ class IterativelyReweighted(AbstractEstimator):
 def _residual_scale(problem: RegressionProblem, p: np.ndarray) -> np.ndarray:
     """Return the standard deviation of each joint's ordinary residuals, by medians [N m or N]."""
     # Of more than a million rows some suffice, evenly spread.
-    step = max(1, -(-int(problem.factors.rows.max()) // 2**20))
+    max_rows = int(problem.factors.rows.max())
+    step = max(1, math.ceil(max_rows / 2**20))
     sizes = [[] for _ in range(problem.robot.joints)]
     for chunk, residuals in problem.residuals(p):
-        for sizes_of_joint, residual, mask in zip(
-            sizes, np.abs(residuals.T), chunk.mask.T, strict=True
-        ):
-            sizes_of_joint.append(residual[mask][::step])
-    medians = np.array([np.median(np.concatenate(x)) for x in sizes])
+        joints = zip(sizes, residuals.T, chunk.mask.T, strict=True)
+        for joint_sizes, residual, mask in joints:
+            rows = residual[mask]
+            joint_sizes.append(np.abs(rows[::step]))
+    medians = [np.median(np.concatenate(x)) for x in sizes]
     # A floor for rows without noise, whose residuals are zero.
     max_norm = float(np.sqrt(problem.factors.force_squares.max()))
     floor = max(1e-12 * max_norm, np.finfo(float).tiny)

@@ -229,14 +229,18 @@ def _divide_into_stretches(problem: RegressionProblem) -> tuple[list[Span], bool
             # Equal lengths have fast transforms; all rows must be in a stretch.
             edges = [*range(start, stop, length), stop]
             if complete:
-                parts = np.array_split(np.arange(start, stop), len(edges) - 1)
+                rows = np.arange(start, stop)
+                parts = np.array_split(rows, len(edges) - 1)
                 edges = [*(int(part[0]) for part in parts), stop]
-            stretches += [Span(number, a, b) for a, b in itertools.pairwise(edges)]
+            for a, b in itertools.pairwise(edges):
+                stretches.append(Span(number, a, b))
     if complete:
         return stretches, True
-    count = max(1, len(stretches) * (3 * MAX_SAMPLES // 8) // samples)
+    transformed_samples = 3 * MAX_SAMPLES // 8
+    count = max(1, len(stretches) * transformed_samples // samples)
     places = (np.arange(count) + 0.5) * len(stretches) / count
-    return [stretches[k] for k in np.unique(places.astype(int))], False
+    numbers = np.unique(places.astype(int))
+    return [stretches[k] for k in numbers], False
 
 
 def _shared_lengths(
@@ -281,9 +285,11 @@ def _visible_lines(
     frequency = fft.rfftfreq(length, recording.row_time)
     sample_time = recording.sample_time
     decimation = recording.decimation
-    gain = recording.filter.low_pass(sample_time).gain(frequency, sample_time)
+    low_pass = recording.filter.low_pass(sample_time)
+    gain = low_pass.gain(frequency, sample_time)
     for k, factor in enumerate(decimation.stages):
-        gain = gain * decimation.low_pass(k).gain(frequency, sample_time)
+        low_pass = decimation.low_pass(k)
+        gain = gain * low_pass.gain(frequency, sample_time)
         sample_time *= factor
     # Lines with less gain carry no information.
     count = int(np.flatnonzero(gain > 1e-3)[-1]) + 1

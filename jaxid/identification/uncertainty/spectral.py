@@ -67,20 +67,21 @@ def _widen_by_jackknife(errors: Uncertainty, estimate: Estimate) -> Uncertainty:
     """Take the jackknife's deviations where chance allows them once in ten thousand times."""
     if errors.jackknife is None:
         return errors
-    # The fewer blocks decide a parameter, the more its jackknife scatters.
     shares = []
     for part in estimate.blocks.parts:
         R, _ = part.weighted(estimate.weights)
         shares.append(np.sum((R @ estimate.inverse) ** 2, axis=0))
+    # The fewer blocks decide a parameter, the more its jackknife scatters.
     total = np.sum(shares, axis=0)
-    deciding_blocks = total**2 / np.maximum(np.sum(np.square(shares), axis=0), 1e-300)
-    limits = stats.f.ppf(0.9999, np.maximum(deciding_blocks, 1.0), errors.dof)
+    squares = np.sum(np.square(shares), axis=0)
+    deciding_blocks = total**2 / np.maximum(squares, 1e-300)
+    max_ratios = stats.f.ppf(0.9999, np.maximum(deciding_blocks, 1.0), errors.dof)
 
     deviations = errors.standard_deviations
     has_deviation = np.isfinite(deviations) & (deviations > 0)
-    contradicts = has_deviation & (errors.jackknife**2 > limits * deviations**2)
-    deviations = np.where(contradicts, errors.jackknife, deviations)
-    covariance = rescale_covariance(errors.covariance, deviations)
+    exceeds = errors.jackknife**2 > max_ratios * deviations**2
+    deviations = np.where(has_deviation & exceeds, errors.jackknife, deviations)
+    covariance = rescale_covariance(np.asarray(errors.covariance), deviations)
     return dataclasses.replace(errors, covariance=covariance)
 
 
@@ -96,10 +97,12 @@ class SpectralWindows:
         self._order = np.argsort(frequency, kind="stable")
         places = np.argsort(self._order)
         ordered = frequency[self._order]
-        half_widths = np.maximum(max(0.25, 4.0 / longest), 0.3 * ordered)
-        margins = half_widths * (1 + 1e-9)
-        first = np.searchsorted(ordered, ordered - margins, side="left")
-        end = np.searchsorted(ordered, ordered + margins, side="right")
+        min_half_width = max(0.25, 4.0 / longest)
+        half_widths = np.maximum(min_half_width, 0.3 * ordered)
+        # Lines at the edge of a window belong to it in spite of rounding.
+        half_widths = half_widths * (1 + 1e-9)
+        first = np.searchsorted(ordered, ordered - half_widths, side="left")
+        end = np.searchsorted(ordered, ordered + half_widths, side="right")
         self._lines = first[places], end[places]
         # Both ends of a window rise with its middle: the windows around a line are
         # neighbours.
@@ -138,15 +141,18 @@ class SpectralTable:
         self._windows = SpectralWindows(frequency, longest)
         # A line and its mirror image are one random number.
         self._half = 0.5 * multiplicity[None]
-        remaining_part = self._windows.sum_lines(self._half * (exposure - leverage))
+        window_rows = self._windows.sum_lines(self._half * exposure)
+        unexplained = self._half * (exposure - leverage)
+        residual_rows = self._windows.sum_lines(unexplained)
         # A fit is assumed to leave at least 2 % of a window's power.
-        min_part = 0.02 * self._windows.sum_lines(self._half * exposure)
-        self._remaining_part = xp.maximum(remaining_part, xp.maximum(min_part, 1e-300))
+        min_rows = xp.maximum(0.02 * window_rows, 1e-300)
+        self._residual_rows = xp.maximum(residual_rows, min_rows)
         # Channel by channel: fewer numbers at once.
         self._maps = []
         for c in range(len(leverage)):
-            smooth = energy[:, c] / self._remaining_part[c][None]
-            self._maps.append(self._half * self._windows.sum_windows(smooth))
+            energy_of_row = energy[:, c] / self._residual_rows[c][None]
+            smooth = self._windows.sum_windows(energy_of_row)
+            self._maps.append(self._half * smooth)
         # From a line's power to the scatter of its mean over the stretches.
         stretches = xp.maximum(exposure, 1.0)
         self._scatter = xp.sqrt(2.0 / (self._half * (1.0 + stretches)))
@@ -168,7 +174,7 @@ class SpectralTable:
     def density(self, power: np.ndarray) -> np.ndarray:
         """Return the spectrum of the errors at each line, from the periodogram of residuals."""
         sums = self._windows.sum_lines(self._half * power)
-        return np.asarray(sums / self._remaining_part)
+        return np.asarray(sums / self._residual_rows)
 
     def __call__(self, power: AnyArray) -> tuple[AnyArray, AnyArray]:
         """Return variances and degrees of freedom for periodograms [draws, channels, lines]."""
@@ -176,8 +182,9 @@ class SpectralTable:
         variance: Any = 0.0
         squares: Any = 0.0
         for c, line_map in enumerate(self._maps):
-            scatter = power[:, c] * self._scatter[c][None]
-            variance = variance + power[:, c] @ line_map.T
+            channel_power = power[:, c]
+            variance = variance + channel_power @ line_map.T
+            scatter = channel_power * self._scatter[c][None]
             squares = squares + scatter**2 @ (line_map**2).T
         has_scatter = squares > 0
         dof = 4.0 * variance**2 / xp.where(has_scatter, squares, 1.0)
@@ -221,7 +228,8 @@ def white_variances(lines: Sequence[Lines]) -> np.ndarray:
     power = sum(np.sum(x.multiplicity * x.power, axis=1) for x in lines)
     remaining_share = 1.0 - explained / max(np.sum(rows), 1.0)
     levels = power / np.maximum(rows * remaining_share, 1.0)
-    return np.sum([np.einsum("icf,c->i", x.energy, levels) for x in lines], axis=0)
+    variances = [np.einsum("icf,c->i", x.energy, levels) for x in lines]
+    return np.sum(variances, axis=0)
 
 
 def residual_spectra(lines: Sequence[Lines]) -> ResidualSpectra:
@@ -229,7 +237,8 @@ def residual_spectra(lines: Sequence[Lines]) -> ResidualSpectra:
     longest = max(lines, key=lambda x: x.length * x.stretches)
     half = 0.5 * longest.multiplicity
     windows = SpectralWindows(longest.frequency, longest.length * longest.row_time)
-    smooth = windows.sum_lines(half * longest.residual) / windows.sum_lines(half)
+    residual_sums = windows.sum_lines(half * longest.residual)
+    smooth = residual_sums / windows.sum_lines(half)
     mean_exposure = np.mean(longest.exposure)
     # One-sided: the mirror image of a line counts with it.
     scale = 2.0 * longest.row_time / np.maximum(mean_exposure, 1e-300)
@@ -239,13 +248,15 @@ def residual_spectra(lines: Sequence[Lines]) -> ResidualSpectra:
         is_passed = longest.gain > 0
     leverage = longest.leverage / longest.exposure[:, None]
     remaining_part = np.clip(1.0 - leverage, 0.02, None)
-    power = (longest.residual / remaining_part / longest.gain**2)[:, is_passed]
+    whitened = longest.residual / remaining_part / longest.gain**2
+    power = whitened[:, is_passed]
     total = power.sum(axis=1, keepdims=True)
     cumulative = np.cumsum(power, axis=1) / np.where(total > 0, total, 1.0)
     count = power.shape[1]
     straight_line = np.arange(1, count + 1) / count
     low_frequencies = max(1, round(0.1 * count))
-    figure_lines = np.unique(np.linspace(0, len(half) - 1, 400).round().astype(int))
+    figure_places = np.linspace(0, len(half) - 1, 400).round()
+    figure_lines = np.unique(figure_places.astype(int))
     return ResidualSpectra(
         frequency=longest.frequency[figure_lines],
         density=scale * smooth[:, figure_lines],
@@ -269,17 +280,22 @@ def sandwich_of_columns(
     """
     length = columns[0].shape[-1]
     times = multiplicity(length)
-    energy, leverage, power = [], [], []
+    energy = []
+    leverage = []
+    power = []
     for indices, theta, Q, weight in zip(own, columns, forces, weights, strict=True):
         places = np.array(indices, int)
         equations = xp.fft.rfft(weight * theta)
-        disturbance = xp.fft.rfft(weight * (Q - p[:, places] @ theta))
+        residuals = Q - p[:, places] @ theta
+        disturbance = xp.fft.rfft(weight * residuals)
         real = inverse[:, places] @ equations.real
         imaginary = inverse[:, places] @ equations.imag
         explained = real[places] * equations.real + imaginary[places] * equations.imag
-        energy.append(times[None] / length * (real**2 + imaginary**2))
+        squares = real**2 + imaginary**2
+        energy.append(times[None] / length * squares)
         leverage.append(xp.sum(explained, axis=0) / length)
-        power.append((disturbance.real**2 + disturbance.imag**2) / length)
+        disturbance_squares = disturbance.real**2 + disturbance.imag**2
+        power.append(disturbance_squares / length)
     leverage = xp.stack(leverage)
     table = SpectralTable(
         xp,
