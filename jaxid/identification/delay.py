@@ -104,61 +104,82 @@ def estimate_delay(
     """
     problem = RegressionProblem(base, observations)
     recordings = problem.recordings
-    instruments = recordings
+    instruments = None
     if commanded is not None:
         instruments = RegressionProblem(base, commanded).recordings
         if [o.segments for o in instruments] != [o.segments for o in recordings]:
             raise InputError("`commanded` must have the samples of `observations`.")
     weights = weights or MaximumForces()
     w = weights(base.model.robot, problem.factors)
-    joints = len(w)
-    sample_time = recordings[0].sample_time
-    no_delay = np.eye(base.size + joints)[:, : base.size]
-    together = linalg.block_diag(np.eye(base.size), np.ones((joints, 1)))
-    common_delay = np.asarray(together)
+    search = _search(base, recordings, instruments, w)
+    each_delay = search.each_delay
+    delays = each_delay.solve()[base.size :]
+    covariance = each_delay.jackknife()[base.size :, base.size :]
+    unit = np.eye(len(w))
+    contrast = unit[1:] - unit[:1]
+    _, p_value = joint_test(
+        contrast @ delays, contrast @ covariance @ contrast.T, BLOCKS - 1.0
+    )
+    feedback = 0.0
+    if commanded is None:
+        feedback = search.one_delay.feedback(search.solution)
+    return Delay(
+        seconds=search.seconds + search.step,
+        standard_deviation=search.deviation,
+        dof=BLOCKS - 1.0,
+        feedback=feedback,
+        resolution=RESOLUTION * recordings[0].sample_time,
+        of_joints=search.seconds + delays,
+        p_value=p_value,
+    )
 
+
+class _Search(NamedTuple):
+    """Last round of the search for the delay."""
+
+    seconds: float  # delay that has been removed from the motions
+    step: float  # delay that remains
+    deviation: float
+    solution: np.ndarray  # base parameters, remaining delay
+    one_delay: "_Equations"  # of a delay of all joints
+    each_delay: "_Equations"  # of a delay of each joint
+
+
+def _search(
+    base: BaseParameters,
+    recordings: Sequence[Observations],
+    instruments: Sequence[Observations] | None,
+    w: np.ndarray,
+) -> _Search:
+    """Shift the motions until the rates of the forces explain nothing more."""
+    joints = len(w)
+    no_delay = np.eye(base.size + joints)[:, : base.size]
+    same_delay = linalg.block_diag(np.eye(base.size), np.ones((joints, 1)))
     start = _equations(base, recordings, recordings, w, np.zeros(base.size))
     p = start.combine(no_delay).solve()
     seconds = 0.0
     step = 0.0
     damping = 1.0
     for _ in range(MAX_ROUNDS):
-        shifted = [without_delay(o, seconds) for o in recordings]
-        shifted_instruments = shifted
-        if commanded is not None:
+        seconds += step
+        shifted_logs = [without_delay(o, seconds) for o in recordings]
+        shifted_instruments = shifted_logs
+        if instruments is not None:
             shifted_instruments = [without_delay(o, seconds) for o in instruments]
-        each_delay = _equations(base, shifted, shifted_instruments, w, p)
-        equations = each_delay.combine(common_delay)
-        solution = equations.solve()
-        deviation = float(np.sqrt(equations.jackknife()[-1, -1]))
+        each_delay = _equations(base, shifted_logs, shifted_instruments, w, p)
+        one_delay = each_delay.combine(np.asarray(same_delay))
+        solution = one_delay.solve()
+        deviation = float(np.sqrt(one_delay.jackknife()[-1, -1]))
         if solution[-1] * step < 0:
             # Steps that go to and fro become shorter.
             damping *= 0.5
-        step = damping * float(solution[-1])
-        seconds += step
         p = solution[:-1]
-        if abs(step) <= max(0.02 * deviation, 1e-6 * sample_time):
-            break
-    else:
-        raise InputError(
-            f"the delay does not settle (last change {1e3 * step:.3g} ms): crop the "
-            "log to where the robot moves, and check angle columns and signs."
-        )
-
-    delays = each_delay.solve()[base.size :]
-    covariance = each_delay.jackknife()[base.size :, base.size :]
-    contrast = np.eye(joints)[1:] - np.eye(joints)[:1]
-    _, p_value = joint_test(
-        contrast @ delays, contrast @ covariance @ contrast.T, BLOCKS - 1.0
-    )
-    return Delay(
-        seconds=seconds,
-        standard_deviation=deviation,
-        dof=BLOCKS - 1.0,
-        feedback=equations.feedback(solution) if commanded is None else 0.0,
-        resolution=RESOLUTION * sample_time,
-        of_joints=seconds - step + delays,
-        p_value=p_value,
+        step = damping * float(solution[-1])
+        if abs(step) <= max(0.02 * deviation, 1e-6 * recordings[0].sample_time):
+            return _Search(seconds, step, deviation, solution, one_delay, each_delay)
+    raise InputError(
+        f"the delay does not settle (last change {1e3 * step:.3g} ms): crop the log to "
+        "where the robot moves, and check angle columns and signs."
     )
 
 
@@ -202,8 +223,8 @@ class _Equations(NamedTuple):
         # What the other parameters leave of the rate, whose column is the last but one.
         gram = self.squares[:-2, :-2]
         products = self.squares[:-2, -2]
-        others = np.linalg.lstsq(gram, products, rcond=1e-14)[0]
-        remainder = float(self.squares[-2, -2] - products @ others)
+        multiples = np.linalg.lstsq(gram, products, rcond=1e-14)[0]
+        remainder = float(self.squares[-2, -2] - products @ multiples)
         if remainder <= 0:
             return np.inf
         disturbances = np.sqrt(square) * np.sqrt(rate_square)

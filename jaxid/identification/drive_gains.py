@@ -94,11 +94,14 @@ def identify_drive_gains(
     maps, offsets = _parameter_maps(unloaded.base, load, varying)
     start_parameters, _ = combine(fits, maps, offsets)
 
+    totals = []
     parts = []
     for fit, parameter_map, offset in zip(fits, maps, offsets, strict=True):
-        for factors in fit.time_blocks.parts:
+        blocks = fit.time_blocks
+        totals.append(_rows(blocks.total, fit.weights, parameter_map, offset))
+        for factors in blocks.parts:
             parts.append(_rows(factors, fit.weights, parameter_map, offset))
-    rows = Rows(*map(np.concatenate, zip(*parts, strict=True)))
+    rows = _stack(totals)
     solution = optimize.least_squares(
         lambda u: rows.linearise(u)[0],
         np.append(start_parameters, np.ones(robot.joints)),
@@ -115,9 +118,9 @@ def identify_drive_gains(
     decomposition = Decomposition.of(jacobian, -residuals)
     _require_determined(decomposition, reciprocals)
 
-    blocks = [part.linearise(solution.x) for part in parts]
+    linearised_parts = [part.linearise(solution.x) for part in parts]
     covariance, dof = block_covariance(
-        [(jacobian, residuals) for residuals, jacobian in blocks],
+        [(jacobian, residuals) for residuals, jacobian in linearised_parts],
         decomposition.inverse_information(),
     )
     # The gain 1 / c changes by -1 / c² times a small change of c.
@@ -194,6 +197,11 @@ def _rows(factors: Factors, weights, parameter_map, offset) -> Rows:
                 joints=of_joint,
             )
         )
+    return _stack(parts)
+
+
+def _stack(parts: Sequence[Rows]) -> Rows:
+    """Return the rows of several parts together."""
     return Rows(*map(np.concatenate, zip(*parts, strict=True)))
 
 
@@ -202,13 +210,13 @@ def _parameter_maps(
 ) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """Return maps and offsets from common unknowns to the base parameters of both runs."""
     maps = state_maps(base.size, varying_parameters(base, varying), 2)
-    nothing = np.zeros(base.size)
+    no_offset = np.zeros(base.size)
     if isinstance(load, Tool):
-        return maps, [nothing, body_columns(base, load.body) @ load.parameters]
+        return maps, [no_offset, body_columns(base, load.body) @ load.parameters]
     # The other nine parameters of the load are unknowns, too.
     columns = body_columns(base, base.model.robot.tip_body)
     of_mass = columns[:, 0]
-    others = columns[:, 1:]
-    without_load = np.hstack([maps[0], 0.0 * others])
-    with_load = np.hstack([maps[1], others])
-    return [without_load, with_load], [nothing, load * of_mass]
+    other_columns = columns[:, 1:]
+    without_load = np.hstack([maps[0], 0.0 * other_columns])
+    with_load = np.hstack([maps[1], other_columns])
+    return [without_load, with_load], [no_offset, load * of_mass]

@@ -94,12 +94,14 @@ def resolution_note(
     bias = np.abs(resolution_bias(fit, recording, observations))
     deviations = fit.standard_deviations
     ratio = bias / np.where(deviations > 0, deviations, np.inf)
-    worst = np.argsort(-ratio)[: np.count_nonzero(ratio > MIN_RATIO)]
-    if not len(worst):
+    worst_parameters = np.argsort(-ratio)[: np.count_nonzero(ratio > MIN_RATIO)]
+    if not len(worst_parameters):
         return ()
-    names = [f"{fit.base.names[k]} by {ratio[k]:.1f}" for k in worst[:MAX_NAMES]]
-    if len(worst) > MAX_NAMES:
-        names.append(f"and {len(worst) - MAX_NAMES} more")
+    names = [
+        f"{fit.base.names[k]} by {ratio[k]:.1f}" for k in worst_parameters[:MAX_NAMES]
+    ]
+    if len(worst_parameters) > MAX_NAMES:
+        names.append(f"and {len(worst_parameters) - MAX_NAMES} more")
     return (
         "the encoders are so coarse that parameters are shifted, in standard "
         f"deviations: {', '.join(names)}. Their intervals are too narrow: move faster, "

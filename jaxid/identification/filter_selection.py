@@ -115,27 +115,17 @@ def choose_filter(
 
     def observe_with(candidate: FilterCandidate) -> list[Observations]:
         """Observe the rows that are far enough from the ends for all candidates."""
-        filter, decimation = candidate
-        observations = []
-        for log in logs:
-            o = observe(log, robot, filter, decimation, min_speed)
-            observations.append(_mask_ends(o, edge))
-        return observations
+        observations = [observe(log, robot, *candidate, min_speed) for log in logs]
+        return [_mask_ends(o, edge) for o in observations]
 
-    widest = observe_with(candidates[int(np.argmax(cutoffs))])
-    weights = np.asarray(estimator(RegressionProblem(base, widest)).weights)
+    widest_band = observe_with(candidates[int(np.argmax(cutoffs))])
+    weights = np.asarray(estimator(RegressionProblem(base, widest_band)).weights)
     errors = []
     correlations = []
     for number, candidate in enumerate(candidates):
         observations = observe_with(candidate)
-        if [o.samples for o in observations] != [o.samples for o in widest]:
-            raise InputError(
-                "`candidates` leave different parts of the recordings: avoid gaps."
-            )
         problem = RegressionProblem(base, observations)
-        # The candidate's motion, with forces and rows of the widest band.
-        pairs = zip(widest, observations, strict=True)
-        test = RegressionProblem(base, [o.replace(motion=x.motion) for o, x in pairs])
+        test = RegressionProblem(base, _with_motions(widest_band, observations))
         errors.append(_held_out_errors(problem, test, estimator, weights**2))
         correlations.append(_neighbour_correlation(problem, estimator))
         if progress is not None:
@@ -151,13 +141,25 @@ def choose_filter(
 
 def _default_candidates(sample_time: float) -> list[FilterCandidate]:
     """Return Butterworth filters over the usual range of cut-off frequencies."""
-    highest = min(MAX_CUTOFF, MAX_CUTOFF_SHARE / sample_time)
-    lowest = min(1.0, 0.1 * highest)
+    max_cutoff = min(MAX_CUTOFF, MAX_CUTOFF_SHARE / sample_time)
+    min_cutoff = min(1.0, 0.1 * max_cutoff)
     candidates = []
-    for cutoff in np.geomspace(lowest, highest, CANDIDATES).tolist():
+    for cutoff in np.geomspace(min_cutoff, max_cutoff, CANDIDATES).tolist():
         step = max(1, int(1.0 / (ROWS_PER_PERIOD * cutoff * sample_time)))
         candidates.append((ZeroPhaseButterworth(cutoff), Subsample(step)))
     return candidates
+
+
+def _with_motions(
+    widest_band: Sequence[Observations], observations: Sequence[Observations]
+) -> list[Observations]:
+    """Return the motions of a candidate, with forces and rows of the widest band."""
+    if [o.samples for o in observations] != [o.samples for o in widest_band]:
+        raise InputError(
+            "`candidates` leave different parts of the recordings: avoid gaps."
+        )
+    pairs = zip(widest_band, observations, strict=True)
+    return [o.replace(motion=candidate.motion) for o, candidate in pairs]
 
 
 def _mask_ends(observations: Observations, edge: int) -> Observations:

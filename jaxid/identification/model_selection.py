@@ -198,10 +198,10 @@ def _promise(table, candidates: Sequence[ModelCandidate]) -> float:
     """
     squares = []
     numbers = range(table.shape[1])
-    for outer in numbers:
-        others = [n for n in numbers if n != outer]
-        best = _simplest(table[:, outer, others], candidates)
-        squares.append(table[best, outer, outer])
+    for part in numbers:
+        other_parts = [n for n in numbers if n != part]
+        best = _simplest(table[:, part, other_parts], candidates)
+        squares.append(table[best, part, part])
     return float(np.sqrt(np.mean(squares)))
 
 
@@ -230,11 +230,11 @@ def _simplest(
     """
     sizes = np.array([c.base.size for c in candidates])
     lacks_memory = np.array([c.base.model.memory is None for c in candidates])
-    remaining = np.arange(len(candidates))
+    indices = np.arange(len(candidates))
     for rank in (sizes, lacks_memory):
-        excess = _excess(squares[remaining])
-        remaining = remaining[excess.mean <= excess.deviation]
-        ranks = rank[remaining]
-        remaining = remaining[ranks == ranks.min()]
-    means = squares[remaining].mean(axis=1)
-    return int(remaining[np.argmin(means)])
+        excess = _excess(squares[indices])
+        indices = indices[excess.mean <= excess.deviation]
+        ranks = rank[indices]
+        indices = indices[ranks == ranks.min()]
+    means = squares[indices].mean(axis=1)
+    return int(indices[np.argmin(means)])

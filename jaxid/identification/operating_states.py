@@ -118,8 +118,8 @@ class StatesFit(Summarised, eqx.Module):
         differences = parameters[1:] - parameters[0]
         first, *others = [fit.covariance[np.ix_(k, k)] for fit in self.fits]
         # The errors of the first state are in all differences.
-        common = np.tile(first, (len(others), len(others)))
-        covariance = linalg.block_diag(*others) + common
+        first_errors = np.tile(first, (len(others), len(others)))
+        covariance = linalg.block_diag(*others) + first_errors
         dof = [fit.uncertainty.dof[k] for fit in self.fits]
         min_dof = float(np.min(dof, initial=np.inf))
         return joint_test(differences.ravel(), covariance, min_dof)
@@ -211,9 +211,9 @@ def stores_energy(base: BaseParameters) -> Bool[np.ndarray, " base"]:
     shape = (2, 3, model.robot.joints)
     q, qdd = np.random.default_rng(0).uniform(-1.0, 1.0, shape)
     zeros = np.zeros_like(q)
-    moving = in_numpy(base, base.columns, q, zeros, qdd)
-    resting = in_numpy(base, base.columns, q, zeros, zeros)
-    inertial_forces = np.abs(moving - resting)
+    moving_columns = in_numpy(base, base.columns, q, zeros, qdd)
+    resting_columns = in_numpy(base, base.columns, q, zeros, zeros)
+    inertial_forces = np.abs(moving_columns - resting_columns)
     has_inertia = inertial_forces.max(axis=(0, 1)) > 0
 
     unit_vectors = np.eye(model.size)[list(base.indices)]

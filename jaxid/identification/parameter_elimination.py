@@ -111,11 +111,11 @@ def essential_parameters(
 
     max_error = (1 + cost) * min(errors)
     last_step = max(step for step, error in enumerate(errors) if error <= max_error)
-    essential = np.sort(order[last_step:])
+    essential_indices = np.sort(order[last_step:])
     base = dataclasses.replace(
         fit.base,
-        indices=tuple(fit.base.indices[k] for k in essential),
-        kappa=np.asarray(fit.base.kappa)[essential],
+        indices=tuple(fit.base.indices[k] for k in essential_indices),
+        kappa=np.asarray(fit.base.kappa)[essential_indices],
     )
     reduced_fit = fit_problem(problem.with_base(base), fit.estimator, uncertainty)
     return EssentialParameters(reduced_fit, tuple(path))
@@ -125,18 +125,18 @@ def _elimination_order(fit: Fit, factors: Factors) -> list[int]:
     """Return the base parameters in the order in which they are eliminated."""
     weights = np.asarray(fit.weights)
     R, z = factors.weighted(weights)
-    remaining = list(range(fit.base.size))
+    candidates = list(range(fit.base.size))
     inflation = None
     order = []
-    while remaining:
-        p, inverse = _solve(R, z, remaining)
+    while candidates:
+        p, inverse = _solve(R, z, candidates)
         covariance = naive_covariance(factors, weights, p, inverse)
         naive_deviations = np.sqrt(np.diag(covariance))
         if inflation is None:
             inflation = _inflation(fit.standard_deviations, naive_deviations)
-        deviations = inflation[remaining] * naive_deviations
-        sizes = np.maximum(np.abs(p[remaining]), np.finfo(float).tiny)
-        order.append(remaining.pop(int(np.argmax(deviations / sizes))))
+        deviations = inflation[candidates] * naive_deviations
+        sizes = np.maximum(np.abs(p[candidates]), np.finfo(float).tiny)
+        order.append(candidates.pop(int(np.argmax(deviations / sizes))))
     return order
 
 

@@ -6,8 +6,9 @@ their largest values: all variables lie between -1 and 1. Distances to an optimu
 then bounded, and units do not matter.
 """
 
+from collections.abc import Sequence
 from types import ModuleType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -47,7 +48,7 @@ class ConeProgram(eqx.Module):
     members: Float[AnyArray, "*batch members variables"]
     fillings: Float[AnyArray, "*batch couplings 4 4"]
     # functions that keep their value at the start
-    equal: Float[AnyArray, "*batch equal variables"]
+    equalities: Float[AnyArray, "*batch equal variables"]
     pull: Number  # strength of the pull towards the prior's bodies; 0 for none
     prior: Float[AnyArray, "*batch bodies 4 4"]  # inverses of its pseudo-inertias
     diameters: Float[AnyArray, "*batch variables"]  # of the sets of feasible values
@@ -109,10 +110,10 @@ class ConeProgram(eqx.Module):
         bodies = xp.reshape(y[:count], (self.bodies, self.width))
         drives = y[count:]
         S = xp.reshape(bodies @ self.basis, (self.bodies, 4, 4))
-        coupled = xp.tensordot(self.members @ y, self.couplings, 1)
+        coupling_matrices = xp.tensordot(self.members @ y, self.couplings, 1)
         s = xp.einsum("kri,ki->kr", self.rows, bodies)
         return (
-            xp.concatenate([S, coupled]),
+            xp.concatenate([S, coupling_matrices]),
             xp.concatenate([xp.ravel(s), drives, -drives]),
         )
 
@@ -120,19 +121,19 @@ class ConeProgram(eqx.Module):
         """Apply the transpose of `linear`."""
         xp = self.xp
         z_bodies, z_lower, z_upper = self.split_linear(z)
-        flat = xp.reshape(Z[: self.bodies], (self.bodies, 16))
-        linear = xp.einsum("kri,kr->ki", self.rows, z_bodies)
-        bodies = flat @ self.basis.T + linear
-        coupled = xp.tensordot(self.couplings, Z[self.bodies :], 3)
+        matrices = xp.reshape(Z[: self.bodies], (self.bodies, 16))
+        linear_part = xp.einsum("kri,kr->ki", self.rows, z_bodies)
+        bodies = matrices @ self.basis.T + linear_part
+        coupling_products = xp.tensordot(self.couplings, Z[self.bodies :], 3)
         y = xp.concatenate([xp.ravel(bodies), z_lower - z_upper])
-        return y + coupled @ self.members
+        return y + coupling_products @ self.members
 
     def split_linear(self, z: Values) -> tuple[Values, Values, Values]:
         """Return numbers of the linear inequalities: of bodies, and of both limits of drives."""
         count = self.bodies * self.rows.shape[-2]
-        middle = count + self.drives
+        start_of_upper = count + self.drives
         bodies = self.xp.reshape(z[:count], (self.bodies, -1))
-        return bodies, z[count:middle], z[middle:]
+        return bodies, z[count:start_of_upper], z[start_of_upper:]
 
 
 class Cone(NamedTuple):
@@ -151,13 +152,7 @@ def cone_program(
     bounds = feasible.bounds
     count = len(feasible.bodies)
     scales = feasible.scales(data)
-    A = data.A[:, np.array(feasible.order)] * scales[None]
-    b = data.b
-    if feasible.unbounded:
-        columns, inverse = feasible.unbounded_columns(data)
-        A = A - columns @ (inverse @ (columns.T @ A))
-        b = b - columns @ (inverse @ (columns.T @ b))
-
+    A, b = _scale_rows(feasible, data, scales)
     lengths = np.ones((count, 4))
     lengths[:, :3] = bounds.radius[:, None]
     products = lengths[:, :, None] * lengths[:, None, :]
@@ -170,11 +165,6 @@ def cone_program(
     drive_scales = scales[count * feasible.width :]
     cones = [*_ellipsoids(feasible), *_drive_matrices(feasible, drive_scales)]
     members = np.unique([place for cone in cones for place in cone.places]).astype(int)
-    # At first no matrix: there may be none.
-    couplings = [np.zeros((len(members), 0, 4, 4))]
-    for cone in cones:
-        is_member = (members[:, None] == cone.places).astype(float)
-        couplings.append(xp.tensordot(is_member, cone.basis, 1)[:, None])
     fillings = [cone.filling for cone in cones]
     body_diameters = [1, 2, 2, 2, 1, 1, 1, 1, 1, 1][: feasible.width]
     return ConeProgram(
@@ -183,16 +173,38 @@ def cone_program(
         floors=feasible.floors / pseudo_scales,
         rows=rows,
         offsets=offsets,
-        couplings=xp.concatenate(couplings, axis=1),
+        couplings=_contributions(cones, members),
         members=np.eye(A.shape[1])[members],
         fillings=np.reshape(fillings, (-1, 4, 4)),
-        equal=_total_mass(feasible),
+        equalities=_total_mass(feasible),
         pull=xp.asarray(float(strength)),
         prior=inverse_prior,
         diameters=np.array([*body_diameters * count, *[1.0] * len(feasible.drives)]),
         scale=xp.asarray(data.scale) + 4.0 * count * strength,
         start=_start(feasible, A, b, prior),
     )
+
+
+def _scale_rows(feasible: FeasibleSet, data: ScaledRows, scales) -> tuple[Any, Any]:
+    """Return the rows of the scaled variables, with the unbounded columns projected out."""
+    A = data.A[:, np.array(feasible.order)] * scales[None]
+    if not feasible.unbounded:
+        return A, data.b
+    columns, inverse = feasible.unbounded_columns(data)
+    A = A - columns @ (inverse @ (columns.T @ A))
+    b = data.b - columns @ (inverse @ (columns.T @ data.b))
+    return A, b
+
+
+def _contributions(cones: Sequence[Cone], members: np.ndarray) -> Values:
+    """Return the contributions of some variables to matrices [members, cones, 4, 4]."""
+    # At first no matrix: there may be none.
+    contributions = [np.zeros((len(members), 0, 4, 4))]
+    for cone in cones:
+        is_member = (members[:, None] == cone.places).astype(float)
+        matrices = namespace(cone.basis).tensordot(is_member, cone.basis, 1)
+        contributions.append(matrices[:, None])
+    return namespace(*contributions).concatenate(contributions, axis=1)
 
 
 def _total_mass(feasible: FeasibleSet) -> np.ndarray:
@@ -236,9 +248,9 @@ def _drive_matrices(feasible: FeasibleSet, drive_scales) -> list[Cone]:
         size = 1.0 / xp.sqrt(diagonal)
         products = size[:, None] * size[None]
         basis = drive_scales[places][:, None, None] * coupling.basis * products[None]
-        missing = 4 - len(coupling.diagonal)
-        basis = xp.pad(basis, ((0, 0), (0, missing), (0, missing)))
-        filling = np.diag(np.arange(4) >= 4 - missing).astype(float)
+        padding = 4 - len(coupling.diagonal)
+        basis = xp.pad(basis, ((0, 0), (0, padding), (0, padding)))
+        filling = np.diag(np.arange(4) >= 4 - padding).astype(float)
         cones.append(Cone(start + places, basis, filling))
     return cones
 
@@ -256,13 +268,13 @@ def _start(feasible: FeasibleSet, A, b, prior) -> Values:
     drives = np.full(len(feasible.drives), START_DRIVE)
     if bounds.total_mass is None:
         forces = A[:, : balls.size] @ xp.asarray(balls.ravel())
-        fraction = (forces @ b) / xp.maximum(forces @ forces, 1e-300)
-        fraction = xp.clip(fraction, 0.02, 0.5)
+        mass_fraction = (forces @ b) / xp.maximum(forces @ forces, 1e-300)
+        mass_fraction = xp.clip(mass_fraction, 0.02, 0.5)
     else:
         share = bounds.total_mass / bounds.mass_max.sum()
         min_share = np.average(min_masses, weights=bounds.mass_max)
-        fraction = (share - min_share) / (1.0 - min_share)
-    masses = xp.asarray(min_masses) + fraction * xp.asarray(1.0 - min_masses)
+        mass_fraction = (share - min_share) / (1.0 - min_share)
+    masses = xp.asarray(min_masses) + mass_fraction * xp.asarray(1.0 - min_masses)
     bodies = floors + (masses - floors[:, 0])[:, None] * balls
     if prior is not None and bounds.total_mass is None:
         bodies = _move_to_prior(feasible, bodies, prior)

@@ -126,7 +126,7 @@ class PhysicallyConsistent(AbstractEstimator):
         """
         base = rows.base
         weights = self.weights(rows.robot, rows.factors)
-        unbounded = Estimate.solve(rows, weights, Complete())
+        unbounded_estimate = Estimate.solve(rows, weights, Complete())
         R, z = rows.factors.weighted(weights)
         feasible = self.feasible_set(base)
         count = int(rows.factors.rows.sum())
@@ -138,11 +138,10 @@ class PhysicallyConsistent(AbstractEstimator):
         bodies = np.pad(bodies, ((0, 0), (0, 10 - bodies.shape[1])))
 
         residual = float(np.linalg.norm(R @ parameters - z))
-        smallest = float(np.linalg.norm(R @ unbounded.parameters - z))
-        increase = residual / smallest - 1.0 if smallest > 0 else np.inf
-        determined = np.array(
-            [x is Identifiability.ALONE for x in base.identifiability]
-        )
+        min_residual = float(np.linalg.norm(R @ unbounded_estimate.parameters - z))
+        increase = residual / min_residual - 1.0 if min_residual > 0 else np.inf
+        is_determined = [x is Identifiability.ALONE for x in base.identifiability]
+        determined = np.array(is_determined)
         masses = [columns[0] for columns in feasible.bodies]
         consistency = Consistency(
             bodies=bodies,
@@ -157,7 +156,7 @@ class PhysicallyConsistent(AbstractEstimator):
             active=_active_bounds(base, feasible, program, optimum, bodies),
         )
         notes = [
-            *unbounded.notes,
+            *unbounded_estimate.notes,
             f"physically consistent: {feasible.bounds}.",
             *consistency.findings,
             "standard deviations are those of the estimate without bounds: where "
@@ -166,11 +165,11 @@ class PhysicallyConsistent(AbstractEstimator):
         if not optimum.certified:
             notes.append(UNPROVED.format(error_bound))
         return dataclasses.replace(
-            unbounded,
+            unbounded_estimate,
             parameters=parameters,
             standard=p,
             consistency=consistency,
-            unbounded=unbounded.parameters,
+            unbounded=unbounded_estimate.parameters,
             notes=tuple(notes),
         )
 

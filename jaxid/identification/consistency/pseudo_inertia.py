@@ -94,8 +94,8 @@ def consistency_margin(
     P = pseudo_inertia(np.asarray(bodies))
     size = np.sqrt(np.abs(np.diagonal(P, axis1=-2, axis2=-1)))
     scale = 1.0 / np.where(size > 0, size, 1.0)
-    scaled = P * scale[..., :, None] * scale[..., None, :]
-    return np.linalg.eigvalsh(scaled)[..., 0]
+    scaled_matrix = P * scale[..., :, None] * scale[..., None, :]
+    return np.linalg.eigvalsh(scaled_matrix)[..., 0]
 
 
 class LogCholesky(eqx.Module):
@@ -138,12 +138,12 @@ class LogCholesky(eqx.Module):
                 "`PhysicallyConsistent`, or the bodies of a URDF file."
             )
         # The upper triangle is a lower one with the axes in reverse order.
-        reverse = (Ellipsis, slice(None, None, -1), slice(None, None, -1))
+        reverse_axes = (Ellipsis, slice(None, None, -1), slice(None, None, -1))
         P = jnp.asarray(pseudo_inertia(p))
-        U = jnp.linalg.cholesky(P[reverse])[reverse]
+        U = jnp.linalg.cholesky(P[reverse_axes])[reverse_axes]
         diagonal = jnp.diagonal(U, axis1=-2, axis2=-1)
-        above = U[(..., *UPPER_TRIANGLE)]
-        return cls(jnp.concatenate([jnp.log(diagonal), above], axis=-1))
+        upper_entries = U[(..., *UPPER_TRIANGLE)]
+        return cls(jnp.concatenate([jnp.log(diagonal), upper_entries], axis=-1))
 
     @property
     def parameters(self) -> Float[AnyArray, "*batch 10"]:

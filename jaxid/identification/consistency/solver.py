@@ -215,10 +215,10 @@ def _point(p: ConeProgram, y, Z, z) -> Point:
     pull = xp.concatenate([prior, xp.zeros_like(p.fillings)])
     gradient = rest @ p.A + p.adjoint(pull, xp.zeros_like(z))
     residual = gradient - p.adjoint(Z, z)
-    if p.equal.shape[0]:
+    if p.equalities.shape[0]:
         # Differences of feasible variables are orthogonal to the equality constraints.
-        normal = xp.linalg.solve(p.equal @ p.equal.T, p.equal @ residual)
-        residual = residual - p.equal.T @ normal
+        normal = xp.linalg.solve(p.equalities @ p.equalities.T, p.equalities @ residual)
+        residual = residual - p.equalities.T @ normal
     gap = _matrix_gap(p, S, Z) + s @ z
     error = gap + xp.sum(xp.abs(residual) * p.diameters)
     value = 0.5 * rest @ rest
@@ -310,18 +310,18 @@ def _step(p: ConeProgram, gram, x: Point) -> tuple[Point, Values]:
     d = _select(second_length > first_length, second, first)
     length = xp.maximum(first_length, second_length)
 
-    def refined() -> tuple[Direction, Values]:
-        refined = newton.refine(d)
-        return refined, _length(STEP_FRACTIONS, x, refined)
+    def refine() -> tuple[Direction, Values]:
+        correction = newton.refine(d)
+        return correction, _length(STEP_FRACTIONS, x, correction)
 
     # Near the boundary rounding leaves a residual that the error bound counts.
     is_near = x.error <= 1e-3 * (p.scale + x.value)
     residual_part = xp.sum(xp.abs(x.residual) * p.diameters)
     needs_refinement = is_near & (residual_part > 0.1 * x.error)
     if xp is np:
-        d, length = refined() if needs_refinement else (d, length)
+        d, length = refine() if needs_refinement else (d, length)
     else:
-        d, length = jax.lax.cond(needs_refinement, refined, lambda: (d, length))
+        d, length = jax.lax.cond(needs_refinement, refine, lambda: (d, length))
     length = BOUNDARY_FRACTION * length
     y = x.y + length * d.y
     return _point(p, y, x.Z + length * d.Z, x.z + length * d.z), length
@@ -363,8 +363,8 @@ def _length(fractions, x: Point, d: Direction) -> Values:
     steps = changes[..., None] * lengths[None, None, None]
     ends = matrices[..., None] + steps
     is_positive = xp.all(pivots(ends) > 0, axis=(0, 1))
-    longest = lengths[xp.argmax(is_positive)]
-    return xp.where(xp.any(is_positive), longest, 0.0)
+    max_length = lengths[xp.argmax(is_positive)]
+    return xp.where(xp.any(is_positive), max_length, 0.0)
 
 
 def _barriers(p: ConeProgram, inverse_S, Z, ratio) -> Values:
@@ -374,18 +374,18 @@ def _barriers(p: ConeProgram, inverse_S, Z, ratio) -> Values:
     """
     xp = p.xp
     products = _products(inverse_S, Z)
-    semidefinite = p.basis[None] @ products[: p.bodies] @ p.basis.T[None]
+    semidefinite_part = p.basis[None] @ products[: p.bodies] @ p.basis.T[None]
     of_bodies, lower, upper = p.split_linear(ratio)
-    linear = xp.einsum("kri,kr,krj->kij", p.rows, of_bodies, p.rows)
-    bodies = symmetric_part(semidefinite) + linear
+    linear_part = xp.einsum("kri,kr,krj->kij", p.rows, of_bodies, p.rows)
+    bodies = symmetric_part(semidefinite_part) + linear_part
     ridge = 1.0 + RIDGE * np.eye(p.width)
     drives = xp.diag((1.0 + RIDGE) * (lower + upper))
     blocks = _linalg(p).block_diag(*(bodies * ridge[None]), drives)
 
     couplings = xp.reshape(p.couplings, (*p.couplings.shape[:2], 16))
-    mixed = xp.einsum("ikx,kxy->iky", couplings, products[p.bodies :])
-    coupled = xp.tensordot(mixed, couplings, ((1, 2), (1, 2)))
-    return blocks + p.members.T @ symmetric_part(coupled) @ p.members
+    products_with_couplings = xp.einsum("ikx,kxy->iky", couplings, products[p.bodies :])
+    coupling_part = xp.tensordot(products_with_couplings, couplings, ((1, 2), (1, 2)))
+    return blocks + p.members.T @ symmetric_part(coupling_part) @ p.members
 
 
 def _linalg(p: ConeProgram) -> ModuleType:
@@ -412,14 +412,14 @@ def _newton_solver(p: ConeProgram, H) -> Callable[[Values], Values]:
     def solve(right):
         return linalg.cho_solve(factor, right, check_finite=False)
 
-    if not p.equal.shape[0]:
+    if not p.equalities.shape[0]:
         return solve
-    normal = xp.stack([solve(row) for row in p.equal], axis=1)
-    square = p.equal @ normal
+    normal_steps = xp.stack([solve(row) for row in p.equalities], axis=1)
+    square = p.equalities @ normal_steps
 
     def solve_within(right):
-        unconstrained = solve(right)
-        violation = p.equal @ unconstrained
-        return unconstrained - normal @ xp.linalg.solve(square, violation)
+        free_step = solve(right)
+        violation = p.equalities @ free_step
+        return free_step - normal_steps @ xp.linalg.solve(square, violation)
 
     return solve_within

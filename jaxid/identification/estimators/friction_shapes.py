@@ -117,8 +117,8 @@ def select_shapes(base: BaseParameters, names: Sequence[str] = ()) -> Shapes:
             is_selected = shape.name in names if names else shape.default
             if is_selected:
                 kinds.append(ShapeKind(number, shape))
-    missing = set(names) - {kind.shape.name for kind in kinds}
-    if not kinds or missing:
+    missing_names = set(names) - {kind.shape.name for kind in kinds}
+    if not kinds or missing_names:
         raise InputError(
             "the `model` has no friction with such `shapes`: use `StribeckFriction`."
         )

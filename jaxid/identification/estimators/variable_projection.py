@@ -102,7 +102,7 @@ class ShapeSearch(eqx.Module):
     start: Float[AnyArray, " shapes"]  # shapes of the model
     recordings: tuple[Observations, ...]
     # columns that do not depend on shapes; zero in rows that do not count
-    fixed: Float[AnyArray, "rows joints base"]
+    fixed_columns: Float[AnyArray, "rows joints base"]
     # measured forces [N m or N]; zero in rows that do not count
     forces: Float[AnyArray, "rows joints"]
     mask: Float[AnyArray, "rows joints"]  # one for rows that count, otherwise zero
@@ -129,7 +129,7 @@ class ShapeSearch(eqx.Module):
 
         starts = np.cumsum([0, *(o.rows for o in problem.recordings)])
         shape = (starts[-1], problem.robot.joints)
-        fixed = np.zeros((*shape, base.size))
+        columns = np.zeros((*shape, base.size))
         forces = np.zeros(shape)
         mask = np.zeros(shape)
         blocks = np.zeros(len(forces), int)
@@ -139,13 +139,13 @@ class ShapeSearch(eqx.Module):
             forces[rows] = chunk.forces
             mask[rows] = chunk.mask
             blocks[rows] = chunk.block
-            fixed[rows] = _dense_columns(chunk, base.size)
-        fixed[..., list(column_of_parameter)] = 0.0
+            columns[rows] = _dense_columns(chunk, base.size)
+        columns[..., list(column_of_parameter)] = 0.0
         return cls(
             shapes=shapes,
             start=shapes.values,
             recordings=problem.recordings,
-            fixed=fixed * mask[..., None],
+            fixed_columns=columns * mask[..., None],
             forces=forces * mask,
             mask=mask,
             blocks=blocks,
@@ -176,7 +176,7 @@ class ShapeSearch(eqx.Module):
         start = jnp.asarray(self.start)
         rows = self.row_weights(weights, block_mask)
         row_count = jnp.sum(jnp.where(rows > 0, 1.0, 0.0))
-        dof = jnp.maximum(row_count - float(self.fixed.shape[-1]), 1.0)
+        dof = jnp.maximum(row_count - float(self.fixed_columns.shape[-1]), 1.0)
         information = self.fixed_information(rows)
 
         def weighted_residuals(logarithms):
@@ -250,9 +250,9 @@ class ShapeSearch(eqx.Module):
         self, rows: Float[AnyArray, "rows joints"]
     ) -> Float[Array, "base base"]:
         """Return the products of the fixed columns of rows with these weights."""
-        weighted = jnp.asarray(self.fixed) * rows[..., None]
-        flat = weighted.reshape(-1, self.fixed.shape[-1])
-        return flat.T @ flat
+        weighted_columns = jnp.asarray(self.fixed_columns) * rows[..., None]
+        rows_of_joints = weighted_columns.reshape(-1, self.fixed_columns.shape[-1])
+        return rows_of_joints.T @ rows_of_joints
 
     def fit(
         self,
@@ -269,19 +269,23 @@ class ShapeSearch(eqx.Module):
         """
         columns = self.columns(x)
         joint, parameter, _ = np.array(self.entries).T
-        fixed = jnp.asarray(self.fixed)
+        fixed = jnp.asarray(self.fixed_columns)
         forces = jnp.asarray(self.forces)
         squares = rows**2
 
         def predict(c):
-            shaped = columns * c[parameter][None]
-            return jnp.zeros_like(forces).at[:, joint].add(shaped) + fixed @ c
+            shaped_part = columns * c[parameter][None]
+            return jnp.zeros_like(forces).at[:, joint].add(shaped_part) + fixed @ c
 
         def project(residuals):
             """Return the products of all columns with weighted residuals."""
-            weighted = squares * residuals
-            shaped = jnp.sum(columns * weighted[:, joint], axis=0)
-            return jnp.einsum("rjk,rj->k", fixed, weighted).at[parameter].add(shaped)
+            weighted_residuals = squares * residuals
+            shaped_part = jnp.sum(columns * weighted_residuals[:, joint], axis=0)
+            return (
+                jnp.einsum("rjk,rj->k", fixed, weighted_residuals)
+                .at[parameter]
+                .add(shaped_part)
+            )
 
         if fixed_information is None:
             fixed_information = self.fixed_information(rows)
@@ -305,26 +309,28 @@ class ShapeSearch(eqx.Module):
         """Add the products of the columns that depend on shapes, with all columns."""
         joint, parameter, _ = np.array(self.entries).T
         count = len(parameter)
-        fixed = jnp.asarray(self.fixed)
-        weighted = columns * squares[:, joint]
-        spread = jnp.zeros((*squares.shape, count))
-        spread = spread.at[:, joint, np.arange(count)].set(weighted)
-        flat = spread.reshape(-1, count)
-        with_fixed = flat.T @ fixed.reshape(-1, fixed.shape[-1])
-        products = columns.T @ weighted
+        fixed = jnp.asarray(self.fixed_columns)
+        weighted_columns = columns * squares[:, joint]
+        dense_columns = jnp.zeros((*squares.shape, count))
+        dense_columns = dense_columns.at[:, joint, np.arange(count)].set(
+            weighted_columns
+        )
+        rows_of_joints = dense_columns.reshape(-1, count)
+        fixed_products = rows_of_joints.T @ fixed.reshape(-1, fixed.shape[-1])
+        products = columns.T @ weighted_columns
         # Columns of different joints are never in one row.
-        with_each_other = jnp.where(joint == joint[:, None], products, 0.0)
-        information = information.at[parameter].add(with_fixed)
-        information = information.at[:, parameter].add(with_fixed.T)
-        return information.at[parameter[:, None], parameter].add(with_each_other)
+        shaped_products = jnp.where(joint == joint[:, None], products, 0.0)
+        information = information.at[parameter].add(fixed_products)
+        information = information.at[:, parameter].add(fixed_products.T)
+        return information.at[parameter[:, None], parameter].add(shaped_products)
 
 
 def _dense_columns(chunk: RowChunk, size: int) -> Float[np.ndarray, "rows joints base"]:
     """Return the columns of a chunk with zeros where parameters do not act on a joint."""
-    dense = np.zeros((*chunk.forces.shape, size))
+    columns = np.zeros((*chunk.forces.shape, size))
     for joint, parameters in enumerate(chunk.indices):
-        dense[:, joint, list(parameters)] = chunk.columns[joint]
-    return dense
+        columns[:, joint, list(parameters)] = chunk.columns[joint]
+    return columns
 
 
 def _filter_columns(
@@ -334,8 +340,8 @@ def _filter_columns(
     parts = []
     for o in recordings:
         q, qd, qdd = (jnp.asarray(x) for x in (o.motion.q, o.motion.qd, o.motion.qdd))
-        at_samples = jax.vmap(shapes.columns, (None, 0, 0, 0))(x, q, qd, qdd)
-        parts.append(o.reduce(at_samples[:, joint, column]))
+        columns = jax.vmap(shapes.columns, (None, 0, 0, 0))(x, q, qd, qdd)
+        parts.append(o.reduce(columns[:, joint, column]))
     return jnp.concatenate(parts)
 
 

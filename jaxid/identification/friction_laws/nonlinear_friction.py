@@ -137,10 +137,10 @@ def identify_nonlinear_friction(
     problem = linear_problem.with_base(base)
     search, values, notes = estimator.search(problem, weights)
     shapes = search.shapes
-    base_with_values = shapes.set(base, values)
-    fit = fit_problem(problem.with_base(base_with_values), estimator.linear)
+    shaped_base = shapes.set(base, values)
+    fit = fit_problem(problem.with_base(shaped_base), estimator.linear)
 
-    extended_base = _add_shape_slopes(base_with_values, shapes, values, fit.parameters)
+    extended_base = _add_shape_slopes(shaped_base, shapes, values, fit.parameters)
     extended_fit = fit_problem(problem.with_base(extended_base), estimator.linear)
     uncertainty = extended_fit.uncertainty
     return NonlinearFit(
