@@ -177,11 +177,10 @@ class ShapeSearch(eqx.Module):
         rows = self.row_weights(weights, block_mask)
         row_count = jnp.sum(jnp.where(rows > 0, 1.0, 0.0))
         dof = jnp.maximum(row_count - float(self.fixed_columns.shape[-1]), 1.0)
-        information = self.fixed_information(rows)
 
         def weighted_residuals(logarithms):
             shapes = start * jnp.exp(logarithms)
-            _, residuals = self.fit(shapes, rows, information)
+            _, residuals = self.fit(shapes, rows)
             return rows * residuals
 
         def pulled_residuals(logarithms, noise):
@@ -246,54 +245,40 @@ class ShapeSearch(eqx.Module):
         )
         return rows * jnp.asarray(self.mask)[:, joint]
 
-    def fixed_information(
-        self, rows: Float[AnyArray, "rows joints"]
-    ) -> Float[Array, "base base"]:
-        """Return the products of the fixed columns of rows with these weights."""
-        weighted_columns = jnp.asarray(self.fixed_columns) * rows[..., None]
-        rows_of_joints = weighted_columns.reshape(-1, self.fixed_columns.shape[-1])
-        return rows_of_joints.T @ rows_of_joints
-
     def fit(
         self,
         x: Float[AnyArray, " shapes"],
         rows: Float[AnyArray, "rows joints"],
-        fixed_information: Float[Array, "base base"] | None = None,
     ) -> tuple[Float[Array, " base"], Float[Array, "rows joints"]]:
         """Return the best linear parameters, and what they leave of the forces [N m or N].
 
         Args:
             x: Shapes.
             rows: Weights of the rows to which the linear parameters are fitted.
-            fixed_information: That of the fixed columns, if it is known.
         """
         columns = self.columns(x)
         joint, parameter, _ = np.array(self.entries).T
         fixed = jnp.asarray(self.fixed_columns)
         forces = jnp.asarray(self.forces)
-        squares = rows**2
 
         def predict(c):
             shaped_part = columns * c[parameter][None]
-            return jnp.zeros_like(forces).at[:, joint].add(shaped_part) + fixed @ c
+            return (fixed @ c).at[:, joint].add(shaped_part)
 
         def project(residuals):
             """Return the products of all columns with weighted residuals."""
-            weighted_residuals = squares * residuals
+            weighted_residuals = rows**2 * residuals
             shaped_part = jnp.sum(columns * weighted_residuals[:, joint], axis=0)
-            return (
-                jnp.einsum("rjk,rj->k", fixed, weighted_residuals)
-                .at[parameter]
-                .add(shaped_part)
-            )
+            fixed_part = jnp.einsum("rjk,rj->k", fixed, weighted_residuals)
+            return fixed_part.at[parameter].add(shaped_part)
 
-        if fixed_information is None:
-            fixed_information = self.fixed_information(rows)
-        information = self._add_shaped_columns(fixed_information, columns, squares)
-        size = len(information)
-        inverse, _ = inverse_information(
-            jax.lax.stop_gradient(information), RIDGE * size
-        )
+        size = fixed.shape[-1]
+        all_columns = fixed.at[:, joint, parameter].add(columns)
+        weighted_columns = (all_columns * rows[..., None]).reshape(-1, size)
+        # The matrix of Newton's steps needs no derivatives.
+        weighted_columns = jax.lax.stop_gradient(weighted_columns)
+        information = weighted_columns.T @ weighted_columns
+        inverse, _ = inverse_information(information, RIDGE * size)
 
         def refine(c):
             return c + inverse @ project(forces - predict(c))
@@ -302,27 +287,6 @@ class ShapeSearch(eqx.Module):
         # A step of Newton with a constant matrix has the derivatives of the solution.
         c = refine(c)
         return c, forces - predict(c)
-
-    def _add_shaped_columns(
-        self, information, columns, squares
-    ) -> Float[Array, "base base"]:
-        """Add the products of the columns that depend on shapes, with all columns."""
-        joint, parameter, _ = np.array(self.entries).T
-        count = len(parameter)
-        fixed = jnp.asarray(self.fixed_columns)
-        weighted_columns = columns * squares[:, joint]
-        dense_columns = jnp.zeros((*squares.shape, count))
-        dense_columns = dense_columns.at[:, joint, np.arange(count)].set(
-            weighted_columns
-        )
-        rows_of_joints = dense_columns.reshape(-1, count)
-        fixed_products = rows_of_joints.T @ fixed.reshape(-1, fixed.shape[-1])
-        products = columns.T @ weighted_columns
-        # Columns of different joints are never in one row.
-        shaped_products = jnp.where(joint == joint[:, None], products, 0.0)
-        information = information.at[parameter].add(fixed_products)
-        information = information.at[:, parameter].add(fixed_products.T)
-        return information.at[parameter[:, None], parameter].add(shaped_products)
 
 
 def _dense_columns(chunk: RowChunk, size: int) -> Float[np.ndarray, "rows joints base"]:
