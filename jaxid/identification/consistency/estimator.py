@@ -85,6 +85,19 @@ class Consistency(eqx.Module):
             sentences.append(f"active bounds: {'; '.join(self.active)}.")
         return tuple(sentences)
 
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """All sentences for the user."""
+        sentences = [
+            f"physically consistent: {self.bounds}.",
+            *self.findings,
+            "standard deviations are those of the estimate without bounds: where "
+            "bounds are active, estimates scatter less.",
+        ]
+        if not self.certified:
+            sentences.append(UNPROVED.format(self.error_bound))
+        return tuple(sentences)
+
 
 class PhysicallyConsistent(AbstractEstimator):
     r"""Weighted least squares over the standard parameters of bodies that can exist.
@@ -140,8 +153,9 @@ class PhysicallyConsistent(AbstractEstimator):
         residual = float(np.linalg.norm(R @ parameters - z))
         min_residual = float(np.linalg.norm(R @ unbounded_estimate.parameters - z))
         increase = residual / min_residual - 1.0 if min_residual > 0 else np.inf
-        is_determined = [x is Identifiability.ALONE for x in base.identifiability]
-        determined = np.array(is_determined)
+        determined = np.array(
+            [x is Identifiability.ALONE for x in base.identifiability]
+        )
         masses = [columns[0] for columns in feasible.bodies]
         consistency = Consistency(
             bodies=bodies,
@@ -155,22 +169,13 @@ class PhysicallyConsistent(AbstractEstimator):
             masses_from_bounds=tuple(np.flatnonzero(~determined[masses]).tolist()),
             active=_active_bounds(base, feasible, program, optimum, bodies),
         )
-        notes = [
-            *unbounded_estimate.notes,
-            f"physically consistent: {feasible.bounds}.",
-            *consistency.findings,
-            "standard deviations are those of the estimate without bounds: where "
-            "bounds are active, estimates scatter less.",
-        ]
-        if not optimum.certified:
-            notes.append(UNPROVED.format(error_bound))
         return dataclasses.replace(
             unbounded_estimate,
             parameters=parameters,
             standard=p,
             consistency=consistency,
             unbounded=unbounded_estimate.parameters,
-            notes=tuple(notes),
+            notes=(*unbounded_estimate.notes, *consistency.notes),
         )
 
     def feasible_set(self, base: BaseParameters) -> FeasibleSet:
