@@ -116,6 +116,7 @@ def estimate_delay(
     delays = each_delay.solve()[base.size :]
     covariance = each_delay.jackknife()[base.size :, base.size :]
     unit = np.eye(len(w))
+    # Differences of all delays to that of the first joint are zero for a common one.
     contrast = unit[1:] - unit[:1]
     _, p_value = joint_test(
         contrast @ delays, contrast @ covariance @ contrast.T, BLOCKS - 1.0
@@ -213,6 +214,7 @@ class _Equations(NamedTuple):
         """Return the covariance of the parameters, from estimates without each of the blocks."""
         count = len(self.products)
         estimates = np.array([self.solve(block) for block in range(count)])
+        # `cov` divides by one less than the count; the jackknife multiplies by that.
         return (count - 1) ** 2 / count * np.cov(estimates.T)
 
     def feedback(self, parameters: np.ndarray) -> float:
@@ -273,6 +275,7 @@ def _rows(
     """Return weighted rows: base parameters, delay of each joint, forces."""
     motion, forces = o.read(slice(*chunk.samples))
     predictions = base.forces_in_numpy(p, motion)
+    # A delay adds the rate of the forces times it, and filters act on both alike.
     rates = np.gradient(predictions, o.sample_time, axis=0)
     samples = len(rates)
     joints = len(w)
@@ -292,6 +295,7 @@ def without_delay(observations: Observations, seconds: float) -> Observations:
     require_finite_delay(seconds)
     time = observations.time
     dt = observations.sample_time
+    # Whole samples that the shift reaches over; rounding does not make one more.
     samples = math.ceil(abs(seconds) / dt - 1e-9)
     edge = observations.filter.edge(dt)
     instants = observations.instants

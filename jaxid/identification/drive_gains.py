@@ -92,6 +92,7 @@ def identify_drive_gains(
     _require_gains(robot)
     fits = (as_least_squares(unloaded), as_least_squares(loaded))
     maps, offsets = _parameter_maps(unloaded.base, load, varying)
+    # With nominal gains the problem is linear, and a good start.
     start_parameters, _ = combine(fits, maps, offsets)
 
     totals = []
@@ -112,6 +113,7 @@ def identify_drive_gains(
         ftol=TOLERANCE,
         gtol=TOLERANCE,
     )
+    # The base parameters come first, then the reciprocal gains.
     size = len(start_parameters)
     reciprocals = solution.x[size:]
     residuals, jacobian = rows.linearise(solution.x)

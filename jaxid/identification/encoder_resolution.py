@@ -37,6 +37,7 @@ def _step(changes) -> float:
     changes = np.sort(changes[changes > rounding])
     if len(changes) < MIN_CHANGES:
         return 0.0
+    # The smallest change is taken as one step.
     counts = changes / changes[0]
     is_small = counts < MAX_COUNT
     counts = counts[is_small]
@@ -58,6 +59,7 @@ def resolution_bias(
     """
     robot = fit.base.model.robot
     motion = observations.motion
+    # A log has the forces of a known tool in it.
     forces = fit.predict(motion) + fit.base.tool_forces(motion)
     angles = np.asarray(motion.q)
     if recording.angles_on_motor_side:

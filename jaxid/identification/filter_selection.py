@@ -119,6 +119,7 @@ def choose_filter(
         return [_mask_ends(o, edge) for o in observations]
 
     widest_band = observe_with(candidates[int(np.argmax(cutoffs))])
+    # All candidates are judged with the same weights of the joints.
     weights = np.asarray(estimator(RegressionProblem(base, widest_band)).weights)
     errors = []
     correlations = []
@@ -190,6 +191,7 @@ def _held_out_errors(
         parameters = estimator(training).parameters
         test_factors = test.blocks.select(test_part).total
         squares.append(joint_weights @ test_factors.residual_squares(parameters))
+    # Relative to the same force for each part: the errors' mean is that of the log.
     mean_forces = joint_weights @ test.factors.force_squares / len(folds)
     return np.sqrt(squares / mean_forces)
 
@@ -202,6 +204,7 @@ def _neighbour_correlation(
     squares = np.zeros(problem.robot.joints)
     products = np.zeros(problem.robot.joints)
     for chunk, residuals in problem.residuals(parameters):
+        # Rows that do not count are neighbours of nobody.
         residuals = np.where(chunk.mask, residuals, 0.0)
         neighbours = residuals[1:] * residuals[:-1]
         squares += np.sum(residuals**2, axis=0)

@@ -145,6 +145,7 @@ def choose_model(
             progress((number + 1) / len(candidates))
     table = np.array(tables)
 
+    # On the diagonal one part alone is left out.
     count = len(parts)
     squares = np.diagonal(table, axis1=1, axis2=2)
     best = _simplest(squares, candidates)
@@ -201,6 +202,7 @@ def _promise(table, candidates: Sequence[ModelCandidate]) -> float:
     for part in numbers:
         other_parts = [n for n in numbers if n != part]
         best = _simplest(table[:, part, other_parts], candidates)
+        # The error on a part that neither the choice nor the fit has used.
         squares.append(table[best, part, part])
     return float(np.sqrt(np.mean(squares)))
 

@@ -156,6 +156,7 @@ def identify_states(
             f"`fits` must be two or more with different names: {', '.join(names)}."
         )
     require_same_base(fits)
+    # The combination is linear in estimates of least squares only.
     fits = tuple(map(as_least_squares, fits))
     base = fits[0].base
     indices = varying_parameters(base, varying)
@@ -177,6 +178,7 @@ def state_indices(
     count = np.count_nonzero(is_varying)
     indices = np.cumsum(~is_varying) - 1
     start = size - count + state * count
+    # Those that vary follow the shared ones, state by state.
     indices[is_varying] = np.arange(start, start + count)
     return indices
 
@@ -209,6 +211,7 @@ def stores_energy(base: BaseParameters) -> Bool[np.ndarray, " base"]:
     """
     model = base.model
     shape = (2, 3, model.robot.joints)
+    # Random poses show every energy; three of them exclude a coincidence.
     q, qdd = np.random.default_rng(0).uniform(-1.0, 1.0, shape)
     zeros = np.zeros_like(q)
     moving_columns = in_numpy(base, base.columns, q, zeros, qdd)

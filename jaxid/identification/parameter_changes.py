@@ -121,6 +121,7 @@ class Comparison(Summarised, eqx.Module):
         verdicts = np.full(len(self.indices), Verdict.UNCHANGED)
         verdicts[self.p_values <= chance] = Verdict.PERHAPS
         verdicts[self.adjusted_p_values <= chance] = Verdict.CHANGED
+        # The order matters: later verdicts replace earlier ones.
         verdicts[~self.determined] = Verdict.UNKNOWN
         return tuple(verdicts)
 
@@ -235,6 +236,7 @@ def compare(first: Fit, second: Fit, level: float = LEVEL) -> Comparison:
     """
     require_same_base((first, second))
     size = first.base.size
+    # Errors of different recordings are independent: no cross-covariance.
     return compare_some(
         without_bounds(first),
         without_bounds(second),
@@ -290,6 +292,7 @@ def _status(has_changed: bool) -> Status:
 
 def _holm(p: Float[np.ndarray, " tests"]) -> Float[np.ndarray, " tests"]:
     """Return p-values that are corrected for the number of tests."""
+    # The smallest p-value counts for all tests, the next one for all others.
     order = np.argsort(p, kind="stable")
     products = p[order] * np.arange(len(p), 0, -1)
     adjusted = np.ones_like(p)
@@ -308,6 +311,7 @@ def joint_test(
     if not len(difference):
         return 0.0, 1.0
     deviations = np.sqrt(np.diag(covariance))
+    # Units may differ by orders of magnitude: correlations do not.
     correlation = covariance / deviations / deviations[:, None]
     values, directions = np.linalg.eigh(0.5 * (correlation + correlation.T))
     # Smaller eigenvalues are rounding.
@@ -318,6 +322,7 @@ def joint_test(
     if not np.isfinite(dof):
         return statistic, float(special.chdtrc(size, statistic))
     f_dof = dof - size + 1.0
+    # With fewer degrees of freedom than differences nothing can be said.
     if f_dof <= 0:
         return statistic, 1.0
     f_ratio = statistic * f_dof / (dof * size)

@@ -109,6 +109,7 @@ def essential_parameters(
         for step, (name, error) in enumerate(zip(names, errors, strict=True))
     ]
 
+    # The last step of all that cost little, even if one before costs more.
     max_error = (1 + cost) * min(errors)
     last_step = max(step for step, error in enumerate(errors) if error <= max_error)
     essential_indices = np.sort(order[last_step:])
@@ -132,6 +133,7 @@ def _elimination_order(fit: Fit, factors: Factors) -> list[int]:
         p, inverse = _solve(R, z, candidates)
         covariance = naive_covariance(factors, weights, p, inverse)
         naive_deviations = np.sqrt(np.diag(covariance))
+        # How much larger deviations are than for independent rows is that of the fit.
         if inflation is None:
             inflation = _inflation(fit.standard_deviations, naive_deviations)
         deviations = inflation[candidates] * naive_deviations

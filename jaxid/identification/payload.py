@@ -91,6 +91,7 @@ class Payload(Summarised, eqx.Module):
             values = np.asarray(_about_centre(p))
             J = np.asarray(jax.jacfwd(_about_centre)(p))
         covariance = self.uncertainty.covariance
+        # Infinite variances would make all others NaN in the product.
         is_undetermined = ~np.isfinite(np.diag(covariance))
         finite_part = np.where(np.isfinite(covariance), covariance, 0.0)
         central = J @ finite_part @ J.T
@@ -172,6 +173,7 @@ def identify_payload(
     if not np.isfinite(uncertainty.covariance).all():
         return Payload(body, estimate, estimate, uncertainty, np.nan)
     if bounds is None:
+        # A body that can exist needs no bounds.
         if consistency_margin(estimate) >= 0:
             return Payload(body, estimate, estimate, uncertainty, 0.0)
         bounds = _wide_bounds(robot)
@@ -192,6 +194,7 @@ def _estimate(
     base = unloaded.base
     states = state_maps(base.size, varying_parameters(base, varying), 2)
     columns = body_columns(base, body)
+    # The payload's ten parameters are unknowns that only the loaded run has.
     maps = [
         np.hstack([states[0], np.zeros_like(columns)]),
         np.hstack([states[1], columns]),
@@ -199,6 +202,7 @@ def _estimate(
     fits = (as_least_squares(unloaded), as_least_squares(loaded))
     values, uncertainty = combine(fits, maps)
     covariance = uncertainty.covariance[-10:, -10:]
+    # Parameters about the centre of mass are combinations: the fewest count for all.
     dof = np.full(10, np.min(uncertainty.dof[-10:]))
     return values[-10:], Uncertainty(covariance, dof, covariance)
 

@@ -77,6 +77,7 @@ class BodyBounds(eqx.Module):
                 f"`total_mass` must be from {low.sum():g} to {high.sum():g} kg, but is "
                 f"{total:g} kg."
             )
+        # Bounds that contradict each other are an error here, not in the estimation.
         _ = self.inner_centres
 
     def _require(self, name: str, rule: str, is_good: Bool[np.ndarray, "..."]) -> None:
@@ -103,6 +104,7 @@ class BodyBounds(eqx.Module):
         tip_length = float(np.linalg.norm(np.asarray(robot.tip_offset)))
         chains = [lengths[list(chain)].sum() for chain in robot.ancestors]
         chains[robot.tip_body] += tip_length
+        # A robot whose joints all lie in one point gets bounds of one metre.
         reach = float(max(chains)) or 1.0
         # Distance of each body's origin to the farthest of its neighbouring joints.
         extents = lengths.copy()
@@ -155,6 +157,7 @@ class BodyBounds(eqx.Module):
         low = np.maximum(self.centre_min, -radius)
         high = np.minimum(self.centre_max, radius)
         edge = 0.1 * (high - low)
+        # Without an ellipsoid the sphere takes its place.
         centre = np.where(has_ellipsoid, self.ellipsoid_centre, 0.0)
         axes = np.where(has_ellipsoid, self.ellipsoid_axes, radius)
         ellipsoids = ((centre, axes), (0.0, radius))

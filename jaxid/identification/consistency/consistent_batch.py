@@ -66,6 +66,7 @@ class ConsistentSolver(Hashable):
     base: BaseParameters
     estimator: PhysicallyConsistent = PhysicallyConsistent()
 
+    # A class with `__eq__` loses the hash that it inherits.
     __hash__ = Hashable.__hash__
 
     def __eq__(self, other: object) -> bool:
@@ -96,6 +97,7 @@ class ConsistentSolver(Hashable):
         p = feasible.standard_parameters(data, optimum.y)
         residuals = data.b - data.A @ p
         free_residuals = data.b[self.base.size :]
+        # Exact data leave nothing.
         free_square = jnp.maximum(free_residuals @ free_residuals, 1e-300)
         return ConsistentBatch(
             standard=p,
@@ -140,6 +142,7 @@ def consistent_batch(
         )
     estimator = estimator or PhysicallyConsistent()
     arrays = (np.asarray(R), np.asarray(z), np.asarray(rows))
+    # Errors cannot be raised in compiled code: the first data set is checked before.
     feasible = estimator.feasible_set(base)
     _, program = estimator.program(base, feasible, *(x[0] for x in arrays))
     program.require_interior()

@@ -139,6 +139,7 @@ class PhysicallyConsistent(AbstractEstimator):
         """
         base = rows.base
         weights = self.weights(rows.robot, rows.factors)
+        # Its standard deviations serve the consistent estimate, too.
         unbounded_estimate = Estimate.solve(rows, weights, Complete())
         R, z = rows.factors.weighted(weights)
         feasible = self.feasible_set(base)
@@ -148,6 +149,7 @@ class PhysicallyConsistent(AbstractEstimator):
         p = feasible.standard_parameters(data, optimum.y)
         parameters = np.asarray(base.from_standard(p))
         bodies = p[np.array(feasible.bodies)]
+        # Bodies with principal axes have seven parameters: products of inertia are zero.
         bodies = np.pad(bodies, ((0, 0), (0, 10 - bodies.shape[1])))
 
         residual = float(np.linalg.norm(R @ parameters - z))
@@ -156,6 +158,7 @@ class PhysicallyConsistent(AbstractEstimator):
         determined = np.array(
             [x is Identifiability.ALONE for x in base.identifiability]
         )
+        # The mass is the first parameter of a body.
         masses = [columns[0] for columns in feasible.bodies]
         consistency = Consistency(
             bodies=bodies,
@@ -205,6 +208,7 @@ def _solve(program: ConeProgram, throw: bool) -> tuple[solver.Optimum, float]:
     """Return the optimum, and a bound of its objective's relative distance to the true one."""
     program.require_interior()
     optimum = solver.solve_in_numpy(program)
+    # Noiseless data have an optimum near zero: the scale keeps the ratio sensible.
     error_bound = float(optimum.error / max(optimum.value, program.scale))
     if throw and not optimum.certified:
         raise RuntimeError(
@@ -236,6 +240,7 @@ def _active_bounds(
         if is_active.any():
             sentences.append(f"{name} of body {numbers(is_active)}")
 
+    # Lower bounds of all drives come first, then upper ones.
     of_drives = is_tight[end:].reshape(2, program.drives)
     drives = [base.model.parameter_names[k] for k in feasible.drives]
     for limit, is_active in zip(("0", "their largest value"), of_drives, strict=True):
@@ -282,6 +287,7 @@ def consistent_body(
         raise InputError(
             "`covariance` must be positive definite, but is not."
         ) from error
+    # Rows whose squared residuals are the squared distance in the covariance's metric.
     A = np.linalg.inv(L) / scale
     b = A @ estimate
     data = ScaledRows(A, b, np.float64(len(b)))

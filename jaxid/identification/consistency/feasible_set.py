@@ -78,6 +78,7 @@ class FeasibleSet(NamedTuple):
         """Return the units of the scaled variables: zero for drives without effect."""
         xp = namespace(data.A)
         norms = xp.linalg.norm(data.A[:, np.array(self.drives, int)], axis=0)
+        # Shorter columns are rounding: a joint that never moved has no friction.
         has_effect = norms > 1e-9 * xp.max(norms, initial=0.0)
         safe_norms = xp.where(has_effect, norms, 1.0)
         max_values = MAX_DRIVE_RATIO * xp.linalg.norm(data.b) / safe_norms
@@ -109,6 +110,7 @@ class FeasibleSet(NamedTuple):
         norms = xp.linalg.norm(columns, axis=0)
         scale = 1.0 / xp.where(norms > 0, norms, 1.0)
         gram = (scale[:, None] * (columns.T @ columns)) * scale[None]
+        # The ridge is rounding: columns may depend on each other.
         inverse = xp.linalg.inv(gram + 1e-13 * np.eye(len(self.unbounded)))
         return columns, scale[:, None] * inverse * scale[None]
 
@@ -122,6 +124,7 @@ class FeasibleSet(NamedTuple):
         second_moment = 0.5 * np.sum(unit[4:7], axis=0)
         names = ["largest mass", "sphere"]
         rows = [-mass, mass - second_moment]
+        # Scaled masses are at most one; m L² exceeds the second moment in the sphere.
         offsets = [np.ones(count), np.zeros(count)]
         if np.any(bounds.mass_min):
             names.append("smallest mass")
@@ -159,6 +162,7 @@ def feasible_set(model: Model, bounds: BodyBounds, margin: float = 0.0) -> Feasi
     columns = np.arange(start, start + sizes[number]).reshape(robot.joints, -1)
 
     others = np.setdiff1d(np.arange(model.size), columns)
+    # Terms tell that parameters cannot be negative by a lower bound of zero.
     lower = np.concatenate([term.lower_bounds(robot) for term in model.terms])
     is_drive = lower[others] == 0.0
     return FeasibleSet(
@@ -177,6 +181,7 @@ def nominal_bodies(bounds: BodyBounds) -> np.ndarray:
     high = bounds.mass_max
     mass = np.clip(MEDIUM_MASS * high, low + MEDIUM_MASS * (high - low), high)
     centre = bounds.inner_centres
+    # Half as large as the room that the sphere leaves around the centre.
     distance = np.sum((centre / bounds.radius[:, None]) ** 2, axis=1)
     return ball(mass, centre, 0.5 * bounds.radius * np.sqrt(1.0 - distance))
 

@@ -74,6 +74,7 @@ def inertial_parameters(
 def ball(mass: np.ndarray, centre: np.ndarray, radius: np.ndarray) -> np.ndarray:
     """Return the pseudo-inertias [*batch, 4, 4] of solid balls [kg, m]."""
     P = np.empty((*mass.shape, 4, 4))
+    # The second moment of a ball about its centre is m r² / 5 in each direction.
     P[..., :3, :3] = radius[..., None, None] ** 2 / 5.0 * np.eye(3)
     P[..., :3, :3] += centre[..., :, None] * centre[..., None, :]
     P[..., :3, 3] = centre
@@ -92,6 +93,7 @@ def consistency_margin(
         cannot exist.
     """
     P = pseudo_inertia(np.asarray(bodies))
+    # Estimates that cannot exist may have negative masses.
     size = np.sqrt(np.abs(np.diagonal(P, axis1=-2, axis2=-1)))
     scale = 1.0 / np.where(size > 0, size, 1.0)
     scaled_matrix = P * scale[..., :, None] * scale[..., None, :]
@@ -174,6 +176,8 @@ def pivots(P: Values) -> Values:
 
 def inverse(P: Values) -> Values:
     """Return the inverses of positive definite matrices, by one sweep for each row."""
+    # A sweep exchanges one variable and its right-hand side; after all of them the
+    # matrix is the negative inverse.
     for k, unit_vector in enumerate(np.eye(4)):
         pivot = P[:, k, k]
         others = 1.0 - unit_vector

@@ -302,6 +302,7 @@ def _step(p: ConeProgram, gram, x: Point) -> tuple[Point, Values]:
     xp = p.xp
     newton = _newton(p, gram, x)
     predictor = newton.centre(0.0, 0.0, 0.0)
+    # The second corrector has the second-order terms of the first one's changes.
     mu = _centring(p, x, predictor)
     first = newton.correct(mu, predictor)
     second = newton.correct(mu, first)
@@ -340,6 +341,7 @@ def _centring(p: ConeProgram, x: Point, predictor: Direction) -> Values:
         x.Z + length * predictor.Z,
         x.z + length * predictor.z,
     )
+    # The farther the predictor gets, the less has to be centred.
     fraction = xp.clip((mu_ahead / mu) ** 3, 1e-6, 1.0)
     fraction = xp.where(length < 0.1, xp.maximum(fraction, 0.5), fraction)
     return fraction * mu
@@ -348,6 +350,7 @@ def _centring(p: ConeProgram, x: Point, predictor: Direction) -> Values:
 def _complementarity(p: ConeProgram, S, s, Z, z) -> Values:
     """Return the mean product of slacks and multipliers, beyond that of the pull."""
     xp = p.xp
+    # Each pulled body ends with S Z = pull, whose trace is four times the pull.
     matrices = xp.sum(S * Z) - 4.0 * p.bodies * p.pull
     return (xp.maximum(matrices, 0.0) + s @ z) / p.complementarity
 
@@ -407,6 +410,7 @@ def _newton_solver(p: ConeProgram, H) -> Callable[[Values], Values]:
     try:
         factor = linalg.cho_factor(H, lower=True, check_finite=False)
     except np.linalg.LinAlgError:
+        # NaN ends the search, as it does in JAX, whose factors are NaN.
         return lambda right: np.full_like(right, np.nan)
 
     def solve(right):

@@ -53,6 +53,7 @@ class Shapes(eqx.Module):
         """Standard parameters of the terms that have shapes."""
         robot = self.model.robot
         sizes = [len(term.parameters(robot)) for term in self.model.terms]
+        # Index of the term of each standard parameter.
         owners = np.repeat(np.arange(len(sizes)), sizes)
         return np.flatnonzero(np.isin(owners, self.terms)).tolist()
 
@@ -107,6 +108,7 @@ def select_shapes(base: BaseParameters, names: Sequence[str] = ()) -> Shapes:
     Raises:
         InputError: If there are none.
     """
+    # Columns with memory depend on the path, so no sample can be evaluated alone.
     if base.model.memory is not None:
         raise InputError(
             "shapes are not searched for beside `Presliding`: take `Tanh`."

@@ -176,6 +176,7 @@ class ShapeSearch(eqx.Module):
         start = jnp.asarray(self.start)
         rows = self.row_weights(weights, block_mask)
         row_count = jnp.sum(jnp.where(rows > 0, 1.0, 0.0))
+        # Rows less linear parameters; shapes are few.
         dof = jnp.maximum(row_count - float(self.fixed_columns.shape[-1]), 1.0)
 
         def weighted_residuals(logarithms):
@@ -316,6 +317,7 @@ _filtered_columns = eqx.filter_custom_jvp(_filter_columns)
 def _(primals, tangents):
     """Differentiate by the shapes of all joints together: each acts on its own joint only."""
     x, shapes, recordings, joint, column = primals
+    # One direction for each kind of shape instead of one for each joint and kind.
     kinds = len(shapes.kinds)
     directions = jnp.repeat(jnp.eye(kinds), shapes.size // kinds, axis=1)
 

@@ -131,6 +131,7 @@ def identify_nonlinear_friction(
     """
     estimator = estimator or NonlinearFriction()
     linear_problem = RegressionProblem(linear or base, observations)
+    # Both models are compared with the weights of the linear one.
     linear_fit = fit_problem(linear_problem, estimator.linear)
     weights = np.asarray(linear_fit.weights)
 
@@ -140,6 +141,7 @@ def identify_nonlinear_friction(
     shaped_base = shapes.set(base, values)
     fit = fit_problem(problem.with_base(shaped_base), estimator.linear)
 
+    # In the extended model, uncertain shapes make the levels of friction uncertain.
     extended_base = _add_shape_slopes(shaped_base, shapes, values, fit.parameters)
     extended_fit = fit_problem(problem.with_base(extended_base), estimator.linear)
     uncertainty = extended_fit.uncertainty
@@ -171,6 +173,7 @@ def _add_shape_slopes(
     model = base.model
     standard = np.asarray(base.to_standard(parameters))[shapes.standard_columns]
     slopes = ShapeSlopes(dataclasses.replace(shapes, model=model), values, standard)
+    # No other parameter depends on the slopes: their rows of kappa are zero.
     kappa = np.asarray(base.kappa)
     return dataclasses.replace(
         base,

@@ -76,6 +76,7 @@ def temperature_law(
         estimates[row] = fit.parameters[places]
         deviations[row] = fit.standard_deviations[places]
 
+    # An exponential has no zero and no sign: joints with other estimates stay NaN.
     lines = np.full((4, len(names)), np.nan)
     for joint in np.flatnonzero((estimates > 0).all(axis=0)):
         lines[:, joint] = _exponential(
@@ -95,6 +96,7 @@ def temperature_law(
 
 def _exponential(warming, estimates, deviations) -> tuple[float, ...]:
     """Return rate, its deviation, value at the reference, and its deviation."""
+    # A small deviation of a logarithm is the relative deviation.
     relative_deviations = np.maximum(deviations / estimates, MIN_RELATIVE_DEVIATION)
     line, covariance = np.polyfit(
         warming,
