@@ -110,12 +110,12 @@ def estimate_delay(
         if [o.segments for o in instruments] != [o.segments for o in recordings]:
             raise InputError("`commanded` must have the samples of `observations`.")
     weights = weights or MaximumForces()
-    w = weights(base.model.robot, problem.factors)
-    search = _search(base, recordings, instruments, w)
+    joint_weights = weights(base.model.robot, problem.factors)
+    search = _search(base, recordings, instruments, joint_weights)
     each_delay = search.each_delay
     delays = each_delay.solve()[base.size :]
     covariance = each_delay.jackknife()[base.size :, base.size :]
-    unit = np.eye(len(w))
+    unit = np.eye(len(joint_weights))
     # Differences of all delays to that of the first joint are zero for a common one.
     contrast = unit[1:] - unit[:1]
     _, p_value = joint_test(
@@ -150,13 +150,13 @@ def _search(
     base: BaseParameters,
     recordings: Sequence[Observations],
     instruments: Sequence[Observations] | None,
-    w: np.ndarray,
+    joint_weights: np.ndarray,
 ) -> _Search:
     """Shift the motions until the rates of the forces explain nothing more."""
-    joints = len(w)
+    joints = len(joint_weights)
     no_delay = np.eye(base.size + joints)[:, : base.size]
     same_delay = linalg.block_diag(np.eye(base.size), np.ones((joints, 1)))
-    start = _equations(base, recordings, recordings, w, np.zeros(base.size))
+    start = _equations(base, recordings, recordings, joint_weights, np.zeros(base.size))
     p = start.combine(no_delay).solve()
     seconds = 0.0
     step = 0.0
@@ -167,7 +167,9 @@ def _search(
         shifted_instruments = shifted_logs
         if instruments is not None:
             shifted_instruments = [without_delay(o, seconds) for o in instruments]
-        each_delay = _equations(base, shifted_logs, shifted_instruments, w, p)
+        each_delay = _equations(
+            base, shifted_logs, shifted_instruments, joint_weights, p
+        )
         one_delay = each_delay.combine(np.asarray(same_delay))
         solution = one_delay.solve()
         deviation = float(np.sqrt(one_delay.jackknife()[-1, -1]))
@@ -237,25 +239,25 @@ def _equations(
     base: BaseParameters,
     recordings: Sequence[Observations],
     instruments: Sequence[Observations],
-    w,
+    joint_weights,
     p,
 ) -> _Equations:
     """Return the normal equations of the parameters and of a delay of each joint."""
-    size = base.size + len(w) + 1
+    size = base.size + len(joint_weights) + 1
     products = np.zeros((BLOCKS, size - 1, size))
     squares = np.zeros((size, size))
     rates = np.zeros((size, size))
-    total_rows = sum(o.rows for o in recordings)
+    total_rows = sum(log.rows for log in recordings)
     first_row = 0
-    for o, instrument in zip(recordings, instruments, strict=True):
-        spacing = o.sample_time * o.decimation.factor
-        for chunk in o.chunks(SAMPLES_PER_CHUNK):
+    for log, instrument in zip(recordings, instruments, strict=True):
+        spacing = log.sample_time * log.decimation.factor
+        for chunk in log.chunks(SAMPLES_PER_CHUNK):
             rows = np.arange(*chunk.rows)
-            mask = np.asarray(o.mask)[rows]
-            X = mask[..., None] * _rows(base, o, chunk, w, p)
+            mask = np.asarray(log.mask)[rows]
+            X = mask[..., None] * _rows(base, log, chunk, joint_weights, p)
             Z = X
-            if instrument is not o:
-                Z = mask[..., None] * _rows(base, instrument, chunk, w, p)
+            if instrument is not log:
+                Z = mask[..., None] * _rows(base, instrument, chunk, joint_weights, p)
             blocks = (first_row + rows) * BLOCKS // total_rows
             for block in np.unique(blocks):
                 x = X[blocks == block].reshape(-1, size)
@@ -265,20 +267,20 @@ def _equations(
             is_pair = mask[1:] & mask[:-1]
             change = np.diff(X, axis=0)[is_pair] / spacing
             rates += change.T @ change
-        first_row += o.rows
+        first_row += log.rows
     return _Equations(products, squares, rates)
 
 
 def _rows(
-    base: BaseParameters, o: Observations, chunk: Chunk, w, p
+    base: BaseParameters, log: Observations, chunk: Chunk, joint_weights, p
 ) -> Float[np.ndarray, "rows joints columns"]:
     """Return weighted rows: base parameters, delay of each joint, forces."""
-    motion, forces = o.read(slice(*chunk.samples))
+    motion, forces = log.read(slice(*chunk.samples))
     predictions = base.forces_in_numpy(p, motion)
     # A delay adds the rate of the forces times it, and filters act on both alike.
-    rates = np.gradient(predictions, o.sample_time, axis=0)
+    rates = np.gradient(predictions, log.sample_time, axis=0)
     samples = len(rates)
-    joints = len(w)
+    joints = len(joint_weights)
     width = base.size + joints + 1
     columns = np.zeros((samples, joints, width))
     for joint, values in enumerate(base.regressor_rows(motion)):
@@ -287,7 +289,7 @@ def _rows(
         columns[:, joint, base.size + joint] = -rates[:, joint]
     columns[..., -1] = np.asarray(forces) - base.tool_forces(motion)
     rows = chunk.reduce(columns.reshape(samples, -1))
-    return w[:, None] * rows.reshape(-1, joints, width)
+    return joint_weights[:, None] * rows.reshape(-1, joints, width)
 
 
 def without_delay(observations: Observations, seconds: float) -> Observations:
