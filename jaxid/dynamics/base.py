@@ -187,9 +187,9 @@ class BaseParameters(Summarised, Hashable):
     ) -> Float[AnyArray, "*batch base"]:
         r"""Return the base parameters $p_B = p_1 + \kappa p_2$ (Eq. 22)."""
         p = _as_parameters("standard", p, self.model.size)
-        first = np.array(self.indices)
-        second = np.array(self.dependent, int)
-        return p[..., first] + p[..., second] @ self.kappa.T
+        leaders = np.array(self.indices)
+        others = np.array(self.dependent, int)
+        return p[..., leaders] + p[..., others] @ self.kappa.T
 
     def to_standard(
         self, p: Float[AnyArray, "*batch base"] | Sequence[Any]
@@ -314,10 +314,10 @@ def base_parameters(
     (other_method,) = set(METHODS) - {method}
     cross_check = METHODS[other_method](W)
 
-    first = np.array(dependence.independent, int)
-    second = np.array(dependence.dependent, int)
-    regrouped = regrouping(W, first, second)
-    kappa = regrouped.kappa * scale[first][:, None] / scale[second]
+    leaders = np.array(dependence.independent, int)
+    others = np.array(dependence.dependent, int)
+    regrouped = regrouping(W, leaders, others)
+    kappa = regrouped.kappa * scale[leaders][:, None] / scale[others]
     return BaseParameters(
         model,
         dependence.independent,

@@ -76,12 +76,12 @@ def closed_forms(
     expressions = []
     for row, leader in enumerate(independent):
         terms = {leader: Coefficient((Monomial(Fraction(1)),))}
-        for column, other in enumerate(dependent):
+        for column, follower in enumerate(dependent):
             value = float(kappa[row, column])
-            quotient = _quotient(dimensions[leader], dimensions[other])
+            quotient = _quotient(dimensions[leader], dimensions[follower])
             coefficient = search.coefficient(row, column, quotient, value)
             if coefficient is not None:
-                terms[other] = coefficient
+                terms[follower] = coefficient
         in_order = ((names[k], terms[k]) for k in sorted(terms))
         expressions.append(Expression(tuple(in_order)))
 
@@ -121,13 +121,13 @@ class CoefficientSearch:
         row_unit = matrix.units[matrix.independent]
         self._entry_units = row_unit[:, None] / matrix.units[matrix.dependent]
 
-        scaled = values / self._units
+        relative_values = values / self._units
         fits = slice(1 + len(variations), -CHECKS)
-        self._fit_lengths = scaled[fits]
+        self._fit_lengths = relative_values[fits]
         self._fit_kappa = kappa[fits]
-        self._check_lengths = scaled[-CHECKS:]
+        self._check_lengths = relative_values[-CHECKS:]
         self._check_kappa = kappa[-CHECKS:]
-        self._shares = _shares_of_powers(scaled, kappa)
+        self._shares = _shares_of_powers(relative_values, kappa)
 
     def coefficient(
         self, row: int, column: int, quotient: np.ndarray | None, value: float
@@ -235,21 +235,21 @@ def _vary_each(
 
 
 def _shares_of_powers(
-    scaled: Float[np.ndarray, "cases lengths"],
+    relative_values: Float[np.ndarray, "cases lengths"],
     kappa: Float[np.ndarray, "cases base dependent"],
 ) -> Float[np.ndarray, "lengths powers base dependent"]:
     """Return the share of each power of a length that varies alone."""
-    count = scaled.shape[1]
+    count = relative_values.shape[1]
     shares = np.zeros((count, len(POWERS), *kappa.shape[1:]))
     for k in range(count):
-        first = 1 + k * len(SCALES)
-        rows = [0, *range(first, first + len(SCALES))]
-        powers = scaled[rows, k, None] ** POWERS
+        start = 1 + k * len(SCALES)
+        rows = [0, *range(start, start + len(SCALES))]
+        powers = relative_values[rows, k, None] ** POWERS
         # As many powers as values: they are solved for exactly.
         factors = np.linalg.solve(powers, kappa[rows].reshape(len(rows), -1))
         sizes = np.abs(factors)
-        largest = np.maximum(sizes.max(axis=0), np.finfo(float).tiny)
-        shares[k] = (sizes / largest).reshape(shares.shape[1:])
+        max_size = np.maximum(sizes.max(axis=0), np.finfo(float).tiny)
+        shares[k] = (sizes / max_size).reshape(shares.shape[1:])
     return shares
 
 
@@ -260,9 +260,9 @@ def _products(x: np.ndarray, powers: np.ndarray) -> np.ndarray:
 
 def _simple(number: float) -> Fraction | float:
     """Return the fraction with a small denominator that a number is, or the number."""
-    nearest = Fraction(number).limit_denominator(12)
-    is_fraction = nearest != 0 and abs(number - float(nearest)) < MAX_ERROR
-    return nearest if is_fraction else number
+    fraction = Fraction(number).limit_denominator(12)
+    is_fraction = fraction != 0 and abs(number - float(fraction)) < MAX_ERROR
+    return fraction if is_fraction else number
 
 
 @dataclass(frozen=True)

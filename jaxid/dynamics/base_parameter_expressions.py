@@ -67,8 +67,8 @@ class Coefficient:
     def common_factor(self) -> Monomial:
         """Return the positive factor that all monomials have in common."""
         exponents = [dict(m.powers) for m in self.monomials]
-        smallest = {s: min(e.get(s, 0) for e in exponents) for s in self.symbols}
-        powers = tuple((name, e) for name, e in smallest.items() if e)
+        min_exponents = {s: min(e.get(s, 0) for e in exponents) for s in self.symbols}
+        powers = tuple((name, e) for name, e in min_exponents.items() if e)
         return Monomial(_common_number([m.number for m in self.monomials]), powers)
 
     def factored(self) -> tuple[Monomial, tuple[Monomial, ...]]:

@@ -127,10 +127,10 @@ class Model(Hashable):
     @property
     def input_shapes(self) -> list[Shape]:
         """Shapes of the arguments of `columns`."""
-        rest = np.zeros(self.robot.joints)
+        standstill = np.zeros(self.robot.joints)
         law = self.memory
-        states = [] if law is None else [law.settled(rest).shape]
-        return [rest.shape] * 3 + states
+        states = [] if law is None else [law.settled(standstill).shape]
+        return [standstill.shape] * 3 + states
 
     def with_memory(self, **changes: Any) -> "Model":
         """Return the model with other fields of `memory`, such as `length`."""

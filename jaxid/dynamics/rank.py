@@ -71,10 +71,10 @@ def gram_schmidt(
             independent.append(k)
 
     dependent = [k for k in range(columns) if k not in set(independent)]
-    smallest = shares[independent].min(initial=np.inf)
-    largest = shares[dependent].max(initial=0.0)
+    min_share = shares[independent].min(initial=np.inf)
+    max_share = shares[dependent].max(initial=0.0)
     return Dependence(
-        tuple(independent), tuple(dependent), float(smallest), float(largest)
+        tuple(independent), tuple(dependent), float(min_share), float(max_share)
     )
 
 
@@ -87,10 +87,10 @@ def singular_values(
     the largest factor. A column depends
     on earlier ones if some vector of the null space ends there.
     """
-    scaled, norms = scale_columns(W)
+    unit_columns, norms = scale_columns(W)
     columns = len(norms)
     # The triangular factor has the same singular values and null space, and few rows.
-    triangle = np.linalg.qr(scaled, mode="r")
+    triangle = np.linalg.qr(unit_columns, mode="r")
     _, values, Vt = np.linalg.svd(triangle, full_matrices=True)
     s = np.zeros(columns)
     s[: len(values)] = values / max(values[0], np.finfo(float).tiny)
@@ -99,9 +99,9 @@ def singular_values(
     rank = min(_rank_at_largest_fall(s, tolerance), max_rank)
     dependent = _ends_of_null_vectors(Vt[rank:])
     independent = tuple(k for k in range(columns) if k not in dependent)
-    smallest = float(s[rank - 1]) if rank else np.inf
-    largest = float(s[rank]) if rank < columns else 0.0
-    return Dependence(independent, dependent, smallest, largest)
+    min_share = float(s[rank - 1]) if rank else np.inf
+    max_share = float(s[rank]) if rank < columns else 0.0
+    return Dependence(independent, dependent, min_share, max_share)
 
 
 def _rank_at_largest_fall(s: np.ndarray, tolerance: float) -> int:
@@ -111,8 +111,8 @@ def _rank_at_largest_fall(s: np.ndarray, tolerance: float) -> int:
     is_possible = ranks >= min_rank
     if not is_possible.any():
         return min_rank
-    floored = np.maximum(s, 1e-14)  # all below are rounding
-    falls = floored[:-1] / floored[1:]
+    values = np.maximum(s, 1e-14)  # all below are rounding
+    falls = values[:-1] / values[1:]
     return int(ranks[np.argmax(np.where(is_possible, falls, 0.0))])
 
 
@@ -167,28 +167,28 @@ def regrouping(
 
     A dependent column is a combination of independent columns before it.
     """
-    first = np.array(independent, int)
-    second = np.array(dependent, int)
-    scaled, norms = scale_columns(W)
-    W1 = scaled[:, first]
-    W2 = scaled[:, second]
+    leaders = np.array(independent, int)
+    others = np.array(dependent, int)
+    unit_columns, norms = scale_columns(W)
+    W1 = unit_columns[:, leaders]
+    W2 = unit_columns[:, others]
     Q, R = np.linalg.qr(W1)
     shares = np.abs(np.diag(R))
-    is_before = first[:, None] < second
-    kappa = np.zeros((len(first), len(second)))
-    if len(first) and shares.min() > ROUNDING:
+    is_before = leaders[:, None] < others
+    kappa = np.zeros((len(leaders), len(others)))
+    if len(leaders) and shares.min() > ROUNDING:
         # The second step takes out most of the rounding that poor conditioning
         # amplifies.
         for _ in range(2):
             residuals = np.where(is_before, Q.T @ (W2 - W1 @ kappa), 0.0)
             kappa = kappa + scipy.linalg.solve_triangular(R, residuals)
-    unexplained = np.linalg.norm(W2 - W1 @ kappa, axis=0).max(initial=0.0)
+    max_residual = np.linalg.norm(W2 - W1 @ kappa, axis=0).max(initial=0.0)
 
     kappa = np.where(np.abs(kappa) > 1e-9, kappa, 0.0)
     # Columns of nothing but rounding stay as they are.
     scale = np.where(norms > 0, norms, 1.0)
-    kappa = kappa * scale[second] / scale[first][:, None]
-    return Regrouped(kappa, float(unexplained), shares)
+    kappa = kappa * scale[others] / scale[leaders][:, None]
+    return Regrouped(kappa, float(max_residual), shares)
 
 
 def random_regressor(

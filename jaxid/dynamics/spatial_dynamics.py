@@ -59,10 +59,10 @@ def _times(matrices: Array, x: Array) -> Array:
 
 def moved_by(robot: Robot) -> Float[np.ndarray, "joints joints"]:
     """Return 1 where a body (row) is moved by a joint (column), else 0."""
-    moved = np.zeros((robot.joints, robot.joints))
+    is_moved = np.zeros((robot.joints, robot.joints))
     for body, chain in enumerate(robot.ancestors):
-        moved[body, list(chain)] = 1.0
-    return moved
+        is_moved[body, list(chain)] = 1.0
+    return is_moved
 
 
 def all_placements(robot: Robot, q: Joints) -> Float[Array, "joints 4 4"]:
@@ -81,8 +81,8 @@ def all_placements(robot: Robot, q: Joints) -> Float[Array, "joints 4 4"]:
         has_body = above >= 0
         choice = np.eye(robot.joints)[above] * has_body[:, None]
         ground = np.eye(4) * ~has_body[:, None, None]
-        chosen = jnp.tensordot(jnp.asarray(choice, dtype), placements, 1)
-        placements = (chosen + jnp.asarray(ground, dtype)) @ placements
+        placements_above = jnp.tensordot(jnp.asarray(choice, dtype), placements, 1)
+        placements = (placements_above + jnp.asarray(ground, dtype)) @ placements
         above = np.where(has_body, above[above], -1)
     return placements
 
@@ -112,9 +112,9 @@ def _relative_placements(robot: Robot, q: Joints) -> Float[Array, "joints 3 4"]:
     turn = turn + turns * jnp.sin(angle) * _combine(SKEW, axis)
 
     shift = slides * angle * axis_column
-    moved = jnp.concatenate([turn, shift], axis=2)
+    motion = jnp.concatenate([turn, shift], axis=2)
     last_column = ((0, 0), (0, 0), (3, 0))
-    return rotation @ moved + jnp.pad(offset[:, :, None], last_column)
+    return rotation @ motion + jnp.pad(offset[:, :, None], last_column)
 
 
 class GroundMotion(NamedTuple):
@@ -144,10 +144,10 @@ def ground_motion(robot: Robot, q: Joints, qd: Joints, qdd: Joints) -> GroundMot
     linear = _times(arm, turning) + _times(R, sliding)
     joints = jnp.concatenate([angular, linear], axis=1)
 
-    moved = jnp.asarray(moved_by(robot), dtype)
+    is_moved = jnp.asarray(moved_by(robot), dtype)
     speeds = joints * qd[:, None]
-    v = moved @ speeds
-    a = moved @ (joints * qdd[:, None] + _times(_combine(CROSS, v), speeds))
+    v = is_moved @ speeds
+    a = is_moved @ (joints * qdd[:, None] + _times(_combine(CROSS, v), speeds))
     gravity = jnp.concatenate([jnp.zeros(3, dtype), jnp.asarray(robot.gravity, dtype)])
     return GroundMotion(carry, joints, v, a - gravity[None])
 
@@ -171,11 +171,11 @@ def spatial_mass_and_bias(
     """Return the mass matrix and the bias forces of the bodies (Eq. 38)."""
     motion = ground_motion(robot, q, qd, jnp.zeros_like(q))
     inertias = ground_inertias(p, motion.carry)
-    moved = jnp.asarray(moved_by(robot), q.dtype)
-    composite = jnp.tensordot(moved.T, inertias, 1)
+    is_moved = jnp.asarray(moved_by(robot), q.dtype)
+    composite = jnp.tensordot(is_moved.T, inertias, 1)
     momenta = _times(composite, motion.joints)
     # A joint feels the momenta of those that it carries; the matrix is symmetric.
-    lower = moved * (momenta @ motion.joints.T)
+    lower = is_moved * (momenta @ motion.joints.T)
     off_diagonal = jnp.asarray(1.0 - np.eye(len(q)), q.dtype)
     M = lower + (lower * off_diagonal).T
     return M, _project_forces(robot, inertias, motion)

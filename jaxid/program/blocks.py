@@ -31,20 +31,20 @@ def block_results(program: Program, *arrays: Array) -> tuple[Array, ...]:
 
     def evaluate(arrays: tuple[Array, ...]) -> tuple[Array, ...]:
         # Transposed once, behind a fence of its own.
-        stacked = jnp.concatenate([x.T for x in arrays if x.ndim == 2])
-        rows = iter(fenced(stacked, hidden_one(stacked[0, 0])))
+        matrix = jnp.concatenate([x.T for x in arrays if x.ndim == 2])
+        rows = iter(fenced(matrix, hidden_one(matrix[0, 0])))
         inputs = []
         for x in arrays:
             if x.ndim == 2:
                 inputs.append([next(rows) for _ in x.T])
             else:
                 inputs.append([jnp.broadcast_to(entry, (size,)) for entry in x])
-        return lower(program, fence=True).run(inputs, primitives(stacked[0]))
+        return lower(program, fence=True).run(inputs, primitives(matrix[0]))
 
     # Results of a branch are stored: what uses them does not compute them again.
-    first = arrays[-1][0, 0]
-    nothing = tuple(jnp.broadcast_to(first, (size,)) for _ in program.distinct[0])
-    return jax.lax.cond(hidden_one(first) > 0, evaluate, lambda _: nothing, arrays)
+    reference = arrays[-1][0, 0]
+    nothing = tuple(jnp.broadcast_to(reference, (size,)) for _ in program.distinct[0])
+    return jax.lax.cond(hidden_one(reference) > 0, evaluate, lambda _: nothing, arrays)
 
 
 def results_at_once(program: Program, *arrays: Array) -> tuple[Array, ...]:
@@ -108,18 +108,18 @@ def on_rows(program: Program, *arrays: Array) -> Float[Array, "samples out"]:
         inputs = list(zip(arrays, is_batched, strict=True))
         count = arrays[-1].shape[int(is_batched[-1])]
         # Parameters are vectors, with the axis of the batch matrices.
-        has_own_parameters = any(x.ndim == 2 and batched for x, batched in inputs)
+        has_own_parameters = any(x.ndim == 2 and has_batch for x, has_batch in inputs)
         if has_own_parameters and count >= BLOCK:
             return _one_after_the_other(run, inputs), True
 
         # All become samples, but for what is common to all.
         rows = []
-        for x, batched in inputs:
-            is_common = x.ndim - batched == 1
-            if is_common and not batched:
+        for x, has_batch in inputs:
+            is_common = x.ndim - has_batch == 1
+            if is_common and not has_batch:
                 rows.append(x)
                 continue
-            x = x if batched else x[None]
+            x = x if has_batch else x[None]
             x = x[:, None] if is_common else x
             entries = x.shape[-1]
             rows.append(
@@ -134,11 +134,11 @@ def _one_after_the_other(
     run: Callable, inputs: list[tuple[Array, bool]]
 ) -> Float[Array, "batch samples out"]:
     """Call a function for each element of a batch, with inputs that have one or not."""
-    elements = [x for x, batched in inputs if batched]
+    elements = [x for x, has_batch in inputs if has_batch]
 
     def on_element(parts: list[Array]) -> Array:
         remaining = iter(parts)
-        return run(*(next(remaining) if batched else x for x, batched in inputs))
+        return run(*(next(remaining) if has_batch else x for x, has_batch in inputs))
 
     return jax.lax.map(on_element, elements)
 
@@ -161,8 +161,8 @@ def row_products(
         matrices = []
         for group in groups:
             columns = [counts * values[k] for k in group]
-            stacked = jnp.stack(columns) if group else counts[:0, None]
-            matrices.append(stacked @ stacked.T)
+            matrix = jnp.stack(columns) if group else counts[:0, None]
+            matrices.append(matrix @ matrix.T)
         return matrices
 
     def by_chunks(evaluate: Callable, size: int, *arrays: Array) -> list[Array]:

@@ -73,16 +73,16 @@ class CWriter:
 
     def number(self, x: float) -> str:
         """Write a number with as many digits as its precision needs."""
-        rounded = self._dtype(x)
+        value = self._dtype(x)
         if math.isnan(x):
             return "NAN"
-        if np.isinf(rounded):
+        if np.isinf(value):
             return "INFINITY" if x > 0 else "(-INFINITY)"
         is_scientific = abs(x) > 1e6 or 0 < abs(x) < 1e-4
         write = (
             np.format_float_scientific if is_scientific else np.format_float_positional
         )
-        text = write(rounded, unique=True, trim="0") + self._suffix
+        text = write(value, unique=True, trim="0") + self._suffix
         return f"({text})" if text.startswith("-") else text
 
     def declaration(

@@ -72,8 +72,8 @@ SINGLE = Precision(
 
 def _horner(coefficients: tuple[float, ...], z: Array) -> Array:
     """Evaluate a polynomial whose lowest power comes first."""
-    *others, highest = coefficients
-    total = jnp.full_like(z, highest)
+    *others, leader = coefficients
+    total = jnp.full_like(z, leader)
     for coefficient in reversed(others):
         total = total * z + coefficient
     return total

@@ -138,9 +138,9 @@ def _evaluate(
 ) -> tuple[np.ndarray, Shape]:
     """Return the results that vary [results, samples], and the batch."""
     loads, run, cell_count = _plan(program)
-    aligned, batch = program.align([np.asarray(x, np.float64) for x in arrays], np)
+    entries, batch = program.align([np.asarray(x, np.float64) for x in arrays], np)
     samples = math.prod(batch)
-    inputs = [x.reshape(len(x), samples) for x in aligned]
+    inputs = [x.reshape(len(x), samples) for x in entries]
     results = np.empty((len(program.distinct[0]), samples))
     scratch = np.empty((cell_count - len(results), min(samples, BLOCK)))
     with np.errstate(all="ignore"):

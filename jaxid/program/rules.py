@@ -75,8 +75,8 @@ def divided(function: Callable) -> Callable:
 
         # JAX divides functions without constants only: they become arguments.
         def without_constants(*arguments: Array) -> Any:
-            closed = ClosedJaxpr(program.jaxpr, arguments[:count])
-            results = jaxpr_as_fun(closed)(*arguments[count:])
+            jaxpr = ClosedJaxpr(program.jaxpr, arguments[:count])
+            results = jaxpr_as_fun(jaxpr)(*arguments[count:])
             return jax.tree.unflatten(jax.tree.structure(shapes), results)
 
         on_devices = _divisible(function, without_constants, count)
@@ -84,7 +84,7 @@ def divided(function: Callable) -> Callable:
 
     @run.def_vmap
     def batch(size: int, is_batched: list[bool], *arrays: Array) -> tuple[Any, Any]:
-        axes = [0 if batched else None for batched in is_batched]
+        axes = [0 if x else None for x in is_batched]
         results = jax.vmap(function, axes)(*arrays)
         return results, jax.tree.map(lambda _: True, results)
 

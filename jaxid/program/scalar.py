@@ -166,9 +166,9 @@ def add(x: Operand, y: Operand) -> Operand:
     if not isinstance(y, Scalar):
         if y == 0:
             return x
-        negated, x = _magnitude(x)
-        total = x.graph.node(Operation.ADD, x, -float(y) if negated else float(y))
-        return negate(total) if negated else total
+        is_negative, x = _magnitude(x)
+        total = x.graph.node(Operation.ADD, x, -float(y) if is_negative else float(y))
+        return negate(total) if is_negative else total
     x_negated, x = _magnitude(x)
     y_negated, y = _magnitude(y)
     if x.index > y.index:
@@ -292,9 +292,9 @@ def apply(operation: Operation, *operands: Operand) -> Operand:
         return operation.on_constants(*constants)
     graph = next(x.graph for x in operands if isinstance(x, Scalar))
     if operation.traits & {"odd", "even"}:
-        negated, x = _magnitude(operands[0])
+        is_negative, x = _magnitude(operands[0])
         result = graph.node(operation, x)
-        return negate(result) if negated and "odd" in operation.traits else result
+        return negate(result) if is_negative and "odd" in operation.traits else result
     if "commutative" in operation.traits:
         operands = tuple(sorted(operands, key=_index))
         is_extremum = operation in (Operation.MAXIMUM, Operation.MINIMUM)
@@ -351,10 +351,10 @@ def rewrite(outputs: Sequence[Operand]) -> list[Operand]:
     """Return the same outputs with fewer operations, where some can be saved."""
     outputs = list(outputs)
     while True:
-        factored = Rewriting(outputs).factor_sums()
-        if _count_operations(factored) >= _count_operations(outputs):
+        candidates = Rewriting(outputs).factor_sums()
+        if _count_operations(candidates) >= _count_operations(outputs):
             return Rewriting(outputs).turn_negated_differences()
-        outputs = factored
+        outputs = candidates
 
 
 def _count_operations(outputs: Sequence[Operand]) -> int:
@@ -442,7 +442,7 @@ class Rewriting:
                 products[k] = x
 
         sums: list[_Term] = []
-        factored: set[int] = set()
+        positions: set[int] = set()
         while True:
             factor = _most_common_factor(products.values())
             if factor is None:
@@ -454,12 +454,12 @@ class Rewriting:
                 cofactor = self._replacement(_cofactor(products.pop(k), factor))
                 cofactors.append((is_negative, cofactor))
             sums.append((False, multiply(self._replacement(factor), _sum(cofactors))))
-            factored.update(group)
+            positions.update(group)
         if not sums:
             return None
         others = []
         for k, (is_negative, x) in enumerate(terms):
-            if k not in factored:
+            if k not in positions:
                 others.append((is_negative, self._replacement(x)))
         return others + sums
 

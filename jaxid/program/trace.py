@@ -47,10 +47,10 @@ def _is_symbolic(x: np.ndarray) -> bool:
 
 def _broadcast(x: np.ndarray, *_, shape, broadcast_dimensions, **__) -> np.ndarray:
     """Put the axes of an array at some positions, and repeat it along the others."""
-    aligned = [1] * len(shape)
+    own_shape = [1] * len(shape)
     for source, target in enumerate(broadcast_dimensions):
-        aligned[target] = x.shape[source]
-    return np.broadcast_to(x.reshape(aligned), shape)
+        own_shape[target] = x.shape[source]
+    return np.broadcast_to(x.reshape(own_shape), shape)
 
 
 def _slice(x: np.ndarray, *, start_indices, limit_indices, strides) -> np.ndarray:
@@ -61,16 +61,16 @@ def _slice(x: np.ndarray, *, start_indices, limit_indices, strides) -> np.ndarra
 
 def _pad(x: np.ndarray, filler: np.ndarray, *, padding_config) -> np.ndarray:
     """Put a number before, behind and between the entries, or cut them off."""
-    for axis, (before, behind, between) in enumerate(padding_config):
+    for axis, (before, behind, gaps) in enumerate(padding_config):
         x = np.moveaxis(x, axis, 0)
         start = max(before, 0)
-        stop = start + max(len(x) + (len(x) - 1) * between, 0)
+        stop = start + max(len(x) + (len(x) - 1) * gaps, 0)
         size = stop + max(behind, 0)
-        padded = np.full((size, *x.shape[1:]), filler, x.dtype)
-        padded[start : stop : between + 1] = x
+        result = np.full((size, *x.shape[1:]), filler, x.dtype)
+        result[start : stop : gaps + 1] = x
         first = max(-before, 0)
         end = size - max(-behind, 0)
-        x = np.moveaxis(padded[first:end], 0, axis)
+        x = np.moveaxis(result[first:end], 0, axis)
     return x
 
 
@@ -153,13 +153,13 @@ def _move_by_index(
         labels[k] = np.arange(start, start + x.size, dtype=float).reshape(x.shape)
         start += x.size
     # JAX moves the labels; the entries follow them.
-    (moved,) = _on_numbers(equation, *labels)
-    if not ((moved >= 0) & (moved < start)).all():
+    (positions,) = _on_numbers(equation, *labels)
+    if not ((positions >= 0) & (positions < start)).all():
         raise InputError(
             f"`trace` met an index outside of its array in `{equation.primitive}`: "
             "correct it."
         )
-    return np.concatenate(entries)[moved.astype(int)]
+    return np.concatenate(entries)[positions.astype(int)]
 
 
 def _scatter_add(equation: JaxprEqn, operands: list[np.ndarray]) -> np.ndarray:

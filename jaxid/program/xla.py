@@ -120,8 +120,8 @@ class Lowered(eqx.Module):
         dtype = jnp.result_type(*arrays, float)
         _, batch = self.entries(*arrays)
         rows = [jnp.broadcast_to(jnp.asarray(x, dtype), batch) for x in self(*arrays)]
-        packed = jnp.stack(rows) if rows else jnp.zeros((0, *batch), dtype)
-        return self.program.unpack(packed)
+        results = jnp.stack(rows) if rows else jnp.zeros((0, *batch), dtype)
+        return self.program.unpack(results)
 
     def run(
         self, entries: Entries, operations: dict[Operation, Callable]
@@ -172,8 +172,8 @@ class Lowered(eqx.Module):
         if not angles:
             return {}
         places = [nodes[angle].place for angle in angles]
-        stacked = jnp.stack([entries[number][entry] for number, entry in places])
-        sines, cosines = _circular(stacked, one)
+        inputs = jnp.stack([entries[number][entry] for number, entry in places])
+        sines, cosines = _circular(inputs, one)
         return {angle: (sines[k], cosines[k]) for k, angle in enumerate(angles)}
 
 

@@ -175,8 +175,8 @@ class Presliding(AbstractTransition):
             s_before = s[:-reach]
             memory_before = memory[:-reach]
             s = xp.concatenate([s[:reach], s[reach:] + memory[reach:] * s_before])
-            joined = memory[reach:] * memory_before
-            memory = xp.concatenate([memory[:reach], joined])
+            product = memory[reach:] * memory_before
+            memory = xp.concatenate([memory[:reach], product])
             reach *= 2
         return xp.moveaxis(s, 0, -2)
 

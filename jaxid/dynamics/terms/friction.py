@@ -236,9 +236,11 @@ class LoadFriction(AbstractDryFriction):
 
     def columns(self, robot, q, qd, qdd):
         """Return the diagonal matrix of loads with the signs of the speeds."""
-        rest = jnp.zeros_like(q)
+        standstill = jnp.zeros_like(q)
         bodies = jnp.asarray(self._bodies(robot), q.dtype)
-        load = projection_equation.rigid_body_forces(robot, bodies, q, rest, rest)
+        load = projection_equation.rigid_body_forces(
+            robot, bodies, q, standstill, standstill
+        )
         return jnp.diag(jnp.abs(load) * self.transition(qd))
 
 

@@ -119,8 +119,10 @@ class AbstractTerm(eqx.Module):
         self, robot: Robot, p: Float[AnyArray, " columns"], q: Joints
     ) -> Float[AnyArray, "joints joints"]:
         """Return the factor of the accelerations in these forces (Eq. 38)."""
-        rest = jnp.zeros_like(q)
-        return jax.jacfwd(lambda qdd: self.forces(robot, p, q, rest, qdd))(rest)
+        standstill = jnp.zeros_like(q)
+        return jax.jacfwd(lambda qdd: self.forces(robot, p, q, standstill, qdd))(
+            standstill
+        )
 
     def mass_and_bias(
         self, robot: Robot, p: Float[AnyArray, " columns"], q: Joints, qd: Joints
