@@ -55,25 +55,24 @@ def tables(study: Study) -> list[Table]:
 
 def remarks(study: Study) -> list[Remark]:
     """Return the findings of the paper, as far as they come out here."""
-    worst, true = (
-        [max(m.mean_errors(k)) for k in (0, 1)] for m in (study.weighted, study.true)
-    )
-    plain, weighted = (m.mean_errors(0)[-1] for m in (study.unweighted, study.weighted))
+    identification = max(study.weighted.mean_errors(0))
+    verification = max(study.weighted.mean_errors(1))
+    last_axis = study.unweighted.mean_errors(0)[-1]
+    last_axis_weighted = study.weighted.mean_errors(0)[-1]
     return [
         Remark(
             "The identified model predicts the torques of every axis to "
-            f"{worst[0]:.2g} % of the "
-            f"largest torque, and to {worst[1]:.2g} % on an unseen path.",
-            Status.GOOD if max(worst) < 1.0 else Status.DOUBTFUL,
-            "Mean error of the worst axis; below 1 % in the paper. The true "
-            "parameters leave "
-            f"{true[0]:.2g} % and {true[1]:.2g} %.",
+            f"{identification:.2g} % of the largest torque, and to {verification:.2g} % "
+            "on an unseen path.",
+            Status.GOOD if max(identification, verification) < 1.0 else Status.DOUBTFUL,
+            "Mean error of the worst axis; below 1 % in the paper. The true parameters "
+            f"leave {max(study.true.mean_errors(0)):.2g} % and "
+            f"{max(study.true.mean_errors(1)):.2g} %.",
         ),
         Remark(
-            f"Without weights the last axis errs by {plain:.2g} %, with weights by "
-            f"{weighted:.2g} "
-            "% of its largest torque.",
-            Status.GOOD if weighted < plain else Status.BAD,
+            f"Without weights the last axis errs by {last_axis:.2g} %, with weights by "
+            f"{last_axis_weighted:.2g} % of its largest torque.",
+            Status.GOOD if last_axis_weighted < last_axis else Status.BAD,
         ),
     ]
 
@@ -81,21 +80,19 @@ def remarks(study: Study) -> list[Remark]:
 def paper_table(study: Study) -> Table:
     """Return the statements of the paper beside the results of the demo."""
     base = study.base
+    expressions = base.expressions
     speed, acceleration = study.tip_maxima
-    worst = [significant(max(study.weighted.mean_errors(k)), 2) for k in (0, 1)]
-    definite = [str(m.validation.definiteness) for m in study.models]
-    moving = significant(max(study.moving_errors(study.weighted, 1)), 2)
-    true = significant(max(study.true.mean_errors(1)), 2)
+    definite = [str(model.validation.definiteness) for model in study.models]
     lengths = ", ".join(f"{name} = {base.lengths[name]:g}" for name in ("l2x", "l3z"))
+
+    def worst(errors: list[float]) -> str:
+        return significant(max(errors), 2)
+
     rows = [
         ("parameters, all of them", "70", str(base.model.size)),
         ("base parameters", "44", str(base.size)),
-        ("p_B(1) (Eq. 24)", "m1 + m2 + m3 - m4 rc4z / l3z + I1", base.expressions[0]),
-        (
-            "p_B(2) (Eq. 24)",
-            "m2 rc2x + l2x m3 - l2x m4 rc4z / l3z",
-            base.expressions[1],
-        ),
+        ("p_B(1) (Eq. 24)", "m1 + m2 + m3 - m4 rc4z / l3z + I1", expressions[0]),
+        ("p_B(2) (Eq. 24)", "m2 rc2x + l2x m3 - l2x m4 rc4z / l3z", expressions[1]),
         ("lengths in it [m]", "l2x, l3z", lengths),
         ("speed of the end-effector, up to [m/s]", "2.7", significant(speed)),
         (
@@ -103,10 +100,26 @@ def paper_table(study: Study) -> Table:
             "11.3",
             significant(acceleration),
         ),
-        ("mean error, worst axis, identification [%]", "below 1", worst[0]),
-        ("mean error, worst axis, verification [%]", "below 1", worst[1]),
-        ("the same while the axis moves [%]", MISSING, moving),
-        ("verification, by the true parameters [%]", MISSING, true),
+        (
+            "mean error, worst axis, identification [%]",
+            "below 1",
+            worst(study.weighted.mean_errors(0)),
+        ),
+        (
+            "mean error, worst axis, verification [%]",
+            "below 1",
+            worst(study.weighted.mean_errors(1)),
+        ),
+        (
+            "the same while the axis moves [%]",
+            MISSING,
+            worst(study.moving_errors(study.weighted, 1)),
+        ),
+        (
+            "verification, by the true parameters [%]",
+            MISSING,
+            worst(study.true.mean_errors(1)),
+        ),
         ("mass matrix without weights", "not positive definite", definite[0]),
         ("mass matrix with weights", "positive definite", definite[1]),
         ("mass matrix, consistent bodies", "not done", definite[2]),
@@ -116,14 +129,18 @@ def paper_table(study: Study) -> Table:
             ("cold", COLD, study.weighted.fit),
             ("warm", WARM, study.warm),
         ):
-            own = (fit.parameters[k - 1], fit.standard_deviations[k - 1])
-            name = f"p_B({k}), {state} [{base.units[k - 1]}]"
-            rows.append(
-                (name, f"{paper[k]:.2f}", " ± ".join(with_deviation(*map(float, own))))
+            estimate, deviation = with_deviation(
+                float(fit.parameters[k - 1]), float(fit.standard_deviations[k - 1])
             )
-    title = f"the paper, and the results on the virtual {base.model.robot.name}"
-    names = ("quantity", "paper", "here")
-    return Table(title, *map(Column, names, zip(*rows, strict=True)))
+            name = f"p_B({k}), {state} [{base.units[k - 1]}]"
+            rows.append((name, f"{paper[k]:.2f}", f"{estimate} ± {deviation}"))
+    quantities, statements, results = zip(*rows, strict=True)
+    return Table(
+        f"the paper, and the results on the virtual {base.model.robot.name}",
+        Column("quantity", quantities),
+        Column("paper", statements),
+        Column("here", results),
+    )
 
 
 def error_table(study: Study, recording: int) -> Table:
@@ -155,16 +172,8 @@ def demo_page(study: Study) -> str:
         "assumed: the other parameters of bodies, rotors and friction, and all "
         "disturbances",
     )
-    warming = (
-        "Inertial parameters stay, friction falls as the lubricant warms. A parameter "
-        "has changed "
-        "if its difference is more than chance."
-    )
-    every, changes = (
-        "All base parameters, cold and warm",
-        jid.plot.comparison(study.temperature),
-    )
-    used = ", ".join(f"{name} {number}" for name, number in versions().items())
+    sentences = [Remark(note[0].upper() + note[1:]) for note in notes]
+    software = ", ".join(f"{name} {number}" for name, number in versions().items())
     return render_page(
         "The paper, end to end",
         [
@@ -172,42 +181,45 @@ def demo_page(study: Study) -> str:
             _excitation(study),
             _identification(study),
             _verification(study),
-            (
-                "Cold and warm",
-                [warming, study.temperature.group_summary(), folded(every, changes)],
-            ),
-            (
-                "The robot, and assumptions",
-                [[Remark(n[0].upper() + n[1:]) for n in notes]],
-            ),
+            ("Cold and warm", _temperature(study)),
+            ("The robot, and assumptions", [sentences]),
         ],
         "A persistent method for parameter identification of a seven-axes "
-        "manipulator, repeated "
-        "on a virtual Stäubli TX90L on its rail, with the paper's numbers beside the "
-        "results.",
-        f"`jaxid demo --seed {study.seed}`; {used}",
+        "manipulator, repeated on a virtual Stäubli TX90L on its rail, with the "
+        "paper's numbers beside the results.",
+        f"`jaxid demo --seed {study.seed}`; {software}",
     )
 
 
+def _temperature(study: Study) -> list[Any]:
+    """Return what has changed as the robot became warm."""
+    comparison = study.temperature
+    return [
+        "Inertial parameters stay, friction falls as the lubricant warms. A parameter "
+        "has changed if its difference is more than chance.",
+        comparison.group_summary(),
+        folded("All base parameters, cold and warm", jid.plot.comparison(comparison)),
+    ]
+
+
 def _excitation(study: Study) -> Section:
-    base, series = study.base, study.played.inner
-    robot, (speed, acceleration) = base.model.robot, study.tip_maxima
+    base = study.base
+    robot = base.model.robot
+    series = study.played.inner
     times = np.linspace(0.0, float(series.duration), POINTS)
     motion = series.motion(times)
+    speed, acceleration = study.tip_maxima
     return "Base parameters, and the motion that excites them", [
         f"Of {base.model.size} columns the QR decomposition without pivoting leaves "
-        f"{base.size}; "
-        "the first two are those of Eq. 24.",
+        f"{base.size}; the first two are those of Eq. 24.",
         folded(
             f"All {base.size} base parameters, weighted",
             parameter_table(study.weighted.fit),
         ),
         f"The motion is a Fourier series of {settings.HARMONICS} harmonics at "
-        f"{settings.OMEGA:g} "
-        "rad/s within all limits and clear of collisions. As in the paper, it has the "
-        "least "
-        "condition number; the D-optimal one beside it makes the parameters most "
-        "certain.",
+        f"{settings.OMEGA:g} rad/s within all limits and clear of collisions. As in "
+        "the paper, it has the least condition number; the D-optimal one beside it "
+        "makes the parameters most certain.",
         *([side_by_side_table(study.plans)] if study.plans else []),
         picture(
             _speed_scene(robot, times, motion),
@@ -223,30 +235,26 @@ def _excitation(study: Study) -> Section:
 
 
 def _identification(study: Study) -> Section:
-    robot, observations = study.base.model.robot, study.observations[0]
-    begin, end = (float(t) for t in study.played.window)
-    time = np.asarray(observations.time)
-    shown = np.flatnonzero((time >= begin) & (time <= end))[
-        :: max(1, len(time) // (2 * POINTS))
-    ]
-    desired, filtered = study.played.motion(time[shown]), observations.motion[shown]
-    plain, weighted = (
-        m.validation.errors[0] for m in (study.unweighted, study.weighted)
-    )
+    robot = study.base.model.robot
+    log = study.observations[0]
+    time = np.asarray(log.time)
+    begin, end = study.played.window
+    step = max(1, len(time) // (2 * POINTS))
+    shown = np.flatnonzero((time >= begin) & (time <= end))[::step]
+    desired = study.played.motion(time[shown])
+    unweighted = study.unweighted.validation.errors[0]
+    weighted = study.weighted.validation.errors[0]
     return "Identification with and without weights", [
         "Cold and warm, the servo follows the motion at 1000 Hz. Logs hold angles of "
-        "17-bit "
-        "encoders and torques with 1 % of noise, ripple, stiction and Stribeck "
-        "friction. "
-        f"Filter (Eq. 25): {observations.filter}; {observations.rows} rows of each "
-        "joint.",
+        "17-bit encoders and torques with 1 % of noise, ripple, stiction and Stribeck "
+        f"friction. Filter (Eq. 25): {log.filter}; {log.rows} rows of each joint.",
         picture(
-            jid.plot.filtered(robot, time[shown], desired, filtered, 2),
+            jid.plot.filtered(robot, time[shown], desired, log.motion[shown], 2),
             "Fig. 5: desired velocity and acceleration, and those of the filtered "
             "angles.",
         ),
         picture(
-            jid.plot.torques(plain, robot, "identified without weights", SHOWN),
+            jid.plot.torques(unweighted, robot, "identified without weights", SHOWN),
             "Fig. 6: torques of the axes 1, 3, 5 and 7, and their prediction without "
             "weights.",
         ),
@@ -258,47 +266,46 @@ def _identification(study: Study) -> Section:
 
 
 def _verification(study: Study) -> Section:
-    robot, path = study.base.model.robot, study.joint_path
+    robot = study.base.model.robot
+    path = study.joint_path
     times = np.linspace(0.0, float(path.duration), 5 * POINTS)
-    motion = path.motion(times)
-    first, second = study.weighted.validation.errors
+    identification, verification = study.weighted.validation.errors
     return "Verification on another path", [
         f"The path after ISO 9283 in a cube of {settings.EDGE:g} m, with rests at its "
-        "corners, up "
-        f"to {settings.SPEED:g} m/s and {settings.ACCELERATION:g} m/s². Of the "
-        "redundant joint "
-        "angles the nearest to a posture are taken.",
+        f"corners, up to {settings.SPEED:g} m/s and {settings.ACCELERATION:g} m/s². Of "
+        "the redundant joint angles the nearest to a posture are taken.",
         picture(
-            _speed_scene(robot, times, motion), "Fig. 8: path of the end-effector."
+            _speed_scene(robot, times, path.motion(times)),
+            "Fig. 8: path of the end-effector.",
         ),
         picture(
-            jid.plot.torques(second, robot, "verification", SHOWN),
+            jid.plot.torques(verification, robot, "verification", SHOWN),
             "Fig. 9: torques of the axes 1, 3, 5 and 7 on the verification path.",
         ),
         picture(
-            jid.plot.errors([first], [second], robot),
+            jid.plot.errors([identification], [verification], robot),
             "Fig. 10: mean errors on both paths.",
         ),
         (error_table(study, 0), error_table(study, 1)),
         f"“Moving”: rows of each axis above {settings.AT_REST:g} rad/s or m/s. The "
-        "torque of an "
-        "axis at rest may be anything up to stiction, which no model of speeds "
-        "predicts.",
+        "torque of an axis at rest may be anything up to stiction, which no model of "
+        "speeds predicts.",
     ]
 
 
 def _speed_scene(robot: jid.Robot, times: np.ndarray, motion: jid.Motion) -> Any:
     """Return the robot along a motion, coloured by the speeds of its joints."""
-    used = 100.0 * np.abs(np.asarray(motion.qd)) / np.asarray(robot.limits.velocity)
+    percents = 100.0 * np.abs(np.asarray(motion.qd)) / np.asarray(robot.limits.velocity)
     label = "speed [% of the limit]"
-    return jid.plot.poses(robot, motion.q, time=times, values=used, label=label)
+    return jid.plot.poses(robot, motion.q, time=times, values=percents, label=label)
 
 
 def _record(study: Study) -> dict[str, Any]:
     """Return the results of the demo for `demo.json`, in rad, m, s, N and N m."""
-    base, fits = study.base, (study.weighted.fit, study.warm)
+    base = study.base
     speed, acceleration = study.tip_maxima
-    criteria = [{c.name: c.after for c in plan.criteria} for plan in study.plans]
+    cold = study.weighted.fit.parameters
+    warm = study.warm.parameters
     return {
         "schema": SCHEMAS["demo.json"],
         "versions": versions(),
@@ -309,10 +316,7 @@ def _record(study: Study) -> dict[str, Any]:
             "truth": study.truth,
         },
         "excitation": {
-            "designs": [
-                {"criterion": plan.criterion.name, "criteria": own}
-                for plan, own in zip(study.plans, criteria, strict=True)
-            ],
+            "designs": [_design_record(plan) for plan in study.plans],
             "tip_speed": speed,
             "tip_acceleration": acceleration,
         },
@@ -331,8 +335,13 @@ def _record(study: Study) -> dict[str, Any]:
             {
                 "number": k,
                 "paper": [COLD[k], WARM[k]],
-                "estimates": [fit.parameters[k - 1] for fit in fits],
+                "estimates": [cold[k - 1], warm[k - 1]],
             }
             for k in COLD
         ],
     }
+
+
+def _design_record(plan: jid.ExcitationPlan) -> dict[str, Any]:
+    values = {criterion.name: criterion.after for criterion in plan.criteria}
+    return {"criterion": plan.criterion.name, "criteria": values}

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -14,14 +14,30 @@ from jaxid.excitation.design import DesignProgress
 from jaxid.identification.parameter_changes import Comparison
 from jaxid.validation.torque_errors import Validation
 
-HARMONICS, OMEGA, SAMPLES = 5, 0.8, 800
-"""Fourier series of the paper: order, fundamental frequency [rad/s], samples of a period."""
-SAMPLE_TIME, STEP = 1e-3, 20
-"""Sample time of servo and log [s] (not published), and samples for each row."""
-CUBE, EDGE = (0.3, 0.5, 0.8), 0.6
-"""Centre and edge of the cube of the verification path [m]."""
-SPEED, ACCELERATION = 1.05, 4.0
-"""Limits of the end-effector along that path [m/s, m/s²]: nearly all that the joints can do."""
+HARMONICS = 5
+"""Order of the Fourier series of the paper."""
+OMEGA = 0.8
+"""Its fundamental frequency [rad/s]."""
+SAMPLES = 800
+"""Samples of a period at which limits are checked."""
+SAMPLE_TIME = 1e-3
+"""Sample time of servo and log [s] (not published)."""
+STEP = 20
+"""Samples of the log for each row."""
+CENTRE = (0.3, 0.5, 0.8)
+"""Centre of the cube of the verification path [m]."""
+EDGE = 0.6
+"""Edge of this cube [m]."""
+SPEED = 1.05
+"""Limit of the end-effector along that path [m/s], nearly all that the joints can do."""
+ACCELERATION = 4.0
+"""Limit of its acceleration [m/s²]."""
+TOOL = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
+"""Orientation of the tool on that path: it points along the rail (Fig. 8)."""
+POSTURE = (0.0, 1.57, -0.3, 1.8, 0.0, 0.0, 0.0)
+"""Joint angles to which the redundant robot stays near on that path [m, rad]."""
+SHOULDER = 2
+"""Index of the joint whose drive cannot hold and move the arm within all its limits."""
 AT_REST = 0.02
 """Speed below which a joint counts as resting, twice the width of the model's dry friction
 [rad/s or m/s]."""
@@ -71,8 +87,10 @@ class Study(NamedTuple):
     def moving_errors(self, model: Model, recording: int) -> list[float]:
         """Return the mean errors of all axes while they move [% of the largest torque]."""
         errors = model.validation.errors[recording]
-        moving = np.abs(self.observations[2 * recording].reduced_motion.qd) > AT_REST
-        sums = np.where(moving, np.abs(np.asarray(errors.errors)), 0.0).sum(axis=0)
+        # The observations of the warm robot lie between the two recordings.
+        speeds = np.abs(self.observations[2 * recording].reduced_motion.qd)
+        moving = speeds > AT_REST
+        sums = np.where(moving, np.abs(errors.errors), 0.0).sum(axis=0)
         mean = sums / np.maximum(moving.sum(axis=0), 1)
         return [float(x) for x in 100.0 * mean / np.asarray(errors.max_forces)]
 
@@ -98,9 +116,10 @@ def run_study(
     """Repeat the experiments of the paper."""
     progress("finding base parameters", 0.0)
     cold = jid.simulation.virtual_tx90l_on_rail()
-    hot = jid.simulation.virtual_tx90l_on_rail(warm=True)
-    robot, base = cold.robot, jid.base_parameters(cold.model)
-    _ = base.expressions
+    warm = jid.simulation.virtual_tx90l_on_rail(warm=True)
+    robot = cold.robot
+    base = jid.base_parameters(cold.model)
+    _ = base.expressions  # computed here, in the stage that says so
     plans: tuple[jid.ExcitationPlan, ...] = ()
     if motion is None:
         plans = _design(base, seed, progress)
@@ -109,45 +128,55 @@ def run_study(
     progress("adding the leads", 0.0)
     played = jid.trajectories.with_leads(motion, robot, periods=periods)
     progress("inverse kinematics of the verification path", 0.0)
-    forward = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
-    path = jid.trajectories.iso9283_path(  # the tool points along the rail (Fig. 8)
-        CUBE, EDGE, forward, leans_along=1, speed=SPEED, acceleration=ACCELERATION
+    tip_path = jid.trajectories.iso9283_path(
+        CENTRE, EDGE, TOOL, leans_along=1, speed=SPEED, acceleration=ACCELERATION
     )
-    joints = jid.trajectories.joint_path(
-        robot, path, posture=(0.0, 1.57, -0.3, 1.8, 0.0, 0.0, 0.0)
-    )
+    joint_path = jid.trajectories.joint_path(robot, tip_path, posture=POSTURE)
+
     observations = []
     for virtual, trajectory, name in (
         (cold, played, "identification, cold"),
-        (hot, played, "identification, warm"),
-        (cold, joints, "verification"),
+        (warm, played, "identification, warm"),
+        (cold, joint_path, "verification"),
     ):
         progress(f"measuring: {name}", 0.0)
         number = 10 * seed + len(observations)
         run = virtual.track(trajectory, sample_time=SAMPLE_TIME, seed=number, name=name)
-        rows = jid.Subsample(STEP)
-        log = jid.observe(run.recording, robot, jid.filters.PaperFilter(), rows)
+        log = jid.observe(
+            run.recording, robot, jid.filters.PaperFilter(), jid.Subsample(STEP)
+        )
         observations.append(log)
+    cold_log, warm_log, verification_log = observations
+
     progress("identifying", 0.0)
-    rows = jid.RegressionProblem(base, [observations[0]])
+    rows = jid.RegressionProblem(base, [cold_log])
     truth = np.asarray(base.from_standard(cold.parameters))
+    weighted_fit = jid.identify(base, rows, jid.WeightedLeastSquares())
+    warm_fit = jid.identify(base, warm_log, jid.WeightedLeastSquares())
     fits = {
         "without weights": jid.identify(base, rows, jid.estimators.LeastSquares()),
-        "weighted": jid.identify(base, rows, jid.WeightedLeastSquares()),
+        "weighted": weighted_fit,
         "consistent": jid.identify(base, rows, jid.PhysicallyConsistent()),
+        "true parameters": eqx.tree_at(lambda fit: fit.parameters, weighted_fit, truth),
     }
-    fits["true parameters"] = eqx.tree_at(
-        lambda f: f.parameters, fits["weighted"], truth
-    )
     progress("predicting torques", 0.0)
-    recordings = [observations[0], observations[2]]
     models = [
-        Model(name, fit, jid.validate(fit, recordings)) for name, fit in fits.items()
+        Model(name, fit, jid.validate(fit, [cold_log, verification_log]))
+        for name, fit in fits.items()
     ]
     progress("comparing cold and warm", 0.0)
-    warm = jid.identify(base, observations[1], jid.WeightedLeastSquares())
-    found: Any = (*models, warm, jid.compare(fits["weighted"], warm))
-    return Study(seed, base, truth, plans, played, joints, tuple(observations), *found)
+    return Study(
+        seed,
+        base,
+        truth,
+        plans,
+        played,
+        joint_path,
+        tuple(observations),
+        *models,
+        warm=warm_fit,
+        temperature=jid.compare(weighted_fit, warm_fit),
+    )
 
 
 def _design(
@@ -155,25 +184,29 @@ def _design(
 ) -> tuple[jid.ExcitationPlan, ...]:
     """Return a motion with the least condition number, and a D-optimal one (Eq. 36)."""
     limits = base.model.robot.limits
-    low, high, most = (
-        np.array(x)
-        for x in (limits.position_min, limits.position_max, limits.acceleration)
-    )
-    # The drive of the shoulder could not hold and move the arm in all that its limits
-    # allow.
-    low[2], high[2], most[2] = -0.4, 0.4, 3.0
+    position_min = np.array(limits.position_min)
+    position_max = np.array(limits.position_max)
+    acceleration = np.array(limits.acceleration)
+    position_min[SHOULDER] = -0.4
+    position_max[SHOULDER] = 0.4
+    acceleration[SHOULDER] = 3.0
     limits = dataclasses.replace(
-        limits, position_min=low, position_max=high, acceleration=most
+        limits,
+        position_min=position_min,
+        position_max=position_max,
+        acceleration=acceleration,
     )
 
-    name, done = "designing two motions", {}
-    progress(name, 0.0)
+    stage = "designing two motions"
+    progress(stage, 0.0)
+    fractions: dict[str, float] = {}
 
     def design(criterion: jid.criteria.AbstractCriterion) -> jid.ExcitationPlan:
-        def report(now: DesignProgress) -> None:
-            done[criterion.name] = now.fraction
-            if any(done.values()):  # zero would begin the stage anew
-                progress(name, sum(done.values()) / 2)
+        def report(search: DesignProgress) -> None:
+            fractions[criterion.name] = search.fraction
+            total = sum(fractions.values())
+            if total > 0.0:  # zero would begin the stage anew
+                progress(stage, total / 2)
 
         return jid.design_excitation(
             base,
@@ -192,6 +225,5 @@ def _design(
         )
 
     # Most of the time is that of the compiler, which works on one core at a time.
-    return tuple(
-        on_cores(design, (jid.criteria.ConditionNumber(), jid.criteria.DOptimal()))
-    )
+    criteria = (jid.criteria.ConditionNumber(), jid.criteria.DOptimal())
+    return tuple(on_cores(design, criteria))
