@@ -1,7 +1,7 @@
 """Report of an identification without torques: measured and simulated motion, and its numbers."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,10 +21,12 @@ from .figure import Figure
 from .figure_elements import ERROR, GREY, MEASURED, PREDICTED, Curve, Panel
 from .page import Section, provenance, render_page
 from .result_files import write_csv, write_json
-from .result_records import header, plain
+from .result_records import header
 
-SHOWN = 6
+MAX_FIGURES = 6
 """Motions whose figures the page shows."""
+MAX_RATIO = 0.9
+"""Error of a good simulation, relative to those of the baselines."""
 
 
 class RolloutReport(NamedTuple):
@@ -50,50 +52,87 @@ class RolloutReport(NamedTuple):
     @property
     def verdict(self) -> Remark:
         """Whether the simulation is closer to the robot than a linear joint."""
-        return rollout_verdict(self.errors)
+        simulation = self.errors.total()
+        linear = self.errors.total("linear")
+        worse_joints = [
+            name
+            for name, error, linear_error in zip(
+                self.errors.joint_names, simulation, linear, strict=True
+            )
+            if error >= linear_error
+        ]
+        text = "The simulation moves more like the robot than a linear joint does"
+        status = Status.GOOD
+        if worse_joints:
+            joints = ", ".join(worse_joints)
+            text = f"The simulation is no better than a linear joint ({joints})"
+            status = Status.DOUBTFUL
+        sizes = f"{in_milli(simulation)} instead of {in_milli(linear)} mrad or mm"
+        return Remark(f"{text}: errors of {sizes}", status)
 
     @property
     def has_stiffness(self) -> bool:
         """Whether simulators can be given absolute numbers."""
         return bool(np.isfinite(self.fit.stiffness).any())
 
-    def write(self, folder: Path) -> list[Path]:
-        """Write the page, `rollout.json`, `rollout.csv`, and MJCF if bodies are known."""
-        return write_rollout(folder, self)
-
     def tables(self) -> list[Table]:
         """Return estimates, errors beside the baselines and by motion, numbers for simulators."""
-        found = [self.fit.summary(), comparison_table(self), self.errors.summary()]
-        return [*found, simulator_table(self.fit)] if self.has_stiffness else found
+        tables = [self.fit.summary(), comparison_table(self), self.errors.summary()]
+        return [*tables, simulator_table(self.fit)] if self.has_stiffness else tables
+
+    def write(self, folder: Path) -> list[Path]:
+        """Write the page, `rollout.json`, `rollout.csv`, and MJCF if bodies are known."""
+        fit = self.fit
+        page = rollout_page(self)
+        rows = _estimate_rows(fit)
+        names = ["rollout.html", "rollout.json", "rollout.csv"]
+        with atomic_folder(folder) as staging:
+            if self.has_stiffness and fit.bodies is not None:
+                path = staging / "robot.xml"
+                models = export_servo_mjcf(fit, path, samples=self.samples)
+                names += [model.name for model in models]
+            record = {**_record(self, rows), "files": names}
+            write_json(staging / "rollout.json", record)
+            write_csv(staging / "rollout.csv", rows)
+            (staging / "rollout.html").write_text(page, encoding="utf-8")
+        return [folder / name for name in names]
+
+
+def in_milli(errors: np.ndarray) -> str:
+    """Return errors in thousandths of their unit."""
+    return ", ".join(significant(1e3 * float(error)) for error in errors)
 
 
 def comparison_table(report: RolloutReport) -> Table:
     """Return the errors of the simulation beside those of the baselines."""
-    errors, kinds = report.errors, ("simulated", "linear", "command")
-    free = [1e3 * errors.total(kind) for kind in kinds]
-    worse = free[0] > 0.9 * np.minimum(free[1], free[2])
-    where = "logs that the fit has not seen" if report.unseen else "the logs of the fit"
+    errors = report.errors
+    simulation = 1e3 * errors.total("simulated")
+    linear = 1e3 * errors.total("linear")
+    command = 1e3 * errors.total("command")
+    is_doubtful = simulation > MAX_RATIO * np.minimum(linear, command)
+    logs = "logs that the fit has not seen" if report.unseen else "the logs of the fit"
     return Table(
-        f"errors of {where} [mrad or mm]",
+        f"errors of {logs} [mrad or mm]",
         Column("joint", errors.joint_names),
-        Column("simulation,\nfree-running", free[0]),
+        Column("simulation,\nfree-running", simulation),
         Column("simulation,\nwindows of 1 s", 1e3 * report.windows),
-        Column("linear joint\nwith delay", free[1]),
-        Column("copied\ncommand", free[2]),
-        status=[Status.DOUBTFUL if x else Status.GOOD for x in worse],
+        Column("linear joint\nwith delay", linear),
+        Column("copied\ncommand", command),
+        status=[Status.DOUBTFUL if doubt else Status.GOOD for doubt in is_doubtful],
     )
 
 
 def motion_figure(errors: RolloutErrors, motion: int) -> Figure:
     """Return measured and simulated positions of all joints in one motion, and the errors."""
-    time, panels = np.asarray(errors.time[motion]), []
-    kinds = (errors.command, errors.measured, errors.simulated, errors.counted)
-    channels = [np.asarray(x[motion]) for x in kinds]
-    for name, command, measured, simulated, counted in zip(
-        errors.joint_names, *channels, strict=True
-    ):
+    time = np.asarray(errors.time[motion])
+    panels = []
+    for j, name in enumerate(errors.joint_names):
+        command = np.asarray(errors.command[motion])[j]
+        measured = np.asarray(errors.measured[motion])[j]
+        simulated = np.asarray(errors.simulated[motion])[j]
+        counted = np.asarray(errors.counted[motion])[j] > 0
+        panel = motion_panel(name, time, measured, simulated, counted)
         commanded = Curve(time, command, "commanded", GREY, width=0.6)
-        panel = motion_panel(name, time, measured, simulated, counted > 0)
         panels.append(dataclasses.replace(panel, curves=[commanded, *panel.curves]))
     title = f"{errors.motions[motion]}: measured and simulated, free-running"
     return Figure(title, panels, columns=2, height=3.6)
@@ -107,131 +146,105 @@ def motion_panel(
     counted: np.ndarray,
 ) -> Panel:
     """Return measured and simulated positions of a joint, and the errors of what counts below."""
-    wrong = 1e3 * (simulated - measured)
-    rms = np.sqrt(np.mean(wrong[counted] ** 2)) if counted.any() else np.nan
-    error = Curve(time, wrong, "error", ERROR, width=0.7)
-    curves = [
-        Curve(time, measured, "measured", MEASURED, width=1.9),
-        Curve(time, simulated, "simulated", PREDICTED, width=0.9),
-    ]
-    below = [Panel([error], y="error", unit="mrad or mm", share=0.6)]
-    said = f"RMS {significant(float(rms))} mrad or mm"
-    return Panel(curves, name, said, y="position", unit="rad or m", below=below)
-
-
-def rollout_verdict(errors: RolloutErrors) -> Remark:
-    """Return in words whether the simulation is closer to the robot than a linear joint."""
-    total, linear = errors.total(), errors.total("linear")
-    worse = [
-        n for n, x, y in zip(errors.joint_names, total, linear, strict=True) if x >= y
-    ]
-    text = "The simulation moves more like the robot than a linear joint does"
-    if worse:
-        text = f"The simulation is no better than a linear joint ({', '.join(worse)})"
-    sizes = (
-        ", ".join(significant(1e3 * x) for x in values) for values in (total, linear)
-    )
-    return Remark(
-        f"{text}: errors of {' instead of '.join(sizes)} mrad or mm",
-        Status.DOUBTFUL if worse else Status.GOOD,
+    errors = 1e3 * (simulated - measured)
+    rms = np.nan
+    if counted.any():
+        rms = float(np.sqrt(np.mean(errors[counted] ** 2)))
+    error = Curve(time, errors, "error", ERROR, width=0.7)
+    return Panel(
+        [
+            Curve(time, measured, "measured", MEASURED, width=1.9),
+            Curve(time, simulated, "simulated", PREDICTED, width=0.9),
+        ],
+        title=name,
+        value=f"RMS {significant(rms)} mrad or mm",
+        y="position",
+        unit="rad or m",
+        below=[Panel([error], y="error", unit="mrad or mm", share=0.6)],
     )
 
 
-def rollout_page(report: RolloutReport, figures: Sequence[Figure]) -> str:
+def rollout_page(report: RolloutReport) -> str:
     """Return the page of an identification without torques as HTML."""
-    fit, errors = report.fit, report.errors
-    parameters = fit.summary()
-    simulators: list[Any] = [
-        "No weight tells a stiffness: name it by `rollout.stiffness`."
-    ]
+    errors = report.errors
+    motions = range(min(MAX_FIGURES, len(errors.motions)))
+    parameters = report.fit.summary()
+    simulators: Any = "No weight tells a stiffness: name it by `rollout.stiffness`."
     if report.has_stiffness:
-        simulators = [simulator_table(fit)]
+        simulators = simulator_table(report.fit)
+    table = Table(
+        "", *parameters.columns, facts=parameters.facts, status=parameters.status
+    )
+    text = (
+        "Positions tell torques only in units of the servo's stiffness. Parameters "
+        "that the logs tell only together are merged."
+    )
     sections: list[Section] = [
         ("Verdict", [report.verdict, parameters.remarks]),
         ("Errors", [comparison_table(report), errors.summary()]),
-        ("Measured and simulated motion", figures),
         (
-            "What the logs determine",
-            [
-                "Positions tell torques only in units of the servo's stiffness. "
-                "Parameters that "
-                "the logs tell only together are merged.",
-                Table(
-                    "",
-                    *parameters.columns,
-                    facts=parameters.facts,
-                    status=parameters.status,
-                ),
-            ],
+            "Measured and simulated motion",
+            [motion_figure(errors, motion) for motion in motions],
         ),
-        ("For simulators", simulators),
+        ("What the logs determine", [text, table]),
+        ("For simulators", [simulators]),
         provenance(report.settings),
     ]
     return render_page("Joints behind position servos", sections)
 
 
-def write_rollout(folder: Path, report: RolloutReport) -> list[Path]:
-    """Write the page, `rollout.json`, `rollout.csv`, and MJCF if bodies are known."""
-    fit, count = report.fit, min(SHOWN, len(report.errors.motions))
-    figures = [motion_figure(report.errors, k) for k in range(count)]
-    rows = [
-        {
-            "joint": fit.joint_names[c.joint],
-            "parameter": c.name,
-            "meaning": c.meaning,
-            "unit": c.unit,
-            "estimate": c.value,
-            "standard_deviation": c.deviation,
-            "low_95": c.interval()[0],
-            "high_95": c.interval()[1],
-        }
-        for c in fit.combinations
-    ]
-    names = ["rollout.html", "rollout.json", "rollout.csv"]
-    with atomic_folder(folder) as staging:
-        if report.has_stiffness and fit.bodies is not None:
-            made = export_servo_mjcf(fit, staging / "robot.xml", samples=report.samples)
-            names += [p.name for p in made]
-        write_json(staging / "rollout.json", {**_record(report, rows), "files": names})
-        write_csv(staging / "rollout.csv", rows)
-        page = rollout_page(report, figures)
-        (staging / "rollout.html").write_text(page, encoding="utf-8")
-    return [folder / name for name in names]
+def _estimate_rows(fit: ServoFit) -> list[dict[str, Any]]:
+    """Return the parameters that the logs determine, one row for each."""
+    rows = []
+    for combination in fit.combinations:
+        low, high = combination.interval()
+        rows.append(
+            {
+                "joint": fit.joint_names[combination.joint],
+                "parameter": combination.name,
+                "meaning": combination.meaning,
+                "unit": combination.unit,
+                "estimate": combination.value,
+                "standard_deviation": combination.deviation,
+                "low_95": low,
+                "high_95": high,
+            }
+        )
+    return rows
 
 
 def _record(report: RolloutReport, rows: list[dict[str, Any]]) -> dict[str, Any]:
     """Return the content of `rollout.json`."""
-    fit, errors = report.fit, report.errors
-    simulators = None
-    if report.has_stiffness:
-        values = simulator_values(fit)
-        limits = values.pop("effort_limit")
-        simulators = {
-            **values,
-            "effort_limit": np.where(np.isfinite(limits), limits, -1.0),
-        }
-    return plain(
-        {
-            **header("rollout.json"),
-            "kind": "commands",
-            "joints": fit.joint_names,
-            "combinations": rows,
-            "symbols": [x.symbol for x in PARAMETERS],
-            "parameters": fit.parameters,
-            "free": fit.free,
-            "covariance": fit.covariance,
-            "hold": fit.hold,
-            "errors": {
-                "motions": errors.motions,
-                "unseen": report.unseen,
-                **{
-                    kind: errors.rms(kind)
-                    for kind in ("simulated", "linear", "command")
-                },
-                "windows": report.windows,
-            },
-            "contacts": [c._asdict() for c in (*fit.contacts, *errors.contacts)],
-            "simulators": simulators,
-            "notes": fit.notes,
-        }
-    )
+    fit = report.fit
+    errors = report.errors
+    return {
+        **header("rollout.json"),
+        "kind": "commands",
+        "joints": fit.joint_names,
+        "combinations": rows,
+        "symbols": [parameter.symbol for parameter in PARAMETERS],
+        "parameters": fit.parameters,
+        "free": fit.free,
+        "covariance": fit.covariance,
+        "hold": fit.hold,
+        "errors": {
+            "motions": errors.motions,
+            "unseen": report.unseen,
+            "simulated": errors.rms("simulated"),
+            "linear": errors.rms("linear"),
+            "command": errors.rms("command"),
+            "windows": report.windows,
+        },
+        "contacts": [
+            contact._asdict() for contact in (*fit.contacts, *errors.contacts)
+        ],
+        "simulators": _simulator_record(fit) if report.has_stiffness else None,
+        "notes": fit.notes,
+    }
+
+
+def _simulator_record(fit: ServoFit) -> dict[str, Any]:
+    """Return the numbers for simulators; an effort limit that is not known is -1."""
+    values = simulator_values(fit)
+    limits = values["effort_limit"]
+    return {**values, "effort_limit": np.where(np.isfinite(limits), limits, -1.0)}

@@ -10,14 +10,14 @@ import numpy as np
 
 from jaxid.io import atomic_folder
 from jaxid.measurement.observations import Observations
-from jaxid.result_table import Column, Remark, Status, Table, significant
+from jaxid.result_table import Column, Remark, Status, Table
 from jaxid.rollout import TorqueRolloutFit
 
 from .figure import Figure
 from .page import Section, provenance, render_page
 from .result_files import estimate_rows, write_csv, write_json
-from .result_records import header, plain
-from .rollout import SHOWN, motion_panel
+from .result_records import header
+from .rollout import MAX_FIGURES, in_milli, motion_panel
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -56,7 +56,7 @@ class TorqueRolloutReport:
         return Remark(
             f"Simulations are {'closer' if is_closer else 'no closer'} to the robot "
             f"than with the fit of torques: errors after {self.fit.horizon:g} s of "
-            f"{_in_milli(rollouts)} instead of {_in_milli(torque_fit)} mrad or mm",
+            f"{in_milli(rollouts)} instead of {in_milli(torque_fit)} mrad or mm",
             Status.GOOD if is_closer else Status.DOUBTFUL,
         )
 
@@ -78,59 +78,62 @@ class TorqueRolloutReport:
 
     def write(self, folder: Path) -> list[Path]:
         """Write the page, `rollout.json` and `rollout.csv`."""
-        fit, free = self.fit, np.flatnonzero(self.fit.free)
-        names, units = (
-            [x[k] for k in free] for x in (fit.rollout.names, fit.rollout.units)
-        )
-        rows = estimate_rows((names, units, fit.unknowns[free], fit.uncertainty))
-        files = ["rollout.html", "rollout.json", "rollout.csv"]
+        fit = self.fit
         sections: list[Section] = [
             ("Verdict", [self.verdict, self.findings]),
             ("Errors", [self.error_table()]),
-            ("Measured and simulated motion", [*map(self._figure, self.logs[:SHOWN])]),
+            (
+                "Measured and simulated motion",
+                [self._figure(log) for log in self.logs[:MAX_FIGURES]],
+            ),
             ("Parameters", [fit.summary(), self.notes]),
             provenance(self.settings),
         ]
         page = render_page("Simulations under recorded torques", sections)
+        unknowns = np.flatnonzero(fit.free)
+        names = [fit.rollout.names[k] for k in unknowns]
+        units = [fit.rollout.units[k] for k in unknowns]
+        rows = estimate_rows((names, units, fit.unknowns[unknowns], fit.uncertainty))
+        files = ["rollout.html", "rollout.json", "rollout.csv"]
         with atomic_folder(folder) as staging:
             write_json(staging / "rollout.json", {**self._record(rows), "files": files})
             write_csv(staging / "rollout.csv", rows)
             (staging / "rollout.html").write_text(page, encoding="utf-8")
-        return [folder / name for name in files]
+        return [folder / file for file in files]
 
     def _record(self, rows: list[dict[str, Any]]) -> dict[str, Any]:
+        """Return the content of `rollout.json`."""
         fit = self.fit
         torque_fit, rollouts = self.errors
-        errors = {
-            "unseen": self.unseen,
-            "fit_of_torques": torque_fit,
-            "rollouts": rollouts,
-        }
-        content = {
+        return {
+            **header("rollout.json"),
             "kind": "torques",
             "joints": fit.joint_names,
             "horizon": fit.horizon,
             "parameters": rows,
             "covariance": fit.uncertainty.covariance,
             "rms": fit.rms,
-            "errors": errors,
+            "errors": {
+                "unseen": self.unseen,
+                "fit_of_torques": torque_fit,
+                "rollouts": rollouts,
+            },
             "notes": [remark.text for remark in (*self.findings, *self.notes)],
         }
-        return plain({**header("rollout.json"), **content})
 
     def _figure(self, log: Observations) -> Figure:
-        time, measured, simulated = self.fit.simulate(log)
+        """Return measured positions, and those simulated in windows."""
+        fit = self.fit
+        time, measured, simulated = fit.simulate(log)
         panels = [
-            motion_panel(name, time, q, simulated_q, np.isfinite(simulated_q))
-            for name, q, simulated_q in zip(
-                self.fit.joint_names, measured.T, simulated.T, strict=True
+            motion_panel(
+                name,
+                time,
+                measured[:, j],
+                simulated[:, j],
+                np.isfinite(simulated[:, j]),
             )
+            for j, name in enumerate(fit.joint_names)
         ]
-        horizon = f"{self.fit.horizon:g} s"
-        title = f"{log.name}: measured, and simulated in windows of {horizon}"
+        title = f"{log.name}: measured, and simulated in windows of {fit.horizon:g} s"
         return Figure(title, panels, columns=2, height=3.6)
-
-
-def _in_milli(errors: np.ndarray) -> str:
-    """Return errors in thousandths of their unit."""
-    return ", ".join(significant(1e3 * error) for error in errors)
