@@ -33,7 +33,8 @@ PLACING = threading.Lock()
 """Held while files take their places."""
 TEMPORARY: set[Path] = set()
 """Temporary folders in use; who ends the process at once removes them."""
-_DTYPES = ("float64", "float32", "int64", "int32", "bool")
+DTYPES = ("float64", "float32", "int64", "int32", "bool")
+"""Types of the arrays that a document can hold."""
 
 
 def write_text(path: str | Path, text: str) -> None:
@@ -79,18 +80,19 @@ def require_writable(folder: str | Path) -> None:
 @contextlib.contextmanager
 def _temporary_folder(folder: Path) -> Iterator[Path]:
     """Make a hidden folder on the same file system, and remove it in the end."""
-    place = folder
-    while not place.exists() and not place.is_symlink():
-        place = place.parent
-    if not place.is_dir():
+    parent = folder
+    while not parent.exists() and not parent.is_symlink():
+        parent = parent.parent
+    if not parent.is_dir():
         raise InputError(
-            f"`{place}` must be a folder, but is none: choose another place."
+            f"`{parent}` must be a folder, but is none: choose another place."
         )
-    path = place / f".jaxid-{uuid.uuid4().hex[:12]}"
+    path = parent / f".jaxid-{uuid.uuid4().hex[:12]}"
     TEMPORARY.add(path)
     try:
         path.mkdir()
     except OSError as error:
+        # The user knows the folder, not the hidden one in it.
         raise OSError(error.errno, error.strerror, str(folder)) from error
     try:
         yield path
@@ -100,24 +102,25 @@ def _temporary_folder(folder: Path) -> Iterator[Path]:
 
 
 def _move_files(staging: Path, folder: Path, outdated: Iterable[str]) -> None:
-    paths = sorted(
-        staging.iterdir(), key=lambda path: (path.suffix == ".json", path.name)
+    """Replace files in a folder by those of the same name, those in JSON last."""
+    names = sorted(
+        (path.name for path in staging.iterdir()),
+        key=lambda name: (name.endswith(".json"), name),
     )
-    for path in paths:
-        if (folder / path.name).is_dir():
+    for name in names:
+        if (folder / name).is_dir():
             raise InputError(
-                f"`{folder / path.name}` must be a file, but is a folder: remove it."
+                f"`{folder / name}` must be a file, but is a folder: remove it."
             )
-    old = {name for name in outdated if (folder / name).is_file()} - {
-        p.name for p in paths
-    }
-    if len(paths) > 1:
-        # Without its JSON files, no mixture of old and new files is taken for a result.
-        old |= {p.name for p in paths if p.suffix == ".json"}
-    for name in old:
+    removals = {name for name in outdated if (folder / name).is_file()} - set(names)
+    if len(names) > 1:
+        # Without its JSON files, no mixture of earlier and later files is taken for a
+        # result.
+        removals |= {name for name in names if name.endswith(".json")}
+    for name in removals:
         (folder / name).unlink(missing_ok=True)
-    for path in paths:
-        os.replace(path, folder / path.name)
+    for name in names:
+        os.replace(staging / name, folder / name)
 
 
 def read_json(path: str | Path) -> Any:
@@ -133,10 +136,9 @@ def json_text(content: dict[str, Any]) -> str:
     text = json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False)
     # A list of numbers or texts stands on one line. Texts hold no line breaks, so none
     # is touched.
-    return (
-        re.sub(r"\[\n[^\[\]{}]*\n *\]", lambda m: re.sub(r"\n *", " ", m[0]), text)
-        + "\n"
-    )
+    flat_list = re.compile(r"\[\n[^\[\]{}]*\n *\]")
+    one_line = flat_list.sub(lambda match: re.sub(r"\n *", " ", match[0]), text)
+    return f"{one_line}\n"
 
 
 def fill_template(path: Path, **values: Any) -> str:
@@ -162,12 +164,12 @@ def import_extra(module: str, extra: str, use: str) -> Any:
     """
     try:
         return importlib.import_module(module)
-    except ImportError as missing:
+    except ImportError as error:
         package = module.partition(".")[0]
         raise InputError(
             f"{use} the package `{package}`: install it (`pip install "
             f'"jaxid-robotics[{extra}]"`).'
-        ) from missing
+        ) from error
 
 
 def to_json(value: Any, refused: tuple[type, ...] = ()) -> Any:
@@ -180,97 +182,125 @@ def to_json(value: Any, refused: tuple[type, ...] = ()) -> Any:
         return {"member": f"{type(value).__name__}.{value.name}"}
     if isinstance(value, np.generic):
         return to_json(value.item())
+    # An array on the devices of other processes has no numbers here.
     if isinstance(value, AnyArray) and getattr(value, "is_fully_addressable", True):
-        array = np.asarray(value)
-        name, entries = array.dtype.name, array.tolist()
-        if name not in _DTYPES:
-            raise InputError(f"a document cannot hold an array of {name}.")
-        if array.dtype.kind == "f" and not np.isfinite(array).all():
-            shown = np.where(
-                np.isfinite(array), array.astype(object), array.astype(str)
-            )
-            entries = shown.tolist()
-        return {name: entries} if array.size else {name: [], "shape": list(array.shape)}
+        return _array_to_json(np.asarray(value))
     if isinstance(value, float):
         return value if math.isfinite(value) else {"float": repr(value)}
     if isinstance(value, tuple | list) and not hasattr(value, "_fields"):
-        return [to_json(x, refused) for x in value]
+        return [to_json(entry, refused) for entry in value]
     if isinstance(value, eqx.Module) and dataclasses.is_dataclass(value):
-        fields = (f for f in dataclasses.fields(value) if f.init)
-        entries = {f.name: to_json(getattr(value, f.name), refused) for f in fields}
+        entries = {
+            field.name: to_json(getattr(value, field.name), refused)
+            for field in dataclasses.fields(value)
+            if field.init
+        }
         return {"kind": type(value).__name__, **entries}
     raise InputError(f"a document cannot hold {value!r:.60}.")
 
 
+def _array_to_json(array: np.ndarray) -> dict[str, Any]:
+    """Return an array as an object with its type; NaN and infinity become texts."""
+    name = array.dtype.name
+    if name not in DTYPES:
+        raise InputError(f"a document cannot hold an array of {name}.")
+    if not array.size:
+        return {name: [], "shape": list(array.shape)}
+    finite = np.isfinite(array)
+    if not finite.all():
+        array = np.where(finite, array.astype(object), array.astype(str))
+    return {name: array.tolist()}
+
+
 def from_json(value: Any, hint: Any, place: str = "") -> Any:
-    """Return the module or value that `to_json` has made these values of."""
+    """Return the module or value that `to_json` has made these values of.
+
+    Args:
+        value: Values of a document.
+        hint: Annotation that the result has to fit, such as that of a field.
+        place: Place in the document, for messages.
+    """
     options = union_members(hint)
+    result = value
     if isinstance(value, dict):
         result = _object_from_json(value, options, place)
     elif isinstance(value, list):
         hints = _element_hints(options, len(value))
-        pairs = enumerate(zip(value, hints, strict=True))
-        result = tuple(from_json(x, h, f"{place}[{k}]") for k, (x, h) in pairs)
-    else:
-        result = value
-    forms = [result]
+        result = tuple(
+            from_json(entry, entry_hint, f"{place}[{k}]")
+            for k, (entry, entry_hint) in enumerate(zip(value, hints, strict=True))
+        )
+    if any(_fits(result, option) for option in options):
+        return result
+    # A number and an array without axes are the same.
     if isinstance(result, float | np.ndarray):
-        # A number and an array without axes are the same.
-        forms.append(np.array(result) if isinstance(result, float) else result[()])
-    for form in forms:
-        if any(_fits(form, option) for option in options):
-            return form
+        twin = np.array(result) if isinstance(result, float) else result[()]
+        if any(_fits(twin, option) for option in options):
+            return twin
     raise InputError(f"`{place}` holds {value!r:.60}, which does not belong there")
 
 
 def _object_from_json(value: dict[str, Any], options: Sequence[Any], place: str) -> Any:
+    """Return the module, array, number or member of an enumeration that an object holds."""
     if "kind" in value:
         return _module_from_json(value, options, place)
     names = set(value) - {"shape"}
-    if len(names) != 1 or not names <= {*_DTYPES, "float", "member"}:
+    if len(names) != 1 or not names <= {*DTYPES, "float", "member"}:
         raise InputError(f"`{place}` has the keys {', '.join(sorted(map(str, value)))}")
     (name,) = names
-    entries = value[name]
-    if name == "float" and entries in ("inf", "-inf", "nan"):
-        return float(entries)
+    content = value[name]
+    if name == "float" and content in ("inf", "-inf", "nan"):
+        return float(content)
     if name == "member":
-        enums = (o for o in options if isinstance(o, type) and issubclass(o, enum.Enum))
-        members = {f"{o.__name__}.{member.name}": member for o in enums for member in o}
-        if str(entries) not in members:
-            raise InputError(f"`{place}` names `{entries}`, which is not known")
-        return members[entries]
+        return _member_from_json(content, options, place)
     try:
-        array = np.array(entries, name)
+        array = np.array(content, name)
         array = array.reshape(value.get("shape", array.shape))
     except (TypeError, ValueError, OverflowError):
         array = None
+    # NumPy reads more than `to_json` writes, such as `true` as 1.
     if array is None or to_json(array) != value:
         raise InputError(f"`{place}` is no array of {name}")
     return array
 
 
+def _member_from_json(name: Any, options: Sequence[Any], place: str) -> enum.Enum:
+    """Return a member of one of the enumerations among the options."""
+    for option in options:
+        if isinstance(option, type) and issubclass(option, enum.Enum):
+            for member in option:
+                if name == f"{option.__name__}.{member.name}":
+                    return member
+    raise InputError(f"`{place}` names `{name}`, which is not known")
+
+
 def _module_from_json(value: dict[str, Any], options: Sequence[Any], place: str) -> Any:
+    """Return a module of a class that is derived from one of the options."""
     kind = value["kind"]
-    families = [o for o in options if isinstance(o, type) and issubclass(o, eqx.Module)]
-    named = [
-        c for family in families for c in _subclasses(family) if c.__name__ == kind
+    classes = [
+        subclass
+        for option in options
+        if isinstance(option, type) and issubclass(option, eqx.Module)
+        for subclass in _subclasses(option)
+        if subclass.__name__ == kind
     ]
     # Of classes of one name the last one counts; not a twin that Equinox derives for
     # its own ends.
-    named = [c for c in named if not any(b in named for b in c.__mro__[1:])]
-    if not named:
+    classes = [c for c in classes if not any(b in classes for b in c.__mro__[1:])]
+    if not classes:
         raise InputError(
             f"`{place or 'the model'}` is a `{kind}`, which is not known: import the "
             "module that defines it, or use a newer version of jaxid"
         )
-    hints = {f.name: f.type for f in dataclasses.fields(named[-1]) if f.init}
+    module_class = classes[-1]
+    hints = {field.name: field.type for field in dataclasses.fields(module_class)}
     entries = {
         name: from_json(entry, hints.get(name, Any), f"{place}.{name}".strip("."))
         for name, entry in value.items()
         if name != "kind"
     }
     try:
-        return named[-1](**entries)
+        return module_class(**entries)
     except TypeError as error:
         raise InputError(
             f"`{place or kind}` ({kind}) has other keys: {error}"
@@ -278,18 +308,22 @@ def _module_from_json(value: dict[str, Any], options: Sequence[Any], place: str)
 
 
 def _subclasses(family: type) -> list[type]:
-    """Return a class and all that are derived from it, older ones first."""
-    return [
-        family,
-        *(c for child in family.__subclasses__() for c in _subclasses(child)),
-    ]
+    """Return a class and all that are derived from it, those defined first before others."""
+    classes = [family]
+    for child in family.__subclasses__():
+        classes += _subclasses(child)
+    return classes
 
 
 def union_members(hint: Any) -> tuple[Any, ...]:
     """Return the members of a union, or the annotation itself if it is none."""
-    if typing.get_origin(hint) in (typing.Union, types.UnionType):
-        return tuple(o for x in typing.get_args(hint) for o in union_members(x))
-    return (hint,)
+    if typing.get_origin(hint) not in (typing.Union, types.UnionType):
+        return (hint,)
+    return tuple(
+        member
+        for argument in typing.get_args(hint)
+        for member in union_members(argument)
+    )
 
 
 def _element_hints(options: Sequence[Any], length: int) -> tuple[Any, ...]:
@@ -301,10 +335,12 @@ def _element_hints(options: Sequence[Any], length: int) -> tuple[Any, ...]:
                 return arguments[:1] * length
             if len(arguments) == length:
                 return arguments
+    # No value fits these.
     return (None,) * length
 
 
 def _fits(value: Any, option: Any) -> bool:
+    """Return whether a value is one of an annotation without unions."""
     if option is Any:
         return value is None or isinstance(value, str | bool | int | float)
     if option is None or option is type(None):

@@ -59,7 +59,7 @@ def _chart(title: str, value: str, height: float, content: Any) -> dict[str, Any
 
 def panel_content(panel: Panel, bins: int) -> dict[str, Any]:
     """Return a panel, those below it, and their curves; long lines are decimated."""
-    curves = [
+    curves: list[dict[str, Any]] = [
         _curve_content(curve, part, bins) | {"panel": number}
         for number, part in enumerate(panel.parts)
         for curve in part.curves
@@ -78,6 +78,7 @@ def panel_content(panel: Panel, bins: int) -> dict[str, Any]:
 
 
 def _curve_content(curve: Curve, panel: Panel, bins: int) -> dict[str, Any]:
+    """Return a curve with its points packed; a line in time is decimated."""
     x = curve.x
     y = curve.y
     if panel.in_time and curve.kind == "line":
