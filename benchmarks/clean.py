@@ -107,21 +107,16 @@ def recorded(robot, file, log, seed, folder):
 def said(cases, folder):
     """Return the verdict, what `jaxid identify` marks, findings of `jaxid inspect`, and notes."""
     import jaxid as jid
-    from jaxid.experiment import identify_logs  # private: what the command line runs
 
-    remarks, r, _ = spoilt.judged(cases, folder)
+    remarks, report, _ = spoilt.judged(cases, folder)
     marked = [str(x.text) for x in remarks[1:] if x.status.name in ("DOUBTFUL", "BAD")]
-    notes = list(r.notes)
-    for path in sorted(folder.glob("log*.npz"))[: len(cases)]:
-        _, observations, diagnosis = identify_logs.load_log(
-            r.experiment, path, lambda *_: None
-        )
-        fit = jid.identify(
-            r.experiment.base, observations, r.experiment.estimation.plain
-        )
-        inspected = diagnosis.with_fit(fit)
-        marked += inspected.findings
-        notes += inspected.notes
+    notes = list(report.notes)
+    experiment = jid.experiment.load_experiment(folder / "e.toml")
+    paths = sorted(folder.glob("log*.npz"))[: len(cases)]
+    inspection = jid.workflow.inspect_logs(experiment.setup, paths, experiment.columns)
+    for log in inspection.logs:
+        marked += log.diagnosis.findings
+        notes += log.diagnosis.notes
     return remarks[0].status.name, list(dict.fromkeys(marked)), notes
 
 

@@ -156,14 +156,14 @@ def program(base, factor, estimator):
 def measured(name):
     """Return base parameters and weighted factor of a measured robot's log."""
     import jaxid as jid
-    from jaxid.experiment.experiment import load_experiment  # private: experiment files
 
     file, log = LOGS[name]
-    loaded = load_experiment(EXPERIMENTS / file)
-    recording = loaded.read(DATA / log)
-    factors = jid.RegressionProblem(loaded.base, (loaded.observe(recording),)).factors
+    loaded = jid.experiment.load_experiment(EXPERIMENTS / file)
+    setup = loaded.setup
+    recording = jid.workflow.read_log(setup, DATA / log, loaded.columns)
+    factors = jid.RegressionProblem(setup.base, (setup.observe(recording),)).factors
     weights = 1.0 / (factors.force_squares / factors.rows) ** 0.5
-    return loaded.base, (*factors.weighted(weights), int(factors.rows.sum()))
+    return setup.base, (*factors.weighted(weights), int(factors.rows.sum()))
 
 
 def optimum(arms, quick):

@@ -135,7 +135,6 @@ def readers(folder):
     import polars as pl
 
     import jaxid as jid
-    from jaxid.experiment.experiment import load_experiment  # private: experiment files
 
     columns = jid.Columns(angles="q{}", forces="tau{}", time="time")
     table = pl.read_csv(folder / "identification.csv")[:300]
@@ -159,7 +158,7 @@ def readers(folder):
         "log.parquet": log,
         "arm.urdf": jid.load_urdf,
         "model.json": jid.load_fit,
-        "experiment.toml": load_experiment,
+        "experiment.toml": jid.experiment.load_experiment,
     }
 
 

@@ -62,22 +62,25 @@ NOISE = 0.01
 def chosen_fit(experiment, train):
     """Return what `jaxid choose` finds for some observations, and its fit to them."""
     import jaxid as jid
-    from jaxid.experiment.choose import choose_variant  # private: experiment files
-    from jaxid.experiment.experiment import parse_experiment
 
-    choice, text = choose_variant(experiment, train)
-    variant = parse_experiment(text, experiment.path)
-    return choice, variant.fit(jid.RegressionProblem(variant.base, train))
+    variants = jid.experiment.variants(experiment)
+    setups = {name: variant.setup for name, variant in variants.items()}
+    choice = jid.workflow.choose_setup_by_rows(setups, train)
+    setup = setups[choice.chosen.name]
+    return choice, setup.fit(jid.RegressionProblem(setup.base, train))
 
 
 @functools.cache
 def measured(name):
     """Return the experiment of a robot, and its observations."""
-    from jaxid.experiment.experiment import load_experiment  # private: experiment files
+    import jaxid as jid
 
-    experiment = load_experiment(EXPERIMENTS / f"{name}.toml")
+    experiment = jid.experiment.load_experiment(EXPERIMENTS / f"{name}.toml")
     return experiment, [
-        experiment.observe(experiment.read(DATA / log)) for log in LOGS[name]
+        experiment.setup.observe(
+            jid.workflow.read_log(experiment.setup, DATA / log, experiment.columns)
+        )
+        for log in LOGS[name]
     ]
 
 
@@ -203,14 +206,17 @@ def authors_torques(file, q, qd, qdd):
 def pendulum():
     """Compare with the published models of the double pendulum."""
     import jaxid as jid
-    from jaxid.experiment.experiment import parse_experiment
 
     folder = DATA / "double_pendulum"
-    experiment = parse_experiment(
+    experiment = jid.experiment.parse_experiment(
         PENDULUM.format(folder=folder), folder / "pendulum.toml"
     )
     logs = [
-        experiment.observe(experiment.read(folder / f"{x}.csv"))
+        experiment.setup.observe(
+            jid.workflow.read_log(
+                experiment.setup, folder / f"{x}.csv", experiment.columns
+            )
+        )
         for x in IDENTIFY + VERIFY
     ]
     train, later = logs[: len(IDENTIFY)], logs[len(IDENTIFY) :]
@@ -405,10 +411,9 @@ def observed(m, forces, size, rng):
 def load(name, draws):
     """Measure coefficients of simulated friction by load, and the coverage of their intervals."""
     import jaxid as jid
-    from jaxid.experiment.experiment import parse_experiment
 
     path, robot, _, torques = arm(name)
-    experiment = parse_experiment(
+    experiment = jid.experiment.parse_experiment(
         f'[robot]\nurdf = "{path}"\n[model]\nload = true\n', path
     )
     truth, errors, held = np.linspace(0.1, 0.25, robot.joints), [], []
@@ -418,7 +423,7 @@ def load(name, draws):
         weight, sign = torques(jid.Motion(m.q, 0 * m.q, 0 * m.q)), np.tanh(m.qd / 0.01)
         dry = 0.1 * size + truth * np.abs(weight)
         log = observed(m, rigid + 0.1 * size * m.qd + dry * sign, size, rng)
-        fit = experiment.fit(RegressionProblem(experiment.base, [log]))
+        fit = experiment.setup.fit(RegressionProblem(experiment.setup.base, [log]))
         for j, value in enumerate(truth):
             if (
                 f"fl{j + 1}" in fit.base.names

@@ -33,7 +33,6 @@ from stepwise import Stepwise
 from timing import DATA, EXPERIMENTS
 
 import jaxid as jid
-from jaxid.experiment.experiment import load_experiment  # private: experiment files
 
 LOGS = {"tx40": "tx40/motor_position.csv", "ur10": "ur10/exciting_measured.csv"}
 SHARE = 0.6
@@ -93,9 +92,11 @@ def fits(base: jid.BaseParameters, train: jid.Observations, *, quick: bool):
 
 def table(name: str, *, quick: bool) -> list[str]:
     """Return the rows of one robot."""
-    experiment = load_experiment(EXPERIMENTS / f"{name}.toml")
-    recording = experiment.read(DATA / LOGS[name])
-    train, test = experiment.observe(recording).split(SHARE)
+    experiment = jid.experiment.load_experiment(EXPERIMENTS / f"{name}.toml")
+    recording = jid.workflow.read_log(
+        experiment.setup, DATA / LOGS[name], experiment.columns
+    )
+    train, test = experiment.setup.observe(recording).split(SHARE)
     lines = [
         f"| {name.upper()} | weighted, first 60 % | weighted, rest | of WLS | moving "
         "| of WLS "
@@ -104,7 +105,7 @@ def table(name: str, *, quick: bool) -> list[str]:
     ]
     moving = np.abs(np.asarray(test.reduced_motion.qd)).max(axis=1) > STILL
     reference = None
-    for label, fit, remark in fits(experiment.base, train, quick=quick):
+    for label, fit, remark in fits(experiment.setup.base, train, quick=quick):
         errors = jid.validate(fit, [train, test]).errors
         parts = (errors[0].errors, errors[1].errors, errors[1].errors[moving])
         largest = np.asarray(errors[0].max_forces)

@@ -41,9 +41,6 @@ import timing
 import trimesh
 
 import jaxid as jid
-from jaxid.experiment.experiment import (
-    load_experiment,
-)  # private: the base that was designed for
 
 jax.config.update("jax_enable_x64", True)
 ROBOTS = "lib/python*/site-packages/cmeel.prefix/share/example-robot-data/robots"
@@ -225,11 +222,11 @@ def readable(urdf: Path, folder: Path) -> Path:
 
 def log_deviation(experiment, trajectory) -> float:
     """Return the logarithm of the geometric mean of all standard deviations."""
-    noise = 0.01 * np.asarray(experiment.robot.max_forces)
+    noise = 0.01 * np.asarray(experiment.setup.robot.max_forces)
     motion = trajectory.motion(np.asarray(trajectory.basis.times(800)))
-    theta = np.asarray(experiment.base.regressor(motion)) / noise[:, None]
+    theta = np.asarray(experiment.setup.base.regressor(motion)) / noise[:, None]
     sizes = np.abs(
-        np.linalg.qr(theta.reshape(-1, experiment.base.size), mode="r").diagonal()
+        np.linalg.qr(theta.reshape(-1, experiment.setup.base.size), mode="r").diagonal()
     )
     return -float(np.mean(np.log(sizes)))
 
@@ -254,12 +251,14 @@ def main():
             )
             (folder / "experiment.toml").write_bytes(text.stdout)
             found = design(folder, options.time)
-            experiment = load_experiment(folder / "experiment.toml")
+            experiment = jid.experiment.load_experiment(folder / "experiment.toml")
             trajectory = jid.trajectories.load_trajectory(folder / "motion.json")
             motion = trajectory.motion(
                 np.linspace(0.0, float(trajectory.duration), INSTANTS)
             )
-            margins = Oracle(urdf, folder).judge(experiment.robot.joint_names, motion)
+            margins = Oracle(urdf, folder).judge(
+                experiment.setup.robot.joint_names, motion
+            )
             good = (
                 min(
                     margins["floor [mm]"],

@@ -406,14 +406,13 @@ def recorded(urdf, cache, **settings):
 
 def written(cases, folder):
     """Write the logs of cases; return them and the experiment, which the first case describes."""
-    from jaxid.experiment.experiment import (
-        load_experiment,
-    )  # private: what the command line runs
-    from jaxid.experiment.template import write_template
+    import jaxid as jid
 
     case, paths = cases[0], []
     (folder / "arm.urdf").write_text(case.urdf)
-    text = write_template(folder / "arm.urdf", folder=folder).replace('"time"', '"t"')
+    text = jid.experiment.write_template(folder / "arm.urdf", folder=folder).replace(
+        '"time"', '"t"'
+    )
     for pattern, replacement in case.edits:
         text, count = re.subn(pattern, replacement, text, count=1)
         if not count:
@@ -426,25 +425,18 @@ def written(cases, folder):
         }
         paths.append(folder / (f"log{k + 1}.npz" if k else "log.npz"))
         np.savez(paths[-1], t=c.t, **columns)
-    return load_experiment(folder / "e.toml"), paths
+    return jid.experiment.load_experiment(folder / "e.toml"), paths
 
 
 def judged(cases, folder):
     """Return the verdict on logs, the likely mistakes, and the largest share of missed forces."""
-    from rich.console import Console
-
-    from jaxid.experiment import identify_logs  # private: what the command line runs
-    from jaxid.validation.verdict import verdict
+    import jaxid as jid
 
     experiment, paths = written(cases, folder)
-    with (
-        open("/dev/null", "w") as nowhere,
-        identify_logs.stages(Console(file=nowhere)) as stage,
-    ):
-        report, _ = identify_logs.identify_logs(experiment, paths, [], 0.6, "", stage)
+    report = jid.identify_logs(experiment.setup, paths, experiment.columns, 0.4)
     fitted = report.identification
     size = np.fmax(fitted[0].force_rms, 0.01 * np.nan_to_num(fitted[0].max_forces))
-    return verdict(report), report, float(np.nanmax(fitted[0].rms / size))
+    return report.judgement, report, float(np.nanmax(fitted[0].rms / size))
 
 
 def one(robot, urdf, change, j, amount, folder):

@@ -2,8 +2,8 @@
 
 Everything else is in namespaces: `program`, `dynamics`, `terms`, `filters`, `units`, `estimators`,
 `friction_laws`, `uncertainty`, `consistency`, `excitation`, `criteria`, `constraints`,
-`trajectories`, `collision`, `simulation`, `export`; the built-in robots are
-in `robots`, the figures in `plot`.
+`trajectories`, `collision`, `simulation`, `export`, `workflow`, `experiment`; the
+built-in robots are in `robots`, the figures in `plot`.
 """
 
 import importlib as _importlib

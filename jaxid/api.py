@@ -3,12 +3,14 @@
 from . import (
     dynamics as dynamics,
     excitation as excitation,
+    experiment as experiment,
     export as export,
     program as program,
     rollout as rollout,
     simulation as simulation,
     trajectory as trajectories,  # noqa: F401
     units as units,
+    workflow as workflow,
 )
 from .dynamics import terms as terms
 from .dynamics.base import (
@@ -86,3 +88,5 @@ from .rollout.identify import identify_rollout as identify_rollout
 from .simulation.virtual import VirtualRobot as VirtualRobot
 from .validation.diagnosis import diagnose as diagnose
 from .validation.torque_errors import validate as validate
+from .workflow.log_identification import identify_logs as identify_logs
+from .workflow.setup import Setup as Setup

@@ -262,7 +262,9 @@ def test_init_writes_a_file_that_loads(tmp_path):
     assert done.returncode == 0
     for words in ("velocity 0 is taken", "effort 0 is taken", "the body has no mass"):
         assert words in " ".join(done.stderr.split())
-    assert load_experiment(tmp_path / "experiment.toml").robot.joint_names == ("hinge",)
+    assert load_experiment(tmp_path / "experiment.toml").setup.robot.joint_names == (
+        "hinge",
+    )
 
 
 def test_a_process_of_its_own_has_double_precision(folder):
@@ -328,7 +330,7 @@ def test_after_a_failure_nothing_is_half_written(folder, first, run, monkeypatch
 
 def test_errors_that_are_not_the_users_keep_their_traceback(folder, monkeypatch):
     monkeypatch.setattr(
-        "jaxid.experiment.identify_logs.validate",
+        "jaxid.workflow.log_identification.validate",
         lambda *_, **__: np.zeros(3) + np.zeros(4),
     )
     monkeypatch.setattr(sys, "argv", ["jaxid", "identify", "experiment.toml", "a.csv"])
@@ -380,8 +382,8 @@ def test_long_logs_give_what_short_ones_give(
     arguments = ("slow.toml", f"a.{kind}", "--verify", f"b.{kind}", "--split", "0.6")
     words("identify", *arguments, "-o", "short")
     expected = words("inspect", "slow.toml", f"a.{kind}")
-    monkeypatch.setattr("jaxid.experiment.experiment.LONG", 500)
-    monkeypatch.setattr("jaxid.experiment.experiment.read_recording", None)
+    monkeypatch.setattr("jaxid.workflow.log_loading.LONG_LOG_ROWS", 500)
+    monkeypatch.setattr("jaxid.workflow.log_reading.read_recording", None)
     if compiled_rows:
         monkeypatch.setattr("jaxid.RegressionProblem.compiled_samples", 500)
     words("identify", *arguments, "-o", "long")
@@ -402,8 +404,8 @@ def test_long_logs_give_what_short_ones_give(
 
 
 def test_slips_are_found_in_a_part_of_a_long_log(folder, words, monkeypatch):
-    monkeypatch.setattr("jaxid.experiment.experiment.LONG", 500)
-    monkeypatch.setattr("jaxid.diagnosis.diagnosis.EXAMINED", 800)
+    monkeypatch.setattr("jaxid.workflow.log_loading.LONG_LOG_ROWS", 500)
+    monkeypatch.setattr("jaxid.validation.diagnosis.EXAMINED", 800)
     pl.read_csv("a.csv").with_columns(-pl.col("tau2")).write_csv("turned.csv")
     said = words("inspect", "experiment.toml", "turned.csv")
     assert "800 of the 1200 samples were examined for mistakes" in said
@@ -411,7 +413,7 @@ def test_slips_are_found_in_a_part_of_a_long_log(folder, words, monkeypatch):
 
 
 def test_errors_of_many_rows_are_of_every_nth(folder, first, words, monkeypatch):
-    monkeypatch.setattr("jaxid.experiment.experiment.LONG", 500)
+    monkeypatch.setattr("jaxid.workflow.log_loading.LONG_LOG_ROWS", 500)
     monkeypatch.setattr("jaxid.validation.torque_errors.ROWS", 100)
     said = words("identify", "experiment.toml", "a.csv", "-o", "long")
     assert "torque errors and figures take one of every 3 of its 2" in said
@@ -425,7 +427,7 @@ def test_errors_of_many_rows_are_of_every_nth(folder, first, words, monkeypatch)
 def test_a_long_log_that_must_be_mended_is_read_as_a_whole(
     folder, run, words, monkeypatch
 ):
-    monkeypatch.setattr("jaxid.experiment.experiment.LONG", 500)
+    monkeypatch.setattr("jaxid.workflow.log_loading.LONG_LOG_ROWS", 500)
     lines = (folder / "a.csv").read_text().splitlines()
     lines.insert(700, lines[700])
     (folder / "twins.csv").write_text("\n".join(lines))

@@ -20,7 +20,7 @@ KEYS = [
             f"[model]\ncoulomb = {{ {key} = {value} }}\n[filter]",
             f"coulomb.{key}` must be",
         )
-        for key, value in (("epsilon", "inf"), ("epsilon", "500"), ("dead_zone", "inf"))
+        for key, value in (("epsilon", "inf"), ("epsilon", "500"))
     ),
     (
         "[limits]",

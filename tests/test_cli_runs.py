@@ -3,6 +3,7 @@
 import json
 import os
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,9 +21,10 @@ from test_cli import (  # noqa: F401
 
 import jaxid as jid
 from jaxid.dynamics.dispatch import in_numpy
-from jaxid.experiment import choose
+from jaxid.experiment import experiment_variants
 from jaxid.experiment.experiment import load_experiment
 from jaxid.simulation.virtual import random_bodies
+from jaxid.workflow.log_loading import read_log
 
 SPATIAL = """\
 [robot]
@@ -81,7 +83,7 @@ def workshop(tmp_path_factory):
     (place / "experiment.toml").write_text(SPATIAL)
     (place / "load.toml").write_text(SPATIAL + LOAD)
     described = load_experiment(place / "load.toml")
-    model = described.model
+    model = described.setup.model
     random = np.random.default_rng(0)
     p = random.uniform(0.2, 1.0, model.size)
     loaded = p.copy()
@@ -104,6 +106,12 @@ def shop(workshop, tmp_path, monkeypatch):
     return tmp_path
 
 
+def read(path, log):
+    """The recording of a log, as an experiment file says."""
+    experiment = load_experiment(path)
+    return read_log(experiment.setup, Path(log), experiment.columns)
+
+
 def pasted(out, title):
     """The lines for the experiment file that a command has printed, from one on."""
     lines = out.splitlines()
@@ -124,7 +132,7 @@ def test_a_payload_is_found_and_can_be_subtracted(shop, run):  # noqa: F811
     assert [row["name"] for row in found["parameters"]][10:13] == ["m", "x", "y"]
     assert "could exist" in out
     (shop / "tool.toml").write_text(SPATIAL + pasted(out, "[robot.tool]"))
-    tool = load_experiment("tool.toml").robot.tool
+    tool = load_experiment("tool.toml").setup.robot.tool
     np.testing.assert_allclose(tool.inertia, found["inertia"], rtol=1e-4)
     # Of forces that are wrong by their gains, the mass matrix may be indefinite.
     assert run("identify", "experiment.toml", "empty.csv", "-o", "a")[0] in (0, 3)
@@ -144,8 +152,8 @@ def test_true_forces_are_found_and_can_be_used(shop, run):  # noqa: F811
     line = pasted(out, "[recording]").splitlines()[1]
     text = SPATIAL.replace('time = "t"', f'time = "t"\n{line}')
     (shop / "true.toml").write_text(text)
-    forces = load_experiment("true.toml").read("empty_nominal.csv").forces
-    expected = load_experiment("experiment.toml").read("empty.csv").forces
+    forces = read("true.toml", "empty_nominal.csv").forces
+    expected = read("experiment.toml", "empty.csv").forces
     np.testing.assert_allclose(forces, expected, rtol=0.02, atol=1e-3)
     (shop / "tool.toml").write_text(
         SPATIAL + LOAD + LOAD.replace("[load]", "[robot.tool]")
@@ -238,10 +246,10 @@ def test_states_share_inertia(folder, words):  # noqa: F811
     found = json.loads((folder / "states" / "states.json").read_text(encoding="utf-8"))
     assert found["states"] == ["a", "warm"]
     described = load_experiment(folder / "experiment.toml")
-    base, estimator = described.base, described.estimation.plain
+    base, estimator = described.setup.base, described.setup.least_squares
     runs = []
     for name in ("a", "warm"):
-        log = described.observe(described.read(folder / f"{name}.csv"))
+        log = described.setup.observe(read(described.path, folder / f"{name}.csv"))
         runs.append(jid.identify(base, log, estimator=estimator, name=name))
     expected = jid.identify_states(runs)
     estimates = {row["name"]: row["estimate"] for row in found["parameters"]}
@@ -252,33 +260,22 @@ def test_states_share_inertia(folder, words):  # noqa: F811
     assert set(found["shared"]) == {base.names[k] for k in expected.shared}
 
 
-def test_essential_parameters_on_the_command_line(folder, first, run, words):  # noqa: F811
-    (folder / "essential.toml").write_text(
-        EXPERIMENT + "[estimator]\nessential = 0.3\n"
-    )
-    said = words("identify", "essential.toml", "a.csv", "-o", "few")
-    few, every = (len(result(folder, k)["fit"]["covariance"]) for k in ("few", "first"))
-    assert 0 < few < every
-    assert f"{few} of {every} base parameters are essential" in said
-    assert "eliminated, and taken as zero: " in said
-    assert refused(
-        run("identify", "essential.toml", "first", "b.csv"), "for essential parameters"
-    )
-
-
 def test_a_model_is_chosen_and_its_file_identifies(shop, run, monkeypatch):  # noqa: F811
-    few = {name: choose.EFFECTS[name] for name in ("root of speed", "springs")}
-    monkeypatch.setattr(choose, "EFFECTS", few)
+    few = {
+        name: experiment_variants.EFFECTS[name] for name in ("root of speed", "springs")
+    }
+    monkeypatch.setattr(experiment_variants, "EFFECTS", few)
     code, out, err = run("choose", "experiment.toml", "empty.csv", "-o", "chosen.toml")
     assert (code, err) == (0, "")
     assert "viscous, dry + root of speed + springs" in out
     assert "is the simplest model" in out
     chosen = load_experiment("chosen.toml")
     # The truth has neither springs nor roots, and a comment of the file stays.
-    names = [type(term).__name__ for term in chosen.model.terms]
+    names = [type(term).__name__ for term in chosen.setup.model.terms]
     assert "LinearSpring" not in names
     assert (
-        chosen.robot.joint_names == load_experiment("experiment.toml").robot.joint_names
+        chosen.setup.robot.joint_names
+        == load_experiment("experiment.toml").setup.robot.joint_names
     )
     assert run("identify", "chosen.toml", "empty.csv", "-o", "c")[0] in (0, 3)
     again = run("choose", "experiment.toml", "empty.csv", "-o", "chosen.toml")
@@ -292,7 +289,7 @@ PRESLIDING = SPATIAL.replace(
 
 def test_friction_with_memory_from_the_log_to_the_report(shop, run, words):  # noqa: F811
     (shop / "memory.toml").write_text(PRESLIDING)
-    model = load_experiment("memory.toml").model.with_memory(length=0.05)
+    model = load_experiment("memory.toml").setup.model.with_memory(length=0.05)
     p, t = (
         np.random.default_rng(0).uniform(0.2, 1.0, model.size),
         np.arange(0.0, 20.0, 0.005),

@@ -251,7 +251,7 @@ def test_the_example_in_the_readme_runs(given, tmp_path):
         "log.csv",
         "example.py",
     }
-    assert made == {"model.json"}
+    assert made == {"report"}
 
 
 THRESHOLDS = {

@@ -22,17 +22,8 @@ from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
 from jaxid.excitation import search
 from jaxid.excitation.coefficient_limits import JointLimits
-from jaxid.excitation.constraints import ForceLimits
 from jaxid.excitation.criteria import CRITERIA, EOptimal
 from jaxid.experiment.decoder import keys_of
-from jaxid.experiment.excitation import (
-    design_motion,
-    find_constraints,
-    find_nominal,
-    prepare_design,
-    write_design,
-)
-from jaxid.experiment.excitation_tables import Excitation, Leads
 from jaxid.experiment.experiment import load_experiment
 from jaxid.report.excitation import plan_remarks
 from jaxid.trajectory.controllers import CONTROLLERS
@@ -40,6 +31,13 @@ from jaxid.trajectory.files import load_trajectory, save_trajectory
 from jaxid.trajectory.fourier import FourierBasis, fourier_series
 from jaxid.trajectory.lead_in_and_out import LeadsBasis
 from jaxid.trajectory.spline import RestToRestSplineBasis
+from jaxid.workflow.excitation_settings import Excitation, Leads
+from jaxid.workflow.motion_design import (
+    design_motion,
+    prepare_motion,
+    write_design,
+)
+from jaxid.workflow.nominal_parameters import find_nominal, limit_forces
 
 PENDULUM = """\
 <robot name="pendulum">
@@ -148,14 +146,25 @@ def excited(written):
     return designed_by(load_experiment(written / "free.toml"))
 
 
+def task_of(experiment):
+    """The motion that an experiment file asks for."""
+    return prepare_motion(
+        experiment.setup, experiment.excitation, experiment.surroundings
+    )
+
+
 def designed_by(experiment):
-    return design_motion(experiment, prepare_design(experiment, None), lambda _: None)
+    return design_motion(task_of(experiment))
+
+
+def nominal_of(experiment):
+    return find_nominal(experiment.setup, experiment.excitation)
 
 
 @pytest.fixture
 def no_pictures(monkeypatch):
     """Drawing takes longer than all else where a motion is there already."""
-    monkeypatch.setattr("jaxid.experiment.excitation.write_excitation", lambda *_: [])
+    monkeypatch.setattr("jaxid.workflow.motion_design.write_excitation", lambda *_: [])
 
 
 def listing(folder):
@@ -284,7 +293,7 @@ def test_floor_self_collision_and_forces_are_kept_by_default(tmp_path, run):
     assert ends.min() >= 0.04 + 0.029
     assert np.ptp(q, axis=0).min() > 0.1
     gaps = np.asarray(
-        experiment.surroundings.clearance.model.clearance(experiment.robot, q)
+        experiment.surroundings.clearance.model.clearance(experiment.setup.robot, q)
     )
     assert gaps.min() >= 0.029
     # MuJoCo finds no contact between the cylinders of the file, but one where the arm
@@ -305,14 +314,12 @@ def test_friction_that_the_file_claims_counts_in_the_forces(tmp_path):
     claim = '<axis xyz="0 1 0"/><dynamics damping="3" friction="2"/>'
     path.write_text(path.read_text().replace('<axis xyz="0 1 0"/>', claim))
     experiment = load_experiment(tmp_path / "arm.toml")
-    found = find_nominal(experiment)
-    (limits,) = (
-        c for c in find_constraints(experiment, found)[0] if isinstance(c, ForceLimits)
-    )
+    found = nominal_of(experiment)
+    limits = limit_forces(experiment.setup, experiment.excitation, found).limits
     # Upright, at 1 rad/s, with a margin of 30 %: MuJoCo's forces over what is left of
     # 50 N m.
     motion = Motion(np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]]), np.zeros((1, 3)))
-    worst = np.asarray(limits(experiment.robot, motion)).max(axis=0)
+    worst = np.asarray(limits(experiment.setup.robot, motion)).max(axis=0)
     model = mujoco.MjModel.from_xml_path(str(path))
     data = mujoco.MjData(model)
     data.qvel[:] = motion.qd[0]
@@ -399,7 +406,7 @@ def test_keys_choose_the_family_of_motions(written, key, constrained, expected):
 def test_earlier_results_are_nominal(written, excited, monkeypatch):
     experiment = load_experiment(with_keys(written, "after.toml", 'nominal = "report"'))
     path = with_keys(written, "kept.toml", 'nominal = "report"', "force_margin = 0.1")
-    base = experiment.base
+    base = experiment.setup.base
     covariance, names = 0.01 * np.eye(base.size), [*base.names]
 
     class Earlier:
@@ -409,42 +416,42 @@ def test_earlier_results_are_nominal(written, excited, monkeypatch):
             self.base = SimpleNamespace(names=tuple(names), size=len(names))
             self.covariance = covariance
 
-    monkeypatch.setattr("jaxid.experiment.excitation.read_fit", Earlier)
-    found = find_nominal(experiment)
+    monkeypatch.setattr("jaxid.workflow.nominal_parameters.read_fit", Earlier)
+    found = nominal_of(experiment)
     np.testing.assert_array_equal(found.covariance, covariance)
     assert found.undetermined == ()
     covariance = covariance.copy()
     covariance[0, 0] = np.inf
-    found = find_nominal(experiment)
+    found = nominal_of(experiment)
     assert found.undetermined == base.names[:1]
     np.testing.assert_array_equal(
         np.diag(found.covariance), 0.01 * (np.arange(base.size) > 0)
     )
-    find_constraints(
-        load_experiment(path), found
-    )  # refuses a covariance that is not finite
+    kept = load_experiment(path)
+    # refuses a covariance that is not finite
+    limit_forces(kept.setup, kept.excitation, found)
     names[0] = "other"
     with pytest.raises(ValueError, match="are not the"):
-        find_nominal(experiment)
+        nominal_of(experiment)
 
 
 def test_tables_are_sampled_as_a_controller_wants_them(
     written, excited, no_pictures, monkeypatch
 ):
     monkeypatch.setattr(
-        "jaxid.experiment.excitation.design_excitation", lambda *_, **__: excited.plan
+        "jaxid.workflow.motion_design.design_excitation", lambda *_, **__: excited.plan
     )
     keys = ("sample_time = 0.03", "leads = { periods = 2 }")
     experiment = load_experiment(with_keys(written, "cycles.toml", *keys, text=FREE))
     found = designed_by(experiment)
-    begin, end = found.played.motion.window
+    begin, end = found.playable.motion.window
     assert end - begin == pytest.approx(4 * np.pi / 0.8)
-    files = write_design(experiment, found, written / "cycles" / "motion.csv")
+    files = write_design(task_of(experiment), found, written / "cycles" / "motion.csv")
     t, q, qd, qdd = table(files[0]).T
     np.testing.assert_allclose(t, 0.03 * np.arange(len(t)), atol=1e-12)
-    assert 0.0 <= t[-1] - float(found.played.motion.duration) < 0.03
+    assert 0.0 <= t[-1] - float(found.playable.motion.duration) < 0.03
     np.testing.assert_allclose(
-        q[-1], found.played.motion.motion(found.played.motion.duration).q[0]
+        q[-1], found.playable.motion.motion(found.playable.motion.duration).q[0]
     )
     assert np.abs([qd[-1], qdd[-1]]).max() < 1e-9
     assert files[1].name == "motion.ros.yaml"
@@ -460,7 +467,7 @@ def test_tables_are_sampled_as_a_controller_wants_them(
     t = table(files[0])[:, 0]
     np.testing.assert_allclose(t, 0.008 * np.arange(len(t)), atol=1e-12)
     assert files[-1].read_text().count("  servoj(") == len(t)
-    write_design(experiment, found, written / "cycles" / "motion.csv")
+    write_design(task_of(experiment), found, written / "cycles" / "motion.csv")
     assert listing(written / "cycles") == [
         "motion.csv",
         "motion.json",
@@ -482,7 +489,7 @@ def test_the_guide_shows_every_key():
 
 def test_limits_that_nobody_gave_are_named(written, excited):
     (written / "open.toml").write_text(EXPERIMENT.replace("acceleration = [4]", ""))
-    robot = load_experiment(written / "open.toml").robot
+    robot = load_experiment(written / "open.toml").setup.robot
     limits = JointLimits(robot, excited.plan.limits.basis)
     plan = dataclasses.replace(excited.plan, limits=limits)
     said = [remark.text for remark in plan_remarks(plan)]
@@ -496,12 +503,12 @@ def test_a_motion_without_a_way_into_it_is_written_with_a_warning(
     def refuse(series, robot, periods):
         raise InputError("no lead is short enough.")
 
-    monkeypatch.setattr("jaxid.experiment.excitation.with_leads", refuse)
+    monkeypatch.setattr("jaxid.workflow.motion_files.with_leads", refuse)
     monkeypatch.setattr(
-        "jaxid.experiment.excitation.design_excitation", lambda *_, **__: excited.plan
+        "jaxid.workflow.motion_design.design_excitation", lambda *_, **__: excited.plan
     )
     led = designed_by(load_experiment(written / "free.toml"))
-    assert led.played.motion is led.plan.trajectory
+    assert led.playable.motion is led.plan.trajectory
     text = " ".join(remark.text for remark in led.remarks)
     assert (
         "the motion is without leads, and starts and ends at full speed: no lead is"
@@ -511,7 +518,7 @@ def test_a_motion_without_a_way_into_it_is_written_with_a_warning(
 
 def test_a_criterion_is_chosen_by_its_name_whatever_the_order(written, monkeypatch):
     """One design with the members in reverse order, and the name of each member."""
-    tables = "jaxid.experiment.excitation_tables.CRITERIA"
+    tables = "jaxid.workflow.excitation_settings.CRITERIA"
     monkeypatch.setattr(tables, dict(reversed(CRITERIA.items())))
     for name, criterion in CRITERIA.items():
         path = with_keys(written, "named.toml", f'criterion = "{name}"', text=FREE)
@@ -524,38 +531,7 @@ def test_a_criterion_is_chosen_by_its_name_whatever_the_order(written, monkeypat
         load_experiment(path)
 
 
-def test_ctrl_c_among_the_criteria_shows_those_that_are_done(
-    excited, run, no_pictures, monkeypatch
-):
-    asked = []
-
-    def one_design(*args, **settings):
-        asked.append(settings["criterion"].name)
-        if len(asked) == 2:
-            raise KeyboardInterrupt
-        return excited.plan
-
-    monkeypatch.setattr("jaxid.cli.commands.design_motion", lambda *_: excited)
-    monkeypatch.setattr("jaxid.experiment.excitation.design_excitation", one_design)
-    arguments = ["excite", "experiment.toml", "-o", "some/motion.csv", "--all-criteria"]
-    code, out, err = run(*arguments)
-    assert code == 3, err  # forces have no limits there
-    assert asked == [c.name for c in CRITERIA.values()][:2]
-    assert "motions that minimise one of the criteria each" in out
-    assert f"stopped after 1 of {len(CRITERIA)} criteria" in out
-
-
-def test_ctrl_c_before_a_motion_keeps_all_limits(written, run, monkeypatch):
-    def stopped(*_):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("jaxid.cli.commands.design_motion", stopped)
-    code, out, err = run("excite", "experiment.toml", "-o", "never/motion.csv")
-    assert (code, out) == (130, "")
-    assert (
-        "jaxid: stopped before a motion kept all limits, and nothing was written."
-        in err
-    )
+def test_a_search_that_was_not_begun_cannot_go_on(run):
     code, out, err = run(
         "excite", "experiment.toml", "-o", "never/motion.csv", "--resume"
     )
@@ -609,4 +585,4 @@ def test_a_controller_gets_no_motion_that_starts_at_full_speed(written, monkeypa
     keys = ('controller = "universal_robots"', "leads = false", "sample_time = 0.008")
     experiment = load_experiment(with_keys(written, "jump.toml", *keys, text=FREE))
     with pytest.raises(InputError, match="`controller`"):
-        prepare_design(experiment, None)
+        task_of(experiment)

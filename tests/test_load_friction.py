@@ -31,14 +31,14 @@ def experiment(tmp_path):
 
 @pytest.mark.parametrize("seed", range(4))
 def test_coefficients_are_found(experiment, seed):
-    robot, rng = experiment.robot, np.random.default_rng(seed)
+    robot, rng = experiment.setup.robot, np.random.default_rng(seed)
     mass, r, inertia = [6.0, 4.0, 2.0], rng.uniform(-0.1, 0.2, (3, 3)), 0.02
     bodies = []
     for m, c in zip(mass, r, strict=True):
         J = inertia * np.eye(3) + m * (c @ c * np.eye(3) - np.outer(c, c))
         bodies.append([m, *(m * c), *np.diag(J), -J[1, 2], -J[0, 2], -J[0, 1]])
     truth = jid.Model(
-        robot, (*experiment.model.terms, jid.terms.LoadFriction(np.array(bodies)))
+        robot, (*experiment.setup.model.terms, jid.terms.LoadFriction(np.array(bodies)))
     )
     rest = rng.uniform(0.3, 1.0, truth.size - 33)
     coefficients = np.array([0.1, 0.15, 0.25])
@@ -50,7 +50,7 @@ def test_coefficients_are_found(experiment, seed):
     forces = in_numpy(truth, truth.forces, motion.q, motion.qd, motion.qdd, shared=(p,))
     forces = forces + rng.normal(0.0, [0.1, 0.2, 0.1], forces.shape)
     o = jid.Observations.of(motion.q, motion.qd, motion.qdd, forces, sample_time=0.01)
-    fit = experiment.fit(RegressionProblem(experiment.base, [o]))
+    fit = experiment.setup.fit(RegressionProblem(experiment.setup.base, [o]))
     # Gravity puts no load on the first joint, which turns about it.
     assert [name for name in fit.base.names if name.startswith("fl")] == ["fl2", "fl3"]
     for name, value in zip(("fl2", "fl3"), coefficients[1:], strict=True):
@@ -62,7 +62,7 @@ def test_coefficients_are_found(experiment, seed):
 
 def test_what_it_needs_is_said(tmp_path):
     for text, complaint in (
-        ("[estimator]\nkind = 'weighted'\n", "`model.load` needs the bodies"),
+        ("[estimator]\nkind = 'weighted'\n", r"`model.load`\) needs the bodies"),
         ("principal_axes = true\n", "`load` needs complete bodies"),
     ):
         (tmp_path / "e.toml").write_text(ARM + text)

@@ -65,19 +65,14 @@ def demo(
     """
     from jaxid.demo.results import remarks, tables, write_study
     from jaxid.demo.study import run_study
-    from jaxid.experiment.identify_logs import stages
-    from jaxid.report.page import show, show_remarks
+
+    from .printing import show, show_remarks
+    from .progress_bar import progress_bar
 
     console = options.start(output=output, force=force)
-    with stages(options.open_console(stderr=True)) as stage:
-
-        def progress(name: str, fraction: float) -> None:
-            if fraction == 0.0:
-                stage(name)
-            stage.through(fraction)
-
+    with progress_bar(options.open_console(stderr=True)) as progress:
         study = run_study(seed, progress)
-        stage("writing the report")
+        progress("writing the report", 0.0)
         files = write_study(output, study)
     show(console, *tables(study))
     show_remarks(console, remarks(study))
@@ -121,8 +116,9 @@ def init(
     """
     options.start(urdf)
     from jaxid.experiment.template import write_template
-    from jaxid.report.page import show_remarks
     from jaxid.robot.urdf import load_urdf
+
+    from .printing import show_remarks
 
     text = write_template(urdf, tip=tip, base=base)
     show_remarks(
@@ -145,10 +141,6 @@ def excite(
     resume: Annotated[
         bool, typer.Option("--resume", help="Go on with the motion that was written.")
     ] = False,
-    all_criteria: Annotated[
-        bool,
-        typer.Option("--all-criteria", help="Show what each of the criteria buys."),
-    ] = False,
 ) -> None:
     """Design the motion to record, within the limits of the joints.
 
@@ -162,7 +154,7 @@ def excite(
     from . import commands
 
     options.refuse_foreign_table(output)
-    commands.excite(console, experiment, output, resume, time, all_criteria)
+    commands.excite(console, experiment, output, resume, time)
 
 
 @app.command()
@@ -275,22 +267,11 @@ def export(
     console = options.start(report, *([urdf] if urdf else []))
     from . import commands
 
-    endings = {"mjcf": ".xml", "pinocchio": "_pinocchio.json"}
-    path = Path(f"arm{endings.get(to, f'.{to}')}") if output is None else output
-    made = [path, path.with_suffix(".h")] if to == "c" else [path]
-    if to == "c" and path.suffix != ".c":
-        raise InputError(f"`--output` must be a C file like arm.c, but is `{path}`.")
-    for one in made:
-        if one.is_dir():
-            raise InputError(f"`{one}` is a folder: choose another `--output`.")
-        if one.exists() and not force:
-            raise InputError(
-                f"`{one}` is there already: choose another `--output`, or `--force`."
-            )
-    chain = {"tip": tip, "base": base}
-    commands.export(report, to, path, urdf, chain, not single, force)
+    path = output or Path(commands.EXPORTS[to])
+    files = commands.export(report, to, path, urdf, tip, base, not single, force)
     console.print()
-    console.print(Text(f"wrote {path.parent}: {', '.join(x.name for x in made)}"))
+    names = ", ".join(file.name for file in files)
+    console.print(Text(f"wrote {path.parent}: {names}"))
 
 
 @app.command()

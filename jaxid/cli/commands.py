@@ -1,10 +1,8 @@
 """Work of the commands for an experiment and its logs, and what they print."""
 
 import dataclasses
-import functools
-import os
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import typer
@@ -12,20 +10,9 @@ from rich.console import Console
 from rich.text import Text
 
 from jaxid.errors import InputError
-from jaxid.excitation.criteria import CRITERIA
-from jaxid.excitation.design import DesignProgress
-from jaxid.experiment import choose as choosing, identify_logs
-from jaxid.experiment.excitation import (
-    compare_criteria,
-    design_motion,
-    play,
-    prepare_design,
-    write_design,
-    write_motion,
-)
+from jaxid.experiment.decoder import within
 from jaxid.experiment.experiment import Experiment, load_experiment
-from jaxid.experiment.robot_tables import joint_number
-from jaxid.experiment.rollout_logs import identify_rollouts
+from jaxid.experiment.experiment_variants import variants
 from jaxid.experiment.template import toml_text
 from jaxid.export import (
     export_c,
@@ -34,83 +21,70 @@ from jaxid.export import (
     export_pinocchio,
     export_urdf,
 )
-from jaxid.identification.drive_gains import identify_drive_gains
 from jaxid.identification.fit_result import Fit
-from jaxid.identification.identify import identify as estimate
-from jaxid.identification.operating_states import identify_states
 from jaxid.identification.parameter_changes import compare as compare_fits
-from jaxid.identification.payload import (
-    CENTRAL_NAMES,
-    CENTRAL_UNITS,
-    identify_payload,
-)
+from jaxid.identification.payload import Payload
 from jaxid.io import require_writable, write_text
-from jaxid.report.excitation import headline, ordered, plan_remarks, side_by_side_table
+from jaxid.report.excitation import headline, ordered, plan_remarks
 from jaxid.report.identification import body_table, motor_tables, residual_table
-from jaxid.report.page import show, show_files, show_remarks
-from jaxid.report.result_files import (
-    read_faults,
-    read_fit,
-    write_comparison,
-    write_estimates,
-    write_report,
+from jaxid.report.result_files import read_faults, read_fit, write_comparison
+from jaxid.result_table import Remark, Status, significant
+from jaxid.robot.robot import Robot
+from jaxid.trajectory.trajectory import LinearTrajectory
+from jaxid.workflow.log_identification import IdentificationReport, identify_logs
+from jaxid.workflow.log_inspection import inspect_logs
+from jaxid.workflow.log_rollout import identify_rollout_logs
+from jaxid.workflow.motion_design import (
+    MotionTask,
+    design_motion,
+    prepare_motion,
+    write_design,
 )
-from jaxid.result_table import Remark, Status, Table, significant
-from jaxid.robot.inertia import INERTIAL_NAMES, INERTIAL_UNITS
-from jaxid.validation.verdict import verdict
+from jaxid.workflow.motion_files import make_playable, write_motion
+from jaxid.workflow.repeated_runs import (
+    RunsReport,
+    identify_gains_logs,
+    identify_payload_logs,
+    identify_states_logs,
+)
+from jaxid.workflow.robot_file import joint_number
+from jaxid.workflow.setup_choice import choose_setup
 
 from . import process
 from .options import command_line, open_console
+from .printing import show, show_files, show_remarks
+from .progress_bar import progress_bar
 
-STOPPED = 130
-"""Exit code of a command that Ctrl-C has ended, as shells expect it."""
+EXPORTS = {
+    "c": "arm.c",
+    "urdf": "arm.urdf",
+    "mjcf": "arm.xml",
+    "json": "arm.json",
+    "pinocchio": "arm_pinocchio.json",
+    "jax": "arm.jax",
+}
+"""Formats of `jaxid export`, and the file where none is named."""
+TITLE_OF_TOOL = "to subtract it from other logs, in the experiment file:"
+TITLE_OF_GAINS = "to use them, in the experiment file:"
 UNUSABLE = 3
 """Exit code if the verdict is that a model must not be used, or a motion not be recorded."""
 
 
 def inspect(console: Console, path: Path, logs: list[Path]) -> None:
     """Show what can be identified, and if logs are sane."""
-    experiment, examined = load_experiment(path), []
-    with identify_logs.stages(open_console(stderr=True)) as stage:
-        stage("finding base parameters")
-        _ = experiment.base.expressions
-        experiment, _ = identify_logs.select_filter(experiment, logs, stage)
-        for log in logs:
-            _, observations, diagnosis = identify_logs.load_log(experiment, log, stage)
-            stage(f"factorising {log.name}")
-            estimator = experiment.estimation.plain
-            fit = estimate(experiment.base, observations, estimator, stage.through)
-            stage(f"looking for mistakes in {log.name}")
-            examined.append((diagnosis.with_fit(fit, experiment.commanded(log)), fit))
-    robot = experiment.robot
-    show(console, robot.summary(), *motor_tables(robot), experiment.base.summary())
-    show_remarks(console, experiment.notes)
-    for diagnosis, fit in examined:
-        table = Table("", facts=fit.facts, remarks=fit.determination)
-        show(console, diagnosis.summary(), table)
-
-
-def _check_logs(logs: list[Path], verify: list[Path], split: float | None) -> None:
-    """Reject logs that would count twice, or verify a model that has seen them."""
-    if split is not None and not 0 < split < 1:
-        raise InputError(
-            f"`--split` must lie between 0 and 1, like 0.6, but is {split:g}."
-        )
-    places = [os.path.realpath(p) for p in logs]
-    repeated = next((p for k, p in enumerate(logs) if places[k] in places[:k]), None)
-    if repeated is not None:
-        raise InputError(f"`{repeated}` is given twice: its rows would count double.")
-    both = set(places) & {os.path.realpath(p) for p in verify}
-    if both:
-        raise InputError(
-            f"`{Path(sorted(both)[0]).name}` is given both to identify and to verify "
-            "with: use "
-            "`--split`."
-        )
-    if all(map(identify_logs.is_report, logs)):
-        raise InputError(
-            "give at least one log as a file, for torque errors and figures."
-        )
+    experiment = load_experiment(path)
+    setup = experiment.setup
+    notes, tables = setup.notes, []
+    with progress_bar(open_console(stderr=True)) as progress:
+        progress("finding base parameters", 0.0)
+        base_table = setup.base.summary()
+        if logs:
+            columns = experiment.require_columns(logs)
+            inspection = inspect_logs(setup, logs, columns, progress)
+            notes, tables = inspection.notes, inspection.tables()
+    show(console, setup.robot.summary(), *motor_tables(setup.robot), base_table)
+    show_remarks(console, notes)
+    show(console, *tables)
 
 
 def identify(
@@ -123,36 +97,49 @@ def identify(
     figures: str | None,
 ) -> None:
     """Estimate the parameters and write a report."""
-    _check_logs(logs, verify, split)
-    experiment = load_experiment(path)
-    with identify_logs.stages(open_console(stderr=True)) as stage:
-        report, validation = identify_logs.identify_logs(
-            experiment, logs, verify, split, command_line(), stage
+    if split is not None and not 0 < split < 1:
+        raise InputError(
+            f"`--split` must lie between 0 and 1, like 0.6, but is {split:g}."
         )
-        stage("writing the report")
-        written = write_report(output, report, figures or "")
-    fit, robot = report.fit, experiment.robot
-    tabulated = () if fit.consistency is None else fit.consistency.findings
+    held_out = None if split is None else 1.0 - split
+    experiment = load_experiment(path)
+    columns = experiment.require_columns([*logs, *verify])
+    with progress_bar(open_console(stderr=True)) as progress:
+        report = identify_logs(
+            experiment.setup, logs, columns, held_out, verify, progress
+        )
+        settings = {"experiment": str(path), **origin(experiment), **report.settings}
+        report = dataclasses.replace(report, settings=settings)
+        progress("writing the report", 0.0)
+        files = report.save(output, figures or "")
+    show_identification(console, report)
+    show_files(console, output, [file.name for file in files])
+    if report.verdict.status is Status.BAD:
+        raise typer.Exit(UNUSABLE)
+
+
+def show_identification(console: Console, report: IdentificationReport) -> None:
+    """Print the tables of an identification, and what its verdict asks to look at."""
+    fit = report.fit
+    robot = fit.base.model.robot
     show(console, robot.summary(), *motor_tables(robot))
-    show_remarks(
-        console, [*report.notes, *(n for n in fit.notes if n not in tabulated)]
-    )
+    tabulated = () if fit.consistency is None else fit.consistency.findings
+    fit_notes = [note for note in fit.notes if note not in tabulated]
+    show_remarks(console, [*report.notes, *fit_notes])
     show(console, fit.summary())
     if fit.residual_spectra is not None:
         show(console, residual_table(fit.residual_spectra, robot))
     if fit.consistency is not None:
         show(console, body_table(fit.consistency, robot.joint_names))
-    show(console, validation.summary())
-    judged = verdict(report)
-    marked = (r for r in judged[1:] if r.status in (Status.DOUBTFUL, Status.BAD))
-    show_remarks(console, [judged[0], *marked])
-    show_files(console, output, [p.name for p in written])
-    if judged[0].status is Status.BAD:
-        raise typer.Exit(UNUSABLE)
+    show(console, report.validation.summary())
+    verdict, *criteria = report.judgement
+    marked = [x for x in criteria if x.status in (Status.DOUBTFUL, Status.BAD)]
+    show_remarks(console, [verdict, *marked])
 
 
-def _doubts(texts: Any) -> list[Remark]:
-    return [Remark(text, Status.DOUBTFUL) for text in texts]
+def origin(experiment: Experiment) -> dict[str, str]:
+    """Return command and experiment file of a report, for those who repeat it."""
+    return {"command": command_line(), "experiment_text": experiment.text}
 
 
 def excite(
@@ -161,50 +148,38 @@ def excite(
     output: Path,
     resume: bool,
     seconds: float | None,
-    all_criteria: bool,
 ) -> None:
     """Design a motion; the best one so far is written whenever there is a better one."""
-    experiment, errors = load_experiment(path), open_console(stderr=True)
-    written = output.with_suffix(".json") if resume else None
-    if written is not None and not written.is_file():
-        raise InputError(
-            f"`{written}` is not there: `--resume` needs a motion to go on with."
+    experiment = load_experiment(path)
+    earlier_design = None
+    if resume:
+        earlier_design = output.with_suffix(".json")
+        if not earlier_design.is_file():
+            raise InputError(
+                f"`{earlier_design}` is not there: `--resume` needs a motion to go on "
+                "with."
+            )
+    with within("excitation", path.name):
+        task = prepare_motion(
+            experiment.setup,
+            experiment.excitation,
+            experiment.surroundings,
+            earlier_design,
         )
-    preparation = prepare_design(experiment, written)
-    faults = preparation.faults(experiment)
-    show_remarks(errors, [Remark(text, Status.BAD) for text in faults])
-    motion = _BestMotion(experiment, output, faults)
-    with process.handing_over(motion.farewell), identify_logs.stages(errors) as stage:
-        try:
-            keep = functools.partial(motion.keep, stage)
-            design = design_motion(experiment, preparation, keep, seconds)
-        except KeyboardInterrupt:
-            errors.print(Text(f"jaxid: {motion.farewell()}."), soft_wrap=True)
-            raise typer.Exit(STOPPED) from None
-        stage("writing the report")
-        files = write_design(experiment, design, output, command_line())
+    errors = open_console(stderr=True)
+    show_remarks(errors, [Remark(text, Status.BAD) for text in task.faults])
+    best_motion = _BestMotion(task, output)
+    with process.handing_over(best_motion.farewell), progress_bar(errors) as progress:
+        with within("excitation", path.name):
+            design = design_motion(task, progress, best_motion.keep, seconds)
+        progress("writing the report", 0.0)
+        files = write_design(task, design, output, **origin(experiment))
     show(console, *design.plan.tables())
     verdict = headline(design.plan, design.remarks)
-    show_remarks(
-        console, [*ordered((*plan_remarks(design.plan), *design.remarks)), verdict]
-    )
-    show_files(
-        console, output.parent, [str(p.relative_to(output.parent)) for p in files]
-    )
-    if all_criteria and not design.plan.interrupted:
-        with identify_logs.stages(errors) as stage:
-            plans = compare_criteria(
-                experiment, functools.partial(_show_progress, stage)
-            )
-        if plans:
-            show(console, side_by_side_table(plans))
-        done = sum(not plan.interrupted for plan in plans)
-        if done < len(CRITERIA):
-            show_remarks(
-                console, _doubts([f"stopped after {done} of {len(CRITERIA)} criteria"])
-            )
-    if design.plan.interrupted:
-        raise typer.Exit(STOPPED)
+    remarks = ordered((*plan_remarks(design.plan), *design.remarks))
+    show_remarks(console, [*remarks, verdict])
+    names = [str(file.relative_to(output.parent)) for file in files]
+    show_files(console, output.parent, names)
     if verdict.status is Status.BAD:
         raise typer.Exit(UNUSABLE)
 
@@ -212,36 +187,29 @@ def excite(
 class _BestMotion:
     """The best motion of a search so far, in its files."""
 
-    def __init__(self, experiment: Experiment, output: Path, faults: tuple[str, ...]):
-        self._experiment, self._output, self._faults = experiment, output, faults
-        self._value = np.inf
+    def __init__(self, task: MotionTask, output: Path):
+        self._task = task
+        self._output = output
+        self._is_written = False
 
-    def keep(self, stage: identify_logs.Stages, now: DesignProgress) -> None:
-        """Show the progress of a design, and write every better motion."""
-        _show_progress(stage, now)
-        if now.feasible and now.best < self._value:
-            write_motion(
-                self._experiment, play(self._experiment, now.trajectory), self._output
-            )
-            self._value = now.best
+    def keep(self, motion: LinearTrajectory) -> None:
+        """Write a better motion."""
+        robot, excitation = self._task.setup.robot, self._task.excitation
+        playable = make_playable(robot, excitation, motion)
+        write_motion(robot, excitation, playable, self._output)
+        self._is_written = True
 
     def farewell(self) -> str:
-        """Return what is said when Ctrl-C ends the search."""
-        if self._value == np.inf:
+        """Return the sentence with which Ctrl-C ends the search."""
+        if not self._is_written:
             return "stopped before a motion kept all limits, and nothing was written"
-        unchecked = f"; NOT CHECKED: {'; '.join(self._faults)}" if self._faults else ""
+        faults = self._task.faults
+        unchecked = f"; NOT CHECKED: {'; '.join(faults)}" if faults else ""
         return (
             f"stopped: `{self._output}` and the files beside it hold the best motion "
-            "so far, which "
-            f"keeps all limits that were checked{unchecked}; `--resume` goes on with it"
+            f"so far, which keeps all limits that were checked{unchecked}; `--resume` "
+            "goes on with it"
         )
-
-
-def _show_progress(stage: identify_logs.Stages, now: DesignProgress) -> None:
-    """Show the progress of a design, or end it after a signal."""
-    if process.STOP.is_set():
-        raise KeyboardInterrupt
-    stage.design(now)
 
 
 def export(
@@ -249,36 +217,61 @@ def export(
     to: str,
     path: Path,
     urdf: Path | None,
-    chain: dict[str, Any],
+    tip: str | None,
+    base: str | None,
     double: bool,
     force: bool,
-) -> None:
-    """Write the model of a report in a format; an unusable one only by force."""
+) -> list[Path]:
+    """Write the model of a report in a format, an unusable one only by force; return the files."""
+    files = [path, path.with_suffix(".h")] if to == "c" else [path]
+    _require_free(files, to, force)
     require_writable(path.parent)
-    fit, faults = read_fit(report), read_faults(report)
+    faults = read_faults(report)
     if faults and not force:
         raise InputError(
             f"the verdict of `{report}` is that its model must not be used: "
-            f"{faults[0]} Mend "
-            "that first, or write it nonetheless with `--force`."
+            f"{faults[0]} Mend that first, or write it nonetheless with `--force`."
         )
-    if to == "c":
-        export_c(fit, path.parent, name=path.stem, double=double)
-    elif to == "urdf":
-        own = Path(fit.base.model.robot.source) if urdf is None else urdf
-        known = own.suffix in (".urdf", ".xacro", ".xml") and own.is_file()
-        if urdf is None and not known:
+    fit = read_fit(report)
+    match to:
+        case "c":
+            export_c(fit, path.parent, name=path.stem, double=double)
+        case "urdf":
+            export_urdf(fit, urdf or _own_urdf(fit), path, tip=tip, base=base)
+        case "mjcf":
+            export_mjcf(fit, path)
+        case "pinocchio":
+            export_pinocchio(fit, path)
+        case "jax":
+            export_jax(fit, path)
+        case "json":
+            fit.save(path)
+    return files
+
+
+def _require_free(files: Sequence[Path], to: str, force: bool) -> None:
+    """Reject files of an export that are there already, or have a wrong suffix."""
+    if to == "c" and files[0].suffix != ".c":
+        raise InputError(
+            f"`--output` must be a C file like arm.c, but is `{files[0]}`."
+        )
+    for file in files:
+        if file.is_dir():
+            raise InputError(f"`{file}` is a folder: choose another `--output`.")
+        if file.exists() and not force:
             raise InputError(
-                "`--to urdf` changes the robot's own file: name it with `--urdf`."
+                f"`{file}` is there already: choose another `--output`, or `--force`."
             )
-        export_urdf(fit, own, path, **chain)
-    else:
-        writers = {
-            "mjcf": export_mjcf,
-            "pinocchio": export_pinocchio,
-            "jax": export_jax,
-        }
-        writers.get(to, Fit.save)(fit, path)
+
+
+def _own_urdf(fit: Fit) -> Path:
+    """Return the file that the robot of a fit was read from."""
+    source = Path(fit.base.model.robot.source)
+    if source.suffix not in (".urdf", ".xacro", ".xml") or not source.is_file():
+        raise InputError(
+            "`--to urdf` changes the robot's own file: name it with `--urdf`."
+        )
+    return source
 
 
 def compare(
@@ -294,15 +287,17 @@ def compare(
 
 def choose(console: Console, path: Path, logs: list[Path], output: Path) -> None:
     """Choose a model, print the table, and write the experiment file."""
-    _check_logs(logs, [], None)
     experiment = load_experiment(path)
     if output.parent.resolve() != path.parent.resolve():
         raise InputError(
             "`--output` must lie beside the experiment file: its paths count from it."
         )
-    with identify_logs.stages(open_console(stderr=True)) as stage:
-        choice, text = choosing.choose(experiment, logs, stage)
-    write_text(output, text)
+    columns = experiment.require_columns(logs)
+    experiments = variants(experiment)
+    setups = {name: variant.setup for name, variant in experiments.items()}
+    with progress_bar(open_console(stderr=True)) as progress:
+        choice = choose_setup(setups, logs, columns, progress)
+    write_text(output, experiments[choice.chosen.name].text)
     show(console, choice.summary())
     show_files(console, output.parent, [output.name])
 
@@ -318,37 +313,30 @@ def payload(
 ) -> None:
     """Find a payload, and print the table of the experiment file that subtracts it."""
     experiment = load_experiment(path)
-    carrier = None if body is None else joint_number(experiment.robot, body, "--body")
-    (empty, full), doubts = _pair(experiment, logs, loaded)
-    found = identify_payload(empty, full, body=carrier, mass=mass)
-    name = experiment.robot.joint_names[found.body]
-    keys = ("mass", "centre_of_mass", "inertia", "estimate", "distance")
-    content = {"body": name, **{key: getattr(found, key) for key in keys}}
-    sources = {"unloaded": logs, "loaded": loaded}
-    rows = (INERTIAL_NAMES, INERTIAL_UNITS, found.parameters, found.uncertainty)
-    central = (CENTRAL_NAMES, CENTRAL_UNITS, *found.central)
-    doubts = _doubts(doubts)
-    tables = [found.summary()]
-    files = write_estimates(
-        output, "payload", [rows, central], content, sources, tables, doubts
-    )
-    show(console, *tables)
-    show_remarks(console, doubts)
-    upper = [(k, i) for k in range(3) for i in range(k, 3)]
-    inertia = ", ".join(
-        f"{'xyz'[k]}{'xyz'[i]} = {found.inertia[k, i]:.6g}" for k, i in upper
-    )
-    lines = [
+    robot = experiment.setup.robot
+    carrier = None if body is None else joint_number(robot, body, "--body")
+    columns = experiment.require_columns([*logs, *loaded])
+    with progress_bar(open_console(stderr=True)) as progress:
+        report = identify_payload_logs(
+            experiment.setup, logs, loaded, columns, carrier, mass, progress
+        )
+    lines = tool_lines(report.result, robot)
+    show_runs(console, report, output, TITLE_OF_TOOL, lines)
+
+
+def tool_lines(payload: Payload, robot: Robot) -> list[str]:
+    """Return the table of an experiment file that subtracts a payload."""
+    entries = []
+    for i, j in zip(*np.triu_indices(3), strict=True):
+        entries.append(f"{'xyz'[i]}{'xyz'[j]} = {payload.inertia[i, j]:.6g}")
+    centre = [f"{value:.6g}" for value in payload.centre_of_mass]
+    return [
         "[robot.tool]",
-        f"body = {toml_text(name)}",
-        f"mass = {found.mass:.6g}",
-        f"centre_of_mass = [{', '.join(f'{v:.6g}' for v in found.centre_of_mass)}]",
-        f"inertia = {{ {inertia} }}",
+        f"body = {toml_text(robot.joint_names[payload.body])}",
+        f"mass = {payload.mass:.6g}",
+        f"centre_of_mass = [{', '.join(centre)}]",
+        f"inertia = {{ {', '.join(entries)} }}",
     ]
-    _show_lines(
-        console, "to subtract it from other logs, in the experiment file:", lines
-    )
-    show_files(console, output, [p.name for p in files])
 
 
 def gains(
@@ -365,100 +353,57 @@ def gains(
             f"{path.name}: the table `[load]` is missing: it describes the load "
             "behind `--loaded`."
         )
-    (empty, full), doubts = _pair(experiment, logs, loaded)
-    found = identify_drive_gains(empty, full, experiment.load)
-    # The key of the file that corrects forces, and its values.
-    columns, key, known = experiment.columns, "force_gains", None
-    if columns is not None:
-        key = "force_gains" if columns.torque_constants is None else "torque_constants"
-        known = getattr(columns, key)
-    values = (
-        np.array(1.0 if known is None else known) * np.asarray(found.gains)
-    ).tolist()
-    sources = {"unloaded": logs, "loaded": loaded}
-    names = found.joint_names
-    rows = (names, ("1",) * len(names), found.gains, found.uncertainty)
-    doubts = _doubts(doubts)
-    tables = [found.summary()]
-    files = write_estimates(
-        output, "gains", [rows], {key: values}, sources, tables, doubts
-    )
-    show(console, *tables)
-    show_remarks(console, doubts)
-    shown = ", ".join(significant(v, 5) for v in values)
-    lines = ["[recording]", f"{key} = [{shown}]"]
-    _show_lines(console, "to use them, in the experiment file:", lines)
-    show_files(console, output, [p.name for p in files])
+    columns = experiment.require_columns([*logs, *loaded])
+    with progress_bar(open_console(stderr=True)) as progress:
+        report = identify_gains_logs(
+            experiment.setup, logs, loaded, columns, experiment.load, progress
+        )
+    ((key, values),) = report.content.items()
+    digits = ", ".join(significant(value, 5) for value in values)
+    lines = ["[recording]", f"{key} = [{digits}]"]
+    show_runs(console, report, output, TITLE_OF_GAINS, lines)
 
 
 def states(console: Console, path: Path, logs: list[Path], output: Path) -> None:
     """Fit several states of a robot at once: one inertia, friction for each."""
     experiment = load_experiment(path)
-    names = [Path(os.path.realpath(log)).stem for log in logs]
-    if len(set(names)) < max(len(names), 2):
-        raise InputError(
-            "give one log or report for each of two or more states, with different "
-            "names."
-        )
-    with identify_logs.stages(open_console(stderr=True)) as stage:
-        runs, doubts = identify_logs.read_runs(
-            experiment, [[log] for log in logs], names, stage
-        )
-    found = identify_states(runs)
-    chance = found.sharing[1]
-    content = {
-        "states": found.states,
-        "shared": [found.base.names[k] for k in found.shared],
-        "varying": [found.base.names[k] for k in found.varying],
-        "sharing_chance": chance,
-    }
-    rows = (found.names, found.units, found.parameters, found.uncertainty)
-    if chance < 0.01:
-        doubts.append(
-            "the states do not agree on what they share (chance "
-            f"{100 * chance:.2g} %): something else than friction and offsets differs"
-        )
-    comparisons = [found.compare(names[0], other) for other in names[1:]]
-    pairs = [(c.group_summary(), c.summary()) for c in comparisons]
-    tables = [found.summary(), *(table for pair in pairs for table in pair)]
-    said, sources = _doubts(doubts), {"states": logs}
-    files = write_estimates(output, "states", [rows], content, sources, tables, said)
-    show(console, tables[0])
-    show_remarks(console, said)
-    show(console, *tables[1:])
-    show_files(console, output, [p.name for p in files])
+    columns = experiment.require_columns(logs)
+    with progress_bar(open_console(stderr=True)) as progress:
+        report = identify_states_logs(experiment.setup, logs, columns, progress)
+    show_runs(console, report, output)
+
+
+def show_runs(
+    console: Console,
+    report: RunsReport,
+    output: Path,
+    title: str = "",
+    lines: Sequence[str] = (),
+) -> None:
+    """Write and print the result of several runs, and lines for the experiment file."""
+    files = report.save(output)
+    table, *details = report.tables()
+    show(console, table)
+    show_remarks(console, report.remarks)
+    show(console, *details)
+    if lines:
+        console.print(Text("\n".join(["", title, *lines])), soft_wrap=True)
+    show_files(console, output, [file.name for file in files])
 
 
 def rollout(
     console: Console, path: Path, logs: list[Path], verify: list[Path], output: Path
 ) -> None:
     """Identify so that simulations follow the positions, and write the report."""
-    _check_logs(logs, verify, None)
     experiment = load_experiment(path)
-    with identify_logs.stages(open_console(stderr=True)) as stage:
-        report = identify_rollouts(experiment, logs, verify, command_line(), stage)
-        stage("writing the report")
-        written = report.write(output)
+    columns = experiment.require_columns([*logs, *verify])
+    with progress_bar(open_console(stderr=True)) as progress:
+        report = identify_rollout_logs(
+            experiment.setup, logs, columns, experiment.rollout, verify, progress
+        )
+        report = dataclasses.replace(report, settings=origin(experiment))
+        progress("writing the report", 0.0)
+        files = report.write(output)
     show(console, *report.tables())
     show_remarks(console, [report.verdict])
-    show_files(console, output, [p.name for p in written])
-
-
-def _pair(
-    experiment: Experiment, logs: list[Path], loaded: list[Path]
-) -> tuple[list[Fit], list[str]]:
-    twice = {os.path.realpath(p) for p in logs} & {os.path.realpath(p) for p in loaded}
-    if twice:
-        raise InputError(
-            f"`{Path(sorted(twice)[0]).name}` is given both without and with the "
-            "load: name it "
-            "once."
-        )
-    with identify_logs.stages(open_console(stderr=True)) as stage:
-        return identify_logs.read_runs(
-            experiment, [logs, loaded], ["unloaded", "loaded"], stage
-        )
-
-
-def _show_lines(console: Console, text: str, lines: list[str]) -> None:
-    console.print(Text("\n".join(["", text, *lines])), soft_wrap=True)
+    show_files(console, output, [file.name for file in files])

@@ -74,10 +74,10 @@ def start(*reads: Path, output: Path | None = None, force: bool = False) -> Cons
     """Turn on double precision and the cache of compiled code; return the terminal."""
     missing = [f"`{path}`" for path in reads if not path.exists()]
     if missing:
-        words = (
-            "is no file or folder" if len(missing) == 1 else "are no files or folders"
-        )
-        raise InputError(f"{', '.join(missing)} {words}: check the path.")
+        verb = "is no file or folder"
+        if len(missing) > 1:
+            verb = "are no files or folders"
+        raise InputError(f"{', '.join(missing)} {verb}: check the path.")
     import jax
 
     from jaxid.io import require_writable

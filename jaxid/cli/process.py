@@ -17,8 +17,6 @@ import traceback
 from collections.abc import Callable, Iterator
 from typing import NoReturn
 
-STOP = threading.Event()
-"""Set when a signal has asked the command to stop."""
 _farewells: list[Callable[[], str]] = []
 
 
@@ -58,7 +56,6 @@ def main() -> NoReturn:
         (number,) = received.args
         for again in (signal.SIGINT, signal.SIGTERM):
             signal.signal(again, lambda *_: os._exit(128 + number))
-        STOP.set()
         # Files that belong together take their places together, for a second at most.
         lock = getattr(sys.modules.get("jaxid.io"), "PLACING", None)
         _ = lock is None or lock.acquire(timeout=1.0)
@@ -79,11 +76,7 @@ def _code() -> int:
 
         main()
     except SystemExit as stopped:
-        return (
-            stopped.code
-            if isinstance(stopped.code, int)
-            else int(stopped.code is not None)
-        )
+        return int(stopped.code or 0)
     except BaseException:
         traceback.print_exc()
         return 1

@@ -6,16 +6,14 @@ init` prints. The function may be a class of the package. Of other functions, ar
 before the `*` come from elsewhere and are no keys.
 """
 
-import dataclasses
 import difflib
 import inspect
 import json
 import math
 import re
 import typing
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from operator import ge, gt, le, lt
 from typing import Annotated, Any, Literal, NamedTuple
 
 import jaxtyping
@@ -24,53 +22,10 @@ import numpy as np
 from jaxid.errors import InputError
 from jaxid.io import union_members
 from jaxid.units import Unit, unit
+from jaxid.workflow.allowed_values import OneOf, quoted
 
 LARGEST = 1e12
 """Largest number of a key, infinity apart, in any unit."""
-RENAMED = {"rows.slow": "min_speed", "rows.every": "step", "collision.ground": "floor"}
-"""Old keys and their new names."""
-
-
-class Bounds(NamedTuple):
-    """Range of a number, given as `Annotated[float, Bounds(above=0.0)]`; None for no bound."""
-
-    above: float | None = None  # exclusive lower bound
-    least: float | None = None  # inclusive lower bound
-    most: float | None = None  # inclusive upper bound
-    below: float | None = None  # exclusive upper bound
-
-    def check(self, value: float | int, place: str) -> None:
-        """Reject a number out of the range, NaN and infinity."""
-        if not math.isfinite(value):
-            raise InputError(f"`{place}` must be finite, but is {value}.")
-        rules = (("above", gt), ("at least", ge), ("at most", le), ("below", lt))
-        for bound, (words, holds) in zip(self, rules, strict=True):
-            if bound is not None and not holds(value, bound):
-                raise InputError(
-                    f"`{place}` must be {words} {bound:.10g}, but is {value}."
-                )
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class OneOf:
-    """Names that a text may have, given as `Annotated[str, OneOf(CRITERIA)]`."""
-
-    names: Collection[str]
-
-    def check(self, value: str, place: str) -> None:
-        """Reject a text that is none of the names."""
-        if value not in self.names:
-            shown = json.dumps(value, ensure_ascii=False)
-            raise InputError(f"`{place}` must be {quoted(self.names)}, but is {shown}.")
-
-
-Positive = Annotated[float, Bounds(above=0.0)]
-Magnitude = Annotated[float, Bounds(least=0.0)]
-Fraction = Annotated[float, Bounds(above=0.0, below=1.0)]
-Finite = Annotated[float, Bounds()]
-Count = Annotated[int, Bounds(least=1, most=10_000)]
-Vector = tuple[Finite, Finite, Finite]
-PerJoint = list[float]
 
 
 class Key(NamedTuple):
@@ -84,28 +39,29 @@ class Key(NamedTuple):
 
 def keys_of(function: Callable) -> dict[str, Key]:
     """Return the keys of a table that calls a function or class."""
+    texts = descriptions(function)
+    # Converters widen the annotations of arguments; those of the fields say what is
+    # meant.
+    hints = typing.get_type_hints(function, include_extras=True)
+    keys = {}
+    for argument in inspect.signature(function, eval_str=True).parameters.values():
+        name = argument.name
+        if isinstance(function, type) or argument.kind is argument.KEYWORD_ONLY:
+            hint = hints.get(name, argument.annotation)
+            keys[name] = Key(name, hint, argument.default, texts.get(name, ""))
+    return keys
+
+
+def descriptions(function: Callable) -> dict[str, str]:
+    """Return the descriptions of arguments or attributes in a docstring, by their names."""
+    text = inspect.getdoc(function) or ""
     sections = re.findall(
-        r"^(?:Args|Attributes):\n((?:    .*\n?|\n)+)",
-        inspect.getdoc(function) or "",
-        flags=re.M,
+        r"^(?:Args|Attributes):\n((?:    .*\n?|\n)+)", text, flags=re.M
     )
     entries = re.findall(
         r"^    (\w+): ((?:.*\n?)(?:        .*\n?)*)", "\n".join(sections), re.M
     )
-    texts = {name: " ".join(text.split()) for name, text in entries}
-    parameters = inspect.signature(function, eval_str=True).parameters.values()
-    kept = (
-        p for p in parameters if isinstance(function, type) or p.kind is p.KEYWORD_ONLY
-    )
-    # Converters widen the annotations of arguments; those of the fields say what is
-    # meant.
-    fields = typing.get_type_hints(function, include_extras=True)
-    return {
-        p.name: Key(
-            p.name, fields.get(p.name, p.annotation), p.default, texts.get(p.name, "")
-        )
-        for p in kept
-    }
+    return {name: " ".join(words.split()) for name, words in entries}
 
 
 def call(function: Callable, table: Any, place: str, *context: Any) -> Any:
@@ -137,35 +93,51 @@ def decode(
     Arguments in `skip` are no keys; keys without default are needed where the table is
     `complete`.
     """
-    groups = [{k: v for k, v in keys_of(f).items() if k not in skip} for f in functions]
-    known = {name: key for keys in groups for name, key in keys.items()}
-    check_names(table, list(known), place)
-    needed = (n for n, key in known.items() if key.default is inspect.Parameter.empty)
-    missing = next((name for name in needed if name not in table), None)
-    if missing and complete:
-        table_name = re.sub(r"\[\d+\]", "", place)
-        raise InputError(f"`{place}.{missing}` is missing: `[{table_name}]` needs it.")
+    keys: dict[str, Key] = {}
+    for function in functions:
+        keys |= keys_of(function)
+    for name in skip:
+        keys.pop(name, None)
+    check_names(table, list(keys), place)
+    if complete:
+        _require_keys(keys, table, place)
     values = {
-        n: decode_value(v, known[n].hint, f"{place}.{n}") for n, v in table.items()
+        name: decode_value(value, keys[name].hint, f"{place}.{name}")
+        for name, value in table.items()
     }
-    return [{n: values[n] for n in keys if n in values} for keys in groups]
+    groups = []
+    for function in functions:
+        names = keys_of(function).keys() & values.keys()
+        groups.append({name: values[name] for name in names})
+    return groups
+
+
+def _require_keys(keys: dict[str, Key], table: dict[str, Any], place: str) -> None:
+    """Reject a table that lacks a key without default."""
+    for name, key in keys.items():
+        if key.default is inspect.Parameter.empty and name not in table:
+            table_name = re.sub(r"\[\d+\]", "", place)
+            raise InputError(f"`{place}.{name}` is missing: `[{table_name}]` needs it.")
 
 
 def check_names(
-    table: dict[str, Any], known: list[str], place: str = "the file"
+    table: dict[str, Any], known_names: list[str], place: str = "the file"
 ) -> None:
     """Reject a key of a table, or a table of the file, that is not known."""
-    name = next((name for name in table if name not in known), None)
-    if name is None:
-        return
-    full = name if place == "the file" else f"{place}.{name}"
-    if full in RENAMED:
-        raise InputError(f"`{full}` was renamed to `{RENAMED[full]}`.")
-    near = difflib.get_close_matches(name, known, n=1, cutoff=0.6)
-    if near:
-        raise InputError(f"`{full}` is no known key: did you mean `{near[0]}`?")
-    where = place if full == name else f"the table `[{place}]`"
-    raise InputError(f"`{full}` is no known key: {where} has {', '.join(known)}.")
+    for name in table:
+        if name in known_names:
+            continue
+        in_file = place == "the file"
+        path = name if in_file else f"{place}.{name}"
+        similar_names = difflib.get_close_matches(name, known_names, n=1, cutoff=0.6)
+        if similar_names:
+            raise InputError(
+                f"`{path}` is no known key: did you mean `{similar_names[0]}`?"
+            )
+        where = place if in_file else f"the table `[{place}]`"
+        raise InputError(
+            f"`{path}` is no known key: {where} has {', '.join(known_names)}."
+        )
 
 
 _OTHER = object()
@@ -174,15 +146,16 @@ _OTHER = object()
 
 def decode_value(value: Any, hint: Any, place: str) -> Any:
     """Return a value of the file as an argument with such an annotation."""
-    options = [o for o in union_members(hint) if o is not type(None)]
+    options = [x for x in union_members(hint) if x is not type(None)]
     for option in options:
-        made = _convert(value, option, place)
-        if made is not _OTHER:
-            return made
+        result = _convert(value, option, place)
+        if result is not _OTHER:
+            return result
     words = dict.fromkeys(_describe(option) for option in options)
-    shown = json.dumps(value, ensure_ascii=False, default=str)
-    came = "a table" if isinstance(value, dict) else shown
-    raise InputError(f"`{place}` must be {' or '.join(words)}, but is {came}.")
+    text = "a table"
+    if not isinstance(value, dict):
+        text = json.dumps(value, ensure_ascii=False, default=str)
+    raise InputError(f"`{place}` must be {' or '.join(words)}, but is {text}.")
 
 
 _SCALARS: dict[Any, tuple[Any, str]] = {
@@ -198,63 +171,78 @@ _SCALARS: dict[Any, tuple[Any, str]] = {
 def _convert(value: Any, option: Any, place: str) -> Any:
     """Return a value as an annotation asks for it, or `_OTHER` if it is of another kind."""
     origin, arguments = typing.get_origin(option), typing.get_args(option)
-    if function := table_of(option):
+    function = table_of(option)
+    if function is not None:
         return call(function, value, place) if isinstance(value, dict) else _OTHER
     if origin is Annotated:
-        made = _convert(value, arguments[0], place)
-        if made is not _OTHER:
-            arguments[1].check(made, place)
-        return made
+        kind, rule = arguments
+        result = _convert(value, kind, place)
+        if result is not _OTHER:
+            rule.check(result, place)
+        return result
     if origin is Literal:
         return value if value in arguments else _OTHER
     if origin in (list, tuple):
         if not isinstance(value, list):
             return _OTHER
-        repeated = origin is list or arguments[-1] is Ellipsis
-        hints = arguments[:1] * len(value) if repeated else arguments
-        if len(hints) != len(value):
-            raise InputError(
-                f"`{place}` must hold {len(hints)} values, but holds {len(value)}."
-            )
-        pairs = enumerate(zip(value, hints, strict=True))
-        return origin(decode_value(x, hint, f"{place}[{k}]") for k, (x, hint) in pairs)
-    if origin is dict:
-        if not isinstance(value, dict):
-            return _OTHER
-        return {
-            k: decode_value(x, arguments[1], f"{place}.{k}") for k, x in value.items()
-        }
-    if option not in _SCALARS:
-        if isinstance(value, str | dict):
-            return _OTHER
-        try:
-            made = np.array(value, np.float64)
-        except (TypeError, ValueError) as error:
-            raise InputError(
-                f"`{place}` must hold numbers, in rows of equal length."
-            ) from error
-        if (np.abs(made[np.isfinite(made)]) > LARGEST).any():
-            raise InputError(f"`{place}`: no quantity is larger than {LARGEST:g}.")
-        return made
-    if not isinstance(value, _SCALARS[option][0]) or isinstance(value, bool) != (
-        option is bool
-    ):
+        is_repeated = origin is list or arguments[-1] is Ellipsis
+        hints = arguments[:1] * len(value) if is_repeated else arguments
+        return origin(_convert_list(value, hints, place))
+    if option in _SCALARS:
+        return _convert_scalar(value, option, place)
+    return _convert_array(value, place)
+
+
+def _convert_list(values: list[Any], hints: Sequence[Any], place: str) -> list[Any]:
+    """Return the values of a list, each by its own annotation."""
+    if len(hints) != len(values):
+        raise InputError(
+            f"`{place}` must hold {len(hints)} values, but holds {len(values)}."
+        )
+    results = []
+    for number, hint in enumerate(hints):
+        results.append(decode_value(values[number], hint, f"{place}[{number}]"))
+    return results
+
+
+def _convert_array(value: Any, place: str) -> Any:
+    """Return numbers as an array."""
+    if isinstance(value, str | dict):
         return _OTHER
-    if option in (int, float) and math.isfinite(value) and abs(value) > LARGEST:
+    try:
+        array = np.array(value, np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            f"`{place}` must hold numbers, in rows of equal length."
+        ) from error
+    finite_numbers = array[np.isfinite(array)]
+    if (np.abs(finite_numbers) > LARGEST).any():
+        raise InputError(f"`{place}`: no quantity is larger than {LARGEST:g}.")
+    return array
+
+
+def _convert_scalar(value: Any, kind: Any, place: str) -> Any:
+    """Return one number, text, unit or truth value."""
+    toml_kinds, _ = _SCALARS[kind]
+    # In Python, but not in TOML, a truth value is a whole number.
+    if not isinstance(value, toml_kinds) or isinstance(value, bool) != (kind is bool):
+        return _OTHER
+    if kind in (int, float) and math.isfinite(value) and abs(value) > LARGEST:
         raise InputError(
             f"`{place}` is {value:g}: no quantity is larger than {LARGEST:g}."
         )
     if isinstance(value, str) and not value.isprintable():
         raise InputError(f"`{place}` holds a control character, {value!a}: remove it.")
-    return unit(value) if option is Unit else option(value)
+    return unit(value) if kind is Unit else kind(value)
 
 
 def table_of(option: Any) -> Callable | None:
     """Return the function of a table: a class, or that of `Annotated[Result, function]`."""
     if typing.get_origin(option) is Annotated:
         return next((x for x in typing.get_args(option)[1:] if callable(x)), None)
-    plain = isinstance(option, type) and typing.get_origin(option) is None
-    return None if not plain or option in _SCALARS or _is_array(option) else option
+    is_class = isinstance(option, type) and typing.get_origin(option) is None
+    is_table = is_class and option not in _SCALARS and not _is_array(option)
+    return option if is_table else None
 
 
 def _is_array(option: Any) -> bool:
@@ -262,21 +250,16 @@ def _is_array(option: Any) -> bool:
 
 
 def _describe(option: Any) -> str:
+    """Return an annotation in words, for messages."""
     origin, arguments = typing.get_origin(option), typing.get_args(option)
     if origin is Annotated and not table_of(option):
-        rule = arguments[1]
-        is_name = isinstance(rule, OneOf)
-        return quoted(rule.names) if is_name else _describe(arguments[0])
+        kind, rule = arguments
+        return quoted(rule.names) if isinstance(rule, OneOf) else _describe(kind)
     if origin is Literal:
         return quoted(arguments)
     if origin in (list, tuple):
         return "a list"
     if _is_array(option):
         return "a number or a list"
-    return _SCALARS.get(option, (None, "a table"))[1]
-
-
-def quoted(values: Iterable[Any]) -> str:
-    """Return values as a sentence lists them: `"a", "b" or "c"`."""
-    words = [f'"{v}"' if isinstance(v, str) else str(v) for v in values]
-    return " or ".join(filter(None, [", ".join(words[:-1]), words[-1]]))
+    _, words = _SCALARS.get(option, (None, "a table"))
+    return words

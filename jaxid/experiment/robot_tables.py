@@ -7,18 +7,20 @@ from typing import Annotated, Any, Literal, cast
 
 import numpy as np
 
-from jaxid.arrays import Float
 from jaxid.errors import InputError
 from jaxid.robot import library
-from jaxid.robot.inertia import INERTIAL_NAMES
 from jaxid.robot.library import from_dh
 from jaxid.robot.limits_and_drives import Limits, per_joint, range_fault
 from jaxid.robot.robot import Robot, Tool
 from jaxid.robot.rotations import rpy_rotation
-from jaxid.robot.urdf import joint_parameters, load_urdf, urdf_parameters
+from jaxid.robot.shapes import HalfSpace
+from jaxid.workflow.allowed_values import Finite, Magnitude, PerJoint, Positive, Vector
+from jaxid.workflow.robot_file import RobotFile, joint_number
 
-from .decoder import Finite, Magnitude, PerJoint, Positive, Vector
-
+MIN_FORCE = 1e-9
+"""Force that is taken for a mistake if a limit is smaller [N m or N]."""
+OWNERS = {"tip": ("urdf", "mjcf"), "base": ("urdf", "mjcf"), "convention": ("dh",)}
+"""Keys of `[robot]` that belong to some sources only."""
 AngleUnit = Literal["rad", "deg"]
 DhRow = tuple[str | None, bool, tuple[float, float, float, float]]
 
@@ -112,16 +114,6 @@ def known_load(
     return on
 
 
-def joint_number(robot: Robot, name: str, key: str = "body") -> int:
-    """Return the index of the joint that a key or an option names."""
-    if name not in robot.joint_names:
-        raise InputError(
-            f"`{key}` must be the name of the joint that moves it "
-            f'({", ".join(robot.joint_names)}), but is "{name}".'
-        )
-    return robot.joint_names.index(name)
-
-
 @dataclasses.dataclass(frozen=True)
 class RobotSource:
     """Place of a robot, and its source: one of `urdf`, `mjcf`, `builtin` and `dh` is needed.
@@ -176,58 +168,60 @@ class RobotSource:
     tool: Annotated[Callable[[Robot], Tool | float], known_load] | None = None
 
     def __post_init__(self) -> None:
-        given = [
-            k for k in ("urdf", "mjcf", "builtin", "dh") if getattr(self, k) is not None
-        ]
-        if len(given) != 1:
-            came = " and ".join(f"`{k}`" for k in given) or "none of them"
+        names = ("urdf", "mjcf", "builtin", "dh")
+        sources = [name for name in names if getattr(self, name) is not None]
+        if len(sources) != 1:
+            shown = " and ".join(f"`{name}`" for name in sources) or "none of them"
             raise InputError(
                 "one of `urdf`, `mjcf`, `builtin` and `dh` is needed, but there is "
-                f"{came}."
+                f"{shown}."
             )
-        owners = {
-            "tip": ("urdf", "mjcf"),
-            "base": ("urdf", "mjcf"),
-            "convention": ("dh",),
-        }
-        for key, owner in owners.items():
-            if getattr(self, key) is not None and given[0] not in owner:
+        (source,) = sources
+        for key, owners in OWNERS.items():
+            if getattr(self, key) is not None and source not in owners:
                 raise InputError(
-                    f"`{key}` belongs to `{owner[0]}`, not to `{given[0]}`: remove it."
+                    f"`{key}` belongs to `{owners[0]}`, not to `{source}`: remove it."
                 )
+
+    def robot_file(self, folder: Path) -> RobotFile | None:
+        """Return the robot's URDF or MJCF file; None for other sources.
+
+        Raises:
+            InputError: If the file is not there.
+        """
+        key = "mjcf" if self.urdf is None else "urdf"
+        name = getattr(self, key)
+        if name is None:
+            return None
+        path = folder / name
+        if not path.is_file():
+            raise InputError(
+                f"`{key}`: `{path}` is no file: paths are relative to this file."
+            )
+        return RobotFile(path, tip=self.tip, base=self.base, **self.placement)
 
     @property
     def placement(self) -> dict[str, Any]:
         """Position and orientation on the ground, as functions take them that make robots."""
-        R = (
-            None
-            if self.base_rotation is None
-            else rpy_rotation(np.deg2rad(self.base_rotation))
-        )
-        return {
-            "base_rotation": R,
-            "base_position": self.base_position or (0.0, 0.0, 0.0),
-        }
+        rotation = None
+        if self.base_rotation is not None:
+            rotation = rpy_rotation(np.deg2rad(self.base_rotation))
+        position = self.base_position or (0.0, 0.0, 0.0)
+        return {"base_rotation": rotation, "base_position": position}
 
     @property
-    def chain(self) -> dict[str, Any]:
-        """Chain in the URDF or MJCF file."""
-        return {"tip": self.tip, "base": self.base}
-
-    @property
-    def file(self) -> str | None:
-        """Path of the URDF or MJCF file."""
-        return self.mjcf if self.urdf is None else self.urdf
+    def base_plane(self) -> HalfSpace:
+        """Solid below the plane on which the robot stands."""
+        rotation, position = self.placement.values()
+        normal = np.array([0.0, 0.0, 1.0]) if rotation is None else rotation[:, 2]
+        height = float(normal @ np.array(position))
+        return HalfSpace("floor", normal=normal, height=height)
 
     def build(self, folder: Path) -> Robot:
         """Return the robot; paths are relative to the folder of the experiment file."""
-        if self.file is not None:
-            path, key = folder / self.file, "mjcf" if self.urdf is None else "urdf"
-            if not path.is_file():
-                raise InputError(
-                    f"`{key}`: `{path}` is no file: paths are relative to this file."
-                )
-            robot = load_urdf(path, **self.chain, **self.placement)
+        robot_file = self.robot_file(folder)
+        if robot_file is not None:
+            robot = robot_file.load()
         elif self.dh is not None:
             robot = from_dh(
                 [numbers for _, _, numbers in self.dh],
@@ -253,48 +247,6 @@ class RobotSource:
         if isinstance(tool, float):
             raise InputError("`robot.tool.centre_of_mass` is missing.")
         return robot if tool is None else robot.replace(tool=tool)
-
-    def parameters(self, folder: Path) -> Float[np.ndarray, "bodies 10"] | None:
-        """Return the bodies' parameters that the robot's file claims; None if there is none.
-
-        Raises:
-            InputError: If the file describes a body that cannot exist.
-        """
-        if self.file is None:
-            return None
-        return np.asarray(urdf_parameters(folder / self.file, **self.chain)).reshape(
-            -1, 10
-        )
-
-    def claims(self, folder: Path) -> dict[str, float]:
-        """Return all that the robot's file claims, by names in a model; nothing without bodies.
-
-        Raises:
-            InputError: If the file describes a body that cannot exist.
-        """
-        bodies = self.parameters(folder)
-        if bodies is None or not np.any(bodies):
-            return {}
-        return named(bodies) | self.joint_parameters(folder)
-
-    def joint_parameters(self, folder: Path) -> dict[str, float]:
-        """Return rotor inertias and friction that the file claims, by their names in a model."""
-        if self.file is None:
-            return {}
-        claimed = joint_parameters(folder / self.file, **self.chain)
-        rows = zip(("Ia", "fv", "fc"), claimed.values(), strict=True)
-        return {
-            f"{k}{j}": float(x)
-            for k, row in rows
-            for j, x in enumerate(row, 1)
-            if x > 0.0
-        }
-
-
-def named(bodies: Float[np.ndarray, "bodies 10"]) -> dict[str, float]:
-    """Return the parameters of bodies by their names in a model."""
-    names = (f"{name}{k + 1}" for k in range(len(bodies)) for name in INERTIAL_NAMES)
-    return dict(zip(names, bodies.ravel().tolist(), strict=True))
 
 
 def replace_limits(
@@ -327,40 +279,49 @@ def replace_limits(
         "position_min": position_min,
         "position_max": position_max,
         "velocity": velocity,
+        "acceleration": acceleration,
+        "jerk": jerk,
+        "force": force,
     }
-    given |= {"acceleration": acceleration, "jerk": jerk, "force": force}
-    fields, told = {}, []
-    for name, values in given.items():
-        new = per_joint(name, values, robot.joints, np.nan)
-        new = new if name == "force" else new * _angle_scale(robot, angle_unit)
-        known = np.isnan(new)
-        fields[name] = np.where(known, getattr(robot.limits, name), new)
-        told += [
-            f"{name} of {j}"
-            for j, k in zip(robot.joint_names, known, strict=True)
-            if not k
-        ]
-        told += [] if known.any() else [name]
-    # Forces that no joint has would make weights infinite.
-    most = np.asarray(fields["force"])
-    if ((most > 0) & (most < 1e-9)).any() or (np.isfinite(most) & (most >= 1e9)).any():
+    limits, assumed = {}, robot.limits.assumed
+    for name, numbers in given.items():
+        values = per_joint(name, numbers, robot.joints, np.nan)
+        if name != "force":
+            values = values * _angle_scale(robot, angle_unit)
+        is_given = ~np.isnan(values)
+        limits[name] = np.where(is_given, values, getattr(robot.limits, name))
+        # What is given is no assumption of the robot's source any more.
+        settled_names = {
+            f"{name} of {robot.joint_names[j]}" for j in np.flatnonzero(is_given)
+        }
+        if is_given.all():
+            settled_names.add(name)
+        assumed = tuple(text for text in assumed if text not in settled_names)
+    _require_plausible(robot, limits)
+    return robot.replace(limits=Limits(robot.joints, **limits, assumed=assumed))
+
+
+def _require_plausible(robot: Robot, limits: dict[str, np.ndarray]) -> None:
+    """Reject forces that would make weights infinite, and ranges that no joint has."""
+    forces = limits["force"]
+    if ((forces > 0) & (forces < MIN_FORCE)).any():
         raise InputError(
-            f"`force` must lie between 1e-9 and 1e9 N m or N, but is {most}."
+            f"`force` must be at least {MIN_FORCE} N m or N, but is {forces}."
         )
     for j, name in enumerate(robot.joint_names):
-        low, high = fields["position_min"][j], fields["position_max"][j]
-        if why := range_fault(low, high, robot.revolute[j]):
+        low, high = limits["position_min"][j], limits["position_max"][j]
+        fault = range_fault(low, high, robot.revolute[j])
+        if fault:
             cure = "give the limits in metres, inf for none"
             if robot.revolute[j]:
                 cure = 'for degrees add `angle_unit = "deg"`, and inf means no limit'
-            raise InputError(f"joint `{name}` {why}: {cure}.")
-    assumed = tuple(name for name in robot.limits.assumed if name not in told)
-    limits = Limits(robot.joints, **fields, assumed=assumed)
-    return robot.replace(limits=limits)
+            raise InputError(f"joint `{name}` {fault}: {cure}.")
 
 
 def _angle_scale(robot: Robot, unit: AngleUnit) -> np.ndarray:
-    return np.where(np.array(robot.revolute) & (unit == "deg"), np.pi / 180, 1.0)
+    """Return the size of the unit of each joint [rad or m]."""
+    in_degrees = np.array(robot.revolute) & (unit == "deg")
+    return np.where(in_degrees, np.pi / 180, 1.0)
 
 
 def replace_drives(
@@ -371,7 +332,6 @@ def replace_drives(
     zero: list[Finite] | None = None,
     angle_unit: AngleUnit = "rad",
     max_torques: list[Positive] | None = None,
-    rotor_inertia: list[Magnitude] | None = None,
 ) -> Robot:
     """Motors and gears, needed for logs on the motors' side.
 
@@ -383,22 +343,23 @@ def replace_drives(
         zero: Joint angles at which the motors' angles are zero [rad or m], like `0.0`.
         angle_unit: Unit of `zero`: "rad" or "deg".
         max_torques: Largest torques of the motors, before the gears [N m].
-        rotor_inertia: Inertias of the rotors, before the gears [kg m²], like `1e-4`;
-            shown, not used.
 
     Raises:
         InputError: If a list has another length, or the ratios cannot be inverted.
     """
     if gear_ratios is not None and matrix is not None:
         raise InputError("give `gear_ratios` or `matrix`, but not both.")
-    n = robot.joints
-    if matrix is not None and {len(matrix), *map(len, matrix)} != {n}:
-        raise InputError(f"`matrix` must hold {n} rows of {n} numbers.")
-    new: dict[str, Any] = {"max_torques": max_torques, "rotor_inertia": rotor_inertia}
-    new["reduction"] = matrix
+    joints = robot.joints
+    drives: dict[str, Any] = {}
+    if max_torques is not None:
+        drives["max_torques"] = max_torques
     if gear_ratios is not None:
-        new["reduction"] = per_joint("gear_ratios", gear_ratios, n, 1.0)
+        drives["reduction"] = per_joint("gear_ratios", gear_ratios, joints, 1.0)
+    if matrix is not None:
+        if {len(matrix), *map(len, matrix)} != {joints}:
+            raise InputError(f"`matrix` must hold {joints} rows of {joints} numbers.")
+        drives["reduction"] = matrix
     if zero is not None:
-        new["zero"] = per_joint("zero", zero, n, 0.0) * _angle_scale(robot, angle_unit)
-    given = {name: value for name, value in new.items() if value is not None}
-    return robot.replace(drives=dataclasses.replace(robot.drives, **given))
+        angles = per_joint("zero", zero, joints, 0.0)
+        drives["zero"] = angles * _angle_scale(robot, angle_unit)
+    return robot.replace(drives=dataclasses.replace(robot.drives, **drives))

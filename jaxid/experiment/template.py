@@ -6,14 +6,13 @@ out.
 """
 
 import inspect
-import itertools
 import json
 import math
 import os
 import re
 import textwrap
 import typing
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -25,11 +24,12 @@ from jaxid.robot.description_files import is_mjcf
 from jaxid.robot.robot import Robot
 from jaxid.robot.urdf import load_urdf
 from jaxid.units import Unit
+from jaxid.workflow.setup import DEFAULT_CUTOFF
 
 from .decoder import Key, keys_of
 from .estimator_table import KINDS
 from .experiment import TABLES
-from .model_and_log_tables import CUTOFF, SIDES, DryFriction
+from .model_and_log_tables import SIDES, DryFriction
 from .robot_tables import known_load
 
 WIDTH, COLUMN = 100, 38
@@ -58,9 +58,15 @@ SUMMARIES = {
 """Descriptions of tables where the docstring of their function says something else."""
 INNER = {"robot": ("robot.tool", known_load), "model": ("model.coulomb", DryFriction)}
 """Tables within others, and their functions."""
-OF_KINDS = {*itertools.chain(*KINDS.values())} - set.intersection(
-    *map(set, KINDS.values())
+LIMITS = (
+    "position_min",
+    "position_max",
+    "velocity",
+    "acceleration",
+    "jerk",
+    "force",
 )
+OF_KINDS = set().union(*KINDS.values()) - set.intersection(*map(set, KINDS.values()))
 """Keys that not all kinds of estimators take, which are commented out."""
 
 
@@ -73,25 +79,12 @@ def write_template(
 ) -> str:
     """Return a complete commented experiment file for a robot; it loads as it is."""
     robot = load_urdf(urdf, tip=tip, base=base)
-    path = Path(os.path.relpath(Path(urdf).resolve(), Path(folder).resolve()))
-    limits = (
-        "position_min",
-        "position_max",
-        "velocity",
-        "acceleration",
-        "jerk",
-        "force",
-    )
-    joints = range(robot.joints)
-    angles, forces = [*map(robot.joint_unit, joints)], [*map(robot.force_unit, joints)]
+    path = os.path.relpath(Path(urdf).resolve(), Path(folder).resolve())
+    key = "mjcf" if is_mjcf(urdf) else "urdf"
     values = {
-        "robot": {
-            "mjcf" if is_mjcf(urdf) else "urdf": path.as_posix(),
-            "tip": tip,
-            "base": base,
-        },
+        "robot": {key: Path(path).as_posix(), "tip": tip, "base": base},
         "limits": {
-            name: np.asarray(getattr(robot.limits, name)).tolist() for name in limits
+            name: np.asarray(getattr(robot.limits, name)).tolist() for name in LIMITS
         },
         "drives": {"gear_ratios": [1.0] * robot.joints},
         "model": {"offset": True},
@@ -99,10 +92,10 @@ def write_template(
             "angles": "q{}",
             "forces": "tau{}",
             "time": "time",
-            "angle_unit": angles if len({*angles}) > 1 else angles[0],
-            "force_unit": forces if len({*angles}) > 1 else forces[0],
+            "angle_unit": _one_or_each(map(robot.joint_unit, range(robot.joints))),
+            "force_unit": _one_or_each(map(robot.force_unit, range(robot.joints))),
         },
-        "filter": {"kind": "butterworth", "cutoff": CUTOFF},
+        "filter": {"kind": "butterworth", "cutoff": DEFAULT_CUTOFF},
         "estimator": {"kind": "consistent"},
     }
     sections = [HEAD.format(name=robot.name)]
@@ -110,9 +103,15 @@ def write_template(
         table = _table(name, functions, robot.joints, values.get(name, {}))
         sections.append(_joints(robot) + table if name == "limits" else table)
         if name in INNER:
-            inner, function = INNER[name]
-            sections.append(_table(inner, (function,), robot.joints, {}))
+            inner_name, function = INNER[name]
+            sections.append(_table(inner_name, (function,), robot.joints, {}))
     return "\n".join(sections)
+
+
+def _one_or_each(units: Iterable[str]) -> str | list[str]:
+    """Return the unit that all joints have, or those of all joints."""
+    units = list(units)
+    return units if len(set(units)) > 1 else units[0]
 
 
 def _table(
@@ -124,8 +123,8 @@ def _table(
     lines.append(f"{'' if active else '# '}[{name}]")
     if name == "filter":
         lines += _entry("kind", json.dumps(values["kind"]), "", True)
-    known = {*SIDES, "tool"}
-    kinds = {filter: kind for kind, filter in FILTERS.items()}
+    written_names = {*SIDES, "tool"}
+    kinds: dict[Any, str] = {filter: kind for kind, filter in FILTERS.items()}
     for function in functions:
         kind = kinds.get(function)
         is_active = active and kind in (None, values.get("kind"))
@@ -133,50 +132,64 @@ def _table(
             # Keys of the other kinds of filters are comments.
             lines += ["#", *_entry("kind", json.dumps(kind), _summary(function), False)]
         for key in keys_of(function).values():
-            if key.name not in known:
-                shown = is_active and key.name not in OF_KINDS
-                lines += _key(key, joints, values.get(key.name), shown)
-        known |= {*keys_of(function)}
+            if key.name not in written_names:
+                is_common = key.name not in OF_KINDS
+                value = values.get(key.name)
+                lines += _key(key, joints, value, is_active and is_common)
+        written_names |= {*keys_of(function)}
     return "\n".join(lines) + "\n"
 
 
 def _key(key: Key, joints: int, value: Any, active: bool) -> Iterator[str]:
+    """Yield the lines of a key: its value, default or an example, and its description."""
     # The description as users of the file need it, and the example in it.
     text = re.sub(r"[;,] (?:or )?None(?: if [^;.]*)?", "", key.text)
     text = text.replace(" if None", " by default")
-    found = re.search(r",? like `([^`]+)`", text)
-    text, example = (text.replace(found[0], "", 1), found[1]) if found else (text, "")
-    needed = key.default is inspect.Parameter.empty
-    if value is None and not (needed or (example and not active) or "=" in example):
+    example = ""
+    like = re.search(r",? like `([^`]+)`", text)
+    if like is not None:
+        text = text.replace(like[0], "", 1)
+        example = like[1]
+    has_default = key.default is not inspect.Parameter.empty
+    shows_example = (example and not active) or "=" in example
+    if value is None and has_default and not shows_example:
         value = key.default
-    shown = toml_text(value)
-    if shown is None:
-        # An example of the right type: a value for each joint where a list is needed.
-        active, option = False, union_members(key.hint)[0]
-        while typing.get_origin(option) is Annotated:
-            option = typing.get_args(option)[0]
-        kind, words = typing.get_origin(option), {int: "1", float: "1.0"}
-        if kind in (list, tuple) and not example.startswith("["):
-            example = f"[{', '.join([example or '1.0'] * joints)}]"
-        if kind is Literal:
-            words[option] = json.dumps(typing.get_args(option)[0])
-        shown = example or words.get(option, "true")
-    yield from _entry(key.name, shown, text, active)
+    assigned_text = toml_text(value)
+    if assigned_text is None:
+        active = False
+        assigned_text = _example(union_members(key.hint)[0], example, joints)
+    yield from _entry(key.name, assigned_text, text, active)
+
+
+def _example(hint: Any, example: str, joints: int) -> str:
+    """Return an example of the right type: a value for each joint where a list is needed."""
+    while typing.get_origin(hint) is Annotated:
+        hint = typing.get_args(hint)[0]
+    kind = typing.get_origin(hint)
+    if kind in (list, tuple) and not example.startswith("["):
+        numbers = [example or "1.0"] * joints
+        return f"[{', '.join(numbers)}]"
+    if example:
+        return example
+    if kind is Literal:
+        return json.dumps(typing.get_args(hint)[0])
+    return {int: "1", float: "1.0"}.get(hint, "true")
 
 
 def toml_text(value: Any) -> str | None:
     """Return a value as TOML; None for what a file need not say."""
     if isinstance(value, list | tuple):
-        shown = [repr(x) if isinstance(x, float) else toml_text(x) for x in value]
-        return f"[{', '.join(map(str, shown))}]" if value else None
+        # In a list, infinity is written, too.
+        texts = [repr(x) if isinstance(x, float) else str(toml_text(x)) for x in value]
+        return f"[{', '.join(texts)}]" if value else None
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, Unit):
         return json.dumps(value.symbol)
     if isinstance(value, str):
         # Nothing in a text may look like a comment behind a key.
-        quoted = json.dumps(value, ensure_ascii=False).replace("  #", "  \\u0023")
-        return "".join(c if c.isprintable() else f"\\U{ord(c):08x}" for c in quoted)
+        text = json.dumps(value, ensure_ascii=False).replace("  #", "  \\u0023")
+        return "".join(c if c.isprintable() else f"\\U{ord(c):08x}" for c in text)
     if isinstance(value, int | float) and math.isfinite(value):
         return repr(value)
     return None
@@ -212,10 +225,8 @@ def _summary(function: Callable) -> str:
 
 def _joints(robot: Robot) -> str:
     """Return a comment with numbers, names and kinds of the joints."""
-    names = (
-        f"{i} {name} ({'turns' if turns else 'slides'})"
-        for i, (name, turns) in enumerate(
-            zip(robot.joint_names, robot.revolute, strict=True), 1
-        )
-    )
-    return "\n".join(_comment(f"The joints: {', '.join(names)}")) + "\n"
+    texts = []
+    for j, name in enumerate(robot.joint_names):
+        motion = "turns" if robot.revolute[j] else "slides"
+        texts.append(f"{j + 1} {name} ({motion})")
+    return "\n".join(_comment(f"The joints: {', '.join(texts)}")) + "\n"

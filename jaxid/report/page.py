@@ -1,14 +1,12 @@
-"""Results for people: HTML pages that need nothing else, and tables in the terminal."""
+"""HTML pages of results, which need nothing else."""
 
 import functools
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from markupsafe import Markup
-from rich.console import Console
-from rich.text import Text
 
 from jaxid.result_table import (
     Remark,
@@ -106,25 +104,3 @@ def provenance(settings: Mapping[str, Any]) -> Section:
     if experiment:
         blocks.append(folded("The experiment file", code(str(experiment))))
     return "To repeat this", blocks
-
-
-def show(console: Console, *tables: Table) -> None:
-    """Print tables, each with an empty line before it."""
-    for table in tables:
-        console.print()
-        # Numbers are not cut where a line is too short for them.
-        console.print(table, crop=False)
-
-
-def show_remarks(console: Console, remarks: Iterable[Remark | str]) -> None:
-    """Print remarks, one paragraph each."""
-    unique = tuple(dict.fromkeys(remarks))
-    if unique:
-        show(console, Table("", remarks=unique))
-
-
-def show_files(console: Console, folder: Path, names: Iterable[str]) -> None:
-    """Print the names of files that were written, and their folder if it is another one."""
-    place = "" if folder == Path() else f" {folder}:"
-    console.print()
-    console.print(Text(f"wrote{place} {', '.join(names)}"))

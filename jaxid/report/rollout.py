@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -29,7 +29,8 @@ MAX_RATIO = 0.9
 """Error of a good simulation, relative to those of the baselines."""
 
 
-class RolloutReport(NamedTuple):
+@dataclasses.dataclass(frozen=True, eq=False)
+class RolloutReport:
     """Content of the report.
 
     Attributes:

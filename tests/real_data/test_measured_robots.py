@@ -91,9 +91,13 @@ def test_kr300_is_said_to_be_undetermined_and_a_ridge_transfers(identify, shared
     assert all(e["relative"] < 0.20 for e in ridge)
     described = load_experiment(HERE / "kr300.toml")
     paths = [shared_data / "kr300" / f"traj_{name}.csv" for name in "ABC"]
-    first, *others = (described.observe(described.read(path)) for path in paths)
-    weights = described.estimation.plain.weights
-    plain = jid.identify(described.base, first, jid.WeightedLeastSquares(weights))
+    setup = described.setup
+    first, *others = (
+        setup.observe(jid.workflow.read_log(setup, path, described.columns))
+        for path in paths
+    )
+    weights = setup.least_squares.weights
+    plain = jid.identify(setup.base, first, jid.WeightedLeastSquares(weights))
     errors = jid.validate(plain, others).errors
     assert all(
         a.relative > 1.3 * b["relative"] for a, b in zip(errors, ridge, strict=True)
@@ -103,3 +107,76 @@ def test_kr300_is_said_to_be_undetermined_and_a_ridge_transfers(identify, shared
     np.testing.assert_allclose(
         rms, [0.26, 0.25, 0.50, 0.39], atol=0.005
     )  # as in the README
+
+
+TX40 = """\
+[robot]
+builtin = "tx40"
+[recording]
+angles = "Joint_{}"
+forces = "Joint_{}"
+forces_file = "motor_torque.csv"
+sample_time = 2e-4
+side = "motor"
+[filter]
+kind = "butterworth"
+cutoff = 20
+[rows]
+step = 50
+"""
+UR10 = """\
+[robot]
+builtin = "ur10"
+[recording]
+angles = "q{}"
+velocities = "dq{}"
+forces = "tau{}"
+time = "t"
+"""
+FRICTION = (
+    jid.terms.RigidBodies(),
+    jid.terms.ViscousFriction(),
+    jid.terms.CoulombFriction(),
+    jid.terms.RotorInertia(),
+    jid.terms.ConstantOffset(),
+)
+
+
+@pytest.mark.parametrize("name", ["tx40", "ur10"])
+def test_python_and_the_command_line_have_the_same_defaults(
+    name, shared_data, tmp_path
+):
+    if name == "tx40":
+        text, log = TX40, shared_data / "tx40" / "motor_position.csv"
+        model = jid.Model(jid.robots.tx40(), (*FRICTION, jid.terms.CoupledDrives()))
+        setup = jid.Setup(
+            model,
+            filter=jid.ZeroPhaseButterworth(20.0),
+            decimation=jid.Subsample(50),
+            reading=jid.workflow.LogReading(forces_file="motor_torque.csv"),
+        )
+        columns = jid.Columns(
+            angles="Joint_{}",
+            forces="Joint_{}",
+            sample_time=2e-4,
+            angles_on_motor_side=True,
+            forces_on_motor_side=True,
+        )
+    else:
+        text, log = UR10, shared_data / "ur10" / "exciting_measured.csv"
+        setup = jid.Setup(jid.Model(jid.robots.ur10(), FRICTION))
+        columns = jid.Columns(angles="q{}", velocities="dq{}", forces="tau{}", time="t")
+
+    (tmp_path / "experiment.toml").write_text(text)
+    words = ("identify", tmp_path / "experiment.toml", log, "--split", "0.6")
+    command(*words, "-o", tmp_path / "command")
+    report = jid.identify_logs(setup, [log], columns, held_out=0.4)
+    report.save(tmp_path / "python")
+
+    results = [
+        json.loads((tmp_path / place / "result.json").read_text(encoding="utf-8"))
+        for place in ("command", "python")
+    ]
+    for key in ("base_parameters", "fit", "errors", "consistency", "notes", "verdict"):
+        assert results[0][key] == results[1][key], key
+    assert results[0]["verdict"][0]["text"] == report.verdict.text

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from jaxid.cli.printing import show
 from jaxid.report.identification import body_table
-from jaxid.report.page import show
 from jaxid.result_table import (
     MISSING,
     Column,

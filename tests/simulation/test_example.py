@@ -13,6 +13,7 @@ from jaxid.robot import library
 from jaxid.simulation.example import FILES, virtual_panda, write_example
 from jaxid.simulation.virtual import random_bodies
 from jaxid.validation.torque_errors import validate
+from jaxid.workflow.log_loading import read_log
 
 
 @pytest.fixture(scope="module")
@@ -42,13 +43,14 @@ def test_files_are_small_and_the_seed_decides(example, tmp_path):
 
 def test_the_truth_is_found_again(example):
     virtual, experiment = virtual_panda(), load_experiment(example / "experiment.toml")
-    base = experiment.base
+    setup = experiment.setup
+    base = setup.base
     assert base.model.parameter_names == virtual.model.parameter_names
     observations = [
-        experiment.observe(experiment.read(example / f"{name}.csv"))
+        setup.observe(read_log(setup, example / f"{name}.csv", experiment.columns))
         for name in ("identification", "verification")
     ]
-    fit = identify(base, observations[0], experiment.estimation.estimator)
+    fit = identify(base, observations[0], setup.estimator)
     truth = json.loads((example / "truth.json").read_text("utf-8"))
     rows = truth["base_parameters"]
     assert [r["name"] for r in rows] == list(base.names)

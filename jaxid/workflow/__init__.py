@@ -1,0 +1,33 @@
+"""The work of the commands as functions: from logs to a report, with one setup."""
+
+from .excitation_settings import Excitation as Excitation, Leads as Leads
+from .log_identification import (
+    IdentificationReport as IdentificationReport,
+    identify_logs as identify_logs,
+)
+from .log_inspection import inspect_logs as inspect_logs
+from .log_loading import load_log as load_log, read_log as read_log
+from .log_reading import LogReading as LogReading
+from .log_rollout import (
+    ServoSettings as ServoSettings,
+    TorqueSettings as TorqueSettings,
+    identify_rollout_logs as identify_rollout_logs,
+)
+from .motion_design import (
+    MotionTask as MotionTask,
+    design_motion as design_motion,
+    prepare_motion as prepare_motion,
+    write_design as write_design,
+)
+from .repeated_runs import (
+    identify_gains_logs as identify_gains_logs,
+    identify_payload_logs as identify_payload_logs,
+    identify_states_logs as identify_states_logs,
+)
+from .robot_file import RobotFile as RobotFile
+from .setup import Setup as Setup
+from .setup_choice import (
+    choose_setup as choose_setup,
+    choose_setup_by_rows as choose_setup_by_rows,
+)
+from .surroundings import Collision as Collision

@@ -1,0 +1,153 @@
+"""Settings of the motion that identifies a robot, and of the search for it."""
+
+import dataclasses
+import math
+from typing import Annotated, Literal
+
+import numpy as np
+
+from jaxid.errors import InputError
+from jaxid.excitation.criteria import CRITERIA, AbstractCriterion
+from jaxid.trajectory.controllers import CONTROLLERS
+from jaxid.trajectory.fourier import FourierBasis, RestToRestBasis
+from jaxid.trajectory.lead_in_and_out import LeadsBasis
+from jaxid.trajectory.spline import RestToRestSplineBasis
+from jaxid.trajectory.trajectory import AbstractBasis, count_cycles
+
+from .allowed_values import Bounds, Count, OneOf, Positive
+
+Corner = tuple[float, float, float]
+
+
+@dataclasses.dataclass(frozen=True)
+class Leads:
+    """Ways from standstill into a periodic motion, and out of it.
+
+    Attributes:
+        time: Duration of each, if they are designed together with the motion [s].
+        periods: Number of periods between them.
+    """
+
+    time: Positive | None = None
+    periods: Annotated[int, Bounds(minimum=1, maximum=1000)] = 1
+
+
+@dataclasses.dataclass(frozen=True)
+class Excitation:
+    """Motion that `jaxid excite` designs, within the limits above.
+
+    Attributes:
+        criterion: Objective: "d_optimal" for the smallest standard deviations on the
+            whole, a_optimal, e_optimal, condition_number (the paper's, Eq. 36),
+            weighted_condition_number or scaled_condition_number.
+        harmonics: Number of harmonics of the Fourier series.
+        omega: Ground frequency of the series [rad/s].
+        rest: Whether the motion starts and stops at rest.
+        spline: Spline from rest to rest in place of a series, like
+            `{ points = 12, duration = 8.0 }`.
+        leads: Way from standstill into the periodic motion, and out; or a table, like
+            `{ time = 0.5, periods = 2 }`: of so many seconds, designed together with
+            the motion, and two periods between them.
+        samples: Number of samples that one run will measure.
+        noise: Standard deviation of the forces' noise for each joint [N m or N]; by
+            default 1 % of the largest forces.
+        starts: Number of random motions to start from.
+        generations: Number of times that the motions found have children.
+        time: Time for the search [s], like `60.0`; by default all of its steps are
+            done.
+        seed: Seed of the random motions.
+        sample_time: Time between two rows of the written table, the controller's cycle
+            [s], like `0.004`; by default that of the controller, or of the samples.
+        controller: Controller that plays the motion, for its cycle and its file:
+            franka, kuka_fri, kuka_rsi or universal_robots, like `"universal_robots"`.
+        ros: Kind of the file for ROS 2: "yaml" or "mcap" (a bag).
+        nominal: Folder of an earlier result of `jaxid identify`, to compare with, like
+            `"report"`.
+        earlier: Motions whose logs will be used together with this one's, like
+            `["trajectory.json"]`.
+        force_margin: Fraction of the largest forces to keep free, by nominal
+            parameters, like `0.1`; by default 0.3 if friction or others are unknown,
+            else 0.
+        tip_speed: Largest speed of the end-effector [m/s], like `1.5`.
+        tip_acceleration: Largest acceleration of the end-effector [m/s²], like `10.0`.
+        workspace: Box for the end-effector: two corners [m], like
+            `[[-1.0, -1.0, 0.1], [1.0, 1.0, 1.5]]`.
+    """
+
+    criterion: Annotated[str, OneOf(CRITERIA)] = "d_optimal"
+    harmonics: Annotated[int, Bounds(minimum=1, maximum=50)] = 5
+    omega: Annotated[float, Bounds(above=0.0, maximum=1000.0)] = 0.8
+    rest: bool = False
+    spline: RestToRestSplineBasis | None = None
+    leads: bool | Leads = True
+    samples: Annotated[int, Bounds(minimum=2, maximum=10_000_000)] = 800
+    noise: list[Annotated[float, Bounds(above=0.0, below=1e9)]] | None = None
+    starts: Count = 32
+    generations: Annotated[int, Bounds(minimum=0, maximum=10_000)] = 12
+    time: Positive | None = None
+    seed: Annotated[int, Bounds(minimum=0, maximum=2**32 - 1)] = 0
+    sample_time: Annotated[float, Bounds(minimum=1e-5)] | None = None
+    controller: Annotated[str, OneOf(CONTROLLERS)] | None = None
+    ros: Literal["yaml", "mcap"] = "yaml"
+    nominal: str | None = None
+    earlier: tuple[str, ...] = ()
+    force_margin: Annotated[float, Bounds(minimum=0.0, below=1.0)] | None = None
+    tip_speed: Positive = math.inf
+    tip_acceleration: Positive = math.inf
+    workspace: tuple[Corner, Corner] | None = None
+
+    @property
+    def objective(self) -> AbstractCriterion:
+        """Criterion of that name."""
+        return CRITERIA[self.criterion]
+
+    @property
+    def cycle(self) -> float | None:
+        """Time between two rows of the table [s]; None for that of the samples."""
+        if self.sample_time is None and self.controller is not None:
+            return CONTROLLERS[self.controller].sample_time
+        return self.sample_time
+
+    @property
+    def chosen_leads(self) -> Leads | None:
+        """Ways into and out of the motion; None if it starts as it is."""
+        if not self.leads or self.rest or self.spline is not None:
+            return None
+        return self.leads if isinstance(self.leads, Leads) else Leads()
+
+    @property
+    def rests(self) -> bool:
+        """Whether the motion starts and ends at standstill, if leads are possible."""
+        return self.chosen_leads is not None or self.rest or self.spline is not None
+
+    def basis(self, constrained: bool) -> AbstractBasis:
+        """Return the basis of the trajectories; with other constraints, leads are designed too.
+
+        Raises:
+            InputError: If two kinds are asked for, or one whose end no sample would
+                meet.
+        """
+        if self.spline is not None:
+            if self.rest:
+                raise InputError(
+                    "`rest` is for Fourier series, and a `spline` rests at its ends: "
+                    "leave one out."
+                )
+            return self.spline
+        leads, series = self.chosen_leads, (self.harmonics, self.omega)
+        if self.rest:
+            return RestToRestBasis(*series)
+        if leads is None and self.cycle is not None:
+            # Samples at full speed must not end before the period or go on after it.
+            period, step = 2 * np.pi / self.omega, self.cycle
+            count = count_cycles(period, step)
+            if abs(count * step - period) > 1e-6 * step:
+                raise InputError(
+                    f"`sample_time` must divide the period of {period:.9g} s where "
+                    "there are no "
+                    f"`leads`: choose `omega` = {2 * np.pi / (count * step):.9g}, or "
+                    "use `leads`."
+                )
+        if leads is None or (not constrained and leads.time is None):
+            return FourierBasis(*series)
+        return LeadsBasis(*series, lead=leads.time or 0.5, periods=leads.periods)

@@ -1,0 +1,288 @@
+"""Identification from logs: they are read, filtered, fitted, judged, and become a report."""
+
+import dataclasses
+import functools
+import os
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxid.errors import InputError
+from jaxid.identification.combination import (
+    combine_fits,
+    replace_estimates,
+    require_same_base,
+    share_rows,
+    without_bounds,
+)
+from jaxid.identification.encoder_resolution import resolution_note
+from jaxid.identification.estimators import GivenWeights
+from jaxid.identification.fit_result import Fit
+from jaxid.identification.identify import fit_problem
+from jaxid.identification.problem import RegressionProblem
+from jaxid.measurement.columns import Columns
+from jaxid.measurement.observations import Observations
+from jaxid.measurement.recording import Recording
+from jaxid.report.result_files import read_fit, write_report
+from jaxid.result_table import Remark, Summarised, Table
+from jaxid.validation.diagnosis import mistakes_in_logs
+from jaxid.validation.torque_errors import (
+    TorqueErrors,
+    Validation,
+    torque_errors,
+    validate,
+)
+from jaxid.validation.verdict import Report, verdict
+
+from .log_loading import LoadedLog, fitted_share, is_report, load_logs, select_filter
+from .setup import Progress, Setup, ignore_progress
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class IdentificationReport(Summarised, Report):
+    """Identified model, its validation, and the judgement on it; notebooks show the judgement."""
+
+    @property
+    def validation(self) -> Validation:
+        """Torque errors on all logs."""
+        robot = self.fit.base.model.robot
+        units = tuple(robot.force_unit(joint) for joint in range(robot.joints))
+        return Validation(self.every_error, self.definiteness, robot.joint_names, units)
+
+    @functools.cached_property
+    def judgement(self) -> list[Remark]:
+        """Verdict, and below it a remark for each criterion."""
+        return verdict(self)
+
+    @property
+    def verdict(self) -> Remark:
+        """Whether the model may be used, in one sentence."""
+        return self.judgement[0]
+
+    def summary(self) -> Table:
+        """Return the verdict, and the criteria behind it."""
+        return Table("verdict", remarks=self.judgement)
+
+    def save(self, folder: str | Path, figures: str = "") -> list[Path]:
+        """Write `report.html`, `result.json`, `parameters.csv` and `model.json`; return them.
+
+        Args:
+            folder: Folder of the report; other files in it are kept.
+            figures: Format of files with the figures, if they are wanted: "svg", "png"
+                or "pdf".
+        """
+        return write_report(Path(folder), self, figures)
+
+
+class LogParts(NamedTuple):
+    """Observations that are fitted, and observations for the validation."""
+
+    fitted: list[Observations]
+    unseen: list[Observations]
+
+    @property
+    def every(self) -> list[Observations]:
+        """All observations."""
+        return [*self.fitted, *self.unseen]
+
+
+def identify_logs(
+    setup: Setup,
+    logs: Sequence[str | Path],
+    columns: Columns,
+    held_out: float | None = None,
+    verify: Sequence[str | Path] = (),
+    progress: Progress = ignore_progress,
+) -> IdentificationReport:
+    """Identify a robot with logs, and validate the model with others or the rest of them.
+
+    Args:
+        setup: How logs become parameters.
+        logs: Paths of logs; folders of earlier reports add what those have seen.
+        columns: Meaning of the columns of the logs.
+        held_out: Fraction of each log, its last part, that is kept for the validation.
+        verify: Paths of further logs for the validation.
+        progress: Callback, called with a stage and its completed fraction (0 to 1).
+
+    Raises:
+        InputError: If a log cannot be used, or would count twice.
+    """
+    logs, verify = [Path(log) for log in logs], [Path(log) for log in verify]
+    require_separate_logs(logs, verify, held_out)
+    files = [path for path in logs if not is_report(path)]
+    reports = [path for path in logs if is_report(path)]
+
+    setup, choice = select_filter(setup, files, columns, progress, held_out)
+    loaded_logs = load_logs(setup, [*files, *verify], columns, progress)
+    fitted_logs = loaded_logs[: len(files)]
+    parts = split_logs(loaded_logs, len(files), held_out)
+
+    progress("finding base parameters", 0.0)
+    base = setup.base
+    rows = RegressionProblem(
+        base, parts.fitted, partial(progress, "factorising the rows")
+    )
+    fit = setup.fit(rows, progress)
+    if reports:
+        fit = add_reports(setup, reports, fit, parts.unseen)
+
+    validation = validate(
+        fit, parts.every, progress=partial(progress, "predicting torques")
+    )
+    progress("looking for mistakes", 0.0)
+    # Bounds would hide what is wrong.
+    diagnoses = [log.diagnosis for log in fitted_logs]
+    mistakes, mistake_notes = mistakes_in_logs(diagnoses, without_bounds(fit))
+    notes = [note for part in parts.every for note in part.notes]
+    notes += [*mistake_notes, *resolution_notes(fit, fitted_logs)]
+    claims = errors_of_claims(setup, fit, parts.every)
+    return IdentificationReport(
+        fit,
+        validation.errors[: len(parts.fitted)],
+        validation.errors[len(parts.fitted) :],
+        validation.definiteness,
+        describe(setup, logs, verify, held_out),
+        notes=(*setup.notes, *dict.fromkeys(notes)),
+        doubts=[text for log in loaded_logs for text in log.findings],
+        mistakes=mistakes,
+        choice=choice,
+        claimed=claims.errors,
+        claimed_mass=claims.mass,
+    )
+
+
+def require_separate_logs(
+    logs: Sequence[Path], verify: Sequence[Path] = (), held_out: float | None = None
+) -> None:
+    """Reject logs that would count twice, or verify a model that has seen them."""
+    if held_out is not None and not 0 < held_out < 1:
+        raise InputError(
+            f"`held_out` must lie between 0 and 1, like 0.4, but is {held_out:g}."
+        )
+    places = [os.path.realpath(log) for log in logs]
+    for number, log in enumerate(logs):
+        if places[number] in places[:number]:
+            raise InputError(f"`{log}` is given twice: its rows would count double.")
+    shared_places = set(places) & {os.path.realpath(log) for log in verify}
+    if shared_places:
+        raise InputError(
+            f"`{Path(min(shared_places)).name}` is given both to identify and to "
+            "verify with: use `--split`, or `held_out` in Python."
+        )
+    if all(map(is_report, logs)):
+        raise InputError(
+            "give at least one log as a file, for torque errors and figures."
+        )
+
+
+def split_logs(
+    logs: Sequence[LoadedLog], count: int, held_out: float | None
+) -> LogParts:
+    """Return the first `count` logs for the fit, or their first parts; and all the rest."""
+    observations = [log.observations for log in logs]
+    to_fit, to_verify = observations[:count], observations[count:]
+    if held_out is None:
+        return LogParts(to_fit, to_verify)
+    share = fitted_share(held_out)
+    fitted, rests = [], []
+    for log in to_fit:
+        first, rest = log.split(share)
+        fitted.append(first.replace(name=f"{first.name}, first {100 * share:g} %"))
+        rests.append(rest.replace(name=f"{rest.name}, rest"))
+    return LogParts(fitted, [*rests, *to_verify])
+
+
+def resolution_notes(fit: Fit, logs: Sequence[LoadedLog]) -> list[str]:
+    """Return what the resolution of the encoders explains, log by log."""
+    notes = []
+    for observations, diagnosis in logs:
+        recording = diagnosis.log
+        if isinstance(recording, Recording) and not diagnosis.faulty:
+            texts = resolution_note(fit, recording, observations)
+            notes += [f"{recording.name}: {text}" for text in texts]
+    return notes
+
+
+def describe(
+    setup: Setup, logs: Sequence[Path], verify: Sequence[Path], held_out: float | None
+) -> dict[str, Any]:
+    """Return the logs and settings of an identification, for its record."""
+    return {
+        "identification": [str(log) for log in logs],
+        "verification": [str(log) for log in verify],
+        "split": None if held_out is None else fitted_share(held_out),
+        "filter": str(setup.filter),
+        "decimation": str(setup.decimation),
+        "min_speed": setup.min_speed,
+    }
+
+
+class Claims(NamedTuple):
+    """Parameters that the robot's file claims, compared with logs."""
+
+    errors: tuple[TorqueErrors, ...] = ()  # torque errors on each log
+    mass: float = 0.0  # mass of all bodies [kg]
+
+
+def errors_of_claims(setup: Setup, fit: Fit, logs: Sequence[Observations]) -> Claims:
+    """Return torque errors of the parameters that the robot's file claims; nothing without them."""
+    if setup.robot_file is None:
+        return Claims()
+    values = setup.robot_file.claims()
+    if not values:
+        return Claims()
+    names = fit.base.model.parameter_names
+    parameters = fit.base.from_standard([values.get(name, 0.0) for name in names])
+    claimed_fit = dataclasses.replace(fit, parameters=np.asarray(parameters))
+    errors = tuple(torque_errors(claimed_fit, log) for log in logs)
+    return Claims(errors, float(setup.robot_file.bodies()[:, 0].sum()))
+
+
+def read_earlier_fit(setup: Setup, folder: Path) -> Fit:
+    """Return the fit of the report in a folder.
+
+    Raises:
+        InputError: If its base parameters are not those of the setup.
+    """
+    fit = read_fit(folder)
+    fit_of_setup = dataclasses.replace(fit, base=setup.base, name="these logs")
+    try:
+        require_same_base((fit, fit_of_setup))
+    except InputError as error:
+        raise InputError(f"`{folder}` does not fit these logs: {error}") from error
+    return fit
+
+
+def add_reports(
+    setup: Setup, reports: Sequence[Path], fit: Fit, unseen_logs: Sequence[Observations]
+) -> Fit:
+    """Return a fit to all logs, those of earlier reports included, which must not be unseen."""
+    bounded = fit.consistency is not None
+    if fit.base.names != setup.base.names or not (bounded or fit.is_least_squares):
+        raise InputError(
+            "earlier reports can be added to least squares only, but the estimator is "
+            f"{fit.estimator}: leave `[estimator]` out, or give the logs themselves."
+        )
+    earlier_fits = [read_earlier_fit(setup, folder) for folder in reports]
+    fit = functools.reduce(combine_fits, [*earlier_fits, fit])
+    if setup.has_bounded_bodies:
+        fit = bound_bodies(setup, fit)
+    for log in unseen_logs:
+        rows = RegressionProblem(setup.base, [log])
+        if fit.blocks is not None and share_rows(fit.blocks, rows.blocks):
+            raise InputError(
+                f"a report that was given has seen the data of `{log.name}`: verify "
+                "with another."
+            )
+    return fit
+
+
+def bound_bodies(setup: Setup, fit: Fit) -> Fit:
+    """Return a fit whose bodies can exist, from the factors of one whose bodies may not."""
+    rows = RegressionProblem(fit.base, blocks=fit.time_blocks, names=fit.recordings)
+    estimator = dataclasses.replace(setup.estimator, weights=GivenWeights(fit.weights))
+    bounded_fit = dataclasses.replace(fit_problem(rows, estimator), name=fit.name)
+    return replace_estimates(bounded_fit, bounded_fit.parameters, fit.uncertainty)

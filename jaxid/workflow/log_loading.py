@@ -1,0 +1,226 @@
+"""Logs of a setup: read, filtered and examined; one of many samples stays on disk."""
+
+import dataclasses
+import os
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxid.errors import InputError
+from jaxid.identification.filter_selection import (
+    FilterChoice,
+    choose_filter,
+)
+from jaxid.measurement.columns import Columns
+from jaxid.measurement.log_files import estimated_rows, is_bag_folder
+from jaxid.measurement.observations import Observations
+from jaxid.measurement.reading import scan_log
+from jaxid.measurement.recording import NeedsMemory, Recording
+from jaxid.validation.diagnosis import Diagnosis, diagnose
+from jaxid.validation.torque_errors import comparison_step
+
+from .setup import Progress, Setup, ignore_progress
+
+LONG_LOG_ROWS = 500_000
+"""Samples from which a log is read part by part."""
+BRIDGED_PERIODS = 0.1
+"""Pause that is bridged in any case, in periods of the largest cut-off frequency."""
+MIN_SPEED_OF_MOTION = 1e-9
+"""Speed below which a joint rests [rad/s or m/s]."""
+
+
+class LoadedLog(NamedTuple):
+    """Log as it is used."""
+
+    observations: Observations  # filtered log
+    diagnosis: Diagnosis  # findings on the log, and the log as it was read
+
+    @property
+    def findings(self) -> list[str]:
+        """Findings on the log, each behind its name."""
+        name = self.diagnosis.log.name
+        return [f"{name}: {text}" for text in self.diagnosis.findings]
+
+
+def read_log(setup: Setup, log: str | Path, columns: Columns) -> Recording:
+    """Read a log into memory."""
+    return setup.reading.read(Path(log), columns, setup.robot, bridged_pause(setup))
+
+
+def read_commands(setup: Setup, log: Path, columns: Columns) -> Recording:
+    """Read a log with the commanded angles in place of forces."""
+    return setup.reading.read_commands(log, columns, setup.robot, bridged_pause(setup))
+
+
+def bridged_pause(setup: Setup) -> float:
+    """Return the pause of a log that is bridged in any case [s]."""
+    filters = (setup.filter, *setup.filter_candidates)
+    return BRIDGED_PERIODS / max(getattr(x, "cutoff", np.inf) for x in filters)
+
+
+def observe_commands(setup: Setup, log: Path, columns: Columns) -> Observations | None:
+    """Return a log with the commanded angles in place of the measured ones, filtered.
+
+    None if their columns are not named, or the log is long.
+    """
+    if setup.reading.commands is None or is_long(log):
+        return None
+    command_columns = dataclasses.replace(
+        columns, angles=setup.reading.commands, velocities=None
+    )
+    return setup.observe(read_log(setup, log, command_columns))
+
+
+def is_long(log: Path) -> bool:
+    """Return whether a log is better read part by part than as a whole."""
+    return estimated_rows(log) >= LONG_LOG_ROWS
+
+
+def is_report(path: Path) -> bool:
+    """Return whether a folder is an earlier report, and no bag."""
+    return path.is_dir() and not is_bag_folder(path)
+
+
+def load_logs(
+    setup: Setup,
+    logs: Sequence[Path],
+    columns: Columns,
+    progress: Progress = ignore_progress,
+) -> list[LoadedLog]:
+    """Read and diagnose logs, whose names differ afterwards.
+
+    Raises:
+        InputError: If nothing moves in one of them.
+    """
+    stems = [path.stem for path in logs]
+    loaded_logs = []
+    for path in logs:
+        name = None
+        if stems.count(path.stem) > 1:
+            name = f"{Path(os.path.realpath(path)).parent.name}/{path.stem}"
+        log = load_log(setup, path, columns, progress, name)
+        if log.diagnosis.statistics.speed.max() < MIN_SPEED_OF_MOTION:
+            raise InputError(
+                f"no joint moves in `{log.observations.name}`: name other columns, or "
+                "another log."
+            )
+        loaded_logs.append(log)
+    return loaded_logs
+
+
+def load_log(
+    setup: Setup,
+    path: Path,
+    columns: Columns,
+    progress: Progress = ignore_progress,
+    name: str | None = None,
+) -> LoadedLog:
+    """Read and diagnose a log; one of many samples stays on the disk."""
+    notes = ()
+    if is_long(path):
+        try:
+            return _load_in_parts(setup, path, columns, progress, name)
+        except NeedsMemory as reason:
+            notes = (f"{path.name} is long, but was read as a whole: {reason}",)
+
+    progress(f"reading {path.name}", 0.0)
+    recording = read_log(setup, path, columns)
+    if name is not None:
+        recording = dataclasses.replace(recording, name=name)
+    progress(f"filtering {path.name}", 0.0)
+    observations = setup.observe(recording)
+    diagnosis = diagnose(recording, setup.robot, observations=observations)
+    observations = observations.replace(notes=(*observations.notes, *notes))
+    return LoadedLog(observations, diagnosis)
+
+
+def _load_in_parts(
+    setup: Setup, path: Path, columns: Columns, progress: Progress, name: str | None
+) -> LoadedLog:
+    """Open and diagnose a log that need not fit into memory.
+
+    Raises:
+        NeedsMemory: If it can be read as a whole only.
+    """
+    reading = setup.reading
+    if reading.force_delay:
+        raise NeedsMemory("`recording.force_delay` shifts the angles of whole logs")
+    progress(f"opening {path.name}", 0.0)
+    observations = scan_log(
+        path,
+        columns,
+        setup.robot,
+        setup.filter,
+        setup.decimation,
+        setup.min_speed,
+        name,
+        largest_gap=reading.largest_gap,
+        start=reading.start,
+        stop=reading.stop,
+        **reading.files(path),
+    )
+    diagnosis = diagnose(
+        observations,
+        setup.robot,
+        min_speed=setup.min_speed,
+        progress=partial(progress, f"looking through {path.name}"),
+    )
+    notes = (*observations.notes, *diagnosis.notes)
+    step = comparison_step(observations)
+    if step > 1:
+        rows = f"one of every {step} of its {observations.rows} rows"
+        notes = (*notes, f"{observations.name}: torque errors and figures take {rows}")
+    return LoadedLog(observations.replace(notes=notes), diagnosis)
+
+
+def select_filter(
+    setup: Setup,
+    logs: Sequence[Path],
+    columns: Columns,
+    progress: Progress = ignore_progress,
+    held_out: float | None = None,
+) -> tuple[Setup, FilterChoice | None]:
+    """Return the setup with the filter that suits some logs best, and the choice.
+
+    The last part of each log, the fraction `held_out`, stays unseen.
+    """
+    if not setup.filter_candidates or not logs:
+        return setup, None
+    long_log = next(filter(is_long, logs), None)
+    if long_log is not None:
+        raise InputError(
+            "one of several filters is to be chosen (a list as `filter.cutoff`), but "
+            f"`{long_log.name}` is long: choose with a short part of it, and give that "
+            "one filter for the whole."
+        )
+    recordings = []
+    for log in logs:
+        progress(f"reading {log.name}", 0.0)
+        recording = read_log(setup, log, columns)
+        if held_out is not None:
+            recording, _ = recording.split(fitted_share(held_out))
+        recordings.append(recording)
+    choice = choose_filter(
+        setup.base,
+        recordings,
+        [(candidate, setup.decimation) for candidate in setup.filter_candidates],
+        estimator=setup.unbounded_estimator,
+        min_speed=setup.min_speed,
+        progress=partial(progress, "choosing the filter"),
+    )
+    chosen_setup = dataclasses.replace(
+        setup,
+        unknowns=setup.base,
+        filter=choice.filter,
+        filter_candidates=(),
+        notes=(*setup.notes, str(choice)),
+    )
+    return chosen_setup, choice
+
+
+def fitted_share(held_out: float) -> float:
+    """Return the fraction of each log that is fitted, as a user would write it."""
+    return round(1.0 - held_out, 12)

@@ -1,0 +1,173 @@
+"""Identification so that simulations move like the robot: logs become a report."""
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+from jaxid.dynamics.model import Model
+from jaxid.dynamics.terms import RigidBodies
+from jaxid.errors import InputError
+from jaxid.measurement.columns import Columns
+from jaxid.report.rollout import RolloutReport
+from jaxid.report.torque_rollout import TorqueRolloutReport
+from jaxid.result_table import Remark, Status
+from jaxid.rollout import (
+    Bodies,
+    identify_rollout,
+    identify_torque_rollout,
+)
+
+from .allowed_values import Bounds, Positive
+from .log_identification import require_separate_logs
+from .log_loading import load_logs, read_commands, select_filter
+from .setup import Progress, Setup, ignore_progress
+
+
+@dataclasses.dataclass(frozen=True)
+class ServoSettings:
+    """Settings of `jaxid rollout`: for logs of commands, without torques.
+
+    Attributes:
+        bodies: Whether the bodies of the robot's file load the joints; by default if it
+            has some.
+        stiffness: Stiffness (proportional gain) of the servos if it is known [N m/rad
+            or N/m], like `12.0`, or a list with `nan` where it is not; otherwise a
+            known weight tells it.
+        time_step: Longest step of the simulation [s].
+        friction: Whether friction that grows with load or falls with speed is tried.
+        saturation: Whether a largest torque of the servo is tried.
+        integral: Whether integral action of the servos (PID instead of PD controllers)
+            is tried.
+        samples: Number of MJCF files drawn from the distribution of the estimates.
+    """
+
+    bodies: bool | None = None
+    stiffness: Positive | list[float] | None = None
+    time_step: Positive = 0.01
+    friction: bool = True
+    saturation: bool = True
+    integral: bool = False
+    samples: Annotated[int, Bounds(minimum=0, maximum=10_000)] = 0
+
+
+@dataclasses.dataclass(frozen=True)
+class TorqueSettings:
+    """Settings of `jaxid rollout` for logs of torques.
+
+    Attributes:
+        horizon: With torques: length of the windows that are simulated [s].
+        gains: With torques: whether gains of the other joints' torques, relative to the
+            first joint's, are identified.
+        load_friction: With torques: whether friction that grows with the torque is
+            identified.
+    """
+
+    horizon: Positive = 0.2
+    gains: bool = False
+    load_friction: bool = False
+
+
+def identify_rollout_logs(
+    setup: Setup,
+    logs: Sequence[str | Path],
+    columns: Columns,
+    settings: ServoSettings | TorqueSettings,
+    verify: Sequence[str | Path] = (),
+    progress: Progress = ignore_progress,
+) -> RolloutReport | TorqueRolloutReport:
+    """Identify a robot so that simulations follow its positions, and simulate.
+
+    Args:
+        setup: How logs become parameters; `reading.commands` names the columns of the
+            commands.
+        logs: Paths of logs.
+        columns: Meaning of their columns.
+        settings: Settings for logs of commands, or for logs of torques.
+        verify: Paths of logs for the validation; by default those of the fit.
+        progress: Callback, called with a stage and its completed fraction (0 to 1).
+    """
+    logs, verify = [Path(log) for log in logs], [Path(log) for log in verify]
+    require_separate_logs(logs, verify)
+    if isinstance(settings, TorqueSettings):
+        return _follow_torques(setup, logs, columns, settings, verify, progress)
+    return _follow_commands(setup, logs, columns, settings, verify, progress)
+
+
+def _follow_commands(
+    setup: Setup,
+    logs: Sequence[Path],
+    columns: Columns,
+    settings: ServoSettings,
+    verify: Sequence[Path],
+    progress: Progress,
+) -> RolloutReport:
+    """Identify joints behind position servos."""
+    recordings = []
+    for log in (*logs, *verify):
+        progress(f"reading {log.name}", 0.0)
+        recordings.append(read_commands(setup, log, columns))
+    fitted, unseen = recordings[: len(logs)], recordings[len(logs) :]
+    progress("identifying", 0.0)
+    fit = identify_rollout(
+        fitted,
+        bodies_of_file(setup, settings),
+        joint_names=setup.robot.joint_names,
+        time_step=settings.time_step,
+        saturation=settings.saturation,
+        friction=settings.friction,
+        integral=settings.integral,
+        stiffness=settings.stiffness,
+    )
+    progress("simulating", 0.0)
+    simulated = unseen or fitted
+    errors = fit.validate(simulated)
+    window_errors = fit.window_errors(simulated)
+    return RolloutReport(fit, errors, window_errors, bool(unseen), settings.samples, {})
+
+
+def bodies_of_file(setup: Setup, settings: ServoSettings) -> Bodies | None:
+    """Return the bodies that the robot's file describes, as loads of its joints."""
+    if settings.bodies is False:
+        return None
+    if setup.robot_file is None:
+        if settings.bodies:
+            raise InputError("`rollout.bodies` needs a robot from a URDF or MJCF file.")
+        return None
+    bodies = setup.robot_file.bodies()
+    has_mass = bool((bodies[:, 0] > 0).any())
+    if not has_mass:
+        return None
+    return Bodies(Model(setup.robot, (RigidBodies(),)), bodies.ravel())
+
+
+def _follow_torques(
+    setup: Setup,
+    logs: Sequence[Path],
+    columns: Columns,
+    settings: TorqueSettings,
+    verify: Sequence[Path],
+    progress: Progress,
+) -> TorqueRolloutReport:
+    """Identify the model of `identify_logs`, beside other methods."""
+    if setup.load_friction:
+        raise InputError("give `rollout.load_friction`, not `model.load`.")
+    progress("finding base parameters", 0.0)
+    base = setup.base
+    setup, _ = select_filter(setup, logs, columns, progress)
+    loaded_logs = load_logs(setup, [*logs, *verify], columns, progress)
+    observations = [log.observations for log in loaded_logs]
+    fitted, unseen = observations[: len(logs)], observations[len(logs) :]
+    progress("identifying", 0.0)
+    fit = identify_torque_rollout(base, fitted, **dataclasses.asdict(settings))
+    progress("simulating", 0.0)
+    doubts = [text for log in loaded_logs for text in log.findings]
+    notes = [*setup.notes, *(note for log in observations for note in log.notes)]
+    return TorqueRolloutReport(
+        fit,
+        unseen or fitted,
+        bool(unseen),
+        [Remark(text, Status.DOUBTFUL) for text in doubts],
+        [Remark(note) for note in notes],
+        {},
+    )

@@ -1,0 +1,98 @@
+"""Checks of a designed motion, one remark each: joints, floor, self-collision, forces."""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from jaxid.excitation.constraints import Finding
+from jaxid.excitation.design_result import ExcitationPlan
+from jaxid.result_table import Remark, Status
+from jaxid.robot.shapes import HalfSpace
+
+from .surroundings import Surroundings
+
+MAX_ROUNDING = 1e-6
+"""Excess over a limit of the joints that counts as rounding, relative to the limit."""
+
+
+def check_motion(
+    surroundings: Surroundings, plan: ExcitationPlan, force_fault: str
+) -> Iterator[Remark]:
+    """Yield one remark for each check of a motion: kept, exceeded, or why it was not checked.
+
+    Args:
+        surroundings: Shapes that must keep a distance.
+        plan: Designed motion, and its findings on what was checked.
+        force_fault: Why forces were not checked; empty if they were.
+    """
+    yield check_joints(plan)
+    floors = [x.name for x in surroundings.obstacles if isinstance(x, HalfSpace)]
+    floor_findings, other_findings = [], []
+    for finding in plan.findings:
+        if finding.name.startswith("the clearance of "):
+            above_floor = any(finding.name.endswith(f" and {x}") for x in floors)
+            (floor_findings if above_floor else other_findings).append(finding)
+    yield check_floor(surroundings, bool(floors), floor_findings)
+    yield from check_self_collision(surroundings, other_findings)
+    force_findings = [
+        finding
+        for finding in plan.findings
+        if finding.name.startswith(("the force of", "the torque of"))
+    ]
+    if force_fault:
+        yield Remark(f"forces: {force_fault}", Status.BAD)
+    elif force_findings:
+        yield judge("forces by the nominal parameters", force_findings)
+
+
+def check_joints(plan: ExcitationPlan) -> Remark:
+    """Return whether the joints keep their limits."""
+    derivatives = 4 if np.isfinite(np.asarray(plan.limits.limits.jerk)).any() else 3
+    excess = np.asarray(plan.use)[:derivatives].max() - 1.0
+    quantities = "positions, speeds and accelerations"
+    if excess > MAX_ROUNDING:
+        text = f"{quantities}: limits are exceeded by {100 * excess:.2g} %"
+        return Remark(text, Status.BAD)
+    return Remark(
+        f"{quantities}: all joints keep their limits at all times", Status.GOOD
+    )
+
+
+def check_floor(
+    surroundings: Surroundings, has_floor: bool, findings: Sequence[Finding]
+) -> Remark:
+    """Return whether the robot stays above the floor."""
+    if has_floor and findings:
+        return judge("floor", findings)
+    if has_floor:
+        return Remark("floor: no shape of the robot can come near it", Status.GOOD)
+    if surroundings.collision.floor is False:
+        return Remark("floor: not checked, as `floor = false` asks", Status.DOUBTFUL)
+    return Remark("floor: not checked, for no shape of the robot is known", Status.BAD)
+
+
+def check_self_collision(
+    surroundings: Surroundings, findings: Sequence[Finding]
+) -> Iterator[Remark]:
+    """Yield whether bodies keep their distance, and which of their shapes are not known."""
+    shapes = surroundings.shapes
+    for note in () if shapes is None else shapes.notes:
+        yield Remark(f"self-collision: {note}", Status.DOUBTFUL)
+    for fault in surroundings.faults:
+        yield Remark(f"self-collision: {fault}", Status.BAD)
+    if findings:
+        yield judge("self-collision", findings)
+    elif not surroundings.collision.fit:
+        text = "self-collision: not checked, as `fit = false` asks"
+        yield Remark(text, Status.DOUBTFUL)
+    elif not surroundings.faults:
+        yield Remark("self-collision: no two bodies can meet", Status.GOOD)
+
+
+def judge(name: str, findings: Sequence[Finding]) -> Remark:
+    """Return a remark about the quantity that is nearest to its limit, or furthest beyond it."""
+    worst = max(findings, key=lambda finding: finding.value)
+    verb = "keep their limits" if worst.value <= 0 else "do not keep their limits"
+    nearest = str(worst).removeprefix("the ")
+    text = f"{name}: {len(findings)} quantities {verb}; the nearest: {nearest}"
+    return Remark(text, Status.GOOD if worst.value <= 0 else Status.BAD)

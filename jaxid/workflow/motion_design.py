@@ -1,0 +1,286 @@
+"""Design of the motion that identifies best, within all limits that can be checked."""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from jaxid.errors import InputError
+from jaxid.excitation.constraints import AbstractConstraint, TipLimits
+from jaxid.excitation.design import DesignProgress, design_excitation
+from jaxid.excitation.design_result import ExcitationPlan
+from jaxid.excitation.problem import assumed_noise
+from jaxid.io import import_extra
+from jaxid.report.excitation import write_excitation
+from jaxid.result_table import Remark, Status
+from jaxid.trajectory.controllers import CONTROLLERS
+from jaxid.trajectory.files import load_trajectory
+from jaxid.trajectory.lead_in_and_out import WithLeads
+from jaxid.trajectory.trajectory import LinearTrajectory
+
+from .excitation_settings import Excitation
+from .motion_check import check_motion
+from .motion_files import PlayableMotion, make_playable, write_motion
+from .nominal_parameters import (
+    UNKNOWN_SHARE,
+    Nominal,
+    earlier_information,
+    find_nominal,
+    limit_forces,
+)
+from .setup import Progress, Setup, ignore_progress
+from .surroundings import Surroundings
+
+Improvement = Callable[[LinearTrajectory], None]
+"""Callback, called with every better motion that keeps all limits."""
+
+
+class MotionTask(NamedTuple):
+    """Motion to design, and all that its search needs to know.
+
+    Attributes:
+        setup: Robot, and the parameters to identify.
+        excitation: Settings of the motion and of its search.
+        surroundings: Shapes that must keep a distance.
+        nominal: Parameters that are known; None without.
+        constraints: Constraints beside the limits of the joints.
+        force_fault: Why forces are not among the constraints; empty if they are.
+        begin: Motion to go on with; None to begin anew.
+    """
+
+    setup: Setup
+    excitation: Excitation
+    surroundings: Surroundings
+    nominal: Nominal | None
+    constraints: tuple[AbstractConstraint, ...]
+    force_fault: str
+    begin: LinearTrajectory | None = None
+
+    @property
+    def faults(self) -> tuple[str, ...]:
+        """Sentences about all that will not be checked."""
+        forces = (f"forces: {self.force_fault}",) if self.force_fault else ()
+        return (*self.surroundings.faults, *forces)
+
+
+class DesignedMotion(NamedTuple):
+    """Designed motion as a robot can play it."""
+
+    plan: ExcitationPlan  # result of the optimisation
+    playable: PlayableMotion  # motion that the robot plays
+    remarks: tuple[Remark, ...]  # remarks beside those of the plan
+
+
+def prepare_motion(
+    setup: Setup,
+    excitation: Excitation,
+    surroundings: Surroundings,
+    earlier_design: Path | None = None,
+) -> MotionTask:
+    """Find the constraints of a design, and the motion of an earlier one to go on with.
+
+    Args:
+        setup: Robot, and the parameters to identify.
+        excitation: Settings of the motion and of its search.
+        surroundings: Shapes that must keep a distance.
+        earlier_design: File of the motion to go on with (.json).
+
+    Raises:
+        InputError: If the settings do not fit the robot, or the earlier motion does not
+            fit them.
+    """
+    require_playable(setup, excitation)
+    nominal = find_nominal(setup, excitation)
+    forces = limit_forces(setup, excitation, nominal)
+    tip = TipLimits(
+        excitation.tip_speed, excitation.tip_acceleration, *(excitation.workspace or ())
+    )
+    constraints: list[AbstractConstraint] = []
+    if surroundings.clearance is not None:
+        constraints.append(surroundings.clearance)
+    if tip.entries(setup.robot):
+        constraints.append(tip)
+    if forces.limits is not None:
+        constraints.append(forces.limits)
+    task = MotionTask(
+        setup, excitation, surroundings, nominal, tuple(constraints), forces.fault
+    )
+    if earlier_design is None:
+        return task
+    begin = load_trajectory(earlier_design)
+    begin = begin.inner if isinstance(begin, WithLeads) else begin
+    basis = excitation.basis(bool(constraints))
+    if not (isinstance(begin, LinearTrajectory) and str(begin.basis) == str(basis)):
+        raise InputError(
+            f"`{earlier_design}` holds a motion of another kind: design anew."
+        )
+    return task._replace(begin=begin)
+
+
+def require_playable(setup: Setup, excitation: Excitation) -> None:
+    """Reject settings that the controller or the file for ROS cannot have."""
+    if excitation.ros == "mcap":
+        import_extra("rosbags.rosbag2", "logs", "a bag of ROS 2 is written by")
+    if excitation.controller is not None:
+        CONTROLLERS[excitation.controller].require(setup.robot)
+        if not excitation.rests:
+            raise InputError(
+                "`controller` plays motions from standstill to standstill: leave "
+                "`leads = false` out, or set `rest = true`."
+            )
+
+
+def design_motion(
+    task: MotionTask,
+    progress: Progress = ignore_progress,
+    improvement: Improvement | None = None,
+    seconds: float | None = None,
+) -> DesignedMotion:
+    """Design a motion.
+
+    Args:
+        task: Motion to design.
+        progress: Callback, called with a stage and its completed fraction (0 to 1).
+        improvement: Callback, called with every better motion that keeps all limits.
+        seconds: Time for the search [s]; by default that of the settings.
+
+    Raises:
+        InputError: If the settings do not fit the robot, or no motion keeps all limits.
+    """
+    setup, excitation = task.setup, task.excitation
+    if excitation.noise is None:
+        noise = assumed_noise(setup.robot)
+    else:
+        noise = np.array(excitation.noise)
+    plan = design_excitation(
+        setup.base,
+        basis=excitation.basis(bool(task.constraints)),
+        constraints=task.constraints,
+        key=jax.random.key(excitation.seed),
+        noise=noise,
+        nominal=task.nominal and task.nominal.sizes(setup.base),
+        prior=earlier_information(setup, excitation, noise),
+        samples=excitation.samples,
+        criterion=excitation.objective,
+        starts=excitation.starts,
+        generations=excitation.generations,
+        progress=follow_design(progress, improvement),
+        begin=task.begin,
+        seconds=excitation.time if seconds is None else seconds,
+    )
+    playable = make_playable(setup.robot, excitation, plan.trajectory)
+    return DesignedMotion(plan, playable, tuple(describe_motion(task, plan, playable)))
+
+
+def follow_design(
+    progress: Progress, improvement: Improvement | None = None
+) -> Callable[[DesignProgress], None]:
+    """Return a callback of a design that shows its progress and hands better motions on."""
+    best_value = np.inf
+
+    def follow(step: DesignProgress) -> None:
+        nonlocal best_value
+        limits = "" if step.feasible else ", limits not yet kept"
+        text = f"{step.task}, best so far {step.best:.5g}{limits}"
+        progress(text, step.fraction)
+        if improvement is not None and step.feasible and step.best < best_value:
+            improvement(step.trajectory)
+            best_value = step.best
+
+    return follow
+
+
+def write_design(
+    task: MotionTask,
+    design: DesignedMotion,
+    output: Path,
+    command: str = "",
+    experiment_text: str = "",
+) -> list[Path]:
+    """Write a motion as `write_motion` does, and its page; return the files.
+
+    Args:
+        task: Motion that was designed.
+        design: Designed motion.
+        output: Table of the motion (.csv); the page is in a folder beside it.
+        command: Command to repeat the design, for the page.
+        experiment_text: Text of the experiment file, for the page.
+    """
+    facts = (("seed", str(task.excitation.seed)),)
+    settings = {"facts": facts, "experiment_text": experiment_text, "command": command}
+    # First the page: where there is no room for pictures, nothing changes.
+    pictures = write_excitation(
+        output.with_suffix(""),
+        design.plan,
+        design.playable.motion,
+        design.remarks,
+        settings,
+        task.surroundings.shapes,
+    )
+    motion_files = write_motion(
+        task.setup.robot, task.excitation, design.playable, output
+    )
+    return motion_files + pictures
+
+
+def describe_motion(
+    task: MotionTask, plan: ExcitationPlan, playable: PlayableMotion
+) -> Iterator[Remark]:
+    """Yield what must be known of a designed motion beside its plan."""
+    excitation = task.excitation
+    if playable.fault:
+        yield Remark(playable.fault, Status.BAD)
+    begin, end = playable.window
+    if begin > 0:
+        yield Remark(
+            "the robot starts at rest and is in the designed motion from "
+            f"{begin:.3f} to {end:.3f} s of {float(playable.motion.duration):.3f} s"
+        )
+    if excitation.noise is None:
+        yield Remark(
+            "the noise is assumed as 1 % of the largest forces: give `noise` if it is "
+            "known"
+        )
+    if excitation.earlier:
+        files = ", ".join(excitation.earlier)
+        yield Remark(f"deviations are those together with {files}")
+    leads = excitation.chosen_leads
+    if leads is not None and leads.periods > 1:
+        yield Remark(
+            f"the motion runs through {leads.periods} periods; the deviations are of one"
+        )
+    if task.nominal is None:
+        yield Remark(
+            "for relative deviations, say in `excitation.nominal` where an earlier "
+            "result is"
+        )
+    yield from check_motion(task.surroundings, plan, task.force_fault)
+    if task.nominal is not None:
+        yield from describe_nominal(task, task.nominal)
+
+
+def describe_nominal(task: MotionTask, nominal: Nominal) -> Iterator[Remark]:
+    """Yield what the forces of a motion leave out."""
+    unknown_names = [
+        name
+        for name, value in zip(task.setup.base.names, nominal.parameters, strict=True)
+        if np.isnan(value)
+    ]
+    if unknown_names:
+        text = (
+            f"not known, and counted as zero in the forces: {', '.join(unknown_names)}"
+        )
+        if task.excitation.force_margin is None:
+            text += (
+                f"; so {100 * UNKNOWN_SHARE:g} % of the largest forces are kept free "
+                "(`force_margin`)"
+            )
+        yield Remark(text, Status.DOUBTFUL)
+    if nominal.undetermined:
+        text = (
+            f"`{task.excitation.nominal}` does not determine "
+            f"{', '.join(nominal.undetermined)}: their uncertainty counts as zero"
+        )
+        yield Remark(text, Status.DOUBTFUL)

@@ -1,0 +1,164 @@
+"""Knowledge before an experiment: nominal parameters, limits of forces, earlier motions."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxid.arrays import Float, double_precision
+from jaxid.dynamics.base import BaseParameters
+from jaxid.dynamics.motion import Motion
+from jaxid.errors import InputError
+from jaxid.excitation.constraints import ForceLimits
+from jaxid.excitation.criteria import information
+from jaxid.report.result_files import read_fit
+from jaxid.robot.robot import Robot
+from jaxid.trajectory.files import load_trajectory
+
+from .excitation_settings import Excitation
+from .setup import Setup
+
+UNKNOWN_SHARE = 0.3
+"""Fraction of the largest forces that is kept free where friction, or anything else, is unknown."""
+RANDOM_POSES = 2000
+"""Number of random poses in which the forces of gravity are computed."""
+
+NO_INERTIAS = (
+    "not checked: no inertias are known; say in `excitation.nominal` where a report is"
+)
+NO_MAX_FORCES = "not checked: no largest forces are known; give `limits.force`"
+
+
+class Nominal(NamedTuple):
+    """Base parameters as far as they are known before the experiment."""
+
+    parameters: Float[np.ndarray, " base"]  # values; NaN where nothing is known
+    # covariance of an earlier fit, zero for what it does not determine; None if they
+    # are claims
+    covariance: Float[np.ndarray, "base base"] | None
+    undetermined: tuple[str, ...] = ()  # names of what an earlier fit leaves open
+
+    def sizes(self, base: BaseParameters) -> Float[np.ndarray, " base"]:
+        """Return the values; NaN for estimates of what is not determined, which mean nothing."""
+        leaves_open = np.isin(base.names, self.undetermined)
+        return np.where(leaves_open, np.nan, self.parameters)
+
+
+def find_nominal(setup: Setup, excitation: Excitation) -> Nominal | None:
+    """Return nominal parameters of an earlier result, or those that the robot's file claims.
+
+    Raises:
+        InputError: If the earlier result is of other parameters.
+    """
+    if excitation.nominal is not None:
+        return _of_earlier_fit(setup.base, excitation.nominal)
+    claims = {} if setup.robot_file is None else setup.robot_file.claims()
+    if not claims:
+        return None
+    names = setup.model.parameter_names
+    values = setup.base.from_standard([claims.get(name, 0.0) for name in names])
+    claimed = [names[k] in claims for k in setup.base.indices]
+    return Nominal(np.where(claimed, np.asarray(values), np.nan), None)
+
+
+def _of_earlier_fit(base: BaseParameters, report: str) -> Nominal:
+    """Return the parameters of an earlier report."""
+    fit = read_fit(Path(report))
+    if fit.base.names != base.names:
+        raise InputError(
+            f"`nominal`: the base parameters of `{report}` are not the {base.size} of "
+            "this file."
+        )
+    covariance = np.array(fit.covariance)
+    undetermined = ~np.isfinite(np.diag(covariance))
+    covariance[undetermined | undetermined[:, None]] = 0.0
+    names = tuple(base.names[k] for k in np.flatnonzero(undetermined))
+    return Nominal(np.asarray(fit.parameters), covariance, names)
+
+
+class LimitedForces(NamedTuple):
+    """Limits of the forces in a design; or why there are none."""
+
+    limits: ForceLimits | None
+    fault: str  # why forces are not checked; empty if they are
+
+
+def limit_forces(
+    setup: Setup, excitation: Excitation, nominal: Nominal | None
+) -> LimitedForces:
+    """Return limits of the forces by nominal parameters.
+
+    Raises:
+        InputError: If `force_margin` is given, but no motion can keep the limits.
+    """
+    limits = None
+    fault = NO_INERTIAS
+    if nominal is not None:
+        margin = excitation.force_margin
+        if margin is None:
+            margin = UNKNOWN_SHARE if np.isnan(nominal.parameters).any() else 0.0
+        parameters = np.nan_to_num(nominal.parameters)
+        limits = ForceLimits(setup.base, parameters, nominal.covariance, margin)
+        has_limits = bool(limits.entries(setup.robot))
+        fault = gravity_fault(setup.robot, limits) if has_limits else NO_MAX_FORCES
+    if fault and excitation.force_margin is not None:
+        raise InputError(f"`force_margin`: {fault}.")
+    return LimitedForces(None if fault else limits, fault)
+
+
+def gravity_fault(robot: Robot, limits: ForceLimits) -> str:
+    """Return which joint cannot hold the robot in any pose of its range; empty if all can."""
+    q = random_poses(robot)
+    rest = Motion(q, np.zeros_like(q), np.zeros_like(q))
+    with double_precision():
+        excess: Float[np.ndarray, "poses values"] = np.asarray(limits(robot, rest))
+    largest_excess = excess.max(axis=1)
+    best_pose = int(largest_excess.argmin())
+    if largest_excess[best_pose] <= 0:
+        return ""
+    finding = limits.entries(robot)[int(excess[best_pose].argmax())]
+    force = finding.limit * (1.0 + largest_excess[best_pose])
+    return (
+        f"in every one of {RANDOM_POSES} poses gravity needs more than the limits of the "
+        f"forces allow; at best {finding.name} needs {force:.3g} of "
+        f"{finding.limit:.3g} {finding.unit}: check efforts and inertias of the robot's "
+        "file, or give `limits.force`"
+    )
+
+
+def random_poses(robot: Robot) -> Float[np.ndarray, "poses joints"]:
+    """Return random poses within the range of the joints, the first of them near zero."""
+    ends = np.where(robot.revolute, np.pi, 1.0)
+    low, high = robot.limits.position_min, robot.limits.position_max
+    low = np.where(np.isfinite(low), low, -ends)
+    high = np.where(np.isfinite(high), high, ends)
+    poses = np.random.default_rng(0).uniform(low, high, (RANDOM_POSES, robot.joints))
+    poses[0] = np.clip(0.0, low, high)
+    return poses
+
+
+def earlier_information(
+    setup: Setup, excitation: Excitation, noise: Float[np.ndarray, " joints"]
+) -> Float[np.ndarray, "base base"] | None:
+    """Return the information of earlier motions; None if there are none."""
+    if not excitation.earlier:
+        return None
+    if not excitation.objective.weighted:
+        raise InputError(
+            f'`earlier` and `criterion = "{excitation.criterion}"` do not go together: '
+            'choose a criterion in units of the noise, like "d_optimal".'
+        )
+    robot = setup.robot
+    total = np.zeros((setup.base.size, setup.base.size))
+    for name in excitation.earlier:
+        trajectory = load_trajectory(Path(name))
+        if trajectory.joints != robot.joints:
+            raise InputError(
+                f"`earlier`: the motion of `{Path(name).name}` moves "
+                f"{trajectory.joints} joint(s), but the robot `{robot.name}` has "
+                f"{robot.joints}."
+            )
+        step = float(trajectory.duration) / excitation.samples
+        motion = trajectory.motion(np.arange(excitation.samples) * step)
+        total += np.asarray(information(setup.base, motion, 1.0 / noise).weighted)
+    return total

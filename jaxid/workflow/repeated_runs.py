@@ -1,0 +1,300 @@
+"""Several runs of one robot: payload, gains of the drives, and states such as cold and warm."""
+
+import dataclasses
+import functools
+import os
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxid.errors import InputError
+from jaxid.identification.combination import combine_fits
+from jaxid.identification.drive_gains import DriveGains, identify_drive_gains
+from jaxid.identification.estimators import Complete
+from jaxid.identification.fit_result import Fit
+from jaxid.identification.identify import fit_problem
+from jaxid.identification.operating_states import identify_states
+from jaxid.identification.payload import (
+    CENTRAL_NAMES,
+    CENTRAL_UNITS,
+    identify_payload,
+)
+from jaxid.identification.problem import RegressionProblem
+from jaxid.measurement.columns import Columns
+from jaxid.report.result_files import Estimates, write_estimates
+from jaxid.result_table import Remark, Status, Summarised, Table
+from jaxid.robot.inertia import INERTIAL_NAMES, INERTIAL_UNITS
+from jaxid.robot.robot import Tool
+from jaxid.validation.diagnosis import mistakes_in_logs
+
+from .log_identification import read_earlier_fit
+from .log_loading import is_report, load_logs, select_filter
+from .setup import Progress, Setup, ignore_progress
+
+PAYLOAD_KEYS = ("mass", "centre_of_mass", "inertia", "estimate", "distance")
+"""Properties of a payload in its JSON file."""
+MIN_CHANCE_OF_SHARING = 0.01
+"""Chance below which states do not agree on what they share."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class RunsReport(Summarised):
+    """Result of several runs, and doubts about their logs.
+
+    Attributes:
+        kind: Kind of the result: "payload", "gains" or "states".
+        result: The result.
+        estimates: Estimates in the files, the first with their covariance.
+        content: Further content of the JSON file.
+        sources: Logs and reports of each run.
+        doubts: Doubts about the logs, as sentences.
+        details: Tables beside that of the result.
+    """
+
+    kind: str
+    result: Any
+    estimates: Sequence[Estimates]
+    content: Mapping[str, Any]
+    sources: Mapping[str, Sequence[Path]]
+    doubts: Sequence[str]
+    details: Sequence[Table] = ()
+
+    @property
+    def remarks(self) -> list[Remark]:
+        """Doubts, as remarks."""
+        return [Remark(text, Status.DOUBTFUL) for text in self.doubts]
+
+    def tables(self) -> list[Table]:
+        """Return all tables of the result."""
+        return [self.result.summary(), *self.details]
+
+    def save(self, folder: str | Path) -> list[Path]:
+        """Write a page, and the numbers as JSON and CSV; return the files."""
+        return write_estimates(
+            Path(folder),
+            self.kind,
+            self.estimates,
+            self.content,
+            self.sources,
+            self.tables(),
+            self.remarks,
+        )
+
+
+class Runs(NamedTuple):
+    """Fits of several runs, and doubts about their logs."""
+
+    fits: list[Fit]
+    doubts: list[str]
+
+
+def fit_runs(
+    setup: Setup,
+    groups: Mapping[str, Sequence[Path]],
+    columns: Columns,
+    progress: Progress = ignore_progress,
+) -> Runs:
+    """Fit the logs and earlier reports of each run, by weighted least squares.
+
+    Args:
+        setup: How logs become parameters.
+        groups: Logs and reports of each run, by its name.
+        columns: Meaning of the columns of the logs.
+        progress: Callback, called with a stage and its completed fraction (0 to 1).
+    """
+    if setup.nonlinear_friction:
+        raise InputError(
+            "`estimator.nonlinear_friction` would find other shapes of friction in each "
+            "run: leave it out, and give all runs one `epsilon` and `stribeck`."
+        )
+    doubts = []
+    if not has_plain_estimator(setup):
+        doubts.append(
+            "all runs are weighted least squares here: the rest of `[estimator]` does "
+            "not count"
+        )
+    progress("finding base parameters", 0.0)
+    paths = [path for group in groups.values() for path in group]
+    files = [path for path in paths if not is_report(path)]
+    setup, _ = select_filter(setup, files, columns, progress)
+    fits = []
+    for name, group in groups.items():
+        fit, group_doubts = fit_run(setup, name, group, columns, progress)
+        fits.append(fit)
+        doubts += group_doubts
+    return Runs(fits, doubts)
+
+
+def has_plain_estimator(setup: Setup) -> bool:
+    """Return whether the estimator is least squares, perhaps with bounds of the bodies."""
+    complete = isinstance(setup.least_squares.solution, Complete)
+    unbounded = setup.unbounded_estimator is setup.least_squares
+    return unbounded and complete
+
+
+def fit_run(
+    setup: Setup,
+    name: str,
+    paths: Sequence[Path],
+    columns: Columns,
+    progress: Progress,
+) -> tuple[Fit, list[str]]:
+    """Return the fit to the logs and earlier reports of one run, and doubts about the logs."""
+    fits = [read_earlier_fit(setup, path) for path in paths if is_report(path)]
+    files = [path for path in paths if not is_report(path)]
+    doubts = []
+    if files:
+        logs = load_logs(setup, files, columns, progress)
+        observations = [log.observations for log in logs]
+        factorising = partial(progress, f"factorising the rows, {name}")
+        rows = RegressionProblem(setup.base, observations, factorising)
+        fits.append(fit_problem(rows, setup.least_squares))
+        mistakes, _ = mistakes_in_logs([log.diagnosis for log in logs], fits[-1])
+        doubts = [text for log in logs for text in log.findings] + [*mistakes]
+    return dataclasses.replace(functools.reduce(combine_fits, fits), name=name), doubts
+
+
+def fit_with_and_without_load(
+    setup: Setup,
+    unloaded: Sequence[str | Path],
+    loaded: Sequence[str | Path],
+    columns: Columns,
+    progress: Progress,
+) -> tuple[Runs, dict[str, list[Path]]]:
+    """Fit the runs without and with a load; return them, and their logs."""
+    groups = {
+        "unloaded": [Path(log) for log in unloaded],
+        "loaded": [Path(log) for log in loaded],
+    }
+    places = [{os.path.realpath(log) for log in logs} for logs in groups.values()]
+    shared_places = set.intersection(*places)
+    if shared_places:
+        raise InputError(
+            f"`{Path(min(shared_places)).name}` is given both without and with the "
+            "load: name it once."
+        )
+    return fit_runs(setup, groups, columns, progress), groups
+
+
+def identify_payload_logs(
+    setup: Setup,
+    unloaded: Sequence[str | Path],
+    loaded: Sequence[str | Path],
+    columns: Columns,
+    body: int | None = None,
+    mass: float | None = None,
+    progress: Progress = ignore_progress,
+) -> RunsReport:
+    """Identify a payload from logs without it and logs with it.
+
+    Args:
+        setup: How logs become parameters.
+        unloaded: Logs and folders of reports without the payload.
+        loaded: Logs and folders of reports with the payload.
+        columns: Meaning of the columns of the logs.
+        body: Joint that moves the payload; the last one by default.
+        mass: Mass of the payload, if it is known [kg].
+        progress: Callback, called with a stage and its completed fraction (0 to 1).
+    """
+    runs, sources = fit_with_and_without_load(
+        setup, unloaded, loaded, columns, progress
+    )
+    payload = identify_payload(*runs.fits, body=body, mass=mass)
+    estimates = [
+        (INERTIAL_NAMES, INERTIAL_UNITS, payload.parameters, payload.uncertainty),
+        (CENTRAL_NAMES, CENTRAL_UNITS, *payload.central),
+    ]
+    content = {key: getattr(payload, key) for key in PAYLOAD_KEYS}
+    content["body"] = setup.robot.joint_names[payload.body]
+    return RunsReport("payload", payload, estimates, content, sources, runs.doubts)
+
+
+def identify_gains_logs(
+    setup: Setup,
+    unloaded: Sequence[str | Path],
+    loaded: Sequence[str | Path],
+    columns: Columns,
+    load: Tool | float,
+    progress: Progress = ignore_progress,
+) -> RunsReport:
+    """Identify the gains of the drives from logs without and with a known load.
+
+    Args:
+        setup: How logs become parameters.
+        unloaded: Logs and folders of reports without the load.
+        loaded: Logs and folders of reports with the load.
+        columns: Meaning of the columns of the logs.
+        load: The load; or its mass if it is at the end-effector [kg].
+        progress: Callback, called with a stage and its completed fraction (0 to 1).
+    """
+    runs, sources = fit_with_and_without_load(
+        setup, unloaded, loaded, columns, progress
+    )
+    unloaded_fit, loaded_fit = runs.fits
+    drives = identify_drive_gains(unloaded_fit, loaded_fit, load)
+    names = drives.joint_names
+    estimates = [(names, ("1",) * len(names), drives.gains, drives.uncertainty)]
+    content = corrected_gains(columns, drives)
+    return RunsReport("gains", drives, estimates, content, sources, runs.doubts)
+
+
+def corrected_gains(columns: Columns, drives: DriveGains) -> dict[str, list[float]]:
+    """Return the argument of `Columns` that corrects the forces."""
+    key = "force_gains" if columns.torque_constants is None else "torque_constants"
+    earlier_values = getattr(columns, key)
+    factors = np.array(1.0 if earlier_values is None else earlier_values)
+    return {key: (factors * np.asarray(drives.gains)).tolist()}
+
+
+def identify_states_logs(
+    setup: Setup,
+    logs: Sequence[str | Path],
+    columns: Columns,
+    progress: Progress = ignore_progress,
+) -> RunsReport:
+    """Identify a robot in several states at once: one inertia, friction for each state.
+
+    Args:
+        setup: How logs become parameters.
+        logs: A log, or the folder of a report, for each state; their names are those of
+            the states.
+        columns: Meaning of the columns of the logs.
+        progress: Callback, called with a stage and its completed fraction (0 to 1).
+    """
+    paths = [Path(log) for log in logs]
+    groups = {Path(os.path.realpath(path)).stem: [path] for path in paths}
+    if len(groups) < max(len(paths), 2):
+        raise InputError(
+            "give one log or report for each of two or more states, with different "
+            "names."
+        )
+    runs = fit_runs(setup, groups, columns, progress)
+    states = identify_states(runs.fits)
+    doubts = list(runs.doubts)
+    _, chance = states.sharing
+    if chance < MIN_CHANCE_OF_SHARING:
+        doubts.append(
+            "the states do not agree on what they share (chance "
+            f"{100 * chance:.2g} %): something else than friction and offsets differs"
+        )
+    first_state, *other_states = groups
+    comparisons = [states.compare(first_state, state) for state in other_states]
+    tables = [(x.group_summary(), x.summary()) for x in comparisons]
+    content = {
+        "states": states.states,
+        "shared": [states.base.names[k] for k in states.shared],
+        "varying": [states.base.names[k] for k in states.varying],
+        "sharing_chance": chance,
+    }
+    return RunsReport(
+        "states",
+        states,
+        [(states.names, states.units, states.parameters, states.uncertainty)],
+        content,
+        {"states": paths},
+        doubts,
+        details=[table for pair in tables for table in pair],
+    )

@@ -1,0 +1,112 @@
+"""URDF or MJCF file of a robot, and what it claims about bodies, rotors and friction."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxid.arrays import Float
+from jaxid.errors import InputError
+from jaxid.identification.consistency import consistency_margin
+from jaxid.robot.inertia import INERTIAL_NAMES
+from jaxid.robot.robot import Robot
+from jaxid.robot.urdf import joint_parameters, load_urdf, urdf_parameters
+
+
+@dataclasses.dataclass(frozen=True)
+class RobotFile:
+    """URDF or MJCF file of a robot.
+
+    Attributes:
+        path: Path of the file.
+        tip: Link (body or site) of the end-effector; only the chain to it is used.
+        base: Link (body) that stands on the ground; the root by default.
+        base_rotation: Orientation of the base in the frame of the ground; None for
+            parallel frames.
+        base_position: Position of the base in the frame of the ground [m].
+    """
+
+    path: str | Path
+    tip: str | None = None
+    base: str | None = None
+    base_rotation: Float[np.ndarray, "3 3"] | None = None
+    base_position: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    @property
+    def chain(self) -> dict[str, Any]:
+        """Ends of the chain, as functions take them that read the file."""
+        return {"tip": self.tip, "base": self.base}
+
+    @property
+    def placement(self) -> dict[str, Any]:
+        """Orientation and position of the base, as functions take them that make robots."""
+        return {
+            "base_rotation": self.base_rotation,
+            "base_position": self.base_position,
+        }
+
+    def load(self) -> Robot:
+        """Load the robot."""
+        return load_urdf(self.path, **self.chain, **self.placement)
+
+    def bodies(self) -> Float[np.ndarray, "bodies 10"]:
+        """Return the inertial parameters of the bodies.
+
+        Raises:
+            InputError: If the file describes a body that cannot exist.
+        """
+        parameters = urdf_parameters(self.path, **self.chain)
+        return np.asarray(parameters).reshape(-1, len(INERTIAL_NAMES))
+
+    def possible_bodies(self) -> Float[np.ndarray, "bodies 10"] | None:
+        """Return the inertial parameters if all bodies can exist, otherwise None."""
+        try:
+            bodies = self.bodies()
+        except InputError:
+            return None
+        can_exist = bool((consistency_margin(bodies) > 0.0).all())
+        return bodies if can_exist else None
+
+    def claims(self) -> dict[str, float]:
+        """Return all parameters that the file claims, by their names in a model.
+
+        Nothing if it describes no masses, or a body that cannot exist: notes of the
+        robot name that body.
+        """
+        try:
+            bodies = self.bodies()
+        except InputError:
+            return {}
+        if not np.any(bodies):
+            return {}
+        return _named_bodies(bodies) | self._joint_claims()
+
+    def _joint_claims(self) -> dict[str, float]:
+        """Return rotor inertias and friction that the file claims, by their names in a model."""
+        values = joint_parameters(self.path, **self.chain).values()
+        claims = {}
+        for symbol, row in zip(("Ia", "fv", "fc"), values, strict=True):
+            for joint, value in enumerate(row, 1):
+                if value > 0.0:
+                    claims[f"{symbol}{joint}"] = float(value)
+        return claims
+
+
+def _named_bodies(bodies: Float[np.ndarray, "bodies 10"]) -> dict[str, float]:
+    """Return the parameters of bodies by their names in a model."""
+    return {
+        f"{symbol}{number}": float(value)
+        for number, body in enumerate(bodies, 1)
+        for symbol, value in zip(INERTIAL_NAMES, body, strict=True)
+    }
+
+
+def joint_number(robot: Robot, name: str, key: str = "body") -> int:
+    """Return the index of the joint that a key or an option names."""
+    if name not in robot.joint_names:
+        raise InputError(
+            f"`{key}` must be the name of the joint that moves it "
+            f'({", ".join(robot.joint_names)}), but is "{name}".'
+        )
+    return robot.joint_names.index(name)

@@ -1,0 +1,264 @@
+"""Setup of an identification: how logs of a robot become parameters."""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Sequence
+
+import equinox as eqx
+import numpy as np
+
+from jaxid.arrays import AnyArray, Float
+from jaxid.dynamics.base import BaseParameters, base_parameters
+from jaxid.dynamics.model import Model
+from jaxid.dynamics.terms import (
+    AbstractTerm,
+    AbstractTransition,
+    CoulombFriction,
+    LoadFriction,
+    StribeckFriction,
+    Tanh,
+)
+from jaxid.dynamics.terms.friction import AbstractDryFriction
+from jaxid.errors import InputError
+from jaxid.identification.consistency import (
+    EntropicPull,
+    PhysicallyConsistent,
+)
+from jaxid.identification.estimators import (
+    AbstractEstimator,
+    LeastSquares,
+    NonlinearFriction,
+    WeightedLeastSquares,
+)
+from jaxid.identification.estimators.regularisation_and_weights import default_weights
+from jaxid.identification.fit_result import Fit
+from jaxid.identification.friction_laws import (
+    identify_nonlinear_friction,
+    identify_presliding,
+)
+from jaxid.identification.friction_laws.presliding_lengths import presliding_note
+from jaxid.identification.identify import fit_problem
+from jaxid.identification.problem import RegressionProblem
+from jaxid.identification.uncertainty import AbstractUncertainty, SpectralSandwich
+from jaxid.measurement.filters import (
+    AbstractDecimation,
+    AbstractFilter,
+    Subsample,
+    ZeroPhaseButterworth,
+)
+from jaxid.measurement.observations import Observations, observe
+from jaxid.measurement.recording import Recording
+from jaxid.robot.inertia import INERTIAL_NAMES
+from jaxid.robot.robot import Robot
+
+from .log_reading import LogReading
+from .robot_file import RobotFile
+
+DEFAULT_CUTOFF = 10.0
+"""Cut-off frequency of the filter where none is given [Hz]."""
+MAX_LOAD_FRICTION_FITS = 10
+"""Fits after which friction by load must have settled."""
+LOAD_FRICTION_TOLERANCE = 1e-3
+"""Change of the friction by load from fit to fit that counts as none, relative to the largest."""
+
+NO_FILTER = (
+    f"no filter is given (table `[filter]`): a Butterworth low-pass at "
+    f"{DEFAULT_CUTOFF:g} Hz is assumed; choose about five times the highest frequency "
+    "of the motion."
+)
+
+Progress = Callable[[str, float], None]
+"""Callback, called with the name of a stage and its completed fraction (0 to 1)."""
+
+
+def ignore_progress(stage: str, fraction: float) -> None:
+    """Show no progress."""
+
+
+class Setup(eqx.Module):
+    """How logs of a robot become parameters; the command line uses the same defaults.
+
+    Attributes:
+        unknowns: Base parameters to identify; or their model, whose base parameters
+            are then found when they are needed.
+        filter: Filter of motion, forces and columns; by default a zero-phase
+            Butterworth filter of 10 Hz.
+        filter_candidates: Filters of which the logs choose one instead.
+        decimation: Decimation of forces and columns.
+        min_speed: Speed of each joint below which its rows do not count [rad/s or m/s].
+        estimator: Estimator; by default weighted least squares over bodies that can
+            exist, with a weak pull towards those of the robot's file.
+        least_squares: Least squares for checks, and for runs that are compared or
+            combined; by default weighted like the default estimator.
+        uncertainty: Method of the standard deviations.
+        nonlinear_friction: Whether the shape of friction is sought, too, and kept if it
+            predicts unseen parts of the logs better.
+        load_friction: Whether dry friction grows with the load on a joint, too, by the
+            weight of the bodies that are identified.
+        robot_file: File of the robot: the prior of its bodies, and claims to compare
+            with.
+        reading: How logs are read.
+        notes: Assumptions, as sentences.
+    """
+
+    unknowns: BaseParameters | Model
+    _: dataclasses.KW_ONLY
+    filter: AbstractFilter = eqx.field(default=None)
+    filter_candidates: tuple[AbstractFilter, ...] = ()
+    decimation: AbstractDecimation = Subsample(1)
+    min_speed: Float[AnyArray, " joints"] | Sequence[float] | None = None
+    estimator: AbstractEstimator = eqx.field(default=None)
+    least_squares: LeastSquares | WeightedLeastSquares = eqx.field(default=None)
+    uncertainty: AbstractUncertainty = SpectralSandwich()
+    nonlinear_friction: bool = False
+    load_friction: bool = False
+    robot_file: RobotFile | None = None
+    reading: LogReading = LogReading()
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Fill in the defaults that depend on the robot.
+
+        Raises:
+            InputError: If two settings do not go together.
+        """
+        notes = self.notes
+        if self.filter is None:
+            self.filter = ZeroPhaseButterworth(DEFAULT_CUTOFF)
+            notes = (*notes, NO_FILTER)
+        weights, weight_notes = default_weights(self.robot)
+        if self.least_squares is None:
+            self.least_squares = WeightedLeastSquares(weights)
+        if self.estimator is None:
+            pull = pull_to_bodies(self.robot_file)
+            # An optimum without proof is a note of the fit here, and no error.
+            self.estimator = PhysicallyConsistent(weights, pull=pull, throw=False)
+            notes = (*notes, *weight_notes)
+        self.notes = notes
+        if self.load_friction and not self.has_bounded_bodies:
+            raise InputError(
+                "friction by load (`model.load`) needs the bodies that a physically "
+                'consistent estimator finds: `PhysicallyConsistent`, `kind = "consistent"`.'
+            )
+        if self.nonlinear_friction and self.model.memory is not None:
+            raise InputError(
+                "give presliding friction or `nonlinear_friction`, but not both."
+            )
+
+    @functools.cached_property
+    def base(self) -> BaseParameters:
+        """Base parameters of the model, found when they are first asked for."""
+        if isinstance(self.unknowns, BaseParameters):
+            return self.unknowns
+        return base_parameters(self.unknowns)
+
+    @property
+    def model(self) -> Model:
+        """Model whose parameters are wanted."""
+        unknowns = self.unknowns
+        return unknowns.model if isinstance(unknowns, BaseParameters) else unknowns
+
+    @property
+    def robot(self) -> Robot:
+        """Robot of the model."""
+        return self.model.robot
+
+    @property
+    def has_bounded_bodies(self) -> bool:
+        """Whether the estimator keeps to bodies that can exist."""
+        return isinstance(self.estimator, PhysicallyConsistent)
+
+    @property
+    def unbounded_estimator(self) -> AbstractEstimator:
+        """The estimator; for bodies that can exist least squares, without their bounds."""
+        return self.least_squares if self.has_bounded_bodies else self.estimator
+
+    def observe(self, recording: Recording) -> Observations:
+        """Filter a recording and make rows of it."""
+        return observe(
+            recording, self.robot, self.filter, self.decimation, self.min_speed
+        )
+
+    def fit(self, rows: RegressionProblem, progress: Progress = ignore_progress) -> Fit:
+        """Estimate the parameters from rows of logs."""
+        if self.nonlinear_friction:
+            return self._fit_with_shapes(rows, progress)
+        notes = ()
+        if self.model.memory is not None:
+            # Lengths of presliding are no linear parameters: they are found first.
+            rows = rows.with_base(identify_presliding(rows.base, rows.recordings))
+            notes = (presliding_note(rows.base),)
+        fit = fit_problem(rows, self.estimator, uncertainty=self.uncertainty)
+        fit = dataclasses.replace(fit, notes=(*notes, *fit.notes))
+        if self.load_friction:
+            return self._fit_with_load_friction(fit, rows.recordings)
+        return fit
+
+    def _fit_with_shapes(self, rows: RegressionProblem, progress: Progress) -> Fit:
+        """Fit the shape of friction, too; return the better one of this fit and the linear one."""
+        terms = tuple(map(without_stribeck, self.model.terms))
+        result = identify_nonlinear_friction(
+            self.base,
+            rows.recordings,
+            NonlinearFriction(self.least_squares),
+            linear=base_parameters(Model(self.robot, terms)),
+            progress=functools.partial(progress, "searching for the shape of friction"),
+        )
+        return result.better
+
+    def _fit_with_load_friction(self, fit: Fit, logs: Sequence[Observations]) -> Fit:
+        """Fit again with friction by the weight of the bodies found, until it changes no more."""
+        terms = fit.base.model.terms
+        transition = fit.base.model.memory or dry_transition(terms)
+        joints = self.robot.joints
+        coefficients = np.full(joints, np.inf)
+        for _ in range(MAX_LOAD_FRICTION_FITS):
+            # The columns of the bodies come first, whatever follows.
+            size = joints * len(INERTIAL_NAMES)
+            bodies = np.asarray(fit.full_parameters)[:size].reshape(joints, -1)
+            load_friction = LoadFriction(bodies=bodies, transition=transition)
+            base = base_parameters(Model(self.robot, (*terms, load_friction)))
+            rows = RegressionProblem(base, logs)
+            fit = fit_problem(rows, self.estimator, uncertainty=self.uncertainty)
+
+            earlier_coefficients = coefficients
+            coefficients = np.asarray(fit.full_parameters)[-joints:]
+            change = np.abs(coefficients - earlier_coefficients).max()
+            if change < LOAD_FRICTION_TOLERANCE * np.abs(coefficients).max():
+                return fit
+        note = (
+            f"friction by load has not settled in {MAX_LOAD_FRICTION_FITS} fits: its "
+            "values are uncertain."
+        )
+        return dataclasses.replace(fit, notes=(*fit.notes, note))
+
+
+def pull_to_bodies(
+    robot_file: RobotFile | None, strength: float = 1.0
+) -> EntropicPull | None:
+    """Return the pull of a consistent estimator towards the bodies of the robot's file.
+
+    Args:
+        robot_file: File of the robot; balls are the prior without it, or where its
+            bodies cannot exist.
+        strength: Strength of the pull; 0 for none.
+    """
+    if strength == 0.0:
+        return None
+    bodies = None if robot_file is None else robot_file.possible_bodies()
+    return EntropicPull(bodies, strength)
+
+
+def without_stribeck(term: AbstractTerm) -> AbstractTerm:
+    """Return a term with Coulomb's law in place of Stribeck's; other terms as they are."""
+    if isinstance(term, StribeckFriction):
+        return CoulombFriction(term.transition)
+    return term
+
+
+def dry_transition(terms: Sequence[AbstractTerm]) -> AbstractTransition:
+    """Return the transition of the dry friction in a model, or the usual one without it."""
+    for term in terms:
+        if isinstance(term, AbstractDryFriction):
+            return term.transition
+    return Tanh()

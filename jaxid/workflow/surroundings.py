@@ -1,0 +1,172 @@
+"""Surroundings of a robot, and shapes of its links, between which a distance must remain."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Annotated, Literal, NamedTuple
+
+import numpy as np
+
+from jaxid.errors import InputError
+from jaxid.excitation.constraints import Clearance
+from jaxid.robot.capsule_fit import fit_capsules, stand_in_capsules
+from jaxid.robot.collision import GROUND, Box, Capsule, CollisionModel, HalfSpace
+from jaxid.robot.limits_and_drives import owners
+from jaxid.robot.robot import Robot
+from jaxid.robot.rotations import rpy_rotation
+
+from .allowed_values import Finite, Positive, Vector
+from .robot_file import RobotFile, joint_number
+
+
+def capsule(
+    *, name: str, body: str, start: Vector, radius: Positive, end: Vector | None = None
+) -> tuple[str, Capsule]:
+    """Return a capsule and the name of its body; a sphere without `end`.
+
+    Args:
+        name: Name of the capsule.
+        body: Name of the joint that moves the capsule's body, or "ground".
+        start: One end of the axis, in the frame of the body [m].
+        radius: Radius [m].
+        end: Other end of the axis [m].
+    """
+    return body, Capsule(name, GROUND, start=start, end=end, radius=radius)
+
+
+def box(
+    *, name: str, centre: Vector, size: Vector, rotation: Vector | None = None
+) -> Box:
+    """Return a box in the world.
+
+    Args:
+        name: Name of the box.
+        centre: Centre [m].
+        size: Lengths of the edges [m].
+        rotation: Roll, pitch, yaw [deg].
+    """
+    R = None if rotation is None else rpy_rotation(np.deg2rad(rotation))
+    return Box(name, centre=centre, size=size, rotation=R)
+
+
+@dataclasses.dataclass(frozen=True)
+class Collision:
+    """Shapes that must keep a distance while a designed motion runs.
+
+    Attributes:
+        distance: Distance that must remain [m].
+        fit: Whether to fit capsules around the geometry of the robot's links.
+        packages: Folder of what the URDF file calls `package://`, like `"."`.
+        floor: Height of the floor [m], "base" for the plane on which the robot stands,
+            or false for none.
+        capsules: Capsules on bodies or on the ground, like
+            `[{ name = "gun", body = "ground", start = [0, 0, 0], end = [0, 0, 1],
+            radius = 0.1 }]`.
+        boxes: Boxes in the world, with angles in degrees, like
+            `[{ name = "table", centre = [0.8, 0, 0.2], size = [1, 1, 1], rotation = [0,
+            0, 45] }]`.
+        pairs: Pairs of shapes to watch, like `[["gun", "table"]]`; by default all that
+            the joints can bring together.
+    """
+
+    distance: Positive = 0.03
+    fit: bool = True
+    packages: str | None = None
+    floor: Finite | Literal["base"] | bool = "base"
+    capsules: tuple[Annotated[tuple[str, Capsule], capsule], ...] = ()
+    boxes: tuple[Annotated[Box, box], ...] = ()
+    pairs: list[tuple[str, str]] | None = None
+
+    def build(
+        self,
+        robot: Robot,
+        robot_file: RobotFile | None = None,
+        base_plane: HalfSpace | None = None,
+    ) -> "Surroundings":
+        """Return the distance that shapes must keep, and what is not known of them.
+
+        Args:
+            robot: The robot.
+            robot_file: File with the geometry of its links.
+            base_plane: Solid below the plane on which it stands; z = 0 by default.
+
+        Raises:
+            InputError: If shapes cannot be made, or a name is unknown.
+        """
+        capsules, faults = [], []
+        if self.fit and robot_file is not None:
+            capsules, faults = fit_links(robot_file, self.packages)
+        for body, shape in self.capsules:
+            number = GROUND if body == "ground" else joint_number(robot, body)
+            capsules.append(dataclasses.replace(shape, body=number))
+        obstacles: list[Box | HalfSpace] = list(self.boxes)
+        if self.floor in ("base", True):
+            obstacles.append(base_plane or HalfSpace("floor"))
+        elif self.floor is not False:
+            obstacles.append(HalfSpace("floor", height=self.floor))
+        if self.fit:
+            substitutes = substitute_capsules(robot, capsules)
+            capsules += substitutes
+            if substitutes:
+                names = ", ".join(f"`{capsule.name}`" for capsule in substitutes)
+                faults.append(
+                    f"the shape of {names} is unknown: stout capsules along the lines "
+                    "between the joints stand in for it; give `capsules` in "
+                    "`[collision]`, or a file with collision geometry"
+                )
+        clearance = None
+        try:
+            model = CollisionModel(robot, capsules, obstacles, self.pairs)
+            clearance = Clearance(model, self.distance)
+        except InputError:
+            # Without shapes of the user, there may be none that can meet.
+            if self.capsules or self.boxes or self.pairs:
+                raise
+        return Surroundings(self, clearance, tuple(faults))
+
+
+def fit_links(
+    robot_file: RobotFile, packages: str | None
+) -> tuple[list[Capsule], list[str]]:
+    """Return capsules around the geometry of the robot's file, and what cannot be read."""
+    faults: dict[str, str] = {}
+    capsules = fit_capsules(
+        robot_file.path,
+        packages=packages,
+        faults=faults,
+        **robot_file.chain,
+        **robot_file.placement,
+    )
+    links: dict[str, list[str]] = {}
+    for link, fault in faults.items():
+        links.setdefault(fault, []).append(link)
+    sentences = [
+        f"{owners('link', names)}: geometry not read ({fault.rstrip('.')})"
+        for fault, names in links.items()
+    ]
+    return list(capsules), sentences
+
+
+def substitute_capsules(robot: Robot, capsules: Sequence[Capsule]) -> list[Capsule]:
+    """Return capsules for bodies of which no shape is known."""
+    # The base may be a frame alone.
+    first_body = 0 if capsules else GROUND
+    bodies = {*range(first_body, robot.joints)} - {x.body for x in capsules}
+    return list(stand_in_capsules(robot, sorted(bodies)))
+
+
+class Surroundings(NamedTuple):
+    """Shapes of robot and surroundings."""
+
+    collision: Collision  # what the user says of them
+    clearance: Clearance | None  # distance that they must keep; None if there are none
+    faults: tuple[str, ...]  # what is not known of them, in sentences
+
+    @property
+    def shapes(self) -> CollisionModel | None:
+        """All shapes; None if there are none."""
+        return None if self.clearance is None else self.clearance.model
+
+    @property
+    def obstacles(self) -> tuple[Box | HalfSpace, ...]:
+        """Floor, boxes and other solids that do not move."""
+        return () if self.shapes is None else self.shapes.obstacles
