@@ -25,7 +25,7 @@ from jaxid.experiment.model_and_log_tables import SIDES
 from jaxid.identification.estimators.regularisation_and_weights import (
     LARGEST_UNCERTAINTY,
 )
-from jaxid.identification.fit_result import DOUBTFUL, TRUSTED
+from jaxid.identification.fit_result import DOUBT_LIMIT, TRUST_LIMIT
 from jaxid.measurement.filters import FILTERS
 from jaxid.simulation.virtual import random_bodies
 from jaxid.validation.diagnosis import SURE
@@ -266,7 +266,7 @@ THRESHOLDS = {
         f"{RMS_ERROR[1]:.0f}%",
         f"up to {UNSEEN_RATIO} times those of the fit",
     ),
-    "7.": (f"up to {TRUSTED:.0%}", f"up to {DOUBTFUL:.0%} doubtful"),
+    "7.": (f"up to {TRUST_LIMIT:.0%}", f"up to {DOUBT_LIMIT:.0%} doubtful"),
     "10.": (f"all of {POSES} poses",),
     "11.": (f"{SURE:.0f} standard deviations",),
 }

@@ -109,7 +109,7 @@ def _solve_groups(
     size = -(-datasets // groups)
     # The last group is filled up with the first data sets.
     numbers = np.arange(groups * size) % datasets
-    grouped = jax.tree.map(
+    grouped_sets = jax.tree.map(
         lambda x: x[numbers].reshape(groups, size, *x.shape[1:]), batch
     )
 
@@ -128,7 +128,7 @@ def _solve_groups(
         # together.
         return jax.lax.map(solve_pair, pairs) if on_cpu else jax.vmap(solve_pair)(pairs)
 
-    fits = jax.lax.map(solve_group, grouped)
+    fits = jax.lax.map(solve_group, grouped_sets)
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:datasets], fits)
 
 
@@ -234,8 +234,12 @@ def _estimate(
     """Return the parameters [draws, base], and squared residuals [draws, joints]."""
     products, force_squares = rows.products(rows.forces)
     p = rows.gradient(products) @ inverse
-    predicted = [p[:, k] @ gram for k, gram in zip(rows.parameters, grams, strict=True)]
-    squares = force_squares - 2 * rows.along(p, products) + rows.along(p, predicted)
+    predicted_products = [
+        p[:, k] @ gram for k, gram in zip(rows.parameters, grams, strict=True)
+    ]
+    squares = (
+        force_squares - 2 * rows.along(p, products) + rows.along(p, predicted_products)
+    )
 
     def refine() -> tuple[Array, Array]:
         products, squares = rows.products(rows.residuals(p))

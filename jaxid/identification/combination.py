@@ -156,10 +156,10 @@ def combine_fits(earlier: Fit, later: Fit, name: str | None = None) -> Fit:
     parameters, uncertainty = combine((earlier, later), (identity, identity))
     # The later rows are scaled so that they keep their weights under those of the
     # earlier fit.
-    scaled = later.time_blocks.scale_joints(later.weights / earlier.weights)
+    scaled_blocks = later.time_blocks.scale_joints(later.weights / earlier.weights)
     problem = RegressionProblem(
         earlier.base,
-        blocks=Blocks((*earlier.time_blocks.parts, *scaled.parts)),
+        blocks=Blocks((*earlier.time_blocks.parts, *scaled_blocks.parts)),
         names=(*earlier.recordings, *later.recordings),
     )
     fit = fit_problem(problem, WeightedLeastSquares(GivenWeights(earlier.weights)))
@@ -176,10 +176,10 @@ def share_rows(first: Blocks, second: Blocks) -> bool:
     the columns and forces do, whatever the weights. Two blocks must agree: one may be a
     robot at rest.
     """
-    ours = _column_norms(first)
-    theirs = _column_norms(second)
-    count = sum(any(_are_equal(a, b) for b in theirs) for a in ours)
-    return count >= max(1, min(2, len(ours), len(theirs)))
+    first_norms = _column_norms(first)
+    second_norms = _column_norms(second)
+    count = sum(any(_are_equal(a, b) for b in second_norms) for a in first_norms)
+    return count >= max(1, min(2, len(first_norms), len(second_norms)))
 
 
 def _are_equal(first: np.ndarray, second: np.ndarray) -> bool:
@@ -192,6 +192,6 @@ def _column_norms(blocks: Blocks) -> list[np.ndarray]:
     for part in blocks.parts:
         if part.rows.any():
             norms = [np.linalg.norm(joint.R, axis=0) for joint in part.joints]
-            relative = [x / max(x.max(initial=0.0), 1e-300) for x in norms]
-            block_norms.append(np.concatenate([part.rows, *relative]))
+            relative_norms = [x / max(x.max(initial=0.0), 1e-300) for x in norms]
+            block_norms.append(np.concatenate([part.rows, *relative_norms]))
     return block_norms

@@ -19,7 +19,7 @@ from jaxid.result_table import Summarised, Table
 from jaxid.robot.robot import Robot, Tool
 
 from .combination import as_least_squares, combine, require_same_base
-from .estimators.regularisation_and_weights import NUMERICAL, Decomposition
+from .estimators.regularisation_and_weights import MIN_SINGULAR_VALUE, Decomposition
 from .factors import Factors
 from .fit_result import Fit, interval_table
 from .operating_states import state_maps, varying_parameters
@@ -152,7 +152,7 @@ def _require_gains(robot: Robot) -> None:
 def _require_determined(decomposition: Decomposition, reciprocals) -> None:
     """Check that the runs determine all gains, and that these are plausible."""
     values = decomposition.values
-    is_determined = values[-1] > NUMERICAL * values[0]
+    is_determined = values[-1] > MIN_SINGULAR_VALUE * values[0]
     is_plausible = (reciprocals > 1 / MAX_GAIN) & (reciprocals < MAX_GAIN)
     if not is_determined or not is_plausible.all():
         raise InputError(

@@ -39,9 +39,9 @@ from .estimators.regularisation_and_weights import (
 from .factors import Blocks
 from .uncertainty.result import ResidualSpectra, Uncertainty
 
-TRUSTED = 0.1
+TRUST_LIMIT = 0.1
 """Relative standard deviation (fraction) up to which an estimate is trusted."""
-DOUBTFUL = 0.5
+DOUBT_LIMIT = 0.5
 """Relative standard deviation (fraction) up to which an estimate is only doubtful."""
 FORMAT = "jaxid model"
 """Entry of a model file that tells what it is."""
@@ -162,7 +162,7 @@ class Fit(Summarised, eqx.Module):
         for direction in self.undetermined:
             deviations[list(direction.parts)] = np.inf
         grades = Status.GOOD, Status.DOUBTFUL, Status.BAD
-        steps = np.searchsorted((TRUSTED, DOUBTFUL), deviations)
+        steps = np.searchsorted((TRUST_LIMIT, DOUBT_LIMIT), deviations)
         return tuple(grades[k] for k in steps)
 
     @property
@@ -233,8 +233,8 @@ class Fit(Summarised, eqx.Module):
             (
                 "estimates",
                 f"{counts[Status.GOOD]} of {self.base.size} known to "
-                f"{100 * TRUSTED:g} %, {counts[Status.DOUBTFUL]} to "
-                f"{100 * DOUBTFUL:g} %, {counts[Status.BAD]} worse or undetermined",
+                f"{100 * TRUST_LIMIT:g} %, {counts[Status.DOUBTFUL]} to "
+                f"{100 * DOUBT_LIMIT:g} %, {counts[Status.BAD]} worse or undetermined",
             ),
         ]
 

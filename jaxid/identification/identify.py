@@ -15,7 +15,7 @@ from jaxid.measurement.observations import Observations, Progress
 from .estimators.estimate import AbstractEstimator
 from .estimators.least_squares import WeightedLeastSquares
 from .estimators.regularisation_and_weights import (
-    NUMERICAL,
+    MIN_SINGULAR_VALUE,
     AbstractSpectralSolution,
     Decomposition,
     default_weights,
@@ -99,16 +99,16 @@ def fit_problem(
     factors = estimate.blocks.total if has_row_weights else rows.factors
     R, z = factors.weighted(weights)
     decomposition = Decomposition.of(R, z)
-    unbounded = estimate.without_bounds()
+    unbounded_estimate = estimate.without_bounds()
     naive = naive_covariance(
         factors,
         weights,
-        unbounded.parameters,
-        unbounded.inverse,
-        unbounded.number_of_parameters(R),
+        unbounded_estimate.parameters,
+        unbounded_estimate.inverse,
+        unbounded_estimate.number_of_parameters(R),
     )
     naive[decomposition.unknown, decomposition.unknown] = np.inf
-    errors, spectra = uncertainty(rows, unbounded, naive)
+    errors, spectra = uncertainty(rows, unbounded_estimate, naive)
 
     # Residuals are those of all rows, whatever weights the estimator gave them.
     squares = rows.factors.residual_squares(estimate.parameters)
@@ -175,11 +175,13 @@ def _require_more_rows_than_parameters(problem: RegressionProblem) -> None:
         )
 
 
-def _condition_numbers(factors: Factors, weighted: np.ndarray) -> ConditionNumbers:
-    unweighted, _ = factors.weighted(np.ones(len(factors.joints)))
-    lengths = np.linalg.norm(weighted, axis=0)
-    scaled = weighted / np.where(lengths > 0, lengths, 1.0)
-    matrices = unweighted, weighted, scaled
+def _condition_numbers(
+    factors: Factors, weighted_matrix: np.ndarray
+) -> ConditionNumbers:
+    unweighted_matrix, _ = factors.weighted(np.ones(len(factors.joints)))
+    lengths = np.linalg.norm(weighted_matrix, axis=0)
+    scaled_matrix = weighted_matrix / np.where(lengths > 0, lengths, 1.0)
+    matrices = unweighted_matrix, weighted_matrix, scaled_matrix
     return ConditionNumbers(
         *(float(np.linalg.cond(x)) if x.any() else np.inf for x in matrices)
     )
@@ -217,9 +219,9 @@ def _shrinkage_notes(
     values: np.ndarray, solution: AbstractSpectralSolution
 ) -> tuple[str, ...]:
     """Return what standard deviations leave out if a solution shrinks weak directions."""
-    visible = values > NUMERICAL * values.max(initial=0.0)
+    is_visible = values > MIN_SINGULAR_VALUE * values.max(initial=0.0)
     fractions = solution.inverse(values) * values**2
-    count = np.count_nonzero(visible & (fractions <= 0.5))
+    count = np.count_nonzero(is_visible & (fractions <= 0.5))
     if not count:
         return ()
     return (

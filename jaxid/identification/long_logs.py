@@ -255,9 +255,9 @@ class _Stream:
         grams = [matrices for _, matrices in self._grams(pieces, mixing)]
         return _sum_by_joint(grams)
 
-    def _pass(self, first: Grams, progress: Progress | None) -> _Pass:
+    def _pass(self, first_grams: Grams, progress: Progress | None) -> _Pass:
         """Reduce all rows, given about what the products of all rows are."""
-        triangles = [_regular_triangle(G) for G in first]
+        triangles = [_regular_triangle(G) for G in first_grams]
         mixing = [np.linalg.inv(R) for R in triangles]
         blocks = [[np.zeros_like(R) for R in triangles] for _ in self._edges[1:]]
         for block, grams in self._grams(self._pieces, mixing, progress):
@@ -265,7 +265,7 @@ class _Stream:
                 total += G
         totals = _sum_by_joint(blocks)
         roots = [[_root(G) for G in block] for block in blocks]
-        joints = zip(totals, first, mixing, strict=True)
+        joints = zip(totals, first_grams, mixing, strict=True)
         return _Pass(
             [[a @ R for a, R in zip(x, triangles, strict=True)] for x in roots],
             [R.T @ G @ R for R, G in zip(triangles, totals, strict=True)],
@@ -284,8 +284,10 @@ class _Stream:
             if progress is not None:
                 progress((k + 1) / len(pieces))
         for block, equations in self._end_rows:
-            mixed = [rows @ mix for rows, mix in zip(equations, mixing, strict=True)]
-            yield block, [rows.T @ rows for rows in mixed]
+            mixed_rows = [
+                rows @ mix for rows, mix in zip(equations, mixing, strict=True)
+            ]
+            yield block, [rows.T @ rows for rows in mixed_rows]
 
     def _fill(self, piece: Piece) -> list[np.ndarray]:
         """Read the arrays of one piece, filled up to the shape of the loop."""
@@ -334,10 +336,10 @@ def _fill_up(x: np.ndarray, length: int) -> np.ndarray:
 
 
 def _shows_every_direction(
-    total: np.ndarray, first: np.ndarray, mixing: np.ndarray, ratio: float = 1e4
+    total: np.ndarray, first_grams: np.ndarray, mixing: np.ndarray, ratio: float = 1e4
 ) -> bool:
     """Return whether the first look has shown the size of every direction that it has shown."""
-    values, directions = np.linalg.eigh(mixing.T @ first @ mixing)
+    values, directions = np.linalg.eigh(mixing.T @ first_grams @ mixing)
     visible_directions = directions[:, values > 0.5]
     if not visible_directions.shape[1]:
         return not total.any()
@@ -352,8 +354,8 @@ def _regular_triangle(G: np.ndarray) -> np.ndarray:
     """Return a triangle whose square is about G, and which is never singular."""
     norms = np.sqrt(np.diag(G))
     scale = np.where(norms > 0, norms, max(norms.max(initial=0.0), 1.0))
-    regular = G / np.outer(scale, scale) + 1e-13 * np.eye(len(G))
-    return np.linalg.cholesky(regular).T * scale
+    regular_gram = G / np.outer(scale, scale) + 1e-13 * np.eye(len(G))
+    return np.linalg.cholesky(regular_gram).T * scale
 
 
 def _root(G: np.ndarray) -> np.ndarray:
@@ -400,16 +402,16 @@ def _compile_loop(
 ) -> Callable:
     """Return the loop, which is compiled when it is first called."""
     joints = len(acting)
-    distinct = _DistinctColumns.of(program, acting)
+    distinct_columns = _DistinctColumns.of(program, acting)
     base_columns = lower(program, fence=True)
-    height = len(distinct.outputs) + joints
+    height = len(distinct_columns.outputs) + joints
     zeros = [jnp.zeros(shape.samples)] * height
 
     def evaluate(motion: Array, forces: Array) -> list[Array]:
-        packed = base_columns(*jnp.split(motion, len(motion) // joints))
+        outputs = base_columns(*jnp.split(motion, len(motion) // joints))
         columns = []
-        for output in distinct.outputs:
-            column = jnp.asarray(packed[output], float)
+        for output in distinct_columns.outputs:
+            column = jnp.asarray(outputs[output], float)
             columns.append(jnp.broadcast_to(column, motion.shape[1:]))
         return columns + list(forces)
 
@@ -432,18 +434,18 @@ def _compile_loop(
             weights = _iteration_part(mask, k, shape.rows).astype(rows.dtype)
             sums = []
             for gram, mix, places, weight in zip(
-                grams, mixing, distinct.places, weights, strict=True
+                grams, mixing, distinct_columns.places, weights, strict=True
             ):
                 # Without stages a joint's columns are taken before they are stored.
                 joint_rows = (
                     rows[places] if tails else jnp.stack([columns[i] for i in places])
                 )
-                mixed = mix.T @ (joint_rows * weight[None])
-                sums.append(gram + mixed @ mixed.T)
+                mixed_rows = mix.T @ (joint_rows * weight[None])
+                sums.append(gram + mixed_rows @ mixed_rows.T)
             return next_tails, sums
 
         tails = [jnp.zeros((height, x.delay * x.factor)) for x in shape.stages]
-        grams = [jnp.zeros((len(x), len(x))) for x in distinct.places]
+        grams = [jnp.zeros((len(x), len(x))) for x in distinct_columns.places]
         return jax.lax.fori_loop(0, count, iteration, (tails, grams))[1]
 
     return jax.jit(run)

@@ -139,8 +139,8 @@ class RegressionProblem:
 
     def _reduce(self, number: int, equations: Callable) -> list[Factors]:
         """Return the factors of one recording's blocks of time."""
-        empty = empty_factors(self.base.acting_columns, self.base.size)
-        parts = [empty] * (len(self._edges[number]) - 1)
+        empty_part = empty_factors(self.base.acting_columns, self.base.size)
+        parts = [empty_part] * (len(self._edges[number]) - 1)
         first_block = self._first_block(number)
         for chunk in self.recording_chunks(number):
             block = chunk.block - first_block
@@ -190,11 +190,11 @@ class RegressionProblem:
             self._cached_chunks[number] = chunks
             self.cached_numbers -= numbers
 
-    def _report(self, number: int, done: float) -> None:
+    def _report(self, number: int, share: float) -> None:
         """Report the completed fraction of a pass, from that of one recording."""
         if self.progress is not None:
             sizes = [o.samples for o in self.recordings]
-            samples = sum(sizes[:number]) + done * sizes[number]
+            samples = sum(sizes[:number]) + share * sizes[number]
             self.progress(min(1.0, samples / sum(sizes)))
 
     def residuals(self, p: np.ndarray) -> Iterator[tuple[RowChunk, np.ndarray]]:

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from jaxid.identification.fit_result import DOUBTFUL, TRUSTED, Fit
+from jaxid.identification.fit_result import DOUBT_LIMIT, TRUST_LIMIT, Fit
 from jaxid.identification.parameter_changes import Comparison, Verdict
 from jaxid.result_table import Status, significant, with_deviations
 
@@ -19,8 +19,8 @@ ROWS_PER_PANEL = 40
 OFFSET = 0.17
 """Distance of the two intervals of one parameter from the middle of its row."""
 GRADES = (
-    (Status.GOOD, f"up to {100 * TRUSTED:g} %: trusted", BLUE),
-    (Status.DOUBTFUL, f"up to {100 * DOUBTFUL:g} %: doubtful", ORANGE),
+    (Status.GOOD, f"up to {100 * TRUST_LIMIT:g} %: trusted", BLUE),
+    (Status.DOUBTFUL, f"up to {100 * DOUBT_LIMIT:g} %: doubtful", ORANGE),
     (Status.BAD, "above: small, or not excited", VERMILION),
 )
 """Judgements of a relative standard deviation, with their names and colours."""
@@ -85,7 +85,7 @@ def _parameter_panel(
         x_range=(low, MAX_PERCENT),
         y_names=names,
         beside=texts,
-        levels=[("x", 100.0 * limit, GREY) for limit in (TRUSTED, DOUBTFUL)],
+        levels=[("x", 100.0 * limit, GREY) for limit in (TRUST_LIMIT, DOUBT_LIMIT)],
     )
 
 

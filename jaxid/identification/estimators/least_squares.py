@@ -19,7 +19,7 @@ from ..factors import Blocks, JointFactor, RowChunk, join_chunks
 from ..problem import RegressionProblem
 from .estimate import AbstractEstimator, Channel, Estimate, joint_rows
 from .regularisation_and_weights import (
-    NUMERICAL,
+    MIN_SINGULAR_VALUE,
     AbstractSolution,
     AbstractWeights,
     Complete,
@@ -117,11 +117,11 @@ class InstrumentalVariables(AbstractEstimator):
                 products[columns] += instruments_of_rows @ channel.disturbance
         R, _ = problem.factors.weighted(weights)
         lengths = np.linalg.norm(R, axis=0)
-        is_visible = lengths > NUMERICAL * lengths.max(initial=0.0)
+        is_visible = lengths > MIN_SINGULAR_VALUE * lengths.max(initial=0.0)
         # Columns of rounding get an infinite scale, and their parameters stay zero.
         scale = np.where(is_visible, lengths, np.inf)
         scales = np.outer(scale, scale)
-        inverse = np.linalg.pinv(information / scales, NUMERICAL) / scales
+        inverse = np.linalg.pinv(information / scales, MIN_SINGULAR_VALUE) / scales
         return Estimate(
             base=problem.base,
             parameters=inverse @ products,
@@ -208,13 +208,16 @@ class RelativeTo(AbstractEstimator):
 class _ProblemWithoutPrior(RegressionProblem):
     """Regression problem with the forces that a prior does not explain."""
 
-    def __init__(self, original: RegressionProblem, prior: np.ndarray):
-        origin = np.asarray(original.base.from_standard(prior))
-        blocks = _subtract_forces(original.blocks, origin)
+    def __init__(self, original_problem: RegressionProblem, prior: np.ndarray):
+        origin = np.asarray(original_problem.base.from_standard(prior))
+        blocks = _subtract_forces(original_problem.blocks, origin)
         super().__init__(
-            original.base, original.recordings, original.progress, blocks=blocks
+            original_problem.base,
+            original_problem.recordings,
+            original_problem.progress,
+            blocks=blocks,
         )
-        self._original = original
+        self._original = original_problem
         self._prior = prior
         self._origin = origin
 

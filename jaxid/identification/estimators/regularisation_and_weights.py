@@ -16,7 +16,7 @@ from jaxid.robot.robot import Robot
 from ..factors import Blocks, Factors
 from ..problem import cross_validation_folds
 
-NUMERICAL = 1e-11
+MIN_SINGULAR_VALUE = 1e-11
 """Relative singular value below which a direction is only rounding."""
 RIDGE = 64 * np.finfo(float).eps
 """Ridge of the products of columns of length one, which may depend on each other."""
@@ -55,8 +55,8 @@ class Decomposition(eqx.Module):
         # Shorter columns are rounding: units may differ by less.
         is_visible = norms > 1e-13 * norms.max(initial=0.0)
         scale = np.where(is_visible, norms, 1.0)
-        scaled = np.where(is_visible, R / scale, 0.0)
-        U, values, directions = np.linalg.svd(scaled, full_matrices=False)
+        scaled_matrix = np.where(is_visible, R / scale, 0.0)
+        U, values, directions = np.linalg.svd(scaled_matrix, full_matrices=False)
         forces = U.T @ z
         rest = float(np.sqrt(max(z @ z - forces @ forces, 0.0)))
         return cls(scale, values, directions, forces, rest)
@@ -64,7 +64,7 @@ class Decomposition(eqx.Module):
     @property
     def unknown(self) -> Bool[np.ndarray, " base"]:
         """Which parameters take part in directions that are only rounding."""
-        is_rounding = self.values <= NUMERICAL * self.values.max(initial=0.0)
+        is_rounding = self.values <= MIN_SINGULAR_VALUE * self.values.max(initial=0.0)
         return np.sum(self.directions[is_rounding] ** 2, axis=0) > 1e-8
 
     def solve(self, inverse: np.ndarray | None = None) -> np.ndarray:
@@ -93,8 +93,8 @@ def inverse_information(
     size = information.shape[-1]
     squares = jnp.diagonal(information)
     scale = 1.0 / jnp.sqrt(jnp.where(squares > 0, squares, 1.0))
-    scaled = scale[:, None] * information * scale[None]
-    L = jnp.linalg.cholesky(scaled + ridge * np.eye(size))
+    scaled_matrix = scale[:, None] * information * scale[None]
+    L = jnp.linalg.cholesky(scaled_matrix + ridge * np.eye(size))
     scaled_root = jax.lax.linalg.triangular_solve(
         L,
         jnp.eye(size),
@@ -137,7 +137,7 @@ class Complete(AbstractSpectralSolution):
 
     def inverse(self, values):
         """Return the inverse squares; zero for directions of rounding."""
-        return Truncated(NUMERICAL).inverse(values)
+        return Truncated(MIN_SINGULAR_VALUE).inverse(values)
 
 
 class Truncated(AbstractSpectralSolution):
@@ -159,7 +159,7 @@ class Truncated(AbstractSpectralSolution):
     def inverse(self, values):
         """Return the inverse squares; zero for weak directions."""
         values = np.asarray(values)
-        limit = max(self.rcond, NUMERICAL) * values.max(initial=0.0)
+        limit = max(self.rcond, MIN_SINGULAR_VALUE) * values.max(initial=0.0)
         is_strong = values > limit
         return np.where(is_strong, 1.0 / np.where(is_strong, values, 1.0) ** 2, 0.0)
 
@@ -183,7 +183,7 @@ class Ridge(AbstractSpectralSolution):
     def inverse(self, values):
         """Return bounded inverse squares."""
         values = np.asarray(values)
-        halving_value = max(self.strength, NUMERICAL) * values.max(initial=0.0)
+        halving_value = max(self.strength, MIN_SINGULAR_VALUE) * values.max(initial=0.0)
         return 1.0 / (values**2 + halving_value**2)
 
 
@@ -208,19 +208,19 @@ class CrossValidated(AbstractSolution):
         count = len(blocks.parts)
         errors = np.empty((len(self.candidates), count))
         for k, (others, part) in enumerate(cross_validation_folds(blocks, count)):
-            training = blocks.select(others).total
-            decomposition = Decomposition.of(*training.weighted(weights))
-            held_out = blocks.select(part).total
+            training_factors = blocks.select(others).total
+            decomposition = Decomposition.of(*training_factors.weighted(weights))
+            test_factors = blocks.select(part).total
             for i, candidate in enumerate(self.candidates):
                 inverse = candidate.inverse(decomposition.values)
                 p = decomposition.solve(inverse)
-                errors[i, k] = squared_weights @ held_out.residual_squares(p)
+                errors[i, k] = squared_weights @ test_factors.residual_squares(p)
         total = errors.sum(axis=1)
-        best = int(np.argmin(total))
-        standard_error = errors[best].std(ddof=1) * np.sqrt(count)
-        is_as_good = total <= total[best] + standard_error
-        strongest = int(np.flatnonzero(is_as_good).max())
-        return self.candidates[strongest]
+        best_number = int(np.argmin(total))
+        standard_error = errors[best_number].std(ddof=1) * np.sqrt(count)
+        is_as_good = total <= total[best_number] + standard_error
+        strongest_number = int(np.flatnonzero(is_as_good).max())
+        return self.candidates[strongest_number]
 
 
 class AbstractWeights(eqx.Module):

@@ -76,16 +76,16 @@ def rescale_covariance(
     Infinite variances, of parameters that are undetermined, stay infinite.
     """
     original_deviations = np.sqrt(np.diag(covariance))
-    undetermined = np.isinf(original_deviations)
-    has_scale = (original_deviations > 0) & ~undetermined
+    is_undetermined = np.isinf(original_deviations)
+    has_scale = (original_deviations > 0) & ~is_undetermined
 
     scale = np.zeros_like(original_deviations)
     scale[has_scale] = deviations[has_scale] / original_deviations[has_scale]
 
     finite_part = np.where(np.isfinite(covariance), covariance, 0.0)
-    rescaled = np.outer(scale, scale) * finite_part
-    rescaled[undetermined, undetermined] = np.inf
-    return rescaled
+    rescaled_covariance = np.outer(scale, scale) * finite_part
+    rescaled_covariance[is_undetermined, is_undetermined] = np.inf
+    return rescaled_covariance
 
 
 class ResidualSpectra(eqx.Module):

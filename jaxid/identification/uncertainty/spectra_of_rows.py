@@ -116,7 +116,7 @@ class Lines:
         if channel.equations is not channel.instruments:
             equations = self._transform_parts(channel.equations)
         influences = inverse[:, columns] @ instruments
-        explained = np.einsum("if,if->f", influences[columns], equations)
+        explained_power = np.einsum("if,if->f", influences[columns], equations)
 
         products = np.zeros((BIN_COUNT, len(columns), len(columns)))
         edges = 2 * np.searchsorted(self.bins, np.arange(BIN_COUNT + 1))
@@ -126,7 +126,7 @@ class Lines:
                 products[k] = lines @ lines.T
         return ChannelSpectra(
             energy=_add_parts(np.square(influences, out=influences)),
-            leverage=_add_parts(explained) / self.multiplicity,
+            leverage=_add_parts(explained_power) / self.multiplicity,
             power=np.abs(self.transform(channel.disturbance)) ** 2 / self.length,
             exposure=channel.counted / self.length,
             products=products,
@@ -157,7 +157,7 @@ class RowSpectra(NamedTuple):
     inverses: list[np.ndarray]
     # products of each channel's instruments by bins [bins, columns, columns]
     products: list[np.ndarray]
-    complete: bool  # whether all rows were transformed
+    is_complete: bool  # whether all rows were transformed
 
 
 class _StretchChannel(NamedTuple):
@@ -170,7 +170,7 @@ class _StretchChannel(NamedTuple):
 
 def row_spectra(problem: RegressionProblem, estimate: Estimate) -> RowSpectra:
     """Transform the stretches of the rows in one pass."""
-    stretches, complete = _divide_into_stretches(problem)
+    stretches, is_complete = _divide_into_stretches(problem)
     lengths = _shared_lengths(problem, stretches)
     all_lines: dict[tuple, Lines] = {}
     inverses: dict[int, np.ndarray] = {}
@@ -208,7 +208,7 @@ def row_spectra(problem: RegressionProblem, estimate: Estimate) -> RowSpectra:
         list(all_lines.values()),
         list(inverses.values()),
         list(products.values()),
-        complete,
+        is_complete,
     )
 
 
@@ -219,8 +219,8 @@ def _divide_into_stretches(problem: RegressionProblem) -> tuple[list[Span], bool
     correlation time of the noise over the length of a stretch.
     """
     samples = sum(o.samples for o in problem.recordings)
-    complete = samples <= MAX_SAMPLES
-    max_rows = MAX_ROWS if complete else MAX_ROWS // 4
+    is_complete = samples <= MAX_SAMPLES
+    max_rows = MAX_ROWS if is_complete else MAX_ROWS // 4
     stretches = []
     for number, recording in enumerate(problem.recordings):
         max_length = 4 * max_rows // recording.decimation.factor
@@ -228,13 +228,13 @@ def _divide_into_stretches(problem: RegressionProblem) -> tuple[list[Span], bool
         for start, stop in recording.row_segments:
             # Equal lengths have fast transforms; all rows must be in a stretch.
             edges = [*range(start, stop, length), stop]
-            if complete:
+            if is_complete:
                 rows = np.arange(start, stop)
                 parts = np.array_split(rows, len(edges) - 1)
                 edges = [*(int(part[0]) for part in parts), stop]
             for a, b in itertools.pairwise(edges):
                 stretches.append(Span(number, a, b))
-    if complete:
+    if is_complete:
         return stretches, True
     transformed_samples = 3 * MAX_SAMPLES // 8
     count = max(1, len(stretches) * transformed_samples // samples)

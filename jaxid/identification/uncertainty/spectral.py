@@ -51,11 +51,13 @@ class SpectralSandwich(AbstractUncertainty):
         covariance, dof = sandwich(spectra)
         variances = np.diag(naive)
         undetermined = np.isinf(variances)
-        if not spectra.complete:
+        if not spectra.is_complete:
             ratios = np.ones_like(variances)
-            white = white_variances(spectra.lines)
-            has_ratio = (white > 0) & ~undetermined
-            ratios[has_ratio] = np.sqrt(variances[has_ratio] / white[has_ratio])
+            white_noise_variances = white_variances(spectra.lines)
+            has_ratio = (white_noise_variances > 0) & ~undetermined
+            ratios[has_ratio] = np.sqrt(
+                variances[has_ratio] / white_noise_variances[has_ratio]
+            )
             deviations = np.sqrt(np.diag(covariance))
             covariance = rescale_covariance(covariance, ratios * deviations)
         covariance[undetermined, undetermined] = np.inf
@@ -79,8 +81,8 @@ def _widen_by_jackknife(errors: Uncertainty, estimate: Estimate) -> Uncertainty:
 
     deviations = errors.standard_deviations
     has_deviation = np.isfinite(deviations) & (deviations > 0)
-    exceeds = errors.jackknife**2 > max_ratios * deviations**2
-    deviations = np.where(has_deviation & exceeds, errors.jackknife, deviations)
+    is_exceeded = errors.jackknife**2 > max_ratios * deviations**2
+    deviations = np.where(has_deviation & is_exceeded, errors.jackknife, deviations)
     covariance = rescale_covariance(np.asarray(errors.covariance), deviations)
     return dataclasses.replace(errors, covariance=covariance)
 
@@ -96,17 +98,21 @@ class SpectralWindows:
     def __init__(self, frequency: Float[np.ndarray, " lines"], longest: float):
         self._order = np.argsort(frequency, kind="stable")
         places = np.argsort(self._order)
-        ordered = frequency[self._order]
+        ordered_frequency = frequency[self._order]
         min_half_width = max(0.25, 4.0 / longest)
-        half_widths = np.maximum(min_half_width, 0.3 * ordered)
+        half_widths = np.maximum(min_half_width, 0.3 * ordered_frequency)
         # Lines at the edge of a window belong to it in spite of rounding.
         half_widths = half_widths * (1 + 1e-9)
-        first = np.searchsorted(ordered, ordered - half_widths, side="left")
-        end = np.searchsorted(ordered, ordered + half_widths, side="right")
+        first = np.searchsorted(
+            ordered_frequency, ordered_frequency - half_widths, side="left"
+        )
+        end = np.searchsorted(
+            ordered_frequency, ordered_frequency + half_widths, side="right"
+        )
         self._lines = first[places], end[places]
         # Both ends of a window rise with its middle: the windows around a line are
         # neighbours.
-        numbers = np.arange(len(ordered))
+        numbers = np.arange(len(ordered_frequency))
         first_window = np.searchsorted(end, numbers, side="right")
         end_window = np.searchsorted(first, numbers, side="right")
         self._windows = first_window[places], end_window[places]
@@ -142,8 +148,8 @@ class SpectralTable:
         # A line and its mirror image are one random number.
         self._half = 0.5 * multiplicity[None]
         window_rows = self._windows.sum_lines(self._half * exposure)
-        unexplained = self._half * (exposure - leverage)
-        residual_rows = self._windows.sum_lines(unexplained)
+        unexplained_part = self._half * (exposure - leverage)
+        residual_rows = self._windows.sum_lines(unexplained_part)
         # A fit is assumed to leave at least 2 % of a window's power.
         min_rows = xp.maximum(0.02 * window_rows, 1e-300)
         self._residual_rows = xp.maximum(residual_rows, min_rows)
@@ -151,8 +157,8 @@ class SpectralTable:
         self._maps = []
         for c in range(len(leverage)):
             energy_of_row = energy[:, c] / self._residual_rows[c][None]
-            smooth = self._windows.sum_windows(energy_of_row)
-            self._maps.append(self._half * smooth)
+            smooth_power = self._windows.sum_windows(energy_of_row)
+            self._maps.append(self._half * smooth_power)
         # From a line's power to the scatter of its mean over the stretches.
         stretches = xp.maximum(exposure, 1.0)
         self._scatter = xp.sqrt(2.0 / (self._half * (1.0 + stretches)))
@@ -224,9 +230,9 @@ def sandwich(spectra: RowSpectra) -> tuple[np.ndarray, np.ndarray]:
 def white_variances(lines: Sequence[Lines]) -> np.ndarray:
     """Return variances of the estimates for white errors, with one level for each joint."""
     rows = sum(x.length * x.exposure for x in lines)
-    explained = sum(np.sum(x.multiplicity * x.leverage) for x in lines)
+    explained_power = sum(np.sum(x.multiplicity * x.leverage) for x in lines)
     power = sum(np.sum(x.multiplicity * x.power, axis=1) for x in lines)
-    remaining_share = 1.0 - explained / max(np.sum(rows), 1.0)
+    remaining_share = 1.0 - explained_power / max(np.sum(rows), 1.0)
     levels = power / np.maximum(rows * remaining_share, 1.0)
     variances = [np.einsum("icf,c->i", x.energy, levels) for x in lines]
     return np.sum(variances, axis=0)
@@ -238,7 +244,7 @@ def residual_spectra(lines: Sequence[Lines]) -> ResidualSpectra:
     half = 0.5 * longest.multiplicity
     windows = SpectralWindows(longest.frequency, longest.length * longest.row_time)
     residual_sums = windows.sum_lines(half * longest.residual)
-    smooth = residual_sums / windows.sum_lines(half)
+    smooth_power = residual_sums / windows.sum_lines(half)
     mean_exposure = np.mean(longest.exposure)
     # One-sided: the mirror image of a line counts with it.
     scale = 2.0 * longest.row_time / np.maximum(mean_exposure, 1e-300)
@@ -248,8 +254,8 @@ def residual_spectra(lines: Sequence[Lines]) -> ResidualSpectra:
         is_passed = longest.gain > 0
     leverage = longest.leverage / longest.exposure[:, None]
     remaining_part = np.clip(1.0 - leverage, 0.02, None)
-    whitened = longest.residual / remaining_part / longest.gain**2
-    power = whitened[:, is_passed]
+    whitened_power = longest.residual / remaining_part / longest.gain**2
+    power = whitened_power[:, is_passed]
     total = power.sum(axis=1, keepdims=True)
     cumulative = np.cumsum(power, axis=1) / np.where(total > 0, total, 1.0)
     count = power.shape[1]
@@ -259,7 +265,7 @@ def residual_spectra(lines: Sequence[Lines]) -> ResidualSpectra:
     figure_lines = np.unique(figure_places.astype(int))
     return ResidualSpectra(
         frequency=longest.frequency[figure_lines],
-        density=scale * smooth[:, figure_lines],
+        density=scale * smooth_power[:, figure_lines],
         gain=longest.gain[figure_lines],
         departure=np.abs(cumulative - straight_line).max(axis=1),
         # Kolmogorov's quantile of 95 %.
@@ -270,12 +276,20 @@ def residual_spectra(lines: Sequence[Lines]) -> ResidualSpectra:
 
 
 def sandwich_of_columns(
-    xp, own, weights, inverse, p, columns, forces, exposure, row_time: float
+    xp,
+    joint_parameters,
+    weights,
+    inverse,
+    p,
+    columns,
+    forces,
+    exposure,
+    row_time: float,
 ):
     """Return variances and degrees of freedom of estimates `p` [draws, base], in NumPy or JAX.
 
     Columns [columns, rows] and forces [draws, rows] of each joint are zero where a row
-    does not count; the columns belong to its `own` parameters; `exposure` is the
+    does not count; the columns belong to `joint_parameters`; `exposure` is the
     fraction of rows that count.
     """
     length = columns[0].shape[-1]
@@ -283,17 +297,21 @@ def sandwich_of_columns(
     energy = []
     leverage = []
     power = []
-    for indices, theta, Q, weight in zip(own, columns, forces, weights, strict=True):
+    for indices, theta, Q, weight in zip(
+        joint_parameters, columns, forces, weights, strict=True
+    ):
         places = np.array(indices, int)
         equations = xp.fft.rfft(weight * theta)
         residuals = Q - p[:, places] @ theta
         disturbance = xp.fft.rfft(weight * residuals)
         real = inverse[:, places] @ equations.real
         imaginary = inverse[:, places] @ equations.imag
-        explained = real[places] * equations.real + imaginary[places] * equations.imag
+        explained_power = (
+            real[places] * equations.real + imaginary[places] * equations.imag
+        )
         squares = real**2 + imaginary**2
         energy.append(times[None] / length * squares)
-        leverage.append(xp.sum(explained, axis=0) / length)
+        leverage.append(xp.sum(explained_power, axis=0) / length)
         disturbance_squares = disturbance.real**2 + disturbance.imag**2
         power.append(disturbance_squares / length)
     leverage = xp.stack(leverage)
