@@ -309,6 +309,7 @@ def base_parameters(
         raise InputError(
             f"`method` must be one of {', '.join(METHODS)}, but is {method!r}."
         )
+    # Random motions excite whatever any motion can excite.
     W, scale = random_regressor(_snapped(model), seed)
     dependence = METHODS[method](W)
     (other_method,) = set(METHODS) - {method}
@@ -317,6 +318,7 @@ def base_parameters(
     leaders = np.array(dependence.independent, int)
     others = np.array(dependence.dependent, int)
     regrouped = regrouping(W, leaders, others)
+    # Back from columns that are free of units to those of the model.
     kappa = regrouped.kappa * scale[leaders][:, None] / scale[others]
     return BaseParameters(
         model,

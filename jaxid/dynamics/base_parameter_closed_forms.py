@@ -112,6 +112,7 @@ class CoefficientSearch:
 
         values = np.concatenate([start, variations, geometries])
         kappa, self._is_valid = matrix(lengths, values)
+        # Where the columns are wrong, the matrix can be singular.
         kappa = np.where(np.isfinite(kappa), kappa, 0.0)
 
         self.lengths: tuple[Length, ...] = lengths
@@ -177,6 +178,7 @@ class CoefficientSearch:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the products that are needed, and their factors."""
         values = self._fit_kappa[:, row, column]
+        # Products that are not needed blur the factors of the others: fit again without.
         while True:
             products = _products(self._fit_lengths, powers)
             factors = np.linalg.lstsq(products, values, rcond=None)[0]
@@ -394,6 +396,7 @@ def changing_lengths(robot: Robot, matrix: Regrouping) -> tuple[Length, ...]:
         _, is_right = matrix(lengths, draws(matrix, lengths, 2, generator))
         return is_right
 
+    # Usually all components can vary at once; single ones are tried otherwise.
     components = named_lengths(robot, matrix)
     if can_vary(components):
         return components

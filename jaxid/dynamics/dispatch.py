@@ -73,6 +73,7 @@ def opened(
     numbers: list[AnyArray] = [np.zeros((len(leaves_of_models), 0))]
     for k, values in enumerate(zip(*leaves_of_models, strict=True)):
         if is_traced(values):
+            # All numbers of the leaf are inputs; zeros stand in the closed model.
             stack = jnp.stack
             leaves[k] = np.zeros(values[0].shape, values[0].dtype)
             positions = np.arange(leaves[k].size)
@@ -202,6 +203,7 @@ _lock = threading.Lock()
 
 def method_of(owner: eqx.Module, definition: Callable, *shapes: Shape) -> SampleMethod:
     """Return a method of a model; those that were used last are kept."""
+    # By content: equal models that were made one after the other share their programs.
     key = (definition.__name__, shapes, *content(owner))
     with _lock:
         method = _methods.setdefault(key, SampleMethod(owner, definition, shapes))
@@ -232,15 +234,18 @@ def on_samples(
         model, (numbers,) = opened(definition.__name__, owner)
         return on_samples(model, model.call, *samples, shared=(numbers, *shared))
 
+    # Lists become NumPy arrays; only arrays of JAX make the result one.
     arrays = [*(as_array("p", x) for x in shared), *samples]
     batch = _batch_shape(arrays)
     method = method_of(owner, definition, *(x.shape[-1:] for x in arrays))
     dtype = jnp.result_type(*(x.dtype for x in arrays), float)
     in_jax = [x for x in arrays if isinstance(x, jax.Array)]
+    # Inside `jit` and the like the method becomes a part of what is compiled.
     if is_traced(arrays):
         inputs = [jnp.asarray(x, dtype) for x in arrays]
         return _over_batches(method.on_rows, batch, inputs, len(shared))
 
+    # A few samples are done before XLA has compiled; arrays elsewhere stay there.
     devices = {device for x in in_jax for device in x.devices()}
     is_on_one_cpu = len(devices) <= 1 and all(d.platform == "cpu" for d in devices)
     is_small = math.prod(batch) <= MAX_SAMPLES_IN_NUMPY and not method.is_long
@@ -362,6 +367,7 @@ def solve_symmetric(A: Float[AnyArray, "joints joints"], b: Joints) -> Joints:
             if i > j:
                 L[i, j] = entry / LD[j, j]
 
+    # L y = b, then D z = y, then L^T x = z.
     x = [b[i] for i in range(n)]
     for i in range(n):
         for k in range(i):

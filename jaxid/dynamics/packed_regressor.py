@@ -63,6 +63,7 @@ class JointRegressor(eqx.Module):
         self, *arrays: AnyArray, fence: bool = False
     ) -> list[Float[Array, "*batch columns samples"]]:
         """Return the columns of each joint, from arguments with samples last."""
+        # Constants come as floats; an array of the batch's shape is made of each.
         values = lower(self.program, fence)(*arrays)
         dtype = jnp.result_type(*arrays, float)
         *batch, samples = jnp.shape(arrays[0])[1:]

@@ -98,6 +98,7 @@ def rigid_body_regressor(
     Returns:
         For each joint (first axis) the columns of each body (second axis).
     """
+    # The accelerations are affine in qdd: their slope is the same at any point.
     F = jax.jacfwd(partial_velocities(robot, q, qd, qdd))(qdd)
     bodies = [body_regressor(*m) for m in body_motions(robot, q, qd, qdd)]
     return jnp.stack([f.T @ b for f, b in zip(F, bodies, strict=True)], axis=1)
@@ -140,6 +141,7 @@ def rigid_body_mass_matrix(
         else:
             force = m * axis
             moment = jnp.cross(h, axis)
+        # Every joint on the way to the ground feels the wrench.
         j = i
         while j >= 0:
             component = moment if robot.revolute[j] else force

@@ -61,6 +61,7 @@ def gram_schmidt(
         rank = len(independent)
         if norms[k] <= min_norm or rank == rows:
             continue
+        # Relative to its own norm: a small column is not a dependent one.
         w = W[:, k] / norms[k]
         # Twice is enough unless almost nothing remains; the third pass costs little.
         for _ in range(3):
@@ -172,6 +173,7 @@ def regrouping(
     unit_columns, norms = scale_columns(W)
     W1 = unit_columns[:, leaders]
     W2 = unit_columns[:, others]
+    # The diagonal of R is what each column adds to those before it.
     Q, R = np.linalg.qr(W1)
     shares = np.abs(np.diag(R))
     is_before = leaders[:, None] < others

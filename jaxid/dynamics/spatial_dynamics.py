@@ -71,10 +71,10 @@ def all_placements(robot: Robot, q: Joints) -> Float[Array, "joints 4 4"]:
     Each turn of the loop doubles the number of joints that a placement passes over.
     """
     dtype = q.dtype
-    local = jnp.concatenate(
-        [_relative_placements(robot, q), _bottom_rows(robot, dtype)], 1
+    # First in the frame of the parent, then in that of a body further above.
+    placements = jnp.concatenate(
+        [_relative_placements(robot, q), _bottom_rows(robot, dtype)], axis=1
     )
-    placements = local
     above = np.array(robot.parent)
     while (above >= 0).any():
         # The placements of the bodies above, for each body; the ground's is one.
@@ -146,6 +146,7 @@ def ground_motion(robot: Robot, q: Joints, qd: Joints, qdd: Joints) -> GroundMot
 
     is_moved = jnp.asarray(moved_by(robot), dtype)
     speeds = joints * qd[:, None]
+    # Sums over all joints that move a body replace the recursion along the tree.
     v = is_moved @ speeds
     a = is_moved @ (joints * qdd[:, None] + _times(_combine(CROSS, v), speeds))
     gravity = jnp.concatenate([jnp.zeros(3, dtype), jnp.asarray(robot.gravity, dtype)])
@@ -172,6 +173,7 @@ def spatial_mass_and_bias(
     motion = ground_motion(robot, q, qd, jnp.zeros_like(q))
     inertias = ground_inertias(p, motion.carry)
     is_moved = jnp.asarray(moved_by(robot), q.dtype)
+    # All bodies beyond a joint move as one when that joint alone moves.
     composite = jnp.tensordot(is_moved.T, inertias, 1)
     momenta = _times(composite, motion.joints)
     # A joint feels the momenta of those that it carries; the matrix is symmetric.
@@ -184,6 +186,7 @@ def spatial_mass_and_bias(
 def _project_forces(robot: Robot, inertias: Array, motion: GroundMotion) -> Joints:
     """Return the forces of the joints that move the bodies (Newton and Euler)."""
     _, joints, v, a = motion
+    # The cross product of wrenches is that of motions, transposed and negative.
     rates = jnp.einsum("nji,nj->ni", _combine(CROSS, v), _times(inertias, v))
     wrenches = _times(inertias, a) - rates
     beyond = jnp.asarray(moved_by(robot).T, joints.dtype) @ wrenches
@@ -195,6 +198,7 @@ def spatial_regressor(
 ) -> Float[Array, "joints joints 10"]:
     """Return the regressor of every body (Eq. 11)."""
     carry, joints, v, a = ground_motion(robot, q, qd, qdd)
+    # In the frames of the bodies, where the parameters are constant.
     v_body = jnp.einsum("nji,nj->ni", carry, v)
     a_body = jnp.einsum("nji,nj->ni", carry, a)
     unit_inertias = jnp.asarray(INERTIA, q.dtype)

@@ -50,6 +50,7 @@ def block_results(program: Program, *arrays: Array) -> tuple[Array, ...]:
 def results_at_once(program: Program, *arrays: Array) -> tuple[Array, ...]:
     """Return the distinct results of samples, without fences."""
     count = next(len(x) for x in arrays if x.ndim == 2)
+    # Entries that all samples have in common are repeated, and samples stay as they are.
     inputs = [[jnp.broadcast_to(row, (count,)) for row in x.T] for x in arrays]
     like = jnp.zeros(count, arrays[-1].dtype)
     return lower(program, fence=False).run(inputs, primitives(like))
@@ -110,6 +111,7 @@ def on_rows(program: Program, *arrays: Array) -> Float[Array, "samples out"]:
         # Parameters are vectors, with the axis of the batch matrices.
         has_own_parameters = any(x.ndim == 2 and has_batch for x, has_batch in inputs)
         if has_own_parameters and count >= BLOCK:
+            # Blocks have parameters in common: no block may hold several elements.
             return _one_after_the_other(run, inputs), True
 
         # All become samples, but for what is common to all.

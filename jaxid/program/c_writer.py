@@ -126,6 +126,7 @@ class CWriter:
 
     def _statements(self, program: Program, inputs: Sequence[str]) -> list[str]:
         """Write one line for each node, and calls of the library."""
+        # By stages: a call of the library computes many numbers, but waits for all.
         stages = self._stages(program)
         lines: list[str] = []
         for stage in range(max(stages, default=0) + 1):

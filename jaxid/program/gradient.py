@@ -96,6 +96,7 @@ def _slopes_of_nodes(
         if isinstance(x, int):
             slopes[x] = add(slopes[x], weight)
 
+    # Nodes read only nodes before them: backwards, a slope is complete when used.
     for k in reversed(range(len(scalars))):
         node = program.nodes[k]
         if node.operation is Operation.INPUT or slopes[k] == 0.0:

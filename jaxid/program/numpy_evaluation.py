@@ -141,6 +141,7 @@ def _evaluate(
     entries, batch = program.align([np.asarray(x, np.float64) for x in arrays], np)
     samples = math.prod(batch)
     inputs = [x.reshape(len(x), samples) for x in entries]
+    # Results are written in place; all else goes through a few short rows.
     results = np.empty((len(program.distinct[0]), samples))
     scratch = np.empty((cell_count - len(results), min(samples, BLOCK)))
     with np.errstate(all="ignore"):

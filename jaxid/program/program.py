@@ -169,6 +169,7 @@ def assemble(
     structure: Any,
 ) -> Program:
     """Make a program of the part of a graph that the outputs need."""
+    # Only now all uses are known, on which factoring depends.
     outputs = rewrite(outputs)
     scalars = live_scalars(outputs)
     place = {scalar.index: k for k, scalar in enumerate(scalars)}

@@ -350,6 +350,7 @@ def live_scalars(outputs: Sequence[Operand]) -> list[Scalar]:
 def rewrite(outputs: Sequence[Operand]) -> list[Operand]:
     """Return the same outputs with fewer operations, where some can be saved."""
     outputs = list(outputs)
+    # Factors that were drawn out can make sums that have factors again.
     while True:
         candidates = Rewriting(outputs).factor_sums()
         if _count_operations(candidates) >= _count_operations(outputs):
@@ -380,6 +381,7 @@ class Rewriting:
         for scalar in self.scalars:
             if scalar.operation in _SUMS:
                 summands.update(filter(self._is_sum_used_once, scalar.operands))
+        # Operands come first, so that the replacements of all terms are known.
         for scalar in self.scalars:
             terms = None
             if scalar.operation in _SUMS and scalar not in summands:

@@ -220,6 +220,7 @@ def _as_matrices(
     x: np.ndarray, contracted: Sequence[int], batch: Sequence[int]
 ) -> tuple[np.ndarray, Shape]:
     """Return an array as [*batch, others, contracted], and its other axes."""
+    # Axes in the order of `dot_general`'s result.
     others = [k for k in range(x.ndim) if k not in (*contracted, *batch)]
     shape = tuple(x.shape[k] for k in others)
     in_order = x.transpose((*batch, *others, *contracted))
@@ -374,6 +375,7 @@ def _run(
     for equation in jaxpr.eqns:
         operands = [read(name) for name in equation.invars]
         results = _run_equation(equation, operands)
+        # Entries of a symbolic array may all have become numbers; it stays symbolic.
         dtype = object if any(map(_is_symbolic, operands)) else None
         for name, result in zip(equation.outvars, results, strict=True):
             values[name] = np.asarray(result, dtype)

@@ -135,6 +135,7 @@ class Lowered(eqx.Module):
         source = next((x for x in firsts if x.size), jnp.zeros((1,), dtype))
         one = hidden_one(source[(0,) * source.ndim]) if self.fence else None
 
+        # Together they are vectorised; angles that are computed follow one by one.
         pairs = self._sines_and_cosines(entries, one)
         values: list[Array] = []
         for position, node in enumerate(nodes):

@@ -80,6 +80,7 @@ class TorqueRipple(AbstractTerm):
         """Return sines and cosines, on all axes that a motor turns."""
         A = np.asarray(robot.drives.reduction)
         diagonal = np.where(np.diag(A) == 0, 1.0, np.diag(A))
+        # Relative to the motor's own joint, on whose side the parameters are.
         ratios = A / diagonal[:, None]
         blocks = []
         for k in self.motor:

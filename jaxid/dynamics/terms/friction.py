@@ -236,6 +236,7 @@ class LoadFriction(AbstractDryFriction):
 
     def columns(self, robot, q, qd, qdd):
         """Return the diagonal matrix of loads with the signs of the speeds."""
+        # At standstill only gravity loads the joints.
         standstill = jnp.zeros_like(q)
         bodies = jnp.asarray(self._bodies(robot), q.dtype)
         load = projection_equation.rigid_body_forces(

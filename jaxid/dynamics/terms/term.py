@@ -119,6 +119,7 @@ class AbstractTerm(eqx.Module):
         self, robot: Robot, p: Float[AnyArray, " columns"], q: Joints
     ) -> Float[AnyArray, "joints joints"]:
         """Return the factor of the accelerations in these forces (Eq. 38)."""
+        # Forces are affine in the accelerations: their slope is the mass matrix.
         standstill = jnp.zeros_like(q)
         return jax.jacfwd(lambda qdd: self.forces(robot, p, q, standstill, qdd))(
             standstill
