@@ -1,8 +1,8 @@
 """Shape vocabulary of annotations, and arrays of NumPy and JAX side by side.
 
 Axes: `joints` (= bodies), `standard` (columns of the full regressor), `base` (columns
-    of the base
-regressor), `samples` (rows of a log), `rows` (rows left after filtering), `batch`.
+of the base regressor), `samples` (rows of a log), `rows` (rows left after filtering),
+`batch`.
 """
 
 import os
@@ -97,8 +97,7 @@ def matching(name: str, value: AnyArray | float, qd: AnyArray) -> AnyArray | flo
     if shape and shape != qd.shape[-1:]:
         raise InputError(
             f"`{name}` must be one number, or one for each of {qd.shape[-1]} joints, "
-            "but has shape "
-            f"{shape}."
+            f"but has shape {shape}."
         )
     return value
 
@@ -147,13 +146,13 @@ def in_parts(solve: Callable[[Any], Any], data: Any, size: int = 16) -> Any:
     size = min(count, size)
 
     def part(start: int) -> Any:
-        chosen = np.arange(start, start + size) % count
-        return jax.block_until_ready(solve(jax.tree.map(lambda x: x[chosen], data)))
+        indices = np.arange(start, start + size) % count
+        return jax.block_until_ready(solve(jax.tree.map(lambda x: x[indices], data)))
 
     # The first call compiles, and the others wait for it.
     cores = None if jax.default_backend() == "cpu" else 1
-    found = on_cores(part, range(0, count, size), cores)
-    return jax.tree.map(lambda *x: jnp.concatenate(x)[:count], *found)
+    results = on_cores(part, range(0, count, size), cores)
+    return jax.tree.map(lambda *x: jnp.concatenate(x)[:count], *results)
 
 
 def content(tree: Any) -> tuple:

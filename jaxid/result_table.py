@@ -98,13 +98,15 @@ def macros(template: Path) -> Any:
 
     def marked_up(text: str) -> Markup:
         # What stands between backticks becomes a name in other letters.
-        escaped = html.escape(printable(text))
-        return Markup(re.sub(r"`([^`]+)`", r'<span class="key">\1</span>', escaped))
+        escaped_text = html.escape(printable(text))
+        return Markup(
+            re.sub(r"`([^`]+)`", r'<span class="key">\1</span>', escaped_text)
+        )
 
     def aligned(number: str) -> str:
         # Blanks behind a number become as wide as the digits and the point left out.
-        pointed = re.sub(r"^([^. ]*) ", "\\1\N{PUNCTUATION SPACE}", number)
-        return pointed.replace(" ", "\N{FIGURE SPACE}")
+        padded = re.sub(r"^([^. ]*) ", "\\1\N{PUNCTUATION SPACE}", number)
+        return padded.replace(" ", "\N{FIGURE SPACE}")
 
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(template.parent),
@@ -395,5 +397,5 @@ def versions() -> dict[str, str]:
         jaxid_version = importlib.metadata.version("jaxid-robotics")
     except importlib.metadata.PackageNotFoundError:
         jaxid_version = "not installed"
-    others = {name: importlib.metadata.version(name) for name in ("jax", "numpy")}
-    return {"jaxid": jaxid_version, **others, "python": platform.python_version()}
+    libraries = {name: importlib.metadata.version(name) for name in ("jax", "numpy")}
+    return {"jaxid": jaxid_version, **libraries, "python": platform.python_version()}

@@ -240,26 +240,28 @@ def _identification(study: Study) -> Section:
     time = np.asarray(log.time)
     begin, end = study.played.window
     step = max(1, len(time) // (2 * POINTS))
-    shown = np.flatnonzero((time >= begin) & (time <= end))[::step]
-    desired = study.played.motion(time[shown])
-    unweighted = study.unweighted.validation.errors[0]
-    weighted = study.weighted.validation.errors[0]
+    rows = np.flatnonzero((time >= begin) & (time <= end))[::step]
+    desired_motion = study.played.motion(time[rows])
+    unweighted_errors = study.unweighted.validation.errors[0]
+    weighted_errors = study.weighted.validation.errors[0]
     return "Identification with and without weights", [
         "Cold and warm, the servo follows the motion at 1000 Hz. Logs hold angles of "
         "17-bit encoders and torques with 1 % of noise, ripple, stiction and Stribeck "
         f"friction. Filter (Eq. 25): {log.filter}; {log.rows} rows of each joint.",
         picture(
-            jid.plot.filtered(robot, time[shown], desired, log.motion[shown], 2),
+            jid.plot.filtered(robot, time[rows], desired_motion, log.motion[rows], 2),
             "Fig. 5: desired velocity and acceleration, and those of the filtered "
             "angles.",
         ),
         picture(
-            jid.plot.torques(unweighted, robot, "identified without weights", SHOWN),
+            jid.plot.torques(
+                unweighted_errors, robot, "identified without weights", SHOWN
+            ),
             "Fig. 6: torques of the axes 1, 3, 5 and 7, and their prediction without "
             "weights.",
         ),
         picture(
-            jid.plot.torques(weighted, robot, "identified with weights", SHOWN),
+            jid.plot.torques(weighted_errors, robot, "identified with weights", SHOWN),
             "Fig. 7: the same with weights (Eq. 30).",
         ),
     ]

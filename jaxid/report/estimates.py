@@ -37,17 +37,17 @@ def parameter_figure(fit: Fit) -> Figure:
     """
     percents = 100.0 * np.asarray(fit.relative_standard_deviations)
     percents[np.isnan(percents)] = np.inf
-    smallest = np.min(percents[percents > 0], initial=10.0)
-    low = 10.0 ** math.floor(math.log10(max(smallest, 1e-3)) - 0.1)
+    min_percent = np.min(percents[percents > 0], initial=10.0)
+    low = 10.0 ** math.floor(math.log10(max(min_percent, 1e-3)) - 0.1)
     order = np.argsort(percents, kind="stable")
     panels = [
         _parameter_panel(fit, rows, np.clip(percents[rows], low, MAX_PERCENT), low)
         for rows in _split(order)
     ]
     name = fit.base.model.robot.name
-    trusted = fit.trust.count(Status.GOOD)
+    count = fit.trust.count(Status.GOOD)
     return _listing(
-        f"{name}: {trusted} of {len(percents)} base parameters are known to 10 %",
+        f"{name}: {count} of {len(percents)} base parameters are known to 10 %",
         panels,
     )
 
@@ -138,12 +138,14 @@ def _comparison_panel(comparison: Comparison, shown: np.ndarray) -> Panel:
                 ],
             )
         )
-    changed = [comparison.verdicts[k] is Verdict.CHANGED for k in shown]
+    is_changed = [comparison.verdicts[k] is Verdict.CHANGED for k in shown]
     return Panel(
         curves,
         x="estimate / farthest end of both intervals",
         x_range=(-1.08, 1.08),
-        y_names=[name + " *" * mark for name, mark in zip(names, changed, strict=True)],
+        y_names=[
+            name + " *" * mark for name, mark in zip(names, is_changed, strict=True)
+        ],
         beside=_difference_texts(comparison, shown),
         levels=[("x", 0.0, GREY)],
     )

@@ -65,9 +65,9 @@ def plan_remarks(plan: ExcitationPlan) -> list[Remark]:
     )
 
     doubts = []
-    unpublished = ", ".join(plan.limits.limits.assumed)
-    if unpublished:
-        doubts.append(f"Limits that nobody published, assumed: {unpublished}")
+    unpublished_limits = ", ".join(plan.limits.limits.assumed)
+    if unpublished_limits:
+        doubts.append(f"Limits that nobody published, assumed: {unpublished_limits}")
     if plan.limits.assumed:
         doubts.append(f"Assumed, because not given: {_assumed_limits(plan)}")
     if plan.vague:
@@ -187,15 +187,15 @@ def headline(plan: ExcitationPlan, remarks: Sequence[Remark]) -> Remark:
     if any(remark.status is Status.BAD for remark in remarks):
         text = "Do not record this motion yet: what is marked ✗ comes first."
         return Remark(text, Status.BAD)
-    unchecked = [
+    unchecked_names = [
         remark.text.split(":")[0]
         for remark in remarks
         if ": not checked, as" in remark.text
     ]
-    if unchecked:
+    if unchecked_names:
         return Remark(
             "This motion keeps all limits that were checked; not checked: "
-            f"{', '.join(unchecked)}.",
+            f"{', '.join(unchecked_names)}.",
             Status.DOUBTFUL,
         )
     return Remark(

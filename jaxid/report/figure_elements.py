@@ -105,8 +105,8 @@ class Solids(NamedTuple):
         ground = np.broadcast_to(np.eye(3, 4), (len(self.places), 1, 3, 4))
         # Body -1, the ground, is the last one.
         places = np.concatenate([self.places, ground], axis=1)[:, self.bodies]
-        rotated = np.einsum("fvij,vj->fvi", places[..., :3], self.vertices)
-        return rotated + places[..., 3]
+        rotated_vertices = np.einsum("fvij,vj->fvi", places[..., :3], self.vertices)
+        return rotated_vertices + places[..., 3]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -200,17 +200,17 @@ def decimate(
 
     fractions = (times - times[0]) / (times[-1] - times[0])
     row_bins = np.minimum((bins * fractions).astype(int), bins - 1)
-    first = np.flatnonzero(np.diff(row_bins, prepend=-1))
-    last = np.append(first[1:], len(times)) - 1
-    low = np.fmin.reduceat(ordinates, first)
-    high = np.fmax.reduceat(ordinates, first)
+    first_rows = np.flatnonzero(np.diff(row_bins, prepend=-1))
+    last_rows = np.append(first_rows[1:], len(times)) - 1
+    low = np.fmin.reduceat(ordinates, first_rows)
+    high = np.fmax.reduceat(ordinates, first_rows)
 
     # Two points for each bin, in the order that follows the line from end to end.
-    falling = ordinates[last] < ordinates[first]
+    falling = ordinates[last_rows] < ordinates[first_rows]
     starts = np.where(falling, high, low)
     ends = np.where(falling, low, high)
-    gaps = np.flatnonzero(np.diff(row_bins[first]) > 1) + 1
-    bin_times = np.stack([times[first], times[last]], axis=1)
+    gaps = np.flatnonzero(np.diff(row_bins[first_rows]) > 1) + 1
+    bin_times = np.stack([times[first_rows], times[last_rows]], axis=1)
     bin_values = np.stack([starts, ends], axis=1)
     return (
         np.insert(bin_times, gaps, np.nan, axis=0).ravel(),

@@ -67,16 +67,19 @@ def _glance(report: Report) -> list[Any]:
     """Return verdict, three numbers, the data, and what deserves attention."""
     overall, *criteria = verdict(report)
     doubts = []
-    others = []
+    good_remarks = []
     for remark in criteria:
         is_doubt = remark.status in (Status.BAD, Status.DOUBTFUL)
-        (doubts if is_doubt else others).append(remark)
+        if is_doubt:
+            doubts.append(remark)
+        else:
+            good_remarks.append(remark)
     return [
         overall,
         _three_numbers(report),
         Table("", facts=_data(report)),
         *([doubts] if doubts else []),
-        folded("What else was checked", others),
+        folded("What else was checked", good_remarks),
     ]
 
 
@@ -100,12 +103,12 @@ def _three_numbers(report: Report) -> Markup:
         joint = fit.base.model.robot.joint_names[worst]
         number = f"{percent(float(mean_percents[worst]) / 100.0)} %"
         meaning = f"mean error of the worst joint, {joint}, of its largest torque"
-    trusted = f"{fit.trust.count(Status.GOOD)} of {fit.base.size}"
+    share = f"{fit.trust.count(Status.GOOD)} of {fit.base.size}"
     return tiles(
         (f"{percent(error)} %", f"torque error (RMS) {motion}", status),
         (number, meaning, Status.NEUTRAL),
         (
-            trusted,
+            share,
             "parameters known to 10 %",
             Status.BAD if fit.undetermined else Status.NEUTRAL,
         ),
@@ -132,10 +135,8 @@ def _data(report: Report) -> Iterator[tuple[str, str]]:
         )
     else:
         mass = significant(float(np.asarray(fit.consistency.bodies)[:, 0].sum()))
-        bounded = len(fit.consistency.masses_from_bounds)
-        origin = (
-            f", of which {bounded} bodies follow from bounds too" if bounded else ""
-        )
+        bodies = len(fit.consistency.masses_from_bounds)
+        origin = f", of which {bodies} bodies follow from bounds too" if bodies else ""
         yield "total mass of the moving bodies", f"{mass} kg{origin}"
     if report.claimed_mass:
         yield "total mass by the robot's file", f"{significant(report.claimed_mass)} kg"
@@ -174,17 +175,17 @@ def _physics(report: Report, figures: Mapping[str, Figure]) -> Iterator[Section]
 def _torques(figures: Mapping[str, Figure], robot: Robot) -> list[Any]:
     """Return the figures of the recordings, the first one unfolded."""
     logs = [figure for name, figure in figures.items() if name.startswith("torque_")]
-    shown = logs[: max(1, MAX_PANELS // robot.joints)]
+    first_logs = logs[: max(1, MAX_PANELS // robot.joints)]
     # Many panels share the size of the page.
-    panels = sum(len(figure.panels) for figure in shown)
-    bins = min(shown[0].bins, MAX_BINS // panels)
-    blocks: list[Any] = [dataclasses.replace(shown[0], bins=bins)]
-    for figure in shown[1:]:
-        untitled = dataclasses.replace(figure, title="", bins=bins)
-        blocks.append(folded(figure.title, untitled))
-    omitted = len(logs) - len(shown)
-    if omitted:
-        text = f"{omitted} more recordings are not shown here; result.json has their errors."
+    panels = sum(len(figure.panels) for figure in first_logs)
+    bins = min(first_logs[0].bins, MAX_BINS // panels)
+    blocks: list[Any] = [dataclasses.replace(first_logs[0], bins=bins)]
+    for figure in first_logs[1:]:
+        untitled_figure = dataclasses.replace(figure, title="", bins=bins)
+        blocks.append(folded(figure.title, untitled_figure))
+    remaining_logs = len(logs) - len(first_logs)
+    if remaining_logs:
+        text = f"{remaining_logs} more recordings are not shown here; result.json has their errors."
         blocks.append(text)
     return blocks
 

@@ -52,9 +52,14 @@ def charts(drawing: Drawing) -> list[dict[str, Any]]:
 
 
 def _chart(title: str, value: str, height: float, content: Any) -> dict[str, Any]:
+    """Return a chart as the template takes it."""
     text = json.dumps(content, separators=(",", ":"), ensure_ascii=False)
-    packed = pack(text.encode())
-    return {"title": title, "value": value, "height": height, "content": packed}
+    return {
+        "title": title,
+        "value": value,
+        "height": height,
+        "content": pack(text.encode()),
+    }
 
 
 def panel_content(panel: Panel, bins: int) -> dict[str, Any]:
@@ -133,6 +138,7 @@ def _axis_ranges(scene: Scene) -> list[list[float]]:
 
 
 def _solids_content(solids: Solids) -> dict[str, Any]:
+    """Return shapes, which the browser moves with the bodies."""
     frames, bodies = solids.places.shape[:2]
     places = solids.places.round(LENGTH_DIGITS).reshape(frames, bodies, 12)
     return {
@@ -144,6 +150,7 @@ def _solids_content(solids: Solids) -> dict[str, Any]:
 
 
 def _coordinates(points: np.ndarray) -> dict[str, Any]:
+    """Return the coordinates of points by their axes, as plotly takes them."""
     return {axis: _floats(points[:, k]) for k, axis in enumerate("xyz")}
 
 

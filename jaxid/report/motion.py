@@ -86,6 +86,7 @@ def joint_figure(
 
 
 def _limit_lines(bounds: Iterable[Any]) -> list[tuple[str, float, str]]:
+    """Return lines at the limits that are finite."""
     return [("y", float(bound), VERMILION) for bound in bounds if np.isfinite(bound)]
 
 
@@ -116,8 +117,8 @@ def tip_figure(
 def _size_panel(name: str, unit: str, time: AnyArray, vectors: AnyArray) -> Panel:
     """Return the length of vectors over time."""
     sizes = np.linalg.norm(np.asarray(vectors), axis=1)
-    largest = f"up to {sizes.max():.3g} {unit}"
-    return Panel([Curve(time, sizes)], title=name, value=largest, unit=unit)
+    maximum = f"up to {sizes.max():.3g} {unit}"
+    return Panel([Curve(time, sizes)], title=name, value=maximum, unit=unit)
 
 
 def filtered_figure(
@@ -142,12 +143,12 @@ def filtered_figure(
         ("velocity", f"{unit}/s", desired.qd, filtered.qd),
         ("acceleration", f"{unit}/s²", desired.qdd, filtered.qdd),
     ):
-        reference = np.asarray(desired_rate)[:, joint]
-        measured = np.asarray(filtered_rate)[:, joint]
-        rms = float(np.sqrt(np.mean((measured - reference) ** 2)))
+        desired_values = np.asarray(desired_rate)[:, joint]
+        filtered_values = np.asarray(filtered_rate)[:, joint]
+        rms = float(np.sqrt(np.mean((filtered_values - desired_values) ** 2)))
         curves = [
-            Curve(time, reference, "desired", MEASURED, width=2.4),
-            Curve(time, measured, "filtered", PREDICTED),
+            Curve(time, desired_values, "desired", MEASURED, width=2.4),
+            Curve(time, filtered_values, "filtered", PREDICTED),
         ]
         difference = f"RMS difference {rms:.3g} {rate_unit}"
         panels.append(Panel(curves, title=name, value=difference, unit=rate_unit))

@@ -92,13 +92,14 @@ def _half_widths(
     covariance = np.nan_to_num(fit.covariance, posinf=0.0)
     variances = np.einsum("vjk,kl,vjl->vj", columns, covariance, columns)
     half_widths = 1.96 * np.sqrt(np.maximum(variances, 0.0))
-    undetermined = ~np.isfinite(np.diag(fit.covariance))
-    is_affected = np.any(columns[..., undetermined] != 0.0, axis=(0, 2))
+    is_undetermined = ~np.isfinite(np.diag(fit.covariance))
+    is_affected = np.any(columns[..., is_undetermined] != 0.0, axis=(0, 2))
     half_widths[:, is_affected] = np.nan
     return half_widths
 
 
 def _confidence_band(model: Curve, half_widths: np.ndarray) -> Curve:
+    """Return the band of 95 % around the friction of the model."""
     low = model.y - half_widths
     high = model.y + half_widths
     return Curve(model.x, model.y, "95 % band", MEASURED, "band", low=low, high=high)
@@ -109,17 +110,21 @@ def _measured_friction(model: Curve, speeds: np.ndarray, errors: np.ndarray) -> 
 
     Measured friction is that of the model less the torque errors.
     """
-    counted = np.isfinite(errors)
-    speeds = speeds[counted]
-    friction = np.interp(speeds, model.x, model.y) - errors[counted]
+    is_counted = np.isfinite(errors)
+    speeds = speeds[is_counted]
+    friction = np.interp(speeds, model.x, model.y) - errors[is_counted]
     max_speed = model.x[-1]
     edges = np.linspace(-max_speed, max_speed, SPEED_CLASSES + 1)
     classes = np.digitize(speeds, edges[1:-1])
 
     counts = np.bincount(classes, minlength=SPEED_CLASSES)
-    shown = counts >= MIN_CLASS_ROWS
-    mean_speeds = np.bincount(classes, speeds, SPEED_CLASSES)[shown] / counts[shown]
-    mean_friction = np.bincount(classes, friction, SPEED_CLASSES)[shown] / counts[shown]
+    is_shown = counts >= MIN_CLASS_ROWS
+    mean_speeds = (
+        np.bincount(classes, speeds, SPEED_CLASSES)[is_shown] / counts[is_shown]
+    )
+    mean_friction = (
+        np.bincount(classes, friction, SPEED_CLASSES)[is_shown] / counts[is_shown]
+    )
     name = "measured, mean of a class of speed"
     return Curve(mean_speeds, mean_friction, name, GREY, "points")
 
@@ -149,14 +154,14 @@ def gravity_table(fit: Fit, log: TorqueErrors) -> Table:
     """Return the largest force against gravity of each joint along a recording."""
     robot = fit.base.model.robot
     q = np.asarray(log.positions)[even_indices(len(log.time), MAX_POSES)]
-    largest = np.max(np.abs(gravity_forces(fit, q)), axis=0)
-    largest[largest < ROUNDING * np.max(largest)] = 0.0
+    max_torques = np.max(np.abs(gravity_forces(fit, q)), axis=0)
+    max_torques[max_torques < ROUNDING * np.max(max_torques)] = 0.0
     columns = [
         Column("joint", robot.joint_names),
-        Column("largest torque\nof gravity", largest),
+        Column("largest torque\nof gravity", max_torques),
         Column("unit", [robot.force_unit(j) for j in range(robot.joints)]),
     ]
-    shares = largest / np.asarray(log.max_forces)
+    shares = max_torques / np.asarray(log.max_forces)
     if np.isfinite(shares).all():
         columns.append(Column("of the largest\nthe drive has", shares, "%", percent))
     return Table("", *columns)

@@ -82,10 +82,10 @@ def _spectrum_panel(spectra: ResidualSpectra, robot: Robot, j: int) -> Panel:
     """Return the spectrum of a joint, and that of white noise behind the filters."""
     frequency = np.asarray(spectra.frequency)
     gain = np.asarray(spectra.gain)
-    shown = (frequency > 0) & (gain > MIN_GAIN)
-    frequency = frequency[shown]
-    white_density = gain[shown] ** 2
-    density = np.asarray(spectra.density)[j, shown]
+    is_shown = (frequency > 0) & (gain > MIN_GAIN)
+    frequency = frequency[is_shown]
+    white_density = gain[is_shown] ** 2
+    density = np.asarray(spectra.density)[j, is_shown]
     level = np.sum(density) / np.sum(white_density)
 
     white_name = "white noise behind the filters (10 % of its power there)"
@@ -132,7 +132,7 @@ def autocorrelation_figure(
         limit = np.full(count, limits[j])
         legend = "white residuals: 95 % within"
         band = Curve(lags, lags, legend, MEASURED, "band", low=-limit, high=limit)
-        lowest = 1.1 * float(np.nanmin(correlation))
+        minimum = 1.1 * float(np.nanmin(correlation))
         panels.append(
             Panel(
                 [
@@ -144,7 +144,7 @@ def autocorrelation_figure(
                 value=f"next row: {significant(float(correlation[1]), 2)}",
                 x="lag [s]",
                 x_range=(-0.5 * lags[1], lags[-1] + 0.5 * lags[1]),
-                y_range=(min(-0.25, lowest), 1.05),
+                y_range=(min(-0.25, minimum), 1.05),
                 levels=[("y", 0.0, GREY)],
             )
         )
@@ -171,10 +171,10 @@ def autocorrelation(
     Rows that do not count for a joint are left out; NaN where no pair of rows counts.
     """
     residuals = errors.errors - np.nanmean(errors.errors, axis=0)
-    counted = np.isfinite(residuals)
+    is_counted = np.isfinite(residuals)
     # The sum over the pairs of rows that count, and the number of these pairs.
-    sums = _correlate(np.where(counted, residuals, 0.0), lags)
-    pairs = np.round(_correlate(counted.astype(float), lags))
+    sums = _correlate(np.where(is_counted, residuals, 0.0), lags)
+    pairs = np.round(_correlate(is_counted.astype(float), lags))
     means = np.full_like(sums, np.nan)
     np.divide(sums, pairs, out=means, where=pairs > 0)
     with np.errstate(invalid="ignore", divide="ignore"):

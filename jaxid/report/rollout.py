@@ -128,13 +128,16 @@ def motion_figure(errors: RolloutErrors, motion: int) -> Figure:
     time = np.asarray(errors.time[motion])
     panels = []
     for j, name in enumerate(errors.joint_names):
-        command = np.asarray(errors.command[motion])[j]
-        measured = np.asarray(errors.measured[motion])[j]
-        simulated = np.asarray(errors.simulated[motion])[j]
-        counted = np.asarray(errors.counted[motion])[j] > 0
-        panel = motion_panel(name, time, measured, simulated, counted)
-        commanded = Curve(time, command, "commanded", GREY, width=0.6)
-        panels.append(dataclasses.replace(panel, curves=[commanded, *panel.curves]))
+        panel = motion_panel(
+            name,
+            time,
+            measured=np.asarray(errors.measured[motion])[j],
+            simulated=np.asarray(errors.simulated[motion])[j],
+            counted=np.asarray(errors.counted[motion])[j] > 0,
+        )
+        positions = np.asarray(errors.command[motion])[j]
+        command = Curve(time, positions, "commanded", GREY, width=0.6)
+        panels.append(dataclasses.replace(panel, curves=[command, *panel.curves]))
     title = f"{errors.motions[motion]}: measured and simulated, free-running"
     return Figure(title, panels, columns=2, height=3.6)
 

@@ -74,8 +74,8 @@ def _joint_panel(errors: TorqueErrors, robot: Robot, j: int, window: slice) -> P
     """Return forces of a joint, with the errors in a panel below."""
     unit = robot.force_unit(j)
     time = np.asarray(errors.time)[window]
-    measured = np.asarray(errors.measured)[window, j]
-    predicted = np.asarray(errors.predicted)[window, j]
+    measured_forces = np.asarray(errors.measured)[window, j]
+    predicted_forces = np.asarray(errors.predicted)[window, j]
     difference = errors.errors[window, j]
     limit = 1.1 * (np.fmax.reduce(np.abs(difference), initial=0.0) or 1.0)
     below = Panel(
@@ -89,8 +89,8 @@ def _joint_panel(errors: TorqueErrors, robot: Robot, j: int, window: slice) -> P
     end = time[-1] if len(time) > 1 else time[0] + 1.0
     return Panel(
         [
-            Curve(time, measured, "measured", MEASURED, width=1.9),
-            Curve(time, predicted, "predicted", PREDICTED, width=0.8),
+            Curve(time, measured_forces, "measured", MEASURED, width=1.9),
+            Curve(time, predicted_forces, "predicted", PREDICTED, width=0.8),
         ],
         title=shortened(robot.joint_names[j], 26),
         value=_mean_error_text(errors, j, unit),
@@ -209,11 +209,11 @@ def _pooled_percents(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return mean and RMS errors [%], as if all recordings were one."""
     errors = np.concatenate([log.errors for log in recordings])
-    counted = np.isfinite(errors)
-    rows = np.maximum(counted.sum(axis=0), 1)
+    is_counted = np.isfinite(errors)
+    rows = np.maximum(is_counted.sum(axis=0), 1)
 
     def mean(values: np.ndarray) -> np.ndarray:
-        return np.where(counted, values, 0.0).sum(axis=0) / rows
+        return np.where(is_counted, values, 0.0).sum(axis=0) / rows
 
     scale = max_forces
     if scale is None:
