@@ -8,6 +8,7 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Float
 
+from .coefficient_limits import Grid, ScaledMotion, ScaledMotions
 from .problem import MAX_COARSE_EXCESS, ExcitationProblem
 
 EXCESS_PENALTY = 3.0
@@ -25,7 +26,7 @@ SAME_VALUE = 2e-5
 class Candidates(NamedTuple):
     """The best motion of each start so far, certified to keep the limits of the joints."""
 
-    x: Float[AnyArray, "starts scaled"]  # scaled coefficients
+    x: ScaledMotions  # scaled coefficients
     value: Float[AnyArray, " starts"]  # logarithm of the criterion, exact
     # relative excess of the worst constraint; not positive where all are kept
     excess: Float[AnyArray, " starts"]
@@ -46,7 +47,7 @@ class Candidates(NamedTuple):
         return float(np.exp(self.value[self.order()[0]]))
 
     @property
-    def best_motion(self) -> Float[np.ndarray, " scaled"]:
+    def best_motion(self) -> ScaledMotion:
         """Scaled coefficients of the best motion."""
         return np.asarray(self.x[self.order()[0]])
 
@@ -88,7 +89,7 @@ class Candidates(NamedTuple):
 
 
 def criterion_values(
-    problem: ExcitationProblem, x: Float[AnyArray, "starts scaled"]
+    problem: ExcitationProblem, x: ScaledMotions
 ) -> Float[np.ndarray, " starts"]:
     """Return the exact logarithms of the criterion."""
     values = []
@@ -98,9 +99,7 @@ def criterion_values(
     return np.array(values)
 
 
-def evaluate(
-    problem: ExcitationProblem, x: Float[AnyArray, "starts scaled"]
-) -> Candidates:
+def evaluate(problem: ExcitationProblem, x: ScaledMotions) -> Candidates:
     """Return motions as they are, with their exact values."""
     x = np.asarray(x)
     values = criterion_values(problem, x)
@@ -110,9 +109,7 @@ def evaluate(
     return Candidates(x, values, np.where(is_finite, excess, np.inf))
 
 
-def evaluate_within_limits(
-    problem: ExcitationProblem, x: Float[AnyArray, "starts scaled"]
-) -> Candidates:
+def evaluate_within_limits(problem: ExcitationProblem, x: ScaledMotions) -> Candidates:
     """Return motions after they were made to keep the limits of the joints for all times.
 
     Where they almost keep the other constraints, they are made smaller until they do;
@@ -123,7 +120,7 @@ def evaluate_within_limits(
         motions = []
         for motion in np.asarray(x):
             scaled = grid.scale_into_limits(motion, growth=growth)
-            motions.append(_shrink_slightly(problem, np.asarray(scaled)))
+            motions.append(_shrink_slightly(problem, grid, scaled))
         return evaluate(problem, np.array(motions))
 
     grid = problem.limits.grid()
@@ -136,21 +133,20 @@ def evaluate_within_limits(
     return candidates.improved(np.arange(len(larger.x)), larger)
 
 
-def _shrink_slightly(problem: ExcitationProblem, motion: np.ndarray) -> np.ndarray:
+def _shrink_slightly(
+    problem: ExcitationProblem, grid: Grid, motion: np.ndarray
+) -> np.ndarray:
     """Return a motion that exceeds its constraints a little so small that it keeps them."""
     if not 0.0 < problem.excess(motion) <= MAX_COARSE_EXCESS:
         return motion
-    grid = problem.limits.grid()
     for factor in SLIGHT_SHRINKAGES:
-        smaller = np.asarray(grid.shrink(motion, factor))
+        smaller = grid.shrink(motion, factor)
         if problem.excess(smaller) <= 0.0:
             return smaller
     return motion
 
 
-def shrink_to_constraints(
-    problem: ExcitationProblem, x: Float[AnyArray, " scaled"]
-) -> Candidates:
+def shrink_to_constraints(problem: ExcitationProblem, x: ScaledMotion) -> Candidates:
     """Return a motion made so small that it keeps all constraints; unchanged if no size does."""
     x = np.asarray(x)
     grid = problem.limits.grid()

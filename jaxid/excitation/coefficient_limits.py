@@ -5,106 +5,114 @@ a limit near one. All rows are scaled alike: a motion keeps its limits if |R y -
 in every row.
 """
 
-import itertools
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import numpy as np
 
-from jaxid.arrays import AnyArray, Array, Float, PRNGKeyArray, namespace
+from jaxid.arrays import AnyArray, Float, PRNGKeyArray, namespace
 from jaxid.errors import InputError
 from jaxid.robot.limits_and_drives import Limits
 from jaxid.robot.robot import Robot
 from jaxid.trajectory.fourier import complete_limits
 from jaxid.trajectory.trajectory import AbstractBasis
 
+ScaledMotion = Float[AnyArray, " scaled"]
+"""Scaled coefficients of a motion, joint by joint."""
+ScaledMotions = Float[np.ndarray, "starts scaled"]
+
+FILLED_FRACTION = 0.95
+"""Fraction of its limits that a motion of full size uses."""
+
+
+class Extent(NamedTuple):
+    """Positions of a motion, and how much of the limits its joints use about their mean."""
+
+    positions: Float[np.ndarray, "joints positions"]
+    use: Float[np.ndarray, " joints"]
+
 
 class Grid(NamedTuple):
     """Limits of all joints on a grid of times."""
 
-    # rows by scaled coefficients, for each joint first positions, then the higher
-    # orders
+    # rows by scaled coefficients: of each joint first positions, then higher orders
     R: Float[np.ndarray, "joints rows variables"]
-    c: Float[
-        np.ndarray, "joints rows"
-    ]  # centres of the ranges, for positions; zero for the rest
-    kinds: tuple[
-        range, ...
-    ]  # rows of positions, velocities, accelerations, and jerks if limited
+    # centres of the ranges, for positions; zero for the rest
+    c: Float[np.ndarray, "joints rows"]
+    # rows of positions, velocities, accelerations, and jerks if these are limited
+    kinds: tuple[range, ...]
     bound: float  # bound of |R y - c| with which the limits hold at all times
     # scaled coefficients of a constant motion at half of each joint's range
     constant: Float[np.ndarray, "joints variables"]
 
-    def rows(self, y: Float[AnyArray, " scaled"]) -> Float[AnyArray, "joints rows"]:
-        """Return the rows of a motion, R y."""
-        return namespace(y).einsum(
-            "jrk,jk->jr", self.R, y.reshape(np.shape(self.constant))
-        )
+    def rows(self, y: ScaledMotion) -> Float[AnyArray, "joints rows"]:
+        """Return the rows of a motion, R y, in NumPy or JAX."""
+        by_joint = y.reshape(np.shape(self.constant))
+        return namespace(y).einsum("jrk,jk->jr", self.R, by_joint)
 
-    def use(self, y: Float[AnyArray, " scaled"]) -> Float[AnyArray, "joints rows"]:
+    def use(self, y: ScaledMotion) -> Float[AnyArray, "joints rows"]:
         """Return the used fractions of the limits, with the sign of the direction."""
         return (self.rows(y) - self.c) / self.bound
 
     def scale_into_limits(
-        self,
-        y: Float[AnyArray, " scaled"],
-        bound: Any | None = None,
-        growth: float = 1.0,
-    ) -> Float[AnyArray, " scaled"]:
+        self, y: ScaledMotion, bound: float | None = None, growth: float = 1.0
+    ) -> np.ndarray:
         """Return the nearest motion of the same shape that keeps |R y - c| <= bound.
 
         Each joint's motion is scaled about its mean, where limits leave room by up to
         `growth`, then shifted into its range.
         """
-        xp, bound = namespace(y), self.bound if bound is None else bound
-        q, peak = self._positions(y)
-        s = xp.minimum(growth, bound / xp.maximum(peak, 1e-12))
-        low, high = self._shifts(q, s, bound)
-        shift = xp.clip((1.0 - s) * q.mean(axis=1), low, xp.maximum(low, high))
-        return self._moved(y, s, shift)
+        bound = self.bound if bound is None else bound
+        positions, use = self._measure(y)
+        factors = np.minimum(growth, bound / np.maximum(use, 1e-12))
+        low, high = self._shift_range(positions, factors, bound)
+        shifts = (1.0 - factors) * positions.mean(axis=1)
+        shifts = np.clip(shifts, low, np.maximum(low, high))
+        return self._move(y, factors, shifts)
 
-    def shrink(
-        self, y: Float[AnyArray, " scaled"], fraction: Any
-    ) -> Float[AnyArray, " scaled"]:
+    def shrink(self, y: ScaledMotion, factor: float) -> np.ndarray:
         """Return a motion made smaller by a factor, each joint's about its mean position."""
-        q, _ = self._positions(y)
-        return self._moved(y, fraction, (1.0 - fraction) * q.mean(axis=1))
+        positions, use = self._measure(y)
+        shifts = (1.0 - factor) * positions.mean(axis=1)
+        return self._move(y, np.full(use.shape, factor), shifts)
 
     def fill(
-        self,
-        y: Float[AnyArray, " scaled"],
-        places: Float[AnyArray, " joints"],
-        size: Any,
-    ) -> Float[AnyArray, " scaled"]:
+        self, y: ScaledMotion, places: Float[AnyArray, " joints"], size: float
+    ) -> np.ndarray:
         """Return a motion of the same shape that fills a fraction of 95 % of its limits.
 
         `places` are those of the joints in the range that is left, from 0 to 1.
         """
-        q, peak = self._positions(y)
-        bound = 0.95 * self.bound
-        s = size * bound / peak
-        low, high = self._shifts(q, s, bound)
-        return self._moved(y, s, low + (high - low) * places)
+        bound = FILLED_FRACTION * self.bound
+        positions, use = self._measure(y)
+        factors = size * bound / use
+        low, high = self._shift_range(positions, factors, bound)
+        return self._move(y, factors, low + (high - low) * np.asarray(places))
 
-    def _positions(self, y: AnyArray) -> tuple[Any, Any]:
+    def _measure(self, y: ScaledMotion) -> Extent:
         """Return the positions, and the largest use of a limit by each joint."""
-        rows, positions = self.rows(y), len(self.kinds[0])
-        q, rest = rows[:, :positions], rows[:, positions:]
-        half = 0.5 * (q.max(axis=1) - q.min(axis=1))
-        xp = namespace(y)
-        return q, xp.maximum(xp.abs(rest).max(axis=1), half)
+        rows = self.rows(np.asarray(y))
+        positions, rates = np.split(rows, [len(self.kinds[0])], axis=1)
+        half_swing = 0.5 * np.ptp(positions, axis=1)
+        return Extent(positions, np.maximum(np.abs(rates).max(axis=1), half_swing))
 
-    def _shifts(self, q: Array, s: Array, bound: Any) -> tuple[Any, Any]:
+    def _shift_range(
+        self, positions: np.ndarray, factors: np.ndarray, bound: float
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Return the least and largest shift that keep scaled positions in their range."""
         centre = self.c[:, 0]
-        return centre - bound - s * q.min(axis=1), centre + bound - s * q.max(axis=1)
+        low = centre - bound - factors * positions.min(axis=1)
+        high = centre + bound - factors * positions.max(axis=1)
+        return low, high
 
-    def _moved(self, y: AnyArray, s: Any, shift: Array) -> Any:
+    def _move(
+        self, y: ScaledMotion, factors: np.ndarray, shifts: np.ndarray
+    ) -> np.ndarray:
         """Return the motion of each joint times a factor, and shifted."""
-        motion = y.reshape(np.shape(self.constant))
-        scaled = namespace(y).reshape(namespace(y).asarray(s), (-1, 1)) * motion
-        return (scaled + shift[:, None] * self.constant).reshape(y.shape)
+        motion = np.asarray(y).reshape(np.shape(self.constant))
+        moved = factors[:, None] * motion + shifts[:, None] * self.constant
+        return moved.reshape(-1)
 
 
 class JointLimits(eqx.Module):
@@ -137,26 +145,26 @@ class JointLimits(eqx.Module):
         self, robot: Robot, basis: AbstractBasis, limits: Limits | None = None
     ):
         limits = robot.limits if limits is None else limits
-        self.basis, self.limits = basis, complete_limits(robot.replace(limits=limits))
-        self.assumed = tuple(
-            (name, int(j))
-            for name in ("position_min", "position_max", "velocity", "acceleration")
-            for j in np.flatnonzero(~np.isfinite(np.asarray(getattr(limits, name))))
-        )
+        self.basis = basis
+        self.limits = complete_limits(robot.replace(limits=limits))
+        self.assumed = _unknown_limits(limits)
         rows, _ = basis.envelope(scale_samples(512, basis))
-        reach = np.array([np.abs(r).max(axis=0) for r in rows])
+        peaks = np.array([np.abs(part).max(axis=0) for part in rows])
+        sizes = self._sizes
         with np.errstate(divide="ignore"):
-            self.scale = np.min(self._sizes[:, :, None] / reach[:, None, :], axis=0)
-        one = np.linalg.lstsq(rows[0], np.ones(len(rows[0])), rcond=None)[0]
-        if (
-            np.abs(rows[0] @ one - 1.0).max() > 1e-9
-            or np.abs(rows[1] @ one).max() > 1e-9
-        ):
+            self.scale = np.min(sizes[:, :, None] / peaks[:, None, :], axis=0)
+
+        # A constant: its positions are one, its velocities zero.
+        ones = np.ones(len(rows[0]))
+        constant = np.linalg.lstsq(rows[0], ones, rcond=None)[0]
+        error = np.abs(rows[0] @ constant - 1.0).max()
+        speed = np.abs(rows[1] @ constant).max()
+        if max(error, speed) > 1e-9:
             raise InputError(
                 "`basis` must hold a constant, for motions that stand still at any "
                 "position."
             )
-        self.constant = self._sizes[0][:, None] * one[None] / self.scale
+        self.constant = sizes[0][:, None] * constant[None] / self.scale
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -167,9 +175,11 @@ class JointLimits(eqx.Module):
     @property
     def _sizes(self) -> Float[np.ndarray, "4 joints"]:
         """Half ranges, speeds, accelerations and jerks."""
-        x = self.limits
-        half = 0.5 * (np.asarray(x.position_max) - np.asarray(x.position_min))
-        return np.array([half, x.velocity, x.acceleration, x.jerk], np.float64)
+        limits = self.limits
+        low = np.asarray(limits.position_min)
+        half = 0.5 * (np.asarray(limits.position_max) - low)
+        sizes = [half, limits.velocity, limits.acceleration, limits.jerk]
+        return np.array(sizes, np.float64)
 
     def coefficients(
         self, y: Float[AnyArray, "*batch scaled"]
@@ -178,31 +188,31 @@ class JointLimits(eqx.Module):
         scale = np.asarray(self.scale)[(None,) * (y.ndim - 1)]
         return y.reshape((*y.shape[:-1], *self.shape)) * scale
 
-    def scaled(
-        self, x: Float[AnyArray, "joints variables"]
-    ) -> Float[np.ndarray, " scaled"]:
+    def scaled(self, x: Float[AnyArray, "joints variables"]) -> np.ndarray:
         """Return the scaled coefficients of a trajectory."""
         return (np.asarray(x) / np.asarray(self.scale)).ravel()
 
     def grid(self, points: int = 512) -> Grid:
         """Return the limits on a grid of times; bases with many coefficients get more points."""
         envelope, factor = self.basis.envelope(scale_samples(points, self.basis))
-        size, scale = self._sizes, np.asarray(self.scale)
-        orders = 4 if np.isfinite(size[3]).any() else 3
-        R = [
-            scale[:, None] * envelope[k][None] / size[k][:, None, None]
-            for k in range(orders)
-        ]
-        ends = itertools.accumulate((part.shape[1] for part in R), initial=0)
-        kinds = tuple(range(a, b) for a, b in itertools.pairwise(ends))
-        R = np.concatenate(R, axis=1)
-        low, high = (
-            np.asarray(self.limits.position_min),
-            np.asarray(self.limits.position_max),
-        )
-        c = np.zeros(R.shape[:2])
-        c[:, kinds[0]] = (0.5 * (low + high) / size[0])[:, None]
-        return Grid(R, c, kinds, 1 / factor, np.asarray(self.constant))
+        sizes = self._sizes
+        scale = np.asarray(self.scale)[:, None]
+        orders = 4 if np.isfinite(sizes[3]).any() else 3
+        parts = []
+        kinds = []
+        count = 0
+        for order in range(orders):
+            part = scale * envelope[order][None] / sizes[order][:, None, None]
+            parts.append(part)
+            kinds.append(range(count, count + part.shape[1]))
+            count += part.shape[1]
+
+        low = np.asarray(self.limits.position_min)
+        centre = 0.5 * (low + np.asarray(self.limits.position_max)) / sizes[0]
+        centres = np.zeros((len(centre), count))
+        centres[:, kinds[0]] = centre[:, None]
+        R = np.concatenate(parts, axis=1)
+        return Grid(R, centres, tuple(kinds), 1 / factor, np.asarray(self.constant))
 
     def use(
         self, x: Float[AnyArray, "joints variables"]
@@ -212,24 +222,33 @@ class JointLimits(eqx.Module):
         The used fraction of a range is the distance from its middle, over half of the
         range.
         """
-        grid, used = self.grid(), np.zeros((4, len(x)))
-        rows = grid.use(self.scaled(x))
+        grid = self.grid()
+        rows = np.abs(grid.use(self.scaled(x)))
+        use = np.zeros((4, len(x)))
         for order, kind in enumerate(grid.kinds):
-            used[order] = np.abs(rows[:, kind]).max(axis=1)
-        return used
+            use[order] = rows[:, kind].max(axis=1)
+        return use
 
     def random(
         self, key: PRNGKeyArray, count: int, size: float = 1.0
     ) -> Float[np.ndarray, "count scaled"]:
         """Draw motions of random shapes and places, of a size relative to 95 % of the limits."""
         joints, variables = self.shape
-        shape, place = jax.random.split(key)
-        draws = np.asarray(jax.random.normal(shape, (count, joints * variables), float))
-        places = np.asarray(jax.random.uniform(place, (count, joints), float))
+        shape_key, place_key = jax.random.split(key)
+        shapes = jax.random.normal(shape_key, (count, joints * variables), float)
+        places = jax.random.uniform(place_key, (count, joints), float)
         fill = self.grid().fill
-        return np.array(
-            [fill(y, place, size) for y, place in zip(draws, places, strict=True)]
-        )
+        pairs = zip(np.asarray(shapes), np.asarray(places), strict=True)
+        return np.array([fill(shape, place, size) for shape, place in pairs])
+
+
+def _unknown_limits(limits: Limits) -> tuple[tuple[str, int], ...]:
+    """Return fields and joints (from 0) whose numbers were not given."""
+    unknown = []
+    for name in ("position_min", "position_max", "velocity", "acceleration"):
+        is_known = np.isfinite(np.asarray(getattr(limits, name)))
+        unknown += [(name, joint) for joint in np.flatnonzero(~is_known).tolist()]
+    return tuple(unknown)
 
 
 def scale_samples(samples: int, basis: AbstractBasis) -> int:

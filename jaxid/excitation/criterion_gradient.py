@@ -8,15 +8,16 @@ import numpy as np
 from jaxid.arrays import Float
 from jaxid.program.gradient import pull_back
 
+from .coefficient_limits import ScaledMotions
 from .problem import ExcitationProblem
 
 
 def value_and_gradient(
     problem: ExcitationProblem,
-    x: Float[np.ndarray, "starts scaled"],
+    x: ScaledMotions,
     sharpness: float | None,
     samples: int,
-) -> tuple[Float[np.ndarray, " starts"], Float[np.ndarray, "starts scaled"]]:
+) -> tuple[Float[np.ndarray, " starts"], ScaledMotions]:
     """Return the logarithms of the criterion and their derivatives by each motion.
 
     Motions are evaluated at `samples`, which stand for all that will be measured.

@@ -22,13 +22,14 @@ from .candidates import (
     evaluate_within_limits,
     shrink_to_constraints,
 )
+from .coefficient_limits import ScaledMotions
 from .constraints import AbstractConstraint
 from .criteria import AbstractCriterion
 from .design_result import DesignStatus, ExcitationPlan
 from .problem import ExcitationProblem
 from .search import count_steps, first_motions, search
 
-Solver = Callable[[ExcitationProblem, Float[AnyArray, "starts scaled"]], AnyArray]
+Solver = Callable[[ExcitationProblem, ScaledMotions], AnyArray]
 """A solver of excitation problems: from random motions to better ones."""
 
 
@@ -212,17 +213,17 @@ class Outcome(NamedTuple):
 
 
 def _run_solver(
-    problem: ExcitationProblem, x: Float[np.ndarray, "starts scaled"], solver: Solver
+    problem: ExcitationProblem, x: ScaledMotions, solver: Solver
 ) -> Outcome:
     """Improve motions by a given solver, then make them keep the limits of the joints."""
-    best = evaluate_within_limits(problem, solver(problem, x))
+    best = evaluate_within_limits(problem, np.asarray(solver(problem, x)))
     history = [evaluate(problem, x).best_value, best.best_value]
     return Outcome(best, history, DesignStatus.GIVEN)
 
 
 def _run_search(
     problem: ExcitationProblem,
-    x: Float[np.ndarray, "starts scaled"],
+    x: ScaledMotions,
     begin: LinearTrajectory | None,
     generations: int,
     random: np.random.Generator,

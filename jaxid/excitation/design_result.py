@@ -29,7 +29,7 @@ from .coefficient_limits import JointLimits
 from .constraints import Finding
 from .criteria import CRITERIA, AbstractCriterion, Information, standard_deviations
 
-VAGUE = 0.5
+MAX_RELATIVE_DEVIATION = 0.5
 """Relative standard deviation above which a parameter counts as hardly determined."""
 
 
@@ -101,11 +101,13 @@ class ExcitationPlan(Summarised, eqx.Module):
     @functools.cached_property
     def criteria(self) -> tuple[Comparison, ...]:
         """Values of all criteria for a random motion and for this one."""
+        comparisons = []
         with double_precision():
-            return tuple(
-                Comparison(c.name, c.value(self.reference), c.value(self.information))
-                for c in CRITERIA.values()
-            )
+            for criterion in CRITERIA.values():
+                before = criterion.value(self.reference)
+                after = criterion.value(self.information)
+                comparisons.append(Comparison(criterion.name, before, after))
+        return tuple(comparisons)
 
     @property
     def standard_deviations(self) -> Float[np.ndarray, " base"]:
@@ -126,17 +128,18 @@ class ExcitationPlan(Summarised, eqx.Module):
     @property
     def gains(self) -> Float[np.ndarray, " base"]:
         """Factor by which each standard deviation is smaller than that of a random motion."""
+        reference = standard_deviations(self.reference.weighted)
         with np.errstate(invalid="ignore"):
-            return (
-                standard_deviations(self.reference.weighted) / self.standard_deviations
-            )
+            return reference / self.standard_deviations
 
     @property
     def mean_gain(self) -> float:
         """Geometric mean of the gains of all parameters that both motions determine, or NaN."""
         gains = self.gains
-        known = gains[np.isfinite(gains) & (gains > 0)]
-        return float(np.exp(np.mean(np.log(known)))) if known.size else np.nan
+        is_determined = np.isfinite(gains) & (gains > 0)
+        if not is_determined.any():
+            return np.nan
+        return float(np.exp(np.mean(np.log(gains[is_determined]))))
 
     @property
     def use(self) -> Float[np.ndarray, "4 joints"]:
@@ -154,86 +157,87 @@ class ExcitationPlan(Summarised, eqx.Module):
     @property
     def vague(self) -> tuple[str, ...]:
         """Names of other base parameters whose deviation is above half of their nominal value."""
-        vague = self.relative_deviations > VAGUE
-        return self._names(vague & np.isfinite(self.standard_deviations))
+        is_vague = self.relative_deviations > MAX_RELATIVE_DEVIATION
+        return self._names(is_vague & np.isfinite(self.standard_deviations))
 
-    def _names(self, chosen: Bool[np.ndarray, " base"]) -> tuple[str, ...]:
-        return tuple(name for name, k in zip(self.base.names, chosen, strict=True) if k)
+    def _names(self, mask: Bool[np.ndarray, " base"]) -> tuple[str, ...]:
+        """Return the names of the base parameters of a mask."""
+        return tuple(self.base.names[k] for k in np.flatnonzero(mask))
 
     def tables(self) -> tuple[Table, ...]:
         """Return the tables of criteria, expected deviations, and use of the limits."""
-        base, relative, columns, status = self.base, self.relative_deviations, [], []
-        if not np.isnan(relative).all():
-            columns = [Column("±", relative, "%", percent)]
-            status = [
-                Status.DOUBTFUL if r > VAGUE else Status.NEUTRAL for r in relative
-            ]
-        kinds = ("range", "speed", "acceleration", "jerk")
-        tables = [
-            Table(
-                f"criteria: smaller is better; this motion was designed by the "
-                f"{self.criterion.name}",
-                Column("criterion", [c.name for c in self.criteria]),
-                Column("random motion", [c.before for c in self.criteria]),
-                Column("this motion", [c.after for c in self.criteria]),
-            ),
-            Table(
-                "expected standard deviations",
-                Column("#", list(range(1, base.size + 1))),
-                Column("parameter", base.names),
-                Column("±", self.standard_deviations),
-                Column("unit", base.units),
-                Column(
-                    "better than\nrandom",
-                    self.gains,
-                    "factor",
-                    lambda gain: f"{gain:.2f}",
-                ),
-                *columns,
-                status=status,
-            ),
-            Table(
-                "use of the limits, for all times",
-                Column("joint", base.model.robot.joint_names),
-                *(
-                    Column(kind, 100 * part, "%", lambda x: f"{x:.1f}")
-                    for kind, part in zip(kinds, self.use, strict=True)
-                    if (part > 0).any()
-                ),
-            ),
-        ]
-        return (
-            (*tables, _findings_table(self.findings))
-            if self.findings
-            else tuple(tables)
+        tables = (
+            self._criteria_table(),
+            self._deviations_table(),
+            self._limits_table(),
         )
+        if not self.findings:
+            return tables
+        return (*tables, _findings_table(self.findings))
+
+    def _criteria_table(self) -> Table:
+        """Return the table of criteria."""
+        names, before, after = zip(*self.criteria, strict=True)
+        return Table(
+            "criteria: smaller is better; this motion was designed by the "
+            f"{self.criterion.name}",
+            Column("criterion", names),
+            Column("random motion", before),
+            Column("this motion", after),
+        )
+
+    def _deviations_table(self) -> Table:
+        """Return the table of expected deviations, relative ones where values are known."""
+        base = self.base
+        columns = [
+            Column("#", list(range(1, base.size + 1))),
+            Column("parameter", base.names),
+            Column("±", self.standard_deviations),
+            Column("unit", base.units),
+            Column("better than\nrandom", self.gains, "factor", "{:.2f}".format),
+        ]
+        status = []
+        relative = self.relative_deviations
+        if not np.isnan(relative).all():
+            columns.append(Column("±", relative, "%", percent))
+            is_vague = relative > MAX_RELATIVE_DEVIATION
+            status = [Status.DOUBTFUL if x else Status.NEUTRAL for x in is_vague]
+        return Table("expected standard deviations", *columns, status=status)
+
+    def _limits_table(self) -> Table:
+        """Return the table of the use of the limits that are finite."""
+        columns = [Column("joint", self.base.model.robot.joint_names)]
+        kinds = ("range", "speed", "acceleration", "jerk")
+        for kind, use in zip(kinds, self.use, strict=True):
+            if (use > 0).any():
+                columns.append(Column(kind, 100 * use, "%", "{:.1f}".format))
+        return Table("use of the limits, for all times", *columns)
 
     @property
     def remarks(self) -> list[Remark]:
         """Gain of the design, limits that are not kept, and parameters that are not determined."""
-        gain = (
-            f"Standard deviations are {self.mean_gain:.3g} times smaller than a "
-            "random motion's"
+        gain = self.mean_gain
+        text = (
+            f"Standard deviations are {gain:.3g} times smaller than a random motion's"
         )
-        if self.mean_gain < 1.0:
-            gain = (
-                f"Standard deviations are {1.0 / self.mean_gain:.3g} times those of a "
-                "random "
+        if gain < 1.0:
+            text = (
+                f"Standard deviations are {1.0 / gain:.3g} times those of a random "
                 "motion, which keeps the limits of the joints alone: search longer "
                 "(`--resume`)"
             )
-        remarks = [Remark(gain), *(Remark(text, Status.BAD) for text in self.diagnosis)]
+        remarks = [Remark(text)]
+        remarks += [Remark(text, Status.BAD) for text in self.diagnosis]
         if self.undetermined:
             text = f"This motion does not determine: {', '.join(self.undetermined)}"
             remarks.append(Remark(text, Status.BAD))
         if self.interrupted:
-            remarks.append(
-                Remark("The design was stopped before its end", Status.DOUBTFUL)
-            )
+            text = "The design was stopped before its end"
+            remarks.append(Remark(text, Status.DOUBTFUL))
         if self.status is DesignStatus.IMPROVING:
             text = (
-                "The last steps still improved the motion: more `generations` may "
-                "find a better one"
+                "The last steps still improved the motion: more `generations` may find "
+                "a better one"
             )
             remarks.append(Remark(text))
         return remarks
@@ -250,19 +254,24 @@ class ExcitationPlan(Summarised, eqx.Module):
 
 def _findings_table(findings: tuple[Finding, ...]) -> Table:
     """Return a table of how near a motion comes to the limits of constraints."""
-    limits = [
-        f"{'≥' if one.is_lower_limit else '≤'} {one.limit:.4g} {one.unit}"
-        for one in findings
-    ]
-    used = [
-        f"{100 * x.used:.1f}" if math.isfinite(x.used) else MISSING for x in findings
-    ]
+    quantities = []
+    values = []
+    limits = []
+    fractions = []
+    for finding in findings:
+        sign = "≥" if finding.is_lower_limit else "≤"
+        fraction = finding.used
+        quantities.append(finding.name.removeprefix("the "))
+        values.append(f"{significant(finding.reached, 4)} {finding.unit}")
+        limits.append(f"{sign} {finding.limit:.4g} {finding.unit}")
+        is_number = math.isfinite(fraction)
+        fractions.append(f"{100 * fraction:.1f}" if is_number else MISSING)
     return Table(
         "use of the other limits, at the instants that were checked",
-        Column("quantity", [one.name.removeprefix("the ") for one in findings]),
-        Column("reaches", [f"{significant(x.reached, 4)} {x.unit}" for x in findings]),
+        Column("quantity", quantities),
+        Column("reaches", values),
         Column("limit", limits),
-        Column("use", used, "%", kind="number"),
-        Column("made of", [one.note for one in findings]),
+        Column("use", fractions, "%", kind="number"),
+        Column("made of", [finding.note for finding in findings]),
         status=[Status.BAD if one.value > 0 else Status.GOOD for one in findings],
     )

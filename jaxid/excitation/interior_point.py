@@ -145,7 +145,7 @@ def _has_converged(stage: Stage, iterate: Iterate) -> bool:
 def _begin_stage(grid: Grid, stage: Stage, iterate: Iterate) -> Iterate:
     """Move one start inside the bound, with multipliers on the central path."""
     bound = START_FRACTION * (stage.bound * grid.bound)
-    y = np.asarray(grid.scale_into_limits(iterate.y, bound))
+    y = grid.scale_into_limits(iterate.y, bound)
     central = stage.barrier / _limit_room(grid, stage, y)
     duals = np.array(iterate.duals)
     limit_duals = duals[: len(central)]

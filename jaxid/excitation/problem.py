@@ -22,7 +22,7 @@ from jaxid.robot.robot import Robot
 from jaxid.trajectory.fourier import FourierBasis
 from jaxid.trajectory.trajectory import AbstractBasis, LinearTrajectory
 
-from .coefficient_limits import JointLimits
+from .coefficient_limits import JointLimits, ScaledMotion
 from .constraints import AbstractConstraint, Finding
 from .criteria import AbstractCriterion, DOptimal, Information, information
 from .criteria.functions_of_eigenvalues import Sharpness
@@ -141,7 +141,7 @@ class ExcitationProblem:
         """Number of scaled coefficients."""
         return int(np.prod(self.limits.shape))
 
-    def trajectory(self, x: Float[AnyArray, " scaled"]) -> LinearTrajectory:
+    def trajectory(self, x: ScaledMotion) -> LinearTrajectory:
         """Return the trajectory of scaled coefficients."""
         return self.basis.trajectory(self.limits.coefficients(x))
 
@@ -151,7 +151,7 @@ class ExcitationProblem:
 
     def value(
         self,
-        x: Float[AnyArray, " scaled"],
+        x: ScaledMotion,
         sharpness: Sharpness = None,
         samples: int | None = None,
     ) -> Float[Array, ""]:
@@ -181,9 +181,7 @@ class ExcitationProblem:
         """Return the logarithm of the criterion of one motion's information."""
         return self.criterion(Information(plain, weighted, self.sizes), sharpness)
 
-    def inequalities(
-        self, x: Float[AnyArray, " scaled"]
-    ) -> Float[Array, " inequalities"]:
+    def inequalities(self, x: ScaledMotion) -> Float[Array, " inequalities"]:
         """Return what must not be positive: relative excess over all limits and constraints.
 
         Limits of the joints hold for all times if these are not positive. Constraints
@@ -199,7 +197,7 @@ class ExcitationProblem:
             excess.append(values.reshape(-1) + MARGIN)
         return jnp.concatenate(excess)
 
-    def violation(self, x: Float[AnyArray, " scaled"]) -> Float[Array, ""]:
+    def violation(self, x: ScaledMotion) -> Float[Array, ""]:
         """Return the largest relative excess over all limits and constraints, for all times.
 
         Args:
@@ -212,7 +210,7 @@ class ExcitationProblem:
         return violation
 
     def constraint_values(
-        self, x: Float[AnyArray, " scaled"], instants: Any = slice(None)
+        self, x: ScaledMotion, instants: Any = slice(None)
     ) -> list[Float[AnyArray, "instants values"]]:
         """Return the values of each constraint at some of the checked instants.
 
@@ -233,14 +231,14 @@ class ExcitationProblem:
             self._sample_rows[samples] = np.asarray(self.basis.rows(times)[:3])
         return self._sample_rows[samples]
 
-    def information(self, x: Float[AnyArray, " scaled"]) -> Information:
+    def information(self, x: ScaledMotion) -> Information:
         """Return the information of one run, computed in NumPy."""
         coefficients = self.limits.coefficients(np.asarray(x))
         rows = self.sample_rows(self.samples)
         motion = Motion(*(part @ coefficients.T for part in rows))
         return information(self.base, motion, self.weights, self.prior, self.sizes)
 
-    def excess(self, x: Float[AnyArray, " scaled"]) -> float:
+    def excess(self, x: ScaledMotion) -> float:
         """Return the largest excess over constraints for all times; minus infinity if none."""
         if not self.constraints:
             return -np.inf
@@ -255,7 +253,7 @@ class ExcitationProblem:
         values = self.constraint_values(np.asarray(x), instants)
         return max(float(highest_values(np.asarray(each)).max()) for each in values)
 
-    def findings(self, x: Float[AnyArray, " scaled"]) -> list[Finding]:
+    def findings(self, x: ScaledMotion) -> list[Finding]:
         """Return all limited quantities with their largest values."""
         findings = []
         values = self.constraint_values(np.asarray(x))

@@ -24,7 +24,7 @@ from .candidates import (
     evaluate_within_limits,
     shrink_to_constraints,
 )
-from .coefficient_limits import scale_samples
+from .coefficient_limits import ScaledMotions, scale_samples
 from .criterion_gradient import value_and_gradient
 from .interior_point import Evaluation, Iterate, Stage
 from .problem import MARGIN, SEARCH_SAMPLES, ExcitationProblem
@@ -103,7 +103,7 @@ def count_steps(problem: ExcitationProblem, starts: int, generations: int) -> in
 
 def search(
     problem: ExcitationProblem,
-    x: Float[np.ndarray, "starts scaled"],
+    x: ScaledMotions,
     best: Candidates,
     generations: int,
     random: np.random.Generator,
@@ -201,9 +201,7 @@ def _improve_children(
     return best.survivors(evaluate_within_limits(problem, np.array(motions)))
 
 
-def _begin(
-    problem: ExcitationProblem, samples: int, x: Float[np.ndarray, "starts scaled"]
-) -> list[Iterate]:
+def _begin(problem: ExcitationProblem, samples: int, x: ScaledMotions) -> list[Iterate]:
     """Return the iterates at some motions."""
     grid = problem.limits.grid(samples)
     return interior_point.begin(grid, np.asarray(x), count_watched(problem))
@@ -266,8 +264,8 @@ def _take(
 def first_motions(
     problem: ExcitationProblem,
     random: np.random.Generator,
-    x: Float[np.ndarray, "starts scaled"],
-) -> Float[np.ndarray, "starts scaled"]:
+    x: ScaledMotions,
+) -> ScaledMotions:
     """Return as many small motions that keep the constraints best, the largest of them first.
 
     They have the shapes of given motions, about poses at which the robot may stand
@@ -287,7 +285,7 @@ def first_motions(
     motions = []
     for size in (0.6, 0.4, 0.3, 0.2, 0.15, 0.1, 0.05):
         for motion, place in zip(x, good_places, strict=True):
-            motions.append(np.asarray(grid.fill(motion, place, size)))
+            motions.append(grid.fill(motion, place, size))
     violation = [max(watched_excess(problem, motion), 0.0) for motion in motions]
     order = np.argsort(violation, kind="stable")
     return np.array(motions)[order[: len(x)]]
@@ -295,9 +293,9 @@ def first_motions(
 
 def crossover(
     problem: ExcitationProblem,
-    x: Float[np.ndarray, "starts scaled"],
+    x: ScaledMotions,
     random: np.random.Generator,
-) -> Float[np.ndarray, "starts scaled"]:
+) -> ScaledMotions:
     """Return one child of each motion with another one: the most promising of several.
 
     Some joints of a child move as in one parent, the others as in another, begun at

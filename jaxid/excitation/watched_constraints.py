@@ -12,6 +12,7 @@ import numpy as np
 from jaxid.arrays import Float, Int
 from jaxid.dynamics.motion import Motion
 
+from .coefficient_limits import ScaledMotion, ScaledMotions
 from .problem import COARSE_STEP, WATCHED_INSTANTS, ExcitationProblem
 
 PEAKS = 48
@@ -30,9 +31,7 @@ def count_watched(problem: ExcitationProblem) -> int:
     return len(problem.constraints) * (len(WATCHED_INSTANTS) + PEAKS)
 
 
-def watch(
-    problem: ExcitationProblem, x: Float[np.ndarray, " scaled"]
-) -> list[WatchedValues]:
+def watch(problem: ExcitationProblem, x: ScaledMotion) -> list[WatchedValues]:
     """Return the values of each constraint that are to be watched near a motion."""
     watched = []
     rows = WATCHED_INSTANTS // COARSE_STEP
@@ -49,9 +48,7 @@ def watch(
     return watched
 
 
-def watched_excess(
-    problem: ExcitationProblem, x: Float[np.ndarray, " scaled"]
-) -> float:
+def watched_excess(problem: ExcitationProblem, x: ScaledMotion) -> float:
     """Return the largest excess of the constraints at the equidistant watched instants."""
     values = problem.constraint_values(x, WATCHED_INSTANTS)
     return max((float(each.max()) for each in values), default=-np.inf)
@@ -59,15 +56,15 @@ def watched_excess(
 
 def linearise(
     problem: ExcitationProblem,
-    x: Float[np.ndarray, "starts scaled"],
+    x: ScaledMotions,
     watched: Sequence[list[WatchedValues]],
 ) -> tuple[
     Float[np.ndarray, "starts values"], Float[np.ndarray, "starts values scaled"]
 ]:
     """Return watched values of several motions, and their derivatives by each motion."""
     coefficients = problem.limits.coefficients(x)
-    excess = [np.zeros((len(x), 0))]
-    derivatives = [np.zeros((len(x), 0, x.shape[-1]))]
+    excess: list[np.ndarray] = [np.zeros((len(x), 0))]
+    derivatives: list[np.ndarray] = [np.zeros((len(x), 0, x.shape[-1]))]
     by_constraint = zip(*watched, strict=True)
     for linearisation, places in zip(
         problem.linearisations, by_constraint, strict=True

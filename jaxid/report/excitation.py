@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxid.arrays import double_precision
 from jaxid.dynamics.motion import Motion
-from jaxid.excitation.design_result import VAGUE, ExcitationPlan
+from jaxid.excitation.design_result import MAX_RELATIVE_DEVIATION, ExcitationPlan
 from jaxid.io import atomic_folder
 from jaxid.result_table import Column, Remark, Status, Table, significant
 from jaxid.robot.collision import CollisionModel
@@ -71,7 +71,7 @@ def plan_remarks(plan: ExcitationPlan) -> list[Remark]:
     if plan.limits.assumed:
         doubts.append(f"Assumed, because not given: {_assumed_limits(plan)}")
     if plan.vague:
-        threshold = f"{100 * VAGUE:g} %"
+        threshold = f"{100 * MAX_RELATIVE_DEVIATION:g} %"
         doubts.append(
             f"Deviations above {threshold} of the nominal value: {', '.join(plan.vague)}"
         )

@@ -1,7 +1,6 @@
 """Leads: from standstill into a periodic motion and out of it, within the limits of the joints."""
 
 import math
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -17,7 +16,7 @@ from .fourier import PeriodsBasis, complete_limits
 from .trajectory import AbstractTrajectory, Envelope, States, as_scalar, stand_outside
 
 
-def _lead(state: Sequence[Any], duration: Any, x: Any, sign: int = 1) -> list:
+def _lead(state: Any, duration: Any, x: Any, sign: int = 1) -> list:
     r"""Return position, velocity, acceleration and jerk of a lead at times x from standstill [s].
 
     The velocity is $\alpha x^2 + \beta x^3$. The lead meets a motion in a state (q, qd,
@@ -113,7 +112,7 @@ class LeadsBasis(PeriodsBasis):
         to_points = _to_control_points(LEAD_DEGREE)
         fractions = np.linspace(0.0, 1.0, LEAD_DEGREE + 1)
         duration = self.lead / ENVELOPE_PIECES
-        parts = [rows]
+        parts: list[Any] = [rows]
         for piece in range(ENVELOPE_PIECES):
             t = duration * (piece + fractions)
             for sign in (1, -1):

@@ -32,7 +32,8 @@ SMOOTHING = 1e-12
 """Standard deviation at zero, where it is made smooth, as a fraction of the limit."""
 
 
-def _numbers(name: str, x: Any) -> np.ndarray | None:
+def _numbers(name: str, x: Any) -> Any:
+    """Return an argument as numbers; None stays None."""
     return None if x is None else np.array(as_array(name, x), np.float64)
 
 
