@@ -66,10 +66,10 @@ class Candidates(NamedTuple):
 
     def improved(self, places: np.ndarray, others: "Candidates") -> "Candidates":
         """Return the same motions, with others at some places where those are better."""
-        present = self.at(places)
-        is_smaller = others.violation < present.violation
-        is_as_small = others.violation == present.violation
-        is_better = is_smaller | (is_as_small & (others.value < present.value))
+        present_motions = self.at(places)
+        is_smaller = others.violation < present_motions.violation
+        is_as_small = others.violation == present_motions.violation
+        is_better = is_smaller | (is_as_small & (others.value < present_motions.value))
 
         candidates = Candidates(*(np.array(part) for part in self))
         for part, values in zip(candidates, others, strict=True):
@@ -79,13 +79,13 @@ class Candidates(NamedTuple):
     def survivors(self, others: "Candidates") -> "Candidates":
         """Return as many of both together as these are, the best first, duplicates last."""
         pairs = zip(self, others, strict=True)
-        both = Candidates(*(np.concatenate(pair) for pair in pairs))
-        order = both.order()
-        value_steps = np.diff(both.value[order], prepend=np.nan)
-        violation_steps = np.diff(both.violation[order], prepend=np.nan)
+        all_motions = Candidates(*(np.concatenate(pair) for pair in pairs))
+        order = all_motions.order()
+        value_steps = np.diff(all_motions.value[order], prepend=np.nan)
+        violation_steps = np.diff(all_motions.violation[order], prepend=np.nan)
         is_duplicate = (value_steps <= SAME_VALUE) & (violation_steps == 0.0)
         order = np.concatenate([order[~is_duplicate], order[is_duplicate]])
-        return both.at(order[: len(self.value)])
+        return all_motions.at(order[: len(self.value)])
 
 
 def criterion_values(
@@ -93,7 +93,7 @@ def criterion_values(
 ) -> Float[np.ndarray, " starts"]:
     """Return the exact logarithms of the criterion."""
     values = []
-    for motion in np.asarray(x):
+    for motion in x:
         information = jax.tree.map(jnp.asarray, problem.information(motion))
         values.append(float(problem.criterion(information)))
     return np.array(values)
@@ -118,9 +118,9 @@ def evaluate_within_limits(problem: ExcitationProblem, x: ScaledMotions) -> Cand
 
     def evaluate_scaled(growth: float) -> Candidates:
         motions = []
-        for motion in np.asarray(x):
-            scaled = grid.scale_into_limits(motion, growth=growth)
-            motions.append(_shrink_slightly(problem, grid, scaled))
+        for motion in x:
+            scaled_motion = grid.scale_into_limits(motion, growth=growth)
+            motions.append(_shrink_slightly(problem, grid, scaled_motion))
         return evaluate(problem, np.array(motions))
 
     grid = problem.limits.grid()
@@ -129,8 +129,8 @@ def evaluate_within_limits(problem: ExcitationProblem, x: ScaledMotions) -> Cand
         return candidates
     # A larger motion mostly has more information, but a condition number may well
     # become worse by it.
-    larger = evaluate_scaled(MAX_GROWTH)
-    return candidates.improved(np.arange(len(larger.x)), larger)
+    larger_motions = evaluate_scaled(MAX_GROWTH)
+    return candidates.improved(np.arange(len(x)), larger_motions)
 
 
 def _shrink_slightly(
@@ -140,9 +140,9 @@ def _shrink_slightly(
     if not 0.0 < problem.excess(motion) <= MAX_COARSE_EXCESS:
         return motion
     for factor in SLIGHT_SHRINKAGES:
-        smaller = grid.shrink(motion, factor)
-        if problem.excess(smaller) <= 0.0:
-            return smaller
+        smaller_motion = grid.shrink(motion, factor)
+        if problem.excess(smaller_motion) <= 0.0:
+            return smaller_motion
     return motion
 
 

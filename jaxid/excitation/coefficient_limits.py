@@ -111,8 +111,8 @@ class Grid(NamedTuple):
     ) -> np.ndarray:
         """Return the motion of each joint times a factor, and shifted."""
         motion = np.asarray(y).reshape(np.shape(self.constant))
-        moved = factors[:, None] * motion + shifts[:, None] * self.constant
-        return moved.reshape(-1)
+        motion = factors[:, None] * motion + shifts[:, None] * self.constant
+        return motion.reshape(-1)
 
 
 class JointLimits(eqx.Module):
@@ -244,11 +244,11 @@ class JointLimits(eqx.Module):
 
 def _unknown_limits(limits: Limits) -> tuple[tuple[str, int], ...]:
     """Return fields and joints (from 0) whose numbers were not given."""
-    unknown = []
+    fields = []
     for name in ("position_min", "position_max", "velocity", "acceleration"):
         is_known = np.isfinite(np.asarray(getattr(limits, name)))
-        unknown += [(name, joint) for joint in np.flatnonzero(~is_known).tolist()]
-    return tuple(unknown)
+        fields += [(name, joint) for joint in np.flatnonzero(~is_known).tolist()]
+    return tuple(fields)
 
 
 def scale_samples(samples: int, basis: AbstractBasis) -> int:

@@ -34,8 +34,8 @@ def value_and_gradient(
         problem, plain, weighted, sharpness
     )
     by_columns = _slopes_by_columns(problem, columns, weight, by_plain, by_weighted)
-    packed = by_columns.reshape(-1, *by_columns.shape[2:])
-    by_motion = pull_back(regressor.program, packed, *motion)
+    packed_slopes = by_columns.reshape(-1, *by_columns.shape[2:])
+    by_motion = pull_back(regressor.program, packed_slopes, *motion)
 
     by_coefficients = np.zeros_like(coefficients)
     for slopes, part in zip(by_motion, rows, strict=True):

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from jaxid.arrays import AnyArray, Float, PRNGKeyArray
+from jaxid.arrays import AnyArray, PRNGKeyArray
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
 from jaxid.robot.limits_and_drives import Limits
@@ -25,6 +25,7 @@ from .candidates import (
 from .coefficient_limits import ScaledMotions
 from .constraints import AbstractConstraint
 from .criteria import AbstractCriterion
+from .criteria.information_matrix import BaseMatrix, BaseVector, JointVector
 from .design_result import DesignStatus, ExcitationPlan
 from .problem import ExcitationProblem
 from .search import count_steps, first_motions, search
@@ -69,8 +70,8 @@ def design_excitation(
     basis: AbstractBasis | None = None,
     criterion: AbstractCriterion | None = None,
     constraints: tuple[AbstractConstraint, ...] = (),
-    noise: Float[AnyArray, " joints"] | None = None,
-    prior: Float[AnyArray, "base base"] | None = None,
+    noise: JointVector | None = None,
+    prior: BaseMatrix | None = None,
     samples: int = 800,
     **settings: Any,
 ) -> ExcitationPlan:
@@ -127,7 +128,7 @@ def minimise(
     starts: int = 32,
     generations: int = 12,
     key: PRNGKeyArray | None = None,
-    nominal: Float[AnyArray, " base"] | None = None,
+    nominal: BaseVector | None = None,
     progress: Callable[[DesignProgress], None] | None = None,
     begin: LinearTrajectory | None = None,
     seconds: float | None = None,
@@ -178,8 +179,8 @@ def minimise(
         outcome = _run_search(problem, x, begin, generations, random, seconds, progress)
     else:
         outcome = _run_solver(problem, x, solver)
-    motion = outcome.best.best_motion
-    unknown = np.full(problem.base.size, np.nan)
+    motion = outcome.candidates.best_motion
+    no_values = np.full(problem.base.size, np.nan)
     plan = ExcitationPlan(
         base=problem.base,
         trajectory=problem.trajectory(motion),
@@ -190,7 +191,7 @@ def minimise(
         noise=problem.noise,
         samples=problem.samples,
         findings=tuple(problem.findings(motion)),
-        nominal=unknown if nominal is None else np.asarray(nominal),
+        nominal=no_values if nominal is None else np.asarray(nominal),
         status=outcome.status,
         history=np.asarray(outcome.history),
     )
@@ -207,7 +208,7 @@ def minimise(
 class Outcome(NamedTuple):
     """Result of a search or of another solver."""
 
-    best: Candidates
+    candidates: Candidates
     history: list[float]  # value of the criterion of the best motion after each step
     status: DesignStatus
 
@@ -216,9 +217,9 @@ def _run_solver(
     problem: ExcitationProblem, x: ScaledMotions, solver: Solver
 ) -> Outcome:
     """Improve motions by a given solver, then make them keep the limits of the joints."""
-    best = evaluate_within_limits(problem, np.asarray(solver(problem, x)))
-    history = [evaluate(problem, x).best_value, best.best_value]
-    return Outcome(best, history, DesignStatus.GIVEN)
+    candidates = evaluate_within_limits(problem, np.asarray(solver(problem, x)))
+    history = [evaluate(problem, x).best_value, candidates.best_value]
+    return Outcome(candidates, history, DesignStatus.GIVEN)
 
 
 def _run_search(
@@ -239,33 +240,33 @@ def _run_search(
     if begin is not None:
         x[0] = problem.limits.scaled(begin.coefficients)
     # With constraints the search looks for one motion that keeps them first.
-    best = evaluate_within_limits(problem, x[:1] if problem.constraints else x)
+    candidates = evaluate_within_limits(problem, x[:1] if problem.constraints else x)
     steps = count_steps(problem, len(x), generations)
     history = []
     try:
-        for step in search(problem, x, best, generations, random, deadline):
-            best = step.best
-            history.append(best.best_value)
-            elapsed = time.monotonic() - start_time
+        for step in search(problem, x, candidates, generations, random, deadline):
+            candidates = step.candidates
+            history.append(candidates.best_value)
+            elapsed_time = time.monotonic() - start_time
             if progress is not None:
                 done = (len(history) - 1) / steps
-                fraction = min(done if seconds is None else elapsed / seconds, 1.0)
-                trajectory = problem.trajectory(best.best_motion)
-                value = best.best_value
+                fraction = min(done if seconds is None else elapsed_time / seconds, 1.0)
+                trajectory = problem.trajectory(candidates.best_motion)
+                value = candidates.best_value
                 progress(
                     DesignProgress(
-                        fraction, step.task, value, best.is_feasible, trajectory
+                        fraction, step.task, value, candidates.is_feasible, trajectory
                     )
                 )
-            if elapsed > duration and best.is_feasible:
+            if elapsed_time > duration and candidates.is_feasible:
                 break
     except KeyboardInterrupt:
-        return Outcome(best, history, DesignStatus.STOPPED)
-    if not best.is_feasible:
-        for place in best.order()[:MAX_SHRUNK]:
-            smaller = shrink_to_constraints(problem, best.x[place])
-            best = best.improved(np.array([place]), smaller)
-    return Outcome(best, history, _status(history))
+        return Outcome(candidates, history, DesignStatus.STOPPED)
+    if not candidates.is_feasible:
+        for place in candidates.order()[:MAX_SHRUNK]:
+            smaller = shrink_to_constraints(problem, candidates.x[place])
+            candidates = candidates.improved(np.array([place]), smaller)
+    return Outcome(candidates, history, _status(history))
 
 
 def _status(history: list[float]) -> DesignStatus:

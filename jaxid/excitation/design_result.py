@@ -10,7 +10,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from jaxid.arrays import AnyArray, Bool, Float, double_precision
+from jaxid.arrays import AnyArray, Float, double_precision
 from jaxid.dynamics.base import BaseParameters
 from jaxid.result_table import (
     MISSING,
@@ -28,6 +28,7 @@ from jaxid.trajectory.trajectory import LinearTrajectory
 from .coefficient_limits import JointLimits
 from .constraints import Finding
 from .criteria import CRITERIA, AbstractCriterion, Information, standard_deviations
+from .criteria.information_matrix import BaseVector, JointVector
 
 MAX_RELATIVE_DEVIATION = 0.5
 """Relative standard deviation above which a parameter counts as hardly determined."""
@@ -76,10 +77,10 @@ class ExcitationPlan(Summarised, eqx.Module):
     limits: JointLimits
     information: Information
     reference: Information
-    noise: Float[AnyArray, " joints"]
+    noise: JointVector
     samples: int = eqx.field(static=True)
     findings: tuple[Finding, ...]
-    nominal: Float[AnyArray, " base"]
+    nominal: BaseVector
     status: DesignStatus = eqx.field(static=True)
     history: Float[AnyArray, " steps"]
 
@@ -110,7 +111,7 @@ class ExcitationPlan(Summarised, eqx.Module):
         return tuple(comparisons)
 
     @property
-    def standard_deviations(self) -> Float[np.ndarray, " base"]:
+    def standard_deviations(self) -> BaseVector:
         """Expected deviations of weighted least squares, in units of the parameters (Eq. 33).
 
         Infinite for undetermined parameters. The noise is assumed to be independent
@@ -120,13 +121,13 @@ class ExcitationPlan(Summarised, eqx.Module):
         return standard_deviations(self.information.weighted)
 
     @property
-    def relative_deviations(self) -> Float[np.ndarray, " base"]:
+    def relative_deviations(self) -> BaseVector:
         """Standard deviations over the nominal parameters; NaN where those are unknown or zero."""
         size = np.abs(np.asarray(self.nominal))
         return self.standard_deviations / np.where(size > 0, size, np.nan)
 
     @property
-    def gains(self) -> Float[np.ndarray, " base"]:
+    def gains(self) -> BaseVector:
         """Factor by which each standard deviation is smaller than that of a random motion."""
         reference = standard_deviations(self.reference.weighted)
         with np.errstate(invalid="ignore"):
@@ -160,7 +161,7 @@ class ExcitationPlan(Summarised, eqx.Module):
         is_vague = self.relative_deviations > MAX_RELATIVE_DEVIATION
         return self._names(is_vague & np.isfinite(self.standard_deviations))
 
-    def _names(self, mask: Bool[np.ndarray, " base"]) -> tuple[str, ...]:
+    def _names(self, mask: AnyArray) -> tuple[str, ...]:
         """Return the names of the base parameters of a mask."""
         return tuple(self.base.names[k] for k in np.flatnonzero(mask))
 

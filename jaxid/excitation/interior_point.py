@@ -34,12 +34,18 @@ CENTRALITY = 1e3  # factor by which multipliers may differ from the central path
 RIDGE = 1e-9  # added to the matrix, relative to its mean diagonal entry
 
 
+ScaledVector = Float[np.ndarray, " scaled"]
+ConstraintVector = Float[np.ndarray, " constraints"]
+SlackVector = Float[np.ndarray, " slacks"]  # one slack if there are constraints
+StepVector = Float[np.ndarray, " scaled_and_slack"]
+
+
 class Evaluation(NamedTuple):
     """Objective, and constraints that are not linear, of one start, with their derivatives."""
 
     value: float
-    gradient: Float[np.ndarray, " scaled"]
-    excess: Float[np.ndarray, " constraints"]
+    gradient: ScaledVector
+    excess: ConstraintVector
     slopes: Float[np.ndarray, "constraints scaled"]
 
 
@@ -55,20 +61,20 @@ class Parts(NamedTuple):
     """The numbers of inequalities by their kinds."""
 
     limits: Float[np.ndarray, " limits"]
-    constraints: Float[np.ndarray, " constraints"]
-    slack: Float[np.ndarray, " slacks"]
+    constraints: ConstraintVector
+    slack: SlackVector
 
 
 class Iterate(NamedTuple):
     """Present point of one start, with its multipliers, and the step that is tried next."""
 
-    y: Float[np.ndarray, " scaled"]
-    slack: Float[np.ndarray, " slacks"]
+    y: ScaledVector
+    slack: SlackVector
     evaluation: Evaluation
     duals: Inequalities  # multipliers
     curvature: Float[np.ndarray, "scaled scaled"]  # of the Lagrangian
     barrier: float  # weight of the logarithmic barrier
-    step: Float[np.ndarray, " scaled_and_slack"]
+    step: StepVector
     dual_step: Inequalities
     length: float = 0.0  # fraction of the step that is tried
     dual_length: float = 0.0
@@ -77,7 +83,7 @@ class Iterate(NamedTuple):
     needs_evaluation: bool = True  # whether the point itself is to be evaluated next
 
     @property
-    def trial(self) -> Float[np.ndarray, " scaled"]:
+    def trial(self) -> ScaledVector:
         """Point to be evaluated next."""
         return self.y + self.length * self.step[: len(self.y)]
 
@@ -173,7 +179,7 @@ def _update(
         duals = iterate.barrier / room
         limits = slice(2 * grid.c.size)
         duals[limits] = iterate.duals[limits]
-        evaluated = iterate._replace(
+        iterate = iterate._replace(
             y=iterate.trial,
             slack=slack,
             evaluation=evaluation,
@@ -181,26 +187,24 @@ def _update(
             refusals=0,
             needs_evaluation=False,
         )
-        return _with_step(grid, stage, evaluated, room)
+        return _with_step(grid, stage, iterate, room)
 
     present_room = _room(grid, stage, iterate.y, iterate.evaluation, iterate.slack)
     merit = _merit(stage, iterate, iterate.evaluation, iterate.slack, present_room)
     trial_merit = _merit(stage, iterate, evaluation, slack, room)
-    promised = DECREASE * iterate.length * iterate.slope
+    promised_decrease = DECREASE * iterate.length * iterate.slope
     rounding = 1e-10 * abs(merit)
     is_finite = math.isfinite(evaluation.value) and bool(
         np.isfinite(evaluation.gradient).all()
     )
-    if is_finite and trial_merit <= merit + promised + rounding:
-        taken = _take_step(stage, iterate, slack, evaluation, room)
-        return _with_step(grid, stage, taken, room)
+    if is_finite and trial_merit <= merit + promised_decrease + rounding:
+        iterate = _take_step(stage, iterate, slack, evaluation, room)
+        return _with_step(grid, stage, iterate, room)
     if iterate.refusals >= PATIENCE:
         size = len(iterate.y)
         mean_curvature = np.trace(iterate.curvature) / size
-        forgetful = iterate._replace(
-            curvature=np.eye(size) * mean_curvature, refusals=0
-        )
-        return _with_step(grid, stage, forgetful, present_room)
+        iterate = iterate._replace(curvature=np.eye(size) * mean_curvature, refusals=0)
+        return _with_step(grid, stage, iterate, present_room)
     length = _shorter_length(iterate, trial_merit - merit)
     return iterate._replace(length=length, refusals=iterate.refusals + 1)
 
@@ -294,12 +298,12 @@ def _barrier_hessian(
 
 def _downhill(
     grid: Grid, stage: Stage, iterate: Iterate, central: Inequalities
-) -> Float[np.ndarray, " scaled_and_slack"]:
+) -> StepVector:
     """Return the negative gradient of the objective with its barrier."""
     evaluation = iterate.evaluation
     parts = _split(central, evaluation)
-    up, down = parts.limits.reshape(2, *grid.c.shape)
-    by_limits = np.einsum("jrk,jr->jk", grid.R, up - down).reshape(-1)
+    upper, lower = parts.limits.reshape(2, *grid.c.shape)
+    by_limits = np.einsum("jrk,jr->jk", grid.R, upper - lower).reshape(-1)
     by_constraints = parts.constraints @ evaluation.slopes
     downhill = -(evaluation.gradient + by_limits + by_constraints)
     if not len(parts.slack):
@@ -365,22 +369,22 @@ def _longest_step(change: Inequalities, room: Inequalities) -> float:
 def _damped_bfgs(B: np.ndarray, s: np.ndarray, change: np.ndarray) -> np.ndarray:
     """Return the damped BFGS update, which stays positive definite [1, procedure 18.2]."""
     Bs = B @ s
-    expected = float(s @ Bs)
-    actual = float(s @ change)
-    if not expected > 1e-16:
+    expected_change = float(s @ Bs)
+    actual_change = float(s @ change)
+    if not expected_change > 1e-16:
         return B
-    damped = DAMPING * expected
+    min_change = DAMPING * expected_change
     mix = 1.0
-    if actual < damped:
-        mix = (expected - damped) / (expected - actual)
+    if actual_change < min_change:
+        mix = (expected_change - min_change) / (expected_change - actual_change)
     r = mix * change + (1.0 - mix) * Bs
-    update = B - np.outer(Bs, Bs / expected) + np.outer(r, r / (s @ r))
+    update = B - np.outer(Bs, Bs / expected_change) + np.outer(r, r / (s @ r))
     return update if np.isfinite(update).all() else B
 
 
 def _cheapest_slack(
-    stage: Stage, iterate: Iterate, excess: Float[np.ndarray, " constraints"]
-) -> Float[np.ndarray, " slacks"]:
+    stage: Stage, iterate: Iterate, excess: ConstraintVector
+) -> SlackVector:
     """Return the slack of least cost, with the barrier that keeps all constraints below it.
 
     So a step may exceed a constraint that bends: the slack follows, and is penalised.

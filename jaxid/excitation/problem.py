@@ -25,8 +25,12 @@ from jaxid.trajectory.trajectory import AbstractBasis, LinearTrajectory
 from .coefficient_limits import JointLimits, ScaledMotion
 from .constraints import AbstractConstraint, Finding
 from .criteria import AbstractCriterion, DOptimal, Information, information
-from .criteria.functions_of_eigenvalues import Sharpness
-from .criteria.information_matrix import information_of_coefficients
+from .criteria.functions_of_eigenvalues import Scalar, Sharpness
+from .criteria.information_matrix import (
+    BaseMatrix,
+    JointVector,
+    information_of_coefficients,
+)
 
 CHECKED_INSTANTS = 8160
 """Instants at which constraints are checked."""
@@ -86,8 +90,8 @@ class ExcitationProblem:
         criterion: AbstractCriterion | None = None,
         constraints: tuple[AbstractConstraint, ...] = (),
         *,
-        noise: Float[AnyArray, " joints"] | None = None,
-        prior: Float[AnyArray, "base base"] | None = None,
+        noise: JointVector | None = None,
+        prior: BaseMatrix | None = None,
         samples: int = 800,
     ):
         require_float64("designing a motion")
@@ -154,7 +158,7 @@ class ExcitationProblem:
         x: ScaledMotion,
         sharpness: Sharpness = None,
         samples: int | None = None,
-    ) -> Float[Array, ""]:
+    ) -> Scalar:
         """Return the logarithm of the criterion of one run.
 
         Args:
@@ -177,7 +181,7 @@ class ExcitationProblem:
 
     def _criterion_of(
         self, plain: Array, weighted: Array, sharpness: Sharpness
-    ) -> Float[Array, ""]:
+    ) -> Scalar:
         """Return the logarithm of the criterion of one motion's information."""
         return self.criterion(Information(plain, weighted, self.sizes), sharpness)
 
@@ -197,7 +201,7 @@ class ExcitationProblem:
             excess.append(values.reshape(-1) + MARGIN)
         return jnp.concatenate(excess)
 
-    def violation(self, x: ScaledMotion) -> Float[Array, ""]:
+    def violation(self, x: ScaledMotion) -> Scalar:
         """Return the largest relative excess over all limits and constraints, for all times.
 
         Args:
@@ -273,14 +277,16 @@ def highest_values(
 ) -> Float[AnyArray, " values"]:
     """Return the highest of each value, also between instants: the tops of parabolas."""
     xp = namespace(values)
-    before = values[:-2]
-    middle = values[1:-1]
-    after = values[2:]
-    bend = 2 * middle - before - after
-    is_peak = (middle >= before) & (middle >= after) & (bend > 0)
+    previous_values = values[:-2]
+    middle_values = values[1:-1]
+    next_values = values[2:]
+    bend = 2 * middle_values - previous_values - next_values
+    is_peak = (
+        (middle_values >= previous_values) & (middle_values >= next_values) & (bend > 0)
+    )
 
     # The top of the parabola through three values is above the middle one.
     divisor = 8 * xp.where(is_peak, bend, 1.0)
-    rise = xp.where(is_peak, (after - before) ** 2 / divisor, 0.0)
+    rise = xp.where(is_peak, (next_values - previous_values) ** 2 / divisor, 0.0)
     ends = xp.maximum(values[0], values[-1])
-    return xp.maximum((middle + rise).max(axis=0), ends)
+    return xp.maximum((middle_values + rise).max(axis=0), ends)

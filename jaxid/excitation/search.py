@@ -81,7 +81,7 @@ class Step(NamedTuple):
     """State of a search before a step, and after the last one."""
 
     task: str  # task of the step, in words
-    best: Candidates  # best motions so far
+    candidates: Candidates  # best motions so far
 
 
 Search = Generator[Step, None, Candidates]
@@ -95,8 +95,8 @@ def schedule_of(problem: ExcitationProblem) -> tuple[Stage, ...]:
 
 def count_steps(problem: ExcitationProblem, starts: int, generations: int) -> int:
     """Return the number of steps of a search without a deadline."""
-    once = (*schedule_of(problem), FINE_STAGE)
-    stages = (*once, *(GENERATION_STAGE,) * generations)
+    stages_of_start = (*schedule_of(problem), FINE_STAGE)
+    stages = (*stages_of_start, *(GENERATION_STAGE,) * generations)
     steps_of_batch = sum(math.ceil(stage.iterations / PART) for stage in stages)
     return steps_of_batch * math.ceil(starts / BATCH)
 
@@ -104,7 +104,7 @@ def count_steps(problem: ExcitationProblem, starts: int, generations: int) -> in
 def search(
     problem: ExcitationProblem,
     x: ScaledMotions,
-    best: Candidates,
+    candidates: Candidates,
     generations: int,
     random: np.random.Generator,
     deadline: float = math.inf,
@@ -114,7 +114,7 @@ def search(
     Args:
         problem: Problem to be solved.
         x: Motions to start from.
-        best: The same motions within limits; with constraints the first one alone.
+        candidates: The same motions within limits; with constraints the first one alone.
         generations: Number of generations.
         random: Generator of the children.
         deadline: Time of `time.monotonic` after which only the fine grid follows [s].
@@ -122,75 +122,79 @@ def search(
     starts = np.arange(len(x))
     batches = np.split(starts, range(BATCH, len(x), BATCH))
     if problem.constraints:
-        best = yield from _find_feasible_motion(problem, x, best)
-        x = np.asarray(best.x)
+        candidates = yield from _find_feasible_motion(problem, x, candidates)
+        x = np.asarray(candidates.x)
         # One motion is improved alone, so that there is a good result soon.
         batches = [starts[:1], *np.split(starts[1:], range(BATCH, len(x) - 1, BATCH))]
 
     for places in batches:
         if len(places) and time.monotonic() < deadline:
-            best = yield from _improve_batch(problem, x, best, places, deadline)
+            candidates = yield from _improve_batch(
+                problem, x, candidates, places, deadline
+            )
     for _ in range(generations):
         if time.monotonic() < deadline:
-            best = yield from _improve_children(problem, best, random, deadline)
+            candidates = yield from _improve_children(
+                problem, candidates, random, deadline
+            )
 
-    order = best.promising()
+    order = candidates.promising()
     if time.monotonic() >= deadline:
         order = order[:BATCH]
     for places in np.split(order, range(BATCH, len(order), BATCH)):
-        step = Step("keeping the limits closely", best)
-        iterates = _begin(problem, FINE_SAMPLES, best.x[places])
+        step = Step("keeping the limits closely", candidates)
+        iterates = _begin(problem, FINE_SAMPLES, candidates.x[places])
         iterates = yield from _improve(
             problem, FINE_SAMPLES, iterates, FINE_STAGE, step
         )
-        best = _take(problem, best, places, iterates)
-    yield Step("keeping the limits closely", best)
+        candidates = _take(problem, candidates, places, iterates)
+    yield Step("keeping the limits closely", candidates)
 
 
 def _find_feasible_motion(
-    problem: ExcitationProblem, x: np.ndarray, best: Candidates
+    problem: ExcitationProblem, x: np.ndarray, candidates: Candidates
 ) -> Search:
     """Look for one motion that keeps all constraints; return it before the other starts."""
     for motion in x[1:]:
-        if best.is_feasible:
+        if candidates.is_feasible:
             break
-        yield Step("looking for a first motion that keeps all limits", best)
-        best = best.survivors(shrink_to_constraints(problem, motion))
-    unknown = np.full(len(x), np.inf)
-    starts = Candidates(x, unknown, unknown)
-    return starts.improved(np.array([0]), best.at(best.order()[:1]))
+        yield Step("looking for a first motion that keeps all limits", candidates)
+        candidates = candidates.survivors(shrink_to_constraints(problem, motion))
+    infinity = np.full(len(x), np.inf)
+    starts = Candidates(x, infinity, infinity)
+    return starts.improved(np.array([0]), candidates.at(candidates.order()[:1]))
 
 
 def _improve_batch(
     problem: ExcitationProblem,
     x: np.ndarray,
-    best: Candidates,
+    candidates: Candidates,
     places: np.ndarray,
     deadline: float,
 ) -> Search:
     """Run all stages for the starts at some places; return the best motions."""
     iterates = _begin(problem, SEARCH_SAMPLES, x[places])
     for stage in schedule_of(problem):
-        step = Step("searching from many starts", best)
+        step = Step("searching from many starts", candidates)
         iterates = yield from _improve(
             problem, SEARCH_SAMPLES, iterates, stage, step, deadline
         )
         if stage.bound < 1.0:
-            best = _take(problem, best, places, iterates)
+            candidates = _take(problem, candidates, places, iterates)
         if time.monotonic() >= deadline:
             break
-    return best
+    return candidates
 
 
 def _improve_children(
     problem: ExcitationProblem,
-    best: Candidates,
+    candidates: Candidates,
     random: np.random.Generator,
     deadline: float,
 ) -> Search:
     """Improve one child of each motion; return the best of parents and children."""
-    step = Step("improving descendants", best)
-    children = crossover(problem, np.asarray(best.x), random)
+    step = Step("improving descendants", candidates)
+    children = crossover(problem, np.asarray(candidates.x), random)
     motions = []
     for start in range(0, len(children), BATCH):
         iterates = _begin(problem, SEARCH_SAMPLES, children[start : start + BATCH])
@@ -198,7 +202,7 @@ def _improve_children(
             problem, SEARCH_SAMPLES, iterates, GENERATION_STAGE, step, deadline
         )
         motions += [iterate.y for iterate in iterates]
-    return best.survivors(evaluate_within_limits(problem, np.array(motions)))
+    return candidates.survivors(evaluate_within_limits(problem, np.array(motions)))
 
 
 def _begin(problem: ExcitationProblem, samples: int, x: ScaledMotions) -> list[Iterate]:
@@ -224,11 +228,11 @@ def _improve(
         yield step
         if time.monotonic() >= deadline:
             break
-        watched = [watch(problem, iterate.y) for iterate in iterates]
-        objective = partial(_evaluate, problem, stage.sharpness, watched)
-        cooled = stage.barrier * interior_point.COOLING**start
+        watched_values = [watch(problem, iterate.y) for iterate in iterates]
+        objective = partial(_evaluate, problem, stage.sharpness, watched_values)
+        barrier = stage.barrier * interior_point.COOLING**start
         part = stage._replace(
-            barrier=max(stage.min_barrier, cooled),
+            barrier=max(stage.min_barrier, barrier),
             iterations=min(PART, stage.iterations - start),
         )
         iterates = interior_point.run(grid, objective, iterates, part)
@@ -238,27 +242,28 @@ def _improve(
 def _evaluate(
     problem: ExcitationProblem,
     sharpness: float,
-    watched: Sequence[list[WatchedValues]],
+    watched_values: Sequence[list[WatchedValues]],
     y: Float[np.ndarray, "points scaled"],
     starts: Sequence[int],
 ) -> list[Evaluation]:
     """Return criterion and constraints at points of these starts."""
     samples = scale_samples(SEARCH_SAMPLES, problem.basis)
     values, gradients = value_and_gradient(problem, y, sharpness, samples)
-    excess, slopes = linearise(problem, y, [watched[start] for start in starts])
-    parts = zip(values.tolist(), gradients, excess + MARGIN, slopes, strict=True)
-    return [Evaluation(*each) for each in parts]
+    constraints = linearise(problem, y, [watched_values[start] for start in starts])
+    excess = constraints.values + MARGIN
+    parts = (values.tolist(), gradients, excess, constraints.slopes)
+    return [Evaluation(*each) for each in zip(*parts, strict=True)]
 
 
 def _take(
     problem: ExcitationProblem,
-    best: Candidates,
+    candidates: Candidates,
     places: np.ndarray,
     iterates: list[Iterate],
 ) -> Candidates:
     """Return the best motions, at some places those of iterates where they are better."""
     x = np.array([iterate.y for iterate in iterates])
-    return best.improved(places, evaluate_within_limits(problem, x))
+    return candidates.improved(places, evaluate_within_limits(problem, x))
 
 
 def first_motions(
@@ -276,8 +281,8 @@ def first_motions(
     high = np.asarray(limits.position_max)
     places = random.uniform(0.1, 0.9, (1000, len(low)))
     q = low + places * (high - low)
-    rest = Motion(q, np.zeros_like(q), np.zeros_like(q))
-    values = [np.asarray(c(problem.robot, rest)) for c in problem.constraints]
+    rest_motion = Motion(q, np.zeros_like(q), np.zeros_like(q))
+    values = [np.asarray(c(problem.robot, rest_motion)) for c in problem.constraints]
     excess = np.max([each.max(axis=1) for each in values], axis=0)
     good_places = places[np.argsort(excess)[: len(x)]]
 
@@ -338,8 +343,8 @@ def _draw_children(
     is_unchanged = random.random(starts) < 0.5
     maps = retimings[np.where(is_unchanged, 0, retiming_numbers)]
     coefficients = problem.limits.coefficients(x[(numbers + offsets) % starts])
-    retimed = np.einsum("bvw,bjw->bjv", maps, coefficients)
-    second_parents = retimed / np.asarray(problem.limits.scale)
+    retimed_mates = np.einsum("bvw,bjw->bjv", maps, coefficients)
+    second_parents = retimed_mates / np.asarray(problem.limits.scale)
 
     # A child has this expected fraction of joints from its second parent, and at least
     # one.

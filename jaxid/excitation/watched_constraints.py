@@ -13,6 +13,7 @@ from jaxid.arrays import Float, Int
 from jaxid.dynamics.motion import Motion
 
 from .coefficient_limits import ScaledMotion, ScaledMotions
+from .constraints.constraint import Linearisation
 from .problem import COARSE_STEP, WATCHED_INSTANTS, ExcitationProblem
 
 PEAKS = 48
@@ -26,6 +27,13 @@ class WatchedValues(NamedTuple):
     entries: Int[np.ndarray, " values"]  # places in the entries of the constraint
 
 
+class WatchedSlopes(NamedTuple):
+    """Watched values of several motions, and their derivatives."""
+
+    values: Float[np.ndarray, "starts values"]
+    slopes: Float[np.ndarray, "starts values scaled"]
+
+
 def count_watched(problem: ExcitationProblem) -> int:
     """Return the number of watched values of one motion."""
     return len(problem.constraints) * (len(WATCHED_INSTANTS) + PEAKS)
@@ -33,19 +41,22 @@ def count_watched(problem: ExcitationProblem) -> int:
 
 def watch(problem: ExcitationProblem, x: ScaledMotion) -> list[WatchedValues]:
     """Return the values of each constraint that are to be watched near a motion."""
-    watched = []
+    watched_values = []
     rows = WATCHED_INSTANTS // COARSE_STEP
     for values in problem.constraint_values(x, slice(None, None, COARSE_STEP)):
         values = np.asarray(values)
-        is_peak = (values >= np.roll(values, 1, 0)) & (values >= np.roll(values, -1, 0))
+        is_above_next = values >= np.roll(values, -1, axis=0)
+        is_peak = is_above_next & (values >= np.roll(values, 1, axis=0))
         heights = np.where(is_peak, values, -np.inf)
-        highest = np.resize(np.argsort(heights, axis=None)[-PEAKS:], PEAKS)
-        peak_rows, peak_entries = np.unravel_index(highest, values.shape)
+        # A constraint with fewer values repeats them.
+        peak_places = np.argsort(heights, axis=None)[-PEAKS:]
+        peak_places = np.resize(peak_places, PEAKS)
+        peak_rows, peak_entries = np.unravel_index(peak_places, values.shape)
         instants = COARSE_STEP * np.concatenate([rows, peak_rows])
         worst_entries = values[rows].argmax(axis=1)
         entries = np.concatenate([worst_entries, peak_entries])
-        watched.append(WatchedValues(instants, entries))
-    return watched
+        watched_values.append(WatchedValues(instants, entries))
+    return watched_values
 
 
 def watched_excess(problem: ExcitationProblem, x: ScaledMotion) -> float:
@@ -58,30 +69,39 @@ def linearise(
     problem: ExcitationProblem,
     x: ScaledMotions,
     watched: Sequence[list[WatchedValues]],
-) -> tuple[
-    Float[np.ndarray, "starts values"], Float[np.ndarray, "starts values scaled"]
-]:
+) -> WatchedSlopes:
     """Return watched values of several motions, and their derivatives by each motion."""
-    coefficients = problem.limits.coefficients(x)
-    excess: list[np.ndarray] = [np.zeros((len(x), 0))]
-    derivatives: list[np.ndarray] = [np.zeros((len(x), 0, x.shape[-1]))]
-    by_constraint = zip(*watched, strict=True)
-    for linearisation, places in zip(
-        problem.linearisations, by_constraint, strict=True
-    ):
-        instants = np.array([each.instants for each in places])
-        entries = np.array([each.entries for each in places])
-        rows = problem.checked_rows[:, instants]
-        q, qd, qdd = np.einsum("obwk,bjk->obwj", rows, coefficients, optimize=True)
-        # All starts are evaluated together, one after the other.
-        motion = Motion(*(part.reshape(instants.size, -1) for part in (q, qd, qdd)))
-        values, by_motion = linearisation(motion, entries.ravel())
+    starts, size = x.shape
+    values = [np.zeros((starts, 0))]
+    slopes = [np.zeros((starts, 0, size))]
+    for number, linearisation in enumerate(problem.linearisations):
+        places = [of_start[number] for of_start in watched]
+        linear = _linearise_constraint(problem, linearisation, x, places)
+        values.append(linear.values)
+        slopes.append(linear.slopes)
+    return WatchedSlopes(np.concatenate(values, axis=1), np.concatenate(slopes, axis=1))
 
-        by_coefficients = np.zeros((*instants.shape, *problem.limits.shape))
-        for by_order, part in zip(by_motion, rows, strict=False):
-            by_joints = by_order.reshape(*instants.shape, -1, 1)
-            by_coefficients += by_joints * part[:, :, None]
-        by_x = by_coefficients * np.asarray(problem.limits.scale)
-        excess.append(values.reshape(instants.shape))
-        derivatives.append(by_x.reshape(*instants.shape, -1))
-    return np.concatenate(excess, axis=1), np.concatenate(derivatives, axis=1)
+
+def _linearise_constraint(
+    problem: ExcitationProblem,
+    linearisation: Linearisation,
+    x: ScaledMotions,
+    places: list[WatchedValues],
+) -> WatchedSlopes:
+    """Return watched values of one constraint, of all starts together."""
+    instants = np.array([each.instants for each in places])
+    entries = np.array([each.entries for each in places])
+    rows = problem.checked_rows[:, instants]
+    coefficients = problem.limits.coefficients(x)
+    states = np.einsum("obwk,bjk->obwj", rows, coefficients, optimize=True)
+    q, qd, qdd = states.reshape(3, instants.size, -1)
+    values, by_motion = linearisation(Motion(q, qd, qdd), entries.ravel())
+
+    by_coefficients = np.zeros((*instants.shape, *problem.limits.shape))
+    for by_order, part in zip(by_motion, rows, strict=False):
+        by_joint = by_order.reshape(*instants.shape, -1, 1)
+        by_coefficients += by_joint * part[:, :, None]
+    slopes = by_coefficients * np.asarray(problem.limits.scale)
+    return WatchedSlopes(
+        values.reshape(instants.shape), slopes.reshape(*instants.shape, -1)
+    )

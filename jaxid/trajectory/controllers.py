@@ -61,8 +61,8 @@ def write_rsi(
 ) -> None:
     """Write a table of corrections for RSI: degrees from the first position, one row a cycle."""
     q = trajectory.sample(sample_time)[1].q
-    turned = np.rad2deg(q - q[0])
-    columns = {f"AK.A{j + 1} [deg]": turned[:, j] for j in range(robot.joints)}
+    angles = np.rad2deg(q - q[0])
+    columns = {f"AK.A{j + 1} [deg]": angles[:, j] for j in range(robot.joints)}
     write_text(path, pl.DataFrame(columns).write_csv())
 
 

@@ -183,21 +183,23 @@ def _write_bag(message: dict[str, Any], path: Path) -> None:
         }
         name = "trajectory_msgs/msg/JointTrajectoryPoint"
         points.append(typed(name, **arrays, time_from_start=time))
-    whole = typed(
+    trajectory_message = typed(
         MESSAGE, header=header, joint_names=message["joint_names"], points=points
     )
     with atomic_folder(path.parent) as folder:
         bag, plugin = folder / "bag", rosbag2.StoragePlugin.MCAP
         with rosbag2.Writer(bag, version=9, storage_plugin=plugin) as writer:
             connection = writer.add_connection(TOPIC, MESSAGE, typestore=store)
-            writer.write(connection, 0, store.serialize_cdr(whole, MESSAGE))
+            writer.write(
+                connection, 0, store.serialize_cdr(trajectory_message, MESSAGE)
+            )
         next(bag.glob("*.mcap")).rename(folder / path.name)
         shutil.rmtree(bag)
 
 
 def _ros_time(time: float) -> dict[str, int]:
-    seconds, rest = divmod(round(time * 1_000_000_000), 1_000_000_000)
-    return {"sec": seconds, "nanosec": rest}
+    seconds, nanoseconds = divmod(round(time * 1_000_000_000), 1_000_000_000)
+    return {"sec": seconds, "nanosec": nanoseconds}
 
 
 def _sample(

@@ -24,10 +24,10 @@ def _lead(state: Any, duration: Any, x: Any, sign: int = 1) -> list:
     """
     q, qd, qdd = state
     alpha, beta = _velocity_coefficients(sign * qd, qdd, duration)
-    by_alpha = (x**3 - duration**3) / 3
-    by_beta = (x**4 - duration**4) / 4
+    square_part = alpha * (x**3 - duration**3) / 3
+    cube_part = beta * (x**4 - duration**4) / 4
     return [
-        q + alpha * by_alpha + beta * by_beta,
+        q + square_part + cube_part,
         sign * (alpha * x**2 + beta * x**3),
         2 * alpha * x + 3 * beta * x**2,
         sign * (2 * alpha + 6 * beta * x),
@@ -114,7 +114,7 @@ class LeadsBasis(PeriodsBasis):
         duration = self.lead / ENVELOPE_PIECES
         parts: list[Any] = [rows]
         for piece in range(ENVELOPE_PIECES):
-            t = duration * (piece + fractions)
+            t = duration * piece + duration * fractions
             for sign in (1, -1):
                 parts.append(to_points @ self._lead_rows(t, sign))
         return tuple(np.concatenate(x) for x in zip(*parts, strict=True)), factor
@@ -185,11 +185,11 @@ class WithLeads(AbstractTrajectory):
         in_states = _lead(first, lead_in, from_start)
         out_states = _lead(last, lead_out, to_end, -1)
         states = []
-        for inner, early, late in zip(
+        for series_part, in_part, out_part in zip(
             inner_states, in_states, out_states, strict=False
         ):
-            after_start = jnp.where(time > end, late, inner)
-            states.append(jnp.where(time < begin, early, after_start))
+            after_start = jnp.where(time > end, out_part, series_part)
+            states.append(jnp.where(time < begin, in_part, after_start))
         return tuple(states)
 
 
@@ -230,23 +230,23 @@ def with_leads(
     lead_in = _shortest_leads(q, qd, qdd, limits)
     lead_out = _shortest_leads(q, -qd, qdd, limits)
     total = lead_in.duration.max(axis=1) + lead_out.duration.max(axis=1)
-    best = int(np.argmin(total))
-    if not np.isfinite(total[best]):
+    phase = int(np.argmin(total))
+    if not np.isfinite(total[phase]):
         excess = np.maximum(lead_in.excess, lead_out.excess)
-        nearest = int(np.argmin(excess.max(axis=1)))
-        joint = int(np.argmax(excess[nearest]))
+        nearest_phase = int(np.argmin(excess.max(axis=1)))
+        joint = int(np.argmax(excess[nearest_phase]))
         raise InputError(
             "no instant of the period can be reached from standstill within the "
             f"limits: at best joint `{robot.joint_names[joint]}` exceeds one of them "
-            f"by {100 * excess[nearest, joint]:.3g} %: take a motion that uses less of "
+            f"by {100 * excess[nearest_phase, joint]:.3g} %: take a motion that uses less of "
             "the limits."
         )
     return WithLeads(
         series,
-        phases[best],
+        phases[phase],
         periods * period,
-        lead_in.duration[best],
-        lead_out.duration[best],
+        lead_in.duration[phase],
+        lead_out.duration[phase],
     )
 
 

@@ -205,29 +205,29 @@ def iso9283_path(
     if c.shape != (3,):
         raise InputError("`centre` must hold three numbers [m].")
     x, y, z = np.eye(3)
-    rising = (x, y)[leans_along] + z
-    level = (y, x)[leans_along]
+    rising_axis = (x, y)[leans_along] + z
+    level_axis = (y, x)[leans_along]
     # The corners lie a tenth of the diagonal inside, so that 80 % of the half edges are
     # left.
-    large = 0.8 * edge / 2
-    small = 0.08 * edge / 2
-    u = large * rising
-    v = large * level
+    large_radius = 0.8 * edge / 2
+    small_radius = 0.08 * edge / 2
+    u = large_radius * rising_axis
+    v = large_radius * level_axis
     p2 = c + u + v
     p3 = c - u + v
     p4 = c - u - v
     p5 = c + u - v
-    up = rising / np.sqrt(2.0)
-    top = c + large * up
-    small_top = c + small * up
+    up = rising_axis / np.sqrt(2.0)
+    top = c + large_radius * up
+    small_top = c + small_radius * up
 
     corners = (c, p2, p3, p4, p5, p2, p4, c, top)
     lines = [Line(start, end) for start, end in itertools.pairwise(corners)]
     pieces = (
         *lines,
-        Circle(c, large * up, large * level),
+        Circle(c, large_radius * up, large_radius * level_axis),
         Line(top, small_top),
-        Circle(c, small * up, small * level),
+        Circle(c, small_radius * up, small_radius * level_axis),
         Line(small_top, c),
     )
     return TipPath(pieces, rotation, speed, acceleration)

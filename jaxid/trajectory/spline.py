@@ -55,12 +55,12 @@ def _evaluate(
     start = times[0]
     end = times[-1]
     # Written with `where`, because the derivative of `clip` at its ends is one half.
-    clipped = xp.where(t < start, start, xp.where(t > end, end, t))
-    pieces = xp.searchsorted(times, clipped, side="right") - 1
+    clipped_times = xp.where(t < start, start, xp.where(t > end, end, t))
+    pieces = xp.searchsorted(times, clipped_times, side="right") - 1
     pieces = xp.clip(pieces, 0, len(times) - 2)
 
     # Horner's scheme for the polynomial and its derivatives.
-    x = (clipped - times[pieces])[:, None]
+    x = (clipped_times - times[pieces])[:, None]
     powers = coefficients[:, pieces]
     value = powers[0]
     first = second = third = xp.zeros_like(value)
@@ -158,8 +158,8 @@ def interpolate_at_rest(
     t: Float[np.ndarray, " points"], points: Float[np.ndarray, "points joints"]
 ) -> BSpline:
     """Return the quintic spline through points at some times that stands still at both ends."""
-    rest = [(order, np.zeros(points.shape[1])) for order in (1, 2)]
-    return make_interp_spline(t, points, DEGREE, bc_type=(rest, rest))
+    conditions = [(order, np.zeros(points.shape[1])) for order in (1, 2)]
+    return make_interp_spline(t, points, DEGREE, bc_type=(conditions, conditions))
 
 
 def spline_polynomials(spline: BSpline) -> Float[np.ndarray, "powers pieces columns"]:

@@ -206,9 +206,9 @@ class AbstractBasis(eqx.Module):
         maps = []
         for direction in (rows, rows[::-1]):
             for shift in range(SHIFTS):
-                retimed = np.roll(direction, shift * samples_per_shift, axis=0)
-                to_retimed = inverse @ retimed
-                if np.abs(rows @ to_retimed - retimed).max() <= tolerance:
+                retimed_rows = np.roll(direction, shift * samples_per_shift, axis=0)
+                to_retimed = inverse @ retimed_rows
+                if np.abs(rows @ to_retimed - retimed_rows).max() <= tolerance:
                     maps.append(to_retimed)
         return np.array(maps)
 

@@ -115,11 +115,10 @@ class ForceLimits(AbstractConstraint):
 
     def _forces(self, motion: Motion) -> Float[AnyArray, "*batch 3 joints"]:
         """Return `forces` at all samples."""
-        arrays = (motion.q, motion.qd, motion.qdd)
-        if isinstance(motion.q, jax.Array) or motion.q.ndim != 2:
-            return on_samples(self, self.forces, *arrays)
         # Rows of samples in NumPy need no compiler.
-        return in_numpy(self, self.forces, *arrays)
+        is_rows = isinstance(motion.q, np.ndarray) and motion.q.ndim == 2
+        evaluate = in_numpy if is_rows else on_samples
+        return evaluate(self, self.forces, *_arrays(motion))
 
     def linearisation(self, robot: Robot) -> Linearisation:
         """Return a function of relative excesses and their derivatives, in NumPy."""
@@ -141,30 +140,35 @@ class ForceLimits(AbstractConstraint):
         self, motion: Motion, shares: np.ndarray, limits: np.ndarray
     ) -> ValuesAndSlopes:
         """Return the largest size of a force at each sample, and slopes over the limit."""
-        samples = np.arange(len(limits))
         forces = np.einsum("tsj,tj->ts", self._forces(motion), shares)
-        side = np.abs(forces).argmax(axis=1)
-        largest = forces[samples, side]
-        weights = np.zeros((len(samples), 3, shares.shape[1]))
-        weights[samples, side] = shares * (np.sign(largest) / limits)[:, None]
-        arrays = (motion.q, motion.qd, motion.qdd)
-        slopes = _pull_back(self, self.forces, weights, *arrays)
-        return np.abs(largest), slopes
+        sides = np.abs(forces).argmax(axis=1)
+        samples = np.arange(len(limits))
+        peak_forces = forces[samples, sides]
+
+        slopes = np.sign(peak_forces) / limits
+        weights = np.zeros((len(limits), 3, shares.shape[1]))
+        weights[samples, sides] = shares * slopes[:, None]
+        by_motion = _pull_back(self, self.forces, weights, _arrays(motion))
+        return np.abs(peak_forces), by_motion
 
     def _deviations(
         self, motion: Motion, shares: np.ndarray, limits: np.ndarray
     ) -> ValuesAndSlopes:
         """Return the room for the uncertainty at each sample, and slopes over the limit."""
         base = self.base
-        rows = np.einsum("tjb,tj->tb", np.asarray(base.regressor(motion)), shares)
+        regressor = np.asarray(base.regressor(motion))
+        rows = np.einsum("tjb,tj->tb", regressor, shares)
         products = rows @ self.covariance
         variance = np.maximum((rows * products).sum(axis=1), 0.0)
-        deviation = np.sqrt(variance + (SMOOTHING * limits) ** 2)
-        slope = self.deviations / deviation / limits
-        weights = shares[:, :, None] * (products * slope[:, None])[:, None]
+        smoothing = (SMOOTHING * limits) ** 2
+        deviation = np.sqrt(variance + smoothing)
+
+        slopes = self.deviations / deviation / limits
+        by_rows = products * slopes[:, None]
+        weights = shares[:, :, None] * by_rows[:, None]
         arrays = base.model.arguments(motion)
-        slopes = _pull_back(base, base.columns, weights, *arrays)
-        return self.deviations * deviation, slopes
+        by_motion = _pull_back(base, base.columns, weights, arrays)
+        return self.deviations * deviation, by_motion
 
     def forces(
         self, q: Coordinates, qd: Coordinates, qdd: Coordinates
@@ -200,9 +204,11 @@ class ForceLimits(AbstractConstraint):
         for (name, unit), limit in zip(quantities, limits, strict=True):
             margin = f"{limit:.4g} less a margin of {100 * self.margin:.4g} %"
             note = margin if self.margin else ""
-            reduced = (1 - self.margin) * limit
+            limit_with_margin = (1 - self.margin) * limit
             if np.isfinite(limit):
-                entries.append(Finding(name, reduced, unit, reduced, note=note))
+                entries.append(
+                    Finding(name, limit_with_margin, unit, limit_with_margin, note=note)
+                )
         return tuple(entries)
 
     @staticmethod
@@ -211,11 +217,18 @@ class ForceLimits(AbstractConstraint):
         return np.concatenate([robot.limits.force, robot.drives.max_torques])
 
 
+def _arrays(motion: Motion) -> tuple[AnyArray, ...]:
+    return motion.q, motion.qd, motion.qdd
+
+
 def _pull_back(
-    owner: eqx.Module, definition: Callable, weights: np.ndarray, *arrays: AnyArray
-) -> list[Float[np.ndarray, "samples joints"]]:
+    owner: eqx.Module,
+    definition: Callable,
+    weights: np.ndarray,
+    arrays: tuple[AnyArray, ...],
+) -> list[np.ndarray]:
     """Return derivatives of weighted results of a method for one sample, for rows of samples."""
     program = program_of(owner, definition, *(x.shape[1:] for x in arrays))
     packed_weights = weights.reshape(len(weights), -1).T
-    columns = (np.asarray(x).T for x in arrays)
+    columns = [np.asarray(x).T for x in arrays]
     return [slopes.T for slopes in pull_back(program, packed_weights, *columns)]

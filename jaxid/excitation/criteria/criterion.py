@@ -8,16 +8,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Array, Float
+from jaxid.arrays import Array
 
 from .functions_of_eigenvalues import (
+    Scalar,
     Sharpness,
     log_condition,
     log_largest_inverse,
     log_mean_inverse,
     spectral,
 )
-from .information_matrix import Information, scale_to_unit_diagonal
+from .information_matrix import BaseVector, Information, scale_to_unit_diagonal
 
 
 class AbstractCriterion(eqx.Module):
@@ -32,9 +33,7 @@ class AbstractCriterion(eqx.Module):
     weighted: ClassVar[bool] = True
 
     @abstractmethod
-    def __call__(
-        self, information: Information, sharpness: Sharpness = None
-    ) -> Float[Array, ""]:
+    def __call__(self, information: Information, sharpness: Sharpness = None) -> Scalar:
         """Return the logarithm of the number.
 
         Args:
@@ -70,9 +69,7 @@ class ConditionNumber(AbstractCriterion):
         name += ", weighted" if self.weighted else " of Λ (Eq. 36)"
         return f"{name}, columns scaled" if self.scaled else name
 
-    def __call__(
-        self, information: Information, sharpness: Sharpness = None
-    ) -> Float[Array, ""]:
+    def __call__(self, information: Information, sharpness: Sharpness = None) -> Scalar:
         """Return the logarithm of the condition number."""
         matrix = information.weighted if self.weighted else information.plain
         if self.scaled:
@@ -90,18 +87,16 @@ class DOptimal(AbstractCriterion):
 
     name: ClassVar[str] = "D: mean axis of the confidence ellipsoid"
 
-    def __call__(
-        self, information: Information, sharpness: Sharpness = None
-    ) -> Float[Array, ""]:
+    def __call__(self, information: Information, sharpness: Sharpness = None) -> Scalar:
         """Return the logarithm of the mean axis."""
         matrix = jnp.asarray(information.weighted)
         # The determinant does not depend on the scale that makes the factor accurate.
         _, scale = scale_to_unit_diagonal(matrix)
         scale = jax.lax.stop_gradient(scale)
-        scaled = scale[:, None] * matrix * scale[None]
+        matrix = scale[:, None] * matrix * scale[None]
         # A small ridge keeps a singular matrix with ones on its diagonal positive.
         ridge = 1e-13 * np.eye(len(scale))
-        L = jnp.linalg.cholesky(scaled + ridge)
+        L = jnp.linalg.cholesky(matrix + ridge)
         return -jnp.mean(jnp.log(jnp.diagonal(L)) - jnp.log(scale))
 
 
@@ -115,14 +110,12 @@ class AOptimal(AbstractCriterion):
     """
 
     name: ClassVar[str] = "A: rms of the scaled deviations"
-    sizes: Float[AnyArray, " base"] | None = None
+    sizes: BaseVector | None = None
 
-    def __call__(
-        self, information: Information, sharpness: Sharpness = None
-    ) -> Float[Array, ""]:
+    def __call__(self, information: Information, sharpness: Sharpness = None) -> Scalar:
         """Return the logarithm of the root mean square."""
-        scaled = _divide_by_sizes(information, self.sizes)
-        return 0.5 * jnp.asarray(spectral(log_mean_inverse, scaled, None))
+        matrix = _divide_by_sizes(information, self.sizes)
+        return 0.5 * jnp.asarray(spectral(log_mean_inverse, matrix, None))
 
 
 class EOptimal(AbstractCriterion):
@@ -133,14 +126,12 @@ class EOptimal(AbstractCriterion):
     """
 
     name: ClassVar[str] = "E: longest axis of the scaled ellipsoid"
-    sizes: Float[AnyArray, " base"] | None = None
+    sizes: BaseVector | None = None
 
-    def __call__(
-        self, information: Information, sharpness: Sharpness = None
-    ) -> Float[Array, ""]:
+    def __call__(self, information: Information, sharpness: Sharpness = None) -> Scalar:
         """Return the logarithm of the longest axis."""
-        scaled = _divide_by_sizes(information, self.sizes)
-        return 0.5 * jnp.asarray(spectral(log_largest_inverse, scaled, sharpness))
+        matrix = _divide_by_sizes(information, self.sizes)
+        return 0.5 * jnp.asarray(spectral(log_largest_inverse, matrix, sharpness))
 
 
 CRITERIA: dict[str, AbstractCriterion] = {
@@ -154,9 +145,7 @@ CRITERIA: dict[str, AbstractCriterion] = {
 """All criteria by the values of the key `criterion`, in the order of the tables."""
 
 
-def _divide_by_sizes(
-    information: Information, sizes: Float[AnyArray, " base"] | None
-) -> Array:
+def _divide_by_sizes(information: Information, sizes: BaseVector | None) -> Array:
     """Return the information about the parameters divided by their sizes."""
     sizes = jnp.asarray(information.sizes if sizes is None else sizes)
     return sizes[:, None] * jnp.asarray(information.weighted) * sizes[None]

@@ -9,7 +9,8 @@ import numpy as np
 
 from jaxid.arrays import Array, Float
 
-Sharpness = Float[Array, ""] | float | None
+Scalar = Float[Array, ""]
+Sharpness = Scalar | float | None
 """Closeness of a smooth maximum to the exact one: larger is closer; None is exact."""
 
 MIN_EIGENVALUE = 1e-15
@@ -21,7 +22,7 @@ def spectral(
     function: Callable[[Array, Sharpness], Array],
     matrix: Float[Array, "size size"],
     sharpness: Sharpness,
-) -> Float[Array, ""]:
+) -> Scalar:
     r"""Return a symmetric function of the logarithms of a positive matrix's eigenvalues.
 
     For $f(\Lambda) = \varphi(\lambda)$ with $\Lambda = U \operatorname{diag}(\lambda)
@@ -48,29 +49,23 @@ def _eigenvalues(matrix: Float[Array, "size size"]) -> tuple[Array, Array]:
     return jnp.maximum(eigenvalues, MIN_EIGENVALUE * eigenvalues[-1]), U
 
 
-def log_condition(
-    logs: Float[Array, " size"], sharpness: Sharpness
-) -> Float[Array, ""]:
+def log_condition(logs: Float[Array, " size"], sharpness: Sharpness) -> Scalar:
     r"""Return the log condition number, or above it $\log(\sum\lambda^p \sum\lambda^{-p})/p$."""
     if sharpness is None:
         return logs[-1] - logs[0]
     return _softmax(logs, sharpness) + _softmax(-logs, sharpness)
 
 
-def log_largest_inverse(
-    logs: Float[Array, " size"], sharpness: Sharpness
-) -> Float[Array, ""]:
+def log_largest_inverse(logs: Float[Array, " size"], sharpness: Sharpness) -> Scalar:
     """Return the logarithm of the inverse's largest eigenvalue."""
     return -logs[0] if sharpness is None else _softmax(-logs, sharpness)
 
 
-def log_mean_inverse(
-    logs: Float[Array, " size"], sharpness: Sharpness
-) -> Float[Array, ""]:
+def log_mean_inverse(logs: Float[Array, " size"], sharpness: Sharpness) -> Scalar:
     """Return the logarithm of the inverse's mean eigenvalue."""
     return jax.nn.logsumexp(-logs) - np.log(logs.shape[-1])
 
 
-def _softmax(x: Array, sharpness: Float[Array, ""] | float) -> Array:
+def _softmax(x: Array, sharpness: Scalar | float) -> Array:
     """Return a smooth maximum, which is never below the exact one."""
     return jax.nn.logsumexp(sharpness * x) / sharpness

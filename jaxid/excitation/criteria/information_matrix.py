@@ -11,6 +11,11 @@ from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.motion import Motion
 from jaxid.trajectory.trajectory import AbstractBasis
 
+BaseVector = Float[AnyArray, " base"]
+"""One number for each base parameter."""
+BaseMatrix = Float[AnyArray, "base base"]
+JointVector = Float[AnyArray, " joints"]
+
 RANK_TOLERANCE = 1e-12
 """Eigenvalue, relative to the largest one, below which a direction has no information."""
 MIN_SHARE = 1e-3
@@ -29,15 +34,15 @@ class Information(eqx.Module):
 
     plain: Float[AnyArray, "*batch base base"]
     weighted: Float[AnyArray, "*batch base base"]
-    sizes: Float[AnyArray, " base"]
+    sizes: BaseVector
 
 
 def information(
     base: BaseParameters,
     motion: Motion,
-    weights: Float[AnyArray, " joints"],
-    prior: Float[AnyArray, "base base"] | None = None,
-    sizes: Float[AnyArray, " base"] | None = None,
+    weights: JointVector,
+    prior: BaseMatrix | None = None,
+    sizes: BaseVector | None = None,
 ) -> Information:
     """Return the information of one motion, computed in NumPy (Eq. 36).
 
@@ -68,9 +73,9 @@ def information_of_coefficients(
     *,
     samples: int,
     measured: int,
-    weights: Float[AnyArray, " joints"],
-    prior: Float[AnyArray, "base base"],
-    sizes: Float[AnyArray, " base"],
+    weights: JointVector,
+    prior: BaseMatrix,
+    sizes: BaseVector,
 ) -> Information:
     """Return the information of many trajectories, under `jit` and derivatives (Eq. 36).
 
@@ -92,11 +97,11 @@ def information_of_coefficients(
 
 
 def standard_deviations(
-    weighted: Float[AnyArray, "base base"],
+    weighted: BaseMatrix,
 ) -> Float[np.ndarray, " base"]:
     """Return standard deviations from weighted information; infinite where undetermined."""
-    scaled, scale = scale_to_unit_diagonal(np.asarray(weighted, np.float64))
-    eigenvalues, directions = np.linalg.eigh(scaled)
+    matrix, scale = scale_to_unit_diagonal(np.asarray(weighted, np.float64))
+    eigenvalues, directions = np.linalg.eigh(matrix)
     is_blind = eigenvalues < RANK_TOLERANCE * eigenvalues[-1]
 
     squares = directions[:, ~is_blind] ** 2
