@@ -16,6 +16,9 @@ from .trajectory import (
     AbstractBasis,
     Envelope,
     LinearTrajectory,
+    Rows,
+    Time,
+    Times,
     as_scalar,
     stand_outside,
 )
@@ -52,13 +55,11 @@ class FourierBasis(AbstractBasis):
             )
 
     @property
-    def duration(self) -> Float[AnyArray, ""] | float:
+    def duration(self) -> Time:
         """Period [s]."""
         return 2 * math.pi / self.omega
 
-    def rows(
-        self, t: Float[AnyArray, " samples"]
-    ) -> Float[AnyArray, "4 samples variables"]:
+    def rows(self, t: Times) -> Rows:
         """Return a constant, sines and cosines, and their derivatives."""
         xp = namespace(t, self.omega)
         w = self.omega * np.arange(1.0, self.harmonics + 1.0)[None]
@@ -128,7 +129,7 @@ class RestToRestBasis(PeriodsBasis):
             )
 
     @property
-    def duration(self) -> Float[AnyArray, ""] | float:
+    def duration(self) -> Time:
         """Time from standstill to standstill [s]."""
         return self.periods * self.series.duration
 
@@ -140,9 +141,7 @@ class RestToRestBasis(PeriodsBasis):
         b = null_space(orders[None])
         return np.asarray(block_diag(np.ones((1, 1)), a, b))
 
-    def rows(
-        self, t: Float[AnyArray, " samples"]
-    ) -> Float[AnyArray, "4 samples variables"]:
+    def rows(self, t: Times) -> Rows:
         """Return sines and cosines in the directions that keep the joint at rest at both ends."""
 
         def series_rows(t: AnyArray) -> AnyArray:
@@ -155,7 +154,7 @@ class RestToRestBasis(PeriodsBasis):
         rows, factor = self.series.envelope(points)
         return tuple(x @ self.directions for x in rows), factor
 
-    def times(self, samples: int) -> Float[np.ndarray, " samples"]:
+    def times(self, samples: int) -> Times:
         """Return equidistant times over one period [s]."""
         return self.series.times(samples)
 
@@ -164,7 +163,7 @@ def fourier_series(
     offset: Float[AnyArray, " joints"],
     a: Float[AnyArray, "joints harmonics"],
     b: Float[AnyArray, "joints harmonics"],
-    omega: Float[AnyArray, ""] | float,
+    omega: Time,
 ) -> LinearTrajectory:
     """Return a Fourier series from the coefficients of the paper (Eqs. 34, 35).
 

@@ -13,7 +13,16 @@ from jaxid.robot.limits_and_drives import Limits
 from jaxid.robot.robot import Robot
 
 from .fourier import PeriodsBasis, complete_limits
-from .trajectory import AbstractTrajectory, Envelope, States, as_scalar, stand_outside
+from .trajectory import (
+    AbstractTrajectory,
+    Envelope,
+    Rows,
+    States,
+    Time,
+    Times,
+    as_scalar,
+    stand_outside,
+)
 
 
 def _lead(state: Any, duration: Any, x: Any, sign: int = 1) -> list:
@@ -77,13 +86,11 @@ class LeadsBasis(PeriodsBasis):
             )
 
     @property
-    def duration(self) -> Float[AnyArray, ""] | float:
+    def duration(self) -> Time:
         """Time from standstill to standstill [s]."""
         return self.periods * self.series.duration + 2 * self.lead
 
-    def rows(
-        self, t: Float[AnyArray, " samples"]
-    ) -> Float[AnyArray, "4 samples variables"]:
+    def rows(self, t: Times) -> Rows:
         """Return the series, or the polynomials that lead into it and out of it."""
 
         def moving(t: AnyArray) -> AnyArray:
@@ -119,11 +126,11 @@ class LeadsBasis(PeriodsBasis):
                 parts.append(to_points @ self._lead_rows(t, sign))
         return tuple(np.concatenate(x) for x in zip(*parts, strict=True)), factor
 
-    def times(self, samples: int) -> Float[np.ndarray, " samples"]:
+    def times(self, samples: int) -> Times:
         """Return equidistant times over one period between the leads [s]."""
         return float(self.lead) + self.series.times(samples)
 
-    def instants(self, points: int) -> Float[np.ndarray, " points"]:
+    def instants(self, points: int) -> Times:
         """Return equidistant times over the leads and one period [s]."""
         period, lead = float(self.series.duration), float(self.lead)
         t = np.arange(points) * ((period + 2 * lead) / (points - 1))
@@ -166,11 +173,11 @@ class WithLeads(AbstractTrajectory):
         return begin, begin + self.length
 
     @property
-    def duration(self) -> Float[AnyArray, ""] | float:
+    def duration(self) -> Time:
         """Time from standstill to standstill [s]."""
         return self.window[1] + jnp.max(jnp.asarray(self.lead_out))
 
-    def states(self, t: Float[AnyArray, " samples"]) -> States:
+    def states(self, t: Times) -> States:
         """Return the motion between the leads, and the leads; standstill outside."""
         begin, end = self.window
         time = t[:, None]

@@ -18,6 +18,7 @@ from .spline import (
     interpolate_at_rest,
     spline_polynomials,
 )
+from .trajectory import Times
 
 SAMPLE_TIME = 0.01
 """Largest time between two poses of the inverse kinematics [s]."""
@@ -43,9 +44,7 @@ class Line(eqx.Module):
         """Length of the line [m]."""
         return float(np.linalg.norm(np.asarray(self.end) - np.asarray(self.start)))
 
-    def at(
-        self, fraction: Float[AnyArray, " samples"]
-    ) -> Float[np.ndarray, "samples 3"]:
+    def at(self, fraction: Times) -> Float[np.ndarray, "samples 3"]:
         """Return places at fractions of the length, from 0 to 1 [m]."""
         start = np.asarray(self.start)
         return start + np.asarray(fraction)[:, None] * (np.asarray(self.end) - start)
@@ -75,9 +74,7 @@ class Circle(eqx.Module):
         """Radius of the circle [m]."""
         return float(np.linalg.norm(np.asarray(self.first)))
 
-    def at(
-        self, fraction: Float[AnyArray, " samples"]
-    ) -> Float[np.ndarray, "samples 3"]:
+    def at(self, fraction: Times) -> Float[np.ndarray, "samples 3"]:
         """Return places at fractions of the length, from 0 to 1 [m]."""
         angle = 2 * np.pi * np.asarray(fraction)[:, None]
         first, second = np.asarray(self.first), np.asarray(self.second)
@@ -153,9 +150,7 @@ class TipPath(eqx.Module):
         """Total time [s]."""
         return float(sum(self.durations))
 
-    def positions(
-        self, t: Float[AnyArray, " samples"]
-    ) -> Float[np.ndarray, "samples 3"]:
+    def positions(self, t: Times) -> Float[np.ndarray, "samples 3"]:
         """Return positions of the end-effector [m] at times [s]; it stands still outside."""
         t = np.asarray(t)
         ends = np.cumsum(self.durations)

@@ -15,7 +15,10 @@ from .trajectory import (
     AbstractTrajectory,
     Envelope,
     LinearTrajectory,
+    Rows,
     States,
+    Time,
+    Times,
     as_scalar,
 )
 
@@ -35,11 +38,11 @@ class PiecewisePolynomial(AbstractTrajectory):
     coefficients: Float[AnyArray, "powers pieces joints"]
 
     @property
-    def duration(self) -> Float[AnyArray, ""] | float:
+    def duration(self) -> Time:
         """Time of the end [s]."""
         return self.times[-1]
 
-    def states(self, t: Float[AnyArray, " samples"]) -> States:
+    def states(self, t: Times) -> States:
         """Return the polynomials and two derivatives."""
         return tuple(_evaluate(self.times, self.coefficients, t)[:3])
 
@@ -47,7 +50,7 @@ class PiecewisePolynomial(AbstractTrajectory):
 def _evaluate(
     times: Float[AnyArray, " knots"],
     coefficients: Float[AnyArray, "powers pieces columns"],
-    t: Float[AnyArray, " samples"],
+    t: Times,
 ) -> Float[AnyArray, "4 samples columns"]:
     """Return a `PiecewisePolynomial` and three derivatives, constant outside its times [s]."""
     xp = namespace(times, coefficients, t)
@@ -101,9 +104,7 @@ class RestToRestSplineBasis(AbstractBasis):
                 f"`duration` must be positive [s], but is {self.duration:g}."
             )
 
-    def rows(
-        self, t: Float[AnyArray, " samples"]
-    ) -> Float[AnyArray, "4 samples variables"]:
+    def rows(self, t: Times) -> Rows:
         """Return the motions of unit coefficients."""
         starts, coefficients = _unit_polynomials(self.points)
         derivatives = _evaluate(starts, coefficients, t / self.duration)
@@ -155,7 +156,7 @@ def spline_through(points: Numbers, duration: float) -> LinearTrajectory:
 
 
 def interpolate_at_rest(
-    t: Float[np.ndarray, " points"], points: Float[np.ndarray, "points joints"]
+    t: Times, points: Float[np.ndarray, "points joints"]
 ) -> BSpline:
     """Return the quintic spline through points at some times that stands still at both ends."""
     conditions = [(order, np.zeros(points.shape[1])) for order in (1, 2)]

@@ -29,6 +29,14 @@ SHIFTS = 40
 RETIMING_TOLERANCE = 1e-9
 """Relative error up to which a motion that begins at another time is one of the family."""
 
+Time = Float[AnyArray, ""] | float
+"""One time [s]."""
+Times = Float[AnyArray, " samples"]
+"""Times of samples [s]."""
+Rows = Float[AnyArray, "4 samples variables"]
+"""Position, velocity, acceleration and jerk of each function of a basis at some times."""
+Coefficients = Float[AnyArray, "joints variables"]
+"""Coefficients of a trajectory, one row for each joint."""
 States = tuple[Float[AnyArray, "samples joints"], ...]
 """Positions, velocities and accelerations."""
 
@@ -43,11 +51,11 @@ class AbstractTrajectory(Hashable):
 
     @property
     @abstractmethod
-    def duration(self) -> Float[AnyArray, ""] | float:
+    def duration(self) -> Time:
         """Time from the start at zero to the end [s]; one period of a periodic motion."""
 
     @abstractmethod
-    def states(self, t: Float[AnyArray, " samples"]) -> States:
+    def states(self, t: Times) -> States:
         """Return positions, velocities and accelerations at times [s], under `jit`."""
 
     def motion(self, t: Float[AnyArray, "*batch"] | float | int) -> Motion:
@@ -115,7 +123,7 @@ class PaddedToCycle(AbstractTrajectory):
         cycles = count_cycles(float(self.inner.duration), self.sample_time)
         return cycles * self.sample_time
 
-    def states(self, t: Float[AnyArray, " samples"]) -> States:
+    def states(self, t: Times) -> States:
         """Return the motion, and its final pose after its end."""
         return self.inner.states(jnp.minimum(t, self.inner.duration))
 
@@ -150,9 +158,7 @@ class AbstractBasis(eqx.Module):
         duration: eqx.AbstractVar[float]
 
     @abstractmethod
-    def rows(
-        self, t: Float[AnyArray, " samples"]
-    ) -> Float[AnyArray, "4 samples variables"]:
+    def rows(self, t: Times) -> Rows:
         """Return position, velocity, acceleration and jerk of every function at times [s].
 
         Times in NumPy give rows in NumPy.
@@ -171,7 +177,7 @@ class AbstractBasis(eqx.Module):
                 bounds.
         """
 
-    def trajectory(self, x: Float[AnyArray, "joints variables"]) -> "LinearTrajectory":
+    def trajectory(self, x: Coefficients) -> "LinearTrajectory":
         """Return the trajectory with these coefficients, one row for each joint."""
         return LinearTrajectory(self, x)
 
@@ -180,11 +186,11 @@ class AbstractBasis(eqx.Module):
         """Number of coefficients of each joint."""
         return self.rows(np.zeros(1)).shape[2]
 
-    def times(self, samples: int) -> Float[np.ndarray, " samples"]:
+    def times(self, samples: int) -> Times:
         """Return equidistant times at which a run is measured, without their end [s]."""
         return np.arange(samples) * (float(self.duration) / samples)
 
-    def instants(self, points: int) -> Float[np.ndarray, " points"]:
+    def instants(self, points: int) -> Times:
         """Return equidistant times over the whole motion, for limits that hold throughout [s]."""
         return self.times(points)
 
@@ -222,14 +228,14 @@ class LinearTrajectory(AbstractTrajectory):
     """
 
     basis: AbstractBasis
-    coefficients: Float[AnyArray, "joints variables"]
+    coefficients: Coefficients
 
     @property
-    def duration(self) -> Float[AnyArray, ""] | float:
+    def duration(self) -> Time:
         """Duration of the basis [s]."""
         return self.basis.duration
 
-    def states(self, t: Float[AnyArray, " samples"]) -> States:
+    def states(self, t: Times) -> States:
         """Return the rows of the basis times the coefficients."""
         rows = jnp.asarray(self.basis.rows(t))
         return tuple(part @ self.coefficients.T for part in rows[:3])
@@ -237,9 +243,9 @@ class LinearTrajectory(AbstractTrajectory):
 
 def stand_outside(
     rows: Callable[[AnyArray], AnyArray],
-    t: Float[AnyArray, " samples"],
+    t: Times,
     duration: AnyArray | float,
-) -> Float[AnyArray, "4 samples variables"]:
+) -> Rows:
     """Return rows of a motion that stands still before zero and after its duration [s]."""
     xp = namespace(t, as_scalar(duration))
     # Written with `where`, because the derivative of `clip` at its ends is one half.
