@@ -28,10 +28,8 @@ class Controller(NamedTuple):
         if robot.joints != self.joints or not all(robot.revolute):
             raise InputError(
                 f"`controller` moves robots of {self.joints} revolute joints, but "
-                f"`{robot.name}` "
-                f"has {robot.joints} joint(s), {sum(robot.revolute)} of them "
-                "revolute: leave the "
-                "key out, and give `sample_time`."
+                f"`{robot.name}` has {robot.joints} joint(s), {sum(robot.revolute)} of "
+                "them revolute: leave the key out, and give `sample_time`."
             )
 
 

@@ -25,11 +25,16 @@ from jaxid.robot.robot import Robot
 
 from .trajectory import AbstractTrajectory
 
-FORMAT, VERSION = "jaxid trajectory", 2
+FORMAT = "jaxid trajectory"
+VERSION = 2
 MESSAGE = "trajectory_msgs/msg/JointTrajectory"
 """Type of the message for ROS 2."""
 TOPIC = "/joint_trajectory_controller/joint_trajectory"
 """Topic of the controller that plays it."""
+
+
+ARRAYS = ("positions", "velocities", "accelerations", "effort")
+"""Fields of a point of the message that hold one number for each joint, or none."""
 
 
 def save_trajectory(trajectory: AbstractTrajectory, path: str | Path) -> None:
@@ -42,9 +47,8 @@ def save_trajectory(trajectory: AbstractTrajectory, path: str | Path) -> None:
     Raises:
         InputError: If a number is not finite, or the path is a folder.
     """
-    if not all(
-        np.isfinite(np.asarray(leaf)).all() for leaf in jax.tree.leaves(trajectory)
-    ):
+    leaves = jax.tree.leaves(trajectory)
+    if not all(np.isfinite(np.asarray(leaf)).all() for leaf in leaves):
         raise InputError(
             "a `trajectory` with numbers that are not finite cannot be saved."
         )
@@ -72,8 +76,7 @@ def load_trajectory(path: str | Path) -> AbstractTrajectory:
         if content.get("version") != VERSION:
             raise InputError(
                 f"it has version {content.get('version')}, but this package reads "
-                "version "
-                f"{VERSION}: load it with the package that wrote it"
+                f"version {VERSION}: load it with the package that wrote it"
             )
         return from_json(content.get("trajectory"), AbstractTrajectory, "trajectory")
     except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
@@ -127,20 +130,21 @@ def write_ros(
     `write_csv`, and so are the errors.
     """
     times, motion = _sample(trajectory, robot, sample_time)
-    rows = (np.asarray(x).tolist() for x in (motion.q, motion.qd, motion.qdd))
+    points = []
+    for k, time in enumerate(times.tolist()):
+        point = {
+            "positions": motion.q[k].tolist(),
+            "velocities": motion.qd[k].tolist(),
+            "accelerations": motion.qdd[k].tolist(),
+            "effort": [],
+            "time_from_start": _ros_time(time),
+        }
+        points.append(point)
     names = list(robot.joint_names)
-    message = {
-        "header": {"stamp": _ros_time(0.0), "frame_id": ""},
-        "joint_names": names,
-    }
-    keys = ("positions", "velocities", "accelerations", "effort", "time_from_start")
-    points = [
-        dict(zip(keys, (*row, [], _ros_time(t)), strict=True))
-        for t, *row in zip(times.tolist(), *rows, strict=True)
-    ]
     if Path(path).suffix == ".mcap":
-        _write_bag({**message, "points": points}, Path(path))
+        _write_bag(names, points, Path(path))
         return
+    header = {"stamp": _ros_time(0.0), "frame_id": ""}
     lines = [
         f"# {MESSAGE} of `{robot.name}`: rad (revolute joints) or m (prismatic "
         "joints), and s;",
@@ -148,51 +152,44 @@ def write_ros(
         "# Move the robot slowly to the first point, then:",
         f"#   ros2 topic pub --once {TOPIC} \\",
         f'#     {MESSAGE} "$(cat FILE)"',
-        *(f"{key}: {json.dumps(value)}" for key, value in message.items()),
+        f"header: {json.dumps(header)}",
+        f"joint_names: {json.dumps(names)}",
+        "points:",
     ]
-    # JSON's values are YAML's values, but YAML 1.1 reads `1e-05`, without a point, as
-    # text.
-    texts = (f"- {json.dumps(point, allow_nan=False)}" for point in points)
-    lines += ["points:", *(re.sub(r"(?<![.\d])(\d+)e", r"\1.0e", x) for x in texts)]
+    for point in points:
+        # JSON's values are YAML's values, but YAML 1.1 reads `1e-05`, without a point,
+        # as text.
+        text = json.dumps(point, allow_nan=False)
+        lines.append("- " + re.sub(r"(?<![.\d])(\d+)e", r"\1.0e", text))
     write_text(path, "\n".join(lines) + "\n")
 
 
-def _write_bag(message: dict[str, Any], path: Path) -> None:
-    """Write a message as a bag of ROS 2 in one file (MCAP)."""
-    typesys, rosbag2 = (
-        import_extra(f"rosbags.{name}", "logs", f"`{path.name}` is written by")
-        for name in ("typesys", "rosbag2")
-    )
+def _write_bag(
+    joint_names: list[str], points: list[dict[str, Any]], path: Path
+) -> None:
+    """Write the message as a bag of ROS 2 in one file (MCAP)."""
+    purpose = f"`{path.name}` is written by"
+    typesys = import_extra("rosbags.typesys", "logs", purpose)
+    rosbag2 = import_extra("rosbags.rosbag2", "logs", purpose)
     store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+    make_time = store.types["builtin_interfaces/msg/Time"]
+    make_duration = store.types["builtin_interfaces/msg/Duration"]
+    make_header = store.types["std_msgs/msg/Header"]
+    make_point = store.types["trajectory_msgs/msg/JointTrajectoryPoint"]
 
-    def typed(name: str, **values: Any) -> Any:
-        return store.types[name](**values)
-
-    header = typed(
-        "std_msgs/msg/Header",
-        stamp=typed("builtin_interfaces/msg/Time", **message["header"]["stamp"]),
-        frame_id=message["header"]["frame_id"],
-    )
-    points = []
-    for point in message["points"]:
-        time = typed("builtin_interfaces/msg/Duration", **point["time_from_start"])
-        arrays = {
-            k: np.array(x, np.float64)
-            for k, x in point.items()
-            if k != "time_from_start"
-        }
-        name = "trajectory_msgs/msg/JointTrajectoryPoint"
-        points.append(typed(name, **arrays, time_from_start=time))
-    trajectory_message = typed(
-        MESSAGE, header=header, joint_names=message["joint_names"], points=points
-    )
+    messages = []
+    for point in points:
+        duration = make_duration(**point["time_from_start"])
+        arrays = [np.array(point[name], np.float64) for name in ARRAYS]
+        messages.append(make_point(*arrays, duration))
+    header = make_header(stamp=make_time(**_ros_time(0.0)), frame_id="")
+    message = store.types[MESSAGE](header, joint_names, messages)
     with atomic_folder(path.parent) as folder:
-        bag, plugin = folder / "bag", rosbag2.StoragePlugin.MCAP
+        bag = folder / "bag"
+        plugin = rosbag2.StoragePlugin.MCAP
         with rosbag2.Writer(bag, version=9, storage_plugin=plugin) as writer:
             connection = writer.add_connection(TOPIC, MESSAGE, typestore=store)
-            writer.write(
-                connection, 0, store.serialize_cdr(trajectory_message, MESSAGE)
-            )
+            writer.write(connection, 0, store.serialize_cdr(message, MESSAGE))
         next(bag.glob("*.mcap")).rename(folder / path.name)
         shutil.rmtree(bag)
 
@@ -205,10 +202,10 @@ def _ros_time(time: float) -> dict[str, int]:
 def _sample(
     trajectory: AbstractTrajectory, robot: Robot, sample_time: float
 ) -> tuple[np.ndarray, Motion]:
+    """Return times and motion of a trajectory that moves the robot's joints."""
     if trajectory.joints != robot.joints:
         raise InputError(
             f"`trajectory` must move the {robot.joints} joints of `{robot.name}`, but "
-            "moves "
-            f"{trajectory.joints}."
+            f"moves {trajectory.joints}."
         )
     return trajectory.sample(sample_time)
