@@ -80,12 +80,12 @@ class Candidates(NamedTuple):
         """Return as many of both together as these are, the best first, duplicates last."""
         pairs = zip(self, others, strict=True)
         all_motions = Candidates(*(np.concatenate(pair) for pair in pairs))
-        order = all_motions.order()
-        value_steps = np.diff(all_motions.value[order], prepend=np.nan)
-        violation_steps = np.diff(all_motions.violation[order], prepend=np.nan)
+        ordered = all_motions.at(all_motions.order())
+        value_steps = np.diff(ordered.value, prepend=np.nan)
+        violation_steps = np.diff(ordered.violation, prepend=np.nan)
         is_duplicate = (value_steps <= SAME_VALUE) & (violation_steps == 0.0)
-        order = np.concatenate([order[~is_duplicate], order[is_duplicate]])
-        return all_motions.at(order[: len(self.value)])
+        duplicates_last = np.argsort(is_duplicate, kind="stable")
+        return ordered.at(duplicates_last[: len(self.value)])
 
 
 def criterion_values(

@@ -279,13 +279,7 @@ def _barrier_hessian(
     H = np.zeros((len(iterate.step), len(iterate.step)))
     H[:size, :size] = iterate.curvature + slopes.T @ stiff_slopes
 
-    # Limits couple the variables of one joint only.
-    row_stiffness = parts.limits.reshape(2, *grid.c.shape).sum(axis=0)
-    blocks = np.swapaxes(grid.R, 1, 2) @ (grid.R * row_stiffness[:, :, None])
-    variables = grid.R.shape[2]
-    for joint, block in enumerate(blocks):
-        place = slice(joint * variables, (joint + 1) * variables)
-        H[place, place] += block
+    _add_limits(H, grid, parts.limits)
     ridge = RIDGE * np.trace(H[:size, :size]) / size
     if len(parts.slack):
         coupling = -stiff_slopes.sum(axis=0)
@@ -294,6 +288,18 @@ def _barrier_hessian(
         H[size, size] = parts.constraints.sum() + parts.slack[0]
     H[np.diag_indices(len(H))] += ridge
     return H
+
+
+def _add_limits(H: np.ndarray, grid: Grid, stiffness: np.ndarray) -> None:
+    """Add the curvature of the limits, which couple the variables of one joint only."""
+    upper, lower = stiffness.reshape(2, *grid.c.shape)
+    stiff_rows = grid.R * (upper + lower)[:, :, None]
+    blocks = np.swapaxes(grid.R, 1, 2) @ stiff_rows
+    variables = grid.R.shape[2]
+    for joint, block in enumerate(blocks):
+        start = joint * variables
+        place = slice(start, start + variables)
+        H[place, place] += block
 
 
 def _downhill(

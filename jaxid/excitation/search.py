@@ -73,6 +73,10 @@ BATCH = 8
 """Starts that are improved together."""
 PART = 25
 """Iterations of one step, after which the peaks of constraints are found anew."""
+POSES = 1000
+"""Random poses among which those are looked for that keep all constraints."""
+FIRST_SIZES = (0.6, 0.4, 0.3, 0.2, 0.15, 0.1, 0.05)
+"""Sizes of first motions about such poses, relative to the limits of the joints."""
 CHILD_TRIES = 16
 """Children of each motion of which the most promising is improved."""
 
@@ -266,6 +270,23 @@ def _take(
     return candidates.improved(places, evaluate_within_limits(problem, x))
 
 
+def _feasible_places(
+    problem: ExcitationProblem, random: np.random.Generator, count: int
+) -> Float[np.ndarray, "count joints"]:
+    """Return random poses, as places in the joints' ranges, that keep the constraints best."""
+    limits = problem.limits.limits
+    low = np.asarray(limits.position_min)
+    high = np.asarray(limits.position_max)
+    places = random.uniform(0.1, 0.9, (POSES, len(low)))
+    q = low + places * (high - low)
+    standstill = Motion(q, np.zeros_like(q), np.zeros_like(q))
+    excess = np.full(POSES, -np.inf)
+    for constraint in problem.constraints:
+        values = np.asarray(constraint(problem.robot, standstill))
+        excess = np.maximum(excess, values.max(axis=1))
+    return places[np.argsort(excess)[:count]]
+
+
 def first_motions(
     problem: ExcitationProblem,
     random: np.random.Generator,
@@ -276,20 +297,11 @@ def first_motions(
     They have the shapes of given motions, about poses at which the robot may stand
     still.
     """
-    limits = problem.limits.limits
-    low = np.asarray(limits.position_min)
-    high = np.asarray(limits.position_max)
-    places = random.uniform(0.1, 0.9, (1000, len(low)))
-    q = low + places * (high - low)
-    rest_motion = Motion(q, np.zeros_like(q), np.zeros_like(q))
-    values = [np.asarray(c(problem.robot, rest_motion)) for c in problem.constraints]
-    excess = np.max([each.max(axis=1) for each in values], axis=0)
-    good_places = places[np.argsort(excess)[: len(x)]]
-
+    places = _feasible_places(problem, random, len(x))
     grid = problem.limits.grid()
     motions = []
-    for size in (0.6, 0.4, 0.3, 0.2, 0.15, 0.1, 0.05):
-        for motion, place in zip(x, good_places, strict=True):
+    for size in FIRST_SIZES:
+        for motion, place in zip(x, places, strict=True):
             motions.append(grid.fill(motion, place, size))
     violation = [max(watched_excess(problem, motion), 0.0) for motion in motions]
     order = np.argsort(violation, kind="stable")

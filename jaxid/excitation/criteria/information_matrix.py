@@ -86,11 +86,14 @@ def information_of_coefficients(
     q, qd, qdd = (jnp.einsum("sk,bjk->jbs", part, x) for part in rows[:3])
     columns_by_joint = regressor(q, qd, qdd)
 
-    plain = jnp.zeros((x.shape[0], regressor.size, regressor.size), x.dtype)
+    starts = x.shape[0]
+    plain = jnp.zeros((starts, base.size, base.size), x.dtype)
     weighted = plain
     for joint, columns in enumerate(columns_by_joint):
-        place = np.ix_(regressor.columns[joint], regressor.columns[joint])
-        gram = measured / samples * jnp.einsum("bis,bjs->bij", columns, columns)
+        numbers = regressor.columns[joint]
+        place = np.ix_(numbers, numbers)
+        products = jnp.einsum("bis,bjs->bij", columns, columns)
+        gram = measured / samples * products
         plain = plain.at[:, *place].add(gram)
         weighted = weighted.at[:, *place].add(weights[joint] ** 2 * gram)
     return Information(plain, weighted + prior[None], sizes)
@@ -102,14 +105,13 @@ def standard_deviations(
     """Return standard deviations from weighted information; infinite where undetermined."""
     matrix, scale = scale_to_unit_diagonal(np.asarray(weighted, np.float64))
     eigenvalues, directions = np.linalg.eigh(matrix)
-    is_blind = eigenvalues < RANK_TOLERANCE * eigenvalues[-1]
-
-    squares = directions[:, ~is_blind] ** 2
-    variances = (squares / eigenvalues[None, ~is_blind]).sum(axis=1)
-    deviations = scale * np.sqrt(variances)
+    has_information = eigenvalues >= RANK_TOLERANCE * eigenvalues[-1]
+    variances = 1.0 / eigenvalues[has_information]
+    squares = directions[:, has_information] ** 2
+    deviations = scale * np.sqrt(squares @ variances)
 
     # A parameter is undetermined if it takes part in a direction without information.
-    shares = np.abs(directions[:, is_blind])
+    shares = np.abs(directions[:, ~has_information])
     is_undetermined = (shares > MIN_SHARE).any(axis=1)
     return np.where(is_undetermined, np.inf, deviations)
 
