@@ -12,19 +12,19 @@ from .coefficient_limits import Grid, ScaledMotion, ScaledMotions
 from .problem import MAX_COARSE_EXCESS, ExcitationProblem
 
 EXCESS_PENALTY = 3.0
-"""Penalty of a relative excess beside the criterion's logarithm, where it is to be improved."""
+"""Penalty of a relative excess, added to the criterion's logarithm."""
 MAX_GROWTH = 1.05
 """Factor by which a motion is enlarged to fill its limits."""
 SLIGHT_SHRINKAGES = (0.9995, 0.998, 0.995, 0.99, 0.98, 0.96, 0.93, 0.9)
 """Factors by which a motion is made smaller that exceeds its constraints a little."""
 SHRINKAGE_STEP = 0.05
-"""Step of the factors by which a motion is made smaller until it keeps its constraints."""
+"""Step of the factors by which a motion is made smaller."""
 SAME_VALUE = 2e-5
-"""Difference of the criterion's logarithm below which two motions count as the same one."""
+"""Difference of two criteria's logarithms below which motions are the same."""
 
 
 class Candidates(NamedTuple):
-    """The best motion of each start so far, certified to keep the limits of the joints."""
+    """The best motion of each start so far, within the limits of the joints."""
 
     x: ScaledMotions  # scaled coefficients
     value: Float[AnyArray, " starts"]  # logarithm of the criterion, exact
@@ -52,11 +52,11 @@ class Candidates(NamedTuple):
         return np.asarray(self.x[self.order()[0]])
 
     def order(self) -> np.ndarray:
-        """Return the starts from best to worst; motions that keep their constraints come first."""
+        """Return the starts from best to worst, feasible motions first."""
         return np.lexsort((np.asarray(self.value), self.violation))
 
     def promising(self) -> np.ndarray:
-        """Return the starts, the most promising first: a small excess is soon mended."""
+        """Return the starts, the most promising first: a small excess counts little."""
         penalty = EXCESS_PENALTY * self.violation
         return np.argsort(np.asarray(self.value) + penalty, kind="stable")
 
@@ -65,7 +65,7 @@ class Candidates(NamedTuple):
         return Candidates(*(np.asarray(part)[places] for part in self))
 
     def improved(self, places: np.ndarray, others: "Candidates") -> "Candidates":
-        """Return the same motions, with others at some places where those are better."""
+        """Return these motions, with others at some places if those are better."""
         present_motions = self.at(places)
         is_smaller = others.violation < present_motions.violation
         is_as_small = others.violation == present_motions.violation
@@ -77,7 +77,7 @@ class Candidates(NamedTuple):
         return candidates
 
     def survivors(self, others: "Candidates") -> "Candidates":
-        """Return as many of both together as these are, the best first, duplicates last."""
+        """Return the best of both, as many as these are; duplicates come last."""
         pairs = zip(self, others, strict=True)
         all_motions = Candidates(*(np.concatenate(pair) for pair in pairs))
         ordered = all_motions.at(all_motions.order())
@@ -110,7 +110,7 @@ def evaluate(problem: ExcitationProblem, x: ScaledMotions) -> Candidates:
 
 
 def evaluate_within_limits(problem: ExcitationProblem, x: ScaledMotions) -> Candidates:
-    """Return motions after they were made to keep the limits of the joints for all times.
+    """Return motions that are made to keep the limits of the joints for all times.
 
     Where they almost keep the other constraints, they are made smaller until they do;
     without constraints they fill their limits where that is better.
@@ -136,7 +136,7 @@ def evaluate_within_limits(problem: ExcitationProblem, x: ScaledMotions) -> Cand
 def _shrink_slightly(
     problem: ExcitationProblem, grid: Grid, motion: np.ndarray
 ) -> np.ndarray:
-    """Return a motion that exceeds its constraints a little so small that it keeps them."""
+    """Return a smaller motion that keeps constraints which are exceeded a little."""
     if not 0.0 < problem.excess(motion) <= MAX_COARSE_EXCESS:
         return motion
     for factor in SLIGHT_SHRINKAGES:
@@ -147,7 +147,7 @@ def _shrink_slightly(
 
 
 def shrink_to_constraints(problem: ExcitationProblem, x: ScaledMotion) -> Candidates:
-    """Return a motion made so small that it keeps all constraints; unchanged if no size does."""
+    """Return a motion so small that it keeps all constraints, if any size does."""
     x = np.asarray(x)
     grid = problem.limits.grid()
 

@@ -1,4 +1,4 @@
-"""Limits of the joints as matrices: linear in the coefficients, and certified for all times.
+"""Limits of the joints as matrices: linear in the coefficients, for all times.
 
 The coefficients x of a trajectory are scaled, x = scale * y, so that each y alone meets
 a limit near one. All rows are scaled alike: a motion keeps its limits if |R y - c| <= 1
@@ -27,7 +27,7 @@ FILLED_FRACTION = 0.95
 
 
 class Extent(NamedTuple):
-    """Positions of a motion, and how much of the limits its joints use about their mean."""
+    """Positions of a motion, and the use of the limits about their means."""
 
     positions: Float[np.ndarray, "joints positions"]
     use: Float[np.ndarray, " joints"]
@@ -72,7 +72,7 @@ class Grid(NamedTuple):
         return self._move(y, factors, shifts)
 
     def shrink(self, y: ScaledMotion, factor: float) -> np.ndarray:
-        """Return a motion made smaller by a factor, each joint's about its mean position."""
+        """Return a smaller motion, each joint's about its mean position."""
         positions, use = self._measure(y)
         shifts = (1.0 - factor) * positions.mean(axis=1)
         return self._move(y, np.full(use.shape, factor), shifts)
@@ -80,7 +80,7 @@ class Grid(NamedTuple):
     def fill(
         self, y: ScaledMotion, places: Float[AnyArray, " joints"], size: float
     ) -> np.ndarray:
-        """Return a motion of the same shape that fills a fraction of 95 % of its limits.
+        """Return a motion of the same shape, of a size relative to 95 % of limits.
 
         `places` are those of the joints in the range that is left, from 0 to 1.
         """
@@ -100,7 +100,7 @@ class Grid(NamedTuple):
     def _shift_range(
         self, positions: np.ndarray, factors: np.ndarray, bound: float
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the least and largest shift that keep scaled positions in their range."""
+        """Return the shifts between which scaled positions keep their range."""
         centre = self.c[:, 0]
         low = centre - bound - factors * positions.min(axis=1)
         high = centre + bound - factors * positions.max(axis=1)
@@ -193,7 +193,7 @@ class JointLimits(eqx.Module):
         return (np.asarray(x) / np.asarray(self.scale)).ravel()
 
     def grid(self, points: int = 512) -> Grid:
-        """Return the limits on a grid of times; bases with many coefficients get more points."""
+        """Return the limits on a grid, which is finer for more coefficients."""
         envelope, factor = self.basis.envelope(scale_samples(points, self.basis))
         sizes = self._sizes
         scale = np.asarray(self.scale)[:, None]
@@ -217,7 +217,7 @@ class JointLimits(eqx.Module):
     def use(
         self, x: Float[AnyArray, "joints variables"]
     ) -> Float[np.ndarray, "4 joints"]:
-        """Return the largest used fraction of each limit by coefficients, for all times.
+        """Return the largest used fraction of each limit, for all times.
 
         The used fraction of a range is the distance from its middle, over half of the
         range.
@@ -232,7 +232,7 @@ class JointLimits(eqx.Module):
     def random(
         self, key: PRNGKeyArray, count: int, size: float = 1.0
     ) -> Float[np.ndarray, "count scaled"]:
-        """Draw motions of random shapes and places, of a size relative to 95 % of the limits."""
+        """Draw motions of random shapes, of a size relative to 95 % of the limits."""
         joints, variables = self.shape
         shape_key, place_key = jax.random.split(key)
         shapes = jax.random.normal(shape_key, (count, joints * variables), float)
@@ -252,5 +252,5 @@ def _unknown_limits(limits: Limits) -> tuple[tuple[str, int], ...]:
 
 
 def scale_samples(samples: int, basis: AbstractBasis) -> int:
-    """Return a number of samples that grows with the coefficients beyond five harmonics."""
+    """Return a number of samples that grows with the coefficients of a basis."""
     return samples * max(11, basis.variables) // 11

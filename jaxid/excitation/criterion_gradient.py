@@ -47,7 +47,7 @@ def value_and_gradient(
 def _information(
     problem: ExcitationProblem, columns: list[np.ndarray], weight: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return plain and weighted information from each joint's columns of the regressor."""
+    """Return plain and weighted information from the regressor's columns."""
     shape = (columns[0].shape[0], problem.base.size, problem.base.size)
     plain = np.zeros(shape)
     weighted = np.zeros(shape)

@@ -37,7 +37,7 @@ Solver = Callable[[ExcitationProblem, ScaledMotions], AnyArray]
 SEARCH_SHARE = 0.65
 """Share of a limited time after which only the limits are kept more closely."""
 MIN_IMPROVEMENT = 2e-3
-"""Relative improvement in the last quarter of the steps below which a design has converged."""
+"""Relative improvement in the last quarter of the steps of a converged design."""
 MAX_SHRUNK = 4
 """Motions that are made smaller where none keeps all constraints."""
 
@@ -75,7 +75,7 @@ def design_excitation(
     samples: int = 800,
     **settings: Any,
 ) -> ExcitationPlan:
-    r"""Find the motion that determines the base parameters best within all limits (Eq. 36).
+    r"""Find the motion that determines base parameters best within limits (Eq. 36).
 
     The problem is an `ExcitationProblem`, which `minimise` solves: that names further
     settings. The limits of the joints hold for all times, not only at samples. The same
@@ -216,7 +216,7 @@ class Outcome(NamedTuple):
 def _run_solver(
     problem: ExcitationProblem, x: ScaledMotions, solver: Solver
 ) -> Outcome:
-    """Improve motions by a given solver, then make them keep the limits of the joints."""
+    """Improve motions by a solver, then make them keep the limits of the joints."""
     candidates = evaluate_within_limits(problem, np.asarray(solver(problem, x)))
     history = [evaluate(problem, x).best_value, candidates.best_value]
     return Outcome(candidates, history, DesignStatus.GIVEN)

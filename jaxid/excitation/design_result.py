@@ -1,4 +1,4 @@
-"""A designed experiment: the motion, the expected deviations, and the use of the limits."""
+"""A designed experiment: motion, expected deviations, use of the limits."""
 
 import enum
 import functools
@@ -35,7 +35,7 @@ MAX_RELATIVE_DEVIATION = 0.5
 
 
 class DesignStatus(enum.StrEnum):
-    """How a design ended; whether its motion keeps all limits is `ExcitationPlan.feasible`."""
+    """How a design ended; `ExcitationPlan.feasible` says whether it keeps limits."""
 
     CONVERGED = "the last quarter of its steps hardly improved the motion"
     IMPROVING = "the last quarter of its steps still improved the motion"
@@ -44,7 +44,7 @@ class DesignStatus(enum.StrEnum):
 
 
 class Comparison(NamedTuple):
-    """A criterion's name, its value for a random motion in the same limits, and for the design."""
+    """A criterion's name, and its values for a random motion and for the design."""
 
     name: str
     before: float
@@ -112,7 +112,7 @@ class ExcitationPlan(Summarised, eqx.Module):
 
     @property
     def standard_deviations(self) -> BaseVector:
-        """Expected deviations of weighted least squares, in units of the parameters (Eq. 33).
+        """Expected deviations of weighted least squares (Eq. 33).
 
         Infinite for undetermined parameters. The noise is assumed to be independent
         from sample to sample, with the standard deviations `noise`, and to be the only
@@ -122,20 +122,20 @@ class ExcitationPlan(Summarised, eqx.Module):
 
     @property
     def relative_deviations(self) -> BaseVector:
-        """Standard deviations over the nominal parameters; NaN where those are unknown or zero."""
+        """Standard deviations over nominal parameters; NaN if unknown or zero."""
         size = np.abs(np.asarray(self.nominal))
         return self.standard_deviations / np.where(size > 0, size, np.nan)
 
     @property
     def gains(self) -> BaseVector:
-        """Factor by which each standard deviation is smaller than that of a random motion."""
+        """Factors by which standard deviations are below those of a random motion."""
         reference = standard_deviations(self.reference.weighted)
         with np.errstate(invalid="ignore"):
             return reference / self.standard_deviations
 
     @property
     def mean_gain(self) -> float:
-        """Geometric mean of the gains of all parameters that both motions determine, or NaN."""
+        """Geometric mean of the gains of what both motions determine, or NaN."""
         gains = self.gains
         is_determined = np.isfinite(gains) & (gains > 0)
         if not is_determined.any():
@@ -144,7 +144,7 @@ class ExcitationPlan(Summarised, eqx.Module):
 
     @property
     def use(self) -> Float[np.ndarray, "4 joints"]:
-        """Used fraction of the limits of position, velocity, acceleration, jerk, at all times."""
+        """Used fraction of the limits of position, speed, acceleration and jerk."""
         return self.limits.use(self.trajectory.coefficients)
 
     @property
@@ -157,7 +157,7 @@ class ExcitationPlan(Summarised, eqx.Module):
 
     @property
     def vague(self) -> tuple[str, ...]:
-        """Names of other base parameters whose deviation is above half of their nominal value."""
+        """Names of others whose deviation is above half of their nominal value."""
         is_vague = self.relative_deviations > MAX_RELATIVE_DEVIATION
         return self._names(is_vague & np.isfinite(self.standard_deviations))
 
@@ -188,7 +188,7 @@ class ExcitationPlan(Summarised, eqx.Module):
         )
 
     def _deviations_table(self) -> Table:
-        """Return the table of expected deviations, relative ones where values are known."""
+        """Return the table of expected deviations, also relative ones if known."""
         base = self.base
         columns = [
             Column("#", list(range(1, base.size + 1))),
@@ -216,7 +216,7 @@ class ExcitationPlan(Summarised, eqx.Module):
 
     @property
     def remarks(self) -> list[Remark]:
-        """Gain of the design, limits that are not kept, and parameters that are not determined."""
+        """Gain of the design, limits that are exceeded, undetermined parameters."""
         gain = self.mean_gain
         text = (
             f"Standard deviations are {gain:.3g} times smaller than a random motion's"

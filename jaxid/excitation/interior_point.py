@@ -1,4 +1,4 @@
-"""A primal-dual interior point method with quasi-Newton curvature, for many starts in lockstep.
+"""A primal-dual interior point method with quasi-Newton curvature, for many starts.
 
 Minimises f(y) subject to |R y - c| <= b, rows joint by joint, and to constraints that
 are not linear, which a common slack may exceed at a penalty. Each iteration evaluates
@@ -41,7 +41,7 @@ StepVector = Float[np.ndarray, " scaled_and_slack"]
 
 
 class Evaluation(NamedTuple):
-    """Objective, and constraints that are not linear, of one start, with their derivatives."""
+    """Objective and nonlinear constraints of one start, with their derivatives."""
 
     value: float
     gradient: ScaledVector
@@ -66,7 +66,7 @@ class Parts(NamedTuple):
 
 
 class Iterate(NamedTuple):
-    """Present point of one start, with its multipliers, and the step that is tried next."""
+    """Present point of one start, its multipliers, and the step that is next."""
 
     y: ScaledVector
     slack: SlackVector
@@ -102,7 +102,7 @@ class Stage(NamedTuple):
 def begin(
     grid: Grid, y: Float[np.ndarray, "starts scaled"], constraints: int = 0
 ) -> list[Iterate]:
-    """Return the iterates of some starts before the first stage, with a number of constraints."""
+    """Return the iterates of some starts before the first stage."""
     size = np.shape(y)[1]
     slack = np.zeros(1 if constraints else 0)
     duals = np.zeros(2 * grid.c.size + constraints + len(slack))
@@ -122,7 +122,7 @@ def run(
     iterates: list[Iterate],
     stage: Stage,
 ) -> list[Iterate]:
-    """Move the starts inside the bound of a stage, then iterate until all have converged.
+    """Move the starts inside the bound of a stage, and iterate to convergence.
 
     The objective evaluates points [points, scaled] of starts with these numbers.
     """
@@ -210,7 +210,7 @@ def _update(
 
 
 def _shorter_length(iterate: Iterate, increase: float) -> float:
-    """Return the length to the minimum of a parabola through what is known of the merit."""
+    """Return the length to the minimum of a parabola through the known merits."""
     length = iterate.length
     slope = iterate.slope
     minimum = -slope * length**2 / (2 * (increase - slope * length))
@@ -252,7 +252,7 @@ def _take_step(
 def _with_step(
     grid: Grid, stage: Stage, iterate: Iterate, room: Inequalities
 ) -> Iterate:
-    """Return one start with the step to the barrier's minimum, and how far it may go."""
+    """Return one start with the step to the barrier's minimum and its length."""
     stiffness = iterate.duals / room
     central = iterate.barrier / room
     downhill = _downhill(grid, stage, iterate, central)
@@ -319,7 +319,7 @@ def _downhill(
 
 
 def _solve(H: np.ndarray, downhill: np.ndarray) -> np.ndarray:
-    """Return the Newton step; where rounding makes the matrix indefinite, by its diagonal."""
+    """Return the Newton step; by the diagonal if rounding makes H indefinite."""
     try:
         factor = scipy.linalg.cho_factor(H, lower=True, check_finite=False)
         step = scipy.linalg.cho_solve(factor, downhill, check_finite=False)
@@ -373,7 +373,7 @@ def _longest_step(change: Inequalities, room: Inequalities) -> float:
 
 
 def _damped_bfgs(B: np.ndarray, s: np.ndarray, change: np.ndarray) -> np.ndarray:
-    """Return the damped BFGS update, which stays positive definite [1, procedure 18.2]."""
+    """Return the damped BFGS update, positive definite [1, procedure 18.2]."""
     Bs = B @ s
     expected_change = float(s @ Bs)
     actual_change = float(s @ change)
@@ -391,7 +391,7 @@ def _damped_bfgs(B: np.ndarray, s: np.ndarray, change: np.ndarray) -> np.ndarray
 def _cheapest_slack(
     stage: Stage, iterate: Iterate, excess: ConstraintVector
 ) -> SlackVector:
-    """Return the slack of least cost, with the barrier that keeps all constraints below it.
+    """Return the slack of least cost, the barrier included.
 
     So a step may exceed a constraint that bends: the slack follows, and is penalised.
     """

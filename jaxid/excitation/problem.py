@@ -1,4 +1,4 @@
-"""Design problem: criterion, limits and constraints as functions of one vector (Eq. 36)."""
+"""Design problem: criterion and constraints as functions of one vector (Eq. 36)."""
 
 from typing import Any
 
@@ -37,19 +37,19 @@ CHECKED_INSTANTS = 8160
 COARSE_STEP = 8
 """Instants from one to the next of a coarse check."""
 WATCHED_INSTANTS = np.arange(0, CHECKED_INSTANTS, CHECKED_INSTANTS // 48)
-"""Equidistant instants at which the worst value of each constraint is watched in a search."""
+"""Equidistant instants at which a search watches each constraint's worst value."""
 SEARCH_SAMPLES = 64
 """Samples on which motions with few coefficients are evaluated during a search."""
 MARGIN = 1e-3
-"""Relative distance that is kept from constraints, for what happens between instants."""
+"""Relative distance kept from constraints, for what happens between instants."""
 MIN_COARSE_ROOM = 0.02
-"""Relative distance from all limits from which a coarse check tells that they are kept."""
+"""Relative distance from all limits from which a coarse check suffices."""
 MAX_COARSE_EXCESS = 0.1
-"""Relative excess from which a coarse check tells that a motion is far from its limits."""
+"""Relative excess above limits from which a coarse check suffices."""
 
 
 class ExcitationProblem:
-    """The problem of finding a motion that determines the base parameters well (Eq. 36).
+    """The problem of a motion that determines the base parameters well (Eq. 36).
 
     Its unknown is one vector x of scaled coefficients: each of them alone meets a limit
     of its joint near one. `value`, `inequalities` and `violation` are functions of x
@@ -134,7 +134,7 @@ class ExcitationProblem:
         self.sizes = self._typical_sizes()
 
     def _typical_sizes(self) -> Float[np.ndarray, " base"]:
-        """Return the deviation of each parameter in random motions if it were the only one."""
+        """Return each parameter's deviation if it were the only one."""
         motions = self.limits.random(jax.random.key(0), 8)
         weighted = [self.information(x).weighted for x in motions]
         squares = np.mean([np.diag(matrix) for matrix in weighted], axis=0)
@@ -150,7 +150,7 @@ class ExcitationProblem:
         return self.basis.trajectory(self.limits.coefficients(x))
 
     def random(self, key: PRNGKeyArray) -> Float[Array, " scaled"]:
-        """Draw a random motion that fills the limits of the joints, as scaled coefficients."""
+        """Draw scaled coefficients of a motion that fills the limits of the joints."""
         return self.limits.random(key, 1)[0]
 
     def value(
@@ -186,7 +186,7 @@ class ExcitationProblem:
         return self.criterion(Information(plain, weighted, self.sizes), sharpness)
 
     def inequalities(self, x: ScaledMotion) -> Float[Array, " inequalities"]:
-        """Return what must not be positive: relative excess over all limits and constraints.
+        """Return what must not be positive: excess over limits and constraints.
 
         Limits of the joints hold for all times if these are not positive. Constraints
         are evaluated at equidistant instants, with a small margin.
@@ -202,7 +202,7 @@ class ExcitationProblem:
         return jnp.concatenate(excess)
 
     def violation(self, x: ScaledMotion) -> Scalar:
-        """Return the largest relative excess over all limits and constraints, for all times.
+        """Return the largest excess over limits and constraints, for all times.
 
         Args:
             x: Scaled coefficients.
@@ -243,7 +243,7 @@ class ExcitationProblem:
         return information(self.base, motion, self.weights, self.prior, self.sizes)
 
     def excess(self, x: ScaledMotion) -> float:
-        """Return the largest excess over constraints for all times; minus infinity if none."""
+        """Return the largest excess over constraints; minus infinity if none."""
         if not self.constraints:
             return -np.inf
         coarse_excess = self._largest_excess(x, slice(None, None, COARSE_STEP))
@@ -268,14 +268,14 @@ class ExcitationProblem:
 
 
 def assumed_noise(robot: Robot) -> Float[np.ndarray, " joints"]:
-    """Return standard deviations of the forces' noise where none are given [N m or N]."""
+    """Return the assumed standard deviations of the forces' noise [N m or N]."""
     return 0.01 * np.asarray(robot.max_forces)
 
 
 def highest_values(
     values: Float[AnyArray, "instants values"],
 ) -> Float[AnyArray, " values"]:
-    """Return the highest of each value, also between instants: the tops of parabolas."""
+    """Return the highest values, also between instants: tops of parabolas."""
     xp = namespace(values)
     previous_values = values[:-2]
     middle_values = values[1:-1]

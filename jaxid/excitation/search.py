@@ -53,8 +53,10 @@ SCHEDULE = (
     Stage(0.998, 1e-3, 1e-6, 125, 8.0),
     Stage(0.998, 1e-3, 1e-6, 150, 20.0),
 )
-"""Relaxed limits, then the limits (0.998 leaves room for rounding); slightly relaxed once more;
-sharper in the end."""
+"""Relaxed limits, then the limits; slightly relaxed once more; sharper in the end.
+
+The bound 0.998 leaves room for rounding.
+"""
 CONSTRAINED_SCHEDULE = (
     Stage(1.25, 1e-2, 1e-3, 50),
     Stage(0.998, 1e-3, 1e-4, 75, 4.0, 30.0),
@@ -64,7 +66,7 @@ CONSTRAINED_SCHEDULE = (
     Stage(0.998, 1e-4, 1e-6, 100, 20.0, 100.0),
     Stage(0.998, 1e-4, 1e-6, 50, 20.0, 100.0),
 )
-"""The same where there are constraints: exceeding them becomes more and more expensive."""
+"""The same with constraints: exceeding them becomes more and more expensive."""
 GENERATION_STAGE = Stage(0.998, 1e-3, 1e-6, 150, 20.0, 100.0)
 """Improvement of children."""
 FINE_STAGE = Stage(0.998, 1e-4, 1e-6, 300, 20.0, 100.0)
@@ -118,7 +120,7 @@ def search(
     Args:
         problem: Problem to be solved.
         x: Motions to start from.
-        candidates: The same motions within limits; with constraints the first one alone.
+        candidates: The same motions within limits; with constraints only the first.
         generations: Number of generations.
         random: Generator of the children.
         deadline: Time of `time.monotonic` after which only the fine grid follows [s].
@@ -158,7 +160,7 @@ def search(
 def _find_feasible_motion(
     problem: ExcitationProblem, x: np.ndarray, candidates: Candidates
 ) -> Search:
-    """Look for one motion that keeps all constraints; return it before the other starts."""
+    """Look for a motion that keeps all constraints; return it as the first start."""
     for motion in x[1:]:
         if candidates.is_feasible:
             break
@@ -265,7 +267,7 @@ def _take(
     places: np.ndarray,
     iterates: list[Iterate],
 ) -> Candidates:
-    """Return the best motions, at some places those of iterates where they are better."""
+    """Return the best motions, with those of iterates at some places if better."""
     x = np.array([iterate.y for iterate in iterates])
     return candidates.improved(places, evaluate_within_limits(problem, x))
 
@@ -273,7 +275,7 @@ def _take(
 def _feasible_places(
     problem: ExcitationProblem, random: np.random.Generator, count: int
 ) -> Float[np.ndarray, "count joints"]:
-    """Return random poses, as places in the joints' ranges, that keep the constraints best."""
+    """Return random places in the joints' ranges that keep constraints best."""
     limits = problem.limits.limits
     low = np.asarray(limits.position_min)
     high = np.asarray(limits.position_max)
@@ -292,7 +294,7 @@ def first_motions(
     random: np.random.Generator,
     x: ScaledMotions,
 ) -> ScaledMotions:
-    """Return as many small motions that keep the constraints best, the largest of them first.
+    """Return small motions that keep the constraints, the largest first.
 
     They have the shapes of given motions, about poses at which the robot may stand
     still.

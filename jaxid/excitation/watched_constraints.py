@@ -60,7 +60,7 @@ def watch(problem: ExcitationProblem, x: ScaledMotion) -> list[WatchedValues]:
 
 
 def watched_excess(problem: ExcitationProblem, x: ScaledMotion) -> float:
-    """Return the largest excess of the constraints at the equidistant watched instants."""
+    """Return the largest excess of the constraints at equidistant instants."""
     values = problem.constraint_values(x, WATCHED_INSTANTS)
     return max((float(each.max()) for each in values), default=-np.inf)
 
@@ -70,7 +70,7 @@ def linearise(
     x: ScaledMotions,
     watched: Sequence[list[WatchedValues]],
 ) -> WatchedSlopes:
-    """Return watched values of several motions, and their derivatives by each motion."""
+    """Return watched values of several motions, and their derivatives."""
     starts, size = x.shape
     values = [np.zeros((starts, 0))]
     slopes = [np.zeros((starts, 0, size))]

@@ -36,7 +36,7 @@ class Controller(NamedTuple):
 def write_urscript(
     trajectory: AbstractTrajectory, robot: Robot, path: Path, sample_time: float
 ) -> None:
-    """Write a program in URScript: slowly to the start, then one `servoj` for each cycle.
+    """Write a program in URScript: to the start, then one `servoj` a cycle.
 
     Positions are rounded to 1e-9 rad.
     """
@@ -57,7 +57,7 @@ def write_urscript(
 def write_rsi(
     trajectory: AbstractTrajectory, robot: Robot, path: Path, sample_time: float
 ) -> None:
-    """Write a table of corrections for RSI: degrees from the first position, one row a cycle."""
+    """Write a table for RSI: degrees from the first position, one row a cycle."""
     q = trajectory.sample(sample_time)[1].q
     angles = np.rad2deg(q - q[0])
     columns = {f"AK.A{j + 1} [deg]": angles[:, j] for j in range(robot.joints)}

@@ -1,4 +1,4 @@
-"""Files of trajectories: exact JSON for this package, CSV tables and ROS messages for others."""
+"""Files of trajectories: exact JSON, CSV tables, ROS messages."""
 
 import json
 import re
@@ -38,7 +38,7 @@ ARRAYS = ("positions", "velocities", "accelerations", "effort")
 
 
 def save_trajectory(trajectory: AbstractTrajectory, path: str | Path) -> None:
-    """Write a trajectory so that `load_trajectory` returns the same numbers, bit by bit.
+    """Write a trajectory so that `load_trajectory` returns the same bits.
 
     Args:
         trajectory: Any trajectory.
@@ -91,7 +91,7 @@ def write_csv(
     *,
     sample_time: float,
 ) -> None:
-    """Write a table of samples: time, positions, velocities and accelerations of all joints.
+    """Write a table of times, positions, velocities and accelerations.
 
     The header names joint and unit: `time [s],q_joint1 [rad],...,qdd_joint1
     [rad/s^2],...`.
@@ -122,7 +122,7 @@ def write_ros(
     *,
     sample_time: float,
 ) -> None:
-    """Write the ROS 2 message `trajectory_msgs/JointTrajectory` as YAML, or as a bag (`.mcap`).
+    """Write a ROS 2 `trajectory_msgs/JointTrajectory` as YAML or bag (`.mcap`).
 
     The bag holds the message on the topic of a `joint_trajectory_controller`, and needs
     the extra `logs`. YAML begins with comments that say units and cycle, and how to

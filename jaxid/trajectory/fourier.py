@@ -1,4 +1,4 @@
-"""Fourier series: periodic, or between standstills, with exact derivatives (Eqs. 34, 35)."""
+"""Fourier series: periodic, or between standstills (Eqs. 34, 35)."""
 
 import dataclasses
 import math
@@ -77,9 +77,9 @@ class FourierBasis(AbstractBasis):
         return xp.stack([xp.concatenate(parts, axis=1) for parts in orders])
 
     def envelope(self, points: int) -> Envelope:
-        r"""Return samples of a period: $\max |p| \le \max_k |p(t_k)| / \cos(\pi n / M)$.
+        r"""Return samples of a period, which bound the series.
 
-        The bound holds for every trigonometric polynomial of degree n at M > 2 n
+        The bound $\max |p| \le \max_k |p(t_k)| / \cos(\pi n / M)$ holds for every trigonometric polynomial of degree n at M > 2 n
         equidistant points (Ehlich and Zeller).
         """
         points = max(points, 2 * self.harmonics + 1)
@@ -88,7 +88,7 @@ class FourierBasis(AbstractBasis):
 
 
 class PeriodsBasis(AbstractBasis):
-    """Whole periods of a Fourier series between two standstills: base of two families."""
+    """Periods of a Fourier series between two standstills: base of two bases."""
 
     harmonics: int = eqx.field(static=True)
     omega: Float[AnyArray, ""] = eqx.field(converter=as_scalar)
@@ -135,14 +135,14 @@ class RestToRestBasis(PeriodsBasis):
 
     @property
     def directions(self) -> Float[np.ndarray, "coefficients variables"]:
-        """Orthonormal coefficients of the series that keep a joint at rest at both ends."""
+        """Orthonormal coefficients of the series that rest at both ends."""
         orders = np.arange(1.0, self.harmonics + 1.0)
         a = null_space(np.ones((1, self.harmonics)))
         b = null_space(orders[None])
         return np.asarray(block_diag(np.ones((1, 1)), a, b))
 
     def rows(self, t: Times) -> Rows:
-        """Return sines and cosines in the directions that keep the joint at rest at both ends."""
+        """Return sines and cosines in the directions that rest at both ends."""
 
         def series_rows(t: AnyArray) -> AnyArray:
             return self.series.rows(t) @ self.directions
@@ -186,7 +186,7 @@ def random_fourier_series(
     reach: float = 0.95,
     seed: int = 0,
 ) -> LinearTrajectory:
-    """Draw a Fourier series that uses the limits of every joint: a start for designs and tests.
+    """Draw a Fourier series that uses the limits of every joint.
 
     The coefficients are normal random numbers divided by the order of their harmonic.
     Each joint is scaled until it meets its tightest limit, and its offset is uniform in
@@ -241,7 +241,7 @@ def random_fourier_series(
 
 
 def complete_limits(robot: Robot) -> Limits:
-    """Return the limits of a robot, with assumed positions, speeds and accelerations if unknown.
+    """Return the limits of a robot, with assumed ones for those that are unknown.
 
     Assumed are: half a turn or 1 m to either side; 90 degrees/s or 0.5 m/s; the
     acceleration that reaches the largest speed in 0.25 s.

@@ -1,4 +1,4 @@
-"""Leads: from standstill into a periodic motion and out of it, within the limits of the joints."""
+"""Leads: from standstill into a periodic motion, and out of it."""
 
 import math
 from typing import Any, NamedTuple
@@ -26,7 +26,7 @@ from .trajectory import (
 
 
 def _lead(state: Any, duration: Any, x: Any, sign: int = 1) -> list:
-    r"""Return position, velocity, acceleration and jerk of a lead at times x from standstill [s].
+    r"""Return position and three derivatives of a lead, x after standstill [s].
 
     The velocity is $\alpha x^2 + \beta x^3$. The lead meets a motion in a state (q, qd,
     qdd). A lead-out (`sign` -1) is a lead-in (1) that is run backwards.
@@ -59,7 +59,7 @@ PHASES = 360
 
 
 class LeadsBasis(PeriodsBasis):
-    """Fourier series with a lead-in and a lead-out; the coefficients are those of the series.
+    """Fourier series with a lead-in and a lead-out.
 
     All joints start together and take the time `lead` into the series, and out of it at
     the end. Limits and constraints hold in the leads as well, unlike with `with_leads`,
@@ -105,12 +105,12 @@ class LeadsBasis(PeriodsBasis):
         return stand_outside(moving, t, self.duration)
 
     def _lead_rows(self, x: AnyArray, sign: int) -> AnyArray:
-        """Return the rows of the lead-in (1) or lead-out (-1) at times from standstill."""
+        """Return the rows of the lead-in (1) or lead-out (-1), x from standstill."""
         state = self.series.rows(np.zeros(1))[:3]
         return namespace(x, self.omega).stack(_lead(state, self.lead, x[:, None], sign))
 
     def envelope(self, points: int) -> Envelope:
-        """Return samples of a period, as for any series, and control points of the leads.
+        """Return samples of a period, and control points of the leads.
 
         A polynomial lies within the range of its control points (Bernstein). A lead is
         split into pieces, each of which is bounded by its own control points.
@@ -138,7 +138,7 @@ class LeadsBasis(PeriodsBasis):
 
 
 def _to_control_points(degree: int) -> Float[np.ndarray, "points samples"]:
-    """Return the matrix from equidistant values of a polynomial to its control points."""
+    """Return the matrix from values of a polynomial to its control points."""
     orders = np.arange(degree + 1)
     u = np.linspace(0.0, 1.0, degree + 1)[:, None]
     binomials = np.array([math.comb(degree, order) for order in orders])
@@ -147,7 +147,7 @@ def _to_control_points(degree: int) -> Float[np.ndarray, "points samples"]:
 
 
 class WithLeads(AbstractTrajectory):
-    """A motion between a lead-in from standstill and a lead-out to standstill, smooth throughout.
+    """A motion between a lead-in from standstill and a lead-out to standstill.
 
     Position, velocity and acceleration are continuous. Every joint takes its own time;
     all arrive together. `with_leads` chooses the times within limits.
@@ -168,7 +168,7 @@ class WithLeads(AbstractTrajectory):
 
     @property
     def window(self) -> tuple[Float[AnyArray, ""], Float[AnyArray, ""]]:
-        """Times between which the inner motion is followed [s]: the part to be measured."""
+        """Times between which the inner motion is followed and measured [s]."""
         begin = jnp.max(jnp.asarray(self.lead_in))
         return begin, begin + self.length
 
@@ -245,8 +245,8 @@ def with_leads(
         raise InputError(
             "no instant of the period can be reached from standstill within the "
             f"limits: at best joint `{robot.joint_names[joint]}` exceeds one of them "
-            f"by {100 * excess[nearest_phase, joint]:.3g} %: take a motion that uses less of "
-            "the limits."
+            f"by {100 * excess[nearest_phase, joint]:.3g} %: take a motion that uses "
+            "less of the limits."
         )
     return WithLeads(
         series,

@@ -1,4 +1,4 @@
-"""Paths of the end-effector in space, the path of ISO 9283, and the joints' motion along a path."""
+"""Paths of the end-effector, and the joints' motion along a path."""
 
 import itertools
 import math
@@ -87,7 +87,7 @@ UNIT_ACCELERATION = 10.0 / np.sqrt(3.0)
 
 
 class TipPath(eqx.Module):
-    """Curves that the end-effector follows one after the other, at rest where they meet.
+    """Curves that the end-effector follows in turn, at rest where they meet.
 
     The attitude stays constant. Along a curve the fraction of the length is the
     polynomial $10 u^3 - 15 u^4 + 6 u^5$ of the fraction $u$ of its time: speed and
@@ -151,7 +151,7 @@ class TipPath(eqx.Module):
         return float(sum(self.durations))
 
     def positions(self, t: Times) -> Float[np.ndarray, "samples 3"]:
-        """Return positions of the end-effector [m] at times [s]; it stands still outside."""
+        """Return positions of the end-effector [m] at times [s]."""
         t = np.asarray(t)
         ends = np.cumsum(self.durations)
         starts = ends - self.durations
@@ -174,7 +174,7 @@ def iso9283_path(
     speed: float = 1.0,
     acceleration: float = 4.0,
 ) -> TipPath:
-    """Return the verification path: straight lines, a rectangle and two circles (Fig. 8).
+    """Return the verification path: lines, a rectangle and two circles (Fig. 8).
 
     The paper takes it from the standard ISO 9283. An inclined plane passes through two
     opposite horizontal edges of a cube whose edges are along x, y and z. On it lie the

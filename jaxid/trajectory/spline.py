@@ -1,4 +1,4 @@
-"""Piecewise polynomials, and quintic B-splines between standstills with a continuous jerk."""
+"""Piecewise polynomials, and quintic B-splines between standstills."""
 
 import functools
 import math
@@ -26,7 +26,7 @@ DEGREE = 5
 
 
 class PiecewisePolynomial(AbstractTrajectory):
-    """Polynomials of time that follow one another; standstill before the start and after the end.
+    """Polynomials of time that follow one another; standstill outside.
 
     Attributes:
         times: Start of each polynomial, and the end of the last one [s].
@@ -52,7 +52,7 @@ def _evaluate(
     coefficients: Float[AnyArray, "powers pieces columns"],
     t: Times,
 ) -> Float[AnyArray, "4 samples columns"]:
-    """Return a `PiecewisePolynomial` and three derivatives, constant outside its times [s]."""
+    """Return a `PiecewisePolynomial` and three derivatives at times [s]."""
     xp = namespace(times, coefficients, t)
     times, coefficients, t = (xp.asarray(x) for x in (times, coefficients, t))
     start = times[0]
@@ -111,7 +111,7 @@ class RestToRestSplineBasis(AbstractBasis):
         return derivatives / (self.duration ** np.arange(4.0))[:, None, None]
 
     def envelope(self, points: int) -> Envelope:
-        """Return the control points of each derivative: a spline lies within their range.
+        """Return the control points of each derivative, which bound the spline.
 
         The more knots it is written with, the closer they lie to it.
         """
@@ -133,7 +133,7 @@ class RestToRestSplineBasis(AbstractBasis):
 
 
 def spline_through(points: Numbers, duration: float) -> LinearTrajectory:
-    """Return a quintic spline through points at equal times that stands still at both ends.
+    """Return a quintic spline through points that stands still at both ends.
 
     Args:
         points: Start, way points and end, one row each [rad or m].
@@ -158,13 +158,13 @@ def spline_through(points: Numbers, duration: float) -> LinearTrajectory:
 def interpolate_at_rest(
     t: Times, points: Float[np.ndarray, "points joints"]
 ) -> BSpline:
-    """Return the quintic spline through points at some times that stands still at both ends."""
+    """Return the quintic spline through points at times, at rest at both ends."""
     conditions = [(order, np.zeros(points.shape[1])) for order in (1, 2)]
     return make_interp_spline(t, points, DEGREE, bc_type=(conditions, conditions))
 
 
 def spline_polynomials(spline: BSpline) -> Float[np.ndarray, "powers pieces columns"]:
-    """Return the pieces of a clamped quintic spline in powers of the time since their start."""
+    """Return the pieces of a clamped spline in powers of time since their start."""
     knots = spline.t[DEGREE:-DEGREE]
     starts = knots[:-1]
     middles = 0.5 * (knots[:-1] + knots[1:])
@@ -179,7 +179,7 @@ def spline_polynomials(spline: BSpline) -> Float[np.ndarray, "powers pieces colu
 
 @functools.cache
 def _unit_polynomials(points: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return starts over [0, 1] and coefficients of the splines whose coefficients are units."""
+    """Return starts and polynomials of the splines with unit coefficients."""
     unit = np.eye(points)
     control_points = np.concatenate([unit[:1], unit[:1], unit, unit[-1:], unit[-1:]])
     knots = _clamped_knots(points + 4 - DEGREE, DEGREE)

@@ -1,4 +1,4 @@
-"""Trajectories: motions of all joints as functions of time, and bases of families of them.
+"""Trajectories: motions of all joints as functions of time, and their bases.
 
 In a family each joint's motion is a basis of functions times the joint's coefficients.
 """
@@ -27,14 +27,14 @@ from jaxid.errors import InputError
 SHIFTS = 40
 """Times of a period at which a periodic motion may begin."""
 RETIMING_TOLERANCE = 1e-9
-"""Relative error up to which a motion that begins at another time is one of the family."""
+"""Relative error up to which a retimed motion is one of the family."""
 
 Time = Float[AnyArray, ""] | float
 """One time [s]."""
 Times = Float[AnyArray, " samples"]
 """Times of samples [s]."""
 Rows = Float[AnyArray, "4 samples variables"]
-"""Position, velocity, acceleration and jerk of each function of a basis at some times."""
+"""Position, velocity, acceleration and jerk of each function of a basis."""
 Coefficients = Float[AnyArray, "joints variables"]
 """Coefficients of a trajectory, one row for each joint."""
 States = tuple[Float[AnyArray, "samples joints"], ...]
@@ -42,7 +42,7 @@ States = tuple[Float[AnyArray, "samples joints"], ...]
 
 
 def as_scalar(value: Any) -> Any:
-    """Return one number as an array, so that compiled functions do not depend on its value."""
+    """Return a number as an array: compiled functions are the same for all values."""
     return value if isinstance(value, jax.Array) else np.array(value, np.float64)
 
 
@@ -52,7 +52,7 @@ class AbstractTrajectory(Hashable):
     @property
     @abstractmethod
     def duration(self) -> Time:
-        """Time from the start at zero to the end [s]; one period of a periodic motion."""
+        """Time from the start to the end, or period of a periodic motion [s]."""
 
     @abstractmethod
     def states(self, t: Times) -> States:
@@ -70,7 +70,7 @@ class AbstractTrajectory(Hashable):
     def jerk(
         self, t: Float[AnyArray, "*batch"] | float | int
     ) -> Float[Array, "*batch joints"]:
-        """Return the rate of change of the accelerations [rad/s³ or m/s³] at times [s]."""
+        """Return the derivatives of accelerations [rad/s³ or m/s³] at times [s]."""
         times = jnp.asarray(t, float)
         ones = jnp.ones_like(times)
         _, jerk = jax.jvp(lambda t: self.motion(t).qdd, (times,), (ones,))
@@ -79,7 +79,7 @@ class AbstractTrajectory(Hashable):
     def sample(
         self, sample_time: float
     ) -> tuple[Float[np.ndarray, " samples"], Motion]:
-        """Return times [s] from the start to the end, both included, and the motion at them.
+        """Return times from the start to the end [s], and the motion at them.
 
         Args:
             sample_time: Largest time between two samples [s].
@@ -107,7 +107,7 @@ def _motion(trajectory: AbstractTrajectory, t: Array) -> Motion:
 
 
 class PaddedToCycle(AbstractTrajectory):
-    """A motion that ends at rest, padded with its final pose to a whole number of cycles.
+    """A motion that is padded with its final pose to a whole number of cycles.
 
     Attributes:
         inner: The motion.
@@ -129,13 +129,13 @@ class PaddedToCycle(AbstractTrajectory):
 
 
 def count_cycles(duration: float, sample_time: float) -> int:
-    """Return the number of a controller's cycles [s] after which a motion [s] has ended."""
+    """Return the number of a controller's cycles in which a motion ends."""
     # A motion may end a millionth of a cycle later, for rounding.
     return max(math.ceil(duration / sample_time - 1e-6), 1)
 
 
 Envelope = tuple[tuple[Float[np.ndarray, "rows variables"], ...], float]
-"""Rows for each order of derivative, and a factor of at least 1; see `AbstractBasis.envelope`."""
+"""Rows for each order of derivative, and a factor; see `AbstractBasis`."""
 
 
 class AbstractBasis(eqx.Module):
@@ -159,14 +159,14 @@ class AbstractBasis(eqx.Module):
 
     @abstractmethod
     def rows(self, t: Times) -> Rows:
-        """Return position, velocity, acceleration and jerk of every function at times [s].
+        """Return every function and its three derivatives at times [s].
 
         Times in NumPy give rows in NumPy.
         """
 
     @abstractmethod
     def envelope(self, points: int) -> Envelope:
-        """Return rows whose largest value bounds the motion at all times, and their factor.
+        """Return rows whose largest value bounds the motion, and their factor.
 
         For coefficients x of a joint, |f(t) - c| <= factor * max |rows[k] @ x - c| at
         every time t, where f is the derivative of order k (from 0 to 3) of the joint's
@@ -187,15 +187,15 @@ class AbstractBasis(eqx.Module):
         return self.rows(np.zeros(1)).shape[2]
 
     def times(self, samples: int) -> Times:
-        """Return equidistant times at which a run is measured, without their end [s]."""
+        """Return equidistant times at which a run is measured [s]."""
         return np.arange(samples) * (float(self.duration) / samples)
 
     def instants(self, points: int) -> Times:
-        """Return equidistant times over the whole motion, for limits that hold throughout [s]."""
+        """Return equidistant times over the whole motion, for constraints [s]."""
         return self.times(points)
 
     def retimings(self) -> Float[np.ndarray, "retimings variables variables"]:
-        """Return maps to the coefficients of the same motion begun later or run backwards.
+        """Return maps to coefficients of the same motion, begun later or reversed.
 
         Only maps that stay in the family are returned: a periodic motion may begin at
         any of 40 times, a motion between standstills may run backwards. The first map
@@ -246,7 +246,7 @@ def stand_outside(
     t: Times,
     duration: AnyArray | float,
 ) -> Rows:
-    """Return rows of a motion that stands still before zero and after its duration [s]."""
+    """Return rows of a motion that stands still outside of its duration [s]."""
     xp = namespace(t, as_scalar(duration))
     # Written with `where`, because the derivative of `clip` at its ends is one half.
     is_before = t < 0.0

@@ -1,4 +1,4 @@
-"""Constraints of a motion beside the limits of the joints: forces, end-effector, collisions."""
+"""Constraints of a motion: forces, end-effector, collisions."""
 
 from .clearance import Clearance as Clearance
 from .constraint import AbstractConstraint as AbstractConstraint, Finding as Finding

@@ -57,6 +57,6 @@ class Clearance(AbstractConstraint):
 
 
 def used_fraction(distance: float, value: float) -> float:
-    """Return the required distance over the remaining one; infinite where shapes touch."""
+    """Return the required distance over the present one; infinite at contact."""
     gap = distance - SIZE * value
     return distance / gap if gap > 0 else math.inf

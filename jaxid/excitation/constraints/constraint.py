@@ -1,4 +1,4 @@
-"""A constraint of a motion: how far each limited quantity is above its limit, and in words."""
+"""A constraint of a motion: excess of each quantity over its limit, and words."""
 
 import math
 from abc import abstractmethod
@@ -15,7 +15,7 @@ from jaxid.dynamics.motion import Motion
 from jaxid.robot.robot import Robot
 
 BLOCK = 96
-"""Samples for which derivatives are compiled: those that the search watches of one motion."""
+"""Samples for which derivatives are compiled: those watched of one motion."""
 
 
 class Finding(NamedTuple):
@@ -84,7 +84,7 @@ ValuesAndSlopes = tuple[
 Derivatives by qd and qdd may be left out where values depend on q only.
 """
 Linearisation = Callable[[Motion, Int[np.ndarray, " samples"]], ValuesAndSlopes]
-"""Function of a motion, with one axis of samples, and of the entry that counts at each sample."""
+"""Function of a motion [samples], and of the entry that counts at each sample."""
 
 
 class AbstractConstraint(eqx.Module):
@@ -97,7 +97,7 @@ class AbstractConstraint(eqx.Module):
 
     @abstractmethod
     def __call__(self, robot: Robot, motion: Motion) -> Float[Array, "*batch values"]:
-        """Return the excess over each limit at each sample; zero or negative where it is kept.
+        """Return the excess over each limit at each sample; not positive if kept.
 
         Runs under `jit`, `vmap` and derivatives with respect to the motion.
 
@@ -108,10 +108,10 @@ class AbstractConstraint(eqx.Module):
 
     @abstractmethod
     def entries(self, robot: Robot) -> tuple[Finding, ...]:
-        """Return the limited quantities in the order of the values, without their values."""
+        """Return the limited quantities in the order of the values."""
 
     def linearisation(self, robot: Robot) -> Linearisation:
-        """Return a function in NumPy of a motion and the entry that counts at each sample.
+        """Return a function of a motion and the entry that counts at each sample.
 
         It returns the values of the entries and their derivatives. This one is compiled
         by JAX; a constraint that knows its derivatives in NumPy returns its own.

@@ -38,7 +38,7 @@ def _numbers(name: str, x: Any) -> Any:
 
 
 class ForceLimits(AbstractConstraint):
-    r"""Limits of the joints' forces and of the motors' torques, with room for their uncertainty.
+    r"""Limits of the joints' forces and the motors' torques, with uncertainty.
 
     $$|Q_i| + k\,\sigma_i \le (1 - m)\,Q_{i,max}$$
 
@@ -139,7 +139,7 @@ class ForceLimits(AbstractConstraint):
     def _largest_forces(
         self, motion: Motion, shares: np.ndarray, limits: np.ndarray
     ) -> ValuesAndSlopes:
-        """Return the largest size of a force at each sample, and slopes over the limit."""
+        """Return the largest force of each sample, and slopes over the limit."""
         forces = np.einsum("tsj,tj->ts", self._forces(motion), shares)
         sides = np.abs(forces).argmax(axis=1)
         samples = np.arange(len(limits))
@@ -154,7 +154,7 @@ class ForceLimits(AbstractConstraint):
     def _deviations(
         self, motion: Motion, shares: np.ndarray, limits: np.ndarray
     ) -> ValuesAndSlopes:
-        """Return the room for the uncertainty at each sample, and slopes over the limit."""
+        """Return the uncertainty of each sample, and slopes over the limit."""
         base = self.base
         regressor = np.asarray(base.regressor(motion))
         rows = np.einsum("tjb,tj->tb", regressor, shares)
@@ -173,7 +173,7 @@ class ForceLimits(AbstractConstraint):
     def forces(
         self, q: Coordinates, qd: Coordinates, qdd: Coordinates
     ) -> Float[Array, "3 joints"]:
-        """Return the forces of one sample: as expected, and with dry friction to either side."""
+        """Return the forces of one sample, also with friction to either side."""
         model = self.base.model
         p = self.base.to_standard(jnp.asarray(self.parameters))
         speeds = REVERSAL_SPEED * np.asarray(complete_limits(model.robot).velocity)
@@ -227,7 +227,7 @@ def _pull_back(
     weights: np.ndarray,
     arrays: tuple[AnyArray, ...],
 ) -> list[np.ndarray]:
-    """Return derivatives of weighted results of a method for one sample, for rows of samples."""
+    """Return derivatives of weighted results of a method, for rows of samples."""
     program = program_of(owner, definition, *(x.shape[1:] for x in arrays))
     packed_weights = weights.reshape(len(weights), -1).T
     columns = [np.asarray(x).T for x in arrays]

@@ -18,7 +18,7 @@ from jaxid.robot.robot import Robot
 from .constraint import AbstractConstraint, Finding
 
 SMOOTHING = 1e-6
-"""Excess by which a rate over its limit is too large at standstill, where it is smooth."""
+"""Value of a rate over its limit at standstill, where it is made smooth."""
 
 
 def tip_motion(robot: Robot, motion: Motion) -> tuple[Float[AnyArray, "*batch 3"], ...]:

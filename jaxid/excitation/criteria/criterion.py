@@ -47,7 +47,7 @@ class AbstractCriterion(eqx.Module):
 
 
 class ConditionNumber(AbstractCriterion):
-    r"""Criterion of the paper: condition number of $\Lambda = \Theta_B^T \Theta_B$ (Eq. 36).
+    r"""Criterion of the paper: condition number of $\Theta_B^T \Theta_B$ (Eq. 36).
 
     It depends on the choice of base parameters, and a small one need not mean small
     standard deviations; use it for comparison.
@@ -101,7 +101,7 @@ class DOptimal(AbstractCriterion):
 
 
 class AOptimal(AbstractCriterion):
-    """Root mean square of the standard deviations, each divided by its parameter's size.
+    """Root mean square of the standard deviations, each over its parameter's size.
 
     Attributes:
         sizes: Sizes of the base parameters, in their units; by default the standard

@@ -1,4 +1,4 @@
-"""Functions of a positive matrix's eigenvalues, differentiable where these are equal."""
+"""Functions of eigenvalues, differentiable where these are equal."""
 
 import functools
 from collections.abc import Callable
@@ -23,7 +23,7 @@ def spectral(
     matrix: Float[Array, "size size"],
     sharpness: Sharpness,
 ) -> Scalar:
-    r"""Return a symmetric function of the logarithms of a positive matrix's eigenvalues.
+    r"""Return a symmetric function of the logarithms of a matrix's eigenvalues.
 
     For $f(\Lambda) = \varphi(\lambda)$ with $\Lambda = U \operatorname{diag}(\lambda)
     U^T$ the gradient is $U \operatorname{diag}(\varphi'(\lambda)) U^T$: it needs no
@@ -50,7 +50,10 @@ def _eigenvalues(matrix: Float[Array, "size size"]) -> tuple[Array, Array]:
 
 
 def log_condition(logs: Float[Array, " size"], sharpness: Sharpness) -> Scalar:
-    r"""Return the log condition number, or above it $\log(\sum\lambda^p \sum\lambda^{-p})/p$."""
+    r"""Return the logarithm of the condition number.
+
+    A smooth one is above it: $\log(\sum\lambda^p \sum\lambda^{-p})/p$.
+    """
     if sharpness is None:
         return logs[-1] - logs[0]
     return _softmax(logs, sharpness) + _softmax(-logs, sharpness)

@@ -17,7 +17,7 @@ BaseMatrix = Float[AnyArray, "base base"]
 JointVector = Float[AnyArray, " joints"]
 
 RANK_TOLERANCE = 1e-12
-"""Eigenvalue, relative to the largest one, below which a direction has no information."""
+"""Relative eigenvalue below which a direction has no information."""
 MIN_SHARE = 1e-3
 """Component in such a direction above which a parameter takes part in it."""
 
@@ -77,7 +77,7 @@ def information_of_coefficients(
     prior: BaseMatrix,
     sizes: BaseVector,
 ) -> Information:
-    """Return the information of many trajectories, under `jit` and derivatives (Eq. 36).
+    """Return the information of many trajectories, in JAX (Eq. 36).
 
     Motions are evaluated at `samples`, which stand for those that are `measured`.
     """
@@ -102,7 +102,7 @@ def information_of_coefficients(
 def standard_deviations(
     weighted: BaseMatrix,
 ) -> Float[np.ndarray, " base"]:
-    """Return standard deviations from weighted information; infinite where undetermined."""
+    """Return standard deviations from information; infinite where undetermined."""
     matrix, scale = scale_to_unit_diagonal(np.asarray(weighted, np.float64))
     eigenvalues, directions = np.linalg.eigh(matrix)
     has_information = eigenvalues >= RANK_TOLERANCE * eigenvalues[-1]
@@ -117,7 +117,7 @@ def standard_deviations(
 
 
 def scale_to_unit_diagonal(matrix: AnyArray) -> tuple[Any, Any]:
-    """Return the matrix with ones on its diagonal, and the factor of each row and column."""
+    """Return the matrix with a unit diagonal, and the factor of each row."""
     xp = namespace(matrix)
     diagonal = xp.diagonal(matrix)
     scale = 1.0 / xp.sqrt(xp.where(diagonal > 0, diagonal, 1.0))
