@@ -79,8 +79,9 @@ class FourierBasis(AbstractBasis):
     def envelope(self, points: int) -> Envelope:
         r"""Return samples of a period, which bound the series.
 
-        The bound $\max |p| \le \max_k |p(t_k)| / \cos(\pi n / M)$ holds for every trigonometric polynomial of degree n at M > 2 n
-        equidistant points (Ehlich and Zeller).
+        The bound $\max |p| \le \max_k |p(t_k)| / \cos(\pi n / M)$ holds for every
+        trigonometric polynomial of degree n at M > 2 n equidistant points (Ehlich and
+        Zeller).
         """
         points = max(points, 2 * self.harmonics + 1)
         rows = np.asarray(self.rows(self.times(points)))
