@@ -38,8 +38,7 @@ class Excitation:
 
     Attributes:
         criterion: Objective: "d_optimal" for the smallest standard deviations on the
-            whole, a_optimal, e_optimal, condition_number (the paper's, Eq. 36),
-            weighted_condition_number or scaled_condition_number.
+            whole, "condition_number" for the paper's (Eq. 36), or another criterion.
         harmonics: Number of harmonics of the Fourier series.
         omega: Ground frequency of the series [rad/s].
         rest: Whether the motion starts and stops at rest.
