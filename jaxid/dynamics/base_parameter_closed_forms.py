@@ -178,7 +178,7 @@ class CoefficientSearch:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the products that are needed, and their factors."""
         values = self._fit_kappa[:, row, column]
-        # Products that are not needed blur the factors of the others: fit again without.
+        # Products that are not needed blur the factors of others: fit again.
         while True:
             products = _products(self._fit_lengths, powers)
             factors = np.linalg.lstsq(products, values, rcond=None)[0]

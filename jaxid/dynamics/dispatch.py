@@ -94,7 +94,7 @@ MAX_SAMPLES_IN_NUMPY = 4096
 CACHE_SIZE = 64
 """Number of programs that are kept, of the models that were used last."""
 MAX_JOINTS = {"inertia": 16, "acceleration": 16}
-"""Joints up to which a program is compiled that grows with the square of their number."""
+"""Joints up to which a program that grows with their square is compiled."""
 
 
 def spatial_form(owner: Any) -> Any:

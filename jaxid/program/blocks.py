@@ -50,7 +50,7 @@ def block_results(program: Program, *arrays: Array) -> tuple[Array, ...]:
 def results_at_once(program: Program, *arrays: Array) -> tuple[Array, ...]:
     """Return the distinct results of samples, without fences."""
     count = next(len(x) for x in arrays if x.ndim == 2)
-    # Entries that all samples have in common are repeated, and samples stay as they are.
+    # Entries that all samples have in common are repeated.
     inputs = [[jnp.broadcast_to(row, (count,)) for row in x.T] for x in arrays]
     like = jnp.zeros(count, arrays[-1].dtype)
     return lower(program, fence=False).run(inputs, primitives(like))
