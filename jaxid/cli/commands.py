@@ -26,12 +26,12 @@ from jaxid.identification.parameter_changes import compare as compare_fits
 from jaxid.identification.payload import Payload
 from jaxid.io import require_writable, write_text
 from jaxid.report.excitation import headline, ordered, plan_remarks
-from jaxid.report.identification import body_table, motor_tables, residual_table
+from jaxid.report.identification import motor_tables
 from jaxid.report.result_files import read_faults, read_fit, write_comparison
 from jaxid.result_table import Remark, Status, significant
 from jaxid.robot.robot import Robot
 from jaxid.trajectory.trajectory import LinearTrajectory
-from jaxid.workflow.log_identification import IdentificationReport, identify_logs
+from jaxid.workflow.log_identification import identify_logs
 from jaxid.workflow.log_inspection import inspect_logs
 from jaxid.workflow.log_rollout import identify_rollout_logs
 from jaxid.workflow.motion_design import (
@@ -112,29 +112,10 @@ def identify(
         report = dataclasses.replace(report, settings=settings)
         progress("writing the report", 0.0)
         files = report.save(output, figures or "")
-    show_identification(console, report)
+    show(console, *report.tables())
     show_files(console, output, [file.name for file in files])
     if report.verdict.status is Status.BAD:
         raise typer.Exit(UNUSABLE)
-
-
-def show_identification(console: Console, report: IdentificationReport) -> None:
-    """Print the tables of an identification, and what its verdict asks to look at."""
-    fit = report.fit
-    robot = fit.base.model.robot
-    show(console, robot.summary(), *motor_tables(robot))
-    tabulated = () if fit.consistency is None else fit.consistency.findings
-    fit_notes = [note for note in fit.notes if note not in tabulated]
-    show_remarks(console, [*report.notes, *fit_notes])
-    show(console, fit.summary())
-    if fit.residual_spectra is not None:
-        show(console, residual_table(fit.residual_spectra, robot))
-    if fit.consistency is not None:
-        show(console, body_table(fit.consistency, robot.joint_names))
-    show(console, report.validation.summary())
-    verdict, *criteria = report.judgement
-    marked = [x for x in criteria if x.status in (Status.DOUBTFUL, Status.BAD)]
-    show_remarks(console, [verdict, *marked])
 
 
 def origin(experiment: Experiment) -> dict[str, str]:

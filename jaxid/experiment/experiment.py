@@ -18,6 +18,7 @@ from jaxid.workflow.excitation_settings import Excitation
 from jaxid.workflow.log_loading import is_report
 from jaxid.workflow.log_reading import LogReading
 from jaxid.workflow.log_rollout import ServoSettings, TorqueSettings
+from jaxid.workflow.robot_file import RobotFile
 from jaxid.workflow.setup import Setup
 from jaxid.workflow.surroundings import Collision, Surroundings
 
@@ -131,7 +132,12 @@ def _build(tables: dict[str, Any], text: str, path: Path) -> Experiment:
     """Return the experiment that the tables of a file describe."""
     _require_tables(tables)
     source = call(RobotSource, tables["robot"], "robot")
-    robot = _build_robot(tables, source, path.parent)
+    with within("robot"):
+        robot_file = source.robot_file(path.parent)
+        robot = source.build(robot_file)
+    for name, replace in (("limits", replace_limits), ("drives", replace_drives)):
+        if name in tables:
+            robot = call(replace, tables[name], name, robot)
     columns, reading = None, LogReading()
     if "recording" in tables:
         columns, reading = build_columns(tables["recording"], robot)
@@ -144,7 +150,7 @@ def _build(tables: dict[str, Any], text: str, path: Path) -> Experiment:
         path,
         text,
         source,
-        _build_setup(tables, robot, source, reading, path.parent),
+        _build_setup(tables, robot, robot_file, reading),
         columns,
         load,
         _build_rollout(tables.get("rollout", {}), reading),
@@ -165,22 +171,11 @@ def _require_tables(tables: dict[str, Any]) -> None:
         )
 
 
-def _build_robot(tables: dict[str, Any], source: RobotSource, folder: Path) -> Robot:
-    """Return the robot with its limits and drives."""
-    with within("robot"):
-        robot = source.build(folder)
-    for name, replace in (("limits", replace_limits), ("drives", replace_drives)):
-        if name in tables:
-            robot = call(replace, tables[name], name, robot)
-    return robot
-
-
 def _build_setup(
     tables: dict[str, Any],
     robot: Robot,
-    source: RobotSource,
+    robot_file: RobotFile | None,
     reading: LogReading,
-    folder: Path,
 ) -> Setup:
     """Return how logs become parameters."""
     effects = call(Effects, tables.get("model", {}), "model")
@@ -193,7 +188,6 @@ def _build_setup(
         if others:
             filters["filter_candidates"] = (first_filter, *others)
     decimation, min_speed = call(build_rows, tables.get("rows", {}), "rows", robot)
-    robot_file = source.robot_file(folder)
     arguments, bounds = decode_estimator(tables.get("estimator", {}))
     with within("estimator"):
         estimation = build_estimation(robot, robot_file, bounds, **arguments)

@@ -217,9 +217,8 @@ class RobotSource:
         height = float(normal @ np.array(position))
         return HalfSpace("floor", normal=normal, height=height)
 
-    def build(self, folder: Path) -> Robot:
-        """Return the robot; paths are relative to the folder of the experiment file."""
-        robot_file = self.robot_file(folder)
+    def build(self, robot_file: RobotFile | None) -> Robot:
+        """Return the robot."""
         if robot_file is not None:
             robot = robot_file.load()
         elif self.dh is not None:

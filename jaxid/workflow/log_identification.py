@@ -26,8 +26,9 @@ from jaxid.identification.problem import RegressionProblem
 from jaxid.measurement.columns import Columns
 from jaxid.measurement.observations import Observations
 from jaxid.measurement.recording import Recording
+from jaxid.report.identification import body_table, motor_tables, residual_table
 from jaxid.report.result_files import read_fit, write_report
-from jaxid.result_table import Remark, Summarised, Table
+from jaxid.result_table import Remark, Status, Summarised, Table
 from jaxid.validation.diagnosis import mistakes_in_logs
 from jaxid.validation.torque_errors import (
     TorqueErrors,
@@ -62,9 +63,28 @@ class IdentificationReport(Summarised, Report):
         """Whether the model may be used, in one sentence."""
         return self.judgement[0]
 
-    def summary(self) -> Table:
-        """Return the verdict, and the criteria behind it."""
-        return Table("verdict", remarks=self.judgement)
+    def tables(self) -> list[Table]:
+        """Return estimates and torque errors, and the verdict with what it asks to look at."""
+        fit, robot = self.fit, self.fit.base.model.robot
+        tables = [robot.summary(), *motor_tables(robot)]
+        notes = [*self.notes, *fit.notes]
+        if fit.consistency is not None:
+            # Those are in its table.
+            notes = [note for note in notes if note not in fit.consistency.findings]
+        if notes:
+            tables.append(Table("", remarks=tuple(dict.fromkeys(notes))))
+        tables.append(fit.summary())
+        if fit.residual_spectra is not None:
+            tables.append(residual_table(fit.residual_spectra, robot))
+        if fit.consistency is not None:
+            tables.append(body_table(fit.consistency, robot.joint_names))
+        verdict, *criteria = self.judgement
+        marked = [x for x in criteria if x.status in (Status.DOUBTFUL, Status.BAD)]
+        return [
+            *tables,
+            self.validation.summary(),
+            Table("", remarks=[verdict, *marked]),
+        ]
 
     def save(self, folder: str | Path, figures: str = "") -> list[Path]:
         """Write `report.html`, `result.json`, `parameters.csv` and `model.json`; return them.
