@@ -213,15 +213,18 @@ class FrictionTemperature(eqx.Module):
 
     def factors(self, temperature: Joints) -> tuple[np.ndarray, np.ndarray]:
         """Return the factors of viscous and dry friction at a temperature [°C]."""
-        warmer = np.asarray(temperature) - self.reference
-        return np.exp(-self.viscous_rate * warmer), np.exp(-self.dry_rate * warmer)
+        rise = np.asarray(temperature) - self.reference
+        viscous = np.exp(-self.viscous_rate * rise)
+        dry = np.exp(-self.dry_rate * rise)
+        return viscous, dry
 
     def warm_up(
         self, temperature: Joints, power: Joints, duration: float
     ) -> np.ndarray:
         """Return temperatures [°C] after some time [s] with constant power of friction [W]."""
         final = self.reference + np.asarray(self.resistance) * np.asarray(power)
-        return final + (np.asarray(temperature) - final) * np.exp(-duration / self.time)
+        difference = np.asarray(temperature) - final
+        return final + difference * np.exp(-duration / self.time)
 
 
 class TorqueRipple(Hashable):

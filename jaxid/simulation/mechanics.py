@@ -175,7 +175,8 @@ def follow(
     memory = float(np.exp(-servo.sample_time / RATE_FILTER_TIME))
     rate_gain = (1.0 - memory) / servo.sample_time
 
-    plant.start(*(np.asarray(x)[0] for x in (desired.q, desired.qd, desired.qdd)))
+    first = desired[0]
+    plant.start(np.asarray(first.q), np.asarray(first.qd), np.asarray(first.qdd))
     states = []
     forces = []
     rate = [0.0] * n
@@ -207,7 +208,15 @@ def follow(
             "s: make the `servo` softer or `substeps` larger, and check that the "
             "bodies can exist."
         ) from failure
+    return _servo_run(states, forces)
+
+
+def _servo_run(
+    states: Sequence[Sequence[float]], forces: Sequence[Sequence[float]]
+) -> ServoRun:
+    """Return the motion of a run from the states at all ticks and after the last one."""
     q, qd, qdd = np.split(np.array(states), 3, axis=1)
     # Accelerations jump at a tick: the mean of before and after it.
     mean_qdd = 0.5 * (qdd[:-1] + qdd[1:])
-    return ServoRun(Motion(q[:-1], qd[:-1], mean_qdd), np.array(forces))
+    motion = Motion(q[:-1], qd[:-1], mean_qdd)
+    return ServoRun(motion, np.array(forces))
