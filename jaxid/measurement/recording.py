@@ -121,12 +121,7 @@ class Recording(eqx.Module):
                 "a recording needs either `time` or `sample_time`, and not both."
             )
         if time is not None:
-            stamps = np.array(time, np.float64)
-            if stamps.shape != (samples,) or not np.isfinite(stamps).all():
-                raise InputError(
-                    f"`time` of `{name}` must hold {samples} finite stamps, but has "
-                    f"shape {stamps.shape} or stamps that are not finite."
-                )
+            stamps = _finite_stamps(name, time, samples)
             limits = largest_gap, bridged
             resample = resampling(stamps, name, limits, first_row)
             data = {key: None if x is None else resample(x) for key, x in data.items()}
@@ -227,6 +222,17 @@ def finite_channel(
             "check the unit, or repair or remove that row."
         )
     return array
+
+
+def _finite_stamps(name: str, time: ArrayLike, samples: int) -> np.ndarray:
+    """Return time stamps as finite numbers."""
+    stamps = np.array(time, np.float64)
+    if stamps.shape != (samples,) or not np.isfinite(stamps).all():
+        raise InputError(
+            f"`time` of `{name}` must hold {samples} finite stamps, but has shape "
+            f"{stamps.shape} or stamps that are not finite."
+        )
+    return stamps
 
 
 def positive_time(sample_time: float) -> float:
