@@ -72,7 +72,7 @@ class MujocoRobot(VirtualRobot):
                 raise InputError(
                     "MuJoCo knows only bodies and rotors: leave out other `terms`."
                 )
-        bodies = body_parameters(self.bodies, self.values)
+        bodies = np.array(body_parameters(self.bodies, self.values))
         if robot.tool is not None:
             bodies[robot.tool.body] += np.asarray(robot.tool.parameters)
         return bodies
