@@ -224,17 +224,13 @@ class Column:
         ]
         if self.kind != "number":
             return texts
-        decimals = [len(text.partition(".")[2]) + ("." in text) for text in texts]
-        width = max(decimals, default=0)
+        # Point and decimals of each number.
+        lengths = [len(text) - len(text.split(".")[0]) for text in texts]
+        width = max(lengths, default=0)
         return [
             text + " " * (width - length)
-            for text, length in zip(texts, decimals, strict=True)
+            for text, length in zip(texts, lengths, strict=True)
         ]
-
-    @property
-    def width(self) -> int:
-        """Characters of the longest line."""
-        return max(map(len, (*self.header, *self.texts)))
 
 
 def _plain_cell(value: Any) -> Any:

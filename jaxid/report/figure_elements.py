@@ -4,7 +4,7 @@
 """
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -166,17 +166,14 @@ class Drawing:
     bins: int = 2000
 
     @property
-    def parts(self) -> Iterator[Panel]:
-        """All panels, each followed by those below it."""
-        return (part for panel in self.panels for part in panel.parts)
-
-    @property
     def legend(self) -> list[Curve]:
         """The first curve of each name."""
         entries: dict[str, Curve] = {}
-        for part in self.parts:
-            for curve in part.curves:
-                entries.setdefault(curve.name, curve)
+        for panel in self.panels:
+            for part in panel.parts:
+                for curve in part.curves:
+                    entries.setdefault(curve.name, curve)
+        # Curves without a name have no entry.
         entries.pop("", None)
         return list(entries.values())
 
