@@ -47,8 +47,8 @@ def servo_stiffness(fit: ServoFit, stiffness: Numbers | None = None) -> Joints:
     """
     values = fit.stiffness.copy()
     if stiffness is not None:
-        given_values = np.broadcast_to(np.asarray(stiffness, np.float64), values.shape)
-        values = np.where(np.isnan(given_values), values, given_values)
+        numbers = np.broadcast_to(np.asarray(stiffness, np.float64), values.shape)
+        values = np.where(np.isnan(numbers), values, numbers)
     is_known = np.isfinite(values)
     if not is_known.any():
         raise InputError(

@@ -29,6 +29,12 @@ MAX_STEP = 0.2
 """Largest step of the search, relative to half of a joint's range."""
 STRIDE = 0.03
 """Distance of the poses that are solved one after the other [m]."""
+APPROACH_STEPS = 60
+"""Steps from the posture to the first pose, without curvature."""
+STRIDE_STEPS = 4
+"""Newton steps from a pose to the next one after a stride."""
+FINAL_STEPS = 6
+"""Newton steps of all poses at once, from interpolated coordinates."""
 
 
 def inverse_kinematics_along(
@@ -99,20 +105,21 @@ def _follow_path(task: _TipTask, positions: np.ndarray) -> np.ndarray:
     start = positions[:1]
     iterate = _Iterate(task.posture[None], np.zeros((1, 6)))
     # Far from the pose the curvature misleads.
-    for _ in range(60):
+    for _ in range(APPROACH_STEPS):
         iterate = _newton_step(task, start, iterate, curved=False)
 
     nodes = _ends_of_strides(positions)
     solutions = []
     for k in nodes:
-        iterate = _newton_steps(task, positions[k : k + 1], iterate, 4)
+        iterate = _newton_steps(task, positions[k : k + 1], iterate, STRIDE_STEPS)
         solutions.append(np.concatenate([iterate.q[0], iterate.multipliers[0]]))
 
     places = np.arange(len(positions))
     columns = [np.interp(places, nodes, x) for x in np.transpose(solutions)]
     guess = np.stack(columns, axis=1)
-    iterate = _Iterate(guess[:, :-6], guess[:, -6:])
-    return _newton_steps(task, positions, iterate, 6).q
+    joints = task.robot.joints
+    iterate = _Iterate(guess[:, :joints], guess[:, joints:])
+    return _newton_steps(task, positions, iterate, FINAL_STEPS).q
 
 
 def _ends_of_strides(positions: np.ndarray) -> Int[np.ndarray, " strides"]:

@@ -150,10 +150,10 @@ class UrdfTree:
     def _merge(self, base: str, tip: str | None) -> None:
         """Merge links on fixed joints into the bodies that carry them, depth first."""
         chain = None if tip is None else self._chain(base, tip)
-        # A stack that holds joints in reverse order gives them in that of the file.
         self.carriers[base] = Placement(-1, np.eye(3), np.zeros(3))
         # Numbers of moving joints and of links on the way from the base.
         lengths = {base: (0, 0)}
+        # A stack in reverse order gives the joints of a link in the order of the file.
         stack = self._below[base][::-1]
         while stack:
             joint = stack.pop()
@@ -180,13 +180,16 @@ class UrdfTree:
 
         self.tip = tip or max(lengths, key=lambda link: lengths[link])
         if self.carriers[self.tip].body < 0:
-            way = f"below link `{base}`"
-            if tip is not None:
-                way = f"between links `{base}` and `{tip}`"
-            raise InputError(
-                f"`{self.path}` has no moving joint {way}: choose another `base` or "
-                "`tip`."
-            )
+            raise self._no_joint_error(base, tip)
+
+    def _no_joint_error(self, base: str, tip: str | None) -> InputError:
+        """Return the error of a file without a moving joint between two links."""
+        way = f"below link `{base}`"
+        if tip is not None:
+            way = f"between links `{base}` and `{tip}`"
+        return InputError(
+            f"`{self.path}` has no moving joint {way}: choose another `base` or `tip`."
+        )
 
     def _add_body(self, joint: Any) -> None:
         """Enter the body that a joint moves."""
