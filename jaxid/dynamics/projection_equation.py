@@ -155,7 +155,7 @@ def rigid_body_mass_matrix(
 
 def composite_bodies(
     robot: Robot, p: Float[AnyArray, "joints 10"], frames: list[tuple]
-) -> list[tuple[AnyArray, Vector, Float[AnyArray, "3 3"]]]:
+) -> list[tuple[AnyArray | float, Vector, Float[AnyArray, "3 3"]]]:
     """Return mass, first moment and inertia of all that each joint carries."""
     n = robot.joints
     bodies = [(p[i][0], p[i][1:4], inertia_tensor(p[i][4:])) for i in range(n)]
