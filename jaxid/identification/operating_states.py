@@ -114,15 +114,20 @@ class StatesFit(Summarised, eqx.Module):
         variances = np.array([np.diag(fit.covariance) for fit in self.fits])
         is_determined = np.all(np.isfinite(variances), axis=0)
         k = [index for index in self.shared if is_determined[index]]
-        parameters = np.array([fit.parameters[k] for fit in self.fits])
-        differences = parameters[1:] - parameters[0]
-        first, *others = [fit.covariance[np.ix_(k, k)] for fit in self.fits]
+        parameters = []
+        covariances = []
+        dof = []
+        for fit in self.fits:
+            parameters.append(fit.parameters[k])
+            covariances.append(fit.covariance[np.ix_(k, k)])
+            dof.extend(fit.uncertainty.dof[k])
+        differences = np.subtract(parameters[1:], parameters[0])
         # The errors of the first state are in all differences.
-        first_errors = np.tile(first, (len(others), len(others)))
-        covariance = linalg.block_diag(*others) + first_errors
-        dof = [fit.uncertainty.dof[k] for fit in self.fits]
-        min_dof = float(np.min(dof, initial=np.inf))
-        return joint_test(differences.ravel(), covariance, min_dof)
+        count = len(differences)
+        first_errors = np.tile(covariances[0], (count, count))
+        covariance = linalg.block_diag(*covariances[1:]) + first_errors
+        min_dof = min(dof, default=np.inf)
+        return joint_test(differences.ravel(), covariance, float(min_dof))
 
     def _indices(self, state: str) -> Int[np.ndarray, " base"]:
         if state not in self.states:

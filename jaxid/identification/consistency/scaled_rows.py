@@ -28,10 +28,12 @@ def scaled_rows(base: BaseParameters, R: Values, z: Values, rows: Values) -> Sca
     """Divide the weighted triangle of so many rows by the standard deviation of its residuals."""
     xp = namespace(R)
     residuals = z[base.size :]
-    dof = xp.maximum(xp.asarray(rows - base.size, float), 1.0)
-    min_variance = MIN_NOISE**2 * (z @ z) / (dof + base.size)
+    dof = xp.asarray(rows - base.size, float)
+    dof = xp.maximum(dof, 1.0)
+    force_variance = (z @ z) / (dof + base.size)
     variance = (residuals @ residuals) / dof
-    variance = xp.maximum(variance, min_variance)
+    variance = xp.maximum(variance, MIN_NOISE**2 * force_variance)
+    # Forces of zero have no noise to divide by.
     noise = xp.sqrt(xp.where(variance > 0, variance, 1.0))
     # Base parameters as combinations of the standard ones.
     combination = np.zeros((base.size, base.model.size))

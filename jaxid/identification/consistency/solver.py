@@ -235,13 +235,15 @@ def _matrix_gap(p: ConeProgram, S, Z) -> Values:
     products = xp.sum(S * Z, axis=(-2, -1))
     bodies = products[: p.bodies]
     is_pulled = p.pull > 0
+    # Ones where nothing is pulled keep the logarithm finite.
     log_pull = xp.log(xp.where(is_pulled, p.pull, 1.0))
-    log_det_S = xp.sum(xp.log(pivots(S)), axis=0)
-    log_det_Z = xp.sum(xp.log(pivots(Z)), axis=0)
-    logarithms = (log_det_S + log_det_Z)[: p.bodies] - 4.0 * log_pull
-    pulled_gap = bodies - 4.0 * p.pull - p.pull * logarithms
+    logarithms = xp.log(pivots(S)) + xp.log(pivots(Z))
+    log_det = xp.sum(logarithms[:, : p.bodies], axis=0)
+    excess = log_det - 4.0 * log_pull
+    pulled_gap = bodies - 4.0 * p.pull - p.pull * excess
     gap = xp.where(is_pulled, pulled_gap, bodies)
-    return xp.sum(gap) + xp.sum(products[p.bodies :])
+    couplings = products[p.bodies :]
+    return xp.sum(gap) + xp.sum(couplings)
 
 
 def _targets(p: ConeProgram) -> Values:
@@ -358,15 +360,18 @@ def _complementarity(p: ConeProgram, S, s, Z, z) -> Values:
 def _length(fractions, x: Point, d: Direction) -> Values:
     """Return the longest of some steps that leaves everything positive."""
     xp = namespace(x.y)
-    speeds = xp.concatenate([-d.s / x.s, -d.z / x.z])
     # The linear inequalities hold up to the reciprocal of the largest speed.
-    lengths = fractions / xp.maximum(xp.max(speeds), 1.0)
+    speeds = xp.concatenate([-d.s / x.s, -d.z / x.z])
+    max_speed = xp.maximum(xp.max(speeds), 1.0)
+    lengths = fractions / max_speed
     matrices = xp.concatenate([x.S, x.Z])
     changes = xp.concatenate([d.S, d.Z])
     steps = changes[..., None] * lengths[None, None, None]
     ends = matrices[..., None] + steps
     is_positive = xp.all(pivots(ends) > 0, axis=(0, 1))
-    max_length = lengths[xp.argmax(is_positive)]
+    # The fractions fall: the first that is good is the longest.
+    first = xp.argmax(is_positive)
+    max_length = lengths[first]
     return xp.where(xp.any(is_positive), max_length, 0.0)
 
 
@@ -377,13 +382,15 @@ def _barriers(p: ConeProgram, inverse_S, Z, ratio) -> Values:
     """
     xp = p.xp
     products = _products(inverse_S, Z)
-    semidefinite_part = p.basis[None] @ products[: p.bodies] @ p.basis.T[None]
+    of_basis = products[: p.bodies] @ p.basis.T[None]
+    semidefinite_part = p.basis[None] @ of_basis
     of_bodies, lower, upper = p.split_linear(ratio)
     linear_part = xp.einsum("kri,kr,krj->kij", p.rows, of_bodies, p.rows)
     bodies = symmetric_part(semidefinite_part) + linear_part
     ridge = 1.0 + RIDGE * np.eye(p.width)
-    drives = xp.diag((1.0 + RIDGE) * (lower + upper))
-    blocks = _linalg(p).block_diag(*(bodies * ridge[None]), drives)
+    bodies = bodies * ridge[None]
+    drives = (1.0 + RIDGE) * (lower + upper)
+    blocks = _linalg(p).block_diag(*bodies, xp.diag(drives))
 
     couplings = xp.reshape(p.couplings, (*p.couplings.shape[:2], 16))
     products_with_couplings = xp.einsum("ikx,kxy->iky", couplings, products[p.bodies :])

@@ -216,10 +216,12 @@ class ShapeSearch(eqx.Module):
         """Return for each joint the multiples of its shapes that explain its own rows best."""
         kinds = len(self.shapes.kinds)
         # Combinations of the first two kinds only: there would be too many.
-        combinations = list(itertools.product(START_RATIOS, repeat=min(kinds, 2)))
+        repeat = min(kinds, 2)
+        combinations = list(itertools.product(START_RATIOS, repeat=repeat))
         ratios = np.ones((len(combinations), kinds, 1))
-        ratios[:, :2, 0] = combinations
-        shapes = jnp.asarray(jnp.reshape(self.start, (1, kinds, -1)) * ratios)
+        ratios[:, :repeat, 0] = combinations
+        start = jnp.reshape(jnp.asarray(self.start), (1, kinds, -1))
+        shapes = start * ratios
 
         def joint_squares(x):
             _, residuals = self.fit(x.ravel(), rows)
