@@ -392,10 +392,12 @@ def _barriers(p: ConeProgram, inverse_S, Z, ratio) -> Values:
     drives = (1.0 + RIDGE) * (lower + upper)
     blocks = _linalg(p).block_diag(*bodies, xp.diag(drives))
 
-    couplings = xp.reshape(p.couplings, (*p.couplings.shape[:2], 16))
-    products_with_couplings = xp.einsum("ikx,kxy->iky", couplings, products[p.bodies :])
-    coupling_part = xp.tensordot(products_with_couplings, couplings, ((1, 2), (1, 2)))
-    return blocks + p.members.T @ symmetric_part(coupling_part) @ p.members
+    members, matrices = p.couplings.shape[:2]
+    couplings = xp.reshape(p.couplings, (members, matrices, 16))
+    of_couplings = xp.einsum("ikx,kxy->iky", couplings, products[p.bodies :])
+    coupled = xp.tensordot(of_couplings, couplings, ((1, 2), (1, 2)))
+    coupling_part = symmetric_part(coupled)
+    return blocks + p.members.T @ coupling_part @ p.members
 
 
 def _linalg(p: ConeProgram) -> ModuleType:
