@@ -54,12 +54,15 @@ def _changes(tables: dict[str, Any]) -> Iterator[tuple[str, Changes]]:
         for names in itertools.combinations(EFFECTS, count):
             model: dict[str, Any] = {}
             for name in names:
-                for key, value in copy.deepcopy(EFFECTS[name]).items():
-                    if key == "coulomb":
-                        # Keys of dry friction are added to those of the file.
-                        table = model.get(key, tables.get("model", {}).get(key, {}))
-                        value = {**table, **value}
-                    model[key] = value
+                model |= copy.deepcopy(EFFECTS[name])
+            # Keys of dry friction are added to each other, and to those of the file.
+            dry_friction = [EFFECTS[name].get("coulomb") for name in names]
+            if any(dry_friction):
+                keys_of_file = tables.get("model", {}).get("coulomb")
+                table = {**keys_of_file} if isinstance(keys_of_file, dict) else {}
+                for keys in filter(None, dry_friction):
+                    table |= keys
+                model["coulomb"] = table
             changes = {"estimator": {"kind": "consistent"}, "model": model}
             yield " + ".join((COMMON_EFFECTS, *names)), changes
     for name, changes in ESTIMATORS.items():

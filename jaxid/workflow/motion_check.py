@@ -30,8 +30,9 @@ def check_motion(
     floor_findings, other_findings = [], []
     for finding in plan.findings:
         if finding.name.startswith("the clearance of "):
-            above_floor = any(finding.name.endswith(f" and {x}") for x in floors)
-            (floor_findings if above_floor else other_findings).append(finding)
+            is_of_floor = any(finding.name.endswith(f" and {x}") for x in floors)
+            group = floor_findings if is_of_floor else other_findings
+            group.append(finding)
     yield check_floor(surroundings, bool(floors), floor_findings)
     yield from check_self_collision(surroundings, other_findings)
     force_findings = [
