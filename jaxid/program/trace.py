@@ -242,8 +242,8 @@ def _logistic(x: np.ndarray) -> np.ndarray:
     return _divide(1.0, _add(1.0, _exponential(_negate(x))))
 
 
-def _integer_power(x: np.ndarray, *, y: int) -> np.ndarray:
-    """Return a whole power of each entry."""
+def _integer_power(x: np.ndarray, *, y: int) -> Any:
+    """Return a whole power of each entry; of an array without axes, a scalar."""
     return _each(lambda entry: scalar.integer_power(entry, y), 1)(x)
 
 
