@@ -119,9 +119,9 @@ def _solve_groups(
     def solve_group(group: DataSets) -> BatchFit:
         arrays = [jnp.moveaxis(x, -1, 0) for x in jax.tree.leaves(group.motion)]
         if group.numbers is not None:
-            numbers = group.numbers.T[:, :, None]
-            shape = (*numbers.shape[:2], samples)
-            arrays.insert(0, jnp.broadcast_to(numbers, shape))
+            geometry = group.numbers.T[:, :, None]
+            shape = (*geometry.shape[:2], samples)
+            arrays.insert(0, jnp.broadcast_to(geometry, shape))
         # Columns of each joint [datasets, columns, samples].
         pairs = group, regressor(*arrays, fence=on_cpu)
         # A CPU multiplies the matrices of one data set faster than those of several
