@@ -148,7 +148,6 @@ class Arm:
 def program(base, factor, estimator):
     """Return feasible set, data and program of one fit."""
     feasible = estimator.feasible_set(base)
-    # private: the program, which the conic solver shares
     data, one = estimator.program(base, feasible, *factor)
     return feasible, data, one
 
@@ -171,9 +170,6 @@ def optimum(arms, quick):
     from references import conic
 
     import jaxid as jid
-    from jaxid.identification.consistency.solver import (
-        solve_in_numpy,
-    )  # private: solver alone
 
     estimator, cases = jid.PhysicallyConsistent(), {}
     if DATA.is_dir():
@@ -188,7 +184,7 @@ def optimum(arms, quick):
         cases[f"{k}"] = arm.base, arm.factor(k, 0.2 * k / (count - 1))
     for name, case in cases.items():
         feasible, data, one = program(*case, estimator)
-        ours = solve_in_numpy(one)
+        ours = jid.consistency.solve_in_numpy(one)
         value, _ = conic.optimum(feasible, data)
         apart = abs(float(ours.value) - value) / max(value, float(data.scale))
         found[name if name in found else simulated].append((apart, ours))
@@ -275,14 +271,12 @@ def proofs(arms, quick):
 
 def stress(arms, quick):
     """Count fits without proof, and iterations, where fits are hard."""
-    from jaxid.identification.consistency.solver import (
-        solve_in_numpy,
-    )  # private: solver alone
+    import jaxid as jid
 
     iterations, failures = [], dict.fromkeys(WAYS, 0)
     for k in range(10 if quick else 400):
         arm = arms[(k // len(WAYS)) % len(arms)]
-        found = solve_in_numpy(program(arm.base, *arm.stressed(k))[2])
+        found = jid.consistency.solve_in_numpy(program(arm.base, *arm.stressed(k))[2])
         iterations.append(int(found.iterations))
         failures[WAYS[k % len(WAYS)]] += not found.certified
     lost = sum(failures.values())
@@ -316,9 +310,6 @@ def times(arms, quick):
     from references import conic
 
     import jaxid as jid
-    from jaxid.identification.consistency.solver import (
-        solve_compiled,
-    )  # private: solver alone
 
     arm, estimator = arms[0], jid.PhysicallyConsistent()
     count, turns, many = (2, 2, 8) if quick else (10, 15, 256)
@@ -334,6 +325,7 @@ def times(arms, quick):
     def timed(work, *arguments):
         return timing.elapsed(partial(finished, work, *arguments))[1]
 
+    solve_compiled = jid.consistency.solve_compiled
     finished(solve_compiled, programs[0])
     finished(solve, *factors[0])
 

@@ -115,10 +115,6 @@ class Study:
 
         import jaxid as jid
 
-        # private: the table of a design, which many draws share
-        from jaxid.identification.uncertainty.spectra_of_rows import row_spectra
-        from jaxid.identification.uncertainty.spectral import SpectralTable
-
         self.o = observations(base, p, seed, encoder)
         self.rows = jid.RegressionProblem(base, [self.o])
         self.estimate = jid.WeightedLeastSquares()(self.rows)
@@ -126,8 +122,9 @@ class Study:
         self.bias = np.asarray(self.estimate.parameters) - self.truth
         e = self.estimate
         self.w = np.asarray(e.weights)
-        (lines,) = row_spectra(self.rows, e).lines
-        self.lines, self.table = lines, SpectralTable.of([lines])
+        # All draws share the table of the design.
+        (self.lines,) = jid.uncertainty.row_spectra(self.rows, e).lines
+        self.table = jid.uncertainty.SpectralTable.of([self.lines])
         count, n = self.o.rows, base.model.robot.joints
         A = np.zeros((count, n, base.size))
         for chunk in self.rows.chunks():

@@ -1,9 +1,9 @@
-"""Page of an identification from a log of 60 s at 1 kHz: time to write it, and its size.
+"""Report of a log of 60 s at 1 kHz: time to write its page, and the page's size.
 
     python benchmarks/report.py [--quick] [--json FILE]
 
 A Panda with random bodies follows two random Fourier series; every sample is a row, one
-log is of the fit and one verifies it. `write_report` runs twice; the second time
+log is of the fit and one verifies it. The report is saved twice; the second time
 counts, and includes all files. Whether the page can be read in a browser is tested in
 `tests/report/test_browser.py`.
 """
@@ -19,10 +19,9 @@ from timing import Row, hand_over
 
 def logs(jid, robot, model, duration):
     """Return observations of two motions with noise of 2 % of the largest forces."""
-    from jaxid.simulation.virtual import random_bodies
-
     random, t, found = np.random.default_rng(0), np.arange(0.0, duration, 1e-3), []
-    bodies = random_bodies(robot, np.linspace(6.0, 1.0, robot.joints), random).ravel()
+    masses = np.linspace(6.0, 1.0, robot.joints)
+    bodies = jid.simulation.random_bodies(robot, masses, random).ravel()
     p = np.concatenate([bodies, np.ones(model.size - len(bodies))])
     for seed in (1, 2):
         motion = jid.trajectories.random_fourier_series(
@@ -42,19 +41,19 @@ def main():
 
     jax.config.update("jax_enable_x64", True)
     import jaxid as jid
-    from jaxid.report.result_files import write_report
-    from jaxid.validation.verdict import Report
 
     robot = jid.robots.panda()
     model = jid.Model(robot)
     observations = logs(jid, robot, model, 6.0 if given.quick else 60.0)
     fit = jid.identify(jid.base_parameters(model), observations[0])
     found = jid.validate(fit, observations)
-    report = Report(fit, found.errors[:1], found.errors[1:], found.definiteness)
+    report = jid.workflow.IdentificationReport(
+        fit, found.errors[:1], found.errors[1:], found.definiteness
+    )
     folder = Path(tempfile.mkdtemp())
     for _ in range(2):
         begin = time.perf_counter()
-        write_report(folder, report)
+        report.save(folder)
         seconds = time.perf_counter() - begin
     size = (folder / "report.html").stat().st_size / 1e6
     recipe = "benchmarks/report.py: Panda, two logs, every sample a row"

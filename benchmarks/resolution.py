@@ -1,4 +1,4 @@
-"""Coverage of intervals with coarse encoders, and the warning of `resolution_bias`.
+"""Coverage of intervals with coarse encoders, and a warning by `jid.resolution_bias`.
 
     python benchmarks/resolution.py [--quick] [--json FILE] [--draws 50] [--cutoff 10]
         [--robot xarm7 ...]
@@ -29,7 +29,6 @@ ROBOTS = ("xarm7", "ur3", "scara", "six")
 def study(robot, file, bits, draws, cutoff):
     """Return coverage of all, of friction, with exact angles; the largest bias, and warnings."""
     import jaxid as jid
-    from jaxid.identification.encoder_resolution import resolution_bias
 
     arm = jid.load_urdf(file)
     n, law = arm.joints, jid.CoulombFriction(jid.terms.Tanh(0.01))
@@ -63,7 +62,7 @@ def study(robot, file, bits, draws, cutoff):
         shifts.append(
             (fit.parameters - fits[1][0].parameters) / fit.standard_deviations
         )
-        ratio = np.abs(resolution_bias(*fits[0])) / fit.standard_deviations
+        ratio = np.abs(jid.resolution_bias(*fits[0])) / fit.standard_deviations
         warned += bool(ratio.max() > 0.5)
     friction = np.array([name.startswith(("fv", "fc")) for name in base.names])
     held = np.mean(held, axis=0)

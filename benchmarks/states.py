@@ -1,4 +1,4 @@
-"""Several runs of one simulated robot: cold and warm, payload, drive gains, delay, update.
+"""Several runs of one virtual robot: cold and warm, payload, gains, delay, update.
 
 Everything is simulated; noise on the forces has a standard deviation of 1 % of each
 joint's largest force, half of its variance white and half with a memory of 50 ms.
@@ -26,35 +26,24 @@ cm from the last frame; friction is 20 % larger with it. Gains are drawn within 
     python benchmarks/states.py --quick    # one draw of each
 """
 
+import dataclasses
+
 import jax
 import numpy as np
 import timing
 from scipy import signal
 
 import jaxid as jid
-from jaxid.identification.operating_states import (
-    stores_energy,
-)  # private: kinds of parameters
-
-# private: levels, kinds of parameters
-from jaxid.identification.parameter_changes import (
-    LEVEL,
-    Verdict,
-    parameter_kinds,
-)
-from jaxid.identification.payload import (  # private: a known payload
-    CENTRAL_NAMES,
-    CENTRAL_UNITS,
-    Payload,
-)
-from jaxid.identification.uncertainty import Uncertainty  # private: a known payload
-from jaxid.measurement.recording import remove_delay  # private: mend a log
 
 SAMPLE_TIME, MEMORY, NOISE = 0.002, 0.05, 0.01
+LEVEL = 0.95
 CAD = (273.4, 16.93, 14.35, 7.50, 6.42, 0.569, 0.031)
 """Masses of the bodies [kg]; the first is the difference to the paper's p_B(1)."""
 VISCOUS, COULOMB = ((248.41, 90.19), (41.26, 25.65)), ((312.50, 233.00), (18.24, 15.07))
 DELAY = 0.01
+CENTRAL_UNITS = {"m": "kg", "x": "m", "y": "m", "z": "m"}
+CENTRAL_UNITS |= dict.fromkeys(("A_c", "B_c", "C_c", "D_c", "E_c", "F_c"), "kg m²")
+"""Units of mass, centre of mass, and moments about it."""
 TOOL = jid.Tool(
     6,
     mass=3.0,
@@ -149,7 +138,6 @@ def cold_and_warm(draws: int) -> list[str]:
     rig = Rig(base.model, omega=0.8, seed=1)
     clean = [rig.forces(p) for p in truth]
     cold_p, warm_p = (np.asarray(base.from_standard(p)) for p in truth)
-    stored, kinds = stores_energy(base), np.array(parameter_kinds(base))
     verdicts, nothing, inside, states, shared, widths = [], [], [], [], [], []
     table: list[str] = []
     for seed in range(draws):
@@ -171,8 +159,15 @@ def cold_and_warm(draws: int) -> list[str]:
         )
         if not seed:
             table = _paper_table(base, found, cold_p, warm_p)
-    changed = np.array([[v is Verdict.CHANGED for v in row] for row in verdicts])
-    perhaps = np.array([[v is Verdict.PERHAPS for v in row] for row in verdicts])
+    kinds = np.array(found.kinds)
+    # States share the parameters that store energy; friction and offsets do not.
+    stored = np.isin(np.arange(base.size), both.shared)
+    changed = is_verdict("CHANGED", verdicts)
+    perhaps = is_verdict("PERHAPS", verdicts)
+    of_equals = [row for row, _ in nothing]
+    certain = is_verdict("CHANGED", of_equals)
+    false = ~is_verdict("UNCHANGED", of_equals)
+    of_states = is_verdict("CHANGED", [row for row, _ in states])
     lines = [
         *table,
         "",
@@ -186,10 +181,6 @@ def cold_and_warm(draws: int) -> list[str]:
             f"| {_percent(changed[:, own])} | {_percent(perhaps[:, own])} "
             f"| {_percent(np.array(inside)[:, own])} |"
         )
-    false = np.array(
-        [[v is not Verdict.UNCHANGED for v in row] for row, _ in nothing], dtype=float
-    )
-    certain = np.array([[v is Verdict.CHANGED for v in row] for row, _ in nothing])
     return [
         *lines,
         "",
@@ -207,7 +198,7 @@ def cold_and_warm(draws: int) -> list[str]:
         f"| nothing changed: any group called changed (allowed 5 %) "
         f"| {np.mean([g for _, g in nothing]):.0%} |",
         "| joint fit of both states: all 14 friction parameters called changed "
-        f"| {_all(np.array([[v is Verdict.CHANGED for v in row] for row, _ in states]))} |",
+        f"| {_all(of_states)} |",
         "| joint fit: sharing of inertia rejected at 5 % "
         f"| {np.mean([p < 1 - LEVEL for _, p in states]):.0%} |",
         "| joint fit: standard deviations of inertia, of those of one run (median) "
@@ -215,8 +206,13 @@ def cold_and_warm(draws: int) -> list[str]:
     ]
 
 
+def is_verdict(name: str, draws) -> np.ndarray:
+    """Return which verdicts have this name [draws, parameters]."""
+    return np.array([[verdict.name == name for verdict in row] for row in draws])
+
+
 def _groups(first: jid.Fit, second: jid.Fit) -> bool:
-    """Return whether any group changed (equal states), or just friction (cold and warm)."""
+    """Return whether any group (equal states) or just friction (warm) changed."""
     found = {g["name"]: g["changed"] for g in jid.compare(first, second).groups}
     if second.name == "again":
         return any(found.values())
@@ -270,13 +266,19 @@ def panda() -> tuple[jid.BaseParameters, np.ndarray, np.ndarray]:
     return jid.base_parameters(virtual.model), plain, loaded
 
 
+def central_values(tool: jid.Tool) -> np.ndarray:
+    """Return mass, centre of mass, and moments about it."""
+    central = dataclasses.replace(tool, centre_of_mass=(0.0, 0.0, 0.0))
+    moments = np.asarray(central.parameters)[4:]
+    return np.concatenate([[tool.mass], tool.centre_of_mass, moments])
+
+
 def payload(draws: int) -> list[str]:
     """Return the tables of payloads (Fig. 8) and of drive gains from the same motions."""
     base, plain, loaded = panda()
     rigs = [Rig(base.model, omega=2 * np.pi / 8, seed=k + 1) for k in range(2)]
     clean = [rig.forces(p) for rig, p in zip(rigs, (plain, loaded), strict=True)]
-    known = Uncertainty(np.eye(10), np.ones(10), np.eye(10))
-    wanted, _ = Payload(6, *(np.asarray(TOOL.parameters),) * 2, known, 0.0).central
+    wanted = central_values(TOOL)
     masses, inside, estimates, distances, gains, holds = [], [], [], [], [], []
     for seed in range(draws):
         runs = [
@@ -300,14 +302,14 @@ def payload(draws: int) -> list[str]:
         holds.append(
             np.abs(drives.gains - true) <= drives.uncertainty.half_widths(LEVEL)
         )
-    (first, known), names = estimates[0], zip(CENTRAL_NAMES, CENTRAL_UNITS, strict=True)
+    first, known = estimates[0]
     lines = [
         "| parameter | truth | estimate (95 %) | largest error of all draws |",
         "|---|---|---|---|",
     ]
     errors = np.abs(np.array([values for values, _ in estimates]) - wanted).max(axis=0)
     halves = known.half_widths(LEVEL)
-    for k, (name, unit) in enumerate(names):
+    for k, (name, unit) in enumerate(CENTRAL_UNITS.items()):
         lines.append(
             f"| {name} [{unit}] | {wanted[k]:.4f} | {first[k]:.4f} ± {halves[k]:.4f} "
             f"| {errors[k]:.4f} |"
@@ -344,7 +346,7 @@ def delay(draws: int) -> list[str]:
         late = rig.rows(recording)
         one = jid.estimate_delay(base, late)
         low, high = one.interval(LEVEL)
-        mended = rig.rows(remove_delay(recording, one.seconds))
+        mended = rig.rows(jid.remove_delay(recording, one.seconds))
         fits = [jid.identify(base, o) for o in (late, mended)]
         found.append(one.seconds)
         inside.append(low <= DELAY <= high)

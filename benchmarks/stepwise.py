@@ -25,9 +25,9 @@ import numpy as np
 import timing
 
 import jaxid as jid
-from jaxid.simulation.example import virtual_log  # private: logs of the example
 
-TURNS, ALONE, FILTER, EVERY = 5, 4.0, jid.ZeroPhaseButterworth(10.0), 20
+TURNS, PERIOD, ALONE = 5, 8.0, 4.0
+FILTER, EVERY = jid.ZeroPhaseButterworth(10.0), 20
 DECIDED = 1e-4
 """Fraction (0 to 1) of a column that must be new for an axis to determine its parameter."""
 
@@ -104,6 +104,21 @@ def observed(robot: jid.Robot, recording: jid.Recording) -> jid.Observations:
     return jid.observe(recording, robot, FILTER, jid.Subsample(EVERY))
 
 
+def random_log(virtual, name: str, periods: int, key: tuple[int, int]) -> jid.Recording:
+    """Return a log of all axes, as `jaxid example` writes it for this key."""
+    motion_seed, noise_seed = np.random.SeedSequence(key).generate_state(2).tolist()
+    motion = jid.trajectories.random_fourier_series(
+        virtual.model.robot, omega=2 * np.pi / PERIOD, reach=0.9, seed=motion_seed
+    )
+    return virtual.measure(
+        motion,
+        duration=periods * PERIOD,
+        sample_time=0.002,
+        seed=noise_seed,
+        name=name,
+    )
+
+
 def single_axes(virtual, seed: int) -> tuple[jid.Observations, ...]:
     """Return a log of each axis alone."""
     robot = virtual.model.robot
@@ -133,8 +148,8 @@ def turn(seed: int) -> dict[str, tuple[float, float]]:
     virtual = jid.simulation.virtual_panda(seed)
     robot, model = virtual.model.robot, virtual.model
     base = jid.base_parameters(model)
-    seen = observed(robot, virtual_log(virtual, "seen", 2, (seed, 1)))
-    unseen = observed(robot, virtual_log(virtual, "unseen", 1, (seed, 2)))
+    seen = observed(robot, random_log(virtual, "seen", 2, (seed, 1)))
+    unseen = observed(robot, random_log(virtual, "unseen", 1, (seed, 2)))
     alone = single_axes(virtual, 100 * seed)
     found = {
         "at once": jid.identify(base, seen),

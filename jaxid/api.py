@@ -46,6 +46,7 @@ from .identification.combination import combine_fits as combine_fits
 from .identification.consistency import PhysicallyConsistent as PhysicallyConsistent
 from .identification.delay import estimate_delay as estimate_delay
 from .identification.drive_gains import identify_drive_gains as identify_drive_gains
+from .identification.encoder_resolution import resolution_bias as resolution_bias
 from .identification.estimators import WeightedLeastSquares as WeightedLeastSquares
 from .identification.filter_selection import choose_filter as choose_filter
 from .identification.fit_result import Fit as Fit, load_fit as load_fit
@@ -75,7 +76,10 @@ from .measurement.filters import (
 )
 from .measurement.observations import Observations as Observations, observe as observe
 from .measurement.reading import read_recording as read_recording, scan_log as scan_log
-from .measurement.recording import Recording as Recording
+from .measurement.recording import (
+    Recording as Recording,
+    remove_delay as remove_delay,
+)
 from .program.jax_compilation_cache import (
     enable_compilation_cache as enable_compilation_cache,
 )

@@ -1,14 +1,13 @@
-"""Physically consistent fits as conic programs, an independent form for benchmarks and tests."""
+"""Physically consistent fits as conic programs, independent of the package."""
 
 import cvxpy as cp
 import numpy as np
 
-from jaxid.identification.consistency.feasible_set import FeasibleSet
-from jaxid.identification.consistency.scaled_rows import ScaledRows
+import jaxid as jid
 
 
 def problem(
-    feasible: FeasibleSet, data: ScaledRows
+    feasible: jid.consistency.FeasibleSet, data: jid.consistency.ScaledRows
 ) -> tuple[cp.Problem, cp.Variable, np.ndarray]:
     """Return the fit as a conic program in SI units, its variables and their units."""
     bounds = feasible.bounds
@@ -70,7 +69,9 @@ def problem(
     return cp.Problem(cp.Minimize(objective), constraints), y, unit
 
 
-def optimum(feasible: FeasibleSet, data: ScaledRows) -> tuple[float, np.ndarray]:
+def optimum(
+    feasible: jid.consistency.FeasibleSet, data: jid.consistency.ScaledRows
+) -> tuple[float, np.ndarray]:
     """Return the smallest half squares, and the parameters, by CLARABEL."""
     fit, y, unit = problem(feasible, data)
     fit.solve(cp.CLARABEL, tol_gap_abs=1e-9, tol_gap_rel=1e-9, tol_feas=1e-9)

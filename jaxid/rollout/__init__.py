@@ -4,9 +4,11 @@ from .bodies import Bodies as Bodies
 from .contact import Contact as Contact
 from .errors import RolloutErrors as RolloutErrors
 from .identify import identify_rollout as identify_rollout
+from .motion import ServoMotion as ServoMotion
 from .result import Combination as Combination, ServoFit as ServoFit
 from .servo import PARAMETERS as PARAMETERS
 from .torque import (
     TorqueRolloutFit as TorqueRolloutFit,
     identify_torque_rollout as identify_torque_rollout,
 )
+from .uncoupled import ServoSimulator as ServoSimulator

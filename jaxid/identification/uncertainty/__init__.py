@@ -7,7 +7,11 @@ from .result import (
     ResidualSpectra as ResidualSpectra,
     Uncertainty as Uncertainty,
 )
-from .spectral import SpectralSandwich as SpectralSandwich
+from .spectra_of_rows import row_spectra as row_spectra
+from .spectral import (
+    SpectralSandwich as SpectralSandwich,
+    SpectralTable as SpectralTable,
+)
 
 UNCERTAINTIES: dict[str, type[AbstractUncertainty]] = {
     "spectral": SpectralSandwich,
