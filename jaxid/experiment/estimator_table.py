@@ -142,7 +142,8 @@ def build_estimation(
         least_squares = estimators.LeastSquares(solution)
     if kind == "consistent":
         settings["bounds"] = build_bounds(robot, bounds)
-        settings["margin"] = margin
+        if margin > 0.0:
+            settings["margin"] = margin
         settings["pull"] = pull_to_bodies(robot_file, pull)
         settings["throw"] = False
     build = ESTIMATORS[kind]
