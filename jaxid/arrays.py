@@ -29,7 +29,7 @@ from jaxtyping import (
 from jaxid.errors import InputError
 
 AnyArray = jax.Array | np.ndarray
-"""A JAX array, or a NumPy array: what stays in NumPy stays a constant when JAX traces."""
+"""A JAX array, or a NumPy array: NumPy's values stay constants when JAX traces."""
 
 Joints = Float[AnyArray, " joints"]
 """One number for each joint."""
@@ -46,7 +46,7 @@ Numbers = AnyArray | Sequence[Any] | float | int
 
 
 def require_float64(what: str) -> None:
-    """Raise an error if JAX runs in single precision, which `what` (a task) cannot use."""
+    """Raise an error if JAX runs in single precision, which a task cannot use."""
     if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
         raise RuntimeError(
             f"{what} needs float64, but JAX runs in float32: call "
@@ -56,7 +56,7 @@ def require_float64(what: str) -> None:
 
 
 def double_precision() -> AbstractContextManager:
-    """Return a context in which JAX computes in float64, whatever its setting outside."""
+    """Return a context in which JAX computes in float64, whatever its setting is."""
     if hasattr(jax, "enable_x64"):
         return jax.enable_x64(True)
     from jax.experimental import enable_x64  # pyright: ignore[reportAttributeAccessIssue]
@@ -65,7 +65,7 @@ def double_precision() -> AbstractContextManager:
 
 
 def as_array(name: str, value: Numbers) -> AnyArray:
-    """Return an array as it is, and anything else, which must be numbers, in NumPy's float64."""
+    """Return an array as it is, and other numbers as an array of NumPy's float64."""
     if isinstance(value, AnyArray):
         return value
     try:
@@ -77,7 +77,10 @@ def as_array(name: str, value: Numbers) -> AnyArray:
 
 
 def given(value: Any) -> Any:
-    """Return an argument as it is: converter of a field that is checked together with others."""
+    """Return an argument as it is.
+
+    Converter of a field that is checked together with others.
+    """
     return value
 
 
@@ -87,7 +90,7 @@ def optional(value: float | int | None) -> float | None:
 
 
 def one_or_each(value: Any) -> Any:
-    """Convert a field that holds one number for all joints, or a list with one for each."""
+    """Convert a field that holds one number for all joints, or one for each."""
     return as_array("value", value) if isinstance(value, list | tuple) else value
 
 
@@ -103,12 +106,15 @@ def matching(name: str, value: AnyArray | float, qd: AnyArray) -> AnyArray | flo
 
 
 def is_traced(*trees: Any) -> bool:
-    """Return whether JAX is tracing a leaf of these trees, so that its value is not known."""
+    """Return whether JAX traces a leaf of these trees, so that its value is unknown."""
     return any(isinstance(x, Tracer) for x in jax.tree.leaves(trees))
 
 
 def namespace(*arrays: AnyArray) -> ModuleType:
-    """Return `jax.numpy` if one of the arrays is JAX's, else NumPy (results stay constants)."""
+    """Return `jax.numpy` if an array is JAX's, otherwise NumPy.
+
+    NumPy's results stay constants when JAX traces.
+    """
     return jnp if any(isinstance(x, jax.Array) for x in arrays) else np
 
 
@@ -118,7 +124,7 @@ def on_cores(
     cores: int | None = None,
     ahead: int | None = None,
 ) -> Iterator[Any]:
-    """Yield the results of a function for some items in their order, computed on all cores.
+    """Yield a function's results for some items in their order, computed on all cores.
 
     The calling thread makes the items, and at most `ahead` of them before it takes a
     result: by default one for each core.
@@ -136,7 +142,7 @@ def on_cores(
 
 
 def in_parts(solve: Callable[[Any], Any], data: Any, size: int = 16) -> Any:
-    """Return the results of a compiled function, called for so many entries of data at a time.
+    """Return the results of a compiled function, called for `size` entries at a time.
 
     XLA leaves small operations to one core, so each core gets entries of its own. Parts
     of equal size also mean that another number of entries compiles nothing anew. An
@@ -156,7 +162,7 @@ def in_parts(solve: Callable[[Any], Any], data: Any, size: int = 16) -> Any:
 
 
 def content(tree: Any) -> tuple:
-    """Return a hashable key of a concrete PyTree: structure, shapes, types and bytes."""
+    """Return a hashable key of a concrete PyTree: structure, shapes, types, bytes."""
     leaves, structure = jax.tree.flatten(tree)
     arrays = [np.asarray(x) for x in leaves]
     return structure, tuple((x.shape, x.dtype.str, x.tobytes()) for x in arrays)

@@ -53,7 +53,7 @@ def write_bytes(path: str | Path, data: bytes) -> None:
 def atomic_folder(
     folder: str | Path, outdated: Callable[[Path], Iterable[str]] = lambda folder: ()
 ) -> Iterator[Path]:
-    """Yield an empty temporary folder whose files appear in `folder` when the block ends.
+    """Yield an empty temporary folder, whose files move to `folder` at the end.
 
     After an error in the block nothing has changed. A new folder appears in one step.
     In an existing folder, each file replaces the one of its name in one step, files in
@@ -72,7 +72,10 @@ def atomic_folder(
 
 
 def require_writable(folder: str | Path) -> None:
-    """Check that files can be written to a folder, which need not exist, before long work."""
+    """Check that files can be written to a folder, before long work starts.
+
+    The folder need not exist.
+    """
     with _temporary_folder(Path(folder).absolute()):
         pass
 
@@ -142,7 +145,7 @@ def json_text(content: dict[str, Any]) -> str:
 
 
 def fill_template(path: Path, **values: Any) -> str:
-    """Return the text of a Jinja template with these values; a missing one is an error."""
+    """Return the text of a Jinja template with these values; each must be given."""
     import jinja2  # loaded by those who write such files
 
     environment = jinja2.Environment(
@@ -241,7 +244,7 @@ def from_json(value: Any, hint: Any, place: str = "") -> Any:
 
 
 def _object_from_json(value: dict[str, Any], options: Sequence[Any], place: str) -> Any:
-    """Return the module, array, number or member of an enumeration that an object holds."""
+    """Return the module, array, number or enumeration member that an object holds."""
     if "kind" in value:
         return _module_from_json(value, options, place)
     names = set(value) - {"shape"}
@@ -308,7 +311,7 @@ def _module_from_json(value: dict[str, Any], options: Sequence[Any], place: str)
 
 
 def _subclasses(family: type) -> list[type]:
-    """Return a class and all that are derived from it, those defined first before others."""
+    """Return a class and all classes derived from it, in the order of definition."""
     classes = [family]
     for child in family.__subclasses__():
         classes += _subclasses(child)

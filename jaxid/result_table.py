@@ -1,4 +1,4 @@
-"""Tables of results: facts, columns with units, remarks; as text, and as rows for pages.
+"""Tables of results: facts, columns with units, remarks; as text and as page rows.
 
 A result returns one by its method `summary()` and prints it by `__str__`. Columns hold
 numbers or texts; numbers are formatted by the column's function and aligned at their
@@ -25,13 +25,13 @@ import numpy as np
 MISSING = "–"  # noqa: RUF001
 """Text in place of a number that is not known."""
 SHORT_DECIMALS = range(-3, 9)
-"""Decimals of numbers that are written without exponent; -3 are three digits too many."""
+"""Decimals of numbers without exponent; -3 are three digits too many."""
 MIN_TEXT_WIDTH = 12
 """Characters of a line to which a column of texts may be folded."""
 UNSEEN_CHARACTERS = re.compile(
     r"[\x00-\x08\x0b-\x1f\x7f-\x9f\xad\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff\ud800-\udfff]"
 )
-"""Controls, marks of direction and others that nobody sees, and halves of characters."""
+"""Controls, marks of direction and other invisible ones, and halves of characters."""
 
 
 class Status(enum.Enum):
@@ -53,7 +53,7 @@ STYLES = {
 
 
 def printable(text: str) -> str:
-    """Return a text whose control and escape sequences are spelled out: no terminal obeys them."""
+    """Return a text with controls and escape sequences spelled out for terminals."""
     return UNSEEN_CHARACTERS.sub(
         lambda match: match[0].encode("unicode_escape").decode(), text
     )
@@ -150,7 +150,7 @@ def percent(fraction: float, digits: int = 2) -> str:
 
 
 def with_deviation(value: float, deviation: float) -> tuple[str, str]:
-    """Return an estimate and its standard deviation, both to the deviation's second digit."""
+    """Return an estimate and its standard deviation, to the latter's second digit."""
     if not (math.isfinite(value) and math.isfinite(deviation) and deviation > 0):
         return significant(value, 4), significant(deviation, 2)
     decimals = 1 - _exponent(float(f"{deviation:.1e}"))
@@ -161,7 +161,7 @@ def with_deviation(value: float, deviation: float) -> tuple[str, str]:
 
 
 def with_deviations(values: Any, deviations: Any) -> tuple[list[str], list[str]]:
-    """Return estimates and their deviations as texts for two columns, rounded together."""
+    """Return estimates and deviations as texts for two columns, rounded together."""
     pairs = [
         with_deviation(float(value), float(deviation))
         for value, deviation in zip(values, deviations, strict=True)
@@ -217,7 +217,7 @@ class Column:
 
     @property
     def texts(self) -> list[str]:
-        """Formatted values; numbers have blanks behind them so that their points are aligned."""
+        """Formatted values; blanks behind numbers align their decimal points."""
         texts = [
             self.format(value) if isinstance(value, float) else str(value)
             for value in self.values
@@ -314,7 +314,7 @@ class Table:
         return in_html("notebook", self)
 
     def __rich_console__(self, console: Any, options: Any) -> Iterator[Any]:
-        """Yield title, facts, columns and remarks, with empty lines between the last three."""
+        """Yield title, facts, columns and remarks, with empty lines between."""
         from rich.text import Text
 
         parts = []
@@ -368,7 +368,7 @@ class Table:
 
 
 def _two_columns(rows: Iterable[tuple[Any, str]]) -> Any:
-    """Return heads, such as words or marks, and the texts beside them as a table of `rich`."""
+    """Return heads, such as words or marks, and texts beside them as a `rich` table."""
     from rich.table import Table as Grid
     from rich.text import Text
 

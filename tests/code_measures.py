@@ -1,7 +1,7 @@
 """Size and density of Python code, counted in the nodes of its syntax tree.
 
-A node is an expression or a statement; imports and docstrings do not count. No line break
-changes this size. Nodes a line say how much a reader must take in at once.
+A node is an expression or a statement; imports and docstrings do not count. No line
+break changes this size. Nodes a line say how much a reader must take in at once.
 """
 
 import ast

@@ -52,7 +52,7 @@ def shared_data() -> Path:
 
 @pytest.fixture(scope="session", autouse=True)
 def warnings_of_mujoco():
-    """Fail if a simulation of MuJoCo was unstable, of which it would write into a file."""
+    """Fail if a simulation of MuJoCo was unstable, which it would write into a file."""
     try:
         import mujoco
     except ImportError:

@@ -1,4 +1,4 @@
-"""Comparison with golden results: numbers of whole runs that no change of the code may move.
+"""Comparison with golden results: numbers of whole runs that no change may move.
 
 The tolerance is 1e-9 relative; `JAXID_GOLDEN_TOLERANCE` widens it for machines with
 other instruction sets. To record new values after an intended change, delete the file
@@ -20,7 +20,7 @@ TOLERANCE = float(os.environ.get("JAXID_GOLDEN_TOLERANCE", "1e-9"))
 
 
 def command(*words):
-    """Run a command line in this process; a model may be called unusable (3), all else fails."""
+    """Run a command line here; it may call a model unusable (3), all else fails."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "argv", ["jaxid", *map(str, words)])
         with pytest.raises(SystemExit) as stopped:
@@ -46,7 +46,7 @@ def numbers_of_report(folder):
 
 
 def compare(case, found, tolerance=TOLERANCE):
-    """Compare numbers with the golden file of a case; write it and fail where there is none."""
+    """Compare numbers with a case's golden file; write it and fail without one."""
     path = HERE / f"{case}.json"
     if not path.exists():
         path.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")

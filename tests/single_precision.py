@@ -58,7 +58,7 @@ def plain():
 
 
 def dynamics():
-    """Methods of a model on arrays in float32, whose results have this precision too."""
+    """Methods of a model on float32 arrays, whose results have this precision too."""
     motion = jid.Motion(
         *(jnp.asarray(x[:9], jnp.float32) for x in jax.tree.leaves(cold.motion))
     )

@@ -1,4 +1,4 @@
-"""The command line: what it writes, what it refuses, and that it leaves nothing half-written."""
+"""The command line: what it writes and refuses, and that it leaves no partial files."""
 
 import csv
 import json
@@ -122,7 +122,7 @@ def run(capsys):
 
 @pytest.fixture
 def words(run):
-    """Runs a command, and returns what it prints on one line; code 3 is an unusable model."""
+    """Runs a command, returns its print in one line; code 3 is an unusable model."""
 
     def words(*args, ends=0):
         code, out, err = run(*args)

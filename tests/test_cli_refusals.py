@@ -1,4 +1,4 @@
-"""What no experiment file, log or report may hold: one sentence each, never a traceback."""
+"""What no experiment file, log or report may hold: one sentence each, no traceback."""
 
 import io
 import sys

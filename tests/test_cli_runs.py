@@ -1,4 +1,4 @@
-"""Several runs on the command line: added, with a payload, with a known load, with a delay."""
+"""Several runs on the command line: added, with a payload, a known load, a delay."""
 
 import json
 import os

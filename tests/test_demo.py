@@ -1,4 +1,4 @@
-"""The demo in a short form: the paper's findings must come out, and be written whole."""
+"""The demo in a short form: the paper's findings must come out, and be saved whole."""
 
 import json
 

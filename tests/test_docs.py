@@ -1,4 +1,4 @@
-"""Code that stands in the documents runs: blocks of Python one after the other, TOML as a file.
+"""Code in the documents runs: blocks of Python one after the other, TOML as a file.
 
 The names in `given` are those that a page may use without defining them.
 """
@@ -81,7 +81,7 @@ def _urdf(robot: jid.Robot, bodies) -> str:
 
 
 def _ordered(body, order: str) -> np.ndarray:
-    """Mass, first moments and entries of the tensor about the origin, as others name them."""
+    """Mass, first moments, entries of the tensor about the origin, by other names."""
     m, mx, my, mz, A, B, C, D, E, F = body
     known = {"m": m, "mx": mx, "my": my, "mz": mz, "Ixx": A, "Iyy": B, "Izz": C}
     known |= {"Iyz": -D, "Ixz": -E, "Ixy": -F}
@@ -89,7 +89,7 @@ def _ordered(body, order: str) -> np.ndarray:
 
 
 def _theirs(body) -> dict[str, np.ndarray]:
-    """One body as other packages hold it, in the orders that docs/conventions.md names."""
+    """One body as other packages hold it, in the orders of docs/conventions.md."""
     tensor = _ordered(body, "Ixx Ixy Ixz Ixy Iyy Iyz Ixz Iyz Izz").reshape(3, 3)
     m, c = body[0], body[1:4] / body[0]
     central = tensor - m * (c @ c * np.eye(3) - np.outer(c, c))
@@ -125,7 +125,7 @@ def _log(model: jid.Model, p, seed: int, alone: int | None = None) -> jid.Record
 
 @pytest.fixture(scope="module")
 def given(tmp_path_factory):
-    """Names and files that pages may use: a robot, its model, logs of it in a folder, a fit."""
+    """Names and files that pages may use: a robot, its model, logs of it, a fit."""
     folder = tmp_path_factory.mktemp("documents")
     robot = jid.Robot(
         "two joints",

@@ -35,7 +35,7 @@ def _cited(docstring: str) -> tuple[set[int], set[int]]:
 
 @cache
 def _definitions() -> dict[str, tuple[str, str]]:
-    """Return module and docstring of all modules, classes and functions, by names in `jaxid`."""
+    """Return module and docstring of all modules, classes and functions by name."""
     definitions = {}
 
     def collect(node, name, module):

@@ -1,4 +1,4 @@
-"""Experiment files: what they become, and how each mistake is refused in one sentence."""
+"""Experiment files: what they become, and how each mistake is refused in a sentence."""
 
 import re
 import tomllib
@@ -366,7 +366,8 @@ def test_logs_that_do_not_fit_the_file(load, tmp_path):
     log = tmp_path / "run.csv"
     rows = "\n".join(f"{0.01 * i},{i},{i},{i},1,1,1" for i in range(100))
     log.write_text("t,q1,q2,q3,tau1,tau2,tau3\n" + rows)
-    missing = r"the table `\[recording\]` is missing: .* `run.csv`, which has `t`, `q1`, .* `tau3`\."
+    names = r"`run.csv`, which has `t`, `q1`, .* `tau3`\."
+    missing = rf"the table `\[recording\]` is missing: .* {names}"
     with pytest.raises(ValueError, match=missing):
         load(ARM).require_columns([log])
     with pytest.raises(

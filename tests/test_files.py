@@ -68,7 +68,7 @@ def test_other_files_stay_and_those_of_an_earlier_result_go(tmp_path):
 
 @pytest.mark.parametrize("calls", range(4))
 def test_a_stop_before_any_of_the_moves_leaves_no_mixture(tmp_path, monkeypatch, calls):
-    """A process that is killed between two calls leaves no JSON file beside others' files."""
+    """A process killed between two calls leaves no JSON file beside others' files."""
     write(tmp_path, "a", "b", text="old")
     real, left = os.replace, iter(range(calls))
 

@@ -161,7 +161,7 @@ def test_files_are_short():
 
 
 def test_docstrings_are_in_plain_english():
-    """No summary begins with "What", no description of an argument or attribute with "Of"."""
+    """No summary begins with "What", no description of an argument with "Of"."""
     wrong = []
     for path in SOURCES:
         for node in ast.walk(_tree(path)):

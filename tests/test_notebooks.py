@@ -1,4 +1,4 @@
-"""Notebooks are kept: one preamble, .py and .ipynb in step, executed, without paths, small."""
+"""Notebooks are kept: one preamble, .py and .ipynb in step, executed, without paths."""
 
 import itertools
 import json

@@ -1,4 +1,4 @@
-"""JAX runs in float32 unless told: what then computes in float32 is refused with the cure.
+"""JAX runs in float32 unless told: computing in float32 is refused with the cure.
 
 All else gives the numbers of float64. One process for each precision goes through all
 entry points.

@@ -1,1 +1,1 @@
-"""The paper from end to end, on a virtual robot: a client of the public API (`jaxid demo`)."""
+"""The paper from end to end, on a virtual robot: a client of the public API."""

@@ -1,4 +1,4 @@
-"""Results of the demo beside the paper's numbers: tables, a page, and a record for programs."""
+"""Results of the demo beside the paper's: tables, a page, and a record for programs."""
 
 from pathlib import Path
 from typing import Any
@@ -28,7 +28,7 @@ from . import study as settings
 from .study import Study
 
 SHOWN = (0, 2, 4, 6)
-"""Axes 1, 5 and 7 of the paper's Figs. 6, 7 and 9, and the shoulder, which holds the arm."""
+"""Axes 1, 5 and 7 of the paper's Figs. 6, 7 and 9, and the shoulder."""
 POINTS = 800
 """Samples of a line in a figure."""
 
@@ -62,8 +62,8 @@ def remarks(study: Study) -> list[Remark]:
     return [
         Remark(
             "The identified model predicts the torques of every axis to "
-            f"{identification:.2g} % of the largest torque, and to {verification:.2g} % "
-            "on an unseen path.",
+            f"{identification:.2g} % of the largest torque, and to "
+            f"{verification:.2g} % on an unseen path.",
             Status.GOOD if max(identification, verification) < 1.0 else Status.DOUBTFUL,
             "Mean error of the worst axis; below 1 % in the paper. The true parameters "
             f"leave {max(study.true.mean_errors(0)):.2g} % and "
@@ -144,7 +144,10 @@ def paper_table(study: Study) -> Table:
 
 
 def error_table(study: Study, recording: int) -> Table:
-    """Return the mean errors of all axes on identification (0) or verification (1) (Fig. 10)."""
+    """Return the mean errors of all axes on one of the two logs (Fig. 10).
+
+    Log 0 served the identification, log 1 is for verification.
+    """
 
     def column(name: str, errors: list[float]) -> Column:
         return Column(name, [*errors, max(errors)], "%", lambda x: significant(x, 2))

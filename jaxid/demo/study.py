@@ -29,7 +29,7 @@ CENTRE = (0.3, 0.5, 0.8)
 EDGE = 0.6
 """Edge of this cube [m]."""
 SPEED = 1.05
-"""Limit of the end-effector along that path [m/s], nearly all that the joints can do."""
+"""Limit of the end-effector along that path [m/s]: nearly all that the joints allow."""
 ACCELERATION = 4.0
 """Limit of its acceleration [m/s²]."""
 TOOL = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
@@ -39,12 +39,17 @@ POSTURE = (0.0, 1.57, -0.3, 1.8, 0.0, 0.0, 0.0)
 SHOULDER = 2
 """Index of the joint whose drive cannot hold and move the arm within all its limits."""
 AT_REST = 0.02
-"""Speed below which a joint counts as resting, twice the width of the model's dry friction
-[rad/s or m/s]."""
+"""Speed below which a joint counts as resting [rad/s or m/s].
+
+It is twice the width of the model's dry friction.
+"""
 
 
 class Model(NamedTuple):
-    """Parameters by one estimator, validated on identification (0) and verification (1)."""
+    """Parameters by one estimator, validated on both logs.
+
+    The first log is for identification (0), the second one for verification (1).
+    """
 
     name: str
     fit: jid.Fit
@@ -85,7 +90,7 @@ class Study(NamedTuple):
         return self.unweighted, self.weighted, self.consistent, self.true
 
     def moving_errors(self, model: Model, recording: int) -> list[float]:
-        """Return the mean errors of all axes while they move [% of the largest torque]."""
+        """Return the mean errors of all axes in motion [% of the largest torque]."""
         errors = model.validation.errors[recording]
         # The observations of the warm robot lie between the two recordings.
         speeds = np.abs(self.observations[2 * recording].reduced_motion.qd)
@@ -96,7 +101,10 @@ class Study(NamedTuple):
 
     @property
     def tip_maxima(self) -> tuple[float, float]:
-        """Largest speed [m/s] and acceleration [m/s²] of the end-effector in the identification."""
+        """Largest speed [m/s] and acceleration [m/s²] of the end-effector.
+
+        They are those of the motion for identification.
+        """
         series = self.played.inner
         times = np.linspace(0.0, float(series.duration), 4000, endpoint=False)
         _, *rates = jid.constraints.tip_motion(

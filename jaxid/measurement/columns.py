@@ -165,7 +165,10 @@ def _units(units: Units | None) -> tuple[Unit, ...]:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Log:
-    """Channels of a log in SI units, of one file or of several (the first holds the angles)."""
+    """Channels of a log in SI units, from one or several files.
+
+    The first file holds the angles.
+    """
 
     tables: tuple[LogTable, ...]
     columns: Columns
@@ -173,7 +176,7 @@ class Log:
     def read(
         self, start: int = 0, stop: int | None = None
     ) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
-        """Return angles, velocities and forces of some rows, on the sides they were recorded."""
+        """Return angles, velocities and forces of some rows, as they were recorded."""
         arrays: dict[str, np.ndarray] = {}
         for table in self.tables:
             channels = [channel for channel in table.channels if channel != "time"]

@@ -49,7 +49,7 @@ class SamplesWithMemory(AbstractSamples):
 
 
 def with_memory(observations: Observations, law: Presliding | None) -> Observations:
-    """Return the same observations with the states of friction with memory, if there is any."""
+    """Return the same observations with the states of friction with memory, if any."""
     if law is None:
         return observations
     samples = observations.source

@@ -1,4 +1,4 @@
-"""Observations: motion and forces of a log, and the filters that turn them into rows (Eq. 26)."""
+"""Observations: motion and forces of a log, and the filters that make rows (Eq. 26)."""
 
 import dataclasses
 import math
@@ -43,7 +43,7 @@ Progress = Callable[[float], None]
 
 
 class Observations(eqx.Module):
-    """Motion and forces at the full rate, joint side, and the filters that turn them into rows.
+    """Motion and forces at the full rate, joint side, and the filters that make rows.
 
     The samples are in memory (`observe`, `Observations.of`) or stay on disk
     (`scan_log`).
@@ -85,7 +85,9 @@ class Observations(eqx.Module):
         mask: ArrayLike | None = None,
         name: str = "observations",
     ) -> "Observations":
-        """Make observations of arrays (samples x joints), joint side, whose motion is filtered.
+        """Make observations of arrays (samples x joints) of the joint side.
+
+        The motion is filtered here.
 
         Args:
             q: Joint angles [rad or m].
@@ -132,7 +134,10 @@ class Observations(eqx.Module):
         )
 
     def replace(self, **changes: Any) -> "Observations":
-        """Return the same observations with other fields; `motion` and `forces` are fields too."""
+        """Return the same observations with other fields.
+
+        `motion` and `forces` are fields too.
+        """
         if "motion" in changes or "forces" in changes:
             motion, forces = self.source.read_all()
             changes["source"] = SamplesInMemory(
@@ -208,7 +213,9 @@ class Observations(eqx.Module):
         return self.source.read(samples)
 
     def reduce(self, x: Float[AnyArray, "samples *columns"]) -> Any:
-        """Turn forces or columns at all samples into rows: smooth, trim and decimate (Eq. 26).
+        """Turn forces or columns at all samples into rows (Eq. 26).
+
+        The steps are to smooth, trim and decimate.
 
         Linear, and the same for every column: what holds between columns and forces at
         the samples holds between the rows. JAX can compile and differentiate it.
@@ -228,7 +235,7 @@ class Observations(eqx.Module):
     def chunks(
         self, samples: int = 16384, row_ranges: Sequence[tuple[int, int]] | None = None
     ) -> tuple[Chunk, ...]:
-        """Divide into parts of about so many samples, each with the overlap that its filters need.
+        """Divide into parts of about so many samples, with the filters' overlap.
 
         For columns that do not fit into memory at the full rate: evaluate them at the
         motion of `read(slice(*chunk.samples))`, and `chunk.reduce` gives the rows
@@ -257,7 +264,7 @@ class Observations(eqx.Module):
         return tuple(chunks)
 
     def split(self, fraction: float) -> tuple["Observations", "Observations"]:
-        """Divide the rows in time: a part for identification and the rest for validation.
+        """Divide the rows in time: a part for identification, the rest for validation.
 
         The log is filtered as a whole: no rows are lost where it is divided.
 
@@ -299,7 +306,7 @@ class Observations(eqx.Module):
 
     @property
     def reduced_motion(self) -> Motion:
-        """Motion at the rows' instants, for figures: columns are reduced, not the motion."""
+        """Motion at the rows' instants, for figures; it is not reduced like columns."""
         return self.motion[self.instants]
 
 

@@ -1,4 +1,4 @@
-"""Logs read as a whole, or in parts with overlap for the filters: larger than memory."""
+"""Logs read as a whole, or in parts with overlap for filters: larger than memory."""
 
 import dataclasses
 from collections.abc import Iterator, Sequence
@@ -44,7 +44,7 @@ def read_recording(
     bridged: float = 0.0,
     bad_rows: float = MAX_BAD_ROWS,
 ) -> Recording:
-    """Read a log from CSV (any separator), Parquet, NPZ, MAT, HDF5, or a bag of ROS 1 or 2.
+    """Read a log: CSV (any separator), Parquet, NPZ, MAT, HDF5, or a bag of ROS 1 or 2.
 
     Args:
         path: File with the angles, and with all other channels that have no file of
@@ -132,7 +132,7 @@ def _stray_stamps(
 
 
 class SamplesOnDisk(AbstractSamples):
-    """Samples of a log that stays on disk; each segment begins at its own row of the files.
+    """Samples of a log that stays on disk; each segment begins at a row of the files.
 
     Parts are read with `overlap` samples before and behind them, for the filter.
     """
@@ -164,7 +164,7 @@ class SamplesOnDisk(AbstractSamples):
     def read_rows(
         self, samples: slice
     ) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
-        """Return angles, velocities and forces of a segment's samples as they were recorded."""
+        """Return angles, velocities and forces of a segment's samples as recorded."""
         k = self._segment(samples)
         segment_start, _ = self.segments[k]
         shift = self.first_rows[k] - segment_start
@@ -278,7 +278,7 @@ def _stamps(log: Log) -> Iterator[np.ndarray]:
 def filter_memory(
     filter: AbstractFilter, sample_time: float, has_velocities: bool
 ) -> int:
-    """Return after how many samples a filter's motion no longer depends on an angle or velocity."""
+    """Return for how many samples a filter's motion depends on an angle or velocity."""
     half_length = 4096
     while half_length <= MAX_HALF_MEMORY:
         impulse = np.zeros((2 * half_length + 1, 1))

@@ -113,8 +113,8 @@ class Recording(eqx.Module):
         samples = len(data["angles"])
         if samples < MIN_SAMPLES:
             raise InputError(
-                f"`{name}` has {samples} samples, but at least {MIN_SAMPLES} are needed: "
-                "is the log cut?"
+                f"`{name}` has {samples} samples, but at least {MIN_SAMPLES} are "
+                "needed: is the log cut?"
             )
         if (time is None) == (sample_time is None):
             raise InputError(
@@ -167,7 +167,7 @@ class Recording(eqx.Module):
     def crop(
         self, start: float | int = -np.inf, stop: float | int = np.inf
     ) -> "Recording":
-        """Return the part from `start` [s] on and before `stop` [s], on the clock of `time`.
+        """Return the part from `start` [s] on and before `stop` [s], by its clock.
 
         Raises:
             InputError: If fewer than ten samples are left.
@@ -248,7 +248,9 @@ def consecutive(lengths: Iterable[int]) -> tuple[tuple[int, int], ...]:
 
 
 def unlike_derivatives(recording: Recording) -> dict[int, float]:
-    """Return the channels whose velocities do not make the way of their angles within 0.2 s.
+    """Return the channels whose velocities do not make the way of their angles.
+
+    The ways of 0.2 s are compared.
 
     Only channels whose way is well above the noise of their angles are judged. Each
     comes with the factor by which its velocities are too large.
@@ -317,7 +319,7 @@ def remove_delay(recording: Recording, seconds: float) -> Recording:
 def _without_delay(
     recording: Recording, segment: slice, seconds: float, lost_samples: int
 ) -> dict[str, Any]:
-    """Return the arrays of a segment, with angles at the instants at which forces acted."""
+    """Return the arrays of a segment, with angles at the instants of the forces."""
     time = np.asarray(recording.time)[segment]
     start = lost_samples if seconds > 0 else 0
     samples = slice(start, start + len(time) - lost_samples)

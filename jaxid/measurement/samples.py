@@ -104,7 +104,10 @@ def joint_side(
     velocities: AnyArray | None,
     forces: AnyArray,
 ) -> tuple[Any, ...]:
-    """Convert angles, velocities, forces to the joints' side; `log`: a recording, or `Columns`."""
+    """Convert angles, velocities and forces to the joints' side.
+
+    `log` is a recording, or `Columns`.
+    """
     drives = robot.drives
     q = np.asarray(angles)
     qd = None if velocities is None else np.asarray(velocities)

@@ -1,4 +1,4 @@
-"""The uniform grid behind the time stamps of a log, its gaps, and resampling onto it."""
+"""The uniform grid behind a log's time stamps, its gaps, and resampling onto it."""
 
 from collections.abc import Callable, Iterable, Iterator
 from typing import NamedTuple
@@ -11,7 +11,7 @@ from jaxid.errors import InputError
 MAX_JITTER = 0.05
 """Largest deviation of stamps from a uniform grid, in sample times, that is ignored."""
 MIN_STEP = 0.1
-"""Distance of two stamps, in sample times, up to which their rows are one sample, logged twice."""
+"""Distance of two stamps, in sample times, up to which one sample was logged twice."""
 MIN_SEGMENT = 4
 """Smallest number of rows without a gap that can be a segment."""
 MIN_SAMPLES = 10
@@ -23,7 +23,7 @@ class NeedsMemory(InputError):  # noqa: N818 (the name says what to do)
 
 
 class TimeGrid(NamedTuple):
-    """Uniform stretches of a log: half-open ranges of rows, and the times at which they start [s].
+    """Uniform stretches of a log: half-open ranges of rows, and their start times [s].
 
     The `deviation` is the largest one of the stamps from the grid [s].
     """
@@ -103,7 +103,7 @@ def find_grid(
     first_row: int,
     in_parts: bool = False,
 ) -> TimeGrid:
-    """Find the uniform grid behind time stamps; the typical step is that of the first part.
+    """Find the uniform grid behind time stamps, whose typical step is the first part's.
 
     `read` yields the finite stamps [s] in consecutive parts, and is called three times;
     `limits` are the pauses that are bridged, in sample times and in seconds. Where
@@ -187,7 +187,7 @@ def _find_stretches(
 
 
 def _round_time(sample_time: float, rows: int) -> float:
-    """Return a round sample time if it fits stamps, which are rounded numbers, as well."""
+    """Return a round sample time if it fits stamps (rounded numbers) as well."""
     round_time = float(f"{sample_time:.6g}")
     shift = abs(round_time - sample_time) * rows
     return round_time if shift < 0.01 * sample_time else sample_time
@@ -207,7 +207,8 @@ def _gap_notes(grid: TimeGrid, stretches: Stretches, origin: float) -> tuple[str
         plural = "s" if len(pauses) > 1 else ""
         notes.append(
             f"{len(pauses)} gap{plural} in time, the first after {first_gap:.6g} s, "
-            f"the longest of {longest_pause:.6g} s (sample time {grid.sample_time:.6g} s), "
+            f"the longest of {longest_pause:.6g} s "
+            f"(sample time {grid.sample_time:.6g} s), "
             "split the log into segments; a `largest_gap` above "
             f"{longest_pause / grid.sample_time:.3g} would bridge them"
         )
@@ -222,7 +223,7 @@ def _gap_notes(grid: TimeGrid, stretches: Stretches, origin: float) -> tuple[str
 def _linked(
     parts: Iterable[np.ndarray], origin: float
 ) -> Iterator[tuple[np.ndarray, int]]:
-    """Yield the times of each part after the last one before it, and the row of the first."""
+    """Yield the times of each part, with the last earlier one, and its first row."""
     previous_time = np.zeros(0)
     row = 0
     for part in parts:
@@ -270,7 +271,7 @@ class Resampling(NamedTuple):
     notes: tuple[str, ...]
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
-        """Return the samples of a channel: its rows, or interpolated by cubic splines."""
+        """Return the samples of a channel: its rows, or values of cubic splines."""
         x = x[self.rows]
         ranges = self.grid.ranges
         if self.grid.is_exact:

@@ -1,4 +1,4 @@
-"""Figures of estimates with their intervals: of one fit, and of two fits side by side."""
+"""Figures of estimates with their intervals: of one fit, and of two side by side."""
 
 import math
 from collections.abc import Sequence
@@ -27,7 +27,7 @@ GRADES = (
 
 
 def parameter_figure(fit: Fit) -> Figure:
-    """Return the relative standard deviations of all estimates, the smallest ones first.
+    """Return the relative standard deviations of all estimates, smallest ones first.
 
     Beside them stand the estimates with their standard deviations. Values above 1000 %
     are drawn at the edge.
@@ -55,7 +55,7 @@ def parameter_figure(fit: Fit) -> Figure:
 def _parameter_panel(
     fit: Fit, shown: np.ndarray, percents: np.ndarray, low: float
 ) -> Panel:
-    """Return a row for each parameter, with an interval from the left to its percents."""
+    """Return a row for each parameter: an interval from the left to its percents."""
     names = [fit.base.names[k] for k in shown]
     values = np.asarray(fit.parameters)[shown]
     estimates, deviations = with_deviations(values, fit.standard_deviations[shown])

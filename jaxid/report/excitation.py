@@ -20,7 +20,7 @@ from .page import picture, provenance, render_page
 
 
 def side_by_side_table(plans: Sequence[ExcitationPlan]) -> Table:
-    """Return all criteria of motions that minimise one of them each, and their deviations."""
+    """Return all criteria and deviations of motions that minimise one of them each."""
     criteria = plans[0].criteria
     names = [criterion.name for criterion in criteria]
     columns = [
@@ -49,7 +49,7 @@ def side_by_side_table(plans: Sequence[ExcitationPlan]) -> Table:
 
 
 def plan_remarks(plan: ExcitationPlan) -> list[Remark]:
-    """Return what must be known of a design, what it assumes, and what it leaves vague."""
+    """Return the assumptions and doubts that a reader of a design must know."""
     robot = plan.base.model.robot
     start, second = plan.limits.basis.times(plan.samples)[:2]
     step = float(second - start)
@@ -59,8 +59,8 @@ def plan_remarks(plan: ExcitationPlan) -> list[Remark]:
     )
     deviations = Remark(
         f"Expected deviations are those of {plan.samples} samples in "
-        f"{plan.samples * step:.4g} s ({1 / step:.4g} Hz), of one run, with white noise "
-        f"of the forces: standard deviation {noise}; of n runs they are √n times "
+        f"{plan.samples * step:.4g} s ({1 / step:.4g} Hz), of one run, with white "
+        f"noise of the forces: standard deviation {noise}; of n runs they are √n times "
         "smaller."
     )
 
@@ -72,9 +72,8 @@ def plan_remarks(plan: ExcitationPlan) -> list[Remark]:
         doubts.append(f"Assumed, because not given: {_assumed_limits(plan)}")
     if plan.vague:
         threshold = f"{100 * MAX_RELATIVE_DEVIATION:g} %"
-        doubts.append(
-            f"Deviations above {threshold} of the nominal value: {', '.join(plan.vague)}"
-        )
+        vague = ", ".join(plan.vague)
+        doubts.append(f"Deviations above {threshold} of the nominal value: {vague}")
     if plan.interrupted:
         doubts.append("The search was stopped: `--resume` may find a better motion")
     doubtful = [Remark(text, Status.DOUBTFUL) for text in doubts]
@@ -179,7 +178,7 @@ def _speed_scene(
 
 
 def headline(plan: ExcitationPlan, remarks: Sequence[Remark]) -> Remark:
-    """Return the verdict on a motion in one sentence; `remarks` hold one for each check."""
+    """Return the verdict on a motion in one sentence; `remarks` has one per check."""
     if plan.undetermined:
         return Remark("This motion does not determine all base parameters.", Status.BAD)
     if not plan.feasible:

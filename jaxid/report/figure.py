@@ -19,7 +19,7 @@ class Figure(Drawing):
         return draw(self)
 
     def save(self, path: str | Path) -> None:
-        """Write a page to explore (`.html`), or PNG, PDF or SVG, without date in the file.
+        """Write a page to explore (`.html`), or PNG, PDF or SVG; the file has no date.
 
         Args:
             path: Path of the file, whose suffix tells the format.

@@ -1,4 +1,4 @@
-"""Elements of figures: curves in panels, and a robot in space. How they look is told elsewhere.
+"""Elements of figures, without their style: curves in panels, and a robot in space.
 
 `templates/figures.js` draws them on pages, `paper.py` for papers and notebooks.
 """
@@ -90,7 +90,7 @@ class Panel:
 
 
 class Solids(NamedTuple):
-    """Surfaces of triangles that move with the robot's bodies, or stand on the ground."""
+    """Surfaces of triangles that move with the robot's bodies or stand still."""
 
     # vertices in the frames of their bodies [m]
     vertices: Float[np.ndarray, "vertices 3"]
@@ -181,7 +181,7 @@ class Drawing:
 def decimate(
     time: Float[AnyArray, " rows"], values: Float[AnyArray, " rows"], bins: int
 ) -> tuple[Float[np.ndarray, " points"], Float[np.ndarray, " points"]]:
-    """Return points of a line: all if they are few, else the least and largest of each bin.
+    """Return points of a line: all if they are few, else least and largest of each bin.
 
     A peak of one sample stays visible however long the log is. Gaps in time become NaN,
     at which a line breaks; values that are NaN stay out of their bin.

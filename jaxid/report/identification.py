@@ -1,4 +1,4 @@
-"""Page of an identification: verdict, task, estimates, errors; and the tables of its results."""
+"""Page of an identification: verdict, task, estimates, errors; tables of results."""
 
 import dataclasses
 import re
@@ -36,7 +36,7 @@ MAX_BINS = 28_000
 
 
 def identification_page(report: Report, figures: Mapping[str, Figure]) -> str:
-    """Return the page of an identification as HTML: what matters first, then the details."""
+    """Return the page of an identification as HTML: the verdict first, then details."""
     fit = report.fit
     base = fit.base
     robot = base.model.robot
@@ -56,7 +56,8 @@ def identification_page(report: Report, figures: Mapping[str, Figure]) -> str:
     return render_page(
         f"{robot.name}: identified model",
         sections,
-        f"{base.size} base parameters of {robot.joints} joints, from {logs} log{plural}.",
+        f"{base.size} base parameters of {robot.joints} joints, from {logs} "
+        f"log{plural}.",
         "All numbers: result.json and parameters.csv beside this page. Lines of long "
         "logs show the least and the largest value of each pixel column, so that no "
         "peak is lost.",
@@ -84,7 +85,7 @@ def _glance(report: Report) -> list[Any]:
 
 
 def _three_numbers(report: Report) -> Markup:
-    """Return the torque error, the mean error of the worst joint, and the trusted parameters."""
+    """Return the torque error, the worst joint's mean error, the trusted parameters."""
     fit = report.fit
     logs = report.verification
     motion = "on motion that the fit has not seen"
@@ -149,7 +150,10 @@ def _log_size(log: TorqueErrors) -> str:
 
 
 def _physics(report: Report, figures: Mapping[str, Figure]) -> Iterator[Section]:
-    """Yield what the model says of the robot: in motion, before and after, friction, gravity."""
+    """Yield sections on what the model says of the robot.
+
+    They show the robot in motion, its torques before and after, friction and gravity.
+    """
     text = (
         "Each link has the colour of the torque error of the joint that moves it, the "
         "path of the end-effector that of the mean. Turn it, and move the slider."
@@ -185,8 +189,10 @@ def _torques(figures: Mapping[str, Figure], robot: Robot) -> list[Any]:
         blocks.append(folded(figure.title, untitled_figure))
     remaining_logs = len(logs) - len(first_logs)
     if remaining_logs:
-        text = f"{remaining_logs} more recordings are not shown here; result.json has their errors."
-        blocks.append(text)
+        blocks.append(
+            f"{remaining_logs} more recordings are not shown here; result.json has "
+            "their errors."
+        )
     return blocks
 
 
@@ -284,7 +290,7 @@ def parameter_table(fit: Fit) -> Table:
 
 
 def motor_tables(robot: Robot) -> list[Table]:
-    """Return the motors of a robot, if it has gears or couplings: their joints and properties."""
+    """Return the motors of a robot with gears or couplings: joints and properties."""
     drives = robot.drives
     if drives.is_direct:
         return []
@@ -324,7 +330,7 @@ def error_table(errors: TorqueErrors, robot: Robot) -> Table:
 
 
 def residual_table(spectra: ResidualSpectra, robot: Robot) -> Table:
-    """Return whether the residuals of each joint are white, and where their power lies."""
+    """Return whether each joint's residuals are white, and where their power lies."""
     limit = percent(spectra.limit)
     low_power = f"power below {0.1 * spectra.band:.2g} Hz\n(white: 10 %)"
     return Table(
@@ -338,7 +344,7 @@ def residual_table(spectra: ResidualSpectra, robot: Robot) -> Table:
 
 
 def body_table(consistency: Consistency, names: Sequence[str]) -> Table:
-    """Return mass, centre of mass and margin of each body, and the effect of the bounds."""
+    """Return mass, centre of mass and margin of each body, and the bounds' effect."""
     bodies = np.asarray(consistency.bodies)
     mass = bodies[:, 0]
     centre = bodies[:, 1:4] / mass[:, None]

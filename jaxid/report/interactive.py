@@ -41,7 +41,7 @@ def pack(content: bytes) -> str:
 
 
 def charts(drawing: Drawing) -> list[dict[str, Any]]:
-    """Return the charts of a figure: titles, values, heights [px] and packed contents."""
+    """Return the charts of a figure: titles, values, heights [px], packed contents."""
     if drawing.scene is not None:
         return [_chart("", "", SCENE_HEIGHT, scene_content(drawing.scene))]
     height = drawing.height * PIXELS_PER_INCH
@@ -96,7 +96,7 @@ def _curve_content(curve: Curve, panel: Panel, bins: int) -> dict[str, Any]:
 
 
 def scene_content(scene: Scene) -> dict[str, Any]:
-    """Return a robot in space: the path of its end-effector, and its poses at all frames."""
+    """Return a robot in space: its end-effector's path, and its poses at all frames."""
     bones = scene.bones[scene.frames]
     # A line with gaps: ends of each link, and nothing.
     gaps = np.full_like(bones[:, :, :1], np.nan)

@@ -1,4 +1,4 @@
-"""Figures of a motion (Figs. 3, 4, 5 and 8): joints, end-effector, and the robot in space."""
+"""Figures of a motion (Figs. 3, 4, 5, 8): joints, end-effector, the robot in space."""
 
 import dataclasses
 import itertools
@@ -39,7 +39,7 @@ MAX_PATH_POINTS = 1500
 MAX_FRAMES = 150
 """Largest number of poses of a robot on a page."""
 PLANE_SIZE = 0.7
-"""Half the side of the square that shows a plane, relative to the reach of the robot."""
+"""Half the side of the square that shows a plane, relative to the robot's reach."""
 SQUARE_FACES = np.array([[0, 1, 2], [1, 2, 3]])
 """Triangles of a square whose corners are listed row by row."""
 
@@ -47,7 +47,7 @@ SQUARE_FACES = np.array([[0, 1, 2], [1, 2, 3]])
 def joint_figure(
     robot: Robot, limits: Limits, time: Float[AnyArray, " samples"], motion: Motion
 ) -> Figure:
-    """Return position, velocity and acceleration of every joint between their limits (Fig. 4).
+    """Return position, velocity and acceleration of all joints, with limits (Fig. 4).
 
     Args:
         robot: Robot that moves.
@@ -128,7 +128,7 @@ def filtered_figure(
     filtered: Motion,
     joint: int,
 ) -> Figure:
-    """Return velocity and acceleration of a joint: as desired, and behind a filter (Fig. 5).
+    """Return velocity and acceleration of a joint: desired, behind a filter (Fig. 5).
 
     Args:
         robot: Robot that moves.
@@ -166,7 +166,7 @@ def pose_figure(
     title: str | None = None,
     shapes: CollisionModel | None = None,
 ) -> Figure:
-    """Return the robot along a motion: moving on a page, in some poses on paper (Figs. 3, 8).
+    """Return the robot along a motion: moving on a page, poses on paper (Figs. 3, 8).
 
     Args:
         robot: Robot to draw.
@@ -202,7 +202,7 @@ def pose_figure(
 
 
 def even_indices(count: int, max_count: int) -> np.ndarray:
-    """Return indices of at most `max_count` of `count` entries, the first and the last among them."""
+    """Return indices of at most `max_count` of `count` entries, with both ends."""
     places = np.linspace(0, count - 1, min(max_count, count))
     return np.unique(places.round().astype(int))
 
@@ -253,7 +253,7 @@ def _solids(
 
 
 def _capsule_points(capsule: Capsule) -> Float[np.ndarray, "points 3"]:
-    """Return points on two spheres at the ends of a capsule, spread by the golden angle."""
+    """Return points on the two spheres at a capsule's ends, at the golden angle."""
     number = np.arange(BALL_POINTS)
     angle = GOLDEN_ANGLE * number
     z = 1.0 - (2.0 * number + 1.0) / BALL_POINTS
@@ -267,7 +267,7 @@ def _capsule_points(capsule: Capsule) -> Float[np.ndarray, "points 3"]:
 def _obstacle_points(
     obstacle: HalfSpace | Box, size: float
 ) -> Float[np.ndarray, "points 3"]:
-    """Return the corners of a box, or of a square in a plane around the ground's origin."""
+    """Return corners of a box, or of a square in a plane around the ground's origin."""
     signs = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
     if isinstance(obstacle, Box):
         corners = 0.5 * signs * np.asarray(obstacle.size)

@@ -1,4 +1,4 @@
-"""Figures on paper and in notebooks: drawn by matplotlib, which only this module loads."""
+"""Figures on paper and in notebooks, by matplotlib, which only this module loads."""
 
 import math
 from pathlib import Path
@@ -125,7 +125,7 @@ def _name_abscissas(axes: Axes, names: Any) -> None:
 
 
 def _name_ordinates(axes: Axes, panel: Panel) -> None:
-    """Write names instead of numbers, from the top, and texts to the right of the panel."""
+    """Write names instead of numbers, from the top, and texts right of the panel."""
     axes.set_yticks(np.arange(len(panel.y_names)), panel.y_names)
     axes.set_ylim(len(panel.y_names) - 0.4, -0.6)
     axes.grid(visible=False, axis="y")
@@ -168,7 +168,7 @@ def _draw_curve(axes: Axes, curve: Curve, in_time: bool) -> None:
 
 
 def _draw_scene(figure: Figure, scene: Scene) -> None:
-    """Draw the robot in some poses, earlier ones paler, and the path of its end-effector."""
+    """Draw the robot in some poses, earlier ones paler, and its end-effector's path."""
     axes: Any = figure.add_subplot(
         projection="3d", proj_type="ortho", elev=22.0, azim=-62.0
     )

@@ -1,4 +1,4 @@
-"""Figures of what a model says of its robot: friction, gravity, and errors along a motion."""
+"""Figures of a model's view of its robot: friction, gravity, errors along a motion."""
 
 from collections.abc import Sequence
 
@@ -23,7 +23,7 @@ SPEED_CLASSES = 24
 MIN_CLASS_ROWS = 5
 """Smallest number of rows whose mean friction is shown."""
 ROUNDING = 1e-9
-"""Gravity torque that is zero but for rounding, relative to that of the heaviest joint."""
+"""Gravity torque that is only rounding, relative to that of the heaviest joint."""
 
 
 def friction_figure(fit: Fit, logs: Sequence[TorqueErrors]) -> Figure:
@@ -88,7 +88,7 @@ def _friction_columns(
 def _half_widths(
     fit: Fit, columns: Float[np.ndarray, "speeds joints base"]
 ) -> Float[np.ndarray, "speeds joints"]:
-    """Return half the widths of 95 % intervals; NaN where the logs do not determine them."""
+    """Return half the widths of 95 % intervals; NaN where they are undetermined."""
     covariance = np.nan_to_num(fit.covariance, posinf=0.0)
     variances = np.einsum("vjk,kl,vjl->vj", columns, covariance, columns)
     half_widths = 1.96 * np.sqrt(np.maximum(variances, 0.0))
@@ -193,7 +193,7 @@ def _steady_columns(base: BaseParameters, q: np.ndarray, qd: np.ndarray) -> np.n
 
 
 def error_scene(fit: Fit, log: TorqueErrors) -> Figure:
-    """Return the robot along a recording, coloured by the torque errors of its joints."""
+    """Return the robot along a recording, coloured by its joints' torque errors."""
     robot = fit.base.model.robot
     scale = np.asarray(log.max_forces)
     reference = "largest torque"

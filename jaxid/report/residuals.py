@@ -1,4 +1,4 @@
-"""Figures of residuals: spectra, autocorrelation, and the choice of a filter by them."""
+"""Figures of residuals: spectra, autocorrelation, and the choice of a filter."""
 
 import numpy as np
 from scipy.signal import fftconvolve
@@ -21,7 +21,7 @@ MIN_GAIN = 1e-2
 
 
 def filter_figure(choice: FilterChoice) -> Figure:
-    """Return the held-out errors of all candidates, and the correlation of neighbouring residuals.
+    """Return held-out errors of all candidates, and correlations of nearby residuals.
 
     Thin lines are single parts of the log. Too low a cut-off removes motion that moves
     the robot, too high a one lets noise into the accelerations.
@@ -62,7 +62,7 @@ def filter_figure(choice: FilterChoice) -> Figure:
 
 
 def residual_figure(spectra: ResidualSpectra, robot: Robot) -> Figure:
-    """Return the power of each joint's residuals against frequency, beside that of white noise.
+    """Return the power of each joint's residuals against frequency.
 
     The dashed line is the spectrum that white noise of the same power would have behind
     the filters.
@@ -91,13 +91,14 @@ def _spectrum_panel(spectra: ResidualSpectra, robot: Robot, j: int) -> Panel:
     white_name = "white noise behind the filters (10 % of its power there)"
     verdict = "white" if spectra.white[j] else "not white"
     low_share = percent(float(spectra.low_frequency[j]))
+    low_band = f"below {0.1 * spectra.band:.2g} Hz"
     return Panel(
         [
             Curve(frequency, density, "residuals", width=1.2),
             Curve(frequency, level * white_density, white_name, GREY, dashed=True),
         ],
         title=shortened(robot.joint_names[j], 24),
-        value=f"{verdict}: {low_share} % of the power below {0.1 * spectra.band:.2g} Hz",
+        value=f"{verdict}: {low_share} % of the power {low_band}",
         x="frequency [Hz]",
         unit="(N m)²/Hz" if robot.force_unit(j) == "N m" else "N²/Hz",
         log="xy" if np.any(density > 0) else "x",
@@ -107,7 +108,9 @@ def _spectrum_panel(spectra: ResidualSpectra, robot: Robot, j: int) -> Panel:
 def autocorrelation_figure(
     errors: TorqueErrors, robot: Robot, spectra: ResidualSpectra | None = None
 ) -> Figure:
-    """Return the autocorrelation of each joint's residuals, with the 95 % band of white noise.
+    """Return the autocorrelation of each joint's residuals.
+
+    The band holds 95 % of the values that white noise has.
 
     Args:
         errors: Errors on one recording.
@@ -182,6 +185,6 @@ def autocorrelation(
 
 
 def _correlate(values: np.ndarray, lags: int) -> np.ndarray:
-    """Return the sum of products of rows with those some rows later, for lags from 0."""
+    """Return the sum of products of rows with later rows, for lags from 0."""
     products = fftconvolve(values, values[::-1], axes=0)
     return products[len(values) - 1 :][:lags]

@@ -1,4 +1,7 @@
-"""Results on disk: pages and figures for people, numbers for programs, written atomically."""
+"""Results on disk: pages and figures for people, numbers for programs.
+
+Each result is written atomically.
+"""
 
 import csv
 import itertools
@@ -43,7 +46,7 @@ Estimates = tuple[Sequence[str], Sequence[str], AnyArray, Uncertainty]
 
 
 def write_report(folder: Path, report: Report, suffix: str = "") -> list[Path]:
-    """Write `report.html`, `result.json`, `parameters.csv` and `model.json`; return them.
+    """Write `report.html`, `result.json`, `parameters.csv`, `model.json`; return them.
 
     With a `suffix` (`svg`, `png` or `pdf`) each figure is also written to a file of
     that format. A folder that exists keeps its other files; files of an earlier report
@@ -117,7 +120,10 @@ def _unique_name(stem: str, role: str, names: Iterable[str]) -> str:
 
 
 def safe_name(name: str) -> str:
-    """Return a name that every file system takes: ASCII letters, digits, `-`, `_`, inner dots."""
+    """Return a name that every file system takes.
+
+    It consists of ASCII letters, digits, `-`, `_` and inner dots.
+    """
     ascii_only = unicodedata.normalize("NFKD", name).encode("ascii", "ignore").decode()
     safe = re.sub(r"[^A-Za-z0-9._-]+", "-", ascii_only).strip(".-")[:80].strip(".-")
     return safe or "recording"
@@ -151,7 +157,7 @@ def read_fit(report: Path) -> Fit:
 
 
 def read_faults(report: Path) -> list[str]:
-    """Return why the model of a report must not be used, as its verdict says; nothing if it may."""
+    """Return why a report's model must not be used, by its verdict; else nothing."""
     path = (report if report.is_dir() else report.parent) / "result.json"
     if schema_of(path) != SCHEMAS["result.json"]:
         return []
@@ -197,7 +203,9 @@ def write_estimates(
     tables: Sequence[Table],
     doubts: Sequence[Remark] = (),
 ) -> list[Path]:
-    """Write a payload, gains or states as a page, `{kind}.json` and `{kind}.csv`; return them.
+    """Write a payload, gains or states; return the files.
+
+    The files are a page, `{kind}.json` and `{kind}.csv`.
 
     The page shows the `tables`, and the `doubts` above them.
     """

@@ -30,7 +30,7 @@ def header(file: str) -> dict[str, Any]:
 
 
 def plain(value: Any) -> Any:
-    """Return a value as JSON can hold it: arrays become lists, NaN and infinity become null."""
+    """Return a value for JSON: arrays become lists, NaN and infinity become null."""
     if isinstance(value, np.ndarray | np.generic | jax.Array):
         value = np.asarray(value).tolist()
     if isinstance(value, Mapping):
@@ -98,7 +98,7 @@ def result_record(report: Report) -> dict[str, Any]:
 
 
 def _robot_record(robot: Robot) -> dict[str, Any]:
-    """Return names, units and limits; geometry, drives and tool are in the model file."""
+    """Return names, units, limits; geometry, drives and tool are in the model file."""
     joints = range(robot.joints)
     limits = robot.limits
     rows = table_rows(
@@ -168,7 +168,7 @@ def _spectra_record(fit: Fit) -> dict[str, Any] | None:
 
 
 def consistency_record(fit: Fit) -> dict[str, Any] | None:
-    """Return all standard parameters of a physically consistent estimate; None for others."""
+    """Return all standard parameters of a physically consistent estimate, or None."""
     consistency = fit.consistency
     if consistency is None or fit.full_parameters is None:
         return None

@@ -1,4 +1,4 @@
-"""Report of an identification without torques: measured and simulated motion, and its numbers."""
+"""Report of an identification without torques: motions, their simulation, numbers."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -77,12 +77,15 @@ class RolloutReport:
         return bool(np.isfinite(self.fit.stiffness).any())
 
     def tables(self) -> list[Table]:
-        """Return estimates, errors beside the baselines and by motion, numbers for simulators."""
+        """Return the estimates, their errors, and the numbers for simulators.
+
+        The errors stand beside those of the baselines, and by motion.
+        """
         tables = [self.fit.summary(), comparison_table(self), self.errors.summary()]
         return [*tables, simulator_table(self.fit)] if self.has_stiffness else tables
 
     def write(self, folder: Path) -> list[Path]:
-        """Write the page, `rollout.json`, `rollout.csv`, and MJCF if bodies are known."""
+        """Write page, `rollout.json`, `rollout.csv`, and MJCF if bodies are known."""
         fit = self.fit
         page = rollout_page(self)
         rows = _estimate_rows(fit)
@@ -124,7 +127,7 @@ def comparison_table(report: RolloutReport) -> Table:
 
 
 def motion_figure(errors: RolloutErrors, motion: int) -> Figure:
-    """Return measured and simulated positions of all joints in one motion, and the errors."""
+    """Return measured and simulated positions of all joints in a motion, and errors."""
     time = np.asarray(errors.time[motion])
     panels = []
     for j, name in enumerate(errors.joint_names):
@@ -149,7 +152,7 @@ def motion_panel(
     simulated: np.ndarray,
     counted: np.ndarray,
 ) -> Panel:
-    """Return measured and simulated positions of a joint, and the errors of what counts below."""
+    """Return measured and simulated positions of a joint, and the errors that count."""
     errors = 1e3 * (simulated - measured)
     rms = np.nan
     if counted.any():

@@ -1,4 +1,4 @@
-"""Report of rollouts with torques: measured and simulated windows, errors, parameters."""
+"""Report of rollouts with torques: measured and simulated windows, parameters."""
 
 import dataclasses
 import functools
@@ -50,7 +50,7 @@ class TorqueRolloutReport:
 
     @property
     def verdict(self) -> Remark:
-        """Whether simulations are closer to the robot than those of the fit of torques."""
+        """Whether simulations are closer to the robot than those of the torque fit."""
         torque_fit, rollouts = np.nan_to_num(self.errors, nan=np.inf)
         is_closer = bool((rollouts < torque_fit).all())
         return Remark(

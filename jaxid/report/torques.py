@@ -1,4 +1,4 @@
-"""Measured and predicted forces over time, and their errors (Figs. 6, 7, 9 and 10 of the paper)."""
+"""Measured and predicted forces over time, and their errors (Figs. 6, 7, 9 and 10)."""
 
 from collections.abc import Sequence
 
@@ -102,7 +102,7 @@ def _joint_panel(errors: TorqueErrors, robot: Robot, j: int, window: slice) -> P
 
 
 def _mean_error_text(errors: TorqueErrors, j: int, unit: str) -> str:
-    """Return the mean error of a joint, and its share of the largest force if that is known."""
+    """Return a joint's mean error, and its share of the largest force if known."""
     if not np.isfinite(errors.errors[:, j]).any():
         return "no row counts"
     text = f"mean |e| {significant(errors.mean[j], 2)} {unit}"
@@ -144,7 +144,7 @@ def error_figure(
 def bar_figure(
     groups: Sequence[tuple[str, Sequence[TorqueErrors]]], robot: Robot, title: str = ""
 ) -> Figure:
-    """Return mean absolute errors as bars and RMS errors as points, for some groups (Eq. 37).
+    """Return mean absolute errors as bars, RMS errors as points, by group (Eq. 37).
 
     In percent of the largest forces; of the RMS of the measured forces if a largest one
     is not known. Recordings of one group count as one.

@@ -1,4 +1,4 @@
-"""Bodies that load the joints of a robot: as loads of a known motion, and in scalar programs."""
+"""Bodies that load a robot's joints: loads of a known motion, and scalar programs."""
 
 import dataclasses
 import functools
@@ -48,7 +48,7 @@ class Bodies:
     coupled: bool = False
 
     def matrix_and_bias(self, q: Array, v: Array) -> tuple[AnyArray, AnyArray]:
-        """Return mass matrix and bias forces; without coupling, no matrix and gravity alone."""
+        """Return mass matrix and bias forces; without coupling, gravity alone."""
         model, p, rest = self.model, np.asarray(self.parameters), jnp.zeros_like(q)
         if self.coupled:
             return model.inertia(p, q), model.bias(p, q, v)
@@ -79,7 +79,7 @@ class Bodies:
         return Programs(bodies, derivatives, solve)
 
     def loads(self, motion: ServoMotion) -> ServoMotion:
-        """Return the motions with the loads between two samples of the measured positions."""
+        """Return motions with the loads between two samples of measured positions."""
         q = np.asarray(motion.positions)
         load, inertia = np.zeros_like(q), np.zeros_like(q)
         model, p = self.model, np.asarray(self.parameters)

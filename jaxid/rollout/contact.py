@@ -15,7 +15,7 @@ from jaxid.arrays import Bool, Float
 from .motion import ServoMotion
 
 SUSTAINED = 0.5
-"""Time over which errors are averaged: friction and vibration change their sign sooner [s]."""
+"""Time over which errors are averaged [s]: friction and vibration change faster."""
 SEVERE = 5.0
 """Multiple of a joint's typical averaged error above which it is held by something."""
 LEAST = 0.03
@@ -67,7 +67,7 @@ def contact_rows(
     errors: Float[np.ndarray, "motions joints samples"],
     typical: Float[np.ndarray, " joints"] | None = None,
 ) -> Bool[np.ndarray, "motions joints samples"]:
-    """Return the samples of sustained errors that friction cannot explain, with half a second more.
+    """Return samples of sustained errors beyond friction, with half a second more.
 
     Args:
         motion: Measured motions.
@@ -87,7 +87,7 @@ def contact_rows(
 def typical_errors(
     motion: ServoMotion, mean: np.ndarray
 ) -> Float[np.ndarray, " joints"]:
-    """Return the usual size of averaged errors of each joint at rest, which contacts do not move.
+    """Return each joint's usual size of averaged errors at rest, without contacts.
 
     It is the median of these errors over that of normal ones of unit variance. The
     median motion counts, since contact may last in some of them.

@@ -42,7 +42,7 @@ LEAST = 1e-9
 FADED = 1e-30
 """Derivatives that count as zero: denormal numbers would be slow."""
 BLOCK = 1024
-"""Samples whose derivatives are found at once: fewer cost time, more leave the cache."""
+"""Samples whose derivatives are found at once: fewer cost time, more fill the cache."""
 
 
 class Path(NamedTuple):
@@ -72,7 +72,7 @@ def _simulate(
     motion: ServoMotion,
     hold: AnyArray,
 ) -> Path:
-    """Simulate all motions from their initial states, each with parameters of its own."""
+    """Simulate all motions from their initial states, each with its own parameters."""
     h = jnp.asarray(motion.sample_time)[None] / steps
     share, ahead = (
         jnp.array([1.0 - GAMMA, GAMMA]),
@@ -162,7 +162,10 @@ def _partials(
     others: Array,
     steps: int,
 ) -> Partials:
-    """Return the derivatives of the balance of forces in all stages of one motion [stages, ...]."""
+    """Return derivatives of the balance of forces in all stages of a motion.
+
+    They are arrays [stages, ...].
+    """
     terms = path.before, path.within, others
     state, u, others = jax.tree.map(lambda x: jnp.reshape(x, (-1, len(theta))), terms)
     stages, by_delay = Stages.of(theta, motion, steps, hold)
@@ -172,7 +175,7 @@ def _partials(
 
 
 class _BodyTerms(NamedTuple):
-    """Terms of the bodies in the middle of steps, and their derivatives; the steps come first.
+    """Terms of the bodies in the middle of steps, and their derivatives, steps first.
 
     Attributes:
         M: Mass matrix.
@@ -205,7 +208,7 @@ class CoupledSimulator:
 
     @property
     def steps(self) -> int:
-        """Steps in each sample time: at least two, which tell held commands from others."""
+        """Steps in each sample time: at least two, which reveal held commands."""
         return steps_of(self.motion, self.time_step, 2)
 
     def simulate(self, theta: Float[AnyArray, "*candidates joints parameters"]) -> Path:
@@ -273,7 +276,7 @@ class CoupledSimulator:
     def transitions(
         self, motion: int, theta: np.ndarray, path: Path, free: np.ndarray
     ) -> Callable[[slice], tuple[np.ndarray, np.ndarray]]:
-        """Return a function of some samples: derivatives of the state behind each sample time.
+        """Return a function of samples: derivatives of the state a sample time later.
 
         By the state before, with the velocities a step before, and by the free
         parameters.
@@ -317,7 +320,7 @@ class CoupledSimulator:
 
 
 def _body_terms(path: Path, h: float):
-    """Return mass matrices and bias forces of all steps of a motion, and where they count."""
+    """Return mass matrices and bias forces of a motion's steps, and their places."""
     v = path.before.w[:, 0]
     middle = middle_of(path.before.q[:, 0], v, np.concatenate([v[:1], v[:-1]]), h)
     M = np.zeros((*v.shape, v.shape[1])) if path.M is None else path.M
@@ -334,7 +337,7 @@ def _compose(
     h: float,
     size: int,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return derivatives of the states behind sample times by those before, and by parameters.
+    """Return derivatives of states a sample time later by earlier ones and parameters.
 
     Args:
         theta: Parameters.
@@ -384,7 +387,9 @@ def _compose(
 def _derivatives_of_bodies(
     theta: np.ndarray, at: Partials, terms: _BodyTerms, slope: np.ndarray, h: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return derivatives of the balance of forces by other joints [samples, joints, joints].
+    """Return derivatives of the forces' balance by other joints.
+
+    They are arrays [samples, joints, joints].
 
     By positions and velocities in the middle of the step, and by velocities before the
     stage, less those by velocities in it.

@@ -1,4 +1,4 @@
-"""Dry friction of a joint in one stage of a simulation: exact at rest and at reversals."""
+"""Dry friction of a joint in one stage of a simulation, exact at rest and reversals."""
 
 from typing import NamedTuple
 
@@ -8,7 +8,7 @@ from jaxid.arrays import AnyArray, Array
 
 
 class Slip(NamedTuple):
-    """How joints slip in a stage, and how the balance of forces in it depends on its terms.
+    """How joints slip in a stage, and how the balance of forces depends on its terms.
 
     The balance is `force + inertia w - friction direction = resistance u`.
 

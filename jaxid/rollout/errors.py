@@ -38,7 +38,7 @@ class RolloutErrors:
     contacts: tuple[Contact, ...]
 
     def rms(self, kind: str = "simulated") -> Float[np.ndarray, "motions joints"]:
-        """Return root mean square errors of `simulated`, `command` or `linear`; NaN without any."""
+        """Return RMS errors of `simulated`, `command` or `linear`; NaN without any."""
         rows = zip(getattr(self, kind), self.measured, self.counted, strict=True)
         sums = np.array([np.sum((y - q) ** 2, axis=1, where=k) for y, q, k in rows])
         sizes = np.array([k.sum(axis=1) for k in self.counted])
@@ -57,9 +57,8 @@ class RolloutErrors:
         remarks = [
             Remark(
                 f"{c.name}: {self.joint_names[c.joint]} is held by something from "
-                f"{c.start:.1f} s "
-                f"to {c.stop:.1f} s (error {1e3 * c.error:.0f} mrad): contact? It "
-                "does not count",
+                f"{c.start:.1f} s to {c.stop:.1f} s (error {1e3 * c.error:.0f} mrad): "
+                "contact? It does not count",
                 Status.DOUBTFUL,
             )
             for c in self.contacts

@@ -36,9 +36,9 @@ EFFECTS = (
     ((), ("mu",), ("Fs", "vs"), ("mu", "Fs", "vs")),
     ((), ("um",)),
 )
-"""Groups of effects, from which one each is chosen: bias or load; friction; saturation."""
+"""Groups of effects to choose one each from: bias or load; friction; saturation."""
 GAIN = 0.04
-"""Fall of the logarithm of the held-out mean square for which a larger model is chosen."""
+"""Fall of the held-out mean square's logarithm that justifies a larger model."""
 DAMPED = 0.5
 """Damping ratio below which a joint oscillates."""
 FOLDS = 4
@@ -157,9 +157,8 @@ def _require_motion(motion: ServoMotion) -> None:
         if still.any():
             joint = int(np.argmax(still)) + 1
             raise InputError(
-                f"`logs`: the {channel} of joint {joint} change by less than 1 mrad "
-                "or 1 mm. "
-                "Leave the joint out, or give logs in which it moves."
+                f"`logs`: the {channel} of joint {joint} change by less than 1 mrad or "
+                "1 mm. Leave the joint out, or give logs in which it moves."
             )
 
 
@@ -173,8 +172,7 @@ def _joint_names(
     if len(names) != count:
         raise InputError(
             f"`logs` have {count} joints, but the robot has {len(names)}: choose the "
-            "columns of "
-            "its joints, or the `tip` of the robot."
+            "columns of its joints, or the `tip` of the robot."
         )
     return names
 
@@ -192,8 +190,7 @@ def _known_stiffness(
     ):
         raise InputError(
             f"`stiffness` must be a positive number [N m/rad or N/m], or {joints} of "
-            "them, one for "
-            "each joint."
+            "them, one for each joint."
         )
     return np.broadcast_to(given, (joints,)).copy()
 
@@ -204,7 +201,10 @@ def mask(symbols: Sequence[str]) -> Bool[np.ndarray, " parameters"]:
 
 
 def _lower(scores: np.ndarray, others: np.ndarray) -> Bool[np.ndarray, " joints"]:
-    """Return whether scores [motions, joints] are lower than others, by more than their scatter."""
+    """Return whether scores are lower than others by more than their scatter.
+
+    Scores are arrays [motions, joints].
+    """
     change = scores - others
     count = np.isfinite(change).sum(axis=0)
     mean = np.nansum(change, axis=0) / np.maximum(count, 1)
@@ -294,7 +294,7 @@ class _Search:
         )
 
     def held_out(self, found: Solution, free: np.ndarray) -> np.ndarray:
-        """Return logarithms of the mean square errors of motions left out, one at a time.
+        """Return logarithms of the mean square errors of motions left out in turn.
 
         Without a motion the fit moves by a Gauss-Newton step; its error is simulated.
 
@@ -315,7 +315,7 @@ class _Search:
         return self._scores(errors)
 
     def _scores(self, squares: np.ndarray) -> np.ndarray:
-        """Return logarithms of mean square errors, of sums [motions, candidates, joints]."""
+        """Return logarithms of mean squares of sums [motions, candidates, joints]."""
         counted = np.asarray(self.simulator.motion.counted).sum(axis=-1)
         mean = squares / np.maximum(counted, 1.0)[:, None]
         scores = np.log(
@@ -341,7 +341,7 @@ class _Search:
         self._weigh(self.x)
 
     def _best(self, x: np.ndarray, cost: np.ndarray) -> np.ndarray:
-        """Return the candidate of least cost, unless one that is more damped is nearly as good.
+        """Return the candidate of least cost, or one nearly as good with more damping.
 
         Damping counts up to the ratio `DAMPED`.
 
@@ -367,7 +367,7 @@ class _Search:
         )
 
     def remove_contact(self) -> None:
-        """Leave out the samples in which a joint is held by something that is not in the model."""
+        """Leave out samples in which something outside the model holds a joint."""
         motion = self.simulator.motion
         errors = self.simulator.paths(self.x[None])[:, 0] - np.asarray(motion.positions)
         touched = contact_rows(motion, errors)
@@ -379,7 +379,7 @@ class _Search:
             self._weigh(self.x)
 
     def choose(self, group: Sequence[tuple[str, ...]]) -> None:
-        """Take the effects of a group that lower the held-out errors, joint by joint."""
+        """Take the effects of a group that lower held-out errors, joint by joint."""
         if len(group) == 1:
             return
         every = {symbol for effects in group for symbol in effects}
@@ -416,7 +416,7 @@ class _Search:
         return load > LIGHT * load.max(initial=0.0)
 
     def _first_value(self, symbol: str) -> float | np.ndarray:
-        """Return a start at which an effect is active: otherwise it would have no gradient."""
+        """Return a start at which an effect is active: otherwise it has no gradient."""
         motion = self.simulator.motion
         lag = np.abs(motion.sent - motion.positions).max(axis=(0, 2))
         load = np.abs(motion.load).max(axis=(0, 2))
@@ -433,7 +433,7 @@ class _Search:
         return values[symbol]
 
     def choose_coupling(self, bodies: Bodies) -> bool:
-        """Decide whether inertial torques of the bodies act, beside those of gravity."""
+        """Decide whether inertial torques of bodies act, beside those of gravity."""
         motion = bodies.loads(self.simulator.motion)
         x = self.x.copy()
         own = x[:, INDEX["a"]] * np.asarray(motion.inertia).mean(axis=(0, 2))

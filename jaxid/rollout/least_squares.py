@@ -10,7 +10,7 @@ from jaxid.arrays import Bool, Float
 HELD = 6
 """Largest number of times that parameters are brought to their bounds in a step."""
 Moments = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, ...]]
-"""Function of parameters [..., size] and of the indices of their problems along the first axis.
+"""Function of parameters [..., size] and their problems' indices along the first axis.
 
 It returns costs, gradients and Gauss-Newton matrices.
 """
@@ -44,7 +44,7 @@ def minimise(
     tolerance: float = 1e-3,
     damping: float = 1e-2,
 ) -> Solution:
-    """Minimise sums of squares over the free parameters, each problem with its own damping.
+    """Minimise sums of squares over the free parameters; each problem has its damping.
 
     A parameter at a bound that its gradient would leave is held there for one step.
     Problems of one index along the first axis are left alone as soon as each of them
@@ -79,7 +79,7 @@ def minimise(
 
 
 def improve(costs, problems, terms, bounds, tolerance):
-    """Return parameters of lower costs, their damping, and which problems have converged."""
+    """Return parameters of lower costs, their damping, and the converged problems."""
     x, cost, g, H, free, damping = terms
     decrease = np.zeros_like(cost)
     for _ in range(5):

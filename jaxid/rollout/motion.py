@@ -14,15 +14,15 @@ from jaxid.errors import InputError
 from jaxid.measurement.recording import Recording
 
 SETTLING = 0.5
-"""Time at the start of a log that does not count, because the initial speed is not known [s]."""
+"""Time at the start of a log that does not count: the initial speed is unknown [s]."""
 NEAR = 0.1
 """Time around an instant whose positions give its state [s]."""
 ROUNDING = 1e-3
 """Least deviation of positions around an instant, because encoders round [rad or m]."""
 HISTORY, AHEAD = 0.3, 0.1
-"""Time before the first sample and behind the last one from which commands may act [s]."""
+"""Time before the first and after the last sample from which commands may act [s]."""
 PADDED = 500
-"""Samples to a multiple of which motions are padded, so that few lengths are compiled."""
+"""Samples to a multiple of which motions are padded, so that few lengths compile."""
 
 
 class ServoMotion(eqx.Module):
@@ -119,7 +119,7 @@ class ServoMotion(eqx.Module):
 
     @property
     def certainty(self) -> Float[np.ndarray, "motions states joints"]:
-        """Inverse variance of the initial states, over the number of samples that count."""
+        """Inverse variance of the initial states, over the number of samples."""
         counted = np.maximum(np.asarray(self.counted).sum(axis=-1), 1.0)
         return 1.0 / np.asarray(self.spread) ** 2 / counted[:, None]
 
@@ -170,7 +170,7 @@ class ServoMotion(eqx.Module):
         return found.replace(lengths=tuple(map(int, lengths)), counted=counted)
 
     def _from(self, places: Sequence[tuple[int, int]], size: int) -> "ServoMotion":
-        """Return motions of a size that start from measured states at samples of these."""
+        """Return motions of a size that start from states measured at these samples."""
 
         def cut(x: AnyArray, more: int = 0) -> np.ndarray:
             rows = (np.asarray(x)[k, :, a : a + more + size] for k, a in places)
@@ -239,7 +239,7 @@ def state_at(
 def smooth_rates(
     q: np.ndarray, dt: float, cutoff: float = 8.0
 ) -> tuple[np.ndarray, ...]:
-    """Return positions below a frequency [Hz] with their first and second derivatives."""
+    """Return positions below a frequency [Hz] with first and second derivatives."""
     from scipy.signal import butter, sosfiltfilt
 
     if cutoff < 0.4 / dt:

@@ -1,4 +1,4 @@
-"""Least squares of all joints together, with initial velocities and loads of their simulation."""
+"""Least squares of all joints together, with velocities and loads of a simulation."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ from .servo import LOWER, UPPER, State
 RESOLUTION = 1e-4
 """Errors below which no motion counts more [rad or m]."""
 FALL, COARSE = 0.0005, 0.02
-"""Fall of the logarithm of the mean square error for which the last, the first search go on."""
+"""Fall of the mean square error's logarithm that continues the last, first search."""
 DAMPINGS = (1e-5, 0.01)
 """Dampings of the steps of which the refinement takes the best."""
 ROUNDS = 25
@@ -28,14 +28,14 @@ ROUNDS = 25
 def mean_squares(
     motion: ServoMotion, sums: np.ndarray
 ) -> Float[np.ndarray, "motions joints"]:
-    """Return mean square errors from sums over the samples that count; zero without any."""
+    """Return mean square errors from sums over counted samples; zero without any."""
     return sums / np.maximum(np.asarray(motion.counted).sum(axis=-1), 1.0)
 
 
 def weights_of(
     motion: ServoMotion, sums: np.ndarray
 ) -> Float[np.ndarray, "motions joints"]:
-    """Weigh motions by their own errors, so that the worst one does not decide alone."""
+    """Weigh motions by their own errors: the worst one does not decide alone."""
     counted = np.asarray(motion.counted).sum(axis=-1)
     mean = mean_squares(motion, sums)
     return np.where(counted > 0, 1.0 / (mean + RESOLUTION**2), 0.0) / np.maximum(
@@ -117,14 +117,14 @@ class Refinement:
 
     @cached_property
     def sensitivities(self) -> Float[np.ndarray, "motions joints samples unknowns"]:
-        """Derivatives of the residuals by the free parameters and the motion's initial state."""
+        """Derivatives of the residuals by free parameters and the initial state."""
         S = self.simulator.sensitivities(self.parameters, self.path, self.free)
         S *= np.asarray(self.simulator.motion.counted)[..., None]
         return S
 
     @cached_property
     def sums(self) -> Float[np.ndarray, "motions joints"]:
-        """Sums of squared residuals; infinite where a simulation has left the numbers."""
+        """Sums of squared residuals; infinite where a simulation is not finite."""
         with np.errstate(over="ignore", invalid="ignore"):
             sums = np.sum(self.residuals**2, axis=-1)
         return np.where(np.isfinite(sums), sums, np.inf)
@@ -137,7 +137,7 @@ class Refinement:
 
     @cached_property
     def products(self) -> tuple[np.ndarray, np.ndarray]:
-        """Sensitivities times residuals, and times themselves, of each motion and joint."""
+        """Sensitivities times residuals, and times themselves, by motion and joint."""
         # NumPy's matrix products wait long for cores that other programs use; those of
         # JAX do not.
         with double_precision():
@@ -151,7 +151,7 @@ class Refinement:
         return g, H
 
     def moments(self, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return gradient and Gauss-Newton matrix of the weighted squares, by the unknowns."""
+        """Return gradient and Gauss-Newton matrix of the weighted squares."""
         count, each = int(self.free.sum()), self.simulator.motion.start[0].size
         size = count + len(weights) * each
         g, H = np.zeros(size), np.zeros((size, size))

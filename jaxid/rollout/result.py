@@ -1,4 +1,4 @@
-"""Fit of position-controlled joints: parameters, what they determine, and errors of rollouts."""
+"""Fit of position-controlled joints: determined parameters, and errors of rollouts."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -30,7 +30,7 @@ from .servo import INDEX, LOWER, PARAMETERS, SCALE, UPPER, with_integral
 from .uncoupled import ServoSimulator
 
 UNDETERMINED = 0.25
-"""Standard deviation, relative to a parameter's size, above which it is not determined."""
+"""Relative standard deviation of a parameter above which it is not determined."""
 LIMITED = [INDEX[x] for x in ("B", "d", "b", "um", "g", "ki")]
 """Parameters that are not at a limit of the search unless something is wrong."""
 SYSTEMATIC = 1.5
@@ -142,12 +142,12 @@ class ServoFit:
             if k in LIMITED and found.parameters[j, k] in (UPPER[k], LOWER[k])
             if found.parameters[j, k] != 0.0
         ]
+        integral = "" if found.free[:, INDEX["ki"]].any() else ", integral action"
         missing = (
-            f"errors are larger than an encoder's rounding and change slowly "
+            "errors are larger than an encoder's rounding and change slowly "
             f"({', '.join(lacking)} mrad or mm RMS): an effect is missing, such as "
-            "other friction, "
-            f"play, elasticity{'' if found.free[:, INDEX['ki']].any() else ', integral action'} or "
-            "load, and the parameters are those that imitate it best"
+            f"other friction, play, elasticity{integral} or load, and the parameters "
+            "are those that imitate it best"
         )
         load = np.zeros_like(motion.positions)
         if simulator.bodies is not None:
@@ -175,7 +175,10 @@ class ServoFit:
 
     @cached_property
     def stiffness(self) -> Float[np.ndarray, " joints"]:
-        """Stiffness of each servo [N m/rad or N/m], given or told by a known weight; else NaN."""
+        """Stiffness of each servo [N m/rad or N/m]; NaN where it is unknown.
+
+        It is given, or told by a known weight.
+        """
         found = np.full(len(self.joint_names), np.nan)
         if self.given_stiffness is not None:
             found = self.given_stiffness.copy()
@@ -220,7 +223,10 @@ class ServoFit:
     def paths(
         self, motion: ServoMotion, parameters: AnyArray | None = None
     ) -> np.ndarray:
-        """Return simulated positions [motions, joints, samples], with loads at these positions."""
+        """Return simulated positions [motions, joints, samples].
+
+        The loads are those at the simulated positions.
+        """
         x = np.asarray(self.parameters if parameters is None else parameters)
         if x[:, INDEX["ki"]].any():
             loaded = motion if self.bodies is None else self.bodies.loads(motion)
@@ -263,7 +269,7 @@ class ServoFit:
     def window_errors(
         self, logs: Sequence[Recording] | Recording, horizon: float = 1.0
     ) -> Float[np.ndarray, " joints"]:
-        """Return root mean square errors of windows that start from measured states [rad or m].
+        """Return RMS errors of windows that start from measured states [rad or m].
 
         Args:
             logs: Recordings whose `forces` are the commands.
@@ -326,9 +332,8 @@ class ServoFit:
             ("stiffness", K or "not determined: all parameters are ratios to it"),
         ]
         remarks: list[Remark | str] = [
-            "positions determine inertias, friction, load and motor gain only in "
-            "their ratios to "
-            "the stiffness",
+            "positions determine inertias, friction, load and motor gain only in their "
+            "ratios to the stiffness",
             *(Remark(note, Status.DOUBTFUL) for note in self.notes),
             *(
                 Remark(
@@ -441,7 +446,7 @@ class _Rows(NamedTuple):
 
 
 def systematic_error(r: np.ndarray, kept: np.ndarray, q: np.ndarray) -> float:
-    """Return a joint's RMS error [rad or m] if it looks like a missing effect; otherwise 0.
+    """Return a joint's RMS error [rad or m] if an effect seems missing; otherwise 0.
 
     Args:
         r: Residuals [motions, samples].
@@ -460,7 +465,7 @@ def systematic_error(r: np.ndarray, kept: np.ndarray, q: np.ndarray) -> float:
 
 
 def _inverse(H: np.ndarray) -> np.ndarray:
-    """Return the inverse of an information matrix, large but finite where nothing is known."""
+    """Return the inverse of an information matrix, finite where nothing is known."""
     size = np.sqrt(np.maximum(np.diag(H), 1e-30))
     values, vectors = np.linalg.eigh(H / np.outer(size, size))
     scaled = vectors / np.maximum(values, 1e-12) @ vectors.T
@@ -470,7 +475,7 @@ def _inverse(H: np.ndarray) -> np.ndarray:
 def _determined(
     rows: _Rows, found: Refinement, joint_names: tuple[str, ...]
 ) -> tuple[tuple[Combination, ...], np.ndarray, np.ndarray]:
-    """Return the combinations that the rows determine, and covariance and dof of all parameters."""
+    """Return the determined combinations, and covariance and dof of all parameters."""
     x, joints, symbols = found.parameters[found.free], *np.nonzero(found.free)
     columns = rows.columns
     covariance, every_dof = rows.covariance(columns, np.arange(len(x)))
@@ -504,7 +509,7 @@ def _determined(
 
 
 def _merge(covariance: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return which relative parameters are determined, and how the others merge into them.
+    """Return which relative parameters are determined, and how others merge into them.
 
     Args:
         covariance: Covariance of the relative parameters.

@@ -28,7 +28,10 @@ GAMMA = 1.0 - math.sqrt(0.5)
 
 
 class ServoParameter(NamedTuple):
-    """Parameter of a joint: symbol, meaning, unit (`u` is rad or m), start, limits, scale."""
+    """Parameter of a joint: symbol, meaning, unit, start, limits, scale.
+
+    In the unit, `u` is rad or m.
+    """
 
     symbol: str
     meaning: str
@@ -64,7 +67,7 @@ START, LOWER, UPPER, SCALE = (
 
 
 def delayed_command(c: AnyArray, t: Array, hold: AnyArray) -> tuple[Array, Array]:
-    """Return the commands of the two stages of each step between the instants `t`, in samples.
+    """Return the commands of both stages of each step between instants `t`, in samples.
 
     Commands are interpolated; or they are held until the next one, and count with their
     mean over the step. Before the first they stand still.
@@ -96,7 +99,7 @@ def delayed_command(c: AnyArray, t: Array, hold: AnyArray) -> tuple[Array, Array
 
 
 class Stages(NamedTuple):
-    """Inputs of the implicit Euler stages of a simulation, two for each step [stages, joints].
+    """Inputs of a simulation's implicit Euler stages, two per step [stages, joints].
 
     Attributes:
         commands: Command of the stage, with gain and bias.
@@ -116,7 +119,7 @@ class Stages(NamedTuple):
     def of(
         cls, theta: Array, motion: ServoMotion, steps: int, hold: AnyArray
     ) -> tuple["Stages", Array]:
-        """Return the stages of one motion with this number of steps in each sample time.
+        """Return the stages of one motion with so many steps in each sample time.
 
         Also return the derivatives of their commands by the delay.
         """
@@ -141,7 +144,7 @@ class Stages(NamedTuple):
 def commands_of_stages(
     theta: Array, motion: ServoMotion, steps: int, hold: AnyArray
 ) -> tuple[Array, Array]:
-    """Return the command of each stage, with gain and bias, and its derivative by the delay.
+    """Return each stage's command, with gain and bias, and its derivative by the delay.
 
     Returns:
         Both with the shape [stages, joints].
@@ -160,7 +163,7 @@ def commands_of_stages(
 
 
 class State(NamedTuple):
-    """State of the joints: positions, velocities, and the integral actions of their servos."""
+    """State of the joints: positions, velocities, and integral actions of servos."""
 
     q: Any
     w: Any
@@ -256,7 +259,9 @@ def balanced_integral(theta: Array, motion: ServoMotion, hold: AnyArray) -> Arra
 
 
 def with_integral(motion: ServoMotion, theta: AnyArray, hold: bool) -> ServoMotion:
-    """Return motions with initial integral actions that balance the torques, but may be wrong.
+    """Return motions with initial integral actions that balance the torques.
+
+    The balance may be wrong, so these actions have a spread.
 
     Args:
         motion: Motions.
@@ -362,5 +367,5 @@ def partials(
 
 
 def steps_of(motion: ServoMotion, time_step: float, least: int = 1) -> int:
-    """Return the steps in each sample time, of which the longest is 5 % longer than asked."""
+    """Return the steps in each sample time, the longest up to 5 % longer than asked."""
     return max(least, math.ceil(float(motion.sample_time.max()) / time_step - 0.05))

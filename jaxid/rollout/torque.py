@@ -118,7 +118,7 @@ class TorqueRollout:
 
     @functools.cached_property
     def _acceleration(self) -> Callable:
-        """Accelerations of many samples in scalar operations, which JAX differentiates."""
+        """Accelerations of many samples in scalar operations; JAX differentiates it."""
         model = self.base.model
         joints = (model.robot.joints,)
         return lower(
@@ -195,7 +195,7 @@ class TorqueRolloutFit(Summarised):
         Float[np.ndarray, "samples joints"],
         Float[np.ndarray, "samples joints"],
     ]:
-        """Return times, measured and simulated positions of windows that follow each other.
+        """Return times, measured and simulated positions of consecutive windows.
 
         Behind each window a sample of the simulation is NaN.
         """
@@ -247,7 +247,7 @@ def identify_torque_rollout(
     load_friction: bool = False,
     every: int = 5,
 ) -> TorqueRolloutFit:
-    """Identify a robot so that its simulation under recorded torques follows the positions.
+    """Identify a robot so that its simulation by recorded torques follows positions.
 
     The search starts from the fit of torques. Windows overlap by four fifths.
 
@@ -312,7 +312,7 @@ def identify_torque_rollout(
 
 
 def _require_simulation(base: BaseParameters) -> None:
-    """Check that the model has accelerations that are smooth functions of state and torques."""
+    """Check that the model's accelerations are smooth in states and torques."""
     model = base.model
     leaves = jax.tree.leaves(model.terms, is_leaf=lambda x: isinstance(x, HardSign))
     if model.memory is not None or any(isinstance(x, HardSign) for x in leaves):
@@ -331,7 +331,7 @@ def _require_simulation(base: BaseParameters) -> None:
 def _uncertainty(
     residuals: np.ndarray, jacobian: np.ndarray, block_numbers: np.ndarray
 ) -> Uncertainty:
-    """Return the uncertainty from residuals, their derivatives, and parts of the logs."""
+    """Return the uncertainty from residuals, their derivatives, parts of the logs."""
     blocks = [
         (jacobian[block_numbers == k], residuals[block_numbers == k])
         for k in np.unique(block_numbers)

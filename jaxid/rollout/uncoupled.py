@@ -1,4 +1,4 @@
-"""Joints that do not load each other: simulations of many candidates, and Gauss-Newton matrices."""
+"""Joints that do not load each other: simulations of many candidates, derivatives."""
 
 import dataclasses
 import functools
@@ -38,7 +38,7 @@ def _stage(
 
 
 def _start(theta: Array, motion: ServoMotion, hold: AnyArray) -> State:
-    """Return the initial state, with integral actions in balance where servos have them."""
+    """Return the initial state, with balanced integral actions of the servos."""
     q, w, *integral = jnp.asarray(motion.start)
     return State(q, w, balanced_integral(theta, motion, hold) if integral else None)
 
@@ -224,7 +224,10 @@ class ServoSimulator:
         return self._map(_path, lambda k, q: (q,), theta)[0]
 
     def costs(self, theta: AnyArray, *, each: bool = False) -> np.ndarray:
-        """Return sums of squared errors; with `each`, parameters have the motions first, too."""
+        """Return sums of squared errors.
+
+        With `each`, parameters have the motions first, too.
+        """
 
         def reduce(k: int, q: np.ndarray) -> tuple[np.ndarray]:
             errors = (q - np.asarray(self.motion.positions[k])) * np.asarray(
@@ -235,5 +238,8 @@ class ServoSimulator:
         return self._map(_path, reduce, theta, each=each)[0]
 
     def moments(self, theta: AnyArray) -> tuple[np.ndarray, ...]:
-        """Return costs, gradients and Gauss-Newton matrices, each halved cost's derivatives."""
+        """Return costs, their gradients and Gauss-Newton matrices.
+
+        The last two are derivatives of half the cost.
+        """
         return self._map(_moments, lambda _, *found: found, theta)

@@ -71,7 +71,7 @@ def virtual_panda(seed: int = 0) -> VirtualRobot:
 def virtual_log(
     robot: VirtualRobot, name: str, periods: int, seed: tuple[int, int]
 ) -> Recording:
-    """Return a log of a random motion within the limits, with a period of 8 s, at 500 Hz."""
+    """Return a log of a random motion within the limits, with 8 s period, at 500 Hz."""
     seeds = np.random.SeedSequence(seed).generate_state(2, np.uint32).tolist()
     motion = random_fourier_series(
         robot.robot, omega=2 * math.pi / PERIOD, reach=0.9, seed=seeds[0]
@@ -86,7 +86,7 @@ def virtual_log(
 
 
 def write_example(folder: Path, seed: int = 0) -> list[Path]:
-    """Write an experiment to try: its file, two logs and the truth, all of them or nothing.
+    """Write an experiment to try: its file, two logs and the truth; all or nothing.
 
     Args:
         folder: Folder of the files; made with its parents.

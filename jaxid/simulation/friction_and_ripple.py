@@ -76,7 +76,7 @@ class AbstractGearFriction(Hashable):
 
     @property
     def terms(self) -> tuple[AbstractTerm, ...]:
-        """Part that is linear in parameters: viscous and Coulomb friction (Eqs. 13, 14)."""
+        """Part that is linear in parameters, viscous and Coulomb (Eqs. 13, 14)."""
         return ViscousFriction(), CoulombFriction(Tanh(EPSILON))
 
     @property
@@ -86,7 +86,7 @@ class AbstractGearFriction(Hashable):
 
 
 class SmoothFriction(AbstractGearFriction):
-    r"""Friction of the model, with optional Stribeck friction near standstill (Eqs. 13, 14).
+    r"""Friction of the model, with optional Stribeck friction (Eqs. 13, 14).
 
     $d_v \dot q + d_c \tanh(\dot q / \epsilon) + f_s e^{-(\dot q / v_s)^2} \tanh(4 \dot
     q / v_s)$. Nothing sticks.
@@ -110,7 +110,10 @@ class SmoothFriction(AbstractGearFriction):
         return self.viscous * qd + dry
 
     def over_step(self, qd, expected_qd, z, step):
-        """Return the tangent at the expected speed, with the mean viscous part over the step."""
+        """Return the tangent at the expected speed.
+
+        The viscous part is the mean one over the step.
+        """
         sign = jnp.tanh(expected_qd / EPSILON)
         slope = self.coulomb / EPSILON * (1.0 - sign**2)
         dry = self.coulomb * sign + self._stribeck_part(expected_qd)
@@ -125,7 +128,7 @@ class SmoothFriction(AbstractGearFriction):
 
 
 class LuGreFriction(AbstractGearFriction):
-    r"""Viscous, Coulomb and Stribeck friction and stiction: the LuGre law of bent bristles.
+    r"""Viscous, Coulomb and Stribeck friction, and stiction: LuGre's law of bristles.
 
     $F = \sigma_0 z + \sigma_1(\dot q) \dot z + d_v \dot q$ with
     $\dot z = \dot q - \sigma_0 |\dot q| z / g(\dot q)$ and
@@ -161,7 +164,10 @@ class LuGreFriction(AbstractGearFriction):
         return self._dry_level(qd) / self._stiffness * jnp.sign(qd)
 
     def over_step(self, qd, expected_qd, z, step):
-        """Return friction of bristles that bend with the final speed and yield at the expected."""
+        """Return friction of bristles, which bend with the final speed.
+
+        They yield at the expected speed.
+        """
         stiffness = self._stiffness
         yielding = (
             step * stiffness * jnp.abs(expected_qd) / self._dry_level(expected_qd)
@@ -221,14 +227,14 @@ class FrictionTemperature(eqx.Module):
     def warm_up(
         self, temperature: Joints, power: Joints, duration: float
     ) -> np.ndarray:
-        """Return temperatures [°C] after some time [s] with constant power of friction [W]."""
+        """Return temperatures [°C] after a time [s] of constant friction power [W]."""
         final = self.reference + np.asarray(self.resistance) * np.asarray(power)
         difference = np.asarray(temperature) - final
         return final + difference * np.exp(-duration / self.time)
 
 
 class TorqueRipple(Hashable):
-    """Ripple of the motor torques along the motor angle: cogging and commutation errors.
+    """Ripple of the motor torques along the motor angle: cogging, commutation errors.
 
     It acts beside the forces of the drives; the measured torques do not contain it.
 

@@ -1,4 +1,4 @@
-"""Time steps of a robot with drives: bodies, rotors and friction together; its servo."""
+"""Time steps of a robot with drives: bodies, rotors, friction together; its servo."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -55,7 +55,7 @@ class DriveTrain(Hashable):
         state: Float[AnyArray, "4 joints"],
         u: Joints,
     ) -> Float[AnyArray, "6 joints"]:
-        r"""Return the state after a step, and where mass matrix and bias are needed for the next.
+        r"""Return the state after a step, and where to evaluate the bodies next.
 
         The state is $(q, \dot q, \ddot q)$ of the joints, and the deflections of the
         friction's bristles. Mass matrix and bias of the bodies are those half a step
@@ -114,7 +114,7 @@ class SimulatedPlant:
         self._state = self._advance(bodies, state[: 4 * n], u)
 
     def read(self) -> Sequence[float]:
-        """Return positions, velocities and accelerations of the joints, in this order."""
+        """Return positions, velocities, accelerations of the joints, in this order."""
         return self._state[: 3 * self._joints]
 
 
@@ -137,7 +137,7 @@ class Servo(eqx.Module):
 
 
 class ServoRun(NamedTuple):
-    """True motion of the joints at the ticks of a servo, and the forces after each of them."""
+    """True motion of the joints at the ticks of a servo, and the forces after each."""
 
     motion: Motion
     forces: Float[np.ndarray, "ticks joints"]
@@ -214,7 +214,7 @@ def follow(
 def _servo_run(
     states: Sequence[Sequence[float]], forces: Sequence[Sequence[float]]
 ) -> ServoRun:
-    """Return the motion of a run from the states at all ticks and after the last one."""
+    """Return the motion of a run from the states at all ticks and after the last."""
     q, qd, qdd = np.split(np.array(states), 3, axis=1)
     # Accelerations jump at a tick: the mean of before and after it.
     mean_qdd = 0.5 * (qdd[:-1] + qdd[1:])

@@ -1,4 +1,4 @@
-"""The same experiment on MuJoCo, which is independent of this package (extra `mujoco`)."""
+"""The same experiment on MuJoCo, independent of this package (extra `mujoco`)."""
 
 import contextlib
 import dataclasses
@@ -78,7 +78,7 @@ class MujocoRobot(VirtualRobot):
         return bodies
 
     def forces(self, motion: Motion) -> Float[np.ndarray, "samples joints"]:
-        """Return the forces of a motion by MuJoCo's inverse dynamics, without dry friction.
+        """Return a motion's forces by MuJoCo's inverse dynamics, without dry friction.
 
         MuJoCo's dry friction depends on the solver of its constraints [N m or N].
 
@@ -124,7 +124,7 @@ class MujocoPlant:
             raise ArithmeticError(warnings[0])
 
     def read(self) -> list[float]:
-        """Return positions, velocities and accelerations of the joints, in this order."""
+        """Return positions, velocities, accelerations of the joints, in this order."""
         data = self._data
         arrays = (data.qpos, data.qvel, data.qacc)
         return np.concatenate([x[self._addresses] for x in arrays]).tolist()
@@ -143,7 +143,7 @@ class MujocoPlant:
 
 @contextlib.contextmanager
 def mujoco_warnings(mujoco: Any) -> Iterator[list[str]]:
-    """Collect MuJoCo's warnings; else it writes them into a file in the working folder."""
+    """Collect MuJoCo's warnings, which it otherwise writes into a file."""
     warnings: list[str] = []
     previous = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(warnings.append)

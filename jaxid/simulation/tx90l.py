@@ -1,4 +1,4 @@
-"""The paper's robot as a virtual one: its published numbers are the truth, the rest is assumed.
+"""The paper's robot as a virtual one: published numbers are the truth, others assumed.
 
 Published are six base parameters, cold and warm (Sec. 6), in the layout with seven
 parameters for each body; the masses of the arm's CAD model; and the largest motor
@@ -19,8 +19,11 @@ from .virtual import Sensors, VirtualRobot
 
 COLD = {1: 273.40, 2: 1.68, 27: 248.41, 28: 41.26, 34: 312.50, 35: 18.24}
 WARM = {1: 273.62, 2: 1.65, 27: 90.19, 28: 25.65, 34: 233.00, 35: 15.07}
-"""Published base parameters by their numbers: mass [kg], first moment [kg m], viscous friction
-[N s/m, N m s] and dry friction [N, N m] of the first two axes (Sec. 6)."""
+"""Published base parameters by their numbers (Sec. 6).
+
+They are mass [kg], first moment [kg m], viscous friction [N s/m, N m s] and dry
+friction [N, N m] of the first two axes.
+"""
 TEMPERATURES = (20.0, 45.0)
 """Temperatures of the two published states, assumed [°C]."""
 ROTORS = (12.0, 3.5, 2.0, 1.2, 0.35, 0.30, 0.01)
@@ -30,7 +33,7 @@ ROTORS = (12.0, 3.5, 2.0, 1.2, 0.35, 0.30, 0.01)
 def virtual_tx90l_on_rail(
     *, warm: bool = False, disturbed: bool = True
 ) -> VirtualRobot:
-    """Return the paper's robot: a TX90L on its rail, whose published parameters are the truth.
+    """Return the paper's robot: a TX90L on its rail with the published parameters.
 
     In the layout with seven parameters for each body, p_B(1), p_B(2), p_B(27), p_B(28),
     p_B(34) and p_B(35) of its base parameters are the published ones, cold or warm.
@@ -46,7 +49,7 @@ def virtual_tx90l_on_rail(
     """
     robot = library.tx90l_on_rail()
     max_forces = np.asarray(robot.limits.force)
-    # Assumed, but for the first and the last, which follow from published motor torques.
+    # The first and the last follow from published motor torques; others are assumed.
     ratios = np.array([3000.0 / 69.0, 100.0, 100.0, 80.0, 45.0, 45.0, 5.0])
     robot = robot.replace(
         drives=Drives(
@@ -81,7 +84,9 @@ def virtual_tx90l_on_rail(
 
 
 def cad_tx90l_on_rail() -> Float[np.ndarray, " standard"]:
-    """Return a CAD model of `virtual_tx90l_on_rail().model`: bodies and rotors, no friction.
+    """Return a CAD model of `virtual_tx90l_on_rail().model` without friction.
+
+    It describes bodies and rotors.
 
     Masses and rotors are 10 to 18 % off, each body as a whole.
     """
@@ -93,7 +98,7 @@ def cad_tx90l_on_rail() -> Float[np.ndarray, " standard"]:
 
 
 def _bodies(published: dict[int, float]) -> Float[np.ndarray, "7 7"]:
-    """Return seven parameters of each body: principal axes, published base parameters (Eq. 24)."""
+    """Return seven parameters of each body that have the published values (Eq. 24)."""
     entry = library.entries()["virtual_tx90l_on_rail"]
     m = np.array(entry["masses"])
     r = np.array(entry["centres"])

@@ -1,4 +1,4 @@
-"""A virtual robot: bodies that can exist, friction beyond the model, sensors with noise."""
+"""A virtual robot: possible bodies, friction beyond the model, noisy sensors."""
 
 import dataclasses
 from collections.abc import Callable
@@ -43,7 +43,7 @@ CLOUD_WIDTH = 0.05
 def random_bodies(
     robot: Robot, masses: Joints, random: np.random.Generator
 ) -> Float[np.ndarray, "joints 10"]:
-    """Draw inertial parameters of bodies that can exist: clouds of point masses along the links.
+    """Draw inertial parameters of bodies that can exist: point masses along the links.
 
     A cloud reaches from the origin of the body's frame to the next joint, or to the
     end-effector.
@@ -103,7 +103,10 @@ class Sensors(eqx.Module):
         seed: int,
         name: str,
     ) -> Recording:
-        """Make a recording of true angles [rad or m] and forces [N m or N] of the joint side."""
+        """Make a recording of true angles and forces.
+
+        Angles [rad or m] and forces [N m or N] are those of the joint side.
+        """
         random = np.random.default_rng(seed)
         angles = np.asarray(angles)
         forces = np.asarray(forces)
@@ -126,7 +129,7 @@ class Sensors(eqx.Module):
 
 
 def _coloured(white: np.ndarray, initial: np.ndarray, memory: float) -> np.ndarray:
-    """Return noise of the same variance that keeps a fraction of itself over a sample."""
+    """Return noise of the same variance that is correlated from sample to sample."""
     gain = np.sqrt(1.0 - memory**2)
     noise, _ = signal.lfilter(
         [gain], [1.0, -memory], white, axis=0, zi=memory * initial
@@ -217,7 +220,7 @@ class VirtualRobot(Hashable):
 
     @property
     def model(self) -> Model:
-        """Model to identify: the columns of friction stand behind those of the first term."""
+        """Model to identify; the columns of friction follow those of the first term."""
         return Model(self.robot, (self.terms[0], *self.friction.terms, *self.terms[1:]))
 
     @property
@@ -251,7 +254,7 @@ class VirtualRobot(Hashable):
     def warming(
         self, trajectory: AbstractTrajectory, *, duration: float
     ) -> tuple[Float[np.ndarray, " times"], Float[np.ndarray, "times joints"]]:
-        """Return temperatures while a motion is repeated: friction heats the gears (Sec. 6).
+        """Return temperatures of a repeated motion: friction heats the gears (Sec. 6).
 
         Args:
             trajectory: Repeated motion.
@@ -291,7 +294,7 @@ class VirtualRobot(Hashable):
     def warmed(
         self, trajectory: AbstractTrajectory, *, duration: float
     ) -> "VirtualRobot":
-        """Return the same robot after a motion has been repeated for some time; see `warming`.
+        """Return the same robot after a motion has been repeated for some time.
 
         Args:
             trajectory: Repeated motion.
@@ -326,7 +329,7 @@ class VirtualRobot(Hashable):
         seed: int,
         name: str = "virtual",
     ) -> Recording:
-        """Follow a trajectory without error and record angles and forces as sensors measure them.
+        """Follow a trajectory without error; record angles and forces like the sensors.
 
         Args:
             trajectory: Motion.
@@ -345,7 +348,7 @@ class VirtualRobot(Hashable):
         )
 
     def servo(self, sample_time: float = 1e-3) -> Servo:
-        """Return a servo whose gains suit the mean inertia of each joint over random poses.
+        """Return a servo whose gains suit each joint's mean inertia over random poses.
 
         Each joint by itself has a natural frequency of 8 Hz, and no overshoot.
 
@@ -366,7 +369,10 @@ class VirtualRobot(Hashable):
         return Servo(stiffness, damping, sample_time)
 
     def plant(self, step: float) -> Any:
-        """Return a simulation of the robot with a time step [s]: `start`, `step`, `read`."""
+        """Return a simulation of the robot with a time step [s].
+
+        Its parts are `start`, `step` and `read`.
+        """
         friction = self.present_friction
         drives = DriveTrain(self.bodies, friction, self.ripple, step)
         return SimulatedPlant(drives, self.values)

@@ -1,1 +1,1 @@
-"""Validation: torque errors, checks of sensors, mistakes in the description, verdict."""
+"""Validation: torque errors, sensor checks, mistakes in the description, verdict."""

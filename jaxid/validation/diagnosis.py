@@ -1,4 +1,4 @@
-"""Diagnosis of a log: signs of wrong units, signs, channels, sensors and delays, as sentences."""
+"""Diagnosis of a log: sentences on wrong units, signs, channels, sensors and delays."""
 
 import dataclasses
 import re
@@ -69,7 +69,7 @@ class Diagnosis(Summarised):
     notes: tuple[str, ...] = ()
 
     def mistakes(self, fit: Fit) -> tuple[str, ...]:
-        """Return the likely mistake in the description of the log or the robot, as a sentence.
+        """Return the likely mistake in the description of log or robot, as a sentence.
 
         That is a single one whose correction explains most of what the model misses,
         and more than any other; nothing if the model fits. If it misses much, and no
@@ -81,7 +81,7 @@ class Diagnosis(Summarised):
         return _mistakes([self], fit)[0]
 
     def with_fit(self, fit: Fit, commanded: Observations | None = None) -> "Diagnosis":
-        """Return the diagnosis with what a fit to this log alone reveals, including delays.
+        """Return the diagnosis with what a fit to this log alone reveals, and delays.
 
         The log with `commanded` angles in place of the measured ones is filtered alike.
         """
@@ -94,7 +94,7 @@ class Diagnosis(Summarised):
         )
 
     def summary(self) -> Table:
-        """Return a table: motion and forces of each joint beside its limits, and the findings."""
+        """Return a table: motion and forces beside their limits, and the findings."""
         robot, log, s = self.robot, self.log, self.statistics
         limits = robot.limits
         gaps = len(log.segments) - 1
@@ -236,7 +236,7 @@ def diagnose(
 def mistakes_in_logs(
     diagnoses: Sequence[Diagnosis], fit: Fit
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return findings and notes that a fit to several logs reveals; they are judged together."""
+    """Return findings and notes of a fit to several logs, which are judged together."""
     logs = [d.observations for d in diagnoses if d.observations is not None]
     friction = () if any(d.faulty for d in diagnoses) else negative_friction(fit, logs)
     found, notes = _mistakes(diagnoses, fit)
@@ -247,7 +247,7 @@ def mistakes_in_logs(
 def _mistakes(
     diagnoses: Sequence[Diagnosis], fit: Fit
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the likely mistake in logs, or moments that depart from the model, and notes."""
+    """Return the likely mistake in logs, or moments of departure, and notes."""
     # Faults of channels explain the rest.
     logs = [
         d.observations for d in diagnoses if d.observations is not None and not d.faulty
@@ -264,7 +264,7 @@ def _mistakes(
 
 
 def _excerpt(log: Observations, source: SamplesOnDisk) -> Recording:
-    """Return stretches of a log as they were recorded: from its beginning, middle and end."""
+    """Return stretches of a log as recorded: from its beginning, middle and end."""
     dt = log.sample_time
     # With a filter of a long memory, one long stretch tells more than several short
     # ones.
@@ -293,7 +293,7 @@ def _excerpt(log: Observations, source: SamplesOnDisk) -> Recording:
 
 
 def departures(fit: Fit, observations: Observations) -> tuple[str, ...]:
-    """Report forces that depart from the model for one moment, and at no other time nearly as far.
+    """Report forces that depart from the model for one moment, and only then so far.
 
     Such a departure exceeds half of its joint's RMS force, and lasts a hundredth of the
     log at most, beside what the filter spreads. Uncertain parameters do not explain it:
@@ -320,16 +320,14 @@ def departures(fit: Fit, observations: Observations) -> tuple[str, ...]:
             found.append(
                 f"the force of joint `{name}` departs from the model by {error[k]:.3g} "
                 f"{robot.force_unit(j)} at {o.time[o.instants[k]]:.5g} s, and at no "
-                "other time by "
-                "a fifth of that: a contact or a fault of a sensor; leave that part "
-                "out "
-                "(`recording.start`, `recording.stop`)."
+                "other time by a fifth of that: a contact or a fault of a sensor; "
+                "leave that part out (`recording.start`, `recording.stop`)."
             )
     return tuple(found)
 
 
 def _deviation(fit: Fit, row: np.ndarray) -> float:
-    """Return the standard deviation of a combination of parameters; infinite if undetermined."""
+    """Return a parameter combination's standard deviation; infinite if undetermined."""
     used = np.flatnonzero(row)
     covariance = np.asarray(fit.covariance)[np.ix_(used, used)]
     if not np.isfinite(covariance).all():
@@ -365,8 +363,8 @@ def negative_friction(fit: Fit, logs: Sequence[Observations]) -> tuple[str, ...]
             named = " and ".join(base.names[i] for i in columns if p[i] < 0)
             found.append(
                 f"friction of joint `{name}` comes out negative ({named}): it would "
-                "drive the "
-                "joint; something in the model or the log of this joint is wrong."
+                "drive the joint; something in the model or the log of this joint is "
+                "wrong."
             )
     return tuple(found)
 

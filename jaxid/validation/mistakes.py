@@ -29,7 +29,7 @@ from jaxid.result_table import significant
 from jaxid.robot.robot import Robot
 
 BAD = 0.005
-"""Fraction (0 to 1) of the forces left unexplained from which mistakes are looked for."""
+"""Fraction (0 to 1) of the forces left unexplained from which mistakes are sought."""
 INSTANTS = 300
 """Number of instants of all logs that tell enough."""
 FOLDS = 5
@@ -37,15 +37,15 @@ FOLDS = 5
 LATEST, FARTHEST, GAIN = 0.05, 0.8, 3.0
 """Largest delay [s], error of a zero [rad or m] and gain that are looked for."""
 MOVED, SCALED = 0.2, 1.2
-"""Error of a zero [rad or m] and gain of a force of which a note says where they do not show."""
+"""Error of a zero [rad or m] and gain of a force that logs may not reveal."""
 MATERIAL = 0.02
 """Fraction (0 to 1) of the forces by which a delay must change them to be a mistake."""
 FAR = 0.15
 """Fraction (0 to 1) of the forces that no model misses whose description is right."""
 MOST = 0.5
-"""Fraction (0 to 1) of what a model misses that may be left by the correction of a mistake."""
+"""Fraction (0 to 1) of what a model misses that a mistake's correction may leave."""
 MANY = 12
-"""Number of joints above which no two joints, and no axes, are examined: they would be too many."""
+"""Number of joints above which no pairs of joints and no axes are examined."""
 
 
 class Correction(NamedTuple):
@@ -58,7 +58,7 @@ class Correction(NamedTuple):
 
 
 class _Amount(NamedTuple):
-    """Mistake of any amount in a joint, or in all if the name is empty; and two of its amounts."""
+    """Mistake of any amount in a joint (all, if it has no name), and two amounts."""
 
     joint: str
     what: str
@@ -73,7 +73,7 @@ def likely_mistakes(
     motor_sides: tuple[bool, bool],
     events: tuple[str, ...] = (),
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return a sentence about the mistake that explains most of what a model misses, and notes.
+    """Return a sentence about the mistake that explains most of the misfit, and notes.
 
     A mistake is looked for in all logs alike, then in the columns of each. The notes
     say which mistakes would not show; `events`, sentences about moments, are returned
@@ -115,7 +115,10 @@ def likely_mistakes(
 
 
 class _Samples:
-    """Some instants of all logs, and what a model with any friction misses of their forces."""
+    """Some instants of all logs, and what a model misses of their forces.
+
+    The model may have any friction.
+    """
 
     def __init__(self, model: Model, logs: Sequence[Observations]):
         step = -(-sum(log.rows for log in logs) // INSTANTS)
@@ -166,7 +169,7 @@ class _Samples:
         return mistake.correction(found, part)
 
     def hidden(self, shown: float) -> tuple[str, ...]:
-        """Return a note about mistakes with which the model would miss less than what is shown."""
+        """Return a note on mistakes by which the model would miss less than shown."""
         unseen: dict[str, list[str]] = {}
         for mistake in self.amounts():
             change = mistake.correction(mistake.small, slice(None))
@@ -175,10 +178,10 @@ class _Samples:
         for j, name in enumerate(self._model.robot.joint_names):
             if self.missed(_reversed(self.as_given, j)) < shown:
                 unseen.setdefault("a reversed axis", []).append(f"`{name}`")
-        texts = [
-            f"{what} ({'any joint' if len(names) == self.motion.joints > 1 else ', '.join(names)})"
-            for what, names in unseen.items()
-        ]
+        texts = []
+        for what, names in unseen.items():
+            every = len(names) == self.motion.joints > 1
+            texts.append(f"{what} ({'any joint' if every else ', '.join(names)})")
         return (
             (f"mistakes that these logs cannot reveal: {', '.join(texts)}",)
             if texts
@@ -248,7 +251,7 @@ class _Samples:
 
 
 def _any_friction(speeds: np.ndarray, fastest: np.ndarray) -> np.ndarray:
-    """Return columns of friction of each joint that brakes: dry, with peaks, and quadratic."""
+    """Return friction columns of each braking joint: dry, with peaks, and quadratic."""
     v = speeds / np.where(fastest > 0, fastest, 1.0)
     shapes = [np.tanh(v / width) for width in (0.01, 0.1)]
     shapes += [np.tanh(v / 0.01) * np.exp(-((v / width) ** 2)) for width in (0.05, 0.2)]
@@ -268,7 +271,7 @@ def _reversed(c: Correction, joint: int) -> Correction:
 def _misfit(
     fit: Fit, motion: Motion, forces: np.ndarray, left: float
 ) -> tuple[str, ...]:
-    """Return a sentence about where a model does not fit, or nothing if it misses little."""
+    """Return a sentence about where a model does not fit, or nothing if it does."""
     if left < FAR:
         return ()
     errors = forces - fit.predict(motion) - fit.base.tool_forces(motion)
@@ -277,10 +280,9 @@ def _misfit(
     worst = int(np.argmax(missed))
     return (
         f"the model does not fit: it misses {significant(100 * left, 2)} % of the "
-        "forces, most of "
-        f"all those of joint `{fit.base.model.robot.joint_names[worst]}`, and no "
-        "single mistake in "
-        "signs, order, units, offsets, axes or gravity explains that.",
+        "forces, most of all those of joint "
+        f"`{fit.base.model.robot.joint_names[worst]}`, and no single mistake in signs, "
+        "order, units, offsets, axes or gravity explains that.",
     )
 
 
@@ -355,7 +357,7 @@ def _of_columns(
 
 
 def _of_robot(robot: Robot, motion: Motion, forces: np.ndarray) -> Iterator[Correction]:
-    """Yield corrections of the robot: zeros of its angles, gravity, and axes of joints."""
+    """Yield corrections of the robot: zeros of angles, gravity, and axes of joints."""
     names, n, size = robot.joint_names, robot.joints, np.linalg.norm(robot.gravity)
     for j, turns in ((j, k) for j in range(n) if robot.revolute[j] for k in (-1, 1, 2)):
         q = motion.q + 0.5 * np.pi * turns * np.eye(n)[j]
@@ -406,12 +408,12 @@ def _of_kinds(robot: Robot, motion: Motion, forces: np.ndarray) -> Iterator[Corr
 
 
 class _AnyGeometry(eqx.Module):
-    """Regressor of a model whose axes and gravity are arguments: it is traced only once."""
+    """Regressor of a model with axes and gravity as arguments: it is traced once."""
 
     model: Model
 
     def columns(self, axis, gravity, q, qd, qdd, s=None):
-        """Return the regressor of one sample, and the forces of the known tool behind it."""
+        """Return a sample's regressor, followed by the forces of the known tool."""
         model = Model(
             self.model.robot.replace(axis=axis, gravity=gravity), self.model.terms
         )

@@ -1,4 +1,4 @@
-"""Signs of mistakes that a log shows without a model: units, limits and faults of sensors."""
+"""Signs of mistakes that a log shows without a model: units, limits, sensor faults."""
 
 from collections.abc import Collection, Iterator, Sequence
 
@@ -113,8 +113,7 @@ def limit_findings(
     if standing > 0.5:
         findings.append(
             f"the robot stands still for {100 * standing:.0f} % of the log: crop it "
-            "with "
-            "`recording.start` and `recording.stop`."
+            "with `recording.start` and `recording.stop`."
         )
     return findings
 
@@ -135,16 +134,14 @@ def _joint_findings(
     if with_range and not low - slack <= a <= b <= high + slack:
         yield (
             f"joint `{name}` moves from {a:.3g} to {b:.3g}, its range is {low:.3g} to "
-            f"{high:.3g} "
-            f"{unit}: check `recording.angle_unit`, `side`, `angle_signs` and "
-            "`angle_offsets`."
+            f"{high:.3g} {unit}: check `recording.angle_unit`, `side`, `angle_signs` "
+            "and `angle_offsets`."
         )
     if statistics.speed[j] > 1.1 * limits.velocity[j]:
         yield (
-            f"joint `{name}` reaches {statistics.speed[j]:.3g} {unit}/s, but its "
-            "limit is "
-            f"{float(limits.velocity[j]):.3g} {unit}/s: check the units, or lower the "
-            "cut-off."
+            f"joint `{name}` reaches {statistics.speed[j]:.3g} {unit}/s, but its limit "
+            f"is {float(limits.velocity[j]):.3g} {unit}/s: check the units, or lower "
+            "the cut-off."
         )
     if b - a < 0.02:
         yield (
@@ -158,7 +155,7 @@ def _joint_findings(
 
 
 def _force_findings(robot: Robot, statistics: LogStatistics) -> list[str]:
-    """Report forces that are all too large or all too small: one unit or side is wrong."""
+    """Report forces that are all too large or too small: one unit or side is wrong."""
     ratio = statistics.force / robot.known_max_forces
     ratio = ratio[np.isfinite(robot.known_max_forces)]
     cure = "check `recording.force_unit`, `forces_side` and `torque_constants`."
@@ -184,7 +181,7 @@ def unit_findings(
     highest: Float[np.ndarray, " joints"],
     on_motor_side: bool,
 ) -> list[str]:
-    """Look for a unit or side that brings the angles of all joints back into their ranges."""
+    """Look for a unit or side that brings all joints' angles back into their ranges."""
     low = np.asarray(robot.limits.position_min)
     width = np.asarray(robot.limits.position_max) - low
     known = np.array(robot.revolute) & np.isfinite(width)
@@ -224,7 +221,10 @@ def unit_findings(
 def channel_findings(
     robot: Robot, recording: Recording, statistics: LogStatistics | None = None
 ) -> list[tuple[int, str]]:
-    """Look for held, spiky, wrapped and late channels: return the joint and a sentence of each."""
+    """Look for held, spiky, wrapped and late channels.
+
+    Return the joint and a sentence of each.
+    """
     r, found = recording, []
     angles, forces, time = (np.asarray(x) for x in (r.angles, r.forces, r.time))
     owner = "the motor of joint" if r.angles_on_motor_side else "joint"
@@ -246,10 +246,8 @@ def channel_findings(
             (
                 j,
                 f"the velocities of {owner} `{robot.joint_names[j]}` are {ratio:.3g} "
-                "times the "
-                "derivatives of its angles: check `recording.velocity_unit` and the "
-                "order of the "
-                "columns.",
+                "times the derivatives of its angles: check `recording.velocity_unit` "
+                "and the order of the columns.",
             )
             for j, ratio in unlike_derivatives(r).items()
         ]
@@ -259,15 +257,14 @@ def channel_findings(
                 text = (
                     f"the velocities of joint `{name}` stand {1e3 * abs(late):.3g} ms "
                     f"{'later' if late > 0 else 'earlier'} in the log than the "
-                    "derivatives of its "
-                    "angles: leave `recording.velocities` out."
+                    "derivatives of its angles: leave `recording.velocities` out."
                 )
                 faults.append((j, text))
     return faults
 
 
 def clock_findings(recording: Recording) -> list[str]:
-    """Look for rows that are lost or repeated: all joints jump, or stand, for one sample."""
+    """Look for lost or repeated rows: all joints jump, or stand, for one sample."""
     lost, repeated, time = [], [], np.asarray(recording.time)
     for a, b in recording.segments:
         steps = np.diff(np.asarray(recording.angles)[a:b], axis=0)
@@ -327,8 +324,8 @@ def _wrapped(x: np.ndarray, time: np.ndarray) -> str:
             times = "once" if at.size == 1 else f"{at.size} times"
             return (
                 f"jumps by a full turn ({turn:.4g}) {times}, first at "
-                f"{time[at[0] + 1]:.6g} s: "
-                "undo the wrapping (`recording.unwrap = true`)."
+                f"{time[at[0] + 1]:.6g} s: undo the wrapping "
+                "(`recording.unwrap = true`)."
             )
     return ""
 
@@ -336,7 +333,7 @@ def _wrapped(x: np.ndarray, time: np.ndarray) -> str:
 def _spikes(
     x: np.ndarray, time: np.ndarray, segments: Sequence[tuple[int, int]]
 ) -> str:
-    """Report jumps there and back within some samples, faster than the joint ever moves."""
+    """Report jumps there and back within some samples, faster than joints ever move."""
     places, sizes = [], []
     for a, b in segments:
         smooth = ndimage.median_filter(x[a:b], 7, mode="nearest")
@@ -385,7 +382,7 @@ def _held_angles(
 
 
 def _usual_bends(x: np.ndarray) -> dict[int, float]:
-    """Return the largest bend over some samples, where a channel does not stay at one value."""
+    """Return the largest bend over some samples where a channel changes its value."""
     usual = {}
     ends = np.array(list(_runs(x, 20)), int).reshape(-1, 2)
     for width in (1, 3, 10, 30):
@@ -405,7 +402,7 @@ def _held_forces(
     time: np.ndarray,
     segments: Sequence[tuple[int, int]],
 ) -> str:
-    """Report forces that stay constant for long although the speed of their joint varies."""
+    """Report forces that stay constant for long while their joint's speed varies."""
     lowest, highest = float(forces.min()), float(forces.max())
     if lowest == highest:
         return ""
@@ -446,7 +443,7 @@ def _shortest(samples: int) -> int:
 
 
 def _runs(x: np.ndarray, least: int) -> Iterator[tuple[int, int]]:
-    """Yield first and last sample of stretches of one value, from `least` samples on."""
+    """Yield first and last sample of stretches of one value, `least` or longer."""
     ends = np.flatnonzero(np.append(np.diff(x) != 0, True))
     starts = np.append(0, ends[:-1] + 1)
     for k in np.flatnonzero(ends - starts + 1 >= least):
@@ -456,9 +453,8 @@ def _runs(x: np.ndarray, least: int) -> Iterator[tuple[int, int]]:
 def _held(value: float, start: float, stop: float) -> str:
     return (
         f"{value:.3g} from {start:.6g} s to {stop:.6g} s, though the robot moves: a "
-        "sensor or the "
-        "logger held the last value; leave that part out (`recording.start`, "
-        "`recording.stop`)."
+        "sensor or the logger held the last value; leave that part out "
+        "(`recording.start`, `recording.stop`)."
     )
 
 
@@ -495,8 +491,7 @@ def stuck_findings(
             if on > 0.005 * len(f) and on > 3.0 * beside.sum():
                 findings.append(
                     f"the forces of joint `{name}` stay at {end:.3g} in {on} samples "
-                    "in which it "
-                    "moves: a drive or sensor is at its limit (`recording.stop` "
-                    "leaves that out)."
+                    "in which it moves: a drive or sensor is at its limit "
+                    "(`recording.stop` leaves that out)."
                 )
     return findings

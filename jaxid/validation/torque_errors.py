@@ -1,4 +1,4 @@
-"""Validation of a model: torque errors, and definiteness of the mass matrix (Eq. 37, Sec. 5)."""
+"""Validation: torque errors, and definiteness of the mass matrix (Eq. 37, Sec. 5)."""
 
 import itertools
 from collections.abc import Sequence
@@ -63,13 +63,16 @@ class TorqueErrors(eqx.Module):
 
     @property
     def moving(self) -> Bool[np.ndarray, "rows joints"]:
-        """Rows in which each joint moves faster than a hundredth of its largest speed."""
+        """Rows in which each joint moves faster than 1 % of its largest speed."""
         sizes = np.abs(self.speeds)
         return sizes > STANDING * sizes.max(axis=0)
 
     @property
     def errors(self) -> Float[np.ndarray, "rows joints"]:
-        """Predicted minus measured forces; NaN where a row does not count [N m or N] (Eq. 27)."""
+        """Predicted minus measured forces [N m or N] (Eq. 27).
+
+        NaN where a row does not count.
+        """
         return np.asarray(self.predicted) - self._measured
 
     @property
@@ -94,17 +97,23 @@ class TorqueErrors(eqx.Module):
 
     @property
     def offset(self) -> Float[np.ndarray, " joints"]:
-        """Mean error of each joint [N m or N]: what a constant offset of the log would explain."""
+        """Mean error of each joint [N m or N]; a constant offset would explain it."""
         return np.nanmean(self.errors, axis=0)
 
     @property
     def rms_at_rest(self) -> Float[np.ndarray, " joints"]:
-        """RMS error about the offset while the joint stands [N m or N]; NaN if it never does."""
+        """RMS error about the offset while the joint stands [N m or N].
+
+        NaN if it never does.
+        """
         return self._rms_where(~np.asarray(self.moving))
 
     @property
     def rms_in_motion(self) -> Float[np.ndarray, " joints"]:
-        """RMS error about the offset while the joint moves [N m or N]; NaN if it never does."""
+        """RMS error about the offset while the joint moves [N m or N].
+
+        NaN if it never does.
+        """
         return self._rms_where(np.asarray(self.moving))
 
     @property
@@ -113,9 +122,8 @@ class TorqueErrors(eqx.Module):
 
         Then means of unexplained errors over classes of speed agree between blocks of
         time: more than after nearly any change of the blocks' signs, which leaves noise
-            as it is
-        (randomization test, Fisher). They make up a tenth of the squared errors at
-        least.
+        as it is (randomisation test, Fisher). They make up a tenth of the squared
+        errors at least.
         """
         # One log of a hundred gives a false alarm.
         limit = 0.01 / self.errors.shape[1]
@@ -210,8 +218,7 @@ class Definiteness(eqx.Module):
             return f"The mass matrix is positive definite in all of {self.poses} poses."
         return (
             f"The mass matrix is indefinite in {percent(self.indefinite)} % of "
-            f"{self.poses} poses; "
-            f"its smallest eigenvalue is {self.smallest:.2g}."
+            f"{self.poses} poses; its smallest eigenvalue is {self.smallest:.2g}."
         )
 
 
@@ -270,7 +277,7 @@ def validate(
     *,
     progress: Progress | None = None,
 ) -> Validation:
-    """Check a model: torque errors on recordings, and the definiteness of its mass matrix.
+    """Check a model: torque errors on recordings, and a definite mass matrix.
 
     Args:
         fit: Fit of the model.
@@ -341,7 +348,7 @@ def comparison_step(observations: Observations) -> int:
 
 
 def definiteness(fit: Fit, poses: int = POSES) -> Definiteness:
-    """Look for random poses in which the identified mass matrix is not positive definite (Sec. 5).
+    """Look for random poses with a mass matrix that is not positive definite (Sec. 5).
 
     They are spread over the range of the joints. A joint without limits turns once, a
     rail without limits stays within a metre of zero.

@@ -1,4 +1,4 @@
-"""Verdict on an identified model: one sentence for everything, and one for each criterion."""
+"""Verdict on an identified model: one sentence for all, and one for each criterion."""
 
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
@@ -17,19 +17,19 @@ from jaxid.result_table import Remark, Status, significant
 from .torque_errors import Definiteness, TorqueErrors
 
 RMS_ERROR = (5.0, 50.0)
-"""RMS errors on new motions that are good, and tolerable [% of the RMS force, worst joint]."""
+"""RMS errors on new motions: good, and tolerable [% of the RMS force, worst joint]."""
 FIT_ERROR = (1.0, 30.0)
-"""Missed forces of a fit, noise apart, that are good, and tolerable [% of the RMS force]."""
+"""Missed forces of a fit without noise: good, and tolerable [% of the RMS force]."""
 MATERIAL = 2.0
-"""Errors on new motions that are judged relative to those of the fit [% of the RMS force]."""
+"""Errors on new motions that are judged relative to the fit's [% of the RMS force]."""
 UNSEEN_RATIO = 1.5
 """Errors on new motions, relative to those of the fit, that are good."""
 LARGE_CONDITION = 1e3
-"""Condition number, with scaled columns, above which parameters are hard to tell apart."""
+"""Condition number (scaled columns) above which parameters are hard to tell apart."""
 PRICE = (10.0, 100.0)
 """Increase of the residuals by bounds that is good, and tolerable [%]."""
 OFFSET = 0.3
-"""Constant force that asks for an explanation, relative to the largest force of its joint."""
+"""Constant force to be explained, relative to the largest force of its joint."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -71,7 +71,7 @@ class Report:
 
 
 def verdict(report: Report) -> list[Remark]:
-    """Return the verdict on a model: one sentence for everything, then one for each criterion."""
+    """Return the verdict on a model: one sentence for all, then one per criterion."""
     fit, definiteness = report.fit, report.definiteness
     condition = fit.condition_numbers.scaled
     eigenvalue = significant(definiteness.smallest)
@@ -89,17 +89,15 @@ def verdict(report: Report) -> list[Remark]:
         Remark(
             f"Estimates: {dict(fit.facts)['estimates']}",
             detail="Standard deviation over estimate. A parameter near zero is never "
-            "known to a "
-            "few percent, and that is no fault: look at its interval.",
+            "known to a few percent, and that is no fault: look at its interval.",
         ),
         Remark(
             str(definiteness),
             Status.GOOD if definiteness.positive_definite else Status.BAD,
             f"Smallest eigenvalue over random poses: {eigenvalue} in SI units (Sec. "
-            "5). If it is "
-            "negative, do not simulate or control with this model where joints were "
-            "not moved: "
-            '`kind = "consistent"` in `[estimator]` finds bodies that can exist.',
+            "5). If it is negative, do not simulate or control with this model where "
+            'joints were not moved: `kind = "consistent"` in `[estimator]` finds '
+            "bodies that can exist.",
         ),
         Remark(
             "The condition number with columns of length one is "
@@ -152,11 +150,9 @@ def _judge_fit(fit: Fit, logs: Sequence[TorqueErrors]) -> Remark:
         f"{text}was fitted to (joint `{names[worst]}`): {', '.join(found)}.",
         status,
         f"Good: white noise, or up to {FIT_ERROR[0]:g} % that are not; tolerable: up "
-        "to "
-        f"{FIT_ERROR[1]:g} %. Bartlett's test compares the cumulative spectrum with a "
-        "straight "
-        "line. The intervals account for correlated residuals, not for what the model "
-        "lacks.",
+        f"to {FIT_ERROR[1]:g} %. Bartlett's test compares the cumulative spectrum with "
+        "a straight line. The intervals account for correlated residuals, not for what "
+        "the model lacks.",
     )
 
 
@@ -171,8 +167,8 @@ def _judge_friction(fit: Fit, logs: Sequence[TorqueErrors]) -> Iterator[Remark]:
     if names:
         yield Remark(
             f"Errors depend on speed (joints {', '.join(names)}): friction seems to "
-            "have another "
-            "shape, and the intervals of its parameters may be too narrow.",
+            "have another shape, and the intervals of its parameters may be too "
+            "narrow.",
             Status.DOUBTFUL,
             "Means over classes of speed agree between blocks of time: try `jaxid "
             "choose`.",
@@ -192,7 +188,7 @@ def _relative(logs: Sequence[TorqueErrors]) -> np.ndarray:
 
 
 def _constant_share(logs: Sequence[TorqueErrors], joint: int) -> float:
-    """Return which part of the squared errors of a joint are means of single logs (0 to 1)."""
+    """Return the part of a joint's squared errors that are means of logs (0 to 1)."""
     errors = [e.errors[:, joint] for e in logs]
     whole = float(sum(np.nansum(e**2) for e in errors))
     counts = [np.count_nonzero(np.isfinite(e)) for e in errors]
@@ -213,10 +209,9 @@ def _judge_new_motions(
     unseen = 100 * _relative(verification)
     worst = float(np.max(unseen))
     text = (
-        "On logs that the fit has not seen, it misses up to "
-        f"{significant(worst, 2)} % of the "
+        f"On logs that the fit has not seen, it misses up to {significant(worst, 2)} % "
+        "of the RMS forces"
     )
-    text += "RMS forces"
     # Errors that do not matter may grow.
     ratios = unseen / np.maximum(100 * _relative(identification), 1e-9)
     ratio = float(np.max(np.where(unseen > MATERIAL, ratios, 1.0)))
@@ -239,10 +234,8 @@ def _judge_new_motions(
         status = Status.BAD if worst > RMS_ERROR[1] else Status.DOUBTFUL
     detail = (
         f"Good: up to {RMS_ERROR[0]:g} % for every joint, and {UNSEEN_RATIO:g} times "
-        "the errors of "
-        f"the fit where they exceed {MATERIAL:g} %; tolerable: up to {RMS_ERROR[1]:g} "
-        "%. Mean "
-        "errors by Eq. 37: the paper states below 1 %."
+        f"the errors of the fit where they exceed {MATERIAL:g} %; tolerable: up to "
+        f"{RMS_ERROR[1]:g} %. Mean errors by Eq. 37: the paper states below 1 %."
     )
     return Remark(f"{text}.", status, detail)
 
@@ -261,10 +254,8 @@ def _judge_signs(fit: Fit) -> Iterator[Remark]:
             f"{', '.join(names)}.",
             Status.DOUBTFUL,
             "Good: none below zero by more than two standard deviations. The model "
-            "lacks an effect "
-            'of these joints, or a sign is wrong; `kind = "consistent"` in '
-            "`[estimator]` keeps "
-            "them from being negative.",
+            "lacks an effect of these joints, or a sign is wrong; "
+            '`kind = "consistent"` in `[estimator]` keeps them from being negative.',
         )
 
 
@@ -278,12 +269,10 @@ def _judge_bounds(fit: Fit) -> Iterator[Remark]:
     status = Status.BAD if price > PRICE[1] else status
     yield Remark(
         f"All bodies are physically consistent, for {significant(price, 2)} % larger "
-        "residuals; "
-        f"active bounds: {active}",
+        f"residuals; active bounds: {active}",
         status,
-        f"Good: up to {PRICE[0]:g} %; tolerable: up to {PRICE[1]:g} %. Above, the "
-        "logs contradict "
-        "the bounds: check `total_mass`, `mass_max`, units and signs.",
+        f"Good: up to {PRICE[0]:g} %; tolerable: up to {PRICE[1]:g} %. Above, the logs "
+        "contradict the bounds: check `total_mass`, `mass_max`, units and signs.",
     )
 
 
@@ -300,10 +289,8 @@ def _judge_offsets(fit: Fit) -> Iterator[Remark]:
             unit = robot.force_unit(j)
             yield Remark(
                 f"Joint `{name}` has a constant force of {significant(value, 3)} "
-                f"{unit}, and its "
-                f"limit is {significant(largest, 3)} {unit}: is `gravity` right, or "
-                "does a spring "
-                "or a cable pull?",
+                f"{unit}, and its limit is {significant(largest, 3)} {unit}: is "
+                "`gravity` right, or does a spring or a cable pull?",
                 Status.DOUBTFUL,
                 f"Good: up to {100 * OFFSET:g} % of the largest force.",
             )

@@ -1,4 +1,4 @@
-"""Newton's and Euler's laws in plain NumPy, in the frame of the ground, about centres of mass.
+"""Newton's and Euler's laws in plain NumPy, in the ground's frame, about mass centres.
 
 It shares neither code nor wording with the package: no body frames, no projection, no
 moments about joint origins, no linearity in the parameters.
@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 
 def body_properties(p):
-    """Mass, centre of mass and inertia about it, of the parameters (m, m r_c, A, B, C, D, E, F)."""
+    """Mass, centre and inertia about it, of parameters (m, m r_c, A, B, C, D, E, F)."""
     m, h, (A, B, C, D, E, F) = p[0], np.asarray(p[1:4]), p[4:]
     c = h / m
     about_origin = np.array([[A, -F, -E], [-F, B, -D], [-E, -D, C]])

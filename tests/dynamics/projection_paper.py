@@ -100,7 +100,7 @@ def matrix_form(tree, masses, centres, inertias, q, qd, qdd):
 
 
 def _inertia_columns(w):
-    """[Omega | -hat Omega] of Eq. 9, from the tensor's definition by unit parameters."""
+    """[Omega | -hat Omega] of Eq. 9, by the tensor's definition, unit by unit."""
     tensors = np.zeros((6, 3, 3))
     for k in range(3):
         tensors[k, k, k] = 1.0
@@ -110,7 +110,7 @@ def _inertia_columns(w):
 
 
 def regressor(tree, q, qd, qdd):
-    """[Theta_1 ... Theta_n] of Eqs. 10 and 11, the three matrices of Eq. 10 one by one."""
+    """[Theta_1 ... Theta_n] of Eqs. 10 and 11, by the three matrices of Eq. 10."""
     rows, rates = along(lambda x, xd: origin_velocities(tree, x, xd), q, qd, qdd)
     F_o = jax.jacfwd(lambda xd: origin_velocities(tree, q, xd))(qd)
     o1, o3, o6 = np.zeros((3, 1)), np.zeros((3, 3)), np.zeros((3, 6))

@@ -1,4 +1,4 @@
-"""Base parameters: published counts, Eq. 24, the laws they obey, doubts that are reported."""
+"""Base parameters: published counts, Eq. 24, the laws they obey, reported doubts."""
 
 import functools
 

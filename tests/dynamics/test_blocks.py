@@ -1,4 +1,4 @@
-"""The public dynamics of many samples: by blocks, under every transformation, on every platform."""
+"""The public dynamics of many samples: by blocks, transformed, on all platforms."""
 
 import jax
 import jax.numpy as jnp
@@ -74,7 +74,7 @@ def test_leading_axes_of_parameters_and_motion_broadcast(samples):
 
 
 def test_parameters_that_are_constants_cost_nothing():
-    """XLA folds a fence that depends on constants only, and computes shared values many times."""
+    """XLA folds a fence of constants only, and computes shared values many times."""
     x = in_jax(motion(512))
 
     def fences(function, *arguments):
@@ -164,7 +164,7 @@ def test_a_motion_and_its_arrays_give_the_same():
 
 @pytest.mark.parametrize("samples", [8, 300])
 def test_the_samples_of_a_mesh_of_devices(samples):
-    """Branches and loops agree on what differs along a mesh, whichever argument differs."""
+    """Branches and loops agree on differences along a mesh, of any argument."""
     mesh = jax.sharding.Mesh(np.array(jax.devices()[:1]), ("d",))
     spec = jax.sharding.PartitionSpec("d")
     x = in_jax(motion(samples))

@@ -1,4 +1,4 @@
-"""Methods as users hand them to `jax.jit` and `jax.vmap`: bound, without a lambda around them."""
+"""Methods as users hand them to `jax.jit` and `jax.vmap`: bound, without a lambda."""
 
 import jax
 import jax.numpy as jnp

@@ -50,7 +50,7 @@ def model():
 
 @pytest.fixture(scope="module")
 def unknowns():
-    """Parameters that a real robot could have: drives dissipate, rotors have inertia."""
+    """Parameters that a real robot could have: drives dissipate, rotors have mass."""
     rng = np.random.default_rng(32)
     A, J, fvm = REDUCTION, rng.uniform(1e-4, 1e-3, N), rng.uniform(1e-4, 1e-3, N)
     own = np.diag(A)[COUPLED] ** 2
@@ -104,7 +104,7 @@ def test_mass_matrix_and_bias_make_the_forces(case):
 
 
 def test_mass_matrix_is_the_slope_of_the_forces(case):
-    """Composite bodies against the inverse dynamics of unit accelerations (exact: affine)."""
+    """Composite bodies against the inverse dynamics of unit accelerations: exact."""
     assert trees.relative(case["mass"], case["slope"]) < 1e-13
 
 
@@ -122,7 +122,7 @@ def test_forces_at_rest_lift_and_hold(case, unknowns):
 
 
 def test_power_goes_into_energy_and_friction(model, unknowns, case):
-    """qd . Q = d/dt (kinetic + potential) + power of friction and offsets, on a smooth path."""
+    """qd . Q = d/dt (kinetic + potential) + power of friction and offsets, smooth."""
     rng = np.random.default_rng(34)
     amplitude, rate, phase = rng.uniform(0.3, 1.5, (3, N))
     p = case["p"]

@@ -1,4 +1,4 @@
-"""Invalid input of models, terms and base parameters is rejected by the name of the argument."""
+"""Invalid input of models, terms and base parameters is rejected by argument name."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""jit, vmap and grad through everything; batches; geometry as an input; single precision."""
+"""jit, vmap and grad through everything; batches; geometry as input; float32."""
 
 import equinox as eqx
 import jax
@@ -182,7 +182,7 @@ def test_geometry_may_be_a_batch_axis():
 
 
 def test_a_model_is_a_tree_that_passes_through_jit():
-    """The robot's arrays as inputs: a second robot of the same structure compiles nothing new."""
+    """The robot's arrays as inputs: a second robot of its kind compiles nothing new."""
     traces = []
 
     @eqx.filter_jit

@@ -1,4 +1,4 @@
-"""Base parameters in letters: Eq. 24 as printed, and right on robots of other lengths."""
+"""Base parameters in letters: Eq. 24 as printed, and right for other lengths."""
 
 import math
 from fractions import Fraction
@@ -167,7 +167,7 @@ MODELS = {
 def stretched(
     robot: Robot, lengths: dict[str, float], seed: int
 ) -> tuple[Robot, dict[str, float]]:
-    """The robot with all its offsets and gravity changed at random, and the lengths it then has."""
+    """The robot with random changes of its offsets and gravity, and its new lengths."""
     rng = np.random.default_rng(seed)
     offset = np.array(robot.offset) * rng.uniform(0.6, 1.6, (robot.joints, 3))
     factor = rng.uniform(0.3, 3.0)

@@ -49,7 +49,7 @@ def test_forces_are_newton_euler_for_parameters_that_no_body_has(forces):
 
 
 def test_points_of_a_cloud_feel_newtons_law_alone(forces):
-    """Without Euler's law or any inertia tensor: each point mass pushed along its own path."""
+    """Without Euler's law or inertia tensors: each point mass on a path of its own."""
     rng = np.random.default_rng(3)
     bodies = trees.random_bodies(rng, TREE.joints)
     motion = trees.random_motion(rng, SAMPLES, TREE.joints)

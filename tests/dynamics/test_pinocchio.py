@@ -93,7 +93,7 @@ def test_forces_mass_matrix_bias_and_energies():
 
 
 def test_parameters_convert_as_the_conventions_say():
-    """docs/conventions.md: Pinocchio's vector is (m, h, Ixx, Ixy, Iyy, Ixz, Iyz, Izz)."""
+    """docs/conventions.md: Pinocchio has (m, h, Ixx, Ixy, Iyy, Ixz, Iyz, Izz)."""
     body = trees.random_bodies(np.random.default_rng(24), 1)[0]
     m, mx, my, mz, A, B, C, D, E, F = body.parameters
     theirs = body.pinocchio().toDynamicParameters()

@@ -1,4 +1,4 @@
-"""Which columns depend on earlier ones: two methods, against brute force and LAPACK's ranks."""
+"""Which columns depend on earlier ones: two methods, brute force and LAPACK's ranks."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ METHODS = (gram_schmidt, singular_values)
 
 
 def with_dependent_columns(seed: int, rows: int, columns: int, rank: int) -> np.ndarray:
-    """Random columns of which only some are new; the others mix at most three earlier ones."""
+    """Random columns of which only some are new; others mix at most three of these."""
     rng = np.random.default_rng(seed)
     new = {0, *rng.choice(np.arange(1, columns), rank - 1, replace=False)}
     W = np.zeros((rows, columns))

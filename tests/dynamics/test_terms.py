@@ -95,7 +95,7 @@ class TestContract:
             assert "your own" not in in_words(name, model)[0]
 
     def test_everything_fits_and_is_linear(self, term, robot):
-        """Shapes, forces = columns p, mass matrix = slope, potential's slope = forces at rest."""
+        """Shapes; forces = columns p; the slopes of mass matrix and potential."""
         size = len(term.parameters(robot))
         p = np.random.default_rng(43).normal(size=size)
 
@@ -183,7 +183,7 @@ def test_asymmetric_friction_is_its_level_in_each_direction(robot):
 
 
 def test_asymmetric_friction_is_symmetric_friction_with_an_offset(robot):
-    """The docstring's claim: it spans the columns of the two terms whose place it takes."""
+    """The docstring's claim: it spans the columns of the two terms it replaces."""
     fcp, fcn = np.random.default_rng(44).uniform(1, 5, (2, N))
     found = _columns(AsymmetricCoulombFriction(), robot) @ np.concatenate([fcp, fcn])
     dry = _columns(CoulombFriction(), robot) @ (0.5 * (fcp + fcn))
@@ -234,7 +234,7 @@ def test_ripple_is_that_of_the_motors_and_joints(robot):
 
 
 def _motor_level(A, J, fv, fc, epsilon, qd, qdd):
-    """A^T (J A qdd + fv A qd + fc s(A qd / a_ii)): every motor with its own rotor and friction."""
+    """A^T (J A qdd + fv A qd + fc s(A qd / a_ii)): motors with rotor and friction."""
     own = np.diag(A)
     motors = (
         J * (A @ qdd)
@@ -300,7 +300,7 @@ def test_coupled_drives_of_the_tx40_are_the_published_columns():
 
 
 def test_stribeck_friction_falls_from_its_static_level(robot):
-    """At a few epsilons the sum of both levels, at the Stribeck speed what is left of it."""
+    """At a few epsilons the sum of both levels, at the Stribeck speed what is left."""
     speeds = np.array([0.1, 0.2, 0.4])
     term = StribeckFriction(speeds, exponent=1.5, transition=Tanh(1e-4))
     levels = np.array([1.0, 2.0, 3.0, 0.5, 0.6, 0.7])
@@ -362,7 +362,7 @@ def test_base_parameters_see_friction_near_standstill():
 
 
 def test_a_coupled_motor_has_the_transition_of_its_own_joint():
-    """Widths for each joint: the wrist's motor 3 turns two axes, with one friction on both."""
+    """Widths for each joint: motor 3 of the wrist turns two axes, with one friction."""
     robot = TREE.robot().replace(drives=Drives(N, reduction=REDUCTION))
     widths = (0.01, 0.3, 0.7)
     found = CoupledDrives(Tanh(widths)).columns(robot, Q, QD, QDD)

@@ -43,7 +43,7 @@ TREES = [
 
 
 def _pinocchio(path: Path, names: tuple[str, ...]) -> tuple[pin.Model, list[int]]:
-    """The same joints in Pinocchio (others locked), and where each of ours stands there."""
+    """The same joints in Pinocchio (others locked), and where each of ours stands."""
     model = pin.buildModelFromUrdf(str(path))
     others = [j for j in range(1, model.njoints) if model.names[j] not in names]
     if others:

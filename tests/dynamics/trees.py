@@ -88,7 +88,7 @@ def random_tree(seed: int, joints: int) -> Tree:
 
 
 def bushy_tree(seed: int) -> Tree:
-    """Three branches and two roots, depth first: Pinocchio's mass matrix asks for that order."""
+    """Three branches, two roots, depth first, which Pinocchio's mass matrix needs."""
     rng = np.random.default_rng(seed)
     parent, revolute = (
         (-1, 0, 1, 1, 0, 4, -1),
@@ -98,7 +98,7 @@ def bushy_tree(seed: int) -> Tree:
 
 
 def mixed_tree(seed: int = 0) -> Tree:
-    """Two branches, a rail at the root, a slide in the middle: every case of the recursion."""
+    """Two branches, a rail at the root, a slide in the middle: all recursive cases."""
     rng = np.random.default_rng(seed)
     parent, revolute = (-1, 0, 1, 1, 3), (False, True, True, False, True)
     return Tree(parent, revolute, *geometry(rng, 5), rng.normal(size=3) * 9.81)

@@ -1,4 +1,4 @@
-"""Small arms whose programs compile in a second, and one finished design of each kind."""
+"""Small arms whose programs compile in a second, and one finished design per kind."""
 
 import jax
 import numpy as np
@@ -63,7 +63,7 @@ def random():
 
 @pytest.fixture(scope="package")
 def excess():
-    """A function of a plan: largest excess of its dense samples over the joints' limits."""
+    """A function of a plan: largest excess of dense samples over the joints' limits."""
 
     def excess(plan):
         motion = plan.trajectory.motion(

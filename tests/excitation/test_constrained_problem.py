@@ -1,4 +1,4 @@
-"""Constraints as a search sees them: by a motion's numbers, at its peaks; and with leads."""
+"""Constraints as a search sees them: numbers of a motion, at its peaks; and leads."""
 
 import dataclasses
 import functools

@@ -1,4 +1,4 @@
-"""Every constraint: derivatives, one sample like many, words; and each one's own oracle."""
+"""Every constraint: derivatives, one sample like many, words; and its own oracle."""
 
 from functools import cache
 

@@ -1,4 +1,4 @@
-"""Whole designs on a small arm: limits for all times, better than random, stopped and resumed."""
+"""Whole designs on a small arm: limits at all times, better than random, resumed."""
 
 import dataclasses
 import itertools
@@ -45,7 +45,7 @@ def plan(designed):
 
 @pytest.fixture(scope="module")
 def impossible(pendulum):
-    """The range begins at -2: standing still there is as near to the constraint as it gets."""
+    """The range begins at -2: standing still there is nearest to the constraint."""
     return ExcitationProblem(pendulum, BASIS, constraints=(LowTip(-2.5),), samples=200)
 
 
@@ -144,7 +144,7 @@ def test_another_solver_is_put_around_a_problem(free):
 
 
 def test_the_problems_functions_are_those_of_the_motion(impossible, pendulum):
-    """`value`, `inequalities` and `violation` run under `jit` and agree with the exact ones."""
+    """`value`, `inequalities` and `violation` run in `jit`, and match exact ones."""
     x = impossible.random(jax.random.key(0))
     value = jax.jit(impossible.value)
     motion = impossible.trajectory(x).motion(BASIS.times(200))

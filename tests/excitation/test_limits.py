@@ -1,4 +1,4 @@
-"""Limits as matrices: random and restored motions keep them at all times, and use them."""
+"""Limits as matrices: random, restored motions keep them at all times, and use them."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""Candidates and their children: which survive, which parents their joints come from."""
+"""Candidates and children: which survive, and which parents give them their joints."""
 
 import jax
 import numpy as np
@@ -72,7 +72,7 @@ def test_the_best_of_two_generations_survive_and_none_twice():
 
 
 def test_a_motion_is_enlarged_to_its_limits_only_where_that_is_better(pendulum):
-    """A condition number may well become worse: what a search has gained would be lost."""
+    """A condition number may become worse: what a search has gained would be lost."""
     for criterion in (ConditionNumber(), DOptimal()):
         one = ExcitationProblem(
             pendulum, BASIS, criterion=criterion, noise=np.ones(1), samples=100

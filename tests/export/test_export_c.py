@@ -1,4 +1,4 @@
-"""The C code against NumPy on the same model, against itself, and against its own promises."""
+"""The C code against NumPy on the same model, against itself, and its own promises."""
 
 import itertools
 import re

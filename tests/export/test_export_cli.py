@@ -11,7 +11,8 @@ import jaxid as jid
 from jaxid.cli import app as cli
 
 URDF = """<robot name="stick"><link name="a"/><link name="b"/><joint name="hinge"
- type="continuous"><parent link="a"/><child link="b"/><axis xyz="0 1 0"/></joint></robot>"""
+ type="continuous"><parent link="a"/><child link="b"/><axis xyz="0 1 0"/>
+</joint></robot>"""
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""Files for simulators give the same torques there, as far as they can hold the model."""
+"""Files for simulators give the same torques, as far as they can hold the model."""
 
 import dataclasses
 import importlib.util

@@ -1,4 +1,4 @@
-"""No name, date or note gets out of its place in C, XML, TOML, HTML, YAML or on a terminal."""
+"""No name, date or note leaves its place in C, XML, TOML, HTML, YAML or a terminal."""
 
 import dataclasses
 import io
@@ -115,7 +115,7 @@ def named(fit, name):
 
 
 def code_of(text):
-    """Return C without comments and what is in strings, as a compiler with trigraphs reads it."""
+    """Return C without comments and strings, as a compiler with trigraphs reads it."""
     text = text.replace("??/", "\\").replace("\\\n", "")
     comments_and_strings = r'/\*.*?\*/|"(?:\\.|[^"\\\n])*"'
     return re.sub(comments_and_strings, lambda m: m[0][0] * 2, text, flags=re.DOTALL)

@@ -8,5 +8,5 @@ import jaxid as jid
 
 @pytest.fixture(scope="session")
 def base() -> jid.BaseParameters:
-    """Twelve base parameters of a planar arm of two joints with friction and offsets."""
+    """Twelve base parameters of a planar arm: two joints with friction and offsets."""
     return planar_base()

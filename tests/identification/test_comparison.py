@@ -1,4 +1,4 @@
-"""Comparisons: how often they err where nothing has changed, and that they see what has."""
+"""Comparisons: how often they err without a change, and that they see changes."""
 
 import numpy as np
 import pytest
@@ -44,7 +44,7 @@ def test_false_alarms_are_as_rare_as_promised():
 
 
 def test_estimated_deviations_widen_intervals_and_joint_tests():
-    """Covariances from few samples: with quantiles of the normal law tests err far too often."""
+    """Covariances from few samples, where normal quantiles make tests err too often."""
     (a, _), roots, random = covariances(1)
     dof, A = 30, roots[0]
     rates, normal = np.zeros(2), np.zeros(2)

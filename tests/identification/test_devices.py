@@ -25,7 +25,8 @@ terms = (jid.RigidBodies(), jid.ViscousFriction(), jid.CoulombFriction())
 base = jid.base_parameters(jid.Model(jid.robots.planar_arm(2, 0.4), terms))
 p = standard_parameters(base.model)
 def write(fit):
-    np.savez(sys.argv[1], p=fit.parameters, s=fit.naive_standard_deviations, rows=fit.rows)
+    s = fit.naive_standard_deviations
+    np.savez(sys.argv[1], p=fit.parameters, s=s, rows=fit.rows)
 """
 LONG = """
 assert len(jax.devices()) == 3
@@ -39,14 +40,16 @@ assert shares == sorted(shares) and shares[-1] == 1.0
 DIVIDED = """
 import re
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-motion, (forces,) = np.random.default_rng(0).normal(size=(3, 8, 60, 2)), np.ones((1, 8, 60, 2))
+motion = np.random.default_rng(0).normal(size=(3, 8, 60, 2))
+forces = np.ones((8, 60, 2))
 own = NamedSharding(Mesh(np.array(jax.devices()), ("sets",)), PartitionSpec("sets"))
 data = jid.Motion(*motion), forces + motion.sum(axis=0)
 def found(motion, forces):
     return jid.identify_batch(base, motion, forces, np.ones(2), row_time=0.01)
 run = jax.jit(found).lower(*jax.device_put(data, own)).compile()
 assert len(jax.devices()) == 4
-assert not re.findall("all-gather|all-reduce|all-to-all|collective-permute", run.as_text())
+collectives = "all-gather|all-reduce|all-to-all|collective-permute"
+assert not re.findall(collectives, run.as_text())
 fit = run(*jax.device_put(data, own))
 assert fit.parameters.sharding.spec == PartitionSpec("sets")
 slope = jax.jit(jax.grad(lambda f: found(data[0], f).parameters.sum()))

@@ -112,7 +112,7 @@ def test_every_estimator_of_the_dict_finds_the_truth_without_noise(
 
 
 def test_every_estimator_follows_its_forces_and_judges_itself(base, noisy, member):
-    """Forces in other units, parameters and deviations in other units; the same undetermined."""
+    """Forces, parameters, deviations in other units; the same undetermined ones."""
     (k, fit), c = member, 2.0**-13
     other = jid.identify(
         base, noisy.replace(forces=c * noisy.forces), members(noisy, c)[k]

@@ -143,7 +143,7 @@ def test_a_joint_that_never_moves_is_named_and_the_rest_is_right(base, p, still)
     [jid.estimators.Complete(), jid.estimators.Truncated(), jid.estimators.Ridge()],
 )
 def test_a_log_of_a_joint_that_stands_gives_no_absurd_estimates(base, p, solution):
-    """From the recorded angles on, whose differences must not make columns out of rounding."""
+    """From recorded angles, whose differences must not make columns of rounding."""
     o = observations(base.model, p, still=(1,), samples=2000, noise=0.1)
     log = jid.Recording.of(np.asarray(o.motion.q) + 0.3, o.forces, sample_time=0.005)
     rows = jid.observe(log, base.model.robot, jid.ZeroPhaseButterworth(10.0))

@@ -1,4 +1,4 @@
-"""A model file gives the same fit back, bit for bit; everything else is refused in a sentence."""
+"""A model file returns the same fit, bit for bit; others are refused in a sentence."""
 
 import copy
 import dataclasses
@@ -38,7 +38,7 @@ def path(fit, tmp_path):
 
 
 def same(a, b):
-    """The same structure, classes and static fields; numbers to the last bit, NaN and -0 too."""
+    """The same structure, classes, static fields; numbers to the last bit, also NaN."""
     assert jax.tree.structure(a) == jax.tree.structure(b)
     pairs = zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
     for x, y in (map(np.asarray, pair) for pair in pairs):

@@ -1,4 +1,4 @@
-"""The simplest model that predicts unseen data about as well as any, and an honest promise."""
+"""The simplest model that predicts unseen data as well as any, with honest promises."""
 
 import numpy as np
 import pytest

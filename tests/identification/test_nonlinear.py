@@ -1,4 +1,4 @@
-"""Nonlinear friction: shapes that are known are found again, with honest uncertainties."""
+"""Nonlinear friction: known shapes are found again, with honest uncertainties."""
 
 import dataclasses
 
@@ -66,7 +66,7 @@ def test_shapes_are_found_by_name():
 
 
 def test_what_is_left_is_that_of_the_model_with_these_shapes():
-    """Fixed columns once and friction anew is the same as everything at once; masks count."""
+    """Fixed columns once and friction anew: like everything at once; masks count."""
     mask = np.random.default_rng(5).random((375, 3)) < 0.7
     o = observations(
         filter=jid.ZeroPhaseButterworth(5.0, margin=0.0), every=4, mask=mask
@@ -99,7 +99,7 @@ def test_the_jacobian_is_that_of_what_is_left():
 
 
 def test_the_search_can_be_mapped_and_differentiated():
-    """Draws of the forces side by side; the derivative by the forces is that of differences."""
+    """Draws of the forces side by side; the derivative by forces is a difference's."""
     search = search_of(START, observations(samples=400))
     rng, weights = np.random.default_rng(6), np.ones(3)
     draw, change = search.forces + rng.normal(
@@ -119,7 +119,7 @@ def test_the_search_can_be_mapped_and_differentiated():
 
 
 def test_deviations_of_shapes_agree_with_their_scatter():
-    """White noise on every row: the linearised problem predicts the scatter over 14 draws."""
+    """White noise on every row: the linearised problem predicts scatter over draws."""
     found = []
     for seed in range(14):
         search = search_of(START, observations(samples=600, noise=0.3, noise_seed=seed))

@@ -22,7 +22,7 @@ GAINS = np.array([1.2, 0.85, 1.05])
 
 @pytest.fixture(scope="module")
 def base():
-    """Three joints about different axes: a load on the last body shows all of its parameters."""
+    """Three joints, different axes: a last-body load shows all of its parameters."""
     robot = jid.Robot(
         "spatial arm",
         revolute=(True,) * 3,
@@ -154,7 +154,7 @@ def test_a_delays_deviation_is_that_of_many_draws(base):
 
 
 def in_closed_loop(seed, seconds=20.0, dt=0.005):
-    """A pendulum whose servo counteracts unknown forces: measured and commanded observations."""
+    """A pendulum whose servo resists forces: measured and commanded observations."""
     inertia, weight, kp, kd, steps = 0.4, 6.0, 160.0, 16.0, 4
     rng, t = np.random.default_rng(seed), dt * np.arange(round(seconds / dt))
     w = 2 * np.pi * np.arange(1, 6) / 8

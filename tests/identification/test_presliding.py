@@ -1,4 +1,4 @@
-"""Friction with memory: its law against an ODE, its length from data, and the same everywhere."""
+"""Friction with memory: its law against an ODE, its length from data, all alike."""
 
 import jax
 import jax.numpy as jnp

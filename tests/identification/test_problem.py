@@ -1,4 +1,4 @@
-"""The regression problem against the observation matrix, which only these tests form."""
+"""The regression problem against the observation matrix, only formed in these tests."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The compiled pass over long logs gives what NumPy's QR gives, and chunks change only rounding."""
+"""The compiled pass over long logs agrees with NumPy's QR, whatever the chunks."""
 
 import equinox as eqx
 import numpy as np
@@ -25,7 +25,7 @@ def observed(base, samples=6000, noise=0.3, **options) -> jid.Observations:
 
 
 def changed(o: jid.Observations, **fields) -> jid.Observations:
-    """Other observations of the same samples, of which four fifths of the rows count."""
+    """Other observations of the same samples; four fifths of their rows count."""
     o = o.replace(**fields)
     mask = np.random.default_rng(1).random((len(o.instants), o.joints)) < 0.8
     return eqx.tree_at(lambda x: x.mask, o, mask)

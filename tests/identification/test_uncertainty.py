@@ -1,4 +1,4 @@
-"""The spectral sandwich against its definition, and against the scatter of many draws."""
+"""The spectral sandwich against its definition, and the scatter of many draws."""
 
 import itertools
 
@@ -96,7 +96,7 @@ def coloured(random, shape, memory, dt):
 
 
 def coverage(base, recordings, memory, draws, seed=0):
-    """Share of draws in which the 95 % interval holds the truth, by parameter; naive likewise."""
+    """Share of draws whose 95 % interval holds the truth, by parameter; naive too."""
     random = np.random.default_rng(seed)
     spectra, e = row_spectra(base, recordings)
     lines = spectra.lines
@@ -192,7 +192,7 @@ def test_long_logs_in_stretches_agree_with_the_whole(base, monkeypatch):
 
 
 def test_errors_in_the_part_that_decides_make_intervals_wider(base):
-    """A quick part at the start, with larger errors, decides the inertias of a slow log."""
+    """A quick part at the start with larger errors decides a slow log's inertias."""
     random, p = np.random.default_rng(5), standard_parameters(base.model)
     quick = np.where(np.arange(2000) < 100, 10.0, 1.0)[:, None]
     q, qd, qdd = (
@@ -277,7 +277,7 @@ def test_factors_alone_are_judged_by_blocks(base):
 
 
 def test_many_gaps_cost_no_memory_and_change_little(base, monkeypatch):
-    """Stretches of many lengths share their lines: filled up with rows that do not count."""
+    """Stretches of many lengths share lines, filled up with rows that do not count."""
     ends = np.cumsum([0, *range(110, 150, 5)])
     segments = tuple((int(a), int(b)) for a, b in itertools.pairwise(ends))
     o = long_one(base, segments=segments, samples=int(ends[-1]))

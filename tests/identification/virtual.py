@@ -46,7 +46,7 @@ def observations(
     every: int = 1,
     mask: np.ndarray | None = None,
 ) -> jid.Observations:
-    """Exact motion, forces of the model with white noise; nothing filtered unless asked for."""
+    """Exact motion, forces of the model with white noise; filtered only on request."""
     n = model.robot.joints
     m = motion(n, samples, seed=seed, still=still)
     forces = in_numpy(model, model.forces, m.q, m.qd, m.qdd, shared=(p,))
@@ -69,7 +69,7 @@ def observations(
 def dense(
     base: jid.BaseParameters, o: jid.Observations
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Observation matrix, forces and joint of every counted row, formed the obvious way."""
+    """Observation matrix, forces and joint of each counted row, in the obvious way."""
     m, model = o.motion, base.model
     theta = in_numpy(model, model.columns, m.q, m.qd, m.qdd)[:, :, list(base.indices)]
     rows = o.reduce(theta)
@@ -90,7 +90,7 @@ def left_out_in_turn(blocks: Blocks, weights: np.ndarray) -> np.ndarray:
 
 
 def planar_base(joints: int = 2) -> jid.BaseParameters:
-    """Base parameters of a planar arm with friction and offsets: twelve of two joints."""
+    """Base parameters of a planar arm with friction, offsets: twelve of two joints."""
     terms = (
         jid.RigidBodies(),
         jid.ViscousFriction(),
@@ -104,7 +104,7 @@ def planar_base(joints: int = 2) -> jid.BaseParameters:
 
 
 def fit_of(base: jid.BaseParameters, parameters: np.ndarray, **fields) -> jid.Fit:
-    """A fit with given base parameters: most functions do not ask how they were found."""
+    """A fit with given base parameters: most functions ignore how they were found."""
     n, joints = base.size, base.model.robot.joints
     values = {
         "base": base,

@@ -35,7 +35,7 @@ every = pytest.mark.parametrize("filter", FILTERS, ids=lambda f: type(f).__name_
 
 
 def fourier(t, seed=1, joints=3, harmonics=5):
-    """A Fourier motion and its exact derivatives, written without the package (Eq. 34)."""
+    """A Fourier motion and its exact derivatives, without the package (Eq. 34)."""
     rng = np.random.default_rng(seed)
     a, b = rng.uniform(-0.4, 0.4, (2, joints, harmonics))
     wl = OMEGA * np.arange(1, harmonics + 1)
@@ -152,7 +152,7 @@ def test_motions_follow_the_desired_ones(filter):
 @every
 @pytest.mark.parametrize("angle", [0.3, 123.456])
 def test_a_joint_that_stands_has_no_speed_at_all(filter, angle):
-    """Rounding would be a column of its own to least squares, and parameters of 1e15 the answer."""
+    """Rounding would be a column to least squares, with parameters of 1e15."""
     q = fourier(DT * np.arange(round(PERIOD / DT) + 1))[0]
     q[:, 1] = angle
     speed = np.zeros_like(q)
@@ -214,7 +214,7 @@ def test_the_cutoff_is_where_the_gain_is_one_half():
 
 
 def test_paper_filter_lags_and_attenuates_as_its_formula_says():
-    """Forward and backward, G(s) G(-s) gives minus the acceleration: its sign is turned."""
+    """Forward and backward, G(s) G(-s) gives minus the acceleration: turned sign."""
     t, k = DT * np.arange(16000), 20.0
     motion = PaperFilter(velocity=200.0).motion(np.sin(k * t)[:, None], None, DT)
     w = 2 / DT * math.tan(k * DT / 2)

@@ -1,4 +1,4 @@
-"""Log files: what is read back is what was written; errors name file, column and line."""
+"""Log files: reading returns what was written; errors name file, column and line."""
 
 import re
 

@@ -1,4 +1,4 @@
-"""Observations: forces and columns stay aligned through filters, decimation, gaps and chunks."""
+"""Observations: forces and columns stay aligned through filters, gaps and chunks."""
 
 import dataclasses
 
@@ -205,7 +205,7 @@ def test_remarks_say_what_was_left_out():
 @pytest.mark.parametrize("noise", [0.0, 1e-3])
 @pytest.mark.parametrize("wrong", [-1.0, 1.5, 0.0, 180 / np.pi])
 def test_velocities_that_are_no_derivatives_are_left_out(wrong, noise):
-    """One channel is wrong; one that stands, with noise in both signals, is not judged."""
+    """One channel is wrong; one at rest, with noise in both signals, is not judged."""
     r, rng = a_recording(gaps=(2500,)), np.random.default_rng(2)
     quiet = np.asarray(r.angles) * [1.0, 0.0] + noise * rng.normal(size=r.angles.shape)
     good = np.asarray(r.velocities) * [1.0, 0.0] + 10 * noise * rng.normal(

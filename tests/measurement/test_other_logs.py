@@ -359,7 +359,7 @@ def test_hdf5(tmp_path):
 
 
 def test_mat_of_version_7_3(tmp_path):
-    """Written as MATLAB does: transposed arrays, a head of 512 bytes, structures as groups."""
+    """Written like MATLAB: transposed arrays, 512 bytes' head, structures as groups."""
     path = tmp_path / "a.mat"
     with h5py.File(path, "w", userblock_size=512) as file:
         for name, array in zip(("q", "dq", "tau"), numbers(), strict=True):

@@ -1,4 +1,4 @@
-"""Functions that the tests of a program share, and hypothesis strategies that make more."""
+"""Functions that the tests of a program share, and hypothesis strategies for more."""
 
 import jax
 import jax.numpy as jnp
@@ -29,7 +29,7 @@ SIZE = 3
 
 @st.composite
 def random_functions(draw, smooth=False):
-    """A function of two vectors of `SIZE` entries, as a random straight line of operations."""
+    """A function of two vectors of `SIZE` entries, as random straight operations."""
     unary = (*UNARY[:3], *UNARY[4:6]) if smooth else UNARY
     binary = (*BINARY[:3], BINARY[5]) if smooth else BINARY
     constants = st.sampled_from([0.0, 1.0, -1.0, 2.0, -0.3, 0.7])
@@ -68,10 +68,11 @@ def every_operation(a, b):
     inside = 0.9 * jnp.sin(a)
     return jnp.stack(
         [
-            jnp.tan(inside), jnp.arcsin(inside), jnp.arccos(inside), jnp.arctan(a), jnp.sinh(a),
-            jnp.cosh(a), jnp.tanh(a), jnp.sqrt(a * a), jnp.cbrt(a), jnp.exp(a), jnp.log(a * a),
-            jnp.expm1(a), jnp.log1p(b * b), jnp.abs(a) ** 0.3, jnp.sign(b), jnp.arctan2(a, b),
-            1.0 / a, jnp.minimum(a, b), jnp.maximum(a, b), -a, a**5, a - 1e-7 * b, 1e20 * a,
+            jnp.tan(inside), jnp.arcsin(inside), jnp.arccos(inside), jnp.arctan(a),
+            jnp.sinh(a), jnp.cosh(a), jnp.tanh(a), jnp.sqrt(a * a), jnp.cbrt(a),
+            jnp.exp(a), jnp.log(a * a), jnp.expm1(a), jnp.log1p(b * b),
+            jnp.abs(a) ** 0.3, jnp.sign(b), jnp.arctan2(a, b), 1.0 / a,
+            jnp.minimum(a, b), jnp.maximum(a, b), -a, a**5, a - 1e-7 * b, 1e20 * a,
             jnp.where((a > 0) & (b < 1) | ~(b != 0.5), a, -b),
         ]
     )  # fmt: skip
@@ -82,14 +83,14 @@ def samples(seed, batch, shape=(SIZE,), count=2):
 
 
 def reference(function, *arrays):
-    """The function on batch-last arrays by `vmap`, which shares nothing with a program."""
+    """The function on batch-last arrays by `vmap`: it shares nothing with programs."""
     first = [jnp.moveaxis(jnp.asarray(x), -1, 0) for x in arrays]
     found = jax.jit(jax.vmap(function))(*first)
     return jax.tree.map(lambda x: np.moveaxis(np.asarray(x), 0, -1), found)
 
 
 def chain(angles, rates):
-    """Positions and velocities along a chain of three skew axes: shared values, many results."""
+    """Positions and velocities of a chain of skew axes: shared values, many results."""
     point, turn, results = jnp.zeros(3), jnp.eye(3), []
     offset = np.array([0.3, 0.0, 0.5])
     for k in range(3):

@@ -128,7 +128,7 @@ FLAGS = {"plain": ["-std=c99"], "fused": ["-march=native", "-ffp-contract=fast"]
 
 @pytest.fixture(scope="module", params=[(d, f) for d in (True, False) for f in FLAGS])
 def library(request, tmp_path_factory):
-    """Return the precision, the writer, the file and the function of sines, cosines and tanh."""
+    """Return the precision, writer, file and function of sines, cosines and tanh."""
     double, flags = request.param
     program = trace(lambda x: (jnp.sin(x), jnp.cos(x), jnp.tanh(x)), (5,))
     writer = CWriter(double, "arm", [program])

@@ -9,13 +9,21 @@ from jaxid.program import trace
 from jaxid.program.gradient import pull_back
 
 FUNCTIONS = {
-    "arithmetic": lambda x, y: jnp.stack([x[0] * x[1] - y / x[0], -x[1] + 3.0 * y, x[0] ** 3]),
-    "circular": lambda x, y: jnp.stack([jnp.sin(x[0] * y), jnp.cos(x[1]) * jnp.sin(x[1])]),
+    "arithmetic": lambda x, y: jnp.stack([
+        x[0] * x[1] - y / x[0],
+        -x[1] + 3.0 * y,
+        x[0] ** 3,
+    ]),
+    "circular": lambda x, y: jnp.stack([
+        jnp.sin(x[0] * y),
+        jnp.cos(x[1]) * jnp.sin(x[1]),
+    ]),
     "functions": lambda x, y: jnp.stack([
         jnp.tanh(x[0]) + jnp.sinh(y),
         jnp.sqrt(x[1] ** 2 + 1.0) * jnp.exp(-y),
         jnp.log(2.0 + y) + jnp.arctan(x[0]) + jnp.tan(0.3 * y) + jnp.cosh(x[1]),
-        jnp.arctan2(x[0], 1.5 + y) + jnp.log1p(y**2) + jnp.expm1(x[1]) + jnp.cbrt(2.0 + y),
+        jnp.arctan2(x[0], 1.5 + y) + jnp.log1p(y**2) + jnp.expm1(x[1])
+        + jnp.cbrt(2.0 + y),
         jnp.arcsin(0.3 * y) + jnp.arccos(0.2 * y) + (2.0 + y) ** 1.7,
     ]),
     "choices": lambda x, y: jnp.stack([

@@ -18,7 +18,7 @@ HERE = Path(__file__).resolve().parent
 
 @pytest.fixture
 def identify(shared_data, tmp_path, capsys):
-    """Run `jaxid identify` on logs, compare with golden results, return result and messages."""
+    """Run `jaxid identify` on logs, compare with golden results, return the results."""
 
     def identify(case, experiment, *words):
         words = [

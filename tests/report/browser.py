@@ -93,7 +93,7 @@ class Browser:
         self.call("Emulation.setEmulatedMedia", media=media, features=features)
 
     def open(self, path: Path) -> None:
-        """Open a file, wait until its figures can be drawn, and add the functions of the tests."""
+        """Open a file, wait for its figures, and add the functions of the tests."""
         self.errors.clear()
         self.call("Page.navigate", url=path.resolve().as_uri())
         ready = (

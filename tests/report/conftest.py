@@ -1,4 +1,4 @@
-"""A small robot with a rail and a pendulum, fitted to a noisy virtual log; errors of any arm."""
+"""A small robot with rail and pendulum, fitted to a virtual log; errors of any arm."""
 
 import dataclasses
 
@@ -97,7 +97,7 @@ def changed(fit):
 
 @pytest.fixture(scope="session")
 def consistent():
-    """Return a fit of possible bodies with friction that drives: the bound at zero decides."""
+    """Return a fit of possible bodies, where the bound of friction at zero decides."""
     robot = jid.robots.planar_arm(2, 0.4)
     model = jid.Model(robot, (jid.RigidBodies(), jid.ViscousFriction()))
     t = np.arange(0.0, 6.0, 0.01)

@@ -1,4 +1,4 @@
-"""Pages in a real browser: nothing is cut off or overlaps, no error, zoom and legends work."""
+"""Pages in a real browser: nothing is cut off or overlaps; zoom and legends work."""
 
 import shutil
 import subprocess

@@ -46,7 +46,7 @@ def numbers(packed):
 
 
 def require_everything_inside(shown):
-    """On paper no text is cut off by the edge, and no panel's title touches another panel."""
+    """On paper no text is cut off, and no panel's title touches another panel."""
     figure = shown.matplotlib()
     figure.canvas.draw()
     page, to_inches = figure.bbox_inches, figure.dpi_scale_trans.inverted()

@@ -1,4 +1,4 @@
-"""The page: whole, closed in itself, escaped, and with the numbers of the result file."""
+"""The page: whole, closed in itself, escaped, with the numbers of the result file."""
 
 import dataclasses
 import json
@@ -19,7 +19,7 @@ EVIL = "<script>alert('&\"')</script>"  # as in conftest.py
 
 
 class Reader(HTMLParser):
-    """Follows the tags of a page, and keeps identifiers, links and the cells of its tables."""
+    """Follows a page's tags, and keeps identifiers, links and cells of its tables."""
 
     def __init__(self, text: str):
         super().__init__()
@@ -58,7 +58,7 @@ class Reader(HTMLParser):
 
 
 def read(page_text: str) -> Reader:
-    """A page that needs nothing else, whose identifiers are its own and whose links lead there."""
+    """A page that needs nothing else, with unique identifiers, and links that work."""
     found = Reader(page_text)
     assert page_text.startswith("<!DOCTYPE html>")
     assert len(set(found.ids)) == len(found.ids)

@@ -1,4 +1,4 @@
-"""Tables: numbers as text, alignment, units, widths; and what stands in those of results."""
+"""Tables: numbers as text, alignment, units, widths; and those of results."""
 
 import io
 

@@ -1,4 +1,4 @@
-"""Forward kinematics in plain NumPy and SciPy: an oracle that shares no code with the package."""
+"""Forward kinematics in plain NumPy and SciPy: an oracle that shares no code."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -42,7 +42,7 @@ def tip_transform(robot, q):
 
 
 def dh_frames(rows, q, convention, revolute=None):
-    """4 x 4 placements of the frames 0, 1, …, n of a table, one product after the other."""
+    """4 x 4 placements of a table's frames 0, 1, …, n, one product after the other."""
     x, z = np.eye(3)[[0, 2]]
     frames = [np.eye(4)]
     for i, (alpha, a, d, *rest) in enumerate(rows):

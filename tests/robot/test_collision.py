@@ -1,4 +1,4 @@
-"""Distances of capsules, planes and boxes against Coal and points; derivatives everywhere."""
+"""Distances of capsules, planes, boxes against Coal and points; derivatives."""
 
 import jax
 import jax.numpy as jnp

@@ -53,7 +53,7 @@ def test_rail_robot_is_the_published_chain_on_a_rail(facts):
 
 
 def test_rail_robot_has_the_papers_base_parameters():
-    """44 of 70, and the regrouping of Eq. 24: a test of the frames, which decide its form."""
+    """44 of 70, and the regrouping of Eq. 24: a test of the frames behind its form."""
     terms = (
         RigidBodies(principal_axes=True),
         ViscousFriction(),

@@ -21,16 +21,19 @@ ARM = """
     <body name="table" pos="0 0 0.4" euler="10 20 30">
       <geom type="box" size="0.5 0.5 0.02"/>
       <body name="shoulder" pos="0 0 0.1" quat="1 1 0 0">
-        <joint name="pan" pos="0.1 0 0" axis="0 1 1" ref="20" range="-100 160" frictionloss="0.3"/>
+        <joint name="pan" pos="0.1 0 0" axis="0 1 1" ref="20" range="-100 160"
+          frictionloss="0.3"/>
         <joint name="lift" pos="0 0.2 0.1" axis="1 0 0"/>
         <geom type="box" size="0.1 0.2 0.3" pos="0.1 0 0.2" euler="0 30 0"/>
         <body name="plate" pos="0 0.2 0" euler="0 90 0">
           <geom type="capsule" size="0.05" fromto="0 0 0 0.3 0.1 0" class="heavy"/>
           <body name="ram" pos="0 0 0.3" euler="0 0 45">
             <joint name="slide" type="slide" axis="1 0 1" ref="0.1" range="-0.3 0.4"/>
-            <inertial pos="0.1 0.2 0.3" mass="2" fullinertia="0.2 0.3 0.4 0.01 0.02 0.03"/>
+            <inertial pos="0.1 0.2 0.3" mass="2"
+              fullinertia="0.2 0.3 0.4 0.01 0.02 0.03"/>
             <site name="flange" pos="0 0 0.2" euler="0 45 0"/>
-            <body name="left"><joint name="left" type="slide" axis="0 1 0" range="0.01 0.05"/>
+            <body name="left">
+              <joint name="left" type="slide" axis="0 1 0" range="0.01 0.05"/>
               <geom size="0.02"/></body>
             <body name="right" pos="0 0 0.1"><joint name="right" axis="0 0 1"/>
               <geom size="0.03" pos="0.1 0 0"/></body>

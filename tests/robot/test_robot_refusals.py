@@ -1,4 +1,4 @@
-"""Invalid input of the room: each error names what is wrong, and the file where there is one."""
+"""Invalid input of the room: each error names what is wrong, and the file if any."""
 
 import re
 

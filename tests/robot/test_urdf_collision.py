@@ -1,4 +1,4 @@
-"""Capsules around a URDF's geometry: nothing sticks out, and nothing is much too large."""
+"""Capsules around a URDF's geometry: nothing sticks out, nothing is much too large."""
 
 import numpy as np
 import pytest
@@ -159,7 +159,8 @@ def test_grippers_that_the_chain_leaves_out_count_as_bodies_that_collide(tmp_pat
 def test_shapes_of_mjcf_files_are_held(tmp_path):
     mujoco = pytest.importorskip("mujoco")
     path = tmp_path / "arm.xml"
-    path.write_text("""<mujoco><worldbody><body name="one" pos="0 0 0.3"><joint axis="0 1 0"/>
+    path.write_text("""<mujoco><worldbody>
+    <body name="one" pos="0 0 0.3"><joint axis="0 1 0"/>
       <geom type="capsule" size="0.05" fromto="0 0 0 0.4 0 0"/>
       <geom type="box" size="1 1 1" contype="0" conaffinity="0"/>
       <body name="two" pos="0.5 0 0" euler="0 0 30"><joint axis="0 1 0"/>

@@ -11,7 +11,8 @@ DELAY = 0.012
 MASS, CENTRE = 0.6, 0.15
 ENCODER = 2 * np.pi / 4096
 
-XML = """<mujoco><compiler angle="radian"/><extension><plugin plugin="mujoco.pid"/></extension>
+XML = """<mujoco><compiler angle="radian"/>
+<extension><plugin plugin="mujoco.pid"/></extension>
 <option timestep="{step}" gravity="0 0 -9.81" integrator="implicitfast"/>
 <worldbody><body name="turn">
 <inertial pos="0 0 0" mass="1" diaginertia="0.002 0.002 0.002"/>
@@ -92,7 +93,7 @@ def log(
     ki=0.0,
     limit=1e3,
 ):
-    """Return a log of 50 Hz; commands are held until the next one and reach the servo late."""
+    """Return a log of 50 Hz; commands are held until the next and reach servos late."""
     model = mujoco.MjModel.from_xml_string(
         model_text(stiffer, step, friction, ki, limit)
     )

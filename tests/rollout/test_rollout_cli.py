@@ -1,4 +1,4 @@
-"""`jaxid rollout`: from an experiment file and logs, without or with torques, to a report."""
+"""`jaxid rollout`: from experiment files and logs, with torques or not, to reports."""
 
 import json
 

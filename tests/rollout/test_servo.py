@@ -1,4 +1,4 @@
-"""Identification of position-controlled joints against MuJoCo, differences and scipy."""
+"""Identification of position-controlled joints against MuJoCo and scipy."""
 
 import dataclasses
 
@@ -60,7 +60,7 @@ def test_a_linear_joint_moves_as_scipys():
 
 @pytest.mark.parametrize("J", [1e-7, 1e-5, 1e-3])
 def test_a_ramp_is_followed_steadily_whatever_the_inertia(J):
-    """Both stages of a step have commands of their own: else inertia would count without cause."""
+    """Both stages of a step have own commands: else inertia counts without cause."""
     speed = 0.2
     simulator, x = _one_joint(0.02 * speed * np.arange(400), J=J, B=0.05, F=0.01)
     coupled = CoupledSimulator(simulator.motion, 0.01, False, None)
@@ -195,7 +195,7 @@ def test_joints_that_shake_each_other_move_as_in_mujoco():
 
 
 def test_a_joint_that_turns_around_keeps_its_velocity():
-    """The force turns the joint around within a stage: friction first brakes, then opposes it."""
+    """The force turns the joint in a stage: friction first brakes, then opposes it."""
     force, inertia, friction, w = -3.0, 100.0, 1.0, 0.02
     one = (jnp.array([y]) for y in (force, inertia, friction, inertia, w))
     slip = Slip.of(*one, jnp.ones(1))
@@ -211,7 +211,7 @@ def test_a_joint_that_turns_around_keeps_its_velocity():
 
 
 def test_steps_stay_within_bounds_and_the_others_follow():
-    """The second parameter goes to its bound, for which the first one is solved again."""
+    """The second parameter goes to its bound; the first one is then solved again."""
     H, x = np.array([[2.0, 1.0], [1.0, 2.0]]), np.array([0.0, 0.2])
     bounds = np.array([-9.0, 0.0]), np.array([9.0, 9.0])
     gradient = np.array([0.5, 1.0])
@@ -280,7 +280,7 @@ def test_windows_and_segments(fit):
 
 
 def test_windows_know_the_commands_before_them():
-    """A late joint is far behind its command: so it must be at the start of a window."""
+    """A late joint is far behind its command: so it must be at a window's start."""
     simulator, x = _one_joint(0.01 * np.arange(400), J=4e-3, B=0.05, d=0.09, F=0.01)
     motion = simulator.motion.replace(positions=simulator.paths(x)[0])
     windows = motion.windows(1.0)
@@ -329,7 +329,7 @@ def test_mujoco_moves_like_the_simulation(fit, tmp_path):
 
 
 def _require_motion_of_mujoco(path, log):
-    """Require that MuJoCo, with commands that are held and late, moves as in the log."""
+    """Require that MuJoCo, with held and late commands, moves as in the log."""
     model = mujoco.MjModel.from_xml_path(str(path))
     data, delay = mujoco.MjData(model), model.numeric("delay").data
     measured, sent = np.asarray(log.angles), np.asarray(log.forces)

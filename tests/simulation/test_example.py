@@ -1,4 +1,4 @@
-"""The example: the same for a seed, possible bodies, and a truth that can be found again."""
+"""The example: the same for a seed, with possible bodies, and a truth to be found."""
 
 import json
 

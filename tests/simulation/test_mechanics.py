@@ -1,4 +1,4 @@
-"""Forward dynamics: the other way round of inverse dynamics, and a step that keeps the energy."""
+"""Forward dynamics: the inverse of inverse dynamics, and a step that keeps energy."""
 
 import numpy as np
 import pytest
@@ -43,7 +43,7 @@ def plant(friction=FREE, step=1e-3):
 
 
 def moved(machine, u, steps, ramp=1):
-    """Positions, velocities and accelerations after each step; the force may come slowly."""
+    """Positions, velocities, accelerations after steps; the force may come slowly."""
     rows = []
     for k in range(steps):
         machine.step([min((k + 1) / ramp, 1.0) * x for x in u])

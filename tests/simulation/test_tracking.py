@@ -1,4 +1,4 @@
-"""A servo on a virtual robot: it follows, better with a better model; sensors say what they can."""
+"""A servo on a virtual robot: it follows, better with a better model; its sensors."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Contract of every basis: derivatives that belong together, envelopes that hold, retimings."""
+"""Contract of every basis: matching derivatives, envelopes that hold, retimings."""
 
 import numpy as np
 import pytest

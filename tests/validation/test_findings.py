@@ -1,4 +1,4 @@
-"""Each finding about a log without a model is raised by its own mistake, and by nothing else."""
+"""Each finding about a log without a model is raised by its own mistake alone."""
 
 import dataclasses
 
@@ -164,7 +164,7 @@ def test_lost_and_repeated_rows_are_named_and_nothing_else(count):
 
 
 def test_slow_motion_in_increments_of_an_encoder_loses_no_rows():
-    """Steps of one increment, at times of two: their second differences are rounding alone."""
+    """Steps of one increment, at times of two: second differences are only rounding."""
     increments = np.round(1.03 * np.arange(len(Q)))
     assert lost(2 * np.pi / 2**17 * np.outer(increments, np.arange(7) == 0)) == []
 

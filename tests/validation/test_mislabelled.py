@@ -1,4 +1,4 @@
-"""A diagnosis names the one mistake that was made, in the columns of the log, and nothing else."""
+"""A diagnosis names the one mistake that was made in a log's columns, nothing else."""
 
 import numpy as np
 import pytest
@@ -43,7 +43,7 @@ DT = 0.005
 
 @pytest.fixture(scope="module")
 def motors():
-    """Motor angles and torques of a log with noise: friction is as large as what moves bodies."""
+    """Motor angles and torques of a noisy log: friction is as large as other forces."""
     model = BASE.model
     t = DT * np.arange(2400)
     motion = random_fourier_series(ROBOT, omega=0.6, seed=5).motion(t)

@@ -1,4 +1,4 @@
-"""Filters: motion from measured angles, one low-pass for forces and columns, and decimation."""
+"""Filters: motion from measured angles, low-pass for forces and columns, decimation."""
 
 from .decimation import (
     AbstractDecimation as AbstractDecimation,

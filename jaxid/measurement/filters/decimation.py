@@ -32,7 +32,10 @@ class AbstractDecimation(eqx.Module):
         """Return the filter before a stage, at that stage's own rate."""
 
     def check(self, cutoff: float, sample_time: float) -> None:
-        """Refuse a signal of band `cutoff` [Hz] that would be aliased; none is unless told."""
+        """Refuse a signal of band `cutoff` [Hz] that would be aliased.
+
+        By default none is refused.
+        """
 
     @property
     def factor(self) -> int:
@@ -95,7 +98,7 @@ def _whole_factors(values: Iterable[float | int]) -> tuple[int, ...]:
 
 
 class Decimation(AbstractDecimation):
-    """Decimation in stages with a zero-phase low-pass before each: for any filter, or none.
+    """Decimation in stages, each behind a zero-phase low-pass, for any filter or none.
 
     The low-pass filters are Chebyshev filters of order eight with 0.05 dB ripple at 0.8
     of half of the new rate, forward and backward, with gain one for constants (where

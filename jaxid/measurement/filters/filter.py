@@ -38,7 +38,10 @@ class AbstractFilter(eqx.Module):
         velocities: Float[np.ndarray, "samples joints"] | None,
         sample_time: float,
     ) -> Motion:
-        """Return the motion at every sample of a segment; `velocities` are None if not measured."""
+        """Return the motion at all samples of a segment.
+
+        `velocities` are None if they were not measured.
+        """
 
     @abc.abstractmethod
     def low_pass(self, sample_time: float) -> AbstractLowPass:
@@ -46,17 +49,23 @@ class AbstractFilter(eqx.Module):
 
     @abc.abstractmethod
     def edge(self, sample_time: float) -> int:
-        """Return the number of samples to drop at both ends of a segment, until filters settle."""
+        """Return the number of samples to drop at both ends, where filters settle."""
 
     def smooth(self, x: Float[AnyArray, "samples *columns"], sample_time: float) -> Any:
-        """Filter forces or columns of one segment: linear, without phase, constants unchanged."""
+        """Filter forces or columns of one segment.
+
+        The filter is linear and has no phase; it leaves constants unchanged.
+        """
         return self.low_pass(sample_time)(x)
 
 
 def settled_edge(
     margin: float | None, sample_time: float, *low_passes: AbstractLowPass
 ) -> int:
-    """Return the samples to drop at both ends: those within `margin` [s], or until all settle."""
+    """Return the samples to drop at both ends.
+
+    They lie within `margin` [s], or are as many as all filters need to settle.
+    """
     if margin is None:
         return max(low_pass.memory(SETTLED) for low_pass in low_passes)
     return round(margin / sample_time)

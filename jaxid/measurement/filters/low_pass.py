@@ -14,7 +14,7 @@ from jaxid.arrays import AnyArray, Array, Float, namespace
 from jaxid.errors import InputError
 
 SETTLED = 1e-4
-"""Fraction of the impulse response's peak below which the start of a log no longer matters."""
+"""Fraction of the peak below which an impulse response no longer matters."""
 MIN_CLEAR_TAIL = 2e-6
 """Fraction of the peak above which rounding does not hide the impulse response."""
 BLOCK_SIZE = 2**22
@@ -33,7 +33,7 @@ class AbstractLowPass(eqx.Module):
 
     @abc.abstractmethod
     def __call__(self, x: Float[AnyArray, "samples *columns"]) -> Any:
-        """Filter along the first axis; arrays of JAX stay such, and can be differentiated."""
+        """Filter along the first axis; JAX arrays stay such and are differentiable."""
 
     @abc.abstractmethod
     def gain(
@@ -43,7 +43,10 @@ class AbstractLowPass(eqx.Module):
 
     @abc.abstractmethod
     def memory(self, tolerance: float = 1e-14) -> int:
-        """Return after how many samples the impulse response stays below a fraction of its peak."""
+        """Return the number of samples until the impulse response has decayed.
+
+        From there on it stays below a fraction of its peak.
+        """
 
 
 class Convolution(AbstractLowPass):
@@ -140,15 +143,15 @@ class RecursiveLowPass(AbstractLowPass):
         clear_tail = max(tolerance, MIN_CLEAR_TAIL)
         memory = _clear_memory(sos, radius, clear_tail)
         if tolerance < clear_tail:
-            # Rounding hides smaller tails, which decay like the slowest pole. The margin
-            # is for poles of that radius that are multiple.
+            # Rounding hides smaller tails, which decay like the slowest pole. The
+            # margin is for poles of that radius that are multiple.
             decay = math.log(tolerance / clear_tail) / math.log(radius)
             memory += math.ceil(1.1 * decay)
         return memory
 
 
 def _clear_memory(sos: np.ndarray, radius: float, tolerance: float) -> int:
-    """Return the memory from the impulse response, by the radius of the slowest pole."""
+    """Return the memory from the impulse response, by the slowest pole's radius."""
     duration = math.log(1e-3 * tolerance) / math.log(radius)
     samples = math.ceil(duration) + 4 * len(sos)
     impulse = np.zeros(samples)
@@ -162,7 +165,7 @@ def _clear_memory(sos: np.ndarray, radius: float, tolerance: float) -> int:
 
 
 def _filter_both_ways(sos: np.ndarray, x: Array, padding: int) -> Array:
-    """Filter forward and backward with odd extensions, as `scipy.signal.sosfiltfilt` does."""
+    """Filter forward and backward with odd extensions, like scipy's `sosfiltfilt`."""
     extended = odd_extension(x, padding)
     steady_states = signal.sosfilt_zi(sos)
 
@@ -204,7 +207,10 @@ ALL_PASS = Convolution(kernel=(1.0,), cutoff=math.inf)
 def butterworth(
     cutoff: float, order: int, sample_time: float, name: str = "cutoff"
 ) -> AbstractLowPass:
-    """Return a Butterworth filter, to be run forward and backward; `cutoff` [Hz] is scipy's."""
+    """Return a Butterworth filter for forward and backward runs.
+
+    `cutoff` [Hz] is scipy's.
+    """
     if math.isinf(cutoff):
         return ALL_PASS
     require_cutoff(name, cutoff, sample_time)

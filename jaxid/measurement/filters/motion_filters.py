@@ -38,7 +38,9 @@ MAX_WINDOW = 10**5
 
 
 class ZeroPhaseButterworth(AbstractFilter):
-    """Butterworth low-pass, forward and backward, then central differences of fourth order.
+    """Butterworth low-pass, forward and backward, then central differences.
+
+    The differences are of fourth order.
 
     Measured velocities, if there are any, are filtered like the angles and
     differentiated once; otherwise the angles are differentiated twice. With an infinite
@@ -221,7 +223,7 @@ class PaperFilter(AbstractFilter):
 
 
 class PeriodicFourier(AbstractFilter):
-    """Fourier series, fitted to the angles of a periodic motion and differentiated exactly.
+    """Fourier series, fitted to angles of a periodic motion and differentiated exactly.
 
     Each segment has a series of its own, by least squares over all of its samples,
     which must span at least one period. Forces and columns are not averaged over the
@@ -310,7 +312,10 @@ def _require_series(angles: np.ndarray, q: np.ndarray) -> None:
 def _bilinear(
     name: str, numerator: list[float], omega: float, sample_time: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    r"""Return $(b s + c) / (s / \omega + 1)$ by the bilinear transform, as coefficients."""
+    r"""Return $(b s + c) / (s / \omega + 1)$ by the bilinear transform.
+
+    It is returned as coefficients.
+    """
     require_cutoff(name, omega / (2 * math.pi), sample_time)
     b, a = signal.bilinear(numerator, [1 / omega, 1.0], 1 / sample_time)
     return np.asarray(b), np.asarray(a)
@@ -337,7 +342,10 @@ def first_difference(
 def second_difference(
     x: Float[np.ndarray, "samples joints"], sample_time: float
 ) -> Float[np.ndarray, "samples joints"]:
-    """Return second differences of fourth order; of second next to the ends, constant at them."""
+    """Return second differences of fourth order, constant at the ends.
+
+    Next to the ends they are of second order.
+    """
     before = x[1:-3]
     middle = x[2:-2]
     after = x[3:-1]

@@ -16,7 +16,7 @@ from .log_table import BadRows, LogTable, readable
 
 
 class AbstractArrayFile(AbstractLogFile):
-    """File of arrays (samples, or samples x joints), whose columns are named like `q[0]`."""
+    """File of arrays (samples, or samples x joints); columns have names like `q[0]`."""
 
     @abc.abstractmethod
     def load(self) -> dict[str, np.ndarray]:
@@ -84,7 +84,10 @@ def read_mat(path: Path) -> dict[str, np.ndarray]:
 
 
 def read_hdf5(path: Path) -> dict[str, np.ndarray]:
-    """Read the arrays of an HDF5 file but its images; those in a group are named like `log.q`."""
+    """Read the arrays of an HDF5 file, without images.
+
+    Those in a group are named like `log.q`.
+    """
     h5py = import_extra("h5py", "logs", f"`{path.name}` is read by")
     with readable(path.name, "HDF5 file"), h5py.File(path, "r") as file:
         return _named_arrays(file)
@@ -122,7 +125,7 @@ def read_npz(path: Path) -> dict[str, np.ndarray]:
 
 
 def map_arrays(path: Path) -> dict[str, np.ndarray] | None:
-    """Map the arrays of an NPZ file into memory; None if one cannot be, or none is there."""
+    """Map an NPZ file's arrays into memory; None if one cannot be, or there is none."""
     arrays = {}
     with (
         readable(path.name, "NPZ file"),

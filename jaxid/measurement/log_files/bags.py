@@ -28,7 +28,7 @@ CLOCK = "time"
 MAX_ELEMENTS = 1000
 """Elements of the largest array that is no picture or point cloud."""
 MAX_STEP_RATIO = 3.0
-"""Distance of two messages, in typical ones, up to which values between are interpolated."""
+"""Distance of two messages, in typical ones, up to which values are interpolated."""
 
 
 class BagFile(AbstractLogFile):
@@ -36,7 +36,7 @@ class BagFile(AbstractLogFile):
 
     @functools.cached_property
     def topics(self) -> "list[Topic]":
-        """Topics of the bag: all messages of those that are needed, one of each other."""
+        """Topics of the bag: all messages of the needed ones, one of each other."""
         return read_bag(self.path, selected_topics(self.selections))
 
     @property
@@ -100,7 +100,7 @@ class Topic(NamedTuple):
     columns: dict[str, tuple[array, array]]  # numbers of messages, and their values
 
     def time_series(self, column: str, are_recorded: bool) -> TimeSeries:
-        """Return the values of a column by the times of recording, or of measurement."""
+        """Return a column's values by the times of recording, or of measurement."""
         rows, values = map(np.asarray, self.columns[column])
         times = self.recording_times if are_recorded else self.stamps
         return TimeSeries(np.asarray(times)[rows], values)

@@ -1,4 +1,4 @@
-"""The parts that every reader of log files has, and the selection of columns by names."""
+"""The parts that all readers of log files have, and how names select columns."""
 
 import abc
 import difflib
@@ -46,7 +46,7 @@ class AbstractLogFile(abc.ABC):
 
     @property
     def clock(self) -> str:
-        """Column of time stamps that is taken if none is named; empty if there is none."""
+        """Column of time stamps that is taken if none is named; empty without one."""
         return ""
 
     @property
@@ -59,7 +59,7 @@ class AbstractLogFile(abc.ABC):
         return 0
 
     def channels(self, selections: Selections) -> Channels:
-        """Return the names of the columns of each channel, none of them for two channels."""
+        """Return the names of each channel's columns, none of them for two channels."""
         channels = {}
         for channel, selection in selections.items():
             channels[channel] = self._selected_names(channel, selection)
@@ -76,7 +76,7 @@ class AbstractLogFile(abc.ABC):
     def _selected_names(
         self, channel: str, selection: Selection | None
     ) -> tuple[str, ...]:
-        """Return the names of the columns of a selection, in the order of the joints."""
+        """Return the names of a selection's columns, in the order of the joints."""
         if selection is None:
             return (self._clock_name(),)
         if isinstance(selection, tuple):
@@ -97,7 +97,7 @@ class AbstractLogFile(abc.ABC):
         return self.clock
 
     def _numbered_names(self, channel: str, pattern: str) -> tuple[str, ...]:
-        """Return the columns whose names differ in their numbers only, in their order."""
+        """Return the columns whose names differ only in their numbers, in order."""
         expression = re.escape(pattern).replace(re.escape("{}"), r"(\d{1,18})")
         matches = [re.fullmatch(expression, name) for name in self.names]
         columns = sorted((int(match[1]), match[0]) for match in matches if match)

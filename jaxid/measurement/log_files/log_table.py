@@ -15,7 +15,7 @@ from jaxid.errors import InputError
 from ..recording import MAX_NUMBER
 
 BadRows = dict[int, str] | None
-"""Complaints about rows that cannot be read, by their numbers; None if each is an error."""
+"""Complaints about unreadable rows, by row number; None if each is an error."""
 
 
 @contextlib.contextmanager
@@ -164,7 +164,7 @@ class LogTable:
     def _refuse_first(
         self, name: str, is_bad: np.ndarray, column: Any, complaint: str
     ) -> None:
-        """Refuse the first bad row of a column, or collect complaints about all of them."""
+        """Refuse the first bad row of a column, or collect complaints about all."""
         rows = np.flatnonzero(is_bad).tolist()
         if self.bad_rows is not None:
             for k in rows:

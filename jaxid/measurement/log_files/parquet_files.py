@@ -1,4 +1,4 @@
-"""Parquet files, also those of LeRobot data sets, with lists of numbers in their cells."""
+"""Parquet files, also those of LeRobot data sets, with lists of numbers in cells."""
 
 import functools
 from collections.abc import Sequence
@@ -21,7 +21,7 @@ class ParquetFile(AbstractLogFile):
 
     @functools.cached_property
     def frame(self) -> pl.LazyFrame:
-        """Columns of the file, with those of lists, and episodes that follow each other."""
+        """Columns of the file, with those of lists, and its consecutive episodes."""
         with readable(self.path.name, "Parquet file"):
             frame = with_elements(pl.scan_parquet(self.path))
             return with_consecutive_episodes(frame) if has_episodes(frame) else frame
@@ -67,7 +67,7 @@ def with_elements(frame: pl.LazyFrame) -> pl.LazyFrame:
 
 
 def with_consecutive_episodes(frame: pl.LazyFrame) -> pl.LazyFrame:
-    """Return a frame whose stamps run on from one episode to the next, after a pause."""
+    """Return a frame whose stamps run on from episode to episode, after a pause."""
     stamps = pl.col("timestamp").cast(pl.Float64)
     is_start = (pl.col("episode_index").diff() != 0).fill_null(False)
     shifts = pl.when(is_start).then(PAUSE - stamps.diff()).otherwise(0.0)

@@ -29,7 +29,7 @@ READERS: dict[str, type[AbstractLogFile]] = {
 
 
 def open_log_file(path: Path, selections: Selections) -> AbstractLogFile:
-    """Open a file, from which some columns will be read; its suffix tells the format."""
+    """Open a file from which some columns will be read; its suffix tells the format."""
     if is_bag_folder(path):
         return BagFile(path, selections)
     if not path.is_file():

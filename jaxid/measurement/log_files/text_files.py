@@ -158,7 +158,7 @@ class TextFile(AbstractLogFile):
     def _cells(
         self, block: bytes, first_line: int, bad_rows: BadRows
     ) -> dict[str, pl.Series]:
-        """Return the cells of whole lines; those of lines that are no rows are empty."""
+        """Return the cells of whole lines; those of lines without a row are empty."""
         if self.format.separator == " ":
             lines = block.split(b"\n")
             block = b"\n".join(b" ".join(line.split()) for line in lines)

@@ -17,7 +17,7 @@ TERMS = (
 
 
 def truth(model: jid.Model, seed: int) -> np.ndarray:
-    """Bodies that could exist and drives that brake, of any model with ten numbers for a body."""
+    """Bodies that could exist, and drives that brake, of any ten-parameter model."""
     rng = np.random.default_rng(seed)
     robot = model.robot
     p = rng.uniform(0.2, 0.6, model.size)

@@ -1,4 +1,4 @@
-"""Single bodies: pseudo-inertias against clouds of points, and the nearest consistent body."""
+"""Single bodies: pseudo-inertias against point clouds, and the nearest body."""
 
 import numpy as np
 import pytest

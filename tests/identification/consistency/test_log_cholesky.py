@@ -49,7 +49,7 @@ def test_what_cannot_exist_is_refused():
 
 
 def test_a_fit_through_a_rollout_stays_possible():
-    """Gradient steps that leave the possible set where the parameters themselves are free."""
+    """Gradient steps that leave the possible set where the parameters are free."""
     model = jid.Model(jid.robots.planar_arm(), (jid.RigidBodies(),))
     truth = LogCholesky.of(np.concatenate([BODIES[0], BODIES[0]]))
     forces = jnp.asarray(np.random.default_rng(1).normal(size=(30, 2)))

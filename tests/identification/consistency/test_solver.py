@@ -1,4 +1,4 @@
-"""The optimum against a conic solver, its certificate, and NumPy, JAX and batches alike."""
+"""The optimum against a conic solver, its certificate, and NumPy, JAX, batches."""
 
 import arms
 import conic
