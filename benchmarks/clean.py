@@ -1,16 +1,15 @@
 """Alarms on clean logs of many kinds of robots, and slips that are named.
 
     python benchmarks/clean.py [--quick] [--json FILE] [--robot six] [--log slow]
-    [--slip gain]
+        [--slip gain]
 
 Robots and logs: `closed_loop.py` (simulated by Pinocchio), each kind of log with two
 seeds. What `jaxid identify` and `jaxid inspect` say of a clean log is an alarm if it is
 a finding, a likely mistake, a doubt about a sign or about gravity, or advice on a delay
-that the log does not have.
-Slips: those of `spoilt.py` in ordinary logs, in the first, the middle and the last
-    joint. A slip is
-named if a finding, or a note on a delay, says what it is, alone or beside others of the
-same effect; it is hidden if a note says that these logs would not show it.
+that the log does not have. Slips: those of `spoilt.py` in ordinary logs, in the first,
+the middle and the last joint. A slip is named if a finding, or a note on a delay, says
+what it is, alone or beside others of the same effect; it is hidden if a note says that
+these logs would not show it.
 """
 
 import itertools

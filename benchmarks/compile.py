@@ -4,9 +4,8 @@
 
 Each figure is a process of its own: one without a cache, one that fills a cache in an
 empty folder, one that finds it there. The time runs from the definition in JAX to the
-function that can be
-called: tracing to a scalar program, lowering by XLA, compiling. Imports are not
-    counted.
+function that can be called: tracing to a scalar program, lowering by XLA, compiling.
+Imports are not counted.
 """
 
 import json

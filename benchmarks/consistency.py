@@ -1,7 +1,7 @@
 """Physically consistent fits: optima against a conic solver, proofs, times, definiteness.
 
     python benchmarks/consistency.py [--quick] [--only optimum proofs stress times
-    weights]
+        weights]
 
 * `optimum`: the objective against CLARABEL's (through cvxpy, tolerances 1e-9; the same
   problem as written in `references/conic.py`). Data: whole logs of TX40, UR10, KR300,
@@ -11,8 +11,7 @@
   difference over max(objective, rows / 2).
 * `proofs`: 1000 simulated fits of these arms, noise uniform from 0 to 20 %, compiled.
   Statistics: fits whose error bound stays above 2.5e-7 of objective + rows / 2,
-      iterations, and the smallest
-  eigenvalue of M over 2000 random poses of every fit.
+  iterations, and the smallest eigenvalue of M over 2000 random poses of every fit.
 * `stress`: 400 more in NumPy: in turn bounds divided by 100, bounds times 100, ten
   samples, 100 % noise, and bounds that exclude the truth.
 * `times`: Panda, 98 parameters, 5 % noise: one warm compiled fit against the time that

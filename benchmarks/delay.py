@@ -3,11 +3,10 @@
     python benchmarks/delay.py [--quick] [--json FILE] [--draws 50] [--robot scara ...]
 
 Logs: `closed_loop.py`, 10 s at 1 kHz; the forces are shifted by 0, 3 and 10 ms. With
-    and without
-friction; disturbances that move the robot: none, or 3 % of the RMS force below 5 Hz.
-The model has the right law of friction; a zero-phase Butterworth filter at 10 Hz, every
-25th row. The delay is estimated once by the measured motion alone, once with the
-commanded one.
+and without friction; disturbances that move the robot: none, or 3 % of the RMS force
+below 5 Hz. The model has the right law of friction; a zero-phase Butterworth filter at
+10 Hz, every 25th row. The delay is estimated once by the measured motion alone, once
+with the commanded one.
 
 Covered is a draw whose 95 % interval holds the truth; random, one whose interval
 without the resolution of a tenth of a sample does. A delay is told if the interval of

@@ -3,13 +3,12 @@
     python benchmarks/excitation.py [PART ...] [--quick] [--keys 3] ...
 
 Robot: rail + TX90L, rigid bodies (seven parameters each: 44 base parameters; ten: 57),
-    viscous and
-Coulomb friction, rotors; joint limits of `jid.robots.tx90l_on_rail()`. Five harmonics
-at 0.8 rad/s, 800 samples of one period without its end point, noise 1 % of the largest
-forces, 32 starts. The violation is the largest relative excess of position, velocity
-and acceleration on 8000 points. The gain of a motion is the geometric mean, over the
-parameters, of the standard deviations of weighted least squares in a random motion over
-those in this motion, and of that the mean over 15 random motions
+viscous and Coulomb friction, rotors; joint limits of `jid.robots.tx90l_on_rail()`. Five
+harmonics at 0.8 rad/s, 800 samples of one period without its end point, noise 1 % of
+the largest forces, 32 starts. The violation is the largest relative excess of position,
+velocity and acceleration on 8000 points. The gain of a motion is the geometric mean,
+over the parameters, of the standard deviations of weighted least squares in a random
+motion over those in this motion, and of that the mean over 15 random motions
 (`random_fourier_series`, seeds 0 to 14, at full reach).
 
 * cond: condition number of the unweighted information (Eq. 36). d7, d10: D-optimal

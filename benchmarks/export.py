@@ -3,11 +3,10 @@
     python benchmarks/export.py [--quick] [--model NAME ...] [--table NAME ...]
 
 Models: bodies only, so that peers do the same work; with viscous and Coulomb friction
-    and rotors;
-the TX90L with seven parameters for each body (44 base parameters) and with ten (57);
-the TX40 with its coupled wrist. Parameters: uniform random numbers (seed 0), of which
-base parameters are made; times do not depend on them. `--quick`: a planar arm alone:
-does it still run, and agree?
+and rotors; the TX90L with seven parameters for each body (44 base parameters) and with
+ten (57); the TX40 with its coupled wrist. Parameters: uniform random numbers (seed 0),
+of which base parameters are made; times do not depend on them. `--quick`: a planar arm
+alone: does it still run, and agree?
 
 `times`: Eq. 39 factored (the recursion on base parameters that `export_c` writes); Eq.
 39 literally as regressor times parameters; Eq. 38 as M qdd + h with M by composite

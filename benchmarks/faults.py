@@ -1,33 +1,29 @@
 """Damaged files, SIGKILL at random moments, and long use in one process.
 
     python benchmarks/faults.py [fuzz kill interrupt soak] [--quick] [--minutes 8]
-    [--json FILE]
+        [--json FILE]
 
 The files are those of `jaxid example`, the random numbers seeded.
 
 fuzz: a log (CSV, NPZ, Parquet), an experiment file, a URDF and a model file are damaged
-    at random
-(bytes changed, inserted, removed, cut off, words replaced) and read again. Right is a
-result, or an `InputError` or `OSError`; any other exception or a warning counts as a
-crash.
+at random (bytes changed, inserted, removed, cut off, words replaced) and read again.
+Right is a result, or an `InputError` or `OSError`; any other exception or a warning
+counts as a crash.
 
 kill: `jaxid identify` writes into the folder of an earlier report and gets SIGKILL at a
-    random
-moment of the time that it takes undisturbed. Right is: every file equals that of one of
-the two reports, `result.json` is absent or all files belong to it, and the same command
-then ends well.
+random moment of the time that it takes undisturbed. Right is: every file equals that of
+one of the two reports, `result.json` is absent or all files belong to it, and the same
+command then ends well.
 
 interrupt: each command gets SIGINT, every fifth time SIGTERM, at a random moment
-    between 60 ms (in
-which Python itself starts) and its undisturbed end, or 20 s. Right is: it ends within 2
-s with 130 or 143 and one sentence, or as if nothing had come; no traceback; no
-temporary file is left. Signals that end Python itself before it has read the package
-are counted apart.
+between 60 ms (in which Python itself starts) and its undisturbed end, or 20 s. Right
+is: it ends within 2 s with 130 or 143 and one sentence, or as if nothing had come; no
+traceback; no temporary file is left. Signals that end Python itself before it has read
+the package are counted apart.
 
 soak: logs are identified, batches fitted and motions designed for robots that change
-    every round.
-Printed: resident memory after the first sixth of the time and at the end, and open
-    files.
+every round. Printed: resident memory after the first sixth of the time and at the end,
+and open files.
 """
 
 import contextlib

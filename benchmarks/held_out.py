@@ -1,29 +1,26 @@
 """Held-out errors of estimators and friction models on two measured robots.
 
 Data: the logs of the Stäubli TX40 and the Universal Robots UR10 in `../shared/data`,
-    prepared as
-the experiment files `tests/real_data/tx40.toml` (20 Hz, every 50th row) and `ur10.toml`
-(4 Hz) say, divided in time: the first 60 % of the rows to identify with, the rest to
-verify with.
+prepared as the experiment files `tests/real_data/tx40.toml` (20 Hz, every 50th row) and
+`ur10.toml` (4 Hz) say, divided in time: the first 60 % of the rows to identify with,
+the rest to verify with.
 
 Model: rigid bodies with ten parameters each, rotor inertias, viscous and Coulomb
-    friction (smooth
-sign, epsilon 0.01 rad/s), offsets, and on the TX40 the coupled wrist. The row
-"epsilons" finds one epsilon for each joint, the row "Stribeck" has Stribeck's law and
-finds its speeds too; each is the linear model where held-out blocks *of the
+friction (smooth sign, epsilon 0.01 rad/s), offsets, and on the TX40 the coupled wrist.
+The row "epsilons" finds one epsilon for each joint, the row "Stribeck" has Stribeck's
+law and finds its speeds too; each is the linear model where held-out blocks *of the
 identification part* say that it does not pay (last column). The row "essential" leaves
 out base parameters by held-out blocks of the same part.
 
 Statistics: "weighted" is the RMS error in percent of the largest forces, root mean
-    square of the
-joints: what weighted least squares minimise. "relative" is the norm of all errors over
-    the norm of
-all forces. "moving" is the weighted error of the rows of the rest in which some joint
-moves: the TX40 stands still at the end. "of WLS" compares with weighted least squares.
+square of the joints: what weighted least squares minimise. "relative" is the norm of
+all errors over the norm of all forces. "moving" is the weighted error of the rows of
+the rest in which some joint moves: the TX40 stands still at the end. "of WLS" compares
+with weighted least squares.
 
-    python benchmarks/held_out.py            # both robots, all rows; or one:
-    `held_out.py ur10` python benchmarks/held_out.py --quick    # the UR10, without the
-    rows that search
+    python benchmarks/held_out.py            # both robots, all rows
+    python benchmarks/held_out.py ur10       # one of them
+    python benchmarks/held_out.py --quick    # the UR10, without the rows that search
 """
 
 import jax

@@ -4,10 +4,9 @@
         [--robot xarm7 ...]
 
 Motion: `closed_loop.py`, 10 s at 1 kHz, exact angles. In each draw the angles are
-    rounded to 12, 14
-or 17 bits per turn with other zeros of the encoders, and white noise of 1 % of the RMS
-force is added. Zero-phase Butterworth filter (10 Hz, every 25th row), weights from the
-RMS forces.
+rounded to 12, 14 or 17 bits per turn with other zeros of the encoders, and white noise
+of 1 % of the RMS force is added. Zero-phase Butterworth filter (10 Hz, every 25th row),
+weights from the RMS forces.
 
 The share of exact angles stands beside: what is missing there is not the encoders' (the
 filter of the motion shifts estimates too). Needed is a warning where the bias of some

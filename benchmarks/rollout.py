@@ -1,28 +1,25 @@
 """Rollouts: identification from commands and encoders, without torques.
 
-so101: the SO-101's log (needs ../shared/data), identified on four motions, free-running
-    on six
-others, beside the linear joint and the copied command; joints 1 to 5 [mrad]; time with
-compiling.
-pendulum: the double pendulum's four logs, ends of windows of 0.1 and 0.2 s on two
-    others, beside
-the authors' models with their own friction, cf arctan(100 v), and the same torques, and
-beside other methods; the same on the four logs, each left out in turn, and on those of
-the fit.
-coverage: a simulated servo arm of six axes on MuJoCo, 50 Hz, 12 bits; the truth lies in
-    so many of
-the 95 % intervals; with Stribeck friction that the model leaves out, in how many draws
-it warns.
-gains: the same arm with servos of 1 and 1.6 times the gain.
-confounded: one joint whose logs tell damping and delay, or armature and gain, only
-    together.
-quadruped: twelve hung joints on MuJoCo, 30 s at 200 Hz: time, compiled before.
-band: one hundred posterior models on MuJoCo; fraction of a held-out motion within their
-    band.
-sysid: the SO-101's joint 2, and joints 1 to 5, identified by mujoco.sysid; fifteen
-    minutes.
-evolution: the same joint by CMA-ES with the simulator of this package, given the same
-    CPU time.
+* so101: the SO-101's log (needs ../shared/data), identified on four motions,
+  free-running on six others, beside the linear joint and the copied command; joints 1
+  to 5 [mrad]; time with compiling.
+* pendulum: the double pendulum's four logs, ends of windows of 0.1 and 0.2 s on two
+  others, beside the authors' models with their own friction, cf arctan(100 v), and the
+  same torques, and beside other methods; the same on the four logs, each left out in
+  turn, and on those of the fit.
+* coverage: a simulated servo arm of six axes on MuJoCo, 50 Hz, 12 bits; the truth lies
+  in so many of the 95 % intervals; with Stribeck friction that the model leaves out, in
+  how many draws it warns.
+* gains: the same arm with servos of 1 and 1.6 times the gain.
+* confounded: one joint whose logs tell damping and delay, or armature and gain, only
+  together.
+* quadruped: twelve hung joints on MuJoCo, 30 s at 200 Hz: time, compiled before.
+* band: one hundred posterior models on MuJoCo; fraction of a held-out motion within
+  their band.
+* sysid: the SO-101's joint 2, and joints 1 to 5, identified by mujoco.sysid; fifteen
+  minutes.
+* evolution: the same joint by CMA-ES with the simulator of this package, given the same
+  CPU time.
 
     python benchmarks/rollout.py so101 pendulum coverage gains confounded quadruped band
     python benchmarks/rollout.py --quick

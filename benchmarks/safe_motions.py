@@ -1,7 +1,7 @@
 """Designs for five arms by the command with its default settings, judged by MuJoCo.
 
     python benchmarks/safe_motions.py [panda ur5 xarm7 z1 kinova] [--time 60] [--more
-    240] [--quick]
+        240] [--quick]
 
 The descriptions are those of the package `example-robot-data`, two of them with a
 gripper. For each arm `jaxid init ARM.URDF` and `jaxid excite --time 60` run as a user

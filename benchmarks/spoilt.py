@@ -1,7 +1,7 @@
 """Logs and descriptions with one mistake each, and what `jaxid identify` says of them.
 
     python benchmarks/spoilt.py [--quick] [--json FILE] [--robot six] [--kind sign]
-    [--show]
+        [--show]
 
 Robots and logs: `closed_loop.py` (simulated by Pinocchio). Each robot moves for 10 s
 under control; measured are angles (17 bits), velocities and forces (0.3 % white noise).
@@ -10,11 +10,10 @@ several joints and amounts. The experiment file is that of `jaxid init`, the log
 split at 60 %.
 
 Counted: cases without any `!` or ✗ in the verdict, although the model misses more than
-    `MATTERS` of
-some joint's RMS force (or of 1 % of its largest force, if that is more) and half more
-than in the robot's good log, or is wrong by construction of the log (lost rows, held
-channels); sentences that name another mistake than the one that was made (wrong cures);
-verdicts of good logs that are not good.
+`MATTERS` of some joint's RMS force (or of 1 % of its largest force, if that is more)
+and half more than in the robot's good log, or is wrong by construction of the log (lost
+rows, held channels); sentences that name another mistake than the one that was made
+(wrong cures); verdicts of good logs that are not good.
 """
 
 import contextlib

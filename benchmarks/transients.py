@@ -1,7 +1,7 @@
 """Coverage of 95 % intervals on logs with transients, from robots of many kinds.
 
     python benchmarks/transients.py [--quick] [--seeds 11 12] [--robot scara four]
-    [--json FILE]
+        [--json FILE]
 
 Robots and logs: `closed_loop.py` (simulated by Pinocchio, 17-bit encoders, force noise
 of 0.3 %). The model is that of the simulation, the filter 10 Hz, all else by default.

@@ -3,14 +3,13 @@
     python benchmarks/virtual_robot.py [--quick]
 
 Robot: the TX90L on its rail, cold, with seven parameters for each body, viscous and
-    Coulomb
-friction and rotors: 70 columns, 44 base parameters, the published ones as published.
-Motion: random Fourier series of 0.8 rad/s with five harmonics that use 50 % of the
-    limits; seed 1 to identify
-with, seed 3 to verify with; one period (7.85 s; 3 s with --quick) each. Servo: 1 kHz, 8
-Hz, the true model fed forward. Sensors: encoders of 17 bits on the motors, noise of the
-torques of 1 % of the largest (seeds 1 and 3). Filter: zero-phase Butterworth at 15 Hz,
-columns too, 50 rows/s; weighted with the largest forces; intervals of 95 %.
+Coulomb friction and rotors: 70 columns, 44 base parameters, the published ones as
+published. Motion: random Fourier series of 0.8 rad/s with five harmonics that use 50 %
+of the limits; seed 1 to identify with, seed 3 to verify with; one period (7.85 s; 3 s
+with --quick) each. Servo: 1 kHz, 8 Hz, the true model fed forward. Sensors: encoders of
+17 bits on the motors, noise of the torques of 1 % of the largest (seeds 1 and 3).
+Filter: zero-phase Butterworth at 15 Hz, columns too, 50 rows/s; weighted with the
+largest forces; intervals of 95 %.
 
 Table 1: forces by our inverse dynamics less those of MuJoCo along the same motion,
 largest difference over the largest force of each joint (no dry friction); then RMS
@@ -21,9 +20,8 @@ ours here a tanh of 0.01 rad/s.
 Table 2: base parameters identified from the logs of MuJoCo, of our robot as its model
 has it (`undisturbed`), and of our robot with stiction, Stribeck friction and torque
 ripple: intervals that hold the truth in this one draw of the noise, mean torque error
-    (Eq. 37) by axis against the log, in
-percent of the largest force, and RMS error against the noise-free torques of the
-verification motion.
+(Eq. 37) by axis against the log, in percent of the largest force, and RMS error against
+the noise-free torques of the verification motion.
 
 Table 3: intervals of 95 % over 40 draws of the noise (2 with --quick; seeds 0, 1, ...):
 of the identification motion followed exactly (`measure`), and by the servo (`track`,
