@@ -20,7 +20,7 @@ EPSILON = 0.01
 
 
 def motions(datasets, samples, joints):
-    """Return Fourier series of five harmonics, with other coefficients for each data set."""
+    """Return Fourier series of five harmonics, different for each data set."""
     import numpy as np
 
     import jaxid as jid
@@ -54,7 +54,7 @@ def by_evaluation(base):
 
 
 def by_pinocchio(base):
-    """Return the rows of Pinocchio, sample by sample, with friction columns beside them."""
+    """Return the rows of Pinocchio, sample by sample, and columns of friction."""
     import numpy as np
     import pinocchio as pin
     from pinocchio_loop import Bodies, in_our_order, pinocchio_model

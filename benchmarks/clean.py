@@ -104,7 +104,7 @@ def recorded(robot, file, log, seed, folder):
 
 
 def said(cases, folder):
-    """Return the verdict, what `jaxid identify` marks, findings of `jaxid inspect`, and notes."""
+    """Return the verdict, marked remarks, findings of `jaxid inspect`, and notes."""
     import jaxid as jid
 
     remarks, report, _ = spoilt.judged(cases, folder)
@@ -120,7 +120,7 @@ def said(cases, folder):
 
 
 def is_alarm(text, log):
-    """Return whether a sentence would send a user to look for a mistake that is not there."""
+    """Return whether a sentence reports a mistake that is not there."""
     if "effect is not in the model" in text or "effect of" in text:
         return "sign" in text
     if log == "Stribeck" and "friction seems to have another shape" in text:

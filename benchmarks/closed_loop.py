@@ -14,8 +14,10 @@ import pinocchio as pin
 from scipy import signal
 
 LINK = """<link name="{name}"><inertial><origin xyz="{x} {y} {z}"/><mass value="{m}"/>
-<inertia ixx="{a}" ixy="0.001" ixz="0" iyy="{b}" iyz="0.002" izz="{c}"/></inertial></link>"""
-JOINT = """<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>
+<inertia ixx="{a}" ixy="0.001" ixz="0" iyy="{b}" iyz="0.002" izz="{c}"/>
+</inertial></link>"""
+JOINT = """<joint name="{name}" type="{kind}">
+<parent link="{parent}"/><child link="{child}"/>
 <origin xyz="{xyz}"/><axis xyz="{axis}"/>
 <limit lower="{low}" upper="{high}" effort="{effort}" velocity="{speed}"/></joint>"""
 KINDS = {
@@ -98,8 +100,7 @@ def robots(folder):
     files = {name: Path(folder) / f"{name}.urdf" for name in KINDS}
     for name, joints in KINDS.items():
         files[name].write_text(_urdf(name, joints, [0.0] * len(joints)))
-        # Motors that are five times as strong as an ideal motion needs: friction needs
-        # more.
+        # Motors are five times as strong as an ideal motion needs, for friction.
         model = pin.buildModelFromUrdf(str(files[name]))
         _, forces, _ = _ideal(model, *reference(model, 10.0, 0.01, 0))
         files[name].write_text(_urdf(name, joints, 5 * np.abs(forces).max(axis=0)))

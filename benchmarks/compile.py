@@ -1,4 +1,4 @@
-"""Compile times, apart from run times: cold, and from JAX's persistent compilation cache.
+"""Compile times: cold, and from JAX's persistent compilation cache.
 
     python benchmarks/compile.py [--quick] [--json FILE]
 
@@ -25,7 +25,7 @@ LIMITS = {"regressor": 5.0, "design": 10.0}
 
 
 def regressor_function():
-    """Return the packed regressor of a seven-joint arm with friction and rotors (row 6a)."""
+    """Return the packed regressor of seven joints with friction and rotors (row 6a)."""
     import jax
     import jax.numpy as jnp
 
@@ -37,7 +37,7 @@ def regressor_function():
 
 
 def design_function():
-    """Return the D-optimality of a Fourier motion with its gradient, 800 samples (row 6c)."""
+    """Return the D-optimality of 800 samples with its gradient (row 6c)."""
     import jax
 
     import jaxid as jid
@@ -105,7 +105,7 @@ def words(times):
 
 
 def main():
-    """Measure cold and cached compile times, and the run time of a design's criterion."""
+    """Measure compile times, cold and cached, and the run time of a criterion."""
     parser = timing.parser(__doc__, "only the regressor")
     parser.add_argument("--work", choices=WHAT, help="one process: prints its times")
     parser.add_argument(

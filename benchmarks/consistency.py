@@ -1,4 +1,4 @@
-"""Physically consistent fits: optima against a conic solver, proofs, times, definiteness.
+"""Physically consistent fits: optima of a conic solver, proofs, times, definiteness.
 
     python benchmarks/consistency.py [--quick] [--only optimum proofs stress times
         weights]
@@ -121,7 +121,7 @@ class Arm:
         return R[:, :-1], R[:, -1], len(rows)
 
     def stressed(self, trial):
-        """Return a data set and an estimator that make a fit hard, in one of five ways."""
+        """Return a data set and an estimator of a hard fit, in one of five ways."""
         import numpy as np
 
         import jaxid as jid
@@ -211,7 +211,7 @@ def optimum(arms, quick):
 
 
 def inertias(arm, poses):
-    """Return what each base parameter adds to the mass matrices of some random poses."""
+    """Return the part of each base parameter in mass matrices of random poses."""
     import jax
     import numpy as np
 
@@ -226,7 +226,7 @@ def inertias(arm, poses):
 
 
 def proofs(arms, quick):
-    """Count fits without proof and iterations, and find eigenvalues of the mass matrix."""
+    """Count fits without proof and iterations; find the mass matrix's eigenvalues."""
     import numpy as np
 
     import jaxid as jid
@@ -332,8 +332,7 @@ def times(arms, quick):
         problem.solve("CLARABEL")
         return problem.solver_stats.solve_time
 
-    # A turn takes all data sets with one solver, then with the next, so that each runs
-    # warm.
+    # A turn takes all data sets with one solver, then with the next: each runs warm.
     ways = (
         [partial(timed, solve_compiled, one) for one in programs],
         [partial(timed, solve, *factor) for factor in factors[:count]],

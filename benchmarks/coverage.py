@@ -154,7 +154,7 @@ class Study:
 
 
 def coverage(study, memory, draws, seed):
-    """Return fractions of draws whose intervals hold the truth, and seconds for a fit."""
+    """Return shares of draws whose intervals hold the truth, and seconds per fit."""
     import numpy as np
     from scipy import special
 

@@ -35,7 +35,7 @@ def shifted(forces, seconds, dt):
 
 
 def study(robot, file, friction, disturbance, draws):
-    """Return for each delay, without and with commands: covered, random, told, false."""
+    """Return covered, random, told, false: by delay, without and with commands."""
     import jaxid as jid
 
     arm = jid.load_urdf(file)

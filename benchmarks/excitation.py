@@ -54,7 +54,7 @@ MARGIN, DISTANCE = 0.1, 0.03
 
 
 def base_of(principal_axes, payload=False):
-    """Return the base parameters of the TX90L on its rail: 44 with principal axes, else 57."""
+    """Return the TX90L's base parameters: 44 with principal axes, else 57."""
     robot = jid.robots.tx90l_on_rail()
     robot = robot.with_tool(**PAYLOAD) if payload else robot
     friction = (jid.ViscousFriction(), jid.CoulombFriction(), jid.RotorInertia())
@@ -138,7 +138,7 @@ def condition(plan):
 
 
 def design(name, base, figures, keys, options, **settings):
-    """Design a motion for each key, and print its figures and the median and best of all."""
+    """Design a motion for each key; print its figures, and the median and best."""
     found = []
     settings = {"starts": options.starts, "generations": options.generations} | settings
     if options.quick:

@@ -82,7 +82,8 @@ static double now(void)
     clock_gettime(CLOCK_MONOTONIC, &t);
     return t.tv_sec * 1e9 + t.tv_nsec;
 }
-void many(form *f, long calls, int n, const double *q, const double *qd, const double *qdd,
+void many(form *f, long calls, int n,
+          const double *q, const double *qd, const double *qdd,
           double *tau)
 {
     long k;
@@ -91,7 +92,8 @@ void many(form *f, long calls, int n, const double *q, const double *qd, const d
         f(q + row, qd + row, qdd + row, tau + row);
     }
 }
-void each(form *f, long calls, int n, const double *q, const double *qd, const double *qdd,
+void each(form *f, long calls, int n,
+          const double *q, const double *qd, const double *qdd,
           double *tau, double *took)
 {
     long k;
@@ -185,7 +187,7 @@ def build(found, flags):
 
 
 def compiled(text, flags):
-    """Compile C code as a library, or take that of an earlier run with the same code."""
+    """Compile C code as a library, or take the one of an earlier run."""
     command = ["gcc", "-std=c99", "-w", *flags, "-shared", "-fPIC"]
     key = hashlib.sha256((text + " ".join(command)).encode()).hexdigest()[:16]
     target = Path(tempfile.gettempdir()) / f"jaxid-export-{key}.so"
@@ -280,7 +282,7 @@ def call(opened, function, calls, states, out):
 
 
 def peers(robot, states):
-    """Return Pinocchio's rnea in C++ and CasADi's code of it: work, calls in it, operations."""
+    """Return Pinocchio's rnea in C++ and CasADi's code: work, calls, operations."""
     found = {}
     try:
         import pinocchio_loop

@@ -46,7 +46,8 @@ from timing import Row, hand_over
 
 URDF = """<robot name="r"><link name="a"/><link name="b"><inertial>
 <origin xyz="0 0 .1" rpy="0 0 0"/>
-<mass value="2"/><inertia ixx=".1" ixy="0" ixz="0" iyy=".1" iyz="0" izz=".1"/></inertial></link>
+<mass value="2"/><inertia ixx=".1" ixy="0" ixz="0" iyy=".1" iyz="0" izz=".1"/>
+</inertial></link>
 <link name="c"/><joint name="j" type="revolute"><parent link="a"/><child link="b"/>
 <origin xyz="0 0 .3" rpy="0 1.5708 0"/><axis xyz="0 0 1"/>
 <limit lower="-2" upper="2" effort="50" velocity="3"/></joint>
@@ -350,7 +351,7 @@ def round_of_jobs(seed):
 
 
 def soak(folder, minutes, quick):
-    """Repeat jobs of changing robots and compare memory at the beginning and the end."""
+    """Repeat jobs of changing robots; compare memory at the beginning and the end."""
     begun, rounds, early = time.monotonic(), 0, None
     length = 60.0 * minutes
     while rounds < 2 or (not quick and time.monotonic() - begun < length):

@@ -43,7 +43,7 @@ def inertia_operator(w):
 
 
 def accelerations(q, qd, qdd):
-    """Return acceleration less gravity, angular velocity and acceleration of each body."""
+    """Return each body's acceleration less gravity, angular velocity, acceleration."""
     a, w, wd, z = jnp.array([0.0, 0.0, 9.81]), jnp.zeros(3), jnp.zeros(3), np.eye(3)[2]
     bodies = []
     for k in range(JOINTS):
@@ -90,7 +90,7 @@ def compiled(lowered, inputs):
 
 
 def measure(samples, turns):
-    """Return times for each sample [ns] of all turns and compile times [s], without and with."""
+    """Return times per sample [ns] and compile times [s], without and with."""
     program = jid.program.trace(regressor, (JOINTS,), (JOINTS,), (JOINTS,))
     generator = np.random.default_rng(0)
     inputs = [jnp.asarray(x) for x in generator.uniform(-1, 1, (3, JOINTS, samples))]

@@ -1,4 +1,4 @@
-"""Friction: what `jaxid choose` finds on measured robots, and laws whose truth is known.
+"""Friction: choices of `jaxid choose` on measured robots, and laws with known truth.
 
 Measured robots (`../shared/data`): the first 60 % of the logs of TX40 and UR10, log A
 of the KR300, four logs of the double pendulum. The choice sees these alone; the model
@@ -262,7 +262,7 @@ def pendulum():
 
 @functools.cache
 def arm(name):
-    """Return the path, the robot and the bodies of a simulated arm, and its rigid-body torques."""
+    """Return path, robot, bodies and rigid-body torques of a simulated arm."""
     import cmeel
     import pinocchio as pin
 
@@ -305,7 +305,7 @@ def moves(joints, rng, step=1e-3, count=24):
 
 
 def bristles(qd, length, step=1e-3, substeps=4, damping=3e-3):
-    """Return the LuGre force of bristles per unit of dry friction, by Runge and Kutta's method."""
+    """Return the LuGre force per unit of dry friction, by Runge and Kutta."""
     z, out = np.zeros(qd.shape[1]), np.zeros(qd.shape)
 
     def rate(z, v):
@@ -409,7 +409,7 @@ def observed(m, forces, size, rng):
 
 
 def load(name, draws):
-    """Measure coefficients of simulated friction by load, and the coverage of their intervals."""
+    """Measure coefficients of friction by load, and their intervals' coverage."""
     import jaxid as jid
 
     path, robot, _, torques = arm(name)
@@ -448,7 +448,7 @@ def load(name, draws):
 
 
 def stribeck(name, draws):
-    """Measure the coverage of friction parameters if the model lacks the Stribeck part."""
+    """Measure the coverage of friction if the model lacks the Stribeck part."""
     import jaxid as jid
 
     robot = arm(name)[1]

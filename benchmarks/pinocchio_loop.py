@@ -1,4 +1,4 @@
-"""The same arm in Pinocchio, and a C++ loop over samples that is built from its headers.
+"""The same arm in Pinocchio, and a C++ loop over samples, built from its headers.
 
 The loop is compiled with all of this processor's instructions; it needs `g++`, Boost's
 headers (which come with the wheel of Pinocchio) and Eigen's. Eigen is looked for in
@@ -72,13 +72,13 @@ def pinocchio_model(robot, bodies):
 
 
 def in_our_order(regressors, joints):
-    """Return Pinocchio's columns [samples, joints, columns] in the order of `RigidBodies`."""
+    """Return columns [samples, joints, columns] in the order of `RigidBodies`."""
     columns = regressors.reshape(-1, joints, joints, 10)[..., ORDER] * SIGNS
     return columns.reshape(-1, joints, 10 * joints)
 
 
 def prefixes():
-    """Return the folders that may hold headers, first the common prefix of the wheels."""
+    """Return folders that may hold headers, first the common prefix of wheels."""
     import cmeel
 
     found = [Path(p).parent / "cmeel.prefix" for p in cmeel.__path__]

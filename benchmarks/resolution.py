@@ -26,7 +26,7 @@ ROBOTS = ("xarm7", "ur3", "scara", "six")
 
 
 def study(robot, file, bits, draws, cutoff):
-    """Return coverage of all, of friction, with exact angles; the largest bias, and warnings."""
+    """Return coverage (all, friction, exact angles), largest bias, and warnings."""
     import jaxid as jid
 
     arm = jid.load_urdf(file)

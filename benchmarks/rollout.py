@@ -111,7 +111,7 @@ def authors(number: str) -> dict[str, float]:
 
 
 def authors_errors(y: dict[str, float], logs, horizon: float) -> np.ndarray:
-    """Simulate windows by an authors' model; links hang at zero, and relative angles count."""
+    """Simulate windows by an authors' model with relative angles, hanging at zero."""
     errors = []
     for o in logs:
         dt, steps = o.sample_time, round(horizon / o.sample_time)
@@ -224,7 +224,7 @@ def print_errors(word: str, values) -> None:
 
 
 def arm_text(gain: float, stribeck: bool, axes: int = 6) -> str:
-    """Return an arm whose links are in a row, axes by turns upright and level, as MJCF."""
+    """Return an arm with links in a row, axes by turns upright and level, as MJCF."""
     text, end = "", ""
     for j in range(axes):
         axis = ("0 0 1", "0 1 0", "0 1 0", "1 0 0", "0 1 0", "1 0 0")[j % 6]
@@ -370,7 +370,7 @@ def gains(quick: bool) -> None:
 
 
 def confounded(quick: bool) -> None:
-    """Let logs tell two parameters only together: the summary must merge them, and rightly."""
+    """Check that the summary merges two parameters that logs tell only together."""
     t, draws = np.arange(500) / 50.0, 5 if quick else 100
     bodies = arm_bodies(arm_text(1.0, False, 1))
     for first, second in (("B", "d"), ("J", "a")):
@@ -379,8 +379,7 @@ def confounded(quick: bool) -> None:
             random, logs = np.random.default_rng(seed), []
             model = mujoco.MjModel.from_xml_string(arm_text(1.0, False, 1))
             for k in range(4):
-                # Slow ramps tell one lag; an upright axis has no weight, and one
-                # inertia.
+                # Slow ramps tell one lag; an upright axis has one inertia, no weight.
                 sent = (-1) ** k * random.uniform(0.02, 0.05) * t[:, None]
                 if second == "a":
                     sent = commanded(10 * seed + k, 1, 10.0, 50.0)
@@ -434,7 +433,7 @@ def quadruped(quick: bool) -> None:
 
 
 def band(quick: bool) -> None:
-    """Compare motions themselves, without encoders, whose rounding is wider than the band."""
+    """Compare motions without encoders, whose rounding is wider than the band."""
     text, count = arm_text(1.0, False), 10 if quick else 100
     bodies, sent = arm_bodies(text), commanded(999, 6, 5.0, 50.0)
     true = drive(mujoco.MjModel.from_xml_string(text), sent, 50.0, rounding=1e-12)
@@ -450,8 +449,7 @@ def band(quick: bool) -> None:
         paths = []
         for model in models:
             late, offset = (model.numeric(x).data for x in ("delay", "offset"))
-            # Positions that follow from a command in MuJoCo's next step count as half a
-            # step late.
+            # Positions follow from a command in MuJoCo's next step: half a step late.
             commands = sent + offset
             paths.append(
                 drive(model, commands, 50.0, late=late + STEP / 2, rounding=1e-12)
@@ -479,7 +477,7 @@ PEERS = {
     "its defaults": ("", {}),
     "stiff friction, scaled": (STIFF, {"x_scale": "jac"}),
 }
-"""Settings of MuJoCo's dry friction and of its optimiser: as they come, and the best found."""
+"""Settings of MuJoCo's dry friction and optimiser: its defaults, and the best."""
 
 
 def seconds(work) -> tuple:
@@ -502,7 +500,7 @@ def both_sets(quick: bool, joints=slice(None)) -> list[list[jid.Recording]]:
 
 
 def write(spec, p) -> None:
-    """Write an unknown, over the stiffness, into MJCF; the delay is the simulated sensor's."""
+    """Write an unknown, over the stiffness, into MJCF; the sensor has the delay."""
     value, joint = float(p.value[0]), spec.joint("q")
     if p.name == "B":
         joint.damping = np.array([value, 0.0, 0.0])
@@ -515,7 +513,7 @@ def write(spec, p) -> None:
 
 
 def peer_sequences(motion: jid.rollout.ServoMotion, j: int, friction: str) -> list:
-    """Return a joint's motions for the peer; a second control is the torque of the bodies."""
+    """Return a joint's motions for the peer; the second control is the load."""
     text = (
         '<mujoco><option timestep="0.01" gravity="0 0 0" '
         'integrator="implicitfast"/><worldbody>'
@@ -544,7 +542,7 @@ def peer_sequences(motion: jid.rollout.ServoMotion, j: int, friction: str) -> li
 
 
 def peer_fit(motion: jid.rollout.ServoMotion, j: int, friction: str, options: dict):
-    """Identify a joint by `mujoco.sysid`, with our starts and limits and its own objective."""
+    """Identify a joint by `mujoco.sysid`: our starts and limits, its objective."""
     p, load = peer.ParameterDict(), np.abs(motion.load).max(axis=(0, 2))
     for key in (*UNKNOWNS, "a"):
         start, low, high = (float(x[INDEX[key]]) for x in (START, LOWER, UPPER))
@@ -576,7 +574,7 @@ def peer_error(p, motion: jid.rollout.ServoMotion, j: int, friction: str) -> flo
 
 
 def peer_result(motions, joints: list[int], friction: str, options: dict) -> tuple:
-    """Return the peer's errors [seen or unseen, joints], and the times of its identification."""
+    """Return the peer's errors [seen or unseen, joints], and its times."""
     errors, times = [], []
     for j in joints:
         p, *own = seconds(lambda j=j: peer_fit(motions[0], j, friction, options))
@@ -634,7 +632,7 @@ def sysid_row(what: str, sets, bodies=None) -> Row:
 
 
 def evolution(quick: bool) -> list[Row]:
-    """Compare joint 2 with CMA-ES: errors of both sets after our times and at its end."""
+    """Compare joint 2 with CMA-ES: its errors after our time and at its end."""
     if (lacking := timing.missing("cma")) is not None:
         print(lacking)
         return []
@@ -673,7 +671,7 @@ def evolution(quick: bool) -> list[Row]:
 
 
 def strategy(costs, seed: int, budget: float) -> tuple[list[np.ndarray], float]:
-    """Return the best after a budget of CPU time [s] and at the end; CPU time of all."""
+    """Return the best after a CPU time [s] and at the end, and the whole CPU time."""
     import cma
 
     index = [INDEX[key] for key in UNKNOWNS]
@@ -690,8 +688,7 @@ def strategy(costs, seed: int, budget: float) -> tuple[list[np.ndarray], float]:
     while not search.stop():
         candidates = search.ask()
         search.tell(candidates, costs(parameters(candidates))[:, 0].tolist())
-        # The population that ends after the budget counts still: a little more than
-        # our time.
+        # The population that ends after the budget still counts.
         if not best and time.process_time() - start > budget:
             best.append(parameters([search.result.xbest])[0, 0])
     final = parameters([search.result.xbest])[0, 0]

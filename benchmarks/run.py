@@ -155,7 +155,7 @@ def table(head, rows):
 
 
 def section(name, found):
-    """Return the section of a script: facts of the machine, and its rows or its text."""
+    """Return a script's section: facts of the machine, and its rows or text."""
     facts = "; ".join(f"{key}: {value}" for key, value in found["facts"].items())
     lines = f"## {name}\n\n{facts}; took {found['seconds']} s.\n\n"
     if "text" in found:
@@ -204,7 +204,7 @@ def measure_all(scripts, resume):
 
 
 def check(scripts, whole):
-    """Run everything small, write the table of results, and return the names of what failed."""
+    """Run everything small, write the table of results; return names of failures."""
     jobs = {f"benchmarks/{s.name}.py --quick": [*s.command, "--quick"] for s in scripts}
     if whole:
         jobs["notebooks/run_all.py"] = [

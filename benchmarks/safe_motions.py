@@ -52,7 +52,7 @@ ARMS = {
     "kinova": "kinova_description/robots/kinova.urdf",
 }
 INSTANTS, POSES, NEAR = 4001, 1000, 0.1
-"""Instants of a motion, random poses, and the largest distance that MuJoCo reports [m]."""
+"""Instants of a motion, random poses, and MuJoCo's largest distance [m]."""
 JAXID = [sys.executable, "-m", "jaxid"]
 TICKS = os.sysconf("SC_CLK_TCK")
 
@@ -62,7 +62,7 @@ def robots() -> Path:
 
 
 def design(folder: Path, seconds: float, *more: str) -> dict[str, float]:
-    """Run the command, and return when its first motion was there; its output goes to a file."""
+    """Run the command with output to a file; return when the first motion came."""
     begin = (
         "import time; time.monotonic = time.process_time; from jaxid.cli import "
         "main; main()"
@@ -131,7 +131,7 @@ class Oracle:
         return {pair for pair, gap in self.gaps(q) if gap <= 0}
 
     def gaps(self, q):
-        """Return pairs of bodies that are near, the floor being -1, and their distances [m]."""
+        """Return pairs of near bodies (the floor is -1), and their distances [m]."""
         data, model = self.data, self.model
         data.qpos[:] = q
         mujoco.mj_fwdPosition(model, data)
@@ -148,7 +148,7 @@ class Oracle:
         return found
 
     def forces(self, q, qd, qdd) -> np.ndarray:
-        """Return forces of the inverse dynamics and the largest dry friction [N m or N]."""
+        """Return the inverse dynamics' forces, and the largest dry friction [N m]."""
         model, data, flags = self.model, self.data, self.model.opt.disableflags
         model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
         data.qpos[:], data.qvel[:], data.qacc[:] = q, qd, qdd

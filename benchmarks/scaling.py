@@ -1,4 +1,4 @@
-"""Cost of the regressor and of `identify` against the numbers of samples, joints and cores.
+"""Cost of the regressor and of `identify` by numbers of samples, joints and cores.
 
     python benchmarks/scaling.py [--quick] [--json FILE]
 
@@ -41,7 +41,7 @@ def chain(joints):
 
 
 def cases_of(robot, samples, packed):
-    """Return by name a call on some samples, and the number of samples that it computes."""
+    """Return calls on some samples by name, and their numbers of samples."""
     import numpy as np
     from peers import motion
     from pinocchio_loop import Bodies, Loop, pinocchio_model
@@ -198,7 +198,7 @@ def identified(samples, turns):
 
 
 def by_cores(numbers, samples, turns):
-    """Return nanoseconds per sample for each number of cores, and the distance of estimates."""
+    """Return ns per sample for numbers of cores, and the distance of estimates."""
     import numpy as np
 
     found, scaled = [], []
@@ -284,7 +284,7 @@ def plot(samples, joints, compiling, cores, path):
 
 
 def on_one_core(quick):
-    """Measure cost against samples and joints, and compile times, in a process of one core."""
+    """Measure cost by samples and joints, and compile times, on one core."""
     sizes, joints = ((1, 100), (2, 3)) if quick else (SAMPLES, JOINTS)
     by_size = by_samples(sizes, 5)
     by_joint, compiling = by_joints(map(chain, joints), 256 if quick else 2048, 5)

@@ -1,8 +1,8 @@
-"""Speed of what users call first: dynamics, identification, commands; beside another version.
+"""Speed of the main functions and commands, also beside another version.
 
-Each row is measured by a process of its own, which prints seconds. With `--against` the
-same rows are measured with another checkout of the package, in turn, and the table shows
-the ratio of the shortest times.
+Each row is measured by a process of its own, which prints seconds. With `--against`
+the same rows are measured with another checkout of the package, in turn, and the table
+shows the ratio of the shortest times.
 """
 
 import os
@@ -60,7 +60,8 @@ print(time.process_time() - start)
 """
 COMMAND = """
 import resource, subprocess, sys
-subprocess.run([sys.executable, "-m", "jaxid", *sys.argv[1:]], stdout=subprocess.DEVNULL)
+command = [sys.executable, "-m", "jaxid", *sys.argv[1:]]
+subprocess.run(command, stdout=subprocess.DEVNULL)
 used = resource.getrusage(resource.RUSAGE_CHILDREN)
 print(used.ru_utime + used.ru_stime)
 """

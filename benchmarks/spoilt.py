@@ -377,7 +377,7 @@ CHANNEL = {
 
 
 def cases(n):
-    """Yield names, changes, joints and amounts of all mistakes for a robot of n joints."""
+    """Yield names, changes, joints and amounts of all mistakes for n joints."""
     for kind, (change, joints, amounts) in KINDS.items():
         for j in dict.fromkeys({"f": 0, "m": n // 2, "l": n - 1}[x] for x in joints):
             for amount in amounts:
@@ -404,7 +404,7 @@ def recorded(urdf, cache, **settings):
 
 
 def written(cases, folder):
-    """Write the logs of cases; return them and the experiment, which the first case describes."""
+    """Write the logs of cases; return them and the first case's experiment."""
     import jaxid as jid
 
     case, paths = cases[0], []
@@ -428,7 +428,7 @@ def written(cases, folder):
 
 
 def judged(cases, folder):
-    """Return the verdict on logs, the likely mistakes, and the largest share of missed forces."""
+    """Return the verdict, likely mistakes, and the largest share of missed forces."""
     import jaxid as jid
 
     experiment, paths = written(cases, folder)
@@ -439,7 +439,7 @@ def judged(cases, folder):
 
 
 def one(robot, urdf, change, j, amount, folder):
-    """Return the status of a case, whether a cure is wrong, what is missed, and what was said."""
+    """Return a case's status, whether a cure is wrong, missed forces and sentences."""
     case = recorded(urdf, folder / f"{robot}.npz")
     names = re.findall(r'<joint name="([^"]*)" type="(?:rev|pris|cont)', case.urdf)
     with contextlib.suppress(LookupError) as _:

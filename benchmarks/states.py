@@ -274,7 +274,7 @@ def central_values(tool: jid.Tool) -> np.ndarray:
 
 
 def payload(draws: int) -> list[str]:
-    """Return the tables of payloads (Fig. 8) and of drive gains from the same motions."""
+    """Return tables of payloads (Fig. 8) and of drive gains by the same motions."""
     base, plain, loaded = panda()
     rigs = [Rig(base.model, omega=2 * np.pi / 8, seed=k + 1) for k in range(2)]
     clean = [rig.forces(p) for rig, p in zip(rigs, (plain, loaded), strict=True)]

@@ -1,4 +1,4 @@
-"""Identification axis by axis, with and without friction first, compared with all at once.
+"""Identification axis by axis, also with friction first, against all axes at once.
 
 Axis by axis: the last axis is identified from its own force, its parameters are taken
 for known, then comes the axis before it. Friction can be identified first, from motions
@@ -29,13 +29,15 @@ import jaxid as jid
 TURNS, PERIOD, ALONE = 5, 8.0, 4.0
 FILTER, EVERY = jid.ZeroPhaseButterworth(10.0), 20
 DECIDED = 1e-4
-"""Fraction (0 to 1) of a column that must be new for an axis to determine its parameter."""
+"""Least new fraction (0 to 1) of a column whose parameter an axis determines."""
 
 jax.config.update("jax_enable_x64", True)
 
 
 class Stepwise(jid.estimators.AbstractEstimator):
-    """Least squares for one axis after the other, from the tip inward; deviations are not computed.
+    """Least squares for one axis after the other, from the tip inward.
+
+    Deviations are not computed.
 
     Attributes:
         single_axes: Motions of one axis each; from them friction is identified first,
@@ -82,7 +84,7 @@ class Stepwise(jid.estimators.AbstractEstimator):
 
 
 def is_friction(name: str) -> bool:
-    """Return whether a base parameter is friction; offsets look like weight in a single motion."""
+    """Return whether a base parameter is friction; offsets resemble weight here."""
     return name.startswith(("fv", "fc")) and name[2:].isdigit()
 
 

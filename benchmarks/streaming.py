@@ -116,7 +116,7 @@ def identification(base, o):
 
 
 def distance(base, o):
-    """Return the distance from the estimates of a dense QR, with columns of length one."""
+    """Return the distance from estimates of a dense QR with columns of length one."""
     theta = o.reduce(np.asarray(base.regressor(o.motion))).reshape(-1, base.size)
     norms = np.linalg.norm(theta, axis=0)
     Q, R = np.linalg.qr(theta / norms)

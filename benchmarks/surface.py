@@ -1,4 +1,4 @@
-"""Public dynamics under JAX's transformations, beside the packed form and a loop over Pinocchio.
+"""Public dynamics under JAX's transformations, beside the packed form and Pinocchio.
 
     python benchmarks/surface.py [--quick] [--json FILE]
 
@@ -68,7 +68,7 @@ def packed_form(definition, *shapes):
 
 
 def geometry(model, p, rng):
-    """Return the time with offsets and rotations as inputs, relative to that with constants."""
+    """Return the time with offsets and rotations as inputs over that as constants."""
     import dataclasses
 
     import equinox as eqx

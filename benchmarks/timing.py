@@ -1,4 +1,4 @@
-"""Measurement of the benchmarks: interleaved medians, facts of the machine, physical floors.
+"""Measurement of the benchmarks: interleaved medians, machine, physical floors.
 
 It is imported before JAX, since threads and devices are chosen then.
 """
@@ -26,7 +26,7 @@ sys.path.insert(0, str(REPOSITORY))
 
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 SHORTEST = 5e-3
-"""Shortest duration of one turn of a case [s]; shorter cases are called several times."""
+"""Shortest turn of a case [s]; shorter cases are called several times."""
 PEERS = ("pin", "figaroh", "frax")
 
 
@@ -44,7 +44,7 @@ def parser(text: str, quick: str) -> argparse.ArgumentParser:
 
 
 def pin_to(cores: int) -> None:
-    """Give this process some cores, and its libraries as many threads, before JAX is imported."""
+    """Give this process some cores and as many threads, before JAX is imported."""
     for name in THREADS:
         os.environ[name] = str(cores)
     if hasattr(os, "sched_setaffinity"):
@@ -114,7 +114,7 @@ def elapsed(work: Callable[[], object]) -> tuple[object, float]:
 
 @dataclass(frozen=True)
 class Row:
-    """Row of a table: what was measured and how, the target, the result, and whether it holds."""
+    """Row of a table: quantity and recipe, target, result, and whether it holds."""
 
     number: str
     what: str

@@ -61,7 +61,7 @@ def settle(
     logs: Sequence[jid.Observations],
     bandwidth: float,
 ) -> np.ndarray:
-    """Return estimates from motions that are simulated with the estimates themselves."""
+    """Return estimates from motions simulated with the estimates themselves."""
     parameters = start
     for _ in range(MAX_SIMULATIONS):
         motions = tuple(follow(base, parameters, log, bandwidth) for log in logs)

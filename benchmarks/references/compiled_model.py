@@ -1,4 +1,4 @@
-"""The exported C code, compiled on this machine and called from Python: to check and to time it."""
+"""The exported C code, compiled on this machine and called from Python."""
 
 import ctypes
 import os
