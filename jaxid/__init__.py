@@ -1,9 +1,9 @@
 """Identification of the dynamic parameters of robots, in the order of the pipeline.
 
-Everything else is in namespaces: `program`, `dynamics`, `terms`, `filters`, `units`, `estimators`,
-`friction_laws`, `uncertainty`, `consistency`, `excitation`, `criteria`, `constraints`,
-`trajectories`, `collision`, `simulation`, `export`, `workflow`, `experiment`; the
-built-in robots are in `robots`, the figures in `plot`.
+Everything else is in namespaces: `program`, `dynamics`, `terms`, `filters`, `units`,
+`estimators`, `friction_laws`, `uncertainty`, `consistency`, `excitation`, `criteria`,
+`constraints`, `trajectories`, `collision`, `simulation`, `export`, `workflow`,
+`experiment`; the built-in robots are in `robots`, the figures in `plot`.
 """
 
 import importlib as _importlib
@@ -21,7 +21,7 @@ if _typing.TYPE_CHECKING:
 else:
 
     def __getattr__(name):
-        """Load the public names when one of them is first used, and matplotlib for `plot`."""
+        """Load the public names when one is first used, and matplotlib for `plot`."""
         if name == "plot":
             return _importlib.import_module("jaxid.report.public_figures")
         if not name.startswith("_"):

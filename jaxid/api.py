@@ -1,4 +1,4 @@
-"""Public names of `jaxid`, in the order of the pipeline; the package loads them when used."""
+"""Public names of `jaxid`, in the order of the pipeline; loaded when they are used."""
 
 from . import (
     dynamics as dynamics,

@@ -2,4 +2,4 @@
 
 
 class InputError(ValueError):
-    """Invalid input of a user: a sentence that names the input, the rule and the cure."""
+    """Invalid input of a user: a sentence that names the input, the rule, the cure."""

@@ -1,4 +1,4 @@
-"""Least squares of a function that is not linear, within bounds; batched by `jax.vmap`."""
+"""Least squares of a nonlinear function, within bounds; batched by `jax.vmap`."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple

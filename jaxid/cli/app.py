@@ -27,7 +27,7 @@ app = typer.Typer(
 
 
 def main() -> None:
-    """Run a command in this thread; an error of a user is one sentence, with exit code 2."""
+    """Run a command in this thread; a user's error is one sentence with exit code 2."""
     if isinstance(sys.stdout, io.TextIOWrapper):  # some terminals know few characters
         sys.stdout.reconfigure(errors="replace")
     try:
@@ -376,7 +376,7 @@ def rollout(
     output: options.OutputFolder = Path("rollout"),
     force: options.Force = False,
 ) -> None:
-    """Identify so that simulations move like the robot: from commands without torques, or torques.
+    """Identify from commands alone or torques, so that simulations move like the robot.
 
     If the experiment file names the columns of commands, joints behind position servos,
     with numbers for simulators and MJCF; otherwise the model of `identify`, with errors

@@ -67,7 +67,7 @@ EXPORTS = {
 TITLE_OF_TOOL = "to subtract it from other logs, in the experiment file:"
 TITLE_OF_GAINS = "to use them, in the experiment file:"
 UNUSABLE = 3
-"""Exit code if the verdict is that a model must not be used, or a motion not be recorded."""
+"""Exit code for a verdict against the use of a model, or recording of a motion."""
 
 
 def inspect(console: Console, path: Path, logs: list[Path]) -> None:
@@ -130,15 +130,15 @@ def excite(
     resume: bool,
     seconds: float | None,
 ) -> None:
-    """Design a motion; the best one so far is written whenever there is a better one."""
+    """Design a motion; the best one so far is written whenever a better is found."""
     experiment = load_experiment(path)
     earlier_design = None
     if resume:
         earlier_design = output.with_suffix(".json")
         if not earlier_design.is_file():
             raise InputError(
-                f"`{earlier_design}` is not there: `--resume` needs a motion to go on "
-                "with."
+                f"`{earlier_design}` is not there: "
+                "`--resume` needs a motion to go on with."
             )
     with within("excitation", path.name):
         task = prepare_motion(
@@ -187,9 +187,9 @@ class _BestMotion:
         faults = self._task.faults
         unchecked = f"; NOT CHECKED: {'; '.join(faults)}" if faults else ""
         return (
-            f"stopped: `{self._output}` and the files beside it hold the best motion "
-            f"so far, which keeps all limits that were checked{unchecked}; `--resume` "
-            "goes on with it"
+            f"stopped: `{self._output}` and the files beside it hold "
+            "the best motion so far, which keeps all limits that "
+            f"were checked{unchecked}; `--resume` goes on with it"
         )
 
 
@@ -203,7 +203,10 @@ def export(
     double: bool,
     force: bool,
 ) -> list[Path]:
-    """Write the model of a report in a format, an unusable one only by force; return the files."""
+    """Write the model of a report in a format; return the files.
+
+    An unusable model is written only by force.
+    """
     files = [path, path.with_suffix(".h")] if to == "c" else [path]
     _require_free(files, to, force)
     require_writable(path.parent)
@@ -331,8 +334,8 @@ def gains(
     experiment = load_experiment(path)
     if experiment.load is None:
         raise InputError(
-            f"{path.name}: the table `[load]` is missing: it describes the load "
-            "behind `--loaded`."
+            f"{path.name}: the table `[load]` is missing: "
+            "it describes the load behind `--loaded`."
         )
     columns = experiment.require_columns([*logs, *loaded])
     with progress_bar(open_console(stderr=True)) as progress:

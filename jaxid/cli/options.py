@@ -1,4 +1,4 @@
-"""Options that commands share, the terminal, errors as sentences, and folders of results."""
+"""Options that commands share, the terminal, errors as sentences, result folders."""
 
 import errno
 import shlex
@@ -95,8 +95,8 @@ def start(*reads: Path, output: Path | None = None, force: bool = False) -> Cons
             )
         if not (force or empty or any(schema_of(output / file) for file in SCHEMAS)):
             raise InputError(
-                f"`{output}` holds files but no report: choose another -o, or add "
-                "--force."
+                f"`{output}` holds files but no report: "
+                "choose another -o, or add --force."
             )
         require_writable(output)
     return open_console()
@@ -127,8 +127,8 @@ def describe_error(error: Exception) -> str:
     where = f"`{error.filename}`: " if error.filename else ""
     if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
         return (
-            f"{where}{error.strerror}: nothing was written; make room, or choose "
-            "another -o."
+            f"{where}{error.strerror}: nothing was written; "
+            "make room, or choose another -o."
         )
     return f"{where}{error.strerror}."
 
@@ -140,7 +140,7 @@ def command_line() -> str:
 
 
 def refuse_foreign_table(target: Path) -> None:
-    """Reject a table of a motion in whose place are other files than an earlier motion."""
+    """Reject a path where files lie that are not those of an earlier motion."""
     from jaxid.io import require_writable
     from jaxid.trajectory.controllers import BESIDE
     from jaxid.trajectory.files import load_trajectory
@@ -158,7 +158,7 @@ def refuse_foreign_table(target: Path) -> None:
         )
         if foreign is not None:
             raise InputError(
-                f"`{foreign}` is there already, and no motion of `jaxid excite`: "
-                "choose another -o."
+                f"`{foreign}` is there already, "
+                "and no motion of `jaxid excite`: choose another -o."
             ) from None
         require_writable(target.parent)

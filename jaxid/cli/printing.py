@@ -25,7 +25,7 @@ def show_remarks(console: Console, remarks: Iterable[Remark | str]) -> None:
 
 
 def show_files(console: Console, folder: Path, names: Iterable[str]) -> None:
-    """Print the names of files that were written, and their folder if it is another one."""
+    """Print the names of written files, and their folder if it is another one."""
     place = "" if folder == Path() else f" {folder}:"
     console.print()
     console.print(Text(f"wrote{place} {', '.join(names)}"))

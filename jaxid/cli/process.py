@@ -33,7 +33,7 @@ def handing_over(farewell: Callable[[], str]) -> Iterator[None]:
 
 
 def main() -> NoReturn:
-    """Run a command; Ctrl-C and SIGTERM end it within two seconds, with one sentence."""
+    """Run a command; Ctrl-C and SIGTERM end it within two seconds with one sentence."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, _receive)
     # Threads of BLAS wait busily for each other at small matrices; large work has its
@@ -90,7 +90,7 @@ def _say(text: str) -> None:
 
 
 def _leave(code: int) -> NoReturn:
-    """End the process at once: nothing that still runs in a thread is torn down half-way."""
+    """End the process at once: what runs in a thread is not torn down half-way."""
     # A copy: the command goes on in its own thread.
     for folder in tuple(getattr(sys.modules.get("jaxid.io"), "TEMPORARY", ())):
         shutil.rmtree(folder, ignore_errors=True)

@@ -274,8 +274,8 @@ def _as_parameters(
     p = as_array("p", p)
     if p.shape[-1:] != (size,):
         raise InputError(
-            f"`p` must have {size} {kind} parameters along its last axis, but has "
-            f"shape {p.shape}."
+            f"`p` must have {size} {kind} parameters "
+            f"along its last axis, but has shape {p.shape}."
         )
     return p
 
@@ -343,9 +343,9 @@ def _doubts(
     count = len(dependence.independent)
     if dependence.independent != cross_check.independent:
         yield (
-            f"the two ways to choose base parameters disagree ({count} and "
-            f"{len(cross_check.independent)}): the geometry is nearly degenerate, or "
-            "angles are rounded."
+            "the two ways to choose base parameters disagree "
+            f"({count} and {len(cross_check.independent)}): "
+            "the geometry is nearly degenerate, or angles are rounded."
         )
     if dependence.smallest_independent < MIN_SHARE:
         column = dependence.independent[int(np.argmin(regrouped.shares))]
@@ -363,6 +363,6 @@ def _doubts(
         )
     if regrouped.unexplained > MAX_UNEXPLAINED:
         yield (
-            f"a dependent column is explained only to {regrouped.unexplained:.1e} of "
-            "its size."
+            "a dependent column is explained only "
+            f"to {regrouped.unexplained:.1e} of its size."
         )

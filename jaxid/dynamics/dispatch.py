@@ -267,8 +267,8 @@ def _batch_shape(arrays: list[AnyArray]) -> Shape:
     except ValueError:
         shapes = ", ".join(str(x.shape) for x in arrays)
         raise InputError(
-            "leading axes of parameters and motion must fit each other, but shapes "
-            f"are {shapes}."
+            "leading axes of parameters and motion must "
+            f"fit each other, but shapes are {shapes}."
         ) from None
 
 

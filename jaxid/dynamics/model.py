@@ -66,8 +66,8 @@ class Model(Hashable):
         if len(set(names)) != len(names):
             name = next(name for name in names if names.count(name) > 1)
             raise InputError(
-                f"`terms` must not contribute the same parameter twice, but `{name}` "
-                "comes twice."
+                "`terms` must not contribute the same "
+                f"parameter twice, but `{name}` comes twice."
             )
 
     @property
@@ -101,8 +101,8 @@ class Model(Hashable):
         sizes = [len(term.parameters(self.robot)) for term in self.terms]
         if p.shape != (sum(sizes),):
             raise InputError(
-                f"`p` must hold {sum(sizes)} standard parameters, but has shape "
-                f"{p.shape}."
+                f"`p` must hold {sum(sizes)} standard "
+                f"parameters, but has shape {p.shape}."
             )
         parts = []
         start = 0
@@ -329,8 +329,8 @@ class Model(Hashable):
         q = as_array("q", q)
         if q.shape[-1:] != (self.robot.joints,):
             raise InputError(
-                f"`motion` must have {self.robot.joints} joints along its last axis, "
-                f"but has shape {q.shape}."
+                f"`motion` must have {self.robot.joints} joints "
+                f"along its last axis, but has shape {q.shape}."
             )
         return q
 

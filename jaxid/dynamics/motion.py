@@ -67,8 +67,8 @@ def as_state(*state: Any) -> tuple[Any, Any]:
         return state[0].q, state[0].qd
     if len(state) != 2:
         raise InputError(
-            "`state` must be a `Motion`, or coordinates and velocities, but "
-            f"{len(state)} arrays are given."
+            "`state` must be a `Motion`, or coordinates and velocities, "
+            f"but {len(state)} arrays are given."
         )
     q, qd = state
     return q, qd

@@ -161,8 +161,8 @@ class JointLimits(eqx.Module):
         speed = np.abs(rows[1] @ constant).max()
         if max(error, speed) > 1e-9:
             raise InputError(
-                "`basis` must hold a constant, for motions that stand still at any "
-                "position."
+                "`basis` must hold a constant, "
+                "for motions that stand still at any position."
             )
         self.constant = sizes[0][:, None] * constant[None] / self.scale
 

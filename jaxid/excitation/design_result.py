@@ -180,8 +180,8 @@ class ExcitationPlan(Summarised, eqx.Module):
         """Return the table of criteria."""
         names, before, after = zip(*self.criteria, strict=True)
         return Table(
-            "criteria: smaller is better; this motion was designed by the "
-            f"{self.criterion.name}",
+            "criteria: smaller is better; "
+            f"this motion was designed by the {self.criterion.name}",
             Column("criterion", names),
             Column("random motion", before),
             Column("this motion", after),
@@ -223,9 +223,9 @@ class ExcitationPlan(Summarised, eqx.Module):
         )
         if gain < 1.0:
             text = (
-                f"Standard deviations are {1.0 / gain:.3g} times those of a random "
-                "motion, which keeps the limits of the joints alone: search longer "
-                "(`--resume`)"
+                f"Standard deviations are {1.0 / gain:.3g} times "
+                "those of a random motion, which keeps the limits "
+                "of the joints alone: search longer (`--resume`)"
             )
         remarks = [Remark(text)]
         remarks += [Remark(text, Status.BAD) for text in self.diagnosis]
@@ -237,8 +237,8 @@ class ExcitationPlan(Summarised, eqx.Module):
             remarks.append(Remark(text, Status.DOUBTFUL))
         if self.status is DesignStatus.IMPROVING:
             text = (
-                "The last steps still improved the motion: more `generations` may find "
-                "a better one"
+                "The last steps still improved the motion: "
+                "more `generations` may find a better one"
             )
             remarks.append(Remark(text))
         return remarks

@@ -109,18 +109,18 @@ class ExcitationProblem:
         self.prior = no_prior if prior is None else np.asarray(prior)
         if prior is not None and not self.criterion.weighted:
             raise InputError(
-                "`prior` needs a weighted criterion, but that is the "
-                f"{self.criterion.name}."
+                "`prior` needs a weighted criterion, "
+                f"but that is the {self.criterion.name}."
             )
         if self.prior.shape != (base.size, base.size):
             raise InputError(
-                f"`prior` must have {base.size} rows and columns, but has shape "
-                f"{self.prior.shape}."
+                f"`prior` must have {base.size} rows and columns, "
+                f"but has shape {self.prior.shape}."
             )
         if self.noise.shape != (robot.joints,) or not (self.noise > 0).all():
             raise InputError(
-                "`noise` must hold one positive number for each joint, but is "
-                f"{self.noise}."
+                "`noise` must hold one positive number "
+                f"for each joint, but is {self.noise}."
             )
         self.weights = 1.0 / self.noise
         self.regressor = base.joint_regressor

@@ -1,4 +1,4 @@
-"""Decoding of TOML tables: a table calls a function, and its keys are the function's arguments.
+"""Decoding of TOML tables: a table calls a function with its keys as arguments.
 
 Names, types and defaults of the keys are those of the arguments, and the function's
 docstring describes them: `keys_of` gives all of it, also for the template that `jaxid
@@ -53,7 +53,7 @@ def keys_of(function: Callable) -> dict[str, Key]:
 
 
 def descriptions(function: Callable) -> dict[str, str]:
-    """Return the descriptions of arguments or attributes in a docstring, by their names."""
+    """Return the descriptions of arguments or attributes in a docstring, by name."""
     text = inspect.getdoc(function) or ""
     sections = re.findall(
         r"^(?:Args|Attributes):\n((?:    .*\n?|\n)+)", text, flags=re.M
@@ -73,7 +73,7 @@ def call(function: Callable, table: Any, place: str, *context: Any) -> Any:
 
 @contextmanager
 def within(place: str, file: str = "") -> Iterator[None]:
-    """Name a table, and the file if it is not named further above, in errors of deeper layers."""
+    """Name a table in errors of deeper layers, and the file if it is not named yet."""
     try:
         yield
     except (InputError, FileNotFoundError) as error:
@@ -88,7 +88,7 @@ def decode(
     complete: bool = True,
     skip: Iterable[str] = (),
 ) -> list[dict[str, Any]]:
-    """Return the arguments that a table holds for each of several functions that share it.
+    """Return a table's arguments for each of several functions that share it.
 
     Arguments in `skip` are no keys; keys without default are needed where the table is
     `complete`.
@@ -169,7 +169,7 @@ _SCALARS: dict[Any, tuple[Any, str]] = {
 
 
 def _convert(value: Any, option: Any, place: str) -> Any:
-    """Return a value as an annotation asks for it, or `_OTHER` if it is of another kind."""
+    """Return a value as an annotation asks, or `_OTHER` if it is of another kind."""
     origin, arguments = typing.get_origin(option), typing.get_args(option)
     function = table_of(option)
     if function is not None:
@@ -237,7 +237,7 @@ def _convert_scalar(value: Any, kind: Any, place: str) -> Any:
 
 
 def table_of(option: Any) -> Callable | None:
-    """Return the function of a table: a class, or that of `Annotated[Result, function]`."""
+    """Return a table's function: a class, or that of `Annotated[Result, function]`."""
     if typing.get_origin(option) is Annotated:
         return next((x for x in typing.get_args(option)[1:] if callable(x)), None)
     is_class = isinstance(option, type) and typing.get_origin(option) is None

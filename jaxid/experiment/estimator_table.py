@@ -83,8 +83,8 @@ def decode_estimator(table: dict[str, Any]) -> tuple[dict[str, Any], dict[str, A
     has_other_uncertainty = arguments.get("uncertainty", "spectral") != "spectral"
     if has_other_uncertainty and arguments.get("nonlinear_friction"):
         raise InputError(
-            "`estimator`: `nonlinear_friction` does not go with `uncertainty`: choose "
-            "one."
+            "`estimator`: `nonlinear_friction` "
+            "does not go with `uncertainty`: choose one."
         )
     return arguments, bounds
 
@@ -170,7 +170,7 @@ def build_solution(
 
 
 def build_bounds(robot: Robot, bounds: dict[str, Any]) -> BodyBounds | None:
-    """Return bounds of the bodies, those from the robot's geometry where none are given."""
+    """Return bounds of the bodies; where none are given, from the robot's geometry."""
     if not bounds:
         return None
     if "ellipsoid_centre" in bounds and "ellipsoid_axes" not in bounds:

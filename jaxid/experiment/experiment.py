@@ -88,8 +88,8 @@ class Experiment:
             names = summarise_columns(files[0])
             described = f"columns of `{files[0].name}`, which has {names}"
         raise InputError(
-            f"{self.path.name}: the table `[recording]` is missing: it names "
-            f"{described}."
+            f"{self.path.name}: the table `[recording]` "
+            f"is missing: it names {described}."
         )
 
 
@@ -98,8 +98,8 @@ def load_experiment(path: str | Path) -> Experiment:
     path = Path(path)
     if not path.is_file():
         raise InputError(
-            f"`{path}` is no file: check its path, or write one with `jaxid init "
-            "arm.urdf`."
+            f"`{path}` is no file: check its path, "
+            "or write one with `jaxid init arm.urdf`."
         )
     try:
         text = path.read_bytes().decode("utf-8-sig")
@@ -111,7 +111,7 @@ def load_experiment(path: str | Path) -> Experiment:
 
 
 def parse_experiment(text: str, path: Path) -> Experiment:
-    """Return the experiment of a file with this text; other paths are relative to its folder."""
+    """Return the experiment of a text; other paths are relative to its folder."""
     try:
         tables = tomllib.loads(text)
     except (ValueError, RecursionError) as error:

@@ -1,4 +1,4 @@
-"""Variants of an experiment file, with other friction or another estimator, to choose from."""
+"""Variants of an experiment file, to choose from: other friction or estimators."""
 
 import copy
 import itertools
@@ -26,7 +26,7 @@ EFFECTS: dict[str, dict[str, Any]] = {
     if term.choice
 }
 EFFECTS["presliding"] = {"coulomb": {"presliding": True}}
-"""Effects that the model may have beside those that each model has, as keys of `[model]`."""
+"""Effects that a model may have beside those of each model, as keys of `[model]`."""
 COMMON_EFFECTS = "viscous, dry"
 ESTIMATORS: dict[str, Changes] = {
     "least squares": {"estimator": {"kind": "weighted"}},
@@ -70,7 +70,7 @@ def _changes(tables: dict[str, Any]) -> Iterator[tuple[str, Changes]]:
 
 
 def changed_text(text: str, changes: Changes) -> str:
-    """Return the text of an experiment file with other keys; all others keep their comments."""
+    """Return the text of an experiment file with other keys; comments are kept."""
     document = tomlkit.parse(text)
     for name, keys in changes.items():
         if not keys:

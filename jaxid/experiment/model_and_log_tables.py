@@ -1,4 +1,4 @@
-"""The tables `[model]`, `[recording]`, `[filter]` and `[rows]` of an experiment file."""
+"""Tables `[model]`, `[recording]`, `[filter]` and `[rows]` of an experiment file."""
 
 import dataclasses
 import inspect
@@ -82,7 +82,7 @@ class DryFriction:
 def _speed(
     robot: Robot, name: str, value: float | list[float]
 ) -> float | Float[np.ndarray, " joints"]:
-    """Return a speed of all joints or of each, which must be one that the joints reach."""
+    """Return a speed of all joints or of each, within what the joints reach."""
     if isinstance(value, list):
         speeds = per_joint(name, value, robot.joints, 0.0)
     else:
@@ -222,7 +222,7 @@ def build_columns(table: dict[str, Any], robot: Robot) -> tuple[Columns, LogRead
 
 
 def with_joint_names(value: Any, robot: Robot) -> Any:
-    """Return a pattern of columns with "{name}" as a list of names; other values as they are."""
+    """Return a pattern of columns with "{name}" as names; other values as they are."""
     if isinstance(value, str) and "{name}" in value:
         return [value.replace("{name}", name) for name in robot.joint_names]
     return value
@@ -231,7 +231,7 @@ def with_joint_names(value: Any, robot: Robot) -> Any:
 def require_fitting_units(
     columns: Columns, robot: Robot, arguments: dict[str, Any]
 ) -> None:
-    """Reject units of lengths for joints that turn, and units of angles for those that slide."""
+    """Reject units of length for joints that turn, of angle for those that slide."""
     names = []
     if not columns.angles_on_motor_side:
         names += ["angle_unit", "velocity_unit"]

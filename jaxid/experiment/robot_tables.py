@@ -116,7 +116,7 @@ def known_load(
 
 @dataclasses.dataclass(frozen=True)
 class RobotSource:
-    """Place of a robot, and its source: one of `urdf`, `mjcf`, `builtin` and `dh` is needed.
+    """Place of a robot, and its source: `urdf`, `mjcf`, `builtin` or `dh` is needed.
 
     Attributes:
         urdf: Path of a URDF or xacro file, as seen from the folder of this file.
@@ -173,8 +173,8 @@ class RobotSource:
         if len(sources) != 1:
             shown = " and ".join(f"`{name}`" for name in sources) or "none of them"
             raise InputError(
-                "one of `urdf`, `mjcf`, `builtin` and `dh` is needed, but there is "
-                f"{shown}."
+                "one of `urdf`, `mjcf`, `builtin` "
+                f"and `dh` is needed, but there is {shown}."
             )
         (source,) = sources
         for key, owners in OWNERS.items():
@@ -202,7 +202,7 @@ class RobotSource:
 
     @property
     def placement(self) -> dict[str, Any]:
-        """Position and orientation on the ground, as functions take them that make robots."""
+        """Position and orientation on the ground, for functions that make robots."""
         rotation = None
         if self.base_rotation is not None:
             rotation = rpy_rotation(np.deg2rad(self.base_rotation))
@@ -259,7 +259,7 @@ def replace_limits(
     jerk: PerJoint | None = None,
     force: PerJoint | None = None,
 ) -> Robot:
-    """Limits of the joints, one number for each: inf for none, nan for what the robot says.
+    """Limits of the joints, one number each: inf for none, nan for the robot's own.
 
     Args:
         robot: Robot without these limits.

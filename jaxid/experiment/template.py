@@ -38,7 +38,8 @@ HEAD = """\
 # Experiment file of {name}:
 # what is known of the robot, what its logs hold, how it is identified.
 # Lines that begin with `#` are comments; remove the `#` before a key to use it.
-# Units: rad, m, s, N m (revolute joints) or N (prismatic joints), unless a key says otherwise.
+# Units: rad, m, s, N m (revolute joints) or N (prismatic joints), unless a key says \
+otherwise.
 #
 #   jaxid inspect  experiment.toml                      what can be identified
 #   jaxid inspect  experiment.toml log.csv              is this log sane?
@@ -46,14 +47,12 @@ HEAD = """\
 #   jaxid identify experiment.toml log.csv -o report/   parameters and torque errors
 """
 SUMMARIES = {
-    "load": "Known load that is on the robot in some logs only: `jaxid gains` finds "
-    "the true "
-    "forces.",
-    "recording": "Columns of the logs: CSV (any separator), Parquet, NPZ, MAT, HDF5 "
-    "or ROS bags. "
-    'A pattern ("{}" stands for the joint\'s number, "{name}" for its name), a list '
-    "of names, or "
-    "positions from 0.",
+    "load": "Known load that is on the robot in some logs only: "
+    "`jaxid gains` finds the true forces.",
+    "recording": "Columns of the logs: "
+    "CSV (any separator), Parquet, NPZ, MAT, HDF5 or ROS bags. "
+    'A pattern ("{}" stands for the joint\'s number, "{name}" for its name), '
+    "a list of names, or positions from 0.",
 }
 """Descriptions of tables where the docstring of their function says something else."""
 INNER = {"robot": ("robot.tool", known_load), "model": ("model.coulomb", DryFriction)}
@@ -117,7 +116,7 @@ def _one_or_each(units: Iterable[str]) -> str | list[str]:
 def _table(
     name: str, functions: tuple[Callable, ...], joints: int, values: Mapping[str, Any]
 ) -> str:
-    """Return a table with all keys of some functions; some or all of them are commented out."""
+    """Return a table with all keys of some functions, some or all commented out."""
     active = name not in ("load", "collision", "robot.tool")
     lines = _comment(SUMMARIES.get(name) or _summary(functions[0]))
     lines.append(f"{'' if active else '# '}[{name}]")
@@ -141,7 +140,7 @@ def _table(
 
 
 def _key(key: Key, joints: int, value: Any, active: bool) -> Iterator[str]:
-    """Yield the lines of a key: its value, default or an example, and its description."""
+    """Yield the lines of a key: its value, default or example, and description."""
     # The description as users of the file need it, and the example in it.
     text = re.sub(r"[;,] (?:or )?None(?: if [^;.]*)?", "", key.text)
     text = text.replace(" if None", " by default")
@@ -162,7 +161,7 @@ def _key(key: Key, joints: int, value: Any, active: bool) -> Iterator[str]:
 
 
 def _example(hint: Any, example: str, joints: int) -> str:
-    """Return an example of the right type: a value for each joint where a list is needed."""
+    """Return an example of the right type, for each joint where lists are needed."""
     while typing.get_origin(hint) is Annotated:
         hint = typing.get_args(hint)[0]
     kind = typing.get_origin(hint)

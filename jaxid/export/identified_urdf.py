@@ -131,9 +131,9 @@ def _require_same_robot(robot: Robot, described: Robot, source: str | Path) -> N
     """Reject a file of another robot; how the robot is mounted is not in the file."""
     if robot.joint_names != described.joint_names:
         raise InputError(
-            f"`{source}` has the joints {', '.join(described.joint_names)}, but the "
-            f"fit has {', '.join(robot.joint_names)}: give the file of this robot, or "
-            "its `tip`."
+            f"`{source}` has the joints {', '.join(described.joint_names)}, "
+            f"but the fit has {', '.join(robot.joint_names)}: "
+            "give the file of this robot, or its `tip`."
         )
     for joint, name in enumerate(robot.joint_names):
         turns = robot.revolute[joint]
@@ -155,8 +155,8 @@ def _require_same_robot(robot: Robot, described: Robot, source: str | Path) -> N
         file_numbers = np.asarray(getattr(described, quantity))[bodies]
         if not np.allclose(fit_numbers, file_numbers, rtol=0.0, atol=1e-3):
             raise InputError(
-                f"`{source}` has another `{quantity}` than the robot of the fit: give "
-                "its own file."
+                f"`{source}` has another `{quantity}` "
+                "than the robot of the fit: give its own file."
             )
 
 

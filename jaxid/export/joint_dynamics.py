@@ -125,8 +125,8 @@ def feasible_bodies(fit: Fit, target: str) -> BodyParameters:
     )
     if fit.full_parameters is None:
         raise InputError(
-            f"{target} needs all parameters, but the fit knows only base parameters: "
-            f"{cure}."
+            f"{target} needs all parameters, "
+            f"but the fit knows only base parameters: {cure}."
         )
     bodies = body_parameters(fit.base.model, fit.standard_parameters)
     # Rounding may reach slightly below zero.
@@ -141,8 +141,8 @@ def feasible_bodies(fit: Fit, target: str) -> BodyParameters:
         if (values < 0).any():
             joint = fit.base.model.robot.joint_names[int(np.argmin(values))]
             raise InputError(
-                f"{target} needs `{quantity}` >= 0, but `{joint}` has "
-                f"{values.min():g}: {cure}."
+                f"{target} needs `{quantity}` >= 0, "
+                f"but `{joint}` has {values.min():g}: {cure}."
             )
     return bodies
 

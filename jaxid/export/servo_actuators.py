@@ -52,9 +52,9 @@ def servo_stiffness(fit: ServoFit, stiffness: Numbers | None = None) -> Joints:
     is_known = np.isfinite(values)
     if not is_known.any():
         raise InputError(
-            "`stiffness` [N m/rad] is needed: no known weight tells it, and positions "
-            "tell ratios to it only. Any number gives the same motion of a robot "
-            "without bodies."
+            "`stiffness` [N m/rad] is needed: "
+            "no known weight tells it, and positions tell ratios to it only. "
+            "Any number gives the same motion of a robot without bodies."
         )
     return np.where(is_known, values, np.median(values[is_known]))
 
@@ -132,13 +132,13 @@ def simulator_table(fit: ServoFit, stiffness: Numbers | None = None) -> Table:
     remarks = []
     if (values["delay"] < 0).any():
         remarks.append(
-            "a negative delay means that positions are stamped later than commands: "
-            "use 0"
+            "a negative delay means that positions "
+            "are stamped later than commands: use 0"
         )
     if not fit.hold:
         remarks.append(
-            "the delay counts for interpolated commands: held ones are later by half "
-            "a step"
+            "the delay counts for interpolated commands: "
+            "held ones are later by half a step"
         )
     return Table(
         "actuators of simulators",

@@ -27,8 +27,10 @@ GROUP_SAMPLES = 2048
 GROUP_SAMPLES_ON_GPU = 2**17
 """The same on another device."""
 MAX_CONDITION = 1e4
-"""Condition number, with columns of length one, up to which products of rows are accurate enough;
-beyond it a data set is solved again by orthogonal factors."""
+"""Largest condition number for which products of rows are accurate enough.
+
+Columns have length one; beyond it a data set is solved again by orthogonal factors.
+"""
 
 
 class BatchFit(eqx.Module):

@@ -41,13 +41,13 @@ def require_same_base(fits: Sequence[Fit]) -> None:
         if differing_names:
             difference = f"`{differing_names[0]}` is in one of them only"
         raise InputError(
-            f"`{first.name}` and `{fit.name}` have different base parameters "
-            f"({difference}): use one model."
+            f"`{first.name}` and `{fit.name}` have different "
+            f"base parameters ({difference}): use one model."
         )
 
 
 def as_least_squares(fit: Fit) -> Fit:
-    """Return weighted least squares of a fit's factors: the fit itself where it is that.
+    """Return weighted least squares of a fit's factors; the fit itself if it is that.
 
     For robust, regularised or consistent estimates the factors are solved again with
     the same weights. The standard deviations of consistent ones are those of least
@@ -63,12 +63,15 @@ def as_least_squares(fit: Fit) -> Fit:
 
 
 def without_bounds(fit: Fit) -> Fit:
-    """Return the least squares behind a consistent fit, with its deviations; other fits as is."""
+    """Return the least squares behind a consistent fit; other fits as they are.
+
+    The standard deviations are those of the consistent fit.
+    """
     return fit if fit.consistency is None else as_least_squares(fit)
 
 
 def replace_estimates(fit: Fit, parameters, uncertainty: Uncertainty) -> Fit:
-    """Return a fit with estimates and an uncertainty that were computed from several fits."""
+    """Return a fit with estimates and uncertainty computed from several fits."""
     notes = tuple(note for note in fit.notes if note not in fit.uncertainty.notes)
     return dataclasses.replace(
         fit, parameters=parameters, uncertainty=uncertainty, notes=notes
@@ -76,7 +79,7 @@ def replace_estimates(fit: Fit, parameters, uncertainty: Uncertainty) -> Fit:
 
 
 def combine(fits: Sequence[Fit], maps, offsets=None) -> tuple[np.ndarray, Uncertainty]:
-    """Estimate common unknowns from the factors of several fits by least squares (Eq. 33).
+    """Estimate common unknowns from factors of several fits by least squares (Eq. 33).
 
     The base parameters of each fit are its map [base, unknowns] times the unknowns,
     plus its offset [base], if there are any.
@@ -84,8 +87,8 @@ def combine(fits: Sequence[Fit], maps, offsets=None) -> tuple[np.ndarray, Uncert
     for one, other in itertools.combinations(fits, 2):
         if share_rows(one.time_blocks, other.time_blocks):
             raise InputError(
-                f"`{one.name}` and `{other.name}` have seen the same data, which would "
-                "count twice."
+                f"`{one.name}` and `{other.name}` have seen "
+                "the same data, which would count twice."
             )
     if offsets is None:
         offsets = [np.zeros(fit.base.size) for fit in fits]

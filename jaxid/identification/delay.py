@@ -55,7 +55,7 @@ class Delay(eqx.Module):
     p_value: float
 
     def interval(self, level: float = 0.95) -> tuple[float, float]:
-        """Return the lower and upper limit of the delay [s], with `feedback` and `resolution`.
+        """Return the limits of the delay [s], with `feedback` and `resolution`.
 
         Args:
             level: Probability (0 to 1) that the interval contains the true delay.
@@ -187,14 +187,14 @@ def _search(
 
 
 class _Equations(NamedTuple):
-    """Normal equations: sums of products over the rows, with the forces as last column."""
+    """Normal equations: sums of products over rows, with forces as the last column."""
 
     products: np.ndarray  # instruments times regressor, in each block of time
     squares: np.ndarray  # regressor times regressor
     rates: np.ndarray  # rates of the regressor times rates of the regressor
 
     def combine(self, columns: np.ndarray) -> "_Equations":
-        """Return the equations for parameters of which the present ones are combinations."""
+        """Return equations for parameters that the present ones combine."""
         with_forces = np.asarray(linalg.block_diag(columns, 1.0))
         return _Equations(
             products=columns.T @ self.products @ with_forces,
@@ -213,7 +213,7 @@ class _Equations(NamedTuple):
         return scale * np.linalg.lstsq(A, scale * total[:, -1], rcond=1e-12)[0]
 
     def jackknife(self) -> np.ndarray:
-        """Return the covariance of the parameters, from estimates without each of the blocks."""
+        """Return the parameters' covariance from estimates without each block."""
         count = len(self.products)
         estimates = np.array([self.solve(block) for block in range(count)])
         # `cov` divides by one less than the count; the jackknife multiplies by that.
@@ -293,7 +293,7 @@ def _rows(
 
 
 def without_delay(observations: Observations, seconds: float) -> Observations:
-    """Remove a delay of the forces [s], like `remove_delay`: rows near the ends are left out."""
+    """Remove a delay of forces [s], like `remove_delay`; end rows are left out."""
     require_finite_delay(seconds)
     time = observations.time
     dt = observations.sample_time
@@ -315,7 +315,7 @@ def without_delay(observations: Observations, seconds: float) -> Observations:
     mask = np.asarray(observations.mask) & counts[:, None]
     if not mask.any(axis=0).all():
         raise InputError(
-            f"`{observations.name}` is too short for a delay of {seconds:g} s: no "
-            "rows of some joint are left."
+            f"`{observations.name}` is too short for a delay of {seconds:g} s: "
+            "no rows of some joint are left."
         )
     return observations.replace(motion=Motion(*channels), mask=mask)

@@ -1,4 +1,4 @@
-"""Drive gains: true forces relative to nominal ones, from runs without and with a known load.
+"""Drive gains from runs without and with a known load: true over nominal forces.
 
 Currents times nominal torque constants are forces up to one factor for each joint.
 Masses scale with these factors alike, so that no single run tells them; a known load
@@ -172,7 +172,7 @@ class Rows(NamedTuple):
     joints: np.ndarray  # one for the joint of each row, otherwise zero [rows, joints]
 
     def linearise(self, unknowns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return predicted less measured forces, and their derivatives by the unknowns."""
+        """Return predicted less measured forces, and their derivatives by unknowns."""
         size = self.columns.shape[1]
         reciprocals = self.joints @ unknowns[size:]
         forces = self.columns @ unknowns[:size] + self.known_forces
@@ -183,7 +183,7 @@ class Rows(NamedTuple):
 
 
 def _rows(factors: Factors, weights, parameter_map, offset) -> Rows:
-    """Return the rows of some factors; base parameters are the map times unknowns plus offset."""
+    """Return factors' rows; base parameters are the map times unknowns plus offset."""
     parts = []
     for number, joint in enumerate(factors.joints):
         R = weights[number] * joint.R
@@ -210,7 +210,7 @@ def _stack(parts: Sequence[Rows]) -> Rows:
 def _parameter_maps(
     base: BaseParameters, load: Tool | float, varying: Sequence[str] | None
 ) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Return maps and offsets from common unknowns to the base parameters of both runs."""
+    """Return maps and offsets from common unknowns to both runs' base parameters."""
     maps = state_maps(base.size, varying_parameters(base, varying), 2)
     no_offset = np.zeros(base.size)
     if isinstance(load, Tool):

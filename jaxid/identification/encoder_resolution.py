@@ -1,4 +1,4 @@
-"""Effect of the encoders' resolution on estimates, found by rounding angles once more."""
+"""Effect of encoder resolution on estimates, found by rounding angles once more."""
 
 import dataclasses
 
@@ -23,7 +23,7 @@ MAX_NAMES = 4
 
 
 def encoder_steps(recording: Recording) -> Float[np.ndarray, " joints"]:
-    """Return the step of each angle [rad or m]; zero where the values lie on no grid."""
+    """Return the step of each angle [rad or m]; zero for values on no grid."""
     angles = np.asarray(recording.angles)
     segments = [np.diff(angles[a:b], axis=0) for a, b in recording.segments]
     changes = np.abs(np.concatenate(segments))
@@ -50,7 +50,7 @@ def _step(changes) -> float:
 def resolution_bias(
     fit: Fit, recording: Recording, observations: Observations
 ) -> Float[np.ndarray, " base"]:
-    """Return the bias of base parameters that the encoders' resolution causes, in their units.
+    """Return the bias of base parameters due to encoder resolution, in their units.
 
     The filtered motion is taken for the true one, and the fitted model's forces for the
     true ones. The angles are rounded as the encoders do, filtered, and the parameters
@@ -87,7 +87,10 @@ def resolution_bias(
 def resolution_note(
     fit: Fit, recording: Recording, observations: Observations
 ) -> tuple[str, ...]:
-    """Return a sentence about parameters whose intervals the resolution makes wrong, or nothing."""
+    """Return a sentence on parameters whose intervals the resolution makes wrong.
+
+    It is empty if there are none.
+    """
     # Biases grow with the square of the steps: small ones cannot matter.
     ranges = np.std(np.asarray(recording.angles), axis=0)
     is_coarse = encoder_steps(recording) > 1e-5 * ranges

@@ -25,4 +25,4 @@ ESTIMATORS: dict[str, Callable[..., AbstractEstimator]] = {
     "instrumental": InstrumentalVariables,
     "consistent": PhysicallyConsistent,
 }
-"""Estimators of one regression problem; their arguments are settings such as `weights`."""
+"""Estimators of one regression problem; arguments are settings like `weights`."""

@@ -49,7 +49,7 @@ class RowChunk(NamedTuple):
         )
 
     def divide(self, edges: Sequence[int]) -> "Iterator[RowChunk]":
-        """Yield the parts that lie in each block of time, by the first rows of the blocks."""
+        """Yield the parts in each block of time, by the first rows of the blocks."""
         for block, rows in divide_rows(edges, self.rows):
             yield self.part(rows)._replace(block=self.block + block)
 
@@ -86,7 +86,7 @@ def row_chunks(
     samples: int,
     ranges: Sequence[tuple[int, int]] | None = None,
 ) -> Iterator[RowChunk]:
-    """Yield the rows of a recording by chunks of so many samples, not yet divided (Eq. 26).
+    """Yield the rows of a recording by chunks of samples, not yet divided (Eq. 26).
 
     Only some ranges of rows are made, or all.
     """
@@ -165,7 +165,7 @@ class Factors(eqx.Module):
     def weighted(
         self, weights: Float[AnyArray, " joints"]
     ) -> tuple[np.ndarray, np.ndarray]:
-        r"""Return matrix and right-hand side with the norms of $W \Theta_B p$, $W Q$ (Eq. 29)."""
+        r"""Return the system with the norms of $W \Theta_B p$, $W Q$ (Eq. 29)."""
         blocks = []
         for joint, weight in zip(self.joints, np.asarray(weights), strict=True):
             block = np.zeros((len(joint.R), self.size + 1))
@@ -193,7 +193,7 @@ class Factors(eqx.Module):
 
 
 def empty_factors(columns: Columns, size: int) -> Factors:
-    """Return the factors of no rows, with the columns of each joint and the number of all."""
+    """Return factors of no rows, from each joint's columns and the number of all."""
     joints = []
     for indices in columns:
         no_rows = np.zeros((0, len(indices) + 1))
@@ -216,7 +216,7 @@ class Blocks(eqx.Module):
         return Blocks(tuple(self.parts[k] for k in numbers))
 
     def scale_joints(self, factors: Float[AnyArray, " joints"]) -> "Blocks":
-        """Return the factors of rows that are multiplied by one factor for each joint."""
+        """Return the factors of rows multiplied by one factor for each joint."""
         parts = []
         for part in self.parts:
             joints = [

@@ -199,7 +199,7 @@ def _held_out_errors(
 def _neighbour_correlation(
     problem: RegressionProblem, estimator: AbstractEstimator
 ) -> float:
-    """Return the correlation of neighbouring rows of the residuals, as a mean of the joints."""
+    """Return the correlation of neighbouring residuals, as a mean of the joints."""
     parameters = np.asarray(estimator(problem).parameters)
     squares = np.zeros(problem.robot.joints)
     products = np.zeros(problem.robot.joints)

@@ -123,7 +123,7 @@ class Fit(Summarised, eqx.Module):
 
     @property
     def naive_standard_deviations(self) -> Float[np.ndarray, " base"]:
-        """Standard deviations for independent rows; filtered rows are not independent."""
+        """Standard deviations for independent rows, which filtered rows are not."""
         return self.uncertainty.naive_standard_deviations
 
     def intervals(self, level: float = 0.95) -> Float[np.ndarray, "base 2"]:
@@ -189,7 +189,7 @@ class Fit(Summarised, eqx.Module):
 
     @property
     def is_least_squares(self) -> bool:
-        """Whether the estimates are weighted least squares of the rows, up to rounding."""
+        """Whether estimates are weighted least squares of the rows, up to rounding."""
         R, z = self.factor
         difference = self.parameters - Decomposition.of(R, z).solve()
         return bool(np.linalg.norm(R @ difference) <= 1e-7 * np.linalg.norm(z))
@@ -248,8 +248,8 @@ class Fit(Summarised, eqx.Module):
             return [Remark(text, Status.GOOD)]
         combinations = "1 combination" if count == 1 else f"{count} combinations"
         headline = (
-            f"NOT DETERMINED by these logs: {combinations} of the {size} base "
-            "parameters."
+            "NOT DETERMINED by these logs: "
+            f"{combinations} of the {size} base parameters."
         )
         remarks = [Remark(headline, Status.BAD)]
         for direction in self.undetermined:
@@ -328,11 +328,11 @@ class Fit(Summarised, eqx.Module):
 
     @property
     def checksum(self) -> str:
-        """Checksum of everything that a model file of this fit holds: tells models apart."""
+        """Checksum of all that a model file of this fit holds: tells models apart."""
         return checksum_of(self._content())
 
     def save(self, path: str | Path) -> Path:
-        """Write the fit to a model file (JSON) from which `load` makes the same fit again.
+        """Write the fit to a model file (JSON), from which `load` makes it again.
 
         An estimator that holds recordings or functions is kept in words only.
 

@@ -1,4 +1,4 @@
-"""Identification: from observations to parameters with their uncertainty (Eqs. 26-33)."""
+"""Identification: from observations to parameters and uncertainty (Eqs. 26-33)."""
 
 import dataclasses
 import datetime
@@ -154,8 +154,8 @@ def _check_arguments(base: Any, recordings: Sequence[Any]) -> None:
         _require_type("observations", recording, Observations, "observe(...)")
         if recording.joints != joints:
             raise InputError(
-                f"`observations` of `{recording.name}` have {recording.joints} joints, "
-                f"the robot {joints}."
+                f"`observations` of `{recording.name}` have "
+                f"{recording.joints} joints, the robot {joints}."
             )
 
 
@@ -218,14 +218,14 @@ def naive_covariance(
 def _shrinkage_notes(
     values: np.ndarray, solution: AbstractSpectralSolution
 ) -> tuple[str, ...]:
-    """Return what standard deviations leave out if a solution shrinks weak directions."""
+    """Return what standard deviations omit if a solution shrinks weak directions."""
     is_visible = values > MIN_SINGULAR_VALUE * values.max(initial=0.0)
     fractions = solution.inverse(values) * values**2
     count = np.count_nonzero(is_visible & (fractions <= 0.5))
     if not count:
         return ()
     return (
-        f"the solution pulls {count} of {len(values)} directions of the parameters to "
-        "less than half of what the data say: standard deviations do not tell how far "
-        "from the truth this is.",
+        f"the solution pulls {count} of {len(values)} directions "
+        "of the parameters to less than half of what the data say: "
+        "standard deviations do not tell how far from the truth this is.",
     )

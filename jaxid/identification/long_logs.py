@@ -1,4 +1,4 @@
-"""Factors of long logs: one compiled loop over the samples, on all cores of the processor.
+"""Factors of long logs: one compiled loop over the samples, on all cores.
 
 The loop evaluates the columns of a chunk, filters and decimates them to rows by matrix
 products with the impulse responses, and adds up the Gram matrix of each joint's rows;
@@ -33,7 +33,7 @@ CHUNK = 2048
 PIECE = 32768
 """Samples that are passed to the loop at once."""
 TILE = 16
-"""Rows of a banded matrix product: more multiply more zeros, fewer use the processor less."""
+"""Rows of a banded product: more multiply zeros, fewer use the processor less."""
 MAX_COST = 256
 """Products for each row and column of a filter up to which a matrix product pays."""
 MAX_LAGS = 16384
@@ -60,7 +60,7 @@ def suits(observations: Observations) -> bool:
 
 
 def _stages(observations: Observations) -> list[Stage]:
-    """Return the stages of decimation that change something, the first one with the filter."""
+    """Return the stages of decimation that change something; the first one filters."""
     decimation = observations.decimation
     low_pass = observations.filter.low_pass(observations.sample_time)
     filter_response = impulse_response(low_pass)
@@ -75,7 +75,7 @@ def _stages(observations: Observations) -> list[Stage]:
 
 
 def impulse_response(low_pass: AbstractLowPass) -> Float[np.ndarray, " lags"]:
-    """Return the response to an impulse in the middle, until it has decayed on both sides."""
+    """Return the response to an impulse in the middle, decayed on both sides."""
     half = low_pass.memory()
     impulse = np.zeros(6 * half + 1)
     impulse[3 * half] = 1.0
@@ -102,7 +102,7 @@ class LoopShape(NamedTuple):
 
     @classmethod
     def of(cls, stages: Sequence[Stage], chunk: int) -> "LoopShape":
-        """Return the sizes for some stages and about so many samples of an iteration."""
+        """Return the sizes for some stages and about so many samples at once."""
         factor = math.prod(stage.factor for stage in stages)
         later_factor = factor
         shapes = []
@@ -137,7 +137,7 @@ def stream_blocks(
     edges: Sequence[int],
     progress: Progress | None = None,
 ) -> list[Factors]:
-    """Return the factors of blocks of time by the compiled loop, for logs of any length.
+    """Return the factors of blocks of time by the compiled loop, for any length of log.
 
     All cores share the log. Products are added up in the order of the pieces, so that
     the number of cores changes no digit. `edges` are the first row of each block, and
@@ -216,7 +216,7 @@ class _Stream:
         return iterations * self._shape.samples * self._stride
 
     def _rows_of_ends(self) -> Iterator[tuple[int, list[np.ndarray]]]:
-        """Yield block and equations of the rows that no piece covers, reduced in NumPy."""
+        """Yield block and equations of rows that no piece covers, reduced in NumPy."""
         is_end = np.ones(len(self._mask), bool)
         for piece in self._pieces:
             is_end[piece.rows] = False
@@ -338,7 +338,7 @@ def _fill_up(x: np.ndarray, length: int) -> np.ndarray:
 def _shows_every_direction(
     total: np.ndarray, first_grams: np.ndarray, mixing: np.ndarray, ratio: float = 1e4
 ) -> bool:
-    """Return whether the first look has shown the size of every direction that it has shown."""
+    """Return whether the first look has shown the size of each direction it saw."""
     values, directions = np.linalg.eigh(mixing.T @ first_grams @ mixing)
     visible_directions = directions[:, values > 0.5]
     if not visible_directions.shape[1]:
@@ -359,7 +359,10 @@ def _regular_triangle(G: np.ndarray) -> np.ndarray:
 
 
 def _root(G: np.ndarray) -> np.ndarray:
-    """Return an upper triangle whose square is G, which may be singular; zero columns stay zero."""
+    """Return an upper triangle whose square is G; zero columns stay zero.
+
+    G may be singular.
+    """
     root = np.zeros_like(G)
     columns = np.flatnonzero(np.diag(G) > 0)
     places = np.ix_(columns, columns)

@@ -1,4 +1,4 @@
-"""Many data sets in one call: robots of one kind, noise draws, geometries, any estimator.
+"""Many data sets in one call: like robots, noise draws, geometries, any estimator.
 
 Least squares of all data sets are one compiled computation. Data sets that are not well
 conditioned are solved again by orthogonal factors, one by one, and so are all of them
@@ -177,7 +177,7 @@ def _solve_again(
     fit: BatchFit,
     row_time: float | None,
 ) -> BatchFit:
-    """Solve the data sets that are not well conditioned by orthogonal factors, one by one."""
+    """Solve data sets that are not well conditioned by orthogonal factors, singly."""
     fit = jax.tree.map(np.array, fit)
     for k in np.flatnonzero(~fit.determined).tolist():
         data_set = jax.tree.map(lambda x, k=k: np.asarray(x)[k : k + 1], batch)
@@ -257,8 +257,8 @@ def _with_geometries(
         is_alike = other.parent == robot.parent and other.revolute == robot.revolute
         if not is_alike or other.tool is not None:
             raise InputError(
-                f"`{other.name}` of `robots` must have the topology of `{robot.name}`, "
-                "and no tool."
+                f"`{other.name}` of `robots` must have "
+                f"the topology of `{robot.name}`, and no tool."
             )
         placed = robot.replace(
             axis=other.axis,

@@ -1,4 +1,4 @@
-"""Choice between models and estimators by errors on data that their fits have not seen."""
+"""Choice between models and estimators by errors on data unseen by their fits."""
 
 import itertools
 from collections.abc import Sequence
@@ -89,11 +89,11 @@ class ModelChoice(Summarised, eqx.Module):
 
     def __str__(self):
         return (
-            f"`{self.chosen.name}` is the simplest model whose error exceeds the "
-            "smallest one by at most one deviation of the difference. On further data "
-            f"of this kind expect errors of {percent(self.promise)} % of the forces: "
-            f"{self.parts} were left out in turn, and the choice was repeated without "
-            "each."
+            f"`{self.chosen.name}` is the simplest model whose error exceeds "
+            "the smallest one by at most one deviation of the difference. "
+            f"On further data of this kind expect errors of {percent(self.promise)} % "
+            f"of the forces: {self.parts} were left out in turn, "
+            "and the choice was repeated without each."
         )
 
 
@@ -103,7 +103,7 @@ def choose_model(
     *,
     progress: Progress | None = None,
 ) -> ModelChoice:
-    """Choose the simplest model that predicts unseen parts of the data about as well as any.
+    """Choose the simplest model that predicts unseen data about as well as any other.
 
     Parts of time are left out in turn, or whole logs if there are at least four. Each
     candidate is fitted to the rest and predicts the part. Of all candidates whose mean

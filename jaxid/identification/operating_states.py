@@ -1,4 +1,4 @@
-"""Several states of one robot, cold and warm or light and loaded, identified together (Sec. 6)."""
+"""Several states of one robot, like cold and warm, identified together (Sec. 6)."""
 
 from collections.abc import Sequence
 
@@ -106,7 +106,7 @@ class StatesFit(Summarised, eqx.Module):
 
     @property
     def sharing(self) -> tuple[float, float]:
-        """Statistic and p-value of a joint test whether the states agree on shared parameters.
+        """Statistic and p-value of a test if states agree on shared parameters.
 
         The states' own estimates are compared with those of the first state. A small
         p-value says that some of them have changed after all.
@@ -140,7 +140,9 @@ class StatesFit(Summarised, eqx.Module):
 def identify_states(
     fits: Sequence[Fit], varying: Sequence[str] | None = None
 ) -> StatesFit:
-    """Identify a robot in several states at once: inertia is shared, friction is each state's.
+    """Identify a robot in several states at once, with common inertia.
+
+    Friction is each state's own.
 
     The factors of the fits are combined, without another pass over the data. Shared
     parameters become more precise than in any single fit, and so do those that vary,
@@ -178,7 +180,7 @@ def identify_states(
 def state_indices(
     size: int, varying: Sequence[int], state: int
 ) -> Int[np.ndarray, " base"]:
-    """Return the places of a state's parameters among all: shared ones, then those of each."""
+    """Return places of a state's parameters: shared ones, then those of each state."""
     is_varying = np.isin(np.arange(size), varying)
     count = np.count_nonzero(is_varying)
     indices = np.cumsum(~is_varying) - 1
@@ -189,7 +191,7 @@ def state_indices(
 
 
 def state_maps(size: int, varying: Sequence[int], states: int) -> list[np.ndarray]:
-    """Return for each state the matrix [base, unknowns] from unknowns to its base parameters."""
+    """Return each state's matrix [base, unknowns] from unknowns to base parameters."""
     unit = np.eye(size + (states - 1) * len(varying))
     return [unit[state_indices(size, varying, state)] for state in range(states)]
 
@@ -197,7 +199,10 @@ def state_maps(size: int, varying: Sequence[int], states: int) -> list[np.ndarra
 def varying_parameters(
     base: BaseParameters, varying: Sequence[str] | None
 ) -> tuple[int, ...]:
-    """Return which base parameters each state has for itself; by default those without energy."""
+    """Return which base parameters are each state's own.
+
+    By default they are those without energy.
+    """
     if varying is None:
         return tuple(np.flatnonzero(~stores_energy(base)).tolist())
     for name in varying:
@@ -209,7 +214,9 @@ def varying_parameters(
 
 
 def stores_energy(base: BaseParameters) -> Bool[np.ndarray, " base"]:
-    """Return which base parameters make kinetic or potential energy; friction and offsets do not.
+    """Return which base parameters make kinetic or potential energy.
+
+    Friction and offsets do not.
 
     Forces of the others neither depend on accelerations nor come from a potential,
     whatever the terms of the model are called.

@@ -39,7 +39,7 @@ class Verdict(enum.Enum):
 
 
 class Comparison(Summarised, eqx.Module):
-    r"""Differences of the base parameters of two fits, and which are more than chance (Sec. 6).
+    r"""Differences of the base parameters of two fits, and their significance (Sec. 6).
 
     A parameter has changed if its difference is larger than its own uncertainty allows:
     $|b_1 - b_2| > t \sqrt{s_1^2 + s_2^2}$. That one lies outside the other's interval
@@ -109,7 +109,7 @@ class Comparison(Summarised, eqx.Module):
 
     @property
     def adjusted_p_values(self) -> Float[np.ndarray, " compared"]:
-        """The same with Holm's correction for the number of parameters that are tested."""
+        """The same, with Holm's correction for the number of tested parameters."""
         adjusted = np.ones(len(self.indices))
         adjusted[self.determined] = _holm(self.p_values[self.determined])
         return adjusted
@@ -127,7 +127,7 @@ class Comparison(Summarised, eqx.Module):
 
     @property
     def groups(self) -> list[dict[str, Any]]:
-        """A joint test for each kind of parameter, with Holm's correction for their number.
+        """A joint test for each kind of parameter, with Holm's correction.
 
         Each has `name`, the number of determined `parameters`, the `statistic` (about
         that number where nothing has changed), its `p_value`, and whether the group has
@@ -156,7 +156,7 @@ class Comparison(Summarised, eqx.Module):
         return groups
 
     def summary(self) -> Table:
-        """Return a table of both estimates, their differences with intervals, and verdicts."""
+        """Return a table of estimates, differences with intervals, and verdicts."""
         kinds = self.kinds
         verdicts = self.verdicts
         half_widths = self.half_widths
@@ -249,7 +249,7 @@ def compare(first: Fit, second: Fit, level: float = LEVEL) -> Comparison:
 def compare_some(
     first: Fit, second: Fit, indices: Sequence[int], cross: AnyArray, level: float
 ) -> Comparison:
-    """Compare some base parameters of two fits, whose estimates have a cross-covariance."""
+    """Compare base parameters of two fits whose estimates have a cross-covariance."""
     if not 0 < level < 1:
         raise InputError(
             f"`level` must lie between 0 and 1, like 0.95, but is {level:g}."
@@ -303,7 +303,9 @@ def _holm(p: Float[np.ndarray, " tests"]) -> Float[np.ndarray, " tests"]:
 def joint_test(
     difference: AnyArray, covariance: AnyArray, dof: float
 ) -> tuple[float, float]:
-    r"""Test by $d^T C^{-1} d$ if differences are more than chance: statistic and p-value.
+    r"""Test if differences are more than chance: statistic and p-value.
+
+    The statistic is $d^T C^{-1} d$.
 
     It is chi-squared where the covariance is exact, else Hotelling's $T^2$. All
     variances must be finite and above zero; without differences nothing has changed.
@@ -330,7 +332,7 @@ def joint_test(
 
 
 def parameter_kinds(base: BaseParameters) -> tuple[str, ...]:
-    """Return for each base parameter the term of its leading parameter, as `viscous friction`."""
+    """Return the term of each leading parameter in words, like `viscous friction`."""
     model = base.model
     kinds = []
     for term in model.terms:

@@ -47,7 +47,7 @@ class EssentialParameters(eqx.Module):
 
     @property
     def eliminated(self) -> tuple[str, ...]:
-        """Names of the parameters that are not essential, in the order of elimination."""
+        """Names of the inessential parameters, in the order of elimination."""
         size = self.fit.base.size
         return tuple(step.name for step in self.path[1:] if step.remaining >= size)
 
@@ -63,10 +63,10 @@ class EssentialParameters(eqx.Module):
         start = self.path[0]
         end = self.last_step
         return (
-            f"{end.remaining} of {start.remaining} base parameters are essential: with "
-            f"them alone the error on held-out blocks of time is "
-            f"{100 * end.held_out:.2f} % of the forces, with all "
-            f"{100 * start.held_out:.2f} %."
+            f"{end.remaining} of {start.remaining} base parameters are essential: "
+            "with them alone the error on held-out blocks "
+            f"of time is {100 * end.held_out:.2f} % of the forces, "
+            f"with all {100 * start.held_out:.2f} %."
         )
 
 
@@ -77,7 +77,7 @@ def essential_parameters(
     cost: float = 0.02,
     uncertainty: AbstractUncertainty | None = None,
 ) -> EssentialParameters:
-    """Eliminate the parameter with the largest relative standard deviation, again and again.
+    """Eliminate the parameter with the largest relative deviation, again and again.
 
     Held-out errors decide where to stop: at the fewest parameters whose error exceeds
     the smallest on the path by `cost` at most. Standard deviations are those of the
@@ -143,7 +143,7 @@ def _elimination_order(fit: Fit, factors: Factors) -> list[int]:
 
 
 def _inflation(deviations, naive_deviations) -> np.ndarray:
-    """Return the ratio of deviations to those of independent rows; infinite if unknown."""
+    """Return deviations over those of independent rows; infinite if unknown."""
     has_ratio = np.isfinite(deviations) & (naive_deviations > 0)
     inflation = np.full_like(deviations, np.inf)
     inflation[has_ratio] = deviations[has_ratio] / naive_deviations[has_ratio]
@@ -153,7 +153,7 @@ def _inflation(deviations, naive_deviations) -> np.ndarray:
 def _held_out_errors(
     fit: Fit, problem: RegressionProblem, order: Sequence[int]
 ) -> list[float]:
-    """Return the error on held-out parts before each elimination, relative to the forces."""
+    """Return relative errors on held-out parts before each elimination."""
     joint_weights = fit.weights**2
     total = float(joint_weights @ problem.factors.force_squares)
     squares = np.zeros(len(order))
@@ -167,7 +167,7 @@ def _held_out_errors(
 
 
 def _solve(R, z, parameters: list[int]) -> tuple[np.ndarray, np.ndarray]:
-    """Return least squares in some parameters, the others zero, and the inverse information."""
+    """Return least squares in some parameters, others zero, and inverse information."""
     decomposition = Decomposition.of(R[:, parameters], z)
     p = np.zeros(R.shape[1])
     p[parameters] = decomposition.solve()

@@ -85,7 +85,7 @@ class Payload(Summarised, eqx.Module):
 
     @property
     def central(self) -> tuple[Float[np.ndarray, "10"], Uncertainty]:
-        """Mass, centre of mass, and moments about it, with their uncertainty (`CENTRAL_NAMES`)."""
+        """Mass, centre of mass, moments about it, and uncertainty (`CENTRAL_NAMES`)."""
         with double_precision():
             p = jnp.asarray(self.parameters)
             values = np.asarray(_about_centre(p))
@@ -100,7 +100,7 @@ class Payload(Summarised, eqx.Module):
         return values, Uncertainty(central, self.uncertainty.dof, central)
 
     def summary(self) -> Table:
-        """Return a table of mass, centre of mass and moments about it, and of their consistency."""
+        """Return a table of mass, centre, moments about it, and consistency."""
         values, uncertainty = self.central
         return interval_table(
             "payload in the frame of its body; moments about the centre of mass",

@@ -1,4 +1,4 @@
-"""The regression problem of identification: one pass over the rows makes all its factors."""
+"""The regression problem of identification: one pass over rows makes all factors."""
 
 import functools
 from collections.abc import Callable, Iterator, Sequence
@@ -25,7 +25,7 @@ class Span(NamedTuple):
 
 
 class RegressionProblem:
-    r"""Linear equations $\Theta p = Q$ of some recordings, and the factors of their rows (Eq. 26).
+    r"""Linear equations $\Theta p = Q$ of recordings, and their factors (Eq. 26).
 
     Most estimators need only `blocks` or `factors`: one triangle for each joint.
     Estimators that need the rows themselves, or residuals, iterate over `chunks`, in
@@ -80,7 +80,7 @@ class RegressionProblem:
 
     @functools.cached_property
     def blocks(self) -> Blocks:
-        """The factors by contiguous blocks of time, made by the first pass over the rows."""
+        """Factors by contiguous blocks of time, made by the first pass over rows."""
         if self._initial_blocks is not None:
             return self._initial_blocks
         self._require_samples()
@@ -203,7 +203,7 @@ class RegressionProblem:
             yield chunk, chunk.residuals(p)
 
     def reweighted(self, p: np.ndarray, weight: Callable, scale: np.ndarray) -> Blocks:
-        """Return the factors of rows that have weights of their own, by the same blocks of time.
+        """Return the factors of rows with their own weights, by blocks of time.
 
         Args:
             p: Base parameters, which give each row its residual.
@@ -233,7 +233,7 @@ def block_edges(observations: Observations, blocks: int) -> list[int]:
 def cross_validation_folds(
     blocks: Blocks, count: int = 5
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return indices of all blocks but one contiguous part of time, and of that part; each once."""
+    """Return indices of all blocks but a contiguous part, and of it, for each part."""
     numbers = np.arange(len(blocks.parts))
     if len(numbers) < 2:
         raise InputError(

@@ -91,10 +91,9 @@ def _require_private(folder: Path) -> None:
         status.st_uid != os.getuid() or status.st_mode & 0o022
     ):
         raise InputError(
-            f"`{folder}` belongs to somebody else, or others can write to it, but "
-            "code from there "
-            f"is run: give {VARIABLE} a folder of your own, or turn the cache off "
-            "with `off`."
+            f"`{folder}` belongs to somebody else, "
+            "or others can write to it, but code from there is run: "
+            f"give {VARIABLE} a folder of your own, or turn the cache off with `off`."
         )
 
 

@@ -139,8 +139,8 @@ class Program:
         for k, (x, shape) in enumerate(zip(arrays, self.input_shapes, strict=True)):
             if x.shape[: len(shape)] != shape:
                 raise InputError(
-                    f"Input {k} must have shape {shape}, but has {x.shape}: put the "
-                    "batch last."
+                    f"Input {k} must have shape {shape}, "
+                    f"but has {x.shape}: put the batch last."
                 )
             batches.append(x.shape[len(shape) :])
         batch = np.broadcast_shapes(*batches) if batches else ()

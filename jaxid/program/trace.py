@@ -156,8 +156,8 @@ def _move_by_index(
     (positions,) = _on_numbers(equation, *labels)
     if not ((positions >= 0) & (positions < start)).all():
         raise InputError(
-            f"`trace` met an index outside of its array in `{equation.primitive}`: "
-            "correct it."
+            "`trace` met an index outside of its array "
+            f"in `{equation.primitive}`: correct it."
         )
     return np.concatenate(entries)[positions.astype(int)]
 
@@ -308,8 +308,8 @@ def _convert(x: np.ndarray, dtype: np.dtype) -> np.ndarray:
     if holds_truth_values or np.issubdtype(dtype, np.floating):
         return np.asarray(_each(scalar.as_number, 1)(x), object)
     raise InputError(
-        f"`trace` cannot translate a conversion to {dtype}: a program computes with "
-        "real numbers."
+        f"`trace` cannot translate a conversion to {dtype}: "
+        "a program computes with real numbers."
     )
 
 
@@ -327,8 +327,8 @@ def _translate(equation: JaxprEqn, operands: list[np.ndarray]) -> list[np.ndarra
         carriers = _INDEXED[name]
         if any(_is_symbolic(x) for k, x in enumerate(operands) if k not in carriers):
             raise InputError(
-                f"`trace` cannot translate `{name}` with a variable index: use "
-                "constant integers."
+                f"`trace` cannot translate `{name}` "
+                "with a variable index: use constant integers."
             )
         if "add" in name:
             return [_scatter_add(equation, operands)]
@@ -354,8 +354,8 @@ def _as_constant(constant: object) -> np.ndarray:
     """Return a constant of a traced function in NumPy."""
     if isinstance(constant, Tracer):
         raise InputError(
-            "`trace`: the function closes over a value that JAX is tracing: pass it "
-            "as an input."
+            "`trace`: the function closes over a value "
+            "that JAX is tracing: pass it as an input."
         )
     return np.asarray(constant)
 

@@ -85,8 +85,8 @@ def _read_shape(tree: UrdfTree, packages: str | Path | None, element: Any) -> Sh
         case "cylinder" | "capsule":
             return Shape.about_axis(number("length"), number("radius"))
     raise InputError(
-        f"{tree.place(element)}: `{element.tag}` is no box, cylinder, sphere, capsule "
-        "or mesh."
+        f"{tree.place(element)}: `{element.tag}` is no box, "
+        "cylinder, sphere, capsule or mesh."
     )
 
 
@@ -101,8 +101,8 @@ def _mesh_vertices(
     file = next(filter(Path.is_file, files), None)
     if file is None:
         raise FileNotFoundError(
-            f"{tree.place(element)}: the mesh `{name}` is not there: give its folder "
-            "by `packages`."
+            f"{tree.place(element)}: the mesh `{name}` is not there: "
+            "give its folder by `packages`."
         )
     try:
         mesh: Any = trimesh.load(str(file), force="mesh", process=False)

@@ -232,8 +232,8 @@ class CollisionModel(Hashable):
         i, k = sorted(names.index(name) for name in pair)
         if i >= len(self.capsules) or i == k:
             raise InputError(
-                f"`{pair[0]}` and `{pair[1]}` cannot meet: pair a capsule with another "
-                "shape."
+                f"`{pair[0]}` and `{pair[1]}` cannot meet: "
+                "pair a capsule with another shape."
             )
         return i, k
 

@@ -59,7 +59,7 @@ class Inertia(eqx.Module):
 
     @classmethod
     def from_parameters(cls, p: Float[AnyArray, "*batch 10"]) -> "Inertia":
-        """Return the inertia of ten parameters (Eq. 9); its centre is 0 without mass."""
+        """Return the inertia of ten parameters, centred at 0 without mass (Eq. 9)."""
         xp = namespace(p)
         mass = p[..., 0]
         has_mass = (mass != 0)[..., None]
@@ -119,8 +119,8 @@ class Inertia(eqx.Module):
         moment = np.abs(tensor).max()
         if moment > DOUBTFUL_LENGTH**2 * max(mass, 1.0):
             return (
-                f"its `inertia` is {moment:g} kg m² at a mass of {mass:g} kg: is it "
-                "in kg mm²?"
+                f"its `inertia` is {moment:g} kg m² "
+                f"at a mass of {mass:g} kg: is it in kg mm²?"
             )
         if np.abs(tensor - tensor.T).max() > rounding * moment:
             return "its `inertia` is not symmetric"
@@ -129,9 +129,9 @@ class Inertia(eqx.Module):
         slack = rounding * max(abs(low), abs(high)) + 1e-4 * rounding * mass
         if low < -slack or high > low + middle + slack:
             return (
-                f"its `inertia` has the principal moments {low:.3g}, {middle:.3g}, "
-                f"{high:.3g} kg m², of which one is negative, or larger than the sum "
-                "of the others"
+                f"its `inertia` has the principal moments {low:.3g}, "
+                f"{middle:.3g}, {high:.3g} kg m², of which one is negative, "
+                "or larger than the sum of the others"
             )
         return ""
 

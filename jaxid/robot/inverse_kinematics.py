@@ -211,8 +211,8 @@ def _require_followed(task: _TipTask, positions: np.ndarray, q: np.ndarray) -> N
     k = int(failures[0])
     if not is_reached[k]:
         reason = (
-            f"it comes to within {distances[k]:.3g} m and {angles[k]:.3g} rad of the "
-            "pose"
+            f"it comes to within {distances[k]:.3g} m "
+            f"and {angles[k]:.3g} rad of the pose"
         )
     elif not is_in_range[k]:
         reason = (
@@ -222,7 +222,7 @@ def _require_followed(task: _TipTask, positions: np.ndarray, q: np.ndarray) -> N
         reason = "the joints would have to jump, for the pose is singular"
     place = ", ".join(f"{x:.3f}" for x in positions[k])
     raise InputError(
-        f"`{robot.name}` cannot follow the path: at pose {k + 1} of {len(q)}, "
-        f"({place}) m, {reason}; choose another posture, or a path nearer to the "
-        "middle of its reach."
+        f"`{robot.name}` cannot follow the path: "
+        f"at pose {k + 1} of {len(q)}, ({place}) m, {reason}; "
+        "choose another posture, or a path nearer to the middle of its reach."
     )

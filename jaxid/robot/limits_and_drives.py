@@ -173,8 +173,8 @@ def _reduction_matrix(reduction: Any, joints: int) -> AnyArray:
         matrix = np.diag(matrix)
     if matrix.shape != (joints, joints) or not np.isfinite(matrix).all():
         raise InputError(
-            f"`reduction` must hold {joints} or {joints} x {joints} finite ratios, not "
-            f"{matrix.shape}."
+            f"`reduction` must hold {joints} or {joints} x "
+            f"{joints} finite ratios, not {matrix.shape}."
         )
     # Gear ratios of different sizes are no sign of a singular matrix.
     row_sizes = np.abs(matrix).max(axis=1, keepdims=True)
@@ -207,8 +207,8 @@ def per_joint(name: str, value: Numbers | None, joints: int, unknown: float) -> 
         array = np.full(joints, unknown)
     if array.shape != (joints,):
         raise InputError(
-            f"`{name}` must hold one number for each joint ({joints}), but has shape "
-            f"{array.shape}."
+            f"`{name}` must hold one number for each joint "
+            f"({joints}), but has shape {array.shape}."
         )
     if not np.isnan(unknown):
         _require(name, array, lambda x: ~np.isnan(x), "a number")
@@ -230,8 +230,8 @@ def _require(name: str, values: AnyArray, rule: Any, words: str) -> None:
     if faults.size:
         joint = faults[0]
         raise InputError(
-            f"`{name}` must be {words}, but that of joint {joint + 1} is "
-            f"{values[joint]:g}."
+            f"`{name}` must be {words}, but that "
+            f"of joint {joint + 1} is {values[joint]:g}."
         )
 
 
@@ -241,8 +241,8 @@ def _require_ranges(low: np.ndarray, high: np.ndarray) -> None:
     if faults.size:
         joint = faults[0]
         raise InputError(
-            f"`position_min` of joint {joint + 1} must be below {high[joint]:g}, but "
-            f"is {low[joint]:g}."
+            f"`position_min` of joint {joint + 1} must be "
+            f"below {high[joint]:g}, but is {low[joint]:g}."
         )
 
 
@@ -283,9 +283,9 @@ def limit_notes(
             joints_by_speed.setdefault(float(speed), []).append(name)
     for speed, joints in joints_by_speed.items():
         notes.append(
-            f"{owners('joint', joints)}: a velocity of up to {speed:g} rad/s is "
-            f"{30 * speed / np.pi:.4g} turns a minute: is the limit in degrees per "
-            "second, or none?"
+            f"{owners('joint', joints)}: a velocity of up "
+            f"to {speed:g} rad/s is {30 * speed / np.pi:.4g} turns a minute: "
+            "is the limit in degrees per second, or none?"
         )
     return notes
 

@@ -173,8 +173,8 @@ class Robot(Summarised, eqx.Module):
         in_order = all(-1 <= p < i for i, p in enumerate(self.parent))
         if len(self.parent) != n or not in_order:
             raise InputError(
-                f"`parent` must hold an earlier body, or -1, for each of {n}, but is "
-                f"{self.parent}."
+                "`parent` must hold an earlier body, or -1, "
+                f"for each of {n}, but is {self.parent}."
             )
         if len(self.joint_names) != n or len(set(self.joint_names)) != n:
             raise InputError(
@@ -198,8 +198,8 @@ class Robot(Summarised, eqx.Module):
         for field, per_joint in numbers.items():
             if per_joint.shape[-1:] != (n,):
                 raise InputError(
-                    f"`{field}` must be of {n} joints, like the robot, but are of "
-                    f"{per_joint.shape[-1]}."
+                    f"`{field}` must be of {n} joints, "
+                    f"like the robot, but are of {per_joint.shape[-1]}."
                 )
 
     def _length_notes(self) -> list[str]:

@@ -203,8 +203,8 @@ def _held_notes(tree: UrdfTree) -> list[str]:
     for (master, position), names in groups.items():
         cause = f"mimic of joint `{master}`" if master else "constraint"
         notes.append(
-            f"{owners('joint', names)}: held at {position} ({cause}); the links belong "
-            "to the bodies that carry them."
+            f"{owners('joint', names)}: held at {position} ({cause}); "
+            "the links belong to the bodies that carry them."
         )
     if tree.objects:
         links = owners("link", tree.objects)
@@ -225,14 +225,14 @@ def _inertial_notes(tree: UrdfTree) -> list[str]:
     light_bodies = [tree.joints[i].get("name") for i in np.flatnonzero(masses == 0.0)]
     if light_bodies:
         notes.append(
-            f"{owners('joint', light_bodies)}: the body has no mass; "
-            "`urdf_parameters` takes zero."
+            f"{owners('joint', light_bodies)}: "
+            "the body has no mass; `urdf_parameters` takes zero."
         )
     for link, fault in faults.items():
         if fault:
             notes.append(
-                f"link `{link}`: its inertial, which identification does not need, "
-                f"belongs to no body: {fault}."
+                f"link `{link}`: its inertial, which identification "
+                f"does not need, belongs to no body: {fault}."
             )
     return notes
 

@@ -230,9 +230,9 @@ class UrdfTree:
                 continue
             if self.carriers[first].body != self.carriers[second].body:
                 raise InputError(
-                    f"`{self.path}`: the constraint `{name}` between `{first}` and "
-                    f"`{second}` closes a loop: avoid it (`tip`, `--tip`), or remove "
-                    "it."
+                    f"`{self.path}`: the constraint `{name}` "
+                    f"between `{first}` and `{second}` closes a loop: "
+                    "avoid it (`tip`, `--tip`), or remove it."
                 )
 
     def branch(self, joint: Any) -> Iterator[Any]:
@@ -297,8 +297,8 @@ class UrdfTree:
         while link != base:
             if link not in self._above:
                 raise InputError(
-                    f"`{self.path}`: no chain leads from `base` `{base}` to `tip` "
-                    f"`{tip}`."
+                    f"`{self.path}`: no chain leads "
+                    f"from `base` `{base}` to `tip` `{tip}`."
                 )
             joints.append(self._above[link])
             link, _ = link_names(self._above[link])
@@ -325,8 +325,8 @@ class UrdfTree:
                 cure = f"hold the robot at its base (`base`, `--base {child}`)"
             raise self.error(
                 joint,
-                f"is {kind}, but must turn or slide: avoid it (`tip`, `--tip`), or "
-                f"{cure}",
+                f"is {kind}, but must turn or slide: "
+                f"avoid it (`tip`, `--tip`), or {cure}",
             )
         axis = self.numbers(joint.find("axis"), "xyz", (1.0, 0.0, 0.0))
         length = np.linalg.norm(axis)
@@ -346,8 +346,8 @@ class UrdfTree:
             inertia, fault = inertial
             if check and fault:
                 raise InputError(
-                    f"`{self.path}`: the inertial of link `{link}` belongs to no "
-                    f"body: {fault}."
+                    f"`{self.path}`: the inertial of link "
+                    f"`{link}` belongs to no body: {fault}."
                 )
             parameters[body] += inertia.moved(rotation, position).parameters
         return parameters

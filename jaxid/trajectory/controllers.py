@@ -43,8 +43,8 @@ def write_urscript(
     q = trajectory.sample(sample_time)[1].q
     rows = ["[" + ", ".join(f"{x:.9f}" for x in row) + "]" for row in q.tolist()]
     lines = [
-        f"# Motion of `{robot.name}`: {len(rows)} positions [rad], one in "
-        f"{sample_time:.6g} s.",
+        f"# Motion of `{robot.name}`: "
+        f"{len(rows)} positions [rad], one in {sample_time:.6g} s.",
         "def play_motion():",
         f"  movej({rows[0]}, a=0.5, v=0.3)",
         *(f"  servoj({row}, 0, 0, {sample_time:.6g}, 0.1, 300)" for row in rows),

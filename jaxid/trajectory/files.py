@@ -146,8 +146,8 @@ def write_ros(
         return
     header = {"stamp": _ros_time(0.0), "frame_id": ""}
     lines = [
-        f"# {MESSAGE} of `{robot.name}`: rad (revolute joints) or m (prismatic "
-        "joints), and s;",
+        f"# {MESSAGE} of `{robot.name}`: rad (revolute "
+        "joints) or m (prismatic joints), and s;",
         f"# at most {sample_time:.6g} s from one point to the next.",
         "# Move the robot slowly to the first point, then:",
         f"#   ros2 topic pub --once {TOPIC} \\",
@@ -205,7 +205,7 @@ def _sample(
     """Return times and motion of a trajectory that moves the robot's joints."""
     if trajectory.joints != robot.joints:
         raise InputError(
-            f"`trajectory` must move the {robot.joints} joints of `{robot.name}`, but "
-            f"moves {trajectory.joints}."
+            f"`trajectory` must move the {robot.joints} joints "
+            f"of `{robot.name}`, but moves {trajectory.joints}."
         )
     return trajectory.sample(sample_time)

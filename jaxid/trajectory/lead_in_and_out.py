@@ -225,8 +225,8 @@ def with_leads(
         raise InputError(f"`periods` must be at least 1, but is {periods}.")
     if series.joints != robot.joints:
         raise InputError(
-            f"`series` must move the robot's {robot.joints} joints, but moves "
-            f"{series.joints}."
+            f"`series` must move the robot's {robot.joints} "
+            f"joints, but moves {series.joints}."
         )
     period = float(series.duration)
     phases = period * np.arange(PHASES) / PHASES
@@ -243,10 +243,10 @@ def with_leads(
         nearest_phase = int(np.argmin(excess.max(axis=1)))
         joint = int(np.argmax(excess[nearest_phase]))
         raise InputError(
-            "no instant of the period can be reached from standstill within the "
-            f"limits: at best joint `{robot.joint_names[joint]}` exceeds one of them "
-            f"by {100 * excess[nearest_phase, joint]:.3g} %: take a motion that uses "
-            "less of the limits."
+            "no instant of the period can be reached from standstill within "
+            f"the limits: at best joint `{robot.joint_names[joint]}` exceeds "
+            f"one of them by {100 * excess[nearest_phase, joint]:.3g} %: "
+            "take a motion that uses less of the limits."
         )
     return WithLeads(
         series,

@@ -124,13 +124,13 @@ class TipPath(eqx.Module):
             gap = 0.0 if place is None else float(np.linalg.norm(start - place))
             if gap > 1e-9:
                 raise InputError(
-                    f"piece {number} of `pieces` starts {gap:.3g} m from where the one "
-                    "before ends."
+                    f"piece {number} of `pieces` starts "
+                    f"{gap:.3g} m from where the one before ends."
                 )
             if not 0 < piece.length < np.inf:
                 raise InputError(
-                    f"piece {number} of `pieces` must have a length, but it is "
-                    f"{piece.length:g} m."
+                    f"piece {number} of `pieces` must have a length, "
+                    f"but it is {piece.length:g} m."
                 )
             place = end
 
@@ -295,8 +295,8 @@ def _require_speeds(
     excess = max(used_speed[joint], used_acceleration[joint])
     slowdown = 1.01 * slowdowns[joint]
     raise InputError(
-        f"joint `{robot.joint_names[joint]}` would need {excess:.2f} times its largest "
-        f"{quantity}: give the path a `speed` of {path.speed / slowdown:.3g} m/s and "
-        f"an `acceleration` of {path.acceleration / slowdown**2:.3g} m/s², or choose "
-        "another posture."
+        f"joint `{robot.joint_names[joint]}` would need {excess:.2f} times "
+        f"its largest {quantity}: give the path a `speed` "
+        f"of {path.speed / slowdown:.3g} m/s and an `acceleration` "
+        f"of {path.acceleration / slowdown**2:.3g} m/s², or choose another posture."
     )

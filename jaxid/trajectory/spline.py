@@ -146,8 +146,8 @@ def spline_through(points: Numbers, duration: float) -> LinearTrajectory:
     rows = np.asarray(as_array("points", points), np.float64)
     if rows.ndim != 2 or len(rows) < 2 or not np.isfinite(rows).all():
         raise InputError(
-            "`points` must hold two or more rows of finite numbers, but has shape "
-            f"{rows.shape}."
+            "`points` must hold two or more rows "
+            f"of finite numbers, but has shape {rows.shape}."
         )
     spline = interpolate_at_rest(np.linspace(0.0, 1.0, len(rows)), rows)
     # The first three control points are the start, and the last three are the end.

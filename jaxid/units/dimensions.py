@@ -25,7 +25,7 @@ _EXPONENTS = {"²": 2, "³": 3, "⁴": 4}
 
 
 def dimension(unit: str) -> Dimension | None:
-    """Return the dimension of a unit such as `N m s/rad`, or None if it is not known."""
+    """Return the dimension of a unit such as `N m s/rad`; None if it is not known."""
     exponents = [0, 0, 0]
     numerator, *denominators = unit.split("/")
     for part, sign in ((numerator, 1), *((part, -1) for part in denominators)):
@@ -40,6 +40,6 @@ def dimension(unit: str) -> Dimension | None:
 
 
 def length_power(unit: str) -> int:
-    """Return the power of length in a unit: 2 in kg m² and in N m; 0 if it is not known."""
+    """Return the power of length in a unit: 2 in kg m² and N m; 0 if unknown."""
     unit_dimension = dimension(unit)
     return 0 if unit_dimension is None else unit_dimension.metre

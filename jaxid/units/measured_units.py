@@ -40,8 +40,8 @@ class Unit:
         """Refuse factors that cannot be inverted."""
         if not np.isfinite(self.factor) or self.factor == 0:
             raise InputError(
-                f"`factor` of `{self.symbol}` must be finite and not zero, but is "
-                f"{self.factor}."
+                f"`factor` of `{self.symbol}` must be "
+                f"finite and not zero, but is {self.factor}."
             )
 
 

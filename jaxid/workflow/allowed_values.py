@@ -15,7 +15,7 @@ from jaxid.errors import InputError
 
 
 class Bounds(NamedTuple):
-    """Range of a number, given as `Annotated[float, Bounds(above=0.0)]`; None for no bound."""
+    """Range of a number in `Annotated[float, Bounds(above=0.0)]`; None for no bound."""
 
     above: float | None = None  # exclusive lower bound
     minimum: float | None = None  # inclusive lower bound

@@ -120,7 +120,7 @@ class Excitation:
         return self.chosen_leads is not None or self.rest or self.spline is not None
 
     def basis(self, constrained: bool) -> AbstractBasis:
-        """Return the basis of the trajectories; with other constraints, leads are designed too.
+        """Return the basis of trajectories; if constrained, leads are designed, too.
 
         Raises:
             InputError: If two kinds are asked for, or one whose end no sample would
@@ -129,8 +129,8 @@ class Excitation:
         if self.spline is not None:
             if self.rest:
                 raise InputError(
-                    "`rest` is for Fourier series, and a `spline` rests at its ends: "
-                    "leave one out."
+                    "`rest` is for Fourier series, "
+                    "and a `spline` rests at its ends: leave one out."
                 )
             return self.spline
         leads, series = self.chosen_leads, (self.harmonics, self.omega)
@@ -142,10 +142,9 @@ class Excitation:
             count = count_cycles(period, step)
             if abs(count * step - period) > 1e-6 * step:
                 raise InputError(
-                    f"`sample_time` must divide the period of {period:.9g} s where "
-                    "there are no "
-                    f"`leads`: choose `omega` = {2 * np.pi / (count * step):.9g}, or "
-                    "use `leads`."
+                    f"`sample_time` must divide the period of {period:.9g} s "
+                    "where there are no `leads`: choose `omega` = "
+                    f"{2 * np.pi / (count * step):.9g}, or use `leads`."
                 )
         if leads is None or (not constrained and leads.time is None):
             return FourierBasis(*series)

@@ -1,4 +1,4 @@
-"""Identification from logs: they are read, filtered, fitted, judged, and become a report."""
+"""Identification from logs: they are read, filtered, fitted, judged and reported."""
 
 import dataclasses
 import functools
@@ -44,7 +44,7 @@ from .setup import Progress, Setup, ignore_progress
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class IdentificationReport(Summarised, Report):
-    """Identified model, its validation, and the judgement on it; notebooks show the judgement."""
+    """Identified model, its validation, and the judgement, which notebooks show."""
 
     @property
     def validation(self) -> Validation:
@@ -64,7 +64,7 @@ class IdentificationReport(Summarised, Report):
         return self.judgement[0]
 
     def tables(self) -> list[Table]:
-        """Return estimates and torque errors, and the verdict with what it asks to look at."""
+        """Return estimates and torque errors, and the verdict with what to look at."""
         fit, robot = self.fit, self.fit.base.model.robot
         tables = [robot.summary(), *motor_tables(robot)]
         notes = [*self.notes, *fit.notes]
@@ -87,7 +87,9 @@ class IdentificationReport(Summarised, Report):
         ]
 
     def save(self, folder: str | Path, figures: str = "") -> list[Path]:
-        """Write `report.html`, `result.json`, `parameters.csv` and `model.json`; return them.
+        """Write a report, and return the paths of its files.
+
+        They are `report.html`, `result.json`, `parameters.csv` and `model.json`.
 
         Args:
             folder: Folder of the report; other files in it are kept.
@@ -117,7 +119,7 @@ def identify_logs(
     verify: Sequence[str | Path] = (),
     progress: Progress = ignore_progress,
 ) -> IdentificationReport:
-    """Identify a robot with logs, and validate the model with others or the rest of them.
+    """Identify a robot with logs, and validate with others or the rest of them.
 
     Args:
         setup: How logs become parameters.
@@ -201,7 +203,7 @@ def require_separate_logs(
 def split_logs(
     logs: Sequence[LoadedLog], count: int, held_out: float | None
 ) -> LogParts:
-    """Return the first `count` logs for the fit, or their first parts; and all the rest."""
+    """Return the first `count` logs, or first parts, for the fit, and all the rest."""
     observations = [log.observations for log in logs]
     to_fit, to_verify = observations[:count], observations[count:]
     if held_out is None:
@@ -248,7 +250,7 @@ class Claims(NamedTuple):
 
 
 def errors_of_claims(setup: Setup, fit: Fit, logs: Sequence[Observations]) -> Claims:
-    """Return torque errors of the parameters that the robot's file claims; nothing without them."""
+    """Return torque errors of the parameters claimed by the robot's file, if any."""
     if setup.robot_file is None:
         return Claims()
     values = setup.robot_file.claims()
@@ -279,7 +281,10 @@ def read_earlier_fit(setup: Setup, folder: Path) -> Fit:
 def add_reports(
     setup: Setup, reports: Sequence[Path], fit: Fit, unseen_logs: Sequence[Observations]
 ) -> Fit:
-    """Return a fit to all logs, those of earlier reports included, which must not be unseen."""
+    """Return a fit to all logs, also those of earlier reports.
+
+    The reports must not have seen the unseen logs.
+    """
     bounded = fit.consistency is not None
     if fit.base.names != setup.base.names or not (bounded or fit.is_least_squares):
         raise InputError(
@@ -294,14 +299,14 @@ def add_reports(
         rows = RegressionProblem(setup.base, [log])
         if fit.blocks is not None and share_rows(fit.blocks, rows.blocks):
             raise InputError(
-                f"a report that was given has seen the data of `{log.name}`: verify "
-                "with another."
+                "a report that was given has seen the data "
+                f"of `{log.name}`: verify with another."
             )
     return fit
 
 
 def bound_bodies(setup: Setup, fit: Fit) -> Fit:
-    """Return a fit whose bodies can exist, from the factors of one whose bodies may not."""
+    """Return a fit whose bodies can exist, from factors of one without that bound."""
     rows = RegressionProblem(fit.base, blocks=fit.time_blocks, names=fit.recordings)
     estimator = dataclasses.replace(setup.estimator, weights=GivenWeights(fit.weights))
     bounded_fit = dataclasses.replace(fit_problem(rows, estimator), name=fit.name)

@@ -104,8 +104,8 @@ def load_logs(
         log = load_log(setup, path, columns, progress, name)
         if log.diagnosis.statistics.speed.max() < MIN_SPEED_OF_MOTION:
             raise InputError(
-                f"no joint moves in `{log.observations.name}`: name other columns, or "
-                "another log."
+                f"no joint moves in `{log.observations.name}`: "
+                "name other columns, or another log."
             )
         loaded_logs.append(log)
     return loaded_logs
@@ -192,9 +192,9 @@ def select_filter(
     long_log = next(filter(is_long, logs), None)
     if long_log is not None:
         raise InputError(
-            "one of several filters is to be chosen (a list as `filter.cutoff`), but "
-            f"`{long_log.name}` is long: choose with a short part of it, and give that "
-            "one filter for the whole."
+            "one of several filters is to be chosen (a list as "
+            f"`filter.cutoff`), but `{long_log.name}` is long: "
+            "choose with a short part of it, and give that one filter for the whole."
         )
     recordings = []
     for log in logs:

@@ -1,4 +1,4 @@
-"""How logs are read: their files, their parts, gaps, bad rows, and the delay of the forces."""
+"""How logs are read: files, parts, gaps, bad rows, and the delay of the forces."""
 
 import dataclasses
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Checks of a designed motion, one remark each: joints, floor, self-collision, forces."""
+"""Checks of a designed motion, a remark each: joints, floor, collision, forces."""
 
 from collections.abc import Iterator, Sequence
 
@@ -18,7 +18,7 @@ MAX_ROUNDING = 1e-6
 def check_motion(
     surroundings: Surroundings, plan: ExcitationPlan, force_fault: str
 ) -> Iterator[Remark]:
-    """Yield one remark for each check of a motion: kept, exceeded, or why it was not checked.
+    """Yield a remark for each check of a motion: kept, exceeded, why not checked.
 
     Args:
         surroundings: Shapes that must keep a distance.
@@ -75,7 +75,7 @@ def check_floor(
 def check_self_collision(
     surroundings: Surroundings, findings: Sequence[Finding]
 ) -> Iterator[Remark]:
-    """Yield whether bodies keep their distance, and which of their shapes are not known."""
+    """Yield whether bodies keep their distance, and which shapes are not known."""
     shapes = surroundings.shapes
     for note in () if shapes is None else shapes.notes:
         yield Remark(f"self-collision: {note}", Status.DOUBTFUL)
@@ -91,7 +91,7 @@ def check_self_collision(
 
 
 def judge(name: str, findings: Sequence[Finding]) -> Remark:
-    """Return a remark about the quantity that is nearest to its limit, or furthest beyond it."""
+    """Return a remark on the quantity nearest to its limit, or furthest beyond it."""
     worst = max(findings, key=lambda finding: finding.value)
     verb = "keep their limits" if worst.value <= 0 else "do not keep their limits"
     nearest = str(worst).removeprefix("the ")

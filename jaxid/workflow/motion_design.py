@@ -177,7 +177,7 @@ def design_motion(
 def follow_design(
     progress: Progress, improvement: Improvement | None = None
 ) -> Callable[[DesignProgress], None]:
-    """Return a callback of a design that shows its progress and hands better motions on."""
+    """Return a design's callback that shows progress and hands better motions on."""
     best_value = np.inf
 
     def follow(step: DesignProgress) -> None:
@@ -240,21 +240,22 @@ def describe_motion(
         )
     if excitation.noise is None:
         yield Remark(
-            "the noise is assumed as 1 % of the largest forces: give `noise` if it is "
-            "known"
+            "the noise is assumed as 1 % of the largest forces: "
+            "give `noise` if it is known"
         )
     if excitation.earlier:
         files = ", ".join(excitation.earlier)
         yield Remark(f"deviations are those together with {files}")
     leads = excitation.chosen_leads
     if leads is not None and leads.periods > 1:
+        periods = leads.periods
         yield Remark(
-            f"the motion runs through {leads.periods} periods; the deviations are of one"
+            f"the motion runs through {periods} periods; the deviations are of one"
         )
     if task.nominal is None:
         yield Remark(
-            "for relative deviations, say in `excitation.nominal` where an earlier "
-            "result is"
+            "for relative deviations, say in "
+            "`excitation.nominal` where an earlier result is"
         )
     yield from check_motion(task.surroundings, plan, task.force_fault)
     if task.nominal is not None:
@@ -274,8 +275,8 @@ def describe_nominal(task: MotionTask, nominal: Nominal) -> Iterator[Remark]:
         )
         if task.excitation.force_margin is None:
             text += (
-                f"; so {100 * UNKNOWN_SHARE:g} % of the largest forces are kept free "
-                "(`force_margin`)"
+                f"; so {100 * UNKNOWN_SHARE:g} % of the largest "
+                "forces are kept free (`force_margin`)"
             )
         yield Remark(text, Status.DOUBTFUL)
     if nominal.undetermined:

@@ -1,4 +1,4 @@
-"""Knowledge before an experiment: nominal parameters, limits of forces, earlier motions."""
+"""Knowledge before an experiment: parameters, limits of forces, earlier motions."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -19,7 +19,7 @@ from .excitation_settings import Excitation
 from .setup import Setup
 
 UNKNOWN_SHARE = 0.3
-"""Fraction of the largest forces that is kept free where friction, or anything else, is unknown."""
+"""Fraction of the largest forces kept free where friction or others are unknown."""
 RANDOM_POSES = 2000
 """Number of random poses in which the forces of gravity are computed."""
 
@@ -39,13 +39,13 @@ class Nominal(NamedTuple):
     undetermined: tuple[str, ...] = ()  # names of what an earlier fit leaves open
 
     def sizes(self, base: BaseParameters) -> Float[np.ndarray, " base"]:
-        """Return the values; NaN for estimates of what is not determined, which mean nothing."""
+        """Return the values; NaN for estimates of what is not determined."""
         leaves_open = np.isin(base.names, self.undetermined)
         return np.where(leaves_open, np.nan, self.parameters)
 
 
 def find_nominal(setup: Setup, excitation: Excitation) -> Nominal | None:
-    """Return nominal parameters of an earlier result, or those that the robot's file claims.
+    """Return parameters of an earlier result, or those that the robot's file claims.
 
     Raises:
         InputError: If the earlier result is of other parameters.
@@ -66,8 +66,8 @@ def _of_earlier_fit(base: BaseParameters, report: str) -> Nominal:
     fit = read_fit(Path(report))
     if fit.base.names != base.names:
         raise InputError(
-            f"`nominal`: the base parameters of `{report}` are not the {base.size} of "
-            "this file."
+            f"`nominal`: the base parameters of `{report}` "
+            f"are not the {base.size} of this file."
         )
     covariance = np.array(fit.covariance)
     undetermined = ~np.isfinite(np.diag(covariance))
@@ -107,7 +107,7 @@ def limit_forces(
 
 
 def gravity_fault(robot: Robot, limits: ForceLimits) -> str:
-    """Return which joint cannot hold the robot in any pose of its range; empty if all can."""
+    """Return which joint cannot hold any pose of its range; empty if all can."""
     q = random_poses(robot)
     rest = Motion(q, np.zeros_like(q), np.zeros_like(q))
     with double_precision():
@@ -119,15 +119,15 @@ def gravity_fault(robot: Robot, limits: ForceLimits) -> str:
     finding = limits.entries(robot)[int(excess[best_pose].argmax())]
     force = finding.limit * (1.0 + largest_excess[best_pose])
     return (
-        f"in every one of {RANDOM_POSES} poses gravity needs more than the limits of the "
-        f"forces allow; at best {finding.name} needs {force:.3g} of "
-        f"{finding.limit:.3g} {finding.unit}: check efforts and inertias of the robot's "
-        "file, or give `limits.force`"
+        f"in every one of {RANDOM_POSES} poses gravity needs more than the limits of "
+        f"the forces allow; at best {finding.name} needs {force:.3g} of "
+        f"{finding.limit:.3g} {finding.unit}: check efforts and inertias of the "
+        "robot's file, or give `limits.force`"
     )
 
 
 def random_poses(robot: Robot) -> Float[np.ndarray, "poses joints"]:
-    """Return random poses within the range of the joints, the first of them near zero."""
+    """Return random poses within the joints' range, the first of them near zero."""
     ends = np.where(robot.revolute, np.pi, 1.0)
     low, high = robot.limits.position_min, robot.limits.position_max
     low = np.where(np.isfinite(low), low, -ends)
@@ -154,9 +154,9 @@ def earlier_information(
         trajectory = load_trajectory(Path(name))
         if trajectory.joints != robot.joints:
             raise InputError(
-                f"`earlier`: the motion of `{Path(name).name}` moves "
-                f"{trajectory.joints} joint(s), but the robot `{robot.name}` has "
-                f"{robot.joints}."
+                f"`earlier`: the motion of `{Path(name).name}` "
+                f"moves {trajectory.joints} joint(s), "
+                f"but the robot `{robot.name}` has {robot.joints}."
             )
         step = float(trajectory.duration) / excitation.samples
         motion = trajectory.motion(np.arange(excitation.samples) * step)

@@ -1,4 +1,4 @@
-"""Several runs of one robot: payload, gains of the drives, and states such as cold and warm."""
+"""Several runs of a robot: payload, gains of drives, states like cold and warm."""
 
 import dataclasses
 import functools
@@ -107,14 +107,14 @@ def fit_runs(
     """
     if setup.nonlinear_friction:
         raise InputError(
-            "`estimator.nonlinear_friction` would find other shapes of friction in each "
-            "run: leave it out, and give all runs one `epsilon` and `stribeck`."
+            "`estimator.nonlinear_friction` would find other shapes of friction in "
+            "each run: leave it out, and give all runs one `epsilon` and `stribeck`."
         )
     doubts = []
     if not has_plain_estimator(setup):
         doubts.append(
-            "all runs are weighted least squares here: the rest of `[estimator]` does "
-            "not count"
+            "all runs are weighted least squares here: "
+            "the rest of `[estimator]` does not count"
         )
     progress("finding base parameters", 0.0)
     paths = [path for group in groups.values() for path in group]
@@ -129,7 +129,7 @@ def fit_runs(
 
 
 def has_plain_estimator(setup: Setup) -> bool:
-    """Return whether the estimator is least squares, perhaps with bounds of the bodies."""
+    """Return whether the estimator is least squares, perhaps with bounds of bodies."""
     complete = isinstance(setup.least_squares.solution, Complete)
     unbounded = setup.unbounded_estimator is setup.least_squares
     return unbounded and complete
@@ -142,7 +142,7 @@ def fit_run(
     columns: Columns,
     progress: Progress,
 ) -> tuple[Fit, list[str]]:
-    """Return the fit to the logs and earlier reports of one run, and doubts about the logs."""
+    """Return the fit to logs and earlier reports of one run, and doubts about logs."""
     fits = [read_earlier_fit(setup, path) for path in paths if is_report(path)]
     files = [path for path in paths if not is_report(path)]
     doubts = []
@@ -173,8 +173,8 @@ def fit_with_and_without_load(
     shared_places = set.intersection(*places)
     if shared_places:
         raise InputError(
-            f"`{Path(min(shared_places)).name}` is given both without and with the "
-            "load: name it once."
+            f"`{Path(min(shared_places)).name}` is given "
+            "both without and with the load: name it once."
         )
     return fit_runs(setup, groups, columns, progress), groups
 
@@ -268,8 +268,8 @@ def identify_states_logs(
     groups = {Path(os.path.realpath(path)).stem: [path] for path in paths}
     if len(groups) < max(len(paths), 2):
         raise InputError(
-            "give one log or report for each of two or more states, with different "
-            "names."
+            "give one log or report for each of two "
+            "or more states, with different names."
         )
     runs = fit_runs(setup, groups, columns, progress)
     states = identify_states(runs.fits)

@@ -1,4 +1,4 @@
-"""URDF or MJCF file of a robot, and what it claims about bodies, rotors and friction."""
+"""URDF or MJCF file of a robot, and its claims on bodies, rotors and friction."""
 
 import dataclasses
 from pathlib import Path
@@ -40,7 +40,7 @@ class RobotFile:
 
     @property
     def placement(self) -> dict[str, Any]:
-        """Orientation and position of the base, as functions take them that make robots."""
+        """Orientation and position of the base, for functions that make robots."""
         return {
             "base_rotation": self.base_rotation,
             "base_position": self.base_position,
@@ -83,7 +83,7 @@ class RobotFile:
         return _named_bodies(bodies) | self._joint_claims()
 
     def _joint_claims(self) -> dict[str, float]:
-        """Return rotor inertias and friction that the file claims, by their names in a model."""
+        """Return claimed rotor inertias and friction, by their names in a model."""
         values = joint_parameters(self.path, **self.chain).values()
         claims = {}
         for symbol, row in zip(("Ia", "fv", "fc"), values, strict=True):

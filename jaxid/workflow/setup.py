@@ -59,12 +59,12 @@ DEFAULT_CUTOFF = 10.0
 MAX_LOAD_FRICTION_FITS = 10
 """Fits after which friction by load must have settled."""
 LOAD_FRICTION_TOLERANCE = 1e-3
-"""Change of the friction by load from fit to fit that counts as none, relative to the largest."""
+"""Largest change of friction by load between fits that counts as none, relative."""
 
 NO_FILTER = (
-    f"no filter is given (table `[filter]`): a Butterworth low-pass at "
-    f"{DEFAULT_CUTOFF:g} Hz is assumed; choose about five times the highest frequency "
-    "of the motion."
+    "no filter is given (table `[filter]`): "
+    f"a Butterworth low-pass at {DEFAULT_CUTOFF:g} Hz is assumed; "
+    "choose about five times the highest frequency of the motion."
 )
 
 Progress = Callable[[str, float], None]
@@ -138,7 +138,8 @@ class Setup(eqx.Module):
         if self.load_friction and not self.has_bounded_bodies:
             raise InputError(
                 "friction by load (`model.load`) needs the bodies that a physically "
-                'consistent estimator finds: `PhysicallyConsistent`, `kind = "consistent"`.'
+                "consistent estimator finds: "
+                '`PhysicallyConsistent`, `kind = "consistent"`.'
             )
         if self.nonlinear_friction and self.model.memory is not None:
             raise InputError(
@@ -170,7 +171,7 @@ class Setup(eqx.Module):
 
     @property
     def unbounded_estimator(self) -> AbstractEstimator:
-        """The estimator; for bodies that can exist least squares, without their bounds."""
+        """The estimator; for bodies that can exist, least squares without bounds."""
         return self.least_squares if self.has_bounded_bodies else self.estimator
 
     def observe(self, recording: Recording) -> Observations:
@@ -195,7 +196,7 @@ class Setup(eqx.Module):
         return fit
 
     def _fit_with_shapes(self, rows: RegressionProblem, progress: Progress) -> Fit:
-        """Fit the shape of friction, too; return the better one of this fit and the linear one."""
+        """Fit the shape of friction, too; return the better of both fits."""
         terms = tuple(map(without_stribeck, self.model.terms))
         result = identify_nonlinear_friction(
             self.base,
@@ -207,7 +208,7 @@ class Setup(eqx.Module):
         return result.better
 
     def _fit_with_load_friction(self, fit: Fit, logs: Sequence[Observations]) -> Fit:
-        """Fit again with friction by the weight of the bodies found, until it changes no more."""
+        """Fit again with friction by the bodies' weight, until it no longer changes."""
         terms = fit.base.model.terms
         transition = fit.base.model.memory or dry_transition(terms)
         joints = self.robot.joints
@@ -227,8 +228,8 @@ class Setup(eqx.Module):
             if change < LOAD_FRICTION_TOLERANCE * np.abs(coefficients).max():
                 return fit
         note = (
-            f"friction by load has not settled in {MAX_LOAD_FRICTION_FITS} fits: its "
-            "values are uncertain."
+            "friction by load has not settled in "
+            f"{MAX_LOAD_FRICTION_FITS} fits: its values are uncertain."
         )
         return dataclasses.replace(fit, notes=(*fit.notes, note))
 
@@ -250,14 +251,14 @@ def pull_to_bodies(
 
 
 def without_stribeck(term: AbstractTerm) -> AbstractTerm:
-    """Return a term with Coulomb's law in place of Stribeck's; other terms as they are."""
+    """Return a term with Coulomb's law for Stribeck's; other terms as they are."""
     if isinstance(term, StribeckFriction):
         return CoulombFriction(term.transition)
     return term
 
 
 def dry_transition(terms: Sequence[AbstractTerm]) -> AbstractTransition:
-    """Return the transition of the dry friction in a model, or the usual one without it."""
+    """Return a model's transition of dry friction, or the usual one without it."""
     for term in terms:
         if isinstance(term, AbstractDryFriction):
             return term.transition

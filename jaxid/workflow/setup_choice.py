@@ -1,4 +1,4 @@
-"""Choice between setups of a robot, by errors on parts of the logs that fits have not seen."""
+"""Choice between setups of a robot by errors on parts of logs unseen by the fits."""
 
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -59,7 +59,7 @@ def choose_setup_by_rows(
     observations: Sequence[Observations],
     progress: Progress = ignore_progress,
 ) -> ModelChoice:
-    """Choose between models and estimators by the errors of unseen parts of filtered logs."""
+    """Choose between models and estimators by errors on unseen parts of the logs."""
     progress("choosing the model", 0.0)
     candidates = [
         ModelCandidate(name, setup.base, setup.estimator)
@@ -73,7 +73,7 @@ def choose_setup_by_rows(
 def with_common_length(
     candidates: Sequence[ModelCandidate], observations: Sequence[Observations]
 ) -> list[ModelCandidate]:
-    """Return candidates with the lengths of presliding of the one with the most parameters."""
+    """Return candidates with the presliding lengths of that with most parameters."""
     bases = [x.base for x in candidates if x.base.model.memory is not None]
     if not bases:
         return list(candidates)

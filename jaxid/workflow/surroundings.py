@@ -1,4 +1,4 @@
-"""Surroundings of a robot, and shapes of its links, between which a distance must remain."""
+"""Surroundings of a robot and shapes of its links, which must keep a distance."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -127,7 +127,7 @@ class Collision:
 def fit_links(
     robot_file: RobotFile, packages: str | None
 ) -> tuple[list[Capsule], list[str]]:
-    """Return capsules around the geometry of the robot's file, and what cannot be read."""
+    """Return capsules around the robot file's geometry, and what cannot be read."""
     faults: dict[str, str] = {}
     capsules = fit_capsules(
         robot_file.path,

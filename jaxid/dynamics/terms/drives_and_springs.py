@@ -121,8 +121,8 @@ class CoupledDrives(AbstractTerm):
         if not np.diag(A).all():
             motor = int(np.flatnonzero(np.diag(A) == 0)[0]) + 1
             raise InputError(
-                f"`drives.reduction`: motor {motor} does not turn joint {motor}: "
-                "reorder its rows."
+                f"`drives.reduction`: motor {motor} does not "
+                f"turn joint {motor}: reorder its rows."
             )
         couplings = []
         for i in range(robot.joints):

@@ -61,8 +61,8 @@ class Tanh(AbstractTransition):
             isinstance(self.epsilon, jax.Array) or np.all(np.asarray(self.epsilon) > 0)
         ):
             raise InputError(
-                f"`epsilon` must be positive, but is {self.epsilon}: `HardSign` has "
-                "no width."
+                f"`epsilon` must be positive, but is {self.epsilon}: "
+                "`HardSign` has no width."
             )
 
     def __call__(self, qd):

@@ -229,8 +229,8 @@ class LoadFriction(AbstractDryFriction):
         size = robot.joints * len(INERTIAL_NAMES)
         if np.size(self.bodies) < size:
             raise InputError(
-                "`bodies` must begin with ten numbers for each body, but holds only "
-                f"{np.size(self.bodies)}."
+                "`bodies` must begin with ten numbers for each body, "
+                f"but holds only {np.size(self.bodies)}."
             )
         return self.bodies.ravel()[:size].reshape(robot.joints, -1)
 

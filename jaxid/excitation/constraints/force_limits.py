@@ -75,9 +75,9 @@ class ForceLimits(AbstractConstraint):
         parameters = np.asarray(self.parameters)
         if parameters.shape != (size,) or not np.isfinite(parameters).all():
             raise InputError(
-                "`parameters` must hold one finite number for each base parameter "
-                f"({size}), but has shape {parameters.shape}: `base.from_standard` "
-                "makes them of standard ones."
+                "`parameters` must hold one finite number for each base "
+                f"parameter ({size}), but has shape {parameters.shape}: "
+                "`base.from_standard` makes them of standard ones."
             )
         covariance = self.covariance
         if covariance is None:
@@ -86,8 +86,8 @@ class ForceLimits(AbstractConstraint):
         rounding = 1e-9 * np.abs(covariance).max()
         if not is_finite or np.linalg.eigvalsh(covariance)[0] < -rounding:
             raise InputError(
-                f"`covariance` must be a finite matrix of {size} rows and columns "
-                "without negative eigenvalues."
+                f"`covariance` must be a finite matrix of {size} "
+                "rows and columns without negative eigenvalues."
             )
 
     def __call__(self, robot: Robot, motion: Motion) -> Float[Array, "*batch values"]:

@@ -1,4 +1,4 @@
-"""Physical consistency: parameters of bodies that can exist, found with a certificate."""
+"""Physical consistency: parameters of possible bodies, found with a certificate."""
 
 from .bounds_and_priors import (
     BodyBounds as BodyBounds,

@@ -1,4 +1,4 @@
-"""Prior knowledge about bodies: bounds of masses and sizes, or bodies of a CAD model."""
+"""Prior knowledge about bodies: bounds of mass and size, or bodies of a CAD model."""
 
 import dataclasses
 from typing import Any
@@ -19,7 +19,9 @@ OVERHANG = 0.25
 
 
 class BodyBounds(eqx.Module):
-    """Bounds of masses, sizes and centres of mass; without them the best masses are infinite.
+    """Bounds of masses, sizes and centres of mass.
+
+    Without them the best masses are infinite.
 
     Attributes:
         mass_max: Largest mass of each body [kg], like `50.0`.
@@ -74,8 +76,8 @@ class BodyBounds(eqx.Module):
         total = self.total_mass
         if total is not None and not low.sum() < total < high.sum():
             raise InputError(
-                f"`total_mass` must be from {low.sum():g} to {high.sum():g} kg, but is "
-                f"{total:g} kg."
+                f"`total_mass` must be from {low.sum():g} "
+                f"to {high.sum():g} kg, but is {total:g} kg."
             )
         # Bounds that contradict each other are an error here, not in the estimation.
         _ = self.inner_centres
@@ -85,8 +87,8 @@ class BodyBounds(eqx.Module):
         if not is_good.all():
             body = np.argwhere(~is_good)[0, 0]
             raise InputError(
-                f"`{name}` must be {rule}, but body {body + 1} has "
-                f"{getattr(self, name)[body]}."
+                f"`{name}` must be {rule}, but body "
+                f"{body + 1} has {getattr(self, name)[body]}."
             )
 
     @classmethod
@@ -200,7 +202,7 @@ def _of_each_body(name: str, value: Numbers, bodies: int, *shape: int) -> np.nda
 
 
 class EntropicPull(eqx.Module):
-    r"""Pull of the bodies towards those of a prior, along directions that the data do not see.
+    r"""Pull of the bodies towards a prior, along directions that the data do not see.
 
     It adds $\gamma \sum_k \left( \mathrm{tr}(\Pi_{0k}^{-1} \Pi_k) - \ln \det \Pi_k
     \right)$ to half the squared residuals in units of the noise: the Bregman divergence
@@ -225,6 +227,6 @@ class EntropicPull(eqx.Module):
         margins = consistency_margin(self.bodies)
         if not (margins > 0.0).all():
             raise InputError(
-                f"body {np.argmin(margins) + 1} of the prior's `bodies` needs a mass "
-                "and an inertia."
+                f"body {np.argmin(margins) + 1} of the prior's "
+                "`bodies` needs a mass and an inertia."
             )

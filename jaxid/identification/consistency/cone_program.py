@@ -1,4 +1,4 @@
-r"""Least squares over the parameters of bodies that can exist, as a small convex program.
+r"""Least squares over parameters of possible bodies, as a small convex program.
 
 The variables are those of the bodies, equally many for each, then those of the drives.
 Bodies are measured in their largest masses and the radii of their spheres, drives in
@@ -27,7 +27,7 @@ Number = Float[AnyArray, "*batch"] | np.floating
 START_DRIVE = 0.02
 """Parameters of the drives at the start, in their largest values."""
 START_COUPLING = 1e-3
-"""Entries beside the diagonal of coupled drives at the start, relative to the others."""
+"""Initial entries beside the diagonal of coupled drives, relative to the others."""
 PRIOR_SHARE = 0.98
 """How near the start lies to bodies of a prior that satisfy all bounds."""
 
@@ -96,7 +96,7 @@ class ConeProgram(eqx.Module):
             )
 
     def slacks(self, y: Values) -> tuple[Values, Values]:
-        """Return the semidefinite matrices and the nonnegative functions of variables."""
+        """Return semidefinite matrices and nonnegative functions of variables."""
         xp = self.xp
         S, s = self.linear(y)
         matrices = xp.concatenate([-self.floors, self.fillings])
@@ -129,7 +129,7 @@ class ConeProgram(eqx.Module):
         return y + coupling_products @ self.members
 
     def split_linear(self, z: Values) -> tuple[Values, Values, Values]:
-        """Return numbers of the linear inequalities: of bodies, and of both limits of drives."""
+        """Return numbers of inequalities: of bodies, and of both limits of drives."""
         count = self.bodies * self.rows.shape[-2]
         start_of_upper = count + self.drives
         bodies = self.xp.reshape(z[:count], (self.bodies, -1))
@@ -147,7 +147,7 @@ class Cone(NamedTuple):
 def cone_program(
     feasible: FeasibleSet, data: ScaledRows, strength: float = 0.0, prior=None
 ) -> ConeProgram:
-    """Return the convex program of least squares, with a pull towards the bodies of a prior."""
+    """Return the convex program of least squares, with a pull towards prior bodies."""
     xp = namespace(data.A)
     bounds = feasible.bounds
     count = len(feasible.bodies)
@@ -186,7 +186,7 @@ def cone_program(
 
 
 def _scale_rows(feasible: FeasibleSet, data: ScaledRows, scales) -> tuple[Any, Any]:
-    """Return the rows of the scaled variables, with the unbounded columns projected out."""
+    """Return the rows of scaled variables; unbounded columns are projected out."""
     A = data.A[:, np.array(feasible.order)] * scales[None]
     if not feasible.unbounded:
         return A, data.b
@@ -208,7 +208,7 @@ def _contributions(cones: Sequence[Cone], members: np.ndarray) -> Values:
 
 
 def _total_mass(feasible: FeasibleSet) -> np.ndarray:
-    """Return the row of the total mass, or none where it is not known [rows, variables]."""
+    """Return the row of the total mass [rows, variables], or none if it is unknown."""
     bounds = feasible.bounds
     if bounds.total_mass is None:
         return np.zeros((0, len(feasible.order)))
@@ -256,7 +256,9 @@ def _drive_matrices(feasible: FeasibleSet, drive_scales) -> list[Cone]:
 
 
 def _start(feasible: FeasibleSet, A, b, prior) -> Values:
-    """Return balls at inner centres of mass, as heavy as fits the forces, and some friction.
+    """Return balls at inner centres of mass, and some friction.
+
+    The balls are as heavy as fits the forces.
 
     Where a prior's bodies satisfy all bounds the start lies close to them.
     """
@@ -286,7 +288,7 @@ def _start(feasible: FeasibleSet, A, b, prior) -> Values:
 
 
 def _unit_balls(bounds: BodyBounds) -> AnyArray:
-    """Return the parameters of balls of mass one within unit spheres, one for each body."""
+    """Return the parameters of a ball of mass one in a unit sphere for each body."""
     centre = bounds.inner_centres / bounds.radius[:, None]
     # Half of the second moment that the sphere leaves; that of a ball is 3/5 m r².
     variance = 0.5 * (1.0 - np.sum(centre**2, axis=1))

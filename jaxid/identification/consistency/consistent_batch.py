@@ -51,7 +51,7 @@ class ConsistentBatch(eqx.Module):
 
 
 class ConsistentSolver(Hashable):
-    """Physically consistent estimates of one model: a function of arrays for `jit` and `vmap`.
+    """Physically consistent estimates of one model: a function for `jit` and `vmap`.
 
     The factors are those of `Factors.weighted`: their rows are weighted already, so the
     weights of the estimator do not count. Equal solvers share their compiled functions.
@@ -116,7 +116,7 @@ def consistent_batch(
     rows: Int[AnyArray, " datasets"],
     estimator: PhysicallyConsistent | None = None,
 ) -> ConsistentBatch:
-    """Estimate physically consistent parameters from the triangular factors of many data sets.
+    """Estimate physically consistent parameters from the factors of many data sets.
 
     It is `ConsistentSolver`, compiled once for each model, estimator and shape, and
     spread over the cores of the processor.
@@ -136,9 +136,9 @@ def consistent_batch(
     has_factors = count > 0 and R.shape[-1] == base.size and z.shape == R.shape[:-1]
     if not has_factors or rows.shape != (count,):
         raise InputError(
-            "`R`, `z` and `rows` must have the shapes [datasets, height, "
-            f"{base.size}], [datasets, height] and [datasets], but have {R.shape}, "
-            f"{z.shape} and {rows.shape}."
+            "`R`, `z` and `rows` must have the shapes [datasets, "
+            f"height, {base.size}], [datasets, height] and [datasets], "
+            f"but have {R.shape}, {z.shape} and {rows.shape}."
         )
     estimator = estimator or PhysicallyConsistent()
     arrays = (np.asarray(R), np.asarray(z), np.asarray(rows))

@@ -77,9 +77,9 @@ class Consistency(eqx.Module):
         if self.masses_from_bounds:
             names = ", ".join(f"m{k + 1}" for k in self.masses_from_bounds)
             sentences.append(
-                f"forces do not determine the masses {names} alone: their values, and "
-                "parameters that depend on them, reflect the bounds; base parameters "
-                "and forces do not."
+                f"forces do not determine the masses {names} alone: "
+                "their values, and parameters that depend on them, "
+                "reflect the bounds; base parameters and forces do not."
             )
         if self.active:
             sentences.append(f"active bounds: {'; '.join(self.active)}.")
@@ -149,7 +149,7 @@ class PhysicallyConsistent(AbstractEstimator):
         p = feasible.standard_parameters(data, optimum.y)
         parameters = np.asarray(base.from_standard(p))
         bodies = p[np.array(feasible.bodies)]
-        # Bodies with principal axes have seven parameters: products of inertia are zero.
+        # Bodies with principal axes have seven parameters, no products of inertia.
         bodies = np.pad(bodies, ((0, 0), (0, 10 - bodies.shape[1])))
 
         residual = float(np.linalg.norm(R @ parameters - z))
@@ -190,7 +190,7 @@ class PhysicallyConsistent(AbstractEstimator):
     def program(
         self, base: BaseParameters, feasible: FeasibleSet, R, z, rows
     ) -> tuple[ScaledRows, ConeProgram]:
-        """Return the rows in units of the noise, and the convex program; see `scaled_rows`."""
+        """Return the rows in units of the noise, and the program; see `scaled_rows`."""
         data = scaled_rows(base, R, z, rows)
         if self.pull is None:
             return data, cone_program(feasible, data)
@@ -205,7 +205,7 @@ class PhysicallyConsistent(AbstractEstimator):
 
 
 def _solve(program: ConeProgram, throw: bool) -> tuple[solver.Optimum, float]:
-    """Return the optimum, and a bound of its objective's relative distance to the true one."""
+    """Return the optimum, and a bound of its objective's relative error."""
     program.require_interior()
     optimum = solver.solve_in_numpy(program)
     # Noiseless data have an optimum near zero: the scale keeps the ratio sensible.
@@ -213,8 +213,8 @@ def _solve(program: ConeProgram, throw: bool) -> tuple[solver.Optimum, float]:
     if throw and not optimum.certified:
         raise RuntimeError(
             "no physically consistent estimate with a proof: "
-            f"{UNPROVED.format(error_bound)} Widen the bounds, or accept it with "
-            "`throw=False`."
+            f"{UNPROVED.format(error_bound)} Widen the bounds, "
+            "or accept it with `throw=False`."
         )
     return optimum, error_bound
 
@@ -261,7 +261,7 @@ def consistent_body(
     *,
     throw: bool = True,
 ) -> tuple[Float[np.ndarray, "10"], float, float]:
-    """Return the consistent body closest to an estimate, in the metric of its covariance.
+    """Return the consistent body closest to an estimate, in its covariance's metric.
 
     Args:
         estimate: Estimated parameters $(m, m r_c, A, B, C, D, E, F)$.

@@ -1,4 +1,4 @@
-"""Feasible parameters: bodies that can exist, friction that brakes, rotors with inertia."""
+"""Feasible parameters: possible bodies, friction that brakes, rotors with inertia."""
 
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -16,7 +16,7 @@ from .pseudo_inertia import Values, ball
 from .scaled_rows import ScaledRows
 
 MAX_COUPLED_AXES = 4
-"""Axes that drives may couple: all semidefinite matrices of a program have size four."""
+"""Axes that drives may couple: all semidefinite matrices have size four."""
 MEDIUM_MASS = 0.05
 """Mass of a body of medium size, within the range of its bounds."""
 MAX_DRIVE_RATIO = 10.0
@@ -43,7 +43,7 @@ class LinearBounds(NamedTuple):
 
 
 class FeasibleSet(NamedTuple):
-    """Feasible parameters: consistent bodies, dissipative friction, nonnegative rotor inertias."""
+    """Consistent bodies, dissipative friction and nonnegative rotor inertias."""
 
     bodies: tuple[tuple[int, ...], ...]  # columns of each body's parameters
     drives: tuple[int, ...]  # columns that are nonnegative
@@ -59,7 +59,7 @@ class FeasibleSet(NamedTuple):
 
     @property
     def body_scales(self) -> np.ndarray:
-        """Largest mass of each body, and its products with the radius and the squared radius."""
+        """Largest mass of each body, times 1, the radius and the squared radius."""
         mass = self.bounds.mass_max[:, None]
         radius = self.bounds.radius[:, None]
         powers = np.array([0, 1, 1, 1, 2, 2, 2, 2, 2, 2])[: self.width]
@@ -94,7 +94,7 @@ class FeasibleSet(NamedTuple):
         return xp.concatenate([self.body_scales.ravel(), max_values])
 
     def standard_parameters(self, data: ScaledRows, y: Values) -> Values:
-        """Return the standard parameters of scaled variables; columns without bounds are solved."""
+        """Return standard parameters of scaled variables; solve unbounded columns."""
         p = y * self.scales(data)
         if self.unbounded:
             columns, inverse = self.unbounded_columns(data)
@@ -145,7 +145,7 @@ class FeasibleSet(NamedTuple):
 
 
 def feasible_set(model: Model, bounds: BodyBounds, margin: float = 0.0) -> FeasibleSet:
-    """Return the feasible parameters of a model; bodies contain a fraction of nominal balls."""
+    """Return a model's feasible parameters; bodies contain a part of nominal balls."""
     robot = model.robot
     widths = [term.body_parameters for term in model.terms]
     if not any(widths):
@@ -187,7 +187,7 @@ def nominal_bodies(bounds: BodyBounds) -> np.ndarray:
 
 
 def _couplings(model: Model) -> Iterator[Coupling]:
-    """Yield the matrices of inertias, and of viscous friction, of drives that couple axes."""
+    """Yield matrices of inertias, and of viscous friction, of coupled drives."""
     robot = model.robot
     matrices = [term.drive_matrices(robot) for term in model.terms]
     inertia, friction = np.concatenate(matrices, axis=-1)

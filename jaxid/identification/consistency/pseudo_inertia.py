@@ -46,9 +46,10 @@ UPPER_TRIANGLE = np.triu_indices(4, 1)
 def pseudo_inertia(
     bodies: Float[AnyArray, "*batch 10"],
 ) -> Float[AnyArray, "*batch 4 4"]:
-    r"""Return the pseudo-inertia $\begin{pmatrix} \Sigma & m r_c \\ m r_c^T & m \end{pmatrix}$.
+    r"""Return the pseudo-inertias of bodies.
 
-    The second moments are $\Sigma = \frac12 \mathrm{tr}(J^o) I - J^o$ [kg m²].
+    They are $\begin{pmatrix} \Sigma & m r_c \\ m r_c^T & m \end{pmatrix}$ with the
+    second moments $\Sigma = \frac12 \mathrm{tr}(J^o) I - J^o$ [kg m²].
 
     Args:
         bodies: Parameters $(m, m r_c, A, B, C, D, E, F)$ about the origin of the body's
@@ -117,11 +118,11 @@ class LogCholesky(eqx.Module):
 
     @classmethod
     def of(cls, bodies: Numbers) -> "LogCholesky":
-        """Return the coordinates of bodies that can exist, with $(m, m r_c, A, ..., F)$ each.
+        """Return the coordinates of bodies that can exist.
 
         Args:
-            bodies: Parameters of each body along the last axis, or of all bodies in a
-                row.
+            bodies: Parameters $(m, m r_c, A, ..., F)$ of each body along the last axis,
+                or of all bodies in a row.
 
         Raises:
             InputError: If there are not ten numbers for each body, or a body cannot

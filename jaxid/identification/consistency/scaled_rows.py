@@ -25,7 +25,7 @@ class ScaledRows(NamedTuple):
 
 
 def scaled_rows(base: BaseParameters, R: Values, z: Values, rows: Values) -> ScaledRows:
-    """Divide the weighted triangle of so many rows by the standard deviation of its residuals."""
+    """Divide a weighted triangle by the standard deviation of its residuals."""
     xp = namespace(R)
     residuals = z[base.size :]
     dof = xp.asarray(rows - base.size, float)

@@ -43,7 +43,7 @@ MIN_LENGTH = 1e-8
 STEP_FRACTIONS = np.array(
     [1.0, *1.0 - np.geomspace(0.01, 0.64, 13), 0.28, 0.2, 0.13, 0.08, 0.04, 0.01]
 )
-"""Steps that are tried, as fractions of the longest that the linear inequalities allow."""
+"""Steps that are tried, as fractions of the longest that the inequalities allow."""
 BOUNDARY_FRACTION = 0.99
 """Fraction of the longest step that is taken: slacks stay positive."""
 RIDGE = 1e-14
@@ -53,10 +53,11 @@ TINY = 1e-300
 
 
 class Optimum(eqx.Module):
-    """Result of the interior point method: half the squared residuals, with a bound of the error.
+    """Result of the interior point method: a value, with a bound of its error.
 
-    It is certified if the bound is within the tolerance. The multipliers are those of
-    the linear inequalities, `matrices` those of the semidefinite ones.
+    The value is half the squared residuals; it is certified if the bound is within the
+    tolerance. The multipliers are those of the linear inequalities, `matrices` those of
+    the semidefinite ones.
     """
 
     y: Float[AnyArray, "*batch variables"]
@@ -187,10 +188,10 @@ def _start(p: ConeProgram) -> Point:
 
 
 def prices(p: ConeProgram, optimum: Optimum) -> Float[np.ndarray, " linear"]:
-    """Return by how much the objective would fall without each linear bound, to second order.
+    """Return how much the objective would fall without each linear bound.
 
-    It is in units of half a squared standard deviation, whatever the units of the
-    bounds.
+    It is a value to second order, in units of half a squared standard deviation,
+    whatever the units of the bounds.
     """
     S, s = p.slacks(optimum.y)
     z = optimum.multipliers
@@ -207,7 +208,7 @@ def prices(p: ConeProgram, optimum: Optimum) -> Float[np.ndarray, " linear"]:
 
 
 def _point(p: ConeProgram, y, Z, z) -> Point:
-    """Compute slacks, the residual of the optimality conditions, and the error bound."""
+    """Compute slacks, the residual of the optimality conditions, and the bound."""
     xp = p.xp
     S, s = p.slacks(y)
     rest = p.A @ y - p.b
@@ -247,7 +248,10 @@ def _matrix_gap(p: ConeProgram, S, Z) -> Values:
 
 
 def _targets(p: ConeProgram) -> Values:
-    """Return the products of slacks and multipliers at the optimum: the pull's strength."""
+    """Return the products of slacks and multipliers at the optimum.
+
+    They are the strength of the pull.
+    """
     xp = p.xp
     bodies = xp.ones(p.bodies) * p.pull
     others = xp.zeros(len(p.fillings))
@@ -271,7 +275,7 @@ class Newton(NamedTuple):
         return Direction(y, S, s, Z, z)
 
     def centre(self, mu: Values, second_Z: Values, second_z: Values) -> Direction:
-        """Return the direction towards products `target + mu`, less second-order terms."""
+        """Return the direction to products `target + mu`, less second-order terms."""
         targets = _targets(self.p) + mu
         rZ = targets * self.inverse_S - self.x.Z - second_Z
         rz = mu / self.x.s - self.x.z - second_z
@@ -300,7 +304,7 @@ def _newton(p: ConeProgram, gram, x: Point) -> Newton:
 
 
 def _step(p: ConeProgram, gram, x: Point) -> tuple[Point, Values]:
-    """Take the longer step of two correctors; return the new point and the step length."""
+    """Take the longer step of two correctors; return the new point and the length."""
     xp = p.xp
     newton = _newton(p, gram, x)
     predictor = newton.centre(0.0, 0.0, 0.0)
@@ -406,7 +410,10 @@ def _linalg(p: ConeProgram) -> ModuleType:
 
 
 def _products(inverse_S, Z) -> Values:
-    r"""Return matrices $M$ with $e^T M g = \mathrm{tr}(E S^{-1} G Z)$ for flattened $E$ and $G$."""
+    r"""Return matrices $M$ with $e^T M g = \mathrm{tr}(E S^{-1} G Z)$.
+
+    $e$ and $g$ are $E$ and $G$, flattened.
+    """
     xp = namespace(Z)
     product = inverse_S[:, None, :, :, None] * Z[:, :, None, None, :]
     return xp.reshape(product, (-1, 16, 16))

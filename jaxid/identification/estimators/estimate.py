@@ -23,7 +23,9 @@ from .regularisation_and_weights import (
 
 
 class Channel(NamedTuple):
-    r"""One series of equations $u_t = \theta_t (p - \hat p)$ + disturbance, usually of one joint.
+    r"""One series of equations $u_t = \theta_t (p - \hat p)$ + disturbance.
+
+    Usually it is that of one joint.
 
     The estimate moves by $B \sum_t z_t u_t$. Rows that do not count are zero.
     """
@@ -38,12 +40,14 @@ class Channel(NamedTuple):
 
 
 Influence = Callable[[RowChunk, np.ndarray], Iterator[Channel]]
-"""Function from rows and their residuals [rows, joints], in [N m] or [N], to weighted equations,
-one channel for each joint."""
+"""Function from rows and their residuals to weighted equations.
+
+The residuals are [rows, joints], in [N m] or [N]; each joint has one channel.
+"""
 
 
 def joint_rows(weights: Float[AnyArray, " joints"]) -> Influence:
-    """Return the influence of rows that are weighted by joint: one channel for each joint."""
+    """Return the influence of rows weighted by joint: one channel for each joint."""
 
     def channels(chunk: RowChunk, residuals: np.ndarray) -> Iterator[Channel]:
         joints = zip(
@@ -116,7 +120,7 @@ class Estimate(eqx.Module):
         weights: Float[AnyArray, " joints"],
         solution: AbstractSolution,
     ) -> "Estimate":
-        """Return the least-squares estimate of rows that are weighted by joint (Eqs. 28, 33).
+        """Return the least-squares estimate of rows weighted by joint (Eqs. 28, 33).
 
         Args:
             problem: Regression problem.

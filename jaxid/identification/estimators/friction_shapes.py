@@ -95,7 +95,7 @@ class Shapes(eqx.Module):
     def columns(
         self, values: AnyArray, q: AnyArray, qd: AnyArray, qdd: AnyArray
     ) -> jax.Array:
-        """Return the columns of the terms with shapes, of a sample [joints, columns]."""
+        """Return columns of the terms with shapes, of a sample [joints, columns]."""
         terms = self.terms_with(values)
         robot = self.model.robot
         parts = [terms[k].columns(robot, q, qd, qdd) for k in self.terms]

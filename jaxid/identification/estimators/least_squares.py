@@ -90,7 +90,7 @@ class InstrumentalVariables(AbstractEstimator):
         weighted_rows = joint_rows(weights)
 
         def influence(chunk: RowChunk, residuals: np.ndarray) -> Iterator[Channel]:
-            """Use the reference's columns instead of the measured ones as instruments."""
+            """Use the reference's columns, not the measured ones, as instruments."""
             channels = weighted_rows(chunk, residuals)
             joints = zip(
                 channels,
@@ -157,7 +157,7 @@ def _reference_columns(
     reference: AbstractTrajectory | Motion,
     start: float,
 ) -> list[np.ndarray]:
-    """Return the columns of a reference for each joint, filtered like those of the recording."""
+    """Return each joint's columns of a reference, filtered like the recording."""
     if not isinstance(reference, Motion):
         reference = reference.motion(np.asarray(observations.time) - start)
     motion = jax.tree.map(lambda x: np.asarray(x, np.float64), reference)
@@ -230,7 +230,7 @@ class _ProblemWithoutPrior(RegressionProblem):
 
 
 def _subtract_forces(blocks: Blocks, p: np.ndarray) -> Blocks:
-    """Return the factors of the same rows with the forces of some parameters subtracted."""
+    """Return factors of the same rows, with some parameters' forces subtracted."""
 
     def subtract(joint: JointFactor) -> JointFactor:
         R = np.array(joint.R)

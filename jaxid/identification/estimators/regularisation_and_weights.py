@@ -1,4 +1,4 @@
-"""The weighted system (Eqs. 29-33): weights of the joints, decomposition, and solutions."""
+"""The weighted system: weights of joints, decomposition, solutions (Eqs. 29-33)."""
 
 from abc import abstractmethod
 from typing import NamedTuple
@@ -27,10 +27,10 @@ MIN_SHARE = 0.3
 
 
 class Decomposition(eqx.Module):
-    """Singular value decomposition of the weighted observation matrix with columns of length one.
+    """Singular value decomposition of the weighted observation matrix.
 
-    Scaled columns make the result independent of units. Columns of zeros or of rounding
-    stay zero.
+    Columns are scaled to length one, which makes the result independent of units;
+    columns of zeros or of rounding stay zero.
     """
 
     scale: Float[np.ndarray, " base"]  # lengths of the columns
@@ -68,14 +68,17 @@ class Decomposition(eqx.Module):
         return np.sum(self.directions[is_rounding] ** 2, axis=0) > 1e-8
 
     def solve(self, inverse: np.ndarray | None = None) -> np.ndarray:
-        """Return the parameters, by a substitute of 1 / value² for each direction (`Complete`)."""
+        """Return the parameters, by a substitute of 1 / value² for each direction.
+
+        The substitute is that of `Complete` if none is given.
+        """
         if inverse is None:
             inverse = Complete().inverse(self.values)
         along_directions = inverse * self.values * self.forces
         return self.directions.T @ along_directions / self.scale
 
     def inverse_information(self, inverse: np.ndarray | None = None) -> np.ndarray:
-        """Return the inverse of the information in the parameters' units; see `solve`."""
+        """Return the inverse information in the parameters' units; see `solve`."""
         if inverse is None:
             inverse = Complete().inverse(self.values)
         directions = self.directions / self.scale
@@ -246,8 +249,8 @@ class GivenWeights(AbstractWeights):
         is_one_each = weights.shape == (robot.joints,) and np.isfinite(weights).all()
         if not is_one_each or weights.min() < 0 or not weights.any():
             raise InputError(
-                f"`weights` must be {robot.joints} numbers from 0, not all zero: "
-                f"{weights}."
+                f"`weights` must be {robot.joints} "
+                f"numbers from 0, not all zero: {weights}."
             )
         return weights
 
@@ -300,12 +303,12 @@ class DefaultWeights(NamedTuple):
 
 
 def default_weights(robot: Robot) -> DefaultWeights:
-    """Return weights by the largest forces (Eq. 30), or by residuals if these are unknown."""
+    """Return weights by the largest forces, or residuals if unknown (Eq. 30)."""
     if np.isfinite(robot.known_max_forces).all():
         return DefaultWeights(MaximumForces(), ())
     note = (
-        "the largest forces of the joints are not known: joints are weighted by the "
-        "residuals' variances."
+        "the largest forces of the joints are not known: "
+        "joints are weighted by the residuals' variances."
     )
     return DefaultWeights(ResidualVariances(), (note,))
 
@@ -329,7 +332,7 @@ class UndeterminedDirection(eqx.Module):
     uncertainty: float
 
     def sentence(self, base: BaseParameters) -> str:
-        """Return the combination in words, with the names of five base parameters at most."""
+        """Return the combination in words, with at most five base parameters."""
         names = [base.names[k] for k in self.parts]
         if len(names) == 1:
             return f"{names[0]} is not determined"

@@ -65,7 +65,7 @@ class Huber(AbstractLoss):
 
 
 class Tukey(AbstractLoss):
-    """Tukey's biweight loss: constant beyond a limit, so that large residuals do not count.
+    """Tukey's biweight loss: constant beyond a limit; large residuals do not count.
 
     Attributes:
         limit: Standard deviations from which a residual does not count; the default
@@ -85,7 +85,7 @@ class Tukey(AbstractLoss):
 
 
 class IterativelyReweighted(AbstractEstimator):
-    """Weighted least squares in which rows with large residuals count less (M-estimation).
+    """Weighted least squares in which large residuals count less (M-estimation).
 
     For outliers and friction reversals. The scale of each joint's residuals is taken
     from their median size, every row gets a weight by its own residual, and the system
@@ -127,7 +127,7 @@ class IterativelyReweighted(AbstractEstimator):
         weighted_rows = joint_rows(weights)
 
         def influence(chunk: RowChunk, residuals: np.ndarray) -> Iterator[Channel]:
-            """Weight the residuals of each row; the equations have the mean slope of the loss."""
+            """Weight each row's residuals; equations have the loss's mean slope."""
             row_weights = self.loss.weight(residuals / scale)
             channels = weighted_rows(chunk, row_weights * residuals)
             for channel, slope in zip(channels, slopes, strict=True):
@@ -136,9 +136,9 @@ class IterativelyReweighted(AbstractEstimator):
         notes = ()
         if change > self.tolerance:
             notes = (
-                f"the robust estimate still changed by {100 * change:.2g} % of the "
-                f"residuals after {self.iterations} iterations: there are too many "
-                "outliers to tell them apart.",
+                f"the robust estimate still changed by {100 * change:.2g} % "
+                f"of the residuals after {self.iterations} iterations: "
+                "there are too many outliers to tell them apart.",
             )
         return dataclasses.replace(
             Estimate.solve(problem, weights * np.sqrt(slopes), solution),
@@ -153,7 +153,7 @@ class IterativelyReweighted(AbstractEstimator):
     def _reweight_and_solve(
         self, problem: RegressionProblem, loss: AbstractLoss, weights, p
     ) -> tuple[np.ndarray, float]:
-        """Return new parameters, and the change of the forces relative to the residuals."""
+        """Return new parameters, and the forces' change relative to the residuals."""
         scale = _residual_scale(problem, p)
         blocks = problem.reweighted(p, loss.weight, scale)
         R, z = blocks.total.weighted(weights)
@@ -167,7 +167,7 @@ class IterativelyReweighted(AbstractEstimator):
         return parameters, step_norm / residual_norm
 
     def _mean_slopes(self, problem: RegressionProblem, p, scale) -> np.ndarray:
-        """Return the mean slope of the loss at the residuals of each joint, at least 0.1."""
+        """Return the mean slope of the loss at each joint's residuals, at least 0.1."""
         sums = np.zeros(len(scale))
         for chunk, residuals in problem.residuals(p):
             slopes = self.loss.slope(residuals / scale)
@@ -176,7 +176,7 @@ class IterativelyReweighted(AbstractEstimator):
 
 
 def _residual_scale(problem: RegressionProblem, p: np.ndarray) -> np.ndarray:
-    """Return the standard deviation of each joint's ordinary residuals, by medians [N m or N]."""
+    """Return the deviation of each joint's ordinary residuals by medians [N m or N]."""
     # Of more than a million rows some suffice, evenly spread.
     max_rows = int(problem.factors.rows.max())
     step = max(1, math.ceil(max_rows / 2**20))

@@ -1,4 +1,4 @@
-r"""Nonlinear friction by variable projection: shapes of friction laws beside linear parameters.
+r"""Nonlinear friction by variable projection: shapes beside linear parameters.
 
 For shapes $x$ the best linear parameters are $c = N^+ z$, where $N = [A \; \Phi(x)]$,
 so the residual $r = z - N c$ is a function of the shapes alone (Golub and Pereyra,
@@ -32,7 +32,7 @@ START_RATIOS = (0.2, 1.0, 5.0)
 
 
 class NonlinearFriction(AbstractEstimator):
-    """Estimator of epsilons, Stribeck speeds and other shapes, and then of all parameters.
+    """Estimator of epsilons, Stribeck speeds and other shapes, then all parameters.
 
     The weights of the joints are those of the linear estimator at the shapes of the
     model; with the shapes found, it estimates again. The base parameters of the fit are
@@ -157,13 +157,13 @@ class ShapeSearch(eqx.Module):
         weights: Float[AnyArray, " joints"],
         block_mask: Float[AnyArray, " blocks"] | None = None,
     ) -> tuple[Float[Array, " shapes"], Array]:
-        """Search by Levenberg-Marquardt over logarithms; return shapes, and whether it converged.
+        """Search by Levenberg-Marquardt; return shapes, and whether it converged.
 
-        It begins at the model's shapes, and at the best of a few multiples of them, and
-        keeps the better end: from one start, a Stribeck speed can stop at ten times its
-        value. Where the rows hardly determine a shape, a weak pull keeps it near that
-        of the model: as strong as one row that tells that it differs by a factor of
-        ten.
+        It searches over logarithms, begins at the model's shapes and at the best of a
+        few multiples of them, and keeps the better end: from one start, a Stribeck
+        speed can stop at ten times its value. Where the rows hardly determine a shape,
+        a weak pull keeps it near that of the model: as strong as one row that tells
+        that it differs by a factor of ten.
 
         Args:
             weights: Weight of each joint [1/(N m) or 1/N].
@@ -213,7 +213,7 @@ class ShapeSearch(eqx.Module):
     def _best_multiples(
         self, rows: Float[AnyArray, "rows joints"]
     ) -> Float[Array, " shapes"]:
-        """Return for each joint the multiples of its shapes that explain its own rows best."""
+        """Return each joint's multiples of its shapes that best explain its rows."""
         kinds = len(self.shapes.kinds)
         # Combinations of the first two kinds only: there would be too many.
         repeat = min(kinds, 2)
@@ -253,7 +253,7 @@ class ShapeSearch(eqx.Module):
         x: Float[AnyArray, " shapes"],
         rows: Float[AnyArray, "rows joints"],
     ) -> tuple[Float[Array, " base"], Float[Array, "rows joints"]]:
-        """Return the best linear parameters, and what they leave of the forces [N m or N].
+        """Return the best linear parameters, and what remains of the forces [N m or N].
 
         Args:
             x: Shapes.
@@ -293,7 +293,7 @@ class ShapeSearch(eqx.Module):
 
 
 def _dense_columns(chunk: RowChunk, size: int) -> Float[np.ndarray, "rows joints base"]:
-    """Return the columns of a chunk with zeros where parameters do not act on a joint."""
+    """Return columns of a chunk; zeros where parameters do not act on a joint."""
     columns = np.zeros((*chunk.forces.shape, size))
     for joint, parameters in enumerate(chunk.indices):
         columns[:, joint, list(parameters)] = chunk.columns[joint]
@@ -303,7 +303,7 @@ def _dense_columns(chunk: RowChunk, size: int) -> Float[np.ndarray, "rows joints
 def _filter_columns(
     x, shapes: Shapes, recordings: tuple[Observations, ...], joint, column
 ) -> Float[Array, "rows entries"]:
-    """Return the filtered columns of the terms with shapes, in the rows of these joints."""
+    """Return filtered columns of the terms with shapes, in the rows of these joints."""
     parts = []
     for o in recordings:
         q, qd, qdd = (jnp.asarray(x) for x in (o.motion.q, o.motion.qd, o.motion.qdd))
@@ -317,7 +317,7 @@ _filtered_columns = eqx.filter_custom_jvp(_filter_columns)
 
 @_filtered_columns.def_jvp
 def _(primals, tangents):
-    """Differentiate by the shapes of all joints together: each acts on its own joint only."""
+    """Differentiate by all joints' shapes together: each acts on its own joint only."""
     x, shapes, recordings, joint, column = primals
     # One direction for each kind of shape instead of one for each joint and kind.
     kinds = len(shapes.kinds)

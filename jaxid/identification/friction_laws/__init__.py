@@ -1,4 +1,4 @@
-"""Constants inside friction laws: shapes, lengths of presliding, rates with temperature."""
+"""Constants of friction laws: shapes, presliding lengths, rates with temperature."""
 
 from .nonlinear_friction import (
     HeldOutErrors as HeldOutErrors,

@@ -1,4 +1,4 @@
-"""Friction laws with unknown shapes, compared with the linear model on held-out data."""
+"""Friction laws with unknown shapes, against the linear model on held-out data."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -87,7 +87,7 @@ class NonlinearFit(eqx.Module):
 
     @property
     def better(self) -> Fit:
-        """The nonlinear fit if it pays, otherwise the linear one, with notes that say why."""
+        """The nonlinear fit if it pays, else the linear one; notes say why."""
         if not self.held_out.pays:
             notes = (*self.linear.notes, str(self.held_out))
             return dataclasses.replace(self.linear, notes=notes)
@@ -226,7 +226,7 @@ def _test_squares(
 
 
 class ShapeSlopes(AbstractTerm):
-    """Forces of small changes of shapes: it makes the linearised problem an ordinary one."""
+    """Forces of small changes of shapes: the linearised problem is ordinary."""
 
     shapes: Shapes  # shapes that change, at which forces are linearised
     x: Float[AnyArray, " shapes"]  # their values

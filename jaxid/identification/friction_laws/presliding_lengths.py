@@ -14,7 +14,7 @@ from jaxid.measurement.observations import Observations
 from ..problem import RegressionProblem
 
 LENGTHS = 3.0 ** np.arange(-9, 0)
-"""Lengths that are tried for each joint, before those around the best one [rad or m]."""
+"""Lengths tried for each joint, before those around the best one [rad or m]."""
 STEP_RATIOS = 3.0 ** (0.5 ** np.arange(1, 5))
 """Ratios of neighbouring lengths in the rounds around the best one."""
 
@@ -83,6 +83,6 @@ def presliding_note(base: BaseParameters) -> str:
         )
     ]
     return (
-        "lengths of presliding, whose uncertainty is not in the intervals: "
-        f"{', '.join(words)}."
+        "lengths of presliding, whose uncertainty "
+        f"is not in the intervals: {', '.join(words)}."
     )

@@ -35,9 +35,9 @@ class BlockJackknife(AbstractUncertainty):
         deviations = jackknife(estimate)
         if deviations is None:
             note = (
-                "standard deviations assume independent rows, and are too small where "
-                "errors of neighbouring rows are correlated: there is only one block "
-                "of time."
+                "standard deviations assume independent rows, "
+                "and are too small where errors of neighbouring rows are correlated: "
+                "there is only one block of time."
             )
             dof = np.full(len(naive), np.inf)
             return Uncertainty(naive, dof, naive, None, (note,)), None
@@ -47,7 +47,7 @@ class BlockJackknife(AbstractUncertainty):
 
 
 def jackknife(estimate: Estimate) -> Float[np.ndarray, " base"] | None:
-    """Return standard deviations by the block jackknife; None for a single block of time."""
+    """Return deviations by the block jackknife; None for a single block of time."""
     if len(estimate.blocks.parts) < 2:
         return None
     blocks = residual_blocks(estimate.blocks, estimate.weights, estimate.parameters)
@@ -69,7 +69,7 @@ def residual_blocks(
 def block_covariance(
     blocks: Sequence[ResidualBlock], inverse: AnyArray
 ) -> tuple[np.ndarray, float]:
-    r"""Return the block jackknife's covariance of an estimate, and its degrees of freedom.
+    r"""Return the block jackknife's covariance, and its degrees of freedom.
 
     Without block $k$ the estimate moves by $(1 - B G_k)^{-1} B g_k$, where $G_k$ is the
     block's information and $g_k$ the product of its derivatives and residuals. The
@@ -143,8 +143,8 @@ def bootstrap(
     is_open = ~(np.asarray(condition) < 1 / np.sqrt(RIDGE))
     if is_open.any():
         raise InputError(
-            f"{is_open.sum()} of {draws} draws leave parameters open: take longer "
-            "`blocks`."
+            f"{is_open.sum()} of {draws} draws leave "
+            "parameters open: take longer `blocks`."
         )
     total_gradients = occurrences @ np.array(gradients)
     steps = np.einsum("dij,dj->di", np.asarray(inverse), total_gradients)

@@ -1,4 +1,4 @@
-"""Uncertainty of estimates: the results, and the family of methods that compute them."""
+"""Uncertainty of estimates: results, and the family of methods that compute them."""
 
 from abc import abstractmethod
 
@@ -44,7 +44,7 @@ class Uncertainty(eqx.Module):
 
     @property
     def ratios(self) -> Float[np.ndarray, " base"]:
-        """Standard deviations relative to the naive ones; NaN where nothing is known."""
+        """Standard deviations relative to naive ones; NaN where nothing is known."""
         naive = self.naive_standard_deviations
         has_scale = np.isfinite(naive) & (naive > 0)
         ratios = np.full_like(naive, np.nan)
@@ -131,7 +131,7 @@ class AbstractUncertainty(eqx.Module):
         estimate: Estimate,
         naive: Float[np.ndarray, "base base"],
     ) -> tuple[Uncertainty, ResidualSpectra | None]:
-        """Return the uncertainty, and spectra of the residuals if the method computes them.
+        """Return the uncertainty, and spectra of residuals if they are computed.
 
         Args:
             problem: Rows of the estimate.
@@ -141,7 +141,7 @@ class AbstractUncertainty(eqx.Module):
 
 
 class IndependentRows(AbstractUncertainty):
-    """Textbook covariance for independent errors of the rows: far too small on filtered logs.
+    """Textbook covariance for independent errors: far too small on filtered logs.
 
     It costs nothing: no pass over the rows, and no cross-check.
     """

@@ -1,8 +1,8 @@
 r"""Spectra of the rows of an estimate: one pass transforms stretches of the recordings.
 
 A stretch is a contiguous, equidistant part of the rows. Of each line the pass sums up
-how much it moves the estimates ($K = |FFT_t P|^2 / N$, see `SpectralSandwich`), how much
-of it the fit has explained, and the power of the residuals.
+how much it moves the estimates ($K = |FFT_t P|^2 / N$, see `SpectralSandwich`), how
+much of it the fit has explained, and the power of the residuals.
 """
 
 import itertools
@@ -24,13 +24,19 @@ from ..problem import RegressionProblem, Span
 MAX_ROWS = 2**15
 """Largest number of rows of a stretch; longer parts of a log are divided."""
 MAX_SAMPLES = 2**17
-"""Samples up to which every stretch is transformed; of longer logs some, evenly spread, that are
-shorter and hold three eighths as many samples together."""
+"""Largest number of samples of which every stretch is transformed.
+
+Of longer logs some stretches are, evenly spread, that are shorter and hold three
+eighths as many samples together.
+"""
 MAX_LENGTHS = 4
-"""Number of different lengths up to which each has its own lines; of more, similar ones share them,
-so that memory does not grow with the number of gaps."""
+"""Largest number of different lengths that each have their own lines.
+
+Of more lengths similar ones share them, so that memory does not grow with the number
+of gaps.
+"""
 BIN_EDGES = np.concatenate([np.arange(0.0, 1.0, 0.05), 1.15 ** np.arange(0, 80)])
-"""Edges [Hz] of the bins in which spectra count as constant for correlations of parameters."""
+"""Edges [Hz] of bins of constant spectra, for correlations of parameters."""
 BIN_COUNT = len(BIN_EDGES) + 1
 
 
@@ -133,7 +139,7 @@ class Lines:
         )
 
     def _transform_parts(self, rows: np.ndarray) -> np.ndarray:
-        """Return real and imaginary parts of each line in turn, weighted by how often it counts."""
+        """Return the real and imaginary parts of lines, weighted by their numbers."""
         scale = np.repeat(np.sqrt(self.multiplicity / self.length), 2)
         return scale * self.transform(rows.T).view(float)
 
@@ -281,7 +287,7 @@ def _rows_of_stretches(
 def _visible_lines(
     recording: Observations, length: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return frequencies [Hz] and gains of the lines that filter and decimation let pass."""
+    """Return frequencies [Hz] and gains of lines that filter and decimation pass."""
     frequency = fft.rfftfreq(length, recording.row_time)
     sample_time = recording.sample_time
     decimation = recording.decimation

@@ -1,4 +1,4 @@
-r"""The spectral sandwich: variances of estimates from rows whose errors are correlated in time.
+r"""The spectral sandwich: variances of estimates from rows with correlated errors.
 
 An estimate is linear in the errors, $\hat p_i - p_i = \sum_{jt} P_{ijt} e_{jt}$, so its
 variance is $\sum_{jf} K_{ijf} \phi_j(f)$ with $K = |FFT_t P|^2 / N$ and the spectrum
@@ -28,14 +28,14 @@ from .spectra_of_rows import BIN_COUNT, Lines, RowSpectra, multiplicity, row_spe
 
 
 class SpectralSandwich(AbstractUncertainty):
-    """Spectral sandwich: right for errors that are correlated from row to row (default).
+    """Spectral sandwich: right for errors correlated from row to row (default).
 
     Errors are assumed stationary and independent between joints, recordings, and parts
     of a log on both sides of a gap. Where the errors are larger in the part of a log
     that decides a parameter, the block jackknife gives more than chance allows: then
     its deviation counts. It needs one pass over the rows. Of logs of more than
-    131,072 samples some evenly spread stretches are transformed: these give the ratio to
-    the naive values. If only factors are known, the block jackknife is used instead.
+    131,072 samples some evenly spread stretches are transformed: these give the ratio
+    to the naive values. If only factors are known, the block jackknife is used instead.
     """
 
     def __call__(self, problem, estimate, naive):
@@ -43,8 +43,8 @@ class SpectralSandwich(AbstractUncertainty):
         if not problem.recordings:
             errors, _ = BlockJackknife()(problem, estimate, naive)
             note = (
-                "standard deviations come from the block jackknife: only factors "
-                "were given."
+                "standard deviations come from the block jackknife: "
+                "only factors were given."
             )
             return dataclasses.replace(errors, notes=errors.notes or (note,)), None
         spectra = row_spectra(problem, estimate)
@@ -66,7 +66,7 @@ class SpectralSandwich(AbstractUncertainty):
 
 
 def _widen_by_jackknife(errors: Uncertainty, estimate: Estimate) -> Uncertainty:
-    """Take the jackknife's deviations where chance allows them once in ten thousand times."""
+    """Take the jackknife's deviations where chance allows them once in 10,000 times."""
     if errors.jackknife is None:
         return errors
     shares = []
@@ -133,7 +133,7 @@ class SpectralWindows:
 
 
 class SpectralTable:
-    r"""The sandwich as a linear map of periodograms, $var_i = \sum_{jf} C_{ijf} I_{jf}$.
+    r"""The sandwich as a map of periodograms: $var_i = \sum_{jf} C_{ijf} I_{jf}$.
 
     Computed once for a design and applied to many draws; in NumPy, or in JAX where `xp`
     is `jax.numpy`. The other arguments are those of `Lines`, of all lengths of
@@ -178,12 +178,15 @@ class SpectralTable:
         )
 
     def density(self, power: np.ndarray) -> np.ndarray:
-        """Return the spectrum of the errors at each line, from the periodogram of residuals."""
+        """Return the errors' spectrum at each line, from residual periodograms."""
         sums = self._windows.sum_lines(self._half * power)
         return np.asarray(sums / self._residual_rows)
 
     def __call__(self, power: AnyArray) -> tuple[AnyArray, AnyArray]:
-        """Return variances and degrees of freedom for periodograms [draws, channels, lines]."""
+        """Return variances and degrees of freedom.
+
+        Periodograms are [draws, channels, lines].
+        """
         xp = self._xp
         variance: Any = 0.0
         squares: Any = 0.0
@@ -198,7 +201,7 @@ class SpectralTable:
 
 
 def _join(arrays: Sequence[np.ndarray]) -> np.ndarray:
-    """Return the arrays of all lengths of stretches side by side; one alone is not copied."""
+    """Return arrays of all stretch lengths side by side; a single one is not copied."""
     return arrays[0] if len(arrays) == 1 else np.concatenate(arrays, axis=-1)
 
 
@@ -228,7 +231,7 @@ def sandwich(spectra: RowSpectra) -> tuple[np.ndarray, np.ndarray]:
 
 
 def white_variances(lines: Sequence[Lines]) -> np.ndarray:
-    """Return variances of the estimates for white errors, with one level for each joint."""
+    """Return variances of estimates for white errors, with one level for each joint."""
     rows = sum(x.length * x.exposure for x in lines)
     explained_power = sum(np.sum(x.multiplicity * x.leverage) for x in lines)
     power = sum(np.sum(x.multiplicity * x.power, axis=1) for x in lines)
@@ -239,7 +242,7 @@ def white_variances(lines: Sequence[Lines]) -> np.ndarray:
 
 
 def residual_spectra(lines: Sequence[Lines]) -> ResidualSpectra:
-    """Return spectra and whiteness of the residuals, from the stretches with the most rows."""
+    """Return spectra and whiteness of residuals, from stretches with the most rows."""
     longest = max(lines, key=lambda x: x.length * x.stretches)
     half = 0.5 * longest.multiplicity
     windows = SpectralWindows(longest.frequency, longest.length * longest.row_time)
@@ -286,7 +289,9 @@ def sandwich_of_columns(
     exposure,
     row_time: float,
 ):
-    """Return variances and degrees of freedom of estimates `p` [draws, base], in NumPy or JAX.
+    """Return variances and degrees of freedom of estimates `p` [draws, base].
+
+    Arrays are those of NumPy or JAX.
 
     Columns [columns, rows] and forces [draws, rows] of each joint are zero where a row
     does not count; the columns belong to `joint_parameters`; `exposure` is the
