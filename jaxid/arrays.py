@@ -46,7 +46,7 @@ Numbers = AnyArray | Sequence[Any] | float | int
 
 
 def require_float64(what: str) -> None:
-    """Raise an error if JAX runs in single precision, which a task cannot use."""
+    """Raise an error if JAX runs in float32, which the task `what` cannot use."""
     if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
         raise RuntimeError(
             f"{what} needs float64, but JAX runs in float32: call "

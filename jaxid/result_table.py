@@ -53,7 +53,7 @@ STYLES = {
 
 
 def printable(text: str) -> str:
-    """Return a text with controls and escape sequences spelled out for terminals."""
+    """Return a text with control and escape sequences spelled out for terminals."""
     return UNSEEN_CHARACTERS.sub(
         lambda match: match[0].encode("unicode_escape").decode(), text
     )

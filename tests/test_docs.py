@@ -55,9 +55,9 @@ def _inertial(body) -> str:
         [y * y + z * z, x * x + z * z, x * x + y * y, y * z, x * z, x * y]
     )
     return (
-        f'<inertial><origin xyz="{x} {y} {z}"/><mass value="{m}"/><inertia ixx="{A}" '
-        f'iyy="{B}" '
-        f'izz="{C}" iyz="{-D}" ixz="{-E}" ixy="{-F}"/></inertial>'
+        f'<inertial><origin xyz="{x} {y} {z}"/><mass value="{m}"/>'
+        f'<inertia ixx="{A}" iyy="{B}" izz="{C}" iyz="{-D}" ixz="{-E}" ixy="{-F}"/>'
+        "</inertial>"
     )
 
 
@@ -69,11 +69,10 @@ def _urdf(robot: jid.Robot, bodies) -> str:
         parent = f"link{j}" if j else "ground"
         limits = robot.limits
         parts.append(
-            f'<link name="link{j + 1}">{_inertial(bodies[j])}</link><joint '
-            f'name="{name}" '
-            f'type="revolute"><origin xyz="{offset}"/><parent link="{parent}"/><child '
-            f'link="link{j + 1}"/><axis xyz="{axis}"/><limit '
-            f'lower="{limits.position_min[j]}" '
+            f'<link name="link{j + 1}">{_inertial(bodies[j])}</link>'
+            f'<joint name="{name}" type="revolute"><origin xyz="{offset}"/>'
+            f'<parent link="{parent}"/><child link="link{j + 1}"/><axis xyz="{axis}"/>'
+            f'<limit lower="{limits.position_min[j]}" '
             f'upper="{limits.position_max[j]}" velocity="{limits.velocity[j]}" '
             f'effort="{limits.force[j]}"/></joint>'
         )

@@ -415,8 +415,8 @@ def test_the_template_loads_as_it_is_and_keeps_what_the_urdf_says(tmp_path):
 def test_an_mjcf_file_gives_template_robot_and_nominal_values(tmp_path):
     pytest.importorskip("mujoco")
     (tmp_path / "arm.xml").write_text(
-        '<mujoco><worldbody><body name="link"><joint name="hinge" armature="0.1" '
-        'frictionloss="2"/>'
+        '<mujoco><worldbody><body name="link">'
+        '<joint name="hinge" armature="0.1" frictionloss="2"/>'
         '<geom size="0.1" pos="0.2 0 0"/></body></worldbody></mujoco>'
     )
     text = write_template(

@@ -87,7 +87,7 @@ class Observations(eqx.Module):
     ) -> "Observations":
         """Make observations of arrays (samples x joints) of the joint side.
 
-        The motion is filtered here.
+        The motion must be filtered already.
 
         Args:
             q: Joint angles [rad or m].
@@ -215,10 +215,9 @@ class Observations(eqx.Module):
     def reduce(self, x: Float[AnyArray, "samples *columns"]) -> Any:
         """Turn forces or columns at all samples into rows (Eq. 26).
 
-        The steps are to smooth, trim and decimate.
-
-        Linear, and the same for every column: what holds between columns and forces at
-        the samples holds between the rows. JAX can compile and differentiate it.
+        The steps are smoothing, trimming and decimation. They are linear, and the same
+        for every column: what holds between columns and forces at the samples holds
+        between the rows. JAX can compile and differentiate them.
         """
         edge = self.filter.edge(self.sample_time)
         parts = []

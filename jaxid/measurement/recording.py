@@ -250,10 +250,9 @@ def consecutive(lengths: Iterable[int]) -> tuple[tuple[int, int], ...]:
 def unlike_derivatives(recording: Recording) -> dict[int, float]:
     """Return the channels whose velocities do not make the way of their angles.
 
-    The ways of 0.2 s are compared.
-
-    Only channels whose way is well above the noise of their angles are judged. Each
-    comes with the factor by which its velocities are too large.
+    The ways of 0.2 s are compared. Only channels whose way is well above the noise of
+    their angles are judged. Each comes with the factor by which its velocities are too
+    large.
     """
     dt = recording.sample_time
     steps = max(1, round(JUDGED_WAY_TIME / dt))

@@ -128,7 +128,7 @@ def filtered_figure(
     filtered: Motion,
     joint: int,
 ) -> Figure:
-    """Return velocity and acceleration of a joint: desired, behind a filter (Fig. 5).
+    """Return desired and filtered velocity and acceleration of a joint (Fig. 5).
 
     Args:
         robot: Robot that moves.
@@ -202,7 +202,7 @@ def pose_figure(
 
 
 def even_indices(count: int, max_count: int) -> np.ndarray:
-    """Return indices of at most `max_count` of `count` entries, with both ends."""
+    """Return indices of at most `max_count` of `count` entries, including both ends."""
     places = np.linspace(0, count - 1, min(max_count, count))
     return np.unique(places.round().astype(int))
 
@@ -253,7 +253,7 @@ def _solids(
 
 
 def _capsule_points(capsule: Capsule) -> Float[np.ndarray, "points 3"]:
-    """Return points on the two spheres at a capsule's ends, at the golden angle."""
+    """Return points on two spheres at a capsule's ends, spread by the golden angle."""
     number = np.arange(BALL_POINTS)
     angle = GOLDEN_ANGLE * number
     z = 1.0 - (2.0 * number + 1.0) / BALL_POINTS

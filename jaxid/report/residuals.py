@@ -21,7 +21,7 @@ MIN_GAIN = 1e-2
 
 
 def filter_figure(choice: FilterChoice) -> Figure:
-    """Return held-out errors of all candidates, and correlations of nearby residuals.
+    """Return held-out errors of all candidates, and correlations between neighbours.
 
     Thin lines are single parts of the log. Too low a cut-off removes motion that moves
     the robot, too high a one lets noise into the accelerations.

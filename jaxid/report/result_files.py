@@ -205,9 +205,8 @@ def write_estimates(
 ) -> list[Path]:
     """Write a payload, gains or states; return the files.
 
-    The files are a page, `{kind}.json` and `{kind}.csv`.
-
-    The page shows the `tables`, and the `doubts` above them.
+    The files are a page, `{kind}.json` and `{kind}.csv`. The page shows the `tables`,
+    and the `doubts` above them.
     """
     rows = [row for group in estimates for row in estimate_rows(group)]
     paths = {role: [str(path) for path in logs] for role, logs in sources.items()}

@@ -389,10 +389,8 @@ def _derivatives_of_bodies(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return derivatives of the forces' balance by other joints.
 
-    They are arrays [samples, joints, joints].
-
-    By positions and velocities in the middle of the step, and by velocities before the
-    stage, less those by velocities in it.
+    They are arrays [samples, joints, joints]: by positions and velocities in the middle
+    of the step, and by velocities before the stage, less those by velocities in it.
     """
     a, diagonal = theta[:, INDEX["a"], None], np.eye(len(theta), dtype=bool)
     by_force, by_load = (np.asarray(x)[..., None] for x in (at.by_force, at.by_load))

@@ -44,7 +44,7 @@ def minimise(
     tolerance: float = 1e-3,
     damping: float = 1e-2,
 ) -> Solution:
-    """Minimise sums of squares over the free parameters; each problem has its damping.
+    """Minimise sums of squares over free parameters; each problem has its own damping.
 
     A parameter at a bound that its gradient would leave is held there for one step.
     Problems of one index along the first axis are left alone as soon as each of them

@@ -118,7 +118,7 @@ class TorqueRollout:
 
     @functools.cached_property
     def _acceleration(self) -> Callable:
-        """Accelerations of many samples in scalar operations; JAX differentiates it."""
+        """Accelerations of samples by scalar operations; JAX differentiates them."""
         model = self.base.model
         joints = (model.robot.joints,)
         return lower(
@@ -247,7 +247,7 @@ def identify_torque_rollout(
     load_friction: bool = False,
     every: int = 5,
 ) -> TorqueRolloutFit:
-    """Identify a robot so that its simulation by recorded torques follows positions.
+    """Identify a robot whose simulation under recorded torques follows the positions.
 
     The search starts from the fit of torques. Windows overlap by four fifths.
 

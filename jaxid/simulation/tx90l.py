@@ -86,9 +86,8 @@ def virtual_tx90l_on_rail(
 def cad_tx90l_on_rail() -> Float[np.ndarray, " standard"]:
     """Return a CAD model of `virtual_tx90l_on_rail().model` without friction.
 
-    It describes bodies and rotors.
-
-    Masses and rotors are 10 to 18 % off, each body as a whole.
+    It describes bodies and rotors. Masses and rotors are 10 to 18 % off, each body as a
+    whole.
     """
     errors = 1.0 + np.array([0.15, -0.12, 0.18, -0.10, 0.14, -0.18, 0.11])
     bodies = _bodies(COLD) * errors[:, None]
@@ -98,7 +97,7 @@ def cad_tx90l_on_rail() -> Float[np.ndarray, " standard"]:
 
 
 def _bodies(published: dict[int, float]) -> Float[np.ndarray, "7 7"]:
-    """Return seven parameters of each body that have the published values (Eq. 24)."""
+    """Return seven parameters of each body with published base parameters (Eq. 24)."""
     entry = library.entries()["virtual_tx90l_on_rail"]
     m = np.array(entry["masses"])
     r = np.array(entry["centres"])

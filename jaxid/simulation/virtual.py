@@ -329,7 +329,7 @@ class VirtualRobot(Hashable):
         seed: int,
         name: str = "virtual",
     ) -> Recording:
-        """Follow a trajectory without error; record angles and forces like the sensors.
+        """Follow a trajectory without error; record angles and forces as sensors do.
 
         Args:
             trajectory: Motion.

@@ -81,7 +81,7 @@ class Diagnosis(Summarised):
         return _mistakes([self], fit)[0]
 
     def with_fit(self, fit: Fit, commanded: Observations | None = None) -> "Diagnosis":
-        """Return the diagnosis with what a fit to this log alone reveals, and delays.
+        """Return the diagnosis with findings of a fit to this log alone, and delays.
 
         The log with `commanded` angles in place of the measured ones is filtered alike.
         """
@@ -247,7 +247,7 @@ def mistakes_in_logs(
 def _mistakes(
     diagnoses: Sequence[Diagnosis], fit: Fit
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the likely mistake in logs, or moments of departure, and notes."""
+    """Return the likely mistake in logs, or moments unlike the model, and notes."""
     # Faults of channels explain the rest.
     logs = [
         d.observations for d in diagnoses if d.observations is not None and not d.faulty
@@ -293,7 +293,7 @@ def _excerpt(log: Observations, source: SamplesOnDisk) -> Recording:
 
 
 def departures(fit: Fit, observations: Observations) -> tuple[str, ...]:
-    """Report forces that depart from the model for one moment, and only then so far.
+    """Report forces that depart far from the model at one moment only.
 
     Such a departure exceeds half of its joint's RMS force, and lasts a hundredth of the
     log at most, beside what the filter spreads. Uncertain parameters do not explain it:

@@ -169,7 +169,7 @@ class _Samples:
         return mistake.correction(found, part)
 
     def hidden(self, shown: float) -> tuple[str, ...]:
-        """Return a note on mistakes by which the model would miss less than shown."""
+        """Return a note on mistakes with which the model would miss less than shown."""
         unseen: dict[str, list[str]] = {}
         for mistake in self.amounts():
             change = mistake.correction(mistake.small, slice(None))

@@ -19,7 +19,7 @@ from .torque_errors import Definiteness, TorqueErrors
 RMS_ERROR = (5.0, 50.0)
 """RMS errors on new motions: good, and tolerable [% of the RMS force, worst joint]."""
 FIT_ERROR = (1.0, 30.0)
-"""Missed forces of a fit without noise: good, and tolerable [% of the RMS force]."""
+"""Missed forces of a fit, noise apart: good, and tolerable [% of the RMS force]."""
 MATERIAL = 2.0
 """Errors on new motions that are judged relative to the fit's [% of the RMS force]."""
 UNSEEN_RATIO = 1.5
@@ -188,7 +188,7 @@ def _relative(logs: Sequence[TorqueErrors]) -> np.ndarray:
 
 
 def _constant_share(logs: Sequence[TorqueErrors], joint: int) -> float:
-    """Return the part of a joint's squared errors that are means of logs (0 to 1)."""
+    """Return the share of means of single logs in a joint's squared errors (0 to 1)."""
     errors = [e.errors[:, joint] for e in logs]
     whole = float(sum(np.nansum(e**2) for e in errors))
     counts = [np.count_nonzero(np.isfinite(e)) for e in errors]

@@ -73,10 +73,9 @@ def test_export_of_bodies(target, consistent, tmp_path):
     if target == "urdf":
         chain = "".join(
             f'<link name="l{k + 1}"/><joint name="joint{k + 1}" type="revolute">'
-            f'<parent link="l{k}"/><child link="l{k + 1}"/><origin xyz="{xyz}" '
-            f'rpy="{rpy} 0 0"/>'
-            '<axis xyz="0 0 1"/><limit lower="-3" upper="3" velocity="2" '
-            'effort="80"/></joint>'
+            f'<parent link="l{k}"/><child link="l{k + 1}"/>'
+            f'<origin xyz="{xyz}" rpy="{rpy} 0 0"/><axis xyz="0 0 1"/>'
+            '<limit lower="-3" upper="3" velocity="2" effort="80"/></joint>'
             for k, (xyz, rpy) in enumerate(PANDA)
         )
         (tmp_path / "own.urdf").write_text(

@@ -57,8 +57,8 @@ def test_shapes_move_with_the_robot(browser, tmp_path):
         " s.dispatchEvent(new Event('input')); }"
     )
     shown = (
-        "((d) => [d.x, d.y, d.z].map((a) => "
-        "[...a]))(document.querySelector('.chart').data[2])"
+        "((d) => [d.x, d.y, d.z].map((a) => [...a]))"
+        "(document.querySelector('.chart').data[2])"
     )
     found = np.transpose(browser.evaluate(shown))
     np.testing.assert_allclose(found, figure.scene.solids.placed[12], atol=4e-4)

@@ -133,12 +133,10 @@ def test_a_mesh_is_held_whole(tmp_path):
 
 def test_grippers_that_the_chain_leaves_out_count_as_bodies_that_collide(tmp_path):
     fingers = "".join(
-        f'<link name="{name}"><collision><geometry><sphere '
-        'radius="0.01"/></geometry></collision>'
-        f'</link><joint name="j{name}" type="prismatic"><parent link="tool"/><child '
-        f'link="{name}"/>'
-        f'<origin xyz="0 {y} 0.1"/><axis xyz="0 1 0"/><limit lower="0.02" '
-        'upper="0.04"/></joint>'
+        f'<link name="{name}"><collision><geometry><sphere radius="0.01"/></geometry>'
+        f'</collision></link><joint name="j{name}" type="prismatic">'
+        f'<parent link="tool"/><child link="{name}"/><origin xyz="0 {y} 0.1"/>'
+        '<axis xyz="0 1 0"/><limit lower="0.02" upper="0.04"/></joint>'
         for name, y in (("left", 0.1), ("right", -0.1))
     )
     path = written(tmp_path)

@@ -12,11 +12,9 @@ def link(name, inertial=""):
 def inertial(mass, xyz, rpy, inertia):
     ixx, ixy, ixz, iyy, iyz, izz = inertia
     return (
-        f'<inertial><origin xyz="{numbers(xyz)}" rpy="{numbers(rpy)}"/><mass '
-        f'value="{mass}"/>'
-        f'<inertia ixx="{ixx}" ixy="{ixy}" ixz="{ixz}" iyy="{iyy}" iyz="{iyz}" '
-        f'izz="{izz}"/>'
-        "</inertial>"
+        f'<inertial><origin xyz="{numbers(xyz)}" rpy="{numbers(rpy)}"/>'
+        f'<mass value="{mass}"/><inertia ixx="{ixx}" ixy="{ixy}" ixz="{ixz}" '
+        f'iyy="{iyy}" iyz="{iyz}" izz="{izz}"/></inertial>'
     )
 
 
@@ -33,8 +31,8 @@ def joint(
 ):
     return (
         f'<joint name="{name}" type="{kind}"><origin xyz="{xyz}" rpy="{rpy}"/>'
-        f'<parent link="{parent}"/><child link="{child}"/><axis '
-        f'xyz="{axis}"/>{inner}</joint>'
+        f'<parent link="{parent}"/><child link="{child}"/>'
+        f'<axis xyz="{axis}"/>{inner}</joint>'
     )
 
 

@@ -38,13 +38,11 @@ MAX_WINDOW = 10**5
 
 
 class ZeroPhaseButterworth(AbstractFilter):
-    """Butterworth low-pass, forward and backward, then central differences.
+    """Butterworth low-pass, forward and backward, then fourth-order differences.
 
-    The differences are of fourth order.
-
-    Measured velocities, if there are any, are filtered like the angles and
-    differentiated once; otherwise the angles are differentiated twice. With an infinite
-    `cutoff` nothing is filtered.
+    The differences are central ones. Measured velocities, if there are any, are
+    filtered like the angles and differentiated once; otherwise the angles are
+    differentiated twice. With an infinite `cutoff` nothing is filtered.
 
     Attributes:
         cutoff: Cut-off of angles and velocities, of one direction as in scipy [Hz].
