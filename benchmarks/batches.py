@@ -139,9 +139,8 @@ def against_loops(datasets, samples, turns):
                 f"{datasets} data sets x {samples} samples in one call, against "
                 f"{name} + lstsq",
                 f"Panda, {base.size} base parameters with friction, float64, two "
-                "cores, median of "
-                f"{turns} turns; the loop on {len(some)} data sets a turn; compile "
-                f"{first - times['batch'].median:.1f} s apart",
+                f"cores, median of {turns} turns; the loop on {len(some)} data sets a "
+                f"turn; compile {first - times['batch'].median:.1f} s apart",
                 f"{ASKED:.0f}x",
                 f"{ratio:.1f}x ({1e3 * mine:.2f} ms against {1e3 * loop:.1f} ms for a "
                 "data set)",

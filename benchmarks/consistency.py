@@ -355,8 +355,7 @@ def times(arms, quick):
     lost = int(np.sum(~np.asarray(many_fits.certified)))
     recipe = (
         f"Panda, {arm.model.size} parameters, 5 % noise, {count} data sets one after "
-        "another, "
-        f"{turns} turns of both solvers; medians"
+        f"another, {turns} turns of both solvers; medians"
     )
     return [
         Row(
@@ -365,8 +364,7 @@ def times(arms, quick):
             recipe,
             "<= 2.5 ms",
             f"{1e3 * one:.2f} ms (best {1e3 * found[:, 0].min():.2f}); from triangle "
-            "to parameters "
-            f"{1e3 * whole:.2f} ms",
+            f"to parameters {1e3 * whole:.2f} ms",
             one <= 2.5e-3,
         ),
         Row(

@@ -220,9 +220,9 @@ def coverage_rows(base, p, seeds, draws):
                     f"coverage {seed} {name}",
                     f"% of {base.size} parameters inside 93-97 %, noise {name}",
                     f"trajectory {seed} (condition number {condition:.0f}), {draws} "
-                    "draws, noise "
-                    f"key {10 * seed + k}, {study.o.rows} rows at {RATE / EVERY:g} Hz; "
-                    f"honest/naive {np.median(ratio):.2f} (median)",
+                    f"draws, noise key {10 * seed + k}, {study.o.rows} rows at "
+                    f"{RATE / EVERY:g} Hz; honest/naive {np.median(ratio):.2f} "
+                    "(median)",
                     f">= {asked:g}{', none below 90' if memory > 0.1 else ''}; <= 1 "
                     "ms per fit",
                     f"{said(honest)}; {1e3 * spent:.2f} ms per fit; naive: "
@@ -260,8 +260,7 @@ def bias_rows(base, p, seeds, phases):
             if len(errors) > 1:
                 also = (
                     f"; one log scatters by {scatter.max():.3f} (largest), so a mean "
-                    "of "
-                    f"{phases} by {scatter.max() / phases**0.5:.3f}"
+                    f"of {phases} by {scatter.max() / phases**0.5:.3f}"
                 )
             rows.append(
                 Row(

@@ -228,8 +228,7 @@ def time_forms(name, arm, quick):
     print(f"\n{name} ({jid.base_parameters(model).size} base parameters)\n")
     print(
         "| form | multiplications + additions | -O2 [ns] | -O3 native [ns] | factored "
-        "over it: "
-        "operations | time, -O2 and -O3 | without sines and cosines |"
+        "over it: operations | time, -O2 and -O3 | without sines and cosines |"
     )
     print("|---|---|---|---|---|---|---|")
     own = found[FACTORED].counts

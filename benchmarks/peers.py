@@ -82,10 +82,8 @@ def compare(number, what, recipe, asked, ours, peer, samples, target):
     ratio = peer / ours
     measured = (
         f"{ratio:.1f}x ({per_sample(ours, samples)} against "
-        f"{per_sample(peer, samples)}); "
-        f"best turns {peer.best / ours.best:.1f}x ({ours.best / samples * NS:.0f} ns "
-        "against "
-        f"{peer.best / samples * NS:.0f} ns)"
+        f"{per_sample(peer, samples)}); best turns {peer.best / ours.best:.1f}x "
+        f"({ours.best / samples * NS:.0f} ns against {peer.best / samples * NS:.0f} ns)"
     )
     return Row(number, what, recipe, asked, measured, ratio >= target)
 
@@ -101,8 +99,8 @@ def with_friction(samples, turns):
     what = "regressor with friction and rotors, against FIGAROH"
     recipe = (
         "Panda, bodies + viscous + Coulomb (sign) + rotor columns = 91, N = "
-        f"{samples}, two cores "
-        f"(FIGAROH's loop uses one of them), median of {turns} turns"
+        f"{samples}, two cores (FIGAROH's loop uses one of them), "
+        f"median of {turns} turns"
     )
     absent = timing.missing("figaroh") or timing.missing("pinocchio")
     robot = jid.robots.panda()
@@ -205,11 +203,10 @@ def one_core(samples, turns):
     floor = times["fill"]
     work = counts.multiplications + counts.additions
     recipe = (
-        f"Panda, ten parameters per body = 70 columns, {nonzero} non-zero entries, N "
-        f"= {samples}, "
-        f"one core, median of {turns} turns; floors: warm fill "
-        f"{per_sample(floor, samples)}, "
-        f"{work} operations at {rate / NS:.0f} Gflop/s {work / rate * NS:.0f} ns"
+        f"Panda, ten parameters per body = 70 columns, {nonzero} non-zero entries, N = "
+        f"{samples}, one core, median of {turns} turns; floors: warm fill "
+        f"{per_sample(floor, samples)}, {work} operations at {rate / NS:.0f} Gflop/s "
+        f"{work / rate * NS:.0f} ns"
     )
     asked = {
         2: ">= 3.5x (stretch 5x)",
@@ -240,8 +237,7 @@ def one_core(samples, turns):
     over = ours / floor
     measured = (
         f"{over:.1f}x ({per_sample(ours, samples)} against "
-        f"{per_sample(floor, samples)}); "
-        f"best turns {ours.best / floor.best:.1f}x"
+        f"{per_sample(floor, samples)}); best turns {ours.best / floor.best:.1f}x"
     )
     what = "regressor, against a warm fill of its non-zero entries"
     rows.append(Row("4", what, recipe, asked[4], measured, over <= 9))
@@ -289,8 +285,8 @@ def on_gpu(quick):
     )
     recipe = (
         f"{jax.devices()[0].device_kind}, jax {jax.__version__}, Panda, float64, N = "
-        f"{samples}, "
-        f"median of {turns} turns, compile of the regressor {compiling:.1f} s"
+        f"{samples}, median of {turns} turns, "
+        f"compile of the regressor {compiling:.1f} s"
     )
     *dynamics, (name, design) = times.items()
     rows = [

@@ -345,9 +345,8 @@ def coverage(quick: bool) -> None:
             warned += bool(fit.notes)
         print(
             f"{draws} draws, {'with' if stribeck else 'without'} unmodelled Stribeck "
-            "friction: "
-            f"{100 * np.mean(hits):.1f} % of {len(hits)} intervals hold, {warned} warn "
-            f"({time.time() - start:.0f} s)",
+            f"friction: {100 * np.mean(hits):.1f} % of {len(hits)} intervals hold, "
+            f"{warned} warn ({time.time() - start:.0f} s)",
             flush=True,
         )
 
@@ -619,10 +618,8 @@ def sysid_row(what: str, sets, bodies=None) -> Row:
         said += f"{cpu / warm[1]:.1f} times ours, {cpu / cold[1]:.1f} with compiling)"
     recipe = (
         "identified on four motions, free-running on six others; inertia, damping, "
-        "delay, "
-        f"friction, bias{', stiffness by the weight' if bodies else ''}; its start "
-        "that of our "
-        "table, ours its 18 starts; its steps 10 ms"
+        f"delay, friction, bias{', stiffness by the weight' if bodies else ''}; its "
+        "start that of our table, ours its 18 starts; its steps 10 ms"
     )
     holds = bool((ours[1] <= errors[1]).all() and 10 * warm[1] <= cpu)
     asked = "error <= its, time <= 1/10 of its"

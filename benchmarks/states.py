@@ -235,8 +235,8 @@ def _paper_table(
         )
         lines.append(
             f"| p_B({k + 1}), {base.names[k]} [{base.units[k]}] | {cold[k]:.2f} | {a} "
-            f"| {warm[k]:.2f} | {b} | {found.difference[k]:+.3f} ± "
-            f"{found.half_widths[k]:.3f} "
+            f"| {warm[k]:.2f} | {b} "
+            f"| {found.difference[k]:+.3f} ± {found.half_widths[k]:.3f} "
             f"| {found.verdicts[k].value} |"
         )
     return lines
@@ -366,16 +366,14 @@ def delay(draws: int) -> list[str]:
     return [
         f"| of {draws} draws | |",
         "|---|---|",
-        f"| delay of {1e3 * DELAY:g} ms (sample time {1e3 * SAMPLE_TIME:g} ms): mean "
-        "error, RMS "
-        f"| {errors.mean():.1f} µs, {np.sqrt(np.mean(errors**2)):.1f} µs |",
+        f"| delay of {1e3 * DELAY:g} ms (sample time {1e3 * SAMPLE_TIME:g} ms): "
+        f"mean error, RMS | {errors.mean():.1f} µs, "
+        f"{np.sqrt(np.mean(errors**2)):.1f} µs |",
         f"| its 95 % intervals that hold the truth | {np.mean(inside):.0%} |",
         "| errors of the parameters in standard deviations (median), delay left in; "
-        "removed "
-        f"| {np.mean(before):.2f}; {np.mean(after):.2f} |",
+        f"removed | {np.mean(before):.2f}; {np.mean(after):.2f} |",
         "| three runs, added one by one, against all at once: largest relative "
-        "difference "
-        f"| {max(apart):.0e} |",
+        f"difference | {max(apart):.0e} |",
     ]
 
 

@@ -174,10 +174,8 @@ def case(number, name, base, o, repetitions, most, memory=math.inf):
         number,
         f"{len(o.forces)} samples in memory to base parameters, {name}",
         f"rail + TX90L, {base.size} base parameters with friction and rotors, naive "
-        "covariance, "
-        f"two cores, median of {repetitions} runs; {fit.rows[0]} rows; the first run, "
-        "which "
-        f"compiles, {first:.1f} s",
+        f"covariance, two cores, median of {repetitions} runs; {fit.rows[0]} rows; the "
+        f"first run, which compiles, {first:.1f} s",
         asked,
         f"{median:.2f} s (best {min(times):.2f} s), {peak.megabytes:.0f} MB beyond "
         "the inputs",
@@ -251,10 +249,8 @@ def from_disk(base, samples, repetitions):
         "14",
         f"{samples} samples from Parquet on disk, 20 Hz, every 25th a row",
         f"rail + TX90L, {base.size} base parameters, a file of {size:.0f} MB, two "
-        "cores, median of "
-        f"{repetitions} runs; reading and filtering alone {read:.2f} s, computing "
-        "alone "
-        f"{computed:.2f} s, both by a part of the log",
+        f"cores, median of {repetitions} runs; reading and filtering alone {read:.2f} "
+        f"s, computing alone {computed:.2f} s, both by a part of the log",
         "<= 1.2 x the larger of reading and computing, <= 1000 MB",
         f"{ratio:.2f} x the larger ({median:.2f} s), {peak.megabytes:.0f} MB",
         ratio <= 1.2 and peak.megabytes <= 1000,
@@ -279,8 +275,8 @@ def against_pinocchio(base, motion, forces, samples, repetitions):
         "11",
         f"{samples} samples in memory to base parameters, against NumPy + Pinocchio",
         f"rail + TX90L, {base.size} base parameters, every sample a row; the loop is "
-        "in Python, "
-        f"then a QR; median of {repetitions} turns; estimates differ by {away:.0e}",
+        f"in Python, then a QR; median of {repetitions} turns; estimates differ by "
+        f"{away:.0e}",
         ">= 25x",
         f"{ratio:.0f}x ({a:.3f} s against {b:.2f} s)",
         ratio >= 25,

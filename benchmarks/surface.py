@@ -122,9 +122,8 @@ def dynamics(model, p, quick):
         times = [median(dense, x), median(model.regressor, host)]
         said = (
             f"{times[0] / floor:.1f} of packed; a loop over Pinocchio takes "
-            f"{loop / times[0]:.1f} "
-            f"times as long, {loop / times[1]:.1f} times with NumPy arrays, not "
-            "compiled"
+            f"{loop / times[0]:.1f} times as long, {loop / times[1]:.1f} times with "
+            "NumPy arrays, not compiled"
         )
         yield Row(
             f"regressor/{samples}", "dense regressor", "", "<= 4.5 of packed", said

@@ -194,8 +194,8 @@ def calibration(virtual):
         bias = np.abs(found.mean(axis=0) - truth) / scatter
         print(
             f"| {name} | {100 * inside.mean():.1f} | {np.median(held):.0f} | "
-            f"{held.min()} | "
-            f"{np.median(reported / scatter):.2f} | {np.median(bias):.2f} |"
+            f"{held.min()} | {np.median(reported / scatter):.2f} | "
+            f"{np.median(bias):.2f} |"
         )
 
 
@@ -240,9 +240,8 @@ def filters(virtual):
             worst = int(np.argmax(np.abs(bias)))
             print(
                 f"| {name}; {motion} | {np.median(np.abs(bias)):.2f} | "
-                f"{abs(bias[worst]):.1f} | "
-                f"{base.names[worst]} | {np.sum(np.abs(bias) > 1.96)} | "
-                f"{100 * hold.mean():.0f} |"
+                f"{abs(bias[worst]):.1f} | {base.names[worst]} | "
+                f"{np.sum(np.abs(bias) > 1.96)} | {100 * hold.mean():.0f} |"
             )
 
 
