@@ -85,8 +85,8 @@ def singular_values(
     """Find the null space by a singular value decomposition.
 
     It is the paper's alternative method. The rank is where the singular values fall by
-    the largest factor. A column depends
-    on earlier ones if some vector of the null space ends there.
+    the largest factor. A column depends on earlier ones if some vector of the null
+    space ends there.
     """
     unit_columns, norms = scale_columns(W)
     columns = len(norms)

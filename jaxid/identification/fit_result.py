@@ -268,8 +268,8 @@ class Fit(Summarised, eqx.Module):
         )
         if isinstance(self.solution, Complete):
             advice += (
-                '; `ridge = "cross_validated"` in `[estimator]` keeps small what is '
-                "left open"
+                '; `ridge = "cross_validated"` in `[estimator]` '
+                "keeps small what is left open"
             )
         return [*remarks, Remark(advice)]
 

@@ -1,4 +1,4 @@
-"""Many data sets in one call: like robots, noise draws, geometries, any estimator.
+"""Many data sets in one call: similar robots, noise draws, geometries, any estimator.
 
 Least squares of all data sets are one compiled computation. Data sets that are not well
 conditioned are solved again by orthogonal factors, one by one, and so are all of them

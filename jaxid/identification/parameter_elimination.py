@@ -153,7 +153,7 @@ def _inflation(deviations, naive_deviations) -> np.ndarray:
 def _held_out_errors(
     fit: Fit, problem: RegressionProblem, order: Sequence[int]
 ) -> list[float]:
-    """Return relative errors on held-out parts before each elimination."""
+    """Return held-out errors before each elimination, relative to the forces."""
     joint_weights = fit.weights**2
     total = float(joint_weights @ problem.factors.force_squares)
     squares = np.zeros(len(order))

@@ -261,8 +261,8 @@ def _check_names(names: list[str]) -> None:
         is_identifier = re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name)
         if not is_identifier or RESERVED.fullmatch(name):
             raise InputError(
-                "names in C code must be identifiers of C and not reserved, but one "
-                f"is {name!r}."
+                "names in C code must be identifiers of C and not reserved, "
+                f"but one is {name!r}."
             )
     if len(set(names)) < len(names):
         raise InputError(

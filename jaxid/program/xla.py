@@ -58,8 +58,8 @@ def fenced(x: Array, one: Array | None) -> Array:
 def fenced_nodes(program: Program) -> frozenset[int]:
     """Return positions of the nodes that a fence pays for.
 
-    These are the nodes with (uses - 1) times the cost of computing them again > 6
-    operations; between 0 and 30 the speed hardly depends on it.
+    For these nodes the cost of computing them again, times (uses - 1), exceeds six
+    operations; between 0 and 30 the speed hardly depends on this limit.
     """
     costs = []  # operations that compute each node again, from the fences before it
     nodes = set()

@@ -76,14 +76,14 @@ def from_dh(
     """
     if convention not in ("modified", "standard"):
         raise InputError(
-            '`convention` must be "modified" (Craig) or "standard", but is '
-            f'"{convention}".'
+            '`convention` must be "modified" (Craig) or "standard", '
+            f'but is "{convention}".'
         )
     table = np.array(rows, dtype=np.float64)
     if table.ndim != 2 or table.shape[1] not in (3, 4) or not np.isfinite(table).all():
         raise InputError(
-            "`rows` must hold rows of finite (alpha, "
-            f"a, d, theta), but has shape {table.shape}."
+            "`rows` must hold rows of finite (alpha, a, d, theta), "
+            f"but has shape {table.shape}."
         )
     n = len(table)
     if table.shape[1] == 3:

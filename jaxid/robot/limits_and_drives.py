@@ -173,8 +173,8 @@ def _reduction_matrix(reduction: Any, joints: int) -> AnyArray:
         matrix = np.diag(matrix)
     if matrix.shape != (joints, joints) or not np.isfinite(matrix).all():
         raise InputError(
-            f"`reduction` must hold {joints} or {joints} x "
-            f"{joints} finite ratios, not {matrix.shape}."
+            f"`reduction` must hold {joints} or {joints} x {joints} "
+            f"finite ratios, not {matrix.shape}."
         )
     # Gear ratios of different sizes are no sign of a singular matrix.
     row_sizes = np.abs(matrix).max(axis=1, keepdims=True)
@@ -283,8 +283,8 @@ def limit_notes(
             joints_by_speed.setdefault(float(speed), []).append(name)
     for speed, joints in joints_by_speed.items():
         notes.append(
-            f"{owners('joint', joints)}: a velocity of up "
-            f"to {speed:g} rad/s is {30 * speed / np.pi:.4g} turns a minute: "
+            f"{owners('joint', joints)}: a velocity of up to "
+            f"{speed:g} rad/s is {30 * speed / np.pi:.4g} turns a minute: "
             "is the limit in degrees per second, or none?"
         )
     return notes

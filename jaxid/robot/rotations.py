@@ -66,8 +66,8 @@ def snapped(
     """Return unit vectors whose entries within `tolerance` of zero are zero."""
     if not 0.0 <= tolerance < 0.1:
         raise InputError(
-            "`snap_tolerance` must be an angle from 0 "
-            f"(off) to 0.1 rad, but is {tolerance:g}."
+            "`snap_tolerance` must be an angle from 0 (off) to 0.1 rad, "
+            f"but is {tolerance:g}."
         )
     entries = np.asarray(vectors, np.float64)
     entries = np.where(np.abs(entries) <= tolerance, 0.0, entries)

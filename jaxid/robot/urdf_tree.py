@@ -409,8 +409,8 @@ class UrdfTree:
         if array.shape != (len(default),) or not is_number.all():
             words = "number" if len(default) == 1 else "numbers"
             raise InputError(
-                f"{self.place(element)}: `{key}` must hold {len(default)} finite "
-                f'{words}, but is "{text}".'
+                f"{self.place(element)}: `{key}` must hold "
+                f'{len(default)} finite {words}, but is "{text}".'
             )
         return array
 

@@ -146,8 +146,8 @@ def write_ros(
         return
     header = {"stamp": _ros_time(0.0), "frame_id": ""}
     lines = [
-        f"# {MESSAGE} of `{robot.name}`: rad (revolute "
-        "joints) or m (prismatic joints), and s;",
+        f"# {MESSAGE} of `{robot.name}`: "
+        "rad (revolute joints) or m (prismatic joints), and s;",
         f"# at most {sample_time:.6g} s from one point to the next.",
         "# Move the robot slowly to the first point, then:",
         f"#   ros2 topic pub --once {TOPIC} \\",

@@ -19,7 +19,7 @@ from .excitation_settings import Excitation
 from .setup import Setup
 
 UNKNOWN_SHARE = 0.3
-"""Fraction of the largest forces kept free where friction or others are unknown."""
+"""Fraction of the largest forces kept free where friction or the like is unknown."""
 RANDOM_POSES = 2000
 """Number of random poses in which the forces of gravity are computed."""
 

@@ -59,7 +59,7 @@ DEFAULT_CUTOFF = 10.0
 MAX_LOAD_FRICTION_FITS = 10
 """Fits after which friction by load must have settled."""
 LOAD_FRICTION_TOLERANCE = 1e-3
-"""Largest change of friction by load between fits that counts as none, relative."""
+"""Relative change of the friction by load, from fit to fit, that counts as none."""
 
 NO_FILTER = (
     "no filter is given (table `[filter]`): "

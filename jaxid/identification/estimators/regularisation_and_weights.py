@@ -249,8 +249,8 @@ class GivenWeights(AbstractWeights):
         is_one_each = weights.shape == (robot.joints,) and np.isfinite(weights).all()
         if not is_one_each or weights.min() < 0 or not weights.any():
             raise InputError(
-                f"`weights` must be {robot.joints} "
-                f"numbers from 0, not all zero: {weights}."
+                f"`weights` must be {robot.joints} numbers from 0, "
+                f"not all zero: {weights}."
             )
         return weights
 
