@@ -224,6 +224,19 @@ def test_public_names_are_few():
     )
 
 
+def test_benchmarks_and_notebooks_use_public_names():
+    """Their only import of the package is `import jaxid as jid`."""
+    scripts = [*ROOT.glob("benchmarks/**/*.py"), *ROOT.glob("notebooks/*.py")]
+    private = [
+        f"{_name(path)}: {line.strip()}"
+        for path in scripts
+        for line in path.read_text(encoding="utf-8").splitlines()
+        if re.match(r"\s*(from jaxid\b|import jaxid\.)", line)
+    ]
+    assert scripts
+    assert not private
+
+
 def test_namespaces_hold_their_own_names():
     foreign = []
     for namespace in dir(jaxid):

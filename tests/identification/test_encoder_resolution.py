@@ -4,11 +4,7 @@ import numpy as np
 import pytest
 
 import jaxid as jid
-from jaxid.identification.encoder_resolution import (
-    encoder_steps,
-    resolution_bias,
-    resolution_note,
-)
+from jaxid.identification.encoder_resolution import encoder_steps, resolution_note
 
 STEP = 2 * np.pi / 2**11
 ARM = jid.robots.planar_arm(2, 0.4)
@@ -47,7 +43,7 @@ def test_the_bias_is_that_of_many_encoders():
         fit, log, rows = fitted((np.round(q / STEP + zero) - zero) * STEP, 0.0)
         exact = fitted(q, 0.0)[0]
         found.append(fit.parameters - exact.parameters)
-        told.append(resolution_bias(fit, log, rows))
+        told.append(jid.resolution_bias(fit, log, rows))
     bias, expected = np.mean(told, axis=0), np.mean(found, axis=0)
     scatter = np.std(found, axis=0) / np.sqrt(12) + np.std(told, axis=0) / np.sqrt(12)
     large = np.abs(expected) > 5 * scatter

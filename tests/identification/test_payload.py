@@ -9,7 +9,6 @@ from virtual import observations, standard_parameters
 import jaxid as jid
 from jaxid.identification.delay import without_delay
 from jaxid.identification.payload import body_columns
-from jaxid.measurement.recording import remove_delay
 
 LOAD = jid.Tool(
     2,
@@ -213,16 +212,18 @@ def test_removing_a_delay_undoes_it():
     angles = np.sin(np.outer(t, [3.0, 5.0]))
     shifted = np.sin(np.outer(t - 0.0234, [3.0, 5.0]))
     log = jid.Recording.of(angles, shifted, velocities=angles, sample_time=0.01)
-    back = remove_delay(log, 0.0234)
+    back = jid.remove_delay(log, 0.0234)
     np.testing.assert_allclose(back.time, t[3:])
     np.testing.assert_allclose(back.velocities, back.angles)
-    early = remove_delay(jid.Recording.of(shifted, angles, sample_time=0.01), -0.0234)
+    early = jid.remove_delay(
+        jid.Recording.of(shifted, angles, sample_time=0.01), -0.0234
+    )
     for log in (back, early):
         assert log.samples == 397
         np.testing.assert_allclose(log.angles[3:-3], log.forces[3:-3], atol=2e-6)
     assert "23.4 ms was removed" in back.notes[-1]
     with pytest.raises(ValueError, match="`recording` lasts"):
-        remove_delay(early, 10.0)
+        jid.remove_delay(early, 10.0)
 
 
 def test_rows_whose_motion_is_not_known_do_not_count(base):
