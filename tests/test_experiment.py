@@ -91,6 +91,15 @@ def load(tmp_path):
     return load
 
 
+def test_files_of_earlier_templates_are_read(load):
+    former = "[model.coulomb]\ndead_zone = 0.0\n[excitation]\npolish = 4\n"
+    load(f"{ARM}{former}")
+    with pytest.raises(
+        InputError, match=r"`model\.coulomb\.dead_zone` is no known key"
+    ):
+        load(f"{ARM}[model.coulomb]\ndead_zone = 0.1\n")
+
+
 def read(experiment, log):
     """The recording of a log, as the experiment file says."""
     return read_log(experiment.setup, log, experiment.columns)

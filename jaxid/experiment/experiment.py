@@ -33,6 +33,12 @@ from .model_and_log_tables import (
 )
 from .robot_tables import RobotSource, known_load, replace_drives, replace_limits
 
+FORMER_KEYS = {
+    ("model", "coulomb", "dead_zone"): 0.0,
+    ("rollout", "torque_rows"): False,
+    ("excitation", "polish"): 4,
+}
+"""Keys that earlier templates wrote, with their values: files of theirs are still read."""
 TABLES: dict[str, tuple[Callable, ...]] = {
     "robot": (RobotSource,),
     "load": (known_load,),
@@ -119,6 +125,7 @@ def parse_experiment(text: str, path: Path) -> Experiment:
         raise InputError(
             f"{path.name}: the file is no TOML in UTF-8: {fault}."
         ) from error
+    _drop_former_keys(tables)
     try:
         experiment = _build(tables, text, path)
     except InputError as error:
@@ -126,6 +133,16 @@ def parse_experiment(text: str, path: Path) -> Experiment:
     if "collision" in tables:
         _ = experiment.surroundings  # for its mistakes
     return experiment
+
+
+def _drop_former_keys(tables: dict[str, Any]) -> None:
+    """Remove keys that earlier templates wrote, at the values that change nothing."""
+    for (*places, key), value in FORMER_KEYS.items():
+        table: Any = tables
+        for place in places:
+            table = table.get(place) if isinstance(table, dict) else None
+        if isinstance(table, dict) and table.get(key) == value:
+            del table[key]
 
 
 def _build(tables: dict[str, Any], text: str, path: Path) -> Experiment:
