@@ -38,7 +38,7 @@ FORMER_KEYS = {
     ("rollout", "torque_rows"): False,
     ("excitation", "polish"): 4,
 }
-"""Keys that earlier templates wrote, with their values: files of theirs are still read."""
+"""Keys that earlier templates wrote, with the values that change nothing."""
 TABLES: dict[str, tuple[Callable, ...]] = {
     "robot": (RobotSource,),
     "load": (known_load,),
