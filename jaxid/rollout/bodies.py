@@ -49,10 +49,14 @@ class Bodies:
 
     def matrix_and_bias(self, q: Array, v: Array) -> tuple[AnyArray, AnyArray]:
         """Return mass matrix and bias forces; without coupling, gravity alone."""
-        model, p, rest = self.model, np.asarray(self.parameters), jnp.zeros_like(q)
+        model = self.model
+        p = np.asarray(self.parameters)
+        zero_velocity = jnp.zeros_like(q)
         if self.coupled:
             return model.inertia(p, q), model.bias(p, q, v)
-        return jnp.zeros((len(q), len(q))), model.forces(p, q, rest, rest)
+        return jnp.zeros((len(q), len(q))), model.forces(
+            p, q, zero_velocity, zero_velocity
+        )
 
     @functools.cached_property
     def together(self) -> "Bodies":
@@ -64,12 +68,12 @@ class Bodies:
         """Programs of a simulation of these bodies."""
         n = self.model.robot.joints
 
-        def derived(q, v):
+        def terms_with_derivatives(q, v):
             by_q = jax.jacfwd(self.matrix_and_bias)(q, v)
             return *by_q, jax.jacfwd(lambda v: self.matrix_and_bias(q, v)[1])(v)
 
         bodies, derivatives = (
-            trace(f, (n,), (n,)) for f in (self.matrix_and_bias, derived)
+            trace(f, (n,), (n,)) for f in (self.matrix_and_bias, terms_with_derivatives)
         )
         solve = None
         if self.coupled:
@@ -81,18 +85,20 @@ class Bodies:
     def loads(self, motion: ServoMotion) -> ServoMotion:
         """Return motions with the loads between two samples of measured positions."""
         q = np.asarray(motion.positions)
-        load, inertia = np.zeros_like(q), np.zeros_like(q)
-        model, p = self.model, np.asarray(self.parameters)
+        load = np.zeros_like(q)
+        inertia = np.zeros_like(q)
+        model = self.model
+        p = np.asarray(self.parameters)
         for k, dt in enumerate(map(float, motion.sample_time)):
             path, qd, qdd = (0.5 * (x[1:] + x[:-1]) for x in smooth_rates(q[k].T, dt))
             if self.coupled:
                 M = in_numpy(model, model.inertia, path, shared=(p,))
-                own = np.diagonal(M, axis1=1, axis2=2)
+                diagonals = np.diagonal(M, axis1=1, axis2=2)
                 forces = (
                     in_numpy(model, model.forces, path, qd, qdd, shared=(p,))
-                    - own * qdd
+                    - diagonals * qdd
                 )
-                inertia[k, :, :-1] = own.T
+                inertia[k, :, :-1] = diagonals.T
             else:
                 forces = in_numpy(
                     model, model.forces, path, 0 * qd, 0 * qd, shared=(p,)
@@ -118,11 +124,18 @@ def stage_velocities(
         free: 1 for joints that move, 0 for those that friction holds.
         direction: Mean direction of the joints that move.
     """
-    moved = M @ (w / scale)
+    momentum = M @ (w / scale)
     A = M * jnp.outer(free, free) + jnp.diag(resistance * free + 1.0 - free)
-    balance = (force + inertia * w - friction * direction) / scale + moved
+    balance = (force + inertia * w - friction * direction) / scale + momentum
     u = scale * solve_symmetric(A, free * balance)
-    own = jnp.stack([M[j, j] for j in range(len(force))])
-    others = scale * (moved - M @ (u / scale)) - own * (w - u)
-    slip = Slip.of(force + others, inertia + own, friction, resistance + own, w, ahead)
+    diagonal = jnp.stack([M[j, j] for j in range(len(force))])
+    coupling_force = scale * (momentum - M @ (u / scale)) - diagonal * (w - u)
+    slip = Slip.of(
+        force + coupling_force,
+        inertia + diagonal,
+        friction,
+        resistance + diagonal,
+        w,
+        ahead,
+    )
     return u, slip.free, slip.direction

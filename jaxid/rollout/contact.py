@@ -14,11 +14,11 @@ from jaxid.arrays import Bool, Float
 
 from .motion import ServoMotion
 
-SUSTAINED = 0.5
+AVERAGING_TIME = 0.5
 """Time over which errors are averaged [s]: friction and vibration change faster."""
-SEVERE = 5.0
+CONTACT_RATIO = 5.0
 """Multiple of a joint's typical averaged error above which it is held by something."""
-LEAST = 0.03
+MIN_CONTACT_ERROR = 0.03
 """Averaged error below which nothing is suspected [rad or m]."""
 
 
@@ -48,16 +48,21 @@ def sustained_errors(
     A joint that moves over more than the error is not held: there the error counts as
     zero.
     """
-    mean, measured = np.empty_like(errors), np.asarray(motion.positions)
+    mean_errors = np.empty_like(errors)
+    positions = np.asarray(motion.positions)
     for k, dt in enumerate(motion.sample_time):
-        size = max(1, round(SUSTAINED / float(dt)))
-        mean[k] = np.abs(uniform_filter1d(errors[k], size, axis=-1, mode="nearest"))
-        high, low = (
-            f(measured[k], 2 * size, axis=-1)
+        size = max(1, round(AVERAGING_TIME / float(dt)))
+        mean_errors[k] = np.abs(
+            uniform_filter1d(errors[k], size, axis=-1, mode="nearest")
+        )
+        maxima, minima = (
+            f(positions[k], 2 * size, axis=-1)
             for f in (maximum_filter1d, minimum_filter1d)
         )
-        mean[k] *= high - low < np.maximum(mean[k], LEAST)
-    return mean * (
+        mean_errors[k] *= maxima - minima < np.maximum(
+            mean_errors[k], MIN_CONTACT_ERROR
+        )
+    return mean_errors * (
         np.arange(errors.shape[-1]) < np.array(motion.lengths)[:, None, None]
     )
 
@@ -74,12 +79,14 @@ def contact_rows(
         errors: Simulated less measured positions.
         typical: Typical averaged error of each joint; from these errors if None.
     """
-    mean = sustained_errors(motion, errors)
-    typical = typical_errors(motion, mean) if typical is None else typical
-    limit = np.maximum(SEVERE * np.asarray(typical), LEAST)[None, :, None]
-    rows = mean > limit
+    mean_errors = sustained_errors(motion, errors)
+    typical = typical_errors(motion, mean_errors) if typical is None else typical
+    limit = np.maximum(CONTACT_RATIO * np.asarray(typical), MIN_CONTACT_ERROR)[
+        None, :, None
+    ]
+    rows = mean_errors > limit
     for k, dt in enumerate(motion.sample_time):
-        size = 2 * round(SUSTAINED / float(dt)) + 1
+        size = 2 * round(AVERAGING_TIME / float(dt)) + 1
         rows[k] = binary_dilation(rows[k], np.ones((1, size), bool))
     return rows
 
@@ -92,19 +99,20 @@ def typical_errors(
     It is the median of these errors over that of normal ones of unit variance. The
     median motion counts, since contact may last in some of them.
     """
-    typical = np.zeros(mean.shape[1])
-    for j in range(len(typical)):
-        still = [np.median(x[x > 0]) for x in mean[:, j] if (x > 0).any()]
-        typical[j] = np.median(still) / 0.6745 if still else 0.0
-    return typical
+    error_sizes = np.zeros(mean.shape[1])
+    for j in range(len(error_sizes)):
+        medians = [np.median(x[x > 0]) for x in mean[:, j] if (x > 0).any()]
+        error_sizes[j] = np.median(medians) / 0.6745 if medians else 0.0
+    return error_sizes
 
 
 def contacts(
     motion: ServoMotion, errors: np.ndarray, typical: np.ndarray | None = None
 ) -> tuple[Contact, ...]:
     """Return the stretches of sustained errors that friction cannot explain."""
-    mean, found = sustained_errors(motion, errors), []
-    typical = typical_errors(motion, mean) if typical is None else typical
+    mean_errors = sustained_errors(motion, errors)
+    stretches = []
+    typical = typical_errors(motion, mean_errors) if typical is None else typical
     rows = contact_rows(motion, errors, typical)
     for k, j in np.argwhere(rows.any(axis=2)):
         dt = float(motion.sample_time[k])
@@ -112,7 +120,7 @@ def contacts(
             np.diff(np.concatenate([[0], rows[k, j].astype(int), [0]]))
         )
         for a, b in edges.reshape(-1, 2):
-            peak = float(mean[k, j, a:b].max())
+            peak = float(mean_errors[k, j, a:b].max())
             start, stop = (float(motion.begin[k] + dt * i) for i in (a, b))
-            found.append(Contact(motion.names[k], int(j), start, stop, peak))
-    return tuple(found)
+            stretches.append(Contact(motion.names[k], int(j), start, stop, peak))
+    return tuple(stretches)

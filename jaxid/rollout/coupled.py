@@ -27,21 +27,21 @@ from .servo import (
     Partials,
     Stages,
     State,
+    advance_state,
     commands_of_stages,
-    moved,
     partials,
     steps_of,
 )
 
-ATTEMPTS = 15
+MAX_ATTEMPTS = 15
 """Largest number of solutions in a stage."""
-AGREED = 1e-9
+DIRECTION_TOLERANCE = 1e-9
 """Change of the mean direction of a joint at which velocities and friction agree."""
-LEAST = 1e-9
+MIN_COMPLIANCE = 1e-9
 """Least inverse stiffness by which equations are scaled [rad/(N m) or m/N]."""
-FADED = 1e-30
+DERIVATIVE_FLOOR = 1e-30
 """Derivatives that count as zero: denormal numbers would be slow."""
-BLOCK = 1024
+BLOCK_SIZE = 1024
 """Samples whose derivatives are found at once: fewer cost time, more fill the cache."""
 
 
@@ -74,39 +74,45 @@ def _simulate(
 ) -> Path:
     """Simulate all motions from their initial states, each with its own parameters."""
     h = jnp.asarray(motion.sample_time)[None] / steps
-    share, ahead = (
-        jnp.array([1.0 - GAMMA, GAMMA]),
-        jnp.array([(1.0 - GAMMA) / GAMMA, 1.0]),
-    )
+    shares = jnp.array([1.0 - GAMMA, GAMMA])
+    velocity_factors = jnp.array([(1.0 - GAMMA) / GAMMA, 1.0])
 
     def step(states: tuple[State, Array], commands: Array):
-        before, last = states
+        start_state, last_velocity = states
         M = load = None
         if programs is not None:
             M, load = lower(programs.bodies).dense(
-                *middle_of(before.q, before.w, last, h)
+                *middle_of(start_state.q, start_state.w, last_velocity, h)
             )
             M = None if programs.solve is None else M
-        rest = jnp.zeros_like(last)
+        zero_torque = jnp.zeros_like(last_velocity)
 
-        def stage(state: State, own: tuple[Array, ...]):
-            inputs = Stages(own[0], rest if load is None else load, rest, *own[1:])
-            x = Forces.of(state, of_joints, inputs, h)
-            u = _within(programs, x, state.w, of_joints, inputs, M, h)
-            return moved(state, u, x, inputs, h), (state, u)
+        def stage(state: State, stage_inputs: tuple[Array, ...]):
+            inputs = Stages(
+                stage_inputs[0],
+                zero_torque if load is None else load,
+                zero_torque,
+                *stage_inputs[1:],
+            )
+            x = Forces.of(state, joint_parameters, inputs, h)
+            u = _solve_velocities(programs, x, state.w, joint_parameters, inputs, M, h)
+            return advance_state(state, u, x, inputs, h), (state, u)
 
-        after, stages = jax.lax.scan(stage, before, (commands, share, ahead))
+        end_state, stages = jax.lax.scan(
+            stage, start_state, (commands, shares, velocity_factors)
+        )
         # Results are computed once; otherwise XLA computes `load` and `M` again for
         # each joint.
-        return (after, before.w), (*stages, after.q, load, M)
+        return (end_state, start_state.w), (*stages, end_state.q, load, M)
 
     start = State(*jnp.moveaxis(jnp.asarray(motion.start), 0, -1))
     commands = jax.vmap(
         lambda x, y: commands_of_stages(x.T, y, steps, hold)[0], (-1, 0), -1
     )
     commands = commands(theta, motion)
-    of_joints, by_step = tuple(theta), commands.reshape(-1, 2, *commands.shape[1:])
-    return Path(*jax.lax.scan(step, (start, start.w), by_step)[1])
+    joint_parameters = tuple(theta)
+    step_commands = commands.reshape(-1, 2, *commands.shape[1:])
+    return Path(*jax.lax.scan(step, (start, start.w), step_commands)[1])
 
 
 def middle_of(q: Any, v: Any, last: Any, h: Any) -> tuple[Any, Any]:
@@ -121,7 +127,7 @@ def middle_of(q: Any, v: Any, last: Any, h: Any) -> tuple[Any, Any]:
     return q + 0.5 * h * v, 1.5 * v - 0.5 * last
 
 
-def _within(
+def _solve_velocities(
     programs: Programs | None,
     x: Forces,
     w: Array,
@@ -133,24 +139,31 @@ def _within(
     """Return the velocities in a stage [joints, motions]."""
     if programs is None or programs.solve is None or M is None:
         return x.velocity(w, stage)
-    scale = jnp.sqrt(jnp.maximum(theta[INDEX["a"]], LEAST)) + jnp.zeros_like(w)
+    scale = jnp.sqrt(jnp.maximum(theta[INDEX["a"]], MIN_COMPLIANCE)) + jnp.zeros_like(w)
     M = M * (scale[:, None] * scale[None]) / (GAMMA * h[None])
     terms = x.force, x.inertia, x.friction, x.resistance, scale, w, stage.ahead
     solve = lower(programs.solve)
 
     def improve(state: tuple[Any, ...]) -> tuple[Any, ...]:
-        _, free, direction, *_, count = state
-        return *solve.dense(M, *terms, free, direction), free, direction, count + 1
+        _, free_joints, direction, *_, count = state
+        return (
+            *solve.dense(M, *terms, free_joints, direction),
+            free_joints,
+            direction,
+            count + 1,
+        )
 
-    def differs(state: tuple[Any, ...]) -> Array:
-        _, free, direction, free_before, direction_before, count = state
-        change = free * jnp.abs(direction - direction_before)
-        differ = jnp.any((free != free_before) | (change > AGREED))
-        return (count == 0) | differ & (count < ATTEMPTS)
+    def has_changed(state: tuple[Any, ...]) -> Array:
+        _, free_joints, direction, previous_joints, previous_direction, count = state
+        change = free_joints * jnp.abs(direction - previous_direction)
+        has_difference = jnp.any(
+            (free_joints != previous_joints) | (change > DIRECTION_TOLERANCE)
+        )
+        return (count == 0) | has_difference & (count < MAX_ATTEMPTS)
 
     slip = x.slip(w, stage, x.force)
     start: tuple[Any, ...] = w, slip.free, slip.direction, slip.free, slip.direction, 0
-    return jax.lax.while_loop(differs, improve, start)[0]
+    return jax.lax.while_loop(has_changed, improve, start)[0]
 
 
 @functools.partial(jax.jit, static_argnums=5)
@@ -159,18 +172,20 @@ def _partials(
     motion: ServoMotion,
     hold: AnyArray,
     path: Path,
-    others: Array,
+    other_torques: Array,
     steps: int,
 ) -> Partials:
     """Return derivatives of the balance of forces in all stages of a motion.
 
     They are arrays [stages, ...].
     """
-    terms = path.before, path.within, others
-    state, u, others = jax.tree.map(lambda x: jnp.reshape(x, (-1, len(theta))), terms)
+    terms = path.before, path.within, other_torques
+    state, u, other_torques = jax.tree.map(
+        lambda x: jnp.reshape(x, (-1, len(theta))), terms
+    )
     stages, by_delay = Stages.of(theta, motion, steps, hold)
     return partials(
-        state, u, theta, stages, by_delay, motion.sample_time / steps, others
+        state, u, theta, stages, by_delay, motion.sample_time / steps, other_torques
     )
 
 
@@ -222,16 +237,18 @@ class CoupledSimulator:
         theta = np.asarray(theta).reshape(-1, *np.shape(theta)[-2:])
         theta = np.repeat(theta.T, self.motion.motions // len(theta), axis=-1)
         with double_precision():
-            found = _simulate(
+            path = _simulate(
                 programs, self.steps, jnp.asarray(theta), motion, np.array(self.hold)
             )
-            return jax.tree.map(np.asarray, found)
+            return jax.tree.map(np.asarray, path)
 
     def positions(self, path: Path) -> Float[np.ndarray, "motions joints samples"]:
         """Return the positions of all samples."""
-        first = np.asarray(self.motion.start)[:, 0, :, None]
-        behind = path.positions[self.steps - 1 :: self.steps]
-        return np.concatenate([first, behind.transpose(2, 1, 0)], axis=-1)
+        start_positions = np.asarray(self.motion.start)[:, 0, :, None]
+        later_positions = path.positions[self.steps - 1 :: self.steps]
+        return np.concatenate(
+            [start_positions, later_positions.transpose(2, 1, 0)], axis=-1
+        )
 
     def sensitivities(
         self, theta: np.ndarray, path: Path, free: Bool[np.ndarray, "joints parameters"]
@@ -241,12 +258,10 @@ class CoupledSimulator:
         They are those by the free parameters, joint by joint, and then by the motion's
         initial states.
         """
-        motions, n, samples = (
-            self.motion.motions,
-            len(theta),
-            self.motion.positions.shape[-1],
-        )
-        found = [
+        motions = self.motion.motions
+        n = len(theta)
+        samples = self.motion.positions.shape[-1]
+        transitions = [
             self.transitions(k, np.asarray(theta), path, free) for k in range(motions)
         ]
         size = self.motion.start[0].size
@@ -257,19 +272,20 @@ class CoupledSimulator:
         S = np.zeros((motions, n, samples, state.shape[-1]))
         S[:, :, 0] = state[:, :n]
         blocks = [
-            slice(k, min(k + BLOCK, samples - 1)) for k in range(0, samples - 1, BLOCK)
+            slice(k, min(k + BLOCK_SIZE, samples - 1))
+            for k in range(0, samples - 1, BLOCK_SIZE)
         ]
         places = ((k, rows) for rows in blocks for k in range(motions))
         parts = on_cores(
-            lambda place: found[place[0]](place[1]), places, ahead=2 * motions
+            lambda place: transitions[place[0]](place[1]), places, ahead=2 * motions
         )
         for rows in blocks:
-            own = [next(parts) for _ in range(motions)]
-            T, C = (np.stack(x, axis=1) for x in zip(*own, strict=True))
+            block_parts = [next(parts) for _ in range(motions)]
+            T, C = (np.stack(x, axis=1) for x in zip(*block_parts, strict=True))
             for k in range(rows.stop - rows.start):
                 state = T[k] @ state
                 state[..., :-size] += C[k]
-                state *= np.abs(state) > FADED
+                state *= np.abs(state) > DERIVATIVE_FLOOR
                 S[:, :, rows.start + k + 1] = state[:, :n]
         return S
 
@@ -281,42 +297,54 @@ class CoupledSimulator:
         By the state before, with the velocities a step before, and by the free
         parameters.
         """
-        part, own = (
-            self.motion.part(motion),
-            jax.tree.map(lambda x: x[..., motion], path),
-        )
+        part = self.motion.part(motion)
+        motion_path = jax.tree.map(lambda x: x[..., motion], path)
         part = dataclasses.replace(part, lengths=(), names=())
-        steps, h = self.steps, float(part.sample_time) / self.steps
-        slope = (own.before.w - own.within) / (GAMMA * h)
-        M, load, middle = _body_terms(own, h)
+        steps = self.steps
+        h = float(part.sample_time) / self.steps
+        slope = (motion_path.before.w - motion_path.within) / (GAMMA * h)
+        M, load, step_middles = _body_terms(motion_path, h)
         inertia = np.diagonal(M, axis1=1, axis2=2)
-        others = np.einsum("tij,tsj->tsi", M, slope) - inertia[:, None] * slope
-        known = (np.concatenate([x, x[-1:]]).T for x in (load, inertia))
-        part = part.replace(**dict(zip(("load", "inertia"), known, strict=True)))
+        other_torques = np.einsum("tij,tsj->tsi", M, slope) - inertia[:, None] * slope
+        motion_terms = (np.concatenate([x, x[-1:]]).T for x in (load, inertia))
+        part = part.replace(**dict(zip(("load", "inertia"), motion_terms, strict=True)))
         with double_precision():
-            found = _partials(theta, part, np.array(self.hold), own, others, steps)
+            stage_partials = _partials(
+                theta, part, np.array(self.hold), motion_path, other_torques, steps
+            )
 
         def by_sample(x) -> np.ndarray:
             return np.asarray(x).reshape(-1, steps, *np.shape(x)[1:])
 
-        local = jax.tree.map(
-            lambda x: by_sample(x).reshape(-1, steps, 2, x.shape[-1]), found
+        sample_partials = jax.tree.map(
+            lambda x: by_sample(x).reshape(-1, steps, 2, x.shape[-1]), stage_partials
         )
-        within, slope, size = by_sample(own.within), by_sample(slope), part.start.size
+        velocities = by_sample(motion_path.within)
+        slope = by_sample(slope)
+        size = part.start.size
 
-        def one(rows: slice):
-            some = jax.tree.map(lambda x: x[rows], local)
+        def block_transitions(rows: slice):
+            block_partials = jax.tree.map(lambda x: x[rows], sample_partials)
             terms = None
             if self.bodies is not None:
-                inside = [x[rows.start * steps : rows.stop * steps].T for x in middle]
-                derivatives = evaluate(self.bodies.programs.derivatives, *inside)
+                middle_states = [
+                    x[rows.start * steps : rows.stop * steps].T for x in step_middles
+                ]
+                derivatives = evaluate(self.bodies.programs.derivatives, *middle_states)
                 derivatives = (by_sample(np.moveaxis(x, -1, 0)) for x in derivatives)
                 terms = _BodyTerms(by_sample(M)[rows], *derivatives)
             return _compose(
-                theta, some, within[rows], slope[rows], terms, free, h, size
+                theta,
+                block_partials,
+                velocities[rows],
+                slope[rows],
+                terms,
+                free,
+                h,
+                size,
             )
 
-        return one
+        return block_transitions
 
 
 def _body_terms(path: Path, h: float):
@@ -329,11 +357,11 @@ def _body_terms(path: Path, h: float):
 
 def _compose(
     theta: np.ndarray,
-    local: Partials,
-    within: np.ndarray,
+    sample_partials: Partials,
+    velocities: np.ndarray,
     slope: np.ndarray,
     terms: _BodyTerms | None,
-    free: np.ndarray,
+    free_mask: np.ndarray,
     h: float,
     size: int,
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -341,60 +369,71 @@ def _compose(
 
     Args:
         theta: Parameters.
-        local: Derivatives of the forces in the stages [samples, steps, stages, ...].
-        within: Velocities in the stages [samples, steps, stages, joints].
+        sample_partials: Derivatives of the forces in the stages [samples, steps,
+            stages, ...].
+        velocities: Velocities in the stages [samples, steps, stages, joints].
         slope: Velocities before less those in the stages, over the time of a stage.
         terms: Terms of the bodies [samples, steps, ...].
-        free: Free parameters.
+        free_mask: Whether each parameter is estimated.
         h: Time of a step [s].
         size: Size of the state of all joints.
     """
-    count, steps, _, n = within.shape
-    joint, symbol = np.nonzero(free)
+    count, steps, _, n = velocities.shape
+    joint, symbol = np.nonzero(free_mask)
     columns = size + n + np.arange(len(joint))
     state = np.tile(np.eye(size + n, size + n + len(joint)), (count, 1, 1))
-    q, w, *integral, last = np.split(state, 1 + size // n, axis=1)
+    q, w, *integral, last_velocity = np.split(state, 1 + size // n, axis=1)
     middle = q, w
     for k, s in np.ndindex(steps, 2):
         if s == 0:
-            middle, last = middle_of(q, w, last, h), w
-        at = jax.tree.map(lambda x, k=k, s=s: x[:, k, s], local)
-        moves = (within[:, k, s] != 0.0)[..., None]
-        force = at.by_q[..., None] * q + at.by_w[..., None] * w
+            middle = middle_of(q, w, last_velocity, h)
+            last_velocity = w
+        balance = jax.tree.map(lambda x, k=k, s=s: x[:, k, s], sample_partials)
+        motion_mask = (velocities[:, k, s] != 0.0)[..., None]
+        force = balance.by_q[..., None] * q + balance.by_w[..., None] * w
         for x in integral:
-            force += at.by_integral[..., None] * x
-        force[:, joint, columns] += np.stack(at.by_theta, axis=1)[:, symbol, joint]
-        A = at.resistance[..., None] * np.eye(n)
+            force += balance.by_integral[..., None] * x
+        force[:, joint, columns] += np.stack(balance.by_theta, axis=1)[:, symbol, joint]
+        A = balance.resistance[..., None] * np.eye(n)
         if terms is not None:
-            at_step = _BodyTerms(*(x[:, k] for x in terms))
+            step_terms = _BodyTerms(*(x[:, k] for x in terms))
             by_q, by_v, by_w = _derivatives_of_bodies(
-                theta, at, at_step, slope[:, k, s], h
+                theta, balance, step_terms, slope[:, k, s], h
             )
-            A += by_w * (moves & moves.swapaxes(1, 2))
+            A += by_w * (motion_mask & motion_mask.swapaxes(1, 2))
             force += by_w @ w + by_q @ middle[0] + by_v @ middle[1]
-        change = np.linalg.solve(A, force * moves)
-        share, ahead = ((1.0 - GAMMA, (1.0 - GAMMA) / GAMMA), (GAMMA, 1.0))[s]
+        change = np.linalg.solve(A, force * motion_mask)
+        share, velocity_factor = ((1.0 - GAMMA, (1.0 - GAMMA) / GAMMA), (GAMMA, 1.0))[s]
         for x in integral:
-            growth = -at.rate[..., None] * (q + GAMMA * h * change)
-            growth[:, joint, columns] += np.stack(at.growth, axis=1)[:, symbol, joint]
+            growth = -balance.rate[..., None] * (q + GAMMA * h * change)
+            growth[:, joint, columns] += np.stack(balance.growth, axis=1)[
+                :, symbol, joint
+            ]
             integral = [x + share * h * growth]
         q = q + share * h * change
-        w = (w + ahead * (change - w)) * moves
-    state = np.concatenate([q, w, *integral, last], axis=1)
+        w = (w + velocity_factor * (change - w)) * motion_mask
+    state = np.concatenate([q, w, *integral, last_velocity], axis=1)
     return state[..., : size + n], state[..., size + n :]
 
 
 def _derivatives_of_bodies(
-    theta: np.ndarray, at: Partials, terms: _BodyTerms, slope: np.ndarray, h: float
+    theta: np.ndarray,
+    balance: Partials,
+    terms: _BodyTerms,
+    slope: np.ndarray,
+    h: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return derivatives of the forces' balance by other joints.
 
     They are arrays [samples, joints, joints]: by positions and velocities in the middle
     of the step, and by velocities before the stage, less those by velocities in it.
     """
-    a, diagonal = theta[:, INDEX["a"], None], np.eye(len(theta), dtype=bool)
-    by_force, by_load = (np.asarray(x)[..., None] for x in (at.by_force, at.by_load))
-    by_inertia = np.asarray(at.by_inertia)[..., None] / (GAMMA * h)
+    a = theta[:, INDEX["a"], None]
+    diagonal = np.eye(len(theta), dtype=bool)
+    by_force, by_load = (
+        np.asarray(x)[..., None] for x in (balance.by_force, balance.by_load)
+    )
+    by_inertia = np.asarray(balance.by_inertia)[..., None] / (GAMMA * h)
     by_matrix = a * np.where(diagonal, by_inertia, by_force * slope[:, None])
     by_q = (
         np.einsum("tijl,tij->til", terms.M_by_q, by_matrix) + by_load * terms.load_by_q

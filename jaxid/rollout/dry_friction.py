@@ -58,21 +58,24 @@ class Slip(NamedTuple):
             ahead: Change of the velocity behind the stage over that in it.
         """
         sign = jnp.where(w == 0.0, jnp.sign(force), jnp.sign(w))
-        later = 1.0 - 1.0 / ahead
-        momentum, braking = inertia - later * resistance, friction - sign * force
-        goes_on = jnp.abs(w) * momentum > braking
-        turns = ~goes_on & (braking > 2.0 * friction)
-        safe = jnp.where(turns, braking, 1.0)
+        speed_share = 1.0 - 1.0 / ahead
+        momentum = inertia - speed_share * resistance
+        braking_force = friction - sign * force
+        is_continuing = jnp.abs(w) * momentum > braking_force
+        is_turning = ~is_continuing & (braking_force > 2.0 * friction)
+        divisor = jnp.where(is_turning, braking_force, 1.0)
         # Part of the time until a joint that turns around is at rest.
-        part = jnp.where(turns, jnp.maximum(jnp.abs(w) * momentum / safe, 0.0), 0.0)
-        factor = jnp.where(turns & (momentum > 0.0), 2.0 * friction / safe, 0.0)
-        direction = sign * jnp.where(turns, 2.0 * part - 1.0, 1.0)
+        time_share = jnp.where(
+            is_turning, jnp.maximum(jnp.abs(w) * momentum / divisor, 0.0), 0.0
+        )
+        factor = jnp.where(is_turning & (momentum > 0.0), 2.0 * friction / divisor, 0.0)
+        direction = sign * jnp.where(is_turning, 2.0 * time_share - 1.0, 1.0)
         return cls(
-            jnp.where(goes_on | turns, 1.0, 0.0),
+            jnp.where(is_continuing | is_turning, 1.0, 0.0),
             direction,
-            1.0 - factor * part,
-            factor * sign * part - direction,
+            1.0 - factor * time_share,
+            factor * sign * time_share - direction,
             inertia - factor * momentum,
             w * (1.0 - factor / ahead),
-            w * factor * later,
+            w * factor * speed_share,
         )

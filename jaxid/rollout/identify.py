@@ -27,9 +27,9 @@ from .result import ServoFit
 from .servo import INDEX, LOWER, SCALE, START, UPPER, with_integral
 from .uncoupled import ServoSimulator
 
-BASIC = ("J", "B", "d", "F", "b")
+BASIC_PARAMETERS = ("J", "B", "d", "F", "b")
 """Parameters of every joint, before the choice."""
-LINEAR = ("J", "B", "d", "b", "g")
+LINEAR_PARAMETERS = ("J", "B", "d", "b", "g")
 """Parameters of the baseline: a linear joint of second order with delay."""
 EFFECTS = (
     ((), ("a",), ("b",), ("a", "b")),
@@ -37,17 +37,17 @@ EFFECTS = (
     ((), ("um",)),
 )
 """Groups of effects to choose one each from: bias or load; friction; saturation."""
-GAIN = 0.04
+MIN_SCORE_GAIN = 0.04
 """Fall of the held-out mean square's logarithm that justifies a larger model."""
-DAMPED = 0.5
+OSCILLATION_DAMPING = 0.5
 """Damping ratio below which a joint oscillates."""
-FOLDS = 4
+MIN_PARTS = 4
 """Smallest number of parts for the choice: fewer logs are divided."""
-LARGEST = 1e6
+MAX_MEAN_SQUARE = 1e6
 """Mean square error of a simulation that left all bounds [rad² or m²]."""
-SHORTEST = 5.0
+MIN_PART_DURATION = 5.0
 """Shortest part into which a log is divided [s]."""
-LIGHT = 0.02
+MIN_LOAD_SHARE = 0.02
 """Load, relative to the most loaded joint's, below which a joint counts as unloaded."""
 _STARTS = [
     (J, B, d)
@@ -99,63 +99,75 @@ def identify_rollout(
             the stiffness does not fit the joints.
     """
     logs = [logs] if isinstance(logs, Recording) else list(logs)
-    motion = ServoMotion.of(_divided(logs)).known()
+    motion = ServoMotion.of(_split_logs(logs)).known()
     _require_motion(motion)
     names = _joint_names(motion, bodies, joint_names)
     # Choices show in long steps, too.
-    coarse = max(time_step, float(motion.sample_time.max()))
+    search_step = max(time_step, float(motion.sample_time.max()))
     motion = motion if bodies is None else bodies.loads(motion)
-    given = _known_stiffness(stiffness, len(names))
-    known = None if given is None or bodies is None else given
-    search = _Search(ServoSimulator(motion, coarse), integral, known)
+    known_stiffness = _checked_stiffness(stiffness, len(names))
+    search_stiffness = (
+        None if known_stiffness is None or bodies is None else known_stiffness
+    )
+    search = _Search(ServoSimulator(motion, search_step), integral, search_stiffness)
     motion = search.simulator.motion
-    whole = None if bodies is None else bodies.together
-    coupled = CoupledSimulator(motion, time_step, False, whole)
+    coupled_bodies = None if bodies is None else bodies.together
+    simulator = CoupledSimulator(motion, time_step, False, coupled_bodies)
     with ThreadPoolExecutor(1) as pool:
         # What the refinement needs is compiled while the search runs.
-        pool.submit(prepare, coupled, search.x, search.free)
+        pool.submit(prepare, simulator, search.x, search.free_mask)
         search.run(bodies is not None, friction, saturation, integral)
-    if bodies is not None and whole is not None:
-        together = bodies.coupled or search.choose_coupling(whole)
-        bodies = whole if together else bodies
+    if bodies is not None and coupled_bodies is not None:
+        has_coupling = bodies.coupled or search.choose_coupling(coupled_bodies)
+        bodies = coupled_bodies if has_coupling else bodies
         # Inertial torques act on all joints, however badly a log tells them from `J`.
-        search.free[:, INDEX["a"]] |= together & ~search.known
+        search.free_mask[:, INDEX["a"]] |= has_coupling & ~search.has_stiffness
     motion = search.simulator.motion
     if integral:
         motion = with_integral(motion, search.x, False)
-    coupled = dataclasses.replace(coupled, motion=motion, bodies=bodies)
-    held = search.x.copy()
-    held[:, INDEX["d"]] -= 0.5 * float(motion.sample_time.mean())
-    other = dataclasses.replace(coupled, hold=True)
-    found, told = refine((coupled, search.x), (other, held), search.free)
-    return ServoFit.of(found, search.linear, names, told, given)
+    simulator = dataclasses.replace(simulator, motion=motion, bodies=bodies)
+    held_parameters = search.x.copy()
+    held_parameters[:, INDEX["d"]] -= 0.5 * float(motion.sample_time.mean())
+    held_simulator = dataclasses.replace(simulator, hold=True)
+    refinement, hold_is_told = refine(
+        (simulator, search.x), (held_simulator, held_parameters), search.free_mask
+    )
+    return ServoFit.of(
+        refinement, search.baseline, names, hold_is_told, known_stiffness
+    )
 
 
-def _divided(logs: Sequence[Recording]) -> list[Recording]:
+def _split_logs(logs: Sequence[Recording]) -> list[Recording]:
     """Return logs, the long ones divided.
 
     There are enough parts for the choice, and none is much longer than the others, to
     whose length all are padded.
     """
-    usual, found = (
-        max(float(np.median([x.duration for x in logs])), FOLDS * SHORTEST),
-        [],
+    part_duration = max(
+        float(np.median([x.duration for x in logs])), MIN_PARTS * MIN_PART_DURATION
     )
+    part_logs = []
     for log in logs:
-        wanted = max(-(-FOLDS // len(logs)), round(log.duration / usual))
-        parts = max(1, min(wanted, int(log.duration // SHORTEST)))
-        ends = np.linspace(
-            float(log.time[0]), float(log.time[-1]) + log.sample_time, parts + 1
+        desired_count = max(
+            -(-MIN_PARTS // len(logs)), round(log.duration / part_duration)
         )
-        found += [log.crop(float(a), float(b)) for a, b in itertools.pairwise(ends)]
-    return found
+        part_count = max(1, min(desired_count, int(log.duration // MIN_PART_DURATION)))
+        part_ends = np.linspace(
+            float(log.time[0]), float(log.time[-1]) + log.sample_time, part_count + 1
+        )
+        part_logs += [
+            log.crop(float(a), float(b)) for a, b in itertools.pairwise(part_ends)
+        ]
+    return part_logs
 
 
 def _require_motion(motion: ServoMotion) -> None:
     for channel in ("positions", "commands"):
-        still = np.ptp(getattr(motion, channel), axis=-1).max(axis=0) < 10 * RESOLUTION
-        if still.any():
-            joint = int(np.argmax(still)) + 1
+        rest_mask = (
+            np.ptp(getattr(motion, channel), axis=-1).max(axis=0) < 10 * RESOLUTION
+        )
+        if rest_mask.any():
+            joint = int(np.argmax(rest_mask)) + 1
             raise InputError(
                 f"`logs`: the {channel} of joint {joint} change by less than 1 mrad or "
                 "1 mm. Leave the joint out, or give logs in which it moves."
@@ -177,22 +189,22 @@ def _joint_names(
     return names
 
 
-def _known_stiffness(
+def _checked_stiffness(
     stiffness: Numbers | None, joints: int
 ) -> Float[np.ndarray, " joints"] | None:
     if stiffness is None:
         return None
-    given = np.asarray(stiffness, np.float64)
+    values = np.asarray(stiffness, np.float64)
     if (
-        given.shape not in ((), (joints,))
-        or (given <= 0.0).any()
-        or np.isinf(given).any()
+        values.shape not in ((), (joints,))
+        or (values <= 0.0).any()
+        or np.isinf(values).any()
     ):
         raise InputError(
             f"`stiffness` must be a positive number [N m/rad or N/m], or {joints} of "
             "them, one for each joint."
         )
-    return np.broadcast_to(given, (joints,)).copy()
+    return np.broadcast_to(values, (joints,)).copy()
 
 
 def mask(symbols: Sequence[str]) -> Bool[np.ndarray, " parameters"]:
@@ -200,17 +212,17 @@ def mask(symbols: Sequence[str]) -> Bool[np.ndarray, " parameters"]:
     return np.isin(list(INDEX), list(symbols))
 
 
-def _lower(scores: np.ndarray, others: np.ndarray) -> Bool[np.ndarray, " joints"]:
-    """Return whether scores are lower than others by more than their scatter.
+def _is_lower(scores: np.ndarray, rivals: np.ndarray) -> Bool[np.ndarray, " joints"]:
+    """Return whether scores are lower than those of rivals by more than their scatter.
 
     Scores are arrays [motions, joints].
     """
-    change = scores - others
+    change = scores - rivals
     count = np.isfinite(change).sum(axis=0)
     mean = np.nansum(change, axis=0) / np.maximum(count, 1)
     squares = np.nansum((change - mean) ** 2, axis=0)
     scatter = np.sqrt(squares / np.maximum(count - 1, 1) / np.maximum(count, 1))
-    return mean < -np.maximum(GAIN, scatter)
+    return mean < -np.maximum(MIN_SCORE_GAIN, scatter)
 
 
 class _Search:
@@ -220,37 +232,37 @@ class _Search:
         simulator: Motions and steps.
         weights: Weight of each motion's squared errors [motions, joints].
         x: Parameters so far [joints, parameters].
-        free: Parameters that are estimated.
-        known: Joints whose stiffness is known.
-        linear: Parameters of the linear baseline.
+        free_mask: Whether each parameter is estimated.
+        has_stiffness: Whether the stiffness of each joint is known.
+        baseline: Parameters of the linear baseline.
     """
 
     def __init__(
         self, simulator: ServoSimulator, integral: bool, stiffness: np.ndarray | None
     ):
-        counted = np.asarray(simulator.motion.counted).sum(axis=-1)
-        self.weights = 1.0 / np.maximum(counted, 1.0)
-        joints = counted.shape[1]
+        sample_counts = np.asarray(simulator.motion.counted).sum(axis=-1)
+        self.weights = 1.0 / np.maximum(sample_counts, 1.0)
+        joints = sample_counts.shape[1]
         self.x = np.tile(START, (joints, 1))
-        self.free = np.tile(mask(BASIC), (joints, 1))
-        self.linear = self.x.copy()
-        self.known = (
+        self.free_mask = np.tile(mask(BASIC_PARAMETERS), (joints, 1))
+        self.baseline = self.x.copy()
+        self.has_stiffness = (
             np.zeros(joints, bool) if stiffness is None else np.isfinite(stiffness)
         )
         if stiffness is not None:
-            self.x[self.known, INDEX["a"]] = 1.0 / stiffness[self.known]
+            self.x[self.has_stiffness, INDEX["a"]] = 1.0 / stiffness[self.has_stiffness]
         motion = simulator.motion
         if integral:
             motion = with_integral(motion, self.x, False)
         self.simulator = dataclasses.replace(simulator, motion=motion)
 
     def run(
-        self, loaded: bool, friction: bool, saturation: bool, integral: bool
+        self, has_bodies: bool, friction: bool, saturation: bool, integral: bool
     ) -> None:
         """Choose the effects of all joints.
 
         Args:
-            loaded: Whether bodies load the joints.
+            has_bodies: Whether bodies load the joints.
             friction: Whether friction by load and Stribeck friction are tried.
             saturation: Whether a largest torque is tried.
             integral: Whether integral action is tried.
@@ -258,10 +270,10 @@ class _Search:
         self.start()
         if integral:
             # A servo that saturates often hides its integral action.
-            alone = ((), ("ki",))
-            self.choose((*alone, ("um",), ("ki", "um")) if saturation else alone)
+            effects = ((), ("ki",))
+            self.choose((*effects, ("um",), ("ki", "um")) if saturation else effects)
         groups: list[Sequence[tuple[str, ...]]] = list(EFFECTS)
-        if not loaded:
+        if not has_bodies:
             groups[0] = (("b",),)
         if not friction:
             groups[1] = ((),)
@@ -275,7 +287,7 @@ class _Search:
     def solve(
         self,
         x: np.ndarray,
-        free: np.ndarray,
+        free_mask: np.ndarray,
         iterations: int = 12,
         damping: float = 1e-2,
     ) -> Solution:
@@ -290,10 +302,16 @@ class _Search:
             return (w * self.simulator.costs(x)).sum(axis=0)
 
         return minimise(
-            moments, costs, x, free, (LOWER, UPPER), iterations, damping=damping
+            moments,
+            costs,
+            x,
+            free_mask,
+            (LOWER, UPPER),
+            iterations,
+            damping=damping,
         )
 
-    def held_out(self, found: Solution, free: np.ndarray) -> np.ndarray:
+    def held_out_scores(self, solution: Solution, free_mask: np.ndarray) -> np.ndarray:
         """Return logarithms of the mean square errors of motions left out in turn.
 
         Without a motion the fit moves by a Gauss-Newton step; its error is simulated.
@@ -302,65 +320,80 @@ class _Search:
             Scores [motions, candidates, joints]; NaN where nothing counts.
         """
         w = self.weights[:, None, :]
-        _, g, H = self.simulator.moments(found.x)
-        left = (
-            found.gradient - w[..., None] * g,
-            found.information - w[..., None, None] * H,
+        _, g, H = self.simulator.moments(solution.x)
+        remaining_moments = (
+            solution.gradient - w[..., None] * g,
+            solution.information - w[..., None, None] * H,
         )
-        x = np.broadcast_to(found.x, g.shape)
+        x = np.broadcast_to(solution.x, g.shape)
         step = bounded_step(
-            *left, x, np.broadcast_to(free, x.shape), (LOWER, UPPER), 1e-3
+            *remaining_moments,
+            x,
+            np.broadcast_to(free_mask, x.shape),
+            (LOWER, UPPER),
+            1e-3,
         )
         errors = self.simulator.costs(np.clip(x + step, LOWER, UPPER), each=True)
         return self._scores(errors)
 
     def _scores(self, squares: np.ndarray) -> np.ndarray:
         """Return logarithms of mean squares of sums [motions, candidates, joints]."""
-        counted = np.asarray(self.simulator.motion.counted).sum(axis=-1)
-        mean = squares / np.maximum(counted, 1.0)[:, None]
+        sample_counts = np.asarray(self.simulator.motion.counted).sum(axis=-1)
+        mean = squares / np.maximum(sample_counts, 1.0)[:, None]
         scores = np.log(
-            np.minimum(np.nan_to_num(mean, nan=LARGEST), LARGEST) + RESOLUTION**2
+            np.minimum(np.nan_to_num(mean, nan=MAX_MEAN_SQUARE), MAX_MEAN_SQUARE)
+            + RESOLUTION**2
         )
-        return np.where((counted > 0)[:, None], scores, np.nan)
+        return np.where((sample_counts > 0)[:, None], scores, np.nan)
 
     def start(self) -> None:
         """Fit the basic model from the best of many starts, and the linear baseline."""
         grid = np.tile(self.x, (len(_STARTS), 1, 1))
         grid[..., [INDEX[k] for k in ("J", "B", "d")]] = np.array(_STARTS)[:, None]
         costs = (self.weights[:, None] * self.simulator.costs(grid)).sum(axis=0)
-        best = np.argsort(costs, axis=0)[:3]
+        best_indices = np.argsort(costs, axis=0)[:3]
         x = np.concatenate(
-            [np.take_along_axis(grid, best[..., None], axis=0), self.linear[None]]
+            [
+                np.take_along_axis(grid, best_indices[..., None], axis=0),
+                self.baseline[None],
+            ]
         )
         x[3] = x[0]
         x[3][:, mask(("F", "a", "ki"))] = 0.0
-        free = np.stack([self.free] * 3 + [np.tile(mask(LINEAR), (len(self.x), 1))])
-        found = self.solve(x, free, iterations=8)
-        self.linear = found.x[3]
-        self._take(found.x[:3], self._best(found.x[:3], found.cost[:3]))
-        self._weigh(self.x)
+        free_mask = np.stack(
+            [self.free_mask] * 3 + [np.tile(mask(LINEAR_PARAMETERS), (len(self.x), 1))]
+        )
+        solution = self.solve(x, free_mask, iterations=8)
+        self.baseline = solution.x[3]
+        self._take_candidates(
+            solution.x[:3], self._best_candidates(solution.x[:3], solution.cost[:3])
+        )
+        self._weigh_motions(self.x)
 
-    def _best(self, x: np.ndarray, cost: np.ndarray) -> np.ndarray:
+    def _best_candidates(self, x: np.ndarray, cost: np.ndarray) -> np.ndarray:
         """Return the candidate of least cost, or one nearly as good with more damping.
 
-        Damping counts up to the ratio `DAMPED`.
+        Damping counts up to the ratio `OSCILLATION_DAMPING`.
 
         An oscillation that an initial state excites may imitate the rounding of an
         encoder.
         """
-        best, scores = np.argmin(cost, axis=0), self._scores(self.simulator.costs(x))
+        best_indices = np.argmin(cost, axis=0)
+        scores = self._scores(self.simulator.costs(x))
         ratio = 0.5 * x[..., INDEX["B"]] / np.sqrt(x[..., INDEX["J"]])
-        calm = np.lexsort((cost, -np.minimum(ratio, DAMPED)), axis=0)[0]
-        one, other = (
+        calm_indices = np.lexsort(
+            (cost, -np.minimum(ratio, OSCILLATION_DAMPING)), axis=0
+        )[0]
+        best_scores, calm_scores = (
             np.take_along_axis(scores, k[None, None], axis=1)[:, 0]
-            for k in (best, calm)
+            for k in (best_indices, calm_indices)
         )
-        return np.where(_lower(one, other), best, calm)
+        return np.where(_is_lower(best_scores, calm_scores), best_indices, calm_indices)
 
-    def _take(self, x: np.ndarray, chosen: np.ndarray) -> None:
-        self.x = np.take_along_axis(x, chosen[None, :, None], axis=0)[0]
+    def _take_candidates(self, x: np.ndarray, choices: np.ndarray) -> None:
+        self.x = np.take_along_axis(x, choices[None, :, None], axis=0)[0]
 
-    def _weigh(self, x: np.ndarray) -> None:
+    def _weigh_motions(self, x: np.ndarray) -> None:
         """Weigh motions by their own errors."""
         self.weights = weights_of(
             self.simulator.motion, self.simulator.costs(x[None])[:, 0]
@@ -370,62 +403,68 @@ class _Search:
         """Leave out samples in which something outside the model holds a joint."""
         motion = self.simulator.motion
         errors = self.simulator.paths(self.x[None])[:, 0] - np.asarray(motion.positions)
-        touched = contact_rows(motion, errors)
-        if touched.any():
-            counted = np.asarray(motion.counted) * ~touched
+        contact_mask = contact_rows(motion, errors)
+        if contact_mask.any():
+            counted_samples = np.asarray(motion.counted) * ~contact_mask
             self.simulator = dataclasses.replace(
-                self.simulator, motion=motion.replace(counted=counted)
+                self.simulator, motion=motion.replace(counted=counted_samples)
             )
-            self._weigh(self.x)
+            self._weigh_motions(self.x)
 
     def choose(self, group: Sequence[tuple[str, ...]]) -> None:
         """Take the effects of a group that lower held-out errors, joint by joint."""
         if len(group) == 1:
             return
-        every = {symbol for effects in group for symbol in effects}
-        x, free = (np.stack([y] * len(group)) for y in (self.x, self.free))
+        symbols = {symbol for effects in group for symbol in effects}
+        x, free_mask = (np.stack([y] * len(group)) for y in (self.x, self.free_mask))
         for k, effects in enumerate(group):
-            free[k, :, mask(tuple(every))] = False
-            free[k, :, mask(effects)] = True
-            for symbol in every - set(effects):
+            free_mask[k, :, mask(tuple(symbols))] = False
+            free_mask[k, :, mask(effects)] = True
+            for symbol in symbols - set(effects):
                 x[k, :, INDEX[symbol]] = START[INDEX[symbol]]
             for symbol in effects:
-                x[k, :, INDEX[symbol]] = self._first_value(symbol)
-        free[..., INDEX["a"]] &= self._loaded & ~self.known
-        x[..., INDEX["a"]] *= self._loaded
-        x[:, self.known, INDEX["a"]] = self.x[self.known, INDEX["a"]]
+                x[k, :, INDEX[symbol]] = self._start_value(symbol)
+        free_mask[..., INDEX["a"]] &= self._loaded_joints & ~self.has_stiffness
+        x[..., INDEX["a"]] *= self._loaded_joints
+        x[:, self.has_stiffness, INDEX["a"]] = self.x[self.has_stiffness, INDEX["a"]]
         # Friction per load needs a load.
-        free[..., INDEX["mu"]] &= self._loaded & (x[..., INDEX["a"]] > 0.0)
-        found = self.solve(x, free)
-        scores = self.held_out(found, free)
-        chosen = np.zeros(len(self.x), int)
+        free_mask[..., INDEX["mu"]] &= self._loaded_joints & (x[..., INDEX["a"]] > 0.0)
+        solution = self.solve(x, free_mask)
+        scores = self.held_out_scores(solution, free_mask)
+        choices = np.zeros(len(self.x), int)
         for k in range(1, len(group)):
-            current = np.take_along_axis(scores, chosen[None, None], axis=1)[:, 0]
+            current_scores = np.take_along_axis(scores, choices[None, None], axis=1)[
+                :, 0
+            ]
             # Effects that have been found stay: a known weight is not replaced by a
             # bias.
-            larger = np.array([set(group[c]) <= set(group[k]) for c in chosen])
-            chosen = np.where(larger & _lower(scores[:, k], current), k, chosen)
-        self._take(found.x, chosen)
-        self.free = np.take_along_axis(free, chosen[None, :, None], axis=0)[0]
-        self._weigh(self.x)
+            extension_mask = np.array([set(group[c]) <= set(group[k]) for c in choices])
+            choices = np.where(
+                extension_mask & _is_lower(scores[:, k], current_scores), k, choices
+            )
+        self._take_candidates(solution.x, choices)
+        self.free_mask = np.take_along_axis(free_mask, choices[None, :, None], axis=0)[
+            0
+        ]
+        self._weigh_motions(self.x)
 
     @property
-    def _loaded(self) -> Bool[np.ndarray, " joints"]:
+    def _loaded_joints(self) -> Bool[np.ndarray, " joints"]:
         """Joints on which the bodies have a weight worth mentioning."""
         load = np.abs(self.simulator.motion.load).max(axis=(0, 2))
-        return load > LIGHT * load.max(initial=0.0)
+        return load > MIN_LOAD_SHARE * load.max(initial=0.0)
 
-    def _first_value(self, symbol: str) -> float | np.ndarray:
+    def _start_value(self, symbol: str) -> float | np.ndarray:
         """Return a start at which an effect is active: otherwise it has no gradient."""
         motion = self.simulator.motion
         lag = np.abs(motion.sent - motion.positions).max(axis=(0, 2))
         load = np.abs(motion.load).max(axis=(0, 2))
-        own = self.x[:, INDEX["F"]]
+        dry_friction = self.x[:, INDEX["F"]]
         values = {
             "a": 0.02 / np.maximum(load, 1e-6),
             "b": self.x[:, INDEX["b"]],
             "mu": 0.2,
-            "Fs": 0.3 * own + 1e-3,
+            "Fs": 0.3 * dry_friction + 1e-3,
             "vs": START[INDEX["vs"]],
             "um": 0.6 * lag,
             "ki": SCALE[INDEX["ki"]],
@@ -436,16 +475,24 @@ class _Search:
         """Decide whether inertial torques of bodies act, beside those of gravity."""
         motion = bodies.loads(self.simulator.motion)
         x = self.x.copy()
-        own = x[:, INDEX["a"]] * np.asarray(motion.inertia).mean(axis=(0, 2))
-        x[:, INDEX["J"]] = np.maximum(x[:, INDEX["J"]] - own, 1e-5)
-        scores, results = [], []
-        other = dataclasses.replace(self.simulator, motion=motion)
-        for simulator, start, more in ((self.simulator, self.x, 0), (other, x, 3)):
+        body_inertia = x[:, INDEX["a"]] * np.asarray(motion.inertia).mean(axis=(0, 2))
+        x[:, INDEX["J"]] = np.maximum(x[:, INDEX["J"]] - body_inertia, 1e-5)
+        scores = []
+        results = []
+        coupled_simulator = dataclasses.replace(self.simulator, motion=motion)
+        for simulator, start, iterations in (
+            (self.simulator, self.x, 0),
+            (coupled_simulator, x, 3),
+        ):
             self.simulator = simulator
-            found = self.solve(start[None], self.free[None], iterations=more)
-            scores.append(np.nanmean(self.held_out(found, self.free[None])))
-            results.append((simulator, found.x[0]))
-        better = bool(scores[1] < scores[0])
-        self.simulator, self.x = results[int(better)]
-        self._weigh(self.x)
-        return better
+            solution = self.solve(
+                start[None], self.free_mask[None], iterations=iterations
+            )
+            scores.append(
+                np.nanmean(self.held_out_scores(solution, self.free_mask[None]))
+            )
+            results.append((simulator, solution.x[0]))
+        is_better = bool(scores[1] < scores[0])
+        self.simulator, self.x = results[int(is_better)]
+        self._weigh_motions(self.x)
+        return is_better

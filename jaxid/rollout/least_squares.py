@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxid.arrays import Bool, Float
 
-HELD = 6
+MAX_BOUND_ROUNDS = 6
 """Largest number of times that parameters are brought to their bounds in a step."""
 Moments = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, ...]]
 """Function of parameters [..., size] and their problems' indices along the first axis.
@@ -62,34 +62,37 @@ def minimise(
             matrix.
     """
     x = np.clip(x, *bounds)
-    dampings, left = np.full(x.shape[:-1], damping), np.arange(len(x))
-    done = np.zeros(x.shape[:-1], bool)
-    cost, g, H = moments(x, left)
+    dampings = np.full(x.shape[:-1], damping)
+    subset = np.arange(len(x))
+    convergence = np.zeros(x.shape[:-1], bool)
+    cost, g, H = moments(x, subset)
     for _ in range(iterations):
-        own = [y[left] for y in (x, cost, g, H, free, dampings)]
-        x[left], dampings[left], converged = improve(
-            costs, left, own, bounds, tolerance
+        terms = [y[subset] for y in (x, cost, g, H, free, dampings)]
+        x[subset], dampings[subset], new_convergence = improve(
+            costs, subset, terms, bounds, tolerance
         )
-        cost[left], g[left], H[left] = moments(x[left], left)
-        done[left] |= converged
-        left = left[~done[left].reshape(len(left), -1).all(axis=1)]
-        if not left.size:
+        cost[subset], g[subset], H[subset] = moments(x[subset], subset)
+        convergence[subset] |= new_convergence
+        subset = subset[~convergence[subset].reshape(len(subset), -1).all(axis=1)]
+        if not subset.size:
             break
     return Solution(x, cost, g, H)
 
 
 def improve(costs, problems, terms, bounds, tolerance):
     """Return parameters of lower costs, their damping, and the converged problems."""
-    x, cost, g, H, free, damping = terms
+    x, cost, g, H, free_mask, damping = terms
     decrease = np.zeros_like(cost)
     for _ in range(5):
-        step = bounded_step(g, H, x, free, bounds, damping)
+        step = bounded_step(g, H, x, free_mask, bounds, damping)
         trial = np.clip(x + step, *bounds)
-        found = costs(trial, problems)
-        better = (found < cost) & (decrease == 0.0)
-        decrease = np.where(better, (cost - found) / np.maximum(cost, 1e-300), decrease)
-        x = np.where(better[..., None], trial, x)
-        factor = np.where(better, 0.2, np.where(decrease > 0.0, 1.0, 8.0))
+        trial_cost = costs(trial, problems)
+        is_better = (trial_cost < cost) & (decrease == 0.0)
+        decrease = np.where(
+            is_better, (cost - trial_cost) / np.maximum(cost, 1e-300), decrease
+        )
+        x = np.where(is_better[..., None], trial, x)
+        factor = np.where(is_better, 0.2, np.where(decrease > 0.0, 1.0, 8.0))
         damping = np.clip(damping * factor, 1e-9, 1e6)
         if (decrease > 0.0).mean() > 0.7:
             break
@@ -109,32 +112,37 @@ def bounded_step(
     A parameter that would leave its bounds goes to them, and the others follow. Where
     derivatives have overflowed, the step is zero.
     """
-    low, high = bounds
-    known = np.isfinite(information).all(axis=(-1, -2)) & np.isfinite(gradient).all(
+    lower, upper = bounds
+    is_finite = np.isfinite(information).all(axis=(-1, -2)) & np.isfinite(gradient).all(
         axis=-1
     )
-    known = np.asarray(known)
-    information = np.where(known[..., None, None], information, 0.0)
-    gradient = np.where(known[..., None], gradient, 0.0)
+    is_finite = np.asarray(is_finite)
+    information = np.where(is_finite[..., None, None], information, 0.0)
+    gradient = np.where(is_finite[..., None], gradient, 0.0)
     size = np.sqrt(np.maximum(np.diagonal(information, axis1=-2, axis2=-1), 1e-300))
-    scaled = information / size[..., None] / size[..., None, :]
-    identity, more = np.eye(x.shape[-1]), np.asarray(damping)[..., None, None] + 1e-12
-    held = ((x <= low) & (gradient > 0)) | ((x >= high) & (gradient < 0))
-    moving, step = (
-        (free & ~held & (size > 1e-140)).astype(float),
-        np.zeros_like(gradient),
-    )
-    for _ in range(HELD):
-        A = scaled * moving[..., None] * moving[..., None, :]
-        A = A + identity * (more + (1.0 - moving)[..., None])
-        rest = -gradient / size - np.einsum("...ij,...j->...i", scaled, step * size)
-        own = np.linalg.solve(A, (rest * moving)[..., None])[..., 0] / size
-        step = np.where(moving > 0, own, step)
-        leaves = (moving > 0) & ((x + step < low) | (x + step > high))
-        if not leaves.any():
+    scaled_matrix = information / size[..., None] / size[..., None, :]
+    identity = np.eye(x.shape[-1])
+    diagonal_damping = np.asarray(damping)[..., None, None] + 1e-12
+    bound_mask = ((x <= lower) & (gradient > 0)) | ((x >= upper) & (gradient < 0))
+    moving_mask = (free & ~bound_mask & (size > 1e-140)).astype(float)
+    step = np.zeros_like(gradient)
+    for _ in range(MAX_BOUND_ROUNDS):
+        A = scaled_matrix * moving_mask[..., None] * moving_mask[..., None, :]
+        A = A + identity * (diagonal_damping + (1.0 - moving_mask)[..., None])
+        residual = -gradient / size - np.einsum(
+            "...ij,...j->...i", scaled_matrix, step * size
+        )
+        solution = (
+            np.linalg.solve(A, (residual * moving_mask)[..., None])[..., 0] / size
+        )
+        step = np.where(moving_mask > 0, solution, step)
+        leaving_mask = (moving_mask > 0) & ((x + step < lower) | (x + step > upper))
+        if not leaving_mask.any():
             break
         step = np.where(
-            leaves, np.clip(x + step, low, high) - x, np.where(moving > 0, 0.0, step)
+            leaving_mask,
+            np.clip(x + step, lower, upper) - x,
+            np.where(moving_mask > 0, 0.0, step),
         )
-        moving = np.where(leaves, 0.0, moving)
+        moving_mask = np.where(leaving_mask, 0.0, moving_mask)
     return step

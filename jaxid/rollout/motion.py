@@ -13,15 +13,17 @@ from jaxid.arrays import AnyArray, Float
 from jaxid.errors import InputError
 from jaxid.measurement.recording import Recording
 
-SETTLING = 0.5
+SETTLING_TIME = 0.5
 """Time at the start of a log that does not count: the initial speed is unknown [s]."""
-NEAR = 0.1
+STATE_TIME = 0.1
 """Time around an instant whose positions give its state [s]."""
-ROUNDING = 1e-3
+MIN_DEVIATION = 1e-3
 """Least deviation of positions around an instant, because encoders round [rad or m]."""
-HISTORY, AHEAD = 0.3, 0.1
-"""Time before the first and after the last sample from which commands may act [s]."""
-PADDED = 500
+MAX_DELAY = 0.3
+"""Time before the first sample from which commands may act [s]."""
+MAX_ADVANCE = 0.1
+"""Time after the last sample from which commands may act [s]."""
+LENGTH_STEP = 500
 """Samples to a multiple of which motions are padded, so that few lengths compile."""
 
 
@@ -74,34 +76,38 @@ class ServoMotion(eqx.Module):
             (log, a, b)
             for log in logs
             for a, b in log.segments
-            if (b - a) * log.sample_time > 2 * SETTLING
+            if (b - a) * log.sample_time > 2 * SETTLING_TIME
         ]
         if not parts:
             raise InputError("`logs` hold no segment that lasts longer than a second.")
         lengths = tuple(b - a for _, a, b in parts)
-        padded = PADDED * math.ceil(max(lengths) / PADDED)
+        padded_length = LENGTH_STEP * math.ceil(max(lengths) / LENGTH_STEP)
 
-        def stacked(channel: str) -> np.ndarray:
+        def stack_channel(channel: str) -> np.ndarray:
             rows = (np.asarray(getattr(log, channel))[a:b] for log, a, b in parts)
-            filled = [np.pad(x, ((0, padded - len(x)), (0, 0)), "edge").T for x in rows]
-            return np.stack(filled)
+            padded_rows = [
+                np.pad(x, ((0, padded_length - len(x)), (0, 0)), "edge").T for x in rows
+            ]
+            return np.stack(padded_rows)
 
-        positions, times = (
-            stacked("angles"),
-            np.array([log.sample_time for log, _, _ in parts]),
+        positions = stack_channel("angles")
+        times = np.array([log.sample_time for log, _, _ in parts])
+        index = np.arange(padded_length)
+        start_indices = np.ceil(SETTLING_TIME / times)[:, None]
+        counted_samples = (index >= start_indices) & (
+            index < np.array(lengths)[:, None]
         )
-        index = np.arange(padded)
-        first = np.ceil(SETTLING / times)[:, None]
-        counted = (index >= first) & (index < np.array(lengths)[:, None])
         states = [
             state_at(x[:, :n], 0, float(dt))
             for x, n, dt in zip(positions, lengths, times, strict=True)
         ]
         start, spread, acceleration = (np.stack(x) for x in zip(*states, strict=True))
-        lead = math.ceil(HISTORY / times.min())
+        lead_count = math.ceil(MAX_DELAY / times.min())
         return cls(
             # Before the first command the robot stands still.
-            commands=np.pad(stacked("forces"), ((0, 0), (0, 0), (lead, 0)), "edge"),
+            commands=np.pad(
+                stack_channel("forces"), ((0, 0), (0, 0), (lead_count, 0)), "edge"
+            ),
             positions=positions,
             load=np.zeros_like(positions),
             inertia=np.zeros_like(positions),
@@ -109,7 +115,7 @@ class ServoMotion(eqx.Module):
             spread=spread,
             acceleration=acceleration,
             counted=np.repeat(
-                counted[:, None].astype(float), positions.shape[1], axis=1
+                counted_samples[:, None].astype(float), positions.shape[1], axis=1
             ),
             sample_time=times,
             begin=np.array([float(log.time[a]) for log, a, _ in parts]),
@@ -120,8 +126,8 @@ class ServoMotion(eqx.Module):
     @property
     def certainty(self) -> Float[np.ndarray, "motions states joints"]:
         """Inverse variance of the initial states, over the number of samples."""
-        counted = np.maximum(np.asarray(self.counted).sum(axis=-1), 1.0)
-        return 1.0 / np.asarray(self.spread) ** 2 / counted[:, None]
+        sample_counts = np.maximum(np.asarray(self.counted).sum(axis=-1), 1.0)
+        return 1.0 / np.asarray(self.spread) ** 2 / sample_counts[:, None]
 
     @property
     def motions(self) -> int:
@@ -153,7 +159,7 @@ class ServoMotion(eqx.Module):
             for k, n in enumerate(self.lengths)
             for a in range(0, n - size + 1, size)
         ]
-        return self._from(places, size).replace(lengths=(size,) * len(places))
+        return self._motions_from(places, size).replace(lengths=(size,) * len(places))
 
     def known(self) -> "ServoMotion":
         """Return the motions where commands are known, whatever the delay.
@@ -161,23 +167,32 @@ class ServoMotion(eqx.Module):
         They begin later; at their ends samples do not count that late positions might
         decide.
         """
-        samples, times = self.positions.shape[-1], np.asarray(self.sample_time)
-        first = math.ceil(HISTORY / times.min())
-        found = self._from([(k, first) for k in range(self.motions)], samples)
-        lengths = np.array(self.lengths) - first
-        ends = lengths - np.ceil(AHEAD / times)
-        counted = np.asarray(found.counted) * (np.arange(samples) < ends[:, None, None])
-        return found.replace(lengths=tuple(map(int, lengths)), counted=counted)
+        samples = self.positions.shape[-1]
+        times = np.asarray(self.sample_time)
+        start_index = math.ceil(MAX_DELAY / times.min())
+        later_motions = self._motions_from(
+            [(k, start_index) for k in range(self.motions)], samples
+        )
+        lengths = np.array(self.lengths) - start_index
+        ends = lengths - np.ceil(MAX_ADVANCE / times)
+        counted_samples = np.asarray(later_motions.counted) * (
+            np.arange(samples) < ends[:, None, None]
+        )
+        return later_motions.replace(
+            lengths=tuple(map(int, lengths)), counted=counted_samples
+        )
 
-    def _from(self, places: Sequence[tuple[int, int]], size: int) -> "ServoMotion":
+    def _motions_from(
+        self, places: Sequence[tuple[int, int]], size: int
+    ) -> "ServoMotion":
         """Return motions of a size that start from states measured at these samples."""
 
-        def cut(x: AnyArray, more: int = 0) -> np.ndarray:
-            rows = (np.asarray(x)[k, :, a : a + more + size] for k, a in places)
-            filled = (
-                np.pad(y, ((0, 0), (0, more + size - y.shape[1])), "edge") for y in rows
+        def cut(x: AnyArray, lead: int = 0) -> np.ndarray:
+            rows = (np.asarray(x)[k, :, a : a + lead + size] for k, a in places)
+            padded_rows = (
+                np.pad(y, ((0, 0), (0, lead + size - y.shape[1])), "edge") for y in rows
             )
-            return np.stack(list(filled))
+            return np.stack(list(padded_rows))
 
         arrays = {
             x: cut(getattr(self, x))
@@ -190,8 +205,8 @@ class ServoMotion(eqx.Module):
             )
         ]
         start, spread, acceleration = (np.stack(x) for x in zip(*states, strict=True))
-        index, first = np.array(places).T
-        times = np.asarray(self.sample_time)[index]
+        motion_indices, start_indices = np.array(places).T
+        times = np.asarray(self.sample_time)[motion_indices]
         return self.replace(
             **arrays,
             commands=cut(self.commands, self.lead),
@@ -199,15 +214,15 @@ class ServoMotion(eqx.Module):
             spread=spread,
             acceleration=acceleration,
             sample_time=times,
-            begin=np.asarray(self.begin)[index] + first * times,
-            lengths=tuple(self.lengths[k] for k in index),
-            names=tuple(self.names[k] for k in index),
+            begin=np.asarray(self.begin)[motion_indices] + start_indices * times,
+            lengths=tuple(self.lengths[k] for k in motion_indices),
+            names=tuple(self.names[k] for k in motion_indices),
         )
 
     def repeated(self, count: int) -> "ServoMotion":
         """Return the motions several times."""
-        found = jax.tree.map(lambda x: np.concatenate([np.asarray(x)] * count), self)
-        return found.replace(lengths=self.lengths * count, names=self.names * count)
+        copies = jax.tree.map(lambda x: np.concatenate([np.asarray(x)] * count), self)
+        return copies.replace(lengths=self.lengths * count, names=self.names * count)
 
     def part(self, motion: int) -> "ServoMotion":
         """Return one motion, without the axis of motions."""
@@ -222,18 +237,24 @@ def state_at(
     They are those of a parabola through the samples around it. At the start the
     velocity is that of a line, and the position the measured one.
     """
-    near = max(2, round(NEAR / dt))
-    first, last = max(0, index - near), min(q.shape[1], index + near + 1)
-    t = dt * (np.arange(first, last) - index)
-    inside = index >= near
-    A = np.vander(t, 3 if inside else 2, increasing=True)
-    found, *_ = np.linalg.lstsq(A, q[:, first:last].T, rcond=None)
-    rest = max(len(t) - A.shape[1], 1)
-    error = np.sqrt(np.sum((q[:, first:last].T - A @ found) ** 2, axis=0) / rest)
-    rate = np.maximum(error, 0.1 * ROUNDING) / np.sqrt(np.sum((t - t.mean()) ** 2))
-    state = np.stack([found[0] if inside else q[:, index], found[1]])
-    spread = np.stack([np.maximum(error, ROUNDING), rate])
-    return state, spread, 2.0 * found[2] if inside else 0.0 * rate
+    neighbour_count = max(2, round(STATE_TIME / dt))
+    start_index = max(0, index - neighbour_count)
+    stop_index = min(q.shape[1], index + neighbour_count + 1)
+    t = dt * (np.arange(start_index, stop_index) - index)
+    has_neighbours = index >= neighbour_count
+    A = np.vander(t, 3 if has_neighbours else 2, increasing=True)
+    coefficients, *_ = np.linalg.lstsq(A, q[:, start_index:stop_index].T, rcond=None)
+    degrees_of_freedom = max(len(t) - A.shape[1], 1)
+    error = np.sqrt(
+        np.sum((q[:, start_index:stop_index].T - A @ coefficients) ** 2, axis=0)
+        / degrees_of_freedom
+    )
+    rate = np.maximum(error, 0.1 * MIN_DEVIATION) / np.sqrt(np.sum((t - t.mean()) ** 2))
+    state = np.stack(
+        [coefficients[0] if has_neighbours else q[:, index], coefficients[1]]
+    )
+    spread = np.stack([np.maximum(error, MIN_DEVIATION), rate])
+    return state, spread, 2.0 * coefficients[2] if has_neighbours else 0.0 * rate
 
 
 def smooth_rates(

@@ -17,11 +17,13 @@ from .servo import LOWER, UPPER, State
 
 RESOLUTION = 1e-4
 """Errors below which no motion counts more [rad or m]."""
-FALL, COARSE = 0.0005, 0.02
-"""Fall of the mean square error's logarithm that continues the last, first search."""
+FINE_FALL = 0.0005
+"""Fall of the mean square error's logarithm that continues the last search."""
+COARSE_FALL = 0.02
+"""Fall of the mean square error's logarithm that continues the first search."""
 DAMPINGS = (1e-5, 0.01)
 """Dampings of the steps of which the refinement takes the best."""
-ROUNDS = 25
+MAX_ROUNDS = 25
 """Largest number of steps of the refinement."""
 
 
@@ -36,11 +38,11 @@ def weights_of(
     motion: ServoMotion, sums: np.ndarray
 ) -> Float[np.ndarray, "motions joints"]:
     """Weigh motions by their own errors: the worst one does not decide alone."""
-    counted = np.asarray(motion.counted).sum(axis=-1)
-    mean = mean_squares(motion, sums)
-    return np.where(counted > 0, 1.0 / (mean + RESOLUTION**2), 0.0) / np.maximum(
-        counted, 1.0
-    )
+    sample_counts = np.asarray(motion.counted).sum(axis=-1)
+    mean_errors = mean_squares(motion, sums)
+    return np.where(
+        sample_counts > 0, 1.0 / (mean_errors + RESOLUTION**2), 0.0
+    ) / np.maximum(sample_counts, 1.0)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,11 +70,14 @@ class Refinement:
         free: Bool[np.ndarray, "joints parameters"],
     ) -> "Refinement":
         """Return simulated joints."""
-        empty = np.zeros(0)
-        found = cls(
-            simulator, parameters, free, Path(State(empty, empty), empty, empty)
+        empty_array = np.zeros(0)
+        refinement = cls(
+            simulator,
+            parameters,
+            free,
+            Path(State(empty_array, empty_array), empty_array, empty_array),
         )
-        return found.with_unknowns([found.unknowns])[0]
+        return refinement.with_unknowns([refinement.unknowns])[0]
 
     @property
     def unknowns(self) -> Float[np.ndarray, " unknowns"]:
@@ -82,30 +87,32 @@ class Refinement:
 
     def with_unknowns(self, candidates: Sequence[np.ndarray]) -> list["Refinement"]:
         """Return the joints with other unknowns, simulated together."""
-        count, motion, motions = int(self.free.sum()), self.simulator.motion, []
+        count = int(self.free.sum())
+        motion = self.simulator.motion
+        motions = []
         theta = np.tile(self.parameters, (len(DAMPINGS), 1, 1))
         # Always as many at once, so that nothing is compiled anew.
-        every = motion.repeated(len(DAMPINGS))
+        batch = motion.repeated(len(DAMPINGS))
         for k, z in enumerate(candidates):
             theta[k, self.free] = z[:count]
             motions.append(motion.replace(start=z[count:].reshape(motion.start.shape)))
-        spare = [motion] * (len(DAMPINGS) - len(motions))
-        every = every.replace(
-            start=np.concatenate([x.start for x in (*motions, *spare)])
+        spare_motions = [motion] * (len(DAMPINGS) - len(motions))
+        batch = batch.replace(
+            start=np.concatenate([x.start for x in (*motions, *spare_motions)])
         )
-        path = dataclasses.replace(self.simulator, motion=every).simulate(theta)
+        path = dataclasses.replace(self.simulator, motion=batch).simulate(theta)
         parts = [
             slice(k * motion.motions, (k + 1) * motion.motions)
             for k in range(len(motions))
         ]
         return [
             Refinement(
-                dataclasses.replace(self.simulator, motion=own),
+                dataclasses.replace(self.simulator, motion=part_motion),
                 x,
                 self.free,
                 jax.tree.map(lambda y, part=part: y[..., part], path),
             )
-            for own, x, part in zip(motions, theta, parts, strict=False)
+            for part_motion, x, part in zip(motions, theta, parts, strict=False)
         ]
 
     @cached_property
@@ -141,26 +148,31 @@ class Refinement:
         # NumPy's matrix products wait long for cores that other programs use; those of
         # JAX do not.
         with double_precision():
-            found = [
+            motion_products = [
                 _products(S, r)
                 for S, r in zip(self.sensitivities, self.residuals, strict=True)
             ]
         g, H = (
-            np.stack([np.asarray(x) for x in rows]) for rows in zip(*found, strict=True)
+            np.stack([np.asarray(x) for x in rows])
+            for rows in zip(*motion_products, strict=True)
         )
         return g, H
 
     def moments(self, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return gradient and Gauss-Newton matrix of the weighted squares."""
-        count, each = int(self.free.sum()), self.simulator.motion.start[0].size
-        size = count + len(weights) * each
-        g, H = np.zeros(size), np.zeros((size, size))
-        for k, (w, own_g, own_H) in enumerate(
+        count = int(self.free.sum())
+        state_size = self.simulator.motion.start[0].size
+        size = count + len(weights) * state_size
+        g = np.zeros(size)
+        H = np.zeros((size, size))
+        for k, (w, motion_g, motion_H) in enumerate(
             zip(weights, *self.products, strict=True)
         ):
-            own = np.r_[:count, count + k * each : count + (k + 1) * each]
-            g[own] += w @ own_g
-            H[np.ix_(own, own)] += np.tensordot(w, own_H, 1)
+            indices = np.r_[
+                :count, count + k * state_size : count + (k + 1) * state_size
+            ]
+            g[indices] += w @ motion_g
+            H[np.ix_(indices, indices)] += np.tensordot(w, motion_H, 1)
         return g, H
 
 
@@ -173,8 +185,8 @@ def prepare(
     simulator: CoupledSimulator, parameters: np.ndarray, free: np.ndarray
 ) -> None:
     """Compile what the refinement of motions of this length needs."""
-    found = Refinement.of(simulator, parameters, free)
-    simulator.transitions(0, parameters, found.path, free)
+    refinement = Refinement.of(simulator, parameters, free)
+    simulator.transitions(0, parameters, refinement.path, free)
 
 
 def refine(
@@ -196,45 +208,59 @@ def refine(
     """
 
     def descend(start: tuple[CoupledSimulator, np.ndarray]) -> Refinement:
-        return _descend(Refinement.of(*start, free), COARSE)
+        return _descend(Refinement.of(*start, free), COARSE_FALL)
 
-    one, two = on_cores(descend, (first, other))
-    told = abs(two.score - one.score) > FALL
-    return _descend(two if two.score < one.score - FALL else one, FALL), told
+    first_fit, other_fit = on_cores(descend, (first, other))
+    is_decided = abs(other_fit.score - first_fit.score) > FINE_FALL
+    return _descend(
+        other_fit if other_fit.score < first_fit.score - FINE_FALL else first_fit,
+        FINE_FALL,
+    ), is_decided
 
 
-def _descend(best: Refinement, fall: float) -> Refinement:
+def _descend(fit: Refinement, fall: float) -> Refinement:
     """Return the minimum of the squared errors, weighted by the errors of each motion.
 
     Args:
-        best: Start.
+        fit: Start.
         fall: Fall of the score, promised or found in a step, for which the search goes
             on.
     """
-    motion, first, rows = best.simulator.motion, best.unknowns, np.nonzero(best.free)[1]
-    count, wide = len(rows), np.full(len(first) - len(rows), np.inf)
-    bounds = np.r_[LOWER[rows], -wide], np.r_[UPPER[rows], wide]
+    motion = fit.simulator.motion
+    start_unknowns = fit.unknowns
+    rows = np.nonzero(fit.free)[1]
+    count = len(rows)
+    state_limits = np.full(len(start_unknowns) - len(rows), np.inf)
+    bounds = np.r_[LOWER[rows], -state_limits], np.r_[UPPER[rows], state_limits]
     prior = np.r_[np.zeros(count), motion.certainty.ravel()]
-    free = np.ones(len(first), bool)
-    for _ in range(ROUNDS):
-        weights, z = weights_of(motion, best.sums), best.unknowns
+    free_unknowns = np.ones(len(start_unknowns), bool)
+    for _ in range(MAX_ROUNDS):
+        weights = weights_of(motion, fit.sums)
+        z = fit.unknowns
 
-        def cost(found: Refinement, weights=weights) -> float:
+        def cost(candidate: Refinement, weights=weights) -> float:
             squares = (
-                np.sum(weights * found.sums) + prior @ (found.unknowns - first) ** 2
+                np.sum(weights * candidate.sums)
+                + prior @ (candidate.unknowns - start_unknowns) ** 2
             )
             return float(squares) / weights.size
 
-        g, H = best.moments(weights)
-        g, H = g + prior * (z - first), H + np.diag(prior)
-        steps = [bounded_step(g, H, z, free, bounds, damping) for damping in DAMPINGS]
-        promised = float(-2.0 * g @ steps[0] - steps[0] @ H @ steps[0]) / weights.size
-        if promised < fall:
+        g, H = fit.moments(weights)
+        g = g + prior * (z - start_unknowns)
+        H = H + np.diag(prior)
+        steps = [
+            bounded_step(g, H, z, free_unknowns, bounds, damping)
+            for damping in DAMPINGS
+        ]
+        promised_gain = (
+            float(-2.0 * g @ steps[0] - steps[0] @ H @ steps[0]) / weights.size
+        )
+        if promised_gain < fall:
             break
-        trials = best.with_unknowns([np.clip(z + step, *bounds) for step in steps])
-        found = min(trials, key=cost)
-        gained = cost(best) - cost(found)
-        best = found if gained > 0.0 else best
-        if gained < fall or abs(promised - gained) < fall:
+        trials = fit.with_unknowns([np.clip(z + step, *bounds) for step in steps])
+        trial = min(trials, key=cost)
+        gain = cost(fit) - cost(trial)
+        fit = trial if gain > 0.0 else fit
+        if gain < fall or abs(promised_gain - gain) < fall:
             break
-    return best
+    return fit

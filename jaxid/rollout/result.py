@@ -29,11 +29,11 @@ from .refine import Refinement, mean_squares, weights_of
 from .servo import INDEX, LOWER, PARAMETERS, SCALE, UPPER, with_integral
 from .uncoupled import ServoSimulator
 
-UNDETERMINED = 0.25
+MAX_RELATIVE_DEVIATION = 0.25
 """Relative standard deviation of a parameter above which it is not determined."""
-LIMITED = [INDEX[x] for x in ("B", "d", "b", "um", "g", "ki")]
+LIMITED_PARAMETERS = [INDEX[x] for x in ("B", "d", "b", "um", "g", "ki")]
 """Parameters that are not at a limit of the search unless something is wrong."""
-SYSTEMATIC = 1.5
+MIN_ROUNDING_RATIO = 1.5
 """Multiple of the encoder's rounding above which slow errors show a missing effect."""
 
 
@@ -62,10 +62,10 @@ class Combination(NamedTuple):
 
     def interval(self, level: float = 0.95) -> tuple[float, float]:
         """Return the confidence interval."""
-        half = self.deviation * float(
+        half_width = self.deviation * float(
             special.stdtrit(max(self.dof, 1.0), 0.5 + 0.5 * level)
         )
-        return self.value - half, self.value + half
+        return self.value - half_width, self.value + half_width
 
 
 @dataclasses.dataclass(frozen=True)
@@ -116,59 +116,64 @@ class ServoFit:
     @classmethod
     def of(
         cls,
-        found: Refinement,
+        refinement: Refinement,
         linear: Float[np.ndarray, "joints parameters"],
         joint_names: tuple[str, ...],
         hold_is_told: bool = True,
         given_stiffness: Float[np.ndarray, " joints"] | None = None,
     ) -> "ServoFit":
         """Return the fit of a refinement, with its uncertainty."""
-        simulator, r = found.simulator, found.residuals
+        simulator = refinement.simulator
+        r = refinement.residuals
         motion = simulator.motion
-        everything = simulator.positions(found.path) - np.asarray(motion.positions)
-        typical = typical_errors(motion, sustained_errors(motion, everything))
-        combinations, covariance, dof = _determined(_Rows.of(found), found, joint_names)
-        positions, lacking = np.asarray(motion.positions), []
+        errors = simulator.positions(refinement.path) - np.asarray(motion.positions)
+        error_sizes = typical_errors(motion, sustained_errors(motion, errors))
+        combinations, covariance, dof = _determined_combinations(
+            _Rows.of(refinement), refinement, joint_names
+        )
+        positions = np.asarray(motion.positions)
+        joint_errors = []
         for j, name in enumerate(joint_names):
-            kept = np.asarray(motion.counted)[:, j] > 0
-            if (rms := systematic_error(r[:, j], kept, positions[:, j])) > 0:
-                lacking.append(f"{name} {1e3 * rms:.2g}")
+            counted_samples = np.asarray(motion.counted)[:, j] > 0
+            if (rms := systematic_error(r[:, j], counted_samples, positions[:, j])) > 0:
+                joint_errors.append(f"{name} {1e3 * rms:.2g}")
         notes = [
             f"{joint_names[j]}: {PARAMETERS[k].meaning} is at the limit of the search, "
-            f"{found.parameters[j, k]:.3g}: check signs, units and offsets of the "
+            f"{refinement.parameters[j, k]:.3g}: check signs, units and offsets of the "
             "commands"
-            for j, k in np.argwhere(found.free)
+            for j, k in np.argwhere(refinement.free)
             # An integral gain of zero is none.
-            if k in LIMITED and found.parameters[j, k] in (UPPER[k], LOWER[k])
-            if found.parameters[j, k] != 0.0
+            if k in LIMITED_PARAMETERS
+            and refinement.parameters[j, k] in (UPPER[k], LOWER[k])
+            if refinement.parameters[j, k] != 0.0
         ]
-        integral = "" if found.free[:, INDEX["ki"]].any() else ", integral action"
-        missing = (
+        integral = "" if refinement.free[:, INDEX["ki"]].any() else ", integral action"
+        effect_note = (
             "errors are larger than an encoder's rounding and change slowly "
-            f"({', '.join(lacking)} mrad or mm RMS): an effect is missing, such as "
-            f"other friction, play, elasticity{integral} or load, and the parameters "
-            "are those that imitate it best"
+            f"({', '.join(joint_errors)} mrad or mm RMS): an effect is missing, such "
+            f"as other friction, play, elasticity{integral} or load, and the "
+            "parameters are those that imitate it best"
         )
         load = np.zeros_like(motion.positions)
         if simulator.bodies is not None:
             load = simulator.bodies.loads(motion).load
         return cls(
             joint_names,
-            found.parameters,
-            found.free,
+            refinement.parameters,
+            refinement.free,
             covariance,
             dof,
             combinations,
             linear,
             simulator.hold,
             simulator.time_step,
-            np.sqrt(mean_squares(motion, found.sums)),
+            np.sqrt(mean_squares(motion, refinement.sums)),
             motion.names,
-            typical,
-            contacts(motion, everything, typical),
+            error_sizes,
+            contacts(motion, errors, error_sizes),
             simulator.bodies,
             np.abs(load).mean(axis=(0, 2)),
-            (*notes, *([missing] if lacking else [])),
+            (*notes, *([effect_note] if joint_errors else [])),
             hold_is_told,
             given_stiffness,
         )
@@ -179,22 +184,22 @@ class ServoFit:
 
         It is given, or told by a known weight.
         """
-        found = np.full(len(self.joint_names), np.nan)
+        values = np.full(len(self.joint_names), np.nan)
         if self.given_stiffness is not None:
-            found = self.given_stiffness.copy()
+            values = self.given_stiffness.copy()
         for c in self.combinations:
-            if c.name == "a" and c.deviation < UNDETERMINED * abs(c.value):
-                found[c.joint] = 1.0 / c.value
-        return found
+            if c.name == "a" and c.deviation < MAX_RELATIVE_DEVIATION * abs(c.value):
+                values[c.joint] = 1.0 / c.value
+        return values
 
     @property
     def _commands(self) -> str:
-        said = "held until the next one" if self.hold else "interpolated"
+        description = "held until the next one" if self.hold else "interpolated"
         if self.hold_is_told:
-            return said
+            return description
         return (
-            f"{said}; if held, delays are half a sample time shorter: the logs do "
-            "not tell"
+            f"{description}; if held, delays are half a sample time shorter: the "
+            "logs do not tell"
         )
 
     def _unit(self, c: Combination) -> str:
@@ -229,8 +234,8 @@ class ServoFit:
         """
         x = np.asarray(self.parameters if parameters is None else parameters)
         if x[:, INDEX["ki"]].any():
-            loaded = motion if self.bodies is None else self.bodies.loads(motion)
-            motion = with_integral(loaded, x, self.hold)
+            loaded_motion = motion if self.bodies is None else self.bodies.loads(motion)
+            motion = with_integral(loaded_motion, x, self.hold)
         simulator = CoupledSimulator(motion, self.time_step, self.hold, self.bodies)
         return simulator.positions(simulator.simulate(x))
 
@@ -241,10 +246,12 @@ class ServoFit:
             logs: Recordings whose `forces` are the commands.
         """
         motion = ServoMotion.of([logs] if isinstance(logs, Recording) else logs)
-        simulated = self.paths(motion)
-        linear = ServoSimulator(motion, self.time_step).paths(self.linear[None])[:, 0]
-        errors = simulated - np.asarray(motion.positions)
-        touched = contact_rows(motion, errors, self.typical)
+        simulated_positions = self.paths(motion)
+        linear_positions = ServoSimulator(motion, self.time_step).paths(
+            self.linear[None]
+        )[:, 0]
+        errors = simulated_positions - np.asarray(motion.positions)
+        contact_mask = contact_rows(motion, errors, self.typical)
         parts = range(motion.motions)
         lengths = motion.lengths
         times = motion.begin[:, None] + np.outer(
@@ -259,10 +266,10 @@ class ServoFit:
             motion.names,
             cut(times),
             cut(motion.positions),
-            cut(simulated),
+            cut(simulated_positions),
             cut(motion.sent),
-            cut(linear),
-            cut((np.asarray(motion.counted) > 0) & ~touched),
+            cut(linear_positions),
+            cut((np.asarray(motion.counted) > 0) & ~contact_mask),
             contacts(motion, errors, self.typical),
         )
 
@@ -295,9 +302,11 @@ class ServoFit:
         deviation = np.sqrt(np.diag(self.covariance))
         size, vectors = np.linalg.eigh(self.covariance / deviation / deviation[:, None])
         root = vectors * np.sqrt(np.maximum(size, 0.0))
-        normal = np.clip(random.normal(size=(count, len(root))) @ root.T, -7.0, 7.0)
+        normal_draws = np.clip(
+            random.normal(size=(count, len(root))) @ root.T, -7.0, 7.0
+        )
         draws[:, self.free] += deviation * special.stdtrit(
-            self.dof, special.ndtr(normal)
+            self.dof, special.ndtr(normal_draws)
         )
         return np.clip(draws, LOWER, UPPER)
 
@@ -308,12 +317,16 @@ class ServoFit:
             [c.value for c in rows], [c.deviation for c in rows]
         )
         ends = np.array([c.interval() for c in rows]).reshape(-1, 2)
-        low, high = (with_deviations(x, [c.deviation for c in rows])[0] for x in ends.T)
-        size = np.array([abs(c.value) for c in rows])
-        clear = np.array([c.deviation for c in rows]) < UNDETERMINED * np.maximum(
-            size, 1e-12
+        lower_ends, upper_ends = (
+            with_deviations(x, [c.deviation for c in rows])[0] for x in ends.T
         )
-        first = [k for k in range(1, len(rows)) if rows[k].joint != rows[k - 1].joint]
+        size = np.array([abs(c.value) for c in rows])
+        is_clear = np.array(
+            [c.deviation for c in rows]
+        ) < MAX_RELATIVE_DEVIATION * np.maximum(size, 1e-12)
+        joint_rows = [
+            k for k in range(1, len(rows)) if rows[k].joint != rows[k - 1].joint
+        ]
         K = ", ".join(
             f"{name} {significant(k)}"
             for name, k in zip(self.joint_names, self.stiffness, strict=True)
@@ -352,12 +365,12 @@ class ServoFit:
             Column("estimate", values, kind="number"),
             Column("±", deviations, kind="number"),
             Column("unit", [self._unit(c) for c in rows]),
-            Column("95 %\nfrom", low, kind="number"),
-            Column("95 %\nto", high, kind="number"),
+            Column("95 %\nfrom", lower_ends, kind="number"),
+            Column("95 %\nto", upper_ends, kind="number"),
             facts=facts,
             remarks=remarks,
-            status=[Status.GOOD if x else Status.DOUBTFUL for x in clear],
-            rules=first,
+            status=[Status.GOOD if x else Status.DOUBTFUL for x in is_clear],
+            rules=joint_rows,
         )
 
     def __str__(self) -> str:
@@ -368,69 +381,83 @@ class _Rows(NamedTuple):
     """Weighted sensitivities of a refinement, less what initial states can imitate.
 
     Attributes:
-        found: Refinement.
+        refinement: Refinement.
         weights: Weight of each motion's squared errors [motions, joints].
-        imitated: Initial states that imitate each parameter [motions, states,
+        imitations: Initial states that imitate each parameter [motions, states,
             parameters].
         scores: Sensitivities times residuals [motions, parameters].
         information: Gauss-Newton matrix.
     """
 
-    found: Refinement
+    refinement: Refinement
     weights: np.ndarray
-    imitated: np.ndarray
+    imitations: np.ndarray
     scores: np.ndarray
     information: np.ndarray
 
     @classmethod
-    def of(cls, found: Refinement) -> "_Rows":
+    def of(cls, refinement: Refinement) -> "_Rows":
         """Return the rows of a refinement."""
-        weights = weights_of(found.simulator.motion, found.sums)
-        size, scores, imitated = found.simulator.motion.start[0].size, [], []
-        information = np.zeros((int(found.free.sum()),) * 2)
-        certainties = found.simulator.motion.certainty
+        weights = weights_of(refinement.simulator.motion, refinement.sums)
+        size = refinement.simulator.motion.start[0].size
+        scores = []
+        imitations = []
+        information = np.zeros((int(refinement.free.sum()),) * 2)
+        certainties = refinement.simulator.motion.certainty
         for w, g, H, certainty in zip(
-            weights, *found.products, certainties, strict=True
+            weights, *refinement.products, certainties, strict=True
         ):
-            own_g, own_H = w @ g, np.tensordot(w, H, 1)
-            known = own_H[-size:, -size:] + np.diag(certainty.ravel())
-            imitated.append(np.linalg.solve(known, own_H[-size:, :-size]))
-            scores.append(own_g[:-size] - own_g[-size:] @ imitated[-1])
-            information += own_H[:-size, :-size] - own_H[:-size, -size:] @ imitated[-1]
-        return cls(found, weights, np.stack(imitated), np.stack(scores), information)
+            motion_g = w @ g
+            motion_H = np.tensordot(w, H, 1)
+            state_information = motion_H[-size:, -size:] + np.diag(certainty.ravel())
+            imitations.append(
+                np.linalg.solve(state_information, motion_H[-size:, :-size])
+            )
+            scores.append(motion_g[:-size] - motion_g[-size:] @ imitations[-1])
+            information += (
+                motion_H[:-size, :-size] - motion_H[:-size, -size:] @ imitations[-1]
+            )
+        return cls(
+            refinement, weights, np.stack(imitations), np.stack(scores), information
+        )
 
     @property
     def columns(self) -> list[np.ndarray]:
         """Sensitivities of each motion and joint [parameters, samples]."""
-        found = []
-        for S, start in zip(self.found.sensitivities, self.imitated, strict=True):
-            own, by_start = S[..., : -len(start)], S[..., -len(start) :]
-            found += list(np.swapaxes(own - by_start @ start, 1, 2))
-        return found
+        columns = []
+        for S, start in zip(
+            self.refinement.sensitivities, self.imitations, strict=True
+        ):
+            by_parameters = S[..., : -len(start)]
+            by_start = S[..., -len(start) :]
+            columns += list(np.swapaxes(by_parameters - by_start @ start, 1, 2))
+        return columns
 
     def covariance(
-        self, columns: list, own: np.ndarray
+        self, columns: list, indices: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return covariance and degrees of freedom if only some parameters are unknown.
 
         The spectral sandwich, at least that of independent errors; where motions differ
         more than it explains, their scatter.
         """
-        motion, (motions, joints) = self.found.simulator.motion, self.weights.shape
-        B, place = np.zeros_like(self.information), np.ix_(own, own)
+        motion = self.refinement.simulator.motion
+        motions, joints = self.weights.shape
+        B = np.zeros_like(self.information)
+        place = np.ix_(indices, indices)
         B[place] = _inverse(self.information[place])
-        found = sandwich_of_columns(
+        sandwich = sandwich_of_columns(
             np,
             [range(len(B))] * (motions * joints),
             np.sqrt(self.weights).ravel(),
             B,
             np.zeros((1, len(B))),
             columns,
-            list(self.found.residuals.reshape(motions * joints, 1, -1)),
+            list(self.refinement.residuals.reshape(motions * joints, 1, -1)),
             np.asarray(motion.counted).mean(axis=-1).ravel(),
             float(motion.sample_time.mean()),
         )
-        variance, dof = (x[0] for x in found)
+        variance, dof = (x[0] for x in sandwich)
         # The sandwich is blind where no error can show: there the information alone
         # tells.
         samples = np.asarray(motion.counted).sum(axis=-1).max()
@@ -439,9 +466,9 @@ class _Rows(NamedTuple):
         changes = self.scores @ B
         scatter = motions / max(motions - 1, 1) * (changes**2).sum(axis=0)
         limit = stats.f.ppf(0.95, max(motions - 1, 1), dof)
-        differ = (motions > 1) & (scatter > limit * variance)
-        dof = np.where(differ, motions - 1.0, dof)
-        deviation = np.sqrt(np.where(differ, scatter, variance))
+        scatter_mask = (motions > 1) & (scatter > limit * variance)
+        dof = np.where(scatter_mask, motions - 1.0, dof)
+        deviation = np.sqrt(np.where(scatter_mask, scatter, variance))
         return B / np.outer(size, size) * np.outer(deviation, deviation), dof
 
 
@@ -454,58 +481,66 @@ def systematic_error(r: np.ndarray, kept: np.ndarray, q: np.ndarray) -> float:
         q: Measured positions.
     """
     rms = float(np.sqrt(np.mean(r[kept] ** 2)))
-    both = kept[:, 1:] & kept[:, :-1]
-    neighbours = float(np.mean((r[:, 1:] * r[:, :-1])[both])) / rms**2
+    pair_mask = kept[:, 1:] & kept[:, :-1]
+    neighbours = float(np.mean((r[:, 1:] * r[:, :-1])[pair_mask])) / rms**2
     steps = np.abs(np.diff(q, axis=-1)).ravel()
     steps = steps[steps > 1e-6]
     # Most steps of a slow joint are the smallest one; interpolated logs have smaller
     # ones, too.
     rounding = float(np.quantile(steps, 0.1)) / np.sqrt(12.0) if steps.size else 0.0
-    return 0.0 if rms < SYSTEMATIC * rounding or neighbours < 0.5 else rms
+    return 0.0 if rms < MIN_ROUNDING_RATIO * rounding or neighbours < 0.5 else rms
 
 
 def _inverse(H: np.ndarray) -> np.ndarray:
     """Return the inverse of an information matrix, finite where nothing is known."""
     size = np.sqrt(np.maximum(np.diag(H), 1e-30))
     values, vectors = np.linalg.eigh(H / np.outer(size, size))
-    scaled = vectors / np.maximum(values, 1e-12) @ vectors.T
-    return scaled / np.outer(size, size)
+    scaled_inverse = vectors / np.maximum(values, 1e-12) @ vectors.T
+    return scaled_inverse / np.outer(size, size)
 
 
-def _determined(
-    rows: _Rows, found: Refinement, joint_names: tuple[str, ...]
+def _determined_combinations(
+    rows: _Rows, refinement: Refinement, joint_names: tuple[str, ...]
 ) -> tuple[tuple[Combination, ...], np.ndarray, np.ndarray]:
     """Return the determined combinations, and covariance and dof of all parameters."""
-    x, joints, symbols = found.parameters[found.free], *np.nonzero(found.free)
+    x = refinement.parameters[refinement.free]
+    joints, symbols = np.nonzero(refinement.free)
     columns = rows.columns
-    covariance, every_dof = rows.covariance(columns, np.arange(len(x)))
+    covariance, parameter_dof = rows.covariance(columns, np.arange(len(x)))
     size = np.maximum(np.abs(x), 0.1 * SCALE[symbols])
-    wider = special.stdtrit(every_dof, 0.975) / special.ndtri(0.975) / size
-    own, kappa = _merge(
-        covariance * np.outer(wider, wider),
+    interval_factors = (
+        special.stdtrit(parameter_dof, 0.975) / special.ndtri(0.975) / size
+    )
+    indices, kappa = _merge(
+        covariance * np.outer(interval_factors, interval_factors),
         np.maximum(np.abs(x), SCALE[symbols]) / size,
     )
-    kappa = kappa * size[own][:, None] / size[None, :]
-    reduced, dof = rows.covariance(columns, own)
+    kappa = kappa * size[indices][:, None] / size[None, :]
+    combination_covariance, dof = rows.covariance(columns, indices)
     combinations = []
-    for k, i in enumerate(own):
-        coefficients = np.zeros(found.parameters.shape)
-        coefficients[found.free] = kappa[k]
-        name, meaning = PARAMETERS[symbols[i]].symbol, PARAMETERS[symbols[i]].meaning
-        others = []
+    for k, i in enumerate(indices):
+        coefficients = np.zeros(refinement.parameters.shape)
+        coefficients[refinement.free] = kappa[k]
+        name = PARAMETERS[symbols[i]].symbol
+        meaning = PARAMETERS[symbols[i]].meaning
+        merged_meanings = []
         for m in np.flatnonzero(kappa[k]):
             if m != i:
-                elsewhere = joints[m] != joints[i]
-                where = f" of {joint_names[joints[m]]}" if elsewhere else ""
+                is_elsewhere = joints[m] != joints[i]
+                where = f" of {joint_names[joints[m]]}" if is_elsewhere else ""
                 name += f" {kappa[k, m]:+.3g} {PARAMETERS[symbols[m]].symbol}{where}"
-                others.append(PARAMETERS[symbols[m]].meaning + where)
-        if others:
-            meaning = f"{meaning} and {', '.join(others)} only together"
-        numbers = float(kappa[k] @ x), float(np.sqrt(reduced[i, i])), float(dof[i])
+                merged_meanings.append(PARAMETERS[symbols[m]].meaning + where)
+        if merged_meanings:
+            meaning = f"{meaning} and {', '.join(merged_meanings)} only together"
+        numbers = (
+            float(kappa[k] @ x),
+            float(np.sqrt(combination_covariance[i, i])),
+            float(dof[i]),
+        )
         unit = PARAMETERS[symbols[i]].unit
         place = int(joints[i]), name, meaning, unit, coefficients
         combinations.append(Combination(*place, *numbers))
-    return tuple(combinations), covariance, every_dof
+    return tuple(combinations), covariance, parameter_dof
 
 
 def _merge(covariance: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -516,25 +551,25 @@ def _merge(covariance: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, np.nd
         reach: Usual size of each, to which it may change if it is not determined.
 
     A parameter is not determined if, with those before it known only by the logs, its
-    deviation exceeds `UNDETERMINED`: its column of the information's root adds almost
-    nothing.
+    deviation exceeds `MAX_RELATIVE_DEVIATION`: its column of the information's root
+    adds almost nothing.
     """
     n = len(covariance)
     information = _inverse(covariance)
     values, vectors = np.linalg.eigh(information)
     W = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
-    own: list[int] = []
+    indices: list[int] = []
     Q = np.zeros((n, 0))
     for k in range(n):
-        new = W[:, k] - Q @ (Q.T @ W[:, k])
-        if np.linalg.norm(new) > 1.0 / UNDETERMINED:
-            own.append(k)
-            Q = np.column_stack([Q, new / np.linalg.norm(new)])
-    kappa = np.zeros((len(own), n))
-    if own:
-        kappa = np.linalg.lstsq(W[:, own], W, rcond=None)[0]
-        kappa[:, own] = np.eye(len(own))
+        remainder = W[:, k] - Q @ (Q.T @ W[:, k])
+        if np.linalg.norm(remainder) > 1.0 / MAX_RELATIVE_DEVIATION:
+            indices.append(k)
+            Q = np.column_stack([Q, remainder / np.linalg.norm(remainder)])
+    kappa = np.zeros((len(indices), n))
+    if indices:
+        kappa = np.linalg.lstsq(W[:, indices], W, rcond=None)[0]
+        kappa[:, indices] = np.eye(len(indices))
         # What changes a combination by less than its deviation is left out.
-        deviation = np.sqrt(np.diag(np.linalg.inv(W[:, own].T @ W[:, own])))
+        deviation = np.sqrt(np.diag(np.linalg.inv(W[:, indices].T @ W[:, indices])))
         kappa[np.abs(kappa) * reach < np.minimum(0.02, deviation)[:, None]] = 0.0
-    return np.array(own, int), kappa
+    return np.array(indices, int), kappa

@@ -21,7 +21,7 @@ import numpy as np
 from jaxid.arrays import AnyArray, Array, double_precision
 
 from .dry_friction import Slip
-from .motion import AHEAD, HISTORY, ServoMotion
+from .motion import MAX_ADVANCE, MAX_DELAY, ServoMotion
 
 GAMMA = 1.0 - math.sqrt(0.5)
 """Fraction of a step that each of its two implicit stages takes."""
@@ -47,7 +47,7 @@ PARAMETERS = (
     # With less damping than 6 % of a step, a step may overshoot where friction then
     # holds.
     ServoParameter("B", "damping / stiffness", "s", 0.05, 1e-3, 5.0, 0.03),
-    ServoParameter("d", "delay", "s", 0.01, -AHEAD, HISTORY, 0.01),
+    ServoParameter("d", "delay", "s", 0.01, -MAX_ADVANCE, MAX_DELAY, 0.01),
     ServoParameter("b", "bias / stiffness", "u", 0.0, -1.0, 1.0, 0.01),
     ServoParameter("a", "1 / stiffness", "u/(N m)", 0.0, 0.0, 100.0, 0.05),
     ServoParameter("F", "dry friction / stiffness", "u", 0.01, 0.0, 1.0, 0.01),
@@ -76,26 +76,27 @@ def delayed_command(c: AnyArray, t: Array, hold: AnyArray) -> tuple[Array, Array
         The commands, and their changes by a delay of one sample.
     """
 
-    def held() -> tuple[Array, Array]:
+    def held_commands() -> tuple[Array, Array]:
         table = jnp.concatenate([jnp.zeros(1), jnp.cumsum(c)])
-        within = jnp.maximum(t, -1e3)
-        whole = jnp.clip(jnp.floor(within), 0.0, len(c) - 1.0)
-        k = whole.astype(int)
-        length = jnp.maximum(jnp.diff(within), 1e-12)
-        mean = jnp.diff(table[k] + (within - whole) * c[k]) / length
+        instants = jnp.maximum(t, -1e3)
+        floors = jnp.clip(jnp.floor(instants), 0.0, len(c) - 1.0)
+        k = floors.astype(int)
+        length = jnp.maximum(jnp.diff(instants), 1e-12)
+        mean = jnp.diff(table[k] + (instants - floors) * c[k]) / length
         return jnp.repeat(mean, 2), jnp.repeat(-jnp.diff(c[k]) / length, 2)
 
-    def interpolated() -> tuple[Array, Array]:
+    def interpolated_commands() -> tuple[Array, Array]:
         ends = jnp.stack([t[:-1] + GAMMA * jnp.diff(t), t[1:]], axis=1).ravel()
-        within = jnp.clip(ends, 0.0, len(c) - 1.0)
-        whole = jnp.clip(jnp.floor(within), 0.0, len(c) - 2.0)
-        k = whole.astype(int)
-        before, change = c[k], c[k + 1] - c[k]
-        return before + (within - whole) * change, jnp.where(
-            within == ends, -change, 0.0
+        instants = jnp.clip(ends, 0.0, len(c) - 1.0)
+        floors = jnp.clip(jnp.floor(instants), 0.0, len(c) - 2.0)
+        k = floors.astype(int)
+        start_commands = c[k]
+        change = c[k + 1] - c[k]
+        return start_commands + (instants - floors) * change, jnp.where(
+            instants == ends, -change, 0.0
         )
 
-    return jax.lax.cond(hold, held, interpolated)
+    return jax.lax.cond(hold, held_commands, interpolated_commands)
 
 
 class Stages(NamedTuple):
@@ -125,18 +126,26 @@ class Stages(NamedTuple):
         """
         count = motion.positions.shape[-1] - 1
 
-        def repeated(x: AnyArray) -> Array:
-            each = (x.shape[-1] - 1) // count
-            return jnp.repeat(jnp.asarray(x).T[:-1], 2 * steps // each, axis=0)
+        def repeat_stages(x: AnyArray) -> Array:
+            rows_per_sample = (x.shape[-1] - 1) // count
+            return jnp.repeat(
+                jnp.asarray(x).T[:-1], 2 * steps // rows_per_sample, axis=0
+            )
 
-        def alternating(first: float, second: float) -> Array:
-            return jnp.tile(jnp.array([first, second]), count * steps)[:, None]
+        def alternate_stages(first_value: float, second_value: float) -> Array:
+            return jnp.tile(jnp.array([first_value, second_value]), count * steps)[
+                :, None
+            ]
 
         commands, by_delay = commands_of_stages(theta, motion, steps, hold)
-        share = alternating(1.0 - GAMMA, GAMMA)
-        ahead = alternating((1.0 - GAMMA) / GAMMA, 1.0)
+        share = alternate_stages(1.0 - GAMMA, GAMMA)
+        velocity_factor = alternate_stages((1.0 - GAMMA) / GAMMA, 1.0)
         stages = cls(
-            commands, repeated(motion.load), repeated(motion.inertia), share, ahead
+            commands,
+            repeat_stages(motion.load),
+            repeat_stages(motion.inertia),
+            share,
+            velocity_factor,
         )
         return stages, by_delay
 
@@ -207,19 +216,29 @@ class Forces(NamedTuple):
         """
         J, B, _, _, a, F, mu, Fs, vs, um, _, ki = theta
         q, w, integral = state
-        load, error = a * stages.load, stages.commands - q
-        gain, drive = 1.0, error
+        load = a * stages.load
+        error = stages.commands - q
+        gain = 1.0
+        drive = error
         if integral is not None:
             gain = 1.0 + ki * GAMMA * h
             drive = gain * error + integral
-        inside = jnp.where(jnp.abs(drive) < um, 1.0, 0.0)
-        falling = jnp.exp(-((w / vs) ** 2))
-        friction = F + mu * jnp.abs(load) + Fs * falling
+        control_share = jnp.where(jnp.abs(drive) < um, 1.0, 0.0)
+        stribeck_share = jnp.exp(-((w / vs) ** 2))
+        friction = F + mu * jnp.abs(load) + Fs * stribeck_share
         inertia = (J + a * stages.inertia) / (GAMMA * h)
-        resistance = inertia + B + inside * gain * GAMMA * h
+        resistance = inertia + B + control_share * gain * GAMMA * h
         force = jnp.clip(drive, -um, um) - load
         return cls(
-            error, force, friction, inertia, resistance, inside, falling, gain, ki
+            error,
+            force,
+            friction,
+            inertia,
+            resistance,
+            control_share,
+            stribeck_share,
+            gain,
+            ki,
         )
 
     def velocity(self, w: Array, stages: Stages) -> Array:
@@ -235,14 +254,16 @@ class Forces(NamedTuple):
         )
 
 
-def moved(state: State, u: Array, x: Forces, stage: Stages, h: AnyArray) -> State:
+def advance_state(
+    state: State, u: Array, x: Forces, stage: Stages, h: AnyArray
+) -> State:
     """Return the state behind a stage from the velocities in it."""
     q, w, integral = state
     # A joint that has stopped in the first stage starts the second one at rest.
-    after = jnp.where(u == 0.0, 0.0, w + stage.ahead * (u - w))
+    next_velocity = jnp.where(u == 0.0, 0.0, w + stage.ahead * (u - w))
     if integral is not None:
         integral = integral + stage.share * h * x.rate * (x.error - GAMMA * h * u)
-    return State(q + stage.share * h * u, after, integral)
+    return State(q + stage.share * h * u, next_velocity, integral)
 
 
 def balanced_integral(theta: Array, motion: ServoMotion, hold: AnyArray) -> Array:
@@ -268,16 +289,20 @@ def with_integral(motion: ServoMotion, theta: AnyArray, hold: bool) -> ServoMoti
         theta: Parameters of each joint.
         hold: Whether commands are held until the next one.
     """
-    plain = motion.replace(
+    plain_motion = motion.replace(
         start=np.asarray(motion.start)[:, :2], spread=np.asarray(motion.spread)[:, :2]
     )
     with double_precision():
-        found = jax.vmap(balanced_integral, (None, 0, None))(
-            jnp.asarray(theta), plain.replace(lengths=(), names=()), np.array(hold)
+        integrals = jax.vmap(balanced_integral, (None, 0, None))(
+            jnp.asarray(theta),
+            plain_motion.replace(lengths=(), names=()),
+            np.array(hold),
         )
-    start = np.concatenate([plain.start, np.asarray(found)[:, None]], axis=1)
-    own = np.where(np.asarray(theta)[:, INDEX["ki"]] > 0.0, 1.0, 1e-6)
-    spread = np.concatenate([plain.spread, 0.0 * start[:, 2:] + own], axis=1)
+    start = np.concatenate([plain_motion.start, np.asarray(integrals)[:, None]], axis=1)
+    integral_spread = np.where(np.asarray(theta)[:, INDEX["ki"]] > 0.0, 1.0, 1e-6)
+    spread = np.concatenate(
+        [plain_motion.spread, 0.0 * start[:, 2:] + integral_spread], axis=1
+    )
     return motion.replace(start=start, spread=spread)
 
 
@@ -330,40 +355,44 @@ def partials(
         others: Torques by the accelerations of other joints [stages, joints] [N m or
             N].
     """
-    every, w = theta.T[:, None], state.w
-    x = Forces.of(state, every, stages, h)
-    _, _, _, b, a, _, mu, Fs, vs, _, g, _ = every
+    parameters = theta.T[:, None]
+    w = state.w
+    x = Forces.of(state, parameters, stages, h)
+    _, _, _, b, a, _, mu, Fs, vs, _, g, _ = parameters
     slip = x.slip(w, stages, x.force + a * others)
-    by_inertia, by_damping = slip.by_inertia - u, slip.by_resistance - u
+    by_inertia = slip.by_inertia - u
+    by_damping = slip.by_resistance - u
     by_friction = slip.by_friction
     by_integral = slip.by_force * x.inside
     by_servo = by_integral * x.gain
     by_command = {"d": by_delay, "b": jnp.ones_like(u), "g": (stages.commands - b) / g}
-    falling = 2.0 * Fs * x.falling * w / vs**2
+    stribeck_slope = 2.0 * Fs * x.falling * w / vs**2
     by_load = mu * by_friction * jnp.sign(stages.load) - slip.by_force
-    of_bodies = slip.by_force * others + by_load * stages.load
+    by_compliance = slip.by_force * others + by_load * stages.load
     derivatives = {
         "J": by_inertia / (GAMMA * h),
         "B": by_damping,
         **{key: by_servo * value for key, value in by_command.items()},
-        "a": of_bodies + by_inertia * stages.inertia / (GAMMA * h),
+        "a": by_compliance + by_inertia * stages.inertia / (GAMMA * h),
         "F": by_friction,
         "mu": by_friction * jnp.abs(a * stages.load),
         "Fs": by_friction * x.falling,
-        "vs": by_friction * falling * w / vs,
+        "vs": by_friction * stribeck_slope * w / vs,
         "um": slip.by_force * (1.0 - x.inside) * jnp.sign(x.force + a * stages.load),
         "ki": x.inside * GAMMA * h * (slip.by_force * x.error + GAMMA * h * by_damping),
     }
     by_theta = tuple(derivatives[x] for x in INDEX)
-    by_w = slip.by_w - by_friction * falling
+    by_w = slip.by_w - by_friction * stribeck_slope
     terms = slip.by_force, by_inertia, a * by_load
-    found = Partials(-by_servo, by_w, by_theta, *terms, x.resistance)
+    balance = Partials(-by_servo, by_w, by_theta, *terms, x.resistance)
     if state.integral is None:
-        return found
-    growing = {key: x.rate * value for key, value in by_command.items()}
-    growing["ki"] = x.error - GAMMA * h * u
-    growth = tuple(growing.get(key, jnp.zeros_like(u)) for key in INDEX)
-    return found._replace(by_integral=by_integral, rate=x.rate + 0.0 * u, growth=growth)
+        return balance
+    growth_terms = {key: x.rate * value for key, value in by_command.items()}
+    growth_terms["ki"] = x.error - GAMMA * h * u
+    growth = tuple(growth_terms.get(key, jnp.zeros_like(u)) for key in INDEX)
+    return balance._replace(
+        by_integral=by_integral, rate=x.rate + 0.0 * u, growth=growth
+    )
 
 
 def steps_of(motion: ServoMotion, time_step: float, least: int = 1) -> int:

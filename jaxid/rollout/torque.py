@@ -27,7 +27,7 @@ from jaxid.measurement.observations import Observations
 from jaxid.program.xla import lower
 from jaxid.result_table import Column, Summarised, Table, with_deviations
 
-from .torque_windows import MARGIN, SLIDING, Windows
+from .torque_windows import MARGIN, SLIDING_SPEED, Windows
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,7 +71,9 @@ class TorqueRollout:
         margin = round(MARGIN / self.sample_time)
         steps = jnp.arange(len(forces) - 2.0 * margin)
         samples = margin + steps - delay / self.sample_time
-        delayed_forces = _between(forces, jnp.clip(samples, 0.0, len(forces) - 1.001))
+        delayed_forces = _interpolate(
+            forces, jnp.clip(samples, 0.0, len(forces) - 1.001)
+        )
         return self._positions(x, windows, delayed_forces) - windows.measured
 
     def _parts(self, x: Array) -> list[Array]:
@@ -90,10 +92,10 @@ class TorqueRollout:
 
         def rate(state, measured_forces):
             q, qd = state
-            driving = gains[:, None] * measured_forces
+            driving_torques = gains[:, None] * measured_forces
             # Gear friction grows with the torque that it carries.
-            friction = load_friction[:, None] * jnp.abs(driving)
-            forces = driving - friction * jnp.tanh(qd / SLIDING)
+            friction = load_friction[:, None] * jnp.abs(driving_torques)
+            forces = driving_torques - friction * jnp.tanh(qd / SLIDING_SPEED)
             return qd, jnp.stack(acceleration(p, q, qd, forces))
 
         def advance(state, rate, time):
@@ -126,11 +128,12 @@ class TorqueRollout:
         )
 
 
-def _between(series: Array, at: Array) -> Array:
+def _interpolate(series: Array, instants: Array) -> Array:
     """Return a series at fractions of its samples along the first axis."""
-    whole = jnp.floor(at)
-    k, part = whole.astype(int), (at - whole).reshape(-1, *[1] * (series.ndim - 1))
-    return series[k] + part * (series[k + 1] - series[k])
+    floors = jnp.floor(instants)
+    k = floors.astype(int)
+    fractions = (instants - floors).reshape(-1, *[1] * (series.ndim - 1))
+    return series[k] + fractions * (series[k + 1] - series[k])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -202,15 +205,23 @@ class TorqueRolloutFit(Summarised):
         windows = Windows.of([log], self.horizon, self.horizon)
         with double_precision():
             errors = jax.jit(self.rollout.errors)(jnp.asarray(self.unknowns), windows)
-        start, gap = windows.q[None], np.full((1, *windows.q.shape), np.nan)
-        measured = np.concatenate([start, windows.measured, windows.measured[-1:]])
-        simulated = np.concatenate([start, windows.measured + np.asarray(errors), gap])
-        steps = np.minimum(np.arange(len(measured)), len(measured) - 2)
-        time = log.time[windows.starts + steps[:, None]].T.ravel()
-        measured, simulated = (
-            x.transpose(2, 0, 1).reshape(len(time), -1) for x in (measured, simulated)
+        start = windows.q[None]
+        gap = np.full((1, *windows.q.shape), np.nan)
+        measured_positions = np.concatenate(
+            [start, windows.measured, windows.measured[-1:]]
         )
-        return time, measured, simulated
+        simulated_positions = np.concatenate(
+            [start, windows.measured + np.asarray(errors), gap]
+        )
+        steps = np.minimum(
+            np.arange(len(measured_positions)), len(measured_positions) - 2
+        )
+        time = log.time[windows.starts + steps[:, None]].T.ravel()
+        measured_positions, simulated_positions = (
+            x.transpose(2, 0, 1).reshape(len(time), -1)
+            for x in (measured_positions, simulated_positions)
+        )
+        return time, measured_positions, simulated_positions
 
     def summary(self) -> Table:
         """Return a table of the estimates with 95 % intervals."""
@@ -220,10 +231,10 @@ class TorqueRolloutFit(Summarised):
             if free
         ]
         deviations = self.uncertainty.standard_deviations
-        values, shown = with_deviations(self.unknowns[self.free], deviations)
-        half = self.uncertainty.half_widths()
+        values, deviation_texts = with_deviations(self.unknowns[self.free], deviations)
+        half_widths = self.uncertainty.half_widths()
         ends = [
-            with_deviations(self.unknowns[self.free] + s * half, deviations)[0]
+            with_deviations(self.unknowns[self.free] + s * half_widths, deviations)[0]
             for s in (-1, 1)
         ]
         errors = "  ".join(f"{1e3 * x:.3g}" for x in self.rms)
@@ -231,7 +242,7 @@ class TorqueRolloutFit(Summarised):
             "open-loop rollouts",
             Column("parameter", names),
             Column("estimate", values, kind="number"),
-            Column("±", shown, kind="number"),
+            Column("±", deviation_texts, kind="number"),
             Column("95 %\nfrom", ends[0], kind="number"),
             Column("95 %\nto", ends[1], kind="number"),
             facts=[(f"errors within {self.horizon:g} s", f"{errors} mrad or mm RMS")],
@@ -274,10 +285,10 @@ def identify_torque_rollout(
     joints = base.model.robot.joints
     torque_fit = np.asarray(identify(base, logs).parameters)
     start = rollout.start(torque_fit)
-    is_free = np.repeat([True, gains, load_friction], [base.size + 1, joints, joints])
+    free_mask = np.repeat([True, gains, load_friction], [base.size + 1, joints, joints])
     # All torques, masses and friction can be scaled together: the first gain is 1.
-    is_free[base.size + 1] = False
-    free_unknowns = np.flatnonzero(is_free)
+    free_mask[base.size + 1] = False
+    free_unknowns = np.flatnonzero(free_mask)
 
     def residuals(values, windows):
         unknowns = jnp.asarray(start).at[free_unknowns].set(values)
@@ -287,15 +298,15 @@ def identify_torque_rollout(
     with double_precision():
         minimum = minimise_squares(
             residuals,
-            start[is_free],
-            lower[is_free],
-            upper[is_free],
+            start[free_mask],
+            lower[free_mask],
+            upper[free_mask],
             args=windows,
             rtol=1e-5,
             max_steps=50,
         )
     unknowns = start.copy()
-    unknowns[is_free] = minimum.x
+    unknowns[free_mask] = minimum.x
     errors = np.asarray(minimum.residuals).reshape(-1, joints, windows.q.shape[1])
     rms = np.sqrt(np.mean(errors**2, axis=(0, 2)))
     if not np.isfinite(rms).all():
@@ -307,7 +318,7 @@ def identify_torque_rollout(
     jacobian = np.asarray(minimum.jacobian)
     uncertainty = _uncertainty(errors.ravel(), jacobian, blocks)
     return TorqueRolloutFit(
-        rollout, unknowns, is_free, uncertainty, horizon, rms, torque_fit
+        rollout, unknowns, free_mask, uncertainty, horizon, rms, torque_fit
     )
 
 

@@ -11,7 +11,7 @@ from jaxid.measurement.observations import Observations
 
 MARGIN = 0.05
 """Time before and behind a window for which its torques are known, for delays [s]."""
-SLIDING = 0.05
+SLIDING_SPEED = 0.05
 """Speed at which friction by torque has about its full size [rad/s or m/s]."""
 BLOCKS = 40
 """Contiguous parts of the logs whose scatter gives the uncertainty."""
@@ -46,8 +46,10 @@ class Windows(NamedTuple):
         dt = logs[0].sample_time
         if any(abs(o.sample_time - dt) > 0.01 * dt for o in logs):
             raise InputError("`observations` must have one sample time.")
-        steps, margin = max(1, round(horizon / dt)), round(MARGIN / dt)
-        parts, count = [], 0
+        steps = max(1, round(horizon / dt))
+        margin = round(MARGIN / dt)
+        parts = []
+        count = 0
         for o in logs:
             q, qd, forces = (np.asarray(x) for x in (o.motion.q, o.motion.qd, o.forces))
             edge = o.filter.edge(dt) + margin
@@ -70,7 +72,9 @@ class Windows(NamedTuple):
             raise InputError(
                 f"`observations` hold no window of {horizon:g} s: shorten `horizon`."
             )
-        q0, qd0, u, measured, place = (
+        q0, qd0, u, measured_positions, place = (
             np.stack(x, axis=-1) for x in zip(*parts, strict=True)
         )
-        return cls(q0, qd0, u, measured, place, place * BLOCKS // max(count, 1))
+        return cls(
+            q0, qd0, u, measured_positions, place, place * BLOCKS // max(count, 1)
+        )

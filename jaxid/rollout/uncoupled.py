@@ -16,15 +16,15 @@ from .servo import (
     Forces,
     Stages,
     State,
+    advance_state,
     balanced_integral,
-    moved,
     partials,
     steps_of,
 )
 
-BLOCK = 250
+BLOCK_SIZE = 250
 """Samples whose derivatives are found at once."""
-TOGETHER = 4
+BATCH_SIZE = 4
 """Candidates that are simulated at once."""
 
 
@@ -34,7 +34,7 @@ def _stage(
     """Return the state behind a stage, and the velocity in it."""
     x = Forces.of(state, theta, stage, h)
     u = x.velocity(state.w, stage)
-    return moved(state, u, x, stage, h), u
+    return advance_state(state, u, x, stage, h), u
 
 
 def _start(theta: Array, motion: ServoMotion, hold: AnyArray) -> State:
@@ -60,13 +60,13 @@ def _path(
     """
     h = motion.sample_time / steps
 
-    def one(state: State, stage: Stages):
+    def simulate_stage(state: State, stage: Stages):
         state, _ = _stage(state, theta.T, stage, h)
         return state, state.q
 
     start = _start(theta, motion, hold)
     stages, _ = Stages.of(theta, motion, steps, hold)
-    _, path = jax.lax.scan(one, start, stages)
+    _, path = jax.lax.scan(simulate_stage, start, stages)
     return (jnp.concatenate([start.q[None], path[2 * steps - 1 :: 2 * steps]]).T,)
 
 
@@ -80,71 +80,91 @@ def _moments(
     derivatives of all stages are found at once; only their linear recursion runs in
     time.
     """
-    h, n, P = motion.sample_time / steps, len(theta), len(PARAMETERS)
+    h = motion.sample_time / steps
+    n = len(theta)
+    P = len(PARAMETERS)
 
     def forward(state: State, stage: Stages):
-        after, u = _stage(state, theta.T, stage, h)
-        return after, (state, u)
+        next_state, u = _stage(state, theta.T, stage, h)
+        return next_state, (state, u)
 
     def tangent(state: State, inputs: tuple[Array, ...]):
         q, w, integral = state
-        for by_q, by_w, share, ahead, runs, own, *more in zip(*inputs, strict=True):
-            u = by_q * q + by_w * w + own
+        for (
+            by_q,
+            by_w,
+            share,
+            factor,
+            mask,
+            source,
+            *terms,
+        ) in zip(*inputs, strict=True):
+            u = by_q * q + by_w * w + source
             if integral is not None:
-                by_integral, rate, growth = more
+                by_integral, rate, growth = terms
                 u = u + by_integral * integral
                 integral = integral + share * h * (growth - rate * (q + GAMMA * h * u))
-            q, w = q + share * h * u, runs * (w + ahead * (u - w))
+            q = q + share * h * u
+            w = mask * (w + factor * (u - w))
         return State(q, w, integral), q
 
     def block(state, inputs):
         state, tangents, *sums = state
-        stages, by_delay, measured, counted = inputs
-        state, (before, u) = jax.lax.scan(forward, state, stages)
-        found = partials(before, u, theta, stages, by_delay, h, jnp.zeros_like(u))
-        runs = jnp.where(u == 0.0, 0.0, 1.0)
-        factor = runs / found.resistance
+        stages, by_delay, positions, sample_mask = inputs
+        state, (states, u) = jax.lax.scan(forward, state, stages)
+        balance = partials(states, u, theta, stages, by_delay, h, jnp.zeros_like(u))
+        motion_mask = jnp.where(u == 0.0, 0.0, 1.0)
+        factor = motion_mask / balance.resistance
         # One long last axis: `jnp.stack` takes twenty times as long.
-        by_theta = jnp.concatenate([factor * x for x in found.by_theta], axis=-1)
+        by_theta = jnp.concatenate([factor * x for x in balance.by_theta], axis=-1)
         rows = (
-            factor * found.by_q,
-            factor * found.by_w,
+            factor * balance.by_q,
+            factor * balance.by_w,
             stages.share,
             stages.ahead,
-            runs,
+            motion_mask,
             by_theta,
         )
-        if before.integral is not None:
-            growth = jnp.concatenate(found.growth, axis=-1)
-            rows = *rows, factor * found.by_integral, found.rate, growth
-        rows = tuple(x.reshape(BLOCK, 2 * steps, -1, min(n, x.shape[-1])) for x in rows)
+        if states.integral is not None:
+            growth = jnp.concatenate(balance.growth, axis=-1)
+            rows = *rows, factor * balance.by_integral, balance.rate, growth
+        rows = tuple(
+            x.reshape(BLOCK_SIZE, 2 * steps, -1, min(n, x.shape[-1])) for x in rows
+        )
         tangents, S = jax.lax.scan(tangent, tangents, rows)
-        path = jnp.concatenate([before.q[2 * steps :: 2 * steps], state.q[None]])
-        r, S = (path - measured) * counted, S * counted[:, None]
-        own = (
+        path = jnp.concatenate([states.q[2 * steps :: 2 * steps], state.q[None]])
+        r = (path - positions) * sample_mask
+        S = S * sample_mask[:, None]
+        block_sums = (
             jnp.sum(r**2, axis=0),
             jnp.einsum("tpj,tj->jp", S, r),
             jnp.einsum("tpj,tqj->jpq", S, S),
         )
-        return (state, tangents, *(x + y for x, y in zip(sums, own, strict=True))), None
+        return (
+            state,
+            tangents,
+            *(x + y for x, y in zip(sums, block_sums, strict=True)),
+        ), None
 
     def blocks(x: Array, size: int, mode: str = "edge") -> Array:
-        padded = jnp.pad(x, ((0, -len(x) % size), (0, 0)), mode)
-        return padded.reshape(-1, size, x.shape[-1])
+        padded_rows = jnp.pad(x, ((0, -len(x) % size), (0, 0)), mode)
+        return padded_rows.reshape(-1, size, x.shape[-1])
 
     stages, by_delay = Stages.of(theta, motion, steps, hold)
-    stages = jax.tree.map(lambda x: blocks(x, 2 * steps * BLOCK), (stages, by_delay))
-    measured = blocks(jnp.asarray(motion.positions).T[1:], BLOCK)
-    counted = blocks(jnp.asarray(motion.counted).T[1:], BLOCK, "constant")
+    stages = jax.tree.map(
+        lambda x: blocks(x, 2 * steps * BLOCK_SIZE), (stages, by_delay)
+    )
+    positions = blocks(jnp.asarray(motion.positions).T[1:], BLOCK_SIZE)
+    sample_mask = blocks(jnp.asarray(motion.counted).T[1:], BLOCK_SIZE, "constant")
     sums = jnp.zeros(n), jnp.zeros((n, P)), jnp.zeros((n, P, P))
 
-    def by_parameter(one: Array) -> State:
-        change = jnp.broadcast_to(one, theta.shape)
+    def by_parameter(unit_vector: Array) -> State:
+        change = jnp.broadcast_to(unit_vector, theta.shape)
         return jax.jvp(lambda x: _start(x, motion, hold), (theta,), (change,))[1]
 
     tangents = jax.vmap(by_parameter)(jnp.eye(P))
     start = _start(theta, motion, hold), tangents, *sums
-    return jax.lax.scan(block, start, (*stages, measured, counted))[0][2:]
+    return jax.lax.scan(block, start, (*stages, positions, sample_mask))[0][2:]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -181,40 +201,44 @@ class ServoSimulator:
         theta = np.asarray(theta)
         count, joints, _ = theta.shape[-3:]
 
-        def one(place: tuple[int, int]):
-            k, first = place
-            own = theta[k] if each else theta
+        def simulate_batch(place: tuple[int, int]):
+            k, first_candidate = place
+            motion_parameters = theta[k] if each else theta
             # Always as many at once, so that nothing is compiled anew.
-            chosen = np.minimum(np.arange(first, first + TOGETHER), count - 1)
+            candidates = np.minimum(
+                np.arange(first_candidate, first_candidate + BATCH_SIZE), count - 1
+            )
             part = self.motion.part(k)
             copies = {
-                key: np.tile(np.asarray(getattr(part, key)), (TOGETHER, 1))
+                key: np.tile(np.asarray(getattr(part, key)), (BATCH_SIZE, 1))
                 for key in ("commands", "positions", "load", "inertia", "counted")
             }
             copies |= {
-                key: np.tile(np.asarray(getattr(part, key)), TOGETHER)
+                key: np.tile(np.asarray(getattr(part, key)), BATCH_SIZE)
                 for key in ("start", "spread", "acceleration")
             }
             part = dataclasses.replace(part, **copies, lengths=(), names=())
             with double_precision():
-                rows = jnp.asarray(own[chosen].reshape(TOGETHER * joints, -1))
-                found = function(rows, part, self.steps, np.array(self.hold))
-            used = min(TOGETHER, count - first)
-            shaped = (
-                np.asarray(x).reshape(TOGETHER, joints, *x.shape[1:]) for x in found
+                rows = jnp.asarray(
+                    motion_parameters[candidates].reshape(BATCH_SIZE * joints, -1)
+                )
+                outputs = function(rows, part, self.steps, np.array(self.hold))
+            candidate_count = min(BATCH_SIZE, count - first_candidate)
+            batch_outputs = (
+                np.asarray(x).reshape(BATCH_SIZE, joints, *x.shape[1:]) for x in outputs
             )
-            return reduce(k, *(x[:used] for x in shaped))
+            return reduce(k, *(x[:candidate_count] for x in batch_outputs))
 
         places = [
             (k, c)
             for k in range(self.motion.motions)
-            for c in range(0, count, TOGETHER)
+            for c in range(0, count, BATCH_SIZE)
         ]
         # The first call compiles, and the others wait for it.
-        results = [one(places[0]), *on_cores(one, places[1:])]
-        joined = (np.concatenate(x) for x in zip(*results, strict=True))
+        results = [simulate_batch(places[0]), *on_cores(simulate_batch, places[1:])]
+        joined_results = (np.concatenate(x) for x in zip(*results, strict=True))
         return tuple(
-            x.reshape(self.motion.motions, count, *x.shape[1:]) for x in joined
+            x.reshape(self.motion.motions, count, *x.shape[1:]) for x in joined_results
         )
 
     def paths(
@@ -242,4 +266,4 @@ class ServoSimulator:
 
         The last two are derivatives of half the cost.
         """
-        return self._map(_moments, lambda _, *found: found, theta)
+        return self._map(_moments, lambda _, *moments: moments, theta)
