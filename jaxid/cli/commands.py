@@ -185,11 +185,11 @@ class _BestMotion:
         if not self._is_written:
             return "stopped before a motion kept all limits, and nothing was written"
         faults = self._task.faults
-        unchecked = f"; NOT CHECKED: {'; '.join(faults)}" if faults else ""
+        note = f"; NOT CHECKED: {'; '.join(faults)}" if faults else ""
         return (
             f"stopped: `{self._output}` and the files beside it hold "
             "the best motion so far, which keeps all limits that "
-            f"were checked{unchecked}; `--resume` goes on with it"
+            f"were checked{note}; `--resume` goes on with it"
         )
 
 
@@ -263,9 +263,9 @@ def compare(
 ) -> None:
     """Decide which parameters have changed between two runs."""
     cold, warm = (dataclasses.replace(read_fit(p), name=str(p)) for p in paths)
-    found = compare_fits(cold, warm, level)
-    files = write_comparison(output, found, paths)
-    show(console, found.summary(), found.group_summary())
+    comparison = compare_fits(cold, warm, level)
+    files = write_comparison(output, comparison, paths)
+    show(console, comparison.summary(), comparison.group_summary())
     show_files(console, output, [p.name for p in files])
 
 

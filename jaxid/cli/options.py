@@ -147,18 +147,20 @@ def refuse_foreign_table(target: Path) -> None:
 
     if target.suffix.lower() != ".csv":
         raise InputError(f"`{target}` must end in .csv: choose another -o.")
-    beside, pictures = target.with_suffix(".json"), target.with_suffix("")
+    motion_file = target.with_suffix(".json")
+    figure_folder = target.with_suffix("")
     try:
-        load_trajectory(beside)
+        load_trajectory(motion_file)
     except (OSError, ValueError):
-        others = (target.with_suffix(suffix) for suffix in BESIDE)
-        drawn = sorted(pictures.iterdir()) if pictures.is_dir() else []
-        foreign = next(
-            (path for path in (target, beside, *others, *drawn) if path.exists()), None
-        )
-        if foreign is not None:
+        # Without an earlier motion nothing may be there that would be overwritten.
+        paths = [target, motion_file]
+        paths += [target.with_suffix(suffix) for suffix in BESIDE]
+        if figure_folder.is_dir():
+            paths += sorted(figure_folder.iterdir())
+        foreign_files = [path for path in paths if path.exists()]
+        if foreign_files:
             raise InputError(
-                f"`{foreign}` is there already, "
+                f"`{foreign_files[0]}` is there already, "
                 "and no motion of `jaxid excite`: choose another -o."
             ) from None
         require_writable(target.parent)

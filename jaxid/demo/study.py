@@ -94,9 +94,9 @@ class Study(NamedTuple):
         errors = model.validation.errors[recording]
         # The observations of the warm robot lie between the two recordings.
         speeds = np.abs(self.observations[2 * recording].reduced_motion.qd)
-        moving = speeds > AT_REST
-        sums = np.where(moving, np.abs(errors.errors), 0.0).sum(axis=0)
-        mean = sums / np.maximum(moving.sum(axis=0), 1)
+        moves = speeds > AT_REST
+        sums = np.where(moves, np.abs(errors.errors), 0.0).sum(axis=0)
+        mean = sums / np.maximum(moves.sum(axis=0), 1)
         return [float(x) for x in 100.0 * mean / np.asarray(errors.max_forces)]
 
     @property

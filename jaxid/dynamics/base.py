@@ -124,7 +124,11 @@ class BaseParameters(Summarised, Hashable):
         return self.model.inertia(self.to_standard(p), q)
 
     def derived_program(self, name: str, *shapes: Shape) -> Program | None:
-        """Return the program of `columns`, made from the model's; else None."""
+        """Return the program of the method `columns`; None for any other method.
+
+        The base regressor is some columns of the full one: the model's program, which
+        is traced once, is used again without the outputs of the other columns.
+        """
         if name != "columns":
             return None
         program = program_of(self.model, self.model.columns, *shapes)

@@ -112,14 +112,15 @@ def gram(
     owner: eqx.Module, definition: Callable, weights: AnyArray | None, *arrays: AnyArray
 ) -> Float[Array, "columns columns"]:
     """Return the Gram matrix of a model's columns over a motion; see `Model.gram`."""
-    joints = _require_rows(owner, arrays[0])
+    joints = _check_positions(owner, arrays[0])
     weights = np.ones(joints) if weights is None else as_array("weights", weights)
     regressor = JointRegressor(owner, definition, *((joints,) for _ in arrays))
     run = regressor.gram if is_traced(arrays, weights) else _compiled_gram(regressor)
     return run(jnp.asarray(weights, arrays[0].dtype), *arrays)
 
 
-def _require_rows(owner: eqx.Module, q: AnyArray) -> int:
+def _check_positions(owner: eqx.Module, q: AnyArray) -> int:
+    """Require many samples and a robot of known geometry; return the joints' number."""
     if q.ndim != 2:
         raise InputError(
             f"`motion` must have the shape [samples, joints], but has {q.shape}."
@@ -151,7 +152,7 @@ class PackedRegressor(eqx.Module):
     columns: int = eqx.field(static=True)
 
     def __init__(self, owner: eqx.Module, definition: Callable, *samples: AnyArray):
-        _require_rows(owner, samples[0])
+        _check_positions(owner, samples[0])
         arrays = [x.T for x in samples]
         program = program_of(owner, definition, *(x.shape[:1] for x in arrays))
         self.places = _places(program)

@@ -155,14 +155,15 @@ def shrink_to_constraints(problem: ExcitationProblem, x: ScaledMotion) -> Candid
         return problem.excess(grid.shrink(x, factor)) <= 0.0
 
     factors = np.arange(1.0 - SHRINKAGE_STEP, 0.0, -SHRINKAGE_STEP)
-    low = next((factor for factor in factors if is_kept(factor)), None)
-    if low is None:
+    factor = next((factor for factor in factors if is_kept(factor)), None)
+    if factor is None:
         return evaluate(problem, x[None])
-    high = low + SHRINKAGE_STEP
+    # Bisection: the largest factor lies between the one found and the step above it.
+    upper_bound = factor + SHRINKAGE_STEP
     for _ in range(6):
-        middle = 0.5 * (low + high)
+        middle = 0.5 * (factor + upper_bound)
         if is_kept(middle):
-            low = middle
+            factor = middle
         else:
-            high = middle
-    return evaluate(problem, grid.shrink(x, low)[None])
+            upper_bound = middle
+    return evaluate(problem, grid.shrink(x, factor)[None])

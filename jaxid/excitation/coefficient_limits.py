@@ -80,15 +80,20 @@ class Grid(NamedTuple):
     def fill(
         self, y: ScaledMotion, places: Float[AnyArray, " joints"], size: float
     ) -> np.ndarray:
-        """Return a motion of the same shape, of a size relative to 95 % of limits.
+        """Return a motion of the same shape that fills a fraction of all limits.
 
-        `places` are those of the joints in the range that is left, from 0 to 1.
+        Args:
+            y: Motion whose shape is kept.
+            places: Where each joint moves within its range: 0 at the lower, 1 at the
+                upper end.
+            size: Size of the motion; at 1 each joint uses 95 % of a limit.
         """
         bound = FILLED_FRACTION * self.bound
         positions, use = self._measure(y)
         factors = size * bound / use
         low, high = self._shift_range(positions, factors, bound)
-        return self._move(y, factors, low + (high - low) * np.asarray(places))
+        shifts = low + (high - low) * np.asarray(places)
+        return self._move(y, factors, shifts)
 
     def _measure(self, y: ScaledMotion) -> Extent:
         """Return the positions, and the largest use of a limit by each joint."""

@@ -226,7 +226,16 @@ def _take_step(
     evaluation: Evaluation,
     room: Inequalities,
 ) -> Iterate:
-    """Return one start after its step was taken."""
+    """Return the iterate at the end of its step, with new multipliers and curvature.
+
+    Args:
+        stage: Run of the method.
+        iterate: Iterate before the step; `trial` is its point at the end of the step.
+        slack: Slack at that point.
+        evaluation: Objective and constraints at that point.
+        room: Distance of each inequality from its bound at that point.
+    """
+    # After a short step the point is still far from the best one for this barrier.
     cooling = COOLING if iterate.length > MIN_GOOD_LENGTH else 1.0
     barrier = max(stage.min_barrier, iterate.barrier * cooling)
     duals = iterate.duals + iterate.dual_length * iterate.dual_step
@@ -234,10 +243,11 @@ def _take_step(
 
     # Curvature is that of the Lagrangian: of the value and of constraints that bend.
     constraint_duals = _split(duals, evaluation).constraints
-    change = evaluation.gradient - iterate.evaluation.gradient
-    bending = evaluation.slopes - iterate.evaluation.slopes
-    change = change + constraint_duals @ bending
-    curvature = _damped_bfgs(iterate.curvature, iterate.trial - iterate.y, change)
+    objective_change = evaluation.gradient - iterate.evaluation.gradient
+    slope_changes = evaluation.slopes - iterate.evaluation.slopes
+    gradient_change = objective_change + constraint_duals @ slope_changes
+    step = iterate.trial - iterate.y
+    curvature = _damped_bfgs(iterate.curvature, step, gradient_change)
     return iterate._replace(
         y=iterate.trial,
         slack=slack,

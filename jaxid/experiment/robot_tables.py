@@ -274,7 +274,7 @@ def replace_limits(
     Raises:
         InputError: If a list has another length, or a limit is not plausible.
     """
-    given = {
+    arguments = {
         "position_min": position_min,
         "position_max": position_max,
         "velocity": velocity,
@@ -282,8 +282,9 @@ def replace_limits(
         "jerk": jerk,
         "force": force,
     }
-    limits, assumed = {}, robot.limits.assumed
-    for name, numbers in given.items():
+    limits = {}
+    assumed = robot.limits.assumed
+    for name, numbers in arguments.items():
         values = per_joint(name, numbers, robot.joints, np.nan)
         if name != "force":
             values = values * _angle_scale(robot, angle_unit)

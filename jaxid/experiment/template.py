@@ -55,7 +55,10 @@ SUMMARIES = {
     "a list of names, or positions from 0.",
 }
 """Descriptions of tables where the docstring of their function says something else."""
-INNER = {"robot": ("robot.tool", known_load), "model": ("model.coulomb", DryFriction)}
+INNER_TABLES = {
+    "robot": ("robot.tool", known_load),
+    "model": ("model.coulomb", DryFriction),
+}
 """Tables within others, and their functions."""
 LIMITS = (
     "position_min",
@@ -101,8 +104,8 @@ def write_template(
     for name, functions in TABLES.items():
         table = _table(name, functions, robot.joints, values.get(name, {}))
         sections.append(_joints(robot) + table if name == "limits" else table)
-        if name in INNER:
-            inner_name, function = INNER[name]
+        if name in INNER_TABLES:
+            inner_name, function = INNER_TABLES[name]
             sections.append(_table(inner_name, (function,), robot.joints, {}))
     return "\n".join(sections)
 

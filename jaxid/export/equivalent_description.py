@@ -83,7 +83,10 @@ class Description:
         return dataclasses.replace(self, bodies=bodies)
 
     def slide(self, body: int, distance: float) -> "Description":
-        """Move the origin of a frame along its joint's axis."""
+        """Move the origin of a frame along its joint's axis by a distance [m].
+
+        The bodies beyond stay where they are, and so does the matter of the body.
+        """
         robot = self.robot
         shift = np.asarray(robot.axis[body]) * distance
         offset = np.array(robot.offset)

@@ -108,12 +108,13 @@ def choose_model(
     Parts of time are left out in turn, or whole logs if there are at least four. Each
     candidate is fitted to the rest and predicts the part. Of all candidates whose mean
     squared error exceeds the smallest one by at most one standard deviation of the
-    difference, the one with the fewest parameters is chosen (Breiman et al., 1984). Of
-    equally many parameters one whose friction has memory is preferred by the same rule:
-    no other says which force a joint at rest keeps, even where no part holds rest. The
-    promise comes from a second loop around this choice, so that choosing does not make
-    it too small. Lengths of presliding are those of the candidates: find them before,
-    with `identify_presliding`.
+    difference, the one with the fewest parameters is chosen (Breiman et al., 1984).
+    Among models with equally many parameters the same rule prefers friction with
+    memory, because only such a model predicts the force of a joint at rest.
+
+    The promised error comes from a second loop around this choice: otherwise it would
+    be too small, since the choice has seen the errors. Presliding lengths are not
+    fitted: find them before, with `identify_presliding`.
 
     Args:
         candidates: Models of one robot, and their estimators.
@@ -135,17 +136,19 @@ def choose_model(
     problem = RegressionProblem(first.base, blocks=Blocks(parts))
     weights = np.asarray(first.estimator(problem).weights)
     joint_weights = weights**2
-    forces = float(np.mean([joint_weights @ part.force_squares for part in parts]))
+    force_squares = [joint_weights @ part.force_squares for part in parts]
+    mean_force_square = float(np.mean(force_squares))
     tables = []
     for number, candidate in enumerate(candidates):
         if candidate is not first:
             parts = _parts(candidate.base, logs, by_log)
-        tables.append(_held_out_squares(candidate, parts, joint_weights) / forces)
+        part_squares = _held_out_squares(candidate, parts, joint_weights)
+        tables.append(part_squares / mean_force_square)
         if progress is not None:
             progress((number + 1) / len(candidates))
     table = np.array(tables)
 
-    # On the diagonal one part alone is left out.
+    # On the diagonal of its table a fit leaves out one part, and predicts it.
     count = len(parts)
     squares = np.diagonal(table, axis1=1, axis2=2)
     best = _simplest(squares, candidates)

@@ -86,7 +86,7 @@ class RegressionProblem:
         self._require_samples()
         parts = []
         for number, recording in enumerate(self.recordings):
-            # For a long recording it pays to compile the pass.
+            # Compiling the pass pays for long recordings with short filters.
             if recording.samples >= self.compiled_samples and suits(recording):
                 report = functools.partial(self._report, number)
                 edges = self._edges[number]

@@ -152,6 +152,7 @@ class Columns(eqx.Module):
             if self.velocity_unit is not None:
                 velocity_scale = signs * factors("velocity_unit")
             velocities = velocities * velocity_scale
+        # A log of currents has torque constants, which are one otherwise.
         gains = factors("force_unit") * values("force_signs") * values("force_gains")
         force_scale = gains * values("torque_constants")
         offsets = values("angle_offsets", 0.0)

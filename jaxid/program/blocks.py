@@ -43,8 +43,12 @@ def block_results(program: Program, *arrays: Array) -> tuple[Array, ...]:
 
     # Results of a branch are stored: what uses them does not compute them again.
     reference = arrays[-1][0, 0]
-    nothing = tuple(jnp.broadcast_to(reference, (size,)) for _ in program.distinct[0])
-    return jax.lax.cond(hidden_one(reference) > 0, evaluate, lambda _: nothing, arrays)
+    dummy_results = tuple(
+        jnp.broadcast_to(reference, (size,)) for _ in program.distinct[0]
+    )
+    return jax.lax.cond(
+        hidden_one(reference) > 0, evaluate, lambda _: dummy_results, arrays
+    )
 
 
 def results_at_once(program: Program, *arrays: Array) -> tuple[Array, ...]:

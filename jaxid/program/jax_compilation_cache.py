@@ -12,6 +12,8 @@ from jaxid.errors import InputError
 
 VARIABLE = "JAXID_CACHE_DIR"
 """Environment variable that names the folder of the cache, or turns the cache off."""
+WORDS_FOR_OFF = ("", "0", "off", "none")
+"""Values of the variable that turn the cache off."""
 MAX_BYTES = 2**28
 """Maximum size of the cache [bytes]: some hundreds of functions."""
 
@@ -36,22 +38,17 @@ def enable_compilation_cache(folder: str | Path | None = None) -> Path | None:
     Raises:
         InputError: If the folder belongs to somebody else, or others can write to it.
     """
-    present = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
-    if folder is None and present:
-        return Path(present)
+    jax_folder = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
+    if folder is None and jax_folder:
+        return Path(jax_folder)
     variable = os.environ.get(VARIABLE)
-    turned_off = variable is not None and variable.strip().lower() in (
-        "",
-        "0",
-        "off",
-        "none",
-    )
-    if folder is None and turned_off:
+    is_off = variable is not None and variable.strip().lower() in WORDS_FOR_OFF
+    if folder is None and is_off:
         return None
-    above = Path(folder or variable or user_cache()).expanduser().absolute()
-    place = above / "compiled"
+    parent = Path(folder or variable or user_cache()).expanduser().absolute()
+    place = parent / "compiled"
     try:
-        _require_private(above)
+        _require_private(parent)
         _require_private(place)
         _remove_oldest(place, MAX_BYTES)
     except OSError:

@@ -162,19 +162,22 @@ def to_python(program: Program) -> Callable[..., tuple[float, ...]]:
     outputs, one after the other. Division by zero, and functions outside their domain,
     raise Python's own errors, where NumPy gives infinities and NaN.
     """
-    # What these operations read stands several times in their expressions.
-    readers = (Operation.MAXIMUM, Operation.MINIMUM, Operation.SIGN)
-    operands_of_readers = set()
+    # The text of these operations repeats their operands: to write an operand's own
+    # expression there would compute it twice.
+    repeating_operations = (Operation.MAXIMUM, Operation.MINIMUM, Operation.SIGN)
+    repeated_operands = set()
     for node in program.nodes:
-        if node.operation in readers:
-            operands_of_readers.update(node.uses)
+        if node.operation in repeating_operations:
+            repeated_operands.update(node.uses)
+
+    # The first lines unpack the inputs.
     lines = []
     for k, shape in enumerate(program.input_shapes):
         entries = "".join(f"x{k}_{entry}, " for entry in range(math.prod(shape)))
         if entries:
             lines.append(f"({entries}) = x{k}")
 
-    texts: list[str] = []
+    texts: list[str] = []  # name or expression of each node
     for position, node in enumerate(program.nodes):
         if node.operation is Operation.INPUT:
             number, entry = node.place
@@ -185,7 +188,7 @@ def to_python(program: Program) -> Callable[..., tuple[float, ...]]:
         # A value that is needed once is written where it is needed, unless the line
         # gets long.
         is_read_once = program.uses[position] == 1
-        is_read_once &= position not in operands_of_readers
+        is_read_once &= position not in repeated_operands
         if is_read_once and len(text) <= MAX_LENGTH:
             texts.append(f"({text})")
         else:

@@ -197,7 +197,7 @@ def _torques(figures: Mapping[str, Figure], robot: Robot) -> list[Any]:
 
 
 def _parameters(fit: Fit, figure: Figure) -> list[Any]:
-    """Return the meanings of all symbols, and the estimates with theirs."""
+    """Return the meanings of all symbols, and the table and figure of the estimates."""
     base = fit.base
     notes = [
         "* together with what forces cannot tell apart from it: see its combination. "

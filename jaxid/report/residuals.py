@@ -126,6 +126,7 @@ def autocorrelation_figure(
     count = min(MAX_LAGS, len(time) // 2) + 1
     lags = float(np.median(np.diff(time))) * np.arange(count)
     correlations = autocorrelation(errors, count)
+    # Autocorrelations of white noise have the deviation 1 / sqrt(rows).
     rows = np.asarray(errors.counted).sum(axis=0)
     limits = 1.96 / np.sqrt(np.maximum(rows, 1))
     white_noise = [] if spectra is None else [_white_noise(spectra, lags)]
@@ -135,22 +136,20 @@ def autocorrelation_figure(
         limit = np.full(count, limits[j])
         legend = "white residuals: 95 % within"
         band = Curve(lags, lags, legend, MEASURED, "band", low=-limit, high=limit)
+        curve = Curve(lags, correlation, "residuals", marker=True)
+        neighbour_correlation = significant(float(correlation[1]), 2)
+        half_lag = 0.5 * lags[1]
         minimum = 1.1 * float(np.nanmin(correlation))
-        panels.append(
-            Panel(
-                [
-                    band,
-                    Curve(lags, correlation, "residuals", marker=True),
-                    *white_noise,
-                ],
-                title=shortened(name, 24),
-                value=f"next row: {significant(float(correlation[1]), 2)}",
-                x="lag [s]",
-                x_range=(-0.5 * lags[1], lags[-1] + 0.5 * lags[1]),
-                y_range=(min(-0.25, minimum), 1.05),
-                levels=[("y", 0.0, GREY)],
-            )
+        panel = Panel(
+            [band, curve, *white_noise],
+            title=shortened(name, 24),
+            value=f"next row: {neighbour_correlation}",
+            x="lag [s]",
+            x_range=(-half_lag, lags[-1] + half_lag),
+            y_range=(min(-0.25, minimum), 1.05),
+            levels=[("y", 0.0, GREY)],
         )
+        panels.append(panel)
     title = f"{shortened(errors.name, 40)}: autocorrelation of the residuals"
     columns = min(2, len(panels))
     return Figure(title, panels, columns, width=5.5 * columns)

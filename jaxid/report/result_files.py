@@ -207,19 +207,37 @@ def write_estimates(
 
     The files are a page, `{kind}.json` and `{kind}.csv`. The page shows the `tables`,
     and the `doubts` above them.
+
+    Args:
+        folder: Folder of the files.
+        kind: What is written, like "payload".
+        estimates: Groups of estimates; the covariance of the first is written, too.
+        content: Further content of the JSON file.
+        sources: Logs and reports of each run, by its name.
+        tables: Tables of the page.
+        doubts: Doubts about the logs.
     """
-    rows = [row for group in estimates for row in estimate_rows(group)]
-    paths = {role: [str(path) for path in logs] for role, logs in sources.items()}
+    rows = []
+    for group in estimates:
+        rows += estimate_rows(group)
+    _, _, _, first_uncertainty = estimates[0]
+
+    paths_of_runs = {}
+    source_facts = []
+    for run, paths in sources.items():
+        names = [str(path) for path in paths]
+        paths_of_runs[run] = names
+        source_facts.append((run, ", ".join(names)))
+
     record = {
-        "sources": paths,
+        "sources": paths_of_runs,
         "level": LEVEL,
         "parameters": rows,
-        "covariance": estimates[0][-1].covariance,
+        "covariance": first_uncertainty.covariance,
         **content,
     }
-    logs = Table("", facts=[(role, ", ".join(names)) for role, names in paths.items()])
     results = [doubts, *tables] if doubts else tables
-    sections = [("Result", results), ("Logs", [logs])]
+    sections = [("Result", results), ("Logs", [Table("", facts=source_facts)])]
     page = render_page(f"{kind.capitalize()}: results", sections)
     return _write_page_and_table(folder, kind, page, record, rows)
 

@@ -56,10 +56,11 @@ def torque_figure(
     rows = np.flatnonzero(np.asarray(errors.counted).any(axis=1))
     window = slice(rows[0], rows[-1] + 1)
     panels = [_joint_panel(errors, robot, j, window) for j in joints]
+    columns = 3
     if len(panels) <= 2:
         columns = 1
-    else:
-        columns = 2 if len(panels) <= MAX_JOINTS_IN_TWO_COLUMNS else 3
+    elif len(panels) <= MAX_JOINTS_IN_TWO_COLUMNS:
+        columns = 2
     name = shortened(errors.name if title is None else title, 40)
     return Figure(
         f"{name}: relative error {percent(errors.relative)} %",
@@ -169,24 +170,29 @@ def bar_figure(
         for errors in recordings:
             require_joints(errors, robot)
 
-    max_forces = np.asarray(groups[0][1][0].max_forces)
+    # All recordings are of one robot: the largest forces of the first are those of all.
+    _, first_recordings = groups[0]
+    max_forces = np.asarray(first_recordings[0].max_forces)
     reference = "the largest force"
     if not np.isfinite(max_forces).all():
         max_forces = None
         reference = "RMS force"
+
     joints = robot.joints
-    width = min(0.36, 0.72 / len(groups))
+    bar_width = min(0.36, 0.72 / len(groups))
+    # The bars of a joint stand side by side, with their middle at the joint's number.
+    middle_group = 0.5 * (len(groups) - 1)
+    show_numbers = joints * len(groups) <= MAX_BARS_WITH_NUMBERS
     bars = []
     points = []
     for k, (name, recordings) in enumerate(groups):
         colour = GROUP_COLOURS[k]
-        places = np.arange(joints) + (k - 0.5 * (len(groups) - 1)) * (width + 0.02)
+        shift = (k - middle_group) * (bar_width + 0.02)
+        places = np.arange(joints) + shift
         mean, rms = _pooled_percents(recordings, max_forces)
-        texts = [percent(value / 100.0) for value in mean]
-        if joints * len(groups) > MAX_BARS_WITH_NUMBERS:
-            texts = []
+        texts = [percent(value / 100.0) for value in mean] if show_numbers else []
         legend = f"{name}: {percent(float(np.mean(mean)) / 100.0)} % on average"
-        bars.append(Curve(places, mean, legend, colour, "bars", width, texts=texts))
+        bars.append(Curve(places, mean, legend, colour, "bars", bar_width, texts=texts))
         points.append(Curve(places, rms, "RMS", colour, "points"))
     panel = Panel(
         [*bars, *points],

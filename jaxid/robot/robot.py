@@ -210,6 +210,7 @@ class Robot(Summarised, eqx.Module):
                 lengths[f"`offset` of joint `{name}`"] = offset
         notes = []
         for owner, offset in lengths.items():
+            # Arrays of JAX may be traced: their numbers are then unknown.
             if not isinstance(offset, np.ndarray):
                 continue
             length = np.abs(offset).max()

@@ -224,14 +224,21 @@ def _fraction(numerator: Array, denominator: Array, usable: Array) -> Array:
 
 
 def _bisect(slope: Callable[[Array], Array], zero: Array) -> tuple[Array, Array]:
-    """Return ends of intervals around the minima of convex functions from 0 to 1."""
+    """Return both ends of short intervals around the minima of convex functions.
+
+    Args:
+        slope: Derivative of the functions, whose arguments lie between 0 and 1.
+        zero: Zeros in the shape and type of the arguments.
+    """
 
     def halve(_: Array, interval: tuple[Array, Array]) -> tuple[Array, Array]:
         low, high = interval
         middle = 0.5 * (low + high)
+        # A convex function that still falls has its minimum further on.
         falls = slope(middle) < 0
         return jnp.where(falls, middle, low), jnp.where(falls, high, middle)
 
+    # 40 halvings leave 1e-12 of the interval.
     return jax.lax.fori_loop(0, 40, halve, (zero, zero + 1.0))
 
 

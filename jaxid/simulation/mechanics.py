@@ -182,7 +182,7 @@ def follow(
     rate = [0.0] * n
     previous_error = None
     try:
-        for goal, known in zip(goals, feed_forward, strict=True):
+        for goal, forward_forces in zip(goals, feed_forward, strict=True):
             state = plant.read()
             angles = [
                 encoder_step[i] * round(state[i] / encoder_step[i]) for i in joints
@@ -193,7 +193,7 @@ def follow(
             rate = [
                 memory * rate[i] + rate_gain * (error[i] - before[i]) for i in joints
             ]
-            undamped_u = [known[i] + kp[i] * error[i] for i in joints]
+            undamped_u = [forward_forces[i] + kp[i] * error[i] for i in joints]
             u = [undamped_u[i] + kd[i] * rate[i] for i in joints]
             u = [min(max(u[i], -limit[i]), limit[i]) for i in joints]
             states.append(list(state))

@@ -118,10 +118,12 @@ class TipPath(eqx.Module):
                 raise InputError(f"`{name}` must be positive, but is {limit:g}.")
         if not self.pieces:
             raise InputError("`pieces` must hold at least one piece, but is empty.")
-        place = None
+        previous_end = None
         for number, piece in enumerate(self.pieces, 1):
             start, end = piece.at(np.array([0.0, 1.0]))
-            gap = 0.0 if place is None else float(np.linalg.norm(start - place))
+            gap = 0.0
+            if previous_end is not None:
+                gap = float(np.linalg.norm(start - previous_end))
             if gap > 1e-9:
                 raise InputError(
                     f"piece {number} of `pieces` starts "
@@ -132,7 +134,7 @@ class TipPath(eqx.Module):
                     f"piece {number} of `pieces` must have a length, "
                     f"but it is {piece.length:g} m."
                 )
-            place = end
+            previous_end = end
 
     @property
     def durations(self) -> tuple[float, ...]:

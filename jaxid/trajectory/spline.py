@@ -111,9 +111,10 @@ class RestToRestSplineBasis(AbstractBasis):
         return derivatives / (self.duration ** np.arange(4.0))[:, None, None]
 
     def envelope(self, points: int) -> Envelope:
-        """Return the control points of each derivative, which bound the spline.
+        """Return rows that give the control points of each derivative.
 
-        The more knots it is written with, the closer they lie to it.
+        A spline never leaves the range of its control points, so that the factor of the
+        envelope is one. The more knots it is written with, the closer they lie to it.
         """
         spans = self.points + 4 - DEGREE
         refinement = max(1, round(points / max(spans, 1)))

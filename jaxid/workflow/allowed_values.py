@@ -48,8 +48,8 @@ class OneOf:
     def check(self, value: str, place: str) -> None:
         """Reject a text that is none of the names."""
         if value not in self.names:
-            given = json.dumps(value, ensure_ascii=False)
-            raise InputError(f"`{place}` must be {quoted(self.names)}, but is {given}.")
+            text = json.dumps(value, ensure_ascii=False)
+            raise InputError(f"`{place}` must be {quoted(self.names)}, but is {text}.")
 
 
 Positive = Annotated[float, Bounds(above=0.0)]

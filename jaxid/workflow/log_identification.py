@@ -79,11 +79,13 @@ class IdentificationReport(Summarised, Report):
         if fit.consistency is not None:
             tables.append(body_table(fit.consistency, robot.joint_names))
         verdict, *criteria = self.judgement
-        marked = [x for x in criteria if x.status in (Status.DOUBTFUL, Status.BAD)]
+        critical_remarks = [
+            x for x in criteria if x.status in (Status.DOUBTFUL, Status.BAD)
+        ]
         return [
             *tables,
             self.validation.summary(),
-            Table("", remarks=[verdict, *marked]),
+            Table("", remarks=[verdict, *critical_remarks]),
         ]
 
     def save(self, folder: str | Path, figures: str = "") -> list[Path]:
@@ -102,13 +104,13 @@ class IdentificationReport(Summarised, Report):
 class LogParts(NamedTuple):
     """Observations that are fitted, and observations for the validation."""
 
-    fitted: list[Observations]
-    unseen: list[Observations]
+    training_logs: list[Observations]
+    unseen_logs: list[Observations]
 
     @property
     def every(self) -> list[Observations]:
         """All observations."""
-        return [*self.fitted, *self.unseen]
+        return [*self.training_logs, *self.unseen_logs]
 
 
 def identify_logs(
@@ -145,11 +147,11 @@ def identify_logs(
     progress("finding base parameters", 0.0)
     base = setup.base
     rows = RegressionProblem(
-        base, parts.fitted, partial(progress, "factorising the rows")
+        base, parts.training_logs, partial(progress, "factorising the rows")
     )
     fit = setup.fit(rows, progress)
     if reports:
-        fit = add_reports(setup, reports, fit, parts.unseen)
+        fit = add_reports(setup, reports, fit, parts.unseen_logs)
 
     validation = validate(
         fit, parts.every, progress=partial(progress, "predicting torques")
@@ -163,8 +165,8 @@ def identify_logs(
     claims = errors_of_claims(setup, fit, parts.every)
     return IdentificationReport(
         fit,
-        validation.errors[: len(parts.fitted)],
-        validation.errors[len(parts.fitted) :],
+        validation.errors[: len(parts.training_logs)],
+        validation.errors[len(parts.training_logs) :],
         validation.definiteness,
         describe(setup, logs, verify, held_out),
         notes=(*setup.notes, *dict.fromkeys(notes)),
@@ -209,12 +211,15 @@ def split_logs(
     if held_out is None:
         return LogParts(to_fit, to_verify)
     share = fitted_share(held_out)
-    fitted, rests = [], []
+    training_logs = []
+    rests = []
     for log in to_fit:
         first, rest = log.split(share)
-        fitted.append(first.replace(name=f"{first.name}, first {100 * share:g} %"))
+        training_logs.append(
+            first.replace(name=f"{first.name}, first {100 * share:g} %")
+        )
         rests.append(rest.replace(name=f"{rest.name}, rest"))
-    return LogParts(fitted, [*rests, *to_verify])
+    return LogParts(training_logs, [*rests, *to_verify])
 
 
 def resolution_notes(fit: Fit, logs: Sequence[LoadedLog]) -> list[str]:
@@ -285,8 +290,8 @@ def add_reports(
 
     The reports must not have seen the unseen logs.
     """
-    bounded = fit.consistency is not None
-    if fit.base.names != setup.base.names or not (bounded or fit.is_least_squares):
+    has_bodies = fit.consistency is not None
+    if fit.base.names != setup.base.names or not (has_bodies or fit.is_least_squares):
         raise InputError(
             "earlier reports can be added to least squares only, but the estimator is "
             f"{fit.estimator}: leave `[estimator]` out, or give the logs themselves."

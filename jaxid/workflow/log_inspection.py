@@ -58,8 +58,8 @@ def inspect_logs(
     examined_logs = []
     for path in paths:
         observations, diagnosis = load_log(setup, path, columns, progress)
-        factorising = partial(progress, f"factorising {path.name}")
-        fit = identify(setup.base, observations, setup.least_squares, factorising)
+        fit_progress = partial(progress, f"factorising {path.name}")
+        fit = identify(setup.base, observations, setup.least_squares, fit_progress)
         progress(f"looking for mistakes in {path.name}", 0.0)
         commanded_log = observe_commands(setup, path, columns)
         examined_logs.append(ExaminedLog(diagnosis.with_fit(fit, commanded_log), fit))

@@ -113,8 +113,8 @@ class LogReading:
         except InputError as error:
             text = str(error).replace("`forces`", "`commands`")
             raise InputError(text) from None
-        commanded = self.read(log, command_columns, robot, bridged)
-        return dataclasses.replace(measured, forces=commanded.angles)
+        commands = self.read(log, command_columns, robot, bridged)
+        return dataclasses.replace(measured, forces=commands.angles)
 
 
 def file_beside(log: Path, pattern: str | None) -> Path | None:

@@ -107,10 +107,11 @@ def _follow_commands(
     for log in (*logs, *verify):
         progress(f"reading {log.name}", 0.0)
         recordings.append(read_commands(setup, log, columns))
-    fitted, unseen = recordings[: len(logs)], recordings[len(logs) :]
+    training_recordings = recordings[: len(logs)]
+    unseen_recordings = recordings[len(logs) :]
     progress("identifying", 0.0)
     fit = identify_rollout(
-        fitted,
+        training_recordings,
         bodies_of_file(setup, settings),
         joint_names=setup.robot.joint_names,
         time_step=settings.time_step,
@@ -120,10 +121,11 @@ def _follow_commands(
         stiffness=settings.stiffness,
     )
     progress("simulating", 0.0)
-    simulated = unseen or fitted
-    errors = fit.validate(simulated)
-    window_errors = fit.window_errors(simulated)
-    return RolloutReport(fit, errors, window_errors, bool(unseen), settings.samples, {})
+    test_recordings = unseen_recordings or training_recordings
+    errors = fit.validate(test_recordings)
+    window_errors = fit.window_errors(test_recordings)
+    is_unseen = bool(unseen_recordings)
+    return RolloutReport(fit, errors, window_errors, is_unseen, settings.samples, {})
 
 
 def bodies_of_file(setup: Setup, settings: ServoSettings) -> Bodies | None:
@@ -157,16 +159,17 @@ def _follow_torques(
     setup, _ = select_filter(setup, logs, columns, progress)
     loaded_logs = load_logs(setup, [*logs, *verify], columns, progress)
     observations = [log.observations for log in loaded_logs]
-    fitted, unseen = observations[: len(logs)], observations[len(logs) :]
+    training_logs = observations[: len(logs)]
+    unseen_logs = observations[len(logs) :]
     progress("identifying", 0.0)
-    fit = identify_torque_rollout(base, fitted, **dataclasses.asdict(settings))
+    fit = identify_torque_rollout(base, training_logs, **dataclasses.asdict(settings))
     progress("simulating", 0.0)
     doubts = [text for log in loaded_logs for text in log.findings]
     notes = [*setup.notes, *(note for log in observations for note in log.notes)]
     return TorqueRolloutReport(
         fit,
-        unseen or fitted,
-        bool(unseen),
+        unseen_logs or training_logs,
+        bool(unseen_logs),
         [Remark(text, Status.DOUBTFUL) for text in doubts],
         [Remark(note) for note in notes],
         {},

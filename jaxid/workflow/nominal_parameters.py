@@ -86,23 +86,33 @@ class LimitedForces(NamedTuple):
 def limit_forces(
     setup: Setup, excitation: Excitation, nominal: Nominal | None
 ) -> LimitedForces:
-    """Return limits of the forces by nominal parameters.
+    """Return limits of the forces by nominal parameters, or why there are none.
 
     Raises:
-        InputError: If `force_margin` is given, but no motion can keep the limits.
+        InputError: If `force_margin` is given, but forces cannot be limited: nothing is
+            known of them, or gravity alone exceeds the limits.
     """
-    limits = None
-    fault = NO_INERTIAS
-    if nominal is not None:
-        margin = excitation.force_margin
-        if margin is None:
-            margin = UNKNOWN_SHARE if np.isnan(nominal.parameters).any() else 0.0
-        parameters = np.nan_to_num(nominal.parameters)
-        limits = ForceLimits(setup.base, parameters, nominal.covariance, margin)
-        has_limits = bool(limits.entries(setup.robot))
-        fault = gravity_fault(setup.robot, limits) if has_limits else NO_MAX_FORCES
-    if fault and excitation.force_margin is not None:
-        raise InputError(f"`force_margin`: {fault}.")
+    forces = _limits_or_fault(setup, excitation.force_margin, nominal)
+    # A user who gives a margin relies on the limits: then a fault is an error.
+    if forces.fault and excitation.force_margin is not None:
+        raise InputError(f"`force_margin`: {forces.fault}.")
+    return forces
+
+
+def _limits_or_fault(
+    setup: Setup, margin: float | None, nominal: Nominal | None
+) -> LimitedForces:
+    """Return limits that motions can keep, or the fault that prevents them."""
+    if nominal is None:
+        return LimitedForces(None, NO_INERTIAS)
+    if margin is None:
+        has_unknown_parameters = np.isnan(nominal.parameters).any()
+        margin = UNKNOWN_SHARE if has_unknown_parameters else 0.0
+    parameters = np.nan_to_num(nominal.parameters)
+    limits = ForceLimits(setup.base, parameters, nominal.covariance, margin)
+    if not limits.entries(setup.robot):
+        return LimitedForces(None, NO_MAX_FORCES)
+    fault = gravity_fault(setup.robot, limits)
     return LimitedForces(None if fault else limits, fault)
 
 

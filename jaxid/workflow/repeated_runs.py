@@ -149,8 +149,8 @@ def fit_run(
     if files:
         logs = load_logs(setup, files, columns, progress)
         observations = [log.observations for log in logs]
-        factorising = partial(progress, f"factorising the rows, {name}")
-        rows = RegressionProblem(setup.base, observations, factorising)
+        row_progress = partial(progress, f"factorising the rows, {name}")
+        rows = RegressionProblem(setup.base, observations, row_progress)
         fits.append(fit_problem(rows, setup.least_squares))
         mistakes, _ = mistakes_in_logs([log.diagnosis for log in logs], fits[-1])
         doubts = [text for log in logs for text in log.findings] + [*mistakes]

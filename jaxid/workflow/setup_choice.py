@@ -66,8 +66,8 @@ def choose_setup_by_rows(
         for name, setup in setups.items()
     ]
     candidates = with_common_length(candidates, observations)
-    choosing = partial(progress, "choosing the model")
-    return choose_model(candidates, observations, progress=choosing)
+    choice_progress = partial(progress, "choosing the model")
+    return choose_model(candidates, observations, progress=choice_progress)
 
 
 def with_common_length(

@@ -136,12 +136,13 @@ def fit_links(
         **robot_file.chain,
         **robot_file.placement,
     )
-    links: dict[str, list[str]] = {}
+    # Links with the same fault share a sentence.
+    links_by_fault: dict[str, list[str]] = {}
     for link, fault in faults.items():
-        links.setdefault(fault, []).append(link)
+        links_by_fault.setdefault(fault, []).append(link)
     sentences = [
         f"{owners('link', names)}: geometry not read ({fault.rstrip('.')})"
-        for fault, names in links.items()
+        for fault, names in links_by_fault.items()
     ]
     return list(capsules), sentences
 

@@ -74,9 +74,9 @@ class AsymmetricViscousFriction(AbstractTerm):
     def columns(self, robot, q, qd, qdd):
         """Return the diagonal matrices of speeds in either direction."""
         speed = jnp.abs(qd)
-        forwards = jnp.diag(0.5 * (qd + speed))
-        backwards = jnp.diag(0.5 * (qd - speed))
-        return jnp.concatenate([forwards, backwards], axis=1)
+        forward_speeds = jnp.diag(0.5 * (qd + speed))
+        backward_speeds = jnp.diag(0.5 * (qd - speed))
+        return jnp.concatenate([forward_speeds, backward_speeds], axis=1)
 
 
 class CoulombFriction(AbstractDryFriction):
@@ -112,13 +112,13 @@ class AsymmetricCoulombFriction(AbstractDryFriction):
         """Return the fractions of the two directions."""
         s = self.transition(qd)
         dead_zone = getattr(self.transition, "dead_zone", 0.0)
-        moving: Any = 1.0
+        moves: Any = 1.0
         if isinstance(dead_zone, jax.Array) or np.any(dead_zone):
             # Within a dead zone both fractions vanish, as the force does.
-            moving = jnp.where(s == 0.0, s, jnp.ones_like(s))
-        forwards = jnp.diag(0.5 * (moving + s))
-        backwards = jnp.diag(0.5 * (s - moving))
-        return jnp.concatenate([forwards, backwards], axis=1)
+            moves = jnp.where(s == 0.0, s, jnp.ones_like(s))
+        forward_fractions = jnp.diag(0.5 * (moves + s))
+        backward_fractions = jnp.diag(0.5 * (s - moves))
+        return jnp.concatenate([forward_fractions, backward_fractions], axis=1)
 
 
 class SquareRootFriction(AbstractDryFriction):

@@ -97,10 +97,12 @@ class ForceLimits(AbstractConstraint):
         xp = namespace(forces)
         size = xp.max(xp.abs(forces @ to_limited), axis=-2)
         if self.covariance is not None:
+            # Deviations of the forces follow from the covariance of the parameters.
             regressor = self.base.regressor(motion)
             rows = xp.einsum("...jb,jm->...mb", regressor, to_limited)
             variance = xp.einsum("...mb,bc,...mc->...m", rows, self.covariance, rows)
             variance = xp.maximum(variance, 0.0)
+            # A square root has no derivative at zero, hence the smoothing.
             smoothing = xp.broadcast_to((SMOOTHING * limits) ** 2, variance.shape)
             size = size + self.deviations * xp.sqrt(variance + smoothing)
         return size / xp.broadcast_to(limits, size.shape) - 1.0

@@ -208,12 +208,16 @@ def _contributions(cones: Sequence[Cone], members: np.ndarray) -> Values:
 
 
 def _total_mass(feasible: FeasibleSet) -> np.ndarray:
-    """Return the row of the total mass [rows, variables], or none if it is unknown."""
+    """Return the row of the total mass [rows, variables], or none if it is unknown.
+
+    The row times the scaled variables is the sum of all masses over the total mass.
+    """
     bounds = feasible.bounds
     if bounds.total_mass is None:
         return np.zeros((0, len(feasible.order)))
     row = np.zeros((1, len(feasible.order)))
     end = len(feasible.bodies) * feasible.width
+    # The mass is the first variable of each body.
     row[0, : end : feasible.width] = bounds.mass_max / bounds.total_mass
     return row
 
@@ -256,19 +260,20 @@ def _drive_matrices(feasible: FeasibleSet, drive_scales) -> list[Cone]:
 
 
 def _start(feasible: FeasibleSet, A, b, prior) -> Values:
-    """Return balls at inner centres of mass, and some friction.
+    """Return the start of the iteration, a point that satisfies all bounds.
 
-    The balls are as heavy as fits the forces.
-
-    Where a prior's bodies satisfy all bounds the start lies close to them.
+    All bodies are balls inside their ellipsoids, as heavy as fits the forces or the
+    total mass; or they lie close to the bodies of a prior that satisfy all bounds.
+    Friction and other drives are small and positive.
     """
     xp = namespace(A)
     bounds = feasible.bounds
     floors = _scale(feasible, feasible.floors)
     balls = _unit_balls(bounds)[:, : feasible.width]
+    # Masses lie between a minimum and one: find the common fraction of the way.
     min_masses = np.maximum(bounds.mass_min / bounds.mass_max, floors[:, 0])
-    drives = np.full(len(feasible.drives), START_DRIVE)
     if bounds.total_mass is None:
+        # Least squares for one factor of all balls, held away from the bounds.
         forces = A[:, : balls.size] @ xp.asarray(balls.ravel())
         mass_fraction = (forces @ b) / xp.maximum(forces @ forces, 1e-300)
         mass_fraction = xp.clip(mass_fraction, 0.02, 0.5)
@@ -281,9 +286,11 @@ def _start(feasible: FeasibleSet, A, b, prior) -> Values:
     if prior is not None and bounds.total_mass is None:
         bodies = _move_to_prior(feasible, bodies, prior)
 
+    drives = np.full(len(feasible.drives), START_DRIVE)
     for coupling in feasible.couplings:
-        beside = tuple(k for k in coupling.columns if k not in coupling.diagonal)
-        drives[feasible.drive_places(beside)] *= START_COUPLING
+        # Small entries beside the diagonal keep the matrix of coupled drives definite.
+        off_diagonal = tuple(k for k in coupling.columns if k not in coupling.diagonal)
+        drives[feasible.drive_places(off_diagonal)] *= START_COUPLING
     return xp.concatenate([xp.ravel(bodies), xp.asarray(drives)])
 
 

@@ -97,7 +97,7 @@ class ConsistentSolver(Hashable):
         p = feasible.standard_parameters(data, optimum.y)
         residuals = data.b - data.A @ p
         free_residuals = data.b[self.base.size :]
-        # Exact data leave nothing.
+        # Exact data leave no residuals: the ratio below stays finite.
         free_square = jnp.maximum(free_residuals @ free_residuals, 1e-300)
         return ConsistentBatch(
             standard=p,

@@ -140,6 +140,7 @@ class ShapeSearch(eqx.Module):
             mask[rows] = chunk.mask
             blocks[rows] = chunk.block
             columns[rows] = _dense_columns(chunk, base.size)
+        # Columns that depend on the shapes are evaluated anew for each shape.
         columns[..., list(column_of_parameter)] = 0.0
         return cls(
             shapes=shapes,

@@ -166,6 +166,7 @@ class SpectralTable:
     @classmethod
     def of(cls, lines: Sequence[Lines]) -> "SpectralTable":
         """Return the table of the spectra of every length of stretches."""
+        # All lines of a channel have one exposure; the table wants one for each line.
         exposures = [x.exposure[:, None] + np.zeros_like(x.leverage) for x in lines]
         return cls(
             np,
