@@ -405,7 +405,7 @@ def test_long_logs_give_what_short_ones_give(
 
 def test_slips_are_found_in_a_part_of_a_long_log(folder, words, monkeypatch):
     monkeypatch.setattr("jaxid.workflow.log_loading.LONG_LOG_ROWS", 500)
-    monkeypatch.setattr("jaxid.validation.diagnosis.EXAMINED", 800)
+    monkeypatch.setattr("jaxid.validation.diagnosis.MAX_SAMPLES", 800)
     pl.read_csv("a.csv").with_columns(-pl.col("tau2")).write_csv("turned.csv")
     said = words("inspect", "experiment.toml", "turned.csv")
     assert "800 of the 1200 samples were examined for mistakes" in said
@@ -414,7 +414,7 @@ def test_slips_are_found_in_a_part_of_a_long_log(folder, words, monkeypatch):
 
 def test_errors_of_many_rows_are_of_every_nth(folder, first, words, monkeypatch):
     monkeypatch.setattr("jaxid.workflow.log_loading.LONG_LOG_ROWS", 500)
-    monkeypatch.setattr("jaxid.validation.torque_errors.ROWS", 100)
+    monkeypatch.setattr("jaxid.validation.torque_errors.MAX_ROWS", 100)
     said = words("identify", "experiment.toml", "a.csv", "-o", "long")
     assert "torque errors and figures take one of every 3 of its 2" in said
     short, long = (

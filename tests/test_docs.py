@@ -28,10 +28,15 @@ from jaxid.identification.estimators.regularisation_and_weights import (
 from jaxid.identification.fit_result import DOUBT_LIMIT, TRUST_LIMIT
 from jaxid.measurement.filters import FILTERS
 from jaxid.simulation.virtual import random_bodies
-from jaxid.validation.diagnosis import SURE
-from jaxid.validation.mistakes import BAD
+from jaxid.validation.diagnosis import MIN_DEVIATIONS
+from jaxid.validation.mistakes import MIN_MISFIT
 from jaxid.validation.torque_errors import POSES
-from jaxid.validation.verdict import FIT_ERROR, LARGE_CONDITION, RMS_ERROR, UNSEEN_RATIO
+from jaxid.validation.verdict import (
+    FIT_ERROR,
+    MAX_CONDITION_NUMBER,
+    RMS_ERROR,
+    UNSEEN_RATIO,
+)
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -255,7 +260,7 @@ def test_the_example_in_the_readme_runs(given, tmp_path):
 
 THRESHOLDS = {
     "3.": (f"{LARGEST_UNCERTAINTY:.0%}",),
-    "4.": (f"below {LARGE_CONDITION:.0f}",),
+    "4.": (f"below {MAX_CONDITION_NUMBER:.0f}",),
     "5.": (
         f"up to {FIT_ERROR[0]:.0f}% of each joint's RMS force; tolerable to "
         f"{FIT_ERROR[1]:.0f}%",
@@ -267,7 +272,7 @@ THRESHOLDS = {
     ),
     "7.": (f"up to {TRUST_LIMIT:.0%}", f"up to {DOUBT_LIMIT:.0%} doubtful"),
     "10.": (f"all of {POSES} poses",),
-    "11.": (f"{SURE:.0f} standard deviations",),
+    "11.": (f"{MIN_DEVIATIONS:.0f} standard deviations",),
 }
 
 
@@ -281,4 +286,4 @@ def test_thresholds_are_those_of_the_code(question):
 
 def test_the_slip_that_is_looked_for_is_the_codes():
     page = (ROOT / "docs" / "is_my_fit_good.md").read_text(encoding="utf-8")
-    assert f"leaves more than {100 * BAD:g} % of the forces" in page
+    assert f"leaves more than {100 * MIN_MISFIT:g} % of the forces" in page

@@ -36,8 +36,8 @@ def main() -> None:
     except (InputError, OSError, RuntimeError) as error:
         if isinstance(error, RuntimeError) and type(error) is not RuntimeError:
             raise  # of JAX, not a failed search
-        said = Text(f"jaxid: {options.describe_error(error)}")
-        options.open_console(stderr=True).print(said, soft_wrap=True)
+        message = Text(f"jaxid: {options.describe_error(error)}")
+        options.open_console(stderr=True).print(message, soft_wrap=True)
         raise SystemExit(2) from None
 
 

@@ -66,7 +66,7 @@ EXPORTS = {
 """Formats of `jaxid export`, and the file where none is named."""
 TITLE_OF_TOOL = "to subtract it from other logs, in the experiment file:"
 TITLE_OF_GAINS = "to use them, in the experiment file:"
-UNUSABLE = 3
+UNUSABLE_CODE = 3
 """Exit code for a verdict against the use of a model, or recording of a motion."""
 
 
@@ -74,14 +74,16 @@ def inspect(console: Console, path: Path, logs: list[Path]) -> None:
     """Show what can be identified, and if logs are sane."""
     experiment = load_experiment(path)
     setup = experiment.setup
-    notes, tables = setup.notes, []
+    notes = setup.notes
+    tables = []
     with progress_bar(open_console(stderr=True)) as progress:
         progress("finding base parameters", 0.0)
         base_table = setup.base.summary()
         if logs:
             columns = experiment.require_columns(logs)
             inspection = inspect_logs(setup, logs, columns, progress)
-            notes, tables = inspection.notes, inspection.tables()
+            notes = inspection.notes
+            tables = inspection.tables()
     show(console, setup.robot.summary(), *motor_tables(setup.robot), base_table)
     show_remarks(console, notes)
     show(console, *tables)
@@ -101,12 +103,12 @@ def identify(
         raise InputError(
             f"`--split` must lie between 0 and 1, like 0.6, but is {split:g}."
         )
-    held_out = None if split is None else 1.0 - split
+    held_out_share = None if split is None else 1.0 - split
     experiment = load_experiment(path)
     columns = experiment.require_columns([*logs, *verify])
     with progress_bar(open_console(stderr=True)) as progress:
         report = identify_logs(
-            experiment.setup, logs, columns, held_out, verify, progress
+            experiment.setup, logs, columns, held_out_share, verify, progress
         )
         settings = {"experiment": str(path), **origin(experiment), **report.settings}
         report = dataclasses.replace(report, settings=settings)
@@ -115,7 +117,7 @@ def identify(
     show(console, *report.tables())
     show_files(console, output, [file.name for file in files])
     if report.verdict.status is Status.BAD:
-        raise typer.Exit(UNUSABLE)
+        raise typer.Exit(UNUSABLE_CODE)
 
 
 def origin(experiment: Experiment) -> dict[str, str]:
@@ -147,10 +149,13 @@ def excite(
             experiment.surroundings,
             earlier_design,
         )
-    errors = open_console(stderr=True)
-    show_remarks(errors, [Remark(text, Status.BAD) for text in task.faults])
+    error_console = open_console(stderr=True)
+    show_remarks(error_console, [Remark(text, Status.BAD) for text in task.faults])
     best_motion = _BestMotion(task, output)
-    with process.handing_over(best_motion.farewell), progress_bar(errors) as progress:
+    with (
+        process.handing_over(best_motion.farewell),
+        progress_bar(error_console) as progress,
+    ):
         with within("excitation", path.name):
             design = design_motion(task, progress, best_motion.keep, seconds)
         progress("writing the report", 0.0)
@@ -162,7 +167,7 @@ def excite(
     names = [str(file.relative_to(output.parent)) for file in files]
     show_files(console, output.parent, names)
     if verdict.status is Status.BAD:
-        raise typer.Exit(UNUSABLE)
+        raise typer.Exit(UNUSABLE_CODE)
 
 
 class _BestMotion:
@@ -175,7 +180,8 @@ class _BestMotion:
 
     def keep(self, motion: LinearTrajectory) -> None:
         """Write a better motion."""
-        robot, excitation = self._task.setup.robot, self._task.excitation
+        robot = self._task.setup.robot
+        excitation = self._task.excitation
         playable = make_playable(robot, excitation, motion)
         write_motion(robot, excitation, playable, self._output)
         self._is_written = True
@@ -262,8 +268,8 @@ def compare(
     console: Console, paths: tuple[Path, Path], level: float, output: Path
 ) -> None:
     """Decide which parameters have changed between two runs."""
-    cold, warm = (dataclasses.replace(read_fit(p), name=str(p)) for p in paths)
-    comparison = compare_fits(cold, warm, level)
+    cold_fit, warm_fit = (dataclasses.replace(read_fit(p), name=str(p)) for p in paths)
+    comparison = compare_fits(cold_fit, warm_fit, level)
     files = write_comparison(output, comparison, paths)
     show(console, comparison.summary(), comparison.group_summary())
     show_files(console, output, [p.name for p in files])

@@ -65,19 +65,19 @@ def require_one_log_per_option() -> None:
     Otherwise the second log would silently be used for something else.
     """
     words = [word for arg in sys.argv[1:] for word in arg.split("=", 1)]
-    for option, _, second in zip(words, words[1:], words[2:], strict=False):
-        if option in ("--verify", "--loaded") and not second.startswith("-"):
-            raise InputError(f"`{option}` takes one log: repeat it before `{second}`.")
+    for option, _, value in zip(words, words[1:], words[2:], strict=False):
+        if option in ("--verify", "--loaded") and not value.startswith("-"):
+            raise InputError(f"`{option}` takes one log: repeat it before `{value}`.")
 
 
 def start(*reads: Path, output: Path | None = None, force: bool = False) -> Console:
     """Turn on double precision and the cache of compiled code; return the terminal."""
-    missing = [f"`{path}`" for path in reads if not path.exists()]
-    if missing:
+    missing_paths = [f"`{path}`" for path in reads if not path.exists()]
+    if missing_paths:
         verb = "is no file or folder"
-        if len(missing) > 1:
+        if len(missing_paths) > 1:
             verb = "are no files or folders"
-        raise InputError(f"{', '.join(missing)} {verb}: check the path.")
+        raise InputError(f"{', '.join(missing_paths)} {verb}: check the path.")
     import jax
 
     from jaxid.io import require_writable
@@ -88,12 +88,12 @@ def start(*reads: Path, output: Path | None = None, force: bool = False) -> Cons
     jax.config.update("jax_enable_x64", True)
     enable_compilation_cache()
     if output is not None:
-        empty = not output.is_dir() or not any(output.iterdir())
+        is_empty = not output.is_dir() or not any(output.iterdir())
         if output.exists() and not output.is_dir():
             raise InputError(
                 f"`{output}` is a file, but a report needs a folder: choose another -o."
             )
-        if not (force or empty or any(schema_of(output / file) for file in SCHEMAS)):
+        if not (force or is_empty or any(schema_of(output / file) for file in SCHEMAS)):
             raise InputError(
                 f"`{output}` holds files but no report: "
                 "choose another -o, or add --force."
@@ -124,13 +124,13 @@ def describe_error(error: Exception) -> str:
     """Return what an error of a user or of the operating system says, with its file."""
     if not isinstance(error, OSError) or not error.strerror:
         return str(error)
-    where = f"`{error.filename}`: " if error.filename else ""
+    place = f"`{error.filename}`: " if error.filename else ""
     if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
         return (
-            f"{where}{error.strerror}: nothing was written; "
+            f"{place}{error.strerror}: nothing was written; "
             "make room, or choose another -o."
         )
-    return f"{where}{error.strerror}."
+    return f"{place}{error.strerror}."
 
 
 def command_line() -> str:

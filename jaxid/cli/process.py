@@ -41,21 +41,22 @@ def main() -> NoReturn:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # Imports, tracing and drawing make many small objects, of which few are in cycles.
     gc.set_threshold(50_000, 20, 100)
-    codes, done = [], threading.Event()
+    codes = []
+    completion = threading.Event()
 
     def work() -> None:
-        codes.append(_code())
-        done.set()
+        codes.append(_exit_code())
+        completion.set()
 
     try:
         threading.Thread(target=work, daemon=True).start()
         # A signal that another thread has received does not wake this one.
-        while not done.wait(0.1):
+        while not completion.wait(0.1):
             pass
-    except _SignalReceived as received:
-        (number,) = received.args
-        for again in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(again, lambda *_: os._exit(128 + number))
+    except _SignalReceived as interruption:
+        (number,) = interruption.args
+        for signal_number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(signal_number, lambda *_: os._exit(128 + number))
         # Files that belong together take their places together, for a second at most.
         lock = getattr(sys.modules.get("jaxid.io"), "PLACING", None)
         _ = lock is None or lock.acquire(timeout=1.0)
@@ -69,14 +70,14 @@ def _receive(number: int, _) -> None:
     raise _SignalReceived(number)
 
 
-def _code() -> int:
+def _exit_code() -> int:
     """Run the command and return its exit code; a bug keeps its traceback."""
     try:
         from .app import main
 
         main()
-    except SystemExit as stopped:
-        return int(stopped.code or 0)
+    except SystemExit as exit_request:
+        return int(exit_request.code or 0)
     except BaseException:
         traceback.print_exc()
         return 1
@@ -85,8 +86,8 @@ def _code() -> int:
 
 def _say(text: str) -> None:
     # A progress bar has hidden the cursor, and stands in the line.
-    clear = "\x1b[?25h\r\x1b[2K" if sys.stderr.isatty() else ""
-    sys.stderr.write(f"{clear}jaxid: {text}.\n")
+    clear_sequence = "\x1b[?25h\r\x1b[2K" if sys.stderr.isatty() else ""
+    sys.stderr.write(f"{clear_sequence}jaxid: {text}.\n")
 
 
 def _leave(code: int) -> NoReturn:

@@ -15,8 +15,8 @@ def progress_bar(console: Console) -> Iterator[Callable[[str, float], None]]:
         Function that shows the completed fraction (0 to 1) of a stage.
     """
     columns = (*Progress.get_default_columns(), TimeElapsedColumn())
-    quiet = not console.is_terminal
-    with Progress(*columns, console=console, transient=True, disable=quiet) as bar:
+    is_quiet = not console.is_terminal
+    with Progress(*columns, console=console, transient=True, disable=is_quiet) as bar:
         task = bar.add_task("starting", total=1.0)
 
         def show(stage: str, fraction: float) -> None:

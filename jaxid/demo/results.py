@@ -27,7 +27,7 @@ from jaxid.simulation.tx90l import COLD, WARM
 from . import study as settings
 from .study import Study
 
-SHOWN = (0, 2, 4, 6)
+FIGURE_AXES = (0, 2, 4, 6)
 """Axes 1, 5 and 7 of the paper's Figs. 6, 7 and 9, and the shoulder."""
 POINTS = 800
 """Samples of a line in a figure."""
@@ -38,7 +38,7 @@ def write_study(folder: Path, study: Study) -> list[Path]:
     page = demo_page(study)
     with atomic_folder(folder) as staging:
         (staging / "report.html").write_text(page, encoding="utf-8")
-        write_json(staging / "demo.json", _record(study))
+        write_json(staging / "demo.json", _study_record(study))
     return [folder / "report.html", folder / "demo.json"]
 
 
@@ -82,10 +82,10 @@ def paper_table(study: Study) -> Table:
     base = study.base
     expressions = base.expressions
     speed, acceleration = study.tip_maxima
-    definite = [str(model.validation.definiteness) for model in study.models]
+    definiteness_texts = [str(model.validation.definiteness) for model in study.models]
     lengths = ", ".join(f"{name} = {base.lengths[name]:g}" for name in ("l2x", "l3z"))
 
-    def worst(errors: list[float]) -> str:
+    def max_error_text(errors: list[float]) -> str:
         return significant(max(errors), 2)
 
     rows = [
@@ -103,26 +103,26 @@ def paper_table(study: Study) -> Table:
         (
             "mean error, worst axis, identification [%]",
             "below 1",
-            worst(study.weighted.mean_errors(0)),
+            max_error_text(study.weighted.mean_errors(0)),
         ),
         (
             "mean error, worst axis, verification [%]",
             "below 1",
-            worst(study.weighted.mean_errors(1)),
+            max_error_text(study.weighted.mean_errors(1)),
         ),
         (
             "the same while the axis moves [%]",
             MISSING,
-            worst(study.moving_errors(study.weighted, 1)),
+            max_error_text(study.moving_errors(study.weighted, 1)),
         ),
         (
             "verification, by the true parameters [%]",
             MISSING,
-            worst(study.true.mean_errors(1)),
+            max_error_text(study.true.mean_errors(1)),
         ),
-        ("mass matrix without weights", "not positive definite", definite[0]),
-        ("mass matrix with weights", "positive definite", definite[1]),
-        ("mass matrix, consistent bodies", "not done", definite[2]),
+        ("mass matrix without weights", "not positive definite", definiteness_texts[0]),
+        ("mass matrix with weights", "positive definite", definiteness_texts[1]),
+        ("mass matrix, consistent bodies", "not done", definiteness_texts[2]),
     ]
     for k in COLD:
         for state, paper, fit in (
@@ -258,13 +258,15 @@ def _identification(study: Study) -> Section:
         ),
         picture(
             jid.plot.torques(
-                unweighted_errors, robot, "identified without weights", SHOWN
+                unweighted_errors, robot, "identified without weights", FIGURE_AXES
             ),
             "Fig. 6: torques of the axes 1, 3, 5 and 7, and their prediction without "
             "weights.",
         ),
         picture(
-            jid.plot.torques(weighted_errors, robot, "identified with weights", SHOWN),
+            jid.plot.torques(
+                weighted_errors, robot, "identified with weights", FIGURE_AXES
+            ),
             "Fig. 7: the same with weights (Eq. 30).",
         ),
     ]
@@ -284,7 +286,7 @@ def _verification(study: Study) -> Section:
             "Fig. 8: path of the end-effector.",
         ),
         picture(
-            jid.plot.torques(verification, robot, "verification", SHOWN),
+            jid.plot.torques(verification, robot, "verification", FIGURE_AXES),
             "Fig. 9: torques of the axes 1, 3, 5 and 7 on the verification path.",
         ),
         picture(
@@ -292,7 +294,7 @@ def _verification(study: Study) -> Section:
             "Fig. 10: mean errors on both paths.",
         ),
         (error_table(study, 0), error_table(study, 1)),
-        f"“Moving”: rows of each axis above {settings.AT_REST:g} rad/s or m/s. The "
+        f"“Moving”: rows of each axis above {settings.REST_SPEED:g} rad/s or m/s. The "
         "torque of an axis at rest may be anything up to stiction, which no model of "
         "speeds predicts.",
     ]
@@ -305,12 +307,12 @@ def _speed_scene(robot: jid.Robot, times: np.ndarray, motion: jid.Motion) -> Any
     return jid.plot.poses(robot, motion.q, time=times, values=percents, label=label)
 
 
-def _record(study: Study) -> dict[str, Any]:
+def _study_record(study: Study) -> dict[str, Any]:
     """Return the results of the demo for `demo.json`, in rad, m, s, N and N m."""
     base = study.base
     speed, acceleration = study.tip_maxima
-    cold = study.weighted.fit.parameters
-    warm = study.warm.parameters
+    cold_parameters = study.weighted.fit.parameters
+    warm_parameters = study.warm.parameters
     return {
         "schema": SCHEMAS["demo.json"],
         "versions": versions(),
@@ -340,7 +342,7 @@ def _record(study: Study) -> dict[str, Any]:
             {
                 "number": k,
                 "paper": [COLD[k], WARM[k]],
-                "estimates": [cold[k - 1], warm[k - 1]],
+                "estimates": [cold_parameters[k - 1], warm_parameters[k - 1]],
             }
             for k in COLD
         ],

@@ -38,7 +38,7 @@ POSTURE = (0.0, 1.57, -0.3, 1.8, 0.0, 0.0, 0.0)
 """Joint angles to which the redundant robot stays near on that path [m, rad]."""
 SHOULDER = 2
 """Index of the joint whose drive cannot hold and move the arm within all its limits."""
-AT_REST = 0.02
+REST_SPEED = 0.02
 """Speed below which a joint counts as resting [rad/s or m/s].
 
 It is twice the width of the model's dry friction.
@@ -94,9 +94,9 @@ class Study(NamedTuple):
         errors = model.validation.errors[recording]
         # The observations of the warm robot lie between the two recordings.
         speeds = np.abs(self.observations[2 * recording].reduced_motion.qd)
-        moves = speeds > AT_REST
-        sums = np.where(moves, np.abs(errors.errors), 0.0).sum(axis=0)
-        mean = sums / np.maximum(moves.sum(axis=0), 1)
+        is_moving = speeds > REST_SPEED
+        sums = np.where(is_moving, np.abs(errors.errors), 0.0).sum(axis=0)
+        mean = sums / np.maximum(is_moving.sum(axis=0), 1)
         return [float(x) for x in 100.0 * mean / np.asarray(errors.max_forces)]
 
     @property
@@ -123,10 +123,10 @@ def run_study(
 ) -> Study:
     """Repeat the experiments of the paper."""
     progress("finding base parameters", 0.0)
-    cold = jid.simulation.virtual_tx90l_on_rail()
-    warm = jid.simulation.virtual_tx90l_on_rail(warm=True)
-    robot = cold.robot
-    base = jid.base_parameters(cold.model)
+    cold_robot = jid.simulation.virtual_tx90l_on_rail()
+    warm_robot = jid.simulation.virtual_tx90l_on_rail(warm=True)
+    robot = cold_robot.robot
+    base = jid.base_parameters(cold_robot.model)
     _ = base.expressions  # computed here, in the stage that says so
     plans: tuple[jid.ExcitationPlan, ...] = ()
     if motion is None:
@@ -134,7 +134,7 @@ def run_study(
         basis = jid.trajectories.FourierBasis(HARMONICS, OMEGA)
         motion = basis.trajectory(plans[0].trajectory.coefficients)
     progress("adding the leads", 0.0)
-    played = jid.trajectories.with_leads(motion, robot, periods=periods)
+    played_motion = jid.trajectories.with_leads(motion, robot, periods=periods)
     progress("inverse kinematics of the verification path", 0.0)
     tip_path = jid.trajectories.iso9283_path(
         CENTRE, EDGE, TOOL, leans_along=1, speed=SPEED, acceleration=ACCELERATION
@@ -142,14 +142,16 @@ def run_study(
     joint_path = jid.trajectories.joint_path(robot, tip_path, posture=POSTURE)
 
     observations = []
-    for virtual, trajectory, name in (
-        (cold, played, "identification, cold"),
-        (warm, played, "identification, warm"),
-        (cold, joint_path, "verification"),
+    for virtual_robot, trajectory, name in (
+        (cold_robot, played_motion, "identification, cold"),
+        (warm_robot, played_motion, "identification, warm"),
+        (cold_robot, joint_path, "verification"),
     ):
         progress(f"measuring: {name}", 0.0)
         number = 10 * seed + len(observations)
-        run = virtual.track(trajectory, sample_time=SAMPLE_TIME, seed=number, name=name)
+        run = virtual_robot.track(
+            trajectory, sample_time=SAMPLE_TIME, seed=number, name=name
+        )
         log = jid.observe(
             run.recording, robot, jid.filters.PaperFilter(), jid.Subsample(STEP)
         )
@@ -158,7 +160,7 @@ def run_study(
 
     progress("identifying", 0.0)
     rows = jid.RegressionProblem(base, [cold_log])
-    truth = np.asarray(base.from_standard(cold.parameters))
+    truth = np.asarray(base.from_standard(cold_robot.parameters))
     weighted_fit = jid.identify(base, rows, jid.WeightedLeastSquares())
     warm_fit = jid.identify(base, warm_log, jid.WeightedLeastSquares())
     fits = {
@@ -178,7 +180,7 @@ def run_study(
         base,
         truth,
         plans,
-        played,
+        played_motion,
         joint_path,
         tuple(observations),
         *models,

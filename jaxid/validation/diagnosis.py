@@ -36,9 +36,9 @@ from .sensor_checks import (
     stuck_findings,
 )
 
-SURE = 3.0
+MIN_DEVIATIONS = 3.0
 """Standard deviations beyond which a sign is certain."""
-EXAMINED = 2**17
+MAX_SAMPLES = 2**17
 """Largest number of samples of a long log that are examined."""
 
 
@@ -85,28 +85,37 @@ class Diagnosis(Summarised):
 
         The log with `commanded` angles in place of the measured ones is filtered alike.
         """
-        found, more = _mistakes([self], fit)
-        if not found and not self.faulty and self.observations is not None:
-            found = negative_friction(fit, [self.observations])
-            more = (*more, *delay_notes(self.observations, fit, commanded))
+        fit_findings, fit_notes = _mistakes([self], fit)
+        if not fit_findings and not self.faulty and self.observations is not None:
+            fit_findings = negative_friction(fit, [self.observations])
+            fit_notes = (*fit_notes, *delay_notes(self.observations, fit, commanded))
         return dataclasses.replace(
-            self, findings=(*found, *self.findings), notes=(*self.notes, *more)
+            self,
+            findings=(*fit_findings, *self.findings),
+            notes=(*self.notes, *fit_notes),
         )
 
     def summary(self) -> Table:
         """Return a table: motion and forces beside their limits, and the findings."""
-        robot, log, s = self.robot, self.log, self.statistics
+        robot = self.robot
+        log = self.log
+        statistics = self.statistics
         limits = robot.limits
         gaps = len(log.segments) - 1
         joints = range(robot.joints)
         return Table(
             f"log {log.name} (limits of the robot in brackets)",
             Column("joint", robot.joint_names),
-            _beside("from", s.lowest, limits.position_min),
-            _beside("to", s.highest, limits.position_max),
-            _beside("speed", s.speed, limits.velocity, "unit/s"),
-            _beside("force", s.force, robot.known_max_forces),
-            Column("at rest", s.stands.mean(axis=0), "%", lambda x: f"{100 * x:.0f}"),
+            _column_with_limits("from", statistics.lowest, limits.position_min),
+            _column_with_limits("to", statistics.highest, limits.position_max),
+            _column_with_limits("speed", statistics.speed, limits.velocity, "unit/s"),
+            _column_with_limits("force", statistics.force, robot.known_max_forces),
+            Column(
+                "at rest",
+                statistics.stands.mean(axis=0),
+                "%",
+                lambda x: f"{100 * x:.0f}",
+            ),
             Column("unit", [robot.joint_unit(j) for j in joints]),
             Column("force\nunit", [robot.force_unit(j) for j in joints]),
             facts=[
@@ -132,7 +141,9 @@ class Diagnosis(Summarised):
         )
 
 
-def _beside(name: str, values: np.ndarray, limits: AnyArray, unit: str = "") -> Column:
+def _column_with_limits(
+    name: str, values: np.ndarray, limits: AnyArray, unit: str = ""
+) -> Column:
     """Return a column of values with limits in brackets."""
     pairs = zip(values.tolist(), np.asarray(limits).tolist(), strict=True)
     texts = [
@@ -171,26 +182,31 @@ def diagnose(
     """
     notes: tuple[str, ...] = ()
     if isinstance(log, Recording):
-        part = log
+        excerpt = log
         if observations is None:
             cutoff = min(20.0, 0.1 / log.sample_time)
             observations = observe(
                 log, robot, ZeroPhaseButterworth(cutoff), min_speed=min_speed
             )
-        whole = observations
+        all_observations = observations
     elif isinstance(log.source, SamplesOnDisk):
-        part, whole, why = _excerpt(log, log.source), log, ""
+        excerpt = _excerpt(log, log.source)
+        all_observations = log
+        reason = ""
         try:
-            observations = observe(part, robot, log.filter, log.decimation, min_speed)
+            observations = observe(
+                excerpt, robot, log.filter, log.decimation, min_speed
+            )
         except InputError as error:
             observations = None
-            why = f" of single channels only: {error}"
-        if why or part.samples < log.samples:
-            examined = f"{part.samples} of the {log.samples} samples"
-            notes = (f"{examined} were examined for mistakes{why}",)
+            reason = f" of single channels only: {error}"
+        if reason or excerpt.samples < log.samples:
+            examined_samples = f"{excerpt.samples} of the {log.samples} samples"
+            notes = (f"{examined_samples} were examined for mistakes{reason}",)
     else:
-        whole = observations = log
-        part = Recording(
+        all_observations = log
+        observations = log
+        excerpt = Recording(
             *(
                 log.time,
                 np.asarray(log.motion.q),
@@ -201,34 +217,45 @@ def diagnose(
             ),
             *(log.segments, log.sample_time),
         )
-    statistics = LogStatistics(robot.joints, whole.samples)
-    for a, b in whole.segments:
+    statistics = LogStatistics(robot.joints, all_observations.samples)
+    for a, b in all_observations.segments:
         # Differences at the ends of parts are not central: logs in memory are taken at
         # once.
-        step = PART_SIZE if isinstance(whole.source, SamplesOnDisk) else b - a
+        step = (
+            PART_SIZE if isinstance(all_observations.source, SamplesOnDisk) else b - a
+        )
         for start in range(a, b, step):
             samples = slice(start, min(start + step, b))
-            statistics.add(*whole.read(samples), whole.sample_time)
+            statistics.add(
+                *all_observations.read(samples), all_observations.sample_time
+            )
             if progress is not None:
-                progress(samples.stop / whole.samples)
-    sides = part.angles_on_motor_side, part.forces_on_motor_side
-    faults = channel_findings(robot, part, statistics)
-    faulty = tuple(dict.fromkeys(joint for joint, _ in faults))
-    clock = clock_findings(part)
+                progress(samples.stop / all_observations.samples)
+    motor_sides = excerpt.angles_on_motor_side, excerpt.forces_on_motor_side
+    faults = channel_findings(robot, excerpt, statistics)
+    faulty_joints = tuple(dict.fromkeys(joint for joint, _ in faults))
+    clock = clock_findings(excerpt)
     findings = [
         *(text for _, text in faults),
         *clock,
-        *limit_findings(robot, part, statistics, faulty),
-        *stuck_findings(robot, part, faulty),
+        *limit_findings(robot, excerpt, statistics, faulty_joints),
+        *stuck_findings(robot, excerpt, faulty_joints),
     ]
-    rate = 1.0 / part.sample_time
+    rate = 1.0 / excerpt.sample_time
     if not 5.0 <= rate <= 5e4:
         cure = "check `recording.time_unit` or `sample_time`."
         findings.append(f"the log has {rate:.3g} samples in a second: {cure}")
-    found = tuple(findings)
-    faulty = tuple(range(robot.joints)) if clock else faulty
+    all_findings = tuple(findings)
+    faulty_joints = tuple(range(robot.joints)) if clock else faulty_joints
     diagnosis = Diagnosis(
-        log, robot, statistics, found, faulty, observations, sides, notes
+        log,
+        robot,
+        statistics,
+        all_findings,
+        faulty_joints,
+        observations,
+        motor_sides,
+        notes,
     )
     return diagnosis if fit is None else diagnosis.with_fit(fit)
 
@@ -237,11 +264,19 @@ def mistakes_in_logs(
     diagnoses: Sequence[Diagnosis], fit: Fit
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return findings and notes of a fit to several logs, which are judged together."""
-    logs = [d.observations for d in diagnoses if d.observations is not None]
-    friction = () if any(d.faulty for d in diagnoses) else negative_friction(fit, logs)
-    found, notes = _mistakes(diagnoses, fit)
+    logs = [
+        diagnosis.observations
+        for diagnosis in diagnoses
+        if diagnosis.observations is not None
+    ]
+    friction = (
+        ()
+        if any(diagnosis.faulty for diagnosis in diagnoses)
+        else negative_friction(fit, logs)
+    )
+    findings, notes = _mistakes(diagnoses, fit)
     name = f"{diagnoses[0].log.name}: " if len(diagnoses) == 1 else ""
-    return (*friction, *(f"{name}{text}" for text in found)), notes
+    return (*friction, *(f"{name}{text}" for text in findings)), notes
 
 
 def _mistakes(
@@ -250,11 +285,13 @@ def _mistakes(
     """Return the likely mistake in logs, or moments unlike the model, and notes."""
     # Faults of channels explain the rest.
     logs = [
-        d.observations for d in diagnoses if d.observations is not None and not d.faulty
+        diagnosis.observations
+        for diagnosis in diagnoses
+        if diagnosis.observations is not None and not diagnosis.faulty
     ]
-    named = "{0.name}: {1}" if len(diagnoses) > 1 else "{1}"
+    template = "{0.name}: {1}" if len(diagnoses) > 1 else "{1}"
     moments = tuple(
-        named.format(log, text) for log in logs for text in departures(fit, log)
+        template.format(log, text) for log in logs for text in departures(fit, log)
     )
     return (
         likely_mistakes(fit, logs, diagnoses[0].motor_sides, moments)
@@ -268,16 +305,17 @@ def _excerpt(log: Observations, source: SamplesOnDisk) -> Recording:
     dt = log.sample_time
     # With a filter of a long memory, one long stretch tells more than several short
     # ones.
-    count = 4 if log.samples > EXAMINED >= 80 * log.filter.edge(dt) else 1
-    length = min(log.samples, EXAMINED) // count
-    parts, times = [], []
+    count = 4 if log.samples > MAX_SAMPLES >= 80 * log.filter.edge(dt) else 1
+    length = min(log.samples, MAX_SAMPLES) // count
+    parts = []
+    times = []
     for start in np.linspace(0, log.samples - length, count).astype(int).tolist():
-        for (first, last), time in zip(log.segments, log.start_times, strict=True):
-            a = max(first, start)
-            b = min(last, start + length)
+        for (begin, end), time in zip(log.segments, log.start_times, strict=True):
+            a = max(begin, start)
+            b = min(end, start + length)
             if b - a >= MIN_SAMPLES:
                 parts.append(source.read_rows(slice(a, b)))
-                times.append(time + dt * (np.arange(a, b) - first))
+                times.append(time + dt * (np.arange(a, b) - begin))
     angles, velocities, forces = zip(*parts, strict=True)
     return Recording(
         time=np.concatenate(times),
@@ -300,39 +338,41 @@ def departures(fit: Fit, observations: Observations) -> tuple[str, ...]:
     where they matter more than usual errors, the motion is one that the fit does not
     know.
     """
-    o, robot = observations, fit.base.model.robot
-    motion, forces = o.motion[o.instants], np.asarray(o.reduced_forces)
+    o = observations
+    robot = fit.base.model.robot
+    motion = o.motion[o.instants]
+    forces = np.asarray(o.reduced_forces)
     errors = (
         np.abs(forces - fit.predict(motion) - fit.base.tool_forces(motion)) * o.mask
     )
-    size = np.sqrt(np.mean(forces**2, axis=0))
+    rms_forces = np.sqrt(np.mean(forces**2, axis=0))
     length = o.filter.edge(o.sample_time) + 0.01 * o.samples
-    found = []
+    findings = []
     for j, (name, error) in enumerate(zip(robot.joint_names, errors.T, strict=True)):
         k = int(np.argmax(error))
-        others = error[np.abs(o.instants - o.instants[k]) > length]
+        other_errors = error[np.abs(o.instants - o.instants[k]) > length]
         row = np.asarray(fit.base.regressor(motion[k]))[j]
         deviation = _deviation(fit, row)
-        usual = others.max(initial=0.0)
-        if deviation <= usual and error[k] > max(
-            0.5 * size[j], 5.0 * (deviation + usual)
+        usual_error = other_errors.max(initial=0.0)
+        if deviation <= usual_error and error[k] > max(
+            0.5 * rms_forces[j], 5.0 * (deviation + usual_error)
         ):
-            found.append(
+            findings.append(
                 f"the force of joint `{name}` departs from the model by {error[k]:.3g} "
                 f"{robot.force_unit(j)} at {o.time[o.instants[k]]:.5g} s, and at no "
                 "other time by a fifth of that: a contact or a fault of a sensor; "
                 "leave that part out (`recording.start`, `recording.stop`)."
             )
-    return tuple(found)
+    return tuple(findings)
 
 
 def _deviation(fit: Fit, row: np.ndarray) -> float:
     """Return a parameter combination's standard deviation; infinite if undetermined."""
-    used = np.flatnonzero(row)
-    covariance = np.asarray(fit.covariance)[np.ix_(used, used)]
+    columns = np.flatnonzero(row)
+    covariance = np.asarray(fit.covariance)[np.ix_(columns, columns)]
     if not np.isfinite(covariance).all():
         return np.inf
-    return float(np.sqrt(row[used] @ covariance @ row[used]))
+    return float(np.sqrt(row[columns] @ covariance @ row[columns]))
 
 
 def negative_friction(fit: Fit, logs: Sequence[Observations]) -> tuple[str, ...]:
@@ -342,31 +382,35 @@ def negative_friction(fit: Fit, logs: Sequence[Observations]) -> tuple[str, ...]
     count less their mean: in one direction dry friction cannot be told from an offset
     of the force.
     """
-    base, robot = fit.base, fit.base.model.robot
-    p = np.asarray(fit.parameters)
+    base = fit.base
+    robot = fit.base.model.robot
+    parameters = np.asarray(fit.parameters)
     motions = [log.motion[log.instants[:: -(-log.rows // INSTANTS)]] for log in logs]
     rows = [base.regressor_rows(motion) for motion in motions]
-    found = []
-    for j, (name, own) in enumerate(
+    findings = []
+    for j, (name, own_columns) in enumerate(
         zip(robot.joint_names, base.acting_columns, strict=True)
     ):
         friction = [
             k
-            for k, i in enumerate(own)
+            for k, i in enumerate(own_columns)
             if re.fullmatch(rf"f(?!o)[a-z]+{j + 1}", base.names[i])
         ]
-        power, columns = np.zeros(base.size), [own[k] for k in friction]
-        for motion, each in zip(motions, rows, strict=True):
+        power = np.zeros(base.size)
+        columns = [own_columns[k] for k in friction]
+        for motion, motion_rows in zip(motions, rows, strict=True):
             velocity = np.asarray(motion.qd)[:, j]
-            power[columns] += (velocity - velocity.mean()) @ each[j][:, friction]
-        if power @ p < -SURE * _deviation(fit, power):
-            named = " and ".join(base.names[i] for i in columns if p[i] < 0)
-            found.append(
-                f"friction of joint `{name}` comes out negative ({named}): it would "
-                "drive the joint; something in the model or the log of this joint is "
-                "wrong."
+            power[columns] += (velocity - velocity.mean()) @ motion_rows[j][:, friction]
+        if power @ parameters < -MIN_DEVIATIONS * _deviation(fit, power):
+            parameter_names = " and ".join(
+                base.names[i] for i in columns if parameters[i] < 0
             )
-    return tuple(found)
+            findings.append(
+                f"friction of joint `{name}` comes out negative ({parameter_names}): "
+                "it would drive the joint; something in the model or the log of this "
+                "joint is wrong."
+            )
+    return tuple(findings)
 
 
 def delay_notes(
@@ -382,20 +426,24 @@ def delay_notes(
     except ValueError:
         return ()
     # What is advised must be sure.
-    low, high = (1e3 * x for x in delay.interval(0.9999))
+    min_delay, max_delay = (1e3 * x for x in delay.interval(0.9999))
     text = (
-        f"the forces stand between {low:.2g} and {high:.2g} ms later in the log "
-        "than the angles"
+        f"the forces stand between {min_delay:.2g} and {max_delay:.2g} ms later in "
+        "the log than the angles"
     )
     # A delay of a bus is that of all joints; other effects differ from joint to joint.
-    if low <= 0.0 <= high or abs(delay.seconds) < float(np.std(delay.of_joints)):
+    if min_delay <= 0.0 <= max_delay or abs(delay.seconds) < float(
+        np.std(delay.of_joints)
+    ):
         return (f"{text}: a delay cannot be told from none.",)
     if delay.p_value <= 0.001:
-        least, most = (
+        min_joint_delay, max_joint_delay = (
             1e3 * float(x) for x in (np.min(delay.of_joints), np.max(delay.of_joints))
         )
-        apart = f"{least:.3g} to {most:.3g} ms joint by joint"
-        return (f"{text}, but {apart}: as likely, the model lacks an effect.",)
+        delay_range = (
+            f"{min_joint_delay:.3g} to {max_joint_delay:.3g} ms joint by joint"
+        )
+        return (f"{text}, but {delay_range}: as likely, the model lacks an effect.",)
     if commanded is None and delay.feedback > 0.1 * abs(delay.seconds):
         cure = "name the commanded angles (`recording.commands`) to tell how much"
     else:

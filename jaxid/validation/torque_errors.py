@@ -25,9 +25,9 @@ from jaxid.result_table import (
 
 POSES = 2000
 """Random poses in which the mass matrix is evaluated."""
-ROWS = 2**18
+MAX_ROWS = 2**18
 """Largest number of rows that are compared."""
-STANDING = 0.01
+REST_SHARE = 0.01
 """Fraction of a joint's largest speed up to which it stands."""
 OCTAVES = 6
 """Number of times that a joint's largest speed is halved for classes of its speed."""
@@ -65,7 +65,7 @@ class TorqueErrors(eqx.Module):
     def moving(self) -> Bool[np.ndarray, "rows joints"]:
         """Rows in which each joint moves faster than 1 % of its largest speed."""
         sizes = np.abs(self.speeds)
-        return sizes > STANDING * sizes.max(axis=0)
+        return sizes > REST_SHARE * sizes.max(axis=0)
 
     @property
     def errors(self) -> Float[np.ndarray, "rows joints"]:
@@ -132,11 +132,11 @@ class TorqueErrors(eqx.Module):
         )
         return tuple(_chance(e, v) <= limit for e, v in pairs)
 
-    def _rms_where(self, chosen: np.ndarray) -> np.ndarray:
+    def _rms_where(self, row_mask: np.ndarray) -> np.ndarray:
         squares = (self.errors - self.offset) ** 2
-        chosen = chosen & np.isfinite(squares)
+        row_mask = row_mask & np.isfinite(squares)
         return np.sqrt(
-            _ratio(np.sum(squares, axis=0, where=chosen), np.sum(chosen, axis=0))
+            _ratio(np.sum(squares, axis=0, where=row_mask), np.sum(row_mask, axis=0))
         )
 
     @property
@@ -168,17 +168,28 @@ def _chance(
 
     It is one if these means make up less than a tenth of the squared errors.
     """
-    counted = np.isfinite(errors)
-    e, v = errors[counted], speeds[counted]
-    if len(e) < BLOCKS or not v.any() or not e.any():
+    row_mask = np.isfinite(errors)
+    counted_errors = errors[row_mask]
+    counted_speeds = speeds[row_mask]
+    if (
+        len(counted_errors) < BLOCKS
+        or not counted_speeds.any()
+        or not counted_errors.any()
+    ):
         return 1.0
-    octave = np.log2(np.maximum(np.abs(v) / np.abs(v).max(), 0.5**OCTAVES))
-    classes = (2 * np.round(octave + OCTAVES) + (v < 0)).astype(int)
+    octave = np.log2(
+        np.maximum(np.abs(counted_speeds) / np.abs(counted_speeds).max(), 0.5**OCTAVES)
+    )
+    classes = (2 * np.round(octave + OCTAVES) + (counted_speeds < 0)).astype(int)
     sums = np.zeros((BLOCKS, 2 * OCTAVES + 2))
-    np.add.at(sums, (np.arange(len(e)) * BLOCKS // len(e), classes), e)
+    np.add.at(
+        sums,
+        (np.arange(len(counted_errors)) * BLOCKS // len(counted_errors), classes),
+        counted_errors,
+    )
     sums /= np.sqrt(np.maximum(np.bincount(classes, minlength=sums.shape[1]), 1))
     products = np.triu(sums @ sums.T, 1)
-    if 2.0 * products.sum() * BLOCKS / (BLOCKS - 1) < 0.1 * np.sum(e**2):
+    if 2.0 * products.sum() * BLOCKS / (BLOCKS - 1) < 0.1 * np.sum(counted_errors**2):
         return 1.0
     signs = np.array(list(itertools.product((1.0, -1.0), repeat=BLOCKS - 1)))
     signs = np.column_stack([np.ones(len(signs)), signs])
@@ -186,10 +197,12 @@ def _chance(
     return float(np.mean(agreement >= agreement[0] - 1e-9 * np.abs(products).sum()))
 
 
-def _ratio(part: np.ndarray | float, whole: np.ndarray | float) -> np.ndarray:
+def _ratio(
+    numerator: np.ndarray | float, denominator: np.ndarray | float
+) -> np.ndarray:
     """Return a ratio; NaN where the denominator is zero."""
-    whole = np.asarray(whole, np.float64)
-    return np.asarray(part / np.where(whole > 0, whole, np.nan))
+    denominator = np.asarray(denominator, np.float64)
+    return np.asarray(numerator / np.where(denominator > 0, denominator, np.nan))
 
 
 class Definiteness(eqx.Module):
@@ -303,48 +316,48 @@ def torque_errors(
     """Compare the forces that a model predicts with measured ones (Eqs. 27, 37).
 
     The prediction is filtered and decimated like the measurement, in parts. Of more
-    than `ROWS` rows every n-th is compared.
+    than `MAX_ROWS` rows every n-th is compared.
     """
-    known = fit.base.model.robot.known_max_forces
+    max_forces = fit.base.model.robot.known_max_forces
     observations = with_memory(observations, fit.base.model.memory)
     step = comparison_step(observations)
     mask = np.asarray(observations.mask)
     estimator = WeightedLeastSquares(ResidualVariances())
-    own = estimator(RegressionProblem(fit.base, [observations])).parameters
-    found = np.zeros((5, len(mask[::step]), observations.joints))
+    own_parameters = estimator(RegressionProblem(fit.base, [observations])).parameters
+    columns = np.zeros((5, len(mask[::step]), observations.joints))
     for chunk in observations.chunks(65536):
-        first, stop = chunk.rows
+        start, stop = chunk.rows
         # Masked parts are not evaluated.
-        if mask[first:stop].any():
+        if mask[start:stop].any():
             motion, forces = observations.read(slice(*chunk.samples))
             tool = fit.base.tool_forces(motion)
-            predicted = fit.predict(motion) + tool
-            refitted = fit.base.forces_in_numpy(own, motion) + tool
-            rows = slice(-(-first // step), -(-stop // step))
-            taken = slice(rows.start * step - first, None, step)
+            predicted_forces = fit.predict(motion) + tool
+            refitted_forces = fit.base.forces_in_numpy(own_parameters, motion) + tool
+            rows = slice(-(-start // step), -(-stop // step))
+            chunk_rows = slice(rows.start * step - start, None, step)
             for kind, x in enumerate(
-                (forces, predicted, refitted, motion.qd, motion.q)
+                (forces, predicted_forces, refitted_forces, motion.qd, motion.q)
             ):
-                found[kind, rows] = chunk.reduce(x)[taken]
+                columns[kind, rows] = chunk.reduce(x)[chunk_rows]
         if progress is not None:
             progress(stop / observations.rows)
-    measured, predicted, refitted, speeds, q = found
+    measured_forces, predicted_forces, refitted_forces, speeds, positions = columns
     return TorqueErrors(
         name=observations.name,
         time=observations.reduced_time[::step],
-        measured=measured,
-        predicted=predicted,
+        measured=measured_forces,
+        predicted=predicted_forces,
         counted=mask[::step],
-        max_forces=np.where(np.isfinite(known), known, np.nan),
+        max_forces=np.where(np.isfinite(max_forces), max_forces, np.nan),
         speeds=speeds,
-        unexplained=np.where(mask[::step], refitted - measured, np.nan),
-        positions=q,
+        unexplained=np.where(mask[::step], refitted_forces - measured_forces, np.nan),
+        positions=positions,
     )
 
 
 def comparison_step(observations: Observations) -> int:
     """Return the n of the observations of which every n-th row is compared."""
-    return -(-observations.rows // ROWS)
+    return -(-observations.rows // MAX_ROWS)
 
 
 def definiteness(fit: Fit, poses: int = POSES) -> Definiteness:
@@ -354,19 +367,20 @@ def definiteness(fit: Fit, poses: int = POSES) -> Definiteness:
     rail without limits stays within a metre of zero.
     """
     robot = fit.base.model.robot
-    half = np.where(np.array(robot.revolute), np.pi, 1.0)
-    low, high = (
-        np.asarray(robot.limits.position_min),
-        np.asarray(robot.limits.position_max),
+    half_range = np.where(np.array(robot.revolute), np.pi, 1.0)
+    lower_limits = np.asarray(robot.limits.position_min)
+    upper_limits = np.asarray(robot.limits.position_max)
+    lower_limits = np.where(np.isfinite(lower_limits), lower_limits, -half_range)
+    upper_limits = np.where(np.isfinite(upper_limits), upper_limits, half_range)
+    q = np.random.default_rng(0).uniform(
+        lower_limits, upper_limits, (poses, robot.joints)
     )
-    low, high = (
-        np.where(np.isfinite(low), low, -half),
-        np.where(np.isfinite(high), high, half),
-    )
-    q = np.random.default_rng(0).uniform(low, high, (poses, robot.joints))
     M = in_numpy(fit.base, fit.base.inertia, q, shared=(fit.parameters,))
-    smallest = np.linalg.eigvalsh(M)[:, 0]
-    worst = int(np.argmin(smallest))
+    min_eigenvalues = np.linalg.eigvalsh(M)[:, 0]
+    worst_pose = int(np.argmin(min_eigenvalues))
     return Definiteness(
-        float(smallest[worst]), q[worst], float(np.mean(smallest <= 0.0)), poses
+        float(min_eigenvalues[worst_pose]),
+        q[worst_pose],
+        float(np.mean(min_eigenvalues <= 0.0)),
+        poses,
     )

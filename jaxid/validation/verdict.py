@@ -20,11 +20,11 @@ RMS_ERROR = (5.0, 50.0)
 """RMS errors on new motions: good, and tolerable [% of the RMS force, worst joint]."""
 FIT_ERROR = (1.0, 30.0)
 """Missed forces of a fit, noise apart: good, and tolerable [% of the RMS force]."""
-MATERIAL = 2.0
+MIN_UNSEEN_ERROR = 2.0
 """Errors on new motions that are judged relative to the fit's [% of the RMS force]."""
 UNSEEN_RATIO = 1.5
 """Errors on new motions, relative to those of the fit, that are good."""
-LARGE_CONDITION = 1e3
+MAX_CONDITION_NUMBER = 1e3
 """Condition number (scaled columns) above which parameters are hard to tell apart."""
 PRICE = (10.0, 100.0)
 """Increase of the residuals by bounds that is good, and tolerable [%]."""
@@ -72,10 +72,11 @@ class Report:
 
 def verdict(report: Report) -> list[Remark]:
     """Return the verdict on a model: one sentence for all, then one per criterion."""
-    fit, definiteness = report.fit, report.definiteness
+    fit = report.fit
+    definiteness = report.definiteness
     condition = fit.condition_numbers.scaled
     eigenvalue = significant(definiteness.smallest)
-    found = [
+    remarks = [
         *(Remark(text, Status.BAD) for text in dict.fromkeys(report.mistakes)),
         *(Remark(text, Status.DOUBTFUL) for text in dict.fromkeys(report.doubts)),
         _judge_fit(fit, report.identification),
@@ -102,52 +103,60 @@ def verdict(report: Report) -> list[Remark]:
         Remark(
             "The condition number with columns of length one is "
             f"{significant(condition, 3)}.",
-            Status.GOOD if condition < LARGE_CONDITION else Status.DOUBTFUL,
-            f"Good: below {LARGE_CONDITION:g}. Above, some parameters are hard to "
+            Status.GOOD if condition < MAX_CONDITION_NUMBER else Status.DOUBTFUL,
+            f"Good: below {MAX_CONDITION_NUMBER:g}. Above, some parameters are hard to "
             "tell apart.",
         ),
         *_judge_signs(fit),
         *_judge_bounds(fit),
         *_judge_offsets(fit),
     ]
-    statuses = [remark.status for remark in found]
+    statuses = [remark.status for remark in remarks]
     if Status.BAD in statuses:
-        whole = Remark(
+        overall_remark = Remark(
             "Do not rely on this model yet: what is marked ✗ comes first.", Status.BAD
         )
     elif Status.DOUBTFUL in statuses:
         text = "A usable model; look at what is marked ! before you rely on it."
-        whole = Remark(text, Status.DOUBTFUL)
+        overall_remark = Remark(text, Status.DOUBTFUL)
     else:
-        whole = Remark("A good model: all criteria below are met.", Status.GOOD)
-    return [whole, *found]
+        overall_remark = Remark(
+            "A good model: all criteria below are met.", Status.GOOD
+        )
+    return [overall_remark, *remarks]
 
 
 def _judge_fit(fit: Fit, logs: Sequence[TorqueErrors]) -> Remark:
     """Judge how much of the forces a fit misses, unless that is white noise."""
-    spectra, names = fit.residual_spectra, fit.base.model.robot.joint_names
-    missed, found = 100 * _relative(logs), []
+    spectra = fit.residual_spectra
+    names = fit.base.model.robot.joint_names
+    misfits = 100 * _relative_errors(logs)
+    causes = []
     # Of a residual that is white, no part counts; of others about what departs from
     # white noise.
-    coloured = np.ones(len(names))
+    coloured_shares = np.ones(len(names))
     if spectra is not None:
-        coloured = (
+        coloured_shares = (
             np.clip(np.asarray(spectra.departure) - spectra.limit, 0.0, None) ** 0.5
         )
-        share = sum(coloured == 0)
-        found = [f"the residuals of {share} of {len(names)} joints are white noise"]
-    worst = int(np.argmax(missed * np.where(coloured > 0, 1.0, 1e-3)))
-    lacking = float(np.max(missed * coloured))
-    status = Status.GOOD if lacking <= FIT_ERROR[0] else Status.DOUBTFUL
+        white_count = sum(coloured_shares == 0)
+        causes = [
+            f"the residuals of {white_count} of {len(names)} joints are white noise"
+        ]
+    worst_joint = int(np.argmax(misfits * np.where(coloured_shares > 0, 1.0, 1e-3)))
+    coloured_misfit = float(np.max(misfits * coloured_shares))
+    status = Status.GOOD if coloured_misfit <= FIT_ERROR[0] else Status.DOUBTFUL
     if status is Status.DOUBTFUL:
-        found.append("some effect is not in the model, or the noise itself is coloured")
-        status = Status.BAD if missed[worst] > FIT_ERROR[1] else status
+        causes.append(
+            "some effect is not in the model, or the noise itself is coloured"
+        )
+        status = Status.BAD if misfits[worst_joint] > FIT_ERROR[1] else status
     text = (
-        f"The model misses up to {significant(missed[worst], 2)} % of the RMS "
+        f"The model misses up to {significant(misfits[worst_joint], 2)} % of the RMS "
         "forces that it "
     )
     return Remark(
-        f"{text}was fitted to (joint `{names[worst]}`): {', '.join(found)}.",
+        f"{text}was fitted to (joint `{names[worst_joint]}`): {', '.join(causes)}.",
         status,
         f"Good: white noise, or up to {FIT_ERROR[0]:g} % that are not; tolerable: up "
         f"to {FIT_ERROR[1]:g} %. Bartlett's test compares the cumulative spectrum with "
@@ -158,10 +167,12 @@ def _judge_fit(fit: Fit, logs: Sequence[TorqueErrors]) -> Remark:
 
 def _judge_friction(fit: Fit, logs: Sequence[TorqueErrors]) -> Iterator[Remark]:
     """Warn if errors on the logs of a fit depend on the speeds of the joints."""
-    found = np.any([e.depend_on_speed for e in logs], axis=0)
+    speed_dependence = np.any([e.depend_on_speed for e in logs], axis=0)
     names = [
         f"`{n}`"
-        for n, x in zip(fit.base.model.robot.joint_names, found, strict=False)
+        for n, x in zip(
+            fit.base.model.robot.joint_names, speed_dependence, strict=False
+        )
         if x
     ]
     if names:
@@ -175,27 +186,27 @@ def _judge_friction(fit: Fit, logs: Sequence[TorqueErrors]) -> Iterator[Remark]:
         )
 
 
-def _relative(logs: Sequence[TorqueErrors]) -> np.ndarray:
+def _relative_errors(logs: Sequence[TorqueErrors]) -> np.ndarray:
     """Return the RMS errors over the RMS forces of each joint, all logs together."""
-    rms, forces = (
+    rms_errors, rms_forces = (
         np.sqrt(np.mean([np.asarray(x) ** 2 for x in group], axis=0))
         for group in ([e.rms for e in logs], [e.force_rms for e in logs])
     )
     # Forces below a hundredth of the largest count as that.
-    least = 0.01 * np.nan_to_num(np.asarray(logs[0].max_forces))
-    forces = np.maximum(forces, least)
-    return np.nan_to_num(rms / np.where(forces > 0, forces, np.inf))
+    min_forces = 0.01 * np.nan_to_num(np.asarray(logs[0].max_forces))
+    rms_forces = np.maximum(rms_forces, min_forces)
+    return np.nan_to_num(rms_errors / np.where(rms_forces > 0, rms_forces, np.inf))
 
 
 def _constant_share(logs: Sequence[TorqueErrors], joint: int) -> float:
     """Return the share of means of single logs in a joint's squared errors (0 to 1)."""
     errors = [e.errors[:, joint] for e in logs]
-    whole = float(sum(np.nansum(e**2) for e in errors))
+    total = float(sum(np.nansum(e**2) for e in errors))
     counts = [np.count_nonzero(np.isfinite(e)) for e in errors]
     means = sum(
         n * np.nanmean(e) ** 2 for n, e in zip(counts, errors, strict=True) if n
     )
-    return float(means) / whole if whole > 0 else 0.0
+    return float(means) / total if total > 0 else 0.0
 
 
 def _judge_new_motions(
@@ -206,49 +217,58 @@ def _judge_new_motions(
             "The model was not validated on an unseen log: use `--verify` or `--split`."
         )
         return Remark(text, Status.DOUBTFUL)
-    unseen = 100 * _relative(verification)
-    worst = float(np.max(unseen))
+    unseen_errors = 100 * _relative_errors(verification)
+    max_error = float(np.max(unseen_errors))
     text = (
-        f"On logs that the fit has not seen, it misses up to {significant(worst, 2)} % "
-        "of the RMS forces"
+        "On logs that the fit has not seen, it misses up to "
+        f"{significant(max_error, 2)} % of the RMS forces"
     )
     # Errors that do not matter may grow.
-    ratios = unseen / np.maximum(100 * _relative(identification), 1e-9)
-    ratio = float(np.max(np.where(unseen > MATERIAL, ratios, 1.0)))
+    ratios = unseen_errors / np.maximum(100 * _relative_errors(identification), 1e-9)
+    ratio = float(np.max(np.where(unseen_errors > MIN_UNSEEN_ERROR, ratios, 1.0)))
     if ratio > 1:
         text += f", and up to {significant(ratio, 2)} times as much as of the fit's own"
-    worst_joint = int(np.argmax(unseen))
-    constant = _constant_share(verification, worst_joint)
-    if worst > RMS_ERROR[0] and constant > OFFSET:
-        share = significant(100 * constant, 2)
+    worst_joint = int(np.argmax(unseen_errors))
+    constant_share = _constant_share(verification, worst_joint)
+    if max_error > RMS_ERROR[0] and constant_share > OFFSET:
+        share = significant(100 * constant_share, 2)
         text += (
             f"; {share} % of the squared error of joint {worst_joint + 1}, the "
             "worst, is a "
         )
         text += "constant of the log, such as an offset of a sensor"
-    average = max(float(np.mean(e.mean_percent)) for e in verification)
-    if np.isfinite(average):
-        text += f"; mean errors are {significant(average, 2)} % of the largest forces"
+    mean_error = max(float(np.mean(e.mean_percent)) for e in verification)
+    if np.isfinite(mean_error):
+        text += (
+            f"; mean errors are {significant(mean_error, 2)} % of the largest forces"
+        )
     status = Status.GOOD
-    if worst > RMS_ERROR[0] or ratio > UNSEEN_RATIO:
-        status = Status.BAD if worst > RMS_ERROR[1] else Status.DOUBTFUL
+    if max_error > RMS_ERROR[0] or ratio > UNSEEN_RATIO:
+        status = Status.BAD if max_error > RMS_ERROR[1] else Status.DOUBTFUL
     detail = (
         f"Good: up to {RMS_ERROR[0]:g} % for every joint, and {UNSEEN_RATIO:g} times "
-        f"the errors of the fit where they exceed {MATERIAL:g} %; tolerable: up to "
-        f"{RMS_ERROR[1]:g} %. Mean errors by Eq. 37: the paper states below 1 %."
+        f"the errors of the fit where they exceed {MIN_UNSEEN_ERROR:g} %; tolerable: "
+        f"up to {RMS_ERROR[1]:g} %. Mean errors by Eq. 37: the paper states below 1 %."
     )
     return Remark(f"{text}.", status, detail)
 
 
 def _judge_signs(fit: Fit) -> Iterator[Remark]:
     """Name friction and rotor inertias that are negative beyond two deviations."""
-    base, robot = fit.base, fit.base.model.robot
+    base = fit.base
+    robot = fit.base.model.robot
     if any(term.shares_friction for term in base.model.terms):
         return  # only the sum of all friction cannot be negative
-    least = np.concatenate([term.lower_bounds(robot) for term in base.model.terms])
-    alone = ~np.any(np.asarray(base.kappa), axis=1) & (least[list(base.indices)] == 0.0)
-    below = np.asarray(fit.parameters) < -2.0 * fit.standard_deviations
-    if names := [f"`{base.names[k]}`" for k in np.flatnonzero(alone & below)]:
+    lower_bounds = np.concatenate(
+        [term.lower_bounds(robot) for term in base.model.terms]
+    )
+    is_single_bounded = ~np.any(np.asarray(base.kappa), axis=1) & (
+        lower_bounds[list(base.indices)] == 0.0
+    )
+    is_negative = np.asarray(fit.parameters) < -2.0 * fit.standard_deviations
+    if names := [
+        f"`{base.names[k]}`" for k in np.flatnonzero(is_single_bounded & is_negative)
+    ]:
         yield Remark(
             "Friction or rotor inertia comes out negative, as neither is: "
             f"{', '.join(names)}.",
@@ -264,12 +284,12 @@ def _judge_bounds(fit: Fit) -> Iterator[Remark]:
     if fit.consistency is None:
         return
     price = 100 * fit.consistency.residual_increase
-    active = "; ".join(fit.consistency.active) or "none"
+    active_bounds = "; ".join(fit.consistency.active) or "none"
     status = Status.GOOD if price <= PRICE[0] else Status.DOUBTFUL
     status = Status.BAD if price > PRICE[1] else status
     yield Remark(
         f"All bodies are physically consistent, for {significant(price, 2)} % larger "
-        f"residuals; active bounds: {active}",
+        f"residuals; active bounds: {active_bounds}",
         status,
         f"Good: up to {PRICE[0]:g} %; tolerable: up to {PRICE[1]:g} %. Above, the logs "
         "contradict the bounds: check `total_mass`, `mass_max`, units and signs.",
@@ -284,12 +304,12 @@ def _judge_offsets(fit: Fit) -> Iterator[Remark]:
     (offset,) = ConstantOffset.joint_parameters
     for j, name in enumerate(robot.joint_names):
         value, deviation = map(float, values.get(f"{offset.name}{j + 1}", (0.0, 0.0)))
-        largest = float(robot.known_max_forces[j])
-        if abs(value) - 2.0 * deviation > OFFSET * largest:
+        max_force = float(robot.known_max_forces[j])
+        if abs(value) - 2.0 * deviation > OFFSET * max_force:
             unit = robot.force_unit(j)
             yield Remark(
                 f"Joint `{name}` has a constant force of {significant(value, 3)} "
-                f"{unit}, and its limit is {significant(largest, 3)} {unit}: is "
+                f"{unit}, and its limit is {significant(max_force, 3)} {unit}: is "
                 "`gravity` right, or does a spring or a cable pull?",
                 Status.DOUBTFUL,
                 f"Good: up to {100 * OFFSET:g} % of the largest force.",
