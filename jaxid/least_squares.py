@@ -72,6 +72,8 @@ class _Linearisation(NamedTuple):
     Attributes:
         residuals: Residuals [rows].
         jacobian: Their derivatives [rows, unknowns].
+        cost: Sum of their squares; infinite before the first step, which only
+            linearises.
         damping: Damping of the next step, relative to the columns of the Jacobian.
         decrease: Relative decrease of the sum of squares by the last step that was
             taken.
@@ -79,6 +81,7 @@ class _Linearisation(NamedTuple):
 
     residuals: Float[Array, " rows"]
     jacobian: Float[Array, "rows unknowns"]
+    cost: Float[Array, ""]
     damping: Float[Array, ""]
     decrease: Float[Array, ""]
 
@@ -95,30 +98,35 @@ class BoundedLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     rtol: float = 1e-8
     atol: float = 0.0
     norm: Callable[[Any], Array] = optx.max_norm
-    start_damping: float = 1e-3
+    start_damping: float = 1e-2
     max_damping: float = 1e9
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags):
-        """Return the first linearisation."""
-        values, jacobian = _linearise(fn, y, args)
-        damping = jnp.asarray(self.start_damping, y.dtype)
-        return _Linearisation(values, jacobian, damping, jnp.asarray(1.0, y.dtype))
+        """Return a state without derivatives, which the first step computes."""
+        return _Linearisation(
+            residuals=jnp.zeros(f_struct.shape, f_struct.dtype),
+            jacobian=jnp.zeros((f_struct.size, y.size), f_struct.dtype),
+            cost=jnp.asarray(jnp.inf, y.dtype),
+            damping=jnp.asarray(self.start_damping, y.dtype),
+            decrease=jnp.asarray(1.0, y.dtype),
+        )
 
     def step(self, fn, y, args, options, state, tags):
         """Take one step, or none if it does not lower the sum of squares."""
         lower, upper = options["lower"], options["upper"]
         trial = jnp.clip(y + _damped_step(y, state, lower, upper), lower, upper)
         values, jacobian = _linearise(fn, trial, args)
-        cost = jnp.sum(state.residuals**2)
-        decrease = cost - jnp.sum(values**2)
-        is_better = decrease > 0
+        cost = jnp.sum(values**2)
+        is_better = cost < state.cost
 
         factor = jnp.where(is_better, 0.1, 10.0)
+        relative_cost = cost / jnp.maximum(state.cost, jnp.finfo(y.dtype).tiny)
         accepted = _Linearisation(
-            values,
-            jacobian,
-            jnp.maximum(state.damping * factor, 1e-12),
-            decrease / jnp.maximum(cost, jnp.finfo(y.dtype).tiny),
+            residuals=values,
+            jacobian=jacobian,
+            cost=cost,
+            damping=jnp.maximum(state.damping * factor, 1e-12),
+            decrease=1.0 - relative_cost,
         )
         refused = state._replace(damping=state.damping * factor)
         following = jax.tree.map(

@@ -38,8 +38,14 @@ def logs(base):
     return _observed(base, 0), _observed(base, 1)
 
 
-def test_late_torques_are_found_and_the_simulation_is_closer(base, logs):
-    found, other = jid.rollout.identify_torque_rollout(base, logs[0]), logs[1]
+@pytest.fixture(scope="module")
+def fit(base, logs):
+    """The fit to the first log."""
+    return jid.rollout.identify_torque_rollout(base, logs[0])
+
+
+def test_late_torques_are_found_and_the_simulation_is_closer(base, logs, fit):
+    found, other = fit, logs[1]
     assert found.errors_at(other, 0.2).max() < 2e-3
     assert (
         found.errors_at(other, 0.2) < 0.2 * found.errors_at(other, 0.2, found.start)
@@ -52,9 +58,8 @@ def test_late_torques_are_found_and_the_simulation_is_closer(base, logs):
     assert "delay" in str(found)
 
 
-def test_simulated_windows_start_on_the_measured_positions(base, logs):
-    found = jid.rollout.identify_torque_rollout(base, logs[0])
-    (time, measured, simulated), steps = found.simulate(logs[1]), round(0.2 / 0.002)
+def test_simulated_windows_start_on_the_measured_positions(logs, fit):
+    (time, measured, simulated), steps = fit.simulate(logs[1]), round(0.2 / 0.002)
     starts = np.arange(0, len(time), steps + 2)
     np.testing.assert_array_equal(simulated[starts], measured[starts])
     assert np.isnan(simulated[starts + steps + 1]).all()
@@ -63,7 +68,7 @@ def test_simulated_windows_start_on_the_measured_positions(base, logs):
         measured, np.asarray(logs[1].motion.q)[places], atol=1e-12
     )
     sizes = np.sqrt(np.mean((simulated - measured)[starts + steps] ** 2, axis=0))
-    np.testing.assert_allclose(sizes, found.errors_at(logs[1], 0.2), rtol=0.3)
+    np.testing.assert_allclose(sizes, fit.errors_at(logs[1], 0.2), rtol=0.3)
 
 
 def test_rollouts_take_the_bias_of_noisy_encoders_away(path, base):
