@@ -1,6 +1,7 @@
 """Each term against its formula, and what all terms have in common."""
 
 import inspect
+from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -148,6 +149,9 @@ def test_the_contract_covers_every_term():
         "add the new term to the list `ALL` of this file"
     )
     assert members == set(terms.TERMS.values()), "add the new term to `TERMS`"
+    conventions = (Path(__file__).parents[2] / "docs" / "conventions.md").read_text()
+    for term in members:
+        assert f"`{term.__name__}" in conventions, "add a row to docs/conventions.md"
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """Contract of every criterion, and each against its textbook formula in NumPy."""
 
 import dataclasses
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -80,6 +81,12 @@ def test_smooth_values_lie_above_the_exact_ones_and_approach_them(criterion):
     exact, blunt, sharp = (float(criterion(info, p)) for p in (None, 4.0, 100.0))
     assert blunt >= sharp - 1e-12 >= exact - 1e-9
     assert sharp - exact < 0.05
+
+
+def test_every_criterion_is_in_the_documentation():
+    page = (Path(__file__).parents[2] / "docs" / "excitation.md").read_text()
+    for name in CRITERIA:
+        assert f"`{name}`" in page, "add a row to the table of docs/excitation.md"
 
 
 def test_values_are_the_textbooks():

@@ -2,6 +2,7 @@
 
 import inspect
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -50,8 +51,15 @@ def test_the_laws_cover_every_filter_and_each_has_a_name():
         for _, c in inspect.getmembers(filters, inspect.isclass)
         if issubclass(c, AbstractFilter) and not inspect.isabstract(c)
     }
-    assert members == {type(f) for f in FILTERS}, "add the filter to the list `FILTERS`"
-    assert members == {*filters.FILTERS.values()}, "give the filter a name"
+    assert members == {type(f) for f in FILTERS}, (
+        "add it to the list `FILTERS` of this file"
+    )
+    assert members == {*filters.FILTERS.values()}, "add the filter to `FILTERS`"
+    data = (Path(__file__).parents[2] / "docs" / "data.md").read_text()
+    for name in filters.FILTERS:
+        assert f'`"{name}"`' in data, (
+            "add a row to the table of filters in docs/data.md"
+        )
 
 
 @every

@@ -97,6 +97,24 @@ def kernel_gain(
     return np.abs(np.polyval(kernel, np.exp(1j * angular)))
 
 
+def weighted_mean(kernel: np.ndarray, sample_time: float) -> Convolution:
+    """Return the mean with weights, an odd number whose sum is one."""
+    cutoff = _half_gain(kernel, sample_time)
+    return Convolution(kernel=tuple(kernel.tolist()), cutoff=cutoff)
+
+
+def _half_gain(kernel: np.ndarray, sample_time: float) -> float:
+    """Return the lowest frequency at which the gain of a weighted mean is 1/2 [Hz]."""
+    # Sixteen lines for each oscillation that fits into the kernel.
+    frequency = np.linspace(0.0, 0.5 / sample_time, 8 * len(kernel) + 1)
+    gain = kernel_gain(kernel, frequency, sample_time)
+    k = int(np.argmax(gain < 0.5))
+    if k == 0:
+        return math.inf  # everything passes
+    neighbours = [k, k - 1]
+    return float(np.interp(0.5, gain[neighbours], frequency[neighbours]))
+
+
 class RecursiveLowPass(AbstractLowPass):
     """Recursive filter that runs forward and backward, as scipy's `sosfiltfilt`.
 

@@ -23,18 +23,17 @@ from .filter import (
 from .low_pass import (
     SETTLED,
     AbstractLowPass,
-    Convolution,
     butterworth,
     correlate,
-    kernel_gain,
     recursive,
     require_cutoff,
+    weighted_mean,
 )
 
 MAX_SERIES_ERROR = 0.05
 """Largest error of a Fourier series, relative to the motion (RMS)."""
 MAX_WINDOW = 10**5
-"""Samples of the longest window of a polynomial."""
+"""Samples of the longest window."""
 
 
 class ZeroPhaseButterworth(AbstractFilter):
@@ -128,9 +127,7 @@ class SavitzkyGolay(AbstractFilter):
         return Motion(q, qd, self._derivative(change, 1, sample_time))
 
     def low_pass(self, sample_time: float) -> AbstractLowPass:  # noqa: D102
-        kernel = self._kernel(0, sample_time)
-        cutoff = half_gain(kernel, sample_time)
-        return Convolution(kernel=tuple(kernel.tolist()), cutoff=cutoff)
+        return weighted_mean(self._kernel(0, sample_time), sample_time)
 
     def edge(self, sample_time: float) -> int:  # noqa: D102
         return settled_edge(self.margin, sample_time, self.low_pass(sample_time))
@@ -140,16 +137,7 @@ class SavitzkyGolay(AbstractFilter):
 
     def _kernel(self, derivative: int, sample_time: float) -> np.ndarray:
         """Return the weights of the samples in a derivative of the polynomial."""
-        # An odd number of samples, so that one of them is in the middle.
-        steps = min(self.window / sample_time, MAX_WINDOW)
-        half = round(0.5 * steps)
-        samples = 2 * half + 1
-        if not self.order < samples < MAX_WINDOW:
-            raise InputError(
-                f"`window` of {self.window:.6g} s has {samples} samples or more at "
-                f"{1 / sample_time:.6g} Hz, but more than {self.order} (`order`) and "
-                f"less than {MAX_WINDOW} are needed: change it, or check `time_unit`."
-            )
+        half = half_window(self.window, sample_time, self.order + 1)
         # Legendre polynomials: powers, as in `scipy.signal.savgol_coeffs`, lose digits.
         places = np.arange(-half, half + 1) / half
         basis = legendre.legvander(places, self.order)
@@ -160,14 +148,18 @@ class SavitzkyGolay(AbstractFilter):
         )
 
 
-def half_gain(kernel: np.ndarray, sample_time: float) -> float:
-    """Return the lowest frequency at which the gain of a weighted mean is 1/2 [Hz]."""
-    # Sixteen lines for each oscillation that fits into the kernel.
-    frequency = np.linspace(0.0, 0.5 / sample_time, 8 * len(kernel) + 1)
-    gain = kernel_gain(kernel, frequency, sample_time)
-    k = int(np.argmax(gain < 0.5))
-    neighbours = [k, k - 1]
-    return float(np.interp(0.5, gain[neighbours], frequency[neighbours]))
+def half_window(window: float, sample_time: float, min_samples: int = 3) -> int:
+    """Return the samples on each side of the one in the middle of a window [s]."""
+    steps = min(window / sample_time, MAX_WINDOW)
+    half = round(0.5 * steps)
+    samples = 2 * half + 1
+    if not min_samples <= samples < MAX_WINDOW:
+        raise InputError(
+            f"`window` of {window:.6g} s has {samples} samples or more at "
+            f"{1 / sample_time:.6g} Hz, but at least {min_samples} and less than "
+            f"{MAX_WINDOW} are needed: change it, or check `time_unit`."
+        )
+    return half
 
 
 class PaperFilter(AbstractFilter):
