@@ -24,7 +24,7 @@ from jaxid.io import union_members
 from jaxid.units import Unit, unit
 from jaxid.workflow.allowed_values import OneOf, quoted
 
-LARGEST = 1e12
+MAX_NUMBER = 1e12
 """Largest number of a key, infinity apart, in any unit."""
 
 
@@ -216,8 +216,8 @@ def _convert_array(value: Any, place: str) -> Any:
             f"`{place}` must hold numbers, in rows of equal length."
         ) from error
     finite_numbers = array[np.isfinite(array)]
-    if (np.abs(finite_numbers) > LARGEST).any():
-        raise InputError(f"`{place}`: no quantity is larger than {LARGEST:g}.")
+    if (np.abs(finite_numbers) > MAX_NUMBER).any():
+        raise InputError(f"`{place}`: no quantity is larger than {MAX_NUMBER:g}.")
     return array
 
 
@@ -227,9 +227,9 @@ def _convert_scalar(value: Any, kind: Any, place: str) -> Any:
     # In Python, but not in TOML, a truth value is a whole number.
     if not isinstance(value, toml_kinds) or isinstance(value, bool) != (kind is bool):
         return _OTHER
-    if kind in (int, float) and math.isfinite(value) and abs(value) > LARGEST:
+    if kind in (int, float) and math.isfinite(value) and abs(value) > MAX_NUMBER:
         raise InputError(
-            f"`{place}` is {value:g}: no quantity is larger than {LARGEST:g}."
+            f"`{place}` is {value:g}: no quantity is larger than {MAX_NUMBER:g}."
         )
     if isinstance(value, str) and not value.isprintable():
         raise InputError(f"`{place}` holds a control character, {value!a}: remove it.")
