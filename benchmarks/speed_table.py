@@ -47,7 +47,8 @@ samples = motion(int(sys.argv[1]))
 base = jid.base_parameters(model)
 forces = np.asarray(model.inverse_dynamics(p, samples))
 forces = forces + np.random.default_rng(2).normal(size=forces.shape)
-rows = jid.Observations.of(*samples, forces, sample_time=1e-3)
+arrays = samples.q, samples.qd, samples.qdd, forces
+rows = jid.Observations.of(*arrays, sample_time=1e-3)
 print(shortest(lambda: jid.identify(base, rows).parameters, 1.0))
 """
 DESIGN = """
