@@ -33,7 +33,7 @@ from jaxid.robot.robot import Robot
 from jaxid.trajectory.trajectory import LinearTrajectory
 from jaxid.workflow.log_identification import identify_logs
 from jaxid.workflow.log_inspection import inspect_logs
-from jaxid.workflow.log_rollout import identify_rollout_logs
+from jaxid.workflow.log_rollout import identify_rollout_from_logs
 from jaxid.workflow.motion_design import (
     MotionTask,
     design_motion,
@@ -43,9 +43,9 @@ from jaxid.workflow.motion_design import (
 from jaxid.workflow.motion_files import make_playable, write_motion
 from jaxid.workflow.repeated_runs import (
     RunsReport,
-    identify_gains_logs,
-    identify_payload_logs,
-    identify_states_logs,
+    identify_gains_from_logs,
+    identify_payload_from_logs,
+    identify_states_from_logs,
 )
 from jaxid.workflow.robot_file import joint_number
 from jaxid.workflow.setup_choice import choose_setup
@@ -307,7 +307,7 @@ def payload(
     carrier = None if body is None else joint_number(robot, body, "--body")
     columns = experiment.require_columns([*logs, *loaded])
     with progress_bar(open_console(stderr=True)) as progress:
-        report = identify_payload_logs(
+        report = identify_payload_from_logs(
             experiment.setup, logs, loaded, columns, carrier, mass, progress
         )
     lines = tool_lines(report.result, robot)
@@ -345,7 +345,7 @@ def gains(
         )
     columns = experiment.require_columns([*logs, *loaded])
     with progress_bar(open_console(stderr=True)) as progress:
-        report = identify_gains_logs(
+        report = identify_gains_from_logs(
             experiment.setup, logs, loaded, columns, experiment.load, progress
         )
     ((key, values),) = report.content.items()
@@ -359,7 +359,7 @@ def states(console: Console, path: Path, logs: list[Path], output: Path) -> None
     experiment = load_experiment(path)
     columns = experiment.require_columns(logs)
     with progress_bar(open_console(stderr=True)) as progress:
-        report = identify_states_logs(experiment.setup, logs, columns, progress)
+        report = identify_states_from_logs(experiment.setup, logs, columns, progress)
     show_runs(console, report, output)
 
 
@@ -388,7 +388,7 @@ def rollout(
     experiment = load_experiment(path)
     columns = experiment.require_columns([*logs, *verify])
     with progress_bar(open_console(stderr=True)) as progress:
-        report = identify_rollout_logs(
+        report = identify_rollout_from_logs(
             experiment.setup, logs, columns, experiment.rollout, verify, progress
         )
         report = dataclasses.replace(report, settings=origin(experiment))

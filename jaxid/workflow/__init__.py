@@ -11,7 +11,7 @@ from .log_reading import LogReading as LogReading
 from .log_rollout import (
     ServoSettings as ServoSettings,
     TorqueSettings as TorqueSettings,
-    identify_rollout_logs as identify_rollout_logs,
+    identify_rollout_from_logs as identify_rollout_from_logs,
 )
 from .motion_design import (
     MotionTask as MotionTask,
@@ -20,9 +20,9 @@ from .motion_design import (
     write_design as write_design,
 )
 from .repeated_runs import (
-    identify_gains_logs as identify_gains_logs,
-    identify_payload_logs as identify_payload_logs,
-    identify_states_logs as identify_states_logs,
+    identify_gains_from_logs as identify_gains_from_logs,
+    identify_payload_from_logs as identify_payload_from_logs,
+    identify_states_from_logs as identify_states_from_logs,
 )
 from .robot_file import RobotFile as RobotFile
 from .setup import Setup as Setup

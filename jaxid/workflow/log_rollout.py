@@ -68,7 +68,7 @@ class TorqueSettings:
     load_friction: bool = False
 
 
-def identify_rollout_logs(
+def identify_rollout_from_logs(
     setup: Setup,
     logs: Sequence[str | Path],
     columns: Columns,

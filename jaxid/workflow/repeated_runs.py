@@ -179,7 +179,7 @@ def fit_with_and_without_load(
     return fit_runs(setup, groups, columns, progress), groups
 
 
-def identify_payload_logs(
+def identify_payload_from_logs(
     setup: Setup,
     unloaded: Sequence[str | Path],
     loaded: Sequence[str | Path],
@@ -212,7 +212,7 @@ def identify_payload_logs(
     return RunsReport("payload", payload, estimates, content, sources, runs.doubts)
 
 
-def identify_gains_logs(
+def identify_gains_from_logs(
     setup: Setup,
     unloaded: Sequence[str | Path],
     loaded: Sequence[str | Path],
@@ -249,7 +249,7 @@ def corrected_gains(columns: Columns, drives: DriveGains) -> dict[str, list[floa
     return {key: (factors * np.asarray(drives.gains)).tolist()}
 
 
-def identify_states_logs(
+def identify_states_from_logs(
     setup: Setup,
     logs: Sequence[str | Path],
     columns: Columns,
