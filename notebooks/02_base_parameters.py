@@ -39,10 +39,6 @@ paper = jid.base_parameters(
 print(f"{paper.model.size} standard parameters, {paper.size} base parameters")
 for k in (0, 1, 2, 7, 10, 25):
     print(f"p_B({k + 1:2}) [{paper.units[k]:5}] = {paper.expressions[k]}")
-print(
-    "with",
-    ", ".join(f"{letter} = {value:g} m" for letter, value in paper.lengths.items()),
-)
 
 # %% [markdown]
 # ## All ten parameters of each body

@@ -140,7 +140,6 @@ CASES = {
         0
     ],
     "base_parameters": lambda: jid.base_parameters(model).kappa,
-    "expressions": lambda: list(base.lengths.values()),
     "identify": lambda: plain().parameters,
     "standard deviations": lambda: plain().standard_deviations,
     "identify float32 arrays": rounded,

@@ -83,7 +83,6 @@ def paper_table(study: Study) -> Table:
     expressions = base.expressions
     speed, acceleration = study.tip_maxima
     definiteness_texts = [str(model.validation.definiteness) for model in study.models]
-    lengths = ", ".join(f"{name} = {base.lengths[name]:g}" for name in ("l2x", "l3z"))
 
     def max_error_text(errors: list[float]) -> str:
         return significant(max(errors), 2)
@@ -91,9 +90,16 @@ def paper_table(study: Study) -> Table:
     rows = [
         ("parameters, all of them", "70", str(base.model.size)),
         ("base parameters", "44", str(base.size)),
-        ("p_B(1) (Eq. 24)", "m1 + m2 + m3 - m4 rc4z / l3z + I1", expressions[0]),
-        ("p_B(2) (Eq. 24)", "m2 rc2x + l2x m3 - l2x m4 rc4z / l3z", expressions[1]),
-        ("lengths in it [m]", "l2x, l3z", lengths),
+        (
+            "p_B(1) (Eq. 24), l3z = 0.05 m",
+            "m1 + m2 + m3 - m4 rc4z / l3z + I1",
+            expressions[0],
+        ),
+        (
+            "p_B(2) (Eq. 24), l2x = l3z",
+            "m2 rc2x + l2x m3 - l2x m4 rc4z / l3z",
+            expressions[1],
+        ),
         ("speed of the end-effector, up to [m/s]", "2.7", significant(speed)),
         (
             "acceleration of the end-effector, up to [m/s²]",

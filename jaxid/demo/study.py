@@ -127,7 +127,6 @@ def run_study(
     warm_robot = jid.simulation.virtual_tx90l_on_rail(warm=True)
     robot = cold_robot.robot
     base = jid.base_parameters(cold_robot.model)
-    _ = base.expressions  # computed here, in the stage that says so
     plans: tuple[jid.ExcitationPlan, ...] = ()
     if motion is None:
         plans = _design(base, seed, progress)

@@ -14,7 +14,7 @@ from jaxid.errors import InputError
 from jaxid.program import Program, Shape, select_outputs
 from jaxid.result_table import MISSING, Column, Remark, Status, Summarised, Table
 
-from .base_parameter_expressions import Expression
+from .base_parameter_expressions import Summand, write_expression
 from .dispatch import in_numpy, on_samples, program_of
 from .model import Coordinates, Model
 from .motion import Motion, as_motion
@@ -94,22 +94,16 @@ class BaseParameters(Summarised, Hashable):
         return tuple(units[k] for k in self.indices)
 
     @functools.cached_property
-    def closed_forms(self) -> tuple[tuple[Expression, ...], dict[str, float]]:
-        """Expressions in letters, and the values of these (Eq. 24)."""
-        from .base_parameter_closed_forms import closed_forms
-
-        kappa = np.asarray(self.kappa, np.float64)
-        return closed_forms(_snapped(self.model), self.indices, self.dependent, kappa)
-
-    @property
     def expressions(self) -> tuple[str, ...]:
-        """Base parameters as readable combinations, like `mx2 + l2x*m3` (Eq. 24)."""
-        return tuple(str(e) for e in self.closed_forms[0])
-
-    @property
-    def lengths(self) -> dict[str, float]:
-        """Values of the letters in the expressions: lengths [m], and `g` [m/s²]."""
-        return dict(self.closed_forms[1])
+        """Base parameters as readable combinations, `mx2 + 0.05*m3 - mz4` (Eq. 24)."""
+        names = self.model.parameter_names
+        expressions = []
+        for leader, row in zip(self.indices, np.asarray(self.kappa), strict=True):
+            factors = dict(zip(self.dependent, row.tolist(), strict=True))
+            factors = {leader: 1.0} | {k: x for k, x in factors.items() if x != 0.0}
+            summands = [Summand(names[k], factors[k]) for k in sorted(factors)]
+            expressions.append(write_expression(summands))
+        return tuple(expressions)
 
     def columns(self, q, qd, qdd, s=None) -> Float[AnyArray, "joints base"]:
         """Return the base regressor of one sample by definition (Eq. 23)."""
@@ -255,9 +249,6 @@ class BaseParameters(Summarised, Hashable):
             facts.append(
                 (f"{kind.value} ({len(members)})", ", ".join(members) or MISSING)
             )
-        lengths = ", ".join(f"{x} = {value:.4g}" for x, value in self.lengths.items())
-        if lengths:
-            facts.append(("lengths", f"{lengths} (m; m/s² for g)"))
         count = f"{self.size} base parameters of {self.model.size} standard parameters"
         return Table(
             f"{self.model.robot.name}: {count}",

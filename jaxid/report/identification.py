@@ -199,18 +199,15 @@ def _torques(figures: Mapping[str, Figure], robot: Robot) -> list[Any]:
 def _parameters(fit: Fit, figure: Figure) -> list[Any]:
     """Return the meanings of all symbols, and the table and figure of the estimates."""
     base = fit.base
-    notes = [
+    note = (
         "* together with what forces cannot tell apart from it: see its combination. "
         "A parameter near zero is never known to a few percent, and that is no fault."
-    ]
-    if base.lengths:
-        lengths = [f"{name} = {value:.4g}" for name, value in base.lengths.items()]
-        notes.append(f"In the combinations: {', '.join(lengths)} (m; m/s² for g).")
+    )
     summary = f"All {base.size} estimates with 95 % intervals and combinations"
     return [
         *([fit.determination] if fit.undetermined else []),
         glossary(base),
-        folded(summary, parameter_table(fit), *notes, figure),
+        folded(summary, parameter_table(fit), note, figure),
     ]
 
 

@@ -72,7 +72,6 @@ def result_record(report: Report) -> dict[str, Any]:
         ],
         "robot": _robot_record(robot),
         "base_parameters": parameter_rows(fit),
-        "lengths": base.lengths,
         "model": {
             "terms": [str(term) for term in model.terms],
             "standard_names": model.parameter_names,
