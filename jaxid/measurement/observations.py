@@ -2,14 +2,14 @@
 
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import equinox as eqx
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxid.arrays import AnyArray, Bool, Float, namespace
+from jaxid.arrays import AnyArray, Bool, Float, Numbers, namespace
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
 from jaxid.robot.limits_and_drives import per_joint
@@ -31,7 +31,7 @@ from .samples import (
     joined,
     joint_side,
 )
-from .time_grid import TimeGrid
+from .time_grid import Range, Ranges, TimeGrid
 
 MIN_ROWS = 4
 """Smallest number of rows for which a segment is used."""
@@ -63,7 +63,7 @@ class Observations(eqx.Module):
     source: AbstractSamples
     filter: AbstractFilter
     decimation: AbstractDecimation
-    segments: tuple[tuple[int, int], ...] = eqx.field(static=True)
+    segments: Ranges = eqx.field(static=True)
     start_times: tuple[float, ...] = eqx.field(static=True)
     mask: Bool[AnyArray, "rows joints"]
     sample_time: float = eqx.field(static=True)
@@ -81,7 +81,7 @@ class Observations(eqx.Module):
         sample_time: float | int,
         filter: AbstractFilter | None = None,
         decimation: AbstractDecimation | None = None,
-        segments: Sequence[tuple[int, int]] | None = None,
+        segments: Sequence[Range] | None = None,
         mask: ArrayLike | None = None,
         name: str = "observations",
     ) -> "Observations":
@@ -186,7 +186,7 @@ class Observations(eqx.Module):
         return self.sample_time * self.decimation.factor
 
     @property
-    def row_segments(self) -> tuple[tuple[int, int], ...]:
+    def row_segments(self) -> Ranges:
         """Half-open ranges of rows without gaps."""
         return consecutive(map(len, self._row_samples()))
 
@@ -232,7 +232,7 @@ class Observations(eqx.Module):
         return self.decimation(smooth[samples])[rows]
 
     def chunks(
-        self, samples: int = 16384, row_ranges: Sequence[tuple[int, int]] | None = None
+        self, samples: int = 16384, row_ranges: Sequence[Range] | None = None
     ) -> tuple[Chunk, ...]:
         """Divide into parts of about so many samples, with the filters' overlap.
 
@@ -314,7 +314,7 @@ def observe(
     robot: Robot,
     filter: AbstractFilter,
     decimation: AbstractDecimation | None = None,
-    min_speed: ArrayLike | tuple[float | int, ...] | None = None,
+    min_speed: Numbers | None = None,
     name: str | None = None,
 ) -> Observations:
     """Prepare a recording for estimation: joint side, derivatives, rows and their mask.
@@ -346,7 +346,7 @@ def observe(
             notes = (note,)
             recording = dataclasses.replace(recording, velocities=None)
 
-    def load(segments: Sequence[tuple[int, int]]) -> SamplesInMemory:
+    def load(segments: Iterable[Range]) -> SamplesInMemory:
         q, qd, forces = joint_side(
             robot, recording, recording.angles, recording.velocities, recording.forces
         )
@@ -372,14 +372,14 @@ def observe(
 
 
 def prepare(
-    load: Callable[[Sequence[tuple[int, int]]], AbstractSamples],
+    load: Callable[[Iterable[Range]], AbstractSamples],
     grid: TimeGrid,
     joints: int,
     has_velocities: bool,
     robot: Robot,
     filter: AbstractFilter,
     decimation: AbstractDecimation | None,
-    min_speed: ArrayLike | tuple[float | int, ...] | None,
+    min_speed: Numbers | None,
     name: str,
     progress: Progress | None = None,
 ) -> Observations:
@@ -405,13 +405,13 @@ def prepare(
             f"the measured velocities are not used: `{kind}` takes them from the angles"
         )
         notes = (*notes, note)
-    rows = sum(map(len, _row_samples(grid.ranges, edge, decimation.factor)))
+    rows = sum(map(len, _row_samples(grid.segments, edge, decimation.factor)))
     observations = Observations(
-        source=load(grid.ranges),
+        source=load(grid.segments),
         filter=filter,
         decimation=decimation,
-        segments=consecutive(b - a for a, b in grid.ranges),
-        start_times=grid.start_times,
+        segments=consecutive(b - a for a, b in grid.segments),
+        start_times=tuple(grid.segments.values()),
         mask=np.broadcast_to(True, (rows, joints)),
         sample_time=dt,
         name=name,
@@ -436,12 +436,10 @@ def _usable_segments(grid: TimeGrid, edge: int, factor: int, name: str) -> TimeG
     row_samples = (MIN_ROWS - 1) * factor + 1
     min_samples = max(2 * edge + row_samples, MIN_SEGMENT)
     segments = {
-        (a, b): t
-        for (a, b), t in zip(grid.ranges, grid.start_times, strict=True)
-        if b - a >= min_samples
+        (a, b): t for (a, b), t in grid.segments.items() if b - a >= min_samples
     }
     if not segments:
-        samples = max(b - a for a, b in grid.ranges)
+        samples = max(b - a for a, b in grid.segments)
         raise InputError(
             f"the longest segment of `{name}` has {samples} samples at "
             f"{1 / grid.sample_time:.6g} Hz, but the filter takes {edge} at each end, "
@@ -449,16 +447,14 @@ def _usable_segments(grid: TimeGrid, edge: int, factor: int, name: str) -> TimeG
             "`largest_gap`, lower `margin`, or check `time_unit`."
         )
     notes = grid.notes
-    lost_segments = len(grid.ranges) - len(segments)
+    lost_segments = len(grid.segments) - len(segments)
     if lost_segments:
         note = (
             f"{lost_segments} segment(s), shorter than the filter's edges, were left "
             "out"
         )
         notes = (*notes, note)
-    return grid._replace(
-        ranges=tuple(segments), start_times=tuple(segments.values()), notes=notes
-    )
+    return TimeGrid(grid.sample_time, segments, notes)
 
 
 def _speed_mask(
@@ -478,8 +474,6 @@ def _speed_mask(
     return np.concatenate(masks)
 
 
-def _row_samples(
-    segments: Sequence[tuple[int, int]], edge: int, factor: int
-) -> list[range]:
+def _row_samples(segments: Iterable[Range], edge: int, factor: int) -> list[range]:
     """Return the samples of each segment at which rows lie."""
     return [range(a + edge, b - edge, factor) for a, b in segments]

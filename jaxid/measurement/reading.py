@@ -1,13 +1,13 @@
 """Logs read as a whole, or in parts with overlap for filters: larger than memory."""
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import equinox as eqx
 import numpy as np
-from numpy.typing import ArrayLike
 
+from jaxid.arrays import Numbers
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
 from jaxid.result_table import printable
@@ -19,7 +19,7 @@ from .log_files import LogTable
 from .observations import Observations, Progress, prepare
 from .recording import Recording, consecutive
 from .samples import AbstractSamples, joined, joint_side
-from .time_grid import NeedsMemory, TimeGrid, find_grid
+from .time_grid import NeedsMemory, Range, Ranges, TimeGrid, find_grid
 
 PART_SIZE = 65536
 """Samples that are read at once."""
@@ -27,10 +27,6 @@ MAX_BAD_ROWS = 1e-3
 """Fraction of the rows of a log that may be bad."""
 MAX_NAMED_ROWS = 20
 """Bad rows that are named."""
-IMPULSE = 1e-3
-"""Size of the impulse by which the memory of a filter is found [rad or m]."""
-MAX_HALF_MEMORY = 2**20
-"""Samples within which a filter must have settled, or it needs whole logs."""
 
 
 def read_recording(
@@ -141,7 +137,7 @@ class SamplesOnDisk(AbstractSamples):
     robot: Robot
     filter: AbstractFilter
     overlap: int = eqx.field(static=True)
-    segments: tuple[tuple[int, int], ...] = eqx.field(static=True)
+    segments: Ranges = eqx.field(static=True)
     first_rows: tuple[int, ...] = eqx.field(static=True)
     sample_time: float = eqx.field(static=True)
 
@@ -181,7 +177,7 @@ def scan_log(
     robot: Robot,
     filter: AbstractFilter,
     decimation: AbstractDecimation | None = None,
-    min_speed: ArrayLike | tuple[float | int, ...] | None = None,
+    min_speed: Numbers | None = None,
     name: str | None = None,
     *,
     forces_path: str | Path | None = None,
@@ -227,7 +223,7 @@ def scan_log(
     has_velocities = columns.velocities is not None
     name = printable(Path(path).stem) if name is None else name
     if columns.sample_time is not None:
-        grid = TimeGrid(columns.sample_time, ((0, table.rows),))
+        grid = TimeGrid(columns.sample_time, {(0, table.rows): 0.0})
     else:
         grid = find_grid(
             lambda: _stamps(log),
@@ -237,13 +233,22 @@ def scan_log(
             in_parts=True,
         )
     grid = grid.cropped(start, stop, name)
+    memory = filter.memory(grid.sample_time)
+    if memory is None:
+        raise NeedsMemory(
+            f"`{type(filter).__name__}` needs the whole log: take another filter, or "
+            "`read_recording`."
+        )
 
-    def load(ranges: Sequence[tuple[int, int]]) -> SamplesOnDisk:
-        overlap = filter_memory(filter, grid.sample_time, has_velocities)
-        segments = consecutive(b - a for a, b in ranges)
-        first_rows = tuple(a for a, _ in ranges)
+    def load(ranges: Iterable[Range]) -> SamplesOnDisk:
         return SamplesOnDisk(
-            log, robot, filter, overlap, segments, first_rows, grid.sample_time
+            log,
+            robot,
+            filter,
+            overlap=memory,
+            segments=consecutive(b - a for a, b in ranges),
+            first_rows=tuple(a for a, _ in ranges),
+            sample_time=grid.sample_time,
         )
 
     first_angles, _, _ = log.read(0, 1)
@@ -262,40 +267,14 @@ def scan_log(
 
 
 def _stamps(log: Log) -> Iterator[np.ndarray]:
-    """Yield the time stamps in parts [s]."""
+    """Yield the time stamps in parts [s], with the last one of the part before."""
     rows = log.tables[0].rows
     previous_time = 0.0
     for start in range(0, rows, PART_SIZE):
-        # Integers and dates count from a part's first row: the row before links parts.
         first = max(0, start - 1)
         part = log.stamps(first, min(start + PART_SIZE, rows))
         if start > 0:
-            part = (part - part[0] + previous_time)[1:]
+            # Integers and dates count from a part's first row.
+            part = part - part[0] + previous_time
         previous_time = float(part[-1])
         yield part
-
-
-def filter_memory(
-    filter: AbstractFilter, sample_time: float, has_velocities: bool
-) -> int:
-    """Return for how many samples a filter's motion depends on an angle or velocity."""
-    half_length = 4096
-    while half_length <= MAX_HALF_MEMORY:
-        impulse = np.zeros((2 * half_length + 1, 1))
-        impulse[half_length] = IMPULSE
-        velocities = impulse if has_velocities else None
-        try:
-            motion = filter.motion(impulse, velocities, sample_time)
-        except ValueError:
-            break
-        response = np.abs(np.hstack([motion.q, motion.qd, motion.qdd]))
-        samples, _ = np.nonzero(response > 1e-13 * response.max(axis=0))
-        reach = int(np.abs(samples - half_length).max(initial=0))
-        if reach < half_length // 2:
-            # The part below rounding decays at the same rate.
-            return int(1.3 * reach) + 4
-        half_length *= 4
-    raise NeedsMemory(
-        f"`{type(filter).__name__}` needs the whole log: take another filter, or "
-        "`read_recording`."
-    )

@@ -15,12 +15,7 @@ from scipy.interpolate import CubicSpline
 from jaxid.arrays import AnyArray, Float
 from jaxid.errors import InputError
 
-from .time_grid import (
-    MIN_SAMPLES,
-    NeedsMemory as NeedsMemory,
-    TimeGrid,
-    resampling,
-)
+from .time_grid import MIN_SAMPLES, Ranges, TimeGrid, resampling
 
 MAX_NUMBER = 1e30
 """Largest number in a log, in any unit: its square still is finite."""
@@ -56,7 +51,7 @@ class Recording(eqx.Module):
     velocities: Float[AnyArray, "samples joints"] | None
     angles_on_motor_side: bool = eqx.field(static=True)
     forces_on_motor_side: bool = eqx.field(static=True)
-    segments: tuple[tuple[int, int], ...] = eqx.field(static=True)
+    segments: Ranges = eqx.field(static=True)
     sample_time: float = eqx.field(static=True)
     name: str = eqx.field(static=True, default="recording")
     notes: tuple[str, ...] = eqx.field(static=True, default=())
@@ -122,25 +117,23 @@ class Recording(eqx.Module):
             )
         if time is not None:
             stamps = _finite_stamps(name, time, samples)
-            limits = largest_gap, bridged
-            resample = resampling(stamps, name, limits, first_row)
+            resample = resampling(stamps, name, (largest_gap, bridged), first_row)
             data = {key: None if x is None else resample(x) for key, x in data.items()}
-            dt = resample.grid.sample_time
+            grid = resample.grid
             times = resample.times
-            notes = resample.notes
         else:
             dt = positive_time(sample_time or 0.0)
+            grid = TimeGrid(dt, {(0, samples): 0.0})
             times = [dt * np.arange(samples)]
-            notes = ()
         return cls(
             time=np.concatenate(times),
             **data,
             angles_on_motor_side=angles_on_motor_side,
             forces_on_motor_side=forces_on_motor_side,
             segments=consecutive(map(len, times)),
-            sample_time=dt,
+            sample_time=grid.sample_time,
             name=name,
-            notes=notes,
+            notes=grid.notes,
         )
 
     @property
@@ -161,8 +154,8 @@ class Recording(eqx.Module):
     @property
     def grid(self) -> TimeGrid:
         """Segments, their start times and notes."""
-        starts = tuple(float(self.time[a]) for a, _ in self.segments)
-        return TimeGrid(self.sample_time, self.segments, starts, self.notes)
+        segments = {(a, b): float(self.time[a]) for a, b in self.segments}
+        return TimeGrid(self.sample_time, segments, self.notes)
 
     def crop(
         self, start: float | int = -np.inf, stop: float | int = np.inf
@@ -172,8 +165,8 @@ class Recording(eqx.Module):
         Raises:
             InputError: If fewer than ten samples are left.
         """
-        grid = self.grid.cropped(start, stop, self.name)
-        return self._range(grid.ranges[0][0], grid.ranges[-1][1])
+        ranges = [*self.grid.cropped(start, stop, self.name).segments]
+        return self._range(ranges[0][0], ranges[-1][1])
 
     def split(self, fraction: float) -> "tuple[Recording, Recording]":
         """Return the first fraction (0 to 1) of the recorded time, and the rest.
@@ -192,14 +185,10 @@ class Recording(eqx.Module):
 
     def _range(self, start: int, stop: int) -> "Recording":
         """Return some samples, with the segments that they touch."""
-        segments = []
-        for a, b in self.segments:
-            first = max(a, start)
-            end = min(b, stop)
-            if first < end:
-                segments.append((first - start, end - start))
+        bounds = np.clip(self.segments, start, stop) - start
+        segments = tuple((a, b) for a, b in bounds.tolist() if a < b)
         part = jax.tree.map(lambda x: x[start:stop], self)
-        return dataclasses.replace(part, segments=tuple(segments))
+        return dataclasses.replace(part, segments=segments)
 
 
 def finite_channel(
@@ -242,7 +231,7 @@ def positive_time(sample_time: float) -> float:
     return float(sample_time)
 
 
-def consecutive(lengths: Iterable[int]) -> tuple[tuple[int, int], ...]:
+def consecutive(lengths: Iterable[int]) -> Ranges:
     """Return half-open ranges of these lengths, one behind the other."""
     return tuple(itertools.pairwise(itertools.accumulate(lengths, initial=0)))
 
@@ -258,7 +247,7 @@ def unlike_derivatives(recording: Recording) -> dict[int, float]:
     steps = max(1, round(JUDGED_WAY_TIME / dt))
     # Sums of squares and products over all windows.
     errors, ways, noises, products = np.zeros((4, recording.joints))
-    for a, b in recording.grid.ranges:
+    for a, b in recording.segments:
         q = np.asarray(recording.angles)[a:b]
         qd = np.asarray(recording.velocities)[a:b]
         mean_qd = 0.5 * (qd[1:] + qd[:-1])
@@ -294,46 +283,41 @@ def remove_delay(recording: Recording, seconds: float) -> Recording:
     """
     require_finite_delay(seconds)
     lost_samples = math.ceil(abs(seconds) / recording.sample_time - 1e-9)
-    lengths = [b - a for a, b in recording.segments]
-    if max(lengths) - lost_samples < MIN_SAMPLES:
+    longest = max(b - a for a, b in recording.segments)
+    if longest - lost_samples < MIN_SAMPLES:
         raise InputError(
             f"the delay is {seconds:g} s, but the longest segment of "
-            f"`{recording.name}` lasts {max(lengths) * recording.sample_time:g} s."
+            f"`{recording.name}` lasts {longest * recording.sample_time:g} s."
         )
     parts = [
-        _without_delay(recording, slice(a, b), seconds, lost_samples)
+        _without_delay(recording._range(a, b), seconds, lost_samples)
         for a, b in recording.segments
         if b - a - lost_samples >= MIN_SAMPLES
     ]
-    arrays = jax.tree.map(lambda *x: np.concatenate(x), *parts)
     note = f"a delay of the forces of {1e3 * seconds:.4g} ms was removed"
     return dataclasses.replace(
         recording,
-        **arrays,
+        **jax.tree.map(lambda *x: np.concatenate(x), *parts),
         segments=consecutive(len(part["time"]) for part in parts),
         notes=(*recording.notes, note),
     )
 
 
-def _without_delay(
-    recording: Recording, segment: slice, seconds: float, lost_samples: int
-) -> dict[str, Any]:
+def _without_delay(segment: Recording, seconds: float, lost_samples: int) -> dict:
     """Return the arrays of a segment, with angles at the instants of the forces."""
-    time = np.asarray(recording.time)[segment]
     start = lost_samples if seconds > 0 else 0
-    samples = slice(start, start + len(time) - lost_samples)
+    samples = slice(start, start + segment.samples - lost_samples)
+    time = np.asarray(segment.time)
 
     def shift(values):
-        if values is None:
-            return None
-        spline = CubicSpline(time, np.asarray(values)[segment])
-        return spline(time[samples] - seconds)
+        return CubicSpline(time, values)(time[samples] - seconds)
 
+    qd = segment.velocities
     return {
         "time": time[samples],
-        "angles": shift(recording.angles),
-        "forces": np.asarray(recording.forces)[segment][samples],
-        "velocities": shift(recording.velocities),
+        "angles": shift(segment.angles),
+        "forces": np.asarray(segment.forces)[samples],
+        "velocities": None if qd is None else shift(qd),
     }
 
 

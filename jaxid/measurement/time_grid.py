@@ -1,6 +1,7 @@
 """The uniform grid behind a log's time stamps, its gaps, and resampling onto it."""
 
-from collections.abc import Callable, Iterable, Iterator
+import itertools
+from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -18,19 +19,25 @@ MIN_SAMPLES = 10
 """Smallest number of samples that can be filtered."""
 
 
+Range = tuple[int, int]
+"""A half-open range of rows or samples."""
+Ranges = tuple[Range, ...]
+"""Ranges between gaps."""
+
+
 class NeedsMemory(InputError):  # noqa: N818 (the name says what to do)
     """A log that can be read only as a whole; the message gives the reason."""
 
 
 class TimeGrid(NamedTuple):
-    """Uniform stretches of a log: half-open ranges of rows, and their start times [s].
+    """Uniform stretches of a log.
 
-    The `deviation` is the largest one of the stamps from the grid [s].
+    The `segments` are half-open ranges of rows and their start times [s]; the
+    `deviation` is the largest one of the stamps from the grid [s].
     """
 
     sample_time: float
-    ranges: tuple[tuple[int, int], ...]
-    start_times: tuple[float, ...] = (0.0,)
+    segments: dict[Range, float]
     notes: tuple[str, ...] = ()
     deviation: float = 0.0
 
@@ -42,26 +49,25 @@ class TimeGrid(NamedTuple):
     def cropped(self, start: float, stop: float, name: str) -> "TimeGrid":
         """Return the part from `start` [s] on and before `stop` [s]."""
         dt = self.sample_time
-        ranges = []
-        start_times = []
-        for (a, b), t in zip(self.ranges, self.start_times, strict=True):
-            # A time on the grid counts as such in spite of rounding.
+        segments = {}
+        for (a, b), t in self.segments.items():
             steps = (np.array([start, stop]) - t) / dt
+            # A time on the grid counts as such in spite of rounding.
             bounds = np.clip(np.ceil(steps - 1e-6), 0, b - a)
             low, high = bounds.astype(int).tolist()
             if low < high:
-                ranges.append((a + low, a + high))
-                start_times.append(t + low * dt)
-        samples = sum(b - a for a, b in ranges)
+                segments[a + low, a + high] = t + low * dt
+        samples = sum(b - a for a, b in segments)
         if samples < MIN_SAMPLES:
-            a, b = self.ranges[-1]
-            end = self.start_times[-1] + (b - a - 1) * dt
+            first_time, *_ = self.segments.values()
+            (a, b), last_start = [*self.segments.items()][-1]
+            end = last_start + (b - a - 1) * dt
             raise InputError(
                 f"`{name}` has {samples} samples from {start:g} s to {stop:g} s, but "
-                f"at least {MIN_SAMPLES} are needed: it lasts from "
-                f"{self.start_times[0]:g} s to {end:g} s."
+                f"at least {MIN_SAMPLES} are needed: it lasts from {first_time:g} s to "
+                f"{end:g} s."
             )
-        return self._replace(ranges=tuple(ranges), start_times=tuple(start_times))
+        return self._replace(segments=segments)
 
 
 class StepStatistics(NamedTuple):
@@ -95,6 +101,13 @@ class Stretches(NamedTuple):
     rows: int  # number of rows of the log
     sample_time: float  # mean step without missing rows [s]
 
+    @property
+    def segments(self) -> dict[Range, float]:
+        """Ranges of rows that are long enough, and their start times [s]."""
+        ranges = itertools.pairwise([*self.starts, self.rows])
+        segments = zip(ranges, self.start_times, strict=True)
+        return {(a, b): t for (a, b), t in segments if b - a >= MIN_SEGMENT}
+
 
 def find_grid(
     read: Callable[[], Iterable[np.ndarray]],
@@ -105,35 +118,29 @@ def find_grid(
 ) -> TimeGrid:
     """Find the uniform grid behind time stamps, whose typical step is the first part's.
 
-    `read` yields the finite stamps [s] in consecutive parts, and is called three times;
-    `limits` are the pauses that are bridged, in sample times and in seconds. Where
-    `in_parts`, the log is too large to move or remove rows.
+    `read` yields the finite stamps [s] in parts, each of which begins with the last
+    stamp of the part before, and is called three times; `limits` are the pauses that
+    are bridged, in sample times and in seconds. Where `in_parts`, the log is too large
+    to move or remove rows.
     """
-    steps = _step_statistics(next(iter(read()), np.zeros(0)), source)
-    stretches = _find_stretches(
-        read, source, steps, steps.gap_limit(limits), first_row, in_parts
-    )
+    statistics = _step_statistics(next(iter(read())), source)
+    stretches = _find_stretches(read(), source, statistics, limits, first_row, in_parts)
     sample_time = _round_time(stretches.sample_time, stretches.rows)
-    ends = [*stretches.starts[1:], stretches.rows]
-    segments = {
-        (a, b): t
-        for a, b, t in zip(stretches.starts, ends, stretches.start_times, strict=True)
-        if b - a >= MIN_SEGMENT
-    }
+    segments = stretches.segments
     if not segments:
         raise InputError(
             f"`{source}` has no four rows in sequence: its time stamps are "
-            f"{steps.median:.6g} s apart at the median, with {len(stretches.pauses)} "
-            "gaps; check `time_unit`, or give `sample_time`."
+            f"{statistics.median:.6g} s apart at the median, with "
+            f"{len(stretches.pauses)} gaps; check `time_unit`, or give `sample_time`."
         )
-    grid = TimeGrid(sample_time, tuple(segments), tuple(segments.values()))
-    notes = _gap_notes(grid, stretches, steps.origin)
-    deviation = _deviation(grid, _linked(read(), steps.origin))
-    grid = grid._replace(notes=notes, deviation=deviation)
+    grid = TimeGrid(sample_time, segments)
+    deviation = _deviation(grid, read(), statistics.origin)
+    notes = _gap_notes(grid, stretches, statistics.origin)
+    grid = TimeGrid(sample_time, segments, notes, deviation)
     if in_parts and not grid.is_exact:
         raise NeedsMemory(
             f"time stamps of `{source}` leave a uniform grid of {sample_time:.6g} s by "
-            f"{grid.deviation:.6g} s: give `sample_time` if only the stamps are late."
+            f"{deviation:.6g} s: give `sample_time` if only the stamps are late."
         )
     return grid
 
@@ -151,23 +158,25 @@ def _step_statistics(stamps: np.ndarray, source: str) -> StepStatistics:
 
 
 def _find_stretches(
-    read: Callable[[], Iterable[np.ndarray]],
+    parts: Iterable[np.ndarray],
     source: str,
     statistics: StepStatistics,
-    gap_limit: float,
+    limits: tuple[float, float],
     first_row: int,
     in_parts: bool,
 ) -> Stretches:
     """Return the stretches between gaps, and refuse time that runs backwards."""
+    gap_limit = statistics.gap_limit(limits)
     starts = [0]
     start_times = [0.0]
     pauses = []
-    rows = 0
+    row = 0
     regular_time = 0.0
     regular_steps = 0
-    for t, row in _linked(read(), statistics.origin):
+    for stamps in parts:
+        t = stamps - statistics.origin
         steps = np.diff(t)
-        _require_forward(t + statistics.origin, steps, row + first_row, source)
+        _require_forward(stamps, steps, row + first_row, source)
         repeated = np.flatnonzero(steps <= MIN_STEP * statistics.median)
         if in_parts and repeated.size:
             number = row + int(repeated[0]) + 1 + first_row
@@ -182,8 +191,9 @@ def _find_stretches(
         regular = steps[steps < statistics.largest_regular]
         regular_time += float(regular.sum())
         regular_steps += len(regular)
-        rows = row + len(t)
-    return Stretches(starts, start_times, pauses, rows, regular_time / regular_steps)
+        row += len(steps)
+    sample_time = regular_time / regular_steps
+    return Stretches(starts, start_times, pauses, row + 1, sample_time)
 
 
 def _round_time(sample_time: float, rows: int) -> float:
@@ -212,25 +222,12 @@ def _gap_notes(grid: TimeGrid, stretches: Stretches, origin: float) -> tuple[str
             "split the log into segments; a `largest_gap` above "
             f"{longest_pause / grid.sample_time:.3g} would bridge them"
         )
-    lost_rows = stretches.rows - sum(b - a for a, b in grid.ranges)
+    lost_rows = stretches.rows - sum(b - a for a, b in grid.segments)
     if lost_rows:
         notes.append(
             f"{lost_rows} rows between gaps are too few for a segment and were left out"
         )
     return tuple(notes)
-
-
-def _linked(
-    parts: Iterable[np.ndarray], origin: float
-) -> Iterator[tuple[np.ndarray, int]]:
-    """Yield the times of each part, with the last earlier one, and its first row."""
-    previous_time = np.zeros(0)
-    row = 0
-    for part in parts:
-        t = np.concatenate([previous_time, part - origin])
-        yield t, row
-        previous_time = t[-1:]
-        row += len(t) - 1
 
 
 def _require_forward(
@@ -246,18 +243,22 @@ def _require_forward(
         )
 
 
-def _deviation(grid: TimeGrid, parts: Iterable[tuple[np.ndarray, int]]) -> float:
-    """Return the largest deviation of times from the grid [s]."""
-    starts, ends = np.transpose(grid.ranges)
-    start_times = np.array(grid.start_times)
+def _deviation(grid: TimeGrid, parts: Iterable[np.ndarray], origin: float) -> float:
+    """Return the largest deviation of stamps from the grid [s]."""
+    starts, ends = np.transpose([*grid.segments])
+    start_times = np.array([*grid.segments.values()])
+    first_row = 0
     deviation = 0.0
-    for t, row in parts:
-        rows = row + np.arange(len(t))
-        segment = np.maximum(np.searchsorted(starts, rows, "right") - 1, 0)
-        grid_times = start_times[segment] + grid.sample_time * (rows - starts[segment])
-        is_inside = (starts[segment] <= rows) & (rows < ends[segment])
-        deviations = np.abs(t - grid_times)[is_inside]
+    for stamps in parts:
+        rows = first_row + np.arange(len(stamps))
+        segment = np.searchsorted(starts, rows, "right") - 1
+        segment = np.maximum(segment, 0)
+        rows_before = rows - starts[segment]
+        grid_times = start_times[segment] + grid.sample_time * rows_before
+        is_inside = (rows_before >= 0) & (rows < ends[segment])
+        deviations = np.abs(stamps - origin - grid_times)[is_inside]
         deviation = max(deviation, float(deviations.max(initial=0.0)))
+        first_row += len(stamps) - 1
     return deviation
 
 
@@ -268,18 +269,17 @@ class Resampling(NamedTuple):
     stamps: np.ndarray  # their times from the first row on [s]
     grid: TimeGrid
     times: list[np.ndarray]  # times of each segment's samples [s]
-    notes: tuple[str, ...]
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
         """Return the samples of a channel: its rows, or values of cubic splines."""
         x = x[self.rows]
-        ranges = self.grid.ranges
-        if self.grid.is_exact:
-            return np.concatenate([x[a:b] for a, b in ranges])
-        segments = [
-            CubicSpline(self.stamps[a:b], x[a:b])(times)
-            for (a, b), times in zip(ranges, self.times, strict=True)
-        ]
+        segments = []
+        for (a, b), times in zip(self.grid.segments, self.times, strict=True):
+            if self.grid.is_exact:
+                segments.append(x[a:b])
+            else:
+                spline = CubicSpline(self.stamps[a:b], x[a:b])
+                segments.append(spline(times))
         return np.concatenate(segments)
 
 
@@ -292,17 +292,16 @@ def resampling(
     distinct_stamps = stamps[rows]
     grid = find_grid(lambda: [distinct_stamps], source, limits, first_row)
     t = distinct_stamps - stamps[0]
-    dt = grid.sample_time
-    counts = [b - a for a, b in grid.ranges]
-    if not grid.is_exact:
-        durations = [t[b - 1] - t[a] for a, b in grid.ranges]
-        counts = [int(duration / dt + 1e-3) + 1 for duration in durations]
-    times = [
-        start + dt * np.arange(count)
-        for start, count in zip(grid.start_times, counts, strict=True)
-    ]
+    times = []
+    missing_samples = 0
+    for (a, b), start_time in grid.segments.items():
+        count = b - a
+        if not grid.is_exact:
+            count = int((t[b - 1] - t[a]) / grid.sample_time + 1e-3) + 1
+        missing_samples += count - (b - a)
+        times.append(start_time + grid.sample_time * np.arange(count))
 
-    notes = grid.notes
+    notes = [*grid.notes]
     repeated_rows = len(stamps) - len(rows)
     if repeated_rows:
         note = (
@@ -310,11 +309,10 @@ def resampling(
             "before and were removed; if every row is a sample, give `sample_time` "
             "instead of the time stamps"
         )
-        notes = (note, *notes)
+        notes.insert(0, note)
     if not grid.is_exact:
-        missing_samples = sum(counts) - sum(b - a for a, b in grid.ranges)
-        notes = (*notes, _interpolation_note(t, grid, missing_samples))
-    return Resampling(rows, t, grid, times, notes)
+        notes.append(_interpolation_note(t, grid, missing_samples))
+    return Resampling(rows, t, grid._replace(notes=tuple(notes)), times)
 
 
 def _distinct_rows(stamps: np.ndarray) -> np.ndarray:

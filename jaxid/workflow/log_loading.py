@@ -18,7 +18,8 @@ from jaxid.measurement.columns import Columns
 from jaxid.measurement.log_files import estimated_rows, is_bag_folder
 from jaxid.measurement.observations import Observations
 from jaxid.measurement.reading import scan_log
-from jaxid.measurement.recording import NeedsMemory, Recording
+from jaxid.measurement.recording import Recording
+from jaxid.measurement.time_grid import NeedsMemory
 from jaxid.validation.diagnosis import Diagnosis, diagnose
 from jaxid.validation.torque_errors import comparison_step
 

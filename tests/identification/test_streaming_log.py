@@ -10,7 +10,7 @@ from jaxid.dynamics.dispatch import in_numpy
 from jaxid.identification import long_logs
 from jaxid.measurement.log_files import text_files
 from jaxid.measurement.reading import scan_log
-from jaxid.measurement.recording import NeedsMemory
+from jaxid.measurement.time_grid import NeedsMemory
 
 COLUMNS = jid.Columns(angles="q{}", forces="tau{}", time="t")
 SAMPLES = 20000

@@ -20,6 +20,9 @@ from jaxid.errors import InputError
 
 from .low_pass import SETTLED, AbstractLowPass
 
+MOTION_TAIL = 1e-17
+"""Tail of an impulse response that is left out; accelerations magnify it most."""
+
 
 class AbstractFilter(eqx.Module):
     """Filter of a log: motion from the angles, and the band of forces and columns.
@@ -50,6 +53,14 @@ class AbstractFilter(eqx.Module):
     @abc.abstractmethod
     def edge(self, sample_time: float) -> int:
         """Return the number of samples to drop at both ends, where filters settle."""
+
+    def memory(self, sample_time: float) -> int | None:
+        """Return for how many samples the motion depends on an angle or velocity.
+
+        None if it depends on all samples of a segment, which then must be in memory.
+        By default it is the memory of the filter of forces and columns.
+        """
+        return self.low_pass(sample_time).memory(MOTION_TAIL)
 
     def smooth(self, x: Float[AnyArray, "samples *columns"], sample_time: float) -> Any:
         """Filter forces or columns of one segment.

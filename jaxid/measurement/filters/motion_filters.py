@@ -13,6 +13,7 @@ from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
 
 from .filter import (
+    MOTION_TAIL,
     AbstractFilter,
     integer,
     require_margin,
@@ -81,6 +82,12 @@ class ZeroPhaseButterworth(AbstractFilter):
         if self.force_cutoff is None:
             return butterworth(self.cutoff, self.order, sample_time)
         return butterworth(self.force_cutoff, self.order, sample_time, "force_cutoff")
+
+    def memory(self, sample_time):  # noqa: D102
+        smooth = butterworth(self.cutoff, self.order, sample_time)
+        return (
+            smooth.memory(MOTION_TAIL) + 2
+        )  # the differences reach two samples further
 
     def edge(self, sample_time: float) -> int:  # noqa: D102
         motion = butterworth(self.cutoff, self.order, sample_time)
@@ -205,6 +212,11 @@ class PaperFilter(AbstractFilter):
     def low_pass(self, sample_time: float) -> AbstractLowPass:  # noqa: D102
         return _first_order("acceleration", self.acceleration, sample_time)
 
+    def memory(self, sample_time):  # noqa: D102
+        velocities = _first_order("velocity", self.velocity, sample_time)
+        accelerations = self.low_pass(sample_time)
+        return max(x.memory(MOTION_TAIL) for x in (velocities, accelerations))
+
     def edge(self, sample_time: float) -> int:  # noqa: D102
         motion = _first_order("velocity", self.velocity, sample_time)
         return settled_edge(
@@ -278,6 +290,9 @@ class PeriodicFourier(AbstractFilter):
             harmonics = 10.0 * self.harmonics
         name = "force_harmonics / period"
         return butterworth(harmonics / self.period, self.order, sample_time, name)
+
+    def memory(self, sample_time):  # noqa: D102
+        return None
 
     def edge(self, sample_time: float) -> int:  # noqa: D102
         return settled_edge(self.margin, sample_time, self.low_pass(sample_time))
