@@ -73,8 +73,8 @@ def fits(base: jid.BaseParameters, train: jid.Observations, *, quick: bool):
     essential = jid.essential_parameters(wls, train)
     yield (
         "essential parameters",
-        essential.fit,
-        f"{essential.last_step.remaining} of {base.size}",
+        essential,
+        f"{essential.base.size} of {base.size}",
     )
     if quick:
         return

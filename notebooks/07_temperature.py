@@ -116,8 +116,9 @@ jid.plot.bars([(f"{name} model", one) for name, one in errors.items()], robot)
 # %% [markdown]
 # ## A law instead of two states
 #
-# Friction at several temperatures gives its law: $f_v(T) = f_v(T_0)\, e^{-a (T - T_0)}$, with an interval for each rate. Two more logs in between are enough:
-# the picture shows the first four axes, their points a little apart sideways. `law.term` is a friction term for models at any temperature.
+# Friction at several temperatures gives its law: $f_v(T) = f_v(T_0)\, e^{-a (T - T_0)}$, with an interval for each rate: the logarithms of the estimates lie on a
+# line, each as uncertain as its estimate is relative to its size. Two more logs in between are enough: the picture shows the first four axes, their points a
+# little apart sideways. `law` is a friction term for models at any temperature.
 
 # %%
 steps = (20.0, 28.0, 36.0, 45.0)
@@ -126,23 +127,34 @@ several = [
     *(jid.identify(base, observed(cold.at(T), 0, int(T))) for T in steps[1:-1]),
     fits["warm"],
 ]
-law = jid.friction_laws.temperature_law(
-    several, steps, jid.ViscousFriction(), reference=20.0
-)
+places = [base.names.index(f"fv{j + 1}") for j in range(7)]
+values = np.array([f.parameters for f in several])[:, places]
+deviations = np.array([f.standard_deviations for f in several])[:, places]
+rates, rate_deviations, values_at_20 = np.empty((3, 7))
+for j in range(7):
+    line, covariance = np.polyfit(
+        np.array(steps) - 20.0,
+        np.log(values[:, j]),
+        deg=1,
+        w=values[:, j] / deviations[:, j],
+        cov="unscaled",
+    )
+    rates[j] = -line[0]
+    rate_deviations[j] = np.sqrt(covariance[0, 0])
+    values_at_20[j] = np.exp(line[1])
+law = jid.terms.TemperatureScaled(jid.ViscousFriction(), rates, 20.0, 20.0)
+
 figure, axes = plt.subplots(figsize=(11, 3.4))
 T = np.linspace(15, 50, 50)
 for j in range(4):
-    k = base.names.index(law.names[j])
-    values = np.array([f.parameters[k] for f in several])
-    half = np.array([1.96 * f.standard_deviations[k] for f in several])
-    (line,) = axes.plot(T, 100 * np.exp(-law.rates[j] * (T - 20)), lw=1)
+    (curve,) = axes.plot(T, 100 * np.exp(-rates[j] * (T - 20)), lw=1)
     axes.errorbar(
         np.array(steps) + 0.25 * (j - 1.5),
-        100 * values / law.values[j],
-        100 * half / law.values[j],
+        100 * values[:, j] / values_at_20[j],
+        196 * deviations[:, j] / values_at_20[j],
         fmt="o",
         ms=4,
-        color=line.get_color(),
+        color=curve.get_color(),
         label=robot.joint_names[j],
     )
 axes.set_xlabel("temperature of the gear [°C]")
@@ -152,7 +164,7 @@ plt.show()
 true = np.asarray(cold.heating.viscous_rate)
 for j, name in enumerate(robot.joint_names):
     print(
-        f"{name:7} falls by {100 * law.rates[j]:.2f} ± {196 * law.rate_deviations[j]:.2f} % per degree "
+        f"{name:7} falls by {100 * rates[j]:.2f} ± {196 * rate_deviations[j]:.2f} % per degree "
         f"(truth {100 * true[j]:.2f})"
     )
 

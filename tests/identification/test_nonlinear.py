@@ -167,28 +167,3 @@ def test_what_cannot_be_searched_is_rejected():
     zero = dataclasses.replace(START, model=model(0.04, np.array([0.1, 0.0, 0.1])))
     with pytest.raises(ValueError, match="`vs2`"):
         _ = select_shapes(zero).values
-
-
-def test_friction_falls_with_temperature_as_fits_at_several_tell():
-    rates = np.array([0.01, 0.02, 0.03])
-    dry = (jid.RigidBodies(), jid.CoulombFriction(), jid.ConstantOffset())
-    base = jid.base_parameters(jid.Model(ROBOT, (*dry, jid.ViscousFriction())))
-    fits = []
-    for seed, temperature in enumerate((15.0, 30.0, 45.0)):
-        warm = jid.terms.TemperatureScaled(jid.ViscousFriction(), rates, temperature)
-        truth = jid.Model(ROBOT, (*dry, warm))
-        p = virtual.standard_parameters(truth, seed=4)
-        o = virtual.observations(truth, p, samples=600, noise=0.3, noise_seed=seed)
-        fits.append(jid.identify(base, o, WLS))
-    law = jid.friction_laws.temperature_law(
-        fits, (15.0, 30.0, 45.0), jid.ViscousFriction()
-    )
-    assert (np.abs(law.rates - rates) < 4 * law.rate_deviations).all()
-    assert law.rate_deviations.max() < 0.005
-    assert (np.abs(law.values - p[-3:]) < 4 * law.value_deviations).all()
-    for temperatures, term, named in (
-        ((15.0, 15.0, 15.0), jid.ViscousFriction(), "`temperatures`"),
-        ((15.0, 30.0, 45.0), jid.terms.StribeckFriction(), "`term`"),
-    ):
-        with pytest.raises(ValueError, match=named):
-            jid.friction_laws.temperature_law(fits, temperatures, term)

@@ -1,4 +1,4 @@
-"""Constants of friction laws: shapes, presliding lengths, rates with temperature."""
+"""Constants of friction laws: shapes of the laws, and presliding lengths."""
 
 from .nonlinear_friction import (
     HeldOutErrors as HeldOutErrors,
@@ -6,7 +6,3 @@ from .nonlinear_friction import (
     identify_nonlinear_friction as identify_nonlinear_friction,
 )
 from .presliding_lengths import identify_presliding as identify_presliding
-from .temperature_law import (
-    TemperatureLaw as TemperatureLaw,
-    temperature_law as temperature_law,
-)
