@@ -43,7 +43,7 @@ def identify(
         base: Base parameters of the robot.
         observations: Observations of one recording, or of several that are fitted
             together; logs larger than memory come from `scan_log`. Or the regression
-            problem of recordings, such as that of several processes.
+            problem of recordings, whose factors several estimators share.
         estimator: Estimator; by default least squares weighted by the largest forces,
             or by the variances of the residuals if these forces are not known.
         progress: Callback, called with the completed fraction (0 to 1) of a pass over a

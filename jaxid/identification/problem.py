@@ -83,7 +83,7 @@ class RegressionProblem:
         """Factors by contiguous blocks of time, made by the first pass over rows."""
         if self._initial_blocks is not None:
             return self._initial_blocks
-        self._require_samples()
+        self.require_rows()
         parts = []
         for number, recording in enumerate(self.recordings):
             # Compiling the pass pays for long recordings with short filters.
@@ -100,8 +100,8 @@ class RegressionProblem:
         """The factors of all rows together."""
         return self.blocks.total
 
-    def _require_samples(self) -> None:
-        """Check that the rows themselves are known."""
+    def require_rows(self) -> None:
+        """Check that the rows themselves are known, not only their factors."""
         if not self.recordings:
             raise InputError(
                 "this estimate needs the rows themselves: `identify` the recordings."
@@ -115,27 +115,8 @@ class RegressionProblem:
         Raises:
             InputError: If only factors are known.
         """
-        self._require_samples()
+        self.require_rows()
         return RegressionProblem(base, self.recordings, self.progress)
-
-    def fold(
-        self,
-        equations: Callable[[RowChunk], Sequence[np.ndarray]],
-    ) -> Blocks:
-        """Return the factors of transformed rows, by blocks of time.
-
-        Args:
-            equations: Function from a chunk to the rows `[columns, force]` of each
-                joint.
-
-        Raises:
-            InputError: If only factors are known.
-        """
-        self._require_samples()
-        parts = []
-        for number in range(len(self.recordings)):
-            parts += self._reduce(number, equations)
-        return Blocks(tuple(parts))
 
     def _reduce(self, number: int, equations: Callable) -> list[Factors]:
         """Return the factors of one recording's blocks of time."""
@@ -160,7 +141,7 @@ class RegressionProblem:
         Raises:
             InputError: If only factors are known.
         """
-        self._require_samples()
+        self.require_rows()
         for number in range(len(self.recordings)):
             ranges = None
             if spans is not None:
@@ -210,14 +191,21 @@ class RegressionProblem:
             weight: Function from residuals, divided by their scale, to weights from 0
                 to 1.
             scale: Size of each joint's residuals [joints], in [N m] or [N].
+
+        Raises:
+            InputError: If only factors are known.
         """
+        self.require_rows()
 
         def equations(chunk: RowChunk) -> list[np.ndarray]:
             row_weights = np.sqrt(weight(chunk.residuals(p) / scale))
             joints = zip(chunk.equations(), row_weights.T, chunk.mask.T, strict=True)
             return [roots[mask, None] * rows for rows, roots, mask in joints]
 
-        return self.fold(equations)
+        parts = []
+        for number in range(len(self.recordings)):
+            parts += self._reduce(number, equations)
+        return Blocks(tuple(parts))
 
 
 def block_edges(observations: Observations, blocks: int) -> list[int]:

@@ -5,7 +5,6 @@ import pytest
 from virtual import dense, observations, standard_parameters
 
 import jaxid as jid
-from jaxid.identification.estimators.regularisation_and_weights import Decomposition
 from jaxid.result_table import Status
 
 PLAIN = jid.estimators.LeastSquares()
@@ -140,7 +139,7 @@ def test_a_joint_that_never_moves_is_named_and_the_rest_is_right(base, p, still)
 
 @pytest.mark.parametrize(
     "solution",
-    [jid.estimators.Complete(), jid.estimators.Truncated(), jid.estimators.Ridge()],
+    [jid.estimators.Complete(), jid.estimators.Ridge()],
 )
 def test_a_log_of_a_joint_that_stands_gives_no_absurd_estimates(base, p, solution):
     """From recorded angles, whose differences must not make columns of rounding."""
@@ -161,25 +160,6 @@ def test_forces_that_are_all_zero_are_no_crash(base):
     assert np.isnan(jid.validate(fit, o).errors[0].relative)
 
 
-def test_truncated_solution_leaves_weak_directions_at_zero(base, noisy):
-    d = Decomposition.of(
-        *jid.RegressionProblem(base, [noisy]).factors.weighted(np.ones(2))
-    )
-    rcond = float(d.values[4] / d.values[0]) * 0.999
-    along, full = (
-        np.asarray(d.directions)
-        @ (
-            np.asarray(d.scale)
-            * jid.identify(
-                base, noisy, jid.estimators.LeastSquares(solution)
-            ).parameters
-        )
-        for solution in (jid.estimators.Truncated(rcond), jid.estimators.Complete())
-    )
-    np.testing.assert_allclose(along[5:], 0.0, atol=1e-12 * np.abs(along).max())
-    np.testing.assert_allclose(along[:5], full[:5], rtol=1e-10)
-
-
 def test_ridge_solves_its_normal_equations_and_says_what_it_pulls(base, noisy):
     fit = jid.identify(
         base, noisy, jid.estimators.LeastSquares(jid.estimators.Ridge(0.1))
@@ -190,9 +170,9 @@ def test_ridge_solves_its_normal_equations_and_says_what_it_pulls(base, noisy):
     strength = 0.1 * np.linalg.norm(A, 2)
     x = np.linalg.solve(A.T @ A + strength**2 * np.eye(base.size), A.T @ forces)
     np.testing.assert_allclose(fit.parameters, x / scale, rtol=1e-9)
-    for solution in (jid.estimators.Ridge(0.3), jid.estimators.Truncated(0.3)):
-        (note,) = jid.identify(base, noisy, jid.estimators.LeastSquares(solution)).notes
-        assert f"of {base.size} directions" in note
+    ridge = jid.estimators.LeastSquares(jid.estimators.Ridge(0.3))
+    (note,) = jid.identify(base, noisy, ridge).notes
+    assert f"of {base.size} directions" in note
 
 
 def test_cross_validation_pulls_only_where_data_are_poor(base, p):

@@ -10,7 +10,6 @@ from .friction_shapes import select_shapes as select_shapes
 from .least_squares import (
     InstrumentalVariables as InstrumentalVariables,
     LeastSquares as LeastSquares,
-    RelativeTo as RelativeTo,
     WeightedLeastSquares as WeightedLeastSquares,
 )
 from .regularisation_and_weights import (
@@ -23,7 +22,6 @@ from .regularisation_and_weights import (
     MaximumForces as MaximumForces,
     ResidualVariances as ResidualVariances,
     Ridge as Ridge,
-    Truncated as Truncated,
 )
 from .robust import (
     AbstractLoss as AbstractLoss,

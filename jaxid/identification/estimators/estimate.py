@@ -165,9 +165,8 @@ class AbstractEstimator(eqx.Module):
     * `problem.factors`: for each joint the R factor of its columns and forces, which is
       sufficient for least squares with weights of the joints; `problem.blocks`: the
       same by contiguous blocks of time, for cross-validation;
-    * `problem.chunks()`, `problem.residuals(p)`, `problem.fold(...)`,
-      `problem.reweighted(...)`: passes over the rows, where these are known (else an
-      `InputError`);
+    * `problem.chunks()`, `problem.residuals(p)`, `problem.reweighted(...)`: passes over
+      the rows, where these are known (else an `InputError`);
     * `problem.with_base(base)`: the same recordings with other columns.
 
     `Estimate.solve` returns the estimate of weighted least squares; use

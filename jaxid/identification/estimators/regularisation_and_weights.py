@@ -140,31 +140,10 @@ class Complete(AbstractSpectralSolution):
 
     def inverse(self, values):
         """Return the inverse squares; zero for directions of rounding."""
-        return Truncated(MIN_SINGULAR_VALUE).inverse(values)
-
-
-class Truncated(AbstractSpectralSolution):
-    """Only well-determined directions; along the others the parameters are zero.
-
-    Attributes:
-        rcond: Smallest singular value that is kept, relative to the largest, with
-            scaled columns.
-    """
-
-    rcond: float = eqx.field(static=True, default=1e-2)
-
-    def __check_init__(self):
-        if not 0.0 <= self.rcond < 1.0:
-            raise InputError(
-                f"`rcond` must be at least 0 and below 1, but is {self.rcond}."
-            )
-
-    def inverse(self, values):
-        """Return the inverse squares; zero for weak directions."""
         values = np.asarray(values)
-        limit = max(self.rcond, MIN_SINGULAR_VALUE) * values.max(initial=0.0)
-        is_strong = values > limit
-        return np.where(is_strong, 1.0 / np.where(is_strong, values, 1.0) ** 2, 0.0)
+        is_visible = values > MIN_SINGULAR_VALUE * values.max(initial=0.0)
+        squares = np.where(is_visible, values, 1.0) ** 2
+        return np.where(is_visible, 1.0 / squares, 0.0)
 
 
 class Ridge(AbstractSpectralSolution):
