@@ -286,10 +286,6 @@ def compare(
         Path,
         typer.Argument(help="Report of another run of the same robot.", metavar="WARM"),
     ],
-    level: Annotated[
-        float,
-        typer.Option("--level", metavar="L", help="Confidence of the decisions (0-1)."),
-    ] = 0.95,
     output: options.OutputFolder = Path("comparison"),
     force: options.Force = False,
 ) -> None:
@@ -302,7 +298,7 @@ def compare(
 
     if first.resolve() == second.resolve():
         raise InputError(f"`{first}` is given twice: compare two different runs.")
-    commands.compare(console, (first, second), level, output)
+    commands.compare(console, (first, second), output)
 
 
 @app.command()

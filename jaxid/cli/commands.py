@@ -264,12 +264,10 @@ def _own_urdf(fit: Fit) -> Path:
     return source
 
 
-def compare(
-    console: Console, paths: tuple[Path, Path], level: float, output: Path
-) -> None:
+def compare(console: Console, paths: tuple[Path, Path], output: Path) -> None:
     """Decide which parameters have changed between two runs."""
     cold_fit, warm_fit = (dataclasses.replace(read_fit(p), name=str(p)) for p in paths)
-    comparison = compare_fits(cold_fit, warm_fit, level)
+    comparison = compare_fits(cold_fit, warm_fit)
     files = write_comparison(output, comparison, paths)
     show(console, comparison.summary(), comparison.group_summary())
     show_files(console, output, [p.name for p in files])

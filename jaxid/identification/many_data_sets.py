@@ -1,8 +1,7 @@
-"""Many data sets in one call: similar robots, noise draws, geometries, any estimator.
+"""Many data sets in one call: similar robots, noise draws, geometries.
 
 Least squares of all data sets are one compiled computation. Data sets that are not well
-conditioned are solved again by orthogonal factors, one by one, and so are all of them
-by another estimator than weighted least squares.
+conditioned are solved again by orthogonal factors, one by one.
 """
 
 import itertools
@@ -31,7 +30,7 @@ from jaxid.measurement.observations import Observations
 from jaxid.robot.robot import Robot
 
 from .batch_solution import BatchFit, DataSets, solve
-from .estimators import AbstractEstimator, GivenWeights, WeightedLeastSquares
+from .estimators import GivenWeights, WeightedLeastSquares
 from .fit_result import Fit
 from .identify import identify
 from .uncertainty import IndependentRows
@@ -46,7 +45,6 @@ def identify_batch(
     mask: Bool[AnyArray, "sets rows joints"] | None = None,
     robots: Sequence[Robot] | None = None,
     row_time: float | None = None,
-    estimator: AbstractEstimator | None = None,
 ) -> BatchFit:
     """Estimate the base parameters of many data sets in one call (Eqs. 28-33).
 
@@ -68,9 +66,6 @@ def identify_batch(
             the columns that lead its base parameters are kept.
         row_time: Time between two rows [s]. With it, standard deviations come from the
             spectral sandwich; without it, rows are taken for independent.
-        estimator: Another than weighted least squares: it estimates one data set after
-            the other, on all cores. It has weights of its own; not with `robots`, and
-            not while JAX traces.
 
     Raises:
         InputError: If shapes do not fit, there are too few rows, or weights are not
@@ -80,17 +75,11 @@ def identify_batch(
     require_float64("a batch of identifications")
     robot = base.model.robot
     _check_arguments(base, motion, forces, mask, robots)
-    if estimator is not None and not (robots is None and weights is None):
+    if base.model.memory is not None:
         raise InputError(
-            "`estimator` has weights of its own: leave out `robots` and `weights`."
+            "friction with memory needs one data set at a time: call `identify`."
         )
-    if base.model.memory is not None and estimator is None:
-        raise InputError(
-            "friction with memory needs one data set at a time: give an `estimator`."
-        )
-    if estimator is not None:
-        weights = np.ones(robot.joints)
-    elif weights is None:
+    if weights is None:
         if is_traced(robot.limits, robot.drives):
             raise InputError(
                 "`weights` must be given where JAX is tracing the robot's limits."
@@ -105,10 +94,7 @@ def identify_batch(
         mask=None if mask is None else jnp.asarray(mask, float),
         numbers=None,
     )
-    if estimator is None:
-        fit = _solve_together(base, robots, batch, row_time)
-    else:
-        fit = _estimate_each(base, batch, estimator, row_time)
+    fit = _solve_together(base, robots, batch, row_time)
     return jax.tree.map(
         lambda x: x if x.ndim == 1 else x.reshape(sets, *draws, x.shape[-1]), fit
     )
@@ -177,74 +163,60 @@ def _solve_again(
     fit: BatchFit,
     row_time: float | None,
 ) -> BatchFit:
-    """Solve data sets that are not well conditioned by orthogonal factors, singly."""
+    """Solve data sets that are not well conditioned by `identify`, on all cores."""
     fit = jax.tree.map(np.array, fit)
-    for k in np.flatnonzero(~fit.determined).tolist():
-        data_set = jax.tree.map(lambda x, k=k: np.asarray(x)[k : k + 1], batch)
-        if data_set.mask is not None and data_set.mask.sum() <= base.size:
-            fit.parameters[k] = 0.0
-            fit.condition_numbers[k] = np.inf
-            fit.standard_deviations[k] = np.inf
-            fit.naive_standard_deviations[k] = np.inf
-            continue
+    counts = np.full(len(fit.determined), batch.motion.q[0].size)
+    if batch.mask is not None:
+        counts = np.sum(batch.mask, axis=(1, 2))
+    numbers = np.flatnonzero(~fit.determined)
+    # Data sets that determine too little have no estimate, and no condition number.
+    fit.parameters[numbers] = 0.0
+    fit.condition_numbers[numbers] = np.inf
+    fit.standard_deviations[numbers] = np.inf
+    fit.naive_standard_deviations[numbers] = np.inf
+
+    def identify_one(place: tuple[int, int]) -> Fit:
+        k, draw = place
         robot = base.model.robot if robots is None else robots[k]
         placed = eqx.tree_at(lambda b: b.model.robot, base, robot)
-        estimator = WeightedLeastSquares(GivenWeights(data_set.weights[0]))
-        result = _estimate_each(placed, data_set, estimator, row_time)
-        for results, x in zip(
-            jax.tree.leaves(fit), jax.tree.leaves(result), strict=True
-        ):
-            results[k] = x[0]
+        return _identify_one(placed, batch, k, draw, row_time)
+
+    draws = batch.forces.shape[1]
+    enough_rows = numbers[counts[numbers] > base.size].tolist()
+    places = list(itertools.product(enough_rows, range(draws)))
+    for (k, draw), result in zip(places, on_cores(identify_one, places), strict=True):
+        fit.parameters[k, draw] = result.parameters
+        fit.standard_deviations[k, draw] = result.standard_deviations
+        fit.residual_rms[k, draw] = result.residual_rms
+        fit.naive_standard_deviations[k, draw] = result.naive_standard_deviations
+        fit.dof[k, draw] = result.uncertainty.dof
+        # Whether a data set determines its parameters does not depend on the draw.
+        fit.determined[k] = np.isfinite(result.naive_standard_deviations).all()
+        if fit.determined[k]:
+            fit.condition_numbers[k] = result.condition_numbers.scaled
     return jax.tree.map(jnp.asarray, fit)
 
 
-def _estimate_each(
-    base: BaseParameters,
-    batch: DataSets,
-    estimator: AbstractEstimator,
-    row_time: float | None,
-) -> BatchFit:
-    """Return the estimates of `identify` for each data set and draw, on all cores."""
-    motion, forces = jax.tree.map(np.asarray, (batch.motion, batch.forces))
-    mask = np.ones(motion.q.shape, bool)
+def _identify_one(
+    base: BaseParameters, batch: DataSets, k: int, draw: int, row_time: float | None
+) -> Fit:
+    """Return the fit of one draw of a data set."""
+    motion, forces = jax.tree.map(np.asarray, (batch.motion[k], batch.forces[k, draw]))
+    mask = np.ones(forces.shape, bool)
     if batch.mask is not None:
-        mask = np.asarray(batch.mask) > 0
-    uncertainty = IndependentRows() if row_time is None else None
-    sets, draws = forces.shape[:2]
-
-    def identify_one(numbers: tuple[int, int]) -> Fit:
-        k, draw = numbers
-        recording = Observations.of(
-            motion.q[k],
-            motion.qd[k],
-            motion.qdd[k],
-            np.where(mask[k], forces[k, draw], 0.0),
-            sample_time=row_time or 1.0,
-            mask=mask[k],
-            name=f"data set {k + 1}",
-        )
-        return identify(base, recording, estimator, uncertainty=uncertainty)
-
-    numbers = itertools.product(range(sets), range(draws))
-    fits = list(on_cores(identify_one, numbers))
-
-    def by_draw(values: list) -> AnyArray:
-        return jnp.asarray(np.array(values).reshape(sets, draws, -1))
-
-    naive_deviations = by_draw([fit.naive_standard_deviations for fit in fits])
-    # Whether a data set determines its parameters does not depend on the draw.
-    is_determined = np.isfinite(naive_deviations[:, 0]).all(axis=1)
-    conditions = np.array([fit.condition_numbers.scaled for fit in fits[::draws]])
-    return BatchFit(
-        parameters=by_draw([fit.parameters for fit in fits]),
-        standard_deviations=by_draw([fit.standard_deviations for fit in fits]),
-        residual_rms=by_draw([fit.residual_rms for fit in fits]),
-        # Only those that determine all have a condition number.
-        condition_numbers=jnp.asarray(np.where(is_determined, conditions, np.inf)),
-        determined=jnp.asarray(is_determined),
-        naive_standard_deviations=naive_deviations,
-        dof=by_draw([fit.uncertainty.dof for fit in fits]),
+        mask = np.asarray(batch.mask[k]) > 0
+    recording = Observations.of(
+        motion.q,
+        motion.qd,
+        motion.qdd,
+        np.where(mask, forces, 0.0),
+        sample_time=row_time or 1.0,
+        mask=mask,
+        name=f"data set {k + 1}",
     )
+    estimator = WeightedLeastSquares(GivenWeights(np.asarray(batch.weights[k])))
+    uncertainty = IndependentRows() if row_time is None else None
+    return identify(base, recording, estimator, uncertainty=uncertainty)
 
 
 def _with_geometries(

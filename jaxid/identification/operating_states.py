@@ -14,7 +14,7 @@ from jaxid.result_table import Summarised, Table
 
 from .combination import as_least_squares, combine, replace_estimates, require_same_base
 from .fit_result import Fit, interval_table
-from .parameter_changes import LEVEL, Comparison, compare_some, joint_test
+from .parameter_changes import Comparison, compare_some, joint_test
 from .uncertainty import Uncertainty
 
 
@@ -84,7 +84,7 @@ class StatesFit(Summarised, eqx.Module):
         )
         return replace_estimates(fit, self.parameters[k], uncertainty)
 
-    def compare(self, first: str, second: str, level: float = LEVEL) -> Comparison:
+    def compare(self, first: str, second: str) -> Comparison:
         """Decide which of the parameters that vary have changed between two states.
 
         The shared ones are the same in both by assumption; `sharing` tests that.
@@ -92,17 +92,14 @@ class StatesFit(Summarised, eqx.Module):
         Args:
             first: Name of one state.
             second: Name of the other.
-            level: Confidence of intervals and tests, a fraction from 0 to 1.
 
         Raises:
-            InputError: If there is no such state, or `level` is no fraction.
+            InputError: If there is no such state.
         """
         first_indices = self._indices(first)[list(self.varying)]
         second_indices = self._indices(second)[list(self.varying)]
         cross = self.uncertainty.covariance[np.ix_(first_indices, second_indices)]
-        return compare_some(
-            self.fit(first), self.fit(second), self.varying, cross, level
-        )
+        return compare_some(self.fit(first), self.fit(second), self.varying, cross)
 
     @property
     def sharing(self) -> tuple[float, float]:

@@ -11,7 +11,6 @@ from scipy import special
 
 from jaxid.arrays import AnyArray, Bool, Float
 from jaxid.dynamics.base import BaseParameters
-from jaxid.errors import InputError
 from jaxid.result_table import (
     Column,
     Status,
@@ -47,7 +46,7 @@ class Comparison(Summarised, eqx.Module):
 
     Many parameters are tested, and each test errs now and then. `CHANGED` are those
     that stay significant with Holm's correction: if nothing has changed, the chance
-    that *any* parameter is called so is at most `1 - level`. `PERHAPS` are those whose
+    that *any* parameter is called so is at most 5 %. `PERHAPS` are those whose
     own interval excludes zero, as one in twenty does without any change.
 
     Attributes:
@@ -56,7 +55,6 @@ class Comparison(Summarised, eqx.Module):
         indices: Base parameters that are compared.
         difference: Parameters of the second fit less those of the first.
         uncertainty: Uncertainty of the differences.
-        level: Confidence of intervals and tests, a fraction from 0 to 1.
     """
 
     first: Fit
@@ -64,7 +62,6 @@ class Comparison(Summarised, eqx.Module):
     indices: tuple[int, ...] = eqx.field(static=True)
     difference: Float[AnyArray, " compared"]
     uncertainty: Uncertainty
-    level: float = eqx.field(static=True)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -98,7 +95,7 @@ class Comparison(Summarised, eqx.Module):
     @property
     def half_widths(self) -> Float[np.ndarray, " compared"]:
         """Half the widths of the differences' intervals, each for itself."""
-        quantiles = special.stdtrit(self.uncertainty.dof, 0.5 + 0.5 * self.level)
+        quantiles = special.stdtrit(self.uncertainty.dof, 0.5 + 0.5 * LEVEL)
         return quantiles * self.standard_deviations
 
     @property
@@ -117,7 +114,7 @@ class Comparison(Summarised, eqx.Module):
     @property
     def verdicts(self) -> tuple[Verdict, ...]:
         """Verdict about each parameter."""
-        chance = 1.0 - self.level
+        chance = 1.0 - LEVEL
         verdicts = np.full(len(self.indices), Verdict.UNCHANGED)
         verdicts[self.p_values <= chance] = Verdict.PERHAPS
         verdicts[self.adjusted_p_values <= chance] = Verdict.CHANGED
@@ -152,7 +149,7 @@ class Comparison(Summarised, eqx.Module):
             )
         adjusted = _holm(np.array([group["p_value"] for group in groups]))
         for group, p_value in zip(groups, adjusted.tolist(), strict=True):
-            group["changed"] = p_value <= 1.0 - self.level
+            group["changed"] = p_value <= 1.0 - LEVEL
         return groups
 
     def summary(self) -> Table:
@@ -165,7 +162,7 @@ class Comparison(Summarised, eqx.Module):
         for fit in (self.first, self.second):
             values = fit.parameters[list(self.indices)]
             estimates.append(with_deviations(values, half_widths)[0])
-        percent = f"{100 * self.level:g} %"
+        percent = f"{100 * LEVEL:g} %"
         return Table(
             f"{self.first.name} and {self.second.name}: {len(kinds)} base parameters",
             Column("#", list(range(1, len(kinds) + 1))),
@@ -185,13 +182,13 @@ class Comparison(Summarised, eqx.Module):
         """Return the numbers of changes, and those to expect by chance."""
         verdicts = self.verdicts
         tests = len(verdicts) - verdicts.count(Verdict.UNKNOWN)
-        chance = 1.0 - self.level
+        chance = 1.0 - LEVEL
         return [
             f"{verdicts.count(Verdict.CHANGED)} of {tests} parameters have changed: if "
             "none had, the chance to call any of them so would be "
             f"{100 * chance:.3g} % at most (Holm)",
             f"{verdicts.count(Verdict.PERHAPS)} more have perhaps changed: zero lies "
-            f"outside the {100 * self.level:g} % interval of their difference; of "
+            f"outside the {100 * LEVEL:g} % interval of their difference; of "
             f"{tests} parameters that never change, about {chance * tests:.2g} look so",
         ]
 
@@ -220,7 +217,7 @@ class Comparison(Summarised, eqx.Module):
         return [self.summary(), self.group_summary()]
 
 
-def compare(first: Fit, second: Fit, level: float = LEVEL) -> Comparison:
+def compare(first: Fit, second: Fit) -> Comparison:
     """Decide which base parameters have changed between two fits of one robot (Sec. 6).
 
     Of physically consistent fits the least squares behind them are compared.
@@ -228,11 +225,9 @@ def compare(first: Fit, second: Fit, level: float = LEVEL) -> Comparison:
     Args:
         first: Fit of one state, such as the cold robot.
         second: Fit of another state, such as the warm robot, with other recordings.
-        level: Confidence of intervals and tests, a fraction from 0 to 1.
 
     Raises:
-        InputError: If the fits are not of the same base parameters, or `level` is no
-            fraction.
+        InputError: If the fits are not of the same base parameters.
     """
     require_same_base((first, second))
     size = first.base.size
@@ -242,18 +237,13 @@ def compare(first: Fit, second: Fit, level: float = LEVEL) -> Comparison:
         without_bounds(second),
         range(size),
         np.zeros((size, size)),
-        level,
     )
 
 
 def compare_some(
-    first: Fit, second: Fit, indices: Sequence[int], cross: AnyArray, level: float
+    first: Fit, second: Fit, indices: Sequence[int], cross: AnyArray
 ) -> Comparison:
     """Compare base parameters of two fits whose estimates have a cross-covariance."""
-    if not 0 < level < 1:
-        raise InputError(
-            f"`level` must lie between 0 and 1, like 0.95, but is {level:g}."
-        )
     k = list(indices)
     first_covariance = first.covariance[np.ix_(k, k)]
     second_covariance = second.covariance[np.ix_(k, k)]
@@ -272,7 +262,6 @@ def compare_some(
         indices=tuple(k),
         difference=second.parameters[k] - first.parameters[k],
         uncertainty=Uncertainty(covariance, dof, covariance),
-        level=level,
     )
 
 

@@ -110,9 +110,7 @@ def _comparison_panel(comparison: Comparison, shown: np.ndarray) -> Panel:
     fits = (comparison.first, comparison.second)
     indices = np.array(comparison.indices)[shown]
     estimates = np.stack([np.asarray(fit.parameters)[indices] for fit in fits])
-    half_widths = np.stack(
-        [fit.uncertainty.half_widths(comparison.level)[indices] for fit in fits]
-    )
+    half_widths = np.stack([fit.uncertainty.half_widths()[indices] for fit in fits])
     sizes = np.abs(estimates) + half_widths
     # An end at infinity is off the axis, whatever the scale.
     ends = np.max(np.where(np.isfinite(sizes), sizes, 0.0), axis=0)

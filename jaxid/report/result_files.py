@@ -177,7 +177,7 @@ def write_comparison(
         "first": first.name,
         "second": second.name,
         "sources": [str(source) for source in sources],
-        "level": comparison.level,
+        "level": LEVEL,
         "parameters": rows,
         "covariance_of_differences": comparison.uncertainty.covariance,
         "groups": comparison.groups,

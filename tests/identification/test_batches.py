@@ -19,7 +19,6 @@ from jaxid.identification.uncertainty.blocks import bootstrap
 
 SAMPLES = 150
 WEIGHTS = np.array([0.3, 2.0])
-GIVEN = jid.WeightedLeastSquares(jid.estimators.GivenWeights(WEIGHTS))
 
 
 @pytest.fixture(scope="module")
@@ -109,23 +108,6 @@ def test_honest_deviations_of_many_draws(base, sets, arrays):
             found = getattr(fit, name)[k, draw]
             np.testing.assert_allclose(found, getattr(one, name), rtol=1e-8)
         np.testing.assert_allclose(fit.dof[k, draw], one.uncertainty.dof, rtol=1e-8)
-
-
-def test_any_estimator_takes_batches(base, sets, arrays):
-    mask = np.random.default_rng(1).random((3, SAMPLES, 2)) < 0.8
-    m, forces = arrays
-    draws = np.where(mask[:, None], np.stack([forces, 2.0 * forces], axis=1), np.nan)
-    estimator = jid.estimators.IterativelyReweighted(jid.estimators.Tukey())
-    dt = sets[0].sample_time
-    fit = identify_batch(base, m, draws, mask=mask, estimator=estimator, row_time=dt)
-    assert fit.parameters.shape == (3, 2, base.size)
-    assert np.asarray(fit.determined).all()
-    one = jid.identify(base, sets[1].replace(mask=mask[1]), estimator)
-    np.testing.assert_allclose(fit.parameters[1, 0], one.parameters, rtol=1e-8)
-    np.testing.assert_allclose(
-        fit.standard_deviations[1, 0], one.standard_deviations, rtol=1e-8
-    )
-    np.testing.assert_allclose(fit.parameters[1, 1], 2 * one.parameters, rtol=1e-2)
 
 
 def test_draws_scatter_as_the_standard_deviations_say(base, arrays):
@@ -281,7 +263,6 @@ def test_robots_of_one_topology(base):
         (slice(1, None), {}, "`motion` must have the shape"),
         (slice(None), {"mask": np.ones((3, 3, 2), bool)}, "`mask` must have the shape"),
         (slice(None), {"robots": [jid.robots.planar_arm(3)] * 3}, "topology of"),
-        (slice(None), {"weights": WEIGHTS, "estimator": GIVEN}, "`estimator`"),
     ],
 )
 def test_refusals(base, arrays, samples, options, message):
