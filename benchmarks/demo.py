@@ -75,10 +75,7 @@ def figures(record):
     excitation = record["excitation"]
     found["end-effector, speed up to [m/s]"] = excitation["tip_speed"]
     found["end-effector, acceleration up to [m/s²]"] = excitation["tip_acceleration"]
-    for design in excitation["designs"]:
-        name = design["criterion"]
-        for criterion, value in design["criteria"].items():
-            found[f"designed by {name}: {criterion}"] = value
+
     return found
 
 

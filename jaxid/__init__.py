@@ -17,13 +17,13 @@ except _metadata.PackageNotFoundError:
 
 if _typing.TYPE_CHECKING:
     from jaxid.api import *  # noqa: F403
-    from jaxid.report import public_figures as plot  # noqa: F401
+    from jaxid.report import plot  # noqa: F401
 else:
 
     def __getattr__(name):
         """Load the public names when one is first used, and matplotlib for `plot`."""
         if name == "plot":
-            return _importlib.import_module("jaxid.report.public_figures")
+            return _importlib.import_module("jaxid.report.plot")
         if not name.startswith("_"):
             api = vars(_importlib.import_module("jaxid.api"))
             globals().update({k: v for k, v in api.items() if not k.startswith("_")})

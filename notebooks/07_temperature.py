@@ -111,7 +111,7 @@ new = observed(warm, 2, 99)
 errors = {name: jid.validate(fit, new).errors for name, fit in fits.items()}
 for name, one in errors.items():
     print(f"{name} model: relative error {one[0].relative:.1%}")
-jid.plot.bars([(f"{name} model", one) for name, one in errors.items()], robot)
+jid.plot.bars({f"{name} model": one for name, one in errors.items()}, robot)
 
 # %% [markdown]
 # ## A law instead of two states

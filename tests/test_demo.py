@@ -88,7 +88,7 @@ def test_tables_and_files_say_the_same(found, tmp_path):
     files = write_study(tmp_path / "demo", found)
     assert all(file.is_file() for file in files)
     record = json.loads((tmp_path / "demo" / "demo.json").read_text())
-    assert record["base_parameters"]["count"] == 44
+    assert record["base_parameters"] == 44
     weighted = record["estimates"]["weighted"]
     assert weighted["mean_percent_moving"][1] == found.moving_errors(found.weighted, 1)
     assert weighted["mean_percent_verification"] == found.weighted.mean_errors(1)

@@ -25,7 +25,7 @@ from jaxid.excitation.coefficient_limits import JointLimits
 from jaxid.excitation.criteria import CRITERIA, EOptimal
 from jaxid.experiment.decoder import keys_of
 from jaxid.experiment.experiment import load_experiment
-from jaxid.report.excitation import plan_remarks
+from jaxid.report.excitation_page import plan_remarks
 from jaxid.trajectory.controllers import CONTROLLERS
 from jaxid.trajectory.files import load_trajectory, save_trajectory
 from jaxid.trajectory.fourier import FourierBasis, fourier_series

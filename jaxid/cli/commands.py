@@ -25,8 +25,8 @@ from jaxid.identification.fit_result import Fit
 from jaxid.identification.parameter_changes import compare as compare_fits
 from jaxid.identification.payload import Payload
 from jaxid.io import require_writable, write_text
-from jaxid.report.excitation import headline, ordered, plan_remarks
-from jaxid.report.identification import motor_tables
+from jaxid.report.excitation_page import motion_verdict, plan_remarks, sort_remarks
+from jaxid.report.identification_page import motor_tables
 from jaxid.report.result_files import read_faults, read_fit, write_comparison
 from jaxid.result_table import Remark, Status, significant
 from jaxid.robot.robot import Robot
@@ -41,7 +41,7 @@ from jaxid.workflow.motion_design import (
     write_design,
 )
 from jaxid.workflow.motion_files import make_playable, write_motion
-from jaxid.workflow.repeated_runs import (
+from jaxid.workflow.payload_gains_and_states import (
     RunsReport,
     identify_gains_from_logs,
     identify_payload_from_logs,
@@ -161,8 +161,8 @@ def excite(
         progress("writing the report", 0.0)
         files = write_design(task, design, output, **origin(experiment))
     show(console, *design.plan.tables())
-    verdict = headline(design.plan, design.remarks)
-    remarks = ordered((*plan_remarks(design.plan), *design.remarks))
+    verdict = motion_verdict(design.plan, design.remarks)
+    remarks = sort_remarks((*plan_remarks(design.plan), *design.remarks))
     show_remarks(console, [*remarks, verdict])
     names = [str(file.relative_to(output.parent)) for file in files]
     show_files(console, output.parent, names)

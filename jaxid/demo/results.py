@@ -7,8 +7,7 @@ import numpy as np
 
 import jaxid as jid
 from jaxid.io import atomic_folder
-from jaxid.report.excitation import side_by_side_table
-from jaxid.report.identification import parameter_table
+from jaxid.report.identification_page import parameter_table
 from jaxid.report.page import Section, folded, picture, render_page
 from jaxid.report.result_files import write_json
 from jaxid.report.result_records import SCHEMAS
@@ -44,9 +43,10 @@ def write_study(folder: Path, study: Study) -> list[Path]:
 
 def tables(study: Study) -> list[Table]:
     """Return all tables of the demo."""
+    designs = [] if study.plan is None else study.plan.tables()[:1]
     return [
         paper_table(study),
-        *([side_by_side_table(study.plans)] if study.plans else []),
+        *designs,
         error_table(study, 0),
         error_table(study, 1),
         study.temperature.group_summary(),
@@ -218,6 +218,7 @@ def _excitation(study: Study) -> Section:
     times = np.linspace(0.0, float(series.duration), POINTS)
     motion = series.motion(times)
     speed, acceleration = study.tip_maxima
+    designs = [] if study.plan is None else study.plan.tables()[:1]
     return "Base parameters, and the motion that excites them", [
         f"Of {base.model.size} columns the QR decomposition without pivoting leaves "
         f"{base.size}; the first two are those of Eq. 24.",
@@ -227,9 +228,8 @@ def _excitation(study: Study) -> Section:
         ),
         f"The motion is a Fourier series of {settings.HARMONICS} harmonics at "
         f"{settings.OMEGA:g} rad/s within all limits and clear of collisions. As in "
-        "the paper, it has the least condition number; the D-optimal one beside it "
-        "makes the parameters most certain.",
-        *([side_by_side_table(study.plans)] if study.plans else []),
+        "the paper, it has the least condition number.",
+        *designs,
         picture(
             _speed_scene(robot, times, motion),
             "Fig. 3: path of the end-effector along the designed motion, up to "
@@ -283,6 +283,7 @@ def _verification(study: Study) -> Section:
     path = study.joint_path
     times = np.linspace(0.0, float(path.duration), 5 * POINTS)
     identification, verification = study.weighted.validation.errors
+    groups = {"identification": [identification], "verification": [verification]}
     return "Verification on another path", [
         f"The path after ISO 9283 in a cube of {settings.EDGE:g} m, with rests at its "
         f"corners, up to {settings.SPEED:g} m/s and {settings.ACCELERATION:g} m/s². Of "
@@ -296,7 +297,7 @@ def _verification(study: Study) -> Section:
             "Fig. 9: torques of the axes 1, 3, 5 and 7 on the verification path.",
         ),
         picture(
-            jid.plot.errors([identification], [verification], robot),
+            jid.plot.bars(groups, robot),
             "Fig. 10: mean errors on both paths.",
         ),
         (error_table(study, 0), error_table(study, 1)),
@@ -323,13 +324,8 @@ def _study_record(study: Study) -> dict[str, Any]:
         "schema": SCHEMAS["demo.json"],
         "versions": versions(),
         "seed": study.seed,
-        "base_parameters": {
-            "count": base.size,
-            "names": base.names,
-            "truth": study.truth,
-        },
+        "base_parameters": base.size,
         "excitation": {
-            "designs": [_design_record(plan) for plan in study.plans],
             "tip_speed": speed,
             "tip_acceleration": acceleration,
         },
@@ -353,8 +349,3 @@ def _study_record(study: Study) -> dict[str, Any]:
             for k in COLD
         ],
     }
-
-
-def _design_record(plan: jid.ExcitationPlan) -> dict[str, Any]:
-    values = {criterion.name: criterion.after for criterion in plan.criteria}
-    return {"criterion": plan.criterion.name, "criteria": values}

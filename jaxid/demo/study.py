@@ -9,8 +9,7 @@ import jax
 import numpy as np
 
 import jaxid as jid
-from jaxid.arrays import Float, on_cores
-from jaxid.excitation.design import DesignProgress
+from jaxid.arrays import Float
 from jaxid.identification.parameter_changes import Comparison
 from jaxid.validation.torque_errors import Validation
 
@@ -66,9 +65,8 @@ class Study(NamedTuple):
     seed: int  # seed of all random numbers
     base: jid.BaseParameters  # base parameters of the robot
     truth: Float[np.ndarray, " base"]  # base parameters of the cold robot
-    # motions with the least condition number (Eq. 36), and D-optimal; none if a motion
-    # was given
-    plans: tuple[jid.ExcitationPlan, ...]
+    # design with the least condition number (Eq. 36); None if a motion was given
+    plan: jid.ExcitationPlan | None
     # motion of the identification, from standstill to standstill
     played: jid.trajectories.WithLeads
     joint_path: (
@@ -127,11 +125,10 @@ def run_study(
     warm_robot = jid.simulation.virtual_tx90l_on_rail(warm=True)
     robot = cold_robot.robot
     base = jid.base_parameters(cold_robot.model)
-    plans: tuple[jid.ExcitationPlan, ...] = ()
+    plan = None
     if motion is None:
-        plans = _design(base, seed, progress)
-        basis = jid.trajectories.FourierBasis(HARMONICS, OMEGA)
-        motion = basis.trajectory(plans[0].trajectory.coefficients)
+        plan = _design(base, seed, progress)
+        motion = plan.trajectory
     progress("adding the leads", 0.0)
     played_motion = jid.trajectories.with_leads(motion, robot, periods=periods)
     progress("inverse kinematics of the verification path", 0.0)
@@ -178,7 +175,7 @@ def run_study(
         seed,
         base,
         truth,
-        plans,
+        plan,
         played_motion,
         joint_path,
         tuple(observations),
@@ -190,8 +187,8 @@ def run_study(
 
 def _design(
     base: jid.BaseParameters, seed: int, progress: Callable[[str, float], None]
-) -> tuple[jid.ExcitationPlan, ...]:
-    """Return a motion with the least condition number, and a D-optimal one (Eq. 36)."""
+) -> jid.ExcitationPlan:
+    """Return the motion with the least condition number within all limits (Eq. 36)."""
     limits = base.model.robot.limits
     position_min = np.array(limits.position_min)
     position_max = np.array(limits.position_max)
@@ -199,40 +196,25 @@ def _design(
     position_min[SHOULDER] = -0.4
     position_max[SHOULDER] = 0.4
     acceleration[SHOULDER] = 3.0
-    limits = dataclasses.replace(
-        limits,
-        position_min=position_min,
-        position_max=position_max,
-        acceleration=acceleration,
-    )
 
-    stage = "designing two motions"
+    stage = "designing the motion"
     progress(stage, 0.0)
-    fractions: dict[str, float] = {}
-
-    def design(criterion: jid.criteria.AbstractCriterion) -> jid.ExcitationPlan:
-        def report(search: DesignProgress) -> None:
-            fractions[criterion.name] = search.fraction
-            total = sum(fractions.values())
-            if total > 0.0:  # zero would begin the stage anew
-                progress(stage, total / 2)
-
-        return jid.design_excitation(
-            base,
-            criterion=criterion,
-            basis=jid.trajectories.FourierBasis(HARMONICS, OMEGA),
-            limits=limits,
-            constraints=(
-                jid.constraints.Clearance(jid.robots.tx90l_on_rail_collision()),
-            ),
-            starts=2,
-            generations=0,
-            samples=SAMPLES,
-            key=jax.random.key(seed),
-            progress=report,
-            throw=False,
-        )
-
-    # Most of the time is that of the compiler, which works on one core at a time.
-    criteria = (jid.criteria.ConditionNumber(), jid.criteria.DOptimal())
-    return tuple(on_cores(design, criteria))
+    shapes = jid.robots.tx90l_on_rail_collision()
+    return jid.design_excitation(
+        base,
+        criterion=jid.criteria.ConditionNumber(),
+        basis=jid.trajectories.FourierBasis(HARMONICS, OMEGA),
+        limits=dataclasses.replace(
+            limits,
+            position_min=position_min,
+            position_max=position_max,
+            acceleration=acceleration,
+        ),
+        constraints=(jid.constraints.Clearance(shapes),),
+        starts=2,
+        generations=0,
+        samples=SAMPLES,
+        key=jax.random.key(seed),
+        progress=lambda search: progress(stage, search.fraction),
+        throw=False,
+    )

@@ -14,7 +14,7 @@ class Figure(Drawing):
     def matplotlib(self) -> Any:
         """Return a `matplotlib.figure.Figure`, to be changed for a paper."""
         # matplotlib is slow to load, and pages do not need it.
-        from .paper import draw
+        from .matplotlib_figures import draw
 
         return draw(self)
 
@@ -38,6 +38,6 @@ class Figure(Drawing):
 
     def _write_picture(self, file: Any, suffix: str) -> None:
         """Write PNG, PDF or SVG."""
-        from .paper import save
+        from .matplotlib_figures import save
 
         save(self, file, suffix)

@@ -1,6 +1,7 @@
 """Elements of figures, without their style: curves in panels, and a robot in space.
 
-`templates/figures.js` draws them on pages, `paper.py` for papers and notebooks.
+`templates/figures.js` draws them on pages, `matplotlib_figures.py` in notebooks and
+for papers.
 """
 
 import dataclasses

@@ -18,8 +18,8 @@ from jaxid.result_table import (
     versions,
 )
 
+from .browser_figures import charts, library
 from .figure_elements import Drawing
-from .interactive import charts, library
 
 Section = tuple[str, Sequence[Any]]
 """Title, which the table of contents shows, and blocks as `render_page` takes them."""

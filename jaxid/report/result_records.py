@@ -2,28 +2,29 @@
 
 import datetime
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
 import numpy as np
 
-from jaxid.identification.estimators.regularisation_and_weights import (
-    LARGEST_UNCERTAINTY,
-)
+from jaxid.arrays import AnyArray
 from jaxid.identification.fit_result import Fit
 from jaxid.identification.parameter_changes import Comparison, parameter_kinds
+from jaxid.identification.uncertainty import Uncertainty
 from jaxid.result_table import versions
 from jaxid.robot.robot import Robot
 from jaxid.validation.torque_errors import TorqueErrors
 from jaxid.validation.verdict import Report, verdict
 
+Record = dict[str, Any]
+"""Object of a JSON file, or row of a CSV file."""
 KINDS = ("result", "comparison", "payload", "gains", "states", "demo", "rollout")
 SCHEMAS = {f"{kind}.json": f"jaxid-{kind}/1" for kind in KINDS}
 """Files that hold results, and the schemas in them."""
 
 
-def header(file: str) -> dict[str, Any]:
+def header(file: str) -> Record:
     """Return schema, date and versions, the first entries of a result file."""
     date = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
     return {"schema": SCHEMAS[file], "made": {"date": date, "versions": versions()}}
@@ -44,7 +45,7 @@ def plain(value: Any) -> Any:
     return str(value)
 
 
-def table_rows(**columns: Any) -> list[dict[str, Any]]:
+def table_rows(**columns: Any) -> list[Record]:
     """Return a dictionary for each row of some columns."""
     lists = [
         column.tolist() if isinstance(column, np.ndarray | jax.Array) else column
@@ -53,65 +54,63 @@ def table_rows(**columns: Any) -> list[dict[str, Any]]:
     return [dict(zip(columns, row, strict=True)) for row in zip(*lists, strict=True)]
 
 
-def _attributes(source: Any, *names: str) -> dict[str, Any]:
-    return {name: getattr(source, name) for name in names}
-
-
-def result_record(report: Report) -> dict[str, Any]:
-    """Return the content of `result.json`."""
+def result_record(report: Report) -> Record:
+    """Return the content of `result.json`; `model.json` holds robot, model and fit."""
     fit = report.fit
-    base = fit.base
-    model = base.model
-    robot = model.robot
-    definiteness = report.definiteness
+    robot = fit.base.model.robot
+    verdicts = []
+    for remark in verdict(report):
+        verdicts.append({"status": remark.status.name.lower(), "text": remark.text})
+    undetermined = []
+    for direction in fit.undetermined:
+        names = [fit.base.names[k] for k in direction.parts]
+        sentence = direction.sentence(fit.base)
+        undetermined.append(
+            {"sentence": sentence, "parameters": names, **vars(direction)}
+        )
     return {
         **header("result.json"),
-        "verdict": [
-            {"status": remark.status.name.lower(), "text": remark.text}
-            for remark in verdict(report)
-        ],
-        "robot": _robot_record(robot),
+        "verdict": verdicts,
+        "robot": robot.name,
         "base_parameters": parameter_rows(fit),
-        "model": {
-            "terms": [str(term) for term in model.terms],
-            "standard_names": model.parameter_names,
-            "standard_units": model.parameter_units,
-            "independent": base.indices,
-            "dependent": base.dependent,
-            "kappa": base.kappa,
+        "fit": {
+            "estimator": fit.estimator,
+            "recordings": fit.recordings,
+            "rows": fit.rows,
+            "weights": fit.weights,
+            "residual": fit.residual,
+            "residual_rms": fit.residual_rms,
+            "covariance": fit.covariance,
+            "condition_numbers": vars(fit.condition_numbers),
+            "undetermined": undetermined,
         },
-        "fit": _fit_record(fit),
         "consistency": consistency_record(fit),
         "errors": {
             "identification": [_error_record(e, robot) for e in report.identification],
             "verification": [_error_record(e, robot) for e in report.verification],
         },
         "mass_matrix": {
-            **_attributes(definiteness, "positive_definite", "pose", "poses"),
-            "smallest_eigenvalue": definiteness.smallest,
-            "indefinite_share": definiteness.indefinite,
+            "positive_definite": report.definiteness.positive_definite,
+            **vars(report.definiteness),
         },
         "settings": report.settings,
         "notes": report.every_note,
     }
 
 
-def _robot_record(robot: Robot) -> dict[str, Any]:
-    """Return names, units, limits; geometry, drives and tool are in the model file."""
-    joints = range(robot.joints)
-    limits = robot.limits
-    rows = table_rows(
-        name=robot.joint_names,
-        kind=["revolute" if turns else "prismatic" for turns in robot.revolute],
-        unit=[robot.joint_unit(j) for j in joints],
-        force_unit=[robot.force_unit(j) for j in joints],
-        **_attributes(limits, "position_min", "position_max"),
-        **_attributes(limits, "velocity", "acceleration", "jerk", "force"),
+def consistency_record(fit: Fit) -> Record | None:
+    """Return all standard parameters of a physically consistent estimate, or None."""
+    if fit.consistency is None or fit.full_parameters is None:
+        return None
+    parameters = table_rows(
+        name=fit.base.model.parameter_names,
+        unit=fit.base.model.parameter_units,
+        estimate=fit.full_parameters,
     )
-    return {"name": robot.name, "source": robot.source, "joints": rows}
+    return {**vars(fit.consistency), "standard_parameters": parameters}
 
 
-def parameter_rows(fit: Fit) -> list[dict[str, Any]]:
+def parameter_rows(fit: Fit) -> list[Record]:
     """Return the base parameters, one row for each, in their order."""
     intervals = fit.intervals(0.95)
     return table_rows(
@@ -130,78 +129,37 @@ def parameter_rows(fit: Fit) -> list[dict[str, Any]]:
     )
 
 
-def _fit_record(fit: Fit) -> dict[str, Any]:
-    names = fit.base.names
-    return {
-        **_attributes(fit, "estimator", "solution", "recordings", "rows", "weights"),
-        **_attributes(fit, "residual", "residual_rms", "covariance"),
-        "condition_numbers": _attributes(
-            fit.condition_numbers, "raw", "weighted", "scaled"
-        ),
-        "naive_covariance": fit.uncertainty.naive_covariance,
-        "jackknife_standard_deviations": fit.uncertainty.jackknife,
-        "residuals": _spectra_record(fit),
-        "undetermined": [
-            {
-                "sentence": direction.sentence(fit.base),
-                "parameters": [names[k] for k in direction.parts],
-                **_attributes(direction, "shares", "singular_value", "uncertainty"),
-            }
-            for direction in fit.undetermined
-        ],
-        "undetermined_above": LARGEST_UNCERTAINTY,
-    }
-
-
-def _spectra_record(fit: Fit) -> dict[str, Any] | None:
-    """Return the spectra of the residuals; None for a fit that has none."""
-    spectra = fit.residual_spectra
-    if spectra is None:
-        return None
-    return {
-        **_attributes(spectra, "white", "departure", "limit", "band"),
-        **_attributes(spectra, "frequency", "density"),
-        "slow_share": spectra.low_frequency,
-        "filter_gain": spectra.gain,
-    }
-
-
-def consistency_record(fit: Fit) -> dict[str, Any] | None:
-    """Return all standard parameters of a physically consistent estimate, or None."""
-    consistency = fit.consistency
-    if consistency is None or fit.full_parameters is None:
-        return None
-    model = fit.base.model
-    return {
-        "error_bound": consistency.error_bound,
-        "iterations": consistency.iterations,
-        "price": consistency.residual_increase,
-        "assumed": consistency.bounds,
-        "active_bounds": consistency.active,
-        "shares_of_a_body": consistency.margins,
-        "proved": consistency.certified,
-        "masses_from_bounds": [f"m{k + 1}" for k in consistency.masses_from_bounds],
-        "standard_parameters": table_rows(
-            name=model.parameter_names,
-            unit=model.parameter_units,
-            estimate=fit.full_parameters,
-            follows_from_forces_alone=consistency.determined,
-        ),
-    }
-
-
-def _error_record(errors: TorqueErrors, robot: Robot) -> dict[str, Any]:
+def _error_record(errors: TorqueErrors, robot: Robot) -> Record:
+    """Return the torque errors of one recording, joint by joint."""
     rows = table_rows(
         name=robot.joint_names,
         unit=[robot.force_unit(j) for j in range(robot.joints)],
-        rows=np.asarray(errors.counted).sum(axis=0),
-        **_attributes(errors, "mean", "rms", "mean_percent", "rms_percent"),
-        **_attributes(errors, "rms_relative", "offset", "rms_at_rest", "rms_in_motion"),
+        mean=errors.mean,
+        rms=errors.rms,
+        mean_percent=errors.mean_percent,
+        rms_percent=errors.rms_percent,
+        rms_relative=errors.rms_relative,
+        offset=errors.offset,
+        rms_at_rest=errors.rms_at_rest,
+        rms_in_motion=errors.rms_in_motion,
     )
     return {"relative": errors.relative, "recording": errors.name, "joints": rows}
 
 
-def comparison_rows(comparison: Comparison) -> list[dict[str, Any]]:
+def estimate_rows(
+    names: Sequence[str], units: Sequence[str], values: AnyArray, spread: Uncertainty
+) -> list[Record]:
+    """Return some estimates with their uncertainty, one row for each."""
+    return table_rows(
+        name=names,
+        unit=units,
+        estimate=values,
+        standard_deviation=spread.standard_deviations,
+        half_width=spread.half_widths(),
+    )
+
+
+def comparison_rows(comparison: Comparison) -> list[Record]:
     """Return the parameters of two fits, one row for each, with their differences."""
     first = comparison.first
     second = comparison.second

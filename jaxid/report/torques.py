@@ -1,6 +1,6 @@
 """Measured and predicted forces over time, and their errors (Figs. 6, 7, 9 and 10)."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -120,39 +120,18 @@ def require_joints(errors: TorqueErrors, robot: Robot) -> None:
         )
 
 
-def error_figure(
-    identification: Sequence[TorqueErrors],
-    verification: Sequence[TorqueErrors],
-    robot: Robot,
-) -> Figure:
-    """Return mean absolute errors as bars and RMS errors as points (Eq. 37, Fig. 10).
-
-    In percent of the largest forces; of the RMS of the measured forces if a largest one
-    is not known. Several recordings count as one.
-
-    Args:
-        identification: Errors on the recordings of the fit.
-        verification: Errors on recordings that the fit has not seen; may be empty.
-        robot: Robot of the recordings.
-
-    Raises:
-        InputError: If there is no recording at all, or the numbers of joints differ.
-    """
-    groups = (("identification", identification), ("verification", verification))
-    return bar_figure(groups, robot)
-
-
 def bar_figure(
-    groups: Sequence[tuple[str, Sequence[TorqueErrors]]], robot: Robot, title: str = ""
+    groups: Mapping[str, Sequence[TorqueErrors]], robot: Robot, title: str = ""
 ) -> Figure:
-    """Return mean absolute errors as bars, RMS errors as points, by group (Eq. 37).
+    """Return mean errors as bars, RMS errors as points, by group (Eq. 37, Fig. 10).
 
     In percent of the largest forces; of the RMS of the measured forces if a largest one
     is not known. Recordings of one group count as one.
 
     Args:
-        groups: Names, and errors on some recordings, like those of one estimator;
-            groups without recordings are left out.
+        groups: Errors on some recordings by the name of the group, like
+            `{"identification": errors[:1], "verification": errors[1:]}`; groups without
+            recordings are left out.
         robot: Robot of the recordings.
         title: Title of the figure; the robot's name if empty.
 
@@ -160,19 +139,18 @@ def bar_figure(
         InputError: If there is no recording at all, there are too many groups, or the
             numbers of joints differ.
     """
-    groups = [(name, recordings) for name, recordings in groups if recordings]
+    groups = {name: recordings for name, recordings in groups.items() if recordings}
     if not 0 < len(groups) <= len(GROUP_COLOURS):
         raise InputError(
             f"`groups` must hold 1 to {len(GROUP_COLOURS)} groups with errors, but "
             f"holds {len(groups)}."
         )
-    for _, recordings in groups:
-        for errors in recordings:
-            require_joints(errors, robot)
+    every_error = [errors for recordings in groups.values() for errors in recordings]
+    for errors in every_error:
+        require_joints(errors, robot)
 
     # All recordings are of one robot: the largest forces of the first are those of all.
-    _, first_recordings = groups[0]
-    max_forces = np.asarray(first_recordings[0].max_forces)
+    max_forces = np.asarray(every_error[0].max_forces)
     reference = "the largest force"
     if not np.isfinite(max_forces).all():
         max_forces = None
@@ -185,7 +163,7 @@ def bar_figure(
     show_numbers = joints * len(groups) <= MAX_BARS_WITH_NUMBERS
     bars = []
     points = []
-    for k, (name, recordings) in enumerate(groups):
+    for k, (name, recordings) in enumerate(groups.items()):
         colour = GROUP_COLOURS[k]
         shift = (k - middle_group) * (bar_width + 0.02)
         places = np.arange(joints) + shift

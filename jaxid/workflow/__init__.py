@@ -19,7 +19,7 @@ from .motion_design import (
     prepare_motion as prepare_motion,
     write_design as write_design,
 )
-from .repeated_runs import (
+from .payload_gains_and_states import (
     identify_gains_from_logs as identify_gains_from_logs,
     identify_payload_from_logs as identify_payload_from_logs,
     identify_states_from_logs as identify_states_from_logs,

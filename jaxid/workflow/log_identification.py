@@ -26,7 +26,7 @@ from jaxid.identification.problem import RegressionProblem
 from jaxid.measurement.columns import Columns
 from jaxid.measurement.observations import Observations
 from jaxid.measurement.recording import Recording
-from jaxid.report.identification import body_table, motor_tables, residual_table
+from jaxid.report.identification_page import body_table, motor_tables, residual_table
 from jaxid.report.result_files import read_fit, write_report
 from jaxid.result_table import Remark, Status, Summarised, Table
 from jaxid.validation.diagnosis import mistakes_in_logs

@@ -9,8 +9,8 @@ from jaxid.dynamics.model import Model
 from jaxid.dynamics.terms import RigidBodies
 from jaxid.errors import InputError
 from jaxid.measurement.columns import Columns
-from jaxid.report.rollout import RolloutReport
-from jaxid.report.torque_rollout import TorqueRolloutReport
+from jaxid.report.servo_rollout_report import RolloutReport
+from jaxid.report.torque_rollout_report import TorqueRolloutReport
 from jaxid.result_table import Remark, Status
 from jaxid.rollout import (
     Bodies,

@@ -13,7 +13,7 @@ from jaxid.excitation.design import DesignProgress, design_excitation
 from jaxid.excitation.design_result import ExcitationPlan
 from jaxid.excitation.problem import assumed_noise
 from jaxid.io import import_extra
-from jaxid.report.excitation import write_excitation
+from jaxid.report.excitation_page import write_excitation
 from jaxid.result_table import Remark, Status
 from jaxid.trajectory.controllers import CONTROLLERS
 from jaxid.trajectory.files import load_trajectory
@@ -211,7 +211,7 @@ def write_design(
     facts = (("seed", str(task.excitation.seed)),)
     settings = {"facts": facts, "experiment_text": experiment_text, "command": command}
     # First the page: where there is no room for pictures, nothing changes.
-    pictures = write_excitation(
+    page = write_excitation(
         output.with_suffix(""),
         design.plan,
         design.playable.motion,
@@ -222,7 +222,7 @@ def write_design(
     motion_files = write_motion(
         task.setup.robot, task.excitation, design.playable, output
     )
-    return motion_files + pictures
+    return [*motion_files, page]
 
 
 def describe_motion(

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from browser import CHROMIUM, Browser
 
-from jaxid.report.motion import pose_figure
+from jaxid.report.motion_figures import pose_figure
 from jaxid.robot import library
 from jaxid.robot.collision import Capsule, CollisionModel, HalfSpace
 

@@ -13,12 +13,11 @@ import pytest
 
 import jaxid as jid
 from jaxid.identification.uncertainty import ResidualSpectra
+from jaxid.report.browser_figures import charts, library
 from jaxid.report.figure_elements import BLUE, ORANGE, decimate
-from jaxid.report.interactive import charts, library
-from jaxid.report.motion import pose_figure
+from jaxid.report.friction_and_gravity import gravity_forces
+from jaxid.report.motion_figures import pose_figure
 from jaxid.report.parameter_words import in_words
-from jaxid.report.physics import gravity_forces
-from jaxid.report.residuals import autocorrelation
 from jaxid.robot.collision import GROUND, Box, Capsule, CollisionModel, HalfSpace
 
 T = np.linspace(0.0, 2.0, 101)
@@ -113,7 +112,9 @@ def test_long_names_fit_on_the_page(errors_of):
         f, density, 1.0 / (1.0 + (f / 10) ** 4), half, 0.1, half, 9.5
     )
     require_everything_inside(jid.plot.torques(errors, robot))
-    require_everything_inside(jid.plot.errors((errors,), (errors,), robot))
+    require_everything_inside(
+        jid.plot.bars({"identification": (errors,), "verification": (errors,)}, robot)
+    )
     require_everything_inside(jid.plot.residuals(spectra, robot))
 
 
@@ -130,7 +131,8 @@ def test_residuals_stand_beside_white_ones(fit):
 
 def test_bars_are_percents_of_the_largest_forces(errors_of):
     first, second = errors_of(3, seed=1), errors_of(3, seed=2)
-    (panel,) = jid.plot.errors((first,), (second,), arm_of(3)).panels
+    groups = {"identification": (first,), "verification": (second,)}
+    (panel,) = jid.plot.bars(groups, arm_of(3)).panels
     bars = {c.colour: c.y for c in panel.curves if c.kind == "bars"}
     np.testing.assert_allclose(bars[BLUE], first.mean_percent)
     np.testing.assert_allclose(bars[ORANGE], second.mean_percent)
@@ -138,7 +140,8 @@ def test_bars_are_percents_of_the_largest_forces(errors_of):
     np.testing.assert_allclose(marks, [first.rms_percent, second.rms_percent])
     assert panel.unit == "% of the largest force"
     unknown = dataclasses.replace(first, max_forces=np.array([50.0, np.nan, 50.0]))
-    (panel,) = jid.plot.errors((unknown,), (), arm_of(3)).panels
+    groups = {"identification": (unknown,), "verification": ()}
+    (panel,) = jid.plot.bars(groups, arm_of(3)).panels
     np.testing.assert_allclose(panel.curves[0].y, 100 * first.mean / first.force_rms)
     assert panel.unit == "% of RMS force"
     assert [c.kind for c in panel.curves] == ["bars", "points"]
@@ -259,10 +262,6 @@ def test_motions_are_drawn_between_their_limits(motion):
         ):
             np.testing.assert_array_equal(part.curves[0].y, values[:, j])
         assert [len(part.levels) for part in panel.parts] == [0, 2 - 2 * j, 0]
-    position, speed, _ = jid.plot.end_effector(robot, T, motion).panels
-    tip = np.stack([c.y for c in position.curves], axis=1)
-    numerical = np.linalg.norm(np.gradient(tip, T, axis=0), axis=1)
-    np.testing.assert_allclose(speed.curves[0].y[2:-2], numerical[2:-2], atol=5e-3)
 
 
 def test_friction_is_that_of_the_estimates_and_of_the_log(fit, validation):
@@ -316,30 +315,9 @@ def test_parameters_are_named_in_words(fit, name, words, place):
     assert in_words(name, jid.Model(fit.base.model.robot, terms)) == (words, place)
 
 
-def test_autocorrelation_is_that_of_the_plain_formula(errors_of):
-    random = np.random.default_rng(0)
-    counted = random.uniform(size=(400, 2)) > 0.2
-    e = np.zeros((400, 2))
-    for k in range(1, 400):
-        e[k] = 0.7 * e[k - 1] + random.standard_normal(2)
-    whole = errors_of(2, rows=400)
-    errors = dataclasses.replace(whole, predicted=whole.measured + e, counted=counted)
-    found = autocorrelation(errors, 6)
-    for j in range(2):
-        kept = np.where(counted[:, j], e[:, j] - e[counted[:, j], j].mean(), np.nan)
-        products = [np.nanmean(kept[: 400 - k] * kept[k:]) for k in range(6)]
-        np.testing.assert_allclose(
-            found[:, j], np.array(products) / products[0], atol=1e-12
-        )
-    assert abs(found[1] - 0.7).max() < 0.12
-    figure = jid.plot.autocorrelation(errors, arm_of(2))
-    drawn = curve(figure.panels[0], "residuals").y
-    np.testing.assert_allclose(drawn[:6], found[:, 0], atol=1e-12)
-
-
 def test_files_are_the_same_each_time_and_leave_settings_alone(errors_of, tmp_path):
     before = dict(matplotlib.rcParams)
-    figure = jid.plot.bars((("a", (errors_of(2),)),), arm_of(2))
+    figure = jid.plot.bars({"a": (errors_of(2),)}, arm_of(2))
     for suffix in (".png", ".pdf", ".svg", ".html"):
         files = [tmp_path / f"{name}{suffix}" for name in "ab"]
         for file in files:

@@ -7,7 +7,7 @@ import pytest
 from rich.console import Console
 
 from jaxid.cli.printing import show
-from jaxid.report.identification import body_table
+from jaxid.report.identification_page import body_table
 from jaxid.result_table import (
     MISSING,
     Column,

@@ -1,4 +1,4 @@
-"""Figures of a motion (Figs. 3, 4, 5, 8): joints, end-effector, the robot in space."""
+"""Figures of a motion (Figs. 3, 4, 5, 8): joints, and the robot in space."""
 
 import dataclasses
 import itertools
@@ -12,7 +12,6 @@ from scipy.spatial import ConvexHull
 from jaxid.arrays import AnyArray, Float, double_precision
 from jaxid.dynamics.dispatch import in_numpy
 from jaxid.dynamics.motion import Motion
-from jaxid.excitation.constraints import tip_motion
 from jaxid.robot.collision import GROUND, Box, Capsule, CollisionModel, HalfSpace
 from jaxid.robot.forward_kinematics import placements, tip_placement
 from jaxid.robot.limits_and_drives import Limits
@@ -88,37 +87,6 @@ def joint_figure(
 def _limit_lines(bounds: Iterable[Any]) -> list[tuple[str, float, str]]:
     """Return lines at the limits that are finite."""
     return [("y", float(bound), VERMILION) for bound in bounds if np.isfinite(bound)]
-
-
-def tip_figure(
-    robot: Robot, time: Float[AnyArray, " samples"], motion: Motion
-) -> Figure:
-    """Return position, speed and acceleration of the end-effector (Sec. 4).
-
-    Args:
-        robot: Robot that moves.
-        time: Instants of the samples [s].
-        motion: Motion of the joints at the samples.
-    """
-    with double_precision():
-        position, velocity, acceleration = tip_motion(robot, motion)
-    curves = [
-        Curve(time, np.asarray(position)[:, k], axis, CYCLE[k])
-        for k, axis in enumerate("xyz")
-    ]
-    panels = [
-        Panel(curves, title="position", unit="m"),
-        _size_panel("speed", "m/s", time, velocity),
-        _size_panel("acceleration", "m/s²", time, acceleration),
-    ]
-    return Figure(f"{robot.name}: motion of the end-effector", panels, columns=3)
-
-
-def _size_panel(name: str, unit: str, time: AnyArray, vectors: AnyArray) -> Panel:
-    """Return the length of vectors over time."""
-    sizes = np.linalg.norm(np.asarray(vectors), axis=1)
-    maximum = f"up to {sizes.max():.3g} {unit}"
-    return Panel([Curve(time, sizes)], title=name, value=maximum, unit=unit)
 
 
 def filtered_figure(

@@ -6,7 +6,7 @@ import os
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -24,8 +24,8 @@ from jaxid.identification.payload import (
 )
 from jaxid.identification.problem import RegressionProblem
 from jaxid.measurement.columns import Columns
-from jaxid.report.result_files import Estimates, write_estimates
-from jaxid.result_table import Remark, Status, Summarised, Table
+from jaxid.report.result_records import estimate_rows
+from jaxid.report.several_runs_report import RunsReport
 from jaxid.robot.inertia import INERTIAL_NAMES, INERTIAL_UNITS
 from jaxid.robot.robot import Tool
 from jaxid.validation.diagnosis import mistakes_in_logs
@@ -38,50 +38,6 @@ PAYLOAD_KEYS = ("mass", "centre_of_mass", "inertia", "estimate", "distance")
 """Properties of a payload in its JSON file."""
 MIN_CHANCE_OF_SHARING = 0.01
 """Chance below which states do not agree on what they share."""
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class RunsReport(Summarised):
-    """Result of several runs, and doubts about their logs.
-
-    Attributes:
-        kind: Kind of the result: "payload", "gains" or "states".
-        result: The result.
-        estimates: Estimates in the files, the first with their covariance.
-        content: Further content of the JSON file.
-        sources: Logs and reports of each run.
-        doubts: Doubts about the logs, as sentences.
-        details: Tables beside that of the result.
-    """
-
-    kind: str
-    result: Any
-    estimates: Sequence[Estimates]
-    content: Mapping[str, Any]
-    sources: Mapping[str, Sequence[Path]]
-    doubts: Sequence[str]
-    details: Sequence[Table] = ()
-
-    @property
-    def remarks(self) -> list[Remark]:
-        """Doubts, as remarks."""
-        return [Remark(text, Status.DOUBTFUL) for text in self.doubts]
-
-    def tables(self) -> list[Table]:
-        """Return all tables of the result."""
-        return [self.result.summary(), *self.details]
-
-    def save(self, folder: str | Path) -> list[Path]:
-        """Write a page, and the numbers as JSON and CSV; return the files."""
-        return write_estimates(
-            Path(folder),
-            self.kind,
-            self.estimates,
-            self.content,
-            self.sources,
-            self.tables(),
-            self.remarks,
-        )
 
 
 class Runs(NamedTuple):
@@ -203,10 +159,10 @@ def identify_payload_from_logs(
         setup, unloaded, loaded, columns, progress
     )
     payload = identify_payload(*runs.fits, body=body, mass=mass)
-    estimates = [
-        (INERTIAL_NAMES, INERTIAL_UNITS, payload.parameters, payload.uncertainty),
-        (CENTRAL_NAMES, CENTRAL_UNITS, *payload.central),
-    ]
+    estimates = estimate_rows(
+        INERTIAL_NAMES, INERTIAL_UNITS, payload.parameters, payload.uncertainty
+    )
+    estimates += estimate_rows(CENTRAL_NAMES, CENTRAL_UNITS, *payload.central)
     content = {key: getattr(payload, key) for key in PAYLOAD_KEYS}
     content["body"] = setup.robot.joint_names[payload.body]
     return RunsReport("payload", payload, estimates, content, sources, runs.doubts)
@@ -236,7 +192,8 @@ def identify_gains_from_logs(
     unloaded_fit, loaded_fit = runs.fits
     drives = identify_drive_gains(unloaded_fit, loaded_fit, load)
     names = drives.joint_names
-    estimates = [(names, ("1",) * len(names), drives.gains, drives.uncertainty)]
+    units = ("1",) * len(names)
+    estimates = estimate_rows(names, units, drives.gains, drives.uncertainty)
     content = corrected_gains(columns, drives)
     return RunsReport("gains", drives, estimates, content, sources, runs.doubts)
 
@@ -292,7 +249,9 @@ def identify_states_from_logs(
     return RunsReport(
         "states",
         states,
-        [(states.names, states.units, states.parameters, states.uncertainty)],
+        estimate_rows(
+            states.names, states.units, states.parameters, states.uncertainty
+        ),
         content,
         {"states": paths},
         doubts,

@@ -25,9 +25,9 @@ from jaxid.validation.torque_errors import TorqueErrors
 from jaxid.validation.verdict import RMS_ERROR, Report, verdict
 
 from .figure import Figure
+from .friction_and_gravity import gravity_table
 from .page import Section, folded, picture, provenance, render_page, tiles
 from .parameter_words import glossary, word_columns
-from .physics import gravity_table
 
 MAX_PANELS = 42
 """Largest number of joints, of all recordings together, whose forces the page shows."""
@@ -173,7 +173,7 @@ def _physics(report: Report, figures: Mapping[str, Figure]) -> Iterator[Section]
     )
     yield "Friction", [text, figures["friction"]]
     log = report.verification[0] if report.verification else report.identification[0]
-    yield "Gravity", [gravity_table(report.fit, log), figures["gravity"]]
+    yield "Gravity", [gravity_table(report.fit, log)]
 
 
 def _torques(figures: Mapping[str, Figure], robot: Robot) -> list[Any]:
@@ -237,15 +237,12 @@ def _details(report: Report, figures: Mapping[str, Figure]) -> Iterator[Section]
         yield "Bodies", [body_table(fit.consistency, robot.joint_names)]
     if fit.residual_spectra is not None:
         text = (
-            "The residuals of a good model are noise. Power at low frequencies, or "
-            "residuals that resemble their neighbours more than the filters explain "
-            "(dashed), mean that an effect is missing."
+            "The residuals of a good model are noise. More power at low frequencies "
+            "than white noise has behind the filters (dashed) means that an effect is "
+            "missing."
         )
         table = residual_table(fit.residual_spectra, robot)
-        yield (
-            "Residuals",
-            [text, figures["residuals"], figures["autocorrelation"], table],
-        )
+        yield "Residuals", [text, figures["residuals"], table]
     if "filter" in figures:
         yield "Choice of the filter", [figures["filter"]]
 

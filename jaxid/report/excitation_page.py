@@ -9,43 +9,14 @@ import numpy as np
 from jaxid.arrays import double_precision
 from jaxid.dynamics.motion import Motion
 from jaxid.excitation.design_result import MAX_RELATIVE_DEVIATION, ExcitationPlan
-from jaxid.io import atomic_folder
-from jaxid.result_table import Column, Remark, Status, Table, significant
+from jaxid.io import write_text
+from jaxid.result_table import Remark, Status, significant
 from jaxid.robot.collision import CollisionModel
 from jaxid.trajectory.trajectory import AbstractTrajectory
 
 from .figure import Figure
-from .motion import joint_figure, pose_figure, tip_figure
+from .motion_figures import joint_figure, pose_figure
 from .page import picture, provenance, render_page
-
-
-def side_by_side_table(plans: Sequence[ExcitationPlan]) -> Table:
-    """Return all criteria and deviations of motions that minimise one of them each."""
-    criteria = plans[0].criteria
-    names = [criterion.name for criterion in criteria]
-    columns = [
-        Column("#", [*map(str, range(1, len(names) + 1)), ""], kind="number"),
-        Column("criterion", [*names, "deviations, times smaller than random"]),
-        Column("random", [*(float(criterion.before) for criterion in criteria), 1.0]),
-    ]
-    remarks: list[Remark | str] = [
-        "`random` is the median of random motions that fill the same limits; the last "
-        "row is the geometric mean over the base parameters"
-    ]
-    for plan in plans:
-        number = names.index(plan.criterion.name) + 1
-        values = [float(criterion.after) for criterion in plan.criteria]
-        columns.append(Column(f"by #{number}", [*values, plan.mean_gain]))
-        doubts = list(plan.diagnosis)
-        if plan.interrupted:
-            doubts.append("stopped before its end")
-        remarks += [Remark(f"by #{number}: {x}", Status.DOUBTFUL) for x in doubts]
-    return Table(
-        "motions that minimise one of the criteria each",
-        *columns,
-        rules=[len(names)],
-        remarks=remarks,
-    )
 
 
 def plan_remarks(plan: ExcitationPlan) -> list[Remark]:
@@ -92,7 +63,7 @@ def _assumed_limits(plan: ExcitationPlan) -> str:
     return ", ".join(texts)
 
 
-def ordered(remarks: Iterable[Remark]) -> list[Remark]:
+def sort_remarks(remarks: Iterable[Remark]) -> list[Remark]:
     """Return remarks sorted by status: neutral ones first, bad ones last."""
     order = (Status.NEUTRAL, Status.GOOD, Status.DOUBTFUL, Status.BAD)
     return sorted(remarks, key=lambda remark: order.index(remark.status))
@@ -105,44 +76,35 @@ def write_excitation(
     remarks: Sequence[Remark],
     settings: Mapping[str, Any],
     shapes: CollisionModel | None,
-) -> list[Path]:
+) -> Path:
     """Write the page of a design; return the file.
 
     The motion as it is played is drawn among the `shapes`. `settings` tell the origin
     of the design as in `provenance`.
     """
     robot = plan.base.model.robot
-    caption = "Links are coloured by the speed of their joint."
-    if shapes is not None:
-        caption += (
-            " Pale shapes are those that were checked for collision; grey ones "
-            "stand still."
-        )
+    caption = (
+        "Links are coloured by the speed of their joint. Pale shapes are those that "
+        "were checked for collision; grey ones stand still."
+    )
     with double_precision():
         time = np.linspace(0.0, float(played.duration), 801)
         motion = played.motion(time)
+    scene = _speed_scene(plan, time, motion, shapes)
+    every_remark = sort_remarks((*plan_remarks(plan), *remarks))
     criteria, deviations, *use = plan.tables()
+    gain = "A random motion that fills the same limits is shown beside this one."
     sections = [
-        (
-            "Verdict",
-            [headline(plan, remarks), ordered((*plan_remarks(plan), *remarks))],
-        ),
+        ("Verdict", [motion_verdict(plan, remarks), every_remark]),
         (
             "The motion",
             [
-                picture(_speed_scene(plan, time, motion, shapes), caption),
+                picture(scene, caption),
                 joint_figure(robot, plan.limits.limits, time, motion),
-                tip_figure(robot, time, motion),
             ],
         ),
         ("Use of the limits", use),
-        (
-            "Gain over a random motion",
-            [
-                "A random motion that fills the same limits is shown beside this one.",
-                criteria,
-            ],
-        ),
+        ("Gain over a random motion", [gain, criteria]),
         ("Expected standard deviations", [deviations]),
         provenance(settings),
     ]
@@ -152,9 +114,36 @@ def write_excitation(
         f"Designed to determine {plan.base.size} base parameters of {robot.joints} "
         "joints.",
     )
-    with atomic_folder(folder) as staging:
-        (staging / "report.html").write_text(page, encoding="utf-8")
-    return [folder / "report.html"]
+    file = folder / "report.html"
+    write_text(file, page)
+    return file
+
+
+def motion_verdict(plan: ExcitationPlan, remarks: Sequence[Remark]) -> Remark:
+    """Return the verdict on a motion in one sentence; `remarks` has one per check."""
+    status = Status.BAD
+    unchecked_names = [
+        remark.text.split(":")[0]
+        for remark in remarks
+        if ": not checked, as" in remark.text
+    ]
+    if plan.undetermined:
+        text = "This motion does not determine all base parameters."
+    elif not plan.feasible:
+        text = "This motion does not keep all limits."
+    elif any(remark.status is Status.BAD for remark in remarks):
+        text = "Do not record this motion yet: what is marked ✗ comes first."
+    elif unchecked_names:
+        status = Status.DOUBTFUL
+        names = ", ".join(unchecked_names)
+        text = f"This motion keeps all limits that were checked; not checked: {names}."
+    else:
+        status = Status.GOOD
+        text = (
+            "A motion that can be recorded: it keeps all limits, and determines all "
+            "parameters."
+        )
+    return Remark(text, status)
 
 
 def _speed_scene(
@@ -174,31 +163,4 @@ def _speed_scene(
         values=100.0 * speeds / scale,
         label="speed [% of the limit]",
         shapes=shapes,
-    )
-
-
-def headline(plan: ExcitationPlan, remarks: Sequence[Remark]) -> Remark:
-    """Return the verdict on a motion in one sentence; `remarks` has one per check."""
-    if plan.undetermined:
-        return Remark("This motion does not determine all base parameters.", Status.BAD)
-    if not plan.feasible:
-        return Remark("This motion does not keep all limits.", Status.BAD)
-    if any(remark.status is Status.BAD for remark in remarks):
-        text = "Do not record this motion yet: what is marked ✗ comes first."
-        return Remark(text, Status.BAD)
-    unchecked_names = [
-        remark.text.split(":")[0]
-        for remark in remarks
-        if ": not checked, as" in remark.text
-    ]
-    if unchecked_names:
-        return Remark(
-            "This motion keeps all limits that were checked; not checked: "
-            f"{', '.join(unchecked_names)}.",
-            Status.DOUBTFUL,
-        )
-    return Remark(
-        "A motion that can be recorded: it keeps all limits, and determines all "
-        "parameters.",
-        Status.GOOD,
     )

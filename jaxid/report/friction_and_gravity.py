@@ -13,8 +13,8 @@ from jaxid.result_table import Column, Table, percent, shortened, significant
 from jaxid.validation.torque_errors import TorqueErrors
 
 from .figure import Figure
-from .figure_elements import BLUE, CYCLE, GREY, MEASURED, Curve, Panel
-from .motion import even_indices, pose_figure
+from .figure_elements import BLUE, GREY, MEASURED, Curve, Panel
+from .motion_figures import even_indices, pose_figure
 
 MAX_POSES = 2000
 """Largest number of poses whose gravity torques are computed."""
@@ -127,27 +127,6 @@ def _measured_friction(model: Curve, speeds: np.ndarray, errors: np.ndarray) -> 
     )
     name = "measured, mean of a class of speed"
     return Curve(mean_speeds, mean_friction, name, GREY, "points")
-
-
-def gravity_figure(fit: Fit, log: TorqueErrors) -> Figure:
-    """Return the torques of gravity along a recording.
-
-    Args:
-        fit: Identified parameters.
-        log: Errors on the recording, with its positions.
-    """
-    robot = fit.base.model.robot
-    rows = even_indices(len(log.time), MAX_POSES)
-    time = np.asarray(log.time)[rows]
-    torques = gravity_forces(fit, np.asarray(log.positions)[rows])
-    curves = [
-        Curve(time, torques[:, j], shortened(name, 26), CYCLE[j % len(CYCLE)])
-        for j, name in enumerate(robot.joint_names)
-    ]
-    units = dict.fromkeys(robot.force_unit(j) for j in range(robot.joints))
-    panel = Panel(curves, y="gravity", unit=" or ".join(units))
-    title = f"Torques of gravity, along {shortened(log.name, 40)}"
-    return Figure(title, [panel], height=3.2)
 
 
 def gravity_table(fit: Fit, log: TorqueErrors) -> Table:

@@ -8,16 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from jaxid.io import atomic_folder
 from jaxid.measurement.observations import Observations
 from jaxid.result_table import Column, Remark, Status, Table
 from jaxid.rollout import TorqueRolloutFit
 
 from .figure import Figure
 from .page import Section, provenance, render_page
-from .result_files import estimate_rows, write_csv, write_json
-from .result_records import header
-from .rollout import MAX_FIGURES, in_milli, motion_panel
+from .result_files import write_page_and_table
+from .result_records import Record, estimate_rows
+from .servo_rollout_report import MAX_FIGURES, in_milli, motion_panel
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -77,15 +76,13 @@ class TorqueRolloutReport:
         return [self.fit.summary(), self.error_table(), Table("", remarks=remarks)]
 
     def write(self, folder: Path) -> list[Path]:
-        """Write the page, `rollout.json` and `rollout.csv`."""
+        """Write a page, and the numbers as JSON and CSV; return the files."""
         fit = self.fit
+        figures = [self._figure(log) for log in self.logs[:MAX_FIGURES]]
         sections: list[Section] = [
             ("Verdict", [self.verdict, self.findings]),
             ("Errors", [self.error_table()]),
-            (
-                "Measured and simulated motion",
-                [self._figure(log) for log in self.logs[:MAX_FIGURES]],
-            ),
+            ("Measured and simulated motion", figures),
             ("Parameters", [fit.summary(), self.notes]),
             provenance(self.settings),
         ]
@@ -93,20 +90,14 @@ class TorqueRolloutReport:
         unknowns = np.flatnonzero(fit.free)
         names = [fit.rollout.names[k] for k in unknowns]
         units = [fit.rollout.units[k] for k in unknowns]
-        rows = estimate_rows((names, units, fit.unknowns[unknowns], fit.uncertainty))
-        files = ["rollout.html", "rollout.json", "rollout.csv"]
-        with atomic_folder(folder) as staging:
-            write_json(staging / "rollout.json", {**self._record(rows), "files": files})
-            write_csv(staging / "rollout.csv", rows)
-            (staging / "rollout.html").write_text(page, encoding="utf-8")
-        return [folder / file for file in files]
+        rows = estimate_rows(names, units, fit.unknowns[unknowns], fit.uncertainty)
+        return write_page_and_table(folder, "rollout", page, self._record(rows), rows)
 
-    def _record(self, rows: list[dict[str, Any]]) -> dict[str, Any]:
+    def _record(self, rows: list[Record]) -> Record:
         """Return the content of `rollout.json`."""
         fit = self.fit
         torque_fit, rollouts = self.errors
         return {
-            **header("rollout.json"),
             "kind": "torques",
             "joints": fit.joint_names,
             "horizon": fit.horizon,
