@@ -1,14 +1,12 @@
 """Meaning and units of the columns of a log, and logs in SI units."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
-import equinox as eqx
 import numpy as np
 
-from jaxid.arrays import optional
 from jaxid.errors import InputError
 from jaxid.robot.limits_and_drives import per_joint
 from jaxid.units import NM, RAD, Quantity, S, Unit
@@ -20,15 +18,12 @@ Units = Unit | tuple[Unit, ...]
 """One unit for all joints, or one for each."""
 PerJoint = tuple[float, ...] | None
 """One number for each joint, or the default for all."""
+Channels = tuple[np.ndarray, np.ndarray | None, np.ndarray]
+"""Angles, velocities (None if there are none) and forces (samples x joints)."""
 
 
-def _listed(value: Any) -> Any:
-    return (
-        value if value is None or isinstance(value, str | int | Unit) else tuple(value)
-    )
-
-
-class Columns(eqx.Module):
+@dataclasses.dataclass(frozen=True)
+class Columns:
     """Columns of a log that hold the time, the angles and the forces of a robot.
 
     A group of columns is a tuple of names, a pattern such as `"q{}"` (`{}` stands for
@@ -67,30 +62,29 @@ class Columns(eqx.Module):
         unwrap: Whether angles jump by full turns, which is undone.
     """
 
-    angles: Selection = eqx.field(static=True, converter=_listed)
-    forces: Selection = eqx.field(static=True, converter=_listed)
-    velocities: Selection | None = eqx.field(
-        static=True, converter=_listed, default=None
-    )
-    time: str | int | None = eqx.field(static=True, default=None)
-    sample_time: float | None = eqx.field(static=True, converter=optional, default=None)
-    time_unit: Unit = eqx.field(static=True, default=S)
-    angle_unit: Units = eqx.field(static=True, converter=_listed, default=RAD)
-    velocity_unit: Units | None = eqx.field(
-        static=True, converter=_listed, default=None
-    )
-    force_unit: Units = eqx.field(static=True, converter=_listed, default=NM)
-    torque_constants: PerJoint = eqx.field(static=True, converter=_listed, default=None)
-    angle_signs: PerJoint = eqx.field(static=True, converter=_listed, default=None)
-    force_signs: PerJoint = eqx.field(static=True, converter=_listed, default=None)
-    angle_offsets: PerJoint = eqx.field(static=True, converter=_listed, default=None)
-    force_gains: PerJoint = eqx.field(static=True, converter=_listed, default=None)
-    angles_on_motor_side: bool = eqx.field(static=True, default=False)
-    forces_on_motor_side: bool = eqx.field(static=True, default=False)
-    unwrap: bool = eqx.field(static=True, default=False)
+    angles: Selection
+    forces: Selection
+    velocities: Selection | None = None
+    time: str | int | None = None
+    sample_time: float | None = None
+    time_unit: Unit = S
+    angle_unit: Units = RAD
+    velocity_unit: Units | None = None
+    force_unit: Units = NM
+    torque_constants: PerJoint = None
+    angle_signs: PerJoint = None
+    force_signs: PerJoint = None
+    angle_offsets: PerJoint = None
+    force_gains: PerJoint = None
+    angles_on_motor_side: bool = False
+    forces_on_motor_side: bool = False
+    unwrap: bool = False
 
-    def __check_init__(self) -> None:
-        """Refuse contradictions."""
+    def __post_init__(self) -> None:
+        """Make tuples of lists and arrays, and refuse contradictions."""
+        for name, value in dict(vars(self)).items():
+            if isinstance(value, Iterable) and not isinstance(value, str):
+                object.__setattr__(self, name, tuple(value))
         if self.time is not None and self.sample_time is not None:
             raise InputError(
                 "give `time` (a column) or `sample_time` [s], but not both."
@@ -132,30 +126,28 @@ class Columns(eqx.Module):
 
     def to_si(
         self, angles: np.ndarray, velocities: np.ndarray | None, forces: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
+    ) -> Channels:
         """Convert the numbers of a log to SI units (samples x joints)."""
         joints = angles.shape[1]
 
-        def factors(name: str) -> np.ndarray:
-            unit = getattr(self, name)
-            if isinstance(unit, Unit):
-                return np.full(joints, unit.factor)
-            return per_joint(name, [one.factor for one in unit], joints, 1.0)
+        def numbers(name: str, default: float = 1.0) -> np.ndarray:
+            values = getattr(self, name)
+            if isinstance(values, Unit):
+                values = joints * (values,)
+            if values is not None:
+                values = [x.factor if isinstance(x, Unit) else x for x in values]
+            return per_joint(name, values, joints, default)
 
-        def values(name: str, default: float = 1.0) -> np.ndarray:
-            return per_joint(name, getattr(self, name), joints, default)
-
-        signs = values("angle_signs")
-        angle_scale = signs * factors("angle_unit")
+        signs = numbers("angle_signs")
+        angle_scale = signs * numbers("angle_unit")
         if velocities is not None:
-            velocity_scale = angle_scale
-            if self.velocity_unit is not None:
-                velocity_scale = signs * factors("velocity_unit")
+            unit = "angle_unit" if self.velocity_unit is None else "velocity_unit"
+            velocity_scale = signs * numbers(unit)
             velocities = velocities * velocity_scale
         # A log of currents has torque constants, which are one otherwise.
-        gains = factors("force_unit") * values("force_signs") * values("force_gains")
-        force_scale = gains * values("torque_constants")
-        offsets = values("angle_offsets", 0.0)
+        gains = numbers("force_unit") * numbers("force_signs") * numbers("force_gains")
+        force_scale = gains * numbers("torque_constants")
+        offsets = numbers("angle_offsets", 0.0)
         return angles * angle_scale + offsets, velocities, forces * force_scale
 
 
@@ -174,9 +166,7 @@ class Log:
     tables: tuple[LogTable, ...]
     columns: Columns
 
-    def read(
-        self, start: int = 0, stop: int | None = None
-    ) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
+    def read(self, start: int = 0, stop: int | None = None) -> Channels:
         """Return angles, velocities and forces of some rows, as they were recorded."""
         arrays: dict[str, np.ndarray] = {}
         for table in self.tables:
@@ -185,15 +175,16 @@ class Log:
             for channel, names in part.channels.items():
                 blocks = [part.numbers(name) for name in names]
                 arrays[channel] = np.concatenate(blocks, axis=1)
-        angles = arrays["angles"]
+        joints = arrays["angles"].shape[1]
         for channel, array in arrays.items():
-            if array.shape[1] != angles.shape[1]:
+            if array.shape[1] != joints:
                 raise InputError(
                     f"`{channel}` have {array.shape[1]} columns, but the angles in "
-                    f"`{self.tables[0].source}` have {angles.shape[1]}: name one for "
-                    "each joint."
+                    f"`{self.tables[0].source}` have {joints}: name one for each "
+                    "joint."
                 )
-        return self.columns.to_si(angles, arrays.get("velocities"), arrays["forces"])
+        velocities = arrays.get("velocities")
+        return self.columns.to_si(arrays["angles"], velocities, arrays["forces"])
 
     @property
     def bad_rows(self) -> dict[int, str]:
@@ -246,15 +237,10 @@ def open_log(
         names = file.channels(file_selections)
         bad_rows = {} if is_lenient else None
         tables.append(file.table(names, on_disk, bad_rows))
-    _require_equal_rows(tables)
-    return Log(tuple(tables), columns)
-
-
-def _require_equal_rows(tables: Sequence[LogTable]) -> None:
-    first = tables[0]
     for table in tables:
-        if table.rows != first.rows:
+        if table.rows != tables[0].rows:
             raise InputError(
-                f"`{table.source}` has {table.rows} rows, but `{first.source}` has "
-                f"{first.rows}: files of one run must agree row by row."
+                f"`{table.source}` has {table.rows} rows, but `{tables[0].source}` has "
+                f"{tables[0].rows}: files of one run must agree row by row."
             )
+    return Log(tuple(tables), columns)

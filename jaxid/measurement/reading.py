@@ -13,7 +13,7 @@ from jaxid.errors import InputError
 from jaxid.result_table import printable
 from jaxid.robot.robot import Robot
 
-from .columns import Columns, Log, open_log
+from .columns import Channels, Columns, Log, open_log
 from .filters import AbstractDecimation, AbstractFilter
 from .log_files import LogTable
 from .observations import Observations, Progress, prepare
@@ -157,9 +157,7 @@ class SamplesOnDisk(AbstractSamples):
         """Return motion and forces of all segments; they must fit into memory."""
         return joined(self.read(slice(a, b)) for a, b in self.segments)
 
-    def read_rows(
-        self, samples: slice
-    ) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
+    def read_rows(self, samples: slice) -> Channels:
         """Return angles, velocities and forces of a segment's samples as recorded."""
         k = self._segment(samples)
         segment_start, _ = self.segments[k]

@@ -75,13 +75,13 @@ class Subsample(AbstractDecimation):
             )
 
     @property
-    def stages(self) -> tuple[int, ...]:  # noqa: D102
+    def stages(self):  # noqa: D102
         return (self.step,)
 
-    def low_pass(self, stage: int) -> AbstractLowPass:  # noqa: D102
+    def low_pass(self, stage):  # noqa: D102
         return ALL_PASS
 
-    def check(self, cutoff: float, sample_time: float) -> None:  # noqa: D102
+    def check(self, cutoff, sample_time):  # noqa: D102
         rate = 1.0 / (sample_time * self.step)
         if self.step == 1 or cutoff <= 0.5 * rate:
             return
@@ -119,10 +119,10 @@ class Decimation(AbstractDecimation):
             )
 
     @property
-    def stages(self) -> tuple[int, ...]:  # noqa: D102
+    def stages(self):  # noqa: D102
         return self.factors
 
-    def low_pass(self, stage: int) -> AbstractLowPass:  # noqa: D102
+    def low_pass(self, stage):  # noqa: D102
         factor = self.factors[stage]
         if factor == 1:
             return ALL_PASS

@@ -20,6 +20,8 @@ from jaxid.errors import InputError
 
 from .low_pass import SETTLED, AbstractLowPass
 
+DIFFERENCE_SAMPLES = 2
+"""Samples on each side that differences of fourth order need."""
 MOTION_TAIL = 1e-17
 """Tail of an impulse response that is left out; accelerations magnify it most."""
 
@@ -58,9 +60,10 @@ class AbstractFilter(eqx.Module):
         """Return for how many samples the motion depends on an angle or velocity.
 
         None if it depends on all samples of a segment, which then must be in memory.
-        By default it is the memory of the filter of forces and columns.
+        By default it is the memory of the filter of forces and columns, and the two
+        samples that differences need.
         """
-        return self.low_pass(sample_time).memory(MOTION_TAIL)
+        return self.low_pass(sample_time).memory(MOTION_TAIL) + DIFFERENCE_SAMPLES
 
     def smooth(self, x: Float[AnyArray, "samples *columns"], sample_time: float) -> Any:
         """Filter forces or columns of one segment.

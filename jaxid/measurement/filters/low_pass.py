@@ -68,7 +68,7 @@ class Convolution(AbstractLowPass):
         return correlate(x, np.array(self.kernel))
 
     def gain(self, frequency, sample_time):  # noqa: D102
-        return kernel_gain(np.array(self.kernel), frequency, sample_time)
+        return kernel_gain(np.array(self.kernel), np.asarray(frequency), sample_time)
 
     def memory(self, tolerance=1e-14):  # noqa: D102
         return len(self.kernel) // 2
@@ -90,29 +90,24 @@ def correlate(x: Any, kernel: np.ndarray) -> Any:
 
 
 def kernel_gain(
-    kernel: np.ndarray, frequency: Float[AnyArray, " lines"], sample_time: float
+    kernel: np.ndarray, frequency: np.ndarray, sample_time: float
 ) -> np.ndarray:
     """Return the size of the gain of a weighted mean for some frequencies [Hz]."""
-    angular = 2 * math.pi * np.asarray(frequency) * sample_time
+    angular = 2 * math.pi * frequency * sample_time
     return np.abs(np.polyval(kernel, np.exp(1j * angular)))
 
 
 def weighted_mean(kernel: np.ndarray, sample_time: float) -> Convolution:
     """Return the mean with weights, an odd number whose sum is one."""
-    cutoff = _half_gain(kernel, sample_time)
-    return Convolution(kernel=tuple(kernel.tolist()), cutoff=cutoff)
-
-
-def _half_gain(kernel: np.ndarray, sample_time: float) -> float:
-    """Return the lowest frequency at which the gain of a weighted mean is 1/2 [Hz]."""
-    # Sixteen lines for each oscillation that fits into the kernel.
+    # The gain at sixteen lines for each oscillation that fits into the kernel.
     frequency = np.linspace(0.0, 0.5 / sample_time, 8 * len(kernel) + 1)
     gain = kernel_gain(kernel, frequency, sample_time)
     k = int(np.argmax(gain < 0.5))
-    if k == 0:
-        return math.inf  # everything passes
-    neighbours = [k, k - 1]
-    return float(np.interp(0.5, gain[neighbours], frequency[neighbours]))
+    cutoff = math.inf  # everything passes
+    if k > 0:
+        neighbours = [k, k - 1]
+        cutoff = float(np.interp(0.5, gain[neighbours], frequency[neighbours]))
+    return Convolution(kernel=tuple(kernel.tolist()), cutoff=cutoff)
 
 
 class RecursiveLowPass(AbstractLowPass):
@@ -177,14 +172,11 @@ def _clear_memory(sos: np.ndarray, radius: float, tolerance: float) -> int:
     forward = signal.sosfilt(sos, impulse)
     both_ways = signal.correlate(forward, forward, method="fft")
     tail = np.abs(both_ways[samples - 1 :])
-    is_above = tail > tolerance * tail[0]
-    last_sample = np.flatnonzero(is_above)[-1]
-    return int(last_sample) + 1
+    return int(np.flatnonzero(tail > tolerance * tail[0])[-1]) + 1
 
 
 def _filter_both_ways(sos: np.ndarray, x: Array, padding: int) -> Array:
     """Filter forward and backward with odd extensions, like scipy's `sosfiltfilt`."""
-    extended = odd_extension(x, padding)
     steady_states = signal.sosfilt_zi(sos)
 
     def step(states, x):
@@ -197,13 +189,13 @@ def _filter_both_ways(sos: np.ndarray, x: Array, padding: int) -> Array:
             x = y
         return next_states, x
 
-    def one_way(x: Array, reverse: bool) -> Array:
-        start = x[-1] if reverse else x[0]
-        states = [(first * start, second * start) for first, second in steady_states]
-        return jax.lax.scan(step, states, x, reverse=reverse, unroll=4)[1]
+    def one_way(x: Array) -> Array:
+        states = [(first * x[0], second * x[0]) for first, second in steady_states]
+        _, y = jax.lax.scan(step, states, x, unroll=4)
+        return y
 
-    forward = one_way(extended, reverse=False)
-    both_ways = one_way(forward, reverse=True)
+    forward = one_way(odd_extension(x, padding))
+    both_ways = one_way(forward[::-1])[::-1]
     return both_ways[padding : padding + len(x)]
 
 

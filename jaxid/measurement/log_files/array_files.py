@@ -3,7 +3,7 @@
 import abc
 import functools
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +11,8 @@ import numpy as np
 
 from jaxid.io import import_extra
 
-from .log_file import AbstractLogFile, Channels
-from .log_table import BadRows, LogTable, readable
+from .log_file import AbstractLogFile
+from .log_table import LogTable, readable
 
 
 class AbstractArrayFile(AbstractLogFile):
@@ -35,10 +35,10 @@ class AbstractArrayFile(AbstractLogFile):
         return arrays | columns
 
     @property
-    def names(self) -> Sequence[str]:  # noqa: D102
+    def names(self):  # noqa: D102
         return tuple(self.arrays)
 
-    def table(self, channels: Channels, on_disk: bool, bad_rows: BadRows) -> LogTable:  # noqa: D102
+    def table(self, channels, on_disk, bad_rows):  # noqa: D102
         return LogTable(self.path.name, self.arrays, channels, bad_rows=bad_rows)
 
 

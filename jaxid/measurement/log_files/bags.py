@@ -16,8 +16,8 @@ import polars as pl
 from jaxid.errors import InputError
 from jaxid.io import import_extra
 
-from .log_file import AbstractLogFile, Channels, Selections
-from .log_table import BadRows, LogTable, readable
+from .log_file import AbstractLogFile, Selections
+from .log_table import LogTable, readable
 
 STAMP = ".header.stamp"
 """Field of a topic with the times of measurement."""
@@ -30,6 +30,11 @@ MAX_ELEMENTS = 1000
 MAX_STEP_RATIO = 3.0
 """Distance of two messages, in typical ones, up to which values are interpolated."""
 
+Elements = tuple[str, ...]
+"""Endings of the names of a field's numbers, such as `[0]` or `.shoulder`."""
+Field = tuple[str, Elements, Sequence[float]]
+"""Name, elements and numbers of one field of a message."""
+
 
 class BagFile(AbstractLogFile):
     """Bag of ROS, with fields of messages as columns."""
@@ -40,14 +45,14 @@ class BagFile(AbstractLogFile):
         return read_bag(self.path, selected_topics(self.selections))
 
     @property
-    def names(self) -> Sequence[str]:  # noqa: D102
-        return list(itertools.chain(*(topic.columns for topic in self.topics)))
+    def names(self):  # noqa: D102
+        return [name for topic in self.topics for name in topic.columns]
 
     @property
-    def clock(self) -> str:  # noqa: D102
+    def clock(self):  # noqa: D102
         return CLOCK
 
-    def table(self, channels: Channels, on_disk: bool, bad_rows: BadRows) -> LogTable:  # noqa: D102
+    def table(self, channels, on_disk, bad_rows):  # noqa: D102
         names = list(itertools.chain(*channels.values()))
         columns, notes = join_topics(self.path.name, self.topics, names)
         return LogTable(
@@ -84,12 +89,13 @@ class TimeSeries(NamedTuple):
         values = np.interp(target_t, t, self.values[order], left=np.nan, right=np.nan)
 
         steps = np.diff(t, prepend=t[0])
-        is_pause = steps > MAX_STEP_RATIO * np.median(steps)
+        max_step = MAX_STEP_RATIO * np.median(steps)
         # The step that ends at or after each target.
         index = np.searchsorted(t, target_t)
         index = np.minimum(index, len(t) - 1)
-        is_between = t[index] != target_t
-        return np.where(is_pause[index] & is_between, np.nan, values)
+        is_in_pause = (steps[index] > max_step) & (t[index] != target_t)
+        values[is_in_pause] = np.nan
+        return values
 
 
 class Topic(NamedTuple):
@@ -104,14 +110,6 @@ class Topic(NamedTuple):
         rows, values = map(np.asarray, self.columns[column])
         times = self.recording_times if are_recorded else self.stamps
         return TimeSeries(np.asarray(times)[rows], values)
-
-
-class Field(NamedTuple):
-    """Numbers of one field of a message."""
-
-    name: str
-    elements: tuple[str, ...]  # endings of the name, such as `[0]` or `.shoulder`
-    values: Sequence[float]
 
 
 def read_bag(path: Path, selected: Collection[str]) -> list[Topic]:
@@ -147,19 +145,20 @@ def _topic(name: str, messages: Iterable[tuple[int, Any]]) -> Topic:
     """Collect the numbers of messages by column."""
     topic = Topic(array("q"), array("q"), {})
     # Elements of each field in the order of their first message, by the set of them.
-    variants: dict[str, dict[frozenset[str], tuple[str, ...]]] = {}
+    variants: dict[str, dict[frozenset, Elements]] = {}
     for number, (time, message) in enumerate(messages):
-        topic.stamps.append(_stamp(message))
+        stamp = getattr(getattr(message, "header", None), "stamp", None)
+        stamp_ns = 0 if stamp is None else stamp.sec * 10**9 + stamp.nanosec
+        topic.stamps.append(stamp_ns)
         topic.recording_times.append(time)
-        for field in _fields(message, f"{name}.", {}):
-            orders = variants.setdefault(field.name, {})
-            orders.setdefault(frozenset(field.elements), field.elements)
-            for element, value in zip(field.elements, field.values, strict=True):
-                column = field.name + element
+        for field, elements, values in _fields(message, f"{name}.", {}):
+            orders = variants.setdefault(field, {})
+            orders.setdefault(frozenset(elements), elements)
+            for element, value in zip(elements, values, strict=True):
                 empty = (array("q"), array("d"))
-                rows, values = topic.columns.setdefault(column, empty)
-                rows.append(number)
-                values.append(value)
+                column = topic.columns.setdefault(field + element, empty)
+                column[0].append(number)
+                column[1].append(value)
 
     times = topic.recording_times
     topic.columns[name + RECORDING_TIME] = times, times
@@ -168,34 +167,24 @@ def _topic(name: str, messages: Iterable[tuple[int, Any]]) -> Topic:
     return topic
 
 
-def _stamp(message: Any) -> int:
-    """Return the time of measurement in the header of a message [ns]; 0 without one."""
-    header = getattr(message, "header", None)
-    stamp = getattr(header, "stamp", None)
-    return 0 if stamp is None else stamp.sec * 10**9 + stamp.nanosec
-
-
-def _name_by_position(
-    topic: Topic, field: str, orders: Sequence[tuple[str, ...]]
-) -> None:
+def _name_by_position(topic: Topic, field: str, orders: Sequence[Elements]) -> None:
     """Give the elements of a field positions; remove those that mean nothing.
 
     Positions mean nothing if messages differ in their elements, as those of two robots
     on one topic do.
     """
     columns = topic.columns
-    if len(orders) == 1:
+    if len(orders) == 1 and orders[0] != ("",):
         for k, element in enumerate(orders[0]):
-            if element:
-                columns[f"{field}[{k}]"] = columns[field + element]
-        return
-    for element in itertools.chain(*orders):
-        if element.startswith("["):
-            columns.pop(field + element, None)
+            columns[f"{field}[{k}]"] = columns[field + element]
+    if len(orders) > 1:
+        for element in itertools.chain(*orders):
+            if element.startswith("["):
+                columns.pop(field + element, None)
 
 
 def _fields(
-    message: Any, prefix: str, element_names: Mapping[int, tuple[str, ...]]
+    message: Any, prefix: str, element_names: Mapping[int, Elements]
 ) -> Iterator[Field]:
     """Yield the fields with numbers of a message and of those within it.
 
@@ -211,9 +200,9 @@ def _fields(
     for key, value in values.items():
         name = prefix + key
         if isinstance(value, int | float):
-            yield Field(name, ("",), (value,))
+            yield name, ("",), (value,)
         elif hasattr(value, "nanosec"):
-            yield Field(name, ("",), (value.sec + 1e-9 * value.nanosec,))
+            yield name, ("",), (value.sec + 1e-9 * value.nanosec,)
         elif dataclasses.is_dataclass(value):
             yield from _fields(value, f"{name}.", element_names)
         elif isinstance(value, np.ndarray | list) and 0 < len(value) <= MAX_ELEMENTS:
@@ -221,13 +210,13 @@ def _fields(
 
 
 def _array_fields(
-    values: Any, name: str, element_names: Mapping[int, tuple[str, ...]]
+    values: Any, name: str, element_names: Mapping[int, Elements]
 ) -> Iterator[Field]:
     """Yield the fields of an array of numbers, or of a list of messages."""
     positions = tuple(f"[{k}]" for k in range(len(values)))
     elements = element_names.get(len(values)) or positions
     if isinstance(values, np.ndarray):
-        yield Field(name, elements, values.tolist())
+        yield name, elements, values.tolist()
     elif dataclasses.is_dataclass(values[0]):
         for element, item in zip(elements, values, strict=True):
             yield from _fields(item, f"{name}{element}.", element_names)

@@ -190,8 +190,7 @@ def nanoseconds(column: pl.Series) -> pl.Series:
 
 def integer_array(column: Any) -> np.ndarray | None:
     """Return a column of integers as an array; None if it is another one."""
-    if isinstance(column, pl.Series):
-        is_whole = column.dtype.is_integer() and not column.null_count()
-        return column.to_numpy().astype(np.int64) if is_whole else None
-    is_whole = column.dtype.kind in "iu" and column.ndim == 1
-    return column.astype(np.int64) if is_whole else None
+    # An empty cell of a series makes its array one of floats.
+    array = np.asarray(column)
+    is_whole = array.dtype.kind in "iu" and array.ndim == 1
+    return array.astype(np.int64) if is_whole else None

@@ -1,12 +1,11 @@
 """Parquet files, also those of LeRobot data sets, with lists of numbers in cells."""
 
 import functools
-from collections.abc import Sequence
 
 import polars as pl
 
-from .log_file import AbstractLogFile, Channels
-from .log_table import BadRows, LogTable, readable
+from .log_file import AbstractLogFile
+from .log_table import LogTable, readable
 
 PAUSE = 10.0
 """Time from one episode of a data set to the next [s]: a gap in any log."""
@@ -27,17 +26,17 @@ class ParquetFile(AbstractLogFile):
             return with_consecutive_episodes(frame) if has_episodes(frame) else frame
 
     @property
-    def names(self) -> Sequence[str]:  # noqa: D102
+    def names(self):  # noqa: D102
         return self.frame.collect_schema().names()
 
     @property
-    def clock(self) -> str:  # noqa: D102
+    def clock(self):  # noqa: D102
         return "timestamp" if has_episodes(self.frame) else ""
 
-    def table(self, channels: Channels, on_disk: bool, bad_rows: BadRows) -> LogTable:  # noqa: D102
+    def table(self, channels, on_disk, bad_rows):  # noqa: D102
         return LogTable(self.path.name, self.frame, channels, bad_rows=bad_rows)
 
-    def estimated_rows(self) -> int:  # noqa: D102
+    def estimated_rows(self):  # noqa: D102
         return LogTable(self.path.name, pl.scan_parquet(self.path), {}).rows
 
 

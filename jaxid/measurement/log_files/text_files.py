@@ -18,7 +18,7 @@ import polars as pl
 
 from jaxid.errors import InputError
 
-from .log_file import AbstractLogFile, Channels
+from .log_file import AbstractLogFile
 from .log_table import BadRows, LogTable, readable
 
 HEAD_SIZE = 65536
@@ -89,18 +89,18 @@ class TextFile(AbstractLogFile):
         return detect_format(self.path.name, self._head())
 
     @property
-    def names(self) -> Sequence[str]:  # noqa: D102
+    def names(self):  # noqa: D102
         return self.format.names
 
     @property
-    def has_header(self) -> bool:  # noqa: D102
+    def has_header(self):  # noqa: D102
         return self.format.has_header
 
-    def estimated_rows(self) -> int:  # noqa: D102
+    def estimated_rows(self):  # noqa: D102
         head = self._head()
         return self.path.stat().st_size * head.count(b"\n") // max(len(head), 1)
 
-    def table(self, channels: Channels, on_disk: bool, bad_rows: BadRows) -> LogTable:  # noqa: D102
+    def table(self, channels, on_disk, bad_rows):  # noqa: D102
         table = LogTable(
             self.path.name,
             columns={},
