@@ -212,16 +212,11 @@ ESTIMATORS = {
     'kind = "tukey"\nridge = 0.1': jid.estimators.IterativelyReweighted(
         jid.estimators.Tukey(), VARIANCES, jid.estimators.Ridge(0.1)
     ),
-    'kind = "consistent"\npull = 2\nmargin = 0.01': jid.PhysicallyConsistent(
-        VARIANCES,
-        margin=0.01,
-        pull=jid.consistency.EntropicPull(strength=2.0),
-        throw=False,
+    'kind = "consistent"\npull = 2': jid.PhysicallyConsistent(
+        VARIANCES, pull=jid.consistency.EntropicPull(strength=2.0)
     ),
-    "": jid.PhysicallyConsistent(
-        VARIANCES, pull=jid.consistency.EntropicPull(), throw=False
-    ),
-    "pull = 0": jid.PhysicallyConsistent(VARIANCES, throw=False),
+    "": jid.PhysicallyConsistent(VARIANCES, pull=jid.consistency.EntropicPull()),
+    "pull = 0": jid.PhysicallyConsistent(VARIANCES),
 }
 
 
@@ -262,8 +257,6 @@ def test_estimators_of_files(load, tmp_path):
     bounds = """kind = "consistent"
 mass_min = 0.5
 centre_min = [[-0.2, -inf, -0.1], [-0.3, -0.1, -0.1]]
-ellipsoid_centre = [0.0, 0.1, 0.0]
-ellipsoid_axes = [[inf, inf, inf], [0.3, 0.2, 0.2]]
 total_mass = 12
 """
     consistent = load(robot + bounds).setup.estimator
@@ -271,7 +264,6 @@ total_mass = 12
     assert consistent.bounds.total_mass == 12.0
     np.testing.assert_array_equal(consistent.bounds.mass_min, [0.5, 0.5])
     np.testing.assert_array_equal(consistent.bounds.centre_min[:, 1], [-np.inf, -0.1])
-    np.testing.assert_array_equal(consistent.bounds.has_ellipsoid, [False, True])
 
 
 BODIES = '[estimator]\nkind = "consistent"\n'
@@ -336,7 +328,6 @@ REFUSALS = [
         "`nonlinear_friction`",
     ),
     (ARM + BODIES + "centre_max = [[1, 1, 1], [1, 1]]", "`estimator.centre_max`"),
-    (ARM + BODIES + "ellipsoid_centre = [0, 0, 0]", "`ellipsoid_axes`"),
     (ARM + "[estimator]\nridge = 'cv'", "`estimator.ridge`"),
     ("[robot\n", "TOML"),
     (ARM + "x = " + 3000 * "[", "TOML"),

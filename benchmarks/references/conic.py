@@ -39,7 +39,7 @@ def problem(
         )
         shrink = np.diag([1 / L, 1 / L, 1 / L, 1.0]) / np.sqrt(bounds.mass_max[k])
         constraints += [
-            shrink @ (pseudo - feasible.floors[k]) @ shrink >> 0,
+            shrink @ pseudo @ shrink >> 0,
             m / bounds.mass_max[k] <= 1,
             m >= bounds.mass_min[k],
             L**2 * m >= (A + B + C) / 2,
@@ -49,10 +49,6 @@ def problem(
                 constraints.append(h[axis] >= bounds.centre_min[k, axis] * m)
             if np.isfinite(bounds.centre_max[k, axis]):
                 constraints.append(h[axis] <= bounds.centre_max[k, axis] * m)
-        axes = bounds.ellipsoid_axes[k]
-        if np.isfinite(axes).all():
-            away = h - bounds.ellipsoid_centre[k] * m
-            constraints.append(cp.norm(cp.multiply(1 / axes, away)) <= m)
     drives = list(feasible.drives)
     constraints += [y[drives] >= 0, y[drives] <= 1]
     for coupling in feasible.couplings:

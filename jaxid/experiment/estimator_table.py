@@ -14,7 +14,6 @@ from jaxid.identification.estimators_by_name import ESTIMATORS
 from jaxid.identification.uncertainty import UNCERTAINTIES, AbstractUncertainty
 from jaxid.robot.robot import Robot
 from jaxid.workflow.allowed_values import (
-    Bounds,
     Fraction,
     Magnitude,
     OneOf,
@@ -29,7 +28,6 @@ KEYS_OF_SETTINGS: dict[str, tuple[str, ...]] = {
     "weights": ("weights",),
     "solution": ("ridge",),
     "bounds": tuple(keys_of(BodyBounds)),
-    "margin": ("margin",),
     "pull": ("pull",),
 }
 """Keys from which each setting of an estimator is made."""
@@ -99,7 +97,6 @@ def build_estimation(
     ridge: Fraction | Literal["cross_validated"] | None = None,
     nonlinear_friction: bool = False,
     uncertainty: Annotated[str, OneOf(UNCERTAINTIES)] = "spectral",
-    margin: Annotated[float, Bounds(minimum=0.0, below=1.0)] = 0.0,
     pull: Magnitude = 1.0,
 ) -> Estimation:
     """Estimator of the parameters from the rows, and of their standard deviations.
@@ -122,7 +119,6 @@ def build_estimation(
         uncertainty: Method of the standard deviations: "spectral"; "jackknife": from
             blocks of time left out in turn; "independent": as if rows were independent,
             far too small.
-        margin: Fraction of a ball that each body contains ("consistent").
         pull: Strength of a pull towards the bodies of the robot's file, or towards
             balls if those cannot exist ("consistent"); 0 for none.
 
@@ -142,10 +138,7 @@ def build_estimation(
         least_squares = estimators.LeastSquares(solution)
     if kind == "consistent":
         settings["bounds"] = build_bounds(robot, bounds)
-        if margin > 0.0:
-            settings["margin"] = margin
         settings["pull"] = pull_to_bodies(robot_file, pull)
-        settings["throw"] = False
     build = ESTIMATORS[kind]
     names = inspect.signature(build).parameters.keys() & settings.keys()
     estimator = build(**{name: settings[name] for name in names})
@@ -173,8 +166,4 @@ def build_bounds(robot: Robot, bounds: dict[str, Any]) -> BodyBounds | None:
     """Return bounds of the bodies; where none are given, from the robot's geometry."""
     if not bounds:
         return None
-    if "ellipsoid_centre" in bounds and "ellipsoid_axes" not in bounds:
-        raise InputError(
-            "`ellipsoid_centre` needs `ellipsoid_axes`: the half axes [m]."
-        )
     return BodyBounds.from_geometry(robot).replace(**bounds)

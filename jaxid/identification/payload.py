@@ -178,7 +178,7 @@ def identify_payload(
             return Payload(body, estimate, estimate, uncertainty, 0.0)
         bounds = _wide_bounds(robot)
     parameters, distance, error_bound = consistent_body(
-        estimate, uncertainty.covariance, bounds, throw=False
+        estimate, uncertainty.covariance, bounds
     )
     if not error_bound <= MAX_ERROR_BOUND * (1.0 + distance**2):
         raise RuntimeError(

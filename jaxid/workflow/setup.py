@@ -131,8 +131,7 @@ class Setup(eqx.Module):
             self.least_squares = WeightedLeastSquares(weights)
         if self.estimator is None:
             pull = pull_to_bodies(self.robot_file)
-            # An optimum without proof is a note of the fit here, and no error.
-            self.estimator = PhysicallyConsistent(weights, pull=pull, throw=False)
+            self.estimator = PhysicallyConsistent(weights, pull=pull)
             notes = (*notes, *weight_notes)
         self.notes = notes
         if self.load_friction and not self.has_bounded_bodies:

@@ -6,11 +6,14 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
-from jaxid.arrays import AnyArray, Bool, Float, Numbers, given, optional
+from jaxid.arrays import AnyArray, Float, Joints, Numbers, given, optional
 from jaxid.errors import InputError
 from jaxid.robot.robot import Robot
 
 from .pseudo_inertia import consistency_margin
+
+Points = Float[AnyArray, "bodies 3"]
+"""A point in the frame of each body [m]."""
 
 MASS_PER_SQUARED_REACH = 100.0
 """Largest mass of a body, relative to the square of the robot's reach [kg/m²]."""
@@ -31,44 +34,28 @@ class BodyBounds(eqx.Module):
         centre_min: Lower corners of boxes for the centres of mass [m], like `[-0.2,
             -0.2, 0.0]`; -inf for none.
         centre_max: Upper corners [m], like `[0.2, 0.2, 0.5]`; inf for none.
-        ellipsoid_centre: Centres of ellipsoids that hold the centres of mass [m], like
-            `[0.0, 0.0, 0.2]`.
-        ellipsoid_axes: Their half axes, along the axes of the body's frame [m], like
-            `[0.2, 0.2, 0.4]`; inf for none.
         total_mass: Mass of all bodies together [kg], like `120.0`; None if unknown.
     """
 
-    mass_max: Float[np.ndarray, " bodies"] = eqx.field(converter=given)
-    radius: Float[np.ndarray, " bodies"] = eqx.field(converter=given)
-    mass_min: Float[np.ndarray, " bodies"] = eqx.field(converter=given, default=0.0)
-    centre_min: Float[np.ndarray, "bodies 3"] = eqx.field(
-        converter=given, default=-np.inf
-    )
-    centre_max: Float[np.ndarray, "bodies 3"] = eqx.field(
-        converter=given, default=np.inf
-    )
-    ellipsoid_centre: Float[np.ndarray, "bodies 3"] = eqx.field(
-        converter=given, default=0.0
-    )
-    ellipsoid_axes: Float[np.ndarray, "bodies 3"] = eqx.field(
-        converter=given, default=np.inf
-    )
+    mass_max: Joints = eqx.field(converter=given)
+    radius: Joints = eqx.field(converter=given)
+    mass_min: Joints = eqx.field(converter=given, default=0.0)
+    centre_min: Points = eqx.field(converter=given, default=-np.inf)
+    centre_max: Points = eqx.field(converter=given, default=np.inf)
     total_mass: float | None = eqx.field(converter=optional, default=None)
 
     def __post_init__(self):
         bodies = max(np.size(self.mass_max), np.size(self.radius))
         for name in ("mass_max", "radius", "mass_min"):
             setattr(self, name, _of_each_body(name, getattr(self, name), bodies))
-        for name in ("centre_min", "centre_max", "ellipsoid_centre", "ellipsoid_axes"):
+        for name in ("centre_min", "centre_max"):
             setattr(self, name, _of_each_body(name, getattr(self, name), bodies, 3))
         low = self.mass_min
         high = self.mass_max
         radius = self.radius
-        axes = self.ellipsoid_axes
         is_box = self.centre_min < self.centre_max
         self._require("mass_max", "positive and finite", (high > 0) & (high < np.inf))
         self._require("radius", "positive and finite", (radius > 0) & (radius < np.inf))
-        self._require("ellipsoid_axes", "positive", axes > 0)
         self._require(
             "mass_min", "at least 0 and below `mass_max`", (low >= 0) & (low < high)
         )
@@ -82,7 +69,7 @@ class BodyBounds(eqx.Module):
         # Bounds that contradict each other are an error here, not in the estimation.
         _ = self.inner_centres
 
-    def _require(self, name: str, rule: str, is_good: Bool[np.ndarray, "..."]) -> None:
+    def _require(self, name: str, rule: str, is_good: np.ndarray) -> None:
         """Check the rule of a field, and name the first body that breaks it."""
         if not is_good.all():
             body = np.argwhere(~is_good)[0, 0]
@@ -136,46 +123,31 @@ class BodyBounds(eqx.Module):
             parts.append(f"masses from {_span(self.mass_min)} kg")
         if np.isfinite([self.centre_min, self.centre_max]).any():
             parts.append("centres of mass in boxes")
-        if self.has_ellipsoid.any():
-            parts.append("centres of mass in ellipsoids")
         if self.total_mass is not None:
             parts.append(f"{self.total_mass:.4g} kg together")
         return ", ".join(parts)
 
     @property
-    def has_ellipsoid(self) -> Bool[np.ndarray, " bodies"]:
-        """Whether bodies have an ellipsoid for their centre of mass."""
-        return np.asarray(np.isfinite(self.ellipsoid_axes).all(axis=1))
-
-    @property
-    def inner_centres(self) -> Float[np.ndarray, "bodies 3"]:
+    def inner_centres(self) -> np.ndarray:
         """Centres of mass well inside all bounds [m].
 
         Raises:
             InputError: If there are none for some body.
         """
         radius = self.radius[:, None]
-        has_ellipsoid = self.has_ellipsoid[:, None]
         low = np.maximum(self.centre_min, -radius)
         high = np.minimum(self.centre_max, radius)
         edge = 0.1 * (high - low)
-        # Without an ellipsoid the sphere takes its place.
-        centre = np.where(has_ellipsoid, self.ellipsoid_centre, 0.0)
-        axes = np.where(has_ellipsoid, self.ellipsoid_axes, radius)
-        ellipsoids = ((centre, axes), (0.0, radius))
         point = 0.5 * (low + high)
-        # Alternating projections onto the ellipsoid, the sphere and the box, each a
-        # little smaller.
+        # Alternating projections onto the sphere and the box, each a little smaller.
         for _ in range(200):
-            for centre, axes in ellipsoids:
-                offset = point - centre
-                size = np.linalg.norm(offset / axes, axis=1, keepdims=True) / 0.9
-                point = centre + offset / np.maximum(size, 1.0)
+            distance = np.linalg.norm(point / radius, axis=1, keepdims=True)
+            point = point / np.maximum(distance / 0.9, 1.0)
             point = np.clip(point, low + edge, high - edge)
 
-        is_inside = ((low < point) & (point < high)).all(axis=1)
-        for centre, axes in ellipsoids:
-            is_inside &= np.linalg.norm((point - centre) / axes, axis=1) < 0.99
+        is_in_box = ((low < point) & (point < high)).all(axis=1)
+        is_in_sphere = np.linalg.norm(point / radius, axis=1) < 0.99
+        is_inside = is_in_box & is_in_sphere
         if not is_inside.all():
             body = int(np.argmin(is_inside))
             raise InputError(

@@ -37,7 +37,6 @@ class ConeProgram(eqx.Module):
 
     A: Float[AnyArray, "*batch height variables"]  # without the unbounded columns
     b: Float[AnyArray, "*batch height"]
-    floors: Float[AnyArray, "*batch bodies 4 4"]  # lower bounds of the pseudo-inertias
     # linear inequalities of each body, and their constants
     rows: Float[AnyArray, "*batch bodies rows width"]
     offsets: Float[AnyArray, "*batch bodies rows"]
@@ -91,17 +90,15 @@ class ConeProgram(eqx.Module):
         S, s = self.slacks(self.start)
         smallest = np.linalg.eigvalsh(S).min()
         if not (smallest > 0 and s.min() > 0):
-            raise InputError(
-                "no ball lies within all bounds: widen them, or lower `margin`."
-            )
+            raise InputError("no ball lies within all bounds: widen them.")
 
     def slacks(self, y: Values) -> tuple[Values, Values]:
         """Return semidefinite matrices and nonnegative functions of variables."""
         xp = self.xp
         S, s = self.linear(y)
-        matrices = xp.concatenate([-self.floors, self.fillings])
+        constants = xp.concatenate([xp.zeros((self.bodies, 4, 4)), self.fillings])
         drives = [xp.zeros(self.drives), xp.ones(self.drives)]
-        return S + matrices, s + xp.concatenate([xp.ravel(self.offsets), *drives])
+        return S + constants, s + xp.concatenate([xp.ravel(self.offsets), *drives])
 
     def linear(self, y: Values) -> tuple[Values, Values]:
         """Return the linear parts of `slacks`."""
@@ -163,14 +160,13 @@ def cone_program(
 
     _, rows, offsets = feasible.linear_bounds()
     drive_scales = scales[count * feasible.width :]
-    cones = [*_ellipsoids(feasible), *_drive_matrices(feasible, drive_scales)]
+    cones = _drive_matrices(feasible, drive_scales)
     members = np.unique([place for cone in cones for place in cone.places]).astype(int)
     fillings = [cone.filling for cone in cones]
     body_diameters = [1, 2, 2, 2, 1, 1, 1, 1, 1, 1][: feasible.width]
     return ConeProgram(
         A=A,
         b=b,
-        floors=feasible.floors / pseudo_scales,
         rows=rows,
         offsets=offsets,
         couplings=_contributions(cones, members),
@@ -222,25 +218,6 @@ def _total_mass(feasible: FeasibleSet) -> np.ndarray:
     return row
 
 
-def _ellipsoids(feasible: FeasibleSet) -> list[Cone]:
-    """Return matrices that are definite for centres of mass in their ellipsoids."""
-    bounds = feasible.bounds
-    cones = []
-    for body in np.flatnonzero(bounds.has_ellipsoid):
-        axes = bounds.ellipsoid_axes[body] / bounds.radius[body]
-        centre = bounds.ellipsoid_centre[body] / bounds.radius[body]
-        # A Schur complement: the mass on the diagonal, the first moments beside it.
-        basis = np.zeros((4, 4, 4))
-        basis[0] = np.diag([*axes**2, 1.0])
-        basis[0, :3, 3] = -centre
-        basis[0, 3, :3] = -centre
-        basis[1:, :3, 3] = np.eye(3)
-        basis[1:, 3, :3] = np.eye(3)
-        places = body * feasible.width + np.arange(4)
-        cones.append(Cone(places, basis, np.zeros((4, 4))))
-    return cones
-
-
 def _drive_matrices(feasible: FeasibleSet, drive_scales) -> list[Cone]:
     """Return the matrices of coupled drives, whose diagonals are scaled to one."""
     xp = namespace(drive_scales)
@@ -262,16 +239,15 @@ def _drive_matrices(feasible: FeasibleSet, drive_scales) -> list[Cone]:
 def _start(feasible: FeasibleSet, A, b, prior) -> Values:
     """Return the start of the iteration, a point that satisfies all bounds.
 
-    All bodies are balls inside their ellipsoids, as heavy as fits the forces or the
-    total mass; or they lie close to the bodies of a prior that satisfy all bounds.
-    Friction and other drives are small and positive.
+    All bodies are balls, as heavy as fits the forces or the total mass; or they lie
+    close to the bodies of a prior that satisfy all bounds. Friction and other drives
+    are small and positive.
     """
     xp = namespace(A)
     bounds = feasible.bounds
-    floors = _scale(feasible, feasible.floors)
     balls = _unit_balls(bounds)[:, : feasible.width]
     # Masses lie between a minimum and one: find the common fraction of the way.
-    min_masses = np.maximum(bounds.mass_min / bounds.mass_max, floors[:, 0])
+    min_masses = bounds.mass_min / bounds.mass_max
     if bounds.total_mass is None:
         # Least squares for one factor of all balls, held away from the bounds.
         forces = A[:, : balls.size] @ xp.asarray(balls.ravel())
@@ -282,7 +258,7 @@ def _start(feasible: FeasibleSet, A, b, prior) -> Values:
         min_share = np.average(min_masses, weights=bounds.mass_max)
         mass_fraction = (share - min_share) / (1.0 - min_share)
     masses = xp.asarray(min_masses) + mass_fraction * xp.asarray(1.0 - min_masses)
-    bodies = floors + (masses - floors[:, 0])[:, None] * balls
+    bodies = masses[:, None] * balls
     if prior is not None and bounds.total_mass is None:
         bodies = _move_to_prior(feasible, bodies, prior)
 
@@ -314,8 +290,6 @@ def _move_to_prior(feasible: FeasibleSet, bodies, prior) -> Values:
     parameters = _scale(feasible, prior)
     _, rows, offsets = feasible.linear_bounds()
     slacks = np.einsum("kri,ki->kr", rows, parameters) + offsets
-    eigenvalues = np.linalg.eigvalsh(prior - feasible.floors)
-    is_inside = (slacks >= 0).all(axis=1) & (eigenvalues >= 0).all(axis=1)
-    is_inside &= ~feasible.bounds.has_ellipsoid
+    is_inside = (slacks >= 0).all(axis=1)
     share = np.where(is_inside, PRIOR_SHARE, 0.0)[:, None]
     return (1.0 - share) * bodies + share * parameters

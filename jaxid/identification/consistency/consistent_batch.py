@@ -28,6 +28,11 @@ CPU_PART = 16
 ACCELERATOR_BATCH = 256
 """Data sets that an accelerator solves in step."""
 
+Vectors = Float[AnyArray, "*datasets size"]
+"""A vector for each data set."""
+Scalars = Float[AnyArray, "*datasets"]
+"""A number for each data set."""
+
 
 class ConsistentBatch(eqx.Module):
     """Physically consistent parameters of one or many data sets.
@@ -42,10 +47,10 @@ class ConsistentBatch(eqx.Module):
         iterations: Numbers of iterations.
     """
 
-    standard: Float[AnyArray, "*datasets standard"]
-    parameters: Float[AnyArray, "*datasets base"]
-    residual_increases: Float[AnyArray, "*datasets"]
-    error_bounds: Float[AnyArray, "*datasets"]
+    standard: Vectors
+    parameters: Vectors
+    residual_increases: Scalars
+    error_bounds: Scalars
     certified: Bool[AnyArray, "*datasets"]
     iterations: Int[AnyArray, "*datasets"]
 
@@ -60,7 +65,7 @@ class ConsistentSolver(Hashable):
 
     Attributes:
         base: Base parameters of the factors' columns.
-        estimator: Bounds, margin and prior; by default wide bounds.
+        estimator: Bounds and prior; by default wide bounds.
     """
 
     base: BaseParameters
@@ -72,17 +77,12 @@ class ConsistentSolver(Hashable):
     def __eq__(self, other: object) -> bool:
         return isinstance(other, ConsistentSolver) and content(self) == content(other)
 
-    def __call__(
-        self,
-        R: Float[AnyArray, "height base"],
-        z: Float[AnyArray, " height"],
-        rows: Int[AnyArray, ""] | int,
-    ) -> ConsistentBatch:
+    def __call__(self, R: AnyArray, z: AnyArray, rows: AnyArray) -> ConsistentBatch:
         """Return the estimate of one data set.
 
         Args:
-            R: Upper triangle of the weighted rows.
-            z: Weighted forces, of the same decomposition.
+            R: Upper triangle of the weighted rows [height, base].
+            z: Weighted forces, of the same decomposition [height].
             rows: Number of rows behind the factor.
 
         Raises:
@@ -126,7 +126,7 @@ def consistent_batch(
         R: Upper triangles of the weighted rows.
         z: Weighted forces, of the same decompositions.
         rows: Numbers of rows behind the factors.
-        estimator: Bounds, margin and prior; wide bounds if None.
+        estimator: Bounds and prior; wide bounds if None.
 
     Raises:
         InputError: If shapes do not fit, or bounds leave no body.
@@ -147,16 +147,14 @@ def consistent_batch(
     _, program = estimator.program(base, feasible, *(x[0] for x in arrays))
     program.require_interior()
     one = ConsistentSolver(base, estimator)
-    size = CPU_PART if jax.default_backend() == "cpu" else count
-    return in_parts(lambda part: _solve_many(one, *part), arrays, size)
-
-
-@functools.partial(jax.jit, static_argnums=0)
-def _solve_many(one: ConsistentSolver, R, z, rows) -> ConsistentBatch:
-    def solve(batch_size: int | None, *data) -> ConsistentBatch:
-        return jax.lax.map(lambda x: one(*x), data, batch_size=batch_size)
-
     # A core gains nothing from solving data sets in step: it waits for the slowest.
-    one_by_one = functools.partial(solve, None)
-    in_step = functools.partial(solve, ACCELERATOR_BATCH)
-    return jax.lax.platform_dependent(R, z, rows, cpu=one_by_one, default=in_step)
+    if jax.default_backend() == "cpu":
+        solve = functools.partial(_solve_many, one, None)
+        return in_parts(lambda part: solve(*part), arrays, CPU_PART)
+    return _solve_many(one, ACCELERATOR_BATCH, *arrays)
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _solve_many(one: ConsistentSolver, in_step: int | None, *data) -> ConsistentBatch:
+    """Solve data sets one after the other, or some of them in step."""
+    return jax.lax.map(lambda x: one(*x), data, batch_size=in_step)

@@ -28,12 +28,6 @@ MIN_PRICE = 0.01
 MAX_FLAT_MARGIN = 1e-4
 """Margin of a body that is as flat as a body can be."""
 
-UNPROVED = (
-    "the squared residuals may exceed the smallest possible ones by {:.1e} of them; "
-    f"at most {2 * solver.TOLERANCE:.0e} is a proof of the optimum."
-)
-"""Message where the optimum was not proved."""
-
 
 class Consistency(eqx.Module):
     """Properties of a physically consistent estimate.
@@ -95,7 +89,11 @@ class Consistency(eqx.Module):
             "bounds are active, estimates scatter less.",
         ]
         if not self.certified:
-            sentences.append(UNPROVED.format(self.error_bound))
+            sentences.append(
+                "the squared residuals may exceed the smallest possible ones by "
+                f"{self.error_bound:.1e} of them; at most {2 * solver.TOLERANCE:.0e} "
+                "is a proof of the optimum: widen the bounds."
+            )
         return tuple(sentences)
 
 
@@ -112,30 +110,19 @@ class PhysicallyConsistent(AbstractEstimator):
         weights: Weights of the joints; by default the reciprocals of the largest forces
             (Eq. 30).
         bounds: Bounds of the bodies; wide ones from the robot's geometry if None.
-        margin: Fraction (0 to 1) of a nominal ball that every body contains: the mass
-            matrix exceeds that fraction of the nominal balls' mass matrix in every
-            pose.
         pull: Pull towards the bodies of a prior, along directions that the data do not
             see.
-        throw: Whether an optimum without proof is an error; otherwise it is a note.
     """
 
     weights: AbstractWeights = MaximumForces()
     bounds: BodyBounds | None = None
-    margin: float = 0.0
     pull: EntropicPull | None = None
-    throw: bool = eqx.field(static=True, default=True)
-
-    def __check_init__(self):
-        if not 0.0 <= self.margin < 1.0:
-            raise InputError(f"`margin` must be between 0 and 1, but is {self.margin}.")
 
     def __call__(self, rows):
         """Solve a small convex program on the triangular factor of the rows.
 
         Raises:
-            InputError: If weights are not known, or bounds and margin leave no body.
-            RuntimeError: If the optimum was not proved and `throw` is set.
+            InputError: If weights are not known, or bounds leave no body.
         """
         base = rows.base
         weights = self.weights(rows.robot, rows.factors)
@@ -145,7 +132,7 @@ class PhysicallyConsistent(AbstractEstimator):
         feasible = self.feasible_set(base)
         count = int(rows.factors.rows.sum())
         data, program = self.program(base, feasible, R, z, count)
-        optimum, error_bound = _solve(program, self.throw)
+        optimum = _solve(program)
         p = feasible.standard_parameters(data, optimum.y)
         parameters = np.asarray(base.from_standard(p))
         bodies = p[np.array(feasible.bodies)]
@@ -165,7 +152,9 @@ class PhysicallyConsistent(AbstractEstimator):
             margins=consistency_margin(bodies),
             bounds=feasible.bounds,
             residual_increase=increase,
-            error_bound=error_bound,
+            # Noiseless data have an optimum near zero: the scale keeps the ratio
+            # sensible.
+            error_bound=float(optimum.error / max(optimum.value, program.scale)),
             certified=bool(optimum.certified),
             iterations=int(optimum.iterations),
             determined=determined,
@@ -185,7 +174,7 @@ class PhysicallyConsistent(AbstractEstimator):
         """Return the feasible set of a model; bounds of other bodies are rejected."""
         robot = base.model.robot
         bounds = BodyBounds.from_geometry(robot) if self.bounds is None else self.bounds
-        return feasible_set(base.model, bounds, self.margin)
+        return feasible_set(base.model, bounds)
 
     def program(
         self, base: BaseParameters, feasible: FeasibleSet, R, z, rows
@@ -204,19 +193,10 @@ class PhysicallyConsistent(AbstractEstimator):
         return data, cone_program(feasible, data, self.pull.strength, prior)
 
 
-def _solve(program: ConeProgram, throw: bool) -> tuple[solver.Optimum, float]:
-    """Return the optimum, and a bound of its objective's relative error."""
+def _solve(program: ConeProgram) -> solver.Optimum:
+    """Return the optimum of a program whose bounds leave some bodies."""
     program.require_interior()
-    optimum = solver.solve_in_numpy(program)
-    # Noiseless data have an optimum near zero: the scale keeps the ratio sensible.
-    error_bound = float(optimum.error / max(optimum.value, program.scale))
-    if throw and not optimum.certified:
-        raise RuntimeError(
-            "no physically consistent estimate with a proof: "
-            f"{UNPROVED.format(error_bound)} Widen the bounds, "
-            "or accept it with `throw=False`."
-        )
-    return optimum, error_bound
+    return solver.solve_in_numpy(program)
 
 
 def _active_bounds(
@@ -258,8 +238,6 @@ def consistent_body(
     estimate: Float[AnyArray, "10"],
     covariance: Float[AnyArray, "10 10"],
     bounds: BodyBounds,
-    *,
-    throw: bool = True,
 ) -> tuple[Float[np.ndarray, "10"], float, float]:
     """Return the consistent body closest to an estimate, in its covariance's metric.
 
@@ -267,7 +245,6 @@ def consistent_body(
         estimate: Estimated parameters $(m, m r_c, A, B, C, D, E, F)$.
         covariance: Covariance of their errors; positive definite.
         bounds: Bounds of one body, such as `BodyBounds(mass_max=10.0, radius=0.5)`.
-        throw: Whether an optimum without proof is an error.
 
     Returns:
         Parameters of the body; its distance from the estimate in standard deviations
@@ -276,7 +253,6 @@ def consistent_body(
 
     Raises:
         InputError: If the covariance is not positive definite.
-        RuntimeError: If the optimum was not proved and `throw` is set.
     """
     covariance = np.asarray(covariance)
     deviations = np.sqrt(np.abs(np.diag(covariance)))
@@ -296,9 +272,8 @@ def consistent_body(
         drives=(),
         unbounded=(),
         bounds=bounds,
-        floors=np.zeros((1, 4, 4)),
         couplings=(),
     )
-    optimum, _ = _solve(cone_program(feasible, data), throw)
+    optimum = _solve(cone_program(feasible, data))
     parameters = feasible.standard_parameters(data, optimum.y)
     return parameters, float(np.sqrt(2.0 * optimum.value)), float(optimum.error)

@@ -49,7 +49,6 @@ class FeasibleSet(NamedTuple):
     drives: tuple[int, ...]  # columns that are nonnegative
     unbounded: tuple[int, ...]  # columns without bounds
     bounds: BodyBounds
-    floors: np.ndarray  # pseudo-inertias that those of the bodies exceed
     couplings: tuple[Coupling, ...]
 
     @property
@@ -144,8 +143,8 @@ class FeasibleSet(NamedTuple):
         return LinearBounds(names, np.stack(rows, axis=1), np.stack(offsets, axis=1))
 
 
-def feasible_set(model: Model, bounds: BodyBounds, margin: float = 0.0) -> FeasibleSet:
-    """Return a model's feasible parameters; bodies contain a part of nominal balls."""
+def feasible_set(model: Model, bounds: BodyBounds) -> FeasibleSet:
+    """Return a model's feasible parameters."""
     robot = model.robot
     widths = [term.body_parameters for term in model.terms]
     if not any(widths):
@@ -170,7 +169,6 @@ def feasible_set(model: Model, bounds: BodyBounds, margin: float = 0.0) -> Feasi
         drives=tuple(others[is_drive].tolist()),
         unbounded=tuple(others[~is_drive].tolist()),
         bounds=bounds,
-        floors=margin * nominal_bodies(bounds),
         couplings=tuple(_couplings(model)),
     )
 

@@ -15,10 +15,10 @@ from jaxid.identification.consistency.feasible_set import feasible_set, nominal_
 PLANAR = jid.robots.planar_arm(2, 0.5)
 
 
-def case(robot, terms=TERMS, margin=0.0, **bounds):
+def case(robot, terms=TERMS, **bounds):
     base = jid.base_parameters(jid.Model(robot, terms))
     wide = jid.consistency.BodyBounds.from_geometry(robot)
-    return base, feasible_set(base.model, wide.replace(**bounds), margin)
+    return base, feasible_set(base.model, wide.replace(**bounds))
 
 
 CASES = {
@@ -36,10 +36,7 @@ CASES = {
         mass_max=[30.0, 9.0],
         centre_min=[0.0, -0.1, -np.inf],
         centre_max=[0.4, 0.2, 0.3],
-        ellipsoid_centre=[0.2, 0.0, 0.0],
-        ellipsoid_axes=[[0.3, 0.2, 0.2], [np.inf] * 3],
         total_mass=12.0,
-        margin=0.02,
     ),
 }
 
@@ -110,14 +107,14 @@ def test_coupled_drives_in_jax_are_those_in_numpy():
 
 def test_a_batch_is_its_data_sets_one_by_one():
     """In NumPy, and compiled."""
-    base, feasible = case(PLANAR, TERMS[:2], margin=0.1)
+    base, feasible = case(PLANAR, TERMS[:2])
     factors = [arms.factor(base, seed, 0.2, 100) for seed in range(2)]
     R, z, rows = (np.array([f[k] for f in factors]) for k in range(3))
     pull = jid.consistency.EntropicPull()
-    estimator = jid.PhysicallyConsistent(margin=0.1, pull=pull)
+    estimator = jid.PhysicallyConsistent(pull=pull)
     many = jid.consistency.consistent_batch(base, R, z, rows, estimator)
     one = jid.consistency.ConsistentSolver(base, estimator)
-    same = jid.PhysicallyConsistent(margin=0.1, pull=jid.consistency.EntropicPull())
+    same = jid.PhysicallyConsistent(pull=jid.consistency.EntropicPull())
     assert one == jid.consistency.ConsistentSolver(base, same)
     assert one != jid.consistency.ConsistentSolver(base)
     alone = jax.jit(jax.vmap(one))(R, z, rows)
