@@ -86,7 +86,7 @@ def runs():
 
 
 def consistent():
-    return jid.identify(base, cold, jid.PhysicallyConsistent(throw=False))
+    return jid.identify(base, cold, jid.PhysicallyConsistent())
 
 
 def numbers_of(path):

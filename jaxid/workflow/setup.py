@@ -27,7 +27,6 @@ from jaxid.identification.consistency import (
 from jaxid.identification.estimators import (
     AbstractEstimator,
     LeastSquares,
-    NonlinearFriction,
     WeightedLeastSquares,
 )
 from jaxid.identification.estimators.regularisation_and_weights import default_weights
@@ -200,7 +199,7 @@ class Setup(eqx.Module):
         result = identify_nonlinear_friction(
             self.base,
             rows.recordings,
-            NonlinearFriction(self.least_squares),
+            self.least_squares,
             linear=base_parameters(Model(self.robot, terms)),
             progress=functools.partial(progress, "searching for the shape of friction"),
         )

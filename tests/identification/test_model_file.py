@@ -58,7 +58,7 @@ def test_everything_comes_back_bit_for_bit(fit, path):
 def test_a_consistent_fit_keeps_bodies_and_verdict(tmp_path):
     base = planar_base()
     log = observations(base.model, standard_parameters(base.model), noise=0.1)
-    fit = jid.identify(base, log, jid.PhysicallyConsistent(throw=False))
+    fit = jid.identify(base, log, jid.PhysicallyConsistent())
     loaded = jid.load_fit(fit.save(tmp_path / "arm.json"))
     same(loaded, fit)
     assert loaded.consistency.certified == fit.consistency.certified

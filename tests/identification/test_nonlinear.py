@@ -10,11 +10,7 @@ import pytest
 import virtual
 
 import jaxid as jid
-from jaxid.identification.estimators import (
-    NonlinearFriction,
-    ShapeSearch,
-    select_shapes,
-)
+from jaxid.identification.friction_laws import ShapeSearch, select_shapes
 
 ROBOT = jid.robots.planar_arm(3)
 TRUE_EPSILON, TRUE_SPEED = np.array([0.02, 0.05, 0.03]), np.array([0.2, 0.3, 0.15])
@@ -45,7 +41,7 @@ def search_of(base, *logs):
 def test_shapes_are_found_again_through_filters():
     """Exact forces, smoothed and decimated: the minimum is zero, at the truth."""
     o = observations(filter=jid.ZeroPhaseButterworth(5.0), every=4)
-    fit = jid.identify(START, o, NonlinearFriction(WLS))
+    fit = jid.identify_nonlinear_friction(START, o, WLS).fit
     stribeck = fit.base.model.terms[2]
     np.testing.assert_allclose(stribeck.transition.epsilon, TRUE_EPSILON, rtol=1e-3)
     np.testing.assert_allclose(stribeck.speed, TRUE_SPEED, rtol=1e-3)
@@ -59,7 +55,7 @@ def test_shapes_are_found_again_through_filters():
 def test_shapes_are_found_by_name():
     o = virtual.observations(model(TRUE_EPSILON, TRUE_SPEED, 1.5), P, samples=1500)
     base = jid.base_parameters(model(TRUE_EPSILON, TRUE_SPEED, 2.0))
-    fit = jid.identify(base, o, NonlinearFriction(WLS, ("delta",)))
+    fit = jid.identify_nonlinear_friction(base, o, WLS, shapes=("delta",)).fit
     stribeck = fit.base.model.terms[2]
     np.testing.assert_allclose(stribeck.exponent, 1.5, rtol=1e-3)
     np.testing.assert_array_equal(stribeck.speed, TRUE_SPEED)
@@ -125,7 +121,7 @@ def test_deviations_of_shapes_agree_with_their_scatter():
         search = search_of(START, observations(samples=600, noise=0.3, noise_seed=seed))
         found.append(eqx.filter_jit(search)(np.ones(3))[0])
     o = observations(samples=600, noise=0.3)
-    fit = jid.identify_nonlinear_friction(START, o, NonlinearFriction(WLS))
+    fit = jid.identify_nonlinear_friction(START, o, WLS)
     # 14 draws tell a deviation to 19 %: 1.6 is less than three of these.
     scatter = np.std(found, axis=0, ddof=1) / fit.shape_deviations
     assert np.abs(np.log(scatter)).max() < np.log(1.6)
@@ -148,9 +144,7 @@ def test_it_pays_where_friction_is_nonlinear_and_only_there(truth, noise, low, h
     p = virtual.standard_parameters(truth, seed=3)
     o = virtual.observations(truth, p, samples=1000, noise=noise)
     linear = jid.base_parameters(model(0.03))
-    whole = jid.identify_nonlinear_friction(
-        START, o, NonlinearFriction(WLS), linear=linear
-    )
+    whole = jid.identify_nonlinear_friction(START, o, WLS, linear=linear)
     assert whole.held_out.pays == (truth is TRUTH)
     assert low < whole.held_out.gain < high
     assert whole.better.base is (whole.fit if truth is TRUTH else whole.linear).base

@@ -21,7 +21,8 @@ class NonlinearParameter(NamedTuple):
         units: Units for a revolute and a prismatic joint.
         path: Attributes that lead to it, from the term (or transition) that declares
             it.
-        default: Whether it is identified unless `NonlinearFriction` names others.
+        default: Whether `identify_nonlinear_friction` identifies it unless other names
+            are given.
     """
 
     name: str

@@ -6,13 +6,15 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
-from jaxid.arrays import AnyArray, Float, Joints, Numbers, given, optional
+from jaxid.arrays import AnyArray, Float, Numbers, given, optional
 from jaxid.errors import InputError
 from jaxid.robot.robot import Robot
 
 from .pseudo_inertia import consistency_margin
 
-Points = Float[AnyArray, "bodies 3"]
+OfBodies = Float[np.ndarray, " bodies"]
+"""A number for each body."""
+Points = Float[np.ndarray, "bodies 3"]
 """A point in the frame of each body [m]."""
 
 MASS_PER_SQUARED_REACH = 100.0
@@ -37,9 +39,9 @@ class BodyBounds(eqx.Module):
         total_mass: Mass of all bodies together [kg], like `120.0`; None if unknown.
     """
 
-    mass_max: Joints = eqx.field(converter=given)
-    radius: Joints = eqx.field(converter=given)
-    mass_min: Joints = eqx.field(converter=given, default=0.0)
+    mass_max: OfBodies = eqx.field(converter=given)
+    radius: OfBodies = eqx.field(converter=given)
+    mass_min: OfBodies = eqx.field(converter=given, default=0.0)
     centre_min: Points = eqx.field(converter=given, default=-np.inf)
     centre_max: Points = eqx.field(converter=given, default=np.inf)
     total_mass: float | None = eqx.field(converter=optional, default=None)

@@ -6,7 +6,6 @@ from .estimate import (
     Estimate as Estimate,
     EstimatorInWords as EstimatorInWords,
 )
-from .friction_shapes import select_shapes as select_shapes
 from .least_squares import (
     InstrumentalVariables as InstrumentalVariables,
     LeastSquares as LeastSquares,
@@ -28,8 +27,4 @@ from .robust import (
     Huber as Huber,
     IterativelyReweighted as IterativelyReweighted,
     Tukey as Tukey,
-)
-from .variable_projection import (
-    NonlinearFriction as NonlinearFriction,
-    ShapeSearch as ShapeSearch,
 )

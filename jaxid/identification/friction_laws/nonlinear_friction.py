@@ -14,17 +14,24 @@ from jaxid.dynamics.model import Model
 from jaxid.dynamics.terms import AbstractTerm
 from jaxid.measurement.observations import Observations, Progress
 
-from ..estimators.friction_shapes import Shapes
+from ..estimators import AbstractEstimator, WeightedLeastSquares
 from ..estimators.regularisation_and_weights import Decomposition
-from ..estimators.variable_projection import NonlinearFriction, ShapeSearch
 from ..factors import Blocks
 from ..fit_result import Fit
 from ..identify import fit_problem
 from ..problem import RegressionProblem, cross_validation_folds
 from ..uncertainty import Uncertainty
+from .friction_shapes import Shapes, select_shapes
+from .variable_projection import MAX_STEPS, ShapeSearch
 
 MIN_GAIN = 0.01
 """Relative reduction of the squared error from which nonlinear friction can pay."""
+
+NOT_CONVERGED = (
+    f"the search for the shapes of friction has not converged in {MAX_STEPS} steps: "
+    "the logs hardly determine some of them; look at their standard deviations, or "
+    "select fewer."
+)
 
 
 class HeldOutErrors(eqx.Module):
@@ -106,22 +113,26 @@ class NonlinearFit(eqx.Module):
 def identify_nonlinear_friction(
     base: BaseParameters,
     observations: Observations | Sequence[Observations],
-    estimator: NonlinearFriction | None = None,
+    estimator: AbstractEstimator | None = None,
     *,
+    shapes: Sequence[str] = (),
     linear: BaseParameters | None = None,
     progress: Progress | None = None,
 ) -> NonlinearFit:
     """Identify friction laws with their shapes, and compare them with the linear model.
 
-    Both models are fitted again without each of five blocks of time, and tested on it.
+    The weights of the joints are those of the linear model. Both models are fitted
+    again without each of five blocks of time, and tested on it.
 
     Args:
         base: Base parameters of a model with shapes, such as those of
             `StribeckFriction`.
         observations: Observations of one recording, or of several that are fitted
             together.
-        estimator: Estimator; by default weighted least squares and the shapes that
-            terms propose.
+        estimator: Estimator of the linear parameters; by default weighted least
+            squares.
+        shapes: Names of the shapes that are identified, such as `("vs", "delta")`; by
+            default those that the terms propose. The others keep their values.
         linear: Base parameters of the linear model; by default the same model with its
             own shapes.
         progress: Callback, called with the completed fraction (0 to 1).
@@ -129,31 +140,36 @@ def identify_nonlinear_friction(
     Raises:
         InputError: If the model has no shapes, or the observations do not fit to it.
     """
-    estimator = estimator or NonlinearFriction()
+    estimator = estimator or WeightedLeastSquares()
     linear_problem = RegressionProblem(linear or base, observations)
-    # Both models are compared with the weights of the linear one.
-    linear_fit = fit_problem(linear_problem, estimator.linear)
+    linear_fit = fit_problem(linear_problem, estimator)
     weights = np.asarray(linear_fit.weights)
 
     problem = linear_problem.with_base(base)
-    search, values, notes = estimator.search(problem, weights)
-    shapes = search.shapes
-    shaped_base = shapes.set(base, values)
-    fit = fit_problem(problem.with_base(shaped_base), estimator.linear)
+    search = ShapeSearch.of(problem, select_shapes(base, shapes))
+    all_blocks = np.ones(len(linear_problem.blocks.parts))
+    values, has_converged = eqx.filter_jit(search)(weights, all_blocks)
+    values = np.asarray(values)
+    shaped_base = search.shapes.set(base, values)
+    fit = fit_problem(problem.with_base(shaped_base), estimator)
+    notes = fit.notes
+    if not has_converged:
+        notes = (*notes, NOT_CONVERGED)
 
     # In the extended model, uncertain shapes make the levels of friction uncertain.
-    extended_base = _add_shape_slopes(shaped_base, shapes, values, fit.parameters)
-    extended_fit = fit_problem(problem.with_base(extended_base), estimator.linear)
+    extended_base = _add_shape_slopes(
+        shaped_base, search.shapes, values, fit.parameters
+    )
+    extended_fit = fit_problem(problem.with_base(extended_base), estimator)
     uncertainty = extended_fit.uncertainty
     return NonlinearFit(
         fit=dataclasses.replace(
             fit,
             uncertainty=_leading_part(uncertainty, base.size),
-            estimator=estimator,
-            notes=(*fit.notes, *notes),
+            notes=notes,
         ),
-        names=tuple(name for name, _ in shapes.parameters),
-        units=tuple(unit for _, unit in shapes.parameters),
+        names=tuple(name for name, _ in search.shapes.parameters),
+        units=tuple(unit for _, unit in search.shapes.parameters),
         shapes=values,
         shape_covariance=uncertainty.covariance[base.size :, base.size :],
         linear=linear_fit,

@@ -6,7 +6,6 @@ so the residual $r = z - N c$ is a function of the shapes alone (Golub and Perey
 and differentiated.
 """
 
-import dataclasses
 import itertools
 from typing import NamedTuple
 
@@ -18,68 +17,15 @@ import numpy as np
 from jaxid.arrays import AnyArray, Array, Float, Int, require_float64
 from jaxid.measurement.observations import Observations
 
+from ..estimators.regularisation_and_weights import RIDGE, inverse_information
 from ..factors import RowChunk
 from ..problem import RegressionProblem
-from .estimate import AbstractEstimator
-from .friction_shapes import Shapes, select_shapes
-from .least_squares import WeightedLeastSquares
-from .regularisation_and_weights import RIDGE, inverse_information
+from .friction_shapes import Shapes
 
 MAX_STEPS = 60
 """Largest number of steps of a search."""
 START_RATIOS = (0.2, 1.0, 5.0)
 """Multiples of the model's shapes at which a search may begin."""
-
-
-class NonlinearFriction(AbstractEstimator):
-    """Estimator of epsilons, Stribeck speeds and other shapes, then all parameters.
-
-    The weights of the joints are those of the linear estimator at the shapes of the
-    model; with the shapes found, it estimates again. The base parameters of the fit are
-    those of the model with these shapes. Standard deviations assume that the shapes are
-    known: `identify_nonlinear_friction` also accounts for their uncertainty, and
-    compares the result with the linear model.
-
-    Attributes:
-        linear: Estimator of the linear parameters.
-        shapes: Names of the shapes that are identified, such as `("vs", "delta")`; by
-            default those that the terms propose. The others keep their values.
-    """
-
-    linear: AbstractEstimator = WeightedLeastSquares()
-    shapes: tuple[str, ...] = eqx.field(static=True, default=())
-
-    def __call__(self, problem):
-        """Search for the shapes, and estimate with them."""
-        weights = np.asarray(self.linear(problem).weights)
-        search, values, notes = self.search(problem, weights)
-        base = search.shapes.set(problem.base, values)
-        estimate = self.linear(problem.with_base(base))
-        return dataclasses.replace(estimate, notes=(*estimate.notes, *notes))
-
-    def search(
-        self, problem: RegressionProblem, weights: Float[np.ndarray, " joints"]
-    ) -> "SearchResult":
-        """Search for the shapes with some weights of the joints."""
-        search = ShapeSearch.of(problem, select_shapes(problem.base, self.shapes))
-        all_blocks = np.ones(max(search.blocks) + 1)
-        values, has_converged = eqx.filter_jit(search)(weights, all_blocks)
-        notes = ()
-        if not has_converged:
-            notes = (
-                "the search for the shapes of friction has not converged in "
-                f"{MAX_STEPS} steps: the logs hardly determine some of them; look at "
-                "their standard deviations, or select fewer.",
-            )
-        return SearchResult(search, np.asarray(values), notes)
-
-
-class SearchResult(NamedTuple):
-    """Shapes that were found, and sentences about the search."""
-
-    search: "ShapeSearch"
-    values: Float[np.ndarray, " shapes"]
-    notes: tuple[str, ...]
 
 
 class ColumnEntry(NamedTuple):
