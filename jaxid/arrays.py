@@ -34,6 +34,9 @@ AnyArray = jax.Array | np.ndarray
 Joints = Float[AnyArray, " joints"]
 """One number for each joint."""
 
+JointSamples = Float[AnyArray, "samples joints"]
+"""One number for each sample and joint."""
+
 Vector3 = Float[AnyArray, "3"]
 """A point or a direction in space."""
 

@@ -178,11 +178,10 @@ def shortened(text: str, max_length: int) -> str:
     return f"{text[:head]}…{text[-tail:]}"
 
 
-@dataclasses.dataclass(frozen=True)
 class Column:
     """Column of a table.
 
-    Attributes:
+    Args:
         name: Header; may have several lines.
         values: Sequence or array of numbers or texts, one for each row.
         unit: Unit of all values, shown in brackets below the name.
@@ -192,22 +191,24 @@ class Column:
             else `text`.
     """
 
-    name: str
-    values: Any
-    unit: str = ""
-    format: Callable[[float], str] = significant
-    kind: Literal["number", "text", "code", ""] = ""
-
-    def __post_init__(self) -> None:
-        values = self.values
+    def __init__(
+        self,
+        name: str,
+        values: Any,
+        unit: str = "",
+        format: Callable[[float], str] = significant,
+        kind: Literal["number", "text", "code", ""] = "",
+    ):
         if not isinstance(values, list | tuple):
             values = np.asarray(values).tolist()
-        cells = tuple(map(_plain_cell, values))
-        object.__setattr__(self, "values", cells)
-        object.__setattr__(self, "name", printable(self.name))
-        if not self.kind:
-            numeric = bool(cells) and all(isinstance(x, int | float) for x in cells)
-            object.__setattr__(self, "kind", "number" if numeric else "text")
+        self.name = printable(name)
+        self.values = tuple(map(_plain_cell, values))
+        self.unit = unit
+        self.format = format
+        self.kind = kind
+        if not kind:
+            is_number = [isinstance(x, int | float) for x in self.values]
+            self.kind = "number" if is_number and all(is_number) else "text"
 
     @property
     def header(self) -> list[str]:

@@ -1,6 +1,7 @@
 """The feed-forward as one C99 file and its header."""
 
 import inspect
+import itertools
 import json
 import math
 import re
@@ -77,12 +78,12 @@ def c_functions(fit: Fit) -> list[CFunction]:
     shapes = {"p": (fit.base.size,), "s": model.input_shapes[-1]}
     functions = []
     for name, (summary, output, function) in _definitions(fit).items():
-        inputs = tuple(inspect.signature(function).parameters)
-        if model.memory is None:
-            inputs = tuple(x for x in inputs if x != "s")
+        inputs = [*inspect.signature(function).parameters]
+        if model.memory is None and "s" in inputs:
+            inputs.remove("s")
         input_shapes = [shapes.get(x, (model.robot.joints,)) for x in inputs]
         program = trace(function, *input_shapes)
-        functions.append(CFunction(name, summary, program, inputs, output))
+        functions.append(CFunction(name, summary, program, tuple(inputs), output))
     return functions
 
 
@@ -99,9 +100,6 @@ def _definitions(fit: Fit) -> dict[str, tuple[str, str, Callable]]:
 
     def torque_of_parameters(q, qd, qdd, p, s=None):
         return base.columns(q, qd, qdd, s) @ p
-
-    def torque_of_masses(q, qd, qdd, s=None):
-        return model.inertia(parameters, q) @ qdd + model.bias(parameters, q, qd, s)
 
     def mass_matrix(q):
         return model.inertia(parameters, q)
@@ -126,11 +124,6 @@ def _definitions(fit: Fit) -> dict[str, tuple[str, str, Callable]]:
             "The same for given base parameters p, as Theta_B p (Eq. 39)",
             "tau",
             torque_of_parameters,
-        ),
-        "torque_of_masses": (
-            "The same as M qdd + h, with M by composite bodies (Eq. 38)",
-            "tau",
-            torque_of_masses,
         ),
         "mass_matrix": (
             "Mass matrix M, rotors included, row by row (Eq. 38)",
@@ -175,7 +168,7 @@ def c_texts(
         "terms": ", ".join(type(term).__name__ for term in model.terms),
         "gravity": ", ".join(f"{x:g}" for x in np.asarray(model.robot.gravity)),
         "has_memory": model.memory is not None,
-        "tables": _test_tables(fit, writer, functions),
+        "tables": _test_tables(fit, functions),
         "samples": TEST_SAMPLES,
         "tolerance": "1e-10" if writer.double else "0.002",
         "ascii": _ascii,
@@ -188,34 +181,24 @@ def c_texts(
     }
 
 
-def _test_tables(
-    fit: Fit, writer: CWriter, functions: Sequence[CFunction]
-) -> dict[str, list[list[float]]]:
+def _test_tables(fit: Fit, functions: Sequence[CFunction]) -> dict[str, list]:
     """Return random states and the results of all functions, for the self-test."""
     random = np.random.default_rng(0)
     shape = (TEST_SAMPLES, fit.base.model.robot.joints)
-    inputs = dict.fromkeys(x for function in functions for x in function.inputs)
-    arrays = {}
+    parameters = np.asarray(fit.parameters, np.float64)
+    arrays = {"p": np.tile(parameters, (TEST_SAMPLES, 1))}
     tables = {}
-    for name in inputs:
-        if name == "p":
-            parameters = np.asarray(fit.parameters, np.float64)
-            arrays[name] = np.tile(parameters, (TEST_SAMPLES, 1))
-        else:
+    for name in itertools.chain(*(function.inputs for function in functions)):
+        if name not in arrays:
             arrays[name] = np.round(random.uniform(-2.0, 2.0, shape), 3)
             tables[name] = arrays[name].tolist()
-    if not writer.double:
-        arrays = {
-            name: array.astype(np.float32).astype(np.float64)
-            for name, array in arrays.items()
-        }
     for function in functions:
         arguments = [arrays[name].T for name in function.inputs]
         result = np.asarray(evaluate(function.program, *arguments))
         # A constant result has one sample only.
-        rows = result.reshape(function.size, -1)
-        rows = np.broadcast_to(rows, (function.size, TEST_SAMPLES))
-        tables[f"{function.name}_expected"] = rows.T.tolist()
+        columns = result.reshape(function.size, -1).T
+        rows = np.broadcast_to(columns, (TEST_SAMPLES, function.size))
+        tables[f"{function.name}_expected"] = rows.tolist()
     return tables
 
 

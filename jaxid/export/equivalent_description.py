@@ -6,17 +6,14 @@ them:
 * matter on a joint's axis moves alike with the bodies on both sides of it, so that it
   is carried inward until nothing is left of it: what remains are the base parameters;
 * the origin of a frame may lie anywhere on its joint's axis (where axes meet, forces
-  vanish);
-* the frame of the last body may be turned about its joint so that a first moment
-  vanishes.
+  vanish).
 """
 
-import dataclasses
+from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from jaxid.arrays import AnyArray, Float, Joints, Vector3
+from jaxid.arrays import AnyArray, Float, Joints
 from jaxid.dynamics import projection_equation
 from jaxid.identification.consistency.pseudo_inertia import (
     inertial_parameters,
@@ -29,37 +26,29 @@ MIN_DISTANCE = 1e-9
 """Distance that is more than rounding [m]."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Description:
-    """One of many descriptions of the same robot, with the same forces.
+class Description(NamedTuple):
+    """One of many descriptions of the same robot, with the same forces."""
 
-    Attributes:
-        robot: Joints and frames.
-        bodies: Pseudo-inertias.
-        zeros: Angles that are added to those of the joints [rad].
-    """
-
-    robot: Robot
-    bodies: Float[np.ndarray, "joints 4 4"]
-    zeros: Joints
+    robot: Robot  # joints and frames
+    bodies: Float[np.ndarray, "joints 4 4"]  # pseudo-inertias
 
     @property
     def cost(self) -> int:
         """Estimate of the operations: weighted numbers that are not zero."""
         robot = self.robot
-        has_length = np.abs(np.asarray(robot.offset)) > 1e-12
+        lengths = np.count_nonzero(np.abs(np.asarray(robot.offset)) > 1e-12, axis=1)
         total = np.count_nonzero(self.bodies)
         for body, (*ancestors, _) in enumerate(robot.ancestors):
             # A length counts only in a frame that turns.
-            if any(robot.revolute[ancestor] for ancestor in ancestors):
-                total += 4 * has_length[body].any() + 6 * has_length[body].sum()
-        return int(total)
+            turns = any(robot.revolute[ancestor] for ancestor in ancestors)
+            if turns and lengths[body]:
+                total += 4 + 6 * int(lengths[body])
+        return total
 
     def forces(self, q: AnyArray, qd: AnyArray, qdd: AnyArray) -> Joints:
         """Return the forces of the bodies at one sample [N m or N] (Eq. 11)."""
         p = inertial_parameters(_with_44_bits(self.bodies))
-        angles = q + self.zeros
-        return projection_equation.rigid_body_forces(self.robot, p, angles, qd, qdd)
+        return projection_equation.rigid_body_forces(self.robot, p, q, qd, qdd)
 
     def carry_inward(self) -> "Description":
         """Move what moves like the parent to the parent: base parameters (Eq. 22).
@@ -71,16 +60,17 @@ class Description:
         bodies = self.bodies.copy()
         for body in reversed(range(robot.joints)):
             inertia = bodies[body]
+            shared = np.zeros((4, 4))
             if robot.revolute[body]:
                 shared = _on_axis(inertia, np.asarray(robot.axis[body]))
             else:
-                shared = np.zeros((4, 4))
                 shared[:3, :3] = inertia[:3, :3]
             bodies[body] = _without_rounding(inertia - shared, inertia)
-            if robot.parent[body] >= 0:
+            parent = robot.parent[body]
+            if parent >= 0:
                 T = _transform(robot.rotation[body], robot.offset[body])
-                bodies[robot.parent[body]] += T @ shared @ T.T
-        return dataclasses.replace(self, bodies=bodies)
+                bodies[parent] += T @ shared @ T.T
+        return Description(robot, bodies)
 
     def slide(self, body: int, distance: float) -> "Description":
         """Move the origin of a frame along its joint's axis by a distance [m].
@@ -91,42 +81,19 @@ class Description:
         shift = np.asarray(robot.axis[body]) * distance
         offset = np.array(robot.offset)
         offset[body] += np.asarray(robot.rotation[body]) @ shift
-        for child, parent in enumerate(robot.parent):
-            if parent == body:
-                offset[child] -= shift
+        is_child = np.array(robot.parent) == body
+        offset[is_child] -= shift
         bodies = self.bodies.copy()
         T = _transform(np.eye(3), -shift)
         bodies[body] = T @ bodies[body] @ T.T
-        moved = robot.replace(offset=_without_rounding(offset, offset))
-        return dataclasses.replace(self, robot=moved, bodies=bodies)
-
-    def turn_last(self, body: int) -> "Description":
-        """Turn the frame of a last body about its axis until a first moment is zero."""
-        axis = np.asarray(self.robot.axis[body])
-        inertia = self.bodies[body]
-        moment = _across(axis, inertia[:3, 3])
-        if np.linalg.norm(moment) == 0.0:
-            return self
-        # The moment is turned into the plane of the axis and of the coordinate axis
-        # that is nearly at a right angle to it.
-        coordinate = np.eye(3)[np.argmin(np.abs(axis))]
-        direction = _across(axis, coordinate)
-        direction /= np.linalg.norm(direction)
-        sine = axis @ np.cross(direction, moment)
-        angle = float(np.arctan2(sine, direction @ moment))
-
-        T = _transform(Rotation.from_rotvec(-angle * axis).as_matrix(), np.zeros(3))
-        bodies = self.bodies.copy()
-        bodies[body] = _without_rounding(T @ inertia @ T.T, inertia)
-        zeros = self.zeros.copy()
-        zeros[body] += angle
-        return dataclasses.replace(self, bodies=bodies, zeros=zeros)
+        return Description(
+            robot.replace(offset=_without_rounding(offset, offset)), bodies
+        )
 
 
 def simplest_description(robot: Robot, parameters: BodyParameters) -> Description:
     """Return a description of a robot and its bodies that takes few operations."""
-    inertias = np.asarray(pseudo_inertia(parameters))
-    frames = Description(robot, inertias, np.zeros(robot.joints))
+    frames = Description(robot, np.asarray(pseudo_inertia(parameters)))
     description = frames.carry_inward()
     for body in range(robot.joints):
         for distance in _distances_to_neighbours(frames.robot, body):
@@ -134,11 +101,6 @@ def simplest_description(robot: Robot, parameters: BodyParameters) -> Descriptio
             if candidate.carry_inward().cost < description.cost:
                 frames = candidate
                 description = candidate.carry_inward()
-    for body in set(range(robot.joints)) - set(robot.parent):
-        if robot.revolute[body]:
-            description = min(
-                description, description.turn_last(body), key=lambda x: x.cost
-            )
     return description
 
 
@@ -149,32 +111,26 @@ def _distances_to_neighbours(robot: Robot, body: int) -> list[float]:
     offset = np.asarray(robot.offset)
     axis = np.asarray(robot.axis[body])
     axis_in_parent = np.asarray(robot.rotation[body]) @ axis
-    distances = [-float(axis_in_parent @ offset[body])]
-    for child, parent in enumerate(robot.parent):
-        if parent == body:
-            distances.append(float(axis @ offset[child]))
-    distances = dict.fromkeys(distances)
+    is_child = np.array(robot.parent) == body
+    to_parent = -float(axis_in_parent @ offset[body])
+    to_children = [float(axis @ x) for x in offset[is_child]]
+    distances = dict.fromkeys([to_parent, *to_children])
     return [distance for distance in distances if abs(distance) > MIN_DISTANCE]
 
 
-def _on_axis(
-    inertia: Float[np.ndarray, "4 4"], axis: Vector3
-) -> Float[np.ndarray, "4 4"]:
+def _on_axis(inertia: np.ndarray, axis: np.ndarray) -> np.ndarray:
     """Return the part of a pseudo-inertia that a turn about an axis does not change."""
     part = np.zeros((4, 4))
     part[3, 3] = inertia[3, 3]
-    part[:3, 3] = (axis @ inertia[:3, 3]) * axis
-    part[3, :3] = part[:3, 3]
-    part[:3, :3] = (axis @ inertia[:3, :3] @ axis) * np.outer(axis, axis)
+    first_moment = axis @ inertia[:3, 3]
+    part[:3, 3] = first_moment * axis
+    part[3, :3] = first_moment * axis
+    second_moment = axis @ inertia[:3, :3] @ axis
+    part[:3, :3] = second_moment * np.outer(axis, axis)
     return part
 
 
-def _across(axis: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """Return the part of a vector at a right angle to a unit vector."""
-    return vector - (axis @ vector) * axis
-
-
-def _transform(rotation: AnyArray, position: AnyArray) -> Float[np.ndarray, "4 4"]:
+def _transform(rotation: AnyArray, position: AnyArray) -> np.ndarray:
     """Return the homogeneous matrix of a placement."""
     T = np.eye(4)
     T[:3, :3] = rotation

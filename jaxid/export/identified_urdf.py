@@ -7,7 +7,6 @@ import numpy as np
 from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
 from lxml.builder import E  # pyright: ignore[reportMissingModuleSource]
 
-from jaxid.arrays import Float
 from jaxid.errors import InputError
 from jaxid.identification.fit_result import Fit
 from jaxid.io import write_bytes
@@ -27,6 +26,9 @@ from .joint_dynamics import (
 
 COMMENT_START = " Inertias and friction: model of "
 """Beginning of the comment in a URDF file that names the model."""
+
+MAX_DEVIATION = 1e-3
+"""Largest difference of frames in two descriptions of one robot [m, or of cosines]."""
 
 
 def export_urdf(
@@ -136,39 +138,35 @@ def _require_same_robot(robot: Robot, described: Robot, source: str | Path) -> N
             "give the file of this robot, or its `tip`."
         )
     for joint, name in enumerate(robot.joint_names):
-        turns = robot.revolute[joint]
-        if turns != described.revolute[joint]:
-            words = ("slides", "turns")
+        if robot.revolute[joint] != described.revolute[joint]:
+            words = "turns" if described.revolute[joint] else "slides"
             raise InputError(
-                f"joint `{name}` {words[not turns]} in `{source}`, but {words[turns]} "
-                "in the robot of the fit: give its own file."
+                f"joint `{name}` {words} in `{source}`, but not in the robot of the "
+                "fit: give its own file."
             )
-    all_bodies = np.arange(robot.joints)
-    bodies_on_bodies = np.flatnonzero(np.array(robot.parent) >= 0)
-    rows = {
-        "axis": all_bodies,
-        "rotation": bodies_on_bodies,
-        "offset": bodies_on_bodies,
-    }
-    for quantity, bodies in rows.items():
-        fit_numbers = np.asarray(getattr(robot, quantity))[bodies]
-        file_numbers = np.asarray(getattr(described, quantity))[bodies]
-        if not np.allclose(fit_numbers, file_numbers, rtol=0.0, atol=1e-3):
+    is_on_body = np.array(robot.parent) >= 0
+    for quantity in ("axis", "rotation", "offset"):
+        fit_numbers = np.asarray(getattr(robot, quantity))
+        file_numbers = np.asarray(getattr(described, quantity))
+        deviations = np.abs(fit_numbers - file_numbers)
+        if quantity != "axis":
+            deviations = deviations[is_on_body]
+        if deviations.max(initial=0.0) > MAX_DEVIATION:
             raise InputError(
-                f"`{source}` has another `{quantity}` "
-                "than the robot of the fit: give its own file."
+                f"`{source}` has another `{quantity}` than the robot of the fit: give "
+                "its own file."
             )
 
 
-def _inertial(p: Float[np.ndarray, "10"]) -> Any:
+def _inertial(p: np.ndarray) -> Any:
     """Return the element of a body, in the frame of its link."""
     inertia = Inertia.from_parameters(p)
     names = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
-    moments = [exact_text(moment) for moment in inertia.moments]
+    moments = zip(names, map(exact_text, inertia.moments), strict=True)
     return E.inertial(
         E.origin(xyz=exact_text(inertia.centre), rpy="0 0 0"),
         E.mass(value=exact_text(inertia.mass)),
-        E.inertia(**dict(zip(names, moments, strict=True))),
+        E.inertia(**dict(moments)),
     )
 
 

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxid.arrays import Float, Joints, double_precision
+from jaxid.arrays import Joints, double_precision
 from jaxid.dynamics.terms import AbstractTerm
 from jaxid.errors import InputError
 from jaxid.identification.consistency.pseudo_inertia import consistency_margin
@@ -59,27 +59,23 @@ def joint_dynamics(fit: Fit) -> JointDynamics:
                 rotors.append(name)
             if not coefficients[:, :, k].any():
                 omissions.append(name)
-    armature, damping, friction = total
-    values: dict[str, Joints] = {
-        "armature": armature,
-        "damping": damping,
-        "friction": friction,
-    }
+    values = dict(zip(("armature", "damping", "friction"), total, strict=True))
     return JointDynamics(values, tuple(rotors), tuple(omissions))
 
 
-def _joint_coefficients(
-    term: AbstractTerm, robot: Robot
-) -> Float[np.ndarray, "3 joints columns"]:
-    """Return inertia, viscous and dry friction of unit parameters, or zeros."""
+def _joint_coefficients(term: AbstractTerm, robot: Robot) -> np.ndarray:
+    """Return inertia, viscous and dry friction of unit parameters, or zeros.
+
+    The axes are these three, the joints, and the parameters of the term.
+    """
     random = np.random.default_rng(0)
-    n = robot.joints
-    q, qdd = random.uniform(-1.0, 1.0, (2, PROBES, n))
-    speeds = random.uniform(*PROBE_SPEEDS, (PROBES, n))
-    qd = speeds * random.choice([-1.0, 1.0], (PROBES, n))
+    shape = (PROBES, robot.joints)
+    q, qdd = random.uniform(-1.0, 1.0, (2, *shape))
+    speeds = random.uniform(*PROBE_SPEEDS, shape)
+    qd = speeds * random.choice([-1.0, 1.0], shape)
 
     columns = _odd_columns(term, robot, q, qd, qdd)
-    coefficients = np.zeros((3, n, columns.shape[2]))
+    coefficients = np.zeros((3, *columns.shape[1:]))
     is_used = np.any(columns, axis=0)
     # A simulator knows no parameter that acts on several joints.
     acts_on_one_joint = np.count_nonzero(is_used, axis=0) == 1
@@ -88,14 +84,15 @@ def _joint_coefficients(
         basis = np.stack([qdd[:, joint], velocity, np.sign(velocity)], axis=1)
         forces = columns[:, joint, k]
         solution = np.linalg.lstsq(basis, forces)[0]
-        if np.abs(basis @ solution - forces).max() < 1e-9:
+        error = np.abs(basis @ solution - forces)
+        if error.max() < 1e-9:
             coefficients[:, joint, k] = solution.round(12)
     return coefficients
 
 
 def _odd_columns(
     term: AbstractTerm, robot: Robot, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray
-) -> Float[np.ndarray, "probes joints columns"]:
+) -> np.ndarray:
     """Return the part of a term's columns that changes its sign with the motion.
 
     Springs and offsets drop out, and friction is the mean of both directions.

@@ -9,7 +9,7 @@ from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
 from lxml.builder import E  # pyright: ignore[reportMissingModuleSource]
 from scipy.spatial.transform import Rotation
 
-from jaxid.arrays import AnyArray, Float, Joints
+from jaxid.arrays import AnyArray, Joints
 from jaxid.identification.fit_result import Fit
 from jaxid.io import write_text
 from jaxid.robot.inertia import BodyParameters, Inertia
@@ -83,7 +83,7 @@ def mjcf_text(
     return etree.tostring(root, pretty_print=True, encoding="unicode")
 
 
-def _inertial(p: Float[np.ndarray, "10"]) -> Any:
+def _inertial(p: np.ndarray) -> Any:
     """Return the element of a body's mass, centre of mass and moments of inertia."""
     inertia = Inertia.from_parameters(p)
     # In MuJoCo's order: xx, yy, zz, xy, xz, yz.

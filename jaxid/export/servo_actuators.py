@@ -7,7 +7,7 @@ import numpy as np
 from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
 from lxml.builder import E  # pyright: ignore[reportMissingModuleSource]
 
-from jaxid.arrays import AnyArray, Joints, Numbers
+from jaxid.arrays import AnyArray, Joints
 from jaxid.errors import InputError
 from jaxid.io import write_text
 from jaxid.result_table import Column, Table
@@ -34,33 +34,25 @@ UNITS = {
 """Units of `simulator_values` at joints that turn, and at joints that slide."""
 
 
-def servo_stiffness(fit: ServoFit, stiffness: Numbers | None = None) -> Joints:
-    """Return the stiffness of each servo: as given, of the fit, or of other joints.
-
-    Args:
-        fit: Identified servos.
-        stiffness: Stiffness, one for all joints or one for each [N m/rad or N/m]; that
-            of the fit where it is None or NaN.
+def servo_stiffness(fit: ServoFit) -> Joints:
+    """Return the stiffness of each servo: that of the fit, or of other joints.
 
     Raises:
-        InputError: If no joint tells its stiffness and none is given.
+        InputError: If no joint tells its stiffness and none was given.
     """
-    values = fit.stiffness.copy()
-    if stiffness is not None:
-        numbers = np.broadcast_to(np.asarray(stiffness, np.float64), values.shape)
-        values = np.where(np.isnan(numbers), values, numbers)
+    values = fit.stiffness
     is_known = np.isfinite(values)
     if not is_known.any():
         raise InputError(
-            "`stiffness` [N m/rad] is needed: "
-            "no known weight tells it, and positions tell ratios to it only. "
-            "Any number gives the same motion of a robot without bodies."
+            "`stiffness` [N m/rad] of `identify_rollout` is needed: no known weight "
+            "tells it, and positions tell ratios to it only. Any number gives the same "
+            "motion of a robot without bodies."
         )
     return np.where(is_known, values, np.median(values[is_known]))
 
 
 def simulator_values(
-    fit: ServoFit, stiffness: Numbers | None = None, parameters: AnyArray | None = None
+    fit: ServoFit, parameters: AnyArray | None = None
 ) -> dict[str, Joints]:
     """Return the numbers of each joint that simulators of actuators take.
 
@@ -69,7 +61,6 @@ def simulator_values(
 
     Args:
         fit: Identified servos.
-        stiffness: Stiffness of each servo [N m/rad or N/m]; that of the fit if None.
         parameters: Other parameters of the joints, such as a draw from their
             distribution.
 
@@ -79,12 +70,12 @@ def simulator_values(
     """
     rows = fit.parameters if parameters is None else np.asarray(parameters)
     ratios = {symbol: rows[:, k] for symbol, k in INDEX.items()}
-    # Parameters are in units of the stiffness, which positions alone do not tell.
-    K = servo_stiffness(fit, stiffness)
-    if stiffness is None:
-        # A draw has its own stiffness where the weight tells it.
-        is_drawn = np.isfinite(fit.stiffness) & fit.free[:, INDEX["a"]]
-        K = np.where(is_drawn, 1.0 / np.maximum(ratios["a"], 1e-9), K)
+    # Parameters are in units of the stiffness, which positions alone do not tell. A
+    # draw has its own stiffness where the weight tells it.
+    is_drawn = np.isfinite(fit.stiffness) & fit.free[:, INDEX["a"]]
+    drawn_stiffness = 1.0 / np.maximum(ratios["a"], 1e-9)
+    K = np.where(is_drawn, drawn_stiffness, servo_stiffness(fit))
+
     inertia = np.maximum(K * ratios["J"] - _body_inertias(fit, ratios["a"]), 0.0)
     friction = ratios["F"] + ratios["mu"] * np.abs(ratios["a"]) * fit.load
     is_limited = ratios["um"] < START[INDEX["um"]]
@@ -115,63 +106,52 @@ def _body_inertias(fit: ServoFit, compliance: Joints) -> Joints:
     return np.where(without_bodies, 0.0, np.diag(np.asarray(mass_matrix)))
 
 
-def simulator_table(fit: ServoFit, stiffness: Numbers | None = None) -> Table:
+def simulator_table(fit: ServoFit) -> Table:
     """Return the numbers of each joint for Isaac Lab, MuJoCo Playground and others.
 
     Args:
         fit: Identified servos.
-        stiffness: Stiffness of each servo [N m/rad or N/m]; that of the fit if None.
     """
-    values = simulator_values(fit, stiffness)
-    units = _units(fit)
-    columns = [
-        Column(name.replace("_", " "), value, units[name])
-        for name, value in values.items()
-        if name != "integral_gain" or value.any()
-    ]
+    values = simulator_values(fit)
+    slides = fit.bodies is not None and not all(fit.bodies.model.robot.revolute)
+    columns = []
+    for name, value in values.items():
+        if name != "integral_gain" or value.any():
+            pair = dict.fromkeys(UNITS[name])
+            unit = " or ".join(pair) if slides else UNITS[name][0]
+            columns.append(Column(name.replace("_", " "), value, unit))
     remarks = []
     if (values["delay"] < 0).any():
         remarks.append(
-            "a negative delay means that positions "
-            "are stamped later than commands: use 0"
+            "a negative delay means that positions are stamped later than commands: "
+            "use 0"
         )
     if not fit.hold:
         remarks.append(
-            "the delay counts for interpolated commands: "
-            "held ones are later by half a step"
+            "the delay counts for interpolated commands: held ones are later by half a "
+            "step"
         )
     return Table(
         "actuators of simulators",
         Column("joint", fit.joint_names),
         *columns,
-        Column("stiffness from", _stiffness_sources(fit, stiffness)),
+        Column("stiffness from", _stiffness_sources(fit)),
         remarks=remarks,
     )
 
 
-def _units(fit: ServoFit) -> dict[str, str]:
-    """Return the units of `simulator_values`; both kinds if some joint may slide."""
-    if fit.bodies is None or all(fit.bodies.model.robot.revolute):
-        return {name: unit for name, (unit, _) in UNITS.items()}
-    return {name: " or ".join(dict.fromkeys(pair)) for name, pair in UNITS.items()}
-
-
-def _stiffness_sources(fit: ServoFit, stiffness: Numbers | None) -> list[str]:
+def _stiffness_sources(fit: ServoFit) -> list[str]:
     """Return where the stiffness of each joint is from."""
-    is_given = np.zeros(len(fit.joint_names), bool)
-    for numbers in (stiffness, fit.given_stiffness):
-        if numbers is not None:
-            is_given |= np.isfinite(np.asarray(numbers, np.float64))
-    follows_from_weight = np.isfinite(fit.stiffness)
-    sources = np.where(follows_from_weight, "weight", "other joints")
-    return np.where(is_given, "given", sources).tolist()
+    sources = np.where(np.isfinite(fit.stiffness), "weight", "other joints")
+    if fit.given_stiffness is not None:
+        sources = np.where(np.isfinite(fit.given_stiffness), "given", sources)
+    return sources.tolist()
 
 
 def export_servo_mjcf(
     fit: ServoFit,
     path: str | Path,
     *,
-    stiffness: Numbers | None = None,
     samples: int = 0,
     seed: int = 0,
     timestep: float = 0.002,
@@ -187,7 +167,6 @@ def export_servo_mjcf(
     Args:
         fit: Identified servos of a robot whose bodies are known.
         path: Path of the file.
-        stiffness: Stiffness of each servo [N m/rad or N/m]; that of the fit if None.
         samples: Number of further files, `NAME_000.xml` …, drawn from the estimates'
             distribution.
         seed: Seed of the draws.
@@ -201,10 +180,12 @@ def export_servo_mjcf(
             "`fit` has no bodies: identify with `bodies`, or use `simulator_table`."
         )
     path = Path(path)
-    paths = [path, *(path.with_stem(f"{path.stem}_{k:03d}") for k in range(samples))]
+    paths = [path]
+    for k in range(samples):
+        paths.append(path.with_stem(f"{path.stem}_{k:03d}"))
     draws = [fit.parameters, *fit.samples(samples, seed)]
     for file, parameters in zip(paths, draws, strict=True):
-        values = simulator_values(fit, stiffness, parameters)
+        values = simulator_values(fit, parameters)
         write_text(file, _servo_mjcf(fit.bodies, fit.joint_names, values, timestep))
     return paths
 
@@ -230,8 +211,7 @@ def _servo_mjcf(
     actuators = root.find("actuator")
     actuators.clear()
     for k, name in enumerate(joint_names):
-        servo = {quantity: float(numbers[k]) for quantity, numbers in values.items()}
-        actuators.append(_actuator(name, servo))
+        actuators.append(_actuator(name, k, values))
     if values["integral_gain"].any():
         root.append(E.extension(E.plugin(plugin="mujoco.pid")))
     root.append(
@@ -243,22 +223,22 @@ def _servo_mjcf(
     return etree.tostring(root, pretty_print=True, encoding="unicode")
 
 
-def _actuator(joint: str, servo: dict[str, float]) -> Any:
+def _actuator(name: str, joint: int, values: dict[str, Joints]) -> Any:
     """Return the element of a joint's servo."""
-    gain = exact_text(servo["stiffness"])
-    if servo["integral_gain"] > 0.0:
-        integral_gain = exact_text(servo["integral_gain"])
+    gain = exact_text(values["stiffness"][joint])
+    integral_gain = values["integral_gain"][joint]
+    if integral_gain > 0.0:
         element: Any = E.plugin(
             E.config(key="kp", value=gain),
-            E.config(key="ki", value=integral_gain),
-            name=joint,
-            joint=joint,
+            E.config(key="ki", value=exact_text(integral_gain)),
+            name=name,
+            joint=name,
             plugin="mujoco.pid",
             actdim="1",
         )
     else:
-        element = E.position(name=joint, joint=joint, kp=gain)
-    limit = servo["effort_limit"]
+        element = E.position(name=name, joint=name, kp=gain)
+    limit = values["effort_limit"][joint]
     if np.isfinite(limit):
         element.set("forcerange", exact_text((-limit, limit)))
     return element

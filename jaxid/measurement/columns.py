@@ -11,7 +11,7 @@ from jaxid.errors import InputError
 from jaxid.robot.limits_and_drives import per_joint
 from jaxid.units import NM, RAD, Quantity, S, Unit
 
-from .log_files import LogTable, Selection, open_log_file
+from .log_files import Complaints, LogTable, Selection, open_log_file
 from .recording import positive_time
 
 Units = Unit | tuple[Unit, ...]
@@ -187,7 +187,7 @@ class Log:
         return self.columns.to_si(arrays["angles"], velocities, arrays["forces"])
 
     @property
-    def bad_rows(self) -> dict[int, str]:
+    def bad_rows(self) -> Complaints:
         """Complaints about rows that were read and are bad, by their positions."""
         complaints = {}
         for table in self.tables:
@@ -234,9 +234,8 @@ def open_log(
     tables = []
     for file_path, file_selections in selections.items():
         file = open_log_file(file_path, file_selections)
-        names = file.channels(file_selections)
         bad_rows = {} if is_lenient else None
-        tables.append(file.table(names, on_disk, bad_rows))
+        tables.append(file.table(file.channels(), on_disk, bad_rows))
     for table in tables:
         if table.rows != tables[0].rows:
             raise InputError(

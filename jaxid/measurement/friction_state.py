@@ -7,6 +7,7 @@ from jaxid.dynamics.terms import Presliding
 
 from .observations import Observations
 from .samples import AbstractSamples, SamplesInMemory, joined
+from .time_grid import Ranges
 
 PART_SIZE = 16384
 """Samples after which the state is kept, for reading parts of a log."""
@@ -17,35 +18,40 @@ class SamplesWithMemory(AbstractSamples):
 
     source: AbstractSamples  # the samples
     law: Presliding  # law of the state
-    # half-open ranges of samples without gaps; each starts as in steady motion
-    segments: tuple[tuple[int, int], ...]
+    segments: Ranges  # samples without gaps; each starts as in steady motion
     # states at some samples, the first ones of all segments among them
-    starts: dict[int, np.ndarray]
+    states: dict[int, np.ndarray]
 
-    def __init__(self, source, law, segments):
-        self.source = source
-        self.law = law
-        self.segments = segments
-        self.starts = {}
+    @classmethod
+    def of(
+        cls, source: AbstractSamples, law: Presliding, segments: Ranges
+    ) -> "SamplesWithMemory":
+        """Find the states at the first samples of the parts of all segments."""
+        states = {}
         for a, b in segments:
             motion, _ = source.read(slice(a, a + 1))
-            self.starts[a] = np.asarray(law.settled(motion.qd[0]))
+            state = np.asarray(law.settled(motion.qd[0]))
             for start in range(a, b, PART_SIZE):
-                stop = min(start + PART_SIZE, b)
-                motion, _ = self.read(slice(start, min(stop + 1, b)))
-                self.starts[stop] = np.asarray(motion.state)[-1]
+                states[start] = state
+                motion, _ = source.read(slice(start, min(start + PART_SIZE + 1, b)))
+                state = _follow(law, motion, state)[-1]
+        return cls(source, law, segments, states)
 
     def read(self, samples):  # noqa: D102
-        start = max(k for k in self.starts if k <= samples.start)
+        start = max(k for k in self.states if k <= samples.start)
         motion, forces = self.source.read(slice(start, samples.stop))
-        q = np.asarray(motion.q, np.float64)
-        state = self.law.states(q, self.starts[start])
+        state = _follow(self.law, motion, self.states[start])
         motion = Motion(motion.q, motion.qd, motion.qdd, state)
         part = slice(samples.start - start, None, samples.step)
         return motion[part], forces[part]
 
     def read_all(self):  # noqa: D102
         return joined(self.read(slice(a, b)) for a, b in self.segments)
+
+
+def _follow(law: Presliding, motion: Motion, state: np.ndarray) -> np.ndarray:
+    """Return the states along a motion that begins in a state."""
+    return np.asarray(law.states(np.asarray(motion.q, np.float64), state))
 
 
 def with_memory(observations: Observations, law: Presliding | None) -> Observations:
@@ -55,7 +61,7 @@ def with_memory(observations: Observations, law: Presliding | None) -> Observati
     samples = observations.source
     if isinstance(samples, SamplesWithMemory):
         samples = samples.source
-    source = SamplesWithMemory(samples, law, observations.segments)
+    source = SamplesWithMemory.of(samples, law, observations.segments)
     if isinstance(samples, SamplesInMemory):
         source = SamplesInMemory(*source.read_all())
     return observations.replace(source=source)

@@ -9,7 +9,14 @@ import equinox as eqx
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxid.arrays import AnyArray, Bool, Float, Numbers, namespace
+from jaxid.arrays import (
+    AnyArray,
+    Bool,
+    Float,
+    JointSamples,
+    Numbers,
+    namespace,
+)
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
 from jaxid.robot.limits_and_drives import per_joint
@@ -26,6 +33,7 @@ from .recording import (
 from .samples import (
     AbstractSamples,
     Chunk,
+    MotionAndForces,
     Overlap,
     SamplesInMemory,
     joined,
@@ -151,7 +159,7 @@ class Observations(eqx.Module):
         return self.source.read_all()[0]
 
     @property
-    def forces(self) -> Float[AnyArray, "samples joints"]:
+    def forces(self) -> JointSamples:
         """Generalised forces of all samples, not filtered [N m or N]."""
         return self.source.read_all()[1]
 
@@ -208,7 +216,7 @@ class Observations(eqx.Module):
             parts.append(start + self.sample_time * (np.asarray(indices) - a))
         return np.concatenate(parts)
 
-    def read(self, samples: slice) -> tuple[Motion, Float[AnyArray, "samples joints"]]:
+    def read(self, samples: slice) -> MotionAndForces:
         """Return motion and forces of some samples of one segment."""
         return self.source.read(samples)
 

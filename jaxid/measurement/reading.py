@@ -8,14 +8,13 @@ import equinox as eqx
 import numpy as np
 
 from jaxid.arrays import Numbers
-from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
 from jaxid.result_table import printable
 from jaxid.robot.robot import Robot
 
 from .columns import Channels, Columns, Log, open_log
 from .filters import AbstractDecimation, AbstractFilter
-from .log_files import LogTable
+from .log_files import Complaints, LogTable
 from .observations import Observations, Progress, prepare
 from .recording import Recording, consecutive
 from .samples import AbstractSamples, joined, joint_side
@@ -93,7 +92,7 @@ def read_recording(
     return dataclasses.replace(recording, notes=(*notes, *recording.notes))
 
 
-def _bad_row_note(complaints: dict[int, str], rows: int, max_share: float) -> str:
+def _bad_row_note(complaints: Complaints, rows: int, max_share: float) -> str:
     """Return a remark about the rows that are left out; refuse too many of them."""
     count = len(complaints)
     texts = [text for _, text in sorted(complaints.items())]
@@ -110,8 +109,8 @@ def _bad_row_note(complaints: dict[int, str], rows: int, max_share: float) -> st
 
 
 def _stray_stamps(
-    stamps: np.ndarray, complaints: dict[int, str], table: LogTable
-) -> dict[int, str]:
+    stamps: np.ndarray, complaints: Complaints, table: LogTable
+) -> Complaints:
     """Return complaints about rows whose stamp alone is out of order."""
     good_rows = np.setdiff1d(np.arange(len(stamps)), [*complaints])
     good_stamps = stamps[good_rows]
@@ -141,27 +140,25 @@ class SamplesOnDisk(AbstractSamples):
     first_rows: tuple[int, ...] = eqx.field(static=True)
     sample_time: float = eqx.field(static=True)
 
-    def read(self, samples: slice) -> tuple[Motion, np.ndarray]:
-        """Return motion and forces of some samples of one segment, joint side."""
-        segment = self.segments[self._segment(samples)]
+    def read(self, samples):  # noqa: D102
+        segment_start, segment_stop = self.segments[self._segment(samples)]
         # With the neighbours that the filter needs.
-        start = max(segment[0], samples.start - self.overlap)
-        stop = min(segment[1], samples.stop + self.overlap)
+        start = max(segment_start, samples.start - self.overlap)
+        stop = min(segment_stop, samples.stop + self.overlap)
         rows = self.read_rows(slice(start, stop))
         q, qd, forces = joint_side(self.robot, self.log.columns, *rows)
         motion = self.filter.motion(q, qd, self.sample_time)
-        part = slice(samples.start - start, samples.stop - start, samples.step)
+        first = samples.start - start
+        part = slice(first, samples.stop - start, samples.step)
         return motion[part], forces[part]
 
-    def read_all(self) -> tuple[Motion, np.ndarray]:
-        """Return motion and forces of all segments; they must fit into memory."""
+    def read_all(self):  # noqa: D102
         return joined(self.read(slice(a, b)) for a, b in self.segments)
 
     def read_rows(self, samples: slice) -> Channels:
         """Return angles, velocities and forces of a segment's samples as recorded."""
         k = self._segment(samples)
-        segment_start, _ = self.segments[k]
-        shift = self.first_rows[k] - segment_start
+        shift = self.first_rows[k] - self.segments[k][0]
         return self.log.read(samples.start + shift, samples.stop + shift)
 
     def _segment(self, samples: slice) -> int:

@@ -10,9 +10,10 @@ import equinox as eqx
 import jax
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.integrate import cumulative_trapezoid
 from scipy.interpolate import CubicSpline
 
-from jaxid.arrays import AnyArray, Float
+from jaxid.arrays import AnyArray, Float, JointSamples
 from jaxid.errors import InputError
 
 from .time_grid import MIN_SAMPLES, Ranges, TimeGrid, resampling
@@ -46,9 +47,9 @@ class Recording(eqx.Module):
     """
 
     time: Float[AnyArray, " samples"]
-    angles: Float[AnyArray, "samples joints"]
-    forces: Float[AnyArray, "samples joints"]
-    velocities: Float[AnyArray, "samples joints"] | None
+    angles: JointSamples
+    forces: JointSamples
+    velocities: JointSamples | None
     angles_on_motor_side: bool = eqx.field(static=True)
     forces_on_motor_side: bool = eqx.field(static=True)
     segments: Ranges = eqx.field(static=True)
@@ -250,13 +251,12 @@ def unlike_derivatives(recording: Recording) -> dict[int, float]:
     for a, b in recording.segments:
         q = np.asarray(recording.angles)[a:b]
         qd = np.asarray(recording.velocities)[a:b]
-        mean_qd = 0.5 * (qd[1:] + qd[:-1])
-        integral = dt * np.cumsum(mean_qd, axis=0)
-        integral = np.concatenate([np.zeros_like(q[:1]), integral])
+        integral = cumulative_trapezoid(qd, dx=dt, axis=0, initial=0.0)
         way = q[steps:] - q[:-steps]
         expected_way = integral[steps:] - integral[:-steps]
         error = way - expected_way
         noise = np.diff(q, 2, axis=0)
+
         errors += np.sum(error**2, axis=0)
         ways += np.sum(way**2, axis=0)
         noises += np.sum(noise**2, axis=0)

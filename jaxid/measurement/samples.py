@@ -10,20 +10,25 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from jaxid.arrays import AnyArray, Float
+from jaxid.arrays import AnyArray, JointSamples
 from jaxid.dynamics.motion import Motion
 from jaxid.robot.robot import Robot
+
+from .time_grid import Range
+
+MotionAndForces = tuple[Motion, JointSamples]
+"""Motion, and forces [N m or N], at the same samples."""
 
 
 class AbstractSamples(eqx.Module):
     """Motion and forces at the full rate, joint side, in memory or on disk."""
 
     @abc.abstractmethod
-    def read(self, samples: slice) -> tuple[Motion, Float[AnyArray, "samples joints"]]:
+    def read(self, samples: slice) -> MotionAndForces:
         """Return motion and forces of some samples of one segment."""
 
     @abc.abstractmethod
-    def read_all(self) -> tuple[Motion, Float[AnyArray, "samples joints"]]:
+    def read_all(self) -> MotionAndForces:
         """Return motion and forces of all segments."""
 
 
@@ -31,7 +36,7 @@ class SamplesInMemory(AbstractSamples):
     """Filtered motion and unfiltered forces [N m or N] as arrays."""
 
     motion: Motion
-    forces: Float[AnyArray, "samples joints"]
+    forces: JointSamples
 
     def read(self, samples):  # noqa: D102
         return self.motion[samples], np.asarray(self.forces)[samples]
@@ -44,8 +49,8 @@ class Chunk(NamedTuple):
     """Part of the observations whose columns fit into memory."""
 
     # half-open range of samples whose columns are needed (rows and overlap)
-    samples: tuple[int, int]
-    rows: tuple[int, int]  # half-open range of the resulting rows
+    samples: Range
+    rows: Range  # half-open range of the resulting rows
     # function that turns columns at these samples into these rows
     reduce: Callable[[AnyArray], np.ndarray]
 
@@ -60,10 +65,10 @@ class Overlap(NamedTuple):
 
     def chunk(
         self,
-        segment: tuple[int, int],
+        segment: Range,
         first_row: int,
-        rows: tuple[int, int],
-        reduce: Callable[[slice, slice, AnyArray], Any],
+        rows: Range,
+        reduce: Callable[..., Any],
     ) -> Chunk:
         """Return the part of a segment for some rows.
 
@@ -79,16 +84,17 @@ class Overlap(NamedTuple):
         # Decimation keeps its phase: its first input sample is a row.
         extra_rows = math.ceil(self.decimation / self.factor)
         input_row = max(0, start - extra_rows)
+        outputs = slice(start - input_row, stop - input_row)
 
         first_sample = segment[0] + self.edge
-        last_sample = first_sample + (stop - 1) * self.factor
         low = first_sample + input_row * self.factor
-        high = min(segment[1] - self.edge, last_sample + self.decimation + 1)
+        last_sample = first_sample + (stop - 1) * self.factor
+        end_sample = segment[1] - self.edge
+        high = min(end_sample, last_sample + self.decimation + 1)
+
         begin = max(segment[0], low - self.smoothing)
         end = min(segment[1], high + self.smoothing)
-
         inputs = slice(low - begin, high - begin)
-        outputs = slice(start - input_row, stop - input_row)
         return Chunk((begin, end), rows, functools.partial(reduce, inputs, outputs))
 
 
@@ -103,7 +109,7 @@ def joint_side(
     angles: AnyArray,
     velocities: AnyArray | None,
     forces: AnyArray,
-) -> tuple[Any, ...]:
+) -> Any:
     """Convert angles, velocities and forces to the joints' side.
 
     `log` is a recording, or `Columns`.

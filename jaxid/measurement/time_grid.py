@@ -71,25 +71,12 @@ class TimeGrid(NamedTuple):
 
 
 class StepStatistics(NamedTuple):
-    """Time from one row to the next, as the first part of a log has it."""
+    """Time from one row to the next, as the first part of a log has it [s]."""
 
-    origin: float  # first stamp [s]
-    median: float  # [s]
-    deviation: float  # robust standard deviation [s]
-
-    def gap_limit(self, limits: tuple[float, float]) -> float:
-        """Return the longest pause that is no gap [s].
-
-        A gap is a pause that neither the limits, in sample times and in seconds, nor
-        the jitter explain.
-        """
-        longest_step = self.median + 8.0 * self.deviation
-        return max(limits[0] * self.median, limits[1], longest_step)
-
-    @property
-    def largest_regular(self) -> float:
-        """Longest step at which no row is missing [s]."""
-        return 1.5 * self.median + 8.0 * self.deviation
+    origin: float  # first stamp
+    median: float
+    max_regular: float  # longest step at which no row is missing
+    max_pause: float  # longest pause that is no gap
 
 
 class Stretches(NamedTuple):
@@ -123,8 +110,8 @@ def find_grid(
     are bridged, in sample times and in seconds. Where `in_parts`, the log is too large
     to move or remove rows.
     """
-    statistics = _step_statistics(next(iter(read())), source)
-    stretches = _find_stretches(read(), source, statistics, limits, first_row, in_parts)
+    statistics = _step_statistics(next(iter(read())), source, limits)
+    stretches = _find_stretches(read(), source, statistics, first_row, in_parts)
     sample_time = _round_time(stretches.sample_time, stretches.rows)
     segments = stretches.segments
     if not segments:
@@ -145,7 +132,9 @@ def find_grid(
     return grid
 
 
-def _step_statistics(stamps: np.ndarray, source: str) -> StepStatistics:
+def _step_statistics(
+    stamps: np.ndarray, source: str, limits: tuple[float, float]
+) -> StepStatistics:
     steps = np.diff(stamps)
     steps = steps[steps > 0]
     if not steps.size:
@@ -154,19 +143,20 @@ def _step_statistics(stamps: np.ndarray, source: str) -> StepStatistics:
         )
     median = float(np.median(steps))
     absolute_deviation = float(np.median(np.abs(steps - median)))
-    return StepStatistics(float(stamps[0]), median, 1.4826 * absolute_deviation)
+    jitter = 8.0 * (1.4826 * absolute_deviation)  # eight standard deviations
+    # A gap is a pause that neither the limits nor the jitter explain.
+    max_pause = max(limits[0] * median, limits[1], median + jitter)
+    return StepStatistics(float(stamps[0]), median, 1.5 * median + jitter, max_pause)
 
 
 def _find_stretches(
     parts: Iterable[np.ndarray],
     source: str,
     statistics: StepStatistics,
-    limits: tuple[float, float],
     first_row: int,
     in_parts: bool,
 ) -> Stretches:
     """Return the stretches between gaps, and refuse time that runs backwards."""
-    gap_limit = statistics.gap_limit(limits)
     starts = [0]
     start_times = [0.0]
     pauses = []
@@ -184,11 +174,11 @@ def _find_stretches(
                 f"rows of `{source}` repeat the time stamp of the row before, first "
                 f"at row {number}: remove them, or give `sample_time`."
             )
-        gaps = np.flatnonzero(steps > gap_limit)
+        gaps = np.flatnonzero(steps > statistics.max_pause)
         starts += (row + gaps + 1).tolist()
         start_times += t[gaps + 1].tolist()
         pauses += steps[gaps].tolist()
-        regular = steps[steps < statistics.largest_regular]
+        regular = steps[steps < statistics.max_regular]
         regular_time += float(regular.sum())
         regular_steps += len(regular)
         row += len(steps)

@@ -13,9 +13,9 @@ from jaxid.dynamics.terms import RigidBodies
 BODIES = (RigidBodies(),)
 GEOMETRIES = 7
 SAMPLES = 3
-# Eight structures of 1 to 8 joints, seven geometries of each: 56 trees, with branches,
+# Five structures of 1 to 8 joints, seven geometries of each: 35 trees, with branches,
 # several roots, and both kinds of joints.
-STRUCTURES = [(1, 11), (2, 13), (3, 14), (4, 38), (5, 23), (6, 22), (7, 31), (8, 12)]
+STRUCTURES = [(1, 11), (2, 13), (4, 38), (6, 22), (8, 12)]
 
 
 def _regressor(pinned: pin.Model, q, qd, qdd) -> np.ndarray:

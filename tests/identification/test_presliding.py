@@ -147,7 +147,7 @@ def test_parts_of_a_log_streams_and_the_whole_agree(filtered):
     )
     law = Presliding(LENGTHS)
     base = jid.base_parameters(model_of(law))
-    source = SamplesWithMemory(log.source, law, log.segments)
+    source = SamplesWithMemory.of(log.source, law, log.segments)
     whole = with_memory(log, law).motion.state
     for a, b, step in (
         (0, 5, 1),

@@ -30,7 +30,7 @@ FILTERS = [
     PaperFilter(),
     PeriodicFourier(PERIOD, 5),
     SavitzkyGolay(0.04),
-    SavitzkyGolay(0.1, order=4, margin=0.0),
+    SavitzkyGolay(0.1, order=4),
 ]
 every = pytest.mark.parametrize("filter", FILTERS, ids=lambda f: type(f).__name__)
 
@@ -273,7 +273,7 @@ def periodic(periods, harmonics):
         (lambda: ZeroPhaseButterworth(5.0, 2.5), "`order`"),
         (lambda: ZeroPhaseButterworth(1e-12).edge(DT), "`cutoff`"),
         (lambda: PaperFilter(10.0, 400.0).edge(0.01), "`acceleration`"),
-        (lambda: PeriodicFourier(np.inf, 5).edge(DT), "`force_harmonics / period`"),
+        (lambda: PeriodicFourier(np.inf, 5).edge(DT), "`10 harmonics / period`"),
         (lambda: PeriodicFourier(1.0, 2.5), "`harmonics`"),
         (lambda: SavitzkyGolay(0.0), "`window` of `SavitzkyGolay`"),
         (lambda: SavitzkyGolay(0.1, order=1), "`order`"),

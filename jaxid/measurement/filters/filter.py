@@ -7,14 +7,12 @@ forces and columns.
 """
 
 import abc
-import math
 from collections.abc import Callable
 from typing import Any, ClassVar
 
 import equinox as eqx
-import numpy as np
 
-from jaxid.arrays import AnyArray, Float
+from jaxid.arrays import AnyArray, Float, JointSamples
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
 
@@ -39,8 +37,8 @@ class AbstractFilter(eqx.Module):
     @abc.abstractmethod
     def motion(
         self,
-        angles: Float[np.ndarray, "samples joints"],
-        velocities: Float[np.ndarray, "samples joints"] | None,
+        angles: JointSamples,
+        velocities: JointSamples | None,
         sample_time: float,
     ) -> Motion:
         """Return the motion at all samples of a segment.
@@ -52,9 +50,12 @@ class AbstractFilter(eqx.Module):
     def low_pass(self, sample_time: float) -> AbstractLowPass:
         """Return the zero-phase filter of forces and columns."""
 
-    @abc.abstractmethod
     def edge(self, sample_time: float) -> int:
-        """Return the number of samples to drop at both ends, where filters settle."""
+        """Return the number of samples to drop at both ends, where filters settle.
+
+        By default they are those of the filter of forces and columns.
+        """
+        return self.low_pass(sample_time).memory(SETTLED)
 
     def memory(self, sample_time: float) -> int | None:
         """Return for how many samples the motion depends on an angle or velocity.
@@ -73,18 +74,6 @@ class AbstractFilter(eqx.Module):
         return self.low_pass(sample_time)(x)
 
 
-def settled_edge(
-    margin: float | None, sample_time: float, *low_passes: AbstractLowPass
-) -> int:
-    """Return the samples to drop at both ends.
-
-    They lie within `margin` [s], or are as many as all filters need to settle.
-    """
-    if margin is None:
-        return max(low_pass.memory(SETTLED) for low_pass in low_passes)
-    return round(margin / sample_time)
-
-
 def integer(name: str) -> Callable[[float | int], int]:
     """Return a converter that accepts integers only, as `int` or `float`."""
 
@@ -99,22 +88,16 @@ def integer(name: str) -> Callable[[float | int], int]:
 def require_positive(filter: AbstractFilter, *names: str) -> None:
     """Refuse settings that are not positive; None is allowed."""
     for name in names:
-        _require(filter, name, lambda x: x > 0, "positive")
-
-
-def require_margin(filter: AbstractFilter) -> None:
-    """Refuse a margin that is no time; None is allowed."""
-    words = "a time [s] of zero or more"
-    _require(filter, "margin", lambda x: 0 <= x < math.inf, words)
+        require(filter, name, lambda x: x > 0, "positive")
 
 
 def require_order(filter: AbstractFilter, min_order: int = 1) -> None:
     """Refuse an order that no filter has in practice."""
     words = f"between {min_order} and 20 (2 to 8 are usual)"
-    _require(filter, "order", lambda x: min_order <= x <= 20, words)
+    require(filter, "order", lambda x: min_order <= x <= 20, words)
 
 
-def _require(
+def require(
     filter: AbstractFilter, name: str, is_valid: Callable[[float], bool], words: str
 ) -> None:
     """Refuse a setting that is neither None nor valid."""

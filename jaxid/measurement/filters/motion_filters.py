@@ -17,10 +17,9 @@ from .filter import (
     MOTION_TAIL,
     AbstractFilter,
     integer,
-    require_margin,
+    require,
     require_order,
     require_positive,
-    settled_edge,
 )
 from .low_pass import (
     SETTLED,
@@ -34,6 +33,10 @@ from .low_pass import (
 
 MAX_SERIES_ERROR = 0.05
 """Largest error of a Fourier series, relative to the motion (RMS)."""
+FORCE_BAND = 10
+"""Cut-off of the forces of a periodic motion, over its highest harmonic."""
+FORCE_ORDER = 4
+"""Order of that filter, of one direction."""
 MAX_WINDOW = 10**5
 """Samples of the longest window."""
 
@@ -64,7 +67,8 @@ class ZeroPhaseButterworth(AbstractFilter):
     def __check_init__(self) -> None:
         require_positive(self, "cutoff", "force_cutoff")
         require_order(self)
-        require_margin(self)
+        words = "a time [s] of zero or more"
+        require(self, "margin", lambda x: 0 <= x < math.inf, words)
 
     def motion(self, angles, velocities, sample_time):  # noqa: D102
         smooth = butterworth(self.cutoff, self.order, sample_time)
@@ -89,10 +93,10 @@ class ZeroPhaseButterworth(AbstractFilter):
         return smooth.memory(MOTION_TAIL) + DIFFERENCE_SAMPLES
 
     def edge(self, sample_time):  # noqa: D102
+        if self.margin is not None:
+            return round(self.margin / sample_time)
         motion = butterworth(self.cutoff, self.order, sample_time)
-        return settled_edge(
-            self.margin, sample_time, motion, self.low_pass(sample_time)
-        )
+        return max(motion.memory(SETTLED), super().edge(sample_time))
 
 
 class SavitzkyGolay(AbstractFilter):
@@ -107,18 +111,14 @@ class SavitzkyGolay(AbstractFilter):
     Attributes:
         window: Duration of the window [s], like `0.1`.
         order: Degree of the polynomial.
-        margin: Time to drop at both ends of a segment [s], like `0.1`; half of the
-            window if None.
     """
 
     window: float = eqx.field(static=True, converter=float)
     order: int = eqx.field(static=True, converter=integer("order"), default=3)
-    margin: float | None = eqx.field(static=True, converter=optional, default=None)
 
     def __check_init__(self) -> None:
         require_positive(self, "window")
         require_order(self, min_order=2)  # a lower one has no second derivative
-        require_margin(self)
 
     def motion(self, angles, velocities, sample_time):  # noqa: D102
         # From the first sample on, so that a joint at rest stays exactly at rest.
@@ -134,9 +134,6 @@ class SavitzkyGolay(AbstractFilter):
 
     def low_pass(self, sample_time):  # noqa: D102
         return weighted_mean(self._kernel(0, sample_time), sample_time)
-
-    def edge(self, sample_time):  # noqa: D102
-        return settled_edge(self.margin, sample_time, self.low_pass(sample_time))
 
     def _derivative(self, x: np.ndarray, times: int, sample_time: float) -> np.ndarray:
         return correlate(x, self._kernel(times, sample_time))
@@ -185,18 +182,14 @@ class PaperFilter(AbstractFilter):
     Attributes:
         velocity: Cut-off of the velocities [rad/s].
         acceleration: Cut-off of accelerations, forces and columns [rad/s].
-        margin: Time to drop at both ends of a segment [s], like `0.1`; until the filter
-            has settled if None.
     """
 
     uses_velocities: ClassVar[bool] = False
     velocity: float = eqx.field(static=True, converter=float, default=1200.0)
     acceleration: float = eqx.field(static=True, converter=float, default=100.0)
-    margin: float | None = eqx.field(static=True, converter=optional, default=None)
 
     def __check_init__(self) -> None:
         require_positive(self, "velocity", "acceleration")
-        require_margin(self)
 
     def motion(self, angles, velocities, sample_time):  # noqa: D102
         path = angles - angles[0]
@@ -217,9 +210,7 @@ class PaperFilter(AbstractFilter):
 
     def edge(self, sample_time):  # noqa: D102
         motion = _first_order("velocity", self.velocity, sample_time)
-        return settled_edge(
-            self.margin, sample_time, motion, self.low_pass(sample_time)
-        )
+        return max(motion.memory(SETTLED), super().edge(sample_time))
 
 
 class PeriodicFourier(AbstractFilter):
@@ -228,34 +219,21 @@ class PeriodicFourier(AbstractFilter):
     Each segment has a series of its own, by least squares over all of its samples,
     which must span at least one period. Forces and columns are not averaged over the
     periods: least squares do that, and the scatter between the periods tells the
-    uncertainty. They are filtered by a zero-phase Butterworth low-pass. Measured
-    velocities are not used.
+    uncertainty. They are filtered by a zero-phase Butterworth low-pass at ten times the
+    highest harmonic. Measured velocities are not used.
 
     Attributes:
         period: Period of the motion [s], like `10.0`.
         harmonics: Number of harmonics, like `5`; that of the planned trajectory or a
             few more.
-        force_harmonics: Cut-off of forces and columns, in harmonics, like `50`; ten
-            times `harmonics` if None, infinite if decimation alone shall limit their
-            band.
-        order: Order of the low-pass, of one direction.
-        margin: Time to drop at both ends of a segment [s], like `0.1`; until the filter
-            has settled if None.
     """
 
     uses_velocities: ClassVar[bool] = False
     period: float = eqx.field(static=True, converter=float)
     harmonics: int = eqx.field(static=True, converter=integer("harmonics"))
-    force_harmonics: float | None = eqx.field(
-        static=True, converter=optional, default=None
-    )
-    order: int = eqx.field(static=True, converter=integer("order"), default=4)
-    margin: float | None = eqx.field(static=True, converter=optional, default=None)
 
     def __check_init__(self) -> None:
-        require_positive(self, "period", "harmonics", "force_harmonics")
-        require_order(self)
-        require_margin(self)
+        require_positive(self, "period", "harmonics")
 
     def motion(self, angles, velocities, sample_time):  # noqa: D102
         t = sample_time * np.arange(len(angles))
@@ -283,17 +261,12 @@ class PeriodicFourier(AbstractFilter):
         return Motion(q, qd, qdd)
 
     def low_pass(self, sample_time):  # noqa: D102
-        harmonics = self.force_harmonics
-        if harmonics is None:
-            harmonics = 10.0 * self.harmonics
-        name = "force_harmonics / period"
-        return butterworth(harmonics / self.period, self.order, sample_time, name)
+        cutoff = FORCE_BAND * self.harmonics / self.period
+        name = f"{FORCE_BAND} harmonics / period"
+        return butterworth(cutoff, FORCE_ORDER, sample_time, name)
 
     def memory(self, sample_time):  # noqa: D102
         return None
-
-    def edge(self, sample_time):  # noqa: D102
-        return settled_edge(self.margin, sample_time, self.low_pass(sample_time))
 
 
 def _require_series(angles: np.ndarray, q: np.ndarray) -> None:
@@ -344,13 +317,13 @@ def second_difference(x: np.ndarray, sample_time: float) -> np.ndarray:
 
     Next to the ends they are of second order.
     """
-    d = np.empty_like(x)
-    d[1:-1] = (x[2:] - 2 * x[1:-1] + x[:-2]) / sample_time**2
-
-    middle = x[2:-2]
     nearest = x[3:-1] + x[1:-3]
     second_nearest = x[4:] + x[:-4]
+    middle = x[2:-2]
     difference = 16 * nearest - second_nearest - 30 * middle
+
+    d = np.empty_like(x)
+    d[1:-1] = np.diff(x, 2, axis=0) / sample_time**2
     d[2:-2] = difference / (12 * sample_time**2)
     d[0] = d[1]
     d[-1] = d[-2]

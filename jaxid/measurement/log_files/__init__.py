@@ -5,7 +5,7 @@ from .log_file import (
     Selection as Selection,
     Selections as Selections,
 )
-from .log_table import LogTable as LogTable
+from .log_table import Complaints as Complaints, LogTable as LogTable
 from .readers import (
     READERS as READERS,
     estimated_rows as estimated_rows,

@@ -14,16 +14,19 @@ from jaxid.io import import_extra
 from .log_file import AbstractLogFile
 from .log_table import LogTable, readable
 
+Arrays = dict[str, np.ndarray]
+"""Arrays by name."""
+
 
 class AbstractArrayFile(AbstractLogFile):
     """File of arrays (samples, or samples x joints); columns have names like `q[0]`."""
 
     @abc.abstractmethod
-    def load(self) -> dict[str, np.ndarray]:
+    def load(self) -> Arrays:
         """Return the arrays of the file by their names."""
 
     @functools.cached_property
-    def arrays(self) -> dict[str, np.ndarray]:
+    def arrays(self) -> Arrays:
         """Arrays of the file, and the columns of matrices."""
         arrays = self.load()
         columns = {}
@@ -46,7 +49,18 @@ class NpzFile(AbstractArrayFile):
     """NPZ file of NumPy; arrays that are not compressed stay on the disk."""
 
     def load(self):  # noqa: D102
-        return map_arrays(self.path) or read_npz(self.path)
+        arrays = map_arrays(self.path)
+        if arrays:
+            return arrays
+        # Objects, which could run code, are rejected.
+        kind = "NPZ file of plain arrays (`numpy.savez`, without objects)"
+        with (
+            readable(self.path.name, kind),
+            self.path.open("rb") as file,
+            np.load(file) as archive,
+        ):
+            # A member that NumPy did not write comes as bytes, which are left out.
+            return _named_arrays({name: archive[name] for name in archive.files})
 
     def estimated_rows(self):  # noqa: D102
         arrays = map_arrays(self.path) or {}
@@ -57,7 +71,18 @@ class MatFile(AbstractArrayFile):
     """MAT file of MATLAB, of any version."""
 
     def load(self):  # noqa: D102
-        return read_mat(self.path)
+        from scipy.io import loadmat
+
+        with self.path.open("rb") as file:
+            head = file.read(516)
+        if b"\x89HDF" in head:
+            # Version 7.3 is HDF5, in which the arrays are transposed.
+            arrays = read_hdf5(self.path)
+            return _named_arrays({name: array.T for name, array in arrays.items()})
+        with readable(self.path.name, "MAT file"):
+            content = loadmat(self.path, simplify_cells=True)
+        variables = {name: x for name, x in content.items() if name[:2] != "__"}
+        return _named_arrays(variables)
 
 
 class Hdf5File(AbstractArrayFile):
@@ -67,23 +92,7 @@ class Hdf5File(AbstractArrayFile):
         return read_hdf5(self.path)
 
 
-def read_mat(path: Path) -> dict[str, np.ndarray]:
-    """Read the arrays of a MAT file of any version."""
-    from scipy.io import loadmat
-
-    with path.open("rb") as file:
-        head = file.read(516)
-    if b"\x89HDF" in head:
-        # Version 7.3 is HDF5, in which the arrays are transposed.
-        transposed = {name: array.T for name, array in read_hdf5(path).items()}
-        return _named_arrays(transposed)
-    with readable(path.name, "MAT file"):
-        content = loadmat(path, simplify_cells=True)
-    variables = {name: x for name, x in content.items() if not name.startswith("__")}
-    return _named_arrays(variables)
-
-
-def read_hdf5(path: Path) -> dict[str, np.ndarray]:
+def read_hdf5(path: Path) -> Arrays:
     """Read the arrays of an HDF5 file, without images.
 
     Those in a group are named like `log.q`.
@@ -93,11 +102,9 @@ def read_hdf5(path: Path) -> dict[str, np.ndarray]:
         return _named_arrays(file)
 
 
-def _named_arrays(
-    content: Mapping[str, Any], prefix: str = ""
-) -> dict[str, np.ndarray]:
+def _named_arrays(content: Mapping[str, Any], prefix: str = "") -> Arrays:
     """Return arrays by name; those in a structure are named like `log.q`."""
-    arrays: dict[str, np.ndarray] = {}
+    arrays: Arrays = {}
     for key, value in content.items():
         name = prefix + key
         if isinstance(value, Mapping):
@@ -116,15 +123,7 @@ def is_hdf5_array(value: Any) -> bool:
     return dimensions in (1, 2) and value.dtype.itemsize > 1
 
 
-def read_npz(path: Path) -> dict[str, np.ndarray]:
-    """Read the arrays of an NPZ file; objects, which could run code, are rejected."""
-    kind = "NPZ file of plain arrays (`numpy.savez`, without objects)"
-    with readable(path.name, kind), path.open("rb") as file, np.load(file) as archive:
-        # A member that NumPy did not write comes as bytes, which are left out.
-        return _named_arrays({name: archive[name] for name in archive.files})
-
-
-def map_arrays(path: Path) -> dict[str, np.ndarray] | None:
+def map_arrays(path: Path) -> Arrays | None:
     """Map an NPZ file's arrays into memory; None if one cannot be, or there is none."""
     arrays = {}
     with (

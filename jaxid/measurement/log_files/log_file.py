@@ -58,10 +58,10 @@ class AbstractLogFile(abc.ABC):
         """Estimate the number of rows; 0 if they cannot be read in parts."""
         return 0
 
-    def channels(self, selections: Selections) -> Channels:
+    def channels(self) -> Channels:
         """Return the names of each channel's columns, none of them for two channels."""
         channels = {}
-        for channel, selection in selections.items():
+        for channel, selection in self.selections.items():
             channels[channel] = self._selected_names(channel, selection)
         names = [*itertools.chain(*channels.values())]
         repeated = [name for name in names if names.count(name) > 1]

@@ -14,7 +14,9 @@ from jaxid.errors import InputError
 
 from ..recording import MAX_NUMBER
 
-BadRows = dict[int, str] | None
+Complaints = dict[int, str]
+"""Complaints about rows, by their numbers."""
+BadRows = Complaints | None
 """Complaints about unreadable rows, by row number; None if each is an error."""
 
 

@@ -19,7 +19,7 @@ import polars as pl
 from jaxid.errors import InputError
 
 from .log_file import AbstractLogFile
-from .log_table import BadRows, LogTable, readable
+from .log_table import BadRows, Complaints, LogTable, readable
 
 HEAD_SIZE = 65536
 """Bytes from which the format is detected."""
@@ -54,7 +54,7 @@ class TextFormat(NamedTuple):
             frame = frame.select(pl.all().str.replace(",", ".", literal=True))
         return frame.to_dict(as_series=True)
 
-    def bad_lines(self, block: bytes) -> dict[int, str]:
+    def bad_lines(self, block: bytes) -> Complaints:
         """Return complaints about lines that are no rows, by their positions."""
         separator = self.separator.encode()
         columns = len(self.names)
