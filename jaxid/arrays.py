@@ -31,6 +31,27 @@ from jaxid.errors import InputError
 AnyArray = jax.Array | np.ndarray
 """A JAX array, or a NumPy array: NumPy's values stay constants when JAX traces."""
 
+Vector = Float[np.ndarray, " _"]
+"""NumPy array of one axis."""
+
+Matrix = Float[np.ndarray, "_ _"]
+"""NumPy array of two axes."""
+
+Matrices = list[np.ndarray]
+"""One matrix for each joint, with columns of its own."""
+
+BaseVector = Float[np.ndarray, " base"]
+"""One number for each base parameter."""
+
+BaseMatrix = Float[np.ndarray, "base base"]
+"""One number for each pair of base parameters, like a covariance."""
+
+Indices = tuple[int, ...]
+"""Places in a list, like those of some base parameters."""
+
+Texts = tuple[str, ...]
+"""Names or sentences."""
+
 Joints = Float[AnyArray, " joints"]
 """One number for each joint."""
 

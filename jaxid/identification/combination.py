@@ -14,6 +14,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from jaxid.arrays import BaseMatrix, BaseVector, Vector
 from jaxid.errors import InputError
 
 from .estimators import GivenWeights, WeightedLeastSquares
@@ -78,7 +79,7 @@ def replace_estimates(fit: Fit, parameters, uncertainty: Uncertainty) -> Fit:
     )
 
 
-def combine(fits: Sequence[Fit], maps, offsets=None) -> tuple[np.ndarray, Uncertainty]:
+def combine(fits: Sequence[Fit], maps, offsets=None) -> tuple[Vector, Uncertainty]:
     """Estimate common unknowns from factors of several fits by least squares (Eq. 33).
 
     The base parameters of each fit are its map [base, unknowns] times the unknowns,
@@ -121,7 +122,7 @@ def combine(fits: Sequence[Fit], maps, offsets=None) -> tuple[np.ndarray, Uncert
     return decomposition.solve(), Uncertainty(covariance, total_dof, covariance)
 
 
-def _finite_covariance(fit: Fit) -> tuple[np.ndarray, np.ndarray]:
+def _finite_covariance(fit: Fit) -> tuple[BaseMatrix, BaseVector]:
     """Return the covariance of a fit's estimates and degrees of freedom.
 
     A fit that does not determine everything has no variance of some estimates. The
@@ -185,11 +186,11 @@ def share_rows(first: Blocks, second: Blocks) -> bool:
     return count >= max(1, min(2, len(first_norms), len(second_norms)))
 
 
-def _are_equal(first: np.ndarray, second: np.ndarray) -> bool:
+def _are_equal(first: Vector, second: Vector) -> bool:
     return first.shape == second.shape and np.abs(first - second).max() <= 1e-9
 
 
-def _column_norms(blocks: Blocks) -> list[np.ndarray]:
+def _column_norms(blocks: Blocks) -> list[Vector]:
     """Return each block's rows and norms, relative to the joint's largest."""
     block_norms = []
     for part in blocks.parts:

@@ -16,13 +16,17 @@ from typing import NamedTuple
 import equinox as eqx
 import numpy as np
 
-from jaxid.arrays import AnyArray, Float
+from jaxid.arrays import AnyArray, BaseVector, Float, Indices, Joints, Matrices, Matrix
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.motion import Motion
 from jaxid.measurement.observations import Observations
 
-Columns = Sequence[tuple[int, ...]]
+Columns = Sequence[Indices]
 """Indices of the base parameters that can act on each joint."""
+
+
+LinearSystem = tuple[Matrix, BaseVector]
+"""Matrix and right-hand side of linear equations of the base parameters."""
 
 
 class RowChunk(NamedTuple):
@@ -32,9 +36,9 @@ class RowChunk(NamedTuple):
     block: int  # index of the block of time, counted over all recordings
     rows: slice  # range of the recording's rows
     indices: Columns  # base parameters that can act on each joint
-    columns: list[np.ndarray]  # columns of each joint [rows, indices of the joint]
+    columns: Matrices  # columns of each joint [rows, indices of the joint]
     # measured forces less those of a known tool [rows, joints], in [N m] or [N]
-    forces: np.ndarray
+    forces: Matrix
     mask: np.ndarray  # rows that count for each joint [rows, joints]
 
     def part(self, rows: slice) -> "RowChunk":
@@ -53,7 +57,7 @@ class RowChunk(NamedTuple):
         for block, rows in divide_rows(edges, self.rows):
             yield self.part(rows)._replace(block=self.block + block)
 
-    def residuals(self, p: np.ndarray) -> Float[np.ndarray, "rows joints"]:
+    def residuals(self, p: BaseVector) -> Matrix:
         """Return measured less predicted forces [N m or N]."""
         predicted_forces = [
             theta @ p[list(indices)]
@@ -61,7 +65,7 @@ class RowChunk(NamedTuple):
         ]
         return self.forces - np.stack(predicted_forces, axis=1)
 
-    def equations(self) -> list[np.ndarray]:
+    def equations(self) -> Matrices:
         """Return the rows `[columns, force]` of each joint that count."""
         joints = zip(self.columns, self.forces.T, self.mask.T, strict=True)
         return [np.column_stack([theta, force])[mask] for theta, force, mask in joints]
@@ -106,7 +110,7 @@ def row_chunks(
         )
 
 
-def without_tool(base: BaseParameters, motion: Motion, forces: AnyArray) -> np.ndarray:
+def without_tool(base: BaseParameters, motion: Motion, forces: AnyArray) -> Matrix:
     """Return measured forces less those of a known tool [N m or N]."""
     forces = np.asarray(forces)
     if base.model.robot.tool is None:
@@ -127,7 +131,7 @@ class JointFactor(eqx.Module):
     r"""The R factor of $[\Theta_j \; Q_j]$, the rows of one joint and their forces."""
 
     # base parameters that can act on the joint
-    columns: tuple[int, ...] = eqx.field(static=True)
+    columns: Indices = eqx.field(static=True)
     # upper triangle, or fewer rows; its last column belongs to the forces
     R: Float[AnyArray, "height width"]
     rows: int = eqx.field(static=True)  # number of rows that were reduced to R
@@ -144,7 +148,7 @@ class Factors(eqx.Module):
     joints: tuple[JointFactor, ...]  # factor of each joint
     size: int = eqx.field(static=True)  # number of base parameters
 
-    def append(self, rows: Sequence[np.ndarray]) -> "Factors":
+    def append(self, rows: Matrices) -> "Factors":
         """Return the factors after more rows `[columns, force]` of each joint."""
         pairs = zip(self.joints, rows, strict=True)
         return Factors(tuple(joint.append(x) for joint, x in pairs), self.size)
@@ -162,9 +166,7 @@ class Factors(eqx.Module):
         """Number of rows of each joint."""
         return np.array([joint.rows for joint in self.joints])
 
-    def weighted(
-        self, weights: Float[AnyArray, " joints"]
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def weighted(self, weights: Joints) -> LinearSystem:
         r"""Return the system with the norms of $W \Theta_B p$, $W Q$ (Eq. 29)."""
         blocks = []
         for joint, weight in zip(self.joints, np.asarray(weights), strict=True):
@@ -174,9 +176,7 @@ class Factors(eqx.Module):
         R = np.asarray(np.linalg.qr(np.vstack(blocks), mode="r"))
         return R[:, :-1], R[:, -1]
 
-    def residual_squares(
-        self, p: Float[AnyArray, " base"]
-    ) -> Float[np.ndarray, " joints"]:
+    def residual_squares(self, p: BaseVector) -> Joints:
         """Return the sum of the squared residuals of each joint [N² m² or N²]."""
         # The factors hold columns and forces: `columns @ p - forces`.
         coefficients = np.append(p, -1.0)
@@ -187,7 +187,7 @@ class Factors(eqx.Module):
         return np.array(squares)
 
     @property
-    def force_squares(self) -> Float[np.ndarray, " joints"]:
+    def force_squares(self) -> Joints:
         """Sum of the squared forces of each joint [N² m² or N²]."""
         return np.array([np.sum(joint.R[:, -1] ** 2) for joint in self.joints])
 
@@ -215,7 +215,7 @@ class Blocks(eqx.Module):
         """Return some of the blocks."""
         return Blocks(tuple(self.parts[k] for k in numbers))
 
-    def scale_joints(self, factors: Float[AnyArray, " joints"]) -> "Blocks":
+    def scale_joints(self, factors: Joints) -> "Blocks":
         """Return the factors of rows multiplied by one factor for each joint."""
         parts = []
         for part in self.parts:

@@ -10,7 +10,16 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
-from jaxid.arrays import AnyArray, Float
+from jaxid.arrays import (
+    AnyArray,
+    BaseVector,
+    Float,
+    Indices,
+    Joints,
+    Matrix,
+    Texts,
+    Vector,
+)
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
@@ -36,7 +45,7 @@ from .estimators.regularisation_and_weights import (
     Decomposition,
     UndeterminedDirection,
 )
-from .factors import Blocks
+from .factors import Blocks, LinearSystem
 from .uncertainty.result import ResidualSpectra, Uncertainty
 
 TRUST_LIMIT = 0.1
@@ -94,16 +103,16 @@ class Fit(Summarised, eqx.Module):
     base: BaseParameters
     parameters: Float[AnyArray, " base"]
     uncertainty: Uncertainty
-    weights: Float[AnyArray, " joints"]
+    weights: Joints
     condition_numbers: ConditionNumbers
-    rows: tuple[int, ...] = eqx.field(static=True)
-    residual_rms: Float[AnyArray, " joints"]
+    rows: Indices = eqx.field(static=True)
+    residual_rms: Joints
     residual: float
     undetermined: tuple[UndeterminedDirection, ...]
     estimator: AbstractEstimator
     solution: AbstractSpectralSolution
-    recordings: tuple[str, ...] = eqx.field(static=True)
-    notes: tuple[str, ...] = eqx.field(static=True)
+    recordings: Texts = eqx.field(static=True)
+    notes: Texts = eqx.field(static=True)
     consistency: Consistency | None = None
     full_parameters: Float[AnyArray, " standard"] | None = None
     residual_spectra: ResidualSpectra | None = None
@@ -117,16 +126,16 @@ class Fit(Summarised, eqx.Module):
         return self.uncertainty.covariance
 
     @property
-    def standard_deviations(self) -> Float[np.ndarray, " base"]:
+    def standard_deviations(self) -> BaseVector:
         """Standard deviations of the estimates; infinite where nothing is known."""
         return self.uncertainty.standard_deviations
 
     @property
-    def naive_standard_deviations(self) -> Float[np.ndarray, " base"]:
+    def naive_standard_deviations(self) -> BaseVector:
         """Standard deviations for independent rows, which filtered rows are not."""
         return self.uncertainty.naive_standard_deviations
 
-    def intervals(self, level: float = 0.95) -> Float[np.ndarray, "base 2"]:
+    def intervals(self, level: float = 0.95) -> Matrix:
         """Return confidence intervals of the parameters.
 
         They tell how far noise can take the estimates of a model that is right: errors
@@ -144,7 +153,7 @@ class Fit(Summarised, eqx.Module):
         return np.stack([lower, self.parameters + half_widths], axis=1)
 
     @property
-    def relative_standard_deviations(self) -> Float[np.ndarray, " base"]:
+    def relative_standard_deviations(self) -> BaseVector:
         """Standard deviations relative to the sizes of the estimates."""
         sizes = np.abs(self.parameters)
         ratios = np.full_like(sizes, np.inf)
@@ -179,7 +188,7 @@ class Fit(Summarised, eqx.Module):
         return self.blocks
 
     @property
-    def factor(self) -> tuple[np.ndarray, np.ndarray]:
+    def factor(self) -> LinearSystem:
         """Matrix and right-hand side with the norms of all weighted rows (Eq. 29).
 
         Raises:
@@ -200,7 +209,7 @@ class Fit(Summarised, eqx.Module):
         return self.condition_numbers.raw
 
     @property
-    def standard_parameters(self) -> Float[np.ndarray, " standard"]:
+    def standard_parameters(self) -> Vector:
         """Standard parameters with the same forces.
 
         Physical masses and inertias only if the estimator finds such
@@ -313,7 +322,7 @@ class Fit(Summarised, eqx.Module):
             remarks=remarks,
         )
 
-    def predict(self, motion: Motion) -> Float[np.ndarray, "samples joints"]:
+    def predict(self, motion: Motion) -> Matrix:
         """Return the forces of a motion, without a known tool's [N m or N] (Eq. 39).
 
         Raises:

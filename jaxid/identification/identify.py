@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxid.arrays import AnyArray
+from jaxid.arrays import AnyArray, BaseMatrix, BaseVector, Matrix, Texts
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
 from jaxid.measurement.observations import Observations, Progress
@@ -175,9 +175,7 @@ def _require_more_rows_than_parameters(problem: RegressionProblem) -> None:
         )
 
 
-def _condition_numbers(
-    factors: Factors, weighted_matrix: np.ndarray
-) -> ConditionNumbers:
+def _condition_numbers(factors: Factors, weighted_matrix: Matrix) -> ConditionNumbers:
     unweighted_matrix, _ = factors.weighted(np.ones(len(factors.joints)))
     lengths = np.linalg.norm(weighted_matrix, axis=0)
     scaled_matrix = weighted_matrix / np.where(lengths > 0, lengths, 1.0)
@@ -190,10 +188,10 @@ def _condition_numbers(
 def naive_covariance(
     factors: Factors,
     weights: AnyArray,
-    parameters: AnyArray,
-    inverse: np.ndarray,
+    parameters: BaseVector,
+    inverse: BaseMatrix,
     effective_parameters: float = 0.0,
-) -> np.ndarray:
+) -> BaseMatrix:
     r"""Return the covariance for independent rows and a variance of each joint.
 
     The estimates are $B \Theta^T W^2 Q$, so their covariance is
@@ -215,9 +213,7 @@ def naive_covariance(
     return covariance
 
 
-def _shrinkage_notes(
-    values: np.ndarray, solution: AbstractSpectralSolution
-) -> tuple[str, ...]:
+def _shrinkage_notes(values: BaseVector, solution: AbstractSpectralSolution) -> Texts:
     """Return what standard deviations omit if a solution shrinks weak directions."""
     is_visible = values > MIN_SINGULAR_VALUE * values.max(initial=0.0)
     fractions = solution.inverse(values) * values**2

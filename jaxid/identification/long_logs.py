@@ -19,7 +19,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Array, Float, double_precision, on_cores
+from jaxid.arrays import (
+    AnyArray,
+    Array,
+    Indices,
+    Matrix,
+    Vector,
+    double_precision,
+    on_cores,
+)
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.dispatch import program_of
 from jaxid.measurement.filters import AbstractLowPass
@@ -41,12 +49,14 @@ MAX_LAGS = 16384
 
 Grams = list[np.ndarray]
 """For each joint the products of its columns and forces with each other."""
+BlockGrams = tuple[int, Grams]
+"""Index of a block of time, and products of rows in it."""
 
 
 class Stage(NamedTuple):
     """Zero-phase filter, and the decimation after it."""
 
-    response: np.ndarray  # response to an impulse, of odd length
+    response: Vector  # response to an impulse, of odd length
     factor: int
 
 
@@ -74,7 +84,7 @@ def _stages(observations: Observations) -> list[Stage]:
     return stages
 
 
-def impulse_response(low_pass: AbstractLowPass) -> Float[np.ndarray, " lags"]:
+def impulse_response(low_pass: AbstractLowPass) -> Vector:
     """Return the response to an impulse in the middle, decayed on both sides."""
     half = low_pass.memory()
     impulse = np.zeros(6 * half + 1)
@@ -156,7 +166,7 @@ def stream_blocks(
 class _Pass(NamedTuple):
     """Result of one pass over a log."""
 
-    triangles: list[list[np.ndarray]]  # R factor for each block and joint
+    triangles: list[Grams]  # R factor for each block and joint
     total: Grams  # products of all rows
     is_accurate: bool  # whether the first look has shown the size of every direction
 
@@ -215,7 +225,7 @@ class _Stream:
         iterations = math.ceil((rows + self._shape.delay) / self._shape.rows)
         return iterations * self._shape.samples * self._stride
 
-    def _rows_of_ends(self) -> Iterator[tuple[int, list[np.ndarray]]]:
+    def _rows_of_ends(self) -> Iterator[BlockGrams]:
         """Yield block and equations of rows that no piece covers, reduced in NumPy."""
         is_end = np.ones(len(self._mask), bool)
         for piece in self._pieces:
@@ -231,7 +241,7 @@ class _Stream:
             for part in chunk._replace(mask=mask).divide(self._edges):
                 yield part.block, part.equations()
 
-    def triangles(self, progress: Progress | None) -> list[list[np.ndarray]]:
+    def triangles(self, progress: Progress | None) -> list[Grams]:
         """Return an R factor of columns and forces for each block and joint."""
         result = self._pass(self._first_grams(), progress)
         if not result.is_accurate:
@@ -274,7 +284,7 @@ class _Stream:
 
     def _grams(
         self, pieces: list[Piece], mixing: Grams, progress: Progress | None = None
-    ) -> Iterator[tuple[int, Grams]]:
+    ) -> Iterator[BlockGrams]:
         """Yield block and Gram matrices of some pieces, and of the ends."""
         # One core adds up a piece; the next ones are read meanwhile.
         arrays = map(self._fill, pieces)
@@ -289,7 +299,7 @@ class _Stream:
             ]
             yield block, [rows.T @ rows for rows in mixed_rows]
 
-    def _fill(self, piece: Piece) -> list[np.ndarray]:
+    def _fill(self, piece: Piece) -> Grams:
         """Read the arrays of one piece, filled up to the shape of the loop."""
         shape = self._shape
         motion, forces = self._observations.read(piece.samples)
@@ -307,14 +317,14 @@ class _Stream:
             np.asarray(iterations, np.int32),
         ]
 
-    def _call(self, arrays: list[np.ndarray], mixing: Grams) -> Grams:
+    def _call(self, arrays: Grams, mixing: Grams) -> Grams:
         """Return the Gram matrices of a piece."""
         cpu = jax.local_devices(backend="cpu")[0]
         with double_precision(), jax.default_device(cpu):
             return [np.asarray(G) for G in self._loop(*arrays, mixing, self._matrices)]
 
 
-def _banded_matrix(stage: Stage) -> np.ndarray:
+def _banded_matrix(stage: Stage) -> Matrix:
     """Return the matrix that makes the rows of a tile of consecutive samples."""
     rows = []
     for k in range(TILE):
@@ -327,7 +337,7 @@ def _sum_by_joint(grams: list[Grams]) -> Grams:
     return [np.sum(matrices, axis=0) for matrices in zip(*grams, strict=True)]
 
 
-def _fill_up(x: np.ndarray, length: int) -> np.ndarray:
+def _fill_up(x: Matrix, length: int) -> Matrix:
     """Return an array of so many rows, filled up with zeros."""
     missing_rows = max(0, length - len(x))
     if missing_rows:
@@ -336,7 +346,7 @@ def _fill_up(x: np.ndarray, length: int) -> np.ndarray:
 
 
 def _shows_every_direction(
-    total: np.ndarray, first_grams: np.ndarray, mixing: np.ndarray, ratio: float = 1e4
+    total: Matrix, first_grams: Matrix, mixing: Matrix, ratio: float = 1e4
 ) -> bool:
     """Return whether the first look has shown the size of each direction it saw."""
     values, directions = np.linalg.eigh(mixing.T @ first_grams @ mixing)
@@ -350,7 +360,7 @@ def _shows_every_direction(
     return bool(is_small_enough and sizes[0] * ratio > typical_size)
 
 
-def _regular_triangle(G: np.ndarray) -> np.ndarray:
+def _regular_triangle(G: Matrix) -> Matrix:
     """Return a triangle whose square is about G, and which is never singular."""
     norms = np.sqrt(np.diag(G))
     scale = np.where(norms > 0, norms, max(norms.max(initial=0.0), 1.0))
@@ -358,7 +368,7 @@ def _regular_triangle(G: np.ndarray) -> np.ndarray:
     return np.linalg.cholesky(regular_gram).T * scale
 
 
-def _root(G: np.ndarray) -> np.ndarray:
+def _root(G: Matrix) -> Matrix:
     """Return an upper triangle whose square is G; zero columns stay zero.
 
     G may be singular.
@@ -377,12 +387,10 @@ class _DistinctColumns(NamedTuple):
 
     outputs: list[int]  # outputs of the program, every distinct expression once
     # rows of each joint's columns and force among the filtered ones
-    places: list[np.ndarray]
+    places: Grams
 
     @classmethod
-    def of(
-        cls, program: Program, acting: tuple[tuple[int, ...], ...]
-    ) -> "_DistinctColumns":
+    def of(cls, program: Program, acting: tuple[Indices, ...]) -> "_DistinctColumns":
         """Return the distinct columns that act on joints."""
         size = len(program.outputs) // len(acting)
         outputs: dict[str, int] = {}
@@ -401,7 +409,7 @@ class _DistinctColumns(NamedTuple):
 
 @functools.lru_cache(maxsize=16)
 def _compile_loop(
-    program: Program, acting: tuple[tuple[int, ...], ...], shape: LoopShape
+    program: Program, acting: tuple[Indices, ...], shape: LoopShape
 ) -> Callable:
     """Return the loop, which is compiled when it is first called."""
     joints = len(acting)

@@ -6,7 +6,7 @@ import equinox as eqx
 import numpy as np
 from scipy import linalg
 
-from jaxid.arrays import AnyArray, Bool, Float, Int
+from jaxid.arrays import AnyArray, Float, Indices, Matrix, Texts
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.dispatch import in_numpy
 from jaxid.errors import InputError
@@ -30,8 +30,8 @@ class StatesFit(Summarised, eqx.Module):
     """
 
     fits: tuple[Fit, ...]
-    shared: tuple[int, ...] = eqx.field(static=True)
-    varying: tuple[int, ...] = eqx.field(static=True)
+    shared: Indices = eqx.field(static=True)
+    varying: Indices = eqx.field(static=True)
     parameters: Float[AnyArray, " estimates"]
     uncertainty: Uncertainty
 
@@ -41,12 +41,12 @@ class StatesFit(Summarised, eqx.Module):
         return self.fits[0].base
 
     @property
-    def states(self) -> tuple[str, ...]:
+    def states(self) -> Texts:
         """Names of the states."""
         return tuple(fit.name for fit in self.fits)
 
     @property
-    def names(self) -> tuple[str, ...]:
+    def names(self) -> Texts:
         """Names of all estimates, like `m1` and `fv1 (cold)`."""
         names = [self.base.names[k] for k in self.shared]
         for state in self.states:
@@ -54,7 +54,7 @@ class StatesFit(Summarised, eqx.Module):
         return tuple(names)
 
     @property
-    def units(self) -> tuple[str, ...]:
+    def units(self) -> Texts:
         """Units of all estimates."""
         indices = (*self.shared, *self.varying * len(self.states))
         return tuple(self.base.units[k] for k in indices)
@@ -126,7 +126,7 @@ class StatesFit(Summarised, eqx.Module):
         min_dof = min(dof, default=np.inf)
         return joint_test(differences.ravel(), covariance, float(min_dof))
 
-    def _indices(self, state: str) -> Int[np.ndarray, " base"]:
+    def _indices(self, state: str) -> np.ndarray:
         if state not in self.states:
             raise InputError(
                 f"`state` must be one of {', '.join(self.states)}, but is `{state}`."
@@ -174,9 +174,7 @@ def identify_states(
     )
 
 
-def state_indices(
-    size: int, varying: Sequence[int], state: int
-) -> Int[np.ndarray, " base"]:
+def state_indices(size: int, varying: Sequence[int], state: int) -> np.ndarray:
     """Return places of a state's parameters: shared ones, then those of each state."""
     is_varying = np.isin(np.arange(size), varying)
     count = np.count_nonzero(is_varying)
@@ -187,15 +185,13 @@ def state_indices(
     return indices
 
 
-def state_maps(size: int, varying: Sequence[int], states: int) -> list[np.ndarray]:
+def state_maps(size: int, varying: Sequence[int], states: int) -> list[Matrix]:
     """Return each state's matrix [base, unknowns] from unknowns to base parameters."""
     unit = np.eye(size + (states - 1) * len(varying))
     return [unit[state_indices(size, varying, state)] for state in range(states)]
 
 
-def varying_parameters(
-    base: BaseParameters, varying: Sequence[str] | None
-) -> tuple[int, ...]:
+def varying_parameters(base: BaseParameters, varying: Sequence[str] | None) -> Indices:
     """Return which base parameters are each state's own.
 
     By default they are those without energy.
@@ -210,7 +206,7 @@ def varying_parameters(
     return tuple(k for k, name in enumerate(base.names) if name in varying)
 
 
-def stores_energy(base: BaseParameters) -> Bool[np.ndarray, " base"]:
+def stores_energy(base: BaseParameters) -> np.ndarray:
     """Return which base parameters make kinetic or potential energy.
 
     Friction and offsets do not.

@@ -9,7 +9,7 @@ import equinox as eqx
 import numpy as np
 from scipy import special
 
-from jaxid.arrays import AnyArray, Bool, Float
+from jaxid.arrays import AnyArray, Float, Indices, Texts, Vector
 from jaxid.dynamics.base import BaseParameters
 from jaxid.result_table import (
     Column,
@@ -59,53 +59,53 @@ class Comparison(Summarised, eqx.Module):
 
     first: Fit
     second: Fit
-    indices: tuple[int, ...] = eqx.field(static=True)
+    indices: Indices = eqx.field(static=True)
     difference: Float[AnyArray, " compared"]
     uncertainty: Uncertainty
 
     @property
-    def names(self) -> tuple[str, ...]:
+    def names(self) -> Texts:
         """Names of the parameters."""
         return self._select(self.first.base.names)
 
     @property
-    def units(self) -> tuple[str, ...]:
+    def units(self) -> Texts:
         """Units of the parameters."""
         return self._select(self.first.base.units)
 
     @property
-    def kinds(self) -> tuple[str, ...]:
+    def kinds(self) -> Texts:
         """Kind of each parameter, such as `viscous friction`."""
         return self._select(parameter_kinds(self.first.base))
 
-    def _select(self, words: Sequence[str]) -> tuple[str, ...]:
+    def _select(self, words: Sequence[str]) -> Texts:
         return tuple(words[k] for k in self.indices)
 
     @property
-    def determined(self) -> Bool[np.ndarray, " compared"]:
+    def determined(self) -> Vector:
         """Which differences have a standard deviation."""
         return np.isfinite(self.standard_deviations)
 
     @property
-    def standard_deviations(self) -> Float[np.ndarray, " compared"]:
+    def standard_deviations(self) -> Vector:
         """Standard deviations of the differences; infinite where nothing is known."""
         variances = np.diag(self.uncertainty.covariance)
         return np.sqrt(np.where(variances > 0, variances, np.inf))
 
     @property
-    def half_widths(self) -> Float[np.ndarray, " compared"]:
+    def half_widths(self) -> Vector:
         """Half the widths of the differences' intervals, each for itself."""
         quantiles = special.stdtrit(self.uncertainty.dof, 0.5 + 0.5 * LEVEL)
         return quantiles * self.standard_deviations
 
     @property
-    def p_values(self) -> Float[np.ndarray, " compared"]:
+    def p_values(self) -> Vector:
         """Probability of so large a difference without any change, each for itself."""
         size = np.abs(self.difference) / self.standard_deviations
         return 2.0 * special.stdtr(self.uncertainty.dof, -size)
 
     @property
-    def adjusted_p_values(self) -> Float[np.ndarray, " compared"]:
+    def adjusted_p_values(self) -> Vector:
         """The same, with Holm's correction for the number of tested parameters."""
         adjusted = np.ones(len(self.indices))
         adjusted[self.determined] = _holm(self.p_values[self.determined])
@@ -265,7 +265,7 @@ def compare_some(
     )
 
 
-def _dof_of_sum(a, b, dof_a, dof_b) -> np.ndarray:
+def _dof_of_sum(a, b, dof_a, dof_b) -> Vector:
     """Return the degrees of freedom of sums of two variances (Welch, Satterthwaite)."""
     dof = (a + b) ** 2 / (a**2 / dof_a + b**2 / dof_b)
     return np.where(np.isnan(dof), np.inf, dof)
@@ -279,7 +279,7 @@ def _status(has_changed: bool) -> Status:
     return Status.DOUBTFUL if has_changed else Status.NEUTRAL
 
 
-def _holm(p: Float[np.ndarray, " tests"]) -> Float[np.ndarray, " tests"]:
+def _holm(p: Vector) -> Vector:
     """Return p-values that are corrected for the number of tests."""
     # The smallest p-value counts for all tests, the next one for all others.
     order = np.argsort(p, kind="stable")
@@ -320,7 +320,7 @@ def joint_test(
     return statistic, float(special.fdtrc(size, f_dof, f_ratio))
 
 
-def parameter_kinds(base: BaseParameters) -> tuple[str, ...]:
+def parameter_kinds(base: BaseParameters) -> Texts:
     """Return the term of each leading parameter in words, like `viscous friction`."""
     model = base.model
     kinds = []

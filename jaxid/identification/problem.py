@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxid.arrays import BaseVector, Joints, Matrices, Matrix
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
 from jaxid.measurement.friction_state import with_memory
@@ -178,12 +179,12 @@ class RegressionProblem:
             samples = sum(sizes[:number]) + share * sizes[number]
             self.progress(min(1.0, samples / sum(sizes)))
 
-    def residuals(self, p: np.ndarray) -> Iterator[tuple[RowChunk, np.ndarray]]:
+    def residuals(self, p: BaseVector) -> Iterator[tuple[RowChunk, Matrix]]:
         """Yield the rows with the residuals of some parameters [rows, joints]."""
         for chunk in self.chunks():
             yield chunk, chunk.residuals(p)
 
-    def reweighted(self, p: np.ndarray, weight: Callable, scale: np.ndarray) -> Blocks:
+    def reweighted(self, p: BaseVector, weight: Callable, scale: Joints) -> Blocks:
         """Return the factors of rows with their own weights, by blocks of time.
 
         Args:
@@ -197,7 +198,7 @@ class RegressionProblem:
         """
         self.require_rows()
 
-        def equations(chunk: RowChunk) -> list[np.ndarray]:
+        def equations(chunk: RowChunk) -> Matrices:
             row_weights = np.sqrt(weight(chunk.residuals(p) / scale))
             joints = zip(chunk.equations(), row_weights.T, chunk.mask.T, strict=True)
             return [roots[mask, None] * rows for rows, roots, mask in joints]

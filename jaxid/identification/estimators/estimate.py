@@ -8,7 +8,15 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import numpy as np
 
-from jaxid.arrays import AnyArray, Float
+from jaxid.arrays import (
+    BaseMatrix,
+    BaseVector,
+    Indices,
+    Joints,
+    Matrix,
+    Texts,
+    Vector,
+)
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
 
@@ -30,26 +38,26 @@ class Channel(NamedTuple):
     The estimate moves by $B \sum_t z_t u_t$. Rows that do not count are zero.
     """
 
-    columns: tuple[int, ...]  # base parameters of the equations
+    columns: Indices  # base parameters of the equations
     instruments: (
-        np.ndarray
-    )  # $z_t$ [rows, columns]: for least squares the equations themselves
-    equations: np.ndarray  # $\theta_t$ [rows, columns], weighted
-    disturbance: np.ndarray  # $u_t$ [rows]: residuals, weighted
+        Matrix  # $z_t$ [rows, columns]: for least squares the equations themselves
+    )
+    equations: Matrix  # $\theta_t$ [rows, columns], weighted
+    disturbance: Vector  # $u_t$ [rows]: residuals, weighted
     counted: int  # number of rows that count
 
 
-Influence = Callable[[RowChunk, np.ndarray], Iterator[Channel]]
+Influence = Callable[[RowChunk, Matrix], Iterator[Channel]]
 """Function from rows and their residuals to weighted equations.
 
 The residuals are [rows, joints], in [N m] or [N]; each joint has one channel.
 """
 
 
-def joint_rows(weights: Float[AnyArray, " joints"]) -> Influence:
+def joint_rows(weights: Joints) -> Influence:
     """Return the influence of rows weighted by joint: one channel for each joint."""
 
-    def channels(chunk: RowChunk, residuals: np.ndarray) -> Iterator[Channel]:
+    def channels(chunk: RowChunk, residuals: Matrix) -> Iterator[Channel]:
         joints = zip(
             chunk.indices,
             chunk.columns,
@@ -101,23 +109,23 @@ class Estimate(eqx.Module):
     """
 
     base: BaseParameters
-    parameters: Float[np.ndarray, " base"] = eqx.field(converter=np.asarray)
-    weights: Float[np.ndarray, " joints"] = eqx.field(converter=np.asarray)
+    parameters: BaseVector = eqx.field(converter=np.asarray)
+    weights: Vector = eqx.field(converter=np.asarray)
     blocks: Blocks
-    inverse: Float[np.ndarray, "base base"] = eqx.field(converter=np.asarray)
+    inverse: BaseMatrix = eqx.field(converter=np.asarray)
     influence: Influence
     solution: AbstractSpectralSolution = Complete()
-    standard: Float[np.ndarray, " standard"] | None = None
-    notes: tuple[str, ...] = eqx.field(static=True, default=())
+    standard: Vector | None = None
+    notes: Texts = eqx.field(static=True, default=())
     consistency: Any = None
-    unbounded: Float[np.ndarray, " base"] | None = None
+    unbounded: BaseVector | None = None
     effective_parameters: float | None = None
 
     @classmethod
     def solve(
         cls,
         problem: RegressionProblem,
-        weights: Float[AnyArray, " joints"],
+        weights: Joints,
         solution: AbstractSolution,
     ) -> "Estimate":
         """Return the least-squares estimate of rows weighted by joint (Eqs. 28, 33).
@@ -147,7 +155,7 @@ class Estimate(eqx.Module):
             return self
         return dataclasses.replace(self, parameters=self.unbounded)
 
-    def number_of_parameters(self, R: np.ndarray) -> float:
+    def number_of_parameters(self, R: Matrix) -> float:
         """Return how many parameters the rows with a weighted factor `R` determine."""
         if self.effective_parameters is not None:
             return self.effective_parameters

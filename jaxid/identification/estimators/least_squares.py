@@ -5,6 +5,7 @@ from collections.abc import Iterator
 import jax
 import numpy as np
 
+from jaxid.arrays import Matrices, Matrix
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
 from jaxid.measurement.samples import SamplesInMemory
@@ -79,7 +80,7 @@ class InstrumentalVariables(AbstractEstimator):
         instruments = self._instruments(problem)
         weighted_rows = joint_rows(weights)
 
-        def influence(chunk: RowChunk, residuals: np.ndarray) -> Iterator[Channel]:
+        def influence(chunk: RowChunk, residuals: Matrix) -> Iterator[Channel]:
             """Use the reference's columns, not the measured ones, as instruments."""
             channels = weighted_rows(chunk, residuals)
             joints = zip(
@@ -121,7 +122,7 @@ class InstrumentalVariables(AbstractEstimator):
             influence=influence,
         )
 
-    def _instruments(self, problem: RegressionProblem) -> list[list[np.ndarray]]:
+    def _instruments(self, problem: RegressionProblem) -> list[Matrices]:
         """Return the columns of each recording's reference, filtered like it."""
         problem.require_rows()
         recordings = problem.recordings

@@ -8,7 +8,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Array, Bool, Float, one_or_each
+from jaxid.arrays import (
+    AnyArray,
+    Array,
+    BaseMatrix,
+    BaseVector,
+    Float,
+    Indices,
+    Joints,
+    Texts,
+    Vector,
+    one_or_each,
+)
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
 from jaxid.robot.robot import Robot
@@ -33,13 +44,11 @@ class Decomposition(eqx.Module):
     columns of zeros or of rounding stay zero.
     """
 
-    scale: Float[np.ndarray, " base"]  # lengths of the columns
-    values: Float[np.ndarray, " base"]  # singular values, in falling order
+    scale: BaseVector  # lengths of the columns
+    values: BaseVector  # singular values, in falling order
     # right singular vectors of the scaled parameters, as rows
-    directions: Float[np.ndarray, "base base"]
-    forces: Float[
-        np.ndarray, " base"
-    ]  # weighted forces along the left singular vectors
+    directions: BaseMatrix
+    forces: BaseVector  # weighted forces along the left singular vectors
     rest: float  # norm of the forces that the columns cannot explain
 
     @classmethod
@@ -62,12 +71,12 @@ class Decomposition(eqx.Module):
         return cls(scale, values, directions, forces, rest)
 
     @property
-    def unknown(self) -> Bool[np.ndarray, " base"]:
+    def unknown(self) -> np.ndarray:
         """Which parameters take part in directions that are only rounding."""
         is_rounding = self.values <= MIN_SINGULAR_VALUE * self.values.max(initial=0.0)
         return np.sum(self.directions[is_rounding] ** 2, axis=0) > 1e-8
 
-    def solve(self, inverse: np.ndarray | None = None) -> np.ndarray:
+    def solve(self, inverse: BaseVector | None = None) -> BaseVector:
         """Return the parameters, by a substitute of 1 / value² for each direction.
 
         The substitute is that of `Complete` if none is given.
@@ -77,7 +86,7 @@ class Decomposition(eqx.Module):
         along_directions = inverse * self.values * self.forces
         return self.directions.T @ along_directions / self.scale
 
-    def inverse_information(self, inverse: np.ndarray | None = None) -> np.ndarray:
+    def inverse_information(self, inverse: BaseVector | None = None) -> BaseMatrix:
         """Return the inverse information in the parameters' units; see `solve`."""
         if inverse is None:
             inverse = Complete().inverse(self.values)
@@ -127,7 +136,7 @@ class AbstractSpectralSolution(AbstractSolution):
     """
 
     @abstractmethod
-    def inverse(self, values: Float[AnyArray, " base"]) -> Float[np.ndarray, " base"]:
+    def inverse(self, values: BaseVector) -> BaseVector:
         """Return the substitute of 1 / value² for each singular value."""
 
     def choose(self, blocks, weights):
@@ -209,7 +218,7 @@ class AbstractWeights(eqx.Module):
     """A choice of one weight for each joint: the diagonal of W (Eq. 30)."""
 
     @abstractmethod
-    def __call__(self, robot: Robot, factors: Factors) -> Float[np.ndarray, " joints"]:
+    def __call__(self, robot: Robot, factors: Factors) -> Vector:
         """Return the weights [1/(N m) or 1/N] for some observations of a robot."""
 
 
@@ -220,7 +229,7 @@ class GivenWeights(AbstractWeights):
         weights: Weight of each joint [1/(N m) or 1/N].
     """
 
-    weights: Float[AnyArray, " joints"] = eqx.field(converter=one_or_each)
+    weights: Joints = eqx.field(converter=one_or_each)
 
     def __call__(self, robot, factors):
         """Return the weights; reject those that are not one number for each joint."""
@@ -267,7 +276,7 @@ class ResidualVariances(AbstractWeights):
             weights = self._reciprocals(factors, factors.residual_squares(p))
         return weights
 
-    def _reciprocals(self, factors: Factors, squares: np.ndarray) -> np.ndarray:
+    def _reciprocals(self, factors: Factors, squares: Vector) -> Vector:
         deviations = np.sqrt(squares / np.maximum(factors.rows, 1))
         # Finite also for a joint without any force or residual.
         floor = max(1e-9 * float(deviations.max()), 1e-100)
@@ -278,7 +287,7 @@ class DefaultWeights(NamedTuple):
     """Weights of a robot's joints if the user has chosen none."""
 
     weights: AbstractWeights
-    notes: tuple[str, ...]  # sentences for the user
+    notes: Texts  # sentences for the user
 
 
 def default_weights(robot: Robot) -> DefaultWeights:
@@ -305,7 +314,7 @@ class UndeterminedDirection(eqx.Module):
             combination was not moved.
     """
 
-    parts: tuple[int, ...] = eqx.field(static=True)
+    parts: Indices = eqx.field(static=True)
     shares: tuple[float, ...] = eqx.field(static=True)
     singular_value: float
     uncertainty: float

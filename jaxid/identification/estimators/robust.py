@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import equinox as eqx
 import numpy as np
 
-from jaxid.arrays import Float
+from jaxid.arrays import BaseVector, Joints, Matrix
 from jaxid.errors import InputError
 
 from ..factors import RowChunk
@@ -37,11 +37,11 @@ class AbstractLoss(eqx.Module):
             raise InputError(f"`limit` must be positive, but is {self.limit}.")
 
     @abstractmethod
-    def weight(self, x: Float[np.ndarray, "*rows"]) -> Float[np.ndarray, "*rows"]:
+    def weight(self, x: np.ndarray) -> np.ndarray:
         """Return the weights (0 to 1) of rows with such residuals."""
 
     @abstractmethod
-    def slope(self, x: Float[np.ndarray, "*rows"]) -> Float[np.ndarray, "*rows"]:
+    def slope(self, x: np.ndarray) -> np.ndarray:
         """Return the derivative of residual times weight."""
 
 
@@ -126,7 +126,7 @@ class IterativelyReweighted(AbstractEstimator):
         solution = self.solution.choose(blocks, weights)
         weighted_rows = joint_rows(weights)
 
-        def influence(chunk: RowChunk, residuals: np.ndarray) -> Iterator[Channel]:
+        def influence(chunk: RowChunk, residuals: Matrix) -> Iterator[Channel]:
             """Weight each row's residuals; equations have the loss's mean slope."""
             row_weights = self.loss.weight(residuals / scale)
             channels = weighted_rows(chunk, row_weights * residuals)
@@ -152,7 +152,7 @@ class IterativelyReweighted(AbstractEstimator):
 
     def _reweight_and_solve(
         self, problem: RegressionProblem, loss: AbstractLoss, weights, p
-    ) -> tuple[np.ndarray, float]:
+    ) -> tuple[BaseVector, float]:
         """Return new parameters, and the forces' change relative to the residuals."""
         scale = _residual_scale(problem, p)
         blocks = problem.reweighted(p, loss.weight, scale)
@@ -166,7 +166,7 @@ class IterativelyReweighted(AbstractEstimator):
         step_norm = float(np.linalg.norm(R @ (parameters - p)))
         return parameters, step_norm / residual_norm
 
-    def _mean_slopes(self, problem: RegressionProblem, p, scale) -> np.ndarray:
+    def _mean_slopes(self, problem: RegressionProblem, p, scale) -> Joints:
         """Return the mean slope of the loss at each joint's residuals, at least 0.1."""
         sums = np.zeros(len(scale))
         for chunk, residuals in problem.residuals(p):
@@ -175,7 +175,7 @@ class IterativelyReweighted(AbstractEstimator):
         return np.maximum(sums / np.maximum(problem.factors.rows, 1), 0.1)
 
 
-def _residual_scale(problem: RegressionProblem, p: np.ndarray) -> np.ndarray:
+def _residual_scale(problem: RegressionProblem, p: BaseVector) -> Joints:
     """Return the deviation of each joint's ordinary residuals by medians [N m or N]."""
     # Of more than a million rows some suffice, evenly spread.
     max_rows = int(problem.factors.rows.max())

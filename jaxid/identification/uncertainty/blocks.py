@@ -6,7 +6,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Array, Float, PRNGKeyArray, require_float64
+from jaxid.arrays import (
+    AnyArray,
+    Array,
+    BaseVector,
+    Float,
+    Joints,
+    Matrix,
+    PRNGKeyArray,
+    Vector,
+    require_float64,
+)
 from jaxid.errors import InputError
 
 from ..estimators.estimate import Estimate
@@ -18,7 +28,7 @@ from ..estimators.regularisation_and_weights import (
 from ..factors import Blocks
 from .result import AbstractUncertainty, Uncertainty, rescale_covariance
 
-ResidualBlock = tuple[Float[np.ndarray, "_ unknowns"], Float[np.ndarray, " _"]]
+ResidualBlock = tuple[Matrix, Vector]
 """Derivatives of a block's weighted forces by the unknowns, and the residuals."""
 
 
@@ -46,7 +56,7 @@ class BlockJackknife(AbstractUncertainty):
         return Uncertainty(covariance, dof, naive, deviations), None
 
 
-def jackknife(estimate: Estimate) -> Float[np.ndarray, " base"] | None:
+def jackknife(estimate: Estimate) -> BaseVector | None:
     """Return deviations by the block jackknife; None for a single block of time."""
     if len(estimate.blocks.parts) < 2:
         return None
@@ -68,7 +78,7 @@ def residual_blocks(
 
 def block_covariance(
     blocks: Sequence[ResidualBlock], inverse: AnyArray
-) -> tuple[np.ndarray, float]:
+) -> tuple[Matrix, float]:
     r"""Return the block jackknife's covariance, and its degrees of freedom.
 
     Without block $k$ the estimate moves by $(1 - B G_k)^{-1} B g_k$, where $G_k$ is the
@@ -95,7 +105,7 @@ def block_covariance(
 
 
 def bootstrap(
-    blocks: Blocks, weights: Float[AnyArray, " joints"], draws: int, key: PRNGKeyArray
+    blocks: Blocks, weights: Joints, draws: int, key: PRNGKeyArray
 ) -> Float[Array, "draws base"]:
     r"""Return estimates from blocks of time that are drawn with replacement.
 

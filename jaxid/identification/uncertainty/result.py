@@ -6,7 +6,7 @@ import equinox as eqx
 import numpy as np
 from scipy import special
 
-from jaxid.arrays import AnyArray, Float
+from jaxid.arrays import AnyArray, BaseMatrix, BaseVector, Float, Joints, Texts
 from jaxid.errors import InputError
 
 from ..estimators.estimate import Estimate
@@ -30,20 +30,20 @@ class Uncertainty(eqx.Module):
     dof: Float[AnyArray, " base"]
     naive_covariance: Float[AnyArray, "base base"]
     jackknife: Float[AnyArray, " base"] | None = None
-    notes: tuple[str, ...] = eqx.field(static=True, default=())
+    notes: Texts = eqx.field(static=True, default=())
 
     @property
-    def standard_deviations(self) -> Float[np.ndarray, " base"]:
+    def standard_deviations(self) -> BaseVector:
         """Standard deviations of the estimates; infinite where nothing is known."""
         return np.sqrt(np.diag(self.covariance))
 
     @property
-    def naive_standard_deviations(self) -> Float[np.ndarray, " base"]:
+    def naive_standard_deviations(self) -> BaseVector:
         """Standard deviations if the rows were independent."""
         return np.sqrt(np.diag(self.naive_covariance))
 
     @property
-    def ratios(self) -> Float[np.ndarray, " base"]:
+    def ratios(self) -> BaseVector:
         """Standard deviations relative to naive ones; NaN where nothing is known."""
         naive = self.naive_standard_deviations
         has_scale = np.isfinite(naive) & (naive > 0)
@@ -51,7 +51,7 @@ class Uncertainty(eqx.Module):
         ratios[has_scale] = self.standard_deviations[has_scale] / naive[has_scale]
         return ratios
 
-    def half_widths(self, level: float = 0.95) -> Float[np.ndarray, " base"]:
+    def half_widths(self, level: float = 0.95) -> BaseVector:
         """Return half the widths of confidence intervals, by the t distribution.
 
         Args:
@@ -68,9 +68,7 @@ class Uncertainty(eqx.Module):
         return self.standard_deviations * special.stdtrit(dof, 0.5 + 0.5 * level)
 
 
-def rescale_covariance(
-    covariance: Float[np.ndarray, "base base"], deviations: Float[np.ndarray, " base"]
-) -> Float[np.ndarray, "base base"]:
+def rescale_covariance(covariance: BaseMatrix, deviations: BaseVector) -> BaseMatrix:
     """Return the covariance with the same correlations and other standard deviations.
 
     Infinite variances, of parameters that are undetermined, stay infinite.
@@ -110,9 +108,9 @@ class ResidualSpectra(eqx.Module):
     frequency: Float[AnyArray, " lines"]
     density: Float[AnyArray, "joints lines"]
     gain: Float[AnyArray, " lines"]
-    departure: Float[AnyArray, " joints"]
+    departure: Joints
     limit: float
-    low_frequency: Float[AnyArray, " joints"]
+    low_frequency: Joints
     band: float
 
     @property
@@ -129,7 +127,7 @@ class AbstractUncertainty(eqx.Module):
         self,
         problem: RegressionProblem,
         estimate: Estimate,
-        naive: Float[np.ndarray, "base base"],
+        naive: BaseMatrix,
     ) -> tuple[Uncertainty, ResidualSpectra | None]:
         """Return the uncertainty, and spectra of residuals if they are computed.
 

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import fft
 
-from jaxid.arrays import Float, on_cores
+from jaxid.arrays import BaseMatrix, Matrices, Matrix, Vector, on_cores
 from jaxid.measurement.observations import Observations
 
 from ..estimators.estimate import Channel, Estimate
@@ -44,9 +44,9 @@ class ChannelSpectra(NamedTuple):
     """Spectra of one channel of a stretch."""
 
     # $|\sum_t (B z_t)_i e^{-i \omega t}|^2 m / N$ [base, lines]
-    energy: np.ndarray
-    leverage: np.ndarray  # fraction (0 to 1) of each line explained by the fit
-    power: np.ndarray  # periodogram of the disturbances
+    energy: Matrix
+    leverage: Vector  # fraction (0 to 1) of each line explained by the fit
+    power: Vector  # periodogram of the disturbances
     exposure: float  # fraction of the rows that count
     # products of the instruments, summed over the lines of each bin
     products: np.ndarray
@@ -77,8 +77,8 @@ class Lines:
         self,
         length: int,
         row_time: float,
-        frequency: np.ndarray,
-        gain: np.ndarray,
+        frequency: Vector,
+        gain: Vector,
         base_size: int,
         joints: int,
     ):
@@ -100,7 +100,7 @@ class Lines:
         """Return the Fourier transform of the rows of a stretch, on the last axis."""
         return np.asarray(fft.rfft(rows, self.length))[..., : len(self.frequency)]
 
-    def add_residuals(self, residuals: np.ndarray) -> None:
+    def add_residuals(self, residuals: Matrix) -> None:
         """Add the residuals of a stretch [rows, joints]."""
         self.residual += np.abs(self.transform(residuals.T)) ** 2 / self.length
         self.stretches += 1
@@ -113,7 +113,7 @@ class Lines:
         self.exposure[c] += spectra.exposure
 
     def transform_channel(
-        self, channel: Channel, inverse: np.ndarray
+        self, channel: Channel, inverse: BaseMatrix
     ) -> ChannelSpectra:
         """Return the spectra of one channel of a stretch."""
         columns = list(channel.columns)
@@ -138,7 +138,7 @@ class Lines:
             products=products,
         )
 
-    def _transform_parts(self, rows: np.ndarray) -> np.ndarray:
+    def _transform_parts(self, rows: Matrix) -> Matrix:
         """Return the real and imaginary parts of lines, weighted by their numbers."""
         scale = np.repeat(np.sqrt(self.multiplicity / self.length), 2)
         return scale * self.transform(rows.T).view(float)
@@ -149,7 +149,7 @@ def _add_parts(x: np.ndarray) -> np.ndarray:
     return x[..., ::2] + x[..., 1::2]
 
 
-def multiplicity(length: int) -> Float[np.ndarray, " lines"]:
+def multiplicity(length: int) -> Vector:
     """Return how often a line counts: for itself, and for its mirror image."""
     k = np.arange(length)
     return np.bincount(np.minimum(k, length - k)).astype(float)
@@ -160,9 +160,9 @@ class RowSpectra(NamedTuple):
 
     lines: list[Lines]  # of every length of stretches
     # columns of the inverse information of each channel [base, columns]
-    inverses: list[np.ndarray]
+    inverses: Matrices
     # products of each channel's instruments by bins [bins, columns, columns]
-    products: list[np.ndarray]
+    products: Matrices
     is_complete: bool  # whether all rows were transformed
 
 
@@ -284,9 +284,7 @@ def _rows_of_stretches(
                     parts = []
 
 
-def _visible_lines(
-    recording: Observations, length: int
-) -> tuple[np.ndarray, np.ndarray]:
+def _visible_lines(recording: Observations, length: int) -> tuple[Vector, Vector]:
     """Return frequencies [Hz] and gains of lines that filter and decimation pass."""
     frequency = fft.rfftfreq(length, recording.row_time)
     sample_time = recording.sample_time

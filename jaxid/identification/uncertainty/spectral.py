@@ -14,7 +14,14 @@ from typing import Any
 import numpy as np
 from scipy import fft, stats
 
-from jaxid.arrays import AnyArray, Float, namespace
+from jaxid.arrays import (
+    AnyArray,
+    BaseMatrix,
+    BaseVector,
+    Matrix,
+    Vector,
+    namespace,
+)
 
 from ..estimators.estimate import Estimate
 from .blocks import BlockJackknife, jackknife
@@ -95,7 +102,7 @@ class SpectralWindows:
     lines as last axis in any order.
     """
 
-    def __init__(self, frequency: Float[np.ndarray, " lines"], longest: float):
+    def __init__(self, frequency: Vector, longest: float):
         self._order = np.argsort(frequency, kind="stable")
         places = np.argsort(self._order)
         ordered_frequency = frequency[self._order]
@@ -178,7 +185,7 @@ class SpectralTable:
             longest=max(x.length * x.row_time for x in lines),
         )
 
-    def density(self, power: np.ndarray) -> np.ndarray:
+    def density(self, power: Matrix) -> Matrix:
         """Return the errors' spectrum at each line, from residual periodograms."""
         sums = self._windows.sum_lines(self._half * power)
         return np.asarray(sums / self._residual_rows)
@@ -206,7 +213,7 @@ def _join(arrays: Sequence[np.ndarray]) -> np.ndarray:
     return arrays[0] if len(arrays) == 1 else np.concatenate(arrays, axis=-1)
 
 
-def sandwich(spectra: RowSpectra) -> tuple[np.ndarray, np.ndarray]:
+def sandwich(spectra: RowSpectra) -> tuple[BaseMatrix, BaseVector]:
     """Return the covariance of an estimate, and degrees of freedom of each variance.
 
     Variances are summed line by line. For correlations between parameters the spectrum
@@ -231,7 +238,7 @@ def sandwich(spectra: RowSpectra) -> tuple[np.ndarray, np.ndarray]:
     return rescale_covariance(covariance, deviations), np.maximum(dof, 1.0)
 
 
-def white_variances(lines: Sequence[Lines]) -> np.ndarray:
+def white_variances(lines: Sequence[Lines]) -> BaseVector:
     """Return variances of estimates for white errors, with one level for each joint."""
     rows = sum(x.length * x.exposure for x in lines)
     explained_power = sum(np.sum(x.multiplicity * x.leverage) for x in lines)
