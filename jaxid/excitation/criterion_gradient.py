@@ -9,6 +9,7 @@ from jaxid.arrays import Float
 from jaxid.program.gradient import pull_back
 
 from .coefficient_limits import ScaledMotions
+from .criteria.information_matrix import gram_matrices
 from .problem import ExcitationProblem
 
 
@@ -29,9 +30,9 @@ def value_and_gradient(
     columns = [np.swapaxes(each, 0, 1) for each in regressor.in_numpy(*motion)]
     weight = problem.samples / samples
 
-    plain, weighted = _information(problem, columns, weight)
+    plain, weighted = gram_matrices(regressor, columns, problem.weights)
     values, by_plain, by_weighted = _criterion_and_slopes(
-        problem, plain, weighted, sharpness
+        problem, weight * plain, weight * weighted + problem.prior, sharpness
     )
     by_columns = _slopes_by_columns(problem, columns, weight, by_plain, by_weighted)
     packed_slopes = by_columns.reshape(-1, *by_columns.shape[2:])
@@ -42,23 +43,6 @@ def value_and_gradient(
         by_coefficients += np.einsum("jbs,sk->bjk", slopes, part)
     gradient = by_coefficients * np.asarray(problem.limits.scale)
     return values, gradient.reshape(x.shape)
-
-
-def _information(
-    problem: ExcitationProblem, columns: list[np.ndarray], weight: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return plain and weighted information from the regressor's columns."""
-    shape = (columns[0].shape[0], problem.base.size, problem.base.size)
-    plain = np.zeros(shape)
-    weighted = np.zeros(shape)
-    numbers_by_joint = problem.regressor.columns
-    for joint, each in enumerate(columns):
-        numbers = numbers_by_joint[joint]
-        place = np.ix_(numbers, numbers)
-        gram = weight * (each @ np.swapaxes(each, 1, 2))
-        plain[:, *place] += gram
-        weighted[:, *place] += problem.weights[joint] ** 2 * gram
-    return plain, weighted + problem.prior
 
 
 def _criterion_and_slopes(

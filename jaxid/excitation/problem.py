@@ -29,7 +29,7 @@ from .criteria.functions_of_eigenvalues import Scalar, Sharpness
 from .criteria.information_matrix import (
     BaseMatrix,
     JointVector,
-    information_of_coefficients,
+    gram_matrices,
 )
 
 CHECKED_INSTANTS = 8160
@@ -167,17 +167,19 @@ class ExcitationProblem:
             samples: Number of evaluated samples, which stand for all measured ones; all
                 of them if None.
         """
-        batch = information_of_coefficients(
-            self.base,
-            self.basis,
-            self.limits.coefficients(jnp.asarray(x))[None],
-            samples=self.samples if samples is None else samples,
-            measured=self.samples,
-            weights=self.weights,
-            prior=self.prior,
-            sizes=self.sizes,
+        samples = self.samples if samples is None else samples
+        coefficients = self.limits.coefficients(jnp.asarray(x))[None]
+        motion = [
+            jnp.einsum("sk,bjk->jbs", part, coefficients)
+            for part in self.sample_rows(samples)
+        ]
+        columns = self.regressor(*motion)
+        plain, weighted = gram_matrices(self.regressor, columns, self.weights)
+        # The samples stand for all that are measured.
+        weight = self.samples / samples
+        return self._criterion_of(
+            weight * plain[0], weight * weighted[0] + self.prior, sharpness
         )
-        return self._criterion_of(batch.plain[0], batch.weighted[0], sharpness)
 
     def _criterion_of(
         self, plain: Array, weighted: Array, sharpness: Sharpness

@@ -33,7 +33,8 @@ def placements(
 ) -> tuple[Float[AnyArray, "joints 3 3"], Float[AnyArray, "joints 3"]]:
     """Return attitudes and origins [m] of all bodies in the frame of the ground."""
     q = jnp.asarray(q)
-    rotations, origins = [], []
+    rotations = []
+    origins = []
     for i, parent in enumerate(robot.parent):
         R, r = placement_in_parent(robot, i, q[i])
         if parent >= 0:
@@ -55,20 +56,20 @@ class TipJacobian(NamedTuple):
     """Placements of the end-effector, and their derivatives by the joints.
 
     Attributes:
-        rotation: Attitudes on the ground.
+        rotation: Attitudes on the ground [poses 3 3].
         position: Positions on the ground [m].
-        velocity: Velocities of the origin by the rates of the joints.
-        turn: Angular velocities by the rates of the joints.
+        velocity: Velocities of the origin by the rates of the joints [poses joints 3].
+        turn: Angular velocities by the rates of the joints [poses joints 3].
     """
 
-    rotation: Float[np.ndarray, "poses 3 3"]
-    position: Float[np.ndarray, "poses 3"]
-    velocity: Float[np.ndarray, "poses joints 3"]
-    turn: Float[np.ndarray, "poses joints 3"]
+    rotation: np.ndarray
+    position: np.ndarray
+    velocity: np.ndarray
+    turn: np.ndarray
 
 
-def tip_jacobian(robot: Robot, q: Float[np.ndarray, "poses joints"]) -> TipJacobian:
-    """Return placements of the end-effector and their derivatives, in NumPy."""
+def tip_jacobian(robot: Robot, q: np.ndarray) -> TipJacobian:
+    """Return placements of the end-effector in many poses, and their derivatives."""
     offset = np.asarray(robot.offset)
     rotation = np.asarray(robot.rotation)
     axis = np.asarray(robot.axis)
@@ -95,10 +96,8 @@ def tip_jacobian(robot: Robot, q: Float[np.ndarray, "poses joints"]) -> TipJacob
 
 
 def tip_curvature(
-    tip: TipJacobian,
-    force: Float[np.ndarray, "poses 3"],
-    moment: Float[np.ndarray, "poses 3"],
-) -> Float[np.ndarray, "poses joints joints"]:
+    tip: TipJacobian, force: np.ndarray, moment: np.ndarray
+) -> np.ndarray:
     """Return second derivatives of the placement, times a force and a moment.
 
     Attitudes count as rotation vectors from the attitude of the end-effector.

@@ -50,12 +50,12 @@ class Tool(eqx.Module):
     inertia: Matrix3 = eqx.field(converter=given, default=None)
 
     def __post_init__(self):
-        self.mass = _checked("`mass` of the tool", self.mass, ())
-        self.centre_of_mass = _checked(
+        self.mass = as_finite_array("`mass` of the tool", self.mass, ())
+        self.centre_of_mass = as_finite_array(
             "`centre_of_mass` of the tool", self.centre_of_mass, (3,)
         )
         tensor = np.zeros((3, 3)) if self.inertia is None else self.inertia
-        self.inertia = _checked("`inertia` of the tool", tensor, (3, 3))
+        self.inertia = as_finite_array("`inertia` of the tool", tensor, (3, 3))
         if not is_traced(self.mass) and self.mass <= 0:
             raise InputError(
                 f"`mass` of the tool must be positive, but is {self.mass:g} kg."
@@ -139,12 +139,12 @@ class Robot(Summarised, eqx.Module):
         self.parent = tuple(int(body) for body in self.parent)
         self.revolute = tuple(bool(turns) for turns in self.revolute)
         # Arrays of JAX may have leading axes, for batches of geometries.
-        self.axis = _unit_axes(_checked("`axis`", self.axis, (n, 3)))
-        self.rotation = _rotations("`rotation`", self.rotation, (n, 3, 3))
-        self.offset = _checked("`offset`", self.offset, (n, 3))
-        self.gravity = _checked("`gravity`", self.gravity, (3,))
-        self.tip_rotation = _rotations("`tip_rotation`", self.tip_rotation, (3, 3))
-        self.tip_offset = _checked("`tip_offset`", self.tip_offset, (3,))
+        self.axis = _unit_axes(as_finite_array("`axis`", self.axis, (n, 3)))
+        self.rotation = as_rotations("`rotation`", self.rotation, (n, 3, 3))
+        self.offset = as_finite_array("`offset`", self.offset, (n, 3))
+        self.gravity = as_finite_array("`gravity`", self.gravity, (3,))
+        self.tip_rotation = as_rotations("`tip_rotation`", self.tip_rotation, (3, 3))
+        self.tip_offset = as_finite_array("`tip_offset`", self.tip_offset, (3,))
         self._check_joints()
 
         doubts = limit_notes(self.joint_names, self.revolute, self.limits)
@@ -289,8 +289,8 @@ class Robot(Summarised, eqx.Module):
             InputError: If the attitude is no rotation, or the position no point.
         """
         attitude = np.eye(3) if rotation is None else rotation
-        R = _rotations("`rotation`", attitude, (3, 3))
-        r = _checked("`position`", position, (3,))
+        R = as_rotations("`rotation`", attitude, (3, 3))
+        r = as_finite_array("`position`", position, (3,))
         xp = namespace(R, r, self.rotation, self.offset)
         rotations = R @ self.rotation
         offsets = xp.broadcast_to(r, self.offset.shape) + self.offset @ R.T
@@ -328,11 +328,8 @@ class Robot(Summarised, eqx.Module):
             self.tip_body, mass=mass, centre_of_mass=centre_of_mass, inertia=inertia
         )
         load = at_tip.body_inertia.moved(self.tip_rotation, self.tip_offset)
-        tool = Tool(
-            self.tip_body,
-            mass=load.mass,
-            centre_of_mass=load.centre,
-            inertia=load.tensor,
+        tool = dataclasses.replace(
+            at_tip, centre_of_mass=load.centre, inertia=load.tensor
         )
         return self.replace(tool=tool)
 
@@ -373,7 +370,7 @@ class Robot(Summarised, eqx.Module):
         )
 
 
-def _checked(name: str, value: Numbers, shape: tuple[int, ...]) -> AnyArray:
+def as_finite_array(name: str, value: Numbers, shape: tuple[int, ...]) -> AnyArray:
     """Return an array of finite numbers; that of JAX may have leading axes."""
     if isinstance(value, jax.Array):
         array: AnyArray = value
@@ -400,9 +397,9 @@ def _unit_axes(axes: AnyArray) -> AnyArray:
     return np.where(np.abs(length - 1.0) > 1e-15, axes / length, axes)
 
 
-def _rotations(name: str, value: Numbers, shape: tuple[int, ...]) -> AnyArray:
+def as_rotations(name: str, value: Numbers, shape: tuple[int, ...]) -> AnyArray:
     """Return a copy as rotation matrices; a JAX array is taken as it is."""
-    R = _checked(name, value, shape)
+    R = as_finite_array(name, value, shape)
     if isinstance(R, np.ndarray):
         error = np.abs(np.swapaxes(R, -1, -2) @ R - np.eye(3)).max(axis=(-1, -2))
         if (error >= 1e-6).any() or (np.linalg.det(R) < 0).any():

@@ -7,6 +7,7 @@ of its file.
 """
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from jaxid.arrays import AnyArray, Float, Matrix3, Numbers, Vector3, namespace
 from jaxid.errors import InputError
@@ -40,15 +41,13 @@ def rotation_about(
 
 def axis_rotation(axis: Numbers, angle: float) -> Matrix3:
     """Return the rotation about a unit vector [rad], exact for quarter turns."""
-    R = rotation_about(np.asarray(axis, np.float64), np.asarray(angle))
-    return without_rounding(np.asarray(R))
+    turn = Rotation.from_rotvec(angle * np.asarray(axis, np.float64))
+    return without_rounding(turn.as_matrix())
 
 
 def rpy_rotation(rpy: Numbers) -> Matrix3:
     """Return the rotation by roll, pitch and yaw [rad] about x, y, z, as in URDF."""
-    roll, pitch, yaw = np.asarray(rpy, dtype=np.float64)
-    x, y, z = np.eye(3)
-    return axis_rotation(z, yaw) @ axis_rotation(y, pitch) @ axis_rotation(x, roll)
+    return without_rounding(Rotation.from_euler("xyz", rpy).as_matrix())
 
 
 def rpy_angles(rotation: Matrix3) -> Vector3:

@@ -171,7 +171,8 @@ class UrdfTree:
                 is_fixed = True
                 self.mimics.append(joint)
             if is_fixed:
-                self.carriers[child] = self._held_placement(joint)
+                carrier = self.carriers[parent]
+                self.carriers[child] = _placed(carrier, *self.held_pose(joint))
             else:
                 self._add_body(joint)
             joints, links = lengths[parent]
@@ -203,23 +204,18 @@ class UrdfTree:
         self.rotation.append(carrier.rotation)
         self.offset.append(carrier.position)
 
-    def _held_placement(self, joint: Any) -> Placement:
-        """Return the placement of the link that a fixed or held joint carries."""
-        parent, _ = link_names(joint)
-        return _placed(self.carriers[parent], *self.held_pose(joint))
-
     def placed_links(self) -> dict[str, Placement]:
         """Return `carriers`, and links on joints that the chain leaves out."""
         placements = dict(self.carriers)
         links = list(placements)
         for link in links:
-            body, R, r = placements[link]
             for joint in self._below[link]:
                 _, child = link_names(joint)
                 is_readable = joint.get("type") in (*TURNING, "prismatic", "fixed")
                 if is_readable and child not in placements:
-                    rotation, offset = self.held_pose(joint)
-                    placements[child] = Placement(body, R @ rotation, r + R @ offset)
+                    placements[child] = _placed(
+                        placements[link], *self.held_pose(joint)
+                    )
                     links.append(child)
         return placements
 
@@ -270,9 +266,7 @@ class UrdfTree:
     def held_pose(self, joint: Any) -> tuple[Matrix3, Vector3]:
         """Return attitude and origin [m] of a held joint's link in its parent."""
         R, r = self._origin(joint)
-        if joint.get("type") == "fixed":
-            return R, r
-        value = self.held_at(joint)
+        value = 0.0 if joint.get("type") == "fixed" else self.held_at(joint)
         if value == 0.0:
             return R, r
         axis = self._axis(joint)

@@ -1,13 +1,14 @@
 """Leads: from standstill into a periodic motion, and out of it."""
 
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from scipy.special import comb
 
-from jaxid.arrays import AnyArray, Float, double_precision, is_traced, namespace
+from jaxid.arrays import AnyArray, Joints, double_precision, is_traced, namespace
 from jaxid.errors import InputError
 from jaxid.robot.limits_and_drives import Limits
 from jaxid.robot.robot import Robot
@@ -23,6 +24,15 @@ from .trajectory import (
     as_scalar,
     stand_outside,
 )
+
+LEAD_DEGREE = 4
+"""Degree of a lead's position as a polynomial of time."""
+ENVELOPE_PIECES = 8
+"""Pieces of a lead that are bounded by their own control points."""
+PHASES = 360
+"""Instants of the period at which `with_leads` tries to enter and leave it."""
+LEAD_DURATIONS = np.geomspace(0.02, 10.0, 120)[:, None, None]
+"""Durations of leads that `with_leads` tries [s]."""
 
 
 def _lead(state: Any, duration: Any, x: Any, sign: int = 1) -> list:
@@ -50,14 +60,6 @@ def _velocity_coefficients(qd: Any, qdd: Any, duration: Any) -> tuple[Any, Any]:
     return alpha, beta
 
 
-LEAD_DEGREE = 4
-"""Degree of a lead's position as a polynomial of time."""
-ENVELOPE_PIECES = 8
-"""Pieces of a lead that are bounded by their own control points."""
-PHASES = 360
-"""Instants of the period at which `with_leads` tries to enter and leave it."""
-
-
 class LeadsBasis(PeriodsBasis):
     """Fourier series with a lead-in and a lead-out.
 
@@ -75,9 +77,7 @@ class LeadsBasis(PeriodsBasis):
         InputError: If one of them is not positive.
     """
 
-    lead: Float[AnyArray, ""] = eqx.field(
-        converter=as_scalar, default=0.5, kw_only=True
-    )
+    lead: Time = eqx.field(converter=as_scalar, default=0.5, kw_only=True)
 
     def __check_init__(self):
         if not is_traced(self.lead) and not 0 < self.lead < math.inf:
@@ -116,7 +116,7 @@ class LeadsBasis(PeriodsBasis):
         split into pieces, each of which is bounded by its own control points.
         """
         rows, factor = self.series.envelope(points)
-        to_points = _to_control_points(LEAD_DEGREE)
+        to_points = _to_control_points()
         fractions = np.linspace(0.0, 1.0, LEAD_DEGREE + 1)
         duration = self.lead / ENVELOPE_PIECES
         parts: list[Any] = [rows]
@@ -132,17 +132,18 @@ class LeadsBasis(PeriodsBasis):
 
     def instants(self, points: int) -> Times:
         """Return equidistant times over the leads and one period [s]."""
-        period, lead = float(self.series.duration), float(self.lead)
-        t = np.arange(points) * ((period + 2 * lead) / (points - 1))
+        period = float(self.series.duration)
+        lead = float(self.lead)
+        t = np.linspace(0.0, period + 2 * lead, points)
+        # The lead-out follows the last period.
         return np.where(t > lead + period, t + (self.periods - 1) * period, t)
 
 
-def _to_control_points(degree: int) -> Float[np.ndarray, "points samples"]:
-    """Return the matrix from values of a polynomial to its control points."""
-    orders = np.arange(degree + 1)
-    u = np.linspace(0.0, 1.0, degree + 1)[:, None]
-    binomials = np.array([math.comb(degree, order) for order in orders])
-    bernstein = binomials * u**orders * (1 - u) ** (degree - orders)
+def _to_control_points() -> np.ndarray:
+    """Return the matrix from values of a lead's polynomial to its control points."""
+    orders = np.arange(LEAD_DEGREE + 1)
+    u = np.linspace(0.0, 1.0, LEAD_DEGREE + 1)[:, None]
+    bernstein = comb(LEAD_DEGREE, orders) * u**orders * (1 - u) ** orders[::-1]
     return np.linalg.inv(bernstein)
 
 
@@ -161,13 +162,13 @@ class WithLeads(AbstractTrajectory):
     """
 
     inner: AbstractTrajectory
-    start: Float[AnyArray, ""] = eqx.field(converter=as_scalar)
-    length: Float[AnyArray, ""] = eqx.field(converter=as_scalar)
-    lead_in: Float[AnyArray, " joints"]
-    lead_out: Float[AnyArray, " joints"]
+    start: Time = eqx.field(converter=as_scalar)
+    length: Time = eqx.field(converter=as_scalar)
+    lead_in: Joints
+    lead_out: Joints
 
     @property
-    def window(self) -> tuple[Float[AnyArray, ""], Float[AnyArray, ""]]:
+    def window(self) -> tuple[Time, Time]:
         """Times between which the inner motion is followed and measured [s]."""
         begin = jnp.max(jnp.asarray(self.lead_in))
         return begin, begin + self.length
@@ -188,16 +189,17 @@ class WithLeads(AbstractTrajectory):
         from_start = jnp.clip(time - begin + lead_in, 0.0, lead_in)
         to_end = jnp.clip(end + lead_out - time, 0.0, lead_out)
 
-        inner_states = self.inner.states(self.start + t - begin)
-        in_states = _lead(first, lead_in, from_start)
-        out_states = _lead(last, lead_out, to_end, -1)
-        states = []
-        for series_part, in_part, out_part in zip(
-            inner_states, in_states, out_states, strict=False
-        ):
-            after_start = jnp.where(time > end, out_part, series_part)
-            states.append(jnp.where(time < begin, in_part, after_start))
-        return tuple(states)
+        parts = zip(
+            _lead(first, lead_in, from_start),
+            self.inner.states(self.start + t - begin),
+            _lead(last, lead_out, to_end, -1),
+            strict=False,
+        )
+        conditions = [time < begin, time <= end]
+        return tuple(
+            jnp.select(conditions, [in_part, series_part], out_part)
+            for in_part, series_part, out_part in parts
+        )
 
 
 def with_leads(
@@ -234,63 +236,53 @@ def with_leads(
         motion = series.motion(phases)
     q, qd, qdd = (np.asarray(x) for x in (motion.q, motion.qd, motion.qdd))
     limits = complete_limits(robot)
-    lead_in = _shortest_leads(q, qd, qdd, limits)
-    lead_out = _shortest_leads(q, -qd, qdd, limits)
-    total = lead_in.duration.max(axis=1) + lead_out.duration.max(axis=1)
+    use_in = _use_of_limits((q, qd, qdd), limits)
+    use_out = _use_of_limits((q, -qd, qdd), limits)
+    lead_in = _shortest_durations(use_in)
+    lead_out = _shortest_durations(use_out)
+    total = lead_in.max(axis=1) + lead_out.max(axis=1)
     phase = int(np.argmin(total))
     if not np.isfinite(total[phase]):
-        excess = np.maximum(lead_in.excess, lead_out.excess)
-        nearest_phase = int(np.argmin(excess.max(axis=1)))
-        joint = int(np.argmax(excess[nearest_phase]))
+        use = np.maximum(use_in.min(axis=0), use_out.min(axis=0))
+        nearest_phase = int(np.argmin(use.max(axis=1)))
+        joint = int(np.argmax(use[nearest_phase]))
+        excess = use[nearest_phase, joint] - 1.0
         raise InputError(
             "no instant of the period can be reached from standstill within "
             f"the limits: at best joint `{robot.joint_names[joint]}` exceeds "
-            f"one of them by {100 * excess[nearest_phase, joint]:.3g} %: "
+            f"one of them by {100 * excess:.3g} %: "
             "take a motion that uses less of the limits."
         )
     return WithLeads(
-        series,
-        phases[phase],
-        periods * period,
-        lead_in.duration[phase],
-        lead_out.duration[phase],
+        series, phases[phase], periods * period, lead_in[phase], lead_out[phase]
     )
 
 
-class ShortestLeads(NamedTuple):
-    """Leads to every phase of a motion."""
+def _shortest_durations(use: np.ndarray) -> np.ndarray:
+    """Return the shortest lead of each phase and joint; infinite if none is allowed."""
+    durations = np.where(use <= 1.0 + 1e-9, LEAD_DURATIONS, np.inf)
+    return durations.min(axis=0)
 
-    duration: Float[np.ndarray, "phases joints"]  # infinite where there is none [s]
-    excess: Float[np.ndarray, "phases joints"]  # least relative excess over a limit
 
-
-def _shortest_leads(
-    q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, limits: Limits
-) -> ShortestLeads:
-    """Return the shortest lead to every phase and joint within the limits."""
-    T = np.geomspace(0.02, 10.0, 120)[:, None, None]
-    alpha, beta = _velocity_coefficients(qd, qdd, T)
+def _use_of_limits(state: tuple[np.ndarray, ...], limits: Limits) -> np.ndarray:
+    """Return the used fraction of a limit by leads [durations, phases, joints]."""
+    T = LEAD_DURATIONS
+    alpha, beta = _velocity_coefficients(state[1], state[2], T)
     # The extremes lie where the next derivative is zero, or at the ends.
     with np.errstate(divide="ignore", invalid="ignore"):
-        extremes = [-alpha / beta, -2 * alpha / (3 * beta), -alpha / (3 * beta)]
+        ratio = -alpha / beta
     instants = [0 * T, T]
-    for x in extremes:
+    for x in (ratio, 2 * ratio / 3, ratio / 3):
         is_within = np.isfinite(x) & (x > 0) & (x < T)
         instants.append(np.where(is_within, x, T))
-    leads = [_lead((q, qd, qdd), T, x) for x in instants]
-    position, speed, acceleration, jerk = (
-        np.stack(parts) for parts in zip(*leads, strict=True)
-    )
+    leads = [_lead(state, T, x) for x in instants]
+    position, *rates = (np.stack(parts) for parts in zip(*leads, strict=True))
 
     low = np.asarray(limits.position_min)
     high = np.asarray(limits.position_max)
-    distance = np.abs(position - 0.5 * (low + high))
-    used_fractions = (
-        distance.max(axis=0) / (0.5 * (high - low)),
-        np.abs(speed).max(axis=0) / limits.velocity,
-        np.abs(acceleration).max(axis=0) / limits.acceleration,
-        np.abs(jerk).max(axis=0) / limits.jerk,
-    )
-    excess = np.max(used_fractions, axis=0) - 1.0
-    duration = np.where(excess <= 1e-9, T, np.inf).min(axis=0)
-    return ShortestLeads(duration, excess.min(axis=0))
+    distance = np.abs(position - 0.5 * (low + high)).max(axis=0)
+    use = distance / (0.5 * (high - low))
+    max_rates = (limits.velocity, limits.acceleration, limits.jerk)
+    for rate, max_rate in zip(rates, max_rates, strict=True):
+        use = np.maximum(use, np.abs(rate).max(axis=0) / max_rate)
+    return use

@@ -134,6 +134,8 @@ def test_words_name_what_is_exceeded(name):
             else "falls short"
             if f.is_lower_limit
             else f"{100 * peak:.3g} %"
+            if f.has_use
+            else "exceeds"
         )
         assert word in str(f)
         assert f"{abs(f.excess):.3g} {f.unit}" in str(f)

@@ -1,8 +1,5 @@
 """Distances that shapes keep while the robot moves."""
 
-import functools
-import math
-
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -47,16 +44,8 @@ class Clearance(AbstractConstraint):
 
     def entries(self, robot: Robot) -> tuple[Finding, ...]:
         """Return the pairs."""
-
-        def entry(name: str, distance: float) -> Finding:
-            usage = functools.partial(used_fraction, distance)
-            quantity = f"the clearance of {name}"
-            return Finding(quantity, SIZE, "m", distance, True, usage=usage)
-
-        return tuple(map(entry, self.model.pair_names, self.distances.tolist()))
-
-
-def used_fraction(distance: float, value: float) -> float:
-    """Return the required distance over the present one; infinite at contact."""
-    gap = distance - SIZE * value
-    return distance / gap if gap > 0 else math.inf
+        pairs = zip(self.model.pair_names, self.distances.tolist(), strict=True)
+        return tuple(
+            Finding(f"the clearance of {name}", SIZE, "m", distance, True)
+            for name, distance in pairs
+        )
