@@ -13,7 +13,7 @@ from jaxid.arrays import AnyArray, Array, Float, Hashable, Joints, double_precis
 from jaxid.errors import InputError
 
 from .forward_kinematics import placements
-from .robot import Robot
+from .robot import Robot, complete_limits
 from .shapes import GROUND, Box, Capsule, HalfSpace, segment_distance
 
 POSES = 400
@@ -177,13 +177,13 @@ class CollisionModel(Hashable):
 
     def _largest_gaps(self, robot: Robot) -> list[float]:
         """Return the largest gap of each pair in random poses [m]."""
-        low = np.asarray(robot.limits.position_min)
-        high = np.asarray(robot.limits.position_max)
-        low = np.where(np.isfinite(low), low, -np.pi)
-        high = np.where(np.isfinite(high), high, np.pi)
+        limits = complete_limits(robot)
         random = np.random.default_rng(0)
-        size = (POSES, robot.joints)
-        q = random.uniform(np.minimum(low, high), np.maximum(low, high), size)
+        q = random.uniform(
+            limits.position_min,
+            limits.position_max,
+            (POSES, robot.joints),
+        )
 
         def gaps(pose: Array) -> Array:
             return self._gaps(self.ends(robot, pose))

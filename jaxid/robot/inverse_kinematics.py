@@ -11,14 +11,13 @@ steps where Newton's method doubles the digits.)
 from typing import NamedTuple
 
 import numpy as np
-from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
 from jaxid.arrays import Joints, Matrix3, Numbers, as_array
 from jaxid.errors import InputError
 
 from .forward_kinematics import TipJacobian, tip_curvature, tip_jacobian
-from .robot import Robot, as_rotations
+from .robot import Robot, as_rotations, complete_limits
 
 POSE_TOLERANCE = 1e-9
 """Distance at which a pose is reached [m, and rad]."""
@@ -78,12 +77,9 @@ def _tip_task(robot: Robot, rotation: Numbers, posture: Numbers | None) -> _TipT
     """Return the checked task; joints without limits get half a turn, or a metre."""
     low = np.asarray(robot.limits.position_min)
     high = np.asarray(robot.limits.position_max)
-    is_limited = np.isfinite(low) & np.isfinite(high)
-    with np.errstate(invalid="ignore"):
-        default_range = np.where(robot.revolute, np.pi, 1.0)
-        half_range = np.where(is_limited, (high - low) / 2, default_range)
-        middle = np.clip(np.where(is_limited, (high + low) / 2, 0.0), low, high)
-
+    limits = complete_limits(robot)
+    half_range = 0.5 * (limits.position_max - limits.position_min)
+    middle = 0.5 * (limits.position_max + limits.position_min)
     goal = np.asarray(as_array("posture", middle if posture is None else posture))
     if goal.shape != middle.shape:
         raise InputError(
@@ -107,7 +103,9 @@ def _follow_path(task: _TipTask, positions: np.ndarray) -> np.ndarray:
     for k in nodes:
         unknowns = _newton_steps(task, positions[k : k + 1], unknowns, STRIDE_STEPS)
         solutions.append(unknowns[0])
-    guess = make_interp_spline(nodes, solutions, k=1)(np.arange(len(positions)))
+    places = np.arange(len(positions))
+    columns = [np.interp(places, nodes, column) for column in np.transpose(solutions)]
+    guess = np.transpose(columns)
     return _newton_steps(task, positions, guess, FINAL_STEPS)[:, :joints]
 
 

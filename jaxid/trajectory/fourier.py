@@ -1,6 +1,5 @@
 """Fourier series: periodic, or between standstills (Eqs. 34, 35)."""
 
-import dataclasses
 import math
 
 import equinox as eqx
@@ -9,8 +8,7 @@ from scipy.linalg import block_diag, null_space
 
 from jaxid.arrays import AnyArray, Float, is_traced, namespace
 from jaxid.errors import InputError
-from jaxid.robot.limits_and_drives import Limits
-from jaxid.robot.robot import Robot
+from jaxid.robot.robot import Robot, complete_limits
 
 from .trajectory import (
     AbstractBasis,
@@ -217,7 +215,7 @@ def random_fourier_series(
     random = np.random.default_rng(seed)
     amplitudes = random.standard_normal((2, robot.joints, harmonics))
     a, b = amplitudes / np.arange(1, harmonics + 1)
-    x = np.concatenate([np.zeros((robot.joints, 1)), a, b], axis=1)
+    x = np.hstack([np.zeros((robot.joints, 1)), a, b])
 
     # Each joint meets its tightest limit, also between the points of the envelope.
     rows, factor = basis.envelope(512)
@@ -239,32 +237,3 @@ def random_fourier_series(
     x *= scale[:, None]
     x[:, 0] = 0.5 * (low + high) - scale * centre + shift
     return basis.trajectory(x)
-
-
-def complete_limits(robot: Robot) -> Limits:
-    """Return the limits of a robot, with assumed ones for those that are unknown.
-
-    Assumed are: half a turn or 1 m to either side; 90 degrees/s or 0.5 m/s; the
-    acceleration that reaches the largest speed in 0.25 s.
-    """
-    limits = robot.limits
-    is_revolute = np.array(robot.revolute, bool)
-    half_range = np.where(is_revolute, math.pi, 1.0)
-    speed = np.where(is_revolute, math.pi / 2, 0.5)
-    low = np.asarray(limits.position_min)
-    high = np.asarray(limits.position_max)
-    has_low = np.isfinite(low)
-    has_high = np.isfinite(high)
-
-    # A range that is open on one side is as long as one that is open on both.
-    assumed_low = np.where(has_high, high - 2 * half_range, -half_range)
-    assumed_high = np.where(has_low, low + 2 * half_range, half_range)
-    velocity = np.where(np.isfinite(limits.velocity), limits.velocity, speed)
-    has_acceleration = np.isfinite(limits.acceleration)
-    return dataclasses.replace(
-        limits,
-        position_min=np.where(has_low, low, assumed_low),
-        position_max=np.where(has_high, high, assumed_high),
-        velocity=velocity,
-        acceleration=np.where(has_acceleration, limits.acceleration, velocity / 0.25),
-    )

@@ -11,9 +11,9 @@ from scipy.special import comb
 from jaxid.arrays import AnyArray, Joints, double_precision, is_traced, namespace
 from jaxid.errors import InputError
 from jaxid.robot.limits_and_drives import Limits
-from jaxid.robot.robot import Robot
+from jaxid.robot.robot import Robot, complete_limits
 
-from .fourier import PeriodsBasis, complete_limits
+from .fourier import PeriodsBasis
 from .trajectory import (
     AbstractTrajectory,
     Envelope,

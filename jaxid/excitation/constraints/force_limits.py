@@ -16,8 +16,7 @@ from jaxid.dynamics.motion import Motion
 from jaxid.dynamics.terms import AbstractTransition, Reversal
 from jaxid.errors import InputError
 from jaxid.program.gradient import pull_back
-from jaxid.robot.robot import Robot
-from jaxid.trajectory.fourier import complete_limits
+from jaxid.robot.robot import Robot, complete_limits
 
 from .constraint import (
     AbstractConstraint,
