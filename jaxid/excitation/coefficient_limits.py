@@ -41,9 +41,9 @@ class Grid(NamedTuple):
     """Limits of all joints on a grid of times."""
 
     # rows by scaled coefficients: of each joint first positions, then higher orders
-    R: Float[np.ndarray, "joints rows variables"]
+    R: np.ndarray
     # centres of the ranges, for positions; zero for the rest
-    c: Float[np.ndarray, "joints rows"]
+    c: np.ndarray
     # rows of positions, velocities, accelerations, and jerks if these are limited
     kinds: tuple[range, ...]
     bound: float  # bound of |R y - c| with which the limits hold at all times
@@ -187,9 +187,7 @@ class JointLimits(eqx.Module):
         sizes = [half, limits.velocity, limits.acceleration, limits.jerk]
         return np.array(sizes, np.float64)
 
-    def coefficients(
-        self, y: Float[AnyArray, "*batch scaled"]
-    ) -> Float[AnyArray, "*batch joints variables"]:
+    def coefficients(self, y: Float[AnyArray, "*batch scaled"]) -> AnyArray:
         """Return the coefficients of trajectories from scaled ones."""
         scale = np.asarray(self.scale)[(None,) * (y.ndim - 1)]
         return y.reshape((*y.shape[:-1], *self.shape)) * scale

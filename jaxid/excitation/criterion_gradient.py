@@ -5,7 +5,6 @@ A search asks for these thousands of times, of few samples.
 
 import numpy as np
 
-from jaxid.arrays import Float
 from jaxid.program.gradient import pull_back
 
 from .coefficient_limits import ScaledMotions
@@ -18,7 +17,7 @@ def value_and_gradient(
     x: ScaledMotions,
     sharpness: float | None,
     samples: int,
-) -> tuple[Float[np.ndarray, " starts"], ScaledMotions]:
+) -> tuple[np.ndarray, ScaledMotions]:
     """Return the logarithms of the criterion and their derivatives by each motion.
 
     Motions are evaluated at `samples`, which stand for all that will be measured.
@@ -69,8 +68,8 @@ def _slopes_by_columns(
     weight: float,
     by_plain: np.ndarray,
     by_weighted: np.ndarray,
-) -> Float[np.ndarray, "joints base starts samples"]:
-    """Return derivatives by the entries of the regressor."""
+) -> np.ndarray:
+    """Return derivatives by the regressor's entries [joints, base, starts, samples]."""
     starts, _, samples = columns[0].shape
     slopes = np.zeros((len(columns), problem.base.size, starts, samples))
     numbers_by_joint = problem.regressor.columns

@@ -20,7 +20,7 @@ import scipy.linalg
 
 from jaxid.arrays import Float
 
-from .coefficient_limits import Grid
+from .coefficient_limits import Grid, ScaledMotions
 
 INITIAL_CURVATURE = 0.3  # small, so that first steps are large
 TO_BOUNDARY = 0.995  # fraction of the way to the next limit that a step may go
@@ -46,7 +46,7 @@ class Evaluation(NamedTuple):
     value: float
     gradient: ScaledVector
     excess: ConstraintVector
-    slopes: Float[np.ndarray, "constraints scaled"]
+    slopes: np.ndarray  # of the constraints, by the scaled coefficients
 
 
 Inequalities = Float[np.ndarray, " inequalities"]
@@ -60,7 +60,7 @@ are any.
 class Parts(NamedTuple):
     """The numbers of inequalities by their kinds."""
 
-    limits: Float[np.ndarray, " limits"]
+    limits: np.ndarray
     constraints: ConstraintVector
     slack: SlackVector
 
@@ -72,7 +72,7 @@ class Iterate(NamedTuple):
     slack: SlackVector
     evaluation: Evaluation
     duals: Inequalities  # multipliers
-    curvature: Float[np.ndarray, "scaled scaled"]  # of the Lagrangian
+    curvature: np.ndarray  # of the Lagrangian
     barrier: float  # weight of the logarithmic barrier
     step: StepVector
     dual_step: Inequalities
@@ -99,9 +99,7 @@ class Stage(NamedTuple):
     penalty: float = 10.0  # penalty of the slack by which constraints are exceeded
 
 
-def begin(
-    grid: Grid, y: Float[np.ndarray, "starts scaled"], constraints: int = 0
-) -> list[Iterate]:
+def begin(grid: Grid, y: ScaledMotions, constraints: int = 0) -> list[Iterate]:
     """Return the iterates of some starts before the first stage."""
     size = np.shape(y)[1]
     slack = np.zeros(1 if constraints else 0)
@@ -280,7 +278,7 @@ def _with_step(
 
 def _barrier_hessian(
     grid: Grid, iterate: Iterate, stiffness: Inequalities
-) -> Float[np.ndarray, "scaled_and_slack scaled_and_slack"]:
+) -> np.ndarray:
     """Return the curvature of the objective with its barrier."""
     slopes = iterate.evaluation.slopes
     size = len(iterate.y)

@@ -133,7 +133,7 @@ class ExcitationProblem:
         self.sizes = np.ones(base.size)
         self.sizes = self._typical_sizes()
 
-    def _typical_sizes(self) -> Float[np.ndarray, " base"]:
+    def _typical_sizes(self) -> np.ndarray:
         """Return each parameter's deviation if it were the only one."""
         motions = self.limits.random(jax.random.key(0), 8)
         weighted = [self.information(x).weighted for x in motions]
@@ -230,7 +230,7 @@ class ExcitationProblem:
         )
         return [constraint(self.robot, motion) for constraint in self.constraints]
 
-    def sample_rows(self, samples: int) -> Float[np.ndarray, "3 samples variables"]:
+    def sample_rows(self, samples: int) -> np.ndarray:
         """Return the rows of the basis, up to accelerations, at samples of a run."""
         if samples not in self._sample_rows:
             times = self.basis.times(samples)
@@ -269,15 +269,13 @@ class ExcitationProblem:
         return findings
 
 
-def assumed_noise(robot: Robot) -> Float[np.ndarray, " joints"]:
+def assumed_noise(robot: Robot) -> np.ndarray:
     """Return the assumed standard deviations of the forces' noise [N m or N]."""
     return 0.01 * np.asarray(robot.max_forces)
 
 
-def highest_values(
-    values: Float[AnyArray, "instants values"],
-) -> Float[AnyArray, " values"]:
-    """Return the highest values, also between instants: tops of parabolas."""
+def highest_values(values: AnyArray) -> AnyArray:
+    """Return the highest of the values at instants, also between: tops of parabolas."""
     xp = namespace(values)
     previous_values = values[:-2]
     middle_values = values[1:-1]

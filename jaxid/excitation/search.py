@@ -14,7 +14,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxid.arrays import Float
 from jaxid.dynamics.motion import Motion
 
 from . import interior_point
@@ -249,7 +248,7 @@ def _evaluate(
     problem: ExcitationProblem,
     sharpness: float,
     watched_values: Sequence[list[WatchedValues]],
-    y: Float[np.ndarray, "points scaled"],
+    y: ScaledMotions,
     starts: Sequence[int],
 ) -> list[Evaluation]:
     """Return criterion and constraints at points of these starts."""
@@ -274,7 +273,7 @@ def _take(
 
 def _feasible_places(
     problem: ExcitationProblem, random: np.random.Generator, count: int
-) -> Float[np.ndarray, "count joints"]:
+) -> np.ndarray:
     """Return random places in the joints' ranges that keep constraints best."""
     limits = problem.limits.limits
     low = np.asarray(limits.position_min)

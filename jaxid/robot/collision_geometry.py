@@ -92,7 +92,7 @@ def _read_shape(tree: UrdfTree, packages: str | Path | None, element: Any) -> Sh
 
 def _mesh_vertices(
     tree: UrdfTree, packages: str | Path | None, element: Any
-) -> Float[np.ndarray, "points 3"]:
+) -> np.ndarray:
     """Return the vertices of a mesh in the unit of its file."""
     import trimesh  # loaded where there are meshes
 

@@ -155,8 +155,8 @@ class CollisionModel(Hashable):
         clearances = jnp.take_along_axis(gaps_of_groups, minimum, axis=-1)[..., 0]
         return clearances.reshape(*batch, len(self.groups))
 
-    def _gaps(self, ends: Float[Array, "capsules 2 3"]) -> Float[Array, " pairs"]:
-        """Return the distance between the surfaces of each pair in one pose [m]."""
+    def _gaps(self, ends: Array) -> Array:
+        """Return the distance between the surfaces of each pair for some `ends` [m]."""
         start = ends[:, 0]
         end = ends[:, 1]
         radii = jnp.stack([jnp.asarray(capsule.radius) for capsule in self.capsules])

@@ -10,14 +10,14 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Float, Joints, Matrix3, Vector3
+from jaxid.arrays import AnyArray, Joints, Matrix3, Vector3
 
 from .robot import Robot
-from .rotations import rotation_about
+from .rotations import Rotations, Vectors, rotation_about
 
 
 def placement_in_parent(
-    robot: Robot, body: int, q: Float[AnyArray, ""]
+    robot: Robot, body: int, q: AnyArray
 ) -> tuple[Matrix3, Vector3]:
     """Return attitude and origin [m] of a body in its parent at a coordinate."""
     R = robot.rotation[body]
@@ -28,9 +28,7 @@ def placement_in_parent(
     return R, r + R @ axis * q
 
 
-def placements(
-    robot: Robot, q: Joints
-) -> tuple[Float[AnyArray, "joints 3 3"], Float[AnyArray, "joints 3"]]:
+def placements(robot: Robot, q: Joints) -> tuple[Rotations, Vectors]:
     """Return attitudes and origins [m] of all bodies in the frame of the ground."""
     q = jnp.asarray(q)
     rotations = []

@@ -121,7 +121,7 @@ class Drives(Hashable):
         return np.array_equal(self.reduction, unit_gears) and not np.any(self.zero)
 
     @property
-    def _inverse(self) -> Float[AnyArray, "joints joints"]:
+    def _inverse(self) -> AnyArray:
         """Joint angle for motor angle."""
         return namespace(self.reduction).linalg.inv(self.reduction)
 

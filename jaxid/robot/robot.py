@@ -45,7 +45,7 @@ class Tool(eqx.Module):
 
     body: int = eqx.field(static=True)
     _: dataclasses.KW_ONLY
-    mass: Float[AnyArray, ""] = eqx.field(converter=given)
+    mass: AnyArray = eqx.field(converter=given)
     centre_of_mass: Vector3 = eqx.field(converter=given)
     inertia: Matrix3 = eqx.field(converter=given, default=None)
 
@@ -69,7 +69,7 @@ class Tool(eqx.Module):
         return Inertia(self.mass, self.centre_of_mass, self.inertia)
 
     @property
-    def parameters(self) -> Float[AnyArray, "10"]:
+    def parameters(self) -> AnyArray:
         """Parameters $(m, m r_c, A, B, C, D, E, F)$ about the origin (Eqs. 8, 9)."""
         return self.body_inertia.parameters
 
@@ -307,7 +307,7 @@ class Robot(Summarised, eqx.Module):
     def with_tool(
         self,
         *,
-        mass: Float[AnyArray, ""] | float | int,
+        mass: AnyArray | float | int,
         centre_of_mass: Numbers,
         inertia: Numbers | None = None,
     ) -> "Robot":

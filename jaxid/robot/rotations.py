@@ -12,6 +12,10 @@ from scipy.spatial.transform import Rotation
 from jaxid.arrays import AnyArray, Float, Matrix3, Numbers, Vector3, namespace
 from jaxid.errors import InputError
 
+Vectors = Float[AnyArray, "*batch 3"]
+"""Points or directions, with any leading axes."""
+Rotations = Float[AnyArray, "*batch 3 3"]
+"""Rotations, or inertia tensors, with any leading axes."""
 SNAP_TOLERANCE = 1e-4
 """Default difference from a quarter turn that counts as rounding [rad]."""
 
@@ -24,9 +28,7 @@ def skew(a: Vector3) -> Matrix3:
     return namespace(a).array(rows)
 
 
-def rotation_about(
-    axis: Vector3, angle: Float[AnyArray, "*batch"]
-) -> Float[AnyArray, "*batch 3 3"]:
+def rotation_about(axis: Vector3, angle: AnyArray) -> Rotations:
     """Return the rotation about a unit vector by an angle [rad].
 
     The part of a vector along the axis stays and the rest turns: in this form a
@@ -59,9 +61,7 @@ def rpy_angles(rotation: Matrix3) -> Vector3:
     return np.array([roll, pitch, yaw])
 
 
-def snapped(
-    vectors: Float[AnyArray, "*shape 3"], tolerance: float
-) -> Float[np.ndarray, "*shape 3"]:
+def snapped(vectors: Vectors, tolerance: float) -> np.ndarray:
     """Return unit vectors whose entries within `tolerance` of zero are zero."""
     if not 0.0 <= tolerance < 0.1:
         raise InputError(
@@ -74,9 +74,7 @@ def snapped(
     return without_rounding(entries / lengths)
 
 
-def snapped_rotations(
-    rotations: Float[AnyArray, "*shape 3 3"], tolerance: float
-) -> Float[np.ndarray, "*shape 3 3"]:
+def snapped_rotations(rotations: Rotations, tolerance: float) -> np.ndarray:
     """Return nearest rotations whose entries within `tolerance` of zero are zero."""
     R = np.asarray(rotations, np.float64)
     rows = snapped(rotations, tolerance)

@@ -17,13 +17,13 @@ from jaxid.arrays import AnyArray, Array, Float, Matrix3, Numbers, Vector3
 from jaxid.errors import InputError
 
 from .robot import as_finite_array, as_rotations
+from .rotations import Vectors
 
 GROUND = -1
 """Index of the ground among the bodies."""
 ROUNDING = 1e-6
 """Largest error of a distance, by which it is smooth at zero [m]."""
 
-Vectors = Float[AnyArray, "*batch 3"]
 Lengths = Float[AnyArray, "*batch"]
 
 
@@ -45,7 +45,7 @@ class Capsule(eqx.Module):
     body: int = eqx.field(static=True)
     start: Vector3
     end: Vector3
-    radius: Float[AnyArray, ""]
+    radius: AnyArray
 
     def __init__(
         self,
@@ -83,7 +83,7 @@ class HalfSpace(eqx.Module):
 
     name: str = eqx.field(static=True)
     normal: Vector3
-    height: Float[AnyArray, ""]
+    height: AnyArray
 
     def __init__(
         self,

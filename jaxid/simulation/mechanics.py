@@ -145,7 +145,7 @@ def follow(
     plant: Any,
     servo: Servo,
     desired: Motion,
-    forward: np.ndarray,
+    forward: AnyArray,
     limits: Joints,
     resolution: Joints,
     substeps: int,

@@ -151,7 +151,7 @@ class Tracking(eqx.Module):
             0 to 1.
     """
 
-    time: Float[AnyArray, " samples"]
+    time: AnyArray
     desired: Motion
     actual: Motion
     forces: PerSample
@@ -220,7 +220,7 @@ class VirtualRobot(Hashable):
         return Model(self.robot, (self.terms[0], *self.friction.terms, *self.terms[1:]))
 
     @property
-    def parameters(self) -> Float[np.ndarray, " standard"]:
+    def parameters(self) -> np.ndarray:
         """True standard parameters of `model` at the present temperature."""
         first, *others = (np.asarray(x) for _, x in self.bodies.split(self.values))
         return np.concatenate([first, self.present_friction.parameters, *others])

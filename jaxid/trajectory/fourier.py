@@ -6,7 +6,7 @@ import equinox as eqx
 import numpy as np
 from scipy.linalg import block_diag, null_space
 
-from jaxid.arrays import AnyArray, Float, is_traced, namespace
+from jaxid.arrays import AnyArray, Float, Joints, is_traced, namespace
 from jaxid.errors import InputError
 from jaxid.robot.robot import Robot, complete_limits
 
@@ -40,7 +40,7 @@ class FourierBasis(AbstractBasis):
     """
 
     harmonics: int = eqx.field(static=True)
-    omega: Float[AnyArray, ""] = eqx.field(converter=as_scalar)
+    omega: AnyArray = eqx.field(converter=as_scalar)
 
     def __check_init__(self):
         if self.harmonics < 1:
@@ -90,7 +90,7 @@ class PeriodsBasis(AbstractBasis):
     """Periods of a Fourier series between two standstills: base of two bases."""
 
     harmonics: int = eqx.field(static=True)
-    omega: Float[AnyArray, ""] = eqx.field(converter=as_scalar)
+    omega: AnyArray = eqx.field(converter=as_scalar)
     periods: int = eqx.field(static=True, default=1)
 
     def __check_init__(self):
@@ -133,7 +133,7 @@ class RestToRestBasis(PeriodsBasis):
         return self.periods * self.series.duration
 
     @property
-    def directions(self) -> Float[np.ndarray, "coefficients variables"]:
+    def directions(self) -> np.ndarray:
         """Orthonormal coefficients of the series that rest at both ends."""
         orders = np.arange(1.0, self.harmonics + 1.0)
         a = null_space(np.ones((1, self.harmonics)))
@@ -159,7 +159,7 @@ class RestToRestBasis(PeriodsBasis):
 
 
 def fourier_series(
-    offset: Float[AnyArray, " joints"],
+    offset: Joints,
     a: Float[AnyArray, "joints harmonics"],
     b: Float[AnyArray, "joints harmonics"],
     omega: Time,

@@ -77,7 +77,7 @@ class LeadsBasis(PeriodsBasis):
         InputError: If one of them is not positive.
     """
 
-    lead: Time = eqx.field(converter=as_scalar, default=0.5, kw_only=True)
+    lead: AnyArray = eqx.field(converter=as_scalar, default=0.5, kw_only=True)
 
     def __check_init__(self):
         if not is_traced(self.lead) and not 0 < self.lead < math.inf:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import equinox as eqx
 import numpy as np
 
-from jaxid.arrays import Matrix3, Numbers, Vector3, as_array
+from jaxid.arrays import AnyArray, Matrix3, Numbers, Vector3, as_array
 from jaxid.errors import InputError
 from jaxid.robot.inverse_kinematics import inverse_kinematics_along
 from jaxid.robot.robot import Robot
@@ -37,7 +37,7 @@ class Curve(NamedTuple):
         radius: Radius of curvature; infinite for a line [m].
     """
 
-    at: Callable[[np.ndarray], np.ndarray]
+    at: Callable[[np.ndarray], AnyArray]
     length: float
     radius: float
 
@@ -46,7 +46,7 @@ def line(start: Vector3, end: Vector3) -> Curve:
     """Return a straight line between two points [m]."""
     step = np.subtract(end, start)
 
-    def at(fraction: np.ndarray) -> np.ndarray:
+    def at(fraction: np.ndarray) -> AnyArray:
         return start + fraction[:, None] * step
 
     return Curve(at, float(np.linalg.norm(step)), np.inf)
@@ -63,7 +63,7 @@ def circle(centre: Vector3, first: Vector3, second: Vector3) -> Curve:
     """
     radius = float(np.linalg.norm(first))
 
-    def at(fraction: np.ndarray) -> np.ndarray:
+    def at(fraction: np.ndarray) -> AnyArray:
         angle = 2 * np.pi * fraction[:, None]
         return centre + np.cos(angle) * first + np.sin(angle) * second
 

@@ -96,7 +96,7 @@ class RestToRestSplineBasis(AbstractBasis):
     """
 
     points: int = eqx.field(static=True, default=12)
-    duration: Float[AnyArray, ""] = eqx.field(converter=as_scalar, default=8.0)
+    duration: AnyArray = eqx.field(converter=as_scalar, default=8.0)
 
     def __check_init__(self):
         if self.points < 2:
@@ -156,7 +156,7 @@ def spline_polynomials(spline: BSpline) -> PolynomialCoefficients:
 
 
 @functools.cache
-def _unit_polynomials(points: int) -> tuple[np.ndarray, np.ndarray]:
+def _unit_polynomials(points: int) -> tuple[Knots, PolynomialCoefficients]:
     """Return starts and polynomials of the splines with unit coefficients."""
     unit = np.eye(points)
     control_points = np.concatenate([unit[:1], unit[:1], unit, unit[-1:], unit[-1:]])

@@ -58,7 +58,7 @@ class AbstractTrajectory(Hashable):
     def states(self, t: Times) -> States:
         """Return positions, velocities and accelerations at times [s], under `jit`."""
 
-    def motion(self, t: Float[AnyArray, "*batch"] | float | int) -> Motion:
+    def motion(self, t: AnyArray | float | int) -> Motion:
         """Return the motion at one time or at many [s]."""
         return _motion(self, jnp.asarray(t, float))
 
@@ -67,18 +67,14 @@ class AbstractTrajectory(Hashable):
         """Number of joints."""
         return jax.eval_shape(lambda: self.motion(0.0)).q.shape[-1]
 
-    def jerk(
-        self, t: Float[AnyArray, "*batch"] | float | int
-    ) -> Float[Array, "*batch joints"]:
+    def jerk(self, t: AnyArray | float | int) -> Array:
         """Return the derivatives of accelerations [rad/s³ or m/s³] at times [s]."""
         times = jnp.asarray(t, float)
         ones = jnp.ones_like(times)
         _, jerk = jax.jvp(lambda t: self.motion(t).qdd, (times,), (ones,))
         return jerk
 
-    def sample(
-        self, sample_time: float
-    ) -> tuple[Float[np.ndarray, " samples"], Motion]:
+    def sample(self, sample_time: float) -> tuple[np.ndarray, Motion]:
         """Return times from the start to the end [s], and the motion at them.
 
         Args:
@@ -194,7 +190,7 @@ class AbstractBasis(eqx.Module):
         """Return equidistant times over the whole motion, for constraints [s]."""
         return self.times(points)
 
-    def retimings(self) -> Float[np.ndarray, "retimings variables variables"]:
+    def retimings(self) -> np.ndarray:
         """Return maps to coefficients of the same motion, begun later or reversed.
 
         Only maps that stay in the family are returned: a periodic motion may begin at

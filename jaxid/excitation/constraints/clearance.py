@@ -4,13 +4,12 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import Array, Float
 from jaxid.dynamics.dispatch import on_samples
 from jaxid.dynamics.motion import Motion
 from jaxid.robot.collision import CollisionModel
 from jaxid.robot.robot import Robot
 
-from .constraint import AbstractConstraint, Finding
+from .constraint import AbstractConstraint, Excess, Finding
 
 SIZE = 0.1
 """Missing distance that counts as one [m]."""
@@ -32,11 +31,11 @@ class Clearance(AbstractConstraint):
     distance: float = 0.03
 
     @property
-    def distances(self) -> Float[np.ndarray, " pairs"]:
+    def distances(self) -> np.ndarray:
         """Least distance of each pair [m]."""
         return np.minimum(self.distance, 0.5 * np.array(self.model.room))
 
-    def __call__(self, robot: Robot, motion: Motion) -> Float[Array, "*batch values"]:
+    def __call__(self, robot: Robot, motion: Motion) -> Excess:
         """Return the missing distance of each pair."""
         ends = eqx.Partial(self.model.ends, robot)
         gaps = self.model.clearances(on_samples(ends, ends.__call__, motion.q))

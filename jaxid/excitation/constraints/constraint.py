@@ -14,6 +14,8 @@ from jaxid.arrays import AnyArray, Array, Float, Int
 from jaxid.dynamics.motion import Motion
 from jaxid.robot.robot import Robot
 
+Excess = Float[Array, "*batch values"]
+"""Relative excess over each limit, at each sample."""
 BLOCK = 96
 """Samples for which derivatives are compiled: those watched of one motion."""
 
@@ -100,7 +102,7 @@ class AbstractConstraint(eqx.Module):
     """
 
     @abstractmethod
-    def __call__(self, robot: Robot, motion: Motion) -> Float[Array, "*batch values"]:
+    def __call__(self, robot: Robot, motion: Motion) -> Excess:
         """Return the excess over each limit at each sample; not positive if kept.
 
         Runs under `jit`, `vmap` and derivatives with respect to the motion.
@@ -148,9 +150,7 @@ class AbstractConstraint(eqx.Module):
 
         return linearise
 
-    def describe(
-        self, robot: Robot, values: Float[AnyArray, "*batch values"]
-    ) -> list[Finding]:
+    def describe(self, robot: Robot, values: AnyArray) -> list[Finding]:
         """Return the limited quantities with the largest of their values."""
         entries = self.entries(robot)
         peaks = np.asarray(values).reshape(-1, len(entries)).max(axis=0)

@@ -20,6 +20,7 @@ from jaxid.robot.robot import Robot, complete_limits
 
 from .constraint import (
     AbstractConstraint,
+    Excess,
     Finding,
     Linearisation,
     ValuesAndSlopes,
@@ -89,7 +90,7 @@ class ForceLimits(AbstractConstraint):
                 "rows and columns without negative eigenvalues."
             )
 
-    def __call__(self, robot: Robot, motion: Motion) -> Float[Array, "*batch values"]:
+    def __call__(self, robot: Robot, motion: Motion) -> Excess:
         """Return the relative excess over each limit."""
         limits, to_limited = self._limited(robot)
         forces = self._forces(motion)
@@ -114,7 +115,7 @@ class ForceLimits(AbstractConstraint):
         to_limited = np.concatenate([np.eye(robot.joints), to_motors], axis=1)
         return (1 - self.margin) * limits[has_limit], to_limited[:, has_limit]
 
-    def _forces(self, motion: Motion) -> Float[AnyArray, "*batch 3 joints"]:
+    def _forces(self, motion: Motion) -> AnyArray:
         """Return `forces` at all samples."""
         # Rows of samples in NumPy need no compiler.
         is_rows = isinstance(motion.q, np.ndarray) and motion.q.ndim == 2
@@ -171,9 +172,7 @@ class ForceLimits(AbstractConstraint):
         by_motion = _pull_back(base, base.columns, weights, arrays)
         return self.deviations * deviation, by_motion
 
-    def forces(
-        self, q: Coordinates, qd: Coordinates, qdd: Coordinates
-    ) -> Float[Array, "3 joints"]:
+    def forces(self, q: Coordinates, qd: Coordinates, qdd: Coordinates) -> Array:
         """Return the forces of one sample, also with friction to either side."""
         model = self.base.model
         p = self.base.to_standard(jnp.asarray(self.parameters))

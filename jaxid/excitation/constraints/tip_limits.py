@@ -8,21 +8,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Array, Float, Vector3, as_array
+from jaxid.arrays import Vector3, as_array
 from jaxid.dynamics.dispatch import on_samples
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
 from jaxid.robot.forward_kinematics import tip_placement
 from jaxid.robot.robot import Robot
+from jaxid.robot.rotations import Vectors
 
 from .clearance import SIZE
-from .constraint import AbstractConstraint, Finding
+from .constraint import AbstractConstraint, Excess, Finding
 
 SMOOTHING = 1e-6
 """Value of a rate over its limit at standstill, where it is made smooth."""
 
 
-def tip_motion(robot: Robot, motion: Motion) -> tuple[Float[AnyArray, "*batch 3"], ...]:
+def tip_motion(robot: Robot, motion: Motion) -> tuple[Vectors, ...]:
     """Return position, velocity and acceleration of the end-effector's origin [m, s].
 
     They are those in the frame of the ground, without gravity.
@@ -93,7 +94,7 @@ class TipLimits(AbstractConstraint):
                 f"ones, but are {self.low} and {self.high} [m]."
             )
 
-    def __call__(self, robot: Robot, motion: Motion) -> Float[Array, "*batch values"]:
+    def __call__(self, robot: Robot, motion: Motion) -> Excess:
         """Return the relative excess over each limit."""
         position, velocity, acceleration = tip_motion(robot, motion)
         values = []

@@ -87,7 +87,7 @@ def gram_matrices(
 
 def standard_deviations(
     weighted: BaseMatrix,
-) -> Float[np.ndarray, " base"]:
+) -> np.ndarray:
     """Return standard deviations from information; infinite where undetermined."""
     matrix, scale = scale_to_unit_diagonal(np.asarray(weighted, np.float64))
     eigenvalues, directions = np.linalg.eigh(matrix)
