@@ -121,7 +121,9 @@ def evaluate_within_limits(problem: ExcitationProblem, x: ScaledMotions) -> Cand
 
 
 def _shrink_slightly(
-    problem: ExcitationProblem, grid: Grid, motion: np.ndarray
+    problem: ExcitationProblem,
+    grid: Grid,
+    motion: np.ndarray,
 ) -> np.ndarray:
     """Return a smaller motion that keeps constraints which are exceeded a little."""
     if not 0.0 < problem.excess(motion) <= MAX_COARSE_EXCESS:

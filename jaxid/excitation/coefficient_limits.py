@@ -60,7 +60,9 @@ class Grid(NamedTuple):
         return (self.rows(y) - self.c) / self.bound
 
     def scale_into_limits(
-        self, y: ScaledMotion, bound: float | None = None
+        self,
+        y: ScaledMotion,
+        bound: float | None = None,
     ) -> np.ndarray:
         """Return the nearest motion of the same shape that keeps |R y - c| <= bound.
 
@@ -99,7 +101,11 @@ class Grid(NamedTuple):
         return Extent(positions, np.maximum(np.abs(rates).max(axis=1), half_swing))
 
     def _scale(
-        self, y: ScaledMotion, positions: np.ndarray, factors: PerJoint, bound: float
+        self,
+        y: ScaledMotion,
+        positions: np.ndarray,
+        factors: PerJoint,
+        bound: float,
     ) -> np.ndarray:
         """Return the motion scaled about its means, then shifted into the ranges."""
         low, high = self._shift_range(positions, factors, bound)
@@ -107,7 +113,10 @@ class Grid(NamedTuple):
         return self._move(y, factors, np.clip(shifts, low, np.maximum(low, high)))
 
     def _shift_range(
-        self, positions: np.ndarray, factors: PerJoint, bound: float
+        self,
+        positions: np.ndarray,
+        factors: PerJoint,
+        bound: float,
     ) -> tuple[PerJoint, PerJoint]:
         """Return the shifts between which scaled positions keep their range."""
         centre = self.c[:, 0]
@@ -149,7 +158,10 @@ class JointLimits(eqx.Module):
     assumed: tuple[tuple[str, int], ...] = eqx.field(static=True)
 
     def __init__(
-        self, robot: Robot, basis: AbstractBasis, limits: Limits | None = None
+        self,
+        robot: Robot,
+        basis: AbstractBasis,
+        limits: Limits | None = None,
     ):
         limits = robot.limits if limits is None else limits
         self.basis = basis

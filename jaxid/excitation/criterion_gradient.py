@@ -31,7 +31,10 @@ def value_and_gradient(
 
     plain, weighted = gram_matrices(regressor, columns, problem.weights)
     values, by_plain, by_weighted = _criterion_and_slopes(
-        problem, weight * plain, weight * weighted + problem.prior, sharpness
+        problem,
+        weight * plain,
+        weight * weighted + problem.prior,
+        sharpness,
     )
     by_columns = _slopes_by_columns(problem, columns, weight, by_plain, by_weighted)
     packed_slopes = by_columns.reshape(-1, *by_columns.shape[2:])

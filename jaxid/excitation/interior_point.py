@@ -168,7 +168,10 @@ def _begin_stage(grid: Grid, stage: Stage, iterate: Iterate) -> Iterate:
 
 
 def _update(
-    grid: Grid, stage: Stage, iterate: Iterate, evaluation: Evaluation
+    grid: Grid,
+    stage: Stage,
+    iterate: Iterate,
+    evaluation: Evaluation,
 ) -> Iterate:
     """Take the step of one start, or shorten it."""
     slack = _cheapest_slack(stage, iterate, evaluation.excess)
@@ -258,7 +261,10 @@ def _take_step(
 
 
 def _with_step(
-    grid: Grid, stage: Stage, iterate: Iterate, room: Inequalities
+    grid: Grid,
+    stage: Stage,
+    iterate: Iterate,
+    room: Inequalities,
 ) -> Iterate:
     """Return one start with the step to the barrier's minimum and its length."""
     stiffness = iterate.duals / room
@@ -277,7 +283,9 @@ def _with_step(
 
 
 def _barrier_hessian(
-    grid: Grid, iterate: Iterate, stiffness: Inequalities
+    grid: Grid,
+    iterate: Iterate,
+    stiffness: Inequalities,
 ) -> np.ndarray:
     """Return the curvature of the objective with its barrier."""
     slopes = iterate.evaluation.slopes
@@ -311,7 +319,10 @@ def _add_limits(H: np.ndarray, grid: Grid, stiffness: np.ndarray) -> None:
 
 
 def _downhill(
-    grid: Grid, stage: Stage, iterate: Iterate, central: Inequalities
+    grid: Grid,
+    stage: Stage,
+    iterate: Iterate,
+    central: Inequalities,
 ) -> StepVector:
     """Return the negative gradient of the objective with its barrier."""
     evaluation = iterate.evaluation
@@ -337,7 +348,9 @@ def _solve(H: np.ndarray, downhill: np.ndarray) -> np.ndarray:
 
 
 def _change_of_inequalities(
-    grid: Grid, iterate: Iterate, step: np.ndarray
+    grid: Grid,
+    iterate: Iterate,
+    step: np.ndarray,
 ) -> Inequalities:
     """Return by how much a step reduces the distance from each bound."""
     size = len(iterate.y)
@@ -355,7 +368,11 @@ def _limit_room(grid: Grid, stage: Stage, y: np.ndarray) -> np.ndarray:
 
 
 def _room(
-    grid: Grid, stage: Stage, y: np.ndarray, evaluation: Evaluation, slack: np.ndarray
+    grid: Grid,
+    stage: Stage,
+    y: np.ndarray,
+    evaluation: Evaluation,
+    slack: np.ndarray,
 ) -> Inequalities:
     """Return the distances from all bounds."""
     limit_room = _limit_room(grid, stage, y)
@@ -397,7 +414,9 @@ def _damped_bfgs(B: np.ndarray, s: np.ndarray, change: np.ndarray) -> np.ndarray
 
 
 def _cheapest_slack(
-    stage: Stage, iterate: Iterate, excess: ConstraintVector
+    stage: Stage,
+    iterate: Iterate,
+    excess: ConstraintVector,
 ) -> SlackVector:
     """Return the slack of least cost, the barrier included.
 

@@ -178,11 +178,16 @@ class ExcitationProblem:
         # The samples stand for all that are measured.
         weight = self.samples / samples
         return self._criterion_of(
-            weight * plain[0], weight * weighted[0] + self.prior, sharpness
+            weight * plain[0],
+            weight * weighted[0] + self.prior,
+            sharpness,
         )
 
     def _criterion_of(
-        self, plain: Array, weighted: Array, sharpness: Sharpness
+        self,
+        plain: Array,
+        weighted: Array,
+        sharpness: Sharpness,
     ) -> Scalar:
         """Return the logarithm of the criterion of one motion's information."""
         return self.criterion(Information(plain, weighted, self.sizes), sharpness)
@@ -216,7 +221,9 @@ class ExcitationProblem:
         return violation
 
     def constraint_values(
-        self, x: ScaledMotion, instants: Any = slice(None)
+        self,
+        x: ScaledMotion,
+        instants: Any = slice(None),
     ) -> list[Float[AnyArray, "instants values"]]:
         """Return the values of each constraint at some of the checked instants.
 

@@ -41,7 +41,9 @@ class Shape(NamedTuple):
 
 
 def link_shapes(
-    tree: UrdfTree, packages: str | Path | None, link: str
+    tree: UrdfTree,
+    packages: str | Path | None,
+    link: str,
 ) -> Iterator[Shape]:
     """Yield the collision shapes of a link of a URDF file, or else its visual ones.
 
@@ -63,7 +65,9 @@ def link_shapes(
         description = part.find("geometry/*")
         # An element without geometry is named in the error.
         shape = _read_shape(
-            tree, packages, part if description is None else description
+            tree,
+            packages,
+            part if description is None else description,
         )
         yield shape.placed(rotation, position)
 
@@ -91,7 +95,9 @@ def _read_shape(tree: UrdfTree, packages: str | Path | None, element: Any) -> Sh
 
 
 def _mesh_vertices(
-    tree: UrdfTree, packages: str | Path | None, element: Any
+    tree: UrdfTree,
+    packages: str | Path | None,
+    element: Any,
 ) -> np.ndarray:
     """Return the vertices of a mesh in the unit of its file."""
     import trimesh  # loaded where there are meshes
@@ -112,7 +118,9 @@ def _mesh_vertices(
 
 
 def _mesh_files(
-    description: Path, packages: str | Path | None, name: str
+    description: Path,
+    packages: str | Path | None,
+    name: str,
 ) -> Iterator[Path]:
     """Yield the places where the mesh of a description may be."""
     scheme, _, location = name.rpartition("://")

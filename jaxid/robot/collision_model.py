@@ -122,7 +122,9 @@ class CollisionModel(Hashable):
 
     @eqx.filter_jit
     def clearance(
-        self, robot: Robot, q: Float[AnyArray, "*batch joints"]
+        self,
+        robot: Robot,
+        q: Float[AnyArray, "*batch joints"],
     ) -> Float[AnyArray, "*batch groups"]:
         """Return the clearances of poses, negative where shapes overlap [m].
 
@@ -150,7 +152,9 @@ class CollisionModel(Hashable):
         gaps_of_groups = gaps[:, np.array(places)]
         # The derivative is that of one pair, also where several are equally near.
         minimum = jnp.argmin(
-            jax.lax.stop_gradient(gaps_of_groups), axis=-1, keepdims=True
+            jax.lax.stop_gradient(gaps_of_groups),
+            axis=-1,
+            keepdims=True,
         )
         clearances = jnp.take_along_axis(gaps_of_groups, minimum, axis=-1)[..., 0]
         return clearances.reshape(*batch, len(self.groups))
@@ -252,7 +256,9 @@ def _check_shapes(robot: Robot, capsules: Sequence[Capsule], names: list[str]) -
 
 
 def _meeting_pairs(
-    robot: Robot, capsules: Sequence[Capsule], obstacles: int
+    robot: Robot,
+    capsules: Sequence[Capsule],
+    obstacles: int,
 ) -> list[tuple[int, int]]:
     """Return the pairs of shapes on bodies that are neither one nor neighbours."""
     bodies = [capsule.body for capsule in capsules] + [GROUND] * obstacles

@@ -17,7 +17,9 @@ from .rotations import Rotations, Vectors, rotation_about
 
 
 def placement_in_parent(
-    robot: Robot, body: int, q: AnyArray
+    robot: Robot,
+    body: int,
+    q: AnyArray,
 ) -> tuple[Matrix3, Vector3]:
     """Return attitude and origin [m] of a body in its parent at a coordinate."""
     R = robot.rotation[body]
@@ -94,7 +96,9 @@ def tip_jacobian(robot: Robot, q: np.ndarray) -> TipJacobian:
 
 
 def tip_curvature(
-    tip: TipJacobian, force: np.ndarray, moment: np.ndarray
+    tip: TipJacobian,
+    force: np.ndarray,
+    moment: np.ndarray,
 ) -> np.ndarray:
     """Return second derivatives of the placement, times a force and a moment.
 

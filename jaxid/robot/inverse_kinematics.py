@@ -118,7 +118,10 @@ def _ends_of_strides(positions: np.ndarray) -> np.ndarray:
 
 
 def _newton_steps(
-    task: _TipTask, positions: np.ndarray, unknowns: Unknowns, count: int
+    task: _TipTask,
+    positions: np.ndarray,
+    unknowns: Unknowns,
+    count: int,
 ) -> Unknowns:
     """Take some steps with the curvature of the placements."""
     for _ in range(count):
@@ -127,7 +130,10 @@ def _newton_steps(
 
 
 def _newton_step(
-    task: _TipTask, positions: np.ndarray, unknowns: Unknowns, curved: bool = True
+    task: _TipTask,
+    positions: np.ndarray,
+    unknowns: Unknowns,
+    curved: bool = True,
 ) -> Unknowns:
     """Take a step towards the coordinates that reach the poses nearest to the posture.
 

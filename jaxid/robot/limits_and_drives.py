@@ -103,7 +103,11 @@ class Drives(Hashable):
 
     def __post_init__(self, joints: int | None):
         n = _count(
-            joints, self.reduction, self.zero, self.max_torques, self.rotor_inertia
+            joints,
+            self.reduction,
+            self.zero,
+            self.max_torques,
+            self.rotor_inertia,
         )
         self.reduction = _reduction_matrix(self.reduction, n)
         self.zero = per_joint("zero", self.zero, n, 0.0)
@@ -268,7 +272,9 @@ def length_notes(owner: str, lengths: Numbers) -> list[str]:
 
 
 def limit_notes(
-    names: Sequence[str], revolute: Sequence[bool], limits: Limits
+    names: Sequence[str],
+    revolute: Sequence[bool],
+    limits: Limits,
 ) -> list[str]:
     """Return notes on limits that may be in millimetres or in degrees per second."""
     rows = (limits.position_min, limits.position_max, limits.velocity)

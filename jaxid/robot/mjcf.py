@@ -92,7 +92,12 @@ class _Writer:
         return getattr(self._model, kind)(index).name or f"{kind}{index}"
 
     def _connect(
-        self, name: str, kind: str, parent: str, child: str, origin: Any
+        self,
+        name: str,
+        kind: str,
+        parent: str,
+        child: str,
+        origin: Any,
     ) -> Any:
         """Write a joint between two links."""
         ends = E.parent(link=parent), E.child(link=child)
@@ -134,7 +139,10 @@ class _Writer:
         return range(first, first + int(self._model.body_jntnum[body]))
 
     def _joint_placement(
-        self, joint: int, rotation: Matrix3, position: Vector3
+        self,
+        joint: int,
+        rotation: Matrix3,
+        position: Vector3,
     ) -> tuple[Matrix3, Vector3]:
         """Return attitude and origin of a joint's frame from the placement of its body.
 

@@ -52,7 +52,9 @@ class Tool(eqx.Module):
     def __post_init__(self):
         self.mass = as_finite_array("`mass` of the tool", self.mass, ())
         self.centre_of_mass = as_finite_array(
-            "`centre_of_mass` of the tool", self.centre_of_mass, (3,)
+            "`centre_of_mass` of the tool",
+            self.centre_of_mass,
+            (3,),
         )
         tensor = np.zeros((3, 3)) if self.inertia is None else self.inertia
         self.inertia = as_finite_array("`inertia` of the tool", tensor, (3, 3))
@@ -276,7 +278,9 @@ class Robot(Summarised, eqx.Module):
         )
 
     def mounted(
-        self, rotation: Numbers | None = None, position: Numbers = (0.0, 0.0, 0.0)
+        self,
+        rotation: Numbers | None = None,
+        position: Numbers = (0.0, 0.0, 0.0),
     ) -> "Robot":
         """Return the robot on a base that is tilted and shifted in the same gravity.
 
@@ -325,11 +329,16 @@ class Robot(Summarised, eqx.Module):
             InputError: If the mass is not positive, or no body has such an inertia.
         """
         at_tip = Tool(
-            self.tip_body, mass=mass, centre_of_mass=centre_of_mass, inertia=inertia
+            self.tip_body,
+            mass=mass,
+            centre_of_mass=centre_of_mass,
+            inertia=inertia,
         )
         load = at_tip.body_inertia.moved(self.tip_rotation, self.tip_offset)
         tool = dataclasses.replace(
-            at_tip, centre_of_mass=load.centre, inertia=load.tensor
+            at_tip,
+            centre_of_mass=load.centre,
+            inertia=load.tensor,
         )
         return self.replace(tool=tool)
 

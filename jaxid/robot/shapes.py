@@ -180,7 +180,10 @@ class Box(eqx.Module):
 
 
 def segment_distance(
-    start: Vectors, end: Vectors, other_start: Vectors, other_end: Vectors
+    start: Vectors,
+    end: Vectors,
+    other_start: Vectors,
+    other_end: Vectors,
 ) -> Lengths:
     """Return the distance between segments, which may touch or be points [m]."""
     u = end - start

@@ -120,7 +120,10 @@ def urdf_parameters(
 
 
 def joint_parameters(
-    path: str | Path, *, tip: str | None = None, base: str | None = None
+    path: str | Path,
+    *,
+    tip: str | None = None,
+    base: str | None = None,
 ) -> dict[str, Joints]:
     """Return `armature`, `damping` and dry `friction` that a file claims.
 

@@ -59,7 +59,11 @@ class UrdfTree:
     """
 
     def __init__(
-        self, path: str | Path, *, base: str | None = None, tip: str | None = None
+        self,
+        path: str | Path,
+        *,
+        base: str | None = None,
+        tip: str | None = None,
     ) -> None:
         self.path = str(path)
         self.root, self.gravity, loops = read_description(path)

@@ -203,7 +203,10 @@ class WithLeads(AbstractTrajectory):
 
 
 def with_leads(
-    series: AbstractTrajectory, robot: Robot, *, periods: int = 1
+    series: AbstractTrajectory,
+    robot: Robot,
+    *,
+    periods: int = 1,
 ) -> WithLeads:
     """Add a lead-in and a lead-out to a periodic motion, within the robot's limits.
 
@@ -254,7 +257,11 @@ def with_leads(
             "take a motion that uses less of the limits."
         )
     return WithLeads(
-        series, phases[phase], periods * period, lead_in[phase], lead_out[phase]
+        series,
+        phases[phase],
+        periods * period,
+        lead_in[phase],
+        lead_out[phase],
     )
 
 

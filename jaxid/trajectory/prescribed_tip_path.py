@@ -216,7 +216,10 @@ def iso9283_path(
 
 
 def joint_path(
-    robot: Robot, path: TipPath, *, posture: Numbers | None = None
+    robot: Robot,
+    path: TipPath,
+    *,
+    posture: Numbers | None = None,
 ) -> PiecewisePolynomial:
     """Return the joints' motion that takes the end-effector along a path.
 
@@ -261,7 +264,9 @@ def _instants(path: TipPath) -> list[np.ndarray]:
 
 
 def _require_speeds(
-    robot: Robot, path: TipPath, coefficients: PolynomialCoefficients
+    robot: Robot,
+    path: TipPath,
+    coefficients: PolynomialCoefficients,
 ) -> None:
     """Reject a path on which a joint would have to move faster than it can."""
     # Velocities and accelerations at the knots are coefficients.

@@ -139,7 +139,10 @@ class ForceLimits(AbstractConstraint):
         return linearise
 
     def _largest_forces(
-        self, motion: Motion, shares: np.ndarray, limits: np.ndarray
+        self,
+        motion: Motion,
+        shares: np.ndarray,
+        limits: np.ndarray,
     ) -> ValuesAndSlopes:
         """Return the largest force of each sample, and slopes over the limit."""
         forces = np.einsum("tsj,tj->ts", self._forces(motion), shares)
@@ -154,7 +157,10 @@ class ForceLimits(AbstractConstraint):
         return np.abs(peak_forces), by_motion
 
     def _deviations(
-        self, motion: Motion, shares: np.ndarray, limits: np.ndarray
+        self,
+        motion: Motion,
+        shares: np.ndarray,
+        limits: np.ndarray,
     ) -> ValuesAndSlopes:
         """Return the uncertainty of each sample, and slopes over the limit."""
         base = self.base

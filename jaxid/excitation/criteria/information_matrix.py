@@ -61,7 +61,9 @@ def information(
 
 
 def gram_matrices(
-    regressor: JointRegressor, columns: Sequence[AnyArray], weights: JointVector
+    regressor: JointRegressor,
+    columns: Sequence[AnyArray],
+    weights: JointVector,
 ) -> tuple[Any, Any]:
     r"""Return $\Theta_B^T \Theta_B$ and $\Theta_B^T W^2 \Theta_B$ of some motions.
 
