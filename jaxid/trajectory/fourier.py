@@ -220,18 +220,18 @@ def random_fourier_series(
     # Each joint meets its tightest limit, also between the points of the envelope.
     rows, factor = basis.envelope(512)
     q, qd, qdd = (x @ part.T for part in rows[:3])
-    centre = 0.5 * (q.max(axis=1) + q.min(axis=1))
-    swing = 0.5 * factor * np.ptp(q, axis=1)
+    top = q.max(axis=1)
+    bottom = q.min(axis=1)
+    centre = 0.5 * (top + bottom)
+    swing = 0.5 * factor * (top - bottom)
     speed = factor * np.abs(qd).max(axis=1)
     acceleration = factor * np.abs(qdd).max(axis=1)
-    scale = np.min(
-        [
-            half_range / swing,
-            reach * limits.velocity / speed,
-            reach * limits.acceleration / acceleration,
-        ],
-        axis=0,
-    )
+    scales = [
+        half_range / swing,
+        reach * limits.velocity / speed,
+        reach * limits.acceleration / acceleration,
+    ]
+    scale = np.min(scales, axis=0)
     room = np.maximum(half_range - scale * swing, 0.0)
     shift = random.uniform(-1.0, 1.0, robot.joints) * room
     x *= scale[:, None]

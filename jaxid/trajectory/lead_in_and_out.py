@@ -45,12 +45,11 @@ def _lead(state: Any, duration: Any, x: Any, sign: int = 1) -> list:
     alpha, beta = _velocity_coefficients(sign * qd, qdd, duration)
     square_part = alpha * (x**3 - duration**3) / 3
     cube_part = beta * (x**4 - duration**4) / 4
-    return [
-        q + square_part + cube_part,
-        sign * (alpha * x**2 + beta * x**3),
-        2 * alpha * x + 3 * beta * x**2,
-        sign * (2 * alpha + 6 * beta * x),
-    ]
+    position = q + square_part + cube_part
+    velocity = alpha * x**2 + beta * x**3
+    acceleration = 2 * alpha * x + 3 * beta * x**2
+    jerk = 2 * alpha + 6 * beta * x
+    return [position, sign * velocity, acceleration, sign * jerk]
 
 
 def _velocity_coefficients(qd: Any, qdd: Any, duration: Any) -> tuple[Any, Any]:
@@ -95,12 +94,14 @@ class LeadsBasis(PeriodsBasis):
 
         def moving(t: AnyArray) -> AnyArray:
             xp = namespace(t, self.omega, self.lead)
-            is_early = (t < self.lead)[None, :, None]
-            is_late = (t > self.duration - self.lead)[None, :, None]
+            time = t[None, :, None]
+            is_early = time < self.lead
+            is_late = time > self.duration - self.lead
+            lead_in = self._lead_rows(t, 1)
             series = self.series.rows(t - self.lead)
             lead_out = self._lead_rows(self.duration - t, -1)
             rows = xp.where(is_late, lead_out, series)
-            return xp.where(is_early, self._lead_rows(t, 1), rows)
+            return xp.where(is_early, lead_in, rows)
 
         return stand_outside(moving, t, self.duration)
 
@@ -278,18 +279,20 @@ def _use_of_limits(state: tuple[np.ndarray, ...], limits: Limits) -> np.ndarray:
     # The extremes lie where the next derivative is zero, or at the ends.
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = -alpha / beta
-    instants = [0 * T, T]
-    for x in (ratio, 2 * ratio / 3, ratio / 3):
-        is_within = np.isfinite(x) & (x > 0) & (x < T)
-        instants.append(np.where(is_within, x, T))
-    leads = [_lead(state, T, x) for x in instants]
-    position, *rates = (np.stack(parts) for parts in zip(*leads, strict=True))
-
-    low = np.asarray(limits.position_min)
-    high = np.asarray(limits.position_max)
-    distance = np.abs(position - 0.5 * (low + high)).max(axis=0)
-    use = distance / (0.5 * (high - low))
-    max_rates = (limits.velocity, limits.acceleration, limits.jerk)
-    for rate, max_rate in zip(rates, max_rates, strict=True):
-        use = np.maximum(use, np.abs(rate).max(axis=0) / max_rate)
+    middle = 0.5 * (limits.position_max + limits.position_min)
+    half_range = 0.5 * (limits.position_max - limits.position_min)
+    use = np.zeros(ratio.shape)
+    for x in (0 * T, T, ratio, 2 * ratio / 3, ratio / 3):
+        # NaN is not within, either.
+        is_within = (x > 0) & (x < T)
+        instants = np.where(is_within | (x == 0), x, T)
+        position, velocity, acceleration, jerk = _lead(state, T, instants)
+        fractions = (
+            (position - middle) / half_range,
+            velocity / limits.velocity,
+            acceleration / limits.acceleration,
+            jerk / limits.jerk,
+        )
+        for fraction in fractions:
+            use = np.maximum(use, np.abs(fraction))
     return use

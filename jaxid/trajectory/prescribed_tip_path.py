@@ -147,7 +147,8 @@ class TipPath(eqx.Module):
             is_on_curve = pieces == number
             time = t[is_on_curve] - starts[number]
             u = np.clip(time / self.durations[number], 0.0, 1.0)
-            places[is_on_curve] = curve.at(u**3 * (10.0 + u * (6.0 * u - 15.0)))
+            fraction = 10.0 * u**3 - 15.0 * u**4 + 6.0 * u**5
+            places[is_on_curve] = curve.at(fraction)
         return places
 
 
@@ -243,14 +244,16 @@ def joint_path(
     polynomials = []
     begin = 0
     for t in instants:
-        nodes = q[begin : begin + len(t)]
-        spline = interpolate_at_rest(t - t[0], nodes)
-        knots.append(t[0] + spline.t[DEGREE : -DEGREE - 1])
+        end = begin + len(t)
+        spline = interpolate_at_rest(t - t[0], q[begin:end])
+        piece_knots = t[0] + spline.t[DEGREE:-DEGREE]
+        knots.append(piece_knots[:-1])
         polynomials.append(spline_polynomials(spline))
-        begin += len(t) - 1
+        begin = end - 1
+    knots.append(times[-1:])
     coefficients = np.concatenate(polynomials, axis=1)
     _require_speeds(robot, path, coefficients)
-    return PiecewisePolynomial(np.concatenate([*knots, times[-1:]]), coefficients)
+    return PiecewisePolynomial(np.concatenate(knots), coefficients)
 
 
 def _instants(path: TipPath) -> list[np.ndarray]:

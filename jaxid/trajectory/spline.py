@@ -58,7 +58,8 @@ def _evaluate(times: Knots, coefficients: PolynomialCoefficients, t: Times) -> R
     start = times[0]
     end = times[-1]
     # Written with `where`, because the derivative of `clip` at its ends is one half.
-    clipped_times = xp.where(t < start, start, xp.where(t > end, end, t))
+    clipped_times = xp.where(t > end, end, t)
+    clipped_times = xp.where(t < start, start, clipped_times)
     pieces = xp.searchsorted(times, clipped_times, side="right") - 1
     pieces = xp.clip(pieces, 0, len(times) - 2)
 

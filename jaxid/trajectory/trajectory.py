@@ -247,7 +247,8 @@ def stand_outside(
     # Written with `where`, because the derivative of `clip` at its ends is one half.
     is_before = t < 0.0
     is_after = t > duration
-    times = xp.where(is_before, 0.0, xp.where(is_after, duration, t))
+    times = xp.where(is_after, duration, t)
+    times = xp.where(is_before, 0.0, times)
     is_moving = ~(is_before | is_after)[None, :, None]
     is_position = np.array([True, False, False, False])[:, None, None]
     return xp.where(is_position | is_moving, rows(times), 0.0)
