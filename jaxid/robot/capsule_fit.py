@@ -177,10 +177,11 @@ def _capsule_about(points: np.ndarray, ends: np.ndarray) -> Segment:
     """Return the smallest capsule around points whose axis has these ends."""
     start, end = ends.reshape(2, 3)
     axis = end - start
-    differences = points - start
+    from_start = points - start
     square = max(float(axis @ axis), 1e-18)
-    fractions = np.clip(differences @ axis / square, 0.0, 1.0)
-    distances = np.linalg.norm(differences - fractions[:, None] * axis, axis=1)
+    fractions = np.clip(from_start @ axis / square, 0.0, 1.0)
+    from_axis = from_start - fractions[:, None] * axis
+    distances = np.linalg.norm(from_axis, axis=1)
     # Rounding must leave no point outside.
     radius = float(distances.max()) * (1 + 1e-9) + 1e-12
     return Segment(start, end, radius)

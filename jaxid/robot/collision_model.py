@@ -143,12 +143,9 @@ class CollisionModel(Hashable):
         """Return the clearances [m] for given ends of all axes on the ground [m]."""
         *batch, capsules, _, _ = ends.shape
         gaps = jax.vmap(self._gaps)(jnp.reshape(ends, (-1, capsules, 2, 3)))
-        # All groups get the same number of pairs: the first one is repeated.
-        size = max(len(group) for group in self.groups)
-        places = []
-        for group in self.groups:
-            padding = group[:1] * (size - len(group))
-            places.append(group + padding)
+        # All groups get the same number of pairs: the first ones are repeated.
+        size = max(map(len, self.groups))
+        places = [np.resize(group, size) for group in self.groups]
         gaps_of_groups = gaps[:, np.array(places)]
         # The derivative is that of one pair, also where several are equally near.
         minimum = jnp.argmin(

@@ -74,8 +74,9 @@ def tip_jacobian(robot: Robot, q: np.ndarray) -> TipJacobian:
     rotation = np.asarray(robot.rotation)
     axis = np.asarray(robot.axis)
 
-    R = np.broadcast_to(np.eye(3), (len(q), 3, 3))
-    r = np.zeros((len(q), 3))
+    poses = len(q)
+    R = np.broadcast_to(np.eye(3), (poses, 3, 3))
+    r = np.zeros((poses, 3))
     origin, turn, slide = np.zeros((3, *q.shape, 3))
     for i in robot.ancestors[robot.tip_body]:
         r = r + R @ offset[i]

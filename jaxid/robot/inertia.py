@@ -75,13 +75,13 @@ class Inertia(eqx.Module):
     def parameters(self) -> TenParameters:
         """Parameters $(m, m r_c, A, B, C, D, E, F)$ about the origin (Eqs. 8, 9)."""
         mass = self.mass[..., None]
+        first_moments = mass * self.centre
         point_mass = mass[..., None] * _moments_of_points(self.centre)
         tensor = self.tensor + point_mass
         squares = tensor[..., *SQUARES]
         products = -tensor[..., *PRODUCTS]
-        xp = namespace(self.mass, self.centre, self.tensor)
-        parts = [mass, mass * self.centre, squares, products]
-        return xp.concatenate(parts, axis=-1)
+        xp = namespace(mass, tensor)
+        return xp.concatenate([mass, first_moments, squares, products], axis=-1)
 
     @property
     def pinocchio(self) -> TenParameters:

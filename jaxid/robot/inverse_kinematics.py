@@ -157,8 +157,9 @@ def _newton_step(
     right_side = np.concatenate([slope, errors], axis=1)
     matrix = _saddle_point_matrix(hessian, jacobian)
     step = np.linalg.solve(matrix, right_side[..., None])[..., 0]
-    size = np.abs(step[:, :joints]).max(axis=1, keepdims=True)
-    step /= np.maximum(1.0, size / MAX_STEP)
+    sizes = np.abs(step[:, :joints])
+    excess = sizes.max(axis=1, keepdims=True) / MAX_STEP
+    step /= np.maximum(1.0, excess)
     step[:, :joints] *= scale
     return unknowns - step
 
@@ -166,14 +167,14 @@ def _newton_step(
 def _saddle_point_matrix(hessian: np.ndarray, jacobian: np.ndarray) -> np.ndarray:
     """Return the matrices of the conditions of an optimum under linear constraints."""
     poses, joints, conditions = jacobian.shape
-    size = joints + conditions
-    matrix = np.zeros((poses, size, size))
-    matrix[:, :joints, :joints] = hessian
-    matrix[:, :joints, joints:] = jacobian
-    matrix[:, joints:, :joints] = np.swapaxes(jacobian, 1, 2)
+    curvature = np.broadcast_to(hessian, (poses, joints, joints))
     # Singular poses have a solution, too.
-    matrix[:, joints:, joints:] = -1e-11 * np.eye(conditions)
-    return matrix
+    ridge = np.broadcast_to(
+        -1e-11 * np.eye(conditions), (poses, conditions, conditions)
+    )
+    upper_rows = np.concatenate([curvature, jacobian], axis=2)
+    lower_rows = np.concatenate([jacobian.swapaxes(1, 2), ridge], axis=2)
+    return np.concatenate([upper_rows, lower_rows], axis=1)
 
 
 def _pose_errors(task: _TipTask, positions: np.ndarray, tip: TipJacobian) -> np.ndarray:

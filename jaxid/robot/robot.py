@@ -300,12 +300,10 @@ class Robot(Summarised, eqx.Module):
         offsets = xp.broadcast_to(r, self.offset.shape) + self.offset @ R.T
 
         # Only bodies on the ground move: the others are placed in their parents.
-        on_ground = np.array(self.parent) < 0
-        moves = np.broadcast_to(on_ground[:, None], self.offset.shape)
-        turns = np.broadcast_to(on_ground[:, None, None], self.rotation.shape)
+        on_ground = np.array(self.parent)[:, None] < 0
         return self.replace(
-            rotation=xp.where(turns, rotations, self.rotation),
-            offset=xp.where(moves, offsets, self.offset),
+            rotation=xp.where(on_ground[..., None], rotations, self.rotation),
+            offset=xp.where(on_ground, offsets, self.offset),
         )
 
     def with_tool(

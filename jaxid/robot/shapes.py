@@ -147,6 +147,7 @@ class Box(eqx.Module):
     def distance(self, start: Vectors, end: Vectors) -> Lengths:
         """Return the signed distances of segments' deepest or nearest points [m]."""
         R = jnp.asarray(self.rotation)
+        # Everything in the frame of the box.
         centre = jnp.broadcast_to(self.centre @ self.rotation, start.shape)
         first = start @ R - centre
         extent = (end - start) @ R
@@ -165,7 +166,8 @@ class Box(eqx.Module):
         # leaves as it is.
         rising = slope(high)
         turn = rising - slope(low)
-        share = jnp.clip(rising / jnp.where(turn > 0, turn, 1.0), 0.0, 1.0)[..., 0]
+        ratio = rising / jnp.where(turn > 0, turn, 1.0)
+        share = jnp.clip(ratio, 0.0, 1.0)[..., 0]
         distance_before = self._signed(first + low * extent)
         distance_after = self._signed(first + high * extent)
         return share * distance_before + (1.0 - share) * distance_after

@@ -49,7 +49,12 @@ def _lead(state: Any, duration: Any, x: Any, sign: int = 1) -> list:
     velocity = alpha * x**2 + beta * x**3
     acceleration = 2 * alpha * x + 3 * beta * x**2
     jerk = 2 * alpha + 6 * beta * x
-    return [position, sign * velocity, acceleration, sign * jerk]
+    return [
+        position,
+        sign * velocity,
+        acceleration,
+        sign * jerk,
+    ]
 
 
 def _velocity_coefficients(qd: Any, qdd: Any, duration: Any) -> tuple[Any, Any]:
@@ -287,12 +292,8 @@ def _use_of_limits(state: tuple[np.ndarray, ...], limits: Limits) -> np.ndarray:
         is_within = (x > 0) & (x < T)
         instants = np.where(is_within | (x == 0), x, T)
         position, velocity, acceleration, jerk = _lead(state, T, instants)
-        fractions = (
-            (position - middle) / half_range,
-            velocity / limits.velocity,
-            acceleration / limits.acceleration,
-            jerk / limits.jerk,
-        )
-        for fraction in fractions:
-            use = np.maximum(use, np.abs(fraction))
+        use = np.maximum(use, np.abs(position - middle) / half_range)
+        use = np.maximum(use, np.abs(velocity) / limits.velocity)
+        use = np.maximum(use, np.abs(acceleration) / limits.acceleration)
+        use = np.maximum(use, np.abs(jerk) / limits.jerk)
     return use
