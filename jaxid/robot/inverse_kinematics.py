@@ -169,9 +169,8 @@ def _saddle_point_matrix(hessian: np.ndarray, jacobian: np.ndarray) -> np.ndarra
     poses, joints, conditions = jacobian.shape
     curvature = np.broadcast_to(hessian, (poses, joints, joints))
     # Singular poses have a solution, too.
-    ridge = np.broadcast_to(
-        -1e-11 * np.eye(conditions), (poses, conditions, conditions)
-    )
+    ridge = -1e-11 * np.eye(conditions)
+    ridge = np.broadcast_to(ridge, (poses, conditions, conditions))
     upper_rows = np.concatenate([curvature, jacobian], axis=2)
     lower_rows = np.concatenate([jacobian.swapaxes(1, 2), ridge], axis=2)
     return np.concatenate([upper_rows, lower_rows], axis=1)

@@ -12,11 +12,8 @@ from jaxid.robot.robot import Robot, complete_limits
 
 from .trajectory import (
     AbstractBasis,
-    Envelope,
     LinearTrajectory,
-    Rows,
     Time,
-    Times,
     as_scalar,
     stand_outside,
 )
@@ -57,7 +54,7 @@ class FourierBasis(AbstractBasis):
         """Period [s]."""
         return 2 * math.pi / self.omega
 
-    def rows(self, t: Times) -> Rows:
+    def rows(self, t):
         """Return a constant, sines and cosines, and their derivatives."""
         xp = namespace(t, self.omega)
         w = self.omega * np.arange(1.0, self.harmonics + 1.0)[None]
@@ -74,7 +71,7 @@ class FourierBasis(AbstractBasis):
         )
         return xp.stack([xp.concatenate(parts, axis=1) for parts in orders])
 
-    def envelope(self, points: int) -> Envelope:
+    def envelope(self, points):
         r"""Return samples of a period, which bound the series.
 
         The bound $\max |p| \le \max_k |p(t_k)| / \cos(\pi n / M)$ holds for every
@@ -140,7 +137,7 @@ class RestToRestBasis(PeriodsBasis):
         b = null_space(orders[None])
         return np.asarray(block_diag(np.ones((1, 1)), a, b))
 
-    def rows(self, t: Times) -> Rows:
+    def rows(self, t):
         """Return sines and cosines in the directions that rest at both ends."""
 
         def series_rows(t: AnyArray) -> AnyArray:
@@ -148,12 +145,12 @@ class RestToRestBasis(PeriodsBasis):
 
         return stand_outside(series_rows, t, self.duration)
 
-    def envelope(self, points: int) -> Envelope:
+    def envelope(self, points):
         """Return samples of a period, as for any series."""
         rows, factor = self.series.envelope(points)
         return tuple(x @ self.directions for x in rows), factor
 
-    def times(self, samples: int) -> Times:
+    def times(self, samples):
         """Return equidistant times over one period [s]."""
         return self.series.times(samples)
 

@@ -16,11 +16,7 @@ from jaxid.robot.robot import Robot, complete_limits
 from .fourier import PeriodsBasis
 from .trajectory import (
     AbstractTrajectory,
-    Envelope,
-    Rows,
-    States,
     Time,
-    Times,
     as_scalar,
     stand_outside,
 )
@@ -94,7 +90,7 @@ class LeadsBasis(PeriodsBasis):
         """Time from standstill to standstill [s]."""
         return self.periods * self.series.duration + 2 * self.lead
 
-    def rows(self, t: Times) -> Rows:
+    def rows(self, t):
         """Return the series, or the polynomials that lead into it and out of it."""
 
         def moving(t: AnyArray) -> AnyArray:
@@ -115,7 +111,7 @@ class LeadsBasis(PeriodsBasis):
         state = self.series.rows(np.zeros(1))[:3]
         return namespace(x, self.omega).stack(_lead(state, self.lead, x[:, None], sign))
 
-    def envelope(self, points: int) -> Envelope:
+    def envelope(self, points):
         """Return samples of a period, and control points of the leads.
 
         A polynomial lies within the range of its control points (Bernstein). A lead is
@@ -132,11 +128,11 @@ class LeadsBasis(PeriodsBasis):
                 parts.append(to_points @ self._lead_rows(t, sign))
         return tuple(np.concatenate(x) for x in zip(*parts, strict=True)), factor
 
-    def times(self, samples: int) -> Times:
+    def times(self, samples):
         """Return equidistant times over one period between the leads [s]."""
         return float(self.lead) + self.series.times(samples)
 
-    def instants(self, points: int) -> Times:
+    def instants(self, points):
         """Return equidistant times over the leads and one period [s]."""
         period = float(self.series.duration)
         lead = float(self.lead)
@@ -184,7 +180,7 @@ class WithLeads(AbstractTrajectory):
         """Time from standstill to standstill [s]."""
         return self.window[1] + jnp.max(jnp.asarray(self.lead_out))
 
-    def states(self, t: Times) -> States:
+    def states(self, t):
         """Return the motion between the leads, and the leads; standstill outside."""
         begin, end = self.window
         time = t[:, None]

@@ -13,9 +13,7 @@ from jaxid.errors import InputError
 from .trajectory import (
     AbstractBasis,
     AbstractTrajectory,
-    Envelope,
     Rows,
-    States,
     Time,
     Times,
     as_scalar,
@@ -46,7 +44,7 @@ class PiecewisePolynomial(AbstractTrajectory):
         """Time of the end [s]."""
         return self.times[-1]
 
-    def states(self, t: Times) -> States:
+    def states(self, t):
         """Return the polynomials and two derivatives."""
         return tuple(_evaluate(self.times, self.coefficients, t)[:3])
 
@@ -107,13 +105,13 @@ class RestToRestSplineBasis(AbstractBasis):
                 f"`duration` must be positive [s], but is {self.duration:g}."
             )
 
-    def rows(self, t: Times) -> Rows:
+    def rows(self, t):
         """Return the motions of unit coefficients."""
         starts, coefficients = _unit_polynomials(self.points)
         derivatives = _evaluate(starts, coefficients, t / self.duration)
         return derivatives / (self.duration ** np.arange(4.0))[:, None, None]
 
-    def envelope(self, points: int) -> Envelope:
+    def envelope(self, points):
         """Return rows that give the control points of each derivative.
 
         A spline never leaves the range of its control points, so that the factor of the

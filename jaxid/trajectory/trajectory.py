@@ -119,7 +119,7 @@ class PaddedToCycle(AbstractTrajectory):
         cycles = count_cycles(float(self.inner.duration), self.sample_time)
         return cycles * self.sample_time
 
-    def states(self, t: Times) -> States:
+    def states(self, t):
         """Return the motion, and its final pose after its end."""
         return self.inner.states(jnp.minimum(t, self.inner.duration))
 
@@ -231,7 +231,7 @@ class LinearTrajectory(AbstractTrajectory):
         """Duration of the basis [s]."""
         return self.basis.duration
 
-    def states(self, t: Times) -> States:
+    def states(self, t):
         """Return the rows of the basis times the coefficients."""
         rows = jnp.asarray(self.basis.rows(t))
         return tuple(part @ self.coefficients.T for part in rows[:3])

@@ -5,11 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxid.dynamics.dispatch import on_samples
-from jaxid.dynamics.motion import Motion
 from jaxid.robot.collision import CollisionModel
-from jaxid.robot.robot import Robot
 
-from .constraint import AbstractConstraint, Excess, Finding
+from .constraint import AbstractConstraint, Finding
 
 SIZE = 0.1
 """Missing distance that counts as one [m]."""
@@ -35,13 +33,13 @@ class Clearance(AbstractConstraint):
         """Least distance of each pair [m]."""
         return np.minimum(self.distance, 0.5 * np.array(self.model.room))
 
-    def __call__(self, robot: Robot, motion: Motion) -> Excess:
+    def __call__(self, robot, motion):
         """Return the missing distance of each pair."""
         ends = eqx.Partial(self.model.ends, robot)
         gaps = self.model.clearances(on_samples(ends, ends.__call__, motion.q))
         return (jnp.broadcast_to(self.distances, gaps.shape) - gaps) / SIZE
 
-    def entries(self, robot: Robot) -> tuple[Finding, ...]:
+    def entries(self, robot):
         """Return the pairs."""
         pairs = zip(self.model.pair_names, self.distances.tolist(), strict=True)
         return tuple(

@@ -20,9 +20,7 @@ from jaxid.robot.robot import Robot, complete_limits
 
 from .constraint import (
     AbstractConstraint,
-    Excess,
     Finding,
-    Linearisation,
     ValuesAndSlopes,
 )
 
@@ -90,7 +88,7 @@ class ForceLimits(AbstractConstraint):
                 "rows and columns without negative eigenvalues."
             )
 
-    def __call__(self, robot: Robot, motion: Motion) -> Excess:
+    def __call__(self, robot, motion):
         """Return the relative excess over each limit."""
         limits, to_limited = self._limited(robot)
         forces = self._forces(motion)
@@ -122,7 +120,7 @@ class ForceLimits(AbstractConstraint):
         evaluate = in_numpy if is_rows else on_samples
         return evaluate(self, self.forces, *_arrays(motion))
 
-    def linearisation(self, robot: Robot) -> Linearisation:
+    def linearisation(self, robot):
         """Return a function of relative excesses and their derivatives, in NumPy."""
         limits, to_limited = self._limited(robot)
 
@@ -197,7 +195,7 @@ class ForceLimits(AbstractConstraint):
         forces = [jnp.asarray(each.forces(p, q, qd, qdd)) for each in models]
         return jnp.stack(forces) + model.known_forces(q, qd, qdd)[None]
 
-    def entries(self, robot: Robot) -> tuple[Finding, ...]:
+    def entries(self, robot):
         """Return the forces and torques that have a limit."""
         quantities = [
             (f"the force of joint `{name}`", robot.force_unit(joint))

@@ -17,7 +17,7 @@ from jaxid.robot.robot import Robot
 from jaxid.robot.rotations import Vectors
 
 from .clearance import SIZE
-from .constraint import AbstractConstraint, Excess, Finding
+from .constraint import AbstractConstraint, Finding
 
 SMOOTHING = 1e-6
 """Value of a rate over its limit at standstill, where it is made smooth."""
@@ -94,7 +94,7 @@ class TipLimits(AbstractConstraint):
                 f"ones, but are {self.low} and {self.high} [m]."
             )
 
-    def __call__(self, robot: Robot, motion: Motion) -> Excess:
+    def __call__(self, robot, motion):
         """Return the relative excess over each limit."""
         position, velocity, acceleration = tip_motion(robot, motion)
         values = []
@@ -110,7 +110,7 @@ class TipLimits(AbstractConstraint):
             values.append(excess / SIZE)
         return jnp.stack(values, axis=-1)
 
-    def entries(self, robot: Robot) -> tuple[Finding, ...]:
+    def entries(self, robot):
         """Return the quantities that have a limit."""
         entries = []
         for name, limit, unit in (
