@@ -149,9 +149,10 @@ def mjcf_shapes(path: str | Path) -> dict[str, list[Shape]]:
 
     shapes: dict[str, list[Shape]] = {}
     for geom in range(model.ngeom):
-        body = int(model.geom_bodyid[geom])
+        body = model.geom_bodyid[geom]
         body_is_solid = is_solid[model.geom_bodyid == body].any()
-        if model.geom_type[geom] in unbounded or (body_is_solid and not is_solid[geom]):
+        is_unbounded = int(model.geom_type[geom]) in unbounded
+        if is_unbounded or (body_is_solid and not is_solid[geom]):
             continue
         rotation = rotation_of_quaternion(model.geom_quat[geom])
         shape = _geom_shape(mujoco, model, geom)

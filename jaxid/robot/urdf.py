@@ -141,12 +141,9 @@ def joint_parameters(
 def _limits(tree: UrdfTree) -> tuple[Limits, list[str]]:
     """Return the limits of all joints, and notes on those that are taken as unknown."""
     joints = len(tree.joints)
-    low = np.full(joints, -np.inf)
-    high = np.full(joints, np.inf)
-    magnitudes = {
-        "velocity": np.full(joints, np.inf),
-        "effort": np.full(joints, np.inf),
-    }
+    low = np.empty(joints)
+    high = np.empty(joints)
+    magnitudes = {key: np.full(joints, np.inf) for key in ("velocity", "effort")}
     unknown: dict[str, list[str]] = {}
     for i, joint in enumerate(tree.joints):
         name = joint.get("name")
