@@ -258,16 +258,19 @@ def _meeting_pairs(
     obstacles: int,
 ) -> list[tuple[int, int]]:
     """Return the pairs of shapes on bodies that are neither one nor neighbours."""
-    bodies = [capsule.body for capsule in capsules] + [GROUND] * obstacles
-    parents = [None if body == GROUND else robot.parent[body] for body in bodies]
+    bodies = [capsule.body for capsule in capsules]
+    links = set(enumerate(robot.parent))
     pairs = []
-    for i, k in itertools.combinations(range(len(bodies)), 2):
-        if i >= len(capsules) or bodies[i] == bodies[k]:
-            continue
-        neighbours = bodies[k] == parents[i] or bodies[i] == parents[k]
-        # An obstacle is not part of the base that carries the first body.
-        if k >= len(capsules) or not neighbours:
+    for i, k in itertools.combinations(range(len(capsules)), 2):
+        first = bodies[i]
+        second = bodies[k]
+        are_neighbours = (first, second) in links or (second, first) in links
+        if first != second and not are_neighbours:
             pairs.append((i, k))
+    # An obstacle is not part of the base that carries the first body.
+    for i, body in enumerate(bodies):
+        if body != GROUND:
+            pairs += [(i, len(bodies) + number) for number in range(obstacles)]
     return pairs
 
 

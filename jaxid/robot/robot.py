@@ -408,11 +408,11 @@ def complete_limits(robot: Robot) -> Limits:
 
 def as_finite_array(name: str, value: Numbers, shape: tuple[int, ...]) -> AnyArray:
     """Return an array of finite numbers; that of JAX may have leading axes."""
-    if isinstance(value, jax.Array):
-        array: AnyArray = value
-    else:
-        array = np.array(as_array(name, value), np.float64)
-    if array.shape[array.ndim - len(shape) :] != shape or array.ndim < len(shape):
+    array = as_array(name, value)
+    if not isinstance(array, jax.Array):
+        array = np.array(array, np.float64)
+    last_axes = array.shape[array.ndim - len(shape) :]
+    if last_axes != shape:
         raise InputError(f"{name} must have the shape {shape}, but has {array.shape}.")
     if isinstance(array, np.ndarray) and not np.isfinite(array).all():
         raise InputError(f"{name} must hold finite numbers.")
@@ -437,8 +437,9 @@ def as_rotations(name: str, value: Numbers, shape: tuple[int, ...]) -> AnyArray:
     """Return a copy as rotation matrices; a JAX array is taken as it is."""
     R = as_finite_array(name, value, shape)
     if isinstance(R, np.ndarray):
-        error = np.abs(np.swapaxes(R, -1, -2) @ R - np.eye(3)).max(axis=(-1, -2))
-        if (error >= 1e-6).any() or (np.linalg.det(R) < 0).any():
+        products = np.swapaxes(R, -1, -2) @ R
+        is_orthonormal = np.abs(products - np.eye(3)).max() < 1e-6
+        if not is_orthonormal or (np.linalg.det(R) < 0).any():
             raise InputError(
                 f"{name} must hold orthonormal, right-handed rotation matrices."
             )

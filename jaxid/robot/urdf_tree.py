@@ -368,7 +368,8 @@ class UrdfTree:
         if np.abs(rpy).max() > MAX_ANGLE:
             fault = f"its `rpy` is {_words(rpy)}, which are degrees, not radians"
         R = rpy_rotation(rpy)
-        return Inertia(mass, centre, R @ tensor @ R.T), fault
+        tensor = R @ tensor @ R.T
+        return Inertia(mass, centre, tensor), fault
 
     def place(self, element: Any) -> str:
         """Return file and line of an element, for messages."""
