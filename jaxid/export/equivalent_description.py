@@ -37,7 +37,7 @@ class Description(NamedTuple):
         """Estimate of the operations: weighted numbers that are not zero."""
         robot = self.robot
         lengths = np.count_nonzero(np.abs(np.asarray(robot.offset)) > 1e-12, axis=1)
-        total = np.count_nonzero(self.bodies)
+        total = int(np.count_nonzero(self.bodies))
         for body, (*ancestors, _) in enumerate(robot.ancestors):
             # A length counts only in a frame that turns.
             turns = any(robot.revolute[ancestor] for ancestor in ancestors)

@@ -59,7 +59,11 @@ def joint_dynamics(fit: Fit) -> JointDynamics:
                 rotors.append(name)
             if not coefficients[:, :, k].any():
                 omissions.append(name)
-    values = dict(zip(("armature", "damping", "friction"), total, strict=True))
+    values: dict[str, Joints] = {
+        "armature": total[0],
+        "damping": total[1],
+        "friction": total[2],
+    }
     return JointDynamics(values, tuple(rotors), tuple(omissions))
 
 

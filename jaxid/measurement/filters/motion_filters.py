@@ -8,7 +8,7 @@ import numpy as np
 from numpy.polynomial import legendre
 from scipy import signal
 
-from jaxid.arrays import optional
+from jaxid.arrays import AnyArray, optional
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
 
@@ -135,7 +135,7 @@ class SavitzkyGolay(AbstractFilter):
     def low_pass(self, sample_time):  # noqa: D102
         return weighted_mean(self._kernel(0, sample_time), sample_time)
 
-    def _derivative(self, x: np.ndarray, times: int, sample_time: float) -> np.ndarray:
+    def _derivative(self, x: AnyArray, times: int, sample_time: float) -> AnyArray:
         return correlate(x, self._kernel(times, sample_time))
 
     def _kernel(self, derivative: int, sample_time: float) -> np.ndarray:
@@ -269,7 +269,7 @@ class PeriodicFourier(AbstractFilter):
         return None
 
 
-def _require_series(angles: np.ndarray, q: np.ndarray) -> None:
+def _require_series(angles: AnyArray, q: AnyArray) -> None:
     """Refuse angles that are no Fourier series of the period."""
     motion = angles.std(axis=0)
     error = np.sqrt(np.mean((angles - q) ** 2, axis=0))
