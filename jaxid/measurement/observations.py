@@ -474,9 +474,11 @@ def _speed_mask(
     masks = []
     for chunk in observations.chunks(65536):
         samples = instants[slice(*chunk.rows)]
-        first, last = int(samples[0]), int(samples[-1])
-        motion, _ = observations.read(slice(first, last + 1, factor))
-        masks.append(np.abs(np.asarray(motion.qd)) >= speeds)
+        first_sample = int(samples[0])
+        last_sample = int(samples[-1])
+        motion, _ = observations.read(slice(first_sample, last_sample + 1, factor))
+        speed = np.abs(np.asarray(motion.qd))
+        masks.append(speed >= speeds)
         if progress is not None:
             progress(chunk.rows[1] / observations.rows)
     return np.concatenate(masks)

@@ -145,12 +145,14 @@ class SamplesOnDisk(AbstractSamples):
         # With the neighbours that the filter needs.
         start = max(segment_start, samples.start - self.overlap)
         stop = min(segment_stop, samples.stop + self.overlap)
-        rows = self.read_rows(slice(start, stop))
-        q, qd, forces = joint_side(self.robot, self.log.columns, *rows)
+        channels = self.read_rows(slice(start, stop))
+        q, qd, forces = joint_side(self.robot, self.log.columns, *channels)
         motion = self.filter.motion(q, qd, self.sample_time)
-        first = samples.start - start
-        part = slice(first, samples.stop - start, samples.step)
-        return motion[part], forces[part]
+
+        first_row = samples.start - start
+        end_row = samples.stop - start
+        rows = slice(first_row, end_row, samples.step)
+        return motion[rows], forces[rows]
 
     def read_all(self):  # noqa: D102
         return joined(self.read(slice(a, b)) for a, b in self.segments)

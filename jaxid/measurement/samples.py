@@ -79,6 +79,8 @@ class Overlap(NamedTuple):
             reduce: Function of the samples between the edges, the rows among them, and
                 columns that returns the rows.
         """
+        first_sample = segment[0] + self.edge
+        end_sample = segment[1] - self.edge
         start = rows[0] - first_row
         stop = rows[1] - first_row
         # Decimation keeps its phase: its first input sample is a row.
@@ -86,16 +88,16 @@ class Overlap(NamedTuple):
         input_row = max(0, start - extra_rows)
         outputs = slice(start - input_row, stop - input_row)
 
-        first_sample = segment[0] + self.edge
+        # Samples of the decimation, then those of the filter before it.
         low = first_sample + input_row * self.factor
         last_sample = first_sample + (stop - 1) * self.factor
-        end_sample = segment[1] - self.edge
         high = min(end_sample, last_sample + self.decimation + 1)
-
         begin = max(segment[0], low - self.smoothing)
         end = min(segment[1], high + self.smoothing)
         inputs = slice(low - begin, high - begin)
-        return Chunk((begin, end), rows, functools.partial(reduce, inputs, outputs))
+
+        reduce_part = functools.partial(reduce, inputs, outputs)
+        return Chunk((begin, end), rows, reduce_part)
 
 
 def joined(parts: Iterable[Any]) -> Any:

@@ -79,7 +79,8 @@ def correlate(x: Any, kernel: np.ndarray) -> Any:
     half = len(kernel) // 2
     extended = odd_extension(x, half)
     if not isinstance(x, jax.Array):
-        return ndimage.correlate1d(extended, kernel, axis=0)[half : half + len(x)]
+        sums = ndimage.correlate1d(extended, kernel, axis=0)
+        return sums[half : half + len(x)]
 
     def correlate_column(column: Array) -> Array:
         precision = jax.lax.Precision.HIGHEST
@@ -172,7 +173,9 @@ def _clear_memory(sos: np.ndarray, radius: float, tolerance: float) -> int:
     forward = signal.sosfilt(sos, impulse)
     both_ways = signal.correlate(forward, forward, method="fft")
     tail = np.abs(both_ways[samples - 1 :])
-    return int(np.flatnonzero(tail > tolerance * tail[0])[-1]) + 1
+    is_clear = tail > tolerance * tail[0]
+    last_sample = np.flatnonzero(is_clear)[-1]
+    return int(last_sample) + 1
 
 
 def _filter_both_ways(sos: np.ndarray, x: Array, padding: int) -> Array:

@@ -255,9 +255,12 @@ class PeriodicFourier(AbstractFilter):
         _require_series(angles, q)
 
         _, a, b = np.split(series, [1, self.harmonics + 1])
-        w = omega[:, None]
-        qd = cosines @ (w * a) - sines @ (w * b)
-        qdd = -sines @ (w**2 * a) - cosines @ (w**2 * b)
+        speed_a = omega[:, None] * a
+        speed_b = omega[:, None] * b
+        qd = cosines @ speed_a - sines @ speed_b
+        acceleration_a = omega[:, None] * speed_a
+        acceleration_b = omega[:, None] * speed_b
+        qdd = -sines @ acceleration_a - cosines @ acceleration_b
         return Motion(q, qd, qdd)
 
     def low_pass(self, sample_time):  # noqa: D102
@@ -317,14 +320,17 @@ def second_difference(x: np.ndarray, sample_time: float) -> np.ndarray:
 
     Next to the ends they are of second order.
     """
-    nearest = x[3:-1] + x[1:-3]
-    second_nearest = x[4:] + x[:-4]
+    before = x[1:-3]
     middle = x[2:-2]
+    after = x[3:-1]
+    nearest = after + before
+    second_nearest = x[4:] + x[:-4]
     difference = 16 * nearest - second_nearest - 30 * middle
 
+    squared_time = sample_time**2
     d = np.empty_like(x)
-    d[1:-1] = np.diff(x, 2, axis=0) / sample_time**2
-    d[2:-2] = difference / (12 * sample_time**2)
+    d[1:-1] = np.diff(x, 2, axis=0) / squared_time
+    d[2:-2] = difference / (12 * squared_time)
     d[0] = d[1]
     d[-1] = d[-2]
     return d

@@ -83,18 +83,22 @@ class TimeSeries(NamedTuple):
     def interpolated(self, targets: np.ndarray) -> np.ndarray:
         """Return values at other times [ns]; NaN outside and in pauses."""
         order = np.argsort(self.times, kind="stable")
+        sorted_values = self.values[order]
         # Float64 holds nanoseconds only if they do not count from 1970.
-        t = (self.times[order] - targets[0]).astype(np.float64)
+        elapsed = self.times[order] - targets[0]
+        t = elapsed.astype(np.float64)
         target_t = (targets - targets[0]).astype(np.float64)
-        values = np.interp(target_t, t, self.values[order], left=np.nan, right=np.nan)
+        nan = np.nan
+        values = np.interp(target_t, t, sorted_values, left=nan, right=nan)
 
         steps = np.diff(t, prepend=t[0])
         max_step = MAX_STEP_RATIO * np.median(steps)
         # The step that ends at or after each target.
         index = np.searchsorted(t, target_t)
         index = np.minimum(index, len(t) - 1)
-        is_in_pause = (steps[index] > max_step) & (t[index] != target_t)
-        values[is_in_pause] = np.nan
+        is_after_pause = steps[index] > max_step
+        is_between = t[index] != target_t
+        values[is_after_pause & is_between] = nan
         return values
 
 
@@ -193,10 +197,10 @@ def _fields(
     """
     values = {x.name: getattr(message, x.name) for x in dataclasses.fields(message)}
     for key, texts in values.items():
-        if re.search("(^|_)names?$", key) and isinstance(texts, list):
+        has_names = re.search("(^|_)names?$", key) and isinstance(texts, list)
+        if has_names and len(set(texts)) == len(texts):
             elements = tuple(f".{text}" for text in texts)
-            if len(set(elements)) == len(texts):
-                element_names = {**element_names, len(texts): elements}
+            element_names = {**element_names, len(texts): elements}
     for key, value in values.items():
         name = prefix + key
         if isinstance(value, int | float):
@@ -238,14 +242,17 @@ def join_topics(
     if clock == CLOCK:
         are_recorded = not all(all(owners[name].stamps) for name in names)
 
-    fields = {name: owners[name].time_series(name, are_recorded) for name in names}
-    times = fields[names[0]].times
-    foreign_names = [x for x in names if not np.array_equal(fields[x].times, times)]
-    values = {name: fields[name].values for name in names}
+    times = owners[names[0]].time_series(names[0], are_recorded).times
+    values = {}
+    foreign_names = []
     is_common = np.ones(len(times), bool)
-    for name in foreign_names:
-        values[name] = fields[name].interpolated(times)
-        is_common &= np.isfinite(values[name])
+    for name in names:
+        series = owners[name].time_series(name, are_recorded)
+        values[name] = series.values
+        if not np.array_equal(series.times, times):
+            foreign_names.append(name)
+            values[name] = series.interpolated(times)
+            is_common &= np.isfinite(values[name])
     if not is_common.any():
         raise InputError(
             f"the topics of `{source}` overlap nowhere in time: compare their clocks."

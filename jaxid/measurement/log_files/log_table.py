@@ -171,15 +171,16 @@ class LogTable:
         if self.bad_rows is not None:
             for k in rows:
                 number = k + self.first_row
-                words = f"`{name}` {complaint.format(column[k])}"
-                self.bad_rows.setdefault(number, f"{self.unit} {number} ({words})")
+                words = complaint.format(column[k])
+                text = f"{self.unit} {number} (`{name}` {words})"
+                self.bad_rows.setdefault(number, text)
         elif rows:
             number = rows[0] + self.first_row
+            words = complaint.format(column[rows[0]])
             others = f" (and {len(rows) - 1} more)" if len(rows) > 1 else ""
             raise InputError(
                 f"column `{name}` of `{self.source}`, {self.unit} {number}, "
-                f"{complaint.format(column[rows[0]])}{others}: repair the log or "
-                "remove those rows."
+                f"{words}{others}: repair the log or remove those rows."
             )
 
 
