@@ -113,8 +113,8 @@ def _distances_to_neighbours(robot: Robot, body: int) -> list[float]:
     axis_in_parent = np.asarray(robot.rotation[body]) @ axis
     is_child = np.array(robot.parent) == body
     to_parent = -float(axis_in_parent @ offset[body])
-    to_children = [float(axis @ x) for x in offset[is_child]]
-    distances = dict.fromkeys([to_parent, *to_children])
+    to_children = offset[is_child] @ axis
+    distances = dict.fromkeys([to_parent, *to_children.tolist()])
     return [distance for distance in distances if abs(distance) > MIN_DISTANCE]
 
 

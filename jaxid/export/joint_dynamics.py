@@ -76,7 +76,8 @@ def _joint_coefficients(term: AbstractTerm, robot: Robot) -> np.ndarray:
     shape = (PROBES, robot.joints)
     q, qdd = random.uniform(-1.0, 1.0, (2, *shape))
     speeds = random.uniform(*PROBE_SPEEDS, shape)
-    qd = speeds * random.choice([-1.0, 1.0], shape)
+    directions = random.choice([-1.0, 1.0], shape)
+    qd = speeds * directions
 
     columns = _odd_columns(term, robot, q, qd, qdd)
     coefficients = np.zeros((3, *columns.shape[1:]))
@@ -84,8 +85,9 @@ def _joint_coefficients(term: AbstractTerm, robot: Robot) -> np.ndarray:
     # A simulator knows no parameter that acts on several joints.
     acts_on_one_joint = np.count_nonzero(is_used, axis=0) == 1
     for joint, k in np.argwhere(is_used & acts_on_one_joint):
+        acceleration = qdd[:, joint]
         velocity = qd[:, joint]
-        basis = np.stack([qdd[:, joint], velocity, np.sign(velocity)], axis=1)
+        basis = np.stack([acceleration, velocity, np.sign(velocity)], axis=1)
         forces = columns[:, joint, k]
         solution = np.linalg.lstsq(basis, forces)[0]
         error = np.abs(basis @ solution - forces)

@@ -76,13 +76,15 @@ def simulator_values(
     drawn_stiffness = 1.0 / np.maximum(ratios["a"], 1e-9)
     K = np.where(is_drawn, drawn_stiffness, servo_stiffness(fit))
 
-    inertia = np.maximum(K * ratios["J"] - _body_inertias(fit, ratios["a"]), 0.0)
-    friction = ratios["F"] + ratios["mu"] * np.abs(ratios["a"]) * fit.load
+    inertia = K * ratios["J"]
+    armature = inertia - _body_inertias(fit, ratios["a"])
+    load_friction = ratios["mu"] * np.abs(ratios["a"]) * fit.load
+    friction = ratios["F"] + load_friction
     is_limited = ratios["um"] < START[INDEX["um"]]
     return {
         "stiffness": K,
         "damping": K * ratios["B"],
-        "armature": inertia,
+        "armature": np.maximum(armature, 0.0),
         "friction": K * friction,
         "effort_limit": np.where(is_limited, K * ratios["um"], np.inf),
         "delay": ratios["d"],
@@ -153,7 +155,6 @@ def export_servo_mjcf(
     path: str | Path,
     *,
     samples: int = 0,
-    seed: int = 0,
     timestep: float = 0.002,
 ) -> list[Path]:
     """Write the robot for MuJoCo, with its identified servos as position actuators.
@@ -169,7 +170,6 @@ def export_servo_mjcf(
         path: Path of the file.
         samples: Number of further files, `NAME_000.xml` …, drawn from the estimates'
             distribution.
-        seed: Seed of the draws.
         timestep: Time step of the simulation [s].
 
     Raises:
@@ -183,7 +183,7 @@ def export_servo_mjcf(
     paths = [path]
     for k in range(samples):
         paths.append(path.with_stem(f"{path.stem}_{k:03d}"))
-    draws = [fit.parameters, *fit.samples(samples, seed)]
+    draws = [fit.parameters, *fit.samples(samples)]
     for file, parameters in zip(paths, draws, strict=True):
         values = simulator_values(fit, parameters)
         write_text(file, _servo_mjcf(fit.bodies, fit.joint_names, values, timestep))
