@@ -57,12 +57,10 @@ def figures(record):
     found = {}
     for name in ESTIMATORS:
         estimate = record["estimates"][name]
-        for k, role in enumerate(("identification", "verification")):
+        for role in ("identification", "verification"):
             found[f"average error, {role}, {name} [%]"] = max(
                 estimate[f"mean_percent_{role}"]
             )
-            moving = max(estimate["mean_percent_moving"][k])
-            found[f"average error, {role}, {name}, moving [%]"] = moving
         found[f"poses with an indefinite mass matrix, {name} [%]"] = (
             100 * estimate["indefinite_share"]
         )

@@ -120,7 +120,7 @@ print(
 # ## How well is each parameter known?
 #
 # Standard deviations come from the spectrum of the residuals: rows behind a filter are not independent, and the textbook formula gives values that are too small by
-# the factor printed here. Blue parameters are known to 10 %, yellow ones to 50 %; red ones are small, or have little effect in this motion.
+# the factor printed here. Parameters that are not known to 10 % are small, or have little effect in this motion.
 
 # %%
 print(
@@ -128,7 +128,8 @@ print(
     np.median(fit.uncertainty.ratios).round(1),
     "(median)",
 )
-jid.plot.parameters(fit)
+count = (fit.relative_standard_deviations <= 0.1).sum()
+print(f"{count} of {base.size} parameters are known to 10 %")
 
 # %% [markdown]
 # ## Comparison with known values

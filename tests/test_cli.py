@@ -274,7 +274,7 @@ def test_a_process_of_its_own_has_double_precision(folder):
 
 
 def test_help_needs_no_jax(run):
-    script = "import sys; import jaxid.cli; sys.exit('jax' in sys.modules)"
+    script = "import sys; import jaxid.cli.app; sys.exit('jax' in sys.modules)"
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     assert (
         subprocess.run([sys.executable, "-c", script], env=environment).returncode == 0
@@ -292,11 +292,11 @@ def test_an_earlier_report_is_replaced_and_foreign_files_are_kept(folder, first,
     (first / "notes.txt").write_text("mine")
     figures = ("--figures", "svg")
     assert run("identify", "experiment.toml", "a.csv", "-o", "first", *figures)[0] == 0
-    assert "torque_a.svg" in os.listdir("first")
+    assert "torque_4_a.svg" in os.listdir("first")
     assert run("identify", "experiment.toml", "b.csv", "-o", "first", *figures)[0] == 0
     assert result(folder, "first")["fit"]["recordings"] == ["b"]
-    assert {"torque_b.svg", "notes.txt"} <= set(os.listdir("first"))
-    assert "torque_a.svg" not in os.listdir("first")
+    assert {"torque_4_b.svg", "notes.txt"} <= set(os.listdir("first"))
+    assert "torque_4_a.svg" not in os.listdir("first")
     (folder / "data").mkdir()
     (folder / "data" / "precious.txt").write_text("mine")
     arguments = ("identify", "experiment.toml", "a.csv", "-o")
@@ -383,7 +383,7 @@ def test_long_logs_give_what_short_ones_give(
     words("identify", *arguments, "-o", "short")
     expected = words("inspect", "slow.toml", f"a.{kind}")
     monkeypatch.setattr("jaxid.workflow.log_loading.LONG_LOG_ROWS", 500)
-    monkeypatch.setattr("jaxid.workflow.log_reading.read_recording", None)
+    monkeypatch.setattr("jaxid.workflow.log_loading.read_recording", None)
     if compiled_rows:
         monkeypatch.setattr("jaxid.RegressionProblem.compiled_samples", 500)
     words("identify", *arguments, "-o", "long")
@@ -445,9 +445,8 @@ def test_a_filter_is_chosen_from_a_list_and_the_report_shows_why(folder, words):
     said = words("identify", "experiment.toml", "a.csv", "--verify", "c.csv")
     assert re.search(r"a cut-off of (10|20) Hz predicts held-out parts", said)
     assert "2 Hz" in said
-    assert "Choice of the filter" in (folder / "report" / "report.html").read_text(
-        "utf-8"
-    )
+    page = (folder / "report" / "report.html").read_text("utf-8")
+    assert "predicts held-out parts" in page
 
 
 @pytest.mark.parametrize("moment", [1.0, 4.0])

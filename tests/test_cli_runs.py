@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from arm_files import HALF_PI, urdf_of_arm
 from test_cli import (  # noqa: F401
     EXPERIMENT,
     first,
@@ -26,15 +27,13 @@ from jaxid.experiment.experiment import load_experiment
 from jaxid.simulation.virtual import random_bodies
 from jaxid.workflow.log_loading import read_log
 
+SPATIAL_ARM = urdf_of_arm(
+    (0.0, 0.0, 0.3, 0.0), (0.1, 0.0, 0.0, -HALF_PI), (0.4, 0.1, 0.0, -HALF_PI)
+)
 SPATIAL = """\
 [robot]
 name = "spatial"
-convention = "modified"
-dh = [
-  { alpha = 0.0, a = 0.0, d = 0.3 },
-  { alpha = -90.0, a = 0.1, d = 0.0 },
-  { alpha = -90.0, a = 0.4, d = 0.1 },
-]
+urdf = "spatial.urdf"
 [limits]
 force = [60, 80, 20]
 velocity = [3, 3, 3]
@@ -80,6 +79,7 @@ def write(path, model, p, seed, gains=1.0, late=0.0):
 def workshop(tmp_path_factory):
     """Logs without and with a load, by true and by nominal gains."""
     place = tmp_path_factory.mktemp("workshop")
+    (place / "spatial.urdf").write_text(SPATIAL_ARM)
     (place / "experiment.toml").write_text(SPATIAL)
     (place / "load.toml").write_text(SPATIAL + LOAD)
     described = load_experiment(place / "load.toml")

@@ -27,8 +27,8 @@ from jaxid.experiment.decoder import keys_of
 from jaxid.experiment.experiment import load_experiment
 from jaxid.report.excitation_page import plan_remarks
 from jaxid.trajectory.controllers import CONTROLLERS
-from jaxid.trajectory.files import load_trajectory, save_trajectory
-from jaxid.trajectory.fourier import FourierBasis, fourier_series
+from jaxid.trajectory.files import load_trajectory
+from jaxid.trajectory.fourier import FourierBasis
 from jaxid.trajectory.lead_in_and_out import LeadsBasis
 from jaxid.trajectory.spline import RestToRestSplineBasis
 from jaxid.workflow.excitation_settings import Excitation, Leads
@@ -372,8 +372,7 @@ def test_limits_forces_by_nominal_parameters_and_adds_to_earlier_motions(
         _, q, _, qdd = table(written / folder / "motion.csv").T
         return np.abs((0.11 + 2 * 0.4**2) * qdd - 2 * 0.4 * 9.81 * np.cos(q)).max()
 
-    keys = ("force_margin = 0.5", 'earlier = ["plan/motion.json"]')
-    path = with_keys(written, "weak.toml", *keys)
+    path = with_keys(written, "weak.toml", "force_margin = 0.5")
     code, out, err = run("excite", path, "-o", "weak/motion.csv")
     assert code == 0, err
     assert largest_force("weak") <= 6.0 < 7.5 < largest_force("plan")
@@ -555,22 +554,11 @@ def test_a_search_that_was_not_begun_cannot_go_on(run):
         ),
         ("noise = [1, 2]", "`noise` must hold one positive number for each joint"),
         ('nominal = "nowhere"', "holds no `model.json`"),
-        ('earlier = ["nowhere.json"]', "nowhere.json"),
-        (
-            'earlier = ["arm.json"]',
-            "the motion of `arm.json` moves 2 joint(s), but the robot",
-        ),
-        (
-            'earlier = ["arm.json"]\ncriterion = "condition_number"',
-            '`earlier` and `criterion = "condition_number"` do not go together',
-        ),
     ],
 )
 def test_refuses_what_does_not_fit(written, run, key, said):
     text = EXPERIMENT.replace("harmonics = 2", "harmonics = 1")
     (written / "wrong.toml").write_text(text + key + "\n")
-    arm = fourier_series(np.zeros(2), np.zeros((2, 1)), np.ones((2, 1)), 1.0)
-    save_trajectory(arm, written / "arm.json")
     code, out, err = run("excite", "wrong.toml")
     assert (code, out) == (2, "")
     assert err.count("\n") == 1

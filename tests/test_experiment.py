@@ -44,14 +44,24 @@ URDF = """\
 </robot>
 """
 
+ARM_OF_SHAPES = """\
+<robot name="arm">
+  <link name="base"/><link name="a"/><link name="b"/><link name="c"/>
+  <joint name="turn" type="continuous">
+    <parent link="base"/><child link="a"/><origin xyz="0 0 0.3"/><axis xyz="0 0 1"/>
+  </joint>
+  <joint name="lift" type="continuous">
+    <parent link="a"/><child link="b"/><origin rpy="-1.5707963267948966 0 0"/>
+    <axis xyz="0 0 1"/>
+  </joint>
+  <joint name="bend" type="continuous">
+    <parent link="b"/><child link="c"/><origin xyz="0.5 0 0"/><axis xyz="0 0 1"/>
+  </joint>
+</robot>
+"""
 SHAPES = """
 [robot]
-convention = "modified"
-dh = [
-  { alpha = 0, a = 0, d = 0.3, name = "turn" },
-  { alpha = -90, a = 0, d = 0, name = "lift" },
-  { alpha = 0, a = 0.5, d = 0, name = "bend" },
-]
+urdf = "shapes.urdf"
 
 [collision]
 distance = 0.05
@@ -84,6 +94,7 @@ def load(tmp_path):
     """Loads an experiment file with this text."""
 
     def load(text):
+        (tmp_path / "shapes.urdf").write_text(ARM_OF_SHAPES)
         path = tmp_path / "experiment.toml"
         path.write_text(text, encoding="utf-8")
         return load_experiment(path)
@@ -125,19 +136,6 @@ def test_defaults_are_said(load):
     assert "10 Hz is assumed" in experiment.setup.notes[1]
 
 
-def test_a_table_of_angles_in_degrees_is_the_builtin_robot(load):
-    rows = [(90, 0.0, 0.1273), (0, -0.612, 0.0), (0, -0.5723, 0.0)]
-    rows += [(90, 0.0, 0.163941), (-90, 0.0, 0.1157), (0, 0.0, 0.0922)]
-    table = ",\n".join(f"  {{ alpha = {al}, a = {a}, d = {d} }}" for al, a, d in rows)
-    robot = load(
-        f'[robot]\nconvention = "standard"\nname = "mine"\ndh = [\n{table}\n]\n'
-    ).setup.robot
-    known = jid.robots.ur10()
-    assert robot.name == "mine"
-    np.testing.assert_array_equal(robot.rotation, known.rotation)
-    np.testing.assert_array_equal(robot.offset, known.offset)
-
-
 def test_limits_replace_those_of_the_robot_and_nan_keeps_them(load):
     known = jid.robots.tx90l_on_rail()
     text = """
@@ -164,6 +162,19 @@ def test_drives_replace_those_of_the_robot(load):
     np.testing.assert_array_equal(drives.reduction, known.reduction)
     np.testing.assert_allclose(drives.zero, known.zero, rtol=1e-15)
     np.testing.assert_array_equal(drives.max_torques, [1, 2, 3, 4, 5, 6])
+
+
+@pytest.mark.parametrize("name", ["planar_arm", "tx40"])
+def test_a_setup_of_a_robot_has_the_model_of_a_file_without_the_table_model(load, name):
+    robot = getattr(jid.robots, name)()
+    of_file = load(f'[robot]\nbuiltin = "{name}"\n').setup
+    setup = jid.Setup(robot)
+    assert setup.model.parameter_names == of_file.model.parameter_names
+    assert any(isinstance(term, jid.ConstantOffset) for term in setup.model.terms)
+    motion = jid.Motion(*np.random.default_rng(0).normal(size=(3, 5, robot.joints)))
+    np.testing.assert_array_equal(
+        setup.model.regressor(motion), of_file.model.regressor(motion)
+    )
 
 
 def test_a_tool_at_the_end_effector_or_on_a_body(load):
@@ -279,9 +290,6 @@ REFUSALS = [
     ('[robot]\nbuiltin = "tx9"', "`robot.builtin`"),
     ('[robot]\nbuiltin = "panda"\ntip = "x"', "`tip` belongs to `urdf`"),
     ('[robot]\nurdf = "no.urdf"', "`urdf`: `.*no.urdf`"),
-    ("[robot]\ndh = [{alpha = 0, a = 0, d = 0}]", "`convention`"),
-    ("[robot]\ndh = []\nconvention = 'standard'", "`robot`"),
-    ("[robot]\ndh = [{alpha = 0, b = 0}]", "`robot.dh[0].b`.*alpha, a, d, theta"),
     (ARM + "gravity = [0, 0, 'g']", "`robot.gravity[2]`"),
     (ARM + "xyzzy = 1", "`robot.xyzzy`.*`[robot]` has urdf"),
     (ARM + 'name = "a\\u001b[31m"', "`robot.name`.*control character"),

@@ -2,20 +2,19 @@
 
 import numpy as np
 import pytest
+from arm_files import HALF_PI, urdf_of_arm
 
 import jaxid as jid
 from jaxid.dynamics.dispatch import in_numpy
 from jaxid.experiment.experiment import load_experiment
 from jaxid.identification.problem import RegressionProblem
 
+ARM_FILE = urdf_of_arm(
+    (0.0, 0.0, 0.3, 0.0), (0.1, 0.0, 0.0, -HALF_PI), (0.4, 0.0, 0.1, 0.0)
+)
 ARM = """\
 [robot]
-convention = "modified"
-dh = [
-  { alpha = 0.0, a = 0.0, d = 0.3 },
-  { alpha = -90.0, a = 0.1, d = 0.0 },
-  { alpha = 0.0, a = 0.4, d = 0.1 },
-]
+urdf = "arm.urdf"
 [limits]
 force = [60, 80, 20]
 [model]
@@ -25,6 +24,7 @@ load = true
 
 @pytest.fixture
 def experiment(tmp_path):
+    (tmp_path / "arm.urdf").write_text(ARM_FILE)
     (tmp_path / "e.toml").write_text(ARM)
     return load_experiment(tmp_path / "e.toml")
 
@@ -61,6 +61,7 @@ def test_coefficients_are_found(experiment, seed):
 
 
 def test_what_it_needs_is_said(tmp_path):
+    (tmp_path / "arm.urdf").write_text(ARM_FILE)
     for text, complaint in (
         ("[estimator]\nkind = 'weighted'\n", r"`model.load`\) needs the bodies"),
         ("principal_axes = true\n", "`load` needs complete bodies"),

@@ -1,8 +1,9 @@
-"""The command line `jaxid`: names, options and help of the commands.
+"""The command line `jaxid`: names, options, help and work of the commands.
 
-Their work is imported when they run, so that `jaxid --help` answers at once.
+The package is imported when a command runs, so that `jaxid --help` answers at once.
 """
 
+import dataclasses
 import io
 import sys
 from pathlib import Path
@@ -11,10 +12,14 @@ from typing import Annotated, Literal
 import typer
 from rich.text import Text
 
+import jaxid as jid
 from jaxid.errors import InputError
-from jaxid.result_table import versions
+from jaxid.result_table import Remark, Status, versions
 
-from . import options
+from . import options, report_commands, run_commands, terminal
+
+UNUSABLE_CODE = 3
+"""Exit code for a verdict against the use of a model, or recording of a motion."""
 
 app = typer.Typer(
     name="jaxid",
@@ -36,8 +41,8 @@ def main() -> None:
     except (InputError, OSError, RuntimeError) as error:
         if isinstance(error, RuntimeError) and type(error) is not RuntimeError:
             raise  # of JAX, not a failed search
-        message = Text(f"jaxid: {options.describe_error(error)}")
-        options.open_console(stderr=True).print(message, soft_wrap=True)
+        message = Text(f"jaxid: {terminal.describe_error(error)}")
+        terminal.open_console(stderr=True).print(message, soft_wrap=True)
         raise SystemExit(2) from None
 
 
@@ -63,40 +68,36 @@ def demo(
     Base parameters, optimal excitation, measurement cold and warm, identification, and
     verification on the path of ISO 9283.
     """
+    console = options.start(output=output, force=force)
     from jaxid.demo.results import remarks, tables, write_study
     from jaxid.demo.study import run_study
 
-    from .printing import show, show_remarks
-    from .progress_bar import progress_bar
-
-    console = options.start(output=output, force=force)
-    with progress_bar(options.open_console(stderr=True)) as progress:
+    with terminal.progress_bar() as progress:
         study = run_study(seed, progress)
         progress("writing the report", 0.0)
         files = write_study(output, study)
-    show(console, *tables(study))
-    show_remarks(console, remarks(study))
-    console.print()
-    console.print(Text(f"the report: {files[0]}"), soft_wrap=True)
+    terminal.show(console, *tables(study))
+    terminal.show_remarks(console, remarks(study))
+    terminal.show_files(console, output, files)
 
 
 @app.command()
 def example(
     folder: Annotated[Path, typer.Argument(help="Folder of the files.", metavar="DIR")],
-    seed: options.Seed = 0,
 ) -> None:
     """Write an experiment to try things on.
 
     An experiment file and two logs of a virtual robot whose parameters are known.
     """
+    console = options.start()
     from jaxid.simulation.example import write_example
 
-    console = options.start()
-    for file in write_example(folder, seed=seed):
-        console.print(Text(f"wrote {file}"), soft_wrap=True)
-    words = f"now: jaxid identify {folder}/experiment.toml {folder}/identification.csv "
-    words += f"--verify {folder}/verification.csv -o {folder}/report"
-    console.print(Text(words), soft_wrap=True)
+    terminal.show_files(console, folder, write_example(folder))
+    terminal.show_text(
+        console,
+        f"now: jaxid identify {folder}/experiment.toml {folder}/identification.csv "
+        f"--verify {folder}/verification.csv -o {folder}/report",
+    )
 
 
 @app.command()
@@ -115,15 +116,9 @@ def init(
     Like this: jaxid init arm.urdf > experiment.toml
     """
     options.start(urdf)
-    from jaxid.experiment.template import write_template
-    from jaxid.robot.urdf import load_urdf
-
-    from .printing import show_remarks
-
-    text = write_template(urdf, tip=tip, base=base)
-    show_remarks(
-        options.open_console(stderr=True), load_urdf(urdf, tip=tip, base=base).notes
-    )
+    text = jid.experiment.write_template(urdf, tip=tip, base=base)
+    notes = jid.load_urdf(urdf, tip=tip, base=base).notes
+    terminal.show_remarks(terminal.open_console(stderr=True), notes)
     typer.echo(text.encode(), nl=False)  # TOML is UTF-8, whatever the terminal is
 
 
@@ -151,17 +146,44 @@ def excite(
     code is 3 if something was not checked.
     """
     console = options.start(experiment)
-    from . import commands
+    from jaxid.experiment.decoder import within
+    from jaxid.report.excitation_page import motion_verdict, plan_remarks, sort_remarks
+
+    from .best_motion import BestMotion
 
     options.refuse_foreign_table(output)
-    commands.excite(console, experiment, output, resume, time)
+    content = jid.experiment.load_experiment(experiment)
+    earlier_design = output.with_suffix(".json") if resume else None
+    if earlier_design is not None and not earlier_design.is_file():
+        raise InputError(
+            f"`{earlier_design}` is not there: `--resume` needs a motion to go on with."
+        )
+    with within("excitation", experiment.name):
+        task = jid.workflow.prepare_motion(
+            content.setup, content.excitation, content.surroundings, earlier_design
+        )
+    faults = [Remark(text, Status.BAD) for text in task.faults]
+    terminal.show_remarks(terminal.open_console(stderr=True), faults)
+    with BestMotion(task, output) as best_motion, terminal.progress_bar() as progress:
+        with within("excitation", experiment.name):
+            design = jid.workflow.design_motion(task, progress, best_motion.keep, time)
+        progress("writing the report", 0.0)
+        origin = options.report_origin(content.text)
+        files = jid.workflow.write_design(task, design, output, **origin)
+    terminal.show(console, *design.plan.tables())
+    verdict = motion_verdict(design.plan, design.remarks)
+    remarks = sort_remarks((*plan_remarks(design.plan), *design.remarks))
+    terminal.show_remarks(console, [*remarks, verdict])
+    terminal.show_files(console, output.parent, files)
+    if verdict.status is Status.BAD:
+        raise typer.Exit(UNUSABLE_CODE)
 
 
 @app.command()
 def inspect(
     experiment: options.ExperimentFile,
     logs: Annotated[
-        list[Path] | None, typer.Argument(help="Logs to examine.", metavar="LOG")
+        options.Paths | None, typer.Argument(help="Logs to examine.", metavar="LOG")
     ] = None,
 ) -> None:
     """Show what can be identified, and check logs for mistakes.
@@ -170,10 +192,26 @@ def inspect(
     parameter; ranges, speeds and forces of each log beside the limits, and what the log
     does not determine.
     """
-    console = options.start(experiment, *(logs or []))
-    from . import commands
+    logs = logs or []
+    console = options.start(experiment, *logs)
+    from jaxid.report.identification_page import motor_tables
 
-    commands.inspect(console, experiment, logs or [])
+    content = jid.experiment.load_experiment(experiment)
+    setup = content.setup
+    notes = setup.notes
+    tables = []
+    with terminal.progress_bar() as progress:
+        progress("finding base parameters", 0.0)
+        base_table = setup.base.summary()
+        if logs:
+            columns = content.require_columns(logs)
+            inspection = jid.workflow.inspect_logs(setup, logs, columns, progress)
+            notes = inspection.notes
+            tables = inspection.tables()
+    robot = setup.robot
+    terminal.show(console, robot.summary(), *motor_tables(robot), base_table)
+    terminal.show_remarks(console, notes)
+    terminal.show(console, *tables)
 
 
 @app.command()
@@ -199,12 +237,31 @@ def identify(
 
     A page for the browser, with figures and a verdict; the same numbers for programs.
     """
-    console = options.start(
-        experiment, *logs, *(verify or []), output=output, force=force
-    )
-    from . import commands
-
-    commands.identify(console, experiment, logs, verify or [], split, output, figures)
+    unseen_logs = verify or []
+    console = options.start(experiment, *logs, *unseen_logs, output=output, force=force)
+    if split is not None and not 0 < split < 1:
+        raise InputError(
+            f"`--split` must lie between 0 and 1, like 0.6, but is {split:g}."
+        )
+    held_out = None if split is None else 1.0 - split
+    content = jid.experiment.load_experiment(experiment)
+    columns = content.require_columns([*logs, *unseen_logs])
+    with terminal.progress_bar() as progress:
+        report = jid.identify_logs(
+            content.setup, logs, columns, held_out, unseen_logs, progress
+        )
+        settings = {
+            "experiment": str(experiment),
+            **options.report_origin(content.text),
+            **report.settings,
+        }
+        report = dataclasses.replace(report, settings=settings)
+        progress("writing the report", 0.0)
+        files = report.save(output, figures or "")
+    terminal.show(console, *report.tables())
+    terminal.show_files(console, output, files)
+    if report.verdict.status is Status.BAD:
+        raise typer.Exit(UNUSABLE_CODE)
 
 
 @app.command()
@@ -229,158 +286,29 @@ def choose(
             f"`{output}` is there already: choose another `--output`, or `--force`."
         )
     console = options.start(experiment, *logs)
-    from . import commands
+    from jaxid.io import write_text
 
-    commands.choose(console, experiment, logs, output)
-
-
-@app.command()
-def export(
-    report: Annotated[
-        Path, typer.Argument(help="Report, or a model file (.json).", metavar="REPORT")
-    ],
-    to: Annotated[
-        Literal["c", "urdf", "mjcf", "json", "pinocchio", "jax"],
-        typer.Option("--to", help="What to write."),
-    ],
-    output: Annotated[
-        Path | None,
-        typer.Option(
-            "-o", "--output", metavar="FILE", help="The file; by default `arm`."
-        ),
-    ] = None,
-    urdf: Annotated[
-        Path | None,
-        typer.Option(metavar="ARM.URDF", help="The robot's file, for `--to urdf`."),
-    ] = None,
-    tip: options.Tip = None,
-    base: options.Base = None,
-    single: Annotated[
-        bool, typer.Option("--float", help="C that computes in single precision.")
-    ] = False,
-    force: options.Force = False,
-) -> None:
-    """Write a model as C, URDF, MJCF, JSON, vectors or JAX.
-
-    C is a feed-forward for controllers: one file and its header, named like the output.
-    """
-    console = options.start(report, *([urdf] if urdf else []))
-    from . import commands
-
-    path = output or Path(commands.EXPORTS[to])
-    files = commands.export(report, to, path, urdf, tip, base, not single, force)
-    console.print()
-    names = ", ".join(file.name for file in files)
-    console.print(Text(f"wrote {path.parent}: {names}"))
+    content = jid.experiment.load_experiment(experiment)
+    if output.parent.resolve() != experiment.parent.resolve():
+        raise InputError(
+            "`--output` must lie beside the experiment file: its paths count from it."
+        )
+    columns = content.require_columns(logs)
+    experiments = jid.experiment.variants(content)
+    setups = {name: variant.setup for name, variant in experiments.items()}
+    with terminal.progress_bar() as progress:
+        choice = jid.workflow.choose_setup(setups, logs, columns, progress)
+    write_text(output, experiments[choice.chosen.name].text)
+    terminal.show(console, choice.summary())
+    terminal.show_files(console, output.parent, [output])
 
 
-@app.command()
-def compare(
-    first: Annotated[
-        Path,
-        typer.Argument(
-            help="Report of one run, like that of the cold robot.", metavar="COLD"
-        ),
-    ],
-    second: Annotated[
-        Path,
-        typer.Argument(help="Report of another run of the same robot.", metavar="WARM"),
-    ],
-    output: options.OutputFolder = Path("comparison"),
-    force: options.Force = False,
-) -> None:
-    """Decide which parameters have changed between two runs.
-
-    Each argument is a folder that `jaxid identify` has written.
-    """
-    console = options.start(first, second, output=output, force=force)
-    from . import commands
-
-    if first.resolve() == second.resolve():
-        raise InputError(f"`{first}` is given twice: compare two different runs.")
-    commands.compare(console, (first, second), output)
-
-
-@app.command()
-def payload(
-    experiment: options.ExperimentFile,
-    logs: options.Logs,
-    loaded: options.Loaded,
-    body: Annotated[
-        str | None,
-        typer.Option(metavar="JOINT", help="The joint that moves the payload."),
-    ] = None,
-    mass: Annotated[
-        float | None,
-        typer.Option(metavar="KG", min=1e-6, help="Its mass, if a scale told it."),
-    ] = None,
-    output: options.OutputFolder = Path("payload"),
-    force: options.Force = False,
-) -> None:
-    """Find a payload's mass, centre of mass and moments of inertia.
-
-    From logs without it and logs with it. Friction may differ between them.
-    """
-    console = options.start(experiment, *logs, *loaded, output=output, force=force)
-    from . import commands
-
-    commands.payload(console, experiment, logs, loaded, body, mass, output)
-
-
-@app.command()
-def gains(
-    experiment: options.ExperimentFile,
-    logs: options.Logs,
-    loaded: options.Loaded,
-    output: options.OutputFolder = Path("gains"),
-    force: options.Force = False,
-) -> None:
-    """Find the drives' true forces with a load that is known.
-
-    From logs without it and logs with it; the table `[load]` of the experiment file
-    describes it.
-    """
-    console = options.start(experiment, *logs, *loaded, output=output, force=force)
-    from . import commands
-
-    commands.gains(console, experiment, logs, loaded, output)
-
-
-@app.command()
-def states(
-    experiment: options.ExperimentFile,
-    logs: options.Logs,
-    output: options.OutputFolder = Path("states"),
-    force: options.Force = False,
-) -> None:
-    """Fit several states at once: one inertia, friction for each.
-
-    One log or report for each, like cold and warm. Friction and offsets are each
-    state's own, all else is shared.
-    """
-    console = options.start(experiment, *logs, output=output, force=force)
-    from . import commands
-
-    commands.states(console, experiment, logs, output)
-
-
-@app.command()
-def rollout(
-    experiment: options.ExperimentFile,
-    logs: options.Logs,
-    verify: options.Verified = None,
-    output: options.OutputFolder = Path("rollout"),
-    force: options.Force = False,
-) -> None:
-    """Identify from commands alone or torques, so that simulations move like the robot.
-
-    If the experiment file names the columns of commands, joints behind position servos,
-    with numbers for simulators and MJCF; otherwise the model of `identify`, with errors
-    beside those of other methods. A page shows measured and simulated motion.
-    """
-    console = options.start(
-        experiment, *logs, *(verify or []), output=output, force=force
-    )
-    from . import commands
-
-    commands.rollout(console, experiment, logs, verify or [], output)
+for command in (
+    report_commands.export,
+    report_commands.compare,
+    run_commands.payload,
+    run_commands.gains,
+    run_commands.states,
+    run_commands.rollout,
+):
+    app.command()(command)

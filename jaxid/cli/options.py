@@ -1,17 +1,16 @@
-"""Options that commands share, the terminal, errors as sentences, result folders."""
+"""Options that commands share, and what they check before they load JAX."""
 
-import errno
 import shlex
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 from rich.console import Console
-from rich.text import Text
 
 from jaxid.errors import InputError
-from jaxid.result_table import printable
+
+from .terminal import open_console
 
 ExperimentFile = Annotated[
     Path, typer.Argument(help="The experiment file.", metavar="EXPERIMENT.TOML")
@@ -36,15 +35,16 @@ Base = Annotated[
     str | None,
     typer.Option(metavar="LINK", help="The link on the ground; by default the root."),
 ]
+Paths = list[Path]
 Logs = Annotated[
-    list[Path],
+    Paths,
     typer.Argument(
         help="Logs; the folder of an earlier report stands for those it was made of.",
         metavar="LOG",
     ),
 ]
 Verified = Annotated[
-    list[Path] | None,
+    Paths | None,
     typer.Option(
         "--verify",
         metavar="LOG",
@@ -52,7 +52,7 @@ Verified = Annotated[
     ),
 ]
 Loaded = Annotated[
-    list[Path],
+    Paths,
     typer.Option(
         metavar="LOG", help="A log with the load, or a report; may be repeated."
     ),
@@ -102,35 +102,9 @@ def start(*reads: Path, output: Path | None = None, force: bool = False) -> Cons
     return open_console()
 
 
-class Terminal(Console):
-    """Terminal on which the names of files and joints cannot be control sequences."""
-
-    def print(self, *objects: Any, **arguments: Any) -> None:  # noqa: D102
-        for text in objects:
-            if isinstance(text, Text):
-                text.plain = printable(text.plain)
-        super().print(*objects, **arguments)
-
-
-def open_console(stderr: bool = False) -> Console:
-    """Return the terminal, or a console of fixed width where there is none."""
-    console = Terminal(stderr=stderr, highlight=False)
-    if not console.is_terminal and "COLUMNS" not in console._environ:
-        console.width = 100
-    return console
-
-
-def describe_error(error: Exception) -> str:
-    """Return what an error of a user or of the operating system says, with its file."""
-    if not isinstance(error, OSError) or not error.strerror:
-        return str(error)
-    place = f"`{error.filename}`: " if error.filename else ""
-    if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
-        return (
-            f"{place}{error.strerror}: nothing was written; "
-            "make room, or choose another -o."
-        )
-    return f"{place}{error.strerror}."
+def report_origin(experiment_text: str) -> dict[str, str]:
+    """Return command and experiment file of a report, for those who repeat it."""
+    return {"command": command_line(), "experiment_text": experiment_text}
 
 
 def command_line() -> str:

@@ -14,22 +14,15 @@ import signal
 import sys
 import threading
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import NoReturn
 
-_farewells: list[Callable[[], str]] = []
+farewells: list[Callable[[], str]] = []
+"""Functions that say what a command has written when a signal ends it."""
 
 
 class _SignalReceived(BaseException):
     """Raised in the main thread, where nothing but waiting is interrupted."""
-
-
-@contextlib.contextmanager
-def handing_over(farewell: Callable[[], str]) -> Iterator[None]:
-    """Let a block say what it has handed over when a signal ends it."""
-    _farewells.append(farewell)
-    yield
-    _farewells.remove(farewell)
 
 
 def main() -> NoReturn:
@@ -61,7 +54,7 @@ def main() -> NoReturn:
         lock = getattr(sys.modules.get("jaxid.io"), "PLACING", None)
         _ = lock is None or lock.acquire(timeout=1.0)
         if not codes:
-            _say(_farewells[-1]() if _farewells else "stopped: nothing was written")
+            _say(farewells[-1]() if farewells else "stopped: nothing was written")
             codes.append(128 + number)
     _leave(codes[0])
 

@@ -8,9 +8,10 @@ import numpy as np
 import jaxid as jid
 from jaxid.io import atomic_folder
 from jaxid.report.identification_page import parameter_table
+from jaxid.report.motion_figures import speed_figure
 from jaxid.report.page import Section, folded, picture, render_page
 from jaxid.report.result_files import write_json
-from jaxid.report.result_records import SCHEMAS
+from jaxid.report.result_records import header
 from jaxid.result_table import (
     MISSING,
     Column,
@@ -117,11 +118,6 @@ def paper_table(study: Study) -> Table:
             max_error_text(study.weighted.mean_errors(1)),
         ),
         (
-            "the same while the axis moves [%]",
-            MISSING,
-            max_error_text(study.moving_errors(study.weighted, 1)),
-        ),
-        (
             "verification, by the true parameters [%]",
             MISSING,
             max_error_text(study.true.mean_errors(1)),
@@ -167,7 +163,6 @@ def error_table(study: Study, recording: int) -> Table:
             column(m.name.replace(" ", "\n"), m.mean_errors(recording))
             for m in study.models
         ),
-        column("weighted,\nmoving", study.moving_errors(study.weighted, recording)),
         rules=[len(names)],
     )
 
@@ -231,7 +226,7 @@ def _excitation(study: Study) -> Section:
         "the paper, it has the least condition number.",
         *designs,
         picture(
-            _speed_scene(robot, times, motion),
+            speed_figure(robot, robot.limits, times, motion),
             "Fig. 3: path of the end-effector along the designed motion, up to "
             f"{speed:.3g} m/s and {acceleration:.3g} m/s² (in the paper 2.7 m/s and "
             "11.3 m/s²).",
@@ -246,22 +241,12 @@ def _excitation(study: Study) -> Section:
 def _identification(study: Study) -> Section:
     robot = study.base.model.robot
     log = study.observations[0]
-    time = np.asarray(log.time)
-    begin, end = study.played.window
-    step = max(1, len(time) // (2 * POINTS))
-    rows = np.flatnonzero((time >= begin) & (time <= end))[::step]
-    desired_motion = study.played.motion(time[rows])
     unweighted_errors = study.unweighted.validation.errors[0]
     weighted_errors = study.weighted.validation.errors[0]
     return "Identification with and without weights", [
         "Cold and warm, the servo follows the motion at 1000 Hz. Logs hold angles of "
         "17-bit encoders and torques with 1 % of noise, ripple, stiction and Stribeck "
         f"friction. Filter (Eq. 25): {log.filter}; {log.rows} rows of each joint.",
-        picture(
-            jid.plot.filtered(robot, time[rows], desired_motion, log.motion[rows], 2),
-            "Fig. 5: desired velocity and acceleration, and those of the filtered "
-            "angles.",
-        ),
         picture(
             jid.plot.torques(
                 unweighted_errors, robot, "identified without weights", FIGURE_AXES
@@ -289,7 +274,7 @@ def _verification(study: Study) -> Section:
         f"corners, up to {settings.SPEED:g} m/s and {settings.ACCELERATION:g} m/s². Of "
         "the redundant joint angles the nearest to a posture are taken.",
         picture(
-            _speed_scene(robot, times, path.motion(times)),
+            speed_figure(robot, robot.limits, times, path.motion(times)),
             "Fig. 8: path of the end-effector.",
         ),
         picture(
@@ -301,17 +286,9 @@ def _verification(study: Study) -> Section:
             "Fig. 10: mean errors on both paths.",
         ),
         (error_table(study, 0), error_table(study, 1)),
-        f"“Moving”: rows of each axis above {settings.REST_SPEED:g} rad/s or m/s. The "
-        "torque of an axis at rest may be anything up to stiction, which no model of "
-        "speeds predicts.",
+        "The torque of an axis at rest may be anything up to stiction, which no model "
+        "of speeds predicts: so even the true parameters leave errors there.",
     ]
-
-
-def _speed_scene(robot: jid.Robot, times: np.ndarray, motion: jid.Motion) -> Any:
-    """Return the robot along a motion, coloured by the speeds of its joints."""
-    percents = 100.0 * np.abs(np.asarray(motion.qd)) / np.asarray(robot.limits.velocity)
-    label = "speed [% of the limit]"
-    return jid.plot.poses(robot, motion.q, time=times, values=percents, label=label)
 
 
 def _study_record(study: Study) -> dict[str, Any]:
@@ -321,8 +298,7 @@ def _study_record(study: Study) -> dict[str, Any]:
     cold_parameters = study.weighted.fit.parameters
     warm_parameters = study.warm.parameters
     return {
-        "schema": SCHEMAS["demo.json"],
-        "versions": versions(),
+        **header("demo.json"),
         "seed": study.seed,
         "base_parameters": base.size,
         "excitation": {
@@ -335,7 +311,6 @@ def _study_record(study: Study) -> dict[str, Any]:
                 "standard_deviations": model.fit.standard_deviations,
                 "mean_percent_identification": model.mean_errors(0),
                 "mean_percent_verification": model.mean_errors(1),
-                "mean_percent_moving": [study.moving_errors(model, k) for k in (0, 1)],
                 "indefinite_share": model.validation.definiteness.indefinite,
             }
             for model in study.models

@@ -9,7 +9,6 @@ import jax
 import numpy as np
 
 import jaxid as jid
-from jaxid.arrays import Float
 from jaxid.identification.parameter_changes import Comparison
 from jaxid.validation.torque_errors import Validation
 
@@ -37,11 +36,6 @@ POSTURE = (0.0, 1.57, -0.3, 1.8, 0.0, 0.0, 0.0)
 """Joint angles to which the redundant robot stays near on that path [m, rad]."""
 SHOULDER = 2
 """Index of the joint whose drive cannot hold and move the arm within all its limits."""
-REST_SPEED = 0.02
-"""Speed below which a joint counts as resting [rad/s or m/s].
-
-It is twice the width of the model's dry friction.
-"""
 
 
 class Model(NamedTuple):
@@ -64,7 +58,7 @@ class Study(NamedTuple):
 
     seed: int  # seed of all random numbers
     base: jid.BaseParameters  # base parameters of the robot
-    truth: Float[np.ndarray, " base"]  # base parameters of the cold robot
+    truth: np.ndarray  # base parameters of the cold robot
     # design with the least condition number (Eq. 36); None if a motion was given
     plan: jid.ExcitationPlan | None
     # motion of the identification, from standstill to standstill
@@ -86,16 +80,6 @@ class Study(NamedTuple):
     def models(self) -> tuple[Model, ...]:
         """All sets of parameters whose errors are compared."""
         return self.unweighted, self.weighted, self.consistent, self.true
-
-    def moving_errors(self, model: Model, recording: int) -> list[float]:
-        """Return the mean errors of all axes in motion [% of the largest torque]."""
-        errors = model.validation.errors[recording]
-        # The observations of the warm robot lie between the two recordings.
-        speeds = np.abs(self.observations[2 * recording].reduced_motion.qd)
-        is_moving = speeds > REST_SPEED
-        sums = np.where(is_moving, np.abs(errors.errors), 0.0).sum(axis=0)
-        mean = sums / np.maximum(is_moving.sum(axis=0), 1)
-        return [float(x) for x in 100.0 * mean / np.asarray(errors.max_forces)]
 
     @property
     def tip_maxima(self) -> tuple[float, float]:

@@ -24,6 +24,8 @@ from jaxid.io import union_members
 from jaxid.units import Unit, unit
 from jaxid.workflow.allowed_values import OneOf, quoted
 
+TomlTable = dict[str, Any]
+"""Table of a TOML file, or arguments that are made of one."""
 MAX_NUMBER = 1e12
 """Largest number of a key, infinity apart, in any unit."""
 
@@ -87,7 +89,7 @@ def decode(
     *,
     complete: bool = True,
     skip: Iterable[str] = (),
-) -> list[dict[str, Any]]:
+) -> list[TomlTable]:
     """Return a table's arguments for each of several functions that share it.
 
     Arguments in `skip` are no keys; keys without default are needed where the table is
@@ -112,7 +114,7 @@ def decode(
     return groups
 
 
-def _require_keys(keys: dict[str, Key], table: dict[str, Any], place: str) -> None:
+def _require_keys(keys: dict[str, Key], table: TomlTable, place: str) -> None:
     """Reject a table that lacks a key without default."""
     for name, key in keys.items():
         if key.default is inspect.Parameter.empty and name not in table:
@@ -121,7 +123,7 @@ def _require_keys(keys: dict[str, Key], table: dict[str, Any], place: str) -> No
 
 
 def check_names(
-    table: dict[str, Any], known_names: list[str], place: str = "the file"
+    table: TomlTable, known_names: list[str], place: str = "the file"
 ) -> None:
     """Reject a key of a table, or a table of the file, that is not known."""
     for name in table:

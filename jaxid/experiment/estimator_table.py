@@ -1,7 +1,7 @@
 """The table `[estimator]` of an experiment file: how rows become parameters."""
 
 import inspect
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 from jaxid.errors import InputError
 from jaxid.identification import estimators
@@ -22,7 +22,7 @@ from jaxid.workflow.allowed_values import (
 from jaxid.workflow.robot_file import RobotFile
 from jaxid.workflow.setup import pull_to_bodies
 
-from .decoder import decode, keys_of, within
+from .decoder import TomlTable, decode, keys_of, within
 
 KEYS_OF_SETTINGS: dict[str, tuple[str, ...]] = {
     "weights": ("weights",),
@@ -58,7 +58,7 @@ class Estimation(NamedTuple):
     notes: tuple[str, ...]  # assumptions, in sentences
 
 
-def decode_estimator(table: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+def decode_estimator(table: TomlTable) -> tuple[TomlTable, TomlTable]:
     """Return the arguments of `build_estimation`, and the bounds of bodies.
 
     Raises:
@@ -90,7 +90,7 @@ def decode_estimator(table: dict[str, Any]) -> tuple[dict[str, Any], dict[str, A
 def build_estimation(
     robot: Robot,
     robot_file: RobotFile | None,
-    bounds: dict[str, Any],
+    bounds: TomlTable,
     *,
     kind: Annotated[str, OneOf(KINDS)] = "consistent",
     weights: Literal["maximum_forces", "residual_variances"] | None = None,
@@ -133,11 +133,12 @@ def build_estimation(
             _ = robot.max_forces
     solution = build_solution(ridge)
     least_squares = estimators.WeightedLeastSquares(joint_weights, solution)
-    settings: dict[str, Any] = {"weights": joint_weights, "solution": solution}
+    settings: TomlTable = {"weights": joint_weights, "solution": solution}
     if kind == "least_squares":
         least_squares = estimators.LeastSquares(solution)
     if kind == "consistent":
-        settings["bounds"] = build_bounds(robot, bounds)
+        if bounds:
+            settings["bounds"] = BodyBounds.from_geometry(robot).replace(**bounds)
         settings["pull"] = pull_to_bodies(robot_file, pull)
     build = ESTIMATORS[kind]
     names = inspect.signature(build).parameters.keys() & settings.keys()
@@ -160,10 +161,3 @@ def build_solution(
     if ridge is not None:
         return estimators.Ridge(ridge)
     return estimators.Complete()
-
-
-def build_bounds(robot: Robot, bounds: dict[str, Any]) -> BodyBounds | None:
-    """Return bounds of the bodies; where none are given, from the robot's geometry."""
-    if not bounds:
-        return None
-    return BodyBounds.from_geometry(robot).replace(**bounds)

@@ -22,7 +22,7 @@ from jaxid.workflow.robot_file import RobotFile
 from jaxid.workflow.setup import Setup
 from jaxid.workflow.surroundings import Collision, Surroundings
 
-from .decoder import call, check_names, decode, within
+from .decoder import TomlTable, call, check_names, decode, within
 from .estimator_table import build_estimation, decode_estimator
 from .model_and_log_tables import (
     Effects,
@@ -135,7 +135,7 @@ def parse_experiment(text: str, path: Path) -> Experiment:
     return experiment
 
 
-def _drop_former_keys(tables: dict[str, Any]) -> None:
+def _drop_former_keys(tables: TomlTable) -> None:
     """Remove keys that earlier templates wrote, at the values that change nothing."""
     for (*places, key), value in FORMER_KEYS.items():
         table: Any = tables
@@ -145,7 +145,7 @@ def _drop_former_keys(tables: dict[str, Any]) -> None:
             del table[key]
 
 
-def _build(tables: dict[str, Any], text: str, path: Path) -> Experiment:
+def _build(tables: TomlTable, text: str, path: Path) -> Experiment:
     """Return the experiment that the tables of a file describe."""
     _require_tables(tables)
     source = call(RobotSource, tables["robot"], "robot")
@@ -176,7 +176,7 @@ def _build(tables: dict[str, Any], text: str, path: Path) -> Experiment:
     )
 
 
-def _require_tables(tables: dict[str, Any]) -> None:
+def _require_tables(tables: TomlTable) -> None:
     """Reject tables that are unknown, no tables, or missing."""
     check_names(tables, list(TABLES))
     for name, table in tables.items():
@@ -184,12 +184,12 @@ def _require_tables(tables: dict[str, Any]) -> None:
             raise InputError(f"`{name}` must be a table, but is {table!r}.")
     if "robot" not in tables:
         raise InputError(
-            "the table `[robot]` is missing: give it `urdf`, `mjcf`, `builtin` or `dh`."
+            "the table `[robot]` is missing: give it `urdf`, `mjcf` or `builtin`."
         )
 
 
 def _build_setup(
-    tables: dict[str, Any],
+    tables: TomlTable,
     robot: Robot,
     robot_file: RobotFile | None,
     reading: LogReading,
@@ -221,7 +221,7 @@ def _build_setup(
 
 
 def _build_rollout(
-    table: dict[str, Any], reading: LogReading
+    table: TomlTable, reading: LogReading
 ) -> ServoSettings | TorqueSettings:
     """Return the settings for logs of commands if the file names them, or of torques.
 
@@ -241,18 +241,17 @@ def _build_rollout(
     return settings
 
 
-def _build_excitation(table: dict[str, Any], folder: Path) -> Excitation:
+def _build_excitation(table: TomlTable, folder: Path) -> Excitation:
     """Return the settings of the motion, with paths that count from the folder."""
     excitation = call(Excitation, table, "excitation")
     nominal = excitation.nominal
     return dataclasses.replace(
         excitation,
         nominal=None if nominal is None else str(folder / nominal),
-        earlier=tuple(str(folder / name) for name in excitation.earlier),
     )
 
 
-def _build_collision(table: dict[str, Any], folder: Path) -> Collision:
+def _build_collision(table: TomlTable, folder: Path) -> Collision:
     """Return the shapes of the file, with paths that count from the folder."""
     collision = call(Collision, table, "collision")
     packages = collision.packages

@@ -15,13 +15,8 @@ from .experiment import Experiment, parse_experiment
 
 Changes = dict[str, dict[str, Any]]
 """Keys that differ from those of a file, by their tables."""
-KEYS: dict[str, dict[str, Any]] = {
-    "viscous_asymmetric": {"viscous": "asymmetric"},
-    "stribeck": {"coulomb": {"stribeck": 0.1}},
-}
-"""Keys of `[model]` for terms that are no switches."""
 EFFECTS: dict[str, dict[str, Any]] = {
-    term.choice: KEYS.get(name, {name: True})
+    term.choice: term.choice_keys or {name: True}
     for name, term in TERMS.items()
     if term.choice
 }

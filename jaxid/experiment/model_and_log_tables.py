@@ -17,7 +17,7 @@ from jaxid.units import Unit
 from jaxid.workflow.allowed_values import Count, Magnitude, OneOf, Positive
 from jaxid.workflow.log_reading import LogReading
 
-from .decoder import call, decode, decode_value, within
+from .decoder import TomlTable, call, decode, decode_value, within
 
 MAX_SPEED = 100.0
 """Speed that no joint exceeds [rad/s or m/s]."""
@@ -191,7 +191,7 @@ class Sides:
     forces_side: Side | None = None
 
     @property
-    def of_columns(self) -> dict[str, Any]:
+    def of_columns(self) -> TomlTable:
         """Sides as arguments of `Columns`."""
         forces_side = self.forces_side or self.side
         return {
@@ -204,7 +204,7 @@ SIDES = ("angles_on_motor_side", "forces_on_motor_side")
 """Arguments of `Columns` for which the file has `side` and `forces_side`."""
 
 
-def build_columns(table: dict[str, Any], robot: Robot) -> tuple[Columns, LogReading]:
+def build_columns(table: TomlTable, robot: Robot) -> tuple[Columns, LogReading]:
     """Return the columns of the logs, and how logs are read."""
     table = {key: with_joint_names(value, robot) for key, value in table.items()}
     if "commands" in table:
@@ -228,9 +228,7 @@ def with_joint_names(value: Any, robot: Robot) -> Any:
     return value
 
 
-def require_fitting_units(
-    columns: Columns, robot: Robot, arguments: dict[str, Any]
-) -> None:
+def require_fitting_units(columns: Columns, robot: Robot, arguments: TomlTable) -> None:
     """Reject units of length for joints that turn, of angle for those that slide."""
     names = []
     if not columns.angles_on_motor_side:
@@ -253,7 +251,7 @@ def require_fitting_units(
                 )
 
 
-def build_filters(table: dict[str, Any]) -> list[filters.AbstractFilter]:
+def build_filters(table: TomlTable) -> list[filters.AbstractFilter]:
     """Return the filter, or several to choose from."""
     hint = Annotated[str, OneOf(filters.FILTERS)]
     kind = decode_value(table.get("kind", ""), hint, "filter.kind")

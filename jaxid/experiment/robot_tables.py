@@ -9,7 +9,6 @@ import numpy as np
 
 from jaxid.errors import InputError
 from jaxid.robot import library
-from jaxid.robot.library import from_dh
 from jaxid.robot.limits_and_drives import Limits, per_joint, range_fault
 from jaxid.robot.robot import Robot, Tool
 from jaxid.robot.rotations import rpy_rotation
@@ -19,32 +18,7 @@ from jaxid.workflow.robot_file import RobotFile, joint_number
 
 MIN_FORCE = 1e-9
 """Force that is taken for a mistake if a limit is smaller [N m or N]."""
-OWNERS = {"tip": ("urdf", "mjcf"), "base": ("urdf", "mjcf"), "convention": ("dh",)}
-"""Keys of `[robot]` that belong to some sources only."""
 AngleUnit = Literal["rad", "deg"]
-DhRow = tuple[str | None, bool, tuple[float, float, float, float]]
-
-
-def dh_row(
-    *,
-    alpha: float = 0.0,
-    a: float = 0.0,
-    d: float = 0.0,
-    theta: float = 0.0,
-    slides: bool = False,
-    name: str | None = None,
-) -> DhRow:
-    """Return one joint of a Denavit-Hartenberg table.
-
-    Args:
-        alpha: Twist about x [deg].
-        a: Length along x [m].
-        d: Offset along z [m].
-        theta: Angle about z at which the joint is at zero [deg].
-        slides: Whether the joint slides along z.
-        name: Name of the joint.
-    """
-    return name, slides, (float(np.deg2rad(alpha)), a, d, float(np.deg2rad(theta)))
 
 
 def inertia_tensor(
@@ -116,7 +90,7 @@ def known_load(
 
 @dataclasses.dataclass(frozen=True)
 class RobotSource:
-    """Place of a robot, and its source: `urdf`, `mjcf`, `builtin` or `dh` is needed.
+    """Place of a robot, and its source: `urdf`, `mjcf` or `builtin` is needed.
 
     Attributes:
         urdf: Path of a URDF or xacro file, as seen from the folder of this file.
@@ -126,11 +100,7 @@ class RobotSource:
         base: Link (body) of that file that stands on the ground, like `"base_link"`.
         builtin: Name of a robot that jaxid knows, like `"tx40"`: tx90l_on_rail, tx40,
             ur10, ur10e, panda, iiwa14, kr300 or planar_arm.
-        dh: Denavit-Hartenberg table with one row for each joint, alpha and theta in
-            degrees, a and d in metres, like `[{ alpha = -90.0, a = 0.0, d = 0.3, theta
-            = 90.0, name = "turn" }]`; `slides = true` marks a prismatic joint.
-        convention: Convention of `dh`: "modified" lists alpha and a of the link before
-            each joint, "standard" those of the link after it.
+
         name: Name of the robot, like `"my robot"`.
         gravity: Gravity in the frame of the ground [m/s²], like `[0.0, 0.0, -9.81]`.
         base_rotation: Orientation of the robot on the ground: roll, pitch, yaw [deg],
@@ -158,8 +128,7 @@ class RobotSource:
         ]
         | None
     ) = None
-    dh: list[Annotated[DhRow, dh_row]] | None = None
-    convention: Literal["modified", "standard"] | None = None
+
     name: str | None = None
     gravity: Vector | None = None
     base_rotation: Vector | None = None
@@ -168,19 +137,18 @@ class RobotSource:
     tool: Annotated[Callable[[Robot], Tool | float], known_load] | None = None
 
     def __post_init__(self) -> None:
-        names = ("urdf", "mjcf", "builtin", "dh")
+        names = ("urdf", "mjcf", "builtin")
         sources = [name for name in names if getattr(self, name) is not None]
         if len(sources) != 1:
             shown = " and ".join(f"`{name}`" for name in sources) or "none of them"
             raise InputError(
-                "one of `urdf`, `mjcf`, `builtin` "
-                f"and `dh` is needed, but there is {shown}."
+                "one of `urdf`, `mjcf` and `builtin` is needed, but there is "
+                f"{shown}; give a Denavit-Hartenberg table to `from_dh` in Python."
             )
-        (source,) = sources
-        for key, owners in OWNERS.items():
-            if getattr(self, key) is not None and source not in owners:
+        for key in ("tip", "base"):
+            if getattr(self, key) is not None and self.builtin is not None:
                 raise InputError(
-                    f"`{key}` belongs to `{owners[0]}`, not to `{source}`: remove it."
+                    f"`{key}` belongs to `urdf`, not to `builtin`: remove it."
                 )
 
     def robot_file(self, folder: Path) -> RobotFile | None:
@@ -221,21 +189,9 @@ class RobotSource:
         """Return the robot."""
         if robot_file is not None:
             robot = robot_file.load()
-        elif self.dh is not None:
-            robot = from_dh(
-                [numbers for _, _, numbers in self.dh],
-                convention=self.convention or "",
-                revolute=tuple(not slides for _, slides, _ in self.dh),
-                joint_names=tuple(
-                    name or f"joint{i}" for i, (name, *_) in enumerate(self.dh, 1)
-                ),
-                source="Denavit-Hartenberg table of the experiment file",
-                **self.placement,
-            )
         else:
-            robot = getattr(library, cast(str, self.builtin))().mounted(
-                *self.placement.values()
-            )
+            build = getattr(library, cast(str, self.builtin))
+            robot = build().mounted(*self.placement.values())
         if self.snap_tolerance is not None:
             robot = robot.snapped(self.snap_tolerance)
         if self.gravity is not None:

@@ -15,6 +15,8 @@ import numpy as np
 
 from .figure_elements import Curve, Drawing, Panel, Scene, Solids, decimate
 
+Content = dict[str, Any]
+"""Data of a figure as the page holds them."""
 PIXELS_PER_INCH = 96
 """Pixels of an inch on a page."""
 SCENE_HEIGHT = 560
@@ -40,18 +42,18 @@ def pack(content: bytes) -> str:
     return base64.b64encode(gzip.compress(content, 6, mtime=0)).decode()
 
 
-def charts(drawing: Drawing) -> list[dict[str, Any]]:
+def charts(drawing: Drawing) -> list[Content]:
     """Return the charts of a figure: titles, values, heights [px], packed contents."""
     if drawing.scene is not None:
         return [_chart("", "", SCENE_HEIGHT, scene_content(drawing.scene))]
     height = drawing.height * PIXELS_PER_INCH
     return [
-        _chart(panel.title, panel.value, height, panel_content(panel, drawing.bins))
+        _chart(panel.title, panel.value, height, panel_content(panel))
         for panel in drawing.panels
     ]
 
 
-def _chart(title: str, value: str, height: float, content: Any) -> dict[str, Any]:
+def _chart(title: str, value: str, height: float, content: Any) -> Content:
     """Return a chart as the template takes it."""
     text = json.dumps(content, separators=(",", ":"), ensure_ascii=False)
     return {
@@ -62,10 +64,10 @@ def _chart(title: str, value: str, height: float, content: Any) -> dict[str, Any
     }
 
 
-def panel_content(panel: Panel, bins: int) -> dict[str, Any]:
+def panel_content(panel: Panel) -> Content:
     """Return a panel, those below it, and their curves; long lines are decimated."""
-    curves: list[dict[str, Any]] = [
-        _curve_content(curve, part, bins) | {"panel": number}
+    curves: list[Content] = [
+        _curve_content(curve, part) | {"panel": number}
         for number, part in enumerate(panel.parts)
         for curve in part.curves
     ]
@@ -82,12 +84,12 @@ def panel_content(panel: Panel, bins: int) -> dict[str, Any]:
     return {"panels": panels, "curves": curves}
 
 
-def _curve_content(curve: Curve, panel: Panel, bins: int) -> dict[str, Any]:
+def _curve_content(curve: Curve, panel: Panel) -> Content:
     """Return a curve with its points packed; a line in time is decimated."""
     x = curve.x
     y = curve.y
     if panel.in_time and curve.kind == "line":
-        x, y = decimate(x, y, bins)
+        x, y = decimate(x, y)
     content = {**vars(curve), "x": _floats(x), "y": _floats(y)}
     if curve.low is not None:
         content["low"] = _floats(curve.low)
@@ -95,13 +97,13 @@ def _curve_content(curve: Curve, panel: Panel, bins: int) -> dict[str, Any]:
     return content
 
 
-def scene_content(scene: Scene) -> dict[str, Any]:
+def scene_content(scene: Scene) -> Content:
     """Return a robot in space: its end-effector's path, and its poses at all frames."""
     bones = scene.bones[scene.frames]
     # A line with gaps: ends of each link, and nothing.
     gaps = np.full_like(bones[:, :, :1], np.nan)
     lines = np.concatenate([bones, gaps], axis=2).reshape(len(bones), -1, 3)
-    content: dict[str, Any] = {
+    content: Content = {
         "label": scene.label,
         "ranges": _axis_ranges(scene),
         "path": _coordinates(scene.points[:, -1]),
@@ -137,7 +139,7 @@ def _axis_ranges(scene: Scene) -> list[list[float]]:
     return np.stack([low - margin, high + margin], axis=1).tolist()
 
 
-def _solids_content(solids: Solids) -> dict[str, Any]:
+def _solids_content(solids: Solids) -> Content:
     """Return shapes, which the browser moves with the bodies."""
     frames, bodies = solids.places.shape[:2]
     places = solids.places.round(LENGTH_DIGITS).reshape(frames, bodies, 12)
@@ -149,7 +151,7 @@ def _solids_content(solids: Solids) -> dict[str, Any]:
     }
 
 
-def _coordinates(points: np.ndarray) -> dict[str, Any]:
+def _coordinates(points: np.ndarray) -> Content:
     """Return the coordinates of points by their axes, as plotly takes them."""
     return {axis: _floats(points[:, k]) for k, axis in enumerate("xyz")}
 

@@ -1,22 +1,19 @@
 """Page and remarks of a designed excitation motion."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from jaxid.arrays import double_precision
-from jaxid.dynamics.motion import Motion
 from jaxid.excitation.design_result import MAX_RELATIVE_DEVIATION, ExcitationPlan
 from jaxid.io import write_text
 from jaxid.result_table import Remark, Status, significant
 from jaxid.robot.collision import CollisionModel
 from jaxid.trajectory.trajectory import AbstractTrajectory
 
-from .figure import Figure
-from .motion_figures import joint_figure, pose_figure
-from .page import picture, provenance, render_page
+from .motion_figures import joint_figure, speed_figure
+from .page import Settings, picture, provenance, render_page
 
 
 def plan_remarks(plan: ExcitationPlan) -> list[Remark]:
@@ -74,10 +71,10 @@ def write_excitation(
     plan: ExcitationPlan,
     played: AbstractTrajectory,
     remarks: Sequence[Remark],
-    settings: Mapping[str, Any],
+    settings: Settings,
     shapes: CollisionModel | None,
-) -> Path:
-    """Write the page of a design; return the file.
+) -> list[Path]:
+    """Write the page of a design; return its file.
 
     The motion as it is played is drawn among the `shapes`. `settings` tell the origin
     of the design as in `provenance`.
@@ -90,7 +87,8 @@ def write_excitation(
     with double_precision():
         time = np.linspace(0.0, float(played.duration), 801)
         motion = played.motion(time)
-    scene = _speed_scene(plan, time, motion, shapes)
+    limits = plan.limits.limits
+    scene = speed_figure(robot, limits, time, motion, shapes)
     every_remark = sort_remarks((*plan_remarks(plan), *remarks))
     criteria, deviations, *use = plan.tables()
     gain = "A random motion that fills the same limits is shown beside this one."
@@ -100,7 +98,7 @@ def write_excitation(
             "The motion",
             [
                 picture(scene, caption),
-                joint_figure(robot, plan.limits.limits, time, motion),
+                joint_figure(robot, limits, time, motion),
             ],
         ),
         ("Use of the limits", use),
@@ -116,7 +114,7 @@ def write_excitation(
     )
     file = folder / "report.html"
     write_text(file, page)
-    return file
+    return [file]
 
 
 def motion_verdict(plan: ExcitationPlan, remarks: Sequence[Remark]) -> Remark:
@@ -144,23 +142,3 @@ def motion_verdict(plan: ExcitationPlan, remarks: Sequence[Remark]) -> Remark:
             "parameters."
         )
     return Remark(text, status)
-
-
-def _speed_scene(
-    plan: ExcitationPlan,
-    time: np.ndarray,
-    motion: Motion,
-    shapes: CollisionModel | None,
-) -> Figure:
-    """Return the robot among shapes, coloured by the speeds of its joints."""
-    speeds = np.abs(np.asarray(motion.qd))
-    limits = np.asarray(plan.limits.limits.velocity)
-    scale = np.where(np.isfinite(limits), limits, np.max(speeds))
-    return pose_figure(
-        plan.base.model.robot,
-        motion.q,
-        time=time,
-        values=100.0 * speeds / scale,
-        label="speed [% of the limit]",
-        shapes=shapes,
-    )

@@ -10,7 +10,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from jaxid.arrays import AnyArray, Float, Int
+from jaxid.arrays import AnyArray
 
 # The palette of Okabe and Ito, which colour-blind readers can tell apart.
 BLUE = "#0072B2"
@@ -27,6 +27,8 @@ PREDICTED = VERMILION
 ERROR = BLUE
 CYCLE = (BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY, GREY)
 """Colours of joints in one panel."""
+MAX_BINS = 1000
+"""Pixel columns of a line, of which each keeps its extremes if the line is longer."""
 GAP_RATIO = 1.5
 """Time between two samples, relative to the median, from which a line has a gap."""
 
@@ -67,7 +69,6 @@ class Panel:
     x_names: Sequence[str] = ()
     # names of the ordinates 0, 1, … from the top, instead of numbers
     y_names: Sequence[str] = ()
-    beside: Sequence[str] = ()  # texts to the right of these names
     # thin lines across: `x` or `y`, value, colour
     levels: Sequence[tuple[str, float, str]] = ()
     # panels below this one with the same abscissa, smaller by their share
@@ -93,16 +94,15 @@ class Panel:
 class Solids(NamedTuple):
     """Surfaces of triangles that move with the robot's bodies or stand still."""
 
-    # vertices in the frames of their bodies [m]
-    vertices: Float[np.ndarray, "vertices 3"]
-    bodies: Int[np.ndarray, " vertices"]  # body of each vertex; -1 is the ground
-    faces: Int[np.ndarray, "faces 3"]  # vertices of each triangle
-    # rotation and origin of each body at the frames of the scene, as [R r]
-    places: Float[np.ndarray, "frames bodies 3 4"]
+    vertices: np.ndarray  # (vertices, 3): in the frames of their bodies [m]
+    bodies: np.ndarray  # (vertices,): body of each vertex; -1 is the ground
+    faces: np.ndarray  # (faces, 3): vertices of each triangle
+    # (frames, bodies, 3, 4): rotation and origin of each body as [R r]
+    places: np.ndarray
 
     @property
-    def placed(self) -> Float[np.ndarray, "frames vertices 3"]:
-        """Vertices in the frame of the ground [m]."""
+    def placed(self) -> np.ndarray:
+        """Vertices in the frame of the ground [m], (frames, vertices, 3)."""
         ground = np.broadcast_to(np.eye(3, 4), (len(self.places), 1, 3, 4))
         # Body -1, the ground, is the last one.
         places = np.concatenate([self.places, ground], axis=1)[:, self.bodies]
@@ -114,29 +114,28 @@ class Solids(NamedTuple):
 class Scene:
     """Robot along a motion in space."""
 
-    time: Float[np.ndarray, " samples"]  # instants of the samples [s]
-    # origins of all bodies, and the end-effector [m]
-    points: Float[np.ndarray, "samples points 3"]
+    time: np.ndarray  # (samples,): their instants [s]
+    points: np.ndarray  # (samples, points, 3): all bodies' origins, and the tip [m]
     # body from whose origin the line to each point leads; -1 for the ground
     links: tuple[int, ...]
-    frames: Int[np.ndarray, " frames"]  # samples at which the page shows the robot
+    frames: np.ndarray  # samples at which the page shows the robot
     poses: int = 6  # number of poses on paper
-    # values of the joints at the samples, as colours; None for none
-    values: Float[np.ndarray, "samples joints"] | None = None
+    # (samples, joints): values of the joints, as colours; None for none
+    values: np.ndarray | None = None
     label: str = ""  # name of the values, with their unit
     # shapes of the robot and around it, on a page; None for none
     solids: Solids | None = None
 
     @property
-    def bones(self) -> Float[np.ndarray, "samples points 2 3"]:
-        """Lines from joint to joint, and to the end-effector."""
+    def bones(self) -> np.ndarray:
+        """Lines between joints and to the tip, (samples, points, 2, 3)."""
         ground = np.zeros_like(self.points[:, :1])
         # Link -1, the ground, is the last point.
         starts = np.concatenate([self.points, ground], axis=1)[:, list(self.links)]
         return np.stack([starts, self.points], axis=2)
 
     @property
-    def mean(self) -> Float[np.ndarray, " samples"]:
+    def mean(self) -> np.ndarray:
         """Mean of the values of all joints."""
         if self.values is None:
             return np.zeros(len(self.time))
@@ -154,8 +153,6 @@ class Drawing:
         height: Height of each panel with those below it [inch].
         width: Width of all on paper [inch].
         scene: Robot in space, in place of panels.
-        bins: Pixel columns of a line on a page: of longer lines each column keeps its
-            extremes.
     """
 
     title: str
@@ -164,7 +161,6 @@ class Drawing:
     height: float = 2.1
     width: float = 11.0
     scene: Scene | None = None
-    bins: int = 2000
 
     @property
     def legend(self) -> list[Curve]:
@@ -180,8 +176,8 @@ class Drawing:
 
 
 def decimate(
-    time: Float[AnyArray, " rows"], values: Float[AnyArray, " rows"], bins: int
-) -> tuple[Float[np.ndarray, " points"], Float[np.ndarray, " points"]]:
+    time: AnyArray, values: AnyArray, bins: int = MAX_BINS
+) -> tuple[np.ndarray, np.ndarray]:
     """Return points of a line: all if they are few, else least and largest of each bin.
 
     A peak of one sample stays visible however long the log is. Gaps in time become NaN,

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from jaxid.arrays import Float
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.dispatch import in_numpy
 from jaxid.dynamics.motion import Motion
@@ -69,9 +68,7 @@ def friction_figure(fit: Fit, logs: Sequence[TorqueErrors]) -> Figure:
     return Figure(f"{robot.name}: friction of the joints", panels, min(3, len(panels)))
 
 
-def _friction_columns(
-    base: BaseParameters, speeds: Float[np.ndarray, "speeds joints"]
-) -> Float[np.ndarray, "speeds joints base"]:
+def _friction_columns(base: BaseParameters, speeds: np.ndarray) -> np.ndarray:
     """Return the columns of the friction of joints that move alone."""
     count, joints = speeds.shape
     # Each joint moves alone at each speed; in the last sample all stand still.
@@ -85,9 +82,7 @@ def _friction_columns(
     return columns[:-1] - columns[-1]
 
 
-def _half_widths(
-    fit: Fit, columns: Float[np.ndarray, "speeds joints base"]
-) -> Float[np.ndarray, "speeds joints"]:
+def _half_widths(fit: Fit, columns: np.ndarray) -> np.ndarray:
     """Return half the widths of 95 % intervals; NaN where they are undetermined."""
     covariance = np.nan_to_num(fit.covariance, posinf=0.0)
     variances = np.einsum("vjk,kl,vjl->vj", columns, covariance, columns)
@@ -146,9 +141,7 @@ def gravity_table(fit: Fit, log: TorqueErrors) -> Table:
     return Table("", *columns)
 
 
-def gravity_forces(
-    fit: Fit, q: Float[np.ndarray, "rows joints"]
-) -> Float[np.ndarray, "rows joints"]:
+def gravity_forces(fit: Fit, q: np.ndarray) -> np.ndarray:
     """Return the forces of the drives against gravity at standstill [N m or N]."""
     base = fit.base
     model = base.model

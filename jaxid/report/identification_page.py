@@ -10,7 +10,6 @@ from markupsafe import Markup
 
 from jaxid.identification.consistency.estimator import Consistency
 from jaxid.identification.fit_result import Fit
-from jaxid.identification.uncertainty import ResidualSpectra
 from jaxid.result_table import (
     Column,
     Remark,
@@ -27,15 +26,17 @@ from jaxid.validation.verdict import RMS_ERROR, Report, verdict
 from .figure import Figure
 from .friction_and_gravity import gravity_table
 from .page import Section, folded, picture, provenance, render_page, tiles
-from .parameter_words import glossary, word_columns
+from .parameter_words import FRAMES_NOTE, word_columns
 
+Figures = Mapping[str, Figure]
+"""Figures by the names of their files."""
+Sections = Iterator[Section]
+"""Sections of the page, from the top."""
 MAX_PANELS = 42
 """Largest number of joints, of all recordings together, whose forces the page shows."""
-MAX_BINS = 28_000
-"""Pixel columns of all these panels together, which bound the size of the page."""
 
 
-def identification_page(report: Report, figures: Mapping[str, Figure]) -> str:
+def identification_page(report: Report, figures: Figures) -> str:
     """Return the page of an identification as HTML: the verdict first, then details."""
     fit = report.fit
     base = fit.base
@@ -44,7 +45,7 @@ def identification_page(report: Report, figures: Mapping[str, Figure]) -> str:
         ("At a glance", _glance(report)),
         *_physics(report, figures),
         ("Measured and predicted forces", _torques(figures, robot)),
-        ("Parameters in words", _parameters(fit, figures["parameters"])),
+        ("Parameters in words", _parameters(fit)),
         (
             "Details",
             [folded(name, *blocks) for name, blocks in _details(report, figures)],
@@ -67,20 +68,14 @@ def identification_page(report: Report, figures: Mapping[str, Figure]) -> str:
 def _glance(report: Report) -> list[Any]:
     """Return verdict, three numbers, the data, and what deserves attention."""
     overall, *criteria = verdict(report)
-    doubts = []
-    good_remarks = []
-    for remark in criteria:
-        is_doubt = remark.status in (Status.BAD, Status.DOUBTFUL)
-        if is_doubt:
-            doubts.append(remark)
-        else:
-            good_remarks.append(remark)
+    doubts = [x for x in criteria if x.status in (Status.BAD, Status.DOUBTFUL)]
+    other_remarks = [x for x in criteria if x not in doubts]
     return [
         overall,
         _three_numbers(report),
         Table("", facts=_data(report)),
         *([doubts] if doubts else []),
-        folded("What else was checked", good_remarks),
+        folded("What else was checked", other_remarks),
     ]
 
 
@@ -149,7 +144,7 @@ def _log_size(log: TorqueErrors) -> str:
     return f"{log.name}: {duration} s, {len(log.time)} rows of each joint"
 
 
-def _physics(report: Report, figures: Mapping[str, Figure]) -> Iterator[Section]:
+def _physics(report: Report, figures: Figures) -> Sections:
     """Yield sections on what the model says of the robot.
 
     They show the robot in motion, its torques before and after, friction and gravity.
@@ -176,17 +171,13 @@ def _physics(report: Report, figures: Mapping[str, Figure]) -> Iterator[Section]
     yield "Gravity", [gravity_table(report.fit, log)]
 
 
-def _torques(figures: Mapping[str, Figure], robot: Robot) -> list[Any]:
+def _torques(figures: Figures, robot: Robot) -> list[Any]:
     """Return the figures of the recordings, the first one unfolded."""
     logs = [figure for name, figure in figures.items() if name.startswith("torque_")]
     first_logs = logs[: max(1, MAX_PANELS // robot.joints)]
-    # Many panels share the size of the page.
-    panels = sum(len(figure.panels) for figure in first_logs)
-    bins = min(first_logs[0].bins, MAX_BINS // panels)
-    blocks: list[Any] = [dataclasses.replace(first_logs[0], bins=bins)]
+    blocks: list[Any] = [first_logs[0]]
     for figure in first_logs[1:]:
-        untitled_figure = dataclasses.replace(figure, title="", bins=bins)
-        blocks.append(folded(figure.title, untitled_figure))
+        blocks.append(folded(figure.title, dataclasses.replace(figure, title="")))
     remaining_logs = len(logs) - len(first_logs)
     if remaining_logs:
         blocks.append(
@@ -196,22 +187,17 @@ def _torques(figures: Mapping[str, Figure], robot: Robot) -> list[Any]:
     return blocks
 
 
-def _parameters(fit: Fit, figure: Figure) -> list[Any]:
-    """Return the meanings of all symbols, and the table and figure of the estimates."""
-    base = fit.base
+def _parameters(fit: Fit) -> list[Any]:
+    """Return the table of the estimates, and how to read it."""
     note = (
         "* together with what forces cannot tell apart from it: see its combination. "
         "A parameter near zero is never known to a few percent, and that is no fault."
     )
-    summary = f"All {base.size} estimates with 95 % intervals and combinations"
-    return [
-        *([fit.determination] if fit.undetermined else []),
-        glossary(base),
-        folded(summary, parameter_table(fit), note, figure),
-    ]
+    doubts = [fit.determination] if fit.undetermined else []
+    return [*doubts, parameter_table(fit), note, FRAMES_NOTE]
 
 
-def _details(report: Report, figures: Mapping[str, Figure]) -> Iterator[Section]:
+def _details(report: Report, figures: Figures) -> Sections:
     """Yield what experts ask for."""
     fit = report.fit
     robot = fit.base.model.robot
@@ -227,12 +213,10 @@ def _details(report: Report, figures: Mapping[str, Figure]) -> Iterator[Section]
 
     text = (
         "Predicted less measured forces. Bars: the mean of their absolute values (Eq. "
-        "37, Fig. 10 of the paper); points: their RMS. The offset is the mean error, "
-        "which a constant of the log explains; RMS values at rest and in motion are "
-        "about it."
+        "37, Fig. 10 of the paper); points: their RMS."
     )
-    tables = tuple(error_table(errors, robot) for errors in report.every_error)
-    yield "Torque errors", [text, figures["errors"], tables]
+    table = report.validation.summary()
+    yield "Torque errors", [text, figures["errors"], table]
     if fit.consistency is not None:
         yield "Bodies", [body_table(fit.consistency, robot.joint_names)]
     if fit.residual_spectra is not None:
@@ -241,10 +225,7 @@ def _details(report: Report, figures: Mapping[str, Figure]) -> Iterator[Section]
             "than white noise has behind the filters (dashed) means that an effect is "
             "missing."
         )
-        table = residual_table(fit.residual_spectra, robot)
-        yield "Residuals", [text, figures["residuals"], table]
-    if "filter" in figures:
-        yield "Choice of the filter", [figures["filter"]]
+        yield "Residuals", [text, figures["residuals"]]
 
 
 def _task(report: Report) -> list[tuple[str, Any]]:
@@ -304,37 +285,6 @@ def motor_tables(robot: Robot) -> list[Table]:
         if np.isfinite(values).any() and np.any(values):
             columns.append(Column(name, np.asarray(values), unit))
     return [Table("motors", *columns)]
-
-
-def error_table(errors: TorqueErrors, robot: Robot) -> Table:
-    """Return the torque errors of one recording, joint by joint (Eq. 37)."""
-    return Table(
-        f"{errors.name}: relative error {percent(errors.relative)} %",
-        Column("joint", robot.joint_names),
-        Column("unit", [robot.force_unit(j) for j in range(robot.joints)]),
-        Column("mean |e|", errors.mean),
-        Column("RMS", errors.rms),
-        Column("mean", errors.mean_percent, "% of max"),
-        Column("RMS", errors.rms_percent, "% of max"),
-        Column("RMS", 100 * errors.rms_relative, "% of RMS force"),
-        Column("offset", errors.offset),
-        Column("RMS at\nrest", errors.rms_at_rest),
-        Column("RMS in\nmotion", errors.rms_in_motion),
-    )
-
-
-def residual_table(spectra: ResidualSpectra, robot: Robot) -> Table:
-    """Return whether each joint's residuals are white, and where their power lies."""
-    limit = percent(spectra.limit)
-    low_power = f"power below {0.1 * spectra.band:.2g} Hz\n(white: 10 %)"
-    return Table(
-        f"residuals within the filters' band; white: departure below {limit} %",
-        Column("joint", robot.joint_names),
-        Column("white", ["yes" if white else "no" for white in spectra.white]),
-        Column("departure", spectra.departure, "%", percent),
-        Column(low_power, spectra.low_frequency, "%", percent),
-        status=[Status.GOOD if white else Status.DOUBTFUL for white in spectra.white],
-    )
 
 
 def body_table(consistency: Consistency, names: Sequence[str]) -> Table:

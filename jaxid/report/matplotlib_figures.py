@@ -25,12 +25,10 @@ from .figure_elements import (
 
 STYLE = ["default", Path(__file__).with_name("figures.mplstyle")]
 """Settings of matplotlib, which stay within this module."""
-LINE_BINS = 700
-"""Bins of a long line, about as many as it has pixel columns."""
 TITLE_HEIGHT = 0.9
 """Height of title and legend [inch]."""
 SMALL_SIZE = 7.5
-"""Size of the texts beside names and on bars [pt]."""
+"""Size of the texts on bars [pt]."""
 DATED_ENTRIES = {"png": "Software", "pdf": "CreationDate", "svg": "Date"}
 """Entry of a file that differs from day to day, or with the version of matplotlib."""
 
@@ -111,7 +109,7 @@ def _draw_panel(axes: Axes, panel: Panel) -> None:
     if panel.x_names:
         _name_abscissas(axes, panel.x_names)
     if panel.y_names:
-        _name_ordinates(axes, panel)
+        _name_ordinates(axes, panel.y_names)
 
 
 def _name_abscissas(axes: Axes, names: Any) -> None:
@@ -124,22 +122,11 @@ def _name_abscissas(axes: Axes, names: Any) -> None:
     axes.grid(visible=False, axis="x")
 
 
-def _name_ordinates(axes: Axes, panel: Panel) -> None:
-    """Write names instead of numbers, from the top, and texts right of the panel."""
-    axes.set_yticks(np.arange(len(panel.y_names)), panel.y_names)
-    axes.set_ylim(len(panel.y_names) - 0.4, -0.6)
+def _name_ordinates(axes: Axes, names: Any) -> None:
+    """Write names instead of numbers, from the top."""
+    axes.set_yticks(np.arange(len(names)), names)
+    axes.set_ylim(len(names) - 0.4, -0.6)
     axes.grid(visible=False, axis="y")
-    place = axes.get_yaxis_transform()
-    for row, text in enumerate(panel.beside):
-        axes.text(
-            1.03,
-            row,
-            text,
-            color=GREY,
-            transform=place,
-            va="center",
-            fontsize=SMALL_SIZE,
-        )
 
 
 def _draw_curve(axes: Axes, curve: Curve, in_time: bool) -> None:
@@ -161,7 +148,7 @@ def _draw_curve(axes: Axes, curve: Curve, in_time: bool) -> None:
             axes.scatter(x, y, s=16, zorder=3, **look)
         case "line":
             if in_time:
-                x, y = decimate(x, y, LINE_BINS)
+                x, y = decimate(x, y)
             dashes = "--" if curve.dashed else "-"
             marker = "o" if curve.marker else ""
             axes.plot(x, y, lw=curve.width, ls=dashes, marker=marker, ms=2.6, **look)

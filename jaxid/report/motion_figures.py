@@ -1,4 +1,4 @@
-"""Figures of a motion (Figs. 3, 4, 5, 8): joints, and the robot in space."""
+"""Figures of a motion (Figs. 3, 4, 8): joints, and the robot in space."""
 
 import dataclasses
 import itertools
@@ -20,8 +20,6 @@ from jaxid.robot.robot import Robot
 from .figure import Figure
 from .figure_elements import (
     CYCLE,
-    MEASURED,
-    PREDICTED,
     VERMILION,
     Curve,
     Panel,
@@ -29,6 +27,10 @@ from .figure_elements import (
     Solids,
 )
 
+Times = Float[AnyArray, " samples"]
+"""Instants of the samples of a motion."""
+JointSamples = Float[AnyArray, "samples joints"]
+"""A value of each joint at each sample."""
 BALL_POINTS = 40
 """Points on the ball at each end of a capsule."""
 GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
@@ -43,9 +45,7 @@ SQUARE_FACES = np.array([[0, 1, 2], [1, 2, 3]])
 """Triangles of a square whose corners are listed row by row."""
 
 
-def joint_figure(
-    robot: Robot, limits: Limits, time: Float[AnyArray, " samples"], motion: Motion
-) -> Figure:
+def joint_figure(robot: Robot, limits: Limits, time: Times, motion: Motion) -> Figure:
     """Return position, velocity and acceleration of all joints, with limits (Fig. 4).
 
     Args:
@@ -89,46 +89,11 @@ def _limit_lines(bounds: Iterable[Any]) -> list[tuple[str, float, str]]:
     return [("y", float(bound), VERMILION) for bound in bounds if np.isfinite(bound)]
 
 
-def filtered_figure(
-    robot: Robot,
-    time: Float[AnyArray, " samples"],
-    desired: Motion,
-    filtered: Motion,
-    joint: int,
-) -> Figure:
-    """Return desired and filtered velocity and acceleration of a joint (Fig. 5).
-
-    Args:
-        robot: Robot that moves.
-        time: Instants of the samples [s].
-        desired: Desired motion at the samples.
-        filtered: Motion that the filter makes of measured positions.
-        joint: Index of the joint, from 0.
-    """
-    unit = robot.joint_unit(joint)
-    panels = []
-    for name, rate_unit, desired_rate, filtered_rate in (
-        ("velocity", f"{unit}/s", desired.qd, filtered.qd),
-        ("acceleration", f"{unit}/s²", desired.qdd, filtered.qdd),
-    ):
-        desired_values = np.asarray(desired_rate)[:, joint]
-        filtered_values = np.asarray(filtered_rate)[:, joint]
-        rms = float(np.sqrt(np.mean((filtered_values - desired_values) ** 2)))
-        curves = [
-            Curve(time, desired_values, "desired", MEASURED, width=2.4),
-            Curve(time, filtered_values, "filtered", PREDICTED),
-        ]
-        difference = f"RMS difference {rms:.3g} {rate_unit}"
-        panels.append(Panel(curves, title=name, value=difference, unit=rate_unit))
-    title = f"{robot.name}: {robot.joint_names[joint]}, desired and filtered"
-    return Figure(title, panels)
-
-
 def pose_figure(
     robot: Robot,
-    q: Float[AnyArray, "samples joints"],
-    time: Float[AnyArray, " samples"] | None = None,
-    values: Float[AnyArray, "samples joints"] | None = None,
+    q: JointSamples,
+    time: Times | None = None,
+    values: JointSamples | None = None,
     label: str = "",
     poses: int = 6,
     title: str | None = None,
@@ -169,15 +134,34 @@ def pose_figure(
     return Figure(title, height=2.6, width=7.5, scene=scene)
 
 
+def speed_figure(
+    robot: Robot,
+    limits: Limits,
+    time: np.ndarray,
+    motion: Motion,
+    shapes: CollisionModel | None = None,
+) -> Figure:
+    """Return the robot along a motion, coloured by the speeds of its joints."""
+    speeds = np.abs(np.asarray(motion.qd))
+    max_speeds = np.asarray(limits.velocity)
+    scale = np.where(np.isfinite(max_speeds), max_speeds, np.max(speeds))
+    return pose_figure(
+        robot,
+        motion.q,
+        time=time,
+        values=100.0 * speeds / scale,
+        label="speed [% of the limit]",
+        shapes=shapes,
+    )
+
+
 def even_indices(count: int, max_count: int) -> np.ndarray:
     """Return indices of at most `max_count` of `count` entries, including both ends."""
     places = np.linspace(0, count - 1, min(max_count, count))
     return np.unique(places.round().astype(int))
 
 
-def _points(
-    robot: Robot, q: Float[np.ndarray, "samples joints"]
-) -> Float[np.ndarray, "samples points 3"]:
+def _points(robot: Robot, q: np.ndarray) -> np.ndarray:
     """Return the origins of all bodies, and the end-effector [m]."""
 
     def points(sample):
@@ -189,9 +173,7 @@ def _points(
         return in_numpy(robot, points, q)
 
 
-def _solids(
-    robot: Robot, shapes: CollisionModel, q: Float[np.ndarray, "frames joints"]
-) -> Solids:
+def _solids(robot: Robot, shapes: CollisionModel, q: np.ndarray) -> Solids:
     """Return the surfaces of all shapes, and the places of the bodies in some poses."""
 
     def body_places(sample):
@@ -220,7 +202,7 @@ def _solids(
     )
 
 
-def _capsule_points(capsule: Capsule) -> Float[np.ndarray, "points 3"]:
+def _capsule_points(capsule: Capsule) -> np.ndarray:
     """Return points on two spheres at a capsule's ends, spread by the golden angle."""
     number = np.arange(BALL_POINTS)
     angle = GOLDEN_ANGLE * number
@@ -232,9 +214,7 @@ def _capsule_points(capsule: Capsule) -> Float[np.ndarray, "points 3"]:
     return (ends[:, None] + float(capsule.radius) * sphere).reshape(-1, 3)
 
 
-def _obstacle_points(
-    obstacle: HalfSpace | Box, size: float
-) -> Float[np.ndarray, "points 3"]:
+def _obstacle_points(obstacle: HalfSpace | Box, size: float) -> np.ndarray:
     """Return corners of a box, or of a square in a plane around the ground's origin."""
     signs = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
     if isinstance(obstacle, Box):

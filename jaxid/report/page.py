@@ -21,6 +21,8 @@ from jaxid.result_table import (
 from .browser_figures import charts, library
 from .figure_elements import Drawing
 
+Settings = Mapping[str, Any]
+"""Origin of a result: facts, command, experiment file."""
 Section = tuple[str, Sequence[Any]]
 """Title, which the table of contents shows, and blocks as `render_page` takes them."""
 _macros = functools.partial(macros, Path(__file__).parent / "templates" / "page.html")
@@ -89,7 +91,7 @@ def folded(summary: str, *blocks: Any) -> Markup:
     return _macros().folded(summary, *map(_render, blocks))
 
 
-def provenance(settings: Mapping[str, Any]) -> Section:
+def provenance(settings: Settings) -> Section:
     """Return the last section of a page: how to get the same result again.
 
     Of `settings`, `facts` (pairs of a word and a text), `command` and `experiment_text`

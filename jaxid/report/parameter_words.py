@@ -6,8 +6,16 @@ import numpy as np
 
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.model import Model
-from jaxid.result_table import Column, Table
+from jaxid.result_table import Column
 from jaxid.robot.robot import Robot
+
+FRAMES_NOTE = (
+    "Numbers count joints and bodies from the base. Masses times distances, and "
+    "moments of inertia, are about the origin of the body's frame, which lies on the "
+    "axis of its joint, and along the frame's axes. Friction and rotors are seen from "
+    "the joint, behind the gear."
+)
+"""Frames and sides in which parameters are given."""
 
 
 def in_words(name: str, model: Model) -> tuple[str, str]:
@@ -43,27 +51,3 @@ def word_columns(base: BaseParameters) -> list[Column]:
         meanings.append(f"{meaning}\N{NO-BREAK SPACE}*" if needs_star else meaning)
         places.append(place)
     return [Column("in words", meanings), Column("of", places)]
-
-
-def glossary(base: BaseParameters) -> Table:
-    """Return the symbols of a model with their meanings, each once."""
-    model = base.model
-    units = {}
-    meanings = {}
-    for name, unit in model.parameters:
-        symbol = re.sub(r"\d+(_\d+)?$", "", name)
-        if symbol not in units:
-            units[symbol] = unit
-            meanings[symbol], _ = in_words(name, model)
-    return Table(
-        "",
-        Column("symbol", [f"{symbol}1, …" for symbol in units]),
-        Column("meaning", list(meanings.values())),
-        Column("unit", list(units.values())),
-        remarks=[
-            "Numbers count joints and bodies from the base. Masses times distances, "
-            "and moments of inertia, are about the origin of the body's frame, which "
-            "lies on the axis of its joint, and along the frame's axes. Friction and "
-            "rotors are seen from the joint, behind the gear"
-        ],
-    )

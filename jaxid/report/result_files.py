@@ -11,17 +11,17 @@ from pathlib import Path
 
 from jaxid.errors import InputError
 from jaxid.identification.fit_result import Fit, load_fit
-from jaxid.identification.parameter_changes import Comparison, Verdict
+from jaxid.identification.parameter_changes import LEVEL, Comparison, Verdict
 from jaxid.io import atomic_folder, json_text, read_json
 from jaxid.result_table import Remark, Status
 from jaxid.validation.verdict import Report
 
-from .estimates import comparison_figure, parameter_figure
+from .comparison_figure import comparison_figure
 from .figure import Figure
 from .friction_and_gravity import error_scene, friction_figure
 from .identification_page import identification_page
 from .page import render_page
-from .residuals import filter_figure, residual_figure
+from .residual_spectra import residual_figure
 from .result_records import (
     SCHEMAS,
     Record,
@@ -72,7 +72,6 @@ def report_figures(report: Report) -> dict[str, Figure]:
     }
     figures = {
         "errors": bar_figure(roles, robot),
-        "parameters": parameter_figure(fit),
         "friction": friction_figure(fit, report.identification),
         "robot": error_scene(fit, shown_log),
     }
@@ -83,8 +82,7 @@ def report_figures(report: Report) -> dict[str, Figure]:
         }
         title = "Torque errors before and after"
         figures["before_and_after"] = bar_figure(groups, robot, title)
-    if report.choice is not None:
-        figures["filter"] = filter_figure(report.choice)
+
     if fit.residual_spectra is not None:
         figures["residuals"] = residual_figure(fit.residual_spectra, robot)
     for role, logs in roles.items():

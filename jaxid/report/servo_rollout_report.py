@@ -1,7 +1,6 @@
 """Report of an identification without torques: motions, their simulation, numbers."""
 
 import dataclasses
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +13,11 @@ from jaxid.export.servo_actuators import (
     simulator_values,
 )
 from jaxid.result_table import Column, Remark, Status, Table, significant
-from jaxid.rollout import PARAMETERS, RolloutErrors, ServoFit
+from jaxid.rollout import RolloutErrors, ServoFit
 
 from .figure import Figure
 from .figure_elements import ERROR, GREY, MEASURED, PREDICTED, Curve, Panel
-from .page import Section, provenance, render_page
+from .page import Section, Settings, provenance, render_page
 from .result_files import write_page_and_table
 from .result_records import Record
 
@@ -47,24 +46,18 @@ class RolloutReport:
     windows: Float[np.ndarray, " joints"]
     unseen: bool
     samples: int
-    settings: Mapping[str, Any]
+    settings: Settings
 
     @property
     def verdict(self) -> Remark:
         """Whether the simulation is closer to the robot than a linear joint."""
         simulation = self.errors.total()
         linear = self.errors.total("linear")
-        worse_joints = [
-            name
-            for name, error, linear_error in zip(
-                self.errors.joint_names, simulation, linear, strict=True
-            )
-            if error >= linear_error
-        ]
+        is_worse = simulation >= linear
         text = "The simulation moves more like the robot than a linear joint does"
         status = Status.GOOD
-        if worse_joints:
-            joints = ", ".join(worse_joints)
+        if is_worse.any():
+            joints = ", ".join(np.array(self.errors.joint_names)[is_worse])
             text = f"The simulation is no better than a linear joint ({joints})"
             status = Status.DOUBTFUL
         sizes = f"{in_milli(simulation)} instead of {in_milli(linear)} mrad or mm"
@@ -146,8 +139,6 @@ class RolloutReport:
             "kind": "commands",
             "joints": fit.joint_names,
             "combinations": rows,
-            "symbols": [parameter.symbol for parameter in PARAMETERS],
-            "parameters": fit.parameters,
             "covariance": fit.covariance,
             "errors": {
                 "motions": errors.motions,

@@ -2,9 +2,8 @@
 
 import dataclasses
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -13,7 +12,7 @@ from jaxid.result_table import Column, Remark, Status, Table
 from jaxid.rollout import TorqueRolloutFit
 
 from .figure import Figure
-from .page import Section, provenance, render_page
+from .page import Section, Settings, provenance, render_page
 from .result_files import write_page_and_table
 from .result_records import Record, estimate_rows
 from .servo_rollout_report import MAX_FIGURES, in_milli, motion_panel
@@ -37,7 +36,7 @@ class TorqueRolloutReport:
     unseen: bool
     findings: list[Remark]
     notes: list[Remark]
-    settings: Mapping[str, Any]
+    settings: Settings
 
     @functools.cached_property
     def errors(self) -> np.ndarray:

@@ -59,11 +59,7 @@ class UrdfTree:
     """
 
     def __init__(
-        self,
-        path: str | Path,
-        *,
-        base: str | None = None,
-        tip: str | None = None,
+        self, path: str | Path, *, base: str | None = None, tip: str | None = None
     ) -> None:
         self.path = str(path)
         self.root, self.gravity, loops = read_description(path)
@@ -175,8 +171,7 @@ class UrdfTree:
                 is_fixed = True
                 self.mimics.append(joint)
             if is_fixed:
-                carrier = self.carriers[parent]
-                self.carriers[child] = _placed(carrier, *self.held_pose(joint))
+                self.carriers[child] = self._held_placement(joint)
             else:
                 self._add_body(joint)
             joints, links = lengths[parent]
@@ -208,18 +203,23 @@ class UrdfTree:
         self.rotation.append(carrier.rotation)
         self.offset.append(carrier.position)
 
+    def _held_placement(self, joint: Any) -> Placement:
+        """Return the placement of the link that a fixed or held joint carries."""
+        parent, _ = link_names(joint)
+        return _placed(self.carriers[parent], *self.held_pose(joint))
+
     def placed_links(self) -> dict[str, Placement]:
         """Return `carriers`, and links on joints that the chain leaves out."""
         placements = dict(self.carriers)
         links = list(placements)
         for link in links:
+            body, R, r = placements[link]
             for joint in self._below[link]:
                 _, child = link_names(joint)
                 is_readable = joint.get("type") in (*TURNING, "prismatic", "fixed")
                 if is_readable and child not in placements:
-                    placements[child] = _placed(
-                        placements[link], *self.held_pose(joint)
-                    )
+                    rotation, offset = self.held_pose(joint)
+                    placements[child] = Placement(body, R @ rotation, r + R @ offset)
                     links.append(child)
         return placements
 
@@ -270,7 +270,9 @@ class UrdfTree:
     def held_pose(self, joint: Any) -> tuple[Matrix3, Vector3]:
         """Return attitude and origin [m] of a held joint's link in its parent."""
         R, r = self._origin(joint)
-        value = 0.0 if joint.get("type") == "fixed" else self.held_at(joint)
+        if joint.get("type") == "fixed":
+            return R, r
+        value = self.held_at(joint)
         if value == 0.0:
             return R, r
         axis = self._axis(joint)
@@ -368,8 +370,7 @@ class UrdfTree:
         if np.abs(rpy).max() > MAX_ANGLE:
             fault = f"its `rpy` is {_words(rpy)}, which are degrees, not radians"
         R = rpy_rotation(rpy)
-        tensor = R @ tensor @ R.T
-        return Inertia(mass, centre, tensor), fault
+        return Inertia(mass, centre, R @ tensor @ R.T), fault
 
     def place(self, element: Any) -> str:
         """Return file and line of an element, for messages."""

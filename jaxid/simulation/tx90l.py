@@ -8,6 +8,7 @@ the list.
 
 import numpy as np
 
+from jaxid.arrays import Float
 from jaxid.dynamics.terms import RigidBodies, RotorInertia
 from jaxid.robot import library
 from jaxid.robot.limits_and_drives import Drives
@@ -82,7 +83,7 @@ def virtual_tx90l_on_rail(
     return virtual if disturbed else virtual.undisturbed()
 
 
-def cad_tx90l_on_rail() -> np.ndarray:
+def cad_tx90l_on_rail() -> Float[np.ndarray, " standard"]:
     """Return a CAD model of `virtual_tx90l_on_rail().model` without friction.
 
     It describes bodies and rotors. Masses and rotors are 10 to 18 % off, each body as a
@@ -95,7 +96,7 @@ def cad_tx90l_on_rail() -> np.ndarray:
     )
 
 
-def _bodies(published: dict[int, float]) -> np.ndarray:
+def _bodies(published: dict[int, float]) -> Float[np.ndarray, "7 7"]:
     """Return seven parameters of each body with published base parameters (Eq. 24)."""
     entry = library.entries()["virtual_tx90l_on_rail"]
     m = np.array(entry["masses"])
@@ -150,7 +151,7 @@ def _friction(robot: Robot) -> tuple[LuGreFriction, FrictionTemperature]:
     return friction, heating
 
 
-def _warm_factors(first: int, second: int) -> np.ndarray:
+def _warm_factors(first: int, second: int) -> Float[np.ndarray, "7"]:
     """Return warm over cold friction of all axes, by two numbers of base parameters."""
     factor_1 = WARM[first] / COLD[first]
     factor_2 = WARM[second] / COLD[second]

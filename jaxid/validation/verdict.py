@@ -10,11 +10,10 @@ from jaxid.dynamics.terms import ConstantOffset
 from jaxid.identification.estimators.regularisation_and_weights import (
     LARGEST_UNCERTAINTY,
 )
-from jaxid.identification.filter_selection import FilterChoice
 from jaxid.identification.fit_result import Fit
 from jaxid.result_table import Remark, Status, significant
 
-from .torque_errors import Definiteness, TorqueErrors
+from .torque_errors import Definiteness, TorqueErrors, Validation
 
 RMS_ERROR = (5.0, 50.0)
 """RMS errors on new motions: good, and tolerable [% of the RMS force, worst joint]."""
@@ -49,12 +48,16 @@ class Report:
     ] = ()  # findings on the logs that deserve attention, as sentences
     # likely mistakes in the description of the logs or the robot, as sentences
     mistakes: Sequence[str] = ()
-    choice: FilterChoice | None = (
-        None  # choice of the filter, where it was left to the logs
-    )
     # errors on all logs of the parameters that the robot's file claims; empty without
     claimed: Sequence[TorqueErrors] = ()
     claimed_mass: float = 0.0  # mass of all bodies that it claims [kg]; 0 without
+
+    @property
+    def validation(self) -> Validation:
+        """Torque errors on all logs."""
+        robot = self.fit.base.model.robot
+        units = tuple(robot.force_unit(joint) for joint in range(robot.joints))
+        return Validation(self.every_error, self.definiteness, robot.joint_names, units)
 
     @property
     def every_error(self) -> tuple[TorqueErrors, ...]:

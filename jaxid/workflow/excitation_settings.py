@@ -62,8 +62,6 @@ class Excitation:
         ros: Kind of the file for ROS 2: "yaml" or "mcap" (a bag).
         nominal: Folder of an earlier result of `jaxid identify`, to compare with, like
             `"report"`.
-        earlier: Motions whose logs will be used together with this one's, like
-            `["trajectory.json"]`.
         force_margin: Fraction of the largest forces to keep free, by nominal
             parameters, like `0.1`; by default 0.3 if friction or others are unknown,
             else 0.
@@ -89,7 +87,6 @@ class Excitation:
     controller: Annotated[str, OneOf(CONTROLLERS)] | None = None
     ros: Literal["yaml", "mcap"] = "yaml"
     nominal: str | None = None
-    earlier: tuple[str, ...] = ()
     force_margin: Annotated[float, Bounds(minimum=0.0, below=1.0)] | None = None
     tip_speed: Positive = math.inf
     tip_acceleration: Positive = math.inf

@@ -6,7 +6,7 @@ import os
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,32 +26,24 @@ from jaxid.identification.problem import RegressionProblem
 from jaxid.measurement.columns import Columns
 from jaxid.measurement.observations import Observations
 from jaxid.measurement.recording import Recording
-from jaxid.report.identification_page import body_table, motor_tables, residual_table
+from jaxid.report.identification_page import body_table, motor_tables
 from jaxid.report.result_files import read_fit, write_report
 from jaxid.result_table import Remark, Status, Summarised, Table
 from jaxid.validation.diagnosis import mistakes_in_logs
 from jaxid.validation.torque_errors import (
     TorqueErrors,
-    Validation,
     torque_errors,
     validate,
 )
 from jaxid.validation.verdict import Report, verdict
 
 from .log_loading import LoadedLog, fitted_share, is_report, load_logs, select_filter
-from .setup import Progress, Setup, ignore_progress
+from .setup import Paths, Progress, Setup, ignore_progress
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class IdentificationReport(Summarised, Report):
     """Identified model, its validation, and the judgement, which notebooks show."""
-
-    @property
-    def validation(self) -> Validation:
-        """Torque errors on all logs."""
-        robot = self.fit.base.model.robot
-        units = tuple(robot.force_unit(joint) for joint in range(robot.joints))
-        return Validation(self.every_error, self.definiteness, robot.joint_names, units)
 
     @functools.cached_property
     def judgement(self) -> list[Remark]:
@@ -74,8 +66,7 @@ class IdentificationReport(Summarised, Report):
         if notes:
             tables.append(Table("", remarks=tuple(dict.fromkeys(notes))))
         tables.append(fit.summary())
-        if fit.residual_spectra is not None:
-            tables.append(residual_table(fit.residual_spectra, robot))
+
         if fit.consistency is not None:
             tables.append(body_table(fit.consistency, robot.joint_names))
         verdict, *criteria = self.judgement
@@ -115,10 +106,10 @@ class LogParts(NamedTuple):
 
 def identify_logs(
     setup: Setup,
-    logs: Sequence[str | Path],
+    logs: Paths,
     columns: Columns,
     held_out: float | None = None,
-    verify: Sequence[str | Path] = (),
+    verify: Paths = (),
     progress: Progress = ignore_progress,
 ) -> IdentificationReport:
     """Identify a robot with logs, and validate with others or the rest of them.
@@ -139,7 +130,7 @@ def identify_logs(
     files = [path for path in logs if not is_report(path)]
     reports = [path for path in logs if is_report(path)]
 
-    setup, choice = select_filter(setup, files, columns, progress, held_out)
+    setup = select_filter(setup, files, columns, progress, held_out)
     loaded_logs = load_logs(setup, [*files, *verify], columns, progress)
     fitted_logs = loaded_logs[: len(files)]
     parts = split_logs(loaded_logs, len(files), held_out)
@@ -168,11 +159,17 @@ def identify_logs(
         validation.errors[: len(parts.training_logs)],
         validation.errors[len(parts.training_logs) :],
         validation.definiteness,
-        describe(setup, logs, verify, held_out),
+        settings={
+            "identification": list(map(str, logs)),
+            "verification": list(map(str, verify)),
+            "split": None if held_out is None else fitted_share(held_out),
+            "filter": str(setup.filter),
+            "decimation": str(setup.decimation),
+            "min_speed": setup.min_speed,
+        },
         notes=(*setup.notes, *dict.fromkeys(notes)),
         doubts=[text for log in loaded_logs for text in log.findings],
         mistakes=mistakes,
-        choice=choice,
         claimed=claims.errors,
         claimed_mass=claims.mass,
     )
@@ -231,20 +228,6 @@ def resolution_notes(fit: Fit, logs: Sequence[LoadedLog]) -> list[str]:
             texts = resolution_note(fit, recording, observations)
             notes += [f"{recording.name}: {text}" for text in texts]
     return notes
-
-
-def describe(
-    setup: Setup, logs: Sequence[Path], verify: Sequence[Path], held_out: float | None
-) -> dict[str, Any]:
-    """Return the logs and settings of an identification, for its record."""
-    return {
-        "identification": [str(log) for log in logs],
-        "verification": [str(log) for log in verify],
-        "split": None if held_out is None else fitted_share(held_out),
-        "filter": str(setup.filter),
-        "decimation": str(setup.decimation),
-        "min_speed": setup.min_speed,
-    }
 
 
 class Claims(NamedTuple):

@@ -1,7 +1,6 @@
 """Examination of logs: is this log sane, and what does it determine?"""
 
 import dataclasses
-from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -13,7 +12,7 @@ from jaxid.result_table import Summarised, Table
 from jaxid.validation.diagnosis import Diagnosis
 
 from .log_loading import load_log, observe_commands, select_filter
-from .setup import Progress, Setup, ignore_progress
+from .setup import Paths, Progress, Setup, ignore_progress
 
 
 class ExaminedLog(NamedTuple):
@@ -41,7 +40,7 @@ class Inspection(Summarised):
 
 def inspect_logs(
     setup: Setup,
-    logs: Sequence[str | Path],
+    logs: Paths,
     columns: Columns,
     progress: Progress = ignore_progress,
 ) -> Inspection:
@@ -54,7 +53,7 @@ def inspect_logs(
         progress: Callback, called with a stage and its completed fraction (0 to 1).
     """
     paths = [Path(log) for log in logs]
-    setup, _ = select_filter(setup, paths, columns, progress)
+    setup = select_filter(setup, paths, columns, progress)
     examined_logs = []
     for path in paths:
         observations, diagnosis = load_log(setup, path, columns, progress)

@@ -10,16 +10,15 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxid.errors import InputError
-from jaxid.identification.filter_selection import (
-    FilterChoice,
-    choose_filter,
-)
+from jaxid.identification.filter_selection import choose_filter
 from jaxid.measurement.columns import Columns
 from jaxid.measurement.log_files import estimated_rows, is_bag_folder
 from jaxid.measurement.observations import Observations
-from jaxid.measurement.reading import scan_log
-from jaxid.measurement.recording import Recording
+from jaxid.measurement.reading import read_recording, scan_log
+from jaxid.measurement.recording import Recording, remove_delay
 from jaxid.measurement.time_grid import NeedsMemory
+from jaxid.robot.robot import Robot
+from jaxid.units import NM
 from jaxid.validation.diagnosis import Diagnosis, diagnose
 from jaxid.validation.torque_errors import comparison_step
 
@@ -31,6 +30,8 @@ BRIDGED_PERIODS = 0.1
 """Pause that is bridged in any case, in periods of the largest cut-off frequency."""
 MIN_SPEED_OF_MOTION = 1e-9
 """Speed below which a joint rests [rad/s or m/s]."""
+MIN_SAMPLE_TIME = 1e-6
+"""Sample time below which the unit of the time must be wrong [s]."""
 
 
 class LoadedLog(NamedTuple):
@@ -48,18 +49,74 @@ class LoadedLog(NamedTuple):
 
 def read_log(setup: Setup, log: str | Path, columns: Columns) -> Recording:
     """Read a log into memory."""
-    return setup.reading.read(Path(log), columns, setup.robot, bridged_pause(setup))
+    path = Path(log)
+    reading = setup.reading
+    filters = (setup.filter, *setup.filter_candidates)
+    max_cutoff = max(getattr(x, "cutoff", np.inf) for x in filters)
+    recording = read_recording(
+        path,
+        columns,
+        largest_gap=reading.largest_gap,
+        bridged=BRIDGED_PERIODS / max_cutoff,
+        bad_rows=reading.bad_rows,
+        **reading.files(path),
+    )
+    require_plausible(recording, path, setup.robot)
+    if np.isfinite((reading.start, reading.stop)).any():
+        recording = recording.crop(reading.start, reading.stop)
+    if reading.force_delay:
+        recording = remove_delay(recording, reading.force_delay)
+    return recording
+
+
+def require_plausible(recording: Recording, log: Path, robot: Robot) -> None:
+    """Reject a recording of another number of joints, or with a wrong unit of time."""
+    if recording.joints != robot.joints:
+        raise InputError(
+            f"`recording.angles` names {recording.joints} of the columns of "
+            f"`{log.name}`, but `{robot.name}` has {robot.joints} joints: name one "
+            "column for each, or choose another robot (`robot.tip`)."
+        )
+    if recording.sample_time < MIN_SAMPLE_TIME:
+        rate = 1 / recording.sample_time
+        raise InputError(
+            f"`{log.name}` has {rate:.3g} samples in a second: check `time_unit`."
+        )
 
 
 def read_commands(setup: Setup, log: Path, columns: Columns) -> Recording:
-    """Read a log with the commanded angles in place of forces."""
-    return setup.reading.read_commands(log, columns, setup.robot, bridged_pause(setup))
+    """Read a log with the commanded angles in place of forces.
 
-
-def bridged_pause(setup: Setup) -> float:
-    """Return the pause of a log that is bridged in any case [s]."""
-    filters = (setup.filter, *setup.filter_candidates)
-    return BRIDGED_PERIODS / max(getattr(x, "cutoff", np.inf) for x in filters)
+    Raises:
+        InputError: If the columns of the commands are not named, or not in the log.
+    """
+    commands = setup.reading.commands
+    if commands is None:
+        raise InputError(
+            "`recording.commands` is missing: it names the columns of the "
+            'commanded angles, like "cmd{}".'
+        )
+    # Readers know no commands: they read them as forces, with their units ...
+    measured_columns = dataclasses.replace(
+        columns,
+        forces=commands,
+        force_unit=NM,
+        force_signs=None,
+        force_gains=None,
+        torque_constants=None,
+        velocities=None,
+    )
+    # ... and once more as angles, in the units and signs of these.
+    command_columns = dataclasses.replace(
+        measured_columns, angles=commands, forces=columns.angles
+    )
+    try:
+        measured = read_log(setup, log, measured_columns)
+    except InputError as error:
+        text = str(error).replace("`forces`", "`commands`")
+        raise InputError(text) from None
+    command_angles = read_log(setup, log, command_columns).angles
+    return dataclasses.replace(measured, forces=command_angles)
 
 
 def observe_commands(setup: Setup, log: Path, columns: Columns) -> Observations | None:
@@ -183,13 +240,13 @@ def select_filter(
     columns: Columns,
     progress: Progress = ignore_progress,
     held_out: float | None = None,
-) -> tuple[Setup, FilterChoice | None]:
-    """Return the setup with the filter that suits some logs best, and the choice.
+) -> Setup:
+    """Return the setup with the filter that suits some logs best; a note says why.
 
     The last part of each log, the fraction `held_out`, stays unseen.
     """
     if not setup.filter_candidates or not logs:
-        return setup, None
+        return setup
     long_log = next(filter(is_long, logs), None)
     if long_log is not None:
         raise InputError(
@@ -212,14 +269,13 @@ def select_filter(
         min_speed=setup.min_speed,
         progress=partial(progress, "choosing the filter"),
     )
-    chosen_setup = dataclasses.replace(
+    return dataclasses.replace(
         setup,
         unknowns=setup.base,
         filter=choice.filter,
         filter_candidates=(),
         notes=(*setup.notes, str(choice)),
     )
-    return chosen_setup, choice
 
 
 def fitted_share(held_out: float) -> float:

@@ -21,7 +21,7 @@ from jaxid.rollout import (
 from .allowed_values import Bounds, Positive
 from .log_identification import require_separate_logs
 from .log_loading import load_logs, read_commands, select_filter
-from .setup import Progress, Setup, ignore_progress
+from .setup import Paths, Progress, Setup, ignore_progress
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,10 +70,10 @@ class TorqueSettings:
 
 def identify_rollout_from_logs(
     setup: Setup,
-    logs: Sequence[str | Path],
+    logs: Paths,
     columns: Columns,
     settings: ServoSettings | TorqueSettings,
-    verify: Sequence[str | Path] = (),
+    verify: Paths = (),
     progress: Progress = ignore_progress,
 ) -> RolloutReport | TorqueRolloutReport:
     """Identify a robot so that simulations follow its positions, and simulate.
@@ -156,7 +156,7 @@ def _follow_torques(
         raise InputError("give `rollout.load_friction`, not `model.load`.")
     progress("finding base parameters", 0.0)
     base = setup.base
-    setup, _ = select_filter(setup, logs, columns, progress)
+    setup = select_filter(setup, logs, columns, progress)
     loaded_logs = load_logs(setup, [*logs, *verify], columns, progress)
     observations = [log.observations for log in loaded_logs]
     training_logs = observations[: len(logs)]

@@ -11,7 +11,6 @@ from jaxid.errors import InputError
 from jaxid.excitation.constraints import AbstractConstraint, TipLimits
 from jaxid.excitation.design import DesignProgress, design_excitation
 from jaxid.excitation.design_result import ExcitationPlan
-from jaxid.excitation.problem import assumed_noise
 from jaxid.io import import_extra
 from jaxid.report.excitation_page import write_excitation
 from jaxid.result_table import Remark, Status
@@ -26,7 +25,6 @@ from .motion_files import PlayableMotion, make_playable, write_motion
 from .nominal_parameters import (
     UNKNOWN_SHARE,
     Nominal,
-    earlier_information,
     find_nominal,
     limit_forces,
 )
@@ -150,10 +148,7 @@ def design_motion(
         InputError: If the settings do not fit the robot, or no motion keeps all limits.
     """
     setup, excitation = task.setup, task.excitation
-    if excitation.noise is None:
-        noise = assumed_noise(setup.robot)
-    else:
-        noise = np.array(excitation.noise)
+    noise = None if excitation.noise is None else np.array(excitation.noise)
     plan = design_excitation(
         setup.base,
         basis=excitation.basis(bool(task.constraints)),
@@ -161,7 +156,6 @@ def design_motion(
         key=jax.random.key(excitation.seed),
         noise=noise,
         nominal=task.nominal and task.nominal.sizes(setup.base),
-        prior=earlier_information(setup, excitation, noise),
         samples=excitation.samples,
         criterion=excitation.objective,
         starts=excitation.starts,
@@ -211,7 +205,7 @@ def write_design(
     facts = (("seed", str(task.excitation.seed)),)
     settings = {"facts": facts, "experiment_text": experiment_text, "command": command}
     # First the page: where there is no room for pictures, nothing changes.
-    page = write_excitation(
+    pages = write_excitation(
         output.with_suffix(""),
         design.plan,
         design.playable.motion,
@@ -222,7 +216,7 @@ def write_design(
     motion_files = write_motion(
         task.setup.robot, task.excitation, design.playable, output
     )
-    return [*motion_files, page]
+    return motion_files + pages
 
 
 def describe_motion(
@@ -243,14 +237,11 @@ def describe_motion(
             "the noise is assumed as 1 % of the largest forces: "
             "give `noise` if it is known"
         )
-    if excitation.earlier:
-        files = ", ".join(excitation.earlier)
-        yield Remark(f"deviations are those together with {files}")
     leads = excitation.chosen_leads
     if leads is not None and leads.periods > 1:
-        periods = leads.periods
         yield Remark(
-            f"the motion runs through {periods} periods; the deviations are of one"
+            f"the motion runs through {leads.periods} periods; the deviations are of "
+            "one"
         )
     if task.nominal is None:
         yield Remark(

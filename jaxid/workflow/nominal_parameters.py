@@ -10,10 +10,8 @@ from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
 from jaxid.excitation.constraints import ForceLimits
-from jaxid.excitation.criteria import information
 from jaxid.report.result_files import read_fit
-from jaxid.robot.robot import Robot, complete_limits
-from jaxid.trajectory.files import load_trajectory
+from jaxid.robot.robot import Robot
 
 from .excitation_settings import Excitation
 from .setup import Setup
@@ -32,13 +30,13 @@ NO_MAX_FORCES = "not checked: no largest forces are known; give `limits.force`"
 class Nominal(NamedTuple):
     """Base parameters as far as they are known before the experiment."""
 
-    parameters: Float[np.ndarray, " base"]  # values; NaN where nothing is known
+    parameters: np.ndarray  # values; NaN where nothing is known
     # covariance of an earlier fit, zero for what it does not determine; None if they
     # are claims
     covariance: Float[np.ndarray, "base base"] | None
     undetermined: tuple[str, ...] = ()  # names of what an earlier fit leaves open
 
-    def sizes(self, base: BaseParameters) -> Float[np.ndarray, " base"]:
+    def sizes(self, base: BaseParameters) -> np.ndarray:
         """Return the values; NaN for estimates of what is not determined."""
         leaves_open = np.isin(base.names, self.undetermined)
         return np.where(leaves_open, np.nan, self.parameters)
@@ -92,27 +90,23 @@ def limit_forces(
         InputError: If `force_margin` is given, but forces cannot be limited: nothing is
             known of them, or gravity alone exceeds the limits.
     """
-    forces = _limits_or_fault(setup, excitation.force_margin, nominal)
-    # A user who gives a margin relies on the limits: then a fault is an error.
-    if forces.fault and excitation.force_margin is not None:
-        raise InputError(f"`force_margin`: {forces.fault}.")
-    return forces
-
-
-def _limits_or_fault(
-    setup: Setup, margin: float | None, nominal: Nominal | None
-) -> LimitedForces:
-    """Return limits that motions can keep, or the fault that prevents them."""
-    if nominal is None:
-        return LimitedForces(None, NO_INERTIAS)
-    if margin is None:
+    limits = None
+    fault = NO_INERTIAS
+    margin = excitation.force_margin
+    if nominal is not None:
         has_unknown_parameters = np.isnan(nominal.parameters).any()
-        margin = UNKNOWN_SHARE if has_unknown_parameters else 0.0
-    parameters = np.nan_to_num(nominal.parameters)
-    limits = ForceLimits(setup.base, parameters, nominal.covariance, margin)
-    if not limits.entries(setup.robot):
-        return LimitedForces(None, NO_MAX_FORCES)
-    fault = gravity_fault(setup.robot, limits)
+        default_margin = UNKNOWN_SHARE if has_unknown_parameters else 0.0
+        limits = ForceLimits(
+            setup.base,
+            np.nan_to_num(nominal.parameters),
+            nominal.covariance,
+            default_margin if margin is None else margin,
+        )
+        is_limited = limits.entries(setup.robot)
+        fault = gravity_fault(setup.robot, limits) if is_limited else NO_MAX_FORCES
+    # A user who gives a margin relies on the limits: then a fault is an error.
+    if fault and margin is not None:
+        raise InputError(f"`force_margin`: {fault}.")
     return LimitedForces(None if fault else limits, fault)
 
 
@@ -121,7 +115,7 @@ def gravity_fault(robot: Robot, limits: ForceLimits) -> str:
     q = random_poses(robot)
     rest = Motion(q, np.zeros_like(q), np.zeros_like(q))
     with double_precision():
-        excess: Float[np.ndarray, "poses values"] = np.asarray(limits(robot, rest))
+        excess = np.asarray(limits(robot, rest))
     largest_excess = excess.max(axis=1)
     best_pose = int(largest_excess.argmin())
     if largest_excess[best_pose] <= 0:
@@ -136,37 +130,12 @@ def gravity_fault(robot: Robot, limits: ForceLimits) -> str:
     )
 
 
-def random_poses(robot: Robot) -> Float[np.ndarray, "poses joints"]:
+def random_poses(robot: Robot) -> np.ndarray:
     """Return random poses within the joints' range, the first of them near zero."""
-    limits = complete_limits(robot)
-    low, high = np.asarray(limits.position_min), np.asarray(limits.position_max)
+    ends = np.where(robot.revolute, np.pi, 1.0)
+    low, high = robot.limits.position_min, robot.limits.position_max
+    low = np.where(np.isfinite(low), low, -ends)
+    high = np.where(np.isfinite(high), high, ends)
     poses = np.random.default_rng(0).uniform(low, high, (RANDOM_POSES, robot.joints))
     poses[0] = np.clip(0.0, low, high)
     return poses
-
-
-def earlier_information(
-    setup: Setup, excitation: Excitation, noise: Float[np.ndarray, " joints"]
-) -> Float[np.ndarray, "base base"] | None:
-    """Return the information of earlier motions; None if there are none."""
-    if not excitation.earlier:
-        return None
-    if not excitation.objective.weighted:
-        raise InputError(
-            f'`earlier` and `criterion = "{excitation.criterion}"` do not go together: '
-            'choose a criterion in units of the noise, like "d_optimal".'
-        )
-    robot = setup.robot
-    total = np.zeros((setup.base.size, setup.base.size))
-    for name in excitation.earlier:
-        trajectory = load_trajectory(Path(name))
-        if trajectory.joints != robot.joints:
-            raise InputError(
-                f"`earlier`: the motion of `{Path(name).name}` "
-                f"moves {trajectory.joints} joint(s), "
-                f"but the robot `{robot.name}` has {robot.joints}."
-            )
-        step = float(trajectory.duration) / excitation.samples
-        motion = trajectory.motion(np.arange(excitation.samples) * step)
-        total += np.asarray(information(setup.base, motion, 1.0 / noise).weighted)
-    return total

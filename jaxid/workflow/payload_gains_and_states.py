@@ -32,7 +32,7 @@ from jaxid.validation.diagnosis import mistakes_in_logs
 
 from .log_identification import read_earlier_fit
 from .log_loading import is_report, load_logs, select_filter
-from .setup import Progress, Setup, ignore_progress
+from .setup import Paths, Progress, Setup, ignore_progress
 
 PAYLOAD_KEYS = ("mass", "centre_of_mass", "inertia", "estimate", "distance")
 """Properties of a payload in its JSON file."""
@@ -45,6 +45,7 @@ class Runs(NamedTuple):
 
     fits: list[Fit]
     doubts: list[str]
+    sources: Mapping[str, Sequence[Path]]  # logs and reports of each run
 
 
 def fit_runs(
@@ -75,13 +76,13 @@ def fit_runs(
     progress("finding base parameters", 0.0)
     paths = [path for group in groups.values() for path in group]
     files = [path for path in paths if not is_report(path)]
-    setup, _ = select_filter(setup, files, columns, progress)
+    setup = select_filter(setup, files, columns, progress)
     fits = []
     for name, group in groups.items():
         fit, group_doubts = fit_run(setup, name, group, columns, progress)
         fits.append(fit)
         doubts += group_doubts
-    return Runs(fits, doubts)
+    return Runs(fits, doubts, groups)
 
 
 def has_plain_estimator(setup: Setup) -> bool:
@@ -115,12 +116,12 @@ def fit_run(
 
 def fit_with_and_without_load(
     setup: Setup,
-    unloaded: Sequence[str | Path],
-    loaded: Sequence[str | Path],
+    unloaded: Paths,
+    loaded: Paths,
     columns: Columns,
     progress: Progress,
-) -> tuple[Runs, dict[str, list[Path]]]:
-    """Fit the runs without and with a load; return them, and their logs."""
+) -> Runs:
+    """Fit the runs without and with a load."""
     groups = {
         "unloaded": [Path(log) for log in unloaded],
         "loaded": [Path(log) for log in loaded],
@@ -132,13 +133,13 @@ def fit_with_and_without_load(
             f"`{Path(min(shared_places)).name}` is given "
             "both without and with the load: name it once."
         )
-    return fit_runs(setup, groups, columns, progress), groups
+    return fit_runs(setup, groups, columns, progress)
 
 
 def identify_payload_from_logs(
     setup: Setup,
-    unloaded: Sequence[str | Path],
-    loaded: Sequence[str | Path],
+    unloaded: Paths,
+    loaded: Paths,
     columns: Columns,
     body: int | None = None,
     mass: float | None = None,
@@ -155,9 +156,7 @@ def identify_payload_from_logs(
         mass: Mass of the payload, if it is known [kg].
         progress: Callback, called with a stage and its completed fraction (0 to 1).
     """
-    runs, sources = fit_with_and_without_load(
-        setup, unloaded, loaded, columns, progress
-    )
+    runs = fit_with_and_without_load(setup, unloaded, loaded, columns, progress)
     payload = identify_payload(*runs.fits, body=body, mass=mass)
     estimates = estimate_rows(
         INERTIAL_NAMES, INERTIAL_UNITS, payload.parameters, payload.uncertainty
@@ -165,13 +164,13 @@ def identify_payload_from_logs(
     estimates += estimate_rows(CENTRAL_NAMES, CENTRAL_UNITS, *payload.central)
     content = {key: getattr(payload, key) for key in PAYLOAD_KEYS}
     content["body"] = setup.robot.joint_names[payload.body]
-    return RunsReport("payload", payload, estimates, content, sources, runs.doubts)
+    return RunsReport("payload", payload, estimates, content, runs.sources, runs.doubts)
 
 
 def identify_gains_from_logs(
     setup: Setup,
-    unloaded: Sequence[str | Path],
-    loaded: Sequence[str | Path],
+    unloaded: Paths,
+    loaded: Paths,
     columns: Columns,
     load: Tool | float,
     progress: Progress = ignore_progress,
@@ -186,16 +185,14 @@ def identify_gains_from_logs(
         load: The load; or its mass if it is at the end-effector [kg].
         progress: Callback, called with a stage and its completed fraction (0 to 1).
     """
-    runs, sources = fit_with_and_without_load(
-        setup, unloaded, loaded, columns, progress
-    )
+    runs = fit_with_and_without_load(setup, unloaded, loaded, columns, progress)
     unloaded_fit, loaded_fit = runs.fits
     drives = identify_drive_gains(unloaded_fit, loaded_fit, load)
     names = drives.joint_names
     units = ("1",) * len(names)
     estimates = estimate_rows(names, units, drives.gains, drives.uncertainty)
     content = corrected_gains(columns, drives)
-    return RunsReport("gains", drives, estimates, content, sources, runs.doubts)
+    return RunsReport("gains", drives, estimates, content, runs.sources, runs.doubts)
 
 
 def corrected_gains(columns: Columns, drives: DriveGains) -> dict[str, list[float]]:
@@ -208,7 +205,7 @@ def corrected_gains(columns: Columns, drives: DriveGains) -> dict[str, list[floa
 
 def identify_states_from_logs(
     setup: Setup,
-    logs: Sequence[str | Path],
+    logs: Paths,
     columns: Columns,
     progress: Progress = ignore_progress,
 ) -> RunsReport:

@@ -93,7 +93,7 @@ class RobotFile:
         return claims
 
 
-def _named_bodies(bodies: Float[np.ndarray, "bodies 10"]) -> dict[str, float]:
+def _named_bodies(bodies: np.ndarray) -> dict[str, float]:
     """Return the parameters of bodies by their names in a model."""
     return {
         f"{symbol}{number}": float(value)

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import equinox as eqx
 import numpy as np
@@ -13,7 +14,9 @@ from jaxid.dynamics.model import Model
 from jaxid.dynamics.terms import (
     AbstractTerm,
     AbstractTransition,
+    ConstantOffset,
     CoulombFriction,
+    CoupledDrives,
     LoadFriction,
     StribeckFriction,
     Tanh,
@@ -66,6 +69,10 @@ NO_FILTER = (
     "choose about five times the highest frequency of the motion."
 )
 
+Paths = Sequence[str | Path]
+"""Paths of logs, and of folders of earlier reports."""
+Unknowns = BaseParameters | Model
+"""What is to be identified."""
 Progress = Callable[[str, float], None]
 """Callback, called with the name of a stage and its completed fraction (0 to 1)."""
 
@@ -74,12 +81,31 @@ def ignore_progress(stage: str, fraction: float) -> None:
     """Show no progress."""
 
 
+def default_terms(robot: Robot) -> tuple[AbstractTerm, ...]:
+    """Return the effects in the model of an experiment file without `[model]`.
+
+    They are those of `Model(robot)`, a constant offset of each joint, and the friction
+    and rotors of motors that move two joints.
+    """
+    terms = (*Model(robot).terms, ConstantOffset())
+    coupled_drives = CoupledDrives()
+    return (*terms, coupled_drives) if coupled_drives.couplings(robot) else terms
+
+
+def as_unknowns(source: Unknowns | Robot) -> Unknowns:
+    """Return base parameters or a model as they are; the default model of a robot."""
+    if isinstance(source, Robot):
+        return Model(source, default_terms(source))
+    return source
+
+
 class Setup(eqx.Module):
     """How logs of a robot become parameters; the command line uses the same defaults.
 
     Attributes:
         unknowns: Base parameters to identify; or their model, whose base parameters
-            are then found when they are needed.
+            are then found when they are needed; or the robot: then its model has the
+            effects that a file has by default (`default_terms`).
         filter: Filter of motion, forces and columns; by default a zero-phase
             Butterworth filter of 10 Hz.
         filter_candidates: Filters of which the logs choose one instead.
@@ -100,7 +126,7 @@ class Setup(eqx.Module):
         notes: Assumptions, as sentences.
     """
 
-    unknowns: BaseParameters | Model
+    unknowns: Unknowns = eqx.field(converter=as_unknowns)
     _: dataclasses.KW_ONLY
     filter: AbstractFilter = eqx.field(default=None)
     filter_candidates: tuple[AbstractFilter, ...] = ()
@@ -121,6 +147,8 @@ class Setup(eqx.Module):
         Raises:
             InputError: If two settings do not go together.
         """
+        # Equinox converts fields after this method, which needs the model.
+        self.unknowns = as_unknowns(self.unknowns)
         notes = self.notes
         if self.filter is None:
             self.filter = ZeroPhaseButterworth(DEFAULT_CUTOFF)

@@ -18,12 +18,12 @@ from jaxid.measurement.observations import Observations
 
 from .log_identification import require_separate_logs
 from .log_loading import load_logs, select_filter
-from .setup import Progress, Setup, ignore_progress
+from .setup import Paths, Progress, Setup, ignore_progress
 
 
 def choose_setup(
     setups: Mapping[str, Setup],
-    logs: Sequence[str | Path],
+    logs: Paths,
     columns: Columns,
     progress: Progress = ignore_progress,
 ) -> ModelChoice:
@@ -47,7 +47,7 @@ def choose_setup(
             "leave `estimator.nonlinear_friction` out: the choice is between models "
             "that are linear in their parameters."
         )
-    setup, _ = select_filter(setup, paths, columns, progress)
+    setup = select_filter(setup, paths, columns, progress)
     observations = [
         log.observations for log in load_logs(setup, paths, columns, progress)
     ]

@@ -16,7 +16,7 @@ from lxml import etree
 from rich.text import Text
 
 import jaxid as jid
-from jaxid.cli.options import Terminal
+from jaxid.cli.terminal import Terminal
 from jaxid.errors import InputError
 from jaxid.experiment.template import toml_text
 from jaxid.export import c_code

@@ -57,11 +57,10 @@ def test_writes_all_files_with_their_parents(written):
     figures = (
         "errors",
         "friction",
-        "parameters",
         "residuals",
     )
     figures += ("robot",)
-    figures += ("torque_5_first-run", "torque_6_second")
+    figures += ("torque_4_first-run", "torque_5_second")
     expected = ["model.json", "parameters.csv", "report.html", "result.json"]
     expected += [f"{name}.png" for name in figures]
     assert names(written) == sorted(load(written)["files"]) == sorted(expected)
@@ -130,8 +129,8 @@ def test_a_new_report_takes_the_place_of_the_old_one(tmp_path, fit, validation, 
         (tmp_path / name).write_text("mine")
     report(tmp_path, fit, validation, suffix="pdf")
     report(tmp_path, fit, validation, suffix="svg", verification=())
-    assert "torque_6_second.svg" not in names(tmp_path)
-    assert "torque_5_first-run.svg" in names(tmp_path)
+    assert "torque_5_second.svg" not in names(tmp_path)
+    assert "torque_4_first-run.svg" in names(tmp_path)
     assert not [name for name in names(tmp_path) if name.endswith(".pdf")]
     for name in ("log.csv", "torque_mine.svg"):
         assert (tmp_path / name).read_text() == "mine"

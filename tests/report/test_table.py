@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from jaxid.cli.printing import show
+from jaxid.cli.terminal import show
 from jaxid.report.identification_page import body_table
 from jaxid.result_table import (
     MISSING,

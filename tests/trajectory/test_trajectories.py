@@ -16,6 +16,7 @@ from jaxid.robot.limits_and_drives import Limits
 from jaxid.trajectory import (
     FourierBasis,
     LeadsBasis,
+    Line,
     LinearTrajectory,
     PaddedToCycle,
     RestToRestBasis,
@@ -24,10 +25,10 @@ from jaxid.trajectory import (
     fourier_series,
     iso9283_path,
     joint_path,
-    line,
     load_trajectory,
     random_fourier_series,
     save_trajectory,
+    spline_through,
     with_leads,
     write_csv,
     write_ros,
@@ -54,11 +55,11 @@ FAMILY = {
         np.asarray(series().coefficients)
     ),
     "spline by handles": RestToRestSplineBasis(6, 2.5).trajectory(POINTS.T),
-    "padded": PaddedToCycle(RestToRestSplineBasis(6, 4.0).trajectory(POINTS.T), 0.03),
+    "padded": PaddedToCycle(spline_through(POINTS, 4.0), 0.03),
     "path of the end-effector": joint_path(
         library.tx90l_on_rail(),
         TipPath(
-            (line(np.array([0.2, 0.45, 0.65]), np.array([0.0, 0.65, 0.65])),), DOWN
+            (Line(np.array([0.2, 0.45, 0.65]), np.array([0.0, 0.65, 0.65])),), DOWN
         ),
         posture=[0.0, 1.57, 0.3, 1.6, 0.0, 0.5, 0.0],
     ),
@@ -103,9 +104,9 @@ def test_files_keep_every_bit(name, tmp_path):
         np.testing.assert_array_equal(x, y)
 
 
-def test_splines_start_and_end_at_their_handles_and_keep_to_the_range_of_all():
-    ends = FAMILY["spline by handles"].motion(np.array([0.0, 2.5])).q
-    np.testing.assert_allclose(ends, POINTS[[0, -1]], atol=1e-12)
+def test_splines_pass_their_points_and_keep_to_the_range_of_their_handles():
+    through = spline_through(POINTS, 5.0)
+    np.testing.assert_allclose(through.motion(np.arange(6.0)).q, POINTS, atol=1e-12)
     q = np.asarray(FAMILY["spline by handles"].motion(np.linspace(0, 2.5, 1000)).q)
     assert (q <= POINTS.max(axis=0) + 1e-12).all()
     assert (q >= POINTS.min(axis=0) - 1e-12).all()
@@ -169,7 +170,7 @@ def test_leads_keep_the_limits_and_follow_the_series_between():
 
 
 LAZY = PANDA.replace(limits=Limits(7, acceleration=[*[10.0] * 6, 1e-3]))
-SIDE = line(np.zeros(3), np.array([1.0, 0.0, 0.0]))
+SIDE = Line(np.zeros(3), np.array([1.0, 0.0, 0.0]))
 
 
 @pytest.mark.parametrize(
@@ -184,6 +185,7 @@ SIDE = line(np.zeros(3), np.array([1.0, 0.0, 0.0]))
         (lambda: with_leads(series(), ARM, periods=0), "`periods`"),
         (lambda: with_leads(series(), PANDA), "`series`"),
         (lambda: with_leads(series(PANDA), LAZY), "`joint7`"),
+        (lambda: spline_through(POINTS[:1], 1.0), "`points`"),
         (lambda: RestToRestSplineBasis(1, 1.0), "`points`"),
         (lambda: RestToRestSplineBasis(5, -1.0), "`duration`"),
         (lambda: series().sample(0.0), "`sample_time`"),
@@ -191,7 +193,10 @@ SIDE = line(np.zeros(3), np.array([1.0, 0.0, 0.0]))
         (lambda: TipPath((SIDE,), DOWN, speed=0.0), "speed"),
         (lambda: TipPath((), DOWN), "pieces"),
         (lambda: TipPath((SIDE, SIDE), DOWN), "piece 2 of `pieces`"),
-        (lambda: TipPath((line(np.zeros(3), np.zeros(3)),), DOWN), "finite length"),
+        (
+            lambda: TipPath((Line(np.zeros(3), np.zeros(3)),), DOWN),
+            "piece 1 of `pieces`",
+        ),
     ],
 )
 def test_refuses(make, name):

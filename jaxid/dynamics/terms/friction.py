@@ -62,6 +62,7 @@ class AsymmetricViscousFriction(AbstractTerm):
     """
 
     choice = "viscous by direction"
+    choice_keys = {"viscous": "asymmetric"}  # noqa: RUF012
     joint_parameters = (
         JointParameter(
             "fvp", "viscous friction, forwards", ("N m s", "N s/m"), "viscous"
@@ -167,6 +168,7 @@ class StribeckFriction(AbstractDryFriction):
     exponent: EachJoint = eqx.field(converter=one_or_each, default=2.0)
     transition: AbstractTransition = Tanh()
     choice = "Stribeck"
+    choice_keys = {"coulomb": {"stribeck": 0.1}}  # noqa: RUF012
     joint_parameters = (
         JointParameter(
             "fc", "Coulomb friction: the same at any speed", ("N m", "N"), "dry"

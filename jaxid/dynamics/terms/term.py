@@ -70,6 +70,8 @@ class AbstractTerm(eqx.Module):
             like `springs = true`, beside any other terms.
         choice: Name of the effect in the comparison of models by `jaxid choose`; empty
             if it is not tried there.
+        choice_keys: Keys of the file's table `[model]` that add the effect there; those
+            of a switch if empty.
         shares_friction: Whether the term is a part of the friction beside which other
             parts may be negative, since only the sum of all parts cannot.
     """
@@ -77,6 +79,7 @@ class AbstractTerm(eqx.Module):
     joint_parameters: ClassVar[tuple[JointParameter, ...]] = ()
     is_switch: ClassVar[bool] = False
     choice: ClassVar[str] = ""
+    choice_keys: ClassVar[dict[str, Any]] = {}
     shares_friction: ClassVar[bool] = False
 
     @classmethod

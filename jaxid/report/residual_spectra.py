@@ -1,58 +1,16 @@
-"""Figures of residuals: their spectra, and the choice of a filter."""
+"""Figure of the spectra of residuals, beside those of white noise."""
 
 import numpy as np
 
-from jaxid.identification.filter_selection import FilterChoice
 from jaxid.identification.uncertainty import ResidualSpectra
 from jaxid.result_table import percent, shortened
 from jaxid.robot.robot import Robot
 
 from .figure import Figure
-from .figure_elements import GREY, ORANGE, PALE, Curve, Panel
+from .figure_elements import GREY, Curve, Panel
 
 MIN_GAIN = 1e-2
 """Gain of the filters below which a spectrum is not shown."""
-
-
-def filter_figure(choice: FilterChoice) -> Figure:
-    """Return held-out errors of all candidates, and correlations between neighbours.
-
-    Thin lines are single parts of the log. Too low a cut-off removes motion that moves
-    the robot, too high a one lets noise into the accelerations.
-
-    Args:
-        choice: Choice of a filter with all its candidates.
-    """
-    order = np.argsort(np.asarray(choice.cutoffs))
-    cutoffs = np.asarray(choice.cutoffs)[order]
-    errors = 100.0 * np.asarray(choice.errors)[order]
-    best_cutoff = float(np.asarray(choice.cutoffs)[choice.best])
-    label = "cut-off of forces and columns [Hz]"
-    levels = [("x", best_cutoff, ORANGE)]
-    parts = [Curve(cutoffs, part, "single parts", PALE, width=0.8) for part in errors.T]
-    mean = Curve(cutoffs, 100.0 * choice.curve[order], "all parts", marker=True)
-    correlation = Curve(cutoffs, np.asarray(choice.correlations)[order], marker=True)
-    panels = [
-        Panel(
-            [*parts, mean],
-            title=f"chosen: {best_cutoff:.3g} Hz",
-            x=label,
-            y="error on unseen parts",
-            unit="% of the forces",
-            log="xy",
-            levels=levels,
-        ),
-        Panel(
-            [correlation],
-            title="zero where rows are independent",
-            x=label,
-            y="correlation of neighbouring residuals",
-            unit="1",
-            log="x",
-            levels=levels,
-        ),
-    ]
-    return Figure("Choice of the filter", panels, columns=2, height=3.2)
 
 
 def residual_figure(spectra: ResidualSpectra, robot: Robot) -> Figure:

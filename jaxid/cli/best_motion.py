@@ -1,0 +1,48 @@
+"""The best motion of a search so far, written whenever a better one is found."""
+
+from pathlib import Path
+
+from jaxid.trajectory.trajectory import LinearTrajectory
+from jaxid.workflow.motion_design import MotionTask
+from jaxid.workflow.motion_files import make_playable, write_motion
+
+from . import process
+
+
+class BestMotion:
+    """The best motion of a search so far, in its files.
+
+    Within its context, a signal that ends the process says where the motion is.
+    """
+
+    def __init__(self, task: MotionTask, output: Path):
+        self._task = task
+        self._output = output
+        self._is_written = False
+
+    def __enter__(self) -> "BestMotion":
+        process.farewells.append(self.farewell)
+        return self
+
+    def __exit__(self, *_) -> None:
+        process.farewells.pop()
+
+    def keep(self, motion: LinearTrajectory) -> None:
+        """Write a better motion."""
+        robot = self._task.setup.robot
+        excitation = self._task.excitation
+        playable = make_playable(robot, excitation, motion)
+        write_motion(robot, excitation, playable, self._output)
+        self._is_written = True
+
+    def farewell(self) -> str:
+        """Return the sentence with which Ctrl-C ends the search."""
+        if not self._is_written:
+            return "stopped before a motion kept all limits, and nothing was written"
+        faults = self._task.faults
+        note = f"; NOT CHECKED: {'; '.join(faults)}" if faults else ""
+        return (
+            f"stopped: `{self._output}` and the files beside it hold "
+            "the best motion so far, which keeps all limits that "
+            f"were checked{note}; `--resume` goes on with it"
+        )

@@ -1,0 +1,142 @@
+"""Commands that take reports: `export` and `compare`."""
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+import jaxid as jid
+from jaxid.errors import InputError
+
+from . import options, terminal
+
+EXPORTS = {
+    "c": "arm.c",
+    "urdf": "arm.urdf",
+    "mjcf": "arm.xml",
+    "json": "arm.json",
+    "pinocchio": "arm_pinocchio.json",
+    "jax": "arm.jax",
+}
+"""Formats of `jaxid export`, and the file where none is named."""
+
+
+def export(
+    report: Annotated[
+        Path, typer.Argument(help="Report, or a model file (.json).", metavar="REPORT")
+    ],
+    to: Annotated[
+        Literal["c", "urdf", "mjcf", "json", "pinocchio", "jax"],
+        typer.Option("--to", help="What to write."),
+    ],
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "-o", "--output", metavar="FILE", help="The file; by default `arm`."
+        ),
+    ] = None,
+    urdf: Annotated[
+        Path | None,
+        typer.Option(metavar="ARM.URDF", help="The robot's file, for `--to urdf`."),
+    ] = None,
+    tip: options.Tip = None,
+    base: options.Base = None,
+    single: Annotated[
+        bool, typer.Option("--float", help="C that computes in single precision.")
+    ] = False,
+    force: options.Force = False,
+) -> None:
+    """Write a model as C, URDF, MJCF, JSON, vectors or JAX.
+
+    C is a feed-forward for controllers: one file and its header, named like the output.
+    """
+    console = options.start(report, *([urdf] if urdf else []))
+    from jaxid.io import require_writable
+    from jaxid.report.result_files import read_faults, read_fit
+
+    path = output or Path(EXPORTS[to])
+    files = [path, path.with_suffix(".h")] if to == "c" else [path]
+    require_no_files(files, to, force)
+    require_writable(path.parent)
+    faults = read_faults(report)
+    if faults and not force:
+        raise InputError(
+            f"the verdict of `{report}` is that its model must not be used: "
+            f"{faults[0]} Mend that first, or write it nonetheless with `--force`."
+        )
+    fit = read_fit(report)
+    match to:
+        case "c":
+            jid.export_c(fit, path.parent, name=path.stem, double=not single)
+        case "urdf":
+            source = urdf or source_urdf(fit)
+            jid.export_urdf(fit, source, path, tip=tip, base=base)
+        case "mjcf":
+            jid.export_mjcf(fit, path)
+        case "pinocchio":
+            jid.export.export_pinocchio(fit, path)
+        case "jax":
+            jid.export.export_jax(fit, path)
+        case "json":
+            fit.save(path)
+    terminal.show_files(console, path.parent, files)
+
+
+def require_no_files(files: Sequence[Path], to: str, force: bool) -> None:
+    """Reject files of an export that are there already, or have a wrong suffix."""
+    if to == "c" and files[0].suffix != ".c":
+        raise InputError(
+            f"`--output` must be a C file like arm.c, but is `{files[0]}`."
+        )
+    for file in files:
+        if file.is_dir():
+            raise InputError(f"`{file}` is a folder: choose another `--output`.")
+        if file.exists() and not force:
+            raise InputError(
+                f"`{file}` is there already: choose another `--output`, or `--force`."
+            )
+
+
+def source_urdf(fit: "jid.Fit") -> Path:
+    """Return the file that the robot of a fit was read from."""
+    source = Path(fit.base.model.robot.source)
+    if source.suffix not in (".urdf", ".xacro", ".xml") or not source.is_file():
+        raise InputError(
+            "`--to urdf` changes the robot's own file: name it with `--urdf`."
+        )
+    return source
+
+
+def compare(
+    first: Annotated[
+        Path,
+        typer.Argument(
+            help="Report of one run, like that of the cold robot.", metavar="COLD"
+        ),
+    ],
+    second: Annotated[
+        Path,
+        typer.Argument(help="Report of another run of the same robot.", metavar="WARM"),
+    ],
+    output: options.OutputFolder = Path("comparison"),
+    force: options.Force = False,
+) -> None:
+    """Decide which parameters have changed between two runs.
+
+    Each argument is a folder that `jaxid identify` has written.
+    """
+    console = options.start(first, second, output=output, force=force)
+    from jaxid.report.result_files import read_fit, write_comparison
+
+    if first.resolve() == second.resolve():
+        raise InputError(f"`{first}` is given twice: compare two different runs.")
+    paths = (first, second)
+    cold_fit, warm_fit = (
+        dataclasses.replace(read_fit(path), name=str(path)) for path in paths
+    )
+    comparison = jid.compare(cold_fit, warm_fit)
+    files = write_comparison(output, comparison, paths)
+    terminal.show(console, comparison.summary(), comparison.group_summary())
+    terminal.show_files(console, output, files)

@@ -1,0 +1,94 @@
+"""The terminal of the commands: tables, remarks, names of files, progress, errors."""
+
+import errno
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.text import Text
+
+from jaxid.result_table import Remark, Table, printable
+
+Progress = Callable[[str, float], None]
+"""Function that shows the completed fraction (0 to 1) of a stage."""
+
+
+class Terminal(Console):
+    """Terminal on which the names of files and joints cannot be control sequences."""
+
+    def print(self, *objects: Any, **arguments: Any) -> None:  # noqa: D102
+        for text in objects:
+            if isinstance(text, Text):
+                text.plain = printable(text.plain)
+        super().print(*objects, **arguments)
+
+
+def open_console(stderr: bool = False) -> Console:
+    """Return the terminal, or a console of fixed width where there is none."""
+    console = Terminal(stderr=stderr, highlight=False)
+    if not console.is_terminal and "COLUMNS" not in console._environ:
+        console.width = 100
+    return console
+
+
+def show(console: Console, *tables: Table) -> None:
+    """Print tables, each with an empty line before it."""
+    for table in tables:
+        console.print()
+        # Numbers are not cut where a line is too short for them.
+        console.print(table, crop=False)
+
+
+def show_remarks(console: Console, remarks: Iterable[Remark | str]) -> None:
+    """Print remarks, one paragraph each."""
+    unique = tuple(dict.fromkeys(remarks))
+    if unique:
+        show(console, Table("", remarks=unique))
+
+
+def show_files(console: Console, folder: Path, files: Iterable[Path]) -> None:
+    """Print the names of written files, and their folder if it is another one."""
+    place = "" if folder == Path() else f" {folder}:"
+    names = ", ".join(str(file.relative_to(folder)) for file in files)
+    console.print()
+    console.print(Text(f"wrote{place} {names}"))
+
+
+def show_text(console: Console, text: str) -> None:
+    """Print a text that may be copied: no line of it is broken."""
+    console.print(Text(text), soft_wrap=True)
+
+
+@contextmanager
+def progress_bar() -> Iterator[Progress]:
+    """Show a progress bar in a terminal, and nothing elsewhere."""
+    # Not needed by `--help`, which must answer at once.
+    from rich.progress import Progress as Bar, TimeElapsedColumn
+
+    console = open_console(stderr=True)
+    columns = (*Bar.get_default_columns(), TimeElapsedColumn())
+    is_quiet = not console.is_terminal
+    with Bar(*columns, console=console, transient=True, disable=is_quiet) as bar:
+        task = bar.add_task("starting", total=1.0)
+
+        def show_stage(stage: str, fraction: float) -> None:
+            if fraction == 0.0:
+                bar.reset(task)  # the clock starts again
+            bar.update(task, description=stage, completed=fraction)
+
+        yield show_stage
+
+
+def describe_error(error: Exception) -> str:
+    """Return what an error of a user or of the operating system says, with its file."""
+    if not isinstance(error, OSError) or not error.strerror:
+        return str(error)
+    place = f"`{error.filename}`: " if error.filename else ""
+    if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+        return (
+            f"{place}{error.strerror}: nothing was written; "
+            "make room, or choose another -o."
+        )
+    return f"{place}{error.strerror}."
