@@ -72,7 +72,7 @@ NO_FILTER = (
 Paths = Sequence[str | Path]
 """Paths of logs, and of folders of earlier reports."""
 Unknowns = BaseParameters | Model
-"""What is to be identified."""
+"""Parameters that are to be identified, or their model."""
 Progress = Callable[[str, float], None]
 """Callback, called with the name of a stage and its completed fraction (0 to 1)."""
 
