@@ -21,7 +21,7 @@ from test_cli import (  # noqa: F401
 )
 
 import jaxid as jid
-from jaxid.dynamics.dispatch import in_numpy
+from jaxid.dynamics.sample_methods import in_numpy
 from jaxid.experiment import experiment_variants
 from jaxid.experiment.experiment import load_experiment
 from jaxid.simulation.virtual import random_bodies

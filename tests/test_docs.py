@@ -18,7 +18,7 @@ import polars as pl
 import pytest
 
 import jaxid as jid
-from jaxid.dynamics.dispatch import in_numpy
+from jaxid.dynamics.sample_methods import in_numpy
 from jaxid.experiment.decoder import check_names, decode
 from jaxid.experiment.experiment import TABLES
 from jaxid.experiment.model_and_log_tables import SIDES

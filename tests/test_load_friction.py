@@ -5,7 +5,7 @@ import pytest
 from arm_files import HALF_PI, urdf_of_arm
 
 import jaxid as jid
-from jaxid.dynamics.dispatch import in_numpy
+from jaxid.dynamics.sample_methods import in_numpy
 from jaxid.experiment.experiment import load_experiment
 from jaxid.identification.problem import RegressionProblem
 

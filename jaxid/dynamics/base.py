@@ -15,7 +15,6 @@ from jaxid.program import Program, Shape, select_outputs
 from jaxid.result_table import MISSING, Column, Remark, Status, Summarised, Table
 
 from .base_parameter_expressions import Summand, write_expression
-from .dispatch import in_numpy, on_samples, program_of
 from .model import Coordinates, Model
 from .motion import Motion, as_motion
 from .packed_regressor import Columns, JointRegressor, PackedRegressor
@@ -27,6 +26,7 @@ from .rank import (
     regrouping,
     singular_values,
 )
+from .sample_methods import in_numpy, on_samples, program_of
 
 Parameters = Float[AnyArray, " base"] | Sequence[float | int]
 

@@ -16,9 +16,9 @@ from jaxid.program import Shape
 from jaxid.robot.robot import Robot
 
 from . import projection_equation
-from .dispatch import on_samples, solve_symmetric, spatial_form
 from .motion import Motion, as_motion, as_state
 from .packed_regressor import PackedRegressor, gram
+from .sample_methods import on_samples, spatial_form
 from .terms import (
     AbstractTerm,
     CoulombFriction,
@@ -182,7 +182,9 @@ class Model(Hashable):
 
     def acceleration(self, p, q, qd, forces) -> Joints:
         """Return the accelerations of one sample that forces cause (Eq. 38)."""
-        return solve_symmetric(self.inertia(p, q), forces - self.bias(p, q, qd))
+        return projection_equation.solve_symmetric(
+            self.inertia(p, q), forces - self.bias(p, q, qd)
+        )
 
     def potential(self, p, q) -> Float[AnyArray, ""]:
         """Return the potential energy of one sample by definition."""

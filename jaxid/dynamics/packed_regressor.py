@@ -23,9 +23,9 @@ from jaxid.program import (
     on_any_platform,
     packed_entries,
 )
-from jaxid.program.blocks import row_products
+from jaxid.program.xla_sample_blocks import row_products
 
-from .dispatch import CACHE_SIZE, MAX_SAMPLES_IN_NUMPY, program_of
+from .sample_methods import CACHE_SIZE, MAX_SAMPLES_IN_NUMPY, program_of
 
 Columns = tuple[int, ...]
 """Positions of columns, in order."""

@@ -182,3 +182,32 @@ def potential_energy_columns(robot: Robot, q: Joints) -> Float[AnyArray, "joints
     return jnp.concatenate(
         [mass[:, None], moment, jnp.zeros((robot.joints, 6))], axis=1
     )
+
+
+def solve_symmetric(A: Float[AnyArray, "joints joints"], b: Joints) -> Joints:
+    r"""Solve $A x = b$ by $A = L D L^T$, without square roots or pivoting.
+
+    Only the lower triangle of A, which is definite, is read. A program has no loops.
+    """
+    n = b.shape[0]
+    L, LD = {}, {}
+    for j in range(n):
+        for i in range(j, n):
+            entry = A[i, j]
+            for k in range(j):
+                entry = entry - LD[i, k] * L[j, k]
+            LD[i, j] = entry
+            if i > j:
+                L[i, j] = entry / LD[j, j]
+
+    # L y = b, then D z = y, then L^T x = z.
+    x = [b[i] for i in range(n)]
+    for i in range(n):
+        for k in range(i):
+            x[i] = x[i] - L[i, k] * x[k]
+    for i in range(n):
+        x[i] = x[i] / LD[i, i]
+    for i in reversed(range(n)):
+        for k in range(i + 1, n):
+            x[i] = x[i] - L[k, i] * x[k]
+    return jnp.stack(x)

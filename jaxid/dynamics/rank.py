@@ -16,10 +16,10 @@ import scipy.linalg
 from jaxid.arrays import AnyArray, Float
 from jaxid.units.dimensions import length_power
 
-from .dispatch import in_numpy
 from .model import Model
 from .motion import Motion
 from .packed_regressor import Columns
+from .sample_methods import in_numpy
 
 ROUNDING = 1e-12
 """Fraction of the largest column below which a column is nothing but rounding."""

@@ -29,7 +29,7 @@ from jaxid.arrays import (
     on_cores,
 )
 from jaxid.dynamics.base import BaseParameters
-from jaxid.dynamics.dispatch import program_of
+from jaxid.dynamics.sample_methods import program_of
 from jaxid.measurement.filters import AbstractLowPass
 from jaxid.measurement.observations import Observations, Progress
 from jaxid.program import Program, lower

@@ -22,9 +22,9 @@ from jaxid.arrays import (
     require_float64,
 )
 from jaxid.dynamics.base import BaseParameters
-from jaxid.dynamics.dispatch import opened
 from jaxid.dynamics.motion import Motion
 from jaxid.dynamics.packed_regressor import JointRegressor
+from jaxid.dynamics.sample_methods import opened
 from jaxid.errors import InputError
 from jaxid.measurement.observations import Observations
 from jaxid.robot.robot import Robot

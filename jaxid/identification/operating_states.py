@@ -8,7 +8,7 @@ from scipy import linalg
 
 from jaxid.arrays import AnyArray, Float, Indices, Matrix, Texts
 from jaxid.dynamics.base import BaseParameters
-from jaxid.dynamics.dispatch import in_numpy
+from jaxid.dynamics.sample_methods import in_numpy
 from jaxid.errors import InputError
 from jaxid.result_table import Summarised, Table
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from jaxid.errors import InputError
 
-from .scalar import Graph, Operand, Operation, Scalar, live_scalars, rewrite
+from .scalar import Graph, Operand, Operation, Scalar, live_scalars
 
 Shape = tuple[int, ...]
 """Shape of an array."""
@@ -169,8 +169,6 @@ def assemble(
     structure: Any,
 ) -> Program:
     """Make a program of the part of a graph that the outputs need."""
-    # Only now all uses are known, on which factoring depends.
-    outputs = rewrite(outputs)
     scalars = live_scalars(outputs)
     place = {scalar.index: k for k, scalar in enumerate(scalars)}
 

@@ -1,4 +1,4 @@
-"""Scalar expressions, simplified when they are built and once more at the end.
+"""Scalar expressions, simplified when they are built.
 
 Equal expressions are the same object: each one is looked up in the table of its `Graph`
 before it is made. A graph belongs to one trace and is freed with it.
@@ -6,15 +6,11 @@ before it is made. A graph belongs to one trace and is freed with it.
 The rules keep the value of every finite computation up to the rounding of one
 operation. They fold `0 x` and `x - x` to 0, so that a NaN or an infinity in x can
 disappear from the result: check inputs beforehand.
-
-With all uses known, `c x + c y` becomes `c (x + y)` where nothing else needs the
-products, and `-(x - y)` becomes `y - x` where nothing else needs the difference.
 """
 
 import enum
-from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, TypeGuard, overload
+from collections.abc import Mapping, Sequence
+from typing import Any, overload
 
 import numpy as np
 
@@ -329,11 +325,6 @@ def as_truth(x: Operand) -> Operand:
     return x if is_truth(x) else apply(Operation.NOT_EQUAL, x, 0.0)
 
 
-_SUMS = (Operation.ADD, Operation.SUBTRACT)
-_Term = tuple[bool, Operand]
-"""Sign of a summand (true if it is subtracted), and the summand."""
-
-
 def live_scalars(outputs: Sequence[Operand]) -> list[Scalar]:
     """Return the scalars that the outputs need, each one after its operands."""
     scalars: dict[int, Scalar] = {}
@@ -345,166 +336,3 @@ def live_scalars(outputs: Sequence[Operand]) -> list[Scalar]:
             stack += [x for x in scalar.operands if isinstance(x, Scalar)]
     # Operands are older than what they are used for.
     return [scalars[index] for index in sorted(scalars)]
-
-
-def rewrite(outputs: Sequence[Operand]) -> list[Operand]:
-    """Return the same outputs with fewer operations, where some can be saved."""
-    outputs = list(outputs)
-    # Factors that were drawn out can make sums that have factors again.
-    while True:
-        candidates = Rewriting(outputs).factor_sums()
-        if _count_operations(candidates) >= _count_operations(outputs):
-            return Rewriting(outputs).turn_negated_differences()
-        outputs = candidates
-
-
-def _count_operations(outputs: Sequence[Operand]) -> int:
-    """Return the number of operations that cost something."""
-    idle = (Operation.INPUT, Operation.NEGATE)
-    return sum(x.operation not in idle for x in live_scalars(outputs))
-
-
-class Rewriting:
-    """One pass over the scalars of some outputs, operands first."""
-
-    def __init__(self, outputs: Sequence[Operand]):
-        self.outputs = outputs
-        self.scalars = live_scalars(outputs)
-        self.uses = Counter(x for x in outputs if isinstance(x, Scalar))
-        for scalar in self.scalars:
-            self.uses.update(x for x in scalar.operands if isinstance(x, Scalar))
-        self.replacements: dict[Scalar, Operand] = {}
-
-    def factor_sums(self) -> list[Operand]:
-        """Draw common factors out of sums; a sum inside another one is a part of it."""
-        summands = set()
-        for scalar in self.scalars:
-            if scalar.operation in _SUMS:
-                summands.update(filter(self._is_sum_used_once, scalar.operands))
-        # Operands come first, so that the replacements of all terms are known.
-        for scalar in self.scalars:
-            terms = None
-            if scalar.operation in _SUMS and scalar not in summands:
-                terms = self._factor(_flatten_sum(scalar, summands))
-            self.replacements[scalar] = (
-                self._rebuild(scalar) if terms is None else _sum(terms)
-            )
-        return [self._replacement(x) for x in self.outputs]
-
-    def turn_negated_differences(self) -> list[Operand]:
-        """Write `-(x - y)` as `y - x`."""
-        for scalar in self.scalars:
-            (x, *_) = scalar.operands
-            negates = scalar.operation is Operation.NEGATE and self._is_used_once(x)
-            if negates and x.operation is Operation.SUBTRACT:
-                left, right = map(self._replacement, x.operands)
-                self.replacements[scalar] = scalar.graph.node(
-                    Operation.SUBTRACT, right, left
-                )
-            elif scalar.operation is Operation.INPUT:
-                self.replacements[scalar] = scalar
-            else:
-                # `_rebuild` would restore the canonical order, and with it the
-                # negation.
-                operands = map(self._replacement, scalar.operands)
-                self.replacements[scalar] = scalar.graph.node(
-                    scalar.operation, *operands
-                )
-        return [self._replacement(x) for x in self.outputs]
-
-    def _replacement(self, x: Operand) -> Operand:
-        return self.replacements[x] if isinstance(x, Scalar) else x
-
-    def _is_used_once(self, x: Operand) -> TypeGuard[Scalar]:
-        return isinstance(x, Scalar) and self.uses[x] == 1
-
-    def _is_sum_used_once(self, x: Operand) -> bool:
-        return self._is_used_once(x) and x.operation in _SUMS
-
-    def _rebuild(self, scalar: Scalar) -> Operand:
-        """Return the same operation on rewritten operands."""
-        if scalar.operation is Operation.INPUT:
-            return scalar
-        operands = [self._replacement(x) for x in scalar.operands]
-        if scalar.operation is Operation.ADD:
-            return add(*operands)
-        if scalar.operation is Operation.SUBTRACT:
-            return add(operands[0], negate(operands[1]))
-        if scalar.operation is Operation.MULTIPLY:
-            return multiply(*operands)
-        if scalar.operation is Operation.NEGATE:
-            return negate(operands[0])
-        return scalar.graph.node(scalar.operation, *operands)
-
-    def _factor(self, terms: list[_Term]) -> list[_Term] | None:
-        """Draw common factors out of products; None if there are none."""
-        products = {}
-        for k, (_, x) in enumerate(terms):
-            if self._is_used_once(x) and x.operation is Operation.MULTIPLY:
-                products[k] = x
-
-        sums: list[_Term] = []
-        positions: set[int] = set()
-        while True:
-            factor = _most_common_factor(products.values())
-            if factor is None:
-                break
-            group = [k for k, x in products.items() if factor in x.operands]
-            cofactors = []
-            for k in group:
-                is_negative, _ = terms[k]
-                cofactor = self._replacement(_cofactor(products.pop(k), factor))
-                cofactors.append((is_negative, cofactor))
-            sums.append((False, multiply(self._replacement(factor), _sum(cofactors))))
-            positions.update(group)
-        if not sums:
-            return None
-        others = []
-        for k, (is_negative, x) in enumerate(terms):
-            if k not in positions:
-                others.append((is_negative, self._replacement(x)))
-        return others + sums
-
-
-def _most_common_factor(products: Iterable[Scalar]) -> Operand | None:
-    """Return the factor of most products; None if no two have one in common."""
-    counts = Counter(factor for x in products for factor in set(x.operands))
-    factors = (factor for factor, count in counts.items() if count > 1)
-    return max(factors, key=lambda x: (counts[x], _order(x)), default=None)
-
-
-def _flatten_sum(x: Scalar, summands: set[Scalar]) -> list[_Term]:
-    """Return the terms of a sum, with those of the sums inside it."""
-    left, right = x.operands
-    is_difference = x.operation is Operation.SUBTRACT
-    stack: list[_Term] = [(is_difference, right), (False, left)]
-    terms: list[_Term] = []
-    while stack:
-        is_negative, term = stack.pop()
-        if isinstance(term, Scalar) and term in summands:
-            left, right = term.operands
-            is_difference = term.operation is Operation.SUBTRACT
-            stack.append((is_negative != is_difference, right))
-            stack.append((is_negative, left))
-        else:
-            terms.append((is_negative, term))
-    return terms
-
-
-def _order(x: Operand) -> float:
-    """Return a key that breaks ties: constants first, then older expressions."""
-    return -float(x.index) if isinstance(x, Scalar) else 1.0 + abs(x)
-
-
-def _cofactor(product: Scalar, factor: Operand) -> Operand:
-    """Return the other factor of a product."""
-    x, y = product.operands
-    return y if x is factor or x == factor else x
-
-
-def _sum(terms: list[_Term]) -> Operand:
-    """Add terms from left to right."""
-    total: Operand = 0.0
-    for is_negative, x in terms:
-        total = add(total, negate(x) if is_negative else x)
-    return total

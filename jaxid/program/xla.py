@@ -18,43 +18,42 @@ from jaxid.arrays import AnyArray, Array
 from jaxid.errors import InputError
 
 from .jax_sincos import sine_cosine
-from .program import Program, Shape
+from .program import Node, Program, Shape
 from .scalar import Operation
 
 ELEMENTWISE: dict[Operation, Callable] = {
     o: getattr(jnp, o.numpy.__name__) for o in Operation if o is not Operation.INPUT
 }
-BARRIER_HOLDS = jax.__version_info__ >= (0, 12)
-"""Whether an optimization barrier stops XLA's CPU backend."""
 MIN_SAVING = 6
 """Number of operations that a fence must save."""
 FUNCTION_COST = 20
 """Cost of a function such as tanh, in additions."""
 CIRCULAR = (Operation.SINE, Operation.COSINE)
-Entries = Sequence[Array | Sequence[Array]]
+Entries = Sequence[Sequence[Array] | Array]
 """Entries of each input, in order: arrays of the batch's shape."""
+Results = tuple[Array, ...]
+"""Distinct results that vary, in order: arrays of the batch's shape."""
 
 
 def hidden_one(reference: Array) -> Array:
     """Return (sign bit of a number | 1), which is 1 for any number, NaN included.
 
     XLA does not copy divisions, since they are expensive, and x / 1 is exact, also for
-    NaN and infinities: division by a one that XLA cannot recognise is a fence. From JAX
-    0.12 on an optimization barrier does the same at no cost. The number is known only
-    at run time.
+    NaN and infinities: division by a one that XLA cannot recognise is a fence. The
+    number is known only at run time.
     """
     width = 8 * reference.dtype.itemsize
     bits = jax.lax.stop_gradient(reference).view(f"uint{width}")
-    return (bits >> (width - 1) | 1).astype(reference.dtype)
+    sign = bits >> (width - 1)
+    return (sign | 1).astype(reference.dtype)
 
 
 def fenced(x: Array, one: Array | None) -> Array:
     """Return a value behind a fence, unless `one` is None."""
-    if one is None:
-        return x
-    return jax.lax.optimization_barrier(x) if BARRIER_HOLDS else x / one
+    return x if one is None else x / one
 
 
+@functools.lru_cache(maxsize=64)
 def fenced_nodes(program: Program) -> frozenset[int]:
     """Return positions of the nodes that a fence pays for.
 
@@ -62,15 +61,16 @@ def fenced_nodes(program: Program) -> frozenset[int]:
     operations; between 0 and 30 the speed hardly depends on this limit.
     """
     costs = []  # operations that compute each node again, from the fences before it
-    nodes = set()
+    positions = set()
     for k, node in enumerate(program.nodes):
         cost = _cost(node.operation) + sum(costs[i] for i in node.uses)
+        saving = cost * (program.uses[k] - 1)
         is_number = "truth" not in node.operation.traits
-        if is_number and cost * (program.uses[k] - 1) > MIN_SAVING:
-            nodes.add(k)
+        if is_number and saving > MIN_SAVING:
+            positions.add(k)
             cost = 0
         costs.append(cost)
-    return frozenset(nodes)
+    return frozenset(positions)
 
 
 def _cost(operation: Operation) -> int:
@@ -84,12 +84,11 @@ class Lowered(eqx.Module):
     """A program on JAX arrays whose batch axes stand last.
 
     Works under `jit`, `grad`, `jvp` and `vmap`, in the precision of the arrays. Call it
-    inside `jax.jit`: otherwise each operation is dispatched by itself.
+    inside `jax.jit`: otherwise each operation is executed by itself.
     """
 
     program: Program = eqx.field(static=True)
     fence: bool = eqx.field(static=True)  # whether fences stand behind shared values
-    fenced: frozenset[int] = eqx.field(static=True)  # positions of these nodes
 
     def __call__(self, *arrays: AnyArray) -> list[Array | float]:
         """Compute the packed result, from arrays with batch axes last.
@@ -99,9 +98,9 @@ class Lowered(eqx.Module):
         """
         return self.program.pack(self.distinct(*arrays))
 
-    def distinct(self, *arrays: AnyArray) -> tuple[Array, ...]:
+    def distinct(self, *arrays: AnyArray) -> Results:
         """Compute the distinct results that vary, from the same arrays."""
-        return self.run(self.entries(*arrays)[0], ELEMENTWISE)
+        return self.run(self.entries(*arrays)[0])
 
     def entries(self, *arrays: AnyArray) -> tuple[list[Array], Shape]:
         """Return the inputs as [entries, *batch], and the batch's shape."""
@@ -118,45 +117,34 @@ class Lowered(eqx.Module):
         Constants cost memory and time here; prefer the packed result.
         """
         dtype = jnp.result_type(*arrays, float)
-        _, batch = self.entries(*arrays)
-        rows = [jnp.broadcast_to(jnp.asarray(x, dtype), batch) for x in self(*arrays)]
+        entries, batch = self.entries(*arrays)
+        values = self.program.pack(self.run(entries))
+        rows = [jnp.broadcast_to(jnp.asarray(x, dtype), batch) for x in values]
         results = jnp.stack(rows) if rows else jnp.zeros((0, *batch), dtype)
         return self.program.unpack(results)
 
-    def run(
-        self, entries: Entries, operations: dict[Operation, Callable]
-    ) -> tuple[Array, ...]:
-        """Compute the results that vary, with a function for each operation."""
-        nodes = self.program.nodes
-        # The last input: XLA folds what depends on constants, such as parameters often
-        # are.
-        firsts = [x[0] for x in reversed(entries) if len(x)]
-        dtype = firsts[0].dtype if firsts else jnp.result_type(float)
-        source = next((x for x in firsts if x.size), jnp.zeros((1,), dtype))
-        one = hidden_one(source[(0,) * source.ndim]) if self.fence else None
-
+    def run(self, entries: Entries) -> Results:
+        """Compute the distinct results that vary, from the entries of the inputs."""
+        reference = _reference(entries)
+        one = hidden_one(reference) if self.fence else None
+        fences = fenced_nodes(self.program) if self.fence else frozenset()
         # Together they are vectorised; angles that are computed follow one by one.
-        pairs = self._sines_and_cosines(entries, one)
+        circular_pairs = self._sines_and_cosines(entries, one)
         values: list[Array] = []
-        for position, node in enumerate(nodes):
+        for position, node in enumerate(self.program.nodes):
             if node.operation is Operation.INPUT:
                 number, entry = node.place
-                values.append(entries[number][entry])
-                continue
-            if node.operation in CIRCULAR:
+                value = entries[number][entry]
+            elif node.operation in CIRCULAR:
                 (angle,) = node.uses
-                if angle not in pairs:
-                    pairs[angle] = _circular(values[angle], one)
-                sine, cosine = pairs[angle]
-                values.append(sine if node.operation is Operation.SINE else cosine)
-                continue
-            operands = [values[x] if isinstance(x, int) else x for x in node.operands]
-            if node.operation is Operation.SELECT:
-                # Both choices may be constants, which have no precision of their own.
-                operands[1:] = [jnp.asarray(x, dtype) for x in operands[1:]]
-            value = operations[node.operation](*operands)
-            is_fenced = position in self.fenced
-            values.append(fenced(value, one) if is_fenced else value)
+                if angle not in circular_pairs:
+                    circular_pairs[angle] = _circular(values[angle], one)
+                value = circular_pairs[angle][CIRCULAR.index(node.operation)]
+            else:
+                value = _apply(node, values, reference.dtype)
+                if position in fences:
+                    value = fenced(value, one)
+            values.append(value)
         return tuple(values[k] for k in self.program.distinct[0])
 
     def _sines_and_cosines(
@@ -164,58 +152,44 @@ class Lowered(eqx.Module):
     ) -> dict[int, tuple[Array, Array]]:
         """Compute sine and cosine of all inputs that are angles in one call."""
         nodes = self.program.nodes
+        operands = [x.uses[0] for x in nodes if x.operation in CIRCULAR]
         angles = []
-        for node in nodes:
-            if node.operation not in CIRCULAR or node.uses[0] in angles:
-                continue
-            if nodes[node.uses[0]].operation is Operation.INPUT:
-                angles.append(node.uses[0])
+        for k in dict.fromkeys(operands):
+            if nodes[k].operation is Operation.INPUT:
+                angles.append(k)
         if not angles:
             return {}
         places = [nodes[angle].place for angle in angles]
         inputs = jnp.stack([entries[number][entry] for number, entry in places])
         sines, cosines = _circular(inputs, one)
-        return {angle: (sines[k], cosines[k]) for k, angle in enumerate(angles)}
+        return dict(zip(angles, zip(sines, cosines, strict=True), strict=True))
 
 
-def primitives(like: Array) -> dict[Operation, Callable]:
-    """Return the operations with JAX's own primitives for the arithmetic.
-
-    They skip the checks of types and shapes in array operators, so that a program is
-    traced in a fraction of the time. JAX differentiates operators faster: do not
-    differentiate these. All have the shape of one array.
-    """
-
-    # By text: plus and minus zero are equal, but not their texts.
-    @functools.cache
-    def constant(text: str) -> Array:
-        return jax.lax.full_like(like, float(text))
-
-    def on_arrays(primitive: Callable) -> Callable:
-        def apply(*operands: Array | float) -> Array:
-            arrays = [
-                constant(repr(x)) if isinstance(x, float) else x for x in operands
-            ]
-            return primitive(*arrays)
-
-        return apply
-
-    return ELEMENTWISE | {
-        Operation.ADD: on_arrays(jax.lax.add),
-        Operation.SUBTRACT: on_arrays(jax.lax.sub),
-        Operation.MULTIPLY: on_arrays(jax.lax.mul),
-        Operation.DIVIDE: on_arrays(jax.lax.div),
-        Operation.NEGATE: on_arrays(jax.lax.neg),
-    }
+def _reference(entries: Entries) -> Array:
+    """Return a number that is not known before run time."""
+    # The last input: XLA folds what depends on constants, such as parameters often are.
+    rows = [x[0] for x in reversed(entries) if len(x)]
+    for row in rows:
+        if row.size:
+            return row[(0,) * row.ndim]
+    return jnp.zeros((), rows[0].dtype if rows else float)
 
 
-@functools.lru_cache(maxsize=64)
+def _apply(node: Node, values: list[Array], dtype: Any) -> Array:
+    """Compute a node from the values of those before it."""
+    operands = [values[x] if isinstance(x, int) else x for x in node.operands]
+    if node.operation is Operation.SELECT:
+        # Both choices may be constants, which have no precision of their own.
+        operands[1:] = [jnp.asarray(x, dtype) for x in operands[1:]]
+    return ELEMENTWISE[node.operation](*operands)
+
+
 def lower(program: Program, fence: bool = True) -> Lowered:
     """Prepare a program for JAX arrays, with fences behind shared values or without.
 
     On a GPU fences would break it into many kernels, and float64 divisions are slow.
     """
-    return Lowered(program, fence, fenced_nodes(program) if fence else frozenset())
+    return Lowered(program, fence)
 
 
 def on_any_platform(program: Program, evaluate: Callable, *arrays: AnyArray) -> Any:

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from jaxid.dynamics.base import BaseParameters
-from jaxid.dynamics.dispatch import in_numpy
 from jaxid.dynamics.motion import Motion
+from jaxid.dynamics.sample_methods import in_numpy
 from jaxid.identification.fit_result import Fit
 from jaxid.result_table import Column, Table, percent, shortened, significant
 from jaxid.validation.torque_errors import TorqueErrors

@@ -10,8 +10,8 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 from jaxid.arrays import AnyArray, Float, double_precision
-from jaxid.dynamics.dispatch import in_numpy
 from jaxid.dynamics.motion import Motion
+from jaxid.dynamics.sample_methods import in_numpy
 from jaxid.robot.collision import GROUND, Box, Capsule, CollisionModel, HalfSpace
 from jaxid.robot.forward_kinematics import placements, tip_placement
 from jaxid.robot.limits_and_drives import Limits

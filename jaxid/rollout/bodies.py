@@ -9,8 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxid.arrays import AnyArray, Array, Float
-from jaxid.dynamics.dispatch import in_numpy, solve_symmetric
 from jaxid.dynamics.model import Model
+from jaxid.dynamics.projection_equation import solve_symmetric
+from jaxid.dynamics.sample_methods import in_numpy
 from jaxid.program import Program, trace
 from jaxid.program.trace import FREE
 

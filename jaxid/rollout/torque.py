@@ -16,7 +16,7 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Array, Float, double_precision
 from jaxid.dynamics.base import BaseParameters
-from jaxid.dynamics.dispatch import program_of
+from jaxid.dynamics.sample_methods import program_of
 from jaxid.dynamics.terms import HardSign
 from jaxid.errors import InputError
 from jaxid.identification.identify import identify

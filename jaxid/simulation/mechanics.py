@@ -9,9 +9,10 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Float, Hashable, Joints
 from jaxid.dynamics import projection_equation
-from jaxid.dynamics.dispatch import program_of, solve_symmetric
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.motion import Motion
+from jaxid.dynamics.projection_equation import solve_symmetric
+from jaxid.dynamics.sample_methods import program_of
 from jaxid.errors import InputError
 from jaxid.program import to_python
 

@@ -10,9 +10,9 @@ import numpy as np
 from scipy import signal
 
 from jaxid.arrays import AnyArray, Float, Hashable, Joints, require_float64
-from jaxid.dynamics.dispatch import in_numpy
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.motion import Motion
+from jaxid.dynamics.sample_methods import in_numpy
 from jaxid.dynamics.terms import AbstractTerm
 from jaxid.errors import InputError
 from jaxid.identification.consistency.pseudo_inertia import inertial_parameters

@@ -20,9 +20,9 @@ import numpy as np
 from scipy import optimize
 from scipy.interpolate import CubicSpline
 
-from jaxid.dynamics.dispatch import in_numpy
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.motion import Motion
+from jaxid.dynamics.sample_methods import in_numpy
 from jaxid.identification.fit_result import Fit
 from jaxid.measurement.observations import Observations
 from jaxid.result_table import significant

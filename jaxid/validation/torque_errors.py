@@ -7,7 +7,7 @@ import equinox as eqx
 import numpy as np
 
 from jaxid.arrays import AnyArray, Bool, Float
-from jaxid.dynamics.dispatch import in_numpy
+from jaxid.dynamics.sample_methods import in_numpy
 from jaxid.identification.estimators import ResidualVariances, WeightedLeastSquares
 from jaxid.identification.fit_result import Fit
 from jaxid.identification.problem import RegressionProblem

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 import jaxid as jid
-from jaxid.dynamics.dispatch import program_of
+from jaxid.dynamics.sample_methods import program_of
 from jaxid.program import evaluate, trace
 
 

@@ -5,9 +5,9 @@ import pytest
 import trees
 
 from jaxid.dynamics.base import base_parameters
-from jaxid.dynamics.dispatch import on_samples
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.motion import Motion
+from jaxid.dynamics.sample_methods import on_samples
 from jaxid.dynamics.terms import (
     CoulombFriction,
     CoupledDrives,

@@ -12,7 +12,7 @@ from compiled_model import CompiledModel
 from export_samples import fit_of, motion, possible
 
 import jaxid as jid
-from jaxid.dynamics.dispatch import in_numpy
+from jaxid.dynamics.sample_methods import in_numpy
 from jaxid.errors import InputError
 from jaxid.export import exported_function, torque_program
 

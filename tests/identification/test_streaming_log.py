@@ -6,7 +6,7 @@ import pytest
 from virtual import motion, standard_parameters
 
 import jaxid as jid
-from jaxid.dynamics.dispatch import in_numpy
+from jaxid.dynamics.sample_methods import in_numpy
 from jaxid.identification import long_logs
 from jaxid.measurement.log_files import text_files
 from jaxid.measurement.reading import scan_log

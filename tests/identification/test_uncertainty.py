@@ -14,7 +14,7 @@ from virtual import (
 )
 
 import jaxid as jid
-from jaxid.dynamics.dispatch import in_numpy
+from jaxid.dynamics.sample_methods import in_numpy
 from jaxid.identification.uncertainty import UNCERTAINTIES, spectra_of_rows
 from jaxid.identification.uncertainty.spectral import (
     SpectralTable,

@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 import jaxid as jid
-from jaxid.dynamics.dispatch import in_numpy
+from jaxid.dynamics.sample_methods import in_numpy
 from jaxid.identification.factors import Blocks
 from jaxid.identification.fit_result import ConditionNumbers
 from jaxid.identification.uncertainty import Uncertainty

@@ -115,23 +115,6 @@ def test_known_choices_are_made(x, y):
     assert apply(Operation.NOT_EQUAL, x, x).operation is Operation.NOT_EQUAL
 
 
-@pytest.mark.parametrize(
-    ("function", "size", "counts"),
-    [
-        (lambda x: 0.3 * x[0] - 0.3 * x[1] + x[2], 3, (1, 2, 0)),
-        (lambda x: x[0] * x[1] + x[2] + x[1] * x[3], 4, (1, 2, 0)),
-        (lambda x: sum(0.5 * x[k] for k in range(4)), 4, (1, 3, 0)),
-        # Products that are needed elsewhere stay.
-        (lambda x: (0.3 * x[0] + 0.3 * x[1], 0.3 * x[0], 0.3 * x[1]), 2, (2, 1, 0)),
-        (lambda x: -(x[0] - x[1]), 2, (0, 1, 0)),
-        (lambda x: jnp.stack([x[0] - x[1], x[1] - x[0]]), 2, (0, 1, 1)),
-    ],
-)
-def test_common_factors_and_negated_differences(function, size, counts):
-    c = trace(function, (size,)).counts
-    assert (c.multiplications, c.additions, c.negations) == counts
-
-
 @given(
     st.lists(st.tuples(*[st.integers(0, 4)] * 3), min_size=2, max_size=9),
     st.integers(0, 9),

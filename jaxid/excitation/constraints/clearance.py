@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxid.arrays import Array, Float
-from jaxid.dynamics.dispatch import on_samples
 from jaxid.dynamics.motion import Motion
+from jaxid.dynamics.sample_methods import on_samples
 from jaxid.robot.collision import CollisionModel
 from jaxid.robot.robot import Robot
 

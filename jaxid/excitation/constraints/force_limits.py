@@ -10,9 +10,9 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Array, Float, as_array, namespace
 from jaxid.dynamics.base import BaseParameters
-from jaxid.dynamics.dispatch import in_numpy, on_samples, program_of
 from jaxid.dynamics.model import Coordinates
 from jaxid.dynamics.motion import Motion
+from jaxid.dynamics.sample_methods import in_numpy, on_samples, program_of
 from jaxid.dynamics.terms import AbstractTransition, Reversal
 from jaxid.errors import InputError
 from jaxid.program.gradient import pull_back

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxid.arrays import AnyArray, Array, Float, as_array
-from jaxid.dynamics.dispatch import on_samples
 from jaxid.dynamics.motion import Motion
+from jaxid.dynamics.sample_methods import on_samples
 from jaxid.errors import InputError
 from jaxid.robot.forward_kinematics import tip_placement
 from jaxid.robot.robot import Robot

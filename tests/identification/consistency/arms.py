@@ -3,7 +3,7 @@
 import numpy as np
 
 import jaxid as jid
-from jaxid.dynamics.dispatch import in_numpy
+from jaxid.dynamics.sample_methods import in_numpy
 from jaxid.identification.consistency.scaled_rows import ScaledRows, scaled_rows
 from jaxid.simulation.virtual import random_bodies
 

@@ -23,16 +23,15 @@ from jaxid.arrays import (
     AnyArray,
     Array,
     Float,
-    Joints,
     Numbers,
     as_array,
     content,
     is_traced,
 )
 from jaxid.errors import InputError
-from jaxid.program import Program, Shape, evaluate, evaluate_rows, packed_entries, trace
-from jaxid.program.blocks import BLOCK, on_rows
+from jaxid.program import Program, Shape, evaluate, trace
 from jaxid.program.rules import with_derivatives_of
+from jaxid.program.xla_sample_blocks import BLOCK, on_rows
 
 
 class OpenModel(eqx.Module):
@@ -250,10 +249,11 @@ def on_samples(
     is_on_one_cpu = len(devices) <= 1 and all(d.platform == "cpu" for d in devices)
     is_small = math.prod(batch) <= MAX_SAMPLES_IN_NUMPY and not method.is_long
     if is_small and is_on_one_cpu:
-        rows = _rows_in_numpy(method.program, arrays, batch)
-        results = rows.reshape((*batch, *method.output_shape))
+        columns = [_entries_first(x) for x in arrays]
+        results = _samples_first(evaluate(method.program, *columns), len(batch))
         with jax.default_device(*devices or (None,)):
-            return jnp.asarray(results, dtype) if in_jax else results
+            convert = jnp.asarray if in_jax else np.asarray
+            return convert(results, dtype)
 
     inputs = [jnp.asarray(x, dtype) for x in arrays]
     results = _over_batches(method.compiled, batch, inputs, len(shared))
@@ -272,67 +272,49 @@ def _batch_shape(arrays: list[AnyArray]) -> Shape:
         ) from None
 
 
-def _rows_in_numpy(
-    program: Program, arrays: list[AnyArray], batch: Shape
-) -> Float[np.ndarray, "samples results"]:
-    """Return the packed results of all samples in NumPy."""
-    inputs = []
-    for x in arrays:
-        entries = np.moveaxis(np.asarray(x, np.float64), -1, 0)
-        absent_axes = (1,) * (len(batch) + 1 - x.ndim)
-        inputs.append(entries.reshape(len(entries), *absent_axes, *entries.shape[1:]))
+def _entries_first(x: AnyArray) -> np.ndarray:
+    """Return an array [*batch, entries] as [entries, *batch], in float64."""
+    return np.moveaxis(np.asarray(x, np.float64), -1, 0)
 
-    distinct = evaluate_rows(program, *inputs)
-    entries = np.arange(len(program.outputs))
-    dtype = np.result_type(*(x.dtype for x in arrays), np.float32)
-    results = np.empty((distinct.shape[1], len(entries)), dtype)
-    # Blocks stay in the processor's cache while they are transposed.
-    for start in range(0, len(results), BLOCK):
-        block = slice(start, start + BLOCK)
-        results[block] = packed_entries(program, distinct[:, block], entries).T
-    return results
+
+def _samples_first(results: np.ndarray, batch_axes: int) -> np.ndarray:
+    """Return results [*shape, *batch] as [*batch, *shape], without a copy."""
+    axes = range(results.ndim)
+    first = results.ndim - batch_axes
+    return results.transpose(*axes[first:], *axes[:first])
 
 
 def _over_batches(
     run: Callable, batch: Shape, arrays: list[Array], shared: int
 ) -> Array:
-    """Apply a function of rows, by `vmap` over the leading axes of parameters.
+    """Apply a function of rows to arrays whose leading axes are broadcast.
 
     The first arrays, of this number, are parameters; the others are samples.
     """
     if all(x.ndim == 1 for x in arrays[:shared]):
-        return _over_samples(run, batch, arrays[:shared], arrays[shared:])
+        count = math.prod(batch)
+        rows = [_broadcast_rows(x, batch, (count,)) for x in arrays[shared:]]
+        results = run(*arrays[:shared], *rows)
+    else:
+        # Blocks of samples have their parameters in common where these have an axis
+        # of length one for the samples.
+        samples = batch[-1]
+        inputs = []
+        for k, x in enumerate(arrays):
+            is_common = k < shared and (x.ndim == 1 or x.shape[-2] == 1)
+            if is_common and x.ndim > 1:
+                x = x[..., 0, :]
+            axes = (-1,) if is_common else (-1, samples)
+            inputs.append(_broadcast_rows(x, batch[:-1] if is_common else batch, axes))
+        results = jax.vmap(run)(*inputs)
+        results = results.reshape(-1, *results.shape[2:])
+    return results.reshape(*batch, *results.shape[1:])
 
-    rank = len(batch) + 1
-    arrays = [x.reshape((1,) * (rank - x.ndim) + x.shape) for x in arrays]
-    axes = [0 if len(x) > 1 else None for x in arrays]
-    parts = [x if axis == 0 else x[0] for x, axis in zip(arrays, axes, strict=True)]
-    if all(axis is None for axis in axes):
-        return _over_batches(run, batch[1:], parts, shared)[None]
 
-    def over_other_axes(*parts: Array) -> Array:
-        # Parameters that have no other batch are vectors again.
-        vectors = [
-            x.reshape(x.shape[-1:]) if math.prod(x.shape[:-1]) == 1 else x
-            for x in parts
-        ]
-        return _over_batches(run, batch[1:], vectors, shared)
-
-    return jax.vmap(over_other_axes, axes)(*parts)
-
-
-def _over_samples(
-    run: Callable, batch: Shape, parameters: list[Array], samples: list[Array]
-) -> Array:
-    """Apply a function of rows to samples with any batch axes."""
-    rows = []
-    for x in samples:
-        size = x.shape[-1]
-        rows.append(jnp.broadcast_to(x, (*batch, size)).reshape(math.prod(batch), size))
-    results = run(*parameters, *rows)
-    if len(batch) == 1:
-        return results
-    return results.reshape((*batch, *results.shape[1:]))
+def _broadcast_rows(x: Array, batch: Shape, axes: Shape) -> Array:
+    """Repeat an array along a batch, whose axes are given another shape then."""
+    entries = x.shape[-1]
+    return jnp.broadcast_to(x, (*batch, entries)).reshape(*axes, entries)
 
 
 def in_numpy(
@@ -343,38 +325,7 @@ def in_numpy(
 ) -> np.ndarray:
     """Apply a method for one sample to rows of samples in NumPy, in float64."""
     parameters = [np.asarray(x, np.float64) for x in shared]
-    columns = [np.asarray(x, np.float64).T for x in samples]
+    columns = [_entries_first(x) for x in samples]
     shapes = [x.shape for x in parameters] + [x.shape[:1] for x in columns]
     results = evaluate(program_of(owner, definition, *shapes), *parameters, *columns)
-    # A result that does not depend on the samples is the same for all of them.
-    results = np.broadcast_to(results, (*results.shape[:-1], len(samples[0])))
-    return np.moveaxis(results, -1, 0)
-
-
-def solve_symmetric(A: Float[AnyArray, "joints joints"], b: Joints) -> Joints:
-    r"""Solve $A x = b$ by $A = L D L^T$, without square roots or pivoting.
-
-    Only the lower triangle of A, which is definite, is read. A program has no loops.
-    """
-    n = b.shape[0]
-    L, LD = {}, {}
-    for j in range(n):
-        for i in range(j, n):
-            entry = A[i, j]
-            for k in range(j):
-                entry = entry - LD[i, k] * L[j, k]
-            LD[i, j] = entry
-            if i > j:
-                L[i, j] = entry / LD[j, j]
-
-    # L y = b, then D z = y, then L^T x = z.
-    x = [b[i] for i in range(n)]
-    for i in range(n):
-        for k in range(i):
-            x[i] = x[i] - L[i, k] * x[k]
-    for i in range(n):
-        x[i] = x[i] / LD[i, i]
-    for i in reversed(range(n)):
-        for k in range(i + 1, n):
-            x[i] = x[i] - L[k, i] * x[k]
-    return jnp.stack(x)
+    return _samples_first(results, 1)

@@ -6,7 +6,7 @@ arrays, and are put in place afterwards. An accelerator takes all samples at onc
 """
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -16,62 +16,57 @@ from jaxid.arrays import Array, Float
 
 from .program import Program
 from .rules import ALWAYS, differing_alike
-from .xla import fenced, hidden_one, lower, primitives
+from .xla import Results, fenced, hidden_one, lower
 
 BLOCK = 256
 """Samples of one evaluation."""
+Rows = Float[Array, "samples out"]
+"""Packed result of each sample."""
 
 
-def block_results(program: Program, *arrays: Array) -> tuple[Array, ...]:
+def block_results(program: Program, *arrays: Array) -> Results:
     """Return the distinct results of a block of samples, each computed once.
 
     Inputs are [entries] if all samples have them in common, else [samples, entries].
     """
-    size = next(len(x) for x in arrays if x.ndim == 2)
+    count = len(arrays[-1])
+    reference = arrays[-1][0, 0]
 
-    def evaluate(arrays: tuple[Array, ...]) -> tuple[Array, ...]:
-        # Transposed once, behind a fence of its own.
+    def evaluate(arrays: tuple[Array, ...]) -> Results:
+        # All samples are transposed together, behind a fence of their own.
         matrix = jnp.concatenate([x.T for x in arrays if x.ndim == 2])
         rows = iter(fenced(matrix, hidden_one(matrix[0, 0])))
-        inputs = []
-        for x in arrays:
-            if x.ndim == 2:
-                inputs.append([next(rows) for _ in x.T])
-            else:
-                inputs.append([jnp.broadcast_to(entry, (size,)) for entry in x])
-        return lower(program, fence=True).run(inputs, primitives(matrix[0]))
+        columns = [[next(rows) for _ in x.T] if x.ndim == 2 else x for x in arrays]
+        return lower(program, fence=True).run(_repeat(columns, count))
+
+    def skip(_: tuple[Array, ...]) -> Results:
+        return tuple(jnp.broadcast_to(reference, count) for _ in program.distinct[0])
 
     # Results of a branch are stored: what uses them does not compute them again.
-    reference = arrays[-1][0, 0]
-    dummy_results = tuple(
-        jnp.broadcast_to(reference, (size,)) for _ in program.distinct[0]
-    )
-    return jax.lax.cond(
-        hidden_one(reference) > 0, evaluate, lambda _: dummy_results, arrays
-    )
+    return jax.lax.cond(hidden_one(reference) > 0, evaluate, skip, arrays)
 
 
-def results_at_once(program: Program, *arrays: Array) -> tuple[Array, ...]:
+def results_at_once(program: Program, *arrays: Array) -> Results:
     """Return the distinct results of samples, without fences."""
-    count = next(len(x) for x in arrays if x.ndim == 2)
-    # Entries that all samples have in common are repeated.
-    inputs = [[jnp.broadcast_to(row, (count,)) for row in x.T] for x in arrays]
-    like = jnp.zeros(count, arrays[-1].dtype)
-    return lower(program, fence=False).run(inputs, primitives(like))
+    columns = [x.T for x in arrays]
+    return lower(program, fence=False).run(_repeat(columns, len(arrays[-1])))
 
 
-def _pack(
-    results: Callable[..., tuple[Array, ...]], program: Program, *arrays: Array
-) -> Float[Array, "samples out"]:
+def _repeat(columns: Sequence, count: int) -> list[list[Array]]:
+    """Return all entries as arrays of the samples, also what these have in common."""
+    return [[jnp.broadcast_to(row, count) for row in x] for x in columns]
+
+
+def _pack(results: Callable[..., Results], program: Program, *arrays: Array) -> Rows:
     """Return distinct results in the order of the packed result, with its constants."""
-    like = jnp.zeros(len(arrays[-1]), arrays[-1].dtype)
     columns = []
     for x in program.pack(results(program, *arrays)):
-        columns.append(jax.lax.full_like(like, x) if isinstance(x, float) else x)
+        column = jnp.asarray(x, arrays[-1].dtype)
+        columns.append(jnp.broadcast_to(column, len(arrays[-1])))
     return jnp.stack(columns, axis=1)
 
 
-def _in_blocks(program: Program, *arrays: Array) -> Float[Array, "samples out"]:
+def _in_blocks(program: Program, *arrays: Array) -> Rows:
     """Return the packed result of each sample, block by block."""
     count = len(arrays[-1])
     if count <= BLOCK:
@@ -94,7 +89,7 @@ def _slice_samples(x: Array, start: Array, size: int) -> Array:
     return jax.lax.dynamic_slice_in_dim(x, start, size) if x.ndim == 2 else x
 
 
-def on_rows(program: Program, *arrays: Array) -> Float[Array, "samples out"]:
+def on_rows(program: Program, *arrays: Array) -> Rows:
     """Return the packed result of each sample; not for differentiation.
 
     Inputs as in `block_results`; at least the last one has samples.
@@ -162,7 +157,7 @@ def row_products(
     if count == 0:
         return [jnp.zeros((len(group), len(group)), dtype) for group in groups]
 
-    def products(results: tuple[Array, ...], counts: Array) -> list[Array]:
+    def products(results: Results, counts: Array) -> list[Array]:
         values = program.pack(results)
         matrices = []
         for group in groups:
