@@ -58,6 +58,15 @@ Joints = Float[AnyArray, " joints"]
 JointSamples = Float[AnyArray, "samples joints"]
 """One number for each sample and joint."""
 
+ManyJoints = Float[AnyArray, "*batch joints"]
+"""One number for each joint, at any number of samples."""
+
+JointMatrix = Float[AnyArray, "joints joints"]
+"""A mass matrix, or another matrix with a row and a column for each joint."""
+
+Bodies = Float[AnyArray, "joints 10"]
+"""Ten inertial parameters of each body."""
+
 Vector3 = Float[AnyArray, "3"]
 """A point or a direction in space."""
 

@@ -9,7 +9,16 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Float, Hashable, Joints, Numbers, as_array
+from jaxid.arrays import (
+    AnyArray,
+    Float,
+    Hashable,
+    JointMatrix,
+    Joints,
+    ManyJoints,
+    Numbers,
+    as_array,
+)
 from jaxid.errors import InputError
 from jaxid.program import Program, Shape, select_outputs
 from jaxid.result_table import MISSING, Column, Remark, Status, Summarised, Table
@@ -100,8 +109,11 @@ class BaseParameters(Summarised, Hashable):
         expressions = []
         for leader, row in zip(self.indices, np.asarray(self.kappa), strict=True):
             factors = dict(zip(self.dependent, row.tolist(), strict=True))
-            factors = {leader: 1.0} | {k: x for k, x in factors.items() if x != 0.0}
-            summands = [Summand(names[k], factors[k]) for k in sorted(factors)]
+            factors[leader] = 1.0
+            summands = []
+            for k in sorted(factors):
+                if factors[k] != 0.0:
+                    summands.append(Summand(names[k], factors[k]))
             expressions.append(write_expression(summands))
         return tuple(expressions)
 
@@ -113,7 +125,7 @@ class BaseParameters(Summarised, Hashable):
         """Return the generalised forces of one sample by definition (Eq. 39)."""
         return self.model.forces(self.to_standard(p), q, qd, qdd, s)
 
-    def inertia(self, p, q) -> Float[AnyArray, "joints joints"]:
+    def inertia(self, p, q) -> JointMatrix:
         """Return the mass matrix of one sample by definition (Eq. 38)."""
         return self.model.inertia(self.to_standard(p), q)
 
@@ -208,7 +220,7 @@ class BaseParameters(Summarised, Hashable):
 
     def inverse_dynamics(
         self, p: Parameters, *motion: Motion | Coordinates
-    ) -> Float[AnyArray, "*batch joints"]:
+    ) -> ManyJoints:
         r"""Return the generalised forces $\Theta_B p_B$ [N m or N] (Eq. 39).
 
         Args:

@@ -39,7 +39,10 @@ def write_expression(summands: Iterable[Summand]) -> str:
     for summand in summands:
         key = summand.size or summand.name
         groups.setdefault(key, []).append(summand)
-    return _write_sum((x[0].is_negative, _write_group(x)) for x in groups.values())
+    parts = []
+    for members in groups.values():
+        parts.append((members[0].is_negative, _write_group(members)))
+    return _write_sum(parts)
 
 
 def _write_group(members: list[Summand]) -> str:

@@ -10,7 +10,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Float, Hashable, Joints, as_array, namespace
+from jaxid.arrays import (
+    AnyArray,
+    Float,
+    Hashable,
+    JointMatrix,
+    Joints,
+    ManyJoints,
+    as_array,
+    namespace,
+)
 from jaxid.errors import InputError
 from jaxid.program import Shape
 from jaxid.robot.robot import Robot
@@ -27,8 +36,9 @@ from .terms import (
     RotorInertia,
     ViscousFriction,
 )
+from .terms.term import NamesAndUnits, TermParameters
 
-Coordinates = Float[AnyArray, "*batch joints"] | Sequence[Any]
+Coordinates = ManyJoints | Sequence[Any]
 Parameters = Float[AnyArray, " standard"] | Sequence[float | int]
 
 DEFAULT_TERMS = (RigidBodies(), ViscousFriction(), CoulombFriction(), RotorInertia())
@@ -71,7 +81,7 @@ class Model(Hashable):
             )
 
     @property
-    def parameters(self) -> tuple[tuple[str, str], ...]:
+    def parameters(self) -> NamesAndUnits:
         """Names and units of all standard parameters."""
         return tuple(p for term in self.terms for p in term.parameters(self.robot))
 
@@ -92,7 +102,7 @@ class Model(Hashable):
 
     def split(
         self, p: Float[AnyArray, " standard"]
-    ) -> list[tuple[AbstractTerm, Float[AnyArray, " columns"]]]:
+    ) -> list[tuple[AbstractTerm, TermParameters]]:
         """Return each term with its parameters.
 
         Raises:
@@ -172,7 +182,7 @@ class Model(Hashable):
         parts = model.split(p)
         return reduce(add, (t.forces(self.robot, x, q, qd, qdd) for t, x in parts))
 
-    def inertia(self, p, q) -> Float[AnyArray, "joints joints"]:
+    def inertia(self, p, q) -> JointMatrix:
         """Return the mass matrix of one sample by definition (Eq. 38)."""
         return reduce(add, (t.mass_matrix(self.robot, x, q) for t, x in self.split(p)))
 
@@ -245,7 +255,7 @@ class Model(Hashable):
 
     def inverse_dynamics(
         self, p: Parameters, *motion: Motion | Coordinates
-    ) -> Float[AnyArray, "*batch joints"]:
+    ) -> ManyJoints:
         r"""Return the forces $\Theta p$ [N m or N], without forming $\Theta$ (Eq. 16).
 
         Args:
@@ -267,9 +277,7 @@ class Model(Hashable):
         """
         return on_samples(self, self.inertia, self.check(q), shared=(p,))
 
-    def bias_forces(
-        self, p: Parameters, *state: Motion | Coordinates
-    ) -> Float[AnyArray, "*batch joints"]:
+    def bias_forces(self, p: Parameters, *state: Motion | Coordinates) -> ManyJoints:
         r"""Return the forces $h(q, \dot q)$ at zero acceleration [N m or N] (Eq. 38).
 
         Args:
@@ -280,9 +288,7 @@ class Model(Hashable):
         q, qd = as_state(*state)
         return on_samples(self, self.bias, self.check(q), self.check(qd), shared=(p,))
 
-    def forward_dynamics(
-        self, p: Parameters, *state_and_forces: Any
-    ) -> Float[AnyArray, "*batch joints"]:
+    def forward_dynamics(self, p: Parameters, *state_and_forces: Any) -> ManyJoints:
         r"""Return the accelerations $M^{-1} (Q_m - h)$ that forces cause (Eq. 38).
 
         Args:
@@ -317,12 +323,12 @@ class Model(Hashable):
         """Return the potential energy [J], zero at the ground's origin."""
         return on_samples(self, self.potential, self.check(q), shared=(p,))
 
-    def tool_forces(self, motion: Motion) -> Float[AnyArray, "*batch joints"]:
+    def tool_forces(self, motion: Motion) -> ManyJoints:
         """Return the forces of the known tool [N m or N]; zero without a tool."""
         self.check(motion.q)
         return on_samples(self, self.known_forces, motion.q, motion.qd, motion.qdd)
 
-    def check(self, q: Coordinates) -> Float[AnyArray, "*batch joints"]:
+    def check(self, q: Coordinates) -> ManyJoints:
         """Return coordinates as an array with one number for each joint.
 
         Raises:
@@ -342,8 +348,5 @@ class SpatialModel(Model):
 
     def acceleration(self, p, q, qd, forces):
         """Return the accelerations of one sample that forces cause (Eq. 38)."""
-        parts = [t.mass_and_bias(self.robot, x, q, qd) for t, x in self.split(p)]
-        M = reduce(add, (mass for mass, _ in parts))
-        h = reduce(add, (bias for _, bias in parts))
-        factor = jax.scipy.linalg.cho_factor(M)
-        return jax.scipy.linalg.cho_solve(factor, forces - h)
+        factor = jax.scipy.linalg.cho_factor(self.inertia(p, q))
+        return jax.scipy.linalg.cho_solve(factor, forces - self.bias(p, q, qd))

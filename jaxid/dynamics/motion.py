@@ -4,7 +4,7 @@ from typing import Any
 
 import equinox as eqx
 
-from jaxid.arrays import AnyArray, Float, as_array
+from jaxid.arrays import AnyArray, Float, ManyJoints, as_array
 from jaxid.errors import InputError
 
 
@@ -25,9 +25,9 @@ class Motion(eqx.Module):
         state: States of friction with memory; None where they follow from the path `q`.
     """
 
-    q: Float[AnyArray, "*batch joints"] = eqx.field(converter=_coordinates)
-    qd: Float[AnyArray, "*batch joints"] = eqx.field(converter=_coordinates)
-    qdd: Float[AnyArray, "*batch joints"] = eqx.field(converter=_coordinates)
+    q: ManyJoints = eqx.field(converter=_coordinates)
+    qd: ManyJoints = eqx.field(converter=_coordinates)
+    qdd: ManyJoints = eqx.field(converter=_coordinates)
     state: Float[AnyArray, "*batch states"] | None = None
 
     def __getitem__(self, index) -> "Motion":

@@ -13,25 +13,23 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Float, Joints
+from jaxid.arrays import AnyArray, Bodies, Float, JointMatrix, Joints, Matrix3, Vector3
 from jaxid.robot.forward_kinematics import placement_in_parent, placements
 from jaxid.robot.inertia import inertia_tensor
 from jaxid.robot.robot import Robot
 from jaxid.robot.rotations import skew
 
-Vector = Float[AnyArray, "3"]
-
 
 def body_motions(
     robot: Robot, q: Joints, qd: Joints, qdd: Joints
-) -> list[tuple[Vector, Vector, Vector]]:
+) -> list[tuple[Vector3, Vector3, Vector3]]:
     r"""Return $(a, \omega, \dot\omega)$ of every body in its own frame (Eqs. 6, 8).
 
     Returns:
         For each body the acceleration of its origin less gravity [m/s²], its angular
         velocity [rad/s] and its angular acceleration [rad/s²].
     """
-    motions: list[tuple[Vector, Vector, Vector]] = []
+    motions: list[tuple[Vector3, Vector3, Vector3]] = []
     ground = (-robot.gravity, np.zeros(3), np.zeros(3))
     for i, parent in enumerate(robot.parent):
         a, w, wd = motions[parent] if parent >= 0 else ground
@@ -62,14 +60,14 @@ def partial_velocities(robot: Robot, q: Joints, qd: Joints, qdd: Joints):
     return accelerations
 
 
-def momentum_matrix(w: Vector) -> Float[AnyArray, "3 6"]:
+def momentum_matrix(w: Vector3) -> Float[AnyArray, "3 6"]:
     r"""Return $[\Omega\;|\;-\hat\Omega]$: $(A, ..., F) \to J^o\omega$ (Eq. 9)."""
     x, y, z = w[0], w[1], w[2]
     o = 0.0 * x
     return jnp.array([[x, o, o, o, -z, -y], [o, y, o, -z, o, -x], [o, o, z, -y, -x, o]])
 
 
-def body_regressor(a: Vector, w: Vector, wd: Vector) -> Float[AnyArray, "6 10"]:
+def body_regressor(a: Vector3, w: Vector3, wd: Vector3) -> Float[AnyArray, "6 10"]:
     r"""Return the regressor $\bar\Theta_i$ of one free body (Eq. 10).
 
     Multiplied with the body's parameters $p_i = (m, m r_c, A, B, C, D, E, F)$ it gives
@@ -105,7 +103,7 @@ def rigid_body_regressor(
 
 
 def rigid_body_forces(
-    robot: Robot, p: Float[AnyArray, "joints 10"], q: Joints, qd: Joints, qdd: Joints
+    robot: Robot, p: Bodies, q: Joints, qd: Joints, qdd: Joints
 ) -> Joints:
     r"""Return the forces $\sum_i F_{o,i}^T \bar\Theta_i p_i$ [N m or N] (Eq. 11).
 
@@ -118,9 +116,7 @@ def rigid_body_forces(
     return project(wrenches)[0]
 
 
-def rigid_body_mass_matrix(
-    robot: Robot, p: Float[AnyArray, "joints 10"], q: Joints
-) -> Float[AnyArray, "joints joints"]:
+def rigid_body_mass_matrix(robot: Robot, p: Bodies, q: Joints) -> JointMatrix:
     r"""Return the mass matrix $\sum_i F_{o,i}^T M_i F_{o,i}$ (Eq. 38).
 
     All bodies beyond a joint move as one when that joint alone moves. Mass, first
@@ -154,8 +150,8 @@ def rigid_body_mass_matrix(
 
 
 def composite_bodies(
-    robot: Robot, p: Float[AnyArray, "joints 10"], frames: list[tuple]
-) -> list[tuple[AnyArray | float, Vector, Float[AnyArray, "3 3"]]]:
+    robot: Robot, p: Bodies, frames: list[tuple]
+) -> list[tuple[AnyArray | float, Vector3, Matrix3]]:
     """Return mass, first moment and inertia of all that each joint carries."""
     n = robot.joints
     bodies = [(p[i][0], p[i][1:4], inertia_tensor(p[i][4:])) for i in range(n)]
@@ -184,7 +180,7 @@ def potential_energy_columns(robot: Robot, q: Joints) -> Float[AnyArray, "joints
     )
 
 
-def solve_symmetric(A: Float[AnyArray, "joints joints"], b: Joints) -> Joints:
+def solve_symmetric(A: JointMatrix, b: Joints) -> Joints:
     r"""Solve $A x = b$ by $A = L D L^T$, without square roots or pivoting.
 
     Only the lower triangle of A, which is definite, is read. A program has no loops.

@@ -13,11 +13,10 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Array, Float, Joints
+from jaxid.arrays import AnyArray, Array, Bodies, Float, JointMatrix, Joints
 from jaxid.robot.inertia import inertia_tensor
 from jaxid.robot.robot import Robot
 
-Bodies = Float[AnyArray, "joints 10"]
 Spatial = Float[Array, "joints 6"]
 
 
@@ -162,15 +161,21 @@ def spatial_forces(
     robot: Robot, p: Bodies, q: Joints, qd: Joints, qdd: Joints
 ) -> Joints:
     """Return the generalised forces of all bodies [N m or N] (Eq. 11)."""
-    motion = ground_motion(robot, q, qd, qdd)
-    return _project_forces(robot, ground_inertias(p, motion.carry), motion)
+    carry, joints, v, a = ground_motion(robot, q, qd, qdd)
+    inertias = ground_inertias(p, carry)
+    # The cross product of wrenches is that of motions, transposed and negative.
+    momenta = _times(inertias, v)
+    rates = jnp.einsum("nji,nj->ni", _combine(CROSS, v), momenta)
+    wrenches = _times(inertias, a) - rates
+    # A joint feels the wrenches of all bodies that it moves (Newton and Euler).
+    beyond = jnp.asarray(moved_by(robot).T, q.dtype) @ wrenches
+    return jnp.sum(joints * beyond, axis=1)
 
 
-def spatial_mass_and_bias(
-    robot: Robot, p: Bodies, q: Joints, qd: Joints
-) -> tuple[Float[Array, "joints joints"], Joints]:
-    """Return the mass matrix and the bias forces of the bodies (Eq. 38)."""
-    motion = ground_motion(robot, q, qd, jnp.zeros_like(q))
+def spatial_mass_matrix(robot: Robot, p: Bodies, q: Joints) -> JointMatrix:
+    """Return the mass matrix of the bodies (Eq. 38)."""
+    standstill = jnp.zeros_like(q)
+    motion = ground_motion(robot, q, standstill, standstill)
     inertias = ground_inertias(p, motion.carry)
     is_moved = jnp.asarray(moved_by(robot), q.dtype)
     # All bodies beyond a joint move as one when that joint alone moves.
@@ -179,18 +184,7 @@ def spatial_mass_and_bias(
     # A joint feels the momenta of those that it carries; the matrix is symmetric.
     lower = is_moved * (momenta @ motion.joints.T)
     off_diagonal = jnp.asarray(1.0 - np.eye(len(q)), q.dtype)
-    M = lower + (lower * off_diagonal).T
-    return M, _project_forces(robot, inertias, motion)
-
-
-def _project_forces(robot: Robot, inertias: Array, motion: GroundMotion) -> Joints:
-    """Return the forces of the joints that move the bodies (Newton and Euler)."""
-    _, joints, v, a = motion
-    # The cross product of wrenches is that of motions, transposed and negative.
-    rates = jnp.einsum("nji,nj->ni", _combine(CROSS, v), _times(inertias, v))
-    wrenches = _times(inertias, a) - rates
-    beyond = jnp.asarray(moved_by(robot).T, joints.dtype) @ wrenches
-    return jnp.sum(joints * beyond, axis=1)
+    return lower + (lower * off_diagonal).T
 
 
 def spatial_regressor(

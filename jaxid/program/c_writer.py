@@ -35,6 +35,8 @@ RESERVED = re.compile(
     "unsigned|using|virtual|void|volatile|while|xor|t[a-z]?[0-9]+[ab]?"
 )
 """Keywords of C and C++, and the names of the generated variables."""
+Names = Sequence[str]
+"""Names in C, or expressions, in order."""
 _LN2 = Fraction("0.693147180559945309417232121458176568075500134360255254120680009")
 
 
@@ -85,9 +87,7 @@ class CWriter:
         text = write(value, unique=True, trim="0") + self._suffix
         return f"({text})" if text.startswith("-") else text
 
-    def declaration(
-        self, name: str, inputs: Sequence[str], outputs: Sequence[str]
-    ) -> str:
+    def declaration(self, name: str, inputs: Names, outputs: Names) -> str:
         """Write the prototype of a program's function, without a semicolon."""
         _check_names([name, *inputs, *outputs])
         arguments = [f"const {self.type} *{x}" for x in inputs]
@@ -95,7 +95,7 @@ class CWriter:
         return f"void {name}({', '.join(arguments) or 'void'})"
 
     def definition(
-        self, program: Program, name: str, inputs: Sequence[str], outputs: Sequence[str]
+        self, program: Program, name: str, inputs: Names, outputs: Names
     ) -> str:
         """Write a program as the definition of a C function.
 
@@ -124,7 +124,7 @@ class CWriter:
         """Write the variable of a node, or a constant."""
         return f"t{x}" if isinstance(x, int) else self.number(x)
 
-    def _statements(self, program: Program, inputs: Sequence[str]) -> list[str]:
+    def _statements(self, program: Program, inputs: Names) -> list[str]:
         """Write one line for each node, and calls of the library."""
         # By stages: a call of the library computes many numbers, but waits for all.
         stages = self._stages(program)
@@ -156,7 +156,7 @@ class CWriter:
             stages.append(before + (self._function(program, k) is not None))
         return stages
 
-    def _statement(self, program: Program, k: int, inputs: Sequence[str]) -> str:
+    def _statement(self, program: Program, k: int, inputs: Names) -> str:
         """Write the line of a node that the library does not compute."""
         node = program.nodes[k]
         if node.operation is Operation.INPUT:
@@ -189,15 +189,15 @@ class CWriter:
         """Write a call of the library for several nodes."""
         width = self.widths[name]
         operands = list(dict.fromkeys(program.nodes[k].operands[0] for k in nodes))
+        arguments = [self._operand(x) for x in operands]
         # The library always computes as many numbers.
-        idle = [self.number(0.0)] * (width - len(operands))
-        arguments = ", ".join([*map(self._operand, operands), *idle])
+        arguments += [self.number(0.0)] * (width - len(operands))
         label = f"t{name[0]}{stage}"
         results = [f"{label}a", f"{label}b"][: len(LIBRARY[name])]
-        arrays = ", ".join(f"{x}[{width}]" for x in results)
+        arrays = [f"{x}[{width}]" for x in results]
         lines = [
-            f"const {self.type} {label}[{width}] = {{{arguments}}};",
-            f"{self.type} {arrays};",
+            f"const {self.type} {label}[{width}] = {{{', '.join(arguments)}}};",
+            f"{self.type} {', '.join(arrays)};",
             f"{self.prefix}_{name}({label}, {', '.join(results)});",
         ]
         for k in nodes:
@@ -236,7 +236,7 @@ class CWriter:
             exponential=[1 / math.factorial(n) for n in range(2, terms + 1)],
         )
 
-    def _polynomial(self, coefficients: Sequence[float], powers: Sequence[str]) -> str:
+    def _polynomial(self, coefficients: Sequence[float], powers: Names) -> str:
         """Write a polynomial in Estrin's scheme, whose chain is short.
 
         Coefficients begin with the lowest power; the `powers` are the names of x, x^2,

@@ -17,8 +17,13 @@ from jaxid.arrays import Array
 
 _HALF_PI = Fraction("1.57079632679489661923132169163975144209858469968755291")
 
+Pair = tuple[Array, Array]
+"""Sine and cosine."""
+Coefficients = tuple[float, ...]
+"""Numbers of a sum or of a polynomial."""
 
-def half_pi(bits: int, count: int) -> tuple[float, ...]:
+
+def half_pi(bits: int, count: int) -> Coefficients:
     """Return pi/2 as a sum of numbers with few bits, for exact multiples."""
     pieces = []
     remainder = _HALF_PI
@@ -33,10 +38,10 @@ def half_pi(bits: int, count: int) -> tuple[float, ...]:
 class Precision(NamedTuple):
     """Constants of one floating-point precision."""
 
-    pieces: tuple[float, ...]  # parts of pi/2, the largest first
+    pieces: Coefficients  # parts of pi/2, the largest first
     limit: float  # largest number of quarter turns
-    sine: tuple[float, ...]  # coefficients of the sine's polynomial, lowest power first
-    cosine: tuple[float, ...]  # the same for the cosine
+    sine: Coefficients  # coefficients of the sine's polynomial, lowest power first
+    cosine: Coefficients  # the same for the cosine
 
 
 # Minimax coefficients on |r| <= pi/4 (Remez exchange in 60 digits, then rounded),
@@ -70,7 +75,7 @@ SINGLE = Precision(
 )
 
 
-def _horner(coefficients: tuple[float, ...], z: Array) -> Array:
+def _horner(coefficients: Coefficients, z: Array) -> Array:
     """Evaluate a polynomial whose lowest power comes first."""
     *others, leader = coefficients
     total = jnp.full_like(z, leader)
@@ -80,7 +85,7 @@ def _horner(coefficients: tuple[float, ...], z: Array) -> Array:
 
 
 @jax.custom_jvp
-def sine_cosine(x: Array) -> tuple[Array, Array]:
+def sine_cosine(x: Array) -> Pair:
     """Compute (sin x, cos x) of angles [rad], up to 3e9 (float32: 1e5)."""
     precision = DOUBLE if x.dtype == np.float64 else SINGLE
     turns = jnp.round(x * float(1 / _HALF_PI))

@@ -23,6 +23,8 @@ from . import scalar
 from .program import Program, Shape, assemble
 from .scalar import Graph, Operation
 
+Arrays = list[np.ndarray]
+"""Operands or results of an equation, in order."""
 FREE = object()
 """Mark of the entries of an input that vary; numbers beside it become constants.
 
@@ -115,7 +117,7 @@ _INDEXED = {
 """Positions of the operands that hold entries; the others hold indices."""
 
 
-def _on_numbers(equation: JaxprEqn, *operands: np.ndarray) -> list[np.ndarray]:
+def _on_numbers(equation: JaxprEqn, *operands: np.ndarray) -> Arrays:
     """Run one equation on numbers, in NumPy where it suffices."""
     name = equation.primitive.name
     if name == "iota":
@@ -141,7 +143,7 @@ def _as_list(equation: JaxprEqn, results: Any) -> list:
 
 
 def _move_by_index(
-    equation: JaxprEqn, carriers: tuple[int, ...], operands: list[np.ndarray]
+    equation: JaxprEqn, carriers: tuple[int, ...], operands: Arrays
 ) -> np.ndarray:
     """Move entries to the places that the indices among the operands give."""
     entries = []
@@ -162,7 +164,7 @@ def _move_by_index(
     return np.concatenate(entries)[positions.astype(int)]
 
 
-def _scatter_add(equation: JaxprEqn, operands: list[np.ndarray]) -> np.ndarray:
+def _scatter_add(equation: JaxprEqn, operands: Arrays) -> np.ndarray:
     """Add entries at constant places, as the transpose of a gather does."""
     target, indices, updates = operands
     total = target.astype(object).copy()
@@ -320,7 +322,7 @@ def _entries(x: np.ndarray) -> np.ndarray:
     return x.astype(np.float64).astype(object)
 
 
-def _translate(equation: JaxprEqn, operands: list[np.ndarray]) -> list[np.ndarray]:
+def _translate(equation: JaxprEqn, operands: Arrays) -> Arrays:
     """Run one equation on arrays of which at least one is symbolic."""
     name = equation.primitive.name
     if name in _INDEXED:
@@ -360,9 +362,7 @@ def _as_constant(constant: object) -> np.ndarray:
     return np.asarray(constant)
 
 
-def _run(
-    jaxpr: Jaxpr, constants: list, arguments: list[np.ndarray]
-) -> list[np.ndarray]:
+def _run(jaxpr: Jaxpr, constants: list, arguments: Arrays) -> Arrays:
     """Run a jaxpr on arrays of scalars or numbers, one equation after the other."""
     values: dict[Any, np.ndarray] = {}
     for name, constant in zip(jaxpr.constvars, constants, strict=True):
@@ -382,7 +382,7 @@ def _run(
     return [read(name) for name in jaxpr.outvars]
 
 
-def _run_equation(equation: JaxprEqn, operands: list[np.ndarray]) -> list[np.ndarray]:
+def _run_equation(equation: JaxprEqn, operands: Arrays) -> Arrays:
     """Run one equation: a call of another jaxpr, a move of entries, or arithmetic."""
     name = equation.primitive.name
     jaxpr = _called_jaxpr(equation)
@@ -429,7 +429,9 @@ def trace(function: Callable, *inputs: Shape | np.ndarray) -> Program:
         avals = [jax.ShapeDtypeStruct(x.shape, np.float64) for x in arguments]
         jaxpr, result = jax.make_jaxpr(function, return_shape=True)(*avals)
         leaves = _run(jaxpr.jaxpr, jaxpr.consts, arguments)
-    outputs = [scalar.as_number(e) for x in leaves for e in _entries(x).ravel()]
+    outputs = []
+    for leaf in leaves:
+        outputs += map(scalar.as_number, _entries(leaf).ravel())
     input_shapes = tuple(x.shape for x in arguments)
     output_shapes = tuple(np.shape(x) for x in leaves)
     return assemble(input_shapes, outputs, output_shapes, jax.tree.structure(result))

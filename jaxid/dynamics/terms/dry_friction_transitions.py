@@ -12,7 +12,9 @@ from jaxid.arrays import (
     AnyArray,
     Float,
     Hashable,
+    JointMatrix,
     Joints,
+    ManyJoints,
     matching,
     namespace,
     one_or_each,
@@ -111,7 +113,7 @@ class Presliding(AbstractTransition):
 
     length: EachJoint = eqx.field(converter=one_or_each, default=1e-3)
     steady: AbstractTransition = Tanh()
-    motors: Float[AnyArray, "joints joints"] | None = None
+    motors: JointMatrix | None = None
     state: States | None = None
 
     def __check_init__(self):
@@ -132,9 +134,7 @@ class Presliding(AbstractTransition):
             return self.steady(speeds)
         return self.state[..., speeds.shape[-1] :]
 
-    def settled(
-        self, qd: Float[AnyArray, "*batch joints"]
-    ) -> Float[AnyArray, "*batch states"]:
+    def settled(self, qd: ManyJoints) -> Float[AnyArray, "*batch states"]:
         """Return the states of steady motion."""
         return self._with_motors(qd, self.steady)
 

@@ -4,12 +4,12 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Float
+from jaxid.arrays import Bodies
 from jaxid.dynamics import projection_equation, spatial_dynamics
 from jaxid.robot.inertia import INERTIAL_NAMES, INERTIAL_UNITS
 from jaxid.robot.robot import Robot
 
-from .term import AbstractTerm
+from .term import AbstractTerm, NamesAndUnits, TermParameters
 
 PRINCIPAL = 7
 """Number of inertial parameters of a body without products of inertia (Eq. 12)."""
@@ -50,7 +50,7 @@ class RigidBodies(AbstractTerm):
             "F": "product of inertia in x, y",
         }
 
-    def parameters(self, robot: Robot) -> tuple[tuple[str, str], ...]:
+    def parameters(self, robot: Robot) -> NamesAndUnits:
         """Return `m1`, `mx1`, … `F1`, then those of the next body."""
         pairs = zip(INERTIAL_NAMES, INERTIAL_UNITS, strict=True)
         of_body = list(pairs)[: self.body_parameters]
@@ -62,9 +62,7 @@ class RigidBodies(AbstractTerm):
         theta = projection_equation.rigid_body_regressor(robot, q, qd, qdd)
         return theta[:, :, : self.body_parameters].reshape(robot.joints, -1)
 
-    def all_ten(
-        self, robot: Robot, p: Float[AnyArray, " columns"]
-    ) -> Float[AnyArray, "joints 10"]:
+    def all_ten(self, robot: Robot, p: TermParameters) -> Bodies:
         """Return all ten parameters of the bodies, with zeros where left out."""
         bodies = p.reshape(robot.joints, self.body_parameters)
         if not self.principal_axes:
@@ -111,10 +109,4 @@ class SpatialBodies(RigidBodies):
 
     def mass_matrix(self, robot, p, q):
         """Return the mass matrix of the bodies (Eq. 38)."""
-        return self.mass_and_bias(robot, p, q, jnp.zeros_like(q))[0]
-
-    def mass_and_bias(self, robot, p, q, qd):
-        """Return the mass matrix of the bodies and their bias forces (Eq. 38)."""
-        return spatial_dynamics.spatial_mass_and_bias(
-            robot, self.all_ten(robot, p), q, qd
-        )
+        return spatial_dynamics.spatial_mass_matrix(robot, self.all_ten(robot, p), q)

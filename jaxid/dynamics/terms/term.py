@@ -9,8 +9,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Float, Joints
+from jaxid.arrays import AnyArray, Float, JointMatrix, Joints
 from jaxid.robot.robot import Robot
+
+TermParameters = Float[AnyArray, " columns"]
+"""One number for each parameter of a term."""
+NamesAndUnits = tuple[tuple[str, str], ...]
+"""Name and unit of each parameter."""
 
 
 class NonlinearParameter(NamedTuple):
@@ -87,7 +92,7 @@ class AbstractTerm(eqx.Module):
         """Return the term as a switch adds it; dry friction takes the transition."""
         return cls()
 
-    def parameters(self, robot: Robot) -> tuple[tuple[str, str], ...]:
+    def parameters(self, robot: Robot) -> NamesAndUnits:
         """Return name and unit of each parameter, in the order of the columns."""
         parameters = []
         for parameter in self.joint_parameters:
@@ -111,7 +116,7 @@ class AbstractTerm(eqx.Module):
     def forces(
         self,
         robot: Robot,
-        p: Float[AnyArray, " columns"],
+        p: TermParameters,
         q: Joints,
         qd: Joints,
         qdd: Joints,
@@ -119,9 +124,7 @@ class AbstractTerm(eqx.Module):
         """Return the forces [N m or N] of parameters for one sample."""
         return self.columns(robot, q, qd, qdd) @ p
 
-    def mass_matrix(
-        self, robot: Robot, p: Float[AnyArray, " columns"], q: Joints
-    ) -> Float[AnyArray, "joints joints"]:
+    def mass_matrix(self, robot: Robot, p: TermParameters, q: Joints) -> JointMatrix:
         """Return the factor of the accelerations in these forces (Eq. 38)."""
         # Forces are affine in the accelerations: their slope is the mass matrix.
         standstill = jnp.zeros_like(q)
@@ -129,15 +132,7 @@ class AbstractTerm(eqx.Module):
             standstill
         )
 
-    def mass_and_bias(
-        self, robot: Robot, p: Float[AnyArray, " columns"], q: Joints, qd: Joints
-    ) -> tuple[Float[AnyArray, "joints joints"], Joints]:
-        """Return the mass matrix and the bias forces (Eq. 38)."""
-        return self.mass_matrix(robot, p, q), self.forces(
-            robot, p, q, qd, jnp.zeros_like(q)
-        )
-
-    def potential_columns(self, robot: Robot, q: Joints) -> Float[AnyArray, " columns"]:
+    def potential_columns(self, robot: Robot, q: Joints) -> TermParameters:
         """Return the potential energy [J] of unit parameters."""
         return jnp.zeros(len(self.parameters(robot)), q.dtype)
 
@@ -151,7 +146,7 @@ class AbstractTerm(eqx.Module):
         """Number of inertial parameters of each body; zero without bodies."""
         return 0
 
-    def lower_bounds(self, robot: Robot) -> Float[np.ndarray, " columns"]:
+    def lower_bounds(self, robot: Robot) -> TermParameters:
         """Return lower bounds: 0, or -inf where both signs are possible."""
         bounds = np.full(len(self.parameters(robot)), -np.inf)
         for k, parameter in enumerate(self.joint_parameters):
