@@ -17,6 +17,8 @@ from .scalar import Graph, Operand, Operation, Scalar, live_scalars
 
 Shape = tuple[int, ...]
 """Shape of an array."""
+Shapes = tuple[Shape, ...]
+"""Shapes of arrays, in order."""
 Reference = int | float
 """An operand or a result: the position of a node (int) or a constant (float)."""
 
@@ -69,13 +71,13 @@ class Program:
     """
 
     # shapes of the inputs, without batch axes
-    input_shapes: tuple[Shape, ...]
+    input_shapes: Shapes
     # operations; each one reads only nodes before it
     nodes: tuple[Node, ...] = field(repr=False)
     # packed result: for each entry of each output, in order, a node or a constant
     outputs: tuple[Reference, ...] = field(repr=False)
     # shapes of the outputs, without batch axes
-    output_shapes: tuple[Shape, ...]
+    output_shapes: Shapes
     structure: Any = field(repr=False)  # tree structure of the function's result
 
     @functools.cached_property
@@ -163,9 +165,9 @@ class Program:
 
 
 def assemble(
-    input_shapes: tuple[Shape, ...],
+    input_shapes: Shapes,
     outputs: Sequence[Operand],
-    output_shapes: tuple[Shape, ...],
+    output_shapes: Shapes,
     structure: Any,
 ) -> Program:
     """Make a program of the part of a graph that the outputs need."""
