@@ -63,8 +63,6 @@ def identify_drive_gains(
     unloaded: Fit,
     loaded: Fit,
     load: Tool | float,
-    *,
-    varying: Sequence[str] | None = None,
 ) -> DriveGains:
     r"""Identify drive gains from a run without and a run with a known load.
 
@@ -72,15 +70,14 @@ def identify_drive_gains(
     $c_j$. Noise is in the measured forces, so least squares of *their* residuals are
     unbiased, and gains do not shrink as they would if forces stood among the columns.
     Parameters that several joints feel tie the gains to each other: joints that feel
-    the load help those that hardly do.
+    the load help those that hardly do. Friction and offsets may differ between the
+    runs.
 
     Args:
         unloaded: Fit of the run without the load; forces by nominal gains.
         loaded: Fit of the run with it, and with the same nominal gains.
         load: Load that was mounted between the runs. If only its mass [kg] on the
             end-effector is given, its centre and inertia are identified too.
-        varying: Names of base parameters that may differ between the runs beside the
-            load. If None, friction and offsets.
 
     Raises:
         InputError: If the runs have different base parameters, motors turn more than
@@ -91,7 +88,7 @@ def identify_drive_gains(
     robot = unloaded.base.model.robot
     _require_gains(robot)
     fits = (as_least_squares(unloaded), as_least_squares(loaded))
-    maps, offsets = _parameter_maps(unloaded.base, load, varying)
+    maps, offsets = _parameter_maps(unloaded.base, load)
     # With nominal gains the problem is linear, and a good start.
     start_parameters, _ = combine(fits, maps, offsets)
 
@@ -208,10 +205,10 @@ def _stack(parts: Sequence[Rows]) -> Rows:
 
 
 def _parameter_maps(
-    base: BaseParameters, load: Tool | float, varying: Sequence[str] | None
+    base: BaseParameters, load: Tool | float
 ) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """Return maps and offsets from common unknowns to both runs' base parameters."""
-    maps = state_maps(base.size, varying_parameters(base, varying), 2)
+    maps = state_maps(base.size, varying_parameters(base), 2)
     no_offset = np.zeros(base.size)
     if isinstance(load, Tool):
         return maps, [no_offset, body_columns(base, load.body) @ load.parameters]

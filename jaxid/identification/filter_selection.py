@@ -41,15 +41,12 @@ class FilterChoice(eqx.Module):
         cutoffs: Cut-off frequencies of forces and columns [Hz].
         errors: Held-out error of each candidate on each part of the log, relative to
             the forces.
-        correlations: Mean correlation of neighbouring rows of the residuals for each
-            candidate: near zero where rows are independent.
         best: Index of the chosen candidate.
     """
 
     candidates: tuple[FilterCandidate, ...]
     cutoffs: Float[AnyArray, " candidates"]
     errors: Float[AnyArray, "candidates folds"]
-    correlations: Float[AnyArray, " candidates"]
     best: int = eqx.field(static=True)
 
     @property
@@ -58,7 +55,7 @@ class FilterChoice(eqx.Module):
         return self.candidates[self.best][0]
 
     @property
-    def curve(self) -> Float[np.ndarray, " candidates"]:
+    def curve(self) -> np.ndarray:
         """Held-out error of each candidate on the whole log."""
         return np.sqrt(np.mean(np.square(self.errors), axis=1))
 
@@ -122,20 +119,17 @@ def choose_filter(
     # All candidates are judged with the same weights of the joints.
     weights = np.asarray(estimator(RegressionProblem(base, widest_band)).weights)
     errors = []
-    correlations = []
     for number, candidate in enumerate(candidates):
         observations = observe_with(candidate)
         problem = RegressionProblem(base, observations)
         test = RegressionProblem(base, _with_motions(widest_band, observations))
         errors.append(_held_out_errors(problem, test, estimator, weights**2))
-        correlations.append(_neighbour_correlation(problem, estimator))
         if progress is not None:
             progress((number + 1) / len(candidates))
     return FilterChoice(
         candidates=tuple(candidates),
         cutoffs=cutoffs,
         errors=np.array(errors),
-        correlations=np.array(correlations),
         best=int(np.argmin(np.mean(np.square(errors), axis=1))),
     )
 
@@ -174,10 +168,7 @@ def _mask_ends(observations: Observations, edge: int) -> Observations:
 
 
 def _held_out_errors(
-    problem: RegressionProblem,
-    test: RegressionProblem,
-    estimator: AbstractEstimator,
-    joint_weights,
+    problem: RegressionProblem, test: RegressionProblem, estimator, joint_weights
 ) -> np.ndarray:
     """Return the error on each part of time, relative to the forces of all parts.
 
@@ -194,20 +185,3 @@ def _held_out_errors(
     # Relative to the same force for each part: the errors' mean is that of the log.
     mean_forces = joint_weights @ test.factors.force_squares / len(folds)
     return np.sqrt(squares / mean_forces)
-
-
-def _neighbour_correlation(
-    problem: RegressionProblem, estimator: AbstractEstimator
-) -> float:
-    """Return the correlation of neighbouring residuals, as a mean of the joints."""
-    parameters = np.asarray(estimator(problem).parameters)
-    squares = np.zeros(problem.robot.joints)
-    products = np.zeros(problem.robot.joints)
-    for chunk, residuals in problem.residuals(parameters):
-        # Rows that do not count are neighbours of nobody.
-        residuals = np.where(chunk.mask, residuals, 0.0)
-        neighbours = residuals[1:] * residuals[:-1]
-        squares += np.sum(residuals**2, axis=0)
-        products += np.sum(neighbours, axis=0)
-    correlations = products / np.where(squares > 0, squares, 1.0)
-    return float(np.mean(correlations))

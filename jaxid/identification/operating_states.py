@@ -191,7 +191,9 @@ def state_maps(size: int, varying: Sequence[int], states: int) -> list[Matrix]:
     return [unit[state_indices(size, varying, state)] for state in range(states)]
 
 
-def varying_parameters(base: BaseParameters, varying: Sequence[str] | None) -> Indices:
+def varying_parameters(
+    base: BaseParameters, varying: Sequence[str] | None = None
+) -> Indices:
     """Return which base parameters are each state's own.
 
     By default they are those without energy.

@@ -1,13 +1,11 @@
 """Payload: the difference between a run without a load and a run with it."""
 
-from collections.abc import Sequence
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Array, Float, double_precision
+from jaxid.arrays import AnyArray, Float, Matrix3, Vector3, double_precision
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
 from jaxid.result_table import Remark, Status, Summarised, Table
@@ -22,6 +20,9 @@ from .uncertainty import Uncertainty
 
 CENTRAL_NAMES = ("m", "x", "y", "z", "A_c", "B_c", "C_c", "D_c", "E_c", "F_c")
 CENTRAL_UNITS = ("kg", "m", "m", "m", *("kg m²",) * 6)
+
+Body = Float[AnyArray, "10"]
+"""Parameters $(m, m r_c, A, B, C, D, E, F)$ of a body."""
 
 MAX_DISTANCE = 4.0
 """Standard deviations from the estimate to a possible body that are not unusual."""
@@ -49,8 +50,8 @@ class Payload(Summarised, eqx.Module):
     """
 
     body: int = eqx.field(static=True)
-    parameters: Float[AnyArray, "10"]
-    estimate: Float[AnyArray, "10"]
+    parameters: Body
+    estimate: Body
     uncertainty: Uncertainty
     distance: float
 
@@ -60,12 +61,12 @@ class Payload(Summarised, eqx.Module):
         return float(self.parameters[0])
 
     @property
-    def centre_of_mass(self) -> Float[np.ndarray, "3"]:
+    def centre_of_mass(self) -> Vector3:
         """Centre of mass in the frame of the body [m]."""
         return np.asarray(self.parameters[1:4] / self.mass)
 
     @property
-    def inertia(self) -> Float[np.ndarray, "3 3"]:
+    def inertia(self) -> Matrix3:
         """Inertia tensor about the centre of mass, along the body's axes [kg m²]."""
         return np.asarray(Inertia.from_parameters(self.parameters).tensor)
 
@@ -84,7 +85,7 @@ class Payload(Summarised, eqx.Module):
         )
 
     @property
-    def central(self) -> tuple[Float[np.ndarray, "10"], Uncertainty]:
+    def central(self) -> tuple[np.ndarray, Uncertainty]:
         """Mass, centre of mass, moments about it, and uncertainty (`CENTRAL_NAMES`)."""
         with double_precision():
             p = jnp.asarray(self.parameters)
@@ -136,14 +137,13 @@ def identify_payload(
     *,
     body: int | None = None,
     mass: float | None = None,
-    varying: Sequence[str] | None = None,
-    bounds: BodyBounds | None = None,
 ) -> Payload:
     """Identify a payload from a run without it and a run with it.
 
     Both are fitted together. What the payload adds to the base parameters depends on
     its ten parameters alone, and these are determined all ten although the last body's
-    own are not: the robot without the payload is known from the other run.
+    own are not: the robot without the payload is known from the other run. Friction and
+    offsets may differ between the runs, since they change with load and temperature.
     Uncertainties of both runs count.
 
     Args:
@@ -152,33 +152,24 @@ def identify_payload(
         body: Index of the body that carries it; that of the end-effector if None.
         mass: Mass of the payload [kg] if a scale has told it (to 0.1 %): the rest is
             then known better.
-        varying: Names of base parameters that may differ between the runs beside the
-            payload. If None, friction and offsets: they change with load and
-            temperature.
-        bounds: Bounds of the payload, such as `BodyBounds(mass_max=..., radius=...)`.
-            If None, wide ones from the robot's reach, which count only if the estimate
-            could not exist.
 
     Raises:
         InputError: If the runs have different base parameters or have seen the same
             data, or the model does not have ten parameters for the body.
-        RuntimeError: If no body within the bounds was proved to be the nearest.
+        RuntimeError: If no body was proved to be the nearest.
     """
     require_same_base((unloaded, loaded))
     robot = unloaded.base.model.robot
     body = robot.tip_body if body is None else body
-    estimate, uncertainty = _estimate(unloaded, loaded, body, varying)
+    estimate, uncertainty = _estimate(unloaded, loaded, body)
     if mass is not None:
         estimate, uncertainty = _weigh(estimate, uncertainty, mass)
     if not np.isfinite(uncertainty.covariance).all():
         return Payload(body, estimate, estimate, uncertainty, np.nan)
-    if bounds is None:
-        # A body that can exist needs no bounds.
-        if consistency_margin(estimate) >= 0:
-            return Payload(body, estimate, estimate, uncertainty, 0.0)
-        bounds = _wide_bounds(robot)
+    if consistency_margin(estimate) >= 0:
+        return Payload(body, estimate, estimate, uncertainty, 0.0)
     parameters, distance, error_bound = consistent_body(
-        estimate, uncertainty.covariance, bounds
+        estimate, uncertainty.covariance, _wide_bounds(robot)
     )
     if not error_bound <= MAX_ERROR_BOUND * (1.0 + distance**2):
         raise RuntimeError(
@@ -187,12 +178,10 @@ def identify_payload(
     return Payload(body, parameters, estimate, uncertainty, distance)
 
 
-def _estimate(
-    unloaded: Fit, loaded: Fit, body: int, varying: Sequence[str] | None
-) -> tuple[Float[np.ndarray, "10"], Uncertainty]:
+def _estimate(unloaded: Fit, loaded: Fit, body: int) -> tuple[np.ndarray, Uncertainty]:
     """Return the parameters that a load on a body has added between two runs."""
     base = unloaded.base
-    states = state_maps(base.size, varying_parameters(base, varying), 2)
+    states = state_maps(base.size, varying_parameters(base), 2)
     columns = body_columns(base, body)
     # The payload's ten parameters are unknowns that only the loaded run has.
     maps = [
@@ -208,8 +197,8 @@ def _estimate(
 
 
 def _weigh(
-    estimate: Float[np.ndarray, "10"], uncertainty: Uncertainty, mass: float
-) -> tuple[Float[np.ndarray, "10"], Uncertainty]:
+    estimate: np.ndarray, uncertainty: Uncertainty, mass: float
+) -> tuple[np.ndarray, Uncertainty]:
     """Update the estimate by a measured mass [kg], as a Kalman filter does."""
     covariance = uncertainty.covariance
     variance = (SCALE_DEVIATION * mass) ** 2
@@ -225,8 +214,8 @@ def _wide_bounds(robot: Robot) -> BodyBounds:
     return BodyBounds(mass_max=np.max(bounds.mass_max), radius=np.max(bounds.radius))
 
 
-def body_columns(base: BaseParameters, body: int) -> Float[np.ndarray, "base 10"]:
-    """Return the base parameters that unit parameters of a load on a body add."""
+def body_columns(base: BaseParameters, body: int) -> np.ndarray:
+    """Return what unit parameters of a load on a body add to base parameters."""
     joints = base.model.robot.joints
     if not 0 <= body < joints:
         raise InputError(f"`body` must be from 0 to {joints - 1}, but is {body}.")
@@ -243,7 +232,7 @@ def body_columns(base: BaseParameters, body: int) -> Float[np.ndarray, "base 10"
     return np.asarray(base.from_standard(unit_vectors)).T
 
 
-def _about_centre(p: Float[Array, "10"]) -> Float[Array, "10"]:
+def _about_centre(p: jax.Array) -> jax.Array:
     """Return mass, centre of mass, and the six moments about it."""
     body = Inertia.from_parameters(p)
     central = Inertia(body.mass, jnp.zeros_like(body.centre), body.tensor).parameters

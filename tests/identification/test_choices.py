@@ -72,7 +72,6 @@ def test_a_filter_is_chosen_between_too_low_and_too_high(noisy_log):
     assert found.filter.cutoff == best
     assert found.curve[0] > 1.5 * found.curve.min()
     assert found.curve[-1] > 1.1 * found.curve.min()
-    assert found.correlations[0] > found.correlations[-1]
     assert told[-1] == 1.0
 
 

@@ -59,10 +59,6 @@ def test_all_ten_parameters_come_back_without_noise(base, exact):
     np.testing.assert_allclose(found.inertia, LOAD.inertia, atol=1e-8)
     np.testing.assert_allclose(found.centre_of_mass, LOAD.centre_of_mass, atol=1e-8)
     np.testing.assert_allclose(found.tool.parameters, LOAD.parameters, atol=1e-8)
-    held = jid.identify_payload(*exact, varying=[])
-    assert np.abs(held.parameters - LOAD.parameters).max() > 1e-3, (
-        "friction has changed"
-    )
 
 
 def test_deviations_are_those_of_many_draws_and_carry_both_runs(base):

@@ -17,8 +17,8 @@ from .estimator import (
 )
 from .feasible_set import FeasibleSet as FeasibleSet
 from .pseudo_inertia import (
-    LogCholesky as LogCholesky,
     consistency_margin as consistency_margin,
+    inertial_parameters as inertial_parameters,
     pseudo_inertia as pseudo_inertia,
 )
 from .scaled_rows import ScaledRows as ScaledRows

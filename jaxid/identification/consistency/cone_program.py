@@ -6,9 +6,8 @@ their largest values: all variables lie between -1 and 1. Distances to an optimu
 then bounded, and units do not matter.
 """
 
-from collections.abc import Sequence
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -40,11 +39,9 @@ class ConeProgram(eqx.Module):
     # linear inequalities of each body, and their constants
     rows: Float[AnyArray, "*batch bodies rows width"]
     offsets: Float[AnyArray, "*batch bodies rows"]
-    # Further positive semidefinite matrices: contributions of the variables that take
-    # part in them, unit vectors of these variables, and constants, which are ones where
-    # a matrix is smaller than four.
-    couplings: Float[AnyArray, "*batch members couplings 4 4"]
-    members: Float[AnyArray, "*batch members variables"]
+    # Further positive semidefinite matrices: what drives contribute to them, and
+    # constants, which are ones where a matrix is smaller than four.
+    couplings: Float[AnyArray, "*batch drives couplings 4 4"]
     fillings: Float[AnyArray, "*batch couplings 4 4"]
     # functions that keep their value at the start
     equalities: Float[AnyArray, "*batch equal variables"]
@@ -107,7 +104,7 @@ class ConeProgram(eqx.Module):
         bodies = xp.reshape(y[:count], (self.bodies, self.width))
         drives = y[count:]
         S = xp.reshape(bodies @ self.basis, (self.bodies, 4, 4))
-        coupling_matrices = xp.tensordot(self.members @ y, self.couplings, 1)
+        coupling_matrices = xp.tensordot(drives, self.couplings, 1)
         s = xp.einsum("kri,ki->kr", self.rows, bodies)
         return (
             xp.concatenate([S, coupling_matrices]),
@@ -122,8 +119,8 @@ class ConeProgram(eqx.Module):
         linear_part = xp.einsum("kri,kr->ki", self.rows, z_bodies)
         bodies = matrices @ self.basis.T + linear_part
         coupling_products = xp.tensordot(self.couplings, Z[self.bodies :], 3)
-        y = xp.concatenate([xp.ravel(bodies), z_lower - z_upper])
-        return y + coupling_products @ self.members
+        drives = z_lower - z_upper + coupling_products
+        return xp.concatenate([xp.ravel(bodies), drives])
 
     def split_linear(self, z: Values) -> tuple[Values, Values, Values]:
         """Return numbers of inequalities: of bodies, and of both limits of drives."""
@@ -131,14 +128,6 @@ class ConeProgram(eqx.Module):
         start_of_upper = count + self.drives
         bodies = self.xp.reshape(z[:count], (self.bodies, -1))
         return bodies, z[count:start_of_upper], z[start_of_upper:]
-
-
-class Cone(NamedTuple):
-    """A further positive semidefinite matrix, filled up to size four with ones."""
-
-    places: np.ndarray  # variables that take part
-    basis: Values  # their contributions [places, 4, 4]
-    filling: np.ndarray
 
 
 def cone_program(
@@ -160,18 +149,15 @@ def cone_program(
 
     _, rows, offsets = feasible.linear_bounds()
     drive_scales = scales[count * feasible.width :]
-    cones = _drive_matrices(feasible, drive_scales)
-    members = np.unique([place for cone in cones for place in cone.places]).astype(int)
-    fillings = [cone.filling for cone in cones]
+    couplings, fillings = _drive_matrices(feasible, drive_scales)
     body_diameters = [1, 2, 2, 2, 1, 1, 1, 1, 1, 1][: feasible.width]
     return ConeProgram(
         A=A,
         b=b,
         rows=rows,
         offsets=offsets,
-        couplings=_contributions(cones, members),
-        members=np.eye(A.shape[1])[members],
-        fillings=np.reshape(fillings, (-1, 4, 4)),
+        couplings=couplings,
+        fillings=fillings,
         equalities=_total_mass(feasible),
         pull=xp.asarray(float(strength)),
         prior=inverse_prior,
@@ -192,17 +178,6 @@ def _scale_rows(feasible: FeasibleSet, data: ScaledRows, scales) -> tuple[Any, A
     return A, b
 
 
-def _contributions(cones: Sequence[Cone], members: np.ndarray) -> Values:
-    """Return the contributions of some variables to matrices [members, cones, 4, 4]."""
-    # At first no matrix: there may be none.
-    contributions = [np.zeros((len(members), 0, 4, 4))]
-    for cone in cones:
-        is_member = (members[:, None] == cone.places).astype(float)
-        matrices = namespace(cone.basis).tensordot(is_member, cone.basis, 1)
-        contributions.append(matrices[:, None])
-    return namespace(*contributions).concatenate(contributions, axis=1)
-
-
 def _total_mass(feasible: FeasibleSet) -> np.ndarray:
     """Return the row of the total mass [rows, variables], or none if it is unknown.
 
@@ -218,22 +193,28 @@ def _total_mass(feasible: FeasibleSet) -> np.ndarray:
     return row
 
 
-def _drive_matrices(feasible: FeasibleSet, drive_scales) -> list[Cone]:
-    """Return the matrices of coupled drives, whose diagonals are scaled to one."""
+def _drive_matrices(feasible: FeasibleSet, drive_scales) -> tuple[Values, np.ndarray]:
+    """Return what drives contribute to matrices of coupled ones, and their constants.
+
+    The diagonals of these matrices are scaled to one.
+    """
     xp = namespace(drive_scales)
-    start = len(feasible.bodies) * feasible.width
-    cones = []
-    for coupling in feasible.couplings:
-        places = feasible.drive_places(coupling.columns)
+    count = len(feasible.drives)
+    # At first no matrix: there may be none.
+    contributions = [np.zeros((count, 0, 4, 4))]
+    fillings = np.zeros((len(feasible.couplings), 4, 4))
+    for coupling, filling in zip(feasible.couplings, fillings, strict=True):
+        axes = len(coupling.diagonal)
         diagonal = drive_scales[feasible.drive_places(coupling.diagonal)]
-        size = 1.0 / xp.sqrt(diagonal)
+        size = xp.concatenate([1.0 / xp.sqrt(diagonal), np.ones(4 - axes)])
+        basis = np.zeros((count, 4, 4))
+        places = feasible.drive_places(coupling.columns)
+        basis[places, :axes, :axes] = coupling.basis
         products = size[:, None] * size[None]
-        basis = drive_scales[places][:, None, None] * coupling.basis * products[None]
-        padding = 4 - len(coupling.diagonal)
-        basis = xp.pad(basis, ((0, 0), (0, padding), (0, padding)))
-        filling = np.diag(np.arange(4) >= 4 - padding).astype(float)
-        cones.append(Cone(start + places, basis, filling))
-    return cones
+        matrices = drive_scales[:, None, None] * basis * products[None]
+        contributions.append(matrices[:, None])
+        filling[range(axes, 4), range(axes, 4)] = 1.0
+    return xp.concatenate(contributions, axis=1), fillings
 
 
 def _start(feasible: FeasibleSet, A, b, prior) -> Values:

@@ -12,15 +12,16 @@ calls of LAPACK for each matrix would make batches half as fast.
 
 from typing import Any
 
-import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Float, Numbers, as_array, is_traced, namespace
-from jaxid.errors import InputError
+from jaxid.arrays import AnyArray, Float, as_array, namespace
 
 Values = Any
 """Arrays of NumPy or JAX, and NumPy scalars."""
+Bodies = Float[AnyArray, "*batch 10"]
+r"""Parameters $(m, m r_c, A, B, C, D, E, F)$ of bodies."""
+PseudoInertias = Float[AnyArray, "*batch 4 4"]
+"""Pseudo-inertias of bodies."""
 
 
 def _unit_pseudo_inertias() -> np.ndarray:
@@ -40,12 +41,9 @@ def _unit_pseudo_inertias() -> np.ndarray:
 
 BASIS = _unit_pseudo_inertias()
 r"""Pseudo-inertias of unit parameters $(m, m r_c, A, B, C, D, E, F)$."""
-UPPER_TRIANGLE = np.triu_indices(4, 1)
 
 
-def pseudo_inertia(
-    bodies: Float[AnyArray, "*batch 10"],
-) -> Float[AnyArray, "*batch 4 4"]:
+def pseudo_inertia(bodies: Bodies) -> PseudoInertias:
     r"""Return the pseudo-inertias of bodies.
 
     They are $\begin{pmatrix} \Sigma & m r_c \\ m r_c^T & m \end{pmatrix}$ with the
@@ -59,9 +57,7 @@ def pseudo_inertia(
     return namespace(p).tensordot(p, BASIS.astype(p.dtype), 1)
 
 
-def inertial_parameters(
-    pseudo: Float[AnyArray, "*batch 4 4"],
-) -> Float[AnyArray, "*batch 10"]:
+def inertial_parameters(pseudo: PseudoInertias) -> Bodies:
     """Return the parameters $(m, m r_c, A, B, C, D, E, F)$ of pseudo-inertias."""
     xx, yy, zz = (pseudo[..., k, k] for k in range(3))
     mass = pseudo[..., 3, 3]
@@ -84,9 +80,7 @@ def ball(mass: np.ndarray, centre: np.ndarray, radius: np.ndarray) -> np.ndarray
     return P * mass[..., None, None]
 
 
-def consistency_margin(
-    bodies: Float[AnyArray, "*batch 10"],
-) -> Float[np.ndarray, "*batch"]:
+def consistency_margin(bodies: Bodies) -> np.ndarray:
     r"""Return the distances of bodies from the boundary of physical consistency.
 
     It is the smallest eigenvalue of the pseudo-inertia after its diagonal is scaled to
@@ -99,63 +93,6 @@ def consistency_margin(
     scale = 1.0 / np.where(size > 0, size, 1.0)
     scaled_matrix = P * scale[..., :, None] * scale[..., None, :]
     return np.linalg.eigvalsh(scaled_matrix)[..., 0]
-
-
-class LogCholesky(eqx.Module):
-    r"""Log-Cholesky coordinates of bodies: any ten numbers are a body that can exist.
-
-    The pseudo-inertia of a body is $U U^T$ with an upper triangle $U$ whose diagonal is
-    positive (Rucker, Wensing, Smooth Parameterization of Rigid-Body Inertia, 2022). Its
-    logarithms and its other entries are free: an optimiser of any kind stays within the
-    possible bodies.
-
-    Attributes:
-        coordinates: For each body the logarithms of the diagonal of $U$, then the
-            entries above it row by row; any real numbers.
-    """
-
-    coordinates: Float[AnyArray, "*batch 10"]
-
-    @classmethod
-    def of(cls, bodies: Numbers) -> "LogCholesky":
-        """Return the coordinates of bodies that can exist.
-
-        Args:
-            bodies: Parameters $(m, m r_c, A, ..., F)$ of each body along the last axis,
-                or of all bodies in a row.
-
-        Raises:
-            InputError: If there are not ten numbers for each body, or a body cannot
-                exist, or is flat: points and plates lie at infinity.
-        """
-        p = as_array("bodies", bodies)
-        if p.shape[-1:] != (10,):
-            if p.ndim != 1 or p.size % 10:
-                raise InputError(
-                    f"`bodies` must hold ten numbers each, but has shape {p.shape}."
-                )
-            p = p.reshape(-1, 10)
-        if not is_traced(p) and not (consistency_margin(p) > 0).all():
-            raise InputError(
-                "`bodies` must be able to exist, with a volume: use "
-                "`PhysicallyConsistent`, or the bodies of a URDF file."
-            )
-        # The upper triangle is a lower one with the axes in reverse order.
-        reverse_axes = (Ellipsis, slice(None, None, -1), slice(None, None, -1))
-        P = jnp.asarray(pseudo_inertia(p))
-        U = jnp.linalg.cholesky(P[reverse_axes])[reverse_axes]
-        diagonal = jnp.diagonal(U, axis1=-2, axis2=-1)
-        upper_entries = U[(..., *UPPER_TRIANGLE)]
-        return cls(jnp.concatenate([jnp.log(diagonal), upper_entries], axis=-1))
-
-    @property
-    def parameters(self) -> Float[AnyArray, "*batch 10"]:
-        """Parameters $(m, m r_c, A, B, C, D, E, F)$ of each body."""
-        x = jnp.asarray(self.coordinates)
-        U = jnp.zeros((*x.shape[:-1], 4, 4), x.dtype)
-        U = U.at[(..., *np.diag_indices(4))].set(jnp.exp(x[..., :4]))
-        U = U.at[(..., *UPPER_TRIANGLE)].set(x[..., 4:])
-        return inertial_parameters(U @ jnp.swapaxes(U, -1, -2))
 
 
 def pivots(P: Values) -> Values:

@@ -393,15 +393,12 @@ def _barriers(p: ConeProgram, inverse_S, Z, ratio) -> Values:
     bodies = symmetric_part(semidefinite_part) + linear_part
     ridge = 1.0 + RIDGE * np.eye(p.width)
     bodies = bodies * ridge[None]
-    drives = (1.0 + RIDGE) * (lower + upper)
-    blocks = _linalg(p).block_diag(*bodies, xp.diag(drives))
 
-    members, matrices = p.couplings.shape[:2]
-    couplings = xp.reshape(p.couplings, (members, matrices, 16))
+    couplings = xp.reshape(p.couplings, (*p.couplings.shape[:2], 16))
     of_couplings = xp.einsum("ikx,kxy->iky", couplings, products[p.bodies :])
     coupled = xp.tensordot(of_couplings, couplings, ((1, 2), (1, 2)))
-    coupling_part = symmetric_part(coupled)
-    return blocks + p.members.T @ coupling_part @ p.members
+    drives = xp.diag((1.0 + RIDGE) * (lower + upper)) + symmetric_part(coupled)
+    return _linalg(p).block_diag(*bodies, drives)
 
 
 def _linalg(p: ConeProgram) -> ModuleType:
