@@ -33,6 +33,12 @@ Columns have length one; beyond it a data set is solved again by orthogonal fact
 """
 
 
+JointArrays = list[Array]
+"""One array for each joint."""
+Estimates = Float[AnyArray, "*results base"]
+"""One number for each base parameter of each draw of each data set."""
+
+
 class BatchFit(eqx.Module):
     """Identified base parameters of many data sets.
 
@@ -51,13 +57,13 @@ class BatchFit(eqx.Module):
         dof: Degrees of freedom of each variance, for the t distribution.
     """
 
-    parameters: Float[AnyArray, "*results base"]
-    standard_deviations: Float[AnyArray, "*results base"]
+    parameters: Estimates
+    standard_deviations: Estimates
     residual_rms: Float[AnyArray, "*results joints"]
     condition_numbers: Float[AnyArray, "*datasets"]
     determined: Bool[AnyArray, "*datasets"]
-    naive_standard_deviations: Float[AnyArray, "*results base"]
-    dof: Float[AnyArray, "*results base"]
+    naive_standard_deviations: Estimates
+    dof: Estimates
 
 
 class DataSets(NamedTuple):
@@ -115,8 +121,8 @@ def _solve_groups(
         lambda x: x[numbers].reshape(groups, size, *x.shape[1:]), batch
     )
 
-    def solve_pair(pair: tuple[DataSets, list[Array]]) -> BatchFit:
-        return _solve_one(*pair, regressor, row_time, on_cpu)
+    def solve_pair(pair: tuple[DataSets, JointArrays]) -> BatchFit:
+        return _solve_one(*pair, regressor, row_time)
 
     def solve_group(group: DataSets) -> BatchFit:
         arrays = [jnp.moveaxis(x, -1, 0) for x in jax.tree.leaves(group.motion)]
@@ -138,37 +144,37 @@ class _Rows(NamedTuple):
     """Rows of one data set, joint by joint; those that do not count are zero."""
 
     parameters: list[np.ndarray]  # indices of the parameters that act on the joint
-    columns: list[Array]  # [columns, samples]
-    forces: list[Array]  # [draws, samples]
+    columns: JointArrays  # [columns, samples]
+    forces: JointArrays  # [draws, samples]
     weights: Array  # weight of each joint
     size: int  # number of base parameters
 
-    def products(self, forces: list[Array]) -> tuple[list[Array], Array]:
+    def products(self, forces: JointArrays) -> tuple[JointArrays, Array]:
         """Return products of forces with columns, and the forces' squares by joint."""
         squares = [jnp.sum(Q**2, axis=-1) for Q in forces]
         products = [Q @ A.T for A, Q in zip(self.columns, forces, strict=True)]
         return products, jnp.stack(squares, axis=-1)
 
-    def residuals(self, p: Array) -> list[Array]:
+    def residuals(self, p: Array) -> JointArrays:
         """Return measured less predicted forces of each joint."""
         joints = zip(self.forces, self.columns, self.parameters, strict=True)
         return [forces - p[:, k] @ columns for forces, columns, k in joints]
 
-    def information(self, grams: list[Array]) -> Array:
+    def information(self, grams: JointArrays) -> Array:
         """Add the weighted products of columns with columns [base, base]."""
         total = jnp.zeros((self.size, self.size), self.weights.dtype)
         for k, gram, weight in zip(self.parameters, grams, self.weights, strict=True):
             total = total.at[k[:, None], k].add(weight**2 * gram)
         return total
 
-    def gradient(self, products: list[Array]) -> Array:
+    def gradient(self, products: JointArrays) -> Array:
         """Add the weighted products of columns with forces [draws, base]."""
         total = jnp.zeros((len(products[0]), self.size), self.weights.dtype)
         for k, x, weight in zip(self.parameters, products, self.weights, strict=True):
             total = total.at[:, k].add(weight**2 * x)
         return total
 
-    def along(self, p: Array, products: list[Array]) -> Array:
+    def along(self, p: Array, products: JointArrays) -> Array:
         """Multiply parameters and products, by joint [draws, joints]."""
         pairs = zip(self.parameters, products, strict=True)
         return jnp.stack([jnp.sum(p[:, k] * x, axis=-1) for k, x in pairs], axis=-1)
@@ -176,10 +182,9 @@ class _Rows(NamedTuple):
 
 def _solve_one(
     data_set: DataSets,
-    columns: list[Array],
+    columns: JointArrays,
     regressor: JointRegressor,
     row_time: float | None,
-    on_cpu: bool,
 ) -> BatchFit:
     """Solve one data set by the products of its rows."""
     samples = len(data_set.motion.q)
@@ -201,7 +206,7 @@ def _solve_one(
         )
     grams = [A @ A.T for A in rows.columns]
     inverse, condition = inverse_information(rows.information(grams))
-    p, squares = _estimate(rows, grams, inverse, condition, on_cpu)
+    p, squares = _estimate(rows, grams, inverse, condition)
     naive_deviations = _naive_deviations(rows, grams, inverse, squares, counts)
     deviations = naive_deviations
     dof = jnp.broadcast_to(counts.sum() - rows.size, deviations.shape)
@@ -231,7 +236,7 @@ def _solve_one(
 
 
 def _estimate(
-    rows: _Rows, grams: list[Array], inverse: Array, condition: Array, on_cpu: bool
+    rows: _Rows, grams: JointArrays, inverse: Array, condition: Array
 ) -> tuple[Array, Array]:
     """Return the parameters [draws, base], and squared residuals [draws, joints]."""
     products, force_squares = rows.products(rows.forces)
@@ -253,18 +258,12 @@ def _estimate(
     # Residuals themselves are only needed where differences of large numbers would lose
     # digits.
     loses_digits = (condition > 1e3) | jnp.any(squares < 1e-6 * force_squares)
-    if on_cpu:
-        p, squares = jax.lax.cond(loses_digits, refine, lambda: (p, squares))
-    else:
-        # Under `vmap` both would be computed anyway.
-        refined_p, refined_squares = refine()
-        p = jnp.where(loses_digits, refined_p, p)
-        squares = jnp.where(loses_digits, refined_squares, squares)
+    p, squares = jax.lax.cond(loses_digits, refine, lambda: (p, squares))
     return p, jnp.maximum(squares, 0.0)
 
 
 def _naive_deviations(
-    rows: _Rows, grams: list[Array], inverse: Array, squares: Array, counts: Array
+    rows: _Rows, grams: JointArrays, inverse: Array, squares: Array, counts: Array
 ) -> Array:
     """Return deviations for independent rows; see `naive_covariance`."""
     explained_share = rows.size / jnp.maximum(counts.sum(), 1.0)

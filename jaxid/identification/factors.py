@@ -25,6 +25,8 @@ Columns = Sequence[Indices]
 """Indices of the base parameters that can act on each joint."""
 
 
+Ranges = Sequence[tuple[int, int]] | None
+"""Half-open ranges of rows; None for all rows."""
 LinearSystem = tuple[Matrix, BaseVector]
 """Matrix and right-hand side of linear equations of the base parameters."""
 
@@ -88,7 +90,7 @@ def row_chunks(
     base: BaseParameters,
     observations: Observations,
     samples: int,
-    ranges: Sequence[tuple[int, int]] | None = None,
+    ranges: Ranges = None,
 ) -> Iterator[RowChunk]:
     """Yield the rows of a recording by chunks of samples, not yet divided (Eq. 26).
 

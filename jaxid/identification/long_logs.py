@@ -44,8 +44,6 @@ TILE = 16
 """Rows of a banded product: more multiply zeros, fewer use the processor less."""
 MAX_COST = 256
 """Products for each row and column of a filter up to which a matrix product pays."""
-MAX_LAGS = 16384
-"""Length of a filter's response up to which a matrix product pays."""
 
 Grams = list[np.ndarray]
 """For each joint the products of its columns and forces with each other."""
@@ -65,8 +63,7 @@ def suits(observations: Observations) -> bool:
     stages = _stages(observations)
     # A filter is a matrix product of so many products for each row and column.
     cost = sum(len(stage.response) / stage.factor for stage in stages)
-    max_lags = max((len(stage.response) for stage in stages), default=1)
-    return cost <= MAX_COST and max_lags <= MAX_LAGS
+    return cost <= MAX_COST
 
 
 def _stages(observations: Observations) -> list[Stage]:
@@ -339,10 +336,9 @@ def _sum_by_joint(grams: list[Grams]) -> Grams:
 
 def _fill_up(x: Matrix, length: int) -> Matrix:
     """Return an array of so many rows, filled up with zeros."""
-    missing_rows = max(0, length - len(x))
-    if missing_rows:
-        return np.pad(x, ((0, missing_rows), (0, 0)))
-    return np.ascontiguousarray(x[:length])
+    rows = np.zeros((length, x.shape[1]), x.dtype)
+    rows[: len(x)] = x[:length]
+    return rows
 
 
 def _shows_every_direction(
@@ -383,7 +379,11 @@ def _root(G: Matrix) -> Matrix:
 
 
 class _DistinctColumns(NamedTuple):
-    """Columns that the loop filters; joints share them."""
+    """Columns that the loop filters; joints share them.
+
+    Parallel axes have equal columns: a quarter of them on a UR10, where filtering all
+    would take one and a half times as long.
+    """
 
     outputs: list[int]  # outputs of the program, every distinct expression once
     # rows of each joint's columns and force among the filtered ones

@@ -35,6 +35,9 @@ from .fit_result import Fit
 from .identify import identify
 from .uncertainty import IndependentRows
 
+Robots = Sequence[Robot] | None
+"""Robot of each data set; None for that of the base parameters."""
+
 
 def identify_batch(
     base: BaseParameters,
@@ -43,7 +46,7 @@ def identify_batch(
     weights: Float[AnyArray, "*sets joints"] | None = None,
     *,
     mask: Bool[AnyArray, "sets rows joints"] | None = None,
-    robots: Sequence[Robot] | None = None,
+    robots: Robots = None,
     row_time: float | None = None,
 ) -> BatchFit:
     """Estimate the base parameters of many data sets in one call (Eqs. 28-33).
@@ -124,7 +127,7 @@ def _check_arguments(base, motion, forces, mask, robots) -> None:
 
 def _solve_together(
     base: BaseParameters,
-    robots: Sequence[Robot] | None,
+    robots: Robots,
     batch: DataSets,
     row_time: float | None,
 ) -> BatchFit:
@@ -158,7 +161,7 @@ def _solve_together(
 
 def _solve_again(
     base: BaseParameters,
-    robots: Sequence[Robot] | None,
+    robots: Robots,
     batch: DataSets,
     fit: BatchFit,
     row_time: float | None,

@@ -9,7 +9,7 @@ import equinox as eqx
 import numpy as np
 from scipy import special
 
-from jaxid.arrays import AnyArray, Float, Indices, Texts, Vector
+from jaxid.arrays import AnyArray, Float, Indices, Matrix, Texts, Vector
 from jaxid.dynamics.base import BaseParameters
 from jaxid.result_table import (
     Column,
@@ -241,12 +241,12 @@ def compare(first: Fit, second: Fit) -> Comparison:
 
 
 def compare_some(
-    first: Fit, second: Fit, indices: Sequence[int], cross: AnyArray
+    first: Fit, second: Fit, indices: Sequence[int], cross: Matrix
 ) -> Comparison:
     """Compare base parameters of two fits whose estimates have a cross-covariance."""
     k = list(indices)
-    first_covariance = first.covariance[np.ix_(k, k)]
-    second_covariance = second.covariance[np.ix_(k, k)]
+    first_covariance = np.asarray(first.covariance)[np.ix_(k, k)]
+    second_covariance = np.asarray(second.covariance)[np.ix_(k, k)]
     # Infinite variances make numbers that are none.
     with np.errstate(invalid="ignore", divide="ignore"):
         covariance = first_covariance + second_covariance - cross - cross.T

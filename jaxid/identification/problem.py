@@ -13,7 +13,7 @@ from jaxid.measurement.friction_state import with_memory
 from jaxid.measurement.observations import Observations, Progress
 from jaxid.robot.robot import Robot
 
-from .factors import Blocks, Factors, RowChunk, empty_factors, row_chunks
+from .factors import Blocks, Factors, Ranges, RowChunk, empty_factors, row_chunks
 from .long_logs import stream_blocks, suits
 
 
@@ -150,7 +150,7 @@ class RegressionProblem:
             yield from self.recording_chunks(number, ranges)
 
     def recording_chunks(
-        self, number: int, ranges: Sequence[tuple[int, int]] | None = None
+        self, number: int, ranges: Ranges = None
     ) -> Iterator[RowChunk]:
         """Yield the rows of one recording; keep them if they are all made and few."""
         if number in self._cached_chunks:

@@ -41,9 +41,7 @@ class Shape(NamedTuple):
 
 
 def link_shapes(
-    tree: UrdfTree,
-    packages: str | Path | None,
-    link: str,
+    tree: UrdfTree, packages: str | Path | None, link: str
 ) -> Iterator[Shape]:
     """Yield the collision shapes of a link of a URDF file, or else its visual ones.
 
@@ -65,9 +63,7 @@ def link_shapes(
         description = part.find("geometry/*")
         # An element without geometry is named in the error.
         shape = _read_shape(
-            tree,
-            packages,
-            part if description is None else description,
+            tree, packages, part if description is None else description
         )
         yield shape.placed(rotation, position)
 
@@ -95,10 +91,8 @@ def _read_shape(tree: UrdfTree, packages: str | Path | None, element: Any) -> Sh
 
 
 def _mesh_vertices(
-    tree: UrdfTree,
-    packages: str | Path | None,
-    element: Any,
-) -> np.ndarray:
+    tree: UrdfTree, packages: str | Path | None, element: Any
+) -> Float[np.ndarray, "points 3"]:
     """Return the vertices of a mesh in the unit of its file."""
     import trimesh  # loaded where there are meshes
 
@@ -118,9 +112,7 @@ def _mesh_vertices(
 
 
 def _mesh_files(
-    description: Path,
-    packages: str | Path | None,
-    name: str,
+    description: Path, packages: str | Path | None, name: str
 ) -> Iterator[Path]:
     """Yield the places where the mesh of a description may be."""
     scheme, _, location = name.rpartition("://")
@@ -149,10 +141,9 @@ def mjcf_shapes(path: str | Path) -> dict[str, list[Shape]]:
 
     shapes: dict[str, list[Shape]] = {}
     for geom in range(model.ngeom):
-        body = model.geom_bodyid[geom]
+        body = int(model.geom_bodyid[geom])
         body_is_solid = is_solid[model.geom_bodyid == body].any()
-        is_unbounded = int(model.geom_type[geom]) in unbounded
-        if is_unbounded or (body_is_solid and not is_solid[geom]):
+        if model.geom_type[geom] in unbounded or (body_is_solid and not is_solid[geom]):
             continue
         rotation = rotation_of_quaternion(model.geom_quat[geom])
         shape = _geom_shape(mujoco, model, geom)

@@ -8,17 +8,13 @@ the list.
 
 import numpy as np
 
+from jaxid.arrays import Float
 from jaxid.dynamics.terms import RigidBodies, RotorInertia
 from jaxid.robot import library
 from jaxid.robot.limits_and_drives import Drives
 from jaxid.robot.robot import Robot
 
-from .friction_and_ripple import (
-    FrictionTemperature,
-    LuGreFriction,
-    SmoothFriction,
-    TorqueRipple,
-)
+from .friction_and_ripple import FrictionTemperature, LuGreFriction, TorqueRipple
 from .virtual import Sensors, VirtualRobot
 
 COLD = {1: 273.40, 2: 1.68, 27: 248.41, 28: 41.26, 34: 312.50, 35: 18.24}
@@ -84,13 +80,10 @@ def virtual_tx90l_on_rail(
         heating=heating,
         temperature=np.full(7, TEMPERATURES[warm]),
     )
-    if disturbed:
-        return virtual
-    smooth_friction = SmoothFriction(friction.viscous, friction.coulomb)
-    return virtual.replace(friction=smooth_friction, ripple=None)
+    return virtual if disturbed else virtual.undisturbed()
 
 
-def cad_tx90l_on_rail() -> np.ndarray:
+def cad_tx90l_on_rail() -> Float[np.ndarray, " standard"]:
     """Return a CAD model of `virtual_tx90l_on_rail().model` without friction.
 
     It describes bodies and rotors. Masses and rotors are 10 to 18 % off, each body as a
@@ -103,26 +96,25 @@ def cad_tx90l_on_rail() -> np.ndarray:
     )
 
 
-def _bodies(published: dict[int, float]) -> np.ndarray:
+def _bodies(published: dict[int, float]) -> Float[np.ndarray, "7 7"]:
     """Return seven parameters of each body with published base parameters (Eq. 24)."""
     entry = library.entries()["virtual_tx90l_on_rail"]
     m = np.array(entry["masses"])
     r = np.array(entry["centres"])
     gyration = np.array(entry["gyration"])
     # m4 r_c4z counts 20 times in p_B(1) and once in p_B(2): with l_2x = l_3z = 0.05 m.
-    forearm_moment = m[3] * r[3, 2]
-    carried_masses = m[1] + m[2] + ROTORS[0]
-    m[0] = published[1] - carried_masses + 20.0 * forearm_moment
-    first_moment = published[2] - 0.05 * m[2] + forearm_moment
+    moment = m[3] * r[3, 2]
+    other_masses = m[1] + m[2] + ROTORS[0] - 20.0 * moment
+    m[0] = published[1] - other_masses
+    first_moment = published[2] - 0.05 * m[2] + moment
     r[1, 0] = first_moment / m[1]
     # Second moments about the origin without products: possible if each leaves room for
     # all others.
     shares = np.count_nonzero(r, axis=1)[:, None]
     spread = gyration**2 + shares * r**2
     planes = spread.sum(axis=1, keepdims=True) - spread
-    masses = m[:, None]
-    moments = masses * planes
-    return np.hstack([masses, masses * r, moments])
+    moments = m[:, None] * planes
+    return np.concatenate([m[:, None], m[:, None] * r, moments], axis=1)
 
 
 def _friction(robot: Robot) -> tuple[LuGreFriction, FrictionTemperature]:
@@ -159,7 +151,7 @@ def _friction(robot: Robot) -> tuple[LuGreFriction, FrictionTemperature]:
     return friction, heating
 
 
-def _warm_factors(first: int, second: int) -> np.ndarray:
+def _warm_factors(first: int, second: int) -> Float[np.ndarray, "7"]:
     """Return warm over cold friction of all axes, by two numbers of base parameters."""
     factor_1 = WARM[first] / COLD[first]
     factor_2 = WARM[second] / COLD[second]

@@ -14,8 +14,6 @@ from jaxid.arrays import AnyArray, Array, Float, Int
 from jaxid.dynamics.motion import Motion
 from jaxid.robot.robot import Robot
 
-Excess = Float[Array, "*batch values"]
-"""Relative excess over each limit, at each sample."""
 BLOCK = 96
 """Samples for which derivatives are compiled: those watched of one motion."""
 
@@ -32,7 +30,8 @@ class Finding(NamedTuple):
             not rise above it.
         note: Origin of the limit: `12 less a margin of 50 %`.
         value: Relative excess over the limit; negative or zero where it is kept.
-        has_use: Whether a fraction of the limit is used; not where it is a place.
+        usage: Function of the relative excess that returns the used fraction of the
+            limit.
     """
 
     name: str
@@ -42,7 +41,7 @@ class Finding(NamedTuple):
     is_lower_limit: bool = False
     note: str = ""
     value: float = math.nan
-    has_use: bool = True
+    usage: Callable[[float], float] = lambda value: 1.0 + value
 
     @property
     def excess(self) -> float:
@@ -51,12 +50,8 @@ class Finding(NamedTuple):
 
     @property
     def used(self) -> float:
-        """Used fraction of the limit, 1 if just kept; NaN where that means nothing."""
-        if not self.has_use:
-            return math.nan
-        if not self.is_lower_limit:
-            return self.reached / self.limit
-        return self.limit / self.reached if self.reached > 0 else math.inf
+        """Used fraction of the limit, from 0 to 1; NaN where that means nothing."""
+        return self.usage(self.value)
 
     @property
     def reached(self) -> float:
@@ -72,9 +67,8 @@ class Finding(NamedTuple):
         elif self.is_lower_limit:
             text = f"{self.name} falls short of its limit by {amount}"
         else:
-            text = f"{self.name} exceeds its limit by {amount}"
-            if self.has_use:
-                text += f" ({100 * self.value:.3g} %)"
+            percentage = f"{100 * self.value:.3g} %"
+            text = f"{self.name} exceeds its limit by {amount} ({percentage})"
         if math.isnan(self.limit):
             return text
         word = "least" if self.is_lower_limit else "most"
@@ -102,7 +96,7 @@ class AbstractConstraint(eqx.Module):
     """
 
     @abstractmethod
-    def __call__(self, robot: Robot, motion: Motion) -> Excess:
+    def __call__(self, robot: Robot, motion: Motion) -> Float[Array, "*batch values"]:
         """Return the excess over each limit at each sample; not positive if kept.
 
         Runs under `jit`, `vmap` and derivatives with respect to the motion.
@@ -150,7 +144,9 @@ class AbstractConstraint(eqx.Module):
 
         return linearise
 
-    def describe(self, robot: Robot, values: AnyArray) -> list[Finding]:
+    def describe(
+        self, robot: Robot, values: Float[AnyArray, "*batch values"]
+    ) -> list[Finding]:
         """Return the limited quantities with the largest of their values."""
         entries = self.entries(robot)
         peaks = np.asarray(values).reshape(-1, len(entries)).max(axis=0)

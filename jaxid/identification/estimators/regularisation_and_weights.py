@@ -276,7 +276,7 @@ class ResidualVariances(AbstractWeights):
             weights = self._reciprocals(factors, factors.residual_squares(p))
         return weights
 
-    def _reciprocals(self, factors: Factors, squares: Vector) -> Vector:
+    def _reciprocals(self, factors: Factors, squares: Joints) -> Vector:
         deviations = np.sqrt(squares / np.maximum(factors.rows, 1))
         # Finite also for a joint without any force or residual.
         floor = max(1e-9 * float(deviations.max()), 1e-100)

@@ -26,10 +26,10 @@ class Uncertainty(eqx.Module):
         notes: Sentences for the user.
     """
 
-    covariance: Float[AnyArray, "base base"]
-    dof: Float[AnyArray, " base"]
-    naive_covariance: Float[AnyArray, "base base"]
-    jackknife: Float[AnyArray, " base"] | None = None
+    covariance: BaseMatrix
+    dof: BaseVector
+    naive_covariance: BaseMatrix
+    jackknife: BaseVector | None = None
     notes: Texts = eqx.field(static=True, default=())
 
     @property
