@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import equinox as eqx
 import numpy as np
 
-from jaxid.arrays import AnyArray, Float
+from jaxid.arrays import AnyArray, Float, Joints
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
 from jaxid.measurement.filters import (
@@ -74,7 +74,7 @@ def choose_filter(
     candidates: Sequence[FilterCandidate] | None = None,
     *,
     estimator: AbstractEstimator | None = None,
-    min_speed: Sequence[float] | Float[AnyArray, " joints"] | None = None,
+    min_speed: Sequence[float] | Joints | None = None,
     progress: Progress | None = None,
 ) -> FilterChoice:
     """Choose the filter with which a model predicts held-out parts of the log best.

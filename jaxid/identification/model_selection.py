@@ -178,8 +178,8 @@ def _parts(
 
 def _held_out_squares(
     candidate: ModelCandidate, parts: Sequence[Factors], joint_weights
-) -> Float[np.ndarray, "parts parts"]:
-    """Return the squared errors on the second part of fits without both.
+) -> np.ndarray:
+    """Return the squared errors on the second part of fits without both [parts, parts].
 
     On the diagonal only that part was left out.
     """
@@ -213,12 +213,12 @@ def _promise(table, candidates: Sequence[ModelCandidate]) -> float:
 class Excess(NamedTuple):
     """Squared errors above those of the best candidate."""
 
-    mean: Float[np.ndarray, " candidates"]
-    deviation: Float[np.ndarray, " candidates"]  # standard deviation of the mean
+    mean: np.ndarray
+    deviation: np.ndarray  # standard deviation of the mean
 
 
-def _excess(squares: Float[np.ndarray, "candidates parts"]) -> Excess:
-    """Return by how much squared errors exceed the smallest ones."""
+def _excess(squares: np.ndarray) -> Excess:
+    """Return by how much squared errors [candidates, parts] exceed the smallest."""
     best = np.argmin(squares.mean(axis=1))
     differences = squares - squares[best]
     deviations = differences.std(axis=1, ddof=1) / np.sqrt(squares.shape[1])
@@ -226,12 +226,13 @@ def _excess(squares: Float[np.ndarray, "candidates parts"]) -> Excess:
 
 
 def _simplest(
-    squares: Float[np.ndarray, "candidates parts"],
+    squares: np.ndarray,
     candidates: Sequence[ModelCandidate],
 ) -> int:
     """Return the simplest of the candidates that are about as good as the best one.
 
-    The second comparison is between candidates with equally many parameters.
+    The squared errors are those of candidates on parts [candidates, parts]. The second
+    comparison is between candidates with equally many parameters.
     """
     sizes = np.array([c.base.size for c in candidates])
     lacks_memory = np.array([c.base.model.memory is None for c in candidates])

@@ -14,6 +14,9 @@ from jaxid.dynamics.model import Model
 from jaxid.dynamics.terms import AbstractTerm, NonlinearParameter
 from jaxid.errors import InputError
 
+ShapeValues = Float[AnyArray, " shapes"]
+"""Values of the shapes, kind by kind, and joint by joint within each kind."""
+
 
 class ShapeKind(NamedTuple):
     """A shape of one term; it has one value for each joint."""
@@ -58,7 +61,7 @@ class Shapes(eqx.Module):
         return np.flatnonzero(np.isin(owners, self.terms)).tolist()
 
     @property
-    def values(self) -> Float[np.ndarray, " shapes"]:
+    def values(self) -> np.ndarray:
         """Shapes of the model.
 
         Raises:
@@ -76,9 +79,7 @@ class Shapes(eqx.Module):
             )
         return values
 
-    def terms_with(
-        self, values: Float[AnyArray, " shapes"]
-    ) -> tuple[AbstractTerm, ...]:
+    def terms_with(self, values: ShapeValues) -> tuple[AbstractTerm, ...]:
         """Return the terms of the model with other shapes."""
         terms = list(self.model.terms)
         rows = values.reshape(len(self.kinds), -1)
@@ -86,9 +87,7 @@ class Shapes(eqx.Module):
             terms[term] = eqx.tree_at(shape.value, terms[term], row)
         return tuple(terms)
 
-    def set(
-        self, base: BaseParameters, values: Float[AnyArray, " shapes"]
-    ) -> BaseParameters:
+    def set(self, base: BaseParameters, values: ShapeValues) -> BaseParameters:
         """Return the same base parameters of the model with other shapes."""
         return eqx.tree_at(lambda b: b.model.terms, base, self.terms_with(values))
 

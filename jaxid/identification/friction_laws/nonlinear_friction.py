@@ -21,7 +21,7 @@ from ..fit_result import Fit
 from ..identify import fit_problem
 from ..problem import RegressionProblem, cross_validation_folds
 from ..uncertainty import Uncertainty
-from .friction_shapes import Shapes, select_shapes
+from .friction_shapes import Shapes, ShapeValues, select_shapes
 from .variable_projection import MAX_STEPS, ShapeSearch
 
 MIN_GAIN = 0.01
@@ -82,13 +82,13 @@ class NonlinearFit(eqx.Module):
     fit: Fit
     names: tuple[str, ...] = eqx.field(static=True)
     units: tuple[str, ...] = eqx.field(static=True)
-    shapes: Float[AnyArray, " shapes"]
+    shapes: ShapeValues
     shape_covariance: Float[AnyArray, "shapes shapes"]
     linear: Fit
     held_out: HeldOutErrors
 
     @property
-    def shape_deviations(self) -> Float[np.ndarray, " shapes"]:
+    def shape_deviations(self) -> np.ndarray:
         """Standard deviations of the shapes; infinite where nothing is known."""
         return np.sqrt(np.diag(self.shape_covariance))
 
@@ -245,7 +245,7 @@ class ShapeSlopes(AbstractTerm):
     """Forces of small changes of shapes: the linearised problem is ordinary."""
 
     shapes: Shapes  # shapes that change, at which forces are linearised
-    x: Float[AnyArray, " shapes"]  # their values
+    x: ShapeValues  # their values
     p: Float[AnyArray, " standard"]  # standard parameters of the terms that have shapes
 
     def parameters(self, robot):
