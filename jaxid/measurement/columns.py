@@ -101,27 +101,29 @@ class Columns:
         self._require(
             "torque_constants", lambda c: c != 0 and np.isfinite(c), "finite, not zero"
         )
-        current = any(u.quantity is Quantity.CURRENT for u in _units(self.force_unit))
-        if current != (self.torque_constants is not None):
+        quantities = [unit.quantity for unit in _units(self.force_unit)]
+        has_currents = Quantity.CURRENT in quantities
+        if has_currents != (self.torque_constants is not None):
             raise InputError(
                 "`torque_constants` [N m/A] are needed if `force_unit` is a current, "
                 "and only then."
             )
 
     def _require_unit(self, name: str, *allowed: Quantity) -> None:
-        for one in _units(getattr(self, name)):
-            if one.quantity not in allowed:
+        words = " or ".join(quantity.value for quantity in allowed)
+        for unit in _units(getattr(self, name)):
+            if unit.quantity not in allowed:
                 raise InputError(
-                    f"`{name}` must measure {' or '.join(q.value for q in allowed)}, "
-                    f"but `{one.symbol}` measures {one.quantity.value}."
+                    f"`{name}` must measure {words}, but `{unit.symbol}` measures "
+                    f"{unit.quantity.value}."
                 )
 
     def _require(self, name: str, rule: Callable[[float], Any], words: str) -> None:
         values = getattr(self, name) or ()
         if not all(map(rule, values)):
-            shown = ", ".join(f"{x:g}" for x in values)
+            numbers = ", ".join(f"{x:g}" for x in values)
             raise InputError(
-                f"`{name}` must be {words} for each joint, but is {shown}."
+                f"`{name}` must be {words} for each joint, but is {numbers}."
             )
 
     def to_si(

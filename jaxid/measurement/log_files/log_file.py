@@ -106,13 +106,13 @@ class AbstractLogFile(abc.ABC):
             return (self._name(channel, pattern.replace("{}", "1")),)
         numbers = [number for number, _ in columns]
         names = [name for _, name in columns]
-        first = min(numbers[0], 1)
-        last = first + len(numbers) - 1
-        if numbers != list(range(first, last + 1)):
+        first_number = min(numbers[0], 1)
+        last_number = first_number + len(numbers) - 1
+        if numbers != list(range(first_number, last_number + 1)):
             raise InputError(
                 f"the columns of `{self.path.name}` for `{channel}`, "
-                f"`{'`, `'.join(names[:20])}`, must have the numbers from {first} to "
-                f"{last}: name each."
+                f"`{'`, `'.join(names[:20])}`, must have the numbers from "
+                f"{first_number} to {last_number}: name each."
             )
         return tuple(names)
 
