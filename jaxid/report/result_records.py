@@ -134,6 +134,7 @@ def _error_record(errors: TorqueErrors, robot: Robot) -> Record:
     rows = table_rows(
         name=robot.joint_names,
         unit=[robot.force_unit(j) for j in range(robot.joints)],
+        rows=np.asarray(errors.counted).sum(axis=0),
         mean=errors.mean,
         rms=errors.rms,
         mean_percent=errors.mean_percent,
