@@ -356,9 +356,7 @@ def test_what_was_not_checked_is_said_first_and_ends_in_a_code(tmp_path, run):
     assert "`force_margin`: in every one of" in err
 
 
-def test_limits_forces_by_nominal_parameters_and_adds_to_earlier_motions(
-    designed, run, no_pictures, monkeypatch
-):
+def test_limits_forces_by_nominal_parameters(designed, run, no_pictures, monkeypatch):
     written = designed
     for (
         name,

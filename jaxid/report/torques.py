@@ -23,8 +23,6 @@ from .figure_elements import (
     Panel,
 )
 
-MAX_JOINTS_IN_TWO_COLUMNS = 16
-"""Largest number of joints whose panels stand in two columns; more stand in three."""
 MAX_BARS_WITH_NUMBERS = 20
 """Largest number of bars on which their values are written."""
 GROUP_COLOURS = (BLUE, ORANGE, GREEN, PURPLE)
@@ -56,18 +54,13 @@ def torque_figure(
     rows = np.flatnonzero(np.asarray(errors.counted).any(axis=1))
     window = slice(rows[0], rows[-1] + 1)
     panels = [_joint_panel(errors, robot, j, window) for j in joints]
-    columns = 3
-    if len(panels) <= 2:
-        columns = 1
-    elif len(panels) <= MAX_JOINTS_IN_TWO_COLUMNS:
-        columns = 2
+    columns = 2 if len(panels) > 2 else 1
     name = shortened(errors.name if title is None else title, 40)
     return Figure(
         f"{name}: relative error {percent(errors.relative)} %",
         panels,
         columns,
         height=2.6,
-        width=15.0 if columns == 3 else 11.0,
     )
 
 
