@@ -23,7 +23,6 @@ jax.config.update("jax_enable_x64", DOUBLE)
 from virtual import observations, standard_parameters
 
 import jaxid as jid
-from jaxid.trajectory.fourier import fourier_series
 from jaxid.validation.torque_errors import validate
 
 URDF = """<robot name="r"><link name="a"/><link name="b"/><link name="c"/>
@@ -111,7 +110,8 @@ def angles_along_path():
 
 def written_motion():
     a = np.array([[0.1, 0.2], [0.3, -0.1]])
-    series = fourier_series(np.array([0.3, 0.1]), a, a[::-1], 1.1)
+    coefficients = np.column_stack([[0.3, 0.1], a, a[::-1]])
+    series = jid.trajectories.FourierBasis(2, 1.1).trajectory(coefficients)
     jid.trajectories.save_trajectory(series, FOLDER / "motion.json")
     found = jid.trajectories.load_trajectory(FOLDER / "motion.json")
     return found.motion(np.linspace(0.0, 1.0, 5)).qdd

@@ -11,10 +11,10 @@ from jaxid.arrays import AnyArray, Float
 from .coefficient_limits import Grid, ScaledMotion, ScaledMotions
 from .problem import MAX_COARSE_EXCESS, ExcitationProblem
 
+PerStart = Float[AnyArray, " starts"]
+"""One number for each start of a search."""
 EXCESS_PENALTY = 3.0
 """Penalty of a relative excess, added to the criterion's logarithm."""
-MAX_GROWTH = 1.05
-"""Factor by which a motion is enlarged to fill its limits."""
 SLIGHT_SHRINKAGES = (0.9995, 0.998, 0.995, 0.99, 0.98, 0.96, 0.93, 0.9)
 """Factors by which a motion is made smaller that exceeds its constraints a little."""
 SHRINKAGE_STEP = 0.05
@@ -27,12 +27,12 @@ class Candidates(NamedTuple):
     """The best motion of each start so far, within the limits of the joints."""
 
     x: ScaledMotions  # scaled coefficients
-    value: Float[AnyArray, " starts"]  # logarithm of the criterion, exact
+    value: PerStart  # logarithm of the criterion, exact
     # relative excess of the worst constraint; not positive where all are kept
-    excess: Float[AnyArray, " starts"]
+    excess: PerStart
 
     @property
-    def violation(self) -> Float[np.ndarray, " starts"]:
+    def violation(self) -> PerStart:
         """Excess where a constraint is not kept; zero elsewhere."""
         return np.maximum(np.asarray(self.excess), 0.0)
 
@@ -88,9 +88,7 @@ class Candidates(NamedTuple):
         return ordered.at(duplicates_last[: len(self.value)])
 
 
-def criterion_values(
-    problem: ExcitationProblem, x: ScaledMotions
-) -> Float[np.ndarray, " starts"]:
+def criterion_values(problem: ExcitationProblem, x: ScaledMotions) -> PerStart:
     """Return the exact logarithms of the criterion."""
     values = []
     for motion in x:
@@ -112,29 +110,20 @@ def evaluate(problem: ExcitationProblem, x: ScaledMotions) -> Candidates:
 def evaluate_within_limits(problem: ExcitationProblem, x: ScaledMotions) -> Candidates:
     """Return motions that are made to keep the limits of the joints for all times.
 
-    Where they almost keep the other constraints, they are made smaller until they do;
-    without constraints they fill their limits where that is better.
+    Where they almost keep the other constraints, they are made smaller until they do.
     """
-
-    def evaluate_scaled(growth: float) -> Candidates:
-        motions = []
-        for motion in x:
-            scaled_motion = grid.scale_into_limits(motion, growth=growth)
-            motions.append(_shrink_slightly(problem, grid, scaled_motion))
-        return evaluate(problem, np.array(motions))
-
     grid = problem.limits.grid()
-    candidates = evaluate_scaled(1.0)
-    if problem.constraints:
-        return candidates
-    # A larger motion mostly has more information, but a condition number may well
-    # become worse by it.
-    larger_motions = evaluate_scaled(MAX_GROWTH)
-    return candidates.improved(np.arange(len(x)), larger_motions)
+    motions = []
+    for motion in x:
+        scaled_motion = grid.scale_into_limits(motion)
+        motions.append(_shrink_slightly(problem, grid, scaled_motion))
+    return evaluate(problem, np.array(motions))
 
 
 def _shrink_slightly(
-    problem: ExcitationProblem, grid: Grid, motion: np.ndarray
+    problem: ExcitationProblem,
+    grid: Grid,
+    motion: np.ndarray,
 ) -> np.ndarray:
     """Return a smaller motion that keeps constraints which are exceeded a little."""
     if not 0.0 < problem.excess(motion) <= MAX_COARSE_EXCESS:

@@ -14,13 +14,17 @@ import numpy as np
 from jaxid.arrays import AnyArray, Float, PRNGKeyArray, namespace
 from jaxid.errors import InputError
 from jaxid.robot.limits_and_drives import Limits
-from jaxid.robot.robot import Robot
-from jaxid.trajectory.fourier import complete_limits
-from jaxid.trajectory.trajectory import AbstractBasis
+from jaxid.robot.robot import Robot, complete_limits
+from jaxid.trajectory.trajectory import AbstractBasis, Coefficients
 
 ScaledMotion = Float[AnyArray, " scaled"]
 """Scaled coefficients of a motion, joint by joint."""
 ScaledMotions = Float[np.ndarray, "starts scaled"]
+"""Scaled coefficients of several motions."""
+PerJoint = np.ndarray
+"""One number for each joint."""
+RowValues = Float[AnyArray, "joints rows"]
+"""Rows of the limits of each joint, for a motion."""
 
 FILLED_FRACTION = 0.95
 """Fraction of its limits that a motion of full size uses."""
@@ -29,57 +33,52 @@ FILLED_FRACTION = 0.95
 class Extent(NamedTuple):
     """Positions of a motion, and the use of the limits about their means."""
 
-    positions: Float[np.ndarray, "joints positions"]
-    use: Float[np.ndarray, " joints"]
+    positions: np.ndarray  # of each joint
+    use: PerJoint
 
 
 class Grid(NamedTuple):
     """Limits of all joints on a grid of times."""
 
     # rows by scaled coefficients: of each joint first positions, then higher orders
-    R: Float[np.ndarray, "joints rows variables"]
+    R: np.ndarray
     # centres of the ranges, for positions; zero for the rest
-    c: Float[np.ndarray, "joints rows"]
+    c: np.ndarray
     # rows of positions, velocities, accelerations, and jerks if these are limited
     kinds: tuple[range, ...]
     bound: float  # bound of |R y - c| with which the limits hold at all times
     # scaled coefficients of a constant motion at half of each joint's range
-    constant: Float[np.ndarray, "joints variables"]
+    constant: np.ndarray
 
-    def rows(self, y: ScaledMotion) -> Float[AnyArray, "joints rows"]:
+    def rows(self, y: ScaledMotion) -> RowValues:
         """Return the rows of a motion, R y, in NumPy or JAX."""
-        by_joint = y.reshape(np.shape(self.constant))
+        by_joint = y.reshape(self.constant.shape)
         return namespace(y).einsum("jrk,jk->jr", self.R, by_joint)
 
-    def use(self, y: ScaledMotion) -> Float[AnyArray, "joints rows"]:
+    def use(self, y: ScaledMotion) -> RowValues:
         """Return the used fractions of the limits, with the sign of the direction."""
         return (self.rows(y) - self.c) / self.bound
 
     def scale_into_limits(
-        self, y: ScaledMotion, bound: float | None = None, growth: float = 1.0
+        self,
+        y: ScaledMotion,
+        bound: float | None = None,
     ) -> np.ndarray:
         """Return the nearest motion of the same shape that keeps |R y - c| <= bound.
 
-        Each joint's motion is scaled about its mean, where limits leave room by up to
-        `growth`, then shifted into its range.
+        Each joint's motion is scaled about its mean, then shifted into its range.
         """
         bound = self.bound if bound is None else bound
-        positions, use = self._measure(y)
-        factors = np.minimum(growth, bound / np.maximum(use, 1e-12))
-        low, high = self._shift_range(positions, factors, bound)
-        shifts = (1.0 - factors) * positions.mean(axis=1)
-        shifts = np.clip(shifts, low, np.maximum(low, high))
-        return self._move(y, factors, shifts)
+        extent = self._measure(y)
+        factors = np.minimum(1.0, bound / np.maximum(extent.use, 1e-12))
+        return self._scale(y, extent.positions, factors, bound)
 
     def shrink(self, y: ScaledMotion, factor: float) -> np.ndarray:
         """Return a smaller motion, each joint's about its mean position."""
-        positions, use = self._measure(y)
-        shifts = (1.0 - factor) * positions.mean(axis=1)
-        return self._move(y, np.full(use.shape, factor), shifts)
+        positions = self._measure(y).positions
+        return self._scale(y, positions, np.full(len(positions), factor), np.inf)
 
-    def fill(
-        self, y: ScaledMotion, places: Float[AnyArray, " joints"], size: float
-    ) -> np.ndarray:
+    def fill(self, y: ScaledMotion, places: PerJoint, size: float) -> np.ndarray:
         """Return a motion of the same shape that fills a fraction of all limits.
 
         Args:
@@ -92,8 +91,7 @@ class Grid(NamedTuple):
         positions, use = self._measure(y)
         factors = size * bound / use
         low, high = self._shift_range(positions, factors, bound)
-        shifts = low + (high - low) * np.asarray(places)
-        return self._move(y, factors, shifts)
+        return self._move(y, factors, low + (high - low) * np.asarray(places))
 
     def _measure(self, y: ScaledMotion) -> Extent:
         """Return the positions, and the largest use of a limit by each joint."""
@@ -102,22 +100,35 @@ class Grid(NamedTuple):
         half_swing = 0.5 * np.ptp(positions, axis=1)
         return Extent(positions, np.maximum(np.abs(rates).max(axis=1), half_swing))
 
+    def _scale(
+        self,
+        y: ScaledMotion,
+        positions: np.ndarray,
+        factors: PerJoint,
+        bound: float,
+    ) -> np.ndarray:
+        """Return the motion scaled about its means, then shifted into the ranges."""
+        low, high = self._shift_range(positions, factors, bound)
+        shifts = (1.0 - factors) * positions.mean(axis=1)
+        return self._move(y, factors, np.clip(shifts, low, np.maximum(low, high)))
+
     def _shift_range(
-        self, positions: np.ndarray, factors: np.ndarray, bound: float
-    ) -> tuple[np.ndarray, np.ndarray]:
+        self,
+        positions: np.ndarray,
+        factors: PerJoint,
+        bound: float,
+    ) -> tuple[PerJoint, PerJoint]:
         """Return the shifts between which scaled positions keep their range."""
         centre = self.c[:, 0]
         low = centre - bound - factors * positions.min(axis=1)
         high = centre + bound - factors * positions.max(axis=1)
         return low, high
 
-    def _move(
-        self, y: ScaledMotion, factors: np.ndarray, shifts: np.ndarray
-    ) -> np.ndarray:
+    def _move(self, y: ScaledMotion, factors: PerJoint, shifts: PerJoint) -> np.ndarray:
         """Return the motion of each joint times a factor, and shifted."""
-        motion = np.asarray(y).reshape(np.shape(self.constant))
-        motion = factors[:, None] * motion + shifts[:, None] * self.constant
-        return motion.reshape(-1)
+        motion = np.asarray(y).reshape(self.constant.shape)
+        moved_motion = factors[:, None] * motion + shifts[:, None] * self.constant
+        return moved_motion.reshape(-1)
 
 
 class JointLimits(eqx.Module):
@@ -142,12 +153,15 @@ class JointLimits(eqx.Module):
 
     basis: AbstractBasis
     limits: Limits
-    scale: Float[AnyArray, "joints variables"]
-    constant: Float[AnyArray, "joints variables"]
+    scale: Coefficients
+    constant: Coefficients
     assumed: tuple[tuple[str, int], ...] = eqx.field(static=True)
 
     def __init__(
-        self, robot: Robot, basis: AbstractBasis, limits: Limits | None = None
+        self,
+        robot: Robot,
+        basis: AbstractBasis,
+        limits: Limits | None = None,
     ):
         limits = robot.limits if limits is None else limits
         self.basis = basis
@@ -178,22 +192,19 @@ class JointLimits(eqx.Module):
         return joints, variables
 
     @property
-    def _sizes(self) -> Float[np.ndarray, "4 joints"]:
+    def _sizes(self) -> np.ndarray:
         """Half ranges, speeds, accelerations and jerks."""
         limits = self.limits
-        low = np.asarray(limits.position_min)
-        half = 0.5 * (np.asarray(limits.position_max) - low)
+        half = 0.5 * (limits.position_max - limits.position_min)
         sizes = [half, limits.velocity, limits.acceleration, limits.jerk]
         return np.array(sizes, np.float64)
 
-    def coefficients(
-        self, y: Float[AnyArray, "*batch scaled"]
-    ) -> Float[AnyArray, "*batch joints variables"]:
+    def coefficients(self, y: Float[AnyArray, "*batch scaled"]) -> AnyArray:
         """Return the coefficients of trajectories from scaled ones."""
         scale = np.asarray(self.scale)[(None,) * (y.ndim - 1)]
         return y.reshape((*y.shape[:-1], *self.shape)) * scale
 
-    def scaled(self, x: Float[AnyArray, "joints variables"]) -> np.ndarray:
+    def scaled(self, x: Coefficients) -> np.ndarray:
         """Return the scaled coefficients of a trajectory."""
         return (np.asarray(x) / np.asarray(self.scale)).ravel()
 
@@ -205,24 +216,20 @@ class JointLimits(eqx.Module):
         orders = 4 if np.isfinite(sizes[3]).any() else 3
         parts = []
         kinds = []
-        count = 0
-        for order in range(orders):
-            part = scale * envelope[order][None] / sizes[order][:, None, None]
-            parts.append(part)
-            kinds.append(range(count, count + part.shape[1]))
-            count += part.shape[1]
+        start = 0
+        for rows, size in zip(envelope[:orders], sizes[:orders], strict=True):
+            parts.append(scale * rows[None] / size[:, None, None])
+            kinds.append(range(start, start + len(rows)))
+            start += len(rows)
 
-        low = np.asarray(self.limits.position_min)
-        centre = 0.5 * (low + np.asarray(self.limits.position_max)) / sizes[0]
-        centres = np.zeros((len(centre), count))
-        centres[:, kinds[0]] = centre[:, None]
+        middle = 0.5 * (self.limits.position_min + self.limits.position_max)
+        centres = np.zeros((len(middle), start))
+        centres[:, kinds[0]] = (middle / sizes[0])[:, None]
         R = np.concatenate(parts, axis=1)
         return Grid(R, centres, tuple(kinds), 1 / factor, np.asarray(self.constant))
 
-    def use(
-        self, x: Float[AnyArray, "joints variables"]
-    ) -> Float[np.ndarray, "4 joints"]:
-        """Return the largest used fraction of each limit, for all times.
+    def use(self, x: Coefficients) -> np.ndarray:
+        """Return the largest used fraction of each limit, for all times [4 joints].
 
         The used fraction of a range is the distance from its middle, over half of the
         range.
@@ -234,17 +241,15 @@ class JointLimits(eqx.Module):
             use[order] = rows[:, kind].max(axis=1)
         return use
 
-    def random(
-        self, key: PRNGKeyArray, count: int, size: float = 1.0
-    ) -> Float[np.ndarray, "count scaled"]:
-        """Draw motions of random shapes, of a size relative to 95 % of the limits."""
+    def random(self, key: PRNGKeyArray, count: int) -> ScaledMotions:
+        """Draw motions of random shapes that use 95 % of the limits."""
         joints, variables = self.shape
         shape_key, place_key = jax.random.split(key)
         shapes = jax.random.normal(shape_key, (count, joints * variables), float)
         places = jax.random.uniform(place_key, (count, joints), float)
-        fill = self.grid().fill
+        grid = self.grid()
         pairs = zip(np.asarray(shapes), np.asarray(places), strict=True)
-        return np.array([fill(shape, place, size) for shape, place in pairs])
+        return np.array([grid.fill(shape, place, 1.0) for shape, place in pairs])
 
 
 def _unknown_limits(limits: Limits) -> tuple[tuple[str, int], ...]:

@@ -5,10 +5,10 @@ A search asks for these thousands of times, of few samples.
 
 import numpy as np
 
-from jaxid.arrays import Float
 from jaxid.program.gradient import pull_back
 
 from .coefficient_limits import ScaledMotions
+from .criteria.information_matrix import gram_matrices
 from .problem import ExcitationProblem
 
 
@@ -17,7 +17,7 @@ def value_and_gradient(
     x: ScaledMotions,
     sharpness: float | None,
     samples: int,
-) -> tuple[Float[np.ndarray, " starts"], ScaledMotions]:
+) -> tuple[np.ndarray, ScaledMotions]:
     """Return the logarithms of the criterion and their derivatives by each motion.
 
     Motions are evaluated at `samples`, which stand for all that will be measured.
@@ -29,9 +29,12 @@ def value_and_gradient(
     columns = [np.swapaxes(each, 0, 1) for each in regressor.in_numpy(*motion)]
     weight = problem.samples / samples
 
-    plain, weighted = _information(problem, columns, weight)
+    plain, weighted = gram_matrices(regressor, columns, problem.weights)
     values, by_plain, by_weighted = _criterion_and_slopes(
-        problem, plain, weighted, sharpness
+        problem,
+        weight * plain,
+        weight * weighted + problem.prior,
+        sharpness,
     )
     by_columns = _slopes_by_columns(problem, columns, weight, by_plain, by_weighted)
     packed_slopes = by_columns.reshape(-1, *by_columns.shape[2:])
@@ -42,23 +45,6 @@ def value_and_gradient(
         by_coefficients += np.einsum("jbs,sk->bjk", slopes, part)
     gradient = by_coefficients * np.asarray(problem.limits.scale)
     return values, gradient.reshape(x.shape)
-
-
-def _information(
-    problem: ExcitationProblem, columns: list[np.ndarray], weight: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return plain and weighted information from the regressor's columns."""
-    shape = (columns[0].shape[0], problem.base.size, problem.base.size)
-    plain = np.zeros(shape)
-    weighted = np.zeros(shape)
-    numbers_by_joint = problem.regressor.columns
-    for joint, each in enumerate(columns):
-        numbers = numbers_by_joint[joint]
-        place = np.ix_(numbers, numbers)
-        gram = weight * (each @ np.swapaxes(each, 1, 2))
-        plain[:, *place] += gram
-        weighted[:, *place] += problem.weights[joint] ** 2 * gram
-    return plain, weighted + problem.prior
 
 
 def _criterion_and_slopes(
@@ -85,8 +71,8 @@ def _slopes_by_columns(
     weight: float,
     by_plain: np.ndarray,
     by_weighted: np.ndarray,
-) -> Float[np.ndarray, "joints base starts samples"]:
-    """Return derivatives by the entries of the regressor."""
+) -> np.ndarray:
+    """Return derivatives by the regressor's entries [joints, base, starts, samples]."""
     starts, _, samples = columns[0].shape
     slopes = np.zeros((len(columns), problem.base.size, starts, samples))
     numbers_by_joint = problem.regressor.columns

@@ -214,7 +214,9 @@ class Outcome(NamedTuple):
 
 
 def _run_solver(
-    problem: ExcitationProblem, x: ScaledMotions, solver: Solver
+    problem: ExcitationProblem,
+    x: ScaledMotions,
+    solver: Solver,
 ) -> Outcome:
     """Improve motions by a solver, then make them keep the limits of the joints."""
     candidates = evaluate_within_limits(problem, np.asarray(solver(problem, x)))
@@ -255,7 +257,11 @@ def _run_search(
                 value = candidates.best_value
                 progress(
                     DesignProgress(
-                        fraction, step.task, value, candidates.is_feasible, trajectory
+                        fraction,
+                        step.task,
+                        value,
+                        candidates.is_feasible,
+                        trajectory,
                     )
                 )
             if elapsed_time > duration and candidates.is_feasible:

@@ -143,7 +143,7 @@ class ExcitationPlan(Summarised, eqx.Module):
         return float(np.exp(np.mean(np.log(gains[is_determined]))))
 
     @property
-    def use(self) -> Float[np.ndarray, "4 joints"]:
+    def use(self) -> np.ndarray:
         """Used fraction of the limits of position, speed, acceleration and jerk."""
         return self.limits.use(self.trajectory.coefficients)
 

@@ -20,7 +20,7 @@ import scipy.linalg
 
 from jaxid.arrays import Float
 
-from .coefficient_limits import Grid
+from .coefficient_limits import Grid, ScaledMotions
 
 INITIAL_CURVATURE = 0.3  # small, so that first steps are large
 TO_BOUNDARY = 0.995  # fraction of the way to the next limit that a step may go
@@ -46,7 +46,7 @@ class Evaluation(NamedTuple):
     value: float
     gradient: ScaledVector
     excess: ConstraintVector
-    slopes: Float[np.ndarray, "constraints scaled"]
+    slopes: np.ndarray  # of the constraints, by the scaled coefficients
 
 
 Inequalities = Float[np.ndarray, " inequalities"]
@@ -60,7 +60,7 @@ are any.
 class Parts(NamedTuple):
     """The numbers of inequalities by their kinds."""
 
-    limits: Float[np.ndarray, " limits"]
+    limits: np.ndarray
     constraints: ConstraintVector
     slack: SlackVector
 
@@ -72,7 +72,7 @@ class Iterate(NamedTuple):
     slack: SlackVector
     evaluation: Evaluation
     duals: Inequalities  # multipliers
-    curvature: Float[np.ndarray, "scaled scaled"]  # of the Lagrangian
+    curvature: np.ndarray  # of the Lagrangian
     barrier: float  # weight of the logarithmic barrier
     step: StepVector
     dual_step: Inequalities
@@ -99,9 +99,7 @@ class Stage(NamedTuple):
     penalty: float = 10.0  # penalty of the slack by which constraints are exceeded
 
 
-def begin(
-    grid: Grid, y: Float[np.ndarray, "starts scaled"], constraints: int = 0
-) -> list[Iterate]:
+def begin(grid: Grid, y: ScaledMotions, constraints: int = 0) -> list[Iterate]:
     """Return the iterates of some starts before the first stage."""
     size = np.shape(y)[1]
     slack = np.zeros(1 if constraints else 0)
@@ -170,7 +168,10 @@ def _begin_stage(grid: Grid, stage: Stage, iterate: Iterate) -> Iterate:
 
 
 def _update(
-    grid: Grid, stage: Stage, iterate: Iterate, evaluation: Evaluation
+    grid: Grid,
+    stage: Stage,
+    iterate: Iterate,
+    evaluation: Evaluation,
 ) -> Iterate:
     """Take the step of one start, or shorten it."""
     slack = _cheapest_slack(stage, iterate, evaluation.excess)
@@ -260,7 +261,10 @@ def _take_step(
 
 
 def _with_step(
-    grid: Grid, stage: Stage, iterate: Iterate, room: Inequalities
+    grid: Grid,
+    stage: Stage,
+    iterate: Iterate,
+    room: Inequalities,
 ) -> Iterate:
     """Return one start with the step to the barrier's minimum and its length."""
     stiffness = iterate.duals / room
@@ -279,8 +283,10 @@ def _with_step(
 
 
 def _barrier_hessian(
-    grid: Grid, iterate: Iterate, stiffness: Inequalities
-) -> Float[np.ndarray, "scaled_and_slack scaled_and_slack"]:
+    grid: Grid,
+    iterate: Iterate,
+    stiffness: Inequalities,
+) -> np.ndarray:
     """Return the curvature of the objective with its barrier."""
     slopes = iterate.evaluation.slopes
     size = len(iterate.y)
@@ -313,7 +319,10 @@ def _add_limits(H: np.ndarray, grid: Grid, stiffness: np.ndarray) -> None:
 
 
 def _downhill(
-    grid: Grid, stage: Stage, iterate: Iterate, central: Inequalities
+    grid: Grid,
+    stage: Stage,
+    iterate: Iterate,
+    central: Inequalities,
 ) -> StepVector:
     """Return the negative gradient of the objective with its barrier."""
     evaluation = iterate.evaluation
@@ -339,7 +348,9 @@ def _solve(H: np.ndarray, downhill: np.ndarray) -> np.ndarray:
 
 
 def _change_of_inequalities(
-    grid: Grid, iterate: Iterate, step: np.ndarray
+    grid: Grid,
+    iterate: Iterate,
+    step: np.ndarray,
 ) -> Inequalities:
     """Return by how much a step reduces the distance from each bound."""
     size = len(iterate.y)
@@ -357,7 +368,11 @@ def _limit_room(grid: Grid, stage: Stage, y: np.ndarray) -> np.ndarray:
 
 
 def _room(
-    grid: Grid, stage: Stage, y: np.ndarray, evaluation: Evaluation, slack: np.ndarray
+    grid: Grid,
+    stage: Stage,
+    y: np.ndarray,
+    evaluation: Evaluation,
+    slack: np.ndarray,
 ) -> Inequalities:
     """Return the distances from all bounds."""
     limit_room = _limit_room(grid, stage, y)
@@ -399,7 +414,9 @@ def _damped_bfgs(B: np.ndarray, s: np.ndarray, change: np.ndarray) -> np.ndarray
 
 
 def _cheapest_slack(
-    stage: Stage, iterate: Iterate, excess: ConstraintVector
+    stage: Stage,
+    iterate: Iterate,
+    excess: ConstraintVector,
 ) -> SlackVector:
     """Return the slack of least cost, the barrier included.
 

@@ -29,7 +29,7 @@ from .criteria.functions_of_eigenvalues import Scalar, Sharpness
 from .criteria.information_matrix import (
     BaseMatrix,
     JointVector,
-    information_of_coefficients,
+    gram_matrices,
 )
 
 CHECKED_INSTANTS = 8160
@@ -133,7 +133,7 @@ class ExcitationProblem:
         self.sizes = np.ones(base.size)
         self.sizes = self._typical_sizes()
 
-    def _typical_sizes(self) -> Float[np.ndarray, " base"]:
+    def _typical_sizes(self) -> np.ndarray:
         """Return each parameter's deviation if it were the only one."""
         motions = self.limits.random(jax.random.key(0), 8)
         weighted = [self.information(x).weighted for x in motions]
@@ -167,20 +167,27 @@ class ExcitationProblem:
             samples: Number of evaluated samples, which stand for all measured ones; all
                 of them if None.
         """
-        batch = information_of_coefficients(
-            self.base,
-            self.basis,
-            self.limits.coefficients(jnp.asarray(x))[None],
-            samples=self.samples if samples is None else samples,
-            measured=self.samples,
-            weights=self.weights,
-            prior=self.prior,
-            sizes=self.sizes,
+        samples = self.samples if samples is None else samples
+        coefficients = self.limits.coefficients(jnp.asarray(x))[None]
+        motion = [
+            jnp.einsum("sk,bjk->jbs", part, coefficients)
+            for part in self.sample_rows(samples)
+        ]
+        columns = self.regressor(*motion)
+        plain, weighted = gram_matrices(self.regressor, columns, self.weights)
+        # The samples stand for all that are measured.
+        weight = self.samples / samples
+        return self._criterion_of(
+            weight * plain[0],
+            weight * weighted[0] + self.prior,
+            sharpness,
         )
-        return self._criterion_of(batch.plain[0], batch.weighted[0], sharpness)
 
     def _criterion_of(
-        self, plain: Array, weighted: Array, sharpness: Sharpness
+        self,
+        plain: Array,
+        weighted: Array,
+        sharpness: Sharpness,
     ) -> Scalar:
         """Return the logarithm of the criterion of one motion's information."""
         return self.criterion(Information(plain, weighted, self.sizes), sharpness)
@@ -214,7 +221,9 @@ class ExcitationProblem:
         return violation
 
     def constraint_values(
-        self, x: ScaledMotion, instants: Any = slice(None)
+        self,
+        x: ScaledMotion,
+        instants: Any = slice(None),
     ) -> list[Float[AnyArray, "instants values"]]:
         """Return the values of each constraint at some of the checked instants.
 
@@ -228,7 +237,7 @@ class ExcitationProblem:
         )
         return [constraint(self.robot, motion) for constraint in self.constraints]
 
-    def sample_rows(self, samples: int) -> Float[np.ndarray, "3 samples variables"]:
+    def sample_rows(self, samples: int) -> np.ndarray:
         """Return the rows of the basis, up to accelerations, at samples of a run."""
         if samples not in self._sample_rows:
             times = self.basis.times(samples)
@@ -267,15 +276,13 @@ class ExcitationProblem:
         return findings
 
 
-def assumed_noise(robot: Robot) -> Float[np.ndarray, " joints"]:
+def assumed_noise(robot: Robot) -> np.ndarray:
     """Return the assumed standard deviations of the forces' noise [N m or N]."""
     return 0.01 * np.asarray(robot.max_forces)
 
 
-def highest_values(
-    values: Float[AnyArray, "instants values"],
-) -> Float[AnyArray, " values"]:
-    """Return the highest values, also between instants: tops of parabolas."""
+def highest_values(values: AnyArray) -> AnyArray:
+    """Return the highest of the values at instants, also between: tops of parabolas."""
     xp = namespace(values)
     previous_values = values[:-2]
     middle_values = values[1:-1]

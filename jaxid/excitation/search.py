@@ -14,7 +14,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxid.arrays import Float
 from jaxid.dynamics.motion import Motion
 
 from . import interior_point
@@ -136,12 +135,19 @@ def search(
     for places in batches:
         if len(places) and time.monotonic() < deadline:
             candidates = yield from _improve_batch(
-                problem, x, candidates, places, deadline
+                problem,
+                x,
+                candidates,
+                places,
+                deadline,
             )
     for _ in range(generations):
         if time.monotonic() < deadline:
             candidates = yield from _improve_children(
-                problem, candidates, random, deadline
+                problem,
+                candidates,
+                random,
+                deadline,
             )
 
     order = candidates.promising()
@@ -151,14 +157,20 @@ def search(
         step = Step("keeping the limits closely", candidates)
         iterates = _begin(problem, FINE_SAMPLES, candidates.x[places])
         iterates = yield from _improve(
-            problem, FINE_SAMPLES, iterates, FINE_STAGE, step
+            problem,
+            FINE_SAMPLES,
+            iterates,
+            FINE_STAGE,
+            step,
         )
         candidates = _take(problem, candidates, places, iterates)
     yield Step("keeping the limits closely", candidates)
 
 
 def _find_feasible_motion(
-    problem: ExcitationProblem, x: np.ndarray, candidates: Candidates
+    problem: ExcitationProblem,
+    x: np.ndarray,
+    candidates: Candidates,
 ) -> Search:
     """Look for a motion that keeps all constraints; return it as the first start."""
     for motion in x[1:]:
@@ -183,7 +195,12 @@ def _improve_batch(
     for stage in schedule_of(problem):
         step = Step("searching from many starts", candidates)
         iterates = yield from _improve(
-            problem, SEARCH_SAMPLES, iterates, stage, step, deadline
+            problem,
+            SEARCH_SAMPLES,
+            iterates,
+            stage,
+            step,
+            deadline,
         )
         if stage.bound < 1.0:
             candidates = _take(problem, candidates, places, iterates)
@@ -205,7 +222,12 @@ def _improve_children(
     for start in range(0, len(children), BATCH):
         iterates = _begin(problem, SEARCH_SAMPLES, children[start : start + BATCH])
         iterates = yield from _improve(
-            problem, SEARCH_SAMPLES, iterates, GENERATION_STAGE, step, deadline
+            problem,
+            SEARCH_SAMPLES,
+            iterates,
+            GENERATION_STAGE,
+            step,
+            deadline,
         )
         motions += [iterate.y for iterate in iterates]
     return candidates.survivors(evaluate_within_limits(problem, np.array(motions)))
@@ -249,7 +271,7 @@ def _evaluate(
     problem: ExcitationProblem,
     sharpness: float,
     watched_values: Sequence[list[WatchedValues]],
-    y: Float[np.ndarray, "points scaled"],
+    y: ScaledMotions,
     starts: Sequence[int],
 ) -> list[Evaluation]:
     """Return criterion and constraints at points of these starts."""
@@ -273,8 +295,10 @@ def _take(
 
 
 def _feasible_places(
-    problem: ExcitationProblem, random: np.random.Generator, count: int
-) -> Float[np.ndarray, "count joints"]:
+    problem: ExcitationProblem,
+    random: np.random.Generator,
+    count: int,
+) -> np.ndarray:
     """Return random places in the joints' ranges that keep constraints best."""
     limits = problem.limits.limits
     low = np.asarray(limits.position_min)

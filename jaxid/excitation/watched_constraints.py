@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxid.arrays import Float, Int
 from jaxid.dynamics.motion import Motion
 
 from .coefficient_limits import ScaledMotion, ScaledMotions
@@ -23,15 +22,15 @@ PEAKS = 48
 class WatchedValues(NamedTuple):
     """Watched values of one constraint, near one motion."""
 
-    instants: Int[np.ndarray, " values"]  # places among the checked instants
-    entries: Int[np.ndarray, " values"]  # places in the entries of the constraint
+    instants: np.ndarray  # places among the checked instants
+    entries: np.ndarray  # places in the entries of the constraint
 
 
 class WatchedSlopes(NamedTuple):
     """Watched values of several motions, and their derivatives."""
 
-    values: Float[np.ndarray, "starts values"]
-    slopes: Float[np.ndarray, "starts values scaled"]
+    values: np.ndarray  # [starts, values]
+    slopes: np.ndarray  # [starts, values, scaled coefficients]
 
 
 def count_watched(problem: ExcitationProblem) -> int:

@@ -7,16 +7,20 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.spatial import ConvexHull, QhullError
 
-from jaxid.arrays import AnyArray, Float, Matrix3, Numbers, Vector3
+from jaxid.arrays import AnyArray, Numbers, Vector3
 from jaxid.errors import InputError
 
-from .collision_geometry import Shape, link_shapes, mjcf_shapes
+from .collision_geometry import link_shapes, mjcf_shapes
 from .robot import Robot
 from .shapes import GROUND, Capsule
 from .urdf_tree import ORIGIN, UrdfTree
 
 STAND_IN_SHARE = 0.07
 """Radius of a capsule for an unknown shape, relative to the robot's length."""
+AXIS_SHARE = 0.6
+"""Length of the first axis of a search, relative to the extent of the points."""
+FIRST_SHIFT = 0.1
+"""First shift of an axis in a search, relative to the size of the points."""
 
 
 def fit_capsules(
@@ -75,7 +79,9 @@ def fit_capsules(
             faults[link] = str(error)
         for number, shape in enumerate(shapes, 1):
             label = link if number == 1 else f"{link} {number}"
-            axis = _around(shape)
+            axis = Segment(shape.points[0], shape.points[-1], shape.radius)
+            if shape.radius == 0.0:
+                axis = enclose(shape.points)
             capsule = Capsule(
                 label,
                 body,
@@ -133,82 +139,52 @@ class Segment(NamedTuple):
         return np.pi * self.radius**2 * (length + 4 / 3 * self.radius)
 
 
-def _around(shape: Shape) -> Segment:
-    """Return a capsule around a shape."""
-    if shape.radius == 0.0:
-        return enclose(shape.points)
-    return Segment(shape.points[0], shape.points[-1], shape.radius)
+def enclose(points: AnyArray) -> Segment:
+    """Return a small capsule around all points [m].
 
-
-class AxisSearch(NamedTuple):
-    """Capsules around points, about axes near a direction.
-
-    Attributes:
-        points: Points [m].
-        centre: Centre of the box around them [m].
-        size: Longest edge of that box [m].
-        frame: The direction, and two directions at right angles to it, as rows.
-    """
-
-    points: Float[np.ndarray, "points 3"]
-    centre: Vector3
-    size: float
-    frame: Matrix3
-
-    def volume(self, change: Float[np.ndarray, "4"]) -> float:
-        """Return the volume of the capsule about an axis [m³]."""
-        return self.capsule(change).volume
-
-    def capsule(self, change: Float[np.ndarray, "4"]) -> Segment:
-        """Return the smallest capsule about an axis.
-
-        Args:
-            change: Two numbers that turn the axis from the direction, and two that
-                shift it from the centre, relative to the size.
-        """
-        direction = self.frame[0]
-        sideways = self.frame[1:]
-        axis = direction + change[:2] @ sideways
-        axis = axis / np.linalg.norm(axis)
-        place = self.centre + self.size * (change[2:] @ sideways)
-
-        differences = self.points - place
-        heights = differences @ axis
-        distances = np.linalg.norm(differences - heights[:, None] * axis, axis=1)
-        # Rounding must leave no point outside.
-        radius = float(distances.max()) * (1 + 1e-9) + 1e-12
-        reach = np.sqrt(np.maximum(radius**2 - distances**2, 0.0))
-        start = (heights + reach).min()
-        end = (heights - reach).max()
-        if start > end:
-            start = end = 0.5 * (start + end)
-        return Segment(place + start * axis, place + end * axis, radius)
-
-
-def enclose(points: Float[AnyArray, "points 3"]) -> Segment:
-    """Return a small capsule around all points.
-
-    The direction and the place of the axis are searched from each of the principal
-    directions. For every axis the radius reaches the farthest point and the ends are as
-    near as they can be, so all points are inside, whatever the search finds. (The
-    smallest cylinder is no help: a capsule about its axis is up to six times larger.)
+    The ends of the axis are searched from those of the best principal direction. For
+    every axis the radius reaches the farthest point, so all points are inside, whatever
+    the search finds. (The smallest cylinder is no help: a capsule about its axis is up
+    to six times larger.)
     """
     hull = _hull_points(np.asarray(points))
-    low = hull.min(axis=0)
-    high = hull.max(axis=0)
-    centre = 0.5 * (high + low)
-    size = max(float((high - low).max()), 1e-9)
-    _, _, directions = np.linalg.svd(hull - hull.mean(axis=0), full_matrices=True)
-    options = {"maxiter": 400, "xatol": 1e-5, "fatol": 1e-6 * size**3}
+    centre = 0.5 * (hull.min(axis=0) + hull.max(axis=0))
+    size = max(float(np.ptp(hull, axis=0).max()), 1e-9)
+    _, _, directions = np.linalg.svd(hull - hull.mean(axis=0))
 
-    capsules = []
-    for k in range(3):
-        search = AxisSearch(hull, centre, size, np.roll(directions, -k, axis=0))
-        optimum = minimize(
-            search.volume, np.zeros(4), method="Nelder-Mead", options=options
-        )
-        capsules.append(search.capsule(optimum.x))
-    return min(capsules, key=lambda capsule: capsule.volume)
+    def volume(ends: np.ndarray) -> float:
+        return _capsule_about(hull, ends).volume
+
+    axes = []
+    for direction in directions:
+        heights = (hull - centre) @ direction
+        # The round ends reach beyond the axis.
+        reach = AXIS_SHARE * np.array([heights.min(), heights.max()])
+        axes.append((centre + reach[:, None] * direction).ravel())
+    start = min(axes, key=volume)
+    simplex = np.vstack([start, start + FIRST_SHIFT * size * np.eye(6)])
+    options = {
+        "initial_simplex": simplex,
+        "maxiter": 500,
+        "xatol": 1e-4 * size,
+        "fatol": 1e-5 * size**3,
+    }
+    optimum = minimize(volume, start, method="Nelder-Mead", options=options)
+    return _capsule_about(hull, optimum.x)
+
+
+def _capsule_about(points: np.ndarray, ends: np.ndarray) -> Segment:
+    """Return the smallest capsule around points whose axis has these ends."""
+    start, end = ends.reshape(2, 3)
+    axis = end - start
+    from_start = points - start
+    square = max(float(axis @ axis), 1e-18)
+    fractions = np.clip(from_start @ axis / square, 0.0, 1.0)
+    from_axis = from_start - fractions[:, None] * axis
+    distances = np.linalg.norm(from_axis, axis=1)
+    # Rounding must leave no point outside.
+    radius = float(distances.max()) * (1 + 1e-9) + 1e-12
+    return Segment(start, end, radius)
 
 
 def _hull_points(points: np.ndarray) -> np.ndarray:

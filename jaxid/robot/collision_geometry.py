@@ -41,7 +41,9 @@ class Shape(NamedTuple):
 
 
 def link_shapes(
-    tree: UrdfTree, packages: str | Path | None, link: str
+    tree: UrdfTree,
+    packages: str | Path | None,
+    link: str,
 ) -> Iterator[Shape]:
     """Yield the collision shapes of a link of a URDF file, or else its visual ones.
 
@@ -63,7 +65,9 @@ def link_shapes(
         description = part.find("geometry/*")
         # An element without geometry is named in the error.
         shape = _read_shape(
-            tree, packages, part if description is None else description
+            tree,
+            packages,
+            part if description is None else description,
         )
         yield shape.placed(rotation, position)
 
@@ -91,8 +95,10 @@ def _read_shape(tree: UrdfTree, packages: str | Path | None, element: Any) -> Sh
 
 
 def _mesh_vertices(
-    tree: UrdfTree, packages: str | Path | None, element: Any
-) -> Float[np.ndarray, "points 3"]:
+    tree: UrdfTree,
+    packages: str | Path | None,
+    element: Any,
+) -> np.ndarray:
     """Return the vertices of a mesh in the unit of its file."""
     import trimesh  # loaded where there are meshes
 
@@ -112,7 +118,9 @@ def _mesh_vertices(
 
 
 def _mesh_files(
-    description: Path, packages: str | Path | None, name: str
+    description: Path,
+    packages: str | Path | None,
+    name: str,
 ) -> Iterator[Path]:
     """Yield the places where the mesh of a description may be."""
     scheme, _, location = name.rpartition("://")
@@ -141,9 +149,10 @@ def mjcf_shapes(path: str | Path) -> dict[str, list[Shape]]:
 
     shapes: dict[str, list[Shape]] = {}
     for geom in range(model.ngeom):
-        body = int(model.geom_bodyid[geom])
+        body = model.geom_bodyid[geom]
         body_is_solid = is_solid[model.geom_bodyid == body].any()
-        if model.geom_type[geom] in unbounded or (body_is_solid and not is_solid[geom]):
+        is_unbounded = int(model.geom_type[geom]) in unbounded
+        if is_unbounded or (body_is_solid and not is_solid[geom]):
             continue
         rotation = rotation_of_quaternion(model.geom_quat[geom])
         shape = _geom_shape(mujoco, model, geom)

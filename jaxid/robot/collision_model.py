@@ -13,7 +13,7 @@ from jaxid.arrays import AnyArray, Array, Float, Hashable, Joints, double_precis
 from jaxid.errors import InputError
 
 from .forward_kinematics import placements
-from .robot import Robot
+from .robot import Robot, complete_limits
 from .shapes import GROUND, Box, Capsule, HalfSpace, segment_distance
 
 POSES = 400
@@ -122,7 +122,9 @@ class CollisionModel(Hashable):
 
     @eqx.filter_jit
     def clearance(
-        self, robot: Robot, q: Float[AnyArray, "*batch joints"]
+        self,
+        robot: Robot,
+        q: Float[AnyArray, "*batch joints"],
     ) -> Float[AnyArray, "*batch groups"]:
         """Return the clearances of poses, negative where shapes overlap [m].
 
@@ -141,22 +143,21 @@ class CollisionModel(Hashable):
         """Return the clearances [m] for given ends of all axes on the ground [m]."""
         *batch, capsules, _, _ = ends.shape
         gaps = jax.vmap(self._gaps)(jnp.reshape(ends, (-1, capsules, 2, 3)))
-        # All groups get the same number of pairs: the first one is repeated.
-        size = max(len(group) for group in self.groups)
-        places = []
-        for group in self.groups:
-            padding = group[:1] * (size - len(group))
-            places.append(group + padding)
+        # All groups get the same number of pairs: the first ones are repeated.
+        size = max(map(len, self.groups))
+        places = [np.resize(group, size) for group in self.groups]
         gaps_of_groups = gaps[:, np.array(places)]
         # The derivative is that of one pair, also where several are equally near.
         minimum = jnp.argmin(
-            jax.lax.stop_gradient(gaps_of_groups), axis=-1, keepdims=True
+            jax.lax.stop_gradient(gaps_of_groups),
+            axis=-1,
+            keepdims=True,
         )
         clearances = jnp.take_along_axis(gaps_of_groups, minimum, axis=-1)[..., 0]
         return clearances.reshape(*batch, len(self.groups))
 
-    def _gaps(self, ends: Float[Array, "capsules 2 3"]) -> Float[Array, " pairs"]:
-        """Return the distance between the surfaces of each pair in one pose [m]."""
+    def _gaps(self, ends: Array) -> Array:
+        """Return the distance between the surfaces of each pair for some `ends` [m]."""
         start = ends[:, 0]
         end = ends[:, 1]
         radii = jnp.stack([jnp.asarray(capsule.radius) for capsule in self.capsules])
@@ -177,13 +178,13 @@ class CollisionModel(Hashable):
 
     def _largest_gaps(self, robot: Robot) -> list[float]:
         """Return the largest gap of each pair in random poses [m]."""
-        low = np.asarray(robot.limits.position_min)
-        high = np.asarray(robot.limits.position_max)
-        low = np.where(np.isfinite(low), low, -np.pi)
-        high = np.where(np.isfinite(high), high, np.pi)
+        limits = complete_limits(robot)
         random = np.random.default_rng(0)
-        size = (POSES, robot.joints)
-        q = random.uniform(np.minimum(low, high), np.maximum(low, high), size)
+        q = random.uniform(
+            limits.position_min,
+            limits.position_max,
+            (POSES, robot.joints),
+        )
 
         def gaps(pose: Array) -> Array:
             return self._gaps(self.ends(robot, pose))
@@ -252,19 +253,24 @@ def _check_shapes(robot: Robot, capsules: Sequence[Capsule], names: list[str]) -
 
 
 def _meeting_pairs(
-    robot: Robot, capsules: Sequence[Capsule], obstacles: int
+    robot: Robot,
+    capsules: Sequence[Capsule],
+    obstacles: int,
 ) -> list[tuple[int, int]]:
     """Return the pairs of shapes on bodies that are neither one nor neighbours."""
-    bodies = [capsule.body for capsule in capsules] + [GROUND] * obstacles
-    parents = [None if body == GROUND else robot.parent[body] for body in bodies]
+    bodies = [capsule.body for capsule in capsules]
+    links = set(enumerate(robot.parent))
     pairs = []
-    for i, k in itertools.combinations(range(len(bodies)), 2):
-        if i >= len(capsules) or bodies[i] == bodies[k]:
-            continue
-        neighbours = bodies[k] == parents[i] or bodies[i] == parents[k]
-        # An obstacle is not part of the base that carries the first body.
-        if k >= len(capsules) or not neighbours:
+    for i, k in itertools.combinations(range(len(capsules)), 2):
+        first = bodies[i]
+        second = bodies[k]
+        are_neighbours = (first, second) in links or (second, first) in links
+        if first != second and not are_neighbours:
             pairs.append((i, k))
+    # An obstacle is not part of the base that carries the first body.
+    for i, body in enumerate(bodies):
+        if body != GROUND:
+            pairs += [(i, len(bodies) + number) for number in range(obstacles)]
     return pairs
 
 

@@ -10,14 +10,16 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Float, Joints, Matrix3, Vector3
+from jaxid.arrays import AnyArray, Joints, Matrix3, Vector3
 
 from .robot import Robot
-from .rotations import rotation_about
+from .rotations import Rotations, Vectors, rotation_about
 
 
 def placement_in_parent(
-    robot: Robot, body: int, q: Float[AnyArray, ""]
+    robot: Robot,
+    body: int,
+    q: AnyArray,
 ) -> tuple[Matrix3, Vector3]:
     """Return attitude and origin [m] of a body in its parent at a coordinate."""
     R = robot.rotation[body]
@@ -28,12 +30,11 @@ def placement_in_parent(
     return R, r + R @ axis * q
 
 
-def placements(
-    robot: Robot, q: Joints
-) -> tuple[Float[AnyArray, "joints 3 3"], Float[AnyArray, "joints 3"]]:
+def placements(robot: Robot, q: Joints) -> tuple[Rotations, Vectors]:
     """Return attitudes and origins [m] of all bodies in the frame of the ground."""
     q = jnp.asarray(q)
-    rotations, origins = [], []
+    rotations = []
+    origins = []
     for i, parent in enumerate(robot.parent):
         R, r = placement_in_parent(robot, i, q[i])
         if parent >= 0:
@@ -55,26 +56,27 @@ class TipJacobian(NamedTuple):
     """Placements of the end-effector, and their derivatives by the joints.
 
     Attributes:
-        rotation: Attitudes on the ground.
+        rotation: Attitudes on the ground [poses 3 3].
         position: Positions on the ground [m].
-        velocity: Velocities of the origin by the rates of the joints.
-        turn: Angular velocities by the rates of the joints.
+        velocity: Velocities of the origin by the rates of the joints [poses joints 3].
+        turn: Angular velocities by the rates of the joints [poses joints 3].
     """
 
-    rotation: Float[np.ndarray, "poses 3 3"]
-    position: Float[np.ndarray, "poses 3"]
-    velocity: Float[np.ndarray, "poses joints 3"]
-    turn: Float[np.ndarray, "poses joints 3"]
+    rotation: np.ndarray
+    position: np.ndarray
+    velocity: np.ndarray
+    turn: np.ndarray
 
 
-def tip_jacobian(robot: Robot, q: Float[np.ndarray, "poses joints"]) -> TipJacobian:
-    """Return placements of the end-effector and their derivatives, in NumPy."""
+def tip_jacobian(robot: Robot, q: np.ndarray) -> TipJacobian:
+    """Return placements of the end-effector in many poses, and their derivatives."""
     offset = np.asarray(robot.offset)
     rotation = np.asarray(robot.rotation)
     axis = np.asarray(robot.axis)
 
-    R = np.broadcast_to(np.eye(3), (len(q), 3, 3))
-    r = np.zeros((len(q), 3))
+    poses = len(q)
+    R = np.broadcast_to(np.eye(3), (poses, 3, 3))
+    r = np.zeros((poses, 3))
     origin, turn, slide = np.zeros((3, *q.shape, 3))
     for i in robot.ancestors[robot.tip_body]:
         r = r + R @ offset[i]
@@ -96,9 +98,9 @@ def tip_jacobian(robot: Robot, q: Float[np.ndarray, "poses joints"]) -> TipJacob
 
 def tip_curvature(
     tip: TipJacobian,
-    force: Float[np.ndarray, "poses 3"],
-    moment: Float[np.ndarray, "poses 3"],
-) -> Float[np.ndarray, "poses joints joints"]:
+    force: np.ndarray,
+    moment: np.ndarray,
+) -> np.ndarray:
     """Return second derivatives of the placement, times a force and a moment.
 
     Attitudes count as rotation vectors from the attitude of the end-effector.

@@ -15,11 +15,14 @@ from jaxid.arrays import (
 )
 
 from .limits_and_drives import DOUBTFUL_LENGTH, MAX_LENGTH
+from .rotations import Rotations, Vectors
 
 AXES = "xyz"
 INERTIAL_NAMES = ("m", *(f"m{a}" for a in AXES), *"ABCDEF")
 """Inertial parameters of a body in the paper's order (Eq. 9)."""
 INERTIAL_UNITS = ("kg", *("kg m",) * 3, *("kg m²",) * 6)
+TenParameters = Float[AnyArray, "*batch 10"]
+"""Ten inertial parameters, with any leading axes."""
 BodyParameters = Float[AnyArray, "joints 10"]
 """Ten inertial parameters of each body of a robot."""
 SQUARES = ((0, 1, 2), (0, 1, 2))
@@ -48,9 +51,9 @@ class Inertia(eqx.Module):
             m²].
     """
 
-    mass: Float[AnyArray, "*batch"]
-    centre: Float[AnyArray, "*batch 3"]
-    tensor: Float[AnyArray, "*batch 3 3"]
+    mass: AnyArray
+    centre: Vectors
+    tensor: Rotations
 
     def __init__(self, mass: Numbers, centre: Numbers, tensor: Numbers):
         self.mass = as_array("mass", mass)
@@ -58,7 +61,7 @@ class Inertia(eqx.Module):
         self.tensor = as_array("tensor", tensor)
 
     @classmethod
-    def from_parameters(cls, p: Float[AnyArray, "*batch 10"]) -> "Inertia":
+    def from_parameters(cls, p: TenParameters) -> "Inertia":
         """Return the inertia of ten parameters, centred at 0 without mass (Eq. 9)."""
         xp = namespace(p)
         mass = p[..., 0]
@@ -69,19 +72,19 @@ class Inertia(eqx.Module):
         return cls(mass, centre, inertia_tensor(p[..., 4:]) - point_masses)
 
     @property
-    def parameters(self) -> Float[AnyArray, "*batch 10"]:
+    def parameters(self) -> TenParameters:
         """Parameters $(m, m r_c, A, B, C, D, E, F)$ about the origin (Eqs. 8, 9)."""
         mass = self.mass[..., None]
+        first_moments = mass * self.centre
         point_mass = mass[..., None] * _moments_of_points(self.centre)
         tensor = self.tensor + point_mass
         squares = tensor[..., *SQUARES]
         products = -tensor[..., *PRODUCTS]
-        xp = namespace(self.mass, self.centre, self.tensor)
-        parts = [mass, mass * self.centre, squares, products]
-        return xp.concatenate(parts, axis=-1)
+        xp = namespace(mass, tensor)
+        return xp.concatenate([mass, first_moments, squares, products], axis=-1)
 
     @property
-    def pinocchio(self) -> Float[AnyArray, "*batch 10"]:
+    def pinocchio(self) -> TenParameters:
         """Parameters $(m, m r_c, I_{xx}, I_{xy}, I_{yy}, I_{xz}, I_{yz}, I_{zz})$."""
         p = self.parameters
         tensor = inertia_tensor(p[..., 4:])
@@ -89,7 +92,7 @@ class Inertia(eqx.Module):
         return namespace(p).concatenate([p[..., :4], moments], axis=-1)
 
     @property
-    def moments(self) -> Float[AnyArray, "*batch 6"]:
+    def moments(self) -> AnyArray:
         """Entries xx, xy, xz, yy, yz, zz of the tensor, the order of URDF [kg m²]."""
         return self.tensor[..., *URDF_ORDER]
 
@@ -136,7 +139,7 @@ class Inertia(eqx.Module):
         return ""
 
 
-def inertia_tensor(j: Float[AnyArray, "*batch 6"]) -> Float[AnyArray, "*batch 3 3"]:
+def inertia_tensor(j: AnyArray) -> Rotations:
     """Return the tensor $J^o$ of the moments $(A, B, C, D, E, F)$ [kg m²] (Eq. 9)."""
     A, B, C, D, E, F = (j[..., k] for k in range(6))
     xp = namespace(j)
@@ -144,7 +147,7 @@ def inertia_tensor(j: Float[AnyArray, "*batch 6"]) -> Float[AnyArray, "*batch 3 
     return xp.stack([xp.stack(row, axis=-1) for row in rows], axis=-2)
 
 
-def _moments_of_points(r: Float[AnyArray, "*batch 3"]) -> Float[AnyArray, "*batch 3 3"]:
+def _moments_of_points(r: Vectors) -> Rotations:
     """Return the inertia tensors of unit masses at points, about the origin [m²]."""
     xp = namespace(r)
     squares = xp.sum(r * r, axis=-1)[..., None, None]

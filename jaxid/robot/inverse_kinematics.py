@@ -13,11 +13,11 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from jaxid.arrays import Float, Int, Matrix3, Numbers, as_array
+from jaxid.arrays import Joints, Matrix3, Numbers, as_array
 from jaxid.errors import InputError
 
 from .forward_kinematics import TipJacobian, tip_curvature, tip_jacobian
-from .robot import Robot
+from .robot import Robot, as_rotations, complete_limits
 
 POSE_TOLERANCE = 1e-9
 """Distance at which a pose is reached [m, and rad]."""
@@ -39,10 +39,10 @@ FINAL_STEPS = 6
 
 def inverse_kinematics_along(
     robot: Robot,
-    positions: Float[np.ndarray, "poses 3"],
+    positions: np.ndarray,
     rotation: Numbers,
     posture: Numbers | None = None,
-) -> Float[np.ndarray, "poses joints"]:
+) -> np.ndarray:
     """Return coordinates within the limits along a path of close positions [rad or m].
 
     Columns of the `rotation` are the end-effector's axes on the ground. The search
@@ -63,66 +63,53 @@ class _TipTask(NamedTuple):
 
     robot: Robot
     rotation: Matrix3
-    posture: Float[np.ndarray, " joints"]
-    half_range: Float[np.ndarray, " joints"]
-    low: Float[np.ndarray, " joints"]
-    high: Float[np.ndarray, " joints"]
+    posture: Joints
+    half_range: Joints
+    low: Joints
+    high: Joints
 
 
-class _Iterate(NamedTuple):
-    """Coordinates of some poses, and the multipliers of their placements."""
-
-    q: Float[np.ndarray, "poses joints"]
-    multipliers: Float[np.ndarray, "poses 6"]
+Unknowns = np.ndarray
+"""Coordinates of each pose, then the six multipliers of its placement."""
 
 
 def _tip_task(robot: Robot, rotation: Numbers, posture: Numbers | None) -> _TipTask:
     """Return the checked task; joints without limits get half a turn, or a metre."""
     low = np.asarray(robot.limits.position_min)
     high = np.asarray(robot.limits.position_max)
-    is_limited = np.isfinite(low) & np.isfinite(high)
-    with np.errstate(invalid="ignore"):
-        default_range = np.where(robot.revolute, np.pi, 1.0)
-        half_range = np.where(is_limited, (high - low) / 2, default_range)
-        middle = np.clip(np.where(is_limited, (high + low) / 2, 0.0), low, high)
-
+    limits = complete_limits(robot)
+    half_range = 0.5 * (limits.position_max - limits.position_min)
+    middle = 0.5 * (limits.position_max + limits.position_min)
     goal = np.asarray(as_array("posture", middle if posture is None else posture))
     if goal.shape != middle.shape:
         raise InputError(
             f"`posture` must hold {robot.joints} numbers, but has shape {goal.shape}."
         )
-    R = np.asarray(as_array("rotation", rotation))
-    orthonormal = R.shape == (3, 3) and np.abs(R.T @ R - np.eye(3)).max() < 1e-9
-    if not orthonormal or np.linalg.det(R) < 0:
-        raise InputError(
-            "`rotation` must be an orthonormal, right-handed matrix of 3 rows."
-        )
-    return _TipTask(robot, R, goal, half_range, low, high)
+    R = as_rotations("`rotation`", rotation, (3, 3))
+    return _TipTask(robot, np.asarray(R), goal, half_range, low, high)
 
 
 def _follow_path(task: _TipTask, positions: np.ndarray) -> np.ndarray:
     """Return coordinates at all poses: stride by stride, then all between at once."""
-    start = positions[:1]
-    iterate = _Iterate(task.posture[None], np.zeros((1, 6)))
+    joints = task.robot.joints
+    unknowns = np.zeros((1, joints + 6))
+    unknowns[:, :joints] = task.posture
     # Far from the pose the curvature misleads.
     for _ in range(APPROACH_STEPS):
-        iterate = _newton_step(task, start, iterate, curved=False)
+        unknowns = _newton_step(task, positions[:1], unknowns, curved=False)
 
     nodes = _ends_of_strides(positions)
     solutions = []
     for k in nodes:
-        iterate = _newton_steps(task, positions[k : k + 1], iterate, STRIDE_STEPS)
-        solutions.append(np.concatenate([iterate.q[0], iterate.multipliers[0]]))
-
+        unknowns = _newton_steps(task, positions[k : k + 1], unknowns, STRIDE_STEPS)
+        solutions.append(unknowns[0])
     places = np.arange(len(positions))
-    columns = [np.interp(places, nodes, x) for x in np.transpose(solutions)]
-    guess = np.stack(columns, axis=1)
-    joints = task.robot.joints
-    iterate = _Iterate(guess[:, :joints], guess[:, joints:])
-    return _newton_steps(task, positions, iterate, FINAL_STEPS).q
+    columns = [np.interp(places, nodes, column) for column in np.transpose(solutions)]
+    guess = np.transpose(columns)
+    return _newton_steps(task, positions, guess, FINAL_STEPS)[:, :joints]
 
 
-def _ends_of_strides(positions: np.ndarray) -> Int[np.ndarray, " strides"]:
+def _ends_of_strides(positions: np.ndarray) -> np.ndarray:
     """Return the indices of poses about a `STRIDE` apart, with both ends."""
     distances = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     lengths = np.concatenate([[0.0], np.cumsum(distances)])
@@ -131,62 +118,65 @@ def _ends_of_strides(positions: np.ndarray) -> Int[np.ndarray, " strides"]:
 
 
 def _newton_steps(
-    task: _TipTask, positions: np.ndarray, iterate: _Iterate, count: int
-) -> _Iterate:
+    task: _TipTask,
+    positions: np.ndarray,
+    unknowns: Unknowns,
+    count: int,
+) -> Unknowns:
     """Take some steps with the curvature of the placements."""
     for _ in range(count):
-        iterate = _newton_step(task, positions, iterate)
-    return iterate
+        unknowns = _newton_step(task, positions, unknowns)
+    return unknowns
 
 
 def _newton_step(
-    task: _TipTask, positions: np.ndarray, iterate: _Iterate, curved: bool = True
-) -> _Iterate:
+    task: _TipTask,
+    positions: np.ndarray,
+    unknowns: Unknowns,
+    curved: bool = True,
+) -> Unknowns:
     """Take a step towards the coordinates that reach the poses nearest to the posture.
 
     It solves the linearised conditions of an optimum, with the curvature of the
     placements if `curved`.
     """
     joints = task.robot.joints
+    q, multipliers = np.split(unknowns, [joints], axis=1)
+    # Coordinates count relative to half of their ranges.
     scale = task.half_range
-    tip = tip_jacobian(task.robot, iterate.q)
+    tip = tip_jacobian(task.robot, q)
     errors = _pose_errors(task, positions, tip)
     jacobian = np.concatenate([tip.velocity, tip.turn], axis=2) * scale[:, None]
     hessian = np.eye(joints)
     if curved:
-        force = iterate.multipliers[:, :3]
-        moment = iterate.multipliers[:, 3:]
+        force, moment = np.split(multipliers, 2, axis=1)
         hessian = hessian + np.outer(scale, scale) * tip_curvature(tip, force, moment)
 
-    pull = np.einsum("pji,pi->pj", jacobian, iterate.multipliers)
-    slope = (iterate.q - task.posture) / scale + pull
+    pull = np.einsum("pji,pi->pj", jacobian, multipliers)
+    slope = (q - task.posture) / scale + pull
     right_side = np.concatenate([slope, errors], axis=1)
     matrix = _saddle_point_matrix(hessian, jacobian)
     step = np.linalg.solve(matrix, right_side[..., None])[..., 0]
-    size = np.abs(step[:, :joints]).max(axis=1, keepdims=True)
-    step /= np.maximum(1.0, size / MAX_STEP)
-    q = iterate.q - scale * step[:, :joints]
-    return _Iterate(q, iterate.multipliers - step[:, joints:])
+    sizes = np.abs(step[:, :joints])
+    excess = sizes.max(axis=1, keepdims=True) / MAX_STEP
+    step /= np.maximum(1.0, excess)
+    step[:, :joints] *= scale
+    return unknowns - step
 
 
-def _saddle_point_matrix(
-    hessian: np.ndarray, jacobian: Float[np.ndarray, "poses joints 6"]
-) -> Float[np.ndarray, "poses unknowns unknowns"]:
-    """Return the matrix of the conditions of an optimum under linear constraints."""
+def _saddle_point_matrix(hessian: np.ndarray, jacobian: np.ndarray) -> np.ndarray:
+    """Return the matrices of the conditions of an optimum under linear constraints."""
     poses, joints, conditions = jacobian.shape
-    size = joints + conditions
-    matrix = np.zeros((poses, size, size))
-    matrix[:, :joints, :joints] = hessian
-    matrix[:, :joints, joints:] = jacobian
-    matrix[:, joints:, :joints] = np.swapaxes(jacobian, 1, 2)
+    curvature = np.broadcast_to(hessian, (poses, joints, joints))
     # Singular poses have a solution, too.
-    matrix[:, joints:, joints:] = -1e-11 * np.eye(conditions)
-    return matrix
+    ridge = -1e-11 * np.eye(conditions)
+    ridge = np.broadcast_to(ridge, (poses, conditions, conditions))
+    upper_rows = np.concatenate([curvature, jacobian], axis=2)
+    lower_rows = np.concatenate([jacobian.swapaxes(1, 2), ridge], axis=2)
+    return np.concatenate([upper_rows, lower_rows], axis=1)
 
 
-def _pose_errors(
-    task: _TipTask, positions: np.ndarray, tip: TipJacobian
-) -> Float[np.ndarray, "poses 6"]:
+def _pose_errors(task: _TipTask, positions: np.ndarray, tip: TipJacobian) -> np.ndarray:
     """Return the differences of positions [m] and of attitudes [rad] from poses."""
     turn = Rotation.from_matrix(tip.rotation @ task.rotation.T).as_rotvec()
     return np.concatenate([tip.position - positions, turn], axis=1)

@@ -57,7 +57,8 @@ class Limits(eqx.Module):
         # All but the ends of the ranges are sizes, which must be positive.
         names = ("velocity", "acceleration", "jerk", "force")
         magnitudes = {name: getattr(self, name) for name in names}
-        n = _count(joints, self.position_min, self.position_max, *magnitudes.values())
+        ends = (self.position_min, self.position_max)
+        n = _count(joints, *ends, *magnitudes.values())
         low = per_joint("position_min", self.position_min, n, -np.inf)
         high = per_joint("position_max", self.position_max, n, np.inf)
         self.position_min = low
@@ -103,7 +104,11 @@ class Drives(Hashable):
 
     def __post_init__(self, joints: int | None):
         n = _count(
-            joints, self.reduction, self.zero, self.max_torques, self.rotor_inertia
+            joints,
+            self.reduction,
+            self.zero,
+            self.max_torques,
+            self.rotor_inertia,
         )
         self.reduction = _reduction_matrix(self.reduction, n)
         self.zero = per_joint("zero", self.zero, n, 0.0)
@@ -121,7 +126,7 @@ class Drives(Hashable):
         return np.array_equal(self.reduction, unit_gears) and not np.any(self.zero)
 
     @property
-    def _inverse(self) -> Float[AnyArray, "joints joints"]:
+    def _inverse(self) -> AnyArray:
         """Joint angle for motor angle."""
         return namespace(self.reduction).linalg.inv(self.reduction)
 
@@ -268,7 +273,9 @@ def length_notes(owner: str, lengths: Numbers) -> list[str]:
 
 
 def limit_notes(
-    names: Sequence[str], revolute: Sequence[bool], limits: Limits
+    names: Sequence[str],
+    revolute: Sequence[bool],
+    limits: Limits,
 ) -> list[str]:
     """Return notes on limits that may be in millimetres or in degrees per second."""
     rows = (limits.position_min, limits.position_max, limits.velocity)

@@ -48,7 +48,7 @@ def mjcf_as_urdf(path: str | Path) -> tuple[Any, Vector3, list[Loop]]:
         tree.add_constraint(int(constraint))
 
     gravity = np.array(model.opt.gravity)
-    if model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_GRAVITY):
+    if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY:
         gravity = np.zeros(3)
     return tree.root, gravity, tree.loops
 
@@ -92,7 +92,12 @@ class _Writer:
         return getattr(self._model, kind)(index).name or f"{kind}{index}"
 
     def _connect(
-        self, name: str, kind: str, parent: str, child: str, origin: Any
+        self,
+        name: str,
+        kind: str,
+        parent: str,
+        child: str,
+        origin: Any,
     ) -> Any:
         """Write a joint between two links."""
         ends = E.parent(link=parent), E.child(link=child)
@@ -110,7 +115,8 @@ class _Writer:
         # The link of the body itself follows its last joint.
         mount = f"{name} mount"
         mount_type = "fixed"
-        for joint in self._joints_of(body):
+        first_joint = model.body_jntadr[body]
+        for joint in range(first_joint, first_joint + model.body_jntnum[body]):
             if JOINT_TYPES[model.jnt_type[joint]] == "floating":
                 mount = self._name("joint", joint)
                 mount_type = "floating"
@@ -128,13 +134,11 @@ class _Writer:
         self._links.append(name)
         self._connect(mount, mount_type, parent, name, _origin(R, r))
 
-    def _joints_of(self, body: int) -> range:
-        """Return the indices of the joints that move a body in its parent."""
-        first = int(self._model.body_jntadr[body])
-        return range(first, first + int(self._model.body_jntnum[body]))
-
     def _joint_placement(
-        self, joint: int, rotation: Matrix3, position: Vector3
+        self,
+        joint: int,
+        rotation: Matrix3,
+        position: Vector3,
     ) -> tuple[Matrix3, Vector3]:
         """Return attitude and origin of a joint's frame from the placement of its body.
 
@@ -186,9 +190,8 @@ class _Writer:
         model = self._model
         limit: dict[str, str] = {}
         if model.jnt_limited[joint]:
-            low, high = model.jnt_range[joint]
-            limit["lower"] = exact_text(low)
-            limit["upper"] = exact_text(high)
+            ends = map(exact_text, model.jnt_range[joint])
+            limit.update(zip(("lower", "upper"), ends, strict=True))
         if np.isfinite(self._efforts[joint]):
             limit["effort"] = exact_text(self._efforts[joint])
         dof = model.jnt_dofadr[joint]
@@ -217,19 +220,19 @@ class _Writer:
         model = self._model
         kinds = self._mujoco.mjtEq
         kind = int(model.eq_type[constraint])
-        pair = [int(model.eq_obj1id[constraint]), int(model.eq_obj2id[constraint])]
-        if kind == int(kinds.mjEQ_JOINT):
-            joint, master = pair
-            self._add_mimic(joint, master, model.eq_data[constraint, :5])
-        elif kind in (int(kinds.mjEQ_CONNECT), int(kinds.mjEQ_WELD)):
-            between_sites = int(self._mujoco.mjtObj.mjOBJ_SITE)
-            if model.eq_objtype[constraint] == between_sites:
-                pair = [int(model.site_bodyid[site]) for site in pair]
+        first = int(model.eq_obj1id[constraint])
+        second = int(model.eq_obj2id[constraint])
+        if kind == kinds.mjEQ_JOINT:
+            self._add_mimic(first, second, model.eq_data[constraint, :5])
+        elif kind in (kinds.mjEQ_CONNECT, kinds.mjEQ_WELD):
+            bodies = np.array([first, second])
+            if model.eq_objtype[constraint] == self._mujoco.mjtObj.mjOBJ_SITE:
+                bodies = model.site_bodyid[bodies]
             # A mocap body is moved by a program: it is no part of the robot.
-            if (model.body_mocapid[pair] < 0).all():
+            if (model.body_mocapid[bodies] < 0).all():
                 name = self._name("equality", constraint)
-                first, second = pair
-                self.loops.append((name, self._links[first], self._links[second]))
+                links = [self._links[body] for body in bodies]
+                self.loops.append((name, *links))
 
     def _add_mimic(self, joint: int, master: int, polynomial: np.ndarray) -> None:
         """Write a constraint of a joint; it is exact where the mimicked joint is held.
@@ -242,10 +245,9 @@ class _Writer:
         slope = 0.0
         change = polynomial[0]
         if master >= 0:
-            low, high = -np.inf, np.inf
+            coordinate = 0.0
             if model.jnt_limited[master]:
-                low, high = model.jnt_range[master]
-            coordinate = min(max(0.0, low), high)
+                coordinate = np.clip(0.0, *model.jnt_range[master])
             master_ref = model.qpos0[model.jnt_qposadr[master]]
             slope = polynomial[1]
             value = np.polyval(polynomial[::-1], coordinate - master_ref)
@@ -260,10 +262,7 @@ class _Writer:
 def _largest_forces(mujoco: Any, model: Any) -> Joints:
     """Return the largest force of actuators on each joint; infinite if unknown."""
     transmissions = mujoco.mjtTrn
-    joint_kinds = (
-        int(transmissions.mjTRN_JOINT),
-        int(transmissions.mjTRN_JOINTINPARENT),
-    )
+    joint_kinds = (transmissions.mjTRN_JOINT, transmissions.mjTRN_JOINTINPARENT)
     total = np.zeros(model.njnt)
     for actuator in range(model.nu):
         if int(model.actuator_trntype[actuator]) in joint_kinds:
@@ -272,7 +271,8 @@ def _largest_forces(mujoco: Any, model: Any) -> Joints:
             total[joint] += _largest_input(mujoco, model, actuator) * gear
     total = np.where(total > 0.0, total, np.inf)
     joint_limits = np.abs(model.jnt_actfrcrange).max(axis=1)
-    return np.where(model.jnt_actfrclimited, np.minimum(total, joint_limits), total)
+    smaller_limits = np.minimum(total, joint_limits)
+    return np.where(model.jnt_actfrclimited, smaller_limits, total)
 
 
 def _largest_input(mujoco: Any, model: Any, actuator: int) -> float:
@@ -280,7 +280,7 @@ def _largest_input(mujoco: Any, model: Any, actuator: int) -> float:
     if model.actuator_forcelimited[actuator]:
         return np.abs(model.actuator_forcerange[actuator]).max()
     # Other actuators have a bias, such as that of a position servo.
-    is_motor = int(model.actuator_biastype[actuator]) == int(mujoco.mjtBias.mjBIAS_NONE)
+    is_motor = model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_NONE
     if is_motor and model.actuator_ctrllimited[actuator]:
         gain = model.actuator_gainprm[actuator, 0]
         return np.abs(model.actuator_ctrlrange[actuator] * gain).max()

@@ -45,17 +45,19 @@ class Tool(eqx.Module):
 
     body: int = eqx.field(static=True)
     _: dataclasses.KW_ONLY
-    mass: Float[AnyArray, ""] = eqx.field(converter=given)
+    mass: AnyArray = eqx.field(converter=given)
     centre_of_mass: Vector3 = eqx.field(converter=given)
     inertia: Matrix3 = eqx.field(converter=given, default=None)
 
     def __post_init__(self):
-        self.mass = _checked("`mass` of the tool", self.mass, ())
-        self.centre_of_mass = _checked(
-            "`centre_of_mass` of the tool", self.centre_of_mass, (3,)
+        self.mass = as_finite_array("`mass` of the tool", self.mass, ())
+        self.centre_of_mass = as_finite_array(
+            "`centre_of_mass` of the tool",
+            self.centre_of_mass,
+            (3,),
         )
         tensor = np.zeros((3, 3)) if self.inertia is None else self.inertia
-        self.inertia = _checked("`inertia` of the tool", tensor, (3, 3))
+        self.inertia = as_finite_array("`inertia` of the tool", tensor, (3, 3))
         if not is_traced(self.mass) and self.mass <= 0:
             raise InputError(
                 f"`mass` of the tool must be positive, but is {self.mass:g} kg."
@@ -69,7 +71,7 @@ class Tool(eqx.Module):
         return Inertia(self.mass, self.centre_of_mass, self.inertia)
 
     @property
-    def parameters(self) -> Float[AnyArray, "10"]:
+    def parameters(self) -> AnyArray:
         """Parameters $(m, m r_c, A, B, C, D, E, F)$ about the origin (Eqs. 8, 9)."""
         return self.body_inertia.parameters
 
@@ -139,12 +141,12 @@ class Robot(Summarised, eqx.Module):
         self.parent = tuple(int(body) for body in self.parent)
         self.revolute = tuple(bool(turns) for turns in self.revolute)
         # Arrays of JAX may have leading axes, for batches of geometries.
-        self.axis = _unit_axes(_checked("`axis`", self.axis, (n, 3)))
-        self.rotation = _rotations("`rotation`", self.rotation, (n, 3, 3))
-        self.offset = _checked("`offset`", self.offset, (n, 3))
-        self.gravity = _checked("`gravity`", self.gravity, (3,))
-        self.tip_rotation = _rotations("`tip_rotation`", self.tip_rotation, (3, 3))
-        self.tip_offset = _checked("`tip_offset`", self.tip_offset, (3,))
+        self.axis = _unit_axes(as_finite_array("`axis`", self.axis, (n, 3)))
+        self.rotation = as_rotations("`rotation`", self.rotation, (n, 3, 3))
+        self.offset = as_finite_array("`offset`", self.offset, (n, 3))
+        self.gravity = as_finite_array("`gravity`", self.gravity, (3,))
+        self.tip_rotation = as_rotations("`tip_rotation`", self.tip_rotation, (3, 3))
+        self.tip_offset = as_finite_array("`tip_offset`", self.tip_offset, (3,))
         self._check_joints()
 
         doubts = limit_notes(self.joint_names, self.revolute, self.limits)
@@ -276,7 +278,9 @@ class Robot(Summarised, eqx.Module):
         )
 
     def mounted(
-        self, rotation: Numbers | None = None, position: Numbers = (0.0, 0.0, 0.0)
+        self,
+        rotation: Numbers | None = None,
+        position: Numbers = (0.0, 0.0, 0.0),
     ) -> "Robot":
         """Return the robot on a base that is tilted and shifted in the same gravity.
 
@@ -289,25 +293,23 @@ class Robot(Summarised, eqx.Module):
             InputError: If the attitude is no rotation, or the position no point.
         """
         attitude = np.eye(3) if rotation is None else rotation
-        R = _rotations("`rotation`", attitude, (3, 3))
-        r = _checked("`position`", position, (3,))
+        R = as_rotations("`rotation`", attitude, (3, 3))
+        r = as_finite_array("`position`", position, (3,))
         xp = namespace(R, r, self.rotation, self.offset)
         rotations = R @ self.rotation
         offsets = xp.broadcast_to(r, self.offset.shape) + self.offset @ R.T
 
         # Only bodies on the ground move: the others are placed in their parents.
-        on_ground = np.array(self.parent) < 0
-        moves = np.broadcast_to(on_ground[:, None], self.offset.shape)
-        turns = np.broadcast_to(on_ground[:, None, None], self.rotation.shape)
+        on_ground = np.array(self.parent)[:, None] < 0
         return self.replace(
-            rotation=xp.where(turns, rotations, self.rotation),
-            offset=xp.where(moves, offsets, self.offset),
+            rotation=xp.where(on_ground[..., None], rotations, self.rotation),
+            offset=xp.where(on_ground, offsets, self.offset),
         )
 
     def with_tool(
         self,
         *,
-        mass: Float[AnyArray, ""] | float | int,
+        mass: AnyArray | float | int,
         centre_of_mass: Numbers,
         inertia: Numbers | None = None,
     ) -> "Robot":
@@ -325,12 +327,14 @@ class Robot(Summarised, eqx.Module):
             InputError: If the mass is not positive, or no body has such an inertia.
         """
         at_tip = Tool(
-            self.tip_body, mass=mass, centre_of_mass=centre_of_mass, inertia=inertia
+            self.tip_body,
+            mass=mass,
+            centre_of_mass=centre_of_mass,
+            inertia=inertia,
         )
         load = at_tip.body_inertia.moved(self.tip_rotation, self.tip_offset)
-        tool = Tool(
-            self.tip_body,
-            mass=load.mass,
+        tool = dataclasses.replace(
+            at_tip,
             centre_of_mass=load.centre,
             inertia=load.tensor,
         )
@@ -373,13 +377,42 @@ class Robot(Summarised, eqx.Module):
         )
 
 
-def _checked(name: str, value: Numbers, shape: tuple[int, ...]) -> AnyArray:
+def complete_limits(robot: Robot) -> Limits:
+    """Return the limits of a robot, with assumed ones for those that are unknown.
+
+    Assumed are: half a turn or 1 m to either side; 90 degrees/s or 0.5 m/s; the
+    acceleration that reaches the largest speed in 0.25 s.
+    """
+    limits = robot.limits
+    is_revolute = np.array(robot.revolute, bool)
+    half_range = np.where(is_revolute, np.pi, 1.0)
+    speed = np.where(is_revolute, np.pi / 2, 0.5)
+    low = np.asarray(limits.position_min)
+    high = np.asarray(limits.position_max)
+    has_low = np.isfinite(low)
+    has_high = np.isfinite(high)
+
+    # A range that is open on one side is as long as one that is open on both.
+    assumed_low = np.where(has_high, high - 2 * half_range, -half_range)
+    assumed_high = np.where(has_low, low + 2 * half_range, half_range)
+    velocity = np.where(np.isfinite(limits.velocity), limits.velocity, speed)
+    has_acceleration = np.isfinite(limits.acceleration)
+    return dataclasses.replace(
+        limits,
+        position_min=np.where(has_low, low, assumed_low),
+        position_max=np.where(has_high, high, assumed_high),
+        velocity=velocity,
+        acceleration=np.where(has_acceleration, limits.acceleration, velocity / 0.25),
+    )
+
+
+def as_finite_array(name: str, value: Numbers, shape: tuple[int, ...]) -> AnyArray:
     """Return an array of finite numbers; that of JAX may have leading axes."""
-    if isinstance(value, jax.Array):
-        array: AnyArray = value
-    else:
-        array = np.array(as_array(name, value), np.float64)
-    if array.shape[array.ndim - len(shape) :] != shape or array.ndim < len(shape):
+    array = as_array(name, value)
+    if not isinstance(array, jax.Array):
+        array = np.array(array, np.float64)
+    last_axes = array.shape[array.ndim - len(shape) :]
+    if last_axes != shape:
         raise InputError(f"{name} must have the shape {shape}, but has {array.shape}.")
     if isinstance(array, np.ndarray) and not np.isfinite(array).all():
         raise InputError(f"{name} must hold finite numbers.")
@@ -400,12 +433,13 @@ def _unit_axes(axes: AnyArray) -> AnyArray:
     return np.where(np.abs(length - 1.0) > 1e-15, axes / length, axes)
 
 
-def _rotations(name: str, value: Numbers, shape: tuple[int, ...]) -> AnyArray:
+def as_rotations(name: str, value: Numbers, shape: tuple[int, ...]) -> AnyArray:
     """Return a copy as rotation matrices; a JAX array is taken as it is."""
-    R = _checked(name, value, shape)
+    R = as_finite_array(name, value, shape)
     if isinstance(R, np.ndarray):
-        error = np.abs(np.swapaxes(R, -1, -2) @ R - np.eye(3)).max(axis=(-1, -2))
-        if (error >= 1e-6).any() or (np.linalg.det(R) < 0).any():
+        products = np.swapaxes(R, -1, -2) @ R
+        is_orthonormal = np.abs(products - np.eye(3)).max() < 1e-6
+        if not is_orthonormal or (np.linalg.det(R) < 0).any():
             raise InputError(
                 f"{name} must hold orthonormal, right-handed rotation matrices."
             )

@@ -7,25 +7,30 @@ of its file.
 """
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from jaxid.arrays import AnyArray, Float, Matrix3, Numbers, Vector3, namespace
 from jaxid.errors import InputError
 
+Vectors = Float[AnyArray, "*batch 3"]
+"""Points or directions, with any leading axes."""
+Rotations = Float[AnyArray, "*batch 3 3"]
+"""Rotations, or inertia tensors, with any leading axes."""
 SNAP_TOLERANCE = 1e-4
 """Default difference from a quarter turn that counts as rounding [rad]."""
 
 
 def skew(a: Vector3) -> Matrix3:
     r"""Return the matrix $\tilde a$ with $\tilde a b = a \times b$ (Eq. 3)."""
-    x, y, z = a[0], a[1], a[2]
+    x = a[0]
+    y = a[1]
+    z = a[2]
     zero = 0.0 * x
     rows = [[zero, -z, y], [z, zero, -x], [-y, x, zero]]
     return namespace(a).array(rows)
 
 
-def rotation_about(
-    axis: Vector3, angle: Float[AnyArray, "*batch"]
-) -> Float[AnyArray, "*batch 3 3"]:
+def rotation_about(axis: Vector3, angle: AnyArray) -> Rotations:
     """Return the rotation about a unit vector by an angle [rad].
 
     The part of a vector along the axis stays and the rest turns: in this form a
@@ -40,15 +45,13 @@ def rotation_about(
 
 def axis_rotation(axis: Numbers, angle: float) -> Matrix3:
     """Return the rotation about a unit vector [rad], exact for quarter turns."""
-    R = rotation_about(np.asarray(axis, np.float64), np.asarray(angle))
-    return without_rounding(np.asarray(R))
+    turn = Rotation.from_rotvec(angle * np.asarray(axis, np.float64))
+    return without_rounding(turn.as_matrix())
 
 
 def rpy_rotation(rpy: Numbers) -> Matrix3:
     """Return the rotation by roll, pitch and yaw [rad] about x, y, z, as in URDF."""
-    roll, pitch, yaw = np.asarray(rpy, dtype=np.float64)
-    x, y, z = np.eye(3)
-    return axis_rotation(z, yaw) @ axis_rotation(y, pitch) @ axis_rotation(x, roll)
+    return without_rounding(Rotation.from_euler("xyz", rpy).as_matrix())
 
 
 def rpy_angles(rotation: Matrix3) -> Vector3:
@@ -60,9 +63,7 @@ def rpy_angles(rotation: Matrix3) -> Vector3:
     return np.array([roll, pitch, yaw])
 
 
-def snapped(
-    vectors: Float[AnyArray, "*shape 3"], tolerance: float
-) -> Float[np.ndarray, "*shape 3"]:
+def snapped(vectors: Vectors, tolerance: float) -> np.ndarray:
     """Return unit vectors whose entries within `tolerance` of zero are zero."""
     if not 0.0 <= tolerance < 0.1:
         raise InputError(
@@ -75,9 +76,7 @@ def snapped(
     return without_rounding(entries / lengths)
 
 
-def snapped_rotations(
-    rotations: Float[AnyArray, "*shape 3 3"], tolerance: float
-) -> Float[np.ndarray, "*shape 3 3"]:
+def snapped_rotations(rotations: Rotations, tolerance: float) -> np.ndarray:
     """Return nearest rotations whose entries within `tolerance` of zero are zero."""
     R = np.asarray(rotations, np.float64)
     rows = snapped(rotations, tolerance)

@@ -16,12 +16,14 @@ import numpy as np
 from jaxid.arrays import AnyArray, Array, Float, Matrix3, Numbers, Vector3
 from jaxid.errors import InputError
 
+from .robot import as_finite_array, as_rotations
+from .rotations import Vectors
+
 GROUND = -1
 """Index of the ground among the bodies."""
 ROUNDING = 1e-6
 """Largest error of a distance, by which it is smooth at zero [m]."""
 
-Vectors = Float[AnyArray, "*batch 3"]
 Lengths = Float[AnyArray, "*batch"]
 
 
@@ -43,7 +45,7 @@ class Capsule(eqx.Module):
     body: int = eqx.field(static=True)
     start: Vector3
     end: Vector3
-    radius: Float[AnyArray, ""]
+    radius: AnyArray
 
     def __init__(
         self,
@@ -56,10 +58,10 @@ class Capsule(eqx.Module):
     ):
         self.name = name
         self.body = body
-        self.start = _finite_point(f"`start` of capsule `{name}`", start)
+        self.start = as_finite_array(f"`start` of capsule `{name}`", start, (3,))
         self.end = self.start
         if end is not None:
-            self.end = _finite_point(f"`end` of capsule `{name}`", end)
+            self.end = as_finite_array(f"`end` of capsule `{name}`", end, (3,))
         self.radius = np.array(radius, np.float64)
         if not 0 < self.radius < np.inf:
             raise InputError(
@@ -81,7 +83,7 @@ class HalfSpace(eqx.Module):
 
     name: str = eqx.field(static=True)
     normal: Vector3
-    height: Float[AnyArray, ""]
+    height: AnyArray
 
     def __init__(
         self,
@@ -90,7 +92,7 @@ class HalfSpace(eqx.Module):
         normal: Numbers = (0.0, 0.0, 1.0),
         height: Numbers = 0.0,
     ):
-        direction = _finite_point(f"`normal` of `{name}`", normal)
+        direction = as_finite_array(f"`normal` of `{name}`", normal, (3,))
         length = np.linalg.norm(direction)
         if length < 1e-9 or not np.isfinite(height).all():
             raise InputError(
@@ -132,21 +134,20 @@ class Box(eqx.Module):
         size: Numbers,
         rotation: Numbers | None = None,
     ):
-        R = np.eye(3) if rotation is None else np.array(rotation, np.float64)
+        R = np.eye(3) if rotation is None else rotation
         self.name = name
-        self.rotation = R
-        self.centre = _finite_point(f"`centre` of box `{name}`", centre)
-        self.size = _finite_point(f"`size` of box `{name}`", size)
+        self.rotation = as_rotations(f"`rotation` of box `{name}`", R, (3, 3))
+        self.centre = as_finite_array(f"`centre` of box `{name}`", centre, (3,))
+        self.size = as_finite_array(f"`size` of box `{name}`", size, (3,))
         if (self.size <= 0).any():
             raise InputError(
                 f"`size` of box `{name}` must be positive [m], but is {size}."
             )
-        if R.shape != (3, 3) or not np.abs(R.T @ R - np.eye(3)).max() < 1e-6:
-            raise InputError(f"`rotation` of box `{name}` is no rotation matrix.")
 
     def distance(self, start: Vectors, end: Vectors) -> Lengths:
         """Return the signed distances of segments' deepest or nearest points [m]."""
         R = jnp.asarray(self.rotation)
+        # Everything in the frame of the box.
         centre = jnp.broadcast_to(self.centre @ self.rotation, start.shape)
         first = start @ R - centre
         extent = (end - start) @ R
@@ -165,7 +166,8 @@ class Box(eqx.Module):
         # leaves as it is.
         rising = slope(high)
         turn = rising - slope(low)
-        share = jnp.clip(rising / jnp.where(turn > 0, turn, 1.0), 0.0, 1.0)[..., 0]
+        ratio = rising / jnp.where(turn > 0, turn, 1.0)
+        share = jnp.clip(ratio, 0.0, 1.0)[..., 0]
         distance_before = self._signed(first + low * extent)
         distance_after = self._signed(first + high * extent)
         return share * distance_before + (1.0 - share) * distance_after
@@ -180,7 +182,10 @@ class Box(eqx.Module):
 
 
 def segment_distance(
-    start: Vectors, end: Vectors, other_start: Vectors, other_end: Vectors
+    start: Vectors,
+    end: Vectors,
+    other_start: Vectors,
+    other_end: Vectors,
 ) -> Lengths:
     """Return the distance between segments, which may touch or be points [m]."""
     u = end - start
@@ -255,11 +260,3 @@ def _rounded_norm(vector: Vectors) -> Array:
     """Return lengths of vectors, smooth at zero and up to `ROUNDING` too small [m]."""
     square = jnp.einsum("...i,...i->...", vector, vector)
     return jnp.sqrt(square + ROUNDING**2) - ROUNDING
-
-
-def _finite_point(name: str, value: Numbers) -> np.ndarray:
-    """Check and copy a point."""
-    point = np.array(value, np.float64)
-    if point.shape != (3,) or not np.isfinite(point).all():
-        raise InputError(f"{name} must hold three finite numbers, but is {value}.")
-    return point

@@ -5,17 +5,13 @@ from typing import Any
 
 import numpy as np
 
-from jaxid.arrays import AnyArray, Float, Joints, Numbers, is_traced
+from jaxid.arrays import AnyArray, Float, Joints, Numbers
 from jaxid.errors import InputError
 
-from .forward_kinematics import tip_jacobian
-from .inertia import BodyParameters, Inertia
-from .limits_and_drives import DOUBTFUL_LENGTH, Limits, owners, range_fault
+from .limits_and_drives import Limits, owners, range_fault
 from .robot import Robot
 from .urdf_tree import ORIGIN, TURNING, UrdfTree
 
-MIN_EFFORT_SHARE = 0.25
-"""Effort, relative to what gravity needs, below which its unit is doubtful."""
 UNLIMITED_RANGE = 2e4
 """Range of a joint that turns without end [rad]."""
 
@@ -71,11 +67,11 @@ def load_urdf(
     try:
         robot = Robot(
             tree.name,
-            parent=tuple(tree.parent),
+            parent=tuple(placement.body for placement in tree.placements),
             revolute=tuple(joint.get("type") in TURNING for joint in tree.joints),
-            axis=tree.axis,
-            rotation=tree.rotation,
-            offset=tree.offset,
+            axis=tree.axes,
+            rotation=[placement.rotation for placement in tree.placements],
+            offset=[placement.position for placement in tree.placements],
             joint_names=tuple(joint.get("name") for joint in tree.joints),
             gravity=tree.gravity if gravity is None else gravity,
             limits=limits,
@@ -87,9 +83,7 @@ def load_urdf(
         )
     except InputError as error:
         raise InputError(f"`{path}`: {error}") from error
-    # Gravity needs other forces where the robot is mounted at an angle.
-    robot = robot.mounted(base_rotation, base_position)
-    return robot.replace(notes=(*robot.notes, *_effort_notes(robot, tree.bodies())))
+    return robot.mounted(base_rotation, base_position)
 
 
 load_mjcf = load_urdf
@@ -126,7 +120,10 @@ def urdf_parameters(
 
 
 def joint_parameters(
-    path: str | Path, *, tip: str | None = None, base: str | None = None
+    path: str | Path,
+    *,
+    tip: str | None = None,
+    base: str | None = None,
 ) -> dict[str, Joints]:
     """Return `armature`, `damping` and dry `friction` that a file claims.
 
@@ -144,12 +141,9 @@ def joint_parameters(
 def _limits(tree: UrdfTree) -> tuple[Limits, list[str]]:
     """Return the limits of all joints, and notes on those that are taken as unknown."""
     joints = len(tree.joints)
-    low = np.full(joints, -np.inf)
-    high = np.full(joints, np.inf)
-    magnitudes = {
-        "velocity": np.full(joints, np.inf),
-        "effort": np.full(joints, np.inf),
-    }
+    low = np.empty(joints)
+    high = np.empty(joints)
+    magnitudes = {key: np.full(joints, np.inf) for key in ("velocity", "effort")}
     unknown: dict[str, list[str]] = {}
     for i, joint in enumerate(tree.joints):
         name = joint.get("name")
@@ -235,43 +229,3 @@ def _inertial_notes(tree: UrdfTree) -> list[str]:
                 f"does not need, belongs to no body: {fault}."
             )
     return notes
-
-
-def _effort_notes(robot: Robot, bodies: BodyParameters) -> list[str]:
-    """Return notes on joints that cannot hold a fraction of these bodies."""
-    if is_traced(robot):
-        return []
-    forces = np.abs(_gravity_forces(robot, bodies)).max(axis=0)
-    efforts = np.asarray(robot.limits.force)
-    notes = []
-    joints = np.flatnonzero(efforts < MIN_EFFORT_SHARE * forces)
-    for joint in joints.tolist():
-        unit = robot.force_unit(joint)
-        notes.append(
-            f"joint `{robot.joint_names[joint]}`: an effort of {efforts[joint]:.3g} "
-            f"{unit} is far below the {forces[joint]:.3g} {unit} that gravity needs "
-            "with the inertias of the file: are its units right?"
-        )
-    return notes
-
-
-def _gravity_forces(
-    robot: Robot, bodies: BodyParameters
-) -> Float[np.ndarray, "poses joints"]:
-    """Return the forces that bodies need at rest in random poses [N m or N]."""
-    low = np.asarray(robot.limits.position_min)
-    high = np.asarray(robot.limits.position_max)
-    ends = np.where(robot.revolute, np.pi, 0.0)
-    low = np.where(np.isfinite(low), low, -ends)
-    high = np.where(np.isfinite(high), high, ends)
-    q = np.random.default_rng(0).uniform(low, high, (64, robot.joints))
-
-    forces = np.zeros(q.shape)
-    for body, parameters in enumerate(bodies):
-        inertia = Inertia.from_parameters(parameters)
-        # A centre of mass that is so far away is in millimetres.
-        if inertia.mass > 0.0 and np.abs(inertia.centre).max() < DOUBTFUL_LENGTH:
-            at_centre = robot.replace(tip_body=body, tip_offset=inertia.centre)
-            velocity = tip_jacobian(at_centre, q).velocity
-            forces -= inertia.mass * (velocity @ robot.gravity)
-    return forces

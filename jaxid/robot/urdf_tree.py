@@ -48,8 +48,10 @@ class UrdfTree:
     Attributes:
         links: Elements of the links, by name.
         carriers: For each link its placement on the body that carries it.
-        joints: Elements of the moving joints; `parent`, `axis`, `rotation` and `offset`
-            as in `Robot`.
+        joints: Elements of the moving joints.
+        axes: Axes of these joints.
+        placements: Placements of the bodies that they move, on the bodies that carry
+            them.
         mimics: Elements of joints that mimic others.
         side_joints: Elements of joints on moving bodies that lead to no link of the
             chain.
@@ -59,7 +61,11 @@ class UrdfTree:
     """
 
     def __init__(
-        self, path: str | Path, *, base: str | None = None, tip: str | None = None
+        self,
+        path: str | Path,
+        *,
+        base: str | None = None,
+        tip: str | None = None,
     ) -> None:
         self.path = str(path)
         self.root, self.gravity, loops = read_description(path)
@@ -84,10 +90,8 @@ class UrdfTree:
                     f"its links are {listed(list(self.links))}."
                 )
         self.joints = []
-        self.parent = []
-        self.axis = []
-        self.rotation = []
-        self.offset = []
+        self.axes = []
+        self.placements: list[Placement] = []
         self.mimics = []
         self.side_joints = []
         self.objects = []
@@ -171,7 +175,8 @@ class UrdfTree:
                 is_fixed = True
                 self.mimics.append(joint)
             if is_fixed:
-                self.carriers[child] = self._held_placement(joint)
+                carrier = self.carriers[parent]
+                self.carriers[child] = _placed(carrier, *self.held_pose(joint))
             else:
                 self._add_body(joint)
             joints, links = lengths[parent]
@@ -194,32 +199,24 @@ class UrdfTree:
     def _add_body(self, joint: Any) -> None:
         """Enter the body that a joint moves."""
         parent, child = link_names(joint)
-        rotation, offset = self._origin(joint)
-        carrier = _placed(self.carriers[parent], rotation, offset)
-        self.axis.append(self._axis(joint))
+        placement = _placed(self.carriers[parent], *self._origin(joint))
         self.carriers[child] = Placement(len(self.joints), np.eye(3), np.zeros(3))
         self.joints.append(joint)
-        self.parent.append(carrier.body)
-        self.rotation.append(carrier.rotation)
-        self.offset.append(carrier.position)
-
-    def _held_placement(self, joint: Any) -> Placement:
-        """Return the placement of the link that a fixed or held joint carries."""
-        parent, _ = link_names(joint)
-        return _placed(self.carriers[parent], *self.held_pose(joint))
+        self.axes.append(self._axis(joint))
+        self.placements.append(placement)
 
     def placed_links(self) -> dict[str, Placement]:
         """Return `carriers`, and links on joints that the chain leaves out."""
         placements = dict(self.carriers)
         links = list(placements)
         for link in links:
-            body, R, r = placements[link]
             for joint in self._below[link]:
                 _, child = link_names(joint)
                 is_readable = joint.get("type") in (*TURNING, "prismatic", "fixed")
                 if is_readable and child not in placements:
-                    rotation, offset = self.held_pose(joint)
-                    placements[child] = Placement(body, R @ rotation, r + R @ offset)
+                    placements[child] = _placed(
+                        placements[link], *self.held_pose(joint)
+                    )
                     links.append(child)
         return placements
 
@@ -270,9 +267,7 @@ class UrdfTree:
     def held_pose(self, joint: Any) -> tuple[Matrix3, Vector3]:
         """Return attitude and origin [m] of a held joint's link in its parent."""
         R, r = self._origin(joint)
-        if joint.get("type") == "fixed":
-            return R, r
-        value = self.held_at(joint)
+        value = 0.0 if joint.get("type") == "fixed" else self.held_at(joint)
         if value == 0.0:
             return R, r
         axis = self._axis(joint)
@@ -370,7 +365,8 @@ class UrdfTree:
         if np.abs(rpy).max() > MAX_ANGLE:
             fault = f"its `rpy` is {_words(rpy)}, which are degrees, not radians"
         R = rpy_rotation(rpy)
-        return Inertia(mass, centre, R @ tensor @ R.T), fault
+        tensor = R @ tensor @ R.T
+        return Inertia(mass, centre, tensor), fault
 
     def place(self, element: Any) -> str:
         """Return file and line of an element, for messages."""

@@ -14,7 +14,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import Float, Hashable, Joints
+from jaxid.arrays import Hashable, Joints
 from jaxid.dynamics.terms import AbstractTerm, CoulombFriction, Tanh, ViscousFriction
 from jaxid.robot.robot import Robot
 
@@ -80,7 +80,7 @@ class AbstractGearFriction(Hashable):
         return ViscousFriction(), CoulombFriction(Tanh(EPSILON))
 
     @property
-    def parameters(self) -> Float[np.ndarray, " parameters"]:
+    def parameters(self) -> np.ndarray:
         """Parameters of these terms."""
         return np.concatenate([np.asarray(self.viscous), np.asarray(self.coulomb)])
 

@@ -7,11 +7,13 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Float, Hashable, Joints
-from jaxid.dynamics import projection_equation
+from jaxid.arrays import AnyArray, Hashable, Joints
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.motion import Motion
-from jaxid.dynamics.projection_equation import solve_symmetric
+from jaxid.dynamics.projection_equation import (
+    rigid_body_mass_matrix,
+    solve_symmetric,
+)
 from jaxid.dynamics.sample_methods import program_of
 from jaxid.errors import InputError
 from jaxid.program import to_python
@@ -35,7 +37,7 @@ class DriveTrain(Hashable):
     ripple: TorqueRipple | None  # ripple of the motor torques
     step: float  # length of a step [s]
 
-    def inertia_and_bias(self, p, q, qd) -> Float[AnyArray, " entries"]:
+    def inertia_and_bias(self, p, q, qd) -> AnyArray:
         """Return mass matrix, row by row, and bias forces of one sample (Eq. 38)."""
         model = self.model
         robot = model.robot
@@ -44,18 +46,16 @@ class DriveTrain(Hashable):
         if robot.tool is not None:
             bodies = np.zeros((robot.joints, 10))
             bodies[robot.tool.body] = robot.tool.parameters
-            M = M + projection_equation.rigid_body_mass_matrix(
-                robot, jnp.asarray(bodies), q
-            )
+            M = M + rigid_body_mass_matrix(robot, jnp.asarray(bodies), q)
             h = h + model.known_forces(q, qd, jnp.zeros_like(q))
         return jnp.concatenate([M.ravel(), h])
 
     def advance(
         self,
-        bodies: Float[AnyArray, " entries"],
-        state: Float[AnyArray, "4 joints"],
+        bodies: AnyArray,
+        state: AnyArray,
         u: Joints,
-    ) -> Float[AnyArray, "6 joints"]:
+    ) -> AnyArray:
         r"""Return the state after a step, and where to evaluate the bodies next.
 
         The state is $(q, \dot q, \ddot q)$ of the joints, and the deflections of the
@@ -87,7 +87,7 @@ class DriveTrain(Hashable):
 class SimulatedPlant:
     """One simulation of a robot, step by step; all numbers are on the joint side."""
 
-    def __init__(self, drives: DriveTrain, parameters: Float[AnyArray, " standard"]):
+    def __init__(self, drives: DriveTrain, parameters: AnyArray):
         n = drives.model.robot.joints
         p = np.asarray(parameters, np.float64)
         bodies = program_of(drives, drives.inertia_and_bias, p.shape, (n,), (n,))
@@ -141,14 +141,14 @@ class ServoRun(NamedTuple):
     """True motion of the joints at the ticks of a servo, and the forces after each."""
 
     motion: Motion
-    forces: Float[np.ndarray, "ticks joints"]
+    forces: np.ndarray
 
 
 def follow(
     plant: Any,
     servo: Servo,
     desired: Motion,
-    forward: Float[np.ndarray, "ticks joints"],
+    forward: AnyArray,
     limits: Joints,
     resolution: Joints,
     substeps: int,
@@ -181,27 +181,25 @@ def follow(
     states = []
     forces = []
     rate = [0.0] * n
-    previous_error = None
+    previous_error = [0.0] * n
     try:
         for goal, forward_forces in zip(goals, feed_forward, strict=True):
             state = plant.read()
-            angles = [
-                encoder_step[i] * round(state[i] / encoder_step[i]) for i in joints
-            ]
-            error = [goal[i] - angles[i] for i in joints]
             # The first tick has no error to compare with, and a constant error no rate.
-            before = error if previous_error is None else previous_error
-            rate = [
-                memory * rate[i] + rate_gain * (error[i] - before[i]) for i in joints
-            ]
-            undamped_u = [forward_forces[i] + kp[i] * error[i] for i in joints]
-            u = [undamped_u[i] + kd[i] * rate[i] for i in joints]
-            u = [min(max(u[i], -limit[i]), limit[i]) for i in joints]
+            is_first = not states
+            u = []
+            for i in joints:
+                angle = encoder_step[i] * round(state[i] / encoder_step[i])
+                error = goal[i] - angle
+                change = 0.0 if is_first else error - previous_error[i]
+                rate[i] = memory * rate[i] + rate_gain * change
+                previous_error[i] = error
+                force = forward_forces[i] + kp[i] * error + kd[i] * rate[i]
+                u.append(min(max(force, -limit[i]), limit[i]))
             states.append(list(state))
             forces.append(u)
             for _ in range(substeps):
                 plant.step(u)
-            previous_error = error
         states.append(list(plant.read()))
     except (ArithmeticError, ValueError) as failure:
         raise InputError(

@@ -7,14 +7,15 @@ from typing import Any
 
 import numpy as np
 
-from jaxid.arrays import AnyArray, Float
+from jaxid.arrays import AnyArray
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
 from jaxid.export.feed_forward import body_parameters
 from jaxid.export.mujoco_model import mjcf_text
+from jaxid.robot.inertia import BodyParameters
 from jaxid.robot.mjcf import import_mujoco
 
-from .virtual import VirtualRobot
+from .virtual import PerSample, VirtualRobot
 
 
 class MujocoRobot(VirtualRobot):
@@ -55,7 +56,7 @@ class MujocoRobot(VirtualRobot):
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_LIMIT
         return MujocoPlant(model, self.robot.joint_names)
 
-    def _drive_inertia(self) -> Float[np.ndarray, "joints joints"]:
+    def _drive_inertia(self) -> np.ndarray:
         """Return the inertia of the rotors on the joint side [kg m² or kg]."""
         matrices = [
             term.drive_matrices(self.robot)[0] @ np.asarray(p)
@@ -63,7 +64,7 @@ class MujocoRobot(VirtualRobot):
         ]
         return np.sum(matrices, axis=0)
 
-    def _bodies_with_tool(self) -> Float[np.ndarray, "joints 10"]:
+    def _bodies_with_tool(self) -> BodyParameters:
         """Return ten parameters of each body, with a known tool."""
         robot = self.robot
         for term, p in self.bodies.split(self.values):
@@ -77,7 +78,7 @@ class MujocoRobot(VirtualRobot):
             bodies[robot.tool.body] += np.asarray(robot.tool.parameters)
         return bodies
 
-    def forces(self, motion: Motion) -> Float[np.ndarray, "samples joints"]:
+    def forces(self, motion: Motion) -> PerSample:
         """Return a motion's forces by MuJoCo's inverse dynamics, without dry friction.
 
         MuJoCo's dry friction depends on the solver of its constraints [N m or N].
@@ -129,7 +130,7 @@ class MujocoPlant:
         arrays = (data.qpos, data.qvel, data.qacc)
         return np.concatenate([x[self._addresses] for x in arrays]).tolist()
 
-    def inverse(self, motion: Motion) -> Float[np.ndarray, "samples joints"]:
+    def inverse(self, motion: Motion) -> PerSample:
         """Return forces of a motion without dry friction [N m or N]."""
         forces = np.empty(motion.q.shape)
         self._model.dof_frictionloss[:] = 0.0

@@ -8,13 +8,17 @@ the list.
 
 import numpy as np
 
-from jaxid.arrays import Float
 from jaxid.dynamics.terms import RigidBodies, RotorInertia
 from jaxid.robot import library
 from jaxid.robot.limits_and_drives import Drives
 from jaxid.robot.robot import Robot
 
-from .friction_and_ripple import FrictionTemperature, LuGreFriction, TorqueRipple
+from .friction_and_ripple import (
+    FrictionTemperature,
+    LuGreFriction,
+    SmoothFriction,
+    TorqueRipple,
+)
 from .virtual import Sensors, VirtualRobot
 
 COLD = {1: 273.40, 2: 1.68, 27: 248.41, 28: 41.26, 34: 312.50, 35: 18.24}
@@ -80,10 +84,13 @@ def virtual_tx90l_on_rail(
         heating=heating,
         temperature=np.full(7, TEMPERATURES[warm]),
     )
-    return virtual if disturbed else virtual.undisturbed()
+    if disturbed:
+        return virtual
+    smooth_friction = SmoothFriction(friction.viscous, friction.coulomb)
+    return virtual.replace(friction=smooth_friction, ripple=None)
 
 
-def cad_tx90l_on_rail() -> Float[np.ndarray, " standard"]:
+def cad_tx90l_on_rail() -> np.ndarray:
     """Return a CAD model of `virtual_tx90l_on_rail().model` without friction.
 
     It describes bodies and rotors. Masses and rotors are 10 to 18 % off, each body as a
@@ -96,25 +103,26 @@ def cad_tx90l_on_rail() -> Float[np.ndarray, " standard"]:
     )
 
 
-def _bodies(published: dict[int, float]) -> Float[np.ndarray, "7 7"]:
+def _bodies(published: dict[int, float]) -> np.ndarray:
     """Return seven parameters of each body with published base parameters (Eq. 24)."""
     entry = library.entries()["virtual_tx90l_on_rail"]
     m = np.array(entry["masses"])
     r = np.array(entry["centres"])
     gyration = np.array(entry["gyration"])
     # m4 r_c4z counts 20 times in p_B(1) and once in p_B(2): with l_2x = l_3z = 0.05 m.
-    moment = m[3] * r[3, 2]
-    other_masses = m[1] + m[2] + ROTORS[0] - 20.0 * moment
-    m[0] = published[1] - other_masses
-    first_moment = published[2] - 0.05 * m[2] + moment
+    forearm_moment = m[3] * r[3, 2]
+    carried_masses = m[1] + m[2] + ROTORS[0]
+    m[0] = published[1] - carried_masses + 20.0 * forearm_moment
+    first_moment = published[2] - 0.05 * m[2] + forearm_moment
     r[1, 0] = first_moment / m[1]
     # Second moments about the origin without products: possible if each leaves room for
     # all others.
     shares = np.count_nonzero(r, axis=1)[:, None]
     spread = gyration**2 + shares * r**2
     planes = spread.sum(axis=1, keepdims=True) - spread
-    moments = m[:, None] * planes
-    return np.concatenate([m[:, None], m[:, None] * r, moments], axis=1)
+    masses = m[:, None]
+    moments = masses * planes
+    return np.hstack([masses, masses * r, moments])
 
 
 def _friction(robot: Robot) -> tuple[LuGreFriction, FrictionTemperature]:
@@ -151,7 +159,7 @@ def _friction(robot: Robot) -> tuple[LuGreFriction, FrictionTemperature]:
     return friction, heating
 
 
-def _warm_factors(first: int, second: int) -> Float[np.ndarray, "7"]:
+def _warm_factors(first: int, second: int) -> np.ndarray:
     """Return warm over cold friction of all axes, by two numbers of base parameters."""
     factor_1 = WARM[first] / COLD[first]
     factor_2 = WARM[second] / COLD[second]

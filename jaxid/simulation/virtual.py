@@ -17,17 +17,19 @@ from jaxid.dynamics.terms import AbstractTerm
 from jaxid.errors import InputError
 from jaxid.identification.consistency.pseudo_inertia import inertial_parameters
 from jaxid.measurement.recording import Recording
+from jaxid.robot.inertia import BodyParameters
 from jaxid.robot.robot import Robot
 from jaxid.trajectory.trajectory import AbstractTrajectory
 
 from .friction_and_ripple import (
     AbstractGearFriction,
     FrictionTemperature,
-    SmoothFriction,
     TorqueRipple,
 )
 from .mechanics import DriveTrain, Servo, SimulatedPlant, follow
 
+PerSample = Float[AnyArray, "samples joints"]
+"""One number for each sample and joint."""
 SERVO_FREQUENCY = 8.0
 """Natural frequency of a servo's joints [Hz]."""
 SERVO_POSES = 200
@@ -42,7 +44,7 @@ CLOUD_WIDTH = 0.05
 
 def random_bodies(
     robot: Robot, masses: Joints, random: np.random.Generator
-) -> Float[np.ndarray, "joints 10"]:
+) -> BodyParameters:
     """Draw inertial parameters of bodies that can exist: point masses along the links.
 
     A cloud reaches from the origin of the body's frame to the next joint, or to the
@@ -88,7 +90,7 @@ class Sensors(eqx.Module):
     memory: float = 0.02
     motor_side: bool = eqx.field(static=True, default=False)
 
-    def resolution(self, robot: Robot) -> Float[np.ndarray, " joints"]:
+    def resolution(self, robot: Robot) -> Joints:
         """Return the steps of the encoders on the joint side [rad or m]."""
         turns = np.abs(np.diag(robot.drives.reduction)) if self.motor_side else 1.0
         return np.broadcast_to(self.encoder_step / turns, robot.joints)
@@ -96,8 +98,8 @@ class Sensors(eqx.Module):
     def record(
         self,
         robot: Robot,
-        angles: Float[AnyArray, "samples joints"],
-        forces: Float[AnyArray, "samples joints"],
+        angles: PerSample,
+        forces: PerSample,
         *,
         sample_time: float,
         seed: int,
@@ -112,7 +114,12 @@ class Sensors(eqx.Module):
         forces = np.asarray(forces)
         white, drive = random.standard_normal((2, *forces.shape))
         initial = random.standard_normal((1, forces.shape[1]))
-        coloured = _coloured(drive, initial, np.exp(-sample_time / self.memory))
+        # Each sample remembers a part of the one before; the variance stays one.
+        share = np.exp(-sample_time / self.memory)
+        gain = np.sqrt(1.0 - share**2)
+        coloured, _ = signal.lfilter(
+            [gain], [1.0, -share], drive, axis=0, zi=share * initial
+        )
         forces = forces + white * np.asarray(self.white_noise)
         forces = forces + coloured * np.asarray(self.coloured_noise)
         if self.motor_side:
@@ -126,15 +133,6 @@ class Sensors(eqx.Module):
             forces_on_motor_side=self.motor_side,
             name=name,
         )
-
-
-def _coloured(white: np.ndarray, initial: np.ndarray, memory: float) -> np.ndarray:
-    """Return noise of the same variance that is correlated from sample to sample."""
-    gain = np.sqrt(1.0 - memory**2)
-    noise, _ = signal.lfilter(
-        [gain], [1.0, -memory], white, axis=0, zi=memory * initial
-    )
-    return noise
 
 
 class Tracking(eqx.Module):
@@ -152,15 +150,15 @@ class Tracking(eqx.Module):
             0 to 1.
     """
 
-    time: Float[AnyArray, " samples"]
+    time: AnyArray
     desired: Motion
     actual: Motion
-    forces: Float[AnyArray, "samples joints"]
+    forces: PerSample
     recording: Recording
     saturated: Joints
 
     @property
-    def tracking_error(self) -> Float[np.ndarray, "samples joints"]:
+    def tracking_error(self) -> PerSample:
         """Desired minus true positions [rad or m]."""
         return np.asarray(self.desired.q) - np.asarray(self.actual.q)
 
@@ -198,12 +196,9 @@ class VirtualRobot(Hashable):
                 f"`values` must hold {size} numbers for `terms`, but has shape "
                 f"{self.values.shape}."
             )
-        gears = None if self.heating is None else (self.robot.joints,)
-        shape = None if self.temperature is None else self.temperature.shape
-        if shape != gears:
+        if (self.temperature is None) != (self.heating is None):
             raise InputError(
-                "`temperature` must hold one number for each gear with `heating`, "
-                "else None."
+                "`temperature` must be given with `heating`, and only with it."
             )
 
     @property
@@ -224,7 +219,7 @@ class VirtualRobot(Hashable):
         return Model(self.robot, (self.terms[0], *self.friction.terms, *self.terms[1:]))
 
     @property
-    def parameters(self) -> Float[np.ndarray, " standard"]:
+    def parameters(self) -> np.ndarray:
         """True standard parameters of `model` at the present temperature."""
         first, *others = (np.asarray(x) for _, x in self.bodies.split(self.values))
         return np.concatenate([first, self.present_friction.parameters, *others])
@@ -232,11 +227,6 @@ class VirtualRobot(Hashable):
     def replace(self, **fields: Any) -> "VirtualRobot":
         """Return a copy with some fields replaced, such as another friction."""
         return dataclasses.replace(self, **fields)
-
-    def undisturbed(self) -> "VirtualRobot":
-        """Return the robot of the model: smooth friction, and sensor noise only."""
-        friction = SmoothFriction(self.friction.viscous, self.friction.coulomb)
-        return self.replace(friction=friction, ripple=None)
 
     def at(self, temperature: Joints | float) -> "VirtualRobot":
         """Return the same robot with gears of another temperature.
@@ -253,7 +243,7 @@ class VirtualRobot(Hashable):
 
     def warming(
         self, trajectory: AbstractTrajectory, *, duration: float
-    ) -> tuple[Float[np.ndarray, " times"], Float[np.ndarray, "times joints"]]:
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Return temperatures of a repeated motion: friction heats the gears (Sec. 6).
 
         Args:
@@ -310,7 +300,7 @@ class VirtualRobot(Hashable):
             return friction
         return friction - self.ripple.forces(self.robot, q)
 
-    def forces(self, motion: Motion) -> Float[np.ndarray, "samples joints"]:
+    def forces(self, motion: Motion) -> PerSample:
         """Return the forces of the drives for a motion, with rigid gears [N m or N]."""
         arrays = [np.asarray(x, np.float64) for x in (motion.q, motion.qd, motion.qdd)]
         forces = in_numpy(
@@ -453,9 +443,7 @@ class VirtualRobot(Hashable):
         return Tracking(time[samples], desired[samples], actual, forces, log, saturated)
 
 
-def mean_power(
-    friction: AbstractGearFriction, motion: Motion
-) -> Float[np.ndarray, " joints"]:
+def mean_power(friction: AbstractGearFriction, motion: Motion) -> Joints:
     """Return the mean power of friction in a motion [W]."""
     forces = in_numpy(friction, friction.steady, motion.qd)
     return np.mean(forces * motion.qd, axis=0)
@@ -463,7 +451,7 @@ def mean_power(
 
 def forward_forces(
     feed_forward: Callable[[Motion], AnyArray] | None, desired: Motion
-) -> Float[np.ndarray, "samples joints"]:
+) -> PerSample:
     """Return the forces that are fed forward [N m or N]."""
     if feed_forward is None:
         return np.zeros(desired.q.shape)

@@ -10,7 +10,6 @@ from .files import (
 from .fourier import (
     FourierBasis as FourierBasis,
     RestToRestBasis as RestToRestBasis,
-    fourier_series as fourier_series,
     random_fourier_series as random_fourier_series,
 )
 from .lead_in_and_out import (
@@ -19,16 +18,15 @@ from .lead_in_and_out import (
     with_leads as with_leads,
 )
 from .prescribed_tip_path import (
-    Circle as Circle,
-    Line as Line,
     TipPath as TipPath,
+    circle as circle,
     iso9283_path as iso9283_path,
     joint_path as joint_path,
+    line as line,
 )
 from .spline import (
     PiecewisePolynomial as PiecewisePolynomial,
     RestToRestSplineBasis as RestToRestSplineBasis,
-    spline_through as spline_through,
 )
 from .trajectory import (
     AbstractBasis as AbstractBasis,

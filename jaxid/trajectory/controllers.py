@@ -34,7 +34,10 @@ class Controller(NamedTuple):
 
 
 def write_urscript(
-    trajectory: AbstractTrajectory, robot: Robot, path: Path, sample_time: float
+    trajectory: AbstractTrajectory,
+    robot: Robot,
+    path: Path,
+    sample_time: float,
 ) -> None:
     """Write a program in URScript: to the start, then one `servoj` a cycle.
 
@@ -55,7 +58,10 @@ def write_urscript(
 
 
 def write_rsi(
-    trajectory: AbstractTrajectory, robot: Robot, path: Path, sample_time: float
+    trajectory: AbstractTrajectory,
+    robot: Robot,
+    path: Path,
+    sample_time: float,
 ) -> None:
     """Write a table for RSI: degrees from the first position, one row a cycle."""
     q = trajectory.sample(sample_time)[1].q

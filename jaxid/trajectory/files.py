@@ -165,7 +165,9 @@ def write_ros(
 
 
 def _write_bag(
-    joint_names: list[str], points: list[dict[str, Any]], path: Path
+    joint_names: list[str],
+    points: list[dict[str, Any]],
+    path: Path,
 ) -> None:
     """Write the message as a bag of ROS 2 in one file (MCAP)."""
     purpose = f"`{path.name}` is written by"
@@ -200,7 +202,9 @@ def _ros_time(time: float) -> dict[str, int]:
 
 
 def _sample(
-    trajectory: AbstractTrajectory, robot: Robot, sample_time: float
+    trajectory: AbstractTrajectory,
+    robot: Robot,
+    sample_time: float,
 ) -> tuple[np.ndarray, Motion]:
     """Return times and motion of a trajectory that moves the robot's joints."""
     if trajectory.joints != robot.joints:

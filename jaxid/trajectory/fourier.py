@@ -1,24 +1,19 @@
 """Fourier series: periodic, or between standstills (Eqs. 34, 35)."""
 
-import dataclasses
 import math
 
 import equinox as eqx
 import numpy as np
 from scipy.linalg import block_diag, null_space
 
-from jaxid.arrays import AnyArray, Float, is_traced, namespace
+from jaxid.arrays import AnyArray, is_traced, namespace
 from jaxid.errors import InputError
-from jaxid.robot.limits_and_drives import Limits
-from jaxid.robot.robot import Robot
+from jaxid.robot.robot import Robot, complete_limits
 
 from .trajectory import (
     AbstractBasis,
-    Envelope,
     LinearTrajectory,
-    Rows,
     Time,
-    Times,
     as_scalar,
     stand_outside,
 )
@@ -31,7 +26,8 @@ class FourierBasis(AbstractBasis):
     - \frac{b_{i,l}}{\omega l} \cos(\omega l t) \right)$$
 
     The coefficients of a joint are its offset $q_{i,0}$ [rad or m], all $a_{i,l}$ and
-    all $b_{i,l}$ [rad/s or m/s].
+    all $b_{i,l}$ [rad/s or m/s]: with those of the paper as columns, the trajectory is
+    `basis.trajectory(np.column_stack([offset, a, b]))`.
 
     Attributes:
         harmonics: Number of harmonics $N$.
@@ -42,7 +38,7 @@ class FourierBasis(AbstractBasis):
     """
 
     harmonics: int = eqx.field(static=True)
-    omega: Float[AnyArray, ""] = eqx.field(converter=as_scalar)
+    omega: AnyArray = eqx.field(converter=as_scalar)
 
     def __check_init__(self):
         if self.harmonics < 1:
@@ -59,7 +55,7 @@ class FourierBasis(AbstractBasis):
         """Period [s]."""
         return 2 * math.pi / self.omega
 
-    def rows(self, t: Times) -> Rows:
+    def rows(self, t):
         """Return a constant, sines and cosines, and their derivatives."""
         xp = namespace(t, self.omega)
         w = self.omega * np.arange(1.0, self.harmonics + 1.0)[None]
@@ -76,7 +72,7 @@ class FourierBasis(AbstractBasis):
         )
         return xp.stack([xp.concatenate(parts, axis=1) for parts in orders])
 
-    def envelope(self, points: int) -> Envelope:
+    def envelope(self, points):
         r"""Return samples of a period, which bound the series.
 
         The bound $\max |p| \le \max_k |p(t_k)| / \cos(\pi n / M)$ holds for every
@@ -92,7 +88,7 @@ class PeriodsBasis(AbstractBasis):
     """Periods of a Fourier series between two standstills: base of two bases."""
 
     harmonics: int = eqx.field(static=True)
-    omega: Float[AnyArray, ""] = eqx.field(converter=as_scalar)
+    omega: AnyArray = eqx.field(converter=as_scalar)
     periods: int = eqx.field(static=True, default=1)
 
     def __check_init__(self):
@@ -135,14 +131,14 @@ class RestToRestBasis(PeriodsBasis):
         return self.periods * self.series.duration
 
     @property
-    def directions(self) -> Float[np.ndarray, "coefficients variables"]:
+    def directions(self) -> np.ndarray:
         """Orthonormal coefficients of the series that rest at both ends."""
         orders = np.arange(1.0, self.harmonics + 1.0)
         a = null_space(np.ones((1, self.harmonics)))
         b = null_space(orders[None])
         return np.asarray(block_diag(np.ones((1, 1)), a, b))
 
-    def rows(self, t: Times) -> Rows:
+    def rows(self, t):
         """Return sines and cosines in the directions that rest at both ends."""
 
         def series_rows(t: AnyArray) -> AnyArray:
@@ -150,33 +146,14 @@ class RestToRestBasis(PeriodsBasis):
 
         return stand_outside(series_rows, t, self.duration)
 
-    def envelope(self, points: int) -> Envelope:
+    def envelope(self, points):
         """Return samples of a period, as for any series."""
         rows, factor = self.series.envelope(points)
         return tuple(x @ self.directions for x in rows), factor
 
-    def times(self, samples: int) -> Times:
+    def times(self, samples):
         """Return equidistant times over one period [s]."""
         return self.series.times(samples)
-
-
-def fourier_series(
-    offset: Float[AnyArray, " joints"],
-    a: Float[AnyArray, "joints harmonics"],
-    b: Float[AnyArray, "joints harmonics"],
-    omega: Time,
-) -> LinearTrajectory:
-    """Return a Fourier series from the coefficients of the paper (Eqs. 34, 35).
-
-    Args:
-        offset: Centre of each joint's motion [rad or m].
-        a: Amplitudes of the velocity's cosines [rad/s or m/s].
-        b: Amplitudes of the velocity's sines [rad/s or m/s].
-        omega: Ground frequency [rad/s].
-    """
-    xp = namespace(offset, a, b)
-    x = xp.concatenate([offset[:, None], a, b], axis=1)
-    return FourierBasis(a.shape[1], omega).trajectory(x)
 
 
 def random_fourier_series(
@@ -217,54 +194,25 @@ def random_fourier_series(
     random = np.random.default_rng(seed)
     amplitudes = random.standard_normal((2, robot.joints, harmonics))
     a, b = amplitudes / np.arange(1, harmonics + 1)
-    x = np.concatenate([np.zeros((robot.joints, 1)), a, b], axis=1)
+    x = np.hstack([np.zeros((robot.joints, 1)), a, b])
 
     # Each joint meets its tightest limit, also between the points of the envelope.
     rows, factor = basis.envelope(512)
     q, qd, qdd = (x @ part.T for part in rows[:3])
-    centre = 0.5 * (q.max(axis=1) + q.min(axis=1))
-    swing = 0.5 * factor * np.ptp(q, axis=1)
+    top = q.max(axis=1)
+    bottom = q.min(axis=1)
+    centre = 0.5 * (top + bottom)
+    swing = 0.5 * factor * (top - bottom)
     speed = factor * np.abs(qd).max(axis=1)
     acceleration = factor * np.abs(qdd).max(axis=1)
-    scale = np.min(
-        [
-            half_range / swing,
-            reach * limits.velocity / speed,
-            reach * limits.acceleration / acceleration,
-        ],
-        axis=0,
-    )
+    scales = [
+        half_range / swing,
+        reach * limits.velocity / speed,
+        reach * limits.acceleration / acceleration,
+    ]
+    scale = np.min(scales, axis=0)
     room = np.maximum(half_range - scale * swing, 0.0)
     shift = random.uniform(-1.0, 1.0, robot.joints) * room
     x *= scale[:, None]
     x[:, 0] = 0.5 * (low + high) - scale * centre + shift
     return basis.trajectory(x)
-
-
-def complete_limits(robot: Robot) -> Limits:
-    """Return the limits of a robot, with assumed ones for those that are unknown.
-
-    Assumed are: half a turn or 1 m to either side; 90 degrees/s or 0.5 m/s; the
-    acceleration that reaches the largest speed in 0.25 s.
-    """
-    limits = robot.limits
-    is_revolute = np.array(robot.revolute, bool)
-    half_range = np.where(is_revolute, math.pi, 1.0)
-    speed = np.where(is_revolute, math.pi / 2, 0.5)
-    low = np.asarray(limits.position_min)
-    high = np.asarray(limits.position_max)
-    has_low = np.isfinite(low)
-    has_high = np.isfinite(high)
-
-    # A range that is open on one side is as long as one that is open on both.
-    assumed_low = np.where(has_high, high - 2 * half_range, -half_range)
-    assumed_high = np.where(has_low, low + 2 * half_range, half_range)
-    velocity = np.where(np.isfinite(limits.velocity), limits.velocity, speed)
-    has_acceleration = np.isfinite(limits.acceleration)
-    return dataclasses.replace(
-        limits,
-        position_min=np.where(has_low, low, assumed_low),
-        position_max=np.where(has_high, high, assumed_high),
-        velocity=velocity,
-        acceleration=np.where(has_acceleration, limits.acceleration, velocity / 0.25),
-    )

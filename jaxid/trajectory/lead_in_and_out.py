@@ -1,28 +1,34 @@
 """Leads: from standstill into a periodic motion, and out of it."""
 
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from scipy.special import comb
 
-from jaxid.arrays import AnyArray, Float, double_precision, is_traced, namespace
+from jaxid.arrays import AnyArray, Joints, double_precision, is_traced, namespace
 from jaxid.errors import InputError
 from jaxid.robot.limits_and_drives import Limits
-from jaxid.robot.robot import Robot
+from jaxid.robot.robot import Robot, complete_limits
 
-from .fourier import PeriodsBasis, complete_limits
+from .fourier import PeriodsBasis
 from .trajectory import (
     AbstractTrajectory,
-    Envelope,
-    Rows,
-    States,
     Time,
-    Times,
     as_scalar,
     stand_outside,
 )
+
+LEAD_DEGREE = 4
+"""Degree of a lead's position as a polynomial of time."""
+ENVELOPE_PIECES = 8
+"""Pieces of a lead that are bounded by their own control points."""
+PHASES = 360
+"""Instants of the period at which `with_leads` tries to enter and leave it."""
+LEAD_DURATIONS = np.geomspace(0.02, 10.0, 120)[:, None, None]
+"""Durations of leads that `with_leads` tries [s]."""
 
 
 def _lead(state: Any, duration: Any, x: Any, sign: int = 1) -> list:
@@ -35,11 +41,15 @@ def _lead(state: Any, duration: Any, x: Any, sign: int = 1) -> list:
     alpha, beta = _velocity_coefficients(sign * qd, qdd, duration)
     square_part = alpha * (x**3 - duration**3) / 3
     cube_part = beta * (x**4 - duration**4) / 4
+    position = q + square_part + cube_part
+    velocity = alpha * x**2 + beta * x**3
+    acceleration = 2 * alpha * x + 3 * beta * x**2
+    jerk = 2 * alpha + 6 * beta * x
     return [
-        q + square_part + cube_part,
-        sign * (alpha * x**2 + beta * x**3),
-        2 * alpha * x + 3 * beta * x**2,
-        sign * (2 * alpha + 6 * beta * x),
+        position,
+        sign * velocity,
+        acceleration,
+        sign * jerk,
     ]
 
 
@@ -48,14 +58,6 @@ def _velocity_coefficients(qd: Any, qdd: Any, duration: Any) -> tuple[Any, Any]:
     alpha = 3 * qd / duration**2 - qdd / duration
     beta = qdd / duration**2 - 2 * qd / duration**3
     return alpha, beta
-
-
-LEAD_DEGREE = 4
-"""Degree of a lead's position as a polynomial of time."""
-ENVELOPE_PIECES = 8
-"""Pieces of a lead that are bounded by their own control points."""
-PHASES = 360
-"""Instants of the period at which `with_leads` tries to enter and leave it."""
 
 
 class LeadsBasis(PeriodsBasis):
@@ -75,9 +77,7 @@ class LeadsBasis(PeriodsBasis):
         InputError: If one of them is not positive.
     """
 
-    lead: Float[AnyArray, ""] = eqx.field(
-        converter=as_scalar, default=0.5, kw_only=True
-    )
+    lead: AnyArray = eqx.field(converter=as_scalar, default=0.5, kw_only=True)
 
     def __check_init__(self):
         if not is_traced(self.lead) and not 0 < self.lead < math.inf:
@@ -90,17 +90,19 @@ class LeadsBasis(PeriodsBasis):
         """Time from standstill to standstill [s]."""
         return self.periods * self.series.duration + 2 * self.lead
 
-    def rows(self, t: Times) -> Rows:
+    def rows(self, t):
         """Return the series, or the polynomials that lead into it and out of it."""
 
         def moving(t: AnyArray) -> AnyArray:
             xp = namespace(t, self.omega, self.lead)
-            is_early = (t < self.lead)[None, :, None]
-            is_late = (t > self.duration - self.lead)[None, :, None]
+            time = t[None, :, None]
+            is_early = time < self.lead
+            is_late = time > self.duration - self.lead
+            lead_in = self._lead_rows(t, 1)
             series = self.series.rows(t - self.lead)
             lead_out = self._lead_rows(self.duration - t, -1)
             rows = xp.where(is_late, lead_out, series)
-            return xp.where(is_early, self._lead_rows(t, 1), rows)
+            return xp.where(is_early, lead_in, rows)
 
         return stand_outside(moving, t, self.duration)
 
@@ -109,14 +111,14 @@ class LeadsBasis(PeriodsBasis):
         state = self.series.rows(np.zeros(1))[:3]
         return namespace(x, self.omega).stack(_lead(state, self.lead, x[:, None], sign))
 
-    def envelope(self, points: int) -> Envelope:
+    def envelope(self, points):
         """Return samples of a period, and control points of the leads.
 
         A polynomial lies within the range of its control points (Bernstein). A lead is
         split into pieces, each of which is bounded by its own control points.
         """
         rows, factor = self.series.envelope(points)
-        to_points = _to_control_points(LEAD_DEGREE)
+        to_points = _to_control_points()
         fractions = np.linspace(0.0, 1.0, LEAD_DEGREE + 1)
         duration = self.lead / ENVELOPE_PIECES
         parts: list[Any] = [rows]
@@ -126,23 +128,24 @@ class LeadsBasis(PeriodsBasis):
                 parts.append(to_points @ self._lead_rows(t, sign))
         return tuple(np.concatenate(x) for x in zip(*parts, strict=True)), factor
 
-    def times(self, samples: int) -> Times:
+    def times(self, samples):
         """Return equidistant times over one period between the leads [s]."""
         return float(self.lead) + self.series.times(samples)
 
-    def instants(self, points: int) -> Times:
+    def instants(self, points):
         """Return equidistant times over the leads and one period [s]."""
-        period, lead = float(self.series.duration), float(self.lead)
-        t = np.arange(points) * ((period + 2 * lead) / (points - 1))
+        period = float(self.series.duration)
+        lead = float(self.lead)
+        t = np.linspace(0.0, period + 2 * lead, points)
+        # The lead-out follows the last period.
         return np.where(t > lead + period, t + (self.periods - 1) * period, t)
 
 
-def _to_control_points(degree: int) -> Float[np.ndarray, "points samples"]:
-    """Return the matrix from values of a polynomial to its control points."""
-    orders = np.arange(degree + 1)
-    u = np.linspace(0.0, 1.0, degree + 1)[:, None]
-    binomials = np.array([math.comb(degree, order) for order in orders])
-    bernstein = binomials * u**orders * (1 - u) ** (degree - orders)
+def _to_control_points() -> np.ndarray:
+    """Return the matrix from values of a lead's polynomial to its control points."""
+    orders = np.arange(LEAD_DEGREE + 1)
+    u = np.linspace(0.0, 1.0, LEAD_DEGREE + 1)[:, None]
+    bernstein = comb(LEAD_DEGREE, orders) * u**orders * (1 - u) ** orders[::-1]
     return np.linalg.inv(bernstein)
 
 
@@ -161,13 +164,13 @@ class WithLeads(AbstractTrajectory):
     """
 
     inner: AbstractTrajectory
-    start: Float[AnyArray, ""] = eqx.field(converter=as_scalar)
-    length: Float[AnyArray, ""] = eqx.field(converter=as_scalar)
-    lead_in: Float[AnyArray, " joints"]
-    lead_out: Float[AnyArray, " joints"]
+    start: Time = eqx.field(converter=as_scalar)
+    length: Time = eqx.field(converter=as_scalar)
+    lead_in: Joints
+    lead_out: Joints
 
     @property
-    def window(self) -> tuple[Float[AnyArray, ""], Float[AnyArray, ""]]:
+    def window(self) -> tuple[Time, Time]:
         """Times between which the inner motion is followed and measured [s]."""
         begin = jnp.max(jnp.asarray(self.lead_in))
         return begin, begin + self.length
@@ -177,7 +180,7 @@ class WithLeads(AbstractTrajectory):
         """Time from standstill to standstill [s]."""
         return self.window[1] + jnp.max(jnp.asarray(self.lead_out))
 
-    def states(self, t: Times) -> States:
+    def states(self, t):
         """Return the motion between the leads, and the leads; standstill outside."""
         begin, end = self.window
         time = t[:, None]
@@ -188,20 +191,24 @@ class WithLeads(AbstractTrajectory):
         from_start = jnp.clip(time - begin + lead_in, 0.0, lead_in)
         to_end = jnp.clip(end + lead_out - time, 0.0, lead_out)
 
-        inner_states = self.inner.states(self.start + t - begin)
-        in_states = _lead(first, lead_in, from_start)
-        out_states = _lead(last, lead_out, to_end, -1)
-        states = []
-        for series_part, in_part, out_part in zip(
-            inner_states, in_states, out_states, strict=False
-        ):
-            after_start = jnp.where(time > end, out_part, series_part)
-            states.append(jnp.where(time < begin, in_part, after_start))
-        return tuple(states)
+        parts = zip(
+            _lead(first, lead_in, from_start),
+            self.inner.states(self.start + t - begin),
+            _lead(last, lead_out, to_end, -1),
+            strict=False,
+        )
+        conditions = [time < begin, time <= end]
+        return tuple(
+            jnp.select(conditions, [in_part, series_part], out_part)
+            for in_part, series_part, out_part in parts
+        )
 
 
 def with_leads(
-    series: AbstractTrajectory, robot: Robot, *, periods: int = 1
+    series: AbstractTrajectory,
+    robot: Robot,
+    *,
+    periods: int = 1,
 ) -> WithLeads:
     """Add a lead-in and a lead-out to a periodic motion, within the robot's limits.
 
@@ -234,63 +241,56 @@ def with_leads(
         motion = series.motion(phases)
     q, qd, qdd = (np.asarray(x) for x in (motion.q, motion.qd, motion.qdd))
     limits = complete_limits(robot)
-    lead_in = _shortest_leads(q, qd, qdd, limits)
-    lead_out = _shortest_leads(q, -qd, qdd, limits)
-    total = lead_in.duration.max(axis=1) + lead_out.duration.max(axis=1)
+    use_in = _use_of_limits((q, qd, qdd), limits)
+    use_out = _use_of_limits((q, -qd, qdd), limits)
+    lead_in = _shortest_durations(use_in)
+    lead_out = _shortest_durations(use_out)
+    total = lead_in.max(axis=1) + lead_out.max(axis=1)
     phase = int(np.argmin(total))
     if not np.isfinite(total[phase]):
-        excess = np.maximum(lead_in.excess, lead_out.excess)
-        nearest_phase = int(np.argmin(excess.max(axis=1)))
-        joint = int(np.argmax(excess[nearest_phase]))
+        use = np.maximum(use_in.min(axis=0), use_out.min(axis=0))
+        nearest_phase = int(np.argmin(use.max(axis=1)))
+        joint = int(np.argmax(use[nearest_phase]))
+        excess = use[nearest_phase, joint] - 1.0
         raise InputError(
             "no instant of the period can be reached from standstill within "
             f"the limits: at best joint `{robot.joint_names[joint]}` exceeds "
-            f"one of them by {100 * excess[nearest_phase, joint]:.3g} %: "
+            f"one of them by {100 * excess:.3g} %: "
             "take a motion that uses less of the limits."
         )
     return WithLeads(
         series,
         phases[phase],
         periods * period,
-        lead_in.duration[phase],
-        lead_out.duration[phase],
+        lead_in[phase],
+        lead_out[phase],
     )
 
 
-class ShortestLeads(NamedTuple):
-    """Leads to every phase of a motion."""
+def _shortest_durations(use: np.ndarray) -> np.ndarray:
+    """Return the shortest lead of each phase and joint; infinite if none is allowed."""
+    durations = np.where(use <= 1.0 + 1e-9, LEAD_DURATIONS, np.inf)
+    return durations.min(axis=0)
 
-    duration: Float[np.ndarray, "phases joints"]  # infinite where there is none [s]
-    excess: Float[np.ndarray, "phases joints"]  # least relative excess over a limit
 
-
-def _shortest_leads(
-    q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, limits: Limits
-) -> ShortestLeads:
-    """Return the shortest lead to every phase and joint within the limits."""
-    T = np.geomspace(0.02, 10.0, 120)[:, None, None]
-    alpha, beta = _velocity_coefficients(qd, qdd, T)
+def _use_of_limits(state: tuple[np.ndarray, ...], limits: Limits) -> np.ndarray:
+    """Return the used fraction of a limit by leads [durations, phases, joints]."""
+    T = LEAD_DURATIONS
+    alpha, beta = _velocity_coefficients(state[1], state[2], T)
     # The extremes lie where the next derivative is zero, or at the ends.
     with np.errstate(divide="ignore", invalid="ignore"):
-        extremes = [-alpha / beta, -2 * alpha / (3 * beta), -alpha / (3 * beta)]
-    instants = [0 * T, T]
-    for x in extremes:
-        is_within = np.isfinite(x) & (x > 0) & (x < T)
-        instants.append(np.where(is_within, x, T))
-    leads = [_lead((q, qd, qdd), T, x) for x in instants]
-    position, speed, acceleration, jerk = (
-        np.stack(parts) for parts in zip(*leads, strict=True)
-    )
-
-    low = np.asarray(limits.position_min)
-    high = np.asarray(limits.position_max)
-    distance = np.abs(position - 0.5 * (low + high))
-    used_fractions = (
-        distance.max(axis=0) / (0.5 * (high - low)),
-        np.abs(speed).max(axis=0) / limits.velocity,
-        np.abs(acceleration).max(axis=0) / limits.acceleration,
-        np.abs(jerk).max(axis=0) / limits.jerk,
-    )
-    excess = np.max(used_fractions, axis=0) - 1.0
-    duration = np.where(excess <= 1e-9, T, np.inf).min(axis=0)
-    return ShortestLeads(duration, excess.min(axis=0))
+        ratio = -alpha / beta
+    middle = 0.5 * (limits.position_max + limits.position_min)
+    half_range = 0.5 * (limits.position_max - limits.position_min)
+    use = np.zeros(ratio.shape)
+    for x in (0 * T, T, ratio, 2 * ratio / 3, ratio / 3):
+        # NaN, where the next derivative is zero nowhere, is not within.
+        is_within = (x >= 0) & (x < T)
+        instants = np.where(is_within, x, T)
+        position, velocity, acceleration, jerk = _lead(state, T, instants)
+        distance = np.abs(position - middle)
+        use = np.maximum(use, distance / half_range)
+        use = np.maximum(use, np.abs(velocity) / limits.velocity)
+        use = np.maximum(use, np.abs(acceleration) / limits.acceleration)
+        use = np.maximum(use, np.abs(jerk) / limits.jerk)
+    return use

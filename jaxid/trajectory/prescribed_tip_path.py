@@ -2,19 +2,21 @@
 
 import itertools
 import math
-from typing import ClassVar
+from collections.abc import Callable
+from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
 
-from jaxid.arrays import AnyArray, Float, Numbers, as_array
+from jaxid.arrays import AnyArray, Matrix3, Numbers, Vector3
 from jaxid.errors import InputError
 from jaxid.robot.inverse_kinematics import inverse_kinematics_along
-from jaxid.robot.robot import Robot
+from jaxid.robot.robot import Robot, as_finite_array, as_rotations
 
 from .spline import (
     DEGREE,
     PiecewisePolynomial,
+    PolynomialCoefficients,
     interpolate_at_rest,
     spline_polynomials,
 )
@@ -26,59 +28,46 @@ MIN_SPANS = 12
 """Smallest number of spans of the spline along one piece."""
 
 
-class Line(eqx.Module):
-    """A straight line.
+class Curve(NamedTuple):
+    """A line or a circle.
 
     Attributes:
-        start: Start of the line [m].
-        end: End of the line [m].
-        radius: Radius of curvature: infinite [m].
+        at: Function that returns places at fractions of the length, from 0 to 1 [m].
+        length: Length of the curve [m].
+        radius: Radius of curvature; infinite for a line [m].
     """
 
-    radius: ClassVar[float] = np.inf
-    start: Float[AnyArray, "3"]
-    end: Float[AnyArray, "3"]
-
-    @property
-    def length(self) -> float:
-        """Length of the line [m]."""
-        return float(np.linalg.norm(np.asarray(self.end) - np.asarray(self.start)))
-
-    def at(self, fraction: Times) -> Float[np.ndarray, "samples 3"]:
-        """Return places at fractions of the length, from 0 to 1 [m]."""
-        start = np.asarray(self.start)
-        return start + np.asarray(fraction)[:, None] * (np.asarray(self.end) - start)
+    at: Callable[[np.ndarray], AnyArray]
+    length: float
+    radius: float
 
 
-class Circle(eqx.Module):
-    """A whole circle.
+def line(start: Vector3, end: Vector3) -> Curve:
+    """Return a straight line between two points [m]."""
+    step = np.subtract(end, start)
 
-    Attributes:
+    def at(fraction: np.ndarray) -> AnyArray:
+        return start + fraction[:, None] * step
+
+    return Curve(at, float(np.linalg.norm(step)), np.inf)
+
+
+def circle(centre: Vector3, first: Vector3, second: Vector3) -> Curve:
+    """Return a whole circle.
+
+    Args:
         centre: Centre of the circle [m].
         first: Vector from the centre to the start and end [m].
         second: Vector from the centre to the point after a quarter of the circle:
             equally long, at a right angle to `first` [m].
     """
+    radius = float(np.linalg.norm(first))
 
-    centre: Float[AnyArray, "3"]
-    first: Float[AnyArray, "3"]
-    second: Float[AnyArray, "3"]
+    def at(fraction: np.ndarray) -> AnyArray:
+        angle = 2 * np.pi * fraction[:, None]
+        return centre + np.cos(angle) * first + np.sin(angle) * second
 
-    @property
-    def length(self) -> float:
-        """Circumference [m]."""
-        return 2 * np.pi * self.radius
-
-    @property
-    def radius(self) -> float:
-        """Radius of the circle [m]."""
-        return float(np.linalg.norm(np.asarray(self.first)))
-
-    def at(self, fraction: Times) -> Float[np.ndarray, "samples 3"]:
-        """Return places at fractions of the length, from 0 to 1 [m]."""
-        angle = 2 * np.pi * np.asarray(fraction)[:, None]
-        first, second = np.asarray(self.first), np.asarray(self.second)
-        return np.asarray(self.centre) + np.cos(angle) * first + np.sin(angle) * second
+    return Curve(at, 2 * np.pi * radius, radius)
 
 
 UNIT_SPEED = 15.0 / 8.0
@@ -94,7 +83,8 @@ class TipPath(eqx.Module):
     acceleration are zero at both ends and continuous between.
 
     Attributes:
-        pieces: Curves in the order in which they are run.
+        pieces: Curves in the order in which they are run, each from the end of the one
+            before.
         rotation: Attitude of the end-effector: columns are its axes in the frame of the
             ground.
         speed: Largest speed [m/s].
@@ -102,49 +92,43 @@ class TipPath(eqx.Module):
 
     Raises:
         InputError: If there is no piece, one has no length or does not start where the
-            one before it ends, or a limit is not positive.
+            one before ends, or a limit is not positive.
     """
 
-    pieces: tuple[Line | Circle, ...] = eqx.field(converter=tuple)
-    rotation: Float[AnyArray, "3 3"] = eqx.field(
-        converter=lambda x: as_array("rotation", x)
-    )
-    speed: float = eqx.field(converter=float, default=1.0)
-    acceleration: float = eqx.field(converter=float, default=4.0)
+    pieces: tuple[Curve, ...] = eqx.field(converter=tuple)
+    rotation: Matrix3
+    speed: float = 1.0
+    acceleration: float = 4.0
 
     def __check_init__(self):
-        for name, limit in (("speed", self.speed), ("acceleration", self.acceleration)):
+        for name in ("speed", "acceleration"):
+            limit = getattr(self, name)
             if not 0 < limit < np.inf:
                 raise InputError(f"`{name}` must be positive, but is {limit:g}.")
-        if not self.pieces:
-            raise InputError("`pieces` must hold at least one piece, but is empty.")
-        previous_end = None
-        for number, piece in enumerate(self.pieces, 1):
-            start, end = piece.at(np.array([0.0, 1.0]))
-            gap = 0.0
-            if previous_end is not None:
-                gap = float(np.linalg.norm(start - previous_end))
+        lengths = [piece.length for piece in self.pieces]
+        if not lengths or not 0 < min(lengths) <= max(lengths) < np.inf:
+            raise InputError(
+                "`pieces` must hold at least one piece, each of a finite length, "
+                f"but their lengths are {lengths} m."
+            )
+        ends = [piece.at(np.array([0.0, 1.0])) for piece in self.pieces]
+        for number, (previous, piece) in enumerate(itertools.pairwise(ends), 2):
+            gap = float(np.linalg.norm(piece[0] - previous[1]))
             if gap > 1e-9:
                 raise InputError(
                     f"piece {number} of `pieces` starts "
                     f"{gap:.3g} m from where the one before ends."
                 )
-            if not 0 < piece.length < np.inf:
-                raise InputError(
-                    f"piece {number} of `pieces` must have a length, "
-                    f"but it is {piece.length:g} m."
-                )
-            previous_end = end
 
     @property
     def durations(self) -> tuple[float, ...]:
         """Time of each piece [s]: the shortest that keeps speed and acceleration."""
         durations = []
-        for piece in self.pieces:
-            max_speed = min(self.speed, np.sqrt(self.acceleration * piece.radius))
-            by_speed = UNIT_SPEED * piece.length / max_speed
-            by_acceleration = UNIT_ACCELERATION * piece.length / self.acceleration
-            durations.append(max(by_speed, np.sqrt(by_acceleration)))
+        for _, length, radius in self.pieces:
+            max_speed = min(self.speed, np.sqrt(self.acceleration * radius))
+            by_speed = UNIT_SPEED * length / max_speed
+            by_acceleration = np.sqrt(UNIT_ACCELERATION * length / self.acceleration)
+            durations.append(max(by_speed, by_acceleration))
         return tuple(durations)
 
     @property
@@ -152,7 +136,7 @@ class TipPath(eqx.Module):
         """Total time [s]."""
         return float(sum(self.durations))
 
-    def positions(self, t: Times) -> Float[np.ndarray, "samples 3"]:
+    def positions(self, t: Times) -> np.ndarray:
         """Return positions of the end-effector [m] at times [s]."""
         t = np.asarray(t)
         ends = np.cumsum(self.durations)
@@ -163,7 +147,8 @@ class TipPath(eqx.Module):
             is_on_curve = pieces == number
             time = t[is_on_curve] - starts[number]
             u = np.clip(time / self.durations[number], 0.0, 1.0)
-            places[is_on_curve] = curve.at(u**3 * (10.0 + u * (6.0 * u - 15.0)))
+            fraction = 10.0 * u**3 - 15.0 * u**4 + 6.0 * u**5
+            places[is_on_curve] = curve.at(fraction)
         return places
 
 
@@ -198,9 +183,7 @@ def iso9283_path(
         InputError: If the centre is no point, the cube has no size, or a limit is not
             positive.
     """
-    c = as_array("centre", centre)
-    if c.shape != (3,):
-        raise InputError("`centre` must hold three numbers [m].")
+    c = as_finite_array("`centre`", centre, (3,))
     x, y, z = np.eye(3)
     rising_axis = (x, y)[leans_along] + z
     level_axis = (y, x)[leans_along]
@@ -219,19 +202,23 @@ def iso9283_path(
     small_top = c + small_radius * up
 
     corners = (c, p2, p3, p4, p5, p2, p4, c, top)
-    lines = [Line(start, end) for start, end in itertools.pairwise(corners)]
+    lines = itertools.starmap(line, itertools.pairwise(corners))
     pieces = (
         *lines,
-        Circle(c, large_radius * up, large_radius * level_axis),
-        Line(top, small_top),
-        Circle(c, small_radius * up, small_radius * level_axis),
-        Line(small_top, c),
+        circle(c, large_radius * up, large_radius * level_axis),
+        line(top, small_top),
+        circle(c, small_radius * up, small_radius * level_axis),
+        line(small_top, c),
     )
-    return TipPath(pieces, rotation, speed, acceleration)
+    attitude = as_rotations("`rotation`", rotation, (3, 3))
+    return TipPath(pieces, attitude, speed, acceleration)
 
 
 def joint_path(
-    robot: Robot, path: TipPath, *, posture: Numbers | None = None
+    robot: Robot,
+    path: TipPath,
+    *,
+    posture: Numbers | None = None,
 ) -> PiecewisePolynomial:
     """Return the joints' motion that takes the end-effector along a path.
 
@@ -255,14 +242,16 @@ def joint_path(
     polynomials = []
     begin = 0
     for t in instants:
-        nodes = q[begin : begin + len(t)]
-        spline = interpolate_at_rest(t - t[0], nodes)
-        knots.append(t[0] + spline.t[DEGREE : -DEGREE - 1])
+        end = begin + len(t)
+        spline = interpolate_at_rest(t - t[0], q[begin:end])
+        piece_knots = t[0] + spline.t[DEGREE:-DEGREE]
+        knots.append(piece_knots[:-1])
         polynomials.append(spline_polynomials(spline))
-        begin += len(t) - 1
+        begin = end - 1
+    knots.append(times[-1:])
     coefficients = np.concatenate(polynomials, axis=1)
     _require_speeds(robot, path, coefficients)
-    return PiecewisePolynomial(np.concatenate([*knots, times[-1:]]), coefficients)
+    return PiecewisePolynomial(np.concatenate(knots), coefficients)
 
 
 def _instants(path: TipPath) -> list[np.ndarray]:
@@ -278,7 +267,7 @@ def _instants(path: TipPath) -> list[np.ndarray]:
 def _require_speeds(
     robot: Robot,
     path: TipPath,
-    coefficients: Float[np.ndarray, "powers pieces joints"],
+    coefficients: PolynomialCoefficients,
 ) -> None:
     """Reject a path on which a joint would have to move faster than it can."""
     # Velocities and accelerations at the knots are coefficients.
@@ -292,13 +281,11 @@ def _require_speeds(
     joint = int(slowdowns.argmax())
     if slowdowns[joint] <= 1.001:
         return
-    is_speed = used_speed[joint] == slowdowns[joint]
-    quantity = "speed" if is_speed else "acceleration"
-    excess = max(used_speed[joint], used_acceleration[joint])
     slowdown = 1.01 * slowdowns[joint]
     raise InputError(
-        f"joint `{robot.joint_names[joint]}` would need {excess:.2f} times "
-        f"its largest {quantity}: give the path a `speed` "
-        f"of {path.speed / slowdown:.3g} m/s and an `acceleration` "
-        f"of {path.acceleration / slowdown**2:.3g} m/s², or choose another posture."
+        f"joint `{robot.joint_names[joint]}` would need {used_speed[joint]:.2f} times "
+        f"its largest speed and {used_acceleration[joint]:.2f} times its largest "
+        f"acceleration: give the path a `speed` of {path.speed / slowdown:.3g} m/s and "
+        f"an `acceleration` of {path.acceleration / slowdown**2:.3g} m/s², or choose "
+        "another posture."
     )

@@ -7,22 +7,24 @@ import equinox as eqx
 import numpy as np
 from scipy.interpolate import BSpline, make_interp_spline
 
-from jaxid.arrays import AnyArray, Float, Numbers, as_array, is_traced, namespace
+from jaxid.arrays import AnyArray, Float, is_traced, namespace
 from jaxid.errors import InputError
 
 from .trajectory import (
     AbstractBasis,
     AbstractTrajectory,
-    Envelope,
-    LinearTrajectory,
     Rows,
-    States,
     Time,
     Times,
     as_scalar,
 )
 
 DEGREE = 5
+"""Degree of the polynomials of a spline."""
+Knots = Float[AnyArray, " knots"]
+"""Times at which polynomials meet, with both ends [s]."""
+PolynomialCoefficients = Float[AnyArray, "powers pieces joints"]
+"""Coefficients of the powers of the time since a piece's start, highest power first."""
 
 
 class PiecewisePolynomial(AbstractTrajectory):
@@ -34,31 +36,28 @@ class PiecewisePolynomial(AbstractTrajectory):
             highest power first.
     """
 
-    times: Float[AnyArray, " knots"]
-    coefficients: Float[AnyArray, "powers pieces joints"]
+    times: Knots
+    coefficients: PolynomialCoefficients
 
     @property
     def duration(self) -> Time:
         """Time of the end [s]."""
         return self.times[-1]
 
-    def states(self, t: Times) -> States:
+    def states(self, t):
         """Return the polynomials and two derivatives."""
         return tuple(_evaluate(self.times, self.coefficients, t)[:3])
 
 
-def _evaluate(
-    times: Float[AnyArray, " knots"],
-    coefficients: Float[AnyArray, "powers pieces columns"],
-    t: Times,
-) -> Float[AnyArray, "4 samples columns"]:
+def _evaluate(times: Knots, coefficients: PolynomialCoefficients, t: Times) -> Rows:
     """Return a `PiecewisePolynomial` and three derivatives at times [s]."""
     xp = namespace(times, coefficients, t)
     times, coefficients, t = (xp.asarray(x) for x in (times, coefficients, t))
     start = times[0]
     end = times[-1]
     # Written with `where`, because the derivative of `clip` at its ends is one half.
-    clipped_times = xp.where(t < start, start, xp.where(t > end, end, t))
+    clipped_times = xp.where(t > end, end, t)
+    clipped_times = xp.where(t < start, start, clipped_times)
     pieces = xp.searchsorted(times, clipped_times, side="right") - 1
     pieces = xp.clip(pieces, 0, len(times) - 2)
 
@@ -66,7 +65,9 @@ def _evaluate(
     x = (clipped_times - times[pieces])[:, None]
     powers = coefficients[:, pieces]
     value = powers[0]
-    first = second = third = xp.zeros_like(value)
+    first = xp.zeros_like(value)
+    second = first
+    third = first
     for coefficient in powers[1:]:
         third = third * x + 3 * second
         second = second * x + 2 * first
@@ -94,6 +95,7 @@ class RestToRestSplineBasis(AbstractBasis):
     """
 
     points: int = eqx.field(static=True, default=12)
+    # Experiment files are decoded by this annotation.
     duration: Float[AnyArray, ""] = eqx.field(converter=as_scalar, default=8.0)
 
     def __check_init__(self):
@@ -104,13 +106,13 @@ class RestToRestSplineBasis(AbstractBasis):
                 f"`duration` must be positive [s], but is {self.duration:g}."
             )
 
-    def rows(self, t: Times) -> Rows:
+    def rows(self, t):
         """Return the motions of unit coefficients."""
         starts, coefficients = _unit_polynomials(self.points)
         derivatives = _evaluate(starts, coefficients, t / self.duration)
         return derivatives / (self.duration ** np.arange(4.0))[:, None, None]
 
-    def envelope(self, points: int) -> Envelope:
+    def envelope(self, points):
         """Return rows that give the control points of each derivative.
 
         A spline never leaves the range of its control points, so that the factor of the
@@ -133,38 +135,13 @@ class RestToRestSplineBasis(AbstractBasis):
         return tuple(control_points), 1.0
 
 
-def spline_through(points: Numbers, duration: float) -> LinearTrajectory:
-    """Return a quintic spline through points that stands still at both ends.
-
-    Args:
-        points: Start, way points and end, one row each [rad or m].
-        duration: Time from standstill to standstill [s].
-
-    Raises:
-        InputError: If there are not at least two points, or the duration is not
-            positive.
-    """
-    rows = np.asarray(as_array("points", points), np.float64)
-    if rows.ndim != 2 or len(rows) < 2 or not np.isfinite(rows).all():
-        raise InputError(
-            "`points` must hold two or more rows "
-            f"of finite numbers, but has shape {rows.shape}."
-        )
-    spline = interpolate_at_rest(np.linspace(0.0, 1.0, len(rows)), rows)
-    # The first three control points are the start, and the last three are the end.
-    handles = np.concatenate([rows[:1], spline.c[3:-3], rows[-1:]])
-    return RestToRestSplineBasis(len(handles), duration).trajectory(handles.T)
-
-
-def interpolate_at_rest(
-    t: Times, points: Float[np.ndarray, "points joints"]
-) -> BSpline:
+def interpolate_at_rest(t: Times, points: np.ndarray) -> BSpline:
     """Return the quintic spline through points at times, at rest at both ends."""
     conditions = [(order, np.zeros(points.shape[1])) for order in (1, 2)]
     return make_interp_spline(t, points, DEGREE, bc_type=(conditions, conditions))
 
 
-def spline_polynomials(spline: BSpline) -> Float[np.ndarray, "powers pieces columns"]:
+def spline_polynomials(spline: BSpline) -> PolynomialCoefficients:
     """Return the pieces of a clamped spline in powers of time since their start."""
     knots = spline.t[DEGREE:-DEGREE]
     starts = knots[:-1]
@@ -179,7 +156,7 @@ def spline_polynomials(spline: BSpline) -> Float[np.ndarray, "powers pieces colu
 
 
 @functools.cache
-def _unit_polynomials(points: int) -> tuple[np.ndarray, np.ndarray]:
+def _unit_polynomials(points: int) -> tuple[Knots, PolynomialCoefficients]:
     """Return starts and polynomials of the splines with unit coefficients."""
     unit = np.eye(points)
     control_points = np.concatenate([unit[:1], unit[:1], unit, unit[-1:], unit[-1:]])

@@ -58,7 +58,7 @@ class AbstractTrajectory(Hashable):
     def states(self, t: Times) -> States:
         """Return positions, velocities and accelerations at times [s], under `jit`."""
 
-    def motion(self, t: Float[AnyArray, "*batch"] | float | int) -> Motion:
+    def motion(self, t: AnyArray | float | int) -> Motion:
         """Return the motion at one time or at many [s]."""
         return _motion(self, jnp.asarray(t, float))
 
@@ -67,18 +67,7 @@ class AbstractTrajectory(Hashable):
         """Number of joints."""
         return jax.eval_shape(lambda: self.motion(0.0)).q.shape[-1]
 
-    def jerk(
-        self, t: Float[AnyArray, "*batch"] | float | int
-    ) -> Float[Array, "*batch joints"]:
-        """Return the derivatives of accelerations [rad/s³ or m/s³] at times [s]."""
-        times = jnp.asarray(t, float)
-        ones = jnp.ones_like(times)
-        _, jerk = jax.jvp(lambda t: self.motion(t).qdd, (times,), (ones,))
-        return jerk
-
-    def sample(
-        self, sample_time: float
-    ) -> tuple[Float[np.ndarray, " samples"], Motion]:
+    def sample(self, sample_time: float) -> tuple[np.ndarray, Motion]:
         """Return times from the start to the end [s], and the motion at them.
 
         Args:
@@ -123,7 +112,7 @@ class PaddedToCycle(AbstractTrajectory):
         cycles = count_cycles(float(self.inner.duration), self.sample_time)
         return cycles * self.sample_time
 
-    def states(self, t: Times) -> States:
+    def states(self, t):
         """Return the motion, and its final pose after its end."""
         return self.inner.states(jnp.minimum(t, self.inner.duration))
 
@@ -194,7 +183,7 @@ class AbstractBasis(eqx.Module):
         """Return equidistant times over the whole motion, for constraints [s]."""
         return self.times(points)
 
-    def retimings(self) -> Float[np.ndarray, "retimings variables variables"]:
+    def retimings(self) -> np.ndarray:
         """Return maps to coefficients of the same motion, begun later or reversed.
 
         Only maps that stay in the family are returned: a periodic motion may begin at
@@ -235,7 +224,7 @@ class LinearTrajectory(AbstractTrajectory):
         """Duration of the basis [s]."""
         return self.basis.duration
 
-    def states(self, t: Times) -> States:
+    def states(self, t):
         """Return the rows of the basis times the coefficients."""
         rows = jnp.asarray(self.basis.rows(t))
         return tuple(part @ self.coefficients.T for part in rows[:3])
@@ -251,7 +240,8 @@ def stand_outside(
     # Written with `where`, because the derivative of `clip` at its ends is one half.
     is_before = t < 0.0
     is_after = t > duration
-    times = xp.where(is_before, 0.0, xp.where(is_after, duration, t))
+    times = xp.where(is_after, duration, t)
+    times = xp.where(is_before, 0.0, times)
     is_moving = ~(is_before | is_after)[None, :, None]
     is_position = np.array([True, False, False, False])[:, None, None]
     return xp.where(is_position | is_moving, rows(times), 0.0)

@@ -9,10 +9,10 @@ import numpy as np
 from jaxid.arrays import double_precision
 from jaxid.errors import InputError
 from jaxid.io import atomic_folder
-from jaxid.robot.robot import Robot
+from jaxid.robot.robot import Robot, complete_limits
 from jaxid.trajectory.controllers import BESIDE, CONTROLLERS
 from jaxid.trajectory.files import save_trajectory, write_csv, write_ros
-from jaxid.trajectory.fourier import FourierBasis, complete_limits
+from jaxid.trajectory.fourier import FourierBasis
 from jaxid.trajectory.lead_in_and_out import with_leads
 from jaxid.trajectory.trajectory import (
     AbstractTrajectory,

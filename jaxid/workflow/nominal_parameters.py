@@ -11,7 +11,7 @@ from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
 from jaxid.excitation.constraints import ForceLimits
 from jaxid.report.result_files import read_fit
-from jaxid.robot.robot import Robot
+from jaxid.robot.robot import Robot, complete_limits
 
 from .excitation_settings import Excitation
 from .setup import Setup
@@ -132,10 +132,8 @@ def gravity_fault(robot: Robot, limits: ForceLimits) -> str:
 
 def random_poses(robot: Robot) -> np.ndarray:
     """Return random poses within the joints' range, the first of them near zero."""
-    ends = np.where(robot.revolute, np.pi, 1.0)
-    low, high = robot.limits.position_min, robot.limits.position_max
-    low = np.where(np.isfinite(low), low, -ends)
-    high = np.where(np.isfinite(high), high, ends)
+    limits = complete_limits(robot)
+    low, high = np.asarray(limits.position_min), np.asarray(limits.position_max)
     poses = np.random.default_rng(0).uniform(low, high, (RANDOM_POSES, robot.joints))
     poses[0] = np.clip(0.0, low, high)
     return poses

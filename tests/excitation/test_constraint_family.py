@@ -134,6 +134,8 @@ def test_words_name_what_is_exceeded(name):
             else "falls short"
             if f.is_lower_limit
             else f"{100 * peak:.3g} %"
+            if f.has_use
+            else "exceeds"
         )
         assert word in str(f)
         assert f"{abs(f.excess):.3g} {f.unit}" in str(f)
@@ -201,11 +203,11 @@ def test_the_tip_moves_as_its_difference_quotients():
     np.testing.assert_allclose(
         [1.5, 8.0] * (1 + values[:, :2]), np.transpose(sizes), rtol=1e-6
     )
-    # The box counts in half edges.
+    # The box counts in tenths of a metre: upper sides, then lower ones.
     p = np.asarray(now[0])
-    np.testing.assert_allclose(values[:, 2], (p[:, 0] - 0.4) / 0.35, atol=1e-10)
-    np.testing.assert_allclose(values[:, 3], (-0.3 - p[:, 0]) / 0.35, atol=1e-10)
-    np.testing.assert_allclose(values[:, 5], (0.2 - p[:, 1]) / 0.35, atol=1e-10)
+    np.testing.assert_allclose(values[:, 2], (p[:, 0] - 0.4) / 0.1, atol=1e-10)
+    np.testing.assert_allclose(values[:, 4], (-0.3 - p[:, 0]) / 0.1, atol=1e-10)
+    np.testing.assert_allclose(values[:, 5], (0.2 - p[:, 1]) / 0.1, atol=1e-10)
 
 
 @pytest.mark.parametrize(

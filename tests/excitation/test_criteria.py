@@ -16,7 +16,6 @@ from jaxid.excitation.criteria import (
     standard_deviations,
 )
 from jaxid.excitation.criteria.functions_of_eigenvalues import log_condition, spectral
-from jaxid.excitation.criteria.information_matrix import information_of_coefficients
 from jaxid.trajectory.fourier import FourierBasis
 
 SIZE = 7
@@ -131,33 +130,23 @@ def test_equal_eigenvalues_are_differentiated():
     assert np.isfinite(g).all()
 
 
-def test_compiled_information_is_that_of_all_samples(base, random):
+def test_information_is_that_of_all_samples(base, random):
     basis = FourierBasis(3, 1.2)
-    x = random.standard_normal((5, 2, basis.variables))
     weights, prior = np.array([0.1, 0.7]), 1e-3 * np.eye(base.size)
-    batch = information_of_coefficients(
-        base,
-        basis,
-        jnp.asarray(x),
-        samples=50,
-        measured=50,
-        weights=weights,
-        prior=prior,
-        sizes=np.ones(base.size),
-    )
-    for k, one in enumerate(x):
-        motion = basis.trajectory(one).motion(basis.times(50))
+    for x in random.standard_normal((3, 2, basis.variables)):
+        motion = basis.trajectory(x).motion(basis.times(50))
         theta = np.asarray(base.regressor(motion))
         plain = np.einsum("sji,sjk->ik", theta, theta)
         weighted = np.einsum("sji,j,sjk->ik", theta, weights**2, theta) + prior
         exact = information(base, motion, weights, prior)
-        for got, asked in (
-            (batch.plain[k], plain),
-            (batch.weighted[k], weighted),
-            (exact.plain, plain),
-            (exact.weighted, weighted),
-        ):
+        for got, asked in ((exact.plain, plain), (exact.weighted, weighted)):
             np.testing.assert_allclose(got, asked, atol=1e-10 * np.abs(asked).max())
+
+
+def test_the_compiled_value_is_that_of_the_information(free):
+    x = free.random(jax.random.key(8))
+    exact = free.criterion(free.information(x))
+    assert float(free.value(x)) == pytest.approx(float(exact), abs=1e-10)
 
 
 def test_deviations_are_those_of_the_inverse_and_infinite_where_nothing_is_known():

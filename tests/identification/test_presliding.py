@@ -17,7 +17,12 @@ from jaxid.identification.problem import RegressionProblem
 from jaxid.measurement.friction_state import PART_SIZE, SamplesWithMemory, with_memory
 from jaxid.simulation.friction_and_ripple import LuGreFriction
 from jaxid.simulation.virtual import Sensors, VirtualRobot, random_bodies
-from jaxid.trajectory.spline import spline_through
+from jaxid.trajectory.spline import (
+    DEGREE,
+    PiecewisePolynomial,
+    interpolate_at_rest,
+    spline_polynomials,
+)
 
 ROBOT = jid.robots.planar_arm(2, 0.5).replace(limits=jid.Limits(force=[60.0, 20.0]))
 LENGTHS = np.array([4e-3, 2e-3])
@@ -194,9 +199,12 @@ def test_presliding_of_another_law_is_found_with_coarse_encoders():
             points += [point] * (7 if number % 4 == 0 else 1)
             if number % 4 == 2:
                 points += [point + 0.02 * rng.uniform(-1, 1, 2) for _ in range(2)]
-        run = arm.track(
-            spline_through(np.array(points), 24.0), seed=seed, sample_time=2e-3
+        spline = interpolate_at_rest(
+            np.linspace(0.0, 24.0, len(points)), np.array(points)
         )
+        knots = spline.t[DEGREE:-DEGREE]
+        motion = PiecewisePolynomial(knots, spline_polynomials(spline))
+        run = arm.track(motion, seed=seed, sample_time=2e-3)
         rows = jid.Subsample(5)
         logs.append(
             jid.observe(run.recording, ROBOT, jid.ZeroPhaseButterworth(20.0), rows)

@@ -158,6 +158,7 @@ def test_shapes_of_mjcf_files_are_held(tmp_path):
     mujoco = pytest.importorskip("mujoco")
     path = tmp_path / "arm.xml"
     path.write_text("""<mujoco><worldbody>
+    <geom type="plane" size="3 3 1"/>
     <body name="one" pos="0 0 0.3"><joint axis="0 1 0"/>
       <geom type="capsule" size="0.05" fromto="0 0 0 0.4 0 0"/>
       <geom type="box" size="1 1 1" contype="0" conaffinity="0"/>
@@ -170,9 +171,11 @@ def test_shapes_of_mjcf_files_are_held(tmp_path):
     assert [c.body for c in (one, two, three)] == [0, 1, 1]
     assert float(one.radius) == pytest.approx(0.05)
     assert np.linalg.norm(one.end - one.start) == pytest.approx(0.4)
-    assert float(two.radius) < 1.01 * np.hypot(0.05, 0.02)
+    # No larger than the capsule through the corners along the box's longest edge.
+    along = volume(np.zeros(3), np.array([0.2, 0.0, 0.0]), np.hypot(0.05, 0.02))
+    assert volume(two.start, two.end, float(two.radius)) <= along
     model = mujoco.MjModel.from_xml_path(str(path))
-    R = Rotation.from_quat(model.geom_quat[2], scalar_first=True).as_matrix()
+    R = Rotation.from_quat(model.geom_quat[3], scalar_first=True).as_matrix()
     signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
     corners = (signs * [0.1, 0.05, 0.02]) @ R.T + [0.1, 0, 0]
     assert outside(corners, two.start, two.end, two.radius).max() <= 1e-9

@@ -1,17 +1,11 @@
 """Distances that shapes keep while the robot moves."""
 
-import functools
-import math
-
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import Array, Float
-from jaxid.dynamics.motion import Motion
 from jaxid.dynamics.sample_methods import on_samples
 from jaxid.robot.collision import CollisionModel
-from jaxid.robot.robot import Robot
 
 from .constraint import AbstractConstraint, Finding
 
@@ -35,28 +29,20 @@ class Clearance(AbstractConstraint):
     distance: float = 0.03
 
     @property
-    def distances(self) -> Float[np.ndarray, " pairs"]:
+    def distances(self) -> np.ndarray:
         """Least distance of each pair [m]."""
         return np.minimum(self.distance, 0.5 * np.array(self.model.room))
 
-    def __call__(self, robot: Robot, motion: Motion) -> Float[Array, "*batch values"]:
+    def __call__(self, robot, motion):
         """Return the missing distance of each pair."""
         ends = eqx.Partial(self.model.ends, robot)
         gaps = self.model.clearances(on_samples(ends, ends.__call__, motion.q))
         return (jnp.broadcast_to(self.distances, gaps.shape) - gaps) / SIZE
 
-    def entries(self, robot: Robot) -> tuple[Finding, ...]:
+    def entries(self, robot):
         """Return the pairs."""
-
-        def entry(name: str, distance: float) -> Finding:
-            usage = functools.partial(used_fraction, distance)
-            quantity = f"the clearance of {name}"
-            return Finding(quantity, SIZE, "m", distance, True, usage=usage)
-
-        return tuple(map(entry, self.model.pair_names, self.distances.tolist()))
-
-
-def used_fraction(distance: float, value: float) -> float:
-    """Return the required distance over the present one; infinite at contact."""
-    gap = distance - SIZE * value
-    return distance / gap if gap > 0 else math.inf
+        pairs = zip(self.model.pair_names, self.distances.tolist(), strict=True)
+        return tuple(
+            Finding(f"the clearance of {name}", SIZE, "m", distance, True)
+            for name, distance in pairs
+        )

@@ -14,6 +14,8 @@ from jaxid.arrays import AnyArray, Array, Float, Int
 from jaxid.dynamics.motion import Motion
 from jaxid.robot.robot import Robot
 
+Excess = Float[Array, "*batch values"]
+"""Relative excess over each limit, at each sample."""
 BLOCK = 96
 """Samples for which derivatives are compiled: those watched of one motion."""
 
@@ -30,8 +32,7 @@ class Finding(NamedTuple):
             not rise above it.
         note: Origin of the limit: `12 less a margin of 50 %`.
         value: Relative excess over the limit; negative or zero where it is kept.
-        usage: Function of the relative excess that returns the used fraction of the
-            limit.
+        has_use: Whether a fraction of the limit is used; not where it is a place.
     """
 
     name: str
@@ -41,7 +42,7 @@ class Finding(NamedTuple):
     is_lower_limit: bool = False
     note: str = ""
     value: float = math.nan
-    usage: Callable[[float], float] = lambda value: 1.0 + value
+    has_use: bool = True
 
     @property
     def excess(self) -> float:
@@ -50,8 +51,12 @@ class Finding(NamedTuple):
 
     @property
     def used(self) -> float:
-        """Used fraction of the limit, from 0 to 1; NaN where that means nothing."""
-        return self.usage(self.value)
+        """Used fraction of the limit, 1 if just kept; NaN where that means nothing."""
+        if not self.has_use:
+            return math.nan
+        if not self.is_lower_limit:
+            return self.reached / self.limit
+        return self.limit / self.reached if self.reached > 0 else math.inf
 
     @property
     def reached(self) -> float:
@@ -67,8 +72,9 @@ class Finding(NamedTuple):
         elif self.is_lower_limit:
             text = f"{self.name} falls short of its limit by {amount}"
         else:
-            percentage = f"{100 * self.value:.3g} %"
-            text = f"{self.name} exceeds its limit by {amount} ({percentage})"
+            text = f"{self.name} exceeds its limit by {amount}"
+            if self.has_use:
+                text += f" ({100 * self.value:.3g} %)"
         if math.isnan(self.limit):
             return text
         word = "least" if self.is_lower_limit else "most"
@@ -96,7 +102,7 @@ class AbstractConstraint(eqx.Module):
     """
 
     @abstractmethod
-    def __call__(self, robot: Robot, motion: Motion) -> Float[Array, "*batch values"]:
+    def __call__(self, robot: Robot, motion: Motion) -> Excess:
         """Return the excess over each limit at each sample; not positive if kept.
 
         Runs under `jit`, `vmap` and derivatives with respect to the motion.
@@ -144,9 +150,7 @@ class AbstractConstraint(eqx.Module):
 
         return linearise
 
-    def describe(
-        self, robot: Robot, values: Float[AnyArray, "*batch values"]
-    ) -> list[Finding]:
+    def describe(self, robot: Robot, values: AnyArray) -> list[Finding]:
         """Return the limited quantities with the largest of their values."""
         entries = self.entries(robot)
         peaks = np.asarray(values).reshape(-1, len(entries)).max(axis=0)

@@ -16,13 +16,11 @@ from jaxid.dynamics.sample_methods import in_numpy, on_samples, program_of
 from jaxid.dynamics.terms import AbstractTransition, Reversal
 from jaxid.errors import InputError
 from jaxid.program.gradient import pull_back
-from jaxid.robot.robot import Robot
-from jaxid.trajectory.fourier import complete_limits
+from jaxid.robot.robot import Robot, complete_limits
 
 from .constraint import (
     AbstractConstraint,
     Finding,
-    Linearisation,
     ValuesAndSlopes,
 )
 
@@ -90,7 +88,7 @@ class ForceLimits(AbstractConstraint):
                 "rows and columns without negative eigenvalues."
             )
 
-    def __call__(self, robot: Robot, motion: Motion) -> Float[Array, "*batch values"]:
+    def __call__(self, robot, motion):
         """Return the relative excess over each limit."""
         limits, to_limited = self._limited(robot)
         forces = self._forces(motion)
@@ -115,14 +113,14 @@ class ForceLimits(AbstractConstraint):
         to_limited = np.concatenate([np.eye(robot.joints), to_motors], axis=1)
         return (1 - self.margin) * limits[has_limit], to_limited[:, has_limit]
 
-    def _forces(self, motion: Motion) -> Float[AnyArray, "*batch 3 joints"]:
+    def _forces(self, motion: Motion) -> AnyArray:
         """Return `forces` at all samples."""
         # Rows of samples in NumPy need no compiler.
         is_rows = isinstance(motion.q, np.ndarray) and motion.q.ndim == 2
         evaluate = in_numpy if is_rows else on_samples
         return evaluate(self, self.forces, *_arrays(motion))
 
-    def linearisation(self, robot: Robot) -> Linearisation:
+    def linearisation(self, robot):
         """Return a function of relative excesses and their derivatives, in NumPy."""
         limits, to_limited = self._limited(robot)
 
@@ -139,7 +137,10 @@ class ForceLimits(AbstractConstraint):
         return linearise
 
     def _largest_forces(
-        self, motion: Motion, shares: np.ndarray, limits: np.ndarray
+        self,
+        motion: Motion,
+        shares: np.ndarray,
+        limits: np.ndarray,
     ) -> ValuesAndSlopes:
         """Return the largest force of each sample, and slopes over the limit."""
         forces = np.einsum("tsj,tj->ts", self._forces(motion), shares)
@@ -154,7 +155,10 @@ class ForceLimits(AbstractConstraint):
         return np.abs(peak_forces), by_motion
 
     def _deviations(
-        self, motion: Motion, shares: np.ndarray, limits: np.ndarray
+        self,
+        motion: Motion,
+        shares: np.ndarray,
+        limits: np.ndarray,
     ) -> ValuesAndSlopes:
         """Return the uncertainty of each sample, and slopes over the limit."""
         base = self.base
@@ -172,9 +176,7 @@ class ForceLimits(AbstractConstraint):
         by_motion = _pull_back(base, base.columns, weights, arrays)
         return self.deviations * deviation, by_motion
 
-    def forces(
-        self, q: Coordinates, qd: Coordinates, qdd: Coordinates
-    ) -> Float[Array, "3 joints"]:
+    def forces(self, q: Coordinates, qd: Coordinates, qdd: Coordinates) -> Array:
         """Return the forces of one sample, also with friction to either side."""
         model = self.base.model
         p = self.base.to_standard(jnp.asarray(self.parameters))
@@ -193,7 +195,7 @@ class ForceLimits(AbstractConstraint):
         forces = [jnp.asarray(each.forces(p, q, qd, qdd)) for each in models]
         return jnp.stack(forces) + model.known_forces(q, qd, qdd)[None]
 
-    def entries(self, robot: Robot) -> tuple[Finding, ...]:
+    def entries(self, robot):
         """Return the forces and torques that have a limit."""
         quantities = [
             (f"the force of joint `{name}`", robot.force_unit(joint))

@@ -8,20 +8,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Array, Float, as_array
+from jaxid.arrays import Vector3, as_array
 from jaxid.dynamics.motion import Motion
 from jaxid.dynamics.sample_methods import on_samples
 from jaxid.errors import InputError
 from jaxid.robot.forward_kinematics import tip_placement
 from jaxid.robot.robot import Robot
+from jaxid.robot.rotations import Vectors
 
+from .clearance import SIZE
 from .constraint import AbstractConstraint, Finding
 
 SMOOTHING = 1e-6
 """Value of a rate over its limit at standstill, where it is made smooth."""
 
 
-def tip_motion(robot: Robot, motion: Motion) -> tuple[Float[AnyArray, "*batch 3"], ...]:
+def tip_motion(robot: Robot, motion: Motion) -> tuple[Vectors, ...]:
     """Return position, velocity and acceleration of the end-effector's origin [m, s].
 
     They are those in the frame of the ground, without gravity.
@@ -50,8 +52,7 @@ class Side(NamedTuple):
 
     axis: int  # axis to which it is perpendicular
     sign: float  # 1 where coordinates must not be larger, -1 where not smaller
-    end: float  # its coordinate times the sign [m]
-    size: float  # half of the box's edge; 1 where the opposite side is open [m]
+    coordinate: float  # its coordinate along the axis [m]
 
 
 def _corner(x: Any) -> np.ndarray:
@@ -61,8 +62,7 @@ def _corner(x: Any) -> np.ndarray:
 class TipLimits(AbstractConstraint):
     """Limits of the end-effector: speed, acceleration, and a box parallel to the axes.
 
-    Values of the box count in half of its edges, or in metres where the opposite side
-    is open.
+    Excess over a side of the box counts in units of 0.1 m.
 
     Attributes:
         speed: Largest speed; infinity for none [m/s].
@@ -78,8 +78,8 @@ class TipLimits(AbstractConstraint):
 
     speed: float = math.inf
     acceleration: float = math.inf
-    low: Float[AnyArray, "3"] = eqx.field(converter=_corner, default=(-math.inf,) * 3)
-    high: Float[AnyArray, "3"] = eqx.field(converter=_corner, default=(math.inf,) * 3)
+    low: Vector3 = eqx.field(converter=_corner, default=(-math.inf,) * 3)
+    high: Vector3 = eqx.field(converter=_corner, default=(math.inf,) * 3)
 
     def __check_init__(self):
         if not (self.speed > 0 and self.acceleration > 0):
@@ -94,7 +94,7 @@ class TipLimits(AbstractConstraint):
                 f"ones, but are {self.low} and {self.high} [m]."
             )
 
-    def __call__(self, robot: Robot, motion: Motion) -> Float[Array, "*batch values"]:
+    def __call__(self, robot, motion):
         """Return the relative excess over each limit."""
         position, velocity, acceleration = tip_motion(robot, motion)
         values = []
@@ -106,11 +106,11 @@ class TipLimits(AbstractConstraint):
                 square = jnp.sum((vector / limit) ** 2, axis=-1)
                 values.append(jnp.sqrt(square + SMOOTHING**2) - 1.0)
         for side in self._sides:
-            coordinate = side.sign * position[..., side.axis]
-            values.append((coordinate - side.end) / side.size)
+            excess = side.sign * (position[..., side.axis] - side.coordinate)
+            values.append(excess / SIZE)
         return jnp.stack(values, axis=-1)
 
-    def entries(self, robot: Robot) -> tuple[Finding, ...]:
+    def entries(self, robot):
         """Return the quantities that have a limit."""
         entries = []
         for name, limit, unit in (
@@ -120,24 +120,17 @@ class TipLimits(AbstractConstraint):
             if math.isfinite(limit):
                 quantity = f"the {name} of the end-effector"
                 entries.append(Finding(quantity, limit, unit, limit))
-        for axis, sign, end, size in self._sides:
-            quantity = f"{'xyz'[axis]} of the end-effector"
-            entry = Finding(quantity, size, "m", sign * end, sign < 0)
-            if not np.isfinite(self.low[axis] + self.high[axis]):
-                note = "the other side is open"
-                entry = entry._replace(note=note, usage=lambda value: math.nan)
-            entries.append(entry)
+        for axis, sign, coordinate in self._sides:
+            name = f"{'xyz'[axis]} of the end-effector"
+            is_lower_limit = sign < 0
+            entries.append(
+                Finding(name, SIZE, "m", coordinate, is_lower_limit, has_use=False)
+            )
         return tuple(entries)
 
     @property
     def _sides(self) -> list[Side]:
         """Sides of the box that are not open."""
-        half_edges = 0.5 * (self.high - self.low)
-        sizes = np.where(np.isfinite(half_edges), half_edges, 1.0)
-        sides = []
-        for axis, size in enumerate(sizes.tolist()):
-            for sign, corner in ((1.0, self.high), (-1.0, self.low)):
-                if np.isfinite(corner[axis]):
-                    end = sign * float(corner[axis])
-                    sides.append(Side(axis, sign, end, size))
-        return sides
+        sides = [Side(axis, 1.0, end) for axis, end in enumerate(self.high.tolist())]
+        sides += [Side(axis, -1.0, end) for axis, end in enumerate(self.low.tolist())]
+        return [side for side in sides if math.isfinite(side.coordinate)]

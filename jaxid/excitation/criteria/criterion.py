@@ -69,7 +69,7 @@ class ConditionNumber(AbstractCriterion):
         name += ", weighted" if self.weighted else " of Λ (Eq. 36)"
         return f"{name}, columns scaled" if self.scaled else name
 
-    def __call__(self, information: Information, sharpness: Sharpness = None) -> Scalar:
+    def __call__(self, information, sharpness=None):
         """Return the logarithm of the condition number."""
         matrix = information.weighted if self.weighted else information.plain
         if self.scaled:
@@ -87,7 +87,7 @@ class DOptimal(AbstractCriterion):
 
     name: ClassVar[str] = "D: mean axis of the confidence ellipsoid"
 
-    def __call__(self, information: Information, sharpness: Sharpness = None) -> Scalar:
+    def __call__(self, information, sharpness=None):
         """Return the logarithm of the mean axis."""
         matrix = jnp.asarray(information.weighted)
         # The determinant does not depend on the scale that makes the factor accurate.
@@ -112,7 +112,7 @@ class AOptimal(AbstractCriterion):
     name: ClassVar[str] = "A: rms of the scaled deviations"
     sizes: BaseVector | None = None
 
-    def __call__(self, information: Information, sharpness: Sharpness = None) -> Scalar:
+    def __call__(self, information, sharpness=None):
         """Return the logarithm of the root mean square."""
         matrix = _divide_by_sizes(information, self.sizes)
         return 0.5 * jnp.asarray(spectral(log_mean_inverse, matrix, None))
@@ -128,7 +128,7 @@ class EOptimal(AbstractCriterion):
     name: ClassVar[str] = "E: longest axis of the scaled ellipsoid"
     sizes: BaseVector | None = None
 
-    def __call__(self, information: Information, sharpness: Sharpness = None) -> Scalar:
+    def __call__(self, information, sharpness=None):
         """Return the logarithm of the longest axis."""
         matrix = _divide_by_sizes(information, self.sizes)
         return 0.5 * jnp.asarray(spectral(log_largest_inverse, matrix, sharpness))

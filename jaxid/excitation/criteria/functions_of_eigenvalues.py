@@ -20,7 +20,7 @@ MIN_EIGENVALUE = 1e-15
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def spectral(
     function: Callable[[Array, Sharpness], Array],
-    matrix: Float[Array, "size size"],
+    matrix: Array,
     sharpness: Sharpness,
 ) -> Scalar:
     r"""Return a symmetric function of the logarithms of a matrix's eigenvalues.
@@ -43,13 +43,13 @@ def _spectral_derivative(function: Callable, primals: tuple, tangents: tuple) ->
     return value, jnp.sum(gradient * tangents[0])
 
 
-def _eigenvalues(matrix: Float[Array, "size size"]) -> tuple[Array, Array]:
+def _eigenvalues(matrix: Array) -> tuple[Array, Array]:
     """Return eigenvalues and eigenvectors; what is below rounding is raised to it."""
     eigenvalues, U = jnp.linalg.eigh(matrix)
     return jnp.maximum(eigenvalues, MIN_EIGENVALUE * eigenvalues[-1]), U
 
 
-def log_condition(logs: Float[Array, " size"], sharpness: Sharpness) -> Scalar:
+def log_condition(logs: Array, sharpness: Sharpness) -> Scalar:
     r"""Return the logarithm of the condition number.
 
     A smooth one is above it: $\log(\sum\lambda^p \sum\lambda^{-p})/p$.
@@ -59,12 +59,12 @@ def log_condition(logs: Float[Array, " size"], sharpness: Sharpness) -> Scalar:
     return _softmax(logs, sharpness) + _softmax(-logs, sharpness)
 
 
-def log_largest_inverse(logs: Float[Array, " size"], sharpness: Sharpness) -> Scalar:
+def log_largest_inverse(logs: Array, sharpness: Sharpness) -> Scalar:
     """Return the logarithm of the inverse's largest eigenvalue."""
     return -logs[0] if sharpness is None else _softmax(-logs, sharpness)
 
 
-def log_mean_inverse(logs: Float[Array, " size"], sharpness: Sharpness) -> Scalar:
+def log_mean_inverse(logs: Array, sharpness: Sharpness) -> Scalar:
     """Return the logarithm of the inverse's mean eigenvalue."""
     return jax.nn.logsumexp(-logs) - np.log(logs.shape[-1])
 

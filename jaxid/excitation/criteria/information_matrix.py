@@ -1,15 +1,15 @@
 """Information of a motion about the base parameters (Eq. 36)."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 
 from jaxid.arrays import AnyArray, Float, namespace
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.motion import Motion
-from jaxid.trajectory.trajectory import AbstractBasis
+from jaxid.dynamics.packed_regressor import JointRegressor
 
 BaseVector = Float[AnyArray, " base"]
 """One number for each base parameter."""
@@ -53,55 +53,43 @@ def information(
         prior: Information of earlier experiments; none if None.
         sizes: Typical size of each parameter; one if None.
     """
-    shape = (base.size, base.size)
-    plain = np.zeros(shape)
-    weighted = np.zeros(shape) if prior is None else np.array(prior, np.float64)
-    rows_by_joint = base.regressor_rows(motion)
-    joints = zip(base.acting_columns, rows_by_joint, np.asarray(weights), strict=True)
-    for columns, rows, weight in joints:
-        gram = rows.T @ rows
-        place = np.ix_(columns, columns)
-        plain[place] += gram
-        weighted[place] += weight**2 * gram
-    return Information(plain, weighted, np.ones(base.size) if sizes is None else sizes)
+    columns = [rows.T[None] for rows in base.regressor_rows(motion)]
+    plain, weighted = gram_matrices(base.joint_regressor, columns, weights)
+    earlier = 0.0 if prior is None else np.asarray(prior)
+    typical_sizes = np.ones(base.size) if sizes is None else sizes
+    return Information(plain[0], weighted[0] + earlier, typical_sizes)
 
 
-def information_of_coefficients(
-    base: BaseParameters,
-    basis: AbstractBasis,
-    x: Float[AnyArray, "starts joints variables"],
-    *,
-    samples: int,
-    measured: int,
+def gram_matrices(
+    regressor: JointRegressor,
+    columns: Sequence[AnyArray],
     weights: JointVector,
-    prior: BaseMatrix,
-    sizes: BaseVector,
-) -> Information:
-    """Return the information of many trajectories, in JAX (Eq. 36).
+) -> tuple[Any, Any]:
+    r"""Return $\Theta_B^T \Theta_B$ and $\Theta_B^T W^2 \Theta_B$ of some motions.
 
-    Motions are evaluated at `samples`, which stand for those that are `measured`.
+    Args:
+        regressor: Base regressor.
+        columns: Its columns for each joint [motions, columns, samples], in NumPy or
+            JAX.
+        weights: Inverse standard deviation of each joint's noise [1/(N m) or 1/N].
     """
-    regressor = base.joint_regressor
-    rows = np.asarray(basis.rows(basis.times(samples)))
-    q, qd, qdd = (jnp.einsum("sk,bjk->jbs", part, x) for part in rows[:3])
-    columns_by_joint = regressor(q, qd, qdd)
-
-    starts = x.shape[0]
-    plain = jnp.zeros((starts, base.size, base.size), x.dtype)
-    weighted = plain
-    for joint, columns in enumerate(columns_by_joint):
-        numbers = regressor.columns[joint]
-        place = np.ix_(numbers, numbers)
-        products = jnp.einsum("bis,bjs->bij", columns, columns)
-        gram = measured / samples * products
-        plain = plain.at[:, *place].add(gram)
-        weighted = weighted.at[:, *place].add(weights[joint] ** 2 * gram)
-    return Information(plain, weighted + prior[None], sizes)
+    plain = 0.0
+    weighted = 0.0
+    xp = namespace(*columns)
+    for numbers, rows, weight in zip(regressor.columns, columns, weights, strict=True):
+        gram = xp.pad(rows @ rows.swapaxes(1, 2), ((0, 0), (0, 1), (0, 1)))
+        # Parameters that do not act on the joint take the zeros at the end.
+        places = np.full(regressor.size, len(numbers))
+        places[list(numbers)] = np.arange(len(numbers))
+        gram = gram[:, places[:, None], places]
+        plain = plain + gram
+        weighted = weighted + weight**2 * gram
+    return plain, weighted
 
 
 def standard_deviations(
     weighted: BaseMatrix,
-) -> Float[np.ndarray, " base"]:
+) -> np.ndarray:
     """Return standard deviations from information; infinite where undetermined."""
     matrix, scale = scale_to_unit_diagonal(np.asarray(weighted, np.float64))
     eigenvalues, directions = np.linalg.eigh(matrix)
