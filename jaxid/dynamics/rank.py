@@ -221,7 +221,8 @@ def random_motion(model: Model, samples: int, seed: int) -> Motion:
     q = rng.uniform(-3.0, 3.0, shape) * units
     qd = rng.uniform(-3.0, 3.0, shape) * units
     qdd = rng.uniform(-6.0, 6.0, shape) * units
-    qd[1::2] *= 1e-3 ** rng.uniform(0.0, 1.0, qd[1::2].shape)
+    slow_samples = qd[1::2]
+    slow_samples *= 1e-3 ** rng.uniform(0.0, 1.0, slow_samples.shape)
     return Motion(q, qd, qdd)
 
 

@@ -250,10 +250,10 @@ def on_samples(
     is_small = math.prod(batch) <= MAX_SAMPLES_IN_NUMPY and not method.is_long
     if is_small and is_on_one_cpu:
         columns = [_entries_first(x) for x in arrays]
-        results = _samples_first(evaluate(method.program, *columns), len(batch))
+        results = evaluate(method.program, *columns)
+        results = _samples_first(results, len(batch)).astype(dtype, copy=False)
         with jax.default_device(*devices or (None,)):
-            convert = jnp.asarray if in_jax else np.asarray
-            return convert(results, dtype)
+            return jnp.asarray(results) if in_jax else results
 
     inputs = [jnp.asarray(x, dtype) for x in arrays]
     results = _over_batches(method.compiled, batch, inputs, len(shared))

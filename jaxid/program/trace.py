@@ -66,10 +66,12 @@ def _pad(x: np.ndarray, filler: np.ndarray, *, padding_config) -> np.ndarray:
     for axis, (before, behind, gaps) in enumerate(padding_config):
         x = np.moveaxis(x, axis, 0)
         start = max(before, 0)
-        stop = start + max(len(x) + (len(x) - 1) * gaps, 0)
+        length = max(len(x) + (len(x) - 1) * gaps, 0)
+        stop = start + length
         size = stop + max(behind, 0)
         result = np.full((size, *x.shape[1:]), filler, x.dtype)
         result[start : stop : gaps + 1] = x
+        # A negative number cuts entries off.
         first = max(-before, 0)
         end = size - max(-behind, 0)
         x = np.moveaxis(result[first:end], 0, axis)

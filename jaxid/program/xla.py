@@ -15,7 +15,6 @@ import jax
 import jax.numpy as jnp
 
 from jaxid.arrays import AnyArray, Array
-from jaxid.errors import InputError
 
 from .jax_sincos import sine_cosine
 from .program import Node, Program, Shape
@@ -104,11 +103,7 @@ class Lowered(eqx.Module):
 
     def entries(self, *arrays: AnyArray) -> tuple[list[Array], Shape]:
         """Return the inputs as [entries, *batch], and the batch's shape."""
-        dtype = jnp.result_type(*arrays, float) if arrays else jnp.result_type(float)
-        if not jnp.issubdtype(dtype, jnp.floating):
-            raise InputError(
-                f"A program computes with real numbers, but got arrays of {dtype}."
-            )
+        dtype = jnp.result_type(*arrays, float)
         return self.program.align([jnp.asarray(x, dtype) for x in arrays], jnp)
 
     def dense(self, *arrays: AnyArray) -> Any:
