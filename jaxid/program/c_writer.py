@@ -193,7 +193,9 @@ class CWriter:
         # The library always computes as many numbers.
         arguments += [self.number(0.0)] * (width - len(operands))
         label = f"t{name[0]}{stage}"
-        results = [f"{label}a", f"{label}b"][: len(LIBRARY[name])]
+        results = [f"{label}a"]
+        if len(LIBRARY[name]) > 1:
+            results.append(f"{label}b")
         arrays = [f"{x}[{width}]" for x in results]
         lines = [
             f"const {self.type} {label}[{width}] = {{{', '.join(arguments)}}};",
@@ -203,7 +205,8 @@ class CWriter:
         for k in nodes:
             operation, (x,) = program.nodes[k]
             result = results[operation is Operation.COSINE]
-            lines.append(f"const {self.type} t{k} = {result}[{operands.index(x)}];")
+            position = operands.index(x)
+            lines.append(f"const {self.type} t{k} = {result}[{position}];")
         return lines
 
     def library(self) -> str:

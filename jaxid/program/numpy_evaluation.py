@@ -146,11 +146,12 @@ def _evaluate(
     scratch = np.empty((cell_count - len(results), min(samples, BLOCK)))
     with np.errstate(all="ignore"):
         for start in range(0, samples, BLOCK):
-            block = slice(start, min(start + BLOCK, samples))
-            size = block.stop - block.start
-            cells = [*results[:, block], *scratch[:, :size]]
+            stop = min(start + BLOCK, samples)
+            block = slice(start, stop)
+            cells = [*results[:, block], *scratch[:, : stop - start]]
             for cell, number, entry in loads:
-                cells[cell][:] = inputs[number][entry, block]
+                row = inputs[number][entry]
+                cells[cell][:] = row[block]
             run(cells)
     return results, batch
 

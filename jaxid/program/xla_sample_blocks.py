@@ -6,7 +6,9 @@ arrays, and are put in place afterwards. An accelerator takes all samples at onc
 """
 
 import functools
+import itertools
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -35,8 +37,12 @@ def block_results(program: Program, *arrays: Array) -> Results:
     def evaluate(arrays: tuple[Array, ...]) -> Results:
         # All samples are transposed together, behind a fence of their own.
         matrix = jnp.concatenate([x.T for x in arrays if x.ndim == 2])
-        rows = iter(fenced(matrix, hidden_one(matrix[0, 0])))
-        columns = [[next(rows) for _ in x.T] if x.ndim == 2 else x for x in arrays]
+        one = hidden_one(matrix[0, 0])
+        rows = iter(fenced(matrix, one))
+        columns: list[Any] = list(arrays)
+        for k, x in enumerate(arrays):
+            if x.ndim == 2:
+                columns[k] = list(itertools.islice(rows, x.shape[1]))
         return lower(program, fence=True).run(_repeat(columns, count))
 
     def skip(_: tuple[Array, ...]) -> Results:
@@ -54,7 +60,10 @@ def results_at_once(program: Program, *arrays: Array) -> Results:
 
 def _repeat(columns: Sequence, count: int) -> list[list[Array]]:
     """Return all entries as arrays of the samples, also what these have in common."""
-    return [[jnp.broadcast_to(row, count) for row in x] for x in columns]
+    entries = []
+    for x in columns:
+        entries.append([jnp.broadcast_to(row, count) for row in x])
+    return entries
 
 
 def _pack(results: Callable[..., Results], program: Program, *arrays: Array) -> Rows:
