@@ -249,7 +249,7 @@ def test_the_example_in_the_readme_runs(given, tmp_path):
         check=False,
     )
     assert done.returncode == 0, done.stderr
-    assert "12 base parameters" in done.stdout
+    assert "14 base parameters" in done.stdout
     made = {path.name for path in tmp_path.iterdir()} - {
         "arm.urdf",
         "log.csv",
