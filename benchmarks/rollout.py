@@ -93,7 +93,7 @@ def so101(quick: bool) -> None:
             (1e3 * errors.total(kind)[:5]).round(1),
             "mrad, joints 1 to 5",
         )
-    print(f"identified in {elapsed:.0f} s; contacts on the six: {len(errors.contacts)}")
+    print(f"identified in {elapsed:.0f} s")
     held = np.full((700, 6), 0.3)
     held[:100] *= np.linspace(0.0, 1.0, 100)[:, None]
     (path,) = fit.simulate(jid.Recording.of(0 * held, held, sample_time=0.02))

@@ -134,7 +134,6 @@ class RolloutReport:
         """Return the content of `rollout.json`."""
         fit = self.fit
         errors = self.errors
-        contacts = [contact._asdict() for contact in (*fit.contacts, *errors.contacts)]
         return {
             "kind": "commands",
             "joints": fit.joint_names,
@@ -148,7 +147,6 @@ class RolloutReport:
                 "command": errors.rms("command"),
                 "windows": self.windows,
             },
-            "contacts": contacts,
             "simulators": simulator_values(fit) if self.has_stiffness else None,
             "notes": fit.notes,
         }

@@ -1,7 +1,6 @@
 """Identification from rollouts: a simulation that moves like the robot."""
 
 from .bodies import Bodies as Bodies
-from .contact import Contact as Contact
 from .errors import RolloutErrors as RolloutErrors
 from .identify import identify_rollout as identify_rollout
 from .motion import ServoMotion as ServoMotion

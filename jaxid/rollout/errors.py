@@ -5,9 +5,7 @@ import dataclasses
 import numpy as np
 
 from jaxid.arrays import Float
-from jaxid.result_table import Column, Remark, Status, Table
-
-from .contact import Contact
+from jaxid.result_table import Column, Table
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,9 +20,7 @@ class RolloutErrors:
         simulated: Simulated positions.
         command: Commanded positions.
         linear: Simulation by the linear baseline.
-        counted: Whether a sample counts: behind the first half second, and without
-            contact.
-        contacts: Stretches in which something outside the model holds the robot.
+        counted: Whether a sample counts: behind the first half second.
     """
 
     joint_names: tuple[str, ...]
@@ -35,7 +31,6 @@ class RolloutErrors:
     command: tuple[np.ndarray, ...]
     linear: tuple[np.ndarray, ...]
     counted: tuple[np.ndarray, ...]
-    contacts: tuple[Contact, ...]
 
     def rms(self, kind: str = "simulated") -> Float[np.ndarray, "motions joints"]:
         """Return RMS errors of `simulated`, `command` or `linear`; NaN without any."""
@@ -54,20 +49,11 @@ class RolloutErrors:
         """Return a table of the errors of all motions."""
         rms = 1e3 * self.rms()
         columns = [Column(name, rms[:, j]) for j, name in enumerate(self.joint_names)]
-        remarks = [
-            Remark(
-                f"{c.name}: {self.joint_names[c.joint]} is held by something from "
-                f"{c.start:.1f} s to {c.stop:.1f} s (error {1e3 * c.error:.0f} mrad): "
-                "contact? It does not count",
-                Status.DOUBTFUL,
-            )
-            for c in self.contacts
-        ]
         title = (
             "errors of free-running simulations, behind the first half second "
             "[mrad or mm]"
         )
-        return Table(title, Column("motion", self.motions), *columns, remarks=remarks)
+        return Table(title, Column("motion", self.motions), *columns)
 
     def __str__(self) -> str:
         return self.summary().text()

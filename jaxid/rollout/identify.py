@@ -18,7 +18,6 @@ from jaxid.errors import InputError
 from jaxid.measurement.recording import Recording
 
 from .bodies import Bodies
-from .contact import contact_rows
 from .coupled import CoupledSimulator
 from .least_squares import Solution, bounded_step, minimise
 from .motion import ServoMotion
@@ -279,10 +278,8 @@ class _Search:
             groups[1] = ((),)
         if not saturation:
             groups[2] = ((),)
-        for k, group in enumerate(groups):
+        for group in groups:
             self.choose(group)
-            if k == 0:
-                self.remove_contact()
 
     def solve(
         self,
@@ -294,11 +291,11 @@ class _Search:
         """Fit candidates [candidates, joints, parameters] to all motions."""
         w = self.weights[:, None, :]
 
-        def moments(x, k):
+        def moments(x):
             parts = zip((0, 1, 2), self.simulator.moments(x), strict=True)
             return tuple((w[(...,) + (None,) * n] * y).sum(axis=0) for n, y in parts)
 
-        def costs(x, k):
+        def costs(x):
             return (w * self.simulator.costs(x)).sum(axis=0)
 
         return minimise(
@@ -398,18 +395,6 @@ class _Search:
         self.weights = weights_of(
             self.simulator.motion, self.simulator.costs(x[None])[:, 0]
         )
-
-    def remove_contact(self) -> None:
-        """Leave out samples in which something outside the model holds a joint."""
-        motion = self.simulator.motion
-        errors = self.simulator.paths(self.x[None])[:, 0] - np.asarray(motion.positions)
-        contact_mask = contact_rows(motion, errors)
-        if contact_mask.any():
-            counted_samples = np.asarray(motion.counted) * ~contact_mask
-            self.simulator = dataclasses.replace(
-                self.simulator, motion=motion.replace(counted=counted_samples)
-            )
-            self._weigh_motions(self.x)
 
     def choose(self, group: Sequence[tuple[str, ...]]) -> None:
         """Take the effects of a group that lower held-out errors, joint by joint."""

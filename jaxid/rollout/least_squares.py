@@ -9,12 +9,12 @@ from jaxid.arrays import Bool, Float
 
 MAX_BOUND_ROUNDS = 6
 """Largest number of times that parameters are brought to their bounds in a step."""
-Moments = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, ...]]
-"""Function of parameters [..., size] and their problems' indices along the first axis.
+Moments = Callable[[np.ndarray], tuple[np.ndarray, ...]]
+"""Function of parameters [..., size] of some problems.
 
 It returns costs, gradients and Gauss-Newton matrices.
 """
-Costs = Callable[[np.ndarray, np.ndarray], np.ndarray]
+Costs = Callable[[np.ndarray], np.ndarray]
 """Function of the same that returns the costs alone."""
 
 
@@ -65,13 +65,13 @@ def minimise(
     dampings = np.full(x.shape[:-1], damping)
     subset = np.arange(len(x))
     convergence = np.zeros(x.shape[:-1], bool)
-    cost, g, H = moments(x, subset)
+    cost, g, H = moments(x)
     for _ in range(iterations):
         terms = [y[subset] for y in (x, cost, g, H, free, dampings)]
         x[subset], dampings[subset], new_convergence = improve(
-            costs, subset, terms, bounds, tolerance
+            costs, terms, bounds, tolerance
         )
-        cost[subset], g[subset], H[subset] = moments(x[subset], subset)
+        cost[subset], g[subset], H[subset] = moments(x[subset])
         convergence[subset] |= new_convergence
         subset = subset[~convergence[subset].reshape(len(subset), -1).all(axis=1)]
         if not subset.size:
@@ -79,14 +79,14 @@ def minimise(
     return Solution(x, cost, g, H)
 
 
-def improve(costs, problems, terms, bounds, tolerance):
+def improve(costs, terms, bounds, tolerance):
     """Return parameters of lower costs, their damping, and the converged problems."""
     x, cost, g, H, free_mask, damping = terms
     decrease = np.zeros_like(cost)
     for _ in range(5):
         step = bounded_step(g, H, x, free_mask, bounds, damping)
         trial = np.clip(x + step, *bounds)
-        trial_cost = costs(trial, problems)
+        trial_cost = costs(trial)
         is_better = (trial_cost < cost) & (decrease == 0.0)
         decrease = np.where(
             is_better, (cost - trial_cost) / np.maximum(cost, 1e-300), decrease

@@ -21,7 +21,6 @@ from jaxid.result_table import (
 )
 
 from .bodies import Bodies
-from .contact import Contact, contact_rows, contacts, sustained_errors, typical_errors
 from .coupled import CoupledSimulator
 from .errors import RolloutErrors
 from .motion import ServoMotion
@@ -84,8 +83,6 @@ class ServoFit:
         time_step: Longest step of the simulation [s].
         rms: Errors of the identification [motions, joints] [rad or m].
         motions: Names of the logs.
-        typical: Typical sustained error of each joint [rad or m].
-        contacts: Stretches that were left out, because something held the robot.
         bodies: Bodies whose weight loads the joints; None without.
         load: Mean absolute load of each joint in the logs [N m or N].
         notes: Doubts about the model, in sentences.
@@ -105,8 +102,6 @@ class ServoFit:
     time_step: float
     rms: Float[np.ndarray, "motions joints"]
     motions: tuple[str, ...]
-    typical: Float[np.ndarray, " joints"]
-    contacts: tuple[Contact, ...]
     bodies: Bodies | None
     load: Float[np.ndarray, " joints"]
     notes: tuple[str, ...] = ()
@@ -126,8 +121,6 @@ class ServoFit:
         simulator = refinement.simulator
         r = refinement.residuals
         motion = simulator.motion
-        errors = simulator.positions(refinement.path) - np.asarray(motion.positions)
-        error_sizes = typical_errors(motion, sustained_errors(motion, errors))
         combinations, covariance, dof = _determined_combinations(
             _Rows.of(refinement), refinement, joint_names
         )
@@ -169,8 +162,6 @@ class ServoFit:
             simulator.time_step,
             np.sqrt(mean_squares(motion, refinement.sums)),
             motion.names,
-            error_sizes,
-            contacts(motion, errors, error_sizes),
             simulator.bodies,
             np.abs(load).mean(axis=(0, 2)),
             (*notes, *([effect_note] if joint_errors else [])),
@@ -225,14 +216,12 @@ class ServoFit:
         paths = self.paths(motion)
         return [path[:, :n].T for path, n in zip(paths, motion.lengths, strict=True)]
 
-    def paths(
-        self, motion: ServoMotion, parameters: AnyArray | None = None
-    ) -> np.ndarray:
+    def paths(self, motion: ServoMotion) -> Float[np.ndarray, "motions joints samples"]:
         """Return simulated positions [motions, joints, samples].
 
         The loads are those at the simulated positions.
         """
-        x = np.asarray(self.parameters if parameters is None else parameters)
+        x = self.parameters
         if x[:, INDEX["ki"]].any():
             loaded_motion = motion if self.bodies is None else self.bodies.loads(motion)
             motion = with_integral(loaded_motion, x, self.hold)
@@ -250,8 +239,6 @@ class ServoFit:
         linear_positions = ServoSimulator(motion, self.time_step).paths(
             self.linear[None]
         )[:, 0]
-        errors = simulated_positions - np.asarray(motion.positions)
-        contact_mask = contact_rows(motion, errors, self.typical)
         parts = range(motion.motions)
         lengths = motion.lengths
         times = motion.begin[:, None] + np.outer(
@@ -269,8 +256,7 @@ class ServoFit:
             cut(simulated_positions),
             cut(motion.sent),
             cut(linear_positions),
-            cut((np.asarray(motion.counted) > 0) & ~contact_mask),
-            contacts(motion, errors, self.typical),
+            cut(np.asarray(motion.counted) > 0),
         )
 
     def window_errors(
@@ -348,14 +334,6 @@ class ServoFit:
             "positions determine inertias, friction, load and motor gain only in their "
             "ratios to the stiffness",
             *(Remark(note, Status.DOUBTFUL) for note in self.notes),
-            *(
-                Remark(
-                    f"{c.name}: from {c.start:.1f} s to {c.stop:.1f} s something held "
-                    f"{self.joint_names[c.joint]} (contact?): left out",
-                    Status.DOUBTFUL,
-                )
-                for c in self.contacts
-            ),
         ]
         return Table(
             "joints behind position servos",

@@ -1,5 +1,7 @@
 """A servo arm on MuJoCo: position servos, delay, dry friction, encoders of 12 bits."""
 
+import functools
+
 import mujoco
 import numpy as np
 
@@ -49,8 +51,12 @@ def model_text(stiffer=1.0, step=0.001, friction=FRICTION, ki=0.0, limit=1e3):
     )
 
 
+@functools.cache
 def bodies(coupled=True):
-    """Return the bodies of the arm, as `identify_rollout` takes them."""
+    """Return the bodies of the arm, as `identify_rollout` takes them.
+
+    They are made once: what is compiled for them serves all tests.
+    """
     robot = jid.Robot(
         "servo arm",
         revolute=(True, True),
