@@ -141,7 +141,9 @@ class Arm:
                 centre_max=np.minimum(centre - 0.01, 0.1 * bounds.radius[:, None]),
             )
         noise, samples = (1.0 if way == 3 else 0.05), (10 if way == 2 else None)
-        return self.factor(trial, noise, samples), jid.PhysicallyConsistent(bounds)
+        return self.factor(trial, noise, samples), jid.PhysicallyConsistent(
+            bounds=bounds
+        )
 
 
 def program(base, factor, estimator):
