@@ -9,8 +9,7 @@ Model: rigid bodies with ten parameters each, rotor inertias, viscous and Coulom
 friction (smooth sign, epsilon 0.01 rad/s), offsets, and on the TX40 the coupled wrist.
 The row "epsilons" finds one epsilon for each joint, the row "Stribeck" has Stribeck's
 law and finds its speeds too; each is the linear model where held-out blocks *of the
-identification part* say that it does not pay (last column). The row "essential" leaves
-out base parameters by held-out blocks of the same part.
+identification part* say that it does not pay (last column).
 
 Statistics: "weighted" is the RMS error in percent of the largest forces, root mean
 square of the joints: what weighted least squares minimise. "relative" is the norm of
@@ -26,7 +25,6 @@ with weighted least squares.
 import jax
 import numpy as np
 import timing
-from stepwise import Stepwise
 from timing import DATA, EXPERIMENTS
 
 import jaxid as jid
@@ -68,14 +66,6 @@ def fits(base: jid.BaseParameters, train: jid.Observations, *, quick: bool):
             consistent,
             ", ".join(filter(None, (remark, price))),
         )
-    stepwise = jid.identify(base, train, Stepwise())
-    yield "axis by axis", stepwise, ""
-    essential = jid.essential_parameters(wls, train)
-    yield (
-        "essential parameters",
-        essential,
-        f"{essential.base.size} of {base.size}",
-    )
     if quick:
         return
     for name, other in (("epsilons", base), ("Stribeck", stribeck(base))):

@@ -67,7 +67,6 @@ METHODS = (
     Script("coverage", 20),
     Script("held_out", 10),
     Script("friction", 60),
-    Script("stepwise", 10),
     Script("states", 5),
     Script("rollout", 55),
     Script("transients", 1),

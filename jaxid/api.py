@@ -62,9 +62,6 @@ from .identification.model_selection import (
 )
 from .identification.operating_states import identify_states as identify_states
 from .identification.parameter_changes import compare as compare
-from .identification.parameter_elimination import (
-    essential_parameters as essential_parameters,
-)
 from .identification.payload import identify_payload as identify_payload
 from .identification.problem import RegressionProblem as RegressionProblem
 from .measurement import filters as filters

@@ -151,7 +151,6 @@ CASES = {
     "bootstrap": lambda: jid.uncertainty.bootstrap(
         jid.RegressionProblem(base, [cold]).blocks, np.ones(2), 20, key
     ),
-    "essential_parameters": lambda: jid.essential_parameters(plain(), cold).parameters,
     "identify_states": lambda: jid.identify_states(runs()).parameters,
     "update": lambda: jid.combine_fits(*runs()).parameters,
     "compare": lambda: jid.compare(plain(), jid.identify(base, warm)).difference,

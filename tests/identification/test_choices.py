@@ -1,4 +1,4 @@
-"""Essential parameters, and filters chosen by held-out errors."""
+"""Filters chosen by held-out errors."""
 
 import numpy as np
 import pytest
@@ -10,31 +10,6 @@ BASE = virtual.planar_base(3)
 MODEL = BASE.model
 P = virtual.standard_parameters(MODEL, seed=1)
 WLS = jid.estimators.LeastSquares()
-
-
-def test_parameters_without_effect_are_eliminated():
-    p = np.where([n[:2] == "fo" or n == "fv2" for n in MODEL.parameter_names], 0.0, P)
-    o = virtual.observations(MODEL, p, noise=0.3, samples=800)
-    fit = jid.identify(BASE, o, WLS)
-    found = jid.essential_parameters(fit, o, cost=0.001)
-    names = set(found.base.names)
-    eliminated = set(BASE.names) - names
-    assert {"fo1", "fo2", "fo3", "fv2"} <= eliminated
-    truth = np.asarray(BASE.from_standard(p))
-    large = {n for n, x in zip(BASE.names, truth, strict=True) if abs(x) > 0.2}
-    assert large <= names
-    kept = [BASE.names.index(n) for n in found.base.names]
-    error = np.abs(found.parameters - truth[kept])
-    assert (error < 5 * found.standard_deviations).all()
-    assert eliminated == set(found.notes[-1].split("zero: ")[1].strip(".").split(", "))
-    assert f"{found.base.size} of {BASE.size} base parameters" in found.notes[-1]
-    # A large cost eliminates parameters that have an effect, too.
-    assert jid.essential_parameters(fit, o, cost=20.0).base.size < found.base.size
-    # A model of fewer parameters is the model in which the others are zero.
-    p, motion = np.zeros(BASE.size), virtual.motion(3, 20)
-    p[kept] = found.parameters
-    torques = BASE.inverse_dynamics(p, motion)
-    np.testing.assert_allclose(found.predict(motion), torques, atol=1e-12)
 
 
 @pytest.fixture(scope="module")
@@ -76,11 +51,5 @@ def test_a_filter_is_chosen_between_too_low_and_too_high(noisy_log):
 
 
 def test_invalid_choices_are_rejected():
-    o = virtual.observations(MODEL, P, noise=0.3)
-    fit = jid.identify(BASE, o, WLS)
-    with pytest.raises(ValueError, match="`observations`"):
-        jid.essential_parameters(fit, virtual.observations(MODEL, P, samples=300))
-    with pytest.raises(ValueError, match="`cost`"):
-        jid.essential_parameters(fit, o, cost=-0.1)
     with pytest.raises(ValueError, match="`candidates`"):
         jid.choose_filter(BASE, (), [])
