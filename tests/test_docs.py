@@ -21,7 +21,7 @@ import jaxid as jid
 from jaxid.dynamics.sample_methods import in_numpy
 from jaxid.experiment.decoder import check_names, decode
 from jaxid.experiment.experiment import TABLES
-from jaxid.experiment.model_and_log_tables import SIDES
+from jaxid.experiment.setup_tables import SIDES
 from jaxid.identification.estimators.regularisation_and_weights import (
     LARGEST_UNCERTAINTY,
 )

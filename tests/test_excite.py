@@ -499,7 +499,7 @@ def test_a_motion_without_a_way_into_it_is_written_with_a_warning(
     def refuse(series, robot, periods):
         raise InputError("no lead is short enough.")
 
-    monkeypatch.setattr("jaxid.workflow.motion_files.with_leads", refuse)
+    monkeypatch.setattr("jaxid.workflow.motion_design.with_leads", refuse)
     monkeypatch.setattr(
         "jaxid.workflow.motion_design.design_excitation", lambda *_, **__: excited.plan
     )

@@ -11,8 +11,8 @@ from jaxid import units
 from jaxid.errors import InputError
 from jaxid.experiment.decoder import check_names, decode, keys_of
 from jaxid.experiment.experiment import TABLES, load_experiment
-from jaxid.experiment.model_and_log_tables import SIDES
 from jaxid.experiment.robot_tables import known_load
+from jaxid.experiment.setup_tables import SIDES
 from jaxid.experiment.template import write_template
 from jaxid.workflow.log_loading import read_log
 

@@ -3,8 +3,7 @@
 from pathlib import Path
 
 from jaxid.trajectory.trajectory import LinearTrajectory
-from jaxid.workflow.motion_design import MotionTask
-from jaxid.workflow.motion_files import make_playable, write_motion
+from jaxid.workflow.motion_design import MotionTask, make_playable, write_motion
 
 from . import process
 

@@ -14,6 +14,7 @@ import re
 import typing
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from operator import ge, gt, le, lt
 from typing import Annotated, Any, Literal, NamedTuple
 
 import jaxtyping
@@ -22,7 +23,7 @@ import numpy as np
 from jaxid.errors import InputError
 from jaxid.io import union_members
 from jaxid.units import Unit, unit
-from jaxid.workflow.allowed_values import OneOf, quoted
+from jaxid.workflow.allowed_values import Bounds, OneOf
 
 TomlTable = dict[str, Any]
 """Table of a TOML file, or arguments that are made of one."""
@@ -172,7 +173,8 @@ _SCALARS: dict[Any, tuple[Any, str]] = {
 
 def _convert(value: Any, option: Any, place: str) -> Any:
     """Return a value as an annotation asks, or `_OTHER` if it is of another kind."""
-    origin, arguments = typing.get_origin(option), typing.get_args(option)
+    origin = typing.get_origin(option)
+    arguments = typing.get_args(option)
     function = table_of(option)
     if function is not None:
         return call(function, value, place) if isinstance(value, dict) else _OTHER
@@ -180,7 +182,7 @@ def _convert(value: Any, option: Any, place: str) -> Any:
         kind, rule = arguments
         result = _convert(value, kind, place)
         if result is not _OTHER:
-            rule.check(result, place)
+            _require_allowed(result, rule, place)
         return result
     if origin is Literal:
         return value if value in arguments else _OTHER
@@ -193,6 +195,21 @@ def _convert(value: Any, option: Any, place: str) -> Any:
     if option in _SCALARS:
         return _convert_scalar(value, option, place)
     return _convert_array(value, place)
+
+
+def _require_allowed(value: Any, rule: Bounds | OneOf, place: str) -> None:
+    """Reject a number out of its range, NaN and infinity, and an unknown name."""
+    if isinstance(rule, OneOf):
+        if value not in rule.names:
+            text = json.dumps(value, ensure_ascii=False)
+            raise InputError(f"`{place}` must be {quoted(rule.names)}, but is {text}.")
+        return
+    if not math.isfinite(value):
+        raise InputError(f"`{place}` must be finite, but is {value}.")
+    comparisons = (("above", gt), ("at least", ge), ("at most", le), ("below", lt))
+    for bound, (words, holds) in zip(rule, comparisons, strict=True):
+        if bound is not None and not holds(value, bound):
+            raise InputError(f"`{place}` must be {words} {bound:.10g}, but is {value}.")
 
 
 def _convert_list(values: list[Any], hints: Sequence[Any], place: str) -> list[Any]:
@@ -253,7 +270,8 @@ def _is_array(option: Any) -> bool:
 
 def _describe(option: Any) -> str:
     """Return an annotation in words, for messages."""
-    origin, arguments = typing.get_origin(option), typing.get_args(option)
+    origin = typing.get_origin(option)
+    arguments = typing.get_args(option)
     if origin is Annotated and not table_of(option):
         kind, rule = arguments
         return quoted(rule.names) if isinstance(rule, OneOf) else _describe(kind)
@@ -265,3 +283,9 @@ def _describe(option: Any) -> str:
         return "a number or a list"
     _, words = _SCALARS.get(option, (None, "a table"))
     return words
+
+
+def quoted(values: Iterable[Any]) -> str:
+    """Return values as a sentence lists them: `"a", "b" or "c"`."""
+    words = [f'"{v}"' if isinstance(v, str) else str(v) for v in values]
+    return " or ".join(filter(None, [", ".join(words[:-1]), words[-1]]))

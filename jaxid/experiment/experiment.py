@@ -7,31 +7,28 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from jaxid.dynamics.model import Model
 from jaxid.errors import InputError
 from jaxid.identification.consistency import BodyBounds
 from jaxid.measurement.columns import Columns
 from jaxid.measurement.filters import FILTERS
 from jaxid.measurement.log_files import summarise_columns
-from jaxid.robot.robot import Robot, Tool
+from jaxid.robot.robot import Tool
 from jaxid.workflow.excitation_settings import Excitation
 from jaxid.workflow.log_loading import is_report
-from jaxid.workflow.log_reading import LogReading
 from jaxid.workflow.log_rollout import ServoSettings, TorqueSettings
-from jaxid.workflow.robot_file import RobotFile
-from jaxid.workflow.setup import Setup
+from jaxid.workflow.setup import LogReading, Setup
 from jaxid.workflow.surroundings import Collision, Surroundings
 
 from .decoder import TomlTable, call, check_names, decode, within
-from .estimator_table import build_estimation, decode_estimator
-from .model_and_log_tables import (
+from .robot_tables import RobotSource, known_load, replace_drives, replace_limits
+from .setup_tables import (
     Effects,
     Sides,
     build_columns,
-    build_filters,
+    build_estimation,
     build_rows,
+    build_setup,
 )
-from .robot_tables import RobotSource, known_load, replace_drives, replace_limits
 
 FORMER_KEYS = {
     ("model", "coulomb", "dead_zone"): 0.0,
@@ -155,7 +152,8 @@ def _build(tables: TomlTable, text: str, path: Path) -> Experiment:
     for name, replace in (("limits", replace_limits), ("drives", replace_drives)):
         if name in tables:
             robot = call(replace, tables[name], name, robot)
-    columns, reading = None, LogReading()
+    columns = None
+    reading = LogReading()
     if "recording" in tables:
         columns, reading = build_columns(tables["recording"], robot)
     load = None
@@ -167,7 +165,7 @@ def _build(tables: TomlTable, text: str, path: Path) -> Experiment:
         path,
         text,
         source,
-        _build_setup(tables, robot, robot_file, reading),
+        build_setup(tables, robot, robot_file, reading),
         columns,
         load,
         _build_rollout(tables.get("rollout", {}), reading),
@@ -188,38 +186,6 @@ def _require_tables(tables: TomlTable) -> None:
         )
 
 
-def _build_setup(
-    tables: TomlTable,
-    robot: Robot,
-    robot_file: RobotFile | None,
-    reading: LogReading,
-) -> Setup:
-    """Return how logs become parameters."""
-    effects = call(Effects, tables.get("model", {}), "model")
-    with within("model"):
-        model = Model(robot, effects.build(robot))
-    filters = {}
-    if "filter" in tables:
-        first_filter, *others = build_filters(tables["filter"])
-        filters["filter"] = first_filter
-        if others:
-            filters["filter_candidates"] = (first_filter, *others)
-    decimation, min_speed = call(build_rows, tables.get("rows", {}), "rows", robot)
-    arguments, bounds = decode_estimator(tables.get("estimator", {}))
-    with within("estimator"):
-        estimation = build_estimation(robot, robot_file, bounds, **arguments)
-    return Setup(
-        model,
-        decimation=decimation,
-        min_speed=min_speed,
-        load_friction=effects.load,
-        robot_file=robot_file,
-        reading=reading,
-        **filters,
-        **estimation._asdict(),
-    )
-
-
 def _build_rollout(
     table: TomlTable, reading: LogReading
 ) -> ServoSettings | TorqueSettings:
@@ -229,10 +195,13 @@ def _build_rollout(
         InputError: If a setting is given that is for logs of the other kind.
     """
     servo, torque = decode([ServoSettings, TorqueSettings], table, "rollout")
-    settings, others = ServoSettings(**servo), TorqueSettings(**torque)
-    kind = "forces` without `recording.commands"
-    if reading.commands is None:
-        settings, others, kind = others, settings, "commands"
+    settings = TorqueSettings(**torque)
+    others = ServoSettings(**servo)
+    kind = "commands"
+    if reading.commands is not None:
+        settings = ServoSettings(**servo)
+        others = TorqueSettings(**torque)
+        kind = "forces` without `recording.commands"
     for field in dataclasses.fields(others):
         if getattr(others, field.name) != field.default:
             raise InputError(

@@ -265,7 +265,8 @@ def _require_plausible(robot: Robot, limits: dict[str, np.ndarray]) -> None:
             f"`force` must be at least {MIN_FORCE} N m or N, but is {forces}."
         )
     for j, name in enumerate(robot.joint_names):
-        low, high = limits["position_min"][j], limits["position_max"][j]
+        low = limits["position_min"][j]
+        high = limits["position_max"][j]
         fault = range_fault(low, high, robot.revolute[j])
         if fault:
             cure = "give the limits in metres, inf for none"

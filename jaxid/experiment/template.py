@@ -27,13 +27,14 @@ from jaxid.units import Unit
 from jaxid.workflow.setup import DEFAULT_CUTOFF
 
 from .decoder import Key, keys_of
-from .estimator_table import KINDS
 from .experiment import TABLES
-from .model_and_log_tables import SIDES, DryFriction
 from .robot_tables import known_load
+from .setup_tables import KINDS, SIDES, DryFriction
 
-WIDTH, COLUMN = 100, 38
-"""Largest length of a line, and column in which the comments behind keys begin."""
+WIDTH = 100
+"""Largest length of a line."""
+COLUMN = 38
+"""Column in which the comments behind keys begin."""
 HEAD = """\
 # Experiment file of {name}:
 # what is known of the robot, what its logs hold, how it is identified.

@@ -65,7 +65,7 @@ def report_figures(report: Report) -> dict[str, Figure]:
     """Return all figures of a report by the names of their files, without suffix."""
     fit = report.fit
     robot = fit.base.model.robot
-    shown_log, *_ = (*report.verification, *report.identification)
+    shown_logs = report.verification or report.identification
     roles = {
         "identification": report.identification,
         "verification": report.verification,
@@ -73,7 +73,7 @@ def report_figures(report: Report) -> dict[str, Figure]:
     figures = {
         "errors": bar_figure(roles, robot),
         "friction": friction_figure(fit, report.identification),
-        "robot": error_scene(fit, shown_log),
+        "robot": error_scene(fit, shown_logs[0]),
     }
     if report.claimed:
         groups = {

@@ -7,7 +7,6 @@ from .log_identification import (
 )
 from .log_inspection import inspect_logs as inspect_logs
 from .log_loading import load_log as load_log, read_log as read_log
-from .log_reading import LogReading as LogReading
 from .log_rollout import (
     ServoSettings as ServoSettings,
     TorqueSettings as TorqueSettings,
@@ -25,7 +24,7 @@ from .payload_gains_and_states import (
     identify_states_from_logs as identify_states_from_logs,
 )
 from .robot_file import RobotFile as RobotFile
-from .setup import Setup as Setup
+from .setup import LogReading as LogReading, Setup as Setup
 from .setup_choice import (
     choose_setup as choose_setup,
     choose_setup_by_rows as choose_setup_by_rows,

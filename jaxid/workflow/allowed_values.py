@@ -1,17 +1,12 @@
-"""Values that settings may have; experiment files are checked against them.
+"""Values that settings may have, as annotations of the settings.
 
-The annotation of a setting says which numbers it takes: `Positive`, or
-`Annotated[float, Bounds(above=0.0)]`.
+Experiment files are checked against them: the annotation of a setting says which
+numbers or names it takes, as `Positive` or `Annotated[str, OneOf(CRITERIA)]`.
 """
 
 import dataclasses
-import json
-import math
-from collections.abc import Collection, Iterable
-from operator import ge, gt, le, lt
-from typing import Annotated, Any, NamedTuple
-
-from jaxid.errors import InputError
+from collections.abc import Collection
+from typing import Annotated, NamedTuple
 
 
 class Bounds(NamedTuple):
@@ -22,34 +17,12 @@ class Bounds(NamedTuple):
     maximum: float | None = None  # inclusive upper bound
     below: float | None = None  # exclusive upper bound
 
-    def check(self, value: float | int, place: str) -> None:
-        """Reject a number out of the range, NaN and infinity.
-
-        Args:
-            value: The number.
-            place: Name of the setting, for the message.
-        """
-        if not math.isfinite(value):
-            raise InputError(f"`{place}` must be finite, but is {value}.")
-        rules = (("above", gt), ("at least", ge), ("at most", le), ("below", lt))
-        for bound, (words, holds) in zip(self, rules, strict=True):
-            if bound is not None and not holds(value, bound):
-                raise InputError(
-                    f"`{place}` must be {words} {bound:.10g}, but is {value}."
-                )
-
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class OneOf:
     """Names that a text may have, given as `Annotated[str, OneOf(CRITERIA)]`."""
 
     names: Collection[str]
-
-    def check(self, value: str, place: str) -> None:
-        """Reject a text that is none of the names."""
-        if value not in self.names:
-            text = json.dumps(value, ensure_ascii=False)
-            raise InputError(f"`{place}` must be {quoted(self.names)}, but is {text}.")
 
 
 Positive = Annotated[float, Bounds(above=0.0)]
@@ -59,9 +32,3 @@ Finite = Annotated[float, Bounds()]
 Count = Annotated[int, Bounds(minimum=1, maximum=10_000)]
 Vector = tuple[Finite, Finite, Finite]
 PerJoint = list[float]
-
-
-def quoted(values: Iterable[Any]) -> str:
-    """Return values as a sentence lists them: `"a", "b" or "c"`."""
-    words = [f'"{v}"' if isinstance(v, str) else str(v) for v in values]
-    return " or ".join(filter(None, [", ".join(words[:-1]), words[-1]]))

@@ -130,19 +130,23 @@ class Excitation:
                     "and a `spline` rests at its ends: leave one out."
                 )
             return self.spline
-        leads, series = self.chosen_leads, (self.harmonics, self.omega)
+        series = (self.harmonics, self.omega)
         if self.rest:
             return RestToRestBasis(*series)
+        leads = self.chosen_leads
         if leads is None and self.cycle is not None:
-            # Samples at full speed must not end before the period or go on after it.
-            period, step = 2 * np.pi / self.omega, self.cycle
-            count = count_cycles(period, step)
-            if abs(count * step - period) > 1e-6 * step:
-                raise InputError(
-                    f"`sample_time` must divide the period of {period:.9g} s "
-                    "where there are no `leads`: choose `omega` = "
-                    f"{2 * np.pi / (count * step):.9g}, or use `leads`."
-                )
+            self._require_whole_cycles(self.cycle)
         if leads is None or (not constrained and leads.time is None):
             return FourierBasis(*series)
         return LeadsBasis(*series, lead=leads.time or 0.5, periods=leads.periods)
+
+    def _require_whole_cycles(self, cycle: float) -> None:
+        """Reject samples at full speed that end before the period or go on after it."""
+        period = 2 * np.pi / self.omega
+        count = count_cycles(period, cycle)
+        if abs(count * cycle - period) > 1e-6 * cycle:
+            raise InputError(
+                f"`sample_time` must divide the period of {period:.9g} s where there "
+                f"are no `leads`: choose `omega` = {2 * np.pi / (count * cycle):.9g}, "
+                "or use `leads`."
+            )

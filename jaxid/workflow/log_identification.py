@@ -57,7 +57,8 @@ class IdentificationReport(Summarised, Report):
 
     def tables(self) -> list[Table]:
         """Return estimates and torque errors, and the verdict with what to look at."""
-        fit, robot = self.fit, self.fit.base.model.robot
+        fit = self.fit
+        robot = fit.base.model.robot
         tables = [robot.summary(), *motor_tables(robot)]
         notes = [*self.notes, *fit.notes]
         if fit.consistency is not None:
@@ -125,7 +126,8 @@ def identify_logs(
     Raises:
         InputError: If a log cannot be used, or would count twice.
     """
-    logs, verify = [Path(log) for log in logs], [Path(log) for log in verify]
+    logs = [Path(log) for log in logs]
+    verify = [Path(log) for log in verify]
     require_separate_logs(logs, verify, held_out)
     files = [path for path in logs if not is_report(path)]
     reports = [path for path in logs if is_report(path)]
@@ -204,19 +206,19 @@ def split_logs(
 ) -> LogParts:
     """Return the first `count` logs, or first parts, for the fit, and all the rest."""
     observations = [log.observations for log in logs]
-    to_fit, to_verify = observations[:count], observations[count:]
+    fitted_logs = observations[:count]
+    unseen_logs = observations[count:]
     if held_out is None:
-        return LogParts(to_fit, to_verify)
+        return LogParts(fitted_logs, unseen_logs)
     share = fitted_share(held_out)
     training_logs = []
     rests = []
-    for log in to_fit:
-        first, rest = log.split(share)
-        training_logs.append(
-            first.replace(name=f"{first.name}, first {100 * share:g} %")
-        )
-        rests.append(rest.replace(name=f"{rest.name}, rest"))
-    return LogParts(training_logs, [*rests, *to_verify])
+    for log in fitted_logs:
+        first_part, rest = log.split(share)
+        name = f"{log.name}, first {100 * share:g} %"
+        training_logs.append(first_part.replace(name=name))
+        rests.append(rest.replace(name=f"{log.name}, rest"))
+    return LogParts(training_logs, [*rests, *unseen_logs])
 
 
 def resolution_notes(fit: Fit, logs: Sequence[LoadedLog]) -> list[str]:

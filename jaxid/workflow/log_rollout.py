@@ -87,7 +87,8 @@ def identify_rollout_from_logs(
         verify: Paths of logs for the validation; by default those of the fit.
         progress: Callback, called with a stage and its completed fraction (0 to 1).
     """
-    logs, verify = [Path(log) for log in logs], [Path(log) for log in verify]
+    logs = [Path(log) for log in logs]
+    verify = [Path(log) for log in verify]
     require_separate_logs(logs, verify)
     if isinstance(settings, TorqueSettings):
         return _follow_torques(setup, logs, columns, settings, verify, progress)

@@ -27,7 +27,8 @@ def check_motion(
     """
     yield check_joints(plan)
     floors = [x.name for x in surroundings.obstacles if isinstance(x, HalfSpace)]
-    floor_findings, other_findings = [], []
+    floor_findings = []
+    other_findings = []
     for finding in plan.findings:
         if finding.name.startswith("the clearance of "):
             is_of_floor = any(finding.name.endswith(f" and {x}") for x in floors)

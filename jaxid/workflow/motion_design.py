@@ -7,21 +7,32 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
+from jaxid.arrays import double_precision
 from jaxid.errors import InputError
 from jaxid.excitation.constraints import AbstractConstraint, TipLimits
 from jaxid.excitation.design import DesignProgress, design_excitation
 from jaxid.excitation.design_result import ExcitationPlan
-from jaxid.io import import_extra
+from jaxid.io import atomic_folder, import_extra
 from jaxid.report.excitation_page import write_excitation
 from jaxid.result_table import Remark, Status
-from jaxid.trajectory.controllers import CONTROLLERS
-from jaxid.trajectory.files import load_trajectory
-from jaxid.trajectory.lead_in_and_out import WithLeads
-from jaxid.trajectory.trajectory import LinearTrajectory
+from jaxid.robot.robot import Robot, complete_limits
+from jaxid.trajectory.controllers import BESIDE, CONTROLLERS
+from jaxid.trajectory.files import (
+    load_trajectory,
+    save_trajectory,
+    write_csv,
+    write_ros,
+)
+from jaxid.trajectory.fourier import FourierBasis
+from jaxid.trajectory.lead_in_and_out import WithLeads, with_leads
+from jaxid.trajectory.trajectory import (
+    AbstractTrajectory,
+    LinearTrajectory,
+    PaddedToCycle,
+)
 
 from .excitation_settings import Excitation
 from .motion_check import check_motion
-from .motion_files import PlayableMotion, make_playable, write_motion
 from .nominal_parameters import (
     UNKNOWN_SHARE,
     Nominal,
@@ -61,6 +72,18 @@ class MotionTask(NamedTuple):
         """Sentences about all that will not be checked."""
         forces = (f"forces: {self.force_fault}",) if self.force_fault else ()
         return (*self.surroundings.faults, *forces)
+
+
+class PlayableMotion(NamedTuple):
+    """A motion as a robot can play it."""
+
+    motion: AbstractTrajectory  # from standstill to standstill where that is possible
+    sampled: (
+        AbstractTrajectory  # as it is written in samples: until a sample meets its end
+    )
+    sample_time: float  # time between those samples [s]
+    window: tuple[float, float]  # times between which it is the designed motion [s]
+    fault: str  # why it does not start and end at rest; empty if it does, or need not
 
 
 class DesignedMotion(NamedTuple):
@@ -147,7 +170,8 @@ def design_motion(
     Raises:
         InputError: If the settings do not fit the robot, or no motion keeps all limits.
     """
-    setup, excitation = task.setup, task.excitation
+    setup = task.setup
+    excitation = task.excitation
     noise = None if excitation.noise is None else np.array(excitation.noise)
     plan = design_excitation(
         setup.base,
@@ -186,6 +210,38 @@ def follow_design(
     return follow
 
 
+def make_playable(
+    robot: Robot, excitation: Excitation, motion: LinearTrajectory
+) -> PlayableMotion:
+    """Return a motion from standstill to standstill, in samples of the controller."""
+    leads = excitation.chosen_leads
+    times = np.asarray(motion.basis.times(excitation.samples))
+    step = float(times[1] - times[0])
+    begin = float(times[0])
+    end = float(times[-1]) + step
+    playable = motion
+    fault = ""
+    # Where there are constraints, leads were designed together with the motion.
+    if leads is not None and isinstance(motion.basis, FourierBasis):
+        limited_robot = robot.replace(limits=complete_limits(robot))
+        try:
+            playable = with_leads(motion, limited_robot, periods=leads.periods)
+            begin, end = (float(time) for time in playable.window)
+        except InputError as error:
+            fault = (
+                "the motion is without leads, and starts and ends at full speed: "
+                f"{error} `rest = true` designs one at rest there."
+            )
+    elif leads is not None:
+        end = begin + leads.periods * (end - begin)
+    sampled = playable
+    if excitation.cycle is not None:
+        step = excitation.cycle
+        if excitation.rests and not fault:
+            sampled = PaddedToCycle(playable, step)
+    return PlayableMotion(playable, sampled, step, (begin, end), fault)
+
+
 def write_design(
     task: MotionTask,
     design: DesignedMotion,
@@ -217,6 +273,33 @@ def write_design(
         task.setup.robot, task.excitation, design.playable, output
     )
     return motion_files + pages
+
+
+def write_motion(
+    robot: Robot, excitation: Excitation, playable: PlayableMotion, output: Path
+) -> list[Path]:
+    """Write table, trajectory and ROS message of a motion; return the files."""
+    sampled = playable.sampled
+    step = playable.sample_time
+    table = output.name
+    message = f"{output.stem}.ros.{excitation.ros}"
+    trajectory = f"{output.stem}.json"
+    names = [table, message, trajectory]
+    replaced_names = {f"{output.stem}{suffix}" for suffix in BESIDE}
+    with (
+        double_precision(),
+        atomic_folder(output.parent, lambda _: replaced_names) as folder,
+    ):
+        write_csv(sampled, robot, folder / table, sample_time=step)
+        write_ros(sampled, robot, folder / message, sample_time=step)
+        controller = CONTROLLERS.get(excitation.controller or "")
+        if controller is not None and controller.write and not playable.fault:
+            program = f"{output.stem}{controller.suffix}"
+            controller.write(sampled, robot, folder / program, step)
+            names.append(program)
+        motion = jax.tree.map(np.asarray, playable.motion)
+        save_trajectory(motion, folder / trajectory)
+    return [output.parent / name for name in names]
 
 
 def describe_motion(

@@ -133,7 +133,8 @@ def gravity_fault(robot: Robot, limits: ForceLimits) -> str:
 def random_poses(robot: Robot) -> np.ndarray:
     """Return random poses within the joints' range, the first of them near zero."""
     limits = complete_limits(robot)
-    low, high = np.asarray(limits.position_min), np.asarray(limits.position_max)
+    low = np.asarray(limits.position_min)
+    high = np.asarray(limits.position_max)
     poses = np.random.default_rng(0).uniform(low, high, (RANDOM_POSES, robot.joints))
     poses[0] = np.clip(0.0, low, high)
     return poses

@@ -92,7 +92,8 @@ class Collision:
         Raises:
             InputError: If shapes cannot be made, or a name is unknown.
         """
-        capsules, faults = [], []
+        capsules = []
+        faults = []
         if self.fit and robot_file is not None:
             capsules, faults = fit_links(robot_file, self.packages)
         for body, shape in self.capsules:
