@@ -156,6 +156,22 @@ class CollisionModel(Hashable):
         clearances = jnp.take_along_axis(gaps_of_groups, minimum, axis=-1)[..., 0]
         return clearances.reshape(*batch, len(self.groups))
 
+    @eqx.filter_jit
+    def linearised_clearances(self, ends: Array, places: Array) -> tuple[Array, Array]:
+        """Return one clearance of each sample [m], and its derivatives by the ends.
+
+        Args:
+            ends: Ends of all axes on the ground [samples, capsules, 2, 3] [m].
+            places: Place of each sample's clearance among the groups.
+        """
+
+        def clearance(ends: Array) -> Array:
+            gaps = self.clearances(ends)
+            return jnp.take_along_axis(gaps, places[:, None], axis=1)[:, 0]
+
+        gaps, pull = jax.vjp(clearance, ends)
+        return gaps, *pull(jnp.ones_like(gaps))
+
     def _gaps(self, ends: Array) -> Array:
         """Return the distance between the surfaces of each pair for some `ends` [m]."""
         start = ends[:, 0]

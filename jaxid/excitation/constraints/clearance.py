@@ -4,10 +4,19 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.dynamics.sample_methods import on_samples
+from jaxid.arrays import AnyArray
+from jaxid.dynamics.motion import Motion
 from jaxid.robot.collision import CollisionModel
+from jaxid.robot.robot import Robot
 
-from .constraint import AbstractConstraint, Finding
+from .constraint import (
+    AbstractConstraint,
+    Finding,
+    ValuesAndSlopes,
+    evaluate_samples,
+    in_blocks,
+    pull_back_samples,
+)
 
 SIZE = 0.1
 """Missing distance that counts as one [m]."""
@@ -35,9 +44,35 @@ class Clearance(AbstractConstraint):
 
     def __call__(self, robot, motion):
         """Return the missing distance of each pair."""
-        ends = eqx.Partial(self.model.ends, robot)
-        gaps = self.model.clearances(on_samples(ends, ends.__call__, motion.q))
+        ends = self._ends(robot, motion.q)
+        if isinstance(ends, np.ndarray):
+            samples = ends.reshape(-1, *ends.shape[-3:])
+            (gaps,) = in_blocks(lambda x: (self.model.clearances(x),), samples)
+            gaps = gaps.reshape(*ends.shape[:-3], -1)
+            return (self.distances - gaps) / SIZE
+        gaps = self.model.clearances(ends)
         return (jnp.broadcast_to(self.distances, gaps.shape) - gaps) / SIZE
+
+    def _ends(self, robot: Robot, q: AnyArray) -> AnyArray:
+        """Return the ends of all capsules' axes."""
+        ends = eqx.Partial(self.model.ends, robot)
+        return evaluate_samples(ends, ends.__call__, q)
+
+    def linearisation(self, robot):
+        """Return a function of missing distances and their derivatives.
+
+        Only the distances between given ends are compiled, once for equal shapes.
+        """
+        ends = eqx.Partial(self.model.ends, robot)
+
+        def linearise(motion: Motion, entries: np.ndarray) -> ValuesAndSlopes:
+            arrays = (self._ends(robot, motion.q), entries)
+            gaps, by_ends = in_blocks(self.model.linearised_clearances, *arrays)
+            weights = -by_ends / SIZE
+            by_motion = pull_back_samples(ends, ends.__call__, weights, motion.q)
+            return (self.distances[entries] - gaps) / SIZE, by_motion
+
+        return linearise
 
     def entries(self, robot):
         """Return the pairs."""

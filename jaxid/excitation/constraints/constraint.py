@@ -3,7 +3,7 @@
 import math
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -12,12 +12,14 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Array, Float, Int
 from jaxid.dynamics.motion import Motion
+from jaxid.dynamics.sample_methods import in_numpy, on_samples, program_of
+from jaxid.program.gradient import pull_back
 from jaxid.robot.robot import Robot
 
 Excess = Float[Array, "*batch values"]
 """Relative excess over each limit, at each sample."""
-BLOCK = 96
-"""Samples for which derivatives are compiled: those watched of one motion."""
+BLOCK = 256
+"""Samples for which functions of constraints are compiled, whatever their number."""
 
 
 class Finding(NamedTuple):
@@ -136,16 +138,8 @@ class AbstractConstraint(eqx.Module):
             return values, *pull(jnp.ones_like(values))
 
         def linearise(motion: Motion, entries: np.ndarray) -> ValuesAndSlopes:
-            # Samples are repeated up to whole blocks: another number would compile
-            # anew.
-            samples = len(entries)
-            blocks = math.ceil(samples / BLOCK)
-            places = np.resize(np.arange(samples), (blocks, BLOCK))
             arrays = (entries, motion.q, motion.qd, motion.qdd)
-            results = [linearise_block(*(x[rows] for x in arrays)) for rows in places]
-            values, *slopes = (
-                np.concatenate(parts)[:samples] for parts in zip(*results, strict=True)
-            )
+            values, *slopes = in_blocks(linearise_block, *arrays)
             return values, slopes
 
         return linearise
@@ -156,3 +150,37 @@ class AbstractConstraint(eqx.Module):
         peaks = np.asarray(values).reshape(-1, len(entries)).max(axis=0)
         pairs = zip(entries, peaks.tolist(), strict=True)
         return [entry._replace(value=peak) for entry, peak in pairs]
+
+
+def in_blocks(function: Callable, *arrays: np.ndarray) -> list[np.ndarray]:
+    """Return the results of a compiled function of samples, block by block.
+
+    Samples are repeated up to whole blocks: another number would compile anew.
+    """
+    samples = len(arrays[0])
+    blocks = math.ceil(samples / BLOCK)
+    places = np.resize(np.arange(samples), (blocks, BLOCK))
+    results = [function(*(array[rows] for array in arrays)) for rows in places]
+    parts_of_results = zip(*results, strict=True)
+    return [np.concatenate(parts)[:samples] for parts in parts_of_results]
+
+
+def evaluate_samples(owner: eqx.Module, method: Callable, *samples: AnyArray) -> Any:
+    """Apply a method for one sample; rows of samples in NumPy need no compiler."""
+    first = samples[0]
+    is_rows = isinstance(first, np.ndarray) and first.ndim == 2
+    evaluate = in_numpy if is_rows else on_samples
+    return evaluate(owner, method, *samples)
+
+
+def pull_back_samples(
+    owner: eqx.Module,
+    method: Callable,
+    weights: np.ndarray,
+    *samples: AnyArray,
+) -> list[np.ndarray]:
+    """Return derivatives of weighted results of a method, for rows of samples."""
+    program = program_of(owner, method, *(x.shape[1:] for x in samples))
+    packed_weights = weights.reshape(len(weights), -1).T
+    columns = [np.asarray(x).T for x in samples]
+    return [slopes.T for slopes in pull_back(program, packed_weights, *columns)]

@@ -1,6 +1,5 @@
 """Limits of the joints' forces and of the motors' torques, by nominal parameters."""
 
-from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -12,16 +11,16 @@ from jaxid.arrays import AnyArray, Array, Float, as_array, namespace
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.model import Coordinates
 from jaxid.dynamics.motion import Motion
-from jaxid.dynamics.sample_methods import in_numpy, on_samples, program_of
 from jaxid.dynamics.terms import AbstractTransition, Reversal
 from jaxid.errors import InputError
-from jaxid.program.gradient import pull_back
 from jaxid.robot.robot import Robot, complete_limits
 
 from .constraint import (
     AbstractConstraint,
     Finding,
     ValuesAndSlopes,
+    evaluate_samples,
+    pull_back_samples,
 )
 
 REVERSAL_SPEED = 0.02
@@ -115,10 +114,7 @@ class ForceLimits(AbstractConstraint):
 
     def _forces(self, motion: Motion) -> AnyArray:
         """Return `forces` at all samples."""
-        # Rows of samples in NumPy need no compiler.
-        is_rows = isinstance(motion.q, np.ndarray) and motion.q.ndim == 2
-        evaluate = in_numpy if is_rows else on_samples
-        return evaluate(self, self.forces, *_arrays(motion))
+        return evaluate_samples(self, self.forces, *_arrays(motion))
 
     def linearisation(self, robot):
         """Return a function of relative excesses and their derivatives, in NumPy."""
@@ -151,7 +147,7 @@ class ForceLimits(AbstractConstraint):
         slopes = np.sign(peak_forces) / limits
         weights = np.zeros((len(limits), 3, shares.shape[1]))
         weights[samples, sides] = shares * slopes[:, None]
-        by_motion = _pull_back(self, self.forces, weights, _arrays(motion))
+        by_motion = pull_back_samples(self, self.forces, weights, *_arrays(motion))
         return np.abs(peak_forces), by_motion
 
     def _deviations(
@@ -173,7 +169,7 @@ class ForceLimits(AbstractConstraint):
         by_rows = products * slopes[:, None]
         weights = shares[:, :, None] * by_rows[:, None]
         arrays = base.model.arguments(motion)
-        by_motion = _pull_back(base, base.columns, weights, arrays)
+        by_motion = pull_back_samples(base, base.columns, weights, *arrays)
         return self.deviations * deviation, by_motion
 
     def forces(self, q: Coordinates, qd: Coordinates, qdd: Coordinates) -> Array:
@@ -223,16 +219,3 @@ class ForceLimits(AbstractConstraint):
 
 def _arrays(motion: Motion) -> tuple[AnyArray, ...]:
     return motion.q, motion.qd, motion.qdd
-
-
-def _pull_back(
-    owner: eqx.Module,
-    definition: Callable,
-    weights: np.ndarray,
-    arrays: tuple[AnyArray, ...],
-) -> list[np.ndarray]:
-    """Return derivatives of weighted results of a method, for rows of samples."""
-    program = program_of(owner, definition, *(x.shape[1:] for x in arrays))
-    packed_weights = weights.reshape(len(weights), -1).T
-    columns = [np.asarray(x).T for x in arrays]
-    return [slopes.T for slopes in pull_back(program, packed_weights, *columns)]
