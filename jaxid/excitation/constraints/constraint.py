@@ -152,7 +152,7 @@ class AbstractConstraint(eqx.Module):
         return [entry._replace(value=peak) for entry, peak in pairs]
 
 
-def in_blocks(function: Callable, *arrays: np.ndarray) -> list[np.ndarray]:
+def in_blocks(function: Callable, *arrays: AnyArray) -> list[np.ndarray]:
     """Return the results of a compiled function of samples, block by block.
 
     Samples are repeated up to whole blocks: another number would compile anew.
