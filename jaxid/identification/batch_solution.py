@@ -235,9 +235,7 @@ def _solve_one(
     )
 
 
-def _estimate(
-    rows: _Rows, grams: JointArrays, inverse: Array, condition: Array
-) -> tuple[Array, Array]:
+def _estimate(rows: _Rows, grams: JointArrays, inverse: Array, condition: Array):
     """Return the parameters [draws, base], and squared residuals [draws, joints]."""
     products, force_squares = rows.products(rows.forces)
     p = rows.gradient(products) @ inverse
@@ -248,7 +246,7 @@ def _estimate(
         force_squares - 2 * rows.along(p, products) + rows.along(p, predicted_products)
     )
 
-    def refine() -> tuple[Array, Array]:
+    def refine():
         products, squares = rows.products(rows.residuals(p))
         step = rows.gradient(products) @ inverse
         # The squares at the refined parameters: what is of second order in the step is

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from jaxid.arrays import BaseMatrix, BaseVector, Vector
+from jaxid.arrays import Vector
 from jaxid.errors import InputError
 
 from .estimators import GivenWeights, WeightedLeastSquares
@@ -122,7 +122,7 @@ def combine(fits: Sequence[Fit], maps, offsets=None) -> tuple[Vector, Uncertaint
     return decomposition.solve(), Uncertainty(covariance, total_dof, covariance)
 
 
-def _finite_covariance(fit: Fit) -> tuple[BaseMatrix, BaseVector]:
+def _finite_covariance(fit: Fit):
     """Return the covariance of a fit's estimates and degrees of freedom.
 
     A fit that does not determine everything has no variance of some estimates. The
@@ -190,7 +190,7 @@ def _are_equal(first: Vector, second: Vector) -> bool:
     return first.shape == second.shape and np.abs(first - second).max() <= 1e-9
 
 
-def _column_norms(blocks: Blocks) -> list[Vector]:
+def _column_norms(blocks: Blocks):
     """Return each block's rows and norms, relative to the joint's largest."""
     block_norms = []
     for part in blocks.parts:

@@ -9,7 +9,7 @@ import numpy as np
 from scipy import linalg, special
 from scipy.interpolate import CubicSpline
 
-from jaxid.arrays import AnyArray, Float
+from jaxid.arrays import Joints
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
@@ -51,7 +51,7 @@ class Delay(eqx.Module):
     dof: float
     feedback: float
     resolution: float
-    of_joints: Float[AnyArray, " joints"]
+    of_joints: Joints
     p_value: float
 
     def interval(self, level: float = 0.95) -> tuple[float, float]:
@@ -271,9 +271,7 @@ def _equations(
     return _Equations(products, squares, rates)
 
 
-def _rows(
-    base: BaseParameters, log: Observations, chunk: Chunk, joint_weights, p
-) -> Float[np.ndarray, "rows joints columns"]:
+def _rows(base: BaseParameters, log: Observations, chunk: Chunk, joint_weights, p):
     """Return weighted rows: base parameters, delay of each joint, forces."""
     motion, forces = log.read(slice(*chunk.samples))
     predictions = base.forces_in_numpy(p, motion)

@@ -12,7 +12,7 @@ import equinox as eqx
 import numpy as np
 from scipy import optimize
 
-from jaxid.arrays import AnyArray, Float
+from jaxid.arrays import AnyArray, Float, Joints, Texts
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
 from jaxid.result_table import Summarised, Table
@@ -43,10 +43,10 @@ class DriveGains(Summarised, eqx.Module):
         joint_names: Names of the joints.
     """
 
-    gains: Float[AnyArray, " joints"]
+    gains: Joints
     uncertainty: Uncertainty
     parameters: Float[AnyArray, " base"]
-    joint_names: tuple[str, ...] = eqx.field(static=True)
+    joint_names: Texts = eqx.field(static=True)
 
     def summary(self) -> Table:
         """Return a table of the gains with their 95 % intervals."""
@@ -204,9 +204,7 @@ def _stack(parts: Sequence[Rows]) -> Rows:
     return Rows(*map(np.concatenate, zip(*parts, strict=True)))
 
 
-def _parameter_maps(
-    base: BaseParameters, load: Tool | float
-) -> tuple[list[np.ndarray], list[np.ndarray]]:
+def _parameter_maps(base: BaseParameters, load: Tool | float):
     """Return maps and offsets from common unknowns to both runs' base parameters."""
     maps = state_maps(base.size, varying_parameters(base), 2)
     no_offset = np.zeros(base.size)

@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 
-from jaxid.arrays import Float
+from jaxid.arrays import Float, Joints, Texts
 from jaxid.measurement.observations import Observations, observe
 from jaxid.measurement.recording import Recording
 
@@ -22,7 +22,7 @@ MAX_NAMES = 4
 """Parameters that a note names."""
 
 
-def encoder_steps(recording: Recording) -> Float[np.ndarray, " joints"]:
+def encoder_steps(recording: Recording) -> Joints:
     """Return the step of each angle [rad or m]; zero for values on no grid."""
     angles = np.asarray(recording.angles)
     segments = [np.diff(angles[a:b], axis=0) for a, b in recording.segments]
@@ -86,7 +86,7 @@ def resolution_bias(
 
 def resolution_note(
     fit: Fit, recording: Recording, observations: Observations
-) -> tuple[str, ...]:
+) -> Texts:
     """Return a sentence on parameters whose intervals the resolution makes wrong.
 
     It is empty if there are none.

@@ -110,7 +110,7 @@ def choose_filter(
     cutoffs = np.array([filter.low_pass(dt).cutoff for filter, _ in candidates])
     edge = max(filter.edge(dt) for filter, _ in candidates)
 
-    def observe_with(candidate: FilterCandidate) -> list[Observations]:
+    def observe_with(candidate: FilterCandidate):
         """Observe the rows that are far enough from the ends for all candidates."""
         observations = [observe(log, robot, *candidate, min_speed) for log in logs]
         return [_mask_ends(o, edge) for o in observations]
@@ -134,7 +134,7 @@ def choose_filter(
     )
 
 
-def _default_candidates(sample_time: float) -> list[FilterCandidate]:
+def _default_candidates(sample_time: float):
     """Return Butterworth filters over the usual range of cut-off frequencies."""
     max_cutoff = min(MAX_CUTOFF, MAX_CUTOFF_SHARE / sample_time)
     min_cutoff = min(1.0, 0.1 * max_cutoff)
@@ -147,7 +147,7 @@ def _default_candidates(sample_time: float) -> list[FilterCandidate]:
 
 def _with_motions(
     widest_band: Sequence[Observations], observations: Sequence[Observations]
-) -> list[Observations]:
+):
     """Return the motions of a candidate, with forces and rows of the widest band."""
     if [o.samples for o in observations] != [o.samples for o in widest_band]:
         raise InputError(

@@ -356,7 +356,7 @@ class Fit(Summarised, eqx.Module):
         write_text(path, json_text({**document, "model": self._content()}))
         return Path(path)
 
-    def _content(self) -> Any:
+    def _content(self):
         """Return the fit as plain JSON values."""
         fit = self
         try:

@@ -66,7 +66,7 @@ def suits(observations: Observations) -> bool:
     return cost <= MAX_COST
 
 
-def _stages(observations: Observations) -> list[Stage]:
+def _stages(observations: Observations):
     """Return the stages of decimation that change something; the first one filters."""
     decimation = observations.decimation
     low_pass = observations.filter.low_pass(observations.sample_time)
@@ -418,7 +418,7 @@ def _compile_loop(
     height = len(distinct_columns.outputs) + joints
     zeros = [jnp.zeros(shape.samples)] * height
 
-    def evaluate(motion: Array, forces: Array) -> list[Array]:
+    def evaluate(motion: Array, forces: Array):
         outputs = base_columns(*jnp.split(motion, len(motion) // joints))
         columns = []
         for output in distinct_columns.outputs:
@@ -426,7 +426,7 @@ def _compile_loop(
             columns.append(jnp.broadcast_to(column, motion.shape[1:]))
         return columns + list(forces)
 
-    def run(motion, forces, mask, count, mixing, matrices) -> list[Array]:
+    def run(motion, forces, mask, count, mixing, matrices):
         def iteration(k: Array, state: tuple) -> tuple:
             tails, grams = state
             motion_part = _iteration_part(motion, k, shape.samples)

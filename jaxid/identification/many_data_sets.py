@@ -222,9 +222,7 @@ def _identify_one(
     return identify(base, recording, estimator, uncertainty=uncertainty)
 
 
-def _with_geometries(
-    base: BaseParameters, robots: Sequence[Robot]
-) -> list[BaseParameters]:
+def _with_geometries(base: BaseParameters, robots: Sequence[Robot]):
     """Return the base parameters with the geometry of robots of the same topology."""
     robot = base.model.robot
     results = []

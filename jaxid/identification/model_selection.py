@@ -161,9 +161,7 @@ def choose_model(
     )
 
 
-def _parts(
-    base: BaseParameters, logs: Sequence[Observations], by_log: bool
-) -> tuple[Factors, ...]:
+def _parts(base: BaseParameters, logs: Sequence[Observations], by_log: bool):
     """Return the factors of the parts that are left out in turn."""
     if by_log:
         return tuple(RegressionProblem(base, [log]).factors for log in logs)

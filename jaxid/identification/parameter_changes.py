@@ -178,7 +178,7 @@ class Comparison(Summarised, eqx.Module):
             remarks=self._remarks(),
         )
 
-    def _remarks(self) -> list[str]:
+    def _remarks(self):
         """Return the numbers of changes, and those to expect by chance."""
         verdicts = self.verdicts
         tests = len(verdicts) - verdicts.count(Verdict.UNKNOWN)
@@ -271,7 +271,7 @@ def _dof_of_sum(a, b, dof_a, dof_b) -> Vector:
     return np.where(np.isnan(dof), np.inf, dof)
 
 
-def _with_sign(numbers: Sequence[str]) -> list[str]:
+def _with_sign(numbers: Sequence[str]):
     return [x if x.startswith("-") else f"+{x}" for x in numbers]
 
 

@@ -178,7 +178,7 @@ def identify_payload(
     return Payload(body, parameters, estimate, uncertainty, distance)
 
 
-def _estimate(unloaded: Fit, loaded: Fit, body: int) -> tuple[np.ndarray, Uncertainty]:
+def _estimate(unloaded: Fit, loaded: Fit, body: int):
     """Return the parameters that a load on a body has added between two runs."""
     base = unloaded.base
     states = state_maps(base.size, varying_parameters(base), 2)
@@ -196,9 +196,7 @@ def _estimate(unloaded: Fit, loaded: Fit, body: int) -> tuple[np.ndarray, Uncert
     return values[-10:], Uncertainty(covariance, dof, covariance)
 
 
-def _weigh(
-    estimate: np.ndarray, uncertainty: Uncertainty, mass: float
-) -> tuple[np.ndarray, Uncertainty]:
+def _weigh(estimate: np.ndarray, uncertainty: Uncertainty, mass: float):
     """Update the estimate by a measured mass [kg], as a Kalman filter does."""
     covariance = uncertainty.covariance
     variance = (SCALE_DEVIATION * mass) ** 2

@@ -119,7 +119,7 @@ class RegressionProblem:
         self.require_rows()
         return RegressionProblem(base, self.recordings, self.progress)
 
-    def _reduce(self, number: int, equations: Callable) -> list[Factors]:
+    def _reduce(self, number: int, equations: Callable):
         """Return the factors of one recording's blocks of time."""
         empty_part = empty_factors(self.base.acting_columns, self.base.size)
         parts = [empty_part] * (len(self._edges[number]) - 1)

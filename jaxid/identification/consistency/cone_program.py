@@ -7,7 +7,6 @@ then bounded, and units do not matter.
 """
 
 from types import ModuleType
-from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -167,7 +166,7 @@ def cone_program(
     )
 
 
-def _scale_rows(feasible: FeasibleSet, data: ScaledRows, scales) -> tuple[Any, Any]:
+def _scale_rows(feasible: FeasibleSet, data: ScaledRows, scales):
     """Return the rows of scaled variables; unbounded columns are projected out."""
     A = data.A[:, np.array(feasible.order)] * scales[None]
     if not feasible.unbounded:
@@ -193,7 +192,7 @@ def _total_mass(feasible: FeasibleSet) -> np.ndarray:
     return row
 
 
-def _drive_matrices(feasible: FeasibleSet, drive_scales) -> tuple[Values, np.ndarray]:
+def _drive_matrices(feasible: FeasibleSet, drive_scales):
     """Return what drives contribute to matrices of coupled ones, and their constants.
 
     The diagonals of these matrices are scaled to one.
@@ -217,7 +216,7 @@ def _drive_matrices(feasible: FeasibleSet, drive_scales) -> tuple[Values, np.nda
     return xp.concatenate(contributions, axis=1), fillings
 
 
-def _start(feasible: FeasibleSet, A, b, prior) -> Values:
+def _start(feasible: FeasibleSet, A, b, prior):
     """Return the start of the iteration, a point that satisfies all bounds.
 
     All bodies are balls, as heavy as fits the forces or the total mass; or they lie
@@ -266,7 +265,7 @@ def _scale(feasible: FeasibleSet, pseudo) -> AnyArray:
     return parameters / feasible.body_scales
 
 
-def _move_to_prior(feasible: FeasibleSet, bodies, prior) -> Values:
+def _move_to_prior(feasible: FeasibleSet, bodies, prior):
     """Move bodies towards those of a prior where these satisfy all bounds."""
     parameters = _scale(feasible, prior)
     _, rows, offsets = feasible.linear_bounds()

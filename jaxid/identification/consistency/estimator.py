@@ -5,7 +5,7 @@ import dataclasses
 import equinox as eqx
 import numpy as np
 
-from jaxid.arrays import AnyArray, Bool, Float
+from jaxid.arrays import AnyArray, Bool, Float, Indices, Texts
 from jaxid.dynamics.base import BaseParameters, Identifiability
 from jaxid.errors import InputError
 
@@ -58,11 +58,11 @@ class Consistency(eqx.Module):
     certified: bool = eqx.field(static=True)
     iterations: int = eqx.field(static=True)
     determined: Bool[np.ndarray, " standard"]
-    masses_from_bounds: tuple[int, ...] = eqx.field(static=True)
-    active: tuple[str, ...] = eqx.field(static=True)
+    masses_from_bounds: Indices = eqx.field(static=True)
+    active: Texts = eqx.field(static=True)
 
     @property
-    def findings(self) -> tuple[str, ...]:
+    def findings(self) -> Texts:
         """Sentences about the effect of the bounds on residuals and parameters."""
         percent = 100 * self.residual_increase
         sentences = [
@@ -80,7 +80,7 @@ class Consistency(eqx.Module):
         return tuple(sentences)
 
     @property
-    def notes(self) -> tuple[str, ...]:
+    def notes(self) -> Texts:
         """All sentences for the user."""
         sentences = [
             f"physically consistent: {self.bounds}.",
@@ -205,7 +205,7 @@ def _active_bounds(
     program: ConeProgram,
     optimum: solver.Optimum,
     bodies,
-) -> tuple[str, ...]:
+):
     """Name the bounds that keep the estimate from a better one."""
 
     def numbers(is_active) -> str:

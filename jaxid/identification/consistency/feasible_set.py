@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.sparse.csgraph import connected_components
 
-from jaxid.arrays import namespace
+from jaxid.arrays import Indices, namespace
 from jaxid.dynamics.model import Model
 from jaxid.errors import InputError
 from jaxid.robot.inertia import AXES
@@ -26,9 +26,9 @@ MAX_DRIVE_RATIO = 10.0
 class Coupling(NamedTuple):
     """Parameters of coupled drives that form one positive semidefinite matrix."""
 
-    columns: tuple[int, ...]
+    columns: Indices
     basis: np.ndarray  # matrices of unit parameters [columns, axes, axes]
-    diagonal: tuple[int, ...]  # parameter on the matrix's diagonal, for each axis
+    diagonal: Indices  # parameter on the matrix's diagonal, for each axis
 
 
 class LinearBounds(NamedTuple):
@@ -45,9 +45,9 @@ class LinearBounds(NamedTuple):
 class FeasibleSet(NamedTuple):
     """Consistent bodies, dissipative friction and nonnegative rotor inertias."""
 
-    bodies: tuple[tuple[int, ...], ...]  # columns of each body's parameters
-    drives: tuple[int, ...]  # columns that are nonnegative
-    unbounded: tuple[int, ...]  # columns without bounds
+    bodies: tuple[Indices, ...]  # columns of each body's parameters
+    drives: Indices  # columns that are nonnegative
+    unbounded: Indices  # columns without bounds
     bounds: BodyBounds
     couplings: tuple[Coupling, ...]
 
@@ -69,7 +69,7 @@ class FeasibleSet(NamedTuple):
         """Columns in the order of the scaled variables."""
         return [*sum(self.bodies, ()), *self.drives]
 
-    def drive_places(self, columns: tuple[int, ...]) -> np.ndarray:
+    def drive_places(self, columns: Indices) -> np.ndarray:
         """Return the positions of some columns among those of the drives."""
         return np.array([self.drives.index(k) for k in columns], int)
 

@@ -159,11 +159,11 @@ def _solve(p: ConeProgram, loop: Callable) -> Optimum:
     )
 
 
-def _gram(p: ConeProgram) -> Values:
+def _gram(p: ConeProgram):
     return (p.A.T @ p.A) * (1.0 + RIDGE * np.eye(p.A.shape[-1]))
 
 
-def _select(condition, first: Any, second: Any) -> Any:
+def _select(condition, first: Any, second: Any):
     """Return one of two tuples of arrays."""
     xp = namespace(condition)
     pairs = zip(first, second, strict=True)
@@ -226,7 +226,7 @@ def _point(p: ConeProgram, y, Z, z) -> Point:
     return Point(y, S, s, Z, z, residual, value, error)
 
 
-def _matrix_gap(p: ConeProgram, S, Z) -> Values:
+def _matrix_gap(p: ConeProgram, S, Z):
     """Return the duality gap of the semidefinite inequalities.
 
     With a pull, the eigenvalues of S Z / pull are all one at the optimum: the gap is
@@ -247,7 +247,7 @@ def _matrix_gap(p: ConeProgram, S, Z) -> Values:
     return xp.sum(gap) + xp.sum(couplings)
 
 
-def _targets(p: ConeProgram) -> Values:
+def _targets(p: ConeProgram):
     """Return the products of slacks and multipliers at the optimum.
 
     They are the strength of the pull.
@@ -303,7 +303,7 @@ def _newton(p: ConeProgram, gram, x: Point) -> Newton:
     return Newton(p, x, inverse_S, _newton_solver(p, gram + barriers))
 
 
-def _step(p: ConeProgram, gram, x: Point) -> tuple[Point, Values]:
+def _step(p: ConeProgram, gram, x: Point):
     """Take the longer step of two correctors; return the new point and the length."""
     xp = p.xp
     newton = _newton(p, gram, x)
@@ -317,7 +317,7 @@ def _step(p: ConeProgram, gram, x: Point) -> tuple[Point, Values]:
     d = _select(second_length > first_length, second, first)
     length = xp.maximum(first_length, second_length)
 
-    def refine() -> tuple[Direction, Values]:
+    def refine():
         correction = newton.refine(d)
         return correction, _length(STEP_FRACTIONS, x, correction)
 
@@ -334,7 +334,7 @@ def _step(p: ConeProgram, gram, x: Point) -> tuple[Point, Values]:
     return _point(p, y, x.Z + length * d.Z, x.z + length * d.z), length
 
 
-def _centring(p: ConeProgram, x: Point, predictor: Direction) -> Values:
+def _centring(p: ConeProgram, x: Point, predictor: Direction):
     """Return the product of slacks and multipliers to aim at, by Mehrotra's rule."""
     xp = p.xp
     mu = _complementarity(p, x.S, x.s, x.Z, x.z) + TINY
@@ -353,7 +353,7 @@ def _centring(p: ConeProgram, x: Point, predictor: Direction) -> Values:
     return fraction * mu
 
 
-def _complementarity(p: ConeProgram, S, s, Z, z) -> Values:
+def _complementarity(p: ConeProgram, S, s, Z, z):
     """Return the mean product of slacks and multipliers, beyond that of the pull."""
     xp = p.xp
     # Each pulled body ends with S Z = pull, whose trace is four times the pull.
@@ -361,7 +361,7 @@ def _complementarity(p: ConeProgram, S, s, Z, z) -> Values:
     return (xp.maximum(matrices, 0.0) + s @ z) / p.complementarity
 
 
-def _length(fractions, x: Point, d: Direction) -> Values:
+def _length(fractions, x: Point, d: Direction):
     """Return the longest of some steps that leaves everything positive."""
     xp = namespace(x.y)
     # The linear inequalities hold up to the reciprocal of the largest speed.
@@ -379,7 +379,7 @@ def _length(fractions, x: Point, d: Direction) -> Values:
     return xp.where(xp.any(is_positive), max_length, 0.0)
 
 
-def _barriers(p: ConeProgram, inverse_S, Z, ratio) -> Values:
+def _barriers(p: ConeProgram, inverse_S, Z, ratio):
     """Return the contribution of the bounds to the matrix of Newton's equations.
 
     The ratio is that of multipliers to slacks of the linear inequalities.
@@ -406,7 +406,7 @@ def _linalg(p: ConeProgram) -> ModuleType:
     return scipy.linalg if p.xp is np else jax.scipy.linalg
 
 
-def _products(inverse_S, Z) -> Values:
+def _products(inverse_S, Z):
     r"""Return matrices $M$ with $e^T M g = \mathrm{tr}(E S^{-1} G Z)$.
 
     $e$ and $g$ are $E$ and $G$, flattened.
@@ -416,7 +416,7 @@ def _products(inverse_S, Z) -> Values:
     return xp.reshape(product, (-1, 16, 16))
 
 
-def _newton_solver(p: ConeProgram, H) -> Callable[[Values], Values]:
+def _newton_solver(p: ConeProgram, H):
     """Return the solver of Newton's equations within the equality constraints."""
     xp = p.xp
     linalg = _linalg(p)

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import jax
 import numpy as np
 
-from jaxid.arrays import Matrices, Matrix
+from jaxid.arrays import Matrix
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
 from jaxid.measurement.samples import SamplesInMemory
@@ -122,7 +122,7 @@ class InstrumentalVariables(AbstractEstimator):
             influence=influence,
         )
 
-    def _instruments(self, problem: RegressionProblem) -> list[Matrices]:
+    def _instruments(self, problem: RegressionProblem):
         """Return the columns of each recording's reference, filtered like it."""
         problem.require_rows()
         recordings = problem.recordings

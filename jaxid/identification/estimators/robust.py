@@ -152,7 +152,7 @@ class IterativelyReweighted(AbstractEstimator):
 
     def _reweight_and_solve(
         self, problem: RegressionProblem, loss: AbstractLoss, weights, p
-    ) -> tuple[BaseVector, float]:
+    ):
         """Return new parameters, and the forces' change relative to the residuals."""
         scale = _residual_scale(problem, p)
         blocks = problem.reweighted(p, loss.weight, scale)

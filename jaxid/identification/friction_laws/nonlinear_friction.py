@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Float
+from jaxid.arrays import AnyArray, Float, Texts
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.terms import AbstractTerm
@@ -80,8 +80,8 @@ class NonlinearFit(eqx.Module):
     """
 
     fit: Fit
-    names: tuple[str, ...] = eqx.field(static=True)
-    units: tuple[str, ...] = eqx.field(static=True)
+    names: Texts = eqx.field(static=True)
+    units: Texts = eqx.field(static=True)
     shapes: ShapeValues
     shape_covariance: Float[AnyArray, "shapes shapes"]
     linear: Fit
@@ -221,9 +221,7 @@ def _held_out_errors(
     )
 
 
-def _test_squares(
-    blocks: Blocks, search: ShapeSearch, weights, training, test
-) -> tuple[float, float, float]:
+def _test_squares(blocks: Blocks, search: ShapeSearch, weights, training, test):
     """Return squared errors of the linear and nonlinear model, and squared forces."""
     training_mask = np.zeros(len(blocks.parts))
     training_mask[training] = 1.0

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import equinox as eqx
 import numpy as np
 
-from jaxid.arrays import Float
+from jaxid.arrays import Joints
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
 from jaxid.measurement.friction_state import with_memory
@@ -58,9 +58,7 @@ def identify_presliding(
     return eqx.tree_at(lambda b: b.model, base, model)
 
 
-def residual_norms(
-    problem: RegressionProblem, lengths: Float[np.ndarray, " joints"]
-) -> Float[np.ndarray, " joints"]:
+def residual_norms(problem: RegressionProblem, lengths: Joints) -> Joints:
     """Return the norms of the forces that the columns of each joint do not explain."""
     law = problem.base.model.with_memory(length=lengths).memory
     # The model keeps its lengths, so that its compiled columns serve all trials: only

@@ -138,7 +138,7 @@ class ShapeSearch(eqx.Module):
             residuals = weighted_residuals(logarithms) / noise
             return jnp.append(residuals, logarithms / np.log(10.0))
 
-        def search(logarithms, _) -> tuple[Array, Array]:
+        def search(logarithms, _):
             squares = jnp.sum(weighted_residuals(logarithms) ** 2)
             noise = jnp.maximum(jnp.sqrt(squares / dof), 1e-150)
             minimum = minimise_squares(
@@ -146,7 +146,7 @@ class ShapeSearch(eqx.Module):
             )
             return minimum.x, minimum.converged
 
-        def search_twice(first_shapes) -> tuple[Array, Array, Array]:
+        def search_twice(first_shapes):
             # The strength of the pull depends on the noise, which is known at the end
             # only.
             logarithms, successes = jax.lax.scan(
@@ -272,7 +272,7 @@ def _(primals, tangents):
     kinds = len(shapes.kinds)
     directions = jnp.repeat(jnp.eye(kinds), shapes.size // kinds, axis=1)
 
-    def differentiate(direction) -> tuple[Array, Array]:
+    def differentiate(direction):
         def columns(x):
             return _filter_columns(x, shapes, recordings, joint, column)
 

@@ -198,7 +198,7 @@ def row_spectra(problem: RegressionProblem, estimate: Estimate) -> RowSpectra:
             for c, channel in enumerate(estimate.influence(rows, residuals)):
                 yield _StretchChannel(lines, c, channel)
 
-    def transform(task: _StretchChannel) -> tuple[_StretchChannel, ChannelSpectra]:
+    def transform(task: _StretchChannel):
         return task, task.lines.transform_channel(task.channel, estimate.inverse)
 
     # This thread makes the rows of the next stretch while others transform the channels
@@ -218,7 +218,7 @@ def row_spectra(problem: RegressionProblem, estimate: Estimate) -> RowSpectra:
     )
 
 
-def _divide_into_stretches(problem: RegressionProblem) -> tuple[list[Span], bool]:
+def _divide_into_stretches(problem: RegressionProblem):
     """Divide recordings into stretches; return whether they hold all rows.
 
     Rows of different stretches count as independent: the relative error is about the
@@ -249,9 +249,7 @@ def _divide_into_stretches(problem: RegressionProblem) -> tuple[list[Span], bool
     return [stretches[k] for k in numbers], False
 
 
-def _shared_lengths(
-    problem: RegressionProblem, stretches: Sequence[Span]
-) -> dict[tuple[int, float], int]:
+def _shared_lengths(problem: RegressionProblem, stretches: Sequence[Span]):
     """Return the length of the lines for every number of rows and time between them."""
     kinds = set()
     for stretch in stretches:
@@ -284,7 +282,7 @@ def _rows_of_stretches(
                     parts = []
 
 
-def _visible_lines(recording: Observations, length: int) -> tuple[Vector, Vector]:
+def _visible_lines(recording: Observations, length: int):
     """Return frequencies [Hz] and gains of lines that filter and decimation pass."""
     frequency = fft.rfftfreq(length, recording.row_time)
     sample_time = recording.sample_time
