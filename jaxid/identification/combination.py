@@ -93,10 +93,12 @@ def combine(fits: Sequence[Fit], maps, offsets=None) -> tuple[Vector, Uncertaint
             )
     if offsets is None:
         offsets = [np.zeros(fit.base.size) for fit in fits]
-    factors = [fit.factor for fit in fits]
+    factors = []
     matrices = []
     sides = []
-    for (R, z), E, offset in zip(factors, maps, offsets, strict=True):
+    for fit, E, offset in zip(fits, maps, offsets, strict=True):
+        R, z = fit.factor
+        factors.append(R)
         matrices.append(R @ E)
         sides.append(z - R @ offset)
     decomposition = Decomposition.of(np.vstack(matrices), np.concatenate(sides))
@@ -104,16 +106,17 @@ def combine(fits: Sequence[Fit], maps, offsets=None) -> tuple[Vector, Uncertaint
 
     covariance = np.zeros_like(B)
     scatter = np.zeros(len(B))
-    for fit, (R, _), E in zip(fits, factors, maps, strict=True):
+    for fit, R, E in zip(fits, factors, maps, strict=True):
         fit_covariance, dof = _finite_covariance(fit)
         A = B @ E.T @ R.T @ R
         part = A @ fit_covariance @ A.T
+        variances = np.diag(part)
         covariance += part
         # The degrees of freedom of a sum are a mean of those of its terms.
         shares = A**2 * np.diag(fit_covariance)
         total_shares = np.maximum(shares.sum(axis=1), 1e-300)
         mean_inverse_dof = (shares / dof).sum(axis=1) / total_shares
-        scatter += np.diag(part) ** 2 * mean_inverse_dof
+        scatter += variances**2 * mean_inverse_dof
     total_dof = np.full(len(B), np.inf)
     has_scatter = scatter > 0
     variances = np.diag(covariance)[has_scatter]
@@ -137,17 +140,16 @@ def _finite_covariance(fit: Fit):
     return covariance, np.full(len(covariance), dof)
 
 
-def combine_fits(earlier: Fit, later: Fit, name: str | None = None) -> Fit:
+def combine_fits(earlier: Fit, later: Fit) -> Fit:
     """Add a later fit to an earlier one, as if both had been identified together.
 
     The estimates are those of the joint fit to rounding, and only factors are needed:
     the earlier fit may come from a file. If the weights of the fits differ, each keeps
-    its own.
+    its own. The name is that of both in a row.
 
     Args:
         earlier: Fit of the earlier recordings.
         later: Fit of later recordings of the robot in the same state.
-        name: Name of both together; by default their names in a row.
 
     Raises:
         InputError: If the fits have different base parameters, or have seen the same
@@ -167,9 +169,7 @@ def combine_fits(earlier: Fit, later: Fit, name: str | None = None) -> Fit:
         names=(*earlier.recordings, *later.recordings),
     )
     fit = fit_problem(problem, WeightedLeastSquares(GivenWeights(earlier.weights)))
-    if name is None:
-        name = f"{earlier.name}, {later.name}"
-    fit = dataclasses.replace(fit, name=name)
+    fit = dataclasses.replace(fit, name=f"{earlier.name}, {later.name}")
     return replace_estimates(fit, parameters, uncertainty)
 
 

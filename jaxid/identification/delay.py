@@ -18,7 +18,7 @@ from jaxid.measurement.recording import require_finite_delay
 from jaxid.measurement.samples import Chunk
 
 from .estimators import AbstractWeights, MaximumForces
-from .parameter_changes import joint_test
+from .parameter_changes import equality_test
 from .problem import RegressionProblem
 
 BLOCKS = 20
@@ -115,12 +115,7 @@ def estimate_delay(
     each_delay = search.each_delay
     delays = each_delay.solve()[base.size :]
     covariance = each_delay.jackknife()[base.size :, base.size :]
-    unit = np.eye(len(joint_weights))
-    # Differences of all delays to that of the first joint are zero for a common one.
-    contrast = unit[1:] - unit[:1]
-    _, p_value = joint_test(
-        contrast @ delays, contrast @ covariance @ contrast.T, BLOCKS - 1.0
-    )
+    _, p_value = equality_test(delays[:, None], covariance, BLOCKS - 1.0)
     feedback = 0.0
     if commanded is None:
         feedback = search.one_delay.feedback(search.solution)

@@ -14,7 +14,7 @@ from jaxid.result_table import Summarised, Table
 
 from .combination import as_least_squares, combine, replace_estimates, require_same_base
 from .fit_result import Fit, interval_table
-from .parameter_changes import Comparison, compare_some, joint_test
+from .parameter_changes import Comparison, compare_some, equality_test
 from .uncertainty import Uncertainty
 
 
@@ -105,26 +105,19 @@ class StatesFit(Summarised, eqx.Module):
     def sharing(self) -> tuple[float, float]:
         """Statistic and p-value of a test if states agree on shared parameters.
 
-        The states' own estimates are compared with those of the first state. A small
-        p-value says that some of them have changed after all.
+        The states' own estimates are compared. A small p-value says that some of them
+        have changed after all.
         """
         variances = np.array([np.diag(fit.covariance) for fit in self.fits])
         is_determined = np.all(np.isfinite(variances), axis=0)
         k = [index for index in self.shared if is_determined[index]]
-        parameters = []
-        covariances = []
-        dof = []
-        for fit in self.fits:
-            parameters.append(fit.parameters[k])
-            covariances.append(fit.covariance[np.ix_(k, k)])
-            dof.extend(fit.uncertainty.dof[k])
-        differences = np.subtract(parameters[1:], parameters[0])
-        # The errors of the first state are in all differences.
-        count = len(differences)
-        first_errors = np.tile(covariances[0], (count, count))
-        covariance = linalg.block_diag(*covariances[1:]) + first_errors
-        min_dof = min(dof, default=np.inf)
-        return joint_test(differences.ravel(), covariance, float(min_dof))
+        covariances = [fit.covariance[np.ix_(k, k)] for fit in self.fits]
+        dof = [fit.uncertainty.dof[k].min(initial=np.inf) for fit in self.fits]
+        return equality_test(
+            np.array([fit.parameters[k] for fit in self.fits]),
+            np.asarray(linalg.block_diag(*covariances)),
+            float(min(dof)),
+        )
 
     def _indices(self, state: str) -> np.ndarray:
         if state not in self.states:
@@ -134,12 +127,10 @@ class StatesFit(Summarised, eqx.Module):
         return state_indices(self.base.size, self.varying, self.states.index(state))
 
 
-def identify_states(
-    fits: Sequence[Fit], varying: Sequence[str] | None = None
-) -> StatesFit:
+def identify_states(fits: Sequence[Fit]) -> StatesFit:
     """Identify a robot in several states at once, with common inertia.
 
-    Friction is each state's own.
+    Base parameters that store no energy (friction and offsets) are each state's own.
 
     The factors of the fits are combined, without another pass over the data. Shared
     parameters become more precise than in any single fit, and so do those that vary,
@@ -147,12 +138,10 @@ def identify_states(
 
     Args:
         fits: Fit of each state, with different names.
-        varying: Names of the base parameters that each state has for itself. If None,
-            those that store no energy: friction and offsets.
 
     Raises:
-        InputError: If there are fewer than two fits, two have the same name, base
-            parameters differ, or there is no such base parameter.
+        InputError: If there are fewer than two fits, two have the same name, or base
+            parameters differ.
     """
     names = [fit.name for fit in fits]
     if len(names) < 2 or len(set(names)) < len(names):
@@ -163,7 +152,7 @@ def identify_states(
     # The combination is linear in estimates of least squares only.
     fits = tuple(map(as_least_squares, fits))
     base = fits[0].base
-    indices = varying_parameters(base, varying)
+    indices = varying_parameters(base)
     parameters, uncertainty = combine(fits, state_maps(base.size, indices, len(fits)))
     return StatesFit(
         fits=fits,
@@ -191,21 +180,9 @@ def state_maps(size: int, varying: Sequence[int], states: int) -> list[Matrix]:
     return [unit[state_indices(size, varying, state)] for state in range(states)]
 
 
-def varying_parameters(
-    base: BaseParameters, varying: Sequence[str] | None = None
-) -> Indices:
-    """Return which base parameters are each state's own.
-
-    By default they are those without energy.
-    """
-    if varying is None:
-        return tuple(np.flatnonzero(~stores_energy(base)).tolist())
-    for name in varying:
-        if name not in base.names:
-            raise InputError(
-                f"`{name}` is none of `base.names` of `{base.model.robot.name}`."
-            )
-    return tuple(k for k, name in enumerate(base.names) if name in varying)
+def varying_parameters(base: BaseParameters) -> Indices:
+    """Return which base parameters are each state's own: those without energy."""
+    return tuple(np.flatnonzero(~stores_energy(base)).tolist())
 
 
 def stores_energy(base: BaseParameters) -> np.ndarray:

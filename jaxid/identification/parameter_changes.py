@@ -89,14 +89,12 @@ class Comparison(Summarised, eqx.Module):
     @property
     def standard_deviations(self) -> Vector:
         """Standard deviations of the differences; infinite where nothing is known."""
-        variances = np.diag(self.uncertainty.covariance)
-        return np.sqrt(np.where(variances > 0, variances, np.inf))
+        return self.uncertainty.standard_deviations
 
     @property
     def half_widths(self) -> Vector:
         """Half the widths of the differences' intervals, each for itself."""
-        quantiles = special.stdtrit(self.uncertainty.dof, 0.5 + 0.5 * LEVEL)
-        return quantiles * self.standard_deviations
+        return self.uncertainty.half_widths(LEVEL)
 
     @property
     def p_values(self) -> Vector:
@@ -250,6 +248,10 @@ def compare_some(
     # Infinite variances make numbers that are none.
     with np.errstate(invalid="ignore", divide="ignore"):
         covariance = first_covariance + second_covariance - cross - cross.T
+        has_variance = np.diag(covariance) > 0
+        np.fill_diagonal(
+            covariance, np.where(has_variance, np.diag(covariance), np.inf)
+        )
         dof = _dof_of_sum(
             np.diag(first_covariance),
             np.diag(second_covariance),
@@ -318,6 +320,25 @@ def joint_test(
         return statistic, 1.0
     f_ratio = statistic * f_dof / (dof * size)
     return statistic, float(special.fdtrc(size, f_dof, f_ratio))
+
+
+def equality_test(
+    estimates: Matrix, covariance: Matrix, dof: float
+) -> tuple[float, float]:
+    """Test if several estimates of the same parameters differ: statistic and p-value.
+
+    Args:
+        estimates: Estimates of the parameters [estimates, parameters].
+        covariance: Covariance of all estimates, one after the other.
+        dof: Degrees of freedom of the covariance.
+    """
+    count, size = estimates.shape
+    # Differences to the first estimate are zero if all are equal.
+    differences = np.eye(count)[1:] - np.eye(count)[:1]
+    contrast = np.kron(differences, np.eye(size))
+    return joint_test(
+        contrast @ estimates.ravel(), contrast @ covariance @ contrast.T, dof
+    )
 
 
 def parameter_kinds(base: BaseParameters) -> Texts:
