@@ -13,7 +13,7 @@ from jaxid.arrays import Joints
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
-from jaxid.measurement.observations import Observations
+from jaxid.measurement.observations import Observations, ObservedLogs
 from jaxid.measurement.recording import require_finite_delay
 from jaxid.measurement.samples import Chunk
 
@@ -68,10 +68,10 @@ class Delay(eqx.Module):
 
 def estimate_delay(
     base: BaseParameters,
-    observations: Observations | Sequence[Observations],
+    observations: ObservedLogs,
     weights: AbstractWeights | None = None,
     *,
-    commanded: Observations | Sequence[Observations] | None = None,
+    commanded: ObservedLogs | None = None,
 ) -> Delay:
     r"""Estimate the delay of the forces together with the base parameters.
 

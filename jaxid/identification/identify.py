@@ -10,7 +10,7 @@ import numpy as np
 from jaxid.arrays import AnyArray, BaseMatrix, BaseVector, Matrix, Texts
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
-from jaxid.measurement.observations import Observations, Progress
+from jaxid.measurement.observations import Observations, ObservedLogs, Progress
 
 from .estimators.estimate import AbstractEstimator
 from .estimators.least_squares import WeightedLeastSquares
@@ -30,7 +30,7 @@ from .uncertainty.spectral import SpectralSandwich
 
 def identify(
     base: BaseParameters,
-    observations: Observations | Sequence[Observations] | RegressionProblem,
+    observations: ObservedLogs | RegressionProblem,
     estimator: AbstractEstimator | None = None,
     progress: Progress | None = None,
     uncertainty: AbstractUncertainty | None = None,

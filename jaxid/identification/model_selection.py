@@ -10,7 +10,7 @@ import numpy as np
 from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
-from jaxid.measurement.observations import Observations, Progress
+from jaxid.measurement.observations import Observations, ObservedLogs, Progress
 from jaxid.result_table import Column, Remark, Status, Summarised, Table, percent
 
 from .estimators import AbstractEstimator, WeightedLeastSquares
@@ -99,7 +99,7 @@ class ModelChoice(Summarised, eqx.Module):
 
 def choose_model(
     candidates: Sequence[ModelCandidate],
-    observations: Observations | Sequence[Observations],
+    observations: ObservedLogs,
     *,
     progress: Progress | None = None,
 ) -> ModelChoice:

@@ -10,7 +10,7 @@ from jaxid.arrays import BaseVector, Joints, Matrices, Matrix
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
 from jaxid.measurement.friction_state import with_memory
-from jaxid.measurement.observations import Observations, Progress
+from jaxid.measurement.observations import Observations, ObservedLogs, Progress
 from jaxid.robot.robot import Robot
 
 from .factors import Blocks, Factors, Ranges, RowChunk, empty_factors, row_chunks
@@ -55,7 +55,7 @@ class RegressionProblem:
     def __init__(
         self,
         base: BaseParameters,
-        recordings: Observations | Sequence[Observations] = (),
+        recordings: ObservedLogs = (),
         progress: Progress | None = None,
         *,
         divisions: int = 10,

@@ -317,6 +317,10 @@ class Observations(eqx.Module):
         return self.motion[self.instants]
 
 
+ObservedLogs = Observations | Sequence[Observations]
+"""Observations of one log, or of several."""
+
+
 def observe(
     recording: Recording,
     robot: Robot,

@@ -1,7 +1,6 @@
 """Validation: torque errors, and definiteness of the mass matrix (Eq. 37, Sec. 5)."""
 
 import itertools
-from collections.abc import Sequence
 
 import equinox as eqx
 import numpy as np
@@ -12,7 +11,7 @@ from jaxid.identification.estimators import ResidualVariances, WeightedLeastSqua
 from jaxid.identification.fit_result import Fit
 from jaxid.identification.problem import RegressionProblem
 from jaxid.measurement.friction_state import with_memory
-from jaxid.measurement.observations import Observations, Progress
+from jaxid.measurement.observations import Observations, ObservedLogs, Progress
 from jaxid.result_table import (
     Column,
     Remark,
@@ -286,7 +285,7 @@ class Validation(Summarised, eqx.Module):
 
 def validate(
     fit: Fit,
-    observations: Observations | Sequence[Observations],
+    observations: ObservedLogs,
     *,
     progress: Progress | None = None,
 ) -> Validation:

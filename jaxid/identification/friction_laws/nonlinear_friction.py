@@ -12,7 +12,7 @@ from jaxid.arrays import AnyArray, Float, Texts
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.terms import AbstractTerm
-from jaxid.measurement.observations import Observations, Progress
+from jaxid.measurement.observations import ObservedLogs, Progress
 
 from ..estimators import AbstractEstimator, WeightedLeastSquares
 from ..estimators.regularisation_and_weights import Decomposition
@@ -112,7 +112,7 @@ class NonlinearFit(eqx.Module):
 
 def identify_nonlinear_friction(
     base: BaseParameters,
-    observations: Observations | Sequence[Observations],
+    observations: ObservedLogs,
     estimator: AbstractEstimator | None = None,
     *,
     shapes: Sequence[str] = (),

@@ -1,7 +1,5 @@
 """Lengths of presliding friction, by a search on the rows of each joint alone."""
 
-from collections.abc import Sequence
-
 import equinox as eqx
 import numpy as np
 
@@ -9,7 +7,7 @@ from jaxid.arrays import Joints
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
 from jaxid.measurement.friction_state import with_memory
-from jaxid.measurement.observations import Observations
+from jaxid.measurement.observations import ObservedLogs
 
 from ..problem import RegressionProblem
 
@@ -20,7 +18,7 @@ STEP_RATIOS = 3.0 ** (0.5 ** np.arange(1, 5))
 
 
 def identify_presliding(
-    base: BaseParameters, observations: Observations | Sequence[Observations]
+    base: BaseParameters, observations: ObservedLogs
 ) -> BaseParameters:
     """Find the length of presliding friction of each joint.
 
