@@ -105,13 +105,20 @@ def rigid_body_regressor(
 def rigid_body_forces(
     robot: Robot, p: Bodies, q: Joints, qd: Joints, qdd: Joints
 ) -> Joints:
-    r"""Return the forces $\sum_i F_{o,i}^T \bar\Theta_i p_i$ [N m or N] (Eq. 11).
+    r"""Return the forces $\sum_i F_{o,i}^T \bar\Theta_i p_i$ [N m or N] (Eq. 11)."""
+    motions = body_motions(robot, q, qd, qdd)
+    wrenches = [body_regressor(*m) @ p[i] for i, m in enumerate(motions)]
+    return joint_forces(robot, wrenches, q, qd, qdd)
+
+
+def joint_forces(
+    robot: Robot, wrenches: list[AnyArray], q: Joints, qd: Joints, qdd: Joints
+) -> Joints:
+    """Project force and moment of each body on the joints [N m or N].
 
     The projection is the transpose of the map that gives the accelerations: it is
     applied, and the Jacobian is never built.
     """
-    motions = body_motions(robot, q, qd, qdd)
-    wrenches = [body_regressor(*m) @ p[i] for i, m in enumerate(motions)]
     _, project = jax.vjp(partial_velocities(robot, q, qd, qdd), qdd)
     return project(wrenches)[0]
 

@@ -16,7 +16,7 @@ from jaxid.dynamics.sample_methods import in_numpy, on_samples, program_of
 from jaxid.program.gradient import pull_back
 from jaxid.robot.robot import Robot
 
-Excess = Float[Array, "*batch values"]
+Excess = Float[AnyArray, "*batch values"]
 """Relative excess over each limit, at each sample."""
 BLOCK = 256
 """Samples for which functions of constraints are compiled, whatever their number."""
