@@ -140,9 +140,6 @@ def _error_record(errors: TorqueErrors, robot: Robot) -> Record:
         mean_percent=errors.mean_percent,
         rms_percent=errors.rms_percent,
         rms_relative=errors.rms_relative,
-        offset=errors.offset,
-        rms_at_rest=errors.rms_at_rest,
-        rms_in_motion=errors.rms_in_motion,
     )
     return {"relative": errors.relative, "recording": errors.name, "joints": rows}
 

@@ -68,32 +68,18 @@ class Diagnosis(Summarised):
     motor_sides: tuple[bool, bool]
     notes: tuple[str, ...] = ()
 
-    def mistakes(self, fit: Fit) -> tuple[str, ...]:
-        """Return the likely mistake in the description of log or robot, as a sentence.
-
-        That is a single one whose correction explains most of what the model misses,
-        and more than any other; nothing if the model fits. If it misses much, and no
-        single mistake explains that, the sentence says where.
-
-        Args:
-            fit: Fit of the robot's model, to this log or to several.
-        """
-        return _mistakes([self], fit)[0]
-
     def with_fit(self, fit: Fit, commanded: Observations | None = None) -> "Diagnosis":
         """Return the diagnosis with findings of a fit to this log alone, and delays.
 
         The log with `commanded` angles in place of the measured ones is filtered alike.
         """
-        fit_findings, fit_notes = _mistakes([self], fit)
+        fit_findings = _mistakes([self], fit)
+        notes = self.notes
         if not fit_findings and not self.faulty and self.observations is not None:
             fit_findings = negative_friction(fit, [self.observations])
-            fit_notes = (*fit_notes, *delay_notes(self.observations, fit, commanded))
-        return dataclasses.replace(
-            self,
-            findings=(*fit_findings, *self.findings),
-            notes=(*self.notes, *fit_notes),
-        )
+            notes = (*notes, *delay_notes(self.observations, fit, commanded))
+        findings = (*fit_findings, *self.findings)
+        return dataclasses.replace(self, findings=findings, notes=notes)
 
     def summary(self) -> Table:
         """Return a table: motion and forces beside their limits, and the findings."""
@@ -238,7 +224,7 @@ def diagnose(
     findings = [
         *(text for _, text in faults),
         *clock,
-        *limit_findings(robot, excerpt, statistics, faulty_joints),
+        *limit_findings(robot, statistics, faulty_joints),
         *stuck_findings(robot, excerpt, faulty_joints),
     ]
     rate = 1.0 / excerpt.sample_time
@@ -260,10 +246,8 @@ def diagnose(
     return diagnosis if fit is None else diagnosis.with_fit(fit)
 
 
-def mistakes_in_logs(
-    diagnoses: Sequence[Diagnosis], fit: Fit
-) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return findings and notes of a fit to several logs, which are judged together."""
+def mistakes_in_logs(diagnoses: Sequence[Diagnosis], fit: Fit) -> tuple[str, ...]:
+    """Return findings of a fit to several logs, which are judged together."""
     logs = [
         diagnosis.observations
         for diagnosis in diagnoses
@@ -274,15 +258,13 @@ def mistakes_in_logs(
         if any(diagnosis.faulty for diagnosis in diagnoses)
         else negative_friction(fit, logs)
     )
-    findings, notes = _mistakes(diagnoses, fit)
     name = f"{diagnoses[0].log.name}: " if len(diagnoses) == 1 else ""
-    return (*friction, *(f"{name}{text}" for text in findings)), notes
+    findings = (f"{name}{text}" for text in _mistakes(diagnoses, fit))
+    return (*friction, *findings)
 
 
-def _mistakes(
-    diagnoses: Sequence[Diagnosis], fit: Fit
-) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the likely mistake in logs, or moments unlike the model, and notes."""
+def _mistakes(diagnoses: Sequence[Diagnosis], fit: Fit) -> tuple[str, ...]:
+    """Return the likely mistake in logs, or moments unlike the model."""
     # Faults of channels explain the rest.
     logs = [
         diagnosis.observations
@@ -293,11 +275,9 @@ def _mistakes(
     moments = tuple(
         template.format(log, text) for log in logs for text in departures(fit, log)
     )
-    return (
-        likely_mistakes(fit, logs, diagnoses[0].motor_sides, moments)
-        if logs
-        else ((), ())
-    )
+    if not logs:
+        return ()
+    return likely_mistakes(fit, logs, diagnoses[0].motor_sides, moments)
 
 
 def _excerpt(log: Observations, source: SamplesOnDisk) -> Recording:

@@ -9,6 +9,7 @@ the fit.
 """
 
 import itertools
+import math
 import re
 from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
@@ -38,12 +39,12 @@ MAX_DELAY = 0.05
 """Largest delay that is looked for [s]."""
 MAX_ZERO_ERROR = 0.8
 """Largest error of a zero that is looked for [rad or m]."""
-MAX_GAIN = 3.0
-"""Largest gain of a force that is looked for."""
-SMALL_ZERO_ERROR = 0.2
-"""Error of a zero that logs may not reveal [rad or m]."""
-SMALL_GAIN = 1.2
-"""Gain of a force that logs may not reveal."""
+ZERO_STEP = 0.02
+"""Step of the search for the error of a zero [rad or m]."""
+MAX_LOG_GAIN = math.log(3.0)
+"""Logarithm of the largest gain of a force that is looked for."""
+LOG_GAIN_STEP = -0.1 * math.log(1.2)
+"""Step of the search for the logarithm of a gain."""
 MIN_DELAY_EFFECT = 0.02
 """Fraction (0 to 1) of the forces by which a delay must change them to be a mistake."""
 MAX_MISFIT = 0.15
@@ -64,13 +65,11 @@ class Correction(NamedTuple):
 
 
 class _Amount(NamedTuple):
-    """Mistake of any amount in a joint (all, if it has no name), and two amounts."""
+    """Mistake of any amount: its correction, its limit, and a step of the search."""
 
-    joint: str
-    fault: str
     correction: Callable[[float, slice], Correction]
     max_amount: float
-    small_amount: float
+    step: float
 
 
 def likely_mistakes(
@@ -78,21 +77,20 @@ def likely_mistakes(
     logs: Sequence[Observations],
     motor_sides: tuple[bool, bool],
     events: tuple[str, ...] = (),
-) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return a sentence about the mistake that explains most of the misfit, and notes.
+) -> tuple[str, ...]:
+    """Return a sentence about the mistake that explains most of the misfit.
 
-    A mistake is looked for in all logs alike, then in the columns of each. The notes
-    say which mistakes would not show; `events`, sentences about moments, are returned
-    if no mistake explains them. Whether angles and forces are taken for the motors' is
-    in `motor_sides`.
+    A mistake is looked for in all logs alike, then in the columns of each. If none
+    explains it, `events`, sentences about moments, are returned, or else where the
+    model does not fit. Whether angles and forces are taken for the motors' is in
+    `motor_sides`.
     """
     samples = _Samples(fit.base.model, logs)
     robot = fit.base.model.robot
     misfit = samples.initial_misfit
     initial_unseen_misfit = samples.misfit(samples.no_correction, folds=FOLDS)
-    notes = samples.hidden_mistakes(max(misfit / MAX_RATIO, MIN_MISFIT))
     if misfit < MIN_MISFIT:
-        return events, notes
+        return events
     parts = [slice(0, len(samples.forces)), *(samples.parts if len(logs) > 1 else [])]
     for name, part in zip(
         ("", *(f"{log.name}: " for log in logs)), parts, strict=False
@@ -105,9 +103,6 @@ def likely_mistakes(
         candidates += amounts
         if not name:
             candidates += _robot_corrections(robot, motion, forces)
-            candidates += (
-                _kind_corrections(robot, motion, forces) if misfit > MAX_MISFIT else ()
-            )
         ranking = sorted(
             ((samples.misfit(c, part), k) for k, c in enumerate(candidates))
         )
@@ -124,8 +119,8 @@ def likely_mistakes(
                 f"misses {100 * min_misfit:.2g} % of the forces instead of "
                 f"{100 * misfit:.2g} %."
             )
-            return (text,), ()
-    return events or _misfit_text(fit, samples.motion, samples.forces, misfit), notes
+            return (text,)
+    return events or _misfit_text(fit, samples.motion, samples.forces, misfit)
 
 
 class _Samples:
@@ -146,7 +141,7 @@ class _Samples:
         self.parts = [slice(a, b) for a, b in itertools.pairwise(ends)]
         self._logs, self._instants, self._model = logs, instants, model
         self._max_speeds = np.abs(self.motion.qd).max(axis=0)
-        self._geometries: dict[tuple[bool, ...], _AnyGeometry] = {}
+        self._geometry = _AnyGeometry(model)
         self.no_correction = Correction("", model.robot, self.motion, self.forces)
         self._rows = self._corrected_rows(self.no_correction)
         is_model_friction = [
@@ -173,7 +168,7 @@ class _Samples:
         def misfit(amount: float) -> float:
             return self.misfit(mistake.correction(amount, part), part)
 
-        step = 0.1 * mistake.small_amount
+        step = mistake.step
         initial_square = self.initial_misfit**2
         lower_square = misfit(-step) ** 2
         upper_square = misfit(step) ** 2
@@ -185,26 +180,6 @@ class _Samples:
         options = {"maxiter": 10}
         best_amount = optimize.minimize_scalar(misfit, bounds=bounds, options=options).x
         return mistake.correction(best_amount, part)
-
-    def hidden_mistakes(self, limit: float) -> tuple[str, ...]:
-        """Return a note on mistakes with which a model would miss less than `limit`."""
-        joints: dict[str, list[str]] = {}
-        for mistake in self.amounts():
-            correction = mistake.correction(mistake.small_amount, slice(None))
-            if mistake.joint and self.misfit(correction) < limit:
-                joints.setdefault(mistake.fault, []).append(f"`{mistake.joint}`")
-        for j, name in enumerate(self._model.robot.joint_names):
-            if self.misfit(_reversal(self.no_correction, j)) < limit:
-                joints.setdefault("a reversed axis", []).append(f"`{name}`")
-        texts = []
-        for fault, names in joints.items():
-            is_all = len(names) == self.motion.joints > 1
-            texts.append(f"{fault} ({'any joint' if is_all else ', '.join(names)})")
-        return (
-            (f"mistakes that these logs cannot reveal: {', '.join(texts)}",)
-            if texts
-            else ()
-        )
 
     def amounts(self) -> Iterator[_Amount]:
         """Yield mistakes of any amount: a delay, zeros of angles, gains of forces."""
@@ -220,7 +195,7 @@ class _Samples:
         def delay(x: float, part: slice) -> Correction:
             return correction(text.format(x), part, forces=self._delayed_forces(x))
 
-        yield _Amount("", "", delay, MAX_DELAY, MAX_DELAY)
+        yield _Amount(delay, MAX_DELAY, 0.1 * MAX_DELAY)
         for j, name in enumerate(robot.joint_names[:MAX_JOINTS]):
             axis = np.eye(robot.joints)[j]
             unit, size = ("degrees", np.pi / 180) if robot.revolute[j] else ("m", 1.0)
@@ -242,12 +217,8 @@ class _Samples:
                 )
                 return correction(hint, part, forces=forces * np.exp(-x * axis))
 
-            fault = f"a zero that is off by {SMALL_ZERO_ERROR / size:.2g} {unit}"
-            yield _Amount(name, fault, shift, MAX_ZERO_ERROR, SMALL_ZERO_ERROR)
-            fault = f"forces that are {SMALL_GAIN:g} times too large"
-            yield _Amount(
-                name, fault, scale, float(np.log(MAX_GAIN)), -float(np.log(SMALL_GAIN))
-            )
+            yield _Amount(shift, MAX_ZERO_ERROR, ZERO_STEP)
+            yield _Amount(scale, MAX_LOG_GAIN, LOG_GAIN_STEP)
 
     def _delayed_forces(self, seconds: float) -> np.ndarray:
         """Return the forces that stand later in the logs."""
@@ -260,10 +231,7 @@ class _Samples:
 
     def _corrected_rows(self, c: Correction) -> np.ndarray:
         """Return the regressor, with any friction, and the forces as last column."""
-        kinds = c.robot.revolute
-        if kinds not in self._geometries:
-            self._geometries[kinds] = _AnyGeometry(Model(c.robot, self._model.terms))
-        columns, tool = self._geometries[kinds](c.robot, c.motion)
+        columns, tool = self._geometry(c.robot, c.motion)
         friction = _friction_columns(np.asarray(c.motion.qd), self._max_speeds)
         return np.concatenate([columns, friction, (c.forces - tool)[..., None]], axis=2)
 
@@ -419,16 +387,6 @@ def _robot_corrections(
         )
         yield variant._replace(text=text.format(vector))
         yield _reversal(variant, j)._replace(text=text.format(mirror))
-
-
-def _kind_corrections(
-    robot: Robot, motion: Motion, forces: np.ndarray
-) -> Iterator[Correction]:
-    """Yield corrections of the kinds of joints."""
-    for j, name in enumerate(robot.joint_names[:MAX_JOINTS]):
-        kinds = tuple(turns != (i == j) for i, turns in enumerate(robot.revolute))
-        text = f"joint `{name}` seems to {'turn' if kinds[j] else 'slide'}"
-        yield Correction(text, robot.replace(revolute=kinds), motion, forces)
 
 
 class _AnyGeometry(eqx.Module):

@@ -5,7 +5,7 @@ from collections.abc import Collection, Iterator, Sequence
 import numpy as np
 from scipy import ndimage
 
-from jaxid.arrays import AnyArray, Float
+from jaxid.arrays import AnyArray
 from jaxid.dynamics.motion import Motion
 from jaxid.measurement.recording import Recording, unlike_derivatives
 from jaxid.robot.robot import Robot
@@ -32,7 +32,6 @@ class LogStatistics:
         self.lowest = np.full(joints, np.inf)
         self.highest = np.full(joints, -np.inf)
         self.speed, self.force = np.zeros((2, joints))
-        self._energies = np.zeros(3)
         # Of velocities, derivatives of the angles, and derivatives of these: sums of
         # products.
         self._products = np.zeros((joints, 3, 3))
@@ -47,7 +46,6 @@ class LogStatistics:
         self.highest = np.maximum(self.highest, q.max(axis=0))
         self.speed = np.maximum(self.speed, np.abs(qd).max(axis=0))
         self.force = np.maximum(self.force, np.abs(forces).max(axis=0))
-        self._energies += [np.sum(forces * qd), np.sum(forces**2), np.sum(qd**2)]
         if len(q) > 1:
             derivative = np.gradient(q, sample_time, axis=0)
             second_derivative = np.gradient(derivative, sample_time, axis=0)
@@ -60,16 +58,6 @@ class LogStatistics:
     def stands(self) -> np.ndarray:
         """Whether each joint stands, at some of the samples."""
         return np.concatenate(self._speeds) < REST_SHARE * np.maximum(self.speed, 1e-12)
-
-    @property
-    def power(self) -> float:
-        """Mean power over the product of the RMS forces and velocities."""
-        power, forces, velocities = self._energies
-        return (
-            float(power / np.sqrt(forces * velocities))
-            if forces * velocities > 0
-            else 0.0
-        )
 
     def lateness(self, joint: int) -> float:
         """Return how much later measured velocities stand than those of the angles [s].
@@ -85,31 +73,17 @@ class LogStatistics:
 
 
 def limit_findings(
-    robot: Robot, log: Recording, statistics: LogStatistics, faulty: Collection[int]
+    robot: Robot, statistics: LogStatistics, faulty: Collection[int]
 ) -> list[str]:
     """Compare a log with the limits of its robot: a wrong unit or sign shows here.
 
     Joints in `faulty` have faults of single channels, which explain more.
     """
-    s = statistics
-    angles = (
-        []
-        if faulty
-        else unit_findings(robot, s.lowest, s.highest, log.angles_on_motor_side)
-    )
-    forces = [] if faulty else _force_findings(robot, s)
-    findings = angles + forces
+    findings = [] if faulty else _force_findings(robot, statistics)
     for j in range(robot.joints):
-        if j in faulty:
-            continue
-        findings += _joint_findings(robot, j, s, not angles)
-    # Over a whole log, friction makes a robot consume energy.
-    if not faulty and s.power < -0.05:
-        findings.append(
-            "the robot gives off energy: check `recording.angle_signs` and "
-            "`force_signs`."
-        )
-    share = float(s.stands.all(axis=1).mean())
+        if j not in faulty:
+            findings += _joint_findings(robot, j, statistics)
+    share = float(statistics.stands.all(axis=1).mean())
     if share > 0.5:
         findings.append(
             f"the robot stands still for {100 * share:.0f} % of the log: crop it "
@@ -118,9 +92,7 @@ def limit_findings(
     return findings
 
 
-def _joint_findings(
-    robot: Robot, j: int, statistics: LogStatistics, with_range: bool
-) -> Iterator[str]:
+def _joint_findings(robot: Robot, j: int, statistics: LogStatistics) -> Iterator[str]:
     """Compare the range and speed of a joint with its limits."""
     name = robot.joint_names[j]
     unit = robot.joint_unit(j)
@@ -131,7 +103,7 @@ def _joint_findings(
     b = statistics.highest[j]
     force = statistics.force[j]
     slack = 0.02 * (maximum - minimum) if np.isfinite(maximum - minimum) else 0.0
-    if with_range and not minimum - slack <= a <= b <= maximum + slack:
+    if not minimum - slack <= a <= b <= maximum + slack:
         yield (
             f"joint `{name}` moves from {a:.3g} to {b:.3g}, its range is {minimum:.3g} "
             f"to {maximum:.3g} {unit}: check `recording.angle_unit`, `side`, "
@@ -173,49 +145,6 @@ def _force_findings(robot: Robot, statistics: LogStatistics) -> list[str]:
             f"no joint needs more than {100 * peak:.2g} % of its largest force: {cure}"
         ]
     return []
-
-
-def unit_findings(
-    robot: Robot,
-    lowest: Float[np.ndarray, " joints"],
-    highest: Float[np.ndarray, " joints"],
-    on_motor_side: bool,
-) -> list[str]:
-    """Look for a unit or side that brings all joints' angles back into their ranges."""
-    minima = np.asarray(robot.limits.position_min)
-    width = np.asarray(robot.limits.position_max) - minima
-    mask = np.array(robot.revolute) & np.isfinite(width)
-    if not mask.any():
-        return []
-    minima, width = minima[mask], width[mask]
-
-    def used_fraction(ends: np.ndarray) -> float:
-        """Return the largest used fraction of a range; zero if some range is left."""
-        a, b = np.sort(ends, axis=0)[:, mask]
-        is_inside = (a >= minima - 0.02 * width) & (b <= minima + 1.02 * width)
-        return float(((b - a) / width).max()) if is_inside.all() else 0.0
-
-    ends = np.stack([lowest, highest])
-    if used_fraction(ends) > 0.02:
-        return []
-    degrees = 'degrees (`recording.angle_unit = "deg"`)'
-    radians = "radians (`recording.angle_unit`"
-    corrected_ends = {
-        degrees: np.where(mask, np.deg2rad(ends), ends),
-        f'{radians} is "deg")': np.where(mask, np.rad2deg(ends), ends),
-        f'{radians} is "rev")': np.where(mask, ends / (2 * np.pi), ends),
-    }
-    if not on_motor_side and not robot.drives.is_direct:
-        joint_ends = np.asarray(robot.drives.joint_angles(ends))
-        corrected_ends['the motors\' (`recording.side = "motor"`)'] = joint_ends
-    cures = " or ".join(
-        cure for cure, angles in corrected_ends.items() if used_fraction(angles) > 0.1
-    )
-    text = (
-        "the angles do not suit the ranges of the joints, but would if those in "
-        "the log were "
-    )
-    return [f"{text}{cures}."] if cures else []
 
 
 def channel_findings(

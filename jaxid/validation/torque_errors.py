@@ -19,7 +19,6 @@ from jaxid.result_table import (
     Summarised,
     Table,
     percent,
-    significant,
 )
 
 POSES = 2000
@@ -61,12 +60,6 @@ class TorqueErrors(eqx.Module):
     positions: Float[AnyArray, "rows joints"]
 
     @property
-    def moving(self) -> Bool[np.ndarray, "rows joints"]:
-        """Rows in which each joint moves faster than 1 % of its largest speed."""
-        sizes = np.abs(self.speeds)
-        return sizes > REST_SHARE * sizes.max(axis=0)
-
-    @property
     def errors(self) -> Float[np.ndarray, "rows joints"]:
         """Predicted minus measured forces [N m or N] (Eq. 27).
 
@@ -95,27 +88,6 @@ class TorqueErrors(eqx.Module):
         return 100.0 * self.rms / np.asarray(self.max_forces)
 
     @property
-    def offset(self) -> Float[np.ndarray, " joints"]:
-        """Mean error of each joint [N m or N]; a constant offset would explain it."""
-        return np.nanmean(self.errors, axis=0)
-
-    @property
-    def rms_at_rest(self) -> Float[np.ndarray, " joints"]:
-        """RMS error about the offset while the joint stands [N m or N].
-
-        NaN if it never does.
-        """
-        return self._rms_where(~np.asarray(self.moving))
-
-    @property
-    def rms_in_motion(self) -> Float[np.ndarray, " joints"]:
-        """RMS error about the offset while the joint moves [N m or N].
-
-        NaN if it never does.
-        """
-        return self._rms_where(np.asarray(self.moving))
-
-    @property
     def depend_on_speed(self) -> tuple[bool, ...]:
         """Whether errors of each joint depend on its speed: friction of another shape.
 
@@ -130,13 +102,6 @@ class TorqueErrors(eqx.Module):
             *(np.asarray(x).T for x in (self.unexplained, self.speeds)), strict=True
         )
         return tuple(_chance(e, v) <= limit for e, v in pairs)
-
-    def _rms_where(self, row_mask: np.ndarray) -> np.ndarray:
-        squares = (self.errors - self.offset) ** 2
-        row_mask = row_mask & np.isfinite(squares)
-        return np.sqrt(
-            _ratio(np.sum(squares, axis=0, where=row_mask), np.sum(row_mask, axis=0))
-        )
 
     @property
     def force_rms(self) -> Float[np.ndarray, " joints"]:
@@ -262,12 +227,6 @@ class Validation(Summarised, eqx.Module):
                 [float(e.rms_relative[j]) for e, j in rows],
                 "%",
                 percent,
-            ),
-            Column(
-                "of the largest",
-                [float(e.rms_percent[j]) for e, j in rows],
-                "%",
-                significant,
             ),
         ]
         status = Status.GOOD if self.definiteness.positive_definite else Status.BAD

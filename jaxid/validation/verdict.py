@@ -110,7 +110,6 @@ def verdict(report: Report) -> list[Remark]:
             f"Good: below {MAX_CONDITION_NUMBER:g}. Above, some parameters are hard to "
             "tell apart.",
         ),
-        *_judge_signs(fit),
         *_judge_bounds(fit),
         *_judge_offsets(fit),
     ]
@@ -201,17 +200,6 @@ def _relative_errors(logs: Sequence[TorqueErrors]) -> np.ndarray:
     return np.nan_to_num(rms_errors / np.where(rms_forces > 0, rms_forces, np.inf))
 
 
-def _constant_share(logs: Sequence[TorqueErrors], joint: int) -> float:
-    """Return the share of means of single logs in a joint's squared errors (0 to 1)."""
-    errors = [e.errors[:, joint] for e in logs]
-    total = float(sum(np.nansum(e**2) for e in errors))
-    counts = [np.count_nonzero(np.isfinite(e)) for e in errors]
-    means = sum(
-        n * np.nanmean(e) ** 2 for n, e in zip(counts, errors, strict=True) if n
-    )
-    return float(means) / total if total > 0 else 0.0
-
-
 def _judge_new_motions(
     identification: Sequence[TorqueErrors], verification: Sequence[TorqueErrors]
 ) -> Remark:
@@ -231,55 +219,15 @@ def _judge_new_motions(
     ratio = float(np.max(np.where(unseen_errors > MIN_UNSEEN_ERROR, ratios, 1.0)))
     if ratio > 1:
         text += f", and up to {significant(ratio, 2)} times as much as of the fit's own"
-    worst_joint = int(np.argmax(unseen_errors))
-    constant_share = _constant_share(verification, worst_joint)
-    if max_error > RMS_ERROR[0] and constant_share > OFFSET:
-        share = significant(100 * constant_share, 2)
-        text += (
-            f"; {share} % of the squared error of joint {worst_joint + 1}, the "
-            "worst, is a "
-        )
-        text += "constant of the log, such as an offset of a sensor"
-    mean_error = max(float(np.mean(e.mean_percent)) for e in verification)
-    if np.isfinite(mean_error):
-        text += (
-            f"; mean errors are {significant(mean_error, 2)} % of the largest forces"
-        )
     status = Status.GOOD
     if max_error > RMS_ERROR[0] or ratio > UNSEEN_RATIO:
         status = Status.BAD if max_error > RMS_ERROR[1] else Status.DOUBTFUL
     detail = (
         f"Good: up to {RMS_ERROR[0]:g} % for every joint, and {UNSEEN_RATIO:g} times "
         f"the errors of the fit where they exceed {MIN_UNSEEN_ERROR:g} %; tolerable: "
-        f"up to {RMS_ERROR[1]:g} %. Mean errors by Eq. 37: the paper states below 1 %."
+        f"up to {RMS_ERROR[1]:g} %."
     )
     return Remark(f"{text}.", status, detail)
-
-
-def _judge_signs(fit: Fit) -> Iterator[Remark]:
-    """Name friction and rotor inertias that are negative beyond two deviations."""
-    base = fit.base
-    robot = fit.base.model.robot
-    if any(term.shares_friction for term in base.model.terms):
-        return  # only the sum of all friction cannot be negative
-    lower_bounds = np.concatenate(
-        [term.lower_bounds(robot) for term in base.model.terms]
-    )
-    is_single_bounded = ~np.any(np.asarray(base.kappa), axis=1) & (
-        lower_bounds[list(base.indices)] == 0.0
-    )
-    is_negative = np.asarray(fit.parameters) < -2.0 * fit.standard_deviations
-    if names := [
-        f"`{base.names[k]}`" for k in np.flatnonzero(is_single_bounded & is_negative)
-    ]:
-        yield Remark(
-            "Friction or rotor inertia comes out negative, as neither is: "
-            f"{', '.join(names)}.",
-            Status.DOUBTFUL,
-            "Good: none below zero by more than two standard deviations. The model "
-            "lacks an effect of these joints, or a sign is wrong; "
-            '`kind = "consistent"` in `[estimator]` keeps them from being negative.',
-        )
 
 
 def _judge_bounds(fit: Fit) -> Iterator[Remark]:

@@ -152,9 +152,9 @@ def identify_logs(
     progress("looking for mistakes", 0.0)
     # Bounds would hide what is wrong.
     diagnoses = [log.diagnosis for log in fitted_logs]
-    mistakes, mistake_notes = mistakes_in_logs(diagnoses, without_bounds(fit))
+    mistakes = mistakes_in_logs(diagnoses, without_bounds(fit))
     notes = [note for part in parts.every for note in part.notes]
-    notes += [*mistake_notes, *resolution_notes(fit, fitted_logs)]
+    notes += resolution_notes(fit, fitted_logs)
     claims = errors_of_claims(setup, fit, parts.every)
     return IdentificationReport(
         fit,

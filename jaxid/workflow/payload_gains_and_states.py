@@ -109,7 +109,7 @@ def fit_run(
         row_progress = partial(progress, f"factorising the rows, {name}")
         rows = RegressionProblem(setup.base, observations, row_progress)
         fits.append(fit_problem(rows, setup.least_squares))
-        mistakes, _ = mistakes_in_logs([log.diagnosis for log in logs], fits[-1])
+        mistakes = mistakes_in_logs([log.diagnosis for log in logs], fits[-1])
         doubts = [text for log in logs for text in log.findings] + [*mistakes]
     return dataclasses.replace(functools.reduce(combine_fits, fits), name=name), doubts
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxid.measurement.recording import Recording
-from jaxid.robot.library import panda, planar_arm
+from jaxid.robot.library import panda
 from jaxid.robot.limits_and_drives import Drives
 from jaxid.trajectory.fourier import random_fourier_series
 from jaxid.validation.diagnosis import diagnose
@@ -14,7 +14,6 @@ from jaxid.validation.sensor_checks import (
     channel_findings,
     clock_findings,
     stuck_findings,
-    unit_findings,
 )
 
 ROBOT = panda().replace(drives=Drives(7, reduction=[100.0, -100, 100, 100, 50, 50, 50]))
@@ -24,10 +23,6 @@ Q = np.asarray(random_fourier_series(ROBOT, omega=0.6, seed=3).motion(T).q)
 NOISE = np.random.default_rng(1).normal(0.0, 0.1, Q.shape)
 TAU = 30.0 * np.sin(Q) + 5.0 * np.sign(np.gradient(Q, axis=0)) + NOISE
 NAME = ROBOT.joint_names[2]
-
-
-def units(angles, on_motor_side=False):
-    return unit_findings(ROBOT, angles.min(axis=0), angles.max(axis=0), on_motor_side)
 
 
 def faults(angles=Q, forces=TAU, **more):
@@ -42,19 +37,6 @@ def changed(x, rows, value):
     x = x.copy()
     x[rows, 2] = value
     return x
-
-
-def test_units_and_sides_are_recognised_by_ranges():
-    motors = np.asarray(ROBOT.drives.motor_angles(Q))
-    assert units(Q) == units(motors, on_motor_side=True) == []
-    assert unit_findings(planar_arm(2), np.full(2, -9.0), np.full(2, 9.0), False) == []
-    for angles, words in (
-        (np.rad2deg(Q), "would if those in the log were degrees"),
-        (np.deg2rad(Q), "would if those in the log were radians"),
-        (motors, 'the motors\' (`recording.side = "motor"`)'),
-    ):
-        (said,) = units(angles)
-        assert words in said
 
 
 @pytest.mark.parametrize("count", [0.0, 1e-4, 2e-3])
