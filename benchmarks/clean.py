@@ -8,8 +8,7 @@ seeds. What `jaxid identify` and `jaxid inspect` say of a clean log is an alarm 
 a finding, a likely mistake, a doubt about a sign or about gravity, or advice on a delay
 that the log does not have. Slips: those of `spoilt.py` in ordinary logs, in the first,
 the middle and the last joint. A slip is named if a finding, or a note on a delay, says
-what it is, alone or beside others of the same effect; it is hidden if a note says that
-these logs would not show it.
+what it is, alone or beside others of the same effect.
 """
 
 import itertools
@@ -71,7 +70,7 @@ LOGS = {
     "held": ({}, held),
     "two rates": ({}, None),
 }
-WAYS = "named", "hidden", "missed"
+WAYS = "named", "missed"
 LATE = {"drive filter": 1.6, "held": 4.5}
 """Delays of forces that logs have by their kind [ms]."""
 
@@ -149,7 +148,7 @@ def is_alarm(text, log):
 
 
 def slip(robot, file, name, j, seed, folder, work):
-    """Return whether a slip is named, hidden or missed, and what is said."""
+    """Return whether a slip is named or missed, and what is said."""
     change, _, (amount,) = SLIPS[name]
     case = recorded(robot, file, "ordinary", seed, folder)[0]
     names = re.findall(r'<joint name="([^"]*)" type="(?:rev|pris|cont)', case.urdf)
@@ -161,16 +160,7 @@ def slip(robot, file, name, j, seed, folder, work):
         marked, notes = [str(refusal)], []
     if any(cure in x for cure in cures for x in (*marked, *notes)):
         return "named", marked
-    # The note names joints behind the kind of mistake.
-    note = next((x for x in notes if "would not show" in x), "")
-    words = {
-        "offset": "zero that is off",
-        "gain": "too large",
-        "mirrored": "reversed axis",
-    }
-    pattern = rf"{words.get(name, '^$')}[^(]*\((any joint|[^)]*`{names[j]}`)"
-    hidden = re.search(pattern, note) is not None
-    return "hidden" if hidden else "missed", [*marked, *filter(None, [note])]
+    return "missed", marked
 
 
 def main():

@@ -95,7 +95,8 @@ def likely_mistakes(
     for name, part in zip(
         ("", *(f"{log.name}: " for log in logs)), parts, strict=False
     ):
-        motion, forces = samples.motion[part], samples.forces[part]
+        motion = samples.motion[part]
+        forces = samples.forces[part]
         candidates = [*_column_corrections(robot, motion, forces, motor_sides)]
         amounts = [samples.best_correction(x, part) for x in samples.amounts()]
         if misfit**2 - samples.misfit(amounts[0], part) ** 2 < MIN_DELAY_EFFECT**2:
@@ -139,7 +140,9 @@ class _Samples:
         )
         ends = np.cumsum([0, *map(len, instants)]).tolist()
         self.parts = [slice(a, b) for a, b in itertools.pairwise(ends)]
-        self._logs, self._instants, self._model = logs, instants, model
+        self._logs = logs
+        self._instants = instants
+        self._model = model
         self._max_speeds = np.abs(self.motion.qd).max(axis=0)
         self._geometry = _AnyGeometry(model)
         self.no_correction = Correction("", model.robot, self.motion, self.forces)
@@ -183,7 +186,9 @@ class _Samples:
 
     def amounts(self) -> Iterator[_Amount]:
         """Yield mistakes of any amount: a delay, zeros of angles, gains of forces."""
-        robot, q, forces = self._model.robot, self.motion.q, self.forces
+        robot = self._model.robot
+        q = self.motion.q
+        forces = self.forces
         text = (
             "the forces of the log seem to be late (`recording.force_delay = {:.3g}`)"
         )
@@ -198,7 +203,8 @@ class _Samples:
         yield _Amount(delay, MAX_DELAY, 0.1 * MAX_DELAY)
         for j, name in enumerate(robot.joint_names[:MAX_JOINTS]):
             axis = np.eye(robot.joints)[j]
-            unit, size = ("degrees", np.pi / 180) if robot.revolute[j] else ("m", 1.0)
+            unit = "degrees" if robot.revolute[j] else "m"
+            size = np.pi / 180 if robot.revolute[j] else 1.0
 
             def shift(
                 x: float, part: slice, axis=axis, name=name, unit=unit, size=size
@@ -248,8 +254,8 @@ def _friction_columns(speeds: np.ndarray, max_speeds: np.ndarray) -> np.ndarray:
 
 def _reversal(c: Correction, joint: int) -> Correction:
     """Return a correction that also reverses the angle and the force of a joint."""
-    m, signs = c.motion, np.ones(c.motion.joints)
-    signs[joint] = -1.0
+    m = c.motion
+    signs = np.where(np.arange(m.joints) == joint, -1.0, 1.0)
     motion = Motion(m.q * signs, m.qd * signs, m.qdd * signs)
     return c._replace(motion=motion, forces=c.forces * signs)
 
@@ -327,7 +333,8 @@ def _column_corrections(
             yield variant(text, np.diag(np.where(robot.revolute, scale, 1.0)))
     if drives.is_direct:
         return
-    angles, forces_side = (not side for side in sides)
+    angles = not sides[0]
+    forces_side = not sides[1]
     cases = (
         ("angles and forces", angles, 'side = "{}"`)', (angles, angles)),
         ("angles", angles, "side`, with `forces_side` as it is)", (angles, sides[1])),
@@ -346,8 +353,10 @@ def _robot_corrections(
     robot: Robot, motion: Motion, forces: np.ndarray
 ) -> Iterator[Correction]:
     """Yield corrections of the robot: zeros of angles, gravity, and axes of joints."""
-    names, n, norm = robot.joint_names, robot.joints, np.linalg.norm(robot.gravity)
-    for j, turns in ((j, k) for j in range(n) if robot.revolute[j] for k in (-1, 1, 2)):
+    names = robot.joint_names
+    n = robot.joints
+    norm = np.linalg.norm(robot.gravity)
+    for j, turns in itertools.product(np.flatnonzero(robot.revolute), (-1, 1, 2)):
         q = motion.q + 0.5 * np.pi * turns * np.eye(n)[j]
         text = (
             f"the angle of joint `{names[j]}` seems to lack {90 * turns} degrees "
@@ -418,23 +427,28 @@ def _misfit(rows: np.ndarray, is_friction: np.ndarray, folds: int = 1) -> float:
     it would come out negative. Each of several `folds`, of several stretches each, is
     left out of the fit for it.
     """
-    size = np.sqrt(np.mean(rows[..., -1] ** 2, axis=0))
-    theta = rows / np.where(size > 0, size, np.inf)[:, None]
-    length = np.sqrt(np.sum(theta**2, axis=(0, 1)))
-    if not np.isfinite(length).all():
+    forces = rows[..., -1]
+    force_sizes = np.sqrt(np.mean(forces**2, axis=0))
+    theta = rows / np.where(force_sizes > 0, force_sizes, np.inf)[:, None]
+    lengths = np.sqrt(np.sum(theta**2, axis=(0, 1)))
+    if not np.isfinite(lengths).all():
         return np.inf
-    theta[..., :-1] /= np.where(length[:-1] > 0, length[:-1], 1.0)
+    column_lengths = lengths[:-1]
+    theta[..., :-1] /= np.where(column_lengths > 0, column_lengths, 1.0)
     stretches = np.array_split(theta, 4 * folds)
-    parts = [
-        np.concatenate(stretches[k::folds]).reshape(-1, theta.shape[2])
-        for k in range(folds)
-    ]
-    products, squares = np.array([x.T @ x for x in parts]), 0.0
+    products = []
+    for k in range(folds):
+        part = np.concatenate(stretches[k::folds])
+        matrix = part.reshape(-1, theta.shape[2])
+        products.append(matrix.T @ matrix)
+    total = np.sum(products, axis=0)
+    square = 0.0
     for fold in products:
-        fit_products = products.sum(axis=0) - fold if folds > 1 else fold
-        parameters = np.append(_braking_parameters(fit_products, is_friction), -1.0)
-        squares += max(float(parameters @ fold @ parameters), 0.0)
-    return np.sqrt(squares) / max(length[-1], 1e-300)
+        fit_products = total - fold if folds > 1 else fold
+        parameters = _braking_parameters(fit_products, is_friction)
+        combination = np.append(parameters, -1.0)
+        square += max(float(combination @ fold @ combination), 0.0)
+    return np.sqrt(square) / max(lengths[-1], 1e-300)
 
 
 def _braking_parameters(products: np.ndarray, is_friction: np.ndarray) -> np.ndarray:
@@ -444,12 +458,14 @@ def _braking_parameters(products: np.ndarray, is_friction: np.ndarray) -> np.nda
     that depend on others: what both lose, 1e-6 of the forces, is far below
     `MIN_MISFIT`.
     """
-    mask = np.ones(len(is_friction), bool)
-    matrix = products[:-1, :-1] + 1e-12 * np.eye(len(is_friction))
+    count = len(is_friction)
+    matrix = products[:-1, :-1] + 1e-12 * np.eye(count)
+    vector = products[:-1, -1]
+    mask = np.ones(count, bool)
     while True:
-        result = np.zeros(len(is_friction))
-        result[mask] = np.linalg.solve(matrix[mask][:, mask], products[:-1, -1][mask])
-        drive_mask = is_friction & (result < 0)
-        if not drive_mask.any():
-            return result
-        mask &= ~drive_mask
+        parameters = np.zeros(count)
+        parameters[mask] = np.linalg.solve(matrix[np.ix_(mask, mask)], vector[mask])
+        is_driving = is_friction & (parameters < 0)
+        if not is_driving.any():
+            return parameters
+        mask &= ~is_driving

@@ -31,27 +31,33 @@ class LogStatistics:
     def __init__(self, joints: int, samples: int):
         self.lowest = np.full(joints, np.inf)
         self.highest = np.full(joints, -np.inf)
-        self.speed, self.force = np.zeros((2, joints))
+        self.speed = np.zeros(joints)
+        self.force = np.zeros(joints)
         # Of velocities, derivatives of the angles, and derivatives of these: sums of
         # products.
         self._products = np.zeros((joints, 3, 3))
         # Of long logs every n-th sample tells how long joints stand.
-        self._stride, self._count = -(-samples // 2**18), 0
+        self._stride = -(-samples // 2**18)
+        self._count = 0
         self._speeds: list[np.ndarray] = []
 
     def add(self, motion: Motion, forces: AnyArray, sample_time: float) -> None:
         """Take in the filtered motion and the forces of consecutive samples."""
-        q, qd, forces = (np.asarray(x) for x in (motion.q, motion.qd, forces))
+        q = np.asarray(motion.q)
+        qd = np.asarray(motion.qd)
+        speeds = np.abs(qd)
+        sizes = np.abs(np.asarray(forces))
         self.lowest = np.minimum(self.lowest, q.min(axis=0))
         self.highest = np.maximum(self.highest, q.max(axis=0))
-        self.speed = np.maximum(self.speed, np.abs(qd).max(axis=0))
-        self.force = np.maximum(self.force, np.abs(forces).max(axis=0))
+        self.speed = np.maximum(self.speed, speeds.max(axis=0))
+        self.force = np.maximum(self.force, sizes.max(axis=0))
         if len(q) > 1:
             derivative = np.gradient(q, sample_time, axis=0)
             second_derivative = np.gradient(derivative, sample_time, axis=0)
-            x = np.stack([derivative, second_derivative, qd], axis=2)
-            self._products += np.einsum("tja,tjb->jab", x, x)
-        self._speeds.append(np.abs(qd[-self._count % self._stride :: self._stride]))
+            columns = np.stack([derivative, second_derivative, qd], axis=2)
+            self._products += np.einsum("tja,tjb->jab", columns, columns)
+        first_sample = -self._count % self._stride
+        self._speeds.append(speeds[first_sample :: self._stride])
         self._count += len(q)
 
     @property
@@ -101,7 +107,6 @@ def _joint_findings(robot: Robot, j: int, statistics: LogStatistics) -> Iterator
     maximum = float(limits.position_max[j])
     a = statistics.lowest[j]
     b = statistics.highest[j]
-    force = statistics.force[j]
     slack = 0.02 * (maximum - minimum) if np.isfinite(maximum - minimum) else 0.0
     if not minimum - slack <= a <= b <= maximum + slack:
         yield (
@@ -120,10 +125,6 @@ def _joint_findings(robot: Robot, j: int, statistics: LogStatistics) -> Iterator
             f"joint `{name}` moves by {b - a:.2g} {unit} only: is it the right column "
             "and unit?"
         )
-    if force == 0.0:
-        yield (
-            f"the forces of joint `{name}` are zero throughout: is it the right column?"
-        )
 
 
 def _force_findings(robot: Robot, statistics: LogStatistics) -> list[str]:
@@ -133,7 +134,8 @@ def _force_findings(robot: Robot, statistics: LogStatistics) -> list[str]:
     cure = "check `recording.force_unit`, `forces_side` and `torque_constants`."
     if ratios.size < 2:
         return []
-    minimum, peak = ratios.min(), ratios.max()
+    minimum = ratios.min()
+    peak = ratios.max()
     if minimum > 1.2:
         text = (
             f"all joints need more than their largest forces, {minimum:.2g} to "
@@ -154,7 +156,8 @@ def channel_findings(
 
     Return the joint and a sentence of each.
     """
-    r, texts = recording, []
+    r = recording
+    texts = []
     angles, forces, time = (np.asarray(x) for x in (r.angles, r.forces, r.time))
     owner = "the motor of joint" if r.angles_on_motor_side else "joint"
     for j, name in enumerate(robot.joint_names):
@@ -201,12 +204,15 @@ def clock_findings(recording: Recording) -> list[str]:
         steps = np.diff(np.asarray(recording.angles)[a:b], axis=0)
         if len(steps) < 100:
             continue
-        start, middle, end = steps[:-2], steps[1:-1], steps[2:]
+        start = steps[:-2]
+        middle = steps[1:-1]
+        end = steps[2:]
         mean = 0.5 * (start + end)
         noise = 1.4826 * np.median(np.abs(middle - mean), axis=0)
         # Encoders round to half an increment; smaller differences are those of rounded
         # numbers.
-        sizes, rounding = np.abs(steps), 1e-9 * np.abs(recording.angles).max(axis=0)
+        sizes = np.abs(steps)
+        rounding = 1e-9 * np.abs(recording.angles).max(axis=0)
         increment = np.where(sizes > rounding, sizes, np.inf).min(axis=0)
         noise = np.maximum(noise, 0.5 * increment)
         mask = np.isfinite(noise)
@@ -218,7 +224,8 @@ def clock_findings(recording: Recording) -> list[str]:
         # All joints go on by the same number of steps, as far as noise lets see.
         speed = np.sum(mean**2, axis=1)
         count = np.sum(middle * mean, axis=1) / np.maximum(speed, 1.0)
-        gap, shift = np.abs(middle - mean), np.abs(mean) * np.abs(count - 1)[:, None]
+        gap = np.abs(middle - mean)
+        shift = np.abs(mean) * np.abs(count - 1)[:, None]
         jumps = (
             (np.abs(bend).max(axis=1) < JUMP) & (speed > 9.0) & (gap > JUMP).any(axis=1)
         )
@@ -294,35 +301,47 @@ def _held_angle_text(
 ) -> str:
     """Report an angle that stops or starts with a kink while other joints move."""
     for a, b in segments:
-        part, bends = x[a:b], None
+        part = x[a:b]
         speed = np.abs(np.diff(other_angles[a:b], axis=0))
-        is_moving = (speed > REST_SHARE * speed.max(axis=0, initial=0.0)).any(axis=1)
-        for start, end in _runs(part, _min_run_length(b - a)):
-            if np.mean(is_moving[start:end]) <= 0.5:
-                continue
-            bends = _max_bends(part) if bends is None else bends
-            for lag, bend in bends.items():
-                kinks = [abs(part[start] - part[start - lag])] if start >= lag else []
-                kinks += [abs(part[end + lag] - part[end])] if end + lag < b - a else []
-                if max(kinks, default=0.0) > 3.0 * bend > 0:
-                    return (
-                        f"stays at {_hold(part[start], time[a + start], time[a + end])}"
-                    )
+        min_speed = REST_SHARE * speed.max(axis=0, initial=0.0)
+        is_moving = (speed > min_speed).any(axis=1)
+        runs = [
+            (start, end)
+            for start, end in _runs(part, _min_run_length(b - a))
+            if np.mean(is_moving[start:end]) > 0.5
+        ]
+        max_bends = _max_bends(part) if runs else {}
+        for start, end in runs:
+            if _has_kink(part, start, end, max_bends):
+                hold = _hold(part[start], time[a + start], time[a + end])
+                return f"stays at {hold}"
     return ""
+
+
+def _has_kink(x: np.ndarray, start: int, end: int, max_bends: dict[int, float]) -> bool:
+    """Return whether a channel stops or starts more suddenly than it ever bends."""
+    for lag, bend in max_bends.items():
+        kink = 0.0
+        if start >= lag:
+            kink = abs(x[start] - x[start - lag])
+        if end + lag < len(x):
+            kink = max(kink, abs(x[end + lag] - x[end]))
+        if kink > 3.0 * bend > 0:
+            return True
+    return False
 
 
 def _max_bends(x: np.ndarray) -> dict[int, float]:
     """Return the largest bend over some samples where a channel changes its value."""
     max_bends = {}
-    ends = np.array(list(_runs(x, 20)), int).reshape(-1, 2)
+    runs = list(_runs(x, 20))
     for width in (1, 3, 10, 30):
-        bends = np.abs(x[2 * width :] - 2 * x[width:-width] + x[: -2 * width])
-        coverage = np.zeros(len(x) + 1, int)
-        np.add.at(coverage, np.maximum(0, ends - 2 * width), 1)
-        np.add.at(coverage, ends + 1, -1)
-        max_bends[width] = float(
-            bends[np.cumsum(coverage)[: len(bends)] == 0].max(initial=0.0)
-        )
+        span = 2 * width
+        bends = np.abs(x[span:] - 2 * x[width:-width] + x[:-span])
+        is_changing = np.ones(len(bends), bool)
+        for start, end in runs:
+            is_changing[max(0, start - span) : end + 1] = False
+        max_bends[width] = float(bends[is_changing].max(initial=0.0))
     return max_bends
 
 
@@ -333,11 +352,13 @@ def _held_force_text(
     segments: Sequence[tuple[int, int]],
 ) -> str:
     """Report forces that stay constant for long while their joint's speed varies."""
-    minimum, maximum = float(forces.min()), float(forces.max())
+    minimum = float(forces.min())
+    maximum = float(forces.max())
     if minimum == maximum:
         return ""
     for a, b in segments:
-        f, speed = forces[a:b], np.abs(np.gradient(x[a:b]))
+        f = forces[a:b]
+        speed = np.abs(np.gradient(x[a:b]))
         ends = np.flatnonzero(np.append(np.diff(f) != 0, True)) + 1
         lengths = np.diff(ends, prepend=0)
         max_speed = speed.max(initial=0.0)
@@ -403,13 +424,13 @@ def stuck_findings(
         name = robot.joint_names[j]
         f = forces[:, j]
         speed = np.abs(np.gradient(angles[:, j]))
-        bottom, top = float(f.min()), float(f.max())
-        if bottom == top != 0.0:
+        bottom = float(f.min())
+        top = float(f.max())
+        if bottom == top:
             findings.append(
                 f"the forces of joint `{name}` are {top:.3g} throughout: is it the "
                 "right column?"
             )
-        if bottom == top:
             continue
         subset = f[speed > REST_SHARE * speed.max(initial=0.0)]
         band = 0.02 * (top - bottom)
