@@ -29,6 +29,8 @@ import numpy as np
 from jaxid.arrays import AnyArray
 from jaxid.errors import InputError
 
+FilePath = str | Path
+"""Path of a file or folder."""
 PLACING = threading.Lock()
 """Held while files take their places."""
 TEMPORARY: set[Path] = set()
@@ -37,12 +39,12 @@ DTYPES = ("float64", "float32", "int64", "int32", "bool")
 """Types of the arrays that a document can hold."""
 
 
-def write_text(path: str | Path, text: str) -> None:
+def write_text(path: FilePath, text: str) -> None:
     """Write a text file in UTF-8, whole or not at all."""
     write_bytes(path, text.encode())
 
 
-def write_bytes(path: str | Path, data: bytes) -> None:
+def write_bytes(path: FilePath, data: bytes) -> None:
     """Write a file, whole or not at all; missing folders above it are made."""
     path = Path(path)
     with atomic_folder(path.parent) as folder:
@@ -51,7 +53,7 @@ def write_bytes(path: str | Path, data: bytes) -> None:
 
 @contextlib.contextmanager
 def atomic_folder(
-    folder: str | Path, outdated: Callable[[Path], Iterable[str]] = lambda folder: ()
+    folder: FilePath, outdated: Callable[[Path], Iterable[str]] = lambda folder: ()
 ) -> Iterator[Path]:
     """Yield an empty temporary folder, whose files move to `folder` at the end.
 
@@ -71,7 +73,7 @@ def atomic_folder(
                 os.replace(staging, folder)
 
 
-def require_writable(folder: str | Path) -> None:
+def require_writable(folder: FilePath) -> None:
     """Check that files can be written to a folder, before long work starts.
 
     The folder need not exist.
@@ -126,7 +128,7 @@ def _move_files(staging: Path, folder: Path, outdated: Iterable[str]) -> None:
         os.replace(staging / name, folder / name)
 
 
-def read_json(path: str | Path) -> Any:
+def read_json(path: FilePath) -> Any:
     """Read a JSON file."""
     try:
         return json.loads(Path(path).read_text(encoding="utf-8"))

@@ -22,6 +22,8 @@ from typing import Any, Literal
 
 import numpy as np
 
+from jaxid.arrays import Texts
+
 MISSING = "–"  # noqa: RUF001
 """Text in place of a number that is not known."""
 SHORT_DECIMALS = range(-3, 9)
@@ -288,7 +290,7 @@ class Table:
         self.rules = frozenset(rules)
 
     @property
-    def rows(self) -> list[tuple[str, ...]]:
+    def rows(self) -> list[Texts]:
         """Rows of formatted texts."""
         return list(zip(*(column.texts for column in self.columns), strict=True))
 

@@ -9,6 +9,7 @@ from typing import Any
 
 from jaxid.errors import InputError
 from jaxid.identification.consistency import BodyBounds
+from jaxid.io import FilePath
 from jaxid.measurement.columns import Columns
 from jaxid.measurement.filters import FILTERS
 from jaxid.measurement.log_files import summarise_columns
@@ -96,7 +97,7 @@ class Experiment:
         )
 
 
-def load_experiment(path: str | Path) -> Experiment:
+def load_experiment(path: FilePath) -> Experiment:
     """Load an experiment file; paths in it are relative to its folder."""
     path = Path(path)
     if not path.is_file():

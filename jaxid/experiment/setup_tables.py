@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 
-from jaxid.arrays import Float
+from jaxid.arrays import Float, Texts
 from jaxid.dynamics import terms
 from jaxid.dynamics.model import Model
 from jaxid.errors import InputError
@@ -319,7 +319,7 @@ def build_rows(
     return filters.Subsample(step or 1), speeds
 
 
-KEYS_OF_SETTINGS: dict[str, tuple[str, ...]] = {
+KEYS_OF_SETTINGS: dict[str, Texts] = {
     "weights": ("weights",),
     "solution": ("ridge",),
     "bounds": tuple(keys_of(BodyBounds)),
@@ -328,7 +328,7 @@ KEYS_OF_SETTINGS: dict[str, tuple[str, ...]] = {
 """Keys from which each setting of an estimator is made."""
 
 
-def keys_of_kind(kind: str) -> tuple[str, ...]:
+def keys_of_kind(kind: str) -> Texts:
     """Return the keys of one kind of estimator, apart from those of all kinds."""
     settings = inspect.signature(ESTIMATORS[kind]).parameters
     keys = [key for name in settings for key in KEYS_OF_SETTINGS.get(name, ())]
@@ -350,7 +350,7 @@ class Estimation(NamedTuple):
     least_squares: estimators.LeastSquares | estimators.WeightedLeastSquares
     uncertainty: AbstractUncertainty  # method of the standard deviations
     nonlinear_friction: bool  # whether the shape of friction is sought too
-    notes: tuple[str, ...]  # assumptions, in sentences
+    notes: Texts  # assumptions, in sentences
 
 
 def decode_estimator(table: TomlTable) -> tuple[TomlTable, TomlTable]:

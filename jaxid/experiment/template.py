@@ -18,7 +18,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from jaxid.io import union_members
+from jaxid.io import FilePath, union_members
 from jaxid.measurement.filters import FILTERS
 from jaxid.robot.description_files import is_mjcf
 from jaxid.robot.robot import Robot
@@ -74,11 +74,11 @@ OF_KINDS = set().union(*KINDS.values()) - set.intersection(*map(set, KINDS.value
 
 
 def write_template(
-    urdf: str | Path,
+    urdf: FilePath,
     *,
     tip: str | None = None,
     base: str | None = None,
-    folder: str | Path = ".",
+    folder: FilePath = ".",
 ) -> str:
     """Return a complete commented experiment file for a robot; it loads as it is."""
     robot = load_urdf(urdf, tip=tip, base=base)

@@ -11,8 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxid.arrays import Texts
 from jaxid.identification.fit_result import Fit
-from jaxid.io import atomic_folder, fill_template
+from jaxid.io import FilePath, atomic_folder, fill_template
 from jaxid.program import Program, evaluate, trace
 from jaxid.program.c_writer import CWriter
 
@@ -28,7 +29,7 @@ class CFunction(NamedTuple):
     name: str
     summary: str
     program: Program
-    inputs: tuple[str, ...]
+    inputs: Texts
     output: str
 
     @property
@@ -43,7 +44,7 @@ class CFunction(NamedTuple):
 
 
 def export_c(
-    fit: Fit, folder: str | Path, *, name: str = "arm", double: bool = True
+    fit: Fit, folder: FilePath, *, name: str = "arm", double: bool = True
 ) -> Path:
     """Write the model as one C99 file and its header (Eqs. 38, 39).
 

@@ -7,9 +7,10 @@ import numpy as np
 from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
 from lxml.builder import E  # pyright: ignore[reportMissingModuleSource]
 
+from jaxid.arrays import Texts
 from jaxid.errors import InputError
 from jaxid.identification.fit_result import Fit
-from jaxid.io import write_bytes
+from jaxid.io import FilePath, write_bytes
 from jaxid.robot.inertia import BodyParameters, Inertia
 from jaxid.robot.mjcf import exact_text
 from jaxid.robot.robot import Robot
@@ -33,8 +34,8 @@ MAX_DEVIATION = 1e-3
 
 def export_urdf(
     fit: Fit,
-    source: str | Path,
-    path: str | Path,
+    source: FilePath,
+    path: FilePath,
     *,
     tip: str | None = None,
     base: str | None = None,
@@ -76,7 +77,7 @@ def export_urdf(
     return Path(path)
 
 
-def _replace_comment(root: Any, fit: Fit, left_out: tuple[str, ...]) -> None:
+def _replace_comment(root: Any, fit: Fit, left_out: Texts) -> None:
     """Name the model in a comment, in place of the comment of an earlier export."""
     for comment in root.xpath("comment()"):
         if comment.text.startswith(COMMENT_START):
@@ -129,7 +130,7 @@ def _write_joints(tree: UrdfTree, robot: Robot, dynamics: JointDynamics) -> None
             limit.set(key, limit.get(key, "1e9"))
 
 
-def _require_same_robot(robot: Robot, described: Robot, source: str | Path) -> None:
+def _require_same_robot(robot: Robot, described: Robot, source: FilePath) -> None:
     """Reject a file of another robot; how the robot is mounted is not in the file."""
     if robot.joint_names != described.joint_names:
         raise InputError(

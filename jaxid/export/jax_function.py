@@ -10,7 +10,7 @@ from jax import export
 
 from jaxid.arrays import double_precision
 from jaxid.identification.fit_result import Fit
-from jaxid.io import write_bytes
+from jaxid.io import FilePath, write_bytes
 from jaxid.program import Lowered, on_any_platform
 
 from .feed_forward import torque_program
@@ -40,7 +40,7 @@ def exported_function(fit: Fit) -> export.Exported:
         return export.export(on_samples, platforms=("cpu", "cuda"))(*shapes)
 
 
-def export_jax(fit: Fit, path: str | Path) -> Path:
+def export_jax(fit: Fit, path: FilePath) -> Path:
     """Write the feed-forward as a function of JAX that runs without jaxid (Eq. 39).
 
     Read it with `jax.export.deserialize(bytearray(Path(path).read_bytes()))` in 64-bit

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxid.arrays import Joints, double_precision
+from jaxid.arrays import Joints, Texts, double_precision
 from jaxid.dynamics.terms import AbstractTerm
 from jaxid.errors import InputError
 from jaxid.identification.consistency.pseudo_inertia import consistency_margin
@@ -33,8 +33,8 @@ class JointDynamics(NamedTuple):
     """
 
     values: dict[str, Joints]
-    rotors: tuple[str, ...]
-    omissions: tuple[str, ...]
+    rotors: Texts
+    omissions: Texts
 
 
 def joint_dynamics(fit: Fit) -> JointDynamics:
@@ -150,7 +150,7 @@ def feasible_bodies(fit: Fit, target: str) -> BodyParameters:
     return bodies
 
 
-def origin_comment(fit: Fit, omissions: tuple[str, ...]) -> str:
+def origin_comment(fit: Fit, omissions: Texts) -> str:
     """Return a comment on the model, and on what the file lacks."""
     text = f"{fit.date or 'an unknown day'}, {fit.checksum}. "
     if omissions:

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxid.arrays import AnyArray, Joints
 from jaxid.identification.fit_result import Fit
-from jaxid.io import write_text
+from jaxid.io import FilePath, write_text
 from jaxid.robot.inertia import BodyParameters, Inertia
 from jaxid.robot.mjcf import exact_text
 from jaxid.robot.robot import Robot
@@ -22,7 +22,7 @@ ATTRIBUTES = {"armature": "armature", "damping": "damping", "friction": "frictio
 """Attributes of MJCF for the quantities of `joint_dynamics`."""
 
 
-def export_mjcf(fit: Fit, path: str | Path) -> Path:
+def export_mjcf(fit: Fit, path: FilePath) -> Path:
     """Write the model for MuJoCo: geometry, bodies, rotors, friction, limits, motors.
 
     Rotor inertias are `armature`, viscous friction is `damping`, dry friction is

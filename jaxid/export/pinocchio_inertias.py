@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxid.identification.fit_result import Fit
-from jaxid.io import json_text, write_text
+from jaxid.io import FilePath, json_text, write_text
 from jaxid.robot.inertia import BodyParameters, Inertia
 
 from .feed_forward import body_parameters
@@ -28,7 +28,7 @@ def pinocchio_parameters(fit: Fit) -> BodyParameters:
     return np.asarray(Inertia.from_parameters(bodies).pinocchio)
 
 
-def export_pinocchio(fit: Fit, path: str | Path) -> Path:
+def export_pinocchio(fit: Fit, path: FilePath) -> Path:
     """Write the bodies in Pinocchio's order, and the joints' dynamics, as JSON.
 
     Args:

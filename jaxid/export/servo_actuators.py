@@ -7,9 +7,9 @@ import numpy as np
 from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
 from lxml.builder import E  # pyright: ignore[reportMissingModuleSource]
 
-from jaxid.arrays import AnyArray, Joints
+from jaxid.arrays import AnyArray, Joints, Texts
 from jaxid.errors import InputError
-from jaxid.io import write_text
+from jaxid.io import FilePath, write_text
 from jaxid.result_table import Column, Table
 from jaxid.robot.mjcf import exact_text
 from jaxid.rollout.bodies import Bodies
@@ -152,7 +152,7 @@ def _stiffness_sources(fit: ServoFit) -> list[str]:
 
 def export_servo_mjcf(
     fit: ServoFit,
-    path: str | Path,
+    path: FilePath,
     *,
     samples: int = 0,
     timestep: float = 0.002,
@@ -192,7 +192,7 @@ def export_servo_mjcf(
 
 def _servo_mjcf(
     bodies: Bodies,
-    joint_names: tuple[str, ...],
+    joint_names: Texts,
     values: dict[str, Joints],
     timestep: float,
 ) -> str:

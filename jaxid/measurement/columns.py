@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from jaxid.errors import InputError
+from jaxid.io import FilePath
 from jaxid.robot.limits_and_drives import per_joint
 from jaxid.units import NM, RAD, Quantity, S, Unit
 
@@ -204,15 +205,15 @@ class Log:
 
 
 def open_log(
-    path: str | Path,
+    path: FilePath,
     columns: Columns,
-    forces_path: str | Path | None = None,
-    velocities_path: str | Path | None = None,
+    forces_path: FilePath | None = None,
+    velocities_path: FilePath | None = None,
     *,
     on_disk: bool = False,
     is_lenient: bool = False,
 ) -> Log:
-    """Open the files of a log; with `on_disk`, texts and arrays stay on the disk.
+    """Open the files of a log; with `on_disk`, texts stay on the disk.
 
     Rows that cannot be read are an error, unless `is_lenient`: then `Log.bad_rows`
     names them.
@@ -221,7 +222,7 @@ def open_log(
         raise InputError(
             "`velocities_path` is given, but `Columns.velocities` names no columns."
         )
-    channels: dict[str, tuple[str | Path, Selection | None]] = {
+    channels: dict[str, tuple[FilePath, Selection | None]] = {
         "angles": (path, columns.angles),
         "forces": (forces_path or path, columns.forces),
     }

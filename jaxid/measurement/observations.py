@@ -9,14 +9,7 @@ import equinox as eqx
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxid.arrays import (
-    AnyArray,
-    Bool,
-    Float,
-    JointSamples,
-    Numbers,
-    namespace,
-)
+from jaxid.arrays import AnyArray, Bool, Float, JointSamples, Numbers, Texts, namespace
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
 from jaxid.robot.limits_and_drives import per_joint
@@ -76,7 +69,7 @@ class Observations(eqx.Module):
     mask: Bool[AnyArray, "rows joints"]
     sample_time: float = eqx.field(static=True)
     name: str = eqx.field(static=True, default="observations")
-    notes: tuple[str, ...] = eqx.field(static=True, default=())
+    notes: Texts = eqx.field(static=True, default=())
 
     @classmethod
     def of(

@@ -9,6 +9,7 @@ import numpy as np
 
 from jaxid.arrays import Numbers
 from jaxid.errors import InputError
+from jaxid.io import FilePath
 from jaxid.result_table import printable
 from jaxid.robot.robot import Robot
 
@@ -29,12 +30,12 @@ MAX_NAMED_ROWS = 20
 
 
 def read_recording(
-    path: str | Path,
+    path: FilePath,
     columns: Columns,
     name: str | None = None,
     *,
-    forces_path: str | Path | None = None,
-    velocities_path: str | Path | None = None,
+    forces_path: FilePath | None = None,
+    velocities_path: FilePath | None = None,
     largest_gap: float | int = 1.75,
     bridged: float = 0.0,
     bad_rows: float = MAX_BAD_ROWS,
@@ -169,7 +170,7 @@ class SamplesOnDisk(AbstractSamples):
 
 
 def scan_log(
-    path: str | Path,
+    path: FilePath,
     columns: Columns,
     robot: Robot,
     filter: AbstractFilter,
@@ -177,14 +178,14 @@ def scan_log(
     min_speed: Numbers | None = None,
     name: str | None = None,
     *,
-    forces_path: str | Path | None = None,
-    velocities_path: str | Path | None = None,
+    forces_path: FilePath | None = None,
+    velocities_path: FilePath | None = None,
     largest_gap: float | int = 1.75,
     start: float | int = -np.inf,
     stop: float | int = np.inf,
     progress: Progress | None = None,
 ) -> Observations:
-    """Open a log that need not fit into memory: CSV, Parquet, or uncompressed NPZ.
+    """Open a log that need not fit into memory: CSV or Parquet.
 
     The result equals that of `read_recording` and `observe`, but the samples stay on
     disk. The time stamps are read once to find gaps; between gaps they must be uniform.

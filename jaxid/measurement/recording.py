@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from scipy.integrate import cumulative_trapezoid
 from scipy.interpolate import CubicSpline
 
-from jaxid.arrays import AnyArray, Float, JointSamples
+from jaxid.arrays import AnyArray, Float, JointSamples, Texts
 from jaxid.errors import InputError
 
 from .time_grid import MIN_SAMPLES, Ranges, TimeGrid, resampling
@@ -55,7 +55,7 @@ class Recording(eqx.Module):
     segments: Ranges = eqx.field(static=True)
     sample_time: float = eqx.field(static=True)
     name: str = eqx.field(static=True, default="recording")
-    notes: tuple[str, ...] = eqx.field(static=True, default=())
+    notes: Texts = eqx.field(static=True, default=())
 
     @classmethod
     def of(

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.interpolate import CubicSpline
 
+from jaxid.arrays import Texts
 from jaxid.errors import InputError
 
 MAX_JITTER = 0.05
@@ -38,7 +39,7 @@ class TimeGrid(NamedTuple):
 
     sample_time: float
     segments: dict[Range, float]
-    notes: tuple[str, ...] = ()
+    notes: Texts = ()
     deviation: float = 0.0
 
     @property
@@ -193,7 +194,7 @@ def _round_time(sample_time: float, rows: int) -> float:
     return round_time if shift < 0.01 * sample_time else sample_time
 
 
-def _gap_notes(grid: TimeGrid, stretches: Stretches, origin: float) -> tuple[str, ...]:
+def _gap_notes(grid: TimeGrid, stretches: Stretches, origin: float) -> Texts:
     """Return remarks about the start, the gaps and the rows between them."""
     notes = []
     pauses = stretches.pauses

@@ -4,6 +4,8 @@ import io
 from pathlib import Path
 from typing import Any
 
+from jaxid.io import FilePath
+
 from .figure_elements import Drawing
 from .page import render_page
 
@@ -18,7 +20,7 @@ class Figure(Drawing):
 
         return draw(self)
 
-    def save(self, path: str | Path) -> None:
+    def save(self, path: FilePath) -> None:
         """Write a page to explore (`.html`), or PNG, PDF or SVG; the file has no date.
 
         Args:

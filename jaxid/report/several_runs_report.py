@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxid.identification.parameter_changes import LEVEL
+from jaxid.io import FilePath
 from jaxid.result_table import Remark, Status, Summarised, Table
 
 from .page import render_page
@@ -44,7 +45,7 @@ class RunsReport(Summarised):
         """Return all tables of the result."""
         return [self.result.summary(), *self.details]
 
-    def save(self, folder: str | Path) -> list[Path]:
+    def save(self, folder: FilePath) -> list[Path]:
         """Write a page, and the numbers as JSON and CSV; return the files."""
         paths = {run: list(map(str, logs)) for run, logs in self.sources.items()}
         record = {

@@ -23,6 +23,7 @@ from jaxid.identification.estimators import GivenWeights
 from jaxid.identification.fit_result import Fit
 from jaxid.identification.identify import fit_problem
 from jaxid.identification.problem import RegressionProblem
+from jaxid.io import FilePath
 from jaxid.measurement.columns import Columns
 from jaxid.measurement.observations import Observations
 from jaxid.measurement.recording import Recording
@@ -80,7 +81,7 @@ class IdentificationReport(Summarised, Report):
             Table("", remarks=[verdict, *critical_remarks]),
         ]
 
-    def save(self, folder: str | Path, figures: str = "") -> list[Path]:
+    def save(self, folder: FilePath, figures: str = "") -> list[Path]:
         """Write a report, and return the paths of its files.
 
         They are `report.html`, `result.json`, `parameters.csv` and `model.json`.

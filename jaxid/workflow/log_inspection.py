@@ -5,6 +5,7 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
+from jaxid.arrays import Texts
 from jaxid.identification.fit_result import Fit
 from jaxid.identification.identify import identify
 from jaxid.measurement.columns import Columns
@@ -26,7 +27,7 @@ class ExaminedLog(NamedTuple):
 class Inspection(Summarised):
     """Examined logs, and what was assumed of them."""
 
-    notes: tuple[str, ...]  # assumptions, as sentences
+    notes: Texts  # assumptions, as sentences
     logs: list[ExaminedLog]  # examined logs
 
     def tables(self) -> list[Table]:

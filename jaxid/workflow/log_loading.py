@@ -11,6 +11,7 @@ import numpy as np
 
 from jaxid.errors import InputError
 from jaxid.identification.filter_selection import choose_filter
+from jaxid.io import FilePath
 from jaxid.measurement.columns import Columns
 from jaxid.measurement.log_files import estimated_rows, is_bag_folder
 from jaxid.measurement.observations import Observations
@@ -47,7 +48,7 @@ class LoadedLog(NamedTuple):
         return [f"{name}: {text}" for text in self.diagnosis.findings]
 
 
-def read_log(setup: Setup, log: str | Path, columns: Columns) -> Recording:
+def read_log(setup: Setup, log: FilePath, columns: Columns) -> Recording:
     """Read a log into memory."""
     path = Path(log)
     reading = setup.reading

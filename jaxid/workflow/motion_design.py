@@ -7,7 +7,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from jaxid.arrays import double_precision
+from jaxid.arrays import Texts, double_precision
 from jaxid.errors import InputError
 from jaxid.excitation.constraints import AbstractConstraint, TipLimits
 from jaxid.excitation.design import DesignProgress, design_excitation
@@ -68,7 +68,7 @@ class MotionTask(NamedTuple):
     begin: LinearTrajectory | None = None
 
     @property
-    def faults(self) -> tuple[str, ...]:
+    def faults(self) -> Texts:
         """Sentences about all that will not be checked."""
         forces = (f"forces: {self.force_fault}",) if self.force_fault else ()
         return (*self.surroundings.faults, *forces)

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxid.arrays import Float, double_precision
+from jaxid.arrays import Float, Texts, double_precision
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
@@ -34,7 +34,7 @@ class Nominal(NamedTuple):
     # covariance of an earlier fit, zero for what it does not determine; None if they
     # are claims
     covariance: Float[np.ndarray, "base base"] | None
-    undetermined: tuple[str, ...] = ()  # names of what an earlier fit leaves open
+    undetermined: Texts = ()  # names of what an earlier fit leaves open
 
     def sizes(self, base: BaseParameters) -> np.ndarray:
         """Return the values; NaN for estimates of what is not determined."""

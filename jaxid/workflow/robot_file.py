@@ -1,7 +1,6 @@
 """URDF or MJCF file of a robot, and its claims on bodies, rotors and friction."""
 
 import dataclasses
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,6 +8,7 @@ import numpy as np
 from jaxid.arrays import Float
 from jaxid.errors import InputError
 from jaxid.identification.consistency import consistency_margin
+from jaxid.io import FilePath
 from jaxid.robot.inertia import INERTIAL_NAMES
 from jaxid.robot.robot import Robot
 from jaxid.robot.urdf import joint_parameters, load_urdf, urdf_parameters
@@ -27,7 +27,7 @@ class RobotFile:
         base_position: Position of the base in the frame of the ground [m].
     """
 
-    path: str | Path
+    path: FilePath
     tip: str | None = None
     base: str | None = None
     base_rotation: Float[np.ndarray, "3 3"] | None = None

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import equinox as eqx
 import numpy as np
 
-from jaxid.arrays import AnyArray, Float
+from jaxid.arrays import AnyArray, Float, Texts
 from jaxid.dynamics.base import BaseParameters, base_parameters
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.terms import (
@@ -182,7 +182,7 @@ class Setup(eqx.Module):
     load_friction: bool = False
     robot_file: RobotFile | None = None
     reading: LogReading = LogReading()
-    notes: tuple[str, ...] = ()
+    notes: Texts = ()
 
     def __post_init__(self) -> None:
         """Fill in the defaults that depend on the robot.

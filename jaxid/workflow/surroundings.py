@@ -6,6 +6,7 @@ from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 
+from jaxid.arrays import Texts
 from jaxid.errors import InputError
 from jaxid.excitation.constraints import Clearance
 from jaxid.robot.capsule_fit import fit_capsules, stand_in_capsules
@@ -161,7 +162,7 @@ class Surroundings(NamedTuple):
 
     collision: Collision  # what the user says of them
     clearance: Clearance | None  # distance that they must keep; None if there are none
-    faults: tuple[str, ...]  # what is not known of them, in sentences
+    faults: Texts  # what is not known of them, in sentences
 
     @property
     def shapes(self) -> CollisionModel | None:

@@ -85,17 +85,17 @@ def test_parquet_compiled_and_in_numpy(base, parquet, monkeypatch, long, filter)
     agree(base, log, in_memory(base, parquet, EVERY, filter))
 
 
-def test_mapped_arrays_and_other_files(base, numbers, parquet, tmp_path):
+def test_arrays_and_other_files(base, numbers, parquet, tmp_path):
     time, angles, forces = numbers
     robot = base.model.robot
     np.savez(tmp_path / "log.npz", t=time, q=np.asfortranarray(angles), tau=forces)
     columns = jid.Columns(angles="q", forces="tau", sample_time=DT)
-    mapped = scan_log(tmp_path / "log.npz", columns, robot, SMOOTH).read(
+    motion_and_forces = scan_log(tmp_path / "log.npz", columns, robot, SMOOTH).read(
         slice(1000, 2000)
     )
     expected = scan_log(parquet, COLUMNS, robot, SMOOTH).read(slice(1000, 2000))
-    np.testing.assert_array_equal(mapped[0].qd, expected[0].qd)
-    np.testing.assert_array_equal(mapped[1], forces[1000:2000])
+    np.testing.assert_array_equal(motion_and_forces[0].qd, expected[0].qd)
+    np.testing.assert_array_equal(motion_and_forces[1], forces[1000:2000])
     columns = jid.Columns(angles="q{}", forces="tau{}", sample_time=DT)
     frame(*numbers).drop("tau1", "tau2").write_csv(tmp_path / "q.csv")
     log = scan_log(tmp_path / "q.csv", columns, robot, SMOOTH, forces_path=parquet)

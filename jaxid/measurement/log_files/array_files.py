@@ -2,7 +2,6 @@
 
 import abc
 import functools
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -46,12 +45,9 @@ class AbstractArrayFile(AbstractLogFile):
 
 
 class NpzFile(AbstractArrayFile):
-    """NPZ file of NumPy; arrays that are not compressed stay on the disk."""
+    """NPZ file of NumPy."""
 
     def load(self):  # noqa: D102
-        arrays = map_arrays(self.path)
-        if arrays:
-            return arrays
         # Objects, which could run code, are rejected.
         kind = "NPZ file of plain arrays (`numpy.savez`, without objects)"
         with (
@@ -61,10 +57,6 @@ class NpzFile(AbstractArrayFile):
         ):
             # A member that NumPy did not write comes as bytes, which are left out.
             return _named_arrays({name: archive[name] for name in archive.files})
-
-    def estimated_rows(self):  # noqa: D102
-        arrays = map_arrays(self.path) or {}
-        return max(map(len, arrays.values()), default=0)
 
 
 class MatFile(AbstractArrayFile):
@@ -121,29 +113,3 @@ def is_hdf5_array(value: Any) -> bool:
     """Return whether a value of an HDF5 file is an array of numbers, and no image."""
     dimensions = getattr(value, "ndim", 0)
     return dimensions in (1, 2) and value.dtype.itemsize > 1
-
-
-def map_arrays(path: Path) -> Arrays | None:
-    """Map an NPZ file's arrays into memory; None if one cannot be, or there is none."""
-    arrays = {}
-    with (
-        readable(path.name, "NPZ file"),
-        zipfile.ZipFile(path) as archive,
-        path.open("rb") as file,
-    ):
-        for entry in archive.infolist():
-            if entry.compress_type != zipfile.ZIP_STORED:
-                return None
-            # Behind a local header of 30 bytes, whose last four tell the lengths of the
-            # two texts that follow it.
-            file.seek(entry.header_offset + 26)
-            lengths = np.frombuffer(file.read(4), "<u2")
-            file.seek(entry.header_offset + 30 + int(lengths.sum()))
-            np.lib.format.read_magic(file)
-            shape, is_fortran, dtype = np.lib.format.read_array_header_1_0(file)
-            if dtype.hasobject:
-                return None  # bytes of a file are no objects
-            order = "F" if is_fortran else "C"
-            array = np.memmap(path, dtype, "r", file.tell(), shape, order)
-            arrays[entry.filename.removesuffix(".npy")] = array
-    return _named_arrays(arrays) or None

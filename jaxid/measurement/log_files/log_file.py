@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
+from jaxid.arrays import Texts
 from jaxid.errors import InputError
 
 from .log_table import BadRows, LogTable
@@ -15,7 +16,7 @@ Selection = str | int | tuple[str | int, ...]
 """A name, a pattern with `{}` for the joint's number, a position from 0, or several."""
 Selections = Mapping[str, Selection | None]
 """Selections by channel; None is the clock that some kinds of files have."""
-Channels = Mapping[str, tuple[str, ...]]
+Channels = Mapping[str, Texts]
 """Names of the columns of each channel, in the order of the joints."""
 
 
@@ -73,9 +74,7 @@ class AbstractLogFile(abc.ABC):
             )
         return channels
 
-    def _selected_names(
-        self, channel: str, selection: Selection | None
-    ) -> tuple[str, ...]:
+    def _selected_names(self, channel: str, selection: Selection | None) -> Texts:
         """Return the names of a selection's columns, in the order of the joints."""
         if selection is None:
             return (self._clock_name(),)
@@ -96,7 +95,7 @@ class AbstractLogFile(abc.ABC):
             )
         return self.clock
 
-    def _numbered_names(self, channel: str, pattern: str) -> tuple[str, ...]:
+    def _numbered_names(self, channel: str, pattern: str) -> Texts:
         """Return the columns whose names differ only in their numbers, in order."""
         expression = re.escape(pattern).replace(re.escape("{}"), r"(\d{1,18})")
         matches = [re.fullmatch(expression, name) for name in self.names]

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 
+from jaxid.arrays import Texts
 from jaxid.errors import InputError
 
 from ..recording import MAX_NUMBER
@@ -53,11 +54,11 @@ class LogTable:
 
     source: str
     columns: Any
-    channels: Mapping[str, tuple[str, ...]]
+    channels: Mapping[str, Texts]
     first_row: int = 1
     unit: str = "row"
     bad_rows: BadRows = None
-    notes: tuple[str, ...] = ()
+    notes: Texts = ()
 
     @functools.cached_property
     def rows(self) -> int:

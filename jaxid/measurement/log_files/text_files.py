@@ -16,6 +16,7 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 import polars as pl
 
+from jaxid.arrays import Texts
 from jaxid.errors import InputError
 
 from .log_file import AbstractLogFile
@@ -35,7 +36,7 @@ _conversions: dict[tuple, Path] = {}
 class TextFormat(NamedTuple):
     """Format of a table of text."""
 
-    names: tuple[str, ...]  # names of the columns; positions without a header
+    names: Texts  # names of the columns; positions without a header
     has_header: bool
     separator: str  # a space is any number of spaces or tabs
     has_decimal_commas: bool
