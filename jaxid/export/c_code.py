@@ -76,14 +76,21 @@ def export_c(
 def c_functions(fit: Fit) -> list[CFunction]:
     """Return all functions of a model, with its estimates as constants."""
     model = fit.base.model
-    shapes = {"p": (fit.base.size,), "s": model.input_shapes[-1]}
+    joints = (model.robot.joints,)
+    shapes = {
+        "q_before": joints,
+        "q": joints,
+        "qd": joints,
+        "qdd": joints,
+        "p": (fit.base.size,),
+    }
+    if model.memory is not None:
+        shapes["s"] = model.input_shapes[-1]
     functions = []
     for name, (summary, output, function) in _definitions(fit).items():
-        inputs = [*inspect.signature(function).parameters]
-        if model.memory is None and "s" in inputs:
-            inputs.remove("s")
-        input_shapes = [shapes.get(x, (model.robot.joints,)) for x in inputs]
-        program = trace(function, *input_shapes)
+        arguments = inspect.signature(function).parameters
+        inputs = [x for x in arguments if x in shapes]
+        program = trace(function, *[shapes[x] for x in inputs])
         functions.append(CFunction(name, summary, program, tuple(inputs), output))
     return functions
 

@@ -111,11 +111,12 @@ def _distances_to_neighbours(robot: Robot, body: int) -> list[float]:
         return []
     offset = np.asarray(robot.offset)
     axis = np.asarray(robot.axis[body])
-    axis_in_parent = np.asarray(robot.rotation[body]) @ axis
+    rotation = np.asarray(robot.rotation[body])
+    axis_in_parent = rotation @ axis
     is_child = np.array(robot.parent) == body
-    to_parent = -float(axis_in_parent @ offset[body])
-    to_children = offset[is_child] @ axis
-    distances = dict.fromkeys([to_parent, *to_children.tolist()])
+    child_distances = offset[is_child] @ axis
+    parent_distance = -float(axis_in_parent @ offset[body])
+    distances = dict.fromkeys([parent_distance, *child_distances.tolist()])
     return [distance for distance in distances if abs(distance) > MIN_DISTANCE]
 
 
@@ -149,14 +150,12 @@ def _wrench(inertia: np.ndarray, a: Vector3, w: Vector3, wd: Vector3) -> AnyArra
 
 def _on_axis(inertia: np.ndarray, axis: np.ndarray) -> np.ndarray:
     """Return the part of a pseudo-inertia that a turn about an axis does not change."""
-    part = np.zeros((4, 4))
-    part[3, 3] = inertia[3, 3]
-    first_moment = axis @ inertia[:3, 3]
-    part[:3, 3] = first_moment * axis
-    part[3, :3] = first_moment * axis
-    second_moment = axis @ inertia[:3, :3] @ axis
-    part[:3, :3] = second_moment * np.outer(axis, axis)
-    return part
+    # Mass, first and second moment along the axis stay where they are.
+    along_axis = np.zeros((2, 4))
+    along_axis[0, :3] = axis
+    along_axis[1, 3] = 1.0
+    moments = along_axis @ inertia @ along_axis.T
+    return along_axis.T @ moments @ along_axis
 
 
 def _transform(rotation: AnyArray, position: AnyArray) -> np.ndarray:

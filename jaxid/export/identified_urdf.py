@@ -117,13 +117,16 @@ def _fix_other_joints(tree: UrdfTree) -> list[str]:
 
 def _write_joints(tree: UrdfTree, robot: Robot, dynamics: JointDynamics) -> None:
     """Write the friction and the largest forces of the joints that the robot has."""
+    damping = dynamics.values["damping"]
+    friction = dynamics.values["friction"]
     efforts = np.asarray(robot.known_max_forces)
     for i, joint in enumerate(tree.joints):
         element = _child(joint, "dynamics")
-        for quantity in ("damping", "friction"):
-            element.set(quantity, exact_text(dynamics.values[quantity][i]))
+        element.set("damping", exact_text(damping[i]))
+        element.set("friction", exact_text(friction[i]))
         if np.isfinite(efforts[i]):
-            _child(joint, "limit").set("effort", exact_text(efforts[i]))
+            limit = _child(joint, "limit")
+            limit.set("effort", exact_text(efforts[i]))
     # A URDF must have both; MJCF has no speeds.
     for limit in tree.root.iterfind("joint/limit"):
         for key in ("effort", "velocity"):

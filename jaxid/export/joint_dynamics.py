@@ -87,7 +87,8 @@ def _joint_coefficients(term: AbstractTerm, robot: Robot) -> np.ndarray:
     for joint, k in np.argwhere(is_used & acts_on_one_joint):
         acceleration = qdd[:, joint]
         velocity = qd[:, joint]
-        basis = np.stack([acceleration, velocity, np.sign(velocity)], axis=1)
+        direction = directions[:, joint]
+        basis = np.stack([acceleration, velocity, direction], axis=1)
         forces = columns[:, joint, k]
         solution = np.linalg.lstsq(basis, forces)[0]
         error = np.abs(basis @ solution - forces)

@@ -29,11 +29,13 @@ class SamplesWithMemory(AbstractSamples):
         """Find the states at the first samples of the parts of all segments."""
         states = {}
         for a, b in segments:
-            motion, _ = source.read(slice(a, a + 1))
-            state = np.asarray(law.settled(motion.qd[0]))
+            first_motion, _ = source.read(slice(a, a + 1))
+            state = np.asarray(law.settled(first_motion.qd[0]))
             for start in range(a, b, PART_SIZE):
                 states[start] = state
-                motion, _ = source.read(slice(start, min(start + PART_SIZE + 1, b)))
+                # Up to the first sample of the next part.
+                stop = min(start + PART_SIZE + 1, b)
+                motion, _ = source.read(slice(start, stop))
                 state = _follow(law, motion, state)[-1]
         return cls(source, law, segments, states)
 

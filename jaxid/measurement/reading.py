@@ -142,10 +142,10 @@ class SamplesOnDisk(AbstractSamples):
     sample_time: float = eqx.field(static=True)
 
     def read(self, samples):  # noqa: D102
-        segment_start, segment_stop = self.segments[self._segment(samples)]
+        a, b = self.segments[self._segment(samples)]
         # With the neighbours that the filter needs.
-        start = max(segment_start, samples.start - self.overlap)
-        stop = min(segment_stop, samples.stop + self.overlap)
+        start = max(a, samples.start - self.overlap)
+        stop = min(b, samples.stop + self.overlap)
         channels = self.read_rows(slice(start, stop))
         q, qd, forces = joint_side(self.robot, self.log.columns, *channels)
         motion = self.filter.motion(q, qd, self.sample_time)

@@ -247,7 +247,10 @@ def unlike_derivatives(recording: Recording) -> dict[int, float]:
     dt = recording.sample_time
     steps = max(1, round(JUDGED_WAY_TIME / dt))
     # Sums of squares and products over all windows.
-    errors, ways, noises, products = np.zeros((4, recording.joints))
+    errors = np.zeros(recording.joints)
+    ways = np.zeros(recording.joints)
+    noises = np.zeros(recording.joints)
+    products = np.zeros(recording.joints)
     for a, b in recording.segments:
         q = np.asarray(recording.angles)[a:b]
         qd = np.asarray(recording.velocities)[a:b]

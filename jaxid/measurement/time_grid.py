@@ -52,20 +52,22 @@ class TimeGrid(NamedTuple):
         dt = self.sample_time
         segments = {}
         for (a, b), t in self.segments.items():
-            steps = (np.array([start, stop]) - t) / dt
+            times = np.array([start, stop])
+            steps = (times - t) / dt
             # A time on the grid counts as such in spite of rounding.
-            bounds = np.clip(np.ceil(steps - 1e-6), 0, b - a)
+            samples_before = np.ceil(steps - 1e-6)
+            bounds = np.clip(samples_before, 0, b - a)
             low, high = bounds.astype(int).tolist()
             if low < high:
                 segments[a + low, a + high] = t + low * dt
         samples = sum(b - a for a, b in segments)
         if samples < MIN_SAMPLES:
-            first_time, *_ = self.segments.values()
-            (a, b), last_start = [*self.segments.items()][-1]
-            end = last_start + (b - a - 1) * dt
+            times = [*self.segments.values()]
+            a, b = [*self.segments][-1]
+            end = times[-1] + (b - a - 1) * dt
             raise InputError(
                 f"`{name}` has {samples} samples from {start:g} s to {stop:g} s, but "
-                f"at least {MIN_SAMPLES} are needed: it lasts from {first_time:g} s to "
+                f"at least {MIN_SAMPLES} are needed: it lasts from {times[0]:g} s to "
                 f"{end:g} s."
             )
         return self._replace(segments=segments)

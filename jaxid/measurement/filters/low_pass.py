@@ -101,14 +101,18 @@ def kernel_gain(
 def weighted_mean(kernel: np.ndarray, sample_time: float) -> Convolution:
     """Return the mean with weights, an odd number whose sum is one."""
     # The gain at sixteen lines for each oscillation that fits into the kernel.
-    frequency = np.linspace(0.0, 0.5 / sample_time, 8 * len(kernel) + 1)
+    lines = 8 * len(kernel) + 1
+    frequency = np.linspace(0.0, 0.5 / sample_time, lines)
     gain = kernel_gain(kernel, frequency, sample_time)
     k = int(np.argmax(gain < 0.5))
     cutoff = math.inf  # everything passes
     if k > 0:
-        neighbours = [k, k - 1]
-        cutoff = float(np.interp(0.5, gain[neighbours], frequency[neighbours]))
-    return Convolution(kernel=tuple(kernel.tolist()), cutoff=cutoff)
+        # The gain falls from line k - 1 to line k.
+        gains = gain[[k, k - 1]]
+        frequencies = frequency[[k, k - 1]]
+        cutoff = float(np.interp(0.5, gains, frequencies))
+    weights = tuple(kernel.tolist())
+    return Convolution(kernel=weights, cutoff=cutoff)
 
 
 class RecursiveLowPass(AbstractLowPass):
@@ -167,7 +171,8 @@ class RecursiveLowPass(AbstractLowPass):
 def _clear_memory(sos: np.ndarray, radius: float, tolerance: float) -> int:
     """Return the memory from the impulse response, by the slowest pole's radius."""
     duration = math.log(1e-3 * tolerance) / math.log(radius)
-    samples = math.ceil(duration) + 4 * len(sos)
+    start_samples = 4 * len(sos)
+    samples = math.ceil(duration) + start_samples
     impulse = np.zeros(samples)
     impulse[0] = 1.0
     forward = signal.sosfilt(sos, impulse)

@@ -245,21 +245,25 @@ class PeriodicFourier(AbstractFilter):
                 "filter."
             )
         require_cutoff("harmonics / period", self.harmonics / self.period, sample_time)
-        omega = 2 * math.pi / self.period * np.arange(1, self.harmonics + 1)
+        multiples = np.arange(1, self.harmonics + 1)
+        omega = 2 * math.pi / self.period * multiples
         phases = np.outer(t, omega)
         sines = np.sin(phases)
         cosines = np.cos(phases)
-        basis = np.hstack([np.ones((len(t), 1)), sines, cosines])
-        series = np.linalg.lstsq(basis, angles - angles[0], rcond=None)[0]
+        constant = np.ones((len(t), 1))
+        basis = np.hstack([constant, sines, cosines])
+        path = angles - angles[0]
+        series = np.linalg.lstsq(basis, path, rcond=None)[0]
         q = angles[0] + basis @ series
         _require_series(angles, q)
 
         _, a, b = np.split(series, [1, self.harmonics + 1])
-        speed_a = omega[:, None] * a
-        speed_b = omega[:, None] * b
+        factors = omega[:, None]
+        speed_a = factors * a
+        speed_b = factors * b
         qd = cosines @ speed_a - sines @ speed_b
-        acceleration_a = omega[:, None] * speed_a
-        acceleration_b = omega[:, None] * speed_b
+        acceleration_a = factors * speed_a
+        acceleration_b = factors * speed_b
         qdd = -sines @ acceleration_a - cosines @ acceleration_b
         return Motion(q, qd, qdd)
 

@@ -159,10 +159,11 @@ def _topic(name: str, messages: Iterable[tuple[int, Any]]) -> Topic:
             orders = variants.setdefault(field, {})
             orders.setdefault(frozenset(elements), elements)
             for element, value in zip(elements, values, strict=True):
-                empty = (array("q"), array("d"))
-                column = topic.columns.setdefault(field + element, empty)
-                column[0].append(number)
-                column[1].append(value)
+                empty_column = (array("q"), array("d"))
+                name_in_bag = field + element
+                numbers, column = topic.columns.setdefault(name_in_bag, empty_column)
+                numbers.append(number)
+                column.append(value)
 
     times = topic.recording_times
     topic.columns[name + RECORDING_TIME] = times, times
