@@ -77,7 +77,7 @@ def c_functions(fit: Fit) -> list[CFunction]:
     """Return all functions of a model, with its estimates as constants."""
     model = fit.base.model
     joints = (model.robot.joints,)
-    shapes = {
+    shapes: dict[str, tuple[int, ...]] = {
         "q_before": joints,
         "q": joints,
         "qd": joints,

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Float, Joints, Vector3
+from jaxid.arrays import AnyArray, Float, Joints, Matrix, Vector, Vector3
 from jaxid.dynamics import projection_equation
 from jaxid.identification.consistency.pseudo_inertia import pseudo_inertia
 from jaxid.robot.inertia import BodyParameters
@@ -120,7 +120,7 @@ def _distances_to_neighbours(robot: Robot, body: int) -> list[float]:
     return [distance for distance in distances if abs(distance) > MIN_DISTANCE]
 
 
-def _wrench(inertia: np.ndarray, a: Vector3, w: Vector3, wd: Vector3) -> AnyArray:
+def _wrench(inertia: Matrix, a: Vector3, w: Vector3, wd: Vector3) -> AnyArray:
     r"""Return force and moment at a body's origin, from its pseudo-inertia (Eq. 10).
 
     The moment is $\int r \times W r\,dm$ with $W = \hat{\dot\omega} + \omega \omega^T$,
@@ -148,7 +148,7 @@ def _wrench(inertia: np.ndarray, a: Vector3, w: Vector3, wd: Vector3) -> AnyArra
     return jnp.concatenate([force, moment])
 
 
-def _on_axis(inertia: np.ndarray, axis: np.ndarray) -> np.ndarray:
+def _on_axis(inertia: Matrix, axis: Vector) -> Matrix:
     """Return the part of a pseudo-inertia that a turn about an axis does not change."""
     # Mass, first and second moment along the axis stay where they are.
     along_axis = np.zeros((2, 4))
@@ -158,7 +158,7 @@ def _on_axis(inertia: np.ndarray, axis: np.ndarray) -> np.ndarray:
     return along_axis.T @ moments @ along_axis
 
 
-def _transform(rotation: AnyArray, position: AnyArray) -> np.ndarray:
+def _transform(rotation: AnyArray, position: AnyArray) -> Matrix:
     """Return the homogeneous matrix of a placement."""
     T = np.eye(4)
     T[:3, :3] = rotation

@@ -7,7 +7,7 @@ import numpy as np
 from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
 from lxml.builder import E  # pyright: ignore[reportMissingModuleSource]
 
-from jaxid.arrays import Texts
+from jaxid.arrays import Texts, Vector
 from jaxid.errors import InputError
 from jaxid.identification.fit_result import Fit
 from jaxid.io import FilePath, write_bytes
@@ -162,7 +162,7 @@ def _require_same_robot(robot: Robot, described: Robot, source: FilePath) -> Non
             )
 
 
-def _inertial(p: np.ndarray) -> Any:
+def _inertial(p: Vector) -> Any:
     """Return the element of a body, in the frame of its link."""
     inertia = Inertia.from_parameters(p)
     names = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")

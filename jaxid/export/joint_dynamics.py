@@ -1,11 +1,12 @@
 """Bodies that can exist, and inertia and friction at the joints, for simulators."""
 
 import re
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
 
-from jaxid.arrays import Joints, Texts, double_precision
+from jaxid.arrays import Joints, Matrix, Texts, double_precision
 from jaxid.dynamics.terms import AbstractTerm
 from jaxid.errors import InputError
 from jaxid.identification.consistency.pseudo_inertia import consistency_margin
@@ -22,6 +23,10 @@ PROBE_SPEEDS = (20.0, 80.0)
 """Speeds of these states, beyond the transition of dry friction [rad/s or m/s]."""
 
 
+Quantities = Mapping[str, Joints]
+"""One number for each joint, by the names of the quantities."""
+
+
 class JointDynamics(NamedTuple):
     """Inertia and friction at the joints, as far as simulators can describe them.
 
@@ -32,7 +37,7 @@ class JointDynamics(NamedTuple):
         omissions: Names of the parameters in none of the three.
     """
 
-    values: dict[str, Joints]
+    values: Quantities
     rotors: Texts
     omissions: Texts
 
@@ -59,7 +64,7 @@ def joint_dynamics(fit: Fit) -> JointDynamics:
                 rotors.append(name)
             if not coefficients[:, :, k].any():
                 omissions.append(name)
-    values: dict[str, Joints] = {
+    values: Quantities = {
         "armature": total[0],
         "damping": total[1],
         "friction": total[2],
@@ -98,7 +103,7 @@ def _joint_coefficients(term: AbstractTerm, robot: Robot) -> np.ndarray:
 
 
 def _odd_columns(
-    term: AbstractTerm, robot: Robot, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray
+    term: AbstractTerm, robot: Robot, q: Matrix, qd: Matrix, qdd: Matrix
 ) -> np.ndarray:
     """Return the part of a term's columns that changes its sign with the motion.
 

@@ -1,6 +1,5 @@
 """The identified model as an MJCF file for MuJoCo."""
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -9,14 +8,14 @@ from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
 from lxml.builder import E  # pyright: ignore[reportMissingModuleSource]
 from scipy.spatial.transform import Rotation
 
-from jaxid.arrays import AnyArray, Joints
+from jaxid.arrays import AnyArray, Vector
 from jaxid.identification.fit_result import Fit
 from jaxid.io import FilePath, write_text
 from jaxid.robot.inertia import BodyParameters, Inertia
 from jaxid.robot.mjcf import exact_text
 from jaxid.robot.robot import Robot
 
-from .joint_dynamics import feasible_bodies, joint_dynamics, origin_comment
+from .joint_dynamics import Quantities, feasible_bodies, joint_dynamics, origin_comment
 
 ATTRIBUTES = {"armature": "armature", "damping": "damping", "friction": "frictionloss"}
 """Attributes of MJCF for the quantities of `joint_dynamics`."""
@@ -48,7 +47,7 @@ def export_mjcf(fit: Fit, path: FilePath) -> Path:
 def mjcf_text(
     robot: Robot,
     bodies: BodyParameters,
-    dynamics: Mapping[str, Joints],
+    dynamics: Quantities,
     timestep: float = 0.001,
     comment: str = "",
 ) -> str:
@@ -83,7 +82,7 @@ def mjcf_text(
     return etree.tostring(root, pretty_print=True, encoding="unicode")
 
 
-def _inertial(p: np.ndarray) -> Any:
+def _inertial(p: Vector) -> Any:
     """Return the element of a body's mass, centre of mass and moments of inertia."""
     inertia = Inertia.from_parameters(p)
     # In MuJoCo's order: xx, yy, zz, xy, xz, yz.
@@ -95,7 +94,7 @@ def _inertial(p: np.ndarray) -> Any:
     )
 
 
-def _joint(robot: Robot, i: int, dynamics: Mapping[str, Joints]) -> Any:
+def _joint(robot: Robot, i: int, dynamics: Quantities) -> Any:
     """Return the element of a joint, with its range where both ends are known."""
     element: Any = E.joint(
         name=robot.joint_names[i],

@@ -17,6 +17,7 @@ from jaxid.rollout.result import ServoFit
 from jaxid.rollout.servo import INDEX, START
 
 from .feed_forward import body_parameters
+from .joint_dynamics import Quantities
 from .mujoco_model import mjcf_text
 
 STICKING = "0.99 0.9999 0.001"
@@ -51,9 +52,7 @@ def servo_stiffness(fit: ServoFit) -> Joints:
     return np.where(is_known, values, np.median(values[is_known]))
 
 
-def simulator_values(
-    fit: ServoFit, parameters: AnyArray | None = None
-) -> dict[str, Joints]:
+def simulator_values(fit: ServoFit, parameters: AnyArray | None = None) -> Quantities:
     """Return the numbers of each joint that simulators of actuators take.
 
     The damping is the sum of friction and of the servo's own: positions do not tell
@@ -193,7 +192,7 @@ def export_servo_mjcf(
 def _servo_mjcf(
     bodies: Bodies,
     joint_names: Texts,
-    values: dict[str, Joints],
+    values: Quantities,
     timestep: float,
 ) -> str:
     """Return a robot with position actuators of these values as MJCF."""
@@ -223,7 +222,7 @@ def _servo_mjcf(
     return etree.tostring(root, pretty_print=True, encoding="unicode")
 
 
-def _actuator(name: str, joint: int, values: dict[str, Joints]) -> Any:
+def _actuator(name: str, joint: int, values: Quantities) -> Any:
     """Return the element of a joint's servo."""
     gain = exact_text(values["stiffness"][joint])
     integral_gain = values["integral_gain"][joint]

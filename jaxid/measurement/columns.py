@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxid.arrays import Matrix, Vector
 from jaxid.errors import InputError
 from jaxid.io import FilePath
 from jaxid.robot.limits_and_drives import per_joint
@@ -19,7 +20,7 @@ Units = Unit | tuple[Unit, ...]
 """One unit for all joints, or one for each."""
 PerJoint = tuple[float, ...] | None
 """One number for each joint, or the default for all."""
-Channels = tuple[np.ndarray, np.ndarray | None, np.ndarray]
+Channels = tuple[Matrix, Matrix | None, Matrix]
 """Angles, velocities (None if there are none) and forces (samples x joints)."""
 
 
@@ -128,12 +129,12 @@ class Columns:
             )
 
     def to_si(
-        self, angles: np.ndarray, velocities: np.ndarray | None, forces: np.ndarray
+        self, angles: Matrix, velocities: Matrix | None, forces: Matrix
     ) -> Channels:
         """Convert the numbers of a log to SI units (samples x joints)."""
         joints = angles.shape[1]
 
-        def numbers(name: str, default: float = 1.0) -> np.ndarray:
+        def numbers(name: str, default: float = 1.0) -> Vector:
             values = getattr(self, name)
             if isinstance(values, Unit):
                 values = joints * (values,)
@@ -171,7 +172,7 @@ class Log:
 
     def read(self, start: int = 0, stop: int | None = None) -> Channels:
         """Return angles, velocities and forces of some rows, as they were recorded."""
-        arrays: dict[str, np.ndarray] = {}
+        arrays: dict[str, Matrix] = {}
         for table in self.tables:
             channels = [channel for channel in table.channels if channel != "time"]
             part = table.read(channels, start, stop)
@@ -198,7 +199,7 @@ class Log:
                 complaints[number - table.first_row] = f"{text} of `{table.source}`"
         return complaints
 
-    def stamps(self, start: int = 0, stop: int | None = None) -> np.ndarray:
+    def stamps(self, start: int = 0, stop: int | None = None) -> Vector:
         """Return time stamps [s]; integers and dates count from `start`."""
         table = self.tables[0].read(("time",), start, stop)
         return table.stamps(self.columns.time_unit.factor)

@@ -9,7 +9,16 @@ import equinox as eqx
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxid.arrays import AnyArray, Bool, Float, JointSamples, Numbers, Texts, namespace
+from jaxid.arrays import (
+    AnyArray,
+    Bool,
+    Float,
+    JointSamples,
+    Numbers,
+    Texts,
+    Vector,
+    namespace,
+)
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
 from jaxid.robot.limits_and_drives import per_joint
@@ -200,7 +209,7 @@ class Observations(eqx.Module):
         edge = self.filter.edge(self.sample_time)
         return _row_samples(self.segments, edge, self.decimation.factor)
 
-    def _times(self, samples: Sequence[range]) -> np.ndarray:
+    def _times(self, samples: Sequence[range]) -> Vector:
         """Return the times of samples of each segment [s]."""
         parts = []
         for indices, (a, _), start in zip(
@@ -463,7 +472,7 @@ def _usable_segments(grid: TimeGrid, edge: int, factor: int, name: str) -> TimeG
 
 
 def _speed_mask(
-    observations: Observations, speeds: np.ndarray, progress: Progress | None
+    observations: Observations, speeds: Vector, progress: Progress | None
 ) -> Bool[np.ndarray, "rows joints"]:
     """Return the rows at which each joint is as fast as its speed."""
     instants = observations.instants

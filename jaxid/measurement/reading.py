@@ -7,7 +7,7 @@ from pathlib import Path
 import equinox as eqx
 import numpy as np
 
-from jaxid.arrays import Numbers
+from jaxid.arrays import Indices, Numbers, Vector
 from jaxid.errors import InputError
 from jaxid.io import FilePath
 from jaxid.result_table import printable
@@ -110,7 +110,7 @@ def _bad_row_note(complaints: Complaints, rows: int, max_share: float) -> str:
 
 
 def _stray_stamps(
-    stamps: np.ndarray, complaints: Complaints, table: LogTable
+    stamps: Vector, complaints: Complaints, table: LogTable
 ) -> Complaints:
     """Return complaints about rows whose stamp alone is out of order."""
     good_rows = np.setdiff1d(np.arange(len(stamps)), [*complaints])
@@ -138,7 +138,7 @@ class SamplesOnDisk(AbstractSamples):
     filter: AbstractFilter
     overlap: int = eqx.field(static=True)
     segments: Ranges = eqx.field(static=True)
-    first_rows: tuple[int, ...] = eqx.field(static=True)
+    first_rows: Indices = eqx.field(static=True)
     sample_time: float = eqx.field(static=True)
 
     def read(self, samples):  # noqa: D102
@@ -264,7 +264,7 @@ def scan_log(
     )
 
 
-def _stamps(log: Log) -> Iterator[np.ndarray]:
+def _stamps(log: Log) -> Iterator[Vector]:
     """Yield the time stamps in parts [s], with the last one of the part before."""
     rows = log.tables[0].rows
     previous_time = 0.0

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from scipy.integrate import cumulative_trapezoid
 from scipy.interpolate import CubicSpline
 
-from jaxid.arrays import AnyArray, Float, JointSamples, Texts
+from jaxid.arrays import AnyArray, Float, JointSamples, Texts, Vector
 from jaxid.errors import InputError
 
 from .time_grid import MIN_SAMPLES, Ranges, TimeGrid, resampling
@@ -214,7 +214,7 @@ def finite_channel(
     return array
 
 
-def _finite_stamps(name: str, time: ArrayLike, samples: int) -> np.ndarray:
+def _finite_stamps(name: str, time: ArrayLike, samples: int) -> Vector:
     """Return time stamps as finite numbers."""
     stamps = np.array(time, np.float64)
     if stamps.shape != (samples,) or not np.isfinite(stamps).all():

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from jaxid.arrays import Texts
+from jaxid.arrays import Texts, Vector
 from jaxid.errors import InputError
 
 MAX_JITTER = 0.05
@@ -24,6 +24,8 @@ Range = tuple[int, int]
 """A half-open range of rows or samples."""
 Ranges = tuple[Range, ...]
 """Ranges between gaps."""
+Pauses = tuple[float, float]
+"""Pauses that are bridged: in sample times, and in seconds."""
 
 
 class NeedsMemory(InputError):  # noqa: N818 (the name says what to do)
@@ -100,9 +102,9 @@ class Stretches(NamedTuple):
 
 
 def find_grid(
-    read: Callable[[], Iterable[np.ndarray]],
+    read: Callable[[], Iterable[Vector]],
     source: str,
-    limits: tuple[float, float],
+    limits: Pauses,
     first_row: int,
     in_parts: bool = False,
 ) -> TimeGrid:
@@ -135,9 +137,7 @@ def find_grid(
     return grid
 
 
-def _step_statistics(
-    stamps: np.ndarray, source: str, limits: tuple[float, float]
-) -> StepStatistics:
+def _step_statistics(stamps: Vector, source: str, limits: Pauses) -> StepStatistics:
     steps = np.diff(stamps)
     steps = steps[steps > 0]
     if not steps.size:
@@ -153,7 +153,7 @@ def _step_statistics(
 
 
 def _find_stretches(
-    parts: Iterable[np.ndarray],
+    parts: Iterable[Vector],
     source: str,
     statistics: StepStatistics,
     first_row: int,
@@ -223,9 +223,7 @@ def _gap_notes(grid: TimeGrid, stretches: Stretches, origin: float) -> Texts:
     return tuple(notes)
 
 
-def _require_forward(
-    stamps: np.ndarray, steps: np.ndarray, row: int, source: str
-) -> None:
+def _require_forward(stamps: Vector, steps: Vector, row: int, source: str) -> None:
     back = np.flatnonzero(steps < 0)
     if back.size:
         i = int(back[0])
@@ -236,7 +234,7 @@ def _require_forward(
         )
 
 
-def _deviation(grid: TimeGrid, parts: Iterable[np.ndarray], origin: float) -> float:
+def _deviation(grid: TimeGrid, parts: Iterable[Vector], origin: float) -> float:
     """Return the largest deviation of stamps from the grid [s]."""
     starts, ends = np.transpose([*grid.segments])
     start_times = np.array([*grid.segments.values()])
@@ -259,9 +257,9 @@ class Resampling(NamedTuple):
     """Way of the rows of a log onto the uniform grid behind their time stamps."""
 
     rows: np.ndarray  # rows that count: repeated ones do not
-    stamps: np.ndarray  # their times from the first row on [s]
+    stamps: Vector  # their times from the first row on [s]
     grid: TimeGrid
-    times: list[np.ndarray]  # times of each segment's samples [s]
+    times: list[Vector]  # times of each segment's samples [s]
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
         """Return the samples of a channel: its rows, or values of cubic splines."""
@@ -277,7 +275,7 @@ class Resampling(NamedTuple):
 
 
 def resampling(
-    stamps: np.ndarray, source: str, limits: tuple[float, float], first_row: int
+    stamps: Vector, source: str, limits: Pauses, first_row: int
 ) -> Resampling:
     """Find the way of rows onto the uniform grid behind their time stamps [s]."""
     _require_forward(stamps, np.diff(stamps), first_row, source)
@@ -308,7 +306,7 @@ def resampling(
     return Resampling(rows, t, grid._replace(notes=tuple(notes)), times)
 
 
-def _distinct_rows(stamps: np.ndarray) -> np.ndarray:
+def _distinct_rows(stamps: Vector) -> np.ndarray:
     """Return the rows that do not repeat the stamp of the row before."""
     rows = np.flatnonzero(np.diff(stamps, prepend=-np.inf) > 0)
     if len(rows) == 1:
@@ -318,7 +316,7 @@ def _distinct_rows(stamps: np.ndarray) -> np.ndarray:
     return rows[np.append(True, is_distinct)]
 
 
-def _interpolation_note(t: np.ndarray, grid: TimeGrid, missing_samples: int) -> str:
+def _interpolation_note(t: Vector, grid: TimeGrid, missing_samples: int) -> str:
     """Return why the samples had to be interpolated: missing ones, or jitter."""
     dt = grid.sample_time
     steps = np.diff(t) / dt

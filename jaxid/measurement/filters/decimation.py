@@ -19,12 +19,16 @@ MAX_FACTOR = 13
 """Largest factor of a stage: the poles of its low-pass are still exact enough."""
 
 
+Factors = tuple[int, ...]
+"""Factors of the stages, one after the other."""
+
+
 class AbstractDecimation(eqx.Module):
     """Choice of the samples that become rows, with filters that prevent aliasing."""
 
     @property
     @abc.abstractmethod
-    def stages(self) -> tuple[int, ...]:
+    def stages(self) -> Factors:
         """Factors, one after the other."""
 
     @abc.abstractmethod
@@ -93,7 +97,7 @@ class Subsample(AbstractDecimation):
         )
 
 
-def _whole_factors(values: Iterable[float | int]) -> tuple[int, ...]:
+def _whole_factors(values: Iterable[float | int]) -> Factors:
     return tuple(map(integer("factors"), values))
 
 
@@ -108,7 +112,7 @@ class Decimation(AbstractDecimation):
         factors: Factors of the stages, 13 or less each.
     """
 
-    factors: tuple[int, ...] = eqx.field(static=True, converter=_whole_factors)
+    factors: Factors = eqx.field(static=True, converter=_whole_factors)
 
     def __check_init__(self) -> None:
         is_valid = all(1 <= factor <= MAX_FACTOR for factor in self.factors)

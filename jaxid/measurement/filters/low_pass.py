@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy import ndimage, signal
 
-from jaxid.arrays import AnyArray, Array, Float, namespace
+from jaxid.arrays import AnyArray, Array, Float, Matrix, Vector, namespace
 from jaxid.errors import InputError
 
 SETTLED = 1e-4
@@ -74,7 +74,7 @@ class Convolution(AbstractLowPass):
         return len(self.kernel) // 2
 
 
-def correlate(x: Any, kernel: np.ndarray) -> Any:
+def correlate(x: Any, kernel: Vector) -> Any:
     """Return sums of the samples around each sample, times an odd number of weights."""
     half = len(kernel) // 2
     extended = odd_extension(x, half)
@@ -91,14 +91,14 @@ def correlate(x: Any, kernel: np.ndarray) -> Any:
 
 
 def kernel_gain(
-    kernel: np.ndarray, frequency: np.ndarray, sample_time: float
+    kernel: Vector, frequency: np.ndarray, sample_time: float
 ) -> np.ndarray:
     """Return the size of the gain of a weighted mean for some frequencies [Hz]."""
     angular = 2 * math.pi * frequency * sample_time
     return np.abs(np.polyval(kernel, np.exp(1j * angular)))
 
 
-def weighted_mean(kernel: np.ndarray, sample_time: float) -> Convolution:
+def weighted_mean(kernel: Vector, sample_time: float) -> Convolution:
     """Return the mean with weights, an odd number whose sum is one."""
     # The gain at sixteen lines for each oscillation that fits into the kernel.
     lines = 8 * len(kernel) + 1
@@ -168,7 +168,7 @@ class RecursiveLowPass(AbstractLowPass):
         return memory
 
 
-def _clear_memory(sos: np.ndarray, radius: float, tolerance: float) -> int:
+def _clear_memory(sos: Matrix, radius: float, tolerance: float) -> int:
     """Return the memory from the impulse response, by the slowest pole's radius."""
     duration = math.log(1e-3 * tolerance) / math.log(radius)
     start_samples = 4 * len(sos)
@@ -183,7 +183,7 @@ def _clear_memory(sos: np.ndarray, radius: float, tolerance: float) -> int:
     return int(last_sample) + 1
 
 
-def _filter_both_ways(sos: np.ndarray, x: Array, padding: int) -> Array:
+def _filter_both_ways(sos: Matrix, x: Array, padding: int) -> Array:
     """Filter forward and backward with odd extensions, like scipy's `sosfiltfilt`."""
     steady_states = signal.sosfilt_zi(sos)
 
@@ -236,7 +236,7 @@ def butterworth(
     return recursive(np.asarray(sos, np.float64), cutoff)
 
 
-def recursive(sos: np.ndarray, cutoff: float) -> RecursiveLowPass:
+def recursive(sos: Matrix, cutoff: float) -> RecursiveLowPass:
     """Return second-order sections as a filter whose gain for constants is one."""
     numerators = sos[:, :3].sum(axis=1)
     denominators = sos[:, 3:].sum(axis=1)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.polynomial import legendre
 from scipy import signal
 
-from jaxid.arrays import AnyArray, optional
+from jaxid.arrays import AnyArray, Matrix, Vector, optional
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
 
@@ -138,7 +138,7 @@ class SavitzkyGolay(AbstractFilter):
     def _derivative(self, x: AnyArray, times: int, sample_time: float) -> AnyArray:
         return correlate(x, self._kernel(times, sample_time))
 
-    def _kernel(self, derivative: int, sample_time: float) -> np.ndarray:
+    def _kernel(self, derivative: int, sample_time: float) -> Vector:
         """Return the weights of the samples in a derivative of the polynomial."""
         half = half_window(self.window, sample_time, self.order + 1)
         # Legendre polynomials: powers, as in `scipy.signal.savgol_coeffs`, lose digits.
@@ -294,7 +294,7 @@ def _require_series(angles: AnyArray, q: AnyArray) -> None:
 
 def _bilinear(
     name: str, numerator: list[float], omega: float, sample_time: float
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[Vector, Vector]:
     r"""Return $(b s + c) / (s / \omega + 1)$ by the bilinear transform.
 
     It is returned as coefficients.
@@ -310,7 +310,7 @@ def _first_order(name: str, omega: float, sample_time: float) -> AbstractLowPass
     return recursive(np.asarray(sos), omega / (2 * math.pi))
 
 
-def first_difference(x: np.ndarray, sample_time: float) -> np.ndarray:
+def first_difference(x: Matrix, sample_time: float) -> Matrix:
     """Return central differences of fourth order; of second order next to the ends."""
     d = np.gradient(x, sample_time, axis=0, edge_order=2)
     # At 125 Hz those of second order would lose 1 % of a velocity at 5 Hz.
@@ -319,7 +319,7 @@ def first_difference(x: np.ndarray, sample_time: float) -> np.ndarray:
     return d
 
 
-def second_difference(x: np.ndarray, sample_time: float) -> np.ndarray:
+def second_difference(x: Matrix, sample_time: float) -> Matrix:
     """Return second differences of fourth order, constant at the ends.
 
     Next to the ends they are of second order.

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from jaxid.arrays import Texts
+from jaxid.arrays import Matrix, Texts, Vector
 from jaxid.errors import InputError
 
 from ..recording import MAX_NUMBER
@@ -102,7 +102,7 @@ class LogTable:
             self, columns=columns, channels=subset, first_row=row
         )
 
-    def stamps(self, unit: float) -> np.ndarray:
+    def stamps(self, unit: float) -> Vector:
         """Return the time stamps [s] of a unit [s]; dates have their own.
 
         Integers and dates count from the first of these rows: nanoseconds since 1970 do
@@ -127,7 +127,7 @@ class LogTable:
             )
         return block[:, 0] * unit
 
-    def numbers(self, name: str) -> np.ndarray:
+    def numbers(self, name: str) -> Matrix:
         """Return a column as finite numbers (samples x columns)."""
         column = self.columns[name]
         if isinstance(column, pl.Series):
@@ -148,7 +148,7 @@ class LogTable:
         self._refuse_first(name, ~(size <= MAX_NUMBER), size, complaint)
         return array
 
-    def _series_numbers(self, name: str, column: pl.Series) -> np.ndarray:
+    def _series_numbers(self, name: str, column: pl.Series) -> Vector:
         try:
             numbers = column.cast(pl.Float64, strict=False)
             if column.dtype == pl.String and numbers.null_count():

@@ -16,7 +16,7 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 import polars as pl
 
-from jaxid.arrays import Texts
+from jaxid.arrays import Texts, Vector
 from jaxid.errors import InputError
 
 from .log_file import AbstractLogFile
@@ -201,7 +201,7 @@ def count_per_line(block: bytes, character: bytes) -> np.ndarray:
     return np.diff(counts, prepend=0)
 
 
-def _ticks(part: LogTable, name: str, numbers: np.ndarray) -> Any:
+def _ticks(part: LogTable, name: str, numbers: Vector) -> Any:
     """Return stamps as integers, if all of good rows are: float64 cannot hold them."""
     texts = part.columns[name].str.strip_chars()
     ticks = texts.cast(pl.Int64, strict=False)
