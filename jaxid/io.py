@@ -53,21 +53,22 @@ def write_bytes(path: FilePath, data: bytes) -> None:
 
 @contextlib.contextmanager
 def atomic_folder(
-    folder: FilePath, outdated: Callable[[Path], Iterable[str]] = lambda folder: ()
+    folder: FilePath,
+    outdated_names: Callable[[Path], Iterable[str]] = lambda folder: (),
 ) -> Iterator[Path]:
     """Yield an empty temporary folder, whose files move to `folder` at the end.
 
     After an error in the block nothing has changed. A new folder appears in one step.
     In an existing folder, each file replaces the one of its name in one step, files in
     JSON last: a result whose JSON file is there is complete. Other files stay, but
-    those that `outdated` names.
+    those of `outdated_names`.
     """
     folder = Path(folder).absolute()
     with _temporary_folder(folder) as staging:
         yield staging
         with PLACING:
             if folder.exists():
-                _move_files(staging, folder, outdated(folder))
+                _move_files(staging, folder, outdated_names(folder))
             else:
                 folder.parent.mkdir(parents=True, exist_ok=True)
                 os.replace(staging, folder)
@@ -106,7 +107,7 @@ def _temporary_folder(folder: Path) -> Iterator[Path]:
         TEMPORARY.discard(path)
 
 
-def _move_files(staging: Path, folder: Path, outdated: Iterable[str]) -> None:
+def _move_files(staging: Path, folder: Path, outdated_names: Iterable[str]) -> None:
     """Replace files in a folder by those of the same name, those in JSON last."""
     names = sorted(
         (path.name for path in staging.iterdir()),
@@ -117,7 +118,8 @@ def _move_files(staging: Path, folder: Path, outdated: Iterable[str]) -> None:
             raise InputError(
                 f"`{folder / name}` must be a file, but is a folder: remove it."
             )
-    removals = {name for name in outdated if (folder / name).is_file()} - set(names)
+    outdated_files = {name for name in outdated_names if (folder / name).is_file()}
+    removals = outdated_files - set(names)
     if len(names) > 1:
         # Without its JSON files, no mixture of earlier and later files is taken for a
         # result.
@@ -211,9 +213,9 @@ def _array_to_json(array: np.ndarray) -> dict[str, Any]:
         raise InputError(f"a document cannot hold an array of {name}.")
     if not array.size:
         return {name: [], "shape": list(array.shape)}
-    finite = np.isfinite(array)
-    if not finite.all():
-        array = np.where(finite, array.astype(object), array.astype(str))
+    is_finite = np.isfinite(array)
+    if not is_finite.all():
+        array = np.where(is_finite, array.astype(object), array.astype(str))
     return {name: array.tolist()}
 
 

@@ -107,8 +107,8 @@ def macros(template: Path) -> Any:
 
     def aligned(number: str) -> str:
         # Blanks behind a number become as wide as the digits and the point left out.
-        padded = re.sub(r"^([^. ]*) ", "\\1\N{PUNCTUATION SPACE}", number)
-        return padded.replace(" ", "\N{FIGURE SPACE}")
+        padded_number = re.sub(r"^([^. ]*) ", "\\1\N{PUNCTUATION SPACE}", number)
+        return padded_number.replace(" ", "\N{FIGURE SPACE}")
 
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(template.parent),
@@ -127,15 +127,15 @@ def significant(value: float, digits: int = 3) -> str:
         return MISSING
     if math.isinf(value):
         return "∞" if value > 0 else "-∞"
-    scientific = f"{value:.{digits - 1}e}"
+    scientific_text = f"{value:.{digits - 1}e}"
     # The exponent after rounding: 9.996 is 10.0.
-    rounded = float(scientific)
-    if rounded == 0:
+    rounded_value = float(scientific_text)
+    if rounded_value == 0:
         return "0"
-    decimals = digits - 1 - _exponent(rounded)
+    decimals = digits - 1 - _exponent(rounded_value)
     if decimals not in SHORT_DECIMALS:
-        return scientific
-    return f"{rounded:.{max(decimals, 0)}f}"
+        return scientific_text
+    return f"{rounded_value:.{max(decimals, 0)}f}"
 
 
 def _exponent(value: float) -> int:

@@ -87,13 +87,13 @@ class Experiment:
         if self.columns is not None:
             return self.columns
         files = [log for log in logs if not is_report(log)]
-        described = "the columns of the logs"
+        description = "the columns of the logs"
         if files:
             names = summarise_columns(files[0])
-            described = f"columns of `{files[0].name}`, which has {names}"
+            description = f"columns of `{files[0].name}`, which has {names}"
         raise InputError(
             f"{self.path.name}: the table `[recording]` "
-            f"is missing: it names {described}."
+            f"is missing: it names {description}."
         )
 
 

@@ -140,10 +140,10 @@ class RobotSource:
         names = ("urdf", "mjcf", "builtin")
         sources = [name for name in names if getattr(self, name) is not None]
         if len(sources) != 1:
-            shown = " and ".join(f"`{name}`" for name in sources) or "none of them"
+            words = " and ".join(f"`{name}`" for name in sources) or "none of them"
             raise InputError(
-                "one of `urdf`, `mjcf` and `builtin` is needed, but there is "
-                f"{shown}; give a Denavit-Hartenberg table to `from_dh` in Python."
+                f"one of `urdf`, `mjcf` and `builtin` is needed, but there is {words}; "
+                "give a Denavit-Hartenberg table to `from_dh` in Python."
             )
         for key in ("tip", "base"):
             if getattr(self, key) is not None and self.builtin is not None:

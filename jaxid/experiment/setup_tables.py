@@ -157,8 +157,10 @@ class AbstractEffects:
 
     def build(self, robot: Robot) -> tuple[terms.AbstractTerm, ...]:
         """Return the terms of the model, in the paper's order."""
-        dry = self.coulomb if isinstance(self.coulomb, DryFriction) else DryFriction()
-        transition = dry.transition(robot)
+        dry_friction = DryFriction()
+        if isinstance(self.coulomb, DryFriction):
+            dry_friction = self.coulomb
+        transition = dry_friction.transition(robot)
         effects: dict[str, terms.AbstractTerm] = {
             "bodies": terms.RigidBodies(principal_axes=self.principal_axes)
         }
@@ -167,14 +169,14 @@ class AbstractEffects:
         elif self.viscous:
             effects["viscous"] = terms.ViscousFriction()
         if self.coulomb is not False:
-            effects["coulomb"] = dry.term(robot)
+            effects["coulomb"] = dry_friction.term(robot)
         if self.rotor_inertia:
             effects["rotor_inertia"] = terms.RotorInertia()
         if self.motor_ripple or self.joint_ripple:
             ripple = terms.TorqueRipple(self.motor_ripple, self.joint_ripple)
             effects["ripple"] = ripple
         # An offset is half of what two levels of dry friction can express already.
-        has_offset = not dry.asymmetric if self.offset is None else self.offset
+        has_offset = not dry_friction.asymmetric if self.offset is None else self.offset
         if has_offset:
             effects["offset"] = terms.ConstantOffset()
         if terms.CoupledDrives().couplings(robot):

@@ -133,17 +133,17 @@ def _write_joints(tree: UrdfTree, robot: Robot, dynamics: JointDynamics) -> None
             limit.set(key, limit.get(key, "1e9"))
 
 
-def _require_same_robot(robot: Robot, described: Robot, source: FilePath) -> None:
+def _require_same_robot(robot: Robot, file_robot: Robot, source: FilePath) -> None:
     """Reject a file of another robot; how the robot is mounted is not in the file."""
-    if robot.joint_names != described.joint_names:
+    if robot.joint_names != file_robot.joint_names:
         raise InputError(
             f"`{source}` has the joints {', '.join(described.joint_names)}, "
             f"but the fit has {', '.join(robot.joint_names)}: "
             "give the file of this robot, or its `tip`."
         )
     for joint, name in enumerate(robot.joint_names):
-        if robot.revolute[joint] != described.revolute[joint]:
-            words = "turns" if described.revolute[joint] else "slides"
+        if robot.revolute[joint] != file_robot.revolute[joint]:
+            words = "turns" if file_robot.revolute[joint] else "slides"
             raise InputError(
                 f"joint `{name}` {words} in `{source}`, but not in the robot of the "
                 "fit: give its own file."
@@ -151,7 +151,7 @@ def _require_same_robot(robot: Robot, described: Robot, source: FilePath) -> Non
     is_on_body = np.array(robot.parent) >= 0
     for quantity in ("axis", "rotation", "offset"):
         fit_numbers = np.asarray(getattr(robot, quantity))
-        file_numbers = np.asarray(getattr(described, quantity))
+        file_numbers = np.asarray(getattr(file_robot, quantity))
         deviations = np.abs(fit_numbers - file_numbers)
         if quantity != "axis":
             deviations = deviations[is_on_body]

@@ -140,9 +140,9 @@ def feasible_bodies(fit: Fit, target: str) -> BodyParameters:
     bodies = body_parameters(fit.base.model, fit.standard_parameters)
     # Rounding may reach slightly below zero.
     margins = np.asarray(consistency_margin(bodies))
-    feasible = (margins >= -1e-9) & (bodies[:, 0] > 0)
-    if not feasible.all():
-        body = int(np.argmin(feasible)) + 1
+    is_feasible = (margins >= -1e-9) & (bodies[:, 0] > 0)
+    if not is_feasible.all():
+        body = int(np.argmin(is_feasible)) + 1
         raise InputError(
             f"{target} needs bodies that can exist, but body {body} cannot: {cure}."
         )

@@ -111,10 +111,10 @@ class Columns:
                 "and only then."
             )
 
-    def _require_unit(self, name: str, *allowed: Quantity) -> None:
-        words = " or ".join(quantity.value for quantity in allowed)
+    def _require_unit(self, name: str, *quantities: Quantity) -> None:
+        words = " or ".join(quantity.value for quantity in quantities)
         for unit in _units(getattr(self, name)):
-            if unit.quantity not in allowed:
+            if unit.quantity not in quantities:
                 raise InputError(
                     f"`{name}` must measure {words}, but `{unit.symbol}` measures "
                     f"{unit.quantity.value}."

@@ -286,11 +286,11 @@ def remove_delay(recording: Recording, seconds: float) -> Recording:
     """
     require_finite_delay(seconds)
     lost_samples = math.ceil(abs(seconds) / recording.sample_time - 1e-9)
-    longest = max(b - a for a, b in recording.segments)
-    if longest - lost_samples < MIN_SAMPLES:
+    longest_segment = max(b - a for a, b in recording.segments)
+    if longest_segment - lost_samples < MIN_SAMPLES:
         raise InputError(
             f"the delay is {seconds:g} s, but the longest segment of "
-            f"`{recording.name}` lasts {longest * recording.sample_time:g} s."
+            f"`{recording.name}` lasts {longest_segment * recording.sample_time:g} s."
         )
     parts = [
         _without_delay(recording._range(a, b), seconds, lost_samples)

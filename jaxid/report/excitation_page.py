@@ -44,8 +44,8 @@ def plan_remarks(plan: ExcitationPlan) -> list[Remark]:
         doubts.append(f"Deviations above {threshold} of the nominal value: {vague}")
     if plan.interrupted:
         doubts.append("The search was stopped: `--resume` may find a better motion")
-    doubtful = [Remark(text, Status.DOUBTFUL) for text in doubts]
-    return [*plan.remarks, deviations, *doubtful]
+    remarks = [Remark(text, Status.DOUBTFUL) for text in doubts]
+    return [*plan.remarks, deviations, *remarks]
 
 
 def _assumed_limits(plan: ExcitationPlan) -> str:

@@ -200,9 +200,9 @@ def decimate(
     high = np.fmax.reduceat(ordinates, first_rows)
 
     # Two points for each bin, in the order that follows the line from end to end.
-    falling = ordinates[last_rows] < ordinates[first_rows]
-    starts = np.where(falling, high, low)
-    ends = np.where(falling, low, high)
+    is_falling = ordinates[last_rows] < ordinates[first_rows]
+    starts = np.where(is_falling, high, low)
+    ends = np.where(is_falling, low, high)
     gaps = np.flatnonzero(np.diff(row_bins[first_rows]) > 1) + 1
     bin_times = np.stack([times[first_rows], times[last_rows]], axis=1)
     bin_values = np.stack([starts, ends], axis=1)

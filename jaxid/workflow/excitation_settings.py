@@ -116,7 +116,7 @@ class Excitation:
         """Whether the motion starts and ends at standstill, if leads are possible."""
         return self.chosen_leads is not None or self.rest or self.spline is not None
 
-    def basis(self, constrained: bool) -> AbstractBasis:
+    def basis(self, has_constraints: bool) -> AbstractBasis:
         """Return the basis of trajectories; if constrained, leads are designed, too.
 
         Raises:
@@ -136,7 +136,7 @@ class Excitation:
         leads = self.chosen_leads
         if leads is None and self.cycle is not None:
             self._require_whole_cycles(self.cycle)
-        if leads is None or (not constrained and leads.time is None):
+        if leads is None or (not has_constraints and leads.time is None):
             return FourierBasis(*series)
         return LeadsBasis(*series, lead=leads.time or 0.5, periods=leads.periods)
 

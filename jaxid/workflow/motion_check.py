@@ -95,6 +95,6 @@ def judge(name: str, findings: Sequence[Finding]) -> Remark:
     """Return a remark on the quantity nearest to its limit, or furthest beyond it."""
     worst = max(findings, key=lambda finding: finding.value)
     verb = "keep their limits" if worst.value <= 0 else "do not keep their limits"
-    nearest = str(worst).removeprefix("the ")
-    text = f"{name}: {len(findings)} quantities {verb}; the nearest: {nearest}"
+    nearest_finding = str(worst).removeprefix("the ")
+    text = f"{name}: {len(findings)} quantities {verb}; the nearest: {nearest_finding}"
     return Remark(text, Status.GOOD if worst.value <= 0 else Status.BAD)

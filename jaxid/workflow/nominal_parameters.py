@@ -55,8 +55,8 @@ def find_nominal(setup: Setup, excitation: Excitation) -> Nominal | None:
         return None
     names = setup.model.parameter_names
     values = setup.base.from_standard([claims.get(name, 0.0) for name in names])
-    claimed = [names[k] in claims for k in setup.base.indices]
-    return Nominal(np.where(claimed, np.asarray(values), np.nan), None)
+    is_claimed = [names[k] in claims for k in setup.base.indices]
+    return Nominal(np.where(is_claimed, np.asarray(values), np.nan), None)
 
 
 def _of_earlier_fit(base: BaseParameters, report: str) -> Nominal:

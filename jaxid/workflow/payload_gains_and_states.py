@@ -87,9 +87,9 @@ def fit_runs(
 
 def has_plain_estimator(setup: Setup) -> bool:
     """Return whether the estimator is least squares, perhaps with bounds of bodies."""
-    complete = isinstance(setup.least_squares.solution, Complete)
-    unbounded = setup.unbounded_estimator is setup.least_squares
-    return unbounded and complete
+    is_complete = isinstance(setup.least_squares.solution, Complete)
+    is_unbounded = setup.unbounded_estimator is setup.least_squares
+    return is_unbounded and is_complete
 
 
 def fit_run(

@@ -10,12 +10,16 @@ from .low_pass import (
     AbstractLowPass as AbstractLowPass,
     Convolution as Convolution,
     RecursiveLowPass as RecursiveLowPass,
+    weighted_mean as weighted_mean,
 )
 from .motion_filters import (
     PaperFilter as PaperFilter,
     PeriodicFourier as PeriodicFourier,
     SavitzkyGolay as SavitzkyGolay,
     ZeroPhaseButterworth as ZeroPhaseButterworth,
+    first_difference as first_difference,
+    half_window as half_window,
+    second_difference as second_difference,
 )
 
 FILTERS: dict[str, type[AbstractFilter]] = {

@@ -77,16 +77,16 @@ class Convolution(AbstractLowPass):
 def correlate(x: Any, kernel: Vector) -> Any:
     """Return sums of the samples around each sample, times an odd number of weights."""
     half = len(kernel) // 2
-    extended = odd_extension(x, half)
+    extended_samples = odd_extension(x, half)
     if not isinstance(x, jax.Array):
-        sums = ndimage.correlate1d(extended, kernel, axis=0)
+        sums = ndimage.correlate1d(extended_samples, kernel, axis=0)
         return sums[half : half + len(x)]
 
     def correlate_column(column: Array) -> Array:
         precision = jax.lax.Precision.HIGHEST
         return jnp.correlate(column, kernel, mode="valid", precision=precision)
 
-    columns = extended.reshape(len(extended), -1)
+    columns = extended_samples.reshape(len(extended_samples), -1)
     return jax.vmap(correlate_column, 1, 1)(columns).reshape(x.shape)
 
 
@@ -143,8 +143,8 @@ class RecursiveLowPass(AbstractLowPass):
         for start in range(0, columns.shape[1], width):
             block = slice(start, start + width)
             rows = np.ascontiguousarray(columns[:, block].T)
-            filtered = signal.sosfiltfilt(sos, rows, padtype="odd", padlen=padding)
-            result[:, block] = filtered.T
+            smooth_rows = signal.sosfiltfilt(sos, rows, padtype="odd", padlen=padding)
+            result[:, block] = smooth_rows.T
         return result.reshape(x.shape)
 
     def gain(self, frequency, sample_time):  # noqa: D102

@@ -327,9 +327,9 @@ def second_difference(x: Matrix, sample_time: float) -> Matrix:
     before = x[1:-3]
     middle = x[2:-2]
     after = x[3:-1]
-    nearest = after + before
-    second_nearest = x[4:] + x[:-4]
-    difference = 16 * nearest - second_nearest - 30 * middle
+    nearest_samples = after + before
+    second_nearest_samples = x[4:] + x[:-4]
+    difference = 16 * nearest_samples - second_nearest_samples - 30 * middle
 
     squared_time = sample_time**2
     d = np.empty_like(x)

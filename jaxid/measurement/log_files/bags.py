@@ -85,8 +85,8 @@ class TimeSeries(NamedTuple):
         order = np.argsort(self.times, kind="stable")
         sorted_values = self.values[order]
         # Float64 holds nanoseconds only if they do not count from 1970.
-        elapsed = self.times[order] - targets[0]
-        t = elapsed.astype(np.float64)
+        elapsed_time = self.times[order] - targets[0]
+        t = elapsed_time.astype(np.float64)
         target_t = (targets - targets[0]).astype(np.float64)
         nan = np.nan
         values = np.interp(target_t, t, sorted_values, left=nan, right=nan)
@@ -116,7 +116,7 @@ class Topic(NamedTuple):
         return TimeSeries(np.asarray(times)[rows], values)
 
 
-def read_bag(path: Path, selected: Collection[str]) -> list[Topic]:
+def read_bag(path: Path, needed_topics: Collection[str]) -> list[Topic]:
     """Read the messages of selected topics, and one message of each other topic."""
     purpose = f"`{path.name}` is read by"
     typesys = import_extra("rosbags.typesys", "logs", purpose)
@@ -129,7 +129,7 @@ def read_bag(path: Path, selected: Collection[str]) -> list[Topic]:
     ):
         for name in dict.fromkeys(connection.topic for connection in bag.connections):
             messages = _messages(bag, name)
-            if name in selected:
+            if name in needed_topics:
                 topics.append(_topic(name, messages))
             else:
                 # The bag need not define messages that are not needed.

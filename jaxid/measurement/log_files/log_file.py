@@ -65,12 +65,12 @@ class AbstractLogFile(abc.ABC):
         for channel, selection in self.selections.items():
             channels[channel] = self._selected_names(channel, selection)
         names = [*itertools.chain(*channels.values())]
-        repeated = [name for name in names if names.count(name) > 1]
-        if repeated:
-            owners = [f"`{c}`" for c in channels if repeated[0] in channels[c]]
+        repeated_names = [name for name in names if names.count(name) > 1]
+        if repeated_names:
+            owners = [f"`{c}`" for c in channels if repeated_names[0] in channels[c]]
             raise InputError(
-                f"the column `{repeated[0]}` of `{self.path.name}` is used twice, for "
-                f"{' and '.join(owners)}: name the right one for each joint."
+                f"the column `{repeated_names[0]}` of `{self.path.name}` is used "
+                f"twice, for {' and '.join(owners)}: name the right one for each joint."
             )
         return channels
 
@@ -129,10 +129,10 @@ class AbstractLogFile(abc.ABC):
                 f"has {words} from 0 to {len(names) - 1}: give another position."
             )
         candidates = joined_elements(names)
-        closest = difflib.get_close_matches(column, candidates, n=40, cutoff=0)
+        closest_names = difflib.get_close_matches(column, candidates, n=40, cutoff=0)
         raise InputError(
             f"`{self.path.name}` has no column `{column}` for `{channel}`: name one "
-            f"of its columns, the closest first: `{'`, `'.join(closest)}`."
+            f"of its columns, the closest first: `{'`, `'.join(closest_names)}`."
         )
 
 

@@ -117,8 +117,8 @@ class LogTable:
             return (integers - integers[0]) * 1e-9
         integers = integer_array(column)
         if integers is not None:
-            elapsed = (integers - integers[0]).astype(np.float64)
-            return elapsed * unit
+            elapsed_ticks = (integers - integers[0]).astype(np.float64)
+            return elapsed_ticks * unit
         block = self.numbers(name)
         if block.shape[1] != 1:
             raise InputError(

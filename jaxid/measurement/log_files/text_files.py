@@ -147,8 +147,8 @@ class TextFile(AbstractLogFile):
                 }
                 for name in table.channels.get("time", ()):
                     if are_ticks is None:
-                        largest = np.nanmax(np.abs(columns[name]), initial=0.0)
-                        are_ticks = largest > MAX_EXACT_INTEGER
+                        largest_stamp = np.nanmax(np.abs(columns[name]), initial=0.0)
+                        are_ticks = largest_stamp > MAX_EXACT_INTEGER
                     if are_ticks:
                         columns[name] = _ticks(part, name, columns[name])
                 yield pl.DataFrame(columns)
@@ -232,11 +232,11 @@ def detect_format(source: str, head: bytes) -> TextFormat:
     cells = [cell.strip().strip('"') for cell in text.split(separator)]
     has_header = not are_numbers(cells)
     names = cells if has_header else [str(k) for k in range(len(cells))]
-    repeated = sorted({name for name in names if names.count(name) > 1})
-    if repeated:
+    repeated_names = sorted({name for name in names if names.count(name) > 1})
+    if repeated_names:
         raise InputError(
-            f"the header of `{source}` names the column `{repeated[0]}` twice: rename "
-            "one of them."
+            f"the header of `{source}` names the column `{repeated_names[0]}` twice: "
+            "rename one of them."
         )
     mark = len(codecs.BOM_UTF8) if first_line.startswith(codecs.BOM_UTF8) else 0
     return TextFormat(
