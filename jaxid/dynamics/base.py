@@ -2,8 +2,8 @@
 
 import enum
 import functools
-from collections.abc import Callable, Iterator, Sequence
-from typing import Any, Literal
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -32,19 +32,14 @@ from .rank import (
     Regrouped,
     gram_schmidt,
     random_regressor,
+    rank_by_singular_values,
     regrouping,
-    singular_values,
 )
 from .sample_methods import in_numpy, on_samples, program_of
 
 Parameters = Float[AnyArray, " base"] | Sequence[float | int]
 
 
-METHODS: dict[str, Callable[[Float[AnyArray, "rows columns"]], Dependence]] = {
-    "gram_schmidt": gram_schmidt,
-    "singular_values": singular_values,
-}
-"""Methods that decide which columns depend on others."""
 MIN_SHARE = 5e-4
 """Fraction of an independent column that must be new."""
 MIN_GAP = 1e3
@@ -117,7 +112,7 @@ class BaseParameters(Summarised, Hashable):
             expressions.append(write_expression(summands))
         return tuple(expressions)
 
-    def columns(self, q, qd, qdd, s=None) -> Float[AnyArray, "joints base"]:
+    def columns(self, q, qd, qdd, s=None) -> AnyArray:
         """Return the base regressor of one sample by definition (Eq. 23)."""
         return self.model.columns(q, qd, qdd, s)[:, np.array(self.indices)]
 
@@ -153,9 +148,7 @@ class BaseParameters(Summarised, Hashable):
         """For each joint the base parameters that can act on it."""
         return self.joint_regressor.columns
 
-    def regressor_rows(
-        self, motion: Motion
-    ) -> list[Float[np.ndarray, "samples columns"]]:
+    def regressor_rows(self, motion: Motion) -> list[np.ndarray]:
         """Return each joint's rows of the base regressor in NumPy (Eq. 23).
 
         Args:
@@ -165,13 +158,11 @@ class BaseParameters(Summarised, Hashable):
         regressor = JointRegressor(self, self.columns, *(x.shape[:1] for x in arrays))
         return [rows.T for rows in regressor.in_numpy(*arrays)]
 
-    def forces_in_numpy(
-        self, p: Float[AnyArray, " base"], motion: Motion
-    ) -> Float[np.ndarray, "samples joints"]:
+    def forces_in_numpy(self, p: AnyArray, motion: Motion) -> np.ndarray:
         r"""Return the forces $\Theta_B p_B$ [N m or N] in float64 (Eq. 39)."""
         return in_numpy(self, self.forces, *self.model.arguments(motion), shared=(p,))
 
-    def tool_forces(self, motion: Motion) -> Float[np.ndarray, "samples joints"]:
+    def tool_forces(self, motion: Motion) -> np.ndarray:
         """Return the forces of the known tool [N m or N] in float64."""
         if self.model.robot.tool is None:
             return np.zeros(motion.q.shape)
@@ -179,8 +170,8 @@ class BaseParameters(Summarised, Hashable):
             self.model, self.model.known_forces, motion.q, motion.qd, motion.qdd
         )
 
-    def regressor(self, motion: Motion) -> Float[AnyArray, "*batch joints base"]:
-        r"""Return the base regressor $\Theta_B = \hat\Theta_1$ (Eq. 23)."""
+    def regressor(self, motion: Motion) -> AnyArray:
+        r"""Return the base regressor $\Theta_B$ [*batch, joints, base] (Eq. 23)."""
         return on_samples(self, self.columns, *self.model.arguments(motion))
 
     def packed_regressor(self, motion: Motion) -> PackedRegressor:
@@ -192,18 +183,14 @@ class BaseParameters(Summarised, Hashable):
         """
         return PackedRegressor(self, self.columns, *self.model.arguments(motion))
 
-    def from_standard(
-        self, p: Float[AnyArray, "*batch standard"] | Sequence[Any]
-    ) -> Float[AnyArray, "*batch base"]:
+    def from_standard(self, p: AnyArray | Sequence[Any]) -> AnyArray:
         r"""Return the base parameters $p_B = p_1 + \kappa p_2$ (Eq. 22)."""
         p = _as_parameters("standard", p, self.model.size)
         leaders = np.array(self.indices)
         others = np.array(self.dependent, int)
         return p[..., leaders] + p[..., others] @ self.kappa.T
 
-    def to_standard(
-        self, p: Float[AnyArray, "*batch base"] | Sequence[Any]
-    ) -> Float[AnyArray, "*batch standard"]:
+    def to_standard(self, p: AnyArray | Sequence[Any]) -> AnyArray:
         """Return standard parameters with the same forces.
 
         The dependent ones are zero. They are no physical masses and inertias, but give
@@ -230,9 +217,7 @@ class BaseParameters(Summarised, Hashable):
         arguments = self.model.arguments(as_motion(*motion))
         return on_samples(self, self.forces, *arguments, shared=(p,))
 
-    def mass_matrix(
-        self, p: Parameters, q: Coordinates
-    ) -> Float[AnyArray, "*batch joints joints"]:
+    def mass_matrix(self, p: Parameters, q: Coordinates) -> AnyArray:
         """Return the mass matrix, which base parameters determine (Eq. 38)."""
         return on_samples(self, self.inertia, self.model.check(q), shared=(p,))
 
@@ -273,9 +258,7 @@ class BaseParameters(Summarised, Hashable):
         )
 
 
-def _as_parameters(
-    kind: str, p: Numbers, size: int
-) -> Float[AnyArray, "*batch parameters"]:
+def _as_parameters(kind: str, p: Numbers, size: int) -> AnyArray:
     """Return parameters as an array with this number of them along its last axis."""
     # What is no array of JAX stays in NumPy, and in float64 where JAX runs in float32.
     p = as_array("p", p)
@@ -287,12 +270,7 @@ def _as_parameters(
     return p
 
 
-def base_parameters(
-    model: Model,
-    *,
-    method: Literal["gram_schmidt", "singular_values"] = "gram_schmidt",
-    seed: int = 0,
-) -> BaseParameters:
+def base_parameters(model: Model, *, seed: int = 0) -> BaseParameters:
     r"""Find the combinations of parameters that forces determine (Eqs. 20-22).
 
     The regressor is evaluated at random motions and stacked. Columns that earlier ones
@@ -302,25 +280,15 @@ def base_parameters(
 
     Args:
         model: The model.
-        method: Method by which dependence is decided; the other one is always the
-            cross-check.
         seed: Seed of the random motions.
 
     Returns:
         The base parameters; a disagreement or a small gap is reported in their `notes`.
-
-    Raises:
-        InputError: If there is no such method.
     """
-    if method not in METHODS:
-        raise InputError(
-            f"`method` must be one of {', '.join(METHODS)}, but is {method!r}."
-        )
     # Random motions excite whatever any motion can excite.
     W, scale = random_regressor(_snapped(model), seed)
-    dependence = METHODS[method](W)
-    (other_method,) = set(METHODS) - {method}
-    cross_check = METHODS[other_method](W)
+    dependence = gram_schmidt(W)
+    rank = rank_by_singular_values(W)
 
     leaders = np.array(dependence.independent, int)
     others = np.array(dependence.dependent, int)
@@ -334,7 +302,7 @@ def base_parameters(
         kappa,
         dependence.smallest_independent,
         dependence.largest_dependent,
-        tuple(_doubts(model, dependence, cross_check, regrouped)),
+        tuple(_doubts(model, dependence, rank, regrouped)),
     )
 
 
@@ -344,14 +312,14 @@ def _snapped(model: Model) -> Model:
 
 
 def _doubts(
-    model: Model, dependence: Dependence, cross_check: Dependence, regrouped: Regrouped
+    model: Model, dependence: Dependence, rank: int, regrouped: Regrouped
 ) -> Iterator[str]:
     """Yield doubts about the choice of base parameters, in sentences."""
     count = len(dependence.independent)
-    if dependence.independent != cross_check.independent:
+    if count != rank:
         yield (
             "the two ways to choose base parameters disagree "
-            f"({count} and {len(cross_check.independent)}): "
+            f"({count} and {rank}): "
             "the geometry is nearly degenerate, or angles are rounded."
         )
     if dependence.smallest_independent < MIN_SHARE:

@@ -100,9 +100,7 @@ class Model(Hashable):
         """Number of standard parameters."""
         return len(self.parameters)
 
-    def split(
-        self, p: Float[AnyArray, " standard"]
-    ) -> list[tuple[AbstractTerm, TermParameters]]:
+    def split(self, p: AnyArray) -> list[tuple[AbstractTerm, TermParameters]]:
         """Return each term with its parameters.
 
         Raises:
@@ -145,7 +143,7 @@ class Model(Hashable):
     def with_memory(self, **changes: Any) -> "Model":
         """Return the model with other fields of `memory`, such as `length`."""
 
-        def change(part: Any) -> Any:
+        def change(part):
             return dataclasses.replace(part, **changes) if _has_memory(part) else part
 
         terms = jax.tree.map(change, self.terms, is_leaf=_has_memory)
@@ -169,7 +167,7 @@ class Model(Hashable):
             state = law.states(motion.q, start)
         return motion.q, motion.qd, motion.qdd, state
 
-    def columns(self, q, qd, qdd, s=None) -> Float[AnyArray, "joints standard"]:
+    def columns(self, q, qd, qdd, s=None) -> AnyArray:
         r"""Return the regressor $\Theta$ of one sample by definition (Eqs. 16, 18)."""
         terms = self.terms if s is None else self.with_memory(state=s).terms
         return jnp.concatenate(
@@ -196,7 +194,7 @@ class Model(Hashable):
             self.inertia(p, q), forces - self.bias(p, q, qd)
         )
 
-    def potential(self, p, q) -> Float[AnyArray, ""]:
+    def potential(self, p, q) -> AnyArray:
         """Return the potential energy of one sample by definition."""
         return reduce(
             add, (t.potential_columns(self.robot, q) @ x for t, x in self.split(p))
@@ -217,8 +215,10 @@ class Model(Hashable):
         p = namespace(tool.parameters).stack(bodies)
         return projection_equation.rigid_body_forces(self.robot, p, q, qd, qdd)
 
-    def regressor(self, motion: Motion) -> Float[AnyArray, "*batch joints standard"]:
+    def regressor(self, motion: Motion) -> AnyArray:
         r"""Return the regressor $\Theta(q, \dot q, \ddot q)$ (Eqs. 16, 18).
+
+        Its shape is [*batch, joints, standard].
 
         Args:
             motion: Joint motion at any number of instants.
@@ -240,9 +240,7 @@ class Model(Hashable):
         """
         return PackedRegressor(self, self.columns, *self.arguments(motion))
 
-    def gram(
-        self, motion: Motion, weights: Joints | None = None
-    ) -> Float[AnyArray, "standard standard"]:
+    def gram(self, motion: Motion, weights: Joints | None = None) -> AnyArray:
         r"""Return the information $\sum_k \Theta_k^T W^2 \Theta_k$ (Eq. 29).
 
         Takes a small part of the time of the regressor, which is never held in memory.
@@ -266,9 +264,7 @@ class Model(Hashable):
         arguments = self.arguments(as_motion(*motion))
         return on_samples(self, self.forces, *arguments, shared=(p,))
 
-    def mass_matrix(
-        self, p: Parameters, q: Coordinates
-    ) -> Float[AnyArray, "*batch joints joints"]:
+    def mass_matrix(self, p: Parameters, q: Coordinates) -> AnyArray:
         r"""Return the mass matrix $M(q)$, rotors included (Eq. 38).
 
         Args:
@@ -302,9 +298,7 @@ class Model(Hashable):
         samples = (self.check(x) for x in (q, qd, forces))
         return on_samples(self, self.acceleration, *samples, shared=(p,))
 
-    def kinetic_energy(
-        self, p: Parameters, *state: Motion | Coordinates
-    ) -> Float[AnyArray, "*batch"]:
+    def kinetic_energy(self, p: Parameters, *state: Motion | Coordinates) -> AnyArray:
         r"""Return the kinetic energy $\frac12 \dot q^T M \dot q$ [J].
 
         Args:
@@ -317,9 +311,7 @@ class Model(Hashable):
         qd = self.check(qd)
         return 0.5 * jnp.einsum("...i,...ij,...j->...", qd, M, qd)
 
-    def potential_energy(
-        self, p: Parameters, q: Coordinates
-    ) -> Float[AnyArray, "*batch"]:
+    def potential_energy(self, p: Parameters, q: Coordinates) -> AnyArray:
         """Return the potential energy [J], zero at the ground's origin."""
         return on_samples(self, self.potential, self.check(q), shared=(p,))
 

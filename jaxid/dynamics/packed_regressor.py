@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Array, Float, Int, as_array, is_traced
+from jaxid.arrays import AnyArray, Array, Float, as_array, is_traced
 from jaxid.errors import InputError
 from jaxid.program import (
     Lowered,
@@ -29,6 +29,8 @@ from .sample_methods import CACHE_SIZE, MAX_SAMPLES_IN_NUMPY, program_of
 
 Columns = tuple[int, ...]
 """Positions of columns, in order."""
+Places = tuple[tuple[tuple[int, int | float], ...], ...]
+"""For each joint its columns, each with the number of an array or a constant."""
 
 
 @functools.lru_cache(maxsize=CACHE_SIZE)
@@ -52,16 +54,14 @@ class JointRegressor(eqx.Module):
         self.size = self.program.output_shapes[0][1]
 
     @property
-    def entries(self) -> list[Int[np.ndarray, " columns"]]:
+    def entries(self) -> list[np.ndarray]:
         """For each joint the positions of its columns in the packed result."""
         return [
             joint * self.size + np.array(columns, int)
             for joint, columns in enumerate(self.columns)
         ]
 
-    def __call__(
-        self, *arrays: AnyArray, fence: bool = False
-    ) -> list[Float[Array, "*batch columns samples"]]:
+    def __call__(self, *arrays: AnyArray, fence: bool = False) -> list[Array]:
         """Return the columns of each joint, from arguments with samples last."""
         # Constants come as floats; an array of the batch's shape is made of each.
         values = lower(self.program, fence)(*arrays)
@@ -78,9 +78,7 @@ class JointRegressor(eqx.Module):
             joints.append(jnp.stack(columns, axis=-2))
         return joints
 
-    def gram(
-        self, weights: AnyArray, *arrays: AnyArray
-    ) -> Float[Array, "columns columns"]:
+    def gram(self, weights: AnyArray, *arrays: AnyArray) -> Array:
         r"""Return $\sum_k \Theta_k^T W^2 \Theta_k$, without storing the columns."""
         groups = tuple(tuple(entries.tolist()) for entries in self.entries)
         products = row_products(self.program, groups, *map(jnp.asarray, arrays))
@@ -89,10 +87,11 @@ class JointRegressor(eqx.Module):
             self.columns, weights, products, strict=True
         ):
             place = np.array(columns, int)
-            total = total.at[place[:, None], place].add(weight**2 * product)
+            weighted_product = weight**2 * product
+            total = total.at[place[:, None], place].add(weighted_product)
         return total
 
-    def in_numpy(self, *arrays: AnyArray) -> list[Float[np.ndarray, "columns samples"]]:
+    def in_numpy(self, *arrays: AnyArray) -> list[np.ndarray]:
         """Return the columns of each joint, evaluated in NumPy."""
         batch = np.shape(arrays[0])[1:]
         distinct = evaluate_rows(self.program, *arrays)
@@ -110,7 +109,7 @@ def _compiled_gram(regressor: JointRegressor) -> Callable:
 
 def gram(
     owner: eqx.Module, definition: Callable, weights: AnyArray | None, *arrays: AnyArray
-) -> Float[Array, "columns columns"]:
+) -> Array:
     """Return the Gram matrix of a model's columns over a motion; see `Model.gram`."""
     joints = _check_positions(owner, arrays[0])
     weights = np.ones(joints) if weights is None else as_array("weights", weights)
@@ -147,14 +146,15 @@ class PackedRegressor(eqx.Module):
     """
 
     values: tuple[Float[AnyArray, " samples"], ...]
-    places: tuple[tuple[tuple[int, int | float], ...], ...] = eqx.field(static=True)
+    places: Places = eqx.field(static=True)
     samples: int = eqx.field(static=True)
     columns: int = eqx.field(static=True)
 
     def __init__(self, owner: eqx.Module, definition: Callable, *samples: AnyArray):
         _check_positions(owner, samples[0])
         arrays = [x.T for x in samples]
-        program = program_of(owner, definition, *(x.shape[:1] for x in arrays))
+        shapes = [x.shape[:1] for x in arrays]
+        program = program_of(owner, definition, *shapes)
         self.places = _places(program)
         self.samples = len(samples[0])
         self.columns = program.output_shapes[0][1]
@@ -163,7 +163,7 @@ class PackedRegressor(eqx.Module):
         else:
             self.values = tuple(evaluate_rows(program, *arrays))
 
-    def matrix(self) -> Float[np.ndarray, "rows columns"]:
+    def matrix(self) -> np.ndarray:
         """Return the whole matrix: all samples of joint 1, of joint 2, etc.
 
         `packed.matrix().reshape(joints, samples, columns)` is a view by joint and
@@ -171,7 +171,9 @@ class PackedRegressor(eqx.Module):
         """
         values = jax.device_get(self.values)
         dtype = np.result_type(*(x.dtype for x in self.values), np.float32)
-        matrix = np.zeros((self.columns, len(self.places), self.samples), dtype)
+        joints = len(self.places)
+        shape = (self.columns, joints, self.samples)
+        matrix = np.zeros(shape, dtype)
         for joint, places in enumerate(self.places):
             for column, place in places:
                 is_constant = isinstance(place, float)
@@ -180,7 +182,7 @@ class PackedRegressor(eqx.Module):
 
 
 @functools.lru_cache(maxsize=CACHE_SIZE)
-def _places(program: Program) -> tuple[tuple[tuple[int, int | float], ...], ...]:
+def _places(program: Program) -> Places:
     """Return the `places` of a packed regressor; what is always zero has none."""
     numbers = range(len(program.distinct[0]))
     entries = np.array(program.pack(numbers), object).reshape(program.output_shapes[0])

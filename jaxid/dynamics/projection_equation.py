@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Bodies, Float, JointMatrix, Joints, Matrix3, Vector3
+from jaxid.arrays import AnyArray, Bodies, JointMatrix, Joints, Matrix3, Vector3
 from jaxid.robot.forward_kinematics import placement_in_parent, placements
 from jaxid.robot.inertia import inertia_tensor
 from jaxid.robot.robot import Robot
@@ -36,17 +36,21 @@ def body_motions(
         R, r = placement_in_parent(robot, i, q[i])
         axis = robot.axis[i]
         # The parent carries the body ...
-        a = R.T @ (a + (skew(wd) + skew(w) @ skew(w)) @ r)
+        w_cross = skew(w)
+        accelerations = skew(wd) + w_cross @ w_cross
+        a = R.T @ (a + accelerations @ r)
         w_parent = R.T @ w
         wd_parent = R.T @ wd
         # ... and the joint moves it relative to the parent.
+        rate = axis * qdd[i]
+        turned_rate = jnp.cross(w_parent, axis) * qd[i]
+        w = w_parent
+        wd = wd_parent
         if robot.revolute[i]:
-            w = w_parent + axis * qd[i]
-            wd = wd_parent + axis * qdd[i] + jnp.cross(w_parent, axis) * qd[i]
+            w = w + axis * qd[i]
+            wd = wd + rate + turned_rate
         else:
-            w = w_parent
-            wd = wd_parent
-            a = a + axis * qdd[i] + 2.0 * jnp.cross(w_parent, axis) * qd[i]
+            a = a + rate + 2.0 * turned_rate
         motions.append((a, w, wd))
     return motions
 
@@ -60,14 +64,19 @@ def partial_velocities(robot: Robot, q: Joints, qd: Joints, qdd: Joints):
     return accelerations
 
 
-def momentum_matrix(w: Vector3) -> Float[AnyArray, "3 6"]:
+def momentum_matrix(w: Vector3) -> AnyArray:
     r"""Return $[\Omega\;|\;-\hat\Omega]$: $(A, ..., F) \to J^o\omega$ (Eq. 9)."""
-    x, y, z = w[0], w[1], w[2]
+    x, y, z = w
     o = 0.0 * x
-    return jnp.array([[x, o, o, o, -z, -y], [o, y, o, -z, o, -x], [o, o, z, -y, -x, o]])
+    rows = [
+        [x, o, o, o, -z, -y],
+        [o, y, o, -z, o, -x],
+        [o, o, z, -y, -x, o],
+    ]
+    return jnp.array(rows)
 
 
-def body_regressor(a: Vector3, w: Vector3, wd: Vector3) -> Float[AnyArray, "6 10"]:
+def body_regressor(a: Vector3, w: Vector3, wd: Vector3) -> AnyArray:
     r"""Return the regressor $\bar\Theta_i$ of one free body (Eq. 10).
 
     Multiplied with the body's parameters $p_i = (m, m r_c, A, B, C, D, E, F)$ it gives
@@ -79,18 +88,15 @@ def body_regressor(a: Vector3, w: Vector3, wd: Vector3) -> Float[AnyArray, "6 10
         w: Angular velocity [rad/s].
         wd: Angular acceleration [rad/s²].
     """
-    force = [a[:, None], skew(wd) + skew(w) @ skew(w), np.zeros((3, 6))]
-    moment = [
-        np.zeros((3, 1)),
-        -skew(a),
-        momentum_matrix(wd) + skew(w) @ momentum_matrix(w),
-    ]
+    w_cross = skew(w)
+    accelerations = skew(wd) + w_cross @ w_cross
+    momentum_rates = momentum_matrix(wd) + w_cross @ momentum_matrix(w)
+    force = [a[:, None], accelerations, np.zeros((3, 6))]
+    moment = [np.zeros((3, 1)), -skew(a), momentum_rates]
     return jnp.block([force, moment])
 
 
-def rigid_body_regressor(
-    robot: Robot, q: Joints, qd: Joints, qdd: Joints
-) -> Float[AnyArray, "joints joints 10"]:
+def rigid_body_regressor(robot: Robot, q: Joints, qd: Joints, qdd: Joints) -> AnyArray:
     r"""Return $\Theta_i = F_{o,i}^T \bar\Theta_i$ of every body (Eq. 11).
 
     Returns:
@@ -134,7 +140,8 @@ def rigid_body_mass_matrix(robot: Robot, p: Bodies, q: Joints) -> JointMatrix:
     n = robot.joints
     frames = [placement_in_parent(robot, i, q[i]) for i in range(n)]
     bodies = composite_bodies(robot, p, frames)
-    M: list[list] = [[jnp.zeros(())] * n for _ in range(n)]
+    zero = jnp.zeros(())
+    M: list[list] = [[zero] * n for _ in range(n)]
     for i in reversed(range(n)):
         m, h, J = bodies[i]
         axis = robot.axis[i]
@@ -161,7 +168,10 @@ def composite_bodies(
 ) -> list[tuple[AnyArray | float, Vector3, Matrix3]]:
     """Return mass, first moment and inertia of all that each joint carries."""
     n = robot.joints
-    bodies = [(p[i][0], p[i][1:4], inertia_tensor(p[i][4:])) for i in range(n)]
+    bodies = []
+    for numbers in p:
+        tensor = inertia_tensor(numbers[4:])
+        bodies.append((numbers[0], numbers[1:4], tensor))
     for i in reversed(range(n)):
         parent = robot.parent[i]
         if parent < 0:
@@ -170,14 +180,17 @@ def composite_bodies(
         R, r = frames[i]
         h = R @ h
         # Steiner, with r x h terms since h is measured from the body's own origin.
-        shift = skew(r) @ skew(h) + skew(h) @ skew(r) + m * (skew(r) @ skew(r))
+        r_cross = skew(r)
+        h_cross = skew(h)
+        shift = r_cross @ h_cross + h_cross @ r_cross + m * (r_cross @ r_cross)
         J = R @ J @ R.T - shift
+        h = h + m * r
         m_parent, h_parent, J_parent = bodies[parent]
-        bodies[parent] = (m_parent + m, h_parent + h + m * r, J_parent + J)
+        bodies[parent] = (m_parent + m, h_parent + h, J_parent + J)
     return bodies
 
 
-def potential_energy_columns(robot: Robot, q: Joints) -> Float[AnyArray, "joints 10"]:
+def potential_energy_columns(robot: Robot, q: Joints) -> AnyArray:
     r"""Return the potential energy $-g^T (m r_o + R m r_c)$ of unit parameters [J]."""
     rotations, origins = placements(robot, q)
     mass = -origins @ robot.gravity

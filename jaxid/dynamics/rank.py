@@ -1,8 +1,8 @@
 """Rank of the regressor: columns that depend on those before them (Eqs. 20-22).
 
-Two independent methods: Gram-Schmidt in column order, which is a QR decomposition
-whose dependent columns use up no direction, and the singular values of the whole
-matrix. Column order decides which columns are independent, so that the choice is the
+Gram-Schmidt in column order is a QR decomposition whose dependent columns use up no
+direction. The singular values of the whole matrix confirm the rank. Column order
+decides which columns are independent, so that the choice is the
 same for all motions.
 """
 
@@ -79,30 +79,22 @@ def gram_schmidt(
     )
 
 
-def singular_values(
-    W: Float[AnyArray, "rows columns"], tolerance: float = 1e-6
-) -> Dependence:
-    """Find the null space by a singular value decomposition.
+def rank_by_singular_values(W: AnyArray, tolerance: float = 1e-6) -> int:
+    """Return the rank: where the singular values fall by the largest factor.
 
-    It is the paper's alternative method. The rank is where the singular values fall by
-    the largest factor. A column depends on earlier ones if some vector of the null
-    space ends there.
+    It is the paper's alternative method.
+
+    Args:
+        W: Matrix, whose columns are scaled to the same length.
+        tolerance: Fraction of the largest singular value; larger ones always count.
     """
     unit_columns, norms = scale_columns(W)
-    columns = len(norms)
-    # The triangular factor has the same singular values and null space, and few rows.
-    triangle = np.linalg.qr(unit_columns, mode="r")
-    _, values, Vt = np.linalg.svd(triangle, full_matrices=True)
-    s = np.zeros(columns)
-    s[: len(values)] = values / max(values[0], np.finfo(float).tiny)
-
-    max_rank = np.count_nonzero(norms)
-    rank = min(_rank_at_largest_fall(s, tolerance), max_rank)
-    dependent = _ends_of_null_vectors(Vt[rank:])
-    independent = tuple(k for k in range(columns) if k not in dependent)
-    min_share = float(s[rank - 1]) if rank else np.inf
-    max_share = float(s[rank]) if rank < columns else 0.0
-    return Dependence(independent, dependent, min_share, max_share)
+    s = np.zeros(len(norms))
+    values = np.linalg.svd(unit_columns, compute_uv=False)
+    largest_value = max(values[0], np.finfo(float).tiny)
+    s[: len(values)] = values / largest_value
+    rank = _rank_at_largest_fall(s, tolerance)
+    return min(rank, int(np.count_nonzero(norms)))
 
 
 def _rank_at_largest_fall(s: np.ndarray, tolerance: float) -> int:
@@ -114,31 +106,13 @@ def _rank_at_largest_fall(s: np.ndarray, tolerance: float) -> int:
         return min_rank
     values = np.maximum(s, 1e-14)  # all below are rounding
     falls = values[:-1] / values[1:]
-    return int(ranks[np.argmax(np.where(is_possible, falls, 0.0))])
-
-
-def _ends_of_null_vectors(
-    null_space: Float[np.ndarray, "vectors columns"],
-) -> Columns:
-    """Return the columns at which vectors of the null space end."""
-    ends: list[int] = []
-    # Eliminate from the last column backwards: a pivot found there is where a vector
-    # ends.
-    for k in reversed(range(null_space.shape[1])):
-        if not len(null_space):
-            break
-        pivot = null_space[:, k]
-        if np.linalg.norm(pivot) < 1e-8:
-            continue
-        ends.append(k)
-        Q = np.linalg.qr(pivot[:, None], mode="complete").Q
-        null_space = (Q.T @ null_space)[1:]
-    return tuple(sorted(ends))
+    possible_falls = np.where(is_possible, falls, 0.0)
+    return int(ranks[np.argmax(possible_falls)])
 
 
 def scale_columns(
-    W: Float[AnyArray, "rows columns"],
-) -> tuple[Float[np.ndarray, "rows columns"], Float[np.ndarray, " columns"]]:
+    W: AnyArray,
+) -> tuple[np.ndarray, np.ndarray]:
     """Return a matrix with columns of length one, and their lengths before.
 
     Columns that are nothing but rounding become zero, and so does their length.
@@ -160,7 +134,7 @@ class Regrouped(NamedTuple):
 
 
 def regrouping(
-    W: Float[AnyArray, "rows columns"],
+    W: AnyArray,
     independent: Sequence[int] | np.ndarray,
     dependent: Sequence[int] | np.ndarray,
 ) -> Regrouped:
@@ -182,31 +156,35 @@ def regrouping(
         # The second step takes out most of the rounding that poor conditioning
         # amplifies.
         for _ in range(2):
-            residuals = np.where(is_before, Q.T @ (W2 - W1 @ kappa), 0.0)
+            projections = Q.T @ (W2 - W1 @ kappa)
+            residuals = np.where(is_before, projections, 0.0)
             kappa = kappa + scipy.linalg.solve_triangular(R, residuals)
-    max_residual = np.linalg.norm(W2 - W1 @ kappa, axis=0).max(initial=0.0)
+    errors = np.linalg.norm(W2 - W1 @ kappa, axis=0)
+    max_residual = errors.max(initial=0.0)
 
     kappa = np.where(np.abs(kappa) > 1e-9, kappa, 0.0)
     # Columns of nothing but rounding stay as they are.
     scale = np.where(norms > 0, norms, 1.0)
-    kappa = kappa * scale[others] / scale[leaders][:, None]
+    leader_scale = scale[leaders]
+    kappa = kappa * scale[others] / leader_scale[:, None]
     return Regrouped(kappa, float(max_residual), shares)
 
 
-def random_regressor(
-    model: Model, seed: int
-) -> tuple[Float[np.ndarray, "rows standard"], Float[np.ndarray, " standard"]]:
+def random_regressor(model: Model, seed: int) -> tuple[np.ndarray, np.ndarray]:
     r"""Return the regressor $\Theta_{QR}$ at random motions, free of units (Eq. 20).
 
     Lengths are measured in the robot's own size, so that metres or millimetres make no
     difference. It is computed in float64, whatever the precision in which JAX runs.
     With it comes for each parameter the factor by which its column was multiplied.
     """
-    samples = max(25, math.ceil(3.0 * model.size / model.robot.joints))
+    joints = model.robot.joints
+    samples = max(25, math.ceil(3.0 * model.size / joints))
     motion = random_motion(model, samples, seed)
     theta = in_numpy(model, model.columns, motion.q, motion.qd, motion.qdd)
-    rows, columns = row_units(model), column_units(model)
-    return (theta * rows[:, None] * columns).reshape(-1, model.size), columns
+    rows = row_units(model)
+    columns = column_units(model)
+    scaled_theta = theta * rows[:, None] * columns
+    return scaled_theta.reshape(-1, model.size), columns
 
 
 def random_motion(model: Model, samples: int, seed: int) -> Motion:
@@ -222,16 +200,17 @@ def random_motion(model: Model, samples: int, seed: int) -> Motion:
     qd = rng.uniform(-3.0, 3.0, shape) * units
     qdd = rng.uniform(-6.0, 6.0, shape) * units
     slow_samples = qd[1::2]
-    slow_samples *= 1e-3 ** rng.uniform(0.0, 1.0, slow_samples.shape)
+    exponents = rng.uniform(0.0, 1.0, slow_samples.shape)
+    slow_samples *= 1e-3**exponents
     return Motion(q, qd, qdd)
 
 
-def row_units(model: Model) -> Float[np.ndarray, " joints"]:
+def row_units(model: Model) -> np.ndarray:
     """Return the units of the coordinates: 1 rad, or the robot's size [m]."""
     return np.where(np.array(model.robot.revolute), 1.0, characteristic_length(model))
 
 
-def column_units(model: Model) -> Float[np.ndarray, " standard"]:
+def column_units(model: Model) -> np.ndarray:
     """Return the units of the parameters: powers of the robot's size."""
     size = characteristic_length(model)
     return np.array([size ** length_power(unit) for unit in model.parameter_units])

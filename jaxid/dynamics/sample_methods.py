@@ -22,7 +22,6 @@ import numpy as np
 from jaxid.arrays import (
     AnyArray,
     Array,
-    Float,
     Numbers,
     as_array,
     content,
@@ -42,7 +41,7 @@ class OpenModel(eqx.Module):
     # leaves of the model that have such numbers, and their positions in each
     places: tuple[tuple[int, tuple[int, ...]], ...] = eqx.field(static=True)
 
-    def call(self, numbers: Float[AnyArray, " numbers"], *arguments: AnyArray) -> Array:
+    def call(self, numbers: AnyArray, *arguments: AnyArray) -> Array:
         """Call the method of the model with these numbers."""
         leaves, structure = jax.tree.flatten(self.model)
         start = 0
@@ -61,7 +60,7 @@ class OpenModel(eqx.Module):
 
 def opened(
     method: str, model: eqx.Module, *others: eqx.Module
-) -> tuple[OpenModel, Float[AnyArray, "models numbers"]]:
+) -> tuple[OpenModel, AnyArray]:
     """Return a method with numbers of the model as inputs: traced, or different ones.
 
     All other numbers stay constants of a program. The numbers are those of each model.
@@ -99,10 +98,10 @@ MAX_JOINTS = {"inertia": 16, "acceleration": 16}
 def spatial_form(owner: Any) -> Any:
     """Return a model, or what holds one, with methods of few array operations."""
 
-    def has_spatial_form(part: Any) -> bool:
+    def has_spatial_form(part):
         return hasattr(part, "spatial_form")
 
-    def transform(part: Any) -> Any:
+    def transform(part):
         return part.spatial_form if has_spatial_form(part) else part
 
     return jax.tree.map(transform, owner, is_leaf=has_spatial_form)
@@ -171,17 +170,15 @@ class SampleMethod:
         return jax.jit(self.on_rows)
 
 
-def definition_on_rows(
-    definition: Callable, *arrays: Array
-) -> Float[Array, "samples out"]:
+def definition_on_rows(definition: Callable, *arrays: Array) -> Array:
     """Apply a function of one sample to arrays as in `on_rows`, block by block."""
 
-    def on_one_sample(rows: list[Array]) -> Array:
+    def on_one_sample(rows):
         remaining = iter(rows)
         arguments = [next(remaining) if x.ndim == 2 else x for x in arrays]
         return jnp.ravel(definition(*arguments))
 
-    def in_blocks(samples: list[Array]) -> Array:
+    def in_blocks(samples):
         # Without checkpoints a gradient would store the intermediates of all blocks.
         on_block = jax.checkpoint(on_one_sample)
         return jax.lax.map(on_block, samples, batch_size=BLOCK)
@@ -234,9 +231,11 @@ def on_samples(
         return on_samples(model, model.call, *samples, shared=(numbers, *shared))
 
     # Lists become NumPy arrays; only arrays of JAX make the result one.
-    arrays = [*(as_array("p", x) for x in shared), *samples]
+    parameters = [as_array("p", x) for x in shared]
+    arrays = [*parameters, *samples]
     batch = _batch_shape(arrays)
-    method = method_of(owner, definition, *(x.shape[-1:] for x in arrays))
+    shapes = [x.shape[-1:] for x in arrays]
+    method = method_of(owner, definition, *shapes)
     dtype = jnp.result_type(*(x.dtype for x in arrays), float)
     in_jax = [x for x in arrays if isinstance(x, jax.Array)]
     # Inside `jit` and the like the method becomes a part of what is compiled.
@@ -245,15 +244,19 @@ def on_samples(
         return _over_batches(method.on_rows, batch, inputs, len(shared))
 
     # A few samples are done before XLA has compiled; arrays elsewhere stay there.
-    devices = {device for x in in_jax for device in x.devices()}
-    is_on_one_cpu = len(devices) <= 1 and all(d.platform == "cpu" for d in devices)
-    is_small = math.prod(batch) <= MAX_SAMPLES_IN_NUMPY and not method.is_long
+    devices = set().union(*(x.devices() for x in in_jax))
+    platforms = {device.platform for device in devices}
+    is_on_one_cpu = len(devices) <= 1 and platforms <= {"cpu"}
+    samples_count = math.prod(batch)
+    is_small = samples_count <= MAX_SAMPLES_IN_NUMPY and not method.is_long
     if is_small and is_on_one_cpu:
         columns = [_entries_first(x) for x in arrays]
         results = evaluate(method.program, *columns)
         results = _samples_first(results, len(batch)).astype(dtype, copy=False)
-        with jax.default_device(*devices or (None,)):
-            return jnp.asarray(results) if in_jax else results
+        if not in_jax:
+            return results
+        with jax.default_device(*devices):
+            return jnp.asarray(results)
 
     inputs = [jnp.asarray(x, dtype) for x in arrays]
     results = _over_batches(method.compiled, batch, inputs, len(shared))
@@ -302,10 +305,11 @@ def _over_batches(
         inputs = []
         for k, x in enumerate(arrays):
             is_common = k < shared and (x.ndim == 1 or x.shape[-2] == 1)
-            if is_common and x.ndim > 1:
-                x = x[..., 0, :]
-            axes = (-1,) if is_common else (-1, samples)
-            inputs.append(_broadcast_rows(x, batch[:-1] if is_common else batch, axes))
+            if not is_common:
+                inputs.append(_broadcast_rows(x, batch, (-1, samples)))
+                continue
+            vector = x if x.ndim == 1 else x[..., 0, :]
+            inputs.append(_broadcast_rows(vector, batch[:-1], (-1,)))
         results = jax.vmap(run)(*inputs)
         results = results.reshape(-1, *results.shape[2:])
     return results.reshape(*batch, *results.shape[1:])

@@ -20,7 +20,7 @@ from jaxid.robot.robot import Robot
 Spatial = Float[Array, "joints 6"]
 
 
-def _motion_products(skew: np.ndarray) -> Float[np.ndarray, "6 6 6"]:
+def _motion_products(skew: np.ndarray) -> np.ndarray:
     r"""Return the matrices $v \times$ of unit motions, along the last axis."""
     products = np.zeros((6, 6, 6))
     products[:3, :3, :3] = skew
@@ -29,7 +29,7 @@ def _motion_products(skew: np.ndarray) -> Float[np.ndarray, "6 6 6"]:
     return products
 
 
-def _unit_inertias(skew: np.ndarray) -> Float[np.ndarray, "6 6 10"]:
+def _unit_inertias(skew: np.ndarray) -> np.ndarray:
     r"""Return the inertias of unit parameters $(m, m r_c, A, B, C, D, E, F)$."""
     inertias = np.zeros((6, 6, 10))
     inertias[3:, 3:, 0] = np.eye(3)
@@ -56,7 +56,7 @@ def _times(matrices: Array, x: Array) -> Array:
     return jnp.einsum("nij,nj->ni", matrices, x)
 
 
-def moved_by(robot: Robot) -> Float[np.ndarray, "joints joints"]:
+def moved_by(robot: Robot) -> np.ndarray:
     """Return 1 where a body (row) is moved by a joint (column), else 0."""
     is_moved = np.zeros((robot.joints, robot.joints))
     for body, chain in enumerate(robot.ancestors):
@@ -64,7 +64,7 @@ def moved_by(robot: Robot) -> Float[np.ndarray, "joints joints"]:
     return is_moved
 
 
-def all_placements(robot: Robot, q: Joints) -> Float[Array, "joints 4 4"]:
+def all_placements(robot: Robot, q: Joints) -> Array:
     """Return the homogeneous placements of all bodies in the frame of the ground.
 
     Each turn of the loop doubles the number of joints that a placement passes over.
@@ -86,17 +86,17 @@ def all_placements(robot: Robot, q: Joints) -> Float[Array, "joints 4 4"]:
     return placements
 
 
-def _bottom_rows(robot: Robot, dtype: Any) -> Float[Array, "joints 1 4"]:
+def _bottom_rows(robot: Robot, dtype: Any) -> Array:
     """Return the last rows of homogeneous matrices."""
     return jnp.asarray(np.broadcast_to(np.eye(4)[3:], (robot.joints, 1, 4)), dtype)
 
 
-def _relative_placements(robot: Robot, q: Joints) -> Float[Array, "joints 3 4"]:
+def _relative_placements(robot: Robot, q: Joints) -> Array:
     """Return rotation and position of each body in its parent's frame."""
     dtype = q.dtype
-    axis, rotation, offset = (
-        jnp.asarray(x, dtype) for x in (robot.axis, robot.rotation, robot.offset)
-    )
+    axis = jnp.asarray(robot.axis, dtype)
+    rotation = jnp.asarray(robot.rotation, dtype)
+    offset = jnp.asarray(robot.offset, dtype)
     is_revolute = np.array(robot.revolute)[:, None, None]
     turns = jnp.asarray(is_revolute, dtype)
     slides = jnp.asarray(~is_revolute, dtype)
@@ -107,13 +107,15 @@ def _relative_placements(robot: Robot, q: Joints) -> Float[Array, "joints 3 4"]:
     axis_column = axis[:, :, None]
     along = axis_column * axis[:, None, :]
     across = turns * (identity - along)
+    sideways = turns * _combine(SKEW, axis)
     turn = identity + (jnp.cos(angle) - 1) * across
-    turn = turn + turns * jnp.sin(angle) * _combine(SKEW, axis)
+    turn = turn + jnp.sin(angle) * sideways
 
     shift = slides * angle * axis_column
     motion = jnp.concatenate([turn, shift], axis=2)
     last_column = ((0, 0), (0, 0), (3, 0))
-    return rotation @ motion + jnp.pad(offset[:, :, None], last_column)
+    translation = jnp.pad(offset[:, :, None], last_column)
+    return rotation @ motion + translation
 
 
 class GroundMotion(NamedTuple):
@@ -130,7 +132,8 @@ def ground_motion(robot: Robot, q: Joints, qd: Joints, qdd: Joints) -> GroundMot
     dtype = q.dtype
     placements = all_placements(robot, q)
     R = placements[:, :3, :3]
-    arm = _combine(SKEW, placements[:, :3, 3]) @ R
+    origins = placements[:, :3, 3]
+    arm = _combine(SKEW, origins) @ R
     upper = jnp.concatenate([R, arm], axis=2)
     lower = jnp.concatenate([jnp.zeros_like(R), R], axis=2)
     carry = jnp.concatenate([upper, lower], axis=1)
@@ -147,14 +150,17 @@ def ground_motion(robot: Robot, q: Joints, qd: Joints, qdd: Joints) -> GroundMot
     speeds = joints * qd[:, None]
     # Sums over all joints that move a body replace the recursion along the tree.
     v = is_moved @ speeds
-    a = is_moved @ (joints * qdd[:, None] + _times(_combine(CROSS, v), speeds))
+    crosses = _combine(CROSS, v)
+    rates = joints * qdd[:, None] + _times(crosses, speeds)
+    a = is_moved @ rates
     gravity = jnp.concatenate([jnp.zeros(3, dtype), jnp.asarray(robot.gravity, dtype)])
     return GroundMotion(carry, joints, v, a - gravity[None])
 
 
-def ground_inertias(p: Bodies, carry: Array) -> Float[Array, "joints 6 6"]:
+def ground_inertias(p: Bodies, carry: Array) -> Array:
     """Return the spatial inertias of the bodies about the origin of the ground."""
-    return carry @ _combine(INERTIA, p) @ jnp.swapaxes(carry, 1, 2)
+    inertias = _combine(INERTIA, p)
+    return carry @ inertias @ jnp.swapaxes(carry, 1, 2)
 
 
 def spatial_forces(
@@ -187,9 +193,7 @@ def spatial_mass_matrix(robot: Robot, p: Bodies, q: Joints) -> JointMatrix:
     return lower + (lower * off_diagonal).T
 
 
-def spatial_regressor(
-    robot: Robot, q: Joints, qd: Joints, qdd: Joints
-) -> Float[Array, "joints joints 10"]:
+def spatial_regressor(robot: Robot, q: Joints, qd: Joints, qdd: Joints) -> Array:
     """Return the regressor of every body (Eq. 11)."""
     carry, joints, v, a = ground_motion(robot, q, qd, qdd)
     # In the frames of the bodies, where the parameters are constant.

@@ -140,7 +140,7 @@ def shrink_to_constraints(problem: ExcitationProblem, x: ScaledMotion) -> Candid
     x = np.asarray(x)
     grid = problem.limits.grid()
 
-    def is_kept(factor: float) -> bool:
+    def is_kept(factor):
         return problem.excess(grid.shrink(x, factor)) <= 0.0
 
     factors = np.arange(1.0 - SHRINKAGE_STEP, 0.0, -SHRINKAGE_STEP)

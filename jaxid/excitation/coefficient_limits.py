@@ -199,7 +199,7 @@ class JointLimits(eqx.Module):
         sizes = [half, limits.velocity, limits.acceleration, limits.jerk]
         return np.array(sizes, np.float64)
 
-    def coefficients(self, y: Float[AnyArray, "*batch scaled"]) -> AnyArray:
+    def coefficients(self, y: AnyArray) -> AnyArray:
         """Return the coefficients of trajectories from scaled ones."""
         scale = np.asarray(self.scale)[(None,) * (y.ndim - 1)]
         return y.reshape((*y.shape[:-1], *self.shape)) * scale

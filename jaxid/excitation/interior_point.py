@@ -306,7 +306,7 @@ def _barrier_hessian(
     return H
 
 
-def _add_limits(H: np.ndarray, grid: Grid, stiffness: np.ndarray) -> None:
+def _add_limits(H: np.ndarray, grid: Grid, stiffness: np.ndarray):
     """Add the curvature of the limits, which couple the variables of one joint only."""
     upper, lower = stiffness.reshape(2, *grid.c.shape)
     stiff_rows = grid.R * (upper + lower)[:, :, None]

@@ -9,7 +9,6 @@ import numpy as np
 from jaxid.arrays import (
     AnyArray,
     Array,
-    Float,
     PRNGKeyArray,
     namespace,
     require_float64,
@@ -149,7 +148,7 @@ class ExcitationProblem:
         """Return the trajectory of scaled coefficients."""
         return self.basis.trajectory(self.limits.coefficients(x))
 
-    def random(self, key: PRNGKeyArray) -> Float[Array, " scaled"]:
+    def random(self, key: PRNGKeyArray) -> Array:
         """Draw scaled coefficients of a motion that fills the limits of the joints."""
         return self.limits.random(key, 1)[0]
 
@@ -192,7 +191,7 @@ class ExcitationProblem:
         """Return the logarithm of the criterion of one motion's information."""
         return self.criterion(Information(plain, weighted, self.sizes), sharpness)
 
-    def inequalities(self, x: ScaledMotion) -> Float[Array, " inequalities"]:
+    def inequalities(self, x: ScaledMotion) -> Array:
         """Return what must not be positive: excess over limits and constraints.
 
         Limits of the joints hold for all times if these are not positive. Constraints
@@ -224,7 +223,7 @@ class ExcitationProblem:
         self,
         x: ScaledMotion,
         instants: Any = slice(None),
-    ) -> list[Float[AnyArray, "instants values"]]:
+    ) -> list[AnyArray]:
         """Return the values of each constraint at some of the checked instants.
 
         Args:

@@ -9,6 +9,7 @@ short.
 
 import math
 import re
+import textwrap
 from collections.abc import Sequence
 from fractions import Fraction
 from pathlib import Path
@@ -107,18 +108,22 @@ class CWriter:
         share memory.
         """
         lines = self._statements(program, inputs)
-        places = [x.place for x in program.nodes if x.operation is Operation.INPUT]
-        numbers = {number for number, _ in places}
-        lines += [f"(void){x};" for k, x in enumerate(inputs) if k not in numbers]
-        for output, entries in zip(
-            outputs, program.split(program.outputs), strict=True
-        ):
+        input_nodes = [x for x in program.nodes if x.operation is Operation.INPUT]
+        numbers = {node.place[0] for node in input_nodes}
+        # Compilers warn of arguments that nothing reads.
+        for number, name_of_input in enumerate(inputs):
+            if number not in numbers:
+                lines.append(f"(void){name_of_input};")
+        entries_of_outputs = program.split(program.outputs)
+        for output, entries in zip(outputs, entries_of_outputs, strict=True):
             if not entries:
                 lines.append(f"(void){output};")
             for k, x in enumerate(entries):
-                lines.append(f"{output}[{k}] = {self._operand(x)};")
-        body = "\n".join(f"    {line}" for line in lines)
-        return f"{self.declaration(name, inputs, outputs)}\n{{\n{body}\n}}\n"
+                operand = self._operand(x)
+                lines.append(f"{output}[{k}] = {operand};")
+        declaration = self.declaration(name, inputs, outputs)
+        body = textwrap.indent("\n".join(lines), "    ")
+        return f"{declaration}\n{{\n{body}\n}}\n"
 
     def _operand(self, x: Reference) -> str:
         """Write the variable of a node, or a constant."""
@@ -131,12 +136,13 @@ class CWriter:
         lines: list[str] = []
         for stage in range(max(stages, default=0) + 1):
             nodes = [k for k, number in enumerate(stages) if number == stage]
+            functions = {k: self._function(program, k) for k in nodes}
             for name in self.widths:
-                calls = [k for k in nodes if self._function(program, k) == name]
+                calls = [k for k in nodes if functions[k] == name]
                 if calls:
                     lines += self._call(program, name, calls, stage)
             for k in nodes:
-                if self._function(program, k) is None:
+                if functions[k] is None:
                     lines.append(self._statement(program, k, inputs))
         return lines
 
@@ -165,7 +171,8 @@ class CWriter:
         else:
             operands = [self._operand(x) for x in node.operands]
             text = node.operation.spell(operands, self._formats, self._suffix)
-        kind = "int" if "truth" in node.operation.traits else self.type
+        is_truth = "truth" in node.operation.traits
+        kind = "int" if is_truth else self.type
         return f"const {kind} t{k} = {text};"
 
     @property
@@ -188,19 +195,24 @@ class CWriter:
     ) -> list[str]:
         """Write a call of the library for several nodes."""
         width = self.widths[name]
-        operands = list(dict.fromkeys(program.nodes[k].operands[0] for k in nodes))
+        angles = [program.nodes[k].operands[0] for k in nodes]
+        operands = list(dict.fromkeys(angles))
         arguments = [self._operand(x) for x in operands]
         # The library always computes as many numbers.
-        arguments += [self.number(0.0)] * (width - len(operands))
+        padding = width - len(operands)
+        arguments += [self.number(0.0)] * padding
         label = f"t{name[0]}{stage}"
         results = [f"{label}a"]
         if len(LIBRARY[name]) > 1:
             results.append(f"{label}b")
         arrays = [f"{x}[{width}]" for x in results]
+        argument_list = ", ".join(arguments)
+        array_list = ", ".join(arrays)
+        result_list = ", ".join(results)
         lines = [
-            f"const {self.type} {label}[{width}] = {{{', '.join(arguments)}}};",
-            f"{self.type} {', '.join(arrays)};",
-            f"{self.prefix}_{name}({label}, {', '.join(results)});",
+            f"const {self.type} {label}[{width}] = {{{argument_list}}};",
+            f"{self.type} {array_list};",
+            f"{self.prefix}_{name}({label}, {result_list});",
         ]
         for k in nodes:
             operation, (x,) = program.nodes[k]
@@ -258,7 +270,7 @@ def _count_calls(program: Program, operations: Sequence[Operation]) -> int:
     return len({x.operands for x in program.nodes if x.operation in operations})
 
 
-def _check_names(names: list[str]) -> None:
+def _check_names(names: list[str]):
     """Reject names that C does not allow, or that occur twice."""
     for name in names:
         is_identifier = re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name)

@@ -66,17 +66,16 @@ def gradient_program(program: Program) -> Program:
     graph = Graph()
     shapes = program.input_shapes
     # Inputs are loaded before the first operation, so that they come first.
-    weights = [
-        graph.node(Operation.INPUT, len(shapes), k) for k in range(len(program.outputs))
-    ]
+    number = len(shapes)
+    entries = range(len(program.outputs))
+    weights = [graph.node(Operation.INPUT, number, entry) for entry in entries]
     scalars = record(program, graph)
     slopes = _slopes_of_nodes(program, scalars, weights)
 
-    places = {
-        node.place: k
-        for k, node in enumerate(program.nodes)
-        if node.operation is Operation.INPUT
-    }
+    places = {}
+    for k, node in enumerate(program.nodes):
+        if node.operation is Operation.INPUT:
+            places[node.place] = k
     outputs = []
     for number, shape in enumerate(shapes):
         for entry in range(math.prod(shape)):
@@ -101,9 +100,10 @@ def _slopes_of_nodes(
         node = program.nodes[k]
         if node.operation is Operation.INPUT or slopes[k] == 0.0:
             continue
-        operands = tuple(scalars[x] if isinstance(x, int) else x for x in node.operands)
+        references = node.operands
+        operands = tuple(scalars[x] if isinstance(x, int) else x for x in references)
         shares = _slopes(node.operation, operands, scalars[k], slopes[k])
-        for x, share in zip(node.operands, shares, strict=True):
+        for x, share in zip(references, shares, strict=True):
             if isinstance(x, int):
                 slopes[x] = add(slopes[x], share)
     return slopes

@@ -77,7 +77,7 @@ def user_cache() -> Path:
     return (xdg if xdg.is_absolute() else home / ".cache") / "jaxid"
 
 
-def _require_private(folder: Path) -> None:
+def _require_private(folder: Path):
     """Check that a folder is the user's own; make it if it is missing."""
     for path in reversed([folder, *folder.parents]):
         with contextlib.suppress(FileExistsError):
@@ -94,7 +94,7 @@ def _require_private(folder: Path) -> None:
         )
 
 
-def _remove_oldest(folder: Path, max_bytes: int) -> None:
+def _remove_oldest(folder: Path, max_bytes: int):
     """Remove the least recently used files."""
     files = []
     for path in folder.glob("*-cache"):

@@ -38,9 +38,7 @@ BLOCK = 2048
 class Plan(NamedTuple):
     """A program as one function on cells of memory, which nodes share."""
 
-    loads: tuple[
-        tuple[int, int, int], ...
-    ]  # cell, number of its input, and entry there
+    loads: list[tuple[int, int, int]]  # cell, number of its input, and entry there
     run: Callable[[list[np.ndarray]], None]  # all operations, on the cells
     cells: int  # number of cells; those of the results come first
 
@@ -84,9 +82,8 @@ def _plan(program: Program) -> Plan:
         if node.operation is Operation.INPUT:
             loads.append((cells[position], *node.place))
             continue
-        operands = ", ".join(
-            names[x] if isinstance(x, int) else repr(x) for x in node.operands
-        )
+        spellings = [names[x] if isinstance(x, int) else repr(x) for x in node.operands]
+        operands = ", ".join(spellings)
         function = node.operation.numpy.__name__
         scope.setdefault(function, node.operation.numpy)
         if "truth" in node.operation.traits:
@@ -97,7 +94,7 @@ def _plan(program: Program) -> Plan:
     unpack = "".join(f"c{k}, " for k in range(count))
     body = "".join(f"    {line}\n" for line in lines)
     exec(f"def run(cells):\n    [{unpack}] = cells\n{body}", scope)
-    return Plan(tuple(loads), scope["run"], count)
+    return Plan(loads, scope["run"], count)
 
 
 def _allocate_cells(program: Program) -> tuple[list[int], int]:
@@ -137,22 +134,25 @@ def _evaluate(
     program: Program, arrays: tuple[AnyArray, ...]
 ) -> tuple[np.ndarray, Shape]:
     """Return the results that vary [results, samples], and the batch."""
-    loads, run, cell_count = _plan(program)
-    entries, batch = program.align([np.asarray(x, np.float64) for x in arrays], np)
+    plan = _plan(program)
+    numbers = [np.asarray(x, np.float64) for x in arrays]
+    entries, batch = program.align(numbers, np)
     samples = math.prod(batch)
     inputs = [x.reshape(len(x), samples) for x in entries]
     # Results are written in place; all else goes through a few short rows.
-    results = np.empty((len(program.distinct[0]), samples))
-    scratch = np.empty((cell_count - len(results), min(samples, BLOCK)))
+    count = len(program.distinct[0])
+    results = np.empty((count, samples))
+    scratch = np.empty((plan.cells - count, min(samples, BLOCK)))
     with np.errstate(all="ignore"):
         for start in range(0, samples, BLOCK):
             stop = min(start + BLOCK, samples)
             block = slice(start, stop)
-            cells = [*results[:, block], *scratch[:, : stop - start]]
-            for cell, number, entry in loads:
+            scratch_cells = scratch[:, : stop - start]
+            cells = [*results[:, block], *scratch_cells]
+            for cell, number, entry in plan.loads:
                 row = inputs[number][entry]
                 cells[cell][:] = row[block]
-            run(cells)
+            plan.run(cells)
     return results, batch
 
 

@@ -85,7 +85,7 @@ class Program:
         """Numbers of operations of the program."""
         operations = Counter(node.operation for node in self.nodes)
 
-        def count(*traits: str) -> int:
+        def count(*traits):
             members = [x for x in operations if x.traits.intersection(traits)]
             return sum(operations[x] for x in members)
 
@@ -174,7 +174,7 @@ def assemble(
     scalars = live_scalars(outputs)
     place = {scalar.index: k for k, scalar in enumerate(scalars)}
 
-    def reference(x: Operand) -> Reference:
+    def reference(x):
         return place[x.index] if isinstance(x, Scalar) else float(x)
 
     nodes = []

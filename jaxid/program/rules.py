@@ -4,7 +4,6 @@ import functools
 import itertools
 import string
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -38,11 +37,11 @@ def with_derivatives_of(definition: Callable, run: Callable) -> Callable:
     """
     function = jax.custom_jvp(run)
 
-    def derivative(primals: tuple, tangents: tuple) -> tuple:
+    def derivative(primals, tangents):
         has_tangent = [not isinstance(x, SymbolicZero) for x in tangents]
         variables = [k for k, tangent in enumerate(has_tangent) if tangent]
 
-        def of_variables(*values: Array) -> Any:
+        def of_variables(*values):
             arrays = list(primals)
             for k, value in zip(variables, values, strict=True):
                 arrays[k] = value
@@ -66,7 +65,7 @@ def divided(function: Callable) -> Callable:
     """
 
     @custom_vmap
-    def run(*arrays: Array) -> Any:
+    def run(*arrays):
         if jax.sharding.get_abstract_mesh().manual_axes:
             # `shard_map` has divided the arrays already.
             return function(*arrays)
@@ -74,7 +73,7 @@ def divided(function: Callable) -> Callable:
         count = len(program.consts)
 
         # JAX divides functions without constants only: they become arguments.
-        def without_constants(*arguments: Array) -> Any:
+        def without_constants(*arguments):
             jaxpr = ClosedJaxpr(program.jaxpr, arguments[:count])
             results = jaxpr_as_fun(jaxpr)(*arguments[count:])
             return jax.tree.unflatten(jax.tree.structure(shapes), results)
@@ -83,7 +82,7 @@ def divided(function: Callable) -> Callable:
         return on_devices(*program.consts, *arrays)
 
     @run.def_vmap
-    def batch(size: int, is_batched: list[bool], *arrays: Array) -> tuple[Any, Any]:
+    def batch(size, is_batched, *arrays):
         axes = [0 if x else None for x in is_batched]
         results = jax.vmap(function, axes)(*arrays)
         return results, jax.tree.map(lambda _: True, results)
@@ -101,7 +100,7 @@ def _divisible(function: Callable, on_all: Callable, constants: int) -> Callable
     """
     divisible = custom_partitioning(on_all)
 
-    def partition(mesh: Any, arguments: Any, results: Any) -> tuple:
+    def partition(mesh, arguments, results):
         # The leading axis of the first array that is divided.
         specs = [x.sharding.spec[:1] for x in arguments[constants:]]
         leading = next((spec for spec in specs if any(spec)), ())
@@ -110,17 +109,17 @@ def _divisible(function: Callable, on_all: Callable, constants: int) -> Callable
         arrays = len(arguments) - constants
         shardings = (on_each,) * constants + (by_parts,) * arrays
 
-        def on_part(*arguments: Array) -> Any:
+        def on_part(*arguments):
             return function(*arguments[constants:])
 
         return mesh, on_part, jax.tree.map(lambda _: by_parts, results), shardings
 
-    def rule(_: Any, arguments: Any, results: Any) -> str:
+    def rule(_, arguments, results):
         """Name the axes: all arrays share the leading one, and no others."""
         letters = itertools.product(string.ascii_lowercase, repeat=2)
         names = map("".join, letters)
 
-        def axes(x: Any, is_array: bool) -> str:
+        def axes(x, is_array):
             words = list(itertools.islice(names, len(x.shape)))
             if is_array:
                 words[:1] = ["lead"]

@@ -65,16 +65,18 @@ def _pad(x: np.ndarray, filler: np.ndarray, *, padding_config) -> np.ndarray:
     """Put a number before, behind and between the entries, or cut them off."""
     for axis, (before, behind, gaps) in enumerate(padding_config):
         x = np.moveaxis(x, axis, 0)
+        entries = len(x)
+        gaps_between = (entries - 1) * gaps
         start = max(before, 0)
-        length = max(len(x) + (len(x) - 1) * gaps, 0)
-        stop = start + length
+        stop = start + max(entries + gaps_between, 0)
         size = stop + max(behind, 0)
         result = np.full((size, *x.shape[1:]), filler, x.dtype)
         result[start : stop : gaps + 1] = x
         # A negative number cuts entries off.
         first = max(-before, 0)
         end = size - max(-behind, 0)
-        x = np.moveaxis(result[first:end], 0, axis)
+        remaining_entries = result[first:end]
+        x = np.moveaxis(remaining_entries, 0, axis)
     return x
 
 
@@ -122,20 +124,22 @@ _INDEXED = {
 def _on_numbers(equation: JaxprEqn, *operands: np.ndarray) -> Arrays:
     """Run one equation on numbers, in NumPy where it suffices."""
     name = equation.primitive.name
+    parameters = equation.params
     if name == "iota":
-        indices = np.indices(equation.params["shape"], equation.params["dtype"])
-        return [indices[equation.params["dimension"]]]
+        indices = np.indices(parameters["shape"], parameters["dtype"])
+        return [indices[parameters["dimension"]]]
     # Division of whole numbers differs.
     is_exact = name != "div" or operands[0].dtype == np.float64
     if name in _IN_NUMPY and is_exact and len(operands) <= 3:
         dtype = getattr(equation.outvars[0].aval, "dtype", None)
         with np.errstate(all="ignore"):
-            return [np.asarray(_IN_NUMPY[name](*operands), dtype)]
+            result = _IN_NUMPY[name](*operands)
+        return [np.asarray(result, dtype)]
     with jax.ensure_compile_time_eval():
         # A NumPy array would take the precision of the process; a JAX array keeps its
         # own.
         arrays = [jax.numpy.asarray(x, x.dtype) for x in operands]
-        results = equation.primitive.bind(*arrays, **equation.params)
+        results = equation.primitive.bind(*arrays, **parameters)
         return [np.asarray(x) for x in _as_list(equation, results)]
 
 
@@ -371,7 +375,7 @@ def _run(jaxpr: Jaxpr, constants: list, arguments: Arrays) -> Arrays:
         values[name] = _as_constant(constant)
     values.update(zip(jaxpr.invars, arguments, strict=True))
 
-    def read(name) -> np.ndarray:
+    def read(name):
         return np.asarray(name.val) if isinstance(name, Literal) else values[name]
 
     for equation in jaxpr.eqns:
@@ -427,16 +431,20 @@ def trace(function: Callable, *inputs: Shape | np.ndarray) -> Program:
     """
     graph = Graph()
     arguments = [_argument(graph, k, x) for k, x in enumerate(inputs)]
+    input_shapes = tuple(x.shape for x in arguments)
     with double_precision():
-        avals = [jax.ShapeDtypeStruct(x.shape, np.float64) for x in arguments]
-        jaxpr, result = jax.make_jaxpr(function, return_shape=True)(*avals)
+        avals = [jax.ShapeDtypeStruct(shape, np.float64) for shape in input_shapes]
+        make_jaxpr = jax.make_jaxpr(function, return_shape=True)
+        jaxpr, result = make_jaxpr(*avals)
         leaves = _run(jaxpr.jaxpr, jaxpr.consts, arguments)
+
     outputs = []
     for leaf in leaves:
-        outputs += map(scalar.as_number, _entries(leaf).ravel())
-    input_shapes = tuple(x.shape for x in arguments)
+        entries = _entries(leaf).ravel()
+        outputs += map(scalar.as_number, entries)
     output_shapes = tuple(np.shape(x) for x in leaves)
-    return assemble(input_shapes, outputs, output_shapes, jax.tree.structure(result))
+    structure = jax.tree.structure(result)
+    return assemble(input_shapes, outputs, output_shapes, structure)
 
 
 def _argument(graph: Graph, number: int, description: Shape | np.ndarray) -> np.ndarray:

@@ -7,6 +7,7 @@ arrays, and are put in place afterwards. An accelerator takes all samples at onc
 
 import functools
 import itertools
+import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -34,28 +35,33 @@ def block_results(program: Program, *arrays: Array) -> Results:
     count = len(arrays[-1])
     reference = arrays[-1][0, 0]
 
-    def evaluate(arrays: tuple[Array, ...]) -> Results:
+    def evaluate(arrays):
         # All samples are transposed together, behind a fence of their own.
-        matrix = jnp.concatenate([x.T for x in arrays if x.ndim == 2])
+        transposed = [x.T for x in arrays if x.ndim == 2]
+        matrix = jnp.concatenate(transposed)
         one = hidden_one(matrix[0, 0])
         rows = iter(fenced(matrix, one))
         columns: list[Any] = list(arrays)
         for k, x in enumerate(arrays):
             if x.ndim == 2:
-                columns[k] = list(itertools.islice(rows, x.shape[1]))
-        return lower(program, fence=True).run(_repeat(columns, count))
+                entries = x.shape[1]
+                columns[k] = list(itertools.islice(rows, entries))
+        lowered = lower(program, fence=True)
+        return lowered.run(_repeat(columns, count))
 
-    def skip(_: tuple[Array, ...]) -> Results:
+    def skip(_):
         return tuple(jnp.broadcast_to(reference, count) for _ in program.distinct[0])
 
     # Results of a branch are stored: what uses them does not compute them again.
-    return jax.lax.cond(hidden_one(reference) > 0, evaluate, skip, arrays)
+    is_always_true = hidden_one(reference) > 0
+    return jax.lax.cond(is_always_true, evaluate, skip, arrays)
 
 
 def results_at_once(program: Program, *arrays: Array) -> Results:
     """Return the distinct results of samples, without fences."""
     columns = [x.T for x in arrays]
-    return lower(program, fence=False).run(_repeat(columns, len(arrays[-1])))
+    entries = _repeat(columns, len(arrays[-1]))
+    return lower(program, fence=False).run(entries)
 
 
 def _repeat(columns: Sequence, count: int) -> list[list[Array]]:
@@ -81,7 +87,7 @@ def _in_blocks(program: Program, *arrays: Array) -> Rows:
     if count <= BLOCK:
         return _pack(block_results, program, *arrays)
 
-    def step(k: Array, out: Array) -> Array:
+    def step(k, out):
         # The last block begins earlier, so that it is as long as the others.
         start = jnp.minimum(k * BLOCK, count - BLOCK)
         parts = [_slice_samples(x, start, BLOCK) for x in arrays]
@@ -89,8 +95,10 @@ def _in_blocks(program: Program, *arrays: Array) -> Rows:
         return jax.lax.dynamic_update_slice_in_dim(out, block, start, axis=0)
 
     # All of it is overwritten.
-    empty = jnp.broadcast_to(arrays[-1][0, 0], (count, len(program.outputs)))
-    return jax.lax.fori_loop(0, -(-count // BLOCK), step, empty)
+    shape = (count, len(program.outputs))
+    empty = jnp.broadcast_to(arrays[-1][0, 0], shape)
+    blocks = math.ceil(count / BLOCK)
+    return jax.lax.fori_loop(0, blocks, step, empty)
 
 
 def _slice_samples(x: Array, start: Array, size: int) -> Array:
@@ -107,13 +115,13 @@ def on_rows(program: Program, *arrays: Array) -> Rows:
         return jnp.zeros((0, len(program.outputs)), arrays[-1].dtype)
 
     @custom_vmap
-    def run(*arrays: Array) -> Array:
+    def run(*arrays):
         in_blocks = functools.partial(_in_blocks, program)
         at_once = functools.partial(_pack, results_at_once, program)
         return jax.lax.platform_dependent(*arrays, cpu=in_blocks, default=at_once)
 
     @run.def_vmap
-    def batch(size: int, is_batched: list[bool], *arrays: Array) -> tuple[Array, bool]:
+    def batch(size, is_batched, *arrays):
         inputs = list(zip(arrays, is_batched, strict=True))
         count = arrays[-1].shape[int(is_batched[-1])]
         # Parameters are vectors, with the axis of the batch matrices.
@@ -132,21 +140,18 @@ def on_rows(program: Program, *arrays: Array) -> Rows:
             x = x if has_batch else x[None]
             x = x[:, None] if is_common else x
             entries = x.shape[-1]
-            rows.append(
-                jnp.broadcast_to(x, (size, count, entries)).reshape(-1, entries)
-            )
+            repeated = jnp.broadcast_to(x, (size, count, entries))
+            rows.append(repeated.reshape(-1, entries))
         return run(*rows).reshape(size, count, -1), True
 
     return run(*differing_alike(arrays))
 
 
-def _one_after_the_other(
-    run: Callable, inputs: list[tuple[Array, bool]]
-) -> Float[Array, "batch samples out"]:
+def _one_after_the_other(run: Callable, inputs: list[tuple[Array, bool]]) -> Array:
     """Call a function for each element of a batch, with inputs that have one or not."""
     elements = [x for x, has_batch in inputs if has_batch]
 
-    def on_element(parts: list[Array]) -> Array:
+    def on_element(parts):
         remaining = iter(parts)
         return run(*(next(remaining) if has_batch else x for x, has_batch in inputs))
 
@@ -155,7 +160,7 @@ def _one_after_the_other(
 
 def row_products(
     program: Program, groups: tuple[tuple[int, ...], ...], *arrays: Array
-) -> list[Float[Array, "results results"]]:
+) -> list[Array]:
     """Return sums over samples of products of results, which are not stored.
 
     A group holds positions in the packed result whose values are multiplied with each
@@ -166,7 +171,7 @@ def row_products(
     if count == 0:
         return [jnp.zeros((len(group), len(group)), dtype) for group in groups]
 
-    def products(results: Results, counts: Array) -> list[Array]:
+    def products(results, counts):
         values = program.pack(results)
         matrices = []
         for group in groups:
@@ -175,22 +180,25 @@ def row_products(
             matrices.append(matrix @ matrix.T)
         return matrices
 
-    def by_chunks(evaluate: Callable, size: int, *arrays: Array) -> list[Array]:
-        def step(k: Array, sums: list[Array]) -> list[Array]:
+    def by_chunks(evaluate, size, *arrays):
+        def step(k, sums):
             # The last chunk begins earlier; samples that were counted do not count
             # again.
             start = jnp.minimum(k * size, count - size)
-            counts = (start + jnp.arange(size) >= k * size).astype(dtype)
+            samples = start + jnp.arange(size)
+            counts = (samples >= k * size).astype(dtype)
             parts = [_slice_samples(x, start, size) for x in arrays]
-            terms = products(evaluate(program, *parts), counts)
-            return [a + b for a, b in zip(sums, terms, strict=True)]
+            results = evaluate(program, *parts)
+            terms = products(results, counts)
+            return jax.tree.map(jnp.add, sums, terms)
 
         empty = []
         for group in groups:
             zeros = jnp.zeros((len(group), len(group)), dtype)
             # `where`, see `differing_alike`.
             empty.append(jnp.where(ALWAYS, zeros, arrays[-1][0, 0]))
-        return jax.lax.fori_loop(0, -(-count // size), step, empty)
+        chunks = math.ceil(count / size)
+        return jax.lax.fori_loop(0, chunks, step, empty)
 
     return jax.lax.platform_dependent(
         *differing_alike(arrays),

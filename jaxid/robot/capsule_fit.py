@@ -149,10 +149,12 @@ def enclose(points: AnyArray) -> Segment:
     """
     hull = _hull_points(np.asarray(points))
     centre = 0.5 * (hull.min(axis=0) + hull.max(axis=0))
-    size = max(float(np.ptp(hull, axis=0).max()), 1e-9)
-    _, _, directions = np.linalg.svd(hull - hull.mean(axis=0))
+    extent = float(np.ptp(hull, axis=0).max())
+    size = max(extent, 1e-9)
+    from_mean = hull - hull.mean(axis=0)
+    _, _, directions = np.linalg.svd(from_mean)
 
-    def volume(ends: np.ndarray) -> float:
+    def volume(ends):
         return _capsule_about(hull, ends).volume
 
     axes = []
@@ -160,7 +162,8 @@ def enclose(points: AnyArray) -> Segment:
         heights = (hull - centre) @ direction
         # The round ends reach beyond the axis.
         reach = AXIS_SHARE * np.array([heights.min(), heights.max()])
-        axes.append((centre + reach[:, None] * direction).ravel())
+        ends = centre + reach[:, None] * direction
+        axes.append(ends.ravel())
     start = min(axes, key=volume)
     simplex = np.vstack([start, start + FIRST_SHIFT * size * np.eye(6)])
     options = {
@@ -179,9 +182,10 @@ def _capsule_about(points: np.ndarray, ends: np.ndarray) -> Segment:
     axis = end - start
     from_start = points - start
     square = max(float(axis @ axis), 1e-18)
-    fractions = np.clip(from_start @ axis / square, 0.0, 1.0)
-    from_axis = from_start - fractions[:, None] * axis
-    distances = np.linalg.norm(from_axis, axis=1)
+    heights = from_start @ axis / square
+    fractions = np.clip(heights, 0.0, 1.0)
+    nearest_points = fractions[:, None] * axis
+    distances = np.linalg.norm(from_start - nearest_points, axis=1)
     # Rounding must leave no point outside.
     radius = float(distances.max()) * (1 + 1e-9) + 1e-12
     return Segment(start, end, radius)

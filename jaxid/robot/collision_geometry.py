@@ -75,7 +75,7 @@ def link_shapes(
 def _read_shape(tree: UrdfTree, packages: str | Path | None, element: Any) -> Shape:
     """Return one shape in its own frame."""
 
-    def number(key: str) -> float:
+    def number(key):
         return float(tree.numbers(element, key, (0.0,))[0])
 
     match element.tag:

@@ -113,12 +113,17 @@ class CollisionModel(Hashable):
         """Return the ends of all capsules' axes on the ground in one pose [m]."""
         rotations, origins = placements(robot, q)
         # The ground comes last, where its index -1 leads.
-        rotations = jnp.concatenate([rotations, jnp.eye(3)[None]])
-        origins = jnp.concatenate([origins, jnp.zeros((1, 3))])
+        ground_rotation = jnp.eye(3)[None]
+        ground_origin = jnp.zeros((1, 3))
+        rotations = jnp.concatenate([rotations, ground_rotation])
+        origins = jnp.concatenate([origins, ground_origin])
         bodies = np.array([capsule.body for capsule in self.capsules])
-        axes = [jnp.stack([capsule.start, capsule.end]) for capsule in self.capsules]
-        points = jnp.einsum("cij,cej->cei", rotations[bodies], jnp.stack(axes))
-        return points + jnp.broadcast_to(origins[bodies][:, None], points.shape)
+        starts = jnp.stack([capsule.start for capsule in self.capsules])
+        ends = jnp.stack([capsule.end for capsule in self.capsules])
+        axes = jnp.stack([starts, ends], axis=1)
+        turned_axes = jnp.einsum("cij,cej->cei", rotations[bodies], axes)
+        body_origins = origins[bodies][:, None]
+        return turned_axes + jnp.broadcast_to(body_origins, turned_axes.shape)
 
     @eqx.filter_jit
     def clearance(
@@ -153,7 +158,7 @@ class CollisionModel(Hashable):
             axis=-1,
             keepdims=True,
         )
-        clearances = jnp.take_along_axis(gaps_of_groups, minimum, axis=-1)[..., 0]
+        clearances = jnp.take_along_axis(gaps_of_groups, minimum, axis=-1)
         return clearances.reshape(*batch, len(self.groups))
 
     @eqx.filter_jit
@@ -165,7 +170,7 @@ class CollisionModel(Hashable):
             places: Place of each sample's clearance among the groups.
         """
 
-        def clearance(ends: Array) -> Array:
+        def clearance(ends):
             gaps = self.clearances(ends)
             return jnp.take_along_axis(gaps, places[:, None], axis=1)[:, 0]
 
@@ -176,7 +181,8 @@ class CollisionModel(Hashable):
         """Return the distance between the surfaces of each pair for some `ends` [m]."""
         start = ends[:, 0]
         end = ends[:, 1]
-        radii = jnp.stack([jnp.asarray(capsule.radius) for capsule in self.capsules])
+        radii_of_capsules = [jnp.asarray(capsule.radius) for capsule in self.capsules]
+        radii = jnp.stack(radii_of_capsules)
         first, second = np.array(self.pairs).T
         # Distances from the axes of the first shapes, in the order of the pairs.
         distances = []
@@ -189,7 +195,8 @@ class CollisionModel(Hashable):
         for number, obstacle in enumerate(self.obstacles, len(self.capsules)):
             i = first[second == number]
             if i.size:
-                distances.append(obstacle.distance(start[i], end[i]))
+                distance = obstacle.distance(start[i], end[i])
+                distances.append(distance)
         return jnp.concatenate(distances) - radii[first]
 
     def _largest_gaps(self, robot: Robot) -> list[float]:
@@ -202,7 +209,7 @@ class CollisionModel(Hashable):
             (POSES, robot.joints),
         )
 
-        def gaps(pose: Array) -> Array:
+        def gaps(pose):
             return self._gaps(self.ends(robot, pose))
 
         with double_precision():
@@ -255,7 +262,7 @@ class CollisionModel(Hashable):
         return i, k
 
 
-def _check_shapes(robot: Robot, capsules: Sequence[Capsule], names: list[str]) -> None:
+def _check_shapes(robot: Robot, capsules: Sequence[Capsule], names: list[str]):
     """Reject names that come twice, and bodies that the robot does not have."""
     for name in names:
         if names.count(name) > 1:

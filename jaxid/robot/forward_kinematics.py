@@ -38,8 +38,9 @@ def placements(robot: Robot, q: Joints) -> tuple[Rotations, Vectors]:
     for i, parent in enumerate(robot.parent):
         R, r = placement_in_parent(robot, i, q[i])
         if parent >= 0:
-            R = rotations[parent] @ R
-            r = origins[parent] + rotations[parent] @ r
+            R_parent = rotations[parent]
+            R = R_parent @ R
+            r = origins[parent] + R_parent @ r
         rotations.append(R)
         origins.append(r)
     return jnp.stack(rotations), jnp.stack(origins)
@@ -48,8 +49,10 @@ def placements(robot: Robot, q: Joints) -> tuple[Rotations, Vectors]:
 def tip_placement(robot: Robot, q: Joints) -> tuple[Matrix3, Vector3]:
     """Return attitude and position [m] of the end-effector on the ground."""
     rotations, origins = placements(robot, q)
-    R = rotations[robot.tip_body]
-    return R @ robot.tip_rotation, origins[robot.tip_body] + R @ robot.tip_offset
+    body = robot.tip_body
+    R = rotations[body]
+    position = origins[body] + R @ robot.tip_offset
+    return R @ robot.tip_rotation, position
 
 
 class TipJacobian(NamedTuple):
@@ -91,9 +94,10 @@ def tip_jacobian(robot: Robot, q: np.ndarray) -> TipJacobian:
             r = r + direction * q[:, i, None]
 
     position = r + R @ np.asarray(robot.tip_offset)
+    attitude = R @ np.asarray(robot.tip_rotation)
     lever = position[:, None] - origin
     velocity = slide + np.cross(turn, lever)
-    return TipJacobian(R @ np.asarray(robot.tip_rotation), position, velocity, turn)
+    return TipJacobian(attitude, position, velocity, turn)
 
 
 def tip_curvature(

@@ -64,12 +64,14 @@ class Inertia(eqx.Module):
     def from_parameters(cls, p: TenParameters) -> "Inertia":
         """Return the inertia of ten parameters, centred at 0 without mass (Eq. 9)."""
         xp = namespace(p)
-        mass = p[..., 0]
-        has_mass = (mass != 0)[..., None]
-        centre = p[..., 1:4] / xp.where(has_mass, mass[..., None], 1.0)
-        centre = xp.where(has_mass, centre, 0.0)
-        point_masses = mass[..., None, None] * _moments_of_points(centre)
-        return cls(mass, centre, inertia_tensor(p[..., 4:]) - point_masses)
+        mass = p[..., :1]
+        first_moments = p[..., 1:4]
+        has_mass = mass != 0
+        divisor = xp.where(has_mass, mass, 1.0)
+        centre = xp.where(has_mass, first_moments / divisor, 0.0)
+        point_masses = mass[..., None] * _moments_of_points(centre)
+        tensor = inertia_tensor(p[..., 4:])
+        return cls(mass[..., 0], centre, tensor - point_masses)
 
     @property
     def parameters(self) -> TenParameters:
@@ -80,8 +82,8 @@ class Inertia(eqx.Module):
         tensor = self.tensor + point_mass
         squares = tensor[..., *SQUARES]
         products = -tensor[..., *PRODUCTS]
-        xp = namespace(mass, tensor)
-        return xp.concatenate([mass, first_moments, squares, products], axis=-1)
+        parts = [mass, first_moments, squares, products]
+        return namespace(mass, tensor).concatenate(parts, axis=-1)
 
     @property
     def pinocchio(self) -> TenParameters:
@@ -99,7 +101,9 @@ class Inertia(eqx.Module):
     def moved(self, rotation: Matrix3, position: Vector3) -> "Inertia":
         """Return the same body in the frame in which its present frame is placed."""
         R = rotation
-        return Inertia(self.mass, position + self.centre @ R.T, R @ self.tensor @ R.T)
+        centre = position + self.centre @ R.T
+        tensor = R @ self.tensor @ R.T
+        return Inertia(self.mass, centre, tensor)
 
     def fault(self, rounding: float = 1e-9) -> str:
         """Return why this single body cannot exist; an empty text if it can.
@@ -143,8 +147,10 @@ def inertia_tensor(j: AnyArray) -> Rotations:
     """Return the tensor $J^o$ of the moments $(A, B, C, D, E, F)$ [kg m²] (Eq. 9)."""
     A, B, C, D, E, F = (j[..., k] for k in range(6))
     xp = namespace(j)
-    rows = ([A, -F, -E], [-F, B, -D], [-E, -D, C])
-    return xp.stack([xp.stack(row, axis=-1) for row in rows], axis=-2)
+    first = xp.stack([A, -F, -E], axis=-1)
+    second = xp.stack([-F, B, -D], axis=-1)
+    third = xp.stack([-E, -D, C], axis=-1)
+    return xp.stack([first, second, third], axis=-2)
 
 
 def _moments_of_points(r: Vectors) -> Rotations:
@@ -152,4 +158,5 @@ def _moments_of_points(r: Vectors) -> Rotations:
     xp = namespace(r)
     squares = xp.sum(r * r, axis=-1)[..., None, None]
     products = r[..., :, None] * r[..., None, :]
-    return squares * np.broadcast_to(np.eye(3), products.shape) - products
+    identity = np.broadcast_to(np.eye(3), products.shape)
+    return squares * identity - products

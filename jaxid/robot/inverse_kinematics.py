@@ -80,7 +80,9 @@ def _tip_task(robot: Robot, rotation: Numbers, posture: Numbers | None) -> _TipT
     limits = complete_limits(robot)
     half_range = 0.5 * (limits.position_max - limits.position_min)
     middle = 0.5 * (limits.position_max + limits.position_min)
-    goal = np.asarray(as_array("posture", middle if posture is None else posture))
+    goal = middle
+    if posture is not None:
+        goal = np.asarray(as_array("posture", posture))
     if goal.shape != middle.shape:
         raise InputError(
             f"`posture` must hold {robot.joints} numbers, but has shape {goal.shape}."
@@ -106,14 +108,17 @@ def _follow_path(task: _TipTask, positions: np.ndarray) -> np.ndarray:
     places = np.arange(len(positions))
     columns = [np.interp(places, nodes, column) for column in np.transpose(solutions)]
     guess = np.transpose(columns)
-    return _newton_steps(task, positions, guess, FINAL_STEPS)[:, :joints]
+    unknowns = _newton_steps(task, positions, guess, FINAL_STEPS)
+    return unknowns[:, :joints]
 
 
 def _ends_of_strides(positions: np.ndarray) -> np.ndarray:
     """Return the indices of poses about a `STRIDE` apart, with both ends."""
-    distances = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    steps = np.diff(positions, axis=0)
+    distances = np.linalg.norm(steps, axis=1)
     lengths = np.concatenate([[0.0], np.cumsum(distances)])
-    _, starts = np.unique(np.floor(lengths / STRIDE), return_index=True)
+    strides = np.floor(lengths / STRIDE)
+    _, starts = np.unique(strides, return_index=True)
     return np.unique(np.append(starts, len(positions) - 1))
 
 
@@ -146,11 +151,13 @@ def _newton_step(
     scale = task.half_range
     tip = tip_jacobian(task.robot, q)
     errors = _pose_errors(task, positions, tip)
-    jacobian = np.concatenate([tip.velocity, tip.turn], axis=2) * scale[:, None]
+    by_joints = np.concatenate([tip.velocity, tip.turn], axis=2)
+    jacobian = by_joints * scale[:, None]
     hessian = np.eye(joints)
     if curved:
         force, moment = np.split(multipliers, 2, axis=1)
-        hessian = hessian + np.outer(scale, scale) * tip_curvature(tip, force, moment)
+        curvature = tip_curvature(tip, force, moment)
+        hessian = hessian + np.outer(scale, scale) * curvature
 
     pull = np.einsum("pji,pi->pj", jacobian, multipliers)
     slope = (q - task.posture) / scale + pull
@@ -182,14 +189,15 @@ def _pose_errors(task: _TipTask, positions: np.ndarray, tip: TipJacobian) -> np.
     return np.concatenate([tip.position - positions, turn], axis=1)
 
 
-def _require_followed(task: _TipTask, positions: np.ndarray, q: np.ndarray) -> None:
+def _require_followed(task: _TipTask, positions: np.ndarray, q: np.ndarray):
     """Reject coordinates that miss a pose, leave their range or jump."""
     robot = task.robot
     errors = _pose_errors(task, positions, tip_jacobian(robot, q))
     distances = np.linalg.norm(errors[:, :3], axis=1)
     angles = np.linalg.norm(errors[:, 3:], axis=1)
     excess = np.maximum(task.low - q, q - task.high) / task.half_range
-    changes = np.abs(np.diff(q, axis=0, prepend=q[:1]) / task.half_range)
+    steps = np.diff(q, axis=0, prepend=q[:1])
+    changes = np.abs(steps / task.half_range)
 
     is_reached = np.maximum(distances, angles) <= POSE_TOLERANCE
     is_in_range = excess.max(axis=1) <= RANGE_TOLERANCE
@@ -205,9 +213,8 @@ def _require_followed(task: _TipTask, positions: np.ndarray, q: np.ndarray) -> N
             f"and {angles[k]:.3g} rad of the pose"
         )
     elif not is_in_range[k]:
-        reason = (
-            f"joint `{robot.joint_names[int(excess[k].argmax())]}` leaves its range"
-        )
+        joint = int(excess[k].argmax())
+        reason = f"joint `{robot.joint_names[joint]}` leaves its range"
     else:
         reason = "the joints would have to jump, for the pose is singular"
     place = ", ".join(f"{x:.3f}" for x in positions[k])

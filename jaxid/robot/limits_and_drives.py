@@ -227,7 +227,7 @@ def _magnitudes(name: str, value: Numbers | None, joints: int) -> Any:
     return values
 
 
-def _require(name: str, values: AnyArray, rule: Any, words: str) -> None:
+def _require(name: str, values: AnyArray, rule: Any, words: str):
     """Check a rule that reads after "must be", unless the values are a JAX array."""
     if not isinstance(values, np.ndarray):
         return
@@ -240,7 +240,7 @@ def _require(name: str, values: AnyArray, rule: Any, words: str) -> None:
         )
 
 
-def _require_ranges(low: np.ndarray, high: np.ndarray) -> None:
+def _require_ranges(low: np.ndarray, high: np.ndarray):
     """Reject ranges whose lower end is not below the upper one."""
     faults = np.flatnonzero(low >= high)
     if faults.size:

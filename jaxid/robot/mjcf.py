@@ -105,7 +105,7 @@ class _Writer:
         self.root.append(element)
         return element
 
-    def add_body(self, body: int) -> None:
+    def add_body(self, body: int):
         """Write the joints of a body, one by one, and its link with the inertia."""
         model = self._model
         name = body_name(model, body)
@@ -149,7 +149,8 @@ class _Writer:
         axis = model.jnt_axis[joint]
         ref = model.qpos0[model.jnt_qposadr[joint]]
         position = position + rotation @ model.jnt_pos[joint]
-        if JOINT_TYPES[model.jnt_type[joint]] == "prismatic":
+        kind = JOINT_TYPES[model.jnt_type[joint]]
+        if kind == "prismatic":
             position = position - rotation @ axis * ref
         elif ref:
             rotation = rotation @ axis_rotation(axis, -ref)
@@ -190,8 +191,9 @@ class _Writer:
         model = self._model
         limit: dict[str, str] = {}
         if model.jnt_limited[joint]:
-            ends = map(exact_text, model.jnt_range[joint])
-            limit.update(zip(("lower", "upper"), ends, strict=True))
+            lower, upper = model.jnt_range[joint]
+            limit["lower"] = exact_text(lower)
+            limit["upper"] = exact_text(upper)
         if np.isfinite(self._efforts[joint]):
             limit["effort"] = exact_text(self._efforts[joint])
         dof = model.jnt_dofadr[joint]
@@ -203,7 +205,7 @@ class _Writer:
         axis = E.axis(xyz=exact_text(model.jnt_axis[joint]))
         return [axis, E.limit(**limit), dynamics]
 
-    def add_site(self, site: int) -> None:
+    def add_site(self, site: int):
         """Write a site as a link, if its name is not empty and not that of a body."""
         model = self._model
         name = model.site(site).name
@@ -215,7 +217,7 @@ class _Writer:
         body_link = self._links[model.site_bodyid[site]]
         self._connect(f"{name} site", "fixed", body_link, name, origin)
 
-    def add_constraint(self, constraint: int) -> None:
+    def add_constraint(self, constraint: int):
         """Write a constraint between joints as a mimic; note one that closes a loop."""
         model = self._model
         kinds = self._mujoco.mjtEq
@@ -234,7 +236,7 @@ class _Writer:
                 links = [self._links[body] for body in bodies]
                 self.loops.append((name, *links))
 
-    def _add_mimic(self, joint: int, master: int, polynomial: np.ndarray) -> None:
+    def _add_mimic(self, joint: int, master: int, polynomial: np.ndarray):
         """Write a constraint of a joint; it is exact where the mimicked joint is held.
 
         The polynomial gives the joint's coordinate, as the difference from its `ref`,
@@ -268,7 +270,8 @@ def _largest_forces(mujoco: Any, model: Any) -> Joints:
         if int(model.actuator_trntype[actuator]) in joint_kinds:
             joint = model.actuator_trnid[actuator, 0]
             gear = np.abs(model.actuator_gear[actuator, 0])
-            total[joint] += _largest_input(mujoco, model, actuator) * gear
+            force = _largest_input(mujoco, model, actuator)
+            total[joint] += force * gear
     total = np.where(total > 0.0, total, np.inf)
     joint_limits = np.abs(model.jnt_actfrcrange).max(axis=1)
     smaller_limits = np.minimum(total, joint_limits)

@@ -154,7 +154,7 @@ class Robot(Summarised, eqx.Module):
         # A copy finds the notes of its original again.
         self.notes = tuple(dict.fromkeys(notes))
 
-    def _set_defaults(self, joints: int) -> None:
+    def _set_defaults(self, joints: int):
         """Fill in what follows from the number of joints where it is not given."""
         if not self.joint_names:
             self.joint_names = tuple(f"joint{i + 1}" for i in range(joints))
@@ -169,7 +169,7 @@ class Robot(Summarised, eqx.Module):
         if self.tip_rotation is None:
             self.tip_rotation = np.eye(3)
 
-    def _check_joints(self) -> None:
+    def _check_joints(self):
         """Reject names, parents and bodies that do not fit the number of joints."""
         n = len(self.revolute)
         in_order = all(-1 <= p < i for i, p in enumerate(self.parent))
@@ -250,9 +250,10 @@ class Robot(Summarised, eqx.Module):
         """
         forces = self.known_max_forces
         if not np.isfinite(forces).all():
-            j = int(np.flatnonzero(~np.isfinite(forces))[0])
+            joint = int(np.argmin(np.isfinite(forces)))
+            name = self.joint_names[joint]
             raise InputError(
-                f"the largest force of joint `{self.joint_names[j]}` of `{self.name}` "
+                f"the largest force of joint `{name}` of `{self.name}` "
                 "is not known: give `limits.force` (joint side) or "
                 "`drives.max_torques` (motor side)."
             )
@@ -297,7 +298,8 @@ class Robot(Summarised, eqx.Module):
         r = as_finite_array("`position`", position, (3,))
         xp = namespace(R, r, self.rotation, self.offset)
         rotations = R @ self.rotation
-        offsets = xp.broadcast_to(r, self.offset.shape) + self.offset @ R.T
+        turned_offsets = self.offset @ R.T
+        offsets = xp.broadcast_to(r, turned_offsets.shape) + turned_offsets
 
         # Only bodies on the ground move: the others are placed in their parents.
         on_ground = np.array(self.parent)[:, None] < 0

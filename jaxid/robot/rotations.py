@@ -37,10 +37,11 @@ def rotation_about(axis: Vector3, angle: AnyArray) -> Rotations:
     constant axis leaves the fewest operations.
     """
     xp = namespace(axis, angle)
-    projection = axis[:, None] * axis[None, :]
+    along = axis[:, None] * axis[None, :]
+    across = np.eye(3) - along
     cosine = xp.cos(angle)[..., None, None]
     sine = xp.sin(angle)[..., None, None]
-    return projection + cosine * (np.eye(3) - projection) + sine * skew(axis)
+    return along + cosine * across + sine * skew(axis)
 
 
 def axis_rotation(axis: Numbers, angle: float) -> Matrix3:
@@ -82,12 +83,14 @@ def snapped_rotations(rotations: Rotations, tolerance: float) -> np.ndarray:
     rows = snapped(rotations, tolerance)
     U, _, Vt = np.linalg.svd(rows)
     nearest_rotation = without_rounding(U @ Vt)
-    changes = (np.abs(R - rows) > 1e-14).any(axis=(-2, -1), keepdims=True)
+    differences = np.abs(R - rows)
+    changes = differences.max(axis=(-2, -1), keepdims=True) > 1e-14
     return np.where(changes, nearest_rotation, R)
 
 
 def without_rounding(values: AnyArray) -> np.ndarray:
     """Set entries to 0, 1 or -1 that differ only by rounding, like cos(pi/2)."""
     integers = np.clip(np.round(values), -1.0, 1.0)
-    entries = np.where(np.abs(values - integers) <= 1e-14, integers, values)
+    differences = np.abs(values - integers)
+    entries = np.where(differences <= 1e-14, integers, values)
     return entries + 0.0  # makes -0.0 positive

@@ -148,14 +148,14 @@ class Box(eqx.Module):
         """Return the signed distances of segments' deepest or nearest points [m]."""
         R = jnp.asarray(self.rotation)
         # Everything in the frame of the box.
-        centre = jnp.broadcast_to(self.centre @ self.rotation, start.shape)
-        first = start @ R - centre
+        centre = self.centre @ self.rotation
+        first = start @ R - jnp.broadcast_to(centre, start.shape)
         extent = (end - start) @ R
         # The minimum is found without derivatives: those of its place add nothing to
         # that of the distance.
         origin, direction = jax.lax.stop_gradient((first, extent))
 
-        def slope(place: Array) -> Array:
+        def slope(place):
             point = origin + place * direction
             _, derivative = jax.jvp(self._signed, (point,), (direction,))
             return derivative[..., None]
@@ -166,19 +166,24 @@ class Box(eqx.Module):
         # leaves as it is.
         rising = slope(high)
         turn = rising - slope(low)
-        ratio = rising / jnp.where(turn > 0, turn, 1.0)
+        positive_turn = jnp.where(turn > 0, turn, 1.0)
+        ratio = rising / positive_turn
         share = jnp.clip(ratio, 0.0, 1.0)[..., 0]
-        distance_before = self._signed(first + low * extent)
-        distance_after = self._signed(first + high * extent)
+        point_before = first + low * extent
+        point_after = first + high * extent
+        distance_before = self._signed(point_before)
+        distance_after = self._signed(point_after)
         return share * distance_before + (1.0 - share) * distance_after
 
     def _signed(self, point: Vectors) -> Array:
         """Return the signed distances of points in the frame of the box [m]."""
-        excess = jnp.abs(point) - jnp.broadcast_to(0.5 * self.size, point.shape)
+        half_size = jnp.broadcast_to(0.5 * self.size, point.shape)
+        excess = jnp.abs(point) - half_size
         x, y, z = jnp.unstack(-excess, axis=-1)
         depth = _smaller(_smaller(x, y), z)
         outside_part = jnp.where(excess > 0, excess, 0.0)
-        return _rounded_norm(outside_part) - jnp.where(depth > 0, depth, 0.0)
+        inside_depth = jnp.where(depth > 0, depth, 0.0)
+        return _rounded_norm(outside_part) - inside_depth
 
 
 def segment_distance(
@@ -209,12 +214,15 @@ def _closest_places(u: Vectors, v: Vectors, r: Vectors) -> tuple[Array, Array]:
     vr = _dot(v, r)
     determinant = uu * vv - uv * uv
     # Axes count as parallel below this square of the sine between them.
-    crossing = determinant > 1e-12 * uu * vv
-    a = _fraction(uv * vr - ur * vv, determinant, crossing)
-    b = _fraction(uv * a + vr, vv, vv > 0)
+    is_crossing = determinant > 1e-12 * uu * vv
+    has_u = uu > 0
+    has_v = vv > 0
+    a = _fraction(uv * vr - ur * vv, determinant, is_crossing)
+    b = _fraction(uv * a + vr, vv, has_v)
     # The nearest point to a clipped one; for parallel axes any start will do.
-    a = _fraction(uv * b - ur, uu, uu > 0)
-    return a, _fraction(uv * a + vr, vv, vv > 0)
+    a = _fraction(uv * b - ur, uu, has_u)
+    b = _fraction(uv * a + vr, vv, has_v)
+    return a, b
 
 
 def _dot(x: Vectors, y: Vectors) -> Array:
@@ -224,8 +232,9 @@ def _dot(x: Vectors, y: Vectors) -> Array:
 
 def _fraction(numerator: Array, denominator: Array, usable: Array) -> Array:
     """Return a ratio clipped to the range from 0 to 1; zero where it is not usable."""
-    ratio = numerator / jnp.where(usable, denominator, 1.0)
-    return jnp.where(usable, jnp.clip(ratio, 0.0, 1.0), 0.0)
+    divisor = jnp.where(usable, denominator, 1.0)
+    ratio = jnp.clip(numerator / divisor, 0.0, 1.0)
+    return jnp.where(usable, ratio, 0.0)
 
 
 def _bisect(slope: Callable[[Array], Array], zero: Array) -> tuple[Array, Array]:
@@ -236,7 +245,7 @@ def _bisect(slope: Callable[[Array], Array], zero: Array) -> tuple[Array, Array]
         zero: Zeros in the shape and type of the arguments.
     """
 
-    def halve(_: Array, interval: tuple[Array, Array]) -> tuple[Array, Array]:
+    def halve(_, interval):
         low, high = interval
         middle = 0.5 * (low + high)
         # A convex function that still falls has its minimum further on.

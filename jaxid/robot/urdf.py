@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxid.arrays import AnyArray, Float, Joints, Numbers
+from jaxid.arrays import AnyArray, Joints, Numbers
 from jaxid.errors import InputError
 
 from .limits_and_drives import Limits, owners, range_fault
@@ -96,7 +96,7 @@ def urdf_parameters(
     tip: str | None = None,
     base: str | None = None,
     check: bool = True,
-) -> Float[AnyArray, " inertial"]:
+) -> AnyArray:
     """Return the inertial parameters that a URDF or MJCF file claims (Eq. 9).
 
     Ten for each body of `load_urdf` with the same arguments, in the order of its

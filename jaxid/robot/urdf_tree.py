@@ -111,7 +111,7 @@ class UrdfTree:
             elements[name] = element
         return elements
 
-    def _add(self, joint: Any) -> None:
+    def _add(self, joint: Any):
         """Enter a joint between the links that it connects."""
         self._attribute(joint, "type")
         for tag in ("parent", "child"):
@@ -151,7 +151,7 @@ class UrdfTree:
             )
         return roots[0]
 
-    def _merge(self, base: str, tip: str | None) -> None:
+    def _merge(self, base: str, tip: str | None):
         """Merge links on fixed joints into the bodies that carry them, depth first."""
         chain = None if tip is None else self._chain(base, tip)
         self.carriers[base] = Placement(-1, np.eye(3), np.zeros(3))
@@ -196,7 +196,7 @@ class UrdfTree:
             f"`{self.path}` has no moving joint {way}: choose another `base` or `tip`."
         )
 
-    def _add_body(self, joint: Any) -> None:
+    def _add_body(self, joint: Any):
         """Enter the body that a joint moves."""
         parent, child = link_names(joint)
         placement = _placed(self.carriers[parent], *self._origin(joint))
@@ -220,7 +220,7 @@ class UrdfTree:
                     links.append(child)
         return placements
 
-    def _refuse_loops(self, loops: Iterable[Loop]) -> None:
+    def _refuse_loops(self, loops: Iterable[Loop]):
         """Reject constraints that close a loop between bodies of the robot."""
         for name, first, second in loops:
             if first not in self.carriers or second not in self.carriers:

@@ -41,7 +41,7 @@ def virtual_panda(seed: int = 0) -> VirtualRobot:
     n = robot.joints
     max_forces = np.asarray(robot.max_forces)
 
-    def vary(values: np.ndarray) -> np.ndarray:
+    def vary(values):
         return values * random.uniform(0.8, 1.2, n)
 
     masses = vary(np.array([3.4, 2.2, 2.6, 2.4, 1.6, 1.3, 0.6]))  # [kg]
@@ -116,7 +116,7 @@ def write_example(folder: Path, seed: int = 0) -> list[Path]:
     return [folder / file for file in FILES]
 
 
-def _require_no_other(path: Path, content: bytes) -> None:
+def _require_no_other(path: Path, content: bytes):
     """Refuse to overwrite a file with other content."""
     if path.is_file() and path.read_bytes() == content:
         return
@@ -126,7 +126,7 @@ def _require_no_other(path: Path, content: bytes) -> None:
         )
 
 
-def _write_csv(path: Path, recording: Recording) -> None:
+def _write_csv(path: Path, recording: Recording):
     joints = range(1, recording.joints + 1)
     names = ["time", *(f"q{i}" for i in joints), *(f"tau{i}" for i in joints)]
     columns = [recording.time, recording.angles, recording.forces]

@@ -105,7 +105,7 @@ class MujocoPlant:
         self._mujoco.mj_resetData(self._model, self._data)
         self._set(q, qd, qdd)
 
-    def _set(self, q: AnyArray, qd: AnyArray, qdd: AnyArray) -> None:
+    def _set(self, q: AnyArray, qd: AnyArray, qdd: AnyArray):
         data = self._data
         data.qpos[self._addresses] = q
         data.qvel[self._addresses] = qd

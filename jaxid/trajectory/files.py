@@ -168,7 +168,7 @@ def _write_bag(
     joint_names: list[str],
     points: list[dict[str, Any]],
     path: Path,
-) -> None:
+):
     """Write the message as a bag of ROS 2 in one file (MCAP)."""
     purpose = f"`{path.name}` is written by"
     typesys = import_extra("rosbags.typesys", "logs", purpose)

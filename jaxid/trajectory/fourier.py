@@ -80,8 +80,10 @@ class FourierBasis(AbstractBasis):
         Zeller).
         """
         points = max(points, 2 * self.harmonics + 1)
-        rows = np.asarray(self.rows(self.times(points)))
-        return tuple(rows), 1.0 / math.cos(math.pi * self.harmonics / points)
+        t = self.times(points)
+        rows = np.asarray(self.rows(t))
+        angle = math.pi * self.harmonics / points
+        return tuple(rows), 1.0 / math.cos(angle)
 
 
 class PeriodsBasis(AbstractBasis):
@@ -141,7 +143,7 @@ class RestToRestBasis(PeriodsBasis):
     def rows(self, t):
         """Return sines and cosines in the directions that rest at both ends."""
 
-        def series_rows(t: AnyArray) -> AnyArray:
+        def series_rows(t):
             return self.series.rows(t) @ self.directions
 
         return stand_outside(series_rows, t, self.duration)
@@ -193,8 +195,10 @@ def random_fourier_series(
 
     random = np.random.default_rng(seed)
     amplitudes = random.standard_normal((2, robot.joints, harmonics))
-    a, b = amplitudes / np.arange(1, harmonics + 1)
-    x = np.hstack([np.zeros((robot.joints, 1)), a, b])
+    orders = np.arange(1, harmonics + 1)
+    a, b = amplitudes / orders
+    offset = np.zeros((robot.joints, 1))
+    x = np.hstack([offset, a, b])
 
     # Each joint meets its tightest limit, also between the points of the envelope.
     rows, factor = basis.envelope(512)
@@ -213,6 +217,7 @@ def random_fourier_series(
     scale = np.min(scales, axis=0)
     room = np.maximum(half_range - scale * swing, 0.0)
     shift = random.uniform(-1.0, 1.0, robot.joints) * room
+    middle = 0.5 * (low + high)
     x *= scale[:, None]
-    x[:, 0] = 0.5 * (low + high) - scale * centre + shift
+    x[:, 0] = middle - scale * centre + shift
     return basis.trajectory(x)

@@ -93,7 +93,7 @@ class LeadsBasis(PeriodsBasis):
     def rows(self, t):
         """Return the series, or the polynomials that lead into it and out of it."""
 
-        def moving(t: AnyArray) -> AnyArray:
+        def moving(t):
             xp = namespace(t, self.omega, self.lead)
             time = t[None, :, None]
             is_early = time < self.lead
@@ -108,8 +108,10 @@ class LeadsBasis(PeriodsBasis):
 
     def _lead_rows(self, x: AnyArray, sign: int) -> AnyArray:
         """Return the rows of the lead-in (1) or lead-out (-1), x from standstill."""
+        xp = namespace(x, self.omega)
         state = self.series.rows(np.zeros(1))[:3]
-        return namespace(x, self.omega).stack(_lead(state, self.lead, x[:, None], sign))
+        rows = _lead(state, self.lead, x[:, None], sign)
+        return xp.stack(rows)
 
     def envelope(self, points):
         """Return samples of a period, and control points of the leads.
@@ -123,10 +125,12 @@ class LeadsBasis(PeriodsBasis):
         duration = self.lead / ENVELOPE_PIECES
         parts: list[Any] = [rows]
         for piece in range(ENVELOPE_PIECES):
-            t = duration * piece + duration * fractions
+            t = duration * (piece + fractions)
             for sign in (1, -1):
-                parts.append(to_points @ self._lead_rows(t, sign))
-        return tuple(np.concatenate(x) for x in zip(*parts, strict=True)), factor
+                lead_rows = self._lead_rows(t, sign)
+                parts.append(to_points @ lead_rows)
+        parts_of_orders = zip(*parts, strict=True)
+        return tuple(np.concatenate(x) for x in parts_of_orders), factor
 
     def times(self, samples):
         """Return equidistant times over one period between the leads [s]."""
@@ -138,14 +142,16 @@ class LeadsBasis(PeriodsBasis):
         lead = float(self.lead)
         t = np.linspace(0.0, period + 2 * lead, points)
         # The lead-out follows the last period.
-        return np.where(t > lead + period, t + (self.periods - 1) * period, t)
+        other_periods = (self.periods - 1) * period
+        return np.where(t > lead + period, t + other_periods, t)
 
 
 def _to_control_points() -> np.ndarray:
     """Return the matrix from values of a lead's polynomial to its control points."""
     orders = np.arange(LEAD_DEGREE + 1)
     u = np.linspace(0.0, 1.0, LEAD_DEGREE + 1)[:, None]
-    bernstein = comb(LEAD_DEGREE, orders) * u**orders * (1 - u) ** orders[::-1]
+    powers = u**orders * (1 - u) ** orders[::-1]
+    bernstein = comb(LEAD_DEGREE, orders) * powers
     return np.linalg.inv(bernstein)
 
 
@@ -186,22 +192,22 @@ class WithLeads(AbstractTrajectory):
         time = t[:, None]
         lead_in = jnp.asarray(self.lead_in)[None]
         lead_out = jnp.asarray(self.lead_out)[None]
-        first = self.inner.states(jnp.reshape(self.start, 1))
-        last = self.inner.states(jnp.reshape(self.start + self.length, 1))
+        start = jnp.reshape(self.start, 1)
+        first = self.inner.states(start)
+        last = self.inner.states(start + self.length)
         from_start = jnp.clip(time - begin + lead_in, 0.0, lead_in)
         to_end = jnp.clip(end + lead_out - time, 0.0, lead_out)
 
-        parts = zip(
-            _lead(first, lead_in, from_start),
-            self.inner.states(self.start + t - begin),
-            _lead(last, lead_out, to_end, -1),
-            strict=False,
-        )
-        conditions = [time < begin, time <= end]
-        return tuple(
-            jnp.select(conditions, [in_part, series_part], out_part)
-            for in_part, series_part, out_part in parts
-        )
+        entry = _lead(first, lead_in, from_start)
+        series = self.inner.states(self.start + t - begin)
+        exit_ = _lead(last, lead_out, to_end, -1)
+        is_early = time < begin
+        is_late = time > end
+        states = []
+        for in_part, series_part, out_part in zip(entry, series, exit_, strict=False):
+            part = jnp.where(is_late, out_part, series_part)
+            states.append(jnp.where(is_early, in_part, part))
+        return tuple(states)
 
 
 def with_leads(
@@ -280,17 +286,22 @@ def _use_of_limits(state: tuple[np.ndarray, ...], limits: Limits) -> np.ndarray:
     # The extremes lie where the next derivative is zero, or at the ends.
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = -alpha / beta
-    middle = 0.5 * (limits.position_max + limits.position_min)
-    half_range = 0.5 * (limits.position_max - limits.position_min)
+    low = limits.position_min
+    high = limits.position_max
+    middle = 0.5 * (high + low)
+    half_range = 0.5 * (high - low)
     use = np.zeros(ratio.shape)
     for x in (0 * T, T, ratio, 2 * ratio / 3, ratio / 3):
         # NaN, where the next derivative is zero nowhere, is not within.
         is_within = (x >= 0) & (x < T)
         instants = np.where(is_within, x, T)
         position, velocity, acceleration, jerk = _lead(state, T, instants)
-        distance = np.abs(position - middle)
-        use = np.maximum(use, distance / half_range)
-        use = np.maximum(use, np.abs(velocity) / limits.velocity)
-        use = np.maximum(use, np.abs(acceleration) / limits.acceleration)
-        use = np.maximum(use, np.abs(jerk) / limits.jerk)
+        uses = [
+            (position - middle) / half_range,
+            velocity / limits.velocity,
+            acceleration / limits.acceleration,
+            jerk / limits.jerk,
+        ]
+        largest_use = np.abs(uses).max(axis=0)
+        use = np.maximum(use, largest_use)
     return use

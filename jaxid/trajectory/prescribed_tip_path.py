@@ -46,7 +46,7 @@ def line(start: Vector3, end: Vector3) -> Curve:
     """Return a straight line between two points [m]."""
     step = np.subtract(end, start)
 
-    def at(fraction: np.ndarray) -> AnyArray:
+    def at(fraction):
         return start + fraction[:, None] * step
 
     return Curve(at, float(np.linalg.norm(step)), np.inf)
@@ -63,7 +63,7 @@ def circle(centre: Vector3, first: Vector3, second: Vector3) -> Curve:
     """
     radius = float(np.linalg.norm(first))
 
-    def at(fraction: np.ndarray) -> AnyArray:
+    def at(fraction):
         angle = 2 * np.pi * fraction[:, None]
         return centre + np.cos(angle) * first + np.sin(angle) * second
 
@@ -146,7 +146,8 @@ class TipPath(eqx.Module):
         for number, curve in enumerate(self.pieces):
             is_on_curve = pieces == number
             time = t[is_on_curve] - starts[number]
-            u = np.clip(time / self.durations[number], 0.0, 1.0)
+            duration = self.durations[number]
+            u = np.clip(time / duration, 0.0, 1.0)
             fraction = 10.0 * u**3 - 15.0 * u**4 + 6.0 * u**5
             places[is_on_curve] = curve.at(fraction)
         return places
@@ -237,7 +238,8 @@ def joint_path(
     instants = _instants(path)
     # Each piece ends where the next one starts.
     times = np.concatenate([*(t[:-1] for t in instants), instants[-1][-1:]])
-    q = inverse_kinematics_along(robot, path.positions(times), path.rotation, posture)
+    positions = path.positions(times)
+    q = inverse_kinematics_along(robot, positions, path.rotation, posture)
     knots = []
     polynomials = []
     begin = 0
@@ -268,13 +270,14 @@ def _require_speeds(
     robot: Robot,
     path: TipPath,
     coefficients: PolynomialCoefficients,
-) -> None:
+):
     """Reject a path on which a joint would have to move faster than it can."""
     # Velocities and accelerations at the knots are coefficients.
     speeds = np.abs(coefficients[-2]).max(axis=0)
     accelerations = np.abs(2 * coefficients[-3]).max(axis=0)
-    used_speed = speeds / np.asarray(robot.limits.velocity)
-    used_acceleration = accelerations / np.asarray(robot.limits.acceleration)
+    limits = robot.limits
+    used_speed = speeds / np.asarray(limits.velocity)
+    used_acceleration = accelerations / np.asarray(limits.acceleration)
     # A path that is run f times slower needs a fraction 1/f of speeds and 1/f² of
     # accelerations.
     slowdowns = np.maximum(used_speed, np.sqrt(used_acceleration))

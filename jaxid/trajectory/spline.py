@@ -52,7 +52,9 @@ class PiecewisePolynomial(AbstractTrajectory):
 def _evaluate(times: Knots, coefficients: PolynomialCoefficients, t: Times) -> Rows:
     """Return a `PiecewisePolynomial` and three derivatives at times [s]."""
     xp = namespace(times, coefficients, t)
-    times, coefficients, t = (xp.asarray(x) for x in (times, coefficients, t))
+    times = xp.asarray(times)
+    coefficients = xp.asarray(coefficients)
+    t = xp.asarray(t)
     start = times[0]
     end = times[-1]
     # Written with `where`, because the derivative of `clip` at its ends is one half.
@@ -73,9 +75,10 @@ def _evaluate(times: Knots, coefficients: PolynomialCoefficients, t: Times) -> R
         second = second * x + 2 * first
         first = first * x + value
         value = value * x + coefficient
-    is_moving = ((t >= start) & (t <= end))[:, None]
-    derivatives = [xp.where(is_moving, each, 0.0) for each in (first, second, third)]
-    return xp.stack([value, *derivatives])
+    is_moving = (t >= start) & (t <= end)
+    derivatives = xp.stack([first, second, third])
+    derivatives = xp.where(is_moving[:, None], derivatives, 0.0)
+    return xp.concatenate([value[None], derivatives])
 
 
 class RestToRestSplineBasis(AbstractBasis):

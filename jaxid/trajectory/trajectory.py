@@ -194,7 +194,9 @@ class AbstractBasis(eqx.Module):
         samples_per_shift = math.ceil(4 * self.variables / SHIFTS)
         samples = SHIFTS * samples_per_shift
         step = float(self.duration) / samples
-        rows = np.asarray(self.rows((np.arange(samples) + 0.5) * step)[0])
+        times = (np.arange(samples) + 0.5) * step
+        positions, *_ = self.rows(times)
+        rows = np.asarray(positions)
         inverse = np.linalg.pinv(rows)
         tolerance = RETIMING_TOLERANCE * np.abs(rows).max()
 
@@ -203,7 +205,8 @@ class AbstractBasis(eqx.Module):
             for shift in range(SHIFTS):
                 retimed_rows = np.roll(direction, shift * samples_per_shift, axis=0)
                 to_retimed = inverse @ retimed_rows
-                if np.abs(rows @ to_retimed - retimed_rows).max() <= tolerance:
+                errors = rows @ to_retimed - retimed_rows
+                if np.abs(errors).max() <= tolerance:
                     maps.append(to_retimed)
         return np.array(maps)
 

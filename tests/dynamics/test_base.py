@@ -169,14 +169,13 @@ def test_standard_parameters_and_back():
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_both_methods_agree_with_lapack_on_random_trees(seed):
+def test_the_rank_agrees_with_lapack_on_random_trees(seed):
     bodies = SEVEN if seed % 2 else TEN
     model = Model(
         random_tree(seed, 2 + seed % 4).robot(), (bodies, *DRIVES, ConstantOffset())
     )
     found = base_parameters(model, seed=seed)
     assert found.notes == ()
-    assert found.indices == base_parameters(model, method="singular_values").indices
     W, _ = random_regressor(model, seed + 100)
     norms = np.linalg.norm(W, axis=0)
     live = norms > 1e-12 * norms.max()

@@ -134,7 +134,7 @@ class Presliding(AbstractTransition):
             return self.steady(speeds)
         return self.state[..., speeds.shape[-1] :]
 
-    def settled(self, qd: ManyJoints) -> Float[AnyArray, "*batch states"]:
+    def settled(self, qd: ManyJoints) -> AnyArray:
         """Return the states of steady motion."""
         return self._with_motors(qd, self.steady)
 
@@ -156,14 +156,12 @@ class Presliding(AbstractTransition):
         direction = jnp.sign(strain)
         return direction + (s - direction) * jnp.exp(-jnp.abs(strain))
 
-    def states(
-        self,
-        q: Float[AnyArray, "*batch samples joints"],
-        start: Float[AnyArray, "*batch states"],
-    ) -> Float[AnyArray, "*batch samples states"]:
+    def states(self, q: AnyArray, start: AnyArray) -> AnyArray:
         """Return the states along a path, from that at its first sample."""
         xp = namespace(q)
-        strain = self._strain(xp.diff(xp.moveaxis(q, -2, 0), axis=0))
+        samples_first = xp.moveaxis(q, -2, 0)
+        steps = xp.diff(samples_first, axis=0)
+        strain = self._strain(steps)
         # A step maps the state s before it to memory * s + s_behind.
         memory = xp.exp(-xp.abs(strain))
         s_behind = xp.sign(strain) * (1 - memory)
@@ -172,11 +170,11 @@ class Presliding(AbstractTransition):
         # Each turn joins twice as many steps to one.
         reach = 1
         while reach < len(s):
-            s_before = s[:-reach]
-            memory_before = memory[:-reach]
-            s = xp.concatenate([s[:reach], s[reach:] + memory[reach:] * s_before])
-            product = memory[reach:] * memory_before
-            memory = xp.concatenate([memory[:reach], product])
+            recent_memory = memory[reach:]
+            joined_s = s[reach:] + recent_memory * s[:-reach]
+            joined_memory = recent_memory * memory[:-reach]
+            s = xp.concatenate([s[:reach], joined_s])
+            memory = xp.concatenate([memory[:reach], joined_memory])
             reach *= 2
         return xp.moveaxis(s, 0, -2)
 

@@ -108,9 +108,7 @@ class AbstractTerm(eqx.Module):
         return {x.name: x.meaning for x in self.joint_parameters}
 
     @abstractmethod
-    def columns(
-        self, robot: Robot, q: Joints, qd: Joints, qdd: Joints
-    ) -> Float[AnyArray, "joints columns"]:
+    def columns(self, robot: Robot, q: Joints, qd: Joints, qdd: Joints) -> AnyArray:
         """Return the forces [N m or N] of unit parameters for one sample."""
 
     def forces(
@@ -154,9 +152,7 @@ class AbstractTerm(eqx.Module):
                 bounds[k * robot.joints : (k + 1) * robot.joints] = 0.0
         return bounds
 
-    def drive_matrices(
-        self, robot: Robot
-    ) -> Float[np.ndarray, "2 joints joints columns"]:
+    def drive_matrices(self, robot: Robot) -> np.ndarray:
         """Return the drives' inertia and viscous friction of unit parameters.
 
         Both are symmetric and cannot be negative for any motion.

@@ -5,14 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxid.arrays import AnyArray
-from jaxid.dynamics.motion import Motion
 from jaxid.robot.collision import CollisionModel
 from jaxid.robot.robot import Robot
 
 from .constraint import (
     AbstractConstraint,
     Finding,
-    ValuesAndSlopes,
     evaluate_samples,
     in_blocks,
     pull_back_samples,
@@ -45,13 +43,17 @@ class Clearance(AbstractConstraint):
     def __call__(self, robot, motion):
         """Return the missing distance of each pair."""
         ends = self._ends(robot, motion.q)
-        if isinstance(ends, np.ndarray):
-            samples = ends.reshape(-1, *ends.shape[-3:])
-            (gaps,) = in_blocks(lambda x: (self.model.clearances(x),), samples)
-            gaps = gaps.reshape(*ends.shape[:-3], -1)
-            return (self.distances - gaps) / SIZE
-        gaps = self.model.clearances(ends)
-        return (jnp.broadcast_to(self.distances, gaps.shape) - gaps) / SIZE
+        if not isinstance(ends, np.ndarray):
+            gaps = self.model.clearances(ends)
+            return (jnp.broadcast_to(self.distances, gaps.shape) - gaps) / SIZE
+
+        def clearances(ends):
+            return (self.model.clearances(ends),)
+
+        *batch, capsules, _, _ = ends.shape
+        samples = ends.reshape(-1, capsules, 2, 3)
+        (gaps,) = in_blocks(clearances, samples)
+        return (self.distances - gaps.reshape(*batch, -1)) / SIZE
 
     def _ends(self, robot: Robot, q: AnyArray) -> AnyArray:
         """Return the ends of all capsules' axes."""
@@ -65,7 +67,7 @@ class Clearance(AbstractConstraint):
         """
         ends = eqx.Partial(self.model.ends, robot)
 
-        def linearise(motion: Motion, entries: np.ndarray) -> ValuesAndSlopes:
+        def linearise(motion, entries):
             arrays = (self._ends(robot, motion.q), entries)
             gaps, by_ends = in_blocks(self.model.linearised_clearances, *arrays)
             weights = -by_ends / SIZE

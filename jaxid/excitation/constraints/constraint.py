@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Array, Float, Int
+from jaxid.arrays import AnyArray, Float, Int
 from jaxid.dynamics.motion import Motion
 from jaxid.dynamics.sample_methods import in_numpy, on_samples, program_of
 from jaxid.program.gradient import pull_back
@@ -129,15 +129,15 @@ class AbstractConstraint(eqx.Module):
         """
 
         @jax.jit
-        def linearise_block(entries: Array, *motion: Array) -> tuple[Array, ...]:
-            def value(*motion: Array) -> Array:
+        def linearise_block(entries, *motion):
+            def value(*motion):
                 values = self(robot, Motion(*motion))
                 return jnp.take_along_axis(values, entries[:, None], axis=1)[:, 0]
 
             values, pull = jax.vjp(value, *motion)
             return values, *pull(jnp.ones_like(values))
 
-        def linearise(motion: Motion, entries: np.ndarray) -> ValuesAndSlopes:
+        def linearise(motion, entries):
             arrays = (entries, motion.q, motion.qd, motion.qdd)
             values, *slopes = in_blocks(linearise_block, *arrays)
             return values, slopes

@@ -120,7 +120,7 @@ class ForceLimits(AbstractConstraint):
         """Return a function of relative excesses and their derivatives, in NumPy."""
         limits, to_limited = self._limited(robot)
 
-        def linearise(motion: Motion, entries: np.ndarray) -> ValuesAndSlopes:
+        def linearise(motion, entries):
             shares = to_limited[:, entries].T
             sample_limits = limits[entries]
             size, slopes = self._largest_forces(motion, shares, sample_limits)
@@ -178,11 +178,11 @@ class ForceLimits(AbstractConstraint):
         p = self.base.to_standard(jnp.asarray(self.parameters))
         speeds = REVERSAL_SPEED * np.asarray(complete_limits(model.robot).velocity)
 
-        def is_transition(part: Any) -> bool:
+        def is_transition(part):
             return isinstance(part, AbstractTransition)
 
-        def reverse(side: float) -> Any:
-            def replace(part: Any) -> Any:
+        def reverse(side):
+            def replace(part):
                 return Reversal(part, side, speeds) if is_transition(part) else part
 
             return jax.tree.map(replace, model, is_leaf=is_transition)
