@@ -122,7 +122,7 @@ def _solve_groups(
     )
 
     def solve_pair(pair: tuple[DataSets, JointArrays]) -> BatchFit:
-        return _solve_one(*pair, regressor, row_time)
+        return _solve_one(*pair, regressor, row_time, on_cpu)
 
     def solve_group(group: DataSets) -> BatchFit:
         arrays = [jnp.moveaxis(x, -1, 0) for x in jax.tree.leaves(group.motion)]
@@ -185,6 +185,7 @@ def _solve_one(
     columns: JointArrays,
     regressor: JointRegressor,
     row_time: float | None,
+    on_cpu: bool,
 ) -> BatchFit:
     """Solve one data set by the products of its rows."""
     samples = len(data_set.motion.q)
@@ -206,7 +207,7 @@ def _solve_one(
         )
     grams = [A @ A.T for A in rows.columns]
     inverse, condition = inverse_information(rows.information(grams))
-    p, squares = _estimate(rows, grams, inverse, condition)
+    p, squares = _estimate(rows, grams, inverse, condition, on_cpu)
     naive_deviations = _naive_deviations(rows, grams, inverse, squares, counts)
     deviations = naive_deviations
     dof = jnp.broadcast_to(counts.sum() - rows.size, deviations.shape)
@@ -235,7 +236,9 @@ def _solve_one(
     )
 
 
-def _estimate(rows: _Rows, grams: JointArrays, inverse: Array, condition: Array):
+def _estimate(
+    rows: _Rows, grams: JointArrays, inverse: Array, condition: Array, on_cpu: bool
+):
     """Return the parameters [draws, base], and squared residuals [draws, joints]."""
     products, force_squares = rows.products(rows.forces)
     p = rows.gradient(products) @ inverse
@@ -256,7 +259,14 @@ def _estimate(rows: _Rows, grams: JointArrays, inverse: Array, condition: Array)
     # Residuals themselves are only needed where differences of large numbers would lose
     # digits.
     loses_digits = (condition > 1e3) | jnp.any(squares < 1e-6 * force_squares)
-    p, squares = jax.lax.cond(loses_digits, refine, lambda: (p, squares))
+    if on_cpu:
+        p, squares = jax.lax.cond(loses_digits, refine, lambda: (p, squares))
+    else:
+        # Under `vmap` both would be computed anyway, and indices inside of a condition
+        # cannot be divided among devices.
+        refined_p, refined_squares = refine()
+        p = jnp.where(loses_digits, refined_p, p)
+        squares = jnp.where(loses_digits, refined_squares, squares)
     return p, jnp.maximum(squares, 0.0)
 
 
