@@ -1,10 +1,11 @@
 """Identification from rollouts: a simulation that moves like the robot."""
 
 from .bodies import Bodies as Bodies
+from .determined_combinations import Combination as Combination
 from .errors import RolloutErrors as RolloutErrors
 from .identify import identify_rollout as identify_rollout
 from .motion import ServoMotion as ServoMotion
-from .result import Combination as Combination, ServoFit as ServoFit
+from .result import ServoFit as ServoFit
 from .servo import PARAMETERS as PARAMETERS
 from .torque import (
     TorqueRolloutFit as TorqueRolloutFit,

@@ -23,6 +23,8 @@ from .motion import ServoMotion
 from .servo import (
     GAMMA,
     INDEX,
+    SHARES,
+    VELOCITY_FACTORS,
     Forces,
     Partials,
     Stages,
@@ -74,8 +76,8 @@ def _simulate(
 ) -> Path:
     """Simulate all motions from their initial states, each with its own parameters."""
     h = jnp.asarray(motion.sample_time)[None] / steps
-    shares = jnp.array([1.0 - GAMMA, GAMMA])
-    velocity_factors = jnp.array([(1.0 - GAMMA) / GAMMA, 1.0])
+    shares = jnp.array(SHARES)
+    velocity_factors = jnp.array(VELOCITY_FACTORS)
 
     def step(states: tuple[State, Array], commands: Array):
         start_state, last_velocity = states
@@ -389,29 +391,31 @@ def _compose(
             middle = middle_of(q, w, last_velocity, h)
             last_velocity = w
         balance = jax.tree.map(lambda x, k=k, s=s: x[:, k, s], sample_partials)
-        motion_mask = (velocities[:, k, s] != 0.0)[..., None]
-        force = balance.by_q[..., None] * q + balance.by_w[..., None] * w
+        is_moving = (velocities[:, k, s] != 0.0)[..., None]
+        force = balance.by_q[..., None] * q
+        force += balance.by_w[..., None] * w
         for x in integral:
             force += balance.by_integral[..., None] * x
-        force[:, joint, columns] += np.stack(balance.by_theta, axis=1)[:, symbol, joint]
+        by_theta = np.stack(balance.by_theta, axis=1)
+        force[:, joint, columns] += by_theta[:, symbol, joint]
         A = balance.resistance[..., None] * np.eye(n)
         if terms is not None:
             step_terms = _BodyTerms(*(x[:, k] for x in terms))
             by_q, by_v, by_w = _derivatives_of_bodies(
                 theta, balance, step_terms, slope[:, k, s], h
             )
-            A += by_w * (motion_mask & motion_mask.swapaxes(1, 2))
+            are_both_moving = is_moving & is_moving.swapaxes(1, 2)
+            A += by_w * are_both_moving
             force += by_w @ w + by_q @ middle[0] + by_v @ middle[1]
-        change = np.linalg.solve(A, force * motion_mask)
-        share, velocity_factor = ((1.0 - GAMMA, (1.0 - GAMMA) / GAMMA), (GAMMA, 1.0))[s]
+        change = np.linalg.solve(A, force * is_moving)
+        share = SHARES[s]
         for x in integral:
             growth = -balance.rate[..., None] * (q + GAMMA * h * change)
-            growth[:, joint, columns] += np.stack(balance.growth, axis=1)[
-                :, symbol, joint
-            ]
+            growth_by_theta = np.stack(balance.growth, axis=1)
+            growth[:, joint, columns] += growth_by_theta[:, symbol, joint]
             integral = [x + share * h * growth]
         q = q + share * h * change
-        w = (w + velocity_factor * (change - w)) * motion_mask
+        w = (w + VELOCITY_FACTORS[s] * (change - w)) * is_moving
     state = np.concatenate([q, w, *integral, last_velocity], axis=1)
     return state[..., : size + n], state[..., size + n :]
 

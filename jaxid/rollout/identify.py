@@ -286,7 +286,6 @@ class _Search:
         x: np.ndarray,
         free_mask: np.ndarray,
         iterations: int = 12,
-        damping: float = 1e-2,
     ) -> Solution:
         """Fit candidates [candidates, joints, parameters] to all motions."""
         w = self.weights[:, None, :]
@@ -305,7 +304,6 @@ class _Search:
             free_mask,
             (LOWER, UPPER),
             iterations,
-            damping=damping,
         )
 
     def held_out_scores(self, solution: Solution, free_mask: np.ndarray) -> np.ndarray:

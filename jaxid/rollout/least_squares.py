@@ -9,6 +9,8 @@ from jaxid.arrays import Bool, Float
 
 MAX_BOUND_ROUNDS = 6
 """Largest number of times that parameters are brought to their bounds in a step."""
+START_DAMPING = 1e-2
+"""Damping of the first step, relative to the diagonal of the Gauss-Newton matrix."""
 Moments = Callable[[np.ndarray], tuple[np.ndarray, ...]]
 """Function of parameters [..., size] of some problems.
 
@@ -42,7 +44,6 @@ def minimise(
     bounds: tuple[np.ndarray, np.ndarray],
     iterations: int = 30,
     tolerance: float = 1e-3,
-    damping: float = 1e-2,
 ) -> Solution:
     """Minimise sums of squares over free parameters; each problem has its own damping.
 
@@ -58,11 +59,9 @@ def minimise(
         bounds: Lower and upper limits of the parameters.
         iterations: Largest number of steps.
         tolerance: Relative decrease of the cost below which a problem has converged.
-        damping: Damping of the first step, relative to the diagonal of the Gauss-Newton
-            matrix.
     """
     x = np.clip(x, *bounds)
-    dampings = np.full(x.shape[:-1], damping)
+    dampings = np.full(x.shape[:-1], START_DAMPING)
     subset = np.arange(len(x))
     convergence = np.zeros(x.shape[:-1], bool)
     cost, g, H = moments(x)

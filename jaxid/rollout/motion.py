@@ -241,20 +241,23 @@ def state_at(
     start_index = max(0, index - neighbour_count)
     stop_index = min(q.shape[1], index + neighbour_count + 1)
     t = dt * (np.arange(start_index, stop_index) - index)
+    positions = q[:, start_index:stop_index].T
     has_neighbours = index >= neighbour_count
     A = np.vander(t, 3 if has_neighbours else 2, increasing=True)
-    coefficients, *_ = np.linalg.lstsq(A, q[:, start_index:stop_index].T, rcond=None)
+    coefficients, *_ = np.linalg.lstsq(A, positions, rcond=None)
     degrees_of_freedom = max(len(t) - A.shape[1], 1)
-    error = np.sqrt(
-        np.sum((q[:, start_index:stop_index].T - A @ coefficients) ** 2, axis=0)
-        / degrees_of_freedom
-    )
-    rate = np.maximum(error, 0.1 * MIN_DEVIATION) / np.sqrt(np.sum((t - t.mean()) ** 2))
-    state = np.stack(
-        [coefficients[0] if has_neighbours else q[:, index], coefficients[1]]
-    )
+    residuals = positions - A @ coefficients
+    error = np.sqrt(np.sum(residuals**2, axis=0) / degrees_of_freedom)
+    duration = np.sqrt(np.sum((t - t.mean()) ** 2))
+    rate = np.maximum(error, 0.1 * MIN_DEVIATION) / duration
+    position = q[:, index]
+    acceleration = np.zeros_like(rate)
+    if has_neighbours:
+        position = coefficients[0]
+        acceleration = 2.0 * coefficients[2]
+    state = np.stack([position, coefficients[1]])
     spread = np.stack([np.maximum(error, MIN_DEVIATION), rate])
-    return state, spread, 2.0 * coefficients[2] if has_neighbours else 0.0 * rate
+    return state, spread, acceleration
 
 
 def smooth_rates(

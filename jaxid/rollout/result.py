@@ -3,13 +3,11 @@
 import dataclasses
 from collections.abc import Sequence
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
-from scipy import special, stats
+from scipy import special
 
 from jaxid.arrays import AnyArray, Bool, Float
-from jaxid.identification.uncertainty.spectral import sandwich_of_columns
 from jaxid.measurement.recording import Recording
 from jaxid.result_table import (
     Column,
@@ -22,49 +20,21 @@ from jaxid.result_table import (
 
 from .bodies import Bodies
 from .coupled import CoupledSimulator
+from .determined_combinations import (
+    MAX_RELATIVE_DEVIATION,
+    Combination,
+    determined_combinations,
+)
 from .errors import RolloutErrors
 from .motion import ServoMotion
-from .refine import Refinement, mean_squares, weights_of
-from .servo import INDEX, LOWER, PARAMETERS, SCALE, UPPER, with_integral
+from .refine import Refinement, mean_squares
+from .servo import INDEX, LOWER, PARAMETERS, UPPER, with_integral
 from .uncoupled import ServoSimulator
 
-MAX_RELATIVE_DEVIATION = 0.25
-"""Relative standard deviation of a parameter above which it is not determined."""
 LIMITED_PARAMETERS = [INDEX[x] for x in ("B", "d", "b", "um", "g", "ki")]
 """Parameters that are not at a limit of the search unless something is wrong."""
 MIN_ROUNDING_RATIO = 1.5
 """Multiple of the encoder's rounding above which slow errors show a missing effect."""
-
-
-class Combination(NamedTuple):
-    """Parameter of a joint, or combination of some, that the logs determine.
-
-    Attributes:
-        joint: Index of the joint.
-        name: Parameter, with those that are merged into it.
-        meaning: Description in words.
-        unit: Unit.
-        coefficients: Factor of each parameter of all joints.
-        value: Estimate.
-        deviation: Standard deviation.
-        dof: Degrees of freedom of the deviation.
-    """
-
-    joint: int
-    name: str
-    meaning: str
-    unit: str
-    coefficients: Float[np.ndarray, "joints parameters"]
-    value: float
-    deviation: float
-    dof: float
-
-    def interval(self, level: float = 0.95) -> tuple[float, float]:
-        """Return the confidence interval."""
-        half_width = self.deviation * float(
-            special.stdtrit(max(self.dof, 1.0), 0.5 + 0.5 * level)
-        )
-        return self.value - half_width, self.value + half_width
 
 
 @dataclasses.dataclass(frozen=True)
@@ -121,9 +91,7 @@ class ServoFit:
         simulator = refinement.simulator
         r = refinement.residuals
         motion = simulator.motion
-        combinations, covariance, dof = _determined_combinations(
-            _Rows.of(refinement), refinement, joint_names
-        )
+        combinations, covariance, dof = determined_combinations(refinement, joint_names)
         positions = np.asarray(motion.positions)
         joint_errors = []
         for j, name in enumerate(joint_names):
@@ -198,10 +166,6 @@ class ServoFit:
         if self.bodies is None or self.bodies.model.robot.revolute[c.joint]:
             return c.unit.replace("u", "rad")
         return c.unit.replace("u", "m").replace("(N m)", "N")
-
-    def of_parameter(self, symbol: str) -> Float[np.ndarray, " joints"]:
-        """Return a parameter of all joints by its symbol, like `"J"`."""
-        return self.parameters[:, INDEX[symbol]]
 
     def simulate(self, log: Recording) -> list[np.ndarray]:
         """Simulate the segments of a log from their first positions, free-running.
@@ -286,14 +250,12 @@ class ServoFit:
         random = np.random.default_rng(seed)
         draws = np.tile(self.parameters, (count, 1, 1))
         deviation = np.sqrt(np.diag(self.covariance))
-        size, vectors = np.linalg.eigh(self.covariance / deviation / deviation[:, None])
-        root = vectors * np.sqrt(np.maximum(size, 0.0))
-        normal_draws = np.clip(
-            random.normal(size=(count, len(root))) @ root.T, -7.0, 7.0
-        )
-        draws[:, self.free] += deviation * special.stdtrit(
-            self.dof, special.ndtr(normal_draws)
-        )
+        correlation = self.covariance / deviation / deviation[:, None]
+        values, vectors = np.linalg.eigh(correlation)
+        root = vectors * np.sqrt(np.maximum(values, 0.0))
+        normal_draws = random.normal(size=(count, len(root))) @ root.T
+        probabilities = special.ndtr(np.clip(normal_draws, -7.0, 7.0))
+        draws[:, self.free] += deviation * special.stdtrit(self.dof, probabilities)
         return np.clip(draws, LOWER, UPPER)
 
     def summary(self) -> Table:
@@ -355,101 +317,6 @@ class ServoFit:
         return self.summary().text()
 
 
-class _Rows(NamedTuple):
-    """Weighted sensitivities of a refinement, less what initial states can imitate.
-
-    Attributes:
-        refinement: Refinement.
-        weights: Weight of each motion's squared errors [motions, joints].
-        imitations: Initial states that imitate each parameter [motions, states,
-            parameters].
-        scores: Sensitivities times residuals [motions, parameters].
-        information: Gauss-Newton matrix.
-    """
-
-    refinement: Refinement
-    weights: np.ndarray
-    imitations: np.ndarray
-    scores: np.ndarray
-    information: np.ndarray
-
-    @classmethod
-    def of(cls, refinement: Refinement) -> "_Rows":
-        """Return the rows of a refinement."""
-        weights = weights_of(refinement.simulator.motion, refinement.sums)
-        size = refinement.simulator.motion.start[0].size
-        scores = []
-        imitations = []
-        information = np.zeros((int(refinement.free.sum()),) * 2)
-        certainties = refinement.simulator.motion.certainty
-        for w, g, H, certainty in zip(
-            weights, *refinement.products, certainties, strict=True
-        ):
-            motion_g = w @ g
-            motion_H = np.tensordot(w, H, 1)
-            state_information = motion_H[-size:, -size:] + np.diag(certainty.ravel())
-            imitations.append(
-                np.linalg.solve(state_information, motion_H[-size:, :-size])
-            )
-            scores.append(motion_g[:-size] - motion_g[-size:] @ imitations[-1])
-            information += (
-                motion_H[:-size, :-size] - motion_H[:-size, -size:] @ imitations[-1]
-            )
-        return cls(
-            refinement, weights, np.stack(imitations), np.stack(scores), information
-        )
-
-    @property
-    def columns(self) -> list[np.ndarray]:
-        """Sensitivities of each motion and joint [parameters, samples]."""
-        columns = []
-        for S, start in zip(
-            self.refinement.sensitivities, self.imitations, strict=True
-        ):
-            by_parameters = S[..., : -len(start)]
-            by_start = S[..., -len(start) :]
-            columns += list(np.swapaxes(by_parameters - by_start @ start, 1, 2))
-        return columns
-
-    def covariance(
-        self, columns: list, indices: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return covariance and degrees of freedom if only some parameters are unknown.
-
-        The spectral sandwich, at least that of independent errors; where motions differ
-        more than it explains, their scatter.
-        """
-        motion = self.refinement.simulator.motion
-        motions, joints = self.weights.shape
-        B = np.zeros_like(self.information)
-        place = np.ix_(indices, indices)
-        B[place] = _inverse(self.information[place])
-        sandwich = sandwich_of_columns(
-            np,
-            [range(len(B))] * (motions * joints),
-            np.sqrt(self.weights).ravel(),
-            B,
-            np.zeros((1, len(B))),
-            columns,
-            list(self.refinement.residuals.reshape(motions * joints, 1, -1)),
-            np.asarray(motion.counted).mean(axis=-1).ravel(),
-            float(motion.sample_time.mean()),
-        )
-        variance, dof = (x[0] for x in sandwich)
-        # The sandwich is blind where no error can show: there the information alone
-        # tells.
-        samples = np.asarray(motion.counted).sum(axis=-1).max()
-        variance = np.maximum(variance, np.diag(B) / max(float(samples), 1.0))
-        size = np.sqrt(np.maximum(np.diag(B), 1e-300))
-        changes = self.scores @ B
-        scatter = motions / max(motions - 1, 1) * (changes**2).sum(axis=0)
-        limit = stats.f.ppf(0.95, max(motions - 1, 1), dof)
-        scatter_mask = (motions > 1) & (scatter > limit * variance)
-        dof = np.where(scatter_mask, motions - 1.0, dof)
-        deviation = np.sqrt(np.where(scatter_mask, scatter, variance))
-        return B / np.outer(size, size) * np.outer(deviation, deviation), dof
-
-
 def systematic_error(r: np.ndarray, kept: np.ndarray, q: np.ndarray) -> float:
     """Return a joint's RMS error [rad or m] if an effect seems missing; otherwise 0.
 
@@ -467,87 +334,3 @@ def systematic_error(r: np.ndarray, kept: np.ndarray, q: np.ndarray) -> float:
     # ones, too.
     rounding = float(np.quantile(steps, 0.1)) / np.sqrt(12.0) if steps.size else 0.0
     return 0.0 if rms < MIN_ROUNDING_RATIO * rounding or neighbours < 0.5 else rms
-
-
-def _inverse(H: np.ndarray) -> np.ndarray:
-    """Return the inverse of an information matrix, finite where nothing is known."""
-    size = np.sqrt(np.maximum(np.diag(H), 1e-30))
-    values, vectors = np.linalg.eigh(H / np.outer(size, size))
-    scaled_inverse = vectors / np.maximum(values, 1e-12) @ vectors.T
-    return scaled_inverse / np.outer(size, size)
-
-
-def _determined_combinations(
-    rows: _Rows, refinement: Refinement, joint_names: tuple[str, ...]
-) -> tuple[tuple[Combination, ...], np.ndarray, np.ndarray]:
-    """Return the determined combinations, and covariance and dof of all parameters."""
-    x = refinement.parameters[refinement.free]
-    joints, symbols = np.nonzero(refinement.free)
-    columns = rows.columns
-    covariance, parameter_dof = rows.covariance(columns, np.arange(len(x)))
-    size = np.maximum(np.abs(x), 0.1 * SCALE[symbols])
-    interval_factors = (
-        special.stdtrit(parameter_dof, 0.975) / special.ndtri(0.975) / size
-    )
-    indices, kappa = _merge(
-        covariance * np.outer(interval_factors, interval_factors),
-        np.maximum(np.abs(x), SCALE[symbols]) / size,
-    )
-    kappa = kappa * size[indices][:, None] / size[None, :]
-    combination_covariance, dof = rows.covariance(columns, indices)
-    combinations = []
-    for k, i in enumerate(indices):
-        coefficients = np.zeros(refinement.parameters.shape)
-        coefficients[refinement.free] = kappa[k]
-        name = PARAMETERS[symbols[i]].symbol
-        meaning = PARAMETERS[symbols[i]].meaning
-        merged_meanings = []
-        for m in np.flatnonzero(kappa[k]):
-            if m != i:
-                is_elsewhere = joints[m] != joints[i]
-                where = f" of {joint_names[joints[m]]}" if is_elsewhere else ""
-                name += f" {kappa[k, m]:+.3g} {PARAMETERS[symbols[m]].symbol}{where}"
-                merged_meanings.append(PARAMETERS[symbols[m]].meaning + where)
-        if merged_meanings:
-            meaning = f"{meaning} and {', '.join(merged_meanings)} only together"
-        numbers = (
-            float(kappa[k] @ x),
-            float(np.sqrt(combination_covariance[i, i])),
-            float(dof[i]),
-        )
-        unit = PARAMETERS[symbols[i]].unit
-        place = int(joints[i]), name, meaning, unit, coefficients
-        combinations.append(Combination(*place, *numbers))
-    return tuple(combinations), covariance, parameter_dof
-
-
-def _merge(covariance: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return which relative parameters are determined, and how others merge into them.
-
-    Args:
-        covariance: Covariance of the relative parameters.
-        reach: Usual size of each, to which it may change if it is not determined.
-
-    A parameter is not determined if, with those before it known only by the logs, its
-    deviation exceeds `MAX_RELATIVE_DEVIATION`: its column of the information's root
-    adds almost nothing.
-    """
-    n = len(covariance)
-    information = _inverse(covariance)
-    values, vectors = np.linalg.eigh(information)
-    W = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
-    indices: list[int] = []
-    Q = np.zeros((n, 0))
-    for k in range(n):
-        remainder = W[:, k] - Q @ (Q.T @ W[:, k])
-        if np.linalg.norm(remainder) > 1.0 / MAX_RELATIVE_DEVIATION:
-            indices.append(k)
-            Q = np.column_stack([Q, remainder / np.linalg.norm(remainder)])
-    kappa = np.zeros((len(indices), n))
-    if indices:
-        kappa = np.linalg.lstsq(W[:, indices], W, rcond=None)[0]
-        kappa[:, indices] = np.eye(len(indices))
-        # What changes a combination by less than its deviation is left out.
-        deviation = np.sqrt(np.diag(np.linalg.inv(W[:, indices].T @ W[:, indices])))
-        kappa[np.abs(kappa) * reach < np.minimum(0.02, deviation)[:, None]] = 0.0
-    return np.array(indices, int), kappa

@@ -26,6 +26,11 @@ from .motion import MAX_ADVANCE, MAX_DELAY, ServoMotion
 GAMMA = 1.0 - math.sqrt(0.5)
 """Fraction of a step that each of its two implicit stages takes."""
 
+SHARES = (1.0 - GAMMA, GAMMA)
+"""Fraction of a step by which the position moves in each stage."""
+VELOCITY_FACTORS = ((1.0 - GAMMA) / GAMMA, 1.0)
+"""Change of velocity behind each stage, over that in it."""
+
 
 class ServoParameter(NamedTuple):
     """Parameter of a joint: symbol, meaning, unit, start, limits, scale.
@@ -75,26 +80,30 @@ def delayed_command(c: AnyArray, t: Array, hold: AnyArray) -> tuple[Array, Array
     Returns:
         The commands, and their changes by a delay of one sample.
     """
+    last_index = len(c) - 1.0
 
     def held_commands() -> tuple[Array, Array]:
-        table = jnp.concatenate([jnp.zeros(1), jnp.cumsum(c)])
+        sums = jnp.concatenate([jnp.zeros(1), jnp.cumsum(c)])
         instants = jnp.maximum(t, -1e3)
-        floors = jnp.clip(jnp.floor(instants), 0.0, len(c) - 1.0)
+        floors = jnp.clip(jnp.floor(instants), 0.0, last_index)
         k = floors.astype(int)
+        commands = c[k]
+        integral = sums[k] + (instants - floors) * commands
         length = jnp.maximum(jnp.diff(instants), 1e-12)
-        mean = jnp.diff(table[k] + (instants - floors) * c[k]) / length
-        return jnp.repeat(mean, 2), jnp.repeat(-jnp.diff(c[k]) / length, 2)
+        mean = jnp.diff(integral) / length
+        by_delay = -jnp.diff(commands) / length
+        return jnp.repeat(mean, 2), jnp.repeat(by_delay, 2)
 
     def interpolated_commands() -> tuple[Array, Array]:
-        ends = jnp.stack([t[:-1] + GAMMA * jnp.diff(t), t[1:]], axis=1).ravel()
-        instants = jnp.clip(ends, 0.0, len(c) - 1.0)
-        floors = jnp.clip(jnp.floor(instants), 0.0, len(c) - 2.0)
+        first_ends = t[:-1] + GAMMA * jnp.diff(t)
+        ends = jnp.stack([first_ends, t[1:]], axis=1).ravel()
+        instants = jnp.clip(ends, 0.0, last_index)
+        floors = jnp.clip(jnp.floor(instants), 0.0, last_index - 1.0)
         k = floors.astype(int)
-        start_commands = c[k]
-        change = c[k + 1] - c[k]
-        return start_commands + (instants - floors) * change, jnp.where(
-            instants == ends, -change, 0.0
-        )
+        commands = c[k]
+        change = c[k + 1] - commands
+        by_delay = jnp.where(instants == ends, -change, 0.0)
+        return commands + (instants - floors) * change, by_delay
 
     return jax.lax.cond(hold, held_commands, interpolated_commands)
 
@@ -132,14 +141,12 @@ class Stages(NamedTuple):
                 jnp.asarray(x).T[:-1], 2 * steps // rows_per_sample, axis=0
             )
 
-        def alternate_stages(first_value: float, second_value: float) -> Array:
-            return jnp.tile(jnp.array([first_value, second_value]), count * steps)[
-                :, None
-            ]
+        def alternate_stages(values: tuple[float, float]) -> Array:
+            return jnp.tile(jnp.array(values), count * steps)[:, None]
 
         commands, by_delay = commands_of_stages(theta, motion, steps, hold)
-        share = alternate_stages(1.0 - GAMMA, GAMMA)
-        velocity_factor = alternate_stages((1.0 - GAMMA) / GAMMA, 1.0)
+        share = alternate_stages(SHARES)
+        velocity_factor = alternate_stages(VELOCITY_FACTORS)
         stages = cls(
             commands,
             repeat_stages(motion.load),
@@ -158,17 +165,19 @@ def commands_of_stages(
     Returns:
         Both with the shape [stages, joints].
     """
-    delay, bias, gain = (theta[:, INDEX[key]] for key in ("d", "b", "g"))
+    delay = theta[:, INDEX["d"]]
+    bias = theta[:, INDEX["b"]]
+    gain = theta[:, INDEX["g"]]
+    sample_time = motion.sample_time
     count = motion.positions.shape[-1] - 1
-    instants = jnp.asarray(motion.lead + np.arange(count * steps + 1) / steps)
+    samples = np.arange(count * steps + 1) / steps
+    instants = jnp.asarray(motion.lead + samples)
 
     def of_joint(command: AnyArray, delay: Array) -> tuple[Array, Array]:
-        return delayed_command(command, instants - delay / motion.sample_time, hold)
+        return delayed_command(command, instants - delay / sample_time, hold)
 
     commands, by_delay = jax.vmap(of_joint, out_axes=1)(motion.commands, delay)
-    return gain[None] * commands + bias[None], gain[
-        None
-    ] * by_delay / motion.sample_time
+    return gain * commands + bias, gain * by_delay / sample_time
 
 
 class State(NamedTuple):
@@ -271,12 +280,15 @@ def balanced_integral(theta: Array, motion: ServoMotion, hold: AnyArray) -> Arra
     J, B, _, _, a, F, mu, Fs, vs, _, _, ki = theta.T
     q, w = motion.start[:2]
     load = a * motion.load[:, 0]
+    inertia = J + a * motion.inertia[:, 0]
     direction = w / (jnp.abs(w) + motion.spread[1])
-    friction = F + mu * jnp.abs(load) + Fs * jnp.exp(-((w / vs) ** 2))
+    stribeck_share = jnp.exp(-((w / vs) ** 2))
+    friction = F + mu * jnp.abs(load) + Fs * stribeck_share
     torque = load + B * w + friction * direction
-    torque = torque + (J + a * motion.inertia[:, 0]) * motion.acceleration
-    command = commands_of_stages(theta, motion, 1, hold)[0][0]
-    return jnp.where(ki > 0.0, torque - command + q, 0.0)
+    torque = torque + inertia * motion.acceleration
+    commands, _ = commands_of_stages(theta, motion, 1, hold)
+    error = commands[0] - q
+    return jnp.where(ki > 0.0, torque - error, 0.0)
 
 
 def with_integral(motion: ServoMotion, theta: AnyArray, hold: bool) -> ServoMotion:

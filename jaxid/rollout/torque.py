@@ -29,6 +29,9 @@ from jaxid.result_table import Column, Summarised, Table, with_deviations
 
 from .torque_windows import MARGIN, SLIDING_SPEED, Windows
 
+COUNTED_STEP = 5
+"""Samples of a window from one that counts to the next."""
+
 
 @dataclasses.dataclass(frozen=True)
 class TorqueRollout:
@@ -256,7 +259,6 @@ def identify_torque_rollout(
     horizon: float = 0.2,
     gains: bool = False,
     load_friction: bool = False,
-    every: int = 5,
 ) -> TorqueRolloutFit:
     """Identify a robot whose simulation under recorded torques follows the positions.
 
@@ -270,7 +272,6 @@ def identify_torque_rollout(
             joint's, are estimated. A gain common to all scales all parameters, and no
             log tells it.
         load_friction: Whether friction that grows with the torque is estimated.
-        every: Number of samples from one that counts to the next.
 
     Raises:
         InputError: If there is no window of the horizon, or the model cannot be
@@ -292,7 +293,9 @@ def identify_torque_rollout(
 
     def residuals(values, windows):
         unknowns = jnp.asarray(start).at[free_unknowns].set(values)
-        return rollout.errors(unknowns, windows)[every - 1 :: every].ravel()
+        return rollout.errors(unknowns, windows)[
+            COUNTED_STEP - 1 :: COUNTED_STEP
+        ].ravel()
 
     lower, upper = _limits(rollout)
     with double_precision():

@@ -37,23 +37,20 @@ def _stage(
     return advance_state(state, u, x, stage, h), u
 
 
-def _start(theta: Array, motion: ServoMotion, hold: AnyArray) -> State:
+def _start(theta: Array, motion: ServoMotion) -> State:
     """Return the initial state, with balanced integral actions of the servos."""
     q, w, *integral = jnp.asarray(motion.start)
-    return State(q, w, balanced_integral(theta, motion, hold) if integral else None)
+    return State(q, w, balanced_integral(theta, motion, False) if integral else None)
 
 
 @functools.partial(jax.jit, static_argnums=2)
-def _path(
-    theta: Array, motion: ServoMotion, steps: int, hold: AnyArray
-) -> tuple[Array]:
+def _path(theta: Array, motion: ServoMotion, steps: int) -> tuple[Array]:
     """Simulate one motion; return its positions.
 
     Args:
         theta: Parameters of each joint, as in `PARAMETERS`.
         motion: One motion: commands, load, initial state.
         steps: Steps in each sample time.
-        hold: Whether commands are held until the next one, instead of interpolated.
 
     Returns:
         Positions [joints, samples].
@@ -64,16 +61,14 @@ def _path(
         state, _ = _stage(state, theta.T, stage, h)
         return state, state.q
 
-    start = _start(theta, motion, hold)
-    stages, _ = Stages.of(theta, motion, steps, hold)
+    start = _start(theta, motion)
+    stages, _ = Stages.of(theta, motion, steps, False)
     _, path = jax.lax.scan(simulate_stage, start, stages)
     return (jnp.concatenate([start.q[None], path[2 * steps - 1 :: 2 * steps]]).T,)
 
 
 @functools.partial(jax.jit, static_argnums=2)
-def _moments(
-    theta: Array, motion: ServoMotion, steps: int, hold: AnyArray
-) -> tuple[Array, ...]:
+def _moments(theta: Array, motion: ServoMotion, steps: int) -> tuple[Array, ...]:
     """Return sums of squared errors, half their gradients, and Gauss-Newton matrices.
 
     Loads are held. In blocks, whose numbers stay in the processor's cache, the
@@ -150,7 +145,7 @@ def _moments(
         padded_rows = jnp.pad(x, ((0, -len(x) % size), (0, 0)), mode)
         return padded_rows.reshape(-1, size, x.shape[-1])
 
-    stages, by_delay = Stages.of(theta, motion, steps, hold)
+    stages, by_delay = Stages.of(theta, motion, steps, False)
     stages = jax.tree.map(
         lambda x: blocks(x, 2 * steps * BLOCK_SIZE), (stages, by_delay)
     )
@@ -160,16 +155,16 @@ def _moments(
 
     def by_parameter(unit_vector: Array) -> State:
         change = jnp.broadcast_to(unit_vector, theta.shape)
-        return jax.jvp(lambda x: _start(x, motion, hold), (theta,), (change,))[1]
+        return jax.jvp(lambda x: _start(x, motion), (theta,), (change,))[1]
 
     tangents = jax.vmap(by_parameter)(jnp.eye(P))
-    start = _start(theta, motion, hold), tangents, *sums
+    start = _start(theta, motion), tangents, *sums
     return jax.lax.scan(block, start, (*stages, positions, sample_mask))[0][2:]
 
 
 @dataclasses.dataclass(frozen=True)
 class ServoSimulator:
-    """Motions with the steps in which they are simulated.
+    """Motions with the steps in which they are simulated, by interpolated commands.
 
     Parameters have the shape [candidates, joints, parameters]; results have the motions
     first.
@@ -177,12 +172,10 @@ class ServoSimulator:
     Attributes:
         motion: Motions.
         time_step: Longest step, 5 % more if that makes them fewer [s].
-        hold: Whether commands are held until the next one, instead of interpolated.
     """
 
     motion: ServoMotion
     time_step: float
-    hold: bool = False
 
     @property
     def steps(self) -> int:
@@ -222,7 +215,7 @@ class ServoSimulator:
                 rows = jnp.asarray(
                     motion_parameters[candidates].reshape(BATCH_SIZE * joints, -1)
                 )
-                outputs = function(rows, part, self.steps, np.array(self.hold))
+                outputs = function(rows, part, self.steps)
             candidate_count = min(BATCH_SIZE, count - first_candidate)
             batch_outputs = (
                 np.asarray(x).reshape(BATCH_SIZE, joints, *x.shape[1:]) for x in outputs

@@ -16,12 +16,12 @@ from jaxid.export.servo_actuators import (
     simulator_values,
 )
 from jaxid.rollout.coupled import CoupledSimulator
+from jaxid.rollout.determined_combinations import _Rows
 from jaxid.rollout.dry_friction import Slip
 from jaxid.rollout.identify import mask
 from jaxid.rollout.least_squares import bounded_step, minimise
 from jaxid.rollout.motion import ServoMotion
 from jaxid.rollout.refine import Refinement
-from jaxid.rollout.result import _Rows
 from jaxid.rollout.servo import (
     INDEX,
     LOWER,
@@ -146,15 +146,15 @@ def test_sensitivities_agree_with_differences(coupled, hold, ki):
 
 @pytest.mark.parametrize("ki", [0.0, 4.0])
 def test_the_search_has_the_gauss_newton_matrix_of_uncoupled_joints(ki):
-    simulator, x, free = _arm(None, True, ki)
+    simulator, x, free = _arm(None, False, ki)
     free[:] = True
     S = simulator.sensitivities(x, simulator.simulate(x), free)[0]
     counted = simulator.motion.counted[0]
-    alone = ServoSimulator(simulator.motion, 0.01, True)
+    alone = ServoSimulator(simulator.motion, 0.01)
     r = (alone.paths(x[None])[0, 0] - simulator.motion.positions[0]) * counted
     cost, g, H = (z[0, 0] for z in alone.moments(x[None]))
     of_start = jax.jacfwd(
-        lambda x: balanced_integral(x, simulator.motion.part(0), np.array(True))
+        lambda x: balanced_integral(x, simulator.motion.part(0), np.array(False))
     )(x)
     for j in range(2):
         own = S[j, :, j * len(START) : (j + 1) * len(START)]
@@ -251,11 +251,11 @@ def test_the_arms_parameters_are_found(fit):
     K = np.array(servo_arm.KP)
     truth = {"B": servo_arm.DAMPING / K, "F": servo_arm.FRICTION / K}
     for symbol, values in truth.items():
-        np.testing.assert_allclose(fit.of_parameter(symbol), values, rtol=0.02)
+        np.testing.assert_allclose(fit.parameters[:, INDEX[symbol]], values, rtol=0.02)
     assert fit.hold
     assert fit.bodies.coupled
     np.testing.assert_allclose(
-        fit.of_parameter("J")[1], servo_arm.ARMATURE[1] / K[1], rtol=0.02
+        fit.parameters[:, INDEX["J"]][1], servo_arm.ARMATURE[1] / K[1], rtol=0.02
     )
     assert fit.stiffness[1] == pytest.approx(K[1], rel=0.01)
     assert fit.notes == ()
@@ -353,7 +353,7 @@ def test_integral_action_is_found_and_exported(tmp_path):
     options = {"friction": False, "saturation": False, "time_step": 0.005}
     options |= {"integral": True, "stiffness": servo_arm.KP}
     found = jid.identify_rollout(logs, servo_arm.bodies(), **options)
-    np.testing.assert_allclose(found.of_parameter("ki"), 3.0, rtol=0.01)
+    np.testing.assert_allclose(found.parameters[:, INDEX["ki"]], 3.0, rtol=0.01)
     np.testing.assert_array_equal(found.stiffness, servo_arm.KP)
     values = simulator_values(found)
     np.testing.assert_allclose(values["armature"], servo_arm.ARMATURE, rtol=0.02)
@@ -377,7 +377,7 @@ def test_integral_action_of_a_servo_that_saturates_is_found():
         "stiffness": servo_arm.KP,
     }
     found = jid.identify_rollout(logs, servo_arm.bodies(), **options)
-    np.testing.assert_allclose(found.of_parameter("ki"), 3.0, rtol=0.02)
+    np.testing.assert_allclose(found.parameters[:, INDEX["ki"]], 3.0, rtol=0.02)
     limit = simulator_values(found)["effort_limit"]
     np.testing.assert_allclose(limit, 1.6, rtol=0.02)
     other = servo_arm.log(9, duration=20.0, ki=3.0, limit=1.6)
