@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Array, Float
+from jaxid.arrays import AnyArray, Array
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.projection_equation import solve_symmetric
 from jaxid.dynamics.sample_methods import in_numpy
@@ -45,7 +45,7 @@ class Bodies:
     """
 
     model: Model
-    parameters: Float[AnyArray, " standard"]
+    parameters: AnyArray
     coupled: bool = False
 
     def matrix_and_bias(self, q: Array, v: Array) -> tuple[AnyArray, AnyArray]:

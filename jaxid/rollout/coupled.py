@@ -14,12 +14,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Array, Bool, Float, double_precision, on_cores
+from jaxid.arrays import AnyArray, Array, double_precision, on_cores
 from jaxid.program import evaluate
 from jaxid.program.xla import lower
 
 from .bodies import Bodies, Programs
-from .motion import ServoMotion
+from .motion import FreeParameters, MotionSamples, ServoMotion
 from .servo import (
     GAMMA,
     INDEX,
@@ -228,7 +228,7 @@ class CoupledSimulator:
         """Steps in each sample time: at least two, which reveal held commands."""
         return steps_of(self.motion, self.time_step, 2)
 
-    def simulate(self, theta: Float[AnyArray, "*candidates joints parameters"]) -> Path:
+    def simulate(self, theta: AnyArray) -> Path:
         """Simulate the motions from their initial states.
 
         Args:
@@ -244,7 +244,7 @@ class CoupledSimulator:
             )
             return jax.tree.map(np.asarray, path)
 
-    def positions(self, path: Path) -> Float[np.ndarray, "motions joints samples"]:
+    def positions(self, path: Path) -> MotionSamples:
         """Return the positions of all samples."""
         start_positions = np.asarray(self.motion.start)[:, 0, :, None]
         later_positions = path.positions[self.steps - 1 :: self.steps]
@@ -253,8 +253,8 @@ class CoupledSimulator:
         )
 
     def sensitivities(
-        self, theta: np.ndarray, path: Path, free: Bool[np.ndarray, "joints parameters"]
-    ) -> Float[np.ndarray, "motions joints samples unknowns"]:
+        self, theta: np.ndarray, path: Path, free: FreeParameters
+    ) -> np.ndarray:
         """Return derivatives of the positions.
 
         They are those by the free parameters, joint by joint, and then by the motion's

@@ -5,9 +5,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy import special, stats
 
-from jaxid.arrays import Float
 from jaxid.identification.uncertainty.spectral import sandwich_of_columns
 
+from .motion import JointParameters
 from .refine import Refinement, weights_of
 from .servo import PARAMETERS, SCALE
 
@@ -33,7 +33,7 @@ class Combination(NamedTuple):
     name: str
     meaning: str
     unit: str
-    coefficients: Float[np.ndarray, "joints parameters"]
+    coefficients: JointParameters
     value: float
     deviation: float
     dof: float

@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 
-from jaxid.arrays import Float
+from jaxid.arrays import Matrix, Vector
 from jaxid.result_table import Column, Table
 
 
@@ -32,14 +32,14 @@ class RolloutErrors:
     linear: tuple[np.ndarray, ...]
     counted: tuple[np.ndarray, ...]
 
-    def rms(self, kind: str = "simulated") -> Float[np.ndarray, "motions joints"]:
+    def rms(self, kind: str = "simulated") -> Matrix:
         """Return RMS errors of `simulated`, `command` or `linear`; NaN without any."""
         rows = zip(getattr(self, kind), self.measured, self.counted, strict=True)
         sums = np.array([np.sum((y - q) ** 2, axis=1, where=k) for y, q, k in rows])
         sizes = np.array([k.sum(axis=1) for k in self.counted])
         return np.sqrt(np.where(sizes > 0, sums / np.maximum(sizes, 1), np.nan))
 
-    def total(self, kind: str = "simulated") -> Float[np.ndarray, " joints"]:
+    def total(self, kind: str = "simulated") -> Vector:
         """Return root mean square errors over all motions together."""
         sizes = np.array([k.sum(axis=1) for k in self.counted])
         squares = np.where(sizes > 0, sizes * self.rms(kind) ** 2, 0.0)

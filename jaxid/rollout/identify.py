@@ -13,7 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
-from jaxid.arrays import Bool, Float, Numbers
+from jaxid.arrays import Numbers, Vector
 from jaxid.errors import InputError
 from jaxid.measurement.recording import Recording
 
@@ -188,9 +188,7 @@ def _joint_names(
     return names
 
 
-def _checked_stiffness(
-    stiffness: Numbers | None, joints: int
-) -> Float[np.ndarray, " joints"] | None:
+def _checked_stiffness(stiffness: Numbers | None, joints: int) -> Vector | None:
     if stiffness is None:
         return None
     values = np.asarray(stiffness, np.float64)
@@ -206,12 +204,12 @@ def _checked_stiffness(
     return np.broadcast_to(values, (joints,)).copy()
 
 
-def mask(symbols: Sequence[str]) -> Bool[np.ndarray, " parameters"]:
+def mask(symbols: Sequence[str]) -> np.ndarray:
     """Return which parameters are among these."""
     return np.isin(list(INDEX), list(symbols))
 
 
-def _is_lower(scores: np.ndarray, rivals: np.ndarray) -> Bool[np.ndarray, " joints"]:
+def _is_lower(scores: np.ndarray, rivals: np.ndarray) -> np.ndarray:
     """Return whether scores are lower than those of rivals by more than their scatter.
 
     Scores are arrays [motions, joints].
@@ -432,7 +430,7 @@ class _Search:
         self._weigh_motions(self.x)
 
     @property
-    def _loaded_joints(self) -> Bool[np.ndarray, " joints"]:
+    def _loaded_joints(self) -> np.ndarray:
         """Joints on which the bodies have a weight worth mentioning."""
         load = np.abs(self.simulator.motion.load).max(axis=(0, 2))
         return load > MIN_LOAD_SHARE * load.max(initial=0.0)

@@ -5,8 +5,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxid.arrays import Bool, Float
-
 MAX_BOUND_ROUNDS = 6
 """Largest number of times that parameters are brought to their bounds in a step."""
 START_DAMPING = 1e-2
@@ -30,17 +28,17 @@ class Solution(NamedTuple):
         information: Gauss-Newton matrices.
     """
 
-    x: Float[np.ndarray, "*batch size"]
-    cost: Float[np.ndarray, "*batch"]
-    gradient: Float[np.ndarray, "*batch size"]
-    information: Float[np.ndarray, "*batch size size"]
+    x: np.ndarray
+    cost: np.ndarray
+    gradient: np.ndarray
+    information: np.ndarray
 
 
 def minimise(
     moments: Moments,
     costs: Costs,
-    x: Float[np.ndarray, "*batch size"],
-    free: Bool[np.ndarray, "*batch size"],
+    x: np.ndarray,
+    free: np.ndarray,
     bounds: tuple[np.ndarray, np.ndarray],
     iterations: int = 30,
     tolerance: float = 1e-3,

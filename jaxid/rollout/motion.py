@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from jaxid.arrays import AnyArray, Float
+from jaxid.arrays import AnyArray, Bool, Float, Matrix
 from jaxid.errors import InputError
 from jaxid.measurement.recording import Recording
 
@@ -25,6 +25,13 @@ MAX_ADVANCE = 0.1
 """Time after the last sample from which commands may act [s]."""
 LENGTH_STEP = 500
 """Samples to a multiple of which motions are padded, so that few lengths compile."""
+
+JointParameters = Float[np.ndarray, "joints parameters"]
+"""Parameters of each joint, in the order of `PARAMETERS`."""
+FreeParameters = Bool[np.ndarray, "joints parameters"]
+"""Whether each parameter of each joint is estimated."""
+MotionSamples = Float[np.ndarray, "motions joints samples"]
+"""Positions of joints in several motions, or their errors [rad or m]."""
 
 
 class ServoMotion(eqx.Module):
@@ -124,7 +131,7 @@ class ServoMotion(eqx.Module):
         )
 
     @property
-    def certainty(self) -> Float[np.ndarray, "motions states joints"]:
+    def certainty(self) -> np.ndarray:
         """Inverse variance of the initial states, over the number of samples."""
         sample_counts = np.maximum(np.asarray(self.counted).sum(axis=-1), 1.0)
         return 1.0 / np.asarray(self.spread) ** 2 / sample_counts[:, None]
@@ -144,7 +151,7 @@ class ServoMotion(eqx.Module):
         return self.commands.shape[-1] - self.positions.shape[-1]
 
     @property
-    def sent(self) -> Float[np.ndarray, "motions joints samples"]:
+    def sent(self) -> MotionSamples:
         """Commands of the samples."""
         return np.asarray(self.commands)[..., self.lead :]
 
@@ -229,9 +236,7 @@ class ServoMotion(eqx.Module):
         return jax.tree.map(lambda x: x[motion, ...], self)
 
 
-def state_at(
-    q: Float[np.ndarray, "joints samples"], index: int, dt: float
-) -> tuple[Float[np.ndarray, "2 joints"], Float[np.ndarray, "2 joints"], np.ndarray]:
+def state_at(q: Matrix, index: int, dt: float) -> tuple[Matrix, Matrix, np.ndarray]:
     """Return positions and velocities at a sample, their deviations, and accelerations.
 
     They are those of a parabola through the samples around it. At the start the

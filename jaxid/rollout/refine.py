@@ -8,11 +8,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import Array, Bool, Float, double_precision, on_cores
+from jaxid.arrays import Array, Matrix, Vector, double_precision, on_cores
 
 from .coupled import CoupledSimulator, Path
 from .least_squares import bounded_step
-from .motion import ServoMotion
+from .motion import FreeParameters, JointParameters, MotionSamples, ServoMotion
 from .servo import LOWER, UPPER, State
 
 RESOLUTION = 1e-4
@@ -27,16 +27,12 @@ MAX_ROUNDS = 25
 """Largest number of steps of the refinement."""
 
 
-def mean_squares(
-    motion: ServoMotion, sums: np.ndarray
-) -> Float[np.ndarray, "motions joints"]:
+def mean_squares(motion: ServoMotion, sums: np.ndarray) -> Matrix:
     """Return mean square errors from sums over counted samples; zero without any."""
     return sums / np.maximum(np.asarray(motion.counted).sum(axis=-1), 1.0)
 
 
-def weights_of(
-    motion: ServoMotion, sums: np.ndarray
-) -> Float[np.ndarray, "motions joints"]:
+def weights_of(motion: ServoMotion, sums: np.ndarray) -> Matrix:
     """Weigh motions by their own errors: the worst one does not decide alone."""
     sample_counts = np.asarray(motion.counted).sum(axis=-1)
     mean_errors = mean_squares(motion, sums)
@@ -58,16 +54,16 @@ class Refinement:
     """
 
     simulator: CoupledSimulator
-    parameters: Float[np.ndarray, "joints parameters"]
-    free: Bool[np.ndarray, "joints parameters"]
+    parameters: JointParameters
+    free: FreeParameters
     path: Path
 
     @classmethod
     def of(
         cls,
         simulator: CoupledSimulator,
-        parameters: Float[np.ndarray, "joints parameters"],
-        free: Bool[np.ndarray, "joints parameters"],
+        parameters: JointParameters,
+        free: FreeParameters,
     ) -> "Refinement":
         """Return simulated joints."""
         empty_array = np.zeros(0)
@@ -80,7 +76,7 @@ class Refinement:
         return refinement.with_unknowns([refinement.unknowns])[0]
 
     @property
-    def unknowns(self) -> Float[np.ndarray, " unknowns"]:
+    def unknowns(self) -> Vector:
         """Free parameters, joint by joint, then the initial state of each motion."""
         start = np.asarray(self.simulator.motion.start)
         return np.concatenate([self.parameters[self.free], start.ravel()])
@@ -116,21 +112,21 @@ class Refinement:
         ]
 
     @cached_property
-    def residuals(self) -> Float[np.ndarray, "motions joints samples"]:
+    def residuals(self) -> MotionSamples:
         """Simulated less measured positions, zero where a sample does not count."""
         motion = self.simulator.motion
         errors = self.simulator.positions(self.path) - np.asarray(motion.positions)
         return np.where(np.asarray(motion.counted) > 0, errors, 0.0)
 
     @cached_property
-    def sensitivities(self) -> Float[np.ndarray, "motions joints samples unknowns"]:
+    def sensitivities(self) -> np.ndarray:
         """Derivatives of the residuals by free parameters and the initial state."""
         S = self.simulator.sensitivities(self.parameters, self.path, self.free)
         S *= np.asarray(self.simulator.motion.counted)[..., None]
         return S
 
     @cached_property
-    def sums(self) -> Float[np.ndarray, "motions joints"]:
+    def sums(self) -> Matrix:
         """Sums of squared residuals; infinite where a simulation is not finite."""
         with np.errstate(over="ignore", invalid="ignore"):
             sums = np.sum(self.residuals**2, axis=-1)
@@ -192,7 +188,7 @@ def prepare(
 def refine(
     first: tuple[CoupledSimulator, np.ndarray],
     other: tuple[CoupledSimulator, np.ndarray],
-    free: Bool[np.ndarray, "joints parameters"],
+    free: FreeParameters,
 ) -> tuple[Refinement, bool]:
     """Return the best fit of all joints together, from two that are nearly right.
 

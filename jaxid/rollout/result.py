@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 from scipy import special
 
-from jaxid.arrays import AnyArray, Bool, Float
+from jaxid.arrays import AnyArray, Matrix, Vector
 from jaxid.measurement.recording import Recording
 from jaxid.result_table import (
     Column,
@@ -26,7 +26,7 @@ from .determined_combinations import (
     determined_combinations,
 )
 from .errors import RolloutErrors
-from .motion import ServoMotion
+from .motion import FreeParameters, JointParameters, MotionSamples, ServoMotion
 from .refine import Refinement, mean_squares
 from .servo import INDEX, LOWER, PARAMETERS, UPPER, with_integral
 from .uncoupled import ServoSimulator
@@ -62,30 +62,30 @@ class ServoFit:
     """
 
     joint_names: tuple[str, ...]
-    parameters: Float[np.ndarray, "joints parameters"]
-    free: Bool[np.ndarray, "joints parameters"]
-    covariance: Float[np.ndarray, "free free"]
-    dof: Float[np.ndarray, " free"]
+    parameters: JointParameters
+    free: FreeParameters
+    covariance: Matrix
+    dof: Vector
     combinations: tuple[Combination, ...]
-    linear: Float[np.ndarray, "joints parameters"]
+    linear: JointParameters
     hold: bool
     time_step: float
-    rms: Float[np.ndarray, "motions joints"]
+    rms: Matrix
     motions: tuple[str, ...]
     bodies: Bodies | None
-    load: Float[np.ndarray, " joints"]
+    load: Vector
     notes: tuple[str, ...] = ()
     hold_is_told: bool = True
-    given_stiffness: Float[np.ndarray, " joints"] | None = None
+    given_stiffness: Vector | None = None
 
     @classmethod
     def of(
         cls,
         refinement: Refinement,
-        linear: Float[np.ndarray, "joints parameters"],
+        linear: JointParameters,
         joint_names: tuple[str, ...],
         hold_is_told: bool = True,
-        given_stiffness: Float[np.ndarray, " joints"] | None = None,
+        given_stiffness: Vector | None = None,
     ) -> "ServoFit":
         """Return the fit of a refinement, with its uncertainty."""
         simulator = refinement.simulator
@@ -138,7 +138,7 @@ class ServoFit:
         )
 
     @cached_property
-    def stiffness(self) -> Float[np.ndarray, " joints"]:
+    def stiffness(self) -> Vector:
         """Stiffness of each servo [N m/rad or N/m]; NaN where it is unknown.
 
         It is given, or told by a known weight.
@@ -180,7 +180,7 @@ class ServoFit:
         paths = self.paths(motion)
         return [path[:, :n].T for path, n in zip(paths, motion.lengths, strict=True)]
 
-    def paths(self, motion: ServoMotion) -> Float[np.ndarray, "motions joints samples"]:
+    def paths(self, motion: ServoMotion) -> MotionSamples:
         """Return simulated positions [motions, joints, samples].
 
         The loads are those at the simulated positions.
@@ -225,7 +225,7 @@ class ServoFit:
 
     def window_errors(
         self, logs: Sequence[Recording] | Recording, horizon: float = 1.0
-    ) -> Float[np.ndarray, " joints"]:
+    ) -> Vector:
         """Return RMS errors of windows that start from measured states [rad or m].
 
         Args:
@@ -238,9 +238,7 @@ class ServoFit:
         errors = self.paths(windows) - np.asarray(windows.positions)
         return np.sqrt(np.mean(errors**2, axis=(0, 2)))
 
-    def samples(
-        self, count: int, seed: int = 0
-    ) -> Float[np.ndarray, "count joints parameters"]:
+    def samples(self, count: int, seed: int = 0) -> np.ndarray:
         """Return parameters drawn from their t distributions, within their limits.
 
         Args:

@@ -166,8 +166,8 @@ def commands_of_stages(
         Both with the shape [stages, joints].
     """
     delay = theta[:, INDEX["d"]]
-    bias = theta[:, INDEX["b"]]
-    gain = theta[:, INDEX["g"]]
+    bias = theta[None, :, INDEX["b"]]
+    gain = theta[None, :, INDEX["g"]]
     sample_time = motion.sample_time
     count = motion.positions.shape[-1] - 1
     samples = np.arange(count * steps + 1) / steps

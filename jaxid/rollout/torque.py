@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Array, Float, double_precision
+from jaxid.arrays import AnyArray, Array, Float, Matrix, Vector, double_precision
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.sample_methods import program_of
 from jaxid.dynamics.terms import HardSign
@@ -154,12 +154,12 @@ class TorqueRolloutFit(Summarised):
     """
 
     rollout: TorqueRollout
-    unknowns: Float[np.ndarray, " unknowns"]
+    unknowns: Vector
     free: np.ndarray
     uncertainty: Uncertainty
     horizon: float
-    rms: Float[np.ndarray, " joints"]
-    start: Float[np.ndarray, " base"]
+    rms: Vector
+    start: Vector
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -167,7 +167,7 @@ class TorqueRolloutFit(Summarised):
         return self.rollout.base.model.robot.joint_names
 
     @property
-    def parameters(self) -> Float[np.ndarray, " base"]:
+    def parameters(self) -> Vector:
         """Base parameters."""
         return self.unknowns[: self.rollout.base.size]
 
@@ -176,7 +176,7 @@ class TorqueRolloutFit(Summarised):
         observations: Sequence[Observations] | Observations,
         horizon: float,
         parameters: AnyArray | None = None,
-    ) -> Float[np.ndarray, " joints"]:
+    ) -> Vector:
         """Return the root mean square error at the ends of windows [rad or m].
 
         Args:
@@ -197,9 +197,9 @@ class TorqueRolloutFit(Summarised):
     def simulate(
         self, log: Observations
     ) -> tuple[
-        Float[np.ndarray, " samples"],
-        Float[np.ndarray, "samples joints"],
-        Float[np.ndarray, "samples joints"],
+        Vector,
+        Matrix,
+        Matrix,
     ]:
         """Return times, measured and simulated positions of consecutive windows.
 

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Array, Float, double_precision, on_cores
+from jaxid.arrays import AnyArray, Array, double_precision, on_cores
 
 from .motion import ServoMotion
 from .servo import (
@@ -24,6 +24,8 @@ from .servo import (
 
 BLOCK_SIZE = 250
 """Samples whose derivatives are found at once."""
+HELD = np.array(False)
+"""Whether commands are held until the next one: here they are interpolated."""
 BATCH_SIZE = 4
 """Candidates that are simulated at once."""
 
@@ -40,7 +42,7 @@ def _stage(
 def _start(theta: Array, motion: ServoMotion) -> State:
     """Return the initial state, with balanced integral actions of the servos."""
     q, w, *integral = jnp.asarray(motion.start)
-    return State(q, w, balanced_integral(theta, motion, False) if integral else None)
+    return State(q, w, balanced_integral(theta, motion, HELD) if integral else None)
 
 
 @functools.partial(jax.jit, static_argnums=2)
@@ -62,7 +64,7 @@ def _path(theta: Array, motion: ServoMotion, steps: int) -> tuple[Array]:
         return state, state.q
 
     start = _start(theta, motion)
-    stages, _ = Stages.of(theta, motion, steps, False)
+    stages, _ = Stages.of(theta, motion, steps, HELD)
     _, path = jax.lax.scan(simulate_stage, start, stages)
     return (jnp.concatenate([start.q[None], path[2 * steps - 1 :: 2 * steps]]).T,)
 
@@ -145,7 +147,7 @@ def _moments(theta: Array, motion: ServoMotion, steps: int) -> tuple[Array, ...]
         padded_rows = jnp.pad(x, ((0, -len(x) % size), (0, 0)), mode)
         return padded_rows.reshape(-1, size, x.shape[-1])
 
-    stages, by_delay = Stages.of(theta, motion, steps, False)
+    stages, by_delay = Stages.of(theta, motion, steps, HELD)
     stages = jax.tree.map(
         lambda x: blocks(x, 2 * steps * BLOCK_SIZE), (stages, by_delay)
     )
@@ -234,9 +236,7 @@ class ServoSimulator:
             x.reshape(self.motion.motions, count, *x.shape[1:]) for x in joined_results
         )
 
-    def paths(
-        self, theta: AnyArray
-    ) -> Float[np.ndarray, "motions candidates joints samples"]:
+    def paths(self, theta: AnyArray) -> np.ndarray:
         """Return the simulated positions."""
         return self._map(_path, lambda k, q: (q,), theta)[0]
 

@@ -5,9 +5,8 @@ import re
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from jaxid.arrays import AnyArray
+from jaxid.arrays import AnyArray, Numbers
 from jaxid.errors import InputError
 from jaxid.identification.delay import estimate_delay
 from jaxid.identification.estimators import GivenWeights
@@ -145,7 +144,7 @@ def diagnose(
     fit: Fit | None = None,
     *,
     observations: Observations | None = None,
-    min_speed: ArrayLike | None = None,
+    min_speed: Numbers | None = None,
     progress: Progress | None = None,
 ) -> Diagnosis:
     """Look for mistakes in a log: units, signs, order, sides, sensor faults and delays.

@@ -5,7 +5,7 @@ import itertools
 import equinox as eqx
 import numpy as np
 
-from jaxid.arrays import AnyArray, Bool, Float
+from jaxid.arrays import AnyArray, Joints, JointSamples, Matrix, Vector
 from jaxid.dynamics.sample_methods import in_numpy
 from jaxid.identification.estimators import ResidualVariances, WeightedLeastSquares
 from jaxid.identification.fit_result import Fit
@@ -50,17 +50,17 @@ class TorqueErrors(eqx.Module):
     """
 
     name: str = eqx.field(static=True)
-    time: Float[AnyArray, " rows"]
-    measured: Float[AnyArray, "rows joints"]
-    predicted: Float[AnyArray, "rows joints"]
-    counted: Bool[AnyArray, "rows joints"]
-    max_forces: Float[AnyArray, " joints"]
-    speeds: Float[AnyArray, "rows joints"]
-    unexplained: Float[AnyArray, "rows joints"]
-    positions: Float[AnyArray, "rows joints"]
+    time: AnyArray
+    measured: JointSamples
+    predicted: JointSamples
+    counted: AnyArray
+    max_forces: Joints
+    speeds: JointSamples
+    unexplained: JointSamples
+    positions: JointSamples
 
     @property
-    def errors(self) -> Float[np.ndarray, "rows joints"]:
+    def errors(self) -> Matrix:
         """Predicted minus measured forces [N m or N] (Eq. 27).
 
         NaN where a row does not count.
@@ -68,22 +68,22 @@ class TorqueErrors(eqx.Module):
         return np.asarray(self.predicted) - self._measured
 
     @property
-    def mean(self) -> Float[np.ndarray, " joints"]:
+    def mean(self) -> Vector:
         """Mean absolute error of each joint [N m or N] (Eq. 37)."""
         return np.nanmean(np.abs(self.errors), axis=0)
 
     @property
-    def rms(self) -> Float[np.ndarray, " joints"]:
+    def rms(self) -> Vector:
         """RMS error of each joint [N m or N]."""
         return np.sqrt(np.nanmean(self.errors**2, axis=0))
 
     @property
-    def mean_percent(self) -> Float[np.ndarray, " joints"]:
+    def mean_percent(self) -> Vector:
         """Mean absolute errors in percent of the largest force (Eq. 37)."""
         return 100.0 * self.mean / np.asarray(self.max_forces)
 
     @property
-    def rms_percent(self) -> Float[np.ndarray, " joints"]:
+    def rms_percent(self) -> Vector:
         """RMS errors in percent of the largest force."""
         return 100.0 * self.rms / np.asarray(self.max_forces)
 
@@ -104,12 +104,12 @@ class TorqueErrors(eqx.Module):
         return tuple(_chance(e, v) <= limit for e, v in pairs)
 
     @property
-    def force_rms(self) -> Float[np.ndarray, " joints"]:
+    def force_rms(self) -> Vector:
         """RMS of the measured forces of each joint [N m or N]."""
         return np.sqrt(np.nanmean(self._measured**2, axis=0))
 
     @property
-    def rms_relative(self) -> Float[np.ndarray, " joints"]:
+    def rms_relative(self) -> Vector:
         """RMS errors over the RMS of the measured forces; NaN without any force."""
         return _ratio(self.rms, self.force_rms)
 
@@ -125,9 +125,7 @@ class TorqueErrors(eqx.Module):
         return np.where(self.counted, np.asarray(self.measured), np.nan)
 
 
-def _chance(
-    errors: Float[np.ndarray, " rows"], speeds: Float[np.ndarray, " rows"]
-) -> float:
+def _chance(errors: Vector, speeds: Vector) -> float:
     """Return the probability of errors whose means over classes of speed agree as much.
 
     It is one if these means make up less than a tenth of the squared errors.
@@ -181,7 +179,7 @@ class Definiteness(eqx.Module):
     """
 
     smallest: float
-    pose: Float[AnyArray, " joints"]
+    pose: Joints
     indefinite: float
     poses: int = eqx.field(static=True)
 
