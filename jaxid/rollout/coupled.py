@@ -382,8 +382,9 @@ def _compose(
     """
     count, steps, _, n = velocities.shape
     joint, symbol = np.nonzero(free_mask)
-    columns = size + n + np.arange(len(joint))
-    state = np.tile(np.eye(size + n, size + n + len(joint)), (count, 1, 1))
+    rows = size + n
+    columns = rows + np.arange(len(joint))
+    state = np.tile(np.eye(rows, rows + len(joint)), (count, 1, 1))
     q, w, *integral, last_velocity = np.split(state, 1 + size // n, axis=1)
     middle = q, w
     for k, s in np.ndindex(steps, 2):
@@ -417,7 +418,7 @@ def _compose(
         q = q + share * h * change
         w = (w + VELOCITY_FACTORS[s] * (change - w)) * is_moving
     state = np.concatenate([q, w, *integral, last_velocity], axis=1)
-    return state[..., : size + n], state[..., size + n :]
+    return state[..., :rows], state[..., rows:]
 
 
 def _derivatives_of_bodies(

@@ -222,6 +222,11 @@ def _is_lower(scores: np.ndarray, rivals: np.ndarray) -> np.ndarray:
     return mean < -np.maximum(MIN_SCORE_GAIN, scatter)
 
 
+def _of_candidates(scores: np.ndarray, indices: np.ndarray) -> np.ndarray:
+    """Return the scores of one candidate for each joint [motions, joints]."""
+    return np.take_along_axis(scores, indices[None, None], axis=1)[:, 0]
+
+
 class _Search:
     """Fits of all joints, candidate models and folds, in batches.
 
@@ -371,17 +376,17 @@ class _Search:
         An oscillation that an initial state excites may imitate the rounding of an
         encoder.
         """
+        inertia = x[..., INDEX["J"]]
+        damping = x[..., INDEX["B"]]
+        damping_ratio = 0.5 * damping / np.sqrt(inertia)
+        counted_ratio = np.minimum(damping_ratio, OSCILLATION_DAMPING)
         best_indices = np.argmin(cost, axis=0)
+        calm_indices = np.lexsort((cost, -counted_ratio), axis=0)[0]
         scores = self._scores(self.simulator.costs(x))
-        ratio = 0.5 * x[..., INDEX["B"]] / np.sqrt(x[..., INDEX["J"]])
-        calm_indices = np.lexsort(
-            (cost, -np.minimum(ratio, OSCILLATION_DAMPING)), axis=0
-        )[0]
-        best_scores, calm_scores = (
-            np.take_along_axis(scores, k[None, None], axis=1)[:, 0]
-            for k in (best_indices, calm_indices)
-        )
-        return np.where(_is_lower(best_scores, calm_scores), best_indices, calm_indices)
+        best_scores = _of_candidates(scores, best_indices)
+        calm_scores = _of_candidates(scores, calm_indices)
+        is_better = _is_lower(best_scores, calm_scores)
+        return np.where(is_better, best_indices, calm_indices)
 
     def _take_candidates(self, x: np.ndarray, choices: np.ndarray) -> None:
         self.x = np.take_along_axis(x, choices[None, :, None], axis=0)[0]
@@ -414,15 +419,12 @@ class _Search:
         scores = self.held_out_scores(solution, free_mask)
         choices = np.zeros(len(self.x), int)
         for k in range(1, len(group)):
-            current_scores = np.take_along_axis(scores, choices[None, None], axis=1)[
-                :, 0
-            ]
+            current_scores = _of_candidates(scores, choices)
             # Effects that have been found stay: a known weight is not replaced by a
             # bias.
-            extension_mask = np.array([set(group[c]) <= set(group[k]) for c in choices])
-            choices = np.where(
-                extension_mask & _is_lower(scores[:, k], current_scores), k, choices
-            )
+            is_extension = np.array([set(group[c]) <= set(group[k]) for c in choices])
+            is_better = _is_lower(scores[:, k], current_scores)
+            choices = np.where(is_extension & is_better, k, choices)
         self._take_candidates(solution.x, choices)
         self.free_mask = np.take_along_axis(free_mask, choices[None, :, None], axis=0)[
             0

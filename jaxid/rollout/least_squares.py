@@ -110,36 +110,35 @@ def bounded_step(
     derivatives have overflowed, the step is zero.
     """
     lower, upper = bounds
-    is_finite = np.isfinite(information).all(axis=(-1, -2)) & np.isfinite(gradient).all(
-        axis=-1
-    )
+    is_finite = np.isfinite(gradient).all(axis=-1)
+    is_finite &= np.isfinite(information).all(axis=(-1, -2))
     is_finite = np.asarray(is_finite)
     information = np.where(is_finite[..., None, None], information, 0.0)
     gradient = np.where(is_finite[..., None], gradient, 0.0)
-    size = np.sqrt(np.maximum(np.diagonal(information, axis1=-2, axis2=-1), 1e-300))
+    diagonal = np.diagonal(information, axis1=-2, axis2=-1)
+    size = np.sqrt(np.maximum(diagonal, 1e-300))
     scaled_matrix = information / size[..., None] / size[..., None, :]
     identity = np.eye(x.shape[-1])
     diagonal_damping = np.asarray(damping)[..., None, None] + 1e-12
-    bound_mask = ((x <= lower) & (gradient > 0)) | ((x >= upper) & (gradient < 0))
-    moving_mask = (free & ~bound_mask & (size > 1e-140)).astype(float)
+    leaves_below = (x <= lower) & (gradient > 0)
+    leaves_above = (x >= upper) & (gradient < 0)
+    is_moving = free & ~leaves_below & ~leaves_above & (size > 1e-140)
+    moving_mask = is_moving.astype(float)
     step = np.zeros_like(gradient)
     for _ in range(MAX_BOUND_ROUNDS):
         A = scaled_matrix * moving_mask[..., None] * moving_mask[..., None, :]
         A = A + identity * (diagonal_damping + (1.0 - moving_mask)[..., None])
-        residual = -gradient / size - np.einsum(
-            "...ij,...j->...i", scaled_matrix, step * size
-        )
-        solution = (
-            np.linalg.solve(A, (residual * moving_mask)[..., None])[..., 0] / size
-        )
-        step = np.where(moving_mask > 0, solution, step)
-        leaving_mask = (moving_mask > 0) & ((x + step < lower) | (x + step > upper))
-        if not leaving_mask.any():
+        change = np.einsum("...ij,...j->...i", scaled_matrix, step * size)
+        residual = (-gradient / size - change) * moving_mask
+        solution = np.linalg.solve(A, residual[..., None])[..., 0]
+        is_moving = moving_mask > 0
+        step = np.where(is_moving, solution / size, step)
+        end = x + step
+        is_leaving = is_moving & ((end < lower) | (end > upper))
+        if not is_leaving.any():
             break
-        step = np.where(
-            leaving_mask,
-            np.clip(x + step, lower, upper) - x,
-            np.where(moving_mask > 0, 0.0, step),
-        )
-        moving_mask = np.where(leaving_mask, 0.0, moving_mask)
+        # Those that move start again, now that others have gone to their bounds.
+        step = np.where(is_moving, 0.0, step)
+        step = np.where(is_leaving, np.clip(end, lower, upper) - x, step)
+        moving_mask = np.where(is_leaving, 0.0, moving_mask)
     return step

@@ -38,32 +38,34 @@ class ServoMotion(eqx.Module):
     """Segments of logs as arrays of one length, padded behind their ends.
 
     Attributes:
-        commands: Commanded positions, which begin before the samples.
+        commands: Commanded positions [motions, joints, commands], which begin before
+            the samples.
         positions: Measured positions [motions, joints, samples].
-        load: Torques of the bodies between a sample, or step, and the next one [N m or
-            N].
-        inertia: Inertia of the bodies about each joint [kg m² or kg].
+        load: Torques of the bodies between a sample, or step, and the next one, of the
+            same shape [N m or N].
+        inertia: Inertia of the bodies about each joint, of the same shape [kg m² or
+            kg].
         start: Initial positions and velocities, and integral actions of servos that
-            have them.
+            have them [motions, states, joints].
         spread: Standard deviations of the initial states.
-        acceleration: Initial accelerations.
-        counted: Whether a sample counts in the fit.
+        acceleration: Initial accelerations [motions, joints].
+        counted: Whether a sample counts in the fit [motions, joints, samples].
         sample_time: Time between two samples of each motion [s].
         begin: Time of each motion's first sample in its log [s].
         lengths: Number of samples of each motion.
         names: Name of the log of each motion.
     """
 
-    commands: Float[AnyArray, "*motions joints commanded"]
-    positions: Float[AnyArray, "*motions joints samples"]
-    load: Float[AnyArray, "*motions joints instants"]
-    inertia: Float[AnyArray, "*motions joints instants"]
-    start: Float[AnyArray, "*motions states joints"]
-    spread: Float[AnyArray, "*motions states joints"]
-    acceleration: Float[AnyArray, "*motions joints"]
-    counted: Float[AnyArray, "*motions joints samples"]
-    sample_time: Float[AnyArray, " *motions"]
-    begin: Float[AnyArray, " *motions"]
+    commands: AnyArray
+    positions: AnyArray
+    load: AnyArray
+    inertia: AnyArray
+    start: AnyArray
+    spread: AnyArray
+    acceleration: AnyArray
+    counted: AnyArray
+    sample_time: AnyArray
+    begin: AnyArray
     lengths: tuple[int, ...] = eqx.field(static=True)
     names: tuple[str, ...] = eqx.field(static=True)
 

@@ -89,32 +89,8 @@ class ServoFit:
     ) -> "ServoFit":
         """Return the fit of a refinement, with its uncertainty."""
         simulator = refinement.simulator
-        r = refinement.residuals
         motion = simulator.motion
         combinations, covariance, dof = determined_combinations(refinement, joint_names)
-        positions = np.asarray(motion.positions)
-        joint_errors = []
-        for j, name in enumerate(joint_names):
-            counted_samples = np.asarray(motion.counted)[:, j] > 0
-            if (rms := systematic_error(r[:, j], counted_samples, positions[:, j])) > 0:
-                joint_errors.append(f"{name} {1e3 * rms:.2g}")
-        notes = [
-            f"{joint_names[j]}: {PARAMETERS[k].meaning} is at the limit of the search, "
-            f"{refinement.parameters[j, k]:.3g}: check signs, units and offsets of the "
-            "commands"
-            for j, k in np.argwhere(refinement.free)
-            # An integral gain of zero is none.
-            if k in LIMITED_PARAMETERS
-            and refinement.parameters[j, k] in (UPPER[k], LOWER[k])
-            if refinement.parameters[j, k] != 0.0
-        ]
-        integral = "" if refinement.free[:, INDEX["ki"]].any() else ", integral action"
-        effect_note = (
-            "errors are larger than an encoder's rounding and change slowly "
-            f"({', '.join(joint_errors)} mrad or mm RMS): an effect is missing, such "
-            f"as other friction, play, elasticity{integral} or load, and the "
-            "parameters are those that imitate it best"
-        )
         load = np.zeros_like(motion.positions)
         if simulator.bodies is not None:
             load = simulator.bodies.loads(motion).load
@@ -132,7 +108,10 @@ class ServoFit:
             motion.names,
             simulator.bodies,
             np.abs(load).mean(axis=(0, 2)),
-            (*notes, *([effect_note] if joint_errors else [])),
+            (
+                *_notes_on_limits(refinement, joint_names),
+                *_notes_on_errors(refinement, joint_names),
+            ),
             hold_is_told,
             given_stiffness,
         )
@@ -251,28 +230,28 @@ class ServoFit:
         correlation = self.covariance / deviation / deviation[:, None]
         values, vectors = np.linalg.eigh(correlation)
         root = vectors * np.sqrt(np.maximum(values, 0.0))
-        normal_draws = random.normal(size=(count, len(root))) @ root.T
-        probabilities = special.ndtr(np.clip(normal_draws, -7.0, 7.0))
-        draws[:, self.free] += deviation * special.stdtrit(self.dof, probabilities)
+        independent_draws = random.normal(size=(count, len(root)))
+        normal_draws = np.clip(independent_draws @ root.T, -7.0, 7.0)
+        probabilities = special.ndtr(normal_draws)
+        changes = deviation * special.stdtrit(self.dof, probabilities)
+        draws[:, self.free] += changes
         return np.clip(draws, LOWER, UPPER)
 
     def summary(self) -> Table:
         """Return a table of what the logs determine, with 95 % intervals."""
         rows = self.combinations
-        values, deviations = with_deviations(
-            [c.value for c in rows], [c.deviation for c in rows]
-        )
+        estimates = np.array([c.value for c in rows])
+        deviations = np.array([c.deviation for c in rows])
+        values, deviation_texts = with_deviations(estimates, deviations)
         ends = np.array([c.interval() for c in rows]).reshape(-1, 2)
-        lower_ends, upper_ends = (
-            with_deviations(x, [c.deviation for c in rows])[0] for x in ends.T
-        )
-        size = np.array([abs(c.value) for c in rows])
-        is_clear = np.array(
-            [c.deviation for c in rows]
-        ) < MAX_RELATIVE_DEVIATION * np.maximum(size, 1e-12)
-        joint_rows = [
-            k for k in range(1, len(rows)) if rows[k].joint != rows[k - 1].joint
-        ]
+        lower_ends, _ = with_deviations(ends[:, 0], deviations)
+        upper_ends, _ = with_deviations(ends[:, 1], deviations)
+        sizes = np.maximum(np.abs(estimates), 1e-12)
+        is_clear = deviations < MAX_RELATIVE_DEVIATION * sizes
+        joints = [c.joint for c in rows]
+        joint_rows = (np.flatnonzero(np.diff(joints)) + 1).tolist()
+        rms = np.sqrt((self.rms**2).mean(axis=0))
+        error_texts = "  ".join(significant(1e3 * x) for x in rms)
         K = ", ".join(
             f"{name} {significant(k)}"
             for name, k in zip(self.joint_names, self.stiffness, strict=True)
@@ -280,13 +259,7 @@ class ServoFit:
         )
         facts = [
             ("logs", ", ".join(dict.fromkeys(self.motions))),
-            (
-                "errors",
-                "  ".join(
-                    significant(1e3 * x) for x in np.sqrt((self.rms**2).mean(axis=0))
-                )
-                + "  mrad or mm RMS",
-            ),
+            ("errors", f"{error_texts}  mrad or mm RMS"),
             ("commands", self._commands),
             ("stiffness", K or "not determined: all parameters are ratios to it"),
         ]
@@ -297,11 +270,11 @@ class ServoFit:
         ]
         return Table(
             "joints behind position servos",
-            Column("joint", [self.joint_names[c.joint] for c in rows]),
+            Column("joint", [self.joint_names[j] for j in joints]),
             Column("parameter", [c.name for c in rows]),
             Column("meaning", [c.meaning for c in rows]),
             Column("estimate", values, kind="number"),
-            Column("±", deviations, kind="number"),
+            Column("±", deviation_texts, kind="number"),
             Column("unit", [self._unit(c) for c in rows]),
             Column("95 %\nfrom", lower_ends, kind="number"),
             Column("95 %\nto", upper_ends, kind="number"),
@@ -313,6 +286,43 @@ class ServoFit:
 
     def __str__(self) -> str:
         return self.summary().text()
+
+
+def _notes_on_limits(refinement: Refinement, joint_names: tuple[str, ...]) -> list[str]:
+    """Return a note for each parameter that stands at a limit of the search."""
+    notes = []
+    for j, k in np.argwhere(refinement.free):
+        value = refinement.parameters[j, k]
+        is_limit = value in (UPPER[k], LOWER[k])
+        # An integral gain of zero is none.
+        if k in LIMITED_PARAMETERS and is_limit and value != 0.0:
+            notes.append(
+                f"{joint_names[j]}: {PARAMETERS[k].meaning} is at the limit of the "
+                f"search, {value:.3g}: check signs, units and offsets of the commands"
+            )
+    return notes
+
+
+def _notes_on_errors(refinement: Refinement, joint_names: tuple[str, ...]) -> list[str]:
+    """Return a note if errors show that an effect is missing."""
+    motion = refinement.simulator.motion
+    counted = np.asarray(motion.counted) > 0
+    positions = np.asarray(motion.positions)
+    joint_errors = []
+    for j, name in enumerate(joint_names):
+        residuals = refinement.residuals[:, j]
+        rms = systematic_error(residuals, counted[:, j], positions[:, j])
+        if rms > 0:
+            joint_errors.append(f"{name} {1e3 * rms:.2g}")
+    if not joint_errors:
+        return []
+    integral = "" if refinement.free[:, INDEX["ki"]].any() else ", integral action"
+    return [
+        "errors are larger than an encoder's rounding and change slowly "
+        f"({', '.join(joint_errors)} mrad or mm RMS): an effect is missing, such as "
+        f"other friction, play, elasticity{integral} or load, and the parameters are "
+        "those that imitate it best"
+    ]
 
 
 def systematic_error(r: np.ndarray, kept: np.ndarray, q: np.ndarray) -> float:

@@ -280,10 +280,12 @@ def balanced_integral(theta: Array, motion: ServoMotion, hold: AnyArray) -> Arra
     J, B, _, _, a, F, mu, Fs, vs, _, _, ki = theta.T
     q, w = motion.start[:2]
     load = a * motion.load[:, 0]
-    inertia = J + a * motion.inertia[:, 0]
+    body_inertia = a * motion.inertia[:, 0]
+    inertia = J + body_inertia
     direction = w / (jnp.abs(w) + motion.spread[1])
-    stribeck_share = jnp.exp(-((w / vs) ** 2))
-    friction = F + mu * jnp.abs(load) + Fs * stribeck_share
+    load_friction = mu * jnp.abs(load)
+    stribeck_friction = Fs * jnp.exp(-((w / vs) ** 2))
+    friction = F + load_friction + stribeck_friction
     torque = load + B * w + friction * direction
     torque = torque + inertia * motion.acceleration
     commands, _ = commands_of_stages(theta, motion, 1, hold)

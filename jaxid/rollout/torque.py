@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Array, Float, Matrix, Vector, double_precision
+from jaxid.arrays import AnyArray, Array, Matrix, Vector, double_precision
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.sample_methods import program_of
 from jaxid.dynamics.terms import HardSign
@@ -65,10 +65,8 @@ class TorqueRollout:
         n = self.base.model.robot.joints
         return np.concatenate([np.asarray(p), np.zeros(1), np.ones(n), np.zeros(n)])
 
-    def errors(
-        self, x: Array, windows: Windows
-    ) -> Float[Array, "steps joints windows"]:
-        """Return simulated less measured positions."""
+    def errors(self, x: Array, windows: Windows) -> Array:
+        """Return simulated less measured positions [steps, joints, windows]."""
         forces = jnp.asarray(windows.forces)
         _, delay, _, _ = self._parts(x)
         margin = round(MARGIN / self.sample_time)
@@ -84,10 +82,11 @@ class TorqueRollout:
         n = self.base.model.robot.joints
         return jnp.split(x, np.cumsum([self.base.size, 1, n]))
 
-    def _positions(
-        self, x: Array, windows: Windows, forces: Array
-    ) -> Float[Array, "steps joints windows"]:
-        """Return simulated positions, by the Runge-Kutta method of order four."""
+    def _positions(self, x: Array, windows: Windows, forces: Array) -> Array:
+        """Return simulated positions, by the Runge-Kutta method of order four.
+
+        They are an array [steps, joints, windows].
+        """
         step_size = self.sample_time
         base_parameters, _, gains, load_friction = self._parts(x)
         p = self.base.to_standard(base_parameters)[:, None]

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxid.arrays import AnyArray, Float
+from jaxid.arrays import AnyArray
 from jaxid.errors import InputError
 from jaxid.measurement.observations import Observations
 
@@ -31,10 +31,10 @@ class Windows(NamedTuple):
         blocks: Part of the logs to which each window belongs.
     """
 
-    q: Float[AnyArray, "joints windows"]
-    qd: Float[AnyArray, "joints windows"]
-    forces: Float[AnyArray, "samples joints windows"]
-    measured: Float[AnyArray, "steps joints windows"]
+    q: AnyArray
+    qd: AnyArray
+    forces: AnyArray
+    measured: AnyArray
     starts: np.ndarray
     blocks: np.ndarray
 
