@@ -8,6 +8,7 @@ model lacks some. What counts is also missed in stretches of time that were left
 the fit.
 """
 
+import functools
 import itertools
 import math
 import re
@@ -88,13 +89,14 @@ def likely_mistakes(
     samples = _Samples(fit.base.model, logs)
     robot = fit.base.model.robot
     misfit = samples.initial_misfit
-    initial_unseen_misfit = samples.misfit(samples.no_correction, folds=FOLDS)
     if misfit < MIN_MISFIT:
         return events
-    parts = [slice(0, len(samples.forces)), *(samples.parts if len(logs) > 1 else [])]
-    for name, part in zip(
-        ("", *(f"{log.name}: " for log in logs)), parts, strict=False
-    ):
+    initial_unseen_misfit = samples.misfit(samples.no_correction, folds=FOLDS)
+    parts = [("", slice(0, len(samples.forces)))]
+    if len(logs) > 1:
+        names = [f"{log.name}: " for log in logs]
+        parts += zip(names, samples.parts, strict=True)
+    for name, part in parts:
         motion = samples.motion[part]
         forces = samples.forces[part]
         candidates = [*_column_corrections(robot, motion, forces, motor_sides)]
@@ -104,16 +106,14 @@ def likely_mistakes(
         candidates += amounts
         if not name:
             candidates += _robot_corrections(robot, motion, forces)
-        ranking = sorted(
-            ((samples.misfit(c, part), k) for k, c in enumerate(candidates))
-        )
-        min_misfit = ranking[0][0]
-        suspects = [candidates[k] for value, k in ranking if value < 1.5 * min_misfit]
+        misfits = np.array([samples.misfit(c, part) for c in candidates])
+        order = np.argsort(misfits, kind="stable")
+        min_misfit = misfits[order[0]]
+        suspects = [candidates[k] for k in order if misfits[k] < 1.5 * min_misfit]
         unseen_misfit = samples.misfit(suspects[0], part, FOLDS)
+        max_misfit = min(MAX_RATIO * misfit, MAX_MISFIT)
         # With more than three candidates nothing is known.
-        is_sure = len(suspects) <= 3 and min_misfit <= min(
-            MAX_RATIO * misfit, MAX_MISFIT
-        )
+        is_sure = len(suspects) <= 3 and min_misfit <= max_misfit
         if is_sure and unseen_misfit <= MAX_RATIO * initial_unseen_misfit:
             text = (
                 f"{name}{', or '.join(c.text for c in suspects)}: the model then "
@@ -131,9 +131,10 @@ class _Samples:
     """
 
     def __init__(self, model: Model, logs: Sequence[Observations]):
-        step = -(-sum(log.rows for log in logs) // INSTANTS)
+        rows = sum(log.rows for log in logs)
+        step = -(-rows // INSTANTS)
         instants = [log.instants[::step] for log in logs]
-        motions = [log.motion[rows] for log, rows in zip(logs, instants, strict=True)]
+        motions = [log.motion[k] for log, k in zip(logs, instants, strict=True)]
         self.motion = jax.tree.map(lambda *x: np.concatenate(x), *motions)
         self.forces = np.concatenate(
             [np.asarray(log.reduced_forces)[::step] for log in logs]
@@ -151,7 +152,8 @@ class _Samples:
             re.fullmatch(r"f[vc]\d+", name) is not None
             for name in model.parameter_names
         ]
-        self._is_friction = np.ones(self._rows.shape[2] - 1, bool)
+        column_count = self._rows.shape[2] - 1
+        self._is_friction = np.ones(column_count, bool)
         self._is_friction[: len(is_model_friction)] = is_model_friction
         self.initial_misfit = _misfit(self._rows, self._is_friction)
 
@@ -177,7 +179,8 @@ class _Samples:
         upper_square = misfit(step) ** 2
         curvature = lower_square + upper_square - 2 * initial_square
         slope = upper_square - lower_square
-        if curvature > 0 and slope**2 < 8 * curvature * initial_square * (1 - 0.9**2):
+        min_fall = (1 - 0.9**2) * initial_square
+        if curvature > 0 and slope**2 < 8 * curvature * min_fall:
             return mistake.correction(-np.sign(slope) * step, part)
         bounds = (-mistake.max_amount, mistake.max_amount)
         options = {"maxiter": 10}
@@ -186,45 +189,47 @@ class _Samples:
 
     def amounts(self) -> Iterator[_Amount]:
         """Yield mistakes of any amount: a delay, zeros of angles, gains of forces."""
-        robot = self._model.robot
-        q = self.motion.q
-        forces = self.forces
-        text = (
-            "the forces of the log seem to be late (`recording.force_delay = {:.3g}`)"
-        )
-
-        def correction(text: str, part: slice, q=q, forces=forces) -> Correction:
-            motion = Motion(q[part], self.motion.qd[part], self.motion.qdd[part])
-            return Correction(text, robot, motion, forces[part])
-
-        def delay(x: float, part: slice) -> Correction:
-            return correction(text.format(x), part, forces=self._delayed_forces(x))
-
-        yield _Amount(delay, MAX_DELAY, 0.1 * MAX_DELAY)
-        for j, name in enumerate(robot.joint_names[:MAX_JOINTS]):
-            axis = np.eye(robot.joints)[j]
-            unit = "degrees" if robot.revolute[j] else "m"
-            size = np.pi / 180 if robot.revolute[j] else 1.0
-
-            def shift(
-                x: float, part: slice, axis=axis, name=name, unit=unit, size=size
-            ) -> Correction:
-                hint = (
-                    f"the angle of joint `{name}` seems to lack {x / size:.2g} {unit}"
-                )
-                return correction(
-                    f"{hint} (`recording.angle_offsets`)", part, q + x * axis
-                )
-
-            def scale(x: float, part: slice, axis=axis, name=name) -> Correction:
-                hint = (
-                    f"the gain of the force of joint `{name}` seems to be "
-                    f"{np.exp(x):.2g}"
-                )
-                return correction(hint, part, forces=forces * np.exp(-x * axis))
-
+        yield _Amount(self._later, MAX_DELAY, 0.1 * MAX_DELAY)
+        for j in range(min(self.motion.joints, MAX_JOINTS)):
+            shift = functools.partial(self._shifted, j)
+            scale = functools.partial(self._scaled, j)
             yield _Amount(shift, MAX_ZERO_ERROR, ZERO_STEP)
             yield _Amount(scale, MAX_LOG_GAIN, LOG_GAIN_STEP)
+
+    def _later(self, seconds: float, part: slice) -> Correction:
+        """Return the correction of late forces."""
+        text = (
+            "the forces of the log seem to be late (`recording.force_delay = "
+            f"{seconds:.3g}`)"
+        )
+        forces = self._delayed_forces(seconds)[part]
+        return Correction(text, self._model.robot, self.motion[part], forces)
+
+    def _shifted(self, j: int, change: float, part: slice) -> Correction:
+        """Return the correction of the zero of a joint's angle."""
+        robot = self._model.robot
+        text = f"{np.rad2deg(change):.2g} degrees"
+        if not robot.revolute[j]:
+            text = f"{change:.2g} m"
+        text = (
+            f"the angle of joint `{robot.joint_names[j]}` seems to lack {text} "
+            "(`recording.angle_offsets`)"
+        )
+        motion = self.motion[part]
+        q = motion.q + change * np.eye(motion.joints)[j]
+        motion = Motion(q, motion.qd, motion.qdd)
+        return Correction(text, robot, motion, self.forces[part])
+
+    def _scaled(self, j: int, log_gain: float, part: slice) -> Correction:
+        """Return the correction of the gain of a joint's force."""
+        robot = self._model.robot
+        text = (
+            f"the gain of the force of joint `{robot.joint_names[j]}` seems to be "
+            f"{np.exp(log_gain):.2g}"
+        )
+        gains = np.exp(log_gain * np.eye(robot.joints)[j])
+        forces = self.forces[part] / gains
+        return Correction(text, robot, self.motion[part], forces)
 
     def _delayed_forces(self, seconds: float) -> np.ndarray:
         """Return the forces that stand later in the logs."""
@@ -232,7 +237,8 @@ class _Samples:
         for log, rows in zip(self._logs, self._instants, strict=True):
             time = log.reduced_time
             curve = CubicSpline(time, np.asarray(log.reduced_forces))
-            forces.append(curve(np.clip(log.time[rows] + seconds, time[0], time[-1])))
+            later = np.clip(log.time[rows] + seconds, time[0], time[-1])
+            forces.append(curve(later))
         return np.concatenate(forces)
 
     def _corrected_rows(self, c: Correction) -> np.ndarray:
@@ -245,11 +251,12 @@ class _Samples:
 def _friction_columns(speeds: np.ndarray, max_speeds: np.ndarray) -> np.ndarray:
     """Return friction columns of each braking joint: dry, with peaks, and quadratic."""
     v = speeds / np.where(max_speeds > 0, max_speeds, 1.0)
-    shapes = [np.tanh(v / width) for width in (0.01, 0.1)]
-    shapes += [np.tanh(v / 0.01) * np.exp(-((v / width) ** 2)) for width in (0.05, 0.2)]
-    return np.concatenate(
-        [x[..., None] * np.eye(v.shape[1]) for x in (*shapes, v * abs(v))], 2
-    )
+    sign = np.tanh(v / 0.01)
+    shapes = [sign, np.tanh(v / 0.1)]
+    shapes += [sign * np.exp(-((v / width) ** 2)) for width in (0.05, 0.2)]
+    shapes += [v * abs(v)]
+    identity = np.eye(v.shape[1])
+    return np.concatenate([x[..., None] * identity for x in shapes], axis=2)
 
 
 def _reversal(c: Correction, joint: int) -> Correction:
@@ -267,8 +274,9 @@ def _misfit_text(
     if misfit < MAX_MISFIT:
         return ()
     errors = forces - fit.predict(motion) - fit.base.tool_forces(motion)
-    size = np.sqrt(np.mean(forces**2, axis=0))
-    misfits = np.sqrt(np.mean(errors**2, axis=0)) / np.where(size > 0, size, np.inf)
+    force_sizes = np.sqrt(np.mean(forces**2, axis=0))
+    error_sizes = np.sqrt(np.mean(errors**2, axis=0))
+    misfits = error_sizes / np.where(force_sizes > 0, force_sizes, np.inf)
     joint = int(np.argmax(misfits))
     return (
         f"the model does not fit: it misses {significant(100 * misfit, 2)} % of the "

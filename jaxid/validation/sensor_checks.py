@@ -250,15 +250,18 @@ def clock_findings(recording: Recording) -> list[str]:
 
 def _wrap_text(x: np.ndarray, time: np.ndarray) -> str:
     """Report jumps at full turns without which the angle would be smooth."""
-    step = np.diff(x)
+    steps = np.diff(x)
+    sizes = np.abs(steps)
     # In radians, or in degrees that are taken for radians.
     for turn in (2 * np.pi, 360.0):
-        if not 0.5 * turn < np.abs(step).max(initial=0.0) < 1.5 * turn:
+        if not 0.5 * turn < sizes.max(initial=0.0) < 1.5 * turn:
             continue
-        jumps = np.flatnonzero(np.abs(step[1:]) > 0.5 * turn) + 1
-        rises = np.diff(np.unwrap(x, period=turn))
-        bends = np.sum((step[jumps] - step[jumps - 1]) ** 2)
-        if jumps.size and np.sum((rises[jumps] - rises[jumps - 1]) ** 2) < 0.01 * bends:
+        jumps = np.flatnonzero(sizes[1:] > 0.5 * turn) + 1
+        unwrapped_steps = np.diff(np.unwrap(x, period=turn))
+        bends = steps[jumps] - steps[jumps - 1]
+        unwrapped_bends = unwrapped_steps[jumps] - unwrapped_steps[jumps - 1]
+        is_smoother = np.sum(unwrapped_bends**2) < 0.01 * np.sum(bends**2)
+        if jumps.size and is_smoother:
             count = "once" if jumps.size == 1 else f"{jumps.size} times"
             return (
                 f"jumps by a full turn ({turn:.4g}) {count}, first at "
@@ -358,8 +361,9 @@ def _held_force_text(
         return ""
     for a, b in segments:
         f = forces[a:b]
+        changes = np.diff(f)
         speed = np.abs(np.gradient(x[a:b]))
-        ends = np.flatnonzero(np.append(np.diff(f) != 0, True)) + 1
+        ends = np.flatnonzero(np.append(changes != 0, True)) + 1
         lengths = np.diff(ends, prepend=0)
         max_speed = speed.max(initial=0.0)
         is_moving = speed > REST_SHARE * max_speed
@@ -372,12 +376,14 @@ def _held_force_text(
         # instead.
         usual_length = min(usual_length, (b - a) / len(ends))
         # A drive reaches or leaves its limit without a jump.
-        step = float(np.quantile(np.abs(np.diff(f)), 0.99))
-        for start, end in _runs(f, max(_min_run_length(b - a), int(30 * usual_length))):
+        step = float(np.quantile(np.abs(changes), 0.99))
+        equal_count = np.count_nonzero(changes == 0)
+        min_length = max(_min_run_length(b - a), int(30 * usual_length))
+        for start, end in _runs(f, min_length):
             run = slice(start, end + 1)
             # Forces of a robot may be constant at constant speed, but not if they are
             # noisy.
-            is_noisy = np.count_nonzero(np.diff(f) == 0) - (end - start) < 0.01 * len(f)
+            is_noisy = equal_count - (end - start) < 0.01 * len(f)
             is_steady = np.std(speed[run]) < 0.05 * max_speed and not is_noisy
             if np.mean(is_moving[run]) < 0.5 or is_steady:
                 continue
