@@ -157,32 +157,30 @@ def channel_findings(
     Return the joint and a sentence of each.
     """
     r = recording
-    texts = []
-    angles, forces, time = (np.asarray(x) for x in (r.angles, r.forces, r.time))
+    faults = []
+    angles = np.asarray(r.angles)
+    forces = np.asarray(r.forces)
+    time = np.asarray(r.time)
     owner = "the motor of joint" if r.angles_on_motor_side else "joint"
     for j, name in enumerate(robot.joint_names):
-        angle = f"the angle of {owner} `{name}`"
         x = angles[:, j]
         other_angles = np.delete(angles, j, 1)
         text = _wrap_text(x, time) if robot.revolute[j] else ""
-        text = (
-            text
-            or _spike_text(x, time, r.segments)
-            or _held_angle_text(x, other_angles, time, r.segments)
-        )
+        text = text or _spike_text(x, time, r.segments)
+        text = text or _held_angle_text(x, other_angles, time, r.segments)
+        if text:
+            faults.append((j, f"the angle of {owner} `{name}` {text}"))
         hold = _held_force_text(forces[:, j], x, time, r.segments)
-        texts += [(j, angle, text), (j, f"the forces of joint `{name}`", hold)]
-    faults = [(j, f"{channel} {text}") for j, channel, text in texts if text]
+        if hold:
+            faults.append((j, f"the forces of joint `{name}` {hold}"))
     if statistics is not None and r.velocities is not None:
-        faults += [
-            (
-                j,
+        for j, ratio in unlike_derivatives(r).items():
+            text = (
                 f"the velocities of {owner} `{robot.joint_names[j]}` are {ratio:.3g} "
                 "times the derivatives of its angles: check `recording.velocity_unit` "
-                "and the order of the columns.",
+                "and the order of the columns."
             )
-            for j, ratio in unlike_derivatives(r).items()
-        ]
+            faults.append((j, text))
         for j, name in enumerate(robot.joint_names):
             lag = statistics.lateness(j)
             if abs(lag) > MAX_LAG * r.sample_time:
@@ -197,55 +195,66 @@ def channel_findings(
 
 def clock_findings(recording: Recording) -> list[str]:
     """Look for lost or repeated rows: all joints jump, or stand, for one sample."""
-    losses = []
-    repeats = []
+    instants: dict[str, list[float]] = {"lost": [], "repeated": []}
     time = np.asarray(recording.time)
+    angles = np.asarray(recording.angles)
+    rounding = 1e-9 * np.abs(angles).max(axis=0)
     for a, b in recording.segments:
-        steps = np.diff(np.asarray(recording.angles)[a:b], axis=0)
-        if len(steps) < 100:
-            continue
-        start = steps[:-2]
-        middle = steps[1:-1]
-        end = steps[2:]
-        mean = 0.5 * (start + end)
-        noise = 1.4826 * np.median(np.abs(middle - mean), axis=0)
-        # Encoders round to half an increment; smaller differences are those of rounded
-        # numbers.
-        sizes = np.abs(steps)
-        rounding = 1e-9 * np.abs(recording.angles).max(axis=0)
-        increment = np.where(sizes > rounding, sizes, np.inf).min(axis=0)
-        noise = np.maximum(noise, 0.5 * increment)
-        mask = np.isfinite(noise)
-        if not mask.any():
-            continue
-        mean, middle, bend = (
-            x[:, mask] / noise[mask] for x in (mean, middle, end - start)
-        )
-        # All joints go on by the same number of steps, as far as noise lets see.
-        speed = np.sum(mean**2, axis=1)
-        count = np.sum(middle * mean, axis=1) / np.maximum(speed, 1.0)
-        gap = np.abs(middle - mean)
-        shift = np.abs(mean) * np.abs(count - 1)[:, None]
-        jumps = (
-            (np.abs(bend).max(axis=1) < JUMP) & (speed > 9.0) & (gap > JUMP).any(axis=1)
-        )
-        jumps &= ((gap > JUMP) | (shift < 2 * JUMP)).all(axis=1)
-        jumps &= np.sum((middle - count[:, None] * mean) ** 2, axis=1) < 0.1 * np.sum(
-            gap**2, axis=1
-        )
         inner_times = time[a + 2 : b - 1]
-        losses += inner_times[jumps & (count > 1.5)].tolist()
-        repeats += inner_times[jumps & (middle == 0).all(axis=1)].tolist()
+        steps = np.diff(angles[a:b], axis=0)
+        if len(steps) >= 100:
+            is_lost, is_repeated = _lost_and_repeated(steps, rounding)
+            instants["lost"] += inner_times[is_lost].tolist()
+            instants["repeated"] += inner_times[is_repeated].tolist()
     cure = "name the column of times (`recording.time`), or record again"
-    return [
-        f"{problem} at {len(times)} instant{'' if len(times) == 1 else 's'}, first at "
-        f"{times[0]:.6g} s: {cure}."
-        for problem, times in (
-            ("rows seem to be lost", losses),
-            ("rows seem to be repeated", repeats),
-        )
-        if times
-    ]
+    findings = []
+    for problem, times in instants.items():
+        if times:
+            places = f"{len(times)} instant{'' if len(times) == 1 else 's'}"
+            findings.append(
+                f"rows seem to be {problem} at {places}, first at {times[0]:.6g} s: "
+                f"{cure}."
+            )
+    return findings
+
+
+def _lost_and_repeated(
+    steps: np.ndarray, rounding: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return at which inner steps rows seem to be lost, or repeated.
+
+    Args:
+        steps: Steps of all joints' angles [samples, joints].
+        rounding: Size of steps that are rounding errors of numbers [joints].
+    """
+    middle = steps[1:-1]
+    before = steps[:-2]
+    after = steps[2:]
+    mean = 0.5 * (before + after)
+    sizes = np.abs(steps)
+    # Encoders round to half an increment; smaller differences are those of rounded
+    # numbers.
+    increment = np.where(sizes > rounding, sizes, np.inf).min(axis=0)
+    noise = 1.4826 * np.median(np.abs(middle - mean), axis=0)
+    # The noise of a joint that never moves is infinite, and it has no say.
+    noise = np.maximum(noise, 0.5 * increment)
+    bend = np.abs(after - before) / noise
+    middle = middle / noise
+    mean = mean / noise
+    gap = np.abs(middle - mean)
+    # All joints go on by the same number of steps, as far as noise lets see.
+    speed = np.sum(mean**2, axis=1)
+    count = np.sum(middle * mean, axis=1) / np.maximum(speed, 1.0)
+    common_gap = np.abs(count - 1)[:, None] * np.abs(mean)
+    is_far = gap > JUMP
+    is_shared = (is_far | (common_gap < 2 * JUMP)).all(axis=1)
+    residuals = middle - count[:, None] * mean
+    is_explained = np.sum(residuals**2, axis=1) < 0.1 * np.sum(gap**2, axis=1)
+    is_jump = is_far.any(axis=1) & is_shared & is_explained
+    is_jump &= speed > 9.0
+    is_jump &= bend.max(axis=1) < JUMP
+    is_standing = (middle == 0).all(axis=1)
+    return is_jump & (count > 1.5), is_jump & is_standing
 
 
 def _wrap_text(x: np.ndarray, time: np.ndarray) -> str:
