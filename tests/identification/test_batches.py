@@ -208,28 +208,44 @@ def test_data_sets_of_a_mesh_of_devices(base, arrays):
     )
 
 
-@pytest.mark.parametrize("name", ["offset", "axis", "gravity"])
-def test_derivatives_by_the_geometry_are_differences(base, sets, arrays, name):
-    robot, (m, forces) = base.model.robot, arrays
-    x = jnp.asarray(getattr(robot, name))
-    direction = 0.1 * np.random.default_rng(4).normal(size=x.shape)
+def test_derivatives_by_the_geometry_are_differences(base, sets, arrays):
+    """Along one direction that changes offsets, axes and gravity."""
+    motion, forces = arrays
+    robot = base.model.robot
+    geometry = {
+        k: jnp.asarray(getattr(robot, k)) for k in ("offset", "axis", "gravity")
+    }
+    rng = np.random.default_rng(4)
+    direction = {k: 0.1 * rng.normal(size=x.shape) for k, x in geometry.items()}
 
     @jax.jit
-    def found(x):
-        own = eqx.tree_at(lambda b: getattr(b.model.robot, name), base, x)
-        fit = identify_batch(own, m, forces, WEIGHTS, row_time=sets[0].sample_time)
+    def identified(values):
+        changed = base
+        for name, value in values.items():
+            changed = eqx.tree_at(
+                lambda b, name=name: getattr(b.model.robot, name), changed, value
+            )
+        fit = identify_batch(
+            changed, motion, forces, WEIGHTS, row_time=sets[0].sample_time
+        )
         return fit.parameters, fit.standard_deviations
 
-    h, tangents = 1e-4, jax.jvp(found, (x,), (direction,))[1]
-    there = [found(x + k * h * direction) for k in (1, -1, 2, -2)]
-    for tangent, *near in zip(tangents, *there, strict=True):
-        a, b, c, d = map(np.asarray, near)
+    def identified_at(step):
+        values = {k: x + step * direction[k] for k, x in geometry.items()}
+        return [np.asarray(x) for x in identified(values)]
+
+    h = 1e-4
+    tangents = jax.jvp(identified, (geometry,), (direction,))[1]
+    near = zip(identified_at(h), identified_at(-h), strict=True)
+    far = zip(identified_at(2 * h), identified_at(-2 * h), strict=True)
+    for tangent, (a, b), (c, d) in zip(tangents, near, far, strict=True):
         quotient = (8 * (a - b) - (c - d)) / (12 * h)
         np.testing.assert_allclose(
             tangent, quotient, atol=1e-6 * np.abs(quotient).max()
         )
-    slope = jax.grad(lambda x: found(x)[0].sum())(x)
-    np.testing.assert_allclose(jnp.vdot(slope, direction), tangents[0].sum(), rtol=1e-9)
+    slopes = jax.grad(lambda values: identified(values)[0].sum())(geometry)
+    slope = sum(jnp.vdot(slopes[k], direction[k]) for k in geometry)
+    np.testing.assert_allclose(slope, tangents[0].sum(), rtol=1e-9)
 
 
 def test_all_numbers_of_a_model_may_be_inputs(base, arrays):
