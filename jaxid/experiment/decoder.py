@@ -198,16 +198,20 @@ def _convert(value: Any, option: Any, place: str) -> Any:
 
 
 def _require_allowed(value: Any, rule: Bounds | OneOf, place: str) -> None:
-    """Reject a number out of its range, NaN and infinity, and an unknown name."""
-    if isinstance(rule, OneOf):
-        if value not in rule.names:
-            text = json.dumps(value, ensure_ascii=False)
-            raise InputError(f"`{place}` must be {quoted(rule.names)}, but is {text}.")
-        return
+    """Reject an unknown name, or a number out of its range."""
+    if isinstance(rule, Bounds):
+        _require_in_range(value, rule, place)
+    elif value not in rule.names:
+        text = json.dumps(value, ensure_ascii=False)
+        raise InputError(f"`{place}` must be {quoted(rule.names)}, but is {text}.")
+
+
+def _require_in_range(value: float, bounds: Bounds, place: str) -> None:
+    """Reject a number out of its range, NaN and infinity."""
     if not math.isfinite(value):
         raise InputError(f"`{place}` must be finite, but is {value}.")
-    comparisons = (("above", gt), ("at least", ge), ("at most", le), ("below", lt))
-    for bound, (words, holds) in zip(rule, comparisons, strict=True):
+    comparisons = {"above": gt, "at least": ge, "at most": le, "below": lt}
+    for bound, (words, holds) in zip(bounds, comparisons.items(), strict=True):
         if bound is not None and not holds(value, bound):
             raise InputError(f"`{place}` must be {words} {bound:.10g}, but is {value}.")
 

@@ -141,10 +141,14 @@ def _wrench(inertia: Matrix, a: Vector3, w: Vector3, wd: Vector3) -> AnyArray:
     # The diagonal counts by the differences of its entries only.
     off_diagonal = accelerations * (1.0 - np.eye(3))
     K = off_diagonal @ second_moments + jnp.outer(a, jnp.asarray(h))
-    turning = jnp.stack([K[2, 1] - K[1, 2], K[0, 2] - K[2, 0], K[1, 0] - K[0, 1]])
-    x, y, z = w * w
-    products = second_moments[[1, 2, 0], [2, 0, 1]]
-    moment = turning + products * jnp.stack([z - y, x - z, y - x])
+    twice_antisymmetric = K - K.T
+    squares = w * w
+    # For each axis, the two axes that follow it.
+    second = np.array([1, 2, 0])
+    third = np.array([2, 0, 1])
+    differences = squares[third] - squares[second]
+    moment = twice_antisymmetric[third, second]
+    moment = moment + second_moments[second, third] * differences
     return jnp.concatenate([force, moment])
 
 

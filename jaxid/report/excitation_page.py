@@ -54,9 +54,11 @@ def _assumed_limits(plan: ExcitationPlan) -> str:
     rate_units = {"velocity": "/s", "acceleration": "/s²"}
     texts = []
     for name, j in plan.limits.assumed:
-        value = float(getattr(plan.limits.limits, name)[j])
+        values = getattr(plan.limits.limits, name)
+        value = float(values[j])
         unit = f"{robot.joint_unit(j)}{rate_units.get(name, '')}"
-        texts.append(f"{name} of `{robot.joint_names[j]}` ({value:.4g} {unit})")
+        joint = robot.joint_names[j]
+        texts.append(f"{name} of `{joint}` ({value:.4g} {unit})")
     return ", ".join(texts)
 
 

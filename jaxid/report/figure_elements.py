@@ -189,11 +189,14 @@ def decimate(
         return times, ordinates
     if len(times) <= 2 * bins:
         steps = np.diff(times)
-        gaps = np.flatnonzero(steps > GAP_RATIO * np.median(steps)) + 1
+        is_gap = steps > GAP_RATIO * np.median(steps)
+        gaps = np.flatnonzero(is_gap) + 1
         return np.insert(times, gaps, np.nan), np.insert(ordinates, gaps, np.nan)
 
-    fractions = (times - times[0]) / (times[-1] - times[0])
-    row_bins = np.minimum((bins * fractions).astype(int), bins - 1)
+    elapsed_times = times - times[0]
+    fractions = elapsed_times / elapsed_times[-1]
+    numbers = (bins * fractions).astype(int)
+    row_bins = np.minimum(numbers, bins - 1)
     first_rows = np.flatnonzero(np.diff(row_bins, prepend=-1))
     last_rows = np.append(first_rows[1:], len(times)) - 1
     low = np.fmin.reduceat(ordinates, first_rows)
@@ -203,7 +206,9 @@ def decimate(
     is_falling = ordinates[last_rows] < ordinates[first_rows]
     starts = np.where(is_falling, high, low)
     ends = np.where(is_falling, low, high)
-    gaps = np.flatnonzero(np.diff(row_bins[first_rows]) > 1) + 1
+    # A bin without rows is a gap.
+    bin_steps = np.diff(row_bins[first_rows])
+    gaps = np.flatnonzero(bin_steps > 1) + 1
     bin_times = np.stack([times[first_rows], times[last_rows]], axis=1)
     bin_values = np.stack([starts, ends], axis=1)
     return (

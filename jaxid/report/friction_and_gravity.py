@@ -75,9 +75,10 @@ def _friction_columns(base: BaseParameters, speeds: np.ndarray) -> np.ndarray:
     alone = np.arange(joints)
     qd = np.zeros((count + 1, joints, joints))
     qd[:-1, alone, alone] = speeds
-    qd = qd.reshape(-1, joints)
-    theta = _steady_columns(base, np.zeros_like(qd), qd)
-    columns = theta.reshape(count + 1, joints, joints, -1)[:, alone, alone]
+    samples = qd.reshape(-1, joints)
+    theta = _steady_columns(base, np.zeros_like(samples), samples)
+    blocks = theta.reshape(count + 1, joints, joints, -1)
+    columns = blocks[:, alone, alone]
     # At standstill there is gravity only.
     return columns[:-1] - columns[-1]
 
@@ -114,12 +115,10 @@ def _measured_friction(model: Curve, speeds: np.ndarray, errors: np.ndarray) -> 
 
     counts = np.bincount(classes, minlength=SPEED_CLASSES)
     is_shown = counts >= MIN_CLASS_ROWS
-    mean_speeds = (
-        np.bincount(classes, speeds, SPEED_CLASSES)[is_shown] / counts[is_shown]
-    )
-    mean_friction = (
-        np.bincount(classes, friction, SPEED_CLASSES)[is_shown] / counts[is_shown]
-    )
+    speed_sums = np.bincount(classes, speeds, SPEED_CLASSES)
+    friction_sums = np.bincount(classes, friction, SPEED_CLASSES)
+    mean_speeds = speed_sums[is_shown] / counts[is_shown]
+    mean_friction = friction_sums[is_shown] / counts[is_shown]
     name = "measured, mean of a class of speed"
     return Curve(mean_speeds, mean_friction, name, GREY, "points")
 
@@ -128,8 +127,10 @@ def gravity_table(fit: Fit, log: TorqueErrors) -> Table:
     """Return the largest force against gravity of each joint along a recording."""
     robot = fit.base.model.robot
     q = np.asarray(log.positions)[even_indices(len(log.time), MAX_POSES)]
-    max_torques = np.max(np.abs(gravity_forces(fit, q)), axis=0)
-    max_torques[max_torques < ROUNDING * np.max(max_torques)] = 0.0
+    torques = gravity_forces(fit, q)
+    max_torques = np.max(np.abs(torques), axis=0)
+    is_rounding = max_torques < ROUNDING * np.max(max_torques)
+    max_torques[is_rounding] = 0.0
     columns = [
         Column("joint", robot.joint_names),
         Column("largest torque\nof gravity", max_torques),

@@ -155,10 +155,21 @@ def _draw_curve(axes: Axes, curve: Curve, in_time: bool) -> None:
 
 
 def _draw_scene(figure: Figure, scene: Scene) -> None:
-    """Draw the robot in some poses, earlier ones paler, and its end-effector's path."""
+    """Draw the robot in some poses, and the path of its end-effector."""
     axes: Any = figure.add_subplot(
         projection="3d", proj_type="ortho", elev=22.0, azim=-62.0
     )
+    _draw_path(figure, axes, scene)
+    _draw_poses(axes, scene)
+    low = scene.bones.min(axis=(0, 1, 2))
+    high = scene.bones.max(axis=(0, 1, 2))
+    axes.auto_scale_xyz(*np.stack([low, high], axis=1))
+    axes.set_aspect("equal")
+    axes.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
+
+
+def _draw_path(figure: Figure, axes: Any, scene: Scene) -> None:
+    """Draw the path of the end-effector, coloured by the values along it."""
     tip = scene.points[:, -1]
     steps = np.stack([tip[:-1], tip[1:]], axis=1)
     if scene.values is None:
@@ -169,16 +180,15 @@ def _draw_scene(figure: Figure, scene: Scene) -> None:
         figure.colorbar(path, ax=axes, shrink=0.7, label=scene.label)
     axes.add_collection3d(path, autolim=False)
 
-    count = min(scene.poses, len(tip))
-    poses = np.linspace(0, len(tip) - 1, count).round().astype(int)
+
+def _draw_poses(axes: Any, scene: Scene) -> None:
+    """Draw the robot in some poses, earlier ones paler."""
+    samples = len(scene.points)
+    count = min(scene.poses, samples)
+    poses = np.linspace(0, samples - 1, count).round().astype(int)
     for number, pose in enumerate(poses, 1):
         opacity = 0.16 + 0.84 * (number / count) ** 2
         bones = Line3DCollection(scene.bones[pose], lw=2.4, color=INK, alpha=opacity)
         axes.add_collection3d(bones, autolim=False)
-        axes.scatter(*scene.points[pose, :-1].T, s=18, color=INK, alpha=opacity)
-
-    low = scene.bones.min(axis=(0, 1, 2))
-    high = scene.bones.max(axis=(0, 1, 2))
-    axes.auto_scale_xyz(*np.stack([low, high], axis=1))
-    axes.set_aspect("equal")
-    axes.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
+        joints = scene.points[pose, :-1]
+        axes.scatter(*joints.T, s=18, color=INK, alpha=opacity)

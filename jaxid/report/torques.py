@@ -195,7 +195,9 @@ def _pooled_percents(
     scale = max_forces
     if scale is None:
         forces = np.concatenate([np.asarray(log.measured) for log in recordings])
-        scale = np.maximum(np.sqrt(mean(forces**2)), np.finfo(float).tiny)
+        rms_forces = np.sqrt(mean(forces**2))
+        # No division by zero for a joint without forces.
+        scale = np.maximum(rms_forces, np.finfo(float).tiny)
     mean_error = mean(np.abs(errors))
     rms_error = np.sqrt(mean(errors**2))
     return 100.0 * mean_error / scale, 100.0 * rms_error / scale
