@@ -30,8 +30,6 @@ ACCELERATOR_BATCH = 256
 
 Vectors = Float[AnyArray, "*datasets size"]
 """A vector for each data set."""
-Scalars = Float[AnyArray, "*datasets"]
-"""A number for each data set."""
 
 
 class ConsistentBatch(eqx.Module):
@@ -40,17 +38,13 @@ class ConsistentBatch(eqx.Module):
     Attributes:
         standard: Standard parameters: complete bodies, friction, rotors.
         parameters: Base parameters.
-        residual_increases: Relative increases of the norms of the residuals by the
-            bounds.
-        error_bounds: Bounds of the objectives' relative distances to their optima.
-        certified: Whether the bounds are within the tolerance.
+        certified: Whether the optima are proved: their error bounds are within the
+            tolerance.
         iterations: Numbers of iterations.
     """
 
     standard: Vectors
     parameters: Vectors
-    residual_increases: Scalars
-    error_bounds: Scalars
     certified: Bool[AnyArray, "*datasets"]
     iterations: Int[AnyArray, "*datasets"]
 
@@ -95,15 +89,9 @@ class ConsistentSolver(Hashable):
         data, program = self.estimator.program(self.base, feasible, R, z, rows)
         optimum = solver.solve_compiled(program)
         p = feasible.standard_parameters(data, optimum.y)
-        residuals = data.b - data.A @ p
-        free_residuals = data.b[self.base.size :]
-        # Exact data leave no residuals: the ratio below stays finite.
-        free_square = jnp.maximum(free_residuals @ free_residuals, 1e-300)
         return ConsistentBatch(
             standard=p,
             parameters=self.base.from_standard(p),
-            residual_increases=jnp.sqrt(residuals @ residuals / free_square) - 1.0,
-            error_bounds=optimum.error / jnp.maximum(optimum.value, program.scale),
             certified=jnp.asarray(optimum.certified),
             iterations=jnp.asarray(optimum.iterations),
         )

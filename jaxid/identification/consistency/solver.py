@@ -180,11 +180,12 @@ def _start(p: ConeProgram) -> Point:
     inverse_S = inverse(S)
     rest = p.A @ p.start - p.b
     gradient = xp.linalg.norm(rest @ p.A)
-    force = xp.linalg.norm(p.adjoint(inverse_S, 1.0 / s))
-    max_mu = (0.5 * rest @ rest + RIDGE) / p.complementarity
-    mu = xp.clip(gradient / force, 1e-6 * max_mu, max_mu)
-    Z = xp.maximum(_targets(p), mu) * inverse_S
-    return _point(p, p.start, Z, mu / s)
+    unit_force = xp.linalg.norm(p.adjoint(inverse_S, 1.0 / s))
+    value = 0.5 * rest @ rest + RIDGE
+    max_mu = value / p.complementarity
+    mu = xp.clip(gradient / unit_force, 1e-6 * max_mu, max_mu)
+    products = xp.maximum(_targets(p), mu)
+    return _point(p, p.start, products * inverse_S, mu / s)
 
 
 def prices(p: ConeProgram, optimum: Optimum) -> Float[np.ndarray, " linear"]:
@@ -200,9 +201,11 @@ def prices(p: ConeProgram, optimum: Optimum) -> Float[np.ndarray, " linear"]:
     solve = _newton_solver(p, _gram(p) + barriers)
     unit_vectors = np.eye(p.A.shape[-1])
     columns = [p.linear(y)[1] for y in unit_vectors]
-    compliance = np.array([row @ solve(row) for row in np.transpose(columns)])
+    bound_rows = np.transpose(columns)
+    compliance = np.array([row @ solve(row) for row in bound_rows])
     # Without the bound's own part of the curvature, and then a step of Newton's method.
-    curvature = np.maximum(1.0 - ratio * compliance, 1e-12)
+    remaining_part = 1.0 - ratio * compliance
+    curvature = np.maximum(remaining_part, 1e-12)
     step = z * compliance / curvature - s
     return 0.5 * z * np.maximum(step, 0.0)
 
@@ -216,14 +219,20 @@ def _point(p: ConeProgram, y, Z, z) -> Point:
     pull = xp.concatenate([prior, xp.zeros_like(p.fillings)])
     gradient = rest @ p.A + p.adjoint(pull, xp.zeros_like(z))
     residual = gradient - p.adjoint(Z, z)
-    if p.equalities.shape[0]:
+    E = p.equalities
+    if len(E):
         # Differences of feasible variables are orthogonal to the equality constraints.
-        normal = xp.linalg.solve(p.equalities @ p.equalities.T, p.equalities @ residual)
-        residual = residual - p.equalities.T @ normal
+        normal = xp.linalg.solve(E @ E.T, E @ residual)
+        residual = residual - E.T @ normal
     gap = _matrix_gap(p, S, Z) + s @ z
-    error = gap + xp.sum(xp.abs(residual) * p.diameters)
     value = 0.5 * rest @ rest
+    error = gap + _residual_part(p, residual)
     return Point(y, S, s, Z, z, residual, value, error)
+
+
+def _residual_part(p: ConeProgram, residual):
+    """Return the part of the error bound that comes from the optimality conditions."""
+    return p.xp.sum(p.xp.abs(residual) * p.diameters)
 
 
 def _matrix_gap(p: ConeProgram, S, Z):
@@ -235,16 +244,16 @@ def _matrix_gap(p: ConeProgram, S, Z):
     xp = p.xp
     products = xp.sum(S * Z, axis=(-2, -1))
     bodies = products[: p.bodies]
+    couplings = products[p.bodies :]
     is_pulled = p.pull > 0
-    # Ones where nothing is pulled keep the logarithm finite.
-    log_pull = xp.log(xp.where(is_pulled, p.pull, 1.0))
+    # One where nothing is pulled keeps the logarithm finite.
+    pull = xp.where(is_pulled, p.pull, 1.0)
     logarithms = xp.log(pivots(S)) + xp.log(pivots(Z))
     log_det = xp.sum(logarithms[:, : p.bodies], axis=0)
-    excess = log_det - 4.0 * log_pull
+    excess = log_det - 4.0 * xp.log(pull)
     pulled_gap = bodies - 4.0 * p.pull - p.pull * excess
-    gap = xp.where(is_pulled, pulled_gap, bodies)
-    couplings = products[p.bodies :]
-    return xp.sum(gap) + xp.sum(couplings)
+    body_gap = xp.where(is_pulled, pulled_gap, bodies)
+    return xp.sum(body_gap) + xp.sum(couplings)
 
 
 def _targets(p: ConeProgram):
@@ -323,8 +332,7 @@ def _step(p: ConeProgram, gram, x: Point):
 
     # Near the boundary rounding leaves a residual that the error bound counts.
     is_near = x.error <= 1e-3 * (p.scale + x.value)
-    residual_part = xp.sum(xp.abs(x.residual) * p.diameters)
-    needs_refinement = is_near & (residual_part > 0.1 * x.error)
+    needs_refinement = is_near & (_residual_part(p, x.residual) > 0.1 * x.error)
     if xp is np:
         d, length = refine() if needs_refinement else (d, length)
     else:
@@ -370,12 +378,13 @@ def _length(fractions, x: Point, d: Direction):
     lengths = fractions / max_speed
     matrices = xp.concatenate([x.S, x.Z])
     changes = xp.concatenate([d.S, d.Z])
+    # All lengths at once, on the last axis.
     steps = changes[..., None] * lengths[None, None, None]
     ends = matrices[..., None] + steps
-    is_positive = xp.all(pivots(ends) > 0, axis=(0, 1))
+    end_pivots = pivots(ends)
+    is_positive = xp.all(end_pivots > 0, axis=(0, 1))
     # The fractions fall: the first that is good is the longest.
-    first = xp.argmax(is_positive)
-    max_length = lengths[first]
+    max_length = lengths[xp.argmax(is_positive)]
     return xp.where(xp.any(is_positive), max_length, 0.0)
 
 
@@ -386,18 +395,22 @@ def _barriers(p: ConeProgram, inverse_S, Z, ratio):
     """
     xp = p.xp
     products = _products(inverse_S, Z)
-    of_basis = products[: p.bodies] @ p.basis.T[None]
-    semidefinite_part = p.basis[None] @ of_basis
-    of_bodies, lower, upper = p.split_linear(ratio)
-    linear_part = xp.einsum("kri,kr,krj->kij", p.rows, of_bodies, p.rows)
+    body_products = products[: p.bodies]
+    coupling_products = products[p.bodies :]
+    body_ratio, lower_ratio, upper_ratio = p.split_linear(ratio)
+
+    half_products = body_products @ p.basis.T[None]
+    semidefinite_part = p.basis[None] @ half_products
+    linear_part = xp.einsum("kri,kr,krj->kij", p.rows, body_ratio, p.rows)
     bodies = symmetric_part(semidefinite_part) + linear_part
     ridge = 1.0 + RIDGE * np.eye(p.width)
     bodies = bodies * ridge[None]
 
     couplings = xp.reshape(p.couplings, (*p.couplings.shape[:2], 16))
-    of_couplings = xp.einsum("ikx,kxy->iky", couplings, products[p.bodies :])
-    coupled = xp.tensordot(of_couplings, couplings, ((1, 2), (1, 2)))
-    drives = xp.diag((1.0 + RIDGE) * (lower + upper)) + symmetric_part(coupled)
+    weighted_couplings = xp.einsum("ikx,kxy->iky", couplings, coupling_products)
+    coupled_part = xp.tensordot(weighted_couplings, couplings, ((1, 2), (1, 2)))
+    drive_ratio = (1.0 + RIDGE) * (lower_ratio + upper_ratio)
+    drives = xp.diag(drive_ratio) + symmetric_part(coupled_part)
     return _linalg(p).block_diag(*bodies, drives)
 
 

@@ -127,9 +127,6 @@ def test_a_batch_is_its_data_sets_one_by_one():
         np.testing.assert_allclose(
             many.parameters[k], base.from_standard(p), rtol=1e-3, atol=1e-4
         )
-        free = np.linalg.norm(data.b[base.size :])
-        price = np.sqrt(2.0 * optimum.value) / free - 1.0
-        np.testing.assert_allclose(many.residual_increases[k], price, atol=1e-6)
     assert many.certified.all()
     assert (
         consistency_margin(np.asarray(many.standard)[:, :20].reshape(2, 2, 10)) > 0
