@@ -42,6 +42,10 @@ PIECE = 32768
 """Samples that are passed to the loop at once."""
 TILE = 16
 """Rows of a banded product: more multiply zeros, fewer use the processor less."""
+FIRST_PIECES = 8
+"""Pieces of the log from which the first triangles are made."""
+MAX_SIZE_RATIO = 1e4
+"""Ratio of sizes of directions up to which products of rows lose no digits."""
 MAX_COST = 256
 """Products for each row and column of a filter up to which a matrix product pays."""
 
@@ -208,11 +212,12 @@ class _Stream:
         high = min(first_row + math.ceil(samples / factor), end_row)
         call_rows = self._shape.iterations * self._shape.rows
         max_rows = call_rows - self._shape.delay
+        # The first sample on which row zero of the segment depends.
+        origin = start + edge - reach
         for block, rows in divide_rows(self._edges, slice(low, high)):
             for row in range(rows.start, rows.stop, max_rows):
                 next_row = min(row + max_rows, rows.stop)
-                instant = start + edge + (row - first_row) * factor
-                begin = instant - reach
+                begin = origin + (row - first_row) * factor
                 end = min(begin + self._samples_of(next_row - row), stop)
                 samples_of_rows = slice(begin, end, self._stride)
                 yield Piece(block, slice(row, next_row), samples_of_rows)
@@ -228,14 +233,14 @@ class _Stream:
         for piece in self._pieces:
             is_end[piece.rows] = False
         # Starts and stops of the runs of such rows alternate.
-        changes = np.flatnonzero(np.diff(np.pad(is_end, 1)))
-        starts = changes[::2].tolist()
-        stops = changes[1::2].tolist()
-        ranges = list(zip(starts, stops, strict=True))
+        padded = np.pad(is_end, 1)
+        changes = np.flatnonzero(np.diff(padded))
+        ranges = changes.reshape(-1, 2).tolist()
         samples = max(4096, 2 * self._shape.reach)
         for chunk in row_chunks(self._base, self._observations, samples, ranges):
             mask = chunk.mask & is_end[chunk.rows, None]
-            for part in chunk._replace(mask=mask).divide(self._edges):
+            ends = chunk._replace(mask=mask)
+            for part in ends.divide(self._edges):
                 yield part.block, part.equations()
 
     def triangles(self, progress: Progress | None) -> list[Grams]:
@@ -246,18 +251,18 @@ class _Stream:
             result = self._pass(result.total, progress)
         return result.triangles
 
-    def _first_grams(self, parts: int = 8) -> Grams:
+    def _first_grams(self) -> Grams:
         """Return the Gram matrices of a few parts of the log."""
-        step = max(1, len(self._pieces) // parts)
+        step = max(1, len(self._pieces) // FIRST_PIECES)
         pieces = []
-        for piece in self._pieces[step // 2 :: step]:
+        for block, rows, samples in self._pieces[step // 2 :: step]:
             # As many rows of a piece as an iteration has.
-            start = piece.rows.start
-            stop = min(piece.rows.stop, start + self._shape.rows)
-            begin = piece.samples.start
-            end = min(piece.samples.stop, begin + self._samples_of(stop - start))
-            samples = slice(begin, end, self._stride)
-            pieces.append(Piece(piece.block, slice(start, stop), samples))
+            stop = min(rows.stop, rows.start + self._shape.rows)
+            rows = slice(rows.start, stop)
+            count = self._samples_of(stop - rows.start)
+            end = min(samples.stop, samples.start + count)
+            samples = slice(samples.start, end, self._stride)
+            pieces.append(Piece(block, rows, samples))
         mixing = [np.eye(len(columns) + 1) for columns in self._base.acting_columns]
         grams = [matrices for _, matrices in self._grams(pieces, mixing)]
         return _sum_by_joint(grams)
@@ -270,13 +275,16 @@ class _Stream:
         for block, grams in self._grams(self._pieces, mixing, progress):
             for total, G in zip(blocks[block], grams, strict=True):
                 total += G
+        block_triangles = []
+        for block in blocks:
+            pairs = zip(block, triangles, strict=True)
+            block_triangles.append([_root(G) @ R for G, R in pairs])
         totals = _sum_by_joint(blocks)
-        roots = [[_root(G) for G in block] for block in blocks]
         joints = zip(totals, first_grams, mixing, strict=True)
         return _Pass(
-            [[a @ R for a, R in zip(x, triangles, strict=True)] for x in roots],
-            [R.T @ G @ R for R, G in zip(triangles, totals, strict=True)],
-            all(_shows_every_direction(*joint) for joint in joints),
+            triangles=block_triangles,
+            total=[R.T @ G @ R for R, G in zip(triangles, totals, strict=True)],
+            is_accurate=all(_shows_every_direction(*joint) for joint in joints),
         )
 
     def _grams(
@@ -291,9 +299,8 @@ class _Stream:
             if progress is not None:
                 progress((k + 1) / len(pieces))
         for block, equations in self._end_rows:
-            mixed_rows = [
-                rows @ mix for rows, mix in zip(equations, mixing, strict=True)
-            ]
+            pairs = zip(equations, mixing, strict=True)
+            mixed_rows = [rows @ mix for rows, mix in pairs]
             yield block, [rows.T @ rows for rows in mixed_rows]
 
     def _fill(self, piece: Piece) -> Grams:
@@ -301,14 +308,14 @@ class _Stream:
         shape = self._shape
         motion, forces = self._observations.read(piece.samples)
         forces = without_tool(self._base, motion, forces)
-        arguments = [np.asarray(x) for x in self._base.model.arguments(motion)]
+        arguments = np.hstack(self._base.model.arguments(motion))
         # The first rows come late, and do not count.
         mask = np.pad(self._mask[piece.rows], ((shape.delay, 0), (0, 0)))
         samples = shape.iterations * shape.samples
         rows = shape.iterations * shape.rows
         iterations = math.ceil(len(mask) / shape.rows)
         return [
-            _fill_up(np.asarray(np.hstack(arguments), np.float64), samples),
+            _fill_up(np.asarray(arguments, np.float64), samples),
             _fill_up(np.asarray(forces, np.float64), samples),
             _fill_up(mask, rows),
             np.asarray(iterations, np.int32),
@@ -341,9 +348,7 @@ def _fill_up(x: Matrix, length: int) -> Matrix:
     return rows
 
 
-def _shows_every_direction(
-    total: Matrix, first_grams: Matrix, mixing: Matrix, ratio: float = 1e4
-) -> bool:
+def _shows_every_direction(total: Matrix, first_grams: Matrix, mixing: Matrix) -> bool:
     """Return whether the first look has shown the size of each direction it saw."""
     values, directions = np.linalg.eigh(mixing.T @ first_grams @ mixing)
     visible_directions = directions[:, values > 0.5]
@@ -352,15 +357,18 @@ def _shows_every_direction(
     visible_total = visible_directions.T @ total @ visible_directions
     sizes = np.linalg.eigvalsh(visible_total)
     typical_size = np.median(sizes)
-    is_small_enough = np.linalg.norm(total) <= ratio * typical_size
-    return bool(is_small_enough and sizes[0] * ratio > typical_size)
+    max_size = MAX_SIZE_RATIO * typical_size
+    min_size = typical_size / MAX_SIZE_RATIO
+    return bool(np.linalg.norm(total) <= max_size and sizes[0] > min_size)
 
 
 def _regular_triangle(G: Matrix) -> Matrix:
     """Return a triangle whose square is about G, and which is never singular."""
     norms = np.sqrt(np.diag(G))
-    scale = np.where(norms > 0, norms, max(norms.max(initial=0.0), 1.0))
-    regular_gram = G / np.outer(scale, scale) + 1e-13 * np.eye(len(G))
+    substitute = max(norms.max(initial=0.0), 1.0)
+    scale = np.where(norms > 0, norms, substitute)
+    scaled_gram = G / np.outer(scale, scale)
+    regular_gram = scaled_gram + 1e-13 * np.eye(len(G))
     return np.linalg.cholesky(regular_gram).T * scale
 
 
@@ -393,18 +401,20 @@ class _DistinctColumns(NamedTuple):
     def of(cls, program: Program, acting: tuple[Indices, ...]) -> "_DistinctColumns":
         """Return the distinct columns that act on joints."""
         size = len(program.outputs) // len(acting)
-        outputs: dict[str, int] = {}
-        names = []
+        rows: dict[str, int] = {}
+        outputs = []
+        joint_rows = []
         for j, columns in enumerate(acting):
-            names.append([repr(program.outputs[j * size + k]) for k in columns])
-            for k, name in zip(columns, names[-1], strict=True):
-                outputs[name] = j * size + k
-        rows = {name: row for row, name in enumerate(outputs)}
-        places = []
-        for j, joint_names in enumerate(names):
-            columns = [rows[name] for name in joint_names]
-            places.append(np.array([*columns, len(outputs) + j]))
-        return cls(list(outputs.values()), places)
+            joint_rows.append([])
+            for output in (j * size + k for k in columns):
+                name = repr(program.outputs[output])
+                if name not in rows:
+                    rows[name] = len(rows)
+                    outputs.append(output)
+                joint_rows[j].append(rows[name])
+        # The forces of the joints follow the columns.
+        places = [np.array([*x, len(rows) + j]) for j, x in enumerate(joint_rows)]
+        return cls(outputs, places)
 
 
 @functools.lru_cache(maxsize=16)
@@ -447,10 +457,10 @@ def _compile_loop(
             for gram, mix, places, weight in zip(
                 grams, mixing, distinct_columns.places, weights, strict=True
             ):
-                # Without stages a joint's columns are taken before they are stored.
-                joint_rows = (
-                    rows[places] if tails else jnp.stack([columns[i] for i in places])
-                )
+                joint_rows = rows[places]
+                if not tails:
+                    # Without stages the columns are taken before they are stored.
+                    joint_rows = jnp.stack([columns[i] for i in places])
                 mixed_rows = mix.T @ (joint_rows * weight[None])
                 sums.append(gram + mixed_rows @ mixed_rows.T)
             return next_tails, sums

@@ -114,10 +114,12 @@ class ConeProgram(eqx.Module):
         """Apply the transpose of `linear`."""
         xp = self.xp
         z_bodies, z_lower, z_upper = self.split_linear(z)
-        matrices = xp.reshape(Z[: self.bodies], (self.bodies, 16))
+        body_matrices = Z[: self.bodies]
+        coupling_matrices = Z[self.bodies :]
+        flat_matrices = xp.reshape(body_matrices, (self.bodies, 16))
         linear_part = xp.einsum("kri,kr->ki", self.rows, z_bodies)
-        bodies = matrices @ self.basis.T + linear_part
-        coupling_products = xp.tensordot(self.couplings, Z[self.bodies :], 3)
+        bodies = flat_matrices @ self.basis.T + linear_part
+        coupling_products = xp.tensordot(self.couplings, coupling_matrices, 3)
         drives = z_lower - z_upper + coupling_products
         return xp.concatenate([xp.ravel(bodies), drives])
 
@@ -204,15 +206,17 @@ def _drive_matrices(feasible: FeasibleSet, drive_scales):
     fillings = np.zeros((len(feasible.couplings), 4, 4))
     for coupling, filling in zip(feasible.couplings, fillings, strict=True):
         axes = len(coupling.diagonal)
-        diagonal = drive_scales[feasible.drive_places(coupling.diagonal)]
-        size = xp.concatenate([1.0 / xp.sqrt(diagonal), np.ones(4 - axes)])
-        basis = np.zeros((count, 4, 4))
         places = feasible.drive_places(coupling.columns)
+        basis = np.zeros((count, 4, 4))
         basis[places, :axes, :axes] = coupling.basis
+        diagonal_places = feasible.drive_places(coupling.diagonal)
+        diagonal = drive_scales[diagonal_places]
+        rest = np.ones(4 - axes)
+        size = xp.concatenate([1.0 / xp.sqrt(diagonal), rest])
         products = size[:, None] * size[None]
         matrices = drive_scales[:, None, None] * basis * products[None]
         contributions.append(matrices[:, None])
-        filling[range(axes, 4), range(axes, 4)] = 1.0
+        filling[axes:, axes:] = np.diag(rest)
     return xp.concatenate(contributions, axis=1), fillings
 
 
@@ -259,15 +263,10 @@ def _unit_balls(bounds: BodyBounds) -> AnyArray:
     return inertial_parameters(ball(np.ones(len(centre)), centre, radius))
 
 
-def _scale(feasible: FeasibleSet, pseudo) -> AnyArray:
-    """Return the scaled variables of some pseudo-inertias [bodies, width]."""
-    parameters = inertial_parameters(pseudo)[:, : feasible.width]
-    return parameters / feasible.body_scales
-
-
 def _move_to_prior(feasible: FeasibleSet, bodies, prior):
     """Move bodies towards those of a prior where these satisfy all bounds."""
-    parameters = _scale(feasible, prior)
+    pseudo_parameters = inertial_parameters(prior)[:, : feasible.width]
+    parameters = pseudo_parameters / feasible.body_scales
     _, rows, offsets = feasible.linear_bounds()
     slacks = np.einsum("kri,ki->kr", rows, parameters) + offsets
     is_inside = (slacks >= 0).all(axis=1)

@@ -1,5 +1,6 @@
 """Feasible parameters: possible bodies, friction that brakes, rotors with inertia."""
 
+import itertools
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -76,12 +77,13 @@ class FeasibleSet(NamedTuple):
     def scales(self, data: ScaledRows) -> Values:
         """Return the units of the scaled variables: zero for drives without effect."""
         xp = namespace(data.A)
-        norms = xp.linalg.norm(data.A[:, np.array(self.drives, int)], axis=0)
+        columns = data.A[:, np.array(self.drives, int)]
+        norms = xp.linalg.norm(columns, axis=0)
         # Shorter columns are rounding: a joint that never moved has no friction.
         has_effect = norms > 1e-9 * xp.max(norms, initial=0.0)
-        safe_norms = xp.where(has_effect, norms, 1.0)
-        max_values = MAX_DRIVE_RATIO * xp.linalg.norm(data.b) / safe_norms
-        max_values = xp.where(has_effect, max_values, 0.0)
+        finite_norms = xp.where(has_effect, norms, 1.0)
+        max_force = MAX_DRIVE_RATIO * xp.linalg.norm(data.b)
+        max_values = xp.where(has_effect, max_force / finite_norms, 0.0)
         for coupling in self.couplings:
             # A matrix with a zero on its diagonal is never definite: take the others'
             # bound there.
@@ -130,13 +132,12 @@ class FeasibleSet(NamedTuple):
             rows.append(mass)
             offsets.append(-bounds.mass_min / bounds.mass_max)
         sides = (("lower", 1.0, bounds.centre_min), ("upper", -1.0, bounds.centre_max))
-        for side, sign, corners in sides:
-            for axis in range(3):
-                is_bounded = np.isfinite(corners[:, axis])
-                if not is_bounded.any():
-                    continue
-                corner = np.where(is_bounded, corners[:, axis], 0.0) / bounds.radius
-                row = sign * (unit[1 + axis] - corner[:, None] * mass)
+        for (side, sign, corners), axis in itertools.product(sides, range(3)):
+            is_bounded = np.isfinite(corners[:, axis])
+            if is_bounded.any():
+                corner = np.where(is_bounded, corners[:, axis], 0.0)
+                scaled_corner = corner / bounds.radius
+                row = sign * (unit[1 + axis] - scaled_corner[:, None] * mass)
                 names.append(f"{side} {AXES[axis]} of the centre of mass")
                 rows.append(np.where(is_bounded[:, None], row, 0.0))
                 offsets.append(np.where(is_bounded, 0.0, 1.0))

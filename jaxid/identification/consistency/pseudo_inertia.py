@@ -28,14 +28,15 @@ def _unit_pseudo_inertias() -> np.ndarray:
     """Return the pseudo-inertias of unit parameters [parameter, row, column]."""
     basis = np.zeros((10, 4, 4))
     basis[0, 3, 3] = 1.0
-    for axis, (row, column) in enumerate(((1, 2), (0, 2), (0, 1))):
+    for axis in range(3):
         basis[1 + axis, axis, 3] = 1.0
         basis[1 + axis, 3, axis] = 1.0
         # A moment of inertia is the sum of two second moments.
         basis[4 + axis, range(3), range(3)] = 0.5
         basis[4 + axis, axis, axis] = -0.5
-        basis[7 + axis, row, column] = 1.0
-        basis[7 + axis, column, row] = 1.0
+        # The product of inertia of an axis belongs to both others.
+        others = [k for k in range(3) if k != axis]
+        basis[7 + axis, others, others[::-1]] = 1.0
     return basis
 
 
@@ -101,14 +102,13 @@ def pivots(P: Values) -> Values:
     All of them are positive where a matrix is positive definite; their product is the
     determinant.
     """
-    size = P.shape[1]
     pivots = []
-    for _ in range(size):
+    for _ in range(P.shape[1]):
         pivot = P[:, 0, 0]
-        pivots.append(pivot)
         column = P[:, 1:, 0]
         multiples = column / pivot[:, None]
         P = P[:, 1:, 1:] - column[:, :, None] * multiples[:, None]
+        pivots.append(pivot)
     return namespace(P).stack(pivots)
 
 
@@ -121,7 +121,8 @@ def inverse(P: Values) -> Values:
         others = 1.0 - unit_vector
         vector = P[:, k] * others[None] + unit_vector[None]
         multiples = vector / pivot[:, None]
-        block = P * np.outer(others, others)[None]
+        pairs = np.outer(others, others)
+        block = P * pairs[None]
         P = block - vector[:, :, None] * multiples[:, None]
     return -P
 

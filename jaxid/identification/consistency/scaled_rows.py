@@ -31,8 +31,9 @@ def scaled_rows(base: BaseParameters, R: Values, z: Values, rows: Values) -> Sca
     dof = xp.asarray(rows - base.size, float)
     dof = xp.maximum(dof, 1.0)
     force_variance = (z @ z) / (dof + base.size)
-    variance = (residuals @ residuals) / dof
-    variance = xp.maximum(variance, MIN_NOISE**2 * force_variance)
+    residual_variance = (residuals @ residuals) / dof
+    min_variance = MIN_NOISE**2 * force_variance
+    variance = xp.maximum(residual_variance, min_variance)
     # Forces of zero have no noise to divide by.
     noise = xp.sqrt(xp.where(variance > 0, variance, 1.0))
     # Base parameters as combinations of the standard ones.
