@@ -149,6 +149,16 @@ class _Rows(NamedTuple):
     weights: Array  # weight of each joint
     size: int  # number of base parameters
 
+    def masked(self, mask: AnyArray) -> "_Rows":
+        """Return the rows with zeros where a mask [samples, joints] is zero."""
+        counts = mask.T[:, None] > 0
+        columns = zip(counts, self.columns, strict=True)
+        forces = zip(counts, self.forces, strict=True)
+        return self._replace(
+            columns=[jnp.where(is_counted, x, 0.0) for is_counted, x in columns],
+            forces=[jnp.where(is_counted, x, 0.0) for is_counted, x in forces],
+        )
+
     def products(self, forces: JointArrays) -> tuple[JointArrays, Array]:
         """Return products of forces with columns, and the forces' squares by joint."""
         squares = [jnp.sum(Q**2, axis=-1) for Q in forces]
@@ -200,11 +210,7 @@ def _solve_one(
     counts = jnp.full(weights.shape, 1.0 * samples)
     if data_set.mask is not None:
         counts = data_set.mask.sum(axis=0)
-        masks = data_set.mask.T[:, None] > 0
-        rows = rows._replace(
-            columns=[jnp.where(*x, 0.0) for x in zip(masks, rows.columns, strict=True)],
-            forces=[jnp.where(*x, 0.0) for x in zip(masks, rows.forces, strict=True)],
-        )
+        rows = rows.masked(data_set.mask)
     grams = [A @ A.T for A in rows.columns]
     inverse, condition = inverse_information(rows.information(grams))
     p, squares = _estimate(rows, grams, inverse, condition, on_cpu)
@@ -279,8 +285,10 @@ def _naive_deviations(
     remaining_rows = jnp.maximum(counts * remaining_share, 1.0)
     variances = squares / remaining_rows[None]
     effects = []
-    for k, gram, weight in zip(rows.parameters, grams, rows.weights, strict=True):
+    joints = zip(rows.parameters, grams, rows.weights, strict=True)
+    for k, gram, weight in joints:
         gain = inverse[:, k] * weight**2
-        effects.append(jnp.sum((gain @ gram) * gain, axis=-1))
+        effect = (gain @ gram) * gain
+        effects.append(jnp.sum(effect, axis=-1))
     parameter_variances = variances @ jnp.stack(effects)
     return jnp.sqrt(jnp.maximum(parameter_variances, 0.0))

@@ -205,7 +205,9 @@ class _Equations(NamedTuple):
         lengths = np.sqrt(np.diag(self.squares)[:-1])
         scale = 1.0 / np.where(lengths > 0, lengths, np.inf)
         A = scale[:, None] * total[:, :-1] * scale
-        return scale * np.linalg.lstsq(A, scale * total[:, -1], rcond=1e-12)[0]
+        b = scale * total[:, -1]
+        solution, *_ = np.linalg.lstsq(A, b, rcond=1e-12)
+        return scale * solution
 
     def jackknife(self) -> np.ndarray:
         """Return the parameters' covariance from estimates without each block."""
@@ -219,14 +221,14 @@ class _Equations(NamedTuple):
         residual = np.append(parameters, -1.0)
         square = max(residual @ self.squares @ residual, 0.0)
         rate_square = max(residual @ self.rates @ residual, 0.0)
+        disturbances = np.sqrt(square) * np.sqrt(rate_square)
         # What the other parameters leave of the rate, whose column is the last but one.
         gram = self.squares[:-2, :-2]
         products = self.squares[:-2, -2]
-        multiples = np.linalg.lstsq(gram, products, rcond=1e-14)[0]
+        multiples, *_ = np.linalg.lstsq(gram, products, rcond=1e-14)
         remainder = float(self.squares[-2, -2] - products @ multiples)
         if remainder <= 0:
             return np.inf
-        disturbances = np.sqrt(square) * np.sqrt(rate_square)
         return float(MAX_SENSITIVITY * disturbances / remainder)
 
 
@@ -249,19 +251,24 @@ def _equations(
         for chunk in log.chunks(SAMPLES_PER_CHUNK):
             rows = np.arange(*chunk.rows)
             mask = np.asarray(log.mask)[rows]
-            X = mask[..., None] * _rows(base, log, chunk, joint_weights, p)
+            X = _rows(base, log, chunk, joint_weights, p)
+            X[~mask] = 0.0
             Z = X
             if instrument is not log:
-                Z = mask[..., None] * _rows(base, instrument, chunk, joint_weights, p)
+                Z = _rows(base, instrument, chunk, joint_weights, p)
             blocks = (first_row + rows) * BLOCKS // total_rows
             for block in np.unique(blocks):
-                x = X[blocks == block].reshape(-1, size)
-                z = Z[blocks == block].reshape(-1, size)
+                is_inside = blocks == block
+                # Rows that do not count are zero in one of both factors.
+                x = X[is_inside].reshape(-1, size)
+                z = Z[is_inside].reshape(-1, size)
                 products[block] += z[:, :-1].T @ x
             squares += np.tensordot(X, X, ((0, 1), (0, 1)))
+            # Rates need two rows in sequence.
             is_pair = mask[1:] & mask[:-1]
-            change = np.diff(X, axis=0)[is_pair] / spacing
-            rates += change.T @ change
+            changes = np.diff(X, axis=0)
+            x_rates = changes[is_pair] / spacing
+            rates += x_rates.T @ x_rates
         first_row += log.rows
     return _Equations(products, squares, rates)
 
@@ -279,10 +286,12 @@ def _rows(base: BaseParameters, log: Observations, chunk: Chunk, joint_weights, 
     for joint, values in enumerate(base.regressor_rows(motion)):
         parameters = list(base.acting_columns[joint])
         columns[:, joint, parameters] = values
-        columns[:, joint, base.size + joint] = -rates[:, joint]
+        delay_column = base.size + joint
+        columns[:, joint, delay_column] = -rates[:, joint]
     columns[..., -1] = np.asarray(forces) - base.tool_forces(motion)
-    rows = chunk.reduce(columns.reshape(samples, -1))
-    return joint_weights[:, None] * rows.reshape(-1, joints, width)
+    flat_columns = columns.reshape(samples, -1)
+    rows = chunk.reduce(flat_columns).reshape(-1, joints, width)
+    return joint_weights[:, None] * rows
 
 
 def without_delay(observations: Observations, seconds: float) -> Observations:

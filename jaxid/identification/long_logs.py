@@ -235,7 +235,7 @@ class _Stream:
         # Starts and stops of the runs of such rows alternate.
         padded = np.pad(is_end, 1)
         changes = np.flatnonzero(np.diff(padded))
-        ranges = changes.reshape(-1, 2).tolist()
+        ranges = [(int(a), int(b)) for a, b in changes.reshape(-1, 2)]
         samples = max(4096, 2 * self._shape.reach)
         for chunk in row_chunks(self._base, self._observations, samples, ranges):
             mask = chunk.mask & is_end[chunk.rows, None]

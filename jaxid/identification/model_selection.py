@@ -187,8 +187,9 @@ def _held_out_squares(
         training = tuple(parts[n] for n in numbers if n not in (i, k))
         problem = RegressionProblem(candidate.base, blocks=Blocks(training))
         p = candidate.estimator(problem).parameters
-        squares[i, k] = joint_weights @ parts[k].residual_squares(p)
-        squares[k, i] = joint_weights @ parts[i].residual_squares(p)
+        for row, part in ((i, k), (k, i)):
+            joint_squares = parts[part].residual_squares(p)
+            squares[row, part] = joint_weights @ joint_squares
     return squares
 
 

@@ -207,10 +207,10 @@ class CrossValidated(AbstractSolution):
                 p = decomposition.solve(inverse)
                 errors[i, k] = squared_weights @ test_factors.residual_squares(p)
         total = errors.sum(axis=1)
-        best_number = int(np.argmin(total))
+        best_number = np.argmin(total)
         standard_error = errors[best_number].std(ddof=1) * np.sqrt(count)
-        is_as_good = total <= total[best_number] + standard_error
-        strongest_number = int(np.flatnonzero(is_as_good).max())
+        max_error = total[best_number] + standard_error
+        *_, strongest_number = np.flatnonzero(total <= max_error)
         return self.candidates[strongest_number]
 
 
@@ -359,7 +359,8 @@ def undetermined(
     uncertainty[inverse == 0] = np.inf
 
     directions = []
-    for k in np.flatnonzero(uncertainty > LARGEST_UNCERTAINTY)[::-1]:
+    is_open = uncertainty > LARGEST_UNCERTAINTY
+    for k in np.flatnonzero(is_open)[::-1]:
         direction = decomposition.directions[k]
         order = np.argsort(-np.abs(direction), kind="stable")
         shares = direction[order] / direction[order[0]]

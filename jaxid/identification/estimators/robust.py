@@ -184,8 +184,8 @@ def _residual_scale(problem: RegressionProblem, p: BaseVector) -> Joints:
     for chunk, residuals in problem.residuals(p):
         joints = zip(sizes, residuals.T, chunk.mask.T, strict=True)
         for joint_sizes, residual, mask in joints:
-            rows = residual[mask]
-            joint_sizes.append(np.abs(rows[::step]))
+            selection = residual[mask][::step]
+            joint_sizes.append(np.abs(selection))
     medians = [np.median(np.concatenate(x)) for x in sizes]
     # A floor for rows without noise, whose residuals are zero.
     max_norm = float(np.sqrt(problem.factors.force_squares.max()))

@@ -95,9 +95,11 @@ def block_covariance(
     steps = []
     for derivatives, residuals in blocks:
         rows = derivatives * scale
-        remaining_part = np.eye(len(B)) - scaled_inverse @ (rows.T @ rows)
-        gradient = scaled_inverse @ (rows.T @ residuals)
-        step, *_ = np.linalg.lstsq(remaining_part, gradient, rcond=None)
+        information = rows.T @ rows
+        gradient = rows.T @ residuals
+        remaining_part = np.eye(len(B)) - scaled_inverse @ information
+        right_side = scaled_inverse @ gradient
+        step, *_ = np.linalg.lstsq(remaining_part, right_side, rcond=None)
         steps.append(scale * step)
     dof = len(steps) - 1.0
     deviations = np.array(steps) - np.mean(steps, axis=0)

@@ -59,14 +59,12 @@ class SpectralSandwich(AbstractUncertainty):
         variances = np.diag(naive)
         undetermined = np.isinf(variances)
         if not spectra.is_complete:
-            ratios = np.ones_like(variances)
             white_noise_variances = white_variances(spectra.lines)
             has_ratio = (white_noise_variances > 0) & ~undetermined
-            ratios[has_ratio] = np.sqrt(
-                variances[has_ratio] / white_noise_variances[has_ratio]
-            )
-            deviations = np.sqrt(np.diag(covariance))
-            covariance = rescale_covariance(covariance, ratios * deviations)
+            ratios = np.ones_like(variances)
+            np.divide(variances, white_noise_variances, out=ratios, where=has_ratio)
+            deviations = np.sqrt(ratios) * np.sqrt(np.diag(covariance))
+            covariance = rescale_covariance(covariance, deviations)
         covariance[undetermined, undetermined] = np.inf
         errors = Uncertainty(covariance, dof, naive, jackknife(estimate))
         return _widen_by_jackknife(errors, estimate), residual_spectra(spectra.lines)
@@ -110,12 +108,10 @@ class SpectralWindows:
         half_widths = np.maximum(min_half_width, 0.3 * ordered_frequency)
         # Lines at the edge of a window belong to it in spite of rounding.
         half_widths = half_widths * (1 + 1e-9)
-        first = np.searchsorted(
-            ordered_frequency, ordered_frequency - half_widths, side="left"
-        )
-        end = np.searchsorted(
-            ordered_frequency, ordered_frequency + half_widths, side="right"
-        )
+        lower = ordered_frequency - half_widths
+        upper = ordered_frequency + half_widths
+        first = np.searchsorted(ordered_frequency, lower, side="left")
+        end = np.searchsorted(ordered_frequency, upper, side="right")
         self._lines = first[places], end[places]
         # Both ends of a window rise with its middle: the windows around a line are
         # neighbours.
@@ -228,10 +224,11 @@ def sandwich(spectra: RowSpectra) -> tuple[BaseMatrix, BaseVector]:
     weights = _join([x.multiplicity for x in lines])
     bin_sizes = np.maximum(np.bincount(bins, weights, BIN_COUNT), 1e-300)
     covariance = np.zeros((len(variances), len(variances)))
-    for density, inverse, products in zip(
-        table.density(power), spectra.inverses, spectra.products, strict=True
-    ):
-        means = np.bincount(bins, weights * density, BIN_COUNT) / bin_sizes
+    densities = table.density(power)
+    channels = zip(densities, spectra.inverses, spectra.products, strict=True)
+    for density, inverse, products in channels:
+        sums = np.bincount(bins, weights * density, BIN_COUNT)
+        means = sums / bin_sizes
         information = np.einsum("k,kab->ab", means, products)
         covariance += inverse @ information @ inverse.T
     deviations = np.sqrt(np.maximum(variances, 0.0))
@@ -268,7 +265,8 @@ def residual_spectra(lines: Sequence[Lines]) -> ResidualSpectra:
     whitened_power = longest.residual / remaining_part / longest.gain**2
     power = whitened_power[:, is_passed]
     total = power.sum(axis=1, keepdims=True)
-    cumulative = np.cumsum(power, axis=1) / np.where(total > 0, total, 1.0)
+    finite_total = np.where(total > 0, total, 1.0)
+    cumulative = np.cumsum(power, axis=1) / finite_total
     count = power.shape[1]
     straight_line = np.arange(1, count + 1) / count
     low_frequencies = max(1, round(0.1 * count))
