@@ -86,7 +86,7 @@ def combine(fits: Sequence[Fit], maps, offsets=None) -> tuple[Vector, Uncertaint
     plus its offset [base], if there are any.
     """
     for one, other in itertools.combinations(fits, 2):
-        if share_rows(one.time_blocks, other.time_blocks):
+        if has_common_rows(one.time_blocks, other.time_blocks):
             raise InputError(
                 f"`{one.name}` and `{other.name}` have seen "
                 "the same data, which would count twice."
@@ -173,7 +173,7 @@ def combine_fits(earlier: Fit, later: Fit) -> Fit:
     return replace_estimates(fit, parameters, uncertainty)
 
 
-def share_rows(first: Blocks, second: Blocks) -> bool:
+def has_common_rows(first: Blocks, second: Blocks) -> bool:
     """Return whether two sets of factors were made of the same rows, at least in part.
 
     Names do not tell: different logs may have the same, and one log several. Norms of

@@ -13,9 +13,9 @@ import numpy as np
 from jaxid.errors import InputError
 from jaxid.identification.combination import (
     combine_fits,
+    has_common_rows,
     replace_estimates,
     require_same_base,
-    share_rows,
     without_bounds,
 )
 from jaxid.identification.encoder_resolution import resolution_note
@@ -288,7 +288,7 @@ def add_reports(
         fit = bound_bodies(setup, fit)
     for log in unseen_logs:
         rows = RegressionProblem(setup.base, [log])
-        if fit.blocks is not None and share_rows(fit.blocks, rows.blocks):
+        if fit.blocks is not None and has_common_rows(fit.blocks, rows.blocks):
             raise InputError(
                 "a report that was given has seen the data "
                 f"of `{log.name}`: verify with another."
