@@ -62,10 +62,8 @@ class CWriter:
         self._dtype = np.float64 if double else np.float32
         # Fewer and longer pieces of pi/2 than in JAX, for a shorter chain and smaller
         # angles.
-        pieces = half_pi(33, 2)
-        self._precision = (
-            DOUBLE._replace(pieces=pieces, limit=2.0**20) if double else SINGLE
-        )
+        precise = DOUBLE._replace(pieces=half_pi(33, 2), limit=2.0**20)
+        self._precision = precise if double else SINGLE
         self.turns = self._precision.limit / 4
         self.widths: dict[str, int] = {}
         for name, operations in LIBRARY.items():
@@ -81,10 +79,9 @@ class CWriter:
             return "NAN"
         if np.isinf(value):
             return "INFINITY" if x > 0 else "(-INFINITY)"
-        is_scientific = abs(x) > 1e6 or 0 < abs(x) < 1e-4
-        write = (
-            np.format_float_scientific if is_scientific else np.format_float_positional
-        )
+        write = np.format_float_positional
+        if abs(x) > 1e6 or 0 < abs(x) < 1e-4:
+            write = np.format_float_scientific
         text = write(value, unique=True, trim="0") + self._suffix
         return f"({text})" if text.startswith("-") else text
 

@@ -28,7 +28,8 @@ def half_pi(bits: int, count: int) -> Coefficients:
     pieces = []
     remainder = _HALF_PI
     for _ in range(count):
-        scale = Fraction(2) ** (bits - math.frexp(remainder)[1])
+        _, exponent = math.frexp(remainder)
+        scale = Fraction(2) ** (bits - exponent)
         piece = Fraction(int(remainder * scale)) / scale
         pieces.append(float(piece))
         remainder -= piece
@@ -88,7 +89,8 @@ def _horner(coefficients: Coefficients, z: Array) -> Array:
 def sine_cosine(x: Array) -> Pair:
     """Compute (sin x, cos x) of angles [rad], up to 3e9 (float32: 1e5)."""
     precision = DOUBLE if x.dtype == np.float64 else SINGLE
-    turns = jnp.round(x * float(1 / _HALF_PI))
+    turns_per_radian = float(1 / _HALF_PI)
+    turns = jnp.round(x * turns_per_radian)
     *leading, middle, last = precision.pieces
     r = x
     for piece in leading:
@@ -97,18 +99,24 @@ def sine_cosine(x: Array) -> Pair:
     # once.
     r = r - (turns * middle + turns * last)
     z = r * r
-    sine = r + r * (z * _horner(precision.sine, z))
-    cosine = 1 - (0.5 * z - z * z * _horner(precision.cosine, z))
+    sine_polynomial = _horner(precision.sine, z)
+    cosine_polynomial = _horner(precision.cosine, z)
+    sine = r + r * (z * sine_polynomial)
+    cosine = 1 - (0.5 * z - z * z * cosine_polynomial)
 
     # Each quarter turn more makes a cosine of a sine, and a negative sine of a cosine.
     quarter = turns - 4 * jnp.floor(turns * 0.25)
-    is_swapped = (quarter == 1) | (quarter == 3)
+    is_first = quarter == 1
+    is_swapped = is_first | (quarter == 3)
+    turns_cosine = is_first | (quarter == 2)
     first = jnp.where(is_swapped, cosine, sine)
     second = jnp.where(is_swapped, sine, cosine)
     first = jnp.where(quarter >= 2, -first, first)
-    second = jnp.where((quarter == 1) | (quarter == 2), -second, second)
+    second = jnp.where(turns_cosine, -second, second)
     is_exact = jnp.abs(turns) <= precision.limit
-    return jnp.where(is_exact, first, jnp.nan), jnp.where(is_exact, second, jnp.nan)
+    sine = jnp.where(is_exact, first, jnp.nan)
+    cosine = jnp.where(is_exact, second, jnp.nan)
+    return sine, cosine
 
 
 @sine_cosine.defjvp

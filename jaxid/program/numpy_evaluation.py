@@ -84,8 +84,9 @@ def _plan(program: Program) -> Plan:
             continue
         spellings = [names[x] if isinstance(x, int) else repr(x) for x in node.operands]
         operands = ", ".join(spellings)
-        function = node.operation.numpy.__name__
-        scope.setdefault(function, node.operation.numpy)
+        numpy_function = node.operation.numpy
+        function = numpy_function.__name__
+        scope.setdefault(function, numpy_function)
         if "truth" in node.operation.traits:
             names[position] = f"t{position}"
             lines.append(f"t{position} = {function}({operands})")
@@ -174,7 +175,8 @@ def to_python(program: Program) -> Callable[..., tuple[float, ...]]:
     # The first lines unpack the inputs.
     lines = []
     for k, shape in enumerate(program.input_shapes):
-        entries = "".join(f"x{k}_{entry}, " for entry in range(math.prod(shape)))
+        size = math.prod(shape)
+        entries = "".join(f"x{k}_{entry}, " for entry in range(size))
         if entries:
             lines.append(f"({entries}) = x{k}")
 
@@ -197,7 +199,8 @@ def to_python(program: Program) -> Callable[..., tuple[float, ...]]:
             texts.append(f"t{position}")
 
     results = "".join(f"{_spell(x, texts)}, " for x in program.outputs)
-    names = ", ".join(f"x{k}" for k in range(len(program.input_shapes)))
+    inputs = range(len(program.input_shapes))
+    names = ", ".join(f"x{k}" for k in inputs)
     body = "".join(f"    {line}\n" for line in lines)
     scope = {name: x for name, x in vars(math).items() if not name.startswith("_")}
     exec(f"def run({names}):\n{body}    return ({results})\n", scope)
@@ -211,4 +214,5 @@ def _spell(x: Reference, nodes: list[str]) -> str:
     if math.isfinite(x):
         return f"({x!r})"
     # Python has no literals for infinities and NaN: `math` has their names.
-    return f"({'-' if x < 0 else ''}{abs(x)!s})"
+    sign = "-" if x < 0 else ""
+    return f"({sign}{abs(x)})"

@@ -1,6 +1,7 @@
 """A scalar program: a sequence of scalar operations, and its results."""
 
 import functools
+import itertools
 import math
 from collections import Counter
 from collections.abc import Sequence
@@ -127,8 +128,9 @@ class Program:
 
     def split(self, packed: Any) -> list[Any]:
         """Split values of the packed entries into those of each output."""
-        ends = np.cumsum([math.prod(shape) for shape in self.output_shapes], dtype=int)
-        return [packed[a:b] for a, b in zip([0, *ends], ends, strict=False)]
+        sizes = [math.prod(shape) for shape in self.output_shapes]
+        ends = np.cumsum([0, *sizes])
+        return [packed[start:end] for start, end in itertools.pairwise(ends)]
 
     def align(self, arrays: Sequence[Any], xp: ModuleType) -> tuple[list[Any], Shape]:
         """Return the inputs as [entries, *batch], and the batch's shape."""
@@ -138,13 +140,15 @@ class Program:
                 f"The program takes {count} arrays, but got {len(arrays)}."
             )
         batches = []
-        for k, (x, shape) in enumerate(zip(arrays, self.input_shapes, strict=True)):
-            if x.shape[: len(shape)] != shape:
+        pairs = zip(arrays, self.input_shapes, strict=True)
+        for k, (x, shape) in enumerate(pairs):
+            axes = len(shape)
+            if x.shape[:axes] != shape:
                 raise InputError(
                     f"Input {k} must have shape {shape}, "
                     f"but has {x.shape}: put the batch last."
                 )
-            batches.append(x.shape[len(shape) :])
+            batches.append(x.shape[axes:])
         batch = np.broadcast_shapes(*batches) if batches else ()
 
         entries = []
@@ -158,9 +162,8 @@ class Program:
     def unpack(self, packed: Any) -> Any:
         """Return an array [entries, *batch] as the function returns it."""
         parts = zip(self.split(packed), self.output_shapes, strict=True)
-        leaves = [
-            entries.reshape((*shape, *packed.shape[1:])) for entries, shape in parts
-        ]
+        batch = packed.shape[1:]
+        leaves = [entries.reshape((*shape, *batch)) for entries, shape in parts]
         return jax.tree.unflatten(self.structure, leaves)
 
 

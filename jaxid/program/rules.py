@@ -47,11 +47,9 @@ def with_derivatives_of(definition: Callable, run: Callable) -> Callable:
                 arrays[k] = value
             return definition(*arrays)
 
-        return jax.jvp(
-            of_variables,
-            tuple(primals[k] for k in variables),
-            tuple(tangents[k] for k in variables),
-        )
+        points = tuple(primals[k] for k in variables)
+        directions = tuple(tangents[k] for k in variables)
+        return jax.jvp(of_variables, points, directions)
 
     function.defjvp(derivative, symbolic_zeros=True)
     return function
@@ -75,8 +73,10 @@ def divided(function: Callable) -> Callable:
         # JAX divides functions without constants only: they become arguments.
         def without_constants(*arguments):
             jaxpr = ClosedJaxpr(program.jaxpr, arguments[:count])
-            results = jaxpr_as_fun(jaxpr)(*arguments[count:])
-            return jax.tree.unflatten(jax.tree.structure(shapes), results)
+            evaluate = jaxpr_as_fun(jaxpr)
+            results = evaluate(*arguments[count:])
+            structure = jax.tree.structure(shapes)
+            return jax.tree.unflatten(structure, results)
 
         on_devices = _divisible(function, without_constants, count)
         return on_devices(*program.consts, *arrays)
@@ -102,17 +102,18 @@ def _divisible(function: Callable, on_all: Callable, constants: int) -> Callable
 
     def partition(mesh, arguments, results):
         # The leading axis of the first array that is divided.
-        specs = [x.sharding.spec[:1] for x in arguments[constants:]]
-        leading = next((spec for spec in specs if any(spec)), ())
+        arrays = arguments[constants:]
+        specs = [x.sharding.spec[:1] for x in arrays]
+        leading = next(filter(any, specs), ())
         by_parts = NamedSharding(mesh, PartitionSpec(*leading))
         on_each = NamedSharding(mesh, PartitionSpec())
-        arrays = len(arguments) - constants
-        shardings = (on_each,) * constants + (by_parts,) * arrays
+        shardings = (on_each,) * constants + (by_parts,) * len(arrays)
 
         def on_part(*arguments):
             return function(*arguments[constants:])
 
-        return mesh, on_part, jax.tree.map(lambda _: by_parts, results), shardings
+        result_shardings = jax.tree.map(lambda _: by_parts, results)
+        return mesh, on_part, result_shardings, shardings
 
     def rule(_, arguments, results):
         """Name the axes: all arrays share the leading one, and no others."""
@@ -127,7 +128,9 @@ def _divisible(function: Callable, on_all: Callable, constants: int) -> Callable
 
         inputs = [axes(x, k >= constants) for k, x in enumerate(arguments)]
         outputs = [axes(x, is_array=True) for x in results]
-        return f"{', '.join(inputs)} -> {', '.join(outputs)}"
+        input_list = ", ".join(inputs)
+        output_list = ", ".join(outputs)
+        return f"{input_list} -> {output_list}"
 
     divisible.def_partition(partition=partition, sharding_rule=rule)
     return divisible

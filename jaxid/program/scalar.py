@@ -163,7 +163,8 @@ def add(x: Operand, y: Operand) -> Operand:
         if y == 0:
             return x
         is_negative, x = _magnitude(x)
-        total = x.graph.node(Operation.ADD, x, -float(y) if is_negative else float(y))
+        constant = -float(y) if is_negative else float(y)
+        total = x.graph.node(Operation.ADD, x, constant)
         return negate(total) if is_negative else total
     x_negated, x = _magnitude(x)
     y_negated, y = _magnitude(y)
@@ -203,22 +204,25 @@ def _scale(factor: float, x: Scalar) -> Scalar:
     """Return a positive number times x, merged with a number in x."""
     if factor == 1:
         return x
-    if x.operation is Operation.MULTIPLY and not isinstance(x.operands[0], Scalar):
-        product = factor * x.operands[0]
-        if MIN_FACTOR < product < MAX_FACTOR:
-            return _scale(product, x.operands[1])
+    if x.operation is Operation.MULTIPLY:
+        first, second = x.operands
+        if not isinstance(first, Scalar):
+            product = factor * first
+            if MIN_FACTOR < product < MAX_FACTOR:
+                return _scale(product, second)
     return x.graph.node(Operation.MULTIPLY, factor, x)
 
 
 def divide(x: Operand, y: Operand) -> Operand:
     """Return x / y; a constant divisor becomes a multiplication by its reciprocal."""
     if not isinstance(y, Scalar):
+        divisor = float(y)
         if not isinstance(x, Scalar):
-            return Operation.DIVIDE.on_constants(float(x), float(y))
-        reciprocal = Operation.DIVIDE.on_constants(1.0, float(y))
+            return Operation.DIVIDE.on_constants(float(x), divisor)
+        reciprocal = Operation.DIVIDE.on_constants(1.0, divisor)
         if MIN_FACTOR < abs(reciprocal) < MAX_FACTOR:
             return multiply(reciprocal, x)
-        return x.graph.node(Operation.DIVIDE, x, float(y))
+        return x.graph.node(Operation.DIVIDE, x, divisor)
     if not isinstance(x, Scalar) and x == 0:
         return 0.0
     x_negated, x = _magnitude(x)
@@ -287,11 +291,12 @@ def apply(operation: Operation, *operands: Operand) -> Operand:
     if len(constants) == len(operands):
         return operation.on_constants(*constants)
     graph = next(x.graph for x in operands if isinstance(x, Scalar))
-    if operation.traits & {"odd", "even"}:
+    traits = operation.traits
+    if traits & {"odd", "even"}:
         is_negative, x = _magnitude(operands[0])
         result = graph.node(operation, x)
-        return negate(result) if is_negative and "odd" in operation.traits else result
-    if "commutative" in operation.traits:
+        return negate(result) if is_negative and "odd" in traits else result
+    if "commutative" in traits:
         operands = tuple(sorted(operands, key=_index))
         is_extremum = operation in (Operation.MAXIMUM, Operation.MINIMUM)
         if is_extremum and operands[0] is operands[1]:

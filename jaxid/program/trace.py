@@ -157,12 +157,15 @@ def _move_by_index(
     start = 0
     for k in carriers:
         x = operands[k]
+        stop = start + x.size
+        numbers = np.arange(start, stop, dtype=float)
         entries.append(_entries(x).ravel())
-        labels[k] = np.arange(start, start + x.size, dtype=float).reshape(x.shape)
-        start += x.size
+        labels[k] = numbers.reshape(x.shape)
+        start = stop
     # JAX moves the labels; the entries follow them.
     (positions,) = _on_numbers(equation, *labels)
-    if not ((positions >= 0) & (positions < start)).all():
+    is_inside = (positions >= 0) & (positions < start)
+    if not is_inside.all():
         raise InputError(
             "`trace` met an index outside of its array "
             f"in `{equation.primitive}`: correct it."
@@ -177,9 +180,9 @@ def _scatter_add(equation: JaxprEqn, operands: Arrays) -> np.ndarray:
     zeros = np.zeros(target.shape)
     for k, update in enumerate(updates.astype(object).ravel()):
         # Where JAX adds a one, the update is added.
-        mark = np.zeros(updates.size)
-        mark[k] = 1
-        (marks,) = _on_numbers(equation, zeros, indices, mark.reshape(updates.shape))
+        mark = np.zeros(updates.shape)
+        mark.flat[k] = 1
+        (marks,) = _on_numbers(equation, zeros, indices, mark)
         for place in map(tuple, np.argwhere(marks)):
             total[place] = _add(total[place], update)
     return total
@@ -219,9 +222,12 @@ def _dot_general(x: np.ndarray, y: np.ndarray, *, dimension_numbers, **_) -> np.
     contracted_axes, batch_axes = dimension_numbers
     x, rows = _as_matrices(x, contracted_axes[0], batch_axes[0])
     y, columns = _as_matrices(y, contracted_axes[1], batch_axes[1])
-    products = _multiply(x[..., :, None, :], y[..., None, :, :])
-    sums = np.asarray(_add.reduce(products, axis=-1, initial=0.0), object)
-    return sums.reshape((*x.shape[:-2], *rows, *columns))
+    x_rows = x[..., :, None, :]
+    y_columns = y[..., None, :, :]
+    products = _multiply(x_rows, y_columns)
+    sums = _add.reduce(products, axis=-1, initial=0.0)
+    shape = (*x.shape[:-2], *rows, *columns)
+    return np.asarray(sums, object).reshape(shape)
 
 
 def _as_matrices(
@@ -258,7 +264,8 @@ def _integer_power(x: np.ndarray, *, y: int) -> Any:
 def _select_n(which: np.ndarray, *cases: np.ndarray) -> np.ndarray:
     """Choose between arrays, entry by entry."""
     if not _is_symbolic(which):
-        return np.choose(np.broadcast_to(which, cases[0].shape).astype(int), cases)
+        numbers = np.broadcast_to(which, cases[0].shape).astype(int)
+        return np.choose(numbers, cases)
     return np.asarray(_select(which, cases[1], cases[0]), object)
 
 
@@ -333,7 +340,8 @@ def _translate(equation: JaxprEqn, operands: Arrays) -> Arrays:
     name = equation.primitive.name
     if name in _INDEXED:
         carriers = _INDEXED[name]
-        if any(_is_symbolic(x) for k, x in enumerate(operands) if k not in carriers):
+        indices = [x for k, x in enumerate(operands) if k not in carriers]
+        if any(map(_is_symbolic, indices)):
             raise InputError(
                 f"`trace` cannot translate `{name}` "
                 "with a variable index: use constant integers."

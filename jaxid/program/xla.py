@@ -113,7 +113,8 @@ class Lowered(eqx.Module):
         """
         dtype = jnp.result_type(*arrays, float)
         entries, batch = self.entries(*arrays)
-        values = self.program.pack(self.run(entries))
+        distinct = self.run(entries)
+        values = self.program.pack(distinct)
         rows = [jnp.broadcast_to(jnp.asarray(x, dtype), batch) for x in values]
         results = jnp.stack(rows) if rows else jnp.zeros((0, *batch), dtype)
         return self.program.unpack(results)
@@ -121,8 +122,11 @@ class Lowered(eqx.Module):
     def run(self, entries: Entries) -> Results:
         """Compute the distinct results that vary, from the entries of the inputs."""
         reference = _reference(entries)
-        one = hidden_one(reference) if self.fence else None
-        fences = fenced_nodes(self.program) if self.fence else frozenset()
+        one = None
+        fences = frozenset()
+        if self.fence:
+            one = hidden_one(reference)
+            fences = fenced_nodes(self.program)
         # Together they are vectorised; angles that are computed follow one by one.
         circular_pairs = self._sines_and_cosines(entries, one)
         values: list[Array] = []
@@ -149,15 +153,17 @@ class Lowered(eqx.Module):
         nodes = self.program.nodes
         operands = [x.uses[0] for x in nodes if x.operation in CIRCULAR]
         angles = []
+        inputs = []
         for k in dict.fromkeys(operands):
             if nodes[k].operation is Operation.INPUT:
+                number, entry = nodes[k].place
                 angles.append(k)
+                inputs.append(entries[number][entry])
         if not angles:
             return {}
-        places = [nodes[angle].place for angle in angles]
-        inputs = jnp.stack([entries[number][entry] for number, entry in places])
-        sines, cosines = _circular(inputs, one)
-        return dict(zip(angles, zip(sines, cosines, strict=True), strict=True))
+        sines, cosines = _circular(jnp.stack(inputs), one)
+        pairs = zip(sines, cosines, strict=True)
+        return dict(zip(angles, pairs, strict=True))
 
 
 def _reference(entries: Entries) -> Array:
