@@ -258,7 +258,7 @@ class BaseParameters(Summarised, Hashable):
         )
 
 
-def _as_parameters(kind: str, p: Numbers, size: int) -> AnyArray:
+def _as_parameters(kind: str, p: Numbers, size: int):
     """Return parameters as an array with this number of them along its last axis."""
     # What is no array of JAX stays in NumPy, and in float64 where JAX runs in float32.
     p = as_array("p", p)
@@ -306,7 +306,7 @@ def base_parameters(model: Model, *, seed: int = 0) -> BaseParameters:
     )
 
 
-def _snapped(model: Model) -> Model:
+def _snapped(model: Model):
     """Return the model of a robot whose rounded quarter turns are exact."""
     return Model(model.robot.snapped(), model.terms)
 

@@ -45,7 +45,7 @@ def write_expression(summands: Iterable[Summand]) -> str:
     return _write_sum(parts)
 
 
-def _write_group(members: list[Summand]) -> str:
+def _write_group(members: list[Summand]):
     """Write the product of a factor and of a sum whose first sign is a plus."""
     leader = members[0]
     if not leader.size:
@@ -56,7 +56,7 @@ def _write_group(members: list[Summand]) -> str:
     return f"{leader.size}*({text})" if len(members) > 1 else f"{leader.size}*{text}"
 
 
-def _write_sum(parts: Iterable[tuple[bool, str]]) -> str:
+def _write_sum(parts: Iterable[tuple[bool, str]]):
     """Write a sum of parts, each with whether it is negative."""
     text = "".join(f" {'-' if negative else '+'} {part}" for negative, part in parts)
     # A plus in front is left out, a minus is written without a space.

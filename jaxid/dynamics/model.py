@@ -44,7 +44,7 @@ Parameters = Float[AnyArray, " standard"] | Sequence[float | int]
 DEFAULT_TERMS = (RigidBodies(), ViscousFriction(), CoulombFriction(), RotorInertia())
 
 
-def _has_memory(part: Any) -> bool:
+def _has_memory(part: Any):
     """Return whether a part of a term is the law of friction with memory."""
     return isinstance(part, Presliding)
 

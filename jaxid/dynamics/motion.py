@@ -8,7 +8,7 @@ from jaxid.arrays import AnyArray, Float, ManyJoints, as_array
 from jaxid.errors import InputError
 
 
-def _coordinates(value: Any) -> AnyArray:
+def _coordinates(value: Any):
     """Return a list as an array."""
     # Only lists: trees of what is no array, such as `in_axes` of `vmap`, stay as they
     # are.

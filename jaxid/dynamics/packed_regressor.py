@@ -34,7 +34,7 @@ Places = tuple[tuple[tuple[int, int | float], ...], ...]
 
 
 @functools.lru_cache(maxsize=CACHE_SIZE)
-def _nonzero_columns(program: Program) -> tuple[Columns, ...]:
+def _nonzero_columns(program: Program):
     """Return for each joint the columns of a regressor that are not always zero."""
     nonzeros = np.asarray(program.nonzeros)
     return tuple(tuple(np.flatnonzero(row).tolist()) for row in nonzeros)
@@ -103,7 +103,7 @@ class JointRegressor(eqx.Module):
 
 
 @functools.lru_cache(maxsize=CACHE_SIZE)
-def _compiled_gram(regressor: JointRegressor) -> Callable:
+def _compiled_gram(regressor: JointRegressor):
     return jax.jit(regressor.gram)
 
 
@@ -118,7 +118,7 @@ def gram(
     return run(jnp.asarray(weights, arrays[0].dtype), *arrays)
 
 
-def _check_positions(owner: eqx.Module, q: AnyArray) -> int:
+def _check_positions(owner: eqx.Module, q: AnyArray):
     """Require many samples and a robot of known geometry; return the joints' number."""
     if q.ndim != 2:
         raise InputError(
@@ -182,7 +182,7 @@ class PackedRegressor(eqx.Module):
 
 
 @functools.lru_cache(maxsize=CACHE_SIZE)
-def _places(program: Program) -> Places:
+def _places(program: Program):
     """Return the `places` of a packed regressor; what is always zero has none."""
     numbers = range(len(program.distinct[0]))
     entries = np.array(program.pack(numbers), object).reshape(program.output_shapes[0])
@@ -196,5 +196,5 @@ def _places(program: Program) -> Places:
 
 
 @functools.lru_cache(maxsize=CACHE_SIZE)
-def _compiled(program: Program) -> Callable:
+def _compiled(program: Program):
     return jax.jit(functools.partial(on_any_platform, program, Lowered.distinct))

@@ -97,7 +97,7 @@ def rank_by_singular_values(W: AnyArray, tolerance: float = 1e-6) -> int:
     return min(rank, int(np.count_nonzero(norms)))
 
 
-def _rank_at_largest_fall(s: np.ndarray, tolerance: float) -> int:
+def _rank_at_largest_fall(s: np.ndarray, tolerance: float):
     """Return the rank, behind which singular values fall the most."""
     min_rank = int(np.count_nonzero(s > tolerance))
     ranks = np.arange(1, len(s))

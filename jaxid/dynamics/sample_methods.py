@@ -263,7 +263,7 @@ def on_samples(
     return results if in_jax else np.asarray(results)
 
 
-def _batch_shape(arrays: list[AnyArray]) -> Shape:
+def _batch_shape(arrays: list[AnyArray]):
     """Return the shape to which the leading axes of arrays are broadcast."""
     try:
         return np.broadcast_shapes(*(x.shape[:-1] for x in arrays))
@@ -275,21 +275,19 @@ def _batch_shape(arrays: list[AnyArray]) -> Shape:
         ) from None
 
 
-def _entries_first(x: AnyArray) -> np.ndarray:
+def _entries_first(x: AnyArray):
     """Return an array [*batch, entries] as [entries, *batch], in float64."""
     return np.moveaxis(np.asarray(x, np.float64), -1, 0)
 
 
-def _samples_first(results: np.ndarray, batch_axes: int) -> np.ndarray:
+def _samples_first(results: np.ndarray, batch_axes: int):
     """Return results [*shape, *batch] as [*batch, *shape], without a copy."""
     axes = range(results.ndim)
     first = results.ndim - batch_axes
     return results.transpose(*axes[first:], *axes[:first])
 
 
-def _over_batches(
-    run: Callable, batch: Shape, arrays: list[Array], shared: int
-) -> Array:
+def _over_batches(run: Callable, batch: Shape, arrays: list[Array], shared: int):
     """Apply a function of rows to arrays whose leading axes are broadcast.
 
     The first arrays, of this number, are parameters; the others are samples.
@@ -315,7 +313,7 @@ def _over_batches(
     return results.reshape(*batch, *results.shape[1:])
 
 
-def _broadcast_rows(x: Array, batch: Shape, axes: Shape) -> Array:
+def _broadcast_rows(x: Array, batch: Shape, axes: Shape):
     """Repeat an array along a batch, whose axes are given another shape then."""
     entries = x.shape[-1]
     return jnp.broadcast_to(x, (*batch, entries)).reshape(*axes, entries)

@@ -20,7 +20,7 @@ from jaxid.robot.robot import Robot
 Spatial = Float[Array, "joints 6"]
 
 
-def _motion_products(skew: np.ndarray) -> np.ndarray:
+def _motion_products(skew: np.ndarray):
     r"""Return the matrices $v \times$ of unit motions, along the last axis."""
     products = np.zeros((6, 6, 6))
     products[:3, :3, :3] = skew
@@ -29,7 +29,7 @@ def _motion_products(skew: np.ndarray) -> np.ndarray:
     return products
 
 
-def _unit_inertias(skew: np.ndarray) -> np.ndarray:
+def _unit_inertias(skew: np.ndarray):
     r"""Return the inertias of unit parameters $(m, m r_c, A, B, C, D, E, F)$."""
     inertias = np.zeros((6, 6, 10))
     inertias[3:, 3:, 0] = np.eye(3)
@@ -46,12 +46,12 @@ CROSS = _motion_products(SKEW)
 INERTIA = _unit_inertias(SKEW)
 
 
-def _combine(matrices: np.ndarray, x: AnyArray) -> Array:
+def _combine(matrices: np.ndarray, x: AnyArray):
     """Return sums of constant matrices, weighted by the entries of each row of x."""
     return jnp.tensordot(x, jnp.asarray(matrices, x.dtype), (1, 2))
 
 
-def _times(matrices: Array, x: Array) -> Array:
+def _times(matrices: Array, x: Array):
     """Multiply a matrix and a vector for each body."""
     return jnp.einsum("nij,nj->ni", matrices, x)
 
@@ -86,12 +86,12 @@ def all_placements(robot: Robot, q: Joints) -> Array:
     return placements
 
 
-def _bottom_rows(robot: Robot, dtype: Any) -> Array:
+def _bottom_rows(robot: Robot, dtype: Any):
     """Return the last rows of homogeneous matrices."""
     return jnp.asarray(np.broadcast_to(np.eye(4)[3:], (robot.joints, 1, 4)), dtype)
 
 
-def _relative_placements(robot: Robot, q: Joints) -> Array:
+def _relative_placements(robot: Robot, q: Joints):
     """Return rotation and position of each body in its parent's frame."""
     dtype = q.dtype
     axis = jnp.asarray(robot.axis, dtype)

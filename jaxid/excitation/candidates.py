@@ -124,7 +124,7 @@ def _shrink_slightly(
     problem: ExcitationProblem,
     grid: Grid,
     motion: np.ndarray,
-) -> np.ndarray:
+):
     """Return a smaller motion that keeps constraints which are exceeded a little."""
     if not 0.0 < problem.excess(motion) <= MAX_COARSE_EXCESS:
         return motion

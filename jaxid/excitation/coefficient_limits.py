@@ -93,7 +93,7 @@ class Grid(NamedTuple):
         low, high = self._shift_range(positions, factors, bound)
         return self._move(y, factors, low + (high - low) * np.asarray(places))
 
-    def _measure(self, y: ScaledMotion) -> Extent:
+    def _measure(self, y: ScaledMotion):
         """Return the positions, and the largest use of a limit by each joint."""
         rows = self.rows(np.asarray(y))
         positions, rates = np.split(rows, [len(self.kinds[0])], axis=1)
@@ -106,7 +106,7 @@ class Grid(NamedTuple):
         positions: np.ndarray,
         factors: PerJoint,
         bound: float,
-    ) -> np.ndarray:
+    ):
         """Return the motion scaled about its means, then shifted into the ranges."""
         low, high = self._shift_range(positions, factors, bound)
         shifts = (1.0 - factors) * positions.mean(axis=1)
@@ -117,14 +117,14 @@ class Grid(NamedTuple):
         positions: np.ndarray,
         factors: PerJoint,
         bound: float,
-    ) -> tuple[PerJoint, PerJoint]:
+    ):
         """Return the shifts between which scaled positions keep their range."""
         centre = self.c[:, 0]
         low = centre - bound - factors * positions.min(axis=1)
         high = centre + bound - factors * positions.max(axis=1)
         return low, high
 
-    def _move(self, y: ScaledMotion, factors: PerJoint, shifts: PerJoint) -> np.ndarray:
+    def _move(self, y: ScaledMotion, factors: PerJoint, shifts: PerJoint):
         """Return the motion of each joint times a factor, and shifted."""
         motion = np.asarray(y).reshape(self.constant.shape)
         moved_motion = factors[:, None] * motion + shifts[:, None] * self.constant
@@ -192,7 +192,7 @@ class JointLimits(eqx.Module):
         return joints, variables
 
     @property
-    def _sizes(self) -> np.ndarray:
+    def _sizes(self):
         """Half ranges, speeds, accelerations and jerks."""
         limits = self.limits
         half = 0.5 * (limits.position_max - limits.position_min)
@@ -252,7 +252,7 @@ class JointLimits(eqx.Module):
         return np.array([grid.fill(shape, place, 1.0) for shape, place in pairs])
 
 
-def _unknown_limits(limits: Limits) -> tuple[tuple[str, int], ...]:
+def _unknown_limits(limits: Limits):
     """Return fields and joints (from 0) whose numbers were not given."""
     fields = []
     for name in ("position_min", "position_max", "velocity", "acceleration"):

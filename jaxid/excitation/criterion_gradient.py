@@ -52,7 +52,7 @@ def _criterion_and_slopes(
     plain: np.ndarray,
     weighted: np.ndarray,
     sharpness: float | None,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+):
     """Return the criterion of each motion, and its derivatives by both matrices."""
     values = np.zeros(len(plain))
     by_plain = np.zeros_like(plain)
@@ -71,7 +71,7 @@ def _slopes_by_columns(
     weight: float,
     by_plain: np.ndarray,
     by_weighted: np.ndarray,
-) -> np.ndarray:
+):
     """Return derivatives by the regressor's entries [joints, base, starts, samples]."""
     starts, _, samples = columns[0].shape
     slopes = np.zeros((len(columns), problem.base.size, starts, samples))

@@ -217,7 +217,7 @@ def _run_solver(
     problem: ExcitationProblem,
     x: ScaledMotions,
     solver: Solver,
-) -> Outcome:
+):
     """Improve motions by a solver, then make them keep the limits of the joints."""
     candidates = evaluate_within_limits(problem, np.asarray(solver(problem, x)))
     history = [evaluate(problem, x).best_value, candidates.best_value]
@@ -232,7 +232,7 @@ def _run_search(
     random: np.random.Generator,
     seconds: float | None,
     progress: Callable[[DesignProgress], None] | None,
-) -> Outcome:
+):
     """Do all steps of a search, or those until the time is over or Ctrl-C."""
     start_time = time.monotonic()
     duration = math.inf if seconds is None else seconds
@@ -275,7 +275,7 @@ def _run_search(
     return Outcome(candidates, history, _status(history))
 
 
-def _status(history: list[float]) -> DesignStatus:
+def _status(history: list[float]):
     """Return whether the last quarter of the steps improved the motion."""
     before = history[len(history) - 1 - len(history) // 4]
     is_improving = history[-1] < (1.0 - MIN_IMPROVEMENT) * before

@@ -161,7 +161,7 @@ class ExcitationPlan(Summarised, eqx.Module):
         is_vague = self.relative_deviations > MAX_RELATIVE_DEVIATION
         return self._names(is_vague & np.isfinite(self.standard_deviations))
 
-    def _names(self, mask: AnyArray) -> tuple[str, ...]:
+    def _names(self, mask: AnyArray):
         """Return the names of the base parameters of a mask."""
         return tuple(self.base.names[k] for k in np.flatnonzero(mask))
 
@@ -176,7 +176,7 @@ class ExcitationPlan(Summarised, eqx.Module):
             return tables
         return (*tables, _findings_table(self.findings))
 
-    def _criteria_table(self) -> Table:
+    def _criteria_table(self):
         """Return the table of criteria."""
         names, before, after = zip(*self.criteria, strict=True)
         return Table(
@@ -187,7 +187,7 @@ class ExcitationPlan(Summarised, eqx.Module):
             Column("this motion", after),
         )
 
-    def _deviations_table(self) -> Table:
+    def _deviations_table(self):
         """Return the table of expected deviations, also relative ones if known."""
         base = self.base
         columns = [
@@ -205,7 +205,7 @@ class ExcitationPlan(Summarised, eqx.Module):
             status = [Status.DOUBTFUL if x else Status.NEUTRAL for x in is_vague]
         return Table("expected standard deviations", *columns, status=status)
 
-    def _limits_table(self) -> Table:
+    def _limits_table(self):
         """Return the table of the use of the limits that are finite."""
         columns = [Column("joint", self.base.model.robot.joint_names)]
         kinds = ("range", "speed", "acceleration", "jerk")
@@ -253,7 +253,7 @@ class ExcitationPlan(Summarised, eqx.Module):
             save_trajectory(jax.tree.map(np.asarray, self.trajectory), path)
 
 
-def _findings_table(findings: tuple[Finding, ...]) -> Table:
+def _findings_table(findings: tuple[Finding, ...]):
     """Return a table of how near a motion comes to the limits of constraints."""
     quantities = []
     values = []

@@ -139,14 +139,14 @@ def run(
     return iterates
 
 
-def _has_converged(stage: Stage, iterate: Iterate) -> bool:
+def _has_converged(stage: Stage, iterate: Iterate):
     """Return whether the promised decrease is rounding."""
     if iterate.barrier > stage.min_barrier or iterate.needs_evaluation:
         return False
     return abs(iterate.slope) <= 1e-14 * (1.0 + abs(iterate.evaluation.value))
 
 
-def _begin_stage(grid: Grid, stage: Stage, iterate: Iterate) -> Iterate:
+def _begin_stage(grid: Grid, stage: Stage, iterate: Iterate):
     """Move one start inside the bound, with multipliers on the central path."""
     bound = START_FRACTION * (stage.bound * grid.bound)
     y = grid.scale_into_limits(iterate.y, bound)
@@ -172,7 +172,7 @@ def _update(
     stage: Stage,
     iterate: Iterate,
     evaluation: Evaluation,
-) -> Iterate:
+):
     """Take the step of one start, or shorten it."""
     slack = _cheapest_slack(stage, iterate, evaluation.excess)
     room = _room(grid, stage, iterate.trial, evaluation, slack)
@@ -210,7 +210,7 @@ def _update(
     return iterate._replace(length=length, refusals=iterate.refusals + 1)
 
 
-def _shorter_length(iterate: Iterate, increase: float) -> float:
+def _shorter_length(iterate: Iterate, increase: float):
     """Return the length to the minimum of a parabola through the known merits."""
     length = iterate.length
     slope = iterate.slope
@@ -226,7 +226,7 @@ def _take_step(
     slack: np.ndarray,
     evaluation: Evaluation,
     room: Inequalities,
-) -> Iterate:
+):
     """Return the iterate at the end of its step, with new multipliers and curvature.
 
     Args:
@@ -265,7 +265,7 @@ def _with_step(
     stage: Stage,
     iterate: Iterate,
     room: Inequalities,
-) -> Iterate:
+):
     """Return one start with the step to the barrier's minimum and its length."""
     stiffness = iterate.duals / room
     central = iterate.barrier / room
@@ -286,7 +286,7 @@ def _barrier_hessian(
     grid: Grid,
     iterate: Iterate,
     stiffness: Inequalities,
-) -> np.ndarray:
+):
     """Return the curvature of the objective with its barrier."""
     slopes = iterate.evaluation.slopes
     size = len(iterate.y)
@@ -323,7 +323,7 @@ def _downhill(
     stage: Stage,
     iterate: Iterate,
     central: Inequalities,
-) -> StepVector:
+):
     """Return the negative gradient of the objective with its barrier."""
     evaluation = iterate.evaluation
     parts = _split(central, evaluation)
@@ -337,7 +337,7 @@ def _downhill(
     return np.concatenate([downhill, by_slack])
 
 
-def _solve(H: np.ndarray, downhill: np.ndarray) -> np.ndarray:
+def _solve(H: np.ndarray, downhill: np.ndarray):
     """Return the Newton step; by the diagonal if rounding makes H indefinite."""
     try:
         factor = scipy.linalg.cho_factor(H, lower=True, check_finite=False)
@@ -351,7 +351,7 @@ def _change_of_inequalities(
     grid: Grid,
     iterate: Iterate,
     step: np.ndarray,
-) -> Inequalities:
+):
     """Return by how much a step reduces the distance from each bound."""
     size = len(iterate.y)
     slack_step = step[size:]
@@ -360,7 +360,7 @@ def _change_of_inequalities(
     return np.concatenate([rows, -rows, by_constraints, -slack_step])
 
 
-def _limit_room(grid: Grid, stage: Stage, y: np.ndarray) -> np.ndarray:
+def _limit_room(grid: Grid, stage: Stage, y: np.ndarray):
     """Return the distances from the limits of the joints."""
     rows = (grid.rows(y) - grid.c).ravel()
     bound = stage.bound * grid.bound
@@ -373,13 +373,13 @@ def _room(
     y: np.ndarray,
     evaluation: Evaluation,
     slack: np.ndarray,
-) -> Inequalities:
+):
     """Return the distances from all bounds."""
     limit_room = _limit_room(grid, stage, y)
     return np.concatenate([limit_room, slack.sum() - evaluation.excess, slack])
 
 
-def _split(numbers: Inequalities, evaluation: Evaluation) -> Parts:
+def _split(numbers: Inequalities, evaluation: Evaluation):
     """Return the numbers of limits, constraints and slack."""
     constraints = len(evaluation.excess)
     slack = len(numbers) - (constraints > 0)
@@ -387,17 +387,17 @@ def _split(numbers: Inequalities, evaluation: Evaluation) -> Parts:
     return Parts(numbers[:limits], numbers[limits:slack], numbers[slack:])
 
 
-def _near_central(duals: np.ndarray, central: np.ndarray) -> np.ndarray:
+def _near_central(duals: np.ndarray, central: np.ndarray):
     """Return multipliers that are not too far from the central path."""
     return np.clip(duals, central / CENTRALITY, central * CENTRALITY)
 
 
-def _longest_step(change: Inequalities, room: Inequalities) -> float:
+def _longest_step(change: Inequalities, room: Inequalities):
     """Return the longest step, at most 1, that stays inside all bounds."""
     return min(1.0, TO_BOUNDARY / float((change / room).max(initial=1e-12)))
 
 
-def _damped_bfgs(B: np.ndarray, s: np.ndarray, change: np.ndarray) -> np.ndarray:
+def _damped_bfgs(B: np.ndarray, s: np.ndarray, change: np.ndarray):
     """Return the damped BFGS update, positive definite [1, procedure 18.2]."""
     Bs = B @ s
     expected_change = float(s @ Bs)
@@ -417,7 +417,7 @@ def _cheapest_slack(
     stage: Stage,
     iterate: Iterate,
     excess: ConstraintVector,
-) -> SlackVector:
+):
     """Return the slack of least cost, the barrier included.
 
     So a step may exceed a constraint that bends: the slack follows, and is penalised.
@@ -441,7 +441,7 @@ def _merit(
     evaluation: Evaluation,
     slack: np.ndarray,
     room: Inequalities,
-) -> float:
+):
     """Return the merit function, which a step must decrease."""
     logarithms = [
         float(np.log(np.maximum(part, 1e-300)).sum())

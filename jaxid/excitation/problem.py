@@ -132,7 +132,7 @@ class ExcitationProblem:
         self.sizes = np.ones(base.size)
         self.sizes = self._typical_sizes()
 
-    def _typical_sizes(self) -> np.ndarray:
+    def _typical_sizes(self):
         """Return each parameter's deviation if it were the only one."""
         motions = self.limits.random(jax.random.key(0), 8)
         weighted = [self.information(x).weighted for x in motions]
@@ -187,7 +187,7 @@ class ExcitationProblem:
         plain: Array,
         weighted: Array,
         sharpness: Sharpness,
-    ) -> Scalar:
+    ):
         """Return the logarithm of the criterion of one motion's information."""
         return self.criterion(Information(plain, weighted, self.sizes), sharpness)
 
@@ -260,7 +260,7 @@ class ExcitationProblem:
             return self._largest_excess(x, slice(None))
         return coarse_excess
 
-    def _largest_excess(self, x: AnyArray, instants: slice) -> float:
+    def _largest_excess(self, x: AnyArray, instants: slice):
         """Return the largest value of all constraints, also between these instants."""
         values = self.constraint_values(np.asarray(x), instants)
         return max(float(highest_values(np.asarray(each)).max()) for each in values)

@@ -233,7 +233,7 @@ def _improve_children(
     return candidates.survivors(evaluate_within_limits(problem, np.array(motions)))
 
 
-def _begin(problem: ExcitationProblem, samples: int, x: ScaledMotions) -> list[Iterate]:
+def _begin(problem: ExcitationProblem, samples: int, x: ScaledMotions):
     """Return the iterates at some motions."""
     grid = problem.limits.grid(samples)
     return interior_point.begin(grid, np.asarray(x), count_watched(problem))
@@ -273,7 +273,7 @@ def _evaluate(
     watched_values: Sequence[list[WatchedValues]],
     y: ScaledMotions,
     starts: Sequence[int],
-) -> list[Evaluation]:
+):
     """Return criterion and constraints at points of these starts."""
     samples = scale_samples(SEARCH_SAMPLES, problem.basis)
     values, gradients = value_and_gradient(problem, y, sharpness, samples)
@@ -288,7 +288,7 @@ def _take(
     candidates: Candidates,
     places: np.ndarray,
     iterates: list[Iterate],
-) -> Candidates:
+):
     """Return the best motions, with those of iterates at some places if better."""
     x = np.array([iterate.y for iterate in iterates])
     return candidates.improved(places, evaluate_within_limits(problem, x))
@@ -298,7 +298,7 @@ def _feasible_places(
     problem: ExcitationProblem,
     random: np.random.Generator,
     count: int,
-) -> np.ndarray:
+):
     """Return random places in the joints' ranges that keep constraints best."""
     limits = problem.limits.limits
     low = np.asarray(limits.position_min)
@@ -368,7 +368,7 @@ def _draw_children(
     retimings: np.ndarray,
     x: np.ndarray,
     random: np.random.Generator,
-) -> np.ndarray:
+):
     """Draw one child of each motion with another one."""
     starts = len(x)
     joints, variables = problem.limits.shape

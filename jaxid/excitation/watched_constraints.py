@@ -86,7 +86,7 @@ def _linearise_constraint(
     linearisation: Linearisation,
     x: ScaledMotions,
     places: list[WatchedValues],
-) -> WatchedSlopes:
+):
     """Return watched values of one constraint, of all starts together."""
     instants = np.array([each.instants for each in places])
     entries = np.array([each.entries for each in places])

@@ -122,11 +122,11 @@ class CWriter:
         body = textwrap.indent("\n".join(lines), "    ")
         return f"{declaration}\n{{\n{body}\n}}\n"
 
-    def _operand(self, x: Reference) -> str:
+    def _operand(self, x: Reference):
         """Write the variable of a node, or a constant."""
         return f"t{x}" if isinstance(x, int) else self.number(x)
 
-    def _statements(self, program: Program, inputs: Names) -> list[str]:
+    def _statements(self, program: Program, inputs: Names):
         """Write one line for each node, and calls of the library."""
         # By stages: a call of the library computes many numbers, but waits for all.
         stages = self._stages(program)
@@ -143,12 +143,12 @@ class CWriter:
                     lines.append(self._statement(program, k, inputs))
         return lines
 
-    def _function(self, program: Program, k: int) -> str | None:
+    def _function(self, program: Program, k: int):
         """Return the library's function that computes a node, else None."""
         operation = program.nodes[k].operation
         return next((x for x in self.widths if operation in LIBRARY[x]), None)
 
-    def _stages(self, program: Program) -> list[int]:
+    def _stages(self, program: Program):
         """Return the number of library functions on the longest chain up to each node.
 
         Functions of the same stage do not need each other and are called together.
@@ -159,7 +159,7 @@ class CWriter:
             stages.append(before + (self._function(program, k) is not None))
         return stages
 
-    def _statement(self, program: Program, k: int, inputs: Names) -> str:
+    def _statement(self, program: Program, k: int, inputs: Names):
         """Write the line of a node that the library does not compute."""
         node = program.nodes[k]
         if node.operation is Operation.INPUT:
@@ -173,7 +173,7 @@ class CWriter:
         return f"const {kind} t{k} = {text};"
 
     @property
-    def _formats(self) -> dict[Operation, str]:
+    def _formats(self):
         """Operations that C writes in its own way."""
         sign = f"({self.type})(({{0}} > 0) - ({{0}} < 0))"
         return {
@@ -187,9 +187,7 @@ class CWriter:
             Operation.ABSOLUTE: f"fabs{self._suffix}({{0}})",
         }
 
-    def _call(
-        self, program: Program, name: str, nodes: Sequence[int], stage: int
-    ) -> list[str]:
+    def _call(self, program: Program, name: str, nodes: Sequence[int], stage: int):
         """Write a call of the library for several nodes."""
         width = self.widths[name]
         angles = [program.nodes[k].operands[0] for k in nodes]
@@ -248,7 +246,7 @@ class CWriter:
             exponential=[1 / math.factorial(n) for n in range(2, terms + 1)],
         )
 
-    def _polynomial(self, coefficients: Sequence[float], powers: Names) -> str:
+    def _polynomial(self, coefficients: Sequence[float], powers: Names):
         """Write a polynomial in Estrin's scheme, whose chain is short.
 
         Coefficients begin with the lowest power; the `powers` are the names of x, x^2,
@@ -262,7 +260,7 @@ class CWriter:
         return terms[0]
 
 
-def _count_calls(program: Program, operations: Sequence[Operation]) -> int:
+def _count_calls(program: Program, operations: Sequence[Operation]):
     """Return the number of different arguments of some operations in a program."""
     return len({x.operands for x in program.nodes if x.operation in operations})
 

@@ -86,9 +86,7 @@ def gradient_program(program: Program) -> Program:
     return assemble((*shapes, (len(weights),)), outputs, shapes, structure)
 
 
-def _slopes_of_nodes(
-    program: Program, scalars: list[Scalar], weights: list[Scalar]
-) -> list[Operand]:
+def _slopes_of_nodes(program: Program, scalars: list[Scalar], weights: list[Scalar]):
     """Return the derivative of the weighted sum by each node (reverse mode)."""
     slopes: list[Operand] = [0.0] * len(scalars)
     for weight, x in zip(weights, program.outputs, strict=True):
@@ -109,9 +107,7 @@ def _slopes_of_nodes(
     return slopes
 
 
-def _slopes(
-    operation: Operation, x: tuple[Operand, ...], y: Scalar, slope: Operand
-) -> tuple[Operand, ...]:
+def _slopes(operation: Operation, x: tuple[Operand, ...], y: Scalar, slope: Operand):
     """Return what the derivative by a result adds to those by its operands."""
     if operation in _UNARY:
         return (multiply(slope, _UNARY[operation](x[0], y)),)
@@ -148,6 +144,6 @@ def _slopes(
     raise InputError(f"the operation `{operation}` has no derivative.")
 
 
-def _root_of_one_minus_square(x: Operand) -> Operand:
+def _root_of_one_minus_square(x: Operand):
     """Return the cosine of the arc sine of x."""
     return apply(Operation.SQUARE_ROOT, add(1.0, negate(multiply(x, x))))

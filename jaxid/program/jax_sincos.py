@@ -76,7 +76,7 @@ SINGLE = Precision(
 )
 
 
-def _horner(coefficients: Coefficients, z: Array) -> Array:
+def _horner(coefficients: Coefficients, z: Array):
     """Evaluate a polynomial whose lowest power comes first."""
     *others, leader = coefficients
     total = jnp.full_like(z, leader)

@@ -16,7 +16,7 @@ import numpy as np
 
 from jaxid.arrays import AnyArray
 
-from .program import Program, Reference, Shape
+from .program import Program, Reference
 from .scalar import Operation
 
 PYTHON_FORMATS = {
@@ -69,7 +69,7 @@ def packed_entries(
 
 
 @functools.lru_cache(maxsize=64)
-def _plan(program: Program) -> Plan:
+def _plan(program: Program):
     """Write a program as one function, since a loop would cost as much."""
     cells, count = _allocate_cells(program)
     loads = []
@@ -98,7 +98,7 @@ def _plan(program: Program) -> Plan:
     return Plan(loads, scope["run"], count)
 
 
-def _allocate_cells(program: Program) -> tuple[list[int], int]:
+def _allocate_cells(program: Program):
     """Return the cell of each node, and the number of cells; results keep theirs."""
     results = {node: k for k, node in enumerate(program.distinct[0])}
     last_use = {}
@@ -124,16 +124,14 @@ def _allocate_cells(program: Program) -> tuple[list[int], int]:
     return cells, count
 
 
-def _select(condition, if_true, if_false, out: np.ndarray) -> np.ndarray:
+def _select(condition, if_true, if_false, out: np.ndarray):
     """Choose like `np.where`, into an array that is there already."""
     np.copyto(out, if_false)
     np.copyto(out, if_true, where=condition)
     return out
 
 
-def _evaluate(
-    program: Program, arrays: tuple[AnyArray, ...]
-) -> tuple[np.ndarray, Shape]:
+def _evaluate(program: Program, arrays: tuple[AnyArray, ...]):
     """Return the results that vary [results, samples], and the batch."""
     plan = _plan(program)
     numbers = [np.asarray(x, np.float64) for x in arrays]
@@ -207,7 +205,7 @@ def to_python(program: Program) -> Callable[..., tuple[float, ...]]:
     return scope["run"]
 
 
-def _spell(x: Reference, nodes: list[str]) -> str:
+def _spell(x: Reference, nodes: list[str]):
     """Write an operand in Python, from the texts of the nodes before."""
     if isinstance(x, int):
         return nodes[x]

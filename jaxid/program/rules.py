@@ -90,7 +90,7 @@ def divided(function: Callable) -> Callable:
     return with_derivatives_of(function, lambda *arrays: run(*differing_alike(arrays)))
 
 
-def _divisible(function: Callable, on_all: Callable, constants: int) -> Callable:
+def _divisible(function: Callable, on_all: Callable, constants: int):
     """Return a function whose arguments behind some constants have one leading axis.
 
     Args:

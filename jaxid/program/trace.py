@@ -42,12 +42,12 @@ _UNSUPPORTED = {
 }
 
 
-def _is_symbolic(x: np.ndarray) -> bool:
+def _is_symbolic(x: np.ndarray):
     """Return whether an array holds scalars of a trace."""
     return x.dtype == object
 
 
-def _broadcast(x: np.ndarray, *_, shape, broadcast_dimensions, **__) -> np.ndarray:
+def _broadcast(x: np.ndarray, *_, shape, broadcast_dimensions, **__):
     """Put the axes of an array at some positions, and repeat it along the others."""
     own_shape = [1] * len(shape)
     for source, target in enumerate(broadcast_dimensions):
@@ -55,13 +55,13 @@ def _broadcast(x: np.ndarray, *_, shape, broadcast_dimensions, **__) -> np.ndarr
     return np.broadcast_to(x.reshape(own_shape), shape)
 
 
-def _slice(x: np.ndarray, *, start_indices, limit_indices, strides) -> np.ndarray:
+def _slice(x: np.ndarray, *, start_indices, limit_indices, strides):
     """Cut a part out of an array."""
     steps = strides or (1,) * x.ndim
     return x[tuple(map(slice, start_indices, limit_indices, steps))]
 
 
-def _pad(x: np.ndarray, filler: np.ndarray, *, padding_config) -> np.ndarray:
+def _pad(x: np.ndarray, filler: np.ndarray, *, padding_config):
     """Put a number before, behind and between the entries, or cut them off."""
     for axis, (before, behind, gaps) in enumerate(padding_config):
         x = np.moveaxis(x, axis, 0)
@@ -121,7 +121,7 @@ _INDEXED = {
 """Positions of the operands that hold entries; the others hold indices."""
 
 
-def _on_numbers(equation: JaxprEqn, *operands: np.ndarray) -> Arrays:
+def _on_numbers(equation: JaxprEqn, *operands: np.ndarray):
     """Run one equation on numbers, in NumPy where it suffices."""
     name = equation.primitive.name
     parameters = equation.params
@@ -143,14 +143,12 @@ def _on_numbers(equation: JaxprEqn, *operands: np.ndarray) -> Arrays:
         return [np.asarray(x) for x in _as_list(equation, results)]
 
 
-def _as_list(equation: JaxprEqn, results: Any) -> list:
+def _as_list(equation: JaxprEqn, results: Any):
     """Return the results of an equation as a list."""
     return list(results) if equation.primitive.multiple_results else [results]
 
 
-def _move_by_index(
-    equation: JaxprEqn, carriers: tuple[int, ...], operands: Arrays
-) -> np.ndarray:
+def _move_by_index(equation: JaxprEqn, carriers: tuple[int, ...], operands: Arrays):
     """Move entries to the places that the indices among the operands give."""
     entries = []
     labels = list(operands)
@@ -173,7 +171,7 @@ def _move_by_index(
     return np.concatenate(entries)[positions.astype(int)]
 
 
-def _scatter_add(equation: JaxprEqn, operands: Arrays) -> np.ndarray:
+def _scatter_add(equation: JaxprEqn, operands: Arrays):
     """Add entries at constant places, as the transpose of a gather does."""
     target, indices, updates = operands
     total = target.astype(object).copy()
@@ -210,14 +208,14 @@ _square_root = _operation(Operation.SQUARE_ROOT)
 _exponential = _operation(Operation.EXPONENTIAL)
 
 
-def _reduce(function: np.ufunc, x: np.ndarray, axes: Sequence, initial: float) -> Any:
+def _reduce(function: np.ufunc, x: np.ndarray, axes: Sequence, initial: float):
     """Combine the entries along some axes."""
     for axis in sorted(axes, reverse=True):
         x = function.reduce(x, axis=axis, initial=initial)
     return x
 
 
-def _dot_general(x: np.ndarray, y: np.ndarray, *, dimension_numbers, **_) -> np.ndarray:
+def _dot_general(x: np.ndarray, y: np.ndarray, *, dimension_numbers, **_):
     """Multiply arrays, and add the products along their contracted axes."""
     contracted_axes, batch_axes = dimension_numbers
     x, rows = _as_matrices(x, contracted_axes[0], batch_axes[0])
@@ -230,9 +228,7 @@ def _dot_general(x: np.ndarray, y: np.ndarray, *, dimension_numbers, **_) -> np.
     return np.asarray(sums, object).reshape(shape)
 
 
-def _as_matrices(
-    x: np.ndarray, contracted: Sequence[int], batch: Sequence[int]
-) -> tuple[np.ndarray, Shape]:
+def _as_matrices(x: np.ndarray, contracted: Sequence[int], batch: Sequence[int]):
     """Return an array as [*batch, others, contracted], and its other axes."""
     # Axes in the order of `dot_general`'s result.
     others = [k for k in range(x.ndim) if k not in (*contracted, *batch)]
@@ -243,7 +239,7 @@ def _as_matrices(
     return in_order.reshape(*batch_shape, math.prod(shape), terms), shape
 
 
-def _polynomial(x: np.ndarray, *coefficients: np.ndarray, **_) -> np.ndarray:
+def _polynomial(x: np.ndarray, *coefficients: np.ndarray, **_):
     """Evaluate a polynomial whose constant comes first, by Horner's scheme."""
     total, *others = reversed(coefficients)
     for coefficient in others:
@@ -251,17 +247,17 @@ def _polynomial(x: np.ndarray, *coefficients: np.ndarray, **_) -> np.ndarray:
     return total
 
 
-def _logistic(x: np.ndarray) -> np.ndarray:
+def _logistic(x: np.ndarray):
     """Return 1 / (1 + exp(-x))."""
     return _divide(1.0, _add(1.0, _exponential(_negate(x))))
 
 
-def _integer_power(x: np.ndarray, *, y: int) -> Any:
+def _integer_power(x: np.ndarray, *, y: int):
     """Return a whole power of each entry; of an array without axes, a scalar."""
     return _each(lambda entry: scalar.integer_power(entry, y), 1)(x)
 
 
-def _select_n(which: np.ndarray, *cases: np.ndarray) -> np.ndarray:
+def _select_n(which: np.ndarray, *cases: np.ndarray):
     """Choose between arrays, entry by entry."""
     if not _is_symbolic(which):
         numbers = np.broadcast_to(which, cases[0].shape).astype(int)
@@ -313,7 +309,7 @@ _WITH_PARAMETERS = ("integer_pow", "dot_general", "reduce_sum", "reduce_prod")
 """Primitives whose parameters decide about the result."""
 
 
-def _convert(x: np.ndarray, dtype: np.dtype) -> np.ndarray:
+def _convert(x: np.ndarray, dtype: np.dtype):
     """Convert an array to another type."""
     if not _is_symbolic(x):
         return x.astype(dtype)
@@ -328,14 +324,14 @@ def _convert(x: np.ndarray, dtype: np.dtype) -> np.ndarray:
     )
 
 
-def _entries(x: np.ndarray) -> np.ndarray:
+def _entries(x: np.ndarray):
     """Return an array of scalars, or of Python's own numbers, which mix with them."""
     if _is_symbolic(x) or x.dtype == bool:
         return x.astype(object)
     return x.astype(np.float64).astype(object)
 
 
-def _translate(equation: JaxprEqn, operands: Arrays) -> Arrays:
+def _translate(equation: JaxprEqn, operands: Arrays):
     """Run one equation on arrays of which at least one is symbolic."""
     name = equation.primitive.name
     if name in _INDEXED:
@@ -366,7 +362,7 @@ def _translate(equation: JaxprEqn, operands: Arrays) -> Arrays:
     raise InputError(f"`trace` cannot translate the JAX primitive `{name}`: {reason}.")
 
 
-def _as_constant(constant: object) -> np.ndarray:
+def _as_constant(constant: object):
     """Return a constant of a traced function in NumPy."""
     if isinstance(constant, Tracer):
         raise InputError(
@@ -376,7 +372,7 @@ def _as_constant(constant: object) -> np.ndarray:
     return np.asarray(constant)
 
 
-def _run(jaxpr: Jaxpr, constants: list, arguments: Arrays) -> Arrays:
+def _run(jaxpr: Jaxpr, constants: list, arguments: Arrays):
     """Run a jaxpr on arrays of scalars or numbers, one equation after the other."""
     values: dict[Any, np.ndarray] = {}
     for name, constant in zip(jaxpr.constvars, constants, strict=True):
@@ -396,7 +392,7 @@ def _run(jaxpr: Jaxpr, constants: list, arguments: Arrays) -> Arrays:
     return [read(name) for name in jaxpr.outvars]
 
 
-def _run_equation(equation: JaxprEqn, operands: Arrays) -> Arrays:
+def _run_equation(equation: JaxprEqn, operands: Arrays):
     """Run one equation: a call of another jaxpr, a move of entries, or arithmetic."""
     name = equation.primitive.name
     jaxpr = _called_jaxpr(equation)
@@ -413,7 +409,7 @@ def _run_equation(equation: JaxprEqn, operands: Arrays) -> Arrays:
     return _on_numbers(equation, *operands)
 
 
-def _called_jaxpr(equation: JaxprEqn) -> Any:
+def _called_jaxpr(equation: JaxprEqn):
     """Return the jaxpr that an equation calls, else None."""
     if equation.primitive.name in _UNSUPPORTED:
         return None
@@ -455,7 +451,7 @@ def trace(function: Callable, *inputs: Shape | np.ndarray) -> Program:
     return assemble(input_shapes, outputs, output_shapes, structure)
 
 
-def _argument(graph: Graph, number: int, description: Shape | np.ndarray) -> np.ndarray:
+def _argument(graph: Graph, number: int, description: Shape | np.ndarray):
     """Return an input of the function as an array of scalars and numbers."""
     if isinstance(description, tuple):
         description = np.full(description, FREE, object)

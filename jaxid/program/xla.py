@@ -72,7 +72,7 @@ def fenced_nodes(program: Program) -> frozenset[int]:
     return frozenset(positions)
 
 
-def _cost(operation: Operation) -> int:
+def _cost(operation: Operation):
     """Return the cost of an operation, relative to that of an addition."""
     if operation in (Operation.INPUT, Operation.NEGATE):
         return 0
@@ -146,9 +146,7 @@ class Lowered(eqx.Module):
             values.append(value)
         return tuple(values[k] for k in self.program.distinct[0])
 
-    def _sines_and_cosines(
-        self, entries: Entries, one: Array | None
-    ) -> dict[int, tuple[Array, Array]]:
+    def _sines_and_cosines(self, entries: Entries, one: Array | None):
         """Compute sine and cosine of all inputs that are angles in one call."""
         nodes = self.program.nodes
         operands = [x.uses[0] for x in nodes if x.operation in CIRCULAR]
@@ -166,7 +164,7 @@ class Lowered(eqx.Module):
         return dict(zip(angles, pairs, strict=True))
 
 
-def _reference(entries: Entries) -> Array:
+def _reference(entries: Entries):
     """Return a number that is not known before run time."""
     # The last input: XLA folds what depends on constants, such as parameters often are.
     rows = [x[0] for x in reversed(entries) if len(x)]
@@ -176,7 +174,7 @@ def _reference(entries: Entries) -> Array:
     return jnp.zeros((), rows[0].dtype if rows else float)
 
 
-def _apply(node: Node, values: list[Array], dtype: Any) -> Array:
+def _apply(node: Node, values: list[Array], dtype: Any):
     """Compute a node from the values of those before it."""
     operands = [values[x] if isinstance(x, int) else x for x in node.operands]
     if node.operation is Operation.SELECT:
@@ -203,7 +201,7 @@ def on_any_platform(program: Program, evaluate: Callable, *arrays: AnyArray) -> 
 
 
 @jax.custom_jvp
-def _circular(x: Array, one: Array | None) -> tuple[Array, Array]:
+def _circular(x: Array, one: Array | None):
     """Return sine and cosine behind fences, also for their derivatives."""
     sine, cosine = sine_cosine(x)
     return fenced(sine, one), fenced(cosine, one)

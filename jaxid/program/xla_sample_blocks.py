@@ -64,7 +64,7 @@ def results_at_once(program: Program, *arrays: Array) -> Results:
     return lower(program, fence=False).run(entries)
 
 
-def _repeat(columns: Sequence, count: int) -> list[list[Array]]:
+def _repeat(columns: Sequence, count: int):
     """Return all entries as arrays of the samples, also what these have in common."""
     entries = []
     for x in columns:
@@ -72,7 +72,7 @@ def _repeat(columns: Sequence, count: int) -> list[list[Array]]:
     return entries
 
 
-def _pack(results: Callable[..., Results], program: Program, *arrays: Array) -> Rows:
+def _pack(results: Callable[..., Results], program: Program, *arrays: Array):
     """Return distinct results in the order of the packed result, with its constants."""
     columns = []
     for x in program.pack(results(program, *arrays)):
@@ -81,7 +81,7 @@ def _pack(results: Callable[..., Results], program: Program, *arrays: Array) -> 
     return jnp.stack(columns, axis=1)
 
 
-def _in_blocks(program: Program, *arrays: Array) -> Rows:
+def _in_blocks(program: Program, *arrays: Array):
     """Return the packed result of each sample, block by block."""
     count = len(arrays[-1])
     if count <= BLOCK:
@@ -101,7 +101,7 @@ def _in_blocks(program: Program, *arrays: Array) -> Rows:
     return jax.lax.fori_loop(0, blocks, step, empty)
 
 
-def _slice_samples(x: Array, start: Array, size: int) -> Array:
+def _slice_samples(x: Array, start: Array, size: int):
     """Return some samples of an input, unless all samples have it in common."""
     return jax.lax.dynamic_slice_in_dim(x, start, size) if x.ndim == 2 else x
 
@@ -147,7 +147,7 @@ def on_rows(program: Program, *arrays: Array) -> Rows:
     return run(*differing_alike(arrays))
 
 
-def _one_after_the_other(run: Callable, inputs: list[tuple[Array, bool]]) -> Array:
+def _one_after_the_other(run: Callable, inputs: list[tuple[Array, bool]]):
     """Call a function for each element of a batch, with inputs that have one or not."""
     elements = [x for x, has_batch in inputs if has_batch]
 

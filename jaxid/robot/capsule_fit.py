@@ -176,7 +176,7 @@ def enclose(points: AnyArray) -> Segment:
     return _capsule_about(hull, optimum.x)
 
 
-def _capsule_about(points: np.ndarray, ends: np.ndarray) -> Segment:
+def _capsule_about(points: np.ndarray, ends: np.ndarray):
     """Return the smallest capsule around points whose axis has these ends."""
     start, end = ends.reshape(2, 3)
     axis = end - start
@@ -191,7 +191,7 @@ def _capsule_about(points: np.ndarray, ends: np.ndarray) -> Segment:
     return Segment(start, end, radius)
 
 
-def _hull_points(points: np.ndarray) -> np.ndarray:
+def _hull_points(points: np.ndarray):
     """Return the corners of the hull; all points if they are few or in a plane."""
     if len(points) <= 4:
         return points

@@ -72,7 +72,7 @@ def link_shapes(
         yield shape.placed(rotation, position)
 
 
-def _read_shape(tree: UrdfTree, packages: str | Path | None, element: Any) -> Shape:
+def _read_shape(tree: UrdfTree, packages: str | Path | None, element: Any):
     """Return one shape in its own frame."""
 
     def number(key):
@@ -98,7 +98,7 @@ def _mesh_vertices(
     tree: UrdfTree,
     packages: str | Path | None,
     element: Any,
-) -> np.ndarray:
+):
     """Return the vertices of a mesh in the unit of its file."""
     import trimesh  # loaded where there are meshes
 
@@ -161,7 +161,7 @@ def mjcf_shapes(path: str | Path) -> dict[str, list[Shape]]:
     return shapes
 
 
-def _geom_shape(mujoco: Any, model: Any, geom: int) -> Shape:
+def _geom_shape(mujoco: Any, model: Any, geom: int):
     """Return a shape of a compiled model in its own frame."""
     kinds = mujoco.mjtGeom
     kind = int(model.geom_type[geom])

@@ -87,7 +87,7 @@ class CollisionModel(Hashable):
         )
 
     @property
-    def _names(self) -> list[str]:
+    def _names(self):
         """Names of all shapes, in the order of their indices."""
         return [shape.name for shape in (*self.capsules, *self.obstacles)]
 
@@ -177,7 +177,7 @@ class CollisionModel(Hashable):
         gaps, pull = jax.vjp(clearance, ends)
         return gaps, *pull(jnp.ones_like(gaps))
 
-    def _gaps(self, ends: Array) -> Array:
+    def _gaps(self, ends: Array):
         """Return the distance between the surfaces of each pair for some `ends` [m]."""
         start = ends[:, 0]
         end = ends[:, 1]
@@ -199,7 +199,7 @@ class CollisionModel(Hashable):
                 distances.append(distance)
         return jnp.concatenate(distances) - radii[first]
 
-    def _largest_gaps(self, robot: Robot) -> list[float]:
+    def _largest_gaps(self, robot: Robot):
         """Return the largest gap of each pair in random poses [m]."""
         limits = complete_limits(robot)
         random = np.random.default_rng(0)
@@ -216,12 +216,12 @@ class CollisionModel(Hashable):
             gaps_of_poses = jax.jit(jax.vmap(gaps))(q)
         return np.asarray(gaps_of_poses).max(axis=0).tolist()
 
-    def _ordered(self, pairs: Sequence[tuple[int, int]]) -> tuple[tuple[int, int], ...]:
+    def _ordered(self, pairs: Sequence[tuple[int, int]]):
         """Return pairs of capsules first, then those of each obstacle."""
         last_capsule = len(self.capsules) - 1
         return tuple(sorted(pairs, key=lambda pair: max(pair[1], last_capsule)))
 
-    def _groups(self) -> tuple[tuple[int, ...], ...]:
+    def _groups(self):
         """Return the places of the pairs of each two bodies."""
         groups: dict[tuple, list[int]] = {}
         for place, pair in enumerate(self.pairs):
@@ -229,14 +229,14 @@ class CollisionModel(Hashable):
             groups.setdefault(owners, []).append(place)
         return tuple(tuple(group) for group in groups.values())
 
-    def _owner(self, shape: int) -> int | str:
+    def _owner(self, shape: int):
         """Return the body, or the thing on the ground, to which a shape belongs."""
         if shape >= len(self.capsules):
             return self.obstacles[shape - len(self.capsules)].name
         capsule = self.capsules[shape]
         return _stem(capsule.name) if capsule.body == GROUND else capsule.body
 
-    def _overlap_notes(self, pairs: Sequence[tuple[int, int]]) -> tuple[str, ...]:
+    def _overlap_notes(self, pairs: Sequence[tuple[int, int]]):
         """Return a note on pairs that overlap in all random poses, if there are any."""
         if not pairs:
             return ()
@@ -246,7 +246,7 @@ class CollisionModel(Hashable):
             f"not watched, for they overlap in every pose that was tried: {words}.",
         )
 
-    def _indices(self, pair: Sequence[str]) -> tuple[int, int]:
+    def _indices(self, pair: Sequence[str]):
         """Return the indices of two shapes by their names, in ascending order."""
         names = self._names
         for name in pair:
@@ -279,7 +279,7 @@ def _meeting_pairs(
     robot: Robot,
     capsules: Sequence[Capsule],
     obstacles: int,
-) -> list[tuple[int, int]]:
+):
     """Return the pairs of shapes on bodies that are neither one nor neighbours."""
     bodies = [capsule.body for capsule in capsules]
     links = set(enumerate(robot.parent))
@@ -297,6 +297,6 @@ def _meeting_pairs(
     return pairs
 
 
-def _stem(name: str) -> str:
+def _stem(name: str):
     """Return the name of a capsule's link, without the number of the capsule."""
     return re.sub(r" \d+$", "", name)

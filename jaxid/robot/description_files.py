@@ -33,7 +33,7 @@ def is_mjcf(path: str | Path) -> bool:
     return _parse(path).tag == "mujoco"
 
 
-def _parse(path: str | Path, text: bytes | None = None) -> Any:
+def _parse(path: str | Path, text: bytes | None = None):
     """Return the root element of a file, or of a text made from it."""
     if not Path(path).is_file():
         raise FileNotFoundError(
@@ -52,7 +52,7 @@ def _parse(path: str | Path, text: bytes | None = None) -> Any:
         ) from error
 
 
-def _expand_xacro(path: Path) -> bytes:
+def _expand_xacro(path: Path):
     """Return a xacro file as the program `xacro` expands it."""
     command = f"`xacro {path} -o {path.name.split('.')[0]}.urdf`"
     program = shutil.which("xacro")

@@ -153,7 +153,7 @@ def inertia_tensor(j: AnyArray) -> Rotations:
     return xp.stack([first, second, third], axis=-2)
 
 
-def _moments_of_points(r: Vectors) -> Rotations:
+def _moments_of_points(r: Vectors):
     """Return the inertia tensors of unit masses at points, about the origin [m²]."""
     xp = namespace(r)
     squares = xp.sum(r * r, axis=-1)[..., None, None]

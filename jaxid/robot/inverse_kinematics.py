@@ -73,7 +73,7 @@ Unknowns = np.ndarray
 """Coordinates of each pose, then the six multipliers of its placement."""
 
 
-def _tip_task(robot: Robot, rotation: Numbers, posture: Numbers | None) -> _TipTask:
+def _tip_task(robot: Robot, rotation: Numbers, posture: Numbers | None):
     """Return the checked task; joints without limits get half a turn, or a metre."""
     low = np.asarray(robot.limits.position_min)
     high = np.asarray(robot.limits.position_max)
@@ -91,7 +91,7 @@ def _tip_task(robot: Robot, rotation: Numbers, posture: Numbers | None) -> _TipT
     return _TipTask(robot, np.asarray(R), goal, half_range, low, high)
 
 
-def _follow_path(task: _TipTask, positions: np.ndarray) -> np.ndarray:
+def _follow_path(task: _TipTask, positions: np.ndarray):
     """Return coordinates at all poses: stride by stride, then all between at once."""
     joints = task.robot.joints
     unknowns = np.zeros((1, joints + 6))
@@ -112,7 +112,7 @@ def _follow_path(task: _TipTask, positions: np.ndarray) -> np.ndarray:
     return unknowns[:, :joints]
 
 
-def _ends_of_strides(positions: np.ndarray) -> np.ndarray:
+def _ends_of_strides(positions: np.ndarray):
     """Return the indices of poses about a `STRIDE` apart, with both ends."""
     steps = np.diff(positions, axis=0)
     distances = np.linalg.norm(steps, axis=1)
@@ -127,7 +127,7 @@ def _newton_steps(
     positions: np.ndarray,
     unknowns: Unknowns,
     count: int,
-) -> Unknowns:
+):
     """Take some steps with the curvature of the placements."""
     for _ in range(count):
         unknowns = _newton_step(task, positions, unknowns)
@@ -139,7 +139,7 @@ def _newton_step(
     positions: np.ndarray,
     unknowns: Unknowns,
     curved: bool = True,
-) -> Unknowns:
+):
     """Take a step towards the coordinates that reach the poses nearest to the posture.
 
     It solves the linearised conditions of an optimum, with the curvature of the
@@ -171,7 +171,7 @@ def _newton_step(
     return unknowns - step
 
 
-def _saddle_point_matrix(hessian: np.ndarray, jacobian: np.ndarray) -> np.ndarray:
+def _saddle_point_matrix(hessian: np.ndarray, jacobian: np.ndarray):
     """Return the matrices of the conditions of an optimum under linear constraints."""
     poses, joints, conditions = jacobian.shape
     curvature = np.broadcast_to(hessian, (poses, joints, joints))
@@ -183,7 +183,7 @@ def _saddle_point_matrix(hessian: np.ndarray, jacobian: np.ndarray) -> np.ndarra
     return np.concatenate([upper_rows, lower_rows], axis=1)
 
 
-def _pose_errors(task: _TipTask, positions: np.ndarray, tip: TipJacobian) -> np.ndarray:
+def _pose_errors(task: _TipTask, positions: np.ndarray, tip: TipJacobian):
     """Return the differences of positions [m] and of attitudes [rad] from poses."""
     turn = Rotation.from_matrix(tip.rotation @ task.rotation.T).as_rotvec()
     return np.concatenate([tip.position - positions, turn], axis=1)

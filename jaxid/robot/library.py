@@ -128,7 +128,7 @@ def entries() -> dict[str, dict[str, Any]]:
     return tomllib.loads(Path(__file__).with_suffix(".toml").read_text("utf-8"))
 
 
-def _robot(key: str) -> Robot:
+def _robot(key: str):
     """Return a robot of `library.toml`."""
     entry = dict(entries()[key])
     joints = len(entry.get("dh") or entry["offset"])
@@ -152,7 +152,7 @@ def _robot(key: str) -> Robot:
     return Robot(revolute=revolute, rotation=rotation, **entry)
 
 
-def _limits(table: dict[str, Any], revolute: tuple[bool, ...]) -> Limits:
+def _limits(table: dict[str, Any], revolute: tuple[bool, ...]):
     """Return the limits of a robot of `library.toml`."""
     limits = dict(table)
     for name in limits.pop("degrees", ()):

@@ -126,11 +126,11 @@ class Drives(Hashable):
         return np.array_equal(self.reduction, unit_gears) and not np.any(self.zero)
 
     @property
-    def _inverse(self) -> AnyArray:
+    def _inverse(self):
         """Joint angle for motor angle."""
         return namespace(self.reduction).linalg.inv(self.reduction)
 
-    def _zeros(self, like: AnyArray) -> AnyArray:
+    def _zeros(self, like: AnyArray):
         """Return `zero` in the shape of a batch of angles."""
         return namespace(like, self.zero).broadcast_to(self.zero, like.shape)
 
@@ -167,7 +167,7 @@ class Drives(Hashable):
         return (weights * torques).sum(axis=0)
 
 
-def _reduction_matrix(reduction: Any, joints: int) -> AnyArray:
+def _reduction_matrix(reduction: Any, joints: int):
     """Check gear ratios and return them as a matrix; one of JAX stays as it is."""
     if isinstance(reduction, jax.Array) and reduction.ndim == 2:
         return reduction
@@ -188,7 +188,7 @@ def _reduction_matrix(reduction: Any, joints: int) -> AnyArray:
     return matrix
 
 
-def _count(joints: int | None, *values: Numbers | None) -> int:
+def _count(joints: int | None, *values: Numbers | None):
     """Return the number of joints: as given, or that of the first values."""
     if joints is not None:
         return joints
@@ -220,7 +220,7 @@ def per_joint(name: str, value: Numbers | None, joints: int, unknown: float) -> 
     return array
 
 
-def _magnitudes(name: str, value: Numbers | None, joints: int) -> Any:
+def _magnitudes(name: str, value: Numbers | None, joints: int):
     """Check and copy one positive number for each joint; infinite if None."""
     values = per_joint(name, value, joints, np.inf)
     _require(name, values, lambda x: x > 0, "positive")

@@ -7,7 +7,7 @@ import numpy as np
 from lxml.builder import E  # pyright: ignore[reportMissingModuleSource]
 from scipy.spatial.transform import Rotation
 
-from jaxid.arrays import Joints, Matrix3, Numbers, Vector3
+from jaxid.arrays import Matrix3, Numbers, Vector3
 from jaxid.errors import InputError
 from jaxid.io import import_extra
 
@@ -87,7 +87,7 @@ class _Writer:
         name = model.names.split(b"\0")[0].decode()
         self.root: Any = E.robot(E.link(name="world"), name=name)
 
-    def _name(self, kind: str, index: int) -> str:
+    def _name(self, kind: str, index: int):
         """Return the name of a joint or a constraint, or its number if it has none."""
         return getattr(self._model, kind)(index).name or f"{kind}{index}"
 
@@ -139,7 +139,7 @@ class _Writer:
         joint: int,
         rotation: Matrix3,
         position: Vector3,
-    ) -> tuple[Matrix3, Vector3]:
+    ):
         """Return attitude and origin of a joint's frame from the placement of its body.
 
         An MJCF file describes the pose at the coordinate `ref`, a URDF file that at
@@ -156,7 +156,7 @@ class _Writer:
             rotation = rotation @ axis_rotation(axis, -ref)
         return rotation, position
 
-    def _add_joint(self, joint: int, parent: str, origin: Any) -> str:
+    def _add_joint(self, joint: int, parent: str, origin: Any):
         """Write a joint and an empty link that it moves; return the link's name."""
         kind = JOINT_TYPES[self._model.jnt_type[joint]]
         # A URDF's revolute joint must have a range.
@@ -170,7 +170,7 @@ class _Writer:
         self._joints[joint] = element
         return link
 
-    def _inertial(self, body: int) -> Any:
+    def _inertial(self, body: int):
         """Return mass, centre of mass and principal moments of a body."""
         model = self._model
         R = rotation_of_quaternion(model.body_iquat[body])
@@ -186,7 +186,7 @@ class _Writer:
             ),
         )
 
-    def _properties(self, joint: int) -> list[Any]:
+    def _properties(self, joint: int):
         """Return a joint's axis, range, largest force, friction and rotor inertia."""
         model = self._model
         limit: dict[str, str] = {}
@@ -261,7 +261,7 @@ class _Writer:
         self._joints[joint].append(E.mimic(**attributes))
 
 
-def _largest_forces(mujoco: Any, model: Any) -> Joints:
+def _largest_forces(mujoco: Any, model: Any):
     """Return the largest force of actuators on each joint; infinite if unknown."""
     transmissions = mujoco.mjtTrn
     joint_kinds = (transmissions.mjTRN_JOINT, transmissions.mjTRN_JOINTINPARENT)
@@ -278,7 +278,7 @@ def _largest_forces(mujoco: Any, model: Any) -> Joints:
     return np.where(model.jnt_actfrclimited, smaller_limits, total)
 
 
-def _largest_input(mujoco: Any, model: Any, actuator: int) -> float:
+def _largest_input(mujoco: Any, model: Any, actuator: int):
     """Return the largest force of an actuator before its gear; infinite if unknown."""
     if model.actuator_forcelimited[actuator]:
         return np.abs(model.actuator_forcerange[actuator]).max()
@@ -290,6 +290,6 @@ def _largest_input(mujoco: Any, model: Any, actuator: int) -> float:
     return np.inf
 
 
-def _origin(R: Matrix3, r: Vector3) -> Any:
+def _origin(R: Matrix3, r: Vector3):
     """Return the element of a placement."""
     return E.origin(xyz=exact_text(r), rpy=exact_text(rpy_angles(R)))

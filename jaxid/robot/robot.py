@@ -204,7 +204,7 @@ class Robot(Summarised, eqx.Module):
                     f"like the robot, but are of {per_joint.shape[-1]}."
                 )
 
-    def _length_notes(self) -> list[str]:
+    def _length_notes(self):
         """Reject offsets that no robot has; return notes on some that may be in mm."""
         lengths = {"`tip_offset`": self.tip_offset}
         if self.offset.ndim == 2:
@@ -421,7 +421,7 @@ def as_finite_array(name: str, value: Numbers, shape: tuple[int, ...]) -> AnyArr
     return array
 
 
-def _unit_axes(axes: AnyArray) -> AnyArray:
+def _unit_axes(axes: AnyArray):
     """Return axes of length one; arrays of JAX are taken as they are."""
     if not isinstance(axes, np.ndarray):
         return axes

@@ -175,7 +175,7 @@ class Box(eqx.Module):
         distance_after = self._signed(point_after)
         return share * distance_before + (1.0 - share) * distance_after
 
-    def _signed(self, point: Vectors) -> Array:
+    def _signed(self, point: Vectors):
         """Return the signed distances of points in the frame of the box [m]."""
         half_size = jnp.broadcast_to(0.5 * self.size, point.shape)
         excess = jnp.abs(point) - half_size
@@ -202,7 +202,7 @@ def segment_distance(
     return _rounded_norm(r + a * u - b * v)
 
 
-def _closest_places(u: Vectors, v: Vectors, r: Vectors) -> tuple[Array, Array]:
+def _closest_places(u: Vectors, v: Vectors, r: Vectors):
     """Return the places of the closest points along two segments, from 0 to 1.
 
     The segments have the directions u and v, and r is the difference of their starts.
@@ -225,19 +225,19 @@ def _closest_places(u: Vectors, v: Vectors, r: Vectors) -> tuple[Array, Array]:
     return a, b
 
 
-def _dot(x: Vectors, y: Vectors) -> Array:
+def _dot(x: Vectors, y: Vectors):
     """Return scalar products, with an axis of length one."""
     return jnp.einsum("...i,...i->...", x, y)[..., None]
 
 
-def _fraction(numerator: Array, denominator: Array, usable: Array) -> Array:
+def _fraction(numerator: Array, denominator: Array, usable: Array):
     """Return a ratio clipped to the range from 0 to 1; zero where it is not usable."""
     divisor = jnp.where(usable, denominator, 1.0)
     ratio = jnp.clip(numerator / divisor, 0.0, 1.0)
     return jnp.where(usable, ratio, 0.0)
 
 
-def _bisect(slope: Callable[[Array], Array], zero: Array) -> tuple[Array, Array]:
+def _bisect(slope: Callable[[Array], Array], zero: Array):
     """Return both ends of short intervals around the minima of convex functions.
 
     Args:
@@ -256,7 +256,7 @@ def _bisect(slope: Callable[[Array], Array], zero: Array) -> tuple[Array, Array]
     return jax.lax.fori_loop(0, 40, halve, (zero, zero + 1.0))
 
 
-def _smaller(x: AnyArray, y: AnyArray) -> Array:
+def _smaller(x: AnyArray, y: AnyArray):
     """Return the smaller of two numbers, with its derivative.
 
     Derivatives of `jnp.minimum` ask which argument equals the result. None does where a
@@ -265,7 +265,7 @@ def _smaller(x: AnyArray, y: AnyArray) -> Array:
     return jnp.where(x < y, x, y)
 
 
-def _rounded_norm(vector: Vectors) -> Array:
+def _rounded_norm(vector: Vectors):
     """Return lengths of vectors, smooth at zero and up to `ROUNDING` too small [m]."""
     square = jnp.einsum("...i,...i->...", vector, vector)
     return jnp.sqrt(square + ROUNDING**2) - ROUNDING

@@ -138,7 +138,7 @@ def joint_parameters(
     return parameters
 
 
-def _limits(tree: UrdfTree) -> tuple[Limits, list[str]]:
+def _limits(tree: UrdfTree):
     """Return the limits of all joints, and notes on those that are taken as unknown."""
     joints = len(tree.joints)
     low = np.empty(joints)
@@ -170,7 +170,7 @@ def _limits(tree: UrdfTree) -> tuple[Limits, list[str]]:
     return limits, notes
 
 
-def _checked_range(tree: UrdfTree, joint: Any) -> tuple[float, float]:
+def _checked_range(tree: UrdfTree, joint: Any):
     """Return a joint's range; infinite if it turns without end, or both ends are 0."""
     turns = joint.get("type") in TURNING
     low, high = tree.range(joint)
@@ -186,7 +186,7 @@ def _checked_range(tree: UrdfTree, joint: Any) -> tuple[float, float]:
     return low, high
 
 
-def _held_notes(tree: UrdfTree) -> list[str]:
+def _held_notes(tree: UrdfTree):
     """Return notes on joints that are held, and on objects beside the robot."""
     groups: dict[tuple[str, str], list[str]] = {}
     for joint in tree.mimics:
@@ -206,7 +206,7 @@ def _held_notes(tree: UrdfTree) -> list[str]:
     return notes
 
 
-def _inertial_notes(tree: UrdfTree) -> list[str]:
+def _inertial_notes(tree: UrdfTree):
     """Return notes on bodies without mass, and on links that cannot exist."""
     masses = np.zeros(len(tree.joints))
     faults = {}

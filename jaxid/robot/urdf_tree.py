@@ -99,7 +99,7 @@ class UrdfTree:
         self._merge(root if base is None else base, tip)
         self._refuse_loops(loops)
 
-    def _named(self, tag: str) -> dict[str, Any]:
+    def _named(self, tag: str):
         """Return the elements of a tag by their names."""
         elements: dict[str, Any] = {}
         for element in self.root.iterfind(tag):
@@ -132,7 +132,7 @@ class UrdfTree:
         self._above[child] = joint
         self._below[parent].append(joint)
 
-    def _find_root(self) -> str:
+    def _find_root(self):
         """Return the only link that no joint moves."""
         roots = [link for link in self.links if link not in self._above]
         tree_links = list(roots)
@@ -187,7 +187,7 @@ class UrdfTree:
         if self.carriers[self.tip].body < 0:
             raise self._no_joint_error(base, tip)
 
-    def _no_joint_error(self, base: str, tip: str | None) -> InputError:
+    def _no_joint_error(self, base: str, tip: str | None):
         """Return the error of a file without a moving joint between two links."""
         way = f"below link `{base}`"
         if tip is not None:
@@ -238,7 +238,7 @@ class UrdfTree:
         for lower in self._below[link_names(joint)[1]]:
             yield from self.branch(lower)
 
-    def _moves_below(self, joint: Any) -> bool:
+    def _moves_below(self, joint: Any):
         """Return whether the link that a joint carries carries moving joints itself."""
         _, *lower_joints = self.branch(joint)
         return any(lower.get("type") != "fixed" for lower in lower_joints)
@@ -285,7 +285,7 @@ class UrdfTree:
         # A missing bound is zero if the other one is given, as the URDF standard says.
         return 0.0 if np.isnan(low) else low, 0.0 if np.isnan(high) else high
 
-    def _chain(self, base: str, tip: str) -> list[Any]:
+    def _chain(self, base: str, tip: str):
         """Return the joints between two links."""
         joints = []
         link = tip
@@ -299,7 +299,7 @@ class UrdfTree:
             link, _ = link_names(self._above[link])
         return joints
 
-    def _origin(self, joint: Any) -> tuple[Matrix3, Vector3]:
+    def _origin(self, joint: Any):
         """Return attitude and origin of a joint in its parent link."""
         element = joint.find("origin")
         offset = self.numbers(element, "xyz", ORIGIN)
@@ -310,7 +310,7 @@ class UrdfTree:
             )
         return rpy_rotation(rpy), offset
 
-    def _axis(self, joint: Any) -> Vector3:
+    def _axis(self, joint: Any):
         """Return the unit vector of a moving joint's axis."""
         kind = joint.get("type")
         if kind not in (*TURNING, "prismatic"):
@@ -377,7 +377,7 @@ class UrdfTree:
         """Return an error about a joint, which names the file and the joint."""
         return InputError(f"`{self.path}`: joint `{joint.get('name')}` {complaint}.")
 
-    def _attribute(self, element: Any, key: str) -> str:
+    def _attribute(self, element: Any, key: str):
         """Return an attribute that an element must have."""
         if element.get(key) is None:
             raise InputError(
@@ -421,12 +421,12 @@ def link_names(joint: Any) -> tuple[str, str]:
     return joint.find("parent").get("link"), joint.find("child").get("link")
 
 
-def _placed(carrier: Placement, rotation: Matrix3, position: Vector3) -> Placement:
+def _placed(carrier: Placement, rotation: Matrix3, position: Vector3):
     """Return the placement on a body of what is placed on one of its links."""
     body, R, r = carrier
     return Placement(body, without_rounding(R @ rotation), r + R @ position)
 
 
-def _words(values: np.ndarray) -> str:
+def _words(values: np.ndarray):
     """Return numbers as they are shown in messages."""
     return " ".join(f"{x:g}" for x in values)

@@ -142,7 +142,7 @@ def _write_csv(path: Path, recording: Recording):
     )
 
 
-def _truth(robot: VirtualRobot, seed: int) -> dict[str, object]:
+def _truth(robot: VirtualRobot, seed: int):
     """Return the true parameters, and what no model of the experiment contains."""
     friction: Any = robot.friction
     sensors = robot.sensors
@@ -166,8 +166,6 @@ def _truth(robot: VirtualRobot, seed: int) -> dict[str, object]:
     }
 
 
-def _rows(
-    names: Sequence[str], units: Sequence[str], values: ArrayLike
-) -> list[dict[str, Any]]:
+def _rows(names: Sequence[str], units: Sequence[str], values: ArrayLike):
     rows = zip(names, units, np.asarray(values).tolist(), strict=True)
     return [{"name": name, "unit": unit, "value": x} for name, unit, x in rows]

@@ -191,7 +191,7 @@ class LuGreFriction(AbstractGearFriction):
         return self.coulomb + extra * self._stribeck_share(qd)
 
     @property
-    def _stiffness(self) -> Joints:
+    def _stiffness(self):
         return self.breakaway / self.deflection
 
 

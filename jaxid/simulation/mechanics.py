@@ -210,9 +210,7 @@ def follow(
     return _servo_run(states, forces)
 
 
-def _servo_run(
-    states: Sequence[Sequence[float]], forces: Sequence[Sequence[float]]
-) -> ServoRun:
+def _servo_run(states: Sequence[Sequence[float]], forces: Sequence[Sequence[float]]):
     """Return the motion of a run from the states at all ticks and after the last."""
     q, qd, qdd = np.split(np.array(states), 3, axis=1)
     # Accelerations jump at a tick: the mean of before and after it.

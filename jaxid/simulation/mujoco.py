@@ -12,7 +12,6 @@ from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
 from jaxid.export.feed_forward import body_parameters
 from jaxid.export.mujoco_model import mjcf_text
-from jaxid.robot.inertia import BodyParameters
 from jaxid.robot.mjcf import import_mujoco
 
 from .virtual import PerSample, VirtualRobot
@@ -56,7 +55,7 @@ class MujocoRobot(VirtualRobot):
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_LIMIT
         return MujocoPlant(model, self.robot.joint_names)
 
-    def _drive_inertia(self) -> np.ndarray:
+    def _drive_inertia(self):
         """Return the inertia of the rotors on the joint side [kg m² or kg]."""
         matrices = [
             term.drive_matrices(self.robot)[0] @ np.asarray(p)
@@ -64,7 +63,7 @@ class MujocoRobot(VirtualRobot):
         ]
         return np.sum(matrices, axis=0)
 
-    def _bodies_with_tool(self) -> BodyParameters:
+    def _bodies_with_tool(self):
         """Return ten parameters of each body, with a known tool."""
         robot = self.robot
         for term, p in self.bodies.split(self.values):

@@ -103,7 +103,7 @@ def cad_tx90l_on_rail() -> np.ndarray:
     )
 
 
-def _bodies(published: dict[int, float]) -> np.ndarray:
+def _bodies(published: dict[int, float]):
     """Return seven parameters of each body with published base parameters (Eq. 24)."""
     entry = library.entries()["virtual_tx90l_on_rail"]
     m = np.array(entry["masses"])
@@ -125,7 +125,7 @@ def _bodies(published: dict[int, float]) -> np.ndarray:
     return np.hstack([masses, masses * r, moments])
 
 
-def _friction(robot: Robot) -> tuple[LuGreFriction, FrictionTemperature]:
+def _friction(robot: Robot):
     """Return cold friction and its fall: as of axis 2 where nothing is published."""
     max_forces = np.asarray(robot.limits.force)
     max_speeds = np.asarray(robot.limits.velocity)
@@ -159,7 +159,7 @@ def _friction(robot: Robot) -> tuple[LuGreFriction, FrictionTemperature]:
     return friction, heating
 
 
-def _warm_factors(first: int, second: int) -> np.ndarray:
+def _warm_factors(first: int, second: int):
     """Return warm over cold friction of all axes, by two numbers of base parameters."""
     factor_1 = WARM[first] / COLD[first]
     factor_2 = WARM[second] / COLD[second]

@@ -10,7 +10,6 @@ import jax
 import numpy as np
 import polars as pl
 
-from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
 from jaxid.io import (
     atomic_folder,
@@ -196,7 +195,7 @@ def _write_bag(
         shutil.rmtree(bag)
 
 
-def _ros_time(time: float) -> dict[str, int]:
+def _ros_time(time: float):
     seconds, nanoseconds = divmod(round(time * 1_000_000_000), 1_000_000_000)
     return {"sec": seconds, "nanosec": nanoseconds}
 
@@ -205,7 +204,7 @@ def _sample(
     trajectory: AbstractTrajectory,
     robot: Robot,
     sample_time: float,
-) -> tuple[np.ndarray, Motion]:
+):
     """Return times and motion of a trajectory that moves the robot's joints."""
     if trajectory.joints != robot.joints:
         raise InputError(

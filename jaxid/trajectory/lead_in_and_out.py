@@ -31,7 +31,7 @@ LEAD_DURATIONS = np.geomspace(0.02, 10.0, 120)[:, None, None]
 """Durations of leads that `with_leads` tries [s]."""
 
 
-def _lead(state: Any, duration: Any, x: Any, sign: int = 1) -> list:
+def _lead(state: Any, duration: Any, x: Any, sign: int = 1):
     r"""Return position and three derivatives of a lead, x after standstill [s].
 
     The velocity is $\alpha x^2 + \beta x^3$. The lead meets a motion in a state (q, qd,
@@ -53,7 +53,7 @@ def _lead(state: Any, duration: Any, x: Any, sign: int = 1) -> list:
     ]
 
 
-def _velocity_coefficients(qd: Any, qdd: Any, duration: Any) -> tuple[Any, Any]:
+def _velocity_coefficients(qd: Any, qdd: Any, duration: Any):
     """Return the coefficients of the square and the cube of time in the velocity."""
     alpha = 3 * qd / duration**2 - qdd / duration
     beta = qdd / duration**2 - 2 * qd / duration**3
@@ -106,7 +106,7 @@ class LeadsBasis(PeriodsBasis):
 
         return stand_outside(moving, t, self.duration)
 
-    def _lead_rows(self, x: AnyArray, sign: int) -> AnyArray:
+    def _lead_rows(self, x: AnyArray, sign: int):
         """Return the rows of the lead-in (1) or lead-out (-1), x from standstill."""
         xp = namespace(x, self.omega)
         state = self.series.rows(np.zeros(1))[:3]
@@ -146,7 +146,7 @@ class LeadsBasis(PeriodsBasis):
         return np.where(t > lead + period, t + other_periods, t)
 
 
-def _to_control_points() -> np.ndarray:
+def _to_control_points():
     """Return the matrix from values of a lead's polynomial to its control points."""
     orders = np.arange(LEAD_DEGREE + 1)
     u = np.linspace(0.0, 1.0, LEAD_DEGREE + 1)[:, None]
@@ -273,13 +273,13 @@ def with_leads(
     )
 
 
-def _shortest_durations(use: np.ndarray) -> np.ndarray:
+def _shortest_durations(use: np.ndarray):
     """Return the shortest lead of each phase and joint; infinite if none is allowed."""
     durations = np.where(use <= 1.0 + 1e-9, LEAD_DURATIONS, np.inf)
     return durations.min(axis=0)
 
 
-def _use_of_limits(state: tuple[np.ndarray, ...], limits: Limits) -> np.ndarray:
+def _use_of_limits(state: tuple[np.ndarray, ...], limits: Limits):
     """Return the used fraction of a limit by leads [durations, phases, joints]."""
     T = LEAD_DURATIONS
     alpha, beta = _velocity_coefficients(state[1], state[2], T)

@@ -256,7 +256,7 @@ def joint_path(
     return PiecewisePolynomial(np.concatenate(knots), coefficients)
 
 
-def _instants(path: TipPath) -> list[np.ndarray]:
+def _instants(path: TipPath):
     """Return equidistant times over each piece of a path, its ends included [s]."""
     ends = np.cumsum([0.0, *path.durations])
     instants = []

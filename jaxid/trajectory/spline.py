@@ -13,7 +13,6 @@ from jaxid.errors import InputError
 from .trajectory import (
     AbstractBasis,
     AbstractTrajectory,
-    Rows,
     Time,
     Times,
     as_scalar,
@@ -49,7 +48,7 @@ class PiecewisePolynomial(AbstractTrajectory):
         return tuple(_evaluate(self.times, self.coefficients, t)[:3])
 
 
-def _evaluate(times: Knots, coefficients: PolynomialCoefficients, t: Times) -> Rows:
+def _evaluate(times: Knots, coefficients: PolynomialCoefficients, t: Times):
     """Return a `PiecewisePolynomial` and three derivatives at times [s]."""
     xp = namespace(times, coefficients, t)
     times = xp.asarray(times)
@@ -159,7 +158,7 @@ def spline_polynomials(spline: BSpline) -> PolynomialCoefficients:
 
 
 @functools.cache
-def _unit_polynomials(points: int) -> tuple[Knots, PolynomialCoefficients]:
+def _unit_polynomials(points: int):
     """Return starts and polynomials of the splines with unit coefficients."""
     unit = np.eye(points)
     control_points = np.concatenate([unit[:1], unit[:1], unit, unit[-1:], unit[-1:]])
@@ -169,7 +168,7 @@ def _unit_polynomials(points: int) -> tuple[Knots, PolynomialCoefficients]:
     )
 
 
-def _clamped_knots(spans: int, degree: int) -> np.ndarray:
+def _clamped_knots(spans: int, degree: int):
     """Return equidistant knots of a clamped spline over [0, 1]."""
     return np.concatenate(
         [np.zeros(degree), np.linspace(0.0, 1.0, spans + 1), np.ones(degree)]

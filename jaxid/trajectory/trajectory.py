@@ -90,7 +90,7 @@ class AbstractTrajectory(Hashable):
 
 
 @eqx.filter_jit
-def _motion(trajectory: AbstractTrajectory, t: Array) -> Motion:
+def _motion(trajectory: AbstractTrajectory, t: Array):
     states = trajectory.states(t.reshape(-1))
     return Motion(*(x.reshape(*t.shape, -1) for x in states))
 

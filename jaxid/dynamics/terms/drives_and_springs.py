@@ -233,6 +233,6 @@ class LinearSpring(AbstractTerm):
         return 0.5 * (q - self.rest) ** 2
 
 
-def _off_diagonal(ratios: np.ndarray) -> np.ndarray:
+def _off_diagonal(ratios: np.ndarray):
     """Return the products of the ratios of two different axes."""
     return np.outer(ratios, ratios) * (1.0 - np.eye(len(ratios)))

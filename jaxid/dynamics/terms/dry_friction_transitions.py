@@ -138,14 +138,14 @@ class Presliding(AbstractTransition):
         """Return the states of steady motion."""
         return self._with_motors(qd, self.steady)
 
-    def _with_motors(self, x: AnyArray, function: Any) -> AnyArray:
+    def _with_motors(self, x: AnyArray, function: Any):
         """Return a function of the joints, followed by that of their motors."""
         if self.motors is None:
             return function(x)
         parts = [function(x), function(x @ self.motors.T)]
         return namespace(x).concatenate(parts, axis=-1)
 
-    def _strain(self, change: AnyArray) -> AnyArray:
+    def _strain(self, change: AnyArray):
         """Return steps of joints and motors, relative to their lengths [1]."""
         length = namespace(change).broadcast_to(self.length, change.shape)
         return self._with_motors(change, lambda x: x / length)
@@ -207,7 +207,7 @@ class Reversal(AbstractTransition):
         return value + share * (self.side - value)
 
 
-def _outside_dead_zone(dead_zone: EachJoint, qd: Joints, value: Joints) -> Joints:
+def _outside_dead_zone(dead_zone: EachJoint, qd: Joints, value: Joints):
     """Return a value for speeds beyond the dead zone, and zero within it."""
     if not isinstance(dead_zone, jax.Array) and not np.any(dead_zone):
         return value

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Bodies, Float, matching, one_or_each
+from jaxid.arrays import AnyArray, Float, matching, one_or_each
 from jaxid.dynamics import projection_equation
 from jaxid.errors import InputError
 from jaxid.robot.inertia import INERTIAL_NAMES
@@ -226,7 +226,7 @@ class LoadFriction(AbstractDryFriction):
         self._bodies(robot)
         return super().parameters(robot)
 
-    def _bodies(self, robot: Robot) -> Bodies:
+    def _bodies(self, robot: Robot):
         """Return the parameters of the bodies, one row for each."""
         size = robot.joints * len(INERTIAL_NAMES)
         if np.size(self.bodies) < size:

@@ -55,7 +55,7 @@ class Clearance(AbstractConstraint):
         (gaps,) = in_blocks(clearances, samples)
         return (self.distances - gaps.reshape(*batch, -1)) / SIZE
 
-    def _ends(self, robot: Robot, q: AnyArray) -> AnyArray:
+    def _ends(self, robot: Robot, q: AnyArray):
         """Return the ends of all capsules' axes."""
         ends = eqx.Partial(self.model.ends, robot)
         return evaluate_samples(ends, ends.__call__, q)

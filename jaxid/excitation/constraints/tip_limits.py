@@ -55,7 +55,7 @@ class Side(NamedTuple):
     coordinate: float  # its coordinate along the axis [m]
 
 
-def _corner(x: Any) -> np.ndarray:
+def _corner(x: Any):
     return np.asarray(as_array("workspace", x), np.float64)
 
 
@@ -129,7 +129,7 @@ class TipLimits(AbstractConstraint):
         return tuple(entries)
 
     @property
-    def _sides(self) -> list[Side]:
+    def _sides(self):
         """Sides of the box that are not open."""
         sides = [Side(axis, 1.0, end) for axis, end in enumerate(self.high.tolist())]
         sides += [Side(axis, -1.0, end) for axis, end in enumerate(self.low.tolist())]

@@ -8,8 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import Array
-
 from .functions_of_eigenvalues import (
     Scalar,
     Sharpness,
@@ -145,7 +143,7 @@ CRITERIA: dict[str, AbstractCriterion] = {
 """All criteria by the values of the key `criterion`, in the order of the tables."""
 
 
-def _divide_by_sizes(information: Information, sizes: BaseVector | None) -> Array:
+def _divide_by_sizes(information: Information, sizes: BaseVector | None):
     """Return the information about the parameters divided by their sizes."""
     sizes = jnp.asarray(information.sizes if sizes is None else sizes)
     return sizes[:, None] * jnp.asarray(information.weighted) * sizes[None]

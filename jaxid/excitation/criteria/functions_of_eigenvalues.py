@@ -35,7 +35,7 @@ def spectral(
 
 
 @spectral.defjvp
-def _spectral_derivative(function: Callable, primals: tuple, tangents: tuple) -> tuple:
+def _spectral_derivative(function: Callable, primals: tuple, tangents: tuple):
     matrix, sharpness = primals
     eigenvalues, U = _eigenvalues(matrix)
     value, slopes = jax.value_and_grad(function)(jnp.log(eigenvalues), sharpness)
@@ -43,7 +43,7 @@ def _spectral_derivative(function: Callable, primals: tuple, tangents: tuple) ->
     return value, jnp.sum(gradient * tangents[0])
 
 
-def _eigenvalues(matrix: Array) -> tuple[Array, Array]:
+def _eigenvalues(matrix: Array):
     """Return eigenvalues and eigenvectors; what is below rounding is raised to it."""
     eigenvalues, U = jnp.linalg.eigh(matrix)
     return jnp.maximum(eigenvalues, MIN_EIGENVALUE * eigenvalues[-1]), U
@@ -69,6 +69,6 @@ def log_mean_inverse(logs: Array, sharpness: Sharpness) -> Scalar:
     return jax.nn.logsumexp(-logs) - np.log(logs.shape[-1])
 
 
-def _softmax(x: Array, sharpness: Scalar | float) -> Array:
+def _softmax(x: Array, sharpness: Scalar | float):
     """Return a smooth maximum, which is never below the exact one."""
     return jax.nn.logsumexp(sharpness * x) / sharpness
