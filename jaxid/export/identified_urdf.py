@@ -137,7 +137,7 @@ def _require_same_robot(robot: Robot, file_robot: Robot, source: FilePath) -> No
     """Reject a file of another robot; how the robot is mounted is not in the file."""
     if robot.joint_names != file_robot.joint_names:
         raise InputError(
-            f"`{source}` has the joints {', '.join(described.joint_names)}, "
+            f"`{source}` has the joints {', '.join(file_robot.joint_names)}, "
             f"but the fit has {', '.join(robot.joint_names)}: "
             "give the file of this robot, or its `tip`."
         )
