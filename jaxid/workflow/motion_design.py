@@ -78,9 +78,8 @@ class PlayableMotion(NamedTuple):
     """A motion as a robot can play it."""
 
     motion: AbstractTrajectory  # from standstill to standstill where that is possible
-    sampled: (
-        AbstractTrajectory  # as it is written in samples: until a sample meets its end
-    )
+    # as it is written in samples: until a sample meets its end
+    sampled_motion: AbstractTrajectory
     sample_time: float  # time between those samples [s]
     window: tuple[float, float]  # times between which it is the designed motion [s]
     fault: str  # why it does not start and end at rest; empty if it does, or need not
@@ -234,12 +233,12 @@ def make_playable(
             )
     elif leads is not None:
         end = begin + leads.periods * (end - begin)
-    sampled = playable
+    sampled_motion = playable
     if excitation.cycle is not None:
         step = excitation.cycle
         if excitation.rests and not fault:
-            sampled = PaddedToCycle(playable, step)
-    return PlayableMotion(playable, sampled, step, (begin, end), fault)
+            sampled_motion = PaddedToCycle(playable, step)
+    return PlayableMotion(playable, sampled_motion, step, (begin, end), fault)
 
 
 def write_design(
@@ -279,7 +278,7 @@ def write_motion(
     robot: Robot, excitation: Excitation, playable: PlayableMotion, output: Path
 ) -> list[Path]:
     """Write table, trajectory and ROS message of a motion; return the files."""
-    sampled = playable.sampled
+    sampled_motion = playable.sampled_motion
     step = playable.sample_time
     table = output.name
     message = f"{output.stem}.ros.{excitation.ros}"
@@ -290,12 +289,12 @@ def write_motion(
         double_precision(),
         atomic_folder(output.parent, lambda _: replaced_names) as folder,
     ):
-        write_csv(sampled, robot, folder / table, sample_time=step)
-        write_ros(sampled, robot, folder / message, sample_time=step)
+        write_csv(sampled_motion, robot, folder / table, sample_time=step)
+        write_ros(sampled_motion, robot, folder / message, sample_time=step)
         controller = CONTROLLERS.get(excitation.controller or "")
         if controller is not None and controller.write and not playable.fault:
             program = f"{output.stem}{controller.suffix}"
-            controller.write(sampled, robot, folder / program, step)
+            controller.write(sampled_motion, robot, folder / program, step)
             names.append(program)
         motion = jax.tree.map(np.asarray, playable.motion)
         save_trajectory(motion, folder / trajectory)

@@ -108,8 +108,9 @@ def fit_run(
         observations = [log.observations for log in logs]
         row_progress = partial(progress, f"factorising the rows, {name}")
         rows = RegressionProblem(setup.base, observations, row_progress)
-        fits.append(fit_problem(rows, setup.least_squares))
-        mistakes = mistakes_in_logs([log.diagnosis for log in logs], fits[-1])
+        fit = fit_problem(rows, setup.least_squares)
+        fits.append(fit)
+        mistakes = mistakes_in_logs([log.diagnosis for log in logs], fit)
         doubts = [text for log in logs for text in log.findings] + [*mistakes]
     return dataclasses.replace(functools.reduce(combine_fits, fits), name=name), doubts
 

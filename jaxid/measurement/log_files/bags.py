@@ -151,9 +151,7 @@ def _topic(name: str, messages: Iterable[tuple[int, Any]]) -> Topic:
     # Elements of each field in the order of their first message, by the set of them.
     variants: dict[str, dict[frozenset, Elements]] = {}
     for number, (time, message) in enumerate(messages):
-        stamp = getattr(getattr(message, "header", None), "stamp", None)
-        stamp_ns = 0 if stamp is None else stamp.sec * 10**9 + stamp.nanosec
-        topic.stamps.append(stamp_ns)
+        topic.stamps.append(_stamp(message))
         topic.recording_times.append(time)
         for field, elements, values in _fields(message, f"{name}.", {}):
             orders = variants.setdefault(field, {})
@@ -170,6 +168,13 @@ def _topic(name: str, messages: Iterable[tuple[int, Any]]) -> Topic:
     for field, orders in variants.items():
         _name_by_position(topic, field, [*orders.values()])
     return topic
+
+
+def _stamp(message: Any) -> int:
+    """Return the time of measurement of a message [ns]; 0 if it has none."""
+    header = getattr(message, "header", None)
+    stamp = getattr(header, "stamp", None)
+    return 0 if stamp is None else stamp.sec * 10**9 + stamp.nanosec
 
 
 def _name_by_position(topic: Topic, field: str, orders: Sequence[Elements]) -> None:
@@ -197,11 +202,7 @@ def _fields(
     length: `element_names` holds them by their number.
     """
     values = {x.name: getattr(message, x.name) for x in dataclasses.fields(message)}
-    for key, texts in values.items():
-        has_names = re.search("(^|_)names?$", key) and isinstance(texts, list)
-        if has_names and len(set(texts)) == len(texts):
-            elements = tuple(f".{text}" for text in texts)
-            element_names = {**element_names, len(texts): elements}
+    element_names = {**element_names, **_named_elements(values)}
     for key, value in values.items():
         name = prefix + key
         if isinstance(value, int | float):
@@ -212,6 +213,16 @@ def _fields(
             yield from _fields(value, f"{name}.", element_names)
         elif isinstance(value, np.ndarray | list) and 0 < len(value) <= MAX_ELEMENTS:
             yield from _array_fields(value, name, element_names)
+
+
+def _named_elements(values: Mapping[str, Any]) -> dict[int, Elements]:
+    """Return the elements that the texts of a message name, by their number."""
+    elements = {}
+    for key, texts in values.items():
+        has_names = re.search("(^|_)names?$", key) and isinstance(texts, list)
+        if has_names and len(set(texts)) == len(texts):
+            elements[len(texts)] = tuple(f".{text}" for text in texts)
+    return elements
 
 
 def _array_fields(
