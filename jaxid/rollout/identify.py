@@ -401,20 +401,7 @@ class _Search:
         """Take the effects of a group that lower held-out errors, joint by joint."""
         if len(group) == 1:
             return
-        symbols = {symbol for effects in group for symbol in effects}
-        x, free_mask = (np.stack([y] * len(group)) for y in (self.x, self.free_mask))
-        for k, effects in enumerate(group):
-            free_mask[k, :, mask(tuple(symbols))] = False
-            free_mask[k, :, mask(effects)] = True
-            for symbol in symbols - set(effects):
-                x[k, :, INDEX[symbol]] = START[INDEX[symbol]]
-            for symbol in effects:
-                x[k, :, INDEX[symbol]] = self._start_value(symbol)
-        free_mask[..., INDEX["a"]] &= self._loaded_joints & ~self.has_stiffness
-        x[..., INDEX["a"]] *= self._loaded_joints
-        x[:, self.has_stiffness, INDEX["a"]] = self.x[self.has_stiffness, INDEX["a"]]
-        # Friction per load needs a load.
-        free_mask[..., INDEX["mu"]] &= self._loaded_joints & (x[..., INDEX["a"]] > 0.0)
+        x, free_mask = self._candidates(group)
         solution = self.solve(x, free_mask)
         scores = self.held_out_scores(solution, free_mask)
         choices = np.zeros(len(self.x), int)
@@ -426,10 +413,33 @@ class _Search:
             is_better = _is_lower(scores[:, k], current_scores)
             choices = np.where(is_extension & is_better, k, choices)
         self._take_candidates(solution.x, choices)
-        self.free_mask = np.take_along_axis(free_mask, choices[None, :, None], axis=0)[
-            0
-        ]
+        places = choices[None, :, None]
+        self.free_mask = np.take_along_axis(free_mask, places, axis=0)[0]
         self._weigh_motions(self.x)
+
+    def _candidates(
+        self, group: Sequence[tuple[str, ...]]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return starts with the effects of a group, and which parameters are free."""
+        symbols = set(itertools.chain(*group))
+        x = np.stack([self.x] * len(group))
+        free_mask = np.stack([self.free_mask] * len(group))
+        for k, effects in enumerate(group):
+            free_mask[k, :, mask(tuple(symbols))] = False
+            free_mask[k, :, mask(effects)] = True
+            for symbol in symbols - set(effects):
+                x[k, :, INDEX[symbol]] = START[INDEX[symbol]]
+            for symbol in effects:
+                x[k, :, INDEX[symbol]] = self._start_value(symbol)
+        compliance = INDEX["a"]
+        is_loaded = self._loaded_joints
+        has_stiffness = self.has_stiffness
+        free_mask[..., compliance] &= is_loaded & ~has_stiffness
+        x[..., compliance] *= is_loaded
+        x[:, has_stiffness, compliance] = self.x[has_stiffness, compliance]
+        # Friction per load needs a load.
+        free_mask[..., INDEX["mu"]] &= is_loaded & (x[..., compliance] > 0.0)
+        return x, free_mask
 
     @property
     def _loaded_joints(self) -> np.ndarray:

@@ -3,6 +3,7 @@
 import dataclasses
 import re
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -150,10 +151,10 @@ def diagnose(
     """Look for mistakes in a log: units, signs, order, sides, sensor faults and delays.
 
     Observations on disk are read in parts, and single channels are examined in a part
-    of the log. Observations in memory hold no unfiltered angles, so spikes may escape.
+    of the log.
 
     Args:
-        log: Recording or observations of the robot.
+        log: Recording of the robot, or observations on disk.
         robot: Robot, whose limits are compared with the log.
         fit: Fit to this log; mistakes that only a model reveals are left out if None.
         observations: Observations of the recording; filtered below a tenth of its
@@ -162,67 +163,18 @@ def diagnose(
         progress: Callback, called with the completed fraction (0 to 1).
 
     Raises:
-        InputError: If log and robot do not belong together, or the log is too short to
-            filter.
+        InputError: If log and robot do not belong together, the log is too short to
+            filter, or it is neither a recording nor on disk.
     """
-    notes: tuple[str, ...] = ()
-    if isinstance(log, Recording):
-        excerpt = log
-        if observations is None:
-            cutoff = min(20.0, 0.1 / log.sample_time)
-            observations = observe(
-                log, robot, ZeroPhaseButterworth(cutoff), min_speed=min_speed
-            )
-        all_observations = observations
-    elif isinstance(log.source, SamplesOnDisk):
-        excerpt = _excerpt(log, log.source)
-        all_observations = log
-        reason = ""
-        try:
-            observations = observe(
-                excerpt, robot, log.filter, log.decimation, min_speed
-            )
-        except InputError as error:
-            observations = None
-            reason = f" of single channels only: {error}"
-        if reason or excerpt.samples < log.samples:
-            examined_samples = f"{excerpt.samples} of the {log.samples} samples"
-            notes = (f"{examined_samples} were examined for mistakes{reason}",)
-    else:
-        all_observations = log
-        observations = log
-        excerpt = Recording(
-            *(
-                log.time,
-                np.asarray(log.motion.q),
-                np.asarray(log.forces),
-                None,
-                False,
-                False,
-            ),
-            *(log.segments, log.sample_time),
-        )
-    statistics = LogStatistics(robot.joints, all_observations.samples)
-    for a, b in all_observations.segments:
-        # Differences at the ends of parts are not central: logs in memory are taken at
-        # once.
-        step = (
-            PART_SIZE if isinstance(all_observations.source, SamplesOnDisk) else b - a
-        )
-        for start in range(a, b, step):
-            samples = slice(start, min(start + step, b))
-            statistics.add(
-                *all_observations.read(samples), all_observations.sample_time
-            )
-            if progress is not None:
-                progress(samples.stop / all_observations.samples)
-    motor_sides = excerpt.angles_on_motor_side, excerpt.forces_on_motor_side
+    examined = _examined_log(log, robot, observations, min_speed)
+    excerpt = examined.excerpt
+    statistics = _statistics(examined.all_observations, robot.joints, progress)
     faults = channel_findings(robot, excerpt, statistics)
     faulty_joints = tuple(dict.fromkeys(joint for joint, _ in faults))
-    clock = clock_findings(excerpt)
+    lost_rows = clock_findings(excerpt)
     findings = [
         *(text for _, text in faults),
-        *clock,
+        *lost_rows,
         *limit_findings(robot, statistics, faulty_joints),
         *stuck_findings(robot, excerpt, faulty_joints),
     ]
@@ -230,19 +182,86 @@ def diagnose(
     if not 5.0 <= rate <= 5e4:
         cure = "check `recording.time_unit` or `sample_time`."
         findings.append(f"the log has {rate:.3g} samples in a second: {cure}")
-    all_findings = tuple(findings)
-    faulty_joints = tuple(range(robot.joints)) if clock else faulty_joints
+    if lost_rows:
+        faulty_joints = tuple(range(robot.joints))
     diagnosis = Diagnosis(
         log,
         robot,
         statistics,
-        all_findings,
+        tuple(findings),
         faulty_joints,
-        observations,
-        motor_sides,
-        notes,
+        examined.observations,
+        (excerpt.angles_on_motor_side, excerpt.forces_on_motor_side),
+        examined.notes,
     )
     return diagnosis if fit is None else diagnosis.with_fit(fit)
+
+
+class _ExaminedLog(NamedTuple):
+    """Parts of a log that are examined.
+
+    Attributes:
+        excerpt: Samples of single channels, of a long log a part.
+        all_observations: Observations of the whole log.
+        observations: Observations in which mistakes are looked for, if any.
+        notes: What was left out, as sentences.
+    """
+
+    excerpt: Recording
+    all_observations: Observations
+    observations: Observations | None
+    notes: tuple[str, ...] = ()
+
+
+def _examined_log(
+    log: Recording | Observations,
+    robot: Robot,
+    observations: Observations | None,
+    min_speed: Numbers | None,
+) -> _ExaminedLog:
+    """Return the parts of a log that are examined, in memory or read from the disk."""
+    if isinstance(log, Recording):
+        if observations is None:
+            cutoff = min(20.0, 0.1 / log.sample_time)
+            low_pass = ZeroPhaseButterworth(cutoff)
+            observations = observe(log, robot, low_pass, min_speed=min_speed)
+        return _ExaminedLog(log, observations, observations)
+    if not isinstance(log.source, SamplesOnDisk):
+        raise InputError(
+            "`log` holds filtered samples in memory, which show no faults of single "
+            "channels: give the recording, and these as `observations`."
+        )
+    excerpt = _excerpt(log, log.source)
+    reason = ""
+    try:
+        observations = observe(excerpt, robot, log.filter, log.decimation, min_speed)
+    except InputError as error:
+        observations = None
+        reason = f" of single channels only: {error}"
+    if not reason and excerpt.samples == log.samples:
+        return _ExaminedLog(excerpt, log, observations)
+    examined_samples = f"{excerpt.samples} of the {log.samples} samples"
+    note = f"{examined_samples} were examined for mistakes{reason}"
+    return _ExaminedLog(excerpt, log, observations, (note,))
+
+
+def _statistics(
+    observations: Observations, joints: int, progress: Progress | None
+) -> LogStatistics:
+    """Return the statistics of a whole log, which is read in parts from the disk."""
+    statistics = LogStatistics(joints, observations.samples)
+    is_on_disk = isinstance(observations.source, SamplesOnDisk)
+    for a, b in observations.segments:
+        # Differences at the ends of parts are not central: logs in memory are taken at
+        # once.
+        step = PART_SIZE if is_on_disk else b - a
+        for start in range(a, b, step):
+            samples = slice(start, min(start + step, b))
+            motion, forces = observations.read(samples)
+            statistics.add(motion, forces, observations.sample_time)
+            if progress is not None:
+                progress(samples.stop / observations.samples)
+    return statistics
 
 
 def mistakes_in_logs(diagnoses: Sequence[Diagnosis], fit: Fit) -> tuple[str, ...]:
