@@ -51,16 +51,16 @@ class Path(NamedTuple):
     """Simulation of several motions; the last axis is that of the motions.
 
     Attributes:
-        before: States before each stage [steps, stages, joints, motions].
-        within: Velocities in the stages, zero where friction holds a joint.
+        states: States before each stage [steps, stages, joints, motions].
+        velocities: Velocities in the stages, zero where friction holds a joint.
         positions: Positions behind each step [steps, joints, motions].
         load: Bias forces of the bodies in each step; None without bodies.
         M: Mass matrix of the bodies in each step [steps, joints, joints, motions]; None
             if they are not coupled.
     """
 
-    before: State
-    within: AnyArray
+    states: State
+    velocities: AnyArray
     positions: AnyArray
     load: AnyArray | None = None
     M: AnyArray | None = None
@@ -181,7 +181,7 @@ def _partials(
 
     They are arrays [stages, ...].
     """
-    terms = path.before, path.within, other_torques
+    terms = path.states, path.velocities, other_torques
     state, u, other_torques = jax.tree.map(
         lambda x: jnp.reshape(x, (-1, len(theta))), terms
     )
@@ -304,7 +304,7 @@ class CoupledSimulator:
         part = dataclasses.replace(part, lengths=(), names=())
         steps = self.steps
         h = float(part.sample_time) / self.steps
-        slope = (motion_path.before.w - motion_path.within) / (GAMMA * h)
+        slope = (motion_path.states.w - motion_path.velocities) / (GAMMA * h)
         M, load, step_middles = _body_terms(motion_path, h)
         inertia = np.diagonal(M, axis1=1, axis2=2)
         other_torques = np.einsum("tij,tsj->tsi", M, slope) - inertia[:, None] * slope
@@ -321,7 +321,7 @@ class CoupledSimulator:
         sample_partials = jax.tree.map(
             lambda x: by_sample(x).reshape(-1, steps, 2, x.shape[-1]), stage_partials
         )
-        velocities = by_sample(motion_path.within)
+        velocities = by_sample(motion_path.velocities)
         slope = by_sample(slope)
         size = part.start.size
 
@@ -351,8 +351,8 @@ class CoupledSimulator:
 
 def _body_terms(path: Path, h: float):
     """Return mass matrices and bias forces of a motion's steps, and their places."""
-    v = path.before.w[:, 0]
-    middle = middle_of(path.before.q[:, 0], v, np.concatenate([v[:1], v[:-1]]), h)
+    v = path.states.w[:, 0]
+    middle = middle_of(path.states.q[:, 0], v, np.concatenate([v[:1], v[:-1]]), h)
     M = np.zeros((*v.shape, v.shape[1])) if path.M is None else path.M
     return M, np.zeros_like(v) if path.load is None else path.load, middle
 

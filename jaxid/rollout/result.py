@@ -325,16 +325,16 @@ def _notes_on_errors(refinement: Refinement, joint_names: tuple[str, ...]) -> li
     ]
 
 
-def systematic_error(r: np.ndarray, kept: np.ndarray, q: np.ndarray) -> float:
+def systematic_error(r: np.ndarray, counted: np.ndarray, q: np.ndarray) -> float:
     """Return a joint's RMS error [rad or m] if an effect seems missing; otherwise 0.
 
     Args:
         r: Residuals [motions, samples].
-        kept: Whether a sample counts.
+        counted: Whether a sample counts.
         q: Measured positions.
     """
-    rms = float(np.sqrt(np.mean(r[kept] ** 2)))
-    pair_mask = kept[:, 1:] & kept[:, :-1]
+    rms = float(np.sqrt(np.mean(r[counted] ** 2)))
+    pair_mask = counted[:, 1:] & counted[:, :-1]
     neighbours = float(np.mean((r[:, 1:] * r[:, :-1])[pair_mask])) / rms**2
     steps = np.abs(np.diff(q, axis=-1)).ravel()
     steps = steps[steps > 1e-6]

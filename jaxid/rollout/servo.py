@@ -197,8 +197,8 @@ class Forces(NamedTuple):
         friction: Dry friction.
         inertia: Inertia over the time of the stage.
         resistance: Decrease of the force with the velocity in the stage, with inertia.
-        inside: Whether the servo is not saturated.
-        falling: Part of the Stribeck friction that is left.
+        control_share: 1 where the servo is not saturated, otherwise 0.
+        stribeck_share: Part of the Stribeck friction that is left.
         gain: Factor of the error in the servo's force: 1, more with integral action.
         rate: Growth of the integral action by the error.
     """
@@ -208,8 +208,8 @@ class Forces(NamedTuple):
     friction: Array
     inertia: Array
     resistance: Array
-    inside: Array
-    falling: Array
+    control_share: Array
+    stribeck_share: Array
     gain: Array | float
     rate: Array | float
 
@@ -303,19 +303,21 @@ def with_integral(motion: ServoMotion, theta: AnyArray, hold: bool) -> ServoMoti
         theta: Parameters of each joint.
         hold: Whether commands are held until the next one.
     """
-    plain_motion = motion.replace(
+    initial_motion = motion.replace(
         start=np.asarray(motion.start)[:, :2], spread=np.asarray(motion.spread)[:, :2]
     )
     with double_precision():
         integrals = jax.vmap(balanced_integral, (None, 0, None))(
             jnp.asarray(theta),
-            plain_motion.replace(lengths=(), names=()),
+            initial_motion.replace(lengths=(), names=()),
             np.array(hold),
         )
-    start = np.concatenate([plain_motion.start, np.asarray(integrals)[:, None]], axis=1)
+    start = np.concatenate(
+        [initial_motion.start, np.asarray(integrals)[:, None]], axis=1
+    )
     integral_spread = np.where(np.asarray(theta)[:, INDEX["ki"]] > 0.0, 1.0, 1e-6)
     spread = np.concatenate(
-        [plain_motion.spread, 0.0 * start[:, 2:] + integral_spread], axis=1
+        [initial_motion.spread, 0.0 * start[:, 2:] + integral_spread], axis=1
     )
     return motion.replace(start=start, spread=spread)
 
@@ -355,7 +357,7 @@ def partials(
     stages: Stages,
     by_delay: Array,
     h: AnyArray,
-    others: Array,
+    other_torques: Array,
 ) -> Partials:
     """Return derivatives of the balance of forces in stages of one motion.
 
@@ -366,23 +368,25 @@ def partials(
         stages: Inputs of the stages.
         by_delay: Derivatives of the commands by the delay.
         h: Time of a step [s].
-        others: Torques by the accelerations of other joints [stages, joints] [N m or
-            N].
+        other_torques: Torques by the accelerations of other joints [stages, joints]
+            [N m or N].
     """
     parameters = theta.T[:, None]
     w = state.w
     x = Forces.of(state, parameters, stages, h)
     _, _, _, b, a, _, mu, Fs, vs, _, g, _ = parameters
-    slip = x.slip(w, stages, x.force + a * others)
+    slip = x.slip(w, stages, x.force + a * other_torques)
     by_inertia = slip.by_inertia - u
     by_damping = slip.by_resistance - u
     by_friction = slip.by_friction
-    by_integral = slip.by_force * x.inside
+    by_integral = slip.by_force * x.control_share
     by_servo = by_integral * x.gain
     by_command = {"d": by_delay, "b": jnp.ones_like(u), "g": (stages.commands - b) / g}
-    stribeck_slope = 2.0 * Fs * x.falling * w / vs**2
+    stribeck_slope = 2.0 * Fs * x.stribeck_share * w / vs**2
     by_load = mu * by_friction * jnp.sign(stages.load) - slip.by_force
-    by_compliance = slip.by_force * others + by_load * stages.load
+    drive_sign = jnp.sign(x.force + a * stages.load)
+    by_growth = slip.by_force * x.error + GAMMA * h * by_damping
+    by_compliance = slip.by_force * other_torques + by_load * stages.load
     derivatives = {
         "J": by_inertia / (GAMMA * h),
         "B": by_damping,
@@ -390,10 +394,10 @@ def partials(
         "a": by_compliance + by_inertia * stages.inertia / (GAMMA * h),
         "F": by_friction,
         "mu": by_friction * jnp.abs(a * stages.load),
-        "Fs": by_friction * x.falling,
+        "Fs": by_friction * x.stribeck_share,
         "vs": by_friction * stribeck_slope * w / vs,
-        "um": slip.by_force * (1.0 - x.inside) * jnp.sign(x.force + a * stages.load),
-        "ki": x.inside * GAMMA * h * (slip.by_force * x.error + GAMMA * h * by_damping),
+        "um": slip.by_force * (1.0 - x.control_share) * drive_sign,
+        "ki": x.control_share * GAMMA * h * by_growth,
     }
     by_theta = tuple(derivatives[x] for x in INDEX)
     by_w = slip.by_w - by_friction * stribeck_slope
@@ -409,6 +413,6 @@ def partials(
     )
 
 
-def steps_of(motion: ServoMotion, time_step: float, least: int = 1) -> int:
+def steps_of(motion: ServoMotion, time_step: float, minimum: int = 1) -> int:
     """Return the steps in each sample time, the longest up to 5 % longer than asked."""
-    return max(least, math.ceil(float(motion.sample_time.max()) / time_step - 0.05))
+    return max(minimum, math.ceil(float(motion.sample_time.max()) / time_step - 0.05))

@@ -24,7 +24,7 @@ from .servo import (
 
 BLOCK_SIZE = 250
 """Samples whose derivatives are found at once."""
-HELD = np.array(False)
+HOLD = np.array(False)
 """Whether commands are held until the next one: here they are interpolated."""
 BATCH_SIZE = 4
 """Candidates that are simulated at once."""
@@ -42,7 +42,7 @@ def _stage(
 def _start(theta: Array, motion: ServoMotion) -> State:
     """Return the initial state, with balanced integral actions of the servos."""
     q, w, *integral = jnp.asarray(motion.start)
-    return State(q, w, balanced_integral(theta, motion, HELD) if integral else None)
+    return State(q, w, balanced_integral(theta, motion, HOLD) if integral else None)
 
 
 @functools.partial(jax.jit, static_argnums=2)
@@ -64,7 +64,7 @@ def _path(theta: Array, motion: ServoMotion, steps: int) -> tuple[Array]:
         return state, state.q
 
     start = _start(theta, motion)
-    stages, _ = Stages.of(theta, motion, steps, HELD)
+    stages, _ = Stages.of(theta, motion, steps, HOLD)
     _, path = jax.lax.scan(simulate_stage, start, stages)
     return (jnp.concatenate([start.q[None], path[2 * steps - 1 :: 2 * steps]]).T,)
 
@@ -147,7 +147,7 @@ def _moments(theta: Array, motion: ServoMotion, steps: int) -> tuple[Array, ...]
         padded_rows = jnp.pad(x, ((0, -len(x) % size), (0, 0)), mode)
         return padded_rows.reshape(-1, size, x.shape[-1])
 
-    stages, by_delay = Stages.of(theta, motion, steps, HELD)
+    stages, by_delay = Stages.of(theta, motion, steps, HOLD)
     stages = jax.tree.map(
         lambda x: blocks(x, 2 * steps * BLOCK_SIZE), (stages, by_delay)
     )

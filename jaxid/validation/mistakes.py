@@ -237,8 +237,8 @@ class _Samples:
         for log, rows in zip(self._logs, self._instants, strict=True):
             time = log.reduced_time
             curve = CubicSpline(time, np.asarray(log.reduced_forces))
-            later = np.clip(log.time[rows] + seconds, time[0], time[-1])
-            forces.append(curve(later))
+            instants = np.clip(log.time[rows] + seconds, time[0], time[-1])
+            forces.append(curve(instants))
         return np.concatenate(forces)
 
     def _corrected_rows(self, c: Correction) -> np.ndarray:

@@ -79,15 +79,15 @@ class LogStatistics:
 
 
 def limit_findings(
-    robot: Robot, statistics: LogStatistics, faulty: Collection[int]
+    robot: Robot, statistics: LogStatistics, faulty_joints: Collection[int]
 ) -> list[str]:
     """Compare a log with the limits of its robot: a wrong unit or sign shows here.
 
-    Joints in `faulty` have faults of single channels, which explain more.
+    Joints in `faulty_joints` have faults of single channels, which explain more.
     """
-    findings = [] if faulty else _force_findings(robot, statistics)
+    findings = [] if faulty_joints else _force_findings(robot, statistics)
     for j in range(robot.joints):
-        if j not in faulty:
+        if j not in faulty_joints:
             findings += _joint_findings(robot, j, statistics)
     share = float(statistics.stands.all(axis=1).mean())
     if share > 0.5:
@@ -227,33 +227,33 @@ def _lost_and_repeated(
         steps: Steps of all joints' angles [samples, joints].
         rounding: Size of steps that are rounding errors of numbers [joints].
     """
-    middle = steps[1:-1]
-    before = steps[:-2]
-    after = steps[2:]
-    mean = 0.5 * (before + after)
+    inner_steps = steps[1:-1]
+    previous_steps = steps[:-2]
+    next_steps = steps[2:]
+    mean = 0.5 * (previous_steps + next_steps)
     sizes = np.abs(steps)
     # Encoders round to half an increment; smaller differences are those of rounded
     # numbers.
     increment = np.where(sizes > rounding, sizes, np.inf).min(axis=0)
-    noise = 1.4826 * np.median(np.abs(middle - mean), axis=0)
+    noise = 1.4826 * np.median(np.abs(inner_steps - mean), axis=0)
     # The noise of a joint that never moves is infinite, and it has no say.
     noise = np.maximum(noise, 0.5 * increment)
-    bend = np.abs(after - before) / noise
-    middle = middle / noise
+    bend = np.abs(next_steps - previous_steps) / noise
+    inner_steps = inner_steps / noise
     mean = mean / noise
-    gap = np.abs(middle - mean)
+    gap = np.abs(inner_steps - mean)
     # All joints go on by the same number of steps, as far as noise lets see.
     speed = np.sum(mean**2, axis=1)
-    count = np.sum(middle * mean, axis=1) / np.maximum(speed, 1.0)
+    count = np.sum(inner_steps * mean, axis=1) / np.maximum(speed, 1.0)
     common_gap = np.abs(count - 1)[:, None] * np.abs(mean)
     is_far = gap > JUMP
     is_shared = (is_far | (common_gap < 2 * JUMP)).all(axis=1)
-    residuals = middle - count[:, None] * mean
+    residuals = inner_steps - count[:, None] * mean
     is_explained = np.sum(residuals**2, axis=1) < 0.1 * np.sum(gap**2, axis=1)
     is_jump = is_far.any(axis=1) & is_shared & is_explained
     is_jump &= speed > 9.0
     is_jump &= bend.max(axis=1) < JUMP
-    is_standing = (middle == 0).all(axis=1)
+    is_standing = (inner_steps == 0).all(axis=1)
     return is_jump & (count > 1.5), is_jump & is_standing
 
 
@@ -425,17 +425,17 @@ def _hold(value: float, start: float, stop: float) -> str:
 
 
 def stuck_findings(
-    robot: Robot, recording: Recording, faulty: Collection[int] = ()
+    robot: Robot, recording: Recording, faulty_joints: Collection[int] = ()
 ) -> list[str]:
     """Look for forces that are constant, or cut off at their largest value.
 
     Forces are cut off if many samples lie on the largest value, and few on the values
-    beside it. Joints in `faulty` have known faults, and are left out.
+    beside it. Joints in `faulty_joints` have known faults, and are left out.
     """
     forces = np.asarray(recording.forces)
     angles = np.asarray(recording.angles)
     findings = []
-    for j in (j for j in range(robot.joints) if j not in faulty):
+    for j in (j for j in range(robot.joints) if j not in faulty_joints):
         name = robot.joint_names[j]
         f = forces[:, j]
         speed = np.abs(np.gradient(angles[:, j]))
