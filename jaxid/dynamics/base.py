@@ -135,7 +135,8 @@ class BaseParameters(Summarised, Hashable):
         program = program_of(self.model, self.model.columns, *shapes)
         joints, columns = program.output_shapes[0]
         entries = np.arange(joints * columns).reshape(joints, columns)
-        return select_outputs(program, entries[:, np.array(self.indices, int)])
+        base_entries = entries[:, np.array(self.indices, int)]
+        return select_outputs(program, base_entries)
 
     @property
     def joint_regressor(self) -> JointRegressor:
@@ -154,8 +155,10 @@ class BaseParameters(Summarised, Hashable):
         Args:
             motion: Joint motion [samples, joints].
         """
-        arrays = [np.asarray(x, np.float64).T for x in self.model.arguments(motion)]
-        regressor = JointRegressor(self, self.columns, *(x.shape[:1] for x in arrays))
+        arguments = self.model.arguments(motion)
+        arrays = [np.asarray(x, np.float64).T for x in arguments]
+        shapes = [x.shape[:1] for x in arrays]
+        regressor = JointRegressor(self, self.columns, *shapes)
         return [rows.T for rows in regressor.in_numpy(*arrays)]
 
     def forces_in_numpy(self, p: AnyArray, motion: Motion) -> np.ndarray:
@@ -164,11 +167,10 @@ class BaseParameters(Summarised, Hashable):
 
     def tool_forces(self, motion: Motion) -> np.ndarray:
         """Return the forces of the known tool [N m or N] in float64."""
-        if self.model.robot.tool is None:
+        model = self.model
+        if model.robot.tool is None:
             return np.zeros(motion.q.shape)
-        return in_numpy(
-            self.model, self.model.known_forces, motion.q, motion.qd, motion.qdd
-        )
+        return in_numpy(model, model.known_forces, motion.q, motion.qd, motion.qdd)
 
     def regressor(self, motion: Motion) -> AnyArray:
         r"""Return the base regressor $\Theta_B$ [*batch, joints, base] (Eq. 23)."""

@@ -66,15 +66,18 @@ class JointRegressor(eqx.Module):
         # Constants come as floats; an array of the batch's shape is made of each.
         values = lower(self.program, fence)(*arrays)
         dtype = jnp.result_type(*arrays, float)
-        *batch, samples = jnp.shape(arrays[0])[1:]
+        shape = jnp.shape(arrays[0])[1:]
+        *batch, samples = shape
 
         joints = []
         for entries in self.entries:
             if not len(entries):
                 joints.append(jnp.zeros((*batch, 0, samples), dtype))
                 continue
-            columns = [jnp.asarray(values[entry], dtype) for entry in entries]
-            columns = [jnp.broadcast_to(x, (*batch, samples)) for x in columns]
+            columns = []
+            for entry in entries:
+                column = jnp.asarray(values[entry], dtype)
+                columns.append(jnp.broadcast_to(column, shape))
             joints.append(jnp.stack(columns, axis=-2))
         return joints
 
@@ -184,8 +187,10 @@ class PackedRegressor(eqx.Module):
 @functools.lru_cache(maxsize=CACHE_SIZE)
 def _places(program: Program):
     """Return the `places` of a packed regressor; what is always zero has none."""
-    numbers = range(len(program.distinct[0]))
-    entries = np.array(program.pack(numbers), object).reshape(program.output_shapes[0])
+    nodes, _ = program.distinct
+    packed = program.pack(range(len(nodes)))
+    shape = program.output_shapes[0]
+    entries = np.array(packed, object).reshape(shape)
     places = []
     for row in entries:
         # An `int` numbers an array of values, a `float` is a constant.

@@ -47,10 +47,12 @@ class OpenModel(eqx.Module):
         start = 0
         for leaf, positions in self.places:
             constants = leaves[leaf]
-            stop = start + len(positions)
+            size = constants.size
+            count = len(positions)
+            stop = start + count
             # Each entry of the leaf is one of its constants, or one of the numbers.
-            order = np.arange(constants.size)
-            order[list(positions)] = constants.size + np.arange(len(positions))
+            order = np.arange(size)
+            order[list(positions)] = size + np.arange(count)
             entries = jnp.concatenate([constants.ravel(), numbers[start:stop]])
             leaves[leaf] = entries[order].reshape(constants.shape)
             start = stop
@@ -70,21 +72,25 @@ def opened(
     places = []
     numbers: list[AnyArray] = [np.zeros((len(leaves_of_models), 0))]
     for k, values in enumerate(zip(*leaves_of_models, strict=True)):
+        first, *_ = values
         if is_traced(values):
             # All numbers of the leaf are inputs; zeros stand in the closed model.
             stack = jnp.stack
-            leaves[k] = np.zeros(values[0].shape, values[0].dtype)
-            positions = np.arange(leaves[k].size)
+            leaves[k] = np.zeros(first.shape, first.dtype)
+            positions = np.arange(first.size)
         else:
             stack = np.stack
             rows = np.array([np.ravel(x) for x in values])
-            positions = np.flatnonzero((rows != rows[0]).any(axis=0))
+            differs = (rows != rows[0]).any(axis=0)
+            positions = np.flatnonzero(differs)
         if len(positions):
+            variables = [x.ravel()[positions] for x in values]
             places.append((k, tuple(positions.tolist())))
-            numbers.append(stack([x.ravel()[positions] for x in values]))
-    closed_model = jax.tree.unflatten(structure, leaves)
+            numbers.append(stack(variables))
     concatenate = jnp.concatenate if is_traced(numbers) else np.concatenate
-    return OpenModel(closed_model, method, tuple(places)), concatenate(numbers, axis=1)
+    closed_model = jax.tree.unflatten(structure, leaves)
+    open_model = OpenModel(closed_model, method, tuple(places))
+    return open_model, concatenate(numbers, axis=1)
 
 
 MAX_SAMPLES_IN_NUMPY = 4096

@@ -80,8 +80,10 @@ def all_placements(robot: Robot, q: Joints) -> Array:
         has_body = above >= 0
         choice = np.eye(robot.joints)[above] * has_body[:, None]
         ground = np.eye(4) * ~has_body[:, None, None]
-        placements_above = jnp.tensordot(jnp.asarray(choice, dtype), placements, 1)
-        placements = (placements_above + jnp.asarray(ground, dtype)) @ placements
+        choice = jnp.asarray(choice, dtype)
+        placements_above = jnp.tensordot(choice, placements, 1)
+        placements_above = placements_above + jnp.asarray(ground, dtype)
+        placements = placements_above @ placements
         above = np.where(has_body, above[above], -1)
     return placements
 
@@ -188,7 +190,8 @@ def spatial_mass_matrix(robot: Robot, p: Bodies, q: Joints) -> JointMatrix:
     composite = jnp.tensordot(is_moved.T, inertias, 1)
     momenta = _times(composite, motion.joints)
     # A joint feels the momenta of those that it carries; the matrix is symmetric.
-    lower = is_moved * (momenta @ motion.joints.T)
+    products = momenta @ motion.joints.T
+    lower = is_moved * products
     off_diagonal = jnp.asarray(1.0 - np.eye(len(q)), q.dtype)
     return lower + (lower * off_diagonal).T
 
@@ -197,13 +200,15 @@ def spatial_regressor(robot: Robot, q: Joints, qd: Joints, qdd: Joints) -> Array
     """Return the regressor of every body (Eq. 11)."""
     carry, joints, v, a = ground_motion(robot, q, qd, qdd)
     # In the frames of the bodies, where the parameters are constant.
-    v_body = jnp.einsum("nji,nj->ni", carry, v)
-    a_body = jnp.einsum("nji,nj->ni", carry, a)
+    to_bodies = jnp.swapaxes(carry, 1, 2)
+    v_body = _times(to_bodies, v)
+    a_body = _times(to_bodies, a)
     unit_inertias = jnp.asarray(INERTIA, q.dtype)
     momenta = jnp.einsum("ijk,nj->nik", unit_inertias, v_body)
     rates = jnp.einsum("ijk,nj->nik", unit_inertias, a_body)
     crosses = jnp.swapaxes(_combine(CROSS, v_body), 1, 2)
-    wrenches = carry @ (rates - crosses @ momenta)
+    body_wrenches = rates - crosses @ momenta
+    wrenches = carry @ body_wrenches
     columns = jnp.einsum("js,bsk->jbk", joints, wrenches)
     # A joint feels only the bodies that it moves.
     is_moved = jnp.asarray(moved_by(robot).T, q.dtype)

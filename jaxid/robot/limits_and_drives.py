@@ -8,7 +8,16 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from jaxid.arrays import AnyArray, Float, Hashable, Joints, Numbers, given, namespace
+from jaxid.arrays import (
+    AnyArray,
+    Float,
+    Hashable,
+    Joints,
+    ManyJoints,
+    Numbers,
+    given,
+    namespace,
+)
 from jaxid.errors import InputError
 
 DOUBTFUL_LENGTH = 10.0
@@ -17,8 +26,6 @@ MAX_LENGTH = 1000.0
 """Length that no robot reaches [m]."""
 DOUBTFUL_SPEED = 50.0
 """Speed from which on the unit may be a degree per second [rad/s]."""
-
-Batch = Float[AnyArray, "*batch joints"]
 
 
 class Limits(eqx.Module):
@@ -134,27 +141,27 @@ class Drives(Hashable):
         """Return `zero` in the shape of a batch of angles."""
         return namespace(like, self.zero).broadcast_to(self.zero, like.shape)
 
-    def joint_angles(self, motor_angles: Batch) -> Batch:
+    def joint_angles(self, motor_angles: ManyJoints) -> ManyJoints:
         """Return joint angles [rad or m] of motor angles [rad]."""
         return self.joint_velocities(motor_angles) + self._zeros(motor_angles)
 
-    def joint_velocities(self, motor_velocities: Batch) -> Batch:
+    def joint_velocities(self, motor_velocities: ManyJoints) -> ManyJoints:
         """Return joint velocities, or accelerations, of those of the motors."""
         return motor_velocities @ self._inverse.T
 
-    def joint_forces(self, motor_torques: Batch) -> Batch:
+    def joint_forces(self, motor_torques: ManyJoints) -> ManyJoints:
         """Return generalised forces [N m or N] of motor torques [N m] (Eq. 19)."""
         return motor_torques @ self.reduction
 
-    def motor_angles(self, angles: Batch) -> Batch:
+    def motor_angles(self, angles: ManyJoints) -> ManyJoints:
         """Return motor angles [rad] of joint angles [rad or m]."""
         return self.motor_velocities(angles - self._zeros(angles))
 
-    def motor_velocities(self, velocities: Batch) -> Batch:
+    def motor_velocities(self, velocities: ManyJoints) -> ManyJoints:
         """Return motor velocities [rad/s] of joint velocities [rad/s or m/s]."""
         return velocities @ self.reduction.T
 
-    def motor_torques(self, forces: Batch) -> Batch:
+    def motor_torques(self, forces: ManyJoints) -> ManyJoints:
         """Return motor torques [N m] of generalised forces [N m or N]."""
         return forces @ self._inverse
 
