@@ -22,8 +22,6 @@ from typing import Any, Literal
 
 import numpy as np
 
-from jaxid.arrays import Texts
-
 MISSING = "–"  # noqa: RUF001
 """Text in place of a number that is not known."""
 SHORT_DECIMALS = range(-3, 9)
@@ -290,7 +288,7 @@ class Table:
         self.rules = frozenset(rules)
 
     @property
-    def rows(self) -> list[Texts]:
+    def rows(self) -> list[tuple[str, ...]]:
         """Rows of formatted texts."""
         return list(zip(*(column.texts for column in self.columns), strict=True))
 
