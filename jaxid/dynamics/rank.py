@@ -90,7 +90,9 @@ def rank_by_singular_values(W: AnyArray, tolerance: float = 1e-6) -> int:
     """
     unit_columns, norms = scale_columns(W)
     s = np.zeros(len(norms))
-    values = np.linalg.svd(unit_columns, compute_uv=False)
+    # The triangular factor has the same singular values, and few rows.
+    triangle = np.linalg.qr(unit_columns, mode="r")
+    values = np.linalg.svd(triangle, compute_uv=False)
     largest_value = max(values[0], np.finfo(float).tiny)
     s[: len(values)] = values / largest_value
     rank = _rank_at_largest_fall(s, tolerance)
