@@ -16,7 +16,7 @@ import jaxid as jid
 from jaxid.errors import InputError
 from jaxid.result_table import Remark, Status, versions
 
-from . import options, report_commands, run_commands, terminal
+from . import options, payload_gains_states_rollout, report_commands, terminal
 
 UNUSABLE_CODE = 3
 """Exit code for a verdict against the use of a model, or recording of a motion."""
@@ -306,9 +306,9 @@ def choose(
 for command in (
     report_commands.export,
     report_commands.compare,
-    run_commands.payload,
-    run_commands.gains,
-    run_commands.states,
-    run_commands.rollout,
+    payload_gains_states_rollout.payload,
+    payload_gains_states_rollout.gains,
+    payload_gains_states_rollout.states,
+    payload_gains_states_rollout.rollout,
 ):
     app.command()(command)

@@ -29,7 +29,7 @@ from jaxid.arrays import (
 )
 from jaxid.errors import InputError
 from jaxid.program import Program, Shape, evaluate, trace
-from jaxid.program.rules import with_derivatives_of
+from jaxid.program.jax_transformation_rules import with_derivatives_of
 from jaxid.program.xla_sample_blocks import BLOCK, on_rows
 
 

@@ -15,18 +15,18 @@ from jaxid.robot.limits_and_drives import Limits
 from jaxid.trajectory.fourier import FourierBasis
 from jaxid.trajectory.trajectory import AbstractBasis, LinearTrajectory
 
-from .candidates import (
+from .coefficient_limits import ScaledMotions
+from .constraints import AbstractConstraint
+from .criteria import AbstractCriterion
+from .criteria.information_matrix import BaseMatrix, BaseVector, JointVector
+from .design_result import DesignStatus, ExcitationPlan
+from .feasible_candidates import (
     Candidates,
     criterion_values,
     evaluate,
     evaluate_within_limits,
     shrink_to_constraints,
 )
-from .coefficient_limits import ScaledMotions
-from .constraints import AbstractConstraint
-from .criteria import AbstractCriterion
-from .criteria.information_matrix import BaseMatrix, BaseVector, JointVector
-from .design_result import DesignStatus, ExcitationPlan
 from .problem import ExcitationProblem
 from .search import count_steps, first_motions, search
 

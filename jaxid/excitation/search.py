@@ -17,14 +17,14 @@ import numpy as np
 from jaxid.dynamics.motion import Motion
 
 from . import interior_point
-from .candidates import (
+from .coefficient_limits import ScaledMotions, scale_samples
+from .criterion_gradient import value_and_gradient
+from .feasible_candidates import (
     EXCESS_PENALTY,
     Candidates,
     evaluate_within_limits,
     shrink_to_constraints,
 )
-from .coefficient_limits import ScaledMotions, scale_samples
-from .criterion_gradient import value_and_gradient
 from .interior_point import Evaluation, Iterate, Stage
 from .problem import MARGIN, SEARCH_SAMPLES, ExcitationProblem
 from .watched_constraints import (

@@ -18,7 +18,7 @@ from jaxid.robot.rotations import rpy_angles
 from jaxid.robot.urdf import load_urdf
 from jaxid.robot.urdf_tree import UrdfTree, link_names
 
-from .joint_dynamics import (
+from .bodies_and_joint_dynamics import (
     JointDynamics,
     feasible_bodies,
     joint_dynamics,

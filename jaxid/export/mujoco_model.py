@@ -15,7 +15,12 @@ from jaxid.robot.inertia import BodyParameters, Inertia
 from jaxid.robot.mjcf import exact_text
 from jaxid.robot.robot import Robot
 
-from .joint_dynamics import Quantities, feasible_bodies, joint_dynamics, origin_comment
+from .bodies_and_joint_dynamics import (
+    Quantities,
+    feasible_bodies,
+    joint_dynamics,
+    origin_comment,
+)
 
 ATTRIBUTES = {"armature": "armature", "damping": "damping", "friction": "frictionloss"}
 """Attributes of MJCF for the quantities of `joint_dynamics`."""

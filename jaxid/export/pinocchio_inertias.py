@@ -8,8 +8,8 @@ from jaxid.identification.fit_result import Fit
 from jaxid.io import FilePath, json_text, write_text
 from jaxid.robot.inertia import BodyParameters, Inertia
 
+from .bodies_and_joint_dynamics import joint_dynamics
 from .feed_forward import body_parameters
-from .joint_dynamics import joint_dynamics
 
 
 def pinocchio_parameters(fit: Fit) -> BodyParameters:

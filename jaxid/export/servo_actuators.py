@@ -12,12 +12,12 @@ from jaxid.errors import InputError
 from jaxid.io import FilePath, write_text
 from jaxid.result_table import Column, Table
 from jaxid.robot.mjcf import exact_text
-from jaxid.rollout.bodies import Bodies
+from jaxid.rollout.body_loads import Bodies
 from jaxid.rollout.result import ServoFit
 from jaxid.rollout.servo import INDEX, START
 
+from .bodies_and_joint_dynamics import Quantities
 from .feed_forward import body_parameters
-from .joint_dynamics import Quantities
 from .mujoco_model import mjcf_text
 
 STICKING = "0.99 0.9999 0.001"

@@ -17,7 +17,7 @@ import numpy as np
 from jaxid.arrays import AnyArray, Array, Bool, Float
 from jaxid.dynamics.motion import Motion
 from jaxid.dynamics.packed_regressor import JointRegressor
-from jaxid.program.rules import divided
+from jaxid.program.jax_transformation_rules import divided
 
 from .estimators.regularisation_and_weights import inverse_information
 from .uncertainty.spectral import sandwich_of_columns

@@ -17,8 +17,8 @@ from jax.custom_batching import custom_vmap
 
 from jaxid.arrays import Array, Float
 
+from .jax_transformation_rules import ALWAYS, differing_alike
 from .program import Program
-from .rules import ALWAYS, differing_alike
 from .xla import Results, fenced, hidden_one, lower
 
 BLOCK = 256

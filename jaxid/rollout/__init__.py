@@ -1,6 +1,6 @@
 """Identification from rollouts: a simulation that moves like the robot."""
 
-from .bodies import Bodies as Bodies
+from .body_loads import Bodies as Bodies
 from .determined_combinations import Combination as Combination
 from .errors import RolloutErrors as RolloutErrors
 from .identify import identify_rollout as identify_rollout

@@ -18,7 +18,7 @@ from jaxid.arrays import AnyArray, Array, double_precision, on_cores
 from jaxid.program import evaluate
 from jaxid.program.xla import lower
 
-from .bodies import Bodies, Programs
+from .body_loads import Bodies, Programs
 from .motion import FreeParameters, MotionSamples, ServoMotion
 from .servo import (
     GAMMA,

@@ -7,8 +7,8 @@ from scipy import special, stats
 
 from jaxid.identification.uncertainty.spectral import sandwich_of_columns
 
+from .coupled_refinement import Refinement, weights_of
 from .motion import JointParameters
-from .refine import Refinement, weights_of
 from .servo import PARAMETERS, SCALE
 
 MAX_RELATIVE_DEVIATION = 0.25

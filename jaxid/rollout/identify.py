@@ -17,11 +17,11 @@ from jaxid.arrays import Numbers, Vector
 from jaxid.errors import InputError
 from jaxid.measurement.recording import Recording
 
-from .bodies import Bodies
+from .body_loads import Bodies
 from .coupled import CoupledSimulator
+from .coupled_refinement import RESOLUTION, prepare, refine, weights_of
 from .least_squares import Solution, bounded_step, minimise
 from .motion import ServoMotion
-from .refine import RESOLUTION, prepare, refine, weights_of
 from .result import ServoFit
 from .servo import INDEX, LOWER, SCALE, START, UPPER, with_integral
 from .uncoupled import ServoSimulator

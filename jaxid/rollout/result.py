@@ -18,8 +18,9 @@ from jaxid.result_table import (
     with_deviations,
 )
 
-from .bodies import Bodies
+from .body_loads import Bodies
 from .coupled import CoupledSimulator
+from .coupled_refinement import Refinement, mean_squares
 from .determined_combinations import (
     MAX_RELATIVE_DEVIATION,
     Combination,
@@ -27,7 +28,6 @@ from .determined_combinations import (
 )
 from .errors import RolloutErrors
 from .motion import FreeParameters, JointParameters, MotionSamples, ServoMotion
-from .refine import Refinement, mean_squares
 from .servo import INDEX, LOWER, PARAMETERS, UPPER, with_integral
 from .uncoupled import ServoSimulator
 

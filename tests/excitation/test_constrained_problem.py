@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxid.excitation.candidates import evaluate, shrink_to_constraints
 from jaxid.excitation.constraints import Clearance, ForceLimits, TipLimits
 from jaxid.excitation.criteria import CRITERIA
 from jaxid.excitation.criterion_gradient import value_and_gradient
 from jaxid.excitation.design import minimise
+from jaxid.excitation.feasible_candidates import evaluate, shrink_to_constraints
 from jaxid.excitation.problem import (
     CHECKED_INSTANTS,
     COARSE_STEP,

@@ -3,7 +3,7 @@
 import jax
 import numpy as np
 
-from jaxid.excitation.candidates import (
+from jaxid.excitation.feasible_candidates import (
     EXCESS_PENALTY,
     Candidates,
     evaluate,

@@ -11,7 +11,7 @@ from export_samples import fit_of, motion, possible
 from lxml import etree
 
 import jaxid as jid
-from jaxid.export.joint_dynamics import joint_dynamics
+from jaxid.export.bodies_and_joint_dynamics import joint_dynamics
 
 URDF = """<?xml version="1.0"?>
 <!-- kept -->

@@ -16,12 +16,12 @@ from jaxid.export.servo_actuators import (
     simulator_values,
 )
 from jaxid.rollout.coupled import CoupledSimulator
+from jaxid.rollout.coupled_refinement import Refinement
 from jaxid.rollout.determined_combinations import _Rows
 from jaxid.rollout.dry_friction import Slip
 from jaxid.rollout.identify import mask
 from jaxid.rollout.least_squares import bounded_step, minimise
 from jaxid.rollout.motion import ServoMotion
-from jaxid.rollout.refine import Refinement
 from jaxid.rollout.servo import (
     INDEX,
     LOWER,
