@@ -63,7 +63,7 @@ COMMANDS = [
     ("identify experiment.toml loop.csv", "`loop.csv` is no file"),
     (
         "identify experiment.toml image.csv",
-        "`image.csv` is no text: a log is CSV, Parquet, NPZ",
+        "`image.csv` is no text",
     ),
     (
         "identify experiment.toml long.csv",

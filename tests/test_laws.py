@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 import jaxid as jid
+from jaxid.dynamics.terms import TERMS
 from jaxid.errors import InputError
 
 ARM = jid.robots.planar_arm(2, 0.4)
@@ -17,10 +18,10 @@ ODD = (
     jid.ViscousFriction(),
     jid.CoulombFriction(),
     jid.CoulombFriction(jid.terms.HardSign(dead_zone=0.01)),
-    jid.terms.SquareRootFriction(),
     jid.terms.StribeckFriction(),
     jid.terms.StribeckFriction(0.3, exponent=1.3),
     jid.terms.TemperatureScaled(jid.ViscousFriction(), rate=0.02, temperature=40.0),
+    *(term() for term in TERMS.values() if term.shares_friction),
 )
 # With a tanh the second of these is an offset as well, which pushes near standstill.
 ASYMMETRIC = (

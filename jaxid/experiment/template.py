@@ -20,6 +20,7 @@ import numpy as np
 
 from jaxid.io import FilePath, union_members
 from jaxid.measurement.filters import FILTERS
+from jaxid.measurement.log_files import READERS
 from jaxid.robot.description_files import is_mjcf
 from jaxid.robot.robot import Robot
 from jaxid.robot.urdf import load_urdf
@@ -50,8 +51,7 @@ otherwise.
 SUMMARIES = {
     "load": "Known load that is on the robot in some logs only: "
     "`jaxid gains` finds the true forces.",
-    "recording": "Columns of the logs: "
-    "CSV (any separator), Parquet, NPZ, MAT, HDF5 or ROS bags. "
+    "recording": f"Columns of the logs ({', '.join(READERS)}). "
     'A pattern ("{}" stands for the joint\'s number, "{name}" for its name), '
     "a list of names, or positions from 0.",
 }
@@ -135,7 +135,8 @@ def _table(
             # Keys of the other kinds of filters are comments.
             lines += ["#", *_entry("kind", json.dumps(kind), _summary(function), False)]
         for key in keys_of(function).values():
-            if key.name not in written_names:
+            # Each kind of filter has keys of its own, which may have equal names.
+            if kind is not None or key.name not in written_names:
                 is_common = key.name not in OF_KINDS
                 value = values.get(key.name)
                 lines += _key(key, joints, value, is_active and is_common)

@@ -40,7 +40,7 @@ def read_recording(
     bridged: float = 0.0,
     bad_rows: float = MAX_BAD_ROWS,
 ) -> Recording:
-    """Read a log: CSV (any separator), Parquet, NPZ, MAT, HDF5, or a bag of ROS 1 or 2.
+    """Read a log, in the format that the suffix of its file says.
 
     Args:
         path: File with the angles, and with all other channels that have no file of

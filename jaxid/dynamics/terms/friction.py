@@ -1,4 +1,4 @@
-"""Friction: viscous, Coulomb, Stribeck, root of speed, load, temperature."""
+"""Friction of joints: terms that depend on speed, load and temperature."""
 
 from typing import Any, ClassVar
 

@@ -1,4 +1,4 @@
-"""Files of arrays: NPZ, MAT of any version, and HDF5."""
+"""Files of arrays, which have names like `q` and columns like `q[0]`."""
 
 import abc
 import functools

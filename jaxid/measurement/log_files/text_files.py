@@ -215,8 +215,8 @@ def detect_format(source: str, head: bytes) -> TextFormat:
         raise InputError(f"`{source}` is text in UTF-16: save it again in UTF-8.")
     if b"\0" in head:
         raise InputError(
-            f"`{source}` is no text: a log is CSV, Parquet, NPZ, MAT, HDF5 or a bag "
-            "of ROS, as its suffix says."
+            f"`{source}` is no text, as its suffix says: give it the suffix of its "
+            "format, or export it again."
         )
     first_line, _, _ = head.partition(b"\n")
     # Some programs write the header as a comment.
