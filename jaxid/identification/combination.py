@@ -29,20 +29,22 @@ from .uncertainty.blocks import block_covariance, residual_blocks
 
 def require_same_base(fits: Sequence[Fit]) -> None:
     """Check that fits have the same base parameters."""
-    first = fits[0]
+    first_fit = fits[0]
     for fit in fits[1:]:
-        base, other = first.base, fit.base
-        has_same_columns = base.names == other.names and base.indices == other.indices
+        base, other_base = first_fit.base, fit.base
+        has_same_columns = (
+            base.names == other_base.names and base.indices == other_base.indices
+        )
         if has_same_columns and np.allclose(
-            base.kappa, other.kappa, rtol=1e-6, atol=1e-9
+            base.kappa, other_base.kappa, rtol=1e-6, atol=1e-9
         ):
             continue
-        differing_names = sorted({*base.names} ^ {*other.names})
+        differing_names = sorted({*base.names} ^ {*other_base.names})
         difference = "lengths differ"
         if differing_names:
             difference = f"`{differing_names[0]}` is in one of them only"
         raise InputError(
-            f"`{first.name}` and `{fit.name}` have different "
+            f"`{first_fit.name}` and `{fit.name}` have different "
             f"base parameters ({difference}): use one model."
         )
 
@@ -85,10 +87,10 @@ def combine(fits: Sequence[Fit], maps, offsets=None) -> tuple[Vector, Uncertaint
     The base parameters of each fit are its map [base, unknowns] times the unknowns,
     plus its offset [base], if there are any.
     """
-    for one, other in itertools.combinations(fits, 2):
-        if has_common_rows(one.time_blocks, other.time_blocks):
+    for first_fit, second_fit in itertools.combinations(fits, 2):
+        if has_common_rows(first_fit.time_blocks, second_fit.time_blocks):
             raise InputError(
-                f"`{one.name}` and `{other.name}` have seen "
+                f"`{first_fit.name}` and `{second_fit.name}` have seen "
                 "the same data, which would count twice."
             )
     if offsets is None:

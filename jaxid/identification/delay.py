@@ -149,10 +149,10 @@ def _search(
 ) -> _Search:
     """Shift the motions until the rates of the forces explain nothing more."""
     joints = len(joint_weights)
-    no_delay = np.eye(base.size + joints)[:, : base.size]
-    same_delay = linalg.block_diag(np.eye(base.size), np.ones((joints, 1)))
+    map_without_delay = np.eye(base.size + joints)[:, : base.size]
+    common_delay_map = linalg.block_diag(np.eye(base.size), np.ones((joints, 1)))
     start = _equations(base, recordings, recordings, joint_weights, np.zeros(base.size))
-    p = start.combine(no_delay).solve()
+    p = start.combine(map_without_delay).solve()
     seconds = 0.0
     step = 0.0
     damping = 1.0
@@ -165,7 +165,7 @@ def _search(
         each_delay = _equations(
             base, shifted_logs, shifted_instruments, joint_weights, p
         )
-        one_delay = each_delay.combine(np.asarray(same_delay))
+        one_delay = each_delay.combine(np.asarray(common_delay_map))
         solution = one_delay.solve()
         deviation = float(np.sqrt(one_delay.jackknife()[-1, -1]))
         if solution[-1] * step < 0:
@@ -190,11 +190,11 @@ class _Equations(NamedTuple):
 
     def combine(self, columns: np.ndarray) -> "_Equations":
         """Return equations for parameters that the present ones combine."""
-        with_forces = np.asarray(linalg.block_diag(columns, 1.0))
+        extended_columns = np.asarray(linalg.block_diag(columns, 1.0))
         return _Equations(
-            products=columns.T @ self.products @ with_forces,
-            squares=with_forces.T @ self.squares @ with_forces,
-            rates=with_forces.T @ self.rates @ with_forces,
+            products=columns.T @ self.products @ extended_columns,
+            squares=extended_columns.T @ self.squares @ extended_columns,
+            rates=extended_columns.T @ self.rates @ extended_columns,
         )
 
     def solve(self, without: int | None = None) -> np.ndarray:
@@ -303,7 +303,7 @@ def without_delay(observations: Observations, seconds: float) -> Observations:
     samples = math.ceil(abs(seconds) / dt - 1e-9)
     edge = observations.filter.edge(dt)
     instants = observations.instants
-    counts = np.zeros(len(instants), bool)
+    is_counted = np.zeros(len(instants), bool)
     source = observations.motion
     channels = [np.array(x, np.float64) for x in (source.q, source.qd, source.qdd)]
     for a, b in observations.segments:
@@ -311,10 +311,10 @@ def without_delay(observations: Observations, seconds: float) -> Observations:
         times = np.clip(time[a:b] - seconds, time[a], time[b - 1])
         for channel in channels:
             channel[a:b] = CubicSpline(time[a:b], channel[a:b])(times)
-        first = a + edge + samples if seconds > 0 else a
+        start = a + edge + samples if seconds > 0 else a
         stop = b if seconds > 0 else b - edge - samples
-        counts |= (instants >= first) & (instants < stop)
-    mask = np.asarray(observations.mask) & counts[:, None]
+        is_counted |= (instants >= start) & (instants < stop)
+    mask = np.asarray(observations.mask) & is_counted[:, None]
     if not mask.any(axis=0).all():
         raise InputError(
             f"`{observations.name}` is too short for a delay of {seconds:g} s: "

@@ -186,14 +186,14 @@ def _rows(factors: Factors, weights, parameter_map, offset) -> Rows:
         R = weights[number] * joint.R
         columns = R[:, :-1]
         parameters = list(joint.columns)
-        of_joint = np.zeros((len(R), len(factors.joints)))
-        of_joint[:, number] = 1.0
+        joint_columns = np.zeros((len(R), len(factors.joints)))
+        joint_columns[:, number] = 1.0
         parts.append(
             Rows(
                 columns=columns @ parameter_map[parameters],
                 known_forces=columns @ offset[parameters],
                 measured_forces=R[:, -1],
-                joints=of_joint,
+                joints=joint_columns,
             )
         )
     return _stack(parts)
@@ -207,13 +207,13 @@ def _stack(parts: Sequence[Rows]) -> Rows:
 def _parameter_maps(base: BaseParameters, load: Tool | float):
     """Return maps and offsets from common unknowns to both runs' base parameters."""
     maps = state_maps(base.size, varying_parameters(base), 2)
-    no_offset = np.zeros(base.size)
+    zero_offset = np.zeros(base.size)
     if isinstance(load, Tool):
-        return maps, [no_offset, body_columns(base, load.body) @ load.parameters]
+        return maps, [zero_offset, body_columns(base, load.body) @ load.parameters]
     # The other nine parameters of the load are unknowns, too.
     columns = body_columns(base, base.model.robot.tip_body)
-    of_mass = columns[:, 0]
+    mass_column = columns[:, 0]
     other_columns = columns[:, 1:]
-    without_load = np.hstack([maps[0], 0.0 * other_columns])
-    with_load = np.hstack([maps[1], other_columns])
-    return [without_load, with_load], [no_offset, load * of_mass]
+    unloaded_map = np.hstack([maps[0], 0.0 * other_columns])
+    loaded_map = np.hstack([maps[1], other_columns])
+    return [unloaded_map, loaded_map], [zero_offset, load * mass_column]

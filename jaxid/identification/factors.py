@@ -122,9 +122,9 @@ def without_tool(base: BaseParameters, motion: Motion, forces: AnyArray) -> Matr
 
 def divide_rows(edges: Sequence[int], rows: slice) -> Iterator[tuple[int, slice]]:
     """Yield each block of time that some rows reach into, with its part of the rows."""
-    for block, (first, end) in enumerate(itertools.pairwise(edges)):
-        start = max(first, rows.start)
-        stop = min(end, rows.stop)
+    for block, (first_row, end_row) in enumerate(itertools.pairwise(edges)):
+        start = max(first_row, rows.start)
+        stop = min(end_row, rows.stop)
         if start < stop:
             yield block, slice(start, stop)
 
@@ -158,9 +158,9 @@ class Factors(eqx.Module):
     def __add__(self, other: "Factors") -> "Factors":
         """Return the factors of both sets of rows together."""
         joints = []
-        for ours, theirs in zip(self.joints, other.joints, strict=True):
-            R = ours.append(theirs.R).R
-            joints.append(JointFactor(ours.columns, R, ours.rows + theirs.rows))
+        for joint, other_joint in zip(self.joints, other.joints, strict=True):
+            R = joint.append(other_joint.R).R
+            joints.append(JointFactor(joint.columns, R, joint.rows + other_joint.rows))
         return Factors(tuple(joints), self.size)
 
     @property

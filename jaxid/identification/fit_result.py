@@ -149,8 +149,8 @@ class Fit(Summarised, eqx.Module):
             InputError: If `level` is not between 0 and 1.
         """
         half_widths = self.uncertainty.half_widths(level)
-        lower = self.parameters - half_widths
-        return np.stack([lower, self.parameters + half_widths], axis=1)
+        lower_ends = self.parameters - half_widths
+        return np.stack([lower_ends, self.parameters + half_widths], axis=1)
 
     @property
     def relative_standard_deviations(self) -> BaseVector:
@@ -303,9 +303,9 @@ class Fit(Summarised, eqx.Module):
         ratios = self.uncertainty.ratios
         finite_ratios = ratios[np.isfinite(ratios)]
         if np.any(np.abs(finite_ratios - 1.0) > 1e-9):
-            naive = self.naive_standard_deviations
+            naive_deviations = self.naive_standard_deviations
             columns += [
-                Column("naive ±", naive, format=lambda x: significant(x, 2)),
+                Column("naive ±", naive_deviations, format=lambda x: significant(x, 2)),
                 Column("ratio", ratios, format=lambda x: significant(x, 2)),
             ]
             typical_ratio = significant(float(np.median(finite_ratios)), 2)

@@ -207,14 +207,16 @@ class _Stream:
         edge = recording.filter.edge(recording.sample_time)
         # A row must be so far from the ends of what the filter has left.
         distance = max(reach - edge, recording.decimation.memory(), 0)
-        low = first_row + math.ceil(distance / factor)
+        first_inner_row = first_row + math.ceil(distance / factor)
         samples = stop - start - 2 * edge - distance
-        high = min(first_row + math.ceil(samples / factor), end_row)
+        end_inner_row = min(first_row + math.ceil(samples / factor), end_row)
         call_rows = self._shape.iterations * self._shape.rows
         max_rows = call_rows - self._shape.delay
         # The first sample on which row zero of the segment depends.
         origin = start + edge - reach
-        for block, rows in divide_rows(self._edges, slice(low, high)):
+        for block, rows in divide_rows(
+            self._edges, slice(first_inner_row, end_inner_row)
+        ):
             for row in range(rows.start, rows.stop, max_rows):
                 next_row = min(row + max_rows, rows.stop)
                 begin = origin + (row - first_row) * factor
@@ -233,8 +235,8 @@ class _Stream:
         for piece in self._pieces:
             is_end[piece.rows] = False
         # Starts and stops of the runs of such rows alternate.
-        padded = np.pad(is_end, 1)
-        changes = np.flatnonzero(np.diff(padded))
+        padded_mask = np.pad(is_end, 1)
+        changes = np.flatnonzero(np.diff(padded_mask))
         ranges = [(int(a), int(b)) for a, b in changes.reshape(-1, 2)]
         samples = max(4096, 2 * self._shape.reach)
         for chunk in row_chunks(self._base, self._observations, samples, ranges):

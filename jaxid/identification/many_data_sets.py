@@ -181,12 +181,12 @@ def _solve_again(
     def identify_one(place: tuple[int, int]) -> Fit:
         k, draw = place
         robot = base.model.robot if robots is None else robots[k]
-        placed = eqx.tree_at(lambda b: b.model.robot, base, robot)
-        return _identify_one(placed, batch, k, draw, row_time)
+        placed_base = eqx.tree_at(lambda b: b.model.robot, base, robot)
+        return _identify_one(placed_base, batch, k, draw, row_time)
 
     draws = batch.forces.shape[1]
-    enough_rows = numbers[counts[numbers] > base.size].tolist()
-    places = list(itertools.product(enough_rows, range(draws)))
+    sufficient_sets = numbers[counts[numbers] > base.size].tolist()
+    places = list(itertools.product(sufficient_sets, range(draws)))
     for (k, draw), result in zip(places, on_cores(identify_one, places), strict=True):
         fit.parameters[k, draw] = result.parameters
         fit.standard_deviations[k, draw] = result.standard_deviations
@@ -226,18 +226,21 @@ def _with_geometries(base: BaseParameters, robots: Sequence[Robot]):
     """Return the base parameters with the geometry of robots of the same topology."""
     robot = base.model.robot
     results = []
-    for other in robots:
-        is_alike = other.parent == robot.parent and other.revolute == robot.revolute
-        if not is_alike or other.tool is not None:
+    for other_robot in robots:
+        is_alike = (
+            other_robot.parent == robot.parent
+            and other_robot.revolute == robot.revolute
+        )
+        if not is_alike or other_robot.tool is not None:
             raise InputError(
-                f"`{other.name}` of `robots` must have "
+                f"`{other_robot.name}` of `robots` must have "
                 f"the topology of `{robot.name}`, and no tool."
             )
-        placed = robot.replace(
-            axis=other.axis,
-            rotation=other.rotation,
-            offset=other.offset,
-            gravity=other.gravity,
+        placed_robot = robot.replace(
+            axis=other_robot.axis,
+            rotation=other_robot.rotation,
+            offset=other_robot.offset,
+            gravity=other_robot.gravity,
         )
-        results.append(eqx.tree_at(lambda b: b.model.robot, base, placed))
+        results.append(eqx.tree_at(lambda b: b.model.robot, base, placed_robot))
     return results

@@ -151,7 +151,7 @@ def choose_model(
     # On the diagonal of its table a fit leaves out one part, and predicts it.
     count = len(parts)
     squares = np.diagonal(table, axis1=1, axis2=2)
-    best = _simplest(squares, candidates)
+    best = _simplest_candidate(squares, candidates)
     return ModelChoice(
         candidates=tuple(candidates),
         errors=np.sqrt(squares),
@@ -203,9 +203,9 @@ def _promise(table, candidates: Sequence[ModelCandidate]) -> float:
     numbers = range(table.shape[1])
     for part in numbers:
         other_parts = [n for n in numbers if n != part]
-        best = _simplest(table[:, part, other_parts], candidates)
+        choice = _simplest_candidate(table[:, part, other_parts], candidates)
         # The error on a part that neither the choice nor the fit has used.
-        squares.append(table[best, part, part])
+        squares.append(table[choice, part, part])
     return float(np.sqrt(np.mean(squares)))
 
 
@@ -218,28 +218,31 @@ class Excess(NamedTuple):
 
 def _excess(squares: np.ndarray) -> Excess:
     """Return by how much squared errors [candidates, parts] exceed the smallest."""
-    best = np.argmin(squares.mean(axis=1))
-    differences = squares - squares[best]
+    best_number = np.argmin(squares.mean(axis=1))
+    differences = squares - squares[best_number]
     deviations = differences.std(axis=1, ddof=1) / np.sqrt(squares.shape[1])
     return Excess(differences.mean(axis=1), deviations)
 
 
-def _simplest(
+def _simplest_candidate(
     squares: np.ndarray,
     candidates: Sequence[ModelCandidate],
 ) -> int:
     """Return the simplest of the candidates that are about as good as the best one.
 
-    The squared errors are those of candidates on parts [candidates, parts]. The second
-    comparison is between candidates with equally many parameters.
+    Of candidates with equally many parameters, those with memory are preferred.
+
+    Args:
+        squares: Squared errors on parts [candidates, parts].
+        candidates: Candidates.
     """
     sizes = np.array([c.base.size for c in candidates])
     lacks_memory = np.array([c.base.model.memory is None for c in candidates])
     indices = np.arange(len(candidates))
-    for rank in (sizes, lacks_memory):
+    for ranks in (sizes, lacks_memory):
         excess = _excess(squares[indices])
         indices = indices[excess.mean <= excess.deviation]
-        ranks = rank[indices]
-        indices = indices[ranks == ranks.min()]
+        remaining_ranks = ranks[indices]
+        indices = indices[remaining_ranks == remaining_ranks.min()]
     means = squares[indices].mean(axis=1)
     return int(indices[np.argmin(means)])

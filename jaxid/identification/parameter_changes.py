@@ -105,9 +105,9 @@ class Comparison(Summarised, eqx.Module):
     @property
     def adjusted_p_values(self) -> Vector:
         """The same, with Holm's correction for the number of tested parameters."""
-        adjusted = np.ones(len(self.indices))
-        adjusted[self.determined] = _holm(self.p_values[self.determined])
-        return adjusted
+        p_values = np.ones(len(self.indices))
+        p_values[self.determined] = _holm(self.p_values[self.determined])
+        return p_values
 
     @property
     def verdicts(self) -> tuple[Verdict, ...]:
@@ -145,8 +145,8 @@ class Comparison(Summarised, eqx.Module):
                     "p_value": p_value,
                 }
             )
-        adjusted = _holm(np.array([group["p_value"] for group in groups]))
-        for group, p_value in zip(groups, adjusted.tolist(), strict=True):
+        p_values = _holm(np.array([group["p_value"] for group in groups]))
+        for group, p_value in zip(groups, p_values.tolist(), strict=True):
             group["changed"] = p_value <= 1.0 - LEVEL
         return groups
 
@@ -286,9 +286,9 @@ def _holm(p: Vector) -> Vector:
     # The smallest p-value counts for all tests, the next one for all others.
     order = np.argsort(p, kind="stable")
     products = p[order] * np.arange(len(p), 0, -1)
-    adjusted = np.ones_like(p)
-    adjusted[order] = np.minimum(np.maximum.accumulate(products), 1.0)
-    return adjusted
+    p_values = np.ones_like(p)
+    p_values[order] = np.minimum(np.maximum.accumulate(products), 1.0)
+    return p_values
 
 
 def joint_test(

@@ -233,5 +233,7 @@ def body_columns(base: BaseParameters, body: int) -> np.ndarray:
 def _about_centre(p: jax.Array) -> jax.Array:
     """Return mass, centre of mass, and the six moments about it."""
     body = Inertia.from_parameters(p)
-    central = Inertia(body.mass, jnp.zeros_like(body.centre), body.tensor).parameters
-    return jnp.concatenate([p[:1], body.centre, central[4:]])
+    central_parameters = Inertia(
+        body.mass, jnp.zeros_like(body.centre), body.tensor
+    ).parameters
+    return jnp.concatenate([p[:1], body.centre, central_parameters[4:]])

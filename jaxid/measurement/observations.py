@@ -238,8 +238,8 @@ class Observations(eqx.Module):
 
     def _reduce(self, samples: slice, rows: slice, x: AnyArray) -> Any:
         """Smooth, take the samples between the edges, decimate, and take some rows."""
-        smooth = self.filter.smooth(x, self.sample_time)
-        return self.decimation(smooth[samples])[rows]
+        smooth_samples = self.filter.smooth(x, self.sample_time)
+        return self.decimation(smooth_samples[samples])[rows]
 
     def chunks(
         self, samples: int = 16384, row_ranges: Sequence[Range] | None = None
@@ -290,8 +290,8 @@ class Observations(eqx.Module):
         a, b = self.segments[-1]
         start_time = self.start_times[0]
         end_time = self.start_times[-1] + (b - a - 1) * self.sample_time
-        middle = float(start_time + fraction * (end_time - start_time))
-        is_early = self.reduced_time[:, None] < middle
+        middle_time = float(start_time + fraction * (end_time - start_time))
+        is_early = self.reduced_time[:, None] < middle_time
         mask = np.asarray(self.mask)
         first_part = self.replace(mask=mask & is_early)
         second_part = self.replace(mask=mask & ~is_early)

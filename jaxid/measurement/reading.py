@@ -269,8 +269,8 @@ def _stamps(log: Log) -> Iterator[Vector]:
     rows = log.tables[0].rows
     previous_time = 0.0
     for start in range(0, rows, PART_SIZE):
-        first = max(0, start - 1)
-        part = log.stamps(first, min(start + PART_SIZE, rows))
+        first_row = max(0, start - 1)
+        part = log.stamps(first_row, min(start + PART_SIZE, rows))
         if start > 0:
             # Integers and dates count from a part's first row.
             part = part - part[0] + previous_time

@@ -89,12 +89,12 @@ class Overlap(NamedTuple):
         outputs = slice(start - input_row, stop - input_row)
 
         # Samples of the decimation, then those of the filter before it.
-        low = first_sample + input_row * self.factor
+        input_start = first_sample + input_row * self.factor
         last_sample = first_sample + (stop - 1) * self.factor
-        high = min(end_sample, last_sample + self.decimation + 1)
-        begin = max(segment[0], low - self.smoothing)
-        end = min(segment[1], high + self.smoothing)
-        inputs = slice(low - begin, high - begin)
+        input_end = min(end_sample, last_sample + self.decimation + 1)
+        begin = max(segment[0], input_start - self.smoothing)
+        end = min(segment[1], input_end + self.smoothing)
+        inputs = slice(input_start - begin, input_end - begin)
 
         reduce_part = functools.partial(reduce, inputs, outputs)
         return Chunk((begin, end), rows, reduce_part)

@@ -59,9 +59,9 @@ class TimeGrid(NamedTuple):
             # A time on the grid counts as such in spite of rounding.
             samples_before = np.ceil(steps - 1e-6)
             bounds = np.clip(samples_before, 0, b - a)
-            low, high = bounds.astype(int).tolist()
-            if low < high:
-                segments[a + low, a + high] = t + low * dt
+            first_sample, end_sample = bounds.astype(int).tolist()
+            if first_sample < end_sample:
+                segments[a + first_sample, a + end_sample] = t + first_sample * dt
         samples = sum(b - a for a, b in segments)
         if samples < MIN_SAMPLES:
             times = [*self.segments.values()]
@@ -170,9 +170,9 @@ def _find_stretches(
         t = stamps - statistics.origin
         steps = np.diff(t)
         _require_forward(stamps, steps, row + first_row, source)
-        repeated = np.flatnonzero(steps <= MIN_STEP * statistics.median)
-        if in_parts and repeated.size:
-            number = row + int(repeated[0]) + 1 + first_row
+        repeated_rows = np.flatnonzero(steps <= MIN_STEP * statistics.median)
+        if in_parts and repeated_rows.size:
+            number = row + int(repeated_rows[0]) + 1 + first_row
             raise NeedsMemory(
                 f"rows of `{source}` repeat the time stamp of the row before, first "
                 f"at row {number}: remove them, or give `sample_time`."
@@ -181,9 +181,9 @@ def _find_stretches(
         starts += (row + gaps + 1).tolist()
         start_times += t[gaps + 1].tolist()
         pauses += steps[gaps].tolist()
-        regular = steps[steps < statistics.max_regular]
-        regular_time += float(regular.sum())
-        regular_steps += len(regular)
+        regular_gaps = steps[steps < statistics.max_regular]
+        regular_time += float(regular_gaps.sum())
+        regular_steps += len(regular_gaps)
         row += len(steps)
     sample_time = regular_time / regular_steps
     return Stretches(starts, start_times, pauses, row + 1, sample_time)
@@ -224,9 +224,9 @@ def _gap_notes(grid: TimeGrid, stretches: Stretches, origin: float) -> Texts:
 
 
 def _require_forward(stamps: Vector, steps: Vector, row: int, source: str) -> None:
-    back = np.flatnonzero(steps < 0)
-    if back.size:
-        i = int(back[0])
+    backward_steps = np.flatnonzero(steps < 0)
+    if backward_steps.size:
+        i = int(backward_steps[0])
         raise InputError(
             f"time of `{source}` runs backwards from {stamps[i]:.9g} s to "
             f"{stamps[i + 1]:.9g} s at row {row + i + 1}: sort the log, or split it "

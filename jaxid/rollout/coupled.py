@@ -81,13 +81,14 @@ def _simulate(
 
     def step(states: tuple[State, Array], commands: Array):
         start_state, last_velocity = states
-        M = load = None
-        if programs is not None:
-            M, load = lower(programs.bodies).dense(
-                *middle_of(start_state.q, start_state.w, last_velocity, h)
-            )
-            M = None if programs.solve is None else M
         zero_torque = jnp.zeros_like(last_velocity)
+        M = None
+        load = None
+        if programs is not None:
+            middle_state = middle_of(start_state.q, start_state.w, last_velocity, h)
+            M, load = lower(programs.bodies).dense(*middle_state)
+            # Joints that are not coupled need no mass matrix.
+            M = None if programs.solve is None else M
 
         def stage(state: State, stage_inputs: tuple[Array, ...]):
             inputs = Stages(
@@ -108,13 +109,14 @@ def _simulate(
         return (end_state, start_state.w), (*stages, end_state.q, load, M)
 
     start = State(*jnp.moveaxis(jnp.asarray(motion.start), 0, -1))
-    commands = jax.vmap(
+    commands_of_motions = jax.vmap(
         lambda x, y: commands_of_stages(x.T, y, steps, hold)[0], (-1, 0), -1
     )
-    commands = commands(theta, motion)
-    joint_parameters = tuple(theta)
+    commands = commands_of_motions(theta, motion)
     step_commands = commands.reshape(-1, 2, *commands.shape[1:])
-    return Path(*jax.lax.scan(step, (start, start.w), step_commands)[1])
+    joint_parameters = tuple(theta)
+    _, path = jax.lax.scan(step, (start, start.w), step_commands)
+    return Path(*path)
 
 
 def middle_of(q: Any, v: Any, last: Any, h: Any) -> tuple[Any, Any]:
@@ -352,9 +354,11 @@ class CoupledSimulator:
 def _body_terms(path: Path, h: float):
     """Return mass matrices and bias forces of a motion's steps, and their places."""
     v = path.states.w[:, 0]
-    middle = middle_of(path.states.q[:, 0], v, np.concatenate([v[:1], v[:-1]]), h)
+    middle_states = middle_of(
+        path.states.q[:, 0], v, np.concatenate([v[:1], v[:-1]]), h
+    )
     M = np.zeros((*v.shape, v.shape[1])) if path.M is None else path.M
-    return M, np.zeros_like(v) if path.load is None else path.load, middle
+    return M, np.zeros_like(v) if path.load is None else path.load, middle_states
 
 
 def _compose(
@@ -386,10 +390,10 @@ def _compose(
     columns = rows + np.arange(len(joint))
     state = np.tile(np.eye(rows, rows + len(joint)), (count, 1, 1))
     q, w, *integral, last_velocity = np.split(state, 1 + size // n, axis=1)
-    middle = q, w
+    middle_state = q, w
     for k, s in np.ndindex(steps, 2):
         if s == 0:
-            middle = middle_of(q, w, last_velocity, h)
+            middle_state = middle_of(q, w, last_velocity, h)
             last_velocity = w
         balance = jax.tree.map(lambda x, k=k, s=s: x[:, k, s], sample_partials)
         is_moving = (velocities[:, k, s] != 0.0)[..., None]
@@ -407,7 +411,7 @@ def _compose(
             )
             are_both_moving = is_moving & is_moving.swapaxes(1, 2)
             A += by_w * are_both_moving
-            force += by_w @ w + by_q @ middle[0] + by_v @ middle[1]
+            force += by_w @ w + by_q @ middle_state[0] + by_v @ middle_state[1]
         change = np.linalg.solve(A, force * is_moving)
         share = SHARES[s]
         for x in integral:

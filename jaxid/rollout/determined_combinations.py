@@ -113,7 +113,7 @@ class _Rows(NamedTuple):
         motion = self.refinement.simulator.motion
         motions, joints = self.weights.shape
         channels = motions * joints
-        counted = np.asarray(motion.counted)
+        sample_mask = np.asarray(motion.counted)
         B = np.zeros_like(self.information)
         place = np.ix_(indices, indices)
         B[place] = _inverse(self.information[place])
@@ -126,13 +126,13 @@ class _Rows(NamedTuple):
             np.zeros((1, len(B))),
             columns,
             list(self.refinement.residuals.reshape(channels, 1, -1)),
-            counted.mean(axis=-1).ravel(),
+            sample_mask.mean(axis=-1).ravel(),
             float(motion.sample_time.mean()),
         )
         variance, dof = (x[0] for x in sandwich)
         # The sandwich is blind where no error can show: there the information alone
         # tells.
-        sample_count = float(counted.sum(axis=-1).max())
+        sample_count = float(sample_mask.sum(axis=-1).max())
         variance = np.maximum(variance, squares / max(sample_count, 1.0))
         changes = self.scores @ B
         motion_dof = max(motions - 1, 1)
@@ -182,9 +182,9 @@ def determined_combinations(
         for m in np.flatnonzero(kappa[k]):
             if m != i:
                 is_elsewhere = joints[m] != joints[i]
-                where = f" of {joint_names[joints[m]]}" if is_elsewhere else ""
-                name += f" {kappa[k, m]:+.3g} {PARAMETERS[symbols[m]].symbol}{where}"
-                merged_meanings.append(PARAMETERS[symbols[m]].meaning + where)
+                owner = f" of {joint_names[joints[m]]}" if is_elsewhere else ""
+                name += f" {kappa[k, m]:+.3g} {PARAMETERS[symbols[m]].symbol}{owner}"
+                merged_meanings.append(PARAMETERS[symbols[m]].meaning + owner)
         if merged_meanings:
             meaning = f"{meaning} and {', '.join(merged_meanings)} only together"
         numbers = (

@@ -109,7 +109,7 @@ def bounded_step(
     A parameter that would leave its bounds goes to them, and the others follow. Where
     derivatives have overflowed, the step is zero.
     """
-    lower, upper = bounds
+    lower_limits, upper_limits = bounds
     is_finite = np.isfinite(gradient).all(axis=-1)
     is_finite &= np.isfinite(information).all(axis=(-1, -2))
     is_finite = np.asarray(is_finite)
@@ -120,8 +120,8 @@ def bounded_step(
     scaled_matrix = information / size[..., None] / size[..., None, :]
     identity = np.eye(x.shape[-1])
     diagonal_damping = np.asarray(damping)[..., None, None] + 1e-12
-    leaves_below = (x <= lower) & (gradient > 0)
-    leaves_above = (x >= upper) & (gradient < 0)
+    leaves_below = (x <= lower_limits) & (gradient > 0)
+    leaves_above = (x >= upper_limits) & (gradient < 0)
     is_moving = free & ~leaves_below & ~leaves_above & (size > 1e-140)
     moving_mask = is_moving.astype(float)
     step = np.zeros_like(gradient)
@@ -134,11 +134,11 @@ def bounded_step(
         is_moving = moving_mask > 0
         step = np.where(is_moving, solution / size, step)
         end = x + step
-        is_leaving = is_moving & ((end < lower) | (end > upper))
+        is_leaving = is_moving & ((end < lower_limits) | (end > upper_limits))
         if not is_leaving.any():
             break
         # Those that move start again, now that others have gone to their bounds.
         step = np.where(is_moving, 0.0, step)
-        step = np.where(is_leaving, np.clip(end, lower, upper) - x, step)
+        step = np.where(is_leaving, np.clip(end, lower_limits, upper_limits) - x, step)
         moving_mask = np.where(is_leaving, 0.0, moving_mask)
     return step

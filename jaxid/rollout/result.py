@@ -177,7 +177,8 @@ class ServoFit:
         Args:
             logs: Recordings whose `forces` are the commands.
         """
-        motion = ServoMotion.of([logs] if isinstance(logs, Recording) else logs)
+        logs = [logs] if isinstance(logs, Recording) else logs
+        motion = ServoMotion.of(logs)
         simulated_positions = self.paths(motion)
         linear_positions = ServoSimulator(motion, self.time_step).paths(
             self.linear[None]
@@ -211,9 +212,8 @@ class ServoFit:
             logs: Recordings whose `forces` are the commands.
             horizon: Length of the windows [s].
         """
-        windows = ServoMotion.of(
-            [logs] if isinstance(logs, Recording) else logs
-        ).windows(horizon)
+        logs = [logs] if isinstance(logs, Recording) else logs
+        windows = ServoMotion.of(logs).windows(horizon)
         errors = self.paths(windows) - np.asarray(windows.positions)
         return np.sqrt(np.mean(errors**2, axis=(0, 2)))
 
@@ -306,12 +306,12 @@ def _notes_on_limits(refinement: Refinement, joint_names: tuple[str, ...]) -> li
 def _notes_on_errors(refinement: Refinement, joint_names: tuple[str, ...]) -> list[str]:
     """Return a note if errors show that an effect is missing."""
     motion = refinement.simulator.motion
-    counted = np.asarray(motion.counted) > 0
+    sample_mask = np.asarray(motion.counted) > 0
     positions = np.asarray(motion.positions)
     joint_errors = []
     for j, name in enumerate(joint_names):
         residuals = refinement.residuals[:, j]
-        rms = systematic_error(residuals, counted[:, j], positions[:, j])
+        rms = systematic_error(residuals, sample_mask[:, j], positions[:, j])
         if rms > 0:
             joint_errors.append(f"{name} {1e3 * rms:.2g}")
     if not joint_errors:

@@ -129,17 +129,16 @@ class Stages(NamedTuple):
     def of(
         cls, theta: Array, motion: ServoMotion, steps: int, hold: AnyArray
     ) -> tuple["Stages", Array]:
-        """Return the stages of one motion with so many steps in each sample time.
+        """Return the stages of one motion, and derivatives of commands by the delay.
 
-        Also return the derivatives of their commands by the delay.
+        `steps` is the number of steps in each sample time.
         """
         count = motion.positions.shape[-1] - 1
 
         def repeat_stages(x: AnyArray) -> Array:
             rows_per_sample = (x.shape[-1] - 1) // count
-            return jnp.repeat(
-                jnp.asarray(x).T[:-1], 2 * steps // rows_per_sample, axis=0
-            )
+            stages_per_row = 2 * steps // rows_per_sample
+            return jnp.repeat(jnp.asarray(x).T[:-1], stages_per_row, axis=0)
 
         def alternate_stages(values: tuple[float, float]) -> Array:
             return jnp.tile(jnp.array(values), count * steps)[:, None]

@@ -229,8 +229,8 @@ class TorqueRolloutFit(Summarised):
         """Return a table of the estimates with 95 % intervals."""
         names = [
             name
-            for name, free in zip(self.rollout.names, self.free, strict=True)
-            if free
+            for name, is_free in zip(self.rollout.names, self.free, strict=True)
+            if is_free
         ]
         deviations = self.uncertainty.standard_deviations
         values, deviation_texts = with_deviations(self.unknowns[self.free], deviations)
@@ -361,9 +361,9 @@ def _uncertainty(
 def _limits(rollout: TorqueRollout) -> tuple[np.ndarray, np.ndarray]:
     """Return limits of the unknowns: delays within the margin, positive gains."""
     delay = rollout.base.size
-    lower = np.full(len(rollout.names), -np.inf)
-    upper = np.full(len(rollout.names), np.inf)
-    lower[delay] = -0.8 * MARGIN
-    upper[delay] = 0.8 * MARGIN
-    lower[delay + 1 :] = 0.0
-    return lower, upper
+    lower_limits = np.full(len(rollout.names), -np.inf)
+    upper_limits = np.full(len(rollout.names), np.inf)
+    lower_limits[delay] = -0.8 * MARGIN
+    upper_limits[delay] = 0.8 * MARGIN
+    lower_limits[delay + 1 :] = 0.0
+    return lower_limits, upper_limits

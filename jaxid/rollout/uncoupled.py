@@ -69,6 +69,28 @@ def _path(theta: Array, motion: ServoMotion, steps: int) -> tuple[Array]:
     return (jnp.concatenate([start.q[None], path[2 * steps - 1 :: 2 * steps]]).T,)
 
 
+def _advance_tangents(h: AnyArray, state: State, coefficients) -> tuple[State, Array]:
+    """Advance derivatives of the state by a sample time; return those of positions."""
+    q, w, integral = state
+    for (
+        by_q,
+        by_w,
+        share,
+        factor,
+        mask,
+        source,
+        *terms,
+    ) in zip(*coefficients, strict=True):
+        u = by_q * q + by_w * w + source
+        if integral is not None:
+            by_integral, rate, growth = terms
+            u = u + by_integral * integral
+            integral = integral + share * h * (growth - rate * (q + GAMMA * h * u))
+        q = q + share * h * u
+        w = mask * (w + factor * (u - w))
+    return State(q, w, integral), q
+
+
 @functools.partial(jax.jit, static_argnums=2)
 def _moments(theta: Array, motion: ServoMotion, steps: int) -> tuple[Array, ...]:
     """Return sums of squared errors, half their gradients, and Gauss-Newton matrices.
@@ -81,34 +103,12 @@ def _moments(theta: Array, motion: ServoMotion, steps: int) -> tuple[Array, ...]
     n = len(theta)
     P = len(PARAMETERS)
 
-    def forward(state: State, stage: Stages):
+    def simulate_stage(state: State, stage: Stages):
         next_state, u = _stage(state, theta.T, stage, h)
         return next_state, (state, u)
 
-    def tangent(state: State, inputs: tuple[Array, ...]):
-        q, w, integral = state
-        for (
-            by_q,
-            by_w,
-            share,
-            factor,
-            mask,
-            source,
-            *terms,
-        ) in zip(*inputs, strict=True):
-            u = by_q * q + by_w * w + source
-            if integral is not None:
-                by_integral, rate, growth = terms
-                u = u + by_integral * integral
-                integral = integral + share * h * (growth - rate * (q + GAMMA * h * u))
-            q = q + share * h * u
-            w = mask * (w + factor * (u - w))
-        return State(q, w, integral), q
-
-    def block(state, inputs):
-        state, tangents, *sums = state
-        stages, by_delay, positions, sample_mask = inputs
-        state, (states, u) = jax.lax.scan(forward, state, stages)
+    def tangent_coefficients(states, u, stages, by_delay):
+        """Return the coefficients of the linear recursion [samples, stages, ...]."""
         balance = partials(states, u, theta, stages, by_delay, h, jnp.zeros_like(u))
         motion_mask = jnp.where(u == 0.0, 0.0, 1.0)
         factor = motion_mask / balance.resistance
@@ -125,11 +125,20 @@ def _moments(theta: Array, motion: ServoMotion, steps: int) -> tuple[Array, ...]
         if states.integral is not None:
             growth = jnp.concatenate(balance.growth, axis=-1)
             rows = *rows, factor * balance.by_integral, balance.rate, growth
-        rows = tuple(
+        return tuple(
             x.reshape(BLOCK_SIZE, 2 * steps, -1, min(n, x.shape[-1])) for x in rows
         )
-        tangents, S = jax.lax.scan(tangent, tangents, rows)
-        path = jnp.concatenate([states.q[2 * steps :: 2 * steps], state.q[None]])
+
+    advance_tangents = functools.partial(_advance_tangents, h)
+
+    def add_block(carry, inputs):
+        start_state, start_tangents, *sums = carry
+        stages, by_delay, positions, sample_mask = inputs
+        end_state, (states, u) = jax.lax.scan(simulate_stage, start_state, stages)
+        coefficients = tangent_coefficients(states, u, stages, by_delay)
+        # Derivatives S of the positions [samples, parameters, joints].
+        end_tangents, S = jax.lax.scan(advance_tangents, start_tangents, coefficients)
+        path = jnp.concatenate([states.q[2 * steps :: 2 * steps], end_state.q[None]])
         r = (path - positions) * sample_mask
         S = S * sample_mask[:, None]
         block_sums = (
@@ -137,11 +146,8 @@ def _moments(theta: Array, motion: ServoMotion, steps: int) -> tuple[Array, ...]
             jnp.einsum("tpj,tj->jp", S, r),
             jnp.einsum("tpj,tqj->jpq", S, S),
         )
-        return (
-            state,
-            tangents,
-            *(x + y for x, y in zip(sums, block_sums, strict=True)),
-        ), None
+        total_sums = (x + y for x, y in zip(sums, block_sums, strict=True))
+        return (end_state, end_tangents, *total_sums), None
 
     def blocks(x: Array, size: int, mode: str = "edge") -> Array:
         padded_rows = jnp.pad(x, ((0, -len(x) % size), (0, 0)), mode)
@@ -161,7 +167,8 @@ def _moments(theta: Array, motion: ServoMotion, steps: int) -> tuple[Array, ...]
 
     tangents = jax.vmap(by_parameter)(jnp.eye(P))
     start = _start(theta, motion), tangents, *sums
-    return jax.lax.scan(block, start, (*stages, positions, sample_mask))[0][2:]
+    end, _ = jax.lax.scan(add_block, start, (*stages, positions, sample_mask))
+    return end[2:]
 
 
 @dataclasses.dataclass(frozen=True)

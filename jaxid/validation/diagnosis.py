@@ -166,9 +166,9 @@ def diagnose(
         InputError: If log and robot do not belong together, the log is too short to
             filter, or it is neither a recording nor on disk.
     """
-    examined = _examined_log(log, robot, observations, min_speed)
-    excerpt = examined.excerpt
-    statistics = _statistics(examined.all_observations, robot.joints, progress)
+    examined_log = _examined_log(log, robot, observations, min_speed)
+    excerpt = examined_log.excerpt
+    statistics = _statistics(examined_log.all_observations, robot.joints, progress)
     faults = channel_findings(robot, excerpt, statistics)
     faulty_joints = tuple(dict.fromkeys(joint for joint, _ in faults))
     lost_rows = clock_findings(excerpt)
@@ -190,9 +190,9 @@ def diagnose(
         statistics,
         tuple(findings),
         faulty_joints,
-        examined.observations,
+        examined_log.observations,
         (excerpt.angles_on_motor_side, excerpt.forces_on_motor_side),
-        examined.notes,
+        examined_log.notes,
     )
     return diagnosis if fit is None else diagnosis.with_fit(fit)
 
@@ -340,21 +340,19 @@ def departures(fit: Fit, observations: Observations) -> tuple[str, ...]:
     robot = fit.base.model.robot
     motion = o.motion[o.instants]
     forces = np.asarray(o.reduced_forces)
-    errors = (
-        np.abs(forces - fit.predict(motion) - fit.base.tool_forces(motion)) * o.mask
-    )
+    predicted_forces = fit.predict(motion) + fit.base.tool_forces(motion)
+    errors = np.abs(forces - predicted_forces) * o.mask
     rms_forces = np.sqrt(np.mean(forces**2, axis=0))
     length = o.filter.edge(o.sample_time) + 0.01 * o.samples
     findings = []
     for j, (name, error) in enumerate(zip(robot.joint_names, errors.T, strict=True)):
         k = int(np.argmax(error))
-        other_errors = error[np.abs(o.instants - o.instants[k]) > length]
+        is_elsewhere = np.abs(o.instants - o.instants[k]) > length
+        usual_error = error[is_elsewhere].max(initial=0.0)
         row = np.asarray(fit.base.regressor(motion[k]))[j]
         deviation = _deviation(fit, row)
-        usual_error = other_errors.max(initial=0.0)
-        if deviation <= usual_error and error[k] > max(
-            0.5 * rms_forces[j], 5.0 * (deviation + usual_error)
-        ):
+        min_departure = max(0.5 * rms_forces[j], 5.0 * (deviation + usual_error))
+        if deviation <= usual_error and error[k] > min_departure:
             findings.append(
                 f"the force of joint `{name}` departs from the model by {error[k]:.3g} "
                 f"{robot.force_unit(j)} at {o.time[o.instants[k]]:.5g} s, and at no "
@@ -430,19 +428,18 @@ def delay_notes(
         "the log than the angles"
     )
     # A delay of a bus is that of all joints; other effects differ from joint to joint.
-    if min_delay <= 0.0 <= max_delay or abs(delay.seconds) < float(
-        np.std(delay.of_joints)
-    ):
+    is_scattered = abs(delay.seconds) < np.std(delay.of_joints)
+    if is_scattered or min_delay <= 0.0 <= max_delay:
         return (f"{text}: a delay cannot be told from none.",)
     if delay.p_value <= 0.001:
-        min_joint_delay, max_joint_delay = (
-            1e3 * float(x) for x in (np.min(delay.of_joints), np.max(delay.of_joints))
-        )
+        joint_delays = 1e3 * np.asarray(delay.of_joints)
         delay_range = (
-            f"{min_joint_delay:.3g} to {max_joint_delay:.3g} ms joint by joint"
+            f"{joint_delays.min():.3g} to {joint_delays.max():.3g} ms joint by joint"
         )
         return (f"{text}, but {delay_range}: as likely, the model lacks an effect.",)
-    if commanded is None and delay.feedback > 0.1 * abs(delay.seconds):
+    # The controller's reaction to errors of the forces moves the angles, too.
+    has_feedback = delay.feedback > 0.1 * abs(delay.seconds)
+    if commanded is None and has_feedback:
         cure = "name the commanded angles (`recording.commands`) to tell how much"
     else:
         cure = f"`force_delay = {delay.seconds:.3g}` in `[recording]` removes that"

@@ -449,10 +449,10 @@ def _misfit(rows: np.ndarray, is_friction: np.ndarray, folds: int = 1) -> float:
         part = np.concatenate(stretches[k::folds])
         matrix = part.reshape(-1, theta.shape[2])
         products.append(matrix.T @ matrix)
-    total = np.sum(products, axis=0)
+    total_products = np.sum(products, axis=0)
     square = 0.0
     for fold in products:
-        fit_products = total - fold if folds > 1 else fold
+        fit_products = total_products - fold if folds > 1 else fold
         parameters = _braking_parameters(fit_products, is_friction)
         combination = np.append(parameters, -1.0)
         square += max(float(combination @ fold @ combination), 0.0)

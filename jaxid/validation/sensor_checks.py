@@ -12,6 +12,9 @@ from jaxid.robot.robot import Robot
 
 from .torque_errors import REST_SHARE
 
+Findings = list[tuple[int, str]]
+"""Sentences about faults, each with the index of its joint."""
+
 MAX_LAG = 1.5
 """Samples by which velocities may stand later than the derivatives of the angles."""
 JUMP = 15.0
@@ -103,16 +106,19 @@ def _joint_findings(robot: Robot, j: int, statistics: LogStatistics) -> Iterator
     name = robot.joint_names[j]
     unit = robot.joint_unit(j)
     limits = robot.limits
-    minimum = float(limits.position_min[j])
-    maximum = float(limits.position_max[j])
-    a = statistics.lowest[j]
-    b = statistics.highest[j]
-    slack = 0.02 * (maximum - minimum) if np.isfinite(maximum - minimum) else 0.0
-    if not minimum - slack <= a <= b <= maximum + slack:
+    lower_limit = float(limits.position_min[j])
+    upper_limit = float(limits.position_max[j])
+    minimum = statistics.lowest[j]
+    maximum = statistics.highest[j]
+    # Joints without limits have no range.
+    slack = 0.02 * (upper_limit - lower_limit)
+    if not np.isfinite(slack):
+        slack = 0.0
+    if not lower_limit - slack <= minimum <= maximum <= upper_limit + slack:
         yield (
-            f"joint `{name}` moves from {a:.3g} to {b:.3g}, its range is {minimum:.3g} "
-            f"to {maximum:.3g} {unit}: check `recording.angle_unit`, `side`, "
-            "`angle_signs` and `angle_offsets`."
+            f"joint `{name}` moves from {minimum:.3g} to {maximum:.3g}, its range is "
+            f"{lower_limit:.3g} to {upper_limit:.3g} {unit}: check "
+            "`recording.angle_unit`, `side`, `angle_signs` and `angle_offsets`."
         )
     if statistics.speed[j] > 1.1 * limits.velocity[j]:
         yield (
@@ -120,9 +126,10 @@ def _joint_findings(robot: Robot, j: int, statistics: LogStatistics) -> Iterator
             f"is {float(limits.velocity[j]):.3g} {unit}/s: check the units, or lower "
             "the cut-off."
         )
-    if b - a < 0.02:
+    span = maximum - minimum
+    if span < 0.02:
         yield (
-            f"joint `{name}` moves by {b - a:.2g} {unit} only: is it the right column "
+            f"joint `{name}` moves by {span:.2g} {unit} only: is it the right column "
             "and unit?"
         )
 
@@ -151,17 +158,24 @@ def _force_findings(robot: Robot, statistics: LogStatistics) -> list[str]:
 
 def channel_findings(
     robot: Robot, recording: Recording, statistics: LogStatistics | None = None
-) -> list[tuple[int, str]]:
+) -> Findings:
     """Look for held, spiky, wrapped and late channels.
 
     Return the joint and a sentence of each.
     """
+    findings = _position_and_force_findings(robot, recording)
+    if statistics is not None and recording.velocities is not None:
+        findings += _velocity_findings(robot, recording, statistics)
+    return findings
+
+
+def _position_and_force_findings(robot: Robot, recording: Recording) -> Findings:
     r = recording
-    faults = []
+    findings = []
     angles = np.asarray(r.angles)
     forces = np.asarray(r.forces)
     time = np.asarray(r.time)
-    owner = "the motor of joint" if r.angles_on_motor_side else "joint"
+    owner = _angle_owner(r)
     for j, name in enumerate(robot.joint_names):
         x = angles[:, j]
         other_angles = np.delete(angles, j, 1)
@@ -169,28 +183,41 @@ def channel_findings(
         text = text or _spike_text(x, time, r.segments)
         text = text or _held_angle_text(x, other_angles, time, r.segments)
         if text:
-            faults.append((j, f"the angle of {owner} `{name}` {text}"))
+            findings.append((j, f"the angle of {owner} `{name}` {text}"))
         hold = _held_force_text(forces[:, j], x, time, r.segments)
         if hold:
-            faults.append((j, f"the forces of joint `{name}` {hold}"))
-    if statistics is not None and r.velocities is not None:
-        for j, ratio in unlike_derivatives(r).items():
+            findings.append((j, f"the forces of joint `{name}` {hold}"))
+    return findings
+
+
+def _velocity_findings(
+    robot: Robot, recording: Recording, statistics: LogStatistics
+) -> Findings:
+    """Compare measured velocities with the derivatives of the angles."""
+    findings = []
+    owner = _angle_owner(recording)
+    for j, ratio in unlike_derivatives(recording).items():
+        text = (
+            f"the velocities of {owner} `{robot.joint_names[j]}` are {ratio:.3g} "
+            "times the derivatives of its angles: check `recording.velocity_unit` "
+            "and the order of the columns."
+        )
+        findings.append((j, text))
+    for j, name in enumerate(robot.joint_names):
+        lag = statistics.lateness(j)
+        if abs(lag) > MAX_LAG * recording.sample_time:
+            direction = "later" if lag > 0 else "earlier"
             text = (
-                f"the velocities of {owner} `{robot.joint_names[j]}` are {ratio:.3g} "
-                "times the derivatives of its angles: check `recording.velocity_unit` "
-                "and the order of the columns."
+                f"the velocities of joint `{name}` stand {1e3 * abs(lag):.3g} ms "
+                f"{direction} in the log than the derivatives of its angles: leave "
+                "`recording.velocities` out."
             )
-            faults.append((j, text))
-        for j, name in enumerate(robot.joint_names):
-            lag = statistics.lateness(j)
-            if abs(lag) > MAX_LAG * r.sample_time:
-                text = (
-                    f"the velocities of joint `{name}` stand {1e3 * abs(lag):.3g} ms "
-                    f"{'later' if lag > 0 else 'earlier'} in the log than the "
-                    "derivatives of its angles: leave `recording.velocities` out."
-                )
-                faults.append((j, text))
-    return faults
+            findings.append((j, text))
+    return findings
+
+
+def _angle_owner(recording: Recording) -> str:
+    return "the motor of joint" if recording.angles_on_motor_side else "joint"
 
 
 def clock_findings(recording: Recording) -> list[str]:

@@ -279,8 +279,10 @@ def torque_errors(
     step = comparison_step(observations)
     mask = np.asarray(observations.mask)
     estimator = WeightedLeastSquares(ResidualVariances())
-    own_parameters = estimator(RegressionProblem(fit.base, [observations])).parameters
-    columns = np.zeros((5, len(mask[::step]), observations.joints))
+    problem = RegressionProblem(fit.base, [observations])
+    refitted_parameters = estimator(problem).parameters
+    # Measured, predicted and refitted forces, speeds and positions.
+    compared_rows = np.zeros((5, len(mask[::step]), observations.joints))
     for chunk in observations.chunks(65536):
         start, stop = chunk.rows
         # Masked parts are not evaluated.
@@ -288,16 +290,19 @@ def torque_errors(
             motion, forces = observations.read(slice(*chunk.samples))
             tool = fit.base.tool_forces(motion)
             predicted_forces = fit.predict(motion) + tool
-            refitted_forces = fit.base.forces_in_numpy(own_parameters, motion) + tool
+            refitted_forces = fit.base.forces_in_numpy(refitted_parameters, motion)
+            refitted_forces = refitted_forces + tool
+            # Rows 0, step, 2 step, ... of the log, as far as they lie in the chunk.
             rows = slice(-(-start // step), -(-stop // step))
             chunk_rows = slice(rows.start * step - start, None, step)
-            for kind, x in enumerate(
-                (forces, predicted_forces, refitted_forces, motion.qd, motion.q)
-            ):
-                columns[kind, rows] = chunk.reduce(x)[chunk_rows]
+            samples = (forces, predicted_forces, refitted_forces, motion.qd, motion.q)
+            for number, x in enumerate(samples):
+                compared_rows[number, rows] = chunk.reduce(x)[chunk_rows]
         if progress is not None:
             progress(stop / observations.rows)
-    measured_forces, predicted_forces, refitted_forces, speeds, positions = columns
+    measured_forces, predicted_forces, refitted_forces, speeds, positions = (
+        compared_rows
+    )
     return TorqueErrors(
         name=observations.name,
         time=observations.reduced_time[::step],

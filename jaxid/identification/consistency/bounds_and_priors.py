@@ -52,21 +52,25 @@ class BodyBounds(eqx.Module):
             setattr(self, name, _of_each_body(name, getattr(self, name), bodies))
         for name in ("centre_min", "centre_max"):
             setattr(self, name, _of_each_body(name, getattr(self, name), bodies, 3))
-        low = self.mass_min
-        high = self.mass_max
+        mass_min = self.mass_min
+        mass_max = self.mass_max
         radius = self.radius
         is_box = self.centre_min < self.centre_max
-        self._require("mass_max", "positive and finite", (high > 0) & (high < np.inf))
+        self._require(
+            "mass_max", "positive and finite", (mass_max > 0) & (mass_max < np.inf)
+        )
         self._require("radius", "positive and finite", (radius > 0) & (radius < np.inf))
         self._require(
-            "mass_min", "at least 0 and below `mass_max`", (low >= 0) & (low < high)
+            "mass_min",
+            "at least 0 and below `mass_max`",
+            (mass_min >= 0) & (mass_min < mass_max),
         )
         self._require("centre_min", "below `centre_max`", is_box)
         total = self.total_mass
-        if total is not None and not low.sum() < total < high.sum():
+        if total is not None and not mass_min.sum() < total < mass_max.sum():
             raise InputError(
-                f"`total_mass` must be from {low.sum():g} "
-                f"to {high.sum():g} kg, but is {total:g} kg."
+                f"`total_mass` must be from {mass_min.sum():g} "
+                f"to {mass_max.sum():g} kg, but is {total:g} kg."
             )
         # Bounds that contradict each other are an error here, not in the estimation.
         _ = self.inner_centres
@@ -137,17 +141,17 @@ class BodyBounds(eqx.Module):
             InputError: If there are none for some body.
         """
         radius = self.radius[:, None]
-        low = np.maximum(self.centre_min, -radius)
-        high = np.minimum(self.centre_max, radius)
-        edge = 0.1 * (high - low)
-        point = 0.5 * (low + high)
+        lower_corner = np.maximum(self.centre_min, -radius)
+        upper_corner = np.minimum(self.centre_max, radius)
+        edge = 0.1 * (upper_corner - lower_corner)
+        point = 0.5 * (lower_corner + upper_corner)
         # Alternating projections onto the sphere and the box, each a little smaller.
         for _ in range(200):
             distance = np.linalg.norm(point / radius, axis=1, keepdims=True)
             point = point / np.maximum(distance / 0.9, 1.0)
-            point = np.clip(point, low + edge, high - edge)
+            point = np.clip(point, lower_corner + edge, upper_corner - edge)
 
-        is_in_box = ((low < point) & (point < high)).all(axis=1)
+        is_in_box = ((lower_corner < point) & (point < upper_corner)).all(axis=1)
         is_in_sphere = np.linalg.norm(point / radius, axis=1) < 0.99
         is_inside = is_in_box & is_in_sphere
         if not is_inside.all():
@@ -160,9 +164,9 @@ class BodyBounds(eqx.Module):
 
 def _span(values) -> str:
     """Return the range of some numbers in words."""
-    low = f"{np.min(values):.3g}"
-    high = f"{np.max(values):.3g}"
-    return high if np.ptp(values) == 0 else f"{low} to {high}"
+    minimum = f"{np.min(values):.3g}"
+    maximum = f"{np.max(values):.3g}"
+    return maximum if np.ptp(values) == 0 else f"{minimum} to {maximum}"
 
 
 def _of_each_body(name: str, value: Numbers, bodies: int, *shape: int) -> np.ndarray:

@@ -84,8 +84,8 @@ class ConeProgram(eqx.Module):
     def require_interior(self) -> None:
         """Check that the start lies strictly inside all bounds."""
         S, s = self.slacks(self.start)
-        smallest = np.linalg.eigvalsh(S).min()
-        if not (smallest > 0 and s.min() > 0):
+        min_eigenvalue = np.linalg.eigvalsh(S).min()
+        if not (min_eigenvalue > 0 and s.min() > 0):
             raise InputError("no ball lies within all bounds: widen them.")
 
     def slacks(self, y: Values) -> tuple[Values, Values]:
@@ -126,9 +126,9 @@ class ConeProgram(eqx.Module):
     def split_linear(self, z: Values) -> tuple[Values, Values, Values]:
         """Return numbers of inequalities: of bodies, and of both limits of drives."""
         count = self.bodies * self.rows.shape[-2]
-        start_of_upper = count + self.drives
+        upper_start = count + self.drives
         bodies = self.xp.reshape(z[:count], (self.bodies, -1))
-        return bodies, z[count:start_of_upper], z[start_of_upper:]
+        return bodies, z[count:upper_start], z[upper_start:]
 
 
 def cone_program(

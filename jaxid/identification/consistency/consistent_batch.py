@@ -131,15 +131,15 @@ def consistent_batch(
     estimator = estimator or PhysicallyConsistent()
     arrays = (np.asarray(R), np.asarray(z), np.asarray(rows))
     # Errors cannot be raised in compiled code: the first data set is checked before.
-    feasible = estimator.feasible_set(base)
-    _, program = estimator.program(base, feasible, *(x[0] for x in arrays))
+    feasible_set = estimator.feasible_set(base)
+    _, program = estimator.program(base, feasible_set, *(x[0] for x in arrays))
     program.require_interior()
-    one = ConsistentSolver(base, estimator)
+    data_set_solver = ConsistentSolver(base, estimator)
     # A core gains nothing from solving data sets in step: it waits for the slowest.
     if jax.default_backend() == "cpu":
-        solve = functools.partial(_solve_many, one, None)
+        solve = functools.partial(_solve_many, data_set_solver, None)
         return in_parts(lambda part: solve(*part), arrays, CPU_PART)
-    return _solve_many(one, ACCELERATOR_BATCH, *arrays)
+    return _solve_many(data_set_solver, ACCELERATOR_BATCH, *arrays)
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))

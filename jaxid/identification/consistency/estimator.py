@@ -129,37 +129,37 @@ class PhysicallyConsistent(AbstractEstimator):
         # Its standard deviations serve the consistent estimate, too.
         unbounded_estimate = Estimate.solve(rows, weights, Complete())
         R, z = rows.factors.weighted(weights)
-        feasible = self.feasible_set(base)
+        feasible_set = self.feasible_set(base)
         count = int(rows.factors.rows.sum())
-        data, program = self.program(base, feasible, R, z, count)
+        data, program = self.program(base, feasible_set, R, z, count)
         optimum = _solve(program)
-        p = feasible.standard_parameters(data, optimum.y)
+        p = feasible_set.standard_parameters(data, optimum.y)
         parameters = np.asarray(base.from_standard(p))
-        bodies = p[np.array(feasible.bodies)]
+        bodies = p[np.array(feasible_set.bodies)]
         # Bodies with principal axes have seven parameters, no products of inertia.
         bodies = np.pad(bodies, ((0, 0), (0, 10 - bodies.shape[1])))
 
         residual = float(np.linalg.norm(R @ parameters - z))
         min_residual = float(np.linalg.norm(R @ unbounded_estimate.parameters - z))
         increase = residual / min_residual - 1.0 if min_residual > 0 else np.inf
-        determined = np.array(
+        is_determined = np.array(
             [x is Identifiability.ALONE for x in base.identifiability]
         )
         # The mass is the first parameter of a body.
-        masses = [columns[0] for columns in feasible.bodies]
+        masses = [columns[0] for columns in feasible_set.bodies]
         consistency = Consistency(
             bodies=bodies,
             margins=consistency_margin(bodies),
-            bounds=feasible.bounds,
+            bounds=feasible_set.bounds,
             residual_increase=increase,
             # Noiseless data have an optimum near zero: the scale keeps the ratio
             # sensible.
             error_bound=float(optimum.error / max(optimum.value, program.scale)),
             certified=bool(optimum.certified),
             iterations=int(optimum.iterations),
-            determined=determined,
-            masses_from_bounds=tuple(np.flatnonzero(~determined[masses]).tolist()),
-            active=_active_bounds(base, feasible, program, optimum, bodies),
+            determined=is_determined,
+            masses_from_bounds=tuple(np.flatnonzero(~is_determined[masses]).tolist()),
+            active=_active_bounds(base, feasible_set, program, optimum, bodies),
         )
         return dataclasses.replace(
             unbounded_estimate,
@@ -214,19 +214,20 @@ def _active_bounds(
     is_tight = solver.prices(program, optimum) > MIN_PRICE
     names = feasible.linear_bounds().names
     end = program.bodies * len(names)
-    of_bodies = is_tight[:end].reshape(program.bodies, len(names))
+    body_flags = is_tight[:end].reshape(program.bodies, len(names))
     sentences = []
-    for name, is_active in zip(names, of_bodies.T, strict=True):
+    for name, is_active in zip(names, body_flags.T, strict=True):
         if is_active.any():
             sentences.append(f"{name} of body {numbers(is_active)}")
 
     # Lower bounds of all drives come first, then upper ones.
-    of_drives = is_tight[end:].reshape(2, program.drives)
-    drives = [base.model.parameter_names[k] for k in feasible.drives]
-    for limit, is_active in zip(("0", "their largest value"), of_drives, strict=True):
+    drive_flags = is_tight[end:].reshape(2, program.drives)
+    drive_names = [base.model.parameter_names[k] for k in feasible.drives]
+    limits = ("0", "their largest value")
+    for limit, is_active in zip(limits, drive_flags, strict=True):
         if is_active.any():
-            where = ", ".join(drives[k] for k in np.flatnonzero(is_active))
-            sentences.append(f"{where} at {limit}")
+            active_names = [drive_names[k] for k in np.flatnonzero(is_active)]
+            sentences.append(f"{', '.join(active_names)} at {limit}")
 
     is_flat = consistency_margin(bodies) < MAX_FLAT_MARGIN
     if is_flat.any():
@@ -267,13 +268,13 @@ def consistent_body(
     A = np.linalg.inv(L) / scale
     b = A @ estimate
     data = ScaledRows(A, b, np.float64(len(b)))
-    feasible = FeasibleSet(
+    feasible_set = FeasibleSet(
         bodies=(tuple(range(10)),),
         drives=(),
         unbounded=(),
         bounds=bounds,
         couplings=(),
     )
-    optimum = _solve(cone_program(feasible, data))
-    parameters = feasible.standard_parameters(data, optimum.y)
+    optimum = _solve(cone_program(feasible_set, data))
+    parameters = feasible_set.standard_parameters(data, optimum.y)
     return parameters, float(np.sqrt(2.0 * optimum.value)), float(optimum.error)

@@ -161,14 +161,14 @@ def feasible_set(model: Model, bounds: BodyBounds) -> FeasibleSet:
     start = sum(sizes[:number])
     columns = np.arange(start, start + sizes[number]).reshape(robot.joints, -1)
 
-    others = np.setdiff1d(np.arange(model.size), columns)
+    other_columns = np.setdiff1d(np.arange(model.size), columns)
     # Terms tell that parameters cannot be negative by a lower bound of zero.
-    lower = np.concatenate([term.lower_bounds(robot) for term in model.terms])
-    is_drive = lower[others] == 0.0
+    lower_bounds = np.concatenate([term.lower_bounds(robot) for term in model.terms])
+    is_drive = lower_bounds[other_columns] == 0.0
     return FeasibleSet(
         bodies=tuple(tuple(row) for row in columns.tolist()),
-        drives=tuple(others[is_drive].tolist()),
-        unbounded=tuple(others[~is_drive].tolist()),
+        drives=tuple(other_columns[is_drive].tolist()),
+        unbounded=tuple(other_columns[~is_drive].tolist()),
         bounds=bounds,
         couplings=tuple(_couplings(model)),
     )
@@ -176,9 +176,10 @@ def feasible_set(model: Model, bounds: BodyBounds) -> FeasibleSet:
 
 def nominal_bodies(bounds: BodyBounds) -> np.ndarray:
     """Return the pseudo-inertias of balls of medium size within the bounds."""
-    low = bounds.mass_min
-    high = bounds.mass_max
-    mass = np.clip(MEDIUM_MASS * high, low + MEDIUM_MASS * (high - low), high)
+    min_mass = bounds.mass_min
+    max_mass = bounds.mass_max
+    medium_mass = min_mass + MEDIUM_MASS * (max_mass - min_mass)
+    mass = np.clip(MEDIUM_MASS * max_mass, medium_mass, max_mass)
     centre = bounds.inner_centres
     # Half as large as the room that the sphere leaves around the centre.
     distance = np.sum((centre / bounds.radius[:, None]) ** 2, axis=1)

@@ -35,8 +35,8 @@ def _unit_pseudo_inertias() -> np.ndarray:
         basis[4 + axis, range(3), range(3)] = 0.5
         basis[4 + axis, axis, axis] = -0.5
         # The product of inertia of an axis belongs to both others.
-        others = [k for k in range(3) if k != axis]
-        basis[7 + axis, others, others[::-1]] = 1.0
+        other_axes = [k for k in range(3) if k != axis]
+        basis[7 + axis, other_axes, other_axes[::-1]] = 1.0
     return basis
 
 
@@ -118,10 +118,10 @@ def inverse(P: Values) -> Values:
     # matrix is the negative inverse.
     for k, unit_vector in enumerate(np.eye(4)):
         pivot = P[:, k, k]
-        others = 1.0 - unit_vector
-        vector = P[:, k] * others[None] + unit_vector[None]
+        other_mask = 1.0 - unit_vector
+        vector = P[:, k] * other_mask[None] + unit_vector[None]
         multiples = vector / pivot[:, None]
-        pairs = np.outer(others, others)
+        pairs = np.outer(other_mask, other_mask)
         block = P * pairs[None]
         P = block - vector[:, :, None] * multiples[:, None]
     return -P

@@ -131,7 +131,7 @@ def _solve(p: ConeProgram, loop: Callable) -> Optimum:
     def iterate(search: Search) -> Search:
         point, length = _step(p, gram, search.point)
         is_better = point.error < search.best.error
-        best = _select(is_better, point, search.best)
+        best_point = _select(is_better, point, search.best)
         stalls = xp.where(is_better, 0, search.stalls + 1)
         iterations = search.iterations + 1
         has_finished = (
@@ -141,7 +141,7 @@ def _solve(p: ConeProgram, loop: Callable) -> Optimum:
             | (stalls >= MAX_STALLS)
             | (iterations >= MAX_ITERATIONS)
         )
-        return Search(point, best, iterations, stalls, has_finished)
+        return Search(point, best_point, iterations, stalls, has_finished)
 
     start = _start(p)
     zero = xp.zeros((), int)
@@ -263,8 +263,8 @@ def _targets(p: ConeProgram):
     """
     xp = p.xp
     bodies = xp.ones(p.bodies) * p.pull
-    others = xp.zeros(len(p.fillings))
-    return xp.concatenate([bodies, others])[:, None, None]
+    fillings = xp.zeros(len(p.fillings))
+    return xp.concatenate([bodies, fillings])[:, None, None]
 
 
 class Newton(NamedTuple):
@@ -275,9 +275,9 @@ class Newton(NamedTuple):
     inverse_S: Values  # noqa: N815
     solve: Callable[[Values], Values]
 
-    def direction(self, rZ: Values, rz: Values, right: Values) -> Direction:
+    def direction(self, rZ: Values, rz: Values, right_side: Values) -> Direction:
         """Return the direction of a right-hand side of the optimality conditions."""
-        y = self.solve(right)
+        y = self.solve(right_side)
         S, s = self.p.linear(y)
         Z = rZ - symmetric_part(self.inverse_S @ S @ self.x.Z)
         z = rz - self.x.z / self.x.s * s
@@ -288,8 +288,8 @@ class Newton(NamedTuple):
         targets = _targets(self.p) + mu
         rZ = targets * self.inverse_S - self.x.Z - second_Z
         rz = mu / self.x.s - self.x.z - second_z
-        right = self.p.adjoint(rZ, rz) - self.x.residual
-        return self.direction(rZ, rz, right)
+        right_side = self.p.adjoint(rZ, rz) - self.x.residual
+        return self.direction(rZ, rz, right_side)
 
     def correct(self, mu: Values, d: Direction) -> Direction:
         """Return the direction with the products of changes along another direction."""
@@ -319,11 +319,11 @@ def _step(p: ConeProgram, gram, x: Point):
     predictor = newton.centre(0.0, 0.0, 0.0)
     # The second corrector has the second-order terms of the first one's changes.
     mu = _centring(p, x, predictor)
-    first = newton.correct(mu, predictor)
-    second = newton.correct(mu, first)
-    first_length = _length(STEP_FRACTIONS, x, first)
-    second_length = _length(STEP_FRACTIONS, x, second)
-    d = _select(second_length > first_length, second, first)
+    first_correction = newton.correct(mu, predictor)
+    second_correction = newton.correct(mu, first_correction)
+    first_length = _length(STEP_FRACTIONS, x, first_correction)
+    second_length = _length(STEP_FRACTIONS, x, second_correction)
+    d = _select(second_length > first_length, second_correction, first_correction)
     length = xp.maximum(first_length, second_length)
 
     def refine():

@@ -83,8 +83,8 @@ class Decomposition(eqx.Module):
         """
         if inverse is None:
             inverse = Complete().inverse(self.values)
-        along_directions = inverse * self.values * self.forces
-        return self.directions.T @ along_directions / self.scale
+        coefficients = inverse * self.values * self.forces
+        return self.directions.T @ coefficients / self.scale
 
     def inverse_information(self, inverse: BaseVector | None = None) -> BaseMatrix:
         """Return the inverse information in the parameters' units; see `solve`."""
@@ -113,11 +113,11 @@ def inverse_information(
         left_side=True,
         lower=True,
     )
-    bound = jnp.sqrt(size * jnp.sum(scaled_root**2))
+    condition_bound = jnp.sqrt(size * jnp.sum(scaled_root**2))
     # The factor of a singular information is NaN.
-    bound = jnp.where(jnp.isfinite(bound), bound, jnp.inf)
+    condition_bound = jnp.where(jnp.isfinite(condition_bound), condition_bound, jnp.inf)
     root = scaled_root * scale[None]
-    return root.T @ root, bound
+    return root.T @ root, condition_bound
 
 
 class AbstractSolution(eqx.Module):
@@ -198,19 +198,19 @@ class CrossValidated(AbstractSolution):
         squared_weights = np.asarray(weights) ** 2
         count = len(blocks.parts)
         errors = np.empty((len(self.candidates), count))
-        for k, (others, part) in enumerate(cross_validation_folds(blocks, count)):
-            training_factors = blocks.select(others).total
+        for k, (other_blocks, part) in enumerate(cross_validation_folds(blocks, count)):
+            training_factors = blocks.select(other_blocks).total
             decomposition = Decomposition.of(*training_factors.weighted(weights))
             test_factors = blocks.select(part).total
             for i, candidate in enumerate(self.candidates):
                 inverse = candidate.inverse(decomposition.values)
                 p = decomposition.solve(inverse)
                 errors[i, k] = squared_weights @ test_factors.residual_squares(p)
-        total = errors.sum(axis=1)
-        best_number = np.argmin(total)
+        total_errors = errors.sum(axis=1)
+        best_number = np.argmin(total_errors)
         standard_error = errors[best_number].std(ddof=1) * np.sqrt(count)
-        max_error = total[best_number] + standard_error
-        *_, strongest_number = np.flatnonzero(total <= max_error)
+        max_error = total_errors[best_number] + standard_error
+        *_, strongest_number = np.flatnonzero(total_errors <= max_error)
         return self.candidates[strongest_number]
 
 

@@ -187,8 +187,12 @@ def _add_shape_slopes(
 ) -> BaseParameters:
     """Return base parameters with small changes of the shapes as further parameters."""
     model = base.model
-    standard = np.asarray(base.to_standard(parameters))[shapes.standard_columns]
-    slopes = ShapeSlopes(dataclasses.replace(shapes, model=model), values, standard)
+    standard_parameters = np.asarray(base.to_standard(parameters))[
+        shapes.standard_columns
+    ]
+    slopes = ShapeSlopes(
+        dataclasses.replace(shapes, model=model), values, standard_parameters
+    )
     # No other parameter depends on the slopes: their rows of kappa are zero.
     kappa = np.asarray(base.kappa)
     return dataclasses.replace(
@@ -209,15 +213,15 @@ def _held_out_errors(
         squares.append(_test_squares(blocks, search, weights, training, test))
         if progress is not None:
             progress(len(squares) / len(folds))
-    linear, nonlinear, forces = np.array(squares).T
-    reductions = linear - nonlinear
-    total = float(linear.sum())
+    linear_squares, nonlinear_squares, force_squares = np.array(squares).T
+    reductions = linear_squares - nonlinear_squares
+    total_square = float(linear_squares.sum())
     deviation = reductions.std(ddof=1) * np.sqrt(len(reductions))
     return HeldOutErrors(
-        linear=float(np.sqrt(total / forces.sum())),
-        nonlinear=float(np.sqrt(nonlinear.sum() / forces.sum())),
-        gain=float(reductions.sum() / total),
-        gain_deviation=float(deviation / total),
+        linear=float(np.sqrt(total_square / force_squares.sum())),
+        nonlinear=float(np.sqrt(nonlinear_squares.sum() / force_squares.sum())),
+        gain=float(reductions.sum() / total_square),
+        gain_deviation=float(deviation / total_square),
     )
 
 
@@ -229,14 +233,14 @@ def _test_squares(blocks: Blocks, search: ShapeSearch, weights, training, test):
     training_rows = search.row_weights(weights, training_mask)
     _, residuals = eqx.filter_jit(search.fit)(shapes, training_rows)
     test_rows = search.row_weights(weights, 1.0 - training_mask)
-    nonlinear = float(np.sum((test_rows * residuals) ** 2))
+    nonlinear_square = float(np.sum((test_rows * residuals) ** 2))
 
     linear_system = blocks.select(training).total.weighted(weights)
     p = Decomposition.of(*linear_system).solve()
     test_factors = blocks.select(test).total
-    linear = float(weights**2 @ test_factors.residual_squares(p))
-    forces = float(weights**2 @ test_factors.force_squares)
-    return linear, nonlinear, forces
+    linear_square = float(weights**2 @ test_factors.residual_squares(p))
+    force_square = float(weights**2 @ test_factors.force_squares)
+    return linear_square, nonlinear_square, force_square
 
 
 class ShapeSlopes(AbstractTerm):

@@ -45,14 +45,14 @@ def identify_presliding(
     joints = np.arange(base.model.robot.joints)
     lengths = np.outer(LENGTHS, np.ones(len(joints)))
     residuals = np.array([residual_norms(problem, row) for row in lengths])
-    best = lengths[np.argmin(residuals, axis=0), joints]
+    best_lengths = lengths[np.argmin(residuals, axis=0), joints]
     for ratio in STEP_RATIOS:
-        for neighbour in (best / ratio, best * ratio):
+        for neighbour in (best_lengths / ratio, best_lengths * ratio):
             norms = residual_norms(problem, neighbour)
             lengths = np.vstack([lengths, neighbour])
             residuals = np.vstack([residuals, norms])
-        best = lengths[np.argmin(residuals, axis=0), joints]
-    model = base.model.with_memory(length=best)
+        best_lengths = lengths[np.argmin(residuals, axis=0), joints]
+    model = base.model.with_memory(length=best_lengths)
     return eqx.tree_at(lambda b: b.model, base, model)
 
 

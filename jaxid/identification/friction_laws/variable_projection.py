@@ -65,9 +65,9 @@ class ShapeSearch(eqx.Module):
         base = problem.base
         standard_columns = shapes.standard_columns
         column_of_parameter = {
-            parameter: standard_columns.index(standard)
-            for parameter, standard in enumerate(base.indices)
-            if standard in standard_columns
+            parameter: standard_columns.index(standard_column)
+            for parameter, standard_column in enumerate(base.indices)
+            if standard_column in standard_columns
         }
         entries = [
             ColumnEntry(joint, parameter, column_of_parameter[parameter])
@@ -157,8 +157,8 @@ class ShapeSearch(eqx.Module):
 
         starts = jnp.stack([start, self._best_multiples(rows)])
         logarithms, successes, squares = jax.lax.map(search_twice, starts)
-        best = jnp.argmin(squares)
-        return start * jnp.exp(logarithms[best]), successes[best]
+        best_start = jnp.argmin(squares)
+        return start * jnp.exp(logarithms[best_start]), successes[best_start]
 
     def _best_multiples(self, rows: JointRows) -> ShapeValues:
         """Return each joint's multiples of its shapes that best explain its rows."""
@@ -175,9 +175,9 @@ class ShapeSearch(eqx.Module):
             _, residuals = self.fit(x.ravel(), rows)
             return jnp.sum((rows * residuals) ** 2, axis=0)
 
-        best = jnp.argmin(jax.lax.map(joint_squares, shapes), axis=0)
+        best_numbers = jnp.argmin(jax.lax.map(joint_squares, shapes), axis=0)
         joints = np.arange(shapes.shape[-1])
-        return shapes[best, :, joints].T.ravel()
+        return shapes[best_numbers, :, joints].T.ravel()
 
     def row_weights(
         self, weights: AnyArray, block_mask: AnyArray | None = None
@@ -209,22 +209,22 @@ class ShapeSearch(eqx.Module):
         """
         columns = self.columns(x)
         joint, parameter, _ = np.array(self.entries).T
-        fixed = jnp.asarray(self.fixed_columns)
+        fixed_columns = jnp.asarray(self.fixed_columns)
         forces = jnp.asarray(self.forces)
 
         def predict(c):
             shaped_part = columns * c[parameter][None]
-            return (fixed @ c).at[:, joint].add(shaped_part)
+            return (fixed_columns @ c).at[:, joint].add(shaped_part)
 
         def project(residuals):
             """Return the products of all columns with weighted residuals."""
             weighted_residuals = rows**2 * residuals
             shaped_part = jnp.sum(columns * weighted_residuals[:, joint], axis=0)
-            fixed_part = jnp.einsum("rjk,rj->k", fixed, weighted_residuals)
+            fixed_part = jnp.einsum("rjk,rj->k", fixed_columns, weighted_residuals)
             return fixed_part.at[parameter].add(shaped_part)
 
-        size = fixed.shape[-1]
-        all_columns = fixed.at[:, joint, parameter].add(columns)
+        size = fixed_columns.shape[-1]
+        all_columns = fixed_columns.at[:, joint, parameter].add(columns)
         weighted_columns = (all_columns * rows[..., None]).reshape(-1, size)
         # The matrix of Newton's steps needs no derivatives.
         weighted_columns = jax.lax.stop_gradient(weighted_columns)

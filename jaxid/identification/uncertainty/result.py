@@ -45,10 +45,12 @@ class Uncertainty(eqx.Module):
     @property
     def ratios(self) -> BaseVector:
         """Standard deviations relative to naive ones; NaN where nothing is known."""
-        naive = self.naive_standard_deviations
-        has_scale = np.isfinite(naive) & (naive > 0)
-        ratios = np.full_like(naive, np.nan)
-        ratios[has_scale] = self.standard_deviations[has_scale] / naive[has_scale]
+        naive_deviations = self.naive_standard_deviations
+        has_scale = np.isfinite(naive_deviations) & (naive_deviations > 0)
+        ratios = np.full_like(naive_deviations, np.nan)
+        ratios[has_scale] = (
+            self.standard_deviations[has_scale] / naive_deviations[has_scale]
+        )
         return ratios
 
     def half_widths(self, level: float = 0.95) -> BaseVector:

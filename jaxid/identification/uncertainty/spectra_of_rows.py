@@ -258,11 +258,11 @@ def _shared_lengths(problem: RegressionProblem, stretches: Sequence[Span]):
     if len(kinds) <= MAX_LENGTHS:
         return {(rows, row_time): rows for rows, row_time in kinds}
     lengths = {}
-    longest: dict[float, int] = {}
+    longest_lengths: dict[float, int] = {}
     for rows, row_time in sorted(kinds, reverse=True):
-        if rows * 1.5 < longest.get(row_time, math.inf):
-            longest[row_time] = rows
-        lengths[rows, row_time] = longest[row_time]
+        if rows * 1.5 < longest_lengths.get(row_time, math.inf):
+            longest_lengths[row_time] = rows
+        lengths[rows, row_time] = longest_lengths[row_time]
     return lengths
 
 

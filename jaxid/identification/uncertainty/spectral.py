@@ -57,15 +57,15 @@ class SpectralSandwich(AbstractUncertainty):
         spectra = row_spectra(problem, estimate)
         covariance, dof = sandwich(spectra)
         variances = np.diag(naive)
-        undetermined = np.isinf(variances)
+        is_undetermined = np.isinf(variances)
         if not spectra.is_complete:
             white_noise_variances = white_variances(spectra.lines)
-            has_ratio = (white_noise_variances > 0) & ~undetermined
+            has_ratio = (white_noise_variances > 0) & ~is_undetermined
             ratios = np.ones_like(variances)
             np.divide(variances, white_noise_variances, out=ratios, where=has_ratio)
             deviations = np.sqrt(ratios) * np.sqrt(np.diag(covariance))
             covariance = rescale_covariance(covariance, deviations)
-        covariance[undetermined, undetermined] = np.inf
+        covariance[is_undetermined, is_undetermined] = np.inf
         errors = Uncertainty(covariance, dof, naive, jackknife(estimate))
         return _widen_by_jackknife(errors, estimate), residual_spectra(spectra.lines)
 
@@ -108,16 +108,16 @@ class SpectralWindows:
         half_widths = np.maximum(min_half_width, 0.3 * ordered_frequency)
         # Lines at the edge of a window belong to it in spite of rounding.
         half_widths = half_widths * (1 + 1e-9)
-        lower = ordered_frequency - half_widths
-        upper = ordered_frequency + half_widths
-        first = np.searchsorted(ordered_frequency, lower, side="left")
-        end = np.searchsorted(ordered_frequency, upper, side="right")
-        self._lines = first[places], end[places]
+        lower_edges = ordered_frequency - half_widths
+        upper_edges = ordered_frequency + half_widths
+        first_line = np.searchsorted(ordered_frequency, lower_edges, side="left")
+        end_line = np.searchsorted(ordered_frequency, upper_edges, side="right")
+        self._lines = first_line[places], end_line[places]
         # Both ends of a window rise with its middle: the windows around a line are
         # neighbours.
         numbers = np.arange(len(ordered_frequency))
-        first_window = np.searchsorted(end, numbers, side="right")
-        end_window = np.searchsorted(first, numbers, side="right")
+        first_window = np.searchsorted(end_line, numbers, side="right")
+        end_window = np.searchsorted(first_line, numbers, side="right")
         self._windows = first_window[places], end_window[places]
 
     def sum_lines(self, x: AnyArray) -> AnyArray:
@@ -248,39 +248,41 @@ def white_variances(lines: Sequence[Lines]) -> BaseVector:
 
 def residual_spectra(lines: Sequence[Lines]) -> ResidualSpectra:
     """Return spectra and whiteness of residuals, from stretches with the most rows."""
-    longest = max(lines, key=lambda x: x.length * x.stretches)
-    half = 0.5 * longest.multiplicity
-    windows = SpectralWindows(longest.frequency, longest.length * longest.row_time)
-    residual_sums = windows.sum_lines(half * longest.residual)
-    smooth_power = residual_sums / windows.sum_lines(half)
-    mean_exposure = np.mean(longest.exposure)
+    longest_lines = max(lines, key=lambda x: x.length * x.stretches)
+    half_multiplicity = 0.5 * longest_lines.multiplicity
+    windows = SpectralWindows(
+        longest_lines.frequency, longest_lines.length * longest_lines.row_time
+    )
+    residual_sums = windows.sum_lines(half_multiplicity * longest_lines.residual)
+    smooth_power = residual_sums / windows.sum_lines(half_multiplicity)
+    mean_exposure = np.mean(longest_lines.exposure)
     # One-sided: the mirror image of a line counts with it.
-    scale = 2.0 * longest.row_time / np.maximum(mean_exposure, 1e-300)
+    scale = 2.0 * longest_lines.row_time / np.maximum(mean_exposure, 1e-300)
 
-    is_passed = (longest.gain > 0.5) & (longest.frequency > 0)
+    is_passed = (longest_lines.gain > 0.5) & (longest_lines.frequency > 0)
     if not is_passed.any():
-        is_passed = longest.gain > 0
-    leverage = longest.leverage / longest.exposure[:, None]
+        is_passed = longest_lines.gain > 0
+    leverage = longest_lines.leverage / longest_lines.exposure[:, None]
     remaining_part = np.clip(1.0 - leverage, 0.02, None)
-    whitened_power = longest.residual / remaining_part / longest.gain**2
+    whitened_power = longest_lines.residual / remaining_part / longest_lines.gain**2
     power = whitened_power[:, is_passed]
-    total = power.sum(axis=1, keepdims=True)
-    finite_total = np.where(total > 0, total, 1.0)
-    cumulative = np.cumsum(power, axis=1) / finite_total
+    total_power = power.sum(axis=1, keepdims=True)
+    finite_total = np.where(total_power > 0, total_power, 1.0)
+    cumulative_power = np.cumsum(power, axis=1) / finite_total
     count = power.shape[1]
     straight_line = np.arange(1, count + 1) / count
     low_frequencies = max(1, round(0.1 * count))
-    figure_places = np.linspace(0, len(half) - 1, 400).round()
+    figure_places = np.linspace(0, len(half_multiplicity) - 1, 400).round()
     figure_lines = np.unique(figure_places.astype(int))
     return ResidualSpectra(
-        frequency=longest.frequency[figure_lines],
+        frequency=longest_lines.frequency[figure_lines],
         density=scale * smooth_power[:, figure_lines],
-        gain=longest.gain[figure_lines],
-        departure=np.abs(cumulative - straight_line).max(axis=1),
+        gain=longest_lines.gain[figure_lines],
+        departure=np.abs(cumulative_power - straight_line).max(axis=1),
         # Kolmogorov's quantile of 95 %.
         limit=float(1.358 / np.sqrt(count * mean_exposure)),
-        low_frequency=cumulative[:, low_frequencies - 1],
-        band=float(longest.frequency[is_passed][-1]),
+        low_frequency=cumulative_power[:, low_frequencies - 1],
+        band=float(longest_lines.frequency[is_passed][-1]),
     )
 
 
@@ -311,20 +313,22 @@ def sandwich_of_columns(
     for indices, theta, Q, weight in zip(
         joint_parameters, columns, forces, weights, strict=True
     ):
-        places = np.array(indices, int)
-        equations = xp.fft.rfft(weight * theta)
-        residuals = Q - p[:, places] @ theta
-        disturbance = xp.fft.rfft(weight * residuals)
-        real = inverse[:, places] @ equations.real
-        imaginary = inverse[:, places] @ equations.imag
+        acting_parameters = np.array(indices, int)
+        column_lines = xp.fft.rfft(weight * theta)
+        residuals = Q - p[:, acting_parameters] @ theta
+        residual_lines = xp.fft.rfft(weight * residuals)
+        # Changes of the estimates by the cosine and by the sine of each line.
+        by_cosine = inverse[:, acting_parameters] @ column_lines.real
+        by_sine = inverse[:, acting_parameters] @ column_lines.imag
+        energy.append(times[None] / length * (by_cosine**2 + by_sine**2))
+        # What the fitted parameters explain of each line's own disturbance.
         explained_power = (
-            real[places] * equations.real + imaginary[places] * equations.imag
+            by_cosine[acting_parameters] * column_lines.real
+            + by_sine[acting_parameters] * column_lines.imag
         )
-        squares = real**2 + imaginary**2
-        energy.append(times[None] / length * squares)
         leverage.append(xp.sum(explained_power, axis=0) / length)
-        disturbance_squares = disturbance.real**2 + disturbance.imag**2
-        power.append(disturbance_squares / length)
+        residual_squares = residual_lines.real**2 + residual_lines.imag**2
+        power.append(residual_squares / length)
     leverage = xp.stack(leverage)
     table = SpectralTable(
         xp,

@@ -16,7 +16,7 @@ from jaxid.arrays import AnyArray, Float, JointSamples
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
 
-from .low_pass import SETTLED, AbstractLowPass
+from .low_pass import SETTLING_TOLERANCE, AbstractLowPass
 
 DIFFERENCE_SAMPLES = 2
 """Samples on each side that differences of fourth order need."""
@@ -55,7 +55,7 @@ class AbstractFilter(eqx.Module):
 
         By default they are those of the filter of forces and columns.
         """
-        return self.low_pass(sample_time).memory(SETTLED)
+        return self.low_pass(sample_time).memory(SETTLING_TOLERANCE)
 
     def memory(self, sample_time: float) -> int | None:
         """Return for how many samples the motion depends on an angle or velocity.

@@ -13,7 +13,7 @@ from scipy import ndimage, signal
 from jaxid.arrays import AnyArray, Array, Float, Matrix, Vector, namespace
 from jaxid.errors import InputError
 
-SETTLED = 1e-4
+SETTLING_TOLERANCE = 1e-4
 """Fraction of the peak below which an impulse response no longer matters."""
 MIN_CLEAR_TAIL = 2e-6
 """Fraction of the peak above which rounding does not hide the impulse response."""
@@ -94,12 +94,12 @@ def kernel_gain(
     kernel: Vector, frequency: np.ndarray, sample_time: float
 ) -> np.ndarray:
     """Return the size of the gain of a weighted mean for some frequencies [Hz]."""
-    angular = 2 * math.pi * frequency * sample_time
-    return np.abs(np.polyval(kernel, np.exp(1j * angular)))
+    angular_frequency = 2 * math.pi * frequency * sample_time
+    return np.abs(np.polyval(kernel, np.exp(1j * angular_frequency)))
 
 
 def weighted_mean(kernel: Vector, sample_time: float) -> Convolution:
-    """Return the mean with weights, an odd number whose sum is one."""
+    """Return the filter of an odd number of weights with the sum one."""
     # The gain at sixteen lines for each oscillation that fits into the kernel.
     lines = 8 * len(kernel) + 1
     frequency = np.linspace(0.0, 0.5 / sample_time, lines)
@@ -148,8 +148,8 @@ class RecursiveLowPass(AbstractLowPass):
         return result.reshape(x.shape)
 
     def gain(self, frequency, sample_time):  # noqa: D102
-        angular = 2 * math.pi * np.asarray(frequency) * sample_time
-        _, response = signal.sosfreqz(np.array(self.sections), angular)
+        angular_frequency = 2 * math.pi * np.asarray(frequency) * sample_time
+        _, response = signal.sosfreqz(np.array(self.sections), angular_frequency)
         return np.abs(response) ** 2
 
     def memory(self, tolerance=1e-14):  # noqa: D102
@@ -159,7 +159,7 @@ class RecursiveLowPass(AbstractLowPass):
         if radius == 0:
             return 2 * len(sos)
         clear_tail = max(tolerance, MIN_CLEAR_TAIL)
-        memory = _clear_memory(sos, radius, clear_tail)
+        memory = _impulse_memory(sos, radius, clear_tail)
         if tolerance < clear_tail:
             # Rounding hides smaller tails, which decay like the slowest pole. The
             # margin is for poles of that radius that are multiple.
@@ -168,16 +168,19 @@ class RecursiveLowPass(AbstractLowPass):
         return memory
 
 
-def _clear_memory(sos: Matrix, radius: float, tolerance: float) -> int:
-    """Return the memory from the impulse response, by the slowest pole's radius."""
+def _impulse_memory(sos: Matrix, radius: float, tolerance: float) -> int:
+    """Return the samples after which the impulse response stays below a tolerance.
+
+    The slowest pole's radius tells how long the response must be simulated.
+    """
     duration = math.log(1e-3 * tolerance) / math.log(radius)
     start_samples = 4 * len(sos)
     samples = math.ceil(duration) + start_samples
     impulse = np.zeros(samples)
     impulse[0] = 1.0
-    forward = signal.sosfilt(sos, impulse)
-    both_ways = signal.correlate(forward, forward, method="fft")
-    tail = np.abs(both_ways[samples - 1 :])
+    forward_response = signal.sosfilt(sos, impulse)
+    response = signal.correlate(forward_response, forward_response, method="fft")
+    tail = np.abs(response[samples - 1 :])
     is_clear = tail > tolerance * tail[0]
     last_sample = np.flatnonzero(is_clear)[-1]
     return int(last_sample) + 1
@@ -189,22 +192,22 @@ def _filter_both_ways(sos: Matrix, x: Array, padding: int) -> Array:
 
     def step(states, x):
         next_states = []
-        for (b0, b1, b2, _, a1, a2), (first, second) in zip(sos, states, strict=True):
-            y = b0 * x + first
-            next_first = b1 * x - a1 * y + second
-            next_second = b2 * x - a2 * y
-            next_states.append((next_first, next_second))
+        for (b0, b1, b2, _, a1, a2), (z1, z2) in zip(sos, states, strict=True):
+            y = b0 * x + z1
+            next_z1 = b1 * x - a1 * y + z2
+            next_z2 = b2 * x - a2 * y
+            next_states.append((next_z1, next_z2))
             x = y
         return next_states, x
 
     def one_way(x: Array) -> Array:
-        states = [(first * x[0], second * x[0]) for first, second in steady_states]
+        states = [(z1 * x[0], z2 * x[0]) for z1, z2 in steady_states]
         _, y = jax.lax.scan(step, states, x, unroll=4)
         return y
 
-    forward = one_way(odd_extension(x, padding))
-    both_ways = one_way(forward[::-1])[::-1]
-    return both_ways[padding : padding + len(x)]
+    forward_outputs = one_way(odd_extension(x, padding))
+    outputs = one_way(forward_outputs[::-1])[::-1]
+    return outputs[padding : padding + len(x)]
 
 
 def odd_extension(x: Any, samples: int) -> Any:

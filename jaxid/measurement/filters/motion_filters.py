@@ -22,7 +22,7 @@ from .filter import (
     require_positive,
 )
 from .low_pass import (
-    SETTLED,
+    SETTLING_TOLERANCE,
     AbstractLowPass,
     butterworth,
     correlate,
@@ -71,15 +71,15 @@ class ZeroPhaseButterworth(AbstractFilter):
         require(self, "margin", lambda x: 0 <= x < math.inf, words)
 
     def motion(self, angles, velocities, sample_time):  # noqa: D102
-        smooth = butterworth(self.cutoff, self.order, sample_time)
+        low_pass = butterworth(self.cutoff, self.order, sample_time)
         # From the first sample on, so that a joint at rest stays exactly at rest.
-        path = smooth(angles - angles[0])
+        path = low_pass(angles - angles[0])
         q = angles[0] + path
         if velocities is None:
             qd = first_difference(path, sample_time)
             qdd = second_difference(path, sample_time)
             return Motion(q, qd, qdd)
-        change = smooth(velocities - velocities[0])
+        change = low_pass(velocities - velocities[0])
         qd = velocities[0] + change
         return Motion(q, qd, first_difference(change, sample_time))
 
@@ -89,14 +89,14 @@ class ZeroPhaseButterworth(AbstractFilter):
         return butterworth(self.force_cutoff, self.order, sample_time, "force_cutoff")
 
     def memory(self, sample_time):  # noqa: D102
-        smooth = butterworth(self.cutoff, self.order, sample_time)
-        return smooth.memory(MOTION_TAIL) + DIFFERENCE_SAMPLES
+        low_pass = butterworth(self.cutoff, self.order, sample_time)
+        return low_pass.memory(MOTION_TAIL) + DIFFERENCE_SAMPLES
 
     def edge(self, sample_time):  # noqa: D102
         if self.margin is not None:
             return round(self.margin / sample_time)
         motion = butterworth(self.cutoff, self.order, sample_time)
-        return max(motion.memory(SETTLED), super().edge(sample_time))
+        return max(motion.memory(SETTLING_TOLERANCE), super().edge(sample_time))
 
 
 class SavitzkyGolay(AbstractFilter):
@@ -145,9 +145,9 @@ class SavitzkyGolay(AbstractFilter):
         places = np.arange(-half, half + 1) / half
         basis = legendre.legvander(places, self.order)
         derivatives = legendre.legder(np.eye(self.order + 1), derivative)
-        in_the_middle = legendre.legval(0.0, derivatives)
+        centre_values = legendre.legval(0.0, derivatives)
         unit = (half * sample_time) ** derivative
-        return in_the_middle @ np.linalg.pinv(basis) / unit
+        return centre_values @ np.linalg.pinv(basis) / unit
 
 
 def half_window(window: float, sample_time: float, min_samples: int = 3) -> int:
@@ -196,9 +196,13 @@ class PaperFilter(AbstractFilter):
         b, a = _bilinear("velocity", [1.0, 0.0], self.velocity, sample_time)
         qd = np.asarray(signal.lfilter(b, a, path, axis=0))
         b, a = _bilinear("acceleration", [1.0, 0.0], self.acceleration, sample_time)
-        padding = min(len(angles) - 1, self.low_pass(sample_time).memory(SETTLED))
-        minus = signal.filtfilt(b, a, path, axis=0, padtype="odd", padlen=padding)
-        return Motion(angles, qd, -minus)
+        padding = min(
+            len(angles) - 1, self.low_pass(sample_time).memory(SETTLING_TOLERANCE)
+        )
+        negative_acceleration = signal.filtfilt(
+            b, a, path, axis=0, padtype="odd", padlen=padding
+        )
+        return Motion(angles, qd, -negative_acceleration)
 
     def low_pass(self, sample_time):  # noqa: D102
         return _first_order("acceleration", self.acceleration, sample_time)
@@ -210,7 +214,7 @@ class PaperFilter(AbstractFilter):
 
     def edge(self, sample_time):  # noqa: D102
         motion = _first_order("velocity", self.velocity, sample_time)
-        return max(motion.memory(SETTLED), super().edge(sample_time))
+        return max(motion.memory(SETTLING_TOLERANCE), super().edge(sample_time))
 
 
 class PeriodicFourier(AbstractFilter):
@@ -324,12 +328,12 @@ def second_difference(x: Matrix, sample_time: float) -> Matrix:
 
     Next to the ends they are of second order.
     """
-    before = x[1:-3]
-    middle = x[2:-2]
-    after = x[3:-1]
-    nearest_samples = after + before
+    previous_samples = x[1:-3]
+    centre_samples = x[2:-2]
+    next_samples = x[3:-1]
+    nearest_samples = next_samples + previous_samples
     second_nearest_samples = x[4:] + x[:-4]
-    difference = 16 * nearest_samples - second_nearest_samples - 30 * middle
+    difference = 16 * nearest_samples - second_nearest_samples - 30 * centre_samples
 
     squared_time = sample_time**2
     d = np.empty_like(x)

@@ -216,7 +216,7 @@ def _fields(
 
 
 def _named_elements(values: Mapping[str, Any]) -> dict[int, Elements]:
-    """Return the elements that the texts of a message name, by their number."""
+    """Return the names of elements that a message lists, by the number of elements."""
     elements = {}
     for key, texts in values.items():
         has_names = re.search("(^|_)names?$", key) and isinstance(texts, list)

@@ -73,14 +73,14 @@ class LogTable:
         return rows
 
     def _common_length(self) -> int:
-        first, *others = itertools.chain(*self.channels.values())
-        length = len(self.columns[first])
-        for name in others:
+        first_name, *other_names = itertools.chain(*self.channels.values())
+        length = len(self.columns[first_name])
+        for name in other_names:
             samples = len(self.columns[name])
             if samples != length:
                 raise InputError(
-                    f"`{name}` of `{self.source}` has {samples} samples, but `{first}` "
-                    f"has {length}: one row for each sample is needed."
+                    f"`{name}` of `{self.source}` has {samples} samples, but "
+                    f"`{first_name}` has {length}: one row for each sample is needed."
                 )
         return length
 
@@ -178,10 +178,10 @@ class LogTable:
         elif rows:
             number = rows[0] + self.first_row
             words = complaint.format(column[rows[0]])
-            others = f" (and {len(rows) - 1} more)" if len(rows) > 1 else ""
+            further_rows = f" (and {len(rows) - 1} more)" if len(rows) > 1 else ""
             raise InputError(
                 f"column `{name}` of `{self.source}`, {self.unit} {number}, "
-                f"{words}{others}: repair the log or remove those rows."
+                f"{words}{further_rows}: repair the log or remove those rows."
             )
 
 
