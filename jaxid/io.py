@@ -241,9 +241,11 @@ def from_json(value: Any, hint: Any, place: str = "") -> Any:
         return result
     # A number and an array without axes are the same.
     if isinstance(result, float | np.ndarray):
-        twin = np.array(result) if isinstance(result, float) else result[()]
-        if any(_fits(twin, option) for option in options):
-            return twin
+        alternative_value = (
+            np.array(result) if isinstance(result, float) else result[()]
+        )
+        if any(_fits(alternative_value, option) for option in options):
+            return alternative_value
     raise InputError(f"`{place}` holds {value!r:.60}, which does not belong there")
 
 
@@ -347,7 +349,7 @@ def _element_hints(options: Sequence[Any], length: int) -> tuple[Any, ...]:
 
 
 def _fits(value: Any, option: Any) -> bool:
-    """Return whether a value is one of an annotation without unions."""
+    """Return whether a value belongs to an annotated type that is no union."""
     if option is Any:
         return value is None or isinstance(value, str | bool | int | float)
     if option is None or option is type(None):

@@ -61,9 +61,9 @@ def minimise_squares(
         max_steps=max_steps,
         throw=False,
     )
-    converged = solution.result == optx.RESULTS.successful
+    has_converged = solution.result == optx.RESULTS.successful
     end = solution.stats["end"]
-    return Minimum(solution.value, converged, end.residuals, end.jacobian)
+    return Minimum(solution.value, has_converged, end.residuals, end.jacobian)
 
 
 class _Linearisation(NamedTuple):
@@ -114,25 +114,25 @@ class BoundedLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     def step(self, fn, y, args, options, state, tags):
         """Take one step, or none if it does not lower the sum of squares."""
         lower, upper = options["lower"], options["upper"]
-        trial = jnp.clip(y + _damped_step(y, state, lower, upper), lower, upper)
-        values, jacobian = _linearise(fn, trial, args)
+        trial_point = jnp.clip(y + _damped_step(y, state, lower, upper), lower, upper)
+        values, jacobian = _linearise(fn, trial_point, args)
         cost = jnp.sum(values**2)
         is_better = cost < state.cost
 
         factor = jnp.where(is_better, 0.1, 10.0)
         relative_cost = cost / jnp.maximum(state.cost, jnp.finfo(y.dtype).tiny)
-        accepted = _Linearisation(
+        accepted_state = _Linearisation(
             residuals=values,
             jacobian=jacobian,
             cost=cost,
             damping=jnp.maximum(state.damping * factor, 1e-12),
             decrease=1.0 - relative_cost,
         )
-        refused = state._replace(damping=state.damping * factor)
+        refused_state = state._replace(damping=state.damping * factor)
         following = jax.tree.map(
-            lambda a, b: jnp.where(is_better, a, b), accepted, refused
+            lambda a, b: jnp.where(is_better, a, b), accepted_state, refused_state
         )
-        return jnp.where(is_better, trial, y), following, None
+        return jnp.where(is_better, trial_point, y), following, None
 
     def terminate(self, fn, y, args, options, state, tags):
         """Return whether the last step changed little, or no step lowers the sum."""

@@ -116,7 +116,7 @@ def command_line() -> str:
 def refuse_foreign_table(target: Path) -> None:
     """Reject a path where files lie that are not those of an earlier motion."""
     from jaxid.io import require_writable
-    from jaxid.trajectory.controllers import BESIDE
+    from jaxid.trajectory.controllers import CONTROLLER_SUFFIXES
     from jaxid.trajectory.files import load_trajectory
 
     if target.suffix.lower() != ".csv":
@@ -128,7 +128,7 @@ def refuse_foreign_table(target: Path) -> None:
     except (OSError, ValueError):
         # Without an earlier motion nothing may be there that would be overwritten.
         paths = [target, motion_file]
-        paths += [target.with_suffix(suffix) for suffix in BESIDE]
+        paths += [target.with_suffix(suffix) for suffix in CONTROLLER_SUFFIXES]
         if figure_folder.is_dir():
             paths += sorted(figure_folder.iterdir())
         foreign_files = [path for path in paths if path.exists()]

@@ -84,8 +84,8 @@ def gains(
 ) -> None:
     """Find the drives' true forces with a load that is known.
 
-    From logs without it and logs with it; the table `[load]` of the experiment file
-    describes it.
+    Compare logs without the load and logs with it. The table `[load]` of the experiment
+    file describes the load.
     """
     console = options.start(experiment, *logs, *loaded, output=output, force=force)
     content = jid.experiment.load_experiment(experiment)

@@ -58,8 +58,8 @@ def remarks(study: Study) -> list[Remark]:
     """Return the findings of the paper, as far as they come out here."""
     identification = max(study.weighted.mean_errors(0))
     verification = max(study.weighted.mean_errors(1))
-    last_axis = study.unweighted.mean_errors(0)[-1]
-    last_axis_weighted = study.weighted.mean_errors(0)[-1]
+    error = study.unweighted.mean_errors(0)[-1]
+    weighted_error = study.weighted.mean_errors(0)[-1]
     return [
         Remark(
             "The identified model predicts the torques of every axis to "
@@ -71,9 +71,9 @@ def remarks(study: Study) -> list[Remark]:
             f"{max(study.true.mean_errors(1)):.2g} %.",
         ),
         Remark(
-            f"Without weights the last axis errs by {last_axis:.2g} %, with weights by "
-            f"{last_axis_weighted:.2g} % of its largest torque.",
-            Status.GOOD if last_axis_weighted < last_axis else Status.BAD,
+            f"Without weights the last axis errs by {error:.2g} %, with weights by "
+            f"{weighted_error:.2g} % of its largest torque.",
+            Status.GOOD if weighted_error < error else Status.BAD,
         ),
     ]
 

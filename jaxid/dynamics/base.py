@@ -189,8 +189,8 @@ class BaseParameters(Summarised, Hashable):
         r"""Return the base parameters $p_B = p_1 + \kappa p_2$ (Eq. 22)."""
         p = _as_parameters("standard", p, self.model.size)
         leaders = np.array(self.indices)
-        others = np.array(self.dependent, int)
-        return p[..., leaders] + p[..., others] @ self.kappa.T
+        dependent_columns = np.array(self.dependent, int)
+        return p[..., leaders] + p[..., dependent_columns] @ self.kappa.T
 
     def to_standard(self, p: AnyArray | Sequence[Any]) -> AnyArray:
         """Return standard parameters with the same forces.
@@ -202,9 +202,9 @@ class BaseParameters(Summarised, Hashable):
         shape = (*p.shape[:-1], self.model.size)
         places = np.array(self.indices)
         if isinstance(p, np.ndarray):
-            standard = np.zeros(shape)
-            standard[..., places] = p
-            return standard
+            standard_parameters = np.zeros(shape)
+            standard_parameters[..., places] = p
+            return standard_parameters
         return jnp.zeros(shape, p.dtype).at[..., places].set(p)
 
     def inverse_dynamics(
@@ -293,10 +293,10 @@ def base_parameters(model: Model, *, seed: int = 0) -> BaseParameters:
     rank = rank_by_singular_values(W)
 
     leaders = np.array(dependence.independent, int)
-    others = np.array(dependence.dependent, int)
-    regrouped = regrouping(W, leaders, others)
+    dependent_columns = np.array(dependence.dependent, int)
+    regrouped = regrouping(W, leaders, dependent_columns)
     # Back from columns that are free of units to those of the model.
-    kappa = regrouped.kappa * scale[leaders][:, None] / scale[others]
+    kappa = regrouped.kappa * scale[leaders][:, None] / scale[dependent_columns]
     return BaseParameters(
         model,
         dependence.independent,

@@ -97,10 +97,10 @@ class JointRegressor(eqx.Module):
     def in_numpy(self, *arrays: AnyArray) -> list[np.ndarray]:
         """Return the columns of each joint, evaluated in NumPy."""
         batch = np.shape(arrays[0])[1:]
-        distinct = evaluate_rows(self.program, *arrays)
+        distinct_rows = evaluate_rows(self.program, *arrays)
         joints = []
         for entries in self.entries:
-            values = packed_entries(self.program, distinct, entries)
+            values = packed_entries(self.program, distinct_rows, entries)
             joints.append(values.reshape(len(entries), *batch))
         return joints
 
@@ -188,9 +188,9 @@ class PackedRegressor(eqx.Module):
 def _places(program: Program):
     """Return the `places` of a packed regressor; what is always zero has none."""
     nodes, _ = program.distinct
-    packed = program.pack(range(len(nodes)))
+    numbers_or_zero = program.pack(range(len(nodes)))
     shape = program.output_shapes[0]
-    entries = np.array(packed, object).reshape(shape)
+    entries = np.array(numbers_or_zero, object).reshape(shape)
     places = []
     for row in entries:
         # An `int` numbers an array of values, a `float` is a constant.

@@ -56,9 +56,9 @@ def gram_schmidt(
     min_norm = ROUNDING * norms.max(initial=0.0)
     Q = np.zeros((rows, min(rows, columns)))
     shares = np.zeros(columns)  # fractions of columns that earlier ones do not explain
-    independent: list[int] = []
+    independent_columns: list[int] = []
     for k in range(columns):
-        rank = len(independent)
+        rank = len(independent_columns)
         if norms[k] <= min_norm or rank == rows:
             continue
         # Relative to its own norm: a small column is not a dependent one.
@@ -69,13 +69,16 @@ def gram_schmidt(
         shares[k] = np.linalg.norm(w)
         if shares[k] > tolerance:
             Q[:, rank] = w / shares[k]
-            independent.append(k)
+            independent_columns.append(k)
 
-    dependent = [k for k in range(columns) if k not in set(independent)]
-    min_share = shares[independent].min(initial=np.inf)
-    max_share = shares[dependent].max(initial=0.0)
+    dependent_columns = [k for k in range(columns) if k not in set(independent_columns)]
+    min_share = shares[independent_columns].min(initial=np.inf)
+    max_share = shares[dependent_columns].max(initial=0.0)
     return Dependence(
-        tuple(independent), tuple(dependent), float(min_share), float(max_share)
+        tuple(independent_columns),
+        tuple(dependent_columns),
+        float(min_share),
+        float(max_share),
     )
 
 
@@ -107,8 +110,8 @@ def _rank_at_largest_fall(s: np.ndarray, tolerance: float):
     if not is_possible.any():
         return min_rank
     values = np.maximum(s, 1e-14)  # all below are rounding
-    falls = values[:-1] / values[1:]
-    possible_falls = np.where(is_possible, falls, 0.0)
+    ratios = values[:-1] / values[1:]
+    possible_falls = np.where(is_possible, ratios, 0.0)
     return int(ranks[np.argmax(possible_falls)])
 
 
@@ -145,15 +148,15 @@ def regrouping(
     A dependent column is a combination of independent columns before it.
     """
     leaders = np.array(independent, int)
-    others = np.array(dependent, int)
+    other_columns = np.array(dependent, int)
     unit_columns, norms = scale_columns(W)
     W1 = unit_columns[:, leaders]
-    W2 = unit_columns[:, others]
+    W2 = unit_columns[:, other_columns]
     # The diagonal of R is what each column adds to those before it.
     Q, R = np.linalg.qr(W1)
     shares = np.abs(np.diag(R))
-    is_before = leaders[:, None] < others
-    kappa = np.zeros((len(leaders), len(others)))
+    is_before = leaders[:, None] < other_columns
+    kappa = np.zeros((len(leaders), len(other_columns)))
     if len(leaders) and shares.min() > ROUNDING:
         # The second step takes out most of the rounding that poor conditioning
         # amplifies.
@@ -168,7 +171,7 @@ def regrouping(
     # Columns of nothing but rounding stay as they are.
     scale = np.where(norms > 0, norms, 1.0)
     leader_scale = scale[leaders]
-    kappa = kappa * scale[others] / leader_scale[:, None]
+    kappa = kappa * scale[other_columns] / leader_scale[:, None]
     return Regrouped(kappa, float(max_residual), shares)
 
 

@@ -81,8 +81,8 @@ def opened(
         else:
             stack = np.stack
             rows = np.array([np.ravel(x) for x in values])
-            differs = (rows != rows[0]).any(axis=0)
-            positions = np.flatnonzero(differs)
+            is_varying = (rows != rows[0]).any(axis=0)
+            positions = np.flatnonzero(is_varying)
         if len(positions):
             variables = [x.ravel()[positions] for x in values]
             places.append((k, tuple(positions.tolist())))
@@ -161,27 +161,27 @@ class SampleMethod:
         return jax.eval_shape(lambda *x: self.spatial_definition(*x), *sample).shape
 
     @functools.cached_property
-    def on_rows(self) -> Callable:
-        """The method on rows of samples: [samples, ...] from arrays as in `on_rows`."""
-        run = spatial = functools.partial(definition_on_rows, self.spatial_definition)
+    def over_rows(self) -> Callable:
+        """The method over many samples: [samples, ...] from rows of each argument."""
+        method = functools.partial(definition_on_rows, self.spatial_definition)
         if not self.is_long:
             # The program is the fastest; its derivatives are those of the spatial form.
             program = functools.partial(on_rows, self.program)
-            run = with_derivatives_of(spatial, program)
-        return lambda *arrays: run(*arrays).reshape(-1, *self.output_shape)
+            method = with_derivatives_of(method, program)
+        return lambda *arrays: method(*arrays).reshape(-1, *self.output_shape)
 
     @functools.cached_property
     def compiled(self) -> Callable:
-        """`on_rows`, compiled."""
-        return jax.jit(self.on_rows)
+        """`over_rows`, compiled."""
+        return jax.jit(self.over_rows)
 
 
 def definition_on_rows(definition: Callable, *arrays: Array) -> Array:
     """Apply a function of one sample to arrays as in `on_rows`, block by block."""
 
     def on_one_sample(rows):
-        remaining = iter(rows)
-        arguments = [next(remaining) if x.ndim == 2 else x for x in arrays]
+        remaining_rows = iter(rows)
+        arguments = [next(remaining_rows) if x.ndim == 2 else x for x in arrays]
         return jnp.ravel(definition(*arguments))
 
     def in_blocks(samples):
@@ -193,10 +193,10 @@ def definition_on_rows(definition: Callable, *arrays: Array) -> Array:
     count = len(samples[0])
     if count == 1:
         return on_one_sample([x[0] for x in samples])[None]
-    at_once = jax.vmap(on_one_sample)
+    vectorised_method = jax.vmap(on_one_sample)
     if count <= BLOCK:
-        return at_once(samples)
-    return jax.lax.platform_dependent(samples, cpu=in_blocks, default=at_once)
+        return vectorised_method(samples)
+    return jax.lax.platform_dependent(samples, cpu=in_blocks, default=vectorised_method)
 
 
 _methods: OrderedDict[tuple, SampleMethod] = OrderedDict()
@@ -243,14 +243,14 @@ def on_samples(
     shapes = [x.shape[-1:] for x in arrays]
     method = method_of(owner, definition, *shapes)
     dtype = jnp.result_type(*(x.dtype for x in arrays), float)
-    in_jax = [x for x in arrays if isinstance(x, jax.Array)]
+    jax_arrays = [x for x in arrays if isinstance(x, jax.Array)]
     # Inside `jit` and the like the method becomes a part of what is compiled.
     if is_traced(arrays):
         inputs = [jnp.asarray(x, dtype) for x in arrays]
-        return _over_batches(method.on_rows, batch, inputs, len(shared))
+        return _over_batches(method.over_rows, batch, inputs, len(shared))
 
     # A few samples are done before XLA has compiled; arrays elsewhere stay there.
-    devices = set().union(*(x.devices() for x in in_jax))
+    devices = set().union(*(x.devices() for x in jax_arrays))
     platforms = {device.platform for device in devices}
     is_on_one_cpu = len(devices) <= 1 and platforms <= {"cpu"}
     samples_count = math.prod(batch)
@@ -259,14 +259,14 @@ def on_samples(
         columns = [_entries_first(x) for x in arrays]
         results = evaluate(method.program, *columns)
         results = _samples_first(results, len(batch)).astype(dtype, copy=False)
-        if not in_jax:
+        if not jax_arrays:
             return results
         with jax.default_device(*devices):
             return jnp.asarray(results)
 
     inputs = [jnp.asarray(x, dtype) for x in arrays]
     results = _over_batches(method.compiled, batch, inputs, len(shared))
-    return results if in_jax else np.asarray(results)
+    return results if jax_arrays else np.asarray(results)
 
 
 def _batch_shape(arrays: list[AnyArray]):
@@ -289,8 +289,8 @@ def _entries_first(x: AnyArray):
 def _samples_first(results: np.ndarray, batch_axes: int):
     """Return results [*shape, *batch] as [*batch, *shape], without a copy."""
     axes = range(results.ndim)
-    first = results.ndim - batch_axes
-    return results.transpose(*axes[first:], *axes[:first])
+    sample_axis = results.ndim - batch_axes
+    return results.transpose(*axes[sample_axis:], *axes[:sample_axis])
 
 
 def _over_batches(run: Callable, batch: Shape, arrays: list[Array], shared: int):

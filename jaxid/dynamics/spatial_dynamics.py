@@ -74,17 +74,17 @@ def all_placements(robot: Robot, q: Joints) -> Array:
     placements = jnp.concatenate(
         [_relative_placements(robot, q), _bottom_rows(robot, dtype)], axis=1
     )
-    above = np.array(robot.parent)
-    while (above >= 0).any():
+    ancestors = np.array(robot.parent)
+    while (ancestors >= 0).any():
         # The placements of the bodies above, for each body; the ground's is one.
-        has_body = above >= 0
-        choice = np.eye(robot.joints)[above] * has_body[:, None]
+        has_body = ancestors >= 0
+        choice = np.eye(robot.joints)[ancestors] * has_body[:, None]
         ground = np.eye(4) * ~has_body[:, None, None]
         choice = jnp.asarray(choice, dtype)
         placements_above = jnp.tensordot(choice, placements, 1)
         placements_above = placements_above + jnp.asarray(ground, dtype)
         placements = placements_above @ placements
-        above = np.where(has_body, above[above], -1)
+        ancestors = np.where(has_body, ancestors[ancestors], -1)
     return placements
 
 
@@ -107,10 +107,10 @@ def _relative_placements(robot: Robot, q: Joints):
     # Rodrigues: I + sin(q) [axis] + (1 - cos(q)) [axis]^2, if the joint turns.
     identity = jnp.eye(3, dtype=dtype)[None]
     axis_column = axis[:, :, None]
-    along = axis_column * axis[:, None, :]
-    across = turns * (identity - along)
+    axial_part = axis_column * axis[:, None, :]
+    normal_part = turns * (identity - axial_part)
     sideways = turns * _combine(SKEW, axis)
-    turn = identity + (jnp.cos(angle) - 1) * across
+    turn = identity + (jnp.cos(angle) - 1) * normal_part
     turn = turn + jnp.sin(angle) * sideways
 
     shift = slides * angle * axis_column
@@ -136,17 +136,17 @@ def ground_motion(robot: Robot, q: Joints, qd: Joints, qdd: Joints) -> GroundMot
     R = placements[:, :3, :3]
     origins = placements[:, :3, 3]
     arm = _combine(SKEW, origins) @ R
-    upper = jnp.concatenate([R, arm], axis=2)
-    lower = jnp.concatenate([jnp.zeros_like(R), R], axis=2)
-    carry = jnp.concatenate([upper, lower], axis=1)
+    upper_rows = jnp.concatenate([R, arm], axis=2)
+    lower_rows = jnp.concatenate([jnp.zeros_like(R), R], axis=2)
+    carry = jnp.concatenate([upper_rows, lower_rows], axis=1)
 
     is_revolute = np.array(robot.revolute)[:, None]
     axis = jnp.asarray(robot.axis, dtype)
     turning = jnp.where(is_revolute, axis, 0.0)
-    sliding = jnp.where(is_revolute, 0.0, axis)
-    angular = _times(R, turning)
-    linear = _times(arm, turning) + _times(R, sliding)
-    joints = jnp.concatenate([angular, linear], axis=1)
+    sliding_axes = jnp.where(is_revolute, 0.0, axis)
+    angular_velocities = _times(R, turning)
+    linear_velocities = _times(arm, turning) + _times(R, sliding_axes)
+    joints = jnp.concatenate([angular_velocities, linear_velocities], axis=1)
 
     is_moved = jnp.asarray(moved_by(robot), dtype)
     speeds = joints * qd[:, None]
@@ -176,8 +176,8 @@ def spatial_forces(
     rates = jnp.einsum("nji,nj->ni", _combine(CROSS, v), momenta)
     wrenches = _times(inertias, a) - rates
     # A joint feels the wrenches of all bodies that it moves (Newton and Euler).
-    beyond = jnp.asarray(moved_by(robot).T, q.dtype) @ wrenches
-    return jnp.sum(joints * beyond, axis=1)
+    moved_wrenches = jnp.asarray(moved_by(robot).T, q.dtype) @ wrenches
+    return jnp.sum(joints * moved_wrenches, axis=1)
 
 
 def spatial_mass_matrix(robot: Robot, p: Bodies, q: Joints) -> JointMatrix:
@@ -191,18 +191,18 @@ def spatial_mass_matrix(robot: Robot, p: Bodies, q: Joints) -> JointMatrix:
     momenta = _times(composite, motion.joints)
     # A joint feels the momenta of those that it carries; the matrix is symmetric.
     products = momenta @ motion.joints.T
-    lower = is_moved * products
+    lower_triangle = is_moved * products
     off_diagonal = jnp.asarray(1.0 - np.eye(len(q)), q.dtype)
-    return lower + (lower * off_diagonal).T
+    return lower_triangle + (lower_triangle * off_diagonal).T
 
 
 def spatial_regressor(robot: Robot, q: Joints, qd: Joints, qdd: Joints) -> Array:
     """Return the regressor of every body (Eq. 11)."""
     carry, joints, v, a = ground_motion(robot, q, qd, qdd)
     # In the frames of the bodies, where the parameters are constant.
-    to_bodies = jnp.swapaxes(carry, 1, 2)
-    v_body = _times(to_bodies, v)
-    a_body = _times(to_bodies, a)
+    body_transforms = jnp.swapaxes(carry, 1, 2)
+    v_body = _times(body_transforms, v)
+    a_body = _times(body_transforms, a)
     unit_inertias = jnp.asarray(INERTIA, q.dtype)
     momenta = jnp.einsum("ijk,nj->nik", unit_inertias, v_body)
     rates = jnp.einsum("ijk,nj->nik", unit_inertias, a_body)

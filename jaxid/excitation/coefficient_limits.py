@@ -195,8 +195,8 @@ class JointLimits(eqx.Module):
     def _sizes(self):
         """Half ranges, speeds, accelerations and jerks."""
         limits = self.limits
-        half = 0.5 * (limits.position_max - limits.position_min)
-        sizes = [half, limits.velocity, limits.acceleration, limits.jerk]
+        half_ranges = 0.5 * (limits.position_max - limits.position_min)
+        sizes = [half_ranges, limits.velocity, limits.acceleration, limits.jerk]
         return np.array(sizes, np.float64)
 
     def coefficients(self, y: AnyArray) -> AnyArray:
@@ -222,9 +222,9 @@ class JointLimits(eqx.Module):
             kinds.append(range(start, start + len(rows)))
             start += len(rows)
 
-        middle = 0.5 * (self.limits.position_min + self.limits.position_max)
-        centres = np.zeros((len(middle), start))
-        centres[:, kinds[0]] = (middle / sizes[0])[:, None]
+        middle_positions = 0.5 * (self.limits.position_min + self.limits.position_max)
+        centres = np.zeros((len(middle_positions), start))
+        centres[:, kinds[0]] = (middle_positions / sizes[0])[:, None]
         R = np.concatenate(parts, axis=1)
         return Grid(R, centres, tuple(kinds), 1 / factor, np.asarray(self.constant))
 

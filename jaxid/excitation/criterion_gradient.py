@@ -26,62 +26,71 @@ def value_and_gradient(
     coefficients = problem.limits.coefficients(x)
     motion = [np.einsum("sk,bjk->jbs", part, coefficients) for part in rows]
     regressor = problem.regressor
-    columns = [np.swapaxes(each, 0, 1) for each in regressor.in_numpy(*motion)]
+    columns = [
+        np.swapaxes(columns_of_joint, 0, 1)
+        for columns_of_joint in regressor.in_numpy(*motion)
+    ]
     weight = problem.samples / samples
 
-    plain, weighted = gram_matrices(regressor, columns, problem.weights)
-    values, by_plain, by_weighted = _criterion_and_slopes(
+    plain_matrices, weighted_matrices = gram_matrices(
+        regressor, columns, problem.weights
+    )
+    values, plain_slopes, weighted_slopes = _criterion_and_slopes(
         problem,
-        weight * plain,
-        weight * weighted + problem.prior,
+        weight * plain_matrices,
+        weight * weighted_matrices + problem.prior,
         sharpness,
     )
-    by_columns = _slopes_by_columns(problem, columns, weight, by_plain, by_weighted)
-    packed_slopes = by_columns.reshape(-1, *by_columns.shape[2:])
-    by_motion = pull_back(regressor.program, packed_slopes, *motion)
+    column_slopes = _slopes_by_columns(
+        problem, columns, weight, plain_slopes, weighted_slopes
+    )
+    packed_slopes = column_slopes.reshape(-1, *column_slopes.shape[2:])
+    motion_slopes = pull_back(regressor.program, packed_slopes, *motion)
 
-    by_coefficients = np.zeros_like(coefficients)
-    for slopes, part in zip(by_motion, rows, strict=True):
-        by_coefficients += np.einsum("jbs,sk->bjk", slopes, part)
-    gradient = by_coefficients * np.asarray(problem.limits.scale)
+    coefficient_slopes = np.zeros_like(coefficients)
+    for slopes, part in zip(motion_slopes, rows, strict=True):
+        coefficient_slopes += np.einsum("jbs,sk->bjk", slopes, part)
+    gradient = coefficient_slopes * np.asarray(problem.limits.scale)
     return values, gradient.reshape(x.shape)
 
 
 def _criterion_and_slopes(
     problem: ExcitationProblem,
-    plain: np.ndarray,
-    weighted: np.ndarray,
+    plain_matrices: np.ndarray,
+    weighted_matrices: np.ndarray,
     sharpness: float | None,
 ):
     """Return the criterion of each motion, and its derivatives by both matrices."""
-    values = np.zeros(len(plain))
-    by_plain = np.zeros_like(plain)
-    by_weighted = np.zeros_like(weighted)
-    for k, matrices in enumerate(zip(plain, weighted, strict=True)):
+    values = np.zeros(len(plain_matrices))
+    plain_slopes = np.zeros_like(plain_matrices)
+    weighted_slopes = np.zeros_like(weighted_matrices)
+    for k, matrices in enumerate(zip(plain_matrices, weighted_matrices, strict=True)):
         value, slopes = problem.criterion_and_slopes(*matrices, sharpness)
         values[k] = value
-        by_plain[k] = slopes[0]
-        by_weighted[k] = slopes[1]
-    return values, by_plain, by_weighted
+        plain_slopes[k] = slopes[0]
+        weighted_slopes[k] = slopes[1]
+    return values, plain_slopes, weighted_slopes
 
 
 def _slopes_by_columns(
     problem: ExcitationProblem,
     columns: list[np.ndarray],
     weight: float,
-    by_plain: np.ndarray,
-    by_weighted: np.ndarray,
+    plain_slopes: np.ndarray,
+    weighted_slopes: np.ndarray,
 ):
     """Return derivatives by the regressor's entries [joints, base, starts, samples]."""
     starts, _, samples = columns[0].shape
     slopes = np.zeros((len(columns), problem.base.size, starts, samples))
     numbers_by_joint = problem.regressor.columns
-    for joint, each in enumerate(columns):
+    for joint, joint_columns in enumerate(columns):
         numbers = numbers_by_joint[joint]
         place = np.ix_(numbers, numbers)
-        by_gram = by_plain[:, *place]
-        by_gram = by_gram + problem.weights[joint] ** 2 * by_weighted[:, *place]
+        weight_of_joint = problem.weights[joint] ** 2
+        weighted_part = weight_of_joint * weighted_slopes[:, *place]
+        gram_slopes = plain_slopes[:, *place] + weighted_part
         # Each column is in the product twice.
-        symmetric = weight * (by_gram + np.swapaxes(by_gram, 1, 2))
-        slopes[joint, list(numbers)] = np.swapaxes(symmetric @ each, 0, 1)
+        symmetric_slopes = weight * (gram_slopes + np.swapaxes(gram_slopes, 1, 2))
+        products = symmetric_slopes @ joint_columns
+        slopes[joint, list(numbers)] = np.swapaxes(products, 0, 1)
     return slopes

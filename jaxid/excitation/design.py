@@ -251,8 +251,10 @@ def _run_search(
             history.append(candidates.best_value)
             elapsed_time = time.monotonic() - start_time
             if progress is not None:
-                done = (len(history) - 1) / steps
-                fraction = min(done if seconds is None else elapsed_time / seconds, 1.0)
+                fraction = (len(history) - 1) / steps
+                if seconds is not None:
+                    fraction = elapsed_time / seconds
+                fraction = min(fraction, 1.0)
                 trajectory = problem.trajectory(candidates.best_motion)
                 value = candidates.best_value
                 progress(
@@ -270,13 +272,13 @@ def _run_search(
         return Outcome(candidates, history, DesignStatus.STOPPED)
     if not candidates.is_feasible:
         for place in candidates.order()[:MAX_SHRUNK]:
-            smaller = shrink_to_constraints(problem, candidates.x[place])
-            candidates = candidates.improved(np.array([place]), smaller)
+            smaller_motion = shrink_to_constraints(problem, candidates.x[place])
+            candidates = candidates.improved(np.array([place]), smaller_motion)
     return Outcome(candidates, history, _status(history))
 
 
 def _status(history: list[float]):
     """Return whether the last quarter of the steps improved the motion."""
-    before = history[len(history) - 1 - len(history) // 4]
-    is_improving = history[-1] < (1.0 - MIN_IMPROVEMENT) * before
+    earlier_value = history[len(history) - 1 - len(history) // 4]
+    is_improving = history[-1] < (1.0 - MIN_IMPROVEMENT) * earlier_value
     return DesignStatus.IMPROVING if is_improving else DesignStatus.CONVERGED

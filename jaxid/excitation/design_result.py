@@ -105,9 +105,9 @@ class ExcitationPlan(Summarised, eqx.Module):
         comparisons = []
         with double_precision():
             for criterion in CRITERIA.values():
-                before = criterion.value(self.reference)
-                after = criterion.value(self.information)
-                comparisons.append(Comparison(criterion.name, before, after))
+                reference_value = criterion.value(self.reference)
+                value = criterion.value(self.information)
+                comparisons.append(Comparison(criterion.name, reference_value, value))
         return tuple(comparisons)
 
     @property
@@ -178,13 +178,13 @@ class ExcitationPlan(Summarised, eqx.Module):
 
     def _criteria_table(self):
         """Return the table of criteria."""
-        names, before, after = zip(*self.criteria, strict=True)
+        names, reference_values, values = zip(*self.criteria, strict=True)
         return Table(
             "criteria: smaller is better; "
             f"this motion was designed by the {self.criterion.name}",
             Column("criterion", names),
-            Column("random motion", before),
-            Column("this motion", after),
+            Column("random motion", reference_values),
+            Column("this motion", values),
         )
 
     def _deviations_table(self):
@@ -198,10 +198,10 @@ class ExcitationPlan(Summarised, eqx.Module):
             Column("better than\nrandom", self.gains, "factor", "{:.2f}".format),
         ]
         status = []
-        relative = self.relative_deviations
-        if not np.isnan(relative).all():
-            columns.append(Column("±", relative, "%", percent))
-            is_vague = relative > MAX_RELATIVE_DEVIATION
+        relative_deviations = self.relative_deviations
+        if not np.isnan(relative_deviations).all():
+            columns.append(Column("±", relative_deviations, "%", percent))
+            is_vague = relative_deviations > MAX_RELATIVE_DEVIATION
             status = [Status.DOUBTFUL if x else Status.NEUTRAL for x in is_vague]
         return Table("expected standard deviations", *columns, status=status)
 
@@ -274,5 +274,5 @@ def _findings_table(findings: tuple[Finding, ...]):
         Column("limit", limits),
         Column("use", fractions, "%", kind="number"),
         Column("made of", [finding.note for finding in findings]),
-        status=[Status.BAD if one.value > 0 else Status.GOOD for one in findings],
+        status=[Status.BAD if x.value > 0 else Status.GOOD for x in findings],
     )

@@ -80,12 +80,12 @@ class Candidates(NamedTuple):
         """Return the best of both, as many as these are; duplicates come last."""
         pairs = zip(self, others, strict=True)
         all_motions = Candidates(*(np.concatenate(pair) for pair in pairs))
-        ordered = all_motions.at(all_motions.order())
-        value_steps = np.diff(ordered.value, prepend=np.nan)
-        violation_steps = np.diff(ordered.violation, prepend=np.nan)
+        sorted_motions = all_motions.at(all_motions.order())
+        value_steps = np.diff(sorted_motions.value, prepend=np.nan)
+        violation_steps = np.diff(sorted_motions.violation, prepend=np.nan)
         is_duplicate = (value_steps <= SAME_VALUE) & (violation_steps == 0.0)
-        duplicates_last = np.argsort(is_duplicate, kind="stable")
-        return ordered.at(duplicates_last[: len(self.value)])
+        order = np.argsort(is_duplicate, kind="stable")
+        return sorted_motions.at(order[: len(self.value)])
 
 
 def criterion_values(problem: ExcitationProblem, x: ScaledMotions) -> PerStart:
@@ -150,9 +150,9 @@ def shrink_to_constraints(problem: ExcitationProblem, x: ScaledMotion) -> Candid
     # Bisection: the largest factor lies between the one found and the step above it.
     upper_bound = factor + SHRINKAGE_STEP
     for _ in range(6):
-        middle = 0.5 * (factor + upper_bound)
-        if is_kept(middle):
-            factor = middle
+        middle_factor = 0.5 * (factor + upper_bound)
+        if is_kept(middle_factor):
+            factor = middle_factor
         else:
-            upper_bound = middle
+            upper_bound = middle_factor
     return evaluate(problem, grid.shrink(x, factor)[None])

@@ -23,11 +23,11 @@ from jaxid.arrays import Float
 from .coefficient_limits import Grid, ScaledMotions
 
 INITIAL_CURVATURE = 0.3  # small, so that first steps are large
-TO_BOUNDARY = 0.995  # fraction of the way to the next limit that a step may go
+MAX_SHARE_OF_WAY = 0.995  # fraction of the way to the next limit that a step may go
 DECREASE = 1e-4  # fraction of the promised decrease that a step must give
 DAMPING = 0.1  # fraction of the expected curvature below which a step is damped
 PATIENCE = 8  # refused steps in a row after which the curvature is forgotten
-COOLING = 0.9  # factor of the barrier after a good step
+BARRIER_FACTOR = 0.9  # factor of the barrier after a good step
 MIN_GOOD_LENGTH = 0.1  # length from which a step is a good one
 START_FRACTION = 0.985  # fraction of the bound within which a stage starts
 CENTRALITY = 1e3  # factor by which multipliers may differ from the central path
@@ -126,14 +126,14 @@ def run(
     """
     iterates = [_begin_stage(grid, stage, iterate) for iterate in iterates]
     for _ in range(stage.iterations):
-        active = [
+        active_starts = [
             k for k, each in enumerate(iterates) if not _has_converged(stage, each)
         ]
-        if not active:
+        if not active_starts:
             break
-        points = np.array([iterates[k].trial for k in active])
-        evaluations = objective(points, active)
-        for k, evaluation in zip(active, evaluations, strict=True):
+        points = np.array([iterates[k].trial for k in active_starts])
+        evaluations = objective(points, active_starts)
+        for k, evaluation in zip(active_starts, evaluations, strict=True):
             with np.errstate(all="ignore"):
                 iterates[k] = _update(grid, stage, iterates[k], evaluation)
     return iterates
@@ -150,13 +150,13 @@ def _begin_stage(grid: Grid, stage: Stage, iterate: Iterate):
     """Move one start inside the bound, with multipliers on the central path."""
     bound = START_FRACTION * (stage.bound * grid.bound)
     y = grid.scale_into_limits(iterate.y, bound)
-    central = stage.barrier / _limit_room(grid, stage, y)
+    central_duals = stage.barrier / _limit_room(grid, stage, y)
     duals = np.array(iterate.duals)
-    limit_duals = duals[: len(central)]
+    limit_duals = duals[: len(central_duals)]
     if not limit_duals.any() or (y != iterate.y).any():
-        limit_duals[:] = central
+        limit_duals[:] = central_duals
     else:
-        limit_duals[:] = _near_central(limit_duals, central)
+        limit_duals[:] = _near_central(limit_duals, central_duals)
     return iterate._replace(
         y=y,
         duals=duals,
@@ -237,8 +237,8 @@ def _take_step(
         room: Distance of each inequality from its bound at that point.
     """
     # After a short step the point is still far from the best one for this barrier.
-    cooling = COOLING if iterate.length > MIN_GOOD_LENGTH else 1.0
-    barrier = max(stage.min_barrier, iterate.barrier * cooling)
+    barrier_factor = BARRIER_FACTOR if iterate.length > MIN_GOOD_LENGTH else 1.0
+    barrier = max(stage.min_barrier, iterate.barrier * barrier_factor)
     duals = iterate.duals + iterate.dual_length * iterate.dual_step
     duals = _near_central(duals, barrier / room)
 
@@ -268,17 +268,17 @@ def _with_step(
 ):
     """Return one start with the step to the barrier's minimum and its length."""
     stiffness = iterate.duals / room
-    central = iterate.barrier / room
-    downhill = _downhill(grid, stage, iterate, central)
-    step = _solve(_barrier_hessian(grid, iterate, stiffness), downhill)
+    central_duals = iterate.barrier / room
+    descent = _downhill(grid, stage, iterate, central_duals)
+    step = _solve(_barrier_hessian(grid, iterate, stiffness), descent)
     change = _change_of_inequalities(grid, iterate, step)
-    dual_step = central - iterate.duals + stiffness * change
+    dual_step = central_duals - iterate.duals + stiffness * change
     return iterate._replace(
         step=step,
         dual_step=dual_step,
         length=_longest_step(change, room),
         dual_length=_longest_step(-dual_step, iterate.duals),
-        slope=-float(downhill @ step),
+        slope=-float(descent @ step),
     )
 
 
@@ -308,8 +308,8 @@ def _barrier_hessian(
 
 def _add_limits(H: np.ndarray, grid: Grid, stiffness: np.ndarray):
     """Add the curvature of the limits, which couple the variables of one joint only."""
-    upper, lower = stiffness.reshape(2, *grid.c.shape)
-    stiff_rows = grid.R * (upper + lower)[:, :, None]
+    upper_stiffness, lower_stiffness = stiffness.reshape(2, *grid.c.shape)
+    stiff_rows = grid.R * (upper_stiffness + lower_stiffness)[:, :, None]
     blocks = np.swapaxes(grid.R, 1, 2) @ stiff_rows
     variables = grid.R.shape[2]
     for joint, block in enumerate(blocks):
@@ -327,14 +327,15 @@ def _downhill(
     """Return the negative gradient of the objective with its barrier."""
     evaluation = iterate.evaluation
     parts = _split(central, evaluation)
-    upper, lower = parts.limits.reshape(2, *grid.c.shape)
-    by_limits = np.einsum("jrk,jr->jk", grid.R, upper - lower).reshape(-1)
-    by_constraints = parts.constraints @ evaluation.slopes
-    downhill = -(evaluation.gradient + by_limits + by_constraints)
+    upper_parts, lower_parts = parts.limits.reshape(2, *grid.c.shape)
+    differences = upper_parts - lower_parts
+    limit_gradient = np.einsum("jrk,jr->jk", grid.R, differences).reshape(-1)
+    constraint_gradient = parts.constraints @ evaluation.slopes
+    descent = -(evaluation.gradient + limit_gradient + constraint_gradient)
     if not len(parts.slack):
-        return downhill
-    by_slack = parts.constraints.sum() - stage.penalty + parts.slack
-    return np.concatenate([downhill, by_slack])
+        return descent
+    slack_descent = parts.constraints.sum() - stage.penalty + parts.slack
+    return np.concatenate([descent, slack_descent])
 
 
 def _solve(H: np.ndarray, downhill: np.ndarray):
@@ -356,8 +357,8 @@ def _change_of_inequalities(
     size = len(iterate.y)
     slack_step = step[size:]
     rows = grid.rows(step[:size]).ravel()
-    by_constraints = iterate.evaluation.slopes @ step[:size] - slack_step.sum()
-    return np.concatenate([rows, -rows, by_constraints, -slack_step])
+    constraint_changes = iterate.evaluation.slopes @ step[:size] - slack_step.sum()
+    return np.concatenate([rows, -rows, constraint_changes, -slack_step])
 
 
 def _limit_room(grid: Grid, stage: Stage, y: np.ndarray):
@@ -394,7 +395,7 @@ def _near_central(duals: np.ndarray, central: np.ndarray):
 
 def _longest_step(change: Inequalities, room: Inequalities):
     """Return the longest step, at most 1, that stays inside all bounds."""
-    return min(1.0, TO_BOUNDARY / float((change / room).max(initial=1e-12)))
+    return min(1.0, MAX_SHARE_OF_WAY / float((change / room).max(initial=1e-12)))
 
 
 def _damped_bfgs(B: np.ndarray, s: np.ndarray, change: np.ndarray):
@@ -442,7 +443,11 @@ def _merit(
     slack: np.ndarray,
     room: Inequalities,
 ):
-    """Return the merit function, which a step must decrease."""
+    """Return the objective with penalty and barrier, which a step must decrease.
+
+    `room` holds the distance of each inequality from its bound.
+    """
+    # A lower bound keeps the logarithms finite where a step meets a limit.
     logarithms = [
         float(np.log(np.maximum(part, 1e-300)).sum())
         for part in _split(room, evaluation)

@@ -135,8 +135,8 @@ class ExcitationProblem:
     def _typical_sizes(self):
         """Return each parameter's deviation if it were the only one."""
         motions = self.limits.random(jax.random.key(0), 8)
-        weighted = [self.information(x).weighted for x in motions]
-        squares = np.mean([np.diag(matrix) for matrix in weighted], axis=0)
+        weighted_matrices = [self.information(x).weighted for x in motions]
+        squares = np.mean([np.diag(matrix) for matrix in weighted_matrices], axis=0)
         return 1.0 / np.sqrt(np.where(squares > 0, squares, 1.0))
 
     @property
@@ -163,7 +163,7 @@ class ExcitationProblem:
         Args:
             x: Scaled coefficients.
             sharpness: Sharpness of smooth extremes of eigenvalues; exact if None.
-            samples: Number of evaluated samples, which stand for all measured ones; all
+            samples: Number of evaluated samples, which represent all measured ones; all
                 of them if None.
         """
         samples = self.samples if samples is None else samples
@@ -173,23 +173,26 @@ class ExcitationProblem:
             for part in self.sample_rows(samples)
         ]
         columns = self.regressor(*motion)
-        plain, weighted = gram_matrices(self.regressor, columns, self.weights)
+        plain_matrices, weighted_matrices = gram_matrices(
+            self.regressor, columns, self.weights
+        )
         # The samples stand for all that are measured.
         weight = self.samples / samples
         return self._criterion_of(
-            weight * plain[0],
-            weight * weighted[0] + self.prior,
+            weight * plain_matrices[0],
+            weight * weighted_matrices[0] + self.prior,
             sharpness,
         )
 
     def _criterion_of(
         self,
-        plain: Array,
-        weighted: Array,
+        plain_matrix: Array,
+        weighted_matrix: Array,
         sharpness: Sharpness,
     ):
         """Return the logarithm of the criterion of one motion's information."""
-        return self.criterion(Information(plain, weighted, self.sizes), sharpness)
+        information = Information(plain_matrix, weighted_matrix, self.sizes)
+        return self.criterion(information, sharpness)
 
     def inequalities(self, x: ScaledMotion) -> Array:
         """Return what must not be positive: excess over limits and constraints.
@@ -263,14 +266,16 @@ class ExcitationProblem:
     def _largest_excess(self, x: AnyArray, instants: slice):
         """Return the largest value of all constraints, also between these instants."""
         values = self.constraint_values(np.asarray(x), instants)
-        return max(float(highest_values(np.asarray(each)).max()) for each in values)
+        return max(
+            float(highest_values(np.asarray(samples)).max()) for samples in values
+        )
 
     def findings(self, x: ScaledMotion) -> list[Finding]:
         """Return all limited quantities with their largest values."""
         findings = []
         values = self.constraint_values(np.asarray(x))
-        for constraint, each in zip(self.constraints, values, strict=True):
-            tops = highest_values(np.asarray(each))
+        for constraint, samples in zip(self.constraints, values, strict=True):
+            tops = highest_values(np.asarray(samples))
             findings += constraint.describe(self.robot, tops)
         return findings
 
@@ -294,5 +299,5 @@ def highest_values(values: AnyArray) -> AnyArray:
     # The top of the parabola through three values is above the middle one.
     divisor = 8 * xp.where(is_peak, bend, 1.0)
     rise = xp.where(is_peak, (next_values - previous_values) ** 2 / divisor, 0.0)
-    ends = xp.maximum(values[0], values[-1])
-    return xp.maximum((middle_values + rise).max(axis=0), ends)
+    end_values = xp.maximum(values[0], values[-1])
+    return xp.maximum((middle_values + rise).max(axis=0), end_values)

@@ -150,6 +150,14 @@ def search(
                 deadline,
             )
 
+    candidates = yield from _improve_finely(problem, candidates, deadline)
+    yield Step("keeping the limits closely", candidates)
+
+
+def _improve_finely(
+    problem: ExcitationProblem, candidates: Candidates, deadline: float
+) -> Search:
+    """Improve all motions on the fine grid, after the deadline only the best batch."""
     order = candidates.promising()
     if time.monotonic() >= deadline:
         order = order[:BATCH]
@@ -164,7 +172,7 @@ def search(
             step,
         )
         candidates = _take(problem, candidates, places, iterates)
-    yield Step("keeping the limits closely", candidates)
+    return candidates
 
 
 def _find_feasible_motion(
@@ -258,7 +266,7 @@ def _improve(
             break
         watched_values = [watch(problem, iterate.y) for iterate in iterates]
         objective = partial(_evaluate, problem, stage.sharpness, watched_values)
-        barrier = stage.barrier * interior_point.COOLING**start
+        barrier = stage.barrier * interior_point.BARRIER_FACTOR**start
         part = stage._replace(
             barrier=max(stage.min_barrier, barrier),
             iterations=min(PART, stage.iterations - start),
@@ -280,7 +288,7 @@ def _evaluate(
     constraints = linearise(problem, y, [watched_values[start] for start in starts])
     excess = constraints.values + MARGIN
     parts = (values.tolist(), gradients, excess, constraints.slopes)
-    return [Evaluation(*each) for each in zip(*parts, strict=True)]
+    return [Evaluation(*fields) for fields in zip(*parts, strict=True)]
 
 
 def _take(
@@ -349,7 +357,7 @@ def crossover(
     """
     retimings = problem.basis.retimings()
     samples = scale_samples(SEARCH_SAMPLES, problem.basis)
-    best_children = np.array(x)
+    next_motions = np.array(x)
     best_values = np.full(len(x), np.inf)
     for _ in range(CHILD_TRIES):
         children = _draw_children(problem, retimings, x, random)
@@ -358,9 +366,9 @@ def crossover(
             excess = np.array([watched_excess(problem, child) for child in children])
             values = values + EXCESS_PENALTY * np.maximum(excess, 0.0)
         is_better = values < best_values
-        best_children[is_better] = children[is_better]
+        next_motions[is_better] = children[is_better]
         best_values[is_better] = values[is_better]
-    return best_children
+    return next_motions
 
 
 def _draw_children(

@@ -61,7 +61,7 @@ def watch(problem: ExcitationProblem, x: ScaledMotion) -> list[WatchedValues]:
 def watched_excess(problem: ExcitationProblem, x: ScaledMotion) -> float:
     """Return the largest excess of the constraints at equidistant instants."""
     values = problem.constraint_values(x, WATCHED_INSTANTS)
-    return max((float(each.max()) for each in values), default=-np.inf)
+    return max((float(excess.max()) for excess in values), default=-np.inf)
 
 
 def linearise(
@@ -74,10 +74,10 @@ def linearise(
     values = [np.zeros((starts, 0))]
     slopes = [np.zeros((starts, 0, size))]
     for number, linearisation in enumerate(problem.linearisations):
-        places = [of_start[number] for of_start in watched]
-        linear = _linearise_constraint(problem, linearisation, x, places)
-        values.append(linear.values)
-        slopes.append(linear.slopes)
+        places = [start_values[number] for start_values in watched]
+        linear_model = _linearise_constraint(problem, linearisation, x, places)
+        values.append(linear_model.values)
+        slopes.append(linear_model.slopes)
     return WatchedSlopes(np.concatenate(values, axis=1), np.concatenate(slopes, axis=1))
 
 
@@ -88,19 +88,19 @@ def _linearise_constraint(
     places: list[WatchedValues],
 ):
     """Return watched values of one constraint, of all starts together."""
-    instants = np.array([each.instants for each in places])
-    entries = np.array([each.entries for each in places])
+    instants = np.array([place.instants for place in places])
+    entries = np.array([place.entries for place in places])
     rows = problem.checked_rows[:, instants]
     coefficients = problem.limits.coefficients(x)
     states = np.einsum("obwk,bjk->obwj", rows, coefficients, optimize=True)
     q, qd, qdd = states.reshape(3, instants.size, -1)
-    values, by_motion = linearisation(Motion(q, qd, qdd), entries.ravel())
+    values, motion_slopes = linearisation(Motion(q, qd, qdd), entries.ravel())
 
-    by_coefficients = np.zeros((*instants.shape, *problem.limits.shape))
-    for by_order, part in zip(by_motion, rows, strict=False):
-        by_joint = by_order.reshape(*instants.shape, -1, 1)
-        by_coefficients += by_joint * part[:, :, None]
-    slopes = by_coefficients * np.asarray(problem.limits.scale)
+    coefficient_slopes = np.zeros((*instants.shape, *problem.limits.shape))
+    for order_slopes, part in zip(motion_slopes, rows, strict=False):
+        joint_slopes = order_slopes.reshape(*instants.shape, -1, 1)
+        coefficient_slopes += joint_slopes * part[:, :, None]
+    slopes = coefficient_slopes * np.asarray(problem.limits.scale)
     return WatchedSlopes(
         values.reshape(instants.shape), slopes.reshape(*instants.shape, -1)
     )

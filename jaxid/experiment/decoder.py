@@ -130,20 +130,20 @@ def check_names(
     for name in table:
         if name in known_names:
             continue
-        in_file = place == "the file"
-        path = name if in_file else f"{place}.{name}"
+        is_file = place == "the file"
+        path = name if is_file else f"{place}.{name}"
         similar_names = difflib.get_close_matches(name, known_names, n=1, cutoff=0.6)
         if similar_names:
             raise InputError(
                 f"`{path}` is no known key: did you mean `{similar_names[0]}`?"
             )
-        where = place if in_file else f"the table `[{place}]`"
+        owner = place if is_file else f"the table `[{place}]`"
         raise InputError(
-            f"`{path}` is no known key: {where} has {', '.join(known_names)}."
+            f"`{path}` is no known key: {owner} has {', '.join(known_names)}."
         )
 
 
-_OTHER = object()
+_MISMATCH = object()
 """Result for a value that an annotation is not meant for."""
 
 
@@ -152,7 +152,7 @@ def decode_value(value: Any, hint: Any, place: str) -> Any:
     options = [x for x in union_members(hint) if x is not type(None)]
     for option in options:
         result = _convert(value, option, place)
-        if result is not _OTHER:
+        if result is not _MISMATCH:
             return result
     words = dict.fromkeys(_describe(option) for option in options)
     text = "a table"
@@ -172,23 +172,23 @@ _SCALARS: dict[Any, tuple[Any, str]] = {
 
 
 def _convert(value: Any, option: Any, place: str) -> Any:
-    """Return a value as an annotation asks, or `_OTHER` if it is of another kind."""
+    """Return a value as an annotation asks, or `_MISMATCH` if it is of another kind."""
     origin = typing.get_origin(option)
     arguments = typing.get_args(option)
     function = table_of(option)
     if function is not None:
-        return call(function, value, place) if isinstance(value, dict) else _OTHER
+        return call(function, value, place) if isinstance(value, dict) else _MISMATCH
     if origin is Annotated:
         kind, rule = arguments
         result = _convert(value, kind, place)
-        if result is not _OTHER:
+        if result is not _MISMATCH:
             _require_allowed(result, rule, place)
         return result
     if origin is Literal:
-        return value if value in arguments else _OTHER
+        return value if value in arguments else _MISMATCH
     if origin in (list, tuple):
         if not isinstance(value, list):
-            return _OTHER
+            return _MISMATCH
         is_repeated = origin is list or arguments[-1] is Ellipsis
         hints = arguments[:1] * len(value) if is_repeated else arguments
         return origin(_convert_list(value, hints, place))
@@ -211,8 +211,8 @@ def _require_in_range(value: float, bounds: Bounds, place: str) -> None:
     if not math.isfinite(value):
         raise InputError(f"`{place}` must be finite, but is {value}.")
     comparisons = {"above": gt, "at least": ge, "at most": le, "below": lt}
-    for bound, (words, holds) in zip(bounds, comparisons.items(), strict=True):
-        if bound is not None and not holds(value, bound):
+    for bound, (words, comparison) in zip(bounds, comparisons.items(), strict=True):
+        if bound is not None and not comparison(value, bound):
             raise InputError(f"`{place}` must be {words} {bound:.10g}, but is {value}.")
 
 
@@ -231,7 +231,7 @@ def _convert_list(values: list[Any], hints: Sequence[Any], place: str) -> list[A
 def _convert_array(value: Any, place: str) -> Any:
     """Return numbers as an array."""
     if isinstance(value, str | dict):
-        return _OTHER
+        return _MISMATCH
     try:
         array = np.array(value, np.float64)
     except (TypeError, ValueError) as error:
@@ -249,7 +249,7 @@ def _convert_scalar(value: Any, kind: Any, place: str) -> Any:
     toml_kinds, _ = _SCALARS[kind]
     # In Python, but not in TOML, a truth value is a whole number.
     if not isinstance(value, toml_kinds) or isinstance(value, bool) != (kind is bool):
-        return _OTHER
+        return _MISMATCH
     if kind in (int, float) and math.isfinite(value) and abs(value) > MAX_NUMBER:
         raise InputError(
             f"`{place}` is {value:g}: no quantity is larger than {MAX_NUMBER:g}."
@@ -278,7 +278,9 @@ def _describe(option: Any) -> str:
     arguments = typing.get_args(option)
     if origin is Annotated and not table_of(option):
         kind, rule = arguments
-        return quoted(rule.names) if isinstance(rule, OneOf) else _describe(kind)
+        if isinstance(rule, OneOf):
+            return quoted(rule.names)
+        return _describe(kind)
     if origin is Literal:
         return quoted(arguments)
     if origin in (list, tuple):

@@ -159,9 +159,9 @@ def _build(tables: TomlTable, text: str, path: Path) -> Experiment:
         columns, reading = build_columns(tables["recording"], robot)
     load = None
     if "load" in tables:
-        on_robot = call(known_load, tables["load"], "load")
+        load_of_robot = call(known_load, tables["load"], "load")
         with within("load"):
-            load = on_robot(robot)
+            load = load_of_robot(robot)
     return Experiment(
         path,
         text,
@@ -197,14 +197,14 @@ def _build_rollout(
     """
     servo, torque = decode([ServoSettings, TorqueSettings], table, "rollout")
     settings = TorqueSettings(**torque)
-    others = ServoSettings(**servo)
+    other_settings = ServoSettings(**servo)
     kind = "commands"
     if reading.commands is not None:
         settings = ServoSettings(**servo)
-        others = TorqueSettings(**torque)
+        other_settings = TorqueSettings(**torque)
         kind = "forces` without `recording.commands"
-    for field in dataclasses.fields(others):
-        if getattr(others, field.name) != field.default:
+    for field in dataclasses.fields(other_settings):
+        if getattr(other_settings, field.name) != field.default:
             raise InputError(
                 f"`rollout.{field.name}` is for logs with `recording.{kind}`."
             )

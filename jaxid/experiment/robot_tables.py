@@ -239,7 +239,7 @@ def replace_limits(
         "force": force,
     }
     limits = {}
-    assumed = robot.limits.assumed
+    assumptions = robot.limits.assumed
     for name, numbers in arguments.items():
         values = per_joint(name, numbers, robot.joints, np.nan)
         if name != "force":
@@ -247,14 +247,14 @@ def replace_limits(
         is_given = ~np.isnan(values)
         limits[name] = np.where(is_given, values, getattr(robot.limits, name))
         # What is given is no assumption of the robot's source any more.
-        settled_names = {
+        replaced_names = {
             f"{name} of {robot.joint_names[j]}" for j in np.flatnonzero(is_given)
         }
         if is_given.all():
-            settled_names.add(name)
-        assumed = tuple(text for text in assumed if text not in settled_names)
+            replaced_names.add(name)
+        assumptions = tuple(text for text in assumptions if text not in replaced_names)
     _require_plausible(robot, limits)
-    return robot.replace(limits=Limits(robot.joints, **limits, assumed=assumed))
+    return robot.replace(limits=Limits(robot.joints, **limits, assumed=assumptions))
 
 
 def _require_plausible(robot: Robot, limits: dict[str, np.ndarray]) -> None:
@@ -277,8 +277,8 @@ def _require_plausible(robot: Robot, limits: dict[str, np.ndarray]) -> None:
 
 def _angle_scale(robot: Robot, unit: AngleUnit) -> np.ndarray:
     """Return the size of the unit of each joint [rad or m]."""
-    in_degrees = np.array(robot.revolute) & (unit == "deg")
-    return np.where(in_degrees, np.pi / 180, 1.0)
+    is_in_degrees = np.array(robot.revolute) & (unit == "deg")
+    return np.where(is_in_degrees, np.pi / 180, 1.0)
 
 
 def replace_drives(

@@ -70,12 +70,13 @@ class DryFriction:
     def transition(self, robot: Robot) -> terms.AbstractTransition:
         """Return the transition between the directions."""
         if self.presliding:
-            steady = dataclasses.replace(self, presliding=False).transition(robot)
+            steady_friction = dataclasses.replace(self, presliding=False)
+            steady_transition = steady_friction.transition(robot)
             motors = None
             if terms.CoupledDrives().couplings(robot):
                 ratios = np.asarray(robot.drives.reduction)
                 motors = ratios / np.diag(ratios)[:, None]
-            return terms.Presliding(steady=steady, motors=motors)
+            return terms.Presliding(steady=steady_transition, motors=motors)
         if self.hard:
             return terms.HardSign()
         return terms.Tanh(_speed(robot, "coulomb.epsilon", self.epsilon))
@@ -236,8 +237,8 @@ def build_columns(table: TomlTable, robot: Robot) -> tuple[Columns, LogReading]:
     )
     with within("recording"):
         columns = Columns(**arguments, **Sides(**sides).of_columns)
-        still = np.zeros((1, robot.joints))
-        columns.to_si(still, still, still)  # refuses lists that do not fit the robot
+        zeros = np.zeros((1, robot.joints))
+        columns.to_si(zeros, zeros, zeros)  # refuses lists that do not fit the robot
         require_fitting_units(columns, robot, arguments)
         return columns, LogReading(**reading)
 
@@ -260,12 +261,12 @@ def require_fitting_units(columns: Columns, robot: Robot, arguments: TomlTable) 
         units = arguments.get(name, [])
         if isinstance(units, Unit):
             units = [units] * robot.joints
-        for joint, turns, unit in zip(
+        for joint, is_revolute, unit in zip(
             robot.joint_names, robot.revolute, units, strict=False
         ):
-            foreign_units = LENGTH_UNITS if turns else ANGLE_UNITS
+            foreign_units = LENGTH_UNITS if is_revolute else ANGLE_UNITS
             if unit.symbol in foreign_units:
-                motion = "turns" if turns else "slides"
+                motion = "turns" if is_revolute else "slides"
                 raise InputError(
                     f'`{name}` of joint `{joint}` is "{unit.symbol}", but the joint '
                     f"{motion}: give a list of units."
@@ -472,10 +473,10 @@ def build_setup(
         model = Model(robot, effects.build(robot))
     filters = {}
     if "filter" in tables:
-        first_filter, *others = build_filters(tables["filter"])
+        first_filter, *other_filters = build_filters(tables["filter"])
         filters["filter"] = first_filter
-        if others:
-            filters["filter_candidates"] = (first_filter, *others)
+        if other_filters:
+            filters["filter_candidates"] = (first_filter, *other_filters)
     decimation, min_speed = call(build_rows, tables.get("rows", {}), "rows", robot)
     arguments, bounds = decode_estimator(tables.get("estimator", {}))
     with within("estimator"):

@@ -69,7 +69,9 @@ LIMITS = (
     "jerk",
     "force",
 )
-OF_KINDS = set().union(*KINDS.values()) - set.intersection(*map(set, KINDS.values()))
+KEYS_OF_SOME_KINDS = set().union(*KINDS.values()) - set.intersection(
+    *map(set, KINDS.values())
+)
 """Keys that not all kinds of estimators take, which are commented out."""
 
 
@@ -121,23 +123,23 @@ def _table(
     name: str, functions: tuple[Callable, ...], joints: int, values: Mapping[str, Any]
 ) -> str:
     """Return a table with all keys of some functions, some or all commented out."""
-    active = name not in ("load", "collision", "robot.tool")
+    is_active_table = name not in ("load", "collision", "robot.tool")
     lines = _comment(SUMMARIES.get(name) or _summary(functions[0]))
-    lines.append(f"{'' if active else '# '}[{name}]")
+    lines.append(f"{'' if is_active_table else '# '}[{name}]")
     if name == "filter":
         lines += _entry("kind", json.dumps(values["kind"]), "", True)
     written_names = {*SIDES, "tool"}
     kinds: dict[Any, str] = {filter: kind for kind, filter in FILTERS.items()}
     for function in functions:
         kind = kinds.get(function)
-        is_active = active and kind in (None, values.get("kind"))
+        is_active = is_active_table and kind in (None, values.get("kind"))
         if kind is not None and not is_active:
             # Keys of the other kinds of filters are comments.
             lines += ["#", *_entry("kind", json.dumps(kind), _summary(function), False)]
         for key in keys_of(function).values():
             # Each kind of filter has keys of its own, which may have equal names.
             if kind is not None or key.name not in written_names:
-                is_common = key.name not in OF_KINDS
+                is_common = key.name not in KEYS_OF_SOME_KINDS
                 value = values.get(key.name)
                 lines += _key(key, joints, value, is_active and is_common)
         written_names |= {*keys_of(function)}
@@ -150,10 +152,10 @@ def _key(key: Key, joints: int, value: Any, active: bool) -> Iterator[str]:
     text = re.sub(r"[;,] (?:or )?None(?: if [^;.]*)?", "", key.text)
     text = text.replace(" if None", " by default")
     example = ""
-    like = re.search(r",? like `([^`]+)`", text)
-    if like is not None:
-        text = text.replace(like[0], "", 1)
-        example = like[1]
+    example_match = re.search(r",? like `([^`]+)`", text)
+    if example_match is not None:
+        text = text.replace(example_match[0], "", 1)
+        example = example_match[1]
     has_default = key.default is not inspect.Parameter.empty
     shows_example = (example and not active) or "=" in example
     if value is None and has_default and not shows_example:

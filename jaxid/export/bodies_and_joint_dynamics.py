@@ -112,9 +112,9 @@ def _odd_columns(
     columns = []
     with double_precision():
         for x, v, a in zip(q, qd, qdd, strict=True):
-            forward = np.asarray(term.columns(robot, x, v, a))
-            backward = np.asarray(term.columns(robot, x, -v, -a))
-            columns.append(0.5 * (forward - backward))
+            forward_column = np.asarray(term.columns(robot, x, v, a))
+            backward_column = np.asarray(term.columns(robot, x, -v, -a))
+            columns.append(0.5 * (forward_column - backward_column))
     return np.array(columns)
 
 

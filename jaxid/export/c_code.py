@@ -119,8 +119,8 @@ def _definitions(fit: Fit) -> dict[str, tuple[str, str, Callable]]:
         return torque(q, rest, rest, relaxed_state)
 
     def friction(q, qd, s=None):
-        at_rest = remaining_forces(q, rest, rest, relaxed_state)
-        return remaining_forces(q, qd, rest, s) - at_rest
+        forces_at_rest = remaining_forces(q, rest, rest, relaxed_state)
+        return remaining_forces(q, qd, rest, s) - forces_at_rest
 
     functions = {
         "torque": (

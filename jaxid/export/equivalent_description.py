@@ -39,8 +39,8 @@ class Description(NamedTuple):
         total = int(np.count_nonzero(self.bodies))
         for body, (*ancestors, _) in enumerate(robot.ancestors):
             # A length counts only in a frame that turns.
-            turns = any(robot.revolute[ancestor] for ancestor in ancestors)
-            if turns and lengths[body]:
+            is_turned = any(robot.revolute[ancestor] for ancestor in ancestors)
+            if is_turned and lengths[body]:
                 total += 4 + 6 * int(lengths[body])
         return total
 
@@ -61,16 +61,16 @@ class Description(NamedTuple):
         bodies = self.bodies.copy()
         for body in reversed(range(robot.joints)):
             inertia = bodies[body]
-            shared = np.zeros((4, 4))
+            passed_inertia = np.zeros((4, 4))
             if robot.revolute[body]:
-                shared = _on_axis(inertia, np.asarray(robot.axis[body]))
+                passed_inertia = _on_axis(inertia, np.asarray(robot.axis[body]))
             else:
-                shared[:3, :3] = inertia[:3, :3]
-            bodies[body] = _without_rounding(inertia - shared, inertia)
+                passed_inertia[:3, :3] = inertia[:3, :3]
+            bodies[body] = _without_rounding(inertia - passed_inertia, inertia)
             parent = robot.parent[body]
             if parent >= 0:
                 T = _transform(robot.rotation[body], robot.offset[body])
-                bodies[parent] += T @ shared @ T.T
+                bodies[parent] += T @ passed_inertia @ T.T
         return Description(robot, bodies)
 
     def slide(self, body: int, distance: float) -> "Description":
@@ -144,22 +144,22 @@ def _wrench(inertia: Matrix, a: Vector3, w: Vector3, wd: Vector3) -> AnyArray:
     twice_antisymmetric = K - K.T
     squares = w * w
     # For each axis, the two axes that follow it.
-    second = np.array([1, 2, 0])
-    third = np.array([2, 0, 1])
-    differences = squares[third] - squares[second]
-    moment = twice_antisymmetric[third, second]
-    moment = moment + second_moments[second, third] * differences
+    second_axes = np.array([1, 2, 0])
+    third_axes = np.array([2, 0, 1])
+    differences = squares[third_axes] - squares[second_axes]
+    moment = twice_antisymmetric[third_axes, second_axes]
+    moment = moment + second_moments[second_axes, third_axes] * differences
     return jnp.concatenate([force, moment])
 
 
 def _on_axis(inertia: Matrix, axis: Vector) -> Matrix:
     """Return the part of a pseudo-inertia that a turn about an axis does not change."""
     # Mass, first and second moment along the axis stay where they are.
-    along_axis = np.zeros((2, 4))
-    along_axis[0, :3] = axis
-    along_axis[1, 3] = 1.0
-    moments = along_axis @ inertia @ along_axis.T
-    return along_axis.T @ moments @ along_axis
+    basis = np.zeros((2, 4))
+    basis[0, :3] = axis
+    basis[1, 3] = 1.0
+    moments = basis @ inertia @ basis.T
+    return basis.T @ moments @ basis
 
 
 def _transform(rotation: AnyArray, position: AnyArray) -> Matrix:

@@ -30,9 +30,9 @@ def other_forces(fit: Fit) -> Callable[..., Any]:
     model = fit.base.model
 
     def forces(q, qd, qdd, s=None):
-        with_state = model if s is None else model.with_memory(state=s)
+        model_with_state = model if s is None else model.with_memory(state=s)
         total = jnp.zeros_like(q)
-        for term, p in with_state.split(fit.standard_parameters):
+        for term, p in model_with_state.split(fit.standard_parameters):
             if not term.body_parameters:
                 total = total + term.forces(model.robot, p, q, qd, qdd)
         return total

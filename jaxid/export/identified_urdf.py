@@ -101,7 +101,9 @@ def _replace_inertials(tree: UrdfTree, bodies: BodyParameters) -> None:
 
 def _fix_other_joints(tree: UrdfTree) -> list[str]:
     """Fix joints on the bodies that the robot does not have; return their links."""
-    branches = [joint for first in tree.side_joints for joint in tree.branch(first)]
+    branches = [
+        joint for side_joint in tree.side_joints for joint in tree.branch(side_joint)
+    ]
     for joint in (*tree.mimics, *branches):
         if joint.get("type") == "fixed":
             continue

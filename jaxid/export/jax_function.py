@@ -29,15 +29,15 @@ def exported_function(fit: Fit) -> export.Exported:
     """
     program = torque_program(fit)
     # One sample at a time, since the number of samples is not known here.
-    one = functools.partial(on_any_platform, program, Lowered.dense)
-    on_samples = jax.jit(jax.vmap(one))
+    sample_function = functools.partial(on_any_platform, program, Lowered.dense)
+    vectorised_function = jax.jit(jax.vmap(sample_function))
     with double_precision():
         (samples,) = export.symbolic_shape("samples")
         shapes = [
             jax.ShapeDtypeStruct((samples, *shape), np.float64)
             for shape in program.input_shapes
         ]
-        return export.export(on_samples, platforms=("cpu", "cuda"))(*shapes)
+        return export.export(vectorised_function, platforms=("cpu", "cuda"))(*shapes)
 
 
 def export_jax(fit: Fit, path: FilePath) -> Path:

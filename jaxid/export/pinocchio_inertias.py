@@ -39,8 +39,10 @@ def export_pinocchio(fit: Fit, path: FilePath) -> Path:
     rows = pinocchio_parameters(fit).tolist()
     joints = []
     for i, name in enumerate(fit.base.model.robot.joint_names):
-        at_joint = {key: float(values[i]) for key, values in dynamics.values.items()}
-        joints.append({"name": name, "parameters": rows[i], **at_joint})
+        joint_values = {
+            key: float(values[i]) for key, values in dynamics.values.items()
+        }
+        joints.append({"name": name, "parameters": rows[i], **joint_values})
     content = {
         "model": fit.checksum,
         "date": fit.date,

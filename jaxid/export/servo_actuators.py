@@ -20,7 +20,7 @@ from .bodies_and_joint_dynamics import Quantities
 from .feed_forward import body_parameters
 from .mujoco_model import mjcf_text
 
-STICKING = "0.99 0.9999 0.001"
+STICKING_IMPEDANCE = "0.99 0.9999 0.001"
 """Impedance with which MuJoCo's dry friction holds a joint almost without creep."""
 UNITS = {
     "stiffness": ("N m/rad", "N/m"),
@@ -55,8 +55,8 @@ def servo_stiffness(fit: ServoFit) -> Joints:
 def simulator_values(fit: ServoFit, parameters: AnyArray | None = None) -> Quantities:
     """Return the numbers of each joint that simulators of actuators take.
 
-    The damping is the sum of friction and of the servo's own: positions do not tell
-    them apart. Friction that grows with load is included at the mean load of the logs.
+    Positions determine only the sum of viscous friction and the servo's damping.
+    Friction that grows with load is included at the mean load of the logs.
 
     Args:
         fit: Identified servos.
@@ -69,16 +69,17 @@ def simulator_values(fit: ServoFit, parameters: AnyArray | None = None) -> Quant
     """
     rows = fit.parameters if parameters is None else np.asarray(parameters)
     ratios = {symbol: rows[:, k] for symbol, k in INDEX.items()}
-    # Parameters are in units of the stiffness, which positions alone do not tell. A
-    # draw has its own stiffness where the weight tells it.
-    is_drawn = np.isfinite(fit.stiffness) & fit.free[:, INDEX["a"]]
-    drawn_stiffness = 1.0 / np.maximum(ratios["a"], 1e-9)
-    K = np.where(is_drawn, drawn_stiffness, servo_stiffness(fit))
+    compliance = ratios["a"]
+    # Parameters are in units of the stiffness, which positions alone do not determine.
+    # Where gravity determines it, `parameters` contain its inverse.
+    has_own_stiffness = np.isfinite(fit.stiffness) & fit.free[:, INDEX["a"]]
+    own_stiffness = 1.0 / np.maximum(compliance, 1e-9)
+    K = np.where(has_own_stiffness, own_stiffness, servo_stiffness(fit))
 
-    inertia = K * ratios["J"]
-    armature = inertia - _body_inertias(fit, ratios["a"])
-    load_friction = ratios["mu"] * np.abs(ratios["a"]) * fit.load
+    armature = K * ratios["J"] - _body_inertias(fit, compliance)
+    load_friction = ratios["mu"] * np.abs(compliance) * fit.load
     friction = ratios["F"] + load_friction
+    # The start value means that no limit was found.
     is_limited = ratios["um"] < START[INDEX["um"]]
     return {
         "stiffness": K,
@@ -103,8 +104,8 @@ def _body_inertias(fit: ServoFit, compliance: Joints) -> Joints:
         return np.zeros(joints)
     bodies = fit.bodies
     mass_matrix = bodies.model.mass_matrix(bodies.parameters, np.zeros(joints))
-    without_bodies = bodies.coupled & (compliance > 0)
-    return np.where(without_bodies, 0.0, np.diag(np.asarray(mass_matrix)))
+    has_no_bodies = bodies.coupled & (compliance > 0)
+    return np.where(has_no_bodies, 0.0, np.diag(np.asarray(mass_matrix)))
 
 
 def simulator_table(fit: ServoFit) -> Table:
@@ -205,7 +206,7 @@ def _servo_mjcf(
     for joint in root.iter("joint"):
         # MuJoCo takes no stiffer friction than that of two time steps.
         joint.set("solreffriction", f"{2.0 * timestep!r} 1")
-        joint.set("solimpfriction", STICKING)
+        joint.set("solimpfriction", STICKING_IMPEDANCE)
 
     actuators = root.find("actuator")
     actuators.clear()

@@ -62,8 +62,8 @@ class CWriter:
         self._dtype = np.float64 if double else np.float32
         # Fewer and longer pieces of pi/2 than in JAX, for a shorter chain and smaller
         # angles.
-        precise = DOUBLE._replace(pieces=half_pi(33, 2), limit=2.0**20)
-        self._precision = precise if double else SINGLE
+        double_precision = DOUBLE._replace(pieces=half_pi(33, 2), limit=2.0**20)
+        self._precision = double_precision if double else SINGLE
         self.turns = self._precision.limit / 4
         self.widths: dict[str, int] = {}
         for name, operations in LIBRARY.items():
@@ -155,8 +155,8 @@ class CWriter:
         """
         stages: list[int] = []
         for k, node in enumerate(program.nodes):
-            before = max((stages[i] for i in node.uses), default=0)
-            stages.append(before + (self._function(program, k) is not None))
+            earlier_stage = max((stages[i] for i in node.uses), default=0)
+            stages.append(earlier_stage + (self._function(program, k) is not None))
         return stages
 
     def _statement(self, program: Program, k: int, inputs: Names):

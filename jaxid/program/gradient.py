@@ -24,7 +24,7 @@ from .scalar import (
     select,
 )
 
-_UNARY: dict[Operation, Callable[[Operand, Operand], Operand]] = {
+_DERIVATIVES: dict[Operation, Callable[[Operand, Operand], Operand]] = {
     Operation.ABSOLUTE: lambda x, y: apply(Operation.SIGN, x),
     Operation.SIGN: lambda x, y: 0.0,
     Operation.SINE: lambda x, y: apply(Operation.COSINE, x),
@@ -51,8 +51,10 @@ def pull_back(
 ) -> list[np.ndarray]:
     """Return the derivative of a weighted sum of results by each input.
 
-    Weights of the packed result, and arrays with the shapes of the inputs, are followed
-    by any batch axes.
+    Args:
+        program: Program whose results are weighted.
+        weights: Weights of the packed result, [results, *batch].
+        arrays: Inputs of the program; batch axes follow those of each input.
     """
     return list(evaluate(gradient_program(program), *arrays, weights))
 
@@ -66,9 +68,8 @@ def gradient_program(program: Program) -> Program:
     graph = Graph()
     shapes = program.input_shapes
     # Inputs are loaded before the first operation, so that they come first.
-    number = len(shapes)
     entries = range(len(program.outputs))
-    weights = [graph.node(Operation.INPUT, number, entry) for entry in entries]
+    weights = [graph.node(Operation.INPUT, len(shapes), entry) for entry in entries]
     scalars = record(program, graph)
     slopes = _slopes_of_nodes(program, scalars, weights)
 
@@ -79,7 +80,7 @@ def gradient_program(program: Program) -> Program:
     outputs = []
     for number, shape in enumerate(shapes):
         for entry in range(math.prod(shape)):
-            # What has no effect is no node.
+            # An input that affects no result has no node.
             k = places.get((number, entry))
             outputs.append(0.0 if k is None else slopes[k])
     structure = jax.tree.structure((0,) * len(shapes))
@@ -109,8 +110,8 @@ def _slopes_of_nodes(program: Program, scalars: list[Scalar], weights: list[Scal
 
 def _slopes(operation: Operation, x: tuple[Operand, ...], y: Scalar, slope: Operand):
     """Return what the derivative by a result adds to those by its operands."""
-    if operation in _UNARY:
-        return (multiply(slope, _UNARY[operation](x[0], y)),)
+    if operation in _DERIVATIVES:
+        return (multiply(slope, _DERIVATIVES[operation](x[0], y)),)
     if "truth" in operation.traits:
         return (0.0,) * len(x)
     match operation:
@@ -126,18 +127,18 @@ def _slopes(operation: Operation, x: tuple[Operand, ...], y: Scalar, slope: Oper
             share = divide(slope, x[1])
             return share, negate(multiply(share, y))
         case Operation.MAXIMUM | Operation.MINIMUM:
-            first = apply(Operation.EQUAL, x[0], y)
-            return select(first, slope, 0.0), select(first, 0.0, slope)
+            is_equal = apply(Operation.EQUAL, x[0], y)
+            return select(is_equal, slope, 0.0), select(is_equal, 0.0, slope)
         case Operation.SELECT:
             return 0.0, select(x[0], slope, 0.0), select(x[0], 0.0, slope)
         case Operation.POWER:
             base, exponent = x
             reduced_power = apply(Operation.POWER, base, add(exponent, -1.0))
-            by_base = multiply(slope, multiply(exponent, reduced_power))
+            base_slope = multiply(slope, multiply(exponent, reduced_power))
             if not isinstance(exponent, Scalar):
-                return by_base, 0.0
+                return base_slope, 0.0
             logarithm = apply(Operation.LOGARITHM, base)
-            return by_base, multiply(slope, multiply(y, logarithm))
+            return base_slope, multiply(slope, multiply(y, logarithm))
         case Operation.ARC_TANGENT_2:
             share = divide(slope, add(multiply(x[0], x[0]), multiply(x[1], x[1])))
             return multiply(share, x[1]), negate(multiply(share, x[0]))

@@ -65,16 +65,18 @@ def enable_compilation_cache(folder: str | Path | None = None) -> Path | None:
 
 def user_cache() -> Path:
     """Return the folder of this package among the user's caches."""
-    home = Path.home()
+    home_folder = Path.home()
     if sys.platform == "darwin":
-        return home / "Library" / "Caches" / "jaxid"
+        return home_folder / "Library" / "Caches" / "jaxid"
     if sys.platform == "win32":
-        local = os.environ.get("LOCALAPPDATA")
+        local_folder = os.environ.get("LOCALAPPDATA")
         return (
-            (Path(local) if local else home / "AppData" / "Local") / "jaxid" / "Cache"
+            (Path(local_folder) if local_folder else home_folder / "AppData" / "Local")
+            / "jaxid"
+            / "Cache"
         )
     xdg = Path(os.environ.get("XDG_CACHE_HOME", ""))
-    return (xdg if xdg.is_absolute() else home / ".cache") / "jaxid"
+    return (xdg if xdg.is_absolute() else home_folder / ".cache") / "jaxid"
 
 
 def _require_private(folder: Path):

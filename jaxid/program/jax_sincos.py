@@ -78,9 +78,9 @@ SINGLE = Precision(
 
 def _horner(coefficients: Coefficients, z: Array):
     """Evaluate a polynomial whose lowest power comes first."""
-    *others, leader = coefficients
+    *other_coefficients, leader = coefficients
     total = jnp.full_like(z, leader)
-    for coefficient in reversed(others):
+    for coefficient in reversed(other_coefficients):
         total = total * z + coefficient
     return total
 
@@ -91,13 +91,13 @@ def sine_cosine(x: Array) -> Pair:
     precision = DOUBLE if x.dtype == np.float64 else SINGLE
     turns_per_radian = float(1 / _HALF_PI)
     turns = jnp.round(x * turns_per_radian)
-    *leading, middle, last = precision.pieces
+    *leading_pieces, middle_piece, last_piece = precision.pieces
     r = x
-    for piece in leading:
+    for piece in leading_pieces:
         r = r - turns * piece
     # The steps above are exact; the rest is summed first, so that r is rounded only
     # once.
-    r = r - (turns * middle + turns * last)
+    r = r - (turns * middle_piece + turns * last_piece)
     z = r * r
     sine_polynomial = _horner(precision.sine, z)
     cosine_polynomial = _horner(precision.cosine, z)
@@ -105,17 +105,17 @@ def sine_cosine(x: Array) -> Pair:
     cosine = 1 - (0.5 * z - z * z * cosine_polynomial)
 
     # Each quarter turn more makes a cosine of a sine, and a negative sine of a cosine.
-    quarter = turns - 4 * jnp.floor(turns * 0.25)
-    is_first = quarter == 1
-    is_swapped = is_first | (quarter == 3)
-    turns_cosine = is_first | (quarter == 2)
-    first = jnp.where(is_swapped, cosine, sine)
-    second = jnp.where(is_swapped, sine, cosine)
-    first = jnp.where(quarter >= 2, -first, first)
-    second = jnp.where(turns_cosine, -second, second)
+    quarter_turns = turns - 4 * jnp.floor(turns * 0.25)
+    is_first = quarter_turns == 1
+    is_swapped = is_first | (quarter_turns == 3)
+    turns_cosine = is_first | (quarter_turns == 2)
+    sine_value = jnp.where(is_swapped, cosine, sine)
+    cosine_value = jnp.where(is_swapped, sine, cosine)
+    sine_value = jnp.where(quarter_turns >= 2, -sine_value, sine_value)
+    cosine_value = jnp.where(turns_cosine, -cosine_value, cosine_value)
     is_exact = jnp.abs(turns) <= precision.limit
-    sine = jnp.where(is_exact, first, jnp.nan)
-    cosine = jnp.where(is_exact, second, jnp.nan)
+    sine = jnp.where(is_exact, sine_value, jnp.nan)
+    cosine = jnp.where(is_exact, cosine_value, jnp.nan)
     return sine, cosine
 
 

@@ -16,7 +16,7 @@ from jax.sharding import NamedSharding, PartitionSpec
 
 from jaxid.arrays import Array
 
-ALWAYS = np.array(True)
+TRUE = np.array(True)
 """Condition of a `where` whose other branch only adds axes of `shard_map`."""
 
 
@@ -25,9 +25,9 @@ def differing_alike(arrays: tuple[Array, ...]) -> tuple[Array, ...]:
 
     The results of branches and loops must not depend on which input differs.
     """
-    firsts = (x[(0,) * x.ndim] for x in arrays if x.size)
-    like = functools.reduce(lambda a, b: jnp.where(ALWAYS, a, b), firsts)
-    return tuple(jnp.where(ALWAYS, x, like) for x in arrays)
+    first_entries = (x[(0,) * x.ndim] for x in arrays if x.size)
+    joined_entry = functools.reduce(lambda a, b: jnp.where(TRUE, a, b), first_entries)
+    return tuple(jnp.where(TRUE, x, joined_entry) for x in arrays)
 
 
 def with_derivatives_of(definition: Callable, run: Callable) -> Callable:
@@ -78,8 +78,8 @@ def divided(function: Callable) -> Callable:
             structure = jax.tree.structure(shapes)
             return jax.tree.unflatten(structure, results)
 
-        on_devices = _divisible(function, without_constants, count)
-        return on_devices(*program.consts, *arrays)
+        divisible_function = _divisible(function, without_constants, count)
+        return divisible_function(*program.consts, *arrays)
 
     @run.def_vmap
     def batch(size, is_batched, *arrays):
@@ -98,21 +98,21 @@ def _divisible(function: Callable, on_all: Callable, constants: int):
         on_all: The same as a function of constants and arrays.
         constants: Number of constants.
     """
-    divisible = custom_partitioning(on_all)
+    divisible_function = custom_partitioning(on_all)
 
     def partition(mesh, arguments, results):
         # The leading axis of the first array that is divided.
         arrays = arguments[constants:]
         specs = [x.sharding.spec[:1] for x in arrays]
-        leading = next(filter(any, specs), ())
-        by_parts = NamedSharding(mesh, PartitionSpec(*leading))
-        on_each = NamedSharding(mesh, PartitionSpec())
-        shardings = (on_each,) * constants + (by_parts,) * len(arrays)
+        leading_axis = next(filter(any, specs), ())
+        divided_sharding = NamedSharding(mesh, PartitionSpec(*leading_axis))
+        common_sharding = NamedSharding(mesh, PartitionSpec())
+        shardings = (common_sharding,) * constants + (divided_sharding,) * len(arrays)
 
         def on_part(*arguments):
             return function(*arguments[constants:])
 
-        result_shardings = jax.tree.map(lambda _: by_parts, results)
+        result_shardings = jax.tree.map(lambda _: divided_sharding, results)
         return mesh, on_part, result_shardings, shardings
 
     def rule(_, arguments, results):
@@ -132,5 +132,5 @@ def _divisible(function: Callable, on_all: Callable, constants: int):
         output_list = ", ".join(outputs)
         return f"{input_list} -> {output_list}"
 
-    divisible.def_partition(partition=partition, sharding_rule=rule)
-    return divisible
+    divisible_function.def_partition(partition=partition, sharding_rule=rule)
+    return divisible_function

@@ -60,11 +60,11 @@ def packed_entries(
 ) -> np.ndarray:
     """Return some entries [entries, samples] of the packed result."""
     numbers = program.distinct[1][entries]
-    varies = numbers >= 0
+    is_varying = numbers >= 0
     values = np.empty((len(entries), rows.shape[1]))
-    values[varies] = rows[numbers[varies]]
-    constants = [program.outputs[k] for k in entries[~varies]]
-    values[~varies] = np.array(constants, float)[:, None]
+    values[is_varying] = rows[numbers[is_varying]]
+    constants = [program.outputs[k] for k in entries[~is_varying]]
+    values[~is_varying] = np.array(constants, float)[:, None]
     return values
 
 
@@ -92,9 +92,9 @@ def _plan(program: Program):
             lines.append(f"t{position} = {function}({operands})")
         else:
             lines.append(f"{function}({operands}, out={cell})")
-    unpack = "".join(f"c{k}, " for k in range(count))
+    cell_names = "".join(f"c{k}, " for k in range(count))
     body = "".join(f"    {line}\n" for line in lines)
-    exec(f"def run(cells):\n    [{unpack}] = cells\n{body}", scope)
+    exec(f"def run(cells):\n    [{cell_names}] = cells\n{body}", scope)
     return Plan(loads, scope["run"], count)
 
 
@@ -135,10 +135,11 @@ def _evaluate(program: Program, arrays: tuple[AnyArray, ...]):
     """Return the results that vary [results, samples], and the batch."""
     plan = _plan(program)
     numbers = [np.asarray(x, np.float64) for x in arrays]
-    entries, batch = program.align(numbers, np)
+    aligned_arrays, batch = program.align(numbers, np)
     samples = math.prod(batch)
-    inputs = [x.reshape(len(x), samples) for x in entries]
-    # Results are written in place; all else goes through a few short rows.
+    inputs = [x.reshape(len(x), samples) for x in aligned_arrays]
+
+    # Results are written in place; intermediate values need only rows of one block.
     count = len(program.distinct[0])
     results = np.empty((count, samples))
     scratch = np.empty((plan.cells - count, min(samples, BLOCK)))

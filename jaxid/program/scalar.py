@@ -205,11 +205,11 @@ def _scale(factor: float, x: Scalar) -> Scalar:
     if factor == 1:
         return x
     if x.operation is Operation.MULTIPLY:
-        first, second = x.operands
-        if not isinstance(first, Scalar):
-            product = factor * first
+        first_operand, second_operand = x.operands
+        if not isinstance(first_operand, Scalar):
+            product = factor * first_operand
             if MIN_FACTOR < product < MAX_FACTOR:
-                return _scale(product, second)
+                return _scale(product, second_operand)
     return x.graph.node(Operation.MULTIPLY, factor, x)
 
 
@@ -264,9 +264,9 @@ def select(condition: Operand, if_true: Operand, if_false: Operand) -> Operand:
     if if_true == if_false:
         return if_true
     if is_truth(if_true):
-        first = logic(Operation.AND, condition, if_true)
-        second = logic(Operation.AND, logic(Operation.NOT, condition), if_false)
-        return logic(Operation.OR, first, second)
+        true_part = logic(Operation.AND, condition, if_true)
+        false_part = logic(Operation.AND, logic(Operation.NOT, condition), if_false)
+        return logic(Operation.OR, true_part, false_part)
     return condition.graph.node(Operation.SELECT, condition, if_true, if_false)
 
 

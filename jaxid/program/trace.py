@@ -31,7 +31,7 @@ FREE = object()
 `np.where(offset != 0, FREE, offset)` is an input whose zeros are known.
 """
 
-_UNSUPPORTED = {
+_REASONS_FOR_REFUSAL = {
     "scan": "a program has no loops, so write the loop in Python",
     "while": "a program has no loops, so write a loop of known length in Python",
     "cond": "a program has no branches, so choose between values with `jnp.where`",
@@ -62,20 +62,20 @@ def _slice(x: np.ndarray, *, start_indices, limit_indices, strides):
 
 
 def _pad(x: np.ndarray, filler: np.ndarray, *, padding_config):
-    """Put a number before, behind and between the entries, or cut them off."""
-    for axis, (before, behind, gaps) in enumerate(padding_config):
+    """Pad each axis before, behind and between its entries; negative padding cuts."""
+    for axis, (front_padding, rear_padding, gaps) in enumerate(padding_config):
         x = np.moveaxis(x, axis, 0)
         entries = len(x)
         gaps_between = (entries - 1) * gaps
-        start = max(before, 0)
+        start = max(front_padding, 0)
         stop = start + max(entries + gaps_between, 0)
-        size = stop + max(behind, 0)
+        size = stop + max(rear_padding, 0)
         result = np.full((size, *x.shape[1:]), filler, x.dtype)
         result[start : stop : gaps + 1] = x
-        # A negative number cuts entries off.
-        first = max(-before, 0)
-        end = size - max(-behind, 0)
-        remaining_entries = result[first:end]
+        # Negative padding cuts entries off.
+        begin = max(-front_padding, 0)
+        end = size - max(-rear_padding, 0)
+        remaining_entries = result[begin:end]
         x = np.moveaxis(remaining_entries, 0, axis)
     return x
 
@@ -98,7 +98,7 @@ _MOVEMENTS: dict[str, Callable] = {
     "unstack": lambda x, *, axis: list(np.moveaxis(x, axis, 0)),
 }
 
-_IN_NUMPY: dict[str, Callable] = {
+_NUMPY_FUNCTIONS: dict[str, Callable] = {
     "add": np.add,
     "div": np.divide,
     "eq": np.equal,
@@ -110,7 +110,7 @@ _IN_NUMPY: dict[str, Callable] = {
 }
 """Primitives that known numbers go through in NumPy: JAX would compile each shape."""
 
-_INDEXED = {
+_CARRIER_POSITIONS = {
     "dynamic_slice": (0,),
     "dynamic_update_slice": (0, 1),
     "gather": (0,),
@@ -122,22 +122,21 @@ _INDEXED = {
 
 
 def _on_numbers(equation: JaxprEqn, *operands: np.ndarray):
-    """Run one equation on numbers, in NumPy where it suffices."""
+    """Evaluate one equation for numbers, in NumPy if it has the same primitive."""
     name = equation.primitive.name
     parameters = equation.params
     if name == "iota":
         indices = np.indices(parameters["shape"], parameters["dtype"])
         return [indices[parameters["dimension"]]]
-    # Division of whole numbers differs.
+    # NumPy divides whole numbers in another way than JAX.
     is_exact = name != "div" or operands[0].dtype == np.float64
-    if name in _IN_NUMPY and is_exact and len(operands) <= 3:
+    if name in _NUMPY_FUNCTIONS and is_exact and len(operands) <= 3:
         dtype = getattr(equation.outvars[0].aval, "dtype", None)
         with np.errstate(all="ignore"):
-            result = _IN_NUMPY[name](*operands)
+            result = _NUMPY_FUNCTIONS[name](*operands)
         return [np.asarray(result, dtype)]
     with jax.ensure_compile_time_eval():
-        # A NumPy array would take the precision of the process; a JAX array keeps its
-        # own.
+        # A JAX array keeps its precision; a NumPy array takes that of the process.
         arrays = [jax.numpy.asarray(x, x.dtype) for x in operands]
         results = equation.primitive.bind(*arrays, **parameters)
         return [np.asarray(x) for x in _as_list(equation, results)]
@@ -231,18 +230,18 @@ def _dot_general(x: np.ndarray, y: np.ndarray, *, dimension_numbers, **_):
 def _as_matrices(x: np.ndarray, contracted: Sequence[int], batch: Sequence[int]):
     """Return an array as [*batch, others, contracted], and its other axes."""
     # Axes in the order of `dot_general`'s result.
-    others = [k for k in range(x.ndim) if k not in (*contracted, *batch)]
-    shape = tuple(x.shape[k] for k in others)
-    in_order = x.transpose((*batch, *others, *contracted))
+    other_axes = [k for k in range(x.ndim) if k not in (*contracted, *batch)]
+    shape = tuple(x.shape[k] for k in other_axes)
+    sorted_array = x.transpose((*batch, *other_axes, *contracted))
     terms = math.prod(x.shape[k] for k in contracted)
-    batch_shape = in_order.shape[: len(batch)]
-    return in_order.reshape(*batch_shape, math.prod(shape), terms), shape
+    batch_shape = sorted_array.shape[: len(batch)]
+    return sorted_array.reshape(*batch_shape, math.prod(shape), terms), shape
 
 
 def _polynomial(x: np.ndarray, *coefficients: np.ndarray, **_):
     """Evaluate a polynomial whose constant comes first, by Horner's scheme."""
-    total, *others = reversed(coefficients)
-    for coefficient in others:
+    total, *remaining_coefficients = reversed(coefficients)
+    for coefficient in remaining_coefficients:
         total = _add(_multiply(total, x), coefficient)
     return total
 
@@ -271,7 +270,7 @@ _COMPARISONS = (
     Operation.EQUAL,
     Operation.NOT_EQUAL,
 )
-_ELEMENTARY = [
+_ELEMENTARY_OPERATIONS = [
     *(operation for operation in Operation if "function" in operation.traits),
     *_COMPARISONS,
     Operation.ABSOLUTE,
@@ -279,7 +278,7 @@ _ELEMENTARY = [
 ]
 _LOGIC = (Operation.AND, Operation.OR, Operation.NOT)
 _ARITHMETIC: dict[str, Callable] = {
-    **{o.value: _operation(o) for o in _ELEMENTARY},
+    **{o.value: _operation(o) for o in _ELEMENTARY_OPERATIONS},
     **{o.value: _each(functools.partial(scalar.logic, o), o.numpy.nin) for o in _LOGIC},
     "add": _add,
     "add_any": _add,
@@ -305,7 +304,12 @@ _ARITHMETIC: dict[str, Callable] = {
     "optimization_barrier": lambda *x: list(x),
     "tie": lambda _, x: x,
 }
-_WITH_PARAMETERS = ("integer_pow", "dot_general", "reduce_sum", "reduce_prod")
+_PRIMITIVES_WITH_PARAMETERS = (
+    "integer_pow",
+    "dot_general",
+    "reduce_sum",
+    "reduce_prod",
+)
 """Primitives whose parameters decide about the result."""
 
 
@@ -314,10 +318,12 @@ def _convert(x: np.ndarray, dtype: np.dtype):
     if not _is_symbolic(x):
         return x.astype(dtype)
     if dtype.kind == "b":
-        return np.asarray(_each(scalar.as_truth, 1)(x), object)
+        to_truth_values = _each(scalar.as_truth, 1)
+        return np.asarray(to_truth_values(x), object)
     holds_truth_values = all(scalar.is_truth(entry) for entry in x.flat)
     if holds_truth_values or np.issubdtype(dtype, np.floating):
-        return np.asarray(_each(scalar.as_number, 1)(x), object)
+        to_numbers = _each(scalar.as_number, 1)
+        return np.asarray(to_numbers(x), object)
     raise InputError(
         f"`trace` cannot translate a conversion to {dtype}: "
         "a program computes with real numbers."
@@ -334,8 +340,8 @@ def _entries(x: np.ndarray):
 def _translate(equation: JaxprEqn, operands: Arrays):
     """Run one equation on arrays of which at least one is symbolic."""
     name = equation.primitive.name
-    if name in _INDEXED:
-        carriers = _INDEXED[name]
+    if name in _CARRIER_POSITIONS:
+        carriers = _CARRIER_POSITIONS[name]
         indices = [x for k, x in enumerate(operands) if k not in carriers]
         if any(map(_is_symbolic, indices)):
             raise InputError(
@@ -353,10 +359,10 @@ def _translate(equation: JaxprEqn, operands: Arrays):
             f"`trace` cannot translate `{name}` of integers: use real numbers."
         )
     if name in _ARITHMETIC:
-        parameters = equation.params if name in _WITH_PARAMETERS else {}
+        parameters = equation.params if name in _PRIMITIVES_WITH_PARAMETERS else {}
         results = _ARITHMETIC[name](*map(_entries, operands), **parameters)
         return [np.asarray(x, object) for x in _as_list(equation, results)]
-    reason = _UNSUPPORTED.get(
+    reason = _REASONS_FOR_REFUSAL.get(
         name, "it is not elementwise arithmetic, a sum, or a move of entries"
     )
     raise InputError(f"`trace` cannot translate the JAX primitive `{name}`: {reason}.")
@@ -411,7 +417,7 @@ def _run_equation(equation: JaxprEqn, operands: Arrays):
 
 def _called_jaxpr(equation: JaxprEqn):
     """Return the jaxpr that an equation calls, else None."""
-    if equation.primitive.name in _UNSUPPORTED:
+    if equation.primitive.name in _REASONS_FOR_REFUSAL:
         return None
     keys = ("jaxpr", "call_jaxpr", "fun_jaxpr")
     return next((equation.params[k] for k in keys if k in equation.params), None)

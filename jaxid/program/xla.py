@@ -27,7 +27,7 @@ MIN_SAVING = 6
 """Number of operations that a fence must save."""
 FUNCTION_COST = 20
 """Cost of a function such as tanh, in additions."""
-CIRCULAR = (Operation.SINE, Operation.COSINE)
+CIRCULAR_FUNCTIONS = (Operation.SINE, Operation.COSINE)
 Entries = Sequence[Sequence[Array] | Array]
 """Entries of each input, in order: arrays of the batch's shape."""
 Results = tuple[Array, ...]
@@ -113,8 +113,8 @@ class Lowered(eqx.Module):
         """
         dtype = jnp.result_type(*arrays, float)
         entries, batch = self.entries(*arrays)
-        distinct = self.run(entries)
-        values = self.program.pack(distinct)
+        distinct_values = self.run(entries)
+        values = self.program.pack(distinct_values)
         rows = [jnp.broadcast_to(jnp.asarray(x, dtype), batch) for x in values]
         results = jnp.stack(rows) if rows else jnp.zeros((0, *batch), dtype)
         return self.program.unpack(results)
@@ -134,11 +134,11 @@ class Lowered(eqx.Module):
             if node.operation is Operation.INPUT:
                 number, entry = node.place
                 value = entries[number][entry]
-            elif node.operation in CIRCULAR:
+            elif node.operation in CIRCULAR_FUNCTIONS:
                 (angle,) = node.uses
                 if angle not in circular_pairs:
                     circular_pairs[angle] = _circular(values[angle], one)
-                value = circular_pairs[angle][CIRCULAR.index(node.operation)]
+                value = circular_pairs[angle][CIRCULAR_FUNCTIONS.index(node.operation)]
             else:
                 value = _apply(node, values, reference.dtype)
                 if position in fences:
@@ -149,7 +149,7 @@ class Lowered(eqx.Module):
     def _sines_and_cosines(self, entries: Entries, one: Array | None):
         """Compute sine and cosine of all inputs that are angles in one call."""
         nodes = self.program.nodes
-        operands = [x.uses[0] for x in nodes if x.operation in CIRCULAR]
+        operands = [x.uses[0] for x in nodes if x.operation in CIRCULAR_FUNCTIONS]
         angles = []
         inputs = []
         for k in dict.fromkeys(operands):

@@ -17,7 +17,7 @@ from jax.custom_batching import custom_vmap
 
 from jaxid.arrays import Array, Float
 
-from .jax_transformation_rules import ALWAYS, differing_alike
+from .jax_transformation_rules import TRUE, differing_alike
 from .program import Program
 from .xla import Results, fenced, hidden_one, lower
 
@@ -96,9 +96,9 @@ def _in_blocks(program: Program, *arrays: Array):
 
     # All of it is overwritten.
     shape = (count, len(program.outputs))
-    empty = jnp.broadcast_to(arrays[-1][0, 0], shape)
+    initial_results = jnp.broadcast_to(arrays[-1][0, 0], shape)
     blocks = math.ceil(count / BLOCK)
-    return jax.lax.fori_loop(0, blocks, step, empty)
+    return jax.lax.fori_loop(0, blocks, step, initial_results)
 
 
 def _slice_samples(x: Array, start: Array, size: int):
@@ -116,9 +116,11 @@ def on_rows(program: Program, *arrays: Array) -> Rows:
 
     @custom_vmap
     def run(*arrays):
-        in_blocks = functools.partial(_in_blocks, program)
-        at_once = functools.partial(_pack, results_at_once, program)
-        return jax.lax.platform_dependent(*arrays, cpu=in_blocks, default=at_once)
+        block_run = functools.partial(_in_blocks, program)
+        vectorised_run = functools.partial(_pack, results_at_once, program)
+        return jax.lax.platform_dependent(
+            *arrays, cpu=block_run, default=vectorised_run
+        )
 
     @run.def_vmap
     def batch(size, is_batched, *arrays):
@@ -140,8 +142,8 @@ def on_rows(program: Program, *arrays: Array) -> Rows:
             x = x if has_batch else x[None]
             x = x[:, None] if is_common else x
             entries = x.shape[-1]
-            repeated = jnp.broadcast_to(x, (size, count, entries))
-            rows.append(repeated.reshape(-1, entries))
+            repeated_rows = jnp.broadcast_to(x, (size, count, entries))
+            rows.append(repeated_rows.reshape(-1, entries))
         return run(*rows).reshape(size, count, -1), True
 
     return run(*differing_alike(arrays))
@@ -152,8 +154,10 @@ def _one_after_the_other(run: Callable, inputs: list[tuple[Array, bool]]):
     elements = [x for x, has_batch in inputs if has_batch]
 
     def on_element(parts):
-        remaining = iter(parts)
-        return run(*(next(remaining) if has_batch else x for x, has_batch in inputs))
+        remaining_parts = iter(parts)
+        return run(
+            *(next(remaining_parts) if has_batch else x for x, has_batch in inputs)
+        )
 
     return jax.lax.map(on_element, elements)
 
@@ -192,13 +196,13 @@ def row_products(
             terms = products(results, counts)
             return jax.tree.map(jnp.add, sums, terms)
 
-        empty = []
+        initial_results = []
         for group in groups:
             zeros = jnp.zeros((len(group), len(group)), dtype)
             # `where`, see `differing_alike`.
-            empty.append(jnp.where(ALWAYS, zeros, arrays[-1][0, 0]))
+            initial_results.append(jnp.where(TRUE, zeros, arrays[-1][0, 0]))
         chunks = math.ceil(count / size)
-        return jax.lax.fori_loop(0, chunks, step, empty)
+        return jax.lax.fori_loop(0, chunks, step, initial_results)
 
     return jax.lax.platform_dependent(
         *differing_alike(arrays),

@@ -74,9 +74,9 @@ def panel_content(panel: Panel) -> Content:
     # Abscissas that several curves have are there once; the others name that curve.
     first_curves: dict[str, int] = {}
     for number, curve in enumerate(curves):
-        first = first_curves.setdefault(curve["x"]["floats"], number)
-        if first < number:
-            curve["x"] = first
+        first_number = first_curves.setdefault(curve["x"]["floats"], number)
+        if first_number < number:
+            curve["x"] = first_number
     panels = [
         {**vars(part), "y_label": part.y_label, "curves": [], "below": []}
         for part in panel.parts

@@ -19,8 +19,8 @@ from .page import Settings, picture, provenance, render_page
 def plan_remarks(plan: ExcitationPlan) -> list[Remark]:
     """Return the assumptions and doubts that a reader of a design must know."""
     robot = plan.base.model.robot
-    start, second = plan.limits.basis.times(plan.samples)[:2]
-    step = float(second - start)
+    times = plan.limits.basis.times(plan.samples)
+    step = float(times[1] - times[0])
     noise = ", ".join(
         f"{significant(float(deviation))} {robot.force_unit(j)}"
         for j, deviation in enumerate(plan.noise)
@@ -40,8 +40,8 @@ def plan_remarks(plan: ExcitationPlan) -> list[Remark]:
         doubts.append(f"Assumed, because not given: {_assumed_limits(plan)}")
     if plan.vague:
         threshold = f"{100 * MAX_RELATIVE_DEVIATION:g} %"
-        vague = ", ".join(plan.vague)
-        doubts.append(f"Deviations above {threshold} of the nominal value: {vague}")
+        names = ", ".join(plan.vague)
+        doubts.append(f"Deviations above {threshold} of the nominal value: {names}")
     if plan.interrupted:
         doubts.append("The search was stopped: `--resume` may find a better motion")
     remarks = [Remark(text, Status.DOUBTFUL) for text in doubts]
@@ -91,11 +91,11 @@ def write_excitation(
         motion = played.motion(time)
     limits = plan.limits.limits
     scene = speed_figure(robot, limits, time, motion, shapes)
-    every_remark = sort_remarks((*plan_remarks(plan), *remarks))
+    all_remarks = sort_remarks((*plan_remarks(plan), *remarks))
     criteria, deviations, *use = plan.tables()
     gain = "A random motion that fills the same limits is shown beside this one."
     sections = [
-        ("Verdict", [motion_verdict(plan, remarks), every_remark]),
+        ("Verdict", [motion_verdict(plan, remarks), all_remarks]),
         (
             "The motion",
             [

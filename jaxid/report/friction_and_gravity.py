@@ -12,7 +12,7 @@ from jaxid.result_table import Column, Table, percent, shortened, significant
 from jaxid.validation.torque_errors import TorqueErrors
 
 from .figure import Figure
-from .figure_elements import BLUE, GREY, MEASURED, Curve, Panel
+from .figure_elements import BLUE, GREY, MEASUREMENT_COLOUR, Curve, Panel
 from .motion_figures import even_indices, pose_figure
 
 MAX_POSES = 2000
@@ -53,12 +53,12 @@ def friction_figure(fit: Fit, logs: Sequence[TorqueErrors]) -> Figure:
         if np.isfinite(half_widths[:, j]).all():
             curves.insert(0, _confidence_band(model, half_widths[:, j]))
         unit = robot.force_unit(j)
-        at_max_speed = significant(friction[-1, j], 2)
+        force_text = significant(friction[-1, j], 2)
         panels.append(
             Panel(
                 curves,
                 title=shortened(robot.joint_names[j], 26),
-                value=f"{at_max_speed} {unit} at full speed",
+                value=f"{force_text} {unit} at full speed",
                 x=f"speed [{robot.joint_unit(j)}/s]",
                 y="friction",
                 unit=unit,
@@ -72,13 +72,13 @@ def _friction_columns(base: BaseParameters, speeds: np.ndarray) -> np.ndarray:
     """Return the columns of the friction of joints that move alone."""
     count, joints = speeds.shape
     # Each joint moves alone at each speed; in the last sample all stand still.
-    alone = np.arange(joints)
+    moving_joints = np.arange(joints)
     qd = np.zeros((count + 1, joints, joints))
-    qd[:-1, alone, alone] = speeds
+    qd[:-1, moving_joints, moving_joints] = speeds
     samples = qd.reshape(-1, joints)
     theta = _steady_columns(base, np.zeros_like(samples), samples)
     blocks = theta.reshape(count + 1, joints, joints, -1)
-    columns = blocks[:, alone, alone]
+    columns = blocks[:, moving_joints, moving_joints]
     # At standstill there is gravity only.
     return columns[:-1] - columns[-1]
 
@@ -98,7 +98,9 @@ def _confidence_band(model: Curve, half_widths: np.ndarray) -> Curve:
     """Return the band of 95 % around the friction of the model."""
     low = model.y - half_widths
     high = model.y + half_widths
-    return Curve(model.x, model.y, "95 % band", MEASURED, "band", low=low, high=high)
+    return Curve(
+        model.x, model.y, "95 % band", MEASUREMENT_COLOUR, "band", low=low, high=high
+    )
 
 
 def _measured_friction(model: Curve, speeds: np.ndarray, errors: np.ndarray) -> Curve:
@@ -147,13 +149,13 @@ def gravity_forces(fit: Fit, q: np.ndarray) -> np.ndarray:
     base = fit.base
     model = base.model
     # Friction and offsets act at standstill, too, and are no part of gravity.
-    of_bodies = np.concatenate(
+    is_of_body = np.concatenate(
         [
             np.full(len(term.parameters(model.robot)), bool(term.body_parameters))
             for term in model.terms
         ]
     )
-    p = np.where(of_bodies[list(base.indices)], fit.parameters, 0.0)
+    p = np.where(is_of_body[list(base.indices)], fit.parameters, 0.0)
     return _steady_columns(base, q, np.zeros_like(q)) @ p
 
 

@@ -53,12 +53,12 @@ def identification_page(report: Report, figures: Figures) -> str:
         provenance(report.settings),
     ]
     logs = len(fit.recordings)
-    plural = "" if logs == 1 else "s"
+    ending = "" if logs == 1 else "s"
     return render_page(
         f"{robot.name}: identified model",
         sections,
         f"{base.size} base parameters of {robot.joints} joints, from {logs} "
-        f"log{plural}.",
+        f"log{ending}.",
         "All numbers: result.json and parameters.csv beside this page. Lines of long "
         "logs show the least and the largest value of each pixel column, so that no "
         "peak is lost.",
@@ -67,11 +67,11 @@ def identification_page(report: Report, figures: Figures) -> str:
 
 def _glance(report: Report) -> list[Any]:
     """Return verdict, three numbers, the data, and what deserves attention."""
-    overall, *criteria = verdict(report)
+    judgement, *criteria = verdict(report)
     doubts = [x for x in criteria if x.status in (Status.BAD, Status.DOUBTFUL)]
     other_remarks = [x for x in criteria if x not in doubts]
     return [
-        overall,
+        judgement,
         _three_numbers(report),
         Table("", facts=_data(report)),
         *([doubts] if doubts else []),
@@ -95,9 +95,9 @@ def _three_numbers(report: Report) -> Markup:
     meaning = "condition number: how well the motion tells the parameters apart"
     mean_percents = np.max([log.mean_percent for log in logs], axis=0)
     if np.isfinite(mean_percents).all():
-        worst = int(np.argmax(mean_percents))
-        joint = fit.base.model.robot.joint_names[worst]
-        number = f"{percent(float(mean_percents[worst]) / 100.0)} %"
+        worst_joint = int(np.argmax(mean_percents))
+        joint = fit.base.model.robot.joint_names[worst_joint]
+        number = f"{percent(float(mean_percents[worst_joint]) / 100.0)} %"
         meaning = f"mean error of the worst joint, {joint}, of its largest torque"
     share = f"{fit.trust.count(Status.GOOD)} of {fit.base.size}"
     return tiles(
@@ -202,7 +202,7 @@ def _details(report: Report, figures: Figures) -> Sections:
     fit = report.fit
     robot = fit.base.model.robot
     notes = [Remark(note) for note in report.every_note]
-    yield "Task and notes", [Table("", facts=_task(report)), notes]
+    yield "Task and notes", [Table("", facts=_settings_and_facts(report)), notes]
 
     summary = robot.summary()
     gravity = ", ".join(f"{x:g}" for x in np.asarray(robot.gravity))
@@ -228,7 +228,7 @@ def _details(report: Report, figures: Figures) -> Sections:
         yield "Residuals", [text, figures["residuals"]]
 
 
-def _task(report: Report) -> list[tuple[str, Any]]:
+def _settings_and_facts(report: Report) -> list[tuple[str, Any]]:
     """Return the settings of an identification, and facts of its fit."""
     settings = report.settings
     facts = [
@@ -236,7 +236,7 @@ def _task(report: Report) -> list[tuple[str, Any]]:
         for key in ("experiment", "split", "filter", "decimation")
         if settings.get(key) is not None
     ]
-    # The last fact counts trusted estimates, as the top of the page does.
+    # The last fact, the count of trusted estimates, stands at the top of the page.
     return [*facts, ("estimator", report.fit.estimator), *report.fit.facts[:-1]]
 
 

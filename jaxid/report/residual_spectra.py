@@ -38,7 +38,7 @@ def _spectrum_panel(spectra: ResidualSpectra, robot: Robot, j: int) -> Panel:
     frequency = frequency[is_shown]
     white_density = gain[is_shown] ** 2
     density = np.asarray(spectra.density)[j, is_shown]
-    level = np.sum(density) / np.sum(white_density)
+    white_level = np.sum(density) / np.sum(white_density)
 
     white_name = "white noise behind the filters (10 % of its power there)"
     verdict = "white" if spectra.white[j] else "not white"
@@ -47,7 +47,9 @@ def _spectrum_panel(spectra: ResidualSpectra, robot: Robot, j: int) -> Panel:
     return Panel(
         [
             Curve(frequency, density, "residuals", width=1.2),
-            Curve(frequency, level * white_density, white_name, GREY, dashed=True),
+            Curve(
+                frequency, white_level * white_density, white_name, GREY, dashed=True
+            ),
         ],
         title=shortened(robot.joint_names[j], 24),
         value=f"{verdict}: {low_share} % of the power {low_band}",

@@ -100,8 +100,10 @@ def safe_name(name: str) -> str:
     It consists of ASCII letters, digits, `-`, `_` and inner dots.
     """
     ascii_only = unicodedata.normalize("NFKD", name).encode("ascii", "ignore").decode()
-    safe = re.sub(r"[^A-Za-z0-9._-]+", "-", ascii_only).strip(".-")[:80].strip(".-")
-    return safe or "recording"
+    safe_text = (
+        re.sub(r"[^A-Za-z0-9._-]+", "-", ascii_only).strip(".-")[:80].strip(".-")
+    )
+    return safe_text or "recording"
 
 
 def _earlier_figures(folder: Path) -> set[str]:
@@ -145,12 +147,12 @@ def write_comparison(
     folder: Path, comparison: Comparison, sources: Sequence[Path] = ()
 ) -> list[Path]:
     """Write `report.html`, `comparison.json` and `comparison.csv`; return the files."""
-    first = comparison.first
-    second = comparison.second
+    first_fit = comparison.first
+    second_fit = comparison.second
     rows = comparison_rows(comparison)
     content = {
-        "first": first.name,
-        "second": second.name,
+        "first": first_fit.name,
+        "second": second_fit.name,
         "sources": [str(source) for source in sources],
         "level": LEVEL,
         "parameters": rows,
@@ -164,8 +166,8 @@ def write_comparison(
         ("Estimates side by side", [comparison_figure(comparison)]),
         ("All parameters", [comparison.summary()]),
     ]
-    title = f"{first.base.model.robot.name}: two runs compared"
-    page = render_page(title, sections, f"{first.name} and {second.name}")
+    title = f"{first_fit.base.model.robot.name}: two runs compared"
+    page = render_page(title, sections, f"{first_fit.name} and {second_fit.name}")
     return write_page_and_table(folder, "comparison", page, content, rows)
 
 

@@ -61,11 +61,11 @@ def result_record(report: Report) -> Record:
     verdicts = []
     for remark in verdict(report):
         verdicts.append({"status": remark.status.name.lower(), "text": remark.text})
-    undetermined = []
+    undetermined_records = []
     for direction in fit.undetermined:
         names = [fit.base.names[k] for k in direction.parts]
         sentence = direction.sentence(fit.base)
-        undetermined.append(
+        undetermined_records.append(
             {"sentence": sentence, "parameters": names, **vars(direction)}
         )
     return {
@@ -82,7 +82,7 @@ def result_record(report: Report) -> Record:
             "residual_rms": fit.residual_rms,
             "covariance": fit.covariance,
             "condition_numbers": vars(fit.condition_numbers),
-            "undetermined": undetermined,
+            "undetermined": undetermined_records,
         },
         "consistency": consistency_record(fit),
         "errors": {
@@ -159,18 +159,18 @@ def estimate_rows(
 
 def comparison_rows(comparison: Comparison) -> list[Record]:
     """Return the parameters of two fits, one row for each, with their differences."""
-    first = comparison.first
-    second = comparison.second
+    first_fit = comparison.first
+    second_fit = comparison.second
     indices = list(comparison.indices)
     return table_rows(
         name=comparison.names,
-        expression=[first.base.expressions[k] for k in indices],
+        expression=[first_fit.base.expressions[k] for k in indices],
         unit=comparison.units,
         group=comparison.kinds,
-        first=np.asarray(first.parameters)[indices],
-        first_standard_deviation=first.standard_deviations[indices],
-        second=np.asarray(second.parameters)[indices],
-        second_standard_deviation=second.standard_deviations[indices],
+        first=np.asarray(first_fit.parameters)[indices],
+        first_standard_deviation=first_fit.standard_deviations[indices],
+        second=np.asarray(second_fit.parameters)[indices],
+        second_standard_deviation=second_fit.standard_deviations[indices],
         difference=comparison.difference,
         half_width=comparison.half_widths,
         p_value=comparison.p_values,

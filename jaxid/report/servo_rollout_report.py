@@ -16,7 +16,14 @@ from jaxid.result_table import Column, Remark, Status, Table, significant
 from jaxid.rollout import RolloutErrors, ServoFit
 
 from .figure import Figure
-from .figure_elements import ERROR, GREY, MEASURED, PREDICTED, Curve, Panel
+from .figure_elements import (
+    ERROR,
+    GREY,
+    MEASUREMENT_COLOUR,
+    PREDICTION_COLOUR,
+    Curve,
+    Panel,
+)
 from .page import Section, Settings, provenance, render_page
 from .result_files import write_page_and_table
 from .result_records import Record
@@ -51,17 +58,17 @@ class RolloutReport:
     @property
     def verdict(self) -> Remark:
         """Whether the simulation is closer to the robot than a linear joint."""
-        simulation = self.errors.total()
-        linear = self.errors.total("linear")
-        is_worse = simulation >= linear
+        simulation_errors = self.errors.total()
+        linear_errors = self.errors.total("linear")
+        is_worse = simulation_errors >= linear_errors
         text = "The simulation moves more like the robot than a linear joint does"
         status = Status.GOOD
         if is_worse.any():
             joints = ", ".join(np.array(self.errors.joint_names)[is_worse])
             text = f"The simulation is no better than a linear joint ({joints})"
             status = Status.DOUBTFUL
-        sizes = f"{in_milli(simulation)} instead of {in_milli(linear)} mrad or mm"
-        return Remark(f"{text}: errors of {sizes}", status)
+        sizes = f"{in_milli(simulation_errors)} instead of {in_milli(linear_errors)}"
+        return Remark(f"{text}: errors of {sizes} mrad or mm", status)
 
     @property
     def has_stiffness(self) -> bool:
@@ -72,9 +79,9 @@ class RolloutReport:
         """Return the errors of the simulation beside those of the baselines."""
         errors = self.errors
         simulation = 1e3 * errors.total("simulated")
-        linear = 1e3 * errors.total("linear")
+        linear_errors = 1e3 * errors.total("linear")
         command = 1e3 * errors.total("command")
-        is_doubtful = simulation > MAX_RATIO * np.minimum(linear, command)
+        is_doubtful = simulation > MAX_RATIO * np.minimum(linear_errors, command)
         logs = (
             "logs that the fit has not seen" if self.unseen else "the logs of the fit"
         )
@@ -83,7 +90,7 @@ class RolloutReport:
             Column("joint", errors.joint_names),
             Column("simulation,\nfree-running", simulation),
             Column("simulation,\nwindows of 1 s", 1e3 * self.windows),
-            Column("linear joint\nwith delay", linear),
+            Column("linear joint\nwith delay", linear_errors),
             Column("copied\ncommand", command),
             status=[Status.DOUBTFUL if doubt else Status.GOOD for doubt in is_doubtful],
         )
@@ -203,8 +210,8 @@ def motion_panel(
     error = Curve(time, errors, "error", ERROR, width=0.7)
     return Panel(
         [
-            Curve(time, measured, "measured", MEASURED, width=1.9),
-            Curve(time, simulated, "simulated", PREDICTED, width=0.9),
+            Curve(time, measured, "measured", MEASUREMENT_COLOUR, width=1.9),
+            Curve(time, simulated, "simulated", PREDICTION_COLOUR, width=0.9),
         ],
         title=name,
         value=f"RMS {significant(rms)} mrad or mm",

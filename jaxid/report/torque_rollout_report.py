@@ -114,14 +114,14 @@ class TorqueRolloutReport:
     def _figure(self, log: Observations) -> Figure:
         """Return measured positions, and those simulated in windows."""
         fit = self.fit
-        time, measured, simulated = fit.simulate(log)
+        time, measured_positions, simulated_positions = fit.simulate(log)
         panels = [
             motion_panel(
                 name,
                 time,
-                measured[:, j],
-                simulated[:, j],
-                np.isfinite(simulated[:, j]),
+                measured_positions[:, j],
+                simulated_positions[:, j],
+                np.isfinite(simulated_positions[:, j]),
             )
             for j, name in enumerate(fit.joint_names)
         ]

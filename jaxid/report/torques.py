@@ -15,9 +15,9 @@ from .figure_elements import (
     ERROR,
     GREEN,
     GREY,
-    MEASURED,
+    MEASUREMENT_COLOUR,
     ORANGE,
-    PREDICTED,
+    PREDICTION_COLOUR,
     PURPLE,
     Curve,
     Panel,
@@ -72,7 +72,7 @@ def _joint_panel(errors: TorqueErrors, robot: Robot, j: int, window: slice) -> P
     predicted_forces = np.asarray(errors.predicted)[window, j]
     difference = errors.errors[window, j]
     limit = 1.1 * (np.fmax.reduce(np.abs(difference), initial=0.0) or 1.0)
-    below = Panel(
+    error_panel = Panel(
         [Curve(time, difference, "predicted - measured", ERROR, width=0.6)],
         unit=unit,
         y_range=(-limit, limit),
@@ -83,15 +83,15 @@ def _joint_panel(errors: TorqueErrors, robot: Robot, j: int, window: slice) -> P
     end = time[-1] if len(time) > 1 else time[0] + 1.0
     return Panel(
         [
-            Curve(time, measured_forces, "measured", MEASURED, width=1.9),
-            Curve(time, predicted_forces, "predicted", PREDICTED, width=0.8),
+            Curve(time, measured_forces, "measured", MEASUREMENT_COLOUR, width=1.9),
+            Curve(time, predicted_forces, "predicted", PREDICTION_COLOUR, width=0.8),
         ],
         title=shortened(robot.joint_names[j], 26),
         value=_mean_error_text(errors, j, unit),
         y="torque" if robot.revolute[j] else "force",
         unit=unit,
         x_range=(float(time[0]), float(end)),
-        below=[below],
+        below=[error_panel],
     )
 
 
@@ -138,12 +138,12 @@ def bar_figure(
             f"`groups` must hold 1 to {len(GROUP_COLOURS)} groups with errors, but "
             f"holds {len(groups)}."
         )
-    every_error = [errors for recordings in groups.values() for errors in recordings]
-    for errors in every_error:
+    all_errors = [errors for recordings in groups.values() for errors in recordings]
+    for errors in all_errors:
         require_joints(errors, robot)
 
     # All recordings are of one robot: the largest forces of the first are those of all.
-    max_forces = np.asarray(every_error[0].max_forces)
+    max_forces = np.asarray(all_errors[0].max_forces)
     reference = "the largest force"
     if not np.isfinite(max_forces).all():
         max_forces = None
@@ -160,11 +160,17 @@ def bar_figure(
         colour = GROUP_COLOURS[k]
         shift = (k - middle_group) * (bar_width + 0.02)
         places = np.arange(joints) + shift
-        mean, rms = _pooled_percents(recordings, max_forces)
-        texts = [percent(value / 100.0) for value in mean] if show_numbers else []
-        legend = f"{name}: {percent(float(np.mean(mean)) / 100.0)} % on average"
-        bars.append(Curve(places, mean, legend, colour, "bars", bar_width, texts=texts))
-        points.append(Curve(places, rms, "RMS", colour, "points"))
+        mean_percents, rms_percents = _pooled_percents(recordings, max_forces)
+        texts = (
+            [percent(value / 100.0) for value in mean_percents] if show_numbers else []
+        )
+        legend = (
+            f"{name}: {percent(float(np.mean(mean_percents)) / 100.0)} % on average"
+        )
+        bars.append(
+            Curve(places, mean_percents, legend, colour, "bars", bar_width, texts=texts)
+        )
+        points.append(Curve(places, rms_percents, "RMS", colour, "points"))
     panel = Panel(
         [*bars, *points],
         x="",

@@ -151,8 +151,8 @@ def enclose(points: AnyArray) -> Segment:
     centre = 0.5 * (hull.min(axis=0) + hull.max(axis=0))
     extent = float(np.ptp(hull, axis=0).max())
     size = max(extent, 1e-9)
-    from_mean = hull - hull.mean(axis=0)
-    _, _, directions = np.linalg.svd(from_mean)
+    centred_hull = hull - hull.mean(axis=0)
+    _, _, directions = np.linalg.svd(centred_hull)
 
     def volume(ends):
         return _capsule_about(hull, ends).volume
@@ -180,12 +180,12 @@ def _capsule_about(points: np.ndarray, ends: np.ndarray):
     """Return the smallest capsule around points whose axis has these ends."""
     start, end = ends.reshape(2, 3)
     axis = end - start
-    from_start = points - start
+    vectors = points - start
     square = max(float(axis @ axis), 1e-18)
-    heights = from_start @ axis / square
+    heights = vectors @ axis / square
     fractions = np.clip(heights, 0.0, 1.0)
     nearest_points = fractions[:, None] * axis
-    distances = np.linalg.norm(from_start - nearest_points, axis=1)
+    distances = np.linalg.norm(vectors - nearest_points, axis=1)
     # Rounding must leave no point outside.
     radius = float(distances.max()) * (1 + 1e-9) + 1e-12
     return Segment(start, end, radius)

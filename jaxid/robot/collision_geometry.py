@@ -32,8 +32,8 @@ class Shape(NamedTuple):
     @classmethod
     def about_axis(cls, length: float, radius: float) -> "Shape":
         """Return a capsule along z, whose axis has a length [m]."""
-        half = np.array([0.0, 0.0, 0.5 * length])
-        return cls(np.array([-half, half]), radius)
+        half_axis = np.array([0.0, 0.0, 0.5 * length])
+        return cls(np.array([-half_axis, half_axis]), radius)
 
     def placed(self, rotation: Matrix3, position: Vector3) -> "Shape":
         """Return the shape in the frame in which its present frame is placed."""
@@ -144,14 +144,14 @@ def mjcf_shapes(path: str | Path) -> dict[str, list[Shape]]:
     mujoco = import_mujoco()
     model = mujoco.MjModel.from_xml_path(str(path))
     kinds = mujoco.mjtGeom
-    unbounded = (kinds.mjGEOM_PLANE, kinds.mjGEOM_HFIELD, kinds.mjGEOM_SDF)
+    unbounded_kinds = (kinds.mjGEOM_PLANE, kinds.mjGEOM_HFIELD, kinds.mjGEOM_SDF)
     is_solid = (model.geom_contype | model.geom_conaffinity) != 0
 
     shapes: dict[str, list[Shape]] = {}
     for geom in range(model.ngeom):
         body = model.geom_bodyid[geom]
         body_is_solid = is_solid[model.geom_bodyid == body].any()
-        is_unbounded = int(model.geom_type[geom]) in unbounded
+        is_unbounded = int(model.geom_type[geom]) in unbounded_kinds
         if is_unbounded or (body_is_solid and not is_solid[geom]):
             continue
         rotation = rotation_of_quaternion(model.geom_quat[geom])

@@ -183,21 +183,21 @@ class CollisionModel(Hashable):
         end = ends[:, 1]
         radii_of_capsules = [jnp.asarray(capsule.radius) for capsule in self.capsules]
         radii = jnp.stack(radii_of_capsules)
-        first, second = np.array(self.pairs).T
+        first_numbers, second_numbers = np.array(self.pairs).T
         # Distances from the axes of the first shapes, in the order of the pairs.
         distances = []
-        is_capsule = second < len(self.capsules)
+        is_capsule = second_numbers < len(self.capsules)
         if is_capsule.any():
-            i = first[is_capsule]
-            k = second[is_capsule]
-            between_axes = segment_distance(start[i], end[i], start[k], end[k])
-            distances.append(between_axes - radii[k])
+            i = first_numbers[is_capsule]
+            k = second_numbers[is_capsule]
+            axis_distances = segment_distance(start[i], end[i], start[k], end[k])
+            distances.append(axis_distances - radii[k])
         for number, obstacle in enumerate(self.obstacles, len(self.capsules)):
-            i = first[second == number]
+            i = first_numbers[second_numbers == number]
             if i.size:
                 distance = obstacle.distance(start[i], end[i])
                 distances.append(distance)
-        return jnp.concatenate(distances) - radii[first]
+        return jnp.concatenate(distances) - radii[first_numbers]
 
     def _largest_gaps(self, robot: Robot):
         """Return the largest gap of each pair in random poses [m]."""
@@ -285,10 +285,13 @@ def _meeting_pairs(
     links = set(enumerate(robot.parent))
     pairs = []
     for i, k in itertools.combinations(range(len(capsules)), 2):
-        first = bodies[i]
-        second = bodies[k]
-        are_neighbours = (first, second) in links or (second, first) in links
-        if first != second and not are_neighbours:
+        first_body = bodies[i]
+        second_body = bodies[k]
+        are_neighbours = (first_body, second_body) in links or (
+            second_body,
+            first_body,
+        ) in links
+        if first_body != second_body and not are_neighbours:
             pairs.append((i, k))
     # An obstacle is not part of the base that carries the first body.
     for i, body in enumerate(bodies):

@@ -113,7 +113,7 @@ def tip_curvature(
     # enough. Two turns in a row differ from their sum by half of their bracket.
     force_arm = np.cross(force[:, None], tip.turn)
     moment_arm = np.cross(moment[:, None], tip.turn)
-    of_position = np.einsum("pik,pjk->pij", force_arm, tip.velocity)
-    of_attitude = np.einsum("pik,pjk->pij", moment_arm, tip.turn) / 2
-    upper = np.triu(of_position + of_attitude)
-    return upper + np.swapaxes(np.triu(upper, 1), 1, 2)
+    position_part = np.einsum("pik,pjk->pij", force_arm, tip.velocity)
+    attitude_part = np.einsum("pik,pjk->pij", moment_arm, tip.turn) / 2
+    upper_triangle = np.triu(position_part + attitude_part)
+    return upper_triangle + np.swapaxes(np.triu(upper_triangle, 1), 1, 2)

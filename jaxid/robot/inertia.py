@@ -147,10 +147,10 @@ def inertia_tensor(j: AnyArray) -> Rotations:
     """Return the tensor $J^o$ of the moments $(A, B, C, D, E, F)$ [kg m²] (Eq. 9)."""
     A, B, C, D, E, F = (j[..., k] for k in range(6))
     xp = namespace(j)
-    first = xp.stack([A, -F, -E], axis=-1)
-    second = xp.stack([-F, B, -D], axis=-1)
-    third = xp.stack([-E, -D, C], axis=-1)
-    return xp.stack([first, second, third], axis=-2)
+    first_row = xp.stack([A, -F, -E], axis=-1)
+    second_row = xp.stack([-F, B, -D], axis=-1)
+    third_row = xp.stack([-E, -D, C], axis=-1)
+    return xp.stack([first_row, second_row, third_row], axis=-2)
 
 
 def _moments_of_points(r: Vectors):

@@ -79,11 +79,11 @@ def _tip_task(robot: Robot, rotation: Numbers, posture: Numbers | None):
     high = np.asarray(robot.limits.position_max)
     limits = complete_limits(robot)
     half_range = 0.5 * (limits.position_max - limits.position_min)
-    middle = 0.5 * (limits.position_max + limits.position_min)
-    goal = middle
+    middle_pose = 0.5 * (limits.position_max + limits.position_min)
+    goal = middle_pose
     if posture is not None:
         goal = np.asarray(as_array("posture", posture))
-    if goal.shape != middle.shape:
+    if goal.shape != middle_pose.shape:
         raise InputError(
             f"`posture` must hold {robot.joints} numbers, but has shape {goal.shape}."
         )
@@ -151,8 +151,8 @@ def _newton_step(
     scale = task.half_range
     tip = tip_jacobian(task.robot, q)
     errors = _pose_errors(task, positions, tip)
-    by_joints = np.concatenate([tip.velocity, tip.turn], axis=2)
-    jacobian = by_joints * scale[:, None]
+    tip_slopes = np.concatenate([tip.velocity, tip.turn], axis=2)
+    jacobian = tip_slopes * scale[:, None]
     hessian = np.eye(joints)
     if curved:
         force, moment = np.split(multipliers, 2, axis=1)

@@ -157,8 +157,8 @@ def _limits(table: dict[str, Any], revolute: tuple[bool, ...]):
     limits = dict(table)
     for name in limits.pop("degrees", ()):
         limits[name] = np.where(revolute, np.pi / 180, 1.0) * limits[name]
-    assumed = tuple(limits.pop("assumed", ()))
-    return Limits(len(revolute), **limits, assumed=assumed)
+    assumptions = tuple(limits.pop("assumed", ()))
+    return Limits(len(revolute), **limits, assumed=assumptions)
 
 
 def tx90l_on_rail() -> Robot:

@@ -222,12 +222,12 @@ class _Writer:
         model = self._model
         kinds = self._mujoco.mjtEq
         kind = int(model.eq_type[constraint])
-        first = int(model.eq_obj1id[constraint])
-        second = int(model.eq_obj2id[constraint])
+        first_object = int(model.eq_obj1id[constraint])
+        second_object = int(model.eq_obj2id[constraint])
         if kind == kinds.mjEQ_JOINT:
-            self._add_mimic(first, second, model.eq_data[constraint, :5])
+            self._add_mimic(first_object, second_object, model.eq_data[constraint, :5])
         elif kind in (kinds.mjEQ_CONNECT, kinds.mjEQ_WELD):
-            bodies = np.array([first, second])
+            bodies = np.array([first_object, second_object])
             if model.eq_objtype[constraint] == self._mujoco.mjtObj.mjOBJ_SITE:
                 bodies = model.site_bodyid[bodies]
             # A mocap body is moved by a program: it is no part of the robot.

@@ -172,8 +172,8 @@ class Robot(Summarised, eqx.Module):
     def _check_joints(self):
         """Reject names, parents and bodies that do not fit the number of joints."""
         n = len(self.revolute)
-        in_order = all(-1 <= p < i for i, p in enumerate(self.parent))
-        if len(self.parent) != n or not in_order:
+        is_in_order = all(-1 <= p < i for i, p in enumerate(self.parent))
+        if len(self.parent) != n or not is_in_order:
             raise InputError(
                 "`parent` must hold an earlier body, or -1, "
                 f"for each of {n}, but is {self.parent}."
@@ -197,11 +197,11 @@ class Robot(Summarised, eqx.Module):
                     f"`{field}` must be a body from 0 to {n - 1}, but is {body}."
                 )
         numbers = {"limits": self.limits.force, "drives": self.drives.zero}
-        for field, per_joint in numbers.items():
-            if per_joint.shape[-1:] != (n,):
+        for field, entries in numbers.items():
+            if entries.shape[-1:] != (n,):
                 raise InputError(
                     f"`{field}` must be of {n} joints, "
-                    f"like the robot, but are of {per_joint.shape[-1]}."
+                    f"like the robot, but are of {entries.shape[-1]}."
                 )
 
     def _length_notes(self):
@@ -302,10 +302,10 @@ class Robot(Summarised, eqx.Module):
         offsets = xp.broadcast_to(r, turned_offsets.shape) + turned_offsets
 
         # Only bodies on the ground move: the others are placed in their parents.
-        on_ground = np.array(self.parent)[:, None] < 0
+        is_on_ground = np.array(self.parent)[:, None] < 0
         return self.replace(
-            rotation=xp.where(on_ground[..., None], rotations, self.rotation),
-            offset=xp.where(on_ground, offsets, self.offset),
+            rotation=xp.where(is_on_ground[..., None], rotations, self.rotation),
+            offset=xp.where(is_on_ground, offsets, self.offset),
         )
 
     def with_tool(
@@ -328,15 +328,15 @@ class Robot(Summarised, eqx.Module):
         Raises:
             InputError: If the mass is not positive, or no body has such an inertia.
         """
-        at_tip = Tool(
+        placed_tool = Tool(
             self.tip_body,
             mass=mass,
             centre_of_mass=centre_of_mass,
             inertia=inertia,
         )
-        load = at_tip.body_inertia.moved(self.tip_rotation, self.tip_offset)
+        load = placed_tool.body_inertia.moved(self.tip_rotation, self.tip_offset)
         tool = dataclasses.replace(
-            at_tip,
+            placed_tool,
             centre_of_mass=load.centre,
             inertia=load.tensor,
         )
@@ -413,8 +413,8 @@ def as_finite_array(name: str, value: Numbers, shape: tuple[int, ...]) -> AnyArr
     array = as_array(name, value)
     if not isinstance(array, jax.Array):
         array = np.array(array, np.float64)
-    last_axes = array.shape[array.ndim - len(shape) :]
-    if last_axes != shape:
+    trailing_shape = array.shape[array.ndim - len(shape) :]
+    if trailing_shape != shape:
         raise InputError(f"{name} must have the shape {shape}, but has {array.shape}.")
     if isinstance(array, np.ndarray) and not np.isfinite(array).all():
         raise InputError(f"{name} must hold finite numbers.")

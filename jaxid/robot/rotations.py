@@ -37,11 +37,11 @@ def rotation_about(axis: Vector3, angle: AnyArray) -> Rotations:
     constant axis leaves the fewest operations.
     """
     xp = namespace(axis, angle)
-    along = axis[:, None] * axis[None, :]
-    across = np.eye(3) - along
+    axial_part = axis[:, None] * axis[None, :]
+    normal_part = np.eye(3) - axial_part
     cosine = xp.cos(angle)[..., None, None]
     sine = xp.sin(angle)[..., None, None]
-    return along + cosine * across + sine * skew(axis)
+    return axial_part + cosine * normal_part + sine * skew(axis)
 
 
 def axis_rotation(axis: Numbers, angle: float) -> Matrix3:

@@ -149,11 +149,11 @@ class Box(eqx.Module):
         R = jnp.asarray(self.rotation)
         # Everything in the frame of the box.
         centre = self.centre @ self.rotation
-        first = start @ R - jnp.broadcast_to(centre, start.shape)
+        local_start = start @ R - jnp.broadcast_to(centre, start.shape)
         extent = (end - start) @ R
         # The minimum is found without derivatives: those of its place add nothing to
         # that of the distance.
-        origin, direction = jax.lax.stop_gradient((first, extent))
+        origin, direction = jax.lax.stop_gradient((local_start, extent))
 
         def slope(place):
             point = origin + place * direction
@@ -164,13 +164,13 @@ class Box(eqx.Module):
         # In the box the deepest point lies where two faces are equally near. The
         # derivative is then that mean of both sides' which a shift extent the segment
         # leaves as it is.
-        rising = slope(high)
-        turn = rising - slope(low)
+        end_slope = slope(high)
+        turn = end_slope - slope(low)
         positive_turn = jnp.where(turn > 0, turn, 1.0)
-        ratio = rising / positive_turn
+        ratio = end_slope / positive_turn
         share = jnp.clip(ratio, 0.0, 1.0)[..., 0]
-        point_before = first + low * extent
-        point_after = first + high * extent
+        point_before = local_start + low * extent
+        point_after = local_start + high * extent
         distance_before = self._signed(point_before)
         distance_after = self._signed(point_after)
         return share * distance_before + (1.0 - share) * distance_after
@@ -249,8 +249,8 @@ def _bisect(slope: Callable[[Array], Array], zero: Array):
         low, high = interval
         middle = 0.5 * (low + high)
         # A convex function that still falls has its minimum further on.
-        falls = slope(middle) < 0
-        return jnp.where(falls, middle, low), jnp.where(falls, high, middle)
+        is_falling = slope(middle) < 0
+        return jnp.where(is_falling, middle, low), jnp.where(is_falling, high, middle)
 
     # 40 halvings leave 1e-12 of the interval.
     return jax.lax.fori_loop(0, 40, halve, (zero, zero + 1.0))

@@ -10,7 +10,7 @@ from jaxid.errors import InputError
 
 from .limits_and_drives import Limits, owners, range_fault
 from .robot import Robot
-from .urdf_tree import ORIGIN, TURNING, UrdfTree
+from .urdf_tree import ORIGIN, TURNING_TYPES, UrdfTree
 
 UNLIMITED_RANGE = 2e4
 """Range of a joint that turns without end [rad]."""
@@ -68,7 +68,7 @@ def load_urdf(
         robot = Robot(
             tree.name,
             parent=tuple(placement.body for placement in tree.placements),
-            revolute=tuple(joint.get("type") in TURNING for joint in tree.joints),
+            revolute=tuple(joint.get("type") in TURNING_TYPES for joint in tree.joints),
             axis=tree.axes,
             rotation=[placement.rotation for placement in tree.placements],
             offset=[placement.position for placement in tree.placements],
@@ -144,19 +144,19 @@ def _limits(tree: UrdfTree):
     low = np.empty(joints)
     high = np.empty(joints)
     magnitudes = {key: np.full(joints, np.inf) for key in ("velocity", "effort")}
-    unknown: dict[str, list[str]] = {}
+    unknown_limits: dict[str, list[str]] = {}
     for i, joint in enumerate(tree.joints):
         name = joint.get("name")
         low[i], high[i] = _checked_range(tree, joint)
         if tree.range(joint) == (0.0, 0.0):
-            unknown.setdefault("a range from 0 to 0", []).append(name)
+            unknown_limits.setdefault("a range from 0 to 0", []).append(name)
         # Files often state zero for what nobody has looked up.
         for key, values in magnitudes.items():
             value = tree.limit(joint, key, np.inf)
             if value > 0.0:
                 values[i] = value
             else:
-                unknown.setdefault(f"{key} {value:g}", []).append(name)
+                unknown_limits.setdefault(f"{key} {value:g}", []).append(name)
     limits = Limits(
         position_min=low,
         position_max=high,
@@ -165,14 +165,14 @@ def _limits(tree: UrdfTree):
     )
     notes = [
         f"{owners('joint', joints)}: {limit} is taken as unknown."
-        for limit, joints in unknown.items()
+        for limit, joints in unknown_limits.items()
     ]
     return limits, notes
 
 
 def _checked_range(tree: UrdfTree, joint: Any):
     """Return a joint's range; infinite if it turns without end, or both ends are 0."""
-    turns = joint.get("type") in TURNING
+    turns = joint.get("type") in TURNING_TYPES
     low, high = tree.range(joint)
     is_unlimited = turns and high - low >= UNLIMITED_RANGE
     if is_unlimited or low == high == 0.0:
@@ -211,9 +211,9 @@ def _inertial_notes(tree: UrdfTree):
     masses = np.zeros(len(tree.joints))
     faults = {}
     for link, placement in tree.carriers.items():
-        inertial = tree.inertial(link) if placement.body >= 0 else None
-        if inertial is not None:
-            inertia, faults[link] = inertial
+        inertia_and_fault = tree.inertial(link) if placement.body >= 0 else None
+        if inertia_and_fault is not None:
+            inertia, faults[link] = inertia_and_fault
             masses[placement.body] += abs(inertia.mass)
     notes = []
     light_bodies = [tree.joints[i].get("name") for i in np.flatnonzero(masses == 0.0)]

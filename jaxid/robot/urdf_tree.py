@@ -16,7 +16,7 @@ from .limits_and_drives import listed
 from .mjcf import Loop
 from .rotations import axis_rotation, rpy_rotation, without_rounding
 
-TURNING = ("revolute", "continuous")
+TURNING_TYPES = ("revolute", "continuous")
 """Types of joints that turn."""
 ORIGIN = (0.0, 0.0, 0.0)
 """Position, or roll, pitch and yaw, where a file states none."""
@@ -125,9 +125,9 @@ class UrdfTree:
                 )
         parent, child = link_names(joint)
         if child in self._above:
-            other = self._above[child].get("name")
+            other_joint = self._above[child].get("name")
             raise self.error(
-                joint, f"moves link `{child}`, as `{other}` does: remove one"
+                joint, f"moves link `{child}`, as `{other_joint}` does: remove one"
             )
         self._above[child] = joint
         self._below[parent].append(joint)
@@ -212,7 +212,11 @@ class UrdfTree:
         for link in links:
             for joint in self._below[link]:
                 _, child = link_names(joint)
-                is_readable = joint.get("type") in (*TURNING, "prismatic", "fixed")
+                is_readable = joint.get("type") in (
+                    *TURNING_TYPES,
+                    "prismatic",
+                    "fixed",
+                )
                 if is_readable and child not in placements:
                     placements[child] = _placed(
                         placements[link], *self.held_pose(joint)
@@ -222,26 +226,26 @@ class UrdfTree:
 
     def _refuse_loops(self, loops: Iterable[Loop]):
         """Reject constraints that close a loop between bodies of the robot."""
-        for name, first, second in loops:
-            if first not in self.carriers or second not in self.carriers:
+        for name, first_link, second_link in loops:
+            if first_link not in self.carriers or second_link not in self.carriers:
                 continue
-            if self.carriers[first].body != self.carriers[second].body:
+            if self.carriers[first_link].body != self.carriers[second_link].body:
                 raise InputError(
                     f"`{self.path}`: the constraint `{name}` "
-                    f"between `{first}` and `{second}` closes a loop: "
+                    f"between `{first_link}` and `{second_link}` closes a loop: "
                     "avoid it (`tip`, `--tip`), or remove it."
                 )
 
     def branch(self, joint: Any) -> Iterator[Any]:
         """Yield a joint and all joints below it."""
         yield joint
-        for lower in self._below[link_names(joint)[1]]:
-            yield from self.branch(lower)
+        for lower_joint in self._below[link_names(joint)[1]]:
+            yield from self.branch(lower_joint)
 
     def _moves_below(self, joint: Any):
         """Return whether the link that a joint carries carries moving joints itself."""
         _, *lower_joints = self.branch(joint)
-        return any(lower.get("type") != "fixed" for lower in lower_joints)
+        return any(joint_below.get("type") != "fixed" for joint_below in lower_joints)
 
     def held_at(self, joint: Any) -> float:
         """Return the coordinate at which a joint is held [rad or m].
@@ -254,13 +258,13 @@ class UrdfTree:
         chain = []
         while joint is not None and joint not in chain:
             chain.append(joint)
-            mimic = joint.find("mimic")
-            if mimic is None:
+            mimic_element = joint.find("mimic")
+            if mimic_element is None:
                 low, high = self.range(joint)
                 return offset + factor * min(max(0.0, low), high)
-            offset += factor * float(self.numbers(mimic, "offset", (0.0,))[0])
-            factor *= float(self.numbers(mimic, "multiplier", (1.0,))[0])
-            joint = self._joints.get(mimic.get("joint"))
+            offset += factor * float(self.numbers(mimic_element, "offset", (0.0,))[0])
+            factor *= float(self.numbers(mimic_element, "multiplier", (1.0,))[0])
+            joint = self._joints.get(mimic_element.get("joint"))
         # A constraint without a joint, with an unknown one, or a circle of mimics.
         return offset
 
@@ -271,7 +275,7 @@ class UrdfTree:
         if value == 0.0:
             return R, r
         axis = self._axis(joint)
-        if joint.get("type") in TURNING:
+        if joint.get("type") in TURNING_TYPES:
             return R @ axis_rotation(axis, value), r
         return R, r + R @ axis * value
 
@@ -313,7 +317,7 @@ class UrdfTree:
     def _axis(self, joint: Any):
         """Return the unit vector of a moving joint's axis."""
         kind = joint.get("type")
-        if kind not in (*TURNING, "prismatic"):
+        if kind not in (*TURNING_TYPES, "prismatic"):
             cure = "make it fixed"
             if kind == "floating":
                 _, child = link_names(joint)
@@ -335,10 +339,10 @@ class UrdfTree:
         """Return the parameters of all bodies; reject impossible links if asked to."""
         parameters = np.zeros((len(self.joints), 10))
         for link, (body, rotation, position) in self.carriers.items():
-            inertial = self.inertial(link)
-            if body < 0 or inertial is None:
+            inertia_and_fault = self.inertial(link)
+            if body < 0 or inertia_and_fault is None:
                 continue
-            inertia, fault = inertial
+            inertia, fault = inertia_and_fault
             if check and fault:
                 raise InputError(
                     f"`{self.path}`: the inertial of link "

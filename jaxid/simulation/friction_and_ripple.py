@@ -106,8 +106,8 @@ class SmoothFriction(AbstractGearFriction):
 
     def steady(self, qd):
         """Return the sum of all three parts."""
-        dry = self.coulomb * jnp.tanh(qd / EPSILON) + self._stribeck_part(qd)
-        return self.viscous * qd + dry
+        dry_force = self.coulomb * jnp.tanh(qd / EPSILON) + self._stribeck_part(qd)
+        return self.viscous * qd + dry_force
 
     def over_step(self, qd, expected_qd, z, step):
         """Return the tangent at the expected speed.
@@ -116,9 +116,9 @@ class SmoothFriction(AbstractGearFriction):
         """
         sign = jnp.tanh(expected_qd / EPSILON)
         slope = self.coulomb / EPSILON * (1.0 - sign**2)
-        dry = self.coulomb * sign + self._stribeck_part(expected_qd)
+        dry_force = self.coulomb * sign + self._stribeck_part(expected_qd)
         half_viscous = 0.5 * self.viscous
-        force = dry - slope * expected_qd + half_viscous * qd
+        force = dry_force - slope * expected_qd + half_viscous * qd
         return FrictionStep(force, slope + half_viscous, z, 0.0 * z)
 
     def _stribeck_part(self, qd):
@@ -169,11 +169,11 @@ class LuGreFriction(AbstractGearFriction):
         They yield at the expected speed.
         """
         stiffness = self._stiffness
-        yielding = (
+        compliance = (
             step * stiffness * jnp.abs(expected_qd) / self._dry_level(expected_qd)
         )
         # Share of the deflection that is left after the step.
-        share = 1.0 / (1.0 + yielding)
+        share = 1.0 / (1.0 + compliance)
         damping = self.damping_time * stiffness * self._stribeck_share(expected_qd)
         total_stiffness = (stiffness + damping / step) * share
         half_viscous = 0.5 * self.viscous
@@ -187,8 +187,8 @@ class LuGreFriction(AbstractGearFriction):
 
     def _dry_level(self, qd):
         """Return the level of dry friction at a speed [N m or N]."""
-        extra = self.breakaway - self.coulomb
-        return self.coulomb + extra * self._stribeck_share(qd)
+        breakaway_excess = self.breakaway - self.coulomb
+        return self.coulomb + breakaway_excess * self._stribeck_share(qd)
 
     @property
     def _stiffness(self):
@@ -220,17 +220,18 @@ class FrictionTemperature(eqx.Module):
     def factors(self, temperature: Joints) -> tuple[np.ndarray, np.ndarray]:
         """Return the factors of viscous and dry friction at a temperature [°C]."""
         rise = np.asarray(temperature) - self.reference
-        viscous = np.exp(-self.viscous_rate * rise)
-        dry = np.exp(-self.dry_rate * rise)
-        return viscous, dry
+        viscous_factors = np.exp(-self.viscous_rate * rise)
+        dry_factors = np.exp(-self.dry_rate * rise)
+        return viscous_factors, dry_factors
 
     def warm_up(
         self, temperature: Joints, power: Joints, duration: float
     ) -> np.ndarray:
         """Return temperatures [°C] after a time [s] of constant friction power [W]."""
-        final = self.reference + np.asarray(self.resistance) * np.asarray(power)
-        difference = np.asarray(temperature) - final
-        return final + difference * np.exp(-duration / self.time)
+        rise = np.asarray(self.resistance) * np.asarray(power)
+        final_temperature = self.reference + rise
+        difference = np.asarray(temperature) - final_temperature
+        return final_temperature + difference * np.exp(-duration / self.time)
 
 
 class TorqueRipple(Hashable):

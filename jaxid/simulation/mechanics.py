@@ -102,8 +102,8 @@ class SimulatedPlant:
         """Put the robot into a motion, with bent bristles."""
         half_step = 0.5 * self._drives.step
         z = np.asarray(self._drives.friction.settled(qd))
-        ahead = [q + half_step * qd, qd + half_step * qdd]
-        self._state = np.concatenate([q, qd, qdd, z, *ahead]).tolist()
+        next_state = [q + half_step * qd, qd + half_step * qdd]
+        self._state = np.concatenate([q, qd, qdd, z, *next_state]).tolist()
 
     def step(self, u: Sequence[float]) -> None:
         """Move on by one step with constant torques of the drives [N m or N]."""
@@ -176,8 +176,12 @@ def follow(
     memory = float(np.exp(-servo.sample_time / RATE_FILTER_TIME))
     rate_gain = (1.0 - memory) / servo.sample_time
 
-    first = desired[0]
-    plant.start(np.asarray(first.q), np.asarray(first.qd), np.asarray(first.qdd))
+    first_sample = desired[0]
+    plant.start(
+        np.asarray(first_sample.q),
+        np.asarray(first_sample.qd),
+        np.asarray(first_sample.qdd),
+    )
     states = []
     forces = []
     rate = [0.0] * n

@@ -145,9 +145,9 @@ class MujocoPlant:
 def mujoco_warnings(mujoco: Any) -> Iterator[list[str]]:
     """Collect MuJoCo's warnings, which it otherwise writes into a file."""
     warnings: list[str] = []
-    previous = mujoco.get_mju_user_warning()
+    previous_handler = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(warnings.append)
     try:
         yield warnings
     finally:
-        mujoco.set_mju_user_warning(previous)
+        mujoco.set_mju_user_warning(previous_handler)

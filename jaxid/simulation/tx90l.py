@@ -69,7 +69,7 @@ def virtual_tx90l_on_rail(
         ),
     )
     friction, heating = _friction(robot)
-    virtual = VirtualRobot(
+    virtual_robot = VirtualRobot(
         robot=robot,
         terms=(RigidBodies(principal_axes=True), RotorInertia()),
         values=np.concatenate([_bodies(WARM if warm else COLD).ravel(), ROTORS]),
@@ -85,9 +85,9 @@ def virtual_tx90l_on_rail(
         temperature=np.full(7, TEMPERATURES[warm]),
     )
     if disturbed:
-        return virtual
+        return virtual_robot
     smooth_friction = SmoothFriction(friction.viscous, friction.coulomb)
-    return virtual.replace(friction=smooth_friction, ripple=None)
+    return virtual_robot.replace(friction=smooth_friction, ripple=None)
 
 
 def cad_tx90l_on_rail() -> np.ndarray:

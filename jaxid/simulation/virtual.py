@@ -112,16 +112,16 @@ class Sensors(eqx.Module):
         random = np.random.default_rng(seed)
         angles = np.asarray(angles)
         forces = np.asarray(forces)
-        white, drive = random.standard_normal((2, *forces.shape))
-        initial = random.standard_normal((1, forces.shape[1]))
+        white_part, drive = random.standard_normal((2, *forces.shape))
+        initial_states = random.standard_normal((1, forces.shape[1]))
         # Each sample remembers a part of the one before; the variance stays one.
         share = np.exp(-sample_time / self.memory)
         gain = np.sqrt(1.0 - share**2)
-        coloured, _ = signal.lfilter(
-            [gain], [1.0, -share], drive, axis=0, zi=share * initial
+        coloured_part, _ = signal.lfilter(
+            [gain], [1.0, -share], drive, axis=0, zi=share * initial_states
         )
-        forces = forces + white * np.asarray(self.white_noise)
-        forces = forces + coloured * np.asarray(self.coloured_noise)
+        forces = forces + white_part * np.asarray(self.white_noise)
+        forces = forces + coloured_part * np.asarray(self.coloured_noise)
         if self.motor_side:
             angles = np.asarray(robot.drives.motor_angles(angles))
             forces = np.asarray(robot.drives.motor_torques(forces))
@@ -221,8 +221,12 @@ class VirtualRobot(Hashable):
     @property
     def parameters(self) -> np.ndarray:
         """True standard parameters of `model` at the present temperature."""
-        first, *others = (np.asarray(x) for _, x in self.bodies.split(self.values))
-        return np.concatenate([first, self.present_friction.parameters, *others])
+        first_body, *other_bodies = (
+            np.asarray(x) for _, x in self.bodies.split(self.values)
+        )
+        return np.concatenate(
+            [first_body, self.present_friction.parameters, *other_bodies]
+        )
 
     def replace(self, **fields: Any) -> "VirtualRobot":
         """Return a copy with some fields replaced, such as another friction."""
@@ -414,33 +418,40 @@ class VirtualRobot(Hashable):
                 f"{duration:g} s."
             )
         time = tick * np.arange(round(duration / tick))
-        desired = jax.tree.map(np.asarray, trajectory.motion(time))
+        desired_motion = jax.tree.map(np.asarray, trajectory.motion(time))
         limits = np.asarray(self.robot.known_max_forces)
         run = follow(
             self.plant(tick / substeps),
             servo,
-            desired,
-            forward_forces(feed_forward, desired),
+            desired_motion,
+            forward_forces(feed_forward, desired_motion),
             limits,
             self.sensors.resolution(self.robot),
             substeps,
         )
-        saturated = (np.abs(run.forces) >= limits).mean(axis=0)
+        saturated_fractions = (np.abs(run.forces) >= limits).mean(axis=0)
 
         samples = slice(None, None, ticks_per_sample)
         # Forces are constant between ticks: the mean of before and after a sample.
-        before = np.concatenate([run.forces[:1], run.forces[:-1]])
-        forces = (0.5 * (run.forces + before))[samples]
-        actual = run.motion[samples]
+        previous_forces = np.concatenate([run.forces[:1], run.forces[:-1]])
+        forces = (0.5 * (run.forces + previous_forces))[samples]
+        actual_motion = run.motion[samples]
         log = self.sensors.record(
             self.robot,
-            actual.q,
+            actual_motion.q,
             forces,
             sample_time=ticks_per_sample * tick,
             seed=seed,
             name=name,
         )
-        return Tracking(time[samples], desired[samples], actual, forces, log, saturated)
+        return Tracking(
+            time[samples],
+            desired_motion[samples],
+            actual_motion,
+            forces,
+            log,
+            saturated_fractions,
+        )
 
 
 def mean_power(friction: AbstractGearFriction, motion: Motion) -> Joints:

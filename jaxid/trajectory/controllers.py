@@ -77,5 +77,5 @@ CONTROLLERS = {
     "universal_robots": Controller(6, 0.008, ".script", write_urscript),
 }
 """Controllers by the names of the key `controller`."""
-BESIDE = (".ros.yaml", ".ros.mcap", ".rsi.csv", ".script")
+CONTROLLER_SUFFIXES = (".ros.yaml", ".ros.mcap", ".rsi.csv", ".script")
 """Suffixes of the files that may stand beside the table of a motion."""

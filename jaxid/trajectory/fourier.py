@@ -200,23 +200,27 @@ def random_fourier_series(
     offset = np.zeros((robot.joints, 1))
     x = np.hstack([offset, a, b])
 
-    # Each joint meets its tightest limit, also between the points of the envelope.
+    # The extreme values hold also between the points of the envelope.
     rows, factor = basis.envelope(512)
     q, qd, qdd = (x @ part.T for part in rows[:3])
-    top = q.max(axis=1)
-    bottom = q.min(axis=1)
-    centre = 0.5 * (top + bottom)
-    swing = 0.5 * factor * (top - bottom)
-    speed = factor * np.abs(qd).max(axis=1)
-    acceleration = factor * np.abs(qdd).max(axis=1)
+    highest_q = q.max(axis=1)
+    lowest_q = q.min(axis=1)
+    centre = 0.5 * (highest_q + lowest_q)
+    swing = 0.5 * factor * (highest_q - lowest_q)
+    max_speed = factor * np.abs(qd).max(axis=1)
+    max_acceleration = factor * np.abs(qdd).max(axis=1)
+
+    # Each joint meets its tightest limit.
     scales = [
         half_range / swing,
-        reach * limits.velocity / speed,
-        reach * limits.acceleration / acceleration,
+        reach * limits.velocity / max_speed,
+        reach * limits.acceleration / max_acceleration,
     ]
     scale = np.min(scales, axis=0)
-    room = np.maximum(half_range - scale * swing, 0.0)
-    shift = random.uniform(-1.0, 1.0, robot.joints) * room
+
+    # The range that is left is used at random.
+    max_shift = np.maximum(half_range - scale * swing, 0.0)
+    shift = random.uniform(-1.0, 1.0, robot.joints) * max_shift
     middle = 0.5 * (low + high)
     x *= scale[:, None]
     x[:, 0] = middle - scale * centre + shift

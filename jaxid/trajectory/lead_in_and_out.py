@@ -120,7 +120,7 @@ class LeadsBasis(PeriodsBasis):
         split into pieces, each of which is bounded by its own control points.
         """
         rows, factor = self.series.envelope(points)
-        to_points = _to_control_points()
+        point_matrix = _to_control_points()
         fractions = np.linspace(0.0, 1.0, LEAD_DEGREE + 1)
         duration = self.lead / ENVELOPE_PIECES
         parts: list[Any] = [rows]
@@ -128,7 +128,7 @@ class LeadsBasis(PeriodsBasis):
             t = duration * (piece + fractions)
             for sign in (1, -1):
                 lead_rows = self._lead_rows(t, sign)
-                parts.append(to_points @ lead_rows)
+                parts.append(point_matrix @ lead_rows)
         parts_of_orders = zip(*parts, strict=True)
         return tuple(np.concatenate(x) for x in parts_of_orders), factor
 
@@ -193,20 +193,22 @@ class WithLeads(AbstractTrajectory):
         lead_in = jnp.asarray(self.lead_in)[None]
         lead_out = jnp.asarray(self.lead_out)[None]
         start = jnp.reshape(self.start, 1)
-        first = self.inner.states(start)
-        last = self.inner.states(start + self.length)
-        from_start = jnp.clip(time - begin + lead_in, 0.0, lead_in)
-        to_end = jnp.clip(end + lead_out - time, 0.0, lead_out)
+        first_state = self.inner.states(start)
+        last_state = self.inner.states(start + self.length)
+        lead_in_time = jnp.clip(time - begin + lead_in, 0.0, lead_in)
+        remaining_time = jnp.clip(end + lead_out - time, 0.0, lead_out)
 
-        entry = _lead(first, lead_in, from_start)
+        entry = _lead(first_state, lead_in, lead_in_time)
         series = self.inner.states(self.start + t - begin)
-        exit_ = _lead(last, lead_out, to_end, -1)
+        exit_ = _lead(last_state, lead_out, remaining_time, -1)
         is_early = time < begin
         is_late = time > end
         states = []
-        for in_part, series_part, out_part in zip(entry, series, exit_, strict=False):
-            part = jnp.where(is_late, out_part, series_part)
-            states.append(jnp.where(is_early, in_part, part))
+        for lead_in_part, series_part, lead_out_part in zip(
+            entry, series, exit_, strict=False
+        ):
+            part = jnp.where(is_late, lead_out_part, series_part)
+            states.append(jnp.where(is_early, lead_in_part, part))
         return tuple(states)
 
 

@@ -112,8 +112,8 @@ class TipPath(eqx.Module):
                 f"but their lengths are {lengths} m."
             )
         ends = [piece.at(np.array([0.0, 1.0])) for piece in self.pieces]
-        for number, (previous, piece) in enumerate(itertools.pairwise(ends), 2):
-            gap = float(np.linalg.norm(piece[0] - previous[1]))
+        for number, (previous_piece, piece) in enumerate(itertools.pairwise(ends), 2):
+            gap = float(np.linalg.norm(piece[0] - previous_piece[1]))
             if gap > 1e-9:
                 raise InputError(
                     f"piece {number} of `pieces` starts "
@@ -126,9 +126,11 @@ class TipPath(eqx.Module):
         durations = []
         for _, length, radius in self.pieces:
             max_speed = min(self.speed, np.sqrt(self.acceleration * radius))
-            by_speed = UNIT_SPEED * length / max_speed
-            by_acceleration = np.sqrt(UNIT_ACCELERATION * length / self.acceleration)
-            durations.append(max(by_speed, by_acceleration))
+            speed_duration = UNIT_SPEED * length / max_speed
+            acceleration_duration = np.sqrt(
+                UNIT_ACCELERATION * length / self.acceleration
+            )
+            durations.append(max(speed_duration, acceleration_duration))
         return tuple(durations)
 
     @property

@@ -66,16 +66,16 @@ def _evaluate(times: Knots, coefficients: PolynomialCoefficients, t: Times):
     x = (clipped_times - times[pieces])[:, None]
     powers = coefficients[:, pieces]
     value = powers[0]
-    first = xp.zeros_like(value)
-    second = first
-    third = first
+    first_derivative = xp.zeros_like(value)
+    second_derivative = first_derivative
+    third_derivative = first_derivative
     for coefficient in powers[1:]:
-        third = third * x + 3 * second
-        second = second * x + 2 * first
-        first = first * x + value
+        third_derivative = third_derivative * x + 3 * second_derivative
+        second_derivative = second_derivative * x + 2 * first_derivative
+        first_derivative = first_derivative * x + value
         value = value * x + coefficient
     is_moving = (t >= start) & (t <= end)
-    derivatives = xp.stack([first, second, third])
+    derivatives = xp.stack([first_derivative, second_derivative, third_derivative])
     derivatives = xp.where(is_moving[:, None], derivatives, 0.0)
     return xp.concatenate([value[None], derivatives])
 

@@ -204,10 +204,10 @@ class AbstractBasis(eqx.Module):
         for direction in (rows, rows[::-1]):
             for shift in range(SHIFTS):
                 retimed_rows = np.roll(direction, shift * samples_per_shift, axis=0)
-                to_retimed = inverse @ retimed_rows
-                errors = rows @ to_retimed - retimed_rows
+                retiming = inverse @ retimed_rows
+                errors = rows @ retiming - retimed_rows
                 if np.abs(errors).max() <= tolerance:
-                    maps.append(to_retimed)
+                    maps.append(retiming)
         return np.array(maps)
 
 

@@ -213,13 +213,13 @@ def split_logs(
         return LogParts(fitted_logs, unseen_logs)
     share = fitted_share(held_out)
     training_logs = []
-    rests = []
+    remaining_parts = []
     for log in fitted_logs:
-        first_part, rest = log.split(share)
+        first_part, remaining_part = log.split(share)
         name = f"{log.name}, first {100 * share:g} %"
         training_logs.append(first_part.replace(name=name))
-        rests.append(rest.replace(name=f"{log.name}, rest"))
-    return LogParts(training_logs, [*rests, *unseen_logs])
+        remaining_parts.append(remaining_part.replace(name=f"{log.name}, rest"))
+    return LogParts(training_logs, [*remaining_parts, *unseen_logs])
 
 
 def resolution_notes(fit: Fit, logs: Sequence[LoadedLog]) -> list[str]:

@@ -112,12 +112,12 @@ def read_commands(setup: Setup, log: Path, columns: Columns) -> Recording:
         measured_columns, angles=commands, forces=columns.angles
     )
     try:
-        measured = read_log(setup, log, measured_columns)
+        recording = read_log(setup, log, measured_columns)
     except InputError as error:
         text = str(error).replace("`forces`", "`commands`")
         raise InputError(text) from None
     command_angles = read_log(setup, log, command_columns).angles
-    return dataclasses.replace(measured, forces=command_angles)
+    return dataclasses.replace(recording, forces=command_angles)
 
 
 def observe_commands(setup: Setup, log: Path, columns: Columns) -> Observations | None:

@@ -93,8 +93,9 @@ def check_self_collision(
 
 def judge(name: str, findings: Sequence[Finding]) -> Remark:
     """Return a remark on the quantity nearest to its limit, or furthest beyond it."""
-    worst = max(findings, key=lambda finding: finding.value)
-    verb = "keep their limits" if worst.value <= 0 else "do not keep their limits"
-    nearest_finding = str(worst).removeprefix("the ")
+    worst_finding = max(findings, key=lambda finding: finding.value)
+    keeps_limits = worst_finding.value <= 0
+    verb = "keep their limits" if keeps_limits else "do not keep their limits"
+    nearest_finding = str(worst_finding).removeprefix("the ")
     text = f"{name}: {len(findings)} quantities {verb}; the nearest: {nearest_finding}"
-    return Remark(text, Status.GOOD if worst.value <= 0 else Status.BAD)
+    return Remark(text, Status.GOOD if keeps_limits else Status.BAD)

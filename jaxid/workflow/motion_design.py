@@ -16,7 +16,7 @@ from jaxid.io import atomic_folder, import_extra
 from jaxid.report.excitation_page import write_excitation
 from jaxid.result_table import Remark, Status
 from jaxid.robot.robot import Robot, complete_limits
-from jaxid.trajectory.controllers import BESIDE, CONTROLLERS
+from jaxid.trajectory.controllers import CONTROLLER_SUFFIXES, CONTROLLERS
 from jaxid.trajectory.files import (
     load_trajectory,
     save_trajectory,
@@ -187,8 +187,10 @@ def design_motion(
         begin=task.begin,
         seconds=excitation.time if seconds is None else seconds,
     )
-    playable = make_playable(setup.robot, excitation, plan.trajectory)
-    return DesignedMotion(plan, playable, tuple(describe_motion(task, plan, playable)))
+    playable_motion = make_playable(setup.robot, excitation, plan.trajectory)
+    return DesignedMotion(
+        plan, playable_motion, tuple(describe_motion(task, plan, playable_motion))
+    )
 
 
 def follow_design(
@@ -218,14 +220,14 @@ def make_playable(
     step = float(times[1] - times[0])
     begin = float(times[0])
     end = float(times[-1]) + step
-    playable = motion
+    played_motion = motion
     fault = ""
     # Where there are constraints, leads were designed together with the motion.
     if leads is not None and isinstance(motion.basis, FourierBasis):
         limited_robot = robot.replace(limits=complete_limits(robot))
         try:
-            playable = with_leads(motion, limited_robot, periods=leads.periods)
-            begin, end = (float(time) for time in playable.window)
+            played_motion = with_leads(motion, limited_robot, periods=leads.periods)
+            begin, end = (float(time) for time in played_motion.window)
         except InputError as error:
             fault = (
                 "the motion is without leads, and starts and ends at full speed: "
@@ -233,12 +235,12 @@ def make_playable(
             )
     elif leads is not None:
         end = begin + leads.periods * (end - begin)
-    sampled_motion = playable
+    sampled_motion = played_motion
     if excitation.cycle is not None:
         step = excitation.cycle
         if excitation.rests and not fault:
-            sampled_motion = PaddedToCycle(playable, step)
-    return PlayableMotion(playable, sampled_motion, step, (begin, end), fault)
+            sampled_motion = PaddedToCycle(played_motion, step)
+    return PlayableMotion(played_motion, sampled_motion, step, (begin, end), fault)
 
 
 def write_design(
@@ -284,7 +286,7 @@ def write_motion(
     message = f"{output.stem}.ros.{excitation.ros}"
     trajectory = f"{output.stem}.json"
     names = [table, message, trajectory]
-    replaced_names = {f"{output.stem}{suffix}" for suffix in BESIDE}
+    replaced_names = {f"{output.stem}{suffix}" for suffix in CONTROLLER_SUFFIXES}
     with (
         double_precision(),
         atomic_folder(output.parent, lambda _: replaced_names) as folder,

@@ -38,8 +38,8 @@ class Nominal(NamedTuple):
 
     def sizes(self, base: BaseParameters) -> np.ndarray:
         """Return the values; NaN for estimates of what is not determined."""
-        leaves_open = np.isin(base.names, self.undetermined)
-        return np.where(leaves_open, np.nan, self.parameters)
+        is_undetermined = np.isin(base.names, self.undetermined)
+        return np.where(is_undetermined, np.nan, self.parameters)
 
 
 def find_nominal(setup: Setup, excitation: Excitation) -> Nominal | None:
@@ -68,9 +68,9 @@ def _of_earlier_fit(base: BaseParameters, report: str) -> Nominal:
             f"are not the {base.size} of this file."
         )
     covariance = np.array(fit.covariance)
-    undetermined = ~np.isfinite(np.diag(covariance))
-    covariance[undetermined | undetermined[:, None]] = 0.0
-    names = tuple(base.names[k] for k in np.flatnonzero(undetermined))
+    is_undetermined = ~np.isfinite(np.diag(covariance))
+    covariance[is_undetermined | is_undetermined[:, None]] = 0.0
+    names = tuple(base.names[k] for k in np.flatnonzero(is_undetermined))
     return Nominal(np.asarray(fit.parameters), covariance, names)
 
 
@@ -113,9 +113,9 @@ def limit_forces(
 def gravity_fault(robot: Robot, limits: ForceLimits) -> str:
     """Return which joint cannot hold any pose of its range; empty if all can."""
     q = random_poses(robot)
-    rest = Motion(q, np.zeros_like(q), np.zeros_like(q))
+    rest_motion = Motion(q, np.zeros_like(q), np.zeros_like(q))
     with double_precision():
-        excess = np.asarray(limits(robot, rest))
+        excess = np.asarray(limits(robot, rest_motion))
     largest_excess = excess.max(axis=1)
     best_pose = int(largest_excess.argmin())
     if largest_excess[best_pose] <= 0:

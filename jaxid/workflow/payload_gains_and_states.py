@@ -199,8 +199,8 @@ def identify_gains_from_logs(
 def corrected_gains(columns: Columns, drives: DriveGains) -> dict[str, list[float]]:
     """Return the argument of `Columns` that corrects the forces."""
     key = "force_gains" if columns.torque_constants is None else "torque_constants"
-    earlier_values = getattr(columns, key)
-    factors = np.array(1.0 if earlier_values is None else earlier_values)
+    present_values = getattr(columns, key)
+    factors = np.array(1.0 if present_values is None else present_values)
     return {key: (factors * np.asarray(drives.gains)).tolist()}
 
 

@@ -57,14 +57,13 @@ class TorqueRipple(AbstractTerm):
     def meanings(self):
         """Meanings of the sines and cosines of each multiple."""
         meanings = {}
-        for side, turn, multiples in (
-            ("m", "motor", self.motor),
-            ("j", "joint", self.joint),
-        ):
+        for side, multiples in (("motor", self.motor), ("joint", self.joint)):
             for k in multiples:
-                for letter, wave in (("s", "sine"), ("c", "cosine")):
-                    meaning = f"ripple: {wave}, {k} times a turn of the {turn}"
-                    meanings[f"{letter}{side}{k}"] = meaning
+                # Symbols such as `sm2`: sine, motor, twice a turn.
+                symbol = f"{side[0]}{k}"
+                turns = f"{k} times a turn of the {side}"
+                meanings[f"s{symbol}"] = f"ripple: sine, {turns}"
+                meanings[f"c{symbol}"] = f"ripple: cosine, {turns}"
         return meanings
 
     def parameters(self, robot):
@@ -165,9 +164,9 @@ class CoupledDrives(AbstractTerm):
         viscous = []
         dry = []
         for i, ratios in self.couplings(robot):
-            off_diagonal = _off_diagonal(ratios)
-            inertia.append(off_diagonal.astype(qdd.dtype) @ qdd)
-            viscous.append(off_diagonal.astype(qd.dtype) @ qd)
+            coupling_ratios = _off_diagonal(ratios)
+            inertia.append(coupling_ratios.astype(qdd.dtype) @ qdd)
+            viscous.append(coupling_ratios.astype(qd.dtype) @ qd)
             # The width of the transition is that of the motor's own joint: the motor's
             # speed is put in its place.
             r = ratios.astype(qd.dtype)
@@ -187,9 +186,9 @@ class CoupledDrives(AbstractTerm):
         count = len(couplings)
         matrices = np.zeros((2, n, n, 3 * count))
         for k, (_, ratios) in enumerate(couplings):
-            off_diagonal = _off_diagonal(ratios)
-            matrices[0, :, :, k] = off_diagonal
-            matrices[1, :, :, count + k] = off_diagonal
+            coupling_ratios = _off_diagonal(ratios)
+            matrices[0, :, :, k] = coupling_ratios
+            matrices[1, :, :, count + k] = coupling_ratios
         return matrices
 
 

@@ -211,5 +211,5 @@ def _outside_dead_zone(dead_zone: EachJoint, qd: Joints, value: Joints):
     """Return a value for speeds beyond the dead zone, and zero within it."""
     if not isinstance(dead_zone, jax.Array) and not np.any(dead_zone):
         return value
-    moves = jnp.abs(qd) > matching("dead_zone", dead_zone, qd)
-    return jnp.where(moves, value, jnp.zeros_like(value))
+    is_moving = jnp.abs(qd) > matching("dead_zone", dead_zone, qd)
+    return jnp.where(is_moving, value, jnp.zeros_like(value))

@@ -113,12 +113,12 @@ class AsymmetricCoulombFriction(AbstractDryFriction):
         """Return the fractions of the two directions."""
         s = self.transition(qd)
         dead_zone = getattr(self.transition, "dead_zone", 0.0)
-        moves: Any = 1.0
+        motion_mask: Any = 1.0
         if isinstance(dead_zone, jax.Array) or np.any(dead_zone):
             # Within a dead zone both fractions vanish, as the force does.
-            moves = jnp.where(s == 0.0, s, jnp.ones_like(s))
-        forward_fractions = jnp.diag(0.5 * (moves + s))
-        backward_fractions = jnp.diag(0.5 * (s - moves))
+            motion_mask = jnp.where(s == 0.0, s, jnp.ones_like(s))
+        forward_fractions = jnp.diag(0.5 * (motion_mask + s))
+        backward_fractions = jnp.diag(0.5 * (s - motion_mask))
         return jnp.concatenate([forward_fractions, backward_fractions], axis=1)
 
 
@@ -183,8 +183,8 @@ class StribeckFriction(AbstractDryFriction):
         exponent = matching("exponent", self.exponent, qd)
         # The small number keeps the logarithm finite at standstill.
         power = jnp.exp(0.5 * exponent * jnp.log(relative_speed**2 + 1e-30))
-        static = sign * jnp.exp(-power)
-        return jnp.concatenate([jnp.diag(sign), jnp.diag(static)], axis=1)
+        static_friction = sign * jnp.exp(-power)
+        return jnp.concatenate([jnp.diag(sign), jnp.diag(static_friction)], axis=1)
 
     @property
     def nonlinear_parameters(self):

@@ -11,7 +11,7 @@ from jaxid.robot.robot import Robot
 
 from .term import AbstractTerm, NamesAndUnits, TermParameters
 
-PRINCIPAL = 7
+PRINCIPAL_PARAMETERS = 7
 """Number of inertial parameters of a body without products of inertia (Eq. 12)."""
 
 
@@ -32,7 +32,7 @@ class RigidBodies(AbstractTerm):
     @property
     def body_parameters(self) -> int:
         """Number of inertial parameters of each body: ten, or seven."""
-        return PRINCIPAL if self.principal_axes else len(INERTIAL_NAMES)
+        return PRINCIPAL_PARAMETERS if self.principal_axes else len(INERTIAL_NAMES)
 
     @property
     def meanings(self):
@@ -53,9 +53,9 @@ class RigidBodies(AbstractTerm):
     def parameters(self, robot: Robot) -> NamesAndUnits:
         """Return `m1`, `mx1`, … `F1`, then those of the next body."""
         pairs = zip(INERTIAL_NAMES, INERTIAL_UNITS, strict=True)
-        of_body = list(pairs)[: self.body_parameters]
+        body_pairs = list(pairs)[: self.body_parameters]
         bodies = range(1, robot.joints + 1)
-        return tuple((f"{name}{i}", unit) for i in bodies for name, unit in of_body)
+        return tuple((f"{name}{i}", unit) for i in bodies for name, unit in body_pairs)
 
     def columns(self, robot, q, qd, qdd):
         r"""Return the columns $[\Theta_1 \dots \Theta_n]$ (Eq. 11)."""
@@ -67,7 +67,7 @@ class RigidBodies(AbstractTerm):
         bodies = p.reshape(robot.joints, self.body_parameters)
         if not self.principal_axes:
             return bodies
-        zeros = np.zeros((robot.joints, len(INERTIAL_NAMES) - PRINCIPAL))
+        zeros = np.zeros((robot.joints, len(INERTIAL_NAMES) - PRINCIPAL_PARAMETERS))
         return jnp.concatenate([bodies, zeros.astype(bodies.dtype)], axis=1)
 
     def forces(self, robot, p, q, qd, qdd):

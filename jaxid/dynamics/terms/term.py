@@ -96,9 +96,9 @@ class AbstractTerm(eqx.Module):
         """Return name and unit of each parameter, in the order of the columns."""
         parameters = []
         for parameter in self.joint_parameters:
-            turning, sliding = parameter.units
+            revolute_unit, prismatic_unit = parameter.units
             for i, revolute in enumerate(robot.revolute, 1):
-                unit = turning if revolute else sliding
+                unit = revolute_unit if revolute else prismatic_unit
                 parameters.append((f"{parameter.name}{i}", unit))
         return tuple(parameters)
 

@@ -69,17 +69,23 @@ class Clearance(AbstractConstraint):
 
         def linearise(motion, entries):
             arrays = (self._ends(robot, motion.q), entries)
-            gaps, by_ends = in_blocks(self.model.linearised_clearances, *arrays)
-            weights = -by_ends / SIZE
-            by_motion = pull_back_samples(ends, ends.__call__, weights, motion.q)
-            return (self.distances[entries] - gaps) / SIZE, by_motion
+            gaps, end_slopes = in_blocks(self.model.linearised_clearances, *arrays)
+            weights = -end_slopes / SIZE
+            motion_slopes = pull_back_samples(ends, ends.__call__, weights, motion.q)
+            return (self.distances[entries] - gaps) / SIZE, motion_slopes
 
         return linearise
 
     def entries(self, robot):
-        """Return the pairs."""
+        """Return a finding for each pair of shapes, still without a value."""
         pairs = zip(self.model.pair_names, self.distances.tolist(), strict=True)
         return tuple(
-            Finding(f"the clearance of {name}", SIZE, "m", distance, True)
+            Finding(
+                name=f"the clearance of {name}",
+                size=SIZE,
+                unit="m",
+                limit=distance,
+                is_lower_limit=True,
+            )
             for name, distance in pairs
         )

@@ -167,8 +167,8 @@ def in_blocks(function: Callable, *arrays: AnyArray) -> list[np.ndarray]:
 
 def evaluate_samples(owner: eqx.Module, method: Callable, *samples: AnyArray) -> Any:
     """Apply a method for one sample; rows of samples in NumPy need no compiler."""
-    first = samples[0]
-    is_rows = isinstance(first, np.ndarray) and first.ndim == 2
+    first_samples = samples[0]
+    is_rows = isinstance(first_samples, np.ndarray) and first_samples.ndim == 2
     evaluate = in_numpy if is_rows else on_samples
     return evaluate(owner, method, *samples)
 

@@ -89,14 +89,14 @@ class ForceLimits(AbstractConstraint):
 
     def __call__(self, robot, motion):
         """Return the relative excess over each limit."""
-        limits, to_limited = self._limited(robot)
+        limits, combinations = self._limited(robot)
         forces = self._forces(motion)
         xp = namespace(forces)
-        size = xp.max(xp.abs(forces @ to_limited), axis=-2)
+        size = xp.max(xp.abs(forces @ combinations), axis=-2)
         if self.covariance is not None:
             # Deviations of the forces follow from the covariance of the parameters.
             regressor = self.base.regressor(motion)
-            rows = xp.einsum("...jb,jm->...mb", regressor, to_limited)
+            rows = xp.einsum("...jb,jm->...mb", regressor, combinations)
             variance = xp.einsum("...mb,bc,...mc->...m", rows, self.covariance, rows)
             variance = xp.maximum(variance, 0.0)
             # A square root has no derivative at zero, hence the smoothing.
@@ -108,9 +108,11 @@ class ForceLimits(AbstractConstraint):
         """Return all limits, and the matrix from joint forces to what they limit."""
         limits = self._all_limits(robot)
         has_limit = np.isfinite(limits)
-        to_motors = np.linalg.inv(np.asarray(robot.drives.reduction))
-        to_limited = np.concatenate([np.eye(robot.joints), to_motors], axis=1)
-        return (1 - self.margin) * limits[has_limit], to_limited[:, has_limit]
+        motor_combinations = np.linalg.inv(np.asarray(robot.drives.reduction))
+        combinations = np.concatenate(
+            [np.eye(robot.joints), motor_combinations], axis=1
+        )
+        return (1 - self.margin) * limits[has_limit], combinations[:, has_limit]
 
     def _forces(self, motion: Motion) -> AnyArray:
         """Return `forces` at all samples."""
@@ -118,10 +120,10 @@ class ForceLimits(AbstractConstraint):
 
     def linearisation(self, robot):
         """Return a function of relative excesses and their derivatives, in NumPy."""
-        limits, to_limited = self._limited(robot)
+        limits, combinations = self._limited(robot)
 
         def linearise(motion, entries):
-            shares = to_limited[:, entries].T
+            shares = combinations[:, entries].T
             sample_limits = limits[entries]
             size, slopes = self._largest_forces(motion, shares, sample_limits)
             if self.covariance is not None:
@@ -147,8 +149,8 @@ class ForceLimits(AbstractConstraint):
         slopes = np.sign(peak_forces) / limits
         weights = np.zeros((len(limits), 3, shares.shape[1]))
         weights[samples, sides] = shares * slopes[:, None]
-        by_motion = pull_back_samples(self, self.forces, weights, *_arrays(motion))
-        return np.abs(peak_forces), by_motion
+        motion_slopes = pull_back_samples(self, self.forces, weights, *_arrays(motion))
+        return np.abs(peak_forces), motion_slopes
 
     def _deviations(
         self,
@@ -166,11 +168,11 @@ class ForceLimits(AbstractConstraint):
         deviation = np.sqrt(variance + smoothing)
 
         slopes = self.deviations / deviation / limits
-        by_rows = products * slopes[:, None]
-        weights = shares[:, :, None] * by_rows[:, None]
+        row_slopes = products * slopes[:, None]
+        weights = shares[:, :, None] * row_slopes[:, None]
         arrays = base.model.arguments(motion)
-        by_motion = pull_back_samples(base, base.columns, weights, *arrays)
-        return self.deviations * deviation, by_motion
+        motion_slopes = pull_back_samples(base, base.columns, weights, *arrays)
+        return self.deviations * deviation, motion_slopes
 
     def forces(self, q: Coordinates, qd: Coordinates, qdd: Coordinates) -> Array:
         """Return the forces of one sample, also with friction to either side."""
@@ -188,7 +190,7 @@ class ForceLimits(AbstractConstraint):
             return jax.tree.map(replace, model, is_leaf=is_transition)
 
         models = (model, reverse(1.0), reverse(-1.0))
-        forces = [jnp.asarray(each.forces(p, q, qd, qdd)) for each in models]
+        forces = [jnp.asarray(x.forces(p, q, qd, qdd)) for x in models]
         return jnp.stack(forces) + model.known_forces(q, qd, qdd)[None]
 
     def entries(self, robot):

@@ -54,10 +54,14 @@ def information(
         sizes: Typical size of each parameter; one if None.
     """
     columns = [rows.T[None] for rows in base.regressor_rows(motion)]
-    plain, weighted = gram_matrices(base.joint_regressor, columns, weights)
-    earlier = 0.0 if prior is None else np.asarray(prior)
+    plain_matrices, weighted_matrices = gram_matrices(
+        base.joint_regressor, columns, weights
+    )
+    prior_matrix = 0.0 if prior is None else np.asarray(prior)
     typical_sizes = np.ones(base.size) if sizes is None else sizes
-    return Information(plain[0], weighted[0] + earlier, typical_sizes)
+    return Information(
+        plain_matrices[0], weighted_matrices[0] + prior_matrix, typical_sizes
+    )
 
 
 def gram_matrices(
@@ -73,8 +77,8 @@ def gram_matrices(
             JAX.
         weights: Inverse standard deviation of each joint's noise [1/(N m) or 1/N].
     """
-    plain = 0.0
-    weighted = 0.0
+    plain_matrices = 0.0
+    weighted_matrices = 0.0
     xp = namespace(*columns)
     for numbers, rows, weight in zip(regressor.columns, columns, weights, strict=True):
         gram = xp.pad(rows @ rows.swapaxes(1, 2), ((0, 0), (0, 1), (0, 1)))
@@ -82,9 +86,9 @@ def gram_matrices(
         places = np.full(regressor.size, len(numbers))
         places[list(numbers)] = np.arange(len(numbers))
         gram = gram[:, places[:, None], places]
-        plain = plain + gram
-        weighted = weighted + weight**2 * gram
-    return plain, weighted
+        plain_matrices = plain_matrices + gram
+        weighted_matrices = weighted_matrices + weight**2 * gram
+    return plain_matrices, weighted_matrices
 
 
 def standard_deviations(
