@@ -69,12 +69,9 @@ def user_cache() -> Path:
     if sys.platform == "darwin":
         return home_folder / "Library" / "Caches" / "jaxid"
     if sys.platform == "win32":
-        local_folder = os.environ.get("LOCALAPPDATA")
-        return (
-            (Path(local_folder) if local_folder else home_folder / "AppData" / "Local")
-            / "jaxid"
-            / "Cache"
-        )
+        default_folder = home_folder / "AppData" / "Local"
+        local_folder = Path(os.environ.get("LOCALAPPDATA") or default_folder)
+        return local_folder / "jaxid" / "Cache"
     xdg = Path(os.environ.get("XDG_CACHE_HOME", ""))
     return (xdg if xdg.is_absolute() else home_folder / ".cache") / "jaxid"
 
