@@ -158,20 +158,22 @@ def combine_fits(earlier: Fit, later: Fit) -> Fit:
             data.
     """
     require_same_base((earlier, later))
-    earlier = as_least_squares(earlier)
-    later = as_least_squares(later)
-    identity = np.eye(earlier.base.size)
-    parameters, uncertainty = combine((earlier, later), (identity, identity))
+    first_fit = as_least_squares(earlier)
+    second_fit = as_least_squares(later)
+    identity = np.eye(first_fit.base.size)
+    parameters, uncertainty = combine((first_fit, second_fit), (identity, identity))
     # The later rows are scaled so that they keep their weights under those of the
     # earlier fit.
-    scaled_blocks = later.time_blocks.scale_joints(later.weights / earlier.weights)
-    problem = RegressionProblem(
-        earlier.base,
-        blocks=Blocks((*earlier.time_blocks.parts, *scaled_blocks.parts)),
-        names=(*earlier.recordings, *later.recordings),
+    scaled_blocks = second_fit.time_blocks.scale_joints(
+        second_fit.weights / first_fit.weights
     )
-    fit = fit_problem(problem, WeightedLeastSquares(GivenWeights(earlier.weights)))
-    fit = dataclasses.replace(fit, name=f"{earlier.name}, {later.name}")
+    problem = RegressionProblem(
+        first_fit.base,
+        blocks=Blocks((*first_fit.time_blocks.parts, *scaled_blocks.parts)),
+        names=(*first_fit.recordings, *second_fit.recordings),
+    )
+    fit = fit_problem(problem, WeightedLeastSquares(GivenWeights(first_fit.weights)))
+    fit = dataclasses.replace(fit, name=f"{first_fit.name}, {second_fit.name}")
     return replace_estimates(fit, parameters, uncertainty)
 
 

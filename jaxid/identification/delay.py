@@ -199,13 +199,13 @@ class _Equations(NamedTuple):
 
     def solve(self, without: int | None = None) -> np.ndarray:
         """Return the parameters, from all blocks or without one of them."""
-        total = self.products.sum(axis=0)
+        products = self.products.sum(axis=0)
         if without is not None:
-            total = total - self.products[without]
+            products = products - self.products[without]
         lengths = np.sqrt(np.diag(self.squares)[:-1])
         scale = 1.0 / np.where(lengths > 0, lengths, np.inf)
-        A = scale[:, None] * total[:, :-1] * scale
-        b = scale * total[:, -1]
+        A = scale[:, None] * products[:, :-1] * scale
+        b = scale * products[:, -1]
         solution, *_ = np.linalg.lstsq(A, b, rcond=1e-12)
         return scale * solution
 
@@ -219,9 +219,9 @@ class _Equations(NamedTuple):
     def feedback(self, parameters: np.ndarray) -> float:
         """Return the largest effect of fed-back disturbances on the last parameter."""
         residual = np.append(parameters, -1.0)
-        square = max(residual @ self.squares @ residual, 0.0)
+        residual_square = max(residual @ self.squares @ residual, 0.0)
         rate_square = max(residual @ self.rates @ residual, 0.0)
-        disturbances = np.sqrt(square) * np.sqrt(rate_square)
+        disturbances = np.sqrt(residual_square) * np.sqrt(rate_square)
         # What the other parameters leave of the rate, whose column is the last but one.
         gram = self.squares[:-2, :-2]
         products = self.squares[:-2, -2]

@@ -100,15 +100,15 @@ def fit_problem(
     R, z = factors.weighted(weights)
     decomposition = Decomposition.of(R, z)
     unbounded_estimate = estimate.without_bounds()
-    naive = naive_covariance(
+    independent_covariance = naive_covariance(
         factors,
         weights,
         unbounded_estimate.parameters,
         unbounded_estimate.inverse,
         unbounded_estimate.number_of_parameters(R),
     )
-    naive[decomposition.unknown, decomposition.unknown] = np.inf
-    errors, spectra = uncertainty(rows, unbounded_estimate, naive)
+    independent_covariance[decomposition.unknown, decomposition.unknown] = np.inf
+    errors, spectra = uncertainty(rows, unbounded_estimate, independent_covariance)
 
     # Residuals are those of all rows, whatever weights the estimator gave them.
     squares = rows.factors.residual_squares(estimate.parameters)

@@ -138,8 +138,8 @@ def _solve_together(
         regressor = base.joint_regressor
     else:
         # The geometry becomes an argument of the columns.
-        placed = _with_geometries(base, robots or ())
-        family, numbers = opened("columns", base, *placed)
+        placed_bases = _with_geometries(base, robots or ())
+        family, numbers = opened("columns", base, *placed_bases)
         joints = (robot.joints,)
         count = numbers.shape[1]
         regressor = JointRegressor(

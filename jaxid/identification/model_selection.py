@@ -151,11 +151,11 @@ def choose_model(
     # On the diagonal of its table a fit leaves out one part, and predicts it.
     count = len(parts)
     squares = np.diagonal(table, axis1=1, axis2=2)
-    best = _simplest_candidate(squares, candidates)
+    choice = _simplest_candidate(squares, candidates)
     return ModelChoice(
         candidates=tuple(candidates),
         errors=np.sqrt(squares),
-        best=best,
+        best=choice,
         promise=_promise(table, candidates),
         parts=f"{count} logs" if by_log else f"{count} parts of time",
     )

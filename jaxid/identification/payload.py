@@ -95,10 +95,12 @@ class Payload(Summarised, eqx.Module):
         # Infinite variances would make all others NaN in the product.
         is_undetermined = ~np.isfinite(np.diag(covariance))
         finite_part = np.where(np.isfinite(covariance), covariance, 0.0)
-        central = J @ finite_part @ J.T
+        central_covariance = J @ finite_part @ J.T
         is_affected = np.any(J[:, is_undetermined] != 0.0, axis=1)
-        central[is_affected, is_affected] = np.inf
-        return values, Uncertainty(central, self.uncertainty.dof, central)
+        central_covariance[is_affected, is_affected] = np.inf
+        return values, Uncertainty(
+            central_covariance, self.uncertainty.dof, central_covariance
+        )
 
     def summary(self) -> Table:
         """Return a table of mass, centre, moments about it, and consistency."""

@@ -119,16 +119,16 @@ def _simulate(
     return Path(*path)
 
 
-def middle_of(q: Any, v: Any, last: Any, h: Any) -> tuple[Any, Any]:
+def middle_of(q: Any, v: Any, last_velocity: Any, h: Any) -> tuple[Any, Any]:
     """Return predicted position and velocity in the middle of a step.
 
     Args:
         q: Position before the step.
         v: Velocity before it.
-        last: Velocity before the last step.
+        last_velocity: Velocity before the last step.
         h: Time of a step [s].
     """
-    return q + 0.5 * h * v, 1.5 * v - 0.5 * last
+    return q + 0.5 * h * v, 1.5 * v - 0.5 * last_velocity
 
 
 def _solve_velocities(
@@ -255,7 +255,7 @@ class CoupledSimulator:
         )
 
     def sensitivities(
-        self, theta: np.ndarray, path: Path, free: FreeParameters
+        self, theta: np.ndarray, path: Path, free_mask: FreeParameters
     ) -> np.ndarray:
         """Return derivatives of the positions.
 
@@ -266,10 +266,11 @@ class CoupledSimulator:
         n = len(theta)
         samples = self.motion.positions.shape[-1]
         transitions = [
-            self.transitions(k, np.asarray(theta), path, free) for k in range(motions)
+            self.transitions(k, np.asarray(theta), path, free_mask)
+            for k in range(motions)
         ]
         size = self.motion.start[0].size
-        state = np.zeros((motions, size + n, free.sum() + size))
+        state = np.zeros((motions, size + n, free_mask.sum() + size))
         state[:, :size, -size:] = np.eye(size)
         # The velocity before is that of the start, too.
         state[:, size:] = state[:, n : 2 * n]
@@ -294,7 +295,7 @@ class CoupledSimulator:
         return S
 
     def transitions(
-        self, motion: int, theta: np.ndarray, path: Path, free: np.ndarray
+        self, motion: int, theta: np.ndarray, path: Path, free_mask: np.ndarray
     ) -> Callable[[slice], tuple[np.ndarray, np.ndarray]]:
         """Return a function of samples: derivatives of the state a sample time later.
 
@@ -343,7 +344,7 @@ class CoupledSimulator:
                 velocities[rows],
                 slope[rows],
                 terms,
-                free,
+                free_mask,
                 h,
                 size,
             )
@@ -354,11 +355,11 @@ class CoupledSimulator:
 def _body_terms(path: Path, h: float):
     """Return mass matrices and bias forces of a motion's steps, and their places."""
     v = path.states.w[:, 0]
-    middle_states = middle_of(
-        path.states.q[:, 0], v, np.concatenate([v[:1], v[:-1]]), h
-    )
+    last_velocities = np.concatenate([v[:1], v[:-1]])
+    middle_states = middle_of(path.states.q[:, 0], v, last_velocities, h)
     M = np.zeros((*v.shape, v.shape[1])) if path.M is None else path.M
-    return M, np.zeros_like(v) if path.load is None else path.load, middle_states
+    load = np.zeros_like(v) if path.load is None else path.load
+    return M, load, middle_states
 
 
 def _compose(

@@ -178,40 +178,38 @@ def _products(S: Array, r: Array) -> tuple[Array, Array]:
 
 
 def prepare(
-    simulator: CoupledSimulator, parameters: np.ndarray, free: np.ndarray
+    simulator: CoupledSimulator, parameters: np.ndarray, free_mask: np.ndarray
 ) -> None:
     """Compile what the refinement of motions of this length needs."""
-    refinement = Refinement.of(simulator, parameters, free)
-    simulator.transitions(0, parameters, refinement.path, free)
+    refinement = Refinement.of(simulator, parameters, free_mask)
+    simulator.transitions(0, parameters, refinement.path, free_mask)
 
 
 def refine(
-    first: tuple[CoupledSimulator, np.ndarray],
-    other: tuple[CoupledSimulator, np.ndarray],
-    free: FreeParameters,
+    first_start: tuple[CoupledSimulator, np.ndarray],
+    second_start: tuple[CoupledSimulator, np.ndarray],
+    free_mask: FreeParameters,
 ) -> tuple[Refinement, bool]:
     """Return the best fit of all joints together, from two that are nearly right.
 
     The second one goes on if it is clearly better.
 
     Args:
-        first: Motions and parameters of each joint.
-        other: The same of the second one.
-        free: Parameters that are estimated.
+        first_start: Motions and parameters of each joint.
+        second_start: The same of the second one.
+        free_mask: Parameters that are estimated.
 
     Returns:
         The fit, and whether the logs tell which of the two is better.
     """
 
     def descend(start: tuple[CoupledSimulator, np.ndarray]) -> Refinement:
-        return _descend(Refinement.of(*start, free), COARSE_FALL)
+        return _descend(Refinement.of(*start, free_mask), COARSE_FALL)
 
-    first_fit, other_fit = on_cores(descend, (first, other))
-    is_decided = abs(other_fit.score - first_fit.score) > FINE_FALL
-    return _descend(
-        other_fit if other_fit.score < first_fit.score - FINE_FALL else first_fit,
-        FINE_FALL,
-    ), is_decided
+    first_fit, second_fit = on_cores(descend, (first_start, second_start))
+    gain = first_fit.score - second_fit.score
+    best_fit = second_fit if gain > FINE_FALL else first_fit
+    return _descend(best_fit, FINE_FALL), abs(gain) > FINE_FALL
 
 
 def _descend(fit: Refinement, fall: float) -> Refinement:

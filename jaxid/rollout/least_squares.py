@@ -38,7 +38,7 @@ def minimise(
     moments: Moments,
     costs: Costs,
     x: np.ndarray,
-    free: np.ndarray,
+    free_mask: np.ndarray,
     bounds: tuple[np.ndarray, np.ndarray],
     iterations: int = 30,
     tolerance: float = 1e-3,
@@ -53,7 +53,7 @@ def minimise(
         moments: Costs and their derivatives at parameters of all problems.
         costs: Costs alone.
         x: Start of each problem.
-        free: Parameters that may change.
+        free_mask: Parameters that may change.
         bounds: Lower and upper limits of the parameters.
         iterations: Largest number of steps.
         tolerance: Relative decrease of the cost below which a problem has converged.
@@ -64,7 +64,7 @@ def minimise(
     convergence = np.zeros(x.shape[:-1], bool)
     cost, g, H = moments(x)
     for _ in range(iterations):
-        terms = [y[subset] for y in (x, cost, g, H, free, dampings)]
+        terms = [y[subset] for y in (x, cost, g, H, free_mask, dampings)]
         x[subset], dampings[subset], new_convergence = improve(
             costs, terms, bounds, tolerance
         )
@@ -100,7 +100,7 @@ def bounded_step(
     gradient: np.ndarray,
     information: np.ndarray,
     x: np.ndarray,
-    free: np.ndarray,
+    free_mask: np.ndarray,
     bounds: tuple[np.ndarray, np.ndarray],
     damping: np.ndarray | float,
 ) -> np.ndarray:
@@ -122,7 +122,7 @@ def bounded_step(
     diagonal_damping = np.asarray(damping)[..., None, None] + 1e-12
     leaves_below = (x <= lower_limits) & (gradient > 0)
     leaves_above = (x >= upper_limits) & (gradient < 0)
-    is_moving = free & ~leaves_below & ~leaves_above & (size > 1e-140)
+    is_moving = free_mask & ~leaves_below & ~leaves_above & (size > 1e-140)
     moving_mask = is_moving.astype(float)
     step = np.zeros_like(gradient)
     for _ in range(MAX_BOUND_ROUNDS):

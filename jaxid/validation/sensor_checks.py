@@ -163,39 +163,41 @@ def channel_findings(
 
     Return the joint and a sentence of each.
     """
-    findings = _position_and_force_findings(robot, recording)
+    owner = "the motor of joint" if recording.angles_on_motor_side else "joint"
+    findings = _position_and_force_findings(robot, recording, owner)
     if statistics is not None and recording.velocities is not None:
-        findings += _velocity_findings(robot, recording, statistics)
+        findings += _velocity_findings(robot, recording, owner, statistics)
     return findings
 
 
-def _position_and_force_findings(robot: Robot, recording: Recording) -> Findings:
-    r = recording
+def _position_and_force_findings(
+    robot: Robot, recording: Recording, owner: str
+) -> Findings:
+    """Look for wrapped, spiky and held angles, and for held forces."""
     findings = []
-    angles = np.asarray(r.angles)
-    forces = np.asarray(r.forces)
-    time = np.asarray(r.time)
-    owner = _angle_owner(r)
+    angles = np.asarray(recording.angles)
+    forces = np.asarray(recording.forces)
+    time = np.asarray(recording.time)
+    segments = recording.segments
     for j, name in enumerate(robot.joint_names):
         x = angles[:, j]
         other_angles = np.delete(angles, j, 1)
         text = _wrap_text(x, time) if robot.revolute[j] else ""
-        text = text or _spike_text(x, time, r.segments)
-        text = text or _held_angle_text(x, other_angles, time, r.segments)
+        text = text or _spike_text(x, time, segments)
+        text = text or _held_angle_text(x, other_angles, time, segments)
         if text:
             findings.append((j, f"the angle of {owner} `{name}` {text}"))
-        hold = _held_force_text(forces[:, j], x, time, r.segments)
+        hold = _held_force_text(forces[:, j], x, time, segments)
         if hold:
             findings.append((j, f"the forces of joint `{name}` {hold}"))
     return findings
 
 
 def _velocity_findings(
-    robot: Robot, recording: Recording, statistics: LogStatistics
+    robot: Robot, recording: Recording, owner: str, statistics: LogStatistics
 ) -> Findings:
     """Compare measured velocities with the derivatives of the angles."""
     findings = []
-    owner = _angle_owner(recording)
     for j, ratio in unlike_derivatives(recording).items():
         text = (
             f"the velocities of {owner} `{robot.joint_names[j]}` are {ratio:.3g} "
@@ -214,10 +216,6 @@ def _velocity_findings(
             )
             findings.append((j, text))
     return findings
-
-
-def _angle_owner(recording: Recording) -> str:
-    return "the motor of joint" if recording.angles_on_motor_side else "joint"
 
 
 def clock_findings(recording: Recording) -> list[str]:
@@ -257,29 +255,29 @@ def _lost_and_repeated(
     inner_steps = steps[1:-1]
     previous_steps = steps[:-2]
     next_steps = steps[2:]
-    mean = 0.5 * (previous_steps + next_steps)
+    mean_steps = 0.5 * (previous_steps + next_steps)
     sizes = np.abs(steps)
     # Encoders round to half an increment; smaller differences are those of rounded
     # numbers.
     increment = np.where(sizes > rounding, sizes, np.inf).min(axis=0)
-    noise = 1.4826 * np.median(np.abs(inner_steps - mean), axis=0)
+    noise = 1.4826 * np.median(np.abs(inner_steps - mean_steps), axis=0)
     # The noise of a joint that never moves is infinite, and it has no say.
     noise = np.maximum(noise, 0.5 * increment)
-    bend = np.abs(next_steps - previous_steps) / noise
+    bends = np.abs(next_steps - previous_steps) / noise
     inner_steps = inner_steps / noise
-    mean = mean / noise
-    gap = np.abs(inner_steps - mean)
+    mean_steps = mean_steps / noise
+    gaps = np.abs(inner_steps - mean_steps)
     # All joints go on by the same number of steps, as far as noise lets see.
-    speed = np.sum(mean**2, axis=1)
-    count = np.sum(inner_steps * mean, axis=1) / np.maximum(speed, 1.0)
-    common_gap = np.abs(count - 1)[:, None] * np.abs(mean)
-    is_far = gap > JUMP
+    speed = np.sum(mean_steps**2, axis=1)
+    count = np.sum(inner_steps * mean_steps, axis=1) / np.maximum(speed, 1.0)
+    common_gap = np.abs(count - 1)[:, None] * np.abs(mean_steps)
+    is_far = gaps > JUMP
     is_shared = (is_far | (common_gap < 2 * JUMP)).all(axis=1)
-    residuals = inner_steps - count[:, None] * mean
-    is_explained = np.sum(residuals**2, axis=1) < 0.1 * np.sum(gap**2, axis=1)
+    residuals = inner_steps - count[:, None] * mean_steps
+    is_explained = np.sum(residuals**2, axis=1) < 0.1 * np.sum(gaps**2, axis=1)
     is_jump = is_far.any(axis=1) & is_shared & is_explained
     is_jump &= speed > 9.0
-    is_jump &= bend.max(axis=1) < JUMP
+    is_jump &= bends.max(axis=1) < JUMP
     is_standing = (inner_steps == 0).all(axis=1)
     return is_jump & (count > 1.5), is_jump & is_standing
 
@@ -317,9 +315,8 @@ def _spike_text(
         median = ndimage.median_filter(x[a:b], 7, mode="nearest")
         gap = np.abs(x[a:b] - median)
         max_step = np.abs(np.diff(median)).max(initial=0.0)
-        peaks = np.flatnonzero(
-            gap > max(1.5 * max_step, 10.0 * float(np.quantile(gap, 0.99)))
-        )
+        usual_gap = float(np.quantile(gap, 0.99))
+        peaks = np.flatnonzero(gap > max(1.5 * max_step, 10.0 * usual_gap))
         places += (a + peaks).tolist()
         sizes += gap[peaks].tolist()
     if not places:

@@ -85,10 +85,10 @@ class ConsistentSolver(Hashable):
         require_float64("a physically consistent estimate")
         R = jnp.asarray(R)
         z = jnp.asarray(z)
-        feasible = self.estimator.feasible_set(self.base)
-        data, program = self.estimator.program(self.base, feasible, R, z, rows)
+        feasible_set = self.estimator.feasible_set(self.base)
+        data, program = self.estimator.program(self.base, feasible_set, R, z, rows)
         optimum = solver.solve_compiled(program)
-        p = feasible.standard_parameters(data, optimum.y)
+        p = feasible_set.standard_parameters(data, optimum.y)
         return ConsistentBatch(
             standard=p,
             parameters=self.base.from_standard(p),

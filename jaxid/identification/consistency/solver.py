@@ -147,15 +147,15 @@ def _solve(p: ConeProgram, loop: Callable) -> Optimum:
     zero = xp.zeros((), int)
     search = Search(start, start, zero, zero, zero > 0)
     search = loop(lambda search: ~search.has_finished, iterate, search)
-    best = search.best
+    best_point = search.best
     return Optimum(
-        y=best.y,
-        value=best.value,
-        error=best.error,
-        certified=is_certified(best),
+        y=best_point.y,
+        value=best_point.value,
+        error=best_point.error,
+        certified=is_certified(best_point),
         iterations=search.iterations,
-        multipliers=best.z,
-        matrices=best.Z,
+        multipliers=best_point.z,
+        matrices=best_point.Z,
     )
 
 
@@ -437,19 +437,19 @@ def _newton_solver(p: ConeProgram, H):
         factor = linalg.cho_factor(H, lower=True, check_finite=False)
     except np.linalg.LinAlgError:
         # NaN ends the search, as it does in JAX, whose factors are NaN.
-        return lambda right: np.full_like(right, np.nan)
+        return lambda right_side: np.full_like(right_side, np.nan)
 
-    def solve(right):
-        return linalg.cho_solve(factor, right, check_finite=False)
+    def solve(right_side):
+        return linalg.cho_solve(factor, right_side, check_finite=False)
 
     if not p.equalities.shape[0]:
         return solve
     normal_steps = xp.stack([solve(row) for row in p.equalities], axis=1)
-    square = p.equalities @ normal_steps
+    schur_complement = p.equalities @ normal_steps
 
-    def solve_within(right):
-        free_step = solve(right)
+    def solve_within(right_side):
+        free_step = solve(right_side)
         violation = p.equalities @ free_step
-        return free_step - normal_steps @ xp.linalg.solve(square, violation)
+        return free_step - normal_steps @ xp.linalg.solve(schur_complement, violation)
 
     return solve_within

@@ -135,6 +135,8 @@ class InstrumentalVariables(AbstractEstimator):
         for recording, reference in zip(recordings, self.references, strict=True):
             motion = jax.tree.map(lambda x: np.asarray(x, np.float64), reference)
             source = SamplesInMemory(motion, np.zeros(motion.q.shape))
-            filtered = RegressionProblem(problem.base, recording.replace(source=source))
-            columns.append(join_chunks(list(filtered.chunks())).columns)
+            reference_problem = RegressionProblem(
+                problem.base, recording.replace(source=source)
+            )
+            columns.append(join_chunks(list(reference_problem.chunks())).columns)
         return columns

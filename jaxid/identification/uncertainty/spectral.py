@@ -96,15 +96,15 @@ class SpectralWindows:
     """Windows of neighbouring lines, over which periodograms are smoothed.
 
     A window reaches 30 % of its frequency to either side, at least 0.25 Hz and four
-    lines of the longest stretch [s]. The methods take NumPy and JAX arrays, with the
-    lines as last axis in any order.
+    lines of the longest stretch (`max_duration` [s]). The methods take NumPy and JAX
+    arrays, with the lines as last axis in any order.
     """
 
-    def __init__(self, frequency: Vector, longest: float):
+    def __init__(self, frequency: Vector, max_duration: float):
         self._order = np.argsort(frequency, kind="stable")
         places = np.argsort(self._order)
         ordered_frequency = frequency[self._order]
-        min_half_width = max(0.25, 4.0 / longest)
+        min_half_width = max(0.25, 4.0 / max_duration)
         half_widths = np.maximum(min_half_width, 0.3 * ordered_frequency)
         # Lines at the edge of a window belong to it in spite of rounding.
         half_widths = half_widths * (1 + 1e-9)
@@ -128,11 +128,11 @@ class SpectralWindows:
         """Return for each line the sum over the windows that it is in."""
         return self._sum(x, *self._windows)
 
-    def _sum(self, x: AnyArray, first: np.ndarray, end: np.ndarray) -> AnyArray:
+    def _sum(self, x: AnyArray, starts: np.ndarray, ends: np.ndarray) -> AnyArray:
         xp = namespace(x)
         sums = x[..., self._order].cumsum(axis=-1)
         sums = xp.concatenate([xp.zeros_like(sums[..., :1]), sums], axis=-1)
-        return sums[..., end] - sums[..., first]
+        return sums[..., ends] - sums[..., starts]
 
 
 class SpectralTable:
@@ -144,10 +144,10 @@ class SpectralTable:
     """
 
     def __init__(
-        self, xp, frequency, multiplicity, energy, leverage, exposure, longest
+        self, xp, frequency, multiplicity, energy, leverage, exposure, max_duration
     ):
         self._xp = xp
-        self._windows = SpectralWindows(frequency, longest)
+        self._windows = SpectralWindows(frequency, max_duration)
         # A line and its mirror image are one random number.
         self._half = 0.5 * multiplicity[None]
         window_rows = self._windows.sum_lines(self._half * exposure)
@@ -178,7 +178,7 @@ class SpectralTable:
             _join([x.energy for x in lines]),
             _join([x.leverage for x in lines]),
             _join(exposures),
-            longest=max(x.length * x.row_time for x in lines),
+            max_duration=max(x.length * x.row_time for x in lines),
         )
 
     def density(self, power: Matrix) -> Matrix:
