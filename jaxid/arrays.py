@@ -164,14 +164,14 @@ def on_cores(
     """
     cores = cores or os.cpu_count() or 1
     ahead = ahead or cores
-    waiting: deque[Future] = deque()
+    pending_results: deque[Future] = deque()
     with ThreadPoolExecutor(cores) as pool:
         for item in items:
-            if len(waiting) >= ahead:
-                yield waiting.popleft().result()
-            waiting.append(pool.submit(function, item))
-        while waiting:
-            yield waiting.popleft().result()
+            if len(pending_results) >= ahead:
+                yield pending_results.popleft().result()
+            pending_results.append(pool.submit(function, item))
+        while pending_results:
+            yield pending_results.popleft().result()
 
 
 def in_parts(solve: Callable[[Any], Any], data: Any, size: int = 16) -> Any:

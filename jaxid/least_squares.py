@@ -129,10 +129,10 @@ class BoundedLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             decrease=1.0 - relative_cost,
         )
         refused_state = state._replace(damping=state.damping * factor)
-        following = jax.tree.map(
+        next_state = jax.tree.map(
             lambda a, b: jnp.where(is_better, a, b), accepted_state, refused_state
         )
-        return jnp.where(is_better, trial_point, y), following, None
+        return jnp.where(is_better, trial_point, y), next_state, None
 
     def terminate(self, fn, y, args, options, state, tags):
         """Return whether the last step changed little, or no step lowers the sum."""

@@ -56,10 +56,10 @@ def tables(study: Study) -> list[Table]:
 
 def remarks(study: Study) -> list[Remark]:
     """Return the findings of the paper, as far as they come out here."""
-    identification = max(study.weighted.mean_errors(0))
-    verification = max(study.weighted.mean_errors(1))
-    error = study.unweighted.mean_errors(0)[-1]
-    weighted_error = study.weighted.mean_errors(0)[-1]
+    identification = max(study.weighted_model.mean_errors(0))
+    verification = max(study.weighted_model.mean_errors(1))
+    error = study.unweighted_model.mean_errors(0)[-1]
+    weighted_error = study.weighted_model.mean_errors(0)[-1]
     return [
         Remark(
             "The identified model predicts the torques of every axis to "
@@ -67,8 +67,8 @@ def remarks(study: Study) -> list[Remark]:
             f"{verification:.2g} % on an unseen path.",
             Status.GOOD if max(identification, verification) < 1.0 else Status.DOUBTFUL,
             "Mean error of the worst axis; below 1 % in the paper. The true parameters "
-            f"leave {max(study.true.mean_errors(0)):.2g} % and "
-            f"{max(study.true.mean_errors(1)):.2g} %.",
+            f"leave {max(study.true_model.mean_errors(0)):.2g} % and "
+            f"{max(study.true_model.mean_errors(1)):.2g} %.",
         ),
         Remark(
             f"Without weights the last axis errs by {error:.2g} %, with weights by "
@@ -110,17 +110,17 @@ def paper_table(study: Study) -> Table:
         (
             "mean error, worst axis, identification [%]",
             "below 1",
-            max_error_text(study.weighted.mean_errors(0)),
+            max_error_text(study.weighted_model.mean_errors(0)),
         ),
         (
             "mean error, worst axis, verification [%]",
             "below 1",
-            max_error_text(study.weighted.mean_errors(1)),
+            max_error_text(study.weighted_model.mean_errors(1)),
         ),
         (
             "verification, by the true parameters [%]",
             MISSING,
-            max_error_text(study.true.mean_errors(1)),
+            max_error_text(study.true_model.mean_errors(1)),
         ),
         ("mass matrix without weights", "not positive definite", definiteness_texts[0]),
         ("mass matrix with weights", "positive definite", definiteness_texts[1]),
@@ -128,8 +128,8 @@ def paper_table(study: Study) -> Table:
     ]
     for k in COLD:
         for state, paper, fit in (
-            ("cold", COLD, study.weighted.fit),
-            ("warm", WARM, study.warm),
+            ("cold", COLD, study.weighted_model.fit),
+            ("warm", WARM, study.warm_fit),
         ):
             estimate, deviation = with_deviation(
                 float(fit.parameters[k - 1]), float(fit.standard_deviations[k - 1])
@@ -209,7 +209,7 @@ def _temperature(study: Study) -> list[Any]:
 def _excitation(study: Study) -> Section:
     base = study.base
     robot = base.model.robot
-    series = study.played.inner
+    series = study.played_motion.inner
     times = np.linspace(0.0, float(series.duration), POINTS)
     motion = series.motion(times)
     speed, acceleration = study.tip_maxima
@@ -219,7 +219,7 @@ def _excitation(study: Study) -> Section:
         f"{base.size}; the first two are those of Eq. 24.",
         folded(
             f"All {base.size} base parameters, weighted",
-            parameter_table(study.weighted.fit),
+            parameter_table(study.weighted_model.fit),
         ),
         f"The motion is a Fourier series of {settings.HARMONICS} harmonics at "
         f"{settings.OMEGA:g} rad/s within all limits and clear of collisions. As in "
@@ -241,8 +241,8 @@ def _excitation(study: Study) -> Section:
 def _identification(study: Study) -> Section:
     robot = study.base.model.robot
     log = study.observations[0]
-    unweighted_errors = study.unweighted.validation.errors[0]
-    weighted_errors = study.weighted.validation.errors[0]
+    unweighted_errors = study.unweighted_model.validation.errors[0]
+    weighted_errors = study.weighted_model.validation.errors[0]
     return "Identification with and without weights", [
         "Cold and warm, the servo follows the motion at 1000 Hz. Logs hold angles of "
         "17-bit encoders and torques with 1 % of noise, ripple, stiction and Stribeck "
@@ -267,7 +267,7 @@ def _verification(study: Study) -> Section:
     robot = study.base.model.robot
     path = study.joint_path
     times = np.linspace(0.0, float(path.duration), 5 * POINTS)
-    identification, verification = study.weighted.validation.errors
+    identification, verification = study.weighted_model.validation.errors
     groups = {"identification": [identification], "verification": [verification]}
     return "Verification on another path", [
         f"The path after ISO 9283 in a cube of {settings.EDGE:g} m, with rests at its "
@@ -295,8 +295,8 @@ def _study_record(study: Study) -> dict[str, Any]:
     """Return the results of the demo for `demo.json`, in rad, m, s, N and N m."""
     base = study.base
     speed, acceleration = study.tip_maxima
-    cold_parameters = study.weighted.fit.parameters
-    warm_parameters = study.warm.parameters
+    cold_parameters = study.weighted_model.fit.parameters
+    warm_parameters = study.warm_fit.parameters
     return {
         **header("demo.json"),
         "seed": study.seed,

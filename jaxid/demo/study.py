@@ -62,24 +62,29 @@ class Study(NamedTuple):
     # design with the least condition number (Eq. 36); None if a motion was given
     plan: jid.ExcitationPlan | None
     # motion of the identification, from standstill to standstill
-    played: jid.trajectories.WithLeads
+    played_motion: jid.trajectories.WithLeads
     joint_path: (
         jid.trajectories.AbstractTrajectory
     )  # path of the verification in joint coordinates
     # filtered recordings: identification cold, identification warm, verification
     observations: tuple[jid.Observations, ...]
-    unweighted: Model  # least squares without weights
-    weighted: Model  # least squares with the weights of Eq. 30
-    consistent: Model  # estimate of physically consistent bodies
+    unweighted_model: Model  # least squares without weights
+    weighted_model: Model  # least squares with the weights of Eq. 30
+    consistent_model: Model  # estimate of physically consistent bodies
     # parameters of the robot itself: their errors are all due to disturbances
-    true: Model
-    warm: jid.Fit  # fit of the warm robot
+    true_model: Model
+    warm_fit: jid.Fit  # fit of the warm robot
     temperature: Comparison  # comparison of the cold with the warm robot
 
     @property
     def models(self) -> tuple[Model, ...]:
         """All sets of parameters whose errors are compared."""
-        return self.unweighted, self.weighted, self.consistent, self.true
+        return (
+            self.unweighted_model,
+            self.weighted_model,
+            self.consistent_model,
+            self.true_model,
+        )
 
     @property
     def tip_maxima(self) -> tuple[float, float]:
@@ -87,7 +92,7 @@ class Study(NamedTuple):
 
         They are those of the motion for identification.
         """
-        series = self.played.inner
+        series = self.played_motion.inner
         times = np.linspace(0.0, float(series.duration), 4000, endpoint=False)
         _, *rates = jid.constraints.tip_motion(
             self.base.model.robot, series.motion(times)
@@ -121,21 +126,15 @@ def run_study(
     )
     joint_path = jid.trajectories.joint_path(robot, tip_path, posture=POSTURE)
 
-    observations = []
-    for virtual_robot, trajectory, name in (
+    runs = (
         (cold_robot, played_motion, "identification, cold"),
         (warm_robot, played_motion, "identification, warm"),
         (cold_robot, joint_path, "verification"),
-    ):
+    )
+    observations = []
+    for number, (virtual_robot, trajectory, name) in enumerate(runs, 10 * seed):
         progress(f"measuring: {name}", 0.0)
-        number = 10 * seed + len(observations)
-        run = virtual_robot.track(
-            trajectory, sample_time=SAMPLE_TIME, seed=number, name=name
-        )
-        log = jid.observe(
-            run.recording, robot, jid.filters.PaperFilter(), jid.Subsample(STEP)
-        )
-        observations.append(log)
+        observations.append(_measure(virtual_robot, trajectory, name, number))
     cold_log, warm_log, verification_log = observations
 
     progress("identifying", 0.0)
@@ -164,8 +163,24 @@ def run_study(
         joint_path,
         tuple(observations),
         *models,
-        warm=warm_fit,
+        warm_fit=warm_fit,
         temperature=jid.compare(weighted_fit, warm_fit),
+    )
+
+
+def _measure(
+    virtual_robot: jid.simulation.VirtualRobot,
+    trajectory: jid.trajectories.AbstractTrajectory,
+    name: str,
+    seed: int,
+) -> jid.Observations:
+    """Return the filtered recording of a robot that tracks a trajectory."""
+    run = virtual_robot.track(trajectory, sample_time=SAMPLE_TIME, seed=seed, name=name)
+    return jid.observe(
+        run.recording,
+        virtual_robot.robot,
+        jid.filters.PaperFilter(),
+        jid.Subsample(STEP),
     )
 
 

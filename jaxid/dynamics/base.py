@@ -294,9 +294,9 @@ def base_parameters(model: Model, *, seed: int = 0) -> BaseParameters:
 
     leaders = np.array(dependence.independent, int)
     dependent_columns = np.array(dependence.dependent, int)
-    regrouped = regrouping(W, leaders, dependent_columns)
+    regrouped_columns = regrouping(W, leaders, dependent_columns)
     # Back from columns that are free of units to those of the model.
-    kappa = regrouped.kappa * scale[leaders][:, None] / scale[dependent_columns]
+    kappa = regrouped_columns.kappa * scale[leaders][:, None] / scale[dependent_columns]
     return BaseParameters(
         model,
         dependence.independent,
@@ -304,7 +304,7 @@ def base_parameters(model: Model, *, seed: int = 0) -> BaseParameters:
         kappa,
         dependence.smallest_independent,
         dependence.largest_dependent,
-        tuple(_doubts(model, dependence, rank, regrouped)),
+        tuple(_doubts(model, dependence, rank, regrouped_columns)),
     )
 
 
@@ -314,7 +314,7 @@ def _snapped(model: Model):
 
 
 def _doubts(
-    model: Model, dependence: Dependence, rank: int, regrouped: Regrouped
+    model: Model, dependence: Dependence, rank: int, regrouped_columns: Regrouped
 ) -> Iterator[str]:
     """Yield doubts about the choice of base parameters, in sentences."""
     count = len(dependence.independent)
@@ -325,7 +325,7 @@ def _doubts(
             "the geometry is nearly degenerate, or angles are rounded."
         )
     if dependence.smallest_independent < MIN_SHARE:
-        column = dependence.independent[int(np.argmin(regrouped.shares))]
+        column = dependence.independent[int(np.argmin(regrouped_columns.shares))]
         yield (
             f"`{model.parameter_names[column]}` is barely a base parameter: only "
             f"{dependence.smallest_independent:.1e} of its column is new, because of a "
@@ -338,8 +338,8 @@ def _doubts(
             f"are {dependence.smallest_independent:.1e} and "
             f"{dependence.largest_dependent:.1e}."
         )
-    if regrouped.unexplained > MAX_UNEXPLAINED:
+    if regrouped_columns.unexplained > MAX_UNEXPLAINED:
         yield (
             "a dependent column is explained only "
-            f"to {regrouped.unexplained:.1e} of its size."
+            f"to {regrouped_columns.unexplained:.1e} of its size."
         )

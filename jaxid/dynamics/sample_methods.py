@@ -72,12 +72,12 @@ def opened(
     places = []
     numbers: list[AnyArray] = [np.zeros((len(leaves_of_models), 0))]
     for k, values in enumerate(zip(*leaves_of_models, strict=True)):
-        first, *_ = values
+        first_value, *_ = values
         if is_traced(values):
             # All numbers of the leaf are inputs; zeros stand in the closed model.
             stack = jnp.stack
-            leaves[k] = np.zeros(first.shape, first.dtype)
-            positions = np.arange(first.size)
+            leaves[k] = np.zeros(first_value.shape, first_value.dtype)
+            positions = np.arange(first_value.size)
         else:
             stack = np.stack
             rows = np.array([np.ravel(x) for x in values])
@@ -186,8 +186,8 @@ def definition_on_rows(definition: Callable, *arrays: Array) -> Array:
 
     def in_blocks(samples):
         # Without checkpoints a gradient would store the intermediates of all blocks.
-        on_block = jax.checkpoint(on_one_sample)
-        return jax.lax.map(on_block, samples, batch_size=BLOCK)
+        block_function = jax.checkpoint(on_one_sample)
+        return jax.lax.map(block_function, samples, batch_size=BLOCK)
 
     samples = [x for x in arrays if x.ndim == 2]
     count = len(samples[0])

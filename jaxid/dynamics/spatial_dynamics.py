@@ -100,7 +100,7 @@ def _relative_placements(robot: Robot, q: Joints):
     rotation = jnp.asarray(robot.rotation, dtype)
     offset = jnp.asarray(robot.offset, dtype)
     is_revolute = np.array(robot.revolute)[:, None, None]
-    turns = jnp.asarray(is_revolute, dtype)
+    is_turning = jnp.asarray(is_revolute, dtype)
     slides = jnp.asarray(~is_revolute, dtype)
     angle = q[:, None, None]
 
@@ -108,8 +108,8 @@ def _relative_placements(robot: Robot, q: Joints):
     identity = jnp.eye(3, dtype=dtype)[None]
     axis_column = axis[:, :, None]
     axial_part = axis_column * axis[:, None, :]
-    normal_part = turns * (identity - axial_part)
-    sideways = turns * _combine(SKEW, axis)
+    normal_part = is_turning * (identity - axial_part)
+    sideways = is_turning * _combine(SKEW, axis)
     turn = identity + (jnp.cos(angle) - 1) * normal_part
     turn = turn + jnp.sin(angle) * sideways
 
@@ -142,10 +142,10 @@ def ground_motion(robot: Robot, q: Joints, qd: Joints, qdd: Joints) -> GroundMot
 
     is_revolute = np.array(robot.revolute)[:, None]
     axis = jnp.asarray(robot.axis, dtype)
-    turning = jnp.where(is_revolute, axis, 0.0)
+    turning_axes = jnp.where(is_revolute, axis, 0.0)
     sliding_axes = jnp.where(is_revolute, 0.0, axis)
-    angular_velocities = _times(R, turning)
-    linear_velocities = _times(arm, turning) + _times(R, sliding_axes)
+    angular_velocities = _times(R, turning_axes)
+    linear_velocities = _times(arm, turning_axes) + _times(R, sliding_axes)
     joints = jnp.concatenate([angular_velocities, linear_velocities], axis=1)
 
     is_moved = jnp.asarray(moved_by(robot), dtype)
@@ -192,8 +192,8 @@ def spatial_mass_matrix(robot: Robot, p: Bodies, q: Joints) -> JointMatrix:
     # A joint feels the momenta of those that it carries; the matrix is symmetric.
     products = momenta @ motion.joints.T
     lower_triangle = is_moved * products
-    off_diagonal = jnp.asarray(1.0 - np.eye(len(q)), q.dtype)
-    return lower_triangle + (lower_triangle * off_diagonal).T
+    off_diagonal_mask = jnp.asarray(1.0 - np.eye(len(q)), q.dtype)
+    return lower_triangle + (lower_triangle * off_diagonal_mask).T
 
 
 def spatial_regressor(robot: Robot, q: Joints, qd: Joints, qdd: Joints) -> Array:

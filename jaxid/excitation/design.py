@@ -180,7 +180,7 @@ def minimise(
     else:
         outcome = _run_solver(problem, x, solver)
     motion = outcome.candidates.best_motion
-    no_values = np.full(problem.base.size, np.nan)
+    unknown_values = np.full(problem.base.size, np.nan)
     plan = ExcitationPlan(
         base=problem.base,
         trajectory=problem.trajectory(motion),
@@ -191,7 +191,7 @@ def minimise(
         noise=problem.noise,
         samples=problem.samples,
         findings=tuple(problem.findings(motion)),
-        nominal=no_values if nominal is None else np.asarray(nominal),
+        nominal=unknown_values if nominal is None else np.asarray(nominal),
         status=outcome.status,
         history=np.asarray(outcome.history),
     )

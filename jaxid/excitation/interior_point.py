@@ -104,8 +104,8 @@ def begin(grid: Grid, y: ScaledMotions, constraints: int = 0) -> list[Iterate]:
     size = np.shape(y)[1]
     slack = np.zeros(1 if constraints else 0)
     duals = np.zeros(2 * grid.c.size + constraints + len(slack))
-    no_slopes = np.zeros((constraints, size))
-    evaluation = Evaluation(0.0, np.zeros(size), np.zeros(constraints), no_slopes)
+    zero_slopes = np.zeros((constraints, size))
+    evaluation = Evaluation(0.0, np.zeros(size), np.zeros(constraints), zero_slopes)
     curvature = INITIAL_CURVATURE * np.eye(size)
     step = np.zeros(size + len(slack))
     return [
@@ -214,10 +214,10 @@ def _shorter_length(iterate: Iterate, increase: float):
     """Return the length to the minimum of a parabola through the known merits."""
     length = iterate.length
     slope = iterate.slope
-    minimum = -slope * length**2 / (2 * (increase - slope * length))
-    if not math.isfinite(minimum):
+    best_length = -slope * length**2 / (2 * (increase - slope * length))
+    if not math.isfinite(best_length):
         return 0.1 * length
-    return float(np.clip(minimum, 0.1 * length, 0.5 * length))
+    return float(np.clip(best_length, 0.1 * length, 0.5 * length))
 
 
 def _take_step(
@@ -406,10 +406,10 @@ def _damped_bfgs(B: np.ndarray, s: np.ndarray, change: np.ndarray):
     if not expected_change > 1e-16:
         return B
     min_change = DAMPING * expected_change
-    mix = 1.0
+    damping = 1.0
     if actual_change < min_change:
-        mix = (expected_change - min_change) / (expected_change - actual_change)
-    r = mix * change + (1.0 - mix) * Bs
+        damping = (expected_change - min_change) / (expected_change - actual_change)
+    r = damping * change + (1.0 - damping) * Bs
     update = B - np.outer(Bs, Bs / expected_change) + np.outer(r, r / (s @ r))
     return update if np.isfinite(update).all() else B
 

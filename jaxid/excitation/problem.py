@@ -104,8 +104,8 @@ class ExcitationProblem:
         self.linearisations = [c.linearisation(self.robot) for c in self.constraints]
         self.samples = samples
         self.noise = assumed_noise(robot) if noise is None else np.asarray(noise, float)
-        no_prior = np.zeros((base.size, base.size))
-        self.prior = no_prior if prior is None else np.asarray(prior)
+        zero_prior = np.zeros((base.size, base.size))
+        self.prior = zero_prior if prior is None else np.asarray(prior)
         if prior is not None and not self.criterion.weighted:
             raise InputError(
                 "`prior` needs a weighted criterion, "

@@ -139,8 +139,8 @@ def _wrench(inertia: Matrix, a: Vector3, w: Vector3, wd: Vector3) -> AnyArray:
     force = mass * a + accelerations @ h
 
     # The diagonal counts by the differences of its entries only.
-    off_diagonal = accelerations * (1.0 - np.eye(3))
-    K = off_diagonal @ second_moments + jnp.outer(a, jnp.asarray(h))
+    off_diagonal_part = accelerations * (1.0 - np.eye(3))
+    K = off_diagonal_part @ second_moments + jnp.outer(a, jnp.asarray(h))
     twice_antisymmetric = K - K.T
     squares = w * w
     # For each axis, the two axes that follow it.

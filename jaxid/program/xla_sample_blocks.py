@@ -37,8 +37,8 @@ def block_results(program: Program, *arrays: Array) -> Results:
 
     def evaluate(arrays):
         # All samples are transposed together, behind a fence of their own.
-        transposed = [x.T for x in arrays if x.ndim == 2]
-        matrix = jnp.concatenate(transposed)
+        transposed_arrays = [x.T for x in arrays if x.ndim == 2]
+        matrix = jnp.concatenate(transposed_arrays)
         one = hidden_one(matrix[0, 0])
         rows = iter(fenced(matrix, one))
         columns: list[Any] = list(arrays)
@@ -46,8 +46,8 @@ def block_results(program: Program, *arrays: Array) -> Results:
             if x.ndim == 2:
                 entries = x.shape[1]
                 columns[k] = list(itertools.islice(rows, entries))
-        lowered = lower(program, fence=True)
-        return lowered.run(_repeat(columns, count))
+        lowered_program = lower(program, fence=True)
+        return lowered_program.run(_repeat(columns, count))
 
     def skip(_):
         return tuple(jnp.broadcast_to(reference, count) for _ in program.distinct[0])

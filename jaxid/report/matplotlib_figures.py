@@ -132,26 +132,26 @@ def _name_ordinates(axes: Axes, names: Any) -> None:
 def _draw_curve(axes: Axes, curve: Curve, in_time: bool) -> None:
     x = curve.x
     y = curve.y
-    look: dict[str, Any] = {"color": curve.colour, "label": curve.name or "_"}
+    style: dict[str, Any] = {"color": curve.colour, "label": curve.name or "_"}
     match curve.kind:
         case "band":
-            axes.fill_between(x, curve.low, curve.high, alpha=0.3, lw=0, **look)
+            axes.fill_between(x, curve.low, curve.high, alpha=0.3, lw=0, **style)
         case "bars":
-            bars = axes.bar(x, y, curve.width, **look)
+            bars = axes.bar(x, y, curve.width, **style)
             axes.bar_label(
                 bars, curve.texts, label_type="center", fontsize=SMALL_SIZE, color=INK
             )
         case "intervals":
             axes.hlines(y, curve.low, curve.high, color=curve.colour, lw=1.4)
-            axes.scatter(x, y, s=16, zorder=3, **look)
+            axes.scatter(x, y, s=16, zorder=3, **style)
         case "points":
-            axes.scatter(x, y, s=16, zorder=3, **look)
+            axes.scatter(x, y, s=16, zorder=3, **style)
         case "line":
             if in_time:
                 x, y = decimate(x, y)
             dashes = "--" if curve.dashed else "-"
             marker = "o" if curve.marker else ""
-            axes.plot(x, y, lw=curve.width, ls=dashes, marker=marker, ms=2.6, **look)
+            axes.plot(x, y, lw=curve.width, ls=dashes, marker=marker, ms=2.6, **style)
 
 
 def _draw_scene(figure: Figure, scene: Scene) -> None:

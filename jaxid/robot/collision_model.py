@@ -153,12 +153,12 @@ class CollisionModel(Hashable):
         places = [np.resize(group, size) for group in self.groups]
         gaps_of_groups = gaps[:, np.array(places)]
         # The derivative is that of one pair, also where several are equally near.
-        minimum = jnp.argmin(
+        nearest_pairs = jnp.argmin(
             jax.lax.stop_gradient(gaps_of_groups),
             axis=-1,
             keepdims=True,
         )
-        clearances = jnp.take_along_axis(gaps_of_groups, minimum, axis=-1)
+        clearances = jnp.take_along_axis(gaps_of_groups, nearest_pairs, axis=-1)
         return clearances.reshape(*batch, len(self.groups))
 
     @eqx.filter_jit

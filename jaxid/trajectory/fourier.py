@@ -221,7 +221,7 @@ def random_fourier_series(
     # The range that is left is used at random.
     max_shift = np.maximum(half_range - scale * swing, 0.0)
     shift = random.uniform(-1.0, 1.0, robot.joints) * max_shift
-    middle = 0.5 * (low + high)
+    middle_position = 0.5 * (low + high)
     x *= scale[:, None]
-    x[:, 0] = middle - scale * centre + shift
+    x[:, 0] = middle_position - scale * centre + shift
     return basis.trajectory(x)
