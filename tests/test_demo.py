@@ -21,7 +21,7 @@ def found():
 
 
 def test_numbers_are_golden(found):
-    fit = found.weighted.fit
+    fit = found.weighted_model.fit
     # A servo on quantised encoders with stiction amplifies rounding: a coefficient of
     # the motion changed by 4e-16 moves these parameters by 1e-4 (relative to the
     # largest of their kind).
@@ -32,7 +32,7 @@ def test_numbers_are_golden(found):
                 zip(fit.base.names, map(float, fit.parameters), strict=True)
             ),
             "deviations": list(map(float, fit.standard_deviations)),
-            "errors": [found.weighted.mean_errors(k) for k in (0, 1)],
+            "errors": [found.weighted_model.mean_errors(k) for k in (0, 1)],
         },
         max(TOLERANCE, 2e-3),
     )
@@ -49,18 +49,19 @@ def test_weights_help_the_wrist_and_consistent_bodies_have_a_definite_mass_matri
 ):
     for recording in (0, 1):
         plain, weighted = (
-            x.mean_errors(recording) for x in (found.unweighted, found.weighted)
+            x.mean_errors(recording)
+            for x in (found.unweighted_model, found.weighted_model)
         )
         assert weighted[6] < 0.5 * plain[6]
         assert max(weighted) < 0.5 * max(plain)
-        assert max(found.consistent.mean_errors(recording)) < 1.2 * max(weighted)
-    assert found.consistent.validation.definiteness.positive_definite
+        assert max(found.consistent_model.mean_errors(recording)) < 1.2 * max(weighted)
+    assert found.consistent_model.validation.definiteness.positive_definite
 
 
 def test_friction_falls_with_temperature_and_masses_stay(found):
     cold, warm = (
-        np.asarray(found.weighted.fit.parameters),
-        np.asarray(found.warm.parameters),
+        np.asarray(found.weighted_model.fit.parameters),
+        np.asarray(found.warm_fit.parameters),
     )
     for k in (26, 27, 33, 34):
         assert warm[k] < 0.95 * cold[k]
@@ -80,7 +81,7 @@ def test_tables_and_files_say_the_same(found, tmp_path):
     record = json.loads((tmp_path / "demo" / "demo.json").read_text())
     assert record["base_parameters"] == 44
     weighted = record["estimates"]["weighted"]
-    assert weighted["mean_percent_verification"] == found.weighted.mean_errors(1)
+    assert weighted["mean_percent_verification"] == found.weighted_model.mean_errors(1)
     said = "\n".join(map(str, (*tables(found), *remarks(found))))
     assert "mx2 + 0.05*m3 - mz4" in said
     assert "predicts the torques of every axis" in said

@@ -156,7 +156,7 @@ def _begin_stage(grid: Grid, stage: Stage, iterate: Iterate):
     if not limit_duals.any() or (y != iterate.y).any():
         limit_duals[:] = central_duals
     else:
-        limit_duals[:] = _near_central(limit_duals, central_duals)
+        limit_duals[:] = _clip_to_central_path(limit_duals, central_duals)
     return iterate._replace(
         y=y,
         duals=duals,
@@ -240,7 +240,7 @@ def _take_step(
     barrier_factor = BARRIER_FACTOR if iterate.length > MIN_GOOD_LENGTH else 1.0
     barrier = max(stage.min_barrier, iterate.barrier * barrier_factor)
     duals = iterate.duals + iterate.dual_length * iterate.dual_step
-    duals = _near_central(duals, barrier / room)
+    duals = _clip_to_central_path(duals, barrier / room)
 
     # Curvature is that of the Lagrangian: of the value and of constraints that bend.
     constraint_duals = _split(duals, evaluation).constraints
@@ -269,7 +269,7 @@ def _with_step(
     """Return one start with the step to the barrier's minimum and its length."""
     stiffness = iterate.duals / room
     central_duals = iterate.barrier / room
-    descent = _downhill(grid, stage, iterate, central_duals)
+    descent = _descent(grid, stage, iterate, central_duals)
     step = _solve(_barrier_hessian(grid, iterate, stiffness), descent)
     change = _change_of_inequalities(grid, iterate, step)
     dual_step = central_duals - iterate.duals + stiffness * change
@@ -318,15 +318,15 @@ def _add_limits(H: np.ndarray, grid: Grid, stiffness: np.ndarray):
         H[place, place] += block
 
 
-def _downhill(
+def _descent(
     grid: Grid,
     stage: Stage,
     iterate: Iterate,
-    central: Inequalities,
+    central_duals: Inequalities,
 ):
     """Return the negative gradient of the objective with its barrier."""
     evaluation = iterate.evaluation
-    parts = _split(central, evaluation)
+    parts = _split(central_duals, evaluation)
     upper_parts, lower_parts = parts.limits.reshape(2, *grid.c.shape)
     differences = upper_parts - lower_parts
     limit_gradient = np.einsum("jrk,jr->jk", grid.R, differences).reshape(-1)
@@ -388,9 +388,9 @@ def _split(numbers: Inequalities, evaluation: Evaluation):
     return Parts(numbers[:limits], numbers[limits:slack], numbers[slack:])
 
 
-def _near_central(duals: np.ndarray, central: np.ndarray):
+def _clip_to_central_path(duals: np.ndarray, central_duals: np.ndarray):
     """Return multipliers that are not too far from the central path."""
-    return np.clip(duals, central / CENTRALITY, central * CENTRALITY)
+    return np.clip(duals, central_duals / CENTRALITY, central_duals * CENTRALITY)
 
 
 def _longest_step(change: Inequalities, room: Inequalities):

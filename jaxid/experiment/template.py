@@ -146,7 +146,7 @@ def _table(
     return "\n".join(lines) + "\n"
 
 
-def _key(key: Key, joints: int, value: Any, active: bool) -> Iterator[str]:
+def _key(key: Key, joints: int, value: Any, is_active: bool) -> Iterator[str]:
     """Yield the lines of a key: its value, default or example, and description."""
     # The description as users of the file need it, and the example in it.
     text = re.sub(r"[;,] (?:or )?None(?: if [^;.]*)?", "", key.text)
@@ -157,14 +157,14 @@ def _key(key: Key, joints: int, value: Any, active: bool) -> Iterator[str]:
         text = text.replace(example_match[0], "", 1)
         example = example_match[1]
     has_default = key.default is not inspect.Parameter.empty
-    shows_example = (example and not active) or "=" in example
+    shows_example = (example and not is_active) or "=" in example
     if value is None and has_default and not shows_example:
         value = key.default
     assigned_text = toml_text(value)
     if assigned_text is None:
-        active = False
+        is_active = False
         assigned_text = _example(union_members(key.hint)[0], example, joints)
-    yield from _entry(key.name, assigned_text, text, active)
+    yield from _entry(key.name, assigned_text, text, is_active)
 
 
 def _example(hint: Any, example: str, joints: int) -> str:
@@ -201,9 +201,9 @@ def toml_text(value: Any) -> str | None:
     return None
 
 
-def _entry(name: str, value: str, text: str, active: bool) -> Iterator[str]:
+def _entry(name: str, value: str, text: str, is_active: bool) -> Iterator[str]:
     """Yield the lines of a key; its comment stands behind it, or before a long one."""
-    mark = "" if active else "# "
+    mark = "" if is_active else "# "
     assignment = f"{mark}{name} = {value}"
     if len(assignment) >= COLUMN:
         yield from _comment(f"{text.rstrip('.')}:")

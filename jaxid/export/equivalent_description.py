@@ -141,13 +141,13 @@ def _wrench(inertia: Matrix, a: Vector3, w: Vector3, wd: Vector3) -> AnyArray:
     # The diagonal counts by the differences of its entries only.
     off_diagonal_part = accelerations * (1.0 - np.eye(3))
     K = off_diagonal_part @ second_moments + jnp.outer(a, jnp.asarray(h))
-    twice_antisymmetric = K - K.T
+    antisymmetric_difference = K - K.T
     squares = w * w
     # For each axis, the two axes that follow it.
     second_axes = np.array([1, 2, 0])
     third_axes = np.array([2, 0, 1])
     differences = squares[third_axes] - squares[second_axes]
-    moment = twice_antisymmetric[third_axes, second_axes]
+    moment = antisymmetric_difference[third_axes, second_axes]
     moment = moment + second_moments[second_axes, third_axes] * differences
     return jnp.concatenate([force, moment])
 

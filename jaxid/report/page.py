@@ -53,6 +53,7 @@ def render_page(
 
 
 def _render(block: Any) -> Markup:
+    """Return a block of a page as HTML; a tuple is a row of blocks."""
     macros = _macros()
     match block:
         case Markup():

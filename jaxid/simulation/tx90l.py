@@ -131,8 +131,8 @@ def _friction(robot: Robot):
     max_speeds = np.asarray(robot.limits.velocity)
     # Fractions: cold friction of the axes 3 to 7 over the largest torques (at 1 rad/s),
     # assumed.
-    viscous = np.array([COLD[27], COLD[28], *(0.02 * max_forces[2:])])
-    dry = np.array([COLD[34], COLD[35], *(0.04 * max_forces[2:])])
+    viscous_friction = np.array([COLD[27], COLD[28], *(0.02 * max_forces[2:])])
+    dry_friction = np.array([COLD[34], COLD[35], *(0.04 * max_forces[2:])])
     viscous_factors = _warm_factors(27, 28)
     dry_factors = _warm_factors(34, 35)
     rise = TEMPERATURES[1] - TEMPERATURES[0]
@@ -142,12 +142,12 @@ def _friction(robot: Robot):
     # Assumed.
     speed = np.array([0.45, 0.24, 0.21, 0.24, 0.31, 0.17, 0.21]) * max_speeds
     # The mean size of a sine is 0.9 of its RMS.
-    dry_power = dry * dry_factors * 0.9 * speed
-    power = viscous * viscous_factors * speed**2 + dry_power
+    dry_power = dry_friction * dry_factors * 0.9 * speed
+    power = viscous_friction * viscous_factors * speed**2 + dry_power
     friction = LuGreFriction(
-        viscous=viscous,
-        coulomb=dry,
-        breakaway=1.15 * dry,  # these three are assumed
+        viscous=viscous_friction,
+        coulomb=dry_friction,
+        breakaway=1.15 * dry_friction,  # these three are assumed
         stribeck_speed=np.array([0.01, *(0.03,) * 6]),
         deflection=np.array([2e-4, *(5e-4,) * 6]),
     )

@@ -279,8 +279,8 @@ class VirtualRobot(Hashable):
         temperature = np.asarray(self.temperature)
         temperatures = [temperature]
         for _ in range(steps):
-            viscous, dry = heating.factors(temperature)
-            power = viscous * viscous_power + dry * dry_power
+            viscous_factors, dry_factors = heating.factors(temperature)
+            power = viscous_factors * viscous_power + dry_factors * dry_power
             temperature = heating.warm_up(temperature, power, duration / steps)
             temperatures.append(temperature)
         return np.linspace(0.0, duration, steps + 1), np.array(temperatures)

@@ -161,19 +161,19 @@ class CoupledDrives(AbstractTerm):
     def columns(self, robot, q, qd, qdd):
         """Return inertia and viscous friction off the diagonal, and Coulomb parts."""
         inertia = []
-        viscous = []
-        dry = []
+        viscous_friction = []
+        dry_friction = []
         for i, ratios in self.couplings(robot):
             coupling_ratios = _off_diagonal(ratios)
             inertia.append(coupling_ratios.astype(qdd.dtype) @ qdd)
-            viscous.append(coupling_ratios.astype(qd.dtype) @ qd)
+            viscous_friction.append(coupling_ratios.astype(qd.dtype) @ qd)
             # The width of the transition is that of the motor's own joint: the motor's
             # speed is put in its place.
             r = ratios.astype(qd.dtype)
             speeds = [qd[j] for j in range(len(r))]
             speeds[i] = jnp.dot(r, qd)
-            dry.append(r * self.transition.of_motors(jnp.stack(speeds))[i])
-        return jnp.stack([*inertia, *viscous, *dry], axis=1)
+            dry_friction.append(r * self.transition.of_motors(jnp.stack(speeds))[i])
+        return jnp.stack([*inertia, *viscous_friction, *dry_friction], axis=1)
 
     def lower_bounds(self, robot):
         """Return zeros: inertia and friction of the motors are positive."""
