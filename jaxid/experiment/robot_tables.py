@@ -102,9 +102,10 @@ class RobotSource:
             ur10, ur10e, panda, iiwa14, kr300 or planar_arm.
 
         name: Name of the robot, like `"my robot"`.
-        gravity: Gravity in the frame of the ground [m/s²], like `[0.0, 0.0, -9.81]`.
-        base_rotation: Orientation of the robot on the ground: roll, pitch, yaw [deg],
-            like `[0.0, 0.0, 0.0]`.
+        gravity: Gravity in the frame of the ground [m/s²], that of the robot's file by
+            default, like `[0.0, 0.0, -9.81]`.
+        base_rotation: Orientation of the robot on level ground: roll, pitch, yaw [deg];
+            by default as the robot's file places `base`, like `[0.0, 0.0, 0.0]`.
         base_position: Position of the robot on the ground [m], like `[0.0, 0.0, 0.0]`.
         snap_tolerance: Angle [rad] up to which the robot's axes are taken for parallel
             or perpendicular, like `1e-3` for a file with 1.571 instead of pi/2.
@@ -188,7 +189,7 @@ class RobotSource:
     def build(self, robot_file: RobotFile | None) -> Robot:
         """Return the robot."""
         if robot_file is not None:
-            robot = robot_file.load()
+            robot = robot_file.load(self.gravity)
         else:
             build = getattr(library, cast(str, self.builtin))
             robot = build().mounted(*self.placement.values())

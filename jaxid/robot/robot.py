@@ -267,13 +267,18 @@ class Robot(Summarised, eqx.Module):
         """Return the robot with rounded quarter turns made exact, like 1.5708 for pi/2.
 
         Args:
-            tolerance: Entries of axes and attitudes this close to zero become zero
-                [rad].
+            tolerance: Entries of axes, attitudes and the direction of gravity this
+                close to zero become zero [rad].
 
         Raises:
             InputError: If the tolerance is no small angle.
         """
+        gravity = np.asarray(self.gravity)
+        if gravity.any():
+            length = np.linalg.norm(gravity, axis=-1, keepdims=True)
+            gravity = length * snapped(gravity / length, tolerance)
         return self.replace(
+            gravity=gravity,
             axis=snapped(self.axis, tolerance),
             rotation=snapped_rotations(self.rotation, tolerance),
         )

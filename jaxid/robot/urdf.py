@@ -10,7 +10,7 @@ from jaxid.errors import InputError
 
 from .limits_and_drives import Limits, owners, range_fault
 from .robot import Robot
-from .urdf_tree import ORIGIN, TURNING_TYPES, UrdfTree
+from .urdf_tree import ORIGIN, TURNING_TYPES, UrdfTree, link_names
 
 UNLIMITED_RANGE = 2e4
 """Range of a joint that turns without end [rad]."""
@@ -51,8 +51,10 @@ def load_urdf(
             of the most moving joints, then of the most links, then first in the file.
         base: Link or body that stands on the ground; the root if None.
         gravity: Acceleration of gravity in the frame of the ground [m/s²]; 9.81
-            downwards if None, or that of an MJCF file.
-        base_rotation: Attitude of the base link on the ground; upright if None.
+            downwards in the frame of the root if None, or that of an MJCF file.
+        base_rotation: Attitude of the base link on the ground. If None, their frames
+            are parallel, and gravity has the direction that the joints between the root
+            and the base give it.
         base_position: Origin of the base link on the ground [m].
 
     Raises:
@@ -63,6 +65,13 @@ def load_urdf(
     """
     tree = UrdfTree(path, base=base, tip=tip)
     limits, limit_notes = _limits(tree)
+    notes = (*_held_notes(tree), *limit_notes, *_inertial_notes(tree))
+    if gravity is None:
+        # An attitude of the base that the user gives is that on level ground.
+        gravity = tree.gravity
+        if base_rotation is None:
+            gravity = tree.mount.gravity
+            notes = (*_mount_notes(tree, base), *notes)
     tip_body, tip_rotation, tip_offset = tree.carriers[tree.tip]
     try:
         robot = Robot(
@@ -73,13 +82,13 @@ def load_urdf(
             rotation=[placement.rotation for placement in tree.placements],
             offset=[placement.position for placement in tree.placements],
             joint_names=tuple(joint.get("name") for joint in tree.joints),
-            gravity=tree.gravity if gravity is None else gravity,
+            gravity=gravity,
             limits=limits,
             tip_body=tip_body,
             tip_rotation=tip_rotation,
             tip_offset=tip_offset,
             source=tree.path,
-            notes=(*_held_notes(tree), *limit_notes, *_inertial_notes(tree)),
+            notes=notes,
         )
     except InputError as error:
         raise InputError(f"`{path}`: {error}") from error
@@ -184,6 +193,35 @@ def _checked_range(tree: UrdfTree, joint: Any):
     if low >= high:
         raise tree.error(joint, f"ranges from {low:g} to {high:g}: exchange the ends")
     return low, high
+
+
+def _mount_notes(tree: UrdfTree, base: str | None):
+    """Return notes on joints above the base that decide where gravity points in it."""
+    gravity = np.array(tree.gravity, np.float64)
+    mount = tree.mount
+    notes = []
+    # The angle is precise near 0 and 180 degrees, too.
+    sine = np.linalg.norm(np.cross(mount.gravity, gravity))
+    angle = np.rad2deg(np.arctan2(sine, mount.gravity @ gravity))
+    if angle > 1e-4:
+        joints = owners("joint", [joint.get("name") for joint in mount.tilting_joints])
+        if tree.compiled:
+            links = [link_names(joint)[1] for joint in mount.tilting_joints]
+            joints = owners("frame", links)
+        vector = ", ".join(f"{x:.4g}" for x in mount.gravity)
+        notes.append(
+            f"link `{base}` is tilted by {angle:.4g} degrees by {joints} above it: "
+            f"gravity in its frame is [{vector}] m/s²; if it stands otherwise, give "
+            "`gravity` or `base_rotation`."
+        )
+    if mount.moving_joints:
+        joints = owners("joint", [joint.get("name") for joint in mount.moving_joints])
+        notes.append(
+            f"{joints} above `{base}`: gravity is that with the joint held at "
+            "zero, or as near to zero as its range allows; if it stands otherwise, "
+            "give `gravity`."
+        )
+    return notes
 
 
 def _held_notes(tree: UrdfTree):

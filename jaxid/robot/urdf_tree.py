@@ -18,6 +18,8 @@ from .rotations import axis_rotation, rpy_rotation, without_rounding
 
 TURNING_TYPES = ("revolute", "continuous")
 """Types of joints that turn."""
+HOLDABLE_TYPES = (*TURNING_TYPES, "prismatic", "fixed")
+"""Types of joints that can be held at one coordinate."""
 ORIGIN = (0.0, 0.0, 0.0)
 """Position, or roll, pitch and yaw, where a file states none."""
 MAX_ANGLE = 2 * np.pi + 0.01
@@ -38,6 +40,20 @@ class Placement(NamedTuple):
     position: Vector3
 
 
+class Mount(NamedTuple):
+    """Gravity in the frame of a base, and the joints above it that decide on it.
+
+    Attributes:
+        gravity: Acceleration of gravity in the frame of the base [m/s²].
+        tilting_joints: Joints whose frames are turned against gravity.
+        moving_joints: Joints that could turn the base against gravity, but are held.
+    """
+
+    gravity: Vector3
+    tilting_joints: list[Any]
+    moving_joints: list[Any]
+
+
 class UrdfTree:
     """Links and joints of a URDF or MJCF file, merged into bodies.
 
@@ -46,6 +62,8 @@ class UrdfTree:
     element of a simulator does no harm. Arguments and errors are those of `load_urdf`.
 
     Attributes:
+        gravity: Acceleration of gravity in the frame of the file's root [m/s²].
+        mount: How the file places the base in that gravity.
         links: Elements of the links, by name.
         carriers: For each link its placement on the body that carries it.
         joints: Elements of the moving joints.
@@ -96,7 +114,8 @@ class UrdfTree:
         self.side_joints = []
         self.objects = []
         self.carriers: dict[str, Placement] = {}
-        self._merge(root if base is None else base, tip)
+        self.mount = self._mount(self._chain(root, base or root)[::-1])
+        self._merge(base or root, tip)
         self._refuse_loops(loops)
 
     def _named(self, tag: str):
@@ -150,6 +169,26 @@ class UrdfTree:
                 f"{listed(roots) or 'none'}: connect several by fixed joints."
             )
         return roots[0]
+
+    def _mount(self, joints_above: list[Any]):
+        """Return gravity below some joints, of which the first is at the root."""
+        gravity = np.array(self.gravity, np.float64)
+        tilting_joints = []
+        moving_joints = []
+        for joint in joints_above:
+            kind = joint.get("type")
+            # How a robot floats is unknown: the file's attitude is that at rest.
+            pose = self.held_pose if kind in HOLDABLE_TYPES else self._origin
+            rotation, _ = pose(joint)
+            turned_gravity = rotation.T @ gravity
+            if _differ(turned_gravity, gravity):
+                tilting_joints.append(joint)
+            if kind in TURNING_TYPES:
+                quarter_turn = axis_rotation(self._axis(joint), np.pi / 2)
+                if _differ(quarter_turn @ turned_gravity, turned_gravity):
+                    moving_joints.append(joint)
+            gravity = turned_gravity + 0.0  # makes -0.0 positive
+        return Mount(gravity, tilting_joints, moving_joints)
 
     def _merge(self, base: str, tip: str | None):
         """Merge links on fixed joints into the bodies that carry them, depth first."""
@@ -212,12 +251,7 @@ class UrdfTree:
         for link in links:
             for joint in self._below[link]:
                 _, child = link_names(joint)
-                is_readable = joint.get("type") in (
-                    *TURNING_TYPES,
-                    "prismatic",
-                    "fixed",
-                )
-                if is_readable and child not in placements:
+                if joint.get("type") in HOLDABLE_TYPES and child not in placements:
                     placements[child] = _placed(
                         placements[link], *self.held_pose(joint)
                     )
@@ -429,6 +463,11 @@ def _placed(carrier: Placement, rotation: Matrix3, position: Vector3):
     """Return the placement on a body of what is placed on one of its links."""
     body, R, r = carrier
     return Placement(body, without_rounding(R @ rotation), r + R @ position)
+
+
+def _differ(first: Vector3, second: Vector3):
+    """Return whether two directions of gravity differ by more than rounding."""
+    return np.linalg.norm(first - second) > 1e-6 * np.linalg.norm(first)
 
 
 def _words(values: np.ndarray):

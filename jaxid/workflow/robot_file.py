@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxid.arrays import Float
+from jaxid.arrays import Float, Numbers
 from jaxid.errors import InputError
 from jaxid.identification.consistency import consistency_margin
 from jaxid.io import FilePath
@@ -46,9 +46,9 @@ class RobotFile:
             "base_position": self.base_position,
         }
 
-    def load(self) -> Robot:
-        """Load the robot."""
-        return load_urdf(self.path, **self.chain, **self.placement)
+    def load(self, gravity: Numbers | None = None) -> Robot:
+        """Load the robot; gravity in the frame of the ground is the file's if None."""
+        return load_urdf(self.path, gravity=gravity, **self.chain, **self.placement)
 
     def bodies(self) -> Float[np.ndarray, "bodies 10"]:
         """Return the inertial parameters of the bodies.
