@@ -135,6 +135,7 @@ class Columns:
         joints = angles.shape[1]
 
         def numbers(name: str, default: float = 1.0) -> Vector:
+            """Return an attribute's numbers of all joints; units become factors."""
             values = getattr(self, name)
             if isinstance(values, Unit):
                 values = joints * (values,)

@@ -389,6 +389,8 @@ def _compose(
     joint, symbol = np.nonzero(free_mask)
     rows = size + n
     columns = rows + np.arange(len(joint))
+    # From here on variables of the state are their derivatives [samples, joints,
+    # columns]: by the state a sample time before, then by the estimated parameters.
     state = np.tile(np.eye(rows, rows + len(joint)), (count, 1, 1))
     q, w, *integral, last_velocity = np.split(state, 1 + size // n, axis=1)
     middle_state = q, w
@@ -413,6 +415,7 @@ def _compose(
             are_both_moving = is_moving & is_moving.swapaxes(1, 2)
             A += by_w * are_both_moving
             force += by_w @ w + by_q @ middle_state[0] + by_v @ middle_state[1]
+        # Derivatives of the velocities in the stage; friction holds joints at rest.
         change = np.linalg.solve(A, force * is_moving)
         share = SHARES[s]
         for x in integral:

@@ -137,26 +137,22 @@ def identify_rollout(
 
 
 def _split_logs(logs: Sequence[Recording]) -> list[Recording]:
-    """Return logs, the long ones divided.
+    """Return logs, with long ones divided into parts of similar durations.
 
-    There are enough parts for the choice, and none is much longer than the others, to
-    whose length all are padded.
+    The choice needs several parts. All are padded to the longest one, so that none
+    should be much longer than the others.
     """
-    part_duration = max(
-        float(np.median([x.duration for x in logs])), MIN_PARTS * MIN_PART_DURATION
-    )
+    durations = [log.duration for log in logs]
+    part_duration = max(float(np.median(durations)), MIN_PARTS * MIN_PART_DURATION)
+    min_count = -(-MIN_PARTS // len(logs))
     part_logs = []
     for log in logs:
-        desired_count = max(
-            -(-MIN_PARTS // len(logs)), round(log.duration / part_duration)
-        )
-        part_count = max(1, min(desired_count, int(log.duration // MIN_PART_DURATION)))
-        part_ends = np.linspace(
-            float(log.time[0]), float(log.time[-1]) + log.sample_time, part_count + 1
-        )
-        part_logs += [
-            log.crop(float(a), float(b)) for a, b in itertools.pairwise(part_ends)
-        ]
+        desired_count = max(min_count, round(log.duration / part_duration))
+        max_count = int(log.duration // MIN_PART_DURATION)
+        part_count = max(1, min(desired_count, max_count))
+        end_time = log.time[-1] + log.sample_time
+        part_ends = np.linspace(log.time[0], end_time, part_count + 1).tolist()
+        part_logs += [log.crop(a, b) for a, b in itertools.pairwise(part_ends)]
     return part_logs
 
 

@@ -208,16 +208,16 @@ class TorqueRolloutFit(Summarised):
         with double_precision():
             errors = jax.jit(self.rollout.errors)(jnp.asarray(self.unknowns), windows)
         start = windows.q[None]
-        gap = np.full((1, *windows.q.shape), np.nan)
+        gap = np.full(start.shape, np.nan)
         measured_positions = np.concatenate(
             [start, windows.measured, windows.measured[-1:]]
         )
         simulated_positions = np.concatenate(
             [start, windows.measured + np.asarray(errors), gap]
         )
-        steps = np.minimum(
-            np.arange(len(measured_positions)), len(measured_positions) - 2
-        )
+        # The gap has the time of the last sample.
+        count = len(measured_positions)
+        steps = np.minimum(np.arange(count), count - 2)
         time = log.time[windows.starts + steps[:, None]].T.ravel()
         measured_positions, simulated_positions = (
             x.transpose(2, 0, 1).reshape(len(time), -1)

@@ -72,6 +72,7 @@ def _path(theta: Array, motion: ServoMotion, steps: int) -> tuple[Array]:
 def _advance_tangents(h: AnyArray, state: State, coefficients) -> tuple[State, Array]:
     """Advance derivatives of the state by a sample time; return those of positions."""
     q, w, integral = state
+    # Only servos with integral actions have further terms.
     for (
         by_q,
         by_w,
