@@ -223,8 +223,7 @@ def _active_bounds(
     # Lower bounds of all drives come first, then upper ones.
     drive_flags = is_tight[end:].reshape(2, program.drives)
     drive_names = [base.model.parameter_names[k] for k in feasible.drives]
-    limits = ("0", "their largest value")
-    for limit, is_active in zip(limits, drive_flags, strict=True):
+    for limit, is_active in zip(("0", "their largest value"), drive_flags, strict=True):
         if is_active.any():
             active_names = [drive_names[k] for k in np.flatnonzero(is_active)]
             sentences.append(f"{', '.join(active_names)} at {limit}")
