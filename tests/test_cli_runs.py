@@ -143,6 +143,18 @@ def test_a_payload_is_found_and_can_be_subtracted(shop, run):  # noqa: F811
     assert not any("rigid bodies" in line for line in changed)
 
 
+def test_a_tool_that_was_taken_off_ends_with_a_code_and_no_table(shop, run):  # noqa: F811
+    code, out, err = run(
+        "payload", "experiment.toml", "loaded.csv", "--loaded", "empty.csv"
+    )
+    assert (code, err) == (3, "")
+    assert "lighter by 3.0 kg" in out
+    assert "are the logs exchanged" in " ".join(out.split())
+    assert "[robot.tool]" not in out
+    found = json.loads((shop / "payload" / "payload.json").read_text(encoding="utf-8"))
+    assert abs(found["mass"] / -3.0 - 1.0) < 0.01
+
+
 def test_true_forces_are_found_and_can_be_used(shop, run):  # noqa: F811
     logs = ("empty_nominal.csv", "--loaded", "loaded_nominal.csv")
     code, out, err = run("gains", "load.toml", *logs)
@@ -235,7 +247,7 @@ def test_what_does_not_go_together(folder, first, run, table, command, said):  #
 
 def test_what_is_not_seen_or_not_used_is_said(folder, words):  # noqa: F811
     (folder / "huber.toml").write_text(EXPERIMENT + '[estimator]\nkind = "huber"\n')
-    said = words("payload", "huber.toml", "a.csv", "--loaded", "b.csv")
+    said = words("payload", "huber.toml", "a.csv", "--loaded", "b.csv", ends=3)
     assert "all runs are weighted least squares here" in said
     assert "do not determine all ten parameters" in said
 

@@ -18,9 +18,6 @@ from jaxid.result_table import Remark, Status, versions
 
 from . import options, payload_gains_states_rollout, report_commands, terminal
 
-UNUSABLE_CODE = 3
-"""Exit code for a verdict against the use of a model, or recording of a motion."""
-
 app = typer.Typer(
     name="jaxid",
     help="Identifies the dynamic parameters of robots: from a log to a model.",
@@ -176,7 +173,7 @@ def excite(
     terminal.show_remarks(console, [*remarks, verdict])
     terminal.show_files(console, output.parent, files)
     if verdict.status is Status.BAD:
-        raise typer.Exit(UNUSABLE_CODE)
+        raise typer.Exit(options.UNUSABLE_CODE)
 
 
 @app.command()
@@ -261,7 +258,7 @@ def identify(
     terminal.show(console, *report.tables())
     terminal.show_files(console, output, files)
     if report.verdict.status is Status.BAD:
-        raise typer.Exit(UNUSABLE_CODE)
+        raise typer.Exit(options.UNUSABLE_CODE)
 
 
 @app.command()

@@ -12,6 +12,9 @@ from jaxid.errors import InputError
 
 from .terminal import open_console
 
+UNUSABLE_CODE = 3
+"""Exit code for a verdict against the use of a result, or recording of a motion."""
+
 ExperimentFile = Annotated[
     Path, typer.Argument(help="The experiment file.", metavar="EXPERIMENT.TOML")
 ]

@@ -11,7 +11,7 @@ from rich.console import Console
 
 import jaxid as jid
 from jaxid.errors import InputError
-from jaxid.result_table import significant
+from jaxid.result_table import Status, significant
 
 from . import options, terminal
 
@@ -129,15 +129,21 @@ def states(
 def show_runs(
     console: Console, report: "RunsReport", output: Path, lines: Sequence[str] = ()
 ) -> None:
-    """Write and print the result of several runs, and lines for the experiment file."""
+    """Write and print the result of several runs, and lines for the experiment file.
+
+    Of a result that cannot be used there are no such lines.
+    """
     files = report.save(output)
     table, *details = report.tables()
     terminal.show(console, table)
     terminal.show_remarks(console, report.remarks)
     terminal.show(console, *details)
-    if lines:
+    is_usable = report.status is not Status.BAD
+    if lines and is_usable:
         terminal.show_text(console, "\n".join(["", *lines]))
     terminal.show_files(console, output, files)
+    if not is_usable:
+        raise typer.Exit(options.UNUSABLE_CODE)
 
 
 def rollout(

@@ -15,11 +15,11 @@ from scipy import optimize
 from jaxid.arrays import AnyArray, Float, Joints, Texts
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
-from jaxid.result_table import Summarised, Table
+from jaxid.result_table import Remark, Status, Summarised, Table, percent
 from jaxid.robot.robot import Robot, Tool
 
 from .combination import as_least_squares, combine, require_same_base
-from .estimators.regularisation_and_weights import MIN_SINGULAR_VALUE, Decomposition
+from .estimators.regularisation_and_weights import Decomposition
 from .factors import Factors
 from .fit_result import Fit, interval_table
 from .operating_states import state_maps, varying_parameters
@@ -29,6 +29,12 @@ from .uncertainty.blocks import block_covariance
 
 MAX_GAIN = 100.0
 """Ratio of a true to an assumed force beyond which something else is wrong."""
+MAX_DEVIATION = 0.25
+"""Relative standard deviation of a gain beyond which the logs do not tell it."""
+MAX_MISFIT_RATIO = 1.1
+"""Residual of a known load, relative to that of any load, that chance explains."""
+MIN_MISFIT = 1e-3
+"""Share of the forces below which a load fits in any case."""
 TOLERANCE = 1e-14
 """Of the search: as far as rounding allows, since logs may be noiseless."""
 
@@ -37,16 +43,44 @@ class DriveGains(Summarised, eqx.Module):
     """True forces relative to those of nominal gains, joint by joint.
 
     Attributes:
-        gains: Factors by which the measured forces of each joint must be multiplied.
-        uncertainty: Uncertainty of the gains.
+        gains: Factors by which the measured forces of each joint must be multiplied: 1
+            where the logs do not tell it.
+        uncertainty: Uncertainty of the gains: infinite where the logs do not tell it.
         parameters: Base parameters of the unloaded robot, from true forces.
+        misfits: Share of the forces that the load leaves unexplained, and share that
+            the best load of its mass on its body does.
         joint_names: Names of the joints.
     """
 
     gains: Joints
     uncertainty: Uncertainty
     parameters: Float[AnyArray, " base"]
+    misfits: tuple[float, float]
     joint_names: Texts = eqx.field(static=True)
+
+    @property
+    def remarks(self) -> list[Remark]:
+        """Doubts about the load, and joints whose gains it does not tell."""
+        texts = []
+        misfit, min_misfit = self.misfits
+        if misfit > max(MIN_MISFIT, MAX_MISFIT_RATIO * min_misfit):
+            texts.append(
+                f"the load does not fit: it leaves {percent(misfit)} of the forces "
+                f"unexplained, another one of its mass only {percent(min_misfit)}. "
+                "Give its centre of mass in the frame of the body that carries it"
+            )
+        variances = np.diag(self.uncertainty.covariance)
+        names = [
+            f"`{name}`"
+            for name, variance in zip(self.joint_names, variances, strict=True)
+            if np.isinf(variance)
+        ]
+        if names:
+            texts.append(
+                f"these logs do not tell the gain of {', '.join(names)}, which stays 1:"
+                " take a heavier load, or move faster and in more poses"
+            )
+        return [Remark(text, Status.DOUBTFUL) for text in texts]
 
     def summary(self) -> Table:
         """Return a table of the gains with their 95 % intervals."""
@@ -56,6 +90,7 @@ class DriveGains(Summarised, eqx.Module):
             ("1",) * len(self.joint_names),
             self.gains,
             self.uncertainty,
+            self.remarks,
         )
 
 
@@ -81,7 +116,7 @@ def identify_drive_gains(
 
     Raises:
         InputError: If the runs have different base parameters, motors turn more than
-            one axis, the robot has a known tool, or the load tells nothing about some
+            one axis, the robot has a known tool, or the load tells nothing about any
             gain.
     """
     require_same_base((unloaded, loaded))
@@ -89,20 +124,59 @@ def identify_drive_gains(
     _require_gains(robot)
     fits = (as_least_squares(unloaded), as_least_squares(loaded))
     maps, offsets = _parameter_maps(unloaded.base, load)
+    rows, unknowns = _solve(fits, maps, offsets)
+    misfit = min_misfit = _misfit(rows, unknowns)
+    if isinstance(load, Tool):
+        maps_of_mass = _maps_of_mass(unloaded.base, load.body, load.mass)
+        min_misfit = _misfit(*_solve(fits, *maps_of_mass))
+
+    # The base parameters come first, then the reciprocal gains.
+    size = len(unknowns) - robot.joints
+    reciprocals = unknowns[size:]
+    residuals, jacobian = rows.linearise(unknowns)
+    decomposition = Decomposition.of(jacobian, -residuals)
+    linearised_parts = []
+    for fit, parameter_map, offset in zip(fits, maps, offsets, strict=True):
+        for factors in fit.time_blocks.parts:
+            part = _rows(factors, fit.weights, parameter_map, offset)
+            part_residuals, part_jacobian = part.linearise(unknowns)
+            linearised_parts.append((part_jacobian, part_residuals))
+    covariance, dof = block_covariance(
+        linearised_parts, decomposition.inverse_information()
+    )
+    relative_deviations = np.sqrt(np.diag(covariance)[size:]) / np.abs(reciprocals)
+    is_determined = ~decomposition.unknown[size:] & _are_plausible(reciprocals)
+    is_determined &= relative_deviations < MAX_DEVIATION
+    if not is_determined.any():
+        raise InputError(
+            "the load does not tell any gain: describe its centre of mass and inertia, "
+            "too, take a heavier one, or move every joint faster."
+        )
+    # The gain 1 / c changes by -1 / c² times a small change of c.
+    slopes = np.where(is_determined, -1.0 / reciprocals**2, 0.0)
+    covariance = slopes[:, None] * covariance[size:, size:] * slopes
+    covariance[~is_determined, ~is_determined] = np.inf
+    return DriveGains(
+        gains=np.where(is_determined, 1.0 / reciprocals, 1.0),
+        uncertainty=Uncertainty(covariance, np.full(robot.joints, dof), covariance),
+        parameters=maps[0] @ unknowns[:size],
+        misfits=(misfit, min_misfit),
+        joint_names=robot.joint_names,
+    )
+
+
+def _solve(fits, maps, offsets) -> tuple["Rows", np.ndarray]:
+    """Return the rows of both runs, and their base parameters and reciprocal gains."""
     # With nominal gains the problem is linear, and a good start.
     start_parameters, _ = combine(fits, maps, offsets)
-
     totals = []
-    parts = []
     for fit, parameter_map, offset in zip(fits, maps, offsets, strict=True):
-        blocks = fit.time_blocks
-        totals.append(_rows(blocks.total, fit.weights, parameter_map, offset))
-        for factors in blocks.parts:
-            parts.append(_rows(factors, fit.weights, parameter_map, offset))
+        total = fit.time_blocks.total
+        totals.append(_rows(total, fit.weights, parameter_map, offset))
     rows = _stack(totals)
     solution = optimize.least_squares(
         lambda u: rows.linearise(u)[0],
-        np.append(start_parameters, np.ones(robot.joints)),
+        np.append(start_parameters, np.ones(rows.joints.shape[1])),
         lambda u: rows.linearise(u)[1],  # pyright: ignore[reportArgumentType]
         method="lm",
         x_scale="jac",
@@ -110,27 +184,13 @@ def identify_drive_gains(
         ftol=TOLERANCE,
         gtol=TOLERANCE,
     )
-    # The base parameters come first, then the reciprocal gains.
-    size = len(start_parameters)
-    reciprocals = solution.x[size:]
-    residuals, jacobian = rows.linearise(solution.x)
-    decomposition = Decomposition.of(jacobian, -residuals)
-    _require_determined(decomposition, reciprocals)
+    return rows, solution.x
 
-    linearised_parts = [part.linearise(solution.x) for part in parts]
-    covariance, dof = block_covariance(
-        [(jacobian, residuals) for residuals, jacobian in linearised_parts],
-        decomposition.inverse_information(),
-    )
-    # The gain 1 / c changes by -1 / c² times a small change of c.
-    slopes = -1.0 / reciprocals**2
-    covariance = slopes[:, None] * covariance[size:, size:] * slopes
-    return DriveGains(
-        gains=1.0 / reciprocals,
-        uncertainty=Uncertainty(covariance, np.full(robot.joints, dof), covariance),
-        parameters=maps[0] @ solution.x[:size],
-        joint_names=robot.joint_names,
-    )
+
+def _misfit(rows: "Rows", unknowns: np.ndarray) -> float:
+    """Return the share of the forces that stays unexplained (norms)."""
+    residuals, _ = rows.linearise(unknowns)
+    return float(np.linalg.norm(residuals) / np.linalg.norm(rows.measured_forces))
 
 
 def _require_gains(robot: Robot) -> None:
@@ -146,15 +206,9 @@ def _require_gains(robot: Robot) -> None:
         )
 
 
-def _require_determined(decomposition: Decomposition, reciprocals) -> None:
-    """Check that the runs determine all gains, and that these are plausible."""
-    values = decomposition.values
-    is_determined = values[-1] > MIN_SINGULAR_VALUE * values[0]
-    is_plausible = (reciprocals > 1 / MAX_GAIN) & (reciprocals < MAX_GAIN)
-    if not is_determined or not is_plausible.all():
-        raise InputError(
-            "the load does not tell all gains: take a heavier one, move every joint."
-        )
+def _are_plausible(reciprocals: np.ndarray) -> np.ndarray:
+    """Return which gains are positive, and neither tiny nor huge."""
+    return (reciprocals > 1 / MAX_GAIN) & (reciprocals < MAX_GAIN)
 
 
 class Rows(NamedTuple):
@@ -206,14 +260,20 @@ def _stack(parts: Sequence[Rows]) -> Rows:
 
 def _parameter_maps(base: BaseParameters, load: Tool | float):
     """Return maps and offsets from common unknowns to both runs' base parameters."""
+    if not isinstance(load, Tool):
+        return _maps_of_mass(base, base.model.robot.tip_body, load)
     maps = state_maps(base.size, varying_parameters(base), 2)
-    zero_offset = np.zeros(base.size)
-    if isinstance(load, Tool):
-        return maps, [zero_offset, body_columns(base, load.body) @ load.parameters]
-    # The other nine parameters of the load are unknowns, too.
-    columns = body_columns(base, base.model.robot.tip_body)
+    load_parameters = body_columns(base, load.body) @ load.parameters
+    return maps, [np.zeros(base.size), load_parameters]
+
+
+def _maps_of_mass(base: BaseParameters, body: int, mass: float):
+    """Return maps and offsets for a load of which only the mass is known."""
+    maps = state_maps(base.size, varying_parameters(base), 2)
+    columns = body_columns(base, body)
     mass_column = columns[:, 0]
+    # The other nine parameters of the load are unknowns, too.
     other_columns = columns[:, 1:]
     unloaded_map = np.hstack([maps[0], 0.0 * other_columns])
     loaded_map = np.hstack([maps[1], other_columns])
-    return [unloaded_map, loaded_map], [zero_offset, load * mass_column]
+    return [unloaded_map, loaded_map], [np.zeros(base.size), mass * mass_column]

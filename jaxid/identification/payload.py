@@ -8,7 +8,7 @@ import numpy as np
 from jaxid.arrays import AnyArray, Float, Matrix3, Vector3, double_precision
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
-from jaxid.result_table import Remark, Status, Summarised, Table
+from jaxid.result_table import Remark, Status, Summarised, Table, significant
 from jaxid.robot.inertia import INERTIAL_NAMES, Inertia
 from jaxid.robot.robot import Robot, Tool
 
@@ -42,11 +42,12 @@ class Payload(Summarised, eqx.Module):
         body: Index of the body that carries it (0 is the first).
         parameters: $(m, m r_c, A, B, C, D, E, F)$ about the origin of the body's frame:
             the estimate, or the body nearest to it, in units of its uncertainty, that
-            can exist.
+            can exist. If the robot is lighter with the load, the estimate.
         estimate: Estimate from the forces, whether such a body can exist or not.
         uncertainty: Uncertainty of the estimate.
         distance: From the estimate to the parameters, in standard deviations: below 4
-            nothing unusual; NaN where the runs do not determine all ten.
+            nothing unusual; NaN where the runs do not determine all ten, or where the
+            robot is lighter with the load.
     """
 
     body: int = eqx.field(static=True)
@@ -114,8 +115,22 @@ class Payload(Summarised, eqx.Module):
             [self._remark()],
         )
 
+    @property
+    def is_lighter(self) -> bool:
+        """Whether the robot is lighter with the load than without it."""
+        return bool(_is_negative(self.estimate, self.uncertainty))
+
     def _remark(self) -> Remark:
         """Return whether the payload is a body that could exist."""
+        if self.is_lighter:
+            half_width = float(self.uncertainty.half_widths()[0])
+            return Remark(
+                f"with the load the robot is lighter by {significant(-self.mass, 2)} kg"
+                f" (± {significant(half_width, 2)} kg, 95 %): are the logs exchanged, "
+                "or was a tool taken off? Exchange them, which gives what was taken "
+                "off.",
+                Status.BAD,
+            )
         if not np.isfinite(self.distance):
             return Remark(
                 "the logs do not determine all ten parameters of the payload: move the "
@@ -164,6 +179,9 @@ def identify_payload(
     robot = unloaded.base.model.robot
     body = robot.tip_body if body is None else body
     estimate, uncertainty = _estimate(unloaded, loaded, body)
+    if _is_negative(estimate, uncertainty):
+        # The nearest body that can exist would say nothing about the logs.
+        return Payload(body, estimate, estimate, uncertainty, np.nan)
     if mass is not None:
         estimate, uncertainty = _weigh(estimate, uncertainty, mass)
     if not np.isfinite(uncertainty.covariance).all():
@@ -196,6 +214,12 @@ def _estimate(unloaded: Fit, loaded: Fit, body: int):
     # Parameters about the centre of mass are combinations: the fewest count for all.
     dof = np.full(10, np.min(uncertainty.dof[-10:]))
     return values[-10:], Uncertainty(covariance, dof, covariance)
+
+
+def _is_negative(estimate: np.ndarray, uncertainty: Uncertainty) -> bool:
+    """Return whether the mass is below zero by more than its usual scatter."""
+    deviation = uncertainty.standard_deviations[0]
+    return estimate[0] < -MAX_DISTANCE * deviation
 
 
 def _weigh(estimate: np.ndarray, uncertainty: Uncertainty, mass: float):

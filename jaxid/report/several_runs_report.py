@@ -41,6 +41,13 @@ class RunsReport(Summarised):
         """Doubts, as remarks."""
         return [Remark(text, Status.DOUBTFUL) for text in self.doubts]
 
+    @property
+    def status(self) -> Status:
+        """Whether the result can be used: that of the worst remark on it."""
+        remarks = self.result.summary().remarks
+        is_bad = any(remark.status is Status.BAD for remark in remarks)
+        return Status.BAD if is_bad else Status.NEUTRAL
+
     def tables(self) -> list[Table]:
         """Return all tables of the result."""
         return [self.result.summary(), *self.details]

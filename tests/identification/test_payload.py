@@ -103,11 +103,14 @@ def test_the_mass_of_a_load_is_enough_for_gains(base):
     """Its centre and inertia come out beside; noise only makes the intervals wider."""
     found = jid.identify_drive_gains(*pair(base, gains=GAINS), 3.0)
     np.testing.assert_allclose(found.gains, GAINS, rtol=1e-6)
-    noisy = pair(base, np.array([0.5, 0.5, 0.2]), 1, gains=GAINS)
+    noisy = pair(base, np.array([0.01, 0.01, 0.004]), 1, gains=GAINS)
     found, known = (jid.identify_drive_gains(*noisy, load) for load in (3.0, LOAD))
     deviations = found.uncertainty.standard_deviations
     assert (np.abs(found.gains - GAINS) < 4 * deviations).all()
     assert (deviations > known.uncertainty.standard_deviations).all()
+    noisy = pair(base, np.array([0.5, 0.5, 0.2]), 1, gains=GAINS)
+    with pytest.raises(ValueError, match=r"any gain.*centre of mass and inertia"):
+        jid.identify_drive_gains(*noisy, 3.0)
 
 
 def test_a_known_mass_makes_the_rest_of_a_payload_better_known(base):
@@ -118,6 +121,63 @@ def test_a_known_mass_makes_the_rest_of_a_payload_better_known(base):
     assert (t <= s * (1 + 1e-9)).all()
     assert t[3] < 0.99 * s[3]
     assert (np.abs(weighed.estimate - LOAD.parameters) < 4 * t).all()
+
+
+@pytest.mark.parametrize("mass", [None, 3.0])
+def test_a_load_that_was_taken_off_is_no_payload(base, exact, mass):
+    """Logs that are exchanged look the same, whether the mass is known or not."""
+    unloaded, loaded = exact
+    found = jid.identify_payload(loaded, unloaded, mass=mass)
+    assert found.is_lighter
+    np.testing.assert_allclose(found.estimate, -LOAD.parameters, atol=1e-8)
+    assert "lighter by 3.0 kg" in str(found)
+    assert "are the logs exchanged" in " ".join(str(found).split())
+    with pytest.raises(ValueError, match="mass"):
+        _ = found.tool
+    assert not jid.identify_payload(unloaded, loaded, mass=mass).is_lighter
+
+
+def test_no_load_at_all_is_not_lighter(base):
+    """The mass is zero within its scatter: sometimes below, but by little."""
+    noise = np.array([0.05, 0.05, 0.02])
+    unloaded, _ = pair(base, noise, 1)
+    for seed in range(2, 6):
+        again, _ = pair(base, noise, seed)
+        assert not jid.identify_payload(unloaded, again).is_lighter
+
+
+@pytest.mark.parametrize("joint", [0, 2])
+def test_a_gain_that_the_load_does_not_tell_stays_one(base, joint):
+    """A brake carries the load of a joint: its motor only makes noise."""
+    noise = np.array([0.1, 0.1, 0.04])
+    fits = []
+    for seed, fit_mass in enumerate((0.0, 1.0)):
+        parameters = standard_parameters(base.model)
+        parameters[20:30] += fit_mass * LOAD.parameters
+        o = observations(base.model, parameters, noise=noise, seed=seed)
+        forces = o.forces / GAINS
+        random = np.random.default_rng(seed)
+        forces[:, joint] = random.normal(0.0, noise[joint], len(forces))
+        fits.append(jid.identify(base, o.replace(forces=forces), name=str(seed)))
+    found = jid.identify_drive_gains(*fits, LOAD)
+    others = np.arange(3) != joint
+    assert found.gains[joint] == 1.0
+    assert f"do not tell the gain of `joint{joint + 1}`" in found.remarks[0].text
+    np.testing.assert_allclose(found.gains[others], GAINS[others], rtol=0.02)
+
+
+WRONG_CENTRES = [(0.02, -0.03, 0.02), (0.12, -0.03, 0.02), (0.02, -0.03, -0.12)]
+
+
+@pytest.mark.parametrize("centre", WRONG_CENTRES)
+def test_a_load_in_a_wrong_frame_is_doubted(base, centre):
+    noisy = pair(base, np.array([0.1, 0.1, 0.04]), 3, gains=GAINS)
+    moved = jid.Tool(2, mass=3.0, centre_of_mass=centre, inertia=LOAD.inertia)
+    found = jid.identify_drive_gains(*noisy, moved)
+    assert "the load does not fit" in str(found)
+    cured = jid.identify_drive_gains(*noisy, LOAD)
+    assert cured.remarks == []
+    np.testing.assert_allclose(cured.gains, GAINS, rtol=0.02)
 
 
 def late(base, seconds, **options):
