@@ -45,7 +45,7 @@ MIN_SHARE = 5e-4
 MIN_GAP = 1e3
 """Ratio of the new parts of independent and of dependent columns."""
 MAX_UNEXPLAINED = 1e-9
-"""Fraction of a dependent column that may remain unexplained."""
+"""Fraction of a dependent column that the independent ones may leave unexplained."""
 
 
 class Identifiability(enum.Enum):
@@ -338,8 +338,8 @@ def _doubts(
             f"are {dependence.smallest_independent:.1e} and "
             f"{dependence.largest_dependent:.1e}."
         )
-    if regrouped_columns.unexplained > MAX_UNEXPLAINED:
+    if regrouped_columns.max_residual > MAX_UNEXPLAINED:
         yield (
             "a dependent column is explained only "
-            f"to {regrouped_columns.unexplained:.1e} of its size."
+            f"to {regrouped_columns.max_residual:.1e} of its size."
         )

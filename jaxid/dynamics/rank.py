@@ -133,7 +133,7 @@ class Regrouped(NamedTuple):
     r"""Dependent columns by independent ones: $\hat\Theta_2 = \hat\Theta_1 \kappa$."""
 
     kappa: Float[np.ndarray, "base dependent"]  # factors of the independent columns
-    unexplained: float  # largest fraction of a dependent column that kappa misses
+    max_residual: float  # largest fraction of a dependent column that kappa misses
     # fractions of the independent columns that those before them do not explain
     shares: Float[np.ndarray, " base"]
 

@@ -198,20 +198,20 @@ def motion_figure(errors: RolloutErrors, motion: int) -> Figure:
 def motion_panel(
     name: str,
     time: np.ndarray,
-    measured: np.ndarray,
-    simulated: np.ndarray,
-    counted: np.ndarray,
+    measured_positions: np.ndarray,
+    simulated_positions: np.ndarray,
+    is_counted: np.ndarray,
 ) -> Panel:
     """Return measured and simulated positions of a joint, and the errors that count."""
-    errors = 1e3 * (simulated - measured)
+    errors = 1e3 * (simulated_positions - measured_positions)
     rms = np.nan
-    if counted.any():
-        rms = float(np.sqrt(np.mean(errors[counted] ** 2)))
+    if is_counted.any():
+        rms = float(np.sqrt(np.mean(errors[is_counted] ** 2)))
     error = Curve(time, errors, "error", ERROR, width=0.7)
     return Panel(
         [
-            Curve(time, measured, "measured", MEASUREMENT_COLOUR, width=1.9),
-            Curve(time, simulated, "simulated", PREDICTION_COLOUR, width=0.9),
+            Curve(time, measured_positions, "measured", MEASUREMENT_COLOUR, width=1.9),
+            Curve(time, simulated_positions, "simulated", PREDICTION_COLOUR, width=0.9),
         ],
         title=name,
         value=f"RMS {significant(rms)} mrad or mm",

@@ -49,24 +49,25 @@ class TorqueRolloutReport:
     @property
     def verdict(self) -> Remark:
         """Whether simulations are closer to the robot than those of the torque fit."""
-        torque_fit, rollouts = np.nan_to_num(self.errors, nan=np.inf)
-        is_closer = bool((rollouts < torque_fit).all())
+        torque_fit_errors, rollout_errors = np.nan_to_num(self.errors, nan=np.inf)
+        is_closer = bool((rollout_errors < torque_fit_errors).all())
+        comparison = "closer" if is_closer else "no closer"
+        sizes = f"{in_milli(rollout_errors)} instead of {in_milli(torque_fit_errors)}"
         return Remark(
-            f"Simulations are {'closer' if is_closer else 'no closer'} to the robot "
-            f"than with the fit of torques: errors after {self.fit.horizon:g} s of "
-            f"{in_milli(rollouts)} instead of {in_milli(torque_fit)} mrad or mm",
+            f"Simulations are {comparison} to the robot than with the fit of torques: "
+            f"errors after {self.fit.horizon:g} s of {sizes} mrad or mm",
             Status.GOOD if is_closer else Status.DOUBTFUL,
         )
 
     def error_table(self) -> Table:
         """Return the errors of each joint after a horizon."""
         place = "logs that the fit has not seen" if self.unseen else "logs of the fit"
-        torque_fit, rollouts = 1e3 * self.errors
+        torque_fit_errors, rollout_errors = 1e3 * self.errors
         return Table(
             f"errors after {self.fit.horizon:g} s on {place}",
             Column("joint", self.fit.joint_names),
-            Column("fit of torques", torque_fit, "mrad or mm"),
-            Column("rollouts", rollouts, "mrad or mm"),
+            Column("fit of torques", torque_fit_errors, "mrad or mm"),
+            Column("rollouts", rollout_errors, "mrad or mm"),
         )
 
     def tables(self) -> list[Table]:

@@ -126,7 +126,10 @@ def _bodies(published: dict[int, float]):
 
 
 def _friction(robot: Robot):
-    """Return cold friction and its fall: as of axis 2 where nothing is published."""
+    """Return the friction of cold gears, and how it falls with their temperature.
+
+    Axes whose fall is not published have that of axis 2.
+    """
     max_forces = np.asarray(robot.limits.force)
     max_speeds = np.asarray(robot.limits.velocity)
     # Fractions: cold friction of the axes 3 to 7 over the largest torques (at 1 rad/s),
@@ -159,8 +162,8 @@ def _friction(robot: Robot):
     return friction, heating
 
 
-def _warm_factors(first: int, second: int):
+def _warm_factors(number_1: int, number_2: int):
     """Return warm over cold friction of all axes, by two numbers of base parameters."""
-    factor_1 = WARM[first] / COLD[first]
-    factor_2 = WARM[second] / COLD[second]
+    factor_1 = WARM[number_1] / COLD[number_1]
+    factor_2 = WARM[number_2] / COLD[number_2]
     return np.array([factor_1, *(factor_2,) * 6])
