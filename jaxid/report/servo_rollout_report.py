@@ -184,9 +184,9 @@ def motion_figure(errors: RolloutErrors, motion: int) -> Figure:
         panel = motion_panel(
             name,
             time,
-            measured=np.asarray(errors.measured[motion])[j],
-            simulated=np.asarray(errors.simulated[motion])[j],
-            counted=np.asarray(errors.counted[motion])[j] > 0,
+            measured_positions=np.asarray(errors.measured[motion])[j],
+            simulated_positions=np.asarray(errors.simulated[motion])[j],
+            is_counted=np.asarray(errors.counted[motion])[j] > 0,
         )
         positions = np.asarray(errors.command[motion])[j]
         command = Curve(time, positions, "commanded", GREY, width=0.6)
