@@ -66,7 +66,10 @@ def read_recording(
     stamps = log.stamps() if sample_time is None else None
     complaints = log.bad_rows
     if stamps is not None:
-        complaints |= _stray_stamps(stamps, complaints, log.tables[0])
+        strays = _stray_stamps(stamps, complaints, log.tables[0])
+        # So many stamps out of order are no errors of the logger: they are sorted.
+        if len(strays) <= bad_rows * rows:
+            complaints |= strays
     notes = [note for table in log.tables for note in table.notes]
     good_rows = slice(None)
     if complaints:
@@ -112,18 +115,24 @@ def _bad_row_note(complaints: Complaints, rows: int, max_share: float) -> str:
 def _stray_stamps(
     stamps: Vector, complaints: Complaints, table: LogTable
 ) -> Complaints:
-    """Return complaints about rows whose stamp alone is out of order."""
+    """Return complaints about rows whose stamp is out of order, and fits nowhere."""
     good_rows = np.setdiff1d(np.arange(len(stamps)), [*complaints])
     good_stamps = stamps[good_rows]
+    sorted_stamps = np.sort(good_stamps)
+    step = np.median(np.diff(sorted_stamps))
     strays = {}
     for k in np.flatnonzero(np.diff(good_stamps) < 0).tolist():
         # Without a stamp that is too late, the next one would be in order.
         is_late = k == 0 or good_stamps[k + 1] >= good_stamps[k - 1]
         row = int(good_rows[k if is_late else k + 1])
-        strays[row] = (
-            f"{table.unit} {row + table.first_row} (its time {stamps[row]:.9g} s is "
-            "out of order)"
-        )
+        # A row that fills a gap came late only: it is sorted.
+        position = np.searchsorted(sorted_stamps, stamps[row])
+        steps = np.diff(sorted_stamps[max(position - 1, 0) : position + 2])
+        if not (steps.min() > 0.5 * step and steps.max() < 1.5 * step):
+            strays[row] = (
+                f"{table.unit} {row + table.first_row} (its time {stamps[row]:.9g} s "
+                "is out of order)"
+            )
     return strays
 
 

@@ -44,6 +44,8 @@ class Recording(eqx.Module):
         sample_time: Time between two samples [s].
         name: Name of the log.
         notes: Changes between the file and these samples, as sentences.
+        stamp_deviation: Largest deviation of the time stamps from a uniform grid, in
+            sample times; None if the sample time was given instead.
     """
 
     time: Float[AnyArray, " samples"]
@@ -56,6 +58,7 @@ class Recording(eqx.Module):
     sample_time: float = eqx.field(static=True)
     name: str = eqx.field(static=True, default="recording")
     notes: Texts = eqx.field(static=True, default=())
+    stamp_deviation: float | None = eqx.field(static=True, default=None)
 
     @classmethod
     def of(
@@ -93,8 +96,8 @@ class Recording(eqx.Module):
             first_row: Number of the first row in its file, for messages.
 
         Raises:
-            InputError: If shapes differ, a value is not finite, time runs backwards or
-                does not advance, or there are fewer than ten samples.
+            InputError: If shapes differ, a value is not finite, the clock was set back
+                or stands still, or there are fewer than ten samples.
         """
         if not largest_gap > 1.0:
             raise InputError(
@@ -122,10 +125,12 @@ class Recording(eqx.Module):
             data = {key: None if x is None else resample(x) for key, x in data.items()}
             grid = resample.grid
             times = resample.times
+            deviation = grid.deviation / grid.sample_time
         else:
             dt = positive_time(sample_time or 0.0)
             grid = TimeGrid(dt, {(0, samples): 0.0})
             times = [dt * np.arange(samples)]
+            deviation = None
         return cls(
             time=np.concatenate(times),
             **data,
@@ -135,6 +140,7 @@ class Recording(eqx.Module):
             sample_time=grid.sample_time,
             name=name,
             notes=grid.notes,
+            stamp_deviation=deviation,
         )
 
     @property

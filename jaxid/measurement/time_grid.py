@@ -10,6 +10,8 @@ from scipy.interpolate import CubicSpline
 from jaxid.arrays import Texts, Vector
 from jaxid.errors import InputError
 
+from .time_stamps import burst_length, even_stamps, stamp_order
+
 MAX_JITTER = 0.05
 """Largest deviation of stamps from a uniform grid, in sample times, that is ignored."""
 MIN_STEP = 0.1
@@ -115,7 +117,12 @@ def find_grid(
     are bridged, in sample times and in seconds. Where `in_parts`, the log is too large
     to move or remove rows.
     """
-    statistics = _step_statistics(next(iter(read())), source, limits)
+    first_part = next(iter(read()))
+    if in_parts and burst_length(first_part):
+        raise NeedsMemory(
+            f"rows of `{source}` were received in bursts: give `sample_time`."
+        )
+    statistics = _step_statistics(first_part, source, limits)
     stretches = _find_stretches(read(), source, statistics, first_row, in_parts)
     sample_time = _round_time(stretches.sample_time, stretches.rows)
     segments = stretches.segments
@@ -227,7 +234,7 @@ def _require_forward(stamps: Vector, steps: Vector, row: int, source: str) -> No
     backward_steps = np.flatnonzero(steps < 0)
     if backward_steps.size:
         i = int(backward_steps[0])
-        raise InputError(
+        raise NeedsMemory(
             f"time of `{source}` runs backwards from {stamps[i]:.9g} s to "
             f"{stamps[i + 1]:.9g} s at row {row + i + 1}: sort the log, or split it "
             "where the clock was set back."
@@ -278,9 +285,11 @@ def resampling(
     stamps: Vector, source: str, limits: Pauses, first_row: int
 ) -> Resampling:
     """Find the way of rows onto the uniform grid behind their time stamps [s]."""
-    _require_forward(stamps, np.diff(stamps), first_row, source)
-    rows = _distinct_rows(stamps)
-    distinct_stamps = stamps[rows]
+    order, order_notes = stamp_order(stamps, source, first_row)
+    stamps, burst_notes = even_stamps(stamps[order], source)
+    distinct_rows = _distinct_rows(stamps)
+    rows = order[distinct_rows]
+    distinct_stamps = stamps[distinct_rows]
     grid = find_grid(lambda: [distinct_stamps], source, limits, first_row)
     t = distinct_stamps - stamps[0]
     times = []
@@ -292,7 +301,7 @@ def resampling(
         missing_samples += count - (b - a)
         times.append(start_time + grid.sample_time * np.arange(count))
 
-    notes = [*grid.notes]
+    notes = [*order_notes, *burst_notes, *grid.notes]
     repeated_rows = len(stamps) - len(rows)
     if repeated_rows:
         note = (

@@ -8,6 +8,7 @@ from scipy import ndimage
 from jaxid.arrays import AnyArray
 from jaxid.dynamics.motion import Motion
 from jaxid.measurement.recording import Recording, unlike_derivatives
+from jaxid.measurement.time_grid import MAX_JITTER
 from jaxid.robot.robot import Robot
 
 from .torque_errors import REST_SHARE
@@ -219,7 +220,17 @@ def _velocity_findings(
 
 
 def clock_findings(recording: Recording) -> list[str]:
-    """Look for lost or repeated rows: all joints jump, or stand, for one sample."""
+    """Look for lost or repeated rows: all joints jump, or stand, for one sample.
+
+    Uneven stamps tell lost rows by themselves. If only they are late, the samples that
+    were interpolated at them jump, but no row is lost.
+    """
+    deviation = recording.stamp_deviation
+    if deviation is not None and deviation > MAX_JITTER:
+        return []
+    cure = "name the column of times (`recording.time`), or record again"
+    if deviation is not None:
+        cure = "the stamps do not show it, so record again"
     instants: dict[str, list[float]] = {"lost": [], "repeated": []}
     time = np.asarray(recording.time)
     angles = np.asarray(recording.angles)
@@ -231,7 +242,6 @@ def clock_findings(recording: Recording) -> list[str]:
             is_lost, is_repeated = _lost_and_repeated(steps, rounding)
             instants["lost"] += inner_times[is_lost].tolist()
             instants["repeated"] += inner_times[is_repeated].tolist()
-    cure = "name the column of times (`recording.time`), or record again"
     findings = []
     for problem, times in instants.items():
         if times:

@@ -1,0 +1,119 @@
+"""Repair of time stamps: rows out of order are sorted, bursts of rows made even."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxid.arrays import Texts, Vector
+from jaxid.errors import InputError
+
+
+class BurstLimits(NamedTuple):
+    """Limits that tell bursts of reception from jitter, gaps and short episodes.
+
+    Buffers of USB and networks hand over up to some sixteen rows at once, so that most
+    of the steps are far shorter than their mean; episodes of fewer rows than that could
+    not be filtered.
+    """
+
+    step: float = 0.1  # steps within bursts, in mean steps
+    share: float = 0.4  # smallest fraction of such steps, equal stamps included
+    distinct_share: float = 0.1  # smallest fraction of such steps above zero
+    rows: int = 16  # largest mean number of rows of a burst
+    bursts: int = 10  # smallest number of bursts
+    deviation: float = 0.4  # largest deviation from even times, in burst periods
+
+
+BURSTS = BurstLimits()
+MAX_OVERLAP = 1.5
+"""Rows between two stamps, in those of an even log, up to which time ran only once."""
+MAX_LATE_ROWS = 20
+"""Rows by which a row may come late on its way to the logger."""
+
+
+def stamp_order(
+    stamps: Vector, source: str, first_row: int
+) -> tuple[np.ndarray, Texts]:
+    """Return the rows in the order of their stamps, and a note if that is another one.
+
+    Raises:
+        InputError: If the clock was set back, so that some times are there twice.
+    """
+    order = np.argsort(stamps, kind="stable")
+    ends = np.flatnonzero(np.diff(stamps) < 0)
+    if not ends.size:
+        return order, ()
+    sorted_stamps = stamps[order]
+    steps = np.diff(sorted_stamps)
+    step = float(np.median(steps[steps > 0]))
+    # All rows between two stamps that are in reverse order, and those of an even log.
+    first_position = np.searchsorted(sorted_stamps, stamps[ends + 1], "left")
+    end_position = np.searchsorted(sorted_stamps, stamps[ends], "right")
+    even_rows = (stamps[ends] - stamps[ends + 1]) / step + 1
+    overlaps = (end_position - first_position) / even_rows
+    is_refused = overlaps.max() > MAX_OVERLAP
+    k = int(ends[np.argmax(overlaps if is_refused else even_rows)])
+    place = (
+        f"from {stamps[k]:.9g} s to {stamps[k + 1]:.9g} s at row {k + 1 + first_row}"
+    )
+    if is_refused:
+        raise InputError(
+            f"time of `{source}` runs backwards {place}, and some times are there "
+            "twice: the clock was set back; cut the log there into two files, or give "
+            f"`sample_time` (about {step:.4g} s) if its rows are even."
+        )
+    is_long = even_rows.max() > MAX_LATE_ROWS
+    cause = " (the clock was set back, or parts are exchanged)" if is_long else ""
+    plural = "s" if ends.size > 1 else ""
+    note = (
+        f"time runs backwards at {ends.size} row{plural}, farthest {place}{cause}: the "
+        "rows were sorted by their stamps"
+    )
+    return order, (note,)
+
+
+def burst_length(stamps: Vector) -> float:
+    """Return how many rows a burst of reception has; 0 if there are no bursts."""
+    steps = np.diff(stamps)
+    is_short = steps < BURSTS.step * steps.mean()
+    bursts = np.count_nonzero(~is_short) + 1
+    length = len(stamps) / bursts
+    is_likely = (
+        is_short.mean() >= BURSTS.share
+        and np.mean(is_short & (steps > 0)) >= BURSTS.distinct_share
+        and bursts >= BURSTS.bursts
+        and length <= BURSTS.rows
+    )
+    return length if is_likely else 0.0
+
+
+def even_stamps(stamps: Vector, source: str) -> tuple[Vector, Texts]:
+    """Return even stamps for rows that were received in bursts, and a note.
+
+    Raises:
+        InputError: If the bursts do not come as evenly as their rows.
+    """
+    length = burst_length(stamps)
+    if not length:
+        return stamps, ()
+    steps = np.diff(stamps)
+    # The last row of a burst was measured just before the burst was received.
+    is_last = np.append(steps >= BURSTS.step * steps.mean(), True)
+    rows = np.flatnonzero(is_last)
+    times = stamps[rows]
+    sample_time, start = np.polyfit(rows, times - times[0], 1)
+    deviation = np.abs(start + sample_time * rows - (times - times[0])).max()
+    period = length * sample_time
+    text = f"rows were received in bursts of about {length:.3g}, every {period:.4g} s"
+    if deviation > BURSTS.deviation * period:
+        raise InputError(
+            f"{text}, but not evenly, so that the stamps of `{source}` do not tell "
+            "when they were measured: give `sample_time` instead of the stamps, here "
+            f"about {sample_time:.4g} s."
+        )
+    sample_time = float(f"{sample_time:.4g}")
+    note = (
+        f"{text}: they got even stamps, {sample_time:.4g} s apart; give `sample_time` "
+        "if you know a better one"
+    )
+    return stamps[0] + sample_time * np.arange(len(stamps)), (note,)

@@ -1,0 +1,92 @@
+"""Stamps out of order and bursts of reception: even logs come back, notes say why."""
+
+import numpy as np
+import polars as pl
+import pytest
+
+from jaxid.errors import InputError
+from jaxid.measurement.columns import Columns
+from jaxid.measurement.reading import read_recording
+from jaxid.measurement.recording import Recording
+
+STEP = 0.01
+TIMES = STEP * np.arange(600)
+
+
+def recording(rows, stamps, **kwargs):
+    """Return a log of smooth joints whose rows were measured at other times."""
+    t = TIMES[rows]
+    x = np.stack([np.sin(3 * t), np.cos(2 * t)], axis=1)
+    return Recording.of(x, 2 * x, time=stamps, **kwargs)
+
+
+def check(r, samples=600):
+    assert r.samples == samples
+    assert r.sample_time == pytest.approx(STEP, rel=1e-3)
+    np.testing.assert_allclose(r.angles[:, 0], np.sin(3 * TIMES[:samples]), atol=1e-9)
+
+
+@pytest.mark.parametrize("exchange", ["neighbours", "late by three", "blocks"])
+def test_rows_out_of_order_are_sorted(tmp_path, exchange):
+    rows = np.arange(600)
+    if exchange == "neighbours":
+        rows[100::50], rows[101::50] = rows[101::50].copy(), rows[100::50].copy()
+    elif exchange == "late by three":
+        rows[200:204] = [201, 202, 203, 200]
+    else:
+        rows = np.roll(rows, 250)
+    r = recording(rows, TIMES[rows])
+    check(r)
+    assert "sorted by their stamps" in r.notes[0]
+    assert ("set back" in r.notes[0]) == (exchange == "blocks")
+    path = tmp_path / "log.csv"
+    x = np.sin(3 * TIMES[rows])
+    pl.DataFrame({"t": TIMES[rows], "q1": x, "tau1": x}).write_csv(path)
+    read = read_recording(path, Columns("q{}", "tau{}", time="t"))
+    check(read)
+    assert "sorted by their stamps" in read.notes[0]
+
+
+@pytest.mark.parametrize("shift", [0.2, 1.004])
+def test_a_clock_that_was_set_back_is_refused(shift):
+    stamps = TIMES.copy()
+    stamps[300:] -= shift
+    with pytest.raises(InputError, match=r"row 301.* set back; .*`sample_time`"):
+        recording(np.arange(600), stamps)
+
+
+def bursts(lengths, delay=1e-4):
+    """Return stamps of reception of bursts with these numbers of rows."""
+    ends = np.cumsum(lengths)
+    numbers = np.repeat(np.arange(len(ends)), lengths)
+    starts = np.repeat(ends - lengths, lengths)
+    return STEP * ends[numbers] + delay * (np.arange(ends[-1]) - starts)
+
+
+@pytest.mark.parametrize("length", [2, 4, 15])
+def test_bursts_of_reception_become_even(length):
+    r = recording(np.arange(600), bursts(np.full(600 // length, length)))
+    check(r)
+    assert f"bursts of about {length}" in r.notes[0]
+    assert "`sample_time`" in r.notes[0]
+
+
+def test_bursts_of_several_lengths_become_even():
+    lengths = np.tile([3, 5, 4, 4], 37)
+    r = recording(np.arange(592), bursts(lengths))
+    check(r, 592)
+
+
+def test_uneven_bursts_ask_for_the_sample_time():
+    stamps = bursts(np.full(150, 4))
+    stamps[300:] += 0.2
+    with pytest.raises(InputError, match="bursts of about 4.*give `sample_time`"):
+        recording(np.arange(600), stamps)
+
+
+@pytest.mark.parametrize("rows", [20, 30])
+def test_short_episodes_are_no_bursts(rows):
+    episodes = 600 // rows
+    stamps = TIMES + np.repeat(5.0 * np.arange(episodes), rows)
+    r = recording(np.arange(600), stamps)
+    assert len(r.segments) == episodes
