@@ -20,11 +20,14 @@ from .observations import Observations, Progress, prepare
 from .recording import Recording, consecutive
 from .samples import AbstractSamples, joined, joint_side
 from .time_grid import NeedsMemory, Range, Ranges, TimeGrid, find_grid
+from .time_stamps import MAX_LATE_ROWS
 
 PART_SIZE = 65536
 """Samples that are read at once."""
 MAX_BAD_ROWS = 1e-3
 """Fraction of the rows of a log that may be bad."""
+MAX_STRAY_STAMPS = 1e-2
+"""Fraction of the rows whose stamps are wrong, and not only out of order."""
 MAX_NAMED_ROWS = 20
 """Bad rows that are named."""
 
@@ -67,8 +70,8 @@ def read_recording(
     complaints = log.bad_rows
     if stamps is not None:
         strays = _stray_stamps(stamps, complaints, log.tables[0])
-        # So many stamps out of order are no errors of the logger: they are sorted.
-        if len(strays) <= bad_rows * rows:
+        # So many rows out of order are no wrong stamps: they are sorted.
+        if len(strays) <= MAX_STRAY_STAMPS * rows:
             complaints |= strays
     notes = [note for table in log.tables for note in table.notes]
     good_rows = slice(None)
@@ -127,8 +130,10 @@ def _stray_stamps(
         row = int(good_rows[k if is_late else k + 1])
         # A row that fills a gap came late only: it is sorted.
         position = np.searchsorted(sorted_stamps, stamps[row])
-        steps = np.diff(sorted_stamps[max(position - 1, 0) : position + 2])
-        if not (steps.min() > 0.5 * step and steps.max() < 1.5 * step):
+        steps = np.diff(sorted_stamps[max(position - 1, 0) : position + 2]) / step
+        is_filling = 0.5 < steps.min() and steps.max() < 1.5
+        late_rows = abs(position - np.searchsorted(good_rows, row))
+        if not is_filling or late_rows > MAX_LATE_ROWS:
             strays[row] = (
                 f"{table.unit} {row + table.first_row} (its time {stamps[row]:.9g} s "
                 "is out of order)"

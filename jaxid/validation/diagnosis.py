@@ -315,16 +315,18 @@ def _excerpt(log: Observations, source: SamplesOnDisk) -> Recording:
                 parts.append(source.read_rows(slice(a, b)))
                 times.append(time + dt * (np.arange(a, b) - begin))
     angles, velocities, forces = zip(*parts, strict=True)
+    columns = source.log.columns
     return Recording(
         time=np.concatenate(times),
         angles=np.concatenate(angles),
         forces=np.concatenate(forces),
         velocities=None if velocities[0] is None else np.concatenate(velocities),
-        angles_on_motor_side=source.log.columns.angles_on_motor_side,
-        forces_on_motor_side=source.log.columns.forces_on_motor_side,
+        angles_on_motor_side=columns.angles_on_motor_side,
+        forces_on_motor_side=columns.forces_on_motor_side,
         segments=consecutive(map(len, times)),
         sample_time=dt,
         name=log.name,
+        stamp_deviation=0.0 if columns.sample_time is None else None,
     )
 
 

@@ -145,6 +145,20 @@ def test_lost_and_repeated_rows_are_named_and_nothing_else(count):
         assert said.startswith("rows seem to be repeated at 1 instant, first at 3.5 s")
 
 
+def test_stamps_that_are_late_lose_no_rows():
+    """A robot that samples evenly, and stamps late by up to a step now and then."""
+    late = np.zeros(len(T))
+    late[100::150] = 0.8 * DT
+    log = Recording.of(Q, TAU, time=T + late)
+    assert "give `sample_time`" in log.notes[-1]
+    assert clock_findings(log) == []
+    (said,) = clock_findings(
+        Recording.of(np.delete(Q, 700, axis=0), TAU[1:], time=T[1:])
+    )
+    assert "lost at 1 instant" in said
+    assert "name the column" not in said
+
+
 def test_slow_motion_in_increments_of_an_encoder_loses_no_rows():
     """Steps of one increment, at times of two: second differences are only rounding."""
     increments = np.round(1.03 * np.arange(len(Q)))
