@@ -127,6 +127,10 @@ def _stray_stamps(
     for k in np.flatnonzero(np.diff(good_stamps) < 0).tolist():
         # Without a stamp that is too late, the next one would be in order.
         is_late = k == 0 or good_stamps[k + 1] >= good_stamps[k - 1]
+        # Without one that is too early, the next one would be.
+        is_early = (good_stamps[k + 2 : k + 3] >= good_stamps[k]).all()
+        if not is_late and not is_early:
+            continue
         row = int(good_rows[k if is_late else k + 1])
         # A row that fills a gap came late only: it is sorted.
         position = np.searchsorted(sorted_stamps, stamps[row])
