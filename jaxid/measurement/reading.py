@@ -122,7 +122,8 @@ def _stray_stamps(
     good_rows = np.setdiff1d(np.arange(len(stamps)), [*complaints])
     good_stamps = stamps[good_rows]
     sorted_stamps = np.sort(good_stamps)
-    step = np.median(np.diff(sorted_stamps))
+    steps = np.diff(sorted_stamps)
+    step = np.median(steps[steps > 0]) if steps.any() else 1.0
     strays = {}
     for k in np.flatnonzero(np.diff(good_stamps) < 0).tolist():
         # Without a stamp that is too late, the next one would be in order.
@@ -134,8 +135,9 @@ def _stray_stamps(
         row = int(good_rows[k if is_late else k + 1])
         # A row that fills a gap came late only: it is sorted.
         position = np.searchsorted(sorted_stamps, stamps[row])
-        steps = np.diff(sorted_stamps[max(position - 1, 0) : position + 2]) / step
-        is_filling = 0.5 < steps.min() and steps.max() < 1.5
+        neighbours = sorted_stamps[max(position - 1, 0) : position + 2]
+        distances = np.diff(neighbours) / step
+        is_filling = 0.5 < distances.min() and distances.max() < 1.5
         late_rows = abs(position - np.searchsorted(good_rows, row))
         if not is_filling or late_rows > MAX_LATE_ROWS:
             strays[row] = (
