@@ -137,7 +137,7 @@ def _stray_stamps(
         position = np.searchsorted(sorted_stamps, stamps[row])
         neighbours = sorted_stamps[max(position - 1, 0) : position + 2]
         distances = np.diff(neighbours) / step
-        is_filling = 0.5 < distances.min() and distances.max() < 1.5
+        is_filling = distances.min() > 0.5 and distances.max() < 1.5
         late_rows = abs(position - np.searchsorted(good_rows, row))
         if not is_filling or late_rows > MAX_LATE_ROWS:
             strays[row] = (
