@@ -308,6 +308,9 @@ REFUSALS = [
     (ARM + "[model.coulomb]\nasymmetric = true\nstribeck = 1", "`coulomb.stribeck`"),
     (ARM + "[recording]\nangles = 'q{}'", "`recording.forces`"),
     (COLUMNS + "angle_unit = 'degree'", "`degree`"),
+    (COLUMNS + "angle_unit = [0.01, 0.01, 0.01]", "`angle_unit`"),
+    (COLUMNS + "angle_unit = [0.01, true]", "`recording.angle_unit[1]`"),
+    (COLUMNS + "force_unit = '%'", "`rated_forces`"),
     (COLUMNS + "angle_signs = [1, 2]", "`angle_signs`"),
     (
         RAIL + "angle_unit = 'deg'",
@@ -392,6 +395,19 @@ def test_logs_that_do_not_fit_the_file(load, tmp_path):
     experiment = load(ARM + short + "[filter]\nkind = 'butterworth'\ncutoff = 60\n")
     with pytest.raises(ValueError, match="cutoff"):
         experiment.setup.observe(read(experiment, log))
+
+
+def test_the_file_states_scales_of_each_joint(tmp_path):
+    """Angles from -100 to 100 of each joint's range, forces in parts of rated ones."""
+    path = tmp_path / "experiment.toml"
+    keys = "angle_unit = [0.011, 0.012]\nangle_offsets = [0.2, 0.1]\n"
+    keys += 'force_unit = "%"\nrated_forces = [80, 20]\n'
+    path.write_text(COLUMNS + keys, encoding="utf-8")
+    columns = load_experiment(path).columns
+    values = np.array([[-100.0, 100.0]])
+    angles, _, forces = columns.to_si(values, None, values)
+    np.testing.assert_allclose(angles, [[-0.9, 1.3]])
+    np.testing.assert_allclose(forces, [[-80.0, 20.0]])
 
 
 def test_the_template_loads_as_it_is_and_keeps_what_the_urdf_says(tmp_path):

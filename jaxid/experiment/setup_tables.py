@@ -258,7 +258,7 @@ def require_fitting_units(columns: Columns, robot: Robot, arguments: TomlTable) 
     if not columns.forces_on_motor_side:
         names.append("force_unit")
     for name in names:
-        units = arguments.get(name, [])
+        units = getattr(columns, name) if name in arguments else ()
         if isinstance(units, Unit):
             units = [units] * robot.joints
         for joint, is_revolute, unit in zip(

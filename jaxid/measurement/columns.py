@@ -16,10 +16,12 @@ from jaxid.units import NM, RAD, Quantity, S, Unit
 from .log_files import Complaints, LogTable, Selection, open_log_file
 from .recording import positive_time
 
-Units = Unit | tuple[Unit, ...]
-"""One unit for all joints, or one for each."""
+Units = Unit | float | tuple[Unit | float, ...]
+"""One unit for all joints, or one for each; a number is the size of one in SI units."""
 PerJoint = tuple[float, ...] | None
 """One number for each joint, or the default for all."""
+FORCE_QUANTITIES = (Quantity.FORCE, Quantity.CURRENT, Quantity.SHARE)
+"""Quantities that columns of forces may hold."""
 Channels = tuple[Matrix, Matrix | None, Matrix]
 """Angles, velocities (None if there are none) and forces (samples x joints)."""
 
@@ -35,8 +37,9 @@ class Columns:
     `"/topic.field[{}]"`, or `"/topic.field.joint"` by names.
 
     Angles become `sign * unit * value + offset`, velocities `sign * unit * value`, and
-    forces `sign * gain * torque constant * unit * value`. A unit is one for all joints,
-    or one for each.
+    forces `sign * gain * torque constant * rated force * unit * value`. A unit is one
+    for all joints, or one for each; as a number it is the angle [rad or m], velocity or
+    force [N m or N] of a one in the log, like `0.00153` for counts of an encoder.
 
     Attributes:
         angles: Joint or motor angles; `{}` stands for the joints' numbers, from 1 or
@@ -48,11 +51,15 @@ class Columns:
             sets.
         sample_time: Time between two rows [s], instead of time stamps, like `0.001`.
         time_unit: Unit of the stamps.
-        angle_unit: Unit of the angles.
+        angle_unit: Unit of the angles; or the angle of a one in the log [rad or m], as
+            a number such as 0.00153 for the counts of an encoder.
         velocity_unit: Unit of the velocities, like `"rad/s"`; the angles' unit per
             second if None.
-        force_unit: Unit of the forces; currents need `torque_constants`.
+        force_unit: Unit of the forces, or the force of a one in the log [N m or N];
+            currents need `torque_constants`, "%" and "‰" need `rated_forces`.
         torque_constants: Torque of each motor for its current [N m/A].
+        rated_forces: Rated force of each drive, of which the log holds "%" or "‰" [N m
+            or N; A with `torque_constants`].
         angle_signs: +1 or -1 for each joint, for the angles and velocities.
         force_signs: +1 or -1 for each joint.
         angle_offsets: Offsets that are added to the angles [rad or m], like `0.0`.
@@ -74,6 +81,7 @@ class Columns:
     velocity_unit: Units | None = None
     force_unit: Units = NM
     torque_constants: PerJoint = None
+    rated_forces: PerJoint = None
     angle_signs: PerJoint = None
     force_signs: PerJoint = None
     angle_offsets: PerJoint = None
@@ -96,24 +104,40 @@ class Columns:
         self._require_unit("time_unit", Quantity.TIME)
         self._require_unit("angle_unit", Quantity.COORDINATE)
         self._require_unit("velocity_unit", Quantity.VELOCITY)
-        self._require_unit("force_unit", Quantity.FORCE, Quantity.CURRENT)
+        force = Quantity.FORCE if self.torque_constants is None else Quantity.CURRENT
+        self._require_unit("force_unit", force, *FORCE_QUANTITIES)
         self._require("angle_signs", lambda s: abs(s) == 1, "+1 or -1")
         self._require("force_signs", lambda s: abs(s) == 1, "+1 or -1")
         self._require("force_gains", lambda g: 0 < g < np.inf, "positive")
         self._require(
             "torque_constants", lambda c: c != 0 and np.isfinite(c), "finite, not zero"
         )
+        self._require("rated_forces", lambda f: 0 < f < np.inf, "positive")
         quantities = [unit.quantity for unit in _units(self.force_unit)]
+        has_shares = Quantity.SHARE in quantities
+        if has_shares != (self.rated_forces is not None):
+            raise InputError(
+                "`rated_forces` [N m or N; A with `torque_constants`] are needed if "
+                '`force_unit` is "%" or "‰", and only then.'
+            )
         has_currents = Quantity.CURRENT in quantities
-        if has_currents != (self.torque_constants is not None):
+        has_constants = self.torque_constants is not None
+        if has_currents != has_constants and not (has_constants and has_shares):
             raise InputError(
                 "`torque_constants` [N m/A] are needed if `force_unit` is a current, "
                 "and only then."
             )
 
     def _require_unit(self, name: str, *quantities: Quantity) -> None:
-        words = " or ".join(quantity.value for quantity in quantities)
-        for unit in _units(getattr(self, name)):
+        """Check what units measure, and make units of the first quantity of numbers."""
+        units = getattr(self, name)
+        if isinstance(units, tuple):
+            units = tuple(_as_unit(name, unit, quantities[0]) for unit in units)
+        elif units is not None:
+            units = _as_unit(name, units, quantities[0])
+        object.__setattr__(self, name, units)
+        words = " or ".join(dict.fromkeys(quantity.value for quantity in quantities))
+        for unit in _units(units):
             if unit.quantity not in quantities:
                 raise InputError(
                     f"`{name}` must measure {words}, but `{unit.symbol}` measures "
@@ -151,12 +175,24 @@ class Columns:
             velocities = velocities * velocity_scale
         # A log of currents has torque constants, which are one otherwise.
         gains = numbers("force_unit") * numbers("force_signs") * numbers("force_gains")
-        force_scale = gains * numbers("torque_constants")
+        force_scale = gains * numbers("torque_constants") * numbers("rated_forces")
         offsets = numbers("angle_offsets", 0.0)
         return angles * angle_scale + offsets, velocities, forces * force_scale
 
 
-def _units(units: Units | None) -> tuple[Unit, ...]:
+def _as_unit(name: str, unit: Unit | float, quantity: Quantity) -> Unit:
+    """Return a unit, or one of the size that a number tells."""
+    if isinstance(unit, Unit):
+        return unit
+    if not np.isfinite(unit) or unit == 0:
+        raise InputError(
+            f"`{name}` must be a unit, or the size of a one in the log, which is "
+            f"finite and not zero, but is {unit}."
+        )
+    return Unit(f"{unit:g}", float(unit), quantity)
+
+
+def _units(units: Any) -> tuple[Unit, ...]:
     """Return one unit or several as a tuple; an empty one if there is none."""
     return (units,) if isinstance(units, Unit) else units or ()
 

@@ -10,6 +10,8 @@ from .measured_units import (
     MS as MS,
     NM as NM,
     NS as NS,
+    PERCENT as PERCENT,
+    PERMILLE as PERMILLE,
     RAD as RAD,
     RAD_PER_S as RAD_PER_S,
     REV as REV,

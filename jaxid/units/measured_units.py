@@ -16,15 +16,15 @@ class Quantity(enum.Enum):
     VELOCITY = "a velocity"
     FORCE = "a torque or a force"
     CURRENT = "a current"
+    SHARE = "a share of a rated value"
 
 
 @dataclasses.dataclass(frozen=True)
 class Unit:
     """Unit of a measured quantity.
 
-    Define a unit for drive-specific counts: `Unit("count", 2 * pi / 4096,
-    Quantity.COORDINATE)` for an encoder, `Unit("permille", 1e-3 * rated,
-    Quantity.FORCE)` for thousandths of rated torque.
+    Drives often have units of their own, like the counts of an encoder: `Unit("count",
+    2 * pi / 4096, Quantity.COORDINATE)`. `Columns` take the number alone, too.
 
     Attributes:
         symbol: Symbol, such as `deg`.
@@ -63,6 +63,8 @@ NM = Unit("N m", 1.0, Quantity.FORCE)
 N = Unit("N", 1.0, Quantity.FORCE)
 A = Unit("A", 1.0, Quantity.CURRENT)
 MA = Unit("mA", 1e-3, Quantity.CURRENT)
+PERCENT = Unit("%", 1e-2, Quantity.SHARE)
+PERMILLE = Unit("‰", 1e-3, Quantity.SHARE)
 
 UNITS = {
     unit.symbol: unit
@@ -70,7 +72,7 @@ UNITS = {
         *(S, MS, US, NS),
         *(RAD, DEG, REV, M, MM),
         *(RAD_PER_S, DEG_PER_S, RPM, M_PER_S, MM_PER_S),
-        *(NM, N, A, MA),
+        *(NM, N, A, MA, PERCENT, PERMILLE),
     )
 }
 """All named units, by their symbols."""

@@ -105,6 +105,7 @@ def read_commands(setup: Setup, log: Path, columns: Columns) -> Recording:
         force_signs=None,
         force_gains=None,
         torque_constants=None,
+        rated_forces=None,
         velocities=None,
     )
     # ... and once more as angles, in the units and signs of these.

@@ -342,11 +342,71 @@ def test_lengths_and_shapes_must_agree(tmp_path):
         ({"force_unit": units.A}, "`torque_constants`"),
         ({"torque_constants": (1.0,)}, "`torque_constants`"),
         ({"angle_signs": (2,)}, "`angle_signs`"),
+        ({"angle_unit": 0.0}, "`angle_unit`"),
+        ({"angle_unit": units.PERCENT}, "`angle_unit`"),
+        ({"force_unit": (1.0, np.inf)}, "`force_unit`"),
+        ({"force_unit": units.PERCENT}, "`rated_forces`"),
+        ({"rated_forces": (1.0,)}, "`rated_forces`"),
     ],
 )
 def test_columns_that_contradict_themselves(change, name):
     with pytest.raises(ValueError, match=re.escape(name)):
         Columns(**({"angles": "q{}", "forces": "tau{}", "time": "t"} | change))
+
+
+SCALES = {
+    "counts of an encoder": (
+        {"angle_unit": 2 * np.pi / 4096, "angle_offsets": (-np.pi, -np.pi)},
+        (2 * np.pi / 4096, 2 * np.pi / 4096),
+        (-np.pi, -np.pi),
+        (1.0, 1.0),
+    ),
+    "calibrated ranges": (
+        {"angle_unit": (0.011, -0.012), "angle_offsets": (0.2, 0.1)},
+        (0.011, -0.012),
+        (0.2, 0.1),
+        (1.0, 1.0),
+    ),
+    "per mille": (
+        {"force_unit": units.PERMILLE, "rated_forces": (80.0, 20.0)},
+        (1.0, 1.0),
+        (0.0, 0.0),
+        (0.08, 0.02),
+    ),
+    "percent of currents": (
+        {
+            "force_unit": units.PERCENT,
+            "rated_forces": (3.0, 2.0),
+            "torque_constants": (0.1, -0.2),
+        },
+        (1.0, 1.0),
+        (0.0, 0.0),
+        (0.003, -0.004),
+    ),
+    "steps of currents": (
+        {"force_unit": 0.00269, "torque_constants": (1.7, 1.5)},
+        (1.0, 1.0),
+        (0.0, 0.0),
+        (0.00269 * 1.7, 0.00269 * 1.5),
+    ),
+    "a number beside a unit": (
+        {"angle_unit": (units.DEG, 0.5), "force_unit": (units.NM, 0.25)},
+        (np.pi / 180, 0.5),
+        (0.0, 0.0),
+        (1.0, 0.25),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", SCALES)
+def test_units_that_only_one_drive_has(name):
+    change, angle_scale, offsets, force_scale = SCALES[name]
+    columns = Columns(angles="q{}", forces="tau{}", time="t", **change)
+    values = np.array([[3.0, -50.0], [100.0, 7.0]])
+    angles, velocities, forces = columns.to_si(values, values, values)
+    np.testing.assert_allclose(angles, values * angle_scale + offsets, rtol=1e-14)
+    np.testing.assert_allclose(velocities, values * angle_scale, rtol=1e-14)
+    np.testing.assert_allclose(forces, values * force_scale, rtol=1e-14)
 
 
 def test_units_by_symbol():
