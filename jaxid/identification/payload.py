@@ -118,7 +118,7 @@ class Payload(Summarised, eqx.Module):
     @property
     def is_lighter(self) -> bool:
         """Whether the robot is lighter with the load than without it."""
-        return bool(_is_negative(self.estimate, self.uncertainty))
+        return _is_negative(self.estimate, self.uncertainty)
 
     def _remark(self) -> Remark:
         """Return whether the payload is a body that could exist."""
@@ -216,10 +216,10 @@ def _estimate(unloaded: Fit, loaded: Fit, body: int):
     return values[-10:], Uncertainty(covariance, dof, covariance)
 
 
-def _is_negative(estimate: np.ndarray, uncertainty: Uncertainty) -> bool:
+def _is_negative(estimate: AnyArray, uncertainty: Uncertainty) -> bool:
     """Return whether the mass is below zero by more than its usual scatter."""
     deviation = uncertainty.standard_deviations[0]
-    return estimate[0] < -MAX_DISTANCE * deviation
+    return bool(estimate[0] < -MAX_DISTANCE * deviation)
 
 
 def _weigh(estimate: np.ndarray, uncertainty: Uncertainty, mass: float):
