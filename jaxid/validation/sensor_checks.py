@@ -18,6 +18,8 @@ Findings = list[tuple[int, str]]
 
 MAX_LAG = 1.5
 """Samples by which velocities may stand later than the derivatives of the angles."""
+MAX_LIMIT_RATIO = 1.1
+"""Measured speed or force, relative to its limit, that noise and filters explain."""
 JUMP = 15.0
 """Steps of an angle, in units of their noise, that no noise makes."""
 
@@ -89,7 +91,9 @@ def limit_findings(
 
     Joints in `faulty_joints` have faults of single channels, which explain more.
     """
-    findings = [] if faulty_joints else _force_findings(robot, statistics)
+    findings = _common_force_findings(robot, statistics) if not faulty_joints else []
+    if not findings:
+        findings += _force_findings(robot, statistics, faulty_joints)
     for j in range(robot.joints):
         if j not in faulty_joints:
             findings += _joint_findings(robot, j, statistics)
@@ -121,7 +125,7 @@ def _joint_findings(robot: Robot, j: int, statistics: LogStatistics) -> Iterator
             f"{lower_limit:.3g} to {upper_limit:.3g} {unit}: check "
             "`recording.angle_unit`, `side`, `angle_signs` and `angle_offsets`."
         )
-    if statistics.speed[j] > 1.1 * limits.velocity[j]:
+    if statistics.speed[j] > MAX_LIMIT_RATIO * limits.velocity[j]:
         yield (
             f"joint `{name}` reaches {statistics.speed[j]:.3g} {unit}/s, but its limit "
             f"is {float(limits.velocity[j]):.3g} {unit}/s: check the units, or lower "
@@ -135,7 +139,27 @@ def _joint_findings(robot: Robot, j: int, statistics: LogStatistics) -> Iterator
         )
 
 
-def _force_findings(robot: Robot, statistics: LogStatistics) -> list[str]:
+def _force_findings(
+    robot: Robot, statistics: LogStatistics, faulty_joints: Collection[int]
+) -> list[str]:
+    """Report joints whose forces exceed their limits."""
+    max_forces = robot.known_max_forces
+    comparisons = [
+        f"`{name}` {statistics.force[j]:.3g} of {max_forces[j]:.3g} "
+        f"{robot.force_unit(j)}"
+        for j, name in enumerate(robot.joint_names)
+        if j not in faulty_joints
+        and statistics.force[j] > MAX_LIMIT_RATIO * max_forces[j]
+    ]
+    if not comparisons:
+        return []
+    return [
+        f"forces are larger than the robot's limits: {', '.join(comparisons)}: check "
+        "`recording.force_unit` and `force_gains`, the gears and `limits.force`."
+    ]
+
+
+def _common_force_findings(robot: Robot, statistics: LogStatistics) -> list[str]:
     """Report forces that are all too large or too small: one unit or side is wrong."""
     ratios = statistics.force / robot.known_max_forces
     ratios = ratios[np.isfinite(robot.known_max_forces)]

@@ -1,5 +1,7 @@
 """A diagnosis names the one mistake that was made in a log's columns, nothing else."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -248,3 +250,36 @@ def test_forces_in_another_unit_are_one_doubt_and_not_four(motors, factor, words
         "check `recording.force_unit`, `forces_side` and `torque_constants`"
         in doubts[0]
     )
+
+
+@pytest.mark.parametrize("joints", [[1], [0, 3], [0, 1, 2]])
+def test_forces_of_some_joints_beyond_their_limits_are_one_doubt(motors, joints):
+    log, o = log_of(*motors)
+    peaks = diagnose(log, ROBOT, observations=o).statistics.force
+    shares = np.ones(4)
+    shares[joints] = 1.6
+    limits = dataclasses.replace(ROBOT.limits, joints=4, force=peaks / shares)
+    robot = ROBOT.replace(limits=limits)
+    (doubt,) = diagnose(log, robot, observations=o).findings
+    for j in range(4):
+        assert (f"`joint{j + 1}`" in doubt) == (j in joints)
+    first_joint = joints[0]
+    peak = peaks[first_joint]
+    assert f"{peak:.3g} of {peak / 1.6:.3g} N m" in doubt
+    assert "`recording.force_unit`" in doubt
+
+
+@pytest.mark.parametrize(
+    ("limit", "words"),
+    [("position_max", "its range is"), ("velocity", "its limit is")],
+)
+def test_ranges_and_speeds_beyond_limits_are_a_doubt(motors, limit, words):
+    log, o = log_of(*motors)
+    statistics = diagnose(log, ROBOT, observations=o).statistics
+    peaks = {"position_max": statistics.highest, "velocity": statistics.speed}
+    numbers = np.array(getattr(ROBOT.limits, limit))
+    numbers[2] = 0.7 * peaks[limit][2]
+    limits = dataclasses.replace(ROBOT.limits, joints=4, **{limit: numbers})
+    (doubt,) = diagnose(log, ROBOT.replace(limits=limits), observations=o).findings
+    assert doubt.startswith("joint `joint3`")
+    assert words in doubt
