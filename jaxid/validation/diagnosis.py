@@ -27,12 +27,11 @@ from jaxid.result_table import (
 )
 from jaxid.robot.robot import Robot
 
+from .limit_checks import LogStatistics, limit_findings
 from .mistakes import INSTANTS, likely_mistakes
 from .sensor_checks import (
-    LogStatistics,
     channel_findings,
     clock_findings,
-    limit_findings,
     stuck_findings,
 )
 

@@ -1,0 +1,171 @@
+"""Extremes of a log, and comparison with the limits of its robot."""
+
+from collections.abc import Collection, Iterator
+
+import numpy as np
+
+from jaxid.arrays import AnyArray
+from jaxid.dynamics.motion import Motion
+from jaxid.robot.robot import Robot
+
+from .torque_errors import REST_SHARE
+
+MAX_LIMIT_RATIO = 1.1
+"""Measured speed or force, relative to its limit, that noise and filters explain."""
+
+
+class LogStatistics:
+    """Extremes of a log that is read in parts, joint by joint.
+
+    Attributes:
+        lowest: Smallest coordinate of each joint [rad or m].
+        highest: Largest coordinate of each joint [rad or m].
+        speed: Largest speed of each joint [rad/s or m/s].
+        force: Largest force of each joint [N m or N].
+    """
+
+    def __init__(self, joints: int, samples: int):
+        self.lowest = np.full(joints, np.inf)
+        self.highest = np.full(joints, -np.inf)
+        self.speed = np.zeros(joints)
+        self.force = np.zeros(joints)
+        # Of velocities, derivatives of the angles, and derivatives of these: sums of
+        # products.
+        self._products = np.zeros((joints, 3, 3))
+        # Of long logs every n-th sample tells how long joints stand.
+        self._stride = -(-samples // 2**18)
+        self._count = 0
+        self._speeds: list[np.ndarray] = []
+
+    def add(self, motion: Motion, forces: AnyArray, sample_time: float) -> None:
+        """Take in the filtered motion and the forces of consecutive samples."""
+        q = np.asarray(motion.q)
+        qd = np.asarray(motion.qd)
+        speeds = np.abs(qd)
+        sizes = np.abs(np.asarray(forces))
+        self.lowest = np.minimum(self.lowest, q.min(axis=0))
+        self.highest = np.maximum(self.highest, q.max(axis=0))
+        self.speed = np.maximum(self.speed, speeds.max(axis=0))
+        self.force = np.maximum(self.force, sizes.max(axis=0))
+        if len(q) > 1:
+            derivative = np.gradient(q, sample_time, axis=0)
+            second_derivative = np.gradient(derivative, sample_time, axis=0)
+            columns = np.stack([derivative, second_derivative, qd], axis=2)
+            self._products += np.einsum("tja,tjb->jab", columns, columns)
+        first_sample = -self._count % self._stride
+        self._speeds.append(speeds[first_sample :: self._stride])
+        self._count += len(q)
+
+    @property
+    def stands(self) -> np.ndarray:
+        """Whether each joint stands, at some of the samples."""
+        return np.concatenate(self._speeds) < REST_SHARE * np.maximum(self.speed, 1e-12)
+
+    def lateness(self, joint: int) -> float:
+        """Return how much later measured velocities stand than those of the angles [s].
+
+        It is zero where a shift does not explain most of the difference.
+        """
+        P = self._products[joint]
+        if P[0, 0] <= 0 or P[1, 1] <= 0:
+            return 0.0
+        scale, lead = np.linalg.lstsq(P[:2, :2], P[:2, 2], rcond=1e-12)[0]
+        is_explained = lead**2 * P[1, 1] > 0.5 * (P[2, 2] - 2 * P[0, 2] + P[0, 0])
+        return float(-lead / scale) if scale and is_explained else 0.0
+
+
+def limit_findings(
+    robot: Robot, statistics: LogStatistics, faulty_joints: Collection[int]
+) -> list[str]:
+    """Compare a log with the limits of its robot: a wrong unit or sign shows here.
+
+    Joints in `faulty_joints` have faults of single channels, which explain more.
+    """
+    findings = _common_force_findings(robot, statistics) if not faulty_joints else []
+    if not findings:
+        findings += _force_findings(robot, statistics, faulty_joints)
+    for j in range(robot.joints):
+        if j not in faulty_joints:
+            findings += _joint_findings(robot, j, statistics)
+    share = float(statistics.stands.all(axis=1).mean())
+    if share > 0.5:
+        findings.append(
+            f"the robot stands still for {100 * share:.0f} % of the log: crop it "
+            "with `recording.start` and `recording.stop`."
+        )
+    return findings
+
+
+def _joint_findings(robot: Robot, j: int, statistics: LogStatistics) -> Iterator[str]:
+    """Compare the range and speed of a joint with its limits."""
+    name = robot.joint_names[j]
+    unit = robot.joint_unit(j)
+    limits = robot.limits
+    lower_limit = float(limits.position_min[j])
+    upper_limit = float(limits.position_max[j])
+    minimum = statistics.lowest[j]
+    maximum = statistics.highest[j]
+    # Joints without limits have no range.
+    slack = 0.02 * (upper_limit - lower_limit)
+    if not np.isfinite(slack):
+        slack = 0.0
+    if not lower_limit - slack <= minimum <= maximum <= upper_limit + slack:
+        yield (
+            f"joint `{name}` moves from {minimum:.3g} to {maximum:.3g}, its range is "
+            f"{lower_limit:.3g} to {upper_limit:.3g} {unit}: check "
+            "`recording.angle_unit`, `side`, `angle_signs` and `angle_offsets`."
+        )
+    if statistics.speed[j] > MAX_LIMIT_RATIO * limits.velocity[j]:
+        yield (
+            f"joint `{name}` reaches {statistics.speed[j]:.3g} {unit}/s, but its limit "
+            f"is {float(limits.velocity[j]):.3g} {unit}/s: check the units, or lower "
+            "the cut-off."
+        )
+    span = maximum - minimum
+    if span < 0.02:
+        yield (
+            f"joint `{name}` moves by {span:.2g} {unit} only: is it the right column "
+            "and unit?"
+        )
+
+
+def _force_findings(
+    robot: Robot, statistics: LogStatistics, faulty_joints: Collection[int]
+) -> list[str]:
+    """Report joints whose forces exceed their limits."""
+    max_forces = robot.known_max_forces
+    comparisons = [
+        f"`{name}` {statistics.force[j]:.3g} of {max_forces[j]:.3g} "
+        f"{robot.force_unit(j)}"
+        for j, name in enumerate(robot.joint_names)
+        if j not in faulty_joints
+        and statistics.force[j] > MAX_LIMIT_RATIO * max_forces[j]
+    ]
+    if not comparisons:
+        return []
+    return [
+        f"forces are larger than the robot's limits: {', '.join(comparisons)}: check "
+        "`recording.force_unit` and `force_gains`, the gears and `limits.force`."
+    ]
+
+
+def _common_force_findings(robot: Robot, statistics: LogStatistics) -> list[str]:
+    """Report forces that are all too large or too small: one unit or side is wrong."""
+    ratios = statistics.force / robot.known_max_forces
+    ratios = ratios[np.isfinite(robot.known_max_forces)]
+    cure = "check `recording.force_unit`, `forces_side` and `torque_constants`."
+    if ratios.size < 2:
+        return []
+    minimum = ratios.min()
+    peak = ratios.max()
+    if minimum > 1.2:
+        text = (
+            f"all joints need more than their largest forces, {minimum:.2g} to "
+            f"{peak:.2g} times"
+        )
+        return [f"{text} as much: {cure}"]
+    if 0 < peak < 0.02:
+        return [
+            f"no joint needs more than {100 * peak:.2g} % of its largest force: {cure}"
+        ]
+    return []
