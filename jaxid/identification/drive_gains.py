@@ -267,7 +267,7 @@ def _parameter_maps(base: BaseParameters, load: Tool | float):
     return maps, [np.zeros(base.size), load_parameters]
 
 
-def _maps_of_mass(base: BaseParameters, body: int, mass: float):
+def _maps_of_mass(base: BaseParameters, body: int, mass: AnyArray | float):
     """Return maps and offsets for a load of which only the mass is known."""
     maps = state_maps(base.size, varying_parameters(base), 2)
     columns = body_columns(base, body)
