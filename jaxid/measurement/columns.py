@@ -214,8 +214,9 @@ class Log:
             channels = [channel for channel in table.channels if channel != "time"]
             part = table.read(channels, start, stop)
             for channel, names in part.channels.items():
-                blocks = [part.numbers(name) for name in names]
-                arrays[channel] = np.concatenate(blocks, axis=1)
+                blocks = {name: part.numbers(name) for name in names}
+                _require_values(table.source, channel, blocks)
+                arrays[channel] = np.concatenate([*blocks.values()], axis=1)
         joints = arrays["angles"].shape[1]
         for channel, array in arrays.items():
             if array.shape[1] != joints:
@@ -240,6 +241,23 @@ class Log:
         """Return time stamps [s]; integers and dates count from `start`."""
         table = self.tables[0].read(("time",), start, stop)
         return table.stamps(self.columns.time_unit.factor)
+
+
+def _require_values(source: str, channel: str, blocks: dict[str, Matrix]) -> None:
+    """Refuse columns without any number, which drivers write that measure nothing."""
+    empty_columns = [
+        name
+        for name, block in blocks.items()
+        if not np.isfinite(block).any(axis=0).all()
+    ]
+    if empty_columns:
+        cure = "name other columns"
+        if channel == "velocities":
+            cure = "leave `velocities` out, which the angles tell"
+        raise InputError(
+            f"all values of `{'`, `'.join(empty_columns)}` of `{source}` are empty or "
+            f"NaN: the driver reports no `{channel}`; {cure}."
+        )
 
 
 def open_log(

@@ -20,6 +20,7 @@ from .observations import Observations, Progress, prepare
 from .recording import Recording, consecutive
 from .samples import AbstractSamples, joined, joint_side
 from .time_grid import NeedsMemory, Range, Ranges, TimeGrid, find_grid
+from .time_series import is_sparse, join_channels
 from .time_stamps import MAX_LATE_ROWS
 
 PART_SIZE = 65536
@@ -64,16 +65,30 @@ def read_recording(
     """
     log = open_log(path, columns, forces_path, velocities_path, is_lenient=True)
     angles, velocities, forces = log.read()
-    rows = len(angles)
     sample_time = columns.sample_time
     stamps = log.stamps() if sample_time is None else None
     complaints = log.bad_rows
+    notes = [note for table in log.tables for note in table.notes]
+    channels = {"angles": angles, "forces": forces}
+    if velocities is not None:
+        channels["velocities"] = velocities
+    if complaints and is_sparse(channels):
+        source = log.tables[0].source
+        if stamps is None:
+            raise InputError(
+                f"the channels of `{source}` have values at different rows, and so "
+                "times of their own: give `time` (its column of time stamps; bags have "
+                "a clock) instead of `sample_time`."
+            )
+        stamps, channels, join_notes = join_channels(stamps, channels, source)
+        complaints = {}
+        notes += join_notes
+    rows = len(channels["angles"])
     if stamps is not None:
         strays = _stray_stamps(stamps, complaints, log.tables[0])
         # So many rows out of order are no wrong stamps: they are sorted.
         if len(strays) <= MAX_STRAY_STAMPS * rows:
             complaints |= strays
-    notes = [note for table in log.tables for note in table.notes]
     good_rows = slice(None)
     if complaints:
         good_rows = np.setdiff1d(np.arange(rows), [*complaints])
@@ -82,11 +97,11 @@ def read_recording(
             # Rows that are left out leave gaps, which only stamps can tell.
             stamps = sample_time * np.arange(rows)
             sample_time = None
-    angles = angles[good_rows]
+    channels = {name: values[good_rows] for name, values in channels.items()}
+    if columns.unwrap:
+        channels["angles"] = np.unwrap(channels["angles"], axis=0)
     recording = Recording.of(
-        np.unwrap(angles, axis=0) if columns.unwrap else angles,
-        forces[good_rows],
-        velocities=None if velocities is None else velocities[good_rows],
+        **channels,
         time=None if stamps is None else stamps[good_rows],
         sample_time=sample_time,
         angles_on_motor_side=columns.angles_on_motor_side,

@@ -177,7 +177,7 @@ def refused(path, columns, *parts, **kwargs):
         (np.repeat([[0.0, 0.0], [np.inf, -np.inf]], [3, 17], axis=0), "row 4"),
         (
             np.full((20, 2), 0x7F800001, np.uint32).view(np.float32),
-            "row 1",
+            "all values",
         ),  # signalling NaN
         (np.zeros((20, 0)), "(20, 0)"),
         (np.array(["a"] * 20), "real numbers"),

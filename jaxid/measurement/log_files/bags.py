@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import polars as pl
 
-from jaxid.errors import InputError
 from jaxid.io import import_extra
 
 from .log_file import AbstractLogFile, Selections
@@ -27,8 +26,6 @@ CLOCK = "time"
 """Column of the times that is taken if none is named."""
 MAX_ELEMENTS = 1000
 """Elements of the largest array that is no picture or point cloud."""
-MAX_STEP_RATIO = 3.0
-"""Distance of two messages, in typical ones, up to which values are interpolated."""
 
 Elements = tuple[str, ...]
 """Endings of the names of a field's numbers, such as `[0]` or `.shoulder`."""
@@ -54,10 +51,8 @@ class BagFile(AbstractLogFile):
 
     def table(self, channels, on_disk, bad_rows):  # noqa: D102
         names = list(itertools.chain(*channels.values()))
-        columns, notes = join_topics(self.path.name, self.topics, names)
-        return LogTable(
-            self.path.name, columns, channels, bad_rows=bad_rows, notes=notes
-        )
+        columns = join_topics(self.topics, names)
+        return LogTable(self.path.name, columns, channels, bad_rows=bad_rows)
 
 
 def selected_topics(selections: Selections) -> set[str]:
@@ -80,26 +75,11 @@ class TimeSeries(NamedTuple):
     times: np.ndarray  # [ns]
     values: np.ndarray
 
-    def interpolated(self, targets: np.ndarray) -> np.ndarray:
-        """Return values at other times [ns]; NaN outside and in pauses."""
-        order = np.argsort(self.times, kind="stable")
-        sorted_values = self.values[order]
-        # Float64 holds nanoseconds only if they do not count from 1970.
-        elapsed_time = self.times[order] - targets[0]
-        t = elapsed_time.astype(np.float64)
-        target_t = (targets - targets[0]).astype(np.float64)
-        nan = np.nan
-        values = np.interp(target_t, t, sorted_values, left=nan, right=nan)
-
-        steps = np.diff(t, prepend=t[0])
-        max_step = MAX_STEP_RATIO * np.median(steps)
-        # The step that ends at or after each target.
-        index = np.searchsorted(t, target_t)
-        index = np.minimum(index, len(t) - 1)
-        is_after_pause = steps[index] > max_step
-        is_between = t[index] != target_t
-        values[is_after_pause & is_between] = nan
-        return values
+    def at(self, times: np.ndarray) -> np.ndarray:
+        """Return the values at all times of a table [ns]; NaN where there is none."""
+        column = np.full(len(times), np.nan)
+        column[np.searchsorted(times, self.times)] = self.values
+        return column
 
 
 class Topic(NamedTuple):
@@ -238,13 +218,11 @@ def _array_fields(
             yield from _fields(item, f"{name}{element}.", element_names)
 
 
-def join_topics(
-    source: str, topics: Sequence[Topic], names: Sequence[str]
-) -> tuple[dict[str, Any], tuple[str, ...]]:
-    """Return columns at the times of the first one, and notes.
+def join_topics(topics: Sequence[Topic], names: Sequence[str]) -> dict[str, Any]:
+    """Return columns at all of their times, NaN where they have no value.
 
     The times are the stamps in the headers if all of the topics have them and no time
-    of recording is asked for. Columns with other times are interpolated linearly.
+    of recording is asked for.
     """
     clocks = [x for x in names if x.endswith((STAMP, RECORDING_TIME)) or x == CLOCK]
     clock = clocks[0] if clocks else CLOCK
@@ -254,40 +232,15 @@ def join_topics(
     if clock == CLOCK:
         are_recorded = not all(all(owners[name].stamps) for name in names)
 
-    times = owners[names[0]].time_series(names[0], are_recorded).times
-    values = {}
-    foreign_names = []
-    is_common = np.ones(len(times), bool)
-    for name in names:
-        series = owners[name].time_series(name, are_recorded)
-        values[name] = series.values
-        if not np.array_equal(series.times, times):
-            foreign_names.append(name)
-            values[name] = series.interpolated(times)
-            is_common &= np.isfinite(values[name])
-    if not is_common.any():
-        raise InputError(
-            f"the topics of `{source}` overlap nowhere in time: compare their clocks."
-        )
-    columns: dict[str, Any] = {name: values[name][is_common] for name in names}
-    columns[clock] = pl.Series(times[is_common].astype("M8[ns]"))
-    return columns, _join_notes(names[0], foreign_names, is_common)
-
-
-def _join_notes(
-    main_name: str, foreign_names: Sequence[str], is_common: np.ndarray
-) -> tuple[str, ...]:
-    """Return remarks about topics with other times, and messages that were left out."""
-    main_topic = topic_of(main_name)
-    foreign_topics = dict.fromkeys(map(topic_of, foreign_names))
-    notes = [
-        f"`{topic}` is interpolated linearly at the times of `{main_topic}`"
-        for topic in foreign_topics
-    ]
-    lost_messages = int(np.sum(~is_common))
-    if lost_messages:
-        notes.append(
-            f"{lost_messages} of {len(is_common)} messages were left out: other "
-            "topics pause there"
-        )
-    return tuple(notes)
+    series = {
+        name: owners[name].time_series(name, are_recorded)
+        for name in dict.fromkeys(names)
+    }
+    times = series[names[0]].times
+    if all(np.array_equal(x.times, times) for x in series.values()):
+        columns: dict[str, Any] = {name: x.values for name, x in series.items()}
+    else:
+        times = np.unique(np.concatenate([x.times for x in series.values()]))
+        columns = {name: x.at(times) for name, x in series.items()}
+    columns[clock] = pl.Series(times.astype("M8[ns]"))
+    return columns

@@ -1,0 +1,132 @@
+"""Channels with times of their own, interpolated at the times of the first angle."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxid.arrays import Matrix, Texts, Vector
+from jaxid.errors import InputError
+
+MAX_STEP_RATIO = 3.0
+"""Distance of two values, in typical ones, up to which others are interpolated."""
+MIN_SPARSE_SHARE = 0.2
+"""Fraction of incomplete rows from which channels have times of their own."""
+MIN_CHANGES = 20
+"""Rows at which other channels than before have values, in such a table."""
+SLOW_RATE = 0.8
+"""Rate of a channel, in that of the angles, below which it is slow."""
+PASSED_BAND = 0.1
+"""Frequency, in rates of a channel, up to which interpolation keeps amplitudes."""
+
+NamedChannels = dict[str, Matrix]
+"""Values (rows x joints) by channel; those that are not finite are not there."""
+
+
+class JoinedChannels(NamedTuple):
+    """Channels at common times."""
+
+    stamps: Vector  # [s]
+    channels: NamedChannels
+    notes: Texts
+
+
+def is_sparse(channels: NamedChannels) -> bool:
+    """Return whether channels have values at different rows, as in a merged table."""
+    has_value = np.isfinite(np.hstack([*channels.values()]))
+    incomplete_share = np.mean(~has_value.all(axis=1))
+    changes = np.count_nonzero(np.diff(has_value, axis=0).any(axis=1))
+    is_mixed = incomplete_share > MIN_SPARSE_SHARE and changes >= MIN_CHANGES
+    return bool(incomplete_share == 1.0 or is_mixed)
+
+
+def join_channels(
+    stamps: Vector, channels: NamedChannels, source: str
+) -> JoinedChannels:
+    """Return channels at the times of the first angle, interpolated linearly.
+
+    Rows before the first or after the last value of a channel, and in its pauses, are
+    left out.
+    """
+    has_stamp = np.isfinite(stamps)
+    rows = np.flatnonzero(has_stamp & np.isfinite(channels["angles"][:, 0]))
+    times = stamps[rows]
+    joined = {}
+    rates: dict[tuple[str, float], list[str]] = {}
+    for channel, values in channels.items():
+        columns = []
+        for j, column in enumerate(values.T):
+            series = np.flatnonzero(has_stamp & np.isfinite(column))
+            if np.array_equal(series, rows):
+                columns.append(column[rows])
+            else:
+                order = series[np.argsort(stamps[series], kind="stable")]
+                method = _interpolate_angle if channel == "angles" else interpolate
+                columns.append(method(stamps[order], column[order], times))
+                key = channel, _rate(stamps[order])
+                rates.setdefault(key, []).append(str(j + 1))
+        joined[channel] = np.column_stack(columns)
+    is_common = np.isfinite(np.hstack([*joined.values()])).all(axis=1)
+    if not is_common.any():
+        raise InputError(
+            f"the channels of `{source}` overlap nowhere in time: compare their clocks."
+        )
+    notes = [
+        _rate_note(channel, joints, rate, _rate(times))
+        for (channel, rate), joints in rates.items()
+    ]
+    lost_rows = int(np.sum(~is_common))
+    if lost_rows:
+        notes.append(
+            f"{lost_rows} of {len(rows)} rows of the angles were left out: other "
+            "channels pause there"
+        )
+    common = {channel: values[is_common] for channel, values in joined.items()}
+    return JoinedChannels(times[is_common], common, tuple(notes))
+
+
+def _rate(times: Vector) -> float:
+    """Return the typical number of values in a second [Hz]."""
+    steps = np.diff(times)
+    steps = steps[steps > 0]
+    return float(f"{1.0 / np.median(steps):.3g}") if steps.size else 0.0
+
+
+def _rate_note(channel: str, joints: list[str], rate: float, main_rate: float) -> str:
+    """Return a remark about a channel with other times, and what its rate costs."""
+    note = (
+        f"`{channel}` of joints {', '.join(joints)} have times of their own "
+        f"({rate:g} Hz): interpolated linearly at those of the angles "
+        f"({main_rate:g} Hz)"
+    )
+    if rate < SLOW_RATE * main_rate:
+        note += (
+            f"; this weakens what is faster than {PASSED_BAND * rate:.3g} Hz: record "
+            "both at one rate, or keep `filter.cutoff` below that"
+        )
+    return note
+
+
+def interpolate(times: Vector, values: Vector, targets: Vector) -> Vector:
+    """Return values at other times; NaN outside and in pauses."""
+    nan = np.nan
+    target_values = np.interp(targets, times, values, left=nan, right=nan)
+    steps = np.diff(times, prepend=times[0])
+    max_step = MAX_STEP_RATIO * np.median(steps)
+    # The step that ends at or after each target.
+    index = np.searchsorted(times, targets)
+    index = np.minimum(index, len(times) - 1)
+    is_after_pause = steps[index] > max_step
+    is_between = times[index] != targets
+    target_values[is_after_pause & is_between] = nan
+    return target_values
+
+
+def _interpolate_angle(times: Vector, values: Vector, targets: Vector) -> Vector:
+    """Return angles at other times; those that jump by full turns go on doing so."""
+    unwrapped = np.unwrap(values)
+    if np.ptp(values) > 1.01 * 2 * np.pi:
+        # Fast motors turn by half a turn between two values, too.
+        unwrapped = values
+    index = np.searchsorted(times, targets, "right") - 1
+    turns = (unwrapped - values)[np.maximum(index, 0)]
+    return interpolate(times, unwrapped, targets) - turns
