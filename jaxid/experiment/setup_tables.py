@@ -222,8 +222,8 @@ class Sides:
         }
 
 
-SIDES = ("angles_on_motor_side", "forces_on_motor_side")
-"""Arguments of `Columns` for which the file has `side` and `forces_side`."""
+SIDES = ("angles_on_motor_side", "forces_on_motor_side", "joint_names")
+"""Arguments of `Columns` that `side`, `forces_side` and the robot tell."""
 
 
 def build_columns(table: TomlTable, robot: Robot) -> tuple[Columns, LogReading]:
@@ -236,7 +236,9 @@ def build_columns(table: TomlTable, robot: Robot) -> tuple[Columns, LogReading]:
         [Columns, Sides, LogReading], table, "recording", skip=SIDES
     )
     with within("recording"):
-        columns = Columns(**arguments, **Sides(**sides).of_columns)
+        columns = Columns(
+            **arguments, **Sides(**sides).of_columns, joint_names=robot.joint_names
+        )
         zeros = np.zeros((1, robot.joints))
         columns.to_si(zeros, zeros, zeros)  # refuses lists that do not fit the robot
         require_fitting_units(columns, robot, arguments)

@@ -69,6 +69,8 @@ class Columns:
             gears.
         forces_on_motor_side: Whether forces are the motors', before the gears.
         unwrap: Whether angles jump by full turns, which is undone.
+        joint_names: Names of the robot's joints: arrays of bags are read by them, if
+            the messages name their elements so; by place if None.
     """
 
     angles: Selection
@@ -89,6 +91,7 @@ class Columns:
     angles_on_motor_side: bool = False
     forces_on_motor_side: bool = False
     unwrap: bool = False
+    joint_names: tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
         """Make tuples of lists and arrays, and refuse contradictions."""
@@ -292,7 +295,7 @@ def open_log(
         selections.setdefault(Path(file_path), {})[channel] = selection
     tables = []
     for file_path, file_selections in selections.items():
-        file = open_log_file(file_path, file_selections)
+        file = open_log_file(file_path, file_selections, columns.joint_names)
         bad_rows = {} if is_lenient else None
         tables.append(file.table(file.channels(), on_disk, bad_rows))
     for table in tables:

@@ -185,6 +185,29 @@ def test_unknown_topics_and_fields_list_what_there_is(tmp_path):
     )
 
 
+@pytest.mark.parametrize("field", ["{}[{{}}]", "{}"])
+@pytest.mark.parametrize("order", [(2, 0, 1), (1, 0, 2), (0, 1, 2)])
+def test_arrays_are_read_in_the_order_that_messages_state(tmp_path, field, order):
+    """Also where a gripper stands between the joints of the robot."""
+    messages = []
+    for k, row in enumerate(zip(*numbers(), strict=True)):
+        names = [*(JOINTS[j] for j in order[:2]), "gripper", JOINTS[order[2]]]
+        values = [np.insert(x[list(order)], 2, 9.0) for x in row]
+        stamp = START + k * STEP
+        messages.append(("/js", stamp, joint_state(ROS2, stamp, names, *values)))
+    path = write_mcap(tmp_path / "a.mcap", messages)
+    groups = [field.format(f"/js.{x}") for x in ("position", "effort", "velocity")]
+    r = read_recording(path, Columns(*groups, joint_names=JOINTS))
+    check(dataclasses.replace(r, notes=()))
+    (note,) = r.notes
+    assert f"the joints {', '.join(names)} in this order" in note
+    assert "`/js.position.{name}`" in note
+    others = ("a1", "a2", "a3", "a4")
+    r = read_recording(path, Columns(*groups, joint_names=others))
+    assert r.joints == 4
+    assert "read by place" in r.notes[0]
+
+
 def test_two_robots_on_one_topic_are_told_apart(tmp_path):
     hand = states(ROS2, joints=("thumb", "index", "palm"), lag=900_000)
     mixed = write_mcap(tmp_path / "a.mcap", states(ROS2, shuffled=True) + hand)

@@ -52,7 +52,39 @@ class BagFile(AbstractLogFile):
     def table(self, channels, on_disk, bad_rows):  # noqa: D102
         names = list(itertools.chain(*channels.values()))
         columns = join_topics(self.topics, names)
-        return LogTable(self.path.name, columns, channels, bad_rows=bad_rows)
+        return LogTable(
+            self.path.name,
+            columns,
+            channels,
+            bad_rows=bad_rows,
+            notes=tuple(self.notes),
+        )
+
+    def _numbered_names(self, channel, pattern):
+        """Return the elements of an array by the names that its messages state."""
+        names = super()._numbered_names(channel, pattern)
+        if not pattern.endswith("[{}]") or self.joint_names is None:
+            return names
+        prefix = pattern.removesuffix("[{}]") + "."
+        elements = [
+            name.removeprefix(prefix) for name in self.names if name.startswith(prefix)
+        ]
+        is_by_name = set(self.joint_names) <= set(elements)
+        if is_by_name:
+            names = tuple(prefix + joint for joint in self.joint_names)
+        # The angles tell the order of the other channels, too.
+        is_other_order = elements[: len(names)] != [*self.joint_names]
+        if elements and is_other_order and channel == "angles":
+            way = "by place"
+            cure = "the robot's joints have other names: list the columns in its order"
+            if is_by_name:
+                way = "by name"
+                cure = f"`{prefix}{{name}}` says the same"
+            self.notes.append(
+                f"`{pattern}` is read {way}: its messages hold the joints "
+                f"{', '.join(elements)} in this order ({cure})"
+            )
+        return names
 
 
 def selected_topics(selections: Selections) -> set[str]:

@@ -26,11 +26,17 @@ class AbstractLogFile(abc.ABC):
     Attributes:
         path: Path of the file.
         selections: Columns that will be read; a reader may leave out all others.
+        joint_names: Names of the robot's joints; None if they are unknown.
+        notes: Remarks about how columns were selected.
     """
 
-    def __init__(self, path: Path, selections: Selections):
+    def __init__(
+        self, path: Path, selections: Selections, joint_names: Texts | None = None
+    ):
         self.path = path
         self.selections = selections
+        self.joint_names = joint_names
+        self.notes: list[str] = []
 
     @property
     @abc.abstractmethod

@@ -3,6 +3,7 @@
 import contextlib
 from pathlib import Path
 
+from jaxid.arrays import Texts
 from jaxid.errors import InputError
 
 from .array_files import Hdf5File, MatFile, NpzFile
@@ -28,10 +29,12 @@ READERS: dict[str, type[AbstractLogFile]] = {
 """Readers by suffix."""
 
 
-def open_log_file(path: Path, selections: Selections) -> AbstractLogFile:
+def open_log_file(
+    path: Path, selections: Selections, joint_names: Texts | None = None
+) -> AbstractLogFile:
     """Open a file from which some columns will be read; its suffix tells the format."""
     if is_bag_folder(path):
-        return BagFile(path, selections)
+        return BagFile(path, selections, joint_names)
     if not path.is_file():
         raise InputError(
             f"`{path}` is no file and no bag of ROS 2: check the path of the log."
@@ -39,7 +42,7 @@ def open_log_file(path: Path, selections: Selections) -> AbstractLogFile:
     reader = READERS.get(path.suffix.lower())
     if reader is None:
         raise InputError(f"`{path.name}` must end in {', '.join(READERS)}: convert it.")
-    return reader(path, selections)
+    return reader(path, selections, joint_names)
 
 
 def is_bag_folder(path: Path) -> bool:
