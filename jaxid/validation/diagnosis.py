@@ -172,7 +172,7 @@ def diagnose(
     faulty_joints = tuple(dict.fromkeys(joint for joint, _ in faults))
     lost_rows = clock_findings(excerpt)
     findings = [
-        *(text for _, text in faults),
+        *dict.fromkeys(text for _, text in faults),
         *lost_rows,
         *limit_findings(robot, statistics, faulty_joints),
         *stuck_findings(robot, excerpt, faulty_joints),

@@ -62,24 +62,28 @@ def _velocity_findings(
     robot: Robot, recording: Recording, owner: str, statistics: LogStatistics
 ) -> Findings:
     """Compare measured velocities with the derivatives of the angles."""
-    findings = []
+    # One cause is one sentence for all joints that it concerns.
+    causes: dict[str, list[int]] = {}
     for j, ratio in unlike_derivatives(recording).items():
         text = (
-            f"the velocities of {owner} `{robot.joint_names[j]}` are {ratio:.3g} "
-            "times the derivatives of its angles: check `recording.velocity_unit` "
-            "and the order of the columns."
+            f"are {ratio:.3g} times the derivatives of the angles: check "
+            "`recording.velocity_unit` and the order of the columns."
         )
-        findings.append((j, text))
-    for j, name in enumerate(robot.joint_names):
-        lag = statistics.lateness(j)
-        if abs(lag) > MAX_LAG * recording.sample_time:
-            direction = "later" if lag > 0 else "earlier"
+        causes.setdefault(text, []).append(j)
+    lags = np.array([statistics.lateness(j) for j in range(robot.joints)])
+    for direction, delays in (("later", lags), ("earlier", -lags)):
+        joints = np.flatnonzero(delays > MAX_LAG * recording.sample_time).tolist()
+        if joints:
+            delay = 1e3 * np.median(delays[joints])
             text = (
-                f"the velocities of joint `{name}` stand {1e3 * abs(lag):.3g} ms "
-                f"{direction} in the log than the derivatives of its angles: leave "
-                "`recording.velocities` out."
+                f"stand {delay:.2g} ms {direction} in the log than the derivatives of "
+                "the angles: leave `recording.velocities` out."
             )
-            findings.append((j, text))
+            causes[text] = joints
+    findings = []
+    for text, joints in causes.items():
+        names = "`, `".join(robot.joint_names[j] for j in joints)
+        findings += [(j, f"the velocities of {owner} `{names}` {text}") for j in joints]
     return findings
 
 
