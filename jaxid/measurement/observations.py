@@ -409,8 +409,11 @@ def prepare(
         )
     decimation = Subsample(1) if decimation is None else decimation
     dt = grid.sample_time
-    decimation.check(filter.low_pass(dt).cutoff, dt)
-    edge = filter.edge(dt)
+    try:
+        decimation.check(filter.low_pass(dt).cutoff, dt)
+        edge = filter.edge(dt)
+    except InputError as error:
+        raise InputError(f"`{name}`: {error}") from error
     grid = _usable_segments(grid, edge, decimation.factor, name)
     notes = grid.notes
     if has_velocities and not filter.uses_velocities:
@@ -458,7 +461,7 @@ def _usable_segments(grid: TimeGrid, edge: int, factor: int, name: str) -> TimeG
             f"the longest segment of `{name}` has {samples} samples at "
             f"{1 / grid.sample_time:.6g} Hz, but the filter takes {edge} at each end, "
             f"and {MIN_ROWS * factor} more are needed: record longer, raise "
-            "`largest_gap`, lower `margin`, or check `time_unit`."
+            "`largest_gap`, lower `margin`, check `time_unit`, or leave this log out."
         )
     notes = grid.notes
     lost_segments = len(grid.segments) - len(segments)

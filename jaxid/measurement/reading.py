@@ -28,9 +28,11 @@ PART_SIZE = 65536
 MAX_BAD_ROWS = 1e-3
 """Fraction of the rows of a log that may be bad."""
 MAX_STRAY_STAMPS = 1e-2
-"""Fraction of the rows whose stamps are wrong, and not only out of order."""
+"""Fraction of the rows that may have a wrong stamp; more are out of order only."""
 MAX_NAMED_ROWS = 20
-"""Bad rows that are named."""
+"""Causes of bad rows that are named."""
+MAX_EQUAL_ROWS = 5
+"""Rows that are named for one cause."""
 
 
 def read_recording(
@@ -85,10 +87,7 @@ def read_recording(
         notes += join_notes
     rows = len(channels["angles"])
     if stamps is not None:
-        strays = _stray_stamps(stamps, complaints, log.tables[0])
-        # So many rows out of order are no wrong stamps: they are sorted.
-        if len(strays) <= MAX_STRAY_STAMPS * rows:
-            complaints |= strays
+        complaints |= _stray_stamps(stamps, complaints, log.tables[0])
     good_rows = slice(None)
     if complaints:
         good_rows = np.setdiff1d(np.arange(rows), [*complaints])
@@ -117,10 +116,18 @@ def read_recording(
 def _bad_row_note(complaints: Complaints, rows: int, max_share: float) -> str:
     """Return a remark about the rows that are left out; refuse too many of them."""
     count = len(complaints)
-    texts = [text for _, text in sorted(complaints.items())]
+    places: dict[str, list[str]] = {}
+    for _, text in sorted(complaints.items()):
+        unit, number, cause = text.split(" ", 2)
+        places.setdefault(f"{unit} {{}} {cause}", []).append(number)
+    texts = []
+    for text, numbers in places.items():
+        more = len(numbers) - MAX_EQUAL_ROWS
+        tail = f" and {more} more" if more > 0 else ""
+        texts.append(text.replace("{}", ", ".join(numbers[:MAX_EQUAL_ROWS]) + tail, 1))
     words = "; ".join(texts[:MAX_NAMED_ROWS])
-    if count > MAX_NAMED_ROWS:
-        words = f"{words}; and {count - MAX_NAMED_ROWS} more"
+    if len(texts) > MAX_NAMED_ROWS:
+        words = f"{words}; and {len(texts) - MAX_NAMED_ROWS} more"
     if count > max_share * rows:
         raise InputError(
             f"{count} of {rows} rows are bad: {words}; repair the log, or let "
@@ -133,33 +140,21 @@ def _bad_row_note(complaints: Complaints, rows: int, max_share: float) -> str:
 def _stray_stamps(
     stamps: Vector, complaints: Complaints, table: LogTable
 ) -> Complaints:
-    """Return complaints about rows whose stamp is out of order, and fits nowhere."""
+    """Return complaints about rows whose stamp alone is far out of order.
+
+    Rows that came late only, and a clock that was set back, are no such complaints.
+    """
     good_rows = np.setdiff1d(np.arange(len(stamps)), [*complaints])
-    good_stamps = stamps[good_rows]
-    sorted_stamps = np.sort(good_stamps)
-    steps = np.diff(sorted_stamps)
-    step = np.median(steps[steps > 0]) if steps.any() else 1.0
-    strays = {}
-    for k in np.flatnonzero(np.diff(good_stamps) < 0).tolist():
-        # Without a stamp that is too late, the next one would be in order.
-        is_late = k == 0 or good_stamps[k + 1] >= good_stamps[k - 1]
-        # Without one that is too early, the next one would be.
-        is_early = (good_stamps[k + 2 : k + 3] >= good_stamps[k]).all()
-        if not is_late and not is_early:
-            continue
-        row = int(good_rows[k if is_late else k + 1])
-        # A row that fills a gap came late only: it is sorted.
-        position = np.searchsorted(sorted_stamps, stamps[row])
-        neighbours = sorted_stamps[max(position - 1, 0) : position + 2]
-        distances = np.diff(neighbours) / step
-        is_filling = distances.min() > 0.5 and distances.max() < 1.5
-        late_rows = abs(position - np.searchsorted(good_rows, row))
-        if not is_filling or late_rows > MAX_LATE_ROWS:
-            strays[row] = (
-                f"{table.unit} {row + table.first_row} (its time {stamps[row]:.9g} s "
-                "is out of order)"
-            )
-    return strays
+    order = np.argsort(stamps[good_rows], kind="stable")
+    shifts = np.abs(order - np.arange(len(order)))
+    stray_rows = good_rows[order[shifts > MAX_LATE_ROWS]].tolist()
+    if len(stray_rows) > 1 + MAX_STRAY_STAMPS * len(stamps):
+        return {}
+    return {
+        row: f"{table.unit} {row + table.first_row} (its time {stamps[row]:.9g} s is "
+        "out of order)"
+        for row in stray_rows
+    }
 
 
 class SamplesOnDisk(AbstractSamples):

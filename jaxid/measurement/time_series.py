@@ -47,22 +47,23 @@ def join_channels(
     Rows before the first or after the last value of a channel, and in its pauses, are
     left out.
     """
-    has_stamp = np.isfinite(stamps)
-    rows = np.flatnonzero(has_stamp & np.isfinite(channels["angles"][:, 0]))
+    order = np.argsort(stamps, kind="stable")
+    order = order[np.isfinite(stamps[order])]
+    stamps = stamps[order]
+    rows = np.flatnonzero(np.isfinite(channels["angles"][order, 0]))
     times = stamps[rows]
     joined = {}
     rates: dict[tuple[str, float], list[str]] = {}
     for channel, values in channels.items():
+        method = _interpolate_angle if channel == "angles" else interpolate
         columns = []
-        for j, column in enumerate(values.T):
-            series = np.flatnonzero(has_stamp & np.isfinite(column))
+        for j, column in enumerate(values[order].T):
+            series = np.flatnonzero(np.isfinite(column))
             if np.array_equal(series, rows):
                 columns.append(column[rows])
             else:
-                order = series[np.argsort(stamps[series], kind="stable")]
-                method = _interpolate_angle if channel == "angles" else interpolate
-                columns.append(method(stamps[order], column[order], times))
-                key = channel, _rate(stamps[order])
+                columns.append(method(stamps[series], column[series], times))
+                key = channel, _rate(stamps[series])
                 rates.setdefault(key, []).append(str(j + 1))
         joined[channel] = np.column_stack(columns)
     is_common = np.isfinite(np.hstack([*joined.values()])).all(axis=1)

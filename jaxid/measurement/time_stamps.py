@@ -17,8 +17,7 @@ class BurstLimits(NamedTuple):
     """
 
     step: float = 0.1  # steps within bursts, in mean steps
-    share: float = 0.4  # smallest fraction of such steps, equal stamps included
-    distinct_share: float = 0.1  # smallest fraction of such steps above zero
+    share: float = 0.3  # smallest fraction of such steps; equal stamps do not count
     rows: int = 16  # largest mean number of rows of a burst
     bursts: int = 10  # smallest number of bursts
     deviation: float = 0.4  # largest deviation from even times, in burst periods
@@ -62,12 +61,10 @@ def stamp_order(
             "twice: the clock was set back; cut the log there into two files, or give "
             f"`sample_time` (about {step:.4g} s) if its rows are even."
         )
-    is_long = even_rows.max() > MAX_LATE_ROWS
-    cause = " (the clock was set back, or parts are exchanged)" if is_long else ""
     plural = "s" if ends.size > 1 else ""
     note = (
-        f"time runs backwards at {ends.size} row{plural}, farthest {place}{cause}: the "
-        "rows were sorted by their stamps"
+        f"time runs backwards at {ends.size} row{plural}, farthest {place}: the rows "
+        " were sorted by their stamps"
     )
     return order, (note,)
 
@@ -79,8 +76,7 @@ def burst_length(stamps: Vector) -> float:
     bursts = np.count_nonzero(~is_short) + 1
     length = len(stamps) / bursts
     is_likely = (
-        is_short.mean() >= BURSTS.share
-        and np.mean(is_short & (steps > 0)) >= BURSTS.distinct_share
+        np.mean(is_short & (steps > 0)) >= BURSTS.share
         and bursts >= BURSTS.bursts
         and length <= BURSTS.rows
     )
@@ -100,9 +96,9 @@ def even_stamps(stamps: Vector, source: str) -> tuple[Vector, Texts]:
     # The last row of a burst was measured just before the burst was received.
     is_last = np.append(steps >= BURSTS.step * steps.mean(), True)
     rows = np.flatnonzero(is_last)
-    times = stamps[rows]
-    sample_time, start = np.polyfit(rows, times - times[0], 1)
-    deviation = np.abs(start + sample_time * rows - (times - times[0])).max()
+    times = stamps[rows] - stamps[0]
+    sample_time, start = np.polyfit(rows, times, 1)
+    deviation = np.abs(start + sample_time * rows - times).max()
     period = length * sample_time
     text = f"rows were received in bursts of about {length:.3g}, every {period:.4g} s"
     if deviation > BURSTS.deviation * period:

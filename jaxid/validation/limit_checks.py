@@ -12,6 +12,8 @@ from .torque_errors import REST_SHARE
 
 MAX_LIMIT_RATIO = 1.1
 """Measured speed or force, relative to its limit, that noise and filters explain."""
+MIN_SPAN = 0.02
+"""Smallest range of a joint that is a motion [rad or m]."""
 
 
 class LogStatistics:
@@ -81,6 +83,12 @@ def limit_findings(
 
     Joints in `faulty_joints` have faults of single channels, which explain more.
     """
+    spans = statistics.highest - statistics.lowest
+    if spans.max() < MIN_SPAN:
+        return [
+            f"no joint moves by more than {spans.max():.2g} rad or m: name other "
+            "columns, check `recording.angle_unit`, or leave this log out."
+        ]
     findings = _common_force_findings(robot, statistics) if not faulty_joints else []
     if not findings:
         findings += _force_findings(robot, statistics, faulty_joints)
@@ -122,7 +130,7 @@ def _joint_findings(robot: Robot, j: int, statistics: LogStatistics) -> Iterator
             "the cut-off."
         )
     span = maximum - minimum
-    if span < 0.02:
+    if span < MIN_SPAN:
         yield (
             f"joint `{name}` moves by {span:.2g} {unit} only: is it the right column "
             "and unit?"

@@ -165,7 +165,7 @@ def load_logs(
         if log.diagnosis.statistics.speed.max() < MIN_SPEED_OF_MOTION:
             raise InputError(
                 f"no joint moves in `{log.observations.name}`: "
-                "name other columns, or another log."
+                "name other columns, or leave this log out."
             )
         loaded_logs.append(log)
     return loaded_logs

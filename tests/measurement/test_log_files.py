@@ -310,6 +310,17 @@ def test_bad_rows_are_left_out_and_counted(tmp_path, timed):
     assert "\n" not in str(error.value)
 
 
+def test_equal_complaints_are_one(tmp_path):
+    cells = ["nan" if 20 <= k < 35 else f"{np.cos(0.01 * k)}" for k in range(600)]
+    rows = [f"{0.01 * k},{k},1,{cells[k]}" for k in range(600)]
+    (tmp_path / "log.csv").write_text("\n".join(["t,q1,other,tau1", *rows]))
+    with pytest.raises(ValueError, match="15 of 600 rows are bad") as error:
+        read_recording(tmp_path / "log.csv", PLAIN)
+    text = "line 22, 23, 24, 25, 26 and 10 more (`tau1` is not finite"
+    assert text in str(error.value)
+    assert str(error.value).count("not finite") == 1
+
+
 def test_lengths_and_shapes_must_agree(tmp_path):
     log = a_log()
     path = write_csv(tmp_path / "q.csv", log)

@@ -159,6 +159,13 @@ def test_stamps_that_are_late_lose_no_rows():
     assert "name the column" not in said
 
 
+def test_a_log_without_motion_is_one_sentence():
+    still = Recording.of(0.001 * Q, TAU, sample_time=DT)
+    found = [text for text in diagnose(still, ROBOT).findings if "mov" in text]
+    assert len(found) == 1
+    assert "leave this log out" in found[0]
+
+
 def test_slow_motion_in_increments_of_an_encoder_loses_no_rows():
     """Steps of one increment, at times of two: second differences are only rounding."""
     increments = np.round(1.03 * np.arange(len(Q)))

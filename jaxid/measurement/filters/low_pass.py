@@ -255,6 +255,6 @@ def require_cutoff(name: str, cutoff: float, sample_time: float) -> None:
     if not 1e-5 * rate <= cutoff < 0.5 * rate:
         raise InputError(
             f"`{name}` of {cutoff:.6g} Hz must be below half of the sampling rate of "
-            f"{rate:.6g} Hz (and above 1e-5 of it): log faster than {2 * cutoff:.6g} "
-            "Hz, or check `time_unit`."
+            f"{rate:.6g} Hz (and above 1e-5 of it): lower it, or take only logs "
+            f"faster than {2 * cutoff:.6g} Hz; if this one is, check `time_unit`."
         )
