@@ -17,6 +17,7 @@ from jaxid.arrays import AnyArray, Float, JointSamples, Texts, Vector
 from jaxid.errors import InputError
 
 from .time_grid import MIN_SAMPLES, Ranges, TimeGrid, resampling
+from .time_series import interpolate_turns
 
 MAX_NUMBER = 1e30
 """Largest number in a log, in any unit: its square still is finite."""
@@ -122,7 +123,9 @@ class Recording(eqx.Module):
         if time is not None:
             stamps = _finite_stamps(name, time, samples)
             resample = resampling(stamps, name, (largest_gap, bridged), first_row)
+            q = interpolate_turns(resample, data["angles"])
             data = {key: None if x is None else resample(x) for key, x in data.items()}
+            data["angles"] = q
             grid = resample.grid
             times = resample.times
             deviation = grid.deviation / grid.sample_time

@@ -1,5 +1,7 @@
 """Channels with times of their own, interpolated at the times of the first angle."""
 
+from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -55,14 +57,17 @@ def join_channels(
     joined = {}
     rates: dict[tuple[str, float], list[str]] = {}
     for channel, values in channels.items():
-        method = _interpolate_angle if channel == "angles" else interpolate
         columns = []
         for j, column in enumerate(values[order].T):
             series = np.flatnonzero(np.isfinite(column))
             if np.array_equal(series, rows):
                 columns.append(column[rows])
             else:
-                columns.append(method(stamps[series], column[series], times))
+                method = partial(interpolate, stamps[series], targets=times)
+                if channel == "angles":
+                    columns.append(interpolate_turns(method, column[series]))
+                else:
+                    columns.append(method(column[series]))
                 key = channel, _rate(stamps[series])
                 rates.setdefault(key, []).append(str(j + 1))
         joined[channel] = np.column_stack(columns)
@@ -122,12 +127,20 @@ def interpolate(times: Vector, values: Vector, targets: Vector) -> Vector:
     return target_values
 
 
-def _interpolate_angle(times: Vector, values: Vector, targets: Vector) -> Vector:
-    """Return angles at other times; those that jump by full turns go on doing so."""
-    unwrapped = np.unwrap(values)
-    if np.ptp(values) > 1.01 * 2 * np.pi:
-        # Fast motors turn by half a turn between two values, too.
-        unwrapped = values
-    index = np.searchsorted(times, targets, "right") - 1
-    turns = (unwrapped - values)[np.maximum(index, 0)]
-    return interpolate(times, unwrapped, targets) - turns
+def interpolate_turns(
+    method: Callable[[np.ndarray], np.ndarray], angles: np.ndarray
+) -> np.ndarray:
+    """Interpolate angles; those that jump by full turns go on doing so.
+
+    Args:
+        method: Interpolation of smooth channels.
+        angles: Angles (rows, or rows x joints) [rad].
+    """
+    turn = 2 * np.pi
+    unwrapped = np.unwrap(angles, axis=0)
+    # Fast motors turn by half a turn between two values, too, but go on and on.
+    is_within_turn = np.ptp(angles, axis=0) <= 1.01 * turn
+    has_jumps = is_within_turn & (unwrapped != angles).any(axis=0)
+    values = method(np.where(has_jumps, unwrapped, angles))
+    lower_limit = angles.min(axis=0) - 1e-9
+    return np.where(has_jumps, lower_limit + (values - lower_limit) % turn, values)

@@ -64,7 +64,7 @@ def stamp_order(
     plural = "s" if ends.size > 1 else ""
     note = (
         f"time runs backwards at {ends.size} row{plural}, farthest {place}: the rows "
-        " were sorted by their stamps"
+        "were sorted by their stamps"
     )
     return order, (note,)
 

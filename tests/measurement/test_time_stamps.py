@@ -55,6 +55,22 @@ def test_a_clock_that_was_set_back_is_refused(shift):
         recording(np.arange(600), stamps)
 
 
+def test_turns_are_not_smeared_by_jitter():
+    """A joint that turns on and on, whose angle starts again at 180 degrees."""
+    rng = np.random.default_rng(3)
+    stamps = TIMES + STEP * rng.uniform(-0.2, 0.2, 600)
+    stamps -= stamps[0]
+    angle = 1.3 * stamps + np.sin(stamps)
+    x = np.stack([(angle + np.pi) % (2 * np.pi) - np.pi, np.sin(stamps)], axis=1)
+    r = Recording.of(x, x, time=stamps)
+    assert "jitter" in r.notes[-1]
+    expected = 1.3 * r.time + np.sin(r.time)
+    turns = (r.angles[:, 0] - expected) / (2 * np.pi)
+    np.testing.assert_allclose(turns, np.round(turns), atol=1e-5)
+    assert np.ptp(r.angles[:, 0]) < 2 * np.pi
+    np.testing.assert_allclose(r.angles[:, 1], np.sin(r.time), atol=1e-5)
+
+
 def bursts(lengths, delay=1e-4):
     """Return stamps of reception of bursts with these numbers of rows."""
     ends = np.cumsum(lengths)

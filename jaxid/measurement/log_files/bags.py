@@ -76,7 +76,7 @@ class BagFile(AbstractLogFile):
         is_other_order = elements[: len(names)] != [*self.joint_names]
         if elements and is_other_order and channel == "angles":
             way = "by place"
-            cure = "the robot's joints have other names: list the columns in its order"
+            cure = "list the columns if that is not the order of the robot"
             if is_by_name:
                 way = "by name"
                 cure = f"`{prefix}{{name}}` says the same"

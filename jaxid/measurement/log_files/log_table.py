@@ -14,6 +14,8 @@ from jaxid.arrays import Matrix, Texts, Vector
 from jaxid.errors import InputError
 
 from ..recording import MAX_NUMBER
+from ..time_grid import NeedsMemory
+from ..time_series import MIN_SPARSE_SHARE
 
 Complaints = dict[int, str]
 """Complaints about rows, by their numbers."""
@@ -175,6 +177,11 @@ class LogTable:
                 words = complaint.format(column[k])
                 text = f"{self.unit} {number} (`{name}` {words})"
                 self.bad_rows.setdefault(number, text)
+        elif len(rows) > MIN_SPARSE_SHARE * len(is_bad):
+            raise NeedsMemory(
+                f"many cells of `{name}` of `{self.source}` hold no number, as in "
+                "merged tables, which `read_recording` reads."
+            )
         elif rows:
             number = rows[0] + self.first_row
             words = complaint.format(column[rows[0]])
