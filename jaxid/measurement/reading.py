@@ -116,15 +116,7 @@ def read_recording(
 def _bad_row_note(complaints: Complaints, rows: int, max_share: float) -> str:
     """Return a remark about the rows that are left out; refuse too many of them."""
     count = len(complaints)
-    places: dict[str, list[str]] = {}
-    for _, text in sorted(complaints.items()):
-        unit, number, cause = text.split(" ", 2)
-        places.setdefault(f"{unit} {{}} {cause}", []).append(number)
-    texts = []
-    for text, numbers in places.items():
-        more = len(numbers) - MAX_EQUAL_ROWS
-        tail = f" and {more} more" if more > 0 else ""
-        texts.append(text.replace("{}", ", ".join(numbers[:MAX_EQUAL_ROWS]) + tail, 1))
+    texts = _complaints_by_cause(complaints)
     words = "; ".join(texts[:MAX_NAMED_ROWS])
     if len(texts) > MAX_NAMED_ROWS:
         words = f"{words}; and {len(texts) - MAX_NAMED_ROWS} more"
@@ -135,6 +127,21 @@ def _bad_row_note(complaints: Complaints, rows: int, max_share: float) -> str:
         )
     verb = "is bad and was" if count == 1 else "are bad and were"
     return f"{count} of {rows} rows {verb} left out: {words}"
+
+
+def _complaints_by_cause(complaints: Complaints) -> list[str]:
+    """Return one text for all rows with the same cause, like `line 2, 3 (empty)`."""
+    numbers: dict[tuple[str, str], list[str]] = {}
+    for _, text in sorted(complaints.items()):
+        unit, number, cause = text.split(" ", 2)
+        numbers.setdefault((unit, cause), []).append(number)
+    texts = []
+    for (unit, cause), rows in numbers.items():
+        places = ", ".join(rows[:MAX_EQUAL_ROWS])
+        if len(rows) > MAX_EQUAL_ROWS:
+            places = f"{places} and {len(rows) - MAX_EQUAL_ROWS} more"
+        texts.append(f"{unit} {places} {cause}")
+    return texts
 
 
 def _stray_stamps(
