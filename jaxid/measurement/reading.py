@@ -75,14 +75,8 @@ def read_recording(
     if velocities is not None:
         channels["velocities"] = velocities
     if complaints and is_sparse(channels):
-        source = log.tables[0].source
-        if stamps is None:
-            raise InputError(
-                f"the channels of `{source}` have values at different rows, and so "
-                "times of their own: give `time` (its column of time stamps; bags have "
-                "a clock) instead of `sample_time`."
-            )
-        stamps, channels, join_notes = join_channels(stamps, channels, source)
+        joined_channels = join_channels(stamps, channels, log.tables[0].source)
+        stamps, channels, join_notes = joined_channels
         complaints = {}
         notes += join_notes
     rows = len(channels["angles"])

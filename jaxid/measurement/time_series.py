@@ -42,13 +42,22 @@ def is_sparse(channels: NamedChannels) -> bool:
 
 
 def join_channels(
-    stamps: Vector, channels: NamedChannels, source: str
+    stamps: Vector | None, channels: NamedChannels, source: str
 ) -> JoinedChannels:
     """Return channels at the times of the first angle, interpolated linearly.
 
     Rows before the first or after the last value of a channel, and in its pauses, are
     left out.
+
+    Raises:
+        InputError: If there are no stamps, or no common times.
     """
+    if stamps is None:
+        raise InputError(
+            f"the channels of `{source}` have values at different rows, and so times "
+            "of their own: give `time` (its column of time stamps; bags have a clock) "
+            "instead of `sample_time`."
+        )
     order = np.argsort(stamps, kind="stable")
     order = order[np.isfinite(stamps[order])]
     stamps = stamps[order]
