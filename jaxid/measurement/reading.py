@@ -74,7 +74,7 @@ def read_recording(
     channels = {"angles": angles, "forces": forces}
     if velocities is not None:
         channels["velocities"] = velocities
-    if complaints and is_sparse(channels):
+    if log.tables[0].is_merged or (complaints and is_sparse(channels)):
         joined_channels = join_channels(stamps, channels, log.tables[0].source)
         stamps, channels, join_notes = joined_channels
         complaints = {}

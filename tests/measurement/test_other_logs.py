@@ -253,6 +253,18 @@ def test_topics_that_share_their_times_are_not_interpolated(tmp_path):
     )
 
 
+def test_some_messages_that_a_topic_lost_are_interpolated(tmp_path):
+    others = states(ROS2, topic="/e")
+    del others[10], others[20]
+    path = write_mcap(tmp_path / "a.mcap", states(ROS2) + others)
+    r = read_recording(path, Columns("/js.position[{}]", "/e.effort[{}]"))
+    angles, _, efforts = numbers()
+    np.testing.assert_array_equal(r.angles, angles)
+    efforts[10] = 0.5 * (efforts[9] + efforts[11])
+    efforts[21] = 0.5 * (efforts[20] + efforts[22])
+    np.testing.assert_allclose(r.forces, efforts, atol=1e-9)
+
+
 def test_topics_without_common_times(tmp_path):
     messages = states(ROS2, stop=20) + states(ROS2, topic="/e", start=21)
     path = write_mcap(tmp_path / "a.mcap", messages)

@@ -51,13 +51,14 @@ class BagFile(AbstractLogFile):
 
     def table(self, channels, on_disk, bad_rows):  # noqa: D102
         names = list(itertools.chain(*channels.values()))
-        columns = join_topics(self.topics, names)
+        columns, is_merged = join_topics(self.topics, names)
         return LogTable(
             self.path.name,
             columns,
             channels,
             bad_rows=bad_rows,
             notes=tuple(self.notes),
+            is_merged=is_merged,
         )
 
     def _numbered_names(self, channel, pattern):
@@ -250,8 +251,12 @@ def _array_fields(
             yield from _fields(item, f"{name}{element}.", element_names)
 
 
-def join_topics(topics: Sequence[Topic], names: Sequence[str]) -> dict[str, Any]:
-    """Return columns at all of their times, NaN where they have no value.
+def join_topics(
+    topics: Sequence[Topic], names: Sequence[str]
+) -> tuple[dict[str, Any], bool]:
+    """Return columns at all of their times, and whether some have times of their own.
+
+    They are NaN where they have no value.
 
     The times are the stamps in the headers if all of the topics have them and no time
     of recording is asked for.
@@ -264,15 +269,12 @@ def join_topics(topics: Sequence[Topic], names: Sequence[str]) -> dict[str, Any]
     if clock == CLOCK:
         are_recorded = not all(all(owners[name].stamps) for name in names)
 
-    series = {
-        name: owners[name].time_series(name, are_recorded)
-        for name in dict.fromkeys(names)
-    }
+    series = {name: owners[name].time_series(name, are_recorded) for name in names}
     times = series[names[0]].times
-    if all(np.array_equal(x.times, times) for x in series.values()):
-        columns: dict[str, Any] = {name: x.values for name, x in series.items()}
-    else:
+    is_merged = not all(np.array_equal(x.times, times) for x in series.values())
+    if is_merged:
         times = np.unique(np.concatenate([x.times for x in series.values()]))
-        columns = {name: x.at(times) for name, x in series.items()}
+        series = {name: TimeSeries(times, x.at(times)) for name, x in series.items()}
+    columns: dict[str, Any] = {name: x.values for name, x in series.items()}
     columns[clock] = pl.Series(times.astype("M8[ns]"))
-    return columns
+    return columns, is_merged

@@ -52,6 +52,7 @@ class LogTable:
         bad_rows: Complaints about rows that cannot be read, by their numbers; None if
             the first one is an error.
         notes: Remarks about how the columns were made.
+        is_merged: Whether channels have times of their own, and are NaN at others.
     """
 
     source: str
@@ -61,6 +62,7 @@ class LogTable:
     unit: str = "row"
     bad_rows: BadRows = None
     notes: Texts = ()
+    is_merged: bool = False
 
     @functools.cached_property
     def rows(self) -> int:
