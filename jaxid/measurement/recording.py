@@ -123,10 +123,11 @@ class Recording(eqx.Module):
         if time is not None:
             stamps = _finite_stamps(name, time, samples)
             resample = resampling(stamps, name, (largest_gap, bridged), first_row)
-            q = interpolate_turns(resample, data["angles"])
-            data = {key: None if x is None else resample(x) for key, x in data.items()}
-            data["angles"] = q
             grid = resample.grid
+            q = data["angles"]
+            data = {key: None if x is None else resample(x) for key, x in data.items()}
+            if not grid.is_exact:
+                data["angles"] = interpolate_turns(resample, q)
             times = resample.times
             deviation = grid.deviation / grid.sample_time
         else:
