@@ -38,7 +38,7 @@ def test_rows_out_of_order_are_sorted(tmp_path, exchange):
     r = recording(rows, TIMES[rows])
     check(r)
     assert "sorted by their stamps" in r.notes[0]
-    assert ("set back" in r.notes[0]) == (exchange == "blocks")
+    assert ("from 5.99 s to 0 s at row 251" in r.notes[0]) == (exchange == "blocks")
     path = tmp_path / "log.csv"
     x = np.sin(3 * TIMES[rows])
     pl.DataFrame({"t": TIMES[rows], "q1": x, "tau1": x}).write_csv(path)
