@@ -1,5 +1,6 @@
 """Files that describe robots: URDF, xacro, and MJCF as the URDF of the same tree."""
 
+import re
 import shutil
 import subprocess
 from pathlib import Path
@@ -44,12 +45,35 @@ def _parse(path: str | Path, text: bytes | None = None):
     # No entity of a file makes the parser read other files.
     parser = etree.XMLParser(resolve_entities=False, no_network=True, load_dtd=False)
     try:
-        return etree.fromstring(text, parser)
+        return _tolerant_root(text, parser)
     except etree.XMLSyntaxError as error:
         line = error.lineno or 1
         raise InputError(
             f"`{path}`, line {line}: this is not XML ({error.msg})."
         ) from error
+
+
+def _tolerant_root(text: bytes, parser: Any):
+    """Return the root element of a text with the faults that other programs allow.
+
+    These are double hyphens in comments, and blank lines or comments before `<?xml`.
+    """
+    try:
+        return etree.fromstring(text, parser)
+    except etree.XMLSyntaxError:
+        # Line breaks stay, so that messages name the lines of the file. Beyond the last
+        # end of a comment the search would be slow.
+        head, end, rest = text.rpartition(b"-->")
+        content = re.sub(rb"(?s)<!--.*?-->", _line_breaks, head + end) + rest
+        declaration_first = re.sub(
+            rb"\A(?:\xef\xbb\xbf)?(\s+)(<\?xml[^>]*>)", rb"\2\1", content
+        )
+        return etree.fromstring(declaration_first, parser)
+
+
+def _line_breaks(match: re.Match[bytes]):
+    """Return the line breaks of a match."""
+    return b"\n" * match.group().count(b"\n")
 
 
 def _expand_xacro(path: Path):

@@ -24,6 +24,13 @@ DOUBTFUL_LENGTH = 10.0
 """Length from which on the unit may be a millimetre [m]."""
 MAX_LENGTH = 1000.0
 """Length that no robot reaches [m]."""
+MAX_STATED_LENGTH = 1e5
+"""Longest rail that a file can state, in millimetres; longer ones are no limits."""
+MAX_STATED_ANGLE = 720.0
+"""Largest end of a range that a file can state, in degrees; others are no limits."""
+MAX_RANGE_ANGLE = 8 * np.pi
+"""Largest end of the range of a joint in radians, but for whole eighth turns [rad]."""
+EIGHTH_TURN = np.pi / 4
 DOUBTFUL_SPEED = 50.0
 """Speed from which on the unit may be a degree per second [rad/s]."""
 
@@ -260,14 +267,22 @@ def _require_ranges(low: np.ndarray, high: np.ndarray):
 
 def range_fault(low: float, high: float, revolute: bool) -> str:
     """Return a predicate that says why no joint has such a range; or ""."""
-    ends = [end for end in (low, high) if np.isfinite(end)]
+    max_end = MAX_STATED_ANGLE if revolute else MAX_STATED_LENGTH
+    # Files state huge ends where a joint has no limits.
+    ends = [end for end in (low, high) if abs(end) <= max_end]
     end = max(ends, key=abs, default=0.0)
-    max_end = 8 * np.pi if revolute else MAX_LENGTH
-    if abs(end) <= max_end:
-        return ""
-    if revolute:
+    if revolute and seems_in_degrees(end):
         return f"ranges to {end:g} rad, which is {abs(end) / (2 * np.pi):.3g} turns"
-    return f"ranges to {end:g} m, which no robot does"
+    if not revolute and abs(end) > MAX_LENGTH:
+        return f"ranges to {end:g} m, which no robot does"
+    return ""
+
+
+def seems_in_degrees(angle: float) -> bool:
+    """Return whether an angle is far too large for radians, and no eighth turns."""
+    rest = abs(angle) % EIGHTH_TURN
+    rounding = min(rest, EIGHTH_TURN - rest)
+    return abs(angle) > MAX_RANGE_ANGLE and rounding > 1e-3
 
 
 def length_notes(owner: str, lengths: Numbers) -> list[str]:

@@ -8,12 +8,18 @@ import numpy as np
 from jaxid.arrays import AnyArray, Joints, Numbers
 from jaxid.errors import InputError
 
-from .limits_and_drives import Limits, owners, range_fault
+from .limits_and_drives import (
+    MAX_STATED_ANGLE,
+    MAX_STATED_LENGTH,
+    Limits,
+    owners,
+    range_fault,
+)
 from .robot import Robot
-from .urdf_tree import ORIGIN, TURNING_TYPES, UrdfTree, link_names
+from .urdf_tree import ORIGIN, TURNING_TYPES, UrdfTree
 
-UNLIMITED_RANGE = 2e4
-"""Range of a joint that turns without end [rad]."""
+MIN_RANGE = 1e-6
+"""Length of a range below which it is empty, up to rounding [rad or m]."""
 
 
 def load_urdf(
@@ -70,7 +76,7 @@ def load_urdf(
         # An attitude of the base that the user gives is that on level ground.
         gravity = tree.gravity
         if base_rotation is None:
-            gravity = tree.mount.gravity
+            gravity = tree.base_gravity
             notes = (*_mount_notes(tree, base), *notes)
     tip_body, tip_rotation, tip_offset = tree.carriers[tree.tip]
     try:
@@ -157,8 +163,10 @@ def _limits(tree: UrdfTree):
     for i, joint in enumerate(tree.joints):
         name = joint.get("name")
         low[i], high[i] = _checked_range(tree, joint)
-        if tree.range(joint) == (0.0, 0.0):
-            unknown_limits.setdefault("a range from 0 to 0", []).append(name)
+        stated_low, stated_high = tree.range(joint)
+        if (low[i], high[i]) != (stated_low, stated_high):
+            stated_range = f"a range from {stated_low:g} to {stated_high:g}"
+            unknown_limits.setdefault(stated_range, []).append(name)
         # Files often state zero for what nobody has looked up.
         for key, values in magnitudes.items():
             value = tree.limit(joint, key, np.inf)
@@ -180,48 +188,41 @@ def _limits(tree: UrdfTree):
 
 
 def _checked_range(tree: UrdfTree, joint: Any):
-    """Return a joint's range; infinite if it turns without end, or both ends are 0."""
+    """Return a joint's range; infinite if it is empty, or where no joint can end."""
     turns = joint.get("type") in TURNING_TYPES
     low, high = tree.range(joint)
-    is_unlimited = turns and high - low >= UNLIMITED_RANGE
-    if is_unlimited or low == high == 0.0:
-        return -np.inf, np.inf
     fault = range_fault(low, high, turns)
     if fault:
         unit = "radians, not degrees" if turns else "metres"
         raise tree.error(joint, f"{fault}: its limits must be in {unit}")
-    if low >= high:
-        raise tree.error(joint, f"ranges from {low:g} to {high:g}: exchange the ends")
-    return low, high
+    if low > high:
+        raise tree.error(
+            joint,
+            f"ranges from {low:g} to {high:g}: exchange the ends, or state both",
+        )
+    if high - low < MIN_RANGE:
+        return -np.inf, np.inf
+    max_end = MAX_STATED_ANGLE if turns else MAX_STATED_LENGTH
+    return (
+        low if abs(low) <= max_end else -np.inf,
+        high if abs(high) <= max_end else np.inf,
+    )
 
 
 def _mount_notes(tree: UrdfTree, base: str | None):
-    """Return notes on joints above the base that decide where gravity points in it."""
-    gravity = np.array(tree.gravity, np.float64)
-    mount = tree.mount
-    notes = []
-    # The angle is precise near 0 and 180 degrees, too.
-    sine = np.linalg.norm(np.cross(mount.gravity, gravity))
-    angle = np.rad2deg(np.arctan2(sine, mount.gravity @ gravity))
-    if angle > 1e-4:
-        joints = owners("joint", [joint.get("name") for joint in mount.tilting_joints])
-        if tree.compiled:
-            links = [link_names(joint)[1] for joint in mount.tilting_joints]
-            joints = owners("frame", links)
-        vector = ", ".join(f"{x:.4g}" for x in mount.gravity)
-        notes.append(
-            f"link `{base}` is tilted by {angle:.4g} degrees by {joints} above it: "
-            f"gravity in its frame is [{vector}] m/s²; if it stands otherwise, give "
-            "`gravity` or `base_rotation`."
-        )
-    if mount.moving_joints:
-        joints = owners("joint", [joint.get("name") for joint in mount.moving_joints])
-        notes.append(
-            f"{joints} above `{base}`: gravity is that with the joint held at "
-            "zero, or as near to zero as its range allows; if it stands otherwise, "
-            "give `gravity`."
-        )
-    return notes
+    """Return a note if joints above the base decide where gravity points in it."""
+    if not tree.tilting_joints:
+        return []
+    joints = owners("joint", [joint.get("name") for joint in tree.tilting_joints])
+    g = tree.base_gravity
+    cosine = g @ np.asarray(tree.gravity) / (g @ g)
+    angle = np.rad2deg(np.arccos(np.clip(cosine, -1.0, 1.0)))
+    vector = ", ".join(f"{x:.4g}" for x in g)
+    return [
+        f"link `{base}` is tilted by {angle:.3g} degrees by {joints} above it (moving "
+        f"ones are held near zero): gravity in its frame is [{vector}] m/s²; if it "
+        "stands otherwise, give `gravity` or `base_rotation`."
+    ]
 
 
 def _held_notes(tree: UrdfTree):

@@ -12,7 +12,7 @@ from jaxid.errors import InputError
 
 from .description_files import is_mjcf, read_description
 from .inertia import BodyParameters, Inertia
-from .limits_and_drives import listed
+from .limits_and_drives import listed, seems_in_degrees
 from .mjcf import Loop
 from .rotations import axis_rotation, rpy_rotation, without_rounding
 
@@ -20,10 +20,12 @@ TURNING_TYPES = ("revolute", "continuous")
 """Types of joints that turn."""
 HOLDABLE_TYPES = (*TURNING_TYPES, "prismatic", "fixed")
 """Types of joints that can be held at one coordinate."""
+MAX_ROUNDING = 1e-6
+"""Change of gravity's direction that is rounding [rad]."""
 ORIGIN = (0.0, 0.0, 0.0)
 """Position, or roll, pitch and yaw, where a file states none."""
-MAX_ANGLE = 2 * np.pi + 0.01
-"""Largest angle that can be in radians; a full turn may be rounded [rad]."""
+FULL_TURN = 2 * np.pi + 0.01
+"""Angle up to which every number is in radians; a full turn may be rounded [rad]."""
 
 
 class Placement(NamedTuple):
@@ -40,20 +42,6 @@ class Placement(NamedTuple):
     position: Vector3
 
 
-class Mount(NamedTuple):
-    """Gravity in the frame of a base, and the joints above it that decide on it.
-
-    Attributes:
-        gravity: Acceleration of gravity in the frame of the base [m/s²].
-        tilting_joints: Joints whose frames are turned against gravity.
-        moving_joints: Joints that could turn the base against gravity, but are held.
-    """
-
-    gravity: Vector3
-    tilting_joints: list[Any]
-    moving_joints: list[Any]
-
-
 class UrdfTree:
     """Links and joints of a URDF or MJCF file, merged into bodies.
 
@@ -63,7 +51,8 @@ class UrdfTree:
 
     Attributes:
         gravity: Acceleration of gravity in the frame of the file's root [m/s²].
-        mount: How the file places the base in that gravity.
+        base_gravity: The same in the frame of the base, as the joints above it turn it.
+        tilting_joints: Elements of these joints, as far as they tilt the base, or can.
         links: Elements of the links, by name.
         carriers: For each link its placement on the body that carries it.
         joints: Elements of the moving joints.
@@ -114,7 +103,10 @@ class UrdfTree:
         self.side_joints = []
         self.objects = []
         self.carriers: dict[str, Placement] = {}
-        self.mount = self._mount(self._chain(root, base or root)[::-1])
+        self.base_gravity = np.array(self.gravity, np.float64)
+        self.tilting_joints = []
+        for joint in reversed(self._chain(root, base or root)):
+            self._turn_gravity(joint)
         self._merge(base or root, tip)
         self._refuse_loops(loops)
 
@@ -157,8 +149,9 @@ class UrdfTree:
         tree_links = list(roots)
         for link in tree_links:
             tree_links += [link_names(joint)[1] for joint in self._below[link]]
+        reached_links = set(tree_links)
         for link in self.links:
-            if link not in tree_links:
+            if link not in reached_links:
                 raise self.error(
                     self._above[link],
                     "is part of a closed loop: remove one joint of the loop",
@@ -170,25 +163,19 @@ class UrdfTree:
             )
         return roots[0]
 
-    def _mount(self, joints_above: list[Any]):
-        """Return gravity below some joints, of which the first is at the root."""
-        gravity = np.array(self.gravity, np.float64)
-        tilting_joints = []
-        moving_joints = []
-        for joint in joints_above:
-            kind = joint.get("type")
-            # How a robot floats is unknown: the file's attitude is that at rest.
-            pose = self.held_pose if kind in HOLDABLE_TYPES else self._origin
-            rotation, _ = pose(joint)
-            turned_gravity = rotation.T @ gravity
-            if _differ(turned_gravity, gravity):
-                tilting_joints.append(joint)
-            if kind in TURNING_TYPES:
-                quarter_turn = axis_rotation(self._axis(joint), np.pi / 2)
-                if _differ(quarter_turn @ turned_gravity, turned_gravity):
-                    moving_joints.append(joint)
-            gravity = turned_gravity + 0.0  # makes -0.0 positive
-        return Mount(gravity, tilting_joints, moving_joints)
+    def _turn_gravity(self, joint: Any):
+        """Turn gravity from the frame of a joint's parent into that of its child."""
+        kind = joint.get("type")
+        # How a robot floats is unknown: the file's attitude is that at rest.
+        pose = self.held_pose if kind in HOLDABLE_TYPES else self._origin
+        attitude, _ = pose(joint)
+        gravity = attitude.T @ self.base_gravity
+        change = gravity - self.base_gravity
+        if kind in TURNING_TYPES:
+            change = np.append(change, np.cross(self._axis(joint), gravity))
+        if np.linalg.norm(change) > MAX_ROUNDING * np.linalg.norm(gravity):
+            self.tilting_joints.append(joint)
+        self.base_gravity = gravity + 0.0  # makes -0.0 positive
 
     def _merge(self, base: str, tip: str | None):
         """Merge links on fixed joints into the bodies that carry them, depth first."""
@@ -342,7 +329,7 @@ class UrdfTree:
         element = joint.find("origin")
         offset = self.numbers(element, "xyz", ORIGIN)
         rpy = self.numbers(element, "rpy", ORIGIN)
-        if np.abs(rpy).max() > MAX_ANGLE:
+        if _are_degrees(rpy):
             raise self.error(
                 joint, f"has an `rpy` of {_words(rpy)}: give radians, not degrees"
             )
@@ -362,12 +349,13 @@ class UrdfTree:
                 f"avoid it (`tip`, `--tip`), or {cure}",
             )
         axis = self.numbers(joint.find("axis"), "xyz", (1.0, 0.0, 0.0))
-        length = np.linalg.norm(axis)
-        if length < 1e-9:
+        size = np.abs(axis).max()
+        if size < 1e-9:
             raise self.error(
                 joint, "has the zero vector as its axis: give it a direction"
             )
-        return without_rounding(axis / length)
+        direction = axis / size  # huge numbers have no finite length
+        return without_rounding(direction / np.linalg.norm(direction))
 
     def bodies(self, *, check: bool = False) -> BodyParameters:
         """Return the parameters of all bodies; reject impossible links if asked to."""
@@ -400,7 +388,7 @@ class UrdfTree:
         rpy = self.numbers(origin, "rpy", ORIGIN)
 
         fault = Inertia(mass, centre, tensor).fault(rounding=0.01)
-        if np.abs(rpy).max() > MAX_ANGLE:
+        if _are_degrees(rpy):
             fault = f"its `rpy` is {_words(rpy)}, which are degrees, not radians"
         R = rpy_rotation(rpy)
         tensor = R @ tensor @ R.T
@@ -465,9 +453,13 @@ def _placed(carrier: Placement, rotation: Matrix3, position: Vector3):
     return Placement(body, without_rounding(R @ rotation), r + R @ position)
 
 
-def _differ(first: Vector3, second: Vector3):
-    """Return whether two directions of gravity differ by more than rounding."""
-    return np.linalg.norm(first - second) > 1e-6 * np.linalg.norm(first)
+def _are_degrees(rpy: Vector3):
+    """Return whether an attitude must be in degrees: people write whole or half ones.
+
+    Programs that add up turns write angles in radians beyond a full turn.
+    """
+    is_round = (np.abs(rpy) > FULL_TURN) & (2 * rpy % 1 == 0)
+    return is_round.any() or any(map(seems_in_degrees, rpy))
 
 
 def _words(values: np.ndarray):

@@ -144,7 +144,7 @@ def test_a_moving_joint_above_the_base_is_named(tmp_path):
     path = tmp_path / "arm.urdf"
     path.write_text(arm_on_mount(kind="revolute"))
     (note,) = load_urdf(path, base="base").notes
-    assert "`to_base` above `base`" in note
+    assert "by joint `to_base` above it" in note
     path.write_text(arm_on_mount(second="3.141592653589793 0 0", kind="floating"))
     assert load_urdf(path, base="base").gravity.tolist() == [0.0, 0.0, 9.81]
 
@@ -173,4 +173,4 @@ def test_bodies_above_the_base_turn_gravity_as_in_mujoco(tmp_path):
         mujoco.mj_inverse(model, data)
         expected.append(data.qfrc_inverse.copy())
     np.testing.assert_allclose(forces(path, robot, motion), expected, atol=1e-10)
-    assert "frames `torso`, `base` above it" in robot.notes[0]
+    assert "joints `torso mount`, `base mount` above it" in robot.notes[0]

@@ -162,6 +162,9 @@ FILES = {
         arm(rpy="90 0 0"),
         "joint `j1` has an `rpy` of 90 0 0: .*degrees",
     ),
+    "an attitude of ten degrees": (arm(rpy="0 10 0"), "`rpy` of 0 10 0: .*degrees"),
+    "an attitude of rounded degrees": (arm(rpy="0 89.9998 0"), "`rpy` .*degrees"),
+    "one end of a range": (arm(inner='<limit lower="1"/>'), "or state both"),
     "a place far away": (arm(xyz="0 0 1e300"), "`offset` of joint `j1` .* metres"),
     "nothing that moves": (arm(kind="fixed"), "no moving joint below link `base`"),
     "no links": (robot(), "one root link, but has none"),
@@ -172,6 +175,7 @@ FILES = {
     "two links of one name": (two(link("a")), "two links named `a`"),
     "a control character": (arm().replace('name="j1"', 'name="j&#9;1"'), "printable"),
     "broken XML": (arm().replace("</joint>", ""), "line 6: this is not XML"),
+    "comments without an end": (f"<robot>{'<!--' * 200_000}", "this is not XML"),
     "another language": ("<sdf><model/></sdf>", "its root is `<sdf>`"),
     "a xacro file": (
         arm().replace(

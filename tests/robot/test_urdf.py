@@ -224,6 +224,15 @@ def test_a_body_without_mass_is_noted_and_counts_as_massless(write):
         ("prismatic", 'upper="0.5" velocity="3"', (0, 0.5, 3, np.inf)),
         ("revolute", 'lower="-1"', (-1, 0, np.inf, np.inf)),
         ("revolute", 'lower="-1e16" upper="1e16"', (-np.inf, np.inf, np.inf, np.inf)),
+        ("revolute", 'lower="-1000" upper="1"', (-np.inf, 1, np.inf, np.inf)),
+        (
+            "revolute",
+            'lower="-100.530965" upper="100.530965"',
+            (-100.530965, 100.530965, np.inf, np.inf),
+        ),
+        ("revolute", 'lower="0.7" upper="0.7"', (-np.inf, np.inf, np.inf, np.inf)),
+        ("prismatic", 'lower="-1" upper="-1"', (-np.inf, np.inf, np.inf, np.inf)),
+        ("prismatic", 'lower="-1e9" upper="1e9"', (-np.inf, np.inf, np.inf, np.inf)),
         ("revolute", 'effort="9"', (-np.inf, np.inf, np.inf, 9)),
         ("continuous", 'lower="-1" upper="1" effort="9"', (-np.inf, np.inf, np.inf, 9)),
         (
@@ -241,7 +250,52 @@ def test_limits(write, kind, limit, expected):
     assert [values.item() for values in read] == list(expected)
 
 
+@pytest.mark.parametrize("limit", ["0.7 0.7", "-1 -1", "0 0", "-1000 1000"])
+def test_a_range_that_is_none_is_noted(write, limit):
+    lower, upper = limit.split()
+    inner = f'<limit lower="{lower}" upper="{upper}" velocity="1" effort="2"/>'
+    note, _ = load_urdf(write(arm(inner=inner))).notes
+    assert f"`j1`: a range from {lower} to {upper} is taken as unknown" in note
+
+
+@pytest.mark.parametrize("turns", [1.25, -2.25, 3.1, 50.0])
+def test_attitudes_beyond_a_full_turn_are_those_of_pinocchio(write, turns):
+    rpy = f"{2 * np.pi * turns} 0.3 0"
+    body = inertial(1.0, (0, 0, 0), (0.1, 2 * np.pi * turns, 0), (1, 0, 0, 2, 0, 2.5))
+    limit = '<limit lower="-1" upper="1" velocity="1" effort="2"/>'
+    parts = (link("base"), link("a", body))
+    path = write(robot(*parts, joint("j1", "base", "a", rpy=rpy, inner=limit)))
+    ours = load_urdf(path)
+    oracle = Oracle(path)
+    oracle.set(ours.joint_names, [0.5])
+    np.testing.assert_allclose(
+        body_transforms(ours, np.array([0.5])), [oracle.joint("j1")], atol=1e-12
+    )
+    np.testing.assert_allclose(
+        urdf_parameters(path), oracle.parameters("j1"), atol=1e-12
+    )
+
+
+@pytest.mark.parametrize(
+    "head",
+    [
+        '\n\n<?xml version="1.0"?>',
+        '<!-- made\nby hand -->\n<?xml version="1.0" encoding="utf-8"?>',
+        '\ufeff\n<?xml version="1.0" encoding="UTF-8"?>',
+        '<?xml version="1.0"?><!-- a -- b ---\n <link name="base"/> -->',
+    ],
+)
+def test_faults_of_xml_that_other_programs_allow(write, head):
+    text = arm().replace('<?xml version="1.0"?>', head)
+    assert load_urdf(write(text)).joint_names == ("j1",)
+    # Errors name the line of the file.
+    broken = text.replace("</joint>", "")
+    with pytest.raises(InputError, match=f"line {broken.count(chr(10))}: .* not XML"):
+        load_urdf(write(broken))
+
+
 def test_defaults_of_name_and_axis(write):
+    assert load_urdf(write(arm(axis="0 1e300 0"))).axis.tolist() == [[0.0, 1.0, 0.0]]
     text = arm().replace(' name="arm"', "").replace('<axis xyz="0 0 1"/>', "")
     loaded = load_urdf(write(text, "left.urdf"))
     assert loaded.name == "left"
