@@ -103,6 +103,8 @@ class Robot(Summarised, eqx.Module):
         tip_rotation: Attitude of the end-effector in that body; the body's own if None.
         tip_offset: Origin of the end-effector in that body [m].
         source: Origin of the numbers.
+        source_tip: Link of the end-effector that was asked for in that file, or None.
+        source_base: Link on the ground that was asked for in that file, or None.
         notes: Changes and assumptions that were made, one sentence each.
 
     Raises:
@@ -128,6 +130,8 @@ class Robot(Summarised, eqx.Module):
     tip_rotation: Matrix3 = eqx.field(converter=given, default=None)
     tip_offset: Vector3 = eqx.field(converter=given, default=(0.0, 0.0, 0.0))
     source: str = eqx.field(static=True, default="")
+    source_tip: str | None = eqx.field(static=True, default=None)
+    source_base: str | None = eqx.field(static=True, default=None)
     notes: tuple[str, ...] = eqx.field(static=True, default=())
 
     def __post_init__(self):

@@ -94,6 +94,8 @@ def load_urdf(
             tip_rotation=tip_rotation,
             tip_offset=tip_offset,
             source=tree.path,
+            source_tip=tip,
+            source_base=base,
             notes=notes,
         )
     except InputError as error:
