@@ -28,8 +28,6 @@ MAX_DISTANCE = 4.0
 """Standard deviations from the estimate to a possible body that are not unusual."""
 SCALE_DEVIATION = 1e-3
 """Standard deviation of a weighed mass, relative to it."""
-MAX_MASS_ERROR = 0.3
-"""Error of a mass from forces, relative to it, that gains of drives explain."""
 MAX_ERROR_BOUND = 0.01
 """Relative error bound of half the squared distance to the nearest body.
 
@@ -174,8 +172,7 @@ def identify_payload(
 
     Raises:
         InputError: If the runs have different base parameters or have seen the same
-            data, the model does not have ten parameters for the body, or the mass is
-            far from that of the forces.
+            data, or the model does not have ten parameters for the body.
         RuntimeError: If no body was proved to be the nearest.
     """
     require_same_base((unloaded, loaded))
@@ -228,13 +225,6 @@ def _is_negative(estimate: AnyArray, uncertainty: Uncertainty) -> bool:
 def _weigh(estimate: np.ndarray, uncertainty: Uncertainty, mass: float):
     """Update the estimate by a measured mass [kg], as a Kalman filter does."""
     covariance = uncertainty.covariance
-    difference = abs(estimate[0] - mass)
-    max_difference = MAX_DISTANCE * uncertainty.standard_deviations[0]
-    if difference > max(max_difference, MAX_MASS_ERROR * mass):
-        raise InputError(
-            f"`mass` is {mass:g} kg, but the forces tell {estimate[0]:.3g} kg: weigh "
-            "the payload again, or leave `mass` out."
-        )
     variance = (SCALE_DEVIATION * mass) ** 2
     gain = covariance[:, 0] / (covariance[0, 0] + variance)
     estimate = estimate + gain * (mass - estimate[0])
