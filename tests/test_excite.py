@@ -332,6 +332,32 @@ def test_friction_that_the_file_claims_counts_in_the_forces(tmp_path):
     assert worst[2] == pytest.approx(expected / 35.0 - 1.0, rel=1e-3)
 
 
+def test_an_impossible_link_leaves_the_check_of_forces(tmp_path, run):
+    arm(tmp_path)
+    path = tmp_path / "arm.urdf"
+    possible = path.read_text()
+    before, after = possible.split('name="l2"', 1)
+    long_link = after.replace('iyy="0.1"', 'iyy="0.3"', 1)
+    path.write_text(f'{before}name="l2"{long_link}')
+    robot_file = load_experiment(tmp_path / "arm.toml").setup.robot_file
+    bodies = robot_file.possible_bodies()
+    # Second moments 0.15, -0.05, 0.15 become 0.15, 0.00015, 0.15; about the origin.
+    moments = [0.15015 + 0.04, 0.3 + 0.04, 0.15015]
+    np.testing.assert_allclose(bodies[1, :4], [1.0, 0.0, 0.0, 0.2], atol=1e-15)
+    np.testing.assert_allclose(bodies[1, 4:7], moments, rtol=1e-12)
+    code, out, err = run("excite", tmp_path / "arm.toml", "-o", tmp_path / "motion.csv")
+    assert code == 0, err
+    said = " ".join(out.split())
+    assert "✓ forces by the nominal" in said
+    assert "! link `l2`: its moments of inertia cannot belong to a real body" in said
+    # What has no nearest value that can exist is named as the reason.
+    path.write_text(possible.replace('<mass value="1"/>', '<mass value="-1"/>'))
+    experiment = load_experiment(tmp_path / "arm.toml")
+    assert nominal_of(experiment) is None
+    fault = limit_forces(experiment.setup, experiment.excitation, None).fault
+    assert "link `l1`: its `mass` is -1 kg" in fault
+
+
 def test_what_was_not_checked_is_said_first_and_ends_in_a_code(tmp_path, run):
     # Ahead of its base the arm cannot be held by 1 N m.
     ahead = (

@@ -114,8 +114,8 @@ def init(
     """
     options.start(urdf)
     text = jid.experiment.write_template(urdf, tip=tip, base=base)
-    notes = jid.load_urdf(urdf, tip=tip, base=base).notes
-    terminal.show_remarks(terminal.open_console(stderr=True), notes)
+    remarks = jid.load_urdf(urdf, tip=tip, base=base).remarks
+    terminal.show_remarks(terminal.open_console(stderr=True), remarks)
     typer.echo(text.encode(), nl=False)  # TOML is UTF-8, whatever the terminal is
 
 

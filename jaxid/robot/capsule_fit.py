@@ -10,7 +10,8 @@ from scipy.spatial import ConvexHull, QhullError
 from jaxid.arrays import AnyArray, Numbers, Vector3
 from jaxid.errors import InputError
 
-from .collision_geometry import link_shapes, mjcf_shapes
+from .collision_geometry import Shape, link_shapes, mjcf_shapes
+from .limits_and_drives import MAX_LENGTH
 from .robot import Robot
 from .shapes import GROUND, Capsule
 from .urdf_tree import ORIGIN, UrdfTree
@@ -72,7 +73,10 @@ def fit_capsules(
         shapes = compiled_shapes.get(link, [])
         try:
             if not tree.compiled:
-                shapes = list(link_shapes(tree, packages, link))
+                # Numbers that overflow make a shape that is too large.
+                with np.errstate(over="ignore", invalid="ignore"):
+                    shapes = list(link_shapes(tree, packages, link))
+            _refuse_huge_shapes(path, link, shapes)
         except (OSError, InputError) as error:
             if faults is None:
                 raise
@@ -95,6 +99,18 @@ def fit_capsules(
             f"`{path}` has no collision geometry for the links that were asked for."
         )
     return tuple(capsules)
+
+
+def _refuse_huge_shapes(path: str | Path, link: str, shapes: list[Shape]):
+    """Reject shapes that no robot has."""
+    for shape in shapes:
+        reach = np.abs(shape.points).max(initial=0.0) + shape.radius
+        if not reach <= MAX_LENGTH:
+            raise InputError(
+                f"`{path}`: the geometry of link `{link}` must be within "
+                f"{MAX_LENGTH:g} m, but reaches {reach:g} m: give it in metres "
+                "(`scale` of a mesh)."
+            )
 
 
 def stand_in_capsules(robot: Robot, bodies: list[int]) -> list[Capsule]:

@@ -1,5 +1,6 @@
 """Files that describe robots: URDF, xacro, and MJCF as the URDF of the same tree."""
 
+import math
 import re
 import shutil
 import subprocess
@@ -14,11 +15,16 @@ from jaxid.errors import InputError
 from .mjcf import Loop, mjcf_as_urdf
 from .robot import GRAVITY
 
+MAX_PARTS = {"hfield": 10_000_000, "replicate": 2_000}
+"""Largest numbers of heights of a field, and of copies of a body, in an MJCF file."""
+
 
 def read_description(path: str | Path) -> tuple[Any, Numbers, list[Loop]]:
     """Return the URDF element of a robot's file, its gravity, and its closed loops."""
     robot = _parse(path)
     if robot.tag == "mujoco":
+        _refuse_huge(path, robot)
+        _refuse_nan(path, robot)
         return mjcf_as_urdf(path)
     if any("ros.org/" in e.tag and "xacro" in e.tag for e in robot.iter("*")):
         robot = _parse(path, _expand_xacro(Path(path)))
@@ -27,6 +33,30 @@ def read_description(path: str | Path) -> tuple[Any, Numbers, list[Loop]]:
             f"`{path}` is no URDF: its root is `<{robot.tag}>`, not `<robot>`."
         )
     return robot, GRAVITY, []
+
+
+def _refuse_huge(path: str | Path, root: Any):
+    """Reject elements of an MJCF file of which MuJoCo makes gigabytes."""
+    for element in root.iter(*MAX_PARTS):
+        # Copies of copies multiply. MuJoCo names what is no number.
+        counts = element.xpath("@nrow | @ncol | ancestor-or-self::replicate/@count")
+        size = math.prod(int(text) for text in counts if text.isdecimal())
+        if size > MAX_PARTS[element.tag]:
+            raise InputError(
+                f"`{path}`, line {element.sourceline}: `<{element.tag}>` makes {size} "
+                f"parts, but may make {MAX_PARTS[element.tag]}: lower its numbers."
+            )
+
+
+def _refuse_nan(path: str | Path, root: Any):
+    """Reject properties of bodies that are NaN, which MuJoCo takes as not given."""
+    for text in root.xpath("//@mass | //@density | //@diaginertia | //@fullinertia"):
+        if "nan" in text.lower():
+            line = text.getparent().sourceline
+            raise InputError(
+                f"`{path}`, line {line}: `{text.attrname}` must hold finite numbers, "
+                f'but is "{text}".'
+            )
 
 
 def is_mjcf(path: str | Path) -> bool:

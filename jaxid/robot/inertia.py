@@ -33,6 +33,10 @@ URDF_ORDER = ((0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2))
 """Rows and columns of xx, xy, xz, yy, yz, zz."""
 PINOCCHIO_ORDER = ((0, 0, 1, 0, 1, 2), (0, 1, 1, 2, 2, 2))
 """Rows and columns of xx, xy, yy, xz, yz, zz."""
+IMPOSSIBLE = "cannot belong to a real body"
+"""Words of notes on bodies that cannot exist."""
+MIN_THICKNESS = 1e-3
+"""Smallest second moment of a corrected body, relative to the largest."""
 MAX_MASS = 1e5
 """Largest mass of a body of a robot [kg]."""
 
@@ -105,6 +109,24 @@ class Inertia(eqx.Module):
         tensor = R @ self.tensor @ R.T
         return Inertia(self.mass, centre, tensor)
 
+    def nearest_possible(self) -> "Inertia":
+        """Return the nearest body of this mass and centre whose moments can exist.
+
+        They can if mass is nowhere negative: no second moment of it is, which are the
+        eigenvalues of half the trace less the tensor. A body that is flat up to
+        rounding stays as it is.
+        """
+        tensor = np.asarray(self.tensor)
+        second_moments = 0.5 * np.trace(tensor) * np.eye(3) - tensor
+        values, axes = np.linalg.eigh(second_moments)
+        largest_moment = max(values[-1], 0.0)
+        if values[0] >= -1e-9 * largest_moment:
+            return self
+        possible_values = np.maximum(values, MIN_THICKNESS * largest_moment)
+        possible_moments = axes * possible_values @ axes.T
+        possible_tensor = possible_values.sum() * np.eye(3) - possible_moments
+        return Inertia(self.mass, self.centre, possible_tensor)
+
     def fault(self, rounding: float = 1e-9) -> str:
         """Return why this single body cannot exist; an empty text if it can.
 
@@ -136,9 +158,9 @@ class Inertia(eqx.Module):
         slack = rounding * max(abs(low), abs(high)) + 1e-4 * rounding * mass
         if low < -slack or high > low + middle + slack:
             return (
-                f"its `inertia` has the principal moments {low:.3g}, "
-                f"{middle:.3g}, {high:.3g} kg m², of which one is negative, "
-                "or larger than the sum of the others"
+                f"its moments of inertia {IMPOSSIBLE}: `inertia` has the principal "
+                f"moments {low:.3g}, {middle:.3g}, {high:.3g} kg m², of which one is "
+                "negative, or larger than the sum of the others"
             )
         return ""
 

@@ -20,9 +20,9 @@ from jaxid.arrays import (
     namespace,
 )
 from jaxid.errors import InputError
-from jaxid.result_table import Column, Summarised, Table
+from jaxid.result_table import Column, Remark, Status, Summarised, Table
 
-from .inertia import Inertia
+from .inertia import IMPOSSIBLE, Inertia
 from .limits_and_drives import MAX_LENGTH, Drives, Limits, length_notes, limit_notes
 from .rotations import SNAP_TOLERANCE, snapped, snapped_rotations
 
@@ -359,6 +359,14 @@ class Robot(Summarised, eqx.Module):
         """Return the unit of a joint's generalised force: N m or N."""
         return "N m" if self.revolute[joint] else "N"
 
+    @property
+    def remarks(self) -> list[Remark]:
+        """Notes, of which those on bodies that cannot exist are doubts."""
+        return [
+            Remark(note, Status.DOUBTFUL if IMPOSSIBLE in note else Status.NEUTRAL)
+            for note in self.notes
+        ]
+
     def summary(self) -> Table:
         """Return a table of the joints: parents, ranges, speeds and largest forces."""
         names = ("ground", *self.joint_names)
@@ -384,7 +392,7 @@ class Robot(Summarised, eqx.Module):
             Column("force", self.known_max_forces),
             Column("", [self.force_unit(j) for j in range(self.joints)]),
             facts=facts,
-            remarks=self.notes,
+            remarks=self.remarks,
         )
 
 

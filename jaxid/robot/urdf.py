@@ -8,6 +8,7 @@ import numpy as np
 from jaxid.arrays import AnyArray, Joints, Numbers
 from jaxid.errors import InputError
 
+from .inertia import IMPOSSIBLE
 from .limits_and_drives import (
     MAX_STATED_ANGLE,
     MAX_STATED_LENGTH,
@@ -198,10 +199,8 @@ def _checked_range(tree: UrdfTree, joint: Any):
         unit = "radians, not degrees" if turns else "metres"
         raise tree.error(joint, f"{fault}: its limits must be in {unit}")
     if low > high:
-        raise tree.error(
-            joint,
-            f"ranges from {low:g} to {high:g}: exchange the ends, or state both",
-        )
+        cure = "exchange the ends, or state both"
+        raise tree.error(joint, f"ranges from {low:g} to {high:g}: {cure}")
     if high - low < MIN_RANGE:
         return -np.inf, np.inf
     max_end = MAX_STATED_ANGLE if turns else MAX_STATED_LENGTH
@@ -265,8 +264,9 @@ def _inertial_notes(tree: UrdfTree):
         )
     for link, fault in faults.items():
         if fault:
-            notes.append(
-                f"link `{link}`: its inertial, which identification "
-                f"does not need, belongs to no body: {fault}."
-            )
+            # Only moments have a nearest value that can exist.
+            use = "the nearest possible ones are the prior and serve to check forces"
+            if IMPOSSIBLE not in fault:
+                use = f"it {IMPOSSIBLE}, so that inertias of the file are not used"
+            notes.append(f"link `{link}`: {fault}; {use}: correct its inertial.")
     return notes

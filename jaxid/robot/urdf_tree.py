@@ -357,23 +357,28 @@ class UrdfTree:
         direction = axis / size  # huge numbers have no finite length
         return without_rounding(direction / np.linalg.norm(direction))
 
-    def bodies(self, *, check: bool = False) -> BodyParameters:
-        """Return the parameters of all bodies; reject impossible links if asked to."""
+    def bodies(self, *, check: bool = False, nearest: bool = False) -> BodyParameters:
+        """Return the parameters of all bodies; reject impossible links if asked to.
+
+        With `nearest`, moments of links are the nearest that can exist.
+        """
         parameters = np.zeros((len(self.joints), 10))
         for link, (body, rotation, position) in self.carriers.items():
-            inertia_and_fault = self.inertial(link)
+            inertia_and_fault = self.inertial(link, nearest=nearest)
             if body < 0 or inertia_and_fault is None:
                 continue
             inertia, fault = inertia_and_fault
             if check and fault:
                 raise InputError(
-                    f"`{self.path}`: the inertial of link "
-                    f"`{link}` belongs to no body: {fault}."
+                    f"`{self.path}`: link `{link}` cannot exist: {fault}; "
+                    "correct its inertial."
                 )
             parameters[body] += inertia.moved(rotation, position).parameters
         return parameters
 
-    def inertial(self, link: str) -> tuple[Inertia, str] | None:
+    def inertial(
+        self, link: str, *, nearest: bool = False
+    ) -> tuple[Inertia, str] | None:
         """Return a link's inertia in its own frame and why no body has it; or None."""
         element = self.links[link].find("inertial")
         if element is None:
@@ -387,12 +392,14 @@ class UrdfTree:
         centre = self.numbers(origin, "xyz", ORIGIN)
         rpy = self.numbers(origin, "rpy", ORIGIN)
 
-        fault = Inertia(mass, centre, tensor).fault(rounding=0.01)
+        inertia = Inertia(mass, centre, tensor)
+        if nearest:
+            inertia = inertia.nearest_possible()
+        fault = inertia.fault(rounding=0.01)
         if _are_degrees(rpy):
             fault = f"its `rpy` is {_words(rpy)}, which are degrees, not radians"
         R = rpy_rotation(rpy)
-        tensor = R @ tensor @ R.T
-        return Inertia(mass, centre, tensor), fault
+        return Inertia(mass, centre, R @ inertia.tensor @ R.T), fault
 
     def place(self, element: Any) -> str:
         """Return file and line of an element, for messages."""

@@ -45,6 +45,8 @@ def check_motion(
         yield Remark(f"forces: {force_fault}", Status.BAD)
     elif force_findings:
         yield judge("forces by the nominal parameters", force_findings)
+        doubts = plan.base.model.robot.remarks
+        yield from (remark for remark in doubts if remark.status is Status.DOUBTFUL)
 
 
 def check_joints(plan: ExcitationPlan) -> Remark:

@@ -11,6 +11,7 @@ from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
 from jaxid.excitation.constraints import ForceLimits
 from jaxid.report.result_files import read_fit
+from jaxid.robot.inertia import IMPOSSIBLE
 from jaxid.robot.robot import Robot, complete_limits
 
 from .excitation_settings import Excitation
@@ -91,7 +92,10 @@ def limit_forces(
             known of them, or gravity alone exceeds the limits.
     """
     limits = None
+    impossible_bodies = [note for note in setup.robot.notes if IMPOSSIBLE in note]
     fault = NO_INERTIAS
+    if impossible_bodies:
+        fault = f"not checked: {impossible_bodies[0].removesuffix('.')}"
     margin = excitation.force_margin
     if nominal is not None:
         has_unknown_parameters = np.isnan(nominal.parameters).any()

@@ -11,7 +11,8 @@ from jaxid.identification.consistency import consistency_margin
 from jaxid.io import FilePath
 from jaxid.robot.inertia import INERTIAL_NAMES
 from jaxid.robot.robot import Robot
-from jaxid.robot.urdf import joint_parameters, load_urdf, urdf_parameters
+from jaxid.robot.urdf import joint_parameters, load_urdf
+from jaxid.robot.urdf_tree import UrdfTree
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,11 +54,13 @@ class RobotFile:
     def bodies(self) -> Float[np.ndarray, "bodies 10"]:
         """Return the inertial parameters of the bodies.
 
+        Moments of inertia that cannot exist are replaced by the nearest that can.
+
         Raises:
-            InputError: If the file describes a body that cannot exist.
+            InputError: If a body cannot exist for another reason.
         """
-        parameters = urdf_parameters(self.path, **self.chain)
-        return np.asarray(parameters).reshape(-1, len(INERTIAL_NAMES))
+        tree = UrdfTree(self.path, **self.chain)
+        return np.asarray(tree.bodies(check=True, nearest=True))
 
     def possible_bodies(self) -> Float[np.ndarray, "bodies 10"] | None:
         """Return the inertial parameters if all bodies can exist, otherwise None."""

@@ -49,5 +49,37 @@ def test_a_moved_body_is_that_of_pinocchio(inertia):
     np.testing.assert_array_equal(inertia.moments, moments)
 
 
+@pytest.mark.parametrize(
+    "moments", [(0.1, 0.1, 0.3), (-0.2, 0.5, 0.6), (0.01, 0.5, 0.2), (-1.0, -1.0, -1.0)]
+)
+def test_no_possible_body_is_nearer_than_the_nearest(moments):
+    R = pin.exp3(np.array([0.3, -0.5, 0.2]))
+    claimed = Inertia(2.0, (0.1, 0.0, 0.2), R @ np.diag(moments) @ R.T)
+    assert "cannot belong to a real body" in claimed.fault()
+    nearest = claimed.nearest_possible()
+    assert nearest.fault() == ""
+    assert nearest.mass == 2.0
+    assert nearest.centre.tolist() == [0.1, 0.0, 0.2]
+
+    def second_moments(tensor):
+        return 0.5 * np.trace(tensor) * np.eye(3) - tensor
+
+    target = second_moments(claimed.tensor)
+    distance = np.linalg.norm(second_moments(nearest.tensor) - target)
+    random = np.random.default_rng(0)
+    # Bodies around the nearest one, from masses at points.
+    roots = np.linalg.cholesky(second_moments(nearest.tensor) + 1e-9 * np.eye(3))
+    for change in 0.05 * random.normal(size=(200, 3, 3)):
+        other = (roots + change) @ (roots + change).T
+        assert np.linalg.norm(other - target) > distance - 1e-3
+
+
+def test_a_possible_body_stays_as_it_is(inertia):
+    inertia = jax.tree.map(lambda x: x[0], inertia)
+    assert inertia.nearest_possible() is inertia
+    rod = Inertia(1.0, (0.0, 0.0, 0.0), np.diag([0.0, 1.0, 1.0]))
+    assert rod.nearest_possible() is rod
+
+
 def test_a_massless_body_has_its_centre_at_the_origin():
     np.testing.assert_array_equal(Inertia.from_parameters(np.zeros(10)).centre, 0.0)

@@ -170,6 +170,30 @@ REFUSED = {
         ARM.replace("<default>", '<asset><mesh file="no.stl"/></asset><default>', 1),
         "MuJoCo cannot compile this file: .*no.stl",
     ),
+    "a mass that is no number": (
+        ARM.replace('mass="2"', 'mass="nan"'),
+        '`mass` must hold finite numbers, but is "nan"',
+    ),
+    "a density that is no number": (
+        ARM.replace('density="3000"', 'density="NaN"'),
+        "`density` must hold finite",
+    ),
+    "a huge field": (
+        ARM.replace(
+            "<default>",
+            '<asset><hfield name="f" nrow="9999" ncol="9999" size="1 1 1 1"/></asset>'
+            "<default>",
+            1,
+        ),
+        "`<hfield>` makes 99980001 parts",
+    ),
+    "copies of copies": (
+        ARM.replace(
+            "<worldbody>",
+            '<worldbody><replicate count="99"><replicate count="99"/></replicate>',
+        ),
+        "`<replicate>` makes 9801 parts",
+    ),
     "no model": ("<mujoco><bodies/></mujoco>", "MuJoCo cannot compile"),
 }
 

@@ -7,6 +7,7 @@ import pytest
 from urdf_text import arm, inertial, joint, link, robot
 
 from jaxid.errors import InputError
+from jaxid.result_table import Status
 from jaxid.robot.capsule_fit import fit_capsules
 from jaxid.robot.collision import Box, Capsule, CollisionModel, HalfSpace
 from jaxid.robot.inverse_kinematics import inverse_kinematics_along
@@ -271,8 +272,10 @@ def test_inertials_that_cannot_exist_are_noted_and_not_used(tmp_path, case):
     )
     with pytest.raises(InputError, match=f"link `a` .*{sentence}"):
         urdf_parameters(path)
-    (note,) = load_urdf(path).notes
-    assert re.search(f"link `a`: .*{sentence}", note)
+    (remark,) = load_urdf(path).remarks
+    assert re.search(f"link `a`: .*{sentence}.*correct its inertial", remark.text)
+    assert "cannot belong to a real body" in remark.text
+    assert remark.status is Status.DOUBTFUL
     assert urdf_parameters(path, check=False)[0] == claimed[0]
 
 
@@ -281,6 +284,10 @@ def test_inertials_that_cannot_exist_are_noted_and_not_used(tmp_path, case):
     [
         ('<cone radius="1"/>', "line 4: `cone`"),
         ('<box size="1 2"/>', "`size`"),
+        ('<box size="1e300 1 1"/>', "`a` must be within 1000 m"),
+        ('<sphere radius="2000"/>', "`a` must be within 1000 m"),
+        ('<mesh filename="huge.obj"/>', "`a` must be within 1000 m"),
+        ('<mesh filename="huge.obj" scale="1e300 1 1"/>', "`a` must be within 1000 m"),
         (None, "no collision geometry"),
     ],
 )
@@ -292,6 +299,9 @@ def test_geometry_that_cannot_be_read(tmp_path, geometry, message):
         else f"<collision><geometry>{geometry}</geometry></collision>"
     )
     path.write_text(robot(link("base"), link("a", text), joint("j1", "base", "a")))
+    corners = ("0 0 0", "1e300 0 0", "0 1e300 0", "0 0 1e300", "1 1 1")
+    vertices = "".join(f"v {corner}\n" for corner in corners)
+    (tmp_path / "huge.obj").write_text(f"{vertices}f 1 2 3\nf 1 2 4\nf 3 4 5\n")
     with pytest.raises(InputError, match=message):
         fit_capsules(path)
 
