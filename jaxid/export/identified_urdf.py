@@ -9,6 +9,7 @@ from lxml.builder import E  # pyright: ignore[reportMissingModuleSource]
 
 from jaxid.arrays import Texts, Vector
 from jaxid.errors import InputError
+from jaxid.identification.consistency import consistency_margin
 from jaxid.identification.fit_result import Fit
 from jaxid.io import FilePath, write_bytes
 from jaxid.robot.inertia import BodyParameters, Inertia
@@ -44,11 +45,12 @@ def export_urdf(
 
     Each link that a joint moves gets the inertial of its body, which contains all that
     is fixed to the link (fixed links then have none). Each joint gets its damping and
-    dry friction, and its effort where a largest force is known. Joints on identified
-    bodies that the robot does not have, such as fingers, become fixed where the robot
-    holds them, because the bodies contain their links. A URDF describes no rotor
-    inertias, no offsets and no width of a tanh: a comment names what is left out.
-    Meshes, names and all else stay as they are.
+    dry friction, and its effort where a largest force is known. Joints beside the
+    chain to `tip`, such as fingers, keep their type and their links, which are
+    subtracted from the bodies that contain them. Where that leaves no possible body,
+    and if joints of the chain mimic others, they become fixed where the robot holds
+    them. A URDF describes no rotor inertias, no offsets and no width of a tanh: a
+    comment names what is left out. Meshes, names and all else stay as they are.
 
     Args:
         fit: Physically consistent fit.
@@ -89,7 +91,9 @@ def _replace_comment(root: Any, fit: Fit, left_out: Texts) -> None:
 
 def _replace_inertials(tree: UrdfTree, bodies: BodyParameters) -> None:
     """Write the bodies into the links that joints move; no fixed link has one."""
-    links = _fix_other_joints(tree)
+    for joint in tree.mimics:
+        _fix_joint(tree, joint)
+    bodies, links = _without_side_branches(tree, bodies)
     links += [name for name, carrier in tree.carriers.items() if carrier.body >= 0]
     body_links = [link_names(joint)[1] for joint in tree.joints]
     inertials = dict(zip(body_links, bodies, strict=True))
@@ -101,22 +105,51 @@ def _replace_inertials(tree: UrdfTree, bodies: BodyParameters) -> None:
             link.insert(0, _inertial(inertials[name]))
 
 
-def _fix_other_joints(tree: UrdfTree) -> list[str]:
-    """Fix joints on the bodies that the robot does not have; return their links."""
-    branches = [
-        joint for side_joint in tree.side_joints for joint in tree.branch(side_joint)
-    ]
-    for joint in (*tree.mimics, *branches):
-        if joint.get("type") == "fixed":
+def _without_side_branches(
+    tree: UrdfTree, bodies: BodyParameters
+) -> tuple[np.ndarray, list[str]]:
+    """Subtract from the bodies what joints beside the chain carry, such as fingers.
+
+    Where that leaves no possible body, the joints become fixed. Return the bodies, and
+    the links that remain parts of them.
+    """
+    remainders = np.array(bodies)
+    # The poses are those before any joint becomes fixed.
+    placements = tree.placed_links()
+    contained_links = []
+    for side_joint in tree.side_joints:
+        branch = list(tree.branch(side_joint))
+        links = [link_names(joint)[1] for joint in branch]
+        load = np.zeros(10)
+        for link in links:
+            inertia_and_fault = tree.inertial(link)
+            if link in placements and inertia_and_fault is not None:
+                inertia, _ = inertia_and_fault
+                _, rotation, position = placements[link]
+                load += inertia.moved(rotation, position).parameters
+        body = placements[link_names(side_joint)[0]].body
+        remainder = remainders[body] - load
+        # Simulators refuse joints that move no mass.
+        if load[0] > 0.0 and consistency_margin(remainder) > 0.0:
+            remainders[body] = remainder
             continue
-        rotation, position = tree.held_pose(joint)
-        joint.set("type", "fixed")
-        for mimic in joint.findall("mimic"):
-            joint.remove(mimic)
-        origin = _child(joint, "origin")
-        origin.set("xyz", exact_text(position))
-        origin.set("rpy", exact_text(rpy_angles(rotation)))
-    return [link_names(joint)[1] for joint in branches]
+        contained_links += links
+        for joint in branch:
+            _fix_joint(tree, joint)
+    return remainders, contained_links
+
+
+def _fix_joint(tree: UrdfTree, joint: Any) -> None:
+    """Fix a joint where the robot holds it."""
+    if joint.get("type") == "fixed":
+        return
+    rotation, position = tree.held_pose(joint)
+    joint.set("type", "fixed")
+    for mimic in joint.findall("mimic"):
+        joint.remove(mimic)
+    origin = _child(joint, "origin")
+    origin.set("xyz", exact_text(position))
+    origin.set("rpy", exact_text(rpy_angles(rotation)))
 
 
 def _write_joints(tree: UrdfTree, robot: Robot, dynamics: JointDynamics) -> None:

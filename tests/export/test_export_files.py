@@ -166,6 +166,42 @@ def test_fingers_are_exported_once_to_pinocchio_and_mujoco(source, tmp_path, tip
     close(mujoco_torques(mujoco, there, m), held(fit, m, drives=False), 1e-11)
 
 
+def test_fingers_beside_the_tip_keep_their_type(source, tmp_path):
+    """They weigh little; their links are no longer in the body that carries them."""
+    pin, mujoco = pytest.importorskip("pinocchio"), pytest.importorskip("mujoco")
+    moments = 'ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"'
+    small_moments = moments.replace('"1"', '"1e-5"')
+    fingers = FINGERS.replace(moments, small_moments)
+    for mass in ("0.3", "0.4", "0.1"):
+        fingers = fingers.replace(f'mass value="{mass}"', 'mass value="1e-3"')
+    # Pinocchio wants names that no link has.
+    for name in ("left", "right"):
+        fingers = fingers.replace(f'joint name="{name}', f'joint name="turn_{name}')
+    fingers = fingers.replace('mimic joint="left', 'mimic joint="turn_left')
+    source.write_text(URDF.replace("</robot>", fingers), "utf-8")
+    model = jid.Model(jid.load_urdf(source, tip="lower"))
+    fit = fit_of(model, possible(model), full=True)
+    path = jid.export_urdf(fit, source, tmp_path / "arm.urdf")
+    root = etree.parse(str(path)).getroot()
+    types = {joint.get("name"): joint.get("type") for joint in root.iterfind("joint")}
+    assert (types["turn_right"], types["turn_left"]) == ("revolute", "prismatic")
+    assert root.find("joint[@name='turn_right']/mimic") is not None
+    total_mass = fit.full_parameters[:30:10].sum()
+    there = mujoco.MjModel.from_xml_path(str(path))
+    assert there.njnt == 5
+    assert abs(there.body_mass.sum() - total_mass) < 1e-12 * total_mass
+    there = pin.buildModelFromUrdf(str(path))
+    assert abs(pin.computeTotalMass(there) - total_mass) < 1e-12 * total_mass
+    pose = pin.neutral(there)
+    ids = [there.getJointId(name) for name in ("turn_right", "turn_left")]
+    # `left` is held at the lower end of its range, `right` mimics it.
+    for joint_id, value in zip(ids, (2 * 0.1 + 0.5, 0.1), strict=True):
+        pose[there.joints[joint_id].idx_q] = value
+    arm = pin.buildReducedModel(there, ids, pose)
+    m = motion(3, 20)
+    close(pinocchio_torques(pin, arm, m), held(fit, m, drives=False), 1e-11)
+
+
 CHAINS = [{"base": "plate"}, {"tip": "upper"}, {"base": "plate", "tip": "upper"}]
 
 
