@@ -1,7 +1,7 @@
 """Logs read as a whole, or in parts with overlap for filters: larger than memory."""
 
 import dataclasses
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import equinox as eqx
@@ -45,6 +45,8 @@ def read_recording(
     largest_gap: float | int = 1.75,
     bridged: float = 0.0,
     bad_rows: float = MAX_BAD_ROWS,
+    start: float | int = -np.inf,
+    stop: float | int = np.inf,
 ) -> Recording:
     """Read a log, in the format that the suffix of its file says.
 
@@ -60,6 +62,8 @@ def read_recording(
         bridged: Pause that is bridged in any case [s].
         bad_rows: Fraction of the rows that may be bad: they are left out, and `notes`
             names them.
+        start: Start of the part that counts, from the log's first row on [s].
+        stop: End of the part that counts [s]; bad rows elsewhere do not matter.
 
     Raises:
         InputError: If a file, a column, a number or the time is invalid; the message
@@ -80,8 +84,17 @@ def read_recording(
         complaints = {}
         notes += join_notes
     rows = len(channels["angles"])
+    strays: Complaints = {}
     if stamps is not None:
-        complaints |= _stray_stamps(stamps, complaints, log.tables[0])
+        strays = _stray_stamps(stamps, complaints, log.tables[0])
+        complaints |= strays
+    is_part = bool(np.isfinite((start, stop)).any())
+    if complaints and is_part:
+        times = (sample_time or 0.0) * np.arange(rows) if stamps is None else stamps
+        is_sound = np.isfinite(times)
+        is_sound[[*strays]] = False
+        arrays = [times, *channels.values()]
+        complaints = _fill_outside(complaints, is_sound, arrays, start, stop)
     good_rows = slice(None)
     if complaints:
         good_rows = np.setdiff1d(np.arange(rows), [*complaints])
@@ -104,7 +117,40 @@ def read_recording(
         name=printable(Path(path).stem) if name is None else name,
         first_row=log.tables[0].first_row,
     )
-    return dataclasses.replace(recording, notes=(*notes, *recording.notes))
+    recording = dataclasses.replace(recording, notes=(*notes, *recording.notes))
+    return recording.crop(start, stop) if is_part else recording
+
+
+def _fill_outside(
+    complaints: Complaints,
+    is_sound: np.ndarray,
+    arrays: Sequence[np.ndarray],
+    start: float,
+    stop: float,
+) -> Complaints:
+    """Fill bad rows that will be cut off, and return complaints about all others.
+
+    They get the values of the next good row, so that the times of all rows stay; the
+    first of the arrays has their stamps, of which some are sound.
+    """
+    rows = np.arange(len(is_sound))
+    good_rows = np.setdiff1d(rows, [*complaints])
+    if good_rows.size < 2:
+        return complaints
+    stamps = arrays[0]
+    step = float(np.median(np.diff(stamps[is_sound])))
+    delays = stamps - step * rows
+    stamps[:] = step * rows + np.interp(rows, rows[is_sound], delays[is_sound])
+
+    elapsed = stamps - stamps[0]
+    # The row at `start` is inside, and that at `stop` outside, in spite of rounding.
+    is_inside = (elapsed > start - 0.5 * step) & (elapsed < stop - 1e-6 * step)
+    outer_rows = [row for row in complaints if not is_inside[row]]
+    positions = np.searchsorted(good_rows, outer_rows)
+    next_good_rows = good_rows[np.minimum(positions, len(good_rows) - 1)]
+    for values in arrays[1:]:
+        values[outer_rows] = values[next_good_rows]
+    return {row: text for row, text in complaints.items() if is_inside[row]}
 
 
 def _bad_row_note(complaints: Complaints, rows: int, max_share: float) -> str:

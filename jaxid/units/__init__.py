@@ -1,6 +1,7 @@
 """Units of the columns of a log: `jid.units.DEG`, `jid.units.unit("deg")`."""
 
 from .measured_units import (
+    DAY as DAY,
     DEG as DEG,
     DEG_PER_S as DEG_PER_S,
     M_PER_S as M_PER_S,

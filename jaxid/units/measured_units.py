@@ -49,6 +49,7 @@ S = Unit("s", 1.0, Quantity.TIME)
 MS = Unit("ms", 1e-3, Quantity.TIME)
 US = Unit("us", 1e-6, Quantity.TIME)
 NS = Unit("ns", 1e-9, Quantity.TIME)
+DAY = Unit("d", 86400.0, Quantity.TIME)
 RAD = Unit("rad", 1.0, Quantity.COORDINATE)
 DEG = Unit("deg", np.pi / 180, Quantity.COORDINATE)
 REV = Unit("rev", 2 * np.pi, Quantity.COORDINATE)
@@ -69,7 +70,7 @@ PERMILLE = Unit("‰", 1e-3, Quantity.SHARE)
 UNITS = {
     unit.symbol: unit
     for unit in (
-        *(S, MS, US, NS),
+        *(S, MS, US, NS, DAY),
         *(RAD, DEG, REV, M, MM),
         *(RAD_PER_S, DEG_PER_S, RPM, M_PER_S, MM_PER_S),
         *(NM, N, A, MA, PERCENT, PERMILLE),

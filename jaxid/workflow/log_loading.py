@@ -60,11 +60,11 @@ def read_log(setup: Setup, log: FilePath, columns: Columns) -> Recording:
         largest_gap=reading.largest_gap,
         bridged=BRIDGED_PERIODS / max_cutoff,
         bad_rows=reading.bad_rows,
+        start=reading.start,
+        stop=reading.stop,
         **reading.files(path),
     )
     require_plausible(recording, path, setup.robot)
-    if np.isfinite((reading.start, reading.stop)).any():
-        recording = recording.crop(reading.start, reading.stop)
     if reading.force_delay:
         recording = remove_delay(recording, reading.force_delay)
     return recording

@@ -16,6 +16,7 @@ from jaxid.units import Quantity, Unit
 
 COLUMNS = Columns(angles="q{}", forces="tau{}", velocities="dq{}", time="t")
 PLAIN = Columns(angles="q{}", forces="tau{}", time="t")
+UNTIMED = Columns(angles="q{}", forces="tau{}", sample_time=0.002)
 FINITE = st.floats(-1e6, 1e6, allow_subnormal=False)
 
 
@@ -319,6 +320,59 @@ def test_equal_complaints_are_one(tmp_path):
     text = "line 22, 23, 24, 25, 26 and 10 more (`tau1` is not finite"
     assert text in str(error.value)
     assert str(error.value).count("not finite") == 1
+
+
+SPOILT_PARTS = {
+    "forces that are not there yet": (slice(0, 40), lambda row: [*row[:2], "nan"]),
+    "a title in the middle": (slice(2, 3), lambda row: ["driver is up", "", ""]),
+    "empty cells": (slice(3, 20), lambda row: [row[0], "", ""]),
+    "lines that are cut": (slice(5, 9), lambda row: row[:2]),
+    "a stamp out of order": (slice(20, 21), lambda row: ["99", *row[1:]]),
+    "no stamp": (slice(20, 24), lambda row: ["", *row[1:]]),
+    "forces after the end": (slice(950, 1000), lambda row: [*row[:2], "1e99"]),
+    "texts after the end": (slice(990, 1000), lambda row: ["stop", "stop", "stop"]),
+}
+
+
+@pytest.mark.parametrize("part", SPOILT_PARTS)
+@pytest.mark.parametrize("columns", [PLAIN, UNTIMED])
+def test_bad_rows_outside_start_and_stop_do_not_count(tmp_path, part, columns):
+    t = 0.002 * np.arange(1000)
+    cells = [
+        [f"{x:.9g}" for x in row] for row in np.stack([t, np.sin(t), np.cos(t)], 1)
+    ]
+    rows, spoil = SPOILT_PARTS[part]
+    cells[rows] = [spoil(row) for row in cells[rows]]
+    text = "\n".join([",".join(row) for row in [["t", "q1", "tau1"], *cells]])
+    (tmp_path / "log.csv").write_text(text)
+    inside = {"start": 0.08, "stop": 1.9}
+    recording = read_recording(tmp_path / "log.csv", columns, **inside)
+    assert recording.samples == 910
+    assert recording.segments == ((0, 910),)
+    assert recording.notes == ()
+    assert recording.time[0] == pytest.approx(0.08, abs=1e-12)
+    np.testing.assert_allclose(
+        recording.angles[:, 0], np.sin(recording.time), atol=1e-8
+    )
+    np.testing.assert_allclose(
+        recording.forces[:, 0], np.cos(recording.time), atol=1e-8
+    )
+    if columns is PLAIN:
+        with pytest.raises(ValueError, match=r"rows? .* bad"):
+            read_recording(tmp_path / "log.csv", columns, bad_rows=0.0)
+
+
+@pytest.mark.parametrize("row", [40, 500, 949])
+def test_bad_rows_between_start_and_stop_count(tmp_path, row):
+    t = 0.002 * np.arange(1000)
+    table = {
+        "t": t,
+        "q1": np.sin(t),
+        "tau1": np.where(np.arange(1000) == row, np.nan, 1),
+    }
+    path = write_csv(tmp_path / "log.csv", table)
+    with pytest.raises(ValueError, match=f"1 of 1000 rows are bad: line {row + 2} "):
+        read_recording(path, PLAIN, start=0.08, stop=1.9, bad_rows=0.0)
 
 
 def test_lengths_and_shapes_must_agree(tmp_path):

@@ -393,6 +393,18 @@ def test_hdf5(tmp_path):
     refused(path, Columns("arm.q", "arm.tau"), "`a.h5`", "`time`", "`sample_time`")
 
 
+def test_hdf5_with_arrays_that_were_declared_only(tmp_path):
+    path = write_hdf5(tmp_path / "a.h5")
+    with h5py.File(path, "a") as file:
+        for name in ("spare", "arm/effort"):
+            file.create_dataset(name, (400_000_000, 8), "f4", chunks=(1000, 8))
+    clock = {"time": "arm.t", "time_unit": units.NS}
+    check(read_recording(path, Columns("arm.q", "arm.tau", "arm.dq", **clock)))
+    columns = Columns("arm.q", "arm.effort", **clock)
+    refused(path, columns, "`arm.effort`", "1.28e+10 bytes", "write it again")
+    refused(path, Columns("arm.q", "arm.f", **clock), "`spare`", "`arm.effort`")
+
+
 def test_mat_of_version_7_3(tmp_path):
     """Written like MATLAB: transposed arrays, 512 bytes' head, structures as groups."""
     path = tmp_path / "a.mat"

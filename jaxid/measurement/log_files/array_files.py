@@ -8,11 +8,14 @@ from typing import Any
 
 import numpy as np
 
+from jaxid.errors import InputError
 from jaxid.io import import_extra
 
-from .log_file import AbstractLogFile
+from .log_file import AbstractLogFile, Selections, has_column, selected_names
 from .log_table import LogTable, readable
 
+MAX_COMPRESSION = 2000
+"""Largest size of an array, relative to that of its file: deflate reaches 1032."""
 Arrays = dict[str, np.ndarray]
 """Arrays by name."""
 
@@ -69,7 +72,7 @@ class MatFile(AbstractArrayFile):
             head = file.read(516)
         if b"\x89HDF" in head:
             # Version 7.3 is HDF5, in which the arrays are transposed.
-            arrays = read_hdf5(self.path)
+            arrays = read_hdf5(self.path, self.selections)
             return _named_arrays({name: array.T for name, array in arrays.items()})
         with readable(self.path.name, "MAT file"):
             content = loadmat(self.path, simplify_cells=True)
@@ -81,17 +84,32 @@ class Hdf5File(AbstractArrayFile):
     """HDF5 file; arrays in a group are named like `log.q`."""
 
     def load(self):  # noqa: D102
-        return read_hdf5(self.path)
+        return read_hdf5(self.path, self.selections)
 
 
-def read_hdf5(path: Path) -> Arrays:
-    """Read the arrays of an HDF5 file, without images.
+def read_hdf5(path: Path, selections: Selections) -> Arrays:
+    """Read the selected arrays of an HDF5 file, without images.
 
-    Those in a group are named like `log.q`.
+    Those in a group are named like `log.q`. Others hold NaN, and need no memory.
     """
     h5py = import_extra("h5py", "logs", f"`{path.name}` is read by")
+    wanted_names = [name.partition("[")[0] for name in selected_names(selections)]
+    max_size = MAX_COMPRESSION * path.stat().st_size
+    arrays: Arrays = {}
     with readable(path.name, "HDF5 file"), h5py.File(path, "r") as file:
-        return _named_arrays(file)
+        for name, dataset in _named_arrays(file).items():
+            is_wanted = any(has_column([name], wanted) for wanted in wanted_names)
+            if not is_wanted:
+                arrays[name] = np.broadcast_to(np.nan, dataset.shape)
+            elif dataset.nbytes > max_size:
+                raise InputError(
+                    f"`{name}` of `{path.name}` declares {dataset.nbytes:.3g} bytes, "
+                    f"but the whole file has {path.stat().st_size}: write it again "
+                    "with the samples that were recorded only."
+                )
+            else:
+                arrays[name] = dataset[()]
+    return arrays
 
 
 def _named_arrays(content: Mapping[str, Any], prefix: str = "") -> Arrays:
@@ -103,9 +121,9 @@ def _named_arrays(content: Mapping[str, Any], prefix: str = "") -> Arrays:
             arrays |= _named_arrays(value, f"{name}.")
         elif isinstance(value, np.ndarray) and value.ndim > 0:
             # Single rows, as MATLAB writes them, are columns here.
-            arrays[name] = value.ravel() if 1 in value.shape else value
+            arrays[name] = value.reshape(-1) if 1 in value.shape else value
         elif is_hdf5_array(value):
-            arrays[name] = value[()]
+            arrays[name] = value
     return arrays
 
 

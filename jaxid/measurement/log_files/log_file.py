@@ -146,3 +146,18 @@ def joined_elements(names: Iterable[str]) -> list[str]:
     """Return names, with one for all elements of an array, like `q[{}]`."""
     patterns = [re.sub(r"\[\d+\]$", "[{}]", name) for name in names]
     return list(dict.fromkeys(patterns))
+
+
+def selected_names(selections: Selections) -> list[str]:
+    """Return the names and patterns of columns that are selected."""
+    names = []
+    for selection in selections.values():
+        columns = selection if isinstance(selection, tuple) else (selection,)
+        names += [column for column in columns if isinstance(column, str)]
+    return names
+
+
+def has_column(names: Sequence[str], name: str) -> bool:
+    """Return whether a name, or a pattern with `{}` for numbers, is among names."""
+    pattern = re.escape(name).replace(re.escape("{}"), r"\d+")
+    return any(re.fullmatch(rf"{pattern}(\[\d+\])?", cell) for cell in names)

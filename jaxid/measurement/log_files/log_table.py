@@ -116,7 +116,7 @@ class LogTable:
         column = self.columns[name]
         if isinstance(column, pl.Series) and column.dtype.is_temporal():
             ticks = nanoseconds(column)
-            self._refuse_first(name, ticks.is_null().to_numpy(), ticks, "is empty")
+            self.refuse_first(name, ticks.is_null().to_numpy(), ticks, "is empty")
             integers = ticks.to_numpy()
             return (integers - integers[0]) * 1e-9
         integers = integer_array(column)
@@ -149,7 +149,7 @@ class LogTable:
         array = np.array(array.reshape(len(array), -1), np.float64)
         size = np.abs(array).max(axis=1)
         complaint = "is not finite, or larger than any sensor tells ({} in size)"
-        self._refuse_first(name, ~(size <= MAX_NUMBER), size, complaint)
+        self.refuse_first(name, ~(size <= MAX_NUMBER), size, complaint)
         return array
 
     def _series_numbers(self, name: str, column: pl.Series) -> Vector:
@@ -163,12 +163,12 @@ class LogTable:
                 "of numbers."
             ) from error
         is_empty = column.is_null().to_numpy()
-        self._refuse_first(name, is_empty, column, "is empty")
+        self.refuse_first(name, is_empty, column, "is empty")
         is_text = numbers.is_null().to_numpy()
-        self._refuse_first(name, is_text, column, "is `{}`, no number")
+        self.refuse_first(name, is_text, column, "is `{}`, no number")
         return numbers.to_numpy()
 
-    def _refuse_first(
+    def refuse_first(
         self, name: str, is_bad: np.ndarray, column: Any, complaint: str
     ) -> None:
         """Refuse the first bad row of a column, or collect complaints about all."""

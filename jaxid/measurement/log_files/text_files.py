@@ -9,18 +9,19 @@ import itertools
 import re
 import shutil
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO
 
 import numpy as np
 import polars as pl
 
-from jaxid.arrays import Texts, Vector
+from jaxid.arrays import Vector
 from jaxid.errors import InputError
 
 from .log_file import AbstractLogFile
 from .log_table import BadRows, Complaints, LogTable, readable
+from .text_format import STAMP, TextFormat, detect_format
 
 HEAD_SIZE = 65536
 """Bytes from which the format is detected."""
@@ -28,57 +29,19 @@ BLOCK_SIZE = 2**26
 """Bytes that are read at once."""
 MAX_EXACT_INTEGER = 2**53
 """Largest size of integers that float64 holds without rounding."""
+DAY = 24 * 3600 * 10**9
+"""Length of a day [ns]."""
+STAMP_PARTS = {
+    r" ?(Z|[+-]\d\d:?\d\d)$": "",
+    "T": " ",
+    "/": "-",
+    ",": ".",
+    r"^(\d+ days? )?(\d+:)": "1970-01-01 ${2}",
+}
+"""Parts of dates and times, and what they become in dates of one form."""
 
 _conversions: dict[tuple, Path] = {}
 """Folders with the Parquet files of long text files."""
-
-
-class TextFormat(NamedTuple):
-    """Format of a table of text."""
-
-    names: Texts  # names of the columns; positions without a header
-    has_header: bool
-    separator: str  # a space is any number of spaces or tabs
-    has_decimal_commas: bool
-    start: int  # bytes before the first row
-
-    def read_lines(self, block: bytes) -> dict[str, pl.Series]:
-        """Return the cells of whole lines, as texts."""
-        frame = pl.read_csv(
-            io.BytesIO(block),
-            schema=dict.fromkeys(self.names, pl.String()),
-            separator=self.separator,
-            has_header=False,
-            encoding="utf8-lossy",
-        )
-        if self.has_decimal_commas:
-            frame = frame.select(pl.all().str.replace(",", ".", literal=True))
-        return frame.to_dict(as_series=True)
-
-    def bad_lines(self, block: bytes) -> Complaints:
-        """Return complaints about lines that are no rows, by their positions."""
-        separator = self.separator.encode()
-        columns = len(self.names)
-        is_suspect = count_per_line(block, separator) != columns - 1
-        if b'"' in block:
-            is_suspect |= count_per_line(block, b'"') > 0
-        suspects = np.flatnonzero(is_suspect).tolist()
-        lines = block.split(b"\n") if suspects else []
-        complaints = {}
-        for k in suspects:
-            # Separators between quotation marks are text.
-            text = b"".join(lines[k].split(b'"')[::2])
-            cells = text.count(separator) + 1 if lines[k].strip() else 0
-            if lines[k].count(b'"') % 2:
-                complaints[k] = "an open quotation"
-            elif cells != columns:
-                complaints[k] = f"{cells} cells, but {columns} columns"
-        return complaints
-
-    def empty_line(self) -> bytes:
-        """Return a line whose cells are empty."""
-        separators = self.separator * (len(self.names) - 1)
-        return separators.encode() or b'""'
 
 
 class TextFile(AbstractLogFile):
@@ -87,7 +50,7 @@ class TextFile(AbstractLogFile):
     @functools.cached_property
     def format(self) -> TextFormat:
         """Format of the text."""
-        return detect_format(self.path.name, self._head())
+        return detect_format(self.path.name, self._head(), self.selections)
 
     @property
     def names(self):  # noqa: D102
@@ -106,7 +69,7 @@ class TextFile(AbstractLogFile):
             self.path.name,
             columns={},
             channels=channels,
-            first_row=2 if self.has_header else 1,
+            first_row=self.format.first_line,
             unit="line",
             bad_rows=bad_rows,
         )
@@ -117,8 +80,13 @@ class TextFile(AbstractLogFile):
         return dataclasses.replace(table, columns=columns)
 
     def _head(self) -> bytes:
+        """Return lines from the beginning of the file."""
         with self.path.open("rb") as file:
-            return file.read(HEAD_SIZE)
+            head = file.read(HEAD_SIZE)
+        is_cut = len(head) == HEAD_SIZE
+        head = with_line_feeds(head)
+        # The last line of a cut text is no row, unless there is no other.
+        return head.rpartition(b"\n")[0] if is_cut and b"\n" in head else head
 
     def _parquet_folder(self, table: LogTable) -> Path:
         """Convert the columns to Parquet, unless this was done."""
@@ -136,21 +104,19 @@ class TextFile(AbstractLogFile):
         """Yield the numbers of consecutive blocks of lines."""
         names = list(itertools.chain(*table.channels.values()))
         first_line = table.first_row
-        are_ticks = None
+        read_stamps = None
+        times = table.channels.get("time", ())
+        number_names = [name for name in names if name not in times]
         with self.path.open("rb") as file:
-            file.seek(self.format.start)
-            for block in line_blocks(file):
+            for block in line_blocks(file, first_line - 1):
                 cells = self._cells(block, first_line, table.bad_rows)
                 part = dataclasses.replace(table, columns=cells, first_row=first_line)
                 columns: dict[str, Any] = {
-                    name: part.numbers(name)[:, 0] for name in names
+                    name: part.numbers(name)[:, 0] for name in number_names
                 }
-                for name in table.channels.get("time", ()):
-                    if are_ticks is None:
-                        largest_stamp = np.nanmax(np.abs(columns[name]), initial=0.0)
-                        are_ticks = largest_stamp > MAX_EXACT_INTEGER
-                    if are_ticks:
-                        columns[name] = _ticks(part, name, columns[name])
+                for name in times:
+                    read_stamps = read_stamps or stamp_reader(part, name)
+                    columns[name] = read_stamps(part, name)
                 yield pl.DataFrame(columns)
                 first_line += len(cells[names[0]])
         if first_line == table.first_row:
@@ -163,7 +129,7 @@ class TextFile(AbstractLogFile):
         if self.format.separator == " ":
             lines = block.split(b"\n")
             block = b"\n".join(b" ".join(line.split()) for line in lines)
-        complaints = self.format.bad_lines(block)
+        complaints = bad_lines(self.format, block)
         if complaints:
             lines = block.split(b"\n")
             for k, complaint in complaints.items():
@@ -174,21 +140,78 @@ class TextFile(AbstractLogFile):
                         "repair or remove that line."
                     )
                 bad_rows[number] = f"line {number} ({complaint})"
-                lines[k] = self.format.empty_line()
+                lines[k] = blank_row(self.format)
             block = b"\n".join(lines)
         with readable(self.path.name, "table of text"):
-            return self.format.read_lines(block)
+            return read_lines(self.format, block)
 
 
-def line_blocks(file: BinaryIO) -> Iterator[bytes]:
-    """Yield blocks of whole lines; empty lines at the end of a file are left out."""
+def blank_row(form: TextFormat) -> bytes:
+    """Return a line whose cells are empty."""
+    separators = form.separator * (len(form.names) - 1)
+    return separators.encode() or b'""'
+
+
+def read_lines(form: TextFormat, block: bytes) -> dict[str, pl.Series]:
+    """Return the cells of whole lines, as texts."""
+    # The first line has all columns; rows may lack the last ones.
+    frame = pl.read_csv(
+        io.BytesIO(blank_row(form) + b"\n" + block),
+        schema=dict.fromkeys(form.names, pl.String()),
+        separator=form.separator,
+        has_header=False,
+        encoding="utf8-lossy",
+        truncate_ragged_lines=True,
+    )
+    if form.has_decimal_commas:
+        frame = frame.select(pl.all().str.replace(",", ".", literal=True))
+    return frame[1:].to_dict(as_series=True)
+
+
+def bad_lines(form: TextFormat, block: bytes) -> Complaints:
+    """Return complaints about lines that are no rows, by their positions."""
+    separator = form.separator.encode()
+    is_suspect = count_per_line(block, separator) != len(form.names) - 1
+    if b'"' in block:
+        is_suspect |= count_per_line(block, b'"') > 0
+    suspects = np.flatnonzero(is_suspect).tolist()
+    lines = block.split(b"\n") if suspects else []
+    complaints = {}
+    for k in suspects:
+        # Separators between quotation marks are text.
+        text = b"_".join(lines[k].split(b'"')[::2])
+        cells = text.count(separator) + 1 if text.strip() else 0
+        # Empty cells beyond the last column do not count.
+        filled_cells = text.rstrip(separator).count(separator) + 1
+        if lines[k].count(b'"') % 2:
+            complaints[k] = "an open quotation"
+        elif cells < form.columns or filled_cells > len(form.names):
+            complaints[k] = f"{cells} cells, but {form.columns} columns"
+    return complaints
+
+
+def line_blocks(file: BinaryIO, lines_before: int) -> Iterator[bytes]:
+    """Yield blocks of whole lines; empty lines at the end of a file are left out.
+
+    The first lines, before the rows, are left out as well.
+    """
     blank_lines = b""
     while block := file.read(BLOCK_SIZE) + file.readline():
-        block = blank_lines + block
-        rows = block.rstrip(b"\r\n")
+        block = blank_lines + with_line_feeds(block)
+        if lines_before:
+            lines = block.split(b"\n", lines_before)
+            block = lines[-1] if len(lines) > lines_before else b""
+            lines_before = 0
+        block = block.removeprefix(codecs.BOM_UTF8)
+        rows = block.rstrip(b"\n")
         blank_lines = block[len(rows) :].partition(b"\n")[2] if rows else block
         if rows:
             yield rows
+
+
+def with_line_feeds(block: bytes) -> bytes:
+    """Return text whose lines end as on Unix; also those that end twice."""
+    return re.sub(rb"\r+\n?", b"\n", block) if b"\r" in block else block
 
 
 def count_per_line(block: bytes, character: bytes) -> np.ndarray:
@@ -201,60 +224,49 @@ def count_per_line(block: bytes, character: bytes) -> np.ndarray:
     return np.diff(counts, prepend=0)
 
 
-def _ticks(part: LogTable, name: str, numbers: Vector) -> Any:
+def stamp_reader(part: LogTable, name: str) -> Callable[[LogTable, str], Any]:
+    """Return the function that reads all time stamps of a log like these."""
+    texts = part.columns[name].str.strip_chars()
+    if (texts.str.contains(STAMP).mean() or 0.0) > 0.5:
+        return calendar_stamps
+    numbers = texts.cast(pl.Float64, strict=False).abs().fill_nan(None)
+    return tick_stamps if (numbers.max() or 0.0) > MAX_EXACT_INTEGER else number_stamps
+
+
+def number_stamps(part: LogTable, name: str) -> Vector:
+    """Return stamps that are numbers of moderate size."""
+    return part.numbers(name)[:, 0]
+
+
+def tick_stamps(part: LogTable, name: str) -> Any:
     """Return stamps as integers, if all of good rows are: float64 cannot hold them."""
+    numbers = number_stamps(part, name)
     texts = part.columns[name].str.strip_chars()
     ticks = texts.cast(pl.Int64, strict=False)
     bad_rows = part.bad_rows or ()
-    return ticks.fill_null(0) if ticks.null_count() <= len(bad_rows) else numbers
+    if ticks.null_count() > len(bad_rows):
+        return numbers
+    return without_gaps(ticks)
 
 
-def detect_format(source: str, head: bytes) -> TextFormat:
-    """Detect the format of a text file by its first bytes."""
-    if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-        raise InputError(f"`{source}` is text in UTF-16: save it again in UTF-8.")
-    if b"\0" in head:
-        raise InputError(
-            f"`{source}` is no text, as its suffix says: give it the suffix of its "
-            "format, or export it again."
-        )
-    first_line, _, _ = head.partition(b"\n")
-    # Some programs write the header as a comment.
-    text = first_line.decode("utf-8-sig", errors="replace").strip("\r").lstrip("#% ")
-    if not text.strip():
-        raise InputError(
-            f"`{source}` must start with a header or with numbers, but is empty."
-        )
-    separators = [s for s in (";", "\t", ",", " ") if s in text.strip()]
-    separator = separators[0] if separators else ","
-    if separator == " ":
-        text = " ".join(text.split())
-    cells = [cell.strip().strip('"') for cell in text.split(separator)]
-    has_header = not are_numbers(cells)
-    names = cells if has_header else [str(k) for k in range(len(cells))]
-    repeated_names = sorted({name for name in names if names.count(name) > 1})
-    if repeated_names:
-        raise InputError(
-            f"the header of `{source}` names the column `{repeated_names[0]}` twice: "
-            "rename one of them."
-        )
-    mark = len(codecs.BOM_UTF8) if first_line.startswith(codecs.BOM_UTF8) else 0
-    return TextFormat(
-        names=tuple(names),
-        has_header=has_header,
-        separator=separator,
-        has_decimal_commas=separator == ";" and has_decimal_comma(head),
-        start=min(len(first_line) + 1, len(head)) if has_header else mark,
-    )
+def without_gaps(ticks: pl.Series) -> pl.Series:
+    """Return integers, those of bad rows as in the row before or behind."""
+    return ticks.fill_null(strategy="forward").fill_null(strategy="backward")
 
 
-def are_numbers(cells: Sequence[str]) -> bool:
-    """Return whether cells that are not empty hold numbers; some must."""
-    texts = [cell.replace(",", ".") for cell in cells if cell]
-    numbers = pl.Series(texts, dtype=pl.String).cast(pl.Float64, strict=False)
-    return bool(texts) and numbers.null_count() == 0
+def calendar_stamps(part: LogTable, name: str) -> pl.Series:
+    """Return dates, times since midnight or durations, as dates."""
+    texts = part.columns[name].str.strip_chars()
+    for pattern, text in STAMP_PARTS.items():
+        texts = texts.str.replace_all(pattern, text)
+    dates = texts.str.to_datetime("%Y-%m-%d %T%.f", time_unit="ns", strict=False)
+    complaint = "is `{}`, no number and no time"
+    is_bad = dates.is_null().to_numpy()
+    part.refuse_first(name, is_bad, part.columns[name], complaint)
 
-
-def has_decimal_comma(head: bytes) -> bool:
-    """Return whether a comma stands between two digits somewhere."""
-    return re.search(rb"\d,\d", head) is not None
+    ticks = without_gaps(dates.cast(pl.Int64))
+    if (ticks < DAY).all():
+        # A clock without a date begins again at midnight.
+        midnights = (ticks.diff() < -DAY // 2).cast(pl.Int64).cum_sum()
+        ticks += DAY * midnights.fill_null(0)
+    return ticks.cast(dates.dtype)
