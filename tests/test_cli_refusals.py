@@ -67,7 +67,7 @@ COMMANDS = [
     ),
     (
         "identify experiment.toml long.csv",
-        "line 4 (6 cells, but 5 columns) of `long.csv`; line 5",
+        "line 4, 5, 6, 7, 8 and 2 more (6 cells, but 5 columns) of `long.csv`",
     ),
     (
         "identify experiment.toml still.csv",
