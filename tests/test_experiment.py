@@ -440,7 +440,8 @@ def test_an_mjcf_file_gives_template_robot_and_nominal_values(tmp_path):
     pytest.importorskip("mujoco")
     (tmp_path / "arm.xml").write_text(
         '<mujoco><worldbody><body name="link">'
-        '<joint name="hinge" armature="0.1" frictionloss="2"/>'
+        '<joint name="hinge" armature="0.1" frictionloss="2" stiffness="3" '
+        'springref="90"/>'
         '<geom size="0.1" pos="0.2 0 0"/></body></worldbody></mujoco>'
     )
     text = write_template(
@@ -452,7 +453,11 @@ def test_an_mjcf_file_gives_template_robot_and_nominal_values(tmp_path):
     assert experiment.setup.robot.joint_names == ("hinge",)
     claims = experiment.setup.robot_file.claims()
     assert claims["m1"] == pytest.approx(4000 / 3 * np.pi * 1e-3)
-    assert (claims["Ia1"], claims["fc1"]) == (0.1, 2.0)
+    assert (claims["Ia1"], claims["fc1"], claims["ks1"]) == (0.1, 2.0, 3.0)
+    assert claims["fo1"] == pytest.approx(-1.5 * np.pi)
+    names = experiment.setup.model.parameter_names
+    assert "ks1" in names
+    assert "fo1" in names
 
 
 def test_every_commented_key_of_the_template_is_a_known_one(tmp_path):

@@ -23,7 +23,7 @@ from jaxid.measurement.filters import FILTERS
 from jaxid.measurement.log_files import READERS
 from jaxid.robot.description_files import is_mjcf
 from jaxid.robot.robot import Robot
-from jaxid.robot.urdf import load_urdf
+from jaxid.robot.urdf import joint_parameters, load_urdf
 from jaxid.units import Unit
 from jaxid.workflow.setup import DEFAULT_CUTOFF
 
@@ -84,6 +84,7 @@ def write_template(
 ) -> str:
     """Return a complete commented experiment file for a robot; it loads as it is."""
     robot = load_urdf(urdf, tip=tip, base=base)
+    stiffness = joint_parameters(urdf, tip=tip, base=base)["stiffness"]
     path = os.path.relpath(Path(urdf).resolve(), Path(folder).resolve())
     key = "mjcf" if is_mjcf(urdf) else "urdf"
     values = {
@@ -92,7 +93,7 @@ def write_template(
             name: np.asarray(getattr(robot.limits, name)).tolist() for name in LIMITS
         },
         "drives": {"gear_ratios": [1.0] * robot.joints},
-        "model": {"offset": True},
+        "model": {"offset": True, "springs": bool(stiffness.any())},
         "recording": {
             "angles": "q{}",
             "forces": "tau{}",

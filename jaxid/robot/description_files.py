@@ -5,22 +5,20 @@ import re
 import shutil
 import subprocess
 from pathlib import Path
-from typing import Any
 
 from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
 
-from jaxid.arrays import Numbers
 from jaxid.errors import InputError
 
-from .mjcf import Loop, mjcf_as_urdf
+from .mjcf import Description, mjcf_as_urdf
 from .robot import GRAVITY
 
 MAX_PARTS = {"hfield": 10_000_000, "replicate": 2_000}
 """Largest numbers of heights of a field, and of copies of a body, in an MJCF file."""
 
 
-def read_description(path: str | Path) -> tuple[Any, Numbers, list[Loop]]:
-    """Return the URDF element of a robot's file, its gravity, and its closed loops."""
+def read_description(path: str | Path) -> Description:
+    """Return the URDF element of a robot's file, and what else the file states."""
     robot = _parse(path)
     if robot.tag == "mujoco":
         _refuse_huge(path, robot)
@@ -32,7 +30,7 @@ def read_description(path: str | Path) -> tuple[Any, Numbers, list[Loop]]:
         raise InputError(
             f"`{path}` is no URDF: its root is `<{robot.tag}>`, not `<robot>`."
         )
-    return robot, GRAVITY, []
+    return Description(robot, GRAVITY, [], [])
 
 
 def _refuse_huge(path: str | Path, root: Any):

@@ -1,7 +1,7 @@
 """The kinematic tree of an MJCF file, which MuJoCo compiles, written as a URDF."""
 
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from lxml.builder import E  # pyright: ignore[reportMissingModuleSource]
@@ -17,6 +17,56 @@ Loop = tuple[str, str, str]
 """Name of a constraint that closes a loop, and the two bodies that it connects."""
 JOINT_TYPES = ("floating", "ball", "prismatic", "revolute")
 """Types of joints in MuJoCo's order."""
+EFFECTS = {
+    "jnt_stiffness": ("joint", "a spring (`springs = true` in `[model]` describes it)"),
+    "jnt_stiffnesspoly": ("joint", "a stiffness that depends on the deflection"),
+    "jnt_springyield": ("joint", "a spring that yields"),
+    "dof_dampingpoly": ("joint", "a damping that depends on the speed"),
+    "tendon_stiffness": ("tendon", "stiffness"),
+    "tendon_stiffnesspoly": ("tendon", "a stiffness that depends on the deflection"),
+    "tendon_damping": ("tendon", "damping"),
+    "tendon_dampingpoly": ("tendon", "a damping that depends on the speed"),
+    "tendon_frictionloss": ("tendon", "dry friction"),
+    "tendon_armature": ("tendon", "inertia"),
+    "body_gravcomp": (
+        "link",
+        "`gravcomp` (if all bodies have 1, a log of this simulation holds no gravity: "
+        "`gravity = [0.0, 0.0, 0.0]` in `[robot]`)",
+    ),
+}
+"""Arrays of effects beside the default model: kind of the elements, and words."""
+
+
+class Effect(NamedTuple):
+    """An effect on forces that the default model leaves out.
+
+    Attributes:
+        kind: Kind of the element, like "joint".
+        name: Name of the element.
+        words: What it does.
+        link: Name of the link on which it acts; "" for all.
+    """
+
+    kind: str
+    name: str
+    words: str
+    link: str
+
+
+class Description(NamedTuple):
+    """Contents of a robot's file.
+
+    Attributes:
+        root: Element of the robot in a URDF.
+        gravity: Acceleration of gravity [m/s²].
+        loops: Constraints that close loops.
+        effects: Effects on forces that the default model leaves out.
+    """
+
+    root: Any
+    gravity: Numbers
+    loops: list[Loop]
+    effects: list[Effect]
 
 
 def import_mujoco() -> Any:
@@ -24,8 +74,8 @@ def import_mujoco() -> Any:
     return import_extra("mujoco", "mujoco", "MJCF files and simulations need")
 
 
-def mjcf_as_urdf(path: str | Path) -> tuple[Any, Vector3, list[Loop]]:
-    """Return an MJCF file as a URDF element, its gravity [m/s²], and closed loops.
+def mjcf_as_urdf(path: str | Path) -> Description:
+    """Return the contents of an MJCF file, whose robot is written as a URDF.
 
     Each body is a link of its name, fixed to the frame of its last joint; each named
     site is a link that is fixed to its body. A joint that an equality constraint
@@ -50,7 +100,11 @@ def mjcf_as_urdf(path: str | Path) -> tuple[Any, Vector3, list[Loop]]:
     gravity = np.array(model.opt.gravity)
     if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY:
         gravity = np.zeros(3)
-    return tree.root, gravity, tree.loops
+    # Motors that compensate gravity themselves feel the whole weight.
+    if model.jnt_actgravcomp.all() or not gravity.any():
+        model.body_gravcomp[:] = 0.0
+    tree.add_effects()
+    return Description(tree.root, gravity, tree.loops, tree.effects)
 
 
 def body_name(model: Any, body: int) -> str:
@@ -75,6 +129,7 @@ class _Writer:
     Attributes:
         root: Element of the robot.
         loops: Constraints that close loops.
+        effects: Effects that the default model leaves out.
     """
 
     def __init__(self, mujoco: Any, model: Any):
@@ -84,11 +139,12 @@ class _Writer:
         self._joints: dict[int, Any] = {}
         self._efforts = _largest_forces(mujoco, model)
         self.loops: list[Loop] = []
+        self.effects: list[Effect] = []
         name = model.names.split(b"\0")[0].decode()
         self.root: Any = E.robot(E.link(name="world"), name=name)
 
     def _name(self, kind: str, index: int):
-        """Return the name of a joint or a constraint, or its number if it has none."""
+        """Return the name of an element, or its number if it has none."""
         return getattr(self._model, kind)(index).name or f"{kind}{index}"
 
     def _connect(
@@ -201,6 +257,8 @@ class _Writer:
             damping=exact_text(model.dof_damping[dof]),
             friction=exact_text(model.dof_frictionloss[dof]),
             armature=exact_text(model.dof_armature[dof]),
+            stiffness=exact_text(model.jnt_stiffness[joint]),
+            springref=exact_text(model.qpos_spring[model.jnt_qposadr[joint]]),
         )
         axis = E.axis(xyz=exact_text(model.jnt_axis[joint]))
         return [axis, E.limit(**limit), dynamics]
@@ -235,6 +293,24 @@ class _Writer:
                 name = self._name("equality", constraint)
                 links = [self._links[body] for body in bodies]
                 self.loops.append((name, *links))
+        elif kind == kinds.mjEQ_TENDON:
+            name = self._name("equality", constraint)
+            self.effects.append(Effect("constraint", name, "a relation of tendons", ""))
+
+    def add_effects(self):
+        """Enter the effects of joints, tendons, bodies and the medium around them."""
+        model = self._model
+        for array, (kind, words) in EFFECTS.items():
+            # Earlier versions of MuJoCo lack some arrays.
+            values = np.asarray(getattr(model, array, []))
+            for row in np.unique(np.argwhere(values)[:, 0]):
+                element = model.dof_jntid[row] if array.startswith("dof") else row
+                name = self._links[row] if kind == "link" else self._name(kind, element)
+                links = {"joint": f"{name} frame", "link": name}
+                self.effects.append(Effect(kind, name, words, links.get(kind, "")))
+        if model.opt.density or model.opt.viscosity:
+            words = "the resistance of a medium"
+            self.effects.append(Effect("option", "density", words, ""))
 
     def _add_mimic(self, joint: int, master: int, polynomial: np.ndarray):
         """Write a constraint of a joint; it is exact where the mimicked joint is held.

@@ -39,7 +39,7 @@ def load_urdf(
     part of the body that carries them. Joints come depth first, and in the order of the
     file where a link carries several; so a parent comes before its children. A joint
     that mimics another is held at zero, or where the other joint's range puts it, and
-    counts as fixed.
+    counts as fixed; one that carries more than a finger is rejected.
 
     MuJoCo compiles an MJCF file: a joint that an equality constraint couples to another
     is held like a mimic joint, largest forces are those of the actuators, and gravity
@@ -66,13 +66,18 @@ def load_urdf(
 
     Raises:
         FileNotFoundError: If the file does not exist.
-        InputError: If it is no URDF, is no open tree, has a floating or planar joint on
-            the way, or angles or lengths in other units; if `xacro` or MuJoCo cannot
-            read it or is missing.
+        InputError: If it is no URDF, is no open tree, has a floating or planar joint,
+            or a link of the arm on a joint that mimics another, or angles or lengths in
+            other units; if `xacro` or MuJoCo cannot read it or is missing.
     """
     tree = UrdfTree(path, base=base, tip=tip)
     limits, limit_notes = _limits(tree)
-    notes = (*_held_notes(tree), *limit_notes, *_inertial_notes(tree))
+    notes = (
+        *_held_notes(tree),
+        *_effect_notes(tree),
+        *limit_notes,
+        *_inertial_notes(tree),
+    )
     if gravity is None:
         # An attitude of the base that the user gives is that on level ground.
         gravity = tree.gravity
@@ -143,13 +148,15 @@ def joint_parameters(
     tip: str | None = None,
     base: str | None = None,
 ) -> dict[str, Joints]:
-    """Return `armature`, `damping` and dry `friction` that a file claims.
+    """Return `armature`, `damping`, dry `friction` and springs that a file claims.
 
-    They are zero where it claims none. Arguments and errors are those of `load_urdf`.
+    Springs have a `stiffness` [N m/rad or N/m] and a position of rest, `springref` [rad
+    or m]. All are zero where the file claims none. Arguments and errors are those of
+    `load_urdf`.
     """
     tree = UrdfTree(path, base=base, tip=tip)
     parameters = {}
-    for key in ("armature", "damping", "friction"):
+    for key in ("armature", "damping", "friction", "stiffness", "springref"):
         elements = [joint.find("dynamics") for joint in tree.joints]
         values = [tree.numbers(element, key, (0.0,))[0] for element in elements]
         parameters[key] = np.array(values)
@@ -244,6 +251,18 @@ def _held_notes(tree: UrdfTree):
         links = owners("link", tree.objects)
         notes.append(f"{links}: left out, as objects that float freely.")
     return notes
+
+
+def _effect_notes(tree: UrdfTree):
+    """Return notes on effects that the default model leaves out."""
+    groups: dict[tuple[str, str], list[str]] = {}
+    for effect in tree.effects:
+        groups.setdefault((effect.kind, effect.words), []).append(effect.name)
+    return [
+        f"{owners(kind, names)}: the file states {words}; "
+        "it changes the forces, but the default model leaves it out."
+        for (kind, words), names in groups.items()
+    ]
 
 
 def _inertial_notes(tree: UrdfTree):

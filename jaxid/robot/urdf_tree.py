@@ -26,6 +26,8 @@ ORIGIN = (0.0, 0.0, 0.0)
 """Position, or roll, pitch and yaw, where a file states none."""
 FULL_TURN = 2 * np.pi + 0.01
 """Angle up to which every number is in radians; a full turn may be rounded [rad]."""
+MAX_FINGER_SHARE = 0.05
+"""Share of the moving mass above which a joint moves more than a finger."""
 
 
 class Placement(NamedTuple):
@@ -62,6 +64,7 @@ class UrdfTree:
         mimics: Elements of joints that mimic others.
         side_joints: Elements of joints on moving bodies that lead to no link of the
             chain.
+        effects: Effects on forces of bodies that the default model leaves out.
         objects: Names of links that float and move no joint, which are left out.
         tip: Name of the end-effector's link.
         compiled: Whether the file is MJCF, whose shapes are no elements of the links.
@@ -75,7 +78,7 @@ class UrdfTree:
         tip: str | None = None,
     ) -> None:
         self.path = str(path)
-        self.root, self.gravity, loops = read_description(path)
+        self.root, self.gravity, loops, effects = read_description(path)
         self.compiled = is_mjcf(path)
         name = self.root.get("name") or Path(path).stem
         self.name = "".join(c if c.isprintable() else " " for c in name)
@@ -109,6 +112,11 @@ class UrdfTree:
             self._turn_gravity(joint)
         self._merge(base or root, tip)
         self._refuse_loops(loops)
+        moving_links = [
+            link for link, carrier in self.carriers.items() if carrier.body >= 0
+        ]
+        self._refuse_loads(moving_links)
+        self.effects = [x for x in effects if x.link in ("", *moving_links)]
 
     def _named(self, tag: str):
         """Return the elements of a tag by their names."""
@@ -257,6 +265,44 @@ class UrdfTree:
                     "avoid it (`tip`, `--tip`), or remove it."
                 )
 
+    def _refuse_loads(self, moving_links: list[str]):
+        """Reject joints that follow others and carry more than fingers.
+
+        Where they move, a finger hardly changes the forces of an arm, but a link does.
+        """
+        total = sum(self._mass(link) for link in moving_links)
+        for joint in self._joints.values():
+            master = self._master(joint)
+            # Bars beside the chain may follow its joints, too.
+            is_near = joint in self.mimics or master in self.joints
+            if master is None or not is_near:
+                continue
+            branch = list(self.branch(joint))
+            mass = sum(self._mass(link_names(x)[1]) for x in branch)
+            carries_chain = any(x in self.joints for x in branch)
+            if carries_chain or mass > MAX_FINGER_SHARE * total:
+                raise self.error(
+                    joint,
+                    f"follows joint `{master.get('name')}` and carries "
+                    f"{mass:.3g} of {total:.3g} kg, which no model describes: make it "
+                    "fixed if it stands still in the logs, as fingers may, or remove "
+                    "the constraint (`<mimic>`, `<equality>`) if the logs have its own "
+                    "angle and force",
+                )
+
+    def _master(self, joint: Any):
+        """Return the joint that another one follows; None if it stands still."""
+        mimic = joint.find("mimic")
+        (multiplier,) = self.numbers(mimic, "multiplier", (1.0,))
+        if mimic is None or multiplier == 0.0 or joint.get("type") == "fixed":
+            return None
+        return self._joints.get(mimic.get("joint"))
+
+    def _mass(self, link: str):
+        """Return the mass that the file states for a link [kg]."""
+        element = self.links[link].find("inertial/mass")
+        return float(self.numbers(element, "value", (0.0,))[0])
+
     def branch(self, joint: Any) -> Iterator[Any]:
         """Yield a joint and all joints below it."""
         yield joint
@@ -383,7 +429,7 @@ class UrdfTree:
         element = self.links[link].find("inertial")
         if element is None:
             return None
-        (mass,) = self.numbers(element.find("mass"), "value", (0.0,))
+        mass = self._mass(link)
         moments = element.find("inertia")
         keys = ("ixx", "ixy", "ixz", "ixy", "iyy", "iyz", "ixz", "iyz", "izz")
         entries = [self.numbers(moments, key, (0.0,))[0] for key in keys]

@@ -86,12 +86,15 @@ class RobotFile:
         return _named_bodies(bodies) | self._joint_claims()
 
     def _joint_claims(self) -> dict[str, float]:
-        """Return claimed rotor inertias and friction, by their names in a model."""
-        values = joint_parameters(self.path, **self.chain).values()
+        """Return claimed rotors, friction and springs, by their names in a model."""
+        parameters = joint_parameters(self.path, **self.chain)
+        # A spring that rests elsewhere than at zero adds a constant force.
+        offsets = -parameters["stiffness"] * parameters.pop("springref")
+        rows = (*parameters.values(), offsets)
         claims = {}
-        for symbol, row in zip(("Ia", "fv", "fc"), values, strict=True):
+        for symbol, row in zip(("Ia", "fv", "fc", "ks", "fo"), rows, strict=True):
             for joint, value in enumerate(row, 1):
-                if value > 0.0:
+                if value > 0.0 or (symbol == "fo" and value):
                     claims[f"{symbol}{joint}"] = float(value)
         return claims
 

@@ -1,5 +1,7 @@
 """Robots of MJCF files have the dynamics that MuJoCo computes from the same file."""
 
+import re
+
 import mujoco
 import numpy as np
 import pytest
@@ -7,6 +9,7 @@ import pytest
 import jaxid as jid
 from jaxid.errors import InputError
 from jaxid.robot.urdf import joint_parameters
+from jaxid.workflow.robot_file import RobotFile
 
 ARM = """
 <mujoco model="cell">
@@ -194,6 +197,10 @@ REFUSED = {
         ),
         "`<replicate>` makes 9801 parts",
     ),
+    "a joint that moves a link as another one": (
+        ARM.replace('joint1="right" joint2="left"', 'joint1="lift" joint2="pan"'),
+        "joint `lift` follows joint `pan` and carries ",
+    ),
     "no model": ("<mujoco><bodies/></mujoco>", "MuJoCo cannot compile"),
 }
 
@@ -210,3 +217,112 @@ def test_what_is_no_open_tree_is_one_sentence(write, text, sentence):
 def test_a_loop_outside_the_chain_does_no_harm(write):
     path = write(REFUSED["a loop"][0].replace('body1="ram"', 'body1="left"'))
     assert jid.load_mjcf(path, tip="flange").joints == 3
+
+
+EFFECTS = """
+<mujoco><option density="{density}"><flag {flag}/></option>
+  <worldbody>
+    <body name="upper"><joint name="lift" axis="0 1 0" {lift}/>
+      <geom size="0.1" pos="0.2 0 0"/>
+      <body name="lower" pos="0.4 0 0" {lower}><joint name="bend" axis="0 1 0" {bend}/>
+        <geom size="0.1" pos="0.2 0 0"/>
+        <body name="finger" pos="0.2 0 0"><joint name="grip" axis="0 0 1"
+          {grip} stiffness="2" damping="1 2"/><geom size="0.01" pos="0.01 0 0"/></body>
+      </body>
+    </body>
+  </worldbody>
+  {rest}
+</mujoco>
+"""
+TENDON = """<tendon><fixed name="cable" {}><joint joint="lift" coef="1"/>
+  <joint joint="bend" coef="-1"/></fixed></tendon>"""
+OMITTED = {
+    "damping": ({"bend": 'damping="1 0.5 0.1"'}, "joint `bend`: .*damping"),
+    "stiffness": ({"lift": 'stiffness="1 0 3"'}, "joint `lift`: .*stiffness"),
+    "gravity": ({"lower": 'gravcomp="1"'}, "link `lower`: .*`gravcomp`"),
+    "medium": ({"density": "1.2"}, "option `density`: .*medium"),
+    "tendon": (
+        {"rest": TENDON.format('stiffness="5" damping="1"')},
+        "tendon `cable`: .* damping",
+    ),
+    "rotor": ({"rest": TENDON.format('armature="5"')}, "tendon `cable`: .*inertia"),
+    "coupling": (
+        {
+            "rest": TENDON.format("")
+            + '<equality><tendon name="stay" tendon1="cable"/></equality>'
+        },
+        "constraint `stay`: .*tendons",
+    ),
+}
+NO_EFFECTS = {
+    "nothing": {},
+    "no gravity": {"lower": 'gravcomp="1"', "flag": 'gravity="disable"'},
+    "motors do it": {
+        "lower": 'gravcomp="1"',
+        "grip": 'actuatorgravcomp="true"',
+        "lift": 'actuatorgravcomp="true"',
+        "bend": 'actuatorgravcomp="true"',
+    },
+}
+
+
+def effects(**changes):
+    defaults = {
+        "density": 0,
+        "flag": "",
+        "lift": "",
+        "bend": "",
+        "grip": "",
+        "lower": "",
+        "rest": "",
+    }
+    return EFFECTS.format(**(defaults | changes))
+
+
+@pytest.mark.parametrize(("changes", "sentence"), OMITTED.values(), ids=OMITTED)
+def test_a_note_names_each_effect_that_no_term_describes(write, changes, sentence):
+    *_, note = jid.load_mjcf(write(effects(**changes)), tip="lower").notes
+    assert re.match(sentence, note)
+    assert "the default model leaves it out" in note
+
+
+@pytest.mark.parametrize("changes", NO_EFFECTS.values(), ids=NO_EFFECTS)
+def test_what_does_not_act_is_not_noted(write, changes):
+    # The joint of the finger, which the chain leaves out, has a spring of its own.
+    assert not jid.load_mjcf(write(effects(**changes)), tip="lower").notes
+
+
+def test_springs_dampers_and_rotors_are_those_of_mujoco(write):
+    text = effects(
+        lift='stiffness="30" springref="40" ref="10" damping="2" armature="0.1"',
+        bend='stiffness="7" damping="1"',
+    )
+    path = write(text)
+    robot = jid.load_mjcf(path, tip="lower")
+    assert "joints `lift`, `bend`: the file states a spring" in robot.notes[0]
+
+    terms = (
+        jid.RigidBodies(),
+        jid.terms.ViscousFriction(),
+        jid.terms.RotorInertia(),
+        jid.terms.LinearSpring(),
+        jid.terms.ConstantOffset(),
+    )
+    model = jid.Model(robot, terms)
+    claims = RobotFile(path, tip="lower").claims()
+    p = np.array([claims.get(name, 0.0) for name in model.parameter_names])
+    motion = random_motion(2)
+    # The finger is no part of the chain.
+    compiled = mujoco.MjModel.from_xml_path(str(path))
+    compiled.body_mass[-1] = 0.0
+    compiled.body_inertia[-1] = 0.0
+    compiled.dof_armature[-1] = 1.0
+    data = mujoco.MjData(compiled)
+    data.qpos[2] = compiled.qpos_spring[2]
+    expected = []
+    for sample in zip(motion.q, motion.qd, motion.qdd, strict=True):
+        data.qpos[:2], data.qvel[:2], data.qacc[:2] = sample
+        mujoco.mj_inverse(compiled, data)
+        expected.append(data.qfrc_inverse[:2].copy())
+    ours = model.inverse_dynamics(p, motion)
+    np.testing.assert_allclose(ours, expected, rtol=0, atol=1e-10)

@@ -305,7 +305,8 @@ def test_defaults_of_name_and_axis(write):
 # Mimic joints, xacro, and files with nonsense.
 
 HAND = robot(
-    *map(link, ("base", "palm")),
+    link("base"),
+    link("palm", inertial(20.0, (0, 0, 0), (0, 0, 0), (0.1, 0, 0, 0.1, 0, 0.1))),
     link(
         "left", inertial(0.2, (0.0, 0.01, 0.02), (0, 0, 0), (1e-4, 0, 0, 1e-4, 0, 1e-4))
     ),
@@ -360,7 +361,68 @@ def test_a_mimic_of_nothing_is_held_at_its_offset(write):
 def test_a_tip_leaves_mimics_out(write):
     path = write(HAND)
     assert load_urdf(path, tip="palm").joint_names == ("wrist",)
-    assert not urdf_parameters(path, tip="palm").any()
+    assert urdf_parameters(path, tip="palm")[0] == 20.0
+
+
+def follower(mass, *parts, parent="a", mimic='<mimic joint="j1"/>'):
+    """An arm of 5 kg, and a link of some mass on a joint that follows the first one."""
+    moments = (0.1, 0, 0, 0.1, 0, 0.1)
+    return robot(
+        link("base"),
+        link("a", inertial(5.0, (0.1, 0, 0), (0, 0, 0), moments)),
+        link("b", inertial(mass, (0.1, 0, 0), (0, 0, 0), moments)),
+        joint("j1", "base", "a", axis="0 1 0"),
+        joint("j2", parent, "b", axis="0 1 0", inner=mimic),
+        *parts,
+    )
+
+
+WRIST = (link("c"), joint("j3", "b", "c", axis="0 1 0"))
+LOADED = {
+    "the last link": (follower(1.0), "1 of 6 kg"),
+    "a bar beside the arm": (follower(1.0, parent="base"), "1 of 5 kg"),
+    "a bar before the tip": (
+        follower(1.0, link("tip"), joint("j3", "a", "tip", axis="0 1 0")),
+        "1 of 5 kg",
+    ),
+    "a joint": (follower(0.01, *WRIST), "0.01 of 5.01 kg"),
+    "a second follower": (
+        follower(
+            0.0,
+            link("c", inertial(1.0, (0, 0, 0), (0, 0, 0), (0.1, 0, 0, 0.1, 0, 0.1))),
+            joint("j3", "b", "c", axis="0 1 0", inner='<mimic joint="j2"/>'),
+        ),
+        "1 of 6 kg",
+    ),
+}
+FINGERS = {
+    "a light link": follower(0.1),
+    "a joint that stands": follower(
+        1.0, mimic='<mimic joint="j1" multiplier="0" offset="0.2"/>'
+    ),
+    "without its joint": follower(1.0, mimic='<mimic joint="lost"/>'),
+}
+
+
+@pytest.mark.parametrize(("text", "load"), LOADED.values(), ids=LOADED)
+def test_a_joint_that_follows_another_one_carries_no_link_of_the_arm(write, text, load):
+    path = write(text)
+    tip = "tip" if "tip" in text else None
+    for read in (load_urdf, urdf_parameters):
+        with pytest.raises(InputError, match=f"joint `j2` follows joint `j1`.*{load}"):
+            read(path, tip=tip)
+
+
+@pytest.mark.parametrize("text", FINGERS.values(), ids=FINGERS)
+def test_fingers_and_joints_that_stand_are_held(write, text):
+    robot = load_urdf(write(text))
+    assert "`j2`: held" in robot.notes[0]
+
+
+def test_what_the_error_of_a_follower_advises_is_possible(write):
+    fixed = follower(1.0).replace('name="j2" type="revolute"', 'name="j2" type="fixed"')
+    assert load_urdf(write(fixed)).joint_names == ("j1",)
+    assert load_urdf(write(follower(1.0, mimic=""))).joint_names == ("j1", "j2")
 
 
 @pytest.mark.parametrize("pitch", [0.3, np.pi / 2, -np.pi / 2, np.pi / 2 - 1e-9])
