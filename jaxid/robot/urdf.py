@@ -17,7 +17,7 @@ from .limits_and_drives import (
     range_fault,
 )
 from .robot import Robot
-from .urdf_tree import ORIGIN, TURNING_TYPES, UrdfTree
+from .urdf_tree import ORIGIN, TURNING_TYPES, UrdfTree, link_names
 
 MIN_RANGE = 1e-6
 """Length of a range below which it is empty, up to rounding [rad or m]."""
@@ -71,6 +71,7 @@ def load_urdf(
             other units; if `xacro` or MuJoCo cannot read it or is missing.
     """
     tree = UrdfTree(path, base=base, tip=tip)
+    _refuse_loaded_followers(tree)
     limits, limit_notes = _limits(tree)
     notes = (
         *_held_notes(tree),
@@ -139,7 +140,9 @@ def urdf_parameters(
         InputError: If the file cannot be loaded, an inertia is not finite, or a link
             cannot exist.
     """
-    return UrdfTree(path, base=base, tip=tip).bodies(check=check).ravel()
+    tree = UrdfTree(path, base=base, tip=tip)
+    _refuse_loaded_followers(tree)
+    return tree.bodies(check=check).ravel()
 
 
 def joint_parameters(
@@ -161,6 +164,26 @@ def joint_parameters(
         values = [tree.numbers(element, key, (0.0,))[0] for element in elements]
         parameters[key] = np.array(values)
     return parameters
+
+
+def _refuse_loaded_followers(tree: UrdfTree):
+    """Reject joints that follow others and carry more than fingers.
+
+    Where they move, a finger hardly changes the forces of an arm, but a link does.
+    """
+    total = sum(tree.mass(link) for link in tree.moving_links)
+    for joint, master in tree.followers():
+        branch = list(tree.branch(joint))
+        mass = sum(tree.mass(link_names(x)[1]) for x in branch)
+        carries_chain = any(x in tree.joints for x in branch)
+        if carries_chain or mass > MAX_FINGER_SHARE * total:
+            raise tree.error(
+                joint,
+                f"follows joint `{master.get('name')}` and carries {mass:.3g} of "
+                f"{total:.3g} kg, which no model describes: make it fixed if it stands "
+                "still in the logs, as fingers may, or remove the constraint "
+                "(`<mimic>`, `<equality>`) if the logs have its own angle and force",
+            )
 
 
 def _limits(tree: UrdfTree):

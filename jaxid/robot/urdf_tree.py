@@ -26,8 +26,6 @@ ORIGIN = (0.0, 0.0, 0.0)
 """Position, or roll, pitch and yaw, where a file states none."""
 FULL_TURN = 2 * np.pi + 0.01
 """Angle up to which every number is in radians; a full turn may be rounded [rad]."""
-MAX_FINGER_SHARE = 0.05
-"""Share of the moving mass above which a joint moves more than a finger."""
 
 
 class Placement(NamedTuple):
@@ -112,11 +110,8 @@ class UrdfTree:
             self._turn_gravity(joint)
         self._merge(base or root, tip)
         self._refuse_loops(loops)
-        moving_links = [
-            link for link, carrier in self.carriers.items() if carrier.body >= 0
-        ]
-        self._refuse_loads(moving_links)
-        self.effects = [x for x in effects if x.link in ("", *moving_links)]
+        links = ("", *self.moving_links)
+        self.effects = [effect for effect in effects if effect.link in links]
 
     def _named(self, tag: str):
         """Return the elements of a tag by their names."""
@@ -265,30 +260,16 @@ class UrdfTree:
                     "avoid it (`tip`, `--tip`), or remove it."
                 )
 
-    def _refuse_loads(self, moving_links: list[str]):
-        """Reject joints that follow others and carry more than fingers.
+    def followers(self) -> Iterator[tuple[Any, Any]]:
+        """Yield joints that follow others near the chain, with those that they follow.
 
-        Where they move, a finger hardly changes the forces of an arm, but a link does.
+        Bars beside the chain may follow its joints, too.
         """
-        total = sum(self._mass(link) for link in moving_links)
         for joint in self._joints.values():
             master = self._master(joint)
-            # Bars beside the chain may follow its joints, too.
             is_near = joint in self.mimics or master in self.joints
-            if master is None or not is_near:
-                continue
-            branch = list(self.branch(joint))
-            mass = sum(self._mass(link_names(x)[1]) for x in branch)
-            carries_chain = any(x in self.joints for x in branch)
-            if carries_chain or mass > MAX_FINGER_SHARE * total:
-                raise self.error(
-                    joint,
-                    f"follows joint `{master.get('name')}` and carries "
-                    f"{mass:.3g} of {total:.3g} kg, which no model describes: make it "
-                    "fixed if it stands still in the logs, as fingers may, or remove "
-                    "the constraint (`<mimic>`, `<equality>`) if the logs have its own "
-                    "angle and force",
-                )
+            if master is not None and is_near:
+                yield joint, master
 
     def _master(self, joint: Any):
         """Return the joint that another one follows; None if it stands still."""
@@ -298,7 +279,12 @@ class UrdfTree:
             return None
         return self._joints.get(mimic.get("joint"))
 
-    def _mass(self, link: str):
+    @property
+    def moving_links(self) -> list[str]:
+        """Names of the links that are part of bodies."""
+        return [link for link, carrier in self.carriers.items() if carrier.body >= 0]
+
+    def mass(self, link: str) -> float:
         """Return the mass that the file states for a link [kg]."""
         element = self.links[link].find("inertial/mass")
         return float(self.numbers(element, "value", (0.0,))[0])
@@ -429,7 +415,7 @@ class UrdfTree:
         element = self.links[link].find("inertial")
         if element is None:
             return None
-        mass = self._mass(link)
+        mass = self.mass(link)
         moments = element.find("inertia")
         keys = ("ixx", "ixy", "ixz", "ixy", "iyy", "iyz", "ixz", "iyz", "izz")
         entries = [self.numbers(moments, key, (0.0,))[0] for key in keys]
