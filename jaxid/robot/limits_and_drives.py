@@ -33,6 +33,8 @@ MAX_RANGE_ANGLE = 8 * np.pi
 EIGHTH_TURN = np.pi / 4
 DOUBTFUL_SPEED = 50.0
 """Speed from which on the unit may be a degree per second [rad/s]."""
+FULL_TURN = 2 * np.pi + 0.01
+"""Angle up to which every number is in radians; a full turn may be rounded [rad]."""
 
 
 class Limits(eqx.Module):
@@ -328,3 +330,12 @@ def listed(names: Sequence[str]) -> str:
     """Return names in backticks, the first eight of them."""
     words = ", ".join(f"`{name}`" for name in names[:8])
     return words if len(names) <= 8 else f"{words} and {len(names) - 8} more"
+
+
+def are_degrees(rpy: np.ndarray):
+    """Return whether an attitude must be in degrees: people write whole or half ones.
+
+    Programs that add up turns write angles in radians beyond a full turn.
+    """
+    is_round = (np.abs(rpy) > FULL_TURN) & (2 * rpy % 1 == 0)
+    return is_round.any() or any(map(seems_in_degrees, rpy))

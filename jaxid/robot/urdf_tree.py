@@ -12,7 +12,7 @@ from jaxid.errors import InputError
 
 from .description_files import is_mjcf, read_description
 from .inertia import BodyParameters, Inertia
-from .limits_and_drives import listed, seems_in_degrees
+from .limits_and_drives import are_degrees, listed
 from .mjcf import Loop
 from .rotations import axis_rotation, rpy_rotation, without_rounding
 
@@ -24,8 +24,6 @@ MAX_ROUNDING = 1e-6
 """Change of gravity's direction that is rounding [rad]."""
 ORIGIN = (0.0, 0.0, 0.0)
 """Position, or roll, pitch and yaw, where a file states none."""
-FULL_TURN = 2 * np.pi + 0.01
-"""Angle up to which every number is in radians; a full turn may be rounded [rad]."""
 
 
 class Placement(NamedTuple):
@@ -361,7 +359,7 @@ class UrdfTree:
         element = joint.find("origin")
         offset = self.numbers(element, "xyz", ORIGIN)
         rpy = self.numbers(element, "rpy", ORIGIN)
-        if _are_degrees(rpy):
+        if are_degrees(rpy):
             raise self.error(
                 joint, f"has an `rpy` of {_words(rpy)}: give radians, not degrees"
             )
@@ -428,7 +426,7 @@ class UrdfTree:
         if nearest:
             inertia = inertia.nearest_possible()
         fault = inertia.fault(rounding=0.01)
-        if _are_degrees(rpy):
+        if are_degrees(rpy):
             fault = f"its `rpy` is {_words(rpy)}, which are degrees, not radians"
         R = rpy_rotation(rpy)
         return Inertia(mass, centre, R @ inertia.tensor @ R.T), fault
@@ -490,15 +488,6 @@ def _placed(carrier: Placement, rotation: Matrix3, position: Vector3):
     """Return the placement on a body of what is placed on one of its links."""
     body, R, r = carrier
     return Placement(body, without_rounding(R @ rotation), r + R @ position)
-
-
-def _are_degrees(rpy: Vector3):
-    """Return whether an attitude must be in degrees: people write whole or half ones.
-
-    Programs that add up turns write angles in radians beyond a full turn.
-    """
-    is_round = (np.abs(rpy) > FULL_TURN) & (2 * rpy % 1 == 0)
-    return is_round.any() or any(map(seems_in_degrees, rpy))
 
 
 def _words(values: np.ndarray):
