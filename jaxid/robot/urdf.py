@@ -21,6 +21,8 @@ from .urdf_tree import ORIGIN, TURNING_TYPES, UrdfTree, link_names
 
 MIN_RANGE = 1e-6
 """Length of a range below which it is empty, up to rounding [rad or m]."""
+MAX_FINGER_SHARE = 0.05
+"""Share of the moving mass above which a joint moves more than a finger."""
 
 
 def load_urdf(
