@@ -186,11 +186,12 @@ def in_parts(solve: Callable[[Any], Any], data: Any, size: int = 16) -> Any:
 
     def part(start: int) -> Any:
         indices = np.arange(start, start + size) % count
-        return jax.block_until_ready(solve(jax.tree.map(lambda x: x[indices], data)))
+        entries = jax.tree.map(lambda x: x[indices], data)
+        return jax.block_until_ready(solve(entries))
 
-    # The first call compiles, and the others wait for it.
     cores = None if jax.default_backend() == "cpu" else 1
-    results = on_cores(part, range(0, count, size), cores)
+    starts = range(0, count, size)
+    results = on_cores(part, starts, cores)
     return jax.tree.map(lambda *x: jnp.concatenate(x)[:count], *results)
 
 

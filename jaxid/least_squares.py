@@ -161,10 +161,12 @@ def _damped_step(
 ) -> Float[Array, " unknowns"]:
     """Return the damped Gauss-Newton step of the unknowns that no bound holds."""
     gradient = state.jacobian.T @ state.residuals
-    is_held = ((y <= lower) & (gradient > 0)) | ((y >= upper) & (gradient < 0))
+    is_held_low = (y <= lower) & (gradient > 0)
+    is_held_high = (y >= upper) & (gradient < 0)
     lengths = jnp.linalg.norm(state.jacobian, axis=0)
     scales = jnp.where(lengths > 0, lengths, 1.0)
-    columns = jnp.where(is_held[None], 0.0, state.jacobian / scales[None])
+    scaled_jacobian = state.jacobian / scales[None]
+    columns = jnp.where((is_held_low | is_held_high)[None], 0.0, scaled_jacobian)
     # The damping as rows of their own: unlike normal equations, these keep all digits.
     damping_rows = jnp.sqrt(state.damping) * jnp.eye(y.size, dtype=y.dtype)
     rows = jnp.concatenate([columns, damping_rows])

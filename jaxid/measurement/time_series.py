@@ -64,31 +64,16 @@ def join_channels(
     rows = np.flatnonzero(np.isfinite(channels["angles"][order, 0]))
     times = stamps[rows]
     joined = {}
-    rates: dict[tuple[str, float], list[str]] = {}
+    notes = []
     for channel, values in channels.items():
-        columns = []
-        for j, column in enumerate(values[order].T):
-            series = np.flatnonzero(np.isfinite(column))
-            if np.array_equal(series, rows):
-                columns.append(column[rows])
-            else:
-                method = partial(interpolate, stamps[series], targets=times)
-                if channel == "angles":
-                    columns.append(interpolate_turns(method, column[series]))
-                else:
-                    columns.append(method(column[series]))
-                key = channel, _rate(stamps[series])
-                rates.setdefault(key, []).append(str(j + 1))
-        joined[channel] = np.column_stack(columns)
+        ordered_values = values[order]
+        joined[channel] = _at_rows(stamps, ordered_values, rows, channel == "angles")
+        notes += _rate_notes(channel, stamps, ordered_values, rows)
     is_common = np.isfinite(np.hstack([*joined.values()])).all(axis=1)
     if not is_common.any():
         raise InputError(
             f"the channels of `{source}` overlap nowhere in time: compare their clocks."
         )
-    notes = [
-        _rate_note(channel, joints, rate, _rate(times))
-        for (channel, rate), joints in rates.items()
-    ]
     lost_rows = int(np.sum(~is_common))
     if lost_rows:
         notes.append(
@@ -97,6 +82,38 @@ def join_channels(
         )
     common = {channel: values[is_common] for channel, values in joined.items()}
     return JoinedChannels(times[is_common], common, tuple(notes))
+
+
+def _at_rows(stamps: Vector, values: Matrix, rows: Vector, are_angles: bool) -> Matrix:
+    """Return the values of a channel at some rows, interpolated where it has none."""
+    columns = []
+    for column in values.T:
+        value_rows = np.flatnonzero(np.isfinite(column))
+        method = partial(interpolate, stamps[value_rows], targets=stamps[rows])
+        if np.array_equal(value_rows, rows):
+            columns.append(column[rows])
+        elif are_angles:
+            columns.append(interpolate_turns(method, column[value_rows]))
+        else:
+            columns.append(method(column[value_rows]))
+    return np.column_stack(columns)
+
+
+def _rate_notes(
+    channel: str, stamps: Vector, values: Matrix, rows: Vector
+) -> list[str]:
+    """Return a remark about the joints of each rate that have other times."""
+    joints_of_rate: dict[float, list[str]] = {}
+    for joint, column in enumerate(values.T, 1):
+        value_rows = np.flatnonzero(np.isfinite(column))
+        if not np.array_equal(value_rows, rows):
+            rate = _rate(stamps[value_rows])
+            joints_of_rate.setdefault(rate, []).append(str(joint))
+    main_rate = _rate(stamps[rows])
+    return [
+        _rate_note(channel, joints, rate, main_rate)
+        for rate, joints in joints_of_rate.items()
+    ]
 
 
 def _rate(times: Vector) -> float:

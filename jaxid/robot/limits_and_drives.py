@@ -223,9 +223,9 @@ def per_joint(name: str, value: Numbers | None, joints: int, unknown: float) -> 
     """
     if isinstance(value, jax.Array):
         return value
-    array = np.array(unknown if value is None else value, dtype=np.float64)
     if value is None:
-        array = np.full(joints, unknown)
+        return np.full(joints, unknown)
+    array = np.array(value, dtype=np.float64)
     if array.shape != (joints,):
         raise InputError(
             f"`{name}` must hold one number for each joint "

@@ -51,14 +51,14 @@ class BagFile(AbstractLogFile):
 
     def table(self, channels, on_disk, bad_rows):  # noqa: D102
         names = list(itertools.chain(*channels.values()))
-        columns, is_merged = join_topics(self.topics, names)
+        joined_topics = join_topics(self.topics, names)
         return LogTable(
             self.path.name,
-            columns,
+            joined_topics.columns,
             channels,
             bad_rows=bad_rows,
             notes=tuple(self.notes),
-            is_merged=is_merged,
+            is_merged=joined_topics.is_merged,
         )
 
     def _numbered_names(self, channel, pattern):
@@ -251,30 +251,32 @@ def _array_fields(
             yield from _fields(item, f"{name}{element}.", element_names)
 
 
-def join_topics(
-    topics: Sequence[Topic], names: Sequence[str]
-) -> tuple[dict[str, Any], bool]:
-    """Return columns at all of their times, and whether some have times of their own.
+class JoinedTopics(NamedTuple):
+    """Columns of some topics at common times."""
 
-    They are NaN where they have no value.
+    columns: dict[str, Any]  # NaN where a column has no value
+    is_merged: bool  # whether some columns have times of their own
 
-    The times are the stamps in the headers if all of the topics have them and no time
-    of recording is asked for.
-    """
+
+def join_topics(topics: Sequence[Topic], names: Sequence[str]) -> JoinedTopics:
+    """Return columns at all of their times, with a column of these times."""
     clocks = [x for x in names if x.endswith((STAMP, RECORDING_TIME)) or x == CLOCK]
     clock = clocks[0] if clocks else CLOCK
-    names = [name for name in names if name != clock]
     owners = {name: topic for topic in topics for name in topic.columns}
+    owners = {name: owners[name] for name in names if name != clock}
+
     are_recorded = clock.endswith(RECORDING_TIME)
     if clock == CLOCK:
-        are_recorded = not all(all(owners[name].stamps) for name in names)
-
-    series = {name: owners[name].time_series(name, are_recorded) for name in names}
-    times = series[names[0]].times
-    is_merged = not all(np.array_equal(x.times, times) for x in series.values())
+        # Stamps of the headers count if all of the topics have them.
+        are_recorded = not all(all(topic.stamps) for topic in owners.values())
+    series = [topic.time_series(name, are_recorded) for name, topic in owners.items()]
+    times = series[0].times
+    is_merged = not all(np.array_equal(x.times, times) for x in series)
+    values = [x.values for x in series]
     if is_merged:
-        times = np.unique(np.concatenate([x.times for x in series.values()]))
-        series = {name: TimeSeries(times, x.at(times)) for name, x in series.items()}
-    columns: dict[str, Any] = {name: x.values for name, x in series.items()}
+        times = np.unique(np.concatenate([x.times for x in series]))
+        values = [x.at(times) for x in series]
+
+    columns: dict[str, Any] = dict(zip(owners, values, strict=True))
     columns[clock] = pl.Series(times.astype("M8[ns]"))
-    return columns, is_merged
+    return JoinedTopics(columns, is_merged)
