@@ -2,7 +2,9 @@
 
 import dataclasses
 import importlib
+import io
 import sys
+import zipfile
 from pathlib import Path
 
 import h5py
@@ -401,8 +403,69 @@ def test_hdf5_with_arrays_that_were_declared_only(tmp_path):
     clock = {"time": "arm.t", "time_unit": units.NS}
     check(read_recording(path, Columns("arm.q", "arm.tau", "arm.dq", **clock)))
     columns = Columns("arm.q", "arm.effort", **clock)
-    refused(path, columns, "`arm.effort`", "1.28e+10 bytes", "write it again")
+    refused(path, columns, "`arm.effort`", "2.56e+10 bytes", "save it again")
     refused(path, Columns("arm.q", "arm.f", **clock), "`spare`", "`arm.effort`")
+
+
+def npz_member(path, name, shape, content=b""):
+    """Add an array to an NPZ file that declares a shape, whatever its content."""
+    header = io.BytesIO()
+    kind = {"descr": "<f8", "fortran_order": False, "shape": shape}
+    np.lib.format.write_array_header_1_0(header, kind)
+    with zipfile.ZipFile(path, "a", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr(f"{name}.npy", header.getvalue() + content)
+
+
+def declared_npz(path):
+    """Write `effort`, which declares 3e9 numbers, and `zeros`, which hold 1.2e7."""
+    write_arrays(path)
+    npz_member(path, "effort", (1_000_000_000, 3))
+    npz_member(path, "zeros", (4_000_000, 3), bytes(96_000_000))
+    return path
+
+
+def declared_mat(path):
+    """Write `effort` and `zeros`, which hold 9e6 numbers of one byte each."""
+    content = dict(zip(("q", "dq", "tau"), numbers(), strict=True))
+    content["t"] = START + STEP * np.arange(SAMPLES)
+    zeros = np.zeros((3_000_000, 3), np.uint8)
+    savemat(path, content | {"effort": zeros, "zeros": zeros}, do_compression=True)
+    return path
+
+
+@pytest.mark.parametrize("write", [declared_npz, declared_mat])
+def test_arrays_that_hardly_fill_their_file_are_read_only_if_wanted(tmp_path, write):
+    name = f"a.{write.__name__.removeprefix('declared_')}"
+    path = write(tmp_path / name)
+    check(read_recording(path, ARRAYS))
+    for array in ("zeros", "effort"):
+        for column in (array, f"{array}[{{}}]"):
+            columns = dataclasses.replace(ARRAYS, forces=column)
+            refused(path, columns, f"`{array}` of `{name}` needs", "save it again")
+
+
+def test_structures_of_mat_files_that_hardly_fill_their_file(tmp_path):
+    path = tmp_path / "a.mat"
+    log = {"q": np.zeros((3_000_000, 3)), "t": np.arange(9.0)}
+    savemat(path, {"log": log}, do_compression=True)
+    columns = Columns("log.q", "log.t", sample_time=0.1)
+    refused(path, columns, "`log` of `a.mat` needs", "save it again")
+
+
+@pytest.mark.parametrize("format_of_file", [{"format": "4"}, {"do_compression": False}])
+def test_large_arrays_that_fill_their_file_are_read(tmp_path, format_of_file):
+    path = tmp_path / "a.mat"
+    savemat(path, {"q": np.arange(9_000_000.0).reshape(-1, 1)}, **format_of_file)
+    angles = open_log_file(path, {"angles": "q"}).arrays["q"]
+    np.testing.assert_array_equal(angles[[0, -1]], [0.0, 8_999_999.0])
+
+
+def test_parquet_columns_that_hardly_fill_their_file(tmp_path):
+    path = tmp_path / "a.parquet"
+    table = dict.fromkeys(("q", "tau", "t"), np.zeros(5_000_000))
+    pl.DataFrame(table).write_parquet(path)
+    columns = Columns("q", "tau", time="t")
+    refused(path, columns, "`a.parquet` needs 4e+07 bytes", "save it again")
 
 
 def test_mat_of_version_7_3(tmp_path):

@@ -5,6 +5,7 @@ import dataclasses
 import functools
 import itertools
 from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,12 @@ Complaints = dict[int, str]
 """Complaints about rows, by their numbers."""
 BadRows = Complaints | None
 """Complaints about unreadable rows, by row number; None if each is an error."""
+NUMBER_SIZE = 8
+"""Bytes of a number in memory, whatever its type in the file."""
+MAX_INFLATION = 20
+"""Memory of a log, relative to the size of its file; measurements compress less."""
+MIN_REFUSED_MEMORY = 2**26
+"""Memory that any file may need [bytes]."""
 
 
 @contextlib.contextmanager
@@ -37,6 +44,18 @@ def readable(source: str, kind: str) -> Iterator[None]:
         raise InputError(
             f"`{source}` is no {kind}, or is damaged: {reason}."
         ) from error
+
+
+def refuse_inflation(path: Path, sizes: Mapping[str, int]) -> None:
+    """Refuse columns whose sizes in memory [bytes] do not suit that of their file."""
+    file_size = path.stat().st_size
+    if sum(sizes.values()) > max(MIN_REFUSED_MEMORY, MAX_INFLATION * file_size):
+        name = max(sizes, key=lambda name: sizes[name])
+        raise InputError(
+            f"`{name}` of `{path.name}` needs {sizes[name]:.3g} bytes of memory, but "
+            f"the whole file has {file_size}: save it again with the samples that "
+            "were recorded only, or without compression."
+        )
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -1,11 +1,12 @@
 """Parquet files, also those of LeRobot data sets, with lists of numbers in cells."""
 
 import functools
+import itertools
 
 import polars as pl
 
 from .log_file import AbstractLogFile
-from .log_table import LogTable, readable
+from .log_table import NUMBER_SIZE, LogTable, readable, refuse_inflation
 
 PAUSE = 10.0
 """Time from one episode of a data set to the next [s]: a gap in any log."""
@@ -34,7 +35,12 @@ class ParquetFile(AbstractLogFile):
         return "timestamp" if has_episodes(self.frame) else ""
 
     def table(self, channels, on_disk, bad_rows):  # noqa: D102
-        return LogTable(self.path.name, self.frame, channels, bad_rows=bad_rows)
+        table = LogTable(self.path.name, self.frame, channels, bad_rows=bad_rows)
+        if not on_disk:
+            names = itertools.chain(*channels.values())
+            sizes = dict.fromkeys(names, NUMBER_SIZE * table.rows)
+            refuse_inflation(self.path, sizes)
+        return table
 
     def estimated_rows(self):  # noqa: D102
         return LogTable(self.path.name, pl.scan_parquet(self.path), {}).rows
