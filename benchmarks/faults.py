@@ -1,14 +1,9 @@
-"""Damaged files, SIGKILL at random moments, and long use in one process.
+"""SIGKILL and Ctrl-C at random moments, and long use in one process.
 
-    python benchmarks/faults.py [fuzz kill interrupt soak] [--quick] [--minutes 8]
+    python benchmarks/faults.py [kill interrupt soak] [--quick] [--minutes 8]
         [--json FILE]
 
 The files are those of `jaxid example`, the random numbers seeded.
-
-fuzz: a log (CSV, NPZ, Parquet), an experiment file, a URDF and a model file are damaged
-at random (bytes changed, inserted, removed, cut off, words replaced) and read again.
-Right is a result, or an `InputError` or `OSError`; any other exception or a warning
-counts as a crash.
 
 kill: `jaxid identify` writes into the folder of an earlier report and gets SIGKILL at a
 random moment of the time that it takes undisturbed. Right is: every file equals that of
@@ -37,8 +32,6 @@ import subprocess
 import sys
 import tempfile
 import time
-import traceback
-import warnings
 from pathlib import Path
 
 import timing
@@ -53,27 +46,6 @@ URDF = """<robot name="r"><link name="a"/><link name="b"><inertial>
 <limit lower="-2" upper="2" effort="50" velocity="3"/></joint>
 <joint name="k" type="prismatic"><parent link="b"/><child link="c"/><axis xyz="1 0 0"/>
 <limit upper="1" effort="5" velocity="1"/></joint></robot>"""
-FILES = (
-    "log.csv",
-    "log.npz",
-    "log.parquet",
-    "arm.urdf",
-    "model.json",
-    "experiment.toml",
-)
-WORDS = (
-    b"nan",
-    b"inf",
-    b"1e999",
-    b"-0",
-    b"9" * 30,
-    b"true",
-    b"null",
-    b"\xc3\xa9",
-    b"\0",
-    b"{",
-    b'"',
-)
 
 
 def jaxid(*words, **options):
@@ -101,91 +73,6 @@ def planar_base(lengths):
     return jid.base_parameters(
         jid.Model(jid.robots.planar_arm(2, lengths).replace(limits=limits))
     )
-
-
-# Damaged files
-
-
-def damaged(data, chance):
-    """Return bytes with one to four random changes."""
-    data = bytearray(data)
-    for _ in range(chance.randint(1, 4)):
-        place = chance.randrange(len(data) + 1)
-        length = chance.choice((1, 1, 2, 8, 64))
-        kind = chance.randrange(5)
-        if kind == 0 and place < len(data):
-            data[place] ^= 1 << chance.randrange(8)
-        elif kind == 1:
-            data[place:place] = chance.choice(WORDS)
-        elif kind == 2:
-            del data[place : place + length]
-        elif kind == 3:
-            data[place:place] = data[:length]
-        elif chance.random() < 0.2:
-            del data[place:]
-    return bytes(data)
-
-
-def readers(folder):
-    """Return for each kind of file a good sample and a function that reads one."""
-    import numpy as np
-    import polars as pl
-
-    import jaxid as jid
-
-    columns = jid.Columns(angles="q{}", forces="tau{}", time="time")
-    table = pl.read_csv(folder / "identification.csv")[:300]
-    table.write_csv(folder / "log.csv")
-    table.write_parquet(folder / "log.parquet")
-    arrays = {name: table[name].to_numpy() for name in table.columns}
-    np.savez(folder / "log.npz", **arrays)
-    (folder / "arm.urdf").write_text(URDF, encoding="utf-8")
-    base = planar_base((0.5, 0.4))
-    q = np.random.default_rng(0).normal(size=(4, 200, 2))
-    jid.identify(base, jid.Observations.of(*q, sample_time=0.01)).save(
-        folder / "model.json"
-    )
-
-    def log(path):
-        return jid.read_recording(path, columns)
-
-    return {
-        "log.csv": log,
-        "log.npz": log,
-        "log.parquet": log,
-        "arm.urdf": jid.load_urdf,
-        "model.json": jid.load_fit,
-        "experiment.toml": jid.experiment.load_experiment,
-    }
-
-
-def fuzz(folder, minutes, quick):
-    """Count executions and crashes of every reader."""
-    import jaxid as jid
-
-    rows = []
-    for name, read in readers(folder).items():
-        good, chance = (folder / name).read_bytes(), random.Random(name)
-        target, crashes, count = folder / f"damaged-{name}", {}, 0
-        end = time.process_time() + (2.0 if quick else 10.0 * minutes)
-        while time.process_time() < end:
-            target.write_bytes(damaged(good, chance))
-            count += 1
-            try:
-                with warnings.catch_warnings():
-                    warnings.simplefilter("error")
-                    read(target)
-            except (jid.InputError, OSError):
-                pass
-            except Exception as error:
-                line = traceback.extract_tb(error.__traceback__)[-1]
-                crashes[
-                    f"{type(error).__name__} at "
-                    f"{Path(line.filename).name}:{line.lineno}"
-                ] = 1
-        said = f"{count} executions, {len(crashes)} crashes {' '.join(crashes)}"
-        rows.append(Row("fuzz", name, "faults.py fuzz", "0 crashes", said, not crashes))
-    return rows
 
 
 # Kills
@@ -372,7 +259,7 @@ def soak(folder, minutes, quick):
 def main():
     """Run the chosen parts."""
     parser = timing.parser(__doc__, "a few seconds of each")
-    parts = {"fuzz": fuzz, "kill": kill, "interrupt": interrupt, "soak": soak}
+    parts = {"kill": kill, "interrupt": interrupt, "soak": soak}
     parser.add_argument("parts", nargs="*", default=list(parts))
     parser.add_argument("--minutes", type=float, default=8.0)
     options = parser.parse_args()

@@ -34,7 +34,8 @@ LINK = """<link name="{name}"><inertial><origin xyz="0 0 .1" rpy="0 0 0"/>
 </link>"""
 JOINT = """<joint name="j{number}" type="{kind}"><parent link="{parent}"/>
 <child link="{child}"/><origin xyz="0 0 .3" rpy="0 .5 0"/><axis xyz="0 1 0"/>
-<limit lower="-2" upper="2" effort="50" velocity="3"/><dynamics damping=".1"/></joint>"""
+<limit lower="-2" upper="2" effort="50" velocity="3"/><dynamics damping=".1"/>
+</joint>"""
 DAE = """<?xml version="1.0"?>
 <COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
 <asset><unit name="meter" meter="1"/><up_axis>Z_UP</up_axis></asset>
@@ -449,9 +450,7 @@ SAMPLES = {
     "parquet, part by part": Sample("log.parquet", write_parquet, scan("log.parquet")),
     "lerobot": Sample("episode_000000.parquet", write_lerobot, read_lerobot),
     "npz": Sample("log.npz", write_npz, read_columns("log.npz", pattern="{}")),
-    "mat 4": Sample(
-        "log.mat", write_mat("4"), read_columns("log.mat", pattern="{}")
-    ),
+    "mat 4": Sample("log.mat", write_mat("4"), read_columns("log.mat", pattern="{}")),
     "mat 5": Sample(
         "log.mat", write_mat("5"), read_columns("log.mat", "log.time", "log.{}")
     ),

@@ -15,10 +15,6 @@ Right is a result, or an `InputError` or `OSError` whose text is one sentence of
 of the process, more than `MAX_SECONDS`, and more than `MAX_MEMORY` of resident memory,
 the package's own included (about 400 MB), or an allocation that fails. Values that
 change without a word count as right: most formats have no checksums.
-
-`cli` damages the experiment file, the log or the robot of `jaxid inspect`, `identify`
-and `init`; each command runs in a process of its own. Right is exit code 2 with one
-sentence, or 0 or 3.
 """
 
 import argparse
@@ -43,6 +39,7 @@ import zipfile
 from pathlib import Path
 
 import timing
+from file_samples import SAMPLES
 from timing import Row, hand_over
 
 MAX_SECONDS = 20.0
@@ -326,7 +323,9 @@ def hdf5_bomb(is_written):
                 options = {"compression": "gzip", "chunks": (1_000_000, *shape[1:])}
                 array = file.create_dataset(name, shape, "f8", **options)
                 for start in range(0, rows if is_written else 0, 1_000_000):
-                    array[start : start + 1_000_000] = block[:, 0] if name == "time" else block
+                    array[start : start + 1_000_000] = (
+                        block[:, 0] if name == "time" else block
+                    )
 
     return write
 
@@ -504,7 +503,11 @@ def read_one(sample, path):
         return ("sentence", f"{fault}: {text}") if fault else ("refused", text)
     except BaseException as error:
         line = traceback.extract_tb(error.__traceback__)[-1]
-        own = [x for x in traceback.extract_tb(error.__traceback__) if "jaxid/" in x.filename]
+        own = [
+            x
+            for x in traceback.extract_tb(error.__traceback__)
+            if "jaxid/" in x.filename
+        ]
         place = f"{Path(line.filename).name}:{line.lineno}"
         if own:
             place += f" ({Path(own[-1].filename).name}:{own[-1].lineno})"
@@ -527,10 +530,6 @@ def make_files(sample, kind, place, numbers):
 
 def work(kind, place, numbers):
     """Make files of a kind, and read them one by one; write a line before and after."""
-    import jaxid as jid
-    from file_samples import SAMPLES
-
-    _ = jid.InputError
     sample = SAMPLES[kind]
     # What makes hostile files needs memory itself.
     process = os.fork()
@@ -559,11 +558,11 @@ class Worker:
         command += ["--numbers", *map(str, numbers)]
         environment = {**os.environ, "JAX_ENABLE_X64": "1", "JAX_PLATFORMS": "cpu"}
         environment["PYTHONPATH"] = str(timing.REPOSITORY)
-        self.log = tempfile.TemporaryFile("w+", errors="replace")
+        self.log = Path(f"{place}.log")
         # Without a buffer, so that a line that waits can be seen.
-        self.process = subprocess.Popen(
-            command, bufsize=0, stdout=subprocess.PIPE, stderr=self.log, env=environment
-        )
+        options = {"bufsize": 0, "stdout": subprocess.PIPE, "env": environment}
+        with self.log.open("w") as log:
+            self.process = subprocess.Popen(command, stderr=log, **options)
 
     def answer(self, seconds):
         """Return the next line of the process: a kind of result, words and memory."""
@@ -582,8 +581,8 @@ class Worker:
     def end(self):
         """Return how the process has ended."""
         code = self.process.wait()
-        self.log.seek(0)
-        return ["end of the process", f"{code}: {self.log.read()[-300:]}", 0]
+        words = self.log.read_text(errors="replace")[-300:]
+        return ["end of the process", f"{code}: {words}", 0]
 
     def read(self):
         """Return what becomes of the next file."""
@@ -595,7 +594,6 @@ class Worker:
         self.process.kill()
         self.process.wait()
         self.process.stdout.close()
-        self.log.close()
 
 
 def read_kind(kind, place, numbers, show):
@@ -632,7 +630,9 @@ def main():
     parser = timing.parser(__doc__, "three random files of each kind")
     parser.add_argument("--kind", action="append", help="only these kinds")
     parser.add_argument("--number", type=int, help="only the file of this number")
-    parser.add_argument("--each", type=int, default=16, help="random files of each kind")
+    parser.add_argument(
+        "--each", type=int, default=16, help="random files of each kind"
+    )
     parser.add_argument("--show", action="store_true", help="print every result")
     for name, kind in (("--work", str), ("--place", Path)):
         parser.add_argument(name, type=kind, help=argparse.SUPPRESS)
@@ -641,8 +641,6 @@ def main():
     if options.work:
         work(options.work, options.place, options.numbers)
         return 0
-    from file_samples import SAMPLES
-
     each = 3 if options.quick else options.each
     kinds = options.kind or list(SAMPLES)
     rows = []
@@ -655,7 +653,9 @@ def main():
             numbers = [*range(number_of_files(kind, each))]
             if options.number is not None:
                 numbers = [options.number]
-            return read_kind(kind, Path(place) / kind.replace(" ", "-"), numbers, options.show)
+            return read_kind(
+                kind, Path(place) / kind.replace(" ", "-"), numbers, options.show
+            )
 
         for kind, results in zip(kinds, pool.map(read, kinds), strict=True):
             rows.append(rows_of(kind, results))
