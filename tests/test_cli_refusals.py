@@ -1,10 +1,20 @@
 """What no experiment file, log or report may hold: one sentence each, no traceback."""
 
 import io
+import os
+import subprocess
 import sys
 
 import pytest
-from test_cli import EXPERIMENT, first, folder, material, refused, run  # noqa: F401
+from test_cli import (  # noqa: F401
+    EXPERIMENT,
+    ROOT,
+    first,
+    folder,
+    material,
+    refused,
+    run,
+)
 
 from jaxid.cli.app import main
 
@@ -110,6 +120,67 @@ def test_words_that_no_command_knows(folder, run, words):  # noqa: F811
     code, _, err = run(*words.split())
     assert code == 2
     assert "Traceback" not in err
+
+
+LIGHT = """
+import contextlib, io, sys
+from jaxid.cli.app import main
+for words in sys.stdin.read().splitlines():
+    sys.argv = ["jaxid", *words.split()]
+    with contextlib.redirect_stdout(io.StringIO()):
+        try:
+            main()
+        except SystemExit as ended:
+            code = ended.code
+    loaded = {"jax", "scipy", "polars"} & set(sys.modules)
+    print(code, *loaded, words, file=sys.stderr)
+"""
+QUICKLY = [
+    "--help",
+    "identify --help",
+    "--version",
+    "idntify",
+    "identify experiment.toml",
+    "identify experiment.toml a.csv --splt 2",
+    "identify experiment.toml a.csv --split 2",
+    "identify none.toml a.csv",
+    "identify experiment.toml none.csv",
+    "identify experiment.toml a.csv -o a.csv",
+    "identify experiment.toml a.csv --verify b.csv c.csv",
+    "identify no_toml.toml a.csv",
+    "identify table.toml a.csv",
+    "inspect key.toml",
+    "excite inner.toml",
+    "payload lost.toml a.csv --loaded b.csv",
+    "init none.urdf",
+    "export none --to c",
+    "compare a.csv a.csv",
+    "excite experiment.toml -o motion",
+    "excite experiment.toml --resume",
+]
+
+
+def test_refusals_come_before_jax_is_loaded(folder):  # noqa: F811
+    wrong_files = {
+        "no_toml": "[robot",
+        "table": EXPERIMENT.replace("[rows]", "[row]"),
+        "key": EXPERIMENT.replace("cutoff", "cut_off"),
+        "inner": EXPERIMENT + "[model]\ncoulomb = { epsilom = 1 }",
+        "lost": EXPERIMENT.replace('builtin = "planar_arm"', 'urdf = "lost.urdf"'),
+    }
+    for name, text in wrong_files.items():
+        (folder / f"{name}.toml").write_text(text)
+    done = subprocess.run(
+        [sys.executable, "-c", LIGHT],
+        input="\n".join(QUICKLY),
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    ends = [f"{2 * (k > 2)} {words}" for k, words in enumerate(QUICKLY)]
+    found = [line for line in done.stderr.splitlines() if line in ends]
+    assert found == ends, done.stderr
 
 
 def test_damaged_results(folder, first, run):  # noqa: F811

@@ -19,9 +19,10 @@ import pytest
 
 import jaxid as jid
 from jaxid.dynamics.sample_methods import in_numpy
-from jaxid.experiment.decoder import check_names, decode
+from jaxid.experiment.decoder import decode
 from jaxid.experiment.experiment import TABLES
 from jaxid.experiment.setup_tables import SIDES
+from jaxid.experiment_file import check_names
 from jaxid.identification.estimators.regularisation_and_weights import (
     LARGEST_UNCERTAINTY,
 )

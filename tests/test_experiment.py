@@ -9,11 +9,13 @@ import pytest
 import jaxid as jid
 from jaxid import units
 from jaxid.errors import InputError
-from jaxid.experiment.decoder import check_names, decode, keys_of
+from jaxid.experiment.decoder import decode, keys_of, table_of
 from jaxid.experiment.experiment import TABLES, load_experiment
 from jaxid.experiment.robot_tables import known_load
 from jaxid.experiment.setup_tables import SIDES
 from jaxid.experiment.template import write_template
+from jaxid.experiment_file import KEYS, check_names
+from jaxid.io import union_members
 from jaxid.workflow.log_loading import read_log
 
 VARIANCES = jid.estimators.ResidualVariances()
@@ -481,6 +483,26 @@ def test_every_commented_key_of_the_template_is_a_known_one(tmp_path):
             # An inner table has keys without default, which stay comments.
             check_names(table.pop("tool", {}), list(keys_of(known_load)))
             decode(functions, table, name, complete=False, skip=SIDES)
+
+
+def keys_by_table(name, functions):
+    """The names of a table's keys, and of the tables within it."""
+    keys = [key for function in functions for key in keys_of(function).values()]
+    found = {name: {key.name for key in keys}}
+    for key in keys:
+        for function in filter(None, map(table_of, union_members(key.hint))):
+            if function is not type(None):
+                found |= keys_by_table(f"{name}.{key.name}", [function])
+    return found
+
+
+def test_the_keys_that_are_known_before_jax_is_loaded_are_those_of_the_objects():
+    expected = {}
+    for name, functions in TABLES.items():
+        expected |= keys_by_table(name, functions)
+    expected["recording"] -= set(SIDES)
+    expected["filter"] |= {"kind"}
+    assert {name: set(keys) for name, keys in KEYS.items()} == expected
 
 
 def test_no_name_of_a_urdf_writes_into_the_template(tmp_path):

@@ -142,7 +142,13 @@ def excite(
     at the end also a page with pictures. Ctrl-C keeps the best motion so far. The exit
     code is 3 if something was not checked.
     """
-    console = options.start(experiment)
+    options.require_table_name(output)
+    earlier_design = output.with_suffix(".json") if resume else None
+    if earlier_design is not None and not earlier_design.is_file():
+        raise InputError(
+            f"`{earlier_design}` is not there: `--resume` needs a motion to go on with."
+        )
+    console = options.start(experiment=experiment)
     from jaxid.experiment.decoder import within
     from jaxid.report.excitation_page import motion_verdict, plan_remarks, sort_remarks
 
@@ -150,11 +156,6 @@ def excite(
 
     options.refuse_foreign_table(output)
     content = jid.experiment.load_experiment(experiment)
-    earlier_design = output.with_suffix(".json") if resume else None
-    if earlier_design is not None and not earlier_design.is_file():
-        raise InputError(
-            f"`{earlier_design}` is not there: `--resume` needs a motion to go on with."
-        )
     with within("excitation", experiment.name):
         task = jid.workflow.prepare_motion(
             content.setup, content.excitation, content.surroundings, earlier_design
@@ -190,7 +191,7 @@ def inspect(
     does not determine.
     """
     logs = logs or []
-    console = options.start(experiment, *logs)
+    console = options.start(*logs, experiment=experiment)
     from jaxid.report.identification_page import motor_tables
 
     content = jid.experiment.load_experiment(experiment)
@@ -234,12 +235,14 @@ def identify(
 
     A page for the browser, with figures and a verdict; the same numbers for programs.
     """
-    unseen_logs = verify or []
-    console = options.start(experiment, *logs, *unseen_logs, output=output, force=force)
     if split is not None and not 0 < split < 1:
         raise InputError(
             f"`--split` must lie between 0 and 1, like 0.6, but is {split:g}."
         )
+    unseen_logs = verify or []
+    console = options.start(
+        *logs, *unseen_logs, experiment=experiment, output=output, force=force
+    )
     held_out = None if split is None else 1.0 - split
     content = jid.experiment.load_experiment(experiment)
     columns = content.require_columns([*logs, *unseen_logs])
@@ -282,14 +285,14 @@ def choose(
         raise InputError(
             f"`{output}` is there already: choose another `--output`, or `--force`."
         )
-    console = options.start(experiment, *logs)
-    from jaxid.io import write_text
-
-    content = jid.experiment.load_experiment(experiment)
     if output.parent.resolve() != experiment.parent.resolve():
         raise InputError(
             "`--output` must lie beside the experiment file: its paths count from it."
         )
+    console = options.start(*logs, experiment=experiment)
+    from jaxid.io import write_text
+
+    content = jid.experiment.load_experiment(experiment)
     columns = content.require_columns(logs)
     experiments = jid.experiment.variants(content)
     setups = {name: variant.setup for name, variant in experiments.items()}

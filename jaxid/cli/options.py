@@ -2,6 +2,7 @@
 
 import shlex
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -9,6 +10,7 @@ import typer
 from rich.console import Console
 
 from jaxid.errors import InputError
+from jaxid.experiment_file import parse_tables, read_experiment_text
 
 from .terminal import open_console
 
@@ -73,14 +75,25 @@ def require_one_log_per_option() -> None:
             raise InputError(f"`{option}` takes one log: repeat it before `{value}`.")
 
 
-def start(*reads: Path, output: Path | None = None, force: bool = False) -> Console:
-    """Turn on double precision and the cache of compiled code; return the terminal."""
-    missing_paths = [f"`{path}`" for path in reads if not path.exists()]
-    if missing_paths:
-        verb = "is no file or folder"
-        if len(missing_paths) > 1:
-            verb = "are no files or folders"
-        raise InputError(f"{', '.join(missing_paths)} {verb}: check the path.")
+def start(
+    *reads: Path,
+    experiment: Path | None = None,
+    output: Path | None = None,
+    force: bool = False,
+) -> Console:
+    """Turn on double precision and the cache of compiled code; return the terminal.
+
+    Wrong paths, and what is wrong with the experiment file, are refused before JAX is
+    loaded, which takes seconds.
+    """
+    paths = reads if experiment is None else (experiment, *reads)
+    _require_paths(paths)
+    if experiment is not None:
+        parse_tables(read_experiment_text(experiment), experiment)
+    if output is not None and output.exists() and not output.is_dir():
+        raise InputError(
+            f"`{output}` is a file, but a report needs a folder: choose another -o."
+        )
     import jax
 
     from jaxid.io import require_writable
@@ -92,10 +105,6 @@ def start(*reads: Path, output: Path | None = None, force: bool = False) -> Cons
     enable_compilation_cache()
     if output is not None:
         is_empty = not output.is_dir() or not any(output.iterdir())
-        if output.exists() and not output.is_dir():
-            raise InputError(
-                f"`{output}` is a file, but a report needs a folder: choose another -o."
-            )
         if not (force or is_empty or any(schema_of(output / file) for file in SCHEMAS)):
             raise InputError(
                 f"`{output}` holds files but no report: "
@@ -103,6 +112,16 @@ def start(*reads: Path, output: Path | None = None, force: bool = False) -> Cons
             )
         require_writable(output)
     return open_console()
+
+
+def _require_paths(paths: Sequence[Path]) -> None:
+    """Reject paths of files that are not there."""
+    missing_paths = [f"`{path}`" for path in paths if not path.exists()]
+    if missing_paths:
+        verb = "is no file or folder"
+        if len(missing_paths) > 1:
+            verb = "are no files or folders"
+        raise InputError(f"{', '.join(missing_paths)} {verb}: check the path.")
 
 
 def report_origin(experiment_text: str) -> dict[str, str]:
@@ -116,14 +135,18 @@ def command_line() -> str:
     return shlex.join(["jaxid", *words])
 
 
+def require_table_name(target: Path) -> None:
+    """Reject a path of a table that does not end in .csv."""
+    if target.suffix.lower() != ".csv":
+        raise InputError(f"`{target}` must end in .csv: choose another -o.")
+
+
 def refuse_foreign_table(target: Path) -> None:
     """Reject a path where files lie that are not those of an earlier motion."""
     from jaxid.io import require_writable
     from jaxid.trajectory.controllers import CONTROLLER_SUFFIXES
     from jaxid.trajectory.files import load_trajectory
 
-    if target.suffix.lower() != ".csv":
-        raise InputError(f"`{target}` must end in .csv: choose another -o.")
     motion_file = target.with_suffix(".json")
     figure_folder = target.with_suffix("")
     try:

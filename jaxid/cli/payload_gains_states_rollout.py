@@ -42,7 +42,9 @@ def payload(
 
     From logs without it and logs with it. Friction may differ between them.
     """
-    console = options.start(experiment, *logs, *loaded, output=output, force=force)
+    console = options.start(
+        *logs, *loaded, experiment=experiment, output=output, force=force
+    )
     from jaxid.workflow.robot_file import joint_number
 
     content = jid.experiment.load_experiment(experiment)
@@ -87,7 +89,9 @@ def gains(
     Compare logs without the load and logs with it. The table `[load]` of the experiment
     file describes the load.
     """
-    console = options.start(experiment, *logs, *loaded, output=output, force=force)
+    console = options.start(
+        *logs, *loaded, experiment=experiment, output=output, force=force
+    )
     content = jid.experiment.load_experiment(experiment)
     if content.load is None:
         raise InputError(
@@ -116,7 +120,7 @@ def states(
     One log or report for each, like cold and warm. Friction and offsets are each
     state's own, all else is shared.
     """
-    console = options.start(experiment, *logs, output=output, force=force)
+    console = options.start(*logs, experiment=experiment, output=output, force=force)
     content = jid.experiment.load_experiment(experiment)
     columns = content.require_columns(logs)
     with terminal.progress_bar() as progress:
@@ -160,7 +164,9 @@ def rollout(
     beside those of other methods. A page shows measured and simulated motion.
     """
     unseen_logs = verify or []
-    console = options.start(experiment, *logs, *unseen_logs, output=output, force=force)
+    console = options.start(
+        *logs, *unseen_logs, experiment=experiment, output=output, force=force
+    )
     content = jid.experiment.load_experiment(experiment)
     columns = content.require_columns([*logs, *unseen_logs])
     with terminal.progress_bar() as progress:

@@ -52,13 +52,13 @@ def export(
 
     C is a feed-forward for controllers: one file and its header, named like the output.
     """
+    path = output or Path(EXPORTS[to])
+    files = [path, path.with_suffix(".h")] if to == "c" else [path]
+    require_no_files(files, to, force)
     console = options.start(report, *([urdf] if urdf else []))
     from jaxid.io import require_writable
     from jaxid.report.result_files import read_faults, read_fit
 
-    path = output or Path(EXPORTS[to])
-    files = [path, path.with_suffix(".h")] if to == "c" else [path]
-    require_no_files(files, to, force)
     require_writable(path.parent)
     faults = read_faults(report)
     if faults and not force:
@@ -127,11 +127,11 @@ def compare(
 
     Each argument is a folder that `jaxid identify` has written.
     """
+    if first.resolve() == second.resolve():
+        raise InputError(f"`{first}` is given twice: compare two different runs.")
     console = options.start(first, second, output=output, force=force)
     from jaxid.report.result_files import read_fit, write_comparison
 
-    if first.resolve() == second.resolve():
-        raise InputError(f"`{first}` is given twice: compare two different runs.")
     paths = (first, second)
     cold_fit, warm_fit = (
         dataclasses.replace(read_fit(path), name=str(path)) for path in paths

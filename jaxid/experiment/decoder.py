@@ -6,7 +6,6 @@ init` prints. The function may be a class of the package. Of other functions, ar
 before the `*` come from elsewhere and are no keys.
 """
 
-import difflib
 import inspect
 import json
 import math
@@ -21,12 +20,11 @@ import jaxtyping
 import numpy as np
 
 from jaxid.errors import InputError
+from jaxid.experiment_file import TomlTable, check_names
 from jaxid.io import union_members
 from jaxid.units import Unit, unit
 from jaxid.workflow.allowed_values import Bounds, OneOf
 
-TomlTable = dict[str, Any]
-"""Table of a TOML file, or arguments that are made of one."""
 MAX_NUMBER = 1e12
 """Largest number of a key, infinity apart, in any unit."""
 
@@ -121,26 +119,6 @@ def _require_keys(keys: dict[str, Key], table: TomlTable, place: str) -> None:
         if key.default is inspect.Parameter.empty and name not in table:
             table_name = re.sub(r"\[\d+\]", "", place)
             raise InputError(f"`{place}.{name}` is missing: `[{table_name}]` needs it.")
-
-
-def check_names(
-    table: TomlTable, known_names: list[str], place: str = "the file"
-) -> None:
-    """Reject a key of a table, or a table of the file, that is not known."""
-    for name in table:
-        if name in known_names:
-            continue
-        is_file = place == "the file"
-        path = name if is_file else f"{place}.{name}"
-        similar_names = difflib.get_close_matches(name, known_names, n=1, cutoff=0.6)
-        if similar_names:
-            raise InputError(
-                f"`{path}` is no known key: did you mean `{similar_names[0]}`?"
-            )
-        owner = place if is_file else f"the table `[{place}]`"
-        raise InputError(
-            f"`{path}` is no known key: {owner} has {', '.join(known_names)}."
-        )
 
 
 _MISMATCH = object()

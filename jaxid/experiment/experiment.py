@@ -2,12 +2,11 @@
 
 import dataclasses
 import functools
-import tomllib
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 from jaxid.errors import InputError
+from jaxid.experiment_file import TomlTable, parse_tables, read_experiment_text
 from jaxid.identification.consistency import BodyBounds
 from jaxid.io import FilePath
 from jaxid.measurement.columns import Columns
@@ -20,7 +19,7 @@ from jaxid.workflow.log_rollout import ServoSettings, TorqueSettings
 from jaxid.workflow.setup import LogReading, Setup
 from jaxid.workflow.surroundings import Collision, Surroundings
 
-from .decoder import TomlTable, call, check_names, decode, within
+from .decoder import call, decode, within
 from .robot_tables import RobotSource, known_load, replace_drives, replace_limits
 from .setup_tables import (
     Effects,
@@ -31,12 +30,6 @@ from .setup_tables import (
     build_setup,
 )
 
-FORMER_KEYS = {
-    ("model", "coulomb", "dead_zone"): 0.0,
-    ("rollout", "torque_rows"): False,
-    ("excitation", "polish"): 4,
-}
-"""Keys that earlier templates wrote, with the values that change nothing."""
 TABLES: dict[str, tuple[Callable, ...]] = {
     "robot": (RobotSource,),
     "load": (known_load,),
@@ -100,30 +93,12 @@ class Experiment:
 def load_experiment(path: FilePath) -> Experiment:
     """Load an experiment file; paths in it are relative to its folder."""
     path = Path(path)
-    if not path.is_file():
-        raise InputError(
-            f"`{path}` is no file: check its path, "
-            "or write one with `jaxid init arm.urdf`."
-        )
-    try:
-        text = path.read_bytes().decode("utf-8-sig")
-    except ValueError as error:
-        raise InputError(
-            f"{path.name}: the file is no TOML in UTF-8: {error}."
-        ) from error
-    return parse_experiment(text, path)
+    return parse_experiment(read_experiment_text(path), path)
 
 
 def parse_experiment(text: str, path: Path) -> Experiment:
     """Return the experiment of a text; other paths are relative to its folder."""
-    try:
-        tables = tomllib.loads(text)
-    except (ValueError, RecursionError) as error:
-        fault = str(error).rstrip(".")
-        raise InputError(
-            f"{path.name}: the file is no TOML in UTF-8: {fault}."
-        ) from error
-    _drop_former_keys(tables)
+    tables = parse_tables(text, path)
     try:
         experiment = _build(tables, text, path)
     except InputError as error:
@@ -133,19 +108,8 @@ def parse_experiment(text: str, path: Path) -> Experiment:
     return experiment
 
 
-def _drop_former_keys(tables: TomlTable) -> None:
-    """Remove keys that earlier templates wrote, at the values that change nothing."""
-    for (*places, key), value in FORMER_KEYS.items():
-        table: Any = tables
-        for place in places:
-            table = table.get(place) if isinstance(table, dict) else None
-        if isinstance(table, dict) and table.get(key) == value:
-            del table[key]
-
-
 def _build(tables: TomlTable, text: str, path: Path) -> Experiment:
     """Return the experiment that the tables of a file describe."""
-    _require_tables(tables)
     source = call(RobotSource, tables["robot"], "robot")
     with within("robot"):
         robot_file = source.robot_file(path.parent)
@@ -173,18 +137,6 @@ def _build(tables: TomlTable, text: str, path: Path) -> Experiment:
         _build_excitation(tables.get("excitation", {}), path.parent),
         _build_collision(tables.get("collision", {}), path.parent),
     )
-
-
-def _require_tables(tables: TomlTable) -> None:
-    """Reject tables that are unknown, no tables, or missing."""
-    check_names(tables, list(TABLES))
-    for name, table in tables.items():
-        if not isinstance(table, dict):
-            raise InputError(f"`{name}` must be a table, but is {table!r}.")
-    if "robot" not in tables:
-        raise InputError(
-            "the table `[robot]` is missing: give it `urdf`, `mjcf` or `builtin`."
-        )
 
 
 def _build_rollout(

@@ -153,21 +153,11 @@ class RobotSource:
                 )
 
     def robot_file(self, folder: Path) -> RobotFile | None:
-        """Return the robot's URDF or MJCF file; None for other sources.
-
-        Raises:
-            InputError: If the file is not there.
-        """
-        key = "mjcf" if self.urdf is None else "urdf"
-        name = getattr(self, key)
+        """Return the robot's URDF or MJCF file; None for other sources."""
+        name = self.urdf or self.mjcf
         if name is None:
             return None
-        path = folder / name
-        if not path.is_file():
-            raise InputError(
-                f"`{key}`: `{path}` is no file: paths are relative to this file."
-            )
-        return RobotFile(path, tip=self.tip, base=self.base, **self.placement)
+        return RobotFile(folder / name, tip=self.tip, base=self.base, **self.placement)
 
     @property
     def placement(self) -> dict[str, Any]:
