@@ -26,6 +26,8 @@ MISSING = "–"  # noqa: RUF001
 """Text in place of a number that is not known."""
 SHORT_DECIMALS = range(-3, 9)
 """Decimals of numbers without exponent; -3 are three digits too many."""
+PADDING = 2
+"""Blanks between two columns."""
 MIN_TEXT_WIDTH = 12
 """Characters of a line to which a column of texts may be folded."""
 UNSEEN_CHARACTERS = re.compile(
@@ -167,15 +169,6 @@ def with_deviations(values: Any, deviations: Any) -> tuple[list[str], list[str]]
         for value, deviation in zip(values, deviations, strict=True)
     ]
     return [pair[0] for pair in pairs], [pair[1] for pair in pairs]
-
-
-def shortened(text: str, max_length: int) -> str:
-    """Return a text whose middle is left out if it is longer than its place."""
-    if len(text) <= max_length:
-        return text
-    head = (max_length - 1) * 2 // 3
-    tail = max_length - 1 - head
-    return f"{text[:head]}…{text[-tail:]}"
 
 
 class Column:
@@ -323,7 +316,7 @@ class Table:
             facts = [(Text(word, "dim"), text) for word, text in self.facts]
             parts.append(_two_columns(facts))
         if self.columns:
-            parts.append(self._grid())
+            parts.append(self._grid(options.max_width))
         if self.remarks:
             remarks = [(_mark(remark.status), remark.line) for remark in self.remarks]
             parts.append(_two_columns(remarks))
@@ -335,15 +328,15 @@ class Table:
                 yield Text()
             yield part
 
-    def _grid(self) -> Any:
+    def _grid(self, max_width: int) -> Any:
         """Return marks and columns as a table of `rich`, which folds texts to fit."""
         from rich.rule import Rule
         from rich.table import Table as Grid
         from rich.text import Text
 
-        grid = Grid(box=None, padding=(0, 2, 0, 0), pad_edge=False)
+        grid = Grid(box=None, padding=(0, PADDING, 0, 0), pad_edge=False)
         if self.status:
-            grid.add_column()
+            grid.add_column(min_width=1)
         cells = []
         for column in self.columns:
             texts = column.texts
@@ -360,6 +353,12 @@ class Table:
                 grid.add_column(header, min_width=min_width, overflow="fold")
             cells.append(map(Text, texts))
 
+        # Where the terminal is too narrow, lines go on beyond it: `rich` would leave
+        # columns out.
+        widths = [(column.min_width or 0) + PADDING for column in grid.columns]
+        if sum(widths) - PADDING > max_width:
+            grid.width = sum(widths) - PADDING
+
         for k, row in enumerate(zip(*cells, strict=True)):
             if k in self.rules:
                 grid.add_row(*[Rule(style="dim")] * len(grid.columns))
@@ -373,7 +372,7 @@ def _two_columns(rows: Iterable[tuple[Any, str]]) -> Any:
     from rich.table import Table as Grid
     from rich.text import Text
 
-    grid = Grid.grid(padding=(0, 2, 0, 0))
+    grid = Grid.grid(padding=(0, PADDING, 0, 0))
     grid.add_column(no_wrap=True)
     grid.add_column(overflow="fold")
     for head, text in rows:

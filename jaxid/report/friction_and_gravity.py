@@ -8,7 +8,7 @@ from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.motion import Motion
 from jaxid.dynamics.sample_methods import in_numpy
 from jaxid.identification.fit_result import Fit
-from jaxid.result_table import Column, Table, percent, shortened, significant
+from jaxid.result_table import Column, Table, percent, significant
 from jaxid.validation.torque_errors import TorqueErrors
 
 from .figure import Figure
@@ -57,7 +57,7 @@ def friction_figure(fit: Fit, logs: Sequence[TorqueErrors]) -> Figure:
         panels.append(
             Panel(
                 curves,
-                title=shortened(robot.joint_names[j], 26),
+                title=robot.joint_names[j],
                 value=f"{force_text} {unit} at full speed",
                 x=f"speed [{robot.joint_unit(j)}/s]",
                 y="friction",
@@ -178,7 +178,7 @@ def error_scene(fit: Fit, log: TorqueErrors) -> Figure:
     return pose_figure(
         robot,
         np.asarray(log.positions),
-        title=f"{robot.name} along {shortened(log.name, 40)}",
+        title=f"{robot.name} along {log.name}",
         time=np.asarray(log.time),
         values=100.0 * log.errors / scale,
         label=f"torque error [% of {reference}]",

@@ -1,6 +1,8 @@
 """Figures on paper and in notebooks, by matplotlib, which only this module loads."""
 
 import math
+import textwrap
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +31,12 @@ TITLE_HEIGHT = 0.9
 """Height of title and legend [inch]."""
 SMALL_SIZE = 7.5
 """Size of the texts on bars [pt]."""
+TITLE_LENGTH = 70
+"""Largest number of letters in a line of a figure's title."""
+PANEL_TITLE_LENGTH = 26
+"""Largest number of letters in a line of a panel's title, beside its value."""
+TICK_LENGTH = 20
+"""Largest number of letters in a line of a name on an axis."""
 DATED_ENTRIES = {"png": "Software", "pdf": "CreationDate", "svg": "Date"}
 """Entry of a file that differs from day to day, or with the version of matplotlib."""
 
@@ -42,9 +50,8 @@ def draw(drawing: Drawing) -> Figure:
         # The figure belongs to no window and no list of figures.
         figure = Figure(figsize=size, layout="constrained")
         FigureCanvasAgg(figure)
-        figure.suptitle(
-            drawing.title, x=0.01, ha="left", fontsize=12, fontweight="bold"
-        )
+        title = textwrap.fill(drawing.title, TITLE_LENGTH)
+        figure.suptitle(title, x=0.01, ha="left", fontsize=12, fontweight="bold")
         if drawing.scene is not None:
             _draw_scene(figure, drawing.scene)
             return figure
@@ -99,7 +106,8 @@ def _draw_panel(axes: Axes, panel: Panel) -> None:
         line(value, color=colour, lw=0.7, ls="--" if value else "-", zorder=1)
     for curve in panel.curves:
         _draw_curve(axes, curve, panel.in_time)
-    axes.set_title(panel.title, loc="left", fontweight="bold")
+    title = textwrap.fill(panel.title, PANEL_TITLE_LENGTH)
+    axes.set_title(title, loc="left", fontweight="bold")
     axes.set_title(panel.value, loc="right", color=GREY, fontsize=8)
     axes.set_ylabel(panel.y_label)
     axes.set_xlim(panel.x_range)
@@ -112,9 +120,9 @@ def _draw_panel(axes: Axes, panel: Panel) -> None:
         _name_ordinates(axes, panel.y_names)
 
 
-def _name_abscissas(axes: Axes, names: Any) -> None:
+def _name_abscissas(axes: Axes, names: Sequence[str]) -> None:
     """Write names instead of numbers, tilted where they are many or long."""
-    axes.set_xticks(np.arange(len(names)), names)
+    axes.set_xticks(np.arange(len(names)), _folded_names(names))
     if len(names) > 10 or max(map(len, names)) > 12:
         axes.tick_params("x", labelrotation=35)
         for label in axes.get_xticklabels():
@@ -122,11 +130,15 @@ def _name_abscissas(axes: Axes, names: Any) -> None:
     axes.grid(visible=False, axis="x")
 
 
-def _name_ordinates(axes: Axes, names: Any) -> None:
+def _name_ordinates(axes: Axes, names: Sequence[str]) -> None:
     """Write names instead of numbers, from the top."""
-    axes.set_yticks(np.arange(len(names)), names)
+    axes.set_yticks(np.arange(len(names)), _folded_names(names))
     axes.set_ylim(len(names) - 0.4, -0.6)
     axes.grid(visible=False, axis="y")
+
+
+def _folded_names(names: Sequence[str]) -> list[str]:
+    return [textwrap.fill(name, TICK_LENGTH) for name in names]
 
 
 def _draw_curve(axes: Axes, curve: Curve, in_time: bool) -> None:

@@ -3,7 +3,7 @@
 import numpy as np
 
 from jaxid.identification.uncertainty import ResidualSpectra
-from jaxid.result_table import percent, shortened
+from jaxid.result_table import percent
 from jaxid.robot.robot import Robot
 
 from .figure import Figure
@@ -51,7 +51,7 @@ def _spectrum_panel(spectra: ResidualSpectra, robot: Robot, j: int) -> Panel:
                 frequency, white_level * white_density, white_name, GREY, dashed=True
             ),
         ],
-        title=shortened(robot.joint_names[j], 24),
+        title=robot.joint_names[j],
         value=f"{verdict}: {low_share} % of the power {low_band}",
         x="frequency [Hz]",
         unit="(N m)²/Hz" if robot.force_unit(j) == "N m" else "N²/Hz",

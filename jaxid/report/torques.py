@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from jaxid.errors import InputError
-from jaxid.result_table import percent, shortened, significant
+from jaxid.result_table import percent, significant
 from jaxid.robot.robot import Robot
 from jaxid.validation.torque_errors import TorqueErrors
 
@@ -55,7 +55,7 @@ def torque_figure(
     window = slice(rows[0], rows[-1] + 1)
     panels = [_joint_panel(errors, robot, j, window) for j in joints]
     columns = 2 if len(panels) > 2 else 1
-    name = shortened(errors.name if title is None else title, 40)
+    name = errors.name if title is None else title
     return Figure(
         f"{name}: relative error {percent(errors.relative)} %",
         panels,
@@ -86,7 +86,7 @@ def _joint_panel(errors: TorqueErrors, robot: Robot, j: int, window: slice) -> P
             Curve(time, measured_forces, "measured", MEASUREMENT_COLOUR, width=1.9),
             Curve(time, predicted_forces, "predicted", PREDICTION_COLOUR, width=0.8),
         ],
-        title=shortened(robot.joint_names[j], 26),
+        title=robot.joint_names[j],
         value=_mean_error_text(errors, j, unit),
         y="torque" if robot.revolute[j] else "force",
         unit=unit,
@@ -177,7 +177,7 @@ def bar_figure(
         y="mean |error|",
         unit=f"% of {reference}",
         x_range=(-0.6, joints - 0.4),
-        x_names=[shortened(name, 20) for name in robot.joint_names],
+        x_names=robot.joint_names,
     )
     return Figure(
         title or f"{robot.name}: torque errors",

@@ -165,25 +165,27 @@ def test_a_motion_and_its_arrays_give_the_same():
 @pytest.mark.parametrize("samples", [8, 300])
 def test_the_samples_of_a_mesh_of_devices(samples):
     """Branches and loops agree on differences along a mesh, of any argument."""
+    model = jid.Model(jid.robots.planar_arm(1))
+    p = P[: model.size]
     mesh = jax.sharding.Mesh(np.array(jax.devices()[:1]), ("d",))
     spec = jax.sharding.PartitionSpec("d")
-    x = in_jax(motion(samples))
+    x = in_jax(motion(samples, 1))
 
     def on_mesh(function, spec_out=spec):
         run = jax.shard_map(function, mesh=mesh, in_specs=spec, out_specs=spec_out)
         return jax.jit(run)(x)
 
     def cost(x):
-        return jnp.sum(MODEL.inverse_dynamics(P, x) ** 2)
+        return jnp.sum(model.inverse_dynamics(p, x) ** 2)
 
-    found = on_mesh(lambda x: MODEL.inverse_dynamics(P, x))
-    np.testing.assert_allclose(found, MODEL.inverse_dynamics(P, x), rtol=1e-12)
-    np.testing.assert_allclose(on_mesh(MODEL.regressor), MODEL.regressor(x), atol=1e-12)
+    found = on_mesh(lambda x: model.inverse_dynamics(p, x))
+    np.testing.assert_allclose(found, model.inverse_dynamics(p, x), rtol=1e-12)
+    np.testing.assert_allclose(on_mesh(model.regressor), model.regressor(x), atol=1e-12)
     sums = on_mesh(
-        lambda x: jax.lax.psum(MODEL.gram(x), "d"), jax.sharding.PartitionSpec()
+        lambda x: jax.lax.psum(model.gram(x), "d"), jax.sharding.PartitionSpec()
     )
-    np.testing.assert_allclose(sums, MODEL.gram(x), rtol=1e-11, atol=1e-11)
-    slopes, expected = on_mesh(jax.grad(cost)), jax.grad(cost)(x)
+    np.testing.assert_allclose(sums, model.gram(x), rtol=1e-11, atol=1e-11)
+    slopes, expected = on_mesh(jax.grad(cost)), jax.jit(jax.grad(cost))(x)
     jax.tree.map(
         lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9), slopes, expected
     )

@@ -44,6 +44,14 @@ def numbers(packed):
     return np.frombuffer(base64.b64decode(packed["floats"]), "<f4")
 
 
+def texts_of(figure):
+    """Titles and names on the axes of a figure on paper."""
+    figure.canvas.draw()
+    for axes in figure.axes:
+        yield axes.get_title(loc="left")
+        yield from (label.get_text() for label in axes.get_xticklabels())
+
+
 def require_everything_inside(shown):
     """On paper no text is cut off, and no panel's title touches another panel."""
     figure = shown.matplotlib()
@@ -111,11 +119,17 @@ def test_long_names_fit_on_the_page(errors_of):
     spectra = ResidualSpectra(
         f, density, 1.0 / (1.0 + (f / 10) ** 4), half, 0.1, half, 9.5
     )
-    require_everything_inside(jid.plot.torques(errors, robot))
-    require_everything_inside(
-        jid.plot.bars({"identification": (errors,), "verification": (errors,)}, robot)
+    bars = jid.plot.bars(
+        {"identification": (errors,), "verification": (errors,)}, robot
     )
-    require_everything_inside(jid.plot.residuals(spectra, robot))
+    for figure in (
+        jid.plot.torques(errors, robot),
+        bars,
+        jid.plot.residuals(spectra, robot),
+    ):
+        require_everything_inside(figure)
+        drawn = "".join("".join(texts_of(figure.matplotlib())).split())
+        assert all(name in drawn for name in names), "folded, not cut"
 
 
 def test_residuals_stand_beside_white_ones(fit):

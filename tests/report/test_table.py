@@ -90,6 +90,37 @@ def test_numbers_are_never_cut():
     assert wide.text(30).split() == ["n"] * 10 + numbers
 
 
+EXPRESSION = "A2 - B2 - (l2x^2 - l2y^2)*(m3 + m4 + m5) + 0.0825*(m4 + m5 - mz6)"
+
+
+@pytest.mark.parametrize("width", [30, 40, 60, 80, 100])
+def test_names_are_folded_and_never_cut(width):
+    """Two joints may differ in the middle of their names only, expressions too."""
+    names = ["left_arm_shoulder_pan_joint", "left_arm_shoulder_lift_joint"]
+    expressions = [EXPRESSION, EXPRESSION.replace("l2y", "l3y")]
+    numbers = [Column(f"number {k}", [1.5, 10.5], "N m") for k in range(3)]
+    folded = Table(
+        "",
+        Column("joint", names),
+        Column("parameter", expressions, kind="code"),
+        *numbers,
+        status=[Status.GOOD, Status.BAD],
+    )
+    assert "…" not in folded.text(width)
+    lines = folded.text(width).splitlines()
+    header = next(line for line in lines if line.split()[:1] == ["joint"])
+    first, last = header.index("joint"), header.index("parameter")
+    end = max(header.index("[N m]"), last + 12)
+    starts = [k for k, line in enumerate(lines) if line[:1] in ("✓", "✗")]
+    for k, start in enumerate(starts):
+        rows = lines[start : [*starts, None][k + 1]]
+        assert "".join(row[first:last].strip() for row in rows) == names[k]
+        code = "".join(row[last:end] for row in rows)
+        assert "1.50" not in code
+        assert "".join(code.split()) == expressions[k].replace(" ", "")
+    assert all(text in folded.text(width) for text in ("1.50", "10.5"))
+
+
 def test_the_terminal_shows_the_same_letters_in_colour():
     plain, coloured = io.StringIO(), io.StringIO()
     show(Console(file=plain, width=60), table())

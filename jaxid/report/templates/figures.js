@@ -48,6 +48,9 @@
     }),
   };
 
+  // Names of joints may be long: two of them may differ only in the middle.
+  const folded = (name) => name.match(/.{1,20}/g).map(escaped).join("<br>");
+
   const axisNumber = (panel) => (panel ? String(panel + 1) : "");
 
   function traceOf(curve, { panels, curves }) {
@@ -67,7 +70,7 @@
       ticks: "outside", ticklen: 3, tickcolor: grey, ...look, title,
       ...(logarithmic && { type: "log", exponentformat: "power" }),
       ...(range && { range: logarithmic ? range.map(Math.log10) : range }),
-      ...(names.length && { tickvals: [...names.keys()], ticktext: names.map(escaped), autotickangles: [0, 90] }),
+      ...(names.length && { tickvals: [...names.keys()], ticktext: names.map(folded), autotickangles: [0, 90] }),
     };
   }
 
