@@ -28,6 +28,10 @@ EFFECTS = {
     "tendon_dampingpoly": ("tendon", "a damping that depends on the speed"),
     "tendon_frictionloss": ("tendon", "dry friction"),
     "tendon_armature": ("tendon", "inertia"),
+    "actuator_damping": ("actuator", "damping of several joints at once"),
+    "actuator_dampingpoly": ("actuator", "a damping that depends on the speed"),
+    "actuator_armature": ("actuator", "inertia of several joints at once"),
+    "body_plugin": ("link", "a plugin"),
     "body_gravcomp": (
         "link",
         "`gravcomp` (if all bodies have 1, a log of this simulation holds no gravity: "
@@ -35,6 +39,28 @@ EFFECTS = {
     ),
 }
 """Arrays of effects beside the default model: kind of the elements, and words."""
+SWITCHED_ARRAYS = {
+    "SPRING": (
+        "jnt_stiffness",
+        "jnt_stiffnesspoly",
+        "jnt_springyield",
+        "tendon_stiffness",
+        "tendon_stiffnesspoly",
+    ),
+    "DAMPER": (
+        "dof_damping",
+        "dof_dampingpoly",
+        "tendon_damping",
+        "tendon_dampingpoly",
+        "actuator_damping",
+        "actuator_dampingpoly",
+    ),
+    "FRICTIONLOSS": ("dof_frictionloss", "tendon_frictionloss"),
+    "EQUALITY": ("eq_active0",),
+    "CONSTRAINT": ("dof_frictionloss", "tendon_frictionloss", "eq_active0"),
+    "GRAVITY": ("body_gravcomp",),
+}
+"""Arrays of effects that a flag of MuJoCo switches off, by the name of its bit."""
 
 
 class Effect(NamedTuple):
@@ -89,6 +115,8 @@ def mjcf_as_urdf(path: str | Path) -> Description:
         raise InputError(
             f"`{path}`: MuJoCo cannot compile this file: {reason}."
         ) from error
+    _switch_off(mujoco, model)
+    _carry_to_joints(mujoco, model)
     tree = _Writer(mujoco, model)
     for body in range(1, model.nbody):
         tree.add_body(body)
@@ -98,8 +126,6 @@ def mjcf_as_urdf(path: str | Path) -> Description:
         tree.add_constraint(int(constraint))
 
     gravity = np.array(model.opt.gravity)
-    if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY:
-        gravity = np.zeros(3)
     # Motors that compensate gravity themselves feel the whole weight.
     if model.jnt_actgravcomp.all() or not gravity.any():
         model.body_gravcomp[:] = 0.0
@@ -303,6 +329,8 @@ class _Writer:
         for array, (kind, words) in EFFECTS.items():
             # Earlier versions of MuJoCo lack some arrays.
             values = np.asarray(getattr(model, array, []))
+            if array == "body_plugin":
+                values = values + 1  # they are indices, -1 for none
             for row in np.unique(np.argwhere(values)[:, 0]):
                 element = model.dof_jntid[row] if array.startswith("dof") else row
                 name = self._links[row] if kind == "link" else self._name(kind, element)
@@ -337,13 +365,52 @@ class _Writer:
         self._joints[joint].append(E.mimic(**attributes))
 
 
-def _largest_forces(mujoco: Any, model: Any):
-    """Return the largest force of actuators on each joint; infinite if unknown."""
+def _switch_off(mujoco: Any, model: Any):
+    """Set to zero what the flags of a compiled model switch off."""
+    bits = mujoco.mjtDisableBit
+    flags = model.opt.disableflags
+    for name, arrays in SWITCHED_ARRAYS.items():
+        if flags & getattr(bits, f"mjDSBL_{name}"):
+            for array in arrays:
+                # Earlier versions of MuJoCo lack some arrays.
+                getattr(model, array, np.zeros(0))[:] = 0
+    if flags & bits.mjDSBL_GRAVITY:
+        model.opt.gravity[:] = 0.0
+    # Without springs and dampers MuJoCo computes no passive forces at all.
+    if flags & bits.mjDSBL_SPRING and flags & bits.mjDSBL_DAMPER:
+        model.body_gravcomp[:] = 0.0
+        model.opt.density = 0.0
+        model.opt.viscosity = 0.0
+
+
+def _carry_to_joints(mujoco: Any, model: Any):
+    """Give inertia and damping of actuators on one joint to the joint, by gear²."""
+    for actuator in range(model.nu):
+        if not _acts_on_joint(mujoco, model, actuator):
+            continue
+        dof = model.jnt_dofadr[model.actuator_trnid[actuator, 0]]
+        factor = model.actuator_gear[actuator, 0] ** 2
+        for quantity in ("armature", "damping", "dampingpoly"):
+            # Earlier versions of MuJoCo lack some arrays.
+            values = getattr(model, f"actuator_{quantity}", None)
+            if values is not None:
+                joint_values = getattr(model, f"dof_{quantity}")
+                joint_values[dof] += factor * values[actuator]
+                values[actuator] = 0.0
+
+
+def _acts_on_joint(mujoco: Any, model: Any, actuator: int):
+    """Return whether an actuator drives a single joint."""
     transmissions = mujoco.mjtTrn
     joint_kinds = (transmissions.mjTRN_JOINT, transmissions.mjTRN_JOINTINPARENT)
+    return int(model.actuator_trntype[actuator]) in joint_kinds
+
+
+def _largest_forces(mujoco: Any, model: Any):
+    """Return the largest force of actuators on each joint; infinite if unknown."""
     total = np.zeros(model.njnt)
     for actuator in range(model.nu):
-        if int(model.actuator_trntype[actuator]) in joint_kinds:
+        if _acts_on_joint(mujoco, model, actuator):
             joint = model.actuator_trnid[actuator, 0]
             gear = np.abs(model.actuator_gear[actuator, 0])
             force = _largest_input(mujoco, model, actuator)

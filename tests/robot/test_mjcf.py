@@ -254,8 +254,47 @@ OMITTED = {
         "constraint `stay`: .*tendons",
     ),
 }
+OMITTED["actuator of a tendon"] = (
+    {
+        "rest": TENDON.format("")
+        + '<actuator><motor name="winch" tendon="cable" damping="1"/></actuator>'
+    },
+    "actuator `winch`: .*several joints",
+)
+OMITTED["actuator's polynomial"] = (
+    {"rest": '<actuator><motor joint="bend" damping="1 2" gear="3"/></actuator>'},
+    "joint `bend`: .*depends on the speed",
+)
+SPRINGS = {
+    "lift": 'stiffness="1 2"',
+    "bend": 'stiffness="5" springref="20"',
+    "rest": TENDON.format('stiffness="5"'),
+}
+DAMPERS = {
+    "lift": 'damping="1 2"',
+    "bend": 'damping="5"',
+    "rest": TENDON.format('damping="5"')
+    + '<actuator><motor tendon="cable" damping="1 2"/></actuator>',
+}
+NO_PASSIVE_FORCES = 'spring="disable" damper="disable"'
 NO_EFFECTS = {
     "nothing": {},
+    "no springs": SPRINGS | {"flag": 'spring="disable"'},
+    "no dampers": DAMPERS | {"flag": 'damper="disable"'},
+    "no passive forces": {
+        "lower": 'gravcomp="1"',
+        "density": "1.2",
+        "flag": NO_PASSIVE_FORCES,
+    },
+    "no friction": {
+        "rest": TENDON.format('frictionloss="5"'),
+        "flag": 'frictionloss="disable"',
+    },
+    "no constraints": {
+        "rest": TENDON.format('frictionloss="5"')
+        + '<equality><tendon name="stay" tendon1="cable"/></equality>',
+        "flag": 'constraint="disable"',
+    },
     "no gravity": {"lower": 'gravcomp="1"', "flag": 'gravity="disable"'},
     "motors do it": {
         "lower": 'gravcomp="1"',
@@ -292,14 +331,26 @@ def test_what_does_not_act_is_not_noted(write, changes):
     assert not jid.load_mjcf(write(effects(**changes)), tip="lower").notes
 
 
-def test_springs_dampers_and_rotors_are_those_of_mujoco(write):
+MOTORS = """<actuator><motor joint="lift" gear="-3" armature="0.02" damping="0.3"/>
+  <position joint="bend" kp="10" damping="0.5"/></actuator>"""
+
+
+@pytest.mark.parametrize(
+    "flag", ["", *(f'{x}="disable"' for x in ("spring", "damper"))]
+)
+def test_springs_dampers_and_rotors_are_those_of_mujoco(write, flag):
     text = effects(
         lift='stiffness="30" springref="40" ref="10" damping="2" armature="0.1"',
         bend='stiffness="7" damping="1"',
+        rest=MOTORS,
+        flag=flag,
     )
     path = write(text)
     robot = jid.load_mjcf(path, tip="lower")
-    assert "joints `lift`, `bend`: the file states a spring" in robot.notes[0]
+    if "spring" in flag:
+        assert not robot.notes
+    else:
+        assert "joints `lift`, `bend`: the file states a spring" in robot.notes[0]
 
     terms = (
         jid.RigidBodies(),
@@ -326,3 +377,14 @@ def test_springs_dampers_and_rotors_are_those_of_mujoco(write):
         expected.append(data.qfrc_inverse[:2].copy())
     ours = model.inverse_dynamics(p, motion)
     np.testing.assert_allclose(ours, expected, rtol=0, atol=1e-10)
+
+
+def test_a_constraint_that_is_switched_off_holds_no_joint(write):
+    text = ARM.replace('-9.7"/>', '-9.7"><flag equality="disable"/></option>')
+    robot = jid.load_mjcf(write(text))
+    assert robot.joint_names == ("pan", "lift", "slide", "left", "right")
+
+
+def test_friction_that_is_switched_off_is_not_claimed(write):
+    text = ARM.replace('-9.7"/>', '-9.7"><flag frictionloss="disable"/></option>')
+    assert not joint_parameters(write(text))["friction"].any()
