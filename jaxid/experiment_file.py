@@ -22,6 +22,7 @@ KEYS: dict[str, tuple[str, ...]] = {
         "mjcf",
         "tip",
         "base",
+        "xacro_arguments",
         "builtin",
         "name",
         "gravity",

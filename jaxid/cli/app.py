@@ -107,14 +107,17 @@ def init(
     ],
     tip: options.Tip = None,
     base: options.Base = None,
+    xacro: options.XacroArguments = None,
 ) -> None:
     """Print a commented experiment file for a robot.
 
     Like this: jaxid init arm.urdf > experiment.toml
     """
     options.start(urdf)
-    text = jid.experiment.write_template(urdf, tip=tip, base=base)
-    remarks = jid.load_urdf(urdf, tip=tip, base=base).remarks
+    arguments = options.xacro_arguments(xacro)
+    chain = {"tip": tip, "base": base, "xacro_arguments": arguments}
+    text = jid.experiment.write_template(urdf, **chain)
+    remarks = jid.load_urdf(urdf, **chain).remarks
     terminal.show_remarks(terminal.open_console(stderr=True), remarks)
     typer.echo(text.encode(), nl=False)  # TOML is UTF-8, whatever the terminal is
 

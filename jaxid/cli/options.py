@@ -40,6 +40,14 @@ Base = Annotated[
     str | None,
     typer.Option(metavar="LINK", help="The link on the ground; by default the root."),
 ]
+XacroArguments = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--xacro",
+        metavar="NAME:=VALUE",
+        help="An argument of a xacro file, like dof:=6; may be repeated.",
+    ),
+]
 Paths = list[Path]
 Logs = Annotated[
     Paths,
@@ -62,6 +70,17 @@ Loaded = Annotated[
         metavar="LOG", help="A log with the load, or a report; may be repeated."
     ),
 ]
+
+
+def xacro_arguments(words: list[str] | None) -> dict[str, str]:
+    """Return the arguments of a xacro file, as `--xacro` writes them, by name."""
+    arguments = {}
+    for word in words or []:
+        name, mark, text = word.partition(":=")
+        if not name or not mark:
+            raise InputError(f"`--xacro` must be like dof:=6, but is `{word}`.")
+        arguments[name] = text
+    return arguments
 
 
 def require_one_log_per_option() -> None:

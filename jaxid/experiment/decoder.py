@@ -164,6 +164,11 @@ def _convert(value: Any, option: Any, place: str) -> Any:
         return result
     if origin is Literal:
         return value if value in arguments else _MISMATCH
+    if origin is dict:
+        if not isinstance(value, dict):
+            return _MISMATCH
+        _, hint = arguments
+        return {k: decode_value(x, hint, f"{place}.{k}") for k, x in value.items()}
     if origin in (list, tuple):
         if not isinstance(value, list):
             return _MISMATCH

@@ -1,6 +1,7 @@
 """The tables `[robot]`, `[limits]`, `[drives]` and `[load]` of an experiment file."""
 
 import dataclasses
+import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal, cast
@@ -98,6 +99,8 @@ class RobotSource:
         tip: Link (body or site) of the end-effector in the URDF (MJCF) file: only the
             chain from `base` to it is used, like `"flange"`.
         base: Link (body) of that file that stands on the ground, like `"base_link"`.
+        xacro_arguments: Arguments with which a xacro file is expanded, like
+            `{ dof = "6" }`.
         builtin: Name of a robot that jaxid knows, like `"tx40"`: tx90l_on_rail, tx40,
             ur10, ur10e, panda, iiwa14, kr300 or planar_arm.
 
@@ -116,6 +119,7 @@ class RobotSource:
     mjcf: str | None = None
     tip: str | None = None
     base: str | None = None
+    xacro_arguments: dict[str, str | bool | int | float] | None = None
     builtin: (
         Literal[
             "tx90l_on_rail",
@@ -146,7 +150,7 @@ class RobotSource:
                 f"one of `urdf`, `mjcf` and `builtin` is needed, but there is {words}; "
                 "give a Denavit-Hartenberg table to `from_dh` in Python."
             )
-        for key in ("tip", "base"):
+        for key in ("tip", "base", "xacro_arguments"):
             if getattr(self, key) is not None and self.builtin is not None:
                 raise InputError(
                     f"`{key}` belongs to `urdf`, not to `builtin`: remove it."
@@ -157,7 +161,13 @@ class RobotSource:
         name = self.urdf or self.mjcf
         if name is None:
             return None
-        return RobotFile(folder / name, tip=self.tip, base=self.base, **self.placement)
+        # xacro reads `true` and numbers as TOML writes them.
+        arguments = {
+            key: value if isinstance(value, str) else json.dumps(value)
+            for key, value in (self.xacro_arguments or {}).items()
+        }
+        chain = {"tip": self.tip, "base": self.base, "xacro_arguments": arguments}
+        return RobotFile(folder / name, **chain, **self.placement)
 
     @property
     def placement(self) -> dict[str, Any]:

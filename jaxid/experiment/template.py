@@ -80,15 +80,17 @@ def write_template(
     *,
     tip: str | None = None,
     base: str | None = None,
+    xacro_arguments: Mapping[str, str] | None = None,
     folder: FilePath = ".",
 ) -> str:
     """Return a complete commented experiment file for a robot; it loads as it is."""
-    robot = load_urdf(urdf, tip=tip, base=base)
-    stiffness = joint_parameters(urdf, tip=tip, base=base)["stiffness"]
+    chain: Any = {"tip": tip, "base": base, "xacro_arguments": xacro_arguments}
+    robot = load_urdf(urdf, **chain)
+    stiffness = joint_parameters(urdf, **chain)["stiffness"]
     path = os.path.relpath(Path(urdf).resolve(), Path(folder).resolve())
     key = "mjcf" if is_mjcf(urdf) else "urdf"
     values = {
-        "robot": {key: Path(path).as_posix(), "tip": tip, "base": base},
+        "robot": {key: Path(path).as_posix(), **chain},
         "limits": {
             name: np.asarray(getattr(robot.limits, name)).tolist() for name in LIMITS
         },
@@ -189,6 +191,9 @@ def toml_text(value: Any) -> str | None:
         # In a list, infinity is written, too.
         texts = [repr(x) if isinstance(x, float) else str(toml_text(x)) for x in value]
         return f"[{', '.join(texts)}]" if value else None
+    if isinstance(value, dict):
+        entries = [f"{json.dumps(k)} = {toml_text(x)}" for k, x in value.items()]
+        return f"{{ {', '.join(entries)} }}" if value else None
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, Unit):

@@ -12,6 +12,7 @@ from jaxid.errors import InputError
 from jaxid.identification.consistency import consistency_margin
 from jaxid.identification.fit_result import Fit
 from jaxid.io import FilePath, write_bytes
+from jaxid.robot.description_files import is_xacro
 from jaxid.robot.inertia import BodyParameters, Inertia
 from jaxid.robot.mjcf import exact_text
 from jaxid.robot.robot import Robot
@@ -69,8 +70,10 @@ def export_urdf(
     tip = robot.source_tip if tip is None else tip
     base = robot.source_base if base is None else base
     bodies = feasible_bodies(fit, "a URDF file")
-    _require_same_robot(robot, load_urdf(source, tip=tip, base=base), source)
-    tree = UrdfTree(source, tip=tip, base=base)
+    arguments = dict(robot.source_arguments) if is_xacro(source) else {}
+    file_robot = load_urdf(source, tip=tip, base=base, xacro_arguments=arguments)
+    _require_same_robot(robot, file_robot, source)
+    tree = UrdfTree(source, tip=tip, base=base, xacro_arguments=arguments)
     dynamics = joint_dynamics(fit)
     _replace_comment(tree.root, fit, (*dynamics.rotors, *dynamics.omissions))
     _replace_inertials(tree, bodies)

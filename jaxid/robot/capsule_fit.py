@@ -1,5 +1,6 @@
 """Capsules around the links of a robot, from their geometry or from its joints."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -31,6 +32,7 @@ def fit_capsules(
     base: str | None = None,
     base_rotation: Numbers | None = None,
     base_position: Numbers = ORIGIN,
+    xacro_arguments: Mapping[str, str] | None = None,
     packages: str | Path | None = None,
     faults: dict[str, str] | None = None,
 ) -> tuple[Capsule, ...]:
@@ -50,6 +52,7 @@ def fit_capsules(
         base: As in `load_urdf`.
         base_rotation: As in `load_urdf`.
         base_position: As in `load_urdf` [m].
+        xacro_arguments: As in `load_urdf`.
         packages: Folder that holds the packages of `package://` paths. If None, they
             are searched in the folders above the file.
         faults: Dictionary for why a link's geometry cannot be read, by link; if None,
@@ -59,7 +62,7 @@ def fit_capsules(
         FileNotFoundError: If the file or a mesh does not exist.
         InputError: If the file cannot be loaded, or its geometry cannot be read.
     """
-    tree = UrdfTree(path, base=base, tip=tip)
+    tree = UrdfTree(path, base=base, tip=tip, xacro_arguments=xacro_arguments)
     mount = np.eye(3) if base_rotation is None else np.array(base_rotation, np.float64)
     place = np.array(base_position, np.float64)
     # MuJoCo has read the shapes of an MJCF file; those of a URDF are read here.

@@ -2,8 +2,7 @@
 
 import math
 import re
-import shutil
-import subprocess
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,20 +12,28 @@ from jaxid.errors import InputError
 
 from .mjcf import Description, mjcf_as_urdf
 from .robot import GRAVITY
+from .xacro import expand_xacro
 
 MAX_PARTS = {"hfield": 10_000_000, "replicate": 2_000}
 """Largest numbers of heights of a field, and of copies of a body, in an MJCF file."""
 
 
-def read_description(path: str | Path) -> Description:
+def read_description(
+    path: str | Path, xacro_arguments: Mapping[str, str] | None = None
+) -> Description:
     """Return the URDF element of a robot's file, and what else the file states."""
     robot = _parse(path)
+    if xacro_arguments and not _has_xacro(robot):
+        raise InputError(
+            f"`{path}` is no xacro file, which alone has arguments: "
+            "remove `xacro_arguments` (`--xacro`)."
+        )
     if robot.tag == "mujoco":
         _refuse_huge(path, robot)
         _refuse_nan(path, robot)
         return mjcf_as_urdf(path)
-    if any("ros.org/" in e.tag and "xacro" in e.tag for e in robot.iter("*")):
-        robot = _parse(path, _expand_xacro(Path(path)))
+    if _has_xacro(robot):
+        robot = _parse(path, expand_xacro(Path(path), xacro_arguments or {}))
     if robot.tag != "robot":
         raise InputError(
             f"`{path}` is no URDF: its root is `<{robot.tag}>`, not `<robot>`."
@@ -61,6 +68,16 @@ def _refuse_nan(path: str | Path, root: Any):
 def is_mjcf(path: str | Path) -> bool:
     """Return whether a file describes its robot as MJCF."""
     return _parse(path).tag == "mujoco"
+
+
+def is_xacro(path: str | Path) -> bool:
+    """Return whether a file must be expanded by the program `xacro`."""
+    return _has_xacro(_parse(path))
+
+
+def _has_xacro(root: Any):
+    """Return whether there are elements of xacro below a root."""
+    return any("ros.org/" in e.tag and "xacro" in e.tag for e in root.iter("*"))
 
 
 def _parse(path: str | Path, text: bytes | None = None):
@@ -103,21 +120,3 @@ def _tolerant_root(text: bytes, parser: Any):
 def _line_breaks(match: re.Match[bytes]):
     """Return the line breaks of a match."""
     return b"\n" * match.group().count(b"\n")
-
-
-def _expand_xacro(path: Path):
-    """Return a xacro file as the program `xacro` expands it."""
-    command = f"`xacro {path} -o {path.name.split('.')[0]}.urdf`"
-    program = shutil.which("xacro")
-    if program is None:
-        raise InputError(
-            f"`{path}` is a xacro file: expand it by {command} (`pip install xacro`)."
-        )
-    process = subprocess.run([program, str(path)], capture_output=True)
-    if process.returncode:
-        lines = process.stderr.decode(errors="replace").strip().splitlines()
-        reason = lines[0] if lines else "no reason given"
-        raise InputError(
-            f"`{path}`: {command} fails: {reason}: give a file that it has expanded."
-        )
-    return process.stdout

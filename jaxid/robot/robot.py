@@ -105,6 +105,7 @@ class Robot(Summarised, eqx.Module):
         source: Origin of the numbers.
         source_tip: Link of the end-effector that was asked for in that file, or None.
         source_base: Link on the ground that was asked for in that file, or None.
+        source_arguments: Names and texts of the arguments of that file, if it is xacro.
         notes: Changes and assumptions that were made, one sentence each.
 
     Raises:
@@ -132,6 +133,7 @@ class Robot(Summarised, eqx.Module):
     source: str = eqx.field(static=True, default="")
     source_tip: str | None = eqx.field(static=True, default=None)
     source_base: str | None = eqx.field(static=True, default=None)
+    source_arguments: tuple[tuple[str, str], ...] = eqx.field(static=True, default=())
     notes: tuple[str, ...] = eqx.field(static=True, default=())
 
     def __post_init__(self):

@@ -1,5 +1,6 @@
 """Robots from URDF and MJCF files, and the parameters that such a file claims."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +34,7 @@ def load_urdf(
     gravity: Numbers | None = None,
     base_rotation: Numbers | None = None,
     base_position: Numbers = ORIGIN,
+    xacro_arguments: Mapping[str, str] | None = None,
 ) -> Robot:
     """Load a robot from a URDF, xacro or MJCF file, without its inertias.
 
@@ -65,6 +67,7 @@ def load_urdf(
             are parallel, and gravity has the direction that the joints between the root
             and the base give it.
         base_position: Origin of the base link on the ground [m].
+        xacro_arguments: Texts of the arguments of a xacro file, by name.
 
     Raises:
         FileNotFoundError: If the file does not exist.
@@ -72,7 +75,7 @@ def load_urdf(
             or a link of the arm on a joint that mimics another, or angles or lengths in
             other units; if `xacro` or MuJoCo cannot read it or is missing.
     """
-    tree = UrdfTree(path, base=base, tip=tip)
+    tree = UrdfTree(path, base=base, tip=tip, xacro_arguments=xacro_arguments)
     _refuse_loaded_followers(tree)
     limits, limit_notes = _limits(tree)
     notes = (
@@ -105,6 +108,7 @@ def load_urdf(
             source=tree.path,
             source_tip=tip,
             source_base=base,
+            source_arguments=tuple((xacro_arguments or {}).items()),
             notes=notes,
         )
     except InputError as error:
@@ -121,6 +125,7 @@ def urdf_parameters(
     *,
     tip: str | None = None,
     base: str | None = None,
+    xacro_arguments: Mapping[str, str] | None = None,
     check: bool = True,
 ) -> AnyArray:
     """Return the inertial parameters that a URDF or MJCF file claims (Eq. 9).
@@ -134,6 +139,7 @@ def urdf_parameters(
         path: URDF or MJCF file.
         tip: As in `load_urdf`.
         base: As in `load_urdf`.
+        xacro_arguments: As in `load_urdf`.
         check: Whether links that cannot exist are rejected; otherwise their numbers are
             returned as they are.
 
@@ -142,7 +148,7 @@ def urdf_parameters(
         InputError: If the file cannot be loaded, an inertia is not finite, or a link
             cannot exist.
     """
-    tree = UrdfTree(path, base=base, tip=tip)
+    tree = UrdfTree(path, base=base, tip=tip, xacro_arguments=xacro_arguments)
     _refuse_loaded_followers(tree)
     return tree.bodies(check=check).ravel()
 
@@ -152,6 +158,7 @@ def joint_parameters(
     *,
     tip: str | None = None,
     base: str | None = None,
+    xacro_arguments: Mapping[str, str] | None = None,
 ) -> dict[str, Joints]:
     """Return `armature`, `damping`, dry `friction` and springs that a file claims.
 
@@ -159,7 +166,7 @@ def joint_parameters(
     or m]. All are zero where the file claims none. Arguments and errors are those of
     `load_urdf`.
     """
-    tree = UrdfTree(path, base=base, tip=tip)
+    tree = UrdfTree(path, base=base, tip=tip, xacro_arguments=xacro_arguments)
     parameters = {}
     for key in ("armature", "damping", "friction", "stiffness", "springref"):
         elements = [joint.find("dynamics") for joint in tree.joints]

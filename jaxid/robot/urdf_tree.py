@@ -1,6 +1,6 @@
 """Links and joints of URDF, xacro and MJCF files, merged into the bodies of a robot."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -72,9 +72,11 @@ class UrdfTree:
         *,
         base: str | None = None,
         tip: str | None = None,
+        xacro_arguments: Mapping[str, str] | None = None,
     ) -> None:
         self.path = str(path)
-        self.root, self.gravity, loops, effects = read_description(path)
+        description = read_description(path, xacro_arguments)
+        self.root, self.gravity, loops, effects = description
         self.compiled = is_mjcf(path)
         name = self.root.get("name") or Path(path).stem
         self.name = "".join(c if c.isprintable() else " " for c in name)

@@ -1,6 +1,7 @@
 """URDF or MJCF file of a robot, and its claims on bodies, rotors and friction."""
 
 import dataclasses
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,7 @@ class RobotFile:
         base_rotation: Orientation of the base in the frame of the ground; None for
             parallel frames.
         base_position: Position of the base in the frame of the ground [m].
+        xacro_arguments: Texts of the arguments of a xacro file, by name.
     """
 
     path: FilePath
@@ -33,11 +35,16 @@ class RobotFile:
     base: str | None = None
     base_rotation: Float[np.ndarray, "3 3"] | None = None
     base_position: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    xacro_arguments: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
     @property
     def chain(self) -> dict[str, Any]:
-        """Ends of the chain, as functions take them that read the file."""
-        return {"tip": self.tip, "base": self.base}
+        """Ends of the chain and arguments, for functions that read the file."""
+        return {
+            "tip": self.tip,
+            "base": self.base,
+            "xacro_arguments": self.xacro_arguments,
+        }
 
     @property
     def placement(self) -> dict[str, Any]:

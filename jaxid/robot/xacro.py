@@ -1,0 +1,81 @@
+"""Xacro files, which the program `xacro` expands with their arguments to URDF."""
+
+import re
+import shutil
+import subprocess
+from collections.abc import Mapping
+from pathlib import Path
+
+from jaxid.errors import InputError
+
+MAX_SECONDS = 60.0
+"""Time after which the program is stopped [s]."""
+ARGUMENT = re.compile(rb"<[\w.-]+:arg\s[^>]*?\bname\s*=\s*[\"']([^\"']*)[\"']")
+"""Element of a xacro file that declares an argument, with its name."""
+
+
+def expand_xacro(path: Path, arguments: Mapping[str, str]) -> bytes:
+    """Return a xacro file as the program `xacro` expands it.
+
+    Args:
+        path: Path of the file.
+        arguments: Texts of its arguments, by name.
+
+    Raises:
+        InputError: If the program is missing, fails or does not end, or the file has no
+            argument of a name.
+    """
+    assignments = [f"{name}:={text}" for name, text in arguments.items()]
+    words = [str(path), *assignments]
+    command = f"`xacro {' '.join(words)} -o {path.name.split('.')[0]}.urdf`"
+    program = shutil.which("xacro")
+    if program is None:
+        raise InputError(
+            f"`{path}` is a xacro file: expand it by {command} (`pip install xacro`)."
+        )
+    process = _run([program, *words], path, command)
+    if process.returncode:
+        lines = process.stderr.decode(errors="replace").strip().splitlines()
+        reason = lines[0] if lines else "no reason given"
+        raise InputError(
+            f"`{path}`: {command} fails: {reason}: give a file that it has expanded, "
+            "or the arguments that it needs (`xacro_arguments` in `[robot]`, "
+            "`jaxid init --xacro NAME:=VALUE`)."
+        )
+    if arguments:
+        names = _declared_names(path, [program, *words], command)
+        _refuse_unknown(path, arguments, names)
+    return process.stdout
+
+
+def _run(words: list[str], path: Path, command: str):
+    """Run the program, for a limited time."""
+    try:
+        return subprocess.run(
+            words, capture_output=True, stdin=subprocess.DEVNULL, timeout=MAX_SECONDS
+        )
+    except subprocess.TimeoutExpired as error:
+        raise InputError(
+            f"`{path}`: {command} has not ended after {MAX_SECONDS:g} s: "
+            "give a file that it has expanded."
+        ) from error
+
+
+def _declared_names(path: Path, words: list[str], command: str) -> list[str]:
+    """Return the names of the arguments that a file and what it includes declare."""
+    listing = _run([*words, "--deps"], path, command).stdout
+    files = [path, *map(Path, listing.decode(errors="replace").split())]
+    names = []
+    for file in filter(Path.is_file, files):
+        names += [name.decode() for name in ARGUMENT.findall(file.read_bytes())]
+    return list(dict.fromkeys(names))
+
+
+def _refuse_unknown(path: Path, arguments: Mapping[str, str], names: list[str]):
+    """Reject an argument that no file declares, which the program would ignore."""
+    for name in arguments:
+        if name not in names:
+            known_names = ", ".join(f"`{x}`" for x in names) or "none"
+            raise InputError(
+                f"`{path}` has no xacro argument `{name}`; it has {known_names}."
+            )
