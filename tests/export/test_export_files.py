@@ -2,6 +2,7 @@
 
 import dataclasses
 import importlib.util
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -216,6 +217,32 @@ def test_the_chain_of_the_file_is_remembered(source, tmp_path, chain):
     assert jid.load_urdf(path, **chain).joint_names == robot.joint_names
     given = jid.export_urdf(fit, source, tmp_path / "given.urdf", **chain)
     assert given.read_bytes() == path.read_bytes()
+
+
+def test_arguments_of_a_xacro_file_are_remembered(tmp_path, monkeypatch):
+    program = tmp_path / "xacro"
+    program.write_text(
+        f"#!{sys.executable} -S\nimport sys\ntext = open(sys.argv[1]).read()\n"
+        'print(text.replace("${hand}", sys.argv[2].split(":=")[1]))'
+    )
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    source = tmp_path / "small.urdf.xacro"
+    namespace = 'xmlns:xacro="http://www.ros.org/wiki/xacro"'
+    text = URDF.replace('xmlns:xacro="http://example.org"', "").replace(
+        "lower", "${hand}"
+    )
+    source.write_text(
+        text.replace("<robot", f"<robot {namespace}").replace(
+            "<transmission", '<xacro:arg name="hand"/><transmission'
+        )
+    )
+    robot = jid.load_urdf(source, xacro_arguments={"hand": "gripper"})
+    model = jid.Model(robot)
+    fit_of(model, possible(model), full=True).save(tmp_path / "model.json")
+    fit = jid.load_fit(tmp_path / "model.json")
+    path = jid.export_urdf(fit, source, tmp_path / "arm.urdf")
+    assert etree.parse(str(path)).find("link[@name='gripper']/inertial") is not None
 
 
 def test_an_mjcf_file_is_exported_to_both_formats(source, tmp_path):

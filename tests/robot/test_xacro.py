@@ -106,7 +106,9 @@ def test_numbers_and_truth_values_of_the_experiment_file_are_texts(install, tmp_
 
 
 def test_an_unknown_argument_is_named(install, monkeypatch, capfdbinary):
-    with pytest.raises(InputError, match=r"no xacro argument `dof`; it has `kind`, `pr"):
+    with pytest.raises(
+        InputError, match=r"no xacro argument `dof`; it has `kind`, `pr"
+    ):
         jid.load_urdf("arm.urdf.xacro", xacro_arguments={"dof": "6"})
     code, _, err = init(monkeypatch, capfdbinary, "--xacro", "dof=6")
     assert (code, err) == (2, "jaxid: `--xacro` must be like dof:=6, but is `dof=6`.\n")
