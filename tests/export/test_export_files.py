@@ -230,7 +230,7 @@ def test_arguments_of_a_xacro_file_are_remembered(tmp_path, monkeypatch):
     source = tmp_path / "small.urdf.xacro"
     namespace = 'xmlns:xacro="http://www.ros.org/wiki/xacro"'
     text = URDF.replace('xmlns:xacro="http://example.org"', "").replace(
-        "lower", "${hand}"
+        '"lower"', '"${hand}"'
     )
     source.write_text(
         text.replace("<robot", f"<robot {namespace}").replace(
