@@ -13,6 +13,9 @@ os.environ["JAXID_CACHE_DIR"] = "off"
 # Each worker has one core; threads of linear algebra on the cores of other workers cost
 # much time.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# Tests run most of what they compile once: optimising it would take longer. With 0 here
+# it is optimised as for users, which `benchmarks/run.py --check` does.
+os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
 if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     COMPILED = tempfile.TemporaryDirectory(prefix="jaxid-compiled-")
     os.environ["JAX_COMPILATION_CACHE_DIR"] = COMPILED.name
