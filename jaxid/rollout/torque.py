@@ -290,8 +290,11 @@ def identify_torque_rollout(
     free_mask[base.size + 1] = False
     free_unknowns = np.flatnonzero(free_mask)
 
+    # Constants of the compiled program, the same for all logs of a robot.
+    fixed_unknowns = rollout.start(np.zeros_like(torque_fit))
+
     def residuals(values, windows):
-        unknowns = jnp.asarray(start).at[free_unknowns].set(values)
+        unknowns = jnp.asarray(fixed_unknowns).at[free_unknowns].set(values)
         return rollout.errors(unknowns, windows)[
             COUNTED_STEP - 1 :: COUNTED_STEP
         ].ravel()

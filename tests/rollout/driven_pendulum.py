@@ -1,5 +1,7 @@
 """A pendulum of two links on MuJoCo, driven by torques, with perhaps noisy encoders."""
 
+import functools
+
 import mujoco
 import numpy as np
 
@@ -18,6 +20,7 @@ XML = """<mujoco><compiler angle="radian"/>
 </actuator></mujoco>"""
 
 
+@functools.cache
 def log(seed, late=LATE, noise=0.0, samples=3000):
     """Return a recording at 500 Hz: torques act late [s], encoders have noise [rad]."""
     model, random = mujoco.MjModel.from_xml_string(XML), np.random.default_rng(seed)

@@ -88,6 +88,7 @@ def commands(seed, duration=40.0, rate=50.0):
     return envelope * q
 
 
+@functools.cache
 def log(
     seed=0,
     stiffer=1.0,

@@ -31,8 +31,11 @@ def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("rollout")
     (folder / "arm.xml").write_text(servo_arm.model_text())
     (folder / "experiment.toml").write_text(FILE)
-    for name, seed in (("a", 0), ("b", 1), ("unseen", 5)):
-        log = servo_arm.log(seed, duration=30.0)
+    # As many and as long as in `test_servo`: their programs are compiled once.
+    logs = {name: servo_arm.log(k) for k, name in enumerate("abcd")}
+    logs |= {f"short_{k}": servo_arm.log(k, duration=20.0) for k in (0, 1)}
+    logs["unseen"] = servo_arm.log(9, duration=20.0)
+    for name, log in logs.items():
         columns = {"time": log.time}
         for j in range(2):
             columns[f"command{j + 1}"] = log.forces[:, j]
@@ -46,8 +49,7 @@ def test_a_report_without_torques(folder, monkeypatch):
     words = [
         "rollout",
         "experiment.toml",
-        "a.csv",
-        "b.csv",
+        *(f"{name}.csv" for name in "abcd"),
         "--verify",
         "unseen.csv",
         "-o",
@@ -68,13 +70,15 @@ def test_a_report_without_torques(folder, monkeypatch):
 
 def test_known_gains_and_integral_action_of_a_servo_without_it(folder, monkeypatch):
     monkeypatch.chdir(folder)
-    text = FILE.replace("samples = 2", "stiffness = [12.0, nan]\nintegral = true")
+    text = FILE.replace(
+        "samples = 2", "stiffness = [12.0, nan]\nintegral = true\ntime_step = 0.005"
+    )
     (folder / "pid.toml").write_text(text)
     words = [
         "rollout",
         "pid.toml",
-        "a.csv",
-        "b.csv",
+        "short_0.csv",
+        "short_1.csv",
         "--verify",
         "unseen.csv",
         "-o",
@@ -104,6 +108,7 @@ mjcf = "pendulum.xml"
 [model]
 coulomb = false
 rotor_inertia = false
+offset = false
 [recording]
 angles = "q{}"
 forces = "tau{}"

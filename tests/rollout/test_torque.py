@@ -40,7 +40,7 @@ def logs(base):
 @pytest.fixture(scope="module")
 def fit(base, logs):
     """The fit to the first log."""
-    return jid.rollout.identify_torque_rollout(base, logs[0])
+    return jid.rollout.identify_torque_rollout(base, logs[0], horizon=0.1)
 
 
 def test_late_torques_are_found_and_the_simulation_is_closer(base, logs, fit):
@@ -58,7 +58,7 @@ def test_late_torques_are_found_and_the_simulation_is_closer(base, logs, fit):
 
 
 def test_simulated_windows_start_on_the_measured_positions(logs, fit):
-    (time, measured, simulated), steps = fit.simulate(logs[1]), round(0.2 / 0.002)
+    (time, measured, simulated), steps = fit.simulate(logs[1]), round(0.1 / 0.002)
     starts = np.arange(0, len(time), steps + 2)
     np.testing.assert_array_equal(simulated[starts], measured[starts])
     assert np.isnan(simulated[starts + steps + 1]).all()
@@ -67,12 +67,12 @@ def test_simulated_windows_start_on_the_measured_positions(logs, fit):
         measured, np.asarray(logs[1].motion.q)[places], atol=1e-12
     )
     sizes = np.sqrt(np.mean((simulated - measured)[starts + steps] ** 2, axis=0))
-    np.testing.assert_allclose(sizes, fit.errors_at(logs[1], 0.2), rtol=0.3)
+    np.testing.assert_allclose(sizes, fit.errors_at(logs[1], 0.1), rtol=0.3)
 
 
 def test_rollouts_take_the_bias_of_noisy_encoders_away(path, base):
     log = _observed(base, 0, late=-0.001, noise=3e-4)
-    fit = jid.rollout.identify_torque_rollout(base, log)
+    fit = jid.rollout.identify_torque_rollout(base, log, horizon=0.1)
     bodies = jid.robots.urdf_parameters(path)
     truth = np.asarray(base.from_standard([*bodies, *driven_pendulum.DAMPING]))
     torque_fit, rollouts = (
