@@ -449,8 +449,9 @@ def test_a_filter_is_chosen_from_a_list_and_the_report_shows_why(folder, words):
     assert "predicts held-out parts" in page
 
 
-@pytest.mark.parametrize("moment", [1.0, 4.0])
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(
+    ("moment", "number"), [(1.0, signal.SIGTERM), (4.0, signal.SIGINT)]
+)
 def test_a_signal_ends_a_command_at_once_and_leaves_nothing(folder, moment, number):
     command = [
         sys.executable,
