@@ -1,4 +1,4 @@
-"""Text of an experiment file: its tables, their keys, and the robot's file.
+"""Text of an experiment file: its tables and keys, and whether its files are there.
 
 What is wrong with them is said before the methods are loaded, which takes seconds: this
 module imports neither them nor JAX. `experiment/` reads the values.
@@ -11,6 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from jaxid.errors import InputError
+from jaxid.measurement.log_columns import Selection, Selections
+from jaxid.measurement.text_format import TEXT_SUFFIXES, TextColumns
 
 TomlTable = dict[str, Any]
 """Table of a TOML file, or arguments that are made of one."""
@@ -247,6 +249,35 @@ def _require_robot_file(table: TomlTable, folder: Path) -> None:
                 f"`robot.{key}`: `{folder / name}` is no file: paths are relative to "
                 "this file."
             )
+
+
+def require_text_columns(tables: TomlTable, logs: Iterable[Path]) -> None:
+    """Reject text logs without the columns that an experiment file names."""
+    selections = _select_columns(tables.get("recording", {}))
+    for log in logs:
+        if log.suffix.lower() in TEXT_SUFFIXES and log.is_file():
+            TextColumns(log, selections).channels()
+
+
+def _select_columns(recording: TomlTable) -> Selections:
+    """Return the columns that each log must have, as far as the file alone tells."""
+    channels = ["angles", "time"]
+    # Not every command reads the forces beside commands.
+    if "commands" not in recording:
+        channels += [
+            channel
+            for channel in ("forces", "velocities")
+            if f"{channel}_file" not in recording
+        ]
+    selections: dict[str, Selection] = {}
+    for channel in channels:
+        value = recording.get(channel)
+        columns = tuple(value) if isinstance(value, list) else (value,)
+        are_names = all(isinstance(column, str | int) for column in columns)
+        # The robot, which is not loaded yet, tells the names of its joints.
+        if are_names and "{name}" not in str(value):
+            selections[channel] = columns if isinstance(value, list) else columns[0]
+    return selections
 
 
 def check_names(

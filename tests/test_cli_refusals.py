@@ -150,6 +150,8 @@ QUICKLY = [
     "identify no_toml.toml a.csv",
     "identify table.toml a.csv",
     "inspect key.toml",
+    "inspect column.toml a.csv",
+    "identify experiment.toml a.csv --verify empty.csv",
     "excite inner.toml",
     "payload lost.toml a.csv --loaded b.csv",
     "init none.urdf",
@@ -165,11 +167,13 @@ def test_refusals_come_before_jax_is_loaded(folder):  # noqa: F811
         "no_toml": "[robot",
         "table": EXPERIMENT.replace("[rows]", "[row]"),
         "key": EXPERIMENT.replace("cutoff", "cut_off"),
+        "column": EXPERIMENT.replace("tau{}", "torque{}"),
         "inner": EXPERIMENT + "[model]\ncoulomb = { epsilom = 1 }",
         "lost": EXPERIMENT.replace('builtin = "planar_arm"', 'urdf = "lost.urdf"'),
     }
     for name, text in wrong_files.items():
         (folder / f"{name}.toml").write_text(text)
+    (folder / "empty.csv").write_text("")
     done = subprocess.run(
         [sys.executable, "-c", LIGHT],
         input="\n".join(QUICKLY),

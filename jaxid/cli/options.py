@@ -10,7 +10,11 @@ import typer
 from rich.console import Console
 
 from jaxid.errors import InputError
-from jaxid.experiment_file import parse_tables, read_experiment_text
+from jaxid.experiment_file import (
+    parse_tables,
+    read_experiment_text,
+    require_text_columns,
+)
 
 from .terminal import open_console
 
@@ -108,7 +112,8 @@ def start(
     paths = reads if experiment is None else (experiment, *reads)
     _require_paths(paths)
     if experiment is not None:
-        parse_tables(read_experiment_text(experiment), experiment)
+        tables = parse_tables(read_experiment_text(experiment), experiment)
+        require_text_columns(tables, reads)
     if output is not None and output.exists() and not output.is_dir():
         raise InputError(
             f"`{output}` is a file, but a report needs a folder: choose another -o."

@@ -1,10 +1,7 @@
 """Log files as tables of columns: texts, Parquet, arrays, and bags."""
 
-from .log_file import (
-    AbstractLogFile as AbstractLogFile,
-    Selection as Selection,
-    Selections as Selections,
-)
+from ..log_columns import Selection as Selection, Selections as Selections
+from .log_file import AbstractLogFile as AbstractLogFile
 from .log_table import Complaints as Complaints, LogTable as LogTable
 from .readers import (
     READERS as READERS,

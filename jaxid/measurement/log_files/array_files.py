@@ -14,7 +14,8 @@ from numpy.lib import format as npy_format
 
 from jaxid.io import import_extra
 
-from .log_file import AbstractLogFile, has_column, selected_names
+from ..log_columns import has_column, selected_names
+from .log_file import AbstractLogFile
 from .log_table import LogTable, readable, refuse_inflation
 
 MAX_COLUMNS = 1000

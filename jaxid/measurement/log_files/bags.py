@@ -15,7 +15,8 @@ import polars as pl
 
 from jaxid.io import import_extra
 
-from .log_file import AbstractLogFile, Selections
+from ..log_columns import Selections
+from .log_file import AbstractLogFile
 from .log_table import LogTable, readable
 
 STAMP = ".header.stamp"

@@ -6,17 +6,16 @@ from pathlib import Path
 from jaxid.arrays import Texts
 from jaxid.errors import InputError
 
+from ..log_columns import Selections, joined_elements
+from ..text_format import TEXT_SUFFIXES
 from .array_files import Hdf5File, MatFile, NpzFile
 from .bags import BagFile
-from .log_file import AbstractLogFile, Selections, joined_elements
+from .log_file import AbstractLogFile
 from .parquet_files import ParquetFile
 from .text_files import TextFile
 
 READERS: dict[str, type[AbstractLogFile]] = {
-    ".csv": TextFile,
-    ".tsv": TextFile,
-    ".txt": TextFile,
-    ".dat": TextFile,
+    **dict.fromkeys(TEXT_SUFFIXES, TextFile),
     ".parquet": ParquetFile,
     ".npz": NpzFile,
     ".mat": MatFile,

@@ -3,10 +3,8 @@
 import atexit
 import codecs
 import dataclasses
-import functools
 import io
 import itertools
-import re
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator
@@ -19,12 +17,10 @@ import polars as pl
 from jaxid.arrays import Vector
 from jaxid.errors import InputError
 
+from ..text_format import STAMP, TextColumns, TextFormat, with_line_feeds
 from .log_file import AbstractLogFile
 from .log_table import BadRows, Complaints, LogTable, readable
-from .text_format import STAMP, TextFormat, detect_format
 
-HEAD_SIZE = 65536
-"""Bytes from which the format is detected."""
 BLOCK_SIZE = 2**26
 """Bytes that are read at once."""
 MAX_EXACT_INTEGER = 2**53
@@ -44,24 +40,11 @@ _conversions: dict[tuple, Path] = {}
 """Folders with the Parquet files of long text files."""
 
 
-class TextFile(AbstractLogFile):
+class TextFile(TextColumns, AbstractLogFile):
     """Table of text; it stays on the disk as Parquet, to which it is converted once."""
 
-    @functools.cached_property
-    def format(self) -> TextFormat:
-        """Format of the text."""
-        return detect_format(self.path.name, self._head(), self.selections)
-
-    @property
-    def names(self):  # noqa: D102
-        return self.format.names
-
-    @property
-    def has_header(self):  # noqa: D102
-        return self.format.has_header
-
     def estimated_rows(self):  # noqa: D102
-        head = self._head()
+        head = self.head()
         return self.path.stat().st_size * head.count(b"\n") // max(len(head), 1)
 
     def table(self, channels, on_disk, bad_rows):  # noqa: D102
@@ -78,15 +61,6 @@ class TextFile(AbstractLogFile):
         else:
             columns = pl.concat(self._frames(table)).lazy()
         return dataclasses.replace(table, columns=columns)
-
-    def _head(self) -> bytes:
-        """Return lines from the beginning of the file."""
-        with self.path.open("rb") as file:
-            head = file.read(HEAD_SIZE)
-        is_cut = len(head) == HEAD_SIZE
-        head = with_line_feeds(head)
-        # The last line of a cut text is no row, unless there is no other.
-        return head.rpartition(b"\n")[0] if is_cut and b"\n" in head else head
 
     def _parquet_folder(self, table: LogTable) -> Path:
         """Convert the columns to Parquet, unless this was done."""
@@ -207,11 +181,6 @@ def line_blocks(file: BinaryIO, lines_before: int) -> Iterator[bytes]:
         blank_lines = block[len(rows) :].partition(b"\n")[2] if rows else block
         if rows:
             yield rows
-
-
-def with_line_feeds(block: bytes) -> bytes:
-    """Return text whose lines end as on Unix; also those that end twice."""
-    return re.sub(rb"\r+\n?", b"\n", block) if b"\r" in block else block
 
 
 def count_per_line(block: bytes, character: bytes) -> np.ndarray:

@@ -1,18 +1,31 @@
-"""Format of a table of text: where its rows begin, and what separates their cells."""
+"""Format of a table of text: where its rows begin, and what separates their cells.
+
+This module imports neither JAX nor NumPy: a text without a column is refused at once.
+"""
 
 import codecs
 import csv
+import functools
 import itertools
 import re
 import statistics
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from jaxid.arrays import Texts
 from jaxid.errors import InputError
 
-from .log_file import Selections, has_column, selected_names
+from .log_columns import (
+    AbstractLogColumns,
+    Names,
+    Selections,
+    has_column,
+    selected_names,
+)
 
+TEXT_SUFFIXES = (".csv", ".tsv", ".txt", ".dat")
+"""Suffixes of text files."""
+HEAD_SIZE = 65536
+"""Bytes from which the format is detected."""
 SEPARATORS = (";", "\t", ",", " ")
 """Characters that separate cells; a space is any number of spaces or tabs."""
 COMMENT_MARKS = "#% "
@@ -32,12 +45,43 @@ NUMBER = rf"[+-]?(?:(?:\d+\.?\d*|\.\d+){EXPONENT}|(?i:nan|inf|infinity))"
 class TextFormat(NamedTuple):
     """Format of a table of text."""
 
-    names: Texts  # names of the columns, none twice; positions without a header
+    names: Names  # names of the columns, none twice; positions without a header
     columns: int  # cells that a row must have; further ones have no name
     has_header: bool
     separator: str
     has_decimal_commas: bool
     first_line: int  # number of the line with the first row
+
+
+class TextColumns(AbstractLogColumns):
+    """The columns of a text file, by its first lines."""
+
+    @functools.cached_property
+    def format(self) -> TextFormat:
+        """Format of the text."""
+        return detect_format(self.path.name, self.head(), self.selections)
+
+    @property
+    def names(self):  # noqa: D102
+        return self.format.names
+
+    @property
+    def has_header(self):  # noqa: D102
+        return self.format.has_header
+
+    def head(self) -> bytes:
+        """Return lines from the beginning of the file."""
+        with self.path.open("rb") as file:
+            head = file.read(HEAD_SIZE)
+        is_cut = len(head) == HEAD_SIZE
+        head = with_line_feeds(head)
+        # The last line of a cut text is no row, unless there is no other.
+        return head.rpartition(b"\n")[0] if is_cut and b"\n" in head else head
+
+
+def with_line_feeds(block: bytes) -> bytes:
+    """Return text whose lines end as on Unix; also those that end twice."""
+    return re.sub(rb"\r+\n?", b"\n", block) if b"\r" in block else block
 
 
 Header = tuple[int, str]
@@ -166,7 +210,7 @@ def refuse_repeated_names(
             )
 
 
-def unique_names(names: Sequence[str]) -> Texts:
+def unique_names(names: Sequence[str]) -> Names:
     """Return names, with the positions of columns without one or with another's."""
     columns = []
     for k, name in enumerate(names):
