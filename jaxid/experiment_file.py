@@ -242,13 +242,16 @@ def _require_known_keys(tables: TomlTable) -> None:
 
 def _require_robot_file(table: TomlTable, folder: Path) -> None:
     """Reject the path of a robot's file that is not there."""
-    for key in ("urdf", "mjcf"):
-        name = table.get(key)
-        if isinstance(name, str) and not (folder / name).is_file():
-            raise InputError(
-                f"`robot.{key}`: `{folder / name}` is no file: paths are relative to "
-                "this file."
-            )
+    sources = [key for key in ("urdf", "mjcf", "builtin") if key in table]
+    if len(sources) != 1 or sources[0] == "builtin":
+        return  # `RobotSource` says that one of them is needed
+    key = sources[0]
+    name = table[key]
+    if isinstance(name, str) and not (folder / name).is_file():
+        raise InputError(
+            f"`robot`: `{key}`: `{folder / name}` is no file: paths are relative to "
+            "this file."
+        )
 
 
 def require_text_columns(tables: TomlTable, logs: Iterable[Path]) -> None:

@@ -5,6 +5,7 @@ which takes about half of the time of a run: `benchmarks/run.py --check` does so
 a release.
 """
 
+import gc
 import os
 import tempfile
 
@@ -16,6 +17,8 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # Tests run most of what they compile once: optimising it would take longer. With 0 here
 # it is optimised as for users, which `benchmarks/run.py --check` does.
 os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
+# As in commands: tracing makes many small objects, of which few are in cycles.
+gc.set_threshold(50_000, 20, 100)
 if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     COMPILED = tempfile.TemporaryDirectory(prefix="jaxid-compiled-")
     os.environ["JAX_COMPILATION_CACHE_DIR"] = COMPILED.name
