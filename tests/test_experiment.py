@@ -1,5 +1,6 @@
 """Experiment files: what they become, and how each mistake is refused in a sentence."""
 
+import json
 import re
 import tomllib
 
@@ -16,6 +17,7 @@ from jaxid.experiment.setup_tables import SIDES
 from jaxid.experiment.template import write_template
 from jaxid.experiment_file import KEYS, check_names
 from jaxid.io import union_members
+from jaxid.measurement.columns import Columns, with_lerobot_calibration
 from jaxid.workflow.log_loading import read_log
 
 VARIANCES = jid.estimators.ResidualVariances()
@@ -410,6 +412,69 @@ def test_the_file_states_scales_of_each_joint(tmp_path):
     angles, _, forces = columns.to_si(values, None, values)
     np.testing.assert_allclose(angles, [[-0.9, 1.3]])
     np.testing.assert_allclose(forces, [[-80.0, 20.0]])
+
+
+SO_ARM = {
+    "shoulder_pan": {"id": 1, "range_min": 754, "range_max": 3230},
+    "shoulder_lift": {"id": 2, "range_min": 871, "range_max": 3271},
+    "gripper": {"id": 3, "range_min": 1903, "range_max": 3135},
+}
+FURTHER_KEYS = {"drive_mode": 0, "homing_offset": -1024}
+
+
+def lerobot_values(counts, motor, is_gripper=False):
+    """Return what LeRobot writes for counts of a motor, and their angles [rad]."""
+    share = (counts - motor["range_min"]) / (motor["range_max"] - motor["range_min"])
+    middle = 0.5 * (motor["range_max"] + motor["range_min"])
+    values = 100 * share if is_gripper else 200 * share - 100
+    return values, 2 * np.pi / 4096 * (counts - middle)
+
+
+@pytest.mark.parametrize("names", [("a", "b", "c"), ("shoulder_lift", "gripper")])
+def test_calibration_files_of_lerobot_scale_each_joint(tmp_path, names):
+    """Motors by the names of the joints, else by their numbers."""
+    motors = {name: motor | FURTHER_KEYS for name, motor in reversed(SO_ARM.items())}
+    path = tmp_path / "arm.json"
+    path.write_text(json.dumps(motors))
+    arguments = {"angles": "q{}", "forces": "tau{}", "sample_time": 0.1}
+    arguments["angle_offsets"] = [0.3] * len(names)
+    columns = Columns(**with_lerobot_calibration(arguments, path, names))
+    counts = np.linspace(1000.0, 3000.0, 5)
+    motor_names = [name if name in SO_ARM else None for name in names]
+    if None in motor_names:
+        motor_names = [*SO_ARM]
+    pairs = [lerobot_values(counts, SO_ARM[n], n == "gripper") for n in motor_names]
+    values, angles = np.transpose(pairs, (1, 2, 0))
+    scaled_angles, velocities, _ = columns.to_si(values, values, values)
+    np.testing.assert_allclose(scaled_angles, angles + 0.3, atol=1e-12)
+    np.testing.assert_allclose(np.diff(velocities, axis=0), np.diff(angles, axis=0))
+
+
+def test_an_experiment_names_a_calibration_file_of_lerobot(tmp_path):
+    path = tmp_path / "experiment.toml"
+    key = 'lerobot_calibration = "arm.json"\n'
+    for keys, content, expected in (
+        (key, json.dumps(SO_ARM), None),
+        (key + 'angle_unit = "%"\n', json.dumps(SO_ARM), None),
+        (key + 'angle_unit = "rad"\n', json.dumps(SO_ARM), 'write "%"'),
+        (key + 'angle_unit = "deg"\n', json.dumps(SO_ARM), "leave the calibration out"),
+        (key, "{", "`arm.json` must be a calibration file"),
+        (key, "[1, 2]", "`arm.json` must be a calibration file"),
+        (key, '{"a": {"id": 1}, "b": {"id": 2}}', "range_max"),
+        (key, json.dumps({"a": SO_ARM["gripper"]}), "each of the 2 joints"),
+        (key.replace("arm", "other"), "", "`other.json` must be"),
+    ):
+        path.write_text(COLUMNS + keys, encoding="utf-8")
+        (tmp_path / "arm.json").write_text(content)
+        if expected is None:
+            columns = load_experiment(path).columns
+            values = np.full((1, 2), 100.0)
+            angles, _, _ = columns.to_si(values, None, values)
+            half_ranges = np.pi / 4096 * np.array([2476, 2400])
+            np.testing.assert_allclose(angles[0], half_ranges)
+        else:
+            with pytest.raises(InputError, match=re.escape(expected)):
+                load_experiment(path)
 
 
 def test_the_template_loads_as_it_is_and_keeps_what_the_urdf_says(tmp_path):

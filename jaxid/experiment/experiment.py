@@ -120,7 +120,7 @@ def _build(tables: TomlTable, text: str, path: Path) -> Experiment:
     columns = None
     reading = LogReading()
     if "recording" in tables:
-        columns, reading = build_columns(tables["recording"], robot)
+        columns, reading = build_columns(tables["recording"], robot, path.parent)
     load = None
     if "load" in tables:
         load_of_robot = call(known_load, tables["load"], "load")

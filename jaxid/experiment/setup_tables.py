@@ -5,6 +5,7 @@ They say how logs become parameters: a `Setup` is built from them.
 
 import dataclasses
 import inspect
+from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
@@ -23,7 +24,7 @@ from jaxid.identification.estimators.regularisation_and_weights import (
 from jaxid.identification.estimators_by_name import ESTIMATORS
 from jaxid.identification.uncertainty import UNCERTAINTIES, AbstractUncertainty
 from jaxid.measurement import filters
-from jaxid.measurement.columns import Columns
+from jaxid.measurement.columns import Columns, with_lerobot_calibration
 from jaxid.robot.limits_and_drives import per_joint
 from jaxid.robot.robot import Robot
 from jaxid.units import Unit
@@ -227,7 +228,7 @@ SIDES = ("angles_on_motor_side", "forces_on_motor_side", "joint_names")
 """Arguments of `Columns` that `side`, `forces_side` and the robot tell."""
 
 
-def build_columns(table: TomlTable, robot: Robot) -> tuple[Columns, LogReading]:
+def build_columns(table: TomlTable, robot: Robot, folder: Path):
     """Return the columns of the logs, and how logs are read."""
     table = {key: with_joint_names(value, robot) for key, value in table.items()}
     if "commands" in table:
@@ -237,6 +238,9 @@ def build_columns(table: TomlTable, robot: Robot) -> tuple[Columns, LogReading]:
         [Columns, Sides, LogReading], table, "recording", skip=SIDES
     )
     with within("recording"):
+        if "lerobot_calibration" in reading:
+            path = folder / reading["lerobot_calibration"]
+            arguments = with_lerobot_calibration(arguments, path, robot.joint_names)
         columns = Columns(
             **arguments, **Sides(**sides).of_columns, joint_names=robot.joint_names
         )

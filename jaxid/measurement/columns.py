@@ -1,7 +1,8 @@
 """Meaning and units of the columns of a log, and logs in SI units."""
 
 import dataclasses
-from collections.abc import Callable, Iterable
+import json
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ from jaxid.arrays import Matrix, Vector
 from jaxid.errors import InputError
 from jaxid.io import FilePath
 from jaxid.robot.limits_and_drives import per_joint
-from jaxid.units import NM, RAD, Quantity, S, Unit
+from jaxid.units import NM, PERCENT, RAD, Quantity, S, Unit
 
 from .log_files import Complaints, LogTable, Selection, open_log_file
 from .recording import positive_time
@@ -22,6 +23,16 @@ PerJoint = tuple[float, ...] | None
 """One number for each joint, or the default for all."""
 FORCE_QUANTITIES = (Quantity.FORCE, Quantity.CURRENT, Quantity.SHARE)
 """Quantities that columns of forces may hold."""
+RATED_VALUES = {
+    "angle_unit": ("rated_angles", "[rad or m]"),
+    "velocity_unit": ("rated_velocities", "[rad/s or m/s]"),
+    "force_unit": ("rated_forces", "[N m or N; A with `torque_constants`]"),
+}
+"""Values of 100 %, and their units, which a column of shares needs."""
+MOTOR_COUNTS = 4096
+"""Counts of a turn of the motors that LeRobot calibrates."""
+GRIPPER = "gripper"
+"""Motor whose angles LeRobot writes from 0 to 100; those of others from -100."""
 Channels = tuple[Matrix, Matrix | None, Matrix]
 """Angles, velocities (None if there are none) and forces (samples x joints)."""
 
@@ -36,8 +47,9 @@ class Columns:
     (samples x joints), whose columns are `"q[{}]"`. Fields of bags are
     `"/topic.field[{}]"`, or `"/topic.field.joint"` by names.
 
-    Angles become `sign * unit * value + offset`, velocities `sign * unit * value`, and
-    forces `sign * gain * torque constant * rated force * unit * value`. A unit is one
+    Angles become `sign * rated angle * unit * value + offset`, velocities
+    `sign * rated velocity * unit * value`, and forces
+    `sign * gain * torque constant * rated force * unit * value`. A unit is one
     for all joints, or one for each; as a number it is the angle [rad or m], velocity or
     force [N m or N] of a one in the log, like `0.00153` for counts of an encoder.
 
@@ -52,12 +64,15 @@ class Columns:
         sample_time: Time between two rows [s], instead of time stamps, like `0.001`.
         time_unit: Unit of the stamps.
         angle_unit: Unit of the angles; or the angle of a one in the log [rad or m], as
-            a number such as 0.00153 for the counts of an encoder.
+            a number such as 0.00153 for the counts of an encoder; "%" and "‰" need
+            `rated_angles`.
         velocity_unit: Unit of the velocities, like `"rad/s"`; the angles' unit per
             second if None.
         force_unit: Unit of the forces, or the force of a one in the log [N m or N];
             currents need `torque_constants`, "%" and "‰" need `rated_forces`.
         torque_constants: Torque of each motor for its current [N m/A].
+        rated_angles: Angle of each joint at 100 % less that at 0 % [rad or m].
+        rated_velocities: Velocity of each joint at 100 % [rad/s or m/s].
         rated_forces: Rated force of each drive, of which the log holds "%" or "‰" [N m
             or N; A with `torque_constants`].
         angle_signs: +1 or -1 for each joint, for the angles and velocities.
@@ -83,6 +98,8 @@ class Columns:
     velocity_unit: Units | None = None
     force_unit: Units = NM
     torque_constants: PerJoint = None
+    rated_angles: PerJoint = None
+    rated_velocities: PerJoint = None
     rated_forces: PerJoint = None
     angle_signs: PerJoint = None
     force_signs: PerJoint = None
@@ -105,8 +122,8 @@ class Columns:
         if self.sample_time is not None:
             positive_time(self.sample_time)
         self._require_unit("time_unit", Quantity.TIME)
-        self._require_unit("angle_unit", Quantity.COORDINATE)
-        self._require_unit("velocity_unit", Quantity.VELOCITY)
+        self._require_unit("angle_unit", Quantity.COORDINATE, Quantity.SHARE)
+        self._require_unit("velocity_unit", Quantity.VELOCITY, Quantity.SHARE)
         force = Quantity.FORCE if self.torque_constants is None else Quantity.CURRENT
         self._require_unit("force_unit", force, *FORCE_QUANTITIES)
         self._require("angle_signs", lambda s: abs(s) == 1, "+1 or -1")
@@ -115,21 +132,33 @@ class Columns:
         self._require(
             "torque_constants", lambda c: c != 0 and np.isfinite(c), "finite, not zero"
         )
-        self._require("rated_forces", lambda f: 0 < f < np.inf, "positive")
+        for name, (rated_name, unit) in RATED_VALUES.items():
+            self._require(rated_name, lambda x: 0 < x < np.inf, "positive")
+            if self._has_shares(name) != (getattr(self, rated_name) is not None):
+                raise InputError(
+                    f"`{rated_name}` {unit} are needed if `{name}` is "
+                    '"%" or "‰", and only then.'
+                )
         quantities = [unit.quantity for unit in _units(self.force_unit)]
-        has_shares = Quantity.SHARE in quantities
-        if has_shares != (self.rated_forces is not None):
-            raise InputError(
-                "`rated_forces` [N m or N; A with `torque_constants`] are needed if "
-                '`force_unit` is "%" or "‰", and only then.'
-            )
         has_currents = Quantity.CURRENT in quantities
         has_constants = self.torque_constants is not None
-        if has_currents != has_constants and not (has_constants and has_shares):
+        if has_currents != has_constants and not (
+            has_constants and self._has_shares("force_unit")
+        ):
             raise InputError(
                 "`torque_constants` [N m/A] are needed if `force_unit` is a current, "
                 "and only then."
             )
+
+    def _has_shares(self, name: str) -> bool:
+        """Return whether a unit is a share of a rated value."""
+        return Quantity.SHARE in [unit.quantity for unit in _units(getattr(self, name))]
+
+    @property
+    def angle_symbol(self) -> str:
+        """Unit of the angles of joints that turn; several symbols if they differ."""
+        symbols = dict.fromkeys(unit.symbol for unit in _units(self.angle_unit))
+        return ", ".join(symbol for symbol in symbols if symbol not in ("m", "mm"))
 
     def _require_unit(self, name: str, *quantities: Quantity) -> None:
         """Check what units measure, and make units of the first quantity of numbers."""
@@ -171,16 +200,69 @@ class Columns:
             return per_joint(name, values, joints, default)
 
         signs = numbers("angle_signs")
-        angle_scale = signs * numbers("angle_unit")
+        angle_scale = signs * numbers("angle_unit") * numbers("rated_angles")
+        velocity_scale = angle_scale
+        if self.velocity_unit is not None:
+            velocity_unit = numbers("velocity_unit")
+            velocity_scale = signs * velocity_unit * numbers("rated_velocities")
         if velocities is not None:
-            unit = "angle_unit" if self.velocity_unit is None else "velocity_unit"
-            velocity_scale = signs * numbers(unit)
             velocities = velocities * velocity_scale
         # A log of currents has torque constants, which are one otherwise.
         gains = numbers("force_unit") * numbers("force_signs") * numbers("force_gains")
         force_scale = gains * numbers("torque_constants") * numbers("rated_forces")
         offsets = numbers("angle_offsets", 0.0)
         return angles * angle_scale + offsets, velocities, forces * force_scale
+
+
+def with_lerobot_calibration(
+    arguments: dict[str, Any], path: Path, joint_names: Sequence[str]
+) -> dict[str, Any]:
+    """Return arguments of `Columns`, with the scales of a calibration file of LeRobot.
+
+    Percent are those of each joint's calibrated range, from -100 to 100, or from 0 to
+    100 of the gripper; angles count from its middle. Motors are those with the names of
+    the joints, or else the first ones by their numbers.
+
+    Raises:
+        InputError: If the file is another one, has too few motors, or the angles are
+            not in percent.
+    """
+    unit = arguments.setdefault("angle_unit", PERCENT)
+    if unit is not PERCENT:
+        symbol = getattr(unit, "symbol", unit)
+        raise InputError(
+            f'`lerobot_calibration` is for `angle_unit = "%"`, but that is {symbol}: '
+            'write "%"; or leave the calibration out, as in degrees LeRobot counts '
+            "from the middle of each range."
+        )
+    try:
+        motors = json.loads(path.read_text("utf-8"))
+        names = [*joint_names]
+        if not set(names) <= set(motors):
+            motor_names = sorted(motors, key=lambda name: motors[name]["id"])
+            names = motor_names[: len(joint_names)]
+        ranges = [
+            motors[name]["range_max"] - motors[name]["range_min"] for name in names
+        ]
+        half_ranges = np.array(ranges, np.float64) * np.pi / MOTOR_COUNTS
+    except (OSError, ValueError, TypeError, LookupError, AttributeError) as error:
+        raise InputError(
+            f"`{path.name}` must be a calibration file of LeRobot, which holds `id`, "
+            "`range_min` and `range_max` of each motor: check the path "
+            f"({type(error).__name__}: {error})."
+        ) from error
+    if len(names) < len(joint_names) or not (half_ranges > 0).all():
+        raise InputError(
+            f"`{path.name}` must hold a range for each of the {len(joint_names)} "
+            f"joints, but holds {ranges} counts: choose another file, or calibrate "
+            "the arm again."
+        )
+    is_gripper = np.array([name == GRIPPER for name in names])
+    offsets = np.array(arguments.get("angle_offsets") or 0.0)
+    return arguments | {
+        "rated_angles": np.where(is_gripper, 2 * half_ranges, half_ranges),
+        "angle_offsets": offsets + np.where(is_gripper, -half_ranges, 0.0),
+    }
 
 
 def _as_unit(name: str, unit: Unit | float, quantity: Quantity) -> Unit:

@@ -117,7 +117,11 @@ def read_recording(
         name=printable(Path(path).stem) if name is None else name,
         first_row=log.tables[0].first_row,
     )
-    recording = dataclasses.replace(recording, notes=(*notes, *recording.notes))
+    recording = dataclasses.replace(
+        recording,
+        notes=(*notes, *recording.notes),
+        angle_unit=columns.angle_symbol,
+    )
     return recording.crop(start, stop) if is_part else recording
 
 

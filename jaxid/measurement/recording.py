@@ -47,6 +47,7 @@ class Recording(eqx.Module):
         notes: Changes between the file and these samples, as sentences.
         stamp_deviation: Largest deviation of the time stamps from a uniform grid, in
             sample times; None if the sample time was given instead.
+        angle_unit: Unit of the angles in the file, for messages.
     """
 
     time: Float[AnyArray, " samples"]
@@ -60,6 +61,7 @@ class Recording(eqx.Module):
     name: str = eqx.field(static=True, default="recording")
     notes: Texts = eqx.field(static=True, default=())
     stamp_deviation: float | None = eqx.field(static=True, default=None)
+    angle_unit: str = eqx.field(static=True, default="rad")
 
     @classmethod
     def of(

@@ -56,6 +56,7 @@ class Diagnosis(Summarised):
             part; None if no part is long enough.
         motor_sides: Whether angles and forces of the log are taken for the motors'.
         notes: Remarks on how the log was examined, as sentences.
+        angle_unit: Unit of the angles in the file.
     """
 
     log: Recording | Observations
@@ -66,6 +67,7 @@ class Diagnosis(Summarised):
     observations: Observations | None
     motor_sides: tuple[bool, bool]
     notes: tuple[str, ...] = ()
+    angle_unit: str = "rad"
 
     def with_fit(self, fit: Fit, commanded: Observations | None = None) -> "Diagnosis":
         """Return the diagnosis with findings of a fit to this log alone, and delays.
@@ -192,6 +194,7 @@ def diagnose(
         examined_log.observations,
         (excerpt.angles_on_motor_side, excerpt.forces_on_motor_side),
         examined_log.notes,
+        excerpt.angle_unit,
     )
     return diagnosis if fit is None else diagnosis.with_fit(fit)
 
@@ -294,7 +297,14 @@ def _mistakes(diagnoses: Sequence[Diagnosis], fit: Fit) -> tuple[str, ...]:
     )
     if not logs:
         return ()
-    return likely_mistakes(fit, logs, diagnoses[0].motor_sides, moments)
+    first_diagnosis = diagnoses[0]
+    return likely_mistakes(
+        fit,
+        logs,
+        first_diagnosis.motor_sides,
+        moments,
+        first_diagnosis.angle_unit,
+    )
 
 
 def _excerpt(log: Observations, source: SamplesOnDisk) -> Recording:
@@ -326,6 +336,7 @@ def _excerpt(log: Observations, source: SamplesOnDisk) -> Recording:
         sample_time=dt,
         name=log.name,
         stamp_deviation=0.0 if columns.sample_time is None else None,
+        angle_unit=columns.angle_symbol,
     )
 
 

@@ -56,6 +56,16 @@ MAX_JOINTS = 12
 """Number of joints above which no pairs of joints and no axes are examined."""
 
 
+UNIT_FACTORS = {
+    "rad": {"deg": np.pi / 180, "rev": 2 * np.pi},
+    "deg": {"rad, not in deg": 180 / np.pi},
+    "rev": {"rad, not in rev": 0.5 / np.pi},
+}
+"""Units that angles may have instead of that of their file, and factors to them."""
+UNIT_STEP = 0.05
+"""Relative change of a factor that leaves more of the forces if the unit is right."""
+
+
 class Correction(NamedTuple):
     """Correction of a possible mistake."""
 
@@ -63,6 +73,8 @@ class Correction(NamedTuple):
     robot: Robot  # robot without the mistake
     motion: Motion  # motion of the log without it
     forces: np.ndarray  # forces of the log without it [N m or N]
+    # corrections by other factors, which leave more where the factor is exact
+    neighbours: tuple["Correction", ...] = ()
 
 
 class _Amount(NamedTuple):
@@ -78,13 +90,14 @@ def likely_mistakes(
     logs: Sequence[Observations],
     motor_sides: tuple[bool, bool],
     events: tuple[str, ...] = (),
+    angle_unit: str = "rad",
 ) -> tuple[str, ...]:
     """Return a sentence about the mistake that explains most of the misfit.
 
     A mistake is looked for in all logs alike, then in the columns of each. If none
     explains it, `events`, sentences about moments, are returned, or else where the
     model does not fit. Whether angles and forces are taken for the motors' is in
-    `motor_sides`.
+    `motor_sides`, and the unit of the angles in the file in `angle_unit`.
     """
     samples = _Samples(fit.base.model, logs)
     robot = fit.base.model.robot
@@ -99,7 +112,9 @@ def likely_mistakes(
     for name, part in parts:
         motion = samples.motion[part]
         forces = samples.forces[part]
-        candidates = [*_column_corrections(robot, motion, forces, motor_sides)]
+        candidates = [
+            *_column_corrections(robot, motion, forces, motor_sides, angle_unit)
+        ]
         amounts = [samples.best_correction(x, part) for x in samples.amounts()]
         if misfit**2 - samples.misfit(amounts[0], part) ** 2 < MIN_DELAY_EFFECT**2:
             del amounts[0]
@@ -115,8 +130,9 @@ def likely_mistakes(
         # With more than three candidates nothing is known.
         is_sure = len(suspects) <= 3 and min_misfit <= max_misfit
         if is_sure and unseen_misfit <= MAX_RATIO * initial_unseen_misfit:
+            words = ", or ".join(samples.clause(c, part) for c in suspects)
             text = (
-                f"{name}{', or '.join(c.text for c in suspects)}: the model then "
+                f"{name}{words}: the model then "
                 f"misses {100 * min_misfit:.2g} % of the forces instead of "
                 f"{100 * misfit:.2g} %."
             )
@@ -162,6 +178,11 @@ class _Samples:
         rows = self._rows.copy()
         rows[part] = self._corrected_rows(c)
         return _misfit(rows, self._is_friction, folds)
+
+    def clause(self, c: Correction, part: slice) -> str:
+        """Return the clause of a correction, or of a neighbour that leaves less."""
+        best_correction = min((c, *c.neighbours), key=lambda x: self.misfit(x, part))
+        return best_correction.text
 
     def best_correction(self, mistake: _Amount, part: slice) -> Correction:
         """Return the correction of a mistake by the amount that leaves least.
@@ -287,7 +308,11 @@ def _misfit_text(
 
 
 def _column_corrections(
-    robot: Robot, motion: Motion, forces: np.ndarray, sides: tuple[bool, bool]
+    robot: Robot,
+    motion: Motion,
+    forces: np.ndarray,
+    sides: tuple[bool, bool],
+    angle_unit: str,
 ) -> Iterator[Correction]:
     """Yield corrections of the columns of a log."""
     drives = robot.drives
@@ -333,12 +358,19 @@ def _column_corrections(
         yield variant(f"the forces {key}forces`)", forces=change)
         yield variant(f"the angles {key}angles`)", change)
         yield variant(f"angles and forces {key}angles`, `forces`)", change, change)
-    for unit, factor in (("deg", np.pi / 180), ("rev", 2 * np.pi)):
-        for word, scale in ((unit, factor), (f"rad, not in {unit}", 1 / factor)):
-            text = (
-                f"the angles of the log seem to be in {word} (`recording.angle_unit`)"
-            )
-            yield variant(text, np.diag(np.where(robot.revolute, scale, 1.0)))
+    for unit, factor in UNIT_FACTORS.get(angle_unit, {}).items():
+        scales = np.where(robot.revolute, factor, 1.0)
+        text = f"the angles of the log seem to be in {unit} (`recording.angle_unit`)"
+        rough_text = (
+            f"the angles of the log seem to be in no unit with a name, roughly {unit} "
+            "(`recording.angle_unit`, a number or a list, with `angle_offsets`; or "
+            "`drives.gear_ratios`)"
+        )
+        neighbours = [
+            variant(rough_text, np.diag(np.where(robot.revolute, x * factor, 1.0)))
+            for x in (1 - UNIT_STEP, 1 + UNIT_STEP)
+        ]
+        yield variant(text, np.diag(scales))._replace(neighbours=tuple(neighbours))
     if drives.is_direct:
         return
     angles = not sides[0]

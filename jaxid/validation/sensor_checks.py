@@ -331,8 +331,9 @@ def stuck_findings(
 ) -> list[str]:
     """Look for forces that are constant, or cut off at their largest value.
 
-    Forces are cut off if many samples lie on the largest value, and few on the values
-    beside it. Joints in `faulty_joints` have known faults, and are left out.
+    Forces are cut off if many samples lie on the largest value, and few on the three
+    values beside it, which coarse steps would reach as often. Joints in `faulty_joints`
+    have known faults, and are left out.
     """
     forces = np.asarray(recording.forces)
     angles = np.asarray(recording.angles)
@@ -350,9 +351,8 @@ def stuck_findings(
             )
             continue
         subset = f[speed > REST_SHARE * speed.max(initial=0.0)]
-        band = 0.02 * (top - bottom)
-        for end, zone in ((top, subset > top - band), (bottom, subset < bottom + band)):
-            values, counts = np.unique(subset[zone], return_counts=True)
+        values, counts = np.unique(subset, return_counts=True)
+        for end in (top, bottom):
             order = np.argsort(np.abs(values - end))
             hits = int(np.count_nonzero(subset == end))
             neighbours = counts[order][1:4]

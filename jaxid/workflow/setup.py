@@ -113,6 +113,8 @@ class LogReading:
         commands: Columns of the commanded angles, like `"cmd{}"`: with them `jaxid
             inspect` tells a delay in spite of disturbances, and `jaxid rollout` needs
             no `forces`.
+        lerobot_calibration: Calibration file of LeRobot for `angle_unit = "%"`, like
+            `"my_arm.json"`: angles count from the middle of each calibrated range.
         force_delay: Time by which forces stand later in the log than angles [s].
         largest_gap: Longest pause that is bridged, in sample times; a tenth of the
             period of the filter's cut-off frequency is bridged in any case.
@@ -124,6 +126,7 @@ class LogReading:
     forces_file: str | None = None
     velocities_file: str | None = None
     commands: Selection | None = None
+    lerobot_calibration: str | None = None
     force_delay: float = 0.0
     largest_gap: Annotated[float, Bounds(above=1.0)] = 1.75
     bad_rows: Annotated[float, Bounds(minimum=0.0, below=1.0)] = MAX_BAD_ROWS

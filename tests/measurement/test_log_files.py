@@ -412,6 +412,9 @@ def test_lengths_and_shapes_must_agree(tmp_path):
         ({"force_unit": (1.0, np.inf)}, "`force_unit`"),
         ({"force_unit": units.PERCENT}, "`rated_forces`"),
         ({"rated_forces": (1.0,)}, "`rated_forces`"),
+        ({"angle_unit": units.PERCENT}, "`rated_angles` [rad or m]"),
+        ({"velocity_unit": units.PERMILLE}, "`rated_velocities` [rad/s or m/s]"),
+        ({"rated_angles": (0.0,), "angle_unit": units.PERCENT}, "positive"),
     ],
 )
 def test_columns_that_contradict_themselves(change, name):
@@ -430,6 +433,16 @@ SCALES = {
         {"angle_unit": (0.011, -0.012), "angle_offsets": (0.2, 0.1)},
         (0.011, -0.012),
         (0.2, 0.1),
+        (1.0, 1.0),
+    ),
+    "percent of ranges": (
+        {
+            "angle_unit": units.PERCENT,
+            "rated_angles": (1.2, 2.0),
+            "angle_offsets": (0.1, -1.0),
+        },
+        (0.012, 0.02),
+        (0.1, -1.0),
         (1.0, 1.0),
     ),
     "per mille": (
@@ -472,6 +485,16 @@ def test_units_that_only_one_drive_has(name):
     np.testing.assert_allclose(angles, values * angle_scale + offsets, rtol=1e-14)
     np.testing.assert_allclose(velocities, values * angle_scale, rtol=1e-14)
     np.testing.assert_allclose(forces, values * force_scale, rtol=1e-14)
+
+
+def test_velocities_in_percent_and_angles_in_counts():
+    scales = {"angle_unit": 0.5, "velocity_unit": units.PERCENT}
+    rates = {"rated_velocities": (3.0, 2.0), "angle_signs": (1, -1)}
+    columns = Columns("q{}", "tau{}", time="t", **scales, **rates)
+    values = np.array([[50.0, 100.0]])
+    angles, velocities, _ = columns.to_si(values, values, values)
+    np.testing.assert_allclose(angles, [[25.0, -50.0]])
+    np.testing.assert_allclose(velocities, [[1.5, -2.0]])
 
 
 def test_units_by_symbol():

@@ -111,6 +111,11 @@ def test_fast_motors_and_gaps_are_no_faults():
     assert channel_findings(ROBOT, dataclasses.replace(log, angles=angles)) == []
 
 
+@pytest.mark.parametrize("step", [0.5, 2.0, 5.0])
+def test_coarse_steps_of_forces_are_no_limits(step):
+    assert stuck(step * np.round(TAU / step)) == []
+
+
 @pytest.mark.parametrize("level", [0.7, 0.9])
 def test_forces_that_are_cut_off_are_recognised(level):
     forces = 0.01 * np.round(TAU / 0.01)

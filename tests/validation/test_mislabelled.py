@@ -63,12 +63,19 @@ def motors():
     )
 
 
-def log_of(angles, forces, angles_on_motor_side=True, forces_on_motor_side=True):
+def log_of(
+    angles,
+    forces,
+    angles_on_motor_side=True,
+    forces_on_motor_side=True,
+    angle_unit="rad",
+):
     sides = {
         "angles_on_motor_side": angles_on_motor_side,
         "forces_on_motor_side": forces_on_motor_side,
     }
     log = Recording.of(angles, forces, sample_time=DT, **sides)
+    log = dataclasses.replace(log, angle_unit=angle_unit)
     return log, observe(log, ROBOT, ZeroPhaseButterworth(8.0), Subsample(5))
 
 
@@ -104,6 +111,24 @@ def test_a_good_log_has_no_findings_and_prints_its_limits(motors):
     assert text.count("!") >= len(diagnosis.findings)
 
 
+SCALES = {
+    "one scale of all": (0.0145, "rad"),
+    "calibrated ranges": (np.array([0.0157, 0.0163, 0.0167, 0.0160]), "rad"),
+    "the unit is stated": (np.pi / 180, "deg"),
+    "counts": (0.0153, "0.0153"),
+}
+
+
+@pytest.mark.parametrize("name", SCALES)
+def test_no_unit_is_proposed_whose_factor_the_log_does_not_show(motors, said, name):
+    angles, forces = motors
+    scale, angle_unit = SCALES[name]
+    texts = said(angles / scale, forces, angle_unit=angle_unit)
+    assert not any("to be in deg" in text or "to be in re" in text for text in texts)
+    if angle_unit == "rad":
+        assert "no unit with a name, roughly deg" in texts[0]
+
+
 @pytest.mark.parametrize(("joint", "channel"), [(3, "force"), (3, "angle")])
 def test_a_sign_is_found_in_the_motors_columns_by_friction_that_must_brake(
     motors, said, joint, channel
@@ -128,6 +153,8 @@ def test_units_and_sides_are_found(motors, said):
     assert (
         "the angles of the log seem to be in deg (`recording.angle_unit`)" in sentence
     )
+    (sentence,) = said(np.deg2rad(angles), forces, angle_unit="deg")
+    assert "seem to be in rad, not in deg (`recording.angle_unit`)" in sentence
     (sentence,) = said(angles, forces, angles_on_motor_side=False)
     assert "the angles of the log seem to be the motors' (`recording.side`" in sentence
     (sentence,) = said(angles, forces, forces_on_motor_side=False)
