@@ -15,20 +15,19 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from scipy import optimize
 from scipy.interpolate import CubicSpline
 
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.motion import Motion
-from jaxid.dynamics.sample_methods import in_numpy
 from jaxid.identification.fit_result import Fit
 from jaxid.measurement.observations import Observations
 from jaxid.result_table import significant
 from jaxid.robot.robot import Robot
+
+from .braking_fit import AnyGeometry, braking_misfit, friction_columns
 
 MIN_MISFIT = 0.005
 """Fraction (0 to 1) of the forces left unexplained from which mistakes are sought."""
@@ -62,8 +61,16 @@ UNIT_FACTORS = {
     "rev": {"rad, not in rev": 0.5 / np.pi},
 }
 """Units that angles may have instead of that of their file, and factors to them."""
-UNIT_STEP = 0.05
-"""Relative change of a factor that leaves more of the forces if the unit is right."""
+NO_UNIT = (
+    "the angles of the log seem to be in no unit with a name, roughly {} (`recording."
+    "angle_unit` takes numbers, beside `angle_offsets`; or `drives.gear_ratios`)"
+)
+UNIT_TEXTS = {
+    1.0: "the angles of the log seem to be in {} (`recording.angle_unit`)",
+    0.95: NO_UNIT,
+    1.05: NO_UNIT,
+}
+"""Mistakes, by the multiple of a unit's factor that leaves least of the forces."""
 
 
 class Correction(NamedTuple):
@@ -112,9 +119,8 @@ def likely_mistakes(
     for name, part in parts:
         motion = samples.motion[part]
         forces = samples.forces[part]
-        candidates = [
-            *_column_corrections(robot, motion, forces, motor_sides, angle_unit)
-        ]
+        columns = (robot, motion, forces, motor_sides, angle_unit)
+        candidates = [*_column_corrections(*columns)]
         amounts = [samples.best_correction(x, part) for x in samples.amounts()]
         if misfit**2 - samples.misfit(amounts[0], part) ** 2 < MIN_DELAY_EFFECT**2:
             del amounts[0]
@@ -132,9 +138,8 @@ def likely_mistakes(
         if is_sure and unseen_misfit <= MAX_RATIO * initial_unseen_misfit:
             words = ", or ".join(samples.clause(c, part) for c in suspects)
             text = (
-                f"{name}{words}: the model then "
-                f"misses {100 * min_misfit:.2g} % of the forces instead of "
-                f"{100 * misfit:.2g} %."
+                f"{name}{words}: the model then misses {100 * min_misfit:.2g} % of the "
+                f"forces instead of {100 * misfit:.2g} %."
             )
             return (text,)
     return events or _misfit_text(fit, samples.motion, samples.forces, misfit)
@@ -161,7 +166,7 @@ class _Samples:
         self._instants = instants
         self._model = model
         self._max_speeds = np.abs(self.motion.qd).max(axis=0)
-        self._geometry = _AnyGeometry(model)
+        self._geometry = AnyGeometry(model)
         self.no_correction = Correction("", model.robot, self.motion, self.forces)
         self._rows = self._corrected_rows(self.no_correction)
         is_model_friction = [
@@ -171,18 +176,17 @@ class _Samples:
         column_count = self._rows.shape[2] - 1
         self._is_friction = np.ones(column_count, bool)
         self._is_friction[: len(is_model_friction)] = is_model_friction
-        self.initial_misfit = _misfit(self._rows, self._is_friction)
+        self.initial_misfit = braking_misfit(self._rows, self._is_friction)
 
     def misfit(self, c: Correction, part: slice = slice(None), folds: int = 1) -> float:
         """Return what is missed (0 to 1) if a part of the instants is corrected."""
         rows = self._rows.copy()
         rows[part] = self._corrected_rows(c)
-        return _misfit(rows, self._is_friction, folds)
+        return braking_misfit(rows, self._is_friction, folds)
 
     def clause(self, c: Correction, part: slice) -> str:
         """Return the clause of a correction, or of a neighbour that leaves less."""
-        best_correction = min((c, *c.neighbours), key=lambda x: self.misfit(x, part))
-        return best_correction.text
+        return min((c, *c.neighbours), key=lambda x: self.misfit(x, part)).text
 
     def best_correction(self, mistake: _Amount, part: slice) -> Correction:
         """Return the correction of a mistake by the amount that leaves least.
@@ -265,19 +269,8 @@ class _Samples:
     def _corrected_rows(self, c: Correction) -> np.ndarray:
         """Return the regressor, with any friction, and the forces as last column."""
         columns, tool = self._geometry(c.robot, c.motion)
-        friction = _friction_columns(np.asarray(c.motion.qd), self._max_speeds)
+        friction = friction_columns(np.asarray(c.motion.qd), self._max_speeds)
         return np.concatenate([columns, friction, (c.forces - tool)[..., None]], axis=2)
-
-
-def _friction_columns(speeds: np.ndarray, max_speeds: np.ndarray) -> np.ndarray:
-    """Return friction columns of each braking joint: dry, with peaks, and quadratic."""
-    v = speeds / np.where(max_speeds > 0, max_speeds, 1.0)
-    sign = np.tanh(v / 0.01)
-    shapes = [sign, np.tanh(v / 0.1)]
-    shapes += [sign * np.exp(-((v / width) ** 2)) for width in (0.05, 0.2)]
-    shapes += [v * abs(v)]
-    identity = np.eye(v.shape[1])
-    return np.concatenate([x[..., None] * identity for x in shapes], axis=2)
 
 
 def _reversal(c: Correction, joint: int) -> Correction:
@@ -359,18 +352,13 @@ def _column_corrections(
         yield variant(f"the angles {key}angles`)", change)
         yield variant(f"angles and forces {key}angles`, `forces`)", change, change)
     for unit, factor in UNIT_FACTORS.get(angle_unit, {}).items():
-        scales = np.where(robot.revolute, factor, 1.0)
-        text = f"the angles of the log seem to be in {unit} (`recording.angle_unit`)"
-        rough_text = (
-            f"the angles of the log seem to be in no unit with a name, roughly {unit} "
-            "(`recording.angle_unit`, a number or a list, with `angle_offsets`; or "
-            "`drives.gear_ratios`)"
+        exact, *neighbours = (
+            variant(
+                text.format(unit), np.diag(np.where(robot.revolute, x * factor, 1.0))
+            )
+            for x, text in UNIT_TEXTS.items()
         )
-        neighbours = [
-            variant(rough_text, np.diag(np.where(robot.revolute, x * factor, 1.0)))
-            for x in (1 - UNIT_STEP, 1 + UNIT_STEP)
-        ]
-        yield variant(text, np.diag(scales))._replace(neighbours=tuple(neighbours))
+        yield exact._replace(neighbours=tuple(neighbours))
     if drives.is_direct:
         return
     angles = not sides[0]
@@ -436,76 +424,3 @@ def _robot_corrections(
         )
         yield variant._replace(text=text.format(vector))
         yield _reversal(variant, j)._replace(text=text.format(mirror))
-
-
-class _AnyGeometry(eqx.Module):
-    """Regressor of a model with axes and gravity as arguments: it is traced once."""
-
-    model: Model
-
-    def columns(self, axis, gravity, q, qd, qdd, s=None):
-        """Return a sample's regressor, followed by the forces of the known tool."""
-        model = Model(
-            self.model.robot.replace(axis=axis, gravity=gravity), self.model.terms
-        )
-        tool_forces = model.known_forces(q, qd, qdd)[:, None]
-        return jnp.concatenate([model.columns(q, qd, qdd, s), tool_forces], axis=1)
-
-    def __call__(self, robot: Robot, motion: Motion) -> tuple[np.ndarray, np.ndarray]:
-        """Return the regressor of each sample, and the forces of the tool."""
-        geometry = np.asarray(robot.axis), np.asarray(robot.gravity)
-        samples = self.model.arguments(motion)
-        columns = in_numpy(self, self.columns, *samples, shared=geometry)
-        return columns[..., :-1], columns[..., -1]
-
-
-def _misfit(rows: np.ndarray, is_friction: np.ndarray, folds: int = 1) -> float:
-    """Return the fraction (0 to 1) of the forces that least squares miss.
-
-    The rows are a regressor with the forces as last column [instants, joints, columns].
-    All joints count equally. Friction, the columns of `is_friction`, is left out where
-    it would come out negative. Each of several `folds`, of several stretches each, is
-    left out of the fit for it.
-    """
-    forces = rows[..., -1]
-    force_sizes = np.sqrt(np.mean(forces**2, axis=0))
-    theta = rows / np.where(force_sizes > 0, force_sizes, np.inf)[:, None]
-    lengths = np.sqrt(np.sum(theta**2, axis=(0, 1)))
-    if not np.isfinite(lengths).all():
-        return np.inf
-    column_lengths = lengths[:-1]
-    theta[..., :-1] /= np.where(column_lengths > 0, column_lengths, 1.0)
-    stretches = np.array_split(theta, 4 * folds)
-    products = []
-    for k in range(folds):
-        part = np.concatenate(stretches[k::folds])
-        matrix = part.reshape(-1, theta.shape[2])
-        products.append(matrix.T @ matrix)
-    total_products = np.sum(products, axis=0)
-    square = 0.0
-    for fold in products:
-        fit_products = total_products - fold if folds > 1 else fold
-        parameters = _braking_parameters(fit_products, is_friction)
-        combination = np.append(parameters, -1.0)
-        square += max(float(combination @ fold @ combination), 0.0)
-    return np.sqrt(square) / max(lengths[-1], 1e-300)
-
-
-def _braking_parameters(products: np.ndarray, is_friction: np.ndarray) -> np.ndarray:
-    """Return the least-squares parameters, without friction that would not brake.
-
-    Products of columns of length one suffice, with a little on their diagonal for those
-    that depend on others: what both lose, 1e-6 of the forces, is far below
-    `MIN_MISFIT`.
-    """
-    count = len(is_friction)
-    matrix = products[:-1, :-1] + 1e-12 * np.eye(count)
-    vector = products[:-1, -1]
-    mask = np.ones(count, bool)
-    while True:
-        parameters = np.zeros(count)
-        parameters[mask] = np.linalg.solve(matrix[np.ix_(mask, mask)], vector[mask])
-        is_driving = is_friction & (parameters < 0)
-        if not is_driving.any():
-            return parameters
-        mask &= ~is_driving
