@@ -278,7 +278,9 @@ def _select_columns(recording: TomlTable) -> Selections:
     selections: dict[str, Selection] = {}
     for channel in channels:
         value = recording.get(channel)
-        columns = tuple(value) if isinstance(value, list) else (value,)
+        columns: tuple[Any, ...] = (value,)
+        if isinstance(value, list):
+            columns = tuple(value)
         are_names = all(isinstance(column, str | int) for column in columns)
         # The robot, which is not loaded yet, tells the names of its joints.
         if are_names and "{name}" not in str(value):
