@@ -14,7 +14,7 @@ from jaxid.arrays import (
     namespace,
 )
 
-from .limits_and_drives import DOUBTFUL_LENGTH, MAX_LENGTH
+from .limits_and_drives import DOUBTFUL_LENGTH
 from .rotations import Rotations, Vectors
 
 AXES = "xyz"
@@ -39,6 +39,10 @@ MIN_THICKNESS = 1e-3
 """Smallest second moment of a corrected body, relative to the largest."""
 MAX_MASS = 1e5
 """Largest mass of a body of a robot [kg]."""
+MAX_DISTANCE = 20.0
+"""Largest distance of a centre of mass from the frame of its body [m]."""
+MAX_DENSITY = 25_000.0
+"""Density above that of all materials [kg/m³]; osmium has 22,600."""
 
 
 class Inertia(eqx.Module):
@@ -143,7 +147,7 @@ class Inertia(eqx.Module):
         if not 0.0 <= mass <= MAX_MASS:
             return f"its `mass` is {mass:g} kg, but must be from 0 to {MAX_MASS:g} kg"
         distance = np.abs(centre).max()
-        if distance > MAX_LENGTH:
+        if distance > MAX_DISTANCE:
             return f"its `centre_of_mass` is {distance:g} m away: is it in millimetres?"
         moment = np.abs(tensor).max()
         if moment > DOUBTFUL_LENGTH**2 * max(mass, 1.0):
@@ -163,6 +167,19 @@ class Inertia(eqx.Module):
                 "negative, or larger than the sum of the others"
             )
         return ""
+
+
+def ball_densities(bodies: BodyParameters) -> np.ndarray:
+    """Return the densities of balls with the bodies' masses and moments [kg/m³].
+
+    No body of even density with the same mass and sum of moments is less dense.
+    """
+    inertia = Inertia.from_parameters(bodies)
+    moments = np.trace(inertia.tensor, axis1=-2, axis2=-1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        # Half the sum of the moments is 3/5 m r².
+        radii = np.sqrt(5.0 / 6.0 * np.abs(moments) / inertia.mass)
+        return inertia.mass / (4.0 / 3.0 * np.pi * radii**3)
 
 
 def inertia_tensor(j: AnyArray) -> Rotations:

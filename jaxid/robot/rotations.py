@@ -6,6 +6,8 @@ rank is decided with exact quarter turns ("snapping"); the robot itself keeps th
 of its file.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -94,3 +96,22 @@ def without_rounding(values: AnyArray) -> np.ndarray:
     differences = np.abs(values - integers)
     entries = np.where(differences <= 1e-14, integers, values)
     return entries + 0.0  # makes -0.0 positive
+
+
+class Placement(NamedTuple):
+    """Attitude and origin of a link in the frame of the body that carries it.
+
+    Attributes:
+        body: Index of the body; -1 for the ground.
+        rotation: Attitude; its columns are the axes of the link.
+        position: Origin of the link [m].
+    """
+
+    body: int
+    rotation: Matrix3
+    position: Vector3
+
+    def of(self, rotation: Matrix3, position: Vector3) -> "Placement":
+        """Return the placement on the body of what is placed on the link."""
+        body, R, r = self
+        return Placement(body, without_rounding(R @ rotation), r + R @ position)

@@ -9,7 +9,7 @@ import numpy as np
 from jaxid.arrays import AnyArray, Joints, Numbers
 from jaxid.errors import InputError
 
-from .inertia import IMPOSSIBLE
+from .inertia import IMPOSSIBLE, MAX_DENSITY, ball_densities
 from .limits_and_drives import (
     MAX_STATED_ANGLE,
     MAX_STATED_LENGTH,
@@ -22,6 +22,8 @@ from .urdf_tree import ORIGIN, TURNING_TYPES, UrdfTree, link_names
 
 MIN_RANGE = 1e-6
 """Length of a range below which it is empty, up to rounding [rad or m]."""
+PLACEHOLDER_MASS = 0.01
+"""Mass that files state for links which nobody has weighed [kg]."""
 MAX_FINGER_SHARE = 0.05
 """Share of the moving mass above which a joint moves more than a finger."""
 
@@ -226,6 +228,14 @@ def _limits(tree: UrdfTree):
         f"{owners('joint', joints)}: {limit} is taken as unknown."
         for limit, joints in unknown_limits.items()
     ]
+    soft_joints = [
+        joint.get("name")
+        for joint in tree.joints
+        if tree.range(joint) != tree.hard_range(joint)
+    ]
+    if soft_joints:
+        names = owners("joint", soft_joints)
+        notes.append(f"{names}: soft limits (`<safety_controller>`) narrow the range.")
     return limits, notes
 
 
@@ -320,4 +330,28 @@ def _inertial_notes(tree: UrdfTree):
             if IMPOSSIBLE not in fault:
                 use = f"it {IMPOSSIBLE}, so that inertias of the file are not used"
             notes.append(f"link `{link}`: {fault}; {use}: correct its inertial.")
+    fault = "" if any(faults.values()) else placeholder_fault(tree)
+    if fault:
+        cure = "inertias of the file are no prior: correct or remove them"
+        notes.append(f"{fault}; {cure}.")
     return notes
+
+
+def placeholder_fault(tree: UrdfTree) -> str:
+    """Return why nobody can have measured the bodies; empty if somebody can."""
+    bodies = tree.bodies()
+    densities = ball_densities(bodies)
+    dense_bodies = np.flatnonzero(densities > MAX_DENSITY)
+    if dense_bodies.size:
+        names = owners("joint", [tree.joints[i].get("name") for i in dense_bodies])
+        return (
+            f"{names}: mass and moments of the body {IMPOSSIBLE}: "
+            f"{densities[dense_bodies[0]]:.2g} kg/m³ are more than any material has "
+            "(is a mass in grams, or are moments placeholders?)"
+        )
+    # Light branches may be alike, such as propellers.
+    is_chain = len({place.body for place in tree.placements}) == len(bodies) > 2
+    mass = bodies[0, 0]
+    if is_chain and 0.0 < mass <= PLACEHOLDER_MASS and not np.ptp(bodies[:, 0]):
+        return "all bodies have the same mass, as placeholders have"
+    return ""

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
@@ -14,7 +14,7 @@ from .description_files import is_mjcf, read_description
 from .inertia import BodyParameters, Inertia
 from .limits_and_drives import are_degrees, listed
 from .mjcf import Loop
-from .rotations import axis_rotation, rpy_rotation, without_rounding
+from .rotations import Placement, axis_rotation, rpy_rotation, without_rounding
 
 TURNING_TYPES = ("revolute", "continuous")
 """Types of joints that turn."""
@@ -24,20 +24,6 @@ MAX_ROUNDING = 1e-6
 """Change of gravity's direction that is rounding [rad]."""
 ORIGIN = (0.0, 0.0, 0.0)
 """Position, or roll, pitch and yaw, where a file states none."""
-
-
-class Placement(NamedTuple):
-    """Attitude and origin of a link in the frame of the body that carries it.
-
-    Attributes:
-        body: Index of the body; -1 for the ground.
-        rotation: Attitude; its columns are the axes of the link.
-        position: Origin of the link [m].
-    """
-
-    body: int
-    rotation: Matrix3
-    position: Vector3
 
 
 class UrdfTree:
@@ -135,7 +121,9 @@ class UrdfTree:
             link = self._attribute(end, "link")
             if link not in self.links:
                 raise self.error(
-                    joint, f"connects link `{link}`, which the file does not define"
+                    joint,
+                    f"connects link `{link}`, which the file does not define: "
+                    "remove the joint, or define the link",
                 )
         parent, child = link_names(joint)
         if child in self._above:
@@ -205,7 +193,7 @@ class UrdfTree:
                 self.mimics.append(joint)
             if is_fixed:
                 carrier = self.carriers[parent]
-                self.carriers[child] = _placed(carrier, *self.held_pose(joint))
+                self.carriers[child] = carrier.of(*self.held_pose(joint))
             else:
                 self._add_body(joint)
             joints, links = lengths[parent]
@@ -228,7 +216,7 @@ class UrdfTree:
     def _add_body(self, joint: Any):
         """Enter the body that a joint moves."""
         parent, child = link_names(joint)
-        placement = _placed(self.carriers[parent], *self._origin(joint))
+        placement = self.carriers[parent].of(*self._origin(joint))
         self.carriers[child] = Placement(len(self.joints), np.eye(3), np.zeros(3))
         self.joints.append(joint)
         self.axes.append(self._axis(joint))
@@ -242,9 +230,7 @@ class UrdfTree:
             for joint in self._below[link]:
                 _, child = link_names(joint)
                 if joint.get("type") in HOLDABLE_TYPES and child not in placements:
-                    placements[child] = _placed(
-                        placements[link], *self.held_pose(joint)
-                    )
+                    placements[child] = placements[link].of(*self.held_pose(joint))
                     links.append(child)
         return placements
 
@@ -333,7 +319,21 @@ class UrdfTree:
         return R, r + R @ axis * value
 
     def range(self, joint: Any) -> tuple[float, float]:
-        """Return the ends of a joint's range, infinite where unknown [rad or m]."""
+        """Return the ends of a joint's range, infinite where unknown [rad or m].
+
+        Soft limits narrow it: beyond them a controller slows the joint down.
+        """
+        hard_low, hard_high = self.hard_range(joint)
+        element = joint.find("safety_controller")
+        soft_low = float(self.numbers(element, "soft_lower_limit", (0.0,))[0])
+        soft_high = float(self.numbers(element, "soft_upper_limit", (0.0,))[0])
+        low = max(hard_low, soft_low)
+        high = min(hard_high, soft_high)
+        # Both soft limits are zero where a file states none.
+        return (low, high) if low < high else (hard_low, hard_high)
+
+    def hard_range(self, joint: Any) -> tuple[float, float]:
+        """Return the ends of the range at which a joint stops."""
         low = self.limit(joint, "lower", np.nan)
         high = self.limit(joint, "upper", np.nan)
         has_limit = np.isfinite(low) or np.isfinite(high)
@@ -372,7 +372,7 @@ class UrdfTree:
         kind = joint.get("type")
         if kind not in (*TURNING_TYPES, "prismatic"):
             cure = "make it fixed"
-            if kind == "floating":
+            if kind in ("floating", "planar"):
                 _, child = link_names(joint)
                 cure = f"hold the robot at its base (`base`, `--base {child}`)"
             raise self.error(
@@ -484,12 +484,6 @@ class UrdfTree:
 def link_names(joint: Any) -> tuple[str, str]:
     """Return the names of the links that a joint connects: parent and child."""
     return joint.find("parent").get("link"), joint.find("child").get("link")
-
-
-def _placed(carrier: Placement, rotation: Matrix3, position: Vector3):
-    """Return the placement on a body of what is placed on one of its links."""
-    body, R, r = carrier
-    return Placement(body, without_rounding(R @ rotation), r + R @ position)
 
 
 def _words(values: np.ndarray):

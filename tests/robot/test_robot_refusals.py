@@ -123,7 +123,7 @@ FILES = {
         ),
         "joint `root` is floating.*`--tip`.*`--base base`",
     ),
-    "a planar joint": (arm(kind="planar"), "joint `j1` is planar.*`--tip`"),
+    "a planar joint": (arm(kind="planar"), "joint `j1` is planar.*`--base a`"),
     "two parents": (
         two(link("b"), joint("j2", "base", "b"), joint("j3", "a", "b")),
         "`j3` moves",
@@ -252,6 +252,13 @@ IMPOSSIBLE = {
         (0, 0, 0),
         ROUND,
         "`centre_of_mass` is 3000 m",
+    ),
+    "a centre in millimetres": (
+        1.0,
+        (0, 0, 120.0),
+        (0, 0, 0),
+        ROUND,
+        "`centre_of_mass` is 120 m away: is it in millimetres",
     ),
     "degrees": (
         1.0,

@@ -20,6 +20,7 @@ from jaxid.errors import InputError
 from jaxid.robot.inertia import Inertia
 from jaxid.robot.rotations import rpy_angles, rpy_rotation
 from jaxid.robot.urdf import load_urdf, urdf_parameters
+from jaxid.workflow.robot_file import RobotFile
 
 SHARE = "cmeel.prefix/share/example-robot-data/robots"
 FOLDER = Path(str(distribution("example-robot-data").locate_file(SHARE)))
@@ -250,6 +251,28 @@ def test_limits(write, kind, limit, expected):
     assert [values.item() for values in read] == list(expected)
 
 
+@pytest.mark.parametrize(
+    ("soft", "expected"),
+    [
+        ('soft_lower_limit="-1.0" soft_upper_limit="1.2"', (-1.0, 1.2)),
+        ('soft_lower_limit="-9" soft_upper_limit="1.2"', (-2.5, 1.2)),
+        ('soft_lower_limit="-9" soft_upper_limit="9"', (-2.5, 2.5)),
+        ('soft_upper_limit="1.5"', (0.0, 1.5)),
+        ("", (-2.5, 2.5)),
+    ],
+)
+def test_soft_limits_narrow_a_range(write, soft, expected):
+    inner = (
+        '<limit lower="-2.5" upper="2.5" velocity="1" effort="2"/>'
+        f'<safety_controller {soft} k_velocity="10"/>'
+    )
+    arm_of_file = load_urdf(write(arm(inner=inner)))
+    limits = arm_of_file.limits
+    assert (limits.position_min.item(), limits.position_max.item()) == expected
+    are_noted = any("soft limits" in note for note in arm_of_file.notes)
+    assert are_noted == (expected != (-2.5, 2.5))
+
+
 @pytest.mark.parametrize("limit", ["0.7 0.7", "-1 -1", "0 0", "-1000 1000"])
 def test_a_range_that_is_none_is_noted(write, limit):
     lower, upper = limit.split()
@@ -292,6 +315,50 @@ def test_faults_of_xml_that_other_programs_allow(write, head):
     broken = text.replace("</joint>", "")
     with pytest.raises(InputError, match=f"line {broken.count(chr(10))}: .* not XML"):
         load_urdf(write(broken))
+
+
+def chain_of_three(masses, moment):
+    """Return a chain of three bodies with round moments [kg m²]."""
+    parts = [link("l0")]
+    for k, mass in enumerate(masses, 1):
+        tensor = (moment, 0.0, 0.0, moment, 0.0, moment)
+        parts.append(link(f"l{k}", inertial(mass, (0, 0, 0.1), (0, 0, 0), tensor)))
+        parts.append(joint(f"j{k}", f"l{k - 1}", f"l{k}", xyz="0 0 0.3"))
+    return robot(*parts)
+
+
+@pytest.mark.parametrize(
+    ("masses", "moment", "words"),
+    [
+        ((4.0, 3.0, 1.5), 1e-2, ""),
+        ((4000.0, 3.0, 1.5), 1e-2, "joint `j1`: .*is a mass in grams"),
+        ((4.0, 3.0, 0.02), 1e-6, "joints `j1`, `j2`: .* are moments placeholders"),
+        ((4.0, 3.0, 1.5), 0.0, "joints `j1`, `j2`, `j3`: .* placeholders"),
+        ((1e-3, 1e-3, 1e-3), 1e-6, "all bodies have the same mass"),
+    ],
+)
+def test_bodies_that_nobody_has_measured_are_noted_and_no_prior(
+    write, masses, moment, words
+):
+    path = write(chain_of_three(masses, moment))
+    notes = load_urdf(path).notes
+    bodies = RobotFile(path).possible_bodies()
+    if not words:
+        assert notes == ()
+        np.testing.assert_allclose(bodies[:, 0], masses)
+    else:
+        (note,) = notes
+        assert re.match(words, note)
+        assert bodies is None
+
+
+def test_branches_may_be_alike(write):
+    tensor = (1e-3, 0.0, 0.0, 1e-3, 0.0, 1e-3)
+    body = inertial(0.2, (0, 0, 0), (0, 0, 0), tensor)
+    parts = [
+        part for name in "abc" for part in (link(name, body), joint(name, "l", name))
+    ]
+    assert load_urdf(write(robot(link("l"), *parts))).notes == ()
 
 
 def test_defaults_of_name_and_axis(write):
