@@ -82,6 +82,7 @@ METHODS = (
     Script("delay", 40),
     Script("resolution", 10),
     Script("report", 1),
+    Script("robot_files", 2),
 )
 SCRIPTS = SPEED + METHODS
 

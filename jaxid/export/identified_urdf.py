@@ -153,6 +153,7 @@ def _fix_joint(tree: UrdfTree, joint: Any) -> None:
     origin = _child(joint, "origin")
     origin.set("xyz", exact_text(position))
     origin.set("rpy", exact_text(rpy_angles(rotation)))
+    origin.attrib.pop("quat_xyzw", None)  # another form of the same
 
 
 def _write_joints(tree: UrdfTree, robot: Robot, dynamics: JointDynamics) -> None:

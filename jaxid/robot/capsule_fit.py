@@ -15,7 +15,8 @@ from .collision_geometry import Shape, link_shapes, mjcf_shapes
 from .limits_and_drives import MAX_LENGTH
 from .robot import Robot
 from .shapes import GROUND, Capsule
-from .urdf_tree import ORIGIN, UrdfTree
+from .urdf_elements import ORIGIN
+from .urdf_tree import UrdfTree
 
 STAND_IN_SHARE = 0.07
 """Radius of a capsule for an unknown shape, relative to the robot's length."""

@@ -11,8 +11,8 @@ from jaxid.arrays import AnyArray, Float, Matrix3, Vector3
 from jaxid.errors import InputError
 
 from .mjcf import body_name, import_mujoco, rotation_of_quaternion
-from .rotations import rpy_rotation
-from .urdf_tree import ORIGIN, UrdfTree
+from .urdf_elements import ORIGIN
+from .urdf_tree import UrdfTree
 
 CORNERS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
 """Corners of a box with edges of length 2."""
@@ -60,7 +60,7 @@ def link_shapes(
     element = tree.links[link]
     for part in element.findall("collision") or element.findall("visual"):
         origin = part.find("origin")
-        rotation = rpy_rotation(tree.numbers(origin, "rpy", ORIGIN))
+        rotation = tree.attitude(origin)
         position = tree.numbers(origin, "xyz", ORIGIN)
         description = part.find("geometry/*")
         # An element without geometry is named in the error.

@@ -16,6 +16,8 @@ from .xacro import expand_xacro
 
 MAX_PARTS = {"hfield": 10_000_000, "replicate": 2_000}
 """Largest numbers of heights of a field, and of copies of a body, in an MJCF file."""
+HARMLESS_FAULTS = ("NS_ERR_UNDEFINED_NAMESPACE", "ERR_UNKNOWN_VERSION")
+"""Faults of XML that change no element, by the names of the parser."""
 
 
 def read_description(
@@ -77,7 +79,7 @@ def is_xacro(path: str | Path) -> bool:
 
 def _has_xacro(root: Any):
     """Return whether there are elements of xacro below a root."""
-    return any("ros.org/" in e.tag and "xacro" in e.tag for e in root.iter("*"))
+    return any("xacro" in element.tag for element in root.iter("*"))
 
 
 def _parse(path: str | Path, text: bytes | None = None):
@@ -89,7 +91,9 @@ def _parse(path: str | Path, text: bytes | None = None):
     if text is None:
         text = Path(path).read_bytes()
     # No entity of a file makes the parser read other files.
-    parser = etree.XMLParser(resolve_entities=False, no_network=True, load_dtd=False)
+    parser = etree.XMLParser(
+        recover=True, resolve_entities=False, no_network=True, load_dtd=False
+    )
     try:
         return _tolerant_root(text, parser)
     except etree.XMLSyntaxError as error:
@@ -102,19 +106,34 @@ def _parse(path: str | Path, text: bytes | None = None):
 def _tolerant_root(text: bytes, parser: Any):
     """Return the root element of a text with the faults that other programs allow.
 
-    These are double hyphens in comments, and blank lines or comments before `<?xml`.
+    These are double hyphens in comments, blank lines or comments before `<?xml`, and
+    attributes without a blank between them.
     """
     try:
-        return etree.fromstring(text, parser)
+        return _root(text, parser)
     except etree.XMLSyntaxError:
         # Line breaks stay, so that messages name the lines of the file. Beyond the last
         # end of a comment the search would be slow.
         head, end, rest = text.rpartition(b"-->")
         content = re.sub(rb"(?s)<!--.*?-->", _line_breaks, head + end) + rest
-        declaration_first = re.sub(
-            rb"\A(?:\xef\xbb\xbf)?(\s+)(<\?xml[^>]*>)", rb"\2\1", content
+        spaced_content = re.sub(
+            rb"""(=\s*(?:"[^"<]*"|'[^'<]*'))(?=\w)""", rb"\1 ", content
         )
-        return etree.fromstring(declaration_first, parser)
+        declaration_first = re.sub(
+            rb"\A(?:\xef\xbb\xbf)?(\s+)(<\?xml[^>]*>)", rb"\2\1", spaced_content
+        )
+        return _root(declaration_first, parser)
+
+
+def _root(text: bytes, parser: Any):
+    """Return the root element of a text; raise the first fault that is not harmless."""
+    root = etree.fromstring(text, parser)
+    for fault in parser.error_log:
+        if fault.type_name not in HARMLESS_FAULTS:
+            raise etree.XMLSyntaxError(
+                fault.message, fault.type, fault.line, fault.column
+            )
+    return root
 
 
 def _line_breaks(match: re.Match[bytes]):

@@ -18,7 +18,8 @@ from .limits_and_drives import (
     range_fault,
 )
 from .robot import Robot
-from .urdf_tree import ORIGIN, TURNING_TYPES, UrdfTree, link_names
+from .urdf_elements import ORIGIN
+from .urdf_tree import TURNING_TYPES, UrdfTree, link_names
 
 MIN_RANGE = 1e-6
 """Length of a range below which it is empty, up to rounding [rad or m]."""
@@ -84,6 +85,7 @@ def load_urdf(
         *_held_notes(tree),
         *_effect_notes(tree),
         *limit_notes,
+        *_negative_notes(tree),
         *_inertial_notes(tree),
     )
     if gravity is None:
@@ -307,16 +309,43 @@ def _effect_notes(tree: UrdfTree):
     ]
 
 
+def _negative_notes(tree: UrdfTree):
+    """Return notes on friction, rotors and springs that are negative."""
+    notes = []
+    for key in ("armature", "damping", "friction", "stiffness"):
+        joints = [
+            joint.get("name")
+            for joint in tree.joints
+            if tree.numbers(joint.find("dynamics"), key, (0.0,))[0] < 0.0
+        ]
+        if joints:
+            notes.append(
+                f"{owners('joint', joints)}: `{key}` is negative and is not used: "
+                "correct it."
+            )
+    return notes
+
+
 def _inertial_notes(tree: UrdfTree):
     """Return notes on bodies without mass, and on links that cannot exist."""
     masses = np.zeros(len(tree.joints))
     faults = {}
+    rounded_links = []
     for link, placement in tree.carriers.items():
         inertia_and_fault = tree.inertial(link) if placement.body >= 0 else None
-        if inertia_and_fault is not None:
-            inertia, faults[link] = inertia_and_fault
-            masses[placement.body] += abs(inertia.mass)
+        if inertia_and_fault is None:
+            continue
+        inertia, faults[link] = inertia_and_fault
+        masses[placement.body] += abs(inertia.mass)
+        if not faults[link] and inertia.nearest_possible() is not inertia:
+            rounded_links.append(link)
     notes = []
+    if rounded_links:
+        notes.append(
+            f"{owners('link', rounded_links)}: by rounding, a moment of inertia is "
+            "slightly larger than the sum of the others: the prior has the nearest "
+            "moments of a real body."
+        )
     light_bodies = [tree.joints[i].get("name") for i in np.flatnonzero(masses == 0.0)]
     if light_bodies:
         notes.append(

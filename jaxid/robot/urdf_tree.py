@@ -14,7 +14,8 @@ from .description_files import is_mjcf, read_description
 from .inertia import BodyParameters, Inertia
 from .limits_and_drives import are_degrees, listed
 from .mjcf import Loop
-from .rotations import Placement, axis_rotation, rpy_rotation, without_rounding
+from .rotations import Placement, axis_rotation, without_rounding
+from .urdf_elements import ORIGIN, UrdfElements
 
 TURNING_TYPES = ("revolute", "continuous")
 """Types of joints that turn."""
@@ -22,11 +23,9 @@ HOLDABLE_TYPES = (*TURNING_TYPES, "prismatic", "fixed")
 """Types of joints that can be held at one coordinate."""
 MAX_ROUNDING = 1e-6
 """Change of gravity's direction that is rounding [rad]."""
-ORIGIN = (0.0, 0.0, 0.0)
-"""Position, or roll, pitch and yaw, where a file states none."""
 
 
-class UrdfTree:
+class UrdfTree(UrdfElements):
     """Links and joints of a URDF or MJCF file, merged into bodies.
 
     Links on fixed or held joints become part of the body that carries them. Only what
@@ -66,8 +65,8 @@ class UrdfTree:
         self.compiled = is_mjcf(path)
         name = self.root.get("name") or Path(path).stem
         self.name = "".join(c if c.isprintable() else " " for c in name)
-        self.links = self._named("link")
-        self._joints = self._named("joint")
+        self.links = self.named("link")
+        self._joints = self.named("joint")
         if self.root.find("joint/parent[@link='world']") is not None:
             # Simulators know this link, so that many files do not define it.
             self.links.setdefault("world", etree.Element("link", name="world"))
@@ -99,26 +98,14 @@ class UrdfTree:
         links = ("", *self.moving_links)
         self.effects = [effect for effect in effects if effect.link in links]
 
-    def _named(self, tag: str):
-        """Return the elements of a tag by their names."""
-        elements: dict[str, Any] = {}
-        for element in self.root.iterfind(tag):
-            name = self._attribute(element, "name")
-            if name in elements:
-                raise InputError(
-                    f"`{self.path}` has two {tag}s named `{name}`: rename one."
-                )
-            elements[name] = element
-        return elements
-
     def _add(self, joint: Any):
         """Enter a joint between the links that it connects."""
-        self._attribute(joint, "type")
+        self.attribute(joint, "type")
         for tag in ("parent", "child"):
             end = joint.find(tag)
             if end is None:
                 raise InputError(f"{self.place(joint)}: the joint has no `<{tag}>`.")
-            link = self._attribute(end, "link")
+            link = self.attribute(end, "link")
             if link not in self.links:
                 raise self.error(
                     joint,
@@ -365,21 +352,13 @@ class UrdfTree:
             raise self.error(
                 joint, f"has an `rpy` of {_words(rpy)}: give radians, not degrees"
             )
-        return rpy_rotation(rpy), offset
+        return self.attitude(element), offset
 
     def _axis(self, joint: Any):
         """Return the unit vector of a moving joint's axis."""
         kind = joint.get("type")
         if kind not in (*TURNING_TYPES, "prismatic"):
-            cure = "make it fixed"
-            if kind in ("floating", "planar"):
-                _, child = link_names(joint)
-                cure = f"hold the robot at its base (`base`, `--base {child}`)"
-            raise self.error(
-                joint,
-                f"is {kind}, but must turn or slide: "
-                f"avoid it (`tip`, `--tip`), or {cure}",
-            )
+            raise self._type_error(joint)
         axis = self.numbers(joint.find("axis"), "xyz", (1.0, 0.0, 0.0))
         size = np.abs(axis).max()
         if size < 1e-9:
@@ -388,6 +367,23 @@ class UrdfTree:
             )
         direction = axis / size  # huge numbers have no finite length
         return without_rounding(direction / np.linalg.norm(direction))
+
+    def _type_error(self, joint: Any):
+        """Return the error of a joint that neither turns nor slides."""
+        kind = joint.get("type")
+        if kind not in ("floating", "planar", "ball"):
+            types = ", ".join(f"`{name}`" for name in HOLDABLE_TYPES)
+            return self.error(joint, f"has the type `{kind}`: write one of {types}")
+        cure = "make it fixed"
+        if kind == "ball":
+            cure = "remove it, which fixes its body"
+        elif self._moves_below(joint):
+            _, child = link_names(joint)
+            cure = f"hold the robot at its base (`base`, `--base {child}`)"
+        return self.error(
+            joint,
+            f"is {kind}, but must turn or slide: avoid it (`tip`, `--tip`), or {cure}",
+        )
 
     def bodies(self, *, check: bool = False, nearest: bool = False) -> BodyParameters:
         """Return the parameters of all bodies; reject impossible links if asked to.
@@ -430,50 +426,8 @@ class UrdfTree:
         fault = inertia.fault(rounding=0.01)
         if are_degrees(rpy):
             fault = f"its `rpy` is {_words(rpy)}, which are degrees, not radians"
-        R = rpy_rotation(rpy)
+        R = self.attitude(origin)
         return Inertia(mass, centre, R @ inertia.tensor @ R.T), fault
-
-    def place(self, element: Any) -> str:
-        """Return file and line of an element, for messages."""
-        line = element.sourceline  # None if the file is MJCF
-        return f"`{self.path}`, line {line}" if line else f"`{self.path}`"
-
-    def error(self, joint: Any, complaint: str) -> InputError:
-        """Return an error about a joint, which names the file and the joint."""
-        return InputError(f"`{self.path}`: joint `{joint.get('name')}` {complaint}.")
-
-    def _attribute(self, element: Any, key: str):
-        """Return an attribute that an element must have."""
-        if element.get(key) is None:
-            raise InputError(
-                f"{self.place(element)}: `<{element.tag}>` needs the attribute {key}."
-            )
-        return element.get(key)
-
-    def numbers(
-        self,
-        element: Any,
-        key: str,
-        default: tuple[float, ...],
-        *,
-        infinite: bool = False,
-    ) -> np.ndarray:
-        """Return the numbers of an attribute, or the default if it is missing."""
-        text = None if element is None else element.get(key)
-        if text is None:
-            return np.array(default)
-        try:
-            array = np.array([float(word) for word in text.split()])
-        except ValueError:
-            array = np.zeros(0)
-        is_number = ~np.isnan(array) if infinite else np.isfinite(array)
-        if array.shape != (len(default),) or not is_number.all():
-            words = "number" if len(default) == 1 else "numbers"
-            raise InputError(
-                f"{self.place(element)}: `{key}` must hold "
-                f'{len(default)} finite {words}, but is "{text}".'
-            )
-        return array
 
     def limit(self, joint: Any, key: str, unknown: float) -> float:
         """Return a number of a joint's `<limit>`, which may be infinite."""

@@ -15,6 +15,7 @@ from jaxid.robot.library import from_dh, panda, planar_arm
 from jaxid.robot.limits_and_drives import Drives, Limits
 from jaxid.robot.robot import Robot, Tool
 from jaxid.robot.urdf import load_urdf, urdf_parameters
+from jaxid.workflow.robot_file import RobotFile
 
 ARM = {
     "revolute": (True,),
@@ -123,7 +124,22 @@ FILES = {
         ),
         "joint `root` is floating.*`--tip`.*`--base base`",
     ),
-    "a planar joint": (arm(kind="planar"), "joint `j1` is planar.*`--base a`"),
+    "a planar joint": (
+        arm(kind="planar"),
+        "joint `j1` is planar.*`--tip`.*make it fixed",
+    ),
+    "an unknown type": (
+        arm(kind="Revolute"),
+        "joint `j1` has the type `Revolute`: write one of `revolute`, `continuous`",
+    ),
+    "a planar base": (
+        robot(
+            *map(link, ("world", "base", "a")),
+            joint("root", "world", "base", "planar"),
+            joint("j1", "base", "a"),
+        ),
+        "joint `root` is planar.*`--tip`.*`--base base`",
+    ),
     "two parents": (
         two(link("b"), joint("j2", "base", "b"), joint("j3", "a", "b")),
         "`j3` moves",
@@ -284,6 +300,29 @@ def test_inertials_that_cannot_exist_are_noted_and_not_used(tmp_path, case):
     assert "cannot belong to a real body" in remark.text
     assert remark.status is Status.DOUBTFUL
     assert urdf_parameters(path, check=False)[0] == claimed[0]
+
+
+@pytest.mark.parametrize(
+    ("moments", "is_noted"),
+    [
+        ((1.0, 0, 0, 1.0, 0, 2.01), True),  # a plate, rounded to two digits
+        ((0.0, 0, 0, 1.0, 0, 1.003), True),  # a rod
+        ((1.5, -0.505, 0, 1.5, 0, 1.0), True),  # a turned plate
+        ((1.0, 0, 0, 1.0, 0, 2.0), False),
+        ((0.0, 0, 0, 1.0, 0, 1.0), False),
+        ((1.5, -0.5, 0, 1.5, 0, 1.0), False),
+    ],
+)
+def test_moments_that_rounding_makes_impossible_are_noted(tmp_path, moments, is_noted):
+    path = tmp_path / "arm.urdf"
+    body = inertial(1.0, (0, 0, 0), (0, 0, 0), moments)
+    path.write_text(robot(link("base"), link("a", body), joint("j1", "base", "a")))
+    notes = [note for note in load_urdf(path).notes if "by rounding" in note]
+    assert len(notes) == is_noted
+    assert all("link `a`" in note for note in notes)
+    file = RobotFile(str(path))
+    is_same = np.array_equal(file.bodies().ravel(), urdf_parameters(path))
+    assert is_same != is_noted
 
 
 @pytest.mark.parametrize(

@@ -299,6 +299,46 @@ def test_attitudes_beyond_a_full_turn_are_those_of_pinocchio(write, turns):
     )
 
 
+@pytest.mark.parametrize("quaternion", ["0 0 0.6 0.8", "-0.5 0.5 0.5 -0.5"])
+@pytest.mark.parametrize("angles", ['rpy="0.1 0.2 0.3"', 'rpy="0.4 0.5 0.6"'])
+def test_quaternions_are_those_of_pinocchio(write, quaternion, angles):
+    body = inertial(1.0, (0.1, 0, 0), (0.1, 0.2, 0.3), (1, 0.1, 0, 2, 0, 2.5))
+    limit = '<limit lower="-1" upper="1" velocity="1" effort="2"/>'
+    turning = joint("j1", "base", "a", rpy="0.4 0.5 0.6", inner=limit)
+    text = robot(link("base"), link("a", body), turning)
+    text = text.replace("<robot ", '<robot version="1.2" ')
+    assert angles in text
+    path = write(text.replace(angles, f'quat_xyzw="{quaternion}"'))
+    ours = load_urdf(path)
+    oracle = Oracle(path)
+    oracle.set(ours.joint_names, [0.5])
+    np.testing.assert_allclose(
+        body_transforms(ours, np.array([0.5])), [oracle.joint("j1")], atol=1e-12
+    )
+    np.testing.assert_allclose(
+        urdf_parameters(path), oracle.parameters("j1"), atol=1e-12
+    )
+
+
+def test_a_quaternion_without_direction_is_refused(write):
+    text = arm(rpy="0.4 0.5 0.6").replace("rpy=", "quat_xyzw=")
+    with pytest.raises(InputError, match="`quat_xyzw` must hold 4 finite numbers"):
+        load_urdf(write(text))
+    zero = text.replace("0.4 0.5 0.6", "0 0 0 0")
+    with pytest.raises(InputError, match="`quat_xyzw` must not be zero"):
+        load_urdf(write(zero))
+
+
+@pytest.mark.parametrize("key", ["armature", "damping", "friction", "stiffness"])
+def test_a_negative_effect_is_noted_and_not_used(write, key):
+    path = write(arm(inner=f'<dynamics {key}="-1"/>'))
+    assert f"joint `j1`: `{key}` is negative and is not used" in " ".join(
+        load_urdf(path).notes
+    )
+    positive = write(arm(inner=f'<dynamics {key}="1"/>'))
+    assert "negative" not in " ".join(load_urdf(positive).notes)
+
+
 @pytest.mark.parametrize(
     "head",
     [
@@ -306,6 +346,9 @@ def test_attitudes_beyond_a_full_turn_are_those_of_pinocchio(write, turns):
         '<!-- made\nby hand -->\n<?xml version="1.0" encoding="utf-8"?>',
         '\ufeff\n<?xml version="1.0" encoding="UTF-8"?>',
         '<?xml version="1.0"?><!-- a -- b ---\n <link name="base"/> -->',
+        '<?xml version="0.0"?>',
+        '\n<?xml version="2.0"?>\n',
+        '<?xml version="1.0"?>\n<!-- joint of <drake:joint> -->',
     ],
 )
 def test_faults_of_xml_that_other_programs_allow(write, head):
@@ -359,6 +402,26 @@ def test_branches_may_be_alike(write):
         part for name in "abc" for part in (link(name, body), joint(name, "l", name))
     ]
     assert load_urdf(write(robot(link("l"), *parts))).notes == ()
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("<limit ", '<limit drake:acceleration="2" '),
+        ("<robot ", '<robot drake:version="1" '),
+        ("</robot>", "<drake:joint/></robot>"),
+        ('" velocity', '"velocity'),
+        ("<limit lower='-1' ", "<limit lower='-1'"),
+    ],
+)
+def test_undeclared_prefixes_and_missing_blanks_do_no_harm(write, old, new):
+    text = arm(inner="""<limit lower='-1' upper="1" effort="9" velocity="2"/>""")
+    assert new in text.replace(old, new)
+    limits = load_urdf(write(text.replace(old, new))).limits
+    assert limits.velocity.tolist() == [2.0]
+    macro = text.replace("</robot>", "<xacro:arm/></robot>")
+    with pytest.raises(InputError, match="is a xacro file"):
+        load_urdf(write(macro))
 
 
 def test_defaults_of_name_and_axis(write):

@@ -95,7 +95,7 @@ def test_numbers_and_truth_values_of_the_experiment_file_are_texts(install, tmp_
         '[robot]\nurdf = "arm.urdf.xacro"\n'
         "xacro_arguments = { prefix = 6, kind = true }\n"
     )
-    with pytest.raises(InputError, match=r"joint `hinge` is true"):
+    with pytest.raises(InputError, match=r"joint `hinge` has the type `true`"):
         load_experiment(path)
     path.write_text(path.read_text().replace("kind = true", 'kind = "revolute"'))
     robot = load_experiment(path).setup.robot
