@@ -42,17 +42,23 @@ def braking_misfit(rows: np.ndarray, is_friction: np.ndarray, folds: int = 1) ->
     forces = rows[..., -1]
     force_sizes = np.sqrt(np.mean(forces**2, axis=0))
     theta = rows / np.where(force_sizes > 0, force_sizes, np.inf)[:, None]
-    lengths = np.sqrt(np.sum(theta**2, axis=(0, 1)))
+    if not np.isfinite(theta).all():
+        return np.inf
+    stretches = [
+        stretch.reshape(-1, theta.shape[2])
+        for stretch in np.array_split(theta, 4 * folds)
+    ]
+    # Products are scaled instead of the rows, which are many more numbers.
+    stretch_products = [matrix.T @ matrix for matrix in stretches]
+    lengths = np.sqrt(np.diag(np.sum(stretch_products, axis=0)))
     if not np.isfinite(lengths).all():
         return np.inf
-    column_lengths = lengths[:-1]
-    theta[..., :-1] /= np.where(column_lengths > 0, column_lengths, 1.0)
-    stretches = np.array_split(theta, 4 * folds)
-    products = []
-    for k in range(folds):
-        part = np.concatenate(stretches[k::folds])
-        matrix = part.reshape(-1, theta.shape[2])
-        products.append(matrix.T @ matrix)
+    divisors = np.where(lengths > 0, lengths, 1.0)
+    divisors[-1] = 1.0
+    scales = np.outer(divisors, divisors)
+    products = [
+        np.sum(stretch_products[k::folds], axis=0) / scales for k in range(folds)
+    ]
     total_products = np.sum(products, axis=0)
     square = 0.0
     for fold in products:
