@@ -18,7 +18,8 @@ from jaxid.experiment.template import write_template
 from jaxid.experiment_file import KEYS, check_names
 from jaxid.io import union_members
 from jaxid.measurement.columns import Columns, with_lerobot_calibration
-from jaxid.workflow.log_loading import read_log
+from jaxid.workflow import log_loading
+from jaxid.workflow.log_loading import load_log, load_logs, read_log
 
 VARIANCES = jid.estimators.ResidualVariances()
 ARM = """\
@@ -396,9 +397,55 @@ def test_logs_that_do_not_fit_the_file(load, tmp_path):
         read(load(ARM + short + "start = 5\n"), log)
     parts = load(ARM + short + "start = 0.2\n")
     assert read(parts, log).angles[[0, -1], 0].tolist() == [20, 99]
-    experiment = load(ARM + short + "[filter]\nkind = 'butterworth'\ncutoff = 60\n")
-    with pytest.raises(ValueError, match="cutoff"):
-        experiment.setup.observe(read(experiment, log))
+
+
+def test_bad_rows_outside_start_and_stop_of_long_logs(load, tmp_path, monkeypatch):
+    monkeypatch.setattr(log_loading, "LONG_LOG_ROWS", 300)
+    keys = RECORDING.replace('"q{}"', '["q1", "q2"]')
+    keys = keys.replace('"tau{}"', '["tau1", "tau2"]') + "start = 0.5\nstop = 3.5\n"
+    experiment = load(ARM + keys)
+    t = np.arange(400) / 100
+    rows = np.stack([t, np.sin(3 * t), np.cos(2 * t), np.cos(t), np.sin(t)], 1)
+    lines = [",".join(f"{x:.6f}" for x in row) for row in rows]
+    lines[3] = "driver not ready"
+    lines[20] = lines[20].replace(",", ",nan,", 1).rpartition(",")[0]
+    lines[399] = "3.99,1"
+    path = tmp_path / "run.csv"
+    path.write_text("t,q1,q2,tau1,tau2\n" + "\n".join(lines))
+    log = load_log(experiment.setup, path, experiment.columns)
+    assert "read as a whole" in log.observations.notes[-1]
+    assert log.diagnosis.log.samples == 300
+    np.testing.assert_allclose(log.diagnosis.log.angles, rows[50:350, 1:3], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("rate", "samples", "cures"),
+    [
+        (50, 400, ("lower it", "only logs faster than 60 Hz")),
+        (100, 12, ("record longer",)),
+        (100, 5, ("at least 10 are needed",)),
+    ],
+)
+def test_the_one_log_of_five_that_is_too_slow_or_too_short(
+    load, tmp_path, rate, samples, cures
+):
+    keys = RECORDING.replace('"q{}"', '["q1", "q2"]')
+    keys = keys.replace('"tau{}"', '["tau1", "tau2"]')
+    experiment = load(ARM + keys + "[filter]\nkind = 'butterworth'\ncutoff = 30\n")
+    paths = []
+    for k in range(5):
+        count, frequency = (samples, rate) if k == 3 else (400, 100)
+        t = np.arange(count) / frequency
+        rows = np.stack([t, np.sin(3 * t), np.cos(2 * t), np.cos(t), np.sin(t)], 1)
+        lines = [",".join(f"{x:.6f}" for x in row) for row in rows]
+        paths.append(tmp_path / f"run{k}.csv")
+        paths[k].write_text("t,q1,q2,tau1,tau2\n" + "\n".join(lines))
+    with pytest.raises(InputError) as caught:
+        load_logs(experiment.setup, paths, experiment.columns)
+    message = str(caught.value)
+    assert "`run3`" in message or "`run3.csv`" in message, message
+    assert not any(f"run{k}`" in message for k in (0, 1, 2, 4))
+    assert all(cure in message for cure in cures), message
 
 
 def test_the_file_states_scales_of_each_joint(tmp_path):

@@ -15,12 +15,12 @@ from jaxid.robot.robot import Robot
 
 from .columns import Channels, Columns, Log, open_log
 from .filters import AbstractDecimation, AbstractFilter
-from .log_files import Complaints, LogTable
+from .log_files import COMMENT, Complaints, LogTable
 from .observations import Observations, Progress, prepare
 from .recording import Recording, consecutive
 from .samples import AbstractSamples, joined, joint_side
 from .time_grid import NeedsMemory, Range, Ranges, TimeGrid, find_grid
-from .time_series import is_sparse, join_channels
+from .time_series import hold_notes, is_sparse, join_channels, without_filling
 from .time_stamps import MAX_LATE_ROWS
 
 PART_SIZE = 65536
@@ -29,6 +29,8 @@ MAX_BAD_ROWS = 1e-3
 """Fraction of the rows of a log that may be bad."""
 MAX_STRAY_STAMPS = 1e-2
 """Fraction of the rows that may have a wrong stamp; more are out of order only."""
+MAX_END_ROWS = 5
+"""Rows at the end that may be bad, such as a summary."""
 MAX_NAMED_ROWS = 20
 """Causes of bad rows that are named."""
 MAX_EQUAL_ROWS = 5
@@ -78,7 +80,23 @@ def read_recording(
     channels = {"angles": angles, "forces": forces}
     if velocities is not None:
         channels["velocities"] = velocities
-    if log.tables[0].is_merged or (complaints and is_sparse(channels)):
+    is_row = np.ones(len(angles), bool)
+    is_row[[row for row, text in complaints.items() if COMMENT in text]] = False
+    if not is_row.all():
+        rows_before = np.cumsum(is_row) - 1
+        complaints = {
+            int(rows_before[row]): text
+            for row, text in complaints.items()
+            if is_row[row]
+        }
+        channels = {name: values[is_row] for name, values in channels.items()}
+        stamps = None if stamps is None else stamps[is_row]
+    is_merged = log.tables[0].is_merged
+    if stamps is not None:
+        sparse_channels = without_filling(channels)
+        is_merged |= sparse_channels is not channels
+        channels = sparse_channels
+    if is_merged or (complaints and is_sparse(channels)):
         joined_channels = join_channels(stamps, channels, log.tables[0].source)
         stamps, channels, join_notes = joined_channels
         complaints = {}
@@ -119,7 +137,7 @@ def read_recording(
     )
     recording = dataclasses.replace(
         recording,
-        notes=(*notes, *recording.notes),
+        notes=(*notes, *hold_notes(channels, recording.sample_time), *recording.notes),
         angle_unit=columns.angle_symbol,
     )
     return recording.crop(start, stop) if is_part else recording
@@ -158,16 +176,24 @@ def _fill_outside(
 
 
 def _bad_row_note(complaints: Complaints, rows: int, max_share: float) -> str:
-    """Return a remark about the rows that are left out; refuse too many of them."""
+    """Return a remark about the rows that are left out; refuse too many of them.
+
+    Those at the end do not count, which a summary or a cut file has.
+    """
+    end = rows
+    while end - 1 in complaints and rows - end < MAX_END_ROWS:
+        end -= 1
     count = len(complaints)
+    inner_count = sum(row < end for row in complaints)
     texts = _complaints_by_cause(complaints)
     words = "; ".join(texts[:MAX_NAMED_ROWS])
     if len(texts) > MAX_NAMED_ROWS:
         words = f"{words}; and {len(texts) - MAX_NAMED_ROWS} more"
-    if count > max_share * rows:
+    if inner_count > max_share * rows:
         raise InputError(
             f"{count} of {rows} rows are bad: {words}; repair the log, or let "
-            f"`bad_rows` be above {count / rows:.2g} (fraction), which leaves them out."
+            f"`bad_rows` be above {inner_count / rows:.2g} (fraction), which leaves "
+            "them out."
         )
     verb = "is bad and was" if count == 1 else "are bad and were"
     return f"{count} of {rows} rows {verb} left out: {words}"

@@ -33,10 +33,10 @@ COMMENT_MARKS = "#% "
 MAX_LINES_BELOW_HEADER = 5
 """Lines between header and first row, such as one of units."""
 STAMP = (
-    r"^(?:\d{4}[-/]\d\d?[-/]\d\d?[T ]|\d+ days? )?"
-    r"\d\d?:\d\d:\d\d(?:[.,]\d+)? ?(?:Z|[+-]\d\d:?\d\d)?$"
+    r"^(?:(?:\d{4}[-/]\d\d?[-/]\d\d?[T ]|\d+ days? )?"
+    r"\d\d?:\d\d:\d\d(?:[.,]\d+)? ?(?:Z|[+-]\d\d:?\d\d)?|\d\d?:\d\d[.,]\d+)$"
 )
-"""Dates of ISO 8601, times since midnight, and durations of pandas."""
+"""Dates of ISO 8601, times since midnight or the hour, and durations of pandas."""
 EXPONENT = r"(?:[eE][+-]?\d+)?"
 NUMBER = rf"[+-]?(?:(?:\d+\.?\d*|\.\d+){EXPONENT}|(?i:nan|inf|infinity))"
 """Numbers with a decimal point."""
@@ -97,7 +97,7 @@ def detect_format(source: str, head: bytes, selections: Selections) -> TextForma
             f"`{source}` is no text, as its suffix says: give it the suffix of its "
             "format, or export it again."
         )
-    text = head.decode("utf-8-sig", errors="replace")
+    text = decoded(head)
     if not text.strip(COMMENT_MARKS + "\n"):
         raise InputError(
             f"`{source}` must start with a header or with numbers, but is empty."
@@ -126,6 +126,14 @@ def detect_format(source: str, head: bytes, selections: Selections) -> TextForma
         has_decimal_commas=have_decimal_commas(rows),
         first_line=first_row + 1,
     )
+
+
+def decoded(head: bytes) -> str:
+    """Return a text in UTF-8, or in the encoding of Western Windows, as of Excel."""
+    try:
+        return head.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return head.decode("cp1252", errors="replace")
 
 
 def find_header(lines: Sequence[str], names: Sequence[str]) -> Header | None:

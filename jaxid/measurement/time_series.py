@@ -17,6 +17,12 @@ MIN_CHANGES = 20
 """Rows at which other channels than before have values, in such a table."""
 SLOW_RATE = 0.8
 """Rate of a channel, in that of the angles, below which it is slow."""
+MAX_COMMON_SHARE = 0.3
+"""Fraction of a channel's changes that may come with those of another's clock."""
+MIN_HELD_ROWS = 1.5
+"""Rows for each change, in the mean, from which a channel holds its values."""
+MIN_EVEN_SHARE = 0.9
+"""Fraction of the changes that come evenly where a slower channel is repeated."""
 PASSED_BAND = 0.1
 """Frequency, in rates of a channel, up to which interpolation keeps amplitudes."""
 
@@ -39,6 +45,30 @@ def is_sparse(channels: NamedChannels) -> bool:
     changes = np.count_nonzero(np.diff(has_value, axis=0).any(axis=1))
     is_mixed = incomplete_share > MIN_SPARSE_SHARE and changes >= MIN_CHANGES
     return bool(incomplete_share == 1.0 or is_mixed)
+
+
+def without_filling(channels: NamedChannels) -> NamedChannels:
+    """Return channels with NaN where a merged table repeats the last value instead.
+
+    Only where each row has new angles or new forces, but hardly one has both.
+    """
+    changes = {
+        name: np.append(True, np.diff(values, axis=0).any(axis=1))
+        for name, values in channels.items()
+    }
+    rows = np.stack([changes["angles"], changes["forces"]])
+    smaller_count = rows.sum(axis=1).min()
+    is_filled = (
+        smaller_count >= MIN_CHANGES
+        and np.count_nonzero(rows.all(axis=0)) < MAX_COMMON_SHARE * smaller_count
+        and np.mean(rows.any(axis=0)) > MIN_EVEN_SHARE
+    )
+    if not is_filled:
+        return channels
+    return {
+        name: np.where(changes[name][:, None], values, np.nan)
+        for name, values in channels.items()
+    }
 
 
 def join_channels(
@@ -114,6 +144,36 @@ def _rate_notes(
         _rate_note(channel, joints, rate, main_rate)
         for rate, joints in joints_of_rate.items()
     ]
+
+
+def hold_notes(channels: NamedChannels, sample_time: float) -> list[str]:
+    """Return a remark about each channel that repeats its values at even distances.
+
+    Programs that merge a slow channel with fast ones repeat its last value.
+    """
+    notes = []
+    for channel, values in channels.items():
+        changes = np.flatnonzero(np.diff(values, axis=0).any(axis=1))
+        if channel == "angles" or len(changes) < MIN_CHANGES:
+            continue
+        lengths = np.diff(changes)
+        length = float(np.mean(lengths))
+        is_even = np.mean(np.abs(lengths - length) < 1.0) > MIN_EVEN_SHARE
+        if length > MIN_HELD_ROWS and is_even:
+            rate = 1.0 / (length * sample_time)
+            cure = "leave `velocities` out, or record them faster"
+            if channel == "forces":
+                delay = 0.5 * (length - 1.0) * sample_time
+                cure = (
+                    "unless the drive itself holds them, remove their delay by "
+                    f"`force_delay = {delay:.3g}`, and keep `filter.cutoff` below "
+                    f"{PASSED_BAND * rate:.3g} Hz"
+                )
+            notes.append(
+                f"`{channel}` change at {rate:.3g} Hz only, but the rows come at "
+                f"{1.0 / sample_time:.3g} Hz, so that each value is repeated: {cure}"
+            )
+    return notes
 
 
 def _rate(times: Vector) -> float:

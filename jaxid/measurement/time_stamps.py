@@ -21,6 +21,7 @@ class BurstLimits(NamedTuple):
     rows: int = 16  # largest mean number of rows of a burst
     bursts: int = 10  # smallest number of bursts
     deviation: float = 0.4  # largest deviation from even times, in burst periods
+    unevenness: float = 0.25  # largest error of steps of even bursts, in their periods
 
 
 BURSTS = BurstLimits()
@@ -102,6 +103,13 @@ def even_stamps(stamps: Vector, source: str) -> tuple[Vector, Texts]:
     period = length * sample_time
     text = f"rows were received in bursts of about {length:.3g}, every {period:.4g} s"
     if deviation > BURSTS.deviation * period:
+        burst_steps = np.diff(times) / np.median(np.diff(times))
+        if np.abs(burst_steps - np.round(burst_steps)).max() < BURSTS.unevenness:
+            raise InputError(
+                f"{text}, but some rows of `{source}` are lost, so that the stamps do "
+                "not tell when the others were measured: keep only the last row of "
+                "each burst, or record again."
+            )
         raise InputError(
             f"{text}, but not evenly, so that the stamps of `{source}` do not tell "
             "when they were measured: give `sample_time` instead of the stamps, here "

@@ -55,6 +55,20 @@ MIDNIGHT = [f"23:59:{59.8 + t:06.3f}" for t in TIMES[:10]] + [
     f"00:00:{t - 0.2:06.3f}" for t in TIMES[10:]
 ]
 
+LINES = table().splitlines(keepends=True)
+
+
+def with_lines(text, *places):
+    """Insert a line before some lines of the table."""
+    lines = [*LINES]
+    for place in sorted(places, reverse=True):
+        lines.insert(place, f"{text}\n")
+    return "".join(lines)
+
+
+AUTUMN = [f"2026-10-25T03:00:{59 + t:09.6f}+02:00" for t in TIMES[:10]] + [
+    f"2026-10-25T02:00:{59 + t:09.6f}+01:00" for t in TIMES[10:]
+]
 VARIANTS = {
     "comments": "# recorded 2026-01-05 by rig 3\n# firmware 5.2, 50 Hz\n" + table(),
     "comment with the names": "# q1, q2, tau1, tau2 over time of the arm\n" + table(),
@@ -102,6 +116,19 @@ VARIANTS = {
     "clock": stamped(CLOCK),
     "midnight": stamped(MIDNIGHT),
     "durations": stamped([f"0 days 00:00:{t:09.6f}" for t in TIMES]),
+    "change of the zone": stamped(AUTUMN),
+    "west of Greenwich": stamped([x.replace("+", "-") for x in AUTUMN[:10]] + [
+        x.replace("02:00:", "04:00:").replace("+01", "-01") for x in AUTUMN[10:]
+    ]),
+    "minutes and seconds of Excel": stamped([f"59:{59 + t:06.3f}" for t in TIMES]),
+    "the next hour": stamped([f"59:{59.8 + t:06.3f}" for t in TIMES[:10]] + [
+        f"00:{t - 0.2:06.3f}" for t in TIMES[10:]
+    ]),
+    "marks between the rows": with_lines("# mark", 5, 12, 13, 30),
+    "comments between the rows": with_lines("// next, please", 5, 12),
+    "events between the rows": with_lines("Event: operator waits", 3, 9),
+    "comments at the end": table() + "# end\n% of the log\n",
+    "title at the end": table() + "End of file\n",
     "ISO at midnight": stamped(
         [f"2026-01-{5 + (k > 9):02d}T{c}" for k, c in enumerate(MIDNIGHT)]
     ),
@@ -113,11 +140,45 @@ def test_tables_of_many_programs_give_the_same_samples(tmp_path, variant):
     path = tmp_path / "log.csv"
     path.write_bytes(VARIANTS[variant].encode())
     recording = read_recording(path, COLUMNS)
+    assert not any("row" in note for note in recording.notes if "first row" not in note)
     values = numbers()
     np.testing.assert_allclose(recording.angles, values[:, 1:3], rtol=1e-14)
     np.testing.assert_allclose(recording.forces, values[:, 3:], rtol=1e-14)
     assert recording.sample_time == pytest.approx(0.02, rel=1e-9)
     assert len(recording.segments) == 1
+
+
+def test_comments_between_rows_without_stamps_leave_no_gap(tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text(with_lines("# mark", 5, 12))
+    columns = Columns(angles="q{}", forces="tau{}", sample_time=0.02)
+    recording = read_recording(path, columns)
+    np.testing.assert_allclose(recording.time, TIMES, atol=1e-12)
+    np.testing.assert_array_equal(recording.angles, numbers()[:, 1:3])
+    assert recording.notes == ()
+
+
+@pytest.mark.parametrize("end", ["mean,0,0,0,0\nmax,1,1,2,2\n", "samples,30\n"])
+def test_a_summary_at_the_end_is_left_out_and_named(tmp_path, end):
+    path = tmp_path / "log.csv"
+    path.write_text(table() + end)
+    recording = read_recording(path, COLUMNS)
+    np.testing.assert_array_equal(recording.angles, numbers()[:, 1:3])
+    assert "line 32" in recording.notes[0]
+    path.write_text(table() + "nan,nan,nan,nan,nan\n" * 6)
+    with pytest.raises(ValueError, match="of 36 rows are bad"):
+        read_recording(path, COLUMNS)
+
+
+def test_western_encodings_of_windows(tmp_path):
+    path = tmp_path / "log.csv"
+    names = ["Zeit [s]", "q1 [°]", "q2 [°]", "tau1 [µNm]", "tau2 [µNm]"]
+    path.write_bytes(table(names=names).encode("cp1252"))
+    columns = Columns("q{} [°]", "tau{} [µNm]", time="Zeit [s]")
+    recording = read_recording(path, columns)
+    np.testing.assert_array_equal(recording.angles, numbers()[:, 1:3])
+    with pytest.raises(ValueError, match=r"closest first: `q1 \[°\]`"):
+        read_recording(path, Columns("q{} [deg]", "tau{}", time="Zeit [s]"))
 
 
 def test_days_of_matlab(tmp_path):

@@ -127,3 +127,46 @@ def test_a_channel_that_the_driver_does_not_report_is_one_line(
     message = str(caught.value)
     assert message.startswith("all values of `x1`, `x2` of `log.csv` are empty or NaN")
     assert ("leave `velocities` out" in message) == (channel == "velocities")
+
+
+@pytest.mark.parametrize("suffix", ["csv", "parquet"])
+@pytest.mark.parametrize("rate", [10.0, 20.0, 50.0])
+def test_slow_channels_that_were_repeated_are_said_with_both_rates(
+    tmp_path, suffix, rate
+):
+    table = merged(times(100.0), times(rate)).select(pl.all().forward_fill())
+    path = tmp_path / f"log.{suffix}"
+    write = table.write_csv if suffix == "csv" else table.write_parquet
+    write(path)
+    (note,) = [x for x in read_recording(path, COLUMNS).notes if "repeated" in x]
+    held_rows = table.height / DURATION / rate
+    assert note.startswith(f"`forces` change at {rate:g} Hz only, but the rows come at")
+    delay = float(note.partition("`force_delay = ")[2].partition("`")[0])
+    assert delay == pytest.approx(0.005 * (held_rows - 1), rel=0.05)
+    columns = Columns(("q1", "q2"), ("x1", "x2"), ("e1", "e2"), time="t")
+    table = table.with_columns(x1=2 * pl.col("q1"), x2=3 * pl.col("q2"))
+    table.write_parquet(tmp_path / "log.parquet")
+    (note,) = read_recording(tmp_path / "log.parquet", columns).notes
+    assert "`velocities` change at" in note
+    assert "leave `velocities` out" in note
+
+
+@pytest.mark.parametrize("rate", [25.0, 90.0, 400.0])
+def test_merged_tables_whose_empty_cells_were_filled(tmp_path, rate):
+    sparse_table = merged(times(100.0), times(rate, 0.0031))
+    sparse_table.write_parquet(tmp_path / "sparse.parquet")
+    table = sparse_table.select(pl.all().forward_fill())
+    table.write_parquet(tmp_path / "filled.parquet")
+    expected = read_recording(tmp_path / "sparse.parquet", COLUMNS)
+    r = read_recording(tmp_path / "filled.parquet", COLUMNS)
+    np.testing.assert_allclose(r.angles, expected.angles, atol=1e-9)
+    np.testing.assert_allclose(r.forces, expected.forces, atol=1e-9)
+    assert r.notes == expected.notes
+
+
+@pytest.mark.parametrize("step", [0.02, 0.1, 0.5])
+def test_coarse_forces_are_not_called_repeated(tmp_path, step):
+    table = merged(times(100.0), times(100.0))
+    coarse = [(pl.col(name) / step).round() * step for name in ("e1", "e2")]
+    table.with_columns(coarse).write_parquet(tmp_path / "log.parquet")
+    assert read_recording(tmp_path / "log.parquet", COLUMNS).notes == ()

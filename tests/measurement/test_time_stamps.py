@@ -100,6 +100,20 @@ def test_uneven_bursts_ask_for_the_sample_time():
         recording(np.arange(600), stamps)
 
 
+@pytest.mark.parametrize("lost_rows", [[5, 90, 301, 302, 440], range(200, 208)])
+def test_bursts_that_lack_rows_are_refused_without_a_sample_time(lost_rows):
+    stamps = np.delete(bursts(np.full(150, 4)), lost_rows)
+    numbers = np.delete(np.arange(600), lost_rows)
+    if len(lost_rows) == 5:
+        stamps = np.delete(stamps, np.arange(100, 130, 4))
+        numbers = np.delete(numbers, np.arange(100, 130, 4))
+    with pytest.raises(InputError, match=r"rows .* are lost.*last row of each burst"):
+        recording(numbers, stamps)
+    is_last = np.append(np.diff(stamps) > 1e-3, True)
+    r = recording(numbers[is_last], stamps[is_last])
+    assert r.sample_time == pytest.approx(4 * STEP)
+
+
 @pytest.mark.parametrize("rows", [20, 30])
 def test_short_episodes_are_no_bursts(rows):
     episodes = 600 // rows

@@ -2,7 +2,11 @@
 
 from ..log_columns import Selection as Selection, Selections as Selections
 from .log_file import AbstractLogFile as AbstractLogFile
-from .log_table import Complaints as Complaints, LogTable as LogTable
+from .log_table import (
+    COMMENT as COMMENT,
+    Complaints as Complaints,
+    LogTable as LogTable,
+)
 from .readers import (
     READERS as READERS,
     estimated_rows as estimated_rows,

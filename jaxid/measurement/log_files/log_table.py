@@ -20,6 +20,8 @@ from ..time_series import MIN_SPARSE_SHARE
 
 Complaints = dict[int, str]
 """Complaints about rows, by their numbers."""
+COMMENT = "a comment"
+"""Complaint about a line that is no row, and no bad one either."""
 BadRows = Complaints | None
 """Complaints about unreadable rows, by row number; None if each is an error."""
 NUMBER_SIZE = 8
@@ -207,7 +209,7 @@ class LogTable:
             number = rows[0] + self.first_row
             words = complaint.format(column[rows[0]])
             further_rows = f" (and {len(rows) - 1} more)" if len(rows) > 1 else ""
-            raise InputError(
+            raise NeedsMemory(
                 f"column `{name}` of `{self.source}`, {self.unit} {number}, "
                 f"{words}{further_rows}: repair the log or remove those rows."
             )

@@ -17,18 +17,31 @@ import polars as pl
 from jaxid.arrays import Vector
 from jaxid.errors import InputError
 
-from ..text_format import STAMP, TextColumns, TextFormat, with_line_feeds
+from ..text_format import (
+    STAMP,
+    TextColumns,
+    TextFormat,
+    is_number,
+    split_line,
+    with_line_feeds,
+)
+from ..time_grid import NeedsMemory
 from .log_file import AbstractLogFile
-from .log_table import BadRows, Complaints, LogTable, readable
+from .log_table import COMMENT, BadRows, Complaints, LogTable, readable
 
 BLOCK_SIZE = 2**26
 """Bytes that are read at once."""
 MAX_EXACT_INTEGER = 2**53
 """Largest size of integers that float64 holds without rounding."""
-DAY = 24 * 3600 * 10**9
+HOUR = 3600 * 10**9
+"""Length of an hour [ns]."""
+DAY = 24 * HOUR
 """Length of a day [ns]."""
+ZONE = r" ?(Z|[+-]\d\d:?\d\d)$"
+"""Distance from the time of Greenwich, which may change within a log."""
 STAMP_PARTS = {
-    r" ?(Z|[+-]\d\d:?\d\d)$": "",
+    ZONE: "",
+    r"^(\d+:\d+[.,]\d+)$": "00:${1}",
     "T": " ",
     "/": "-",
     ",": ".",
@@ -109,7 +122,7 @@ class TextFile(TextColumns, AbstractLogFile):
             for k, complaint in complaints.items():
                 number = first_line + k
                 if bad_rows is None:
-                    raise InputError(
+                    raise NeedsMemory(
                         f"line {number} of `{self.path.name}` is no row ({complaint}): "
                         "repair or remove that line."
                     )
@@ -160,7 +173,11 @@ def bad_lines(form: TextFormat, block: bytes) -> Complaints:
         if lines[k].count(b'"') % 2:
             complaints[k] = "an open quotation"
         elif cells < form.columns or filled_cells > len(form.names):
-            complaints[k] = f"{cells} cells, but {form.columns} columns"
+            line_cells = split_line(text.decode(errors="replace"), form.separator)
+            # An empty line may stand for a row, but not one of words.
+            is_comment = any(line_cells) and not any(map(is_number, line_cells))
+            complaint = f"{cells} cells, but {form.columns} columns"
+            complaints[k] = COMMENT if is_comment else complaint
     return complaints
 
 
@@ -226,6 +243,8 @@ def without_gaps(ticks: pl.Series) -> pl.Series:
 def calendar_stamps(part: LogTable, name: str) -> pl.Series:
     """Return dates, times since midnight or durations, as dates."""
     texts = part.columns[name].str.strip_chars()
+    # Minutes of zones do not change.
+    zone_hours = texts.str.extract(r":\d\d.*([+-]\d\d):?\d\d$").cast(pl.Int64)
     for pattern, text in STAMP_PARTS.items():
         texts = texts.str.replace_all(pattern, text)
     dates = texts.str.to_datetime("%Y-%m-%d %T%.f", time_unit="ns", strict=False)
@@ -233,9 +252,10 @@ def calendar_stamps(part: LogTable, name: str) -> pl.Series:
     is_bad = dates.is_null().to_numpy()
     part.refuse_first(name, is_bad, part.columns[name], complaint)
 
-    ticks = without_gaps(dates.cast(pl.Int64))
+    ticks = without_gaps(dates.cast(pl.Int64) - HOUR * zone_hours.fill_null(0))
     if (ticks < DAY).all():
-        # A clock without a date begins again at midnight.
-        midnights = (ticks.diff() < -DAY // 2).cast(pl.Int64).cum_sum()
-        ticks += DAY * midnights.fill_null(0)
+        # A clock without a date begins again at midnight, one without hours earlier.
+        period = HOUR if (ticks < HOUR).all() else DAY
+        starts = (ticks.diff() < -period // 2).cast(pl.Int64).cum_sum()
+        ticks += period * starts.fill_null(0)
     return ticks.cast(dates.dtype)
