@@ -182,9 +182,11 @@ def read_experiment_text(path: Path) -> str:
         )
     try:
         return path.read_bytes().decode("utf-8-sig")
-    except ValueError as error:
+    except UnicodeDecodeError as error:
+        line = 1 + error.object.count(b"\n", 0, error.start)
         raise InputError(
-            f"{path.name}: the file is no TOML in UTF-8: {error}."
+            f"{path.name}: the file is no TOML in UTF-8: line {line} holds bytes that "
+            "are no text."
         ) from error
 
 

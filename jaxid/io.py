@@ -134,8 +134,14 @@ def read_json(path: FilePath) -> Any:
     """Read a JSON file."""
     try:
         return json.loads(Path(path).read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as error:
-        raise InputError(str(error)) from error
+    except UnicodeDecodeError as error:
+        raise InputError("it is no text in UTF-8") from error
+    except json.JSONDecodeError as error:
+        raise InputError(f"{error.msg} in line {error.lineno}") from error
+    except ValueError as error:
+        raise InputError("it holds a number with thousands of digits") from error
+    except RecursionError as error:
+        raise InputError("its brackets are nested too deeply") from error
 
 
 def json_text(content: dict[str, Any]) -> str:

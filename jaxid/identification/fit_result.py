@@ -420,9 +420,14 @@ def checksum_of(content: Any) -> str:
 
 def _check(fit: Fit) -> None:
     """Reject arrays of a file that do not belong to its robot."""
-    n = fit.base.size
-    joints = fit.base.model.robot.joints
+    base = fit.base
+    n = base.size
+    joints = base.model.robot.joints
+    parameters = sorted((*base.indices, *base.dependent))
+    if parameters != [*range(base.model.size)]:
+        raise InputError("`indices` and `dependent` must hold each parameter once")
     arrays = {
+        "kappa": (base.kappa, (n, len(base.dependent))),
         "parameters": (fit.parameters, (n,)),
         "covariance": (fit.covariance, (n, n)),
         "weights": (fit.weights, (joints,)),
@@ -436,7 +441,6 @@ def _check(fit: Fit) -> None:
         raise InputError("`parameters` must hold finite numbers")
     if not re.fullmatch(r"(\d{4}-\d{2}-\d{2})?", fit.date, re.ASCII):
         raise InputError(f"`date` must be like 2026-01-31, but is {fit.date!r:.40}")
-    base = fit.base
     texts = [fit.name, *fit.recordings, *fit.notes, *base.names, *base.units]
     for text in texts:
         if not text.isprintable():

@@ -31,7 +31,7 @@ MAX_STRAY_STAMPS = 1e-2
 """Fraction of the rows that may have a wrong stamp; more are out of order only."""
 MAX_END_ROWS = 5
 """Rows at the end that may be bad, such as a summary."""
-MAX_NAMED_ROWS = 20
+MAX_NAMED_ROWS = 6
 """Causes of bad rows that are named."""
 MAX_EQUAL_ROWS = 5
 """Rows that are named for one cause."""
@@ -221,7 +221,9 @@ def _stray_stamps(
 
     Rows that came late only, and a clock that was set back, are no such complaints.
     """
-    good_rows = np.setdiff1d(np.arange(len(stamps)), [*complaints])
+    is_good = np.ones(len(stamps), bool)
+    is_good[[*complaints]] = False
+    good_rows = np.flatnonzero(is_good)
     order = np.argsort(stamps[good_rows], kind="stable")
     shifts = np.abs(order - np.arange(len(order)))
     stray_rows = good_rows[order[shifts > MAX_LATE_ROWS]].tolist()

@@ -1,6 +1,7 @@
 """Boxes, cylinders, spheres, capsules and meshes of URDF and MJCF files."""
 
 import itertools
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,6 +17,8 @@ from .urdf_tree import UrdfTree
 
 CORNERS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
 """Corners of a box with edges of length 2."""
+MESH_ERROR_PARTS = re.compile(r"^\w+Error: | \(<string>.*\)")
+"""Parts of errors of mesh readers that say nothing to a user."""
 
 
 class Shape(NamedTuple):
@@ -112,9 +115,13 @@ def _mesh_vertices(
         )
     try:
         mesh: Any = trimesh.load(str(file), force="mesh", process=False)
-        return np.asarray(mesh.vertices, np.float64)
+        vertices = np.asarray(mesh.vertices, np.float64)
     except Exception as error:  # readers of many formats raise many exceptions
-        raise InputError(f"`{file}` is no mesh that can be read: {error}.") from error
+        reason = MESH_ERROR_PARTS.sub("", " ".join(str(error).split())).rstrip(".")
+        raise InputError(f"`{file}` is no mesh that can be read: {reason}.") from error
+    if len(vertices) == 0:
+        raise InputError(f"`{file}` is no mesh that can be read: it has no vertices.")
+    return vertices
 
 
 def _mesh_files(

@@ -111,7 +111,8 @@ def mjcf_as_urdf(path: str | Path) -> Description:
     try:
         model = mujoco.MjModel.from_xml_path(str(path))
     except ValueError as error:
-        reason = " ".join(str(error).split()).rstrip(".")
+        lines = [" ".join(line.split()) for line in str(error).splitlines()]
+        reason = "; ".join(line.rstrip(".") for line in lines if line)
         raise InputError(
             f"`{path}`: MuJoCo cannot compile this file: {reason}."
         ) from error

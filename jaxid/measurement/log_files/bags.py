@@ -5,6 +5,7 @@ import dataclasses
 import functools
 import itertools
 import re
+import struct
 from array import array
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -17,7 +18,7 @@ from jaxid.io import import_extra
 
 from ..log_columns import Selections
 from .log_file import AbstractLogFile
-from .log_table import LogTable, readable
+from .log_table import LogTable, readable, refuse_inflation
 
 STAMP = ".header.stamp"
 """Field of a topic with the times of measurement."""
@@ -27,6 +28,16 @@ CLOCK = "time"
 """Column of the times that is taken if none is named."""
 MAX_ELEMENTS = 1000
 """Elements of the largest array that is no picture or point cloud."""
+MCAP_MAGIC = b"\x89MCAP0\r\n"
+"""First bytes of an MCAP file."""
+MCAP_TAG = struct.Struct("<BQ")
+"""Code and size of a record of such a file."""
+MCAP_CHUNK = 6
+"""Code of records that hold compressed messages."""
+ROS1_MAGIC = b"#ROSBAG V2.0\n"
+"""First bytes of a bag of ROS 1."""
+ROS1_CHUNK = re.compile(rb"\x09\x00\x00\x00size=(.{4})", re.DOTALL)
+"""Field of a header with the size of compressed messages."""
 
 Elements = tuple[str, ...]
 """Endings of the names of a field's numbers, such as `[0]` or `.shoulder`."""
@@ -130,11 +141,42 @@ class Topic(NamedTuple):
         return TimeSeries(np.asarray(times)[rows], values)
 
 
+def refuse_huge_chunks(path: Path) -> None:
+    """Refuse a bag whose compressed messages do not suit the size of their file."""
+    for file_path in path.glob("*") if path.is_dir() else [path]:
+        size = max(chunk_sizes(file_path), default=0)
+        refuse_inflation(file_path, {"a chunk of messages": size})
+
+
+def chunk_sizes(path: Path) -> Iterator[int]:
+    """Yield the sizes of the chunks of a bag, decompressed [bytes]."""
+    end = path.stat().st_size
+    with path.open("rb") as file:
+        magic = file.read(len(ROS1_MAGIC))
+        if magic.startswith(MCAP_MAGIC):
+            file.seek(len(MCAP_MAGIC))
+            while len(tag := file.read(MCAP_TAG.size)) == MCAP_TAG.size:
+                code, size = MCAP_TAG.unpack(tag)
+                next_record = min(file.tell() + size, end)
+                if code == MCAP_CHUNK:
+                    _, _, chunk_size = struct.unpack("<QQQ", file.read(24).ljust(24))
+                    yield chunk_size
+                file.seek(next_record)
+        while magic == ROS1_MAGIC and (tag := file.read(4)):
+            header = file.read(int.from_bytes(tag, "little"))
+            if chunk := ROS1_CHUNK.search(header):
+                yield int.from_bytes(chunk[1], "little")
+            size = int.from_bytes(file.read(4), "little")
+            file.seek(size, 1)
+
+
 def read_bag(path: Path, needed_topics: Collection[str]) -> list[Topic]:
     """Read the messages of selected topics, and one message of each other topic."""
     purpose = f"`{path.name}` is read by"
     typesys = import_extra("rosbags.typesys", "logs", purpose)
     highlevel = import_extra("rosbags.highlevel", "logs", purpose)
+    with readable(path.name, "bag"):
+        refuse_huge_chunks(path)
     types = typesys.get_typestore(typesys.Stores.LATEST)
     topics = []
     with (

@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import functools
 import itertools
+import re
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -41,8 +42,11 @@ def readable(source: str, kind: str) -> Iterator[None]:
         raise
     except (Exception, pl.exceptions.PanicException) as error:
         # Of many kinds: it depends on which bytes are damaged.
-        text = " ".join(str(error).split())[:200].rstrip(".")
-        reason = text or type(error).__name__
+        # Some add a dump of the data in braces, or a mark below a line.
+        text, *_ = re.split(r"[{^]", " ".join(str(error).split()))
+        reason = text[:200].rstrip(" .:;,(") or type(error).__name__
+        if isinstance(error, MemoryError):
+            reason = "it declares more data than the memory can hold"
         raise InputError(
             f"`{source}` is no {kind}, or is damaged: {reason}."
         ) from error
@@ -169,7 +173,7 @@ class LogTable:
             )
         array = np.array(array.reshape(len(array), -1), np.float64)
         size = np.abs(array).max(axis=1)
-        complaint = "is not finite, or larger than any sensor tells ({} in size)"
+        complaint = "is not finite, or larger than any sensor tells ({:.2g} in size)"
         self.refuse_first(name, ~(size <= MAX_NUMBER), size, complaint)
         return array
 
@@ -187,7 +191,8 @@ class LogTable:
         self.refuse_first(name, is_empty, column, "is empty")
         is_text = numbers.is_null().to_numpy()
         self.refuse_first(name, is_text, column, "is `{}`, no number")
-        return numbers.to_numpy()
+        # Damaged bytes may be a NaN with which NumPy warns.
+        return numbers.fill_nan(np.nan).to_numpy()
 
     def refuse_first(
         self, name: str, is_bad: np.ndarray, column: Any, complaint: str
@@ -195,11 +200,12 @@ class LogTable:
         """Refuse the first bad row of a column, or collect complaints about all."""
         rows = np.flatnonzero(is_bad).tolist()
         if self.bad_rows is not None:
-            for k in rows:
-                number = k + self.first_row
-                words = complaint.format(column[k])
+            numbers = {k + self.first_row for k in rows}
+            # A damaged file may hold a million of them.
+            for number in numbers - self.bad_rows.keys():
+                words = complaint.format(column[number - self.first_row])
                 text = f"{self.unit} {number} (`{name}` {words})"
-                self.bad_rows.setdefault(number, text)
+                self.bad_rows[number] = text
         elif len(rows) > MIN_SPARSE_SHARE * len(is_bad):
             raise NeedsMemory(
                 f"many cells of `{name}` of `{self.source}` hold no number, as in "

@@ -5,6 +5,7 @@ import itertools
 
 import polars as pl
 
+from .array_files import MAX_COLUMNS
 from .log_file import AbstractLogFile
 from .log_table import NUMBER_SIZE, LogTable, readable, refuse_inflation
 
@@ -65,7 +66,8 @@ def with_elements(frame: pl.LazyFrame) -> pl.LazyFrame:
         elements = pl.col(name).cast(pl.List(kind.inner)).list
         values = first_row[name].to_list()
         length = len(values[0] or ()) if values else 0
-        for k in range(length):
+        # A longer list is a picture or a sound, whose elements are no columns.
+        for k in range(length if length <= MAX_COLUMNS else 0):
             element = elements.get(k, null_on_oob=True)
             columns.append(element.alias(f"{name}[{k}]"))
     return frame.with_columns(columns).drop(list(lists))
