@@ -3,7 +3,7 @@
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -16,7 +16,9 @@ from jaxid.measurement.recording import Recording
 SETTLING_TIME = 0.5
 """Time at the start of a log that does not count: the initial speed is unknown [s]."""
 STATE_TIME = 0.1
-"""Time around an instant whose positions give its state [s]."""
+"""Longest time around an instant whose positions give its state [s]."""
+MIN_NEIGHBOURS = 4
+"""Least number of samples on each side of an instant that give its state."""
 MIN_DEVIATION = 1e-3
 """Least deviation of positions around an instant, because encoders round [rad or m]."""
 MAX_DELAY = 0.3
@@ -238,33 +240,109 @@ class ServoMotion(eqx.Module):
         return jax.tree.map(lambda x: x[motion, ...], self)
 
 
-def state_at(q: Matrix, index: int, dt: float) -> tuple[Matrix, Matrix, np.ndarray]:
-    """Return positions and velocities at a sample, their deviations, and accelerations.
+class LocalState(NamedTuple):
+    """State of all joints at a sample, from the samples around it.
 
-    They are those of a parabola through the samples around it. At the start the
+    Attributes:
+        state: Positions and velocities [2, joints].
+        spread: Their standard deviations.
+        acceleration: Accelerations [joints].
+    """
+
+    state: Matrix
+    spread: Matrix
+    acceleration: np.ndarray
+
+
+def state_at(q: Matrix, index: int, dt: float) -> LocalState:
+    """Return the state at a sample: that of a polynomial through the samples around it.
+
+    Each joint has the stretch of time and the degree that make its velocity most
+    certain: on fast motions a long parabola would cut the peaks. At the start the
     velocity is that of a line, and the position the measured one.
     """
     neighbour_count = max(2, round(STATE_TIME / dt))
-    start_index = max(0, index - neighbour_count)
+    if index < neighbour_count:
+        return _initial_state(q, index, dt, neighbour_count)
+
+    polynomials = [_polynomial(q, index, dt, neighbour_count, 2)]
+    while neighbour_count > MIN_NEIGHBOURS:
+        neighbour_count = max(MIN_NEIGHBOURS, round(0.7 * neighbour_count))
+        for degree in (2, 4):
+            polynomials.append(_polynomial(q, index, dt, neighbour_count, degree))
+    # The shortest stretch deviates by noise alone.
+    noise = np.maximum(polynomials[-1].error, 0.1 * MIN_DEVIATION)
+    rates = np.array([x.rate_deviation(noise) for x in polynomials])
+    best = np.argmin(rates, axis=0)
+
+    joints = np.arange(len(q))
+    taylor = np.array([x.coefficients[:2] for x in polynomials])[best, :, joints].T
+    error = np.array([x.error for x in polynomials])[best, joints]
+    spread = np.stack([np.maximum(error, MIN_DEVIATION), rates[best, joints]])
+    # Accelerations of short stretches are mostly noise.
+    return LocalState(taylor, spread, 2.0 * polynomials[0].coefficients[2])
+
+
+class _Polynomial(NamedTuple):
+    """Polynomials of all joints through the samples around an instant.
+
+    Attributes:
+        coefficients: Coefficients of powers of time [powers, joints].
+        error: Standard deviation of the samples around them [joints].
+        rate_noise: Standard deviation of the velocity for samples of deviation 1 [1/s].
+        bend: Bend of the velocity for samples that lie 1 beside the polynomial [1/s].
+    """
+
+    coefficients: np.ndarray
+    error: np.ndarray
+    rate_noise: float
+    bend: float
+
+    def rate_deviation(self, noise: np.ndarray) -> np.ndarray:
+        """Return standard deviations of the velocities [rad/s or m/s].
+
+        What samples deviate beyond their noise is no polynomial: it bends the velocity.
+        """
+        lack_of_fit = np.sqrt(np.maximum(self.error**2 - noise**2, 0.0))
+        return np.hypot(self.rate_noise * noise, self.bend * lack_of_fit)
+
+
+def _polynomial(
+    q: Matrix, index: int, dt: float, neighbour_count: int, degree: int
+) -> _Polynomial:
+    """Return the polynomials through some samples on both sides of one."""
     stop_index = min(q.shape[1], index + neighbour_count + 1)
-    t = dt * (np.arange(start_index, stop_index) - index)
-    positions = q[:, start_index:stop_index].T
-    has_neighbours = index >= neighbour_count
-    A = np.vander(t, 3 if has_neighbours else 2, increasing=True)
-    coefficients, *_ = np.linalg.lstsq(A, positions, rcond=None)
-    degrees_of_freedom = max(len(t) - A.shape[1], 1)
-    residuals = positions - A @ coefficients
+    times = dt * (np.arange(index - neighbour_count, stop_index) - index)
+    positions = q[:, index - neighbour_count : stop_index].T
+    half_width = neighbour_count * dt
+    powers = np.vander(times / half_width, degree + 1, increasing=True)
+    inverse = np.linalg.pinv(powers)
+    scaled_coefficients = inverse @ positions
+    residuals = positions - powers @ scaled_coefficients
+    degrees_of_freedom = max(len(times) - degree - 1, 1)
     error = np.sqrt(np.sum(residuals**2, axis=0) / degrees_of_freedom)
-    duration = np.sqrt(np.sum((t - t.mean()) ** 2))
-    rate = np.maximum(error, 0.1 * MIN_DEVIATION) / duration
-    position = q[:, index]
-    acceleration = np.zeros_like(rate)
-    if has_neighbours:
-        position = coefficients[0]
-        acceleration = 2.0 * coefficients[2]
-    state = np.stack([position, coefficients[1]])
+    scales = half_width ** -np.arange(degree + 1.0)
+    rate_noise = float(np.linalg.norm(inverse[1])) / half_width
+    coefficients = scales[:, None] * scaled_coefficients
+    return _Polynomial(coefficients, error, rate_noise, degree / half_width)
+
+
+def _initial_state(
+    q: Matrix, index: int, dt: float, neighbour_count: int
+) -> LocalState:
+    """Return the state near the start of a log, where samples lie on one side only."""
+    stop_index = min(q.shape[1], index + neighbour_count + 1)
+    times = dt * (np.arange(stop_index) - index)
+    positions = q[:, :stop_index].T
+    powers = np.vander(times, 2, increasing=True)
+    coefficients, *_ = np.linalg.lstsq(powers, positions, rcond=None)
+    residuals = positions - powers @ coefficients
+    error = np.sqrt(np.sum(residuals**2, axis=0) / max(len(times) - 2, 1))
+    length = np.sqrt(np.sum((times - times.mean()) ** 2))
+    rate = np.maximum(error, 0.1 * MIN_DEVIATION) / length
+    state = np.stack([q[:, index], coefficients[1]])
     spread = np.stack([np.maximum(error, MIN_DEVIATION), rate])
-    return state, spread, acceleration
+    return LocalState(state, spread, np.zeros_like(rate))
 
 
 def smooth_rates(

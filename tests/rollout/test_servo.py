@@ -21,7 +21,7 @@ from jaxid.rollout.determined_combinations import _Rows
 from jaxid.rollout.dry_friction import Slip
 from jaxid.rollout.identify import mask
 from jaxid.rollout.least_squares import bounded_step, minimise
-from jaxid.rollout.motion import ServoMotion
+from jaxid.rollout.motion import ServoMotion, state_at
 from jaxid.rollout.servo import (
     INDEX,
     LOWER,
@@ -454,3 +454,19 @@ def test_logs_that_cannot_be_used_are_rejected():
     moving = servo_arm.log(0, duration=10.0)
     with pytest.raises(jid.InputError, match="`logs`"):
         jid.identify_rollout(moving, joint_names=["one"])
+
+
+@pytest.mark.parametrize("hertz", [0.5, 8.0])
+def test_a_state_is_that_of_the_motion_slow_or_fast(hertz):
+    """A parabola over a fifth of a second would cut the peaks of fast motions."""
+    dt = 0.01
+    time = dt * np.arange(200)
+    pulsation = 2 * np.pi * hertz
+    position = 0.2 * np.sin(pulsation * time)
+    step = 3.8e-4
+    measured = step * np.round(position / step)
+    for index in (40, 77, 123):
+        state = state_at(measured[None], index, dt).state[:, 0]
+        velocity = 0.2 * pulsation * np.cos(pulsation * time[index])
+        assert abs(state[0] - position[index]) < 1.5 * step
+        assert abs(state[1] - velocity) < 0.03 * 0.2 * pulsation
