@@ -6,9 +6,11 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
+from rich.console import Console
 
 import jaxid as jid
 from jaxid.errors import InputError
+from jaxid.result_table import Remark, Status
 
 from . import options, terminal
 
@@ -73,8 +75,10 @@ def export(
         case "urdf":
             source = urdf or source_urdf(fit)
             jid.export_urdf(fit, source, path, tip=tip, base=base)
+            show_omissions(console, path, fit, holds_rotors=False)
         case "mjcf":
             jid.export_mjcf(fit, path)
+            show_omissions(console, path, fit, holds_rotors=True)
         case "pinocchio":
             jid.export.export_pinocchio(fit, path)
         case "jax":
@@ -82,6 +86,24 @@ def export(
         case "json":
             fit.save(path)
     terminal.show_files(console, path.parent, files)
+
+
+def show_omissions(
+    console: Console, path: Path, fit: "jid.Fit", holds_rotors: bool
+) -> None:
+    """Print which effects of a model a file of a simulator cannot hold."""
+    from jaxid.export.bodies_and_joint_dynamics import joint_dynamics
+
+    dynamics = joint_dynamics(fit)
+    names = (
+        dynamics.omissions if holds_rotors else (*dynamics.rotors, *dynamics.omissions)
+    )
+    if names:
+        text = (
+            f"`{path}` cannot hold {', '.join(names)}: a simulation with it lacks "
+            "these effects, which `--to c` and `--to json` keep."
+        )
+        terminal.show_remarks(console, [Remark(text, Status.DOUBTFUL)])
 
 
 def require_no_files(files: Sequence[Path], to: str, force: bool) -> None:

@@ -8,6 +8,8 @@ from pathlib import Path
 
 from jaxid.errors import InputError
 
+from .limits_and_drives import listed
+
 MAX_SECONDS = 60.0
 """Time after which the program is stopped [s]."""
 ARGUMENT = re.compile(rb"<[\w.-]+:arg\s[^>]*?\bname\s*=\s*[\"']([^\"']*)[\"']")
@@ -35,16 +37,16 @@ def expand_xacro(path: Path, arguments: Mapping[str, str]) -> bytes:
         )
     process = _run([program, *words], path, command)
     if process.returncode:
-        lines = process.stderr.decode(errors="replace").strip().splitlines()
-        reason = lines[0] if lines else "no reason given"
+        message = process.stderr.decode(errors="replace").strip()
+        reason, *_ = message.splitlines() or ["no reason given"]
         raise InputError(
             f"`{path}`: {command} fails: {reason}: give a file that it has expanded, "
             "or the arguments that it needs (`xacro_arguments` in `[robot]`, "
             "`jaxid init --xacro NAME:=VALUE`)."
         )
     if arguments:
-        names = _declared_names(path, [program, *words], command)
-        _refuse_unknown(path, arguments, names)
+        listing = _run([program, *words, "--deps"], path, command).stdout
+        _refuse_unknown(path, arguments, listing.decode(errors="replace").split())
     return process.stdout
 
 
@@ -61,21 +63,15 @@ def _run(words: list[str], path: Path, command: str):
         ) from error
 
 
-def _declared_names(path: Path, words: list[str], command: str) -> list[str]:
-    """Return the names of the arguments that a file and what it includes declare."""
-    listing = _run([*words, "--deps"], path, command).stdout
-    files = [path, *map(Path, listing.decode(errors="replace").split())]
-    names = []
-    for file in filter(Path.is_file, files):
-        names += [name.decode() for name in ARGUMENT.findall(file.read_bytes())]
-    return list(dict.fromkeys(names))
-
-
-def _refuse_unknown(path: Path, arguments: Mapping[str, str], names: list[str]):
+def _refuse_unknown(
+    path: Path, arguments: Mapping[str, str], included_files: list[str]
+):
     """Reject an argument that no file declares, which the program would ignore."""
-    for name in arguments:
-        if name not in names:
-            known_names = ", ".join(f"`{x}`" for x in names) or "none"
-            raise InputError(
-                f"`{path}` has no xacro argument `{name}`; it has {known_names}."
-            )
+    names = []
+    for file in (path, *map(Path, included_files)):
+        if file.is_file():
+            names += [name.decode() for name in ARGUMENT.findall(file.read_bytes())]
+    for name in arguments.keys() - names:
+        raise InputError(
+            f"`{path}` has no xacro argument `{name}`; it has {listed(names) or 'none'}."
+        )

@@ -59,6 +59,8 @@ def test_every_target_is_written_from_a_report(report, run, tmp_path, target, fi
     assert (code, err) == (0, "")
     assert {p.name for p in tmp_path.iterdir()} - before == files
     assert all(name in out for name in files)
+    # A URDF file holds no rotor inertias.
+    assert ("!  `arm.urdf` cannot hold Ia1: " in out) == (target == "urdf")
     code, _, err = run("report", "--to", target)
     assert code == 2
     assert "is there already" in err
