@@ -73,5 +73,6 @@ def _refuse_unknown(
             names += [name.decode() for name in ARGUMENT.findall(file.read_bytes())]
     for name in arguments.keys() - names:
         raise InputError(
-            f"`{path}` has no xacro argument `{name}`; it has {listed(names) or 'none'}."
+            f"`{path}` has no xacro argument `{name}`; it has "
+            f"{listed(names) or 'none'}."
         )
