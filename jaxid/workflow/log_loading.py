@@ -118,7 +118,9 @@ def read_commands(setup: Setup, log: Path, columns: Columns) -> Recording:
         text = str(error).replace("`forces`", "`commands`")
         raise InputError(text) from None
     command_angles = read_log(setup, log, command_columns).angles
-    return dataclasses.replace(recording, forces=command_angles)
+    # Servos hold their commands, which is no fault of the log.
+    notes = tuple(note for note in recording.notes if "`force_delay" not in note)
+    return dataclasses.replace(recording, forces=command_angles, notes=notes)
 
 
 def observe_commands(setup: Setup, log: Path, columns: Columns) -> Observations | None:

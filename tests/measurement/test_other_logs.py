@@ -452,6 +452,23 @@ def test_structures_of_mat_files_that_hardly_fill_their_file(tmp_path):
     refused(path, columns, "`log` of `a.mat` needs", "save it again")
 
 
+def test_structures_of_mat_files_with_one_name(tmp_path):
+    """Signals of a scope of Simulink, and cells."""
+    signals = np.empty(2, dtype=[("values", object), ("label", object)])
+    angles, velocities, forces = numbers()
+    signals[0] = (angles, "q")
+    signals[1] = (forces, "tau")
+    cells = np.empty(2, object)
+    cells[:] = [velocities, forces[:, 0]]
+    time = STEP * 1e-9 * np.arange(SAMPLES)
+    scope = {"time": time, "signals": signals}
+    savemat(tmp_path / "a.mat", {"scope": scope, "cells": cells})
+    names = ("scope.signals[0].values", "scope.signals[1].values", "cells[0]")
+    check(read_recording(tmp_path / "a.mat", Columns(*names, time="scope.time")))
+    columns = Columns("scope.signal", names[1], time="scope.time")
+    refused(tmp_path / "a.mat", columns, "`scope.signals[0].values[{}]`")
+
+
 @pytest.mark.parametrize("format_of_file", [{"format": "4"}, {"do_compression": False}])
 def test_large_arrays_that_fill_their_file_are_read(tmp_path, format_of_file):
     path = tmp_path / "a.mat"

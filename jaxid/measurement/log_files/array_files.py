@@ -201,12 +201,21 @@ def _named_arrays(content: Mapping[str, Any], prefix: str = "") -> Arrays:
         name = prefix + key
         if isinstance(value, Mapping):
             arrays |= _named_arrays(value, f"{name}.")
+        elif isinstance(value, list) or is_object_array(value):
+            # Structures and cells of MATLAB that have one name together.
+            elements = {f"[{k}]": x for k, x in enumerate(value)}
+            arrays |= _named_arrays(elements, name)
         elif isinstance(value, np.ndarray) and value.ndim > 0:
             # Single rows, as MATLAB writes them, are columns here.
             arrays[name] = value.reshape(-1) if 1 in value.shape else value
         elif is_hdf5_array(value):
             arrays[name] = value
     return arrays
+
+
+def is_object_array(value: Any) -> bool:
+    """Return whether a value is an array of structures or cells."""
+    return isinstance(value, np.ndarray) and value.dtype == object and value.ndim > 0
 
 
 def is_hdf5_array(value: Any) -> bool:
