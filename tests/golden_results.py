@@ -45,6 +45,16 @@ def numbers_of_report(folder):
     }
 
 
+def require_same_results(first, second):
+    """Require that two reports say the same, but for the settings that led to them."""
+    first_results, second_results = (
+        json.loads((place / "result.json").read_text(encoding="utf-8"))
+        for place in (first, second)
+    )
+    for key in ("base_parameters", "fit", "errors", "consistency", "notes", "verdict"):
+        assert first_results[key] == second_results[key], key
+
+
 def compare(case, found, tolerance=TOLERANCE):
     """Compare numbers with a case's golden file; write it and fail without one."""
     path = HERE / f"{case}.json"

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from arm_files import HALF_PI, urdf_of_arm
+from golden_results import require_same_results
 from test_cli import (  # noqa: F401
     EXPERIMENT,
     first,
@@ -335,3 +336,24 @@ def test_friction_with_memory_from_the_log_to_the_report(shop, run, words):  # n
     assert refused(run("identify", "both.toml", "memory.csv"), "but not both")
     words("export", "report", "--to", "c", "-o", "arm.c")
     assert "arm_advance" in (shop / "arm.h").read_text()
+
+
+def test_python_and_the_command_line_have_the_same_defaults(folder, words):  # noqa: F811
+    recording = '[recording]\nangles = "q{}"\nforces = "tau{}"\ntime = "t"\n'
+    Path("plain.toml").write_text(f'[robot]\nbuiltin = "planar_arm"\n{recording}')
+    printed = words(
+        "identify", "plain.toml", "a.csv", "--split", "0.6", "-o", "command"
+    )
+    terms = (
+        jid.RigidBodies(),
+        jid.ViscousFriction(),
+        jid.CoulombFriction(),
+        jid.RotorInertia(),
+        jid.ConstantOffset(),
+    )
+    setup = jid.Setup(jid.Model(jid.robots.planar_arm(), terms))
+    columns = jid.Columns(angles="q{}", forces="tau{}", time="t")
+    report = jid.identify_logs(setup, [Path("a.csv")], columns, held_out=0.4)
+    report.save("python")
+    require_same_results(Path("command"), Path("python"))
+    assert report.verdict.text in printed

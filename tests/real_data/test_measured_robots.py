@@ -8,7 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from golden_results import command, compare, numbers_of_report
+from golden_results import (
+    command,
+    compare,
+    numbers_of_report,
+    require_same_results,
+)
 
 import jaxid as jid
 from jaxid.experiment.experiment import load_experiment
@@ -124,15 +129,6 @@ cutoff = 20
 [rows]
 step = 50
 """
-UR10 = """\
-[robot]
-builtin = "ur10"
-[recording]
-angles = "q{}"
-velocities = "dq{}"
-forces = "tau{}"
-time = "t"
-"""
 FRICTION = (
     jid.terms.RigidBodies(),
     jid.terms.ViscousFriction(),
@@ -150,44 +146,28 @@ def first_rows(file, folder, rows):
     return copy
 
 
-@pytest.mark.parametrize("name", ["tx40", "ur10"])
-def test_python_and_the_command_line_have_the_same_defaults(
-    name, shared_data, tmp_path
-):
-    if name == "tx40":
-        text, folder, rows = TX40, shared_data / "tx40", 15_000
-        log = first_rows(folder / "motor_position.csv", tmp_path, rows)
-        first_rows(folder / "motor_torque.csv", tmp_path, rows)
-        model = jid.Model(jid.robots.tx40(), (*FRICTION, jid.terms.CoupledDrives()))
-        setup = jid.Setup(
-            model,
-            filter=jid.ZeroPhaseButterworth(20.0),
-            decimation=jid.Subsample(50),
-            reading=jid.workflow.LogReading(forces_file="motor_torque.csv"),
-        )
-        columns = jid.Columns(
-            angles="Joint_{}",
-            forces="Joint_{}",
-            sample_time=2e-4,
-            angles_on_motor_side=True,
-            forces_on_motor_side=True,
-        )
-    else:
-        text, file = UR10, shared_data / "ur10" / "exciting_measured.csv"
-        log = first_rows(file, tmp_path, 1500)
-        setup = jid.Setup(jid.Model(jid.robots.ur10(), FRICTION))
-        columns = jid.Columns(angles="q{}", velocities="dq{}", forces="tau{}", time="t")
-
-    (tmp_path / "experiment.toml").write_text(text)
+def test_python_and_the_command_line_have_the_same_defaults(shared_data, tmp_path):
+    """Of motors that move joints together, and forces in a file of their own."""
+    folder, rows = shared_data / "tx40", 15_000
+    log = first_rows(folder / "motor_position.csv", tmp_path, rows)
+    first_rows(folder / "motor_torque.csv", tmp_path, rows)
+    model = jid.Model(jid.robots.tx40(), (*FRICTION, jid.terms.CoupledDrives()))
+    setup = jid.Setup(
+        model,
+        filter=jid.ZeroPhaseButterworth(20.0),
+        decimation=jid.Subsample(50),
+        reading=jid.workflow.LogReading(forces_file="motor_torque.csv"),
+    )
+    columns = jid.Columns(
+        angles="Joint_{}",
+        forces="Joint_{}",
+        sample_time=2e-4,
+        angles_on_motor_side=True,
+        forces_on_motor_side=True,
+    )
+    (tmp_path / "experiment.toml").write_text(TX40)
     words = ("identify", tmp_path / "experiment.toml", log, "--split", "0.6")
     command(*words, "-o", tmp_path / "command")
     report = jid.identify_logs(setup, [log], columns, held_out=0.4)
     report.save(tmp_path / "python")
-
-    results = [
-        json.loads((tmp_path / place / "result.json").read_text(encoding="utf-8"))
-        for place in ("command", "python")
-    ]
-    for key in ("base_parameters", "fit", "errors", "consistency", "notes", "verdict"):
-        assert results[0][key] == results[1][key], key
-    assert results[0]["verdict"][0]["text"] == report.verdict.text
+    require_same_results(tmp_path / "command", tmp_path / "python")
