@@ -13,6 +13,7 @@ from typing import Any
 from jaxid.errors import InputError
 from jaxid.measurement.log_columns import Selection, Selections
 from jaxid.measurement.text_format import TEXT_SUFFIXES, TextColumns
+from jaxid.robot.xml_files import read_xml
 
 TomlTable = dict[str, Any]
 """Table of a TOML file, or arguments that are made of one."""
@@ -246,17 +247,23 @@ def _require_known_keys(tables: TomlTable) -> None:
 
 
 def _require_robot_file(table: TomlTable, folder: Path) -> None:
-    """Reject the path of a robot's file that is not there."""
+    """Reject the path of a robot's file that is not there, or of one that is no XML."""
     sources = [key for key in ("urdf", "mjcf", "builtin") if key in table]
     if len(sources) != 1 or sources[0] == "builtin":
         return  # `RobotSource` says that one of them is needed
     key = sources[0]
     name = table[key]
-    if isinstance(name, str) and not (folder / name).is_file():
+    if not isinstance(name, str):
+        return
+    path = folder / name
+    if not path.is_file():
         raise InputError(
-            f"`robot`: `{key}`: `{folder / name}` is no file: paths are relative to "
-            "this file."
+            f"`robot`: `{key}`: `{path}` is no file: paths are relative to this file."
         )
+    try:
+        read_xml(path)
+    except InputError as error:
+        raise InputError(f"`robot`: {error}") from error
 
 
 def require_text_columns(tables: TomlTable, logs: Iterable[Path]) -> None:

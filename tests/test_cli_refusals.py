@@ -155,6 +155,8 @@ QUICKLY = [
     "excite inner.toml",
     "payload lost.toml a.csv --loaded b.csv",
     "init none.urdf",
+    "init broken.urdf",
+    "inspect broken.toml",
     "export none --to c",
     "compare a.csv a.csv",
     "excite experiment.toml -o motion",
@@ -169,11 +171,13 @@ def test_refusals_come_before_jax_is_loaded(folder):  # noqa: F811
         "key": EXPERIMENT.replace("cutoff", "cut_off"),
         "column": EXPERIMENT.replace("tau{}", "torque{}"),
         "inner": EXPERIMENT + "[model]\ncoulomb = { epsilom = 1 }",
+        "broken": EXPERIMENT.replace('builtin = "planar_arm"', 'urdf = "broken.urdf"'),
         "lost": EXPERIMENT.replace('builtin = "planar_arm"', 'urdf = "lost.urdf"'),
     }
     for name, text in wrong_files.items():
         (folder / f"{name}.toml").write_text(text)
     (folder / "empty.csv").write_text("")
+    (folder / "broken.urdf").write_text('<robot name="arm"><link>')
     done = subprocess.run(
         [sys.executable, "-c", LIGHT],
         input="\n".join(QUICKLY),

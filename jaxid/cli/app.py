@@ -15,6 +15,7 @@ from rich.text import Text
 import jaxid as jid
 from jaxid.errors import InputError
 from jaxid.result_table import Remark, Status, versions
+from jaxid.robot.xml_files import read_xml
 
 from . import options, payload_gains_states_rollout, report_commands, terminal
 
@@ -113,7 +114,9 @@ def init(
 
     Like this: jaxid init arm.urdf > experiment.toml
     """
-    options.start(urdf)
+    options.require_paths([urdf])
+    read_xml(urdf)
+    options.start()
     arguments = options.xacro_arguments(xacro)
     chain = {"tip": tip, "base": base, "xacro_arguments": arguments}
     text = jid.experiment.write_template(urdf, **chain)

@@ -110,7 +110,7 @@ def start(
     loaded, which takes seconds.
     """
     paths = reads if experiment is None else (experiment, *reads)
-    _require_paths(paths)
+    require_paths(paths)
     if experiment is not None:
         tables = parse_tables(read_experiment_text(experiment), experiment)
         require_text_columns(tables, reads)
@@ -138,7 +138,7 @@ def start(
     return open_console()
 
 
-def _require_paths(paths: Sequence[Path]) -> None:
+def require_paths(paths: Sequence[Path]) -> None:
     """Reject paths of files that are not there."""
     missing_paths = [f"`{path}`" for path in paths if not path.exists()]
     if missing_paths:

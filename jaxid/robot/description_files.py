@@ -1,141 +1,39 @@
 """Files that describe robots: URDF, xacro, and MJCF as the URDF of the same tree."""
 
-import math
-import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
-
-from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
 
 from jaxid.errors import InputError
 
 from .mjcf import Description, mjcf_as_urdf
 from .robot import GRAVITY
 from .xacro import expand_xacro
-
-MAX_PARTS = {"hfield": 10_000_000, "replicate": 2_000}
-"""Largest numbers of heights of a field, and of copies of a body, in an MJCF file."""
-HARMLESS_FAULTS = ("NS_ERR_UNDEFINED_NAMESPACE", "ERR_UNKNOWN_VERSION")
-"""Faults of XML that change no element, by the names of the parser."""
+from .xml_files import has_xacro, parse_xml, read_xml, require_urdf
 
 
 def read_description(
     path: str | Path, xacro_arguments: Mapping[str, str] | None = None
 ) -> Description:
     """Return the URDF element of a robot's file, and what else the file states."""
-    robot = _parse(path)
-    if xacro_arguments and not _has_xacro(robot):
+    robot = read_xml(path)
+    if xacro_arguments and not has_xacro(robot):
         raise InputError(
             f"`{path}` is no xacro file, which alone has arguments: "
             "remove `xacro_arguments` (`--xacro`)."
         )
     if robot.tag == "mujoco":
-        _refuse_huge(path, robot)
-        _refuse_nan(path, robot)
         return mjcf_as_urdf(path)
-    if _has_xacro(robot):
-        robot = _parse(path, expand_xacro(Path(path), xacro_arguments or {}))
-    if robot.tag != "robot":
-        raise InputError(
-            f"`{path}` is no URDF: its root is `<{robot.tag}>`, not `<robot>`."
-        )
+    if has_xacro(robot):
+        robot = parse_xml(path, expand_xacro(Path(path), xacro_arguments or {}))
+    require_urdf(path, robot)
     return Description(robot, GRAVITY, [], [])
-
-
-def _refuse_huge(path: str | Path, root: Any):
-    """Reject elements of an MJCF file of which MuJoCo makes gigabytes."""
-    for element in root.iter(*MAX_PARTS):
-        # Copies of copies multiply. MuJoCo names what is no number.
-        counts = element.xpath("@nrow | @ncol | ancestor-or-self::replicate/@count")
-        size = math.prod(int(text) for text in counts if text.isdecimal())
-        if size > MAX_PARTS[element.tag]:
-            raise InputError(
-                f"`{path}`, line {element.sourceline}: `<{element.tag}>` makes {size} "
-                f"parts, but may make {MAX_PARTS[element.tag]}: lower its numbers."
-            )
-
-
-def _refuse_nan(path: str | Path, root: Any):
-    """Reject properties of bodies that are NaN, which MuJoCo takes as not given."""
-    for text in root.xpath("//@mass | //@density | //@diaginertia | //@fullinertia"):
-        if "nan" in text.lower():
-            line = text.getparent().sourceline
-            raise InputError(
-                f"`{path}`, line {line}: `{text.attrname}` must hold finite numbers, "
-                f'but is "{text}".'
-            )
 
 
 def is_mjcf(path: str | Path) -> bool:
     """Return whether a file describes its robot as MJCF."""
-    return _parse(path).tag == "mujoco"
+    return parse_xml(path).tag == "mujoco"
 
 
 def is_xacro(path: str | Path) -> bool:
     """Return whether a file must be expanded by the program `xacro`."""
-    return _has_xacro(_parse(path))
-
-
-def _has_xacro(root: Any):
-    """Return whether there are elements of xacro below a root."""
-    return any("xacro" in element.tag for element in root.iter("*"))
-
-
-def _parse(path: str | Path, text: bytes | None = None):
-    """Return the root element of a file, or of a text made from it."""
-    if not Path(path).is_file():
-        raise FileNotFoundError(
-            f"the robot's file `{path}` does not exist: check its path."
-        )
-    if text is None:
-        text = Path(path).read_bytes()
-    # No entity of a file makes the parser read other files.
-    parser = etree.XMLParser(
-        recover=True, resolve_entities=False, no_network=True, load_dtd=False
-    )
-    try:
-        return _tolerant_root(text, parser)
-    except etree.XMLSyntaxError as error:
-        line = error.lineno or 1
-        raise InputError(
-            f"`{path}`, line {line}: this is not XML ({error.msg})."
-        ) from error
-
-
-def _tolerant_root(text: bytes, parser: Any):
-    """Return the root element of a text with the faults that other programs allow.
-
-    These are double hyphens in comments, blank lines or comments before `<?xml`, and
-    attributes without a blank between them.
-    """
-    try:
-        return _root(text, parser)
-    except etree.XMLSyntaxError:
-        # Line breaks stay, so that messages name the lines of the file. Beyond the last
-        # end of a comment the search would be slow.
-        head, end, rest = text.rpartition(b"-->")
-        content = re.sub(rb"(?s)<!--.*?-->", _line_breaks, head + end) + rest
-        spaced_content = re.sub(
-            rb"""(=\s*(?:"[^"<]*"|'[^'<]*'))(?=\w)""", rb"\1 ", content
-        )
-        declaration_first = re.sub(
-            rb"\A(?:\xef\xbb\xbf)?(\s+)(<\?xml[^>]*>)", rb"\2\1", spaced_content
-        )
-        return _root(declaration_first, parser)
-
-
-def _root(text: bytes, parser: Any):
-    """Return the root element of a text; raise the first fault that is not harmless."""
-    root = etree.fromstring(text, parser)
-    for fault in parser.error_log:
-        if fault.type_name not in HARMLESS_FAULTS:
-            raise etree.XMLSyntaxError(
-                fault.message, fault.type, fault.line, fault.column
-            )
-    return root
-
-
-def _line_breaks(match: re.Match[bytes]):
-    """Return the line breaks of a match."""
-    return b"\n" * match.group().count(b"\n")
+    return has_xacro(parse_xml(path))
