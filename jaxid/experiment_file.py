@@ -6,7 +6,8 @@ module imports neither them nor JAX. `experiment/` reads the values.
 
 import difflib
 import tomllib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -204,7 +205,8 @@ def parse_tables(text: str, path: Path) -> TomlTable:
     try:
         _require_tables(tables)
         _require_known_keys(tables)
-        _require_robot_file(tables["robot"], path.parent)
+        with within("robot"):
+            _require_robot(tables["robot"], path.parent)
     except InputError as error:
         raise InputError(f"{path.name}: {error}") from error
     return tables
@@ -246,24 +248,29 @@ def _require_known_keys(tables: TomlTable) -> None:
             check_names(table, keys, name)
 
 
-def _require_robot_file(table: TomlTable, folder: Path) -> None:
-    """Reject the path of a robot's file that is not there, or of one that is no XML."""
+def _require_robot(table: TomlTable, folder: Path) -> None:
+    """Reject a robot without one source, or with a file that is not there or no XML."""
     sources = [key for key in ("urdf", "mjcf", "builtin") if key in table]
-    if len(sources) != 1 or sources[0] == "builtin":
-        return  # `RobotSource` says that one of them is needed
-    key = sources[0]
-    name = table[key]
-    if not isinstance(name, str):
-        return
-    path = folder / name
-    if not path.is_file():
+    if len(sources) != 1:
+        words = " and ".join(f"`{key}`" for key in sources) or "none of them"
         raise InputError(
-            f"`robot`: `{key}`: `{path}` is no file: paths are relative to this file."
+            f"one of `urdf`, `mjcf` and `builtin` is needed, but there is {words}; "
+            "give a Denavit-Hartenberg table to `from_dh` in Python."
         )
-    try:
+    source = sources[0]
+    if source == "builtin":
+        for key in ("tip", "base", "xacro_arguments"):
+            if key in table:
+                raise InputError(
+                    f"`{key}` belongs to `urdf`, not to `builtin`: remove it."
+                )
+    elif isinstance(table[source], str):
+        path = folder / table[source]
+        if not path.is_file():
+            raise InputError(
+                f"`{source}`: `{path}` is no file: paths are relative to this file."
+            )
         read_xml(path)
-    except InputError as error:
-        raise InputError(f"`robot`: {error}") from error
 
 
 def require_text_columns(tables: TomlTable, logs: Iterable[Path]) -> None:
@@ -316,3 +323,12 @@ def check_names(
         raise InputError(
             f"`{path}` is no known key: {owner} has {', '.join(known_names)}."
         )
+
+
+@contextmanager
+def within(place: str, file: str = "") -> Iterator[None]:
+    """Name a table in errors of deeper layers, and the file if it is not named yet."""
+    try:
+        yield
+    except (InputError, FileNotFoundError) as error:
+        raise InputError(f"{file}{': ' if file else ''}`{place}`: {error}") from error

@@ -1,5 +1,6 @@
 """Several runs on the command line: added, with a payload, a known load, a delay."""
 
+import dataclasses
 import json
 import os
 import re
@@ -339,8 +340,7 @@ def test_friction_with_memory_from_the_log_to_the_report(shop, run, words):  # n
 
 
 def test_python_and_the_command_line_have_the_same_defaults(folder, words):  # noqa: F811
-    recording = '[recording]\nangles = "q{}"\nforces = "tau{}"\ntime = "t"\n'
-    Path("plain.toml").write_text(f'[robot]\nbuiltin = "planar_arm"\n{recording}')
+    Path("plain.toml").write_text(EXPERIMENT[: EXPERIMENT.index("[filter]")])
     printed = words(
         "identify", "plain.toml", "a.csv", "--split", "0.6", "-o", "command"
     )
@@ -351,7 +351,9 @@ def test_python_and_the_command_line_have_the_same_defaults(folder, words):  # n
         jid.RotorInertia(),
         jid.ConstantOffset(),
     )
-    setup = jid.Setup(jid.Model(jid.robots.planar_arm(), terms))
+    arm = jid.robots.planar_arm()
+    limits = dataclasses.replace(arm.limits, joints=2, force=np.array([80.0, 20.0]))
+    setup = jid.Setup(jid.Model(arm.replace(limits=limits), terms))
     columns = jid.Columns(angles="q{}", forces="tau{}", time="t")
     report = jid.identify_logs(setup, [Path("a.csv")], columns, held_out=0.4)
     report.save("python")

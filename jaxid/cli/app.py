@@ -14,6 +14,7 @@ from rich.text import Text
 
 import jaxid as jid
 from jaxid.errors import InputError
+from jaxid.experiment_file import within
 from jaxid.result_table import Remark, Status, versions
 from jaxid.robot.xml_files import read_xml
 
@@ -155,7 +156,6 @@ def excite(
             f"`{earlier_design}` is not there: `--resume` needs a motion to go on with."
         )
     console = options.start(experiment=experiment)
-    from jaxid.experiment.decoder import within
     from jaxid.report.excitation_page import motion_verdict, plan_remarks, sort_remarks
 
     from .best_motion import BestMotion

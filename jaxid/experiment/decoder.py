@@ -11,8 +11,7 @@ import json
 import math
 import re
 import typing
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Sequence
 from operator import ge, gt, le, lt
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -20,7 +19,7 @@ import jaxtyping
 import numpy as np
 
 from jaxid.errors import InputError
-from jaxid.experiment_file import TomlTable, check_names
+from jaxid.experiment_file import TomlTable, check_names, within
 from jaxid.io import union_members
 from jaxid.units import Unit, unit
 from jaxid.workflow.allowed_values import Bounds, OneOf
@@ -70,15 +69,6 @@ def call(function: Callable, table: Any, place: str, *context: Any) -> Any:
     (arguments,) = decode([function], table, place)
     with within(place):
         return function(*context, **arguments)
-
-
-@contextmanager
-def within(place: str, file: str = "") -> Iterator[None]:
-    """Name a table in errors of deeper layers, and the file if it is not named yet."""
-    try:
-        yield
-    except (InputError, FileNotFoundError) as error:
-        raise InputError(f"{file}{': ' if file else ''}`{place}`: {error}") from error
 
 
 def decode(

@@ -6,7 +6,12 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from jaxid.errors import InputError
-from jaxid.experiment_file import TomlTable, parse_tables, read_experiment_text
+from jaxid.experiment_file import (
+    TomlTable,
+    parse_tables,
+    read_experiment_text,
+    within,
+)
 from jaxid.identification.consistency import BodyBounds
 from jaxid.io import FilePath
 from jaxid.measurement.columns import Columns
@@ -19,7 +24,7 @@ from jaxid.workflow.log_rollout import ServoSettings, TorqueSettings
 from jaxid.workflow.setup import LogReading, Setup
 from jaxid.workflow.surroundings import Collision, Surroundings
 
-from .decoder import call, decode, within
+from .decoder import call, decode
 from .robot_tables import RobotSource, known_load, replace_drives, replace_limits
 from .setup_tables import (
     Effects,

@@ -141,21 +141,6 @@ class RobotSource:
     snap_tolerance: Magnitude | None = None
     tool: Annotated[Callable[[Robot], Tool | float], known_load] | None = None
 
-    def __post_init__(self) -> None:
-        names = ("urdf", "mjcf", "builtin")
-        sources = [name for name in names if getattr(self, name) is not None]
-        if len(sources) != 1:
-            words = " and ".join(f"`{name}`" for name in sources) or "none of them"
-            raise InputError(
-                f"one of `urdf`, `mjcf` and `builtin` is needed, but there is {words}; "
-                "give a Denavit-Hartenberg table to `from_dh` in Python."
-            )
-        for key in ("tip", "base", "xacro_arguments"):
-            if getattr(self, key) is not None and self.builtin is not None:
-                raise InputError(
-                    f"`{key}` belongs to `urdf`, not to `builtin`: remove it."
-                )
-
     def robot_file(self, folder: Path) -> RobotFile | None:
         """Return the robot's URDF or MJCF file; None for other sources."""
         name = self.urdf or self.mjcf

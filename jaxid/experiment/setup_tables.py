@@ -14,7 +14,7 @@ from jaxid.arrays import Float, Texts
 from jaxid.dynamics import terms
 from jaxid.dynamics.model import Model
 from jaxid.errors import InputError
-from jaxid.experiment_file import TomlTable
+from jaxid.experiment_file import TomlTable, within
 from jaxid.identification import estimators
 from jaxid.identification.consistency import BodyBounds
 from jaxid.identification.estimators.regularisation_and_weights import (
@@ -38,7 +38,7 @@ from jaxid.workflow.allowed_values import (
 from jaxid.workflow.robot_file import RobotFile
 from jaxid.workflow.setup import LogReading, Setup, pull_to_bodies
 
-from .decoder import call, decode, decode_value, keys_of, quoted, within
+from .decoder import call, decode, decode_value, keys_of, quoted
 
 MAX_SPEED = 100.0
 """Speed that no joint exceeds [rad/s or m/s]."""
