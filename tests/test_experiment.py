@@ -1,9 +1,11 @@
 """Experiment files: what they become, and how each mistake is refused in a sentence."""
 
+import dataclasses
 import json
 import re
 import tomllib
 
+import equinox as eqx
 import numpy as np
 import pytest
 
@@ -615,6 +617,57 @@ def test_the_keys_that_are_known_before_jax_is_loaded_are_those_of_the_objects()
     expected["recording"] -= set(SIDES)
     expected["filter"] |= {"kind"}
     assert {name: set(keys) for name, keys in KEYS.items()} == expected
+
+
+TX40 = """\
+[robot]
+builtin = "tx40"
+[recording]
+angles = "Joint_{}"
+forces = "Joint_{}"
+forces_file = "motor_torque.csv"
+sample_time = 2e-4
+side = "motor"
+[filter]
+kind = "butterworth"
+cutoff = 20
+[rows]
+step = 50
+"""
+
+
+def test_a_file_has_the_defaults_of_python(load):
+    """Motors that move joints together, and forces in a file of their own."""
+    experiment = load(TX40)
+    terms = (
+        jid.terms.RigidBodies(),
+        jid.terms.ViscousFriction(),
+        jid.terms.CoulombFriction(),
+        jid.terms.RotorInertia(),
+        jid.terms.ConstantOffset(),
+        jid.terms.CoupledDrives(),
+    )
+    setup = jid.Setup(
+        jid.Model(jid.robots.tx40(), terms),
+        filter=jid.ZeroPhaseButterworth(20.0),
+        decimation=jid.Subsample(50),
+        reading=jid.workflow.LogReading(forces_file="motor_torque.csv"),
+    )
+    assert eqx.tree_equal(experiment.setup.model.terms, setup.model.terms)
+    assert experiment.setup.model.parameter_names == setup.model.parameter_names
+    settings = {field.name for field in dataclasses.fields(setup)} - {"unknowns", "_"}
+    for name in settings:
+        found, expected = (getattr(x, name) for x in (experiment.setup, setup))
+        assert eqx.tree_equal(found, expected), name
+    columns = jid.Columns(
+        angles="Joint_{}",
+        forces="Joint_{}",
+        sample_time=2e-4,
+        angles_on_motor_side=True,
+        forces_on_motor_side=True,
+        joint_names=jid.robots.tx40().joint_names,
+    )
+    assert experiment.columns == columns
 
 
 def test_no_name_of_a_urdf_writes_into_the_template(tmp_path):

@@ -8,12 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from golden_results import (
-    command,
-    compare,
-    numbers_of_report,
-    require_same_results,
-)
+from golden_results import command, compare, numbers_of_report
 
 import jaxid as jid
 from jaxid.experiment.experiment import load_experiment
@@ -112,62 +107,3 @@ def test_kr300_is_said_to_be_undetermined_and_a_ridge_transfers(identify, shared
     np.testing.assert_allclose(
         rms, [0.26, 0.25, 0.50, 0.39], atol=0.005
     )  # as in the README
-
-
-TX40 = """\
-[robot]
-builtin = "tx40"
-[recording]
-angles = "Joint_{}"
-forces = "Joint_{}"
-forces_file = "motor_torque.csv"
-sample_time = 2e-4
-side = "motor"
-[filter]
-kind = "butterworth"
-cutoff = 20
-[rows]
-step = 50
-"""
-FRICTION = (
-    jid.terms.RigidBodies(),
-    jid.terms.ViscousFriction(),
-    jid.terms.CoulombFriction(),
-    jid.terms.RotorInertia(),
-    jid.terms.ConstantOffset(),
-)
-
-
-def first_rows(file, folder, rows):
-    """Copy the beginning of a log: what is compared does not depend on its length."""
-    lines = file.read_text(encoding="utf-8").splitlines(keepends=True)
-    copy = folder / file.name
-    copy.write_text("".join(lines[: 1 + rows]), encoding="utf-8")
-    return copy
-
-
-def test_python_and_the_command_line_have_the_same_defaults(shared_data, tmp_path):
-    """Of motors that move joints together, and forces in a file of their own."""
-    folder, rows = shared_data / "tx40", 15_000
-    log = first_rows(folder / "motor_position.csv", tmp_path, rows)
-    first_rows(folder / "motor_torque.csv", tmp_path, rows)
-    model = jid.Model(jid.robots.tx40(), (*FRICTION, jid.terms.CoupledDrives()))
-    setup = jid.Setup(
-        model,
-        filter=jid.ZeroPhaseButterworth(20.0),
-        decimation=jid.Subsample(50),
-        reading=jid.workflow.LogReading(forces_file="motor_torque.csv"),
-    )
-    columns = jid.Columns(
-        angles="Joint_{}",
-        forces="Joint_{}",
-        sample_time=2e-4,
-        angles_on_motor_side=True,
-        forces_on_motor_side=True,
-    )
-    (tmp_path / "experiment.toml").write_text(TX40)
-    words = ("identify", tmp_path / "experiment.toml", log, "--split", "0.6")
-    command(*words, "-o", tmp_path / "command")
-    report = jid.identify_logs(setup, [log], columns, held_out=0.4)
-    report.save(tmp_path / "python")
-    require_same_results(tmp_path / "command", tmp_path / "python")
