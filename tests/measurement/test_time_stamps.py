@@ -95,7 +95,7 @@ def test_bursts_of_several_lengths_become_even():
 
 def test_uneven_bursts_ask_for_the_sample_time():
     stamps = bursts(np.full(150, 4))
-    stamps[300:] += 0.2
+    stamps[300:] += 10.5 * 4 * STEP  # no whole number of bursts
     with pytest.raises(InputError, match=r"bursts of about 4.*give `sample_time`"):
         recording(np.arange(600), stamps)
 
