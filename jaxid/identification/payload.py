@@ -8,7 +8,14 @@ import numpy as np
 from jaxid.arrays import AnyArray, Float, Matrix3, Vector3, double_precision
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
-from jaxid.result_table import Remark, Status, Summarised, Table, significant
+from jaxid.result_table import (
+    Remark,
+    Status,
+    Summarised,
+    Table,
+    percent,
+    significant,
+)
 from jaxid.robot.inertia import INERTIAL_NAMES, Inertia
 from jaxid.robot.robot import Robot, Tool
 
@@ -26,6 +33,10 @@ Body = Float[AnyArray, "10"]
 
 MAX_DISTANCE = 4.0
 """Standard deviations from the estimate to a possible body that are not unusual."""
+MAX_RESIDUAL_RATIO = 2.0
+"""Ratio of the residuals with and without a load that is not unusual."""
+SMALL_RESIDUAL = 0.01
+"""Residual that says nothing of a load, relative to the forces."""
 SCALE_DEVIATION = 1e-3
 """Standard deviation of a weighed mass, relative to it."""
 MAX_ERROR_BOUND = 0.01
@@ -48,6 +59,7 @@ class Payload(Summarised, eqx.Module):
         distance: From the estimate to the parameters, in standard deviations: below 4
             nothing unusual; NaN where the runs do not determine all ten, or where the
             robot is lighter with the load.
+        residuals: Residuals without the load and with it, relative to the forces.
     """
 
     body: int = eqx.field(static=True)
@@ -55,6 +67,7 @@ class Payload(Summarised, eqx.Module):
     estimate: Body
     uncertainty: Uncertainty
     distance: float
+    residuals: tuple[float, float]
 
     @property
     def mass(self) -> float:
@@ -131,6 +144,16 @@ class Payload(Summarised, eqx.Module):
                 "off.",
                 Status.BAD,
             )
+        residual, loaded_residual = self.residuals
+        if loaded_residual > MAX_RESIDUAL_RATIO * residual + SMALL_RESIDUAL:
+            return Remark(
+                "no load explains the forces: the model misses "
+                f"{percent(loaded_residual)} % of them with it, and "
+                f"{percent(residual)} % without. Is the load set in the robot's "
+                "controller, which then takes its weight out of the forces? Set it to "
+                "zero there, and record again.",
+                Status.BAD,
+            )
         if not np.isfinite(self.distance):
             return Remark(
                 "the logs do not determine all ten parameters of the payload: move the "
@@ -178,16 +201,17 @@ def identify_payload(
     require_same_base((unloaded, loaded))
     robot = unloaded.base.model.robot
     body = robot.tip_body if body is None else body
+    residuals = (unloaded.residual, loaded.residual)
     estimate, uncertainty = _estimate(unloaded, loaded, body)
     if _is_negative(estimate, uncertainty):
         # The nearest body that can exist would say nothing about the logs.
-        return Payload(body, estimate, estimate, uncertainty, np.nan)
+        return Payload(body, estimate, estimate, uncertainty, np.nan, residuals)
     if mass is not None:
         estimate, uncertainty = _weigh(estimate, uncertainty, mass)
     if not np.isfinite(uncertainty.covariance).all():
-        return Payload(body, estimate, estimate, uncertainty, np.nan)
+        return Payload(body, estimate, estimate, uncertainty, np.nan, residuals)
     if consistency_margin(estimate) >= 0:
-        return Payload(body, estimate, estimate, uncertainty, 0.0)
+        return Payload(body, estimate, estimate, uncertainty, 0.0, residuals)
     parameters, distance, error_bound = consistent_body(
         estimate, uncertainty.covariance, _wide_bounds(robot)
     )
@@ -195,7 +219,7 @@ def identify_payload(
         raise RuntimeError(
             "no body was proved to be the nearest: are both runs of one robot?"
         )
-    return Payload(body, parameters, estimate, uncertainty, distance)
+    return Payload(body, parameters, estimate, uncertainty, distance, residuals)
 
 
 def _estimate(unloaded: Fit, loaded: Fit, body: int):

@@ -23,6 +23,8 @@ from .urdf_tree import TURNING_TYPES, UrdfTree, link_names
 
 MIN_RANGE = 1e-6
 """Length of a range below which it is empty, up to rounding [rad or m]."""
+MAX_MAGNITUDE = 1e7
+"""Largest speed or force that a file can state; larger ones are no limits."""
 PLACEHOLDER_MASS = 0.01
 """Mass that files state for links which nobody has weighed [kg]."""
 MAX_FINGER_SHARE = 0.05
@@ -213,10 +215,10 @@ def _limits(tree: UrdfTree):
         if (low[i], high[i]) != (stated_low, stated_high):
             stated_range = f"a range from {stated_low:g} to {stated_high:g}"
             unknown_limits.setdefault(stated_range, []).append(name)
-        # Files often state zero for what nobody has looked up.
+        # Files often state zero, or 1e9, for what nobody has looked up.
         for key, values in magnitudes.items():
             value = tree.limit(joint, key, np.inf)
-            if value > 0.0:
+            if 0.0 < value <= MAX_MAGNITUDE or value == np.inf:
                 values[i] = value
             else:
                 unknown_limits.setdefault(f"{key} {value:g}", []).append(name)

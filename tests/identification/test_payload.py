@@ -4,11 +4,12 @@ import dataclasses
 
 import numpy as np
 import pytest
-from virtual import observations, standard_parameters
+from virtual import motion, observations, standard_parameters
 
 import jaxid as jid
 from jaxid.identification.delay import without_delay
 from jaxid.identification.payload import body_columns
+from jaxid.result_table import Status
 
 LOAD = jid.Tool(
     2,
@@ -135,6 +136,31 @@ def test_a_load_that_was_taken_off_is_no_payload(base, exact, mass):
     with pytest.raises(ValueError, match="mass"):
         _ = found.tool
     assert not jid.identify_payload(unloaded, loaded, mass=mass).is_lighter
+
+
+def test_a_load_whose_weight_the_controller_takes_out_is_no_payload(base):
+    robot = base.model.robot.replace(
+        axis=np.array([(0.0, 0.0, 1.0), (0.0, 1.0, 0.0), (0.0, 1.0, 0.0)]),
+        offset=np.array([(0.0, 0.0, 0.3), (0.0, 0.05, 0.2), (0.0, 0.0, 0.4)]),
+    )
+    base = jid.base_parameters(jid.Model(robot, base.model.terms))
+    noise = np.array([0.02, 0.02, 0.01])
+    unloaded, loaded = pair(base, noise, 1)
+    assert (
+        jid.identify_payload(unloaded, loaded).summary().remarks[0].status
+        is Status.GOOD
+    )
+    p = standard_parameters(base.model)
+    load = np.zeros_like(p)
+    load[20:30] = LOAD.parameters
+    o = observations(base.model, p + load, seed=2, noise_seed=3, noise=noise)
+    q = motion(3, 400, seed=2).q
+    rest = jid.Motion(q, np.zeros_like(q), np.zeros_like(q))
+    weight = np.asarray(base.model.inverse_dynamics(load, rest))
+    compensated = jid.identify(base, o.replace(forces=o.forces - weight))
+    (remark,) = jid.identify_payload(unloaded, compensated).summary().remarks
+    assert remark.status is Status.BAD
+    assert "set in the robot's controller" in remark.text
 
 
 def test_no_load_at_all_is_not_lighter(base):

@@ -330,10 +330,11 @@ def test_moments_that_rounding_makes_impossible_are_noted(tmp_path, moments, is_
     [
         ('<cone radius="1"/>', "line 4: `cone`"),
         ('<box size="1 2"/>', "`size`"),
-        ('<box size="1e300 1 1"/>', "`a` must be within 1000 m"),
-        ('<sphere radius="2000"/>', "`a` must be within 1000 m"),
-        ('<mesh filename="huge.obj"/>', "`a` must be within 1000 m"),
-        ('<mesh filename="huge.obj" scale="1e300 1 1"/>', "`a` must be within 1000 m"),
+        ('<box size="1e300 1 1"/>', "`a` must be within 50 m"),
+        ('<sphere radius="2000"/>', "`a` must be within 50 m"),
+        ('<mesh filename="huge.obj"/>', "`a` must be within 50 m"),
+        ('<cylinder radius="40" length="300"/>', "`a` must be within 50 m.*in metres"),
+        ('<mesh filename="huge.obj" scale="1e300 1 1"/>', "`a` must be within 50 m"),
         (None, "no collision geometry"),
     ],
 )

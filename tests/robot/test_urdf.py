@@ -273,6 +273,16 @@ def test_soft_limits_narrow_a_range(write, soft, expected):
     assert are_noted == (expected != (-2.5, 2.5))
 
 
+def test_speeds_and_forces_of_a_billion_are_none(write):
+    inner = '<limit lower="-1" upper="1" velocity="1e9" effort="1e+9"/>'
+    arm_of_file = load_urdf(write(arm(inner=inner)))
+    assert np.isinf([*arm_of_file.limits.velocity, *arm_of_file.limits.force]).all()
+    assert [note.split(": ")[1] for note in arm_of_file.notes[:2]] == [
+        "velocity 1e+09 is taken as unknown.",
+        "effort 1e+09 is taken as unknown.",
+    ]
+
+
 @pytest.mark.parametrize("limit", ["0.7 0.7", "-1 -1", "0 0", "-1000 1000"])
 def test_a_range_that_is_none_is_noted(write, limit):
     lower, upper = limit.split()
