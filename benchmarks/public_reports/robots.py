@@ -233,12 +233,11 @@ def compared(text, reference=None, expected=None, name="arm.urdf", named=""):
         named: Pattern of what the notes must say.
     """
     import jaxid as jid
-    from jaxid.robot.urdf import urdf_parameters
 
     path = Path(tempfile.mkdtemp()) / name
     path.write_text(text)
     robot = jid.load_urdf(path)
-    parameters = urdf_parameters(path)
+    parameters = jid.robots.urdf_parameters(path)
     model = jid.Model(robot, [jid.RigidBodies()])
     q, qd, qdd = np.random.default_rng(0).normal(size=(3, 20, robot.joints))
     read = model.inverse_dynamics(parameters, jid.Motion(q, qd, qdd))
