@@ -1,8 +1,8 @@
 """Shape vocabulary of annotations, and arrays of NumPy and JAX side by side.
 
-Axes: `joints` (= bodies), `standard` (columns of the full regressor), `base` (columns
-of the base regressor), `samples` (rows of a log), `rows` (rows left after filtering),
-`batch`.
+Axes: `joints` (those with a coordinate), `bodies`, `standard` (columns of the full
+regressor), `base` (columns of the base regressor), `samples` (rows of a log), `rows`
+(rows left after filtering), `batch`.
 """
 
 import os
@@ -64,7 +64,7 @@ ManyJoints = Float[AnyArray, "*batch joints"]
 JointMatrix = Float[AnyArray, "joints joints"]
 """A mass matrix, or another matrix with a row and a column for each joint."""
 
-Bodies = Float[AnyArray, "joints 10"]
+Bodies = Float[AnyArray, "bodies 10"]
 """Ten inertial parameters of each body."""
 
 Vector3 = Float[AnyArray, "3"]
@@ -107,6 +107,19 @@ def as_array(name: str, value: Numbers) -> AnyArray:
         raise InputError(
             f"`{name}` must be an array of numbers, but is {value!r:.60}."
         ) from error
+
+
+def as_finite_array(name: str, value: Numbers, shape: tuple[int, ...]) -> AnyArray:
+    """Return an array of finite numbers; that of JAX may have leading axes."""
+    array = as_array(name, value)
+    if not isinstance(array, jax.Array):
+        array = np.array(array, np.float64)
+    trailing_shape = array.shape[array.ndim - len(shape) :]
+    if trailing_shape != shape:
+        raise InputError(f"{name} must have the shape {shape}, but has {array.shape}.")
+    if isinstance(array, np.ndarray) and not np.isfinite(array).all():
+        raise InputError(f"{name} must hold finite numbers.")
+    return array
 
 
 def given(value: Any) -> Any:

@@ -55,7 +55,7 @@ def payload(
         report = jid.workflow.identify_payload_from_logs(
             content.setup, logs, loaded, columns, carrier, mass, progress
         )
-    joint = robot.joint_names[report.result.body]
+    joint = robot.body_names[report.result.body]
     lines = [TITLE_OF_TOOL, *tool_lines(report.result, joint)]
     show_runs(console, report, output, lines)
 

@@ -210,7 +210,7 @@ class Model(Hashable):
         tool = self.robot.tool
         if tool is None:
             return jnp.zeros_like(q)
-        bodies: list[AnyArray] = [np.zeros(10)] * self.robot.joints
+        bodies: list[AnyArray] = [np.zeros(10)] * self.robot.bodies
         bodies[tool.body] = tool.parameters
         p = namespace(tool.parameters).stack(bodies)
         return projection_equation.rigid_body_forces(self.robot, p, q, qd, qdd)

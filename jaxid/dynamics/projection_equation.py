@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxid.arrays import AnyArray, Bodies, JointMatrix, Joints, Matrix3, Vector3
+from jaxid.robot.follower_joints import all_coordinates, all_rates, on_coordinates
 from jaxid.robot.forward_kinematics import placement_in_parent, placements
 from jaxid.robot.inertia import inertia_tensor
 from jaxid.robot.robot import Robot
@@ -29,10 +30,12 @@ def body_motions(
         For each body the acceleration of its origin less gravity [m/s²], its angular
         velocity [rad/s] and its angular acceleration [rad/s²].
     """
-    motions: list[tuple[Vector3, Vector3, Vector3]] = []
-    ground = (-robot.gravity, np.zeros(3), np.zeros(3))
-    for i, parent in enumerate(robot.parent):
-        a, w, wd = motions[parent] if parent >= 0 else ground
+    q = all_coordinates(robot.followers, q)
+    qd = all_rates(robot.followers, qd)
+    qdd = all_rates(robot.followers, qdd)
+    motions = {-1: (-robot.gravity, np.zeros(3), np.zeros(3))}
+    for i in robot.order:
+        a, w, wd = motions[robot.parent[i]]
         R, r = placement_in_parent(robot, i, q[i])
         axis = robot.axis[i]
         # The parent carries the body ...
@@ -46,13 +49,13 @@ def body_motions(
         turned_rate = jnp.cross(w_parent, axis) * qd[i]
         w = w_parent
         wd = wd_parent
-        if robot.revolute[i]:
+        if robot.turns[i]:
             w = w + axis * qd[i]
             wd = wd + rate + turned_rate
         else:
             a = a + rate + 2.0 * turned_rate
-        motions.append((a, w, wd))
-    return motions
+        motions[i] = (a, w, wd)
+    return [motions[i] for i in range(robot.bodies)]
 
 
 def partial_velocities(robot: Robot, q: Joints, qd: Joints, qdd: Joints):
@@ -137,7 +140,8 @@ def rigid_body_mass_matrix(robot: Robot, p: Bodies, q: Joints) -> JointMatrix:
     the wrench that one of them needs for a unit acceleration of its joint is carried to
     the ground and felt by every joint on the way.
     """
-    n = robot.joints
+    n = robot.bodies
+    q = all_coordinates(robot.followers, q)
     frames = [placement_in_parent(robot, i, q[i]) for i in range(n)]
     bodies = composite_bodies(robot, p, frames)
     zero = jnp.zeros(())
@@ -145,7 +149,7 @@ def rigid_body_mass_matrix(robot: Robot, p: Bodies, q: Joints) -> JointMatrix:
     for i in reversed(range(n)):
         m, h, J = bodies[i]
         axis = robot.axis[i]
-        if robot.revolute[i]:
+        if robot.turns[i]:
             force = -jnp.cross(h, axis)
             moment = J @ axis
         else:
@@ -154,25 +158,25 @@ def rigid_body_mass_matrix(robot: Robot, p: Bodies, q: Joints) -> JointMatrix:
         # Every joint on the way to the ground feels the wrench.
         j = i
         while j >= 0:
-            component = moment if robot.revolute[j] else force
+            component = moment if robot.turns[j] else force
             M[i][j] = M[j][i] = jnp.dot(robot.axis[j], component)
             R, r = frames[j]
             force = R @ force
             moment = R @ moment + jnp.cross(r, force)
             j = robot.parent[j]
-    return jnp.stack([jnp.stack(row) for row in M])
+    rows = on_coordinates(robot.followers, jnp.stack([jnp.stack(row) for row in M]))
+    return on_coordinates(robot.followers, rows.T).T
 
 
 def composite_bodies(
     robot: Robot, p: Bodies, frames: list[tuple]
 ) -> list[tuple[AnyArray | float, Vector3, Matrix3]]:
     """Return mass, first moment and inertia of all that each joint carries."""
-    n = robot.joints
     bodies = []
     for numbers in p:
         tensor = inertia_tensor(numbers[4:])
         bodies.append((numbers[0], numbers[1:4], tensor))
-    for i in reversed(range(n)):
+    for i in reversed(robot.order):
         parent = robot.parent[i]
         if parent < 0:
             continue
@@ -196,7 +200,7 @@ def potential_energy_columns(robot: Robot, q: Joints) -> AnyArray:
     mass = -origins @ robot.gravity
     moment = -jnp.einsum("bij,i->bj", rotations, jnp.asarray(robot.gravity))
     return jnp.concatenate(
-        [mass[:, None], moment, jnp.zeros((robot.joints, 6))], axis=1
+        [mass[:, None], moment, jnp.zeros((robot.bodies, 6))], axis=1
     )
 
 

@@ -14,10 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxid.arrays import AnyArray, Array, Bodies, Float, JointMatrix, Joints
+from jaxid.robot.follower_joints import all_coordinates, all_rates, on_coordinates
 from jaxid.robot.inertia import inertia_tensor
 from jaxid.robot.robot import Robot
 
-Spatial = Float[Array, "joints 6"]
+Spatial = Float[Array, "bodies 6"]
 
 
 def _motion_products(skew: np.ndarray):
@@ -58,7 +59,7 @@ def _times(matrices: Array, x: Array):
 
 def moved_by(robot: Robot) -> np.ndarray:
     """Return 1 where a body (row) is moved by a joint (column), else 0."""
-    is_moved = np.zeros((robot.joints, robot.joints))
+    is_moved = np.zeros((robot.bodies, robot.bodies))
     for body, chain in enumerate(robot.ancestors):
         is_moved[body, list(chain)] = 1.0
     return is_moved
@@ -78,7 +79,7 @@ def all_placements(robot: Robot, q: Joints) -> Array:
     while (ancestors >= 0).any():
         # The placements of the bodies above, for each body; the ground's is one.
         has_body = ancestors >= 0
-        choice = np.eye(robot.joints)[ancestors] * has_body[:, None]
+        choice = np.eye(robot.bodies)[ancestors] * has_body[:, None]
         ground = np.eye(4) * ~has_body[:, None, None]
         choice = jnp.asarray(choice, dtype)
         placements_above = jnp.tensordot(choice, placements, 1)
@@ -90,7 +91,7 @@ def all_placements(robot: Robot, q: Joints) -> Array:
 
 def _bottom_rows(robot: Robot, dtype: Any):
     """Return the last rows of homogeneous matrices."""
-    return jnp.asarray(np.broadcast_to(np.eye(4)[3:], (robot.joints, 1, 4)), dtype)
+    return jnp.asarray(np.broadcast_to(np.eye(4)[3:], (robot.bodies, 1, 4)), dtype)
 
 
 def _relative_placements(robot: Robot, q: Joints):
@@ -99,10 +100,10 @@ def _relative_placements(robot: Robot, q: Joints):
     axis = jnp.asarray(robot.axis, dtype)
     rotation = jnp.asarray(robot.rotation, dtype)
     offset = jnp.asarray(robot.offset, dtype)
-    is_revolute = np.array(robot.revolute)[:, None, None]
+    is_revolute = np.array(robot.turns)[:, None, None]
     is_turning = jnp.asarray(is_revolute, dtype)
     slides = jnp.asarray(~is_revolute, dtype)
-    angle = q[:, None, None]
+    angle = all_coordinates(robot.followers, q)[:, None, None]
 
     # Rodrigues: I + sin(q) [axis] + (1 - cos(q)) [axis]^2, if the joint turns.
     identity = jnp.eye(3, dtype=dtype)[None]
@@ -123,7 +124,7 @@ def _relative_placements(robot: Robot, q: Joints):
 class GroundMotion(NamedTuple):
     """Motion of all bodies in spatial vectors about the origin of the ground."""
 
-    carry: Float[Array, "joints 6 6"]  # wrenches of the bodies' frames to the ground
+    carry: Float[Array, "bodies 6 6"]  # wrenches of the bodies' frames to the ground
     joints: Spatial  # motions of what the joints move, at unit speed
     v: Spatial  # velocities of the bodies
     a: Spatial  # accelerations of the bodies, less gravity
@@ -140,7 +141,7 @@ def ground_motion(robot: Robot, q: Joints, qd: Joints, qdd: Joints) -> GroundMot
     lower_rows = jnp.concatenate([jnp.zeros_like(R), R], axis=2)
     carry = jnp.concatenate([upper_rows, lower_rows], axis=1)
 
-    is_revolute = np.array(robot.revolute)[:, None]
+    is_revolute = np.array(robot.turns)[:, None]
     axis = jnp.asarray(robot.axis, dtype)
     turning_axes = jnp.where(is_revolute, axis, 0.0)
     sliding_axes = jnp.where(is_revolute, 0.0, axis)
@@ -149,11 +150,12 @@ def ground_motion(robot: Robot, q: Joints, qd: Joints, qdd: Joints) -> GroundMot
     joints = jnp.concatenate([angular_velocities, linear_velocities], axis=1)
 
     is_moved = jnp.asarray(moved_by(robot), dtype)
-    speeds = joints * qd[:, None]
+    speeds = joints * all_rates(robot.followers, qd)[:, None]
     # Sums over all joints that move a body replace the recursion along the tree.
     v = is_moved @ speeds
     crosses = _combine(CROSS, v)
-    rates = joints * qdd[:, None] + _times(crosses, speeds)
+    rates = joints * all_rates(robot.followers, qdd)[:, None]
+    rates = rates + _times(crosses, speeds)
     a = is_moved @ rates
     gravity = jnp.concatenate([jnp.zeros(3, dtype), jnp.asarray(robot.gravity, dtype)])
     return GroundMotion(carry, joints, v, a - gravity[None])
@@ -177,7 +179,8 @@ def spatial_forces(
     wrenches = _times(inertias, a) - rates
     # A joint feels the wrenches of all bodies that it moves (Newton and Euler).
     moved_wrenches = jnp.asarray(moved_by(robot).T, q.dtype) @ wrenches
-    return jnp.sum(joints * moved_wrenches, axis=1)
+    joint_forces = jnp.sum(joints * moved_wrenches, axis=1)
+    return on_coordinates(robot.followers, joint_forces)
 
 
 def spatial_mass_matrix(robot: Robot, p: Bodies, q: Joints) -> JointMatrix:
@@ -192,8 +195,10 @@ def spatial_mass_matrix(robot: Robot, p: Bodies, q: Joints) -> JointMatrix:
     # A joint feels the momenta of those that it carries; the matrix is symmetric.
     products = momenta @ motion.joints.T
     lower_triangle = is_moved * products
-    off_diagonal_mask = jnp.asarray(1.0 - np.eye(len(q)), q.dtype)
-    return lower_triangle + (lower_triangle * off_diagonal_mask).T
+    off_diagonal_mask = jnp.asarray(1.0 - np.eye(robot.bodies), q.dtype)
+    matrix = lower_triangle + (lower_triangle * off_diagonal_mask).T
+    rows = on_coordinates(robot.followers, matrix)
+    return on_coordinates(robot.followers, rows.T).T
 
 
 def spatial_regressor(robot: Robot, q: Joints, qd: Joints, qdd: Joints) -> Array:
@@ -212,4 +217,4 @@ def spatial_regressor(robot: Robot, q: Joints, qd: Joints, qdd: Joints) -> Array
     columns = jnp.einsum("js,bsk->jbk", joints, wrenches)
     # A joint feels only the bodies that it moves.
     is_moved = jnp.asarray(moved_by(robot).T, q.dtype)
-    return is_moved[:, :, None] * columns
+    return on_coordinates(robot.followers, is_moved[:, :, None] * columns)

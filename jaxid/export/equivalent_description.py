@@ -29,7 +29,7 @@ class Description(NamedTuple):
     """One of many descriptions of the same robot, with the same forces."""
 
     robot: Robot  # joints and frames
-    bodies: Float[np.ndarray, "joints 4 4"]  # pseudo-inertias
+    bodies: Float[np.ndarray, "bodies 4 4"]  # pseudo-inertias
 
     @property
     def cost(self) -> int:
@@ -39,7 +39,7 @@ class Description(NamedTuple):
         total = int(np.count_nonzero(self.bodies))
         for body, (*ancestors, _) in enumerate(robot.ancestors):
             # A length counts only in a frame that turns.
-            is_turned = any(robot.revolute[ancestor] for ancestor in ancestors)
+            is_turned = any(robot.turns[ancestor] for ancestor in ancestors)
             if is_turned and lengths[body]:
                 total += 4 + 6 * int(lengths[body])
         return total
@@ -59,10 +59,10 @@ class Description(NamedTuple):
         """
         robot = self.robot
         bodies = self.bodies.copy()
-        for body in reversed(range(robot.joints)):
+        for body in reversed(robot.order):
             inertia = bodies[body]
             passed_inertia = np.zeros((4, 4))
-            if robot.revolute[body]:
+            if robot.turns[body]:
                 passed_inertia = _on_axis(inertia, np.asarray(robot.axis[body]))
             else:
                 passed_inertia[:3, :3] = inertia[:3, :3]
@@ -96,7 +96,7 @@ def simplest_description(robot: Robot, parameters: BodyParameters) -> Descriptio
     """Return a description of a robot and its bodies that takes few operations."""
     frames = Description(robot, np.asarray(pseudo_inertia(parameters)))
     description = frames.carry_inward()
-    for body in range(robot.joints):
+    for body in range(robot.bodies):
         for distance in _distances_to_neighbours(frames.robot, body):
             candidate = frames.slide(body, distance)
             if candidate.carry_inward().cost < description.cost:
@@ -107,7 +107,7 @@ def simplest_description(robot: Robot, parameters: BodyParameters) -> Descriptio
 
 def _distances_to_neighbours(robot: Robot, body: int) -> list[float]:
     """Return the distances along the axis to the origins of parent and children."""
-    if not robot.revolute[body]:
+    if not robot.turns[body]:
         return []
     offset = np.asarray(robot.offset)
     axis = np.asarray(robot.axis[body])

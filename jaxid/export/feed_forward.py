@@ -17,10 +17,10 @@ from .equivalent_description import simplest_description
 
 def body_parameters(model: Model, p: Float[AnyArray, " standard"]) -> BodyParameters:
     """Return ten parameters of each body; zeros if the model leaves some out."""
-    bodies = np.zeros((model.robot.joints, 10))
+    bodies = np.zeros((model.robot.bodies, 10))
     for term, values in model.split(np.asarray(p, np.float64)):
         if term.body_parameters:
-            rows = np.asarray(values).reshape(model.robot.joints, -1)
+            rows = np.asarray(values).reshape(model.robot.bodies, -1)
             bodies[:, : term.body_parameters] += rows
     return bodies
 

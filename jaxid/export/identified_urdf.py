@@ -158,9 +158,11 @@ def _fix_joint(tree: UrdfTree, joint: Any) -> None:
 
 def _write_joints(tree: UrdfTree, robot: Robot, dynamics: JointDynamics) -> None:
     """Write the friction and the largest forces of the joints that the robot has."""
-    damping = dynamics.values["damping"]
-    friction = dynamics.values["friction"]
-    efforts = np.asarray(robot.known_max_forces)
+    # That of followers is part of their leaders'.
+    zeros = np.zeros(len(robot.followers))
+    damping = np.append(dynamics.values["damping"], zeros)
+    friction = np.append(dynamics.values["friction"], zeros)
+    efforts = np.append(robot.known_max_forces, zeros + np.inf)
     for i, joint in enumerate(tree.joints):
         element = _child(joint, "dynamics")
         element.set("damping", exact_text(damping[i]))
@@ -176,12 +178,20 @@ def _write_joints(tree: UrdfTree, robot: Robot, dynamics: JointDynamics) -> None
 
 def _require_same_robot(robot: Robot, file_robot: Robot, source: FilePath) -> None:
     """Reject a file of another robot; how the robot is mounted is not in the file."""
-    if robot.joint_names != file_robot.joint_names:
+    if robot.body_names != file_robot.body_names:
         raise InputError(
-            f"`{source}` has the joints {', '.join(file_robot.joint_names)}, "
-            f"but the fit has {', '.join(robot.joint_names)}: "
+            f"`{source}` has the joints {', '.join(file_robot.body_names)}, "
+            f"but the fit has {', '.join(robot.body_names)}: "
             "give the file of this robot, or its `tip`."
         )
+    for follower, other_follower in zip(
+        robot.followers, file_robot.followers, strict=True
+    ):
+        if follower != other_follower:
+            raise InputError(
+                f"joint `{follower.name}` follows another joint in `{source}` than in "
+                "the robot of the fit, or by other numbers: give its own file."
+            )
     for joint, name in enumerate(robot.joint_names):
         if robot.revolute[joint] != file_robot.revolute[joint]:
             words = "turns" if file_robot.revolute[joint] else "slides"

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from jaxid.arrays import AnyArray, Vector
 from jaxid.identification.fit_result import Fit
 from jaxid.io import FilePath, write_text
+from jaxid.robot.follower_joints import Follower
 from jaxid.robot.inertia import BodyParameters, Inertia
 from jaxid.robot.mjcf import exact_text
 from jaxid.robot.robot import Robot
@@ -70,18 +71,19 @@ def mjcf_text(
     world = etree.SubElement(root, "worldbody")
     actuators = etree.SubElement(root, "actuator")
 
-    elements: list[Any] = []
-    for i, parent in enumerate(robot.parent):
+    elements: dict[int, Any] = {-1: world}
+    for i in robot.order:
         body = E.body(
             _inertial(np.asarray(bodies)[i]),
             _joint(robot, i, dynamics),
-            name=f"{robot.joint_names[i]}_body",
+            name=f"{robot.body_names[i]}_body",
             **placement_attributes(robot.offset[i], robot.rotation[i]),
         )
-        parent_element = elements[parent] if parent >= 0 else world
-        parent_element.append(body)
-        elements.append(body)
-        actuators.append(_motor(robot, i))
+        elements[robot.parent[i]].append(body)
+        elements[i] = body
+    actuators.extend(_motor(robot, joint) for joint in range(robot.joints))
+    if robot.followers:
+        root.append(E.equality(*(_equality(robot, f) for f in robot.followers)))
     tip = placement_attributes(robot.tip_offset, robot.tip_rotation)
     elements[robot.tip_body].append(E.site(name="tip", **tip))
     return etree.tostring(root, pretty_print=True, encoding="unicode")
@@ -102,10 +104,13 @@ def _inertial(p: Vector) -> Any:
 def _joint(robot: Robot, i: int, dynamics: Quantities) -> Any:
     """Return the element of a joint, with its range where both ends are known."""
     element: Any = E.joint(
-        name=robot.joint_names[i],
-        type="hinge" if robot.revolute[i] else "slide",
+        name=robot.body_names[i],
+        type="hinge" if robot.turns[i] else "slide",
         axis=exact_text(robot.axis[i]),
     )
+    # What belongs to a follower is part of what belongs to its leader.
+    if i >= robot.joints:
+        return element
     for quantity, attribute in ATTRIBUTES.items():
         if quantity in dynamics and dynamics[quantity][i]:
             element.set(attribute, exact_text(dynamics[quantity][i]))
@@ -113,6 +118,15 @@ def _joint(robot: Robot, i: int, dynamics: Quantities) -> Any:
     if np.isfinite(ends).all():
         element.set("range", exact_text(ends))
     return element
+
+
+def _equality(robot: Robot, follower: Follower) -> Any:
+    """Return the element of the constraint that makes a joint follow another one."""
+    return E.joint(
+        joint1=follower.name,
+        joint2=robot.joint_names[follower.leader],
+        polycoef=exact_text((follower.offset, follower.factor, 0.0, 0.0, 0.0)),
+    )
 
 
 def _motor(robot: Robot, i: int) -> Any:

@@ -18,7 +18,7 @@ def pinocchio_parameters(fit: Fit) -> BodyParameters:
     Each row is an argument of `pinocchio.Inertia.FromDynamicParameters` and fits the
     columns of Pinocchio's `computeJointTorqueRegressor`:
     $(m, m r_c, I_{xx}, I_{xy}, I_{yy}, I_{xz}, I_{yz}, I_{zz})$. The rows are in the
-    order of the robot's joints. The forces are those of the fit even if the bodies
+    order of the robot's bodies. The forces are those of the fit even if the bodies
     cannot exist.
 
     Args:
@@ -38,9 +38,12 @@ def export_pinocchio(fit: Fit, path: FilePath) -> Path:
     dynamics = joint_dynamics(fit)
     rows = pinocchio_parameters(fit).tolist()
     joints = []
-    for i, name in enumerate(fit.base.model.robot.joint_names):
+    robot = fit.base.model.robot
+    for i, name in enumerate(robot.body_names):
+        # Followers have no friction of their own: it is part of their leaders'.
         joint_values = {
-            key: float(values[i]) for key, values in dynamics.values.items()
+            key: float(values[i]) if i < robot.joints else 0.0
+            for key, values in dynamics.values.items()
         }
         joints.append({"name": name, "parameters": rows[i], **joint_values})
     content = {

@@ -229,7 +229,8 @@ def _with_geometries(base: BaseParameters, robots: Sequence[Robot]):
     for other_robot in robots:
         is_alike = (
             other_robot.parent == robot.parent
-            and other_robot.revolute == robot.revolute
+            and other_robot.turns == robot.turns
+            and other_robot.followers == robot.followers
         )
         if not is_alike or other_robot.tool is not None:
             raise InputError(

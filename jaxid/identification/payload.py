@@ -264,9 +264,9 @@ def _wide_bounds(robot: Robot) -> BodyBounds:
 
 def body_columns(base: BaseParameters, body: int) -> np.ndarray:
     """Return what unit parameters of a load on a body add to base parameters."""
-    joints = base.model.robot.joints
-    if not 0 <= body < joints:
-        raise InputError(f"`body` must be from 0 to {joints - 1}, but is {body}.")
+    bodies = base.model.robot.bodies
+    if not 0 <= body < bodies:
+        raise InputError(f"`body` must be from 0 to {bodies - 1}, but is {body}.")
     names = list(base.model.parameter_names)
     columns = []
     for symbol in INERTIAL_NAMES:

@@ -218,7 +218,7 @@ def _details(report: Report, figures: Figures) -> Sections:
     table = report.validation.summary()
     yield "Torque errors", [text, figures["errors"], table]
     if fit.consistency is not None:
-        yield "Bodies", [body_table(fit.consistency, robot.joint_names)]
+        yield "Bodies", [body_table(fit.consistency, robot.body_names)]
     if fit.residual_spectra is not None:
         text = (
             "The residuals of a good model are noise. More power at low frequencies "

@@ -120,6 +120,9 @@ def pose_figure(
         # Each point has the largest value of all samples up to the next point.
         sizes = np.nan_to_num(np.abs(np.asarray(values, np.float64)))
         values = np.maximum.reduceat(sizes, rows, axis=0)
+        # A follower's link has the colour of its leader's.
+        leaders = [follower.leader for follower in robot.followers]
+        values = np.concatenate([values, values[:, leaders]], axis=1)
     scene = Scene(
         time=time[rows],
         points=_points(robot, q[rows]),

@@ -32,9 +32,9 @@ def in_words(name: str, model: Model) -> tuple[str, str]:
 
 def _joint(robot: Robot, number: str) -> str:
     """Return a joint by its number; nothing if the robot has no such joint."""
-    if not number or not 0 < int(number) <= robot.joints:
+    if not number or not 0 < int(number) <= robot.bodies:
         return ""
-    name = robot.joint_names[int(number) - 1]
+    name = robot.body_names[int(number) - 1]
     return name if name.lower().startswith("joint") else f"joint {name}"
 
 

@@ -128,7 +128,7 @@ def stand_in_capsules(robot: Robot, bodies: list[int]) -> list[Capsule]:
 
     capsules = []
     for body in bodies:
-        link = "base" if body == GROUND else f"link of {robot.joint_names[body]}"
+        link = "base" if body == GROUND else f"link of {robot.body_names[body]}"
         number = 0
         for carrier, end in zip(carriers, offsets, strict=True):
             if carrier != body or not end.any():

@@ -268,10 +268,10 @@ def _check_shapes(robot: Robot, capsules: Sequence[Capsule], names: list[str]):
         if names.count(name) > 1:
             raise InputError(f"two shapes are named `{name}`: rename one.")
     for capsule in capsules:
-        if not GROUND <= capsule.body < robot.joints:
+        if not GROUND <= capsule.body < robot.bodies:
             raise InputError(
                 f"`body` of capsule `{capsule.name}` must be from 0 to "
-                f"{robot.joints - 1}, or -1 for the ground, but is {capsule.body}."
+                f"{robot.bodies - 1}, or -1 for the ground, but is {capsule.body}."
             )
 
 

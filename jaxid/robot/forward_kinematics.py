@@ -12,6 +12,7 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Joints, Matrix3, Vector3
 
+from .follower_joints import all_coordinates, speed_ratios
 from .robot import Robot
 from .rotations import Rotations, Vectors, rotation_about
 
@@ -21,29 +22,34 @@ def placement_in_parent(
     body: int,
     q: AnyArray,
 ) -> tuple[Matrix3, Vector3]:
-    """Return attitude and origin [m] of a body in its parent at a coordinate."""
+    """Return attitude and origin [m] of a body in its parent at its joint's place."""
     R = robot.rotation[body]
     r = robot.offset[body]
     axis = robot.axis[body]
-    if robot.revolute[body]:
+    if robot.turns[body]:
         return R @ rotation_about(axis, q), r
     return R, r + R @ axis * q
 
 
 def placements(robot: Robot, q: Joints) -> tuple[Rotations, Vectors]:
     """Return attitudes and origins [m] of all bodies in the frame of the ground."""
-    q = jnp.asarray(q)
-    rotations = []
-    origins = []
-    for i, parent in enumerate(robot.parent):
+    q = all_coordinates(robot.followers, jnp.asarray(q))
+    rotations = {}
+    origins = {}
+    for i in robot.order:
         R, r = placement_in_parent(robot, i, q[i])
+        parent = robot.parent[i]
         if parent >= 0:
             R_parent = rotations[parent]
             R = R_parent @ R
             r = origins[parent] + R_parent @ r
-        rotations.append(R)
-        origins.append(r)
-    return jnp.stack(rotations), jnp.stack(origins)
+        rotations[i] = R
+        origins[i] = r
+    bodies = range(robot.bodies)
+    return (
+        jnp.stack([rotations[i] for i in bodies]),
+        jnp.stack([origins[i] for i in bodies]),
+    )
 
 
 def tip_placement(robot: Robot, q: Joints) -> tuple[Matrix3, Vector3]:
@@ -56,19 +62,27 @@ def tip_placement(robot: Robot, q: Joints) -> tuple[Matrix3, Vector3]:
 
 
 class TipJacobian(NamedTuple):
-    """Placements of the end-effector, and their derivatives by the joints.
+    """Placements of the end-effector, and their derivatives by all joints.
 
     Attributes:
         rotation: Attitudes on the ground [poses 3 3].
         position: Positions on the ground [m].
-        velocity: Velocities of the origin by the rates of the joints [poses joints 3].
-        turn: Angular velocities by the rates of the joints [poses joints 3].
+        velocity: Velocities of the origin by the rates of all joints in the order from
+            the ground [poses bodies 3].
+        turn: Angular velocities by the same rates [poses bodies 3].
+        ratios: These rates by those of the coordinates [bodies joints].
     """
 
     rotation: np.ndarray
     position: np.ndarray
     velocity: np.ndarray
     turn: np.ndarray
+    ratios: np.ndarray
+
+    @property
+    def slopes(self) -> np.ndarray:
+        """Velocities and angular velocities by the coordinates [poses joints 6]."""
+        return self.ratios.T @ np.concatenate([self.velocity, self.turn], axis=2)
 
 
 def tip_jacobian(robot: Robot, q: np.ndarray) -> TipJacobian:
@@ -78,6 +92,7 @@ def tip_jacobian(robot: Robot, q: np.ndarray) -> TipJacobian:
     axis = np.asarray(robot.axis)
 
     poses = len(q)
+    q = np.asarray(all_coordinates(robot.followers, q))
     R = np.broadcast_to(np.eye(3), (poses, 3, 3))
     r = np.zeros((poses, 3))
     origin, turn, slide = np.zeros((3, *q.shape, 3))
@@ -86,7 +101,7 @@ def tip_jacobian(robot: Robot, q: np.ndarray) -> TipJacobian:
         R = R @ rotation[i]
         direction = R @ axis[i]
         origin[:, i] = r
-        if robot.revolute[i]:
+        if robot.turns[i]:
             turn[:, i] = direction
             R = R @ rotation_about(axis[i], q[:, i])
         else:
@@ -97,7 +112,11 @@ def tip_jacobian(robot: Robot, q: np.ndarray) -> TipJacobian:
     attitude = R @ np.asarray(robot.tip_rotation)
     lever = position[:, None] - origin
     velocity = slide + np.cross(turn, lever)
-    return TipJacobian(attitude, position, velocity, turn)
+    order = list(robot.order)
+    ratios = speed_ratios(robot.followers, robot.joints)
+    return TipJacobian(
+        attitude, position, velocity[:, order], turn[:, order], ratios[order]
+    )
 
 
 def tip_curvature(
@@ -105,7 +124,7 @@ def tip_curvature(
     force: np.ndarray,
     moment: np.ndarray,
 ) -> np.ndarray:
-    """Return second derivatives of the placement, times a force and a moment.
+    """Return second derivatives by the coordinates, times a force and a moment.
 
     Attitudes count as rotation vectors from the attitude of the end-effector.
     """
@@ -116,4 +135,5 @@ def tip_curvature(
     position_part = np.einsum("pik,pjk->pij", force_arm, tip.velocity)
     attitude_part = np.einsum("pik,pjk->pij", moment_arm, tip.turn) / 2
     upper_triangle = np.triu(position_part + attitude_part)
-    return upper_triangle + np.swapaxes(np.triu(upper_triangle, 1), 1, 2)
+    curvature = upper_triangle + np.swapaxes(np.triu(upper_triangle, 1), 1, 2)
+    return tip.ratios.T @ curvature @ tip.ratios

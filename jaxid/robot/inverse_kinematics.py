@@ -151,8 +151,7 @@ def _newton_step(
     scale = task.half_range
     tip = tip_jacobian(task.robot, q)
     errors = _pose_errors(task, positions, tip)
-    tip_slopes = np.concatenate([tip.velocity, tip.turn], axis=2)
-    jacobian = tip_slopes * scale[:, None]
+    jacobian = tip.slopes * scale[:, None]
     hessian = np.eye(joints)
     if curved:
         force, moment = np.split(multipliers, 2, axis=1)

@@ -361,6 +361,8 @@ class _Writer:
             change = value - slope * coordinate
             attributes["joint"] = self._joints[master].get("name")
         ref = model.qpos0[model.jnt_qposadr[joint]]
+        if polynomial[2:].any():
+            attributes["nonlinear"] = "true"
         attributes["multiplier"] = exact_text(slope)
         attributes["offset"] = exact_text(ref + change)
         self._joints[joint].append(E.mimic(**attributes))

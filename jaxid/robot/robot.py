@@ -4,7 +4,6 @@ import dataclasses
 from typing import Any
 
 import equinox as eqx
-import jax
 import numpy as np
 
 from jaxid.arrays import (
@@ -14,7 +13,7 @@ from jaxid.arrays import (
     Matrix3,
     Numbers,
     Vector3,
-    as_array,
+    as_finite_array,
     given,
     is_traced,
     namespace,
@@ -22,6 +21,7 @@ from jaxid.arrays import (
 from jaxid.errors import InputError
 from jaxid.result_table import Column, Remark, Status, Summarised, Table
 
+from .follower_joints import Followers, order_from_ground
 from .inertia import IMPOSSIBLE, Inertia
 from .limits_and_drives import MAX_LENGTH, Drives, Limits, length_notes, limit_notes
 from .rotations import SNAP_TOLERANCE, snapped, snapped_rotations
@@ -79,6 +79,9 @@ class Tool(eqx.Module):
 class Robot(Summarised, eqx.Module):
     r"""An open kinematic chain or tree: joint $i$ moves body $i$ against its parent.
 
+    Bodies of joints that follow others come last, after those of all joints that move
+    alone and have coordinates, limits and drives.
+
     The frame of a body has its origin on the joint's axis. At $q_i = 0$ it is placed in
     its parent at `offset` with the attitude `rotation`; a revolute joint turns it about
     `axis`, a prismatic joint moves it along `axis`. Geometry may consist of NumPy
@@ -89,11 +92,12 @@ class Robot(Summarised, eqx.Module):
     Args:
         name: Name of the robot.
         revolute: For each joint whether it turns; a prismatic joint slides.
-        axis: Axes of the joints, in the frames of their bodies; of any length.
+        axis: Axes of all joints, in the frames of their bodies; of any length.
         rotation: Attitudes of the bodies in their parents at $q = 0$: columns are the
             body's axes.
         offset: Origins of the bodies in their parents at $q = 0$ [m].
         parent: Indices of the parent bodies, -1 for the ground; a serial chain if None.
+        followers: Joints that follow others.
         joint_names: Names of the joints; `joint1`, `joint2`, … if None.
         gravity: Acceleration of gravity in the frame of the ground [m/s²].
         limits: Joint limits; infinite if None.
@@ -117,10 +121,11 @@ class Robot(Summarised, eqx.Module):
     _: dataclasses.KW_ONLY
     joint_names: tuple[str, ...] = eqx.field(static=True, converter=given, default=None)
     parent: tuple[int, ...] = eqx.field(static=True, converter=given, default=None)
+    followers: Followers = ()
     revolute: tuple[bool, ...] = eqx.field(static=True)
-    axis: Float[AnyArray, "*geometry joints 3"] = eqx.field(converter=given)
-    rotation: Float[AnyArray, "*geometry joints 3 3"] = eqx.field(converter=given)
-    offset: Float[AnyArray, "*geometry joints 3"] = eqx.field(converter=given)
+    axis: Float[AnyArray, "*geometry bodies 3"] = eqx.field(converter=given)
+    rotation: Float[AnyArray, "*geometry bodies 3 3"] = eqx.field(converter=given)
+    offset: Float[AnyArray, "*geometry bodies 3"] = eqx.field(converter=given)
     gravity: Float[AnyArray, "*geometry 3"] = eqx.field(
         converter=given, default=GRAVITY
     )
@@ -137,12 +142,12 @@ class Robot(Summarised, eqx.Module):
     notes: tuple[str, ...] = eqx.field(static=True, default=())
 
     def __post_init__(self):
-        n = len(self.revolute)
-        if n == 0:
+        if not self.revolute:
             raise InputError(
                 "`revolute` must have one entry for each joint, but is empty."
             )
-        self._set_defaults(n)
+        n = self.bodies
+        self._set_defaults()
         self.joint_names = tuple(self.joint_names)
         self.parent = tuple(int(body) for body in self.parent)
         self.revolute = tuple(bool(turns) for turns in self.revolute)
@@ -154,53 +159,47 @@ class Robot(Summarised, eqx.Module):
         self.tip_rotation = as_rotations("`tip_rotation`", self.tip_rotation, (3, 3))
         self.tip_offset = as_finite_array("`tip_offset`", self.tip_offset, (3,))
         self._check_joints()
+        self._check_bodies()
 
         doubts = limit_notes(self.joint_names, self.revolute, self.limits)
         notes = (*self.notes, *self._length_notes(), *doubts)
         # A copy finds the notes of its original again.
         self.notes = tuple(dict.fromkeys(notes))
 
-    def _set_defaults(self, joints: int):
+    def _set_defaults(self):
         """Fill in what follows from the number of joints where it is not given."""
+        joints = self.joints
         if not self.joint_names:
             self.joint_names = tuple(f"joint{i + 1}" for i in range(joints))
         if self.parent is None:
-            self.parent = tuple(range(-1, joints - 1))
+            self.parent = tuple(range(-1, self.bodies - 1))
         if self.limits is None:
             self.limits = Limits(joints)
         if self.drives is None:
             self.drives = Drives(joints)
         if self.tip_body is None:
-            self.tip_body = joints - 1
+            self.tip_body = self.bodies - 1
         if self.tip_rotation is None:
             self.tip_rotation = np.eye(3)
 
     def _check_joints(self):
-        """Reject names, parents and bodies that do not fit the number of joints."""
-        n = len(self.revolute)
-        is_in_order = all(-1 <= p < i for i, p in enumerate(self.parent))
-        if len(self.parent) != n or not is_in_order:
-            raise InputError(
-                "`parent` must hold an earlier body, or -1, "
-                f"for each of {n}, but is {self.parent}."
-            )
-        if len(self.joint_names) != n or len(set(self.joint_names)) != n:
+        """Reject names, leaders and numbers that do not fit the number of joints."""
+        n = self.joints
+        if len(self.joint_names) != n or len(set(self.body_names)) != self.bodies:
             raise InputError(
                 f"`joint_names` must be {n} different names, but is {self.joint_names}."
             )
         # Names are written to files and terminals.
-        for name in (self.name, *self.joint_names):
+        for name in (self.name, *self.body_names):
             if not name.isprintable():
                 raise InputError(
                     f"the name {name!r} must be printable: remove the characters."
                 )
-        bodies = {"tip_body": self.tip_body}
-        if self.tool is not None:
-            bodies["tool.body"] = self.tool.body
-        for field, body in bodies.items():
-            if not 0 <= body < n:
+        for follower in self.followers:
+            if not 0 <= follower.leader < n:
                 raise InputError(
-                    f"`{field}` must be a body from 0 to {n - 1}, but is {body}."
+                    f"`leader` of `{follower.name}` must be a joint that moves alone, "
+                    f"from 0 to {n - 1}, but is {follower.leader}."
                 )
         numbers = {"limits": self.limits.force, "drives": self.drives.zero}
         for field, entries in numbers.items():
@@ -210,11 +209,36 @@ class Robot(Summarised, eqx.Module):
                     f"like the robot, but are of {entries.shape[-1]}."
                 )
 
+    def _check_bodies(self):
+        """Reject parents and bodies that do not exist, or that form no tree."""
+        n = self.bodies
+        exist = len(self.parent) == n and all(-1 <= p < n for p in self.parent)
+        order = self.order if exist else ()
+        # Only the bodies of followers, which come last, may carry earlier ones.
+        is_sorted = order == tuple(range(n)) or bool(self.followers)
+        places = {body: place for place, body in enumerate((-1, *order))}
+        is_tree = exist and all(
+            places[p] < places[i] for i, p in enumerate(self.parent)
+        )
+        if not (is_sorted and is_tree):
+            raise InputError(
+                "`parent` must hold an earlier body, or -1, "
+                f"for each of {n}, but is {self.parent}."
+            )
+        bodies = {"tip_body": self.tip_body}
+        if self.tool is not None:
+            bodies["tool.body"] = self.tool.body
+        for field, body in bodies.items():
+            if not 0 <= body < n:
+                raise InputError(
+                    f"`{field}` must be a body from 0 to {n - 1}, but is {body}."
+                )
+
     def _length_notes(self):
         """Reject offsets that no robot has; return notes on some that may be in mm."""
         lengths = {"`tip_offset`": self.tip_offset}
         if self.offset.ndim == 2:
-            for name, offset in zip(self.joint_names, self.offset, strict=True):
+            for name, offset in zip(self.body_names, self.offset, strict=True):
                 lengths[f"`offset` of joint `{name}`"] = offset
         notes = []
         for owner, offset in lengths.items():
@@ -229,17 +253,36 @@ class Robot(Summarised, eqx.Module):
 
     @property
     def joints(self) -> int:
-        """Number of joints, which is the number of bodies."""
-        return len(self.parent)
+        """Number of joints that move alone, which is that of coordinates."""
+        return len(self.revolute)
+
+    @property
+    def bodies(self) -> int:
+        """Number of bodies, those of followers included."""
+        return len(self.revolute) + len(self.followers)
+
+    @property
+    def turns(self) -> tuple[bool, ...]:
+        """For each body whether its joint turns."""
+        return (*self.revolute, *(f.revolute for f in self.followers))
+
+    @property
+    def body_names(self) -> tuple[str, ...]:
+        """Names of the joints that move the bodies."""
+        return (*self.joint_names, *(f.name for f in self.followers))
+
+    @property
+    def order(self) -> tuple[int, ...]:
+        """Bodies in an order in which each comes after the one that carries it."""
+        return order_from_ground(self.parent)
 
     @property
     def ancestors(self) -> tuple[tuple[int, ...], ...]:
-        """For every body the joints that move it, from the ground to its own."""
-        chains: list[tuple[int, ...]] = []
-        for joint, parent in enumerate(self.parent):
-            parent_chain = chains[parent] if parent >= 0 else ()
-            chains.append((*parent_chain, joint))
-        return tuple(chains)
+        """For every body those from the ground to itself, whose joints move it."""
+        chains: dict[int, tuple[int, ...]] = {-1: ()}
+        for body in self.order:
+            chains[body] = (*chains[self.parent[body]], body)
+        return tuple(chains[body] for body in range(self.bodies))
 
     @property
     def known_max_forces(self) -> Joints:
@@ -371,13 +414,16 @@ class Robot(Summarised, eqx.Module):
 
     def summary(self) -> Table:
         """Return a table of the joints: parents, ranges, speeds and largest forces."""
-        names = ("ground", *self.joint_names)
+        names = ("ground", *self.body_names)
         units = [self.joint_unit(j) for j in range(self.joints)]
         limits = self.limits
-        tip_carrier = self.joint_names[self.tip_body]
+        tip_carrier = self.body_names[self.tip_body]
         facts = [("end-effector", f"on the body of `{tip_carrier}`")]
+        for follower in self.followers:
+            relation = follower.relation(self.joint_names[follower.leader])
+            facts.append((f"joint `{follower.name}`", relation))
         if self.tool is not None:
-            carrier = self.joint_names[self.tool.body]
+            carrier = self.body_names[self.tool.body]
             mass = float(self.tool.mass)
             facts.append(("tool", f"{mass:.3g} kg on the body of `{carrier}`"))
         if self.source:
@@ -385,7 +431,7 @@ class Robot(Summarised, eqx.Module):
         return Table(
             f"{self.name}: {self.joints} joints",
             Column("joint", self.joint_names),
-            Column("parent", [names[p + 1] for p in self.parent]),
+            Column("parent", [names[p + 1] for p in self.parent[: self.joints]]),
             Column("unit", units),
             Column("from", np.asarray(limits.position_min)),
             Column("to", np.asarray(limits.position_max)),
@@ -425,19 +471,6 @@ def complete_limits(robot: Robot) -> Limits:
         velocity=velocity,
         acceleration=np.where(has_acceleration, limits.acceleration, velocity / 0.25),
     )
-
-
-def as_finite_array(name: str, value: Numbers, shape: tuple[int, ...]) -> AnyArray:
-    """Return an array of finite numbers; that of JAX may have leading axes."""
-    array = as_array(name, value)
-    if not isinstance(array, jax.Array):
-        array = np.array(array, np.float64)
-    trailing_shape = array.shape[array.ndim - len(shape) :]
-    if trailing_shape != shape:
-        raise InputError(f"{name} must have the shape {shape}, but has {array.shape}.")
-    if isinstance(array, np.ndarray) and not np.isfinite(array).all():
-        raise InputError(f"{name} must hold finite numbers.")
-    return array
 
 
 def _unit_axes(axes: AnyArray):

@@ -13,10 +13,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Array, Float, Matrix3, Numbers, Vector3
+from jaxid.arrays import (
+    AnyArray,
+    Array,
+    Float,
+    Matrix3,
+    Numbers,
+    Vector3,
+    as_finite_array,
+)
 from jaxid.errors import InputError
 
-from .robot import as_finite_array, as_rotations
+from .robot import as_rotations
 from .rotations import Vectors
 
 GROUND = -1

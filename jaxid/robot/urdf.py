@@ -9,6 +9,7 @@ import numpy as np
 from jaxid.arrays import AnyArray, Joints, Numbers
 from jaxid.errors import InputError
 
+from .follower_joints import Followers, all_coordinates, speed_ratios
 from .inertia import IMPOSSIBLE, MAX_DENSITY, ball_densities
 from .limits_and_drives import (
     MAX_STATED_ANGLE,
@@ -19,7 +20,7 @@ from .limits_and_drives import (
 )
 from .robot import Robot
 from .urdf_elements import ORIGIN
-from .urdf_tree import TURNING_TYPES, UrdfTree, link_names
+from .urdf_tree import TURNING_TYPES, UrdfTree
 
 MIN_RANGE = 1e-6
 """Length of a range below which it is empty, up to rounding [rad or m]."""
@@ -27,8 +28,6 @@ MAX_MAGNITUDE = 1e7
 """Largest speed or force that a file can state; larger ones are no limits."""
 PLACEHOLDER_MASS = 0.01
 """Mass that files state for links which nobody has weighed [kg]."""
-MAX_FINGER_SHARE = 0.05
-"""Share of the moving mass above which a joint moves more than a finger."""
 
 
 def load_urdf(
@@ -81,10 +80,10 @@ def load_urdf(
             other units; if `xacro` or MuJoCo cannot read it or is missing.
     """
     tree = UrdfTree(path, base=base, tip=tip, xacro_arguments=xacro_arguments)
-    _refuse_loaded_followers(tree)
     limits, limit_notes = _limits(tree)
     notes = (
         *_held_notes(tree),
+        *_follower_notes(tree),
         *_effect_notes(tree),
         *limit_notes,
         *_negative_notes(tree),
@@ -96,16 +95,18 @@ def load_urdf(
         if base_rotation is None:
             gravity = tree.base_gravity
             notes = (*_mount_notes(tree, base), *notes)
+    joints = tree.leading_joints
     tip_body, tip_rotation, tip_offset = tree.carriers[tree.tip]
     try:
         robot = Robot(
             tree.name,
             parent=tuple(placement.body for placement in tree.placements),
-            revolute=tuple(joint.get("type") in TURNING_TYPES for joint in tree.joints),
+            revolute=[joint.get("type") in TURNING_TYPES for joint in joints],
+            followers=tree.followers,
             axis=tree.axes,
             rotation=[placement.rotation for placement in tree.placements],
             offset=[placement.position for placement in tree.placements],
-            joint_names=tuple(joint.get("name") for joint in tree.joints),
+            joint_names=tuple(joint.get("name") for joint in joints),
             gravity=gravity,
             limits=limits,
             tip_body=tip_body,
@@ -155,7 +156,6 @@ def urdf_parameters(
             cannot exist.
     """
     tree = UrdfTree(path, base=base, tip=tip, xacro_arguments=xacro_arguments)
-    _refuse_loaded_followers(tree)
     return tree.bodies(check=check).ravel()
 
 
@@ -169,8 +169,8 @@ def joint_parameters(
     """Return `armature`, `damping`, dry `friction` and springs that a file claims.
 
     Springs have a `stiffness` [N m/rad or N/m] and a position of rest, `springref` [rad
-    or m]. All are zero where the file claims none. Arguments and errors are those of
-    `load_urdf`.
+    or m]. All are zero where the file claims none. Those of joints that follow others
+    count at the joints that they follow. Arguments and errors are those of `load_urdf`.
     """
     tree = UrdfTree(path, base=base, tip=tip, xacro_arguments=xacro_arguments)
     parameters = {}
@@ -178,37 +178,35 @@ def joint_parameters(
         elements = [joint.find("dynamics") for joint in tree.joints]
         values = [tree.numbers(element, key, (0.0,))[0] for element in elements]
         parameters[key] = np.array(values)
+    if tree.followers:
+        return _of_leaders(tree.followers, parameters)
     return parameters
 
 
-def _refuse_loaded_followers(tree: UrdfTree):
-    """Reject joints that follow others and carry more than fingers.
-
-    Where they move, a finger hardly changes the forces of an arm, but a link does.
-    """
-    total = sum(tree.mass(link) for link in tree.moving_links)
-    for joint, master in tree.followers():
-        branch = list(tree.branch(joint))
-        mass = sum(tree.mass(link_names(x)[1]) for x in branch)
-        carries_chain = any(x in tree.joints for x in branch)
-        if carries_chain or mass > MAX_FINGER_SHARE * total:
-            raise tree.error(
-                joint,
-                f"follows joint `{master.get('name')}` and carries {mass:.3g} of "
-                f"{total:.3g} kg, which no model describes: make it fixed if it stands "
-                "still in the logs, as fingers may, or remove the constraint "
-                "(`<mimic>`, `<equality>`) if the logs have its own angle and force",
-            )
+def _of_leaders(followers: Followers, parameters: dict[str, Joints]):
+    """Return parameters of all joints as those of the joints that move alone."""
+    joints = len(parameters["armature"]) - len(followers)
+    ratios = speed_ratios(followers, joints).T
+    sums = {
+        key: ratios**2 @ parameters[key] for key in ("armature", "damping", "stiffness")
+    }
+    sums["friction"] = np.abs(ratios) @ parameters["friction"]
+    # The springs of all joints are one spring, which rests where their forces cancel.
+    positions = all_coordinates(followers, np.zeros(joints))
+    deflections = positions - parameters["springref"]
+    forces = ratios @ (parameters["stiffness"] * deflections)
+    stiffness = np.where(sums["stiffness"] > 0.0, sums["stiffness"], np.inf)
+    return sums | {"springref": -forces / stiffness}
 
 
 def _limits(tree: UrdfTree):
     """Return the limits of all joints, and notes on those that are taken as unknown."""
-    joints = len(tree.joints)
+    joints = len(tree.leading_joints)
     low = np.empty(joints)
     high = np.empty(joints)
     magnitudes = {key: np.full(joints, np.inf) for key in ("velocity", "effort")}
     unknown_limits: dict[str, list[str]] = {}
-    for i, joint in enumerate(tree.joints):
+    for i, joint in enumerate(tree.leading_joints):
         name = joint.get("name")
         low[i], high[i] = _checked_range(tree, joint)
         stated_low, stated_high = tree.range(joint)
@@ -222,6 +220,7 @@ def _limits(tree: UrdfTree):
                 values[i] = value
             else:
                 unknown_limits.setdefault(f"{key} {value:g}", []).append(name)
+    _limit_by_followers(tree, low, high, magnitudes["velocity"])
     limits = Limits(
         position_min=low,
         position_max=high,
@@ -241,6 +240,28 @@ def _limits(tree: UrdfTree):
         names = owners("joint", soft_joints)
         notes.append(f"{names}: soft limits (`<safety_controller>`) narrow the range.")
     return limits, notes
+
+
+def _limit_by_followers(
+    tree: UrdfTree, low: np.ndarray, high: np.ndarray, velocity: np.ndarray
+):
+    """Narrow the limits of joints, in place, by those of their followers."""
+    joints = tree.joints[len(low) :]
+    for joint, follower in zip(joints, tree.followers, strict=True):
+        leader = follower.leader
+        follower_ends = np.array(_checked_range(tree, joint))
+        ends = np.sort((follower_ends - follower.offset) / follower.factor)
+        low[leader] = max(low[leader], ends[0])
+        high[leader] = min(high[leader], ends[1])
+        speed = tree.limit(joint, "velocity", np.inf)
+        if speed > 0.0:
+            velocity[leader] = min(velocity[leader], speed / abs(follower.factor))
+        if low[leader] >= high[leader]:
+            raise tree.error(
+                joint,
+                "has a range that it leaves wherever the joint that it follows may be: "
+                "correct the `<limit>` of both, or `multiplier` and `offset`",
+            )
 
 
 def _checked_range(tree: UrdfTree, joint: Any):
@@ -297,6 +318,17 @@ def _held_notes(tree: UrdfTree):
         links = owners("link", tree.objects)
         notes.append(f"{links}: left out, as objects that float freely.")
     return notes
+
+
+def _follower_notes(tree: UrdfTree):
+    """Return notes on joints that follow others and move bodies of the robot."""
+    for follower in tree.followers:
+        leader_name = tree.joints[follower.leader].get("name")
+        yield (
+            f"joint `{follower.name}`: follows another one, at "
+            f"{follower.relation(leader_name)}; its body is part of the model, its "
+            f"friction counts as that of `{leader_name}`."
+        )
 
 
 def _effect_notes(tree: UrdfTree):

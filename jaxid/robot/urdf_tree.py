@@ -1,6 +1,6 @@
 """Links and joints of URDF, xacro and MJCF files, merged into the bodies of a robot."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ from jaxid.arrays import Matrix3, Vector3
 from jaxid.errors import InputError
 
 from .description_files import is_mjcf, read_description
+from .follower_joints import Followers, loaded_followers, relation, resolved_followers
 from .inertia import BodyParameters, Inertia
 from .limits_and_drives import are_degrees, listed
 from .mjcf import Loop
@@ -38,11 +39,13 @@ class UrdfTree(UrdfElements):
         tilting_joints: Elements of these joints, as far as they tilt the base, or can.
         links: Elements of the links, by name.
         carriers: For each link its placement on the body that carries it.
-        joints: Elements of the moving joints.
-        axes: Axes of these joints.
+        named_joints: Elements of all joints, by name.
+        joints: Elements of the moving joints; those that follow others come last.
+        followers: How these follow others.
+        axes: Axes of the moving joints.
         placements: Placements of the bodies that they move, on the bodies that carry
             them.
-        mimics: Elements of joints that mimic others.
+        mimics: Elements of joints that mimic others and are held.
         side_joints: Elements of joints on moving bodies that lead to no link of the
             chain.
         effects: Effects on forces of bodies that the default model leaves out.
@@ -66,13 +69,13 @@ class UrdfTree(UrdfElements):
         name = self.root.get("name") or Path(path).stem
         self.name = "".join(c if c.isprintable() else " " for c in name)
         self.links = self.named("link")
-        self._joints = self.named("joint")
+        self.named_joints = self.named("joint")
         if self.root.find("joint/parent[@link='world']") is not None:
             # Simulators know this link, so that many files do not define it.
             self.links.setdefault("world", etree.Element("link", name="world"))
         self._below: dict[str, list[Any]] = {link: [] for link in self.links}
         self._above: dict[str, Any] = {}
-        for joint in self._joints.values():
+        for joint in self.named_joints.values():
             self._add(joint)
 
         root = self._find_root()
@@ -82,18 +85,18 @@ class UrdfTree(UrdfElements):
                     f"`{argument}` must be a link of `{self.path}`, but is `{link}`; "
                     f"its links are {listed(list(self.links))}."
                 )
-        self.joints = []
-        self.axes = []
-        self.placements: list[Placement] = []
-        self.mimics = []
-        self.side_joints = []
-        self.objects = []
-        self.carriers: dict[str, Placement] = {}
+        self.followers: Followers = ()
         self.base_gravity = np.array(self.gravity, np.float64)
         self.tilting_joints = []
         for joint in reversed(self._chain(root, base or root)):
             self._turn_gravity(joint)
         self._merge(base or root, tip)
+        # The bodies tell which followers move more than a finger.
+        tip_chain = [] if tip is None else self._chain(base or root, tip)
+        followers = loaded_followers(self, tip_chain)
+        if followers:
+            self._merge(base or root, tip, followers)
+            self._put_last(followers)
         self._refuse_loops(loops)
         links = ("", *self.moving_links)
         self.effects = [effect for effect in effects if effect.link in links]
@@ -155,10 +158,19 @@ class UrdfTree(UrdfElements):
             self.tilting_joints.append(joint)
         self.base_gravity = gravity + 0.0  # makes -0.0 positive
 
-    def _merge(self, base: str, tip: str | None):
-        """Merge links on fixed joints into the bodies that carry them, depth first."""
-        chain = None if tip is None else self._chain(base, tip)
-        self.carriers[base] = Placement(-1, np.eye(3), np.zeros(3))
+    def _merge(self, base: str, tip: str | None, followers: Sequence[Any] = ()):
+        """Merge links on fixed joints into the bodies that carry them, depth first.
+
+        Joints that mimic others are held, unless they are among the followers.
+        """
+        self.joints = []
+        self.axes = []
+        self.placements: list[Placement] = []
+        self.mimics = []
+        self.side_joints = []
+        self.objects = []
+        chain = None if tip is None else [*self._chain(base, tip), *followers]
+        self.carriers = {base: Placement(-1, np.eye(3), np.zeros(3))}
         # Numbers of moving joints and of links on the way from the base.
         lengths = {base: (0, 0)}
         # A stack in reverse order gives the joints of a link in the order of the file.
@@ -175,7 +187,8 @@ class UrdfTree(UrdfElements):
             if joint.get("type") == "floating" and not self._moves_below(joint):
                 self.objects.append(child)
                 continue
-            if not is_fixed and joint.find("mimic") is not None:
+            is_mimic = joint.find("mimic") is not None and joint not in followers
+            if not is_fixed and is_mimic:
                 is_fixed = True
                 self.mimics.append(joint)
             if is_fixed:
@@ -209,6 +222,24 @@ class UrdfTree(UrdfElements):
         self.axes.append(self._axis(joint))
         self.placements.append(placement)
 
+    def _put_last(self, followers: Sequence[Any]):
+        """Put the bodies of followers behind those of the joints that they follow."""
+        bodies = range(len(self.joints))
+        order = sorted(bodies, key=lambda body: self.joints[body] in followers)
+        numbers = {body: place for place, body in enumerate([-1, *order], -1)}
+        self.joints = [self.joints[body] for body in order]
+        self.axes = [self.axes[body] for body in order]
+        sorted_placements = [self.placements[body] for body in order]
+        self.placements = [x._replace(body=numbers[x.body]) for x in sorted_placements]
+        for link, carrier in self.carriers.items():
+            self.carriers[link] = carrier._replace(body=numbers[carrier.body])
+        self.followers = resolved_followers(self, followers)
+
+    @property
+    def leading_joints(self) -> list[Any]:
+        """Elements of the moving joints that follow no others."""
+        return self.joints[: len(self.joints) - len(self.followers)]
+
     def placed_links(self) -> dict[str, Placement]:
         """Return `carriers`, and links on joints that the chain leaves out."""
         placements = dict(self.carriers)
@@ -232,25 +263,6 @@ class UrdfTree(UrdfElements):
                     f"between `{first_link}` and `{second_link}` closes a loop: "
                     "avoid it (`tip`, `--tip`), or remove it."
                 )
-
-    def followers(self) -> Iterator[tuple[Any, Any]]:
-        """Yield joints that follow others near the chain, with those that they follow.
-
-        Bars beside the chain may follow its joints, too.
-        """
-        for joint in self._joints.values():
-            master = self._master(joint)
-            is_near = joint in self.mimics or master in self.joints
-            if master is not None and is_near:
-                yield joint, master
-
-    def _master(self, joint: Any):
-        """Return the joint that another one follows; None if it stands still."""
-        mimic = joint.find("mimic")
-        (multiplier,) = self.numbers(mimic, "multiplier", (1.0,))
-        if mimic is None or multiplier == 0.0 or joint.get("type") == "fixed":
-            return None
-        return self._joints.get(mimic.get("joint"))
 
     @property
     def moving_links(self) -> list[str]:
@@ -279,20 +291,11 @@ class UrdfTree(UrdfElements):
         It is as near to zero as the range of the joint allows, or that of the joint
         that it mimics.
         """
-        factor = 1.0
-        offset = 0.0
-        chain = []
-        while joint is not None and joint not in chain:
-            chain.append(joint)
-            mimic_element = joint.find("mimic")
-            if mimic_element is None:
-                low, high = self.range(joint)
-                return offset + factor * min(max(0.0, low), high)
-            offset += factor * float(self.numbers(mimic_element, "offset", (0.0,))[0])
-            factor *= float(self.numbers(mimic_element, "multiplier", (1.0,))[0])
-            joint = self._joints.get(mimic_element.get("joint"))
-        # A constraint without a joint, with an unknown one, or a circle of mimics.
-        return offset
+        leader, factor, offset, _ = relation(self, joint)
+        if leader is None:
+            return offset
+        low, high = self.range(leader)
+        return offset + factor * min(max(0.0, low), high)
 
     def held_pose(self, joint: Any) -> tuple[Matrix3, Vector3]:
         """Return attitude and origin [m] of a held joint's link in its parent."""

@@ -44,7 +44,7 @@ class DriveTrain(Hashable):
         M = model.inertia(p, q)
         h = model.bias(p, q, qd)
         if robot.tool is not None:
-            bodies = np.zeros((robot.joints, 10))
+            bodies = np.zeros((robot.bodies, 10))
             bodies[robot.tool.body] = robot.tool.parameters
             M = M + rigid_body_mass_matrix(robot, jnp.asarray(bodies), q)
             h = h + model.known_forces(q, qd, jnp.zeros_like(q))

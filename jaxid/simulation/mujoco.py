@@ -37,9 +37,15 @@ class MujocoRobot(VirtualRobot):
 
         Raises:
             InputError: If the equations of motion contain more than bodies and rotors,
-                or MuJoCo is not installed.
+                a joint follows another one, or MuJoCo is not installed.
         """
         mujoco = import_mujoco()
+        if self.robot.followers:
+            raise InputError(
+                f"joint `{self.robot.followers[0].name}` follows another one, which "
+                "MuJoCo holds to it by a soft constraint only: simulate with "
+                "`jid.VirtualRobot`."
+            )
         friction = self.present_friction
         rotors = np.diagonal(self._drive_inertia())
         joints = {

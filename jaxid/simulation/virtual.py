@@ -55,7 +55,7 @@ def random_bodies(
         masses: Masses of the bodies [kg].
         random: Random number generator.
     """
-    bodies = np.empty((robot.joints, 10))
+    bodies = np.empty((robot.bodies, 10))
     for i, mass in enumerate(np.asarray(masses)):
         children = [c for c, parent in enumerate(robot.parent) if parent == i]
         end = np.asarray(robot.offset[children[0]] if children else robot.tip_offset)

@@ -8,10 +8,10 @@ from typing import NamedTuple
 import equinox as eqx
 import numpy as np
 
-from jaxid.arrays import AnyArray, Matrix3, Numbers, Vector3
+from jaxid.arrays import AnyArray, Matrix3, Numbers, Vector3, as_finite_array
 from jaxid.errors import InputError
 from jaxid.robot.inverse_kinematics import inverse_kinematics_along
-from jaxid.robot.robot import Robot, as_finite_array, as_rotations
+from jaxid.robot.robot import Robot, as_rotations
 
 from .spline import (
     DEGREE,

@@ -70,7 +70,7 @@ class IdentificationReport(Summarised, Report):
         tables.append(fit.summary())
 
         if fit.consistency is not None:
-            tables.append(body_table(fit.consistency, robot.joint_names))
+            tables.append(body_table(fit.consistency, robot.body_names))
         verdict, *criteria = self.judgement
         critical_remarks = [
             x for x in criteria if x.status in (Status.DOUBTFUL, Status.BAD)

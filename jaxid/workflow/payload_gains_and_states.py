@@ -164,7 +164,7 @@ def identify_payload_from_logs(
     )
     estimates += estimate_rows(CENTRAL_NAMES, CENTRAL_UNITS, *payload.central)
     content = {key: getattr(payload, key) for key in PAYLOAD_KEYS}
-    content["body"] = setup.robot.joint_names[payload.body]
+    content["body"] = setup.robot.body_names[payload.body]
     return RunsReport("payload", payload, estimates, content, runs.sources, runs.doubts)
 
 

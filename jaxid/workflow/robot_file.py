@@ -120,10 +120,10 @@ def _named_bodies(bodies: np.ndarray) -> dict[str, float]:
 
 
 def joint_number(robot: Robot, name: str, key: str = "body") -> int:
-    """Return the index of the joint that a key or an option names."""
-    if name not in robot.joint_names:
+    """Return the index of the body whose joint a key or an option names."""
+    if name not in robot.body_names:
         raise InputError(
             f"`{key}` must be the name of the joint that moves it "
-            f'({", ".join(robot.joint_names)}), but is "{name}".'
+            f'({", ".join(robot.body_names)}), but is "{name}".'
         )
-    return robot.joint_names.index(name)
+    return robot.body_names.index(name)

@@ -287,8 +287,9 @@ class Setup(eqx.Module):
         coefficients = np.full(joints, np.inf)
         for _ in range(MAX_LOAD_FRICTION_FITS):
             # The columns of the bodies come first, whatever follows.
-            size = joints * len(INERTIAL_NAMES)
-            bodies = np.asarray(fit.full_parameters)[:size].reshape(joints, -1)
+            size = self.robot.bodies * len(INERTIAL_NAMES)
+            body_parameters = np.asarray(fit.full_parameters)[:size]
+            bodies = body_parameters.reshape(self.robot.bodies, -1)
             load_friction = LoadFriction(bodies=bodies, transition=transition)
             base = base_parameters(Model(self.robot, (*terms, load_friction)))
             rows = RegressionProblem(base, logs)

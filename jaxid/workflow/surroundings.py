@@ -153,7 +153,7 @@ def substitute_capsules(robot: Robot, capsules: Sequence[Capsule]) -> list[Capsu
     """Return capsules for bodies of which no shape is known."""
     # The base may be a frame alone.
     first_body = 0 if capsules else GROUND
-    bodies = {*range(first_body, robot.joints)} - {x.body for x in capsules}
+    bodies = {*range(first_body, robot.bodies)} - {x.body for x in capsules}
     return list(stand_in_capsules(robot, sorted(bodies)))
 
 

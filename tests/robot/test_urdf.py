@@ -519,20 +519,24 @@ def follower(mass, *parts, parent="a", mimic='<mimic joint="j1"/>'):
 
 WRIST = (link("c"), joint("j3", "b", "c", axis="0 1 0"))
 LOADED = {
-    "the last link": (follower(1.0), "1 of 6 kg"),
-    "a bar beside the arm": (follower(1.0, parent="base"), "1 of 5 kg"),
+    "the last link": (follower(1.0), ["j2"]),
+    "a bar beside the arm": (follower(1.0, parent="base"), ["j2"]),
     "a bar before the tip": (
         follower(1.0, link("tip"), joint("j3", "a", "tip", axis="0 1 0")),
-        "1 of 5 kg",
+        ["j2"],
     ),
-    "a joint": (follower(0.01, *WRIST), "0.01 of 5.01 kg"),
+    "a joint": (follower(0.01, *WRIST), ["j2"]),
     "a second follower": (
         follower(
             0.0,
             link("c", inertial(1.0, (0, 0, 0), (0, 0, 0), (0.1, 0, 0, 0.1, 0, 0.1))),
             joint("j3", "b", "c", axis="0 1 0", inner='<mimic joint="j2"/>'),
         ),
-        "1 of 6 kg",
+        ["j2", "j3"],
+    ),
+    "a light tip": (
+        follower(0.01, link("tip"), joint("j3", "b", "tip", "fixed")),
+        ["j2"],
     ),
 }
 FINGERS = {
@@ -544,13 +548,45 @@ FINGERS = {
 }
 
 
-@pytest.mark.parametrize(("text", "load"), LOADED.values(), ids=LOADED)
-def test_a_joint_that_follows_another_one_carries_no_link_of_the_arm(write, text, load):
+@pytest.mark.parametrize(("text", "names"), LOADED.values(), ids=LOADED)
+def test_a_joint_that_follows_another_one_carries_a_link_of_the_arm(write, text, names):
     path = write(text)
-    tip = "tip" if "tip" in text else None
-    for read in (load_urdf, urdf_parameters):
-        with pytest.raises(InputError, match=f"joint `j2` follows joint `j1`.*{load}"):
-            read(path, tip=tip)
+    robot = load_urdf(path, tip="tip" if "tip" in text else None)
+    assert [follower.name for follower in robot.followers] == names
+    assert "`j2`: follows another one, at 1 * `j1` + 0" in robot.notes[0]
+    parameters = urdf_parameters(path, tip=robot.source_tip)
+    assert parameters.size == 10 * robot.bodies
+
+
+REFUSED = {
+    "a leader that is left out": (follower(1.0, parent="base"), "b", "leaves out"),
+    "a link that is left out": (
+        follower(
+            0.1,
+            link("c", inertial(1.0, (0, 0, 0), (0, 0, 0), (0.1, 0, 0, 0.1, 0, 0.1))),
+            link("tip"),
+            joint("j3", "b", "c", axis="0 1 0", inner='<mimic joint="j1"/>'),
+            joint("j4", "a", "tip"),
+            mimic="",
+        ),
+        "tip",
+        "another `tip`",
+    ),
+    "no common range": (
+        follower(1.0, mimic='<mimic joint="j1" offset="9"/>').replace(
+            '<axis xyz="0 1 0"/>',
+            '<axis xyz="0 1 0"/><limit lower="-2" upper="2" velocity="1" effort="1"/>',
+        ),
+        None,
+        "`offset`",
+    ),
+}
+
+
+@pytest.mark.parametrize(("text", "tip", "cure"), REFUSED.values(), ids=REFUSED)
+def test_followers_that_no_model_has(write, text, tip, cure):
+    with pytest.raises(InputError, match=f"joint `j[23]` .*{cure}"):
+        load_urdf(write(text), tip=tip)
 
 
 @pytest.mark.parametrize("text", FINGERS.values(), ids=FINGERS)

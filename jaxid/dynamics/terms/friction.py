@@ -228,13 +228,13 @@ class LoadFriction(AbstractDryFriction):
 
     def _bodies(self, robot: Robot):
         """Return the parameters of the bodies, one row for each."""
-        size = robot.joints * len(INERTIAL_NAMES)
+        size = robot.bodies * len(INERTIAL_NAMES)
         if np.size(self.bodies) < size:
             raise InputError(
                 "`bodies` must begin with ten numbers for each body, "
                 f"but holds only {np.size(self.bodies)}."
             )
-        return self.bodies.ravel()[:size].reshape(robot.joints, -1)
+        return self.bodies.ravel()[:size].reshape(robot.bodies, -1)
 
     def columns(self, robot, q, qd, qdd):
         """Return the diagonal matrix of loads with the signs of the speeds."""

@@ -54,7 +54,7 @@ class RigidBodies(AbstractTerm):
         """Return `m1`, `mx1`, … `F1`, then those of the next body."""
         pairs = zip(INERTIAL_NAMES, INERTIAL_UNITS, strict=True)
         body_pairs = list(pairs)[: self.body_parameters]
-        bodies = range(1, robot.joints + 1)
+        bodies = range(1, robot.bodies + 1)
         return tuple((f"{name}{i}", unit) for i in bodies for name, unit in body_pairs)
 
     def columns(self, robot, q, qd, qdd):
@@ -64,10 +64,10 @@ class RigidBodies(AbstractTerm):
 
     def all_ten(self, robot: Robot, p: TermParameters) -> Bodies:
         """Return all ten parameters of the bodies, with zeros where left out."""
-        bodies = p.reshape(robot.joints, self.body_parameters)
+        bodies = p.reshape(robot.bodies, self.body_parameters)
         if not self.principal_axes:
             return bodies
-        zeros = np.zeros((robot.joints, len(INERTIAL_NAMES) - PRINCIPAL_PARAMETERS))
+        zeros = np.zeros((robot.bodies, len(INERTIAL_NAMES) - PRINCIPAL_PARAMETERS))
         return jnp.concatenate([bodies, zeros.astype(bodies.dtype)], axis=1)
 
     def forces(self, robot, p, q, qd, qdd):
