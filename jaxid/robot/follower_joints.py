@@ -174,21 +174,22 @@ def loaded_followers(tree: Any, tip_chain: Sequence[Any]) -> list[Any]:
         if not (carries_chain or leads_to_tip or mass > MAX_FINGER_SHARE * total):
             continue
         load = f"carries {mass:.3g} of {total:.3g} kg"
-        name = leader.get("name")
+        leader_name = leader.get("name")
         if leader not in tree.joints:
             raise tree.error(
                 joint,
-                f"{load} and follows joint `{name}`, which `base` or `tip` leaves out: "
-                "remove `base` and `tip`, make the joint fixed if it stands still in the logs, "
-                "or remove the constraint (`<mimic>`, `<equality>`) if the logs have "
-                "its own angle and force",
+                f"follows joint `{leader_name}`, which `base` or `tip` leaves out, and "
+                f"{load}: remove `base` and `tip`, make the joint fixed if it stands "
+                "still in the logs, or remove the constraint (`<mimic>`, "
+                "`<equality>`) if the logs have its own angle and force",
             )
         if not is_linear:
             raise tree.error(
                 joint,
-                f"{load} and follows joint `{name}` by a polynomial of higher degree, "
-                "which no model describes: leave only the first two coefficients of "
-                "`polycoef`, or make the joint fixed if it stands still in the logs",
+                f"follows joint `{leader_name}` by a polynomial of higher degree, "
+                f"which no model describes, and {load}: leave only the first two "
+                "coefficients of `polycoef`, or make the joint fixed if it stands "
+                "still in the logs",
             )
         followers.append(joint)
     return followers

@@ -56,7 +56,7 @@ def random_bodies(
         random: Random number generator.
     """
     bodies = np.empty((robot.bodies, 10))
-    for i, mass in enumerate(np.asarray(masses)):
+    for i, mass in enumerate(np.broadcast_to(masses, robot.bodies)):
         children = [c for c, parent in enumerate(robot.parent) if parent == i]
         end = np.asarray(robot.offset[children[0]] if children else robot.tip_offset)
         fractions = random.uniform(0.0, 1.0, (CLOUD_POINTS, 1))

@@ -8,7 +8,12 @@ from follower_arms import RELATIONS, follower_arm
 
 import jaxid as jid
 from jaxid.dynamics.model import SpatialModel
-from jaxid.robot.forward_kinematics import placements, tip_jacobian, tip_placement
+from jaxid.robot.forward_kinematics import (
+    placements,
+    tip_curvature,
+    tip_jacobian,
+    tip_placement,
+)
 from jaxid.robot.inertia import Inertia
 from jaxid.robot.urdf import joint_parameters, urdf_parameters
 
@@ -137,3 +142,29 @@ def test_limits_and_friction_of_followers_count_at_their_leaders(arm, path):
         own = np.abs(ratios.T) > 0
         np.testing.assert_allclose(np.where(own, positions, 0).max(axis=1).max(), 3.0)
     assert np.abs(ratios * robot.limits.velocity).max() == pytest.approx(2.0)
+
+
+def test_identification_finds_the_bodies_of_the_file(arm, path):
+    robot, p = jid.load_urdf(path), urdf_parameters(path)
+    model = jid.Model(robot, (jid.RigidBodies(), jid.ViscousFriction()))
+    p = np.concatenate([p, np.linspace(1.0, 2.0, robot.joints)])
+    base, motion = jid.base_parameters(model), random_motion(arm, 60)
+    observations = jid.Observations.of(
+        *(motion.q, motion.qd, motion.qdd, model.inverse_dynamics(p, motion)),
+        filter=jid.ZeroPhaseButterworth(4.0, force_cutoff=np.inf, margin=0.0),
+        sample_time=0.1,
+    )
+    for estimator in (jid.estimators.LeastSquares(), jid.PhysicallyConsistent()):
+        fit = jid.identify(base, observations, estimator)
+        expected = np.asarray(base.from_standard(p))
+        error = np.abs(fit.parameters - expected)
+        assert error.max() < 1e-5 * np.abs(expected).max()
+    assert len(fit.consistency.bodies) == 4
+
+
+def test_second_derivatives_of_the_tip(arm, path):
+    robot, motion = jid.load_urdf(path), random_motion(arm, 1)
+    force, q = np.array([[1.0, -2.0, 0.5]]), np.asarray(motion.q)
+    curvature = tip_curvature(tip_jacobian(robot, q), force, 0.0 * force)
+    hessian = jax.hessian(lambda x: tip_placement(robot, x)[1] @ force[0])(q[0])
+    np.testing.assert_allclose(curvature[0], hessian, atol=1e-10)

@@ -19,7 +19,7 @@ def fit_of(model: jid.Model, p: np.ndarray, *, full: bool = False) -> jid.Fit:
 
 def possible(model: jid.Model, seed: int = 0) -> np.ndarray:
     """Bodies that could exist, and something positive for all else."""
-    rng, n = np.random.default_rng(seed), model.robot.joints
+    rng, n = np.random.default_rng(seed), model.robot.bodies
     p = rng.uniform(0.2, 0.9, model.size)
     width = model.terms[0].body_parameters
     bodies = random_bodies(model.robot, rng.uniform(0.5, 4.0, n), rng)

@@ -120,6 +120,36 @@ def test_forces_limits_and_gravity_are_those_of_mujoco(write):
     assert values["friction"].tolist() == [0.3, 0.0, 0.0, 0.0]
 
 
+def test_a_link_that_follows_another_joint_has_its_forces(write):
+    path = write(
+        ARM.replace('joint1="right" joint2="left"', 'joint1="slide" joint2="pan"')
+        .replace("0.1 2 30 0 0", "0.1 0.2 0 0 0")
+        .replace(
+            '<joint name="slide"', '<joint name="slide" springref="0.3" stiffness="9"'
+        )
+    )
+    robot = jid.load_mjcf(path)
+    assert robot.body_names == ("pan", "lift", "left", "right", "slide")
+    motion = random_motion(4)
+    # The relation is one of differences from both `ref`.
+    ratios = np.vstack([np.eye(4), [[0.2, 0.0, 0.0, 0.0]]])
+    offset = 0.1 + 0.1 - 0.2 * np.deg2rad(20)
+    q, qd, qdd = (x @ ratios.T for x in (motion.q, motion.qd, motion.qdd))
+    tree_motion = jid.Motion(q + offset * np.eye(5)[4], qd, qdd)
+    expected = mujoco_forces(path, robot.body_names, tree_motion) @ ratios
+    model = jid.Model(robot, (jid.RigidBodies(),))
+    ours = model.inverse_dynamics(jid.robots.urdf_parameters(path), motion)
+    np.testing.assert_allclose(ours, expected, atol=1e-12 * np.abs(expected).max())
+
+    values = joint_parameters(path)
+    np.testing.assert_allclose(values["damping"], [0.2 * 1.04, 0.2, 0.2, 0.2])
+    np.testing.assert_allclose(values["armature"], [0.01 * 1.04, 0.01, 0.01, 0.01])
+    np.testing.assert_allclose(values["stiffness"], [9 * 0.04, 0, 0, 0])
+    # At rest the slide is at its own position of rest.
+    np.testing.assert_allclose(0.2 * values["springref"][0] + offset, 0.3)
+    np.testing.assert_allclose(robot.limits.position_min[0], (-0.3 - offset) / 0.2)
+
+
 def test_a_site_is_a_tip_and_leaves_the_fingers_out(write):
     path = write(ARM)
     robot = jid.load_mjcf(path, tip="flange")
@@ -197,9 +227,9 @@ REFUSED = {
         ),
         "`<replicate>` makes 9801 parts",
     ),
-    "a joint that moves a link as another one": (
+    "a joint that moves a link by a square": (
         ARM.replace('joint1="right" joint2="left"', 'joint1="lift" joint2="pan"'),
-        "joint `lift` follows joint `pan` and carries ",
+        "joint `lift` follows joint `pan` by a polynomial .* carries ",
     ),
     "no model": ("<mujoco><bodies/></mujoco>", "MuJoCo cannot compile"),
 }
