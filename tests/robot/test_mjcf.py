@@ -147,7 +147,7 @@ def test_a_link_that_follows_another_joint_has_its_forces(write):
     np.testing.assert_allclose(values["stiffness"], [9 * 0.04, 0, 0, 0])
     # At rest the slide is at its own position of rest.
     np.testing.assert_allclose(0.2 * values["springref"][0] + offset, 0.3)
-    np.testing.assert_allclose(robot.limits.position_min[0], (-0.3 - offset) / 0.2)
+    np.testing.assert_allclose(robot.limits.position_max[0], (0.4 - offset) / 0.2)
 
 
 def test_a_site_is_a_tip_and_leaves_the_fingers_out(write):

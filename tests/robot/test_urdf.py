@@ -559,7 +559,11 @@ def test_a_joint_that_follows_another_one_carries_a_link_of_the_arm(write, text,
 
 
 REFUSED = {
-    "a leader that is left out": (follower(1.0, parent="base"), "b", "leaves out"),
+    "a leader that is left out": (
+        follower(1.0, *WRIST, parent="base"),
+        "c",
+        "leaves out",
+    ),
     "a link that is left out": (
         follower(
             0.1,
