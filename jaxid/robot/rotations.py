@@ -6,6 +6,7 @@ rank is decided with exact quarter turns ("snapping"); the robot itself keeps th
 of its file.
 """
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -110,6 +111,10 @@ class Placement(NamedTuple):
     body: int
     rotation: Matrix3
     position: Vector3
+
+    def renumbered(self, numbers: Mapping[int, int]) -> "Placement":
+        """Return the placement with another number of the body."""
+        return self._replace(body=numbers[self.body])
 
     def of(self, rotation: Matrix3, position: Vector3) -> "Placement":
         """Return the placement on the body of what is placed on the link."""

@@ -95,7 +95,7 @@ def load_urdf(
         if base_rotation is None:
             gravity = tree.base_gravity
             notes = (*_mount_notes(tree, base), *notes)
-    joints = tree.leading_joints
+    joints = _leading_joints(tree)
     tip_body, tip_rotation, tip_offset = tree.carriers[tree.tip]
     try:
         robot = Robot(
@@ -183,6 +183,11 @@ def joint_parameters(
     return parameters
 
 
+def _leading_joints(tree: UrdfTree) -> list[Any]:
+    """Return the elements of the moving joints that follow no others."""
+    return tree.joints[: len(tree.joints) - len(tree.followers)]
+
+
 def _of_leaders(followers: Followers, parameters: dict[str, Joints]):
     """Return parameters of all joints as those of the joints that move alone."""
     joints = len(parameters["armature"]) - len(followers)
@@ -201,12 +206,12 @@ def _of_leaders(followers: Followers, parameters: dict[str, Joints]):
 
 def _limits(tree: UrdfTree):
     """Return the limits of all joints, and notes on those that are taken as unknown."""
-    joints = len(tree.leading_joints)
+    joints = len(_leading_joints(tree))
     low = np.empty(joints)
     high = np.empty(joints)
     magnitudes = {key: np.full(joints, np.inf) for key in ("velocity", "effort")}
     unknown_limits: dict[str, list[str]] = {}
-    for i, joint in enumerate(tree.leading_joints):
+    for i, joint in enumerate(_leading_joints(tree)):
         name = joint.get("name")
         low[i], high[i] = _checked_range(tree, joint)
         stated_low, stated_high = tree.range(joint)

@@ -92,7 +92,7 @@ class UrdfTree(UrdfElements):
             self._turn_gravity(joint)
         self._merge(base or root, tip)
         # The bodies tell which followers move more than a finger.
-        tip_chain = [] if tip is None else self._chain(base or root, tip)
+        tip_chain = self._chain(base or root, tip or base or root)
         followers = loaded_followers(self, tip_chain)
         if followers:
             self._merge(base or root, tip, followers)
@@ -224,21 +224,17 @@ class UrdfTree(UrdfElements):
 
     def _put_last(self, followers: Sequence[Any]):
         """Put the bodies of followers behind those of the joints that they follow."""
-        bodies = range(len(self.joints))
-        order = sorted(bodies, key=lambda body: self.joints[body] in followers)
-        numbers = {body: place for place, body in enumerate([-1, *order], -1)}
+        is_follower = [joint in followers for joint in self.joints]
+        order = np.argsort(is_follower, kind="stable").tolist()
+        numbers = {body: place for place, body in enumerate(order)}
+        numbers[-1] = -1
         self.joints = [self.joints[body] for body in order]
         self.axes = [self.axes[body] for body in order]
-        sorted_placements = [self.placements[body] for body in order]
-        self.placements = [x._replace(body=numbers[x.body]) for x in sorted_placements]
+        placements = [self.placements[body] for body in order]
+        self.placements = [placement.renumbered(numbers) for placement in placements]
         for link, carrier in self.carriers.items():
-            self.carriers[link] = carrier._replace(body=numbers[carrier.body])
+            self.carriers[link] = carrier.renumbered(numbers)
         self.followers = resolved_followers(self, followers)
-
-    @property
-    def leading_joints(self) -> list[Any]:
-        """Elements of the moving joints that follow no others."""
-        return self.joints[: len(self.joints) - len(self.followers)]
 
     def placed_links(self) -> dict[str, Placement]:
         """Return `carriers`, and links on joints that the chain leaves out."""
