@@ -33,9 +33,10 @@ def body_motions(
     q = all_coordinates(robot.followers, q)
     qd = all_rates(robot.followers, qd)
     qdd = all_rates(robot.followers, qdd)
-    motions = {-1: (-robot.gravity, np.zeros(3), np.zeros(3))}
+    motions: dict[int, tuple[Vector3, Vector3, Vector3]] = {}
+    ground = (-robot.gravity, np.zeros(3), np.zeros(3))
     for i in robot.order:
-        a, w, wd = motions[robot.parent[i]]
+        a, w, wd = motions.get(robot.parent[i], ground)
         R, r = placement_in_parent(robot, i, q[i])
         axis = robot.axis[i]
         # The parent carries the body ...

@@ -87,7 +87,7 @@ def speed_ratios(followers: Followers, joints: int) -> Matrix:
     return np.concatenate([np.eye(joints), follower_rows])
 
 
-def on_coordinates(followers: Followers, rows: AnyArray) -> AnyArray:
+def on_coordinates(followers: Followers, rows: Any) -> Any:
     r"""Return $\Gamma^T$ times rows of all joints, such as their forces."""
     if not followers:
         return rows

@@ -101,7 +101,7 @@ def load_urdf(
         robot = Robot(
             tree.name,
             parent=tuple(placement.body for placement in tree.placements),
-            revolute=[joint.get("type") in TURNING_TYPES for joint in joints],
+            revolute=tuple(joint.get("type") in TURNING_TYPES for joint in joints),
             followers=tree.followers,
             axis=tree.axes,
             rotation=[placement.rotation for placement in tree.placements],
@@ -188,7 +188,7 @@ def _leading_joints(tree: UrdfTree) -> list[Any]:
     return tree.joints[: len(tree.joints) - len(tree.followers)]
 
 
-def _of_leaders(followers: Followers, parameters: dict[str, Joints]):
+def _of_leaders(followers: Followers, parameters: dict[str, Any]) -> dict[str, Any]:
     """Return parameters of all joints as those of the joints that move alone."""
     joints = len(parameters["armature"]) - len(followers)
     ratios = speed_ratios(followers, joints).T
