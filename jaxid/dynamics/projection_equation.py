@@ -33,10 +33,11 @@ def body_motions(
     q = all_coordinates(robot.followers, q)
     qd = all_rates(robot.followers, qd)
     qdd = all_rates(robot.followers, qdd)
-    motions: dict[int, tuple[Vector3, Vector3, Vector3]] = {}
     ground = (-robot.gravity, np.zeros(3), np.zeros(3))
+    motions: list[tuple[Vector3, Vector3, Vector3]] = [ground] * robot.bodies
     for i in robot.order:
-        a, w, wd = motions.get(robot.parent[i], ground)
+        parent = robot.parent[i]
+        a, w, wd = motions[parent] if parent >= 0 else ground
         R, r = placement_in_parent(robot, i, q[i])
         axis = robot.axis[i]
         # The parent carries the body ...
@@ -56,7 +57,7 @@ def body_motions(
         else:
             a = a + rate + 2.0 * turned_rate
         motions[i] = (a, w, wd)
-    return [motions[i] for i in range(robot.bodies)]
+    return motions
 
 
 def partial_velocities(robot: Robot, q: Joints, qd: Joints, qdd: Joints):

@@ -184,14 +184,11 @@ def _require_same_robot(robot: Robot, file_robot: Robot, source: FilePath) -> No
             f"but the fit has {', '.join(robot.body_names)}: "
             "give the file of this robot, or its `tip`."
         )
-    for follower, other_follower in zip(
-        robot.followers, file_robot.followers, strict=True
-    ):
-        if follower != other_follower:
-            raise InputError(
-                f"joint `{follower.name}` follows another joint in `{source}` than in "
-                "the robot of the fit, or by other numbers: give its own file."
-            )
+    if robot.followers != file_robot.followers:
+        raise InputError(
+            f"`{source}` has other relations between joints (`<mimic>`) than the robot "
+            "of the fit: give its own file."
+        )
     for joint, name in enumerate(robot.joint_names):
         if robot.revolute[joint] != file_robot.revolute[joint]:
             words = "turns" if file_robot.revolute[joint] else "slides"

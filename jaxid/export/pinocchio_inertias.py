@@ -39,10 +39,11 @@ def export_pinocchio(fit: Fit, path: FilePath) -> Path:
     rows = pinocchio_parameters(fit).tolist()
     joints = []
     robot = fit.base.model.robot
+    # Friction of followers is part of their leaders'.
+    zeros = np.zeros(len(robot.followers))
     for i, name in enumerate(robot.body_names):
-        # Followers have no friction of their own: it is part of their leaders'.
         joint_values = {
-            key: float(values[i]) if i < robot.joints else 0.0
+            key: float(np.append(values, zeros)[i])
             for key, values in dynamics.values.items()
         }
         joints.append({"name": name, "parameters": rows[i], **joint_values})

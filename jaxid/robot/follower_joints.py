@@ -15,7 +15,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, ManyJoints, Matrix, namespace
+from jaxid.arrays import AnyArray, Indices, ManyJoints, Matrix, namespace
 from jaxid.errors import InputError
 
 MAX_FINGER_SHARE = 0.05
@@ -44,17 +44,11 @@ class Follower(eqx.Module):
     offset: float = eqx.field(static=True, converter=float, default=0.0)
 
     def __check_init__(self):
-        is_finite = math.isfinite(self.factor) and math.isfinite(self.offset)
-        if self.factor == 0.0 or not is_finite:
+        if not 0.0 < abs(self.factor) < math.inf or not math.isfinite(self.offset):
             raise InputError(
-                f"joint `{self.name}` needs a `factor` other than 0 and a finite "
-                f"`offset`, but has {self.factor:g} and {self.offset:g}: a joint that "
-                "stands still is no follower."
+                f"joint `{self.name}` needs a finite `factor` other than 0 and a "
+                f"finite `offset`, but has {self.factor:g} and {self.offset:g}."
             )
-
-    def relation(self, leader_name: str) -> str:
-        """Return the joint's coordinate by that of its leader, for people."""
-        return f"{self.factor:.4g} * `{leader_name}` + {self.offset:.4g}"
 
 
 Followers = tuple[Follower, ...]
@@ -71,7 +65,7 @@ def all_rates(followers: Followers, qd: ManyJoints) -> AnyArray:
     return _joined(qd, [f.factor * qd[..., f.leader] for f in followers])
 
 
-def _joined(values: AnyArray, follower_values: list[AnyArray]) -> AnyArray:
+def _joined(values: AnyArray, follower_values: list):
     """Append the values of followers along the last axis."""
     if not follower_values:
         return values
@@ -81,10 +75,10 @@ def _joined(values: AnyArray, follower_values: list[AnyArray]) -> AnyArray:
 
 def speed_ratios(followers: Followers, joints: int) -> Matrix:
     r"""Return $\Gamma$: speeds of all joints (rows) by those of the coordinates."""
-    follower_rows = np.zeros((len(followers), joints))
-    for row, follower in zip(follower_rows, followers, strict=True):
-        row[follower.leader] = follower.factor
-    return np.concatenate([np.eye(joints), follower_rows])
+    ratios = np.eye(joints + len(followers), joints)
+    for row, follower in enumerate(followers, joints):
+        ratios[row, follower.leader] = follower.factor
+    return ratios
 
 
 def on_coordinates(followers: Followers, rows: Any) -> Any:
@@ -95,19 +89,17 @@ def on_coordinates(followers: Followers, rows: Any) -> Any:
     return jnp.tensordot(jnp.asarray(ratios.T, rows.dtype), rows, 1)
 
 
-def order_from_ground(parent: tuple[int, ...]) -> tuple[int, ...]:
+def order_from_ground(parent: Indices, followers: int) -> Indices:
     """Return the bodies in an order in which each comes after the one that carries it.
 
-    Otherwise they keep the order of their numbers.
+    Otherwise they keep the order of their numbers. Circles of parents are left out.
     """
-    order: list[int] = []
-    for body in range(len(parent)):
-        branch = []
-        while body >= 0 and body not in order and body not in branch:
-            branch.append(body)
-            body = parent[body]
-        order += reversed(branch)
-    return tuple(order)
+    order = [-1]
+    # Only a follower's body may carry one with a smaller number, once on each way.
+    for body in [*range(len(parent))] * (followers + 1):
+        if body not in order and parent[body] in order:
+            order.append(body)
+    return tuple(order[1:])
 
 
 class Relation(NamedTuple):
@@ -173,23 +165,18 @@ def loaded_followers(tree: Any, tip_chain: Sequence[Any]) -> list[Any]:
         leads_to_tip = joint in tip_chain and leader in tree.joints
         if not (carries_chain or leads_to_tip or mass > MAX_FINGER_SHARE * total):
             continue
-        load = f"carries {mass:.3g} of {total:.3g} kg"
-        leader_name = leader.get("name")
+        fault = ""
         if leader not in tree.joints:
+            fault = "which `base` or `tip` leaves out: remove them"
+        elif not is_linear:
+            fault = "by a polynomial: leave two coefficients of `polycoef`"
+        if fault:
             raise tree.error(
                 joint,
-                f"follows joint `{leader_name}`, which `base` or `tip` leaves out, and "
-                f"{load}: remove `base` and `tip`, make the joint fixed if it stands "
+                f"carries {mass:.3g} of {total:.3g} kg and follows joint "
+                f"`{leader.get('name')}`, {fault}, make the joint fixed if it stands "
                 "still in the logs, or remove the constraint (`<mimic>`, "
                 "`<equality>`) if the logs have its own angle and force",
-            )
-        if not is_linear:
-            raise tree.error(
-                joint,
-                f"follows joint `{leader_name}` by a polynomial of higher degree, "
-                f"which no model describes, and {load}: leave only the first two "
-                "coefficients of `polycoef`, or make the joint fixed if it stands "
-                "still in the logs",
             )
         followers.append(joint)
     return followers

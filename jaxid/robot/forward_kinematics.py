@@ -5,7 +5,7 @@ with `jax.grad`. The Jacobian of the end-effector is in NumPy, for many poses at
 where compiling would take longer than computing.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -34,8 +34,8 @@ def placement_in_parent(
 def placements(robot: Robot, q: Joints) -> tuple[Rotations, Vectors]:
     """Return attitudes and origins [m] of all bodies in the frame of the ground."""
     q = all_coordinates(robot.followers, jnp.asarray(q))
-    rotations = {}
-    origins = {}
+    rotations: list[Any] = [None] * robot.bodies
+    origins: list[Any] = [None] * robot.bodies
     for i in robot.order:
         R, r = placement_in_parent(robot, i, q[i])
         parent = robot.parent[i]
@@ -45,11 +45,7 @@ def placements(robot: Robot, q: Joints) -> tuple[Rotations, Vectors]:
             r = origins[parent] + R_parent @ r
         rotations[i] = R
         origins[i] = r
-    bodies = range(robot.bodies)
-    return (
-        jnp.stack([rotations[i] for i in bodies]),
-        jnp.stack([origins[i] for i in bodies]),
-    )
+    return jnp.stack(rotations), jnp.stack(origins)
 
 
 def tip_placement(robot: Robot, q: Joints) -> tuple[Matrix3, Vector3]:

@@ -212,15 +212,14 @@ class Robot(Summarised, eqx.Module):
     def _check_bodies(self):
         """Reject parents and bodies that do not exist, or that form no tree."""
         n = self.bodies
-        exist = len(self.parent) == n and all(-1 <= p < n for p in self.parent)
-        order = self.order if exist else ()
-        # Only the bodies of followers, which come last, may carry earlier ones.
-        is_sorted = order == tuple(range(n)) or bool(self.followers)
-        places = {body: place for place, body in enumerate((-1, *order))}
-        is_tree = exist and all(
-            places[p] < places[i] for i, p in enumerate(self.parent)
+        # Only bodies of followers, which come last, may carry earlier ones.
+        first_follower = self.joints if self.followers else n
+        are_earlier = all(
+            -1 <= parent < body or first_follower <= parent < n
+            for body, parent in enumerate(self.parent)
         )
-        if not (is_sorted and is_tree):
+        # A circle of parents is left out of the order.
+        if len(self.parent) != n or not are_earlier or len(self.order) != n:
             raise InputError(
                 "`parent` must hold an earlier body, or -1, "
                 f"for each of {n}, but is {self.parent}."
@@ -274,15 +273,17 @@ class Robot(Summarised, eqx.Module):
     @property
     def order(self) -> tuple[int, ...]:
         """Bodies in an order in which each comes after the one that carries it."""
-        return order_from_ground(self.parent)
+        return order_from_ground(self.parent, len(self.followers))
 
     @property
     def ancestors(self) -> tuple[tuple[int, ...], ...]:
         """For every body those from the ground to itself, whose joints move it."""
-        chains: dict[int, tuple[int, ...]] = {-1: ()}
+        chains: list[tuple[int, ...]] = [()] * self.bodies
         for body in self.order:
-            chains[body] = (*chains[self.parent[body]], body)
-        return tuple(chains[body] for body in range(self.bodies))
+            parent = self.parent[body]
+            parent_chain = chains[parent] if parent >= 0 else ()
+            chains[body] = (*parent_chain, body)
+        return tuple(chains)
 
     @property
     def known_max_forces(self) -> Joints:
@@ -419,9 +420,6 @@ class Robot(Summarised, eqx.Module):
         limits = self.limits
         tip_carrier = self.body_names[self.tip_body]
         facts = [("end-effector", f"on the body of `{tip_carrier}`")]
-        for follower in self.followers:
-            relation = follower.relation(self.joint_names[follower.leader])
-            facts.append((f"joint `{follower.name}`", relation))
         if self.tool is not None:
             carrier = self.body_names[self.tool.body]
             mass = float(self.tool.mass)

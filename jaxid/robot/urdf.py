@@ -330,9 +330,9 @@ def _follower_notes(tree: UrdfTree):
     for follower in tree.followers:
         leader_name = tree.joints[follower.leader].get("name")
         yield (
-            f"joint `{follower.name}`: follows another one, at "
-            f"{follower.relation(leader_name)}; its body is part of the model, its "
-            f"friction counts as that of `{leader_name}`."
+            f"joint `{follower.name}`: follows another one, at {follower.factor:.4g} * "
+            f"`{leader_name}` + {follower.offset:.4g}; its body is part of the model, "
+            f"its friction counts as that of `{leader_name}`."
         )
 
 

@@ -229,7 +229,7 @@ REFUSED = {
     ),
     "a joint that moves a link by a square": (
         ARM.replace('joint1="right" joint2="left"', 'joint1="lift" joint2="pan"'),
-        "joint `lift` follows joint `pan` by a polynomial .* carries ",
+        "joint `lift` carries .* follows joint `pan`, by a polynomial",
     ),
     "no model": ("<mujoco><bodies/></mujoco>", "MuJoCo cannot compile"),
 }
