@@ -33,6 +33,10 @@ MOTOR_COUNTS = 4096
 """Counts of a turn of the motors that LeRobot calibrates."""
 GRIPPER = "gripper"
 """Motor whose angles LeRobot writes from 0 to 100; those of others from -100."""
+COUNTER_SIZE = 2**16
+"""Number after which counters of drives begin again."""
+MIN_OVERFLOW = 0.75
+"""Smallest step of a counter that begins again, relative to its size."""
 Channels = tuple[Matrix, Matrix | None, Matrix]
 """Angles, velocities (None if there are none) and forces (samples x joints)."""
 
@@ -59,8 +63,8 @@ class Columns:
         forces: Joint forces, motor torques or motor currents.
         velocities: Measured velocities, on the same side as the angles, like `"dq{}"`;
             None if there are none.
-        time: Time stamps; None for `sample_time`, or the clock of bags and LeRobot data
-            sets.
+        time: Time stamps, or a list of two columns with seconds and nanoseconds; None
+            for `sample_time`, or the clock of bags and LeRobot data sets.
         sample_time: Time between two rows [s], instead of time stamps, like `0.001`.
         time_unit: Unit of the stamps.
         angle_unit: Unit of the angles; or the angle of a one in the log [rad or m], as
@@ -91,7 +95,7 @@ class Columns:
     angles: Selection
     forces: Selection
     velocities: Selection | None = None
-    time: str | int | None = None
+    time: str | int | tuple[str | int, str | int] | None = None
     sample_time: float | None = None
     time_unit: Unit = S
     angle_unit: Units = RAD
@@ -291,6 +295,7 @@ class Log:
 
     tables: tuple[LogTable, ...]
     columns: Columns
+    notes: list[str] = dataclasses.field(default_factory=list)
 
     def read(self, start: int = 0, stop: int | None = None) -> Channels:
         """Return angles, velocities and forces of some rows, as they were recorded."""
@@ -301,7 +306,12 @@ class Log:
             for channel, names in part.channels.items():
                 blocks = {name: part.numbers(name) for name in names}
                 _require_values(table.source, channel, blocks)
-                arrays[channel] = np.concatenate([*blocks.values()], axis=1)
+                array = np.concatenate([*blocks.values()], axis=1)
+                # A part does not tell how often a counter began again before.
+                is_part = start > 0 or stop is not None
+                arrays[channel] = (
+                    array if is_part else self._without_overflows(channel, array)
+                )
         joints = arrays["angles"].shape[1]
         for channel, array in arrays.items():
             if array.shape[1] != joints:
@@ -312,6 +322,25 @@ class Log:
                 )
         velocities = arrays.get("velocities")
         return self.columns.to_si(arrays["angles"], velocities, arrays["forces"])
+
+    def _without_overflows(self, channel: str, array: Matrix) -> Matrix:
+        """Return a channel whose counter goes on where it began again; note it."""
+        size = COUNTER_SIZE
+        is_inside = -0.5 * size <= array.min() and array.max() < size
+        if not (is_inside and (array == np.round(array)).all()):
+            return array
+        # No motion and no force changes that much between two samples.
+        max_steps = np.abs(np.diff(array, axis=0)).max(axis=0, initial=0.0)
+        begins_again = max_steps > MIN_OVERFLOW * size
+        if not begins_again.any():
+            return array
+        self.notes.append(
+            f"`{channel}` jump by {size}, as counters do, or numbers without their "
+            "sign: this was undone"
+        )
+        counts = np.unwrap(array, period=size, axis=0)
+        turns = np.round(np.median(counts, axis=0) / size)
+        return counts - size * np.where(begins_again, turns, 0.0)
 
     @property
     def bad_rows(self) -> Complaints:

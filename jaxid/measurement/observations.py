@@ -460,8 +460,7 @@ def _usable_segments(grid: TimeGrid, edge: int, factor: int, name: str) -> TimeG
         raise InputError(
             f"the longest segment of `{name}` has {samples} samples at "
             f"{1 / grid.sample_time:.6g} Hz, but the filter takes {edge} at each end, "
-            f"and {MIN_ROWS * factor} more are needed: record longer, raise "
-            "`largest_gap`, lower `margin`, check `time_unit`, or leave this log out."
+            f"and {MIN_ROWS * factor} more are needed: {grid.cure_of_short_segments}."
         )
     notes = grid.notes
     lost_segments = len(grid.segments) - len(segments)

@@ -15,7 +15,7 @@ from jaxid.robot.robot import Robot
 
 from .columns import Channels, Columns, Log, open_log
 from .filters import AbstractDecimation, AbstractFilter
-from .log_files import COMMENT, Complaints, LogTable
+from .log_files import COMMENT, NO_NUMBER, Complaints, LogTable
 from .observations import Observations, Progress, prepare
 from .recording import Recording, consecutive
 from .samples import AbstractSamples, joined, joint_side
@@ -27,6 +27,8 @@ PART_SIZE = 65536
 """Samples that are read at once."""
 MAX_BAD_ROWS = 1e-3
 """Fraction of the rows of a log that may be bad."""
+MAX_SPARED_ROWS = 0.5
+"""Fraction of bad rows from which leaving them out is no cure."""
 MAX_STRAY_STAMPS = 1e-2
 """Fraction of the rows that may have a wrong stamp; more are out of order only."""
 MAX_END_ROWS = 5
@@ -76,7 +78,7 @@ def read_recording(
     sample_time = columns.sample_time
     stamps = log.stamps() if sample_time is None else None
     complaints = log.bad_rows
-    notes = [note for table in log.tables for note in table.notes]
+    notes = [*log.notes, *(note for table in log.tables for note in table.notes)]
     channels = {"angles": angles, "forces": forces}
     if velocities is not None:
         channels["velocities"] = velocities
@@ -96,7 +98,9 @@ def read_recording(
         sparse_channels = without_filling(channels)
         is_merged |= sparse_channels is not channels
         channels = sparse_channels
-    if is_merged or (complaints and is_sparse(channels)):
+    # Cells with texts do not mean that a channel has no value then.
+    has_texts = any(NO_NUMBER in text for text in complaints.values())
+    if is_merged or (complaints and not has_texts and is_sparse(channels)):
         joined_channels = join_channels(stamps, channels, log.tables[0].source)
         stamps, channels, join_notes = joined_channels
         complaints = {}
@@ -189,12 +193,18 @@ def _bad_row_note(complaints: Complaints, rows: int, max_share: float) -> str:
     words = "; ".join(texts[:MAX_NAMED_ROWS])
     if len(texts) > MAX_NAMED_ROWS:
         words = f"{words}; and {len(texts) - MAX_NAMED_ROWS} more"
-    if inner_count > max_share * rows:
-        raise InputError(
-            f"{count} of {rows} rows are bad: {words}; repair the log, or let "
-            f"`bad_rows` be above {inner_count / rows:.2g} (fraction), which leaves "
-            "them out."
+    share = inner_count / rows
+    cure = (
+        f"repair the log, or let `bad_rows` be above {share:.2g} (fraction), which "
+        "leaves them out"
+    )
+    if share > MAX_SPARED_ROWS:
+        cure = (
+            "name other columns, or export the log again, with one number in each "
+            "cell and no commas between thousands"
         )
+    if share > max_share:
+        raise InputError(f"{count} of {rows} rows are bad: {words}; {cure}.")
     verb = "is bad and was" if count == 1 else "are bad and were"
     return f"{count} of {rows} rows {verb} left out: {words}"
 

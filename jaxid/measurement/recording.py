@@ -18,6 +18,7 @@ from jaxid.errors import InputError
 
 from .time_grid import MIN_SAMPLES, Ranges, TimeGrid, resampling
 from .time_series import interpolate_turns
+from .time_stamps import refuse_shared_stamps
 
 MAX_NUMBER = 1e30
 """Largest number in a log, in any unit: its square still is finite."""
@@ -124,6 +125,7 @@ class Recording(eqx.Module):
             )
         if time is not None:
             stamps = _finite_stamps(name, time, samples)
+            refuse_shared_stamps(stamps, data["angles"], name)
             resample = resampling(stamps, name, (largest_gap, bridged), first_row)
             grid = resample.grid
             q = data["angles"]

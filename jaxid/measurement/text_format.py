@@ -37,7 +37,7 @@ STAMP = (
     r"\d\d?:\d\d:\d\d(?:[.,]\d+)? ?(?:Z|[+-]\d\d:?\d\d)?|\d\d?:\d\d[.,]\d+)$"
 )
 """Dates of ISO 8601, times since midnight or the hour, and durations of pandas."""
-EXPONENT = r"(?:[eE][+-]?\d+)?"
+EXPONENT = r"(?:[eEdD][+-]?\d+)?"
 NUMBER = rf"[+-]?(?:(?:\d+\.?\d*|\.\d+){EXPONENT}|(?i:nan|inf|infinity))"
 """Numbers with a decimal point."""
 
@@ -94,8 +94,8 @@ def detect_format(source: str, head: bytes, selections: Selections) -> TextForma
         raise InputError(f"`{source}` is text in UTF-16: save it again in UTF-8.")
     if b"\0" in head:
         raise InputError(
-            f"`{source}` is no text, as its suffix says: give it the suffix of its "
-            "format, or export it again."
+            f"`{source}` is no text, as its suffix says, or text in UTF-16: give it "
+            "the suffix of its format, or save it again in UTF-8."
         )
     text = decoded(head)
     if not text.strip(COMMENT_MARKS + "\n"):

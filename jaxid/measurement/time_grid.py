@@ -18,6 +18,8 @@ MIN_STEP = 0.1
 """Distance of two stamps, in sample times, up to which one sample was logged twice."""
 MIN_SEGMENT = 4
 """Smallest number of rows without a gap that can be a segment."""
+MIN_LIKELY_SAMPLE_TIME = 5e-5
+"""Sample time below which the unit of the time is likely to be wrong [s]."""
 MIN_SAMPLES = 10
 """Smallest number of samples that can be filtered."""
 
@@ -50,6 +52,15 @@ class TimeGrid(NamedTuple):
     def is_exact(self) -> bool:
         """Whether the rows lie on the grid as they are."""
         return self.deviation <= MAX_JITTER * self.sample_time
+
+    @property
+    def cure_of_short_segments(self) -> str:
+        """What to do about a log whose segments are all too short for a filter."""
+        if self.sample_time < MIN_LIKELY_SAMPLE_TIME:
+            return "check `time_unit`, or give `sample_time`"
+        gap_notes = [note for note in self.notes if "largest_gap" in note]
+        cause = f"{gap_notes[0]};" if gap_notes else "record longer,"
+        return f"{cause} lower `margin`, or leave this log out"
 
     def cropped(self, start: float, stop: float, name: str) -> "TimeGrid":
         """Return the part from `start` [s] on and before `stop` [s]."""
@@ -149,7 +160,8 @@ def _step_statistics(stamps: Vector, source: str, limits: Pauses) -> StepStatist
     steps = steps[steps > 0]
     if not steps.size:
         raise InputError(
-            f"time of `{source}` stands still: check the column of time stamps."
+            f"time of `{source}` stands still: name another column of time stamps, or "
+            "give `sample_time`."
         )
     median = float(np.median(steps))
     absolute_deviation = float(np.median(np.abs(steps - median)))

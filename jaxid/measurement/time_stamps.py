@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxid.arrays import Texts, Vector
+from jaxid.arrays import Matrix, Texts, Vector
 from jaxid.errors import InputError
 
 
@@ -29,6 +29,24 @@ MAX_OVERLAP = 1.5
 """Rows between two stamps, in those of an even log, up to which time ran only once."""
 MAX_LATE_ROWS = 20
 """Rows by which a row may come late on its way to the logger."""
+MAX_SHARED_STAMPS = 0.3
+"""Fraction of the rows that may have the stamp of another sample."""
+
+
+def refuse_shared_stamps(stamps: Vector, angles: Matrix, source: str) -> None:
+    """Refuse stamps that many different samples share: they do not tell their times."""
+    # A logger that is faster than the robot repeats whole samples.
+    is_other_sample = (np.diff(angles, axis=0) != 0).any(axis=1)
+    share = float(np.mean((np.diff(stamps) == 0) & is_other_sample))
+    step = float(np.ptp(stamps)) / len(stamps)
+    if share > MAX_SHARED_STAMPS and step > 0:
+        raise InputError(
+            f"{100 * share:.0f} % of the rows of `{source}` have the time stamp of the "
+            "row before, but other angles: if seconds and nanoseconds have columns of "
+            "their own, name both as `time`; if two drivers wrote the log, remove the "
+            "rows of one; otherwise give `sample_time` instead of the stamps, here "
+            f"about {step:.4g} s."
+        )
 
 
 def stamp_order(
@@ -59,8 +77,9 @@ def stamp_order(
     if is_refused:
         raise InputError(
             f"time of `{source}` runs backwards {place}, and some times are there "
-            "twice: the clock was set back; cut the log there into two files, or give "
-            f"`sample_time` (about {step:.4g} s) if its rows are even."
+            "twice: the clock was set back; cut the log there into two files, or, if "
+            "the motion goes on there as if nothing had happened, give `sample_time` "
+            f"(about {step:.4g} s)."
         )
     plural = "s" if ends.size > 1 else ""
     note = (

@@ -29,6 +29,8 @@ PRICE = (10.0, 100.0)
 """Increase of the residuals by bounds that is good, and tolerable [%]."""
 OFFSET = 0.3
 """Constant force to be explained, relative to the largest force of its joint."""
+MAX_CLAIM = 4.0
+"""Forces of the file's bodies, over those of the logs, that wrong masses explain."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -112,6 +114,7 @@ def verdict(report: Report) -> list[Remark]:
         ),
         *_judge_bounds(fit),
         *_judge_offsets(fit),
+        *_judge_size(report.claimed),
     ]
     statuses = [remark.status for remark in remarks]
     if Status.BAD in statuses:
@@ -245,6 +248,23 @@ def _judge_bounds(fit: Fit) -> Iterator[Remark]:
         f"Good: up to {PRICE[0]:g} %; tolerable: up to {PRICE[1]:g} %. Above, the logs "
         "contradict the bounds: check `total_mass`, `mass_max`, units and signs.",
     )
+
+
+def _judge_size(claimed: Sequence[TorqueErrors]) -> Iterator[Remark]:
+    """Compare the size of the forces with those of the bodies of the robot's file.
+
+    A fit of forces in a wrong unit is as good as any, but its masses are not.
+    """
+    for log in claimed[:1]:
+        ratio = float(np.linalg.norm(log.predicted) / np.linalg.norm(log.measured))
+        if ratio > MAX_CLAIM:
+            yield Remark(
+                f"The bodies of the robot's file need {significant(ratio, 2)} times "
+                "the forces of the logs: are these currents "
+                "(`recording.torque_constants`), the motors' (`forces_side`) or in "
+                "another unit (`force_unit`), or is the file wrong?",
+                Status.DOUBTFUL,
+            )
 
 
 def _judge_offsets(fit: Fit) -> Iterator[Remark]:

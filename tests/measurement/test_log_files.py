@@ -232,6 +232,13 @@ def test_missing_columns_name_the_others_and_the_closest(tmp_path):
         ("log.csv", b"q,q,tau\n1,2,3\n", "`q` twice"),
         ("log.csv", b"q,tau\n" + b"1,2\n" * 9 + b"1,2,3\n" + b"1,2\n" * 9, "2 columns"),
         ("log.csv", "q,tau\n1,2\n".encode("utf-16"), "UTF-16"),
+        ("log.csv", "q,tau\n1,2\n".encode("utf-16-le"), "UTF-16"),
+        ("log.csv", b'q,tau\n"[1.5, 2]",2\n"[1.6, 2]",2\n', "one number in each cell"),
+        (
+            "log.csv",
+            b"q,tau\n" + b'"1,234",2.5\n"2,345",2.5\n1,2.5\n' * 90,
+            "no commas between",
+        ),
         ("log.csv", b"q,tau\n" + b"1,2\n" * 9 + b'1,"2\n' + b"1,2\n" * 9, "line 11"),
         ("log.parquet", b"not parquet", "damaged"),
         ("log.npz", b"not npz", "`log.npz`"),

@@ -230,3 +230,44 @@ def test_lines_are_numbered_as_in_the_file(tmp_path):
         read_recording(tmp_path / "log.csv", COLUMNS)
     recording = read_recording(tmp_path / "log.csv", COLUMNS, bad_rows=0.1)
     assert recording.samples == SAMPLES - 1
+
+
+def test_numbers_of_fortran_and_of_spreadsheets(tmp_path):
+    rng = np.random.default_rng(1)
+    forces = np.round(1e3 * rng.normal(size=(SAMPLES, 2)), 1)
+    lines = ["time,q1,tau1"]
+    for t, (q, force) in zip(TIMES, forces, strict=True):
+        exponent = f"{q:.6E}".replace("E", "D")
+        lines.append(f'{t:.3f},{exponent},"{force:,.1f}"')
+    path = tmp_path / "log.csv"
+    path.write_text("\n".join(lines))
+    log = read_recording(path, COLUMNS)
+    np.testing.assert_allclose(log.angles[:, 0], forces[:, 0])
+    np.testing.assert_allclose(log.forces[:, 0], forces[:, 1])
+
+
+@pytest.mark.parametrize(
+    ("channel", "size", "start"),
+    [
+        ("angles", 2**16, 65000),
+        ("angles", 2**16, -20),
+        ("forces", 2**16, -30),
+        ("velocities", 2**16, -300),
+    ],
+)
+def test_counters_that_begin_again_go_on(tmp_path, channel, size, start):
+    """Also numbers whose sign was lost; others of the same size stay as they are."""
+    counts = start + np.cumsum(np.arange(SAMPLES) * (9 if start > 0 else 1))
+    columns = dict.fromkeys(("angles", "forces", "velocities"), np.arange(SAMPLES))
+    columns[channel] = counts % size
+    path = tmp_path / "log.csv"
+    rows = [",".join(map(str, row)) for row in zip(*columns.values(), strict=True)]
+    path.write_text("\n".join([",".join(columns), *rows]))
+    names = {name: name for name in columns}
+    log = read_recording(path, Columns(**names, sample_time=0.01))
+    steps = np.diff(getattr(log, channel)[:, 0])
+    np.testing.assert_array_equal(steps, np.diff(counts))
+    assert f"`{channel}` jump by {size}" in log.notes[0]
+    assert len(log.notes) == 1
+    if start < 0:
+        np.testing.assert_array_equal(getattr(log, channel)[:, 0], counts)

@@ -55,6 +55,40 @@ def test_a_clock_that_was_set_back_is_refused(shift):
         recording(np.arange(600), stamps)
 
 
+@pytest.mark.parametrize("kind", ["seconds alone", "coarse clock", "two drivers"])
+def test_stamps_that_many_samples_share_are_refused(kind):
+    rows = np.arange(600)
+    stamps = np.floor(TIMES)
+    if kind == "coarse clock":
+        stamps = np.floor(TIMES / 0.1) * 0.1
+    elif kind == "two drivers":
+        rows = np.stack([rows, 0 * rows], axis=1).ravel()
+        stamps = np.repeat(TIMES, 2)
+    with pytest.raises(InputError, match=r"rows of `recording` have the time stamp"):
+        recording(rows, stamps)
+
+
+def test_samples_that_a_fast_logger_repeats_are_removed():
+    rows = np.repeat(np.arange(600), 5)
+    check(recording(rows, TIMES[rows]))
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".npz"])
+def test_seconds_and_nanoseconds_of_two_columns(tmp_path, suffix):
+    ticks = 1_700_000_000_950_000_000 + np.round(TIMES * 1e9).astype(np.int64)
+    x = np.sin(3 * TIMES)
+    columns = {"sec": ticks // 10**9, "nanosec": ticks % 10**9, "q1": x, "tau1": x}
+    path = tmp_path / f"log{suffix}"
+    if suffix == ".csv":
+        pl.DataFrame(columns).write_csv(path)
+    else:
+        np.savez(path, **columns)
+    names = Columns("q{}", "tau{}", time=["sec", "nanosec"])
+    log = read_recording(path, names)
+    check(log)
+    assert log.stamp_deviation < 1e-6
+
+
 def test_turns_are_not_smeared_by_jitter():
     """A joint that turns on and on, whose angle starts again at 180 degrees."""
     rng = np.random.default_rng(3)

@@ -4,6 +4,7 @@ from ..log_columns import Selection as Selection, Selections as Selections
 from .log_file import AbstractLogFile as AbstractLogFile
 from .log_table import (
     COMMENT as COMMENT,
+    NO_NUMBER as NO_NUMBER,
     Complaints as Complaints,
     LogTable as LogTable,
 )

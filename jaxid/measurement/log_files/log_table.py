@@ -31,6 +31,13 @@ MAX_INFLATION = 20
 """Memory of a log, relative to the size of its file; measurements compress less."""
 MIN_REFUSED_MEMORY = 2**26
 """Memory that any file may need [bytes]."""
+NO_NUMBER = "no number"
+"""Words of the complaint about a cell with another text."""
+NUMBER_PARTS = {
+    r"(?i)(\d\.?)d([+-]?\d+)$": "${1}e$2",
+    r"^([+-]?[1-9]\d{0,2}),(\d{3}\.)": "$1$2",
+}
+"""Parts of numbers that Fortran and spreadsheets write, and what they become."""
 
 
 @contextlib.contextmanager
@@ -137,7 +144,11 @@ class LogTable:
         Integers and dates count from the first of these rows: nanoseconds since 1970 do
         not fit into float64, but their differences do.
         """
-        (name,) = self.channels["time"]
+        names = self.channels["time"]
+        if len(names) == 2:
+            seconds, parts = (self.numbers(name)[:, 0] for name in names)
+            return seconds - seconds[0] + 1e-9 * parts
+        (name,) = names
         column = self.columns[name]
         if isinstance(column, pl.Series) and column.dtype.is_temporal():
             ticks = nanoseconds(column)
@@ -181,16 +192,27 @@ class LogTable:
         try:
             numbers = column.cast(pl.Float64, strict=False)
             if column.dtype == pl.String and numbers.null_count():
-                numbers = column.str.strip_chars().cast(pl.Float64, strict=False)
+                texts = column.str.strip_chars()
+                for pattern, text in NUMBER_PARTS.items():
+                    texts = texts.str.replace(pattern, text)
+                numbers = texts.cast(pl.Float64, strict=False)
         except pl.exceptions.PolarsError as error:
             raise InputError(
                 f"column `{name}` of `{self.source}` holds {column.dtype}: name one "
                 "of numbers."
             ) from error
+        texts = column.drop_nulls()
+        # Drivers that measure nothing write words without digits.
+        if numbers.is_null().all() and re.search(r"\d", str(texts.first())):
+            raise InputError(
+                f"column `{name}` of `{self.source}` holds texts such as "
+                f"`{texts.first()}`: name one of numbers, or export the log with one "
+                "number in each cell."
+            )
         is_empty = column.is_null().to_numpy()
         self.refuse_first(name, is_empty, column, "is empty")
         is_text = numbers.is_null().to_numpy()
-        self.refuse_first(name, is_text, column, "is `{}`, no number")
+        self.refuse_first(name, is_text, column, f"is `{{}}`, {NO_NUMBER}")
         # Damaged bytes may be a NaN with which NumPy warns.
         return numbers.fill_nan(np.nan).to_numpy()
 
