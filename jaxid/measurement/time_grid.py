@@ -55,7 +55,7 @@ class TimeGrid(NamedTuple):
 
     @property
     def cure_of_short_segments(self) -> str:
-        """What to do about a log whose segments are all too short for a filter."""
+        """Advice for a log whose segments are all too short for a filter."""
         if self.sample_time < MIN_LIKELY_SAMPLE_TIME:
             return "check `time_unit`, or give `sample_time`"
         gap_notes = [note for note in self.notes if "largest_gap" in note]
