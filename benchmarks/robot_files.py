@@ -20,7 +20,9 @@ with many such files are listed in `README.md`; unpack them, and give their fold
 """
 
 import hashlib
+import os
 import re
+import tempfile
 from collections import Counter
 from collections.abc import Iterator
 from importlib.metadata import distribution
@@ -118,9 +120,9 @@ def compare(jid: Any, path: Path, name: str, chain: dict) -> Result:
     forces, is_possible = claimed_forces(jid, path, robot, motion, chain)
     words = " ".join(robot.notes)
 
-    cases = [("right", "", False), ("noted", words, False)]
+    cases = [("right", (), False), ("noted", robot.notes, False)]
     if "held at" in words:
-        cases.append(("noted", words, True))
+        cases.append(("noted", robot.notes, True))
     kind = "without a word"
     error = np.inf
     for case, notes, hold in cases:
@@ -142,7 +144,8 @@ def exchange_ends(root: Any) -> None:
         low = limit.get("lower")
         high = limit.get("upper")
         if low is not None and high is not None and float(low) > float(high):
-            limit.attrib.update(lower=high, upper=low)
+            limit.set("lower", high)
+            limit.set("upper", low)
 
 
 def remove_couplings(root: Any) -> None:
@@ -174,12 +177,15 @@ def cures(path: Path, chain: dict, sentence: str) -> Iterator[tuple[Path, dict]]
         yield path, chain | {"base": base}
     for words, edit in EDITS.items():
         if words in sentence:
-            root = etree.fromstring(path.read_bytes())
+            parser = etree.XMLParser(recover=True)
+            root = etree.fromstring(path.read_bytes(), parser)
             edit(root)
             copy = path.with_name(f"{path.stem}-cured{path.suffix}")
             copy.write_bytes(etree.tostring(root))
-            yield copy, chain
-            copy.unlink()
+            try:
+                yield copy, chain
+            finally:
+                copy.unlink()
     if "`tip`" in sentence and "tip" not in chain:
         for tip in open_peer(path).links()[:MAX_TIPS]:
             yield path, chain | {"tip": tip}
@@ -261,7 +267,9 @@ def main():
 
     kinds: Counter[str] = Counter()
     cured = 0
-    for found in results(jid, given.folders or [example_folder()]):
+    folders = [folder.resolve() for folder in given.folders]
+    os.chdir(tempfile.mkdtemp())  # MuJoCo writes its warnings to a file
+    for found in results(jid, folders or [example_folder()]):
         jax.clear_caches()  # the programs of this robot
         kinds[found.kind] += 1
         if found.kind in ("copy of another file", "without a moving joint"):

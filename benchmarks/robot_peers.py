@@ -8,22 +8,21 @@ import numpy as np
 from lxml import etree
 
 EFFECTS = {
-    "jnt_stiffnesspoly": "joint",
-    "jnt_springyield": "joint",
-    "dof_dampingpoly": "joint",
-    "tendon_stiffness": "tendon",
-    "tendon_stiffnesspoly": "tendon",
-    "tendon_damping": "tendon",
-    "tendon_dampingpoly": "tendon",
-    "tendon_frictionloss": "tendon",
-    "tendon_armature": "tendon",
-    "tendon_springyield": "tendon",
-    "actuator_armature": "actuator",
-    "actuator_damping": "actuator",
-    "actuator_dampingpoly": "actuator",
-    "body_gravcomp": "body",
+    "jnt_stiffnesspoly": ("joint", "a stiffness that depends on the deflection"),
+    "jnt_springyield": ("joint", "a spring that yields"),
+    "dof_dampingpoly": ("joint", "a damping that depends on the speed"),
+    "tendon_stiffness": ("tendon", "stiffness"),
+    "tendon_stiffnesspoly": ("tendon", "a stiffness that depends on the deflection"),
+    "tendon_damping": ("tendon", "damping"),
+    "tendon_dampingpoly": ("tendon", "a damping that depends on the speed"),
+    "tendon_frictionloss": ("tendon", "dry friction"),
+    "tendon_armature": ("tendon", "inertia"),
+    "actuator_armature": ("actuator", "inertia of several joints"),
+    "actuator_damping": ("actuator", "damping of several joints"),
+    "actuator_dampingpoly": ("actuator", "a damping that depends on the speed"),
+    "body_gravcomp": ("body", "`gravcomp`"),
 }
-"""MuJoCo's arrays of effects that a note may name, and the kind of their elements."""
+"""MuJoCo's arrays of effects that a note may name: kind of their elements, words."""
 
 
 class Follower(NamedTuple):
@@ -40,6 +39,16 @@ class Follower(NamedTuple):
     polynomial: np.ndarray
 
 
+def is_named(name: str, words: str, notes: Iterable[str]) -> bool:
+    """Return whether a note names an element together with its effect."""
+    return any(f"`{name}`" in note and words in note for note in notes)
+
+
+def leaves_out_negative(notes: Iterable[str]) -> bool:
+    """Return whether a note says that negative friction is not used."""
+    return any("is negative and is not used" in note for note in notes)
+
+
 class Peer:
     """Model of a file in another program.
 
@@ -53,7 +62,7 @@ class Peer:
         """Return the names of links, the end of the longest chain first."""
         raise NotImplementedError
 
-    def leave_out(self, notes: str) -> None:
+    def leave_out(self, notes: Iterable[str]) -> None:
         """Switch off the effects that notes name."""
         raise NotImplementedError
 
@@ -158,7 +167,12 @@ class Pinocchio(Peer):
         return [frame.name for frame in bodies]
 
     def leave_out(self, notes):
-        """Switch off nothing: a URDF file has no other effects."""
+        """Take away links that float, and negative friction, if notes say so."""
+        for index, joint in enumerate(self.model.joints):
+            if joint.nv == 6 and "as objects that float freely" in " ".join(notes):
+                self.model.inertias[index] = self.library.Inertia.Zero()
+        for array in (self.model.damping, self.model.upperDryFrictionLimit):
+            array[leaves_out_negative(notes) & (array < 0.0)] = 0.0
 
     def keep_chain(self, base, tip):
         """Take away the mass of links that do not belong to a chain."""
@@ -269,15 +283,20 @@ class Mujoco(Peer):
     def leave_out(self, notes):
         """Switch off the effects that notes name."""
         model = self.model
-        for array, kind in EFFECTS.items():
+        for array, (kind, words) in EFFECTS.items():
             values = np.asarray(getattr(model, array, []))
             for row in np.unique(np.argwhere(values)[:, 0]):
                 element = model.dof_jntid[row] if array.startswith("dof") else row
-                if f"`{self._name(kind, element)}`" in notes:
+                names = [self._name(kind, element)]
+                if kind == "actuator":
+                    names.append(self._name("joint", model.actuator_trnid[row, 0]))
+                if any(is_named(name, words, notes) for name in names):
                     values[row] = 0.0
-        if "`density`" in notes:
+        if is_named("density", "the resistance of a medium", notes):
             model.opt.density = 0.0
             model.opt.viscosity = 0.0
+        for array in (model.dof_damping, model.dof_frictionloss):
+            array[leaves_out_negative(notes) & (array < 0.0)] = 0.0
 
     def keep_chain(self, base, tip):
         """Take away the mass of links that do not belong to a chain."""

@@ -67,15 +67,16 @@ class UrdfElements:
         if text is None:
             return np.array(default)
         try:
-            array = np.array([float(word) for word in text.split()])
+            words = text.replace(", ", " ").split()
+            array = np.array([float(word) for word in words])
         except ValueError:
             array = np.zeros(0)
         is_number = ~np.isnan(array) if infinite else np.isfinite(array)
         if array.shape != (len(default),) or not is_number.all():
-            words = "number" if len(default) == 1 else "numbers"
+            noun = "number" if len(default) == 1 else "numbers"
             raise InputError(
                 f"{self.place(element)}: `{key}` must hold "
-                f'{len(default)} finite {words}, but is "{text}".'
+                f'{len(default)} finite {noun}, but is "{text}".'
             )
         return array
 

@@ -126,6 +126,10 @@ class UrdfTree(UrdfElements):
 
     def _find_root(self):
         """Return the only link that no joint moves."""
+        if not self.links:
+            raise InputError(
+                f"`{self.path}` has no links: give the file that describes the robot."
+            )
         roots = [link for link in self.links if link not in self._above]
         tree_links = list(roots)
         for link in tree_links:
@@ -140,7 +144,7 @@ class UrdfTree(UrdfElements):
         if len(roots) != 1:
             raise InputError(
                 f"`{self.path}` must have one root link, but has "
-                f"{listed(roots) or 'none'}: connect several by fixed joints."
+                f"{listed(roots)}: connect them by fixed joints."
             )
         return roots[0]
 

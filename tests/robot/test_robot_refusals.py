@@ -184,7 +184,7 @@ FILES = {
     "one end of a range": (arm(inner='<limit lower="1"/>'), "or state both"),
     "a place far away": (arm(xyz="0 0 1e300"), "`offset` of joint `j1` .* metres"),
     "nothing that moves": (arm(kind="fixed"), "no moving joint below link `base`"),
-    "no links": (robot(), "one root link, but has none"),
+    "no links": (robot(), "has no links: give the file that describes"),
     "no child": (
         arm().replace('<child link="a"/>', ""),
         "line 5: the joint has no `<child>`",

@@ -339,6 +339,17 @@ def test_a_quaternion_without_direction_is_refused(write):
         load_urdf(write(zero))
 
 
+@pytest.mark.parametrize("xyz", ["0.1, 0.2, -0.3", "0.1 0.2, -0.3", " 0.1,  0.2 -0.3"])
+def test_commas_before_blanks_separate_numbers(write, xyz):
+    assert load_urdf(write(arm(xyz=xyz))).offset.tolist() == [[0.1, 0.2, -0.3]]
+
+
+@pytest.mark.parametrize("xyz", ["0,1 0,2 -0,3", "0.1,0.2,-0.3", "0.1, 0.2, -0.3,"])
+def test_other_commas_are_refused(write, xyz):
+    with pytest.raises(InputError, match="`xyz` must hold 3 finite numbers"):
+        load_urdf(write(arm(xyz=xyz)))
+
+
 @pytest.mark.parametrize("key", ["armature", "damping", "friction", "stiffness"])
 def test_a_negative_effect_is_noted_and_not_used(write, key):
     path = write(arm(inner=f'<dynamics {key}="-1"/>'))
