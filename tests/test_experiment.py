@@ -707,3 +707,48 @@ def test_shapes_come_from_the_file(load):
     # Without shapes the lines between the joints stand in.
     found = load(ARM).surroundings
     assert "stout capsules" in found.faults[0]
+
+
+GEARED = """<robot name="arm"><link name="l0"/><link name="l1"/><link name="l2"/>
+  <joint name="j1" type="revolute"><parent link="l0"/><child link="l1"/>
+    <limit lower="-1" upper="1" effort="9" velocity="2"/></joint>
+  <joint name="j2" type="revolute"><parent link="l1"/><child link="l2"/>
+    <limit lower="-1" upper="1" effort="9" velocity="2"/></joint>
+  <transmission name="t"><joint name="j1"/><actuator name="m">
+    <mechanicalReduction>50</mechanicalReduction></actuator></transmission></robot>"""
+
+
+def test_the_template_proposes_the_gears_of_the_file(tmp_path):
+    (tmp_path / "arm.urdf").write_text(GEARED)
+    text = write_template(tmp_path / "arm.urdf", folder=tmp_path)
+    path = tmp_path / "experiment.toml"
+    path.write_text(text, encoding="utf-8")
+    # As long as nobody says that the log is of the motors, nothing changes.
+    assert load_experiment(path).setup.robot.drives.is_direct
+    motor_text = text.replace('\nside = "joint"', '\nside = "motor"')
+    path.write_text(motor_text, encoding="utf-8")
+    with pytest.raises(InputError, match=r"`gear_ratios = .50.0, 1.0.` in `.drives.`"):
+        load_experiment(path)
+    active_text = re.sub(r"\ngear_ratios = .*", "", motor_text)
+    proposal = "# gear_ratios = [50.0, 1.0]"
+    assert proposal in active_text
+    path.write_text(active_text.replace(proposal, proposal[2:]), encoding="utf-8")
+    drives = load_experiment(path).setup.robot.drives
+    assert np.diag(drives.reduction).tolist() == [50.0, 1.0]
+    (tmp_path / "arm.urdf").write_text(GEARED.replace(">50<", ">1<"))
+    assert proposal[:15] not in write_template(tmp_path / "arm.urdf", folder=tmp_path)
+
+
+def test_another_tip_names_all_lists_and_the_command_that_writes_them(tmp_path):
+    (tmp_path / "arm.urdf").write_text(GEARED)
+    text = write_template(tmp_path / "arm.urdf", folder=tmp_path)
+    path = tmp_path / "experiment.toml"
+    shorter = text.replace('urdf = "arm.urdf"', 'urdf = "arm.urdf"\ntip = "l1"')
+    path.write_text(re.sub(r"\n# tip = .*", "", shorter), encoding="utf-8")
+    keys = "`limits.position_min`, `limits.pos.*`drives.gear_ratios` do not hold 1"
+    cure = r"each joint .j1.: .*`jaxid init \S*arm.urdf --tip l1` prints"
+    with pytest.raises(InputError, match=f"{keys} .*{cure}"):
+        load_experiment(path)
+    lists = write_template(tmp_path / "arm.urdf", tip="l1", folder=tmp_path)
+    path.write_text(lists, encoding="utf-8")
+    assert load_experiment(path).setup.robot.joints == 1

@@ -25,7 +25,14 @@ from jaxid.workflow.setup import LogReading, Setup
 from jaxid.workflow.surroundings import Collision, Surroundings
 
 from .decoder import call, decode
-from .robot_tables import RobotSource, known_load, replace_drives, replace_limits
+from .robot_tables import (
+    RobotSource,
+    known_load,
+    replace_drives,
+    replace_limits,
+    require_gears,
+    require_joint_lists,
+)
 from .setup_tables import (
     Effects,
     Sides,
@@ -119,6 +126,7 @@ def _build(tables: TomlTable, text: str, path: Path) -> Experiment:
     with within("robot"):
         robot_file = source.robot_file(path.parent)
         robot = source.build(robot_file)
+    require_joint_lists(tables, robot)
     for name, replace in (("limits", replace_limits), ("drives", replace_drives)):
         if name in tables:
             robot = call(replace, tables[name], name, robot)
@@ -126,6 +134,7 @@ def _build(tables: TomlTable, text: str, path: Path) -> Experiment:
     reading = LogReading()
     if "recording" in tables:
         columns, reading = build_columns(tables["recording"], robot, path.parent)
+        require_gears(robot, columns)
     load = None
     if "load" in tables:
         load_of_robot = call(known_load, tables["load"], "load")

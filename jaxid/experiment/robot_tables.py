@@ -9,6 +9,8 @@ from typing import Annotated, Any, Literal, cast
 import numpy as np
 
 from jaxid.errors import InputError
+from jaxid.experiment_file import TomlTable
+from jaxid.measurement.columns import Columns
 from jaxid.robot import library
 from jaxid.robot.limits_and_drives import Limits, per_joint, range_fault
 from jaxid.robot.robot import Robot, Tool
@@ -188,6 +190,40 @@ class RobotSource:
         if isinstance(tool, float):
             raise InputError("`robot.tool.centre_of_mass` is missing.")
         return robot if tool is None else robot.replace(tool=tool)
+
+
+def require_joint_lists(tables: TomlTable, robot: Robot) -> None:
+    """Reject lists of another number of joints, as another `tip` leaves them.
+
+    A single list of a wrong length has another cause.
+    """
+    keys = [
+        f"`{name}.{key}`"
+        for name in ("limits", "drives", "recording")
+        for key, value in tables.get(name, {}).items()
+        if isinstance(value, list) and len(value) != robot.joints
+    ]
+    if len(keys) > 1 and Path(robot.source).is_file():
+        options = f" --tip {robot.source_tip}" if robot.source_tip else ""
+        if robot.source_base:
+            options += f" --base {robot.source_base}"
+        raise InputError(
+            f"{', '.join(keys)} do not hold {robot.joints} entries, one for each joint "
+            f"({', '.join(robot.joint_names)}): where `tip` or `base` has changed, "
+            f"take these lists from what `jaxid init {robot.source}{options}` prints."
+        )
+
+
+def require_gears(robot: Robot, columns: Columns) -> None:
+    """Reject logs of motors without the gear ratios that the robot's file states."""
+    is_of_motors = columns.angles_on_motor_side or columns.forces_on_motor_side
+    if is_of_motors and robot.drives.lack_stated_ratios:
+        ratios = np.asarray(robot.drives.stated_ratios).tolist()
+        raise InputError(
+            "`recording.side` or `forces_side` is that of the motors, but the gear "
+            "ratios are 1, while the robot's file states others (`<transmission>`): "
+            f"give `gear_ratios = {ratios}` in `[drives]`, or the side of the joints."
+        )
 
 
 def replace_limits(

@@ -109,6 +109,8 @@ def write_template(
     sections = [HEAD.format(name=robot.name)]
     for name, functions in TABLES.items():
         table = _table(name, functions, robot.joints, values.get(name, {}))
+        if name == "drives" and robot.drives.lack_stated_ratios:
+            table += _stated_ratios(robot)
         sections.append(_joints(robot) + table if name == "limits" else table)
         if name in INNER_TABLES:
             inner_name, function = INNER_TABLES[name]
@@ -233,6 +235,16 @@ def _summary(function: Callable) -> str:
     """Return the first sentence of a docstring, without formulas."""
     text = (inspect.getdoc(function) or "").split("\n\n")[0].replace("\n", " ")
     return re.sub(r" \$[^$]*\$", "", text)
+
+
+def _stated_ratios(robot: Robot) -> str:
+    """Return a comment with the gear ratios that the robot's file states."""
+    value = toml_text(np.asarray(robot.drives.stated_ratios).tolist()) or ""
+    text = (
+        "The robot's file states these ratios (`<transmission>`), in place of those "
+        'above, for logs of the motors\' side (`side = "motor"`)'
+    )
+    return "\n".join([*_comment(f"{text}:"), f"# gear_ratios = {value}"]) + "\n"
 
 
 def _joints(robot: Robot) -> str:

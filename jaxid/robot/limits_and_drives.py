@@ -103,6 +103,8 @@ class Drives(Hashable):
         rotor_inertia: Inertia of each motor, on the motor's side [kg m²]; NaN if
             unknown. It is displayed only: the inertia that the joints feel is
             identified.
+        stated_ratios: Gear ratios that the robot's file states, which are proposed for
+            `reduction` where a log needs it; 1 where it states none.
 
     Raises:
         InputError: If a length is wrong, the matrix is not invertible, or a number is
@@ -117,6 +119,7 @@ class Drives(Hashable):
     zero: Joints = eqx.field(converter=given, default=None)
     max_torques: Joints = eqx.field(converter=given, default=None)
     rotor_inertia: Joints = eqx.field(converter=given, default=None)
+    stated_ratios: Joints = eqx.field(converter=given, default=None)
 
     def __post_init__(self, joints: int | None):
         n = _count(
@@ -134,12 +137,18 @@ class Drives(Hashable):
         # NaN, which is not negative, is an unknown inertia.
         _require("rotor_inertia", rotor_inertia, lambda x: ~(x < 0), "zero or more")
         self.rotor_inertia = rotor_inertia
+        self.stated_ratios = per_joint("stated_ratios", self.stated_ratios, n, 1.0)
 
     @property
     def is_direct(self) -> bool:
         """Whether motors and joints coincide: unit gears and no offset."""
         unit_gears = np.eye(len(self.zero))
         return np.array_equal(self.reduction, unit_gears) and not np.any(self.zero)
+
+    @property
+    def lack_stated_ratios(self) -> bool:
+        """Whether the robot's file states gears, but these drives are direct."""
+        return self.is_direct and bool(np.any(self.stated_ratios != 1.0))
 
     @property
     def _inverse(self):

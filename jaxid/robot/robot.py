@@ -22,7 +22,7 @@ from jaxid.errors import InputError
 from jaxid.result_table import Column, Remark, Status, Summarised, Table
 
 from .follower_joints import Followers, order_from_ground
-from .inertia import IMPOSSIBLE, Inertia
+from .inertia import IMPOSSIBLE, PLACEHOLDER, Inertia
 from .limits_and_drives import MAX_LENGTH, Drives, Limits, length_notes, limit_notes
 from .rotations import SNAP_TOLERANCE, snapped, snapped_rotations
 
@@ -407,11 +407,13 @@ class Robot(Summarised, eqx.Module):
 
     @property
     def remarks(self) -> list[Remark]:
-        """Notes, of which those on bodies that cannot exist are doubts."""
-        return [
-            Remark(note, Status.DOUBTFUL if IMPOSSIBLE in note else Status.NEUTRAL)
-            for note in self.notes
-        ]
+        """Notes, of which those on bodies that nobody can have built are doubts."""
+        remarks = []
+        for note in self.notes:
+            is_doubt = IMPOSSIBLE in note or PLACEHOLDER in note
+            status = Status.DOUBTFUL if is_doubt else Status.NEUTRAL
+            remarks.append(Remark(note, status))
+        return remarks
 
     def summary(self) -> Table:
         """Return a table of the joints: parents, ranges, speeds and largest forces."""

@@ -10,10 +10,11 @@ from jaxid.arrays import AnyArray, Joints, Numbers
 from jaxid.errors import InputError
 
 from .follower_joints import Followers, all_coordinates, speed_ratios
-from .inertia import IMPOSSIBLE, MAX_DENSITY, ball_densities
+from .inertia import IMPOSSIBLE, MAX_DENSITY, PLACEHOLDER, Inertia, ball_densities
 from .limits_and_drives import (
     MAX_STATED_ANGLE,
     MAX_STATED_LENGTH,
+    Drives,
     Limits,
     owners,
     range_fault,
@@ -28,6 +29,10 @@ MAX_MAGNITUDE = 1e7
 """Largest speed or force that a file can state; larger ones are no limits."""
 PLACEHOLDER_MASS = 0.01
 """Mass that files state for links which nobody has weighed [kg]."""
+REDUCTION_TAGS = ("mechanicalReduction", "mechanical_reduction")
+"""Elements of a transmission that state its ratio, in ROS 1 and ROS 2."""
+PLACEHOLDER_RADIUS = 0.3
+"""Radius of gyration of a ball that is larger than a link of an arm [m]."""
 
 
 def load_urdf(
@@ -109,6 +114,7 @@ def load_urdf(
             joint_names=tuple(joint.get("name") for joint in joints),
             gravity=gravity,
             limits=limits,
+            drives=Drives(len(joints), stated_ratios=_gear_ratios(tree)),
             tip_body=tip_body,
             tip_rotation=tip_rotation,
             tip_offset=tip_offset,
@@ -289,6 +295,23 @@ def _checked_range(tree: UrdfTree, joint: Any):
     )
 
 
+def _gear_ratios(tree: UrdfTree):
+    """Return the ratios of motor to joint speed of transmissions of a single joint."""
+    ratios = {joint.get("name"): 1.0 for joint in _leading_joints(tree)}
+    for transmission in tree.root.iter("transmission"):
+        names = [joint.get("name") for joint in transmission.iterfind("joint")]
+        if len(names) != 1 or names[0] not in ratios:
+            continue
+        try:
+            elements = transmission.iter(*REDUCTION_TAGS)
+            ratio = np.prod([float(element.text or "") for element in elements])
+        except ValueError:
+            continue  # no simulator, and no fit, needs it
+        if ratio and np.isfinite(ratio):
+            ratios[names[0]] = float(ratio)
+    return list(ratios.values())
+
+
 def _mount_notes(tree: UrdfTree, base: str | None):
     """Return a note if joints above the base decide where gravity points in it."""
     if not tree.tilting_joints:
@@ -402,7 +425,35 @@ def _inertial_notes(tree: UrdfTree):
     if fault:
         cure = "inertias of the file are no prior: correct or remove them"
         notes.append(f"{fault}; {cure}.")
+    else:
+        notes += _placeholder_notes(tree)
     return notes
+
+
+def _placeholder_notes(tree: UrdfTree):
+    """Return a note on bodies with the moments of balls that are no links of an arm.
+
+    Those of one body may be right by chance if they are large, but not of many.
+    """
+    inertias = Inertia.from_parameters(tree.bodies())
+    masses = np.asarray(inertias.mass)
+    moments = np.einsum("bii->b", inertias.tensor) / 3.0
+    deviations = np.abs(inertias.tensor - moments[:, None, None] * np.eye(3))
+    is_ball = (masses > 0.0) & (deviations.max(axis=(1, 2)) <= 1e-9 * moments)
+    is_at_origin = ~np.any(inertias.centre, axis=1)
+    is_tiny = is_ball & is_at_origin & (masses <= PLACEHOLDER_MASS)
+    is_huge = is_ball & (moments > PLACEHOLDER_RADIUS**2 * masses)
+    if is_huge.sum() < max(3, len(masses) / 2):
+        is_huge[:] = False
+    names = [tree.joints[i].get("name") for i in np.flatnonzero(is_tiny | is_huge)]
+    # Branches at the base may be light, such as propellers.
+    if not names or all(placement.body < 0 for placement in tree.placements):
+        return []
+    return [
+        f"{owners('joint', names)}: the moments of the body are those of a ball of a "
+        f"few grams or of one larger than a link, {PLACEHOLDER}; an estimate is pulled "
+        "towards it: correct it, or write `pull = 0` in `[estimator]`."
+    ]
 
 
 def placeholder_fault(tree: UrdfTree) -> str:
@@ -421,5 +472,5 @@ def placeholder_fault(tree: UrdfTree) -> str:
     is_chain = len({place.body for place in tree.placements}) == len(bodies) > 2
     mass = bodies[0, 0]
     if is_chain and 0.0 < mass <= PLACEHOLDER_MASS and not np.ptp(bodies[:, 0]):
-        return "all bodies have the same mass, as placeholders have"
+        return f"all bodies have the same mass, {PLACEHOLDER}"
     return ""

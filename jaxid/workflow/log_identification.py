@@ -60,7 +60,13 @@ class IdentificationReport(Summarised, Report):
         """Return estimates and torque errors, and the verdict with what to look at."""
         fit = self.fit
         robot = fit.base.model.robot
-        tables = [robot.summary(), *motor_tables(robot)]
+        robot_table = robot.summary()
+        if getattr(fit.estimator, "pull", None) is None:
+            # Doubts about bodies of the file concern only who is pulled to them.
+            robot_table.remarks = tuple(
+                x for x in robot_table.remarks if x.status is not Status.DOUBTFUL
+            )
+        tables = [robot_table, *motor_tables(robot)]
         notes = [*self.notes, *fit.notes]
         if fit.consistency is not None:
             # Those are in its table.

@@ -676,3 +676,41 @@ def test_a_xacro_file_is_expanded_by_the_program(write, tmp_path, monkeypatch):
     program.write_text(f"#!{sys.executable}\nraise SystemExit('no such macro')")
     with pytest.raises(InputError, match="fails: no such macro"):
         load_urdf(path)
+
+
+TRANSMISSIONS = """<transmission name="a"><joint name="j1"><x/></joint>
+    <actuator name="m1"><mechanicalReduction>-50</mechanicalReduction></actuator>
+  </transmission>
+  <ros2_control><transmission name="b"><plugin>simple</plugin>
+    <joint name="j2"><mechanical_reduction>2</mechanical_reduction></joint>
+    <actuator name="m2"><mechanical_reduction>30</mechanical_reduction></actuator>
+  </transmission></ros2_control>
+  <transmission name="c" type="Differential"><joint name="j3"/><joint name="j4"/>
+    <mechanicalReduction>9</mechanicalReduction></transmission>
+  <transmission name="d"><joint name="j3"/>
+    <mechanicalReduction>{}</mechanicalReduction></transmission>
+  <transmission name="e"><joint name="no"/>
+    <mechanicalReduction>7</mechanicalReduction></transmission>"""
+
+
+def chain_of_four(inner):
+    """Return an arm of four links with ranges of 2 rad, and further elements."""
+    limit = '<limit lower="-1" upper="1" effort="9" velocity="2"/>'
+    parts = [link("l0")]
+    for k in range(1, 5):
+        parts.append(link(f"l{k}"))
+        parts.append(joint(f"j{k}", f"l{k - 1}", f"l{k}", inner=limit))
+    return robot(*parts, inner)
+
+
+def test_ratios_of_transmissions_are_read_and_change_nothing(write):
+    text = chain_of_four(TRANSMISSIONS)
+    for word, ratio in (("-0.5", -0.5), ("1", 1.0), ("0", 1.0), ("a", 1.0)):
+        arm_of_file = load_urdf(write(text.format(word)))
+        drives = arm_of_file.drives
+        assert drives.stated_ratios.tolist() == [-50.0, 60.0, ratio, 1.0]
+        assert drives.is_direct
+        assert drives.lack_stated_ratios
+    assert not any("transmission" in note for note in arm_of_file.notes)
+    unit_gears = re.sub("(reduction|Reduction)>[-.0-9]+", r"\1>1", text.format("1"))
+    assert not load_urdf(write(unit_gears)).drives.lack_stated_ratios
