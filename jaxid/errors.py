@@ -2,7 +2,7 @@
 
 import re
 
-LONG_WORD = re.compile(r"\S{301,}")
+LONG_WORD = re.compile(r"[^\s`]{301,}")
 """Word that no sentence shows whole, such as a damaged name; no path is so long."""
 MAX_WORD_PART = 60
 """Characters of such a word that are shown."""

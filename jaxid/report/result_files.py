@@ -110,8 +110,9 @@ def _earlier_figures(folder: Path) -> set[str]:
     """Return the figures that an earlier report in this folder has written."""
     if schema_of(folder / "result.json") != SCHEMAS["result.json"]:
         return set()
-    files = read_json(folder / "result.json").get("files", ())
-    return {file for file in files if FIGURE_FILE.fullmatch(file)}
+    files = read_json(folder / "result.json").get("files")
+    texts = map(str, files) if isinstance(files, list) else ()
+    return {file for file in texts if FIGURE_FILE.fullmatch(file)}
 
 
 def schema_of(path: Path) -> str:
@@ -138,9 +139,12 @@ def read_faults(report: Path) -> list[str]:
     path = (report if report.is_dir() else report.parent) / "result.json"
     if schema_of(path) != SCHEMAS["result.json"]:
         return []
-    # The first remark of a verdict sums the others up.
-    remarks = read_json(path).get("verdict", ())[1:]
-    return [r["text"] for r in remarks if r["status"] == Status.BAD.name.lower()]
+    try:
+        # The first remark of a verdict sums the others up.
+        remarks = read_json(path).get("verdict", ())[1:]
+        return [r["text"] for r in remarks if r["status"] == Status.BAD.name.lower()]
+    except (KeyError, TypeError) as error:
+        raise InputError(f"`{path}` is damaged: identify again.") from error
 
 
 def write_comparison(

@@ -11,12 +11,14 @@ from jaxid.identification.parameter_changes import Verdict, compare
 from jaxid.report import result_files
 from jaxid.report.figure import Figure
 from jaxid.report.result_files import (
+    _earlier_figures,
+    read_faults,
     read_fit,
     safe_name,
     write_comparison,
     write_report,
 )
-from jaxid.report.result_records import consistency_record, plain
+from jaxid.report.result_records import SCHEMAS, consistency_record, plain
 from jaxid.validation.verdict import Report
 
 
@@ -178,3 +180,20 @@ def test_comparisons_hold_the_numbers_exactly(tmp_path, changed):
 )
 def test_names_become_safe(name, safe):
     assert safe_name(name) == safe
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        {"verdict": "bad", "files": 3},
+        {"verdict": {"status": "bad"}, "files": {"torques.svg": 1}},
+        {"verdict": [{}, {"status": "bad"}], "files": [1, None]},
+        {"verdict": None, "files": "torques.svg"},
+    ],
+)
+def test_damaged_results_are_named(tmp_path, content):
+    path = tmp_path / "result.json"
+    path.write_text(json.dumps({"schema": SCHEMAS["result.json"], **content}))
+    with pytest.raises(ValueError, match=r"result\.json` is damaged"):
+        read_faults(tmp_path)
+    assert not _earlier_figures(tmp_path)
