@@ -1,5 +1,6 @@
 """The kinematic tree of an MJCF file, which MuJoCo compiles, written as a URDF."""
 
+import re
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,6 +18,8 @@ Loop = tuple[str, str, str]
 """Name of a constraint that closes a loop, and the two bodies that it connects."""
 JOINT_TYPES = ("floating", "ball", "prismatic", "revolute")
 """Types of joints in MuJoCo's order."""
+PARSER_CODES = re.compile(r"\nError=\w+ ErrorID=\d+ \(\w+\)")
+"""Codes of MuJoCo's XML parser in its errors, which say nothing to a user."""
 EFFECTS = {
     "jnt_stiffness": ("joint", "a spring (`springs = true` in `[model]` describes it)"),
     "jnt_stiffnesspoly": ("joint", "a stiffness that depends on the deflection"),
@@ -111,7 +114,8 @@ def mjcf_as_urdf(path: str | Path) -> Description:
     try:
         model = mujoco.MjModel.from_xml_path(str(path))
     except ValueError as error:
-        lines = [" ".join(line.split()) for line in str(error).splitlines()]
+        text = PARSER_CODES.sub("", str(error))
+        lines = [" ".join(line.split()) for line in text.splitlines()]
         reason = "; ".join(line.rstrip(".") for line in lines if line)
         raise InputError(
             f"`{path}`: MuJoCo cannot compile this file: {reason}."

@@ -82,8 +82,10 @@ def parse_xml(path: str | Path, text: bytes | None = None) -> Any:
         return _tolerant_root(text, parser)
     except etree.XMLSyntaxError as error:
         line = error.lineno or 1
+        # Then come the place again, and advice for programmers.
+        fault, *_ = error.msg.split(", ")
         raise InputError(
-            f"`{path}`, line {line}: this is not XML ({error.msg})."
+            f"`{path}`, line {line}: this is not XML ({fault})."
         ) from error
 
 

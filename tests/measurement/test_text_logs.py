@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from jaxid import units
+from jaxid.errors import InputError
 from jaxid.measurement.columns import Columns
 from jaxid.measurement.reading import read_recording
 
@@ -271,3 +272,11 @@ def test_counters_that_begin_again_go_on(tmp_path, channel, size, start):
     assert len(log.notes) == 1
     if start < 0:
         np.testing.assert_array_equal(getattr(log, channel)[:, 0], counts)
+
+
+def test_a_text_that_is_no_table_is_refused_at_once(tmp_path):
+    rows = "\n".join(f"0.0{k},0.{k},0.{k}" for k in range(20))
+    path = tmp_path / "log.csv"
+    path.write_text(f"t,q1,tau1\n{rows}\n" + '"\n' * 110_000)
+    with pytest.raises(InputError, match=r"110000 lines of `log\.csv` are no rows"):
+        read_recording(path, Columns("q{}", "tau{}", time="t"))

@@ -51,9 +51,11 @@ def readable(source: str, kind: str) -> Iterator[None]:
         # Of many kinds: it depends on which bytes are damaged.
         # Some add a dump of the data in braces, or a mark below a line.
         text, *_ = re.split(r"[{^]", " ".join(str(error).split()))
-        reason = text[:200].rstrip(" .:;,(") or type(error).__name__
+        reason = text[:200].rstrip(" .:;,(") or "its parts contradict each other"
         if isinstance(error, MemoryError):
             reason = "it declares more data than the memory can hold"
+        elif isinstance(error, UnicodeDecodeError):
+            reason = "it holds bytes that are no text"
         raise InputError(
             f"`{source}` is no {kind}, or is damaged: {reason}."
         ) from error

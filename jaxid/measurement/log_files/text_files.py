@@ -31,6 +31,8 @@ from .log_table import COMMENT, BadRows, Complaints, LogTable, readable
 
 BLOCK_SIZE = 2**26
 """Bytes that are read at once."""
+MAX_BAD_LINES = 100_000
+"""Lines of such a block that may be no rows; with more the text is no table."""
 MAX_EXACT_INTEGER = 2**53
 """Largest size of integers that float64 holds without rounding."""
 HOUR = 3600 * 10**9
@@ -117,6 +119,11 @@ class TextFile(TextColumns, AbstractLogFile):
             lines = block.split(b"\n")
             block = b"\n".join(b" ".join(line.split()) for line in lines)
         complaints = bad_lines(self.format, block)
+        if len(complaints) > MAX_BAD_LINES:
+            raise InputError(
+                f"{len(complaints)} lines of `{self.path.name}` are no rows, such as "
+                f"line {first_line + min(complaints)}: export the log again."
+            )
         if complaints:
             lines = block.split(b"\n")
             for k, complaint in complaints.items():
