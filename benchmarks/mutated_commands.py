@@ -20,6 +20,7 @@ import json
 import os
 import random
 import resource
+import runpy
 import shutil
 import signal
 import subprocess
@@ -72,9 +73,7 @@ def run(words, folder):
         for channel, name in ((1, "output.txt"), (2, "errors.txt")):
             os.dup2(os.open(name, os.O_WRONLY | os.O_CREAT), channel)
         sys.argv = ["jaxid", *words]
-        from jaxid.cli import main
-
-        main()
+        runpy.run_module("jaxid", run_name="__main__")
     _, status = os.waitpid(process, 0)
     errors = (folder / "errors.txt").read_text(errors="replace")
     return os.waitstatus_to_exitcode(status), errors

@@ -77,6 +77,7 @@ METHODS = (
     Script("demo", 10),
     Script("faults", 25),
     Script("mutated_files", 6),
+    Script("mutated_commands", 3),
     Script("spoilt", 25),
     Script("clean", 40),
     Script("delay", 40),
