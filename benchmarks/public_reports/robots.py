@@ -462,6 +462,14 @@ def _():
     return settled(text, arm(), "must be in radians, not degrees")
 
 
+@report("fusion360descriptor#2", "the place of a joint in millimetres")
+def _():
+    text = arm(j3=joint("j3", "l2", "l3", 'xyz="0 0 400"', "0 1 0"))
+    return settled(
+        text, arm(), "`j3` stands 400 m from its link: give its place in metres"
+    )
+
+
 @report("universal_robot#340, franka_description#5", "two arms in a file, one log")
 def _():
     names = {f'"{a}{i}"': f'"{b}{i}"' for a, b in ("jk", "lr") for i in (1, 2, 3)}
@@ -513,13 +521,15 @@ def _():
     return settled(text, None, "is a mass in grams")
 
 
-@report("solidworks_urdf_exporter2 PR 181, onshape-to-robot#85", "grams and g mm²")
+@report("solidworks_urdf_exporter2 PR 33, onshape-to-robot#85", "grams and g mm²")
 def _():
     text = with_links(lambda m, c, r, i: (1000 * m, c, r, [1e9 * x for x in i]))
     return settled(text, None, "is it in kg mm²")
 
 
-@report("fusion360descriptor#2, march PR 364", "centres of mass in millimetres")
+@report(
+    "solidworks_urdf_exporter2 PR 181, march PR 364", "centres of mass in millimetres"
+)
 def _():
     def change(mass, centre, turn, moments):
         numbers = " ".join(str(1000 * float(x)) for x in centre.split())

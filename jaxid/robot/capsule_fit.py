@@ -12,13 +12,12 @@ from jaxid.arrays import AnyArray, Numbers, Vector3
 from jaxid.errors import InputError
 
 from .collision_geometry import Shape, link_shapes, mjcf_shapes
+from .limits_and_drives import MAX_LINK_LENGTH
 from .robot import Robot
 from .shapes import GROUND, Capsule
 from .urdf_elements import ORIGIN
 from .urdf_tree import UrdfTree
 
-MAX_REACH = 50.0
-"""Largest distance of a link's geometry from its frame [m]."""
 STAND_IN_SHARE = 0.07
 """Radius of a capsule for an unknown shape, relative to the robot's length."""
 AXIS_SHARE = 0.6
@@ -111,10 +110,10 @@ def _refuse_huge_shapes(path: str | Path, link: str, shapes: list[Shape]):
     """Reject shapes that no robot has."""
     for shape in shapes:
         reach = np.abs(shape.points).max(initial=0.0) + shape.radius
-        if not reach <= MAX_REACH:
+        if not reach <= MAX_LINK_LENGTH:
             raise InputError(
                 f"`{path}`: the geometry of link `{link}` must be within "
-                f"{MAX_REACH:g} m, but reaches {reach:g} m: give it in metres "
+                f"{MAX_LINK_LENGTH:g} m, but reaches {reach:g} m: give it in metres "
                 "(`scale` of a mesh)."
             )
 

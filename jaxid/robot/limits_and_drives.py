@@ -24,6 +24,8 @@ DOUBTFUL_LENGTH = 10.0
 """Length from which on the unit may be a millimetre [m]."""
 MAX_LENGTH = 1000.0
 """Length that no robot reaches [m]."""
+MAX_LINK_LENGTH = 50.0
+"""Length that no link of a robot has [m]."""
 MAX_STATED_LENGTH = 1e5
 """Longest rail that a file can state, in millimetres; longer ones are no limits."""
 MAX_STATED_ANGLE = 720.0

@@ -13,7 +13,7 @@ from jaxid.errors import InputError
 from .description_files import is_mjcf, read_description
 from .follower_joints import Followers, loaded_followers, relation, resolved_followers
 from .inertia import BodyParameters, Inertia
-from .limits_and_drives import are_degrees, listed
+from .limits_and_drives import MAX_LINK_LENGTH, are_degrees, listed
 from .mjcf import Loop
 from .rotations import Placement, axis_rotation, without_rounding
 from .urdf_elements import ORIGIN, UrdfElements
@@ -354,6 +354,11 @@ class UrdfTree(UrdfElements):
         if are_degrees(rpy):
             raise self.error(
                 joint, f"has an `rpy` of {_words(rpy)}: give radians, not degrees"
+            )
+        length = np.abs(offset).max()
+        if length > MAX_LINK_LENGTH:
+            raise self.error(
+                joint, f"stands {length:g} m from its link: give its place in metres"
             )
         return self.attitude(element), offset
 

@@ -124,6 +124,10 @@ FILES = {
         ),
         "joint `root` is floating.*`--tip`.*`--base base`",
     ),
+    "a place in millimetres": (
+        arm(xyz="0 0 300"),
+        "joint `j1` stands 300 m from its link: give its place in metres",
+    ),
     "a planar joint": (
         arm(kind="planar"),
         "joint `j1` is planar.*`--tip`.*make it fixed",
@@ -182,7 +186,10 @@ FILES = {
     "an attitude of ten degrees": (arm(rpy="0 10 0"), "`rpy` of 0 10 0: .*degrees"),
     "an attitude of rounded degrees": (arm(rpy="0 89.9998 0"), "`rpy` .*degrees"),
     "one end of a range": (arm(inner='<limit lower="1"/>'), "or state both"),
-    "a place far away": (arm(xyz="0 0 1e300"), "`offset` of joint `j1` .* metres"),
+    "a place far away": (
+        arm(xyz="0 0 1e300"),
+        "joint `j1` stands 1e[+]300 m .* metres",
+    ),
     "nothing that moves": (arm(kind="fixed"), "no moving joint below link `base`"),
     "no links": (robot(), "has no links: give the file that describes"),
     "no child": (
@@ -357,7 +364,7 @@ def test_geometry_that_cannot_be_read(tmp_path, geometry, message):
     ("options", "note"),
     [
         ({"inner": '<limit velocity="180"/>'}, "180 rad/s .* in degrees"),
-        ({"xyz": "0 0 300"}, "`offset` of joint `j1` is 300 m: .* millimetres"),
+        ({"xyz": "0 0 30"}, "`offset` of joint `j1` is 30 m: .* millimetres"),
         (
             {"kind": "prismatic", "inner": '<limit lower="0" upper="500"/>'},
             "`j1`.* 500 m",
