@@ -295,7 +295,7 @@ def seems_in_degrees(angle: float) -> bool:
     """Return whether an angle is far too large for radians, and no eighth turns."""
     rest = abs(angle) % EIGHTH_TURN
     rounding = min(rest, EIGHTH_TURN - rest)
-    return abs(angle) > MAX_RANGE_ANGLE and rounding > 1e-3
+    return bool(abs(angle) > MAX_RANGE_ANGLE and rounding > 1e-3)
 
 
 def length_notes(owner: str, lengths: Numbers) -> list[str]:

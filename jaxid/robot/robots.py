@@ -1,5 +1,6 @@
-"""The library of robots, and the inertial parameters that files of robots claim."""
+"""The library of robots, followers, and parameters that files of robots claim."""
 
+from .follower_joints import Follower as Follower
 from .library import (
     iiwa14 as iiwa14,
     kr300 as kr300,

@@ -197,6 +197,9 @@ def _leading_joints(tree: UrdfTree) -> list[Any]:
 def _of_leaders(followers: Followers, parameters: dict[str, Any]) -> dict[str, Any]:
     """Return parameters of all joints as those of the joints that move alone."""
     joints = len(parameters["armature"]) - len(followers)
+    # What is negative is not used.
+    for key in ("armature", "damping", "friction", "stiffness"):
+        parameters[key] = np.maximum(parameters[key], 0.0)
     ratios = speed_ratios(followers, joints).T
     sums = {
         key: ratios**2 @ parameters[key] for key in ("armature", "damping", "stiffness")

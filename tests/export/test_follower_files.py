@@ -6,7 +6,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from export_samples import fit_of, motion, possible
-from follower_arms import RELATIONS, follower_arm
+from follower_arms import follower_arm
 
 import jaxid as jid
 from jaxid.errors import InputError
@@ -16,8 +16,10 @@ from jaxid.simulation.friction_and_ripple import SmoothFriction
 from jaxid.simulation.mujoco import MujocoRobot
 from jaxid.simulation.virtual import Sensors, VirtualRobot
 
+SMALL = "follower of a follower"
 
-@pytest.fixture(params=RELATIONS)
+
+@pytest.fixture(params=["half the speed", "slide on a turning joint", SMALL])
 def arm(request):
     return follower_arm(request.param)
 
@@ -114,6 +116,7 @@ def test_a_file_with_another_relation_is_refused(fit, source, tmp_path):
         jid.export_urdf(other_fit, source, tmp_path / "arm.urdf")
 
 
+@pytest.mark.parametrize("arm", [SMALL], indirect=True)
 def test_a_virtual_robot_follows_its_own_model_but_mujoco_is_refused(fit):
     robot = fit.base.model.robot
     terms = (jid.RigidBodies(),)
