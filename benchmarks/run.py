@@ -84,6 +84,7 @@ METHODS = (
     Script("resolution", 10),
     Script("report", 1),
     Script("robot_files", 2),
+    Script("public_reports/run", 12),
 )
 SCRIPTS = SPEED + METHODS
 

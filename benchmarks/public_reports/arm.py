@@ -86,14 +86,17 @@ def motion(seed, seconds=SECONDS, dt=DT):
     return t, scale * q, scale * qd, scale * qdd
 
 
-def simulate(seed=0, noise=NOISE, **settings):
-    """Return a log of the arm: torques of Pinocchio, friction, rotors and noise."""
+def simulate(seed=0, noise=NOISE, draw=0, **settings):
+    """Return a log of the arm: torques of Pinocchio, friction, rotors and noise.
+
+    The `seed` is that of the motion, `draw` that of the noise.
+    """
     t, q, qd, qdd = motion(seed, **settings)
     model = pin.buildModelFromXML(urdf())
     data = model.createData()
     tau = np.array([pin.rnea(model, data, *x) for x in zip(q, qd, qdd, strict=True)])
     tau += VISCOUS * qd + COULOMB * np.tanh(qd / 0.01) + ROTORS * qdd
-    tau += noise * np.random.default_rng(seed + 1000).normal(size=tau.shape)
+    tau += noise * np.random.default_rng(seed + 1000 + draw).normal(size=tau.shape)
     return Log(t, q, qd, qdd, tau)
 
 
@@ -101,13 +104,13 @@ class Outcome(NamedTuple):
     """What a user gets.
 
     Attributes:
-        error: Relative error of the torques on another motion, joint by joint; None if
-            the log is refused.
+        error: Relative error of the torques on another motion, RMS of the joints; None
+            if the log is refused.
         words: The refusal; or all doubts about the log and the model, and the notes.
         is_doubted: Whether the log is refused, or there is any doubt.
     """
 
-    error: np.ndarray | None
+    error: float | None
     words: list[str]
     is_doubted: bool
 
@@ -158,7 +161,7 @@ def identified(logs, keys, folder=None):
 
 
 def error(fit):
-    """Return the relative error of a model's torques on another motion, by joint."""
+    """Return the relative error of a model's torques on another motion."""
     import jaxid as jid
 
     unseen = simulate(seed=7, noise=0.0)
@@ -166,4 +169,5 @@ def error(fit):
     unseen = unseen.rows(is_moving)
     predicted = np.asarray(fit.predict(jid.Motion(unseen.q, unseen.qd, unseen.qdd)))
     size = np.linalg.norm(unseen.tau, axis=0)
-    return np.linalg.norm(predicted - unseen.tau, axis=0) / size
+    errors = np.linalg.norm(predicted - unseen.tau, axis=0) / size
+    return float(np.sqrt(np.mean(errors**2)))

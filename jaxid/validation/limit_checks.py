@@ -121,8 +121,8 @@ def _joint_findings(robot: Robot, j: int, statistics: LogStatistics) -> Iterator
         yield (
             f"joint `{name}` moves from {minimum:.3g} to {maximum:.3g}, its range is "
             f"{lower_limit:.3g} to {upper_limit:.3g} {unit}: check "
-            "`recording.angle_unit`, `side`, `angle_signs` and `angle_offsets`, or "
-            "correct the range (`limits.position_min`, `position_max`)."
+            "`recording.angle_unit`, `side` (with `drives.gear_ratios`), "
+            "`angle_signs` and `angle_offsets`, or correct the range (`limits.position_min`, `position_max`)."
         )
     if statistics.speed[j] > MAX_LIMIT_RATIO * limits.velocity[j]:
         yield (

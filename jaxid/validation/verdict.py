@@ -221,7 +221,7 @@ def _judge_new_motions(
     ratios = unseen_errors / np.maximum(100 * _relative_errors(identification), 1e-9)
     ratio = float(np.max(np.where(unseen_errors > MIN_UNSEEN_ERROR, ratios, 1.0)))
     if ratio > 1:
-        text += f", and up to {significant(ratio, 2)} times as much as of the fit's own"
+        text += f", and up to {significant(claim / size, 2)} times as much as of the fit's own"
     status = Status.GOOD
     if max_error > RMS_ERROR[0] or ratio > UNSEEN_RATIO:
         status = Status.BAD if max_error > RMS_ERROR[1] else Status.DOUBTFUL
@@ -256,10 +256,11 @@ def _judge_size(claimed: Sequence[TorqueErrors]) -> Iterator[Remark]:
     A fit of forces in a wrong unit is as good as any, but its masses are not.
     """
     for log in claimed[:1]:
-        ratio = float(np.linalg.norm(log.predicted) / np.linalg.norm(log.measured))
-        if ratio > MAX_CLAIM:
+        claim = float(np.linalg.norm(log.predicted))
+        size = float(np.linalg.norm(log.measured))
+        if claim > MAX_CLAIM * size > 0:
             yield Remark(
-                f"The bodies of the robot's file need {significant(ratio, 2)} times "
+                f"The bodies of the robot's file need {significant(claim / size, 2)} times "
                 "the forces of the logs: are these currents "
                 "(`recording.torque_constants`), the motors' (`forces_side`) or in "
                 "another unit (`force_unit`), or is the file wrong?",
