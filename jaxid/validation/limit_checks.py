@@ -122,7 +122,8 @@ def _joint_findings(robot: Robot, j: int, statistics: LogStatistics) -> Iterator
             f"joint `{name}` moves from {minimum:.3g} to {maximum:.3g}, its range is "
             f"{lower_limit:.3g} to {upper_limit:.3g} {unit}: check "
             "`recording.angle_unit`, `side` (with `drives.gear_ratios`), "
-            "`angle_signs` and `angle_offsets`, or correct the range (`limits.position_min`, `position_max`)."
+            "`angle_signs` and `angle_offsets`, or correct the range "
+            "(`limits.position_min`, `position_max`)."
         )
     if statistics.speed[j] > MAX_LIMIT_RATIO * limits.velocity[j]:
         yield (

@@ -221,7 +221,7 @@ def _judge_new_motions(
     ratios = unseen_errors / np.maximum(100 * _relative_errors(identification), 1e-9)
     ratio = float(np.max(np.where(unseen_errors > MIN_UNSEEN_ERROR, ratios, 1.0)))
     if ratio > 1:
-        text += f", and up to {significant(claim / size, 2)} times as much as of the fit's own"
+        text += f", and up to {significant(ratio, 2)} times as much as of the fit's own"
     status = Status.GOOD
     if max_error > RMS_ERROR[0] or ratio > UNSEEN_RATIO:
         status = Status.BAD if max_error > RMS_ERROR[1] else Status.DOUBTFUL
@@ -259,9 +259,10 @@ def _judge_size(claimed: Sequence[TorqueErrors]) -> Iterator[Remark]:
         claim = float(np.linalg.norm(log.predicted))
         size = float(np.linalg.norm(log.measured))
         if claim > MAX_CLAIM * size > 0:
+            ratio = significant(claim / size, 2)
             yield Remark(
-                f"The bodies of the robot's file need {significant(claim / size, 2)} times "
-                "the forces of the logs: are these currents "
+                f"The bodies of the robot's file need {ratio} times the forces of the "
+                "logs: are these currents "
                 "(`recording.torque_constants`), the motors' (`forces_side`) or in "
                 "another unit (`force_unit`), or is the file wrong?",
                 Status.DOUBTFUL,

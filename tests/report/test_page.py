@@ -181,6 +181,22 @@ def test_mistakes_come_first_and_decide(fit, validation):
     assert [r.status for r in found[:3]] == [Status.BAD, Status.BAD, Status.DOUBTFUL]
 
 
+@pytest.mark.parametrize(("size", "is_doubted"), [(11.0, True), (0.1, False)])
+def test_forces_far_below_those_of_the_files_bodies_are_doubted(
+    fit, validation, size, is_doubted
+):
+    first, second = validation.errors
+    for forces in (first.measured, 0.0 * np.asarray(first.measured)):
+        claims = dataclasses.replace(
+            first, measured=forces, predicted=size * np.asarray(first.measured)
+        )
+        errors = (first,), (second,), validation.definiteness
+        remarks = verdict(Report(fit, *errors, claimed=(claims,)))
+        doubts = [x for x in remarks if "bodies of the robot's file" in x.text]
+        assert bool(doubts) == (is_doubted and bool(np.any(forces)))
+        assert all("need 11 times" in doubt.text for doubt in doubts)
+
+
 def test_a_weight_that_gravity_does_not_explain_is_pointed_out(fit):
     robot = fit.base.model.robot
     base = SimpleNamespace(
