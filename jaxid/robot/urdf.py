@@ -201,9 +201,7 @@ def _of_leaders(followers: Followers, parameters: dict[str, Any]) -> dict[str, A
     for key in ("armature", "damping", "friction", "stiffness"):
         parameters[key] = np.maximum(parameters[key], 0.0)
     ratios = speed_ratios(followers, joints).T
-    sums = {
-        key: ratios**2 @ parameters[key] for key in ("armature", "damping", "stiffness")
-    }
+    sums = {key: ratios**2 @ values for key, values in parameters.items()}
     sums["friction"] = np.abs(ratios) @ parameters["friction"]
     # The springs of all joints are one spring, which rests where their forces cancel.
     positions = all_coordinates(followers, np.zeros(joints))
@@ -353,12 +351,13 @@ def _held_notes(tree: UrdfTree):
 
 def _follower_notes(tree: UrdfTree):
     """Return notes on joints that follow others and move bodies of the robot."""
-    for follower in tree.followers:
+    first_number = len(_leading_joints(tree)) + 1
+    for number, follower in enumerate(tree.followers, first_number):
         leader_name = tree.joints[follower.leader].get("name")
         yield (
             f"joint `{follower.name}`: follows another one, at {follower.factor:.4g} * "
-            f"`{leader_name}` + {follower.offset:.4g}; its body is part of the model, "
-            f"its friction counts as that of `{leader_name}`."
+            f"`{leader_name}` + {follower.offset:.4g}; its body is number {number} "
+            f"(`m{number}`), its friction counts as that of `{leader_name}`."
         )
 
 

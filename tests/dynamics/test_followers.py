@@ -16,6 +16,7 @@ from jaxid.robot.forward_kinematics import (
 )
 from jaxid.robot.inertia import Inertia
 from jaxid.robot.urdf import joint_parameters, urdf_parameters
+from jaxid.workflow.robot_file import RobotFile
 
 SAMPLES = 5
 
@@ -138,6 +139,11 @@ def test_limits_and_friction_of_followers_count_at_their_leaders(arm, path):
     ratios, offsets = arm.ratios
     np.testing.assert_allclose(values["damping"], 0.5 * np.sum(ratios**2, axis=0))
     np.testing.assert_allclose(values["friction"], 0.25 * np.abs(ratios).sum(axis=0))
+    claims = RobotFile(path).claims()
+    joints = range(1, robot.joints + 1)
+    np.testing.assert_allclose([claims[f"fv{i}"] for i in joints], values["damping"])
+    np.testing.assert_allclose([claims[f"fc{i}"] for i in joints], values["friction"])
+    assert "ks1" not in claims
     for ends in (robot.limits.position_min, robot.limits.position_max):
         positions = np.abs(np.diag(ends) @ ratios.T + offsets)
         own = np.abs(ratios.T) > 0
