@@ -201,14 +201,17 @@ def _of_leaders(followers: Followers, parameters: dict[str, Any]) -> dict[str, A
     for key in ("armature", "damping", "friction", "stiffness"):
         parameters[key] = np.maximum(parameters[key], 0.0)
     ratios = speed_ratios(followers, joints).T
-    sums = {key: ratios**2 @ values for key, values in parameters.items()}
+    squares = ratios**2
+    sums = {key: squares @ values for key, values in parameters.items()}
     sums["friction"] = np.abs(ratios) @ parameters["friction"]
     # The springs of all joints are one spring, which rests where their forces cancel.
     positions = all_coordinates(followers, np.zeros(joints))
     deflections = positions - parameters["springref"]
-    forces = ratios @ (parameters["stiffness"] * deflections)
-    stiffness = np.where(sums["stiffness"] > 0.0, sums["stiffness"], np.inf)
-    return sums | {"springref": -forces / stiffness}
+    spring_forces = parameters["stiffness"] * deflections
+    has_spring = sums["stiffness"] > 0.0
+    stiffness = np.where(has_spring, sums["stiffness"], np.inf)
+    sums["springref"] = -(ratios @ spring_forces) / stiffness
+    return sums
 
 
 def _limits(tree: UrdfTree):

@@ -257,30 +257,46 @@ class LocalState(NamedTuple):
 def state_at(q: Matrix, index: int, dt: float) -> LocalState:
     """Return the state at a sample: that of a polynomial through the samples around it.
 
-    Each joint has the stretch of time and the degree that make its velocity most
-    certain: on fast motions a long parabola would cut the peaks. At the start the
-    velocity is that of a line, and the position the measured one.
+    At the start of a log the velocity is that of a line, and the position the measured
+    one.
     """
     neighbour_count = max(2, round(STATE_TIME / dt))
-    if index < neighbour_count:
-        return _initial_state(q, index, dt, neighbour_count)
+    if index >= neighbour_count:
+        return _state_inside(q, index, dt, neighbour_count)
 
-    polynomials = [_polynomial(q, index, dt, neighbour_count, 2)]
+    line = _polynomial(q, index, dt, neighbour_count, 1)
+    noise = np.maximum(line.error, 0.1 * MIN_DEVIATION)
+    state = np.stack([q[:, index], line.coefficients[1]])
+    deviations = np.maximum(line.error, MIN_DEVIATION)
+    spread = np.stack([deviations, line.rate_noise * noise])
+    return LocalState(state, spread, np.zeros(len(q)))
+
+
+def _state_inside(q: Matrix, index: int, dt: float, neighbour_count: int) -> LocalState:
+    """Return the state at a sample with neighbours on both sides.
+
+    Each joint has the stretch of time and the degree that make its velocity most
+    certain: on fast motions a long parabola would cut the peaks.
+    """
+    parabola = _polynomial(q, index, dt, neighbour_count, 2)
+    polynomials = [parabola]
     while neighbour_count > MIN_NEIGHBOURS:
         neighbour_count = max(MIN_NEIGHBOURS, round(0.7 * neighbour_count))
         for degree in (2, 4):
             polynomials.append(_polynomial(q, index, dt, neighbour_count, degree))
     # The shortest stretch deviates by noise alone.
     noise = np.maximum(polynomials[-1].error, 0.1 * MIN_DEVIATION)
-    rates = np.array([x.rate_deviation(noise) for x in polynomials])
-    best = np.argmin(rates, axis=0)
+    rate_deviations = np.array([x.rate_deviation(noise) for x in polynomials])
+    best = np.argmin(rate_deviations, axis=0)
 
     joints = np.arange(len(q))
-    taylor = np.array([x.coefficients[:2] for x in polynomials])[best, :, joints].T
-    error = np.array([x.error for x in polynomials])[best, joints]
-    spread = np.stack([np.maximum(error, MIN_DEVIATION), rates[best, joints]])
+    states = np.array([x.coefficients[:2] for x in polynomials])
+    errors = np.array([x.error for x in polynomials])
+    deviations = np.maximum(errors[best, joints], MIN_DEVIATION)
+    spread = np.stack([deviations, rate_deviations[best, joints]])
     # Accelerations of short stretches are mostly noise.
-    return LocalState(taylor, spread, 2.0 * polynomials[0].coefficients[2])
+    acceleration = 2.0 * parabola.coefficients[2]
+    return LocalState(states[best, :, joints].T, spread, acceleration)
 
 
 class _Polynomial(NamedTuple):
@@ -310,39 +326,25 @@ class _Polynomial(NamedTuple):
 def _polynomial(
     q: Matrix, index: int, dt: float, neighbour_count: int, degree: int
 ) -> _Polynomial:
-    """Return the polynomials through some samples on both sides of one."""
-    stop_index = min(q.shape[1], index + neighbour_count + 1)
-    times = dt * (np.arange(index - neighbour_count, stop_index) - index)
-    positions = q[:, index - neighbour_count : stop_index].T
+    """Return the polynomials through a sample and its neighbours."""
+    start_index = max(0, index - neighbour_count)
+    positions = q[:, start_index : index + neighbour_count + 1].T
     half_width = neighbour_count * dt
+    times = dt * (np.arange(len(positions)) + start_index - index)
     powers = np.vander(times / half_width, degree + 1, increasing=True)
     inverse = np.linalg.pinv(powers)
     scaled_coefficients = inverse @ positions
+
     residuals = positions - powers @ scaled_coefficients
     degrees_of_freedom = max(len(times) - degree - 1, 1)
     error = np.sqrt(np.sum(residuals**2, axis=0) / degrees_of_freedom)
     scales = half_width ** -np.arange(degree + 1.0)
-    rate_noise = float(np.linalg.norm(inverse[1])) / half_width
-    coefficients = scales[:, None] * scaled_coefficients
-    return _Polynomial(coefficients, error, rate_noise, degree / half_width)
-
-
-def _initial_state(
-    q: Matrix, index: int, dt: float, neighbour_count: int
-) -> LocalState:
-    """Return the state near the start of a log, where samples lie on one side only."""
-    stop_index = min(q.shape[1], index + neighbour_count + 1)
-    times = dt * (np.arange(stop_index) - index)
-    positions = q[:, :stop_index].T
-    powers = np.vander(times, 2, increasing=True)
-    coefficients, *_ = np.linalg.lstsq(powers, positions, rcond=None)
-    residuals = positions - powers @ coefficients
-    error = np.sqrt(np.sum(residuals**2, axis=0) / max(len(times) - 2, 1))
-    length = np.sqrt(np.sum((times - times.mean()) ** 2))
-    rate = np.maximum(error, 0.1 * MIN_DEVIATION) / length
-    state = np.stack([q[:, index], coefficients[1]])
-    spread = np.stack([np.maximum(error, MIN_DEVIATION), rate])
-    return LocalState(state, spread, np.zeros_like(rate))
+    return _Polynomial(
+        coefficients=scales[:, None] * scaled_coefficients,
+        error=error,
+        rate_noise=float(np.linalg.norm(inverse[1])) / half_width,
+        bend=degree / half_width,
+    )
 
 
 def smooth_rates(
