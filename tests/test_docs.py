@@ -30,7 +30,7 @@ from jaxid.identification.fit_result import DOUBT_LIMIT, TRUST_LIMIT
 from jaxid.measurement.filters import FILTERS
 from jaxid.simulation.virtual import random_bodies
 from jaxid.validation.diagnosis import MIN_DEVIATIONS
-from jaxid.validation.mistakes import MIN_MISFIT
+from jaxid.validation.mistake_search import GAINS, MAX_MISFIT
 from jaxid.validation.torque_errors import POSES
 from jaxid.validation.verdict import (
     FIT_ERROR,
@@ -285,6 +285,10 @@ def test_thresholds_are_those_of_the_code(question):
         assert threshold.replace("%", " %") in row
 
 
-def test_the_slip_that_is_looked_for_is_the_codes():
+def test_the_limits_of_mistakes_are_the_codes():
     page = (ROOT / "docs" / "is_my_fit_good.md").read_text(encoding="utf-8")
-    assert f"leaves more than {100 * MIN_MISFIT:g} % of the forces" in page
+    assert f"is named if it explains {GAINS.named:.1f}, also" in page
+    assert f"{GAINS.by_misfit / 100:g} more for each percent" in page
+    assert f"From {GAINS.possible:g} on it is a note" in page
+    assert f"that explains {GAINS.contact:g} is a contact" in page
+    assert f"if more than {100 * MAX_MISFIT:g} % of the forces are missed" in page

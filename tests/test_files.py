@@ -125,5 +125,5 @@ def test_a_place_where_nothing_can_be_is_named_before_the_work(tmp_path):
 
 def test_no_file_exhausts_a_reader(tmp_path):
     (tmp_path / "deep.json").write_text("[" * 100_000)
-    with pytest.raises(InputError, match="recursion"):
+    with pytest.raises(InputError, match="nested too deeply"):
         read_json(tmp_path / "deep.json")

@@ -28,13 +28,15 @@ from jaxid.result_table import (
 from jaxid.robot.robot import Robot
 
 from .limit_checks import LogStatistics, limit_findings
-from .mistakes import INSTANTS, likely_mistakes
+from .mistake_search import find_mistakes
 from .sensor_checks import (
     channel_findings,
     clock_findings,
     stuck_findings,
 )
 
+INSTANTS = 300
+"""Number of instants of a log that tell the power of friction."""
 MIN_DEVIATIONS = 3.0
 """Standard deviations beyond which a sign is certain."""
 MAX_SAMPLES = 2**17
@@ -54,9 +56,8 @@ class Diagnosis(Summarised):
             rows lost.
         observations: Observations in which mistakes are looked for, of a long log a
             part; None if no part is long enough.
-        motor_sides: Whether angles and forces of the log are taken for the motors'.
+        excerpt: Samples of single channels, of a long log a part.
         notes: Remarks on how the log was examined, as sentences.
-        angle_unit: Unit of the angles in the file.
     """
 
     log: Recording | Observations
@@ -65,17 +66,23 @@ class Diagnosis(Summarised):
     findings: tuple[str, ...]
     faulty: tuple[int, ...]
     observations: Observations | None
-    motor_sides: tuple[bool, bool]
+    excerpt: Recording
     notes: tuple[str, ...] = ()
-    angle_unit: str = "rad"
 
-    def with_fit(self, fit: Fit, commanded: Observations | None = None) -> "Diagnosis":
+    def with_fit(
+        self,
+        fit: Fit,
+        commanded: Observations | None = None,
+        bodies: np.ndarray | None = None,
+    ) -> "Diagnosis":
         """Return the diagnosis with findings of a fit to this log alone, and delays.
 
         The log with `commanded` angles in place of the measured ones is filtered alike.
+        The inertial parameters of the robot's file are in `bodies`.
         """
-        fit_findings = _mistakes([self], fit)
-        notes = self.notes
+        mistakes = _mistakes([self], fit, bodies)
+        fit_findings = mistakes.certain
+        notes = (*self.notes, *mistakes.possible)
         if not fit_findings and not self.faulty and self.observations is not None:
             fit_findings = negative_friction(fit, [self.observations])
             notes = (*notes, *delay_notes(self.observations, fit, commanded))
@@ -192,9 +199,8 @@ def diagnose(
         tuple(findings),
         faulty_joints,
         examined_log.observations,
-        (excerpt.angles_on_motor_side, excerpt.forces_on_motor_side),
+        excerpt,
         examined_log.notes,
-        excerpt.angle_unit,
     )
     return diagnosis if fit is None else diagnosis.with_fit(fit)
 
@@ -266,8 +272,25 @@ def _statistics(
     return statistics
 
 
-def mistakes_in_logs(diagnoses: Sequence[Diagnosis], fit: Fit) -> tuple[str, ...]:
-    """Return findings of a fit to several logs, which are judged together."""
+class LogMistakes(NamedTuple):
+    """Mistakes in logs or their robot, as sentences.
+
+    Attributes:
+        certain: Mistakes, and moments unlike the model.
+        possible: Mistakes that explain only a part of what the model misses.
+    """
+
+    certain: tuple[str, ...] = ()
+    possible: tuple[str, ...] = ()
+
+
+def mistakes_in_logs(
+    diagnoses: Sequence[Diagnosis], fit: Fit, bodies: np.ndarray | None = None
+) -> LogMistakes:
+    """Return findings of a fit to several logs, which are judged together.
+
+    The inertial parameters of the robot's file are in `bodies`, if it states some.
+    """
     logs = [
         diagnosis.observations
         for diagnosis in diagnoses
@@ -279,32 +302,31 @@ def mistakes_in_logs(diagnoses: Sequence[Diagnosis], fit: Fit) -> tuple[str, ...
         else negative_friction(fit, logs)
     )
     name = f"{diagnoses[0].log.name}: " if len(diagnoses) == 1 else ""
-    findings = (f"{name}{text}" for text in _mistakes(diagnoses, fit))
-    return (*friction, *findings)
+    mistakes = _mistakes(diagnoses, fit, bodies)
+    certain = (f"{name}{text}" for text in mistakes.certain)
+    possible = (f"{name}{text}" for text in mistakes.possible)
+    return LogMistakes((*friction, *certain), tuple(possible))
 
 
-def _mistakes(diagnoses: Sequence[Diagnosis], fit: Fit) -> tuple[str, ...]:
-    """Return the likely mistake in logs, or moments unlike the model."""
-    # Faults of channels explain the rest.
-    logs = [
-        diagnosis.observations
-        for diagnosis in diagnoses
-        if diagnosis.observations is not None and not diagnosis.faulty
-    ]
-    template = "{0.name}: {1}" if len(diagnoses) > 1 else "{1}"
-    moments = tuple(
-        template.format(log, text) for log in logs for text in departures(fit, log)
-    )
-    if not logs:
-        return ()
-    first_diagnosis = diagnoses[0]
-    return likely_mistakes(
-        fit,
-        logs,
-        first_diagnosis.motor_sides,
-        moments,
-        first_diagnosis.angle_unit,
-    )
+def _mistakes(
+    diagnoses: Sequence[Diagnosis], fit: Fit, bodies: np.ndarray | None
+) -> LogMistakes:
+    """Return the mistake that explains most, or else moments unlike the model."""
+    recordings = []
+    moments = []
+    for diagnosis in diagnoses:
+        observations = diagnosis.observations
+        # Faults of channels explain the rest.
+        if observations is not None and not diagnosis.faulty:
+            recording = diagnosis.excerpt
+            recordings.append(dataclasses.replace(recording, name=observations.name))
+            name = f"{observations.name}: " if len(diagnoses) > 1 else ""
+            moments += [f"{name}{text}" for text in departures(fit, observations)]
+    if not recordings:
+        return LogMistakes()
+    mistakes = find_mistakes(fit.base.model, recordings, bodies)
+    certain = mistakes.explained or tuple(moments) or mistakes.unexplained
+    return LogMistakes(certain, mistakes.possible)
 
 
 def _excerpt(log: Observations, source: SamplesOnDisk) -> Recording:

@@ -159,9 +159,11 @@ def identify_logs(
     progress("looking for mistakes", 0.0)
     # Bounds would hide what is wrong.
     diagnoses = [log.diagnosis for log in fitted_logs]
-    mistakes = mistakes_in_logs(diagnoses, without_bounds(fit))
+    bodies = setup.file_bodies
+    mistakes = mistakes_in_logs(diagnoses, without_bounds(fit), bodies)
     notes = [note for part in parts.every for note in part.notes]
     notes += resolution_notes(fit, fitted_logs)
+    notes += mistakes.possible
     claims = errors_of_claims(setup, fit, parts.every)
     return IdentificationReport(
         fit,
@@ -178,7 +180,7 @@ def identify_logs(
         },
         notes=(*setup.notes, *dict.fromkeys(notes)),
         doubts=[text for log in loaded_logs for text in log.findings],
-        mistakes=mistakes,
+        mistakes=mistakes.certain,
         claimed=claims.errors,
         claimed_mass=claims.mass,
     )

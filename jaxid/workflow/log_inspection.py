@@ -55,6 +55,7 @@ def inspect_logs(
     """
     paths = [Path(log) for log in logs]
     setup = select_filter(setup, paths, columns, progress)
+    bodies = setup.file_bodies
     examined_logs = []
     for path in paths:
         observations, diagnosis = load_log(setup, path, columns, progress)
@@ -62,5 +63,7 @@ def inspect_logs(
         fit = identify(setup.base, observations, setup.least_squares, fit_progress)
         progress(f"looking for mistakes in {path.name}", 0.0)
         commanded_log = observe_commands(setup, path, columns)
-        examined_logs.append(ExaminedLog(diagnosis.with_fit(fit, commanded_log), fit))
+        examined_logs.append(
+            ExaminedLog(diagnosis.with_fit(fit, commanded_log, bodies), fit)
+        )
     return Inspection(setup.notes, examined_logs)

@@ -110,7 +110,8 @@ def fit_run(
         rows = RegressionProblem(setup.base, observations, row_progress)
         fit = fit_problem(rows, setup.least_squares)
         fits.append(fit)
-        mistakes = mistakes_in_logs([log.diagnosis for log in logs], fit)
+        diagnoses = [log.diagnosis for log in logs]
+        mistakes = mistakes_in_logs(diagnoses, fit).certain
         doubts = [text for log in logs for text in log.findings] + [*mistakes]
     return dataclasses.replace(functools.reduce(combine_fits, fits), name=name), doubts
 

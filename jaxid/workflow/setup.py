@@ -226,6 +226,11 @@ class Setup(eqx.Module):
         return base_parameters(self.unknowns)
 
     @property
+    def file_bodies(self) -> Float[np.ndarray, "bodies 10"] | None:
+        """Inertial parameters of the robot's file; None if no such bodies can exist."""
+        return None if self.robot_file is None else self.robot_file.possible_bodies()
+
+    @property
     def model(self) -> Model:
         """Model whose parameters are wanted."""
         unknowns = self.unknowns

@@ -1,0 +1,299 @@
+"""Search for the mistake that explains most of what a model misses."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy import optimize
+
+from jaxid.dynamics.model import Model
+from jaxid.measurement.recording import Recording
+from jaxid.result_table import significant
+
+from .contacts import ContactSearch
+from .descriptions import DescribedLog
+from .filtered_log import FilteredLog
+from .row_fits import RowFit, Rows, screen
+from .suspects import Quantity, Suspect, SuspectedMistakes
+
+
+class Gains(NamedTuple):
+    """Falls of the score from which mistakes are said, and limits of the search.
+
+    On 140 simulated clean logs of ten machines no mistake explained more than 0.1, and
+    no contact more than 0.4; on clean logs of four real robots at most 0.9 and 1.2,
+    because the models lack effects that a mistake imitates.
+    """
+
+    named: float = 1.0
+    possible: float = 0.3
+    by_misfit: float = 16.0  # added to both, times what exceeds the typical misfit
+    contact: float = 1.3
+    screened: float = 0.03  # promise of a column, from which its amount is searched
+    equal: float = 0.9  # share of the largest fall, from which mistakes are equal
+
+
+GAINS = Gains()
+MAX_SEARCHED = 12
+"""Number of quantities that are searched, the most promising ones."""
+MAX_VALIDATED = 8
+"""Number of mistakes that are tried on parts that the fit has not seen."""
+MAX_EQUAL = 3
+"""Number of mistakes of equal effect, above which none of them is known."""
+TYPICAL_MISFIT = 0.025
+"""Fraction (0 to 1) of the forces that a model of a simulated robot may miss."""
+MAX_POWER_DIFFERENCE = 0.05
+"""Difference of the power of friction, over RMS force and speed, that is no chance."""
+MAX_MISFIT = 0.15
+"""Fraction (0 to 1) of the forces that no model misses whose description is right."""
+
+
+class Mistakes(NamedTuple):
+    """Findings of a search, as sentences.
+
+    Attributes:
+        explained: Mistakes that explain most of what the model misses.
+        unexplained: A contact, or that the model does not fit.
+        possible: Mistakes that explain a part of what it misses.
+    """
+
+    explained: tuple[str, ...] = ()
+    unexplained: tuple[str, ...] = ()
+    possible: tuple[str, ...] = ()
+
+
+class Explanation(NamedTuple):
+    """A mistake, and what it explains.
+
+    Attributes:
+        gain: Fall of the score, also on parts that the fit has not seen.
+        misfit: Fraction (0 to 1) of the forces that the model then misses.
+        power: Least power of a joint's friction, over RMS force and RMS speed.
+        sentence: What seems to be wrong.
+    """
+
+    gain: float
+    misfit: float
+    power: float
+    sentence: str
+
+
+def find_mistakes(
+    model: Model, recordings: Sequence[Recording], bodies: np.ndarray | None = None
+) -> Mistakes:
+    """Look for the mistake in logs or robot that explains most.
+
+    All logs are searched together; if no mistake of all explains enough, each is
+    searched alone.
+
+    Args:
+        model: Model of the robot as it is described.
+        recordings: Logs, whose columns are taken alike.
+        bodies: Inertial parameters of the robot's file [bodies, 10]; or None.
+    """
+    log = FilteredLog(model.robot, recordings)
+    if not log.is_long_enough:
+        return Mistakes()
+    described_log = DescribedLog(model, log)
+    suspected = SuspectedMistakes(described_log, recordings[0], bodies)
+    suspects = [*suspected.of_columns(), *suspected.of_robot()]
+    mistakes = _search(described_log, suspects, [*suspected.quantities()])
+    if mistakes.explained or len(recordings) == 1:
+        return mistakes
+
+    texts = []
+    for recording in recordings:
+        one_log = FilteredLog(model.robot, [recording])
+        if one_log.is_long_enough:
+            described_log = DescribedLog(model, one_log)
+            suspected = SuspectedMistakes(described_log, recording)
+            suspects = list(suspected.of_columns())
+            log_mistakes = _search(described_log, suspects, [*suspected.quantities()])
+            texts += [f"{recording.name}: {text}" for text in log_mistakes.explained]
+    return mistakes._replace(explained=tuple(texts))
+
+
+def _search(
+    described_log: DescribedLog,
+    suspects: Sequence[Suspect],
+    quantities: Sequence[Quantity],
+) -> Mistakes:
+    """Return what explains most of a log: a mistake, a contact, or nothing."""
+    judge = described_log.judge
+    fit = judge.fit(described_log.rows)
+    misfit = _misfit(fit, described_log.rows)
+    results = explanations(described_log, suspects, quantities)
+    gain = results[0].gain if results else 0.0
+    contact = ContactSearch(described_log, fit).best()
+    if contact.gain >= max(GAINS.contact, gain):
+        start, stop = described_log.log.times_of(contact.start, contact.stop)
+        text = (
+            f"something seems to push the robot from {start:.4g} to {stop:.4g} s, a "
+            "contact or a person: leave that part out (`recording.start`, "
+            "`recording.stop`)."
+        )
+        return Mistakes(unexplained=(text,))
+    equal_results = _equal(results)
+    texts = ", or ".join(x.sentence for x in equal_results)
+    is_single = 0 < len(equal_results) <= MAX_EQUAL
+    if is_single and _explains(equal_results[0], GAINS.named):
+        remaining_misfit = equal_results[0].misfit
+        effect = (
+            f"the model then misses {100 * remaining_misfit:.2g} % of the forces "
+            f"instead of {100 * misfit:.2g} %."
+        )
+        return Mistakes(explained=(f"{texts}: {effect}",))
+    if misfit > MAX_MISFIT:
+        return Mistakes(unexplained=(_misfit_text(described_log, fit),))
+    if is_single and _explains(equal_results[0], GAINS.possible):
+        return Mistakes(possible=(f"possible, but not sure: {texts}.",))
+    return Mistakes()
+
+
+def _equal(results: Sequence[Explanation]) -> list[Explanation]:
+    """Return the mistakes of nearly the largest gain, without those that drive joints.
+
+    Of two signs that explain the forces alike, the wrong one makes friction negative.
+    """
+    if not results or results[0].gain <= 0.0:
+        return []
+    equal_results = [x for x in results if x.gain >= GAINS.equal * results[0].gain]
+    max_power = max(x.power for x in equal_results)
+    return [x for x in equal_results if x.power > max_power - MAX_POWER_DIFFERENCE]
+
+
+def _explains(explanation: Explanation, gain: float) -> bool:
+    """Return whether a mistake explains more than a gain that effects may imitate.
+
+    The more a model misses without the mistake, too, the more effects it lacks.
+    """
+    excess = max(0.0, explanation.misfit - TYPICAL_MISFIT)
+    return explanation.gain >= gain + GAINS.by_misfit * excess
+
+
+def _joint_misfits(fit: RowFit, rows: Rows) -> np.ndarray:
+    """Return the RMS errors of the joints over their RMS forces."""
+    return np.sqrt(fit.squares / (np.mean(rows.forces**2, axis=0) + 1e-300))
+
+
+def _misfit(fit: RowFit, rows: Rows) -> float:
+    """Return the fraction (0 to 1) of the forces that is missed; joints count alike."""
+    return float(np.sqrt(np.mean(_joint_misfits(fit, rows) ** 2)))
+
+
+def _misfit_text(described_log: DescribedLog, fit: RowFit) -> str:
+    """Return a sentence about where a model does not fit."""
+    rows = described_log.rows
+    joint = int(np.argmax(_joint_misfits(fit, rows)))
+    share = significant(100 * _misfit(fit, rows), 2)
+    return (
+        f"the model does not fit: it misses {share} % of the forces, most of all those "
+        f"of joint `{described_log.robot.joint_names[joint]}`, and no single mistake "
+        "in signs, order, units, offsets, axes or gravity explains that."
+    )
+
+
+class _Trial(NamedTuple):
+    """Rows under a mistake, and the fall of the score in the fit."""
+
+    gain: float
+    sentence: str
+    rows: Rows
+
+
+def explanations(
+    described_log: DescribedLog,
+    suspects: Sequence[Suspect],
+    quantities: Sequence[Quantity],
+) -> list[Explanation]:
+    """Return the mistakes that explain something, the best first."""
+    judge = described_log.judge
+    rows = described_log.rows
+    score = judge.fit(rows).score
+    trials = []
+    for suspect in suspects:
+        suspect_rows = suspect.rows()
+        gain = score - judge.fit(suspect_rows).score
+        trials.append(_Trial(gain, suspect.sentence, suspect_rows))
+    trials += _searched_quantities(described_log, quantities)
+    trials.sort(key=lambda trial: -trial.gain)
+
+    unseen_score = judge.unseen_score(rows)
+    results = []
+    for trial in trials[:MAX_VALIDATED]:
+        if trial.gain > GAINS.screened:
+            unseen_gain = unseen_score - judge.unseen_score(trial.rows)
+            gain = min(trial.gain, unseen_gain)
+            fit = judge.fit(trial.rows)
+            power = described_log.friction_powers(trial.rows, fit).min()
+            misfit = _misfit(fit, trial.rows)
+            explanation = Explanation(gain, misfit, float(power), trial.sentence)
+            results.append(explanation)
+    return sorted(results, key=lambda result: -result.gain)
+
+
+def _searched_quantities(
+    described_log: DescribedLog, quantities: Sequence[Quantity]
+) -> list[_Trial]:
+    """Return the best amounts of the most promising quantities."""
+    judge = described_log.judge
+    rows = described_log.rows
+    fit = judge.fit(rows)
+    # Weights from the errors of a spoilt log may hide its mistake: those from the
+    # forces are tried, too.
+    fits = fit, judge.weighted_fit(rows, judge.force_weights(rows))
+    promises = [_promise(described_log, quantity, fits) for quantity in quantities]
+    order = np.argsort(promises)[::-1][:MAX_SEARCHED]
+    trials = []
+    for k in order:
+        if promises[k] > GAINS.screened:
+            quantity = quantities[k]
+            amount = _best_amount(described_log, quantity)
+            if _is_plausible(quantity, amount):
+                trial_rows = quantity.rows(amount)
+                gain = fit.score - judge.fit(trial_rows).score
+                trials.append(_Trial(gain, quantity.sentence(amount), trial_rows))
+    return trials
+
+
+def _promise(
+    described_log: DescribedLog, quantity: Quantity, fits: Sequence[RowFit]
+) -> float:
+    """Return the fall of the score that a small amount promises."""
+    step = quantity.step
+    higher_rows = quantity.rows(step)
+    lower_rows = quantity.rows(-step)
+    columns = (higher_rows.columns - lower_rows.columns) / (2 * step)
+    forces = (higher_rows.forces - lower_rows.forces) / (2 * step)
+    gains = []
+    for fit in fits:
+        column = columns @ fit.parameters - forces
+        screening = screen(described_log.judge, described_log.rows, fit, column)
+        gains.append(screening.gain)
+    return max(gains)
+
+
+def _is_plausible(quantity: Quantity, amount: float) -> bool:
+    """Return whether an amount matters and lies within the bounds, not at them."""
+    lower, upper = quantity.bounds
+    margin = 0.02 * (upper - lower)
+    is_inside = lower + margin < amount < upper - margin
+    return is_inside and abs(amount) > quantity.min_amount
+
+
+def _best_amount(described_log: DescribedLog, quantity: Quantity) -> float:
+    """Return the amount that leaves least."""
+
+    def score(amount: float) -> float:
+        return described_log.judge.fit(quantity.rows(amount)).score
+
+    lower, upper = quantity.bounds
+    grid = np.linspace(lower, upper, 9)
+    scores = [score(amount) for amount in grid]
+    best = int(np.argmin(scores))
+    bracket = grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]
+    options = {"maxiter": 12, "xatol": 0.02 * quantity.step}
+    result: Any = optimize.minimize_scalar(
+        score, bounds=bracket, method="bounded", options=options
+    )
+    return float(result.x) if result.fun < scores[best] else float(grid[best])
