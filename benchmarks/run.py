@@ -85,6 +85,7 @@ METHODS = (
     Script("report", 1),
     Script("robot_files", 2),
     Script("public_reports/run", 12),
+    Script("judgement/rates", 40),
 )
 SCRIPTS = SPEED + METHODS
 

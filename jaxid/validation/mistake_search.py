@@ -159,7 +159,11 @@ def _equal(results: Sequence[Explanation]) -> list[Explanation]:
         return []
     equal_results = [x for x in results if x.gain >= GAINS.equal * results[0].gain]
     max_power = max(x.power for x in equal_results)
-    return [x for x in equal_results if x.power > max_power - MAX_POWER_DIFFERENCE]
+    by_sentence: dict[str, Explanation] = {}
+    for explanation in equal_results:
+        if explanation.power > max_power - MAX_POWER_DIFFERENCE:
+            by_sentence.setdefault(explanation.sentence, explanation)
+    return list(by_sentence.values())
 
 
 def _explains(explanation: Explanation, gain: float) -> bool:

@@ -251,12 +251,14 @@ class SuspectedMistakes:
             sentence = "the coordinates of sliding joints seem to be in mm"
             yield sentence, np.where(turning, 1.0, 1e-3)
         if self._log.robot.drives.is_direct:
+            # The ratios are coarse: that of the robot may lie between two of them.
+            sentence = (
+                f"the angles of the log seem to be {GEAR_RATIOS[0]:g} to "
+                f"{GEAR_RATIOS[-1]:g} times too large: state the gears "
+                "(`drives.gear_ratios`, `recording.side`), or the unit (`recording."
+                "angle_unit` takes numbers, beside `angle_offsets`)"
+            )
             for ratio in GEAR_RATIOS:
-                sentence = (
-                    f"the angles of the log seem to be about {ratio:g} times those of "
-                    "the joints: are they the motors' (`drives.gear_ratios`, "
-                    "`recording.side`)?"
-                )
                 yield sentence, np.full(len(turning), 1 / ratio)
 
     def _sides(self) -> Iterator[Suspect]:
