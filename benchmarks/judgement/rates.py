@@ -88,8 +88,16 @@ def outcome(sentences, words):
         return "quiet"
     if any(word in text for text in specific for word in words):
         return "named"
-    names_a_mistake = [x for x in specific if "seem" in x]
-    return "another" if names_a_mistake else "told"
+    return "another" if named_mistakes(sentences) else "told"
+
+
+def named_mistakes(sentences):
+    """Return the sentences that name a mistake."""
+    return [
+        text
+        for _, text in sentences
+        if "seem" in text and not any(part in text for part in USUAL)
+    ]
 
 
 def tasks(options):
@@ -135,7 +143,7 @@ def main():
         if slip == "clean":
             statuses = {status for status, _ in sentences}
             result = "✗" if "BAD" in statuses else "!" if "DOUBTFUL" in statuses else ""
-            mistakes = [x for _, x in sentences if "seem" in x]
+            mistakes = named_mistakes(sentences)
             clean["logs"] += 1
             clean["alarms"] += bool(mistakes)
             clean["any ! or ✗"] += bool(result)
