@@ -90,10 +90,11 @@ class ContactSearch:
         samples = is_inside.astype(float)[:, None]
         inside_rows = self._log.log.rows_of(samples)
         joints = self._weights.shape[1]
-        columns = inside_rows[..., None] * np.eye(joints)
-        weighted_columns = (columns * self._weights[..., None]).reshape(-1, joints)
-        row_counts = np.count_nonzero(weighted_columns > 0.0, axis=0)
-        return weighted_columns[:, row_counts > 2]
+        weights = inside_rows * self._weights
+        columns = weights[..., None] * np.eye(joints)
+        # A joint of which less than three rows lie inside has no say.
+        is_inside_often = np.count_nonzero(weights > 0.0, axis=0) > 2
+        return columns.reshape(-1, joints)[:, is_inside_often]
 
     def _explained(self, columns: np.ndarray) -> np.ndarray:
         """Return the parameters by which a fit imitates columns."""

@@ -186,12 +186,12 @@ class DescribedLog:
         """
         joints = rows.forces.shape[1]
         body_count = self._body_rows.shape[2]
-        own_columns = rows.columns[:, :, body_count:]
-        shapes = own_columns.shape[2] // joints
+        friction_columns = rows.columns[:, :, body_count:]
+        shapes = friction_columns.shape[2] // joints
         parameters = fit.parameters[body_count:].reshape(joints, shapes)
         powers = np.zeros(joints)
         for j in range(joints):
-            columns = own_columns[:, j, shapes * j : shapes * (j + 1)]
+            columns = friction_columns[:, j, shapes * j : shapes * (j + 1)]
             braking_forces = columns[:, BRAKING] @ parameters[j, BRAKING]
             speeds = columns[:, 1]
             force_square = np.mean(rows.forces[:, j] ** 2)
@@ -201,10 +201,10 @@ class DescribedLog:
 
     @cached_property
     def _sample_columns(self) -> np.ndarray:
-        """All columns on the grid [samples, joints, bodies' and own columns]."""
+        """All columns on the grid [samples, joints, columns]."""
         bodies = self.samples_of_bodies(self.log.motion)
-        own = self.samples_of_friction(self.log.motion, self.log.forces)
-        return np.concatenate([bodies, own], axis=2)
+        friction = self.samples_of_friction(self.log.motion, self.log.forces)
+        return np.concatenate([bodies, friction], axis=2)
 
     def with_low_pass(self, joints: tuple[int, ...], cutoff: float) -> Rows:
         """Return the rows if a filter made the forces of some joints late."""

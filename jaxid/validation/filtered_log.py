@@ -90,8 +90,8 @@ class FilteredLog:
 
         row_counts = [len(_centres(length)) for length in self._lengths]
         self.blocks = self._block_numbers(row_counts)
-        self.max_speeds = np.maximum(np.abs(self.motion.qd).max(axis=0), 1e-9)
-        is_resting = np.abs(self.motion.qd) < REST_SPEED * self.max_speeds
+        speeds = np.abs(self.motion.qd)
+        is_resting = speeds <= REST_SPEED * speeds.max(axis=0)
         self.is_moving = self.rows_of(is_resting.astype(float)) < 0.5
 
     def _block_numbers(self, row_counts: Sequence[int]) -> np.ndarray:

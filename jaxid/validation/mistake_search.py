@@ -10,7 +10,7 @@ from jaxid.dynamics.model import Model
 from jaxid.measurement.recording import Recording
 from jaxid.result_table import significant
 
-from .contacts import ContactSearch
+from .contacts import Contact, ContactSearch
 from .descriptions import DescribedLog
 from .filtered_log import FilteredLog
 from .row_fits import RowFit, Rows, screen
@@ -97,42 +97,53 @@ def find_mistakes(
     described_log = DescribedLog(model, log)
     suspected = SuspectedMistakes(described_log, recordings[0], bodies)
     suspects = [*suspected.of_columns(), *suspected.of_robot()]
-    mistakes = _search(described_log, suspects, [*suspected.quantities()])
-    if mistakes.explained or len(recordings) == 1:
+    is_one_log = len(recordings) == 1
+    quantities = list(suspected.quantities())
+    mistakes = _search(described_log, suspects, quantities, is_one_log)
+    if mistakes.explained or is_one_log:
         return mistakes
 
-    texts = []
+    explained = []
+    unexplained = []
     for recording in recordings:
-        one_log = FilteredLog(model.robot, [recording])
-        if one_log.is_long_enough:
-            described_log = DescribedLog(model, one_log)
-            suspected = SuspectedMistakes(described_log, recording)
-            suspects = list(suspected.of_columns())
-            log_mistakes = _search(described_log, suspects, [*suspected.quantities()])
-            texts += [f"{recording.name}: {text}" for text in log_mistakes.explained]
-    return mistakes._replace(explained=tuple(texts))
+        log_mistakes = _mistakes_in_columns(model, recording)
+        explained += [f"{recording.name}: {x}" for x in log_mistakes.explained]
+        unexplained += [f"{recording.name}: {x}" for x in log_mistakes.unexplained]
+    return mistakes._replace(
+        explained=tuple(explained),
+        unexplained=tuple(unexplained) or mistakes.unexplained,
+    )
+
+
+def _mistakes_in_columns(model: Model, recording: Recording) -> Mistakes:
+    """Look for the mistake in the columns of one of several logs."""
+    log = FilteredLog(model.robot, [recording])
+    if not log.is_long_enough:
+        return Mistakes()
+    described_log = DescribedLog(model, log)
+    suspected = SuspectedMistakes(described_log, recording)
+    suspects = list(suspected.of_columns())
+    quantities = list(suspected.quantities())
+    return _search(described_log, suspects, quantities, is_one_log=True)
 
 
 def _search(
     described_log: DescribedLog,
     suspects: Sequence[Suspect],
     quantities: Sequence[Quantity],
+    is_one_log: bool,
 ) -> Mistakes:
-    """Return what explains most of a log: a mistake, a contact, or nothing."""
+    """Return what explains most: a mistake, in one log also a contact, or nothing."""
     judge = described_log.judge
     fit = judge.fit(described_log.rows)
     misfit = _misfit(fit, described_log.rows)
     results = explanations(described_log, suspects, quantities)
     gain = results[0].gain if results else 0.0
-    contact = ContactSearch(described_log, fit).best()
-    if contact.gain >= max(GAINS.contact, gain):
-        start, stop = described_log.log.times_of(contact.start, contact.stop)
-        text = (
-            f"something seems to push the robot from {start:.4g} to {stop:.4g} s, a "
-            "contact or a person: leave that part out (`recording.start`, "
-            "`recording.stop`)."
-        )
-        return Mistakes(unexplained=(text,))
+    if is_one_log:
+        contact = ContactSearch(described_log, fit).best()
+        if contact.gain >= max(GAINS.contact, gain):
+            return Mistakes(unexplained=(_contact_text(described_log, contact),))
+
     equal_results = _equal(results)
     texts = ", or ".join(x.sentence for x in equal_results)
     is_single = 0 < len(equal_results) <= MAX_EQUAL
@@ -148,6 +159,16 @@ def _search(
     if is_single and _explains(equal_results[0], GAINS.possible):
         return Mistakes(possible=(f"possible, but not sure: {texts}.",))
     return Mistakes()
+
+
+def _contact_text(described_log: DescribedLog, contact: Contact) -> str:
+    """Return a sentence about a contact and its time."""
+    start, stop = described_log.log.times_of(contact.start, contact.stop)
+    return (
+        f"something seems to push the robot from {start:.4g} to {stop:.4g} s, a "
+        "contact or a person: leave that part out (`recording.start`, "
+        "`recording.stop`)."
+    )
 
 
 def _equal(results: Sequence[Explanation]) -> list[Explanation]:

@@ -78,7 +78,6 @@ class SuspectedMistakes:
         described_log: DescribedLog,
         recording: Recording,
         bodies: np.ndarray | None = None,
-        commanded: Motion | None = None,
     ):
         """Prepare the mistakes of a log.
 
@@ -86,12 +85,10 @@ class SuspectedMistakes:
             described_log: Log, and the rows that it has under other descriptions.
             recording: What its columns are taken for.
             bodies: Inertial parameters of the robot's file [bodies, 10]; or None.
-            commanded: Motion that was commanded, if that is known.
         """
         self._log = described_log
         self._recording = recording
         self._bodies = bodies
-        self._commanded = commanded
         robot = described_log.robot
         self._names = [f"`{name}`" for name in robot.joint_names]
         self._joints = range(robot.joints)
@@ -306,7 +303,7 @@ class SuspectedMistakes:
         norm = np.linalg.norm(geometry.gravity)
         if norm == 0:
             return
-        for direction in (*self._directions(), *-self._directions()):
+        for direction in (*np.eye(3), *-np.eye(3)):
             if geometry.gravity @ direction < 0.9 * norm:
                 words = ", ".join(f"{x:.4g}" for x in norm * direction + 0.0)
                 sentence = f"gravity seems to be [{words}] (`robot.gravity`)"
@@ -327,9 +324,6 @@ class SuspectedMistakes:
         )
         if self._bodies is not None:
             yield from self._subtracted_predictions(self._bodies)
-
-    def _directions(self) -> np.ndarray:
-        return np.eye(3)
 
     def _subtracted_predictions(self, bodies: np.ndarray) -> Iterator[Suspect]:
         """Yield what a controller that knows the file's bodies may have subtracted."""
@@ -364,13 +358,6 @@ class SuspectedMistakes:
             yield Suspect(
                 sentence,
                 lambda j=j, cutoff=cutoff: self._log.with_low_pass((j,), cutoff),
-            )
-        if self._commanded is not None:
-            motion = self._commanded
-            yield Suspect(
-                "the angles seem to be the commanded ones, not the measured ones "
-                "(`recording.angles`)",
-                lambda: self._log.with_motion(motion),
             )
 
     def quantities(self) -> Iterator[Quantity]:

@@ -246,6 +246,23 @@ def test_a_push_of_a_person_is_named_with_its_time(motors, said):
     assert abs(stop - 5.8) < 0.1
 
 
+def test_a_push_in_one_of_two_logs_is_named_with_the_log(motors):
+    angles, forces = motors
+    push = np.zeros_like(forces)
+    push[1000:1160, :2] = 0.7 * np.abs(forces[:, :2]).max(axis=0)
+    pairs = [log_of(angles, forces), log_of(angles, forces + push)]
+    logs = [
+        observations.replace(name=name)
+        for name, (_, observations) in zip("ab", pairs, strict=True)
+    ]
+    examined = [
+        diagnose(log, ROBOT, observations=o)
+        for (log, _), o in zip(pairs, logs, strict=True)
+    ]
+    (sentence,) = mistakes_in_logs(examined, identify(BASE, logs)).certain
+    assert sentence.startswith("b: something seems to push the robot from 5")
+
+
 def test_a_late_force_of_one_joint_and_a_wrong_ratio_are_named(motors, said):
     angles, forces = motors
     late = forces.copy()
