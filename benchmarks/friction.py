@@ -92,7 +92,7 @@ def rest(name, asked):
     train, later = log.split(0.6)
     choice, fit = chosen_fit(experiment, [train])
     error = jid.validate(fit, later).errors[0]
-    weighted = float(np.sqrt(np.mean(np.square(error.rms_percent))))
+    weighted = float(np.sqrt(np.mean(np.square(100 * error.rms / error.max_forces))))
     said = f"{weighted:.2f} % (`{choice.chosen.name}`)"
     return [
         Row(

@@ -201,7 +201,7 @@ estimators = {
 figure, axes = plt.subplots(figsize=(11, 3.0))
 for k, estimator in enumerate(estimators.values()):
     one = jid.validate(jid.identify(base, seen, estimator), [seen, unseen])
-    percent = [np.sqrt(np.mean(e.rms_percent**2)) for e in one.errors]
+    percent = [100 * e.relative for e in one.errors]
     axes.barh(
         k - 0.18, percent[0], 0.34, color="#0072B2", label="seen" if k == 0 else None
     )
@@ -223,7 +223,7 @@ for k, estimator in enumerate(estimators.values()):
     )
 axes.set_yticks(range(len(estimators)), estimators)
 axes.set_xlim(0, 1.35 * max(percent))
-axes.set_xlabel("RMS error of all joints [% of their largest forces]")
+axes.set_xlabel("RMS error of all joints [% of the RMS forces]")
 axes.invert_yaxis()
 axes.legend(ncols=2, loc="upper right", bbox_to_anchor=(1.0, 1.16))
 plt.show()
@@ -232,7 +232,7 @@ plt.show()
 # ## What you learned
 #
 # * A log, a geometry and six lines give parameters, honest standard deviations and what the log leaves open.
-# * Judge a model by a part of the log that it has not seen, per joint, in percent of what its motor can do.
+# * Judge a model by a part of the log that it has not seen, in all and per joint, in percent of the RMS torque.
 # * [Is my fit good?](../docs/is_my_fit_good.md) lists the questions in order, with thresholds. On the command line all of this is
 #   `jaxid identify experiment.toml log.csv --split 0.6 -o report/`.
 #

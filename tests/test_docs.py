@@ -30,14 +30,9 @@ from jaxid.identification.fit_result import DOUBT_LIMIT, TRUST_LIMIT
 from jaxid.measurement.filters import FILTERS
 from jaxid.simulation.virtual import random_bodies
 from jaxid.validation.diagnosis import MIN_DEVIATIONS
+from jaxid.validation.judgement import ERRORS, MAX_CONDITION_NUMBER
 from jaxid.validation.mistake_search import GAINS, MAX_MISFIT
 from jaxid.validation.torque_errors import POSES
-from jaxid.validation.verdict import (
-    FIT_ERROR,
-    MAX_CONDITION_NUMBER,
-    RMS_ERROR,
-    UNSEEN_RATIO,
-)
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -262,14 +257,10 @@ def test_the_example_in_the_readme_runs(given, tmp_path):
 THRESHOLDS = {
     "3.": (f"{LARGEST_UNCERTAINTY:.0%}",),
     "4.": (f"below {MAX_CONDITION_NUMBER:.0f}",),
-    "5.": (
-        f"up to {FIT_ERROR[0]:.0f}% of each joint's RMS force; tolerable to "
-        f"{FIT_ERROR[1]:.0f}%",
-    ),
     "6.": (
-        f"up to {RMS_ERROR[0]:.0f}% of each joint's RMS force, tolerable to "
-        f"{RMS_ERROR[1]:.0f}%",
-        f"up to {UNSEEN_RATIO} times those of the fit",
+        f"up to {ERRORS.good:.0%} of the RMS forces",
+        f"above {ERRORS.doubtful:.0%} ({ERRORS.doubtful_joint:.0%} of a joint)",
+        f"above {ERRORS.bad:.0%} ({ERRORS.bad_joint:.0%})",
     ),
     "7.": (f"up to {TRUST_LIMIT:.0%}", f"up to {DOUBT_LIMIT:.0%} doubtful"),
     "10.": (f"all of {POSES} poses",),

@@ -76,7 +76,7 @@ def judged(log, file, folder):
     report = jid.identify_logs(
         experiment.setup, [folder / "log.npz"], experiment.columns, 0.4
     )
-    sentences = [(str(x.status.name), str(x.text)) for x in report.judgement]
+    sentences = [(str(x.status.name), str(x.text)) for x in report.judgement.findings]
     return sentences, list(report.notes)
 
 

@@ -152,7 +152,7 @@ def identified(logs, keys, folder=None):
     notes = [x for log, _ in inspection.logs for x in (*log.log.notes, *log.notes)]
     doubts = [
         str(x.text)
-        for x in report.judgement[1:]
+        for x in report.judgement.findings
         if x.status.name in ("DOUBTFUL", "BAD") and "not validated" not in str(x.text)
     ]
     doubts += [text for text in findings if text not in doubts]

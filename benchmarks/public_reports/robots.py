@@ -180,7 +180,11 @@ def identified(text, truth=None, edits=(), bare=None, **chain):
     wrong = result.fit.predict(jid.Motion(q, qd, qdd))[is_moving] - true
     error = np.linalg.norm(wrong, axis=0) / np.linalg.norm(true, axis=0)
     robot = experiment.setup.robot
-    doubts = [x.text for x in result.judgement if x.status.name in ("DOUBTFUL", "BAD")]
+    doubts = [
+        x.text
+        for x in result.judgement.findings
+        if x.status.name in ("DOUBTFUL", "BAD")
+    ]
     return error, " ".join(map(str, [*robot.notes, *doubts]))
 
 

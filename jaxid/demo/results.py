@@ -283,7 +283,7 @@ def _verification(study: Study) -> Section:
         ),
         picture(
             jid.plot.bars(groups, robot),
-            "Fig. 10: mean errors on both paths.",
+            "Fig. 10: errors on both paths; the paper's measure is in the tables.",
         ),
         (error_table(study, 0), error_table(study, 1)),
         "The torque of an axis at rest may be anything up to stiction, which no model "

@@ -20,8 +20,8 @@ from jaxid.result_table import (
     with_deviations,
 )
 from jaxid.robot.robot import Robot
-from jaxid.validation.torque_errors import TorqueErrors
-from jaxid.validation.verdict import RMS_ERROR, Report, verdict
+from jaxid.validation.judgement import Report, judge
+from jaxid.validation.torque_errors import TorqueErrors, joint_errors, relative_error
 
 from .figure import Figure
 from .friction_and_gravity import gravity_table
@@ -67,46 +67,45 @@ def identification_page(report: Report, figures: Figures) -> str:
 
 def _glance(report: Report) -> list[Any]:
     """Return verdict, three numbers, the data, and what deserves attention."""
-    judgement, *criteria = verdict(report)
-    doubts = [x for x in criteria if x.status in (Status.BAD, Status.DOUBTFUL)]
-    other_remarks = [x for x in criteria if x not in doubts]
+    judgement = judge(report)
+    faults = judgement.faults
+    other_findings = [x for x in judgement.findings if x not in faults]
     return [
-        judgement,
+        judgement.verdict,
         _three_numbers(report),
         Table("", facts=_data(report)),
-        *([doubts] if doubts else []),
-        folded("What else was checked", other_remarks),
+        *([faults] if faults else []),
+        folded("What else was checked", other_findings),
     ]
 
 
 def _three_numbers(report: Report) -> Markup:
-    """Return the torque error, the worst joint's mean error, the trusted parameters."""
+    """Return the torque error in all and of the worst joint, and what is determined."""
     fit = report.fit
     logs = report.verification
     motion = "on motion that the fit has not seen"
     if not logs:
         logs = report.identification
         motion = "on the motion of the fit: no other log was given"
-    error = max(log.relative for log in logs)
-    grade = int(np.searchsorted(RMS_ERROR, 100.0 * error))
-    status = (Status.GOOD, Status.DOUBTFUL, Status.BAD)[grade]
-
-    number = significant(fit.condition_numbers.scaled)
-    meaning = "condition number: how well the motion tells the parameters apart"
-    mean_percents = np.max([log.mean_percent for log in logs], axis=0)
-    if np.isfinite(mean_percents).all():
-        worst_joint = int(np.argmax(mean_percents))
-        joint = fit.base.model.robot.joint_names[worst_joint]
-        number = f"{percent(float(mean_percents[worst_joint]) / 100.0)} %"
-        meaning = f"mean error of the worst joint, {joint}, of its largest torque"
-    share = f"{fit.trust.count(Status.GOOD)} of {fit.base.size}"
+    errors = joint_errors(logs)
+    worst_joint = int(np.argmax(errors))
+    joint_name = fit.base.model.robot.joint_names[worst_joint]
+    undetermined = len(fit.undetermined)
     return tiles(
-        (f"{percent(error)} %", f"torque error (RMS) {motion}", status),
-        (number, meaning, Status.NEUTRAL),
         (
-            share,
-            "parameters known to 10 %",
-            Status.BAD if fit.undetermined else Status.NEUTRAL,
+            f"{percent(relative_error(logs))} %",
+            f"torque error (RMS over RMS) {motion}",
+            Status.NEUTRAL,
+        ),
+        (
+            f"{percent(float(errors[worst_joint]))} %",
+            f"the same of the worst joint, {joint_name}",
+            Status.NEUTRAL,
+        ),
+        (
+            f"{fit.base.size - undetermined} of {fit.base.size}",
+            "combinations of parameters that the logs determine",
+            Status.BAD if undetermined else Status.GOOD,
         ),
     )
 
@@ -211,10 +210,7 @@ def _details(report: Report, figures: Figures) -> Sections:
     table = Table("", *summary.columns, facts=facts)
     yield "Robot and drives", [table, *motor_tables(robot)]
 
-    text = (
-        "Predicted less measured forces. Bars: the mean of their absolute values (Eq. "
-        "37, Fig. 10 of the paper); points: their RMS."
-    )
+    text = "RMS of the differences over the RMS of the measured forces of each joint."
     table = report.validation.summary()
     yield "Torque errors", [text, figures["errors"], table]
     if fit.consistency is not None:

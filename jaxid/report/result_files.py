@@ -14,7 +14,7 @@ from jaxid.identification.fit_result import Fit, load_fit
 from jaxid.identification.parameter_changes import LEVEL, Comparison, Verdict
 from jaxid.io import atomic_folder, json_text, read_json
 from jaxid.result_table import Remark, Status
-from jaxid.validation.verdict import Report
+from jaxid.validation.judgement import Report
 
 from .comparison_figure import comparison_figure
 from .figure import Figure

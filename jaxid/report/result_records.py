@@ -14,8 +14,8 @@ from jaxid.identification.parameter_changes import Comparison, parameter_kinds
 from jaxid.identification.uncertainty import Uncertainty
 from jaxid.result_table import versions
 from jaxid.robot.robot import Robot
+from jaxid.validation.judgement import Report, judge
 from jaxid.validation.torque_errors import TorqueErrors
-from jaxid.validation.verdict import Report, verdict
 
 Record = dict[str, Any]
 """Object of a JSON file, or row of a CSV file."""
@@ -58,8 +58,9 @@ def result_record(report: Report) -> Record:
     """Return the content of `result.json`; `model.json` holds robot, model and fit."""
     fit = report.fit
     robot = fit.base.model.robot
+    judgement = judge(report)
     verdicts = []
-    for remark in verdict(report):
+    for remark in (judgement.verdict, *judgement.findings):
         verdicts.append({"status": remark.status.name.lower(), "text": remark.text})
     undetermined_records = []
     for direction in fit.undetermined:
@@ -138,7 +139,6 @@ def _error_record(errors: TorqueErrors, robot: Robot) -> Record:
         mean=errors.mean,
         rms=errors.rms,
         mean_percent=errors.mean_percent,
-        rms_percent=errors.rms_percent,
         rms_relative=errors.rms_relative,
     )
     return {"relative": errors.relative, "recording": errors.name, "joints": rows}

@@ -7,7 +7,11 @@ import numpy as np
 from jaxid.errors import InputError
 from jaxid.result_table import percent, significant
 from jaxid.robot.robot import Robot
-from jaxid.validation.torque_errors import TorqueErrors
+from jaxid.validation.torque_errors import (
+    TorqueErrors,
+    relative_error,
+    relative_joint_errors,
+)
 
 from .figure import Figure
 from .figure_elements import (
@@ -57,7 +61,7 @@ def torque_figure(
     columns = 2 if len(panels) > 2 else 1
     name = errors.name if title is None else title
     return Figure(
-        f"{name}: relative error {percent(errors.relative)} %",
+        f"{name}: RMS error {percent(errors.relative)} % of the RMS forces",
         panels,
         columns,
         height=2.6,
@@ -87,7 +91,7 @@ def _joint_panel(errors: TorqueErrors, robot: Robot, j: int, window: slice) -> P
             Curve(time, predicted_forces, "predicted", PREDICTION_COLOUR, width=0.8),
         ],
         title=robot.joint_names[j],
-        value=_mean_error_text(errors, j, unit),
+        value=_error_text(errors, j, unit),
         y="torque" if robot.revolute[j] else "force",
         unit=unit,
         x_range=(float(time[0]), float(end)),
@@ -95,13 +99,12 @@ def _joint_panel(errors: TorqueErrors, robot: Robot, j: int, window: slice) -> P
     )
 
 
-def _mean_error_text(errors: TorqueErrors, j: int, unit: str) -> str:
-    """Return a joint's mean error, and its share of the largest force if known."""
+def _error_text(errors: TorqueErrors, j: int, unit: str) -> str:
+    """Return a joint's RMS error, and its share of the RMS force."""
     if not np.isfinite(errors.errors[:, j]).any():
         return "no row counts"
-    text = f"mean |e| {significant(errors.mean[j], 2)} {unit}"
-    fraction = errors.mean_percent[j] / 100.0
-    return f"{text} = {percent(fraction)} % of max" if np.isfinite(fraction) else text
+    share = percent(float(errors.rms_relative[j]))
+    return f"RMS error {significant(errors.rms[j], 2)} {unit} = {share} %"
 
 
 def require_joints(errors: TorqueErrors, robot: Robot) -> None:
@@ -116,10 +119,9 @@ def require_joints(errors: TorqueErrors, robot: Robot) -> None:
 def bar_figure(
     groups: Mapping[str, Sequence[TorqueErrors]], robot: Robot, title: str = ""
 ) -> Figure:
-    """Return mean errors as bars, RMS errors as points, by group (Eq. 37, Fig. 10).
+    """Return errors of the joints as bars, RMS error over RMS force, by group.
 
-    In percent of the largest forces; of the RMS of the measured forces if a largest one
-    is not known. Recordings of one group count as one.
+    Recordings of one group count as one.
 
     Args:
         groups: Errors on some recordings by the name of the group, like
@@ -138,16 +140,9 @@ def bar_figure(
             f"`groups` must hold 1 to {len(GROUP_COLOURS)} groups with errors, but "
             f"holds {len(groups)}."
         )
-    all_errors = [errors for recordings in groups.values() for errors in recordings]
-    for errors in all_errors:
-        require_joints(errors, robot)
-
-    # All recordings are of one robot: the largest forces of the first are those of all.
-    max_forces = np.asarray(all_errors[0].max_forces)
-    reference = "the largest force"
-    if not np.isfinite(max_forces).all():
-        max_forces = None
-        reference = "RMS force"
+    for recordings in groups.values():
+        for errors in recordings:
+            require_joints(errors, robot)
 
     joints = robot.joints
     bar_width = min(0.36, 0.72 / len(groups))
@@ -155,27 +150,21 @@ def bar_figure(
     middle_group = 0.5 * (len(groups) - 1)
     show_numbers = joints * len(groups) <= MAX_BARS_WITH_NUMBERS
     bars = []
-    points = []
     for k, (name, recordings) in enumerate(groups.items()):
-        colour = GROUP_COLOURS[k]
         shift = (k - middle_group) * (bar_width + 0.02)
         places = np.arange(joints) + shift
-        mean_percents, rms_percents = _pooled_percents(recordings, max_forces)
-        texts = (
-            [percent(value / 100.0) for value in mean_percents] if show_numbers else []
-        )
-        legend = (
-            f"{name}: {percent(float(np.mean(mean_percents)) / 100.0)} % on average"
-        )
+        shares = relative_joint_errors(recordings)
+        texts = [percent(float(share)) for share in shares] if show_numbers else []
+        legend = f"{name}: {percent(relative_error(recordings))} % in all"
+        colour = GROUP_COLOURS[k]
         bars.append(
-            Curve(places, mean_percents, legend, colour, "bars", bar_width, texts=texts)
+            Curve(places, 100 * shares, legend, colour, "bars", bar_width, texts=texts)
         )
-        points.append(Curve(places, rms_percents, "RMS", colour, "points"))
     panel = Panel(
-        [*bars, *points],
+        bars,
         x="",
-        y="mean |error|",
-        unit=f"% of {reference}",
+        y="RMS error",
+        unit="% of RMS force",
         x_range=(-0.6, joints - 0.4),
         x_names=robot.joint_names,
     )
@@ -185,25 +174,3 @@ def bar_figure(
         height=3.5,
         width=max(7.6, min(2.0 + 1.1 * joints, 15.4)),
     )
-
-
-def _pooled_percents(
-    recordings: Sequence[TorqueErrors], max_forces: np.ndarray | None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return mean and RMS errors [%], as if all recordings were one."""
-    errors = np.concatenate([log.errors for log in recordings])
-    is_counted = np.isfinite(errors)
-    rows = np.maximum(is_counted.sum(axis=0), 1)
-
-    def mean(values: np.ndarray) -> np.ndarray:
-        return np.where(is_counted, values, 0.0).sum(axis=0) / rows
-
-    scale = max_forces
-    if scale is None:
-        forces = np.concatenate([np.asarray(log.measured) for log in recordings])
-        rms_forces = np.sqrt(mean(forces**2))
-        # No division by zero for a joint without forces.
-        scale = np.maximum(rms_forces, np.finfo(float).tiny)
-    mean_error = mean(np.abs(errors))
-    rms_error = np.sqrt(mean(errors**2))
-    return 100.0 * mean_error / scale, 100.0 * rms_error / scale

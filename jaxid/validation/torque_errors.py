@@ -1,6 +1,8 @@
 """Validation: torque errors, and definiteness of the mass matrix (Eq. 37, Sec. 5)."""
 
 import itertools
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -31,6 +33,8 @@ OCTAVES = 6
 """Number of times that a joint's largest speed is halved for classes of its speed."""
 BLOCKS = 12
 """Blocks of time whose errors are compared."""
+MIN_DUTY = 0.2
+"""Share of its largest force that a joint is expected to do at least."""
 
 
 class TorqueErrors(eqx.Module):
@@ -65,7 +69,7 @@ class TorqueErrors(eqx.Module):
 
         NaN where a row does not count.
         """
-        return np.asarray(self.predicted) - self._measured
+        return np.asarray(self.predicted) - self.counted_forces
 
     @property
     def mean(self) -> Vector:
@@ -81,11 +85,6 @@ class TorqueErrors(eqx.Module):
     def mean_percent(self) -> Vector:
         """Mean absolute errors in percent of the largest force (Eq. 37)."""
         return 100.0 * self.mean / np.asarray(self.max_forces)
-
-    @property
-    def rms_percent(self) -> Vector:
-        """RMS errors in percent of the largest force."""
-        return 100.0 * self.rms / np.asarray(self.max_forces)
 
     @property
     def depend_on_speed(self) -> tuple[bool, ...]:
@@ -106,7 +105,7 @@ class TorqueErrors(eqx.Module):
     @property
     def force_rms(self) -> Vector:
         """RMS of the measured forces of each joint [N m or N]."""
-        return np.sqrt(np.nanmean(self._measured**2, axis=0))
+        return np.sqrt(np.nanmean(self.counted_forces**2, axis=0))
 
     @property
     def rms_relative(self) -> Vector:
@@ -117,11 +116,14 @@ class TorqueErrors(eqx.Module):
     def relative(self) -> float:
         r"""Norm of all errors over the norm of all forces, $|Wp - Q| / |Q|$."""
         return float(
-            np.sqrt(_ratio(np.nansum(self.errors**2), np.nansum(self._measured**2)))
+            np.sqrt(
+                _ratio(np.nansum(self.errors**2), np.nansum(self.counted_forces**2))
+            )
         )
 
     @property
-    def _measured(self) -> np.ndarray:
+    def counted_forces(self) -> np.ndarray:
+        """Measured forces [N m or N]; NaN where a row does not count."""
         return np.where(self.counted, np.asarray(self.measured), np.nan)
 
 
@@ -313,6 +315,59 @@ def torque_errors(
         speeds=speeds,
         unexplained=np.where(mask[::step], refitted_forces - measured_forces, np.nan),
         positions=positions,
+    )
+
+
+def relative_error(logs: Sequence[TorqueErrors]) -> float:
+    """Return the RMS error over the RMS force of some logs, as if they were one."""
+    errors = sum(np.nansum(log.errors**2) for log in logs)
+    forces = sum(np.nansum(log.counted_forces**2) for log in logs)
+    return float(np.nan_to_num(np.sqrt(_ratio(errors, forces))))
+
+
+def unexplained_error(logs: Sequence[TorqueErrors]) -> float:
+    """Return the relative error that remains if the model is fitted to each log."""
+    errors = sum(np.nansum(np.asarray(log.unexplained) ** 2) for log in logs)
+    forces = sum(np.nansum(log.counted_forces**2) for log in logs)
+    return float(np.nan_to_num(np.sqrt(_ratio(errors, forces))))
+
+
+def relative_joint_errors(logs: Sequence[TorqueErrors]) -> Vector:
+    """Return each joint's RMS error over its RMS force, as if some logs were one."""
+    rms = _pooled_rms(logs)
+    return np.nan_to_num(_ratio(rms.errors, rms.forces))
+
+
+def joint_errors(logs: Sequence[TorqueErrors]) -> Vector:
+    """Return each joint's RMS error over what it must do, as if some logs were one.
+
+    A joint must do its RMS force, and a fifth of its largest force at least: errors of
+    a joint that hardly works matter little. The largest force is the limit of the
+    joint, or that of the logs where no limit is known.
+    """
+    rms = _pooled_rms(logs)
+    limits = np.asarray(logs[0].max_forces)
+    forces = np.concatenate([log.counted_forces for log in logs])
+    peaks = np.abs(np.nan_to_num(forces)).max(axis=0)
+    max_forces = np.where(np.isfinite(limits), limits, peaks)
+    duties = np.maximum(rms.forces, MIN_DUTY * max_forces)
+    return np.nan_to_num(_ratio(rms.errors, duties))
+
+
+class _PooledRms(NamedTuple):
+    """RMS errors and forces of each joint over the rows that count of some logs."""
+
+    errors: Vector
+    forces: Vector
+
+
+def _pooled_rms(logs: Sequence[TorqueErrors]) -> _PooledRms:
+    errors = np.concatenate([log.errors for log in logs])
+    forces = np.concatenate([log.counted_forces for log in logs])
+    rows = np.maximum(np.isfinite(errors).sum(axis=0), 1)
+    return _PooledRms(
+        np.sqrt(np.nansum(errors**2, axis=0) / rows),
+        np.sqrt(np.nansum(forces**2, axis=0) / rows),
     )
 
 

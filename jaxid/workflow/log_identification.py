@@ -29,14 +29,14 @@ from jaxid.measurement.observations import Observations
 from jaxid.measurement.recording import Recording
 from jaxid.report.identification_page import body_table, motor_tables
 from jaxid.report.result_files import read_fit, write_report
-from jaxid.result_table import Remark, Status, Summarised, Table
+from jaxid.result_table import Remark, Summarised, Table
 from jaxid.validation.diagnosis import mistakes_in_logs
+from jaxid.validation.judgement import Judgement, Report, judge
 from jaxid.validation.torque_errors import (
     TorqueErrors,
     torque_errors,
     validate,
 )
-from jaxid.validation.verdict import Report, verdict
 
 from .log_loading import LoadedLog, fitted_share, is_report, load_logs, select_filter
 from .setup import Paths, Progress, Setup, ignore_progress
@@ -47,45 +47,31 @@ class IdentificationReport(Summarised, Report):
     """Identified model, its validation, and the judgement, which notebooks show."""
 
     @functools.cached_property
-    def judgement(self) -> list[Remark]:
-        """Verdict, and below it a remark for each criterion."""
-        return verdict(self)
+    def judgement(self) -> Judgement:
+        """Findings, the most severe first, and the verdict that sums them up."""
+        return judge(self)
 
     @property
     def verdict(self) -> Remark:
         """Whether the model may be used, in one sentence."""
-        return self.judgement[0]
+        return self.judgement.verdict
 
     def tables(self) -> list[Table]:
-        """Return estimates and torque errors, and the verdict with what to look at."""
+        """Return estimates and torque errors, then all findings and the verdict."""
         fit = self.fit
         robot = fit.base.model.robot
-        robot_table = robot.summary()
-        if getattr(fit.estimator, "pull", None) is None:
-            # Doubts about bodies of the file concern only who is pulled to them.
-            robot_table.remarks = tuple(
-                x for x in robot_table.remarks if x.status is not Status.DOUBTFUL
-            )
-        tables = [robot_table, *motor_tables(robot)]
-        notes = [*self.notes, *fit.notes]
-        if fit.consistency is not None:
-            # Those are in its table.
-            notes = [note for note in notes if note not in fit.consistency.findings]
-        if notes:
-            tables.append(Table("", remarks=tuple(dict.fromkeys(notes))))
-        tables.append(fit.summary())
-
+        tables = [robot.summary(), *motor_tables(robot), fit.summary()]
         if fit.consistency is not None:
             tables.append(body_table(fit.consistency, robot.body_names))
-        verdict, *criteria = self.judgement
-        critical_remarks = [
-            x for x in criteria if x.status in (Status.DOUBTFUL, Status.BAD)
-        ]
-        return [
-            *tables,
-            self.validation.summary(),
-            Table("", remarks=[verdict, *critical_remarks]),
-        ]
+        tables.append(self.validation.summary())
+        findings = self.judgement.findings
+        sentences = {finding.text for finding in findings}
+        for table in tables:
+            # What is judged below is not said twice.
+            remarks = [x for x in table.remarks if x.text not in sentences]
+            table.remarks = tuple(remarks)
+        lines = [dataclasses.replace(x, detail="") for x in findings]
+        return [*tables, Table("", remarks=[*lines, self.verdict])]
 
     def save(self, folder: FilePath, figures: str = "") -> list[Path]:
         """Write a report, and return the paths of its files.

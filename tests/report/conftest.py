@@ -9,8 +9,8 @@ import jaxid as jid
 from jaxid.report.result_files import write_report
 from jaxid.simulation.friction_and_ripple import SmoothFriction
 from jaxid.simulation.virtual import Sensors, random_bodies
+from jaxid.validation.judgement import Report
 from jaxid.validation.torque_errors import TorqueErrors
-from jaxid.validation.verdict import Report
 
 
 @pytest.fixture(scope="session")

@@ -1,7 +1,6 @@
 """Figures: what they show, on a page and on paper; for small robots and logs."""
 
 import base64
-import dataclasses
 import gzip
 import json
 import sys
@@ -82,7 +81,7 @@ def test_torques_show_what_was_measured_and_predicted(fit, validation):
         assert upper.title == robot.joint_names[j]
         assert (upper.y_label, lower.y_label) == (f"{word} [{unit}]", f"[{unit}]")
         said = upper.value.split(f" {unit} = ")[1].split(" %")[0]
-        assert float(said) == pytest.approx(errors.mean_percent[j], rel=0.06)
+        assert float(said) == pytest.approx(100 * errors.rms_relative[j], rel=0.06)
     require_everything_inside(figure)
     names = [curve.name for curve in figure.legend]
     for shown, j in zip(unpacked(figure), range(2), strict=True):
@@ -143,22 +142,14 @@ def test_residuals_stand_beside_white_ones(fit):
         assert ("not white" in panel.value) != spectra.white[j]
 
 
-def test_bars_are_percents_of_the_largest_forces(errors_of):
+def test_bars_are_rms_errors_over_rms_forces(errors_of):
     first, second = errors_of(3, seed=1), errors_of(3, seed=2)
-    groups = {"identification": (first,), "verification": (second,)}
+    groups = {"identification": (first,), "verification": (second,), "none": ()}
     (panel,) = jid.plot.bars(groups, arm_of(3)).panels
-    bars = {c.colour: c.y for c in panel.curves if c.kind == "bars"}
-    np.testing.assert_allclose(bars[BLUE], first.mean_percent)
-    np.testing.assert_allclose(bars[ORANGE], second.mean_percent)
-    marks = [c.y for c in panel.curves if c.name == "RMS"]
-    np.testing.assert_allclose(marks, [first.rms_percent, second.rms_percent])
-    assert panel.unit == "% of the largest force"
-    unknown = dataclasses.replace(first, max_forces=np.array([50.0, np.nan, 50.0]))
-    groups = {"identification": (unknown,), "verification": ()}
-    (panel,) = jid.plot.bars(groups, arm_of(3)).panels
-    np.testing.assert_allclose(panel.curves[0].y, 100 * first.mean / first.force_rms)
+    bars = {c.colour: c.y for c in panel.curves}
+    np.testing.assert_allclose(bars[BLUE], 100 * first.rms_relative)
+    np.testing.assert_allclose(bars[ORANGE], 100 * second.rms_relative)
     assert panel.unit == "% of RMS force"
-    assert [c.kind for c in panel.curves] == ["bars", "points"]
 
 
 def test_long_lines_keep_every_peak_and_their_ends_and_short_ones_all_points():

@@ -6,14 +6,20 @@ import re
 from html.parser import HTMLParser
 from types import SimpleNamespace
 
-import equinox as eqx
 import numpy as np
 import pytest
 
 import jaxid as jid
 from jaxid.report.page import code, folded, picture, render_page
 from jaxid.result_table import Column, Remark, Status, Table
-from jaxid.validation.verdict import Report, _judge_bounds, _judge_offsets, verdict
+from jaxid.validation.judgement import (
+    SEVERITIES,
+    Report,
+    _judge_bounds,
+    _judge_offsets,
+    judge,
+)
+from jaxid.validation.torque_errors import joint_errors
 
 EVIL = "<script>alert('&\"')</script>"  # as in conftest.py
 
@@ -137,48 +143,84 @@ def test_texts_of_a_page_have_no_backticks_and_notebooks_show_the_same_tables(
     assert EVIL not in Table("", Column("n", [EVIL]))._repr_html_()
 
 
-def test_the_verdict_follows_what_was_found(fit, validation):
+def test_the_verdict_follows_the_most_severe_finding(fit, validation):
     first, second = validation.errors
-    good = verdict(Report(fit, (first,), (second,), validation.definiteness))
-    assert Status.BAD not in [remark.status for remark in good]
-    assert good[0].status is max(
-        (r.status for r in good[1:] if r.status is not Status.NEUTRAL),
-        key=list(Status).index,
-    )
+    good = judge(Report(fit, (first,), (second,), validation.definiteness))
+    assert good.verdict.status is Status.GOOD
+    assert good.faults == ()
     bad = dataclasses.replace(second, predicted=second.predicted + 20.0)
-    found = verdict(Report(fit, (first,), (bad,), validation.definiteness))
-    assert [found[k].status for k in (0, 1, 2)] == [Status.BAD, Status.GOOD, Status.BAD]
-    assert "has not seen" in found[2].text
-    alone = verdict(Report(fit, (first,), (), validation.definiteness))
-    assert any("--verify" in remark.text for remark in alone)
+    found = judge(Report(fit, (first,), (bad,), validation.definiteness))
+    assert found.verdict.status is Status.BAD
+    assert found.findings[0].status is Status.BAD
+    assert "has not seen" in found.findings[0].text
+    marks = [finding.status for finding in found.findings]
+    assert marks == sorted(marks, key=SEVERITIES.index)
     sick = dataclasses.replace(validation.definiteness, smallest=-1.0, indefinite=0.2)
-    assert verdict(Report(fit, (first,), (second,), sick))[0].status is Status.BAD
+    found = judge(Report(fit, (first,), (second,), sick))
+    assert found.verdict.status is Status.BAD
+
+
+def test_errors_on_the_motion_of_the_fit_are_never_called_good(fit, validation):
+    first, _ = validation.errors
+    alone = judge(Report(fit, (first,), (), validation.definiteness))
+    assert alone.verdict.status is Status.DOUBTFUL
+    assert any("--verify" in finding.text for finding in alone.faults)
+    (remark,) = (x for x in alone.findings if "motion of the fit" in x.text)
+    assert remark.status is Status.NEUTRAL
 
 
 @pytest.mark.parametrize(
-    ("share", "departure", "status"),
-    [(0.2, 0.5, Status.DOUBTFUL), (0.2, 0.0, Status.GOOD), (0.6, 0.5, Status.BAD)],
+    ("share", "status"),
+    [
+        (0.05, Status.GOOD),
+        (0.2, Status.NEUTRAL),
+        (0.35, Status.DOUBTFUL),
+        (0.7, Status.BAD),
+    ],
 )
-def test_a_fit_that_misses_more_than_noise_is_doubted_and_then_rejected(
-    fit, validation, share, departure, status
+def test_errors_on_new_motion_are_judged_by_their_share_of_the_forces(
+    fit, validation, share, status
 ):
     first, second = validation.errors
-    spectra = eqx.tree_at(
-        lambda s: s.departure, fit.residual_spectra, np.full(2, departure)
+    wave = np.sin(7.0 * np.asarray(second.time))[:, None] * second.force_rms
+    predicted = np.asarray(second.measured) + np.sqrt(2.0) * share * wave
+    missed = dataclasses.replace(second, predicted=predicted)
+    found = judge(Report(fit, (first,), (missed,), validation.definiteness))
+    (remark,) = (x for x in found.findings if "has not seen" in x.text)
+    assert remark.status is status
+    percents = [float(x) for x in re.findall(r"([\d.]+) %", remark.text)]
+    assert percents[0] == pytest.approx(100 * share, rel=0.1)
+
+
+def test_a_joint_that_hardly_works_does_not_fail_a_model(errors_of):
+    errors = errors_of(2)
+    largest = np.array([50.0, 50.0])
+    measured = np.asarray(errors.measured) * np.array([1.0, 0.01])
+    wrong = measured + np.array([0.0, 1.25])
+    log = dataclasses.replace(
+        errors, measured=measured, predicted=wrong, max_forces=largest
     )
-    wave = np.sin(np.asarray(first.time))[:, None] * first.force_rms
-    missed = dataclasses.replace(first, predicted=first.predicted + 1.4 * share * wave)
-    judged = dataclasses.replace(fit, residual_spectra=spectra)
-    found = verdict(Report(judged, (missed,), (second,), validation.definiteness))
-    assert found[1].status is status
+    np.testing.assert_allclose(joint_errors([log])[1], 1.25 / 10.0, rtol=0.05)
+
+
+def test_errors_that_other_parameters_would_not_make_are_pointed_out(fit, validation):
+    first, second = validation.errors
+    missed = dataclasses.replace(second, predicted=1.15 * np.asarray(second.measured))
+    found = judge(Report(fit, (first,), (missed,), validation.definiteness))
+    (growth,) = (x for x in found.faults if "same model fitted" in x.text)
+    assert growth.status is Status.DOUBTFUL
 
 
 def test_mistakes_come_first_and_decide(fit, validation):
     first, second = validation.errors
     said = {"mistakes": ("a sign is wrong",), "doubts": ("rows are lost",)}
-    found = verdict(Report(fit, (first,), (second,), validation.definiteness, **said))
-    assert [r.text for r in found[1:3]] == ["a sign is wrong.", "rows are lost."]
-    assert [r.status for r in found[:3]] == [Status.BAD, Status.BAD, Status.DOUBTFUL]
+    found = judge(Report(fit, (first,), (second,), validation.definiteness, **said))
+    assert [r.text for r in found.findings[:2]] == [
+        "a sign is wrong.",
+        "rows are lost.",
+    ]
+    assert [r.status for r in found.faults] == [Status.BAD, Status.DOUBTFUL]
+    assert found.verdict.status is Status.BAD
 
 
 @pytest.mark.parametrize(("size", "is_doubted"), [(11.0, True), (0.1, False)])
@@ -191,7 +233,7 @@ def test_forces_far_below_those_of_the_files_bodies_are_doubted(
             first, measured=forces, predicted=size * np.asarray(first.measured)
         )
         errors = (first,), (second,), validation.definiteness
-        remarks = verdict(Report(fit, *errors, claimed=(claims,)))
+        remarks = judge(Report(fit, *errors, claimed=(claims,))).findings
         doubts = [x for x in remarks if "bodies of the robot's file" in x.text]
         assert bool(doubts) == (is_doubted and bool(np.any(forces)))
         assert all("need 11 times" in doubt.text for doubt in doubts)

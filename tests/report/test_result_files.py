@@ -19,7 +19,7 @@ from jaxid.report.result_files import (
     write_report,
 )
 from jaxid.report.result_records import SCHEMAS, consistency_record, plain
-from jaxid.validation.verdict import Report
+from jaxid.validation.judgement import Report
 
 
 @pytest.fixture

@@ -1,0 +1,338 @@
+"""The one judgement of a model: findings with a severity each, then the verdict."""
+
+import dataclasses
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxid.dynamics.terms import ConstantOffset
+from jaxid.identification.fit_result import Fit
+from jaxid.result_table import Remark, Status, percent, significant
+
+from .torque_errors import (
+    Definiteness,
+    TorqueErrors,
+    Validation,
+    joint_errors,
+    relative_error,
+    unexplained_error,
+)
+
+
+class ErrorLimits(NamedTuple):
+    """Torque errors, RMS over RMS, that are good, doubtful and bad.
+
+    Between good and doubtful the number speaks for itself. Attributes ending in `joint`
+    are for the worst joint, the others for all joints together.
+    """
+
+    good: float = 0.1
+    doubtful: float = 0.25
+    bad: float = 0.6
+    doubtful_joint: float = 0.4
+    bad_joint: float = 0.8
+
+
+class GrowthLimits(NamedTuple):
+    """Errors on new motions over those of the same model fitted to these motions."""
+
+    ratio: float = 3.0
+    error: float = 0.05  # smaller errors do not matter
+
+
+class PriceLimits(NamedTuple):
+    """Increase of the residuals by bounds of bodies that is doubtful, and bad."""
+
+    doubtful: float = 0.2
+    bad: float = 1.0
+
+
+ERRORS = ErrorLimits()
+GROWTH = GrowthLimits()
+PRICES = PriceLimits()
+MAX_CONDITION_NUMBER = 1e3
+"""Condition number (scaled columns) above which parameters are hard to tell apart."""
+MAX_OFFSET_SHARE = 0.3
+"""Constant force to be explained, relative to the largest force of its joint."""
+MAX_CLAIM_RATIO = 4.0
+"""Forces of the file's bodies, over those of the logs, that wrong masses explain."""
+
+SEVERITIES = (Status.BAD, Status.DOUBTFUL, Status.GOOD, Status.NEUTRAL)
+"""Order of the findings."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Report:
+    """Content of the report of an identification."""
+
+    fit: Fit  # identified parameters
+    identification: Sequence[TorqueErrors]  # errors on the logs of the fit
+    verification: Sequence[TorqueErrors]  # errors on logs that the fit has not seen
+    definiteness: Definiteness  # of the mass matrix
+    settings: Mapping[str, Any] = dataclasses.field(
+        default_factory=dict
+    )  # origin of the result
+    notes: Sequence[str] = ()  # notes on the logs, as sentences
+    doubts: Sequence[
+        str
+    ] = ()  # findings on the logs that deserve attention, as sentences
+    # likely mistakes in the description of the logs or the robot, as sentences
+    mistakes: Sequence[str] = ()
+    # errors on all logs of the parameters that the robot's file claims; empty without
+    claimed: Sequence[TorqueErrors] = ()
+    claimed_mass: float = 0.0  # mass of all bodies that it claims [kg]; 0 without
+
+    @property
+    def validation(self) -> Validation:
+        """Torque errors on all logs."""
+        robot = self.fit.base.model.robot
+        units = tuple(robot.force_unit(joint) for joint in range(robot.joints))
+        return Validation(self.every_error, self.definiteness, robot.joint_names, units)
+
+    @property
+    def every_error(self) -> tuple[TorqueErrors, ...]:
+        """Errors on all logs."""
+        return (*self.identification, *self.verification)
+
+    @property
+    def every_note(self) -> tuple[str, ...]:
+        """Notes on the robot, the fit and the logs, each once."""
+        fit = self.fit
+        return tuple(
+            dict.fromkeys((*fit.base.model.robot.notes, *fit.notes, *self.notes))
+        )
+
+
+class Judgement(NamedTuple):
+    """Whether a model may be used.
+
+    Attributes:
+        findings: One sentence for each check, the most severe first: ✗ will hurt who
+            uses the model, ! needs a look before, ✓ was checked, · is a remark.
+        verdict: The sentence that sums them up.
+    """
+
+    findings: tuple[Remark, ...]
+    verdict: Remark
+
+    @property
+    def faults(self) -> tuple[Remark, ...]:
+        """Findings with ✗ or !."""
+        severities = (Status.BAD, Status.DOUBTFUL)
+        return tuple(x for x in self.findings if x.status in severities)
+
+
+def judge(report: Report) -> Judgement:
+    """Judge an identified model by all that is known of it and of its logs."""
+    fit = report.fit
+    findings = [
+        *(Remark(text, Status.BAD) for text in dict.fromkeys(report.mistakes)),
+        *(Remark(text, Status.DOUBTFUL) for text in dict.fromkeys(report.doubts)),
+        *_judge_errors(report),
+        fit.determination[0],
+        _judge_mass_matrix(report.definiteness),
+        *_judge_bounds(fit),
+        *_judge_offsets(fit),
+        *_judge_claims(report.claimed),
+        *_judge_friction(fit, report.identification),
+        *_remarks_on_fit(report),
+        *_remarks_on_robot(report),
+        *(Remark(note) for note in report.every_note),
+    ]
+    # Sorting keeps the order of findings with one severity.
+    findings.sort(key=lambda finding: SEVERITIES.index(finding.status))
+    unique_findings = {finding.text: finding for finding in reversed(findings)}
+    findings = list(reversed(unique_findings.values()))
+    return Judgement(tuple(findings), _verdict(report, findings))
+
+
+def _verdict(report: Report, findings: Sequence[Remark]) -> Remark:
+    """Return the sentence for all findings, which follows the most severe one."""
+    statuses = [finding.status for finding in findings]
+    if Status.BAD in statuses:
+        text = "Do not rely on this model yet: what is marked ✗ comes first."
+        return Remark(text, Status.BAD)
+    if Status.DOUBTFUL in statuses:
+        text = "A usable model; look at what is marked ! before you rely on it."
+        return Remark(text, Status.DOUBTFUL)
+    error = percent(relative_error(report.verification))
+    text = f"it predicts new motions within {error} % of the RMS torque."
+    return Remark(f"A good model: nothing speaks against it, and {text}", Status.GOOD)
+
+
+def _judge_errors(report: Report) -> Iterator[Remark]:
+    """Judge the torque errors on motions that the fit has not seen."""
+    if not report.verification:
+        yield Remark(
+            "The model was not validated on an unseen log: use `--verify` or `--split`",
+            Status.DOUBTFUL,
+        )
+        yield _error_remark(report, report.identification, "the motion of the fit")
+        return
+    yield _error_remark(report, report.verification, "motion that it has not seen")
+    yield from _judge_growth(report)
+
+
+def _error_remark(report: Report, logs: Sequence[TorqueErrors], motion: str) -> Remark:
+    """Judge torque errors on some logs; on those of the fit they are never good."""
+    names = report.fit.base.model.robot.joint_names
+    error = relative_error(logs)
+    errors_of_joints = joint_errors(logs)
+    worst_joint = int(np.argmax(errors_of_joints))
+    worst_error = float(errors_of_joints[worst_joint])
+    status = Status.NEUTRAL
+    if error <= ERRORS.good and logs is report.verification:
+        status = Status.GOOD
+    if error > ERRORS.doubtful or worst_error > ERRORS.doubtful_joint:
+        status = Status.DOUBTFUL
+    if error > ERRORS.bad or worst_error > ERRORS.bad_joint:
+        status = Status.BAD
+    return Remark(
+        f"On {motion} the model misses {percent(error)} % of the RMS torque, of joint "
+        f"`{names[worst_joint]}` {percent(worst_error)} %",
+        status,
+        f"Good: up to {100 * ERRORS.good:g} %; ! above {100 * ERRORS.doubtful:g} % "
+        f"({100 * ERRORS.doubtful_joint:g} % of a joint), ✗ above "
+        f"{100 * ERRORS.bad:g} % ({100 * ERRORS.bad_joint:g} %). A joint that hardly "
+        "works is judged by a fifth of its largest torque.",
+    )
+
+
+def _judge_growth(report: Report) -> Iterator[Remark]:
+    """Point out errors on new motions that other parameters would not make."""
+    error = relative_error(report.verification)
+    ratio = error / max(unexplained_error(report.verification), 1e-9)
+    if error > GROWTH.error and ratio > GROWTH.ratio:
+        yield Remark(
+            f"On new motion the errors are {significant(ratio, 2)} times those of the "
+            "same model fitted to it: the motion of the fit is too poor, or something "
+            "has changed between the logs",
+            Status.DOUBTFUL,
+        )
+
+
+def _judge_mass_matrix(definiteness: Definiteness) -> Remark:
+    """Judge whether a simulation or a controller can use the mass matrix."""
+    eigenvalue = significant(definiteness.smallest)
+    return Remark(
+        str(definiteness),
+        Status.GOOD if definiteness.positive_definite else Status.BAD,
+        f"Smallest eigenvalue over random poses: {eigenvalue} in SI units (Sec. 5). If "
+        "it is negative, do not simulate or control with this model where joints were "
+        'not moved: `kind = "consistent"` in `[estimator]` finds bodies that can '
+        "exist.",
+    )
+
+
+def _judge_bounds(fit: Fit) -> Iterator[Remark]:
+    """Judge the price of bounds: a large one says that the logs contradict them."""
+    if fit.consistency is None:
+        return
+    price = fit.consistency.residual_increase
+    active_bounds = "; ".join(fit.consistency.active) or "none"
+    status = Status.GOOD if price <= PRICES.doubtful else Status.DOUBTFUL
+    status = Status.BAD if price > PRICES.bad else status
+    yield Remark(
+        f"All bodies are physically consistent, for {percent(price)} % larger "
+        f"residuals; active bounds: {active_bounds}",
+        status,
+        f"Good: up to {100 * PRICES.doubtful:g} %; tolerable: up to "
+        f"{100 * PRICES.bad:g} %. Above, the logs contradict the bounds: check "
+        "`total_mass`, `mass_max`, units and signs.",
+    )
+
+
+def _judge_offsets(fit: Fit) -> Iterator[Remark]:
+    """Judge constant forces: a large one is a weight that gravity does not explain."""
+    robot = fit.base.model.robot
+    estimates = zip(np.asarray(fit.parameters), fit.standard_deviations, strict=True)
+    values = dict(zip(fit.base.names, estimates, strict=True))
+    (offset,) = ConstantOffset.joint_parameters
+    for j, name in enumerate(robot.joint_names):
+        value, deviation = map(float, values.get(f"{offset.name}{j + 1}", (0.0, 0.0)))
+        max_force = float(robot.known_max_forces[j])
+        if abs(value) - 2.0 * deviation > MAX_OFFSET_SHARE * max_force:
+            unit = robot.force_unit(j)
+            yield Remark(
+                f"Joint `{name}` has a constant force of {significant(value, 3)} "
+                f"{unit}, and its limit is {significant(max_force, 3)} {unit}: is "
+                "`gravity` right, or does a spring or a cable pull?",
+                Status.DOUBTFUL,
+                f"Good: up to {100 * MAX_OFFSET_SHARE:g} % of the largest force.",
+            )
+
+
+def _judge_claims(claimed: Sequence[TorqueErrors]) -> Iterator[Remark]:
+    """Compare the size of the forces with those of the bodies of the robot's file.
+
+    A fit of forces in a wrong unit is as good as any, but its masses are not.
+    """
+    for log in claimed[:1]:
+        claim = float(np.linalg.norm(log.predicted))
+        size = float(np.linalg.norm(log.measured))
+        if claim > MAX_CLAIM_RATIO * size > 0:
+            ratio = significant(claim / size, 2)
+            yield Remark(
+                f"The bodies of the robot's file need {ratio} times the forces of the "
+                "logs: are these currents "
+                "(`recording.torque_constants`), the motors' (`forces_side`) or in "
+                "another unit (`force_unit`), or is the file wrong?",
+                Status.DOUBTFUL,
+            )
+
+
+def _judge_friction(fit: Fit, logs: Sequence[TorqueErrors]) -> Iterator[Remark]:
+    """Point out errors on the logs of a fit that depend on the speeds of the joints."""
+    speed_dependence = np.any([log.depend_on_speed for log in logs], axis=0)
+    joint_names = fit.base.model.robot.joint_names
+    names = [
+        f"`{name}`"
+        for name, depends_on_speed in zip(joint_names, speed_dependence, strict=True)
+        if depends_on_speed
+    ]
+    if names:
+        yield Remark(
+            f"Errors depend on speed (joints {', '.join(names)}): friction seems to "
+            "have another shape, and the intervals of its parameters may be too "
+            "narrow: try `jaxid choose`",
+            detail="Means over classes of speed agree between blocks of time.",
+        )
+
+
+def _remarks_on_fit(report: Report) -> Iterator[Remark]:
+    """Describe the fit by numbers that neither praise nor blame it."""
+    fit = report.fit
+    if report.verification:
+        yield _error_remark(report, report.identification, "the motion of the fit")
+    spectra = fit.residual_spectra
+    if spectra is not None:
+        white_count = int(np.count_nonzero(spectra.white))
+        yield Remark(
+            f"What the fit leaves is white noise for {white_count} of "
+            f"{len(spectra.white)} joints",
+            detail="Bartlett's test compares the cumulative spectrum with a straight "
+            "line. The intervals account for correlated residuals, not for what the "
+            "model lacks.",
+        )
+    yield Remark(
+        f"Estimates: {dict(fit.facts)['estimates']}",
+        detail="Standard deviation over estimate. A parameter near zero is never known "
+        "to a few percent, and that is no fault: look at its interval.",
+    )
+    condition = significant(fit.condition_numbers.scaled, 3)
+    yield Remark(
+        f"The condition number with columns of length one is {condition}",
+        detail=f"Above {MAX_CONDITION_NUMBER:g}, some parameters are hard to tell "
+        "apart, and their intervals are wide.",
+    )
+
+
+def _remarks_on_robot(report: Report) -> Iterator[Remark]:
+    """Repeat what the file of the robot says that cannot be right."""
+    fit = report.fit
+    has_prior = getattr(fit.estimator, "pull", None) is not None
+    for remark in fit.base.model.robot.remarks:
+        # Doubts about bodies of the file concern only who is pulled to them.
+        if has_prior or remark.status is not Status.DOUBTFUL:
+            yield remark
