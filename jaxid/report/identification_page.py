@@ -21,7 +21,11 @@ from jaxid.result_table import (
 )
 from jaxid.robot.robot import Robot
 from jaxid.validation.judgement import Report, judge
-from jaxid.validation.torque_errors import TorqueErrors, joint_errors, relative_error
+from jaxid.validation.torque_errors import (
+    TorqueErrors,
+    relative_error,
+    relative_joint_errors,
+)
 
 from .figure import Figure
 from .friction_and_gravity import gravity_table
@@ -87,7 +91,7 @@ def _three_numbers(report: Report) -> Markup:
     if not logs:
         logs = report.identification
         motion = "on the motion of the fit: no other log was given"
-    errors = joint_errors(logs)
+    errors = relative_joint_errors(logs)
     worst_joint = int(np.argmax(errors))
     joint_name = fit.base.model.robot.joint_names[worst_joint]
     undetermined = len(fit.undetermined)

@@ -16,6 +16,7 @@ from .torque_errors import (
     Validation,
     joint_errors,
     relative_error,
+    relative_joint_errors,
     unexplained_error,
 )
 
@@ -178,9 +179,13 @@ def _error_remark(report: Report, logs: Sequence[TorqueErrors], motion: str) -> 
     """Judge torque errors on some logs; on those of the fit they are never good."""
     names = report.fit.base.model.robot.joint_names
     error = relative_error(logs)
-    errors_of_joints = joint_errors(logs)
+    relative_errors = relative_joint_errors(logs)
+    judged_errors = joint_errors(logs)
+    worst_error = float(judged_errors.max())
+    # Only if a joint is what is wrong, it is named by what it must do.
+    is_joint_wrong = worst_error > ERRORS.doubtful_joint
+    errors_of_joints = judged_errors if is_joint_wrong else relative_errors
     worst_joint = int(np.argmax(errors_of_joints))
-    worst_error = float(errors_of_joints[worst_joint])
     status = Status.NEUTRAL
     if error <= ERRORS.good and logs is report.verification:
         status = Status.GOOD
@@ -190,7 +195,7 @@ def _error_remark(report: Report, logs: Sequence[TorqueErrors], motion: str) -> 
         status = Status.BAD
     return Remark(
         f"On {motion} the model misses {percent(error)} % of the RMS torque, of joint "
-        f"`{names[worst_joint]}` {percent(worst_error)} %",
+        f"`{names[worst_joint]}` {percent(float(relative_errors[worst_joint]))} %",
         status,
         f"Good: up to {100 * ERRORS.good:g} %; ! above {100 * ERRORS.doubtful:g} % "
         f"({100 * ERRORS.doubtful_joint:g} % of a joint), ✗ above "
