@@ -91,6 +91,7 @@ def _three_numbers(report: Report) -> Markup:
     if not logs:
         logs = report.identification
         motion = "on the motion of the fit: no other log was given"
+    band = logs[0].band_words
     errors = relative_joint_errors(logs)
     worst_joint = int(np.argmax(errors))
     joint_name = fit.base.model.robot.joint_names[worst_joint]
@@ -98,7 +99,7 @@ def _three_numbers(report: Report) -> Markup:
     return tiles(
         (
             f"{percent(relative_error(logs))} %",
-            f"torque error (RMS over RMS) {motion}",
+            f"torque error (RMS over RMS){band} {motion}",
             Status.NEUTRAL,
         ),
         (
@@ -137,8 +138,9 @@ def _data(report: Report) -> Iterator[tuple[str, str]]:
         bodies = len(fit.consistency.masses_from_bounds)
         origin = f", of which {bodies} bodies follow from bounds too" if bodies else ""
         yield "total mass of the moving bodies", f"{mass} kg{origin}"
-    if report.claimed_mass:
-        yield "total mass by the robot's file", f"{significant(report.claimed_mass)} kg"
+    if report.claimed_bodies is not None:
+        mass = significant(float(report.claimed_bodies[:, 0].sum()))
+        yield "total mass by the robot's file", f"{mass} kg"
 
 
 def _log_size(log: TorqueErrors) -> str:
@@ -214,11 +216,17 @@ def _details(report: Report, figures: Figures) -> Sections:
     table = Table("", *summary.columns, facts=facts)
     yield "Robot and drives", [table, *motor_tables(robot)]
 
-    text = "RMS of the differences over the RMS of the measured forces of each joint."
+    band = report.every_error[0].band_words
+    text = (
+        "RMS of the differences over the RMS of the measured forces of each joint"
+        f"{band}. Errors of other bands cannot be compared with these."
+    )
     table = report.validation.summary()
     yield "Torque errors", [text, figures["errors"], table]
     if fit.consistency is not None:
-        yield "Bodies", [body_table(fit.consistency, robot.body_names)]
+        names = robot.body_names
+        table = body_table(fit.consistency, names, report.claimed_bodies)
+        yield "Bodies", [table]
     if fit.residual_spectra is not None:
         text = (
             "The residuals of a good model are noise. More power at low frequencies "
@@ -287,8 +295,15 @@ def motor_tables(robot: Robot) -> list[Table]:
     return [Table("motors", *columns)]
 
 
-def body_table(consistency: Consistency, names: Sequence[str]) -> Table:
-    """Return mass, centre of mass and margin of each body, and the bounds' effect."""
+def body_table(
+    consistency: Consistency,
+    names: Sequence[str],
+    file_bodies: np.ndarray | None = None,
+) -> Table:
+    """Return mass, centre of mass and margin of each body, and the bounds' effect.
+
+    Masses and centres are compared with those of the robot's file, if it has some.
+    """
     bodies = np.asarray(consistency.bodies)
     mass = bodies[:, 0]
     centre = bodies[:, 1:4] / mass[:, None]
@@ -296,6 +311,18 @@ def body_table(consistency: Consistency, names: Sequence[str]) -> Table:
         Column(f"{axis} of\ncentre", centre[:, k], "m", lambda x: significant(x, 2))
         for k, axis in enumerate("xyz")
     ]
+    file_columns = []
+    if file_bodies is not None:
+        file_mass = file_bodies[:, 0]
+        divisor = np.where(file_mass > 0, file_mass, np.nan)
+        file_centre = file_bodies[:, 1:4] / divisor[:, None]
+        distance = np.linalg.norm(centre - file_centre, axis=1)
+        file_columns = [
+            Column("mass by\nthe file", file_mass, "kg"),
+            Column(
+                "centre from\nthe file's", distance, "m", lambda x: significant(x, 2)
+            ),
+        ]
     is_bounded = [k in consistency.masses_from_bounds for k in range(len(names))]
     price = f"{100 * consistency.residual_increase:.2g} %"
     error_bound = f"{consistency.error_bound:.1e}"
@@ -304,6 +331,7 @@ def body_table(consistency: Consistency, names: Sequence[str]) -> Table:
         Column("body of joint", names),
         Column("mass", mass, "kg"),
         *centre_columns,
+        *file_columns,
         Column("margin", consistency.margins, "%", percent),
         Column(
             "mass follows from", ["bounds too" if x else "forces" for x in is_bounded]

@@ -61,7 +61,8 @@ def torque_figure(
     columns = 2 if len(panels) > 2 else 1
     name = errors.name if title is None else title
     return Figure(
-        f"{name}: RMS error {percent(errors.relative)} % of the RMS forces",
+        f"{name}: RMS error {percent(errors.relative)} % of the RMS forces"
+        f"{errors.band_words}",
         panels,
         columns,
         height=2.6,

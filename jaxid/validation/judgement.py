@@ -82,7 +82,8 @@ class Report:
     mistakes: Sequence[str] = ()
     # errors on all logs of the parameters that the robot's file claims; empty without
     claimed: Sequence[TorqueErrors] = ()
-    claimed_mass: float = 0.0  # mass of all bodies that it claims [kg]; 0 without
+    # inertial parameters of the bodies that it claims [bodies, 10]; None without
+    claimed_bodies: np.ndarray | None = None
 
     @property
     def validation(self) -> Validation:
@@ -194,7 +195,8 @@ def _error_remark(report: Report, logs: Sequence[TorqueErrors], motion: str) -> 
     if error > ERRORS.bad or worst_error > ERRORS.bad_joint:
         status = Status.BAD
     return Remark(
-        f"On {motion} the model misses {percent(error)} % of the RMS torque, of joint "
+        f"On {motion} the model misses {percent(error)} % of the RMS torque"
+        f"{logs[0].band_words}, of joint "
         f"`{names[worst_joint]}` {percent(float(relative_errors[worst_joint]))} %",
         status,
         f"Good: up to {100 * ERRORS.good:g} %; ! above {100 * ERRORS.doubtful:g} % "

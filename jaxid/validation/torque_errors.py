@@ -51,6 +51,8 @@ class TorqueErrors(eqx.Module):
         unexplained: Errors of the same model fitted to this recording alone: what no
             parameters of it explain; NaN where a row does not count [N m or N].
         positions: Coordinates, filtered and decimated alike [rad or m].
+        band: Cut-off frequency of the filter of all forces [Hz]: errors of different
+            bands cannot be compared.
     """
 
     name: str = eqx.field(static=True)
@@ -62,6 +64,12 @@ class TorqueErrors(eqx.Module):
     speeds: JointSamples
     unexplained: JointSamples
     positions: JointSamples
+    band: float = eqx.field(static=True, default=np.inf)
+
+    @property
+    def band_words(self) -> str:
+        """The band in words for the end of a sentence; nothing without a filter."""
+        return f" below {self.band:.3g} Hz" if np.isfinite(self.band) else ""
 
     @property
     def errors(self) -> Matrix:
@@ -235,7 +243,8 @@ class Validation(Summarised, eqx.Module):
             "Validation",
             *columns,
             facts=[
-                (e.name, f"{percent(e.relative)} % of the forces") for e in self.errors
+                (e.name, f"{percent(e.relative)} % of the forces{e.band_words}")
+                for e in self.errors
             ],
             remarks=[Remark(str(self.definiteness), status)],
             rules=range(count, len(rows), count),
@@ -315,6 +324,7 @@ def torque_errors(
         speeds=speeds,
         unexplained=np.where(mask[::step], refitted_forces - measured_forces, np.nan),
         positions=positions,
+        band=observations.filter.low_pass(observations.sample_time).cutoff,
     )
 
 

@@ -62,7 +62,8 @@ class IdentificationReport(Summarised, Report):
         robot = fit.base.model.robot
         tables = [robot.summary(), *motor_tables(robot), fit.summary()]
         if fit.consistency is not None:
-            tables.append(body_table(fit.consistency, robot.body_names))
+            names = robot.body_names
+            tables.append(body_table(fit.consistency, names, self.claimed_bodies))
         tables.append(self.validation.summary())
         findings = self.judgement.findings
         sentences = {finding.text for finding in findings}
@@ -168,7 +169,7 @@ def identify_logs(
         doubts=[text for log in loaded_logs for text in log.findings],
         mistakes=mistakes.certain,
         claimed=claims.errors,
-        claimed_mass=claims.mass,
+        claimed_bodies=claims.bodies,
     )
 
 
@@ -231,7 +232,7 @@ class Claims(NamedTuple):
     """Parameters that the robot's file claims, compared with logs."""
 
     errors: tuple[TorqueErrors, ...] = ()  # torque errors on each log
-    mass: float = 0.0  # mass of all bodies [kg]
+    bodies: np.ndarray | None = None  # their inertial parameters [bodies, 10]
 
 
 def errors_of_claims(setup: Setup, fit: Fit, logs: Sequence[Observations]) -> Claims:
@@ -245,7 +246,7 @@ def errors_of_claims(setup: Setup, fit: Fit, logs: Sequence[Observations]) -> Cl
     parameters = fit.base.from_standard([values.get(name, 0.0) for name in names])
     claimed_fit = dataclasses.replace(fit, parameters=np.asarray(parameters))
     errors = tuple(torque_errors(claimed_fit, log) for log in logs)
-    return Claims(errors, float(setup.robot_file.bodies()[:, 0].sum()))
+    return Claims(errors, setup.robot_file.bodies())
 
 
 def read_earlier_fit(setup: Setup, folder: Path) -> Fit:
