@@ -139,7 +139,6 @@ def judge(report: Report) -> Judgement:
         *_judge_claims(report.claimed),
         *_judge_friction(fit, report.identification),
         *_remarks_on_fit(report),
-        *_remarks_on_robot(report),
         *(Remark(note) for note in report.every_note),
     ]
     # Sorting keeps the order of findings with one severity.
@@ -333,13 +332,3 @@ def _remarks_on_fit(report: Report) -> Iterator[Remark]:
         detail=f"Above {MAX_CONDITION_NUMBER:g}, some parameters are hard to tell "
         "apart, and their intervals are wide.",
     )
-
-
-def _remarks_on_robot(report: Report) -> Iterator[Remark]:
-    """Repeat what the file of the robot says that cannot be right."""
-    fit = report.fit
-    has_prior = getattr(fit.estimator, "pull", None) is not None
-    for remark in fit.base.model.robot.remarks:
-        # Doubts about bodies of the file concern only who is pulled to them.
-        if has_prior or remark.status is not Status.DOUBTFUL:
-            yield remark
