@@ -57,19 +57,15 @@ def late(log, seconds):
 def outcome(setup, recording, seconds, damping, has_search):
     """Return what is found in a log."""
     import jaxid as jid
-    from jaxid.identification.delay import with_unknown_delay
-    from jaxid.identification.problem import RegressionProblem
-    from jaxid.validation.mistake_search import find_mistakes
 
     delay = jid.estimate_delay(setup.model, recording)
+    training_log, _ = setup.observe(recording).split(0.6)
+    fit = jid.identify(setup.base, training_log, setup.estimator)
+    wider_fit = jid.with_unknown_delay(fit, training_log, delay)
     is_named = delay.is_certain
     if has_search:
-        mistakes = find_mistakes(setup.model, [recording])
-        is_named = "force_delay" in " ".join(mistakes.explained)
-    training_log, _ = setup.observe(recording).split(0.6)
-    rows = RegressionProblem(setup.base, [training_log])
-    fit = setup.fit(rows)
-    wider_fit = with_unknown_delay(fit, rows, delay)
+        diagnosis = jid.diagnose(recording, setup.robot, fit)
+        is_named = any("`force_delay" in text for text in diagnosis.findings)
     fits = fit, wider_fit
     is_viscous = [bool(re.match(r"fv\d", name)) for name in fit.base.names]
     errors = np.abs(fit.parameters[is_viscous] - damping)

@@ -44,6 +44,7 @@ from .identification import (
 )
 from .identification.combination import combine_fits as combine_fits
 from .identification.consistency import PhysicallyConsistent as PhysicallyConsistent
+from .identification.delay import with_unknown_delay as with_unknown_delay
 from .identification.drive_gains import identify_drive_gains as identify_drive_gains
 from .identification.encoder_resolution import resolution_bias as resolution_bias
 from .identification.estimators import WeightedLeastSquares as WeightedLeastSquares

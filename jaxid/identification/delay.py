@@ -7,6 +7,7 @@ import numpy as np
 from scipy import special
 
 from jaxid.arrays import BaseVector
+from jaxid.measurement.observations import ObservedLogs
 from jaxid.result_table import significant, with_deviations
 
 from .fit_result import Fit
@@ -18,7 +19,7 @@ from .uncertainty.spectra_of_rows import spread_rows
 class DelayLimits(NamedTuple):
     """Bounds of a delay that is told.
 
-    On 205 clean logs of five machines, simulated by MuJoCo, delays were at most 1.9
+    On 135 clean logs of five machines, simulated by MuJoCo, delays were at most 1.9
     deviations above zero, and 3.8 below: disturbances that a controller answers, and
     friction at low speeds, make forces look early, not late.
     """
@@ -68,7 +69,9 @@ class Delay(NamedTuple):
         return f"{milliseconds} ± {width} ms"
 
 
-def with_unknown_delay(fit: Fit, problem: RegressionProblem, delay: Delay) -> Fit:
+def with_unknown_delay(
+    fit: Fit, observations: ObservedLogs | RegressionProblem, delay: Delay
+) -> Fit:
     """Return a fit whose uncertainty includes a delay that stays in the log.
 
     A delay of the forces moves the estimates by a multiple of their derivative. Its
@@ -76,10 +79,16 @@ def with_unknown_delay(fit: Fit, problem: RegressionProblem, delay: Delay) -> Fi
     takes to be zero: intervals then hold whether the delay is certain or not.
 
     Args:
-        fit: Fit of the log, as it is.
-        problem: Rows of the fit.
-        delay: Delay of the log.
+        fit: Fit of the logs, as they are.
+        observations: Observations of the fit, or the regression problem of them.
+        delay: Delay of the logs, as from `estimate_delay`.
     """
+    problem = observations
+    if not isinstance(problem, RegressionProblem):
+        problem = RegressionProblem(fit.base, problem)
+    elif problem.base is not fit.base:
+        # The fit has found other columns, such as friction by load.
+        problem = problem.with_base(fit.base)
     derivative = _derivative_by_delay(fit, problem)
     mean_square = delay.seconds**2 + delay.deviation**2
     delay_covariance = mean_square * np.outer(derivative, derivative)
@@ -114,10 +123,7 @@ def _derivative_by_delay(fit: Fit, problem: RegressionProblem) -> BaseVector:
     size = fit.base.size
     information = np.zeros((size, size))
     products = np.zeros(size)
-    # The fit may have found other columns, such as friction by load.
-    has_other_base = fit.base is not problem.base
-    rows_of_fit = problem.with_base(fit.base) if has_other_base else problem
-    for chunk in spread_rows(rows_of_fit):
+    for chunk in spread_rows(problem):
         if len(chunk.forces) < 2:
             continue
         row_time = problem.recordings[chunk.recording].row_time

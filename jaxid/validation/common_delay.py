@@ -35,7 +35,7 @@ def estimate_delay(model: Model, recordings: Recording | Sequence[Recording]) ->
 
     Forces that are late by $\tau$ are $\Theta(t - \tau) p$. Remove the delay by
     `remove_delay` or `force_delay` in `[recording]`. If it stays, `with_unknown_delay`
-    widens the intervals of a fit.
+    widens the intervals of a fit (`identify_logs` does so).
 
     Args:
         model: Model of the robot.

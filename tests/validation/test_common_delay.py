@@ -7,8 +7,6 @@ import numpy as np
 import pytest
 
 import jaxid as jid
-from jaxid.identification.delay import with_unknown_delay
-from jaxid.identification.problem import RegressionProblem
 from jaxid.validation.mistake_search import find_mistakes
 
 ARM = """<mujoco><option timestep="0.001" integrator="implicitfast"/>
@@ -95,10 +93,10 @@ def test_intervals_of_viscous_friction_hold_in_spite_of_a_delay(setup, log):
     is_viscous = [name.startswith("fv") for name in setup.base.names]
     for seconds in (0.0, 0.005, 0.01):
         recording = late(log, seconds)
-        rows = RegressionProblem(setup.base, setup.observe(recording))
-        fit = setup.fit(rows)
+        o = setup.observe(recording)
+        fit = jid.identify(setup.base, o, setup.estimator)
         delay = jid.estimate_delay(setup.model, recording)
-        wider_fit = with_unknown_delay(fit, rows, delay)
+        wider_fit = jid.with_unknown_delay(fit, o, delay)
         errors = np.abs(wider_fit.parameters[is_viscous] - DAMPING)
         assert (errors <= wider_fit.uncertainty.half_widths()[is_viscous]).all()
         ratios = wider_fit.standard_deviations / fit.standard_deviations
@@ -125,6 +123,6 @@ def test_the_derivative_of_estimates_is_that_of_late_forces(setup, log):
     o = motion_log.replace(forces=forces)
     exact_fit = jid.identify(base, o, estimator)
     delay = jid.estimate_delay(setup.model, log)._replace(seconds=0.002, deviation=0.0)
-    wider_fit = with_unknown_delay(exact_fit, RegressionProblem(base, o), delay)
+    wider_fit = jid.with_unknown_delay(exact_fit, o, delay)
     added_variances = np.diag(wider_fit.covariance - exact_fit.covariance)
     np.testing.assert_allclose(np.sqrt(added_variances), changes, rtol=0.02, atol=1e-4)
