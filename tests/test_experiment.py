@@ -23,7 +23,7 @@ from jaxid.measurement.columns import Columns, with_lerobot_calibration
 from jaxid.workflow import log_loading
 from jaxid.workflow.log_loading import load_log, load_logs, read_log
 
-VARIANCES = jid.estimators.ResidualVariances()
+WEIGHTS = jid.estimators.MaximumForces()
 ARM = """\
 [robot]
 builtin = "planar_arm"
@@ -136,11 +136,8 @@ def test_defaults_are_said(load):
     assert experiment.setup.decimation == jid.Subsample(1)
     assert experiment.setup.min_speed is None
     assert experiment.columns is None
-    assert isinstance(
-        experiment.setup.estimator.weights, jid.estimators.ResidualVariances
-    )
-    assert "largest forces" in experiment.setup.notes[0]
-    assert "10 Hz is assumed" in experiment.setup.notes[1]
+    assert experiment.setup.estimator.weights == jid.estimators.MaximumForces()
+    assert "10 Hz is assumed" in experiment.setup.notes[0]
 
 
 def test_limits_replace_those_of_the_robot_and_nan_keeps_them(load):
@@ -223,18 +220,18 @@ ESTIMATORS = {
     'kind = "least_squares"\nridge = "cross_validated"': jid.estimators.LeastSquares(
         jid.estimators.CrossValidated()
     ),
-    "ridge = 0.02": jid.WeightedLeastSquares(VARIANCES, jid.estimators.Ridge(0.02)),
+    "ridge = 0.02": jid.WeightedLeastSquares(WEIGHTS, jid.estimators.Ridge(0.02)),
     'kind = "huber"': jid.estimators.IterativelyReweighted(
-        jid.estimators.Huber(), VARIANCES
+        jid.estimators.Huber(), WEIGHTS
     ),
     'kind = "tukey"\nridge = 0.1': jid.estimators.IterativelyReweighted(
-        jid.estimators.Tukey(), VARIANCES, jid.estimators.Ridge(0.1)
+        jid.estimators.Tukey(), WEIGHTS, jid.estimators.Ridge(0.1)
     ),
     'kind = "consistent"\npull = 2': jid.PhysicallyConsistent(
-        VARIANCES, pull=jid.consistency.EntropicPull(strength=2.0)
+        WEIGHTS, pull=jid.consistency.EntropicPull(strength=2.0)
     ),
-    "": jid.PhysicallyConsistent(VARIANCES, pull=jid.consistency.EntropicPull()),
-    "pull = 0": jid.PhysicallyConsistent(VARIANCES),
+    "": jid.PhysicallyConsistent(WEIGHTS, pull=jid.consistency.EntropicPull()),
+    "pull = 0": jid.PhysicallyConsistent(WEIGHTS),
 }
 
 

@@ -17,10 +17,6 @@ from jaxid.errors import InputError
 from jaxid.experiment_file import TomlTable, within
 from jaxid.identification import estimators
 from jaxid.identification.consistency import BodyBounds
-from jaxid.identification.estimators.regularisation_and_weights import (
-    DefaultWeights,
-    default_weights,
-)
 from jaxid.identification.estimators_by_name import ESTIMATORS
 from jaxid.identification.uncertainty import UNCERTAINTIES, AbstractUncertainty
 from jaxid.measurement import filters
@@ -360,7 +356,6 @@ class Estimation(NamedTuple):
     least_squares: estimators.LeastSquares | estimators.WeightedLeastSquares
     uncertainty: AbstractUncertainty  # method of the standard deviations
     nonlinear_friction: bool  # whether the shape of friction is sought too
-    notes: Texts  # assumptions, in sentences
 
 
 def decode_estimator(table: TomlTable) -> tuple[TomlTable, TomlTable]:
@@ -402,7 +397,7 @@ def build_estimation(
     ridge: Fraction | Literal["cross_validated"] | None = None,
     nonlinear_friction: bool = False,
     uncertainty: Annotated[str, OneOf(UNCERTAINTIES)] = "spectral",
-    pull: Magnitude = 1.0,
+    pull: Magnitude | None = None,
 ) -> Estimation:
     """Estimator of the parameters from the rows, and of their standard deviations.
 
@@ -425,14 +420,15 @@ def build_estimation(
             blocks of time left out in turn; "independent": as if rows were independent,
             far too small.
         pull: Strength of a pull towards the bodies of the robot's file, or towards
-            balls if those cannot exist ("consistent"); 0 for none.
+            balls if those cannot exist ("consistent"), like `1.0`; 0 for none. Without
+            it, blocks of the logs choose the strength.
 
     Raises:
         InputError: If keys do not go together, or a file cannot be read.
     """
-    joint_weights, notes = default_weights(robot)
+    joint_weights = estimators.MaximumForces()
     if weights == "residual_variances" or kind == "least_squares":
-        joint_weights, notes = DefaultWeights(estimators.ResidualVariances(), ())
+        joint_weights = estimators.ResidualVariances()
     elif weights == "maximum_forces":
         with within('weights = "maximum_forces"'):
             _ = robot.max_forces
@@ -453,7 +449,6 @@ def build_estimation(
         least_squares,
         UNCERTAINTIES[uncertainty](),
         nonlinear_friction,
-        notes,
     )
 
 

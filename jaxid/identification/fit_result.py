@@ -140,7 +140,8 @@ class Fit(Summarised, eqx.Module):
 
         They tell how far noise can take the estimates of a model that is right: errors
         that every recording of this kind would share (a wrong geometry, a missing
-        effect) are not in them.
+        effect) are not in them. Those of a consistent estimate reach so far that they
+        include the interval without bounds and prior.
 
         Args:
             level: Probability (0 to 1) that an interval contains the truth.
@@ -149,6 +150,8 @@ class Fit(Summarised, eqx.Module):
             InputError: If `level` is not between 0 and 1.
         """
         half_widths = self.uncertainty.half_widths(level)
+        if self.consistency is not None:
+            half_widths = half_widths + np.abs(self.consistency.shift)
         lower_ends = self.parameters - half_widths
         return np.stack([lower_ends, self.parameters + half_widths], axis=1)
 

@@ -18,7 +18,6 @@ from .estimators.regularisation_and_weights import (
     MIN_SINGULAR_VALUE,
     AbstractSpectralSolution,
     Decomposition,
-    default_weights,
     undetermined,
 )
 from .factors import Factors
@@ -84,10 +83,8 @@ def fit_problem(
     deviations come from the block jackknife.
     """
     _require_more_rows_than_parameters(problem)
-    weight_notes = ()
     if estimator is None:
-        joint_weights, weight_notes = default_weights(problem.robot)
-        estimator = WeightedLeastSquares(joint_weights)
+        estimator = WeightedLeastSquares()
     if uncertainty is None:
         uncertainty = SpectralSandwich()
 
@@ -135,7 +132,6 @@ def fit_problem(
         recordings=problem.names,
         notes=(
             *base.notes,
-            *weight_notes,
             *shrinkage_notes,
             *estimate.notes,
             *errors.notes,

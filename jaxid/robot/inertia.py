@@ -35,8 +35,6 @@ PINOCCHIO_ORDER = ((0, 0, 1, 0, 1, 2), (0, 1, 1, 2, 2, 2))
 """Rows and columns of xx, xy, yy, xz, yz, zz."""
 IMPOSSIBLE = "cannot belong to a real body"
 """Words of notes on bodies that cannot exist."""
-PLACEHOLDER = "as placeholders have"
-"""Words of notes on bodies whose numbers nobody has measured or computed."""
 MIN_THICKNESS = 1e-3
 """Smallest second moment of a corrected body, relative to the largest."""
 MAX_MASS = 1e5

@@ -22,7 +22,7 @@ from jaxid.errors import InputError
 from jaxid.result_table import Column, Remark, Status, Summarised, Table
 
 from .follower_joints import Followers, order_from_ground
-from .inertia import IMPOSSIBLE, PLACEHOLDER, Inertia
+from .inertia import IMPOSSIBLE, Inertia
 from .limits_and_drives import MAX_LENGTH, Drives, Limits, length_notes, limit_notes
 from .rotations import SNAP_TOLERANCE, snapped, snapped_rotations
 
@@ -410,7 +410,7 @@ class Robot(Summarised, eqx.Module):
         """Notes, of which those on bodies that nobody can have built are doubts."""
         remarks = []
         for note in self.notes:
-            is_doubt = IMPOSSIBLE in note or PLACEHOLDER in note
+            is_doubt = IMPOSSIBLE in note
             status = Status.DOUBTFUL if is_doubt else Status.NEUTRAL
             remarks.append(Remark(note, status))
         return remarks

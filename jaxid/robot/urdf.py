@@ -10,7 +10,7 @@ from jaxid.arrays import AnyArray, Joints, Numbers
 from jaxid.errors import InputError
 
 from .follower_joints import Followers, all_coordinates, speed_ratios
-from .inertia import IMPOSSIBLE, MAX_DENSITY, PLACEHOLDER, Inertia, ball_densities
+from .inertia import IMPOSSIBLE, MAX_DENSITY, ball_densities
 from .limits_and_drives import (
     MAX_STATED_ANGLE,
     MAX_STATED_LENGTH,
@@ -27,12 +27,8 @@ MIN_RANGE = 1e-6
 """Length of a range below which it is empty, up to rounding [rad or m]."""
 MAX_MAGNITUDE = 1e7
 """Largest speed or force that a file can state; larger ones are no limits."""
-PLACEHOLDER_MASS = 0.01
-"""Mass that files state for links which nobody has weighed [kg]."""
 REDUCTION_TAGS = ("mechanicalReduction", "mechanical_reduction")
 """Elements of a transmission that state its ratio, in ROS 1 and ROS 2."""
-PLACEHOLDER_RADIUS = 0.3
-"""Radius of gyration of a ball that is larger than a link of an arm [m]."""
 
 
 def load_urdf(
@@ -426,56 +422,14 @@ def _inertial_notes(tree: UrdfTree):
             if IMPOSSIBLE not in fault:
                 use = f"it {IMPOSSIBLE}, so that inertias of the file are not used"
             notes.append(f"link `{link}`: {fault}; {use}: correct its inertial.")
-    fault = "" if any(faults.values()) else placeholder_fault(tree)
-    if fault:
-        cure = "inertias of the file are no prior: correct or remove them"
-        notes.append(f"{fault}; {cure}.")
-    else:
-        notes += _placeholder_notes(tree)
-    return notes
-
-
-def _placeholder_notes(tree: UrdfTree):
-    """Return a note on bodies with the moments of balls that are no links of an arm.
-
-    Those of one body may be right by chance if they are large, but not of many.
-    """
-    inertias = Inertia.from_parameters(tree.bodies())
-    masses = np.asarray(inertias.mass)
-    moments = np.einsum("bii->b", inertias.tensor) / 3.0
-    deviations = np.abs(inertias.tensor - moments[:, None, None] * np.eye(3))
-    is_ball = (masses > 0.0) & (deviations.max(axis=(1, 2)) <= 1e-9 * moments)
-    is_at_origin = ~np.any(inertias.centre, axis=1)
-    is_tiny = is_ball & is_at_origin & (masses <= PLACEHOLDER_MASS)
-    is_huge = is_ball & (moments > PLACEHOLDER_RADIUS**2 * masses)
-    if is_huge.sum() < max(3, len(masses) / 2):
-        is_huge[:] = False
-    names = [tree.joints[i].get("name") for i in np.flatnonzero(is_tiny | is_huge)]
-    # Branches at the base may be light, such as propellers.
-    if not names or all(placement.body < 0 for placement in tree.placements):
-        return []
-    return [
-        f"{owners('joint', names)}: the moments of the body are those of a ball of a "
-        f"few grams or of one larger than a link, {PLACEHOLDER}; an estimate is pulled "
-        "towards it: correct it, or write `pull = 0` in `[estimator]`."
-    ]
-
-
-def placeholder_fault(tree: UrdfTree) -> str:
-    """Return why nobody can have measured the bodies; empty if somebody can."""
-    bodies = tree.bodies()
-    densities = ball_densities(bodies)
+    densities = ball_densities(tree.bodies())
     dense_bodies = np.flatnonzero(densities > MAX_DENSITY)
-    if dense_bodies.size:
+    if dense_bodies.size and not any(faults.values()):
         names = owners("joint", [tree.joints[i].get("name") for i in dense_bodies])
-        return (
+        notes.append(
             f"{names}: mass and moments of the body {IMPOSSIBLE}: "
             f"{densities[dense_bodies[0]]:.2g} kg/m³ are more than any material has "
-            "(is a mass in grams, or are moments placeholders?)"
+            "(is a mass in grams, or are moments placeholders?); correct or remove "
+            "them."
         )
-    # Light branches may be alike, such as propellers.
-    is_chain = len({place.body for place in tree.placements}) == len(bodies) > 2
-    mass = bodies[0, 0]
-    if is_chain and 0.0 < mass <= PLACEHOLDER_MASS and not np.ptp(bodies[:, 0]):
-        return f"all bodies have the same mass, {PLACEHOLDER}"
-    return ""
+    return notes

@@ -12,7 +12,7 @@ from jaxid.identification.consistency import consistency_margin
 from jaxid.io import FilePath
 from jaxid.robot.inertia import INERTIAL_NAMES
 from jaxid.robot.robot import Robot
-from jaxid.robot.urdf import joint_parameters, load_urdf, placeholder_fault
+from jaxid.robot.urdf import joint_parameters, load_urdf
 from jaxid.robot.urdf_tree import UrdfTree
 
 
@@ -70,17 +70,12 @@ class RobotFile:
         return np.asarray(tree.bodies(check=True, nearest=True))
 
     def possible_bodies(self) -> Float[np.ndarray, "bodies 10"] | None:
-        """Return the inertial parameters if all bodies can exist, otherwise None.
-
-        Placeholders are none: an estimate would be pulled towards them.
-        """
+        """Return the inertial parameters if all bodies can exist, otherwise None."""
         try:
             bodies = self.bodies()
         except InputError:
             return None
-        are_placeholders = bool(placeholder_fault(UrdfTree(self.path, **self.chain)))
-        can_exist = bool((consistency_margin(bodies) > 0.0).all())
-        return bodies if can_exist and not are_placeholders else None
+        return bodies if (consistency_margin(bodies) > 0.0).all() else None
 
     def claims(self) -> dict[str, float]:
         """Return all parameters that the file claims, by their names in a model.

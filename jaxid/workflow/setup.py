@@ -33,7 +33,6 @@ from jaxid.identification.estimators import (
     LeastSquares,
     WeightedLeastSquares,
 )
-from jaxid.identification.estimators.regularisation_and_weights import default_weights
 from jaxid.identification.fit_result import Fit
 from jaxid.identification.friction_laws import (
     identify_nonlinear_friction,
@@ -111,7 +110,8 @@ class LogReading:
             like `"{}_torque.csv"`: "{}" stands for the log's name without its suffix.
         velocities_file: File of the velocities, likewise, like `"{}_speed.csv"`.
         commands: Columns of the commanded angles, like `"cmd{}"`: with them `jaxid
-            rollout` needs no `forces`.
+            inspect` tells a delay in spite of disturbances, and `jaxid rollout` needs
+            no `forces`.
         lerobot_calibration: Calibration file of LeRobot for `angle_unit = "%"`, like
             `"my_arm.json"`: angles count from the middle of each calibrated range.
         force_delay: Time by which forces stand later in the log than angles [s].
@@ -157,7 +157,7 @@ class Setup(eqx.Module):
         decimation: Decimation of forces and columns.
         min_speed: Speed of each joint below which its rows do not count [rad/s or m/s].
         estimator: Estimator; by default weighted least squares over bodies that can
-            exist, with a weak pull towards those of the robot's file.
+            exist, pulled towards those of the robot's file as far as the logs bear.
         least_squares: Least squares for checks, and for runs that are compared or
             combined; by default weighted like the default estimator.
         uncertainty: Method of the standard deviations.
@@ -198,13 +198,10 @@ class Setup(eqx.Module):
         if self.filter is None:
             self.filter = ZeroPhaseButterworth(DEFAULT_CUTOFF)
             notes = (*notes, NO_FILTER)
-        weights, weight_notes = default_weights(self.robot)
         if self.least_squares is None:
-            self.least_squares = WeightedLeastSquares(weights)
+            self.least_squares = WeightedLeastSquares()
         if self.estimator is None:
-            pull = pull_to_bodies(self.robot_file)
-            self.estimator = PhysicallyConsistent(weights, pull=pull)
-            notes = (*notes, *weight_notes)
+            self.estimator = PhysicallyConsistent(pull=pull_to_bodies(self.robot_file))
         self.notes = notes
         if self.load_friction and not self.has_bounded_bodies:
             raise InputError(
@@ -289,6 +286,10 @@ class Setup(eqx.Module):
         transition = fit.base.model.memory or dry_transition(terms)
         joints = self.robot.joints
         coefficients = np.full(joints, np.inf)
+        # The first fit has chosen the pull, and says why.
+        consistency: Any = fit.consistency
+        estimator = dataclasses.replace(self.estimator, pull=consistency.pull)
+        notes = [x for x in fit.notes if x not in consistency.notes]
         for _ in range(MAX_LOAD_FRICTION_FITS):
             # The columns of the bodies come first, whatever follows.
             size = self.robot.bodies * len(INERTIAL_NAMES)
@@ -297,7 +298,9 @@ class Setup(eqx.Module):
             load_friction = LoadFriction(bodies=bodies, transition=transition)
             base = base_parameters(Model(self.robot, (*terms, load_friction)))
             rows = RegressionProblem(base, logs)
-            fit = fit_problem(rows, self.estimator, uncertainty=self.uncertainty)
+            fit = fit_problem(rows, estimator, uncertainty=self.uncertainty)
+            every_note = tuple(dict.fromkeys((*notes, *fit.notes)))
+            fit = dataclasses.replace(fit, notes=every_note)
 
             earlier_coefficients = coefficients
             coefficients = np.asarray(fit.full_parameters)[-joints:]
@@ -312,14 +315,14 @@ class Setup(eqx.Module):
 
 
 def pull_to_bodies(
-    robot_file: RobotFile | None, strength: float = 1.0
+    robot_file: RobotFile | None, strength: float | None = None
 ) -> EntropicPull | None:
     """Return the pull of a consistent estimator towards the bodies of the robot's file.
 
     Args:
         robot_file: File of the robot; balls are the prior without it, or where its
             bodies cannot exist.
-        strength: Strength of the pull; 0 for none.
+        strength: Strength of the pull; chosen by the logs if None, 0 for none.
     """
     if strength == 0.0:
         return None

@@ -61,7 +61,7 @@ def test_residual_variances_find_the_noise_of_each_joint(base, p):
     np.testing.assert_allclose(1 / fit.weights, noise, rtol=0.05)
 
 
-def test_a_robot_without_force_limits_is_weighted_by_residuals_and_says_so():
+def test_a_robot_without_force_limits_is_weighted_by_residuals():
     base = jid.base_parameters(jid.Model(jid.robots.planar_arm(2)))
     o = observations(base.model, standard_parameters(base.model), noise=0.1)
     fit = jid.identify(base, o)
@@ -69,11 +69,9 @@ def test_a_robot_without_force_limits_is_weighted_by_residuals_and_says_so():
     np.testing.assert_array_equal(
         fit.parameters, jid.identify(base, o, variances).parameters
     )
-    (note,) = fit.notes
-    assert "weighted by the residuals" in note
-    # An estimator of the user's is not changed: the error names the cure.
-    with pytest.raises(jid.InputError, match=r"weights=.*ResidualVariances\(\)"):
-        jid.identify(base, o, jid.WeightedLeastSquares())
+    assert fit.notes == ()
+    consistent = jid.identify(base, o, jid.PhysicallyConsistent())
+    np.testing.assert_array_equal(consistent.weights, fit.weights)
 
 
 @pytest.mark.parametrize("weights", [[1.0, 1.0], [0.2, 3.0]])

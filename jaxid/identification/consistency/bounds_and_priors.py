@@ -21,6 +21,8 @@ MASS_PER_SQUARED_REACH = 100.0
 """Largest mass of a body, relative to the square of the robot's reach [kg/m²]."""
 OVERHANG = 0.25
 """How far bodies extend beyond their joints, relative to the robot's reach."""
+WEAK_PULL = 1.0
+"""Strength of a weak pull, which already gives the mass matrix a margin."""
 
 
 class BodyBounds(eqx.Module):
@@ -190,15 +192,16 @@ class EntropicPull(eqx.Module):
     Attributes:
         bodies: Parameters $(m, m r_c, A, B, C, D, E, F)$ of the prior's bodies; None
             for balls of medium size.
-        strength: Factor $\gamma$: 1 is weak, and already gives the mass matrix a
-            margin.
+        strength: Factor $\gamma$; 1 is weak. The prior is then used as it is. None:
+            `identify` bounds the pull, and chooses its strength by blocks of the logs;
+            all else takes 1.
     """
 
     bodies: Float[AnyArray, "bodies 10"] | None = None
-    strength: float = 1.0
+    strength: float | None = None
 
     def __check_init__(self):
-        if not 0.0 < self.strength < np.inf:
+        if self.strength is not None and not 0.0 < self.strength < np.inf:
             raise InputError(f"`strength` must be positive, but is {self.strength}.")
         if self.bodies is None:
             return

@@ -5,7 +5,7 @@ import dataclasses
 import equinox as eqx
 import numpy as np
 
-from jaxid.arrays import AnyArray, Bool, Float, Indices, Texts
+from jaxid.arrays import AnyArray, BaseVector, Bool, Float, Indices, Joints, Texts
 from jaxid.dynamics.base import BaseParameters, Identifiability
 from jaxid.errors import InputError
 
@@ -16,10 +16,13 @@ from ..estimators import (
     Estimate,
     MaximumForces,
 )
+from ..factors import Factors
+from ..problem import RegressionProblem
 from . import solver
-from .bounds_and_priors import BodyBounds, EntropicPull
+from .bounds_and_priors import WEAK_PULL, BodyBounds, EntropicPull
 from .cone_program import ConeProgram, cone_program
 from .feasible_set import FeasibleSet, feasible_set, nominal_bodies
+from .prior_check import ChosenPull, choose_pull
 from .pseudo_inertia import consistency_margin, pseudo_inertia
 from .scaled_rows import ScaledRows, scaled_rows
 
@@ -48,6 +51,9 @@ class Consistency(eqx.Module):
         masses_from_bounds: Bodies (0 is the first) whose masses reflect bounds or
             priors.
         active: Names of the active bounds.
+        pull: Pull towards the bodies of a prior, with its strength; None for none.
+        shift: Base parameters less those without bounds and prior, which intervals
+            include.
     """
 
     bodies: Float[AnyArray, "bodies 10"]
@@ -60,6 +66,8 @@ class Consistency(eqx.Module):
     determined: Bool[np.ndarray, " standard"]
     masses_from_bounds: Indices = eqx.field(static=True)
     active: Texts = eqx.field(static=True)
+    pull: EntropicPull | None
+    shift: BaseVector
 
     @property
     def findings(self) -> Texts:
@@ -85,8 +93,8 @@ class Consistency(eqx.Module):
         sentences = [
             f"physically consistent: {self.bounds}.",
             *self.findings,
-            "standard deviations are those of the estimate without bounds: where "
-            "bounds are active, estimates scatter less.",
+            "standard deviations are those of the estimate without bounds; intervals "
+            "include the distance from it.",
         ]
         if not self.certified:
             sentences.append(
@@ -128,17 +136,17 @@ class PhysicallyConsistent(AbstractEstimator):
         weights = self.weights(rows.robot, rows.factors)
         # Its standard deviations serve the consistent estimate, too.
         unbounded_estimate = Estimate.solve(rows, weights, Complete())
-        R, z = rows.factors.weighted(weights)
         feasible_set = self.feasible_set(base)
-        count = int(rows.factors.rows.sum())
-        data, program = self.program(base, feasible_set, R, z, count)
-        optimum = _solve(program)
+        pull, pull_notes = self._choose_pull(rows, weights, feasible_set)
+        estimator = dataclasses.replace(self, pull=pull)
+        data, program, optimum = estimator._optimise(rows.factors, weights, base)
         p = feasible_set.standard_parameters(data, optimum.y)
         parameters = np.asarray(base.from_standard(p))
         bodies = p[np.array(feasible_set.bodies)]
         # Bodies with principal axes have seven parameters, no products of inertia.
         bodies = np.pad(bodies, ((0, 0), (0, 10 - bodies.shape[1])))
 
+        R, z = rows.factors.weighted(weights)
         residual = float(np.linalg.norm(R @ parameters - z))
         min_residual = float(np.linalg.norm(R @ unbounded_estimate.parameters - z))
         increase = residual / min_residual - 1.0 if min_residual > 0 else np.inf
@@ -160,6 +168,8 @@ class PhysicallyConsistent(AbstractEstimator):
             determined=is_determined,
             masses_from_bounds=tuple(np.flatnonzero(~is_determined[masses]).tolist()),
             active=_active_bounds(base, feasible_set, program, optimum, bodies),
+            pull=pull,
+            shift=parameters - unbounded_estimate.parameters,
         )
         return dataclasses.replace(
             unbounded_estimate,
@@ -167,8 +177,34 @@ class PhysicallyConsistent(AbstractEstimator):
             standard=p,
             consistency=consistency,
             unbounded=unbounded_estimate.parameters,
-            notes=(*unbounded_estimate.notes, *consistency.notes),
+            notes=(*unbounded_estimate.notes, *consistency.notes, *pull_notes),
         )
+
+    def _choose_pull(
+        self, rows: RegressionProblem, weights: Joints, feasible: FeasibleSet
+    ) -> ChosenPull:
+        """Return the pull of the estimate, with a strength."""
+        pull = self.pull
+        if pull is None or pull.bodies is None or pull.strength is not None:
+            return ChosenPull(pull, ())
+
+        def solve(factors: Factors, pull: EntropicPull) -> np.ndarray:
+            estimator = dataclasses.replace(self, pull=pull)
+            data, _, optimum = estimator._optimise(factors, weights, rows.base)
+            return feasible.standard_parameters(data, optimum.y)
+
+        columns = np.array(feasible.bodies)
+        _require_count(pull.bodies, feasible)
+        return choose_pull(rows, weights, columns, pull.bodies, solve)
+
+    def _optimise(
+        self, factors: Factors, weights: Joints, base: BaseParameters
+    ) -> tuple[ScaledRows, ConeProgram, solver.Optimum]:
+        """Return the scaled rows of some factors, the program and its optimum."""
+        R, z = factors.weighted(weights)
+        count = int(factors.rows.sum())
+        data, program = self.program(base, self.feasible_set(base), R, z, count)
+        return data, program, _solve(program)
 
     def feasible_set(self, base: BaseParameters) -> FeasibleSet:
         """Return the feasible set of a model; bounds of other bodies are rejected."""
@@ -183,14 +219,19 @@ class PhysicallyConsistent(AbstractEstimator):
         data = scaled_rows(base, R, z, rows)
         if self.pull is None:
             return data, cone_program(feasible, data)
-        count = len(feasible.bodies)
-        if self.pull.bodies is None:
-            prior = nominal_bodies(feasible.bounds)
-        elif len(self.pull.bodies) == count:
+        prior = nominal_bodies(feasible.bounds)
+        if self.pull.bodies is not None:
+            _require_count(self.pull.bodies, feasible)
             prior = pseudo_inertia(self.pull.bodies)
-        else:
-            raise InputError(f"`bodies` of a prior must be the model's {count}.")
-        return data, cone_program(feasible, data, self.pull.strength, prior)
+        strength = WEAK_PULL if self.pull.strength is None else self.pull.strength
+        return data, cone_program(feasible, data, strength, prior)
+
+
+def _require_count(bodies: AnyArray, feasible: FeasibleSet) -> None:
+    """Check that a prior has as many bodies as the model."""
+    count = len(feasible.bodies)
+    if len(bodies) != count:
+        raise InputError(f"`bodies` of a prior must be the model's {count}.")
 
 
 def _solve(program: ConeProgram) -> solver.Optimum:

@@ -1,7 +1,6 @@
 """The weighted system: weights of joints, decomposition, solutions (Eqs. 29-33)."""
 
 from abc import abstractmethod
-from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -16,7 +15,6 @@ from jaxid.arrays import (
     Float,
     Indices,
     Joints,
-    Texts,
     Vector,
     one_or_each,
 )
@@ -243,21 +241,6 @@ class GivenWeights(AbstractWeights):
         return weights
 
 
-class MaximumForces(AbstractWeights):
-    r"""Reciprocals of the largest forces, $1 / (i_{Gj} M_{j,max})$ (Eq. 30)."""
-
-    def __call__(self, robot, factors):
-        """Return the reciprocals; reject a robot whose largest forces are not known."""
-        try:
-            return 1.0 / np.asarray(robot.max_forces)
-        except InputError as error:
-            rule = str(error).removesuffix(".")
-            raise InputError(
-                f"{rule}, or weight joints by their residuals: "
-                "`weights=jid.estimators.ResidualVariances()`."
-            ) from error
-
-
 class ResidualVariances(AbstractWeights):
     """Reciprocals of the residuals' standard deviations, found iteratively.
 
@@ -283,22 +266,18 @@ class ResidualVariances(AbstractWeights):
         return 1.0 / np.maximum(deviations, floor)
 
 
-class DefaultWeights(NamedTuple):
-    """Weights of a robot's joints if the user has chosen none."""
+class MaximumForces(AbstractWeights):
+    r"""Reciprocals of the largest forces, $1 / (i_{Gj} M_{j,max})$ (Eq. 30).
 
-    weights: AbstractWeights
-    notes: Texts  # sentences for the user
+    If those of a joint are not known, joints are weighted by `ResidualVariances`.
+    """
 
-
-def default_weights(robot: Robot) -> DefaultWeights:
-    """Return weights by the largest forces, or residuals if unknown (Eq. 30)."""
-    if np.isfinite(robot.known_max_forces).all():
-        return DefaultWeights(MaximumForces(), ())
-    note = (
-        "the largest forces of the joints are not known: "
-        "joints are weighted by the residuals' variances."
-    )
-    return DefaultWeights(ResidualVariances(), (note,))
+    def __call__(self, robot, factors):
+        """Return the reciprocals, or weights by the residuals."""
+        max_forces = np.asarray(robot.known_max_forces)
+        if np.isfinite(max_forces).all():
+            return 1.0 / max_forces
+        return ResidualVariances()(robot, factors)
 
 
 class UndeterminedDirection(eqx.Module):
