@@ -1,127 +1,149 @@
-"""Delay of forces in closed loop: coverage of its interval, and false advice.
+"""Delay of forces: its interval, the sentence, and coverage of viscous friction.
 
-    python benchmarks/delay.py [--quick] [--json FILE] [--draws 50] [--robot scara ...]
+    python benchmarks/delay.py [--quick] [--json FILE] [--machine wall ...]
+        [--kind plain ...] [--seed 1 ...] [--search]
 
-Logs: `closed_loop.py`, 10 s at 1 kHz; the forces are shifted by 0, 3 and 10 ms. With
-and without friction; disturbances that move the robot: none, or 3 % of the RMS force
-below 5 Hz. The model has the right law of friction; a zero-phase Butterworth filter at
-10 Hz, every 25th row. The delay is estimated once by the measured motion alone, once
-with the commanded one.
+Logs: MuJoCo in closed loop (`judgement/recordings.py`), whose forces then stand 0, 2, 5
+and 10 ms later. A user writes the experiment with `jaxid init`; the first 60 % of the
+log are fitted with the defaults, the delay is that of the whole log, as in `jaxid
+identify`. Limits were set on the machines in `SETTING_KINDS`.
 
-Covered is a draw whose 95 % interval holds the truth; random, one whose interval
-without the resolution of a tenth of a sample does. A delay is told if the interval of
-99.99 % leaves zero out, as `jaxid inspect` does. False is what is told with an interval
-that leaves the truth out.
+Covered: 95 % intervals of viscous friction that hold MuJoCo's damping, without and with
+the delay in them; logs whose friction has another law than the model are left out
+there. Widening: the median, over the parameters of a log, of the ratio of both
+intervals. Held: 95 % intervals of the delay. Named: `Delay.is_certain`; with
+`--search`, sentences of the search for mistakes with `force_delay` instead.
 """
 
+import argparse
+import re
+import sys
 import tempfile
+from collections import defaultdict
 from pathlib import Path
 
-import closed_loop
+sys.path.insert(0, str(Path(__file__).resolve().parent / "judgement"))
+
 import numpy as np
 import timing
-from timing import Row, hand_over
+from timing import Row
 
-ROBOTS = ("scara", "six", "pendulum", "xarm7")
-DELAYS = (0.0, 0.003, 0.01)
-
-
-def shifted(forces, seconds, dt):
-    """Return forces that stand later."""
-    k = round(seconds / dt)
-    return (
-        forces if k == 0 else np.vstack([np.repeat(forces[:1], k, axis=0), forces[:-k]])
-    )
+DELAYS = 0.0, 0.002, 0.005, 0.01
+OTHER_LAWS = "Stribeck", "load friction"
+"""Kinds of logs whose viscous friction is not that of the model."""
 
 
-def study(robot, file, friction, disturbance, draws):
-    """Return covered, random, told, false: by delay, without and with commands."""
+def setup_of(machine, folder):
+    """Return the setup that a user of a machine's file gets by default."""
     import jaxid as jid
 
-    arm = jid.load_urdf(file)
-    terms = [jid.RigidBodies(), jid.ConstantOffset()]
-    if friction:
-        terms += [jid.ViscousFriction(), jid.CoulombFriction(jid.terms.Tanh(0.01))]
-    base = jid.base_parameters(jid.Model(arm, tuple(terms)))
-    levels = {} if friction else {"viscous": 0.0, "coulomb": 0.0}
-    found = np.zeros((len(DELAYS), 2, 4))
-    for seed in range(draws):
-        log = closed_loop.simulate(file, seed=seed, disturbance=disturbance, **levels)
-        weights = jid.estimators.GivenWeights(
-            1 / np.sqrt(np.mean(log.forces**2, axis=0))
-        )
-        for k, late in enumerate(DELAYS):
-            forces = shifted(log.forces, late, 1e-3)
-            both = [
-                jid.observe(
-                    jid.Recording.of(angles, forces, time=log.time),
-                    arm,
-                    jid.ZeroPhaseButterworth(10.0),
-                    jid.Subsample(25),
-                )
-                for angles in (log.angles, log.commands)
-            ]
-            for way, commanded in enumerate((None, both[1])):
-                delay = jid.estimate_delay(base, both[0], weights, commanded=commanded)
-                low, high = delay.interval()
-                held, own = low <= late <= high, delay.resolution
-                random = low + own <= late <= high - own
-                low, high = delay.interval(0.9999)
-                told = not low <= 0 <= high
-                found[k, way] += held, random, told, told and not low <= late <= high
-    return found
+    (folder / "machine.xml").write_text(machine.file)
+    text = jid.experiment.write_template(folder / "machine.xml", folder=folder)
+    (folder / "e.toml").write_text(text)
+    return jid.experiment.load_experiment(folder / "e.toml").setup
+
+
+def late(log, seconds):
+    """Return a recording whose forces stand later."""
+    import jaxid as jid
+
+    forces = log.forces
+    if seconds:
+        columns = [np.interp(log.time - seconds, log.time, x) for x in forces.T]
+        forces = np.stack(columns, axis=1)
+    return jid.Recording.of(log.angles, forces, time=log.time)
+
+
+def outcome(setup, recording, seconds, damping, has_search):
+    """Return what is found in a log."""
+    import jaxid as jid
+
+    delay = jid.estimate_delay(setup.model, recording)
+    training_log, _ = setup.observe(recording).split(0.6)
+    fit = jid.identify(setup.base, training_log, setup.estimator)
+    wider_fit = jid.with_unknown_delay(fit, training_log, delay)
+    is_named = delay.is_certain
+    if has_search:
+        diagnosis = jid.diagnose(recording, setup.robot, fit)
+        is_named = any("`force_delay" in text for text in diagnosis.findings)
+    fits = fit, wider_fit
+    is_viscous = [bool(re.match(r"fv\d", name)) for name in fit.base.names]
+    errors = np.abs(fit.parameters[is_viscous] - damping)
+    half_widths = [x.uncertainty.half_widths() for x in fits]
+    low, high = delay.interval()
+    return {
+        "held": [low <= seconds <= high],
+        "named": [is_named],
+        "before": (errors <= half_widths[0][is_viscous]).tolist(),
+        "after": (errors <= half_widths[1][is_viscous]).tolist(),
+        "widening": [float(np.nanmedian(half_widths[1] / half_widths[0]))],
+    }
 
 
 def main():
-    """Print the table."""
-    parser = timing.parser(__doc__, "two draws of one robot")
-    parser.add_argument("--draws", type=int, default=50)
-    parser.add_argument("--robot", nargs="*")
-    given = parser.parse_args()
+    """Print the tables."""
+    import machines
+    import recordings
+
+    parser: argparse.ArgumentParser = timing.parser(__doc__, "one log of one machine")
+    parser.add_argument("--machine", nargs="*", default=list(machines.MACHINES))
+    parser.add_argument("--kind", nargs="*", default=list(recordings.KINDS))
+    parser.add_argument("--seed", nargs="*", type=int, default=[1])
+    parser.add_argument("--search", action="store_true", help="search for mistakes")
+    options = parser.parse_args()
     timing.pin_to(1)
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    draws, robots = given.draws, given.robot or ROBOTS
-    if given.quick:
-        draws, robots = 2, ["pendulum"]
-    files, rows = closed_loop.robots(Path(tempfile.mkdtemp())), []
-    ways = "covered | random | told | false"
-    print(
-        f"| robot | friction | disturbance | delay | {ways} | with commands: {ways} |"
-    )
-    print("|" + 12 * "---|")
-    totals = np.zeros((2, 4))
-    for robot in robots:
-        for friction in (True, False):
-            for disturbance in (0.0, 0.03):
-                found = study(robot, files[robot], friction, disturbance, draws)
-                totals += found.sum(axis=0)
-                for late, ways in zip(DELAYS, found, strict=True):
-                    shares = " | ".join(f"{100 * x / draws:.0f}" for x in ways.ravel())
-                    case = (
-                        f"{robot} | {friction} | {disturbance:.0%} | {1e3 * late:g} ms"
+    if options.quick:
+        options.machine = ["hobby"]
+        options.kind = ["plain"]
+    folder = Path(tempfile.mkdtemp())
+    totals = defaultdict(lambda: defaultdict(list))
+    for name in options.machine:
+        machine = machines.machine(name)
+        setup = setup_of(machine, folder)
+        is_setting = name in machines.SETTING_KINDS
+        for kind in options.kind:
+            for seed in options.seed:
+                setting = recordings.KINDS[kind]
+                log = recordings.record(machines.machine(name), setting, seed)
+                damping = setting.friction * machine.viscous
+                for seconds in DELAYS:
+                    result = outcome(
+                        setup, late(log, seconds), seconds, damping, options.search
                     )
-                    print(f"| {case} | {shares} |", flush=True)
-    count = draws * len(robots) * 4 * len(DELAYS)
-    for way, (held, random, _, false) in zip(
-        ("measured", "commanded"), totals, strict=True
-    ):
-        covered, random = (f"{100 * x / count:.1f} %" for x in (held, random))
-        said = (
-            f"{covered} covered, {random} without resolution, {false:.0f} of "
-            f"{count} false"
-        )
-        rows.append(
-            Row(
-                f"delay/{way}",
-                f"delay, {way}",
-                f"{count} logs",
-                "93-97 %, 0 false",
-                said,
+                    for key, values in result.items():
+                        is_coverage = key in ("before", "after")
+                        if not (is_coverage and kind in OTHER_LAWS):
+                            totals[is_setting, seconds][key] += values
+                            totals[kind, seconds][key] += values
+    rows = []
+    print("| logs | delay | held | named | fv before | fv after | widening |")
+    print("|---|---|---|---|---|---|---|")
+    words = {True: "setting machines", False: "other machines"}
+    for (group, seconds), result in totals.items():
+        shares = [
+            f"{100 * np.mean(result[key]):.1f} %" if result[key] else "-"
+            for key in ("held", "named", "before", "after")
+        ]
+        widening = f"{np.median(result['widening']):.3f}"
+        case = f"{words.get(group, group)} ({len(result['held'])})"
+        line = " | ".join((case, f"{1e3 * seconds:g} ms", *shares, widening))
+        print(f"| {line} |", flush=True)
+        if group is False:
+            named = 100 * np.mean(result["named"])
+            rows.append(
+                Row(
+                    f"delay/{1e3 * seconds:g}",
+                    f"forces late by {1e3 * seconds:g} ms: named",
+                    f"{len(result['named'])} logs",
+                    {0.0: "at most 1 %", 0.01: "at least 90 %"}.get(seconds, ""),
+                    f"{named:.1f} %, viscous friction covered {shares[3]}",
+                    {0.0: named <= 1, 0.01: named >= 90}.get(seconds),
+                )
             )
-        )
-    hand_over(rows, given.json)
+    timing.hand_over(rows, options.json)
 
 
 if __name__ == "__main__":

@@ -344,7 +344,7 @@ def delay(draws: int) -> list[str]:
     for seed in range(draws):
         recording = rig.record(clean, seed)
         late = rig.rows(recording)
-        one = jid.estimate_delay(base, late)
+        one = jid.estimate_delay(base.model, recording)
         low, high = one.interval(LEVEL)
         mended = rig.rows(jid.remove_delay(recording, one.seconds))
         fits = [jid.identify(base, o) for o in (late, mended)]

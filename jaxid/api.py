@@ -44,7 +44,7 @@ from .identification import (
 )
 from .identification.combination import combine_fits as combine_fits
 from .identification.consistency import PhysicallyConsistent as PhysicallyConsistent
-from .identification.delay import estimate_delay as estimate_delay
+from .identification.delay import with_unknown_delay as with_unknown_delay
 from .identification.drive_gains import identify_drive_gains as identify_drive_gains
 from .identification.encoder_resolution import resolution_bias as resolution_bias
 from .identification.estimators import WeightedLeastSquares as WeightedLeastSquares
@@ -87,6 +87,7 @@ from .robot.robot import Robot as Robot, Tool as Tool
 from .robot.urdf import load_mjcf as load_mjcf, load_urdf as load_urdf
 from .rollout.identify import identify_rollout as identify_rollout
 from .simulation.virtual import VirtualRobot as VirtualRobot
+from .validation.common_delay import estimate_delay as estimate_delay
 from .validation.diagnosis import diagnose as diagnose
 from .validation.torque_errors import validate as validate
 from .workflow.log_identification import identify_logs as identify_logs

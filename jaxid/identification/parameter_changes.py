@@ -23,6 +23,7 @@ from jaxid.result_table import (
 from .combination import require_same_base, without_bounds
 from .fit_result import Fit
 from .uncertainty import Uncertainty
+from .uncertainty.result import dof_of_sum
 
 LEVEL = 0.95
 """Confidence of intervals and tests."""
@@ -252,7 +253,7 @@ def compare_some(
         np.fill_diagonal(
             covariance, np.where(has_variance, np.diag(covariance), np.inf)
         )
-        dof = _dof_of_sum(
+        dof = dof_of_sum(
             np.diag(first_covariance),
             np.diag(second_covariance),
             first.uncertainty.dof[k],
@@ -265,12 +266,6 @@ def compare_some(
         difference=second.parameters[k] - first.parameters[k],
         uncertainty=Uncertainty(covariance, dof, covariance),
     )
-
-
-def _dof_of_sum(a, b, dof_a, dof_b) -> Vector:
-    """Return the degrees of freedom of sums of two variances (Welch, Satterthwaite)."""
-    dof = (a + b) ** 2 / (a**2 / dof_a + b**2 / dof_b)
-    return np.where(np.isnan(dof), np.inf, dof)
 
 
 def _with_sign(numbers: Sequence[str]):

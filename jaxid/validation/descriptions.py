@@ -206,6 +206,15 @@ class DescribedLog:
         friction = self.samples_of_friction(self.log.motion, self.log.forces)
         return np.concatenate([bodies, friction], axis=2)
 
+    def predictions(self, parameters: np.ndarray) -> np.ndarray:
+        """Return the forces of the columns on the grid [samples, joints]."""
+        samples = self._sample_columns
+        body_count = self._body_rows.shape[2]
+        joints = samples.shape[1]
+        friction_parameters = parameters[body_count:].reshape(joints, -1)
+        friction = np.sum(samples[:, :, body_count:] * friction_parameters, axis=2)
+        return samples[:, :, :body_count] @ parameters[:body_count] + friction
+
     def with_low_pass(self, joints: tuple[int, ...], cutoff: float) -> Rows:
         """Return the rows if a filter made the forces of some joints late."""
         order = 2 if len(joints) == 1 else 1

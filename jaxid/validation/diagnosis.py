@@ -9,8 +9,7 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Numbers
 from jaxid.errors import InputError
-from jaxid.identification.delay import estimate_delay
-from jaxid.identification.estimators import GivenWeights
+from jaxid.identification.delay import Delay
 from jaxid.identification.fit_result import Fit
 from jaxid.measurement.filters import ZeroPhaseButterworth
 from jaxid.measurement.observations import Observations, Progress, observe
@@ -69,15 +68,9 @@ class Diagnosis(Summarised):
     excerpt: Recording
     notes: tuple[str, ...] = ()
 
-    def with_fit(
-        self,
-        fit: Fit,
-        commanded: Observations | None = None,
-        bodies: np.ndarray | None = None,
-    ) -> "Diagnosis":
-        """Return the diagnosis with findings of a fit to this log alone, and delays.
+    def with_fit(self, fit: Fit, bodies: np.ndarray | None = None) -> "Diagnosis":
+        """Return the diagnosis with findings of a fit to this log alone.
 
-        The log with `commanded` angles in place of the measured ones is filtered alike.
         The inertial parameters of the robot's file are in `bodies`.
         """
         mistakes = _mistakes([self], fit, bodies)
@@ -85,7 +78,6 @@ class Diagnosis(Summarised):
         notes = (*self.notes, *mistakes.possible)
         if not fit_findings and not self.faulty and self.observations is not None:
             fit_findings = negative_friction(fit, [self.observations])
-            notes = (*notes, *delay_notes(self.observations, fit, commanded))
         findings = (*fit_findings, *self.findings)
         return dataclasses.replace(self, findings=findings, notes=notes)
 
@@ -278,10 +270,12 @@ class LogMistakes(NamedTuple):
     Attributes:
         certain: Mistakes, and moments unlike the model.
         possible: Mistakes that explain only a part of what the model misses.
+        delay: Delay of all forces; None where no mistakes were looked for.
     """
 
     certain: tuple[str, ...] = ()
     possible: tuple[str, ...] = ()
+    delay: Delay | None = None
 
 
 def mistakes_in_logs(
@@ -305,7 +299,7 @@ def mistakes_in_logs(
     mistakes = _mistakes(diagnoses, fit, bodies)
     certain = (f"{name}{text}" for text in mistakes.certain)
     possible = (f"{name}{text}" for text in mistakes.possible)
-    return LogMistakes((*friction, *certain), tuple(possible))
+    return LogMistakes((*friction, *certain), tuple(possible), mistakes.delay)
 
 
 def _mistakes(
@@ -326,7 +320,7 @@ def _mistakes(
         return LogMistakes()
     mistakes = find_mistakes(fit.base.model, recordings, bodies)
     certain = mistakes.explained or tuple(moments) or mistakes.unexplained
-    return LogMistakes(certain, mistakes.possible)
+    return LogMistakes(certain, mistakes.possible, mistakes.delay)
 
 
 def _excerpt(log: Observations, source: SamplesOnDisk) -> Recording:
@@ -441,40 +435,3 @@ def negative_friction(fit: Fit, logs: Sequence[Observations]) -> tuple[str, ...]
                 "joint is wrong."
             )
     return tuple(findings)
-
-
-def delay_notes(
-    observations: Observations, fit: Fit, commanded: Observations | None = None
-) -> tuple[str, ...]:
-    """Return a note about a delay of the forces, which is too small to be a mistake."""
-    # A model that explains too little sees no delay.
-    if not fit.residual < 0.3:
-        return ()
-    weights = GivenWeights(np.asarray(fit.weights))
-    try:
-        delay = estimate_delay(fit.base, observations, weights, commanded=commanded)
-    except ValueError:
-        return ()
-    # What is advised must be sure.
-    min_delay, max_delay = (1e3 * x for x in delay.interval(0.9999))
-    text = (
-        f"the forces stand between {min_delay:.2g} and {max_delay:.2g} ms later in "
-        "the log than the angles"
-    )
-    # A delay of a bus is that of all joints; other effects differ from joint to joint.
-    is_scattered = abs(delay.seconds) < np.std(delay.of_joints)
-    if is_scattered or min_delay <= 0.0 <= max_delay:
-        return (f"{text}: a delay cannot be told from none.",)
-    if delay.p_value <= 0.001:
-        joint_delays = 1e3 * np.asarray(delay.of_joints)
-        delay_range = (
-            f"{joint_delays.min():.3g} to {joint_delays.max():.3g} ms joint by joint"
-        )
-        return (f"{text}, but {delay_range}: as likely, the model lacks an effect.",)
-    # The controller's reaction to errors of the forces moves the angles, too.
-    has_feedback = delay.feedback > 0.1 * abs(delay.seconds)
-    if commanded is None and has_feedback:
-        cure = "name the commanded angles (`recording.commands`) to tell how much"
-    else:
-        cure = f"`force_delay = {delay.seconds:.3g}` in `[recording]` removes that"
-    return (f"{text}: {cure}.",)

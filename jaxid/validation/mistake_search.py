@@ -7,9 +7,11 @@ import numpy as np
 from scipy import optimize
 
 from jaxid.dynamics.model import Model
+from jaxid.identification.delay import Delay
 from jaxid.measurement.recording import Recording
 from jaxid.result_table import significant
 
+from .common_delay import common_delay
 from .contacts import Contact, ContactSearch
 from .descriptions import DescribedLog
 from .filtered_log import FilteredLog
@@ -55,11 +57,28 @@ class Mistakes(NamedTuple):
         explained: Mistakes that explain most of what the model misses.
         unexplained: A contact, or that the model does not fit.
         possible: Mistakes that explain a part of what it misses.
+        delay: Delay of all forces, also one that is no mistake; None if the logs are
+            too short.
     """
 
     explained: tuple[str, ...] = ()
     unexplained: tuple[str, ...] = ()
     possible: tuple[str, ...] = ()
+    delay: Delay | None = None
+
+    def with_delay(self, delay: Delay) -> "Mistakes":
+        """Return the mistakes with the delay, which is one if nothing else is wrong.
+
+        A short delay explains little of the forces, but its interval judges it.
+        """
+        mistakes = self._replace(delay=delay)
+        if self.explained or self.unexplained or not delay.is_certain:
+            return mistakes
+        sentence = (
+            f"the forces of the log seem to be {delay} late, which changes friction "
+            f"most: `force_delay = {delay.seconds:.3g}` in `[recording]` removes that."
+        )
+        return mistakes._replace(explained=(sentence,), possible=())
 
 
 class Explanation(NamedTuple):
@@ -100,8 +119,9 @@ def find_mistakes(
     is_one_log = len(recordings) == 1
     quantities = list(suspected.quantities())
     mistakes = _search(described_log, suspects, quantities, is_one_log)
+    delay = common_delay(described_log)
     if mistakes.explained or is_one_log:
-        return mistakes
+        return mistakes.with_delay(delay)
 
     explained = []
     unexplained = []
@@ -109,10 +129,11 @@ def find_mistakes(
         log_mistakes = _mistakes_in_columns(model, recording)
         explained += [f"{recording.name}: {x}" for x in log_mistakes.explained]
         unexplained += [f"{recording.name}: {x}" for x in log_mistakes.unexplained]
-    return mistakes._replace(
+    mistakes = mistakes._replace(
         explained=tuple(explained),
         unexplained=tuple(unexplained) or mistakes.unexplained,
     )
+    return mistakes.with_delay(delay)
 
 
 def _mistakes_in_columns(model: Model, recording: Recording) -> Mistakes:

@@ -18,6 +18,7 @@ from jaxid.identification.combination import (
     require_same_base,
     without_bounds,
 )
+from jaxid.identification.delay import with_unknown_delay
 from jaxid.identification.encoder_resolution import resolution_note
 from jaxid.identification.estimators import GivenWeights
 from jaxid.identification.fit_result import Fit
@@ -137,17 +138,20 @@ def identify_logs(
         base, parts.training_logs, partial(progress, "factorising the rows")
     )
     fit = setup.fit(rows, progress)
+
+    progress("looking for mistakes", 0.0)
+    # Bounds would hide what is wrong.
+    diagnoses = [log.diagnosis for log in fitted_logs]
+    bodies = setup.file_bodies
+    mistakes = mistakes_in_logs(diagnoses, without_bounds(fit), bodies)
+    if mistakes.delay is not None:
+        fit = with_unknown_delay(fit, rows, mistakes.delay)
     if reports:
         fit = add_reports(setup, reports, fit, parts.unseen_logs)
 
     validation = validate(
         fit, parts.every, progress=partial(progress, "predicting torques")
     )
-    progress("looking for mistakes", 0.0)
-    # Bounds would hide what is wrong.
-    diagnoses = [log.diagnosis for log in fitted_logs]
-    bodies = setup.file_bodies
-    mistakes = mistakes_in_logs(diagnoses, without_bounds(fit), bodies)
     notes = [note for part in parts.every for note in part.notes]
     notes += resolution_notes(fit, fitted_logs)
     notes += mistakes.possible

@@ -12,7 +12,7 @@ from jaxid.measurement.columns import Columns
 from jaxid.result_table import Summarised, Table
 from jaxid.validation.diagnosis import Diagnosis
 
-from .log_loading import load_log, observe_commands, select_filter
+from .log_loading import load_log, select_filter
 from .setup import Paths, Progress, Setup, ignore_progress
 
 
@@ -62,8 +62,5 @@ def inspect_logs(
         fit_progress = partial(progress, f"factorising {path.name}")
         fit = identify(setup.base, observations, setup.least_squares, fit_progress)
         progress(f"looking for mistakes in {path.name}", 0.0)
-        commanded_log = observe_commands(setup, path, columns)
-        examined_logs.append(
-            ExaminedLog(diagnosis.with_fit(fit, commanded_log, bodies), fit)
-        )
+        examined_logs.append(ExaminedLog(diagnosis.with_fit(fit, bodies), fit))
     return Inspection(setup.notes, examined_logs)

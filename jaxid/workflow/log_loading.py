@@ -123,19 +123,6 @@ def read_commands(setup: Setup, log: Path, columns: Columns) -> Recording:
     return dataclasses.replace(recording, forces=command_angles, notes=notes)
 
 
-def observe_commands(setup: Setup, log: Path, columns: Columns) -> Observations | None:
-    """Return a log with the commanded angles in place of the measured ones, filtered.
-
-    None if their columns are not named, or the log is long.
-    """
-    if setup.reading.commands is None or is_long(log):
-        return None
-    command_columns = dataclasses.replace(
-        columns, angles=setup.reading.commands, velocities=None
-    )
-    return setup.observe(read_log(setup, log, command_columns))
-
-
 def is_long(log: Path) -> bool:
     """Return whether a log is better read part by part than as a whole."""
     return estimated_rows(log) >= LONG_LOG_ROWS

@@ -110,8 +110,7 @@ class LogReading:
             like `"{}_torque.csv"`: "{}" stands for the log's name without its suffix.
         velocities_file: File of the velocities, likewise, like `"{}_speed.csv"`.
         commands: Columns of the commanded angles, like `"cmd{}"`: with them `jaxid
-            inspect` tells a delay in spite of disturbances, and `jaxid rollout` needs
-            no `forces`.
+            rollout` needs no `forces`.
         lerobot_calibration: Calibration file of LeRobot for `angle_unit = "%"`, like
             `"my_arm.json"`: angles count from the middle of each calibrated range.
         force_delay: Time by which forces stand later in the log than angles [s].

@@ -7,7 +7,6 @@ import pytest
 from virtual import motion, observations, standard_parameters
 
 import jaxid as jid
-from jaxid.identification.delay import without_delay
 from jaxid.identification.payload import body_columns
 from jaxid.result_table import Status
 
@@ -206,89 +205,6 @@ def test_a_load_in_a_wrong_frame_is_doubted(base, centre):
     np.testing.assert_allclose(cured.gains, GAINS, rtol=0.02)
 
 
-def late(base, seconds, **options):
-    """Observations whose forces stand `seconds` too late in the log."""
-    options = {"samples": 2000, "filter": jid.ZeroPhaseButterworth(10.0), **options}
-    o = observations(base.model, standard_parameters(base.model), **options)
-    return without_delay(o, -seconds)
-
-
-@pytest.mark.parametrize("seconds", [0.0017, -0.0123, 0.0])
-def test_a_delay_of_part_of_a_sample_is_found(base, seconds):
-    """The sample time is 5 ms."""
-    found = jid.estimate_delay(base, late(base, seconds))
-    assert abs(found.seconds - seconds) < 2e-6
-    np.testing.assert_allclose(found.of_joints, seconds, atol=5e-6)
-
-
-def test_a_delays_deviation_is_that_of_many_draws(base):
-    options = {"noise": np.array([2.0, 2.0, 0.7]), "samples": 800}
-    logs = [late(base, 0.003, noise_seed=seed, **options) for seed in range(8)]
-    found = [jid.estimate_delay(base, o) for o in logs]
-    errors = np.array([d.seconds - 0.003 for d in found])
-    sizes = np.array([d.standard_deviation for d in found])
-    assert abs(errors.mean()) < 4 * errors.std() / np.sqrt(8), (
-        "noise does not pull towards zero"
-    )
-    assert 0.5 < sizes.mean() / errors.std() < 2.0
-    assert np.mean([d.p_value < 0.01 for d in found]) < 0.2
-
-
-def in_closed_loop(seed, seconds=20.0, dt=0.005):
-    """A pendulum whose servo resists forces: measured and commanded observations."""
-    inertia, weight, kp, kd, steps = 0.4, 6.0, 160.0, 16.0, 4
-    rng, t = np.random.default_rng(seed), dt * np.arange(round(seconds / dt))
-    w = 2 * np.pi * np.arange(1, 6) / 8
-    target, rate = (
-        f(np.outer(t, w) + w) @ (x / w) for f, x in ((np.sin, 0.5), (np.cos, 0.5 * w))
-    )
-    unknown = np.convolve(rng.normal(size=len(t)), np.ones(20) / 20, "same")
-    q, v, angles, forces = target[0], rate[0], np.zeros_like(t), np.zeros_like(t)
-    for k in range(len(t)):
-        angles[k], forces[k] = (
-            q,
-            kp * (target[k] - q) + kd * (rate[k] - v) + weight * np.sin(q),
-        )
-        for _ in range(steps):
-            h = dt / steps
-            v += h * (forces[k] + 3.0 * unknown[k] - weight * np.sin(q)) / inertia
-            q += h * v
-    # A force that is held for one sample belongs to its middle.
-    held = 0.625 * forces + 0.375 * np.append(forces[0], forces[:-1])
-    held += 0.02 * rng.normal(size=len(t))
-    robot = jid.Robot(
-        "pendulum",
-        revolute=(True,),
-        axis=[(0, 1, 0)],
-        rotation=[np.eye(3)],
-        offset=[(0, 0, 0)],
-    )
-    logs = (
-        jid.Recording.of(x[:, None], held[:, None], time=t) for x in (angles, target)
-    )
-    filters = jid.ZeroPhaseButterworth(10.0), jid.Subsample(5)
-    return robot, [jid.observe(log, robot, *filters) for log in logs]
-
-
-def test_disturbances_that_a_controller_answers_are_no_delay():
-    held, commanded, bare = [], [], []
-    for seed in range(8):
-        robot, (measured, command) = in_closed_loop(seed)
-        base = jid.base_parameters(
-            jid.Model(robot, (jid.RigidBodies(), jid.ConstantOffset()))
-        )
-        weights = jid.estimators.GivenWeights([1.0])
-        found = jid.estimate_delay(base, measured, weights)
-        bare.append(abs(found.seconds) > 2.1 * found.standard_deviation)
-        held.append(found.interval()[0] <= 0.0 <= found.interval()[1])
-        found = jid.estimate_delay(base, measured, weights, commanded=command)
-        assert found.feedback == 0.0
-        commanded.append(found.interval()[0] <= 0.0 <= found.interval()[1])
-    assert all(held)
-    assert sum(bare) >= 6, "without the bound, most intervals would be wrong"
-    assert sum(commanded) >= 7
-
-
 def test_removing_a_delay_undoes_it():
     t = 0.01 * np.arange(400)
     angles = np.sin(np.outer(t, [3.0, 5.0]))
@@ -306,14 +222,6 @@ def test_removing_a_delay_undoes_it():
     assert "23.4 ms was removed" in back.notes[-1]
     with pytest.raises(ValueError, match="`recording` lasts"):
         jid.remove_delay(early, 10.0)
-
-
-def test_rows_whose_motion_is_not_known_do_not_count(base):
-    o = late(base, 0.0)
-    lost = np.flatnonzero(~np.asarray(without_delay(o, 0.02).mask).all(axis=1))
-    np.testing.assert_array_equal(lost, range(4))
-    with pytest.raises(ValueError, match="no rows of some joint are left"):
-        without_delay(o, 100.0)
 
 
 def test_refusals(base, exact):

@@ -70,6 +70,12 @@ class Uncertainty(eqx.Module):
         return self.standard_deviations * special.stdtrit(dof, 0.5 + 0.5 * level)
 
 
+def dof_of_sum(a, b, dof_a, dof_b) -> BaseVector:
+    """Return the degrees of freedom of sums of two variances (Welch, Satterthwaite)."""
+    dof = (a + b) ** 2 / (a**2 / dof_a + b**2 / dof_b)
+    return np.where(np.isnan(dof), np.inf, dof)
+
+
 def rescale_covariance(covariance: BaseMatrix, deviations: BaseVector) -> BaseMatrix:
     """Return the covariance with the same correlations and other standard deviations.
 

@@ -266,6 +266,12 @@ def _shared_lengths(problem: RegressionProblem, stretches: Sequence[Span]):
     return lengths
 
 
+def spread_rows(problem: RegressionProblem) -> Iterator[RowChunk]:
+    """Yield the rows of stretches in time: all rows, or an even selection of many."""
+    stretches, _ = _divide_into_stretches(problem)
+    yield from _rows_of_stretches(problem, stretches)
+
+
 def _rows_of_stretches(
     problem: RegressionProblem, stretches: Sequence[Span]
 ) -> Iterator[RowChunk]:
