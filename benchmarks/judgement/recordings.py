@@ -38,7 +38,9 @@ class Kind(NamedTuple):
     """Kind of recording.
 
     Attributes:
-        motion: "waves", "stops" (from point to point, with pauses) or "chirp".
+        motion: "waves", "stops" (from point to point, with pauses), "chirp", "pose"
+            (at rest), "one still" (waves, the middle joint at rest) or "in step"
+            (waves, the middle joint and the next one move alike).
         seconds: Duration [s].
         pace: Frequencies over the usual ones.
         amplitude: Used share of speeds and ranges.
@@ -94,7 +96,7 @@ def reference(machine, kind, seed):
     time = np.arange(0, kind.seconds, SAMPLE_TIME / STEPS)
     spans = machine.model.jnt_range[:, 1]
     joints = len(spans)
-    if kind.motion == "waves":
+    if kind.motion in ("waves", "pose", "one still", "in step"):
         base = 2 * np.pi * 0.1 * kind.pace
         phases = rng.uniform(0, 2 * np.pi, (5, joints))
         sizes = rng.uniform(0.3, 1.0, (5, joints)) / np.arange(1, 6)[:, None]
@@ -122,6 +124,15 @@ def reference(machine, kind, seed):
     acceleration = np.abs(np.gradient(np.gradient(q, step, axis=0), step, axis=0))
     scale = np.minimum(scale, 4.5 * machine.max_speeds / acceleration.max(axis=0))
     q = q * kind.amplitude * scale
+    middle = joints // 2
+    if kind.motion == "pose":
+        q = 0 * q + 0.5 * spans * rng.uniform(-1, 1, joints)
+    elif kind.motion == "one still":
+        q[:, middle] = q[0, middle]
+    elif kind.motion == "in step":
+        # The slower of both leads, so that the other one keeps its limits.
+        follower = middle - 1
+        q[:, follower] = q[:, middle] * min(1.0, spans[follower] / spans[middle])
     velocities = np.gradient(q, step, axis=0)
     return time, q, velocities, np.gradient(velocities, step, axis=0)
 
