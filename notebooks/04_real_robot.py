@@ -120,7 +120,7 @@ print(
 # ## How well is each parameter known?
 #
 # Standard deviations come from the spectrum of the residuals: rows behind a filter are not independent, and the textbook formula gives values that are too small by
-# the factor printed here. Parameters that are not known to 10 % are small, or have little effect in this motion.
+# the factor printed here. What counts is the torque that an interval leaves open on other motions: a small parameter may be uncertain.
 
 # %%
 print(
@@ -128,8 +128,8 @@ print(
     np.median(fit.uncertainty.ratios).round(1),
     "(median)",
 )
-count = (fit.relative_standard_deviations <= 0.1).sum()
-print(f"{count} of {base.size} parameters are known to 10 %")
+count = (fit.open_shares <= 0.1).sum()
+print(f"{count} of {base.size} parameters leave at most 10 % of the torques open")
 
 # %% [markdown]
 # ## Comparison with known values

@@ -23,10 +23,7 @@ from jaxid.experiment.decoder import decode
 from jaxid.experiment.experiment import TABLES
 from jaxid.experiment.setup_tables import SIDES
 from jaxid.experiment_file import check_names
-from jaxid.identification.estimators.regularisation_and_weights import (
-    LARGEST_UNCERTAINTY,
-)
-from jaxid.identification.fit_result import DOUBT_LIMIT, TRUST_LIMIT
+from jaxid.identification.determination import LARGEST_UNCERTAINTY
 from jaxid.measurement.filters import FILTERS
 from jaxid.simulation.virtual import random_bodies
 from jaxid.validation.diagnosis import MIN_DEVIATIONS
@@ -262,7 +259,7 @@ THRESHOLDS = {
         f"above {ERRORS.doubtful:.0%} ({ERRORS.doubtful_joint:.0%} of a joint)",
         f"above {ERRORS.bad:.0%} ({ERRORS.bad_joint:.0%})",
     ),
-    "7.": (f"up to {TRUST_LIMIT:.0%}", f"up to {DOUBT_LIMIT:.0%} doubtful"),
+    "7.": (f"at most {LARGEST_UNCERTAINTY:.0%}",),
     "10.": (f"all of {POSES} poses",),
     "11.": (f"{MIN_DEVIATIONS:.0f} standard deviations",),
 }

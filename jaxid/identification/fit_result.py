@@ -37,21 +37,22 @@ from jaxid.result_table import (
 )
 
 from .consistency.estimator import Consistency
+from .determination import (
+    LARGEST_UNCERTAINTY,
+    UndeterminedDirection,
+    random_rows,
+)
 from .estimators.estimate import AbstractEstimator, EstimatorInWords
 from .estimators.regularisation_and_weights import (
-    LARGEST_UNCERTAINTY,
     AbstractSpectralSolution,
     Complete,
     Decomposition,
-    UndeterminedDirection,
 )
 from .factors import Blocks, LinearSystem
 from .uncertainty.result import ResidualSpectra, Uncertainty
 
-TRUST_LIMIT = 0.1
-"""Relative standard deviation (fraction) up to which an estimate is trusted."""
-DOUBT_LIMIT = 0.5
-"""Relative standard deviation (fraction) up to which an estimate is only doubtful."""
+MAX_NAMED = 8
+"""Number of undetermined combinations that are named, the weakest ones."""
 FORMAT = "jaxid model"
 """Entry of a model file that tells what it is."""
 VERSION = 1
@@ -164,18 +165,28 @@ class Fit(Summarised, eqx.Module):
         return ratios
 
     @property
-    def trust(self) -> tuple[Status, ...]:
-        """Judgement of each estimate by its relative standard deviation.
+    def open_shares(self) -> BaseVector:
+        """Share of the forces (fraction) that each estimate leaves open by itself.
 
-        `GOOD` up to 0.1, `DOUBTFUL` up to 0.5; `BAD` above, and for all that is
-        undetermined.
+        It is half the width of its 95 % interval, as forces on random motions within
+        the robot's limits, relative to all forces there.
         """
-        deviations = self.relative_standard_deviations.copy()
+        rows = random_rows(self.base, self.parameters)
+        return self.uncertainty.half_widths() * np.linalg.norm(rows, axis=0)
+
+    @property
+    def trust(self) -> tuple[Status, ...]:
+        """Judgement of each estimate by the share of the forces that it leaves open.
+
+        `GOOD` up to a tenth; `DOUBTFUL` above, where other estimates make up for it;
+        `BAD` for all that take part in an undetermined combination.
+        """
+        is_small = self.open_shares <= LARGEST_UNCERTAINTY
+        grades = [Status.GOOD if x else Status.DOUBTFUL for x in is_small]
         for direction in self.undetermined:
-            deviations[list(direction.parts)] = np.inf
-        grades = Status.GOOD, Status.DOUBTFUL, Status.BAD
-        steps = np.searchsorted((TRUST_LIMIT, DOUBT_LIMIT), deviations)
-        return tuple(grades[k] for k in steps)
+            for k in direction.parts:
+                grades[k] = Status.BAD
+        return tuple(grades)
 
     @property
     def time_blocks(self) -> Blocks:
@@ -226,7 +237,6 @@ class Fit(Summarised, eqx.Module):
     def facts(self) -> list[tuple[str, str]]:
         """Rows, condition numbers, residual and trust, each with its word."""
         numbers = self.condition_numbers
-        counts = {grade: self.trust.count(grade) for grade in Status}
         rows = f"{min(self.rows)} to {max(self.rows)}"
         if min(self.rows) == max(self.rows):
             rows = str(self.rows[0])
@@ -244,9 +254,8 @@ class Fit(Summarised, eqx.Module):
             ),
             (
                 "estimates",
-                f"{counts[Status.GOOD]} of {self.base.size} known to "
-                f"{100 * TRUST_LIMIT:g} %, {counts[Status.DOUBTFUL]} to "
-                f"{100 * DOUBT_LIMIT:g} %, {counts[Status.BAD]} worse or undetermined",
+                f"{self.trust.count(Status.GOOD)} of {self.base.size} leave at most "
+                f"{100 * LARGEST_UNCERTAINTY:g} % of the forces open",
             ),
         ]
 
@@ -264,19 +273,22 @@ class Fit(Summarised, eqx.Module):
             f"{combinations} of the {size} base parameters."
         )
         remarks = [Remark(headline, Status.BAD)]
-        for direction in self.undetermined:
+        for direction in self.undetermined[:MAX_NAMED]:
             detail = "not moved at all"
             if np.isfinite(direction.uncertainty):
                 detail = f"leaves {percent(direction.uncertainty)} % of the forces open"
             detail += f"; singular value {direction.singular_value:.1e} of the largest"
             sentence = f"{direction.sentence(self.base)}."
             remarks.append(Remark(sentence, Status.BAD, detail))
+        if count > MAX_NAMED:
+            remarks.append(Remark(f"And {count - MAX_NAMED} more.", Status.BAD))
         advice = (
-            "A combination counts as not determined if it leaves more than "
-            f"{100 * LARGEST_UNCERTAINTY:g} % of the whole forces open. Estimates of "
-            "these parameters mean nothing one by one, and the model may fail on other "
-            "motions. Record a motion that moves these joints in more poses, faster "
-            "and in both directions, or leave effects out in `[model]`"
+            "A combination counts as not determined if its 95 % interval leaves more "
+            f"than {100 * LARGEST_UNCERTAINTY:g} % of the forces of random motions "
+            "within the robot's limits open. Estimates of these parameters mean "
+            "nothing one by one, and the model may fail on other motions. Record a "
+            "motion that moves these joints in more poses, faster and in both "
+            "directions, or leave effects out in `[model]`"
         )
         if isinstance(self.solution, Complete):
             advice += (
@@ -300,7 +312,7 @@ class Fit(Summarised, eqx.Module):
             Column("estimate", values, kind="number"),
             Column("±", deviations, kind="number"),
             Column("unit", base.units),
-            Column("±", self.relative_standard_deviations, "%", percent),
+            Column("open", self.open_shares, "%", percent),
         ]
         remarks = self.determination
         ratios = self.uncertainty.ratios

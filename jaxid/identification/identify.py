@@ -12,13 +12,13 @@ from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
 from jaxid.measurement.observations import Observations, ObservedLogs, Progress
 
+from .determination import random_rows, undetermined
 from .estimators.estimate import AbstractEstimator
 from .estimators.least_squares import WeightedLeastSquares
 from .estimators.regularisation_and_weights import (
     MIN_SINGULAR_VALUE,
     AbstractSpectralSolution,
     Decomposition,
-    undetermined,
 )
 from .factors import Factors
 from .fit_result import ConditionNumbers, Fit
@@ -113,6 +113,7 @@ def fit_problem(
     relative_residual = (
         np.sqrt(squares.sum()) / force_norm if force_norm > 0 else np.inf
     )
+    other_motions = random_rows(base, estimate.parameters)
     shrinkage_notes = _shrinkage_notes(decomposition.values, estimate.solution)
     return Fit(
         base=base,
@@ -124,7 +125,9 @@ def fit_problem(
         residual_rms=np.sqrt(squares / np.maximum(rows.factors.rows, 1)),
         residual_spectra=spectra,
         residual=float(relative_residual),
-        undetermined=undetermined(estimate.blocks, weights, decomposition),
+        undetermined=undetermined(
+            estimate.blocks, weights, decomposition, other_motions
+        ),
         estimator=estimator,
         solution=estimate.solution,
         consistency=estimate.consistency,

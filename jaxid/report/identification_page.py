@@ -196,7 +196,8 @@ def _parameters(fit: Fit) -> list[Any]:
     """Return the table of the estimates, and how to read it."""
     note = (
         "* together with what forces cannot tell apart from it: see its combination. "
-        "A parameter near zero is never known to a few percent, and that is no fault."
+        "Open: the share of the torques of random motions that its interval leaves "
+        "open. A small parameter matters little, however wide its interval."
     )
     doubts = [fit.determination] if fit.undetermined else []
     return [*doubts, parameter_table(fit), note, FRAMES_NOTE]
@@ -266,7 +267,7 @@ def parameter_table(fit: Fit) -> Table:
         Column("unit", base.units),
         Column("95 %\nfrom", low, kind="number"),
         Column("95 %\nto", high, kind="number"),
-        Column("±", fit.relative_standard_deviations, "%", percent),
+        Column("open", fit.open_shares, "%", percent),
         Column("combination", base.expressions, kind="code"),
         status=fit.trust,
     )

@@ -323,8 +323,9 @@ def _remarks_on_fit(report: Report) -> Iterator[Remark]:
         )
     yield Remark(
         f"Estimates: {dict(fit.facts)['estimates']}",
-        detail="Standard deviation over estimate. A parameter near zero is never known "
-        "to a few percent, and that is no fault: look at its interval.",
+        detail="Forces of random motions within the robot's limits, and 95 % intervals "
+        "of the parameters one by one. A small parameter matters little, however wide "
+        "its interval.",
     )
     condition = significant(fit.condition_numbers.scaled, 3)
     yield Remark(

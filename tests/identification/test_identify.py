@@ -5,6 +5,7 @@ import pytest
 from virtual import dense, observations, standard_parameters
 
 import jaxid as jid
+from jaxid.dynamics.sample_methods import in_numpy
 from jaxid.result_table import Status
 
 PLAIN = jid.estimators.LeastSquares()
@@ -199,3 +200,22 @@ def test_refusals(base, p, joints, force, samples, message):
     other = jid.base_parameters(jid.Model(robot, base.model.terms))
     with pytest.raises(ValueError, match=message):
         jid.identify(other, observations(base.model, p, samples=samples))
+
+
+def test_what_a_log_does_not_move_is_open_however_small_its_noise(base, p):
+    """A joint that hardly moves: its columns are small, but not those of rounding."""
+    good = observations(base.model, p, noise=1e-3)
+    motion = good.motion
+    scale = np.array([1.0, 1e-3])
+    q, qd, qdd = (np.asarray(x) * scale for x in (motion.q, motion.qd, motion.qdd))
+    noise = 1e-3 * np.random.default_rng(3).standard_normal(q.shape)
+    model = base.model
+    forces = in_numpy(model, model.forces, q, qd, qdd, shared=(p,)) + noise
+    weak = jid.Observations.of(q, qd, qdd, forces, sample_time=good.sample_time)
+    fit = jid.identify(base, weak, PLAIN)
+    viscous = base.names.index("fv2")
+    assert not jid.identify(base, good, PLAIN).undetermined
+    assert viscous in {k for d in fit.undetermined for k in d.parts}
+    # The fit itself is as good as the noise.
+    assert fit.residual < 2e-3
+    assert fit.open_shares[viscous] > 0.1 > fit.open_shares[base.names.index("fv1")]

@@ -13,12 +13,10 @@ from jaxid.arrays import (
     BaseMatrix,
     BaseVector,
     Float,
-    Indices,
     Joints,
     Vector,
     one_or_each,
 )
-from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
 from jaxid.robot.robot import Robot
 
@@ -29,10 +27,6 @@ MIN_SINGULAR_VALUE = 1e-11
 """Relative singular value below which a direction is only rounding."""
 RIDGE = 64 * np.finfo(float).eps
 """Ridge of the products of columns of length one, which may depend on each other."""
-LARGEST_UNCERTAINTY = 0.1
-"""Fraction of the forces by which an undetermined combination may be wrong."""
-MIN_SHARE = 0.3
-"""Share of the largest parameter of a combination from which another one is named."""
 
 
 class Decomposition(eqx.Module):
@@ -278,78 +272,3 @@ class MaximumForces(AbstractWeights):
         if np.isfinite(max_forces).all():
             return 1.0 / max_forces
         return ResidualVariances()(robot, factors)
-
-
-class UndeterminedDirection(eqx.Module):
-    """A combination of base parameters on which the forces hardly depend.
-
-    Attributes:
-        parts: Indices of the base parameters in it, the largest first.
-        shares: Their fractions, as they count in the forces; the largest is 1.
-        singular_value: Singular value of the scaled observation matrix, relative to the
-            largest.
-        uncertainty: Standard deviation of the forces that the parameters of this
-            combination make one by one, relative to all forces; infinite if the
-            combination was not moved.
-    """
-
-    parts: Indices = eqx.field(static=True)
-    shares: tuple[float, ...] = eqx.field(static=True)
-    singular_value: float
-    uncertainty: float
-
-    def sentence(self, base: BaseParameters) -> str:
-        """Return the combination in words, with at most five base parameters."""
-        names = [base.names[k] for k in self.parts]
-        if len(names) == 1:
-            return f"{names[0]} is not determined"
-        if len(names) > 5:
-            names = [*names[:4], f"{len(names) - 4} others"]
-        return f"{', '.join(names[:-1])} and {names[-1]} cannot be told apart"
-
-
-def undetermined(
-    blocks: Blocks, weights: AnyArray, decomposition: Decomposition
-) -> tuple[UndeterminedDirection, ...]:
-    r"""Return the directions in which the data leave more open than they tell.
-
-    Scale the parameters so that each of them alone makes forces of its own column's
-    length. A step along a singular direction changes the forces by the singular value
-    $s$ only. The noise along it is taken from how much contiguous blocks of time
-    disagree about it, so that coloured noise and errors of the model count: the sum
-    $g_k$ of residuals times the direction's forces over block $k$ gives the deviation
-    $\sqrt{\sum g_k^2 K/(K-1)} / s^2$. Where parameters may thus make forces of a tenth
-    of the whole recording that cancel each other, the direction is not determined.
-    """
-    values = decomposition.values
-    force_norm = np.hypot(np.linalg.norm(decomposition.forces), decomposition.rest)
-    p = decomposition.solve()
-    squares = np.zeros(len(values))
-    for part in blocks.parts:
-        R, z = part.weighted(weights)
-        gradient = R.T @ (R @ p - z) / decomposition.scale
-        squares += (decomposition.directions @ gradient) ** 2
-    count = len(blocks.parts)
-    inverse = Complete().inverse(values)
-    deviations = np.sqrt(squares * count / max(count - 1, 1)) * inverse
-    rounding = np.finfo(float).eps * force_norm
-    uncertainty = np.maximum(deviations, rounding)
-    uncertainty = uncertainty / max(force_norm, np.finfo(float).tiny)
-    uncertainty[inverse == 0] = np.inf
-
-    directions = []
-    is_open = uncertainty > LARGEST_UNCERTAINTY
-    for k in np.flatnonzero(is_open)[::-1]:
-        direction = decomposition.directions[k]
-        order = np.argsort(-np.abs(direction), kind="stable")
-        shares = direction[order] / direction[order[0]]
-        is_part = np.abs(shares) >= MIN_SHARE
-        directions.append(
-            UndeterminedDirection(
-                parts=tuple(order[is_part].tolist()),
-                shares=tuple(shares[is_part].tolist()),
-                singular_value=float(values[k] / values[0]),
-                uncertainty=float(uncertainty[k]),
-            )
-        )
-    return tuple(directions)

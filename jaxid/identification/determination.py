@@ -1,0 +1,174 @@
+"""What logs leave open: combinations of parameters that matter on other motions."""
+
+import equinox as eqx
+import numpy as np
+from scipy import special
+
+from jaxid.arrays import AnyArray, Indices, Joints, Matrix
+from jaxid.dynamics.base import BaseParameters
+from jaxid.dynamics.motion import Motion
+from jaxid.robot.robot import complete_limits
+
+from .estimators.regularisation_and_weights import Complete, Decomposition
+from .factors import Blocks
+
+SAMPLES = 400
+"""Number of random motions on which parameters are judged."""
+MIN_SAMPLES = 40
+"""Number of motions of which the drives are able, without which all are taken."""
+LARGEST_UNCERTAINTY = 0.1
+"""Fraction of the forces that the 95 % interval of a combination may leave open.
+
+Logs of five simulated machines on which a joint rested, or which were too slow, too
+small, too short or of one pose, leave at least 0.17 open; clean logs of good motions,
+on which plain least squares predict another motion well, at most 0.04.
+"""
+MIN_SHARE = 0.3
+"""Share of the largest parameter of a combination from which another one is named."""
+
+
+class UndeterminedDirection(eqx.Module):
+    """A combination of base parameters that the observations leave open.
+
+    Attributes:
+        parts: Indices of the base parameters in it, the largest first.
+        shares: Their fractions, as they count in the forces of the observations; the
+            largest is 1.
+        singular_value: Singular value of the scaled observation matrix, relative to the
+            largest.
+        uncertainty: Half the width of its 95 % interval, as forces on random motions
+            relative to all forces there; infinite if the combination was not moved.
+    """
+
+    parts: Indices = eqx.field(static=True)
+    shares: tuple[float, ...] = eqx.field(static=True)
+    singular_value: float
+    uncertainty: float
+
+    def sentence(self, base: BaseParameters) -> str:
+        """Return the combination in words, with at most five base parameters."""
+        names = [base.names[k] for k in self.parts]
+        if len(names) == 1:
+            return f"{names[0]} is not determined"
+        if len(names) > 5:
+            names = [*names[:4], f"{len(names) - 4} others"]
+        return f"{', '.join(names[:-1])} and {names[-1]} cannot be told apart"
+
+
+def random_rows(base: BaseParameters, parameters: AnyArray) -> Matrix:
+    """Return rows of the base regressor on random motions within the robot's limits.
+
+    Poses, velocities and accelerations are uniform within the limits, at a random pace;
+    motions for which the drives are too weak are left out. The norm of the rows times a
+    change of the parameters is the change of the forces relative to the forces: the
+    root of the mean square over the joints.
+
+    Args:
+        base: Base parameters.
+        parameters: Their values, which tell the forces.
+    """
+    robot = base.model.robot
+    motion = _random_motion(base)
+    rows = np.zeros((robot.joints, SAMPLES, base.size))
+    joint_rows = base.regressor_rows(motion)
+    for j, columns in enumerate(base.acting_columns):
+        rows[j][:, list(columns)] = joint_rows[j]
+
+    max_forces = np.asarray(robot.known_max_forces)[:, None]
+    forces = rows @ np.asarray(parameters)
+    is_possible = np.all(np.abs(forces) <= max_forces, axis=0)
+    if np.count_nonzero(is_possible) >= MIN_SAMPLES:
+        rows = rows[:, is_possible]
+        forces = forces[:, is_possible]
+    # Wrong estimates of what was not moved ask for forces that no drive has.
+    forces = np.clip(forces, -max_forces, max_forces)
+    force_rms = np.sqrt(np.mean(forces**2, axis=1))
+    # Finite also for joints without any force.
+    largest_rms = float(force_rms.max()) or 1.0
+    scale = np.maximum(force_rms, 1e-9 * largest_rms)[:, None, None]
+    count = rows.shape[0] * rows.shape[1]
+    return (rows / scale).reshape(count, base.size) / np.sqrt(count)
+
+
+def _random_motion(base: BaseParameters) -> Motion:
+    """Return random motions within the limits of the robot's joints."""
+    robot = base.model.robot
+    limits = complete_limits(robot)
+    rng = np.random.default_rng(0)
+    shape = (SAMPLES, robot.joints)
+    low = np.asarray(limits.position_min)
+    high = np.asarray(limits.position_max)
+    pace = rng.uniform(0.0, 1.0, (SAMPLES, 1))
+    q = rng.uniform(low, high, shape)
+    qd = pace * rng.uniform(-1.0, 1.0, shape) * np.asarray(limits.velocity)
+    qdd = pace**2 * rng.uniform(-1.0, 1.0, shape) * np.asarray(limits.acceleration)
+    law = base.model.memory
+    return Motion(q, qd, qdd, None if law is None else law.settled(qd))
+
+
+def undetermined(
+    blocks: Blocks, weights: Joints, decomposition: Decomposition, rows: Matrix
+) -> tuple[UndeterminedDirection, ...]:
+    """Return the combinations of parameters that observations leave open.
+
+    Each singular direction of the observations is judged by the forces that its 95 %
+    interval makes on other motions: a log says little of what it has not moved, however
+    well it fits.
+
+    Args:
+        blocks: Factors of the observations by contiguous blocks of time.
+        weights: Weights of the joints.
+        decomposition: Decomposition of the weighted observations.
+        rows: Rows of other motions, as `random_rows` returns them.
+    """
+    half_widths = _half_widths(blocks, weights, decomposition)
+    steps = decomposition.directions / decomposition.scale
+    forces = np.linalg.norm(rows @ steps.T, axis=0)
+    uncertainty = np.full_like(half_widths, np.inf)
+    is_visible = np.isfinite(half_widths)
+    uncertainty[is_visible] = half_widths[is_visible] * forces[is_visible]
+
+    directions = []
+    for k in np.flatnonzero(uncertainty > LARGEST_UNCERTAINTY)[::-1]:
+        direction = decomposition.directions[k]
+        order = np.argsort(-np.abs(direction), kind="stable")
+        shares = direction[order] / direction[order[0]]
+        is_part = np.abs(shares) >= MIN_SHARE
+        value = decomposition.values[k] / decomposition.values[0]
+        directions.append(
+            UndeterminedDirection(
+                parts=tuple(order[is_part].tolist()),
+                shares=tuple(shares[is_part].tolist()),
+                singular_value=float(value),
+                uncertainty=float(uncertainty[k]),
+            )
+        )
+    return tuple(directions)
+
+
+def _half_widths(
+    blocks: Blocks, weights: Joints, decomposition: Decomposition
+) -> np.ndarray:
+    r"""Return half the 95 % intervals of the singular directions' coefficients.
+
+    The noise along a direction is taken from how much contiguous blocks of time
+    disagree about it, so that coloured noise and errors of the model count: the sum
+    $g_k$ of residuals times the direction's forces over block $k$ gives the deviation
+    $\sqrt{\sum g_k^2 K/(K-1)} / s^2$ of its coefficient, where $s$ is the singular
+    value. It is infinite where only rounding is left of a direction.
+    """
+    values = decomposition.values
+    p = decomposition.solve()
+    squares = np.zeros(len(values))
+    for part in blocks.parts:
+        R, z = part.weighted(weights)
+        gradient = R.T @ (R @ p - z) / decomposition.scale
+        squares += (decomposition.directions @ gradient) ** 2
+    count = len(blocks.parts)
+    freedom = max(count - 1, 1)
+    inverse = Complete().inverse(values)
+    deviations = np.sqrt(squares * count / freedom) * inverse
+    force_norm = np.hypot(np.linalg.norm(decomposition.forces), decomposition.rest)
+    rounding = np.finfo(float).eps * force_norm
+    half_widths = special.stdtrit(freedom, 0.975) * np.maximum(deviations, rounding)
+    return np.where(inverse == 0, np.inf, half_widths)
