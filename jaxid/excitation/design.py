@@ -18,7 +18,7 @@ from jaxid.trajectory.trajectory import AbstractBasis, LinearTrajectory
 from .coefficient_limits import ScaledMotions
 from .constraints import AbstractConstraint
 from .criteria import AbstractCriterion
-from .criteria.information_matrix import BaseMatrix, BaseVector, JointVector
+from .criteria.information_matrix import BaseMatrix, JointVector
 from .design_result import DesignStatus, ExcitationPlan
 from .feasible_candidates import (
     Candidates,
@@ -99,7 +99,7 @@ def design_excitation(
             their covariance; the design adds to it.
         samples: Number of measured samples of one run of the motion.
         settings: Arguments of `minimise`: `solver`, `starts`, `generations`, `key`,
-            `nominal`, `progress`, `begin`, `seconds`, `throw`.
+            `progress`, `begin`, `seconds`, `throw`.
 
     Raises:
         InputError: If arguments do not fit, or no motion keeps all constraints: the
@@ -128,7 +128,6 @@ def minimise(
     starts: int = 32,
     generations: int = 12,
     key: PRNGKeyArray | None = None,
-    nominal: BaseVector | None = None,
     progress: Callable[[DesignProgress], None] | None = None,
     begin: LinearTrajectory | None = None,
     seconds: float | None = None,
@@ -149,8 +148,6 @@ def minimise(
         starts: Number of random motions to start from.
         generations: Number of generations.
         key: Key of the random motions; `jax.random.key(0)` if None.
-        nominal: Base parameters as far as they are known, NaN where not, for relative
-            deviations.
         progress: Callback, called with the progress after each step.
         begin: Motion of the same basis in place of the first random one, to go on with.
         seconds: Time after which the best motion so far is returned [s]; None for all
@@ -180,7 +177,6 @@ def minimise(
     else:
         outcome = _run_solver(problem, x, solver)
     motion = outcome.candidates.best_motion
-    unknown_values = np.full(problem.base.size, np.nan)
     plan = ExcitationPlan(
         base=problem.base,
         trajectory=problem.trajectory(motion),
@@ -191,7 +187,6 @@ def minimise(
         noise=problem.noise,
         samples=problem.samples,
         findings=tuple(problem.findings(motion)),
-        nominal=unknown_values if nominal is None else np.asarray(nominal),
         status=outcome.status,
         history=np.asarray(outcome.history),
     )

@@ -19,7 +19,6 @@ from jaxid.result_table import (
     Status,
     Summarised,
     Table,
-    percent,
     significant,
 )
 from jaxid.trajectory.files import save_trajectory
@@ -29,9 +28,6 @@ from .coefficient_limits import JointLimits
 from .constraints import Finding
 from .criteria import CRITERIA, AbstractCriterion, Information, standard_deviations
 from .criteria.information_matrix import BaseVector, JointVector
-
-MAX_RELATIVE_DEVIATION = 0.5
-"""Relative standard deviation above which a parameter counts as hardly determined."""
 
 
 class DesignStatus(enum.StrEnum):
@@ -65,7 +61,6 @@ class ExcitationPlan(Summarised, eqx.Module):
         noise: Assumed standard deviation of the forces' noise by joint [N m or N].
         samples: Number of measured samples of one run.
         findings: Use of the constraints beside the limits of the joints.
-        nominal: Base parameters as far as they are known before, NaN where not.
         status: How the design ended.
         history: Value of the criterion for the best motion, before the first step and
             after each.
@@ -80,7 +75,6 @@ class ExcitationPlan(Summarised, eqx.Module):
     noise: JointVector
     samples: int = eqx.field(static=True)
     findings: tuple[Finding, ...]
-    nominal: BaseVector
     status: DesignStatus = eqx.field(static=True)
     history: Float[AnyArray, " steps"]
 
@@ -121,12 +115,6 @@ class ExcitationPlan(Summarised, eqx.Module):
         return standard_deviations(self.information.weighted)
 
     @property
-    def relative_deviations(self) -> BaseVector:
-        """Standard deviations over nominal parameters; NaN if unknown or zero."""
-        size = np.abs(np.asarray(self.nominal))
-        return self.standard_deviations / np.where(size > 0, size, np.nan)
-
-    @property
     def gains(self) -> BaseVector:
         """Factors by which standard deviations are below those of a random motion."""
         reference = standard_deviations(self.reference.weighted)
@@ -151,19 +139,13 @@ class ExcitationPlan(Summarised, eqx.Module):
     def undetermined(self) -> tuple[str, ...]:
         """Names of base parameters that this motion cannot determine.
 
-        They take part in a combination that has no effect on the forces.
+        Their deviations make forces on a random motion that are larger than the noise
+        (RMS), if not infinite.
         """
-        return self._names(~np.isfinite(self.standard_deviations))
-
-    @property
-    def vague(self) -> tuple[str, ...]:
-        """Names of others whose deviation is above half of their nominal value."""
-        is_vague = self.relative_deviations > MAX_RELATIVE_DEVIATION
-        return self._names(is_vague & np.isfinite(self.standard_deviations))
-
-    def _names(self, mask: AnyArray):
-        """Return the names of the base parameters of a mask."""
-        return tuple(self.base.names[k] for k in np.flatnonzero(mask))
+        rows = self.samples * len(self.noise)
+        column_rms = np.sqrt(np.diag(self.reference.weighted) / rows)
+        is_open = ~(self.standard_deviations * column_rms <= 1.0)
+        return tuple(self.base.names[k] for k in np.flatnonzero(is_open))
 
     def tables(self) -> tuple[Table, ...]:
         """Return the tables of criteria, expected deviations, and use of the limits."""
@@ -188,22 +170,16 @@ class ExcitationPlan(Summarised, eqx.Module):
         )
 
     def _deviations_table(self):
-        """Return the table of expected deviations, also relative ones if known."""
+        """Return the table of expected deviations."""
         base = self.base
-        columns = [
+        return Table(
+            "expected standard deviations",
             Column("#", list(range(1, base.size + 1))),
             Column("parameter", base.names),
             Column("±", self.standard_deviations),
             Column("unit", base.units),
             Column("better than\nrandom", self.gains, "factor", "{:.2f}".format),
-        ]
-        status = []
-        relative_deviations = self.relative_deviations
-        if not np.isnan(relative_deviations).all():
-            columns.append(Column("±", relative_deviations, "%", percent))
-            is_vague = relative_deviations > MAX_RELATIVE_DEVIATION
-            status = [Status.DOUBTFUL if x else Status.NEUTRAL for x in is_vague]
-        return Table("expected standard deviations", *columns, status=status)
+        )
 
     def _limits_table(self):
         """Return the table of the use of the limits that are finite."""
@@ -218,7 +194,7 @@ class ExcitationPlan(Summarised, eqx.Module):
     def remarks(self) -> list[Remark]:
         """Gain of the design, limits that are exceeded, undetermined parameters."""
         gain = self.mean_gain
-        text = (
+        remark = Remark(
             f"Standard deviations are {gain:.3g} times smaller than a random motion's"
         )
         if gain < 1.0:
@@ -227,7 +203,8 @@ class ExcitationPlan(Summarised, eqx.Module):
                 "those of a random motion, which keeps the limits "
                 "of the joints alone: search longer (`--resume`)"
             )
-        remarks = [Remark(text)]
+            remark = Remark(text, Status.DOUBTFUL)
+        remarks = [remark]
         remarks += [Remark(text, Status.BAD) for text in self.diagnosis]
         if self.undetermined:
             text = f"This motion does not determine: {', '.join(self.undetermined)}"

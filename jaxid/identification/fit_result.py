@@ -157,14 +157,6 @@ class Fit(Summarised, eqx.Module):
         return np.stack([lower_ends, self.parameters + half_widths], axis=1)
 
     @property
-    def relative_standard_deviations(self) -> BaseVector:
-        """Standard deviations relative to the sizes of the estimates."""
-        sizes = np.abs(self.parameters)
-        ratios = np.full_like(sizes, np.inf)
-        np.divide(self.standard_deviations, sizes, out=ratios, where=sizes > 0)
-        return ratios
-
-    @property
     def open_shares(self) -> BaseVector:
         """Share of the forces (fraction) that each estimate leaves open by itself.
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxid.arrays import double_precision
-from jaxid.excitation.design_result import MAX_RELATIVE_DEVIATION, ExcitationPlan
+from jaxid.excitation.design_result import ExcitationPlan
 from jaxid.io import write_text
 from jaxid.result_table import Remark, Status, significant
 from jaxid.robot.collision import CollisionModel
@@ -38,10 +38,6 @@ def plan_remarks(plan: ExcitationPlan) -> list[Remark]:
         doubts.append(f"Limits that nobody published, assumed: {unpublished_limits}")
     if plan.limits.assumed:
         doubts.append(f"Assumed, because not given: {_assumed_limits(plan)}")
-    if plan.vague:
-        threshold = f"{100 * MAX_RELATIVE_DEVIATION:g} %"
-        names = ", ".join(plan.vague)
-        doubts.append(f"Deviations above {threshold} of the nominal value: {names}")
     if plan.interrupted:
         doubts.append("The search was stopped: `--resume` may find a better motion")
     remarks = [Remark(text, Status.DOUBTFUL) for text in doubts]
@@ -137,6 +133,12 @@ def motion_verdict(plan: ExcitationPlan, remarks: Sequence[Remark]) -> Remark:
         status = Status.DOUBTFUL
         names = ", ".join(unchecked_names)
         text = f"This motion keeps all limits that were checked; not checked: {names}."
+    elif plan.mean_gain < 1.0:
+        status = Status.DOUBTFUL
+        text = (
+            "This motion keeps all limits, but determines the parameters "
+            f"{1.0 / plan.mean_gain:.3g} times worse than a random motion."
+        )
     else:
         status = Status.GOOD
         text = (

@@ -121,7 +121,7 @@ def parameter_rows(fit: Fit) -> list[Record]:
         group=parameter_kinds(fit.base),
         estimate=fit.parameters,
         standard_deviation=fit.standard_deviations,
-        relative=fit.relative_standard_deviations,
+        open_share=fit.open_shares,
         low_95=intervals[:, 0],
         high_95=intervals[:, 1],
         degrees_of_freedom=fit.uncertainty.dof,

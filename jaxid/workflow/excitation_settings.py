@@ -60,8 +60,8 @@ class Excitation:
         controller: Controller that plays the motion, for its cycle and its file:
             franka, kuka_fri, kuka_rsi or universal_robots, like `"universal_robots"`.
         ros: Kind of the file for ROS 2: "yaml" or "mcap" (a bag).
-        nominal: Folder of an earlier result of `jaxid identify`, to compare with, like
-            `"report"`.
+        nominal: Folder of an earlier result of `jaxid identify`, whose parameters tell
+            the forces, like `"report"`.
         force_margin: Fraction of the largest forces to keep free, by nominal
             parameters, like `0.1`; by default 0.3 if friction or others are unknown,
             else 0.

@@ -178,7 +178,6 @@ def design_motion(
         constraints=task.constraints,
         key=jax.random.key(excitation.seed),
         noise=noise,
-        nominal=task.nominal and task.nominal.sizes(setup.base),
         samples=excitation.samples,
         criterion=excitation.objective,
         starts=excitation.starts,
@@ -326,11 +325,6 @@ def describe_motion(
         yield Remark(
             f"the motion runs through {leads.periods} periods; the deviations are of "
             "one"
-        )
-    if task.nominal is None:
-        yield Remark(
-            "for relative deviations, say in "
-            "`excitation.nominal` where an earlier result is"
         )
     yield from check_motion(task.surroundings, plan, task.force_fault)
     if task.nominal is not None:

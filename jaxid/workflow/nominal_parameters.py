@@ -37,11 +37,6 @@ class Nominal(NamedTuple):
     covariance: Float[np.ndarray, "base base"] | None
     undetermined: Texts = ()  # names of what an earlier fit leaves open
 
-    def sizes(self, base: BaseParameters) -> np.ndarray:
-        """Return the values; NaN for estimates of what is not determined."""
-        is_undetermined = np.isin(base.names, self.undetermined)
-        return np.where(is_undetermined, np.nan, self.parameters)
-
 
 def find_nominal(setup: Setup, excitation: Excitation) -> Nominal | None:
     """Return parameters of an earlier result, or those that the robot's file claims.

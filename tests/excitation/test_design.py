@@ -13,6 +13,8 @@ from jaxid.excitation.criteria import ConditionNumber, DOptimal, information
 from jaxid.excitation.design import design_excitation, minimise
 from jaxid.excitation.design_result import DesignStatus
 from jaxid.excitation.problem import ExcitationProblem
+from jaxid.report.excitation_page import motion_verdict
+from jaxid.result_table import Status
 from jaxid.trajectory.fourier import FourierBasis
 
 EFFORT = {"starts": 3, "generations": 1}
@@ -85,6 +87,19 @@ def test_the_mean_gain_leaves_out_what_stays_open(plan):
         blind.mean_gain, np.exp(np.mean(np.log(blind.gains[1:])))
     )
     assert plan.mean_gain > 1.2
+
+
+def test_a_motion_worse_than_a_random_one_is_not_praised(plan):
+    def verdict_at(scale):
+        weighted = scale * plan.reference.weighted
+        information = dataclasses.replace(plan.information, weighted=weighted)
+        return motion_verdict(dataclasses.replace(plan, information=information), [])
+
+    assert verdict_at(1.1).status is Status.GOOD
+    assert verdict_at(0.25).status is Status.DOUBTFUL
+    assert "2 times worse" in verdict_at(0.25).text
+    # Deviations that on a random motion make forces above the noise.
+    assert verdict_at(1e-6).status is Status.BAD
 
 
 def test_a_stopped_design_gives_its_best_and_another_goes_on_with_it(free, excess):
