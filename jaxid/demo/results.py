@@ -29,6 +29,8 @@ from .study import Study
 
 FIGURE_AXES = (0, 2, 4, 6)
 """Axes 1, 5 and 7 of the paper's Figs. 6, 7 and 9, and the shoulder."""
+MAX_EXCESS = 1.1
+"""Error on the unseen path over that of the true parameters, up to which it is good."""
 POINTS = 800
 """Samples of a line in a figure."""
 
@@ -58,17 +60,20 @@ def remarks(study: Study) -> list[Remark]:
     """Return the findings of the paper, as far as they come out here."""
     identification = max(study.weighted_model.mean_errors(0))
     verification = max(study.weighted_model.mean_errors(1))
+    true_verification = max(study.true_model.mean_errors(1))
     error = study.unweighted_model.mean_errors(0)[-1]
     weighted_error = study.weighted_model.mean_errors(0)[-1]
+    # Better than the true parameters, which leave the noise, none can be.
+    is_good = verification < MAX_EXCESS * true_verification
     return [
         Remark(
             "The identified model predicts the torques of every axis to "
             f"{identification:.2g} % of the largest torque, and to "
             f"{verification:.2g} % on an unseen path.",
-            Status.GOOD if max(identification, verification) < 1.0 else Status.DOUBTFUL,
+            Status.GOOD if is_good else Status.DOUBTFUL,
             "Mean error of the worst axis; below 1 % in the paper. The true parameters "
             f"leave {max(study.true_model.mean_errors(0)):.2g} % and "
-            f"{max(study.true_model.mean_errors(1)):.2g} %.",
+            f"{true_verification:.2g} %.",
         ),
         Remark(
             f"Without weights the last axis errs by {error:.2g} %, with weights by "
