@@ -1,4 +1,4 @@
-"""What logs leave open: combinations of parameters that matter on other motions."""
+"""Combinations of parameters that logs leave open, judged by other motions."""
 
 import equinox as eqx
 import numpy as np
