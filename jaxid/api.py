@@ -53,6 +53,7 @@ from .identification.fit_result import Fit as Fit, load_fit as load_fit
 from .identification.friction_laws import (
     identify_nonlinear_friction as identify_nonlinear_friction,
     identify_presliding as identify_presliding,
+    identify_transition_speeds as identify_transition_speeds,
 )
 from .identification.identify import identify as identify
 from .identification.many_data_sets import identify_batch as identify_batch

@@ -36,6 +36,7 @@ from .terms import (
     RotorInertia,
     ViscousFriction,
 )
+from .terms.dry_friction_transitions import is_open
 from .terms.term import NamesAndUnits, TermParameters
 
 Coordinates = ManyJoints | Sequence[Any]
@@ -147,6 +148,15 @@ class Model(Hashable):
             return dataclasses.replace(part, **changes) if _has_memory(part) else part
 
         terms = jax.tree.map(change, self.terms, is_leaf=_has_memory)
+        return dataclasses.replace(self, terms=terms)
+
+    def with_transition_speeds(self, speeds: Joints | float) -> "Model":
+        """Return the model with speeds of the transitions for which none are given."""
+
+        def change(part):
+            return dataclasses.replace(part, epsilon=speeds) if is_open(part) else part
+
+        terms = jax.tree.map(change, self.terms, is_leaf=is_open)
         return dataclasses.replace(self, terms=terms)
 
     def arguments(self, motion: Motion) -> tuple[AnyArray, ...]:

@@ -49,7 +49,8 @@ class DryFriction:
     """Dry friction, and its transition from one direction of motion to the other.
 
     Attributes:
-        epsilon: Speed of the smooth transition [rad/s or m/s]; or a list.
+        epsilon: Speed of the smooth transition [rad/s or m/s], like `0.01`; or a list;
+            by default it is found from the logs, for each joint.
         hard: Whether to take a sign instead of tanh(speed / epsilon).
         asymmetric: Whether each direction has a level of its own (then there is no
             `offset`).
@@ -59,7 +60,7 @@ class DryFriction:
             like `0.1`; or a list.
     """
 
-    epsilon: Positive | list[Positive] = 0.01
+    epsilon: Positive | list[Positive] | None = None
     hard: bool = False
     asymmetric: bool = False
     presliding: bool = False
@@ -77,6 +78,8 @@ class DryFriction:
             return terms.Presliding(steady=steady_transition, motors=motors)
         if self.hard:
             return terms.HardSign()
+        if self.epsilon is None:
+            return terms.Tanh()
         return terms.Tanh(_speed(robot, "coulomb.epsilon", self.epsilon))
 
     def term(self, robot: Robot) -> terms.AbstractTerm:

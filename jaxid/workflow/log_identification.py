@@ -127,6 +127,8 @@ def identify_logs(
     files = [path for path in logs if not is_report(path)]
     reports = [path for path in logs if is_report(path)]
 
+    if reports:
+        setup = setup.with_transition_speeds_of(read_earlier_fit(setup, reports[0]))
     setup = select_filter(setup, files, columns, progress, held_out)
     loaded_logs = load_logs(setup, [*files, *verify], columns, progress)
     fitted_logs = loaded_logs[: len(files)]

@@ -15,6 +15,7 @@ from jaxid.identification.combination import combine_fits
 from jaxid.identification.drive_gains import DriveGains, identify_drive_gains
 from jaxid.identification.estimators import Complete
 from jaxid.identification.fit_result import Fit
+from jaxid.identification.friction_laws import identify_transition_speeds
 from jaxid.identification.identify import fit_problem
 from jaxid.identification.operating_states import identify_states
 from jaxid.identification.payload import (
@@ -76,10 +77,15 @@ def fit_runs(
     progress("finding base parameters", 0.0)
     paths = [path for group in groups.values() for path in group]
     files = [path for path in paths if not is_report(path)]
+    reports = [path for path in paths if is_report(path)]
+    if reports:
+        setup = setup.with_transition_speeds_of(read_earlier_fit(setup, reports[0]))
     setup = select_filter(setup, files, columns, progress)
     fits = []
     for name, group in groups.items():
         fit, group_doubts = fit_run(setup, name, group, columns, progress)
+        # The columns of all runs must be the same.
+        setup = setup.with_transition_speeds_of(fit)
         fits.append(fit)
         doubts += group_doubts
     return Runs(fits, doubts, groups)
@@ -107,7 +113,8 @@ def fit_run(
         logs = load_logs(setup, files, columns, progress)
         observations = [log.observations for log in logs]
         row_progress = partial(progress, f"factorising the rows, {name}")
-        rows = RegressionProblem(setup.base, observations, row_progress)
+        base = identify_transition_speeds(setup.base, observations)
+        rows = RegressionProblem(base, observations, row_progress)
         fit = fit_problem(rows, setup.least_squares)
         fits.append(fit)
         diagnoses = [log.diagnosis for log in logs]

@@ -37,8 +37,10 @@ from jaxid.identification.fit_result import Fit
 from jaxid.identification.friction_laws import (
     identify_nonlinear_friction,
     identify_presliding,
+    identify_transition_speeds,
 )
 from jaxid.identification.friction_laws.presliding_lengths import presliding_note
+from jaxid.identification.friction_laws.transition_speeds import transition_note
 from jaxid.identification.identify import fit_problem
 from jaxid.identification.problem import RegressionProblem
 from jaxid.identification.uncertainty import AbstractUncertainty, SpectralSandwich
@@ -246,6 +248,18 @@ class Setup(eqx.Module):
         """The estimator; for bodies that can exist, least squares without bounds."""
         return self.least_squares if self.has_bounded_bodies else self.estimator
 
+    def with_transition_speeds_of(self, fit: Fit) -> "Setup":
+        """Return the setup with the speeds of the transitions that a fit has found.
+
+        Fits can be combined only if their columns are the same.
+        """
+        speed = getattr(dry_transition(fit.base.model.terms), "speed", None)
+        if speed is None:
+            return self
+        model = self.model.with_transition_speeds(speed)
+        base = eqx.tree_at(lambda b: b.model, self.base, model)
+        return dataclasses.replace(self, unknowns=base)
+
     def observe(self, recording: Recording) -> Observations:
         """Filter a recording and make rows of it."""
         return observe(
@@ -254,11 +268,15 @@ class Setup(eqx.Module):
 
     def fit(self, rows: RegressionProblem, progress: Progress = ignore_progress) -> Fit:
         """Estimate the parameters from rows of logs."""
+        # Constants of friction laws are no linear parameters: they are found first.
+        notes = ()
+        base = identify_transition_speeds(rows.base, rows.recordings)
+        if base is not rows.base:
+            rows = rows.with_base(base)
+            notes = (transition_note(base),)
         if self.nonlinear_friction:
             return self._fit_with_shapes(rows, progress)
-        notes = ()
         if self.model.memory is not None:
-            # Lengths of presliding are no linear parameters: they are found first.
             rows = rows.with_base(identify_presliding(rows.base, rows.recordings))
             notes = (presliding_note(rows.base),)
         fit = fit_problem(rows, self.estimator, uncertainty=self.uncertainty)
@@ -269,9 +287,9 @@ class Setup(eqx.Module):
 
     def _fit_with_shapes(self, rows: RegressionProblem, progress: Progress) -> Fit:
         """Fit the shape of friction, too; return the better of both fits."""
-        terms = tuple(map(without_stribeck, self.model.terms))
+        terms = tuple(map(without_stribeck, rows.base.model.terms))
         result = identify_nonlinear_friction(
-            self.base,
+            rows.base,
             rows.recordings,
             self.least_squares,
             linear=base_parameters(Model(self.robot, terms)),

@@ -7,7 +7,10 @@ from pathlib import Path
 import equinox as eqx
 
 from jaxid.errors import InputError
-from jaxid.identification.friction_laws import identify_presliding
+from jaxid.identification.friction_laws import (
+    identify_presliding,
+    identify_transition_speeds,
+)
 from jaxid.identification.model_selection import (
     ModelCandidate,
     ModelChoice,
@@ -61,10 +64,10 @@ def choose_setup_by_rows(
 ) -> ModelChoice:
     """Choose between models and estimators by errors on unseen parts of the logs."""
     progress("choosing the model", 0.0)
-    candidates = [
-        ModelCandidate(name, setup.base, setup.estimator)
-        for name, setup in setups.items()
-    ]
+    candidates = []
+    for name, setup in setups.items():
+        base = identify_transition_speeds(setup.base, observations)
+        candidates.append(ModelCandidate(name, base, setup.estimator))
     candidates = with_common_length(candidates, observations)
     choice_progress = partial(progress, "choosing the model")
     return choose_model(candidates, observations, progress=choice_progress)

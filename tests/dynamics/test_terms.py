@@ -339,7 +339,8 @@ def test_warm_friction_is_smaller(robot):
 
 def test_every_nonlinear_parameter_is_found_in_its_term():
     """Names are unique, and changing the value changes the columns."""
-    wrapped = TemperatureScaled(StribeckFriction(), temperature=40.0)
+    stribeck = StribeckFriction(transition=Tanh(0.01))
+    wrapped = TemperatureScaled(stribeck, temperature=40.0)
     assert [s.name for s in wrapped.nonlinear_parameters] == [
         "eps",
         "vs",

@@ -27,6 +27,8 @@ EachJoint = float | Float[AnyArray, "..."]
 """One number for all joints, or one for each."""
 States = Float[AnyArray, " states"]
 """States of friction with memory."""
+USUAL_SPEED = 0.01
+"""Speed of a transition for which none is given, before logs tell [rad/s or m/s]."""
 
 
 class AbstractTransition(Hashable):
@@ -51,31 +53,46 @@ class Tanh(AbstractTransition):
 
     Attributes:
         epsilon: Speed of the transition, one for all joints or one for each, in the
-            joint's own unit [rad/s or m/s].
+            joint's own unit [rad/s or m/s]; by default it is found from the logs
+            (`identify_transition_speeds`), and 0.01 before.
         dead_zone: Speed below which there is no force, likewise [rad/s or m/s].
     """
 
-    epsilon: EachJoint = eqx.field(converter=one_or_each, default=0.01)
+    epsilon: EachJoint | None = eqx.field(converter=one_or_each, default=None)
     dead_zone: EachJoint = eqx.field(converter=one_or_each, default=0.0)
 
     def __check_init__(self):
-        if not (
-            isinstance(self.epsilon, jax.Array) or np.all(np.asarray(self.epsilon) > 0)
-        ):
+        speed = self.speed
+        if not (isinstance(speed, jax.Array) or np.all(np.asarray(speed) > 0)):
             raise InputError(
                 f"`epsilon` must be positive, but is {self.epsilon}: "
                 "`HardSign` has no width."
             )
 
+    @property
+    def speed(self) -> EachJoint:
+        """The speed, also where none is given."""
+        return USUAL_SPEED if self.epsilon is None else self.epsilon
+
     def __call__(self, qd):
         """Return the smooth sign of the speed."""
-        sign = jnp.tanh(qd / matching("epsilon", self.epsilon, qd))
+        sign = jnp.tanh(qd / matching("epsilon", self.speed, qd))
         return _outside_dead_zone(self.dead_zone, qd, sign)
 
     @property
     def nonlinear_parameters(self):
         """`eps1`, … [rad/s or m/s]."""
         return (NonlinearParameter("eps", ("rad/s", "m/s"), ("epsilon",)),)
+
+
+def is_open(part: Any) -> bool:
+    """Return whether a part of a term is a transition whose speed is to be found."""
+    return isinstance(part, Tanh) and part.epsilon is None
+
+
+def has_open_transition(terms: Any) -> bool:
+    """Return whether terms have a transition whose speed is to be found."""
+    return any(map(is_open, jax.tree.leaves(terms, is_leaf=is_open)))
 
 
 class HardSign(AbstractTransition):

@@ -1,4 +1,4 @@
-"""Constants of friction laws: shapes of the laws, and presliding lengths."""
+"""Constants of friction laws: shapes, presliding lengths and transition speeds."""
 
 from .friction_shapes import select_shapes as select_shapes
 from .nonlinear_friction import (
@@ -7,4 +7,5 @@ from .nonlinear_friction import (
     identify_nonlinear_friction as identify_nonlinear_friction,
 )
 from .presliding_lengths import identify_presliding as identify_presliding
+from .transition_speeds import identify_transition_speeds as identify_transition_speeds
 from .variable_projection import ShapeSearch as ShapeSearch

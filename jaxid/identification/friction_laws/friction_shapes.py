@@ -12,6 +12,7 @@ from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.terms import AbstractTerm, NonlinearParameter
+from jaxid.dynamics.terms.dry_friction_transitions import USUAL_SPEED
 from jaxid.errors import InputError
 
 ShapeValues = Float[AnyArray, " shapes"]
@@ -123,4 +124,6 @@ def select_shapes(base: BaseParameters, names: Sequence[str] = ()) -> Shapes:
         raise InputError(
             "the `model` has no friction with such `shapes`: use `StribeckFriction`."
         )
-    return Shapes(base.model, tuple(kinds))
+    # The search starts at numbers, also where no speed of a transition is given.
+    model = base.model.with_transition_speeds(USUAL_SPEED)
+    return Shapes(model, tuple(kinds))

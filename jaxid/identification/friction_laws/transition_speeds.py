@@ -1,0 +1,242 @@
+"""Speeds of the transition of dry friction, by a search on the rows of each joint."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxid.arrays import Joints, Vector
+from jaxid.dynamics.base import BaseParameters
+from jaxid.dynamics.model import Model
+from jaxid.dynamics.terms import AbstractTerm, Tanh
+from jaxid.dynamics.terms.dry_friction_transitions import (
+    USUAL_SPEED,
+    has_open_transition,
+)
+from jaxid.measurement.observations import Observations, ObservedLogs
+
+from ..factors import Blocks, Factors, JointFactor
+from ..problem import RegressionProblem, cross_validation_folds
+
+SPEED_SHARES = np.geomspace(0.003, 0.1, 17)
+"""Speeds that are tried, as fractions of each joint's own top speed."""
+USUAL_TRIAL = 5
+"""Number of the fraction that is taken where the rows do not tell: 0.009."""
+MIN_TRAVEL = 1e-3
+"""Travel below which a joint rests, and its speed is noise [rad or m]."""
+RANK_TOLERANCE = 1e-10
+"""Relative size of singular values below which columns are dependent."""
+
+
+def identify_transition_speeds(
+    base: BaseParameters, observations: ObservedLogs
+) -> BaseParameters:
+    """Find the speed at which dry friction of each joint changes its direction.
+
+    Fractions of each joint's own top speed are tried. The rows of a joint depend on its
+    own speed only, and are fitted alone; one pass over the data makes the columns of
+    all trials, filtered like the forces. The best speed is taken if the same search
+    without some blocks of time predicts these better than the usual fraction does.
+
+    Args:
+        base: Base parameters of a model.
+        observations: Observations of one recording, or of several that are fitted
+            together.
+
+    Returns:
+        The same base parameters, with a speed of each joint in every transition `Tanh`
+        for which none was given.
+    """
+    model = base.model
+    # Friction with memory follows the path: its speed matters at the first sample only.
+    if model.memory is not None or not has_open_transition(model.terms):
+        return base
+    is_one_log = isinstance(observations, Observations)
+    logs = (observations,) if is_one_log else tuple(observations)
+    top_speeds = _top_speeds(logs)
+    speeds = np.outer(SPEED_SHARES, top_speeds)
+    speeds[:, top_speeds == 0] = USUAL_SPEED
+
+    trials = SpeedTrials.of(base, speeds)
+    numbers = trials.best_numbers(RegressionProblem(trials.base, logs).blocks)
+    # Between two trials the logarithm of the speed is interpolated.
+    trial_numbers = np.arange(len(SPEED_SHARES))
+    shares = np.exp(np.interp(numbers, trial_numbers, np.log(SPEED_SHARES)))
+    best_speeds = np.where(top_speeds > 0, shares * top_speeds, USUAL_SPEED)
+    return eqx.tree_at(
+        lambda b: b.model, base, model.with_transition_speeds(best_speeds)
+    )
+
+
+def _top_speeds(logs: Sequence[Observations]) -> Joints:
+    """Return the top speed of each joint, zero where it rests [rad/s or m/s]."""
+    lowest_angles = []
+    highest_angles = []
+    speeds = []
+    for log in logs:
+        for chunk in log.chunks(65536):
+            motion, _ = log.read(slice(*chunk.samples))
+            lowest_angles.append(np.min(motion.q, axis=0))
+            highest_angles.append(np.max(motion.q, axis=0))
+            speeds.append(np.max(np.abs(motion.qd), axis=0))
+    travel = np.max(highest_angles, axis=0) - np.min(lowest_angles, axis=0)
+    return np.where(travel < MIN_TRAVEL, 0.0, np.max(speeds, axis=0))
+
+
+class TrialColumns(AbstractTerm):
+    """Columns of the terms of dry friction at one trial's speeds after another's."""
+
+    terms: tuple[AbstractTerm, ...]
+
+    def parameters(self, robot):
+        """Return the terms' names, which a number makes different, and their units."""
+        return tuple(
+            (f"{number}:{name}", unit)
+            for number, term in enumerate(self.terms)
+            for name, unit in term.parameters(robot)
+        )
+
+    def columns(self, robot, q, qd, qdd):
+        """Return the columns of all terms."""
+        parts = [term.columns(robot, q, qd, qdd) for term in self.terms]
+        return jnp.concatenate(parts, axis=1)
+
+
+class Fold(NamedTuple):
+    """Factors of rows that are fitted, and of rows that are predicted."""
+
+    training: Factors
+    test: Factors
+
+
+@dataclasses.dataclass(frozen=True)
+class SpeedTrials:
+    """Base parameters with the columns of all trials at their end.
+
+    Attributes:
+        base: The base parameters.
+        friction: Numbers of those that the columns of a trial replace.
+        trials: Numbers of those of each trial [trials, friction].
+    """
+
+    base: BaseParameters
+    friction: np.ndarray
+    trials: np.ndarray
+
+    @classmethod
+    def of(cls, base: BaseParameters, speeds: np.ndarray) -> "SpeedTrials":
+        """Append the columns of trials with these speeds [trials, joints]."""
+        model = base.model
+        is_open = [has_open_transition(term) for term in model.terms]
+        sizes = [len(term.parameters(model.robot)) for term in model.terms]
+        standard_columns = np.flatnonzero(np.repeat(is_open, sizes))
+        terms = []
+        for row in speeds:
+            trial_terms = model.with_transition_speeds(row).terms
+            terms += [trial_terms[k] for k in np.flatnonzero(is_open)]
+
+        # Columns that others replace, like those of an offset, need no trial.
+        is_base = np.isin(standard_columns, base.indices)
+        friction = np.searchsorted(base.indices, standard_columns[is_base])
+        shape = (len(speeds), len(standard_columns))
+        trial_columns = model.size + np.arange(np.prod(shape)).reshape(shape)
+        trial_columns = trial_columns[:, is_base]
+        # No other parameter depends on the trials: their rows of kappa are zero.
+        kappa = np.asarray(base.kappa)
+        trial_kappa = np.zeros((trial_columns.size, kappa.shape[1]))
+        extended_base = dataclasses.replace(
+            base,
+            model=Model(model.robot, (*model.terms, TrialColumns(tuple(terms)))),
+            indices=(*base.indices, *trial_columns.ravel().tolist()),
+            kappa=np.vstack([kappa, trial_kappa]),
+        )
+        trials = base.size + np.arange(trial_columns.size)
+        return cls(extended_base, friction, trials.reshape(trial_columns.shape))
+
+    def best_numbers(self, blocks: Blocks) -> Joints:
+        """Return the number of each joint's best trial, with a fraction."""
+        joints = range(len(blocks.parts[0].joints))
+        if len(blocks.parts) < 2:
+            return np.full(len(joints), float(USUAL_TRIAL))
+        total = blocks.total
+        folds = [
+            Fold(blocks.select(training).total, blocks.select(test).total)
+            for training, test in cross_validation_folds(blocks)
+        ]
+        numbers = []
+        for joint in joints:
+            factor = total.joints[joint]
+            number = _minimum(self.squares(factor, factor))
+            numbers.append(number if self.pays(folds, joint) else USUAL_TRIAL)
+        return np.array(numbers, float)
+
+    def pays(self, folds: Sequence[Fold], joint: int) -> bool:
+        """Return whether a search predicts unseen rows better than the usual trial."""
+        saved_square = 0.0
+        for fold in folds:
+            training = fold.training.joints[joint]
+            number = np.argmin(self.squares(training, training))
+            squares = self.squares(training, fold.test.joints[joint])
+            saved_square += squares[USUAL_TRIAL] - squares[number]
+        return saved_square > 0
+
+    def squares(self, training: JointFactor, test: JointFactor) -> Vector:
+        """Return the squared errors on some rows of a fit to others, of each trial."""
+        place = {column: k for k, column in enumerate(training.columns)}
+        trial_columns = {*self.friction.tolist(), *self.trials.ravel().tolist()}
+        other_places = [k for c, k in place.items() if c not in trial_columns]
+        scale = np.linalg.norm(training.R, axis=0)
+        scale = np.where(scale > 0, scale, 1.0)
+        training_rows = training.R / scale
+        test_rows = test.R / scale
+
+        # What the other columns leave of those of the trials, and of the forces.
+        others = training_rows[:, other_places]
+        solution, *_ = np.linalg.lstsq(others, training_rows, RANK_TOLERANCE)
+        training_rest = training_rows - others @ solution
+        test_rest = test_rows - test_rows[:, other_places] @ solution
+        squares = []
+        for trial in self.trials.tolist():
+            places = [place[column] for column in trial if column in place]
+            levels, *_ = np.linalg.lstsq(
+                training_rest[:, places], training_rest[:, -1], RANK_TOLERANCE
+            )
+            errors = test_rest[:, -1] - test_rest[:, places] @ levels
+            squares.append(scale[-1] ** 2 * np.sum(errors**2))
+        return np.array(squares)
+
+
+def _minimum(values: Vector) -> float:
+    """Return the place of the minimum of a parabola through the least of the values."""
+    number = int(np.argmin(values))
+    if number in (0, len(values) - 1):
+        return float(number)
+    before, least, behind = values[number - 1 : number + 2]
+    bend = before - 2 * least + behind
+    return number + 0.5 * (before - behind) / bend if bend > 0 else float(number)
+
+
+def transition_note(base: BaseParameters) -> str:
+    """Return the speeds of the transitions in words."""
+    robot = base.model.robot
+    leaves = jax.tree.leaves(base.model.terms, is_leaf=_is_smooth)
+    transition = next(x for x in leaves if _is_smooth(x))
+    words = [
+        f"{name} {speed:.2g} {robot.joint_unit(joint)}/s"
+        for joint, (name, speed) in enumerate(
+            zip(robot.joint_names, np.asarray(transition.speed).tolist(), strict=True)
+        )
+    ]
+    return (
+        "dry friction changes its direction within about these speeds, found from the "
+        f"logs (`epsilon`): {', '.join(words)}."
+    )
+
+
+def _is_smooth(part: Any) -> bool:
+    """Return whether a part of a term is a transition with a speed of each joint."""
+    return isinstance(part, Tanh) and np.ndim(part.speed) == 1
