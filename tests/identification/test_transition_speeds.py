@@ -1,4 +1,4 @@
-"""Speeds at which dry friction changes its direction: known ones, and MuJoCo's joints."""
+"""Speeds at which dry friction changes its direction: known ones, MuJoCo's rail."""
 
 import mujoco
 import numpy as np

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -19,13 +19,11 @@ from jaxid.dynamics.terms.dry_friction_transitions import (
 )
 from jaxid.measurement.observations import Observations, ObservedLogs
 
-from ..factors import Blocks, Factors, JointFactor
-from ..problem import RegressionProblem, cross_validation_folds
+from ..factors import JointFactor
+from ..problem import RegressionProblem
 
 SPEED_SHARES = np.geomspace(0.003, 0.1, 17)
 """Speeds that are tried, as fractions of each joint's own top speed."""
-USUAL_TRIAL = 5
-"""Number of the fraction that is taken where the rows do not tell: 0.009."""
 MIN_TRAVEL = 1e-3
 """Travel below which a joint rests, and its speed is noise [rad or m]."""
 RANK_TOLERANCE = 1e-10
@@ -39,8 +37,8 @@ def identify_transition_speeds(
 
     Fractions of each joint's own top speed are tried. The rows of a joint depend on its
     own speed only, and are fitted alone; one pass over the data makes the columns of
-    all trials, filtered like the forces. The best speed is taken if the same search
-    without some blocks of time predicts these better than the usual fraction does.
+    all trials, filtered like the forces. Where rows hardly tell the speed, it hardly
+    changes the other parameters.
 
     Args:
         base: Base parameters of a model.
@@ -62,7 +60,8 @@ def identify_transition_speeds(
     speeds[:, top_speeds == 0] = USUAL_SPEED
 
     trials = SpeedTrials.of(base, speeds)
-    numbers = trials.best_numbers(RegressionProblem(trials.base, logs).blocks)
+    factors = RegressionProblem(trials.base, logs).factors
+    numbers = [_minimum(trials.squares(joint)) for joint in factors.joints]
     # Between two trials the logarithm of the speed is interpolated.
     trial_numbers = np.arange(len(SPEED_SHARES))
     shares = np.exp(np.interp(numbers, trial_numbers, np.log(SPEED_SHARES)))
@@ -104,13 +103,6 @@ class TrialColumns(AbstractTerm):
         """Return the columns of all terms."""
         parts = [term.columns(robot, q, qd, qdd) for term in self.terms]
         return jnp.concatenate(parts, axis=1)
-
-
-class Fold(NamedTuple):
-    """Factors of rows that are fitted, and of rows that are predicted."""
-
-    training: Factors
-    test: Factors
 
 
 @dataclasses.dataclass(frozen=True)
@@ -157,56 +149,25 @@ class SpeedTrials:
         trials = base.size + np.arange(trial_columns.size)
         return cls(extended_base, friction, trials.reshape(trial_columns.shape))
 
-    def best_numbers(self, blocks: Blocks) -> Joints:
-        """Return the number of each joint's best trial, with a fraction."""
-        joints = range(len(blocks.parts[0].joints))
-        if len(blocks.parts) < 2:
-            return np.full(len(joints), float(USUAL_TRIAL))
-        total = blocks.total
-        folds = [
-            Fold(blocks.select(training).total, blocks.select(test).total)
-            for training, test in cross_validation_folds(blocks)
-        ]
-        numbers = []
-        for joint in joints:
-            factor = total.joints[joint]
-            number = _minimum(self.squares(factor, factor))
-            numbers.append(number if self.pays(folds, joint) else USUAL_TRIAL)
-        return np.array(numbers, float)
-
-    def pays(self, folds: Sequence[Fold], joint: int) -> bool:
-        """Return whether a search predicts unseen rows better than the usual trial."""
-        saved_square = 0.0
-        for fold in folds:
-            training = fold.training.joints[joint]
-            number = np.argmin(self.squares(training, training))
-            squares = self.squares(training, fold.test.joints[joint])
-            saved_square += squares[USUAL_TRIAL] - squares[number]
-        return saved_square > 0
-
-    def squares(self, training: JointFactor, test: JointFactor) -> Vector:
-        """Return the squared errors on some rows of a fit to others, of each trial."""
-        place = {column: k for k, column in enumerate(training.columns)}
+    def squares(self, joint: JointFactor) -> Vector:
+        """Return the squared errors of each trial, fitted to the rows of a joint."""
+        place = {column: k for k, column in enumerate(joint.columns)}
         trial_columns = {*self.friction.tolist(), *self.trials.ravel().tolist()}
         other_places = [k for c, k in place.items() if c not in trial_columns]
-        scale = np.linalg.norm(training.R, axis=0)
-        scale = np.where(scale > 0, scale, 1.0)
-        training_rows = training.R / scale
-        test_rows = test.R / scale
+        scale = np.linalg.norm(joint.R, axis=0)
+        rows = joint.R / np.where(scale > 0, scale, 1.0)
 
         # What the other columns leave of those of the trials, and of the forces.
-        others = training_rows[:, other_places]
-        solution, *_ = np.linalg.lstsq(others, training_rows, RANK_TOLERANCE)
-        training_rest = training_rows - others @ solution
-        test_rest = test_rows - test_rows[:, other_places] @ solution
+        others = rows[:, other_places]
+        solution, *_ = np.linalg.lstsq(others, rows, RANK_TOLERANCE)
+        remainder = rows - others @ solution
+        forces = remainder[:, -1]
         squares = []
         for trial in self.trials.tolist():
             places = [place[column] for column in trial if column in place]
-            levels, *_ = np.linalg.lstsq(
-                training_rest[:, places], training_rest[:, -1], RANK_TOLERANCE
-            )
-            errors = test_rest[:, -1] - test_rest[:, places] @ levels
-            squares.append(scale[-1] ** 2 * np.sum(errors**2))
+            friction = remainder[:, places]
+            levels, *_ = np.linalg.lstsq(friction, forces, RANK_TOLERANCE)
+            squares.append(np.sum((forces - friction @ levels) ** 2))
         return np.array(squares)
 
 
