@@ -17,11 +17,19 @@ from jaxid.robot.robot import Robot
 from .filtered_log import GRID_RATE, FilteredLog, Motion
 from .row_fits import Judge, RowFit, Rows
 
-WIDTH_SHARES = (0.003, 0.01, 0.03, 0.1)
-"""Speeds of the transition of dry friction that are tried, over the largest speeds."""
+WIDTH_SHARES = np.array([0.003, 0.01, 0.03, 0.1])
+"""Speeds of transitions of dry friction, over the largest speed of each joint.
 
-BRAKING = slice(1, 4)
-"""Columns of friction that take power: viscous, dry and broad."""
+Their columns together have all transitions between; one alone could not be chosen from
+a log that is described wrongly.
+"""
+BRAKING = slice(0, 6)
+"""Columns of friction that take power: viscous, dry and by load."""
+MAX_FRICTION_SHARE = 0.85
+"""Share of the squared forces along the motion above which a force is friction alone.
+
+A column of friction by load is then the force itself, whatever its sign.
+"""
 
 
 class Geometry(NamedTuple):
@@ -83,17 +91,11 @@ class DescribedLog:
         self.judge = Judge(log.is_moving, log.folds)
         self._body_columns = _BodyColumns(robot)
         self._body_rows = log.rows_of(self.samples_of_bodies(log.motion))
-        self._width_share = self._best_width_share()
+        forces = log.forces
+        friction_squares = np.sum(np.sign(log.motion.qd) * forces * np.abs(forces), 0)
+        friction_shares = friction_squares / (np.sum(forces**2, axis=0) + 1e-300)
+        self._has_load_friction = np.abs(friction_shares) < MAX_FRICTION_SHARE
         self.rows = self.with_forces(log.forces)
-
-    def _best_width_share(self) -> float:
-        """Return the transition of dry friction that leaves least."""
-        scores = {}
-        for share in WIDTH_SHARES:
-            self._width_share = share
-            rows = self.with_forces(self.log.forces)
-            scores[share] = self.judge.fit(rows).score
-        return min(scores, key=scores.__getitem__)
 
     def samples_of_bodies(
         self, motion: Motion, geometry: Geometry | None = None
@@ -108,17 +110,16 @@ class DescribedLog:
 
         The derivative of the dry friction imitates what a joint yields before it slips.
         """
-        widths = self._width_share * np.maximum(np.abs(motion.qd).max(axis=0), 1e-9)
-        dry = np.tanh(motion.qd / widths)
-        broad = np.tanh(motion.qd / (4 * widths))
+        widths = WIDTH_SHARES[:, None] * np.abs(motion.qd).max(axis=0) + 1e-9
+        dry = np.tanh(motion.qd / widths[:, None])
+        sharp_dry = dry[1]
         shapes = [
-            motion.qdd,
             motion.qd,
-            dry,
-            broad,
-            np.ones_like(dry),
-            dry * np.abs(forces),
-            self.log.derivative(dry),
+            *dry,
+            sharp_dry * np.abs(forces) * self._has_load_friction,
+            motion.qdd,
+            np.ones_like(sharp_dry),
+            *(self.log.derivative(x) for x in (sharp_dry, dry[-1])),
         ]
         if self._has_springs:
             shapes.append(motion.q)
@@ -137,8 +138,7 @@ class DescribedLog:
     def with_motion(self, motion: Motion, geometry: Geometry | None = None) -> Rows:
         """Return the rows with another motion, and perhaps another geometry."""
         body_rows = self.log.rows_of(self.samples_of_bodies(motion, geometry))
-        friction = self.samples_of_friction(motion, self.log.forces)
-        return Rows(self._joined(body_rows, friction), self.log.force_rows)
+        return self._rows(body_rows, motion, self.log.forces)
 
     def with_geometry(self, geometry: Geometry) -> Rows:
         """Return the rows with another geometry."""
@@ -146,25 +146,23 @@ class DescribedLog:
 
     def with_forces(self, forces: np.ndarray) -> Rows:
         """Return the rows with other forces on the grid."""
-        friction = self.samples_of_friction(self.log.motion, forces)
-        columns = self._joined(self._body_rows, friction)
-        return self._of_same_size(Rows(columns, self.log.rows_of(forces)))
+        return self._rows(self._body_rows, self.log.motion, forces)
 
     def with_motion_and_forces(self, motion: Motion, forces: np.ndarray) -> Rows:
         """Return the rows with another motion and other forces."""
         body_rows = self.log.rows_of(self.samples_of_bodies(motion))
-        friction = self.samples_of_friction(motion, forces)
-        columns = self._joined(body_rows, friction)
-        return self._of_same_size(Rows(columns, self.log.rows_of(forces)))
+        return self._rows(body_rows, motion, forces)
 
-    def _of_same_size(self, rows: Rows) -> Rows:
-        """Return rows of the same least squares whose RMS forces are the log's.
+    def _rows(self, body_rows: np.ndarray, motion: Motion, forces: np.ndarray) -> Rows:
+        """Return rows of a motion and forces, with the RMS forces of the log.
 
         The errors of small forces would be small whatever the description.
         """
+        columns = self._joined(body_rows, self.samples_of_friction(motion, forces))
+        force_rows = self.log.rows_of(forces)
         sizes = np.sqrt(np.mean(self.log.force_rows**2, axis=0))
-        ratios = sizes / np.maximum(np.sqrt(np.mean(rows.forces**2, axis=0)), 1e-300)
-        return Rows(rows.columns * ratios[:, None], rows.forces * ratios)
+        ratios = sizes / np.maximum(np.sqrt(np.mean(force_rows**2, axis=0)), 1e-300)
+        return Rows(columns * ratios[:, None], force_rows * ratios)
 
     def without_gravity_and_coriolis(self) -> Rows:
         """Return the rows if the forces contain neither gravity nor Coriolis terms."""
@@ -172,8 +170,7 @@ class DescribedLog:
         geometry = self.geometry._replace(gravity=np.zeros(3))
         resting = Motion(q, np.zeros_like(qd), qdd)
         body_rows = self.log.rows_of(self.samples_of_bodies(resting, geometry))
-        friction = self.samples_of_friction(self.log.motion, self.log.forces)
-        return Rows(self._joined(body_rows, friction), self.log.force_rows)
+        return self._rows(body_rows, self.log.motion, self.log.forces)
 
     def with_added_forces(self, force_rows: np.ndarray) -> Rows:
         """Return the rows with something added to the forces that was taken out."""
@@ -184,20 +181,18 @@ class DescribedLog:
 
         It is positive, unless the sign of the joint's force or angle is wrong.
         """
-        joints = rows.forces.shape[1]
+        row_count, joints = rows.forces.shape
         body_count = self._body_rows.shape[2]
-        friction_columns = rows.columns[:, :, body_count:]
-        shapes = friction_columns.shape[2] // joints
-        parameters = fit.parameters[body_count:].reshape(joints, shapes)
-        powers = np.zeros(joints)
-        for j in range(joints):
-            columns = friction_columns[:, j, shapes * j : shapes * (j + 1)]
-            braking_forces = columns[:, BRAKING] @ parameters[j, BRAKING]
-            speeds = columns[:, 1]
-            force_square = np.mean(rows.forces[:, j] ** 2)
-            size = np.sqrt(force_square * np.mean(speeds**2))
-            powers[j] = np.mean(braking_forces * speeds) / max(size, 1e-300)
-        return powers
+        columns = rows.columns[:, :, body_count:]
+        diagonal = np.arange(joints)
+        square_columns = columns.reshape(row_count, joints, joints, -1)
+        own_columns = square_columns[:, diagonal, diagonal]
+        parameters = fit.parameters[body_count:].reshape(joints, -1)
+        speeds = own_columns[..., 0]
+        braking_forces = np.sum((own_columns * parameters)[..., BRAKING], axis=2)
+        powers = np.mean(braking_forces * speeds, axis=0)
+        sizes = np.mean(rows.forces**2, axis=0) * np.mean(speeds**2, axis=0)
+        return powers / np.sqrt(sizes + 1e-300)
 
     @cached_property
     def _sample_columns(self) -> np.ndarray:

@@ -1,7 +1,6 @@
 """Diagnosis of a log: sentences on wrong units, signs, channels, sensors and delays."""
 
 import dataclasses
-import re
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -26,18 +25,12 @@ from jaxid.result_table import (
 )
 from jaxid.robot.robot import Robot
 
+from .clipped_forces import clipped_forces, limited_forces
+from .clock import clock_finding, held_forces
 from .limit_checks import LogStatistics, limit_findings
 from .mistake_search import find_mistakes
-from .sensor_checks import (
-    channel_findings,
-    clock_findings,
-    stuck_findings,
-)
+from .sensor_checks import channel_findings, constant_forces
 
-INSTANTS = 300
-"""Number of instants of a log that tell the power of friction."""
-MIN_DEVIATIONS = 3.0
-"""Standard deviations beyond which a sign is certain."""
 MAX_SAMPLES = 2**17
 """Largest number of samples of a long log that are examined."""
 
@@ -57,6 +50,7 @@ class Diagnosis(Summarised):
             part; None if no part is long enough.
         excerpt: Samples of single channels, of a long log a part.
         notes: Remarks on how the log was examined, as sentences.
+        commands: Excerpt with the commanded angles as angles; None if not known.
     """
 
     log: Recording | Observations
@@ -67,6 +61,7 @@ class Diagnosis(Summarised):
     observations: Observations | None
     excerpt: Recording
     notes: tuple[str, ...] = ()
+    commands: Recording | None = None
 
     def with_fit(self, fit: Fit, bodies: np.ndarray | None = None) -> "Diagnosis":
         """Return the diagnosis with findings of a fit to this log alone.
@@ -74,10 +69,8 @@ class Diagnosis(Summarised):
         The inertial parameters of the robot's file are in `bodies`.
         """
         mistakes = _mistakes([self], fit, bodies)
-        fit_findings = mistakes.certain
+        fit_findings = (*mistakes.certain, *mistakes.doubts)
         notes = (*self.notes, *mistakes.possible)
-        if not fit_findings and not self.faulty and self.observations is not None:
-            fit_findings = negative_friction(fit, [self.observations])
         findings = (*fit_findings, *self.findings)
         return dataclasses.replace(self, findings=findings, notes=notes)
 
@@ -146,6 +139,7 @@ def diagnose(
     *,
     observations: Observations | None = None,
     min_speed: Numbers | None = None,
+    commands: Recording | None = None,
     progress: Progress | None = None,
 ) -> Diagnosis:
     """Look for mistakes in a log: units, signs, order, sides, sensor faults and delays.
@@ -160,6 +154,7 @@ def diagnose(
         observations: Observations of the recording; filtered below a tenth of its
             sampling rate, and 20 Hz at most, if None.
         min_speed: Speed of each joint below which rows do not count [rad/s or m/s].
+        commands: The log with the commanded angles as angles, if they are known.
         progress: Callback, called with the completed fraction (0 to 1).
 
     Raises:
@@ -171,18 +166,24 @@ def diagnose(
     statistics = _statistics(examined_log.all_observations, robot.joints, progress)
     faults = channel_findings(robot, excerpt, statistics)
     faulty_joints = tuple(dict.fromkeys(joint for joint, _ in faults))
-    lost_rows = clock_findings(excerpt)
+    clock_text = clock_finding(excerpt)
     findings = [
         *dict.fromkeys(text for _, text in faults),
-        *lost_rows,
+        *([clock_text] if clock_text else []),
         *limit_findings(robot, statistics, faulty_joints),
-        *stuck_findings(robot, excerpt, faulty_joints),
+        *constant_forces(robot, excerpt),
+        *held_forces(robot, excerpt),
+    ]
+    limit_notes = [
+        f"{force.sentence(robot)}: a drive at its limit."
+        for force in limited_forces(excerpt)
+        if force.joint not in faulty_joints
     ]
     rate = 1.0 / excerpt.sample_time
     if not 5.0 <= rate <= 5e4:
         cure = "check `recording.time_unit` or `sample_time`."
         findings.append(f"the log has {rate:.3g} samples in a second: {cure}")
-    if lost_rows:
+    if clock_text:
         faulty_joints = tuple(range(robot.joints))
     diagnosis = Diagnosis(
         log,
@@ -192,7 +193,8 @@ def diagnose(
         faulty_joints,
         examined_log.observations,
         excerpt,
-        examined_log.notes,
+        (*examined_log.notes, *limit_notes),
+        commands,
     )
     return diagnosis if fit is None else diagnosis.with_fit(fit)
 
@@ -268,13 +270,15 @@ class LogMistakes(NamedTuple):
     """Mistakes in logs or their robot, as sentences.
 
     Attributes:
-        certain: Mistakes, and moments unlike the model.
+        certain: Mistakes, contacts, and that the model does not fit.
         possible: Mistakes that explain only a part of what the model misses.
+        doubts: What fits, but needs a look.
         delay: Delay of all forces; None where no mistakes were looked for.
     """
 
     certain: tuple[str, ...] = ()
     possible: tuple[str, ...] = ()
+    doubts: tuple[str, ...] = ()
     delay: Delay | None = None
 
 
@@ -285,42 +289,49 @@ def mistakes_in_logs(
 
     The inertial parameters of the robot's file are in `bodies`, if it states some.
     """
-    logs = [
-        diagnosis.observations
-        for diagnosis in diagnoses
-        if diagnosis.observations is not None
-    ]
-    friction = (
-        ()
-        if any(diagnosis.faulty for diagnosis in diagnoses)
-        else negative_friction(fit, logs)
-    )
-    name = f"{diagnoses[0].log.name}: " if len(diagnoses) == 1 else ""
     mistakes = _mistakes(diagnoses, fit, bodies)
-    certain = (f"{name}{text}" for text in mistakes.certain)
-    possible = (f"{name}{text}" for text in mistakes.possible)
-    return LogMistakes((*friction, *certain), tuple(possible), mistakes.delay)
+    if len(diagnoses) > 1:
+        return mistakes
+    name = diagnoses[0].log.name
+    certain = tuple(f"{name}: {text}" for text in mistakes.certain)
+    possible = tuple(f"{name}: {text}" for text in mistakes.possible)
+    doubts = tuple(f"{name}: {text}" for text in mistakes.doubts)
+    return LogMistakes(certain, possible, doubts, mistakes.delay)
 
 
 def _mistakes(
     diagnoses: Sequence[Diagnosis], fit: Fit, bodies: np.ndarray | None
 ) -> LogMistakes:
-    """Return the mistake that explains most, or else moments unlike the model."""
+    """Return the mistake that explains most, and what only a model reveals."""
+    model = fit.base.model
     recordings = []
-    moments = []
+    commands = []
+    doubts = []
     for diagnosis in diagnoses:
         observations = diagnosis.observations
         # Faults of channels explain the rest.
-        if observations is not None and not diagnosis.faulty:
-            recording = diagnosis.excerpt
-            recordings.append(dataclasses.replace(recording, name=observations.name))
-            name = f"{observations.name}: " if len(diagnoses) > 1 else ""
-            moments += [f"{name}{text}" for text in departures(fit, observations)]
+        if observations is None or diagnosis.faulty:
+            continue
+        log_name = observations.name
+        recording = dataclasses.replace(diagnosis.excerpt, name=log_name)
+        recordings.append(recording)
+        if diagnosis.commands is not None:
+            commands.append(diagnosis.commands)
+        name = f"{log_name}: " if len(diagnoses) > 1 else ""
+        limits = list(limited_forces(recording))
+        doubts += [
+            f"{name}{force.sentence(model.robot)}, and the model needs more: the "
+            "sensor or the log cuts off; leave that part out (`recording.stop`)."
+            for force in clipped_forces(model, recording, limits)
+        ]
     if not recordings:
         return LogMistakes()
-    mistakes = find_mistakes(fit.base.model, recordings, bodies)
-    certain = mistakes.explained or tuple(moments) or mistakes.unexplained
-    return LogMistakes(certain, mistakes.possible, mistakes.delay)
+    if len(commands) < len(recordings):
+        commands = []
+    mistakes = find_mistakes(model, recordings, bodies, commands)
+    certain = mistakes.explained or mistakes.unexplained
+    doubts = (*mistakes.doubts, *doubts)
+    return LogMistakes(certain, mistakes.possible, doubts, mistakes.delay)
 
 
 def _excerpt(log: Observations, source: SamplesOnDisk) -> Recording:
@@ -354,84 +365,3 @@ def _excerpt(log: Observations, source: SamplesOnDisk) -> Recording:
         stamp_deviation=0.0 if columns.sample_time is None else None,
         angle_unit=columns.angle_symbol,
     )
-
-
-def departures(fit: Fit, observations: Observations) -> tuple[str, ...]:
-    """Report forces that depart far from the model at one moment only.
-
-    Such a departure exceeds half of its joint's RMS force, and lasts a hundredth of the
-    log at most, beside what the filter spreads. Uncertain parameters do not explain it:
-    where they matter more than usual errors, the motion is one that the fit does not
-    know.
-    """
-    o = observations
-    robot = fit.base.model.robot
-    motion = o.motion[o.instants]
-    forces = np.asarray(o.reduced_forces)
-    predicted_forces = fit.predict(motion) + fit.base.tool_forces(motion)
-    errors = np.abs(forces - predicted_forces) * o.mask
-    rms_forces = np.sqrt(np.mean(forces**2, axis=0))
-    length = o.filter.edge(o.sample_time) + 0.01 * o.samples
-    findings = []
-    for j, (name, error) in enumerate(zip(robot.joint_names, errors.T, strict=True)):
-        k = int(np.argmax(error))
-        is_elsewhere = np.abs(o.instants - o.instants[k]) > length
-        usual_error = error[is_elsewhere].max(initial=0.0)
-        row = np.asarray(fit.base.regressor(motion[k]))[j]
-        deviation = _deviation(fit, row)
-        min_departure = max(0.5 * rms_forces[j], 5.0 * (deviation + usual_error))
-        if deviation <= usual_error and error[k] > min_departure:
-            findings.append(
-                f"the force of joint `{name}` departs from the model by {error[k]:.3g} "
-                f"{robot.force_unit(j)} at {o.time[o.instants[k]]:.5g} s, and at no "
-                "other time by a fifth of that: a contact or a fault of a sensor; "
-                "leave that part out (`recording.start`, `recording.stop`)."
-            )
-    return tuple(findings)
-
-
-def _deviation(fit: Fit, row: np.ndarray) -> float:
-    """Return a parameter combination's standard deviation; infinite if undetermined."""
-    columns = np.flatnonzero(row)
-    covariance = np.asarray(fit.covariance)[np.ix_(columns, columns)]
-    if not np.isfinite(covariance).all():
-        return np.inf
-    return float(np.sqrt(row[columns] @ covariance @ row[columns]))
-
-
-def negative_friction(fit: Fit, logs: Sequence[Observations]) -> tuple[str, ...]:
-    """Report joints that friction drives, beyond doubt: the model or a log is wrong.
-
-    A single parameter may be negative, as where friction falls with speed. Velocities
-    count less their mean: in one direction dry friction cannot be told from an offset
-    of the force.
-    """
-    base = fit.base
-    robot = fit.base.model.robot
-    parameters = np.asarray(fit.parameters)
-    motions = [log.motion[log.instants[:: -(-log.rows // INSTANTS)]] for log in logs]
-    rows = [base.regressor_rows(motion) for motion in motions]
-    findings = []
-    for j, (name, own_columns) in enumerate(
-        zip(robot.joint_names, base.acting_columns, strict=True)
-    ):
-        friction = [
-            k
-            for k, i in enumerate(own_columns)
-            if re.fullmatch(rf"f(?!o)[a-z]+{j + 1}", base.names[i])
-        ]
-        power = np.zeros(base.size)
-        columns = [own_columns[k] for k in friction]
-        for motion, motion_rows in zip(motions, rows, strict=True):
-            velocity = np.asarray(motion.qd)[:, j]
-            power[columns] += (velocity - velocity.mean()) @ motion_rows[j][:, friction]
-        if power @ parameters < -MIN_DEVIATIONS * _deviation(fit, power):
-            parameter_names = " and ".join(
-                base.names[i] for i in columns if parameters[i] < 0
-            )
-            findings.append(
-                f"friction of joint `{name}` comes out negative ({parameter_names}): "
-                "it would drive the joint; something in the model or the log of this "
-                "joint is wrong."
-            )
-    return tuple(findings)

@@ -79,8 +79,8 @@ class Judge:
         score = self.score(squares)
         return RowFit(parameters, errors, weights, squares, score, factor, scales)
 
-    def unseen_score(self, rows: Rows) -> float:
-        """Return the score with errors in parts that were left out of the fit."""
+    def unseen_squares(self, rows: Rows) -> np.ndarray:
+        """Return the mean squared errors in parts that were left out of the fit."""
         weights = self.mask * self.fit(rows).weights
         errors = np.zeros_like(rows.forces)
         for fold in range(FOLDS):
@@ -89,7 +89,7 @@ class Judge:
             parameters, *_ = _solution(training_rows, weights[~is_unseen])
             predictions = rows.columns[is_unseen] @ parameters
             errors[is_unseen] = rows.forces[is_unseen] - predictions
-        return self.score(self.mean_squares(errors * self.mask, rows.forces))
+        return self.mean_squares(errors * self.mask, rows.forces)
 
     def mean_squares(self, errors: np.ndarray, forces: np.ndarray) -> np.ndarray:
         """Return the mean squared error of each joint, not below the floor."""
@@ -120,32 +120,21 @@ def _solution(
     return scaled / scales, factor, scales
 
 
-class Screening(NamedTuple):
-    """Promise of one more column.
-
-    Attributes:
-        gain: Fall of the score.
-        amount: Parameter of the column.
-    """
-
-    gain: float
-    amount: float
-
-
-def screen(judge: Judge, rows: Rows, fit: RowFit, column: np.ndarray) -> Screening:
-    """Return what one more column [rows, joints] would bring to a fit."""
-    weights = judge.mask * fit.weights
-    matrix = (rows.columns * weights[..., None]).reshape(-1, rows.columns.shape[-1])
-    vector = (column * weights).ravel()
-    products = matrix.T @ vector / fit.scales
-    explained = linalg.cho_solve(fit.factor, products, check_finite=False) / fit.scales
-    remainder = vector - matrix @ explained
-    square = remainder @ remainder
-    # The fit can imitate the column.
-    if square < 1e-6 * max(vector @ vector, 1e-300):
-        return Screening(0.0, 0.0)
-    errors = (fit.errors * weights).ravel()
-    amount = float(remainder @ errors / square)
-    remaining_errors = (errors - amount * remainder).reshape(rows.forces.shape)
+def promise(judge: Judge, rows: Rows, fit: RowFit, columns: np.ndarray) -> float:
+    """Return by how much more columns [rows, joints, columns] would lower the score."""
+    weights = (judge.mask * fit.weights)[..., None]
+    matrix = (rows.columns * weights).reshape(-1, rows.columns.shape[-1])
+    vectors = (columns * weights).reshape(-1, columns.shape[-1])
+    scales = fit.scales[:, None]
+    products = matrix.T @ vectors / scales
+    imitations = linalg.cho_solve(fit.factor, products, check_finite=False) / scales
+    remainders = vectors - matrix @ imitations
+    # What the fit can imitate tells nothing.
+    remainder_squares = np.sum(remainders**2, axis=0)
+    column_squares = np.sum(vectors**2, axis=0)
+    remainders = remainders[:, remainder_squares > 1e-6 * column_squares]
+    errors = (fit.errors * weights[..., 0]).ravel()
+    amounts, *_ = np.linalg.lstsq(remainders, errors, rcond=1e-6)
+    remaining_errors = (errors - remainders @ amounts).reshape(rows.forces.shape)
     squares = judge.mean_squares(remaining_errors / fit.weights, rows.forces)
-    return Screening(fit.score - judge.score(squares), amount)
+    return fit.score - judge.score(squares)

@@ -28,14 +28,16 @@ UNIT_FACTORS = {
     "rev": {"rad, not in rev": 0.5 / math.pi},
 }
 """Units that angles may have instead of that of their file, and factors to them."""
-NO_UNIT = (
-    "the angles of the log seem to be in no unit with a name, roughly {} (`recording."
-    "angle_unit` takes numbers, beside `angle_offsets`; or `drives.gear_ratios`)"
+UNIT_START = "the angles of the log seem to be in "
+"""Begin of all sentences about units of angles."""
+NO_UNIT_TEXT = (
+    UNIT_START + "no unit with a name, roughly {} (`recording.angle_unit` takes "
+    "numbers, beside `angle_offsets`; or `drives.gear_ratios`)"
 )
 UNIT_TEXTS = {
-    1.0: "the angles of the log seem to be in {} (`recording.angle_unit`)",
-    0.95: NO_UNIT,
-    1.05: NO_UNIT,
+    1.0: UNIT_START + "{} (`recording.angle_unit`)",
+    0.95: NO_UNIT_TEXT,
+    1.05: NO_UNIT_TEXT,
 }
 """Mistakes, by the multiple of a unit's factor that leaves least of the forces."""
 
@@ -323,24 +325,20 @@ class SuspectedMistakes:
             described_log.without_gravity_and_coriolis,
         )
         if self._bodies is not None:
-            yield from self._subtracted_predictions(self._bodies)
+            yield self._subtracted_gravity(self._bodies)
 
-    def _subtracted_predictions(self, bodies: np.ndarray) -> Iterator[Suspect]:
-        """Yield what a controller that knows the file's bodies may have subtracted."""
+    def _subtracted_gravity(self, bodies: np.ndarray) -> Suspect:
+        """Return that a controller which knows the file's bodies subtracts gravity."""
         described_log = self._log
-        q, qd, qdd = described_log.log.motion
-        zeros = np.zeros_like(qd)
-        parts = {"gravity": Motion(q, zeros, zeros), "forces": Motion(q, qd, qdd)}
-        for what, motion in parts.items():
-            samples = described_log.samples_of_bodies(motion) @ bodies.ravel()
-            added = described_log.log.rows_of(samples)
-            sentence = (
-                f"the {what} of the file's bodies seem to have been subtracted from "
-                "the forces, by the log or the drive"
-            )
-            yield Suspect(
-                sentence, lambda added=added: described_log.with_added_forces(added)
-            )
+        q, qd, _ = described_log.log.motion
+        rest = np.zeros_like(qd)
+        samples = described_log.samples_of_bodies(Motion(q, rest, rest))
+        force_rows = described_log.log.rows_of(samples @ bodies.ravel())
+        return Suspect(
+            "the gravity of the file's bodies seems to have been subtracted from the "
+            "forces, by the log or the drive",
+            lambda: described_log.with_added_forces(force_rows),
+        )
 
     def _filters(self) -> Iterator[Suspect]:
         every_joint = tuple(self._joints)

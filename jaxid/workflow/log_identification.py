@@ -155,8 +155,11 @@ def identify_logs(
         fit, parts.every, progress=partial(progress, "predicting torques")
     )
     notes = [note for part in parts.every for note in part.notes]
+    for diagnosis in diagnoses:
+        notes += [f"{diagnosis.log.name}: {note}" for note in diagnosis.notes]
     notes += resolution_notes(fit, fitted_logs)
     notes += mistakes.possible
+    doubts = [text for log in loaded_logs for text in log.findings]
     claims = errors_of_claims(setup, fit, parts.every)
     return IdentificationReport(
         fit,
@@ -172,7 +175,7 @@ def identify_logs(
             "min_speed": setup.min_speed,
         },
         notes=(*setup.notes, *dict.fromkeys(notes)),
-        doubts=[text for log in loaded_logs for text in log.findings],
+        doubts=[*doubts, *mistakes.doubts],
         mistakes=mistakes.certain,
         claimed=claims.errors,
         claimed_bodies=claims.bodies,

@@ -123,6 +123,19 @@ def read_commands(setup: Setup, log: Path, columns: Columns) -> Recording:
     return dataclasses.replace(recording, forces=command_angles, notes=notes)
 
 
+def commanded_log(setup: Setup, log: Path, columns: Columns) -> Recording | None:
+    """Return a log with the commanded angles in place of the measured ones.
+
+    None if their columns are not named, or the log is long.
+    """
+    if setup.reading.commands is None or is_long(log):
+        return None
+    command_columns = dataclasses.replace(
+        columns, angles=setup.reading.commands, velocities=None
+    )
+    return read_log(setup, log, command_columns)
+
+
 def is_long(log: Path) -> bool:
     """Return whether a log is better read part by part than as a whole."""
     return estimated_rows(log) >= LONG_LOG_ROWS
@@ -181,7 +194,12 @@ def load_log(
         recording = dataclasses.replace(recording, name=name)
     progress(f"filtering {path.name}", 0.0)
     observations = setup.observe(recording)
-    diagnosis = diagnose(recording, setup.robot, observations=observations)
+    diagnosis = diagnose(
+        recording,
+        setup.robot,
+        observations=observations,
+        commands=commanded_log(setup, path, columns),
+    )
     observations = observations.replace(notes=(*observations.notes, *notes))
     return LoadedLog(observations, diagnosis)
 

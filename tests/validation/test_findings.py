@@ -9,12 +9,10 @@ from jaxid.measurement.recording import Recording
 from jaxid.robot.library import panda
 from jaxid.robot.limits_and_drives import Drives
 from jaxid.trajectory.fourier import random_fourier_series
+from jaxid.validation.clipped_forces import limited_forces
+from jaxid.validation.clock import clock_finding, held_forces
 from jaxid.validation.diagnosis import diagnose
-from jaxid.validation.sensor_checks import (
-    channel_findings,
-    clock_findings,
-    stuck_findings,
-)
+from jaxid.validation.sensor_checks import channel_findings, constant_forces
 
 ROBOT = panda().replace(drives=Drives(7, reduction=[100.0, -100, 100, 100, 50, 50, 50]))
 DT = 0.005
@@ -29,10 +27,6 @@ def faults(angles=Q, forces=TAU, **more):
     return channel_findings(ROBOT, Recording.of(angles, forces, sample_time=DT, **more))
 
 
-def stuck(forces, angles=Q):
-    return stuck_findings(ROBOT, Recording.of(angles, forces, sample_time=DT))
-
-
 def changed(x, rows, value):
     x = x.copy()
     x[rows, 2] = value
@@ -43,7 +37,7 @@ def changed(x, rows, value):
 def test_sane_logs_have_none_however_coarse(count):
     angles = count * np.round(Q / count) if count else Q
     forces = 0.3 * np.round(TAU / 0.3) if count else TAU
-    assert faults(angles, forces) == stuck(forces) == []
+    assert faults(angles, forces) == []
     assert faults(angles[:100], forces[:100]) == []
 
 
@@ -113,55 +107,89 @@ def test_fast_motors_and_gaps_are_no_faults():
 
 @pytest.mark.parametrize("step", [0.5, 2.0, 5.0])
 def test_coarse_steps_of_forces_are_no_limits(step):
-    assert stuck(step * np.round(TAU / step)) == []
+    log = Recording.of(Q, step * np.round(TAU / step), sample_time=DT)
+    assert list(limited_forces(log)) == constant_forces(ROBOT, log) == []
 
 
 @pytest.mark.parametrize("level", [0.7, 0.9])
-def test_forces_that_are_cut_off_are_recognised(level):
+def test_forces_that_are_cut_off_are_a_remark(level):
     forces = 0.01 * np.round(TAU / 0.01)
     top = level * forces[:, 2].max()
     forces[:, 2] = np.minimum(forces[:, 2], top)
-    (said,) = stuck(forces)
-    assert f"the forces of joint `{NAME}` stay at {top:.3g} in " in said
-    (said,) = stuck(changed(TAU, slice(None), 1.25))
-    assert f"the forces of joint `{NAME}` are 1.25 throughout" in said
+    diagnosis = diagnose(Recording.of(Q, forces, sample_time=DT), ROBOT)
+    (note,) = diagnosis.notes
+    assert f"the forces of joint `{NAME}` stay at {top:.3g} in " in note
+    assert not any("stay at" in text for text in diagnosis.findings)
+    log = Recording.of(Q, changed(TAU, slice(None), 1.25), sample_time=DT)
+    (text,) = constant_forces(ROBOT, log)
+    assert f"the forces of joint `{NAME}` are 1.25 throughout" in text
     # A robot that holds still at its largest force is not cut off.
     moving, forces = Q.copy(), np.round(np.abs(TAU), 2)
     moving[1200:1800] = moving[1200]
     forces[1200:1800] = forces.max(axis=0) + 1.0
-    assert stuck(forces, moving) == []
+    assert list(limited_forces(Recording.of(moving, forces, sample_time=DT))) == []
 
 
-def lost(angles, **more):
-    return clock_findings(
-        Recording.of(angles, TAU[: len(angles)], sample_time=DT, **more)
-    )
+ROWS = np.arange(len(T))
+LATE = np.random.default_rng(2)
+CLOCKS = {
+    "even": (ROWS, ""),
+    "lost": (np.delete(ROWS, np.arange(50, 1900, 60)), "rows seem to be lost"),
+    "repeated": (
+        np.insert(ROWS, np.arange(50, 1900, 60), np.arange(50, 1900, 60)),
+        "rows seem to be repeated",
+    ),
+    "jittering": (ROWS + 0.5 * LATE.normal(size=len(ROWS)), "seems to jitter"),
+    "at half the rate": (2 * (ROWS // 2), ""),
+}
 
 
-@pytest.mark.parametrize("count", [0.0, 1e-4, 2e-3])
-def test_lost_and_repeated_rows_are_named_and_nothing_else(count):
-    angles = Q + 1e-5 * np.random.default_rng(0).normal(size=Q.shape)
-    angles = count * np.round(angles / count) if count else angles
-    assert lost(angles) == lost(np.repeat(angles, 2, axis=0)[: len(TAU)]) == []
-    if count < 1e-3:
-        (said,) = lost(np.delete(angles, [700, 900, 901], axis=0))
-        assert said.startswith("rows seem to be lost at 2 instants, first at 3.5 s")
-        (said,) = lost(np.insert(angles, 700, angles[699], axis=0)[: len(TAU)])
-        assert said.startswith("rows seem to be repeated at 1 instant, first at 3.5 s")
+@pytest.mark.parametrize("increment", [0.0, 1e-4])
+@pytest.mark.parametrize("name", CLOCKS)
+def test_rows_that_do_not_belong_to_their_times_are_named(name, increment):
+    rows, words = CLOCKS[name]
+    angles = np.array([np.interp(rows, ROWS, q) for q in Q.T]).T
+    angles = angles + 1e-6 * LATE.normal(size=angles.shape)
+    if increment:
+        angles = increment * np.round(angles / increment)
+    if name == "at half the rate":
+        angles = angles[rows]
+    forces = np.zeros_like(angles)
+    text = clock_finding(Recording.of(angles, forces, sample_time=DT))
+    assert words in text
+    assert bool(words) == bool(text)
+    if words:
+        assert "name the column of times" in text
+        # The cure is none where times are named.
+        time = DT * np.arange(len(angles))
+        text = clock_finding(Recording.of(angles, forces, time=time))
+        assert words in text
+        assert "name the column of times" not in text
 
 
-def test_stamps_that_are_late_lose_no_rows():
-    """A robot that samples evenly, and stamps late by up to a step now and then."""
-    late = np.zeros(len(T))
-    late[100::150] = 0.8 * DT
-    log = Recording.of(Q, TAU, time=T + late)
-    assert "give `sample_time`" in log.notes[-1]
-    assert clock_findings(log) == []
-    angles = Q + 1e-5 * np.random.default_rng(0).normal(size=Q.shape)
-    angles = np.delete(angles, 700, axis=0)
-    (said,) = clock_findings(Recording.of(angles, TAU[1:], time=T[1:]))
-    assert "lost at 1 instant" in said
-    assert "name the column" not in said
+def test_stamps_of_a_robot_that_samples_unevenly_are_right():
+    time = np.sort(T + 0.4 * DT * LATE.uniform(-1, 1, len(T)))
+    angles = np.array([np.interp(time, T, q) for q in Q.T]).T
+    assert clock_finding(Recording.of(angles, TAU, time=time)) == ""
+    text = clock_finding(Recording.of(Q, TAU, time=time))
+    assert "give `recording.sample_time`" in text or text == ""
+
+
+@pytest.mark.parametrize("count", [2e-3, 2 * np.pi / 2**13])
+def test_coarse_encoders_and_slow_motion_lose_no_rows(count):
+    angles = count * np.round(Q / count)
+    assert clock_finding(Recording.of(angles, TAU, sample_time=DT)) == ""
+    increments = np.round(1.03 * np.arange(len(Q)))
+    angles = 2 * np.pi / 2**17 * np.outer(increments, np.arange(7) == 0)
+    assert clock_finding(Recording.of(angles, TAU, sample_time=DT)) == ""
+
+
+def test_forces_that_are_updated_slowly_are_named():
+    forces = TAU.copy()
+    forces[:, 2] = np.repeat(TAU[::8, 2], 8)
+    (text,) = held_forces(ROBOT, Recording.of(Q, forces, sample_time=DT))
+    assert f"the force of joint `{NAME}` is held for 40 ms" in text
+    assert held_forces(ROBOT, Recording.of(Q, np.round(TAU), sample_time=DT)) == []
 
 
 def test_a_log_without_motion_is_one_sentence():
@@ -169,12 +197,6 @@ def test_a_log_without_motion_is_one_sentence():
     found = [text for text in diagnose(still, ROBOT).findings if "mov" in text]
     assert len(found) == 1
     assert "leave this log out" in found[0]
-
-
-def test_slow_motion_in_increments_of_an_encoder_loses_no_rows():
-    """Steps of one increment, at times of two: second differences are only rounding."""
-    increments = np.round(1.03 * np.arange(len(Q)))
-    assert lost(2 * np.pi / 2**17 * np.outer(increments, np.arange(7) == 0)) == []
 
 
 @pytest.mark.parametrize(
