@@ -442,10 +442,23 @@ def test_a_filter_is_chosen_from_a_list_and_the_report_shows_why(folder, words):
     text = EXPERIMENT.replace("cutoff = 10", "cutoff = [2.0, 10.0, 20.0]")
     (folder / "experiment.toml").write_text(text)
     said = words("identify", "experiment.toml", "a.csv", "--verify", "c.csv")
-    assert re.search(r"a cut-off of (10|20) Hz predicts held-out parts", said)
-    assert "2 Hz" in said
+    assert re.search(r"the logs are filtered at (10|20) Hz", said)
+    assert re.search(r"all in a band of [\d.]+ Hz: .*20 Hz", said)
     page = (folder / "report" / "report.html").read_text("utf-8")
-    assert "predicts held-out parts" in page
+    assert "the logs are filtered at" in page
+
+
+def test_a_filter_is_chosen_by_default_also_for_a_log_on_disk(
+    folder, words, monkeypatch
+):
+    text = EXPERIMENT.replace("cutoff = 10", "")
+    (folder / "experiment.toml").write_text(text)
+    in_memory = words("identify", "experiment.toml", "a.csv", "--split", "0.6")
+    monkeypatch.setattr("jaxid.workflow.log_loading.LONG_LOG_ROWS", 500)
+    on_disk = words("identify", "experiment.toml", "a.csv", "--split", "0.6")
+    choice = re.search(r"the logs are filtered at .*?%", in_memory)
+    assert choice is not None
+    assert choice[0] in on_disk
 
 
 @pytest.mark.parametrize(

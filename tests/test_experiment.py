@@ -137,7 +137,8 @@ def test_defaults_are_said(load):
     assert experiment.setup.min_speed is None
     assert experiment.columns is None
     assert experiment.setup.estimator.weights == jid.estimators.MaximumForces()
-    assert "10 Hz is assumed" in experiment.setup.notes[0]
+    cutoffs = [x.cutoff for x in experiment.setup.filter_candidates]
+    assert cutoffs == [10.0, 2.0, 3.5, 5.0]
 
 
 def test_limits_replace_those_of_the_robot_and_nan_keeps_them(load):
@@ -749,3 +750,14 @@ def test_another_tip_names_all_lists_and_the_command_that_writes_them(tmp_path):
     lists = write_template(tmp_path / "arm.urdf", tip="l1", folder=tmp_path)
     path.write_text(lists, encoding="utf-8")
     assert load_experiment(path).setup.robot.joints == 1
+
+
+def test_a_cutoff_is_chosen_unless_it_is_given(load):
+    setup = load(ARM + "[filter]\nkind = 'butterworth'\norder = 2\n").setup
+    assert [x.cutoff for x in setup.filter_candidates] == [10.0, 2.0, 3.5, 5.0]
+    assert {x.order for x in setup.filter_candidates} == {2}
+    given = dataclasses.replace(setup, filter=jid.ZeroPhaseButterworth(3.0))
+    assert given.filter_candidates == ()
+    assert jid.Setup(setup.model, filter=setup.filter).filter_candidates == ()
+    assert dataclasses.replace(setup, load_friction=True).filter_candidates
+    assert load(ARM + "[filter]\nkind = 'paper'\n").setup.filter_candidates == ()

@@ -18,6 +18,7 @@ from jaxid.experiment_file import TomlTable, within
 from jaxid.identification import estimators
 from jaxid.identification.consistency import BodyBounds
 from jaxid.identification.estimators_by_name import ESTIMATORS
+from jaxid.identification.filter_selection import USUAL_CUTOFFS
 from jaxid.identification.uncertainty import UNCERTAINTIES, AbstractUncertainty
 from jaxid.measurement import filters
 from jaxid.measurement.columns import Columns, with_lerobot_calibration
@@ -285,7 +286,8 @@ def build_filters(table: TomlTable) -> list[filters.AbstractFilter]:
     kind = decode_value(table.get("kind", ""), hint, "filter.kind")
     build = filters.FILTERS[kind]
     keys = {name: value for name, value in table.items() if name != "kind"}
-    cutoffs = keys.get("cutoff")
+    usual_cutoffs = list(USUAL_CUTOFFS) if kind == "butterworth" else None
+    cutoffs = keys.get("cutoff", usual_cutoffs)
     if not isinstance(cutoffs, list):
         return [call(build, keys, "filter")]
     if not cutoffs:

@@ -25,7 +25,6 @@ from jaxid.robot.description_files import is_mjcf
 from jaxid.robot.robot import Robot
 from jaxid.robot.urdf import joint_parameters, load_urdf
 from jaxid.units import Unit
-from jaxid.workflow.setup import DEFAULT_CUTOFF
 
 from .decoder import Key, keys_of
 from .experiment import TABLES
@@ -49,6 +48,8 @@ otherwise.
 #   jaxid identify experiment.toml log.csv -o report/   parameters and torque errors
 """
 SUMMARIES = {
+    "filter": "Filter of the logs. Without `cutoff` the logs choose it from 2, 3.5, 5 "
+    "and 10 Hz and what the motion suggests; from a list like `[5.0, 20.0]` likewise.",
     "load": "Known load that is on the robot in some logs only: "
     "`jaxid gains` finds the true forces.",
     "recording": f"Columns of the logs ({', '.join(READERS)}). "
@@ -103,7 +104,7 @@ def write_template(
             "angle_unit": _one_or_each(map(robot.joint_unit, range(robot.joints))),
             "force_unit": _one_or_each(map(robot.force_unit, range(robot.joints))),
         },
-        "filter": {"kind": "butterworth", "cutoff": DEFAULT_CUTOFF},
+        "filter": {"kind": "butterworth"},
         "estimator": {"kind": "consistent"},
     }
     sections = [HEAD.format(name=robot.name)]

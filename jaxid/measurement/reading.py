@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import cast
 
 import equinox as eqx
 import numpy as np
@@ -17,7 +18,7 @@ from .columns import Channels, Columns, Log, open_log
 from .filters import AbstractDecimation, AbstractFilter
 from .log_files import COMMENT, NO_NUMBER, Complaints, LogTable
 from .observations import Observations, Progress, prepare
-from .recording import Recording, consecutive
+from .recording import MIN_SAMPLES, Recording, consecutive
 from .samples import AbstractSamples, joined, joint_side
 from .time_grid import NeedsMemory, Range, Ranges, TimeGrid, find_grid
 from .time_series import hold_notes, is_sparse, join_channels, without_filling
@@ -380,6 +381,47 @@ def scan_log(
         min_speed,
         name,
         progress,
+    )
+
+
+def read_excerpt(log: Observations, max_samples: int, share: float = 1.0) -> Recording:
+    """Return stretches of a log on disk as recorded: from beginning, middle and end.
+
+    Args:
+        log: Result of `scan_log`.
+        max_samples: Largest number of samples of all stretches together.
+        share: Fraction of the log, its first part, from which they are taken.
+    """
+    source = cast(SamplesOnDisk, log.source)
+    dt = log.sample_time
+    samples = int(share * log.samples)
+    # With a filter of a long memory, one long stretch tells more than several short
+    # ones.
+    count = 4 if samples > max_samples >= 80 * log.filter.edge(dt) else 1
+    length = min(samples, max_samples) // count
+    parts = []
+    times = []
+    for start in np.linspace(0, samples - length, count).astype(int).tolist():
+        for (begin, end), time in zip(log.segments, log.start_times, strict=True):
+            a = max(begin, start)
+            b = min(end, start + length)
+            if b - a >= MIN_SAMPLES:
+                parts.append(source.read_rows(slice(a, b)))
+                times.append(time + dt * (np.arange(a, b) - begin))
+    angles, velocities, forces = zip(*parts, strict=True)
+    columns = source.log.columns
+    return Recording(
+        time=np.concatenate(times),
+        angles=np.concatenate(angles),
+        forces=np.concatenate(forces),
+        velocities=None if velocities[0] is None else np.concatenate(velocities),
+        angles_on_motor_side=columns.angles_on_motor_side,
+        forces_on_motor_side=columns.forces_on_motor_side,
+        segments=consecutive(map(len, times)),
+        sample_time=dt,
+        name=log.name,
+        stamp_deviation=0.0 if columns.sample_time is None else None,
+        angle_unit=columns.angle_symbol,
     )
 
 

@@ -12,8 +12,8 @@ from jaxid.identification.delay import Delay
 from jaxid.identification.fit_result import Fit
 from jaxid.measurement.filters import ZeroPhaseButterworth
 from jaxid.measurement.observations import Observations, Progress, observe
-from jaxid.measurement.reading import PART_SIZE, SamplesOnDisk
-from jaxid.measurement.recording import MIN_SAMPLES, Recording, consecutive
+from jaxid.measurement.reading import PART_SIZE, SamplesOnDisk, read_excerpt
+from jaxid.measurement.recording import Recording
 from jaxid.result_table import (
     MISSING,
     Column,
@@ -233,7 +233,7 @@ def _examined_log(
             "`log` holds filtered samples in memory, which show no faults of single "
             "channels: give the recording, and these as `observations`."
         )
-    excerpt = _excerpt(log, log.source)
+    excerpt = read_excerpt(log, MAX_SAMPLES)
     reason = ""
     try:
         observations = observe(excerpt, robot, log.filter, log.decimation, min_speed)
@@ -332,36 +332,3 @@ def _mistakes(
     certain = mistakes.explained or mistakes.unexplained
     doubts = (*mistakes.doubts, *doubts)
     return LogMistakes(certain, mistakes.possible, doubts, mistakes.delay)
-
-
-def _excerpt(log: Observations, source: SamplesOnDisk) -> Recording:
-    """Return stretches of a log as recorded: from its beginning, middle and end."""
-    dt = log.sample_time
-    # With a filter of a long memory, one long stretch tells more than several short
-    # ones.
-    count = 4 if log.samples > MAX_SAMPLES >= 80 * log.filter.edge(dt) else 1
-    length = min(log.samples, MAX_SAMPLES) // count
-    parts = []
-    times = []
-    for start in np.linspace(0, log.samples - length, count).astype(int).tolist():
-        for (begin, end), time in zip(log.segments, log.start_times, strict=True):
-            a = max(begin, start)
-            b = min(end, start + length)
-            if b - a >= MIN_SAMPLES:
-                parts.append(source.read_rows(slice(a, b)))
-                times.append(time + dt * (np.arange(a, b) - begin))
-    angles, velocities, forces = zip(*parts, strict=True)
-    columns = source.log.columns
-    return Recording(
-        time=np.concatenate(times),
-        angles=np.concatenate(angles),
-        forces=np.concatenate(forces),
-        velocities=None if velocities[0] is None else np.concatenate(velocities),
-        angles_on_motor_side=columns.angles_on_motor_side,
-        forces_on_motor_side=columns.forces_on_motor_side,
-        segments=consecutive(map(len, times)),
-        sample_time=dt,
-        name=log.name,
-        stamp_deviation=0.0 if columns.sample_time is None else None,
-        angle_unit=columns.angle_symbol,
-    )

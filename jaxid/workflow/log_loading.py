@@ -1,5 +1,6 @@
 """Logs of a setup: read, filtered and examined; one of many samples stays on disk."""
 
+import contextlib
 import dataclasses
 import os
 from collections.abc import Sequence
@@ -15,7 +16,7 @@ from jaxid.io import FilePath
 from jaxid.measurement.columns import Columns
 from jaxid.measurement.log_files import estimated_rows, is_bag_folder
 from jaxid.measurement.observations import Observations
-from jaxid.measurement.reading import read_recording, scan_log
+from jaxid.measurement.reading import read_excerpt, read_recording, scan_log
 from jaxid.measurement.recording import Recording, remove_delay
 from jaxid.measurement.time_grid import NeedsMemory
 from jaxid.robot.robot import Robot
@@ -29,6 +30,8 @@ LONG_LOG_ROWS = 500_000
 """Samples from which a log is read part by part."""
 BRIDGED_PERIODS = 0.1
 """Pause that is bridged in any case, in periods of the largest cut-off frequency."""
+MAX_CHOICE_SAMPLES = 60_000
+"""Samples by which a filter is chosen, in all logs together: a few CPU seconds."""
 MIN_SPEED_OF_MOTION = 1e-9
 """Speed below which a joint rests [rad/s or m/s]."""
 MIN_SAMPLE_TIME = 1e-6
@@ -212,23 +215,8 @@ def _load_in_parts(
     Raises:
         NeedsMemory: If it can be read as a whole only.
     """
-    reading = setup.reading
-    if reading.force_delay:
-        raise NeedsMemory("`recording.force_delay` shifts the angles of whole logs")
     progress(f"opening {path.name}", 0.0)
-    observations = scan_log(
-        path,
-        columns,
-        setup.robot,
-        setup.filter,
-        setup.decimation,
-        setup.min_speed,
-        name,
-        largest_gap=reading.largest_gap,
-        start=reading.start,
-        stop=reading.stop,
-        **reading.files(path),
-    )
+    observations = open_long_log(setup, path, columns, name)
     diagnosis = diagnose(
         observations,
         setup.robot,
@@ -243,6 +231,32 @@ def _load_in_parts(
     return LoadedLog(observations.replace(notes=notes), diagnosis)
 
 
+def open_long_log(
+    setup: Setup, path: Path, columns: Columns, name: str | None = None
+) -> Observations:
+    """Open a log that need not fit into memory.
+
+    Raises:
+        NeedsMemory: If it can be read as a whole only.
+    """
+    reading = setup.reading
+    if reading.force_delay:
+        raise NeedsMemory("`recording.force_delay` shifts the angles of whole logs")
+    return scan_log(
+        path,
+        columns,
+        setup.robot,
+        setup.filter,
+        setup.decimation,
+        setup.min_speed,
+        name,
+        largest_gap=reading.largest_gap,
+        start=reading.start,
+        stop=reading.stop,
+        **reading.files(path),
+    )
+
+
 def select_filter(
     setup: Setup,
     logs: Sequence[Path],
@@ -252,30 +266,24 @@ def select_filter(
 ) -> Setup:
     """Return the setup with the filter that suits some logs best; a note says why.
 
-    The last part of each log, the fraction `held_out`, stays unseen.
+    The last part of each log, the fraction `held_out`, stays unseen. Of many samples
+    only some are used.
     """
     if not setup.filter_candidates or not logs:
         return setup
-    long_log = next(filter(is_long, logs), None)
-    if long_log is not None:
-        raise InputError(
-            "one of several filters is to be chosen (a list as "
-            f"`filter.cutoff`), but `{long_log.name}` is long: "
-            "choose with a short part of it, and give that one filter for the whole."
-        )
-    recordings = []
-    for log in logs:
+    rows = sum(map(estimated_rows, logs))
+    step = max(1, round(rows / MAX_CHOICE_SAMPLES))
+    excerpts = []
+    for log in logs[::step]:
         progress(f"reading {log.name}", 0.0)
-        recording = read_log(setup, log, columns)
-        if held_out is not None:
-            recording, _ = recording.split(fitted_share(held_out))
-        recordings.append(recording)
+        excerpts.append(load_excerpt(setup, log, columns, held_out))
     choice = choose_filter(
         setup.base,
-        recordings,
-        [(candidate, setup.decimation) for candidate in setup.filter_candidates],
+        excerpts,
+        setup.filter_candidates,
         estimator=setup.unbounded_estimator,
         min_speed=setup.min_speed,
+        row_step=setup.decimation.factor,
         progress=partial(progress, "choosing the filter"),
     )
     return dataclasses.replace(
@@ -285,6 +293,25 @@ def select_filter(
         filter_candidates=(),
         notes=(*setup.notes, str(choice)),
     )
+
+
+def load_excerpt(
+    setup: Setup, log: Path, columns: Columns, held_out: float | None = None
+) -> Recording:
+    """Read a part of a log that is large enough for a choice between filters.
+
+    The last part of the log, the fraction `held_out`, stays unseen.
+    """
+    share = 1.0 if held_out is None else fitted_share(held_out)
+    if is_long(log):
+        with contextlib.suppress(NeedsMemory):
+            # Slow rows are masked later; here they would cost a pass over the log.
+            fast_setup = dataclasses.replace(setup, min_speed=None)
+            long_log = open_long_log(fast_setup, log, columns)
+            return read_excerpt(long_log, MAX_CHOICE_SAMPLES, share)
+    recording = read_log(setup, log, columns)
+    share = min(share, MAX_CHOICE_SAMPLES / recording.samples)
+    return recording if share == 1.0 else recording.split(share)[0]
 
 
 def fitted_share(held_out: float) -> float:

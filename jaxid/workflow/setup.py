@@ -33,6 +33,7 @@ from jaxid.identification.estimators import (
     LeastSquares,
     WeightedLeastSquares,
 )
+from jaxid.identification.filter_selection import USUAL_FILTERS
 from jaxid.identification.fit_result import Fit
 from jaxid.identification.friction_laws import (
     identify_nonlinear_friction,
@@ -48,7 +49,6 @@ from jaxid.measurement.filters import (
     AbstractDecimation,
     AbstractFilter,
     Subsample,
-    ZeroPhaseButterworth,
 )
 from jaxid.measurement.log_files import Selection
 from jaxid.measurement.observations import Observations, observe
@@ -60,18 +60,10 @@ from jaxid.robot.robot import Robot
 from .allowed_values import Bounds
 from .robot_file import RobotFile
 
-DEFAULT_CUTOFF = 10.0
-"""Cut-off frequency of the filter where none is given [Hz]."""
 MAX_LOAD_FRICTION_FITS = 10
 """Fits after which friction by load must have settled."""
 LOAD_FRICTION_TOLERANCE = 1e-3
 """Relative change of the friction by load, from fit to fit, that counts as none."""
-
-NO_FILTER = (
-    "no filter is given (table `[filter]`): "
-    f"a Butterworth low-pass at {DEFAULT_CUTOFF:g} Hz is assumed; "
-    "choose about five times the highest frequency of the motion."
-)
 
 Paths = Sequence[str | Path]
 """Paths of logs, and of folders of earlier reports."""
@@ -152,9 +144,11 @@ class Setup(eqx.Module):
         unknowns: Base parameters to identify; or their model, whose base parameters
             are then found when they are needed; or the robot: then its model has the
             effects that a file has by default (`default_terms`).
-        filter: Filter of motion, forces and columns; by default a zero-phase
-            Butterworth filter of 10 Hz.
-        filter_candidates: Filters of which the logs choose one instead.
+        filter: Filter of motion, forces and columns; by default the first candidate, a
+            zero-phase Butterworth filter of 10 Hz.
+        filter_candidates: Filters of which the logs choose one instead of the first of
+            them; none where another `filter` is given, by default those of
+            `choose_filter`.
         decimation: Decimation of forces and columns.
         min_speed: Speed of each joint below which its rows do not count [rad/s or m/s].
         estimator: Estimator; by default weighted least squares over bodies that can
@@ -195,15 +189,16 @@ class Setup(eqx.Module):
         """
         # Equinox converts fields after this method, which needs the model.
         self.unknowns = as_unknowns(self.unknowns)
-        notes = self.notes
         if self.filter is None:
-            self.filter = ZeroPhaseButterworth(DEFAULT_CUTOFF)
-            notes = (*notes, NO_FILTER)
+            self.filter_candidates = self.filter_candidates or USUAL_FILTERS
+            self.filter = self.filter_candidates[0]
+        elif self.filter not in self.filter_candidates[:1]:
+            # A filter that is given is kept.
+            self.filter_candidates = ()
         if self.least_squares is None:
             self.least_squares = WeightedLeastSquares()
         if self.estimator is None:
             self.estimator = PhysicallyConsistent(pull=pull_to_bodies(self.robot_file))
-        self.notes = notes
         if self.load_friction and not self.has_bounded_bodies:
             raise InputError(
                 "friction by load (`model.load`) needs the bodies that a physically "

@@ -49,7 +49,8 @@ class ZeroPhaseButterworth(AbstractFilter):
     differentiated twice. With an infinite `cutoff` nothing is filtered.
 
     Attributes:
-        cutoff: Cut-off of angles and velocities, of one direction as in scipy [Hz].
+        cutoff: Cut-off of angles and velocities, of one direction as in scipy [Hz],
+            like `10.0`.
         order: Order of one direction.
         force_cutoff: Cut-off of forces and columns [Hz], like `20.0`; `cutoff` if None;
             infinite if decimation alone shall limit their band.
