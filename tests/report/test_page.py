@@ -205,7 +205,7 @@ def test_a_joint_that_hardly_works_does_not_fail_a_model(errors_of):
 
 def test_errors_that_other_parameters_would_not_make_are_pointed_out(fit, validation):
     first, second = validation.errors
-    missed = dataclasses.replace(second, predicted=1.15 * np.asarray(second.measured))
+    missed = dataclasses.replace(second, predicted=1.2 * np.asarray(second.measured))
     found = judge(Report(fit, (first,), (missed,), validation.definiteness))
     (growth,) = (x for x in found.faults if "same model fitted" in x.text)
     assert growth.status is Status.DOUBTFUL
