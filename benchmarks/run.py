@@ -78,8 +78,6 @@ METHODS = (
     Script("faults", 25),
     Script("mutated_files", 6),
     Script("mutated_commands", 3),
-    Script("spoilt", 25),
-    Script("clean", 40),
     Script("delay", 40),
     Script("resolution", 10),
     Script("report", 1),

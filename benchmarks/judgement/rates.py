@@ -9,8 +9,8 @@ experiment with `jaxid init`, names columns and commands, and identifies with th
 `slips.py` on one kind of log of each machine. The limits of the search were set on the
 machines in `SETTING_KINDS`.
 
-A slip is named if a sentence with ✗ says what it is; it is told if any sentence with ✗
-or ! says more than what clean logs get.
+A slip is named if a sentence with ✗ or ! says what it is, possible if only a remark
+does; it is told if any other sentence with ✗ or ! says more than what clean logs get.
 """
 
 import argparse
@@ -29,18 +29,15 @@ from timing import Row
 SPOILT_KINDS = "plain", "Stribeck", "heavy friction", "pauses", "load friction"
 """Kinds of logs that are spoilt, one machine after the other."""
 USUAL = (
-    "some effect is not in the model",
-    "has not seen",
+    "the model misses",
+    "times those of the same model",
     "Errors depend on speed",
     "condition number",
     "NOT DETERMINED",
     "cannot be told apart",
     "physically consistent",
-    "Do not rely",
-    "A usable model",
-    "Estimates",
 )
-"""Parts of sentences that do not name a mistake."""
+"""Parts of sentences that tell how good a model is and what it determines."""
 
 
 def recorded(name, kind, seed, slip):
@@ -81,23 +78,30 @@ def judged(log, file, folder):
 
 
 def outcome(sentences, words):
-    """Return how a slip is treated: named, another, told or quiet."""
-    marked = [text for status, text in sentences if status in ("BAD", "DOUBTFUL")]
-    specific = [x for x in marked if not any(part in x for part in USUAL)]
-    if not specific:
-        return "quiet"
-    if any(word in text for text in specific for word in words):
+    """Return how a slip is treated: named, another, possible, told or quiet."""
+    marked = specific(sentences)
+    if any(word in text for text in marked for word in words):
         return "named"
-    return "another" if named_mistakes(sentences) else "told"
+    if named_mistakes(sentences):
+        return "another"
+    notes = [x for _, x in sentences if "possible, but not sure" in x]
+    if any(word in text for text in notes for word in words):
+        return "possible"
+    return "told" if marked else "quiet"
+
+
+def specific(sentences):
+    """Return the sentences with ✗ or ! that say more than how good a model is."""
+    return [
+        text
+        for status, text in sentences
+        if status in ("BAD", "DOUBTFUL") and not any(part in text for part in USUAL)
+    ]
 
 
 def named_mistakes(sentences):
-    """Return the sentences that name a mistake."""
-    return [
-        text
-        for _, text in sentences
-        if "seem" in text and not any(part in text for part in USUAL)
-    ]
+    """Return the sentences with ✗ or ! that name a mistake."""
+    return [text for text in specific(sentences) if "seem" in text]
 
 
 def tasks(options):
@@ -151,7 +155,7 @@ def main():
             result = outcome(sentences, slips.SLIPS[slip].words)
             spoilt[result] += 1
         marked = [x for status, x in sentences if status in ("BAD", "DOUBTFUL")]
-        notes = [x for x in notes if x.startswith("possible") or ": possible" in x]
+        notes = [x for x in notes if "possible, but not sure" in x]
         print(f"{name} | {kind} | {slip} | {result}", *marked, *notes, sep="\n    ")
         if options.lines:
             line = {"machine": name, "kind": kind, "slip": slip, "result": result}

@@ -25,11 +25,6 @@ a log that is described wrongly.
 """
 BRAKING = slice(0, 6)
 """Columns of friction that take power: viscous, dry and by load."""
-MAX_FRICTION_SHARE = 0.85
-"""Share of the squared forces along the motion above which a force is friction alone.
-
-A column of friction by load is then the force itself, whatever its sign.
-"""
 
 
 class Geometry(NamedTuple):
@@ -91,10 +86,6 @@ class DescribedLog:
         self.judge = Judge(log.is_moving, log.folds)
         self._body_columns = _BodyColumns(robot)
         self._body_rows = log.rows_of(self.samples_of_bodies(log.motion))
-        forces = log.forces
-        friction_squares = np.sum(np.sign(log.motion.qd) * forces * np.abs(forces), 0)
-        friction_shares = friction_squares / (np.sum(forces**2, axis=0) + 1e-300)
-        self._has_load_friction = np.abs(friction_shares) < MAX_FRICTION_SHARE
         self.rows = self.with_forces(log.forces)
 
     def samples_of_bodies(
@@ -116,7 +107,7 @@ class DescribedLog:
         shapes = [
             motion.qd,
             *dry,
-            sharp_dry * np.abs(forces) * self._has_load_friction,
+            sharp_dry * np.abs(forces),
             motion.qdd,
             np.ones_like(sharp_dry),
             *(self.log.derivative(x) for x in (sharp_dry, dry[-1])),

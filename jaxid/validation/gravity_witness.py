@@ -21,6 +21,7 @@ class WitnessLimits(NamedTuple):
     difference: float = 0.6
     absent: float = 0.25  # multiple below which there is hardly any gravity
     share: float = 0.15  # share of the forces from which gravity tells something
+    inertia: float = 0.12  # below which the robot swings without drives
 
 
 LIMITS = WitnessLimits()
@@ -39,16 +40,19 @@ class GravityWitness(NamedTuple):
         difference: RMS of the difference over RMS of the file's.
         multiple: Multiple of the file's that is nearest to that of the fit.
         share: RMS of the file's over RMS of the forces.
+        inertia: RMS of the other forces of the bodies over that of the file's.
     """
 
     difference: float
     multiple: float
     share: float
+    inertia: float
 
     @property
     def is_different(self) -> bool:
         """Whether the gravity of the fit is not that of the file's bodies."""
-        return self.share > LIMITS.share and self.difference > LIMITS.difference
+        has_say = self.share > LIMITS.share and self.inertia > LIMITS.inertia
+        return has_say and self.difference > LIMITS.difference
 
     @property
     def is_absent(self) -> bool:
@@ -75,20 +79,28 @@ def gravity_witness(
     q, qd, _ = described_log.log.motion
     rest = np.zeros_like(qd)
     samples = described_log.samples_of_bodies(Motion(q, rest, rest))
-    columns = described_log.log.rows_of(samples)
+    gravity_columns = described_log.log.rows_of(samples)
+    body_count = gravity_columns.shape[2]
+    body_columns = described_log.rows.columns[:, :, :body_count]
+    other_columns = body_columns - gravity_columns
     forces = described_log.rows.forces
     force_sizes = np.sqrt(np.mean(forces**2, axis=0) + 1e-300)
 
-    def gravity(parameters: np.ndarray) -> np.ndarray:
+    def relative_forces(columns: np.ndarray, parameters: np.ndarray) -> np.ndarray:
         rows = columns @ parameters
         return (rows - rows.mean(axis=0)) / force_sizes
 
-    file_gravity = gravity(bodies.ravel())
-    fit_gravity = gravity(fit.parameters[: columns.shape[2]])
+    file_bodies = bodies.ravel()
+    fit_bodies = fit.parameters[:body_count]
+    file_gravity = relative_forces(gravity_columns, file_bodies)
+    fit_gravity = relative_forces(gravity_columns, fit_bodies)
+    file_inertia = relative_forces(other_columns, file_bodies)
+    fit_inertia = relative_forces(other_columns, fit_bodies)
     square = max(float(np.sum(file_gravity**2)), 1e-300)
     square_difference = float(np.sum((file_gravity - fit_gravity) ** 2))
     return GravityWitness(
         difference=np.sqrt(square_difference / square),
         multiple=float(np.sum(file_gravity * fit_gravity)) / square,
         share=np.sqrt(square / file_gravity.size),
+        inertia=float(np.linalg.norm(fit_inertia) / np.linalg.norm(file_inertia)),
     )

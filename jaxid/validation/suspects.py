@@ -325,20 +325,27 @@ class SuspectedMistakes:
             described_log.without_gravity_and_coriolis,
         )
         if self._bodies is not None:
-            yield self._subtracted_gravity(self._bodies)
+            yield from self._subtracted_predictions(self._bodies)
 
-    def _subtracted_gravity(self, bodies: np.ndarray) -> Suspect:
-        """Return that a controller which knows the file's bodies subtracts gravity."""
+    def _subtracted_predictions(self, bodies: np.ndarray) -> Iterator[Suspect]:
+        """Yield what a controller that knows the file's bodies may have subtracted."""
         described_log = self._log
         q, qd, _ = described_log.log.motion
         rest = np.zeros_like(qd)
-        samples = described_log.samples_of_bodies(Motion(q, rest, rest))
-        force_rows = described_log.log.rows_of(samples @ bodies.ravel())
-        return Suspect(
-            "the gravity of the file's bodies seems to have been subtracted from the "
-            "forces, by the log or the drive",
-            lambda: described_log.with_added_forces(force_rows),
-        )
+        parts = {"gravity": rest, "gravity and Coriolis forces": qd}
+        for part, speeds in parts.items():
+            samples = described_log.samples_of_bodies(Motion(q, speeds, rest))
+            added_rows = described_log.log.rows_of(samples @ bodies.ravel())
+            sentence = (
+                f"{part} of the file's bodies seem to have been subtracted from the "
+                "forces, by the log or the drive"
+            )
+            yield Suspect(
+                sentence,
+                lambda added_rows=added_rows: described_log.with_added_forces(
+                    added_rows
+                ),
+            )
 
     def _filters(self) -> Iterator[Suspect]:
         every_joint = tuple(self._joints)
