@@ -16,6 +16,10 @@ the true torque of another log, in rows within 0.02 rad/s. Load: friction in pro
 to the weight on a joint. Stribeck: half of the dry friction more near standstill,
 falling at 0.1 rad/s, which the model lacks.
 
+Machines of `judgement/` and small gantries (rails of 0.4 m), recorded by MuJoCo, whose
+dry friction is a constraint: how often the intervals of viscous and dry friction hold
+the truth, and the residual over that with one transition speed of 0.01 for all joints.
+
     python benchmarks/friction.py                       # everything, about an hour
     python benchmarks/friction.py tx40 stribeck         # only these
     python benchmarks/friction.py --quick               # simulated arms, few draws
@@ -23,6 +27,9 @@ falling at 0.1 rad/s, which the model lacks.
 
 import functools
 import itertools
+import sys
+import tempfile
+import time
 from pathlib import Path
 
 import numpy as np
@@ -423,7 +430,7 @@ def load(name, draws):
         weight, sign = torques(jid.Motion(m.q, 0 * m.q, 0 * m.q)), np.tanh(m.qd / 0.01)
         dry = 0.1 * size + truth * np.abs(weight)
         log = observed(m, rigid + 0.1 * size * m.qd + dry * sign, size, rng)
-        fit = experiment.setup.fit(RegressionProblem(experiment.setup.base, [log]))
+        fit = experiment.setup.fit(jid.RegressionProblem(experiment.setup.base, [log]))
         for j, value in enumerate(truth):
             if (
                 f"fl{j + 1}" in fit.base.names
@@ -488,6 +495,63 @@ def stribeck(name, draws):
     return rows
 
 
+SMALL_GANTRY = [
+    (-1, "slide", (0, 0, 1.0), (1, 0, 0), 40.0, (0.2, 0, 0), 0.2),
+    (0, "slide", (0, 0, 0), (0, 1, 0), 18.0, (0, 0.2, 0.1), 0.2),
+    (1, "slide", (0, 0, 0), (0, 0, 1), 8.0, (0, 0, -0.3), 0.2),
+    (2, "hinge", (0, 0, -0.3), (0, 0, 1), 1.5, (0.05, 0, -0.1), 3.0),
+]
+"""Links of a gantry with rails of 0.4 m, as in `judgement/machines.py`."""
+
+
+def transitions(names, kind, seeds):
+    """Measure intervals of friction whose transition speeds the logs tell."""
+    sys.path.insert(0, str(Path(__file__).resolve().parent / "judgement"))
+    import machines
+    import recordings
+
+    import jaxid as jid
+
+    machines.MACHINES["small gantry"] = [machines.Link(*x) for x in SMALL_GANTRY]
+    names = names or list(machines.MACHINES)[:10]
+    is_covered, ratios, seconds = [], [], []
+    for name, seed in itertools.product(names, range(seeds)):
+        machine = machines.machine(name)
+        log = recordings.record(machine, recordings.KINDS[kind], seed + 1)
+        step = float(np.median(np.diff(log.time)))
+        recording = jid.Recording.of(log.angles, log.forces, sample_time=step)
+        fits = []
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "machine.xml"
+            path.write_text(machine.file)
+            for keys in ("", "[model.coulomb]\nepsilon = 0.01\n"):
+                text = f'[robot]\nmjcf = "{path}"\n{keys}'
+                setup = jid.experiment.parse_experiment(text, path).setup
+                rows, _ = setup.observe(recording).split(0.6)
+                start = time.process_time()
+                fits.append(setup.fit(jid.RegressionProblem(setup.base, [rows])))
+                seconds.append(time.process_time() - start)
+        fit, usual_fit = fits
+        ratios.append(fit.residual / usual_fit.residual)
+        share = recordings.KINDS[kind].friction
+        low, high = fit.intervals().T
+        for key, truth in (("fv", machine.viscous), ("fc", machine.coulomb)):
+            k = [fit.base.names.index(f"{key}{j + 1}") for j in range(len(truth))]
+            is_covered += (
+                (low[k] <= share * truth) & (share * truth <= high[k])
+            ).tolist()
+    cover = np.mean(is_covered)
+    extra = np.median(np.subtract(seconds[::2], seconds[1::2]))
+    said = (
+        f"{cover:.1%} of {len(is_covered)} covered; residual over that with 0.01: "
+        f"{np.median(ratios):.2f}, largest {max(ratios):.2f}; {extra:.1f} s more"
+    )
+    recipe = f"{len(names)} machine(s), {seeds} seed(s)"
+    holds = bool(cover >= 0.93)
+    what = f"intervals of friction, {kind}"
+    return [Row(f"transitions/{kind}", what, recipe, ">= 93 %", said, holds)]
+
+
 def main():
     """Measure what was asked for."""
     parser = timing.parser(__doc__, "simulated arms, few draws")
@@ -509,6 +573,15 @@ def main():
             parts |= {
                 f"{study.__name__}-{x}": functools.partial(study, x, few) for x in ARMS
             }
+    if timing.missing("mujoco") is None:
+        for kind in ("plain", "slow", "heavy friction", "pauses"):
+            parts |= {
+                f"rails-{kind}": functools.partial(
+                    transitions, ("small gantry",), kind, draws
+                )
+            }
+            if not options.quick:
+                parts[f"machines-{kind}"] = functools.partial(transitions, (), kind, 1)
     rows = []
     for name, part in parts.items():
         if not options.parts or any(name.startswith(x) for x in options.parts):
