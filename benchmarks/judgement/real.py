@@ -3,8 +3,8 @@
     python benchmarks/judgement/real.py [--quick] [--json FILE] [--robot tx40]
         [--slips] [--slip contact]
 
-Experiments are those of `tests/real_data`, without their choice of the estimator: the
-defaults hold. Each robot is identified with one log, and validated with its last 40 %
+Experiments are those of `tests/real_data`, with their settings ("README") and with
+default ones. Each robot is identified with one log, and validated with its last 40 %
 or with its other logs. With `--slips` the 14 mistakes of `PLANTED` are made in one log,
 or in the robot, for its second joint and for one of the wrist. The logs lie beside the
 project, in `../shared/data`.
@@ -100,7 +100,9 @@ def robots():
     texts = {}
     for name in ("tx40", "ur10", "kr300"):
         text = (EXPERIMENTS / f"{name}.toml").read_text(encoding="utf-8")
-        texts[name] = re.sub(r"\[(estimator|filter|rows)\]\n([^\[]*)", "", text)
+        texts[f"{name}, README"] = text
+        settings = r"(?ms)^\[(estimator|filter|rows)\]$.*?(?=^\[|\Z)"
+        texts[name] = re.sub(settings, "", text)
     folder = DATA / "double_pendulum"
     pendulum = PENDULUM.format(folder=folder)
     kr300 = [DATA / "kr300" / f"traj_{letter}.csv" for letter in "ABC"]
@@ -111,6 +113,9 @@ def robots():
         "kr300 B": Robot(texts["kr300"], kr300[1]),
         "kr300 C": Robot(texts["kr300"], kr300[2]),
     }
+    for name in ("tx40", "ur10", "kr300"):
+        text = texts[f"{name}, README"]
+        every_robot[f"{name}, README"] = every_robot[name]._replace(experiment=text)
     for name in PENDULUM_LOGS:
         log = folder / f"{name}.csv"
         every_robot[f"pendulum {name}"] = Robot(pendulum, log, joints=(1,))
