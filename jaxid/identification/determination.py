@@ -1,5 +1,7 @@
 """Combinations of parameters that logs leave open, judged by other motions."""
 
+from typing import NamedTuple
+
 import equinox as eqx
 import numpy as np
 from scipy import special
@@ -7,6 +9,7 @@ from scipy import special
 from jaxid.arrays import AnyArray, Indices, Joints, Matrix
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.motion import Motion
+from jaxid.result_table import Status
 from jaxid.robot.robot import complete_limits
 
 from .estimators.regularisation_and_weights import Complete, Decomposition
@@ -16,13 +19,21 @@ SAMPLES = 400
 """Number of random motions on which parameters are judged."""
 MIN_SAMPLES = 40
 """Number of motions of which the drives are able, without which all are taken."""
-LARGEST_UNCERTAINTY = 0.1
-"""Fraction of the forces that the 95 % interval of a combination may leave open.
 
-Logs of five simulated machines on which a joint rested, or which were too slow, too
-small, too short or of one pose, leave at least 0.17 open; clean logs of good motions,
-on which plain least squares predict another motion well, at most 0.04.
-"""
+
+class OpenShares(NamedTuple):
+    """Fractions of the forces of random motions that 95 % intervals leave open.
+
+    Logs of five simulated machines on which a joint rested, or which were too slow, too
+    small, too short or of one pose, leave at least 0.17 open; clean logs of good
+    motions, whose plain least squares predict another motion well, at most 0.04.
+    """
+
+    doubtful: float = 0.1
+    bad: float = 0.5  # the expected error is half of it: a quarter of the forces
+
+
+OPEN_SHARES = OpenShares()
 MIN_SHARE = 0.3
 """Share of the largest parameter of a combination from which another one is named."""
 
@@ -53,6 +64,13 @@ class UndeterminedDirection(eqx.Module):
         if len(names) > 5:
             names = [*names[:4], f"{len(names) - 4} others"]
         return f"{', '.join(names[:-1])} and {names[-1]} cannot be told apart"
+
+
+def status_of(open_share: float) -> Status:
+    """Return the severity of a share of the forces that is left open."""
+    if open_share > OPEN_SHARES.bad:
+        return Status.BAD
+    return Status.DOUBTFUL if open_share > OPEN_SHARES.doubtful else Status.GOOD
 
 
 def random_rows(base: BaseParameters, parameters: AnyArray) -> Matrix:
@@ -129,7 +147,7 @@ def undetermined(
     uncertainty[is_visible] = half_widths[is_visible] * forces[is_visible]
 
     directions = []
-    for k in np.flatnonzero(uncertainty > LARGEST_UNCERTAINTY)[::-1]:
+    for k in np.flatnonzero(uncertainty > OPEN_SHARES.doubtful)[::-1]:
         direction = decomposition.directions[k]
         order = np.argsort(-np.abs(direction), kind="stable")
         shares = direction[order] / direction[order[0]]

@@ -38,9 +38,10 @@ from jaxid.result_table import (
 
 from .consistency.estimator import Consistency
 from .determination import (
-    LARGEST_UNCERTAINTY,
+    OPEN_SHARES,
     UndeterminedDirection,
     random_rows,
+    status_of,
 )
 from .estimators.estimate import AbstractEstimator, EstimatorInWords
 from .estimators.regularisation_and_weights import (
@@ -170,15 +171,9 @@ class Fit(Summarised, eqx.Module):
     def trust(self) -> tuple[Status, ...]:
         """Judgement of each estimate by the share of the forces that it leaves open.
 
-        `GOOD` up to a tenth; `DOUBTFUL` above, where other estimates make up for it;
-        `BAD` for all that take part in an undetermined combination.
+        `GOOD` up to a tenth; `DOUBTFUL` up to half; `BAD` above.
         """
-        is_small = self.open_shares <= LARGEST_UNCERTAINTY
-        grades = [Status.GOOD if x else Status.DOUBTFUL for x in is_small]
-        for direction in self.undetermined:
-            for k in direction.parts:
-                grades[k] = Status.BAD
-        return tuple(grades)
+        return tuple(map(status_of, self.open_shares))
 
     @property
     def time_blocks(self) -> Blocks:
@@ -247,7 +242,7 @@ class Fit(Summarised, eqx.Module):
             (
                 "estimates",
                 f"{self.trust.count(Status.GOOD)} of {self.base.size} leave at most "
-                f"{100 * LARGEST_UNCERTAINTY:g} % of the forces open",
+                f"{100 * OPEN_SHARES.doubtful:g} % of the forces open",
             ),
         ]
 
@@ -260,23 +255,28 @@ class Fit(Summarised, eqx.Module):
             text = f"These logs determine all {size} base parameters."
             return [Remark(text, Status.GOOD)]
         combinations = "1 combination" if count == 1 else f"{count} combinations"
+        worst_share = max(direction.uncertainty for direction in self.undetermined)
+        consequence = "some of which were not moved at all"
+        if np.isfinite(worst_share):
+            share = percent(worst_share)
+            consequence = f"up to {share} % of the forces of other motions are open"
         headline = (
             "NOT DETERMINED by these logs: "
-            f"{combinations} of the {size} base parameters."
+            f"{combinations} of the {size} base parameters, {consequence}."
         )
-        remarks = [Remark(headline, Status.BAD)]
+        remarks = [Remark(headline, status_of(worst_share))]
         for direction in self.undetermined[:MAX_NAMED]:
             detail = "not moved at all"
             if np.isfinite(direction.uncertainty):
                 detail = f"leaves {percent(direction.uncertainty)} % of the forces open"
             detail += f"; singular value {direction.singular_value:.1e} of the largest"
             sentence = f"{direction.sentence(self.base)}."
-            remarks.append(Remark(sentence, Status.BAD, detail))
+            remarks.append(Remark(sentence, status_of(direction.uncertainty), detail))
         if count > MAX_NAMED:
-            remarks.append(Remark(f"And {count - MAX_NAMED} more.", Status.BAD))
+            remarks.append(Remark(f"And {count - MAX_NAMED} more"))
         advice = (
             "A combination counts as not determined if its 95 % interval leaves more "
-            f"than {100 * LARGEST_UNCERTAINTY:g} % of the forces of random motions "
+            f"than {100 * OPEN_SHARES.doubtful:g} % of the forces of random motions "
             "within the robot's limits open. Estimates of these parameters mean "
             "nothing one by one, and the model may fail on other motions. Record a "
             "motion that moves these joints in more poses, faster and in both "

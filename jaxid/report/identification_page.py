@@ -110,7 +110,7 @@ def _three_numbers(report: Report) -> Markup:
         (
             f"{fit.base.size - undetermined} of {fit.base.size}",
             "combinations of parameters that the logs determine",
-            Status.BAD if undetermined else Status.GOOD,
+            fit.determination[0].status,
         ),
     )
 
