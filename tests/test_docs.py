@@ -26,9 +26,8 @@ from jaxid.experiment_file import check_names
 from jaxid.identification.determination import OPEN_SHARES
 from jaxid.measurement.filters import FILTERS
 from jaxid.simulation.virtual import random_bodies
-from jaxid.validation.diagnosis import MIN_DEVIATIONS
 from jaxid.validation.judgement import ERRORS, MAX_CONDITION_NUMBER
-from jaxid.validation.mistake_search import GAINS, MAX_MISFIT
+from jaxid.validation.mistake_search import GAINS, MAX_MISFIT, MIN_POWER
 from jaxid.validation.torque_errors import POSES
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -261,7 +260,7 @@ THRESHOLDS = {
     ),
     "7.": (f"at most {OPEN_SHARES.doubtful:.0%}", f"up to {OPEN_SHARES.bad:.0%}"),
     "10.": (f"all of {POSES} poses",),
-    "11.": (f"{MIN_DEVIATIONS:.0f} standard deviations",),
+    "11.": (f"{-MIN_POWER:.0%} of RMS force times RMS speed",),
 }
 
 

@@ -226,17 +226,18 @@ def marked(sentences):
     return [text for status, text in sentences if status in ("BAD", "DOUBTFUL")]
 
 
-def without_numbers(text):
-    """Return a sentence in which numbers do not count."""
-    return re.sub(r"[-+]?\d[\d.e+-]*", "#", text)
+def kind_of(text):
+    """Return a sentence without names and numbers: where it stops, it differs."""
+    return re.split(r"[\d`:;]", text, maxsplit=1)[0]
 
 
 def outcome(sentences, clean, words):
     """Return how a slip is treated: named, another, told or quiet."""
-    usual = {without_numbers(text) for text in marked(clean)}
-    specific = [x for x in marked(sentences) if without_numbers(x) not in usual]
-    seeming = [text for text in specific if "seem" in text]
-    if any(word in text for text in specific for word in words):
+    usual = {(status, kind_of(text)) for status, text in clean}
+    marks = [x for x in sentences if x[0] in ("BAD", "DOUBTFUL")]
+    specific = [x for x in marks if (x[0], kind_of(x[1])) not in usual]
+    seeming = [text for text in marked(sentences) if "seem" in text]
+    if any(word in text for text in seeming for word in words):
         return "named"
     if seeming:
         return "another"
