@@ -84,6 +84,7 @@ METHODS = (
     Script("robot_files", 2),
     Script("public_reports/run", 12),
     Script("judgement/rates", 40),
+    Script("judgement/priors", 25),
 )
 SCRIPTS = SPEED + METHODS
 

@@ -123,6 +123,7 @@ class Machine:
         name: Name.
         model: MuJoCo model of the true machine, without friction.
         file: Text of the MJCF file that the user has.
+        true_file: Text of the MJCF file of the true machine.
         max_forces: Largest forces of the drives [N m or N].
         max_speeds: Largest speeds [rad/s or m/s].
         viscous: Viscous friction [N m s/rad or N s/m].
@@ -132,6 +133,7 @@ class Machine:
     name: str
     model: mujoco.MjModel
     file: str
+    true_file: str
     max_forces: np.ndarray
     max_speeds: np.ndarray
     viscous: np.ndarray
@@ -155,6 +157,7 @@ def machine(name):
         name,
         _model(links, bodies, rotors, None),
         _text(links, drawn, np.zeros(len(links)), max_forces),
+        _text(links, bodies, rotors, max_forces),
         max_forces,
         max_speeds,
         share[0] * max_forces / max_speeds,

@@ -31,6 +31,7 @@ from jaxid.identification.consistency import (
 from jaxid.identification.estimators import (
     AbstractEstimator,
     LeastSquares,
+    MaximumForces,
     WeightedLeastSquares,
 )
 from jaxid.identification.filter_selection import USUAL_FILTERS
@@ -195,10 +196,12 @@ class Setup(eqx.Module):
         elif self.filter not in self.filter_candidates[:1]:
             # A filter that is given is kept.
             self.filter_candidates = ()
+        weights = MaximumForces()
         if self.least_squares is None:
-            self.least_squares = WeightedLeastSquares()
+            self.least_squares = WeightedLeastSquares(weights)
         if self.estimator is None:
-            self.estimator = PhysicallyConsistent(pull=pull_to_bodies(self.robot_file))
+            pull = pull_to_bodies(self.robot_file)
+            self.estimator = PhysicallyConsistent(weights, pull=pull)
         if self.load_friction and not self.has_bounded_bodies:
             raise InputError(
                 "friction by load (`model.load`) needs the bodies that a physically "
