@@ -152,6 +152,8 @@ def main():
     import machines
     import numpy as np
 
+    import jaxid as jid
+
     names = options.machine or [x for x in machines.MACHINES if x not in SETTING_KINDS]
     names = ["hobby"] if options.quick else names
     table = {}
