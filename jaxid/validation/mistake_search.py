@@ -75,7 +75,7 @@ class Mistakes(NamedTuple):
         explained: Mistakes that explain most of what the model misses.
         unexplained: A contact, or that the model does not fit.
         possible: Mistakes that explain a part of what it misses.
-        doubts: What fits, but disagrees with the robot's file.
+        doubts: What fits, but disagrees with the robot's file, or is late.
         delay: Delay of all forces, also one that is no mistake; None if the logs are
             too short.
     """
@@ -87,7 +87,7 @@ class Mistakes(NamedTuple):
     delay: Delay | None = None
 
     def with_delay(self, delay: Delay) -> "Mistakes":
-        """Return the mistakes with the delay, which is one if nothing else is wrong.
+        """Return the mistakes with the delay, a doubt if nothing else is wrong.
 
         A short delay explains little of the forces, but its interval judges it.
         """
@@ -98,7 +98,7 @@ class Mistakes(NamedTuple):
             f"the forces of the log seem to be {delay} late, which changes friction "
             f"most: `force_delay = {delay.seconds:.3g}` in `[recording]` removes that."
         )
-        return mistakes._replace(explained=(sentence,), possible=())
+        return mistakes._replace(doubts=(*self.doubts, sentence), possible=())
 
 
 class Explanation(NamedTuple):

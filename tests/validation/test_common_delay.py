@@ -75,11 +75,13 @@ def test_the_interval_holds_the_delay(setup, log, seconds):
 
 
 def test_a_delay_is_named_with_its_cure(setup, log):
-    (sentence,) = find_mistakes(setup.model, [late(log, 0.006)]).explained
+    mistakes = find_mistakes(setup.model, [late(log, 0.006)])
+    (sentence,) = (*mistakes.explained, *mistakes.doubts)
     assert "seem to be 6" in sentence
     assert "ms late" in sentence
     assert "force_delay = 0.0" in sentence
-    assert find_mistakes(setup.model, [log]).explained == ()
+    mistakes = find_mistakes(setup.model, [log])
+    assert mistakes.explained == mistakes.doubts == ()
 
 
 def test_the_delay_of_one_joint_is_none_of_all(setup, log):
