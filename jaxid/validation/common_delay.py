@@ -6,6 +6,7 @@ unless its shape is among the columns, too, as it is in `DescribedLog`.
 """
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from jaxid.measurement.recording import Recording
 
 from .descriptions import DescribedLog
 from .filtered_log import FilteredLog
+from .row_fits import RowFit, Rows
 
 ROUNDS = 3
 """Steps of the search, after which a delay has settled."""
@@ -63,29 +65,49 @@ def common_delay(described_log: DescribedLog) -> Delay:
     all.
     """
     seconds = 0.0
-    equations = _equations(described_log, seconds)
-    step = _limited_step(equations)
+    search = _one_round(described_log, seconds)
     for _ in range(1, ROUNDS):
-        seconds += step
-        equations = _equations(described_log, seconds)
-        step = _limited_step(equations)
+        seconds += search.step
+        search = _one_round(described_log, seconds)
     blocks = described_log.log.blocks
-    block_deviation = _deviation_by_blocks(equations, blocks)
-    joint_deviation = _deviation_by_joints(equations)
+    block_deviation = _deviation_by_blocks(search.equations, blocks)
+    joint_deviation = _deviation_by_joints(search.equations)
     # A search that still moves has found no delay.
-    deviations = (block_deviation, joint_deviation, step, MIN_DEVIATION)
+    deviations = (block_deviation, joint_deviation, search.step, MIN_DEVIATION)
     deviation = float(np.linalg.norm(deviations))
-    return Delay(seconds + step, deviation, float(blocks[-1]))
+    return Delay(seconds + search.step, deviation, float(blocks[-1]), search.misfit)
 
 
-def _equations(described_log: DescribedLog, seconds: float) -> np.ndarray:
+class _Round(NamedTuple):
+    """Round of the search, with a delay that has been removed from the log."""
+
+    equations: np.ndarray
+    step: float  # delay that remains [s]
+    misfit: float  # fraction of the forces that the model misses
+
+
+def _one_round(described_log: DescribedLog, seconds: float) -> _Round:
+    """Return what remains if a delay is removed."""
+    rows = _rows_without_delay(described_log, seconds)
+    fit = described_log.judge.fit(rows)
+    equations = _equations(described_log, rows, fit)
+    *_, remaining_delay = _solution(_products(equations))
+    step = float(np.clip(remaining_delay, -MAX_STEP, MAX_STEP))
+    square_misfits = fit.squares / (np.mean(rows.forces**2, axis=0) + 1e-300)
+    return _Round(equations, step, float(np.sqrt(np.mean(square_misfits))))
+
+
+def _rows_without_delay(described_log: DescribedLog, seconds: float) -> Rows:
+    """Return the rows of a log whose forces stand earlier."""
+    if seconds == 0.0:
+        return described_log.rows
+    joints = tuple(range(described_log.robot.joints))
+    return described_log.with_earlier_forces(joints, seconds)
+
+
+def _equations(described_log: DescribedLog, rows: Rows, fit: RowFit) -> np.ndarray:
     """Return weighted rows of columns, rate and forces [rows, joints, columns + 2]."""
     log = described_log.log
-    rows = described_log.rows
-    if seconds != 0.0:
-        joints = tuple(range(rows.forces.shape[1]))
-        rows = described_log.with_earlier_forces(joints, seconds)
-    fit = described_log.judge.fit(rows)
     predicted_forces = described_log.predictions(fit.parameters)
     rates = log.rows_of(log.derivative(predicted_forces))
     columns = (rows.columns, -rates[..., None], rows.forces[..., None])
@@ -97,12 +119,6 @@ def _products(equations: np.ndarray) -> np.ndarray:
     """Return the sums of products of the columns of some rows."""
     flat_rows = equations.reshape(-1, equations.shape[-1])
     return flat_rows.T @ flat_rows
-
-
-def _limited_step(equations: np.ndarray) -> float:
-    """Return the delay that remains, as far as one step may go."""
-    *_, step = _solution(_products(equations))
-    return float(np.clip(step, -MAX_STEP, MAX_STEP))
 
 
 def _solution(products: np.ndarray) -> np.ndarray:
