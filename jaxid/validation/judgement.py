@@ -307,10 +307,11 @@ def _judge_friction(fit: Fit, logs: Sequence[TorqueErrors]) -> Iterator[Remark]:
         if depends_on_speed
     ]
     if names:
+        joints = f"joint{'s' if len(names) > 1 else ''} {', '.join(names)}"
         yield Remark(
-            f"Errors depend on speed (joints {', '.join(names)}): friction seems to "
-            "have another shape, and the intervals of its parameters may be too "
-            "narrow: try `jaxid choose`",
+            f"Friction of {joints} seems to have another shape: errors depend on "
+            "speed, and the intervals of these friction parameters do not hold; "
+            "`jaxid choose` tries other laws",
             detail="Means over classes of speed agree between blocks of time.",
         )
 
