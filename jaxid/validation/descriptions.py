@@ -23,6 +23,8 @@ WIDTH_SHARES = np.array([0.003, 0.01, 0.03, 0.1])
 Their columns together have all transitions between; one alone could not be chosen from
 a log that is described wrongly.
 """
+MAX_FRICTION_SHARE = 0.85
+"""Share of the squared forces with the sign of the speed: more is friction alone."""
 BRAKING = slice(0, 6)
 """Columns of friction that take power: viscous, dry and by load."""
 
@@ -77,7 +79,15 @@ class DescribedLog:
         rows: Rows of the log as it is described.
     """
 
-    def __init__(self, model: Model, log: FilteredLog):
+    def __init__(self, model: Model, log: FilteredLog, is_strict: bool = False):
+        """Describe a log.
+
+        Args:
+            model: Model of the robot.
+            log: Filtered log.
+            is_strict: Whether forces that are friction alone have no friction by load,
+                which would be the force itself, whatever its sign.
+        """
         robot = model.robot
         self.robot = robot
         self._has_springs = "ks1" in model.parameter_names
@@ -86,6 +96,8 @@ class DescribedLog:
         self.judge = Judge(log.is_moving, log.folds)
         self._body_columns = _BodyColumns(robot)
         self._body_rows = log.rows_of(self.samples_of_bodies(log.motion))
+        is_friction_alone = log.friction_shares > MAX_FRICTION_SHARE
+        self._has_load_friction = ~(is_friction_alone & is_strict)
         self.rows = self.with_forces(log.forces)
 
     def samples_of_bodies(
@@ -107,7 +119,7 @@ class DescribedLog:
         shapes = [
             motion.qd,
             *dry,
-            sharp_dry * np.abs(forces),
+            sharp_dry * np.abs(forces) * self._has_load_friction,
             motion.qdd,
             np.ones_like(sharp_dry),
             *(self.log.derivative(x) for x in (sharp_dry, dry[-1])),

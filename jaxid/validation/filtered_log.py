@@ -119,6 +119,14 @@ class FilteredLog:
         flat = samples.reshape(len(samples), -1)
         return (self._thinning @ flat).reshape(-1, *samples.shape[1:])
 
+    @cached_property
+    def friction_shares(self) -> np.ndarray:
+        """Shares of the squared forces that have the sign of the speed [joints]."""
+        forces = self.forces
+        braking_squares = np.sign(self.motion.qd) * forces * np.abs(forces)
+        squares = np.sum(forces**2, axis=0) + 1e-300
+        return np.abs(np.sum(braking_squares, axis=0)) / squares
+
     def times_of(self, *instants: float) -> tuple[float, ...]:
         """Return the times in the logs of instants on the grid [s]."""
         last = len(self.times) - 1

@@ -96,11 +96,12 @@ def gravity_witness(
     fit_gravity = relative_forces(gravity_columns, fit_bodies)
     file_inertia = relative_forces(other_columns, file_bodies)
     fit_inertia = relative_forces(other_columns, fit_bodies)
+    size = float(np.linalg.norm(file_inertia))
     square = max(float(np.sum(file_gravity**2)), 1e-300)
     square_difference = float(np.sum((file_gravity - fit_gravity) ** 2))
     return GravityWitness(
         difference=np.sqrt(square_difference / square),
         multiple=float(np.sum(file_gravity * fit_gravity)) / square,
         share=np.sqrt(square / file_gravity.size),
-        inertia=float(np.linalg.norm(fit_inertia) / np.linalg.norm(file_inertia)),
+        inertia=float(np.linalg.norm(fit_inertia)) / max(size, 1e-300),
     )

@@ -14,7 +14,7 @@ from jaxid.result_table import significant
 from .commands import are_exchanged
 from .common_delay import common_delay
 from .contacts import Contact, find_contact
-from .descriptions import DescribedLog
+from .descriptions import MAX_FRICTION_SHARE, DescribedLog
 from .filtered_log import FilteredLog
 from .gravity_witness import gravity_witness
 from .row_fits import RowFit, Rows, promise
@@ -53,6 +53,8 @@ MAX_MISFIT = 0.15
 """Fraction (0 to 1) of the forces that no model misses whose description is right."""
 MAX_WITNESS_MISFIT = 0.3
 """The same where gravity is missing, which the inertia of the bodies belies."""
+MAX_STRICT_MISFIT = 0.03
+"""The same with a mistake that is named without friction by load."""
 MIN_POWER = -0.08
 """Power of friction, over RMS force and speed, below which friction drives a joint.
 
@@ -143,17 +145,35 @@ def find_mistakes(
     described_log = DescribedLog(model, log)
     if commands and are_exchanged(described_log, recordings, commands):
         return Mistakes(explained=(EXCHANGED_COMMANDS,))
-    suspected = SuspectedMistakes(described_log, recordings[0], bodies)
-    suspects = [*suspected.of_columns(), *suspected.of_robot()]
-    is_one_log = len(recordings) == 1
-    quantities = list(suspected.quantities())
-    mistakes = _search(described_log, suspects, quantities, is_one_log)
     delay = common_delay(described_log)
-    if not mistakes.explained and not is_one_log:
+    mistakes = _mistakes_of_all(described_log, recordings, bodies)
+    if log.friction_shares.max() > MAX_FRICTION_SHARE and not mistakes.explained:
+        # Friction by load may hide mistakes, or stand for effects that are missing.
+        described_log = DescribedLog(model, log, is_strict=True)
+        explained = _mistakes_of_all(
+            described_log, recordings, bodies, MAX_STRICT_MISFIT
+        ).explained
+        possible = () if explained else mistakes.possible
+        mistakes = mistakes._replace(explained=explained, possible=possible)
+    if not mistakes.explained and len(recordings) > 1:
         mistakes = _mistakes_by_log(model, recordings, mistakes)
     if not mistakes.explained and bodies is not None:
         mistakes = _with_witness(mistakes, described_log, bodies)
     return mistakes.with_delay(delay)
+
+
+def _mistakes_of_all(
+    described_log: DescribedLog,
+    recordings: Sequence[Recording],
+    bodies: np.ndarray | None,
+    max_misfit: float = np.inf,
+) -> Mistakes:
+    """Look for the mistake in all logs together."""
+    suspected = SuspectedMistakes(described_log, recordings[0], bodies)
+    suspects = [*suspected.of_columns(), *suspected.of_robot()]
+    quantities = list(suspected.quantities())
+    is_one_log = len(recordings) == 1
+    return _search(described_log, suspects, quantities, is_one_log, max_misfit)
 
 
 def _mistakes_by_log(
@@ -204,8 +224,12 @@ def _search(
     suspects: Sequence[Suspect],
     quantities: Sequence[Quantity],
     is_one_log: bool,
+    max_misfit: float = np.inf,
 ) -> Mistakes:
-    """Return what explains most: a mistake, in one log also a contact, or nothing."""
+    """Return what explains most: a mistake, in one log also a contact, or nothing.
+
+    With a mistake that is named the model misses less than `max_misfit` of the forces.
+    """
     judge = described_log.judge
     fit = judge.fit(described_log.rows)
     misfit = _misfit(fit, described_log.rows)
@@ -220,6 +244,7 @@ def _search(
     texts = ", or ".join(x.sentence for x in equal_results)
     is_single = 0 < len(equal_results) <= MAX_EQUAL
     is_cure = is_single and equal_results[0].remainder < GAINS.remainder
+    is_cure = is_cure and equal_results[0].misfit < max_misfit
     if is_cure and _explains(equal_results[0], GAINS.named):
         remaining_misfit = equal_results[0].misfit
         effect = (

@@ -273,6 +273,23 @@ def test_gravity_of_the_files_bodies_is_a_witness(motors):
     assert "`robot.gravity`" in reversed_witness.sentence
 
 
+def test_a_force_that_is_friction_alone_has_no_friction_by_load_if_strict(motors):
+    """That column would be the force itself, and would hide every mistake."""
+    log, _ = log_of(*motors)
+    forces = np.asarray(log.forces).copy()
+    forces[:, 1] = 5.0 * np.sign(np.gradient(np.asarray(log.angles)[:, 1]))
+    filtered_log = FilteredLog(ROBOT, [dataclasses.replace(log, forces=forces)])
+    assert filtered_log.friction_shares[1] > 0.9
+    counts = {}
+    for is_strict in (False, True):
+        described_log = DescribedLog(BASE.model, filtered_log, is_strict)
+        columns = described_log.rows.columns
+        counts[is_strict] = np.count_nonzero(np.abs(columns).max(axis=(0, 1)) > 0.0)
+    assert counts[True] == counts[False] - np.count_nonzero(
+        filtered_log.friction_shares > 0.85
+    )
+
+
 @pytest.mark.parametrize("is_clipped", [False, True])
 def test_a_sensor_that_clips_is_told_from_a_drive_at_its_limit(motors, is_clipped):
     log, _ = log_of(*motors)
