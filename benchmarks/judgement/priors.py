@@ -104,7 +104,8 @@ def results(case, seed, unseen):
     base = case.setup.base
     rows = jid.RegressionProblem(base, case.observe(seed))
     free = jid.identify(base, rows, jid.WeightedLeastSquares())
-    is_determined = free.relative_standard_deviations < 0.5
+    sizes = np.abs(np.asarray(free.parameters))
+    is_determined = free.standard_deviations < 0.5 * sizes
     for direction in free.undetermined:
         is_determined[list(direction.parts)] = False
 
