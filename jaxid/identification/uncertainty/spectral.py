@@ -33,6 +33,14 @@ from .result import (
 )
 from .spectra_of_rows import BIN_COUNT, Lines, RowSpectra, multiplicity, row_spectra
 
+JACKKNIFE_LEVEL = 0.98
+"""Quantile of the ratio of both variances from which the jackknife's counts.
+
+Set on five robots that MuJoCo records (palletiser, seven axes, gantry, two arms,
+oblique axes). On five others 95 % intervals hold 86 % of the parameters of slow motions
+without it, and 92 % with it.
+"""
+
 
 class SpectralSandwich(AbstractUncertainty):
     """Spectral sandwich: right for errors correlated from row to row (default).
@@ -71,7 +79,7 @@ class SpectralSandwich(AbstractUncertainty):
 
 
 def _widen_by_jackknife(errors: Uncertainty, estimate: Estimate) -> Uncertainty:
-    """Take the jackknife's deviations where chance allows them once in 10,000 times."""
+    """Take the jackknife's deviations where chance hardly allows them."""
     if errors.jackknife is None:
         return errors
     shares = []
@@ -82,7 +90,9 @@ def _widen_by_jackknife(errors: Uncertainty, estimate: Estimate) -> Uncertainty:
     total = np.sum(shares, axis=0)
     squares = np.sum(np.square(shares), axis=0)
     deciding_blocks = total**2 / np.maximum(squares, 1e-300)
-    max_ratios = stats.f.ppf(0.9999, np.maximum(deciding_blocks, 1.0), errors.dof)
+    max_ratios = stats.f.ppf(
+        JACKKNIFE_LEVEL, np.maximum(deciding_blocks, 1.0), errors.dof
+    )
 
     deviations = errors.standard_deviations
     has_deviation = np.isfinite(deviations) & (deviations > 0)
