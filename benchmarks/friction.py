@@ -1,13 +1,4 @@
-"""Friction: choices of `jaxid choose` on measured robots, and laws with known truth.
-
-Measured robots (`../shared/data`): the first 60 % of the logs of TX40 and UR10, log A
-of the KR300, four logs of the double pendulum. The choice sees these alone; the model
-that it writes is fitted to them and predicts the rest. "Weighted" is the RMS error in
-percent of the largest forces, root mean square of the joints (`held_out.py`);
-"relative" is RMS error over RMS force, mean of the joints; for the pendulum the norm of
-all errors over that of all forces, both low-pass filtered, beside the models of the
-data's authors (friction cf arctan(100 v) + b v, written down here). "What comes" over
-"promised": splits from 0.4 to 0.75, errors of the rest relative to the forces before.
+"""Friction laws with known truth, on simulated arms.
 
 Simulated arms (xarm7 and ur3 of `example-robot-data`): rigid bodies by Pinocchio,
 friction by NumPy, torque noise of 1 % of the RMS. Presliding: bristles (LuGre) with
@@ -21,7 +12,7 @@ dry friction is a constraint: how often the intervals of viscous and dry frictio
 the truth, and the residual over that with one transition speed of 0.01 for all joints.
 
     python benchmarks/friction.py                       # everything, about an hour
-    python benchmarks/friction.py tx40 stribeck         # only these
+    python benchmarks/friction.py stribeck              # only these
     python benchmarks/friction.py --quick               # simulated arms, few draws
 """
 
@@ -34,237 +25,13 @@ from pathlib import Path
 
 import numpy as np
 import timing
-from timing import DATA, EXPERIMENTS, Row, hand_over
+from timing import Row, hand_over
 
 ARMS = {
     "xarm7": "xarm_description/urdf/xarm7.urdf",
     "ur3": "ur_description/urdf/ur3_robot.urdf",
 }
-LOGS = {
-    "tx40": ["tx40/motor_position.csv"],
-    "ur10": ["ur10/exciting_measured.csv"],
-    "kr300": [f"kr300/traj_{name}.csv" for name in "ABC"],
-}
-PENDULUM = """\
-[robot]
-urdf = "{folder}/pendubot_model_1.0.urdf"
-[limits]
-force = [10.0, 10.0]
-[recording]
-time = "time"
-angles = "pos_meas{{}}"
-forces = "tau_meas{{}}"
-largest_gap = 3.0
-[filter]
-kind = "butterworth"
-cutoff = 10
-[rows]
-step = 10
-"""
-IDENTIFY = ("143339", "143524", "143601", "143704")
-VERIFY = ("143747", "144003")
 NOISE = 0.01
-
-
-def chosen_fit(experiment, train):
-    """Return what `jaxid choose` finds for some observations, and its fit to them."""
-    import jaxid as jid
-
-    variants = jid.experiment.variants(experiment)
-    setups = {name: variant.setup for name, variant in variants.items()}
-    choice = jid.workflow.choose_setup_by_rows(setups, train)
-    setup = setups[choice.chosen.name]
-    return choice, setup.fit(jid.RegressionProblem(setup.base, train))
-
-
-@functools.cache
-def measured(name):
-    """Return the experiment of a robot, and its observations."""
-    import jaxid as jid
-
-    experiment = jid.experiment.load_experiment(EXPERIMENTS / f"{name}.toml")
-    return experiment, [
-        experiment.setup.observe(
-            jid.workflow.read_log(experiment.setup, DATA / log, experiment.columns)
-        )
-        for log in LOGS[name]
-    ]
-
-
-def rest(name, asked):
-    """Measure the error on the last 40 % of a log."""
-    import jaxid as jid
-
-    experiment, (log,) = measured(name)
-    train, later = log.split(0.6)
-    choice, fit = chosen_fit(experiment, [train])
-    error = jid.validate(fit, later).errors[0]
-    weighted = float(np.sqrt(np.mean(np.square(100 * error.rms / error.max_forces))))
-    said = f"{weighted:.2f} % (`{choice.chosen.name}`)"
-    return [
-        Row(
-            name,
-            "weighted error on the rest",
-            "60/40",
-            f"<= {asked} %",
-            said,
-            weighted <= asked,
-        )
-    ]
-
-
-def kr300():
-    """Measure the errors on the logs B and C."""
-    import jaxid as jid
-
-    experiment, (first, *others) = measured("kr300")
-    choice, fit = chosen_fit(experiment, [first])
-    errors = [
-        100 * float(e.rms_relative.mean()) for e in jid.validate(fit, others).errors
-    ]
-    said = "{:.0f}, {:.0f} % (`{}`)".format(*errors, choice.chosen.name)
-    return [
-        Row(
-            "kr300",
-            "relative errors on B, C",
-            "A alone",
-            "<= 22 %",
-            said,
-            max(errors) <= 22,
-        )
-    ]
-
-
-def promise(name, splits):
-    """Compare the errors that the choice promises with those on what comes."""
-    import jaxid as jid
-
-    experiment, (log, *_) = measured(name)
-    ratios = []
-    for share in np.linspace(0.4, 0.75, splits):
-        train, later = log.split(float(share))
-        choice, fit = chosen_fit(experiment, [train])
-        before, after = jid.validate(fit, [train, later]).errors
-        # The choice weights the joints as its first candidate does.
-        first = choice.candidates[0]
-        size = np.asarray(
-            first.estimator(jid.RegressionProblem(first.base, [train])).weights
-        )
-        came = np.nanmean((after.errors * size) ** 2)
-        forces = np.nanmean(
-            (np.where(before.counted, before.measured, np.nan) * size) ** 2
-        )
-        ratios.append(float(np.sqrt(came / forces)) / choice.promise)
-        print(f"{name} {share:.2f} {choice.chosen.name}: {ratios[-1]:.2f}", flush=True)
-    low, middle, high = np.quantile(ratios, (0.1, 0.5, 0.9))
-    said = f"{middle:.2f} (80 % of the splits: {low:.2f} to {high:.2f})"
-    what = "what comes over what was promised, median"
-    asked = "0.9 to 1.15"
-    return [
-        Row(
-            f"{name}/promise",
-            what,
-            f"{splits} splits",
-            asked,
-            said,
-            0.9 <= middle <= 1.15,
-        )
-    ]
-
-
-def authors_torques(file, q, qd, qdd):
-    """Return the torques of a published model of the pendulum."""
-    lines = dict(
-        line.split(":") for line in file.read_text().splitlines() if ":" in line
-    )
-    m = {key.strip(): float(value) for key, value in lines.items()}
-    (s1, s2), c2 = np.sin(q.T), np.cos(q[:, 1])
-    coupling, rotor = (
-        m["m2"] * m["l1"] * m["r2"],
-        m["Ir"] * np.array([1, m["gr"], m["gr"] ** 2]),
-    )
-    M22 = m["I2"] + rotor[2]
-    M12 = m["I2"] + coupling * c2 - rotor[1]
-    M11 = (
-        m["I1"]
-        + m["I2"]
-        + m["m2"] * m["l1"] ** 2
-        + 2 * coupling * c2
-        + rotor[0]
-        + rotor[2]
-    )
-    s12 = m["g"] * m["m2"] * m["r2"] * np.sin(q.sum(axis=1))
-    v1, v2 = qd.T
-    tau = np.stack(
-        [
-            M11 * qdd[:, 0]
-            + M12 * qdd[:, 1]
-            - coupling * s2 * (2 * v1 * v2 + v2**2)
-            + s12
-            + m["g"] * (m["m1"] * m["r1"] + m["m2"] * m["l1"]) * s1,
-            M12 * qdd[:, 0] + M22 * qdd[:, 1] + coupling * s2 * v1**2 + s12,
-        ],
-        axis=1,
-    )
-    b, cf = ([m[f"{key}{k}"] for k in (1, 2)] for key in ("b", "cf"))
-    return tau + np.array(b) * qd + np.array(cf) * np.arctan(100 * qd)
-
-
-def pendulum():
-    """Compare with the published models of the double pendulum."""
-    import jaxid as jid
-
-    folder = DATA / "double_pendulum"
-    experiment = jid.experiment.parse_experiment(
-        PENDULUM.format(folder=folder), folder / "pendulum.toml"
-    )
-    logs = [
-        experiment.setup.observe(
-            jid.workflow.read_log(
-                experiment.setup, folder / f"{x}.csv", experiment.columns
-            )
-        )
-        for x in IDENTIFY + VERIFY
-    ]
-    train, later = logs[: len(IDENTIFY)], logs[len(IDENTIFY) :]
-    choice, fit = chosen_fit(experiment, train)
-    ours = [100 * e.relative for e in jid.validate(fit, later).errors]
-    theirs = {}
-    for file in sorted(folder.glob("model_*.yml")):
-        theirs[file.stem[6:]] = [
-            100
-            * np.linalg.norm(
-                o.reduced_forces
-                - o.reduce(
-                    authors_torques(
-                        file,
-                        *(
-                            np.asarray(x)
-                            for x in (o.motion.q, o.motion.qd, o.motion.qdd)
-                        ),
-                    )
-                )
-            )
-            / np.linalg.norm(o.reduced_forces)
-            for o in later
-        ]
-    best = np.min(list(theirs.values()), axis=0)
-    said = "{:.0f}, {:.0f} % (`{}`)".format(*ours, choice.chosen.name)
-    recipe = "; ".join(
-        "{}: {:.0f}, {:.0f} %".format(name, *x) for name, x in theirs.items()
-    )
-    holds = bool(np.all(ours <= best))
-    asked = "<= {:.0f}, {:.0f} %".format(*best)
-    return [
-        Row(
-            "pendulum",
-            "relative errors on two logs",
-            f"authors {recipe}",
-            asked,
-            said,
-            holds,
-        )
-    ]
 
 
 @functools.cache
@@ -560,13 +327,6 @@ def main():
     timing.pin_to(1)
     draws = 2 if options.quick else 30
     parts = {}
-    if DATA.is_dir() and not options.quick:
-        parts |= {
-            "tx40": lambda: rest("tx40", 1.75),
-            "ur10": lambda: rest("ur10", 1.65),
-        }
-        parts |= {"kr300": kr300, "pendulum": pendulum}
-        parts |= {f"promise-{x}": functools.partial(promise, x, 20) for x in LOGS}
     if timing.missing("pinocchio") is None:
         for study in (presliding, load, stribeck):
             few = max(1, draws // 6) if study is presliding else draws

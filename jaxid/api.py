@@ -57,10 +57,6 @@ from .identification.friction_laws import (
 )
 from .identification.identify import identify as identify
 from .identification.many_data_sets import identify_batch as identify_batch
-from .identification.model_selection import (
-    ModelCandidate as ModelCandidate,
-    choose_model as choose_model,
-)
 from .identification.operating_states import identify_states as identify_states
 from .identification.parameter_changes import compare as compare
 from .identification.payload import identify_payload as identify_payload

@@ -110,7 +110,6 @@ KEYS: dict[str, tuple[str, ...]] = {
         "kind",
         "weights",
         "ridge",
-        "nonlinear_friction",
         "uncertainty",
         "pull",
         "mass_max",

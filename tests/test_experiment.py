@@ -339,10 +339,6 @@ REFUSALS = [
         '`estimator.pull`: belongs to `kind = "consistent"',
     ),
     (ARM + "[estimator]\nkind = 'instrumental'", "`estimator.kind` must be"),
-    (
-        ARM + "[estimator]\nnonlinear_friction = true\nuncertainty = 'jackknife'",
-        "`nonlinear_friction`",
-    ),
     (ARM + BODIES + "centre_max = [[1, 1, 1], [1, 1]]", "`estimator.centre_max`"),
     (ARM + "[estimator]\nridge = 'cv'", "`estimator.ridge`"),
     ("[robot\n", "TOML"),

@@ -275,38 +275,43 @@ def choose(
     experiment: options.ExperimentFile,
     logs: options.Logs,
     output: Annotated[
-        Path,
+        Path | None,
         typer.Option(
-            "-o", "--output", metavar="FILE", help="The experiment file to write."
+            "-o",
+            "--output",
+            metavar="FILE",
+            help="The experiment file to write; by default chosen.toml beside yours.",
         ),
-    ] = Path("chosen.toml"),
+    ] = None,
+    seconds: Annotated[
+        float | None,
+        typer.Option("--time", metavar="S", min=1.0, help="Time for the search [s]."),
+    ] = None,
     force: options.Force = False,
 ) -> None:
-    """Choose friction and estimator by errors on unseen data.
+    """Choose the effects of the model by errors on unseen data.
 
-    A table of all models, and an experiment file with the simplest that is about as
-    good as any.
+    A table of the models, a page with figures, and a copy of the experiment file with
+    those effects that the logs need. Ctrl-C keeps the best file so far.
     """
-    if output.exists() and not force:
-        raise InputError(
-            f"`{output}` is there already: choose another `--output`, or `--force`."
-        )
-    if output.parent.resolve() != experiment.parent.resolve():
-        raise InputError(
-            "`--output` must lie beside the experiment file: its paths count from it."
-        )
+    output = options.file_beside(experiment, output, "chosen.toml", force)
     console = options.start(*logs, experiment=experiment)
-    from jaxid.io import write_text
+    from jaxid.report.model_choice_page import write_model_choice
+
+    from .best_file import BestFile
 
     content = jid.experiment.load_experiment(experiment)
-    columns = content.require_columns(logs)
-    experiments = jid.experiment.variants(content)
-    setups = {name: variant.setup for name, variant in experiments.items()}
-    with terminal.progress_bar() as progress:
-        choice = jid.workflow.choose_setup(setups, logs, columns, progress)
-    write_text(output, experiments[choice.chosen.name].text)
+    page = output.with_suffix(".html")
+    with BestFile(output) as best_file, terminal.progress_bar() as progress:
+        choice = jid.experiment.choose_model(
+            content, logs, seconds=seconds, keep=best_file.keep, progress=progress
+        )
+        best_file.keep(choice.text)
+        progress("writing the page", 0.0)
+        origin = options.report_origin(content.text)
+        write_model_choice(page, choice, content.setup.robot, origin)
     terminal.show(console, choice.summary())
-    terminal.show_files(console, output.parent, [output])
+    terminal.show_files(console, output.parent, [output, page])
 
 
 for command in (

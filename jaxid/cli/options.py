@@ -138,6 +138,20 @@ def start(
     return open_console()
 
 
+def file_beside(experiment: Path, output: Path | None, name: str, force: bool) -> Path:
+    """Return the experiment file to write, which lies beside that of the user."""
+    output = experiment.parent / name if output is None else output
+    if output.exists() and not force:
+        raise InputError(
+            f"`{output}` is there already: choose another `--output`, or `--force`."
+        )
+    if output.parent.resolve() != experiment.parent.resolve():
+        raise InputError(
+            "`--output` must lie beside the experiment file: its paths count from it."
+        )
+    return output
+
+
 def require_paths(paths: Sequence[Path]) -> None:
     """Reject paths of files that are not there."""
     missing_paths = [f"`{path}`" for path in paths if not path.exists()]

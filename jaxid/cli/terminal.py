@@ -1,6 +1,7 @@
 """The terminal of the commands: tables, remarks, names of files, progress, errors."""
 
 import errno
+import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,6 +11,9 @@ from rich.console import Console
 from rich.text import Text
 
 from jaxid.result_table import Remark, Table, printable
+
+LINE_INTERVAL = 10.0
+"""Time between two lines of progress where there is no terminal [s]."""
 
 Progress = Callable[[str, float], None]
 """Function that shows the completed fraction (0 to 1) of a stage."""
@@ -61,16 +65,42 @@ def show_text(console: Console, text: str) -> None:
     console.print(Text(text), soft_wrap=True)
 
 
+class ProgressLines:
+    """Progress where there is no terminal: a line now and then, with the time left."""
+
+    def __init__(self, console: Console):
+        self._console = console
+        self._stage_start = time.monotonic()
+        self._line_time = self._stage_start
+
+    def __call__(self, stage: str, fraction: float) -> None:
+        """Print a line if the last one is old enough."""
+        now = time.monotonic()
+        if fraction == 0.0:
+            self._stage_start = now
+        if now - self._line_time < LINE_INTERVAL:
+            return
+        self._line_time = now
+        words = f"{stage}: {100 * fraction:.0f} %"
+        if fraction > 0.0:
+            elapsed_time = now - self._stage_start
+            time_left = elapsed_time * (1.0 / fraction - 1.0)
+            words = f"{words}, about {time_left:.0f} s left"
+        self._console.print(Text(words))
+
+
 @contextmanager
 def progress_bar() -> Iterator[Progress]:
-    """Show a progress bar in a terminal, and nothing elsewhere."""
+    """Show a progress bar in a terminal, and a line each ten seconds elsewhere."""
     # Not needed by `--help`, which must answer at once.
     from rich.progress import Progress as Bar, TimeElapsedColumn
 
     console = open_console(stderr=True)
     columns = (*Bar.get_default_columns(), TimeElapsedColumn())
-    is_quiet = not console.is_terminal
-    with Bar(*columns, console=console, transient=True, disable=is_quiet) as bar:
+    if not console.is_terminal:
+        yield ProgressLines(console)
+        return
+    with Bar(*columns, console=console, transient=True) as bar:
         task = bar.add_task("starting", total=1.0)
 
         def show_stage(stage: str, fraction: float) -> None:

@@ -343,8 +343,6 @@ def keys_of_kind(kind: str) -> Texts:
     """Return the keys of one kind of estimator, apart from those of all kinds."""
     settings = inspect.signature(ESTIMATORS[kind]).parameters
     keys = [key for name in settings for key in KEYS_OF_SETTINGS.get(name, ())]
-    if kind in ("weighted", "least_squares"):
-        keys.append("nonlinear_friction")
     return tuple(keys)
 
 
@@ -360,7 +358,6 @@ class Estimation(NamedTuple):
     # least squares with the same weights and solution
     least_squares: estimators.LeastSquares | estimators.WeightedLeastSquares
     uncertainty: AbstractUncertainty  # method of the standard deviations
-    nonlinear_friction: bool  # whether the shape of friction is sought too
 
 
 def decode_estimator(table: TomlTable) -> tuple[TomlTable, TomlTable]:
@@ -383,12 +380,6 @@ def decode_estimator(table: TomlTable) -> tuple[TomlTable, TomlTable]:
             raise InputError(
                 f"`estimator.{name}`: belongs to `kind = {quoted(owners)}`."
             )
-    has_other_uncertainty = arguments.get("uncertainty", "spectral") != "spectral"
-    if has_other_uncertainty and arguments.get("nonlinear_friction"):
-        raise InputError(
-            "`estimator`: `nonlinear_friction` "
-            "does not go with `uncertainty`: choose one."
-        )
     return arguments, bounds
 
 
@@ -400,7 +391,6 @@ def build_estimation(
     kind: Annotated[str, OneOf(KINDS)] = "consistent",
     weights: Literal["maximum_forces", "residual_variances"] | None = None,
     ridge: Fraction | Literal["cross_validated"] | None = None,
-    nonlinear_friction: bool = False,
     uncertainty: Annotated[str, OneOf(UNCERTAINTIES)] = "spectral",
     pull: Magnitude | None = None,
 ) -> Estimation:
@@ -419,8 +409,6 @@ def build_estimation(
         ridge: Strength of a pull of undetermined combinations towards zero, relative to
             the best-determined one, like `"cross_validated"`: as much as predicts
             left-out parts of the logs best; or a number like 0.01.
-        nonlinear_friction: Whether to find `epsilon` and `stribeck` of each joint too,
-            and to keep them if they predict unseen parts of the logs better.
         uncertainty: Method of the standard deviations: "spectral"; "jackknife": from
             blocks of time left out in turn; "independent": as if rows were independent,
             far too small.
@@ -449,12 +437,7 @@ def build_estimation(
     build = ESTIMATORS[kind]
     names = inspect.signature(build).parameters.keys() & settings.keys()
     estimator = build(**{name: settings[name] for name in names})
-    return Estimation(
-        estimator,
-        least_squares,
-        UNCERTAINTIES[uncertainty](),
-        nonlinear_friction,
-    )
+    return Estimation(estimator, least_squares, UNCERTAINTIES[uncertainty]())
 
 
 def build_solution(

@@ -25,8 +25,4 @@ from .payload_gains_and_states import (
 )
 from .robot_file import RobotFile as RobotFile
 from .setup import LogReading as LogReading, Setup as Setup
-from .setup_choice import (
-    choose_setup as choose_setup,
-    choose_setup_by_rows as choose_setup_by_rows,
-)
 from .surroundings import Collision as Collision

@@ -139,7 +139,7 @@ def identify_logs(
     rows = RegressionProblem(
         base, parts.training_logs, partial(progress, "factorising the rows")
     )
-    fit = setup.fit(rows, progress)
+    fit = setup.fit(rows)
 
     progress("looking for mistakes", 0.0)
     # Bounds would hide what is wrong.

@@ -63,11 +63,6 @@ def fit_runs(
         columns: Meaning of the columns of the logs.
         progress: Callback, called with a stage and its completed fraction (0 to 1).
     """
-    if setup.nonlinear_friction:
-        raise InputError(
-            "`estimator.nonlinear_friction` would find other shapes of friction in "
-            "each run: leave it out, and give all runs one `epsilon` and `stribeck`."
-        )
     doubts = []
     if not has_plain_estimator(setup):
         doubts.append(

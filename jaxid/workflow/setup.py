@@ -16,14 +16,11 @@ from jaxid.dynamics.terms import (
     AbstractTerm,
     AbstractTransition,
     ConstantOffset,
-    CoulombFriction,
     CoupledDrives,
     LoadFriction,
-    StribeckFriction,
     Tanh,
 )
 from jaxid.dynamics.terms.friction import AbstractDryFriction
-from jaxid.errors import InputError
 from jaxid.identification.consistency import (
     EntropicPull,
     PhysicallyConsistent,
@@ -37,7 +34,6 @@ from jaxid.identification.estimators import (
 from jaxid.identification.filter_selection import USUAL_FILTERS
 from jaxid.identification.fit_result import Fit
 from jaxid.identification.friction_laws import (
-    identify_nonlinear_friction,
     identify_presliding,
     identify_transition_speeds,
 )
@@ -157,8 +153,6 @@ class Setup(eqx.Module):
         least_squares: Least squares for checks, and for runs that are compared or
             combined; by default weighted like the default estimator.
         uncertainty: Method of the standard deviations.
-        nonlinear_friction: Whether the shape of friction is sought, too, and kept if it
-            predicts unseen parts of the logs better.
         load_friction: Whether dry friction grows with the load on a joint, too, by the
             weight of the bodies that are identified.
         robot_file: File of the robot: the prior of its bodies, and claims to compare
@@ -176,7 +170,6 @@ class Setup(eqx.Module):
     estimator: AbstractEstimator = eqx.field(default=None)
     least_squares: LeastSquares | WeightedLeastSquares = eqx.field(default=None)
     uncertainty: AbstractUncertainty = SpectralSandwich()
-    nonlinear_friction: bool = False
     load_friction: bool = False
     robot_file: RobotFile | None = None
     reading: LogReading = LogReading()
@@ -202,16 +195,6 @@ class Setup(eqx.Module):
         if self.estimator is None:
             pull = pull_to_bodies(self.robot_file)
             self.estimator = PhysicallyConsistent(weights, pull=pull)
-        if self.load_friction and not self.has_bounded_bodies:
-            raise InputError(
-                "friction by load (`model.load`) needs the bodies that a physically "
-                "consistent estimator finds: "
-                '`PhysicallyConsistent`, `kind = "consistent"`.'
-            )
-        if self.nonlinear_friction and self.model.memory is not None:
-            raise InputError(
-                "give presliding friction or `nonlinear_friction`, but not both."
-            )
 
     @functools.cached_property
     def base(self) -> BaseParameters:
@@ -264,7 +247,7 @@ class Setup(eqx.Module):
             recording, self.robot, self.filter, self.decimation, self.min_speed
         )
 
-    def fit(self, rows: RegressionProblem, progress: Progress = ignore_progress) -> Fit:
+    def fit(self, rows: RegressionProblem) -> Fit:
         """Estimate the parameters from rows of logs."""
         # Constants of friction laws are no linear parameters: they are found first.
         notes = ()
@@ -272,8 +255,6 @@ class Setup(eqx.Module):
         if base is not rows.base:
             rows = rows.with_base(base)
             notes = (transition_note(base),)
-        if self.nonlinear_friction:
-            return self._fit_with_shapes(rows, progress)
         if self.model.memory is not None:
             rows = rows.with_base(identify_presliding(rows.base, rows.recordings))
             notes = (presliding_note(rows.base),)
@@ -283,32 +264,23 @@ class Setup(eqx.Module):
             return self._fit_with_load_friction(fit, rows.recordings)
         return fit
 
-    def _fit_with_shapes(self, rows: RegressionProblem, progress: Progress) -> Fit:
-        """Fit the shape of friction, too; return the better of both fits."""
-        terms = tuple(map(without_stribeck, rows.base.model.terms))
-        result = identify_nonlinear_friction(
-            rows.base,
-            rows.recordings,
-            self.least_squares,
-            linear=base_parameters(Model(self.robot, terms)),
-            progress=functools.partial(progress, "searching for the shape of friction"),
-        )
-        return result.better
-
     def _fit_with_load_friction(self, fit: Fit, logs: Sequence[Observations]) -> Fit:
         """Fit again with friction by the bodies' weight, until it no longer changes."""
         terms = fit.base.model.terms
         transition = fit.base.model.memory or dry_transition(terms)
         joints = self.robot.joints
         coefficients = np.full(joints, np.inf)
-        # The first fit has chosen the pull, and says why.
-        consistency: Any = fit.consistency
-        estimator = dataclasses.replace(self.estimator, pull=consistency.pull)
-        notes = [x for x in fit.notes if x not in consistency.notes]
+        estimator = self.estimator
+        notes = list(fit.notes)
+        if fit.consistency is not None:
+            # The first fit has chosen the pull, and says why.
+            pull: Any = fit.consistency.pull
+            estimator = dataclasses.replace(self.estimator, pull=pull)
+            notes = [x for x in fit.notes if x not in fit.consistency.notes]
         for _ in range(MAX_LOAD_FRICTION_FITS):
             # The columns of the bodies come first, whatever follows.
             size = self.robot.bodies * len(INERTIAL_NAMES)
-            body_parameters = np.asarray(fit.full_parameters)[:size]
+            body_parameters = np.asarray(fit.standard_parameters)[:size]
             bodies = body_parameters.reshape(self.robot.bodies, -1)
             load_friction = LoadFriction(bodies=bodies, transition=transition)
             base = base_parameters(Model(self.robot, (*terms, load_friction)))
@@ -318,7 +290,7 @@ class Setup(eqx.Module):
             fit = dataclasses.replace(fit, notes=every_note)
 
             earlier_coefficients = coefficients
-            coefficients = np.asarray(fit.full_parameters)[-joints:]
+            coefficients = np.asarray(fit.standard_parameters)[-joints:]
             change = np.abs(coefficients - earlier_coefficients).max()
             if change < LOAD_FRICTION_TOLERANCE * np.abs(coefficients).max():
                 return fit
@@ -343,13 +315,6 @@ def pull_to_bodies(
         return None
     bodies = None if robot_file is None else robot_file.possible_bodies()
     return EntropicPull(bodies, strength)
-
-
-def without_stribeck(term: AbstractTerm) -> AbstractTerm:
-    """Return a term with Coulomb's law for Stribeck's; other terms as they are."""
-    if isinstance(term, StribeckFriction):
-        return CoulombFriction(term.transition)
-    return term
 
 
 def dry_transition(terms: Sequence[AbstractTerm]) -> AbstractTransition:

@@ -1,102 +1,120 @@
-"""The simplest model that predicts unseen data as well as any, with honest promises."""
+"""Errors on unseen parts, and the rule by which a change of a model is kept."""
 
 import numpy as np
 import pytest
 import virtual
 
 import jaxid as jid
+from jaxid.identification.model_selection import (
+    Trial,
+    UnseenParts,
+    column_products,
+    divide_logs,
+    next_model,
+    predict_held_out,
+    relative_error,
+)
 
-PLAIN = (jid.RigidBodies(), jid.ViscousFriction(), jid.CoulombFriction())
-MODELS = {
-    "plain": PLAIN,
-    "root": (*PLAIN, jid.terms.SquareRootFriction()),
-    "springs": (*PLAIN, jid.terms.LinearSpring()),
-}
 ROBOT = jid.robots.planar_arm(2, 0.5).replace(limits=jid.Limits(force=[50.0, 8.0]))
+MODEL = jid.Model(ROBOT, (jid.RigidBodies(), jid.ViscousFriction()))
+BASE = jid.base_parameters(MODEL)
+WEIGHTS = np.array([0.3, 2.0])
 
 
-@pytest.fixture(scope="module")
-def candidates():
-    bases = {
-        name: jid.base_parameters(jid.Model(ROBOT, terms))
-        for name, terms in MODELS.items()
-    }
-    return [jid.ModelCandidate(name, base) for name, base in bases.items()]
-
-
-def logs(truth, count=1, samples=1500, noise=0.3, seed=0):
-    model = jid.Model(ROBOT, MODELS[truth])
-    p = virtual.standard_parameters(model)
-    options = {"samples": samples, "noise": noise}
+def logs(count, samples=300):
+    p = virtual.standard_parameters(MODEL)
     return [
-        virtual.observations(model, p, seed=seed + k, noise_seed=seed + k, **options)
+        virtual.observations(MODEL, p, samples=samples, noise=0.3, seed=k, noise_seed=k)
         for k in range(count)
     ]
 
 
-@pytest.mark.parametrize("truth", MODELS)
-def test_the_true_model_is_found(candidates, truth):
-    choice = jid.choose_model(candidates, logs(truth))
-    assert choice.chosen.name == truth
-    assert f"`{truth}` is the simplest" in str(choice)
-    assert choice.parts == "5 parts of time"
+def trial(size, *squares):
+    return Trial((f"{size}",), size, np.array(squares))
 
 
-def test_whole_logs_are_left_out_where_there_are_enough(candidates):
-    choice = jid.choose_model(candidates, logs("root", 4, samples=500))
-    assert choice.chosen.name == "root"
-    assert choice.parts == "4 logs"
-    assert np.shape(choice.errors) == (3, 4)
-
-
-def test_errors_are_those_of_fits_without_the_part(candidates):
-    several = logs("plain", 4, samples=300)
-    choice = jid.choose_model(candidates, several)
-    weights = 1.0 / np.asarray(ROBOT.max_forces)
-    forces = [np.sum((np.asarray(o.reduced_forces) * weights) ** 2) for o in several]
-    for row, candidate in zip(choice.errors, candidates, strict=True):
-        for k, left in enumerate(several):
-            fit = jid.identify(candidate.base, [o for o in several if o is not left])
-            errors = jid.validate(fit, left).errors[0].errors * weights
-            np.testing.assert_allclose(
-                row[k] ** 2, np.sum(errors**2) / np.mean(forces), rtol=1e-8
-            )
-
-
-def test_the_promise_is_what_comes(candidates):
-    ratios = []
-    for seed in range(100, 112):
-        train, later = (
-            logs("plain", 1, 400, 1.0, seed),
-            logs("plain", 2, 400, 1.0, seed + 500),
-        )
-        choice = jid.choose_model(candidates, train)
-        fit = jid.identify(choice.chosen.base, train)
-        weights = 1.0 / np.asarray(ROBOT.max_forces)
-        found = [e.errors * weights for e in jid.validate(fit, later).errors]
-        forces = [np.asarray(o.reduced_forces) * weights for o in train]
-        # Relative to the same forces: motions differ.
-        noise = np.sqrt(np.mean(np.square(found)) / np.mean(np.square(forces)))
-        ratios.append(noise / choice.promise)
-    assert 0.9 < np.median(ratios) < 1.15
-
-
-@pytest.mark.parametrize("memory", [0, 1])
-def test_of_equally_good_models_that_with_memory_is_chosen(memory):
-    laws = [jid.terms.Tanh(), jid.terms.Presliding(0.01)][:: 1 - 2 * memory]
-    terms = [
-        (jid.RigidBodies(), jid.ViscousFriction(), jid.CoulombFriction(x)) for x in laws
-    ]
-    models = [jid.Model(ROBOT, x) for x in terms]
-    names, p = models[0].parameter_names, virtual.standard_parameters(models[0])
-    p[[names.index(x) for x in ("fc1", "fc2")]] = 0.0
-    log = virtual.observations(models[0], p, samples=1500, noise=0.3)
-    choice = jid.choose_model(
-        [jid.ModelCandidate("", jid.base_parameters(x)) for x in models], log
+@pytest.mark.parametrize("count", [1, 4])
+def test_errors_are_those_of_least_squares_without_the_part(count):
+    observed = logs(count)
+    parts = divide_logs(observed)
+    assert parts.words == ("10 parts of time" if count == 1 else "4 logs")
+    training = column_products(BASE, observed, parts, WEIGHTS)
+    judged = column_products(BASE, observed, parts, np.ones(2))
+    products = UnseenParts(
+        training, judged, np.zeros((parts.size, BASE.size)), np.full(BASE.size, 1e-12)
     )
-    assert choice.chosen.base.model.memory is not None
+    columns = list(range(1, BASE.size))
+    found = products.trial((), columns)
+
+    rows = []
+    for number, log in enumerate(observed):
+        matrix, forces, joints = virtual.dense(BASE, log)
+        row = np.repeat(np.arange(log.rows)[:, None], 2, axis=1)[np.asarray(log.mask)]
+        part = np.full(len(row), number) if count > 1 else row * 10 // log.rows
+        rows.append((matrix[:, columns], forces, WEIGHTS[joints], part))
+    matrix, forces, weights, part = map(np.concatenate, zip(*rows, strict=True))
+    expected = []
+    for k in range(parts.size):
+        is_left_out = part == k
+        root = np.where(is_left_out, 0.0, weights)
+        p, *_ = np.linalg.lstsq(root[:, None] * matrix, root * forces)
+        residuals = (matrix @ p - forces)[is_left_out]
+        expected.append(residuals @ residuals * parts.size / (forces @ forces))
+    np.testing.assert_allclose(found.squares, expected, rtol=1e-6)
 
 
-def test_nothing_to_choose_from_is_refused(candidates):
-    with pytest.raises(ValueError, match="at least one model"):
-        jid.choose_model([], logs("plain"))
+def test_bodies_stay_near_the_prior_where_rows_say_nothing():
+    observed = logs(1)
+    parts = divide_logs(observed)
+    products = column_products(BASE, observed, parts, WEIGHTS)
+    prior = np.tile(np.arange(1.0, BASE.size + 1), (parts.size, 1))
+    free = UnseenParts(products, products, prior, np.full(BASE.size, 1e12))
+    held = free.trial((), range(BASE.size)).squares
+    for part, square in enumerate(held):
+        residual = np.append(prior[part], -1.0)
+        expected = residual @ products[part] @ residual
+        mean_force = products[:, -1, -1].mean()
+        np.testing.assert_allclose(square, expected / mean_force, rtol=1e-6)
+
+
+def test_predictions_have_not_seen_their_part():
+    observed = logs(4)
+    estimator = jid.WeightedLeastSquares()
+    predictions = predict_held_out(BASE, observed, estimator)
+    squares = []
+    for number, log in enumerate(observed):
+        others = [x for k, x in enumerate(observed) if k != number]
+        error = jid.validate(jid.identify(BASE, others, estimator), log).errors[0]
+        np.testing.assert_allclose(
+            predictions[number].errors, error.errors, rtol=1e-6, atol=1e-9
+        )
+        squares.append([np.nansum(error.errors**2), np.nansum(error.measured**2)])
+    total, forces = np.sum(squares, axis=0)
+    assert relative_error(predictions) == pytest.approx(np.sqrt(total / forces))
+
+
+@pytest.mark.parametrize(
+    ("trials", "size"),
+    [
+        ([trial(10, 4.0, 4.1), trial(11, 3.0, 3.1)], 11),
+        # Of two models of one size the one with less error.
+        ([trial(10, 3.0, 3.1), trial(10, 2.0, 2.1)], 10),
+        # A model that is smaller, and not worse by 1 % of the error.
+        ([trial(12, 3.0, 3.1), trial(40, 2.99, 3.09)], 12),
+        # Less error on the whole, by one part only.
+        ([trial(12, 8.0, 1.0)], None),
+        # Half a percent of the error, in each part.
+        ([trial(40, 4.95, 4.96)], None),
+        ([], None),
+    ],
+)
+def test_a_change_is_kept_if_it_lowers_the_errors_enough(trials, size):
+    choice = next_model(trial(8, 5.0, 5.01), trials)
+    assert (choice.size if choice else None) == size
+    if len(trials) == 2 and trials[0].size == trials[1].size:
+        assert choice is trials[1]
+
+
+def test_short_logs_are_refused():
+    with pytest.raises(ValueError, match="at least three blocks"):
+        divide_logs([logs(1)[0].replace(mask=np.arange(300)[:, None] < [2, 2])])

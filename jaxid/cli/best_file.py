@@ -1,0 +1,36 @@
+"""The best file of a search so far, written whenever a better one is found."""
+
+from pathlib import Path
+
+from jaxid.io import write_text
+
+from . import process
+
+
+class BestFile:
+    """The best experiment file of a search so far.
+
+    Within its context, a signal that ends the process says where the file is.
+    """
+
+    def __init__(self, output: Path):
+        self._output = output
+        self._is_written = False
+
+    def __enter__(self) -> "BestFile":
+        process.farewells.append(self.farewell)
+        return self
+
+    def __exit__(self, *_) -> None:
+        process.farewells.pop()
+
+    def keep(self, text: str) -> None:
+        """Write a better file."""
+        write_text(self._output, text)
+        self._is_written = True
+
+    def farewell(self) -> str:
+        """Return the sentence with which Ctrl-C ends the search."""
+        if not self._is_written:
+            return "stopped before a change lowered the errors: nothing was written"
+        return f"stopped: `{self._output}` holds the best model so far"

@@ -1,0 +1,124 @@
+"""Page of a choice of models: table, error against size, forces of both models."""
+
+from pathlib import Path
+
+import numpy as np
+
+from jaxid.identification.model_selection import (
+    HeldOutPrediction,
+    ModelChoice,
+    Trial,
+    relative_error,
+)
+from jaxid.io import write_text
+from jaxid.result_table import percent
+from jaxid.robot.robot import Robot
+
+from .figure import Figure
+from .figure_elements import (
+    GREY,
+    MEASUREMENT_COLOUR,
+    PREDICTION_COLOUR,
+    SKY,
+    Curve,
+    Panel,
+)
+from .page import Settings, provenance, render_page
+
+FIRST_MODEL = "file as it is"
+CHOSEN_MODEL = "chosen model"
+
+
+def write_model_choice(
+    file: Path, choice: ModelChoice, robot: Robot, settings: Settings
+) -> None:
+    """Write the page of a choice of models."""
+    sections = [
+        ("Result", [choice.summary()]),
+        ("Error against size", [size_figure(choice)]),
+        ("Forces", [force_figure(choice, robot)]),
+        provenance(settings),
+    ]
+    write_text(file, render_page(f"{robot.name}: choice of a model", sections))
+
+
+def size_figure(choice: ModelChoice) -> Figure:
+    """Return the error on unseen parts of each model, against its size."""
+    curves = [
+        _trial_curve(choice.others, "other models", GREY, "points"),
+        _trial_curve(choice.path, "way of the search", PREDICTION_COLOUR, "line"),
+    ]
+    panel = Panel(
+        curves,
+        x="number of parameters",
+        y="error on unseen parts",
+        unit="% of the forces",
+        log="y",
+    )
+    title = f"Errors {choice.band} by size: {choice.chosen.name}"
+    return Figure(title, [panel], height=4.0, width=7.6)
+
+
+def _trial_curve(trials: list[Trial], name: str, colour: str, kind) -> Curve:
+    """Return sizes and errors of models, with their names."""
+    return Curve(
+        np.array([float(trial.size) for trial in trials]),
+        np.array([100.0 * trial.error for trial in trials]),
+        name,
+        colour,
+        kind,
+        marker=True,
+        texts=[trial.name for trial in trials],
+    )
+
+
+def force_figure(choice: ModelChoice, robot: Robot) -> Figure:
+    """Return forces of the first log, and errors of the first and the chosen model.
+
+    Each part of the log is predicted by fits that have not seen it.
+    """
+    first_prediction = choice.first_predictions[0]
+    prediction = choice.predictions[0]
+    panels = [
+        _joint_panel(first_prediction, prediction, robot, joint)
+        for joint in range(robot.joints)
+    ]
+    first_error = percent(relative_error([first_prediction]))
+    error = percent(relative_error([prediction]))
+    title = (
+        f"{prediction.name}, each part by fits without it: {error} % by the chosen "
+        f"model, {first_error} % by the file as it is"
+    )
+    columns = 2 if len(panels) > 2 else 1
+    return Figure(title, panels, columns, height=2.6)
+
+
+def _joint_panel(
+    first_prediction: HeldOutPrediction,
+    prediction: HeldOutPrediction,
+    robot: Robot,
+    joint: int,
+) -> Panel:
+    """Return the forces of a joint, with the errors of both models below."""
+    unit = robot.force_unit(joint)
+    error_curves = []
+    for source, name, colour in (
+        (first_prediction, FIRST_MODEL, SKY),
+        (prediction, CHOSEN_MODEL, PREDICTION_COLOUR),
+    ):
+        errors = source.errors[:, joint]
+        error_curves.append(Curve(source.time, errors, name, colour, width=0.7))
+    error_panel = Panel(
+        error_curves, y="error", unit=unit, levels=[("y", 0.0, GREY)], share=0.6
+    )
+    measured_forces = first_prediction.measured[:, joint]
+    curve = Curve(
+        first_prediction.time, measured_forces, "measured", MEASUREMENT_COLOUR
+    )
+    return Panel(
+        [curve],
+        title=robot.joint_names[joint],
+        y="torque" if robot.revolute[joint] else "force",
+        unit=unit,
+        below=[error_panel],
+    )
