@@ -239,7 +239,10 @@ SLIPS = {
     "force sign, last": Slip(
         _log(_force_sign), ("sign of the force", "axis of joint"), ("last",)
     ),
-    "angle sign": Slip(_log(_angle_sign), ("sign of the angle", "axis of joint")),
+    "angle sign": Slip(
+        _log(_angle_sign),
+        ("sign of the angle", "sign of the force or angle", "axis of joint"),
+    ),
     "forces exchanged": Slip(_log(_swap("forces")), ("exchanged",)),
     "angles exchanged": Slip(_log(_swap("angles", "commands")), ("exchanged",)),
     "joints exchanged": Slip(
