@@ -24,7 +24,7 @@ from .suspects import UNIT_START, Quantity, Suspect, SuspectedMistakes
 class Gains(NamedTuple):
     """Falls of the score from which mistakes are said, and limits of the search.
 
-    On 108 simulated clean logs of nine machines no mistake explained more than 0.3, and
+    On 50 simulated clean logs of ten machines no mistake explained more than 0.3, and
     on 140 of ten no contact more than 0.4; on clean logs of four real robots at most
     0.9 and 1.2, because the models lack effects that a mistake imitates.
     """
