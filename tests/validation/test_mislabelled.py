@@ -218,16 +218,6 @@ def test_logs_are_judged_together_and_the_wrong_one_is_named(motors):
     assert mistakes_in_logs(good, identify(BASE, logs[:1])).certain == ()
 
 
-def test_a_push_of_a_moment_is_named_with_its_time(motors, said):
-    angles, forces = motors
-    pulse = np.zeros_like(forces)
-    pulse[1000:1006, 0] = 5.0 * np.abs(forces[:, 0]).max()
-    (sentence,) = said(angles, forces + pulse)
-    start, stop = map(float, re.findall(r"from (\S+) to (\S+) s", sentence)[0])
-    assert sentence.startswith("something seems to push the robot")
-    assert 4.9 < start < 5.0 < stop < 5.1
-
-
 def test_forces_without_gravity_are_named_in_spite_of_dry_friction(motors, said):
     """Drivers that report torques without gravity are common."""
     angles, forces = motors
