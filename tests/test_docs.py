@@ -274,7 +274,7 @@ def test_thresholds_are_those_of_the_code(question):
 
 def test_the_limits_of_mistakes_are_the_codes():
     page = (ROOT / "docs" / "is_my_fit_good.md").read_text(encoding="utf-8")
-    assert f"is named if it explains {GAINS.named:.1f}, also" in page
+    assert f"that it helps most and explains {GAINS.named:.1f}, both" in page
     assert f"{GAINS.by_misfit / 100:g} more for each percent" in page
     assert f"From {GAINS.possible:g} on it is a note" in page
     assert f"that explains {GAINS.contact:g} is a contact" in page
