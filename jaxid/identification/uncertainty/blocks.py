@@ -106,27 +106,6 @@ def block_covariance(
     return dof / len(steps) * deviations.T @ deviations, dof
 
 
-def jackknife_bias(blocks: Sequence[ResidualBlock], inverse: AnyArray) -> Vector:
-    r"""Return the jackknife's variances over the true ones, if the errors are noise.
-
-    Without block $k$ the estimate moves by noise of covariance $(A - G_k)^{-1} -
-    A^{-1}$, where $A$ is the information and $G_k$ that of the block. A block that
-    decides a parameter alone makes its jackknife far too large.
-    """
-    B = np.asarray(inverse)
-    variances = np.diag(B)
-    changes = np.zeros_like(variances)
-    for derivatives, _ in blocks:
-        information = derivatives.T @ derivatives
-        remaining_part = np.eye(len(B)) - B @ information
-        remaining_inverse, *_ = np.linalg.lstsq(remaining_part, B, rcond=None)
-        changes += np.maximum(np.diag(remaining_inverse) - variances, 0.0)
-    count = len(blocks)
-    bias = (count - 1.0) / count * changes / np.where(variances > 0, variances, 1.0)
-    # With few blocks the sum is never smaller but for rounding.
-    return np.maximum(bias, 1.0)
-
-
 def bootstrap(
     blocks: Blocks, weights: Joints, draws: int, key: PRNGKeyArray
 ) -> Float[Array, "draws base"]:
