@@ -29,6 +29,9 @@ from .constraints import Finding
 from .criteria import CRITERIA, AbstractCriterion, Information, standard_deviations
 from .criteria.information_matrix import BaseVector, JointVector
 
+MAX_OPEN_NOISE = 10.0
+"""Forces that a parameter may leave open on a random motion, over the noise (RMS)."""
+
 
 class DesignStatus(enum.StrEnum):
     """How a design ended; `ExcitationPlan.feasible` says whether it keeps limits."""
@@ -139,12 +142,12 @@ class ExcitationPlan(Summarised, eqx.Module):
     def undetermined(self) -> tuple[str, ...]:
         """Names of base parameters that this motion cannot determine.
 
-        Their deviations make forces on a random motion that are larger than the noise
-        (RMS), if not infinite.
+        Their deviations make forces on a random motion that are more than ten times
+        the noise (RMS): a tenth of the largest forces with the usual noise.
         """
         rows = self.samples * len(self.noise)
         column_rms = np.sqrt(np.diag(self.reference.weighted) / rows)
-        is_open = ~(self.standard_deviations * column_rms <= 1.0)
+        is_open = ~(self.standard_deviations * column_rms <= MAX_OPEN_NOISE)
         return tuple(self.base.names[k] for k in np.flatnonzero(is_open))
 
     def tables(self) -> tuple[Table, ...]:
