@@ -29,10 +29,6 @@ from timing import Row
 SPOILT_KINDS = "plain", "Stribeck", "heavy friction", "pauses", "load friction"
 """Kinds of logs that are spoilt, one machine after the other."""
 USUAL = (
-    "the model misses",
-    "times those of the same model",
-    "Errors depend on speed",
-    "condition number",
     "NOT DETERMINED",
     "cannot be told apart",
     "physically consistent",
