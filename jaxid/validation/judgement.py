@@ -137,6 +137,8 @@ class Judgement(NamedTuple):
 def judge(report: Report) -> Judgement:
     """Judge an identified model by all that is known of it and of its logs."""
     fit = report.fit
+    # One finding sums up what bounds do.
+    bound_notes = () if fit.consistency is None else fit.consistency.findings
     findings = [
         *(Remark(text, Status.BAD) for text in dict.fromkeys(report.mistakes)),
         *(Remark(text, Status.DOUBTFUL) for text in dict.fromkeys(report.doubts)),
@@ -148,7 +150,7 @@ def judge(report: Report) -> Judgement:
         *_judge_claims(report.claimed),
         *_judge_friction(fit, report.identification),
         *_remarks_on_fit(report),
-        *(Remark(note) for note in report.every_note),
+        *(Remark(note) for note in report.every_note if note not in bound_notes),
     ]
     # Sorting keeps the order of findings with one severity.
     findings.sort(key=lambda finding: SEVERITIES.index(finding.status))
