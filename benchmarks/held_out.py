@@ -23,7 +23,14 @@ from typing import NamedTuple
 
 import numpy as np
 import timing
-from timing import DATA, EXPERIMENTS, Row, hand_over
+from timing import (
+    DATA,
+    EXPERIMENTS,
+    PENDULUM,
+    PENDULUM_LOGS,
+    Row,
+    hand_over,
+)
 
 EFFECTS = {
     "nothing": None,
@@ -43,18 +50,6 @@ MEASURED = {
     "ur10": ["ur10/exciting_measured.csv"],
     "kr300": [f"kr300/traj_{name}.csv" for name in "ABC"],
 }
-PENDULUM = """\
-[robot]
-urdf = "{folder}/pendubot_model_1.0.urdf"
-[limits]
-force = [10.0, 10.0]
-[recording]
-time = "time"
-angles = "pos_meas{{}}"
-forces = "tau_meas{{}}"
-largest_gap = 3.0
-"""
-PENDULUM_LOGS = ("143339", "143524", "143601", "143704", "143747", "144003")
 
 
 class Result(NamedTuple):

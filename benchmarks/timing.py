@@ -22,6 +22,19 @@ HERE = Path(__file__).resolve().parent
 REPOSITORY = HERE.parent
 DATA = REPOSITORY.parent / "shared" / "data"
 EXPERIMENTS = REPOSITORY / "tests" / "real_data"
+PENDULUM = """\
+[robot]
+urdf = "{folder}/pendubot_model_1.0.urdf"
+[limits]
+force = [10.0, 10.0]
+[recording]
+time = "time"
+angles = "pos_meas{{}}"
+forces = "tau_meas{{}}"
+largest_gap = 3.0
+"""
+"""Experiment file of the measured double pendulum, whose folder is filled in."""
+PENDULUM_LOGS = ("143339", "143524", "143601", "143704", "143747", "144003")
 sys.path.insert(0, str(REPOSITORY))
 
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")

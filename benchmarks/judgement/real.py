@@ -25,21 +25,7 @@ from typing import Any, NamedTuple
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 import timing
-from timing import DATA, EXPERIMENTS, Row
-
-PENDULUM = """\
-[robot]
-urdf = "{folder}/pendubot_model_1.0.urdf"
-[limits]
-force = [10.0, 10.0]
-[recording]
-time = "time"
-angles = "pos_meas{{}}"
-forces = "tau_meas{{}}"
-largest_gap = 3.0
-"""
-PENDULUM_LOGS = "143339", "143524", "143601", "143704", "143747", "144003"
-
+from timing import DATA, EXPERIMENTS, PENDULUM, PENDULUM_LOGS, Row
 
 LOG_SLIPS = (
     "force sign",

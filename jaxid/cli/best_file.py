@@ -4,10 +4,10 @@ from pathlib import Path
 
 from jaxid.io import write_text
 
-from . import process
+from .process import Farewell
 
 
-class BestFile:
+class BestFile(Farewell):
     """The best experiment file of a search so far.
 
     Within its context, a signal that ends the process says where the file is.
@@ -16,13 +16,6 @@ class BestFile:
     def __init__(self, output: Path):
         self._output = output
         self._is_written = False
-
-    def __enter__(self) -> "BestFile":
-        process.farewells.append(self.farewell)
-        return self
-
-    def __exit__(self, *_) -> None:
-        process.farewells.pop()
 
     def keep(self, text: str) -> None:
         """Write a better file."""

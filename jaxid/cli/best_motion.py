@@ -5,10 +5,10 @@ from pathlib import Path
 from jaxid.trajectory.trajectory import LinearTrajectory
 from jaxid.workflow.motion_design import MotionTask, make_playable, write_motion
 
-from . import process
+from .process import Farewell
 
 
-class BestMotion:
+class BestMotion(Farewell):
     """The best motion of a search so far, in its files.
 
     Within its context, a signal that ends the process says where the motion is.
@@ -18,13 +18,6 @@ class BestMotion:
         self._task = task
         self._output = output
         self._is_written = False
-
-    def __enter__(self) -> "BestMotion":
-        process.farewells.append(self.farewell)
-        return self
-
-    def __exit__(self, *_) -> None:
-        process.farewells.pop()
 
     def keep(self, motion: LinearTrajectory) -> None:
         """Write a better motion."""

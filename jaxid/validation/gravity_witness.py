@@ -54,8 +54,8 @@ class GravityWitness(NamedTuple):
     @property
     def is_different(self) -> bool:
         """Whether the gravity of the fit is not that of the file's bodies."""
-        has_say = self.share > LIMITS.share and self.inertia > LIMITS.inertia
-        return has_say and self.difference > LIMITS.difference
+        is_telling = self.share > LIMITS.share and self.inertia > LIMITS.inertia
+        return is_telling and self.difference > LIMITS.difference
 
     @property
     def is_absent(self) -> bool:
@@ -66,10 +66,10 @@ class GravityWitness(NamedTuple):
     def sentence(self) -> str:
         """Say how much differs, and the usual causes."""
         difference = f"{100 * self.difference:.2g} %"
-        return (
-            f"gravity of the file's bodies is not in the forces ({difference} of it "
-            f"differ): {CAUSES}, or the file's bodies are wrong."
-        )
+        text = f"gravity in the forces differs by {difference} from that of"
+        if self.is_absent:
+            text = f"the forces seem to lack gravity: {difference} differ from that of"
+        return f"{text} the file's bodies: {CAUSES}, or the file's bodies are wrong."
 
 
 def gravity_witness(
@@ -99,12 +99,12 @@ def gravity_witness(
     fit_gravity = relative_forces(gravity_columns, fit_bodies)
     file_inertia = relative_forces(other_columns, file_bodies)
     fit_inertia = relative_forces(other_columns, fit_bodies)
-    size = float(np.linalg.norm(file_inertia))
-    square = max(float(np.sum(file_gravity**2)), 1e-300)
+    inertia_norm = max(float(np.linalg.norm(file_inertia)), 1e-300)
+    gravity_square = max(float(np.sum(file_gravity**2)), 1e-300)
     square_difference = float(np.sum((file_gravity - fit_gravity) ** 2))
     return GravityWitness(
-        difference=np.sqrt(square_difference / square),
-        multiple=float(np.sum(file_gravity * fit_gravity)) / square,
-        share=np.sqrt(square / file_gravity.size),
-        inertia=float(np.linalg.norm(fit_inertia)) / max(size, 1e-300),
+        difference=np.sqrt(square_difference / gravity_square),
+        multiple=float(np.sum(file_gravity * fit_gravity)) / gravity_square,
+        share=np.sqrt(gravity_square / file_gravity.size),
+        inertia=float(np.linalg.norm(fit_inertia)) / inertia_norm,
     )

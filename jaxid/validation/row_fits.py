@@ -122,19 +122,32 @@ def _solution(
 
 def promise(judge: Judge, rows: Rows, fit: RowFit, columns: np.ndarray) -> float:
     """Return by how much more columns [rows, joints, columns] would lower the score."""
-    weights = (judge.mask * fit.weights)[..., None]
-    matrix = (rows.columns * weights).reshape(-1, rows.columns.shape[-1])
-    vectors = (columns * weights).reshape(-1, columns.shape[-1])
-    scales = fit.scales[:, None]
-    products = matrix.T @ vectors / scales
-    imitations = linalg.cho_solve(fit.factor, products, check_finite=False) / scales
-    remainders = vectors - matrix @ imitations
+    weights = judge.mask * fit.weights
+    vectors = _flat(columns * weights[..., None])
+    remainders = vectors - _imitations(rows, weights, fit, vectors)
     # What the fit can imitate tells nothing.
     remainder_squares = np.sum(remainders**2, axis=0)
     column_squares = np.sum(vectors**2, axis=0)
     remainders = remainders[:, remainder_squares > 1e-6 * column_squares]
-    errors = (fit.errors * weights[..., 0]).ravel()
+
+    errors = (fit.errors * weights).ravel()
     amounts, *_ = np.linalg.lstsq(remainders, errors, rcond=1e-6)
     remaining_errors = (errors - remainders @ amounts).reshape(rows.forces.shape)
     squares = judge.mean_squares(remaining_errors / fit.weights, rows.forces)
     return fit.score - judge.score(squares)
+
+
+def _imitations(
+    rows: Rows, weights: np.ndarray, fit: RowFit, vectors: np.ndarray
+) -> np.ndarray:
+    """Return what the columns of a fit explain of weighted vectors [:, columns]."""
+    matrix = _flat(rows.columns * weights[..., None])
+    scales = fit.scales[:, None]
+    products = matrix.T @ vectors / scales
+    multiples = linalg.cho_solve(fit.factor, products, check_finite=False)
+    return matrix @ (multiples / scales)
+
+
+def _flat(columns: np.ndarray) -> np.ndarray:
+    """Return columns [rows, joints, columns] with the rows of all joints together."""
+    return columns.reshape(-1, columns.shape[-1])
