@@ -309,12 +309,13 @@ class ModelChoice(Summarised):
         # A small change of a square root is half of it over the root.
         slope = 0.5 / self.chosen.error / np.sqrt(len(self.chosen.squares))
         deviations = [slope * x.std(ddof=1) for x in differences]
+        errors = [trial.error for trial in trials]
         return Table(
             "models by their errors on parts that were left out",
             Column("model", [trial.name for trial in trials]),
             Column("parameters", [trial.size for trial in trials]),
-            Column("error", [trial.error for trial in trials], "%", percent),
-            Column("± beside the chosen", deviations, "%", percent),
+            Column("error", errors, "%", lambda x: percent(x, 3)),
+            Column("± of the\ndifference", deviations, "%", percent),
             remarks=self.remarks,
             status=[
                 Status.GOOD if x is self.chosen else Status.NEUTRAL for x in trials

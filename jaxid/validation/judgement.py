@@ -168,11 +168,14 @@ def _verdict(report: Report, findings: Sequence[Remark]) -> Remark:
     if Status.DOUBTFUL in statuses:
         text = "A usable model; look at what is marked ! before you rely on it."
         return Remark(text, Status.DOUBTFUL)
-    error = percent(relative_error(report.verification))
+    error = relative_error(report.verification)
     # The end of a log is less new than another log.
     is_split = report.settings.get("split") is not None
     motion = "the rest of its logs" if is_split else "other logs"
-    text = f"it misses {error} % of the RMS torque of {motion}."
+    text = f"it misses {percent(error)} % of the RMS torque of {motion}."
+    if error > ERRORS.good:
+        text = f"A usable model: nothing else speaks against it, but {text}"
+        return Remark(text, Status.NEUTRAL)
     return Remark(f"A good model: nothing speaks against it, and {text}", Status.GOOD)
 
 

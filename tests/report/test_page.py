@@ -184,10 +184,13 @@ def test_errors_on_new_motion_are_judged_by_their_share_of_the_forces(
     first, second = validation.errors
     wave = np.sin(7.0 * np.asarray(second.time))[:, None] * second.force_rms
     predicted = np.asarray(second.measured) + np.sqrt(2.0) * share * wave
-    missed = dataclasses.replace(second, predicted=predicted)
+    # No other parameters would do better.
+    unexplained = predicted - np.asarray(second.measured)
+    missed = dataclasses.replace(second, predicted=predicted, unexplained=unexplained)
     found = judge(Report(fit, (first,), (missed,), validation.definiteness))
     (remark,) = (x for x in found.findings if "has not seen" in x.text)
     assert remark.status is status
+    assert found.verdict.status is status
     percents = [float(x) for x in re.findall(r"([\d.]+) %", remark.text)]
     assert percents[0] == pytest.approx(100 * share, rel=0.1)
 
