@@ -27,7 +27,12 @@ from jaxid.identification.determination import OPEN_SHARES
 from jaxid.measurement.filters import FILTERS
 from jaxid.simulation.virtual import random_bodies
 from jaxid.validation.judgement import ERRORS, MAX_CONDITION_NUMBER
-from jaxid.validation.mistake_search import GAINS, MAX_MISFIT, MIN_POWER
+from jaxid.validation.mistake_search import (
+    GAINS,
+    MAX_CURED_MISFIT,
+    MAX_MISFIT,
+    MIN_POWER,
+)
 from jaxid.validation.torque_errors import POSES
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -275,7 +280,9 @@ def test_thresholds_are_those_of_the_code(question):
 def test_the_limits_of_mistakes_are_the_codes():
     page = (ROOT / "docs" / "is_my_fit_good.md").read_text(encoding="utf-8")
     assert f"that it helps most and explains {GAINS.named:.1f}, both" in page
-    assert f"{GAINS.by_misfit / 100:g} more for each percent" in page
+    assert f"less than {GAINS.named_rest:g} of what it missed" in page
+    assert f"or less than {100 * MAX_CURED_MISFIT:g} % of the forces" in page
+    assert f"and less than {GAINS.possible_rest:g} of what it missed" in page
     assert f"From {GAINS.possible:g} on it is a note" in page
     assert f"that explains {GAINS.contact:g} is a contact" in page
     assert f"if more than {100 * MAX_MISFIT:g} % of the forces are missed" in page
