@@ -271,7 +271,8 @@ class LogMistakes(NamedTuple):
 
     Attributes:
         certain: Mistakes, contacts, and that the model does not fit.
-        possible: Mistakes that explain only a part of what the model misses.
+        possible: Mistakes that explain only a part of what the model misses, and that
+            most of it is missed at rest.
         doubts: What fits, but needs a look.
         delay: Delay of all forces; None where no mistakes were looked for.
     """
@@ -331,4 +332,9 @@ def _mistakes(
     mistakes = find_mistakes(model, recordings, bodies, commands)
     certain = mistakes.explained or mistakes.unexplained
     doubts = (*mistakes.doubts, *doubts)
-    return LogMistakes(certain, mistakes.possible, doubts, mistakes.delay)
+    possible = mistakes.possible
+    logs = [x.observations for x in diagnoses if x.observations is not None]
+    if all(np.all(log.mask) for log in logs):
+        # No rows at rest have been left out so far.
+        possible += mistakes.rest
+    return LogMistakes(certain, possible, doubts, mistakes.delay)

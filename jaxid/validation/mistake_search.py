@@ -17,6 +17,7 @@ from .contacts import Contact, find_contact
 from .descriptions import MAX_FRICTION_SHARE, DescribedLog
 from .filtered_log import FilteredLog
 from .gravity_witness import gravity_witness
+from .rest import rest_remarks
 from .row_fits import RowFit, Rows, promise
 from .suspects import UNIT_START, Quantity, Suspect, SuspectedMistakes
 
@@ -91,6 +92,7 @@ class Mistakes(NamedTuple):
         unexplained: A contact, or that the model does not fit.
         possible: Mistakes that explain a part of what it misses.
         doubts: What fits, but disagrees with the robot's file, or is late.
+        rest: That the model misses most where joints rest.
         delay: Delay of all forces, also one that is no mistake; None if the logs are
             too short.
     """
@@ -99,6 +101,7 @@ class Mistakes(NamedTuple):
     unexplained: tuple[str, ...] = ()
     possible: tuple[str, ...] = ()
     doubts: tuple[str, ...] = ()
+    rest: tuple[str, ...] = ()
     delay: Delay | None = None
 
     def with_delay(self, delay: Delay) -> "Mistakes":
@@ -159,6 +162,7 @@ def find_mistakes(
     if commands and are_exchanged(described_log, recordings, commands):
         return Mistakes(explained=(EXCHANGED_COMMANDS,))
     delay = common_delay(described_log)
+    rest = rest_remarks(described_log)
     mistakes = _mistakes_of_all(described_log, recordings, bodies)
     if log.friction_shares.max() > MAX_FRICTION_SHARE and not mistakes.explained:
         # Friction by load may hide mistakes, or stand for effects that are missing.
@@ -170,6 +174,8 @@ def find_mistakes(
         mistakes = _mistakes_by_log(model, recordings, mistakes)
     if not mistakes.explained and bodies is not None:
         mistakes = _with_witness(mistakes, described_log, bodies)
+    if not mistakes.explained:
+        mistakes = mistakes._replace(rest=rest)
     return mistakes.with_delay(delay)
 
 

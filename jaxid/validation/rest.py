@@ -1,0 +1,47 @@
+"""Rows at rest, where dry friction takes any value and hides how good a model is."""
+
+import numpy as np
+
+from jaxid.result_table import significant
+
+from .descriptions import DescribedLog
+from .filtered_log import REST_SPEED
+from .row_fits import Judge
+
+MIN_ERROR = 0.1
+"""RMS error of a joint over its RMS force, on unseen parts, from which rest is told.
+
+On clean logs of the setting machines with pauses it was at most 0.07, on others less.
+"""
+MAX_REMAINDER = 0.5
+"""Share of that error that remains if rows at rest are left out."""
+
+
+def rest_remarks(described_log: DescribedLog) -> tuple[str, ...]:
+    """Return a sentence if the rows at rest are most of what a model misses."""
+    moving_judge = described_log.judge
+    judge = Judge(np.ones_like(moving_judge.mask), moving_judge.folds)
+    errors = _unseen_errors(judge, described_log)
+    moving_errors = _unseen_errors(moving_judge, described_log)
+    is_halved = moving_errors < MAX_REMAINDER * errors
+    is_told = (errors > MIN_ERROR) & is_halved & moving_judge.is_judged
+    if not is_told.any():
+        return ()
+    worst_joint = int(np.argmax(errors * is_told))
+    joint_names = np.array(described_log.robot.joint_names)
+    names = ", ".join(f"`{name}`" for name in joint_names[is_told])
+    speeds = REST_SPEED * np.abs(described_log.log.motion.qd).max(axis=0)
+    texts = ", ".join(f"{speed:.2g}" for speed in speeds)
+    return (
+        f"friction at rest takes any value: of the forces of {names} the model misses "
+        f"up to {significant(100 * errors[worst_joint], 2)} % on unseen parts, "
+        f"{significant(100 * moving_errors[worst_joint], 2)} % without rows at rest, "
+        f"which `min_speed = [{texts}]` in `[rows]` leaves out.",
+    )
+
+
+def _unseen_errors(judge: Judge, described_log: DescribedLog) -> np.ndarray:
+    """Return the RMS errors of the joints over their RMS forces, on unseen parts."""
+    rows = described_log.rows
+    squares = judge.unseen_squares(rows)
+    return np.sqrt(squares / (np.mean(rows.forces**2, axis=0) + 1e-300))
