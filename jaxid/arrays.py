@@ -192,8 +192,11 @@ def in_parts(solve: Callable[[Any], Any], data: Any, size: int = 16) -> Any:
 
     XLA leaves small operations to one core, so each core gets entries of its own. Parts
     of equal size also mean that another number of entries compiles nothing anew. An
-    accelerator takes the parts one after the other.
+    accelerator takes all entries at once, from where they are.
     """
+    if jax.default_backend() != "cpu":
+        return solve(data)
+    data = jax.tree.map(np.asarray, data)
     count = len(jax.tree.leaves(data)[0])
     size = min(count, size)
 
@@ -202,9 +205,7 @@ def in_parts(solve: Callable[[Any], Any], data: Any, size: int = 16) -> Any:
         entries = jax.tree.map(lambda x: x[indices], data)
         return jax.block_until_ready(solve(entries))
 
-    cores = None if jax.default_backend() == "cpu" else 1
-    starts = range(0, count, size)
-    results = on_cores(part, starts, cores)
+    results = on_cores(part, range(0, count, size))
     return jax.tree.map(lambda *x: jnp.concatenate(x)[:count], *results)
 
 

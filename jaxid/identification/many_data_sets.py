@@ -154,7 +154,6 @@ def _solve_together(
         data_sets = data_sets._replace(forces=batch.forces - tool_forces[:, None])
     if is_traced(data_sets):
         return solve(regressor, data_sets, row_time)
-    data_sets = jax.tree.map(np.asarray, data_sets)
     fit = in_parts(lambda part: solve(regressor, part, row_time), data_sets)
     return _solve_again(base, robots, batch, fit, row_time)
 

@@ -64,6 +64,14 @@ def results_at_once(program: Program, *arrays: Array) -> Results:
     return lower(program, fence=False).run(entries)
 
 
+def _stored_results(program: Program, *arrays: Array) -> Results:
+    """Return the results of `results_at_once`, each stored before it is used.
+
+    Where results are stacked, a GPU would compute what they share for each of them.
+    """
+    return jax.lax.optimization_barrier(results_at_once(program, *arrays))
+
+
 def _repeat(columns: Sequence, count: int):
     """Return all entries as arrays of the samples, also what these have in common."""
     entries = []
@@ -117,7 +125,7 @@ def on_rows(program: Program, *arrays: Array) -> Rows:
     @custom_vmap
     def run(*arrays):
         block_run = functools.partial(_in_blocks, program)
-        vectorised_run = functools.partial(_pack, results_at_once, program)
+        vectorised_run = functools.partial(_pack, _stored_results, program)
         return jax.lax.platform_dependent(
             *arrays, cpu=block_run, default=vectorised_run
         )

@@ -79,6 +79,15 @@ def test_every_data_set_as_if_identified_alone(base, sets, arrays):
     np.testing.assert_array_equal(in_parts(lambda part: 2.0 * part, x), 2.0 * x)
 
 
+def test_a_gpu_takes_all_data_sets_from_where_they_are(monkeypatch):
+    x = jnp.arange(37.0)
+    calls = []
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    in_parts(calls.append, x)
+    (given,) = calls
+    assert given is x
+
+
 def test_honest_deviations_of_many_draws(base, sets, arrays):
     """The compiled sandwich is that of one identification after the other."""
     mask = np.ones((3, SAMPLES, 2), bool)
