@@ -1,8 +1,8 @@
 """Choice of the model of an experiment file: effects that unseen parts of logs need.
 
 The search begins with the file as it is. Each round tries every single change and makes
-the one that lowers the errors on unseen parts most. The columns of all effects are
-evaluated and filtered once; the models are subsets of them.
+the one that lowers the errors on unseen parts most; the next round begins with a new
+fit. In a round the columns of all effects are evaluated and filtered once.
 """
 
 import dataclasses
@@ -22,6 +22,7 @@ from jaxid.identification.consistency import PhysicallyConsistent
 from jaxid.identification.friction_laws import (
     identify_presliding,
     identify_transition_speeds,
+    minimum_place,
 )
 from jaxid.identification.model_selection import (
     BODY_RIDGE,
@@ -57,11 +58,8 @@ from .experiment import Experiment, parse_experiment
 
 MIN_SPEED_SHARE = 0.05
 """Speed below which rows may be left out, relative to a joint's largest speed."""
-STRIBECK_SHARES = (0.01, 0.02, 0.05, 0.1, 0.2)
+STRIBECK_SHARES = np.geomspace(0.01, 0.3, 6)
 """Stribeck speeds that are tried, relative to a joint's largest speed."""
-
-Names = tuple[str, ...]
-"""Names of changes, in the order in which they are made."""
 
 
 def choose_model(
@@ -78,7 +76,7 @@ def choose_model(
     all models are compared in this one band.
 
     Parts of time are left out in turn, or whole logs if there are at least four. A
-    change is kept if it lowers the errors on them by more than one standard deviation
+    change is kept if it lowers the errors on them by more than two standard deviations
     of the difference, and by 1 % of the error at least. The models are fitted by
     weighted least squares; the promised error is that of the file's own estimator.
 
@@ -100,16 +98,16 @@ def choose_model(
     recordings = [read_log(setup, path, columns) for path in paths]
     progress("evaluating the columns", 0.0)
     search = ModelSearch(experiment, setup, recordings)
+    first_predictions = search.predict()
     path, others, is_complete = search.run(end_time, keep, progress)
-    changes = path[-1].changes
     progress("predicting unseen parts", 0.0)
     return ModelChoice(
         path=path,
         others=others,
         changes=search.keys,
-        text=search.text(changes),
-        first_predictions=search.predict(()),
-        predictions=search.predict(changes),
+        text=search.text,
+        first_predictions=first_predictions,
+        predictions=search.predict() if len(path) > 1 else first_predictions,
         band=search.band,
         parts=search.parts.words,
         is_complete=is_complete,
@@ -139,58 +137,54 @@ class ModelSearch:
     ):
         self._experiment = experiment
         self._recordings = recordings
-        self._text = experiment.text
+        self.text = experiment.text
         if setup.filter != experiment.setup.filter:
             # The cut-off that the logs have chosen.
             cutoff = getattr(setup.filter, "cutoff", None)
             table: dict[str, Any] = {"cutoff": cutoff}
             if isinstance(setup.filter, ZeroPhaseButterworth):
                 table["kind"] = "butterworth"
-            self._text = changed_text(self._text, {"filter": table})
-        self._sources: dict[Names, ColumnSource] = {}
-        logs = [setup.observe(recording) for recording in recordings]
-        max_speeds = np.max([np.abs(log.motion.qd).max(axis=0) for log in logs], axis=0)
-        self._row_changes = self._changes_of_rows(setup, max_speeds)
+            self.text = changed_text(self.text, {"filter": table})
+        self._changes: tuple[str, ...] = ()
+        logs = self._observe(setup)
+        self._max_speeds = np.max(
+            [np.abs(log.motion.qd).max(axis=0) for log in logs], axis=0
+        )
+        self._row_changes = self._changes_of_rows(setup)
         cutoff = setup.filter.low_pass(logs[0].sample_time).cutoff
         self.band = f"below {cutoff:.3g} Hz"
         self.parts = divide_logs(logs)
         self._is_late = np.arange(self.parts.size) >= self.parts.size / 2
         self._masks = [log.mask for log in logs]
-        first_base = find_friction_constants(setup.base, logs)
-        transition = dry_transition(first_base.model.terms)
-        self._speeds = getattr(transition, "speed", None)
-        problem = RegressionProblem(first_base, logs, divisions=DIVISIONS)
-        estimate = setup.least_squares(problem)
-        self._weights = np.asarray(estimate.weights)
-        self._bodies = first_base.to_standard(np.asarray(estimate.parameters))
-        self._first_names = first_base.names
-        estimator = bounded_estimator(setup, problem)
-        self._first_estimates = estimate_without_parts(problem, self.parts, estimator)
-        self._effects = self._effects_of_robot(logs, max_speeds)
+        # Until constants of friction are found, those of the file are near enough.
+        estimate = setup.least_squares(RegressionProblem(setup.base, logs))
+        self._bodies = setup.base.to_standard(np.asarray(estimate.parameters))
+        self._transition = dry_transition(setup.model.terms)
+        self._effects = self._effects_of_robot()
+        self._begin_round()
 
-    def _changes_of_rows(self, setup: Setup, max_speeds) -> dict[str, Keys]:
+    def _observe(self, setup: Setup) -> list[Observations]:
+        return [setup.observe(recording) for recording in self._recordings]
+
+    def _changes_of_rows(self, setup: Setup) -> dict[str, Keys]:
         """Return the changes that need other rows: memory, and a smallest speed."""
         changes: dict[str, Keys] = {}
         if setup.model.memory is None:
             changes["presliding"] = PRESLIDING
         if setup.min_speed is None:
-            speeds = [float(f"{MIN_SPEED_SHARE * x:.2g}") for x in max_speeds]
+            speeds = [float(f"{MIN_SPEED_SHARE * x:.2g}") for x in self._max_speeds]
             changes["minimum speed"] = {"rows": {"min_speed": speeds}}
         return changes
 
     def _setup(self, *changes: Keys) -> Setup:
         """Return the setup of the file with other keys."""
-        text = changed_text(self._text, *changes)
+        text = changed_text(self.text, *changes)
         return parse_experiment(text, self._experiment.path).setup
 
     @property
     def keys(self) -> dict[str, Keys]:
         """Keys of each change by its name."""
         return {**self._effects, **self._row_changes}
-
-    def text(self, names: Names) -> str:
-        """Return the text of the experiment file with some changes."""
-        return changed_text(self._text, *(self.keys[name] for name in names))
 
     def run(
         self,
@@ -204,54 +198,92 @@ class ModelSearch:
             The first model and that after each change; all others; whether no change
             was left to try.
         """
-        path = [self.trial(())]
+        path = [self.trial()]
         others: list[Trial] = []
         while time.monotonic() < end_time:
-            current = path[-1]
             trials = []
-            neighbours = self.neighbours(current.changes)
-            stage = f"round {len(path)}: {len(neighbours)} changes"
-            for number, changes in enumerate(neighbours):
-                progress(stage, number / len(neighbours))
+            names = [name for name in self.keys if name not in self._changes]
+            stage = f"round {len(path)}: {len(names)} changes"
+            for number, name in enumerate(names):
+                progress(stage, number / len(names))
                 if time.monotonic() < end_time:
-                    trials += self.try_changes(changes)
-            model = next_model(current, trials)
+                    trials += self.try_change(name)
+            model = next_model(path[-1], trials)
             others += [trial for trial in trials if trial is not model]
             if model is None:
                 break
-            path.append(model)
+            self.make_change(model.changes[-1])
+            path.append(self.trial())
             if keep is not None:
-                keep(self.text(model.changes))
+                keep(self.text)
         return path, others, time.monotonic() < end_time
 
-    def neighbours(self, changes: Names) -> list[Names]:
-        """Return the changes together with each one that is not among them."""
-        return [(*changes, name) for name in self.keys if name not in changes]
+    def make_change(self, name: str) -> None:
+        """Change the file, and begin the next round with it."""
+        self.text = changed_text(self.text, self.keys[name])
+        self._changes = (*self._changes, name)
+        self._begin_round()
 
-    def try_changes(self, changes: Names) -> list[Trial]:
-        """Return the errors of a model; nothing if its changes do not go together."""
+    def _begin_round(self) -> None:
+        """Fit the model with the changes made; all models of the round use its bodies.
+
+        Without that, a change would make up for bodies and constants of friction that
+        only the model without an earlier change needs.
+        """
+        setup = self._setup()
+        logs = self._observe(setup)
+        if setup.load_friction:
+            # It follows bodies and transitions of a fit, first of that without it.
+            self._fit(setup, logs)
+        problem, self._weights = self._fit(setup, logs)
+        self._names_of_fit = problem.base.names
+        estimator = bounded_estimator(setup, problem)
+        self._estimates = estimate_without_parts(problem, self.parts, estimator)
+        if "Stribeck" in self._effects and "Stribeck" not in self._changes:
+            base = base_parameters(self._model(self._effects["Stribeck"]))
+            speeds = stribeck_speeds(base, logs, self._max_speeds)
+            self._effects["Stribeck"] = {"model": {"coulomb": {"stribeck": speeds}}}
+        self._sources: dict[str | None, ColumnSource] = {}
+
+    def _fit(
+        self, setup: Setup, logs: Sequence[Observations]
+    ) -> tuple[RegressionProblem, np.ndarray]:
+        """Fit the model, and return its rows and weights of the joints."""
+        base = find_friction_constants(base_parameters(self._model()), logs)
+        problem = RegressionProblem(base, logs, divisions=DIVISIONS)
+        estimate = setup.least_squares(problem)
+        self._bodies = base.to_standard(np.asarray(estimate.parameters))
+        self._transition = dry_transition(base.model.terms)
+        return problem, np.asarray(estimate.weights)
+
+    def try_change(self, name: str) -> list[Trial]:
+        """Return the errors with a further change; nothing if it does not go along."""
         try:
-            return [self.trial(changes)]
+            return [self.trial(name)]
         except InputError:
             return []
 
-    def trial(self, changes: Names) -> Trial:
-        """Return the errors of a model on the parts."""
-        names_of_rows = tuple(x for x in self._row_changes if x in changes)
-        if names_of_rows not in self._sources:
-            self._sources[names_of_rows] = self._column_source(names_of_rows)
-        source = self._sources[names_of_rows]
+    def trial(self, name: str | None = None) -> Trial:
+        """Return the errors on the parts of the model, or of that with a change."""
+        row_change = name if name in self._row_changes else None
+        if row_change not in self._sources:
+            self._sources[row_change] = self._column_source(row_change)
+        source = self._sources[row_change]
         columns = list(source.first_columns)
-        for name in changes:
+        changes = self._changes
+        if name is not None:
             columns += source.columns.get(name, [])
+            changes = (*changes, name)
         # The first half is judged with the lengths of the second one.
         trials = [x.trial(changes, sorted(columns)) for x in source.products]
         squares = np.where(self._is_late, trials[0].squares, trials[-1].squares)
-        return trials[0]._replace(squares=squares)
+        # A Stribeck speed of each joint is a parameter too.
+        size = trials[0].size
+        if "Stribeck" in changes:
+            size += len(self._max_speeds)
+        return trials[0]._replace(size=size, squares=squares)
 
-    def _effects_of_robot(
-        self, logs: Sequence[Observations], max_speeds
-    ) -> dict[str, Keys]:
+    def _effects_of_robot(self) -> dict[str, Keys]:
         """Return the effects that the robot can have and the file does not."""
         effects = {}
         first_names = self._names()
@@ -262,10 +294,6 @@ class ModelSearch:
             except InputError:
                 continue
             effects[name] = keys
-        if "Stribeck" in effects:
-            base = base_parameters(self._model(effects["Stribeck"]))
-            speeds = stribeck_speeds(base, logs, max_speeds)
-            effects["Stribeck"] = {"model": {"coulomb": {"stribeck": speeds}}}
         return effects
 
     def _names(self, *changes: Keys) -> set[str]:
@@ -276,24 +304,24 @@ class ModelSearch:
         setup = self._setup(*changes)
         terms = setup.model.terms
         if setup.load_friction:
-            transition = setup.model.memory or dry_transition(terms)
+            transition = setup.model.memory or self._transition
             terms = (*terms, LoadFriction(bodies=self._bodies, transition=transition))
         return Model(setup.robot, terms)
 
-    def _column_source(self, names_of_rows: Names) -> ColumnSource:
-        """Evaluate and filter the columns of all effects."""
-        row_keys = [self._row_changes[name] for name in names_of_rows]
+    def _column_source(self, row_change: str | None) -> ColumnSource:
+        """Evaluate and filter the columns of all effects that the model lacks."""
+        row_keys = [] if row_change is None else [self._row_changes[row_change]]
         first_model = self._model(*row_keys)
         models = {
-            name: self._model(keys, *row_keys) for name, keys in self._effects.items()
+            name: self._model(keys, *row_keys)
+            for name, keys in self._effects.items()
+            if name not in self._changes
         }
         setup = self._setup(*row_keys)
-        logs = [setup.observe(recording) for recording in self._recordings]
+        logs = self._observe(setup)
         terms = join_terms([first_model, *models.values()])
-        model = Model(setup.robot, terms)
-        if self._speeds is not None:
-            model = model.with_transition_speeds(self._speeds)
-        base = base_parameters(model)
+        base = base_parameters(Model(setup.robot, terms))
+        base = identify_transition_speeds(base, logs)
         products = [self._products(base, logs)]
         if base.model.memory is not None:
             # Lengths must not have seen the parts that are judged.
@@ -337,19 +365,18 @@ class ModelSearch:
     def _priors(self, base: BaseParameters) -> tuple[np.ndarray, np.ndarray]:
         """Return the bodies near which the fits stay, and how strongly."""
         priors = np.zeros((self.parts.size, base.size))
-        first_columns = [base.names.index(name) for name in self._first_names]
-        priors[:, first_columns] = self._first_estimates
+        first_columns = [base.names.index(name) for name in self._names_of_fit]
+        priors[:, first_columns] = self._estimates
         # The columns of the bodies come first.
         bodies = base.model.terms[0].parameters(base.model.robot)
         is_body = np.array(base.indices) < len(bodies)
         return priors, np.where(is_body, BODY_RIDGE, RIDGE)
 
-    def predict(self, changes: Names) -> list[HeldOutPrediction]:
+    def predict(self) -> list[HeldOutPrediction]:
         """Predict the parts by the file's own estimator, in the model's own band."""
-        keys = [self.keys[name] for name in changes]
-        setup = self._setup(*keys)
-        logs = [setup.observe(recording) for recording in self._recordings]
-        base = find_friction_constants(base_parameters(self._model(*keys)), logs)
+        setup = self._setup()
+        logs = self._observe(setup)
+        base = find_friction_constants(base_parameters(self._model()), logs)
         estimator = setup.least_squares
         if setup.has_bounded_bodies:
             estimator = bounded_estimator(setup, RegressionProblem(base, logs))
@@ -395,8 +422,11 @@ def join_terms(models: Sequence[Model]) -> tuple[AbstractTerm, ...]:
 def stribeck_speeds(
     base: BaseParameters, logs: Sequence[Observations], max_speeds
 ) -> list[float]:
-    """Return the Stribeck speed of each joint that explains its own rows best."""
-    residuals = []
+    """Return the Stribeck speed of each joint that explains its own rows best.
+
+    For each trial the speeds of the transitions are found anew.
+    """
+    squares = []
     for share in STRIBECK_SHARES:
         terms = []
         for term in base.model.terms:
@@ -405,8 +435,12 @@ def stribeck_speeds(
             terms.append(term)
         model = dataclasses.replace(base.model, terms=tuple(terms))
         trial_base = eqx.tree_at(lambda x: x.model, base, model)
+        trial_base = identify_transition_speeds(trial_base, logs)
         factors = RegressionProblem(trial_base, logs).factors
         # The last entry of a triangle is what the columns leave of the forces.
-        residuals.append([abs(joint.R[-1, -1]) for joint in factors.joints])
-    shares = np.array(STRIBECK_SHARES)[np.argmin(residuals, axis=0)]
+        squares.append([joint.R[-1, -1] ** 2 for joint in factors.joints])
+    numbers = [minimum_place(values) for values in np.transpose(squares)]
+    # Between two trials the logarithm of the speed is interpolated.
+    trial_numbers = np.arange(len(STRIBECK_SHARES))
+    shares = np.exp(np.interp(numbers, trial_numbers, np.log(STRIBECK_SHARES)))
     return [float(f"{x:.2g}") for x in shares * max_speeds]

@@ -45,13 +45,13 @@ Products = Float[AnyArray, "parts columns columns"]
 class Threshold(NamedTuple):
     """Fall of the squared error that one change of a model must reach.
 
-    One standard deviation of the difference is the rule of Breiman et al. (1984). The
-    share, 1 % of the error, is a choice: less is not worth a parameter. Without an
-    effect in the friction, the file was kept on two of two machines (palletiser,
-    gantry: `benchmarks/held_out.py`).
+    Ten changes or so are tried in each round, so that one of them often gains one
+    standard deviation of the difference by chance: on a double pendulum and a KR300
+    such changes made unseen errors larger. The share, 1 % of the error, is a choice:
+    less is not worth a parameter.
     """
 
-    deviations: float = 1.0
+    deviations: float = 2.0
     share: float = 0.02
 
 
@@ -337,7 +337,7 @@ class ModelChoice(Summarised):
             Remark(
                 f"In the table all models have the same rows, {self.band}; "
                 f"{self.parts} were left out in turn. A change is kept if it lowers "
-                "the error by more than one deviation of the difference, and by 1 % "
+                "the error by more than two deviations of the difference, and by 1 % "
                 "of the error at least"
             ),
         ]

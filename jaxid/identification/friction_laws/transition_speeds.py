@@ -61,7 +61,7 @@ def identify_transition_speeds(
 
     trials = SpeedTrials.of(base, speeds)
     factors = RegressionProblem(trials.base, logs).factors
-    numbers = [_minimum(trials.squares(joint)) for joint in factors.joints]
+    numbers = [minimum_place(trials.squares(joint)) for joint in factors.joints]
     # Between two trials the logarithm of the speed is interpolated.
     trial_numbers = np.arange(len(SPEED_SHARES))
     shares = np.exp(np.interp(numbers, trial_numbers, np.log(SPEED_SHARES)))
@@ -171,7 +171,7 @@ class SpeedTrials:
         return np.array(squares)
 
 
-def _minimum(values: Vector) -> float:
+def minimum_place(values: Vector) -> float:
     """Return the place of the minimum of a parabola through the least of the values."""
     number = int(np.argmin(values))
     if number in (0, len(values) - 1):
