@@ -16,7 +16,7 @@ import numpy as np
 
 from jaxid.dynamics.base import BaseParameters, base_parameters
 from jaxid.dynamics.model import Model
-from jaxid.dynamics.terms import AbstractTerm, LoadFriction
+from jaxid.dynamics.terms import AbstractTerm, LoadFriction, Tanh
 from jaxid.errors import InputError
 from jaxid.identification.consistency import PhysicallyConsistent
 from jaxid.identification.friction_laws import (
@@ -320,8 +320,11 @@ class ModelSearch:
         setup = self._setup(*row_keys)
         logs = self._observe(setup)
         terms = join_terms([first_model, *models.values()])
-        base = base_parameters(Model(setup.robot, terms))
-        base = identify_transition_speeds(base, logs)
+        model = Model(setup.robot, terms)
+        # All models of a round share the speeds of the one with which it begins.
+        if isinstance(self._transition, Tanh):
+            model = model.with_transition_speeds(self._transition.speed)
+        base = base_parameters(model)
         products = [self._products(base, logs)]
         if base.model.memory is not None:
             # Lengths must not have seen the parts that are judged.
