@@ -22,8 +22,9 @@ import recordings
 import timing
 from timing import Row, hand_over
 
-KINDS = {"plain": 0.88, "pauses": 0.92, "slow": 0.92}
-"""Kinds of logs, and the smallest share of the intervals that must hold the truth."""
+KINDS = "plain", "pauses", "slow"
+GOAL = 0.92
+"""Smallest share of the intervals that must hold the truth."""
 
 
 def truth(base, machine, folder):
@@ -63,17 +64,17 @@ def main():
     """Measure each kind of log."""
     parser = timing.parser(__doc__, "one machine, one seed")
     names = [x for x in machines.MACHINES if x not in machines.SETTING_KINDS]
-    parser.add_argument("--seeds", type=int, nargs="*", default=[1])
+    parser.add_argument("--seeds", type=int, nargs="*", default=[7, 8])
     parser.add_argument("--machine", nargs="*", default=names)
     options = parser.parse_args()
     import jax
 
     jax.config.update("jax_enable_x64", True)
     folder = Path(tempfile.mkdtemp())
-    seeds = [1] if options.quick else options.seeds
+    seeds = [7] if options.quick else options.seeds
     names = ["hobby"] if options.quick else options.machine
     rows = []
-    for kind, goal in KINDS.items():
+    for kind in KINDS:
         parts = []
         for name in names:
             machine = machines.machine(name)
@@ -85,9 +86,9 @@ def main():
                 f"transients/{kind}",
                 f"intervals of {kind} logs",
                 f"{len(is_held)} parameters of {', '.join(names)}, seeds {seeds}",
-                f"at least {goal:.0%}",
+                f"at least {GOAL:.0%}",
                 f"{share:.1%}",
-                share >= goal,
+                share >= GOAL,
             )
         )
     hand_over(rows, options.json)

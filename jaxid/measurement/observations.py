@@ -222,6 +222,15 @@ class Observations(eqx.Module):
         """Return motion and forces of some samples of one segment."""
         return self.source.read(samples)
 
+    def row_speeds(self, rows: slice) -> Float[np.ndarray, "rows joints"]:
+        """Return the speeds at some rows of one segment [rad/s or m/s]."""
+        samples = self.instants[rows]
+        first_sample = int(samples[0])
+        last_sample = int(samples[-1])
+        factor = self.decimation.factor
+        motion, _ = self.read(slice(first_sample, last_sample + 1, factor))
+        return np.abs(np.asarray(motion.qd))
+
     def reduce(self, x: Float[AnyArray, "samples *columns"]) -> Any:
         """Turn forces or columns at all samples into rows (Eq. 26).
 
@@ -477,16 +486,9 @@ def _speed_mask(
     observations: Observations, speeds: Vector, progress: Progress | None
 ) -> Bool[np.ndarray, "rows joints"]:
     """Return the rows at which each joint is as fast as its speed."""
-    instants = observations.instants
-    factor = observations.decimation.factor
     masks = []
     for chunk in observations.chunks(65536):
-        samples = instants[slice(*chunk.rows)]
-        first_sample = int(samples[0])
-        last_sample = int(samples[-1])
-        motion, _ = observations.read(slice(first_sample, last_sample + 1, factor))
-        speed = np.abs(np.asarray(motion.qd))
-        masks.append(speed >= speeds)
+        masks.append(observations.row_speeds(slice(*chunk.rows)) >= speeds)
         if progress is not None:
             progress(chunk.rows[1] / observations.rows)
     return np.concatenate(masks)

@@ -212,6 +212,40 @@ def test_errors_in_the_part_that_decides_make_intervals_wider(base):
     assert 0.88 < np.mean(held) < 0.99
 
 
+def test_friction_that_lacks_near_rest_is_part_of_the_intervals():
+    """Joints without dry friction below a speed: slow rows disagree with the others."""
+    base = jid.base_parameters(jid.Model(jid.robots.planar_arm(2, 0.4)))
+    parameters = standard_parameters(base.model)
+    exact = observations(base.model, parameters, samples=2000)
+    speeds = np.abs(exact.motion.qd)
+    slow_rows = speeds < 0.04 * speeds.max(axis=0)
+    lacking_forces = np.where(slow_rows, 0.5 * np.sign(exact.motion.qd), 0.0)
+    friction = [x[:2] in ("fv", "fc") for x in base.names]
+    random = np.random.default_rng(3)
+    held, alone, widening = [], [], []
+    for _ in range(12):
+        noisy = exact.forces + 0.1 * random.standard_normal(exact.forces.shape)
+        noise_only = exact.replace(forces=noisy)
+        fit = jid.identify(base, noise_only, ESTIMATOR)
+        widening.append(fit.standard_deviations / sandwich_alone(base, noise_only))
+
+        sticking = exact.replace(forces=noisy - lacking_forces)
+        fit = jid.identify(base, sticking, ESTIMATOR)
+        errors = np.abs(fit.parameters - base.from_standard(parameters))[friction]
+        held.append(errors <= fit.uncertainty.half_widths()[friction])
+        alone.append(errors <= 1.96 * sandwich_alone(base, sticking)[friction])
+        assert "`rows.min_speed`" in " ".join(fit.notes)
+    assert np.mean(alone) < 0.7
+    assert np.mean(held) > 0.9
+    assert np.mean(widening) < 1.05
+
+
+def sandwich_alone(base, o):
+    """Deviations without the jackknife's word and that of slow rows."""
+    covariance, _ = sandwich(row_spectra(base, [o])[0])
+    return np.sqrt(np.diag(covariance))
+
+
 def test_intervals_and_whiteness_of_a_fit(base):
     o = long_one(base)
     white = np.random.default_rng(0).standard_normal((1000, 2))

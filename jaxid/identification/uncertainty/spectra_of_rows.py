@@ -176,7 +176,7 @@ class _StretchChannel(NamedTuple):
 
 def row_spectra(problem: RegressionProblem, estimate: Estimate) -> RowSpectra:
     """Transform the stretches of the rows in one pass."""
-    stretches, is_complete = _divide_into_stretches(problem)
+    stretches, is_complete = divide_into_stretches(problem)
     lengths = _shared_lengths(problem, stretches)
     all_lines: dict[tuple, Lines] = {}
     inverses: dict[int, np.ndarray] = {}
@@ -218,7 +218,7 @@ def row_spectra(problem: RegressionProblem, estimate: Estimate) -> RowSpectra:
     )
 
 
-def _divide_into_stretches(problem: RegressionProblem):
+def divide_into_stretches(problem: RegressionProblem):
     """Divide recordings into stretches; return whether they hold all rows.
 
     Rows of different stretches count as independent: the relative error is about the
@@ -268,7 +268,7 @@ def _shared_lengths(problem: RegressionProblem, stretches: Sequence[Span]):
 
 def spread_rows(problem: RegressionProblem) -> Iterator[RowChunk]:
     """Yield the rows of stretches in time: all rows, or an even selection of many."""
-    stretches, _ = _divide_into_stretches(problem)
+    stretches, _ = divide_into_stretches(problem)
     yield from _rows_of_stretches(problem, stretches)
 
 

@@ -31,6 +31,7 @@ from .result import (
     Uncertainty,
     rescale_covariance,
 )
+from .slow_rows import with_friction_near_rest
 from .spectra_of_rows import BIN_COUNT, Lines, RowSpectra, multiplicity, row_spectra
 
 
@@ -40,13 +41,14 @@ class SpectralSandwich(AbstractUncertainty):
     Errors are assumed stationary and independent between joints, recordings, and parts
     of a log on both sides of a gap. Where the errors are larger in the part of a log
     that decides a parameter, the block jackknife gives more than chance allows: then
-    its deviation counts. It needs one pass over the rows. Of logs of more than
+    its deviation counts. Intervals include what slow rows change beyond noise, as where
+    joints stick. It needs two passes over the rows. Of logs of more than
     131,072 samples some evenly spread stretches are transformed: these give the ratio
     to the naive values. If only factors are known, the block jackknife is used instead.
     """
 
     def __call__(self, problem, estimate, naive):
-        """Return the sandwich, wider where the jackknife contradicts it."""
+        """Return the sandwich, wider where jackknife or slow rows contradict it."""
         if not problem.recordings:
             errors, _ = BlockJackknife()(problem, estimate, naive)
             note = (
@@ -67,7 +69,9 @@ class SpectralSandwich(AbstractUncertainty):
             covariance = rescale_covariance(covariance, deviations)
         covariance[is_undetermined, is_undetermined] = np.inf
         errors = Uncertainty(covariance, dof, naive, jackknife(estimate))
-        return _widen_by_jackknife(errors, estimate), residual_spectra(spectra.lines)
+        errors = _widen_by_jackknife(errors, estimate)
+        errors = with_friction_near_rest(errors, problem, estimate)
+        return errors, residual_spectra(spectra.lines)
 
 
 def _widen_by_jackknife(errors: Uncertainty, estimate: Estimate) -> Uncertainty:
