@@ -7,8 +7,8 @@ from .identify import identify_rollout as identify_rollout
 from .motion import ServoMotion as ServoMotion
 from .result import ServoFit as ServoFit
 from .servo import PARAMETERS as PARAMETERS
+from .simulation import ServoSimulator as ServoSimulator
 from .torque import (
     TorqueRolloutFit as TorqueRolloutFit,
     identify_torque_rollout as identify_torque_rollout,
 )
-from .uncoupled import ServoSimulator as ServoSimulator

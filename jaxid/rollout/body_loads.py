@@ -1,37 +1,16 @@
-"""Bodies that load a robot's joints: loads of a known motion, and scalar programs."""
+"""Torques of bodies on the joints of a robot along a path."""
 
 import dataclasses
-import functools
-from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
+from scipy.signal import butter, sosfiltfilt
 
-from jaxid.arrays import AnyArray, Array
+from jaxid.arrays import AnyArray
 from jaxid.dynamics.model import Model
-from jaxid.dynamics.projection_equation import solve_symmetric
 from jaxid.dynamics.sample_methods import in_numpy
-from jaxid.program import Program, trace
-from jaxid.program.trace import FREE
 
-from .dry_friction import Slip
-from .motion import ServoMotion, smooth_rates
-
-
-class Programs(NamedTuple):
-    """Scalar programs of bodies that are simulated.
-
-    Attributes:
-        bodies: Mass matrix and bias forces from positions and velocities.
-        derivatives: Both with their derivatives: of matrix and forces by positions, of
-            the forces by velocities.
-        solve: Velocities in a stage, as in `stage_velocities`; None without coupling.
-    """
-
-    bodies: Program
-    derivatives: Program
-    solve: Program | None
+CUTOFF = 8.0
+"""Frequency below which measured positions tell accelerations [Hz]."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,95 +27,68 @@ class Bodies:
     parameters: AnyArray
     coupled: bool = False
 
-    def matrix_and_bias(self, q: Array, v: Array) -> tuple[AnyArray, AnyArray]:
-        """Return mass matrix and bias forces; without coupling, gravity alone."""
-        model = self.model
-        p = np.asarray(self.parameters)
-        zero_velocity = jnp.zeros_like(q)
-        if self.coupled:
-            return model.inertia(p, q), model.bias(p, q, v)
-        return jnp.zeros((len(q), len(q))), model.forces(
-            p, q, zero_velocity, zero_velocity
+    def loads(
+        self, paths: np.ndarray, step_times: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the torques between two points of paths, and inertias of the joints.
+
+        The inertia of a joint acts on its own acceleration, and the torque contains all
+        else.
+
+        Args:
+            paths: Positions [motions, joints, points].
+            step_times: Time between two points of each motion [s].
+
+        Returns:
+            Torques [N m or N] and inertias [kg m² or kg], both [motions, joints,
+            points - 1].
+        """
+        motion_loads = [
+            self._path_loads(path.T, float(dt))
+            for path, dt in zip(paths, step_times, strict=True)
+        ]
+        torques, inertias = (
+            np.stack(x) for x in zip(*motion_loads, strict=True)
         )
+        return torques, inertias
 
-    @functools.cached_property
-    def together(self) -> "Bodies":
-        """The same bodies with their inertial torques."""
-        return self if self.coupled else dataclasses.replace(self, coupled=True)
+    def measured_loads(
+        self, positions: np.ndarray, sample_times: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the loads of measured positions, whose noise is filtered out."""
+        smooth_positions = [
+            _filter_positions(x, float(dt))
+            for x, dt in zip(positions, sample_times, strict=True)
+        ]
+        return self.loads(np.stack(smooth_positions), sample_times)
 
-    @functools.cached_property
-    def programs(self) -> Programs:
-        """Programs of a simulation of these bodies."""
-        n = self.model.robot.joints
-
-        def terms_with_derivatives(q, v):
-            by_q = jax.jacfwd(self.matrix_and_bias)(q, v)
-            return *by_q, jax.jacfwd(lambda v: self.matrix_and_bias(q, v)[1])(v)
-
-        bodies, derivatives = (
-            trace(f, (n,), (n,)) for f in (self.matrix_and_bias, terms_with_derivatives)
-        )
-        solve = None
-        if self.coupled:
-            matrix = np.full(bodies.nonzeros[0].shape, FREE)
-            matrix[~bodies.nonzeros[0]] = 0.0
-            solve = trace(stage_velocities, matrix, *[(n,)] * 6, (), *[(n,)] * 2)
-        return Programs(bodies, derivatives, solve)
-
-    def loads(self, motion: ServoMotion) -> ServoMotion:
-        """Return motions with the loads between two samples of measured positions."""
-        q = np.asarray(motion.positions)
-        load = np.zeros_like(q)
-        inertia = np.zeros_like(q)
+    def _path_loads(
+        self, path: np.ndarray, dt: float
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return torques and inertias [joints, points - 1] of one path."""
+        q = 0.5 * (path[1:] + path[:-1])
+        zeros = np.zeros_like(q)
         model = self.model
-        p = np.asarray(self.parameters)
-        for k, dt in enumerate(map(float, motion.sample_time)):
-            path, qd, qdd = (0.5 * (x[1:] + x[:-1]) for x in smooth_rates(q[k].T, dt))
-            if self.coupled:
-                M = in_numpy(model, model.inertia, path, shared=(p,))
-                diagonals = np.diagonal(M, axis1=1, axis2=2)
-                forces = (
-                    in_numpy(model, model.forces, path, qd, qdd, shared=(p,))
-                    - diagonals * qdd
-                )
-                inertia[k, :, :-1] = diagonals.T
-            else:
-                forces = in_numpy(
-                    model, model.forces, path, 0 * qd, 0 * qd, shared=(p,)
-                )
-            load[k, :, :-1] = forces.T
-        return motion.replace(load=load, inertia=inertia)
+        parameters = np.asarray(self.parameters)
+        if not self.coupled:
+            gravity = in_numpy(
+                model, model.forces, q, zeros, zeros, shared=(parameters,)
+            )
+            return gravity.T, zeros.T
+
+        qd = np.diff(path, axis=0) / dt
+        acceleration = np.zeros_like(path)
+        acceleration[1:-1] = np.diff(path, n=2, axis=0) / dt**2
+        qdd = 0.5 * (acceleration[1:] + acceleration[:-1])
+        M = in_numpy(model, model.inertia, q, shared=(parameters,))
+        inertias = np.diagonal(M, axis1=1, axis2=2)
+        torques = in_numpy(model, model.forces, q, qd, qdd, shared=(parameters,))
+        return (torques - inertias * qdd).T, inertias.T
 
 
-def stage_velocities(
-    M, force, inertia, friction, resistance, scale, w, ahead, free, direction
-) -> tuple[Array, Array, Array]:
-    """Return velocities in a stage, and how the joints slip at these velocities.
-
-    Args:
-        M: Mass matrix over the time of the stage, rows and columns times `scale`.
-        force: Forces on the joints over the stiffness.
-        inertia: Inertia of each joint without the bodies.
-        friction: Dry friction.
-        resistance: Resistance of each joint without the bodies.
-        scale: Root of the inverse stiffness.
-        w: Velocities before the stage.
-        ahead: Change of the velocity behind the stage over that in it.
-        free: 1 for joints that move, 0 for those that friction holds.
-        direction: Mean direction of the joints that move.
-    """
-    momentum = M @ (w / scale)
-    A = M * jnp.outer(free, free) + jnp.diag(resistance * free + 1.0 - free)
-    balance = (force + inertia * w - friction * direction) / scale + momentum
-    u = scale * solve_symmetric(A, free * balance)
-    diagonal = jnp.stack([M[j, j] for j in range(len(force))])
-    coupling_force = scale * (momentum - M @ (u / scale)) - diagonal * (w - u)
-    slip = Slip.of(
-        force + coupling_force,
-        inertia + diagonal,
-        friction,
-        resistance + diagonal,
-        w,
-        ahead,
-    )
-    return u, slip.free, slip.direction
+def _filter_positions(positions: np.ndarray, dt: float) -> np.ndarray:
+    """Return positions below `CUTOFF`."""
+    if CUTOFF > 0.4 / dt:
+        return positions
+    sections = butter(2, 2.0 * CUTOFF * dt, output="sos")
+    return sosfiltfilt(sections, positions, axis=-1)

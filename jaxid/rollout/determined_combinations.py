@@ -1,5 +1,12 @@
-"""Which parameters of servos, or combinations of some, logs determine, and how well."""
+"""Which parameters of servos, or combinations of some, logs determine, and how well.
 
+An estimate can differ from the truth by the noise of its own motions (spectral
+sandwich), by effects that the model lacks and that differ between motions (their
+scatter), and by those that differ between equal joints (their scatter). Each counts.
+"""
+
+import dataclasses
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -7,15 +14,16 @@ from scipy import special, stats
 
 from jaxid.identification.uncertainty.spectral import sandwich_of_columns
 
-from .coupled_refinement import Refinement, weights_of
+from .joint_fits import SIZE, JointFit
 from .motion import JointParameters
-from .servo import PARAMETERS, SCALE
+from .servo import INDEX, PARAMETERS, SCALE
 
 MAX_RELATIVE_DEVIATION = 0.25
 """Relative standard deviation of a parameter above which it is not determined."""
 
 
-class Combination(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class Combination:
     """Parameter of a joint, or combination of some, that the logs determine.
 
     Attributes:
@@ -27,6 +35,8 @@ class Combination(NamedTuple):
         value: Estimate.
         deviation: Standard deviation.
         dof: Degrees of freedom of the deviation.
+        agrees: Whether motions, and equal joints, agree on it as far as noise lets
+            them; otherwise the model lacks an effect that disturbs it.
     """
 
     joint: int
@@ -37,112 +47,116 @@ class Combination(NamedTuple):
     value: float
     deviation: float
     dof: float
+    agrees: bool
 
     def interval(self, level: float = 0.95) -> tuple[float, float]:
         """Return the confidence interval."""
-        half_width = self.deviation * float(
-            special.stdtrit(max(self.dof, 1.0), 0.5 + 0.5 * level)
-        )
+        quantile = special.stdtrit(max(self.dof, 1.0), 0.5 + 0.5 * level)
+        half_width = self.deviation * float(quantile)
         return self.value - half_width, self.value + half_width
 
 
-class _Rows(NamedTuple):
-    """Weighted sensitivities of a refinement, less what initial states can imitate.
+class Deviations(NamedTuple):
+    """Uncertainty of some parameters of a joint.
 
     Attributes:
-        refinement: Refinement.
-        weights: Weight of each motion's squared errors [motions, joints].
-        imitations: Initial states that imitate each parameter [motions, states,
-            parameters].
-        scores: Sensitivities times residuals [motions, parameters].
-        information: Gauss-Newton matrix.
+        covariance: Covariance; zero for parameters that count as known.
+        dof: Degrees of freedom of the deviations.
+        agrees: Whether motions agree on each as far as noise lets them.
     """
 
-    refinement: Refinement
-    weights: np.ndarray
-    imitations: np.ndarray
-    scores: np.ndarray
+    covariance: np.ndarray
+    dof: np.ndarray
+    agrees: np.ndarray
+
+    def widened(self, deviations: np.ndarray, dof: np.ndarray) -> "Deviations":
+        """Return the uncertainty with larger deviations."""
+        sizes = np.sqrt(np.maximum(np.diag(self.covariance), 1e-300))
+        factor = deviations / sizes
+        covariance = self.covariance * np.outer(factor, factor)
+        return Deviations(covariance, dof, self.agrees)
+
+
+class JointRows(NamedTuple):
+    """Sensitivities of one joint, less what initial states can imitate.
+
+    Attributes:
+        columns: Sensitivities of each motion [parameters, samples].
+        residuals: Errors of each motion [samples].
+        roots: Roots of the motions' weights.
+        gradients: Half the gradient of each motion [motions, parameters].
+        information: Gauss-Newton matrix, with the pull between equal joints.
+        counted: Share of the samples of each motion that counts.
+        sample_time: Mean time between two samples [s].
+    """
+
+    columns: list[np.ndarray]
+    residuals: list[np.ndarray]
+    roots: np.ndarray
+    gradients: np.ndarray
     information: np.ndarray
+    counted: np.ndarray
+    sample_time: float
 
-    @classmethod
-    def of(cls, refinement: Refinement) -> "_Rows":
-        """Return the rows of a refinement."""
-        weights = weights_of(refinement.simulator.motion, refinement.sums)
-        size = refinement.simulator.motion.start[0].size
-        scores = []
-        imitations = []
-        information = np.zeros((int(refinement.free.sum()),) * 2)
-        certainties = refinement.simulator.motion.certainty
-        for w, g, H, certainty in zip(
-            weights, *refinement.products, certainties, strict=True
-        ):
-            motion_g = w @ g
-            motion_H = np.tensordot(w, H, 1)
-            by_states = motion_H[-size:]
-            state_information = by_states[:, -size:] + np.diag(certainty.ravel())
-            imitation = np.linalg.solve(state_information, by_states[:, :-size])
-            imitations.append(imitation)
-            scores.append(motion_g[:-size] - motion_g[-size:] @ imitation)
-            by_parameters = motion_H[:-size]
-            information += by_parameters[:, :-size]
-            information -= by_parameters[:, -size:] @ imitation
-        return cls(
-            refinement, weights, np.stack(imitations), np.stack(scores), information
-        )
-
-    @property
-    def columns(self) -> list[np.ndarray]:
-        """Sensitivities of each motion and joint [parameters, samples]."""
-        columns = []
-        for S, start in zip(
-            self.refinement.sensitivities, self.imitations, strict=True
-        ):
-            by_parameters = S[..., : -len(start)]
-            by_start = S[..., -len(start) :]
-            columns += list(np.swapaxes(by_parameters - by_start @ start, 1, 2))
-        return columns
-
-    def covariance(
-        self, columns: list, indices: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return covariance and degrees of freedom if only some parameters are unknown.
-
-        The spectral sandwich, at least that of independent errors; where motions differ
-        more than it explains, their scatter.
-        """
-        motion = self.refinement.simulator.motion
-        motions, joints = self.weights.shape
-        channels = motions * joints
-        sample_mask = np.asarray(motion.counted)
+    def deviations(self, indices: np.ndarray) -> Deviations:
+        """Return the uncertainty if only some parameters are unknown."""
+        motions = len(self.columns)
         B = np.zeros_like(self.information)
         place = np.ix_(indices, indices)
         B[place] = _inverse(self.information[place])
         squares = np.diag(B)
         sandwich = sandwich_of_columns(
             np,
-            [range(len(B))] * channels,
-            np.sqrt(self.weights).ravel(),
+            [range(len(B))] * motions,
+            self.roots,
             B,
             np.zeros((1, len(B))),
-            columns,
-            list(self.refinement.residuals.reshape(channels, 1, -1)),
-            sample_mask.mean(axis=-1).ravel(),
-            float(motion.sample_time.mean()),
+            self.columns,
+            [residuals[None] for residuals in self.residuals],
+            self.counted,
+            self.sample_time,
         )
         variance, dof = (x[0] for x in sandwich)
         # The sandwich is blind where no error can show: there the information alone
         # tells.
-        sample_count = float(sample_mask.sum(axis=-1).max())
-        variance = np.maximum(variance, squares / max(sample_count, 1.0))
-        changes = self.scores @ B
+        sample_count = max(len(self.residuals[0]) * float(self.counted.max()), 1.0)
+        variance = np.maximum(variance, squares / sample_count)
+
+        changes = self.gradients @ B
         motion_dof = max(motions - 1, 1)
         scatter = motions / motion_dof * (changes**2).sum(axis=0)
         limit = stats.f.ppf(0.95, motion_dof, dof)
         is_scattered = (motions > 1) & (scatter > limit * variance)
         dof = np.where(is_scattered, motion_dof, dof)
         deviation = np.sqrt(np.where(is_scattered, scatter, variance))
-        scale = deviation / np.sqrt(np.maximum(squares, 1e-300))
-        return B * np.outer(scale, scale), dof
+        factor = deviation / np.sqrt(np.maximum(squares, 1e-300))
+        return Deviations(B * np.outer(factor, factor), dof, ~is_scattered)
+
+
+def rows_of_joints(fit: JointFit) -> list[JointRows]:
+    """Return the sensitivities of all joints to all parameters."""
+    r, S = fit.simulator.sensitivities(fit.parameters, fit.start)
+    equations = fit.equations
+    response = equations.response
+    by_parameters = S[..., :SIZE, :] + np.einsum(
+        "mjst,mjsp->mjpt", S[..., SIZE:, :], response
+    )
+    pull = fit.pull.precision
+    information = equations.information.sum(axis=0) + pull[..., None] * np.eye(SIZE)
+    motion = fit.simulator.motion
+    counted = motion.counted.mean(axis=-1)
+    return [
+        JointRows(
+            list(by_parameters[:, j]),
+            list(r[:, j]),
+            np.sqrt(fit.weights[:, j]),
+            equations.gradient[:, j],
+            information[j],
+            counted[:, j],
+            float(motion.sample_time.mean()),
+        )
+        for j in range(r.shape[1])
+    ]
 
 
 def _inverse(H: np.ndarray) -> np.ndarray:
@@ -153,49 +167,133 @@ def _inverse(H: np.ndarray) -> np.ndarray:
     return scaled_inverse / np.outer(size, size)
 
 
+class Determination(NamedTuple):
+    """What the logs determine.
+
+    Attributes:
+        combinations: Parameters and combinations that the logs determine.
+        covariance: Covariance of all free parameters, joint by joint.
+        dof: Degrees of freedom of their deviations.
+    """
+
+    combinations: tuple[Combination, ...]
+    covariance: np.ndarray
+    dof: np.ndarray
+
+
 def determined_combinations(
-    refinement: Refinement, joint_names: tuple[str, ...]
-) -> tuple[tuple[Combination, ...], np.ndarray, np.ndarray]:
-    """Return the determined combinations, and covariance and dof of all parameters."""
-    rows = _Rows.of(refinement)
-    x = refinement.parameters[refinement.free]
-    joints, symbols = np.nonzero(refinement.free)
-    columns = rows.columns
-    covariance, parameter_dof = rows.covariance(columns, np.arange(len(x)))
-    size = np.maximum(np.abs(x), 0.1 * SCALE[symbols])
-    interval_factors = (
-        special.stdtrit(parameter_dof, 0.975) / special.ndtri(0.975) / size
-    )
-    indices, kappa = _merge(
-        covariance * np.outer(interval_factors, interval_factors),
-        np.maximum(np.abs(x), SCALE[symbols]) / size,
-    )
-    kappa = kappa * size[indices][:, None] / size[None, :]
-    combination_covariance, dof = rows.covariance(columns, indices)
+    fit: JointFit, groups: Sequence[Sequence[int]]
+) -> Determination:
+    """Return what the logs determine, and the uncertainty of all parameters.
+
+    Args:
+        fit: Fit.
+        groups: Joints of each kind.
+    """
+    rows = rows_of_joints(fit)
+    scatter = _scatter_of_equal_joints(fit, groups)
+    kind_sizes = np.ones(len(rows))
+    for group in groups:
+        kind_sizes[list(group)] = len(group)
     combinations = []
-    for k, i in enumerate(indices):
-        coefficients = np.zeros(refinement.parameters.shape)
-        coefficients[refinement.free] = kappa[k]
-        name = PARAMETERS[symbols[i]].symbol
-        meaning = PARAMETERS[symbols[i]].meaning
-        merged_meanings = []
-        for m in np.flatnonzero(kappa[k]):
-            if m != i:
-                is_elsewhere = joints[m] != joints[i]
-                owner = f" of {joint_names[joints[m]]}" if is_elsewhere else ""
-                name += f" {kappa[k, m]:+.3g} {PARAMETERS[symbols[m]].symbol}{owner}"
-                merged_meanings.append(PARAMETERS[symbols[m]].meaning + owner)
-        if merged_meanings:
-            meaning = f"{meaning} and {', '.join(merged_meanings)} only together"
-        numbers = (
-            float(kappa[k] @ x),
-            float(np.sqrt(combination_covariance[i, i])),
-            float(dof[i]),
+    size = int(fit.free.sum())
+    covariance = np.zeros((size, size))
+    all_dof = np.zeros(size)
+    end = 0
+    for j, joint_rows in enumerate(rows):
+        symbols = np.flatnonzero(fit.free[j])
+        deviations = joint_rows.deviations(symbols)
+        place = slice(end, end + len(symbols))
+        end += len(symbols)
+        covariance[place, place] = deviations.covariance[np.ix_(symbols, symbols)]
+        all_dof[place] = deviations.dof[symbols]
+        joint = _Joint(fit, j, joint_rows, scatter[j], max(kind_sizes[j] - 1.0, 1.0))
+        combinations += joint.combinations(deviations, symbols)
+    return Determination(tuple(combinations), covariance, all_dof)
+
+
+def _scatter_of_equal_joints(
+    fit: JointFit, groups: Sequence[Sequence[int]]
+) -> np.ndarray:
+    """Return the deviations of parameters between equal joints [joints, parameters].
+
+    Of estimates without the pull that makes them alike. Biases are each joint's own.
+    """
+    no_pull = dataclasses.replace(fit, pull=fit.pull._replace(precision=0.0 * fit.pull.precision))
+    parameters, _ = no_pull.step(np.full(len(fit.parameters), 1e-6))
+    scatter = np.zeros_like(parameters)
+    for group in groups:
+        members = list(group)
+        if len(members) > 1:
+            scatter[members] = np.std(parameters[members], axis=0, ddof=1)
+    scatter[:, INDEX["b"]] = 0.0
+    return np.where(fit.free, scatter, 0.0)
+
+
+class _Joint(NamedTuple):
+    """One joint: its fit, rows, scatter of joints of its kind, with the scatter's dof."""
+
+    fit: JointFit
+    index: int
+    rows: JointRows
+    scatter: np.ndarray
+    scatter_dof: float
+
+    def combinations(
+        self, deviations: Deviations, symbols: np.ndarray
+    ) -> list[Combination]:
+        """Return what the logs determine of the joint."""
+        x = self.fit.parameters[self.index]
+        sizes = np.maximum(np.abs(x), 0.1 * SCALE)[symbols]
+        place = np.ix_(symbols, symbols)
+        quantiles = special.stdtrit(deviations.dof[symbols], 0.975)
+        factors = quantiles / special.ndtri(0.975) / sizes
+        reach = np.maximum(np.abs(x[symbols]), SCALE[symbols]) / sizes
+        indices, kappa = _merge(
+            deviations.covariance[place] * np.outer(factors, factors), reach
         )
-        unit = PARAMETERS[symbols[i]].unit
-        place = int(joints[i]), name, meaning, unit, coefficients
-        combinations.append(Combination(*place, *numbers))
-    return tuple(combinations), covariance, parameter_dof
+        kappa = kappa * sizes[indices][:, None] / sizes[None, :]
+        remaining = self.rows.deviations(symbols[indices])
+        combinations = []
+        for k, i in enumerate(symbols[indices]):
+            coefficients = np.zeros(SIZE)
+            coefficients[symbols] = kappa[k]
+            combinations.append(self._combination(int(i), coefficients, remaining))
+        return combinations
+
+    def _combination(
+        self, symbol: int, coefficients: np.ndarray, deviations: Deviations
+    ) -> Combination:
+        """Return a combination, wider where equal joints differ."""
+        merged = [m for m in np.flatnonzero(coefficients) if m != symbol]
+        name = PARAMETERS[symbol].symbol
+        meaning = PARAMETERS[symbol].meaning
+        if merged:
+            terms = (f"{coefficients[m]:+.3g} {PARAMETERS[m].symbol}" for m in merged)
+            meanings = (PARAMETERS[m].meaning for m in merged)
+            name = " ".join((name, *terms))
+            meaning = f"{meaning} and {', '.join(meanings)} only together"
+        noise = float(deviations.covariance[symbol, symbol])
+        scatter = float(np.sum((coefficients * self.scatter) ** 2))
+        difference = max(scatter - noise, 0.0)
+        dof = float(deviations.dof[symbol])
+        agrees = bool(deviations.agrees[symbol])
+        if difference > noise:
+            dof = min(dof, self.scatter_dof)
+            agrees = False
+        all_coefficients = np.zeros_like(self.fit.parameters)
+        all_coefficients[self.index] = coefficients
+        return Combination(
+            self.index,
+            name,
+            meaning,
+            PARAMETERS[symbol].unit,
+            all_coefficients,
+            float(coefficients @ self.fit.parameters[self.index]),
+            float(np.sqrt(noise + difference)),
+            dof,
+            agrees,
+        )
 
 
 def _merge(covariance: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

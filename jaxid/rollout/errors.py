@@ -20,7 +20,6 @@ class RolloutErrors:
         simulated: Simulated positions.
         command: Commanded positions.
         linear: Simulation by the linear baseline.
-        counted: Whether a sample counts: behind the first half second.
     """
 
     joint_names: tuple[str, ...]
@@ -30,29 +29,23 @@ class RolloutErrors:
     simulated: tuple[np.ndarray, ...]
     command: tuple[np.ndarray, ...]
     linear: tuple[np.ndarray, ...]
-    counted: tuple[np.ndarray, ...]
 
     def rms(self, kind: str = "simulated") -> Matrix:
-        """Return RMS errors of `simulated`, `command` or `linear`; NaN without any."""
-        rows = zip(getattr(self, kind), self.measured, self.counted, strict=True)
-        sums = np.array([np.sum((y - q) ** 2, axis=1, where=k) for y, q, k in rows])
-        sizes = np.array([k.sum(axis=1) for k in self.counted])
-        return np.sqrt(np.where(sizes > 0, sums / np.maximum(sizes, 1), np.nan))
+        """Return RMS errors of `simulated`, `command` or `linear`."""
+        pairs = zip(getattr(self, kind), self.measured, strict=True)
+        return np.sqrt([np.mean((y - q) ** 2, axis=1) for y, q in pairs])
 
     def total(self, kind: str = "simulated") -> Vector:
         """Return root mean square errors over all motions together."""
-        sizes = np.array([k.sum(axis=1) for k in self.counted])
-        squares = np.where(sizes > 0, sizes * self.rms(kind) ** 2, 0.0)
-        return np.sqrt(squares.sum(axis=0) / sizes.sum(axis=0))
+        sizes = np.array([len(time) for time in self.time])
+        squares = sizes[:, None] * self.rms(kind) ** 2
+        return np.sqrt(squares.sum(axis=0) / sizes.sum())
 
     def summary(self) -> Table:
         """Return a table of the errors of all motions."""
         rms = 1e3 * self.rms()
         columns = [Column(name, rms[:, j]) for j, name in enumerate(self.joint_names)]
-        title = (
-            "errors of free-running simulations, behind the first half second "
-            "[mrad or mm]"
-        )
+        title = "errors of free-running simulations, every sample [mrad or mm]"
         return Table(title, Column("motion", self.motions), *columns)
 
     def __str__(self) -> str:

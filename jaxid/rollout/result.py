@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Sequence
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from scipy import special
@@ -19,22 +20,28 @@ from jaxid.result_table import (
 )
 
 from .body_loads import Bodies
-from .coupled import CoupledSimulator
-from .coupled_refinement import Refinement, mean_squares
 from .determined_combinations import (
     MAX_RELATIVE_DEVIATION,
     Combination,
     determined_combinations,
 )
 from .errors import RolloutErrors
-from .motion import FreeParameters, JointParameters, MotionSamples, ServoMotion
-from .servo import INDEX, LOWER, PARAMETERS, UPPER, with_integral
-from .uncoupled import ServoSimulator
+from .joint_fits import JointFit
+from .motion import FreeParameters, JointParameters, ServoMotion, local_state
+from .servo import INDEX, LOWER, PARAMETERS, UPPER, State
+from .simulation import ServoSimulator
 
 LIMITED_PARAMETERS = [INDEX[x] for x in ("B", "d", "b", "um", "g", "ki")]
 """Parameters that are not at a limit of the search unless something is wrong."""
 MIN_ROUNDING_RATIO = 1.5
 """Multiple of the encoder's rounding above which slow errors show a missing effect."""
+
+
+class Simulation(NamedTuple):
+    """States at all steps [motions, joints, steps], and steps in each sample time."""
+
+    states: State
+    steps: int
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,36 +88,36 @@ class ServoFit:
     @classmethod
     def of(
         cls,
-        refinement: Refinement,
+        fit: JointFit,
         linear: JointParameters,
         joint_names: tuple[str, ...],
+        groups: Sequence[Sequence[int]],
+        undetermined: FreeParameters,
         hold_is_told: bool = True,
         given_stiffness: Vector | None = None,
     ) -> "ServoFit":
-        """Return the fit of a refinement, with its uncertainty."""
-        simulator = refinement.simulator
+        """Return the fit of all joints, with its uncertainty."""
+        simulator = fit.simulator
         motion = simulator.motion
-        combinations, covariance, dof = determined_combinations(refinement, joint_names)
-        load = np.zeros_like(motion.positions)
-        if simulator.bodies is not None:
-            load = simulator.bodies.loads(motion).load
+        determination = determined_combinations(fit, groups)
         return cls(
             joint_names,
-            refinement.parameters,
-            refinement.free,
-            covariance,
-            dof,
-            combinations,
+            fit.parameters,
+            fit.free,
+            determination.covariance,
+            determination.dof,
+            determination.combinations,
             linear,
             simulator.hold,
             simulator.time_step,
-            np.sqrt(mean_squares(motion, refinement.sums)),
+            np.sqrt(fit.mean_squares),
             motion.names,
             simulator.bodies,
-            np.abs(load).mean(axis=(0, 2)),
+            np.abs(simulator.loads[0]).mean(axis=(0, 2)),
             (
-                *_notes_on_limits(refinement, joint_names),
-                *_notes_on_errors(refinement, joint_names),
+                *_notes_on_effects(undetermined, joint_names),
+                *_notes_on_limits(fit, joint_names),
+                *_notes_on_errors(fit, joint_names),
             ),
             hold_is_told,
             given_stiffness,
@@ -156,41 +163,47 @@ class ServoFit:
             Positions of each segment [samples, joints].
         """
         motion = ServoMotion.of([log])
-        paths = self.paths(motion)
+        simulation = self._simulation(motion)
+        paths = simulation.states.q[..., :: simulation.steps]
         return [path[:, :n].T for path, n in zip(paths, motion.lengths, strict=True)]
 
-    def paths(self, motion: ServoMotion) -> MotionSamples:
-        """Return simulated positions [motions, joints, samples].
+    def _simulation(self, motion: ServoMotion) -> "Simulation":
+        """Simulate motions; bodies load the joints at the simulated positions."""
+        simulator = ServoSimulator(motion, self.time_step, self.hold, self.bodies)
+        theta = self.parameters
+        start = motion.start.copy()
+        start[..., 2] = self._balanced_integrals(simulator)
+        simulator = simulator.in_agreement(theta, start)
+        return Simulation(simulator.states(theta, start), simulator.steps)
 
-        The loads are those at the simulated positions.
-        """
-        x = self.parameters
-        if x[:, INDEX["ki"]].any():
-            loaded_motion = motion if self.bodies is None else self.bodies.loads(motion)
-            motion = with_integral(loaded_motion, x, self.hold)
-        simulator = CoupledSimulator(motion, self.time_step, self.hold, self.bodies)
-        return simulator.positions(simulator.simulate(x))
+    def _balanced_integrals(self, simulator: ServoSimulator) -> np.ndarray:
+        """Return initial integral actions, which balance the load at rest."""
+        motion = simulator.motion
+        ratios = {symbol: self.parameters[:, k] for symbol, k in INDEX.items()}
+        error = ratios["g"] * motion.sent[..., 0] + ratios["b"] - motion.start[..., 0]
+        load = ratios["a"] * simulator.loads[0][..., 0]
+        return np.where(ratios["ki"] > 0.0, load - error, 0.0)
 
     def validate(self, logs: Sequence[Recording] | Recording) -> RolloutErrors:
         """Compare free-running simulations with logs, and with simple baselines.
+
+        Every sample counts.
 
         Args:
             logs: Recordings whose `forces` are the commands.
         """
         logs = [logs] if isinstance(logs, Recording) else logs
         motion = ServoMotion.of(logs)
-        simulated_positions = self.paths(motion)
-        linear_positions = ServoSimulator(motion, self.time_step).paths(
-            self.linear[None]
-        )[:, 0]
-        parts = range(motion.motions)
+        simulation = self._simulation(motion)
+        simulated_positions = simulation.states.q[..., :: simulation.steps]
+        baseline = ServoSimulator(motion, self.time_step)
+        linear_positions = baseline.positions(self.linear, motion.start)
         lengths = motion.lengths
-        times = motion.begin[:, None] + np.outer(
-            motion.sample_time, np.arange(max(lengths))
-        )
+        samples = np.arange(max(lengths))
+        times = motion.begin[:, None] + np.outer(motion.sample_time, samples)
 
         def cut(x: AnyArray) -> tuple[np.ndarray, ...]:
-            return tuple(np.asarray(x[k])[..., : lengths[k]] for k in parts)
+            return tuple(y[..., :n] for y, n in zip(x, lengths, strict=True))
 
         return RolloutErrors(
             self.joint_names,
@@ -200,7 +213,6 @@ class ServoFit:
             cut(simulated_positions),
             cut(motion.sent),
             cut(linear_positions),
-            cut(np.asarray(motion.counted) > 0),
         )
 
     def window_errors(
@@ -208,14 +220,37 @@ class ServoFit:
     ) -> Vector:
         """Return RMS errors of windows that start from measured states [rad or m].
 
+        The state at the start of a window is that of the free-running simulation, moved
+        by its local error: errors change slowly, so that no fast motion is smoothed.
+
         Args:
             logs: Recordings whose `forces` are the commands.
             horizon: Length of the windows [s].
         """
         logs = [logs] if isinstance(logs, Recording) else logs
-        windows = ServoMotion.of(logs).windows(horizon)
-        errors = self.paths(windows) - np.asarray(windows.positions)
-        return np.sqrt(np.mean(errors**2, axis=(0, 2)))
+        motion = ServoMotion.of(logs)
+        simulation = self._simulation(motion)
+        size = max(3, round(horizon / float(motion.sample_time.mean())))
+        places = [
+            (k, a, a + size)
+            for k, n in enumerate(motion.lengths)
+            for a in range(0, n - size + 1, size)
+        ]
+        windows = motion.parts(places)
+        starts = []
+        for k, a, _ in places:
+            rows = simulation.states.q[k][:, :: simulation.steps]
+            n = motion.lengths[k]
+            errors = motion.positions[k][:, :n] - rows[:, :n]
+            change = local_state(errors, a, float(motion.sample_time[k])).state
+            state = [x[k][:, a * simulation.steps] for x in simulation.states]
+            starts.append(np.stack(state, axis=-1) + change)
+        start = np.stack(starts)
+        simulator = ServoSimulator(windows, self.time_step, self.hold, self.bodies)
+        simulator = simulator.in_agreement(self.parameters, start)
+        paths = simulator.positions(self.parameters, start)
+        squares = ((paths - windows.positions) * windows.counted) ** 2
+        return np.sqrt(squares.sum(axis=(0, 2)) / windows.counted.sum(axis=(0, 2)))
 
     def samples(self, count: int, seed: int = 0) -> np.ndarray:
         """Return parameters drawn from their t distributions, within their limits.
@@ -248,6 +283,7 @@ class ServoFit:
         upper_ends, _ = with_deviations(ends[:, 1], deviations)
         sizes = np.maximum(np.abs(estimates), 1e-12)
         is_clear = deviations < MAX_RELATIVE_DEVIATION * sizes
+        is_clear &= np.array([c.agrees for c in rows], bool)
         joints = [c.joint for c in rows]
         joint_rows = (np.flatnonzero(np.diff(joints)) + 1).tolist()
         rms = np.sqrt((self.rms**2).mean(axis=0))
@@ -288,13 +324,28 @@ class ServoFit:
         return self.summary().text()
 
 
-def _notes_on_limits(refinement: Refinement, joint_names: tuple[str, ...]) -> list[str]:
+def _notes_on_effects(
+    undetermined: FreeParameters, joint_names: tuple[str, ...]
+) -> list[str]:
+    """Return a note for each effect that lowers errors and is not determined."""
+    notes = []
+    for k, parameter in enumerate(PARAMETERS):
+        joints = [joint_names[j] for j in np.flatnonzero(undetermined[:, k])]
+        if joints:
+            notes.append(
+                f"{parameter.meaning} is possible on {', '.join(joints)}, but the logs "
+                "do not determine it: it is left out; record motions that show it"
+            )
+    return notes
+
+
+def _notes_on_limits(fit: JointFit, joint_names: tuple[str, ...]) -> list[str]:
     """Return a note for each parameter that stands at a limit of the search."""
     notes = []
-    for j, k in np.argwhere(refinement.free):
-        value = refinement.parameters[j, k]
+    for j, k in np.argwhere(fit.free):
+        value = fit.parameters[j, k]
         is_limit = value in (UPPER[k], LOWER[k])
-        # An integral gain of zero is none.
+        # An integral gain or a delay of zero is none.
         if k in LIMITED_PARAMETERS and is_limit and value != 0.0:
             notes.append(
                 f"{joint_names[j]}: {PARAMETERS[k].meaning} is at the limit of the "
@@ -303,25 +354,25 @@ def _notes_on_limits(refinement: Refinement, joint_names: tuple[str, ...]) -> li
     return notes
 
 
-def _notes_on_errors(refinement: Refinement, joint_names: tuple[str, ...]) -> list[str]:
+def _notes_on_errors(fit: JointFit, joint_names: tuple[str, ...]) -> list[str]:
     """Return a note if errors show that an effect is missing."""
-    motion = refinement.simulator.motion
-    sample_mask = np.asarray(motion.counted) > 0
-    positions = np.asarray(motion.positions)
+    motion = fit.simulator.motion
+    path = fit.simulator.positions(fit.parameters, fit.start)
+    sample_mask = motion.counted > 0
     joint_errors = []
     for j, name in enumerate(joint_names):
-        residuals = refinement.residuals[:, j]
-        rms = systematic_error(residuals, sample_mask[:, j], positions[:, j])
+        positions = motion.positions[:, j]
+        residuals = path[:, j] - positions
+        rms = systematic_error(residuals, sample_mask[:, j], positions)
         if rms > 0:
             joint_errors.append(f"{name} {1e3 * rms:.2g}")
     if not joint_errors:
         return []
-    integral = "" if refinement.free[:, INDEX["ki"]].any() else ", integral action"
     return [
         "errors are larger than an encoder's rounding and change slowly "
         f"({', '.join(joint_errors)} mrad or mm RMS): an effect is missing, such as "
-        f"other friction, play, elasticity{integral} or load, and the parameters are "
-        "those that imitate it best"
+        "other friction, play, elasticity or load, and the parameters are those that "
+        "imitate it best"
     ]
 
 

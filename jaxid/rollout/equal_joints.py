@@ -1,0 +1,121 @@
+"""Joints of one kind, like those of the legs: equal as far as the logs do not differ.
+
+Their parameters are pulled towards the mean of their kind, as strongly as it lowers the
+errors of motions that the fit has not seen.
+"""
+
+import re
+from collections.abc import Sequence
+
+import numpy as np
+
+from jaxid.errors import InputError
+
+from .joint_fits import SIZE, JointFit, Pull
+from .motion import JointParameters
+from .servo import INDEX, SCALE
+
+SIDES = frozenset(
+    "l r left right fl fr rl rr hl hr bl br lf rf lh rh lb rb front rear hind back".split()
+)
+"""Words of joint names that tell a side, and not the kind of a joint."""
+SCATTERS = (0.3, 0.1, 0.03, 0.01)
+"""Relative scatters of equal joints' parameters that are tried."""
+PULL_ROUNDS = 3
+"""Times that means follow the parameters."""
+
+
+def joint_groups(
+    names: Sequence[str], alike: Sequence[Sequence[str]] | None
+) -> tuple[tuple[int, ...], ...]:
+    """Return the joints of each kind; a joint of no kind is alone.
+
+    Args:
+        names: Names of the joints.
+        alike: Words of each kind, which the names of its joints contain, like
+            `[["hip"], ["knee"]]`; kinds are names that differ only in a side, like
+            `left_hip` and `right_hip`, if None.
+
+    Raises:
+        InputError: If words name no joint, or two kinds have a joint in common.
+    """
+    kinds = [_kind_of(name) or name for name in names]
+    if alike is not None:
+        kinds = list(names)
+        for words in alike:
+            members = [k for k, name in enumerate(names) if _has_word(name, words)]
+            if not members:
+                raise InputError(
+                    f"`alike`: no joint has {' or '.join(words)} in its name; the "
+                    f"joints are {', '.join(names)}."
+                )
+            for k in members:
+                if kinds[k] != names[k]:
+                    raise InputError(
+                        f"`alike`: joint `{names[k]}` is in two kinds; each joint "
+                        "belongs to one at most."
+                    )
+                kinds[k] = f"kind {' '.join(words)}"
+    return tuple(
+        tuple(k for k, x in enumerate(kinds) if x == kind)
+        for kind in dict.fromkeys(kinds)
+    )
+
+
+def _has_word(name: str, words: Sequence[str]) -> bool:
+    return any(word in name for word in words)
+
+
+def _kind_of(name: str) -> str:
+    """Return a joint's name without its side; empty if it names none."""
+    words = re.split(r"[^a-z0-9]+", name.lower())
+    kind = [word for word in words if word not in SIDES]
+    return " ".join(kind) if len(kind) < len(words) else ""
+
+
+def pull_equal_joints(fit: JointFit, groups: Sequence[Sequence[int]]) -> JointFit:
+    """Return the fit with the pull between equal joints that held-out motions prefer."""
+    is_equal = np.zeros(len(fit.parameters), bool)
+    for group in groups:
+        is_equal[list(group)] = len(group) > 1
+    best_fit = fit
+    if not is_equal.any():
+        return fit
+    best_score = fit.held_out_scores[:, is_equal].mean()
+    for scatter in SCATTERS:
+        trial = best_fit
+        for _ in range(PULL_ROUNDS):
+            pull = pull_of(trial.parameters, groups, scatter)
+            trial = _with_pull(trial, pull).improved(2)
+        score = trial.held_out_scores[:, is_equal].mean()
+        if score > best_score:
+            break
+        best_fit = trial
+        best_score = score
+    return best_fit
+
+
+def _with_pull(fit: JointFit, pull: Pull) -> JointFit:
+    import dataclasses
+
+    return dataclasses.replace(fit, pull=pull)
+
+
+def pull_of(
+    parameters: JointParameters, groups: Sequence[Sequence[int]], scatter: float
+) -> Pull:
+    """Return the pull to the means of equal joints, of a relative scatter.
+
+    Biases are their own: they are of the assembly, and mirrored joints turn them around.
+    """
+    target = np.zeros_like(parameters)
+    precision = np.zeros((len(parameters), SIZE))
+    for group in groups:
+        members = list(group)
+        if len(members) > 1:
+            mean = parameters[members].mean(axis=0)
+            target[members] = mean
+            deviation = scatter * np.maximum(np.abs(mean), 0.1 * SCALE)
+            precision[members] = 1.0 / deviation**2
+    precision[:, INDEX["b"]] = 0.0
+    return Pull(target, precision)

@@ -1,0 +1,354 @@
+"""Simulation of joints behind position servos, and its derivatives.
+
+A joint is simulated along a known load. Joints that load each other are simulated
+again and again, each time along the loads of the last simulation, until they agree:
+servos hold their joints so well that few rounds are enough.
+"""
+
+import dataclasses
+import functools
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxid.arrays import AnyArray, Array, double_precision
+
+from .body_loads import Bodies
+from .motion import ServoMotion
+from .servo import (
+    GAMMA,
+    INDEX,
+    SHARES,
+    VELOCITY_FACTORS,
+    StageInputs,
+    State,
+    advance_stage,
+)
+
+MAX_ROUNDS = 12
+"""Largest number of simulations in which joints that load each other agree."""
+AGREEMENT = 1e-6
+"""Change of positions by a round at which joints agree [rad or m]."""
+
+
+class Channels(NamedTuple):
+    """Inputs and measured positions of all channels: one joint in one motion each.
+
+    The channels are the last axis, which makes the loops over them fast.
+
+    Attributes:
+        commands: Commands [samples, channels], which begin before the positions.
+        positions: Measured positions [samples, channels].
+        counted: Whether a sample counts: 1 or 0.
+        load: Torque of the bodies in each step [N m or N].
+        inertia: Inertia of the bodies in each step [kg m² or kg].
+        sample_time: Time between two samples [s].
+    """
+
+    commands: Array
+    positions: Array
+    counted: Array
+    load: Array
+    inertia: Array
+    sample_time: Array
+
+
+class Moments(NamedTuple):
+    """Sums over the samples of each motion and joint.
+
+    The unknowns are the parameters of the joint, and its initial state in the motion.
+
+    Attributes:
+        cost: Sum of squared errors [motions, joints].
+        gradient: Half its gradient [motions, joints, unknowns].
+        information: Products of sensitivities [motions, joints, unknowns, unknowns].
+    """
+
+    cost: np.ndarray
+    gradient: np.ndarray
+    information: np.ndarray
+
+
+class DelayedCommand(NamedTuple):
+    """Command of each stage for the delay at which it was evaluated.
+
+    Attributes:
+        value: Command.
+        rate: First derivative by time [1/s].
+        bend: Second derivative by time, from samples beside each other [1/s²].
+    """
+
+    value: Array
+    rate: Array
+    bend: Array
+
+    def at(self, lateness: Array) -> tuple[Array, Array]:
+        """Return command and rate if they come later by a small time [s]."""
+        return self.value - self.rate * lateness, self.rate - self.bend * lateness
+
+
+def delayed_command(
+    commands: Array, ends: Array, sample_time: Array, hold: AnyArray
+) -> DelayedCommand:
+    """Return the commands of both stages of steps that end at these instants.
+
+    Commands are interpolated; or they are held until the next one, and count with their
+    mean over the step. Before the first and behind the last they stand still.
+
+    Args:
+        commands: Commands [samples].
+        ends: First start and then all ends of steps, less the delay, in samples.
+        sample_time: Time between two samples [s].
+        hold: Whether commands are held.
+    """
+    last_index = len(commands) - 1.0
+
+    def interpolate(values: Array, instants: Array) -> Array:
+        places = jnp.clip(instants, 0.0, last_index)
+        floors = jnp.clip(jnp.floor(places), 0.0, last_index - 1.0)
+        k = floors.astype(int)
+        return values[k] + (places - floors) * (values[k + 1] - values[k])
+
+    length = jnp.diff(ends)
+    stage_ends = jnp.stack([ends[:-1] + GAMMA * length, ends[1:]], axis=1).ravel()
+    slopes = jnp.append(jnp.diff(commands), 0.0)
+    bends = jnp.gradient(jnp.gradient(commands))
+    inside = jnp.clip(stage_ends, 0.0, last_index)
+    rate = jnp.where(inside == stage_ends, slopes[inside.astype(int)], 0.0)
+
+    # Held commands: means are differences of the integral, whose ends are exact.
+    integral = jnp.concatenate([jnp.zeros(1), jnp.cumsum(commands[:-1])])
+    first_piece = jnp.minimum(ends, 0.0) * commands[0]
+    last_piece = jnp.maximum(ends - last_index, 0.0) * commands[-1]
+    sums = interpolate(integral, ends) + first_piece + last_piece
+    mean = jnp.diff(sums) / length
+    indices = jnp.clip(jnp.floor(ends), 0.0, last_index).astype(int)
+    held_rate = jnp.diff(commands[indices]) / length
+
+    value = jnp.where(hold, jnp.repeat(mean, 2), interpolate(commands, stage_ends))
+    rate = jnp.where(hold, jnp.repeat(held_rate, 2), rate)
+    bend = interpolate(bends, stage_ends)
+    return DelayedCommand(value, rate / sample_time, bend / sample_time**2)
+
+
+def _path(
+    unknowns: Array, delays: Array, channels: Channels, steps: int, hold: AnyArray
+) -> State:
+    """Return the states of all channels at the first sample and behind all steps.
+
+    Args:
+        unknowns: Parameters of the joint, and its initial state [unknowns, channels].
+        delays: Delays in the parameters [s], as constants for derivatives.
+        channels: Inputs.
+        steps: Steps in each sample time.
+        hold: Whether commands are held until the next one.
+    """
+    theta = unknowns[: len(INDEX)]
+    start = State(*unknowns[len(INDEX) :])
+    samples, count = channels.positions.shape
+    lead = channels.commands.shape[0] - samples
+    step_count = (samples - 1) * steps
+    instants = lead + np.arange(step_count + 1) / steps
+
+    def delay_command(commands: Array, delay: Array, sample_time: Array):
+        ends = instants - delay / sample_time
+        return delayed_command(commands, ends, sample_time, hold)
+
+    arguments = channels.commands, delays, channels.sample_time
+    commands = jax.vmap(delay_command, (1, 0, 0), 1)(*arguments)
+    stage_commands = jax.tree.map(lambda x: x.reshape(-1, 2, count), commands)
+    lateness = theta[INDEX["d"]] - delays
+    h = channels.sample_time / steps
+
+    def step(state: State, inputs: tuple[DelayedCommand, Array, Array]):
+        commands, load, inertia = inputs
+
+        def advance(state: State, stage_inputs: tuple[DelayedCommand, Array, Array]):
+            command, share, ahead = stage_inputs
+            stage = StageInputs(*command.at(lateness), load, inertia, share, ahead)
+            return advance_stage(state, theta, stage, h), None
+
+        # A loop: XLA would fuse two stages into one long expression, twice as slow.
+        shares = jnp.array(SHARES), jnp.array(VELOCITY_FACTORS)
+        state, _ = jax.lax.scan(advance, state, (commands, *shares))
+        return state, state
+
+    inputs = stage_commands, channels.load, channels.inertia
+    _, path = jax.lax.scan(step, start, inputs)
+    return jax.tree.map(lambda x, y: jnp.concatenate([x[None], y]), start, path)
+
+
+@functools.partial(jax.jit, static_argnums=3)
+def _states(
+    unknowns: Array, channels: Channels, hold: AnyArray, steps: int
+) -> State:
+    """Return states of all channels at all steps [steps, channels]."""
+    return _path(unknowns, unknowns[INDEX["d"]], channels, steps, hold)
+
+
+def _errors_and_derivatives(
+    unknowns: Array, channels: Channels, hold: AnyArray, steps: int
+) -> tuple[Array, Array]:
+    """Return errors [samples, channels] and derivatives [unknowns, samples, channels].
+
+    Both are zero where a sample does not count.
+    """
+    delays = unknowns[INDEX["d"]]
+
+    def errors(unknowns: Array) -> Array:
+        path = _path(unknowns, delays, channels, steps, hold).q[::steps]
+        return (path - channels.positions) * channels.counted
+
+    def differentiate(direction: Array) -> tuple[Array, Array]:
+        change = jnp.broadcast_to(direction[:, None], unknowns.shape)
+        return jax.jvp(errors, (unknowns,), (change,))
+
+    directions = jnp.eye(len(unknowns))
+    return jax.vmap(differentiate, out_axes=(None, 0))(directions)
+
+
+@functools.partial(jax.jit, static_argnums=3)
+def _sensitivities(
+    unknowns: Array, channels: Channels, hold: AnyArray, steps: int
+) -> tuple[Array, Array]:
+    """Return errors [channels, samples] and derivatives [channels, unknowns, samples]."""
+    r, S = _errors_and_derivatives(unknowns, channels, hold, steps)
+    return r.T, jnp.moveaxis(S, 2, 0)
+
+
+@functools.partial(jax.jit, static_argnums=3)
+def _moments(
+    unknowns: Array, channels: Channels, hold: AnyArray, steps: int
+) -> Moments:
+    r, S = _sensitivities(unknowns, channels, hold, steps)
+    return Moments(
+        jnp.sum(r**2, axis=-1),
+        jnp.einsum("cut,ct->cu", S, r),
+        jnp.einsum("cut,cvt->cuv", S, S),
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class ServoSimulator:
+    """Motions, and how they are simulated.
+
+    Attributes:
+        motion: Commands and measured positions.
+        time_step: Longest step, 5 % more if that makes them fewer [s].
+        hold: Whether commands are held until the next one, instead of interpolated.
+        bodies: Bodies that load the joints; None without.
+        path: Positions at all steps whose loads act [motions, joints, steps]; those
+            that were measured if None.
+    """
+
+    motion: ServoMotion
+    time_step: float = 0.01
+    hold: bool = False
+    bodies: Bodies | None = None
+    path: Any = None
+
+    @property
+    def steps(self) -> int:
+        """Steps in each sample time."""
+        sample_time = float(self.motion.sample_time.max())
+        return max(1, math.ceil(sample_time / self.time_step - 0.05))
+
+    @functools.cached_property
+    def loads(self) -> tuple[np.ndarray, np.ndarray]:
+        """Torques and inertias of the bodies in all steps [motions, joints, steps]."""
+        motion = self.motion
+        if self.bodies is None:
+            motions, joints, samples = motion.positions.shape
+            zeros = np.zeros((motions, joints, (samples - 1) * self.steps))
+            return zeros, zeros
+        if self.path is not None:
+            return self.bodies.loads(self.path, motion.sample_time / self.steps)
+        torques, inertias = self.bodies.measured_loads(
+            motion.positions, motion.sample_time
+        )
+        return (
+            np.repeat(torques, self.steps, axis=-1),
+            np.repeat(inertias, self.steps, axis=-1),
+        )
+
+    @functools.cached_property
+    def _channels(self) -> Channels:
+        """Inputs of the simulation."""
+        motion = self.motion
+        joints = motion.positions.shape[1]
+        arrays = (motion.commands, motion.positions, motion.counted, *self.loads)
+        # Motions and joints become one last axis.
+        columns = [x.reshape(-1, x.shape[-1]).T for x in arrays]
+        return Channels(*columns, np.repeat(motion.sample_time, joints))
+
+    def _call(self, function: Callable, theta: np.ndarray, start: np.ndarray) -> Any:
+        """Call a compiled function of unknowns and channels."""
+        shape = (len(start), *np.shape(theta)[-2:])
+        parameters = np.broadcast_to(theta, shape)
+        unknowns = np.concatenate([parameters, start], axis=-1)
+        columns = unknowns.reshape(-1, unknowns.shape[-1]).T
+        with double_precision():
+            result = function(
+                columns, self._channels, np.array(self.hold), self.steps
+            )
+            return jax.tree.map(np.asarray, result)
+
+    def _by_motion(self, x: np.ndarray) -> np.ndarray:
+        """Return an array of channels as one of motions and joints."""
+        return x.reshape(*self.motion.positions.shape[:2], *x.shape[1:])
+
+    def moments(self, theta: np.ndarray, start: np.ndarray) -> Moments:
+        """Return errors, gradients and products of sensitivities along these loads.
+
+        Args:
+            theta: Parameters of each joint, or of each motion and joint.
+            start: Initial states [motions, joints, states].
+        """
+        moments = self._call(_moments, theta, start)
+        return Moments(*(self._by_motion(x) for x in moments))
+
+    def sensitivities(
+        self, theta: np.ndarray, start: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return errors and their derivatives.
+
+        Returns:
+            Errors [motions, joints, samples], and derivatives [motions, joints,
+            unknowns, samples] by the parameters and the initial state.
+        """
+        r, S = self._call(_sensitivities, theta, start)
+        return self._by_motion(r), self._by_motion(S)
+
+    def states(self, theta: np.ndarray, start: np.ndarray) -> State:
+        """Return states at all steps along these loads [motions, joints, steps]."""
+        states = self._call(_states, theta, start)
+        return State(*(self._by_motion(x.T) for x in states))
+
+    def positions(self, theta: np.ndarray, start: np.ndarray) -> np.ndarray:
+        """Return positions of the samples along these loads."""
+        return self.states(theta, start).q[..., :: self.steps]
+
+    def with_loads_of(self, theta: np.ndarray, start: np.ndarray) -> "ServoSimulator":
+        """Return the simulator with the loads of its own simulation."""
+        if self.bodies is None:
+            return self
+        return dataclasses.replace(self, path=self.states(theta, start).q)
+
+    def in_agreement(self, theta: np.ndarray, start: np.ndarray) -> "ServoSimulator":
+        """Return the simulator with loads that agree with its simulation."""
+        simulator = self
+        for _ in range(MAX_ROUNDS):
+            previous_path = simulator.path
+            simulator = simulator.with_loads_of(theta, start)
+            if simulator.path is None:
+                break
+            if previous_path is None:
+                continue
+            change = np.abs(simulator.path - previous_path)
+            if np.nanmax(change, initial=0.0) < AGREEMENT:
+                break
+        return simulator
