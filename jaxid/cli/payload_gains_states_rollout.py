@@ -178,5 +178,4 @@ def rollout(
         progress("writing the report", 0.0)
         files = report.write(output)
     terminal.show(console, *report.tables())
-    terminal.show_remarks(console, [report.verdict])
     terminal.show_files(console, output, files)

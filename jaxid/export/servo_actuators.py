@@ -10,7 +10,7 @@ from lxml.builder import E  # pyright: ignore[reportMissingModuleSource]
 from jaxid.arrays import AnyArray, Joints, Texts
 from jaxid.errors import InputError
 from jaxid.io import FilePath, write_text
-from jaxid.result_table import Column, Table
+from jaxid.result_table import Column, Remark, Status, Table
 from jaxid.robot.mjcf import exact_text
 from jaxid.rollout.body_loads import Bodies
 from jaxid.rollout.result import ServoFit
@@ -31,8 +31,16 @@ UNITS = {
     "delay": ("s", "s"),
     "offset": ("rad", "m"),
     "integral_gain": ("N m/(rad s)", "N/(m s)"),
+    "feed_forward": ("N m s/rad", "N s/m"),
 }
 """Units of `simulator_values` at joints that turn, and at joints that slide."""
+OPTIONAL_VALUES = ("integral_gain", "feed_forward")
+"""Values of `simulator_values` that most servos lack."""
+FEED_FORWARD_CURE = (
+    "position actuators have no velocity feed-forward: give as control the command "
+    "plus feed forward / stiffness times its rate"
+)
+"""How a simulator moves like servos that feed the velocity of the command forward."""
 
 
 def servo_stiffness(fit: ServoFit) -> Joints:
@@ -65,7 +73,8 @@ def simulator_values(fit: ServoFit, parameters: AnyArray | None = None) -> Quant
 
     Returns:
         `stiffness`, `damping`, `armature`, `friction`, `effort_limit` (infinite
-        without), `delay` [s], `offset` of the command, and `integral_gain`.
+        without), `delay` [s], `offset` of the command, `integral_gain`, and
+        `feed_forward` of the command's velocity.
     """
     rows = fit.parameters if parameters is None else np.asarray(parameters)
     ratios = {symbol: rows[:, k] for symbol, k in INDEX.items()}
@@ -90,6 +99,7 @@ def simulator_values(fit: ServoFit, parameters: AnyArray | None = None) -> Quant
         "delay": ratios["d"],
         "offset": ratios["b"],
         "integral_gain": K * ratios["ki"],
+        "feed_forward": K * ratios["f"],
     }
 
 
@@ -118,16 +128,13 @@ def simulator_table(fit: ServoFit) -> Table:
     slides = fit.bodies is not None and not all(fit.bodies.model.robot.revolute)
     columns = []
     for name, value in values.items():
-        if name != "integral_gain" or value.any():
+        if name not in OPTIONAL_VALUES or value.any():
             pair = dict.fromkeys(UNITS[name])
             unit = " or ".join(pair) if slides else UNITS[name][0]
             columns.append(Column(name.replace("_", " "), value, unit))
-    remarks = []
-    if (values["delay"] < 0).any():
-        remarks.append(
-            "a negative delay means that positions are stamped later than commands: "
-            "use 0"
-        )
+    remarks: list[Remark | str] = []
+    if values["feed_forward"].any():
+        remarks.append(Remark(FEED_FORWARD_CURE, Status.DOUBTFUL))
     if not fit.hold:
         remarks.append(
             "the delay counts for interpolated commands: held ones are later by half a "
@@ -160,16 +167,16 @@ def export_servo_mjcf(
     """Write the robot for MuJoCo, with its identified servos as position actuators.
 
     Controls are the commanded positions, one each in the order of the joints. MJCF has
-    no delay of commands and no bias: both are in a comment and in `<custom>` numbers
-    (`delay`, `offset`). Servos with integral action are `mujoco.pid` plugins, which
-    come with MuJoCo. They start without integral: wait until loaded joints have
-    settled, or set `data.act`.
+    no delay of commands, no bias, and no velocity feed-forward: a comment says so, and
+    they are `<custom>` numbers (`delay`, `offset`, `feed_forward` over the stiffness).
+    Servos with integral action are `mujoco.pid` plugins, which come with MuJoCo. They
+    start without integral: wait until loaded joints have settled, or set `data.act`.
 
     Args:
         fit: Identified servos of a robot whose bodies are known.
         path: Path of the file.
-        samples: Number of further files, `NAME_000.xml` …, drawn from the estimates'
-            distribution.
+        samples: Number of further files, `NAME_samples/000.xml` …, drawn from the
+            estimates' distribution.
         timestep: Time step of the simulation [s].
 
     Raises:
@@ -180,9 +187,8 @@ def export_servo_mjcf(
             "`fit` has no bodies: identify with `bodies`, or use `simulator_table`."
         )
     path = Path(path)
-    paths = [path]
-    for k in range(samples):
-        paths.append(path.with_stem(f"{path.stem}_{k:03d}"))
+    folder = path.with_name(f"{path.stem}_samples")
+    paths = [path, *(folder / f"{k:03d}.xml" for k in range(samples))]
     draws = [fit.parameters, *fit.samples(samples)]
     for file, parameters in zip(paths, draws, strict=True):
         values = simulator_values(fit, parameters)
@@ -200,6 +206,8 @@ def _servo_mjcf(
     model = bodies.model
     rigid_bodies = body_parameters(model, np.asarray(bodies.parameters))
     comment = " Delays [s] and offsets in <custom>. "
+    if values["feed_forward"].any():
+        comment = f"{comment}Beware: {FEED_FORWARD_CURE} (`feed_forward` in <custom>). "
     text = mjcf_text(model.robot, rigid_bodies, values, timestep, comment)
     root = etree.fromstring(text)
     root.find("option").set("integrator", "implicitfast")
@@ -214,12 +222,13 @@ def _servo_mjcf(
         actuators.append(_actuator(name, k, values))
     if values["integral_gain"].any():
         root.append(E.extension(E.plugin(plugin="mujoco.pid")))
-    root.append(
-        E.custom(
-            E.numeric(name="delay", data=exact_text(values["delay"])),
-            E.numeric(name="offset", data=exact_text(values["offset"])),
-        )
-    )
+    numbers = {
+        "delay": values["delay"],
+        "offset": values["offset"],
+        "feed_forward": values["feed_forward"] / values["stiffness"],
+    }
+    elements = (E.numeric(name=k, data=exact_text(x)) for k, x in numbers.items())
+    root.append(E.custom(*elements))
     return etree.tostring(root, pretty_print=True, encoding="unicode")
 
 

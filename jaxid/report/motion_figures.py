@@ -137,6 +137,30 @@ def pose_figure(
     return Figure(title, height=2.6, width=7.5, scene=scene)
 
 
+def compared_poses(
+    robot: Robot,
+    time: Times,
+    measured: JointSamples,
+    simulated: JointSamples,
+    title: str,
+) -> Figure:
+    """Return the robot twice in one view: as it was measured, and as simulated."""
+    scenes = [pose_figure(robot, q, time).scene for q in (simulated, measured)]
+    first, second = (scene for scene in scenes if scene is not None)
+    count = len(first.links)
+    # The ground, -1, is common to both.
+    second_links = [link if link < 0 else link + count for link in second.links]
+    colours = np.repeat([1.0, 0.0], count)
+    scene = dataclasses.replace(
+        first,
+        points=np.concatenate([first.points, second.points], axis=1),
+        links=(*first.links, *second_links),
+        values=np.tile(colours, (len(first.time), 1)),
+        label="0: measured, 1: simulated",
+    )
+    return Figure(title, height=2.6, width=7.5, scene=scene)
+
+
 def speed_figure(
     robot: Robot,
     limits: Limits,

@@ -14,7 +14,7 @@ from jaxid.identification.parameter_changes import Comparison, parameter_kinds
 from jaxid.identification.uncertainty import Uncertainty
 from jaxid.result_table import versions
 from jaxid.robot.robot import Robot
-from jaxid.validation.judgement import Report, judge
+from jaxid.validation.judgement import Judgement, Report, judge
 from jaxid.validation.torque_errors import TorqueErrors
 
 Record = dict[str, Any]
@@ -58,10 +58,6 @@ def result_record(report: Report) -> Record:
     """Return the content of `result.json`; `model.json` holds robot, model and fit."""
     fit = report.fit
     robot = fit.base.model.robot
-    judgement = judge(report)
-    verdicts = []
-    for remark in (judgement.verdict, *judgement.findings):
-        verdicts.append({"status": remark.status.name.lower(), "text": remark.text})
     undetermined_records = []
     for direction in fit.undetermined:
         names = [fit.base.names[k] for k in direction.parts]
@@ -71,7 +67,7 @@ def result_record(report: Report) -> Record:
         )
     return {
         **header("result.json"),
-        "verdict": verdicts,
+        "verdict": verdict_rows(judge(report)),
         "robot": robot.name,
         "base_parameters": parameter_rows(fit),
         "fit": {
@@ -97,6 +93,12 @@ def result_record(report: Report) -> Record:
         "settings": report.settings,
         "notes": report.every_note,
     }
+
+
+def verdict_rows(judgement: Judgement) -> list[Record]:
+    """Return the verdict and all findings, one row for each."""
+    remarks = (judgement.verdict, *judgement.findings)
+    return [{"status": x.status.name.lower(), "text": x.text} for x in remarks]
 
 
 def consistency_record(fit: Fit) -> Record | None:

@@ -1,6 +1,7 @@
 """Report of an identification without torques: motions, their simulation, numbers."""
 
 import dataclasses
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,9 @@ from jaxid.export.servo_actuators import (
     simulator_values,
 )
 from jaxid.result_table import Column, Remark, Status, Table, significant
+from jaxid.robot.robot import Robot
 from jaxid.rollout import RolloutErrors, ServoFit
+from jaxid.validation.judgement import SEVERITIES, Judgement
 
 from .figure import Figure
 from .figure_elements import (
@@ -24,14 +27,22 @@ from .figure_elements import (
     Curve,
     Panel,
 )
-from .page import Section, Settings, provenance, render_page
+from .motion_figures import compared_poses
+from .page import Section, Settings, folded, provenance, render_page
 from .result_files import write_page_and_table
-from .result_records import Record
+from .result_records import Record, verdict_rows
 
 MAX_FIGURES = 6
 """Motions whose figures the page shows."""
 MAX_RATIO = 0.9
 """Error of a good simulation, relative to those of the baselines."""
+BASELINES = {"linear": "a linear joint", "command": "the copied command"}
+"""Baselines, in words."""
+NOT_VALIDATED = Remark(
+    "The simulation was not validated on an unseen log: use `--verify`",
+    Status.DOUBTFUL,
+)
+"""Doubt about a simulation that was compared with the logs of its fit only."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -39,6 +50,7 @@ class RolloutReport:
     """Content of the report.
 
     Attributes:
+        robot: The robot.
         fit: Identified servos.
         errors: Errors of free-running simulations.
         windows: Errors of windows of one second that start from measured states [rad or
@@ -48,6 +60,7 @@ class RolloutReport:
         settings: Facts, command and text of the experiment file.
     """
 
+    robot: Robot
     fit: ServoFit
     errors: RolloutErrors
     windows: Float[np.ndarray, " joints"]
@@ -56,59 +69,100 @@ class RolloutReport:
     settings: Settings
 
     @property
-    def verdict(self) -> Remark:
-        """Whether the simulation is closer to the robot than a linear joint."""
-        simulation_errors = self.errors.total()
-        linear_errors = self.errors.total("linear")
-        is_worse = simulation_errors >= linear_errors
-        text = "The simulation moves more like the robot than a linear joint does"
-        status = Status.GOOD
-        if is_worse.any():
-            joints = ", ".join(np.array(self.errors.joint_names)[is_worse])
-            text = f"The simulation is no better than a linear joint ({joints})"
-            status = Status.DOUBTFUL
-        sizes = f"{in_milli(simulation_errors)} instead of {in_milli(linear_errors)}"
-        return Remark(f"{text}: errors of {sizes} mrad or mm", status)
+    def judgement(self) -> Judgement:
+        """Findings, the most severe first, and the verdict that sums them up."""
+        doubts = [Remark(note, Status.DOUBTFUL) for note in self.fit.notes]
+        return judge_simulation([*self._judge_errors(), *doubts])
+
+    def _judge_errors(self) -> Iterator[Remark]:
+        """Compare the simulation with its baselines, and motions and joints."""
+        if not self.unseen:
+            yield NOT_VALIDATED
+        names = np.array(self.fit.joint_names)
+        simulation = self.errors.total()
+        is_good = self._is_better_than("linear") & self._is_better_than("command")
+        for kind, words in BASELINES.items():
+            joints = ", ".join(names[~self._is_better_than(kind)])
+            if joints:
+                text = f"The simulation is hardly better than {words}: {joints}"
+                yield Remark(text, Status.DOUBTFUL)
+        if is_good.all():
+            j = int(np.argmax(simulation))
+            error = f"{significant(1e3 * simulation[j])} {milli_units(self.robot)[j]}"
+            yield Remark(
+                "The simulation moves more like the robot than a linear joint does; it "
+                f"errs most at {names[j]}, by {error} RMS",
+                Status.GOOD,
+            )
+        combinations = self.fit.combinations
+        disagreements = sum(not c.agrees for c in combinations)
+        if disagreements:
+            yield Remark(
+                f"Motions or equal joints differ in {disagreements} of "
+                f"{len(combinations)} parameters by more than noise: their intervals "
+                "are wider, and they are marked !"
+            )
+
+    def _is_better_than(self, kind: str) -> np.ndarray:
+        """Return for which joints the simulation is better than a baseline."""
+        return self.errors.total() < MAX_RATIO * self.errors.total(kind)
 
     @property
     def has_stiffness(self) -> bool:
         """Whether simulators can be given absolute numbers."""
         return bool(np.isfinite(self.fit.stiffness).any())
 
-    def error_table(self) -> Table:
-        """Return the errors of the simulation beside those of the baselines."""
+    def error_tables(self) -> list[Table]:
+        """Return the errors beside those of the baselines, and those by motion."""
         errors = self.errors
-        simulation = 1e3 * errors.total("simulated")
-        linear_errors = 1e3 * errors.total("linear")
-        command = 1e3 * errors.total("command")
-        is_doubtful = simulation > MAX_RATIO * np.minimum(linear_errors, command)
-        logs = (
-            "logs that the fit has not seen" if self.unseen else "the logs of the fit"
-        )
-        return Table(
-            f"errors of {logs} [mrad or mm]",
+        units = milli_units(self.robot)
+        is_good = self._is_better_than("linear") & self._is_better_than("command")
+        logs = "logs that the fit has not seen" if self.unseen else "logs of the fit"
+        comparison = Table(
+            f"errors on {logs}, every sample (RMS)",
             Column("joint", errors.joint_names),
-            Column("simulation,\nfree-running", simulation),
+            Column("unit", units),
+            Column("simulation,\nfree-running", 1e3 * errors.total()),
             Column("simulation,\nwindows of 1 s", 1e3 * self.windows),
-            Column("linear joint\nwith delay", linear_errors),
-            Column("copied\ncommand", command),
-            status=[Status.DOUBTFUL if doubt else Status.GOOD for doubt in is_doubtful],
+            Column("linear joint\nwith delay", 1e3 * errors.total("linear")),
+            Column("copied\ncommand", 1e3 * errors.total("command")),
+            status=[Status.GOOD if x else Status.DOUBTFUL for x in is_good],
         )
+        rms = 1e3 * errors.rms()
+        columns = map(Column, errors.joint_names, rms.T, units)
+        motions = Column("motion", errors.motions)
+        return [comparison, Table("errors of each motion", motions, *columns)]
+
+    def result_tables(self) -> list[Table]:
+        """Return what the logs determine, and the numbers for simulators."""
+        parameters = self.fit.summary()
+        # What is judged is not said twice.
+        sentences = {finding.text for finding in self.judgement.findings}
+        parameters.remarks = tuple(
+            remark for remark in parameters.remarks if remark.text not in sentences
+        )
+        if not self.has_stiffness:
+            text = "No weight tells a stiffness: name it by `rollout.stiffness`."
+            return [parameters, Table("", remarks=[text])]
+        return [parameters, simulator_table(self.fit)]
 
     def tables(self) -> list[Table]:
-        """Return the estimates, their errors, and the numbers for simulators.
-
-        The errors stand beside those of the baselines, and by motion.
-        """
-        tables = [self.fit.summary(), self.error_table(), self.errors.summary()]
-        return [*tables, simulator_table(self.fit)] if self.has_stiffness else tables
+        """Return estimates and errors, then all findings and the verdict."""
+        judgement = self.judgement
+        lines = [*judgement.findings, judgement.verdict]
+        tables = [*self.result_tables(), *self.error_tables()]
+        return [*tables, Table("", remarks=lines)]
 
     def write(self, folder: Path) -> list[Path]:
-        """Write a page, the numbers as JSON and CSV, and MJCF if bodies are known."""
+        """Write a page, the numbers as JSON and CSV, and MJCF if bodies are known.
+
+        Files that are drawn from the estimates' distribution lie in a folder.
+        """
         models = []
         if self.has_stiffness and self.fit.bodies is not None:
             path = folder / "robot.xml"
-            models = export_servo_mjcf(self.fit, path, samples=self.samples)
+            files = export_servo_mjcf(self.fit, path, samples=self.samples)
+            models = [path, *dict.fromkeys(file.parent for file in files[1:])]
         rows = estimate_rows(self.fit)
         record = self._record(rows)
         files = write_page_and_table(folder, "rollout", self._page(), record, rows)
@@ -117,25 +171,37 @@ class RolloutReport:
     def _page(self) -> str:
         """Return the page as HTML."""
         errors = self.errors
-        parameters = self.fit.summary()
-        simulators: Any = "No weight tells a stiffness: name it by `rollout.stiffness`."
-        if self.has_stiffness:
-            simulators = simulator_table(self.fit)
         text = (
             "Positions tell torques only in units of the servo's stiffness. Parameters "
             "that the logs tell only together are merged."
         )
+        parameters, simulators = self.result_tables()
+        units = milli_units(self.robot)
         motions = range(min(MAX_FIGURES, len(errors.motions)))
-        figures = [motion_figure(errors, motion) for motion in motions]
+        figures = [motion_figure(errors, motion, units) for motion in motions]
+        # The motion with the largest error shows most.
+        motion = int(np.argmax(errors.rms().max(axis=1)))
+        scene = compared_poses(
+            self.robot,
+            errors.time[motion],
+            errors.measured[motion].T,
+            errors.simulated[motion].T,
+            title=f"{errors.motions[motion]}: measured and simulated robot",
+        )
         sections: list[Section] = [
-            ("Verdict", [self.verdict]),
-            ("Errors", [self.error_table(), errors.summary()]),
-            ("Measured and simulated motion", figures),
+            ("At a glance", glance(self.judgement)),
+            ("Errors", self.error_tables()),
+            ("Measured and simulated motion", [scene, *figures]),
             ("What the logs determine", [text, parameters]),
             ("For simulators", [simulators]),
             provenance(self.settings),
         ]
-        return render_page("Joints behind position servos", sections)
+        logs = ", ".join(dict.fromkeys(self.fit.motions))
+        return render_page(
+            f"{self.robot.name}: joints behind position servos",
+            sections,
+            f"{len(units)} joints, from {logs}.",
+        )
 
     def _record(self, rows: list[Record]) -> Record:
         """Return the content of `rollout.json`."""
@@ -143,6 +209,7 @@ class RolloutReport:
         errors = self.errors
         return {
             "kind": "commands",
+            "verdict": verdict_rows(self.judgement),
             "joints": fit.joint_names,
             "combinations": rows,
             "covariance": fit.covariance,
@@ -155,8 +222,35 @@ class RolloutReport:
                 "windows": self.windows,
             },
             "simulators": simulator_values(fit) if self.has_stiffness else None,
-            "notes": fit.notes,
         }
+
+
+def judge_simulation(findings: Sequence[Remark]) -> Judgement:
+    """Return findings, the most severe first, and the verdict that sums them up."""
+    # Sorting keeps the order of findings with one severity.
+    ordered = sorted(findings, key=lambda x: SEVERITIES.index(x.status))
+    verdict = Remark("A good simulation: nothing speaks against it", Status.GOOD)
+    if ordered[0].status is Status.DOUBTFUL:
+        text = "A usable simulation; look at what is marked ! before you rely on it"
+        verdict = Remark(text, Status.DOUBTFUL)
+    return Judgement(tuple(ordered), verdict)
+
+
+def glance(judgement: Judgement) -> list[Any]:
+    """Return the first section of a page: verdict, what is wrong, and what is not."""
+    faults = judgement.faults
+    other_findings = [x for x in judgement.findings if x not in faults]
+    blocks: list[Any] = [judgement.verdict]
+    if faults:
+        blocks.append(faults)
+    if other_findings:
+        blocks.append(folded("What else was checked", other_findings))
+    return blocks
+
+
+def milli_units(robot: Robot) -> list[str]:
+    """Return the unit of each joint's errors."""
+    return [f"m{robot.joint_unit(j)}" for j in range(robot.joints)]
 
 
 def estimate_rows(fit: ServoFit) -> list[Record]:
@@ -164,31 +258,24 @@ def estimate_rows(fit: ServoFit) -> list[Record]:
     rows = []
     for combination in fit.combinations:
         low, high = combination.interval()
-        row = combination._asdict()
+        row = dict(vars(combination))
         del row["coefficients"]
         joint = fit.joint_names[combination.joint]
         rows.append({**row, "joint": joint, "low_95": low, "high_95": high})
     return rows
 
 
-def in_milli(errors: np.ndarray) -> str:
-    """Return errors in thousandths of their unit."""
-    return ", ".join(significant(1e3 * float(error)) for error in errors)
-
-
-def motion_figure(errors: RolloutErrors, motion: int) -> Figure:
+def motion_figure(errors: RolloutErrors, motion: int, units: Sequence[str]) -> Figure:
     """Return measured and simulated positions of all joints in a motion, and errors."""
-    time = np.asarray(errors.time[motion])
+    time = errors.time[motion]
     panels = []
     for j, name in enumerate(errors.joint_names):
+        measured_positions = errors.measured[motion][j]
+        simulated_positions = errors.simulated[motion][j]
         panel = motion_panel(
-            name,
-            time,
-            measured_positions=np.asarray(errors.measured[motion])[j],
-            simulated_positions=np.asarray(errors.simulated[motion])[j],
-            is_counted=np.asarray(errors.counted[motion])[j] > 0,
+            name, units[j], time, measured_positions, simulated_positions
         )
-        positions = np.asarray(errors.command[motion])[j]
+        positions = errors.command[motion][j]
         command = Curve(time, positions, "commanded", GREY, width=0.6)
         panels.append(dataclasses.replace(panel, curves=[command, *panel.curves]))
     title = f"{errors.motions[motion]}: measured and simulated, free-running"
@@ -197,16 +284,22 @@ def motion_figure(errors: RolloutErrors, motion: int) -> Figure:
 
 def motion_panel(
     name: str,
+    unit: str,
     time: np.ndarray,
     measured_positions: np.ndarray,
     simulated_positions: np.ndarray,
-    is_counted: np.ndarray,
 ) -> Panel:
-    """Return measured and simulated positions of a joint, and the errors that count."""
+    """Return measured and simulated positions of a joint, and their errors.
+
+    Args:
+        name: Name of the joint.
+        unit: Unit of the errors: mrad or mm.
+        time: Instants of the samples [s].
+        measured_positions: Measured positions.
+        simulated_positions: Simulated positions, NaN between two simulations.
+    """
     errors = 1e3 * (simulated_positions - measured_positions)
-    rms = np.nan
-    if is_counted.any():
-        rms = float(np.sqrt(np.mean(errors[is_counted] ** 2)))
+    rms = float(np.sqrt(np.nanmean(errors**2)))
     error = Curve(time, errors, "error", ERROR, width=0.7)
     return Panel(
         [
@@ -214,8 +307,8 @@ def motion_panel(
             Curve(time, simulated_positions, "simulated", PREDICTION_COLOUR, width=0.9),
         ],
         title=name,
-        value=f"RMS {significant(rms)} mrad or mm",
+        value=f"RMS {significant(rms)} {unit}",
         y="position",
-        unit="rad or m",
-        below=[Panel([error], y="error", unit="mrad or mm", share=0.6)],
+        unit=unit.removeprefix("m"),
+        below=[Panel([error], y="error", unit=unit, share=0.6)],
     )

@@ -10,12 +10,20 @@ import numpy as np
 from jaxid.measurement.observations import Observations
 from jaxid.result_table import Column, Remark, Status, Table
 from jaxid.rollout import TorqueRolloutFit
+from jaxid.validation.judgement import Judgement
 
 from .figure import Figure
 from .page import Section, Settings, provenance, render_page
 from .result_files import write_page_and_table
-from .result_records import Record, estimate_rows
-from .servo_rollout_report import MAX_FIGURES, in_milli, motion_panel
+from .result_records import Record, estimate_rows, verdict_rows
+from .servo_rollout_report import (
+    MAX_FIGURES,
+    NOT_VALIDATED,
+    glance,
+    judge_simulation,
+    milli_units,
+    motion_panel,
+)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -26,8 +34,7 @@ class TorqueRolloutReport:
         fit: Fit of rollouts.
         logs: Logs of the errors.
         unseen: Whether the fit has not seen these logs.
-        findings: Findings on the logs.
-        notes: Notes on the experiment and the logs.
+        findings: Findings on the experiment and the logs.
         settings: Command and text of the experiment file.
     """
 
@@ -35,7 +42,6 @@ class TorqueRolloutReport:
     logs: Sequence[Observations]
     unseen: bool
     findings: list[Remark]
-    notes: list[Remark]
     settings: Settings
 
     @functools.cached_property
@@ -47,17 +53,17 @@ class TorqueRolloutReport:
         )
 
     @property
-    def verdict(self) -> Remark:
-        """Whether simulations are closer to the robot than those of the torque fit."""
+    def judgement(self) -> Judgement:
+        """Findings, the most severe first, and the verdict that sums them up."""
+        doubts = [] if self.unseen else [NOT_VALIDATED]
         torque_fit_errors, rollout_errors = np.nan_to_num(self.errors, nan=np.inf)
         is_closer = bool((rollout_errors < torque_fit_errors).all())
-        comparison = "closer" if is_closer else "no closer"
-        sizes = f"{in_milli(rollout_errors)} instead of {in_milli(torque_fit_errors)}"
-        return Remark(
-            f"Simulations are {comparison} to the robot than with the fit of torques: "
-            f"errors after {self.fit.horizon:g} s of {sizes} mrad or mm",
+        comparison = Remark(
+            f"Simulations are {'closer' if is_closer else 'no closer'} to the robot "
+            "than with the fit of torques",
             Status.GOOD if is_closer else Status.DOUBTFUL,
         )
+        return judge_simulation([*doubts, comparison, *self.findings])
 
     def error_table(self) -> Table:
         """Return the errors of each joint after a horizon."""
@@ -66,24 +72,30 @@ class TorqueRolloutReport:
         return Table(
             f"errors after {self.fit.horizon:g} s on {place}",
             Column("joint", self.fit.joint_names),
-            Column("fit of torques", torque_fit_errors, "mrad or mm"),
-            Column("rollouts", rollout_errors, "mrad or mm"),
+            Column("unit", self._units),
+            Column("fit of torques", torque_fit_errors),
+            Column("rollouts", rollout_errors),
         )
 
+    @property
+    def _units(self) -> list[str]:
+        return milli_units(self.fit.rollout.base.model.robot)
+
     def tables(self) -> list[Table]:
-        """Return estimates and errors."""
-        remarks = [*self.notes, *self.findings]
-        return [self.fit.summary(), self.error_table(), Table("", remarks=remarks)]
+        """Return estimates and errors, then all findings and the verdict."""
+        judgement = self.judgement
+        lines = [*judgement.findings, judgement.verdict]
+        return [self.fit.summary(), self.error_table(), Table("", remarks=lines)]
 
     def write(self, folder: Path) -> list[Path]:
         """Write a page, and the numbers as JSON and CSV; return the files."""
         fit = self.fit
         figures = [self._figure(log) for log in self.logs[:MAX_FIGURES]]
         sections: list[Section] = [
-            ("Verdict", [self.verdict, self.findings]),
+            ("At a glance", glance(self.judgement)),
             ("Errors", [self.error_table()]),
             ("Measured and simulated motion", figures),
-            ("Parameters", [fit.summary(), self.notes]),
+            ("Parameters", [fit.summary()]),
             provenance(self.settings),
         ]
         page = render_page("Simulations under recorded torques", sections)
@@ -99,6 +111,7 @@ class TorqueRolloutReport:
         torque_fit, rollouts = self.errors
         return {
             "kind": "torques",
+            "verdict": verdict_rows(self.judgement),
             "joints": fit.joint_names,
             "horizon": fit.horizon,
             "parameters": rows,
@@ -109,7 +122,6 @@ class TorqueRolloutReport:
                 "fit_of_torques": torque_fit,
                 "rollouts": rollouts,
             },
-            "notes": [remark.text for remark in (*self.findings, *self.notes)],
         }
 
     def _figure(self, log: Observations) -> Figure:
@@ -119,10 +131,10 @@ class TorqueRolloutReport:
         panels = [
             motion_panel(
                 name,
+                self._units[j],
                 time,
                 measured_positions[:, j],
                 simulated_positions[:, j],
-                np.isfinite(simulated_positions[:, j]),
             )
             for j, name in enumerate(fit.joint_names)
         ]

@@ -35,19 +35,16 @@ class ServoSettings:
             or N/m], like `12.0`, or a list with `nan` where it is not; otherwise a
             known weight tells it.
         time_step: Longest step of the simulation [s].
-        friction: Whether friction that grows with load or falls with speed is tried.
-        saturation: Whether a largest torque of the servo is tried.
-        integral: Whether integral action of the servos (PID instead of PD controllers)
-            is tried.
+        alike: Words in the names of joints of one kind, like `[["hip"], ["knee"]]`:
+            they are equal as far as the logs do not differ. By default joints whose
+            names differ only in a side are of one kind.
         samples: Number of MJCF files drawn from the distribution of the estimates.
     """
 
     bodies: bool | None = None
     stiffness: Positive | list[float] | None = None
     time_step: Positive = 0.01
-    friction: bool = True
-    saturation: bool = True
-    integral: bool = False
+    alike: list[list[str]] | None = None
     samples: Annotated[int, Bounds(minimum=0, maximum=10_000)] = 0
 
 
@@ -110,23 +107,23 @@ def _follow_commands(
         recordings.append(read_commands(setup, log, columns))
     training_recordings = recordings[: len(logs)]
     unseen_recordings = recordings[len(logs) :]
-    progress("identifying", 0.0)
     fit = identify_rollout(
         training_recordings,
         bodies_of_file(setup, settings),
         joint_names=setup.robot.joint_names,
         time_step=settings.time_step,
-        saturation=settings.saturation,
-        friction=settings.friction,
-        integral=settings.integral,
         stiffness=settings.stiffness,
+        alike=settings.alike,
+        progress=progress,
     )
     progress("simulating", 0.0)
     test_recordings = unseen_recordings or training_recordings
     errors = fit.validate(test_recordings)
     window_errors = fit.window_errors(test_recordings)
     is_unseen = bool(unseen_recordings)
-    return RolloutReport(fit, errors, window_errors, is_unseen, settings.samples, {})
+    return RolloutReport(
+        setup.robot, fit, errors, window_errors, is_unseen, settings.samples, {}
+    )
 
 
 def bodies_of_file(setup: Setup, settings: ServoSettings) -> Bodies | None:
@@ -165,13 +162,11 @@ def _follow_torques(
     progress("identifying", 0.0)
     fit = identify_torque_rollout(base, training_logs, **dataclasses.asdict(settings))
     progress("simulating", 0.0)
-    doubts = [text for log in loaded_logs for text in log.findings]
-    notes = [*setup.notes, *(note for log in observations for note in log.notes)]
+    findings = [Remark(note) for note in setup.notes]
+    for log in loaded_logs:
+        findings += [Remark(text, Status.DOUBTFUL) for text in log.findings]
+        findings += [Remark(note) for note in log.observations.notes]
+    is_unseen = bool(unseen_logs)
     return TorqueRolloutReport(
-        fit,
-        unseen_logs or training_logs,
-        bool(unseen_logs),
-        [Remark(text, Status.DOUBTFUL) for text in doubts],
-        [Remark(note) for note in notes],
-        {},
+        fit, unseen_logs or training_logs, is_unseen, findings, {}
     )

@@ -20,9 +20,8 @@ angles = "position{}"
 commands = "command{}"
 time = "time"
 [rollout]
-friction = false
-saturation = false
 samples = 2
+alike = []
 """
 
 
@@ -61,37 +60,43 @@ def test_a_report_without_torques(folder, monkeypatch):
     assert found["errors"]["unseen"]
     assert np.max(found["errors"]["simulated"]) < 1e-3
     assert np.min(found["errors"]["linear"]) > 2e-3
-    assert len(list((folder / "out").glob("robot*.xml"))) == 3
-    mujoco.MjModel.from_xml_path(str(folder / "out" / "robot.xml"))
+    assert found["verdict"][0]["status"] == "good"
+    models = [
+        folder / "out" / "robot.xml",
+        *(folder / "out" / "robot_samples").iterdir(),
+    ]
+    assert len(models) == 3
+    for path in models:
+        mujoco.MjModel.from_xml_path(str(path))
     page = (folder / "out" / "report.html").read_text()
-    assert "lift" in page
-    assert "free-running" in page
+    for words in ("lift", "free-running", "RMS", "measured and simulated robot"):
+        assert words in page
+    for text in (page, done.output):
+        assert "mrad" in text
+        assert "[mrad or mm]" not in text
 
 
-def test_known_gains_and_integral_action_of_a_servo_without_it(folder, monkeypatch):
+def test_known_gains_beside_what_the_logs_tell(folder, monkeypatch):
     monkeypatch.chdir(folder)
-    text = FILE.replace(
-        "samples = 2", "stiffness = [12.0, nan]\nintegral = true\ntime_step = 0.005"
-    )
-    (folder / "pid.toml").write_text(text)
+    text = FILE.replace("samples = 2", "stiffness = [12.0, nan]")
+    (folder / "known.toml").write_text(text)
     words = [
         "rollout",
-        "pid.toml",
+        "known.toml",
         "short_0.csv",
         "short_1.csv",
-        "--verify",
-        "unseen.csv",
         "-o",
-        "pid",
+        "known",
     ]
     done = CliRunner().invoke(app, words, catch_exceptions=False)
     assert done.exit_code == 0, done.output
-    found = json.loads((folder / "pid" / "rollout.json").read_text())
+    assert "not validated on an unseen log" in done.output
+    found = json.loads((folder / "known" / "rollout.json").read_text())
+    assert found["verdict"][0]["status"] == "doubtful"
     np.testing.assert_allclose(
         found["simulators"]["stiffness"], servo_arm.KP, rtol=0.02
     )
     assert found["simulators"]["stiffness"][0] == 12.0
-    assert np.max(found["simulators"]["integral_gain"]) < 0.1
     assert np.max(found["errors"]["simulated"]) < 1e-3
 
 
@@ -176,6 +181,14 @@ def test_settings_of_the_other_kind_of_logs_are_rejected(driven, folder, monkeyp
         assert done.exit_code != 0
         assert f"`rollout.{key.split()[0]}` is for logs" in str(done.exception)
         assert not (place / "none").exists()
+
+
+@pytest.mark.parametrize("key", ["friction = false", "integral = true"])
+def test_keys_of_effects_that_are_always_tried_are_unknown(folder, monkeypatch, key):
+    monkeypatch.chdir(folder)
+    (folder / "former.toml").write_text(f"{FILE}{key}\n")
+    done = CliRunner().invoke(app, ["rollout", "former.toml", "a.csv", "-o", "none"])
+    assert f"`rollout.{key.split()[0]}` is no known key" in str(done.exception)
 
 
 def test_dry_friction_with_torques_must_be_smooth(driven, monkeypatch):
