@@ -8,12 +8,14 @@
   same torques, and beside other methods; the same on the four logs, each left out in
   turn, and on those of the fit.
 * coverage: a simulated servo arm of six axes on MuJoCo, 50 Hz, 12 bits; the truth lies
-  in so many of the 95 % intervals; with Stribeck friction that the model leaves out, in
-  how many draws it warns.
+  in so many of the 95 % intervals, with Stribeck friction and without; in how many draws
+  it warns.
 * gains: the same arm with servos of 1 and 1.6 times the gain.
 * confounded: one joint whose logs tell damping and delay, or armature and gain, only
   together.
 * quadruped: twelve hung joints on MuJoCo, 30 s at 200 Hz: time, compiled before.
+* go2: the Go2's chirp with known gains (needs ../shared/data), identified on the first
+  70 %: the rest, gains and damping in their intervals, legs that agree.
 * band: one hundred posterior models on MuJoCo; fraction of a held-out motion within
   their band.
 * sysid: the SO-101's joint 2, and joints 1 to 5, identified by mujoco.sysid; fifteen
@@ -21,11 +23,13 @@
 * evolution: the same joint by CMA-ES with the simulator of this package, given the same
   CPU time.
 
-    python benchmarks/rollout.py so101 pendulum coverage gains confounded quadruped band
+    python benchmarks/rollout.py so101 coverage gains confounded quadruped go2 band
     python benchmarks/rollout.py --quick
 """
 
 import contextlib
+import itertools
+import re
 import sys
 import tempfile
 import time
@@ -61,7 +65,8 @@ UNSEEN = (
 )
 COMMANDS = jid.Columns(time="time", angles="position{}", forces="command{}")
 STEP, ENCODER = 0.00005, 2 * np.pi / 4096
-FINE = {"friction": False, "saturation": False, "time_step": 0.0025}
+FINE = {"time_step": 0.0025}
+GO2_GAIN, GO2_DAMPING = 20.0, 1.5
 
 
 def so101_file() -> str:
@@ -315,7 +320,7 @@ def arm_logs(
     ]
 
 
-def truth(gain: float) -> np.ndarray:
+def truth(gain: float, stribeck: bool = False) -> np.ndarray:
     j = np.arange(6)
     K = gain * (12.0 - j)
     symbols = [p.symbol for p in jid.rollout.PARAMETERS]
@@ -324,6 +329,8 @@ def truth(gain: float) -> np.ndarray:
     # MuJoCo takes damping at the end of its steps: half a step of it acts as inertia.
     values = {"J": (0.04 + 0.004 * j) / K + B * STEP / 2, "B": B, "a": 1 / K}
     values |= {"F": (0.1 + 0.02 * j) / K, "d": np.full(6, 0.01 - STEP / 2)}
+    if stribeck:
+        values |= {"F": 0.1 / K, "Fs": 0.15 / K, "vs": np.full(6, 0.1)}
     for symbol, value in values.items():
         x[:, symbols.index(symbol)] = value
     return x
@@ -341,10 +348,10 @@ def coverage(quick: bool) -> None:
         for seed in range(draws):
             logs = arm_logs(seed, stribeck=stribeck)
             fit = jid.identify_rollout(logs, bodies, **FINE)
-            hits += inside(fit, truth(1.0))
+            hits += inside(fit, truth(1.0, stribeck))
             warned += bool(fit.notes)
         print(
-            f"{draws} draws, {'with' if stribeck else 'without'} unmodelled Stribeck "
+            f"{draws} draws, {'with' if stribeck else 'without'} Stribeck "
             f"friction: {100 * np.mean(hits):.1f} % of {len(hits)} intervals hold, "
             f"{warned} warn ({time.time() - start:.0f} s)",
             flush=True,
@@ -431,6 +438,40 @@ def quadruped(quick: bool) -> None:
     print(f"errors {1e3 * fit.validate(log).total().max():.2f} mrad at most")
 
 
+def go2(quick: bool) -> None:
+    """Identify legs whose servos' gains are known from their program."""
+    text = (DATA / "go2" / "go2.xml").read_text()
+    text = re.sub(r'<mesh [^>]*/>|<geom [^>]*mesh="[^>]*/>', "", text)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "go2.xml"
+        path.write_text(text)
+        robot = jid.load_mjcf(path, base="base")
+        p = jid.robots.urdf_parameters(path, base="base")
+    bodies = jid.rollout.Bodies(jid.Model(robot, (jid.RigidBodies(),)), p)
+    log = jid.read_recording(DATA / "go2" / "chirp.csv", COMMANDS)
+    seen, unseen = log.split(0.7)
+    fit, wall, cpu = seconds(lambda: jid.identify_rollout(seen, bodies))
+    print(fit)
+    print(f"{cpu:.0f} s of the CPU, {wall:.0f} s")
+    for kind in ("simulated", "linear", "command"):
+        print(f"{kind:10s}", (1e3 * fit.validate(unseen).total(kind)).round(1), "mrad")
+    print("windows   ", (1e3 * fit.window_errors(unseen)).round(1), "mrad in 1 s")
+    for name, value in (("a", 1 / GO2_GAIN), ("B", GO2_DAMPING / GO2_GAIN)):
+        ends = [c.interval() for c in fit.combinations if c.name == name]
+        holds = [low <= value <= high for low, high in ends]
+        print(f"{name} = {value:g} in {sum(holds)} of {len(holds)} intervals")
+    kinds: dict[tuple[str, str], list] = {}
+    for c in fit.combinations:
+        kind = fit.joint_names[c.joint].split("_", 1)[1]
+        kinds.setdefault((kind, c.name), []).append(c)
+    agree = []
+    for (_, name), rows in kinds.items():
+        for one, other in itertools.combinations(rows, 2) if name != "b" else ():
+            half = [0.5 * float(np.ptp(c.interval())) for c in (one, other)]
+            agree.append(abs(one.value - other.value) <= np.hypot(*half))
+    print(f"legs agree in {100 * np.mean(agree):.0f} % of {len(agree)} pairs")
+
+
 def band(quick: bool) -> None:
     """Compare motions without encoders, whose rounding is wider than the band."""
     text, count = arm_text(1.0, False), 10 if quick else 100
@@ -461,14 +502,12 @@ def band(quick: bool) -> None:
     print(f"in the mean {np.mean(held):.0f} % (90 wanted)")
 
 
-SAME = {"friction": False, "saturation": False}
-"""Options that leave effects out of our model which the peers are not given."""
 UNKNOWNS = ("J", "B", "d", "F", "b")
 INDEX = {parameter.symbol: k for k, parameter in enumerate(jid.rollout.PARAMETERS)}
-START = np.array([parameter.start for parameter in jid.rollout.PARAMETERS])
-LOWER = np.array([parameter.lower for parameter in jid.rollout.PARAMETERS])
-UPPER = np.array([parameter.upper for parameter in jid.rollout.PARAMETERS])
-SCALE = np.array([parameter.scale for parameter in jid.rollout.PARAMETERS])
+START, LOWER, UPPER, SCALE = (
+    np.array([getattr(parameter, key) for parameter in jid.rollout.PARAMETERS])
+    for key in ("start", "lower", "upper", "scale")
+)
 LIGHT = 0.02
 """Load, relative to the most loaded joint's, below which a stiffness is frozen."""
 STIFF = 'solimpfriction="0.9999 0.9999 0.001"'
@@ -511,8 +550,11 @@ def write(spec, p) -> None:
         setattr(joint, {"J": "armature", "F": "frictionloss"}[p.name], value)
 
 
-def peer_sequences(motion: jid.rollout.ServoMotion, j: int, friction: str) -> list:
+def peer_sequences(
+    simulator: jid.rollout.ServoSimulator, j: int, friction: str
+) -> list:
     """Return a joint's motions for the peer; the second control is the load."""
+    motion = simulator.motion
     text = (
         '<mujoco><option timestep="0.01" gravity="0 0 0" '
         'integrator="implicitfast"/><worldbody>'
@@ -527,10 +569,11 @@ def peer_sequences(motion: jid.rollout.ServoMotion, j: int, friction: str) -> li
     model = spec.compile()
     for k, n in enumerate(motion.lengths):
         t, name = np.arange(n) * float(motion.sample_time[k]), motion.names[k]
-        sent = np.stack([x[k, j, :n] for x in (motion.sent, motion.load)], axis=1)
+        load = sample_loads(simulator)
+        sent = np.stack([x[k, j, :n] for x in (motion.sent, load)], axis=1)
         q = np.array(motion.positions[k, j, :n, None])
         first = peer.create_initial_state(
-            model, q[0], motion.start[k, 1, [j]], np.zeros(0)
+            model, q[0], motion.start[k, j, [1]], np.zeros(0)
         )
         control, sensor = (
             peer.TimeSeries(t, sent),
@@ -540,9 +583,17 @@ def peer_sequences(motion: jid.rollout.ServoMotion, j: int, friction: str) -> li
     return found
 
 
-def peer_fit(motion: jid.rollout.ServoMotion, j: int, friction: str, options: dict):
+def sample_loads(simulator: jid.rollout.ServoSimulator) -> np.ndarray:
+    """Return the bodies' torques at all samples [motions, joints, samples]."""
+    loads = simulator.loads[0][..., :: simulator.steps]
+    return np.concatenate([loads, loads[..., -1:]], axis=-1)
+
+
+def peer_fit(
+    simulator: jid.rollout.ServoSimulator, j: int, friction: str, options: dict
+):
     """Identify a joint by `mujoco.sysid`: our starts and limits, its objective."""
-    p, load = peer.ParameterDict(), np.abs(motion.load).max(axis=(0, 2))
+    p, load = peer.ParameterDict(), np.abs(simulator.loads[0]).max(axis=(0, 2))
     for key in (*UNKNOWNS, "a"):
         start, low, high = (float(x[INDEX[key]]) for x in (START, LOWER, UPPER))
         frozen = key == "a" and not load[j] > LIGHT * load.max()
@@ -550,7 +601,7 @@ def peer_fit(motion: jid.rollout.ServoMotion, j: int, friction: str, options: di
         p.add(peer.Parameter(key, start, low, high, frozen, write))
     late = peer.SignalTransform()
     late.delay("*", p["d"])
-    sequences = peer_sequences(motion, j, friction)
+    sequences = peer_sequences(simulator, j, friction)
     residual = peer.build_residual_fn(
         models_sequences=sequences, modify_residual=late.apply
     )
@@ -558,26 +609,29 @@ def peer_fit(motion: jid.rollout.ServoMotion, j: int, friction: str, options: di
         return peer.optimize(p, residual, verbose=False, **options)[0]
 
 
-def peer_error(p, motion: jid.rollout.ServoMotion, j: int, friction: str) -> float:
-    """Return the peer's free-running RMS error, on the samples that count for us."""
+def peer_error(
+    p, simulator: jid.rollout.ServoSimulator, j: int, friction: str
+) -> float:
+    """Return the peer's free-running RMS error over all samples."""
+    motion = simulator.motion
     function = peer.build_residual_fn(
-        models_sequences=peer_sequences(motion, j, friction)
+        models_sequences=peer_sequences(simulator, j, friction)
     )
     squares = []
     for k, (y,) in enumerate(function(p.as_vector(), p)[1]):
         n = motion.lengths[k]
         t = np.arange(n) * float(motion.sample_time[k]) - p["d"].value[0]
         errors = np.interp(t, y.times, y.data[:, 0]) - motion.positions[k, j, :n]
-        squares.append(errors[motion.counted[k, j, :n] > 0] ** 2)
+        squares.append(errors**2)
     return float(np.sqrt(np.concatenate(squares).mean()))
 
 
-def peer_result(motions, joints: list[int], friction: str, options: dict) -> tuple:
+def peer_result(simulators, joints: list[int], friction: str, options: dict) -> tuple:
     """Return the peer's errors [seen or unseen, joints], and its times."""
     errors, times = [], []
     for j in joints:
-        p, *own = seconds(lambda j=j: peer_fit(motions[0], j, friction, options))
-        errors.append([peer_error(p, x, j, friction) for x in motions])
+        p, *own = seconds(lambda j=j: peer_fit(simulators[0], j, friction, options))
+        errors.append([peer_error(p, x, j, friction) for x in simulators])
         times.append(own)
     return np.array(errors).T, *np.sum(times, axis=0)
 
@@ -599,18 +653,16 @@ def sysid_row(what: str, sets, bodies=None) -> Row:
     """Compare errors and times; the last of the peer's settings decide."""
     jax.clear_caches()
     joints = list(range(5)) if bodies else [0]
-    turns = [
-        seconds(lambda: jid.identify_rollout(sets[0], bodies, **SAME)) for _ in range(2)
-    ]
+    turns = [seconds(lambda: jid.identify_rollout(sets[0], bodies)) for _ in range(2)]
     (_, *cold), (fit, *warm) = turns
     ours = np.array([fit.validate(x).total()[joints] for x in sets])
     motions = [jid.rollout.ServoMotion.of(x) for x in sets]
-    motions = [bodies.loads(x) if bodies else x for x in motions]
+    simulators = [jid.rollout.ServoSimulator(x, bodies=bodies) for x in motions]
     seen, unseen = 1e3 * ours.round(5)
     said = f"ours {unseen} mrad (seen {seen}), {warm[0]:.1f} s (CPU {warm[1]:.1f}), "
     said += f"with compiling {cold[0]:.1f} (CPU {cold[1]:.1f})"
     for name, settings in PEERS.items():
-        errors, wall, cpu = peer_result(motions, joints, *settings)
+        errors, wall, cpu = peer_result(simulators, joints, *settings)
         seen, unseen = 1e3 * errors.round(5)
         said += (
             f"; its, {name}: {unseen} mrad (seen {seen}), {wall:.0f} s (CPU {cpu:.0f}: "
@@ -618,8 +670,8 @@ def sysid_row(what: str, sets, bodies=None) -> Row:
         said += f"{cpu / warm[1]:.1f} times ours, {cpu / cold[1]:.1f} with compiling)"
     recipe = (
         "identified on four motions, free-running on six others; inertia, damping, "
-        f"delay, friction, bias{', stiffness by the weight' if bodies else ''}; its "
-        "start that of our table, ours its 18 starts; its steps 10 ms"
+        f"delay, friction, bias{', stiffness by the weight' if bodies else ''}; ours "
+        "also tries all other effects; its start that of our table; its steps 10 ms"
     )
     holds = bool((ours[1] <= errors[1]).all() and 10 * warm[1] <= cpu)
     asked = "error <= its, time <= 1/10 of its"
@@ -628,27 +680,42 @@ def sysid_row(what: str, sets, bodies=None) -> Row:
     )
 
 
+POPULATION = 8
+"""Candidates of the strategy, which are simulated as joints of one robot."""
+
+
+def population_simulator(logs) -> jid.rollout.ServoSimulator:
+    """Return a simulator of one joint that moves as often as there are candidates."""
+    motion = jid.rollout.ServoMotion.of(logs)
+    fields = ("commands", "positions", "counted", "start", "spread")
+    copies = {
+        name: np.repeat(getattr(motion, name), POPULATION, axis=1) for name in fields
+    }
+    return jid.rollout.ServoSimulator(motion.replace(**copies), 0.01)
+
+
 def evolution(quick: bool) -> list[Row]:
     """Compare joint 2 with CMA-ES: its errors after our time and at its end."""
     if (lacking := timing.missing("cma")) is not None:
         print(lacking)
         return []
     sets = both_sets(quick, [1])
-    motions = [jid.rollout.ServoMotion.of(logs) for logs in sets]
-    simulators = [jid.rollout.ServoSimulator(motion, 0.01) for motion in motions]
+    simulators = [population_simulator(logs) for logs in sets]
+
+    def costs(x: np.ndarray, simulator=simulators[0]) -> np.ndarray:
+        """Return the mean square error of each candidate."""
+        motion = simulator.motion
+        path = simulator.positions(x[:, 0], motion.start)
+        squares = ((path - motion.positions) * motion.counted) ** 2
+        return squares.sum(axis=(0, 2)) / motion.counted[:, 0].sum()
 
     def errors(x: np.ndarray) -> list[float]:
-        sums = [
-            s.costs(x[None, None]).sum() / s.motion.counted.sum() for s in simulators
-        ]
-        return [1e3 * float(np.sqrt(y)) for y in sums]
+        candidates = np.tile(x[None, None], (POPULATION, 1, 1))
+        return [1e3 * float(np.sqrt(costs(candidates, s)[0])) for s in simulators]
 
-    def costs(x):
-        return simulators[0].costs(x).sum(axis=0)
-
-    costs(START[None, None])
+    costs(np.tile(START, (POPULATION, 1, 1)))
     for _ in range(2):  # the first call compiles
-        fit, _, budget = seconds(lambda: jid.identify_rollout(sets[0], **SAME))
+        fit, _, budget = seconds(lambda: jid.identify_rollout(sets[0]))
     ours = 1e3 * float(fit.validate(sets[1]).total()[0])
     runs = [strategy(costs, seed, budget) for seed in range(1, 2 if quick else 6)]
     found = np.median([[errors(x) for x in run[0]] for run in runs], axis=0)
@@ -673,7 +740,7 @@ def strategy(costs, seed: int, budget: float) -> tuple[list[np.ndarray], float]:
 
     index = [INDEX[key] for key in UNKNOWNS]
     ends = [((x - START) / SCALE)[index].tolist() for x in (LOWER, UPPER)]
-    options = {"seed": seed, "verbose": -9, "bounds": ends}
+    options = {"seed": seed, "verbose": -9, "bounds": ends, "popsize": POPULATION}
     search = cma.CMAEvolutionStrategy(np.zeros(len(index)), 0.5, options)
 
     def parameters(z) -> np.ndarray:
@@ -684,7 +751,7 @@ def strategy(costs, seed: int, budget: float) -> tuple[list[np.ndarray], float]:
     start, best = time.process_time(), []
     while not search.stop():
         candidates = search.ask()
-        search.tell(candidates, costs(parameters(candidates))[:, 0].tolist())
+        search.tell(candidates, costs(parameters(candidates)).tolist())
         # The population that ends after the budget still counts.
         if not best and time.process_time() - start > budget:
             best.append(parameters([search.result.xbest])[0, 0])
@@ -699,6 +766,7 @@ BENCHMARKS = (
     gains,
     confounded,
     quadruped,
+    go2,
     band,
     sysid,
     evolution,

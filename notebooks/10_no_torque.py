@@ -134,9 +134,7 @@ slow = 0.03 * t
 log = jid.Recording.of(
     measured(slow)[:, None], slow[:, None], sample_time=0.02, name="slow"
 )
-slow_fit = jid.identify_rollout(
-    log, bodies, friction=False, saturation=False, joint_names=["lift"]
-)
+slow_fit = jid.identify_rollout(log, bodies, joint_names=["lift"])
 print(slow_fit)
 
 # %% [markdown]
