@@ -8,8 +8,8 @@
   same torques, and beside other methods; the same on the four logs, each left out in
   turn, and on those of the fit.
 * coverage: a simulated servo arm of six axes on MuJoCo, 50 Hz, 12 bits; the truth lies
-  in so many of the 95 % intervals, with Stribeck friction and without; in how many draws
-  it warns.
+  in so many of the 95 % intervals, with Stribeck friction and without; in how many
+  draws it warns.
 * gains: the same arm with servos of 1 and 1.6 times the gain.
 * confounded: one joint whose logs tell damping and delay, or armature and gain, only
   together.
