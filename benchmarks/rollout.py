@@ -292,7 +292,7 @@ def drive(
             for _ in range(count if stribeck else 0):
                 v = data.qvel
                 drag = 0.1 + 0.15 * np.exp(-((v / 0.1) ** 2))
-                data.qfrc_applied[:] = -np.tanh(v / 0.005) * drag
+                data.qfrc_applied[:] = -np.tanh(v / 5e-4) * drag
                 mujoco.mj_step(model, data)
             if not stribeck:
                 mujoco.mj_step(model, data, count)
@@ -456,19 +456,29 @@ def go2(quick: bool) -> None:
     for kind in ("simulated", "linear", "command"):
         print(f"{kind:10s}", (1e3 * fit.validate(unseen).total(kind)).round(1), "mrad")
     print("windows   ", (1e3 * fit.window_errors(unseen)).round(1), "mrad in 1 s")
-    for name, value in (("a", 1 / GO2_GAIN), ("B", GO2_DAMPING / GO2_GAIN)):
-        ends = [c.interval() for c in fit.combinations if c.name == name]
-        holds = [low <= value <= high for low, high in ends]
-        print(f"{name} = {value:g} in {sum(holds)} of {len(holds)} intervals")
-    kinds: dict[tuple[str, str], list] = {}
+    for symbol, value in (("a", 1 / GO2_GAIN), ("B", GO2_DAMPING / GO2_GAIN)):
+        # What is merged into the parameter counts with its estimate.
+        x = fit.parameters.copy()
+        x[:, INDEX[symbol]] = value
+        holds = [
+            holds
+            for c, holds in zip(fit.combinations, inside(fit, x), strict=True)
+            if c.name.split()[0] == symbol
+        ]
+        print(f"{symbol} = {value:g} in {sum(holds)} of {len(holds)} intervals")
+    kinds: dict[tuple, list] = {}
     for c in fit.combinations:
         kind = fit.joint_names[c.joint].split("_", 1)[1]
-        kinds.setdefault((kind, c.name), []).append(c)
+        symbols = tuple(np.flatnonzero(c.coefficients[c.joint]))
+        if c.name.split()[0] != "b":
+            kinds.setdefault((kind, *symbols), []).append(c)
     agree = []
-    for (_, name), rows in kinds.items():
-        for one, other in itertools.combinations(rows, 2) if name != "b" else ():
+    for rows in kinds.values():
+        for one, other in itertools.combinations(rows, 2):
             half = [0.5 * float(np.ptp(c.interval())) for c in (one, other)]
-            agree.append(abs(one.value - other.value) <= np.hypot(*half))
+            change = fit.parameters[one.joint] - fit.parameters[other.joint]
+            difference = one.coefficients[one.joint] @ change
+            agree.append(abs(difference) <= np.hypot(*half))
     print(f"legs agree in {100 * np.mean(agree):.0f} % of {len(agree)} pairs")
 
 

@@ -166,6 +166,9 @@ KEYS: dict[str, tuple[str, ...]] = {
 """Names of the keys of each table; tests compare them with the arguments of TABLES."""
 FORMER_KEYS = {
     ("model", "coulomb", "dead_zone"): 0.0,
+    ("rollout", "friction"): True,
+    ("rollout", "saturation"): True,
+    ("rollout", "integral"): False,
     ("rollout", "torque_rows"): False,
     ("excitation", "polish"): 4,
 }

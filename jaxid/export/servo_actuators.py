@@ -7,7 +7,7 @@ import numpy as np
 from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
 from lxml.builder import E  # pyright: ignore[reportMissingModuleSource]
 
-from jaxid.arrays import AnyArray, Joints, Texts
+from jaxid.arrays import AnyArray, Joints
 from jaxid.errors import InputError
 from jaxid.io import FilePath, write_text
 from jaxid.result_table import Column, Remark, Status, Table
@@ -192,16 +192,11 @@ def export_servo_mjcf(
     draws = [fit.parameters, *fit.samples(samples)]
     for file, parameters in zip(paths, draws, strict=True):
         values = simulator_values(fit, parameters)
-        write_text(file, _servo_mjcf(fit.bodies, fit.joint_names, values, timestep))
+        write_text(file, _servo_mjcf(fit.bodies, values, timestep))
     return paths
 
 
-def _servo_mjcf(
-    bodies: Bodies,
-    joint_names: Texts,
-    values: Quantities,
-    timestep: float,
-) -> str:
+def _servo_mjcf(bodies: Bodies, values: Quantities, timestep: float) -> str:
     """Return a robot with position actuators of these values as MJCF."""
     model = bodies.model
     rigid_bodies = body_parameters(model, np.asarray(bodies.parameters))
@@ -218,7 +213,7 @@ def _servo_mjcf(
 
     actuators = root.find("actuator")
     actuators.clear()
-    for k, name in enumerate(joint_names):
+    for k, name in enumerate(model.robot.joint_names):
         actuators.append(_actuator(name, k, values))
     if values["integral_gain"].any():
         root.append(E.extension(E.plugin(plugin="mujoco.pid")))

@@ -36,8 +36,6 @@ MAX_FIGURES = 6
 """Motions whose figures the page shows."""
 MAX_RATIO = 0.9
 """Error of a good simulation, relative to those of the baselines."""
-BASELINES = {"linear": "a linear joint", "command": "the copied command"}
-"""Baselines, in words."""
 NOT_VALIDATED = Remark(
     "The simulation was not validated on an unseen log: use `--verify`",
     Status.DOUBTFUL,
@@ -79,21 +77,21 @@ class RolloutReport:
         if not self.unseen:
             yield NOT_VALIDATED
         names = np.array(self.fit.joint_names)
-        simulation = self.errors.total()
-        is_good = self._is_better_than("linear") & self._is_better_than("command")
-        for kind, words in BASELINES.items():
-            joints = ", ".join(names[~self._is_better_than(kind)])
-            if joints:
-                text = f"The simulation is hardly better than {words}: {joints}"
-                yield Remark(text, Status.DOUBTFUL)
-        if is_good.all():
-            j = int(np.argmax(simulation))
-            error = f"{significant(1e3 * simulation[j])} {milli_units(self.robot)[j]}"
-            yield Remark(
-                "The simulation moves more like the robot than a linear joint does; it "
-                f"errs most at {names[j]}, by {error} RMS",
-                Status.GOOD,
+        errors = 1e3 * self.errors.total()
+        worst_joint = int(np.argmax(errors))
+        unit = milli_units(self.robot)[worst_joint]
+        text = (
+            "The simulation moves more like the robot than a linear joint does; it errs"
+        )
+        error = f"{significant(errors[worst_joint])} {unit} RMS"
+        status = Status.GOOD
+        if not self._is_good.all():
+            joints = ", ".join(names[~self._is_good])
+            text = (
+                f"The simulation is hardly better than a baseline ({joints}); it errs"
             )
+            status = Status.DOUBTFUL
+        yield Remark(f"{text} most at {names[worst_joint]}, by {error}", status)
         combinations = self.fit.combinations
         disagreements = sum(not c.agrees for c in combinations)
         if disagreements:
@@ -103,9 +101,12 @@ class RolloutReport:
                 "are wider, and they are marked !"
             )
 
-    def _is_better_than(self, kind: str) -> np.ndarray:
-        """Return for which joints the simulation is better than a baseline."""
-        return self.errors.total() < MAX_RATIO * self.errors.total(kind)
+    @property
+    def _is_good(self) -> np.ndarray:
+        """For which joints the simulation is better than both baselines."""
+        errors = self.errors
+        baseline = np.minimum(errors.total("linear"), errors.total("command"))
+        return errors.total() < MAX_RATIO * baseline
 
     @property
     def has_stiffness(self) -> bool:
@@ -116,7 +117,6 @@ class RolloutReport:
         """Return the errors beside those of the baselines, and those by motion."""
         errors = self.errors
         units = milli_units(self.robot)
-        is_good = self._is_better_than("linear") & self._is_better_than("command")
         logs = "logs that the fit has not seen" if self.unseen else "logs of the fit"
         comparison = Table(
             f"errors on {logs}, every sample (RMS)",
@@ -126,7 +126,7 @@ class RolloutReport:
             Column("simulation,\nwindows of 1 s", 1e3 * self.windows),
             Column("linear joint\nwith delay", 1e3 * errors.total("linear")),
             Column("copied\ncommand", 1e3 * errors.total("command")),
-            status=[Status.GOOD if x else Status.DOUBTFUL for x in is_good],
+            status=[Status.GOOD if x else Status.DOUBTFUL for x in self._is_good],
         )
         rms = 1e3 * errors.rms()
         columns = map(Column, errors.joint_names, rms.T, units)
@@ -196,12 +196,7 @@ class RolloutReport:
             ("For simulators", [simulators]),
             provenance(self.settings),
         ]
-        logs = ", ".join(dict.fromkeys(self.fit.motions))
-        return render_page(
-            f"{self.robot.name}: joints behind position servos",
-            sections,
-            f"{len(units)} joints, from {logs}.",
-        )
+        return render_page(f"{self.robot.name}: servos of its joints", sections)
 
     def _record(self, rows: list[Record]) -> Record:
         """Return the content of `rollout.json`."""

@@ -20,6 +20,7 @@ angles = "position{}"
 commands = "command{}"
 time = "time"
 [rollout]
+saturation = true
 samples = 2
 alike = []
 """
