@@ -14,7 +14,7 @@ from scipy import special, stats
 
 from jaxid.identification.uncertainty.spectral import sandwich_of_columns
 
-from .joint_fits import SIZE, JointFit
+from .joint_fits import SIZE, JointFit, Pull
 from .motion import JointParameters
 from .servo import INDEX, PARAMETERS, SCALE
 
@@ -141,7 +141,7 @@ def rows_of_joints(fit: JointFit) -> list[JointRows]:
     by_parameters = S[..., :SIZE, :] + np.einsum(
         "mjst,mjsp->mjpt", S[..., SIZE:, :], response
     )
-    pull = fit.pull.precision
+    pull = fit.pull.precision(fit.parameters)
     information = equations.information.sum(axis=0) + pull[..., None] * np.eye(SIZE)
     motion = fit.simulator.motion
     counted = motion.counted.mean(axis=-1)
@@ -218,13 +218,15 @@ def _scatter_of_equal_joints(
     """Return the deviations of parameters between equal joints [joints, parameters].
 
     Of estimates without the pull that makes them alike. Biases are each joint's own.
+    Two joints tell no scatter.
     """
-    no_pull = dataclasses.replace(fit, pull=fit.pull._replace(precision=0.0 * fit.pull.precision))
-    parameters, _ = no_pull.step(np.full(len(fit.parameters), 1e-6))
+    parameters, _ = dataclasses.replace(fit, pull=Pull()).step(
+        np.full(len(fit.parameters), 1e-6)
+    )
     scatter = np.zeros_like(parameters)
     for group in groups:
         members = list(group)
-        if len(members) > 1:
+        if len(members) > 2:
             scatter[members] = np.std(parameters[members], axis=0, ddof=1)
     scatter[:, INDEX["b"]] = 0.0
     return np.where(fit.free, scatter, 0.0)

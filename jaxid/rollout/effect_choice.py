@@ -23,6 +23,8 @@ Tenth of the mean square, a twentieth of the error. Set on a quadruped's chirp.
 """
 MAX_EFFECT_DEVIATION = 0.25
 """Relative deviation of an effect's parameter above which it is not determined."""
+MIN_EFFECT_COST = 1e-2
+"""Relative change of the mean square by an effect below which it does not act."""
 OSCILLATION_DAMPING = 0.5
 """Damping ratio below which a joint oscillates."""
 MIN_LOAD_SHARE = 0.02
@@ -35,6 +37,12 @@ STARTS = [
 ]
 """Inertia, damping and delay from which searches may start."""
 
+REMOVABLE_EFFECTS = (("f",), ("ki",), ("um",), ("mu",), ("Fs", "vs"))
+"""Effects without which a fit is tried in the end."""
+
+SATURATION_SHARES = (0.2, 0.5, 1.0)
+"""Starts of the largest torque, over the usual start."""
+
 Groups = tuple[tuple[int, ...], ...]
 """Indices of the joints of each kind, which are equal as far as the logs tell."""
 
@@ -45,7 +53,7 @@ def parameter_mask(symbols: Sequence[str]) -> np.ndarray:
 
 
 def is_lower(scores: np.ndarray, rivals: np.ndarray, groups: Groups) -> np.ndarray:
-    """Return for which joints scores are lower than rivals by more than their scatter.
+    """Return for which joints scores are clearly lower than those of rivals.
 
     Joints of a kind decide together.
 
@@ -58,7 +66,9 @@ def is_lower(scores: np.ndarray, rivals: np.ndarray, groups: Groups) -> np.ndarr
     for group in groups:
         change = (scores - rivals)[:, list(group)].mean(axis=1)
         scatter = np.std(change, ddof=1) / np.sqrt(len(change)) if len(change) > 1 else 0
-        decisions[list(group)] = change.mean() < -max(MIN_SCORE_GAIN, scatter)
+        # If one motion alone shows the effect, its gain is the whole scatter.
+        limit = max(MIN_SCORE_GAIN, 0.5 * scatter)
+        decisions[list(group)] = change.mean() < -limit
     return decisions
 
 
@@ -99,7 +109,8 @@ class EffectChoice:
         free_mask[is_loaded & ~is_known, INDEX["a"]] = True
         has_new_compliance = is_loaded & ~is_known
         start_parameters[has_new_compliance, INDEX["a"]] = 0.02 / load[has_new_compliance]
-        starts = _best_starts(simulator, start_parameters, count=2)
+        grid = [(start_parameters, values) for values in STARTS]
+        starts = _best_starts(simulator, grid, count=2)
         fits = []
         for parameters in starts:
             advance()
@@ -116,6 +127,7 @@ class EffectChoice:
 
     def choose_all(self) -> None:
         """Choose all effects."""
+        self.choose_saturation()
         self.choose(("f",), ("ki",))
         self.choose(("b",))
         self.choose(("mu",), ("Fs", "vs"), ("mu", "Fs", "vs"))
@@ -135,6 +147,30 @@ class EffectChoice:
             choice = is_lower(trial.held_out_scores, best_fit.held_out_scores, self.groups)
             best_fit = best_fit.mixed_with(trial, choice)
         self.fit = best_fit.weighed_by_errors()
+
+    def choose_saturation(self) -> None:
+        """Add a largest torque that lowers held-out errors, from many starts.
+
+        A servo that often saturates has no good fit without it to begin with.
+        """
+        self.advance()
+        fit = self.fit
+        k = INDEX["um"]
+        start_parameters = fit.parameters.copy()
+        lag = self._start_values("um")
+        grid = []
+        for share in SATURATION_SHARES:
+            parameters = start_parameters.copy()
+            parameters[:, k] = share * lag
+            grid += [(parameters, values) for values in STARTS]
+        (best_start,) = _best_starts(fit.simulator, grid, count=1)
+        free_mask = fit.free.copy()
+        free_mask[:, k] = True
+        trial = JointFit.of(
+            fit.simulator, best_start, free_mask, start=fit.start, weights=fit.weights
+        ).improved(8)
+        choice = is_lower(trial.held_out_scores, fit.held_out_scores, self.groups)
+        self.fit = fit.mixed_with(trial, choice).weighed_by_errors()
 
     def with_effects(self, effects: tuple[str, ...]) -> JointFit:
         """Return the fit with further effects."""
@@ -204,6 +240,9 @@ def undetermined_effects(fit: JointFit) -> FreeParameters:
         scatter = motions / max(motions - 1, 1) * (changes**2).sum(axis=0)
         values = np.abs(fit.parameters[j, symbols])
         is_uncertain = np.sqrt(scatter) > MAX_EFFECT_DEVIATION * values
+        # An effect that never acts has no information, and no scatter either.
+        own_information = np.diag(information[j])[symbols]
+        is_uncertain |= own_information * values**2 < MIN_EFFECT_COST
         is_limit = (values >= UPPER[symbols]) | (values <= LOWER[symbols])
         undetermined[j, symbols] = is_uncertain | is_limit
     effects = parameter_mask(("mu", "Fs", "vs", "um", "ki", "f"))
@@ -212,6 +251,20 @@ def undetermined_effects(fit: JointFit) -> FreeParameters:
     pair = [INDEX["Fs"], INDEX["vs"]]
     undetermined[:, pair] |= undetermined[:, pair].any(axis=1, keepdims=True)
     return undetermined & fit.free
+
+
+def without_idle_effects(fit: JointFit, groups: Groups) -> JointFit:
+    """Return the fit without effects that do not lower held-out errors.
+
+    An effect that was chosen early may imitate one that was chosen later.
+    """
+    for effects in REMOVABLE_EFFECTS:
+        mask = fit.free & parameter_mask(effects)
+        if mask.any():
+            trial = without_effects(fit, mask).improved(4)
+            needs_effect = is_lower(fit.held_out_scores, trial.held_out_scores, groups)
+            fit = fit.mixed_with(trial, ~needs_effect & mask.any(axis=1))
+    return fit
 
 
 def without_effects(fit: JointFit, effects: FreeParameters) -> JointFit:
@@ -227,24 +280,32 @@ def without_effects(fit: JointFit, effects: FreeParameters) -> JointFit:
 
 
 def _best_starts(
-    simulator: ServoSimulator, start_parameters: JointParameters, count: int
+    simulator: ServoSimulator,
+    grid: Sequence[tuple[JointParameters, tuple[float, float, float]]],
+    count: int,
 ) -> list[JointParameters]:
-    """Return the parameters of least error for each joint, from a grid."""
+    """Return the parameters of least error for each joint.
+
+    Args:
+        simulator: Motions.
+        grid: Parameters, and inertia, damping and delay in their place.
+        count: Number of starts.
+    """
     columns = [INDEX[symbol] for symbol in ("J", "B", "d")]
     motion = simulator.motion
-    grid = []
+    starts = []
     costs = []
-    for values in STARTS:
+    for start_parameters, values in grid:
         parameters = start_parameters.copy()
         parameters[:, columns] = values
         path = simulator.positions(parameters, motion.start)
         errors = (path - motion.positions) * motion.counted
         squares = np.sum(errors**2, axis=-1) / motion.sample_counts
-        grid.append(parameters)
+        starts.append(parameters)
         costs.append(np.nan_to_num(squares.sum(axis=0), nan=np.inf))
     order = np.argsort(np.array(costs), axis=0)
-    joints = np.arange(len(start_parameters))
-    return [np.array(grid)[order[k], joints] for k in range(count)]
+    joints = np.arange(len(starts[0]))
+    return [np.array(starts)[order[k], joints] for k in range(count)]
 
 
 def _calm_choice(first: JointFit, second: JointFit, groups: Groups) -> JointFit:

@@ -4,16 +4,13 @@ Their parameters are pulled towards the mean of their kind, as strongly as it lo
 errors of motions that the fit has not seen.
 """
 
+import dataclasses
 import re
 from collections.abc import Sequence
 
-import numpy as np
-
 from jaxid.errors import InputError
 
-from .joint_fits import SIZE, JointFit, Pull
-from .motion import JointParameters
-from .servo import INDEX, SCALE
+from .joint_fits import JointFit, Pull
 
 SIDES = frozenset(
     "l r left right fl fr rl rr hl hr bl br lf rf lh rh lb rb front rear hind back".split()
@@ -21,8 +18,8 @@ SIDES = frozenset(
 """Words of joint names that tell a side, and not the kind of a joint."""
 SCATTERS = (0.3, 0.1, 0.03, 0.01)
 """Relative scatters of equal joints' parameters that are tried."""
-PULL_ROUNDS = 3
-"""Times that means follow the parameters."""
+PULL_STEPS = 5
+"""Steps of each fit with a pull."""
 
 
 def joint_groups(
@@ -75,47 +72,16 @@ def _kind_of(name: str) -> str:
 
 def pull_equal_joints(fit: JointFit, groups: Sequence[Sequence[int]]) -> JointFit:
     """Return the fit with the pull between equal joints that held-out motions prefer."""
-    is_equal = np.zeros(len(fit.parameters), bool)
-    for group in groups:
-        is_equal[list(group)] = len(group) > 1
-    best_fit = fit
-    if not is_equal.any():
+    equal_joints = [j for group in groups if len(group) > 1 for j in group]
+    if not equal_joints:
         return fit
-    best_score = fit.held_out_scores[:, is_equal].mean()
+    best_fit = fit
     for scatter in SCATTERS:
-        trial = best_fit
-        for _ in range(PULL_ROUNDS):
-            pull = pull_of(trial.parameters, groups, scatter)
-            trial = _with_pull(trial, pull).improved(2)
-        score = trial.held_out_scores[:, is_equal].mean()
-        if score > best_score:
+        trial = dataclasses.replace(best_fit, pull=Pull(groups, scatter))
+        # Means follow the parameters.
+        trial = trial.improved(PULL_STEPS)
+        scores = [x.held_out_scores[:, equal_joints].mean() for x in (trial, best_fit)]
+        if scores[0] > scores[1]:
             break
         best_fit = trial
-        best_score = score
     return best_fit
-
-
-def _with_pull(fit: JointFit, pull: Pull) -> JointFit:
-    import dataclasses
-
-    return dataclasses.replace(fit, pull=pull)
-
-
-def pull_of(
-    parameters: JointParameters, groups: Sequence[Sequence[int]], scatter: float
-) -> Pull:
-    """Return the pull to the means of equal joints, of a relative scatter.
-
-    Biases are their own: they are of the assembly, and mirrored joints turn them around.
-    """
-    target = np.zeros_like(parameters)
-    precision = np.zeros((len(parameters), SIZE))
-    for group in groups:
-        members = list(group)
-        if len(members) > 1:
-            mean = parameters[members].mean(axis=0)
-            target[members] = mean
-            deviation = scatter * np.maximum(np.abs(mean), 0.1 * SCALE)
-            precision[members] = 1.0 / deviation**2
-    precision[:, INDEX["b"]] = 0.0
-    return Pull(target, precision)

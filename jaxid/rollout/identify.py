@@ -22,6 +22,7 @@ from .effect_choice import (
     parameter_mask,
     undetermined_effects,
     without_effects,
+    without_idle_effects,
 )
 from .equal_joints import joint_groups, pull_equal_joints
 from .joint_fits import RESOLUTION, JointFit
@@ -36,6 +37,10 @@ MAX_ROUNDS = 8
 """Largest number of rounds of the refinement."""
 CHOICE_ROUNDS = 3
 """Rounds after which held and interpolated commands are compared."""
+MAX_STEP_ERROR = 0.02
+"""Error of the steps, relative to the errors of the fit, above which they are halved."""
+MAX_HALVINGS = 3
+"""Largest number of times that steps are halved."""
 FIT_COUNT = 15
 """Number of fits, for the progress."""
 
@@ -105,6 +110,12 @@ def identify_rollout(
     simulator = ServoSimulator(motion, search_step, bodies=bodies)
     choice = EffectChoice.start(simulator, groups, known_compliance, advance)
     linear_parameters = _linear_baseline(choice.fit)
+    # Held commands that count as interpolated ones would imitate a feed-forward.
+    fine_fit, _ = _with_better_commands(choice.with_effects(("f",)), time_step)
+    if fine_fit.simulator.hold:
+        held_simulator = dataclasses.replace(simulator, hold=True)
+        held_fit = _with_simulator(choice.fit, held_simulator, choice.fit.parameters)
+        choice.fit = held_fit.improved(6).weighed_by_errors()
     choice.choose_all()
     fit = choice.fit
     if bodies is not None and not bodies.coupled:
@@ -113,10 +124,15 @@ def identify_rollout(
 
     if progress is not None:
         progress("refining", 0.0)
-    fit, hold_is_told = _refine(fit, time_step)
+    fit, hold_is_told = _with_better_commands(fit, time_step)
+    fit = _descend(without_idle_effects(fit, groups))
     undetermined = undetermined_effects(fit)
     if undetermined.any():
         fit = _descend(without_effects(fit, undetermined))
+    fine_fit = _in_short_enough_steps(fit)
+    if fine_fit is not fit:
+        fine_step = fine_fit.simulator.time_step
+        fit, hold_is_told = _with_better_commands(fine_fit, fine_step)
     return ServoFit.of(
         fit,
         linear_parameters,
@@ -158,32 +174,51 @@ def _with_better_bodies(fit: JointFit) -> JointFit:
     return trial.weighed_by_errors() if is_better else fit
 
 
-def _refine(fit: JointFit, time_step: float) -> tuple[JointFit, bool]:
-    """Return the fit in short steps, along the loads of its own simulation.
+def _in_steps(fit: JointFit, time_step: float) -> JointFit:
+    """Return the fit with other steps, along the loads of measured positions."""
+    simulator = dataclasses.replace(fit.simulator, time_step=time_step, path=None)
+    return _with_simulator(fit, simulator, fit.parameters)
+
+
+def _with_simulator(
+    fit: JointFit, simulator: ServoSimulator, parameters: JointParameters
+) -> JointFit:
+    """Return the fit in another simulator, with other parameters."""
+    return JointFit.of(
+        simulator,
+        parameters,
+        fit.free,
+        start=fit.start,
+        weights=fit.weights,
+        pull=fit.pull,
+    )
+
+
+def _with_better_commands(fit: JointFit, time_step: float) -> tuple[JointFit, bool]:
+    """Return the fit in short steps, with held or interpolated commands.
 
     Returns:
-        The fit with the better commands, and whether the logs tell if commands are held
-        or interpolated.
+        The better fit, and whether the logs tell it.
     """
-    simulator = dataclasses.replace(fit.simulator, time_step=time_step)
-    held_parameters = fit.parameters.copy()
+    fit = _in_steps(fit, time_step)
+    simulator = fit.simulator
     half_sample = 0.5 * float(simulator.motion.sample_time.mean())
-    delays = held_parameters[:, INDEX["d"]] - half_sample
-    held_parameters[:, INDEX["d"]] = np.maximum(delays, 0.0)
-    fits = []
-    for hold, parameters in ((False, fit.parameters), (True, held_parameters)):
-        start_fit = JointFit.of(
-            dataclasses.replace(simulator, hold=hold),
-            parameters,
-            fit.free,
-            start=fit.start,
-            weights=fit.weights,
-            pull=fit.pull,
-        )
-        fits.append(_descend(start_fit, CHOICE_ROUNDS))
-    scores = [_score(x) for x in fits]
-    best_fit = _descend(fits[int(np.argmin(scores))])
-    return best_fit, abs(scores[0] - scores[1]) > MIN_FALL
+    # Held commands are half a sample late.
+    change = half_sample if simulator.hold else -half_sample
+    parameters = fit.parameters.copy()
+    delays = parameters[:, INDEX["d"]] + change
+    parameters[:, INDEX["d"]] = np.maximum(delays, 0.0)
+    rival_simulator = dataclasses.replace(simulator, hold=not simulator.hold)
+    rival = _with_simulator(fit, rival_simulator, parameters)
+    rivals = [rival]
+    feed_forward = rival.free & parameter_mask(("f",))
+    if feed_forward.any():
+        # A feed-forward may imitate the commands that are not tried.
+        rivals.append(without_effects(rival, feed_forward))
+    fit = _descend(fit, CHOICE_ROUNDS)
+    rival = min((_descend(x, CHOICE_ROUNDS) for x in rivals), key=_score)
+    gain = _score(fit) - _score(rival)
+    return rival if gain > 0.0 else fit, abs(gain) > MIN_FALL
 
 
 def _descend(fit: JointFit, rounds: int = MAX_ROUNDS) -> JointFit:
@@ -193,6 +228,26 @@ def _descend(fit: JointFit, rounds: int = MAX_ROUNDS) -> JointFit:
         fit = fit.along_simulation().weighed_by_errors().improved(2)
         if abs(previous_score - _score(fit)) < MIN_FALL:
             break
+    return fit
+
+
+def _in_short_enough_steps(fit: JointFit) -> JointFit:
+    """Return the fit in steps so short that they change positions by less than noise.
+
+    The errors of long steps hide in those of real robots, not in those of exact models.
+    """
+    for _ in range(MAX_HALVINGS):
+        simulator = fit.simulator
+        half_step = 0.5 * float(simulator.motion.sample_time.max()) / simulator.steps
+        fine_simulator = dataclasses.replace(
+            simulator, time_step=half_step, path=None
+        ).with_loads_of(fit.parameters, fit.start)
+        paths = [x.positions(fit.parameters, fit.start) for x in (simulator, fine_simulator)]
+        changes = (paths[1] - paths[0]) * simulator.motion.counted
+        mean_changes = np.sum(changes**2, axis=-1) / simulator.motion.sample_counts
+        if (mean_changes < MAX_STEP_ERROR**2 * fit.mean_squares).all():
+            break
+        fit = _descend(_with_simulator(fit, fine_simulator, fit.parameters), 1)
     return fit
 
 

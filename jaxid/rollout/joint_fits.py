@@ -5,6 +5,7 @@ the normal equations of each motion.
 """
 
 import dataclasses
+from collections.abc import Sequence
 from functools import cached_property
 from typing import NamedTuple
 
@@ -13,7 +14,7 @@ import numpy as np
 from jaxid.arrays import Matrix
 
 from .motion import FreeParameters, JointParameters
-from .servo import INDEX, LOWER, UPPER
+from .servo import INDEX, LOWER, SCALE, UPPER
 from .simulation import Moments, ServoSimulator
 
 RESOLUTION = 1e-4
@@ -27,20 +28,38 @@ SIZE = len(INDEX)
 
 
 class Pull(NamedTuple):
-    """Pull of the parameters towards others, like the mean of equal joints.
+    """Pull between joints of a kind, which are nearly equal.
+
+    Biases are left alone: they are of the assembly, and mirrored joints turn them
+    around.
 
     Attributes:
-        target: Parameters to which it pulls.
-        precision: Inverse variances, in the units of the mean cost of a motion.
+        groups: Indices of the joints of each kind.
+        scatter: Relative scatter of their parameters; infinite without any pull.
     """
 
-    target: JointParameters
-    precision: JointParameters
+    groups: Sequence[Sequence[int]] = ()
+    scatter: float = np.inf
 
-    @classmethod
-    def none(cls, joints: int) -> "Pull":
-        """Return no pull."""
-        return cls(np.zeros((joints, SIZE)), np.zeros((joints, SIZE)))
+    def target(self, parameters: JointParameters) -> JointParameters:
+        """Return the means of the parameters over each kind."""
+        target = parameters.copy()
+        for group in self.groups:
+            members = list(group)
+            target[members] = parameters[members].mean(axis=0)
+        return target
+
+    def precision(self, parameters: JointParameters) -> JointParameters:
+        """Return inverse variances, in the units of the mean cost of a motion."""
+        precision = np.zeros_like(parameters)
+        for group in self.groups:
+            members = list(group)
+            if len(members) > 1:
+                mean = np.abs(parameters[members].mean(axis=0))
+                deviation = self.scatter * np.maximum(mean, 0.1 * SCALE)
+                precision[members] = 1.0 / deviation**2
+        precision[:, INDEX["b"]] = 0.0
+        return precision
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,7 +102,7 @@ class JointFit:
         motion = simulator.motion
         start = motion.start if start is None else start
         weights = 1.0 / motion.sample_counts if weights is None else weights
-        pull = Pull.none(len(parameters)) if pull is None else pull
+        pull = Pull() if pull is None else pull
         moments = simulator.moments(parameters, start)
         return cls(simulator, parameters, free, start, weights, pull, moments)
 
@@ -133,8 +152,9 @@ class JointFit:
         states = self.start - self.simulator.motion.start
         state_costs = np.sum(self.certainty * states**2, axis=-1)
         errors = self.weights * self.moments.cost
-        changes = self.parameters - self.pull.target
-        pull_costs = np.sum(self.pull.precision * changes**2, axis=-1)
+        changes = self.parameters - self.pull.target(self.parameters)
+        precision = self.pull.precision(self.parameters)
+        pull_costs = np.sum(precision * changes**2, axis=-1)
         cost = (errors + state_costs).sum(axis=0) + pull_costs
         return np.where(np.isfinite(cost), cost, np.inf)
 
@@ -171,10 +191,10 @@ class JointFit:
         self, gradient: np.ndarray, information: np.ndarray, damping: np.ndarray
     ) -> np.ndarray:
         """Return damped Gauss-Newton steps of free parameters within their limits."""
-        pull = self.pull
         x = np.broadcast_to(self.parameters, gradient.shape)
-        gradient = gradient + pull.precision * (x - pull.target)
-        information = information + pull.precision[..., None] * np.eye(SIZE)
+        precision = self.pull.precision(self.parameters)
+        gradient = gradient + precision * (x - self.pull.target(self.parameters))
+        information = information + precision[..., None] * np.eye(SIZE)
         diagonal = np.diagonal(information, axis1=-2, axis2=-1)
         scale = np.sqrt(np.maximum(diagonal, 1e-300))
         is_moving = self.free & (diagonal > 1e-280)

@@ -238,15 +238,22 @@ class ServoFit:
         ]
         windows = motion.parts(places)
         starts = []
-        for k, a, _ in places:
+        simulated_paths = []
+        for k, a, end in places:
             rows = simulation.states.q[k][:, :: simulation.steps]
             n = motion.lengths[k]
             errors = motion.positions[k][:, :n] - rows[:, :n]
             change = local_state(errors, a, float(motion.sample_time[k])).state
-            state = [x[k][:, a * simulation.steps] for x in simulation.states]
+            first = a * simulation.steps
+            last = (end - 1) * simulation.steps
+            state = [x[k][:, first] for x in simulation.states]
             starts.append(np.stack(state, axis=-1) + change)
+            simulated_paths.append(simulation.states.q[k][:, first : last + 1])
         start = np.stack(starts)
-        simulator = ServoSimulator(windows, self.time_step, self.hold, self.bodies)
+        path = np.stack(simulated_paths)
+        simulator = ServoSimulator(
+            windows, self.time_step, self.hold, self.bodies, path
+        )
         simulator = simulator.in_agreement(self.parameters, start)
         paths = simulator.positions(self.parameters, start)
         squares = ((paths - windows.positions) * windows.counted) ** 2
@@ -331,7 +338,8 @@ def _notes_on_effects(
     notes = []
     for k, parameter in enumerate(PARAMETERS):
         joints = [joint_names[j] for j in np.flatnonzero(undetermined[:, k])]
-        if joints:
+        # Stribeck friction and its speed are one effect.
+        if joints and parameter.symbol != "vs":
             notes.append(
                 f"{parameter.meaning} is possible on {', '.join(joints)}, but the logs "
                 "do not determine it: it is left out; record motions that show it"

@@ -78,17 +78,19 @@ class DelayedCommand(NamedTuple):
 
     Attributes:
         value: Command.
-        rate: First derivative by time [1/s].
-        bend: Second derivative by time, from samples beside each other [1/s²].
+        slope: Its derivative by time [1/s].
+        rate: Mean derivative by time over the step [1/s].
+        bend: Derivative of `rate` by time [1/s²].
     """
 
     value: Array
+    slope: Array
     rate: Array
     bend: Array
 
     def at(self, lateness: Array) -> tuple[Array, Array]:
         """Return command and rate if they come later by a small time [s]."""
-        return self.value - self.rate * lateness, self.rate - self.bend * lateness
+        return self.value - self.slope * lateness, self.rate - self.bend * lateness
 
 
 def delayed_command(
@@ -115,10 +117,7 @@ def delayed_command(
 
     length = jnp.diff(ends)
     stage_ends = jnp.stack([ends[:-1] + GAMMA * length, ends[1:]], axis=1).ravel()
-    slopes = jnp.append(jnp.diff(commands), 0.0)
-    bends = jnp.gradient(jnp.gradient(commands))
-    inside = jnp.clip(stage_ends, 0.0, last_index)
-    rate = jnp.where(inside == stage_ends, slopes[inside.astype(int)], 0.0)
+    indices = jnp.clip(jnp.floor(ends), 0.0, last_index).astype(int)
 
     # Held commands: means are differences of the integral, whose ends are exact.
     integral = jnp.concatenate([jnp.zeros(1), jnp.cumsum(commands[:-1])])
@@ -126,13 +125,27 @@ def delayed_command(
     last_piece = jnp.maximum(ends - last_index, 0.0) * commands[-1]
     sums = interpolate(integral, ends) + first_piece + last_piece
     mean = jnp.diff(sums) / length
-    indices = jnp.clip(jnp.floor(ends), 0.0, last_index).astype(int)
     held_rate = jnp.diff(commands[indices]) / length
 
+    # Rates are means over the step, too, so that the impulse of a jump is exact.
+    slopes = jnp.append(jnp.diff(commands), 0.0)
+
+    def slope_at(instants: Array) -> Array:
+        inside = jnp.clip(instants, 0.0, last_index)
+        return jnp.where(inside == instants, slopes[inside.astype(int)], 0.0)
+
+    mean_rate = jnp.diff(interpolate(commands, ends)) / length
+    mean_bend = jnp.diff(slope_at(ends)) / length
+    # Held commands jump: their derivatives are those of neighbours.
+    held_bend = interpolate(jnp.gradient(jnp.gradient(commands)), ends[1:])
+
     value = jnp.where(hold, jnp.repeat(mean, 2), interpolate(commands, stage_ends))
-    rate = jnp.where(hold, jnp.repeat(held_rate, 2), rate)
-    bend = interpolate(bends, stage_ends)
-    return DelayedCommand(value, rate / sample_time, bend / sample_time**2)
+    slope = jnp.where(hold, jnp.repeat(held_rate, 2), slope_at(stage_ends))
+    rate = jnp.repeat(jnp.where(hold, held_rate, mean_rate), 2)
+    bend = jnp.repeat(jnp.where(hold, held_bend, mean_bend), 2)
+    return DelayedCommand(
+        value, slope / sample_time, rate / sample_time, bend / sample_time**2
+    )
 
 
 def _path(
