@@ -122,7 +122,8 @@ right.legend()
 plt.show()
 
 # %% [markdown]
-# The error is the rounding of the encoder, 0.44 mrad. A linear joint cannot stick and does not sag.
+# Behind the first half second the error is the rounding of the encoder, 0.44 mrad: every sample counts, also those in which the arm sags from a state that no
+# log tells. A linear joint cannot stick and does not sag.
 #
 # ## What a log does not tell
 #

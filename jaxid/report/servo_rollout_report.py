@@ -36,6 +36,11 @@ MAX_FIGURES = 6
 """Motions whose figures the page shows."""
 MAX_RATIO = 0.9
 """Error of a good simulation, relative to those of the baselines."""
+RATIOS = (
+    "Positions tell torques only in units of the servo's stiffness. Parameters that "
+    "the logs tell only together are merged"
+)
+"""How the table of parameters is read."""
 NOT_VALIDATED = Remark(
     "The simulation was not validated on an unseen log: use `--verify`",
     Status.DOUBTFUL,
@@ -136,11 +141,8 @@ class RolloutReport:
     def result_tables(self) -> list[Table]:
         """Return what the logs determine, and the numbers for simulators."""
         parameters = self.fit.summary()
-        # What is judged is not said twice.
-        sentences = {finding.text for finding in self.judgement.findings}
-        parameters.remarks = tuple(
-            remark for remark in parameters.remarks if remark.text not in sentences
-        )
+        # Its notes are findings.
+        parameters.remarks = (Remark(RATIOS),)
         if not self.has_stiffness:
             text = "No weight tells a stiffness: name it by `rollout.stiffness`."
             return [parameters, Table("", remarks=[text])]
@@ -171,10 +173,6 @@ class RolloutReport:
     def _page(self) -> str:
         """Return the page as HTML."""
         errors = self.errors
-        text = (
-            "Positions tell torques only in units of the servo's stiffness. Parameters "
-            "that the logs tell only together are merged."
-        )
         parameters, simulators = self.result_tables()
         units = milli_units(self.robot)
         motions = range(min(MAX_FIGURES, len(errors.motions)))
@@ -192,7 +190,7 @@ class RolloutReport:
             ("At a glance", glance(self.judgement)),
             ("Errors", self.error_tables()),
             ("Measured and simulated motion", [scene, *figures]),
-            ("What the logs determine", [text, parameters]),
+            ("What the logs determine", [parameters]),
             ("For simulators", [simulators]),
             provenance(self.settings),
         ]
