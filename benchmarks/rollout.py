@@ -65,7 +65,6 @@ UNSEEN = (
 )
 COMMANDS = jid.Columns(time="time", angles="position{}", forces="command{}")
 STEP, ENCODER = 0.00005, 2 * np.pi / 4096
-FINE = {"time_step": 0.0025}
 GO2_GAIN, GO2_DAMPING = 20.0, 1.5
 
 
@@ -347,7 +346,7 @@ def coverage(quick: bool) -> None:
         hits, warned, start = [], 0, time.time()
         for seed in range(draws):
             logs = arm_logs(seed, stribeck=stribeck)
-            fit = jid.identify_rollout(logs, bodies, **FINE)
+            fit = jid.identify_rollout(logs, bodies)
             hits += inside(fit, truth(1.0, stribeck))
             warned += bool(fit.notes)
         print(
@@ -363,7 +362,7 @@ def gains(quick: bool) -> None:
     agree, bodies = [], arm_bodies(arm_text(1.0, False))
     for seed in range(1 if quick else 8):
         one, other = (
-            jid.identify_rollout(arm_logs(seed, g), bodies, **FINE) for g in (1.0, 1.6)
+            jid.identify_rollout(arm_logs(seed, g), bodies) for g in (1.0, 1.6)
         )
         second = {(c.joint, c.name): c for c in other.combinations}
         for c in one.combinations:
@@ -391,7 +390,7 @@ def confounded(quick: bool) -> None:
                     sent = commanded(10 * seed + k, 1, 10.0, 50.0)
                 log = jid.Recording.of(drive(model, sent, 50.0), sent, sample_time=0.02)
                 logs.append(log.crop(2.0, 10.0))
-            fit = jid.identify_rollout(logs, bodies if second == "a" else None, **FINE)
+            fit = jid.identify_rollout(logs, bodies if second == "a" else None)
             x = truth(1.0)[:1]
             x[:, [p.symbol for p in jid.rollout.PARAMETERS].index("d")] += (
                 0.0 if fit.hold else 0.01
@@ -489,7 +488,7 @@ def band(quick: bool) -> None:
     true = drive(mujoco.MjModel.from_xml_string(text), sent, 50.0, rounding=1e-12)
     held = []
     for seed in range(1 if quick else 8):
-        fit = jid.identify_rollout(arm_logs(seed), bodies, **FINE)
+        fit = jid.identify_rollout(arm_logs(seed), bodies)
         options = {"samples": count, "timestep": STEP}
         with tempfile.TemporaryDirectory() as folder:
             files = jid.export.export_servo_mjcf(

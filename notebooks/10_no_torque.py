@@ -128,7 +128,7 @@ plt.show()
 # ## What a log does not tell
 #
 # A slow ramp in one direction leaves the joint behind its command by delay and by dry friction, and no one can say which. The fit does not split them
-# arbitrarily: it reports what the log tells only together. Inertia and damping show in the first instants, in which the arm sags.
+# arbitrarily: it reports what the log tells only together. Inertia and damping hardly show: the arm never accelerates.
 
 # %%
 slow = 0.03 * t
