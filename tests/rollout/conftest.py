@@ -10,6 +10,4 @@ import jaxid as jid
 @pytest.fixture(scope="session")
 def fit():
     logs = [servo_arm.log(seed) for seed in range(4)]
-    return jid.identify_rollout(
-        logs, servo_arm.bodies(False), friction=False, saturation=False
-    )
+    return jid.identify_rollout(logs, servo_arm.bodies(False))

@@ -31,19 +31,16 @@ XML = """<mujoco><compiler angle="radian"/>
 </actuator></mujoco>"""
 
 
-def model_text(stiffer=1.0, step=0.001, friction=FRICTION, ki=0.0, limit=1e3):
+def model_text(step=0.001, ki=0.0, limit=1e3):
     """Return the arm as MJCF; `ki` is the integral gain over the stiffness."""
-    gains = tuple(stiffer * k for k in KP)
-    integral = tuple(ki * k for k in gains)
-    soft = 2.0 * step
     return XML.format(
         step=step,
-        soft=soft,
+        soft=2.0 * step,
         I=ARMATURE,
         D=DAMPING,
-        F=friction,
-        K=gains,
-        Ki=integral,
+        F=FRICTION,
+        K=KP,
+        Ki=tuple(ki * k for k in KP),
         n=int(ki > 0.0),
         u=limit,
         c=CENTRE,
@@ -72,7 +69,7 @@ def bodies(coupled=True):
     return jid.rollout.Bodies(model, np.array([*turn, *lift]), coupled)
 
 
-def commands(seed, duration=40.0, rate=50.0):
+def commands(seed, duration, rate=50.0):
     """Return sums of sines, with rests between them [samples, joints]."""
     random, t = np.random.default_rng(seed), np.arange(round(duration * rate)) / rate
     q = np.zeros((len(t), 2))
@@ -82,7 +79,7 @@ def commands(seed, duration=40.0, rate=50.0):
                 0.25 / (1 + 2 * f) * np.sin(2 * np.pi * (f * t + random.uniform()))
             )
     envelope = np.clip(np.minimum(t, 2.0) / 2.0, 0.0, 1.0)[:, None]
-    held = (t % 12.0) > 10.0
+    held = (t % 6.0) > 5.0
     for k in np.flatnonzero(held):
         q[k] = q[k - 1]
     return envelope * q
@@ -91,26 +88,49 @@ def commands(seed, duration=40.0, rate=50.0):
 @functools.cache
 def log(
     seed=0,
-    stiffer=1.0,
-    duration=40.0,
+    duration=8.0,
     step=0.001,
-    friction=FRICTION,
     block=None,
     rounding=ENCODER,
     ki=0.0,
     limit=1e3,
+    feed=None,
 ):
-    """Return a log of 50 Hz; commands are held until the next and reach servos late."""
-    model = mujoco.MjModel.from_xml_string(
-        model_text(stiffer, step, friction, ki, limit)
-    )
-    data, sent = mujoco.MjData(model), commands(seed, duration)
-    every, late, measured = round(0.02 / step), round(DELAY / step), np.zeros_like(sent)
-    data.qpos[:] = sent[0]
-    for k in range(every * len(sent)):
-        if k % every == 0:
-            measured[k // every] = data.qpos
-        data.ctrl[:] = sent[max(0, (k - late) // every)]
+    """Return a log of 50 Hz; commands are held until the next and reach servos late.
+
+    Args:
+        seed: Seed of the commands.
+        duration: Length [s].
+        step: Step of MuJoCo [s].
+        block: Angle of the second joint above which a table holds it [rad].
+        rounding: Step of the encoders [rad].
+        ki: Integral gain over the stiffness [1/s].
+        limit: Largest torque of the servos [N m].
+        feed: Torque for each rad/s of the commands, which are then interpolated; none
+            without [N m s/rad].
+    """
+    model = mujoco.MjModel.from_xml_string(model_text(step, ki, limit))
+    data = mujoco.MjData(model)
+    sent = commands(seed, duration)
+    stride = round(0.02 / step)
+    measured = np.zeros_like(sent)
+    if ki > 0.0:
+        # Integral action carries the weight from the beginning.
+        mujoco.mj_forward(model, data)
+        data.act[:] = data.qfrc_bias / (ki * np.array(KP))
+    # The first command is zero, where the servos have settled before the log begins.
+    mujoco.mj_step(model, data, round(1.0 / step))
+    for k in range(stride * len(sent)):
+        if k % stride == 0:
+            measured[k // stride] = data.qpos
+        samples = max(0.0, (k - round(DELAY / step)) / stride)
+        index = int(samples)
+        command = sent[index]
+        if feed is not None:
+            slope = sent[min(index + 1, len(sent) - 1)] - command
+            command = command + (samples - index) * slope
+            data.qfrc_applied[:] = feed * slope / 0.02
+        data.ctrl[:] = command
         if block is not None:
             # A stiff one-sided spring stands in for a table.
             data.qfrc_applied[1] = min(0.0, 400.0 * (block - data.qpos[1]))
