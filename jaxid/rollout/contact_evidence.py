@@ -37,7 +37,7 @@ class ContactThresholds(NamedTuple):
 
     unexplained: float = 0.85
     flatness: float = 0.4
-    errors_elsewhere: float = 0.4
+    errors_elsewhere: float = 0.6
     min_depth: float = 0.003
     min_samples: int = 20
     share: float = 0.9

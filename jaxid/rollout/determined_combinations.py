@@ -168,7 +168,7 @@ def _inverse(H: np.ndarray) -> np.ndarray:
 
 
 class Determination(NamedTuple):
-    """What the logs determine.
+    """Parameters and combinations that the logs determine, with their uncertainty.
 
     Attributes:
         combinations: Parameters and combinations that the logs determine.

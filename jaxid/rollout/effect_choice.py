@@ -227,24 +227,14 @@ def undetermined_effects(fit: JointFit) -> FreeParameters:
     They are at a limit of the search, or their parts of the logs, which differ, leave
     them uncertain.
     """
-    equations = fit.equations
-    information = equations.information.sum(axis=0)
-    undetermined = np.zeros_like(fit.free)
-    for j, mask in enumerate(fit.free):
-        symbols = np.flatnonzero(mask)
-        place = np.ix_(symbols, symbols)
-        inverse = np.linalg.pinv(information[j][place], rcond=1e-12, hermitian=True)
-        # Each motion moves the estimate; their scatter holds model errors, too.
-        changes = equations.gradient[:, j, symbols] @ inverse
-        motions = len(changes)
-        scatter = motions / max(motions - 1, 1) * (changes**2).sum(axis=0)
-        values = np.abs(fit.parameters[j, symbols])
-        is_uncertain = np.sqrt(scatter) > MAX_EFFECT_DEVIATION * values
-        # An effect that never acts has no information, and no scatter either.
-        own_information = np.diag(information[j])[symbols]
-        is_uncertain |= own_information * values**2 < MIN_EFFECT_COST
-        is_limit = (values >= UPPER[symbols]) | (values <= LOWER[symbols])
-        undetermined[j, symbols] = is_uncertain | is_limit
+    values = np.abs(fit.parameters)
+    information = fit.equations.information.sum(axis=0)
+    own_information = np.diagonal(information, axis1=1, axis2=2)
+    is_uncertain = fit.motion_deviations > MAX_EFFECT_DEVIATION * values
+    # An effect that never acts has no information, and no scatter either.
+    is_idle = own_information * values**2 < MIN_EFFECT_COST
+    is_limit = (values >= UPPER) | (values <= LOWER)
+    undetermined = is_uncertain | is_idle | is_limit
     effects = parameter_mask(("mu", "Fs", "vs", "um", "ki", "f"))
     undetermined &= effects
     # Stribeck friction is one effect of two parameters.

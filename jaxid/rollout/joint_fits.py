@@ -177,6 +177,23 @@ class JointFit:
         )
         return NormalEquations(gradient, information, response, correction)
 
+    @property
+    def motion_deviations(self) -> JointParameters:
+        """Deviations of the parameters by the scatter of motions; zero if not free."""
+        equations = self.equations
+        information = equations.information.sum(axis=0)
+        deviations = np.zeros_like(self.parameters)
+        for j, mask in enumerate(self.free):
+            symbols = np.flatnonzero(mask)
+            matrix = information[j][np.ix_(symbols, symbols)]
+            inverse = np.linalg.pinv(matrix, rcond=1e-12, hermitian=True)
+            # Each motion moves the estimate; their scatter holds model errors, too.
+            changes = equations.gradient[:, j, symbols] @ inverse
+            motions = len(changes)
+            variance = motions / max(motions - 1, 1) * (changes**2).sum(axis=0)
+            deviations[j, symbols] = np.sqrt(variance)
+        return deviations
+
     def step(self, damping: np.ndarray) -> "tuple[JointParameters, np.ndarray]":
         """Return parameters and initial states behind a damped Gauss-Newton step."""
         equations = self.equations
