@@ -24,6 +24,13 @@ HEIGHT_COUNT = 200
 class ContactThresholds(NamedTuple):
     """Bounds within which errors are those of a contact.
 
+    They were set on arms of three and four joints on MuJoCo. In 26 contacts with a
+    table, in half of them with masses that are wrong by 20 %, the share unexplained was
+    0 to 0.72, the flatness 0.01 to 0.21, and the errors elsewhere 0.02 to 0.27 (with
+    fits to the same logs up to 0.55). In 86 draws with errors of the model (masses,
+    gains, friction, saturation, a joint that sticks), of 4 to 150 mrad RMS, the share
+    unexplained was above 0.9.
+
     Attributes:
         unexplained: Share of the squared errors of the height that a table leaves.
         flatness: Deviation of the measured height while the simulation is below the
