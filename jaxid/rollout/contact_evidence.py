@@ -107,10 +107,9 @@ def find_table(robot: Robot, errors: RolloutErrors) -> TableContact | None:
         )
     tables = []
     for point, carrier in points.items():
-        heights = [
-            tip_jacobian(carrier, q).position @ up for q in (measured, simulated)
-        ]
-        table = _fit_table(point, *heights, squares)
+        measured_heights = tip_jacobian(carrier, measured).position @ up
+        simulated_heights = tip_jacobian(carrier, simulated).position @ up
+        table = _fit_table(point, measured_heights, simulated_heights, squares)
         if table is not None:
             tables.append(table)
     return min(tables, key=lambda x: x.unexplained, default=None)
