@@ -16,6 +16,7 @@ from jaxid.export.servo_actuators import (
 from jaxid.result_table import Column, Remark, Status, Table, significant
 from jaxid.robot.robot import Robot
 from jaxid.rollout import RolloutErrors, ServoFit
+from jaxid.rollout.contact_evidence import contact_finding
 from jaxid.validation.judgement import SEVERITIES, Judgement
 
 from .figure import Figure
@@ -97,6 +98,9 @@ class RolloutReport:
             )
             status = Status.DOUBTFUL
         yield Remark(f"{text} most at {names[worst_joint]}, by {error}", status)
+        contact = contact_finding(self.robot, self.errors)
+        if contact is not None:
+            yield Remark(contact, Status.DOUBTFUL)
         combinations = self.fit.combinations
         disagreements = sum(not c.agrees for c in combinations)
         if disagreements:

@@ -47,9 +47,7 @@ class Bodies:
             self._path_loads(path.T, float(dt))
             for path, dt in zip(paths, step_times, strict=True)
         ]
-        torques, inertias = (
-            np.stack(x) for x in zip(*motion_loads, strict=True)
-        )
+        torques, inertias = (np.stack(x) for x in zip(*motion_loads, strict=True))
         return torques, inertias
 
     def measured_loads(
@@ -62,9 +60,7 @@ class Bodies:
         ]
         return self.loads(np.stack(smooth_positions), sample_times)
 
-    def _path_loads(
-        self, path: np.ndarray, dt: float
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def _path_loads(self, path: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
         """Return torques and inertias [joints, points - 1] of one path."""
         q = 0.5 * (path[1:] + path[:-1])
         zeros = np.zeros_like(q)
@@ -88,7 +84,7 @@ class Bodies:
 
 def _filter_positions(positions: np.ndarray, dt: float) -> np.ndarray:
     """Return positions below `CUTOFF`."""
-    if CUTOFF > 0.4 / dt:
+    if 0.4 / dt < CUTOFF:
         return positions
     sections = butter(2, 2.0 * CUTOFF * dt, output="sos")
     return sosfiltfilt(sections, positions, axis=-1)

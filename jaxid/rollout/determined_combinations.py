@@ -233,7 +233,7 @@ def _scatter_of_equal_joints(
 
 
 class _Joint(NamedTuple):
-    """One joint: its fit, rows, scatter of joints of its kind, with the scatter's dof."""
+    """One joint of a fit, with the scatter of joints of its kind and its dof."""
 
     fit: JointFit
     index: int

@@ -1,12 +1,10 @@
 """Choice of the effects of joints by motions that a fit has not seen."""
 
 import dataclasses
-import itertools
 from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from .body_loads import Bodies
 from .joint_fits import JointFit
 from .motion import FreeParameters, JointParameters
 from .servo import INDEX, LOWER, START, UPPER
@@ -37,8 +35,8 @@ STARTS = [
 ]
 """Inertia, damping and delay from which searches may start."""
 
-REMOVABLE_EFFECTS = (("f",), ("ki",), ("um",), ("mu",), ("Fs", "vs"))
-"""Effects without which a fit is tried in the end."""
+IMITATING_EFFECTS = ("f", "ki")
+"""Effects that commands of the other kind imitate: a fit without each is tried."""
 
 SATURATION_SHARES = (0.2, 0.5, 1.0)
 """Starts of the largest torque, over the usual start."""
@@ -52,7 +50,12 @@ def parameter_mask(symbols: Sequence[str]) -> np.ndarray:
     return np.isin(list(INDEX), list(symbols))
 
 
-def is_lower(scores: np.ndarray, rivals: np.ndarray, groups: Groups) -> np.ndarray:
+def is_lower(
+    scores: np.ndarray,
+    rivals: np.ndarray,
+    groups: Groups,
+    scatter_share: float = 1.0,
+) -> np.ndarray:
     """Return for which joints scores are clearly lower than those of rivals.
 
     Joints of a kind decide together.
@@ -61,13 +64,15 @@ def is_lower(scores: np.ndarray, rivals: np.ndarray, groups: Groups) -> np.ndarr
         scores: Held-out scores [motions, joints].
         rivals: Scores of the smaller model.
         groups: Joints of each kind.
+        scatter_share: Share of the scatter between motions that a gain must exceed.
     """
     decisions = np.zeros(scores.shape[1], bool)
     for group in groups:
         change = (scores - rivals)[:, list(group)].mean(axis=1)
-        scatter = np.std(change, ddof=1) / np.sqrt(len(change)) if len(change) > 1 else 0
-        # If one motion alone shows the effect, its gain is the whole scatter.
-        limit = max(MIN_SCORE_GAIN, 0.5 * scatter)
+        scatter = (
+            np.std(change, ddof=1) / np.sqrt(len(change)) if len(change) > 1 else 0
+        )
+        limit = max(MIN_SCORE_GAIN, scatter_share * scatter)
         decisions[list(group)] = change.mean() < -limit
     return decisions
 
@@ -108,7 +113,9 @@ class EffectChoice:
         free_mask[is_loaded, INDEX["b"]] = False
         free_mask[is_loaded & ~is_known, INDEX["a"]] = True
         has_new_compliance = is_loaded & ~is_known
-        start_parameters[has_new_compliance, INDEX["a"]] = 0.02 / load[has_new_compliance]
+        start_parameters[has_new_compliance, INDEX["a"]] = (
+            0.02 / load[has_new_compliance]
+        )
         grid = [(start_parameters, values) for values in STARTS]
         starts = _best_starts(simulator, grid, count=2)
         fits = []
@@ -144,7 +151,9 @@ class EffectChoice:
             self.advance()
             trial = self.with_effects(effects)
             # Two effects compete with each one of them, and with none.
-            choice = is_lower(trial.held_out_scores, best_fit.held_out_scores, self.groups)
+            choice = is_lower(
+                trial.held_out_scores, best_fit.held_out_scores, self.groups
+            )
             best_fit = best_fit.mixed_with(trial, choice)
         self.fit = best_fit.weighed_by_errors()
 
@@ -169,7 +178,13 @@ class EffectChoice:
         trial = JointFit.of(
             fit.simulator, best_start, free_mask, start=fit.start, weights=fit.weights
         ).improved(8)
-        choice = is_lower(trial.held_out_scores, fit.held_out_scores, self.groups)
+        # One motion alone may show it: then its gain is as large as the scatter.
+        choice = is_lower(
+            trial.held_out_scores,
+            fit.held_out_scores,
+            self.groups,
+            scatter_share=0.5,
+        )
         self.fit = fit.mixed_with(trial, choice).weighed_by_errors()
 
     def with_effects(self, effects: tuple[str, ...]) -> JointFit:
@@ -243,15 +258,15 @@ def undetermined_effects(fit: JointFit) -> FreeParameters:
     return undetermined & fit.free
 
 
-def without_idle_effects(fit: JointFit, groups: Groups) -> JointFit:
-    """Return the fit without effects that do not lower held-out errors.
+def without_imitations(fit: JointFit, groups: Groups) -> JointFit:
+    """Return the fit without control effects that do not lower held-out errors.
 
-    An effect that was chosen early may imitate one that was chosen later.
+    They may have imitated held commands, or what was chosen later.
     """
-    for effects in REMOVABLE_EFFECTS:
-        mask = fit.free & parameter_mask(effects)
+    for symbol in IMITATING_EFFECTS:
+        mask = fit.free & parameter_mask((symbol,))
         if mask.any():
-            trial = without_effects(fit, mask).improved(4)
+            trial = without_effects(fit, mask).improved(2)
             needs_effect = is_lower(fit.held_out_scores, trial.held_out_scores, groups)
             fit = fit.mixed_with(trial, ~needs_effect & mask.any(axis=1))
     return fit

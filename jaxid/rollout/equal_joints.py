@@ -12,8 +12,10 @@ from jaxid.errors import InputError
 
 from .joint_fits import JointFit, Pull
 
-SIDES = frozenset(
-    "l r left right fl fr rl rr hl hr bl br lf rf lh rh lb rb front rear hind back".split()
+SIDES = (
+    *("l", "r", "left", "right", "front", "rear", "hind", "back"),
+    *("fl", "fr", "rl", "rr", "hl", "hr", "bl", "br"),
+    *("lf", "rf", "lr", "lh", "rh", "lb", "rb"),
 )
 """Words of joint names that tell a side, and not the kind of a joint."""
 SCATTERS = (0.3, 0.1, 0.03, 0.01)
@@ -71,7 +73,7 @@ def _kind_of(name: str) -> str:
 
 
 def pull_equal_joints(fit: JointFit, groups: Sequence[Sequence[int]]) -> JointFit:
-    """Return the fit with the pull between equal joints that held-out motions prefer."""
+    """Return the fit with the pull of equal joints that held-out motions prefer."""
     equal_joints = [j for group in groups if len(group) > 1 for j in group]
     if not equal_joints:
         return fit

@@ -16,13 +16,12 @@ from jaxid.measurement.recording import Recording
 
 from .body_loads import Bodies
 from .effect_choice import (
-    BASIC_PARAMETERS,
     LINEAR_PARAMETERS,
     EffectChoice,
     parameter_mask,
     undetermined_effects,
     without_effects,
-    without_idle_effects,
+    without_imitations,
 )
 from .equal_joints import joint_groups, pull_equal_joints
 from .joint_fits import RESOLUTION, JointFit
@@ -37,7 +36,7 @@ MAX_ROUNDS = 8
 """Largest number of rounds of the refinement."""
 CHOICE_ROUNDS = 2
 """Rounds after which held and interpolated commands are compared."""
-MAX_STEP_ERROR = 0.2
+MAX_STEP_ERROR = 0.1
 """Median change of estimates, in their deviations, above which steps are halved."""
 MAX_HALVINGS = 2
 """Largest number of times that steps are halved."""
@@ -125,10 +124,9 @@ def identify_rollout(
     if progress is not None:
         progress("refining", 0.0)
     fit, hold_is_told = _with_better_commands(fit, time_step)
-    fit = _descend(without_idle_effects(fit, groups))
+    fit = without_imitations(fit, groups)
     undetermined = undetermined_effects(fit)
-    if undetermined.any():
-        fit = _descend(without_effects(fit, undetermined))
+    fit = _descend(without_effects(fit, undetermined))
     fine_fit = _in_short_enough_steps(fit)
     if fine_fit is not fit:
         fine_step = fine_fit.simulator.time_step
@@ -157,7 +155,7 @@ def _linear_baseline(fit: JointFit) -> JointParameters:
 
 
 def _with_better_bodies(fit: JointFit) -> JointFit:
-    """Return the fit whose bodies have inertial torques, if held-out errors are lower."""
+    """Return the fit with inertial torques, if they lower held-out errors."""
     bodies = fit.simulator.bodies
     simulator = dataclasses.replace(
         fit.simulator, bodies=dataclasses.replace(bodies, coupled=True)

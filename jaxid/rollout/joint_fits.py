@@ -143,7 +143,9 @@ class JointFit:
         motion = self.simulator.motion
         spread = motion.spread.copy()
         # A servo without integral action starts with none.
-        spread[..., 2] = np.where(self.parameters[:, INDEX["ki"]] > 0, spread[..., 2], 1e-6)
+        spread[..., 2] = np.where(
+            self.parameters[:, INDEX["ki"]] > 0, spread[..., 2], 1e-6
+        )
         return 1.0 / spread**2 / motion.sample_counts[..., None]
 
     @cached_property
@@ -152,10 +154,11 @@ class JointFit:
         states = self.start - self.simulator.motion.start
         state_costs = np.sum(self.certainty * states**2, axis=-1)
         errors = self.weights * self.moments.cost
+        motion_costs = errors + state_costs
         changes = self.parameters - self.pull.target(self.parameters)
         precision = self.pull.precision(self.parameters)
         pull_costs = np.sum(precision * changes**2, axis=-1)
-        cost = (errors + state_costs).sum(axis=0) + pull_costs
+        cost = motion_costs.sum(axis=0) + pull_costs
         return np.where(np.isfinite(cost), cost, np.inf)
 
     @cached_property
@@ -166,7 +169,9 @@ class JointFit:
         H = w[..., None] * self.moments.information
         states = self.start - self.simulator.motion.start
         certainty = self.certainty
-        by_states = H[..., SIZE:, SIZE:] + certainty[..., None] * np.eye(states.shape[-1])
+        by_states = H[..., SIZE:, SIZE:] + certainty[..., None] * np.eye(
+            states.shape[-1]
+        )
         state_gradient = g[..., SIZE:] + certainty * states
         coupling = H[..., SIZE:, :SIZE]
         response = -np.linalg.solve(by_states, coupling)
@@ -224,11 +229,13 @@ class JointFit:
             mask = is_moving.astype(float)
             pinned_step = np.where(is_moving, 0.0, step)
             rest = -gradient - np.einsum("...pq,...q->...p", information, pinned_step)
-            scaled = information / scale[..., None] / scale[..., None, :]
-            matrix = scaled * mask[..., None] * mask[..., None, :]
-            regular = damping[..., None] * np.ones(SIZE) + 1e-12 + (1.0 - mask)
-            matrix = matrix + regular[..., None] * np.eye(SIZE)
-            solution = np.linalg.solve(matrix, (mask * rest / scale)[..., None])[..., 0]
+            moving_scale = mask / scale
+            rows = information * moving_scale[..., None]
+            matrix = rows * moving_scale[..., None, :]
+            diagonal = damping[..., None] + 1e-12 + (1.0 - mask)
+            matrix = matrix + diagonal[..., None] * np.eye(SIZE)
+            right_side = (moving_scale * rest)[..., None]
+            solution = np.linalg.solve(matrix, right_side)[..., 0]
             step = np.where(is_moving, solution / scale, pinned_step)
             end = np.clip(x + step, LOWER, UPPER)
             is_leaving = is_moving & (end != x + step)
@@ -259,7 +266,7 @@ class JointFit:
         return fit
 
     def mixed_with(self, other: "JointFit", choice: np.ndarray) -> "JointFit":
-        """Return the fit with some joints from another one, which has the same loads."""
+        """Return the fit with some joints of another one along the same loads."""
         parts = [
             np.where(choice.reshape(-1, *[1] * (y.ndim - 2)), y, x)
             for x, y in zip(self.moments, other.moments, strict=True)

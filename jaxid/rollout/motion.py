@@ -204,8 +204,9 @@ def _stack(
 
     positions = np.stack([pad(x.positions, padded_length) for x in pieces])
     commands = np.stack([pad(x.commands, padded_length + lead) for x in pieces])
-    is_sample = np.arange(padded_length) < np.array(lengths)[:, None]
-    counted = np.repeat(is_sample[:, None].astype(float), positions.shape[1], axis=1)
+    ends = np.array(lengths)[:, None, None]
+    is_sample = np.arange(padded_length) < ends
+    counted = np.where(is_sample, np.ones_like(positions), 0.0)
     start = np.stack([piece.start.state for piece in pieces])
     spread = np.stack([piece.start.spread for piece in pieces])
     return ServoMotion(

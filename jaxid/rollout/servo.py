@@ -127,7 +127,9 @@ def advance_stage(
     inertia = (J + a * inputs.inertia) / duration
     resistance = inertia + B + servo_resistance
 
-    is_moving, direction = slip_of(force, inertia, friction, resistance, w, inputs.ahead)
+    is_moving, direction = slip_of(
+        force, inertia, friction, resistance, w, inputs.ahead
+    )
     balance = force + inertia * w - friction * direction
     u = jnp.where(is_moving, balance / resistance, 0.0)
     # A joint that has stopped in the first stage starts the second one at rest.

@@ -196,9 +196,7 @@ def _path(
 
 
 @functools.partial(jax.jit, static_argnums=3)
-def _states(
-    unknowns: Array, channels: Channels, hold: AnyArray, steps: int
-) -> State:
+def _states(unknowns: Array, channels: Channels, hold: AnyArray, steps: int) -> State:
     """Return states of all channels at all steps [steps, channels]."""
     return _path(unknowns, unknowns[INDEX["d"]], channels, steps, hold)
 
@@ -228,7 +226,7 @@ def _errors_and_derivatives(
 def _sensitivities(
     unknowns: Array, channels: Channels, hold: AnyArray, steps: int
 ) -> tuple[Array, Array]:
-    """Return errors [channels, samples] and derivatives [channels, unknowns, samples]."""
+    """Return errors and derivatives with the channels first and the samples last."""
     r, S = _errors_and_derivatives(unknowns, channels, hold, steps)
     return r.T, jnp.moveaxis(S, 2, 0)
 
@@ -305,9 +303,7 @@ class ServoSimulator:
         unknowns = np.concatenate([parameters, start], axis=-1)
         columns = unknowns.reshape(-1, unknowns.shape[-1]).T
         with double_precision():
-            result = function(
-                columns, self._channels, np.array(self.hold), self.steps
-            )
+            result = function(columns, self._channels, np.array(self.hold), self.steps)
             return jax.tree.map(np.asarray, result)
 
     def _by_motion(self, x: np.ndarray) -> np.ndarray:
