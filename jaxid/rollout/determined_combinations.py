@@ -236,7 +236,7 @@ class _Joint(NamedTuple):
     """One joint of a fit, with the scatter of joints of its kind and its dof."""
 
     fit: JointFit
-    index: int
+    number: int
     rows: JointRows
     scatter: np.ndarray
     scatter_dof: float
@@ -245,7 +245,7 @@ class _Joint(NamedTuple):
         self, deviations: Deviations, symbols: np.ndarray
     ) -> list[Combination]:
         """Return what the logs determine of the joint."""
-        x = self.fit.parameters[self.index]
+        x = self.fit.parameters[self.number]
         sizes = np.maximum(np.abs(x), 0.1 * SCALE)[symbols]
         place = np.ix_(symbols, symbols)
         quantiles = special.stdtrit(deviations.dof[symbols], 0.975)
@@ -284,14 +284,14 @@ class _Joint(NamedTuple):
             dof = min(dof, self.scatter_dof)
             agrees = False
         all_coefficients = np.zeros_like(self.fit.parameters)
-        all_coefficients[self.index] = coefficients
+        all_coefficients[self.number] = coefficients
         return Combination(
-            self.index,
+            self.number,
             name,
             meaning,
             PARAMETERS[symbol].unit,
             all_coefficients,
-            float(coefficients @ self.fit.parameters[self.index]),
+            float(coefficients @ self.fit.parameters[self.number]),
             float(np.sqrt(noise + difference)),
             dof,
             agrees,

@@ -123,7 +123,8 @@ class EffectChoice:
             advance()
             fit = JointFit.of(simulator, parameters, free_mask)
             fits.append(fit.improved(6).weighed_by_errors())
-        fit = _calm_choice(*fits, groups)
+        first_fit, second_fit = fits
+        fit = _calm_choice(first_fit, second_fit, groups)
         return cls(fit, groups, known_compliance, advance)
 
     @property

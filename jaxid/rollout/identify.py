@@ -118,7 +118,7 @@ def identify_rollout(
     choice.choose_all()
     fit = choice.fit
     if bodies is not None and not bodies.coupled:
-        fit = _with_better_bodies(fit)
+        fit = _with_better_bodies(fit, bodies)
     fit = pull_equal_joints(fit, groups)
 
     if progress is not None:
@@ -154,9 +154,8 @@ def _linear_baseline(fit: JointFit) -> JointParameters:
     return baseline.improved(4).parameters
 
 
-def _with_better_bodies(fit: JointFit) -> JointFit:
+def _with_better_bodies(fit: JointFit, bodies: Bodies) -> JointFit:
     """Return the fit with inertial torques, if they lower held-out errors."""
-    bodies = fit.simulator.bodies
     simulator = dataclasses.replace(
         fit.simulator, bodies=dataclasses.replace(bodies, coupled=True)
     )

@@ -289,11 +289,10 @@ class JointFit:
         simulated with them [motions, joints].
         """
         equations = self.equations
-        others = [
-            x.sum(axis=0) - x for x in (equations.gradient, equations.information)
-        ]
+        gradient = equations.gradient.sum(axis=0) - equations.gradient
+        information = equations.information.sum(axis=0) - equations.information
         damping = np.full(self.weights.shape, 1e-3)
-        change = self._parameter_step(*others, damping)
+        change = self._parameter_step(gradient, information, damping)
         start = self.start + np.einsum("mjsp,mjp->mjs", equations.response, change)
         motion = self.simulator.motion
         path = self.simulator.positions(self.parameters + change, start)

@@ -13,7 +13,7 @@ order and L-stable, so that $J \to 0$ is allowed.
 """
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -75,9 +75,9 @@ START, LOWER, UPPER, SCALE = (
 class State(NamedTuple):
     """State of a joint: position, velocity, and integral action of its servo."""
 
-    q: Array
-    w: Array
-    integral: Array
+    q: Any
+    w: Any
+    integral: Any
 
 
 class StageInputs(NamedTuple):
@@ -92,10 +92,10 @@ class StageInputs(NamedTuple):
         ahead: Factor of the change of velocity with which the next stage starts.
     """
 
-    command: Array
-    command_rate: Array
-    load: Array
-    inertia: Array
+    command: Any
+    command_rate: Any
+    load: Any
+    inertia: Any
     share: AnyArray
     ahead: AnyArray
 

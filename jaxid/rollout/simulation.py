@@ -49,12 +49,12 @@ class Channels(NamedTuple):
         sample_time: Time between two samples [s].
     """
 
-    commands: Array
-    positions: Array
-    counted: Array
-    load: Array
-    inertia: Array
-    sample_time: Array
+    commands: Any
+    positions: Any
+    counted: Any
+    load: Any
+    inertia: Any
+    sample_time: Any
 
 
 class Moments(NamedTuple):
@@ -68,9 +68,9 @@ class Moments(NamedTuple):
         information: Products of sensitivities [motions, joints, unknowns, unknowns].
     """
 
-    cost: np.ndarray
-    gradient: np.ndarray
-    information: np.ndarray
+    cost: Any
+    gradient: Any
+    information: Any
 
 
 class DelayedCommand(NamedTuple):
@@ -137,7 +137,9 @@ def delayed_command(
     mean_rate = jnp.diff(interpolate(commands, ends)) / length
     mean_bend = jnp.diff(slope_at(ends)) / length
     # Held commands jump: their derivatives are those of neighbours.
-    held_bend = interpolate(jnp.gradient(jnp.gradient(commands)), ends[1:])
+    held_bend = interpolate(
+        jnp.asarray(jnp.gradient(jnp.asarray(jnp.gradient(commands)))), ends[1:]
+    )
 
     value = jnp.where(hold, jnp.repeat(mean, 2), interpolate(commands, stage_ends))
     slope = jnp.where(hold, jnp.repeat(held_rate, 2), slope_at(stage_ends))
@@ -293,8 +295,11 @@ class ServoSimulator:
         joints = motion.positions.shape[1]
         arrays = (motion.commands, motion.positions, motion.counted, *self.loads)
         # Motions and joints become one last axis.
-        columns = [x.reshape(-1, x.shape[-1]).T for x in arrays]
-        return Channels(*columns, np.repeat(motion.sample_time, joints))
+        commands, positions, counted, load, inertia = (
+            x.reshape(-1, x.shape[-1]).T for x in arrays
+        )
+        sample_times = np.repeat(motion.sample_time, joints)
+        return Channels(commands, positions, counted, load, inertia, sample_times)
 
     def _call(self, function: Callable, theta: np.ndarray, start: np.ndarray) -> Any:
         """Call a compiled function of unknowns and channels."""

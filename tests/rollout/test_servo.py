@@ -108,8 +108,11 @@ def test_integral_action_of_a_servo_that_saturates_is_found_and_exported(tmp_pat
     np.testing.assert_array_equal(fit.stiffness, servo_arm.KP)
     values = simulator_values(fit)
     np.testing.assert_allclose(values["effort_limit"], 1.6, rtol=0.02)
-    np.testing.assert_allclose(values["armature"], servo_arm.ARMATURE, rtol=0.02)
-    np.testing.assert_allclose(values["damping"], servo_arm.DAMPING, rtol=0.02)
+    # MuJoCo damps at the end of its steps of 1 ms: half of it acts as inertia.
+    damping = np.array(servo_arm.DAMPING)
+    armature = servo_arm.ARMATURE + 0.5e-3 * damping
+    np.testing.assert_allclose(values["armature"], armature, rtol=0.02)
+    np.testing.assert_allclose(values["damping"], damping, rtol=0.02)
     other = servo_arm.log(9, **pid)
     assert fit.validate(other).total().max() < 1e-3
     assert fit.window_errors(other).max() < 1e-3
