@@ -36,7 +36,7 @@ MAX_ROUNDS = 8
 """Largest number of rounds of the refinement."""
 CHOICE_ROUNDS = 2
 """Rounds after which held and interpolated commands are compared."""
-MAX_STEP_ERROR = 0.1
+MAX_STEP_ERROR = 0.05
 """Median change of estimates, in their deviations, above which steps are halved."""
 MAX_HALVINGS = 2
 """Largest number of times that steps are halved."""
