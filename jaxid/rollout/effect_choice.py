@@ -17,7 +17,7 @@ LINEAR_PARAMETERS = ("J", "B", "d", "b", "g")
 MIN_SCORE_GAIN = 0.1
 """Fall of the held-out mean square's logarithm that justifies a larger model.
 
-Tenth of the mean square, a twentieth of the error. Set on a quadruped's chirp.
+A tenth of the mean square is a twentieth of the error; set on a quadruped's chirp.
 """
 MAX_EFFECT_DEVIATION = 0.25
 """Relative deviation of an effect's parameter above which it is not determined."""
@@ -108,7 +108,7 @@ class EffectChoice:
         start_parameters[is_known, INDEX["a"]] = known_compliance[is_known]
         free_mask = np.tile(parameter_mask(BASIC_PARAMETERS), (joints, 1))
         # Where bodies load a joint, their weight is preferred to a bias.
-        load = np.abs(simulator.loads[0]).max(axis=(0, 2))
+        load = _largest_loads(simulator)
         is_loaded = load > MIN_LOAD_SHARE * load.max(initial=0.0)
         free_mask[is_loaded, INDEX["b"]] = False
         free_mask[is_loaded & ~is_known, INDEX["a"]] = True
@@ -121,8 +121,8 @@ class EffectChoice:
         fits = []
         for parameters in starts:
             advance()
-            fit = JointFit.of(simulator, parameters, free_mask)
-            fits.append(fit.improved(6).weighed_by_errors())
+            start_fit = JointFit.of(simulator, parameters, free_mask)
+            fits.append(start_fit.improved(6).weighed_by_errors())
         first_fit, second_fit = fits
         fit = _calm_choice(first_fit, second_fit, groups)
         return cls(fit, groups, known_compliance, advance)
@@ -130,7 +130,7 @@ class EffectChoice:
     @property
     def loaded_joints(self) -> np.ndarray:
         """Joints on which the bodies have a weight worth mentioning."""
-        load = np.abs(self.fit.simulator.loads[0]).max(axis=(0, 2))
+        load = _largest_loads(self.fit.simulator)
         return load > MIN_LOAD_SHARE * load.max(initial=0.0)
 
     def choose_all(self) -> None:
@@ -221,7 +221,7 @@ class EffectChoice:
         simulator = self.fit.simulator
         motion = simulator.motion
         lag = np.abs(motion.sent - motion.positions).max(axis=(0, 2))
-        load = np.abs(simulator.loads[0]).max(axis=(0, 2))
+        load = _largest_loads(simulator)
         parameters = self.fit.parameters
         dry_friction = parameters[:, INDEX["F"]]
         values = {
@@ -237,11 +237,16 @@ class EffectChoice:
         return values[symbol]
 
 
+def _largest_loads(simulator: ServoSimulator) -> np.ndarray:
+    """Return the largest torque of the bodies on each joint [N m or N]."""
+    torques, _ = simulator.loads
+    return np.abs(torques).max(axis=(0, 2))
+
+
 def undetermined_effects(fit: JointFit) -> FreeParameters:
     """Return the effects whose parameters the motions do not determine.
 
-    They are at a limit of the search, or their parts of the logs, which differ, leave
-    them uncertain.
+    They are at a limit of the search, never act, or differ between motions.
     """
     values = np.abs(fit.parameters)
     information = fit.equations.information.sum(axis=0)

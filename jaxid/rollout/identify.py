@@ -27,7 +27,7 @@ from .equal_joints import joint_groups, pull_equal_joints
 from .joint_fits import RESOLUTION, JointFit
 from .motion import JointParameters, ServoMotion
 from .result import ServoFit
-from .servo import INDEX
+from .servo import INDEX, LOWER
 from .simulation import ServoSimulator
 
 MIN_FALL = 1e-3
@@ -126,6 +126,8 @@ def identify_rollout(
     fit, hold_is_told = _with_better_commands(fit, time_step)
     fit = without_imitations(fit, groups)
     undetermined = undetermined_effects(fit)
+    # An effect that is zero is none.
+    possible_effects = undetermined & (fit.parameters > LOWER)
     fit = _descend(without_effects(fit, undetermined))
     fine_fit = _in_short_enough_steps(fit)
     if fine_fit is not fit:
@@ -136,7 +138,7 @@ def identify_rollout(
         linear_parameters,
         names,
         groups,
-        undetermined,
+        possible_effects,
         hold_is_told,
         given_stiffness,
     )

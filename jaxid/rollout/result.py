@@ -142,10 +142,10 @@ class ServoFit:
         description = "held until the next one" if self.hold else "interpolated"
         if self.hold_is_told:
             return description
-        return (
-            f"{description}; if held, delays are half a sample time shorter: the "
-            "logs do not tell"
-        )
+        rival = "interpolated, delays are half a sample time longer"
+        if not self.hold:
+            rival = "held until the next one, delays are half a sample time shorter"
+        return f"{description}; the logs do not tell: if they are {rival}"
 
     def _unit(self, c: Combination) -> str:
         """Return the unit of a parameter of a revolute or linear joint."""
@@ -294,7 +294,10 @@ class ServoFit:
         joints = [c.joint for c in rows]
         joint_rows = (np.flatnonzero(np.diff(joints)) + 1).tolist()
         rms = np.sqrt((self.rms**2).mean(axis=0))
-        error_texts = "  ".join(significant(1e3 * x) for x in rms)
+        error_texts = ", ".join(
+            f"{name} {significant(1e3 * x)}"
+            for name, x in zip(self.joint_names, rms, strict=True)
+        )
         K = ", ".join(
             f"{name} {significant(k)}"
             for name, k in zip(self.joint_names, self.stiffness, strict=True)
@@ -302,7 +305,7 @@ class ServoFit:
         )
         facts = [
             ("logs", ", ".join(dict.fromkeys(self.motions))),
-            ("errors", f"{error_texts}  mrad or mm RMS"),
+            ("errors of the fit", f"{error_texts} mrad or mm RMS"),
             ("commands", self._commands),
             ("stiffness", K or "not determined: all parameters are ratios to it"),
         ]
@@ -340,9 +343,10 @@ def _notes_on_effects(
         joints = [joint_names[j] for j in np.flatnonzero(undetermined[:, k])]
         # Stribeck friction and its speed are one effect.
         if joints and parameter.symbol != "vs":
+            effect = parameter.meaning.capitalize()
             notes.append(
-                f"{parameter.meaning} is possible on {', '.join(joints)}, but the logs "
-                "do not determine it: it is left out; record motions that show it"
+                f"{effect} is possible on {', '.join(joints)}, but the logs do not "
+                "determine it: it is left out; record motions that show it"
             )
     return notes
 
@@ -377,7 +381,7 @@ def _notes_on_errors(fit: JointFit, joint_names: tuple[str, ...]) -> list[str]:
     if not joint_errors:
         return []
     return [
-        "errors are larger than an encoder's rounding and change slowly "
+        "Errors are larger than an encoder's rounding and change slowly "
         f"({', '.join(joint_errors)} mrad or mm RMS): an effect is missing, such as "
         "other friction, play, elasticity or load, and the parameters are those that "
         "imitate it best"

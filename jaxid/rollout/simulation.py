@@ -107,47 +107,77 @@ def delayed_command(
         sample_time: Time between two samples [s].
         hold: Whether commands are held.
     """
-    last_index = len(commands) - 1.0
-
-    def interpolate(values: Array, instants: Array) -> Array:
-        places = jnp.clip(instants, 0.0, last_index)
-        floors = jnp.clip(jnp.floor(places), 0.0, last_index - 1.0)
-        k = floors.astype(int)
-        return values[k] + (places - floors) * (values[k + 1] - values[k])
-
-    length = jnp.diff(ends)
-    stage_ends = jnp.stack([ends[:-1] + GAMMA * length, ends[1:]], axis=1).ravel()
-    indices = jnp.clip(jnp.floor(ends), 0.0, last_index).astype(int)
-
-    # Held commands: means are differences of the integral, whose ends are exact.
-    integral = jnp.concatenate([jnp.zeros(1), jnp.cumsum(commands[:-1])])
-    first_piece = jnp.minimum(ends, 0.0) * commands[0]
-    last_piece = jnp.maximum(ends - last_index, 0.0) * commands[-1]
-    sums = interpolate(integral, ends) + first_piece + last_piece
-    mean = jnp.diff(sums) / length
-    held_rate = jnp.diff(commands[indices]) / length
-
-    # Rates are means over the step, too, so that the impulse of a jump is exact.
-    slopes = jnp.append(jnp.diff(commands), 0.0)
-
-    def slope_at(instants: Array) -> Array:
-        inside = jnp.clip(instants, 0.0, last_index)
-        return jnp.where(inside == instants, slopes[inside.astype(int)], 0.0)
-
-    mean_rate = jnp.diff(interpolate(commands, ends)) / length
-    mean_bend = jnp.diff(slope_at(ends)) / length
-    # Held commands jump: their derivatives are those of neighbours.
-    held_bend = interpolate(
-        jnp.asarray(jnp.gradient(jnp.asarray(jnp.gradient(commands)))), ends[1:]
+    held = _held_command(commands, ends)
+    interpolated = _interpolated_command(commands, ends)
+    value, slope, rate, bend = (
+        jnp.where(hold, x, y) for x, y in zip(held, interpolated, strict=True)
     )
-
-    value = jnp.where(hold, jnp.repeat(mean, 2), interpolate(commands, stage_ends))
-    slope = jnp.where(hold, jnp.repeat(held_rate, 2), slope_at(stage_ends))
-    rate = jnp.repeat(jnp.where(hold, held_rate, mean_rate), 2)
-    bend = jnp.repeat(jnp.where(hold, held_bend, mean_bend), 2)
     return DelayedCommand(
         value, slope / sample_time, rate / sample_time, bend / sample_time**2
     )
+
+
+def _held_command(commands: Array, ends: Array) -> DelayedCommand:
+    """Return held commands by the mean over each step; times are in samples."""
+    length = jnp.diff(ends)
+    integral = _integral_of_held(commands, ends)
+    mean = jnp.diff(integral) / length
+
+    last_index = len(commands) - 1
+    indices = jnp.floor(ends).astype(int)
+    end_commands = commands[jnp.clip(indices, 0, last_index)]
+    rate = jnp.diff(end_commands) / length
+    # Held commands jump: their second derivatives are those of neighbours.
+    slopes = jnp.asarray(jnp.gradient(commands))
+    bends = jnp.asarray(jnp.gradient(slopes))
+    bend = _interpolate(bends, ends[1:])
+    by_step = DelayedCommand(mean, rate, rate, bend)
+    return DelayedCommand(*(jnp.repeat(x, 2) for x in by_step))
+
+
+def _integral_of_held(commands: Array, instants: Array) -> Array:
+    """Return the integral of held commands from the first sample to instants."""
+    last_index = len(commands) - 1.0
+    sums = jnp.cumsum(commands[:-1])
+    integral = jnp.concatenate([jnp.zeros(1), sums])
+    time_before = jnp.minimum(instants, 0.0)
+    time_behind = jnp.maximum(instants - last_index, 0.0)
+    inside = _interpolate(integral, instants)
+    return inside + time_before * commands[0] + time_behind * commands[-1]
+
+
+def _interpolated_command(commands: Array, ends: Array) -> DelayedCommand:
+    """Return interpolated commands at the ends of both stages; times are in samples.
+
+    Rates are means over the step, so that the impulse of a jump is exact.
+    """
+    last_index = len(commands) - 1.0
+    length = jnp.diff(ends)
+    first_ends = ends[:-1] + GAMMA * length
+    stage_ends = jnp.stack([first_ends, ends[1:]], axis=1).ravel()
+    slopes = jnp.append(jnp.diff(commands), 0.0)
+
+    def slope_at(instants: Array) -> Array:
+        places = jnp.clip(instants, 0.0, last_index)
+        return jnp.where(places == instants, slopes[places.astype(int)], 0.0)
+
+    rate = jnp.diff(_interpolate(commands, ends)) / length
+    bend = jnp.diff(slope_at(ends)) / length
+    return DelayedCommand(
+        _interpolate(commands, stage_ends),
+        slope_at(stage_ends),
+        jnp.repeat(rate, 2),
+        jnp.repeat(bend, 2),
+    )
+
+
+def _interpolate(values: Array, instants: Array) -> Array:
+    """Return a series at instants in samples; it stands still outside."""
+    last_index = len(values) - 1.0
+    places = jnp.clip(instants, 0.0, last_index)
+    floors = jnp.clip(jnp.floor(places), 0.0, last_index - 1.0)
+    k = floors.astype(int)
+    return values[k] + (places - floors) * (values[k + 1] - values[k])
 
 
 def _path(

@@ -152,7 +152,7 @@ def test_an_effect_that_is_not_determined_is_left_out_and_named():
     assert limits[0] == pytest.approx(0.12, rel=0.02)
     assert limits[1] == 1e3
     notes = [x for x in fit.notes if "left out" in x]
-    (note,) = [x for x in notes if "largest torque" in x]
+    (note,) = [x for x in notes if "Largest torque" in x]
     assert "right_hip" in note
     assert "left_hip" not in note
 
