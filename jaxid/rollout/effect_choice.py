@@ -35,8 +35,8 @@ STARTS = [
 ]
 """Inertia, damping and delay from which searches may start."""
 
-IMITATING_EFFECTS = ("f", "ki")
-"""Effects that commands of the other kind imitate: a fit without each is tried."""
+IMITATING_EFFECTS = ("f", "ki", "um")
+"""Effects that may have imitated later choices: a fit without each is tried."""
 
 SATURATION_SHARES = (0.2, 0.5, 1.0)
 """Starts of the largest torque, over the usual start."""
@@ -267,7 +267,7 @@ def undetermined_effects(fit: JointFit) -> FreeParameters:
 def without_imitations(fit: JointFit, groups: Groups) -> JointFit:
     """Return the fit without control effects that do not lower held-out errors.
 
-    They may have imitated held commands, or what was chosen later.
+    They may have imitated held commands, or friction that was chosen later.
     """
     for symbol in IMITATING_EFFECTS:
         mask = fit.free & parameter_mask((symbol,))
