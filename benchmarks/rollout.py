@@ -28,6 +28,7 @@
 """
 
 import contextlib
+import dataclasses
 import itertools
 import re
 import sys
@@ -156,11 +157,6 @@ def authors_rate(y: dict[str, float], x: np.ndarray, u: np.ndarray) -> np.ndarra
     return np.stack([v1, v2, (m22 * r1 - m12 * r2) / det, (m11 * r2 - m12 * r1) / det])
 
 
-VARIANTS = {
-    "rollouts": {},
-    "rollouts, gains, load friction": {"gains": True, "load_friction": True},
-}
-"""Options of identifications of the pendulum."""
 HORIZONS = (0.1, 0.2)
 
 
@@ -187,13 +183,10 @@ def pendulum(quick: bool) -> None:
             read("143339", "143524", "143601", "143704"),
             read("143747", "144003"),
         )
-        start, found = time.time(), {}
-        for word, options in VARIANTS.items():
-            found[word] = jid.rollout.identify_torque_rollout(base, seen, **options)
-        plain = found["rollouts"]
+        start = time.time()
+        plain = jid.rollout.identify_torque_rollout(base, seen)
         print(
-            f"tau_{kind}: {time.time() - start:.0f} s for all; q1 q2 at 0.1 s, at 0.2 "
-            "s [rad]"
+            f"tau_{kind}: {time.time() - start:.0f} s; q1 q2 at 0.1 s, at 0.2 s [rad]"
         )
         for n in ("1.0", "1.1", "2.0", "3.0"):
             values = [authors_errors(authors(n), unseen, h) for h in HORIZONS]
@@ -201,8 +194,7 @@ def pendulum(quick: bool) -> None:
         bandwidth = 2.0 / plain.horizon
         for word, p in parameters_by_method(base, seen, bandwidth).items():
             print_errors(word, [plain.errors_at(unseen, h, p) for h in HORIZONS])
-        for word, fit in found.items():
-            print_errors(word, [fit.errors_at(unseen, h) for h in HORIZONS])
+        print_errors("rollouts", [plain.errors_at(unseen, h) for h in HORIZONS])
         print_errors(
             "rollouts, logs of the fit", [plain.errors_at(seen, h) for h in HORIZONS]
         )
@@ -700,7 +692,7 @@ def population_simulator(logs) -> jid.rollout.ServoSimulator:
     copies = {
         name: np.repeat(getattr(motion, name), POPULATION, axis=1) for name in fields
     }
-    return jid.rollout.ServoSimulator(motion.replace(**copies), 0.01)
+    return jid.rollout.ServoSimulator(dataclasses.replace(motion, **copies), 0.01)
 
 
 def evolution(quick: bool) -> list[Row]:

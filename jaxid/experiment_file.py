@@ -126,8 +126,6 @@ KEYS: dict[str, tuple[str, ...]] = {
         "alike",
         "samples",
         "horizon",
-        "gains",
-        "load_friction",
     ),
     "excitation": (
         "criterion",
@@ -170,6 +168,8 @@ FORMER_KEYS = {
     ("rollout", "saturation"): True,
     ("rollout", "integral"): False,
     ("rollout", "torque_rows"): False,
+    ("rollout", "gains"): False,
+    ("rollout", "load_friction"): False,
     ("excitation", "polish"): 4,
 }
 """Keys that earlier templates wrote, with the values that change nothing."""

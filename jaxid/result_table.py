@@ -227,6 +227,28 @@ class Column:
         ]
 
 
+def estimate_columns(
+    estimates: Any, deviations: Any, ends: Any, units: Sequence[str]
+) -> list[Column]:
+    """Return columns of estimates, rounded to the second digit of their deviations.
+
+    Args:
+        estimates: Estimates.
+        deviations: Their standard deviations.
+        ends: Lower and upper ends of their 95 % intervals.
+        units: Their units.
+    """
+    values, deviation_texts = with_deviations(estimates, deviations)
+    lower_ends, upper_ends = (with_deviations(x, deviations)[0] for x in ends)
+    return [
+        Column("estimate", values, kind="number"),
+        Column("±", deviation_texts, kind="number"),
+        Column("unit", units),
+        Column("95 %\nfrom", lower_ends, kind="number"),
+        Column("95 %\nto", upper_ends, kind="number"),
+    ]
+
+
 def _plain_cell(value: Any) -> Any:
     """Return a value of a column as a number of Python, or as a printable text."""
     if isinstance(value, np.generic):

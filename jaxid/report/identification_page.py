@@ -15,9 +15,9 @@ from jaxid.result_table import (
     Remark,
     Status,
     Table,
+    estimate_columns,
     percent,
     significant,
-    with_deviations,
 )
 from jaxid.robot.robot import Robot
 from jaxid.validation.judgement import Report, judge
@@ -252,21 +252,13 @@ def _settings_and_facts(report: Report) -> list[tuple[str, Any]]:
 def parameter_table(fit: Fit) -> Table:
     """Return the base parameters in words, with their 95 % intervals."""
     base = fit.base
-    standard_deviations = fit.standard_deviations
-    intervals = fit.intervals()
-    estimates, deviations = with_deviations(fit.parameters, standard_deviations)
-    low, _ = with_deviations(intervals[:, 0], standard_deviations)
-    high, _ = with_deviations(intervals[:, 1], standard_deviations)
+    ends = fit.intervals().T
     return Table(
         "",
         Column("#", list(range(1, base.size + 1))),
         Column("parameter", base.names),
         *word_columns(base),
-        Column("estimate", estimates, kind="number"),
-        Column("±", deviations, kind="number"),
-        Column("unit", base.units),
-        Column("95 %\nfrom", low, kind="number"),
-        Column("95 %\nto", high, kind="number"),
+        *estimate_columns(fit.parameters, fit.standard_deviations, ends, base.units),
         Column("open", fit.open_shares, "%", percent),
         Column("combination", base.expressions, kind="code"),
         status=fit.trust,

@@ -4,7 +4,7 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -33,6 +33,8 @@ JointParameters = Float[np.ndarray, "joints parameters"]
 """Parameters of each joint, in the order of `PARAMETERS`."""
 FreeParameters = Bool[np.ndarray, "joints parameters"]
 """Whether each parameter of each joint is estimated."""
+Place = tuple[int, int, int]
+"""Part of a motion: its index, the first sample, and the end."""
 MotionSamples = Float[np.ndarray, "motions joints samples"]
 """Positions of joints in several motions, or their errors [rad or m]."""
 
@@ -108,10 +110,6 @@ class ServoMotion:
         """Number of motions."""
         return len(self.lengths)
 
-    def replace(self, **fields: Any) -> "ServoMotion":
-        """Return the motions with other arrays."""
-        return dataclasses.replace(self, **fields)
-
     @property
     def lead(self) -> int:
         """Number of commands before the first sample."""
@@ -148,8 +146,8 @@ class ServoMotion:
             places += [(k, a, b) for a, b in itertools.pairwise(ends.tolist())]
         return self.parts(places)
 
-    def parts(self, places: Sequence[tuple[int, int, int]]) -> "ServoMotion":
-        """Return parts of motions: index of the motion, first sample, and end."""
+    def parts(self, places: Sequence[Place]) -> "ServoMotion":
+        """Return parts of motions."""
         pieces = [
             _Piece(
                 self.commands[k][:, a : b + self.lead],

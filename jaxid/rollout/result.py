@@ -3,20 +3,20 @@
 import dataclasses
 from collections.abc import Sequence
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 from scipy import special
 
-from jaxid.arrays import AnyArray, Matrix, Vector
+from jaxid.arrays import Matrix, Vector
 from jaxid.measurement.recording import Recording
 from jaxid.result_table import (
     Column,
     Remark,
     Status,
+    Summarised,
     Table,
+    estimate_columns,
     significant,
-    with_deviations,
 )
 
 from .body_loads import Bodies
@@ -27,7 +27,7 @@ from .determined_combinations import (
 )
 from .errors import RolloutErrors
 from .joint_fits import JointFit
-from .motion import FreeParameters, JointParameters, ServoMotion, local_state
+from .motion import FreeParameters, JointParameters, ServoMotion
 from .servo import INDEX, LOWER, PARAMETERS, UPPER, State
 from .simulation import ServoSimulator
 
@@ -37,15 +37,8 @@ MIN_ROUNDING_RATIO = 1.5
 """Multiple of the encoder's rounding above which slow errors show a missing effect."""
 
 
-class Simulation(NamedTuple):
-    """States at all steps [motions, joints, steps], and steps in each sample time."""
-
-    states: State
-    steps: int
-
-
 @dataclasses.dataclass(frozen=True)
-class ServoFit:
+class ServoFit(Summarised):
     """Identified joints behind position servos.
 
     Attributes:
@@ -162,27 +155,7 @@ class ServoFit:
         Returns:
             Positions of each segment [samples, joints].
         """
-        motion = ServoMotion.of([log])
-        simulation = self._simulation(motion)
-        paths = simulation.states.q[..., :: simulation.steps]
-        return [path[:, :n].T for path, n in zip(paths, motion.lengths, strict=True)]
-
-    def _simulation(self, motion: ServoMotion) -> "Simulation":
-        """Simulate motions; bodies load the joints at the simulated positions."""
-        simulator = ServoSimulator(motion, self.time_step, self.hold, self.bodies)
-        theta = self.parameters
-        start = motion.start.copy()
-        start[..., 2] = self._balanced_integrals(simulator)
-        simulator = simulator.in_agreement(theta, start)
-        return Simulation(simulator.states(theta, start), simulator.steps)
-
-    def _balanced_integrals(self, simulator: ServoSimulator) -> np.ndarray:
-        """Return initial integral actions, which balance the load at rest."""
-        motion = simulator.motion
-        ratios = {symbol: self.parameters[:, k] for symbol, k in INDEX.items()}
-        error = ratios["g"] * motion.sent[..., 0] + ratios["b"] - motion.start[..., 0]
-        load = ratios["a"] * simulator.loads[0][..., 0]
-        return np.where(ratios["ki"] > 0.0, load - error, 0.0)
+        return [path.T for path in self.validate(log).simulated]
 
     def validate(self, logs: Sequence[Recording] | Recording) -> RolloutErrors:
         """Compare free-running simulations with logs, and with simple baselines.
@@ -192,28 +165,49 @@ class ServoFit:
         Args:
             logs: Recordings whose `forces` are the commands.
         """
-        logs = [logs] if isinstance(logs, Recording) else logs
-        motion = ServoMotion.of(logs)
-        simulation = self._simulation(motion)
-        simulated_positions = simulation.states.q[..., :: simulation.steps]
+        simulator, states = self._simulation(logs)
+        motion = simulator.motion
         baseline = ServoSimulator(motion, self.time_step)
         linear_positions = baseline.positions(self.linear, motion.start)
-        lengths = motion.lengths
-        samples = np.arange(max(lengths))
+        samples = np.arange(motion.positions.shape[-1])
         times = motion.begin[:, None] + np.outer(motion.sample_time, samples)
 
-        def cut(x: AnyArray) -> tuple[np.ndarray, ...]:
-            return tuple(y[..., :n] for y, n in zip(x, lengths, strict=True))
+        def cut(x: np.ndarray) -> tuple[np.ndarray, ...]:
+            return tuple(y[..., :n] for y, n in zip(x, motion.lengths, strict=True))
 
         return RolloutErrors(
             self.joint_names,
             motion.names,
             cut(times),
             cut(motion.positions),
-            cut(simulated_positions),
-            cut(motion.sent),
-            cut(linear_positions),
+            cut(states.q),
+            {"linear": cut(linear_positions), "command": cut(motion.sent)},
         )
+
+    def _simulation(
+        self, logs: Sequence[Recording] | Recording
+    ) -> tuple[ServoSimulator, State]:
+        """Simulate logs; bodies load the joints at the simulated positions.
+
+        Returns:
+            The simulator, and the states at the samples [motions, joints, samples].
+        """
+        logs = [logs] if isinstance(logs, Recording) else logs
+        motion = ServoMotion.of(logs)
+        simulator = ServoSimulator(motion, self.time_step, self.hold, self.bodies)
+        start = motion.start.copy()
+        start[..., 2] = self._balanced_integrals(simulator)
+        simulator = simulator.in_agreement(self.parameters, start)
+        states = simulator.states(self.parameters, start)
+        return simulator, State(*(x[..., :: simulator.steps] for x in states))
+
+    def _balanced_integrals(self, simulator: ServoSimulator) -> np.ndarray:
+        """Return initial integral actions, which balance the load at rest."""
+        motion = simulator.motion
+        ratios = {symbol: self.parameters[:, k] for symbol, k in INDEX.items()}
+        error = ratios["g"] * motion.sent[..., 0] + ratios["b"] - motion.start[..., 0]
+        load = ratios["a"] * simulator.loads[0][..., 0]
+        return np.where(ratios["ki"] > 0.0, load - error, 0.0)
 
     def window_errors(
         self, logs: Sequence[Recording] | Recording, horizon: float = 1.0
@@ -227,37 +221,22 @@ class ServoFit:
             logs: Recordings whose `forces` are the commands.
             horizon: Length of the windows [s].
         """
-        logs = [logs] if isinstance(logs, Recording) else logs
-        motion = ServoMotion.of(logs)
-        simulation = self._simulation(motion)
+        simulator, states = self._simulation(logs)
+        motion = simulator.motion
         size = max(3, round(horizon / float(motion.sample_time.mean())))
         places = [
             (k, a, a + size)
             for k, n in enumerate(motion.lengths)
             for a in range(0, n - size + 1, size)
         ]
-        windows = motion.parts(places)
-        starts = []
-        simulated_paths = []
-        for k, a, end in places:
-            rows = simulation.states.q[k][:, :: simulation.steps]
-            n = motion.lengths[k]
-            errors = motion.positions[k][:, :n] - rows[:, :n]
-            change = local_state(errors, a, float(motion.sample_time[k])).state
-            first = a * simulation.steps
-            last = (end - 1) * simulation.steps
-            state = [x[k][:, first] for x in simulation.states]
-            starts.append(np.stack(state, axis=-1) + change)
-            simulated_paths.append(simulation.states.q[k][:, first : last + 1])
-        start = np.stack(starts)
-        path = np.stack(simulated_paths)
-        simulator = ServoSimulator(
-            windows, self.time_step, self.hold, self.bodies, path
-        )
-        simulator = simulator.in_agreement(self.parameters, start)
+        motions, starts, _ = np.array(places).T
+        simulated_states = np.stack(states, axis=-1)[motions, :, starts]
+        errors = dataclasses.replace(motion, positions=motion.positions - states.q)
+        start = simulated_states + errors.parts(places).start
+        simulator = simulator.parts(places).in_agreement(self.parameters, start)
         paths = simulator.positions(self.parameters, start)
-        squares = ((paths - windows.positions) * windows.counted) ** 2
-        return np.sqrt(squares.sum(axis=(0, 2)) / windows.counted.sum(axis=(0, 2)))
+        squares = (paths - simulator.motion.positions) ** 2
+        return np.sqrt(squares.mean(axis=(0, 2)))
 
     def samples(self, count: int, seed: int = 0) -> np.ndarray:
         """Return parameters drawn from their t distributions, within their limits.
@@ -267,16 +246,15 @@ class ServoFit:
             seed: Seed of the draws.
         """
         random = np.random.default_rng(seed)
-        draws = np.tile(self.parameters, (count, 1, 1))
         deviation = np.sqrt(np.diag(self.covariance))
         correlation = self.covariance / deviation / deviation[:, None]
-        values, vectors = np.linalg.eigh(correlation)
-        root = vectors * np.sqrt(np.maximum(values, 0.0))
-        independent_draws = random.normal(size=(count, len(root)))
-        normal_draws = np.clip(independent_draws @ root.T, -7.0, 7.0)
-        probabilities = special.ndtr(normal_draws)
-        changes = deviation * special.stdtrit(self.dof, probabilities)
-        draws[:, self.free] += changes
+        zeros = np.zeros_like(deviation)
+        normal_draws = random.multivariate_normal(
+            zeros, correlation, count, check_valid="ignore", method="eigh"
+        )
+        probabilities = special.ndtr(np.clip(normal_draws, -7.0, 7.0))
+        draws = np.tile(self.parameters, (count, 1, 1))
+        draws[:, self.free] += deviation * special.stdtrit(self.dof, probabilities)
         return np.clip(draws, LOWER, UPPER)
 
     def summary(self) -> Table:
@@ -284,10 +262,7 @@ class ServoFit:
         rows = self.combinations
         estimates = np.array([c.value for c in rows])
         deviations = np.array([c.deviation for c in rows])
-        values, deviation_texts = with_deviations(estimates, deviations)
-        ends = np.array([c.interval() for c in rows]).reshape(-1, 2)
-        lower_ends, _ = with_deviations(ends[:, 0], deviations)
-        upper_ends, _ = with_deviations(ends[:, 1], deviations)
+        ends = np.array([c.interval() for c in rows]).reshape(-1, 2).T
         sizes = np.maximum(np.abs(estimates), 1e-12)
         is_clear = deviations < MAX_RELATIVE_DEVIATION * sizes
         is_clear &= np.array([c.agrees for c in rows], bool)
@@ -319,19 +294,12 @@ class ServoFit:
             Column("joint", [self.joint_names[j] for j in joints]),
             Column("parameter", [c.name for c in rows]),
             Column("meaning", [c.meaning for c in rows]),
-            Column("estimate", values, kind="number"),
-            Column("±", deviation_texts, kind="number"),
-            Column("unit", [self._unit(c) for c in rows]),
-            Column("95 %\nfrom", lower_ends, kind="number"),
-            Column("95 %\nto", upper_ends, kind="number"),
+            *estimate_columns(estimates, deviations, ends, [*map(self._unit, rows)]),
             facts=facts,
             remarks=remarks,
             status=[Status.GOOD if x else Status.DOUBTFUL for x in is_clear],
             rules=joint_rows,
         )
-
-    def __str__(self) -> str:
-        return self.summary().text()
 
 
 def _notes_on_effects(
@@ -370,14 +338,12 @@ def _notes_on_errors(fit: JointFit, joint_names: tuple[str, ...]) -> list[str]:
     """Return a note if errors show that an effect is missing."""
     motion = fit.simulator.motion
     path = fit.simulator.positions(fit.parameters, fit.start)
-    sample_mask = motion.counted > 0
-    joint_errors = []
-    for j, name in enumerate(joint_names):
-        positions = motion.positions[:, j]
-        residuals = path[:, j] - positions
-        rms = systematic_error(residuals, sample_mask[:, j], positions)
-        if rms > 0:
-            joint_errors.append(f"{name} {1e3 * rms:.2g}")
+    rms = systematic_errors(path - motion.positions, motion)
+    joint_errors = [
+        f"{name} {1e3 * error:.2g}"
+        for name, error in zip(joint_names, rms, strict=True)
+        if error > 0.0
+    ]
     if not joint_errors:
         return []
     return [
@@ -388,20 +354,24 @@ def _notes_on_errors(fit: JointFit, joint_names: tuple[str, ...]) -> list[str]:
     ]
 
 
-def systematic_error(r: np.ndarray, counted: np.ndarray, q: np.ndarray) -> float:
-    """Return a joint's RMS error [rad or m] if an effect seems missing; otherwise 0.
+def systematic_errors(residuals: np.ndarray, motion: ServoMotion) -> Vector:
+    """Return RMS errors [rad or m] of joints where an effect seems missing, else 0.
 
     Args:
-        r: Residuals [motions, samples].
-        counted: Whether a sample counts.
-        q: Measured positions.
+        residuals: Errors of the positions [motions, joints, samples].
+        motion: Measured positions.
     """
-    rms = float(np.sqrt(np.mean(r[counted] ** 2)))
-    pair_mask = counted[:, 1:] & counted[:, :-1]
-    neighbours = float(np.mean((r[:, 1:] * r[:, :-1])[pair_mask])) / rms**2
-    steps = np.abs(np.diff(q, axis=-1)).ravel()
-    steps = steps[steps > 1e-6]
+    places = (0, 2)
+    counted = motion.counted
+    r = residuals * counted
+    mean_squares = np.sum(r**2, axis=places) / counted.sum(axis=places)
+    rms = np.sqrt(mean_squares)
+    pair_counts = np.sum(counted[..., 1:] * counted[..., :-1], axis=places)
+    products = np.sum(r[..., 1:] * r[..., :-1], axis=places) / pair_counts
+    steps = np.abs(np.diff(motion.positions))
     # Most steps of a slow joint are the smallest one; interpolated logs have smaller
     # ones, too.
-    rounding = float(np.quantile(steps, 0.1)) / np.sqrt(12.0) if steps.size else 0.0
-    return 0.0 if rms < MIN_ROUNDING_RATIO * rounding or neighbours < 0.5 else rms
+    steps = np.where(steps > 1e-6, steps, np.nan)
+    rounding = np.nanquantile(steps, 0.1, axis=places) / np.sqrt(12.0)
+    is_slow = products > 0.5 * mean_squares
+    return np.where(is_slow & (rms > MIN_ROUNDING_RATIO * rounding), rms, 0.0)

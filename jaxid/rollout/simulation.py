@@ -8,7 +8,7 @@ servos hold their joints so well that few rounds are enough.
 import dataclasses
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -18,7 +18,7 @@ import numpy as np
 from jaxid.arrays import AnyArray, Array, double_precision
 
 from .body_loads import Bodies
-from .motion import ServoMotion
+from .motion import Place, ServoMotion
 from .servo import (
     GAMMA,
     INDEX,
@@ -381,6 +381,16 @@ class ServoSimulator:
         if self.bodies is None:
             return self
         return dataclasses.replace(self, path=self.states(theta, start).q)
+
+    def parts(self, places: Sequence[Place]) -> "ServoSimulator":
+        """Return the simulator of parts of its motions, along the same loads."""
+        path = None
+        if self.path is not None:
+            steps = self.steps
+            path = np.stack(
+                [self.path[k][:, a * steps : (b - 1) * steps + 1] for k, a, b in places]
+            )
+        return dataclasses.replace(self, motion=self.motion.parts(places), path=path)
 
     def in_agreement(self, theta: np.ndarray, start: np.ndarray) -> "ServoSimulator":
         """Return the simulator with loads that agree with its simulation."""

@@ -9,8 +9,12 @@ from jaxid.dynamics.model import Model
 from jaxid.dynamics.terms import RigidBodies
 from jaxid.errors import InputError
 from jaxid.measurement.columns import Columns
-from jaxid.report.servo_rollout_report import RolloutReport
-from jaxid.report.torque_rollout_report import TorqueRolloutReport
+from jaxid.report.rollout_report import (
+    RolloutReport,
+    ServoRolloutReport,
+    TorqueRolloutReport,
+    servo_findings,
+)
 from jaxid.result_table import Remark, Status
 from jaxid.rollout import (
     Bodies,
@@ -54,15 +58,9 @@ class TorqueSettings:
 
     Attributes:
         horizon: With torques: length of the windows that are simulated [s].
-        gains: With torques: whether gains of the other joints' torques, relative to the
-            first joint's, are identified.
-        load_friction: With torques: whether friction that grows with the torque is
-            identified.
     """
 
     horizon: Positive = 0.2
-    gains: bool = False
-    load_friction: bool = False
 
 
 def identify_rollout_from_logs(
@@ -72,7 +70,7 @@ def identify_rollout_from_logs(
     settings: ServoSettings | TorqueSettings,
     verify: Paths = (),
     progress: Progress = ignore_progress,
-) -> RolloutReport | TorqueRolloutReport:
+) -> RolloutReport:
     """Identify a robot so that simulations follow its positions, and simulate.
 
     Args:
@@ -118,11 +116,15 @@ def _follow_commands(
     )
     progress("simulating", 0.0)
     test_recordings = unseen_recordings or training_recordings
-    errors = fit.validate(test_recordings)
-    window_errors = fit.window_errors(test_recordings)
-    is_unseen = bool(unseen_recordings)
-    return RolloutReport(
-        setup.robot, fit, errors, window_errors, is_unseen, settings.samples, {}
+    return ServoRolloutReport(
+        setup.robot,
+        fit.validate(test_recordings),
+        bool(unseen_recordings),
+        servo_findings(fit),
+        {},
+        fit,
+        fit.window_errors(test_recordings),
+        settings.samples,
     )
 
 
@@ -148,10 +150,13 @@ def _follow_torques(
     settings: TorqueSettings,
     verify: Sequence[Path],
     progress: Progress,
-) -> TorqueRolloutReport:
-    """Identify the model of `identify_logs`, beside other methods."""
+) -> RolloutReport:
+    """Identify the model of `identify_logs`, beside the fit of torques."""
     if setup.load_friction:
-        raise InputError("give `rollout.load_friction`, not `model.load`.")
+        raise InputError(
+            "`model.load` is for `jaxid identify`: simulations know no friction that "
+            "grows with torque. Leave it out."
+        )
     progress("finding base parameters", 0.0)
     base = setup.base
     setup = select_filter(setup, logs, columns, progress)
@@ -160,13 +165,13 @@ def _follow_torques(
     training_logs = observations[: len(logs)]
     unseen_logs = observations[len(logs) :]
     progress("identifying", 0.0)
-    fit = identify_torque_rollout(base, training_logs, **dataclasses.asdict(settings))
+    fit = identify_torque_rollout(base, training_logs, horizon=settings.horizon)
     progress("simulating", 0.0)
+    errors = fit.validate(unseen_logs or training_logs)
     findings = [Remark(note) for note in setup.notes]
     for log in loaded_logs:
         findings += [Remark(text, Status.DOUBTFUL) for text in log.findings]
         findings += [Remark(note) for note in log.observations.notes]
-    is_unseen = bool(unseen_logs)
     return TorqueRolloutReport(
-        fit, unseen_logs or training_logs, is_unseen, findings, {}
+        setup.robot, errors, bool(unseen_logs), findings, {}, fit
     )

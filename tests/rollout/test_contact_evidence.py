@@ -64,8 +64,9 @@ def commands():
 def errors_of(measured, simulated):
     """Return errors of one motion."""
     names = ("turn", "lift", "elbow")
-    columns = [(x,) for x in (TIME, measured, simulated, commands(), simulated)]
-    return jid.rollout.RolloutErrors(names, ("log",), *columns)
+    columns = [(x,) for x in (TIME, measured, simulated)]
+    baselines = {"command": (commands(),)}
+    return jid.rollout.RolloutErrors(names, ("log",), *columns, baselines)
 
 
 def test_a_table_is_found_at_its_height():

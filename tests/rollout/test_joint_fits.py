@@ -1,5 +1,7 @@
 """Least squares of joints, their uncertainty, and joints of one kind."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import simulated_joints
@@ -91,7 +93,7 @@ def test_deviations_are_at_least_those_of_independent_errors(logs):
     path = fit.simulator.positions(fit.parameters, fit.start)
     error = 1e-3
     signs = (-1.0) ** np.arange(path.shape[-1])
-    motion = fit.simulator.motion.replace(positions=path + error * signs)
+    motion = dataclasses.replace(fit.simulator.motion, positions=path + error * signs)
     fit = JointFit.of(
         ServoSimulator(motion), fit.parameters, fit.free, start=fit.start
     ).weighed_by_errors()

@@ -157,12 +157,12 @@ def test_a_report_with_torques(driven, monkeypatch):
     ]
     done = CliRunner().invoke(app, words, catch_exceptions=False)
     assert done.exit_code == 0, done.output
-    assert "Simulations are closer to the robot" in done.output
+    assert "The simulation is closer to the robot" in done.output
     found = json.loads((driven / "out" / "rollout.json").read_text())
     assert (found["kind"], found["horizon"]) == ("torques", 0.1)
     assert found["errors"]["unseen"]
     errors = found["errors"]
-    ratio = np.array(errors["rollouts"]) / np.array(errors["fit_of_torques"])
+    ratio = np.array(errors["simulated"]) / np.array(errors["fit_of_torques"])
     assert (ratio < 0.3).all()
     delay = next(x for x in found["parameters"] if x["name"] == "delay")
     assert delay["estimate"] == pytest.approx(driven_pendulum.LATE + 0.001, abs=5e-4)
