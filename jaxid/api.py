@@ -32,6 +32,8 @@ from .excitation.design import design_excitation as design_excitation
 from .excitation.design_result import ExcitationPlan as ExcitationPlan
 from .excitation.problem import ExcitationProblem as ExcitationProblem
 from .export import (
+    as_mujoco as as_mujoco,
+    as_pinocchio as as_pinocchio,
     export_c as export_c,
     export_mjcf as export_mjcf,
     export_urdf as export_urdf,
@@ -49,7 +51,7 @@ from .identification.drive_gains import identify_drive_gains as identify_drive_g
 from .identification.encoder_resolution import resolution_bias as resolution_bias
 from .identification.estimators import WeightedLeastSquares as WeightedLeastSquares
 from .identification.filter_selection import choose_filter as choose_filter
-from .identification.fit_result import Fit as Fit, load_fit as load_fit
+from .identification.fit_result import Fit as Fit
 from .identification.friction_laws import (
     identify_nonlinear_friction as identify_nonlinear_friction,
     identify_presliding as identify_presliding,
@@ -57,6 +59,7 @@ from .identification.friction_laws import (
 )
 from .identification.identify import identify as identify
 from .identification.many_data_sets import identify_batch as identify_batch
+from .identification.model_file import load_fit as load_fit
 from .identification.operating_states import identify_states as identify_states
 from .identification.parameter_changes import compare as compare
 from .identification.payload import identify_payload as identify_payload

@@ -109,6 +109,21 @@ def _table(log: jid.Recording, degrees: bool) -> pl.DataFrame:
     return pl.DataFrame(columns)
 
 
+def _write_lerobot(log: jid.Recording, folder: Path) -> None:
+    """Write a log as LeRobot's hub has it: lists of degrees, two episodes."""
+    folder.mkdir(parents=True)
+    angles = np.rad2deg(log.angles)
+    half = SAMPLES // 2
+    episodes = np.repeat([0, 1], half)
+    columns = {
+        "observation.state": angles.tolist(),
+        "action": angles.tolist(),
+        "timestamp": STEP * np.tile(np.arange(half), 2),
+        "episode_index": episodes,
+    }
+    pl.DataFrame(columns).write_parquet(folder / "file-000.parquet")
+
+
 def _log(model: jid.Model, p, seed: int, alone: int | None = None) -> jid.Recording:
     """A log of all joints, or of one that moves alone."""
     n = model.robot.joints
@@ -158,6 +173,7 @@ def given(tmp_path_factory):
     (folder / "logs").mkdir()
     for k, one in enumerate((log, second)):
         _table(one, degrees=False).write_parquet(folder / "logs" / f"{k}.parquet")
+    _write_lerobot(log, folder / "lerobot" / "data" / "chunk-000")
     jid.simulation.write_example(folder / "example")
     base = jid.base_parameters(model)
     smooth, every = jid.ZeroPhaseButterworth(10.0), jid.Subsample(40)

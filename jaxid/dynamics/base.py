@@ -2,6 +2,7 @@
 
 import enum
 import functools
+import re
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -96,6 +97,15 @@ class BaseParameters(Summarised, Hashable):
         """Units of the base parameters."""
         units = self.model.parameter_units
         return tuple(units[k] for k in self.indices)
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """Terms of the leading parameters in words, like `viscous friction`."""
+        kinds = []
+        for term in self.model.terms:
+            words = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", type(term).__name__).lower()
+            kinds += [words] * len(term.parameters(self.model.robot))
+        return tuple(kinds[k] for k in self.indices)
 
     @functools.cached_property
     def expressions(self) -> tuple[str, ...]:

@@ -7,8 +7,9 @@ from .jax_function import (
     export_jax as export_jax,
     exported_function as exported_function,
 )
-from .mujoco_model import export_mjcf as export_mjcf
-from .pinocchio_inertias import (
+from .mujoco_model import as_mujoco as as_mujoco, export_mjcf as export_mjcf
+from .pinocchio_model import (
+    as_pinocchio as as_pinocchio,
     export_pinocchio as export_pinocchio,
     pinocchio_parameters as pinocchio_parameters,
 )

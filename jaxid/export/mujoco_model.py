@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxid.arrays import AnyArray, Vector
 from jaxid.identification.fit_result import Fit
-from jaxid.io import FilePath, write_text
+from jaxid.io import FilePath, import_extra, write_text
 from jaxid.robot.follower_joints import Follower
 from jaxid.robot.inertia import BodyParameters, Inertia
 from jaxid.robot.mjcf import exact_text
@@ -42,12 +42,32 @@ def export_mjcf(fit: Fit, path: FilePath) -> Path:
     Raises:
         InputError: If the bodies of the fit cannot exist.
     """
+    write_text(path, _text_of(fit))
+    return Path(path)
+
+
+def as_mujoco(fit: Fit) -> Any:
+    """Return the identified robot as a `mujoco.MjSpec`, which others can extend.
+
+    It is what `export_mjcf` writes: attach it to a scene, add sensors, or `compile` it.
+
+    Args:
+        fit: Physically consistent fit.
+
+    Raises:
+        InputError: If the bodies of the fit cannot exist, or MuJoCo is not installed.
+    """
+    mujoco = import_extra("mujoco", "mujoco", "`as_mujoco` needs")
+    return mujoco.MjSpec.from_string(_text_of(fit))
+
+
+def _text_of(fit: Fit) -> str:
+    """Return the MJCF of a fit, with a comment on what it cannot describe."""
     bodies = feasible_bodies(fit, "an MJCF file")
     dynamics = joint_dynamics(fit)
     comment = f" Model of {origin_comment(fit, dynamics.omissions)}"
     robot = fit.base.model.robot
-    write_text(path, mjcf_text(robot, bodies, dynamics.values, comment=comment))
-    return Path(path)
+    return mjcf_text(robot, bodies, dynamics.values, comment=comment)
 
 
 def mjcf_text(

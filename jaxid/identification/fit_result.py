@@ -2,8 +2,8 @@
 
 import dataclasses
 import hashlib
+import importlib
 import json
-import re
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,12 @@ from jaxid.arrays import (
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
-from jaxid.io import from_json, json_text, read_json, to_json, write_text
+from jaxid.io import (
+    import_extra,
+    json_text,
+    to_json,
+    write_text,
+)
 from jaxid.measurement.observations import Observations
 from jaxid.result_table import (
     Column,
@@ -156,6 +161,53 @@ class Fit(Summarised, eqx.Module):
             half_widths = half_widths + np.abs(self.consistency.shift)
         lower_ends = self.parameters - half_widths
         return np.stack([lower_ends, self.parameters + half_widths], axis=1)
+
+    def draws(self, count: int, *, seed: int = 0) -> Float[AnyArray, "draws base"]:
+        """Return random parameters, as likely as `covariance` and `intervals` say.
+
+        A consistent estimate widens its intervals, but not these. Bodies of a draw can
+        be impossible where the logs determine little.
+
+        Args:
+            count: Number of draws.
+            seed: Seed of the random numbers.
+
+        Raises:
+            InputError: If the logs leave a parameter open altogether.
+        """
+        return self.parameters + self.uncertainty.random_errors(count, seed)
+
+    def columns(self) -> dict[str, Any]:
+        """Return names, estimates and intervals, as `parameters.csv` holds them."""
+        intervals = self.intervals(0.95)
+        return {
+            "name": self.base.names,
+            "expression": self.base.expressions,
+            "unit": self.base.units,
+            "group": self.base.kinds,
+            "estimate": np.asarray(self.parameters),
+            "standard_deviation": self.standard_deviations,
+            "open_share": self.open_shares,
+            "low_95": intervals[:, 0],
+            "high_95": intervals[:, 1],
+            "degrees_of_freedom": self.uncertainty.dof,
+            "naive_standard_deviation": self.naive_standard_deviations,
+            "ratio_to_naive": self.uncertainty.ratios,
+        }
+
+    def to_polars(self) -> Any:
+        """Return `columns` as a `polars.DataFrame`: one row for each parameter."""
+        polars = importlib.import_module("polars")
+        return polars.DataFrame(self.columns())
+
+    def to_pandas(self) -> Any:
+        """Return `columns` as a `pandas.DataFrame`: one row for each parameter.
+
+        Raises:
+            InputError: If pandas is not installed.
+        """
+        pandas = import_extra("pandas", "pandas", "`to_pandas` needs")
+        return pandas.DataFrame(self.columns())
 
     @property
     def open_shares(self) -> BaseVector:
@@ -375,83 +427,10 @@ class Fit(Summarised, eqx.Module):
         return to_json(fit)
 
 
-def load_fit(path: str | Path) -> Fit:
-    """Read a fit from a model file, as `Fit.save` and `jaxid identify` write it.
-
-    Numbers are the same to the last bit, and everything works as it did after
-    `identify`. Your own terms are found if the module that defines them is imported;
-    nothing in a file is executed.
-
-    Args:
-        path: Path of the file.
-
-    Raises:
-        OSError: If the file cannot be read.
-        InputError: If it is no model file, of another version, or not as it was
-            written.
-    """
-    try:
-        document = read_json(path)
-    except ValueError as error:
-        raise InputError(
-            f"`{path}` is no model file: it cannot be read as JSON."
-        ) from error
-    if not isinstance(document, dict) or document.get("format") != FORMAT:
-        raise InputError(f"`{path}` is no model file, as `save` writes it.")
-    if document.get("version") != VERSION:
-        raise InputError(
-            f"`{path}` is a model file of version {document.get('version')!r:.20}, "
-            f"but this jaxid reads version {VERSION}: identify again."
-        )
-    content = document.get("model")
-    if document.get("checksum") != checksum_of(content):
-        raise InputError(
-            f"`{path}` is damaged or was changed by hand: save the model again."
-        )
-    try:
-        fit = from_json(content, Fit)
-        _check(fit)
-    except (ValueError, TypeError) as error:
-        reason = " ".join(str(error).split()).rstrip(".")
-        raise InputError(
-            f"`{path}` holds no model that can be used: {reason}."
-        ) from error
-    return fit
-
-
 def checksum_of(content: Any) -> str:
     """Return the SHA-256 of plain JSON values, whatever their layout in a file."""
     text = json.dumps(content, sort_keys=True, separators=(",", ":"), ensure_ascii=True)
     return f"sha256:{hashlib.sha256(text.encode()).hexdigest()}"
-
-
-def _check(fit: Fit) -> None:
-    """Reject arrays of a file that do not belong to its robot."""
-    base = fit.base
-    n = base.size
-    joints = base.model.robot.joints
-    parameters = sorted((*base.indices, *base.dependent))
-    if parameters != [*range(base.model.size)]:
-        raise InputError("`indices` and `dependent` must hold each parameter once")
-    arrays = {
-        "kappa": (base.kappa, (n, len(base.dependent))),
-        "parameters": (fit.parameters, (n,)),
-        "covariance": (fit.covariance, (n, n)),
-        "weights": (fit.weights, (joints,)),
-    }
-    for name, (array, shape) in arrays.items():
-        if np.shape(array) != shape:
-            raise InputError(
-                f"`{name}` must have the shape {shape}, but has {np.shape(array)}"
-            )
-    if not np.isfinite(fit.parameters).all():
-        raise InputError("`parameters` must hold finite numbers")
-    if not re.fullmatch(r"(\d{4}-\d{2}-\d{2})?", fit.date, re.ASCII):
-        raise InputError(f"`date` must be like 2026-01-31, but is {fit.date!r:.40}")
-    texts = [fit.name, *fit.recordings, *fit.notes, *base.names, *base.units]
-    for text in texts:
-        if not text.isprintable():
-            raise InputError(f"the text {text!r:.40} must be printable")
 
 
 def interval_table(

@@ -1,7 +1,6 @@
 """Comparison of two fits: which parameters have changed (Sec. 6)."""
 
 import enum
-import re
 from collections.abc import Sequence
 from typing import Any
 
@@ -10,7 +9,6 @@ import numpy as np
 from scipy import special
 
 from jaxid.arrays import AnyArray, Float, Indices, Matrix, Texts, Vector
-from jaxid.dynamics.base import BaseParameters
 from jaxid.result_table import (
     Column,
     Status,
@@ -77,7 +75,7 @@ class Comparison(Summarised, eqx.Module):
     @property
     def kinds(self) -> Texts:
         """Kind of each parameter, such as `viscous friction`."""
-        return self._select(parameter_kinds(self.first.base))
+        return self._select(self.first.base.kinds)
 
     def _select(self, words: Sequence[str]) -> Texts:
         return tuple(words[k] for k in self.indices)
@@ -334,13 +332,3 @@ def equality_test(
     return joint_test(
         contrast @ estimates.ravel(), contrast @ covariance @ contrast.T, dof
     )
-
-
-def parameter_kinds(base: BaseParameters) -> Texts:
-    """Return the term of each leading parameter in words, like `viscous friction`."""
-    model = base.model
-    kinds = []
-    for term in model.terms:
-        words = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", type(term).__name__).lower()
-        kinds += [words] * len(term.parameters(model.robot))
-    return tuple(kinds[k] for k in base.indices)

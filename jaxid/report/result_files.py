@@ -10,7 +10,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from jaxid.errors import InputError
-from jaxid.identification.fit_result import Fit, load_fit
+from jaxid.identification.fit_result import Fit
+from jaxid.identification.model_file import load_fit
 from jaxid.identification.parameter_changes import LEVEL, Comparison, Verdict
 from jaxid.io import atomic_folder, json_text, read_json
 from jaxid.result_table import Remark, Status
@@ -27,9 +28,9 @@ from .result_records import (
     Record,
     comparison_rows,
     header,
-    parameter_rows,
     plain,
     result_record,
+    table_rows,
 )
 from .torques import bar_figure, torque_figure
 
@@ -55,7 +56,7 @@ def write_report(folder: Path, report: Report, suffix: str = "") -> list[Path]:
         for name, figure in zip(pictures, figures.values(), strict=False):
             figure.save(staging / name)
         write_json(staging / "result.json", record)
-        write_csv(staging / "parameters.csv", parameter_rows(report.fit))
+        write_csv(staging / "parameters.csv", table_rows(**report.fit.columns()))
         report.fit.save(staging / MODEL)
         (staging / "report.html").write_text(page, encoding="utf-8")
     return [folder / name for name in names]

@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxid.arrays import AnyArray
 from jaxid.identification.fit_result import Fit
-from jaxid.identification.parameter_changes import Comparison, parameter_kinds
+from jaxid.identification.parameter_changes import Comparison
 from jaxid.identification.uncertainty import Uncertainty
 from jaxid.result_table import versions
 from jaxid.robot.robot import Robot
@@ -69,7 +69,7 @@ def result_record(report: Report) -> Record:
         **header("result.json"),
         "verdict": verdict_rows(judge(report)),
         "robot": robot.name,
-        "base_parameters": parameter_rows(fit),
+        "base_parameters": table_rows(**fit.columns()),
         "fit": {
             "estimator": fit.estimator,
             "recordings": fit.recordings,
@@ -111,25 +111,6 @@ def consistency_record(fit: Fit) -> Record | None:
         estimate=fit.full_parameters,
     )
     return {**vars(fit.consistency), "standard_parameters": parameters}
-
-
-def parameter_rows(fit: Fit) -> list[Record]:
-    """Return the base parameters, one row for each, in their order."""
-    intervals = fit.intervals(0.95)
-    return table_rows(
-        name=fit.base.names,
-        expression=fit.base.expressions,
-        unit=fit.base.units,
-        group=parameter_kinds(fit.base),
-        estimate=fit.parameters,
-        standard_deviation=fit.standard_deviations,
-        open_share=fit.open_shares,
-        low_95=intervals[:, 0],
-        high_95=intervals[:, 1],
-        degrees_of_freedom=fit.uncertainty.dof,
-        naive_standard_deviation=fit.naive_standard_deviations,
-        ratio_to_naive=fit.uncertainty.ratios,
-    )
 
 
 def _error_record(errors: TorqueErrors, robot: Robot) -> Record:

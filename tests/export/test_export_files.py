@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import trees
 from export_samples import fit_of, motion, possible
 from lxml import etree
 
@@ -314,6 +315,43 @@ def test_the_mjcf_gives_the_same_torques_in_mujoco(fit, tmp_path, name):
     np.testing.assert_array_equal(model.dof_damping, joints["damping"])
     np.testing.assert_array_equal(model.dof_frictionloss, joints["friction"])
     assert fit.checksum in path.read_text("utf-8")
+
+
+def test_pinocchio_gets_a_tree_whose_branches_are_mixed():
+    pin = pytest.importorskip("pinocchio")
+    rng = np.random.default_rng(1)
+    # Joint 4 belongs to the branch of joint 2: Pinocchio wants it before joint 3.
+    parents, turns = (-1, 0, 0, 1, 2), (True, True, True, True, False)
+    tree = trees.Tree(parents, turns, *trees.geometry(rng, 5), rng.normal(size=3) * 9)
+    limits = jid.Limits(5, position_max=[0.5, 1.0, 1.5, 2.0, 2.5])
+    model = jid.Model(tree.robot(limits=limits))
+    fit, m = fit_of(model, possible(model), full=True), motion(5, 20)
+    theirs = jid.as_pinocchio(fit)
+    assert list(theirs.names)[1:] == ["joint1", "joint2", "joint4", "joint3", "joint5"]
+    places = [theirs.getJointId(name) - 1 for name in model.robot.joint_names]
+    np.testing.assert_array_equal(
+        theirs.upperPositionLimit[places], limits.position_max
+    )
+    damping = joint_dynamics(fit).values["damping"]
+    np.testing.assert_array_equal(theirs.damping[places], damping)
+    order = np.argsort(places)
+    moved = jid.Motion(m.q[:, order], m.qd[:, order], m.qdd[:, order])
+    expected = held(fit, m, drives=True) - damping * m.qd
+    close(pinocchio_torques(pin, theirs, moved)[:, places], expected, 1e-12)
+    # Its mass matrix by the composite bodies is wrong in another order.
+    data = theirs.createData()
+    upper = np.triu(pin.crba(theirs, data, moved.q[0]))[np.ix_(places, places)]
+    ours = np.asarray(model.mass_matrix(fit.standard_parameters, m.q[0]))
+    close(np.maximum(np.abs(upper), np.abs(upper).T), np.abs(ours), 1e-12)
+
+
+def test_mujoco_gets_a_specification_that_can_be_extended(fit):
+    mujoco = pytest.importorskip("mujoco")
+    specification = jid.as_mujoco(fit)
+    specification.worldbody.add_geom(size=[1, 1, 1])
+    model = specification.compile()
+    m = motion(model.nu, 20)
+    close(mujoco_torques(mujoco, model, m), held(fit, m, drives=True), 1e-11)
 
 
 def test_pinocchio_parameters_are_those_of_its_inertias_and_regressor(fit, source):

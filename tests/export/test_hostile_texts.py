@@ -20,7 +20,8 @@ from jaxid.cli.terminal import Terminal
 from jaxid.errors import InputError
 from jaxid.experiment.template import toml_text
 from jaxid.export import c_code
-from jaxid.identification.fit_result import checksum_of, load_fit
+from jaxid.identification.fit_result import checksum_of
+from jaxid.identification.model_file import load_fit
 from jaxid.program.c_writer import CWriter
 from jaxid.report.page import render_page
 from jaxid.result_table import Column, Remark, Table, printable

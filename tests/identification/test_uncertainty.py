@@ -293,6 +293,40 @@ def from_factors(base, o, divisions):
     return blocks, jid.identification.identify.fit_problem(problem, ESTIMATOR)
 
 
+def test_draws_have_the_intervals_and_correlations_of_the_fit(base):
+    truth = standard_parameters(base.model)
+    log = observations(base.model, truth, noise=np.full(2, 0.1))
+    fit = jid.identify(base, log)
+    draws = fit.draws(20_000, seed=3)
+    np.testing.assert_array_equal(draws[:5], fit.draws(20_000, seed=3)[:5])
+    deviations = fit.standard_deviations
+    ends = np.quantile(draws, [0.025, 0.975], axis=0)
+    error = (ends - fit.intervals(0.95).T) / deviations
+    assert np.abs(error).max() < 0.1
+    correlation = fit.covariance / np.outer(deviations, deviations)
+    # Errors of 20,000 draws are 0.007; heavy tails take little of a correlation.
+    assert np.abs(np.corrcoef(draws.T) - correlation).max() < 0.06
+
+
+def test_frames_hold_what_the_fit_says(base):
+    log = observations(base.model, standard_parameters(base.model))
+    fit = jid.identify(base, log)
+    frame = fit.to_polars()
+    assert frame.height == base.size
+    np.testing.assert_array_equal(frame["estimate"], fit.parameters)
+    np.testing.assert_array_equal(frame["high_95"], fit.intervals(0.95)[:, 1])
+    assert tuple(frame["expression"]) == base.expressions
+    try:
+        import pandas
+    except ImportError:
+        with pytest.raises(jid.InputError, match=r"pip install.*pandas"):
+            fit.to_pandas()
+    else:
+        pandas.testing.assert_series_equal(
+            fit.to_pandas()["unit"], pandas.Series(base.units, name="unit")
+        )
+
+
 def test_factors_alone_are_judged_by_blocks(base):
     o = observations(base.model, standard_parameters(base.model), noise=0.3)
     blocks, fit = from_factors(base, o, 12)

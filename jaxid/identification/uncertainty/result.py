@@ -69,6 +69,28 @@ class Uncertainty(eqx.Module):
         dof = np.clip(self.dof, 1.0, 1e6)
         return self.standard_deviations * special.stdtrit(dof, 0.5 + 0.5 * level)
 
+    def random_errors(self, count: int, seed: int) -> Float[AnyArray, "draws base"]:
+        """Return errors with these correlations, and t distributed each.
+
+        Raises:
+            InputError: If a variance is infinite.
+        """
+        deviations = self.standard_deviations
+        if not np.isfinite(deviations).all():
+            number = int(np.argmax(~np.isfinite(deviations))) + 1
+            raise InputError(
+                "draws need parameters that the logs determine, "
+                f"but number {number} is open."
+            )
+        correlation = self.covariance / np.outer(deviations, deviations)
+        variances, axes = np.linalg.eigh(correlation)
+        root = axes * np.sqrt(np.clip(variances, 0.0, None))
+        normals = np.random.default_rng(seed).normal(size=(count, len(deviations)))
+        # The t distribution of a parameter has its own degrees of freedom.
+        probabilities = special.ndtr(normals @ root.T)
+        dof = np.clip(self.dof, 1.0, 1e6)
+        return deviations * special.stdtrit(dof, probabilities)
+
 
 def dof_of_sum(a, b, dof_a, dof_b) -> BaseVector:
     """Return the degrees of freedom of sums of two variances (Welch, Satterthwaite)."""
