@@ -11,8 +11,8 @@ as soon as it ends; all of them are written as tables to `results/measured.md`. 
 that fails or takes too long keeps its old figures, is named at the end, and the exit
 code is 1.
 
-`--check` runs every script with `--quick`, the notebooks, and the tests with run-time
-checks of shapes. It prints a table of results, writes it to `results/check.md`, and
+`--check` runs every script with `--quick`, the notebooks, the site, and the tests with
+run-time checks of shapes. It prints a table of results, writes it to `results/check.md`, and
 exits with 1 if something failed. It measures nothing.
 """
 
@@ -214,6 +214,7 @@ def check(scripts, whole):
             sys.executable,
             str(REPOSITORY / "notebooks/run_all.py"),
         ]
+        jobs["docs/build.py"] = [sys.executable, str(REPOSITORY / "docs/build.py")]
         settings = ("JAXID_CHECK_SHAPES=1", "JAX_DISABLE_MOST_OPTIMIZATIONS=0")
         jobs["tests with checked shapes, optimised"] = [
             *("env", *settings, sys.executable, "-m", "pytest")
