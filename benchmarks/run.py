@@ -12,8 +12,8 @@ that fails or takes too long keeps its old figures, is named at the end, and the
 code is 1.
 
 `--check` runs every script with `--quick`, the notebooks, the site, and the tests with
-run-time checks of shapes. It prints a table of results, writes it to `results/check.md`, and
-exits with 1 if something failed. It measures nothing.
+run-time checks of shapes. It prints a table of results, writes it to
+`results/check.md`, and exits with 1 if something failed. It measures nothing.
 """
 
 import argparse

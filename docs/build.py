@@ -171,7 +171,7 @@ def built_pages() -> list[Path]:
 
 
 def broken_links() -> Iterator[str]:
-    """Yield the links of the built pages that lead nowhere, or into the net for code."""
+    """Yield links of the built pages that lead nowhere, and code from the net."""
     pages = {path: lxml.html.parse(path).getroot() for path in built_pages()}
     anchors = {path: set(page.xpath("//@id | //@name")) for path, page in pages.items()}
     for path, page in pages.items():
