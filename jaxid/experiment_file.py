@@ -122,8 +122,11 @@ KEYS: dict[str, tuple[str, ...]] = {
     "rollout": (
         "bodies",
         "stiffness",
+        "damping",
+        "feed_forward",
         "time_step",
         "alike",
+        "contacts",
         "samples",
         "horizon",
     ),

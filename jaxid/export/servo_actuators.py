@@ -1,7 +1,7 @@
 """Identified servos for simulators: MJCF files, and numbers for Isaac Lab."""
 
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
@@ -10,9 +10,10 @@ from lxml.builder import E  # pyright: ignore[reportMissingModuleSource]
 from jaxid.arrays import AnyArray, Joints
 from jaxid.errors import InputError
 from jaxid.io import FilePath, write_text
-from jaxid.result_table import Column, Remark, Status, Table
+from jaxid.result_table import Column, Remark, Status, Table, with_deviation
 from jaxid.robot.mjcf import exact_text
 from jaxid.rollout.body_loads import Bodies
+from jaxid.rollout.determined_combinations import Combination
 from jaxid.rollout.result import ServoFit
 from jaxid.rollout.servo import INDEX, START
 
@@ -34,6 +35,8 @@ UNITS = {
     "feed_forward": ("N m s/rad", "N s/m"),
 }
 """Units of `simulator_values` at joints that turn, and at joints that slide."""
+GAIN_SYMBOLS = {"stiffness": "a", "damping": "B", "feed_forward": "f"}
+"""Parameters of joints that tell the gains of their servos."""
 OPTIONAL_VALUES = ("integral_gain", "feed_forward")
 """Values of `simulator_values` that most servos lack."""
 FEED_FORWARD_CURE = (
@@ -125,12 +128,10 @@ def simulator_table(fit: ServoFit) -> Table:
         fit: Identified servos.
     """
     values = simulator_values(fit)
-    slides = fit.bodies is not None and not all(fit.bodies.model.robot.revolute)
     columns = []
     for name, value in values.items():
         if name not in OPTIONAL_VALUES or value.any():
-            pair = dict.fromkeys(UNITS[name])
-            unit = " or ".join(pair) if slides else UNITS[name][0]
+            unit = " or ".join(dict.fromkeys(_units(fit, name)))
             columns.append(Column(name.replace("_", " "), value, unit))
     remarks: list[Remark | str] = []
     if values["feed_forward"].any():
@@ -149,12 +150,74 @@ def simulator_table(fit: ServoFit) -> Table:
     )
 
 
+def _units(fit: ServoFit, name: str) -> list[str]:
+    """Return the unit of a value of each joint."""
+    bodies = fit.bodies
+    turns = [True] * len(fit.joint_names)
+    if bodies is not None:
+        turns = bodies.model.robot.revolute
+    turning_unit, sliding_unit = UNITS[name]
+    return [turning_unit if is_turning else sliding_unit for is_turning in turns]
+
+
 def _stiffness_sources(fit: ServoFit) -> list[str]:
     """Return where the stiffness of each joint is from."""
     sources = np.where(np.isfinite(fit.stiffness), "weight", "other joints")
-    if fit.given_stiffness is not None:
-        sources = np.where(np.isfinite(fit.given_stiffness), "given", sources)
+    if "stiffness" in fit.gains:
+        sources = np.where(np.isfinite(fit.gains["stiffness"]), "given", sources)
     return sources.tolist()
+
+
+class GainEstimate(NamedTuple):
+    """Gain by the logs, its deviation, and whether it agrees with the one given."""
+
+    value: float
+    deviation: float
+    agrees: bool
+
+
+def gain_finding(fit: ServoFit) -> Remark | None:
+    """Return whether the logs agree with gains that were given; None without any."""
+    if not fit.gains:
+        return None
+    combinations = {(c.joint, c.name): c for c in (*fit.combinations, *fit.compliances)}
+    texts = []
+    status = Status.GOOD
+    for name, values in fit.gains.items():
+        for joint in np.flatnonzero(np.isfinite(values)).tolist():
+            gain = float(values[joint])
+            text = f"{name.replace('_', ' ')} of {fit.joint_names[joint]} {gain:g}"
+            text = f"{text} {_units(fit, name)[joint]}"
+            combination = combinations.get((joint, GAIN_SYMBOLS[name]))
+            if combination is None:
+                texts.append(f"{text}, which the logs do not tell")
+                continue
+            stiffness = float(servo_stiffness(fit)[joint])
+            estimate = _estimate_gain(name, gain, combination, stiffness)
+            value, deviation = with_deviation(estimate.value, estimate.deviation)
+            result = "agrees" if estimate.agrees else "differs"
+            texts.append(f"{text}, estimated {value} ± {deviation}: {result}")
+            if not estimate.agrees:
+                status = Status.DOUBTFUL
+    return Remark(f"Given gains: {'; '.join(texts)}", status)
+
+
+def _estimate_gain(
+    name: str, gain: float, combination: Combination, stiffness: float
+) -> GainEstimate:
+    """Return a gain by the logs; parameters are ratios to the stiffness."""
+    low, high = combination.interval()
+    relative_deviation = combination.deviation / abs(combination.value)
+    if name == "stiffness":
+        value = 1.0 / combination.value
+        agrees = low <= 1.0 / gain <= high
+    else:
+        value = stiffness * combination.value
+        agrees = stiffness * low <= gain <= stiffness * high
+    if name == "damping":
+        # Viscous friction of the joint adds to the servo's damping.
+        agrees = gain <= stiffness * high
+    return GainEstimate(value, relative_deviation * abs(value), agrees)
 
 
 def export_servo_mjcf(

@@ -10,6 +10,7 @@ import numpy as np
 from jaxid.arrays import Vector
 from jaxid.export.servo_actuators import (
     export_servo_mjcf,
+    gain_finding,
     simulator_table,
     simulator_values,
 )
@@ -139,7 +140,7 @@ class RolloutReport:
         errors = self.errors
         logs = "logs that the fit has not seen" if self.unseen else "logs of the fit"
         comparison = Table(
-            f"errors on {logs}, every sample (RMS)",
+            f"errors on {logs}, {errors.sample_words} (RMS)",
             Column("joint", errors.joint_names),
             Column("unit", self._units),
             Column(f"simulation,\n{errors.manner}", 1e3 * errors.total()),
@@ -292,6 +293,11 @@ class ServoRolloutReport(RolloutReport):
 def servo_findings(fit: ServoFit) -> list[Remark]:
     """Return doubts about identified servos, and what motions do not agree on."""
     findings = [Remark(note, Status.DOUBTFUL) for note in fit.notes]
+    gains = gain_finding(fit)
+    if gains is not None:
+        findings.append(gains)
+    if fit.contacts:
+        findings.append(Remark(f"Contacts were given: {fit.contact_words}"))
     disagreements = sum(not c.agrees for c in fit.combinations)
     if disagreements:
         text = (

@@ -82,8 +82,9 @@ def contact_finding(robot: Robot, errors: RolloutErrors) -> str | None:
     table = find_table(robot, errors)
     if table is None:
         return None
-    motions = np.repeat(np.arange(len(errors.time)), [len(t) for t in errors.time])
-    times = np.concatenate(errors.time)
+    sizes = [len(time) for time in errors.time]
+    motions = np.repeat(np.arange(len(sizes)), sizes)[errors.is_counted]
+    times = np.concatenate(errors.time)[errors.is_counted]
     motion = np.bincount(motions[table.below]).argmax()
     span = times[table.below & (motions == motion)]
     return (
@@ -96,8 +97,10 @@ def contact_finding(robot: Robot, errors: RolloutErrors) -> str | None:
 
 def find_table(robot: Robot, errors: RolloutErrors) -> TableContact | None:
     """Return the table that explains most errors; None without evidence."""
-    measured = np.concatenate(errors.measured, axis=1).T
-    simulated = np.concatenate(errors.simulated, axis=1).T
+    # Contacts that were given are known.
+    is_counted = errors.is_counted
+    measured = np.concatenate(errors.measured, axis=1).T[is_counted]
+    simulated = np.concatenate(errors.simulated, axis=1).T[is_counted]
     squares = np.sum((measured - simulated) ** 2, axis=1)
     up = -np.asarray(robot.gravity)
     up /= max(np.linalg.norm(up), 1e-9)

@@ -21,6 +21,7 @@ class RolloutErrors(Summarised):
         time: Instants of the samples of each motion, by the clock of the log [s].
         measured: Measured positions.
         simulated: Simulated positions.
+        counted: Whether a sample counts: 1, or 0 within contacts that were given.
         baselines: Positions of each baseline by its name: `linear` joints and the
             copied `command`, or the `fit_of_torques`.
         manner: How the robot is simulated, like `free-running`.
@@ -31,24 +32,43 @@ class RolloutErrors(Summarised):
     time: tuple[np.ndarray, ...]
     measured: Paths
     simulated: Paths
+    counted: Paths
     baselines: dict[str, Paths]
     manner: str = "free-running"
 
     def rms(self, kind: str = "simulated") -> Matrix:
         """Return RMS errors of `simulated` or of a baseline."""
         paths = {"simulated": self.simulated, **self.baselines}[kind]
-        pairs = zip(paths, self.measured, strict=True)
-        return np.sqrt([np.mean((y - q) ** 2, axis=1) for y, q in pairs])
+        rows = zip(paths, self.measured, self.counted, strict=True)
+        squares = [np.sum(c * (y - q) ** 2, axis=1) for y, q, c in rows]
+        return np.sqrt(squares / self._sizes)
 
     def total(self, kind: str = "simulated") -> Vector:
         """Return root mean square errors over all motions together."""
-        sizes = np.array([len(time) for time in self.time])
-        squares = sizes[:, None] * self.rms(kind) ** 2
-        return np.sqrt(squares.sum(axis=0) / sizes.sum())
+        squares = self._sizes * self.rms(kind) ** 2
+        return np.sqrt(squares.sum(axis=0) / self._sizes.sum(axis=0))
+
+    @property
+    def _sizes(self) -> Matrix:
+        """Number of samples that count, one at least [motions, joints]."""
+        return np.maximum([counted.sum(axis=1) for counted in self.counted], 1.0)
+
+    @property
+    def is_counted(self) -> np.ndarray:
+        """Which samples of all motions, one behind the other, count."""
+        return np.concatenate(self.counted, axis=1)[0] > 0.0
+
+    @property
+    def sample_words(self) -> str:
+        """Which samples count, in words."""
+        left_out = int(np.sum(~self.is_counted))
+        if not left_out:
+            return "every sample"
+        return f"every sample but {left_out} within contacts that were given"
 
     def summary(self) -> Table:
         """Return a table of the errors of all motions."""
         rms = 1e3 * self.rms()
         columns = [Column(name, rms[:, j]) for j, name in enumerate(self.joint_names)]
-        title = f"errors {self.manner}, every sample [mrad or mm]"
+        title = f"errors {self.manner}, {self.sample_words} [mrad or mm]"
         return Table(title, Column("motion", self.motions), *columns)

@@ -15,6 +15,7 @@ from jaxid.errors import InputError
 from jaxid.measurement.recording import Recording
 
 from .body_loads import Bodies
+from .determined_combinations import Combination, determined_combinations
 from .effect_choice import (
     LINEAR_PARAMETERS,
     EffectChoice,
@@ -25,7 +26,7 @@ from .effect_choice import (
 )
 from .equal_joints import joint_groups, pull_equal_joints
 from .joint_fits import RESOLUTION, JointFit
-from .motion import JointParameters, ServoMotion
+from .motion import Contacts, JointParameters, ServoMotion
 from .result import ServoFit
 from .servo import INDEX, LOWER
 from .simulation import ServoSimulator
@@ -54,7 +55,10 @@ def identify_rollout(
     joint_names: Sequence[str] | None = None,
     time_step: float = 0.01,
     stiffness: Numbers | None = None,
+    damping: Numbers | None = None,
+    feed_forward: Numbers | None = None,
     alike: Sequence[Sequence[str]] | None = None,
+    contacts: Contacts = (),
     progress: Progress | None = None,
 ) -> ServoFit:
     """Identify position-controlled joints so that a simulation moves like the robot.
@@ -77,9 +81,15 @@ def identify_rollout(
         time_step: Longest step of the simulation [s].
         stiffness: Known proportional gains of the servos, one for all or one for each
             joint, NaN where unknown [N m/rad or N/m].
+        damping: Known derivative gains, which are compared with the estimates only [N m
+            s/rad or N s/m].
+        feed_forward: Known gains of the command's velocity; likewise.
         alike: Words in the names of joints of one kind, like `[["hip"], ["knee"]]`:
             they are equal as far as the logs do not differ. If None, joints whose names
             differ only in a side are of one kind, like `left_hip` and `right_hip`.
+        contacts: Starts and ends of the times in which something holds the robot, like
+            `[(6.5, 64.7)]`, by the clock of the logs; of all logs, or by the name of
+            the log. These samples do not count [s].
         progress: Callback, called with a stage and its completed fraction (0 to 1).
 
     Raises:
@@ -87,14 +97,23 @@ def identify_rollout(
             stiffness or kinds do not fit the joints.
     """
     logs = [logs] if isinstance(logs, Recording) else list(logs)
-    motion = ServoMotion.of(logs).split()
+    motion = ServoMotion.of(logs, contacts).split()
     _require_motion(motion)
     names = _joint_names(motion, bodies, joint_names)
     groups = joint_groups(names, alike)
-    given_stiffness = _checked_stiffness(stiffness, len(names))
+    all_gains = {
+        "stiffness": stiffness,
+        "damping": damping,
+        "feed_forward": feed_forward,
+    }
+    gains = {
+        name: _checked_gains(name, values, len(names))
+        for name, values in all_gains.items()
+        if values is not None
+    }
     known_compliance = np.full(len(names), np.nan)
-    if bodies is not None and given_stiffness is not None:
-        known_compliance = 1.0 / given_stiffness
+    if bodies is not None and "stiffness" in gains:
+        known_compliance = 1.0 / gains["stiffness"]
 
     count = 0
 
@@ -140,8 +159,25 @@ def identify_rollout(
         groups,
         possible_effects,
         hold_is_told,
-        given_stiffness,
+        gains,
+        _told_compliances(fit, groups, choice.loaded_joints & (known_compliance > 0.0)),
+        contacts,
     )
+
+
+def _told_compliances(
+    fit: JointFit, groups: Sequence[Sequence[int]], joints: np.ndarray
+) -> tuple[Combination, ...]:
+    """Return what the logs tell of the given stiffness of joints under a weight."""
+    if not joints.any():
+        return ()
+    free_mask = fit.free.copy()
+    free_mask[joints, INDEX["a"]] = True
+    trial = JointFit.of(
+        fit.simulator, fit.parameters, free_mask, start=fit.start, weights=fit.weights
+    ).improved(4)
+    combinations = determined_combinations(trial, groups).combinations
+    return tuple(c for c in combinations if c.name == "a" and joints[c.joint])
 
 
 def _linear_baseline(fit: JointFit) -> JointParameters:
@@ -285,15 +321,14 @@ def _joint_names(
     return names
 
 
-def _checked_stiffness(stiffness: Numbers | None, joints: int) -> Vector | None:
-    """Return the stiffness of each joint, NaN where it is unknown."""
-    if stiffness is None:
-        return None
-    values = np.asarray(stiffness, np.float64)
+def _checked_gains(name: str, gains: Numbers, joints: int) -> Vector:
+    """Return a gain of each joint, NaN where it is unknown."""
+    values = np.asarray(gains, np.float64)
     has_shape = values.shape in ((), (joints,))
     if not has_shape or (values <= 0.0).any() or np.isinf(values).any():
+        unit = "N m/rad or N/m" if name == "stiffness" else "N m s/rad or N s/m"
         raise InputError(
-            f"`stiffness` must be a positive number [N m/rad or N/m], or {joints} of "
-            "them, one for each joint."
+            f"`{name}` must be a positive number [{unit}], or {joints} of them, one "
+            "for each joint."
         )
     return np.broadcast_to(values, (joints,)).copy()

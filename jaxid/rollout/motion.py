@@ -3,8 +3,8 @@
 import dataclasses
 import itertools
 import math
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -35,6 +35,10 @@ FreeParameters = Bool[np.ndarray, "joints parameters"]
 """Whether each parameter of each joint is estimated."""
 Place = tuple[int, int, int]
 """Part of a motion: its index, the first sample, and the end."""
+Spans = Sequence[tuple[float, float]]
+"""Starts and ends of stretches of time, by the clock of a log [s]."""
+Contacts = Spans | Mapping[str, Spans]
+"""When something holds the robot: in all logs, or by the name of the log."""
 MotionSamples = Float[np.ndarray, "motions joints samples"]
 """Positions of joints in several motions, or their errors [rad or m]."""
 
@@ -67,43 +71,44 @@ class ServoMotion:
     names: tuple[str, ...]
 
     @classmethod
-    def of(cls, logs: Sequence[Recording]) -> "ServoMotion":
+    def of(cls, logs: Sequence[Recording], contacts: Contacts = ()) -> "ServoMotion":
         """Return the segments of logs whose `forces` are the commands.
 
-        All samples count. Before its first command the robot stands still.
+        All samples count that are not within contacts. Before its first command the
+        robot stands still.
 
         Raises:
-            InputError: If logs have different joints, or no segment lasts longer than a
-                second.
+            InputError: If logs have different joints, no segment lasts longer than a
+                second, or a contact ends before it starts.
         """
         if len({log.joints for log in logs}) != 1:
             raise InputError(
                 "`logs` must hold at least one log, and all with the same joints."
             )
-        parts = [
-            (log, a, b)
-            for log in logs
-            for a, b in log.segments
-            if (b - a) * log.sample_time > 2 * SETTLING_TIME
-        ]
-        if not parts:
-            raise InputError("`logs` hold no segment that lasts longer than a second.")
-        times = np.array([log.sample_time for log, _, _ in parts])
-        lead = math.ceil(MAX_DELAY / times.min())
+        lead = math.ceil(MAX_DELAY / min(log.sample_time for log in logs))
         pieces = []
-        for log, a, b in parts:
-            commands = np.asarray(log.forces)[a:b].T
-            first_commands = np.repeat(commands[:, :1], lead, axis=1)
-            pieces.append(
-                _Piece(
-                    np.concatenate([first_commands, commands], axis=1),
-                    np.asarray(log.angles)[a:b].T,
-                    local_state(np.asarray(log.angles)[a:b].T, 0, log.sample_time),
+        for log in logs:
+            all_positions = np.asarray(log.angles).T
+            all_commands = np.asarray(log.forces).T
+            counted = np.where(_is_in_contact(log, contacts), 0.0, 1.0)
+            all_counted = np.tile(counted, (log.joints, 1))
+            for a, b in log.segments:
+                if (b - a) * log.sample_time <= 2 * SETTLING_TIME:
+                    continue
+                positions = all_positions[:, a:b]
+                piece = _Piece(
+                    np.pad(all_commands[:, a:b], ((0, 0), (lead, 0)), "edge"),
+                    positions,
+                    all_counted[:, a:b],
+                    local_state(positions, 0, log.sample_time),
+                    log.sample_time,
+                    float(log.time[a]),
+                    log.name,
                 )
-            )
-        begin = np.array([float(log.time[a]) for log, a, _ in parts])
-        names = tuple(log.name for log, _, _ in parts)
-        return _stack(pieces, times, begin, names)
+                pieces.append(piece)
+        if not pieces:
+            raise InputError("`logs` hold no segment that lasts longer than a second.")
+        return _stack(pieces)
 
     @property
     def motions(self) -> int:
@@ -119,6 +124,11 @@ class ServoMotion:
     def sent(self) -> MotionSamples:
         """Commands of the samples."""
         return self.commands[..., self.lead :]
+
+    @property
+    def left_out(self) -> int:
+        """Number of samples within contacts that were given."""
+        return sum(self.lengths) - int(self.counted[:, 0].sum())
 
     @property
     def sample_counts(self) -> Matrix:
@@ -148,23 +158,21 @@ class ServoMotion:
 
     def parts(self, places: Sequence[Place]) -> "ServoMotion":
         """Return parts of motions."""
-        pieces = [
-            _Piece(
+        pieces = []
+        for k, a, b in places:
+            dt = float(self.sample_time[k])
+            positions = self.positions[k][:, : self.lengths[k]]
+            piece = _Piece(
                 self.commands[k][:, a : b + self.lead],
-                self.positions[k][:, a:b],
-                local_state(
-                    self.positions[k][:, : self.lengths[k]],
-                    a,
-                    float(self.sample_time[k]),
-                ),
+                positions[:, a:b],
+                self.counted[k][:, a:b],
+                local_state(positions, a, dt),
+                dt,
+                float(self.begin[k]) + a * dt,
+                self.names[k],
             )
-            for k, a, b in places
-        ]
-        indices = [k for k, _, _ in places]
-        times = self.sample_time[indices]
-        starts = np.array([a for _, a, _ in places])
-        names = tuple(self.names[k] for k in indices)
-        return _stack(pieces, times, self.begin[indices] + starts * times, names)
+            pieces.append(piece)
+        return _stack(pieces)
 
 
 class LocalState(NamedTuple):
@@ -180,36 +188,55 @@ class LocalState(NamedTuple):
 
 
 class _Piece(NamedTuple):
-    """Commands and positions of one motion [joints, samples], and its first state."""
+    """One motion: arrays [joints, samples], first state, times [s], name of the log."""
 
     commands: Matrix
     positions: Matrix
+    counted: Matrix
     start: LocalState
+    sample_time: float
+    begin: float
+    name: str
 
 
-def _stack(
-    pieces: Sequence[_Piece], times: Vector, begin: Vector, names: tuple[str, ...]
-) -> ServoMotion:
+def _stack(pieces: Sequence[_Piece]) -> ServoMotion:
     """Return motions as arrays of one length."""
     lengths = tuple(piece.positions.shape[1] for piece in pieces)
     padded_length = max(lengths)
     if len(set(lengths)) > 1:
         padded_length = LENGTH_STEP * math.ceil(padded_length / LENGTH_STEP)
-    lead = pieces[0].commands.shape[1] - lengths[0]
+    gaps = [padded_length - length for length in lengths]
 
-    def pad(x: Matrix, length: int) -> Matrix:
-        return np.pad(x, ((0, 0), (0, length - x.shape[1])), "edge")
+    def pad(arrays: Iterable[Matrix], mode: Any = "edge") -> MotionSamples:
+        pairs = zip(arrays, gaps, strict=True)
+        return np.stack([np.pad(x, ((0, 0), (0, gap)), mode) for x, gap in pairs])
 
-    positions = np.stack([pad(x.positions, padded_length) for x in pieces])
-    commands = np.stack([pad(x.commands, padded_length + lead) for x in pieces])
-    ends = np.array(lengths)[:, None, None]
-    is_sample = np.arange(padded_length) < ends
-    counted = np.where(is_sample, np.ones_like(positions), 0.0)
-    start = np.stack([piece.start.state for piece in pieces])
-    spread = np.stack([piece.start.spread for piece in pieces])
     return ServoMotion(
-        commands, positions, counted, start, spread, times, begin, lengths, names
+        pad(x.commands for x in pieces),
+        pad(x.positions for x in pieces),
+        # Behind its end a motion does not count.
+        pad((x.counted for x in pieces), "constant"),
+        np.stack([x.start.state for x in pieces]),
+        np.stack([x.start.spread for x in pieces]),
+        np.array([x.sample_time for x in pieces]),
+        np.array([x.begin for x in pieces]),
+        lengths,
+        tuple(x.name for x in pieces),
     )
+
+
+def _is_in_contact(log: Recording, contacts: Contacts) -> np.ndarray:
+    """Return which samples of a log are within contacts that were given."""
+    spans = contacts.get(log.name, ()) if isinstance(contacts, Mapping) else contacts
+    within = np.zeros(len(log.time), bool)
+    for start, end in spans:
+        if not start < end:
+            raise InputError(
+                f"`contacts`: each is a start and a later end [s], not {start:g} and "
+                f"{end:g}."
+            )
+        within |= (log.time >= start) & (log.time <= end)
+    return within
 
 
 def local_state(q: Matrix, index: int, dt: float) -> LocalState:

@@ -1,7 +1,7 @@
 """Fit of position-controlled joints: determined parameters, and errors of rollouts."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 
 import numpy as np
@@ -27,7 +27,7 @@ from .determined_combinations import (
 )
 from .errors import RolloutErrors
 from .joint_fits import JointFit
-from .motion import FreeParameters, JointParameters, ServoMotion
+from .motion import Contacts, FreeParameters, JointParameters, ServoMotion
 from .servo import INDEX, LOWER, PARAMETERS, UPPER, State
 from .simulation import ServoSimulator
 
@@ -57,8 +57,11 @@ class ServoFit(Summarised):
         load: Mean absolute load of each joint in the logs [N m or N].
         notes: Doubts about the model, in sentences.
         hold_is_told: Whether the logs tell held commands from interpolated ones.
-        given_stiffness: Stiffness of each servo as far as it was given, else NaN [N
-            m/rad or N/m].
+        gains: Gains of the servos that were given by name (`stiffness`, `damping`,
+            `feed_forward`), NaN where unknown.
+        compliances: What the logs tell of `1 / stiffness` where it was given.
+        contacts: When something held the robot, as it was given [s].
+        left_out: Number of samples within them, which the fit left out.
     """
 
     joint_names: tuple[str, ...]
@@ -76,7 +79,10 @@ class ServoFit(Summarised):
     load: Vector
     notes: tuple[str, ...] = ()
     hold_is_told: bool = True
-    given_stiffness: Vector | None = None
+    gains: Mapping[str, Vector] = dataclasses.field(default_factory=dict)
+    compliances: tuple[Combination, ...] = ()
+    contacts: Contacts = ()
+    left_out: int = 0
 
     @classmethod
     def of(
@@ -86,8 +92,10 @@ class ServoFit(Summarised):
         joint_names: tuple[str, ...],
         groups: Sequence[Sequence[int]],
         undetermined: FreeParameters,
-        hold_is_told: bool = True,
-        given_stiffness: Vector | None = None,
+        hold_is_told: bool,
+        gains: Mapping[str, Vector],
+        compliances: tuple[Combination, ...],
+        contacts: Contacts,
     ) -> "ServoFit":
         """Return the fit of all joints, with its uncertainty."""
         simulator = fit.simulator
@@ -113,7 +121,10 @@ class ServoFit(Summarised):
                 *_notes_on_errors(fit, joint_names),
             ),
             hold_is_told,
-            given_stiffness,
+            gains,
+            compliances,
+            contacts,
+            motion.left_out,
         )
 
     @cached_property
@@ -122,9 +133,8 @@ class ServoFit(Summarised):
 
         It is given, or told by a known weight.
         """
-        values = np.full(len(self.joint_names), np.nan)
-        if self.given_stiffness is not None:
-            values = self.given_stiffness.copy()
+        unknown = np.full(len(self.joint_names), np.nan)
+        values = self.gains.get("stiffness", unknown).copy()
         for c in self.combinations:
             if c.name == "a" and c.deviation < MAX_RELATIVE_DEVIATION * abs(c.value):
                 values[c.joint] = 1.0 / c.value
@@ -139,6 +149,11 @@ class ServoFit(Summarised):
         if not self.hold:
             rival = "held until the next one, delays are half a sample time shorter"
         return f"{description}; the logs do not tell: if they are {rival}"
+
+    @property
+    def contact_words(self) -> str:
+        """Effect of the contacts that were given on the fit, in words."""
+        return f"{self.left_out} samples within them are left out of the fit"
 
     def _unit(self, c: Combination) -> str:
         """Return the unit of a parameter of a revolute or linear joint."""
@@ -160,7 +175,7 @@ class ServoFit(Summarised):
     def validate(self, logs: Sequence[Recording] | Recording) -> RolloutErrors:
         """Compare free-running simulations with logs, and with simple baselines.
 
-        Every sample counts.
+        Every sample counts, but those within contacts that were given.
 
         Args:
             logs: Recordings whose `forces` are the commands.
@@ -181,6 +196,7 @@ class ServoFit(Summarised):
             cut(times),
             cut(motion.positions),
             cut(states.q),
+            cut(motion.counted),
             {"linear": cut(linear_positions), "command": cut(motion.sent)},
         )
 
@@ -193,7 +209,7 @@ class ServoFit(Summarised):
             The simulator, and the states at the samples [motions, joints, samples].
         """
         logs = [logs] if isinstance(logs, Recording) else logs
-        motion = ServoMotion.of(logs)
+        motion = ServoMotion.of(logs, self.contacts)
         simulator = ServoSimulator(motion, self.time_step, self.hold, self.bodies)
         start = motion.start.copy()
         start[..., 2] = self._balanced_integrals(simulator)
@@ -235,8 +251,9 @@ class ServoFit(Summarised):
         start = simulated_states + errors.parts(places).start
         simulator = simulator.parts(places).in_agreement(self.parameters, start)
         paths = simulator.positions(self.parameters, start)
-        squares = (paths - simulator.motion.positions) ** 2
-        return np.sqrt(squares.mean(axis=(0, 2)))
+        windows = simulator.motion
+        squares = ((paths - windows.positions) * windows.counted) ** 2
+        return np.sqrt(squares.sum(axis=(0, 2)) / windows.counted.sum(axis=(0, 2)))
 
     def samples(self, count: int, seed: int = 0) -> np.ndarray:
         """Return parameters drawn from their t distributions, within their limits.
@@ -284,6 +301,8 @@ class ServoFit(Summarised):
             ("commands", self._commands),
             ("stiffness", K or "not determined: all parameters are ratios to it"),
         ]
+        if self.contacts:
+            facts.append(("contacts given", self.contact_words))
         remarks: list[Remark | str] = [
             "positions determine inertias, friction, load and motor gain only in their "
             "ratios to the stiffness",

@@ -250,6 +250,7 @@ class TorqueRolloutFit(Summarised):
             tuple(times),
             measured,
             simulated,
+            tuple(map(np.ones_like, measured)),
             {"fit_of_torques": torque_fit},
             f"in windows of {self.horizon:g} s",
         )

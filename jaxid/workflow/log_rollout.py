@@ -27,6 +27,9 @@ from .log_identification import require_separate_logs
 from .log_loading import load_logs, read_commands, select_filter
 from .setup import Paths, Progress, Setup, ignore_progress
 
+Span = tuple[float, float]
+"""Start and end of a stretch of time [s]."""
+
 
 @dataclasses.dataclass(frozen=True)
 class ServoSettings:
@@ -38,17 +41,26 @@ class ServoSettings:
         stiffness: Stiffness (proportional gain) of the servos if it is known [N m/rad
             or N/m], like `12.0`, or a list with `nan` where it is not; otherwise a
             known weight tells it.
+        damping: Derivative gain of the servos if it is known, for a comparison with the
+            estimate [N m s/rad or N s/m].
+        feed_forward: Gain of the command's velocity if it is known; likewise.
         time_step: Longest step of the simulation [s].
         alike: Words in the names of joints of one kind, like `[["hip"], ["knee"]]`:
             they are equal as far as the logs do not differ. By default joints whose
             names differ only in a side are of one kind.
+        contacts: When something holds the robot, by the clock of the logs, like
+            `[[6.5, 64.7]]`, or by the name of the log, as in `{ sines = [[6.5, 64.7]]
+            }`; these samples do not count [s].
         samples: Number of MJCF files drawn from the distribution of the estimates.
     """
 
     bodies: bool | None = None
     stiffness: Positive | list[float] | None = None
+    damping: Positive | list[float] | None = None
+    feed_forward: Positive | list[float] | None = None
     time_step: Positive = 0.01
     alike: list[list[str]] | None = None
+    contacts: list[Span] | dict[str, list[Span]] | None = None
     samples: Annotated[int, Bounds(minimum=0, maximum=10_000)] = 0
 
 
@@ -111,7 +123,10 @@ def _follow_commands(
         joint_names=setup.robot.joint_names,
         time_step=settings.time_step,
         stiffness=settings.stiffness,
+        damping=settings.damping,
+        feed_forward=settings.feed_forward,
         alike=settings.alike,
+        contacts=settings.contacts or (),
         progress=progress,
     )
     progress("simulating", 0.0)

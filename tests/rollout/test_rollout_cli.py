@@ -1,6 +1,7 @@
 """`jaxid rollout`: from experiment files and logs, with torques or not, to reports."""
 
 import json
+import re
 
 import driven_pendulum
 import mujoco
@@ -79,7 +80,12 @@ def test_a_report_without_torques(folder, monkeypatch):
 
 def test_known_gains_beside_what_the_logs_tell(folder, monkeypatch):
     monkeypatch.chdir(folder)
-    text = FILE.replace("samples = 2", "stiffness = [12.0, nan]")
+    gains = """
+stiffness = [12.0, 11.0]
+damping = [0.5, 1.3]
+feed_forward = [nan, 0.1]
+contacts = { short_1 = [[4.0, 6.0]] }"""
+    text = FILE.replace("samples = 2", gains)
     (folder / "known.toml").write_text(text)
     words = [
         "rollout",
@@ -94,11 +100,21 @@ def test_known_gains_beside_what_the_logs_tell(folder, monkeypatch):
     assert "not validated on an unseen log" in done.output
     found = json.loads((folder / "known" / "rollout.json").read_text())
     assert found["verdict"][0]["status"] == "doubtful"
-    np.testing.assert_allclose(
-        found["simulators"]["stiffness"], servo_arm.KP, rtol=0.02
+    assert found["simulators"]["stiffness"] == [12.0, 11.0]
+    findings = {x["text"]: x["status"] for x in found["verdict"]}
+    (text,) = [x for x in findings if x.startswith("Given gains: ")]
+    assert findings[text] == "doubtful"
+    stiffness, *others = text.removeprefix("Given gains: ").split("; ")
+    # No weight acts on the first joint.
+    assert stiffness == "stiffness of turn 12 N m/rad, which the logs do not tell"
+    # The second joint has 15.
+    assert re.match(
+        r"stiffness of lift 11 N m/rad, estimated 1[45]\.\d+ ± 0\.\d+: differs",
+        others[0],
     )
-    assert found["simulators"]["stiffness"][0] == 12.0
-    assert np.max(found["errors"]["simulated"]) < 1e-3
+    assert re.match(r"damping of turn 0.5 N m s/rad, .*: agrees", others[1])
+    assert re.match(r"damping of lift 1.3 N m s/rad, .*: differs", others[2])
+    assert others[3].endswith("which the logs do not tell.")
 
 
 def test_a_missing_column_of_commands_is_named(folder, monkeypatch):

@@ -47,6 +47,35 @@ def test_every_sample_counts_in_the_errors_though_something_holds_the_robot(fit)
     assert errors.total()[1] > 0.02
 
 
+def test_samples_within_contacts_that_were_given_count_nowhere(fit):
+    """A table holds the second joint in one of four motions, again and again."""
+    logs = [servo_arm.log(k) for k in range(4)]
+    held = logs[1] = servo_arm.log(1, block=0.05)
+    near = held.angles[:, 1] > 0.045
+    edges = np.flatnonzero(np.diff(near.astype(int), prepend=0, append=0))
+    times = np.append(held.time, held.time[-1])[edges].reshape(-1, 2)
+    spans = [(start - 0.05, end + 0.2) for start, end in times.tolist()]
+    known = jid.identify_rollout(
+        logs, servo_arm.bodies(False), contacts={held.name: spans}
+    )
+    np.testing.assert_allclose(known.stiffness[1], servo_arm.KP[1], rtol=0.02)
+    assert known.left_out > 50
+    assert f"{known.left_out} samples within them are left out" in str(known)
+
+    errors = known.validate(logs)
+    assert errors.total().max() < 1e-3
+    inside = [(held.time >= a) & (held.time <= b) for a, b in spans]
+    outside = ~np.any(inside, axis=0)
+    assert f"every sample but {np.sum(~outside)} within contacts" in str(errors)
+    (path,) = known.simulate(held)
+    squares = (path - held.angles)[outside] ** 2
+    np.testing.assert_allclose(errors.rms()[1], np.sqrt(squares.mean(axis=0)))
+    assert known.window_errors(logs).max() < 2e-3
+    assert fit.validate(logs).total()[1] > 0.01
+    with pytest.raises(jid.InputError, match="`contacts`"):
+        jid.identify_rollout(logs, contacts=[(2.0, 1.0)])
+
+
 @pytest.mark.parametrize("horizon", [0.1, 1.0])
 def test_windows_do_not_smooth_a_fast_motion_away(fit, horizon):
     """A chirp to 8 Hz of a perfect model, whose commands come late."""
