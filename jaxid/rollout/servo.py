@@ -84,15 +84,19 @@ class StageInputs(NamedTuple):
     """Inputs of an implicit Euler stage, of which each step has two.
 
     Attributes:
-        command: Delayed command.
-        command_rate: Its derivative by time [1/s].
+        first_command: Delayed command in the first part of the step.
+        second_command: That in the second part.
+        first_share: Share of the first part.
+        command_rate: Mean derivative of the command by time [1/s].
         load: Torque of the bodies [N m or N].
         inertia: Inertia of the bodies [kg m² or kg].
         share: Fraction of the step by which the position moves.
         ahead: Factor of the change of velocity with which the next stage starts.
     """
 
-    command: Any
+    first_command: Any
+    second_command: Any
+    first_share: Any
     command_rate: Any
     load: Any
     inertia: Any
@@ -116,14 +120,23 @@ def advance_stage(
     duration = GAMMA * h
 
     load = a * inputs.load
-    error = g * inputs.command + b - q
     integral_factor = 1.0 + ki * duration
-    drive = integral_factor * error + integral + f * g * inputs.command_rate
-    force = jnp.clip(drive, -um, um) - load
+    feed_forward = f * g * inputs.command_rate
+
+    def mean_of_parts(first: Array, second: Array) -> Array:
+        return second + inputs.first_share * (first - second)
+
+    def drive_of(command: Array) -> Array:
+        return integral_factor * (g * command + b - q) + integral + feed_forward
+
+    # A held command jumps within the step: the mean command would saturate otherwise.
+    drives = drive_of(inputs.first_command), drive_of(inputs.second_command)
+    force = mean_of_parts(*(jnp.clip(drive, -um, um) for drive in drives)) - load
     friction = F + mu * jnp.abs(load) + Fs * jnp.exp(-((w / vs) ** 2))
 
     # The position at the end of the stage counts in the error, unless it saturates.
-    servo_resistance = jnp.where(jnp.abs(drive) < um, integral_factor * duration, 0.0)
+    is_within = (jnp.where(jnp.abs(drive) < um, 1.0, 0.0) for drive in drives)
+    servo_resistance = mean_of_parts(*is_within) * integral_factor * duration
     inertia = (J + a * inputs.inertia) / duration
     resistance = inertia + B + servo_resistance
 
@@ -135,5 +148,7 @@ def advance_stage(
     # A joint that has stopped in the first stage starts the second one at rest.
     next_velocity = jnp.where(is_moving, w + inputs.ahead * (u - w), 0.0)
     step = inputs.share * h
+    command = mean_of_parts(inputs.first_command, inputs.second_command)
+    error = g * command + b - q
     next_integral = integral + step * ki * (error - duration * u)
     return State(q + step * u, next_velocity, next_integral)

@@ -76,21 +76,35 @@ class Moments(NamedTuple):
 class DelayedCommand(NamedTuple):
     """Command of each stage for the delay at which it was evaluated.
 
+    Held commands may jump within a step: they have two parts. Others have equal ones.
+
     Attributes:
-        value: Command.
-        slope: Its derivative by time [1/s].
+        first: Command in the first part of the step.
+        second: Command in the second part.
+        first_share: Share of the first part.
+        slope: Derivative of both by time [1/s].
         rate: Mean derivative by time over the step [1/s].
         bend: Derivative of `rate` by time [1/s²].
     """
 
-    value: Array
+    first: Array
+    second: Array
+    first_share: Array
     slope: Array
     rate: Array
     bend: Array
 
-    def at(self, lateness: Array) -> tuple[Array, Array]:
-        """Return command and rate if they come later by a small time [s]."""
-        return self.value - self.slope * lateness, self.rate - self.bend * lateness
+    def at(self, lateness: Array, h: Array) -> tuple[Array, Array, Array, Array]:
+        """Return both commands, share and rate if they come later by a small time.
+
+        Args:
+            lateness: Time by which they come later [s].
+            h: Time of a step [s].
+        """
+        change = self.slope * lateness
+        share = self.first_share + lateness / h
+        rate = self.rate - self.bend * lateness
+        return self.first - change, self.second - change, share, rate
 
 
 def delayed_command(
@@ -98,8 +112,8 @@ def delayed_command(
 ) -> DelayedCommand:
     """Return the commands of both stages of steps that end at these instants.
 
-    Commands are interpolated; or they are held until the next one, and count with their
-    mean over the step. Before the first and behind the last they stand still.
+    Commands are interpolated, or they are held until the next one. Before the first and
+    behind the last they stand still.
 
     Args:
         commands: Commands [samples].
@@ -109,41 +123,34 @@ def delayed_command(
     """
     held = _held_command(commands, ends)
     interpolated = _interpolated_command(commands, ends)
-    value, slope, rate, bend = (
-        jnp.where(hold, x, y) for x, y in zip(held, interpolated, strict=True)
+    command = DelayedCommand(
+        *(jnp.where(hold, x, y) for x, y in zip(held, interpolated, strict=True))
     )
-    return DelayedCommand(
-        value, slope / sample_time, rate / sample_time, bend / sample_time**2
+    return command._replace(
+        slope=command.slope / sample_time,
+        rate=command.rate / sample_time,
+        bend=command.bend / sample_time**2,
     )
 
 
 def _held_command(commands: Array, ends: Array) -> DelayedCommand:
-    """Return held commands by the mean over each step; times are in samples."""
+    """Return held commands; times are in samples, and steps no longer than one."""
     length = jnp.diff(ends)
-    integral = _integral_of_held(commands, ends)
-    mean = jnp.diff(integral) / length
-
     last_index = len(commands) - 1
-    indices = jnp.floor(ends).astype(int)
+    jump_times = jnp.floor(ends)
+    indices = jump_times.astype(int)
     end_commands = commands[jnp.clip(indices, 0, last_index)]
+    first_share = jnp.clip((jump_times[1:] - ends[:-1]) / length, 0.0, 1.0)
     rate = jnp.diff(end_commands) / length
     # Held commands jump: their second derivatives are those of neighbours.
     slopes = jnp.asarray(jnp.gradient(commands))
     bends = jnp.asarray(jnp.gradient(slopes))
     bend = _interpolate(bends, ends[1:])
-    by_step = DelayedCommand(mean, rate, rate, bend)
+    slope = jnp.zeros_like(rate)
+    by_step = DelayedCommand(
+        end_commands[:-1], end_commands[1:], first_share, slope, rate, bend
+    )
     return DelayedCommand(*(jnp.repeat(x, 2) for x in by_step))
-
-
-def _integral_of_held(commands: Array, instants: Array) -> Array:
-    """Return the integral of held commands from the first sample to instants."""
-    last_index = len(commands) - 1.0
-    sums = jnp.cumsum(commands[:-1])
-    integral = jnp.concatenate([jnp.zeros(1), sums])
-    time_before = jnp.minimum(instants, 0.0)
-    time_behind = jnp.maximum(instants - last_index, 0.0)
-    inside = _interpolate(integral, instants)
-    return inside + time_before * commands[0] + time_behind * commands[-1]
 
 
 def _interpolated_command(commands: Array, ends: Array) -> DelayedCommand:
@@ -163,8 +170,11 @@ def _interpolated_command(commands: Array, ends: Array) -> DelayedCommand:
 
     rate = jnp.diff(_interpolate(commands, ends)) / length
     bend = jnp.diff(slope_at(ends)) / length
+    command = _interpolate(commands, stage_ends)
     return DelayedCommand(
-        _interpolate(commands, stage_ends),
+        command,
+        command,
+        jnp.ones_like(command),
         slope_at(stage_ends),
         jnp.repeat(rate, 2),
         jnp.repeat(bend, 2),
@@ -214,7 +224,7 @@ def _path(
 
         def advance(state: State, stage_inputs: tuple[DelayedCommand, Array, Array]):
             command, share, ahead = stage_inputs
-            stage = StageInputs(*command.at(lateness), load, inertia, share, ahead)
+            stage = StageInputs(*command.at(lateness, h), load, inertia, share, ahead)
             return advance_stage(state, theta, stage, h), None
 
         # A loop: XLA would fuse two stages into one long expression, twice as slow.
