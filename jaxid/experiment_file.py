@@ -124,7 +124,6 @@ KEYS: dict[str, tuple[str, ...]] = {
         "stiffness",
         "damping",
         "feed_forward",
-        "time_step",
         "alike",
         "contacts",
         "samples",

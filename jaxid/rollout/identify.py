@@ -35,6 +35,8 @@ MIN_FALL = 1e-3
 """Fall of the errors' mean logarithm that continues the refinement."""
 MAX_ROUNDS = 8
 """Largest number of rounds of the refinement."""
+TIME_STEP = 0.01
+"""Longest step in which commands are compared [s]."""
 CHOICE_ROUNDS = 2
 """Rounds after which held and interpolated commands are compared."""
 MAX_STEP_ERROR = 0.05
@@ -53,7 +55,6 @@ def identify_rollout(
     bodies: Bodies | None = None,
     *,
     joint_names: Sequence[str] | None = None,
-    time_step: float = 0.01,
     stiffness: Numbers | None = None,
     damping: Numbers | None = None,
     feed_forward: Numbers | None = None,
@@ -78,7 +79,6 @@ def identify_rollout(
             held-out errors (or `coupled` says so). Without them a joint has a constant
             bias.
         joint_names: Names of the joints; those of the model, or numbers, if None.
-        time_step: Longest step of the simulation [s].
         stiffness: Known proportional gains of the servos, one for all or one for each
             joint, NaN where unknown [N m/rad or N/m].
         damping: Known derivative gains, which are compared with the estimates only [N m
@@ -124,12 +124,12 @@ def identify_rollout(
         count += 1
 
     # Choices show in long steps, too.
-    search_step = max(time_step, float(motion.sample_time.max()))
+    search_step = float(motion.sample_time.max())
     simulator = ServoSimulator(motion, search_step, bodies=bodies)
     choice = EffectChoice.start(simulator, groups, known_compliance, advance)
     linear_parameters = _linear_baseline(choice.fit)
     # Held commands that count as interpolated ones would imitate a feed-forward.
-    fine_fit, _ = _with_better_commands(choice.with_effects(("f",)), time_step)
+    fine_fit, _ = _with_better_commands(choice.with_effects(("f",)), TIME_STEP)
     if fine_fit.simulator.hold:
         held_simulator = dataclasses.replace(simulator, hold=True)
         held_fit = _with_simulator(choice.fit, held_simulator, choice.fit.parameters)
@@ -142,7 +142,7 @@ def identify_rollout(
 
     if progress is not None:
         progress("refining", 0.0)
-    fit, hold_is_told = _with_better_commands(fit, time_step)
+    fit, hold_is_told = _with_better_commands(fit, TIME_STEP)
     fit = without_imitations(fit, groups)
     undetermined = undetermined_effects(fit)
     # An effect that is zero is none.

@@ -44,7 +44,6 @@ class ServoSettings:
         damping: Derivative gain of the servos if it is known, for a comparison with the
             estimate [N m s/rad or N s/m].
         feed_forward: Gain of the command's velocity if it is known; likewise.
-        time_step: Longest step of the simulation [s].
         alike: Words in the names of joints of one kind, like `[["hip"], ["knee"]]`:
             they are equal as far as the logs do not differ. By default joints whose
             names differ only in a side are of one kind.
@@ -58,7 +57,6 @@ class ServoSettings:
     stiffness: Positive | list[float] | None = None
     damping: Positive | list[float] | None = None
     feed_forward: Positive | list[float] | None = None
-    time_step: Positive = 0.01
     alike: list[list[str]] | None = None
     contacts: list[Span] | dict[str, list[Span]] | None = None
     samples: Annotated[int, Bounds(minimum=0, maximum=10_000)] = 0
@@ -121,7 +119,6 @@ def _follow_commands(
         training_recordings,
         bodies_of_file(setup, settings),
         joint_names=setup.robot.joint_names,
-        time_step=settings.time_step,
         stiffness=settings.stiffness,
         damping=settings.damping,
         feed_forward=settings.feed_forward,

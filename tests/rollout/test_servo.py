@@ -132,9 +132,7 @@ def test_integral_action_of_a_servo_that_saturates_is_found_and_exported(tmp_pat
     """Logs of MuJoCo's PID controller; the proportional gain is known."""
     pid = {"ki": 3.0, "limit": 1.6}
     logs = [servo_arm.log(k, **pid) for k in range(4)]
-    # A torque that saturates within a step needs shorter steps than the usual ones.
-    options = {"stiffness": servo_arm.KP, "time_step": 0.0025}
-    fit = jid.identify_rollout(logs, servo_arm.bodies(False), **options)
+    fit = jid.identify_rollout(logs, servo_arm.bodies(False), stiffness=servo_arm.KP)
     np.testing.assert_allclose(fit.parameters[:, INDEX["ki"]], 3.0, rtol=0.02)
     np.testing.assert_array_equal(fit.stiffness, servo_arm.KP)
     values = simulator_values(fit)
@@ -215,9 +213,7 @@ def test_commands_of_the_wrong_sign_are_named():
         angles = signs * log.angles
         logs.append(jid.Recording.of(angles, log.forces, sample_time=0.02))
     shares = []
-    fit = jid.identify_rollout(
-        logs, time_step=0.02, progress=lambda _, share: shares.append(share)
-    )
+    fit = jid.identify_rollout(logs, progress=lambda _, share: shares.append(share))
     signed = [note for note in fit.notes if "check signs" in note]
     assert all(note.startswith("joint 1") for note in signed)
     assert len(signed) > 0
