@@ -6,6 +6,7 @@ decimal points. Estimates and their deviations are rounded together: `values, de
 = with_deviations(p, s)` are texts for two columns of `kind="number"`.
 """
 
+import copy
 import dataclasses
 import enum
 import functools
@@ -267,8 +268,12 @@ class Summarised:
         """Return all tables of the result."""
         return (self.summary(),)
 
+    def overview(self) -> "Sequence[Table]":
+        """Return what matters most, in few lines: what `print` shows."""
+        return self.tables()
+
     def __str__(self) -> str:
-        return "\n\n".join(map(str, self.tables()))
+        return "\n\n".join(map(str, self.overview()))
 
     def _repr_html_(self) -> str:
         return "".join(table._repr_html_() for table in self.tables())
@@ -301,6 +306,16 @@ class Table:
         self.remarks = tuple(Remark(x) if isinstance(x, str) else x for x in remarks)
         self.status = tuple(status)
         self.rules = frozenset(rules)
+
+    def select(self, rows: Sequence[int]) -> "Table":
+        """Return title and columns with some of the rows."""
+        columns = []
+        for column in self.columns:
+            selected_column = copy.copy(column)
+            selected_column.values = tuple(column.values[k] for k in rows)
+            columns.append(selected_column)
+        status = [self.status[k] for k in rows] if self.status else ()
+        return Table(self.title, *columns, status=status)
 
     @property
     def rows(self) -> list[tuple[str, ...]]:

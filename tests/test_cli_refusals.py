@@ -88,6 +88,12 @@ COMMANDS = [
         "excite experiment.toml -o a.csv",
         "`a.csv` is there already, and no motion of `jaxid exc",
     ),
+    (
+        "identify a.csv experiment.toml",
+        "`a.csv` is a log; the experiment file comes first, then the logs",
+    ),
+    ("inspect a.csv", "`a.csv` is a log; the experiment file comes first"),
+    ("inspect arm.urdf", "`jaxid init arm.urdf > experiment.toml` writes one"),
     ("excite experiment.toml -o motion", "`motion` must end in .csv"),
     ("excite experiment.toml -o truth.csv", "`truth.json` is there al"),
     ("excite experiment.toml -o mine.csv", "`mine.ros.yaml` is there al"),
@@ -102,6 +108,7 @@ def test_commands(folder, run, words, sentence):  # noqa: F811
     (folder / "pictures").mkdir()
     (folder / "pictures" / "report.html").write_text("mine")
     (folder / "loop.csv").symlink_to("loop.csv")
+    (folder / "arm.urdf").write_text("<robot/>")
     (folder / "image.csv").write_bytes(b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR")
     header, *rows = (folder / "a.csv").read_text().splitlines()
     rows[2:9] = [row + ",1" for row in rows[2:9]]
@@ -148,6 +155,7 @@ QUICKLY = [
     "identify experiment.toml a.csv -o a.csv",
     "identify experiment.toml a.csv --verify b.csv c.csv",
     "identify no_toml.toml a.csv",
+    "identify a.csv experiment.toml",
     "identify table.toml a.csv",
     "inspect key.toml",
     "inspect column.toml a.csv",
@@ -204,7 +212,7 @@ def test_damaged_results(folder, first, run):  # noqa: F811
 def test_a_terminal_of_few_characters_shows_the_rest_as_marks(folder, monkeypatch):  # noqa: F811
     terminal = io.TextIOWrapper(io.BytesIO(), "ascii")
     monkeypatch.setattr(sys, "stdout", terminal)
-    monkeypatch.setattr(sys, "argv", ["jaxid", "inspect", "experiment.toml"])
+    monkeypatch.setattr(sys, "argv", ["jaxid", "inspect", "experiment.toml", "-v"])
     with pytest.raises(SystemExit) as ended:
         main()
     assert ended.value.code == 0

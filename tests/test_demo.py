@@ -7,7 +7,7 @@ import pytest
 from golden_results import TOLERANCE, compare
 
 import jaxid as jid
-from jaxid.demo.results import error_table, paper_table, remarks, tables, write_study
+from jaxid.demo.results import DemoResult, error_table, paper_table, write_study
 from jaxid.demo.study import run_study
 from jaxid.identification.parameter_changes import Verdict
 
@@ -83,6 +83,6 @@ def test_tables_and_files_say_the_same(found, tmp_path):
     assert record["base_parameters"] == 44
     weighted = record["estimates"]["weighted"]
     assert weighted["mean_percent_verification"] == found.weighted_model.mean_errors(1)
-    said = "\n".join(map(str, (*tables(found), *remarks(found))))
+    said = "\n".join(map(str, DemoResult(found).tables()))
     assert "mx2 + 0.05*m3 - mz4" in said
     assert "predicts the torques of every axis" in said

@@ -19,12 +19,12 @@ from jaxid.result_table import Remark, Status, versions
 from jaxid.robot.xml_files import read_xml
 
 from . import options, payload_gains_states_rollout, report_commands, terminal
+from .command_help import EXIT_CODES, Command
 
 app = typer.Typer(
     name="jaxid",
     help="Identifies the dynamic parameters of robots: from a log to a model.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
@@ -36,7 +36,7 @@ def main() -> None:
         sys.stdout.reconfigure(errors="replace")
     try:
         options.require_one_log_per_option()
-        app()
+        app(prog_name="jaxid")
     except (InputError, OSError, RuntimeError) as error:
         if isinstance(error, RuntimeError) and type(error) is not RuntimeError:
             raise  # of JAX, not a failed search
@@ -56,11 +56,11 @@ def _options(
         raise typer.Exit
 
 
-@app.command()
 def demo(
     output: options.OutputFolder = Path("demo"),
     seed: options.Seed = 0,
     force: options.Force = False,
+    detail: options.Detail = None,
 ) -> None:
     """Run the whole method on a virtual seven-axis robot.
 
@@ -68,21 +68,20 @@ def demo(
     verification on the path of ISO 9283.
     """
     console = options.start(output=output, force=force)
-    from jaxid.demo.results import remarks, tables, write_study
+    from jaxid.demo.results import DemoResult, write_study
     from jaxid.demo.study import run_study
 
     with terminal.progress_bar() as progress:
         study = run_study(seed, progress)
         progress("writing the report", 0.0)
         files = write_study(output, study)
-    terminal.show(console, *tables(study))
-    terminal.show_remarks(console, remarks(study))
-    terminal.show_files(console, output, files)
+    terminal.show_result(console, detail, DemoResult(study), output, files)
 
 
-@app.command()
 def example(
-    folder: Annotated[Path, typer.Argument(help="Folder of the files.", metavar="DIR")],
+    folder: Annotated[
+        Path, typer.Argument(help="Folder of the files.", metavar="FOLDER")
+    ],
 ) -> None:
     """Write an experiment to try things on.
 
@@ -99,13 +98,10 @@ def example(
     )
 
 
-@app.command()
 def init(
     urdf: Annotated[
         Path,
-        typer.Argument(
-            help="The robot's URDF, xacro or MJCF file.", metavar="ARM.URDF"
-        ),
+        typer.Argument(help="The robot's URDF, xacro or MJCF file.", metavar="ROBOT"),
     ],
     tip: options.Tip = None,
     base: options.Base = None,
@@ -126,20 +122,19 @@ def init(
     typer.echo(text.encode(), nl=False)  # TOML is UTF-8, whatever the terminal is
 
 
-@app.command()
 def excite(
     experiment: options.ExperimentFile,
     output: Annotated[
         Path,
-        typer.Option("-o", "--output", metavar="FILE.CSV", help="Table of the motion."),
+        typer.Option(
+            "-o", "--output", metavar="FILE", help="Table of the motion (.csv)."
+        ),
     ] = Path("trajectory.csv"),
-    time: Annotated[
-        float | None,
-        typer.Option("--time", metavar="S", min=1.0, help="Time for the search [s]."),
-    ] = None,
+    time: options.Time = None,
     resume: Annotated[
         bool, typer.Option("--resume", help="Go on with the motion that was written.")
     ] = False,
+    detail: options.Detail = None,
 ) -> None:
     """Design the motion to record, within the limits of the joints.
 
@@ -156,8 +151,6 @@ def excite(
             f"`{earlier_design}` is not there: `--resume` needs a motion to go on with."
         )
     console = options.start(experiment=experiment)
-    from jaxid.report.excitation_page import motion_verdict, plan_remarks, sort_remarks
-
     from .best_motion import BestMotion
 
     options.refuse_foreign_table(output)
@@ -174,21 +167,15 @@ def excite(
         progress("writing the report", 0.0)
         origin = options.report_origin(content.text)
         files = jid.workflow.write_design(task, design, output, **origin)
-    terminal.show(console, *design.plan.tables())
-    verdict = motion_verdict(design.plan, design.remarks)
-    remarks = sort_remarks((*plan_remarks(design.plan), *design.remarks))
-    terminal.show_remarks(console, [*remarks, verdict])
-    terminal.show_files(console, output.parent, files)
-    if verdict.status is Status.BAD:
-        raise typer.Exit(options.UNUSABLE_CODE)
+    terminal.show_result(console, detail, design, output.parent, files)
 
 
-@app.command()
 def inspect(
     experiment: options.ExperimentFile,
     logs: Annotated[
         options.Paths | None, typer.Argument(help="Logs to examine.", metavar="LOG")
     ] = None,
+    detail: options.Detail = None,
 ) -> None:
     """Show what can be identified, and check logs for mistakes.
 
@@ -198,27 +185,18 @@ def inspect(
     """
     logs = logs or []
     console = options.start(*logs, experiment=experiment)
-    from jaxid.report.identification_page import motor_tables
-
     content = jid.experiment.load_experiment(experiment)
-    setup = content.setup
-    notes = setup.notes
-    tables = []
     with terminal.progress_bar() as progress:
         progress("finding base parameters", 0.0)
-        base_table = setup.base.summary()
+        inspection = jid.workflow.Inspection(content.setup)
         if logs:
             columns = content.require_columns(logs)
-            inspection = jid.workflow.inspect_logs(setup, logs, columns, progress)
-            notes = inspection.notes
-            tables = inspection.tables()
-    robot = setup.robot
-    terminal.show(console, robot.summary(), *motor_tables(robot), base_table)
-    terminal.show_remarks(console, notes)
-    terminal.show(console, *tables)
+            inspection = jid.workflow.inspect_logs(
+                content.setup, logs, columns, progress
+            )
+    terminal.show_result(console, detail, inspection, Path())
 
 
-@app.command()
 def identify(
     experiment: options.ExperimentFile,
     logs: options.Logs,
@@ -226,8 +204,8 @@ def identify(
     split: Annotated[
         float | None,
         typer.Option(
-            metavar="F",
-            help="Fit the first fraction F (0-1) of each log, validate with the rest.",
+            metavar="SHARE",
+            help="Fit the first share of each log, like 0.6, validate with the rest.",
         ),
     ] = None,
     output: options.OutputFolder = Path("report"),
@@ -236,6 +214,7 @@ def identify(
         typer.Option(help="Also write each figure to a file of this format."),
     ] = None,
     force: options.Force = False,
+    detail: options.Detail = None,
 ) -> None:
     """Estimate the parameters and write a report.
 
@@ -264,13 +243,9 @@ def identify(
         report = dataclasses.replace(report, settings=settings)
         progress("writing the report", 0.0)
         files = report.save(output, figures or "")
-    terminal.show(console, *report.tables())
-    terminal.show_files(console, output, files)
-    if report.verdict.status is Status.BAD:
-        raise typer.Exit(options.UNUSABLE_CODE)
+    terminal.show_result(console, detail, report, output, files)
 
 
-@app.command()
 def choose(
     experiment: options.ExperimentFile,
     logs: options.Logs,
@@ -283,11 +258,9 @@ def choose(
             help="The experiment file to write; by default chosen.toml beside yours.",
         ),
     ] = None,
-    seconds: Annotated[
-        float | None,
-        typer.Option("--time", metavar="S", min=1.0, help="Time for the search [s]."),
-    ] = None,
+    seconds: options.Time = None,
     force: options.Force = False,
+    detail: options.Detail = None,
 ) -> None:
     """Choose the effects of the model by errors on unseen data.
 
@@ -310,11 +283,17 @@ def choose(
         progress("writing the page", 0.0)
         origin = options.report_origin(content.text)
         write_model_choice(page, choice, content.setup.robot, origin)
-    terminal.show(console, choice.summary())
-    terminal.show_files(console, output.parent, [output, page])
+    terminal.show_result(console, detail, choice, output.parent, [output, page])
 
 
 for command in (
+    demo,
+    example,
+    init,
+    excite,
+    inspect,
+    identify,
+    choose,
     report_commands.export,
     report_commands.compare,
     payload_gains_states_rollout.payload,
@@ -322,4 +301,4 @@ for command in (
     payload_gains_states_rollout.states,
     payload_gains_states_rollout.rollout,
 ):
-    app.command()(command)
+    app.command(cls=Command, epilog=EXIT_CODES)(command)

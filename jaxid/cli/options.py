@@ -15,24 +15,38 @@ from jaxid.experiment_file import (
     read_experiment_text,
     require_text_columns,
 )
+from jaxid.measurement.text_format import TEXT_SUFFIXES
 
 from .terminal import open_console
 
-UNUSABLE_CODE = 3
-"""Exit code for a verdict against the use of a result, or recording of a motion."""
+ROBOT_SUFFIXES = (".urdf", ".xacro", ".xml", ".mjcf")
+"""Ends of the names of files that describe robots."""
 
 ExperimentFile = Annotated[
-    Path, typer.Argument(help="The experiment file.", metavar="EXPERIMENT.TOML")
+    Path, typer.Argument(help="The experiment file.", metavar="EXPERIMENT")
 ]
 OutputFolder = Annotated[
-    Path, typer.Option("-o", "--output", metavar="DIR", help="Folder of the result.")
+    Path, typer.Option("-o", "--output", metavar="FOLDER", help="Folder of the result.")
 ]
 Force = Annotated[
     bool,
     typer.Option("--force", help="Write even where other files are there already."),
 ]
+Detail = Annotated[
+    bool | None,
+    typer.Option(
+        "--verbose/--quiet",
+        "-v/-q",
+        help="Print all tables, or nothing but the verdict.",
+    ),
+]
+Time = Annotated[
+    float | None,
+    typer.Option("--time", metavar="SECONDS", min=1.0, help="Time for the search."),
+]
 Seed = Annotated[
-    int, typer.Option("--seed", metavar="N", min=0, help="Seed of all that is random.")
+    int,
+    typer.Option("--seed", metavar="NUMBER", min=0, help="Seed of all that is random."),
 ]
 Tip = Annotated[
     str | None,
@@ -112,6 +126,7 @@ def start(
     paths = reads if experiment is None else (experiment, *reads)
     require_paths(paths)
     if experiment is not None:
+        require_experiment_first(experiment, reads)
         tables = parse_tables(read_experiment_text(experiment), experiment)
         require_text_columns(tables, reads)
     if output is not None and output.exists() and not output.is_dir():
@@ -160,6 +175,21 @@ def require_paths(paths: Sequence[Path]) -> None:
         if len(missing_paths) > 1:
             verb = "are no files or folders"
         raise InputError(f"{', '.join(missing_paths)} {verb}: check the path.")
+
+
+def require_experiment_first(experiment: Path, logs: Sequence[Path]) -> None:
+    """Reject a log, or a robot's file, in the place of the experiment file."""
+    suffix = experiment.suffix.lower()
+    is_swapped = any(log.suffix.lower() == ".toml" for log in logs)
+    if suffix in TEXT_SUFFIXES or (is_swapped and suffix != ".toml"):
+        raise InputError(
+            f"`{experiment}` is a log; the experiment file comes first, then the logs."
+        )
+    if suffix in ROBOT_SUFFIXES:
+        raise InputError(
+            f"`{experiment}` describes a robot; the experiment file comes first: "
+            f"`jaxid init {experiment} > experiment.toml` writes one."
+        )
 
 
 def report_origin(experiment_text: str) -> dict[str, str]:

@@ -14,6 +14,7 @@ from jaxid.errors import InputError
 from jaxid.result_table import Status, significant
 
 from . import options, terminal
+from .command_help import UNUSABLE_CODE
 
 if TYPE_CHECKING:
     from jaxid.identification.payload import Payload
@@ -147,7 +148,7 @@ def show_runs(
         terminal.show_text(console, "\n".join(["", *lines]))
     terminal.show_files(console, output, files)
     if not is_usable:
-        raise typer.Exit(options.UNUSABLE_CODE)
+        raise typer.Exit(UNUSABLE_CODE)
 
 
 def rollout(
@@ -157,9 +158,9 @@ def rollout(
     output: options.OutputFolder = Path("rollout"),
     force: options.Force = False,
 ) -> None:
-    """Identify from commands alone or torques, so that simulations move like the robot.
+    """Identify so that a simulation moves like the robot.
 
-    If the experiment file names the columns of commands, joints behind position servos,
+    If the experiment file names columns of commands: joints behind position servos,
     with numbers for simulators and MJCF; otherwise the model of `identify`, with errors
     beside those of other methods. A page shows measured and simulated motion.
     """

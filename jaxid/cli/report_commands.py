@@ -41,7 +41,7 @@ def export(
     ] = None,
     urdf: Annotated[
         Path | None,
-        typer.Option(metavar="ARM.URDF", help="The robot's file, for `--to urdf`."),
+        typer.Option(metavar="ROBOT", help="The robot's file, for `--to urdf`."),
     ] = None,
     tip: options.Tip = None,
     base: options.Base = None,
@@ -135,15 +135,18 @@ def compare(
     first: Annotated[
         Path,
         typer.Argument(
-            help="Report of one run, like that of the cold robot.", metavar="COLD"
+            help="Report of one run, like that of the cold robot.", metavar="FIRST"
         ),
     ],
     second: Annotated[
         Path,
-        typer.Argument(help="Report of another run of the same robot.", metavar="WARM"),
+        typer.Argument(
+            help="Report of another run of the same robot.", metavar="SECOND"
+        ),
     ],
     output: options.OutputFolder = Path("comparison"),
     force: options.Force = False,
+    detail: options.Detail = None,
 ) -> None:
     """Decide which parameters have changed between two runs.
 
@@ -160,5 +163,4 @@ def compare(
     )
     comparison = jid.compare(cold_fit, warm_fit)
     files = write_comparison(output, comparison, paths)
-    terminal.show(console, comparison.summary(), comparison.group_summary())
-    terminal.show_files(console, output, files)
+    terminal.show_result(console, detail, comparison, output, files)

@@ -2,15 +2,18 @@
 
 import errno
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
+import typer
 from rich.console import Console
 from rich.text import Text
 
-from jaxid.result_table import Remark, Table, printable
+from jaxid.result_table import Remark, Status, Table, printable
+
+from .command_help import UNUSABLE_CODE
 
 LINE_INTERVAL = 10.0
 """Time between two lines of progress where there is no terminal [s]."""
@@ -43,6 +46,57 @@ def show(console: Console, *tables: Table) -> None:
         console.print()
         # Numbers are not cut where a line is too short for them.
         console.print(table, crop=False)
+
+
+class Result(Protocol):
+    """Result of a command."""
+
+    @property
+    def verdict(self) -> Remark:
+        """Whether the result can be used, in one sentence."""
+        ...
+
+    def overview(self) -> Sequence[Table]:
+        """Return what matters most, in few lines."""
+        ...
+
+    def tables(self) -> Sequence[Table]:
+        """Return everything."""
+        ...
+
+
+def show_result(
+    console: Console,
+    detail: bool | None,
+    result: Result,
+    folder: Path,
+    files: Iterable[Path] = (),
+    lines: Sequence[str] = (),
+) -> None:
+    """Print a result in few lines, all of it (`-v`), or the verdict alone (`-q`).
+
+    Args:
+        console: The terminal.
+        detail: True for `-v`, False for `-q`, None without either.
+        result: The result.
+        folder: Folder of the files that were written.
+        files: These files.
+        lines: Lines to paste into the experiment file.
+
+    Raises:
+        typer.Exit: With a code of its own if the result must not be used.
+    """
+    is_unusable = result.verdict.status is Status.BAD
+    if detail is False:
+        console.print(Table("", remarks=[result.verdict]))
+    else:
+        show(console, *(result.tables() if detail else result.overview()))
+        if lines and not is_unusable:
+            show_text(console, "\n".join(["", *lines]))
+        if files:
+            show_files(console, folder, files)
+    if is_unusable:
+        raise typer.Exit(UNUSABLE_CODE)
 
 
 def show_remarks(console: Console, remarks: Iterable[Remark | str]) -> None:

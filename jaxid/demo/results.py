@@ -1,7 +1,8 @@
 """Results of the demo beside the paper's: tables, a page, and a record for programs."""
 
+import dataclasses
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -44,16 +45,33 @@ def write_study(folder: Path, study: Study) -> list[Path]:
     return [folder / "report.html", folder / "demo.json"]
 
 
-def tables(study: Study) -> list[Table]:
-    """Return all tables of the demo."""
-    designs = [] if study.plan is None else study.plan.tables()[:1]
-    return [
-        paper_table(study),
-        *designs,
-        error_table(study, 0),
-        error_table(study, 1),
-        study.temperature.group_summary(),
-    ]
+class DemoResult(NamedTuple):
+    """Result of the demo as a terminal shows it."""
+
+    study: Study
+
+    @property
+    def verdict(self) -> Remark:
+        """How well the model predicts torques, in one sentence."""
+        return dataclasses.replace(remarks(self.study)[0], detail="")
+
+    def overview(self) -> list[Table]:
+        """Return the findings, and the errors on the unseen path."""
+        findings = Table("", remarks=remarks(self.study))
+        return [findings, error_table(self.study, 1)]
+
+    def tables(self) -> list[Table]:
+        """Return all tables, then the findings."""
+        study = self.study
+        designs = [] if study.plan is None else study.plan.tables()[:1]
+        return [
+            paper_table(study),
+            *designs,
+            error_table(study, 0),
+            error_table(study, 1),
+            study.temperature.group_summary(),
+            Table("", remarks=remarks(study)),
+        ]
 
 
 def remarks(study: Study) -> list[Remark]:

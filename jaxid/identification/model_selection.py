@@ -323,6 +323,17 @@ class ModelChoice(Summarised):
         )
 
     @property
+    def verdict(self) -> Remark:
+        """The choice, and the error to expect of it."""
+        return self.remarks[0]
+
+    def overview(self) -> list[Table]:
+        """Return the choice, and the models on the way to it."""
+        notes = [self.verdict, *self.remarks[2:]]
+        path = self.summary().select(range(len(self.path)))
+        return [Table("", remarks=notes), path]
+
+    @property
     def remarks(self) -> list[Remark]:
         """Choice, and the error to expect of it, as sentences."""
         first_error = relative_error(self.first_predictions)

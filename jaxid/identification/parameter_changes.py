@@ -11,6 +11,7 @@ from scipy import special
 from jaxid.arrays import AnyArray, Float, Indices, Matrix, Texts, Vector
 from jaxid.result_table import (
     Column,
+    Remark,
     Status,
     Summarised,
     Table,
@@ -208,6 +209,20 @@ class Comparison(Summarised, eqx.Module):
             Column("verdict", verdicts),
             status=[_status(group["changed"]) for group in groups],
         )
+
+    @property
+    def verdict(self) -> Remark:
+        """How many parameters have changed, in one sentence."""
+        return Remark(self._remarks()[0])
+
+    def overview(self) -> list[Table]:
+        """Return the verdict, the kinds, and the parameters that have changed."""
+        changes = (Verdict.CHANGED, Verdict.PERHAPS)
+        rows = [k for k, verdict in enumerate(self.verdicts) if verdict in changes]
+        tables = [Table("", remarks=[self.verdict]), self.group_summary()]
+        if rows:
+            tables.append(self.summary().select(rows))
+        return tables
 
     def tables(self) -> list[Table]:
         """Return the tables of the parameters, and of their kinds."""

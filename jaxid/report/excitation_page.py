@@ -11,6 +11,7 @@ from jaxid.io import write_text
 from jaxid.result_table import Remark, Status, significant
 from jaxid.robot.collision import CollisionModel
 from jaxid.trajectory.trajectory import AbstractTrajectory
+from jaxid.validation.judgement import SEVERITIES
 
 from .motion_figures import joint_figure, speed_figure
 from .page import Settings, picture, provenance, render_page
@@ -59,9 +60,8 @@ def _assumed_limits(plan: ExcitationPlan) -> str:
 
 
 def sort_remarks(remarks: Iterable[Remark]) -> list[Remark]:
-    """Return remarks sorted by status: neutral ones first, bad ones last."""
-    order = (Status.NEUTRAL, Status.GOOD, Status.DOUBTFUL, Status.BAD)
-    return sorted(remarks, key=lambda remark: order.index(remark.status))
+    """Return remarks sorted by status: bad ones first, neutral ones last."""
+    return sorted(remarks, key=lambda remark: SEVERITIES.index(remark.status))
 
 
 def write_excitation(

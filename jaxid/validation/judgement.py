@@ -68,6 +68,8 @@ MAX_OFFSET_SHARE = 0.3
 MAX_CLAIM_RATIO = 4.0
 """Forces of the file's bodies, over those of the logs, that wrong masses explain."""
 
+MAX_FINDINGS = 8
+"""Number of findings in a short form of the judgement."""
 SEVERITIES = (Status.BAD, Status.DOUBTFUL, Status.GOOD, Status.NEUTRAL)
 """Order of the findings."""
 
@@ -132,6 +134,15 @@ class Judgement(NamedTuple):
         """Findings with ✗ or !."""
         severities = (Status.BAD, Status.DOUBTFUL)
         return tuple(x for x in self.findings if x.status in severities)
+
+    def overview(self) -> list[Remark]:
+        """Return the verdict and the most severe findings, without details."""
+        checks = [x for x in self.findings if x.status is not Status.NEUTRAL]
+        findings = checks[:MAX_FINDINGS]
+        if len(checks) > MAX_FINDINGS:
+            count = len(checks) - MAX_FINDINGS
+            findings.append(Remark(f"{count} more findings are on the page"))
+        return [self.verdict, *(dataclasses.replace(x, detail="") for x in findings)]
 
 
 def judge(report: Report) -> Judgement:

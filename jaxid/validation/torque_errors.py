@@ -1,13 +1,13 @@
 """Validation: torque errors, and definiteness of the mass matrix (Eq. 37, Sec. 5)."""
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
 
-from jaxid.arrays import AnyArray, Joints, JointSamples, Matrix, Vector
+from jaxid.arrays import AnyArray, Joints, JointSamples, Matrix, Texts, Vector
 from jaxid.dynamics.sample_methods import in_numpy
 from jaxid.identification.estimators import ResidualVariances, WeightedLeastSquares
 from jaxid.identification.fit_result import Fit
@@ -249,6 +249,22 @@ class Validation(Summarised, eqx.Module):
             remarks=[Remark(str(self.definiteness), status)],
             rules=range(count, len(rows), count),
         )
+
+
+def error_table(
+    groups: Mapping[str, Sequence[TorqueErrors]], joint_names: Texts
+) -> Table:
+    """Return relative errors: a row for each joint, a column for each group of logs."""
+    columns = []
+    for name, logs in groups.items():
+        errors = [*relative_joint_errors(logs), relative_error(logs)]
+        columns.append(Column(name, errors, "%", percent))
+    return Table(
+        "torque errors (RMS) over torques (RMS)",
+        Column("joint", [*joint_names, "all joints"]),
+        *columns,
+        rules=[len(joint_names)],
+    )
 
 
 def validate(

@@ -5,7 +5,7 @@ from .log_identification import (
     IdentificationReport as IdentificationReport,
     identify_logs as identify_logs,
 )
-from .log_inspection import inspect_logs as inspect_logs
+from .log_inspection import Inspection as Inspection, inspect_logs as inspect_logs
 from .log_loading import load_log as load_log, read_log as read_log
 from .log_rollout import (
     ServoSettings as ServoSettings,

@@ -35,12 +35,16 @@ from jaxid.validation.diagnosis import mistakes_in_logs
 from jaxid.validation.judgement import Judgement, Report, judge
 from jaxid.validation.torque_errors import (
     TorqueErrors,
+    error_table,
     torque_errors,
     validate,
 )
 
 from .log_loading import LoadedLog, fitted_share, is_report, load_logs, select_filter
 from .setup import Paths, Progress, Setup, ignore_progress
+
+MAX_COLUMNS = 5
+"""Largest number of logs whose errors are shown one by one in few lines."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -56,6 +60,23 @@ class IdentificationReport(Summarised, Report):
     def verdict(self) -> Remark:
         """Whether the model may be used, in one sentence."""
         return self.judgement.verdict
+
+    def overview(self) -> list[Table]:
+        """Return the verdict, the findings and the torque errors, in few lines."""
+        base = self.fit.base
+        robot = base.model.robot
+        groups = {errors.name: [errors] for errors in self.every_error}
+        if len(groups) > MAX_COLUMNS:
+            groups = {
+                "logs of the fit": self.identification,
+                "other logs": self.verification,
+            }
+        joint_errors = {name: logs for name, logs in groups.items() if logs}
+        title = f"{robot.name}: {robot.joints} joints, {base.size} base parameters"
+        return [
+            Table(title, remarks=self.judgement.overview()),
+            error_table(joint_errors, robot.joint_names),
+        ]
 
     def tables(self) -> list[Table]:
         """Return estimates and torque errors, then all findings and the verdict."""

@@ -1,15 +1,16 @@
 """Examination of logs: is this log sane, and what does it determine?"""
 
 import dataclasses
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
-from jaxid.arrays import Texts
 from jaxid.identification.fit_result import Fit
 from jaxid.identification.identify import identify
 from jaxid.measurement.columns import Columns
-from jaxid.result_table import Summarised, Table
+from jaxid.report.identification_page import motor_tables
+from jaxid.result_table import Remark, Status, Summarised, Table
 from jaxid.validation.diagnosis import Diagnosis
 
 from .log_loading import load_log, select_filter
@@ -22,17 +23,55 @@ class ExaminedLog(NamedTuple):
     diagnosis: Diagnosis  # statistics and findings
     fit: Fit  # least-squares fit to this log alone
 
+    @property
+    def doubts(self) -> list[Remark]:
+        """Findings, and what the log does not determine."""
+        remarks = [*self.diagnosis.summary().remarks, *self.fit.determination]
+        return [x for x in remarks if x.status in (Status.BAD, Status.DOUBTFUL)]
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Inspection(Summarised):
     """Examined logs, and what was assumed of them."""
 
-    notes: Texts  # assumptions, as sentences
-    logs: list[ExaminedLog]  # examined logs
+    setup: Setup  # robot and model
+    logs: Sequence[ExaminedLog] = ()  # examined logs
+
+    @property
+    def verdict(self) -> Remark:
+        """Whether the logs can be identified with, in one sentence."""
+        base = self.setup.base
+        if not self.logs:
+            return Remark(
+                f"{base.model.robot.name} has {base.model.robot.joints} joints, and "
+                f"{base.size} base parameters of {base.model.size} standard parameters"
+            )
+        count = sum(len(log.doubts) for log in self.logs)
+        if count:
+            text = f"Look at what is marked before you identify: {count} findings"
+            return Remark(text, Status.DOUBTFUL)
+        text = "Nothing suspicious was found, and all base parameters are determined"
+        return Remark(text, Status.GOOD)
+
+    def overview(self) -> list[Table]:
+        """Return the verdict, and the logs with what is suspicious of them."""
+        verdict = Table("", remarks=[self.verdict])
+        if not self.logs:
+            return [self.setup.robot.summary(), verdict]
+        tables = [verdict]
+        for log in self.logs:
+            table = log.diagnosis.summary()
+            table.remarks = tuple(log.doubts)
+            tables.append(table)
+        return tables
 
     def tables(self) -> list[Table]:
-        """Return findings on each log, and what it determines."""
-        tables = []
+        """Return robot and parameters, findings on each log, and what it determines."""
+        setup = self.setup
+        motors = motor_tables(setup.robot)
+        tables = [setup.robot.summary(), *motors, setup.base.summary()]
+        if setup.notes:
+            tables.append(Table("", remarks=setup.notes))
         for diagnosis, fit in self.logs:
             determination = Table("", facts=fit.facts, remarks=fit.determination)
             tables += [diagnosis.summary(), determination]
@@ -63,4 +102,4 @@ def inspect_logs(
         fit = identify(setup.base, observations, setup.least_squares, fit_progress)
         progress(f"looking for mistakes in {path.name}", 0.0)
         examined_logs.append(ExaminedLog(diagnosis.with_fit(fit, bodies), fit))
-    return Inspection(setup.notes, examined_logs)
+    return Inspection(setup, examined_logs)

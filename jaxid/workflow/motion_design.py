@@ -13,8 +13,13 @@ from jaxid.excitation.constraints import AbstractConstraint, TipLimits
 from jaxid.excitation.design import DesignProgress, design_excitation
 from jaxid.excitation.design_result import ExcitationPlan
 from jaxid.io import atomic_folder, import_extra
-from jaxid.report.excitation_page import write_excitation
-from jaxid.result_table import Remark, Status
+from jaxid.report.excitation_page import (
+    motion_verdict,
+    plan_remarks,
+    sort_remarks,
+    write_excitation,
+)
+from jaxid.result_table import Remark, Status, Table
 from jaxid.robot.robot import Robot, complete_limits
 from jaxid.trajectory.controllers import CONTROLLER_SUFFIXES, CONTROLLERS
 from jaxid.trajectory.files import (
@@ -91,6 +96,27 @@ class DesignedMotion(NamedTuple):
     plan: ExcitationPlan  # result of the optimisation
     playable: PlayableMotion  # motion that the robot plays
     remarks: tuple[Remark, ...]  # remarks beside those of the plan
+
+    @property
+    def verdict(self) -> Remark:
+        """Whether the motion may be recorded, in one sentence."""
+        return motion_verdict(self.plan, self.remarks)
+
+    @property
+    def findings(self) -> list[Remark]:
+        """All remarks, the most severe first."""
+        return sort_remarks((*plan_remarks(self.plan), *self.remarks))
+
+    def overview(self) -> list[Table]:
+        """Return the verdict, the findings, and the use of the limits, in few lines."""
+        checks = [x for x in self.findings if x.status is not Status.NEUTRAL]
+        _, _, *uses = self.plan.tables()
+        return [Table("", remarks=[self.verdict, *checks]), *uses]
+
+    def tables(self) -> list[Table]:
+        """Return the tables of the plan, then all findings and the verdict."""
+        lines = [*self.findings, self.verdict]
+        return [*self.plan.tables(), Table("", remarks=lines)]
 
 
 def prepare_motion(
