@@ -268,6 +268,11 @@ class Summarised:
         """Return all tables of the result."""
         return (self.summary(),)
 
+    @property
+    def verdict(self) -> Remark:
+        """What the result says, in one sentence."""
+        return self.summary().remarks[0]
+
     def overview(self) -> "Sequence[Table]":
         """Return what matters most, in few lines: what `print` shows."""
         return self.tables()

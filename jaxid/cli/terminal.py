@@ -5,13 +5,13 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import typer
 from rich.console import Console
 from rich.text import Text
 
-from jaxid.result_table import Remark, Status, Table, printable
+from jaxid.result_table import Remark, Status, Summarised, Table, printable
 
 from .command_help import UNUSABLE_CODE
 
@@ -48,27 +48,10 @@ def show(console: Console, *tables: Table) -> None:
         console.print(table, crop=False)
 
 
-class Result(Protocol):
-    """Result of a command."""
-
-    @property
-    def verdict(self) -> Remark:
-        """Whether the result can be used, in one sentence."""
-        ...
-
-    def overview(self) -> Sequence[Table]:
-        """Return what matters most, in few lines."""
-        ...
-
-    def tables(self) -> Sequence[Table]:
-        """Return everything."""
-        ...
-
-
 def show_result(
     console: Console,
     detail: bool | None,
-    result: Result,
+    result: Summarised,
     folder: Path,
     files: Iterable[Path] = (),
     lines: Sequence[str] = (),

@@ -2,7 +2,7 @@
 
 import dataclasses
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from jaxid.result_table import (
     Column,
     Remark,
     Status,
+    Summarised,
     Table,
     significant,
     versions,
@@ -45,7 +46,8 @@ def write_study(folder: Path, study: Study) -> list[Path]:
     return [folder / "report.html", folder / "demo.json"]
 
 
-class DemoResult(NamedTuple):
+@dataclasses.dataclass(frozen=True, eq=False)
+class DemoResult(Summarised):
     """Result of the demo as a terminal shows it."""
 
     study: Study

@@ -322,11 +322,6 @@ class ModelChoice(Summarised):
             ],
         )
 
-    @property
-    def verdict(self) -> Remark:
-        """The choice, and the error to expect of it."""
-        return self.remarks[0]
-
     def overview(self) -> list[Table]:
         """Return the choice, and the models on the way to it."""
         notes = [self.verdict, *self.remarks[2:]]

@@ -11,7 +11,6 @@ from scipy import special
 from jaxid.arrays import AnyArray, Float, Indices, Matrix, Texts, Vector
 from jaxid.result_table import (
     Column,
-    Remark,
     Status,
     Summarised,
     Table,
@@ -209,11 +208,6 @@ class Comparison(Summarised, eqx.Module):
             Column("verdict", verdicts),
             status=[_status(group["changed"]) for group in groups],
         )
-
-    @property
-    def verdict(self) -> Remark:
-        """How many parameters have changed, in one sentence."""
-        return Remark(self._remarks()[0])
 
     def overview(self) -> list[Table]:
         """Return the verdict, the kinds, and the parameters that have changed."""

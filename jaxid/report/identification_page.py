@@ -222,8 +222,8 @@ def _details(report: Report, figures: Figures) -> Sections:
         "RMS of the differences over the RMS of the measured forces of each joint"
         f"{band}. Errors of other bands cannot be compared with these."
     )
-    table = report.validation.summary()
-    yield "Torque errors", [text, figures["errors"], table]
+    tables = report.validation.tables()
+    yield "Torque errors", [text, figures["errors"], *tables]
     if fit.consistency is not None:
         names = robot.body_names
         table = body_table(fit.consistency, names, report.claimed_bodies)

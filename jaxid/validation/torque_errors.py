@@ -223,32 +223,20 @@ class Validation(Summarised, eqx.Module):
     units: tuple[str, ...] = eqx.field(static=True)
 
     def summary(self) -> Table:
-        """Return a table: RMS errors of each joint on each recording."""
-        rows = [(e, j) for e in self.errors for j in range(len(self.joint_names))]
-        columns = [
-            Column("recording", [e.name for e, _ in rows]),
-            Column("joint", [self.joint_names[j] for _, j in rows]),
-            Column("RMS error", [float(e.rms[j]) for e, j in rows]),
-            Column("unit", [self.units[j] for _, j in rows]),
-            Column(
-                "of the forces",
-                [float(e.rms_relative[j]) for e, j in rows],
-                "%",
-                percent,
-            ),
-        ]
+        """Return a table: RMS errors, a row for each joint, a column for each log."""
         status = Status.GOOD if self.definiteness.positive_definite else Status.BAD
-        count = len(self.joint_names)
         return Table(
-            "Validation",
-            *columns,
-            facts=[
-                (e.name, f"{percent(e.relative)} % of the forces{e.band_words}")
-                for e in self.errors
-            ],
+            "torque errors (RMS)",
+            Column("joint", self.joint_names),
+            *(Column(log.name, log.rms) for log in self.errors),
+            Column("unit", self.units),
             remarks=[Remark(str(self.definiteness), status)],
-            rules=range(count, len(rows), count),
         )
+
+    def tables(self) -> list[Table]:
+        """Return the errors, also relative to the forces."""
+        groups = {log.name: [log] for log in self.errors}
+        return [error_table(groups, self.joint_names), self.summary()]
 
 
 def error_table(

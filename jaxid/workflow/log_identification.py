@@ -86,7 +86,7 @@ class IdentificationReport(Summarised, Report):
         if fit.consistency is not None:
             names = robot.body_names
             tables.append(body_table(fit.consistency, names, self.claimed_bodies))
-        tables.append(self.validation.summary())
+        tables += self.validation.tables()
         findings = self.judgement.findings
         sentences = {finding.text for finding in findings}
         for table in tables:

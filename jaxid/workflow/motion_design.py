@@ -1,5 +1,6 @@
 """Design of the motion that identifies best, within all limits that can be checked."""
 
+import dataclasses
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -19,7 +20,7 @@ from jaxid.report.excitation_page import (
     sort_remarks,
     write_excitation,
 )
-from jaxid.result_table import Remark, Status, Table
+from jaxid.result_table import Remark, Status, Summarised, Table
 from jaxid.robot.robot import Robot, complete_limits
 from jaxid.trajectory.controllers import CONTROLLER_SUFFIXES, CONTROLLERS
 from jaxid.trajectory.files import (
@@ -90,7 +91,8 @@ class PlayableMotion(NamedTuple):
     fault: str  # why it does not start and end at rest; empty if it does, or need not
 
 
-class DesignedMotion(NamedTuple):
+@dataclasses.dataclass(frozen=True, eq=False)
+class DesignedMotion(Summarised):
     """Designed motion as a robot can play it."""
 
     plan: ExcitationPlan  # result of the optimisation
