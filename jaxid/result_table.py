@@ -270,7 +270,7 @@ class Summarised:
 
     @property
     def verdict(self) -> Remark:
-        """What the result says, in one sentence."""
+        """The sentence that sums up the result."""
         return self.summary().remarks[0]
 
     def overview(self) -> "Sequence[Table]":
