@@ -39,7 +39,7 @@ def test_coefficients_are_found(experiment, seed):
         bodies.append([m, *(m * c), *np.diag(J), -J[1, 2], -J[0, 2], -J[0, 1]])
     truth = jid.Model(
         robot, (*experiment.setup.model.terms, jid.terms.LoadFriction(np.array(bodies)))
-    )
+    ).with_transition_speeds(0.04)
     rest = rng.uniform(0.3, 1.0, truth.size - 33)
     coefficients = np.array([0.1, 0.15, 0.25])
     p = np.concatenate([np.ravel(bodies), rest, coefficients])
@@ -58,6 +58,9 @@ def test_coefficients_are_found(experiment, seed):
         assert abs(fit.parameters[k] / value - 1) < 0.05
         assert abs(fit.parameters[k] - value) < 4 * fit.standard_deviations[k]
     assert not any("has not settled" in note for note in fit.notes)
+    # Both kinds of dry friction change their direction at the speed that is planted.
+    *_, load_friction = fit.base.model.terms
+    np.testing.assert_allclose(load_friction.transition.speed[1:], 0.04, rtol=0.15)
 
 
 def test_what_it_needs_is_said(tmp_path):

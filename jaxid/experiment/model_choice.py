@@ -76,9 +76,10 @@ def choose_model(
     all models are compared in this one band.
 
     Parts of time are left out in turn, or whole logs if there are at least four. A
-    change is kept if it lowers the errors on them by more than two standard deviations
-    of the difference, and by 1 % of the error at least. The models are fitted by
-    weighted least squares; the promised error is that of the file's own estimator.
+    change is kept if it lowers the errors of the parts, relative to what they were, by
+    more than two standard deviations of their mean, and the error in all by 1 %. The
+    models are fitted by weighted least squares; the promised error is that of the
+    file's own estimator.
 
     Args:
         experiment: Experiment file with which the search begins.
@@ -304,7 +305,7 @@ class ModelSearch:
         setup = self._setup(*changes)
         terms = setup.model.terms
         if setup.load_friction:
-            transition = setup.model.memory or self._transition
+            transition = dry_transition(terms)
             terms = (*terms, LoadFriction(bodies=self._bodies, transition=transition))
         return Model(setup.robot, terms)
 

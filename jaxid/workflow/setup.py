@@ -268,6 +268,7 @@ class Setup(eqx.Module):
         """Fit again with friction by the bodies' weight, until it no longer changes."""
         memory = fit.base.model.memory
         terms = self.model.terms if memory is None else fit.base.model.terms
+        transition = dry_transition(terms)
         joints = self.robot.joints
         coefficients = np.full(joints, np.inf)
         estimator = self.estimator
@@ -282,12 +283,10 @@ class Setup(eqx.Module):
             size = self.robot.bodies * len(INERTIAL_NAMES)
             body_parameters = np.asarray(fit.standard_parameters)[:size]
             bodies = body_parameters.reshape(self.robot.bodies, -1)
-            transition = memory or dry_transition(fit.base.model.terms)
             load_friction = LoadFriction(bodies=bodies, transition=transition)
             base = base_parameters(Model(self.robot, (*terms, load_friction)))
-            # Once anew: speeds without friction by load make up for it.
+            # Speeds that were found without friction by load make up for it.
             base = identify_transition_speeds(base, logs)
-            terms = base.model.terms[:-1]
             rows = RegressionProblem(base, logs)
             fit = fit_problem(rows, estimator, uncertainty=self.uncertainty)
             every_note = tuple(dict.fromkeys((*notes, *fit.notes)))

@@ -115,6 +115,16 @@ def test_a_change_is_kept_if_it_lowers_the_errors_enough(trials, size):
         assert choice is trials[1]
 
 
+def test_a_part_with_large_errors_does_not_hide_a_fall_of_all():
+    assert next_model(trial(8, 100.0, 1.0, 2.0), [trial(12, 9.0, 0.1, 0.2)]) is not None
+    # Here the part with large errors alone has less.
+    assert next_model(trial(8, 100.0, 1.0, 2.0), [trial(12, 60.0, 1.1, 2.1)]) is None
+
+
+def test_parts_without_rows_do_not_count():
+    assert next_model(trial(8, 0.0, 5.0, 5.1), [trial(9, 0.0, 3.0, 3.1)]) is not None
+
+
 def test_short_logs_are_refused():
     with pytest.raises(ValueError, match="at least three blocks"):
         divide_logs([logs(1)[0].replace(mask=np.arange(300)[:, None] < [2, 2])])

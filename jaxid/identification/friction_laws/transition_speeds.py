@@ -1,6 +1,7 @@
 """Speeds of the transition of dry friction, by a search on the rows of each joint."""
 
 import dataclasses
+import itertools
 from collections.abc import Sequence
 from typing import Any
 
@@ -87,22 +88,36 @@ def _top_speeds(logs: Sequence[Observations]) -> Joints:
 
 
 class TrialColumns(AbstractTerm):
-    """Columns of the terms of dry friction at one trial's speeds after another's."""
+    """Columns of dry friction at one trial's speeds after another's.
 
-    terms: tuple[AbstractTerm, ...]
+    Attributes:
+        friction: Model of the terms of dry friction, whose speeds are not given.
+        speeds: Speeds of each trial [trials, joints].
+    """
+
+    friction: Model
+    speeds: np.ndarray
 
     def parameters(self, robot):
         """Return the terms' names, which a number makes different, and their units."""
         return tuple(
             (f"{number}:{name}", unit)
-            for number, term in enumerate(self.terms)
+            for number in range(len(self.speeds))
+            for term in self.friction.terms
             for name, unit in term.parameters(robot)
         )
 
     def columns(self, robot, q, qd, qdd):
         """Return the columns of all terms."""
-        parts = [term.columns(robot, q, qd, qdd) for term in self.terms]
-        return jnp.concatenate(parts, axis=1)
+
+        def trial_columns(speeds):
+            terms = self.friction.with_transition_speeds(speeds).terms
+            parts = [term.columns(robot, q, qd, qdd) for term in terms]
+            return jnp.concatenate(parts, axis=1)
+
+        # What does not depend on the speeds, as loads, is computed and compiled once.
+        columns = jax.vmap(trial_columns, out_axes=1)(self.speeds)
+        return columns.reshape(len(columns), -1)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -126,10 +141,8 @@ class SpeedTrials:
         is_open = [has_open_transition(term) for term in model.terms]
         sizes = [len(term.parameters(model.robot)) for term in model.terms]
         standard_columns = np.flatnonzero(np.repeat(is_open, sizes))
-        terms = []
-        for row in speeds:
-            trial_terms = model.with_transition_speeds(row).terms
-            terms += [trial_terms[k] for k in np.flatnonzero(is_open)]
+        open_terms = tuple(itertools.compress(model.terms, is_open))
+        trial_term = TrialColumns(Model(model.robot, open_terms), speeds)
 
         # Columns that others replace, like those of an offset, need no trial.
         is_base = np.isin(standard_columns, base.indices)
@@ -142,7 +155,7 @@ class SpeedTrials:
         trial_kappa = np.zeros((trial_columns.size, kappa.shape[1]))
         extended_base = dataclasses.replace(
             base,
-            model=Model(model.robot, (*model.terms, TrialColumns(tuple(terms)))),
+            model=Model(model.robot, (*model.terms, trial_term)),
             indices=(*base.indices, *trial_columns.ravel().tolist()),
             kappa=np.vstack([kappa, trial_kappa]),
         )
