@@ -9,8 +9,9 @@ experiment with `jaxid init`, names columns and commands, and identifies with th
 `slips.py` on one kind of log of each machine. The limits of the search were set on the
 machines in `SETTING_KINDS`.
 
-A slip is named if a sentence with ✗ or ! says what it is, possible if only a remark
-does; it is told if any other sentence with ✗ or ! says more than what clean logs get.
+A slip is named if a sentence with ✗ or ! says what it is, and possible if it adds
+"possible, but not sure"; it is told if any other sentence with ✗ or ! says more than
+what clean logs get.
 """
 
 import argparse
@@ -34,6 +35,8 @@ USUAL = (
     "physically consistent",
 )
 """Parts of sentences that tell how good a model is and what it determines."""
+POSSIBLE = "possible, but not sure"
+"""What a mistake is called that explains only a part of what the model misses."""
 
 
 def recorded(name, kind, seed, slip):
@@ -52,7 +55,7 @@ def recorded(name, kind, seed, slip):
 
 
 def judged(log, file, folder):
-    """Return the sentences of a report, each with its status, and its notes."""
+    """Return the sentences of a report, each with its status."""
     import numpy as np
 
     import jaxid as jid
@@ -69,19 +72,18 @@ def judged(log, file, folder):
     report = jid.identify_logs(
         experiment.setup, [folder / "log.npz"], experiment.columns, 0.4
     )
-    sentences = [(str(x.status.name), str(x.text)) for x in report.judgement.findings]
-    return sentences, list(report.notes)
+    return [(str(x.status.name), str(x.text)) for x in report.judgement.findings]
 
 
 def outcome(sentences, words):
     """Return how a slip is treated: named, another, possible, told or quiet."""
     marked = specific(sentences)
-    if any(word in text for text in marked for word in words):
+    right_texts = [x for x in marked if any(word in x for word in words)]
+    if any(POSSIBLE not in text for text in right_texts):
         return "named"
-    if named_mistakes(sentences):
+    if any(POSSIBLE not in text for text in named_mistakes(sentences)):
         return "another"
-    notes = [x for _, x in sentences if "possible, but not sure" in x]
-    if any(word in text for text in notes for word in words):
+    if right_texts:
         return "possible"
     return "told" if marked else "quiet"
 
@@ -137,9 +139,9 @@ def main():
     for name, kind, slip in every_task:
         log, file = recorded(name, kind, options.seed, slip)
         try:
-            sentences, notes = judged(log, file, folder)
+            sentences = judged(log, file, folder)
         except ValueError as refusal:
-            sentences, notes = [("BAD", str(refusal))], []
+            sentences = [("BAD", str(refusal))]
         if slip == "clean":
             statuses = {status for status, _ in sentences}
             result = "✗" if "BAD" in statuses else "!" if "DOUBTFUL" in statuses else ""
@@ -151,14 +153,11 @@ def main():
             result = outcome(sentences, slips.SLIPS[slip].words)
             spoilt[result] += 1
         marked = [x for status, x in sentences if status in ("BAD", "DOUBTFUL")]
-        notes = [x for x in notes if "possible, but not sure" in x]
-        print(f"{name} | {kind} | {slip} | {result}", *marked, *notes, sep="\n    ")
+        print(f"{name} | {kind} | {slip} | {result}", *marked, sep="\n    ")
         if options.lines:
             line = {"machine": name, "kind": kind, "slip": slip, "result": result}
             with options.lines.open("a") as file_of_lines:
-                file_of_lines.write(
-                    json.dumps(line | {"marked": marked, "notes": notes}) + "\n"
-                )
+                file_of_lines.write(json.dumps(line | {"marked": marked}) + "\n")
     rows = [
         Row(
             "judgement/alarms",

@@ -24,6 +24,7 @@ from typing import Any, NamedTuple
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
+import rates
 import timing
 from timing import DATA, EXPERIMENTS, PENDULUM, PENDULUM_LOGS, Row
 
@@ -223,9 +224,10 @@ def outcome(sentences, clean, words):
     marks = [x for x in sentences if x[0] in ("BAD", "DOUBTFUL")]
     specific = [x for x in marks if (x[0], kind_of(x[1])) not in usual]
     seeming = [text for text in marked(sentences) if "seem" in text]
-    if any(word in text for text in seeming for word in words):
+    mistakes = [text for text in seeming if rates.POSSIBLE not in text]
+    if any(word in text for text in mistakes for word in words):
         return "named"
-    if seeming:
+    if mistakes:
         return "another"
     return "told" if specific else "quiet"
 
@@ -246,10 +248,8 @@ def planted(every_robot, options, folder):
                     sentences = [("BAD", str(refusal))]
                 result = outcome(sentences, clean, slips.SLIPS[slip].words)
                 counts[result] += 1
-                notes = [x for _, x in sentences if "possible" in x]
-                lines = [*marked(sentences), *notes]
                 head = f"{name} | joint {joint + 1} | {slip} | {result}"
-                print(head, *lines, sep="\n    ", flush=True)
+                print(head, *marked(sentences), sep="\n    ", flush=True)
     return counts
 
 

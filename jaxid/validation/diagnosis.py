@@ -70,7 +70,7 @@ class Diagnosis(Summarised):
         """
         mistakes = _mistakes([self], fit, bodies)
         fit_findings = (*mistakes.certain, *mistakes.doubts)
-        notes = (*self.notes, *mistakes.possible)
+        notes = (*self.notes, *mistakes.remarks)
         findings = (*fit_findings, *self.findings)
         return dataclasses.replace(self, findings=findings, notes=notes)
 
@@ -271,15 +271,15 @@ class LogMistakes(NamedTuple):
 
     Attributes:
         certain: Mistakes, contacts, and that the model does not fit.
-        possible: Mistakes that explain only a part of what the model misses, and that
-            most of it is missed at rest.
-        doubts: What fits, but needs a look.
+        doubts: Mistakes that explain only a part of what the model misses, and what
+            fits, but needs a look.
+        remarks: That most of what the model misses is missed at rest.
         delay: Delay of all forces; None where no mistakes were looked for.
     """
 
     certain: tuple[str, ...] = ()
-    possible: tuple[str, ...] = ()
     doubts: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
     delay: Delay | None = None
 
 
@@ -295,9 +295,9 @@ def mistakes_in_logs(
         return mistakes
     name = diagnoses[0].log.name
     certain = tuple(f"{name}: {text}" for text in mistakes.certain)
-    possible = tuple(f"{name}: {text}" for text in mistakes.possible)
     doubts = tuple(f"{name}: {text}" for text in mistakes.doubts)
-    return LogMistakes(certain, possible, doubts, mistakes.delay)
+    remarks = tuple(f"{name}: {text}" for text in mistakes.remarks)
+    return LogMistakes(certain, doubts, remarks, mistakes.delay)
 
 
 def _mistakes(
@@ -331,10 +331,9 @@ def _mistakes(
         commands = []
     mistakes = find_mistakes(model, recordings, bodies, commands)
     certain = mistakes.explained or mistakes.unexplained
-    doubts = (*mistakes.doubts, *doubts)
-    possible = mistakes.possible
+    doubts = (*mistakes.possible, *mistakes.doubts, *doubts)
     logs = [x.observations for x in diagnoses if x.observations is not None]
-    if all(np.all(log.mask) for log in logs):
-        # No rows at rest have been left out so far.
-        possible += mistakes.rest
-    return LogMistakes(certain, possible, doubts, mistakes.delay)
+    # Otherwise, rows at rest have been left out.
+    has_all_rows = all(np.all(log.mask) for log in logs)
+    remarks = mistakes.rest if has_all_rows else ()
+    return LogMistakes(certain, doubts, remarks, mistakes.delay)

@@ -179,7 +179,7 @@ def identify_logs(
     for diagnosis in diagnoses:
         notes += [f"{diagnosis.log.name}: {note}" for note in diagnosis.notes]
     notes += resolution_notes(fit, fitted_logs)
-    notes += mistakes.possible
+    notes += mistakes.remarks
     doubts = [text for log in loaded_logs for text in log.findings]
     claims = errors_of_claims(setup, fit, parts.every)
     return IdentificationReport(

@@ -192,6 +192,9 @@ def test_mistakes_of_any_amount_are_found(motors, said):
     assert sentence.startswith(
         "the gain of the force of joint `joint2` seems to be 1.5"
     )
+    (sentence,) = said(angles, forces * [1.0, 1.1, 1.0, 1.0])
+    assert sentence.startswith("possible, but not sure: the gain of the force of joint")
+    assert "`joint2` seems to be 1.1" in sentence
     (sentence,) = said(angles[8:], forces[:-8])
     assert sentence.startswith(
         "the forces of the log seem to be 41 ms late (`recording.force_delay = 0.04"
@@ -304,6 +307,13 @@ def test_a_push_of_a_person_is_named_with_its_time(motors, said):
     assert sentence.startswith("something seems to push the robot")
     assert abs(start - 5.0) < 0.1
     assert abs(stop - 5.8) < 0.1
+
+
+def test_a_friction_that_drifts_is_no_push(motors, said):
+    angles, forces = motors
+    growth = np.linspace(0.0, 1.0, len(forces))[:, None] ** 2
+    drift = growth * forces.std(axis=0) * np.sign(np.gradient(angles, axis=0))
+    assert not any("push" in sentence for sentence in said(angles, forces + drift))
 
 
 def test_a_push_in_one_of_two_logs_is_named_with_the_log(motors):

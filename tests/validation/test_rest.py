@@ -56,7 +56,7 @@ def test_rows_at_rest_are_told_with_their_cure(setup, held, min_speed, is_told):
     diagnosis = jid.diagnose(log, setup.robot, observations=observations)
     mistakes = mistakes_in_logs([diagnosis], fit)
     assert not mistakes.certain
-    remarks = [x for x in mistakes.possible if "friction at rest" in x]
+    remarks = [x for x in mistakes.remarks if "friction at rest" in x]
     assert len(remarks) == is_told
     if is_told:
         # A fiftieth of the largest speed.
