@@ -1,6 +1,7 @@
 """Several runs on the command line: added, with a payload, a known load, a delay."""
 
 import dataclasses
+import html
 import json
 import os
 import re
@@ -120,6 +121,12 @@ def pasted(out, title):
     return "\n".join(lines[start : lines.index("", start)]) + "\n"
 
 
+def page_text(name):
+    """The text of a page, without tags."""
+    page = Path(name, "report.html").read_text(encoding="utf-8")
+    return re.sub(r"\s*<[^>]*>\s*", " ", html.unescape(page)).strip()
+
+
 def test_a_payload_is_found_and_can_be_subtracted(shop, run):  # noqa: F811
     code, out, err = run(
         "payload", "experiment.toml", "empty.csv", "--loaded", "loaded.csv"
@@ -132,6 +139,11 @@ def test_a_payload_is_found_and_can_be_subtracted(shop, run):  # noqa: F811
     np.testing.assert_allclose(found["centre_of_mass"], [0.02, -0.03, 0.12], atol=3e-3)
     assert [row["name"] for row in found["parameters"]][10:13] == ["m", "x", "y"]
     assert "could exist" in out
+    page = page_text("payload")
+    assert "✓ The payload on joint3 has" in page
+    assert "moment of inertia about x" in page
+    assert "model without the load" in page
+    assert pasted(out, "[robot.tool]").strip() in page
     (shop / "tool.toml").write_text(SPATIAL + pasted(out, "[robot.tool]"))
     tool = load_experiment("tool.toml").setup.robot.tool
     np.testing.assert_allclose(tool.inertia, found["inertia"], rtol=1e-4)
@@ -172,6 +184,24 @@ def test_true_forces_are_found_and_can_be_used(shop, run):  # noqa: F811
         SPATIAL + LOAD + LOAD.replace("[load]", "[robot.tool]")
     )
     assert refused(run("gains", "tool.toml", *logs), "has a known tool")
+    page = page_text("gains")
+    assert "✓ The logs determine 3 of 3 gains" in page
+    assert line in page
+
+
+def test_a_load_that_does_not_fit_is_refused(shop, run):  # noqa: F811
+    (shop / "wrong.toml").write_text(SPATIAL + LOAD.replace("0.12]", "0.01]"))
+    code, out, _ = run(
+        "gains", "wrong.toml", "empty_nominal.csv", "--loaded", "loaded_nominal.csv"
+    )
+    assert code == 3
+    assert "[recording]" not in out
+    assert "✗ The load does not fit" in page_text("gains")
+    assert "force_gains =" not in page_text("gains")
+    logs = ("empty.csv", "--loaded", "loaded.csv")
+    code, _, _ = run("payload", "experiment.toml", *logs, "--body", "joint1")
+    assert code == 3
+    assert "✗ No load explains the forces" in page_text("payload")
 
 
 def test_a_delay_is_seen_and_removed(shop, run):  # noqa: F811
@@ -272,6 +302,9 @@ def test_states_share_inertia(folder, words):  # noqa: F811
         list(estimates.values()), expected.parameters, rtol=1e-9, atol=1e-12
     )
     assert set(found["shared"]) == {base.names[k] for k in expected.shared}
+    page = page_text("states")
+    assert "parameters of friction and offsets have changed from a to warm" in page
+    assert "warm, measured" in page
 
 
 def test_a_model_is_chosen_and_its_file_identifies(shop, run):  # noqa: F811

@@ -1,27 +1,23 @@
 """Commands for several runs: `payload`, `gains`, `states`, `rollout`."""
 
 import dataclasses
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
 import typer
 from rich.console import Console
 
 import jaxid as jid
 from jaxid.errors import InputError
-from jaxid.result_table import Status, significant
+from jaxid.result_table import Status
 
 from . import options, terminal
 from .command_help import UNUSABLE_CODE
 
 if TYPE_CHECKING:
-    from jaxid.identification.payload import Payload
     from jaxid.report.several_runs_report import RunsReport
 
-TITLE_OF_TOOL = "to subtract it from other logs, in the experiment file:"
-TITLE_OF_GAINS = "to use them, in the experiment file:"
+TITLE_OF_LINES = "to correct other logs with it, in the experiment file:"
 
 
 def payload(
@@ -56,26 +52,7 @@ def payload(
         report = jid.workflow.identify_payload_from_logs(
             content.setup, logs, loaded, columns, carrier, mass, progress
         )
-    joint = robot.body_names[report.result.body]
-    lines = [TITLE_OF_TOOL, *tool_lines(report.result, joint)]
-    show_runs(console, report, output, lines)
-
-
-def tool_lines(payload: "Payload", joint: str) -> list[str]:
-    """Return the table of an experiment file that subtracts a payload."""
-    from jaxid.experiment.template import toml_text
-
-    entries = []
-    for i, j in zip(*np.triu_indices(3), strict=True):
-        entries.append(f"{'xyz'[i]}{'xyz'[j]} = {payload.inertia[i, j]:.6g}")
-    centre = [f"{value:.6g}" for value in payload.centre_of_mass]
-    return [
-        "[robot.tool]",
-        f"body = {toml_text(joint)}",
-        f"mass = {payload.mass:.6g}",
-        f"centre_of_mass = [{', '.join(centre)}]",
-        f"inertia = {{ {', '.join(entries)} }}",
-    ]
+    show_runs(console, report, output, content.text)
 
 
 def gains(
@@ -104,10 +81,7 @@ def gains(
         report = jid.workflow.identify_gains_from_logs(
             content.setup, logs, loaded, columns, content.load, progress
         )
-    ((key, values),) = report.content.items()
-    digits = ", ".join(significant(value, 5) for value in values)
-    lines = [TITLE_OF_GAINS, "[recording]", f"{key} = [{digits}]"]
-    show_runs(console, report, output, lines)
+    show_runs(console, report, output, content.text)
 
 
 def states(
@@ -128,24 +102,29 @@ def states(
         report = jid.workflow.identify_states_from_logs(
             content.setup, logs, columns, progress
         )
-    show_runs(console, report, output)
+    show_runs(console, report, output, content.text)
 
 
 def show_runs(
-    console: Console, report: "RunsReport", output: Path, lines: Sequence[str] = ()
+    console: Console,
+    report: "RunsReport",
+    output: Path,
+    experiment_text: str,
 ) -> None:
     """Write and print the result of several runs, and lines for the experiment file.
 
     Of a result that cannot be used there are no such lines.
     """
-    files = report.save(output)
+    origin = options.report_origin(experiment_text)
+    files = dataclasses.replace(report, settings=origin).save(output)
     table, *details = report.tables()
     terminal.show(console, table)
     terminal.show_remarks(console, report.remarks)
     terminal.show(console, *details)
     is_usable = report.status is not Status.BAD
+    lines = report.answer.experiment_lines
     if lines and is_usable:
-        terminal.show_text(console, "\n".join(["", *lines]))
+        terminal.show_text(console, "\n".join(["", TITLE_OF_LINES, *lines]))
     terminal.show_files(console, output, files)
     if not is_usable:
         raise typer.Exit(UNUSABLE_CODE)

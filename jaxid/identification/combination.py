@@ -81,6 +81,13 @@ def replace_estimates(fit: Fit, parameters, uncertainty: Uncertainty) -> Fit:
     )
 
 
+def relative_residual(fit: Fit, parameters: Vector) -> float:
+    """Return the norm of the residuals of a fit's rows, relative to the forces."""
+    factors = fit.time_blocks.total
+    squares = factors.residual_squares(parameters)
+    return float(np.sqrt(squares.sum() / factors.force_squares.sum()))
+
+
 def combine(fits: Sequence[Fit], maps, offsets=None) -> tuple[Vector, Uncertainty]:
     """Estimate common unknowns from factors of several fits by least squares (Eq. 33).
 

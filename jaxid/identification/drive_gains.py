@@ -23,7 +23,7 @@ from .estimators.regularisation_and_weights import Decomposition
 from .factors import Factors
 from .fit_result import Fit, interval_table
 from .operating_states import state_maps, varying_parameters
-from .payload import body_columns
+from .payload import MAX_RESIDUAL_RATIO, body_columns
 from .uncertainty import Uncertainty
 from .uncertainty.blocks import block_covariance
 
@@ -61,14 +61,16 @@ class DriveGains(Summarised, eqx.Module):
     @property
     def remarks(self) -> list[Remark]:
         """Doubts about the load, and joints whose gains it does not tell."""
-        texts = []
+        remarks = []
         misfit, min_misfit = self.misfits
         if misfit > max(MIN_MISFIT, MAX_MISFIT_RATIO * min_misfit):
-            texts.append(
-                f"the load does not fit: it leaves {percent(misfit)} of the forces "
-                f"unexplained, another one of its mass only {percent(min_misfit)}. "
+            is_wrong = misfit > MAX_RESIDUAL_RATIO * min_misfit
+            text = (
+                f"The load does not fit: it leaves {percent(misfit)} % of the forces "
+                f"unexplained, another one of its mass only {percent(min_misfit)} %. "
                 "Give its centre of mass in the frame of the body that carries it"
             )
+            remarks.append(Remark(text, Status.BAD if is_wrong else Status.DOUBTFUL))
         variances = np.diag(self.uncertainty.covariance)
         names = [
             f"`{name}`"
@@ -76,18 +78,19 @@ class DriveGains(Summarised, eqx.Module):
             if np.isinf(variance)
         ]
         if names:
-            texts.append(
-                f"these logs do not tell the gain of {', '.join(names)}, which stays 1:"
+            text = (
+                f"These logs do not tell the gain of {', '.join(names)}, which stays 1:"
                 " take a heavier load, or move faster and in more poses"
             )
-        return [Remark(text, Status.DOUBTFUL) for text in texts]
+            remarks.append(Remark(text, Status.DOUBTFUL))
+        return remarks
 
     def summary(self) -> Table:
         """Return a table of the gains with their 95 % intervals."""
         return interval_table(
             "true forces over those of the logs",
             self.joint_names,
-            ("1",) * len(self.joint_names),
+            ("",) * len(self.joint_names),
             self.gains,
             self.uncertainty,
             self.remarks,

@@ -434,15 +434,16 @@ def checksum_of(content: Any) -> str:
 
 
 def interval_table(
-    title: str, names, units, values, uncertainty: Uncertainty, remarks=()
+    title: str, names, units, values, uncertainty: Uncertainty, remarks=(), words=()
 ) -> Table:
-    """Return a table of estimates with their 95 % intervals."""
+    """Return a table of estimates with their 95 % intervals, and perhaps in words."""
     estimates, half_widths = with_deviations(values, uncertainty.half_widths())
     return Table(
         title,
         Column("parameter", names),
+        *([Column("in words", words)] if words else []),
         Column("estimate", estimates, kind="number"),
         Column("± (95 %)", half_widths, kind="number"),
-        Column("unit", units),
+        *([Column("unit", units)] if any(units) else []),
         remarks=remarks,
     )

@@ -5,7 +5,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Float, Matrix3, Vector3, double_precision
+from jaxid.arrays import (
+    AnyArray,
+    BaseVector,
+    Float,
+    Matrix,
+    Matrix3,
+    Vector3,
+    double_precision,
+)
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
 from jaxid.result_table import (
@@ -19,7 +27,12 @@ from jaxid.result_table import (
 from jaxid.robot.inertia import INERTIAL_NAMES, Inertia
 from jaxid.robot.robot import Robot, Tool
 
-from .combination import as_least_squares, combine, require_same_base
+from .combination import (
+    as_least_squares,
+    combine,
+    relative_residual,
+    require_same_base,
+)
 from .consistency import BodyBounds, consistency_margin, consistent_body
 from .fit_result import Fit, interval_table
 from .operating_states import state_maps, varying_parameters
@@ -27,6 +40,18 @@ from .uncertainty import Uncertainty
 
 CENTRAL_NAMES = ("m", "x", "y", "z", "A_c", "B_c", "C_c", "D_c", "E_c", "F_c")
 CENTRAL_UNITS = ("kg", "m", "m", "m", *("kg m²",) * 6)
+CENTRAL_WORDS = (
+    "mass",
+    "centre of mass, x",
+    "centre of mass, y",
+    "centre of mass, z",
+    "moment of inertia about x",
+    "moment of inertia about y",
+    "moment of inertia about z",
+    "product of inertia in y, z",
+    "product of inertia in x, z",
+    "product of inertia in x, y",
+)
 
 Body = Float[AnyArray, "10"]
 """Parameters $(m, m r_c, A, B, C, D, E, F)$ of a body."""
@@ -59,7 +84,10 @@ class Payload(Summarised, eqx.Module):
         distance: From the estimate to the parameters, in standard deviations: below 4
             nothing unusual; NaN where the runs do not determine all ten, or where the
             robot is lighter with the load.
-        residuals: Residuals without the load and with it, relative to the forces.
+        base_parameters: Base parameters of the robot without the load and with it; they
+            differ by the load, friction and offsets alone.
+        residuals: Residuals of these parameters without the load and with it, relative
+            to the forces.
     """
 
     body: int = eqx.field(static=True)
@@ -67,6 +95,7 @@ class Payload(Summarised, eqx.Module):
     estimate: Body
     uncertainty: Uncertainty
     distance: float
+    base_parameters: tuple[BaseVector, BaseVector]
     residuals: tuple[float, float]
 
     @property
@@ -126,6 +155,7 @@ class Payload(Summarised, eqx.Module):
             values,
             uncertainty,
             [self._remark()],
+            CENTRAL_WORDS,
         )
 
     @property
@@ -138,7 +168,7 @@ class Payload(Summarised, eqx.Module):
         if self.is_lighter:
             half_width = float(self.uncertainty.half_widths()[0])
             return Remark(
-                f"with the load the robot is lighter by {significant(-self.mass, 2)} kg"
+                f"With the load the robot is lighter by {significant(-self.mass, 2)} kg"
                 f" (± {significant(half_width, 2)} kg, 95 %): are the logs exchanged, "
                 "or was a tool taken off? Exchange them, which gives what was taken "
                 "off.",
@@ -147,28 +177,29 @@ class Payload(Summarised, eqx.Module):
         residual, loaded_residual = self.residuals
         if loaded_residual > MAX_RESIDUAL_RATIO * residual + SMALL_RESIDUAL:
             return Remark(
-                "no load explains the forces: the model misses "
+                "No load explains the forces: the model misses "
                 f"{percent(loaded_residual)} % of them with it, and "
-                f"{percent(residual)} % without. Is the load set in the robot's "
-                "controller, which then takes its weight out of the forces? Set it to "
-                "zero there, and record again.",
+                f"{percent(residual)} % without. Is it another body that carries the "
+                "load? Or is the load set in the robot's controller, which then takes "
+                "its gravity out of the forces? Set it to zero there, and record "
+                "again.",
                 Status.BAD,
             )
         if not np.isfinite(self.distance):
             return Remark(
-                "the logs do not determine all ten parameters of the payload: move the "
+                "The logs do not determine all ten parameters of the payload: move the "
                 "joints that carry it in more poses, faster, and alike in both runs.",
                 Status.BAD,
             )
         if self.distance > 0:
             is_usual = self.distance < MAX_DISTANCE
             return Remark(
-                "the estimate itself belongs to no body: these are the parameters of "
+                "The estimate itself belongs to no body: these are the parameters of "
                 "the nearest one that could exist, "
                 f"{self.distance:.2g} standard deviations away.",
                 Status.NEUTRAL if is_usual else Status.DOUBTFUL,
             )
-        return Remark("the payload is a body that could exist.", Status.GOOD)
+        return Remark("The payload is a body that could exist.", Status.GOOD)
 
 
 def identify_payload(
@@ -199,19 +230,53 @@ def identify_payload(
         RuntimeError: If no body was proved to be the nearest.
     """
     require_same_base((unloaded, loaded))
-    robot = unloaded.base.model.robot
-    body = robot.tip_body if body is None else body
-    residuals = (unloaded.residual, loaded.residual)
-    estimate, uncertainty = _estimate(unloaded, loaded, body)
-    if _is_negative(estimate, uncertainty):
-        # The nearest body that can exist would say nothing about the logs.
-        return Payload(body, estimate, estimate, uncertainty, np.nan, residuals)
-    if mass is not None:
+    base = unloaded.base
+    body = base.model.robot.tip_body if body is None else body
+    columns = body_columns(base, body)
+    fits = (as_least_squares(unloaded), as_least_squares(loaded))
+    estimate, uncertainty = _estimate(fits, columns)
+    if mass is not None and not _is_negative(estimate, uncertainty):
         estimate, uncertainty = _weigh(estimate, uncertainty, mass)
-    if not np.isfinite(uncertainty.covariance).all():
-        return Payload(body, estimate, estimate, uncertainty, np.nan, residuals)
+    parameters, distance = _possible_body(estimate, uncertainty, base.model.robot)
+    base_parameters = _robot_with_load(fits, columns @ parameters)
+    residuals = map(relative_residual, fits, base_parameters)
+    return Payload(
+        body=body,
+        parameters=parameters,
+        estimate=estimate,
+        uncertainty=uncertainty,
+        distance=distance,
+        base_parameters=base_parameters,
+        residuals=(next(residuals), next(residuals)),
+    )
+
+
+def _estimate(fits: tuple[Fit, Fit], columns: Matrix):
+    """Return the parameters that a load on a body has added between two runs."""
+    base = fits[0].base
+    states = state_maps(base.size, varying_parameters(base), 2)
+    # The payload's ten parameters are unknowns that only the loaded run has.
+    maps = [
+        np.hstack([states[0], np.zeros_like(columns)]),
+        np.hstack([states[1], columns]),
+    ]
+    values, uncertainty = combine(fits, maps)
+    covariance = uncertainty.covariance[-10:, -10:]
+    # Parameters about the centre of mass are combinations: the fewest count for all.
+    dof = np.full(10, np.min(uncertainty.dof[-10:]))
+    return values[-10:], Uncertainty(covariance, dof, covariance)
+
+
+def _possible_body(
+    estimate: Body, uncertainty: Uncertainty, robot: Robot
+) -> tuple[Body, float]:
+    """Return the nearest body that can exist, and its distance; else the estimate."""
+    is_determined = np.isfinite(uncertainty.covariance).all()
+    # The body nearest to a negative mass would say nothing about the logs.
+    if _is_negative(estimate, uncertainty) or not is_determined:
+        return estimate, np.nan
     if consistency_margin(estimate) >= 0:
-        return Payload(body, estimate, estimate, uncertainty, 0.0, residuals)
+        return estimate, 0.0
     parameters, distance, error_bound = consistent_body(
         estimate, uncertainty.covariance, _wide_bounds(robot)
     )
@@ -219,25 +284,17 @@ def identify_payload(
         raise RuntimeError(
             "no body was proved to be the nearest: are both runs of one robot?"
         )
-    return Payload(body, parameters, estimate, uncertainty, distance, residuals)
+    return parameters, distance
 
 
-def _estimate(unloaded: Fit, loaded: Fit, body: int):
-    """Return the parameters that a load on a body has added between two runs."""
-    base = unloaded.base
+def _robot_with_load(
+    fits: tuple[Fit, Fit], load: BaseVector
+) -> tuple[BaseVector, BaseVector]:
+    """Return the base parameters without and with a load that is known."""
+    base = fits[0].base
     states = state_maps(base.size, varying_parameters(base), 2)
-    columns = body_columns(base, body)
-    # The payload's ten parameters are unknowns that only the loaded run has.
-    maps = [
-        np.hstack([states[0], np.zeros_like(columns)]),
-        np.hstack([states[1], columns]),
-    ]
-    fits = (as_least_squares(unloaded), as_least_squares(loaded))
-    values, uncertainty = combine(fits, maps)
-    covariance = uncertainty.covariance[-10:, -10:]
-    # Parameters about the centre of mass are combinations: the fewest count for all.
-    dof = np.full(10, np.min(uncertainty.dof[-10:]))
-    return values[-10:], Uncertainty(covariance, dof, covariance)
+    values, _ = combine(fits, states, [np.zeros(base.size), load])
+    return states[0] @ values, states[1] @ values + load
 
 
 def _is_negative(estimate: AnyArray, uncertainty: Uncertainty) -> bool:

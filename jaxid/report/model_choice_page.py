@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 
 from jaxid.identification.model_selection import (
-    HeldOutPrediction,
     ModelChoice,
     Trial,
     relative_error,
@@ -15,14 +14,8 @@ from jaxid.result_table import percent
 from jaxid.robot.robot import Robot
 
 from .figure import Figure
-from .figure_elements import (
-    GREY,
-    MEASUREMENT_COLOUR,
-    PREDICTION_COLOUR,
-    SKY,
-    Curve,
-    Panel,
-)
+from .figure_elements import GREY, PREDICTION_COLOUR, Curve, Panel
+from .forces_of_models import model_force_figure
 from .page import Settings, provenance, render_page
 
 FIRST_MODEL = "file as it is"
@@ -79,46 +72,11 @@ def force_figure(choice: ModelChoice, robot: Robot) -> Figure:
     """
     first_prediction = choice.first_predictions[0]
     prediction = choice.predictions[0]
-    panels = [
-        _joint_panel(first_prediction, prediction, robot, joint)
-        for joint in range(robot.joints)
-    ]
     first_error = percent(relative_error([first_prediction]))
     error = percent(relative_error([prediction]))
     title = (
         f"{prediction.name}, each part by fits without it: {error} % by the chosen "
         f"model, {first_error} % by the file as it is"
     )
-    columns = 2 if len(panels) > 2 else 1
-    return Figure(title, panels, columns, height=2.6)
-
-
-def _joint_panel(
-    first_prediction: HeldOutPrediction,
-    prediction: HeldOutPrediction,
-    robot: Robot,
-    joint: int,
-) -> Panel:
-    """Return the forces of a joint, with the errors of both models below."""
-    unit = robot.force_unit(joint)
-    error_curves = []
-    for source, name, colour in (
-        (first_prediction, FIRST_MODEL, SKY),
-        (prediction, CHOSEN_MODEL, PREDICTION_COLOUR),
-    ):
-        errors = source.errors[:, joint]
-        error_curves.append(Curve(source.time, errors, name, colour, width=0.7))
-    error_panel = Panel(
-        error_curves, y="error", unit=unit, levels=[("y", 0.0, GREY)], share=0.6
-    )
-    measured_forces = first_prediction.measured[:, joint]
-    curve = Curve(
-        first_prediction.time, measured_forces, "measured", MEASUREMENT_COLOUR
-    )
-    return Panel(
-        [curve],
-        title=robot.joint_names[joint],
-        y="torque" if robot.revolute[joint] else "force",
-        unit=unit,
-        below=[error_panel],
-    )
+    predictions = {FIRST_MODEL: first_prediction, CHOSEN_MODEL: prediction}
+    return model_force_figure(predictions, robot, title)

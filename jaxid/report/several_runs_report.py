@@ -3,15 +3,27 @@
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from jaxid.identification.parameter_changes import LEVEL
 from jaxid.io import FilePath
 from jaxid.result_table import Remark, Status, Summarised, Table
 
-from .page import render_page
+from .figure import Figure
+from .page import Section, Settings, code, provenance, render_page, tiles
 from .result_files import write_page_and_table
 from .result_records import Record
+
+
+class Answer(NamedTuple):
+    """What a page says first of a result, and how it shows it."""
+
+    title: str  # title of the page
+    sentence: str  # the result in one sentence, if nothing speaks against it
+    numbers: Sequence[tuple[str, str]]  # three numbers, and what they are
+    figures: Sequence[Figure]
+    words: str  # how to read the estimates
+    experiment_lines: Sequence[str] = ()  # lines for the experiment file
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -21,20 +33,24 @@ class RunsReport(Summarised):
     Attributes:
         kind: Kind of the result: "payload", "gains" or "states".
         result: The result.
+        answer: What the page says and shows.
         estimates: Estimates in the files, one row each.
         content: Further content of the JSON file.
         sources: Logs and reports of each run.
         doubts: Doubts about the logs, as sentences.
         details: Tables beside that of the result.
+        settings: Origin of the result, as `provenance` takes it.
     """
 
     kind: str
     result: Any
+    answer: Answer
     estimates: list[Record]
     content: Record
     sources: Mapping[str, Sequence[Path]]
     doubts: Sequence[str]
     details: Sequence[Table] = ()
+    settings: Settings = dataclasses.field(default_factory=dict)
 
     @property
     def remarks(self) -> list[Remark]:
@@ -42,11 +58,21 @@ class RunsReport(Summarised):
         return [Remark(text, Status.DOUBTFUL) for text in self.doubts]
 
     @property
+    def verdict(self) -> Remark:
+        """Whether the result can be used, in one sentence."""
+        remarks = [*self.result.summary().remarks, *self.remarks]
+        faults = [remark for remark in remarks if remark.status is Status.BAD]
+        if faults:
+            return faults[0]
+        if any(remark.status is Status.DOUBTFUL for remark in remarks):
+            text = f"{self.answer.sentence}. Look at what is marked ! before you use it"
+            return Remark(text, Status.DOUBTFUL)
+        return Remark(self.answer.sentence, Status.GOOD)
+
+    @property
     def status(self) -> Status:
-        """Whether the result can be used: that of the worst remark on it."""
-        remarks = self.result.summary().remarks
-        is_bad = any(remark.status is Status.BAD for remark in remarks)
-        return Status.BAD if is_bad else Status.NEUTRAL
+        """Judgement of the result: that of the verdict."""
+        return self.verdict.status
 
     def tables(self) -> list[Table]:
         """Return all tables of the result."""
@@ -63,9 +89,24 @@ class RunsReport(Summarised):
             **self.content,
         }
         facts = [(run, ", ".join(names)) for run, names in paths.items()]
-        results = [self.remarks, *self.tables()] if self.doubts else self.tables()
-        sections = [("Result", results), ("Logs", [Table("", facts=facts)])]
-        page = render_page(f"{self.kind.capitalize()}: results", sections)
+        remarks = [*self.result.summary().remarks, *self.remarks]
+        glance = [
+            self.verdict,
+            tiles(*((*x, Status.NEUTRAL) for x in self.answer.numbers)),
+            Table("", facts=facts),
+            [remark for remark in remarks if remark != self.verdict],
+        ]
+        estimates = Table("", *self.result.summary().columns)
+        sections: list[Section] = [
+            ("At a glance", glance),
+            ("Figures", self.answer.figures),
+            ("Estimates", [*self.details, estimates, self.answer.words]),
+            provenance(self.settings),
+        ]
+        if self.answer.experiment_lines and self.status is not Status.BAD:
+            text = code("\n".join(self.answer.experiment_lines))
+            sections.insert(1, ("For the experiment file", [text]))
+        page = render_page(self.answer.title, sections)
         return write_page_and_table(
             Path(folder), self.kind, page, record, self.estimates
         )

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxid.arrays import BaseVector
 from jaxid.errors import InputError
 from jaxid.identification.combination import combine_fits
 from jaxid.identification.drive_gains import DriveGains, identify_drive_gains
@@ -21,15 +22,23 @@ from jaxid.identification.operating_states import identify_states
 from jaxid.identification.payload import (
     CENTRAL_NAMES,
     CENTRAL_UNITS,
+    body_columns,
     identify_payload,
 )
 from jaxid.identification.problem import RegressionProblem
 from jaxid.measurement.columns import Columns
+from jaxid.measurement.observations import Observations
+from jaxid.report.payload_gains_states_pages import (
+    gains_answer,
+    payload_answer,
+    states_answer,
+)
 from jaxid.report.result_records import estimate_rows
 from jaxid.report.several_runs_report import RunsReport
 from jaxid.robot.inertia import INERTIAL_NAMES, INERTIAL_UNITS
 from jaxid.robot.robot import Tool
 from jaxid.validation.diagnosis import mistakes_in_logs
+from jaxid.validation.torque_errors import TorqueErrors, torque_errors
 
 from .log_identification import read_earlier_fit
 from .log_loading import is_report, load_logs, select_filter
@@ -45,6 +54,7 @@ class Runs(NamedTuple):
     """Fits of several runs, and doubts about their logs."""
 
     fits: list[Fit]
+    logs: list[list[Observations]]  # logs of each run that were given as files
     doubts: list[str]
     sources: Mapping[str, Sequence[Path]]  # logs and reports of each run
 
@@ -76,14 +86,12 @@ def fit_runs(
     if reports:
         setup = setup.with_transition_speeds_of(read_earlier_fit(setup, reports[0]))
     setup = select_filter(setup, files, columns, progress)
-    fits = []
-    for name, group in groups.items():
-        fit, group_doubts = fit_run(setup, name, group, columns, progress)
+    runs = Runs([], [], doubts, groups)
+    for name in groups:
+        fit = add_run(runs, setup, name, columns, progress)
         # The columns of all runs must be the same.
         setup = setup.with_transition_speeds_of(fit)
-        fits.append(fit)
-        doubts += group_doubts
-    return Runs(fits, doubts, groups)
+    return runs
 
 
 def has_plain_estimator(setup: Setup) -> bool:
@@ -93,17 +101,14 @@ def has_plain_estimator(setup: Setup) -> bool:
     return is_unbounded and is_complete
 
 
-def fit_run(
-    setup: Setup,
-    name: str,
-    paths: Sequence[Path],
-    columns: Columns,
-    progress: Progress,
-) -> tuple[Fit, list[str]]:
-    """Return the fit to logs and earlier reports of one run, and doubts about logs."""
+def add_run(
+    runs: Runs, setup: Setup, name: str, columns: Columns, progress: Progress
+) -> Fit:
+    """Add the fit to logs and earlier reports of one run, its logs, and doubts."""
+    paths = runs.sources[name]
     fits = [read_earlier_fit(setup, path) for path in paths if is_report(path)]
     files = [path for path in paths if not is_report(path)]
-    doubts = []
+    observations = []
     if files:
         logs = load_logs(setup, files, columns, progress)
         observations = [log.observations for log in logs]
@@ -112,10 +117,21 @@ def fit_run(
         rows = RegressionProblem(base, observations, row_progress)
         fit = fit_problem(rows, setup.least_squares)
         fits.append(fit)
-        diagnoses = [log.diagnosis for log in logs]
-        mistakes = mistakes_in_logs(diagnoses, fit).certain
-        doubts = [text for log in logs for text in log.findings] + [*mistakes]
-    return dataclasses.replace(functools.reduce(combine_fits, fits), name=name), doubts
+        mistakes = mistakes_in_logs([log.diagnosis for log in logs], fit).certain
+        runs.doubts.extend(text for log in logs for text in log.findings)
+        runs.doubts.extend(mistakes)
+    fit = dataclasses.replace(functools.reduce(combine_fits, fits), name=name)
+    runs.fits.append(fit)
+    runs.logs.append(observations)
+    return fit
+
+
+def errors_of(
+    fit: Fit, parameters: BaseVector, logs: Sequence[Observations]
+) -> list[TorqueErrors]:
+    """Return the torque errors of parameters on the logs of a run."""
+    model = dataclasses.replace(fit, parameters=parameters)
+    return [torque_errors(model, log) for log in logs]
 
 
 def fit_with_and_without_load(
@@ -168,7 +184,20 @@ def identify_payload_from_logs(
     estimates += estimate_rows(CENTRAL_NAMES, CENTRAL_UNITS, *payload.central)
     content = {key: getattr(payload, key) for key in PAYLOAD_KEYS}
     content["body"] = setup.robot.body_names[payload.body]
-    return RunsReport("payload", payload, estimates, content, runs.sources, runs.doubts)
+    progress("predicting torques", 0.0)
+    loaded_fit = runs.fits[1]
+    logs = runs.logs[1]
+    parameters = payload.base_parameters[1]
+    load = body_columns(loaded_fit.base, payload.body) @ payload.parameters
+    answer = payload_answer(
+        payload,
+        setup.robot,
+        errors_of(loaded_fit, parameters - load, logs),
+        errors_of(loaded_fit, parameters, logs),
+    )
+    return RunsReport(
+        "payload", payload, answer, estimates, content, runs.sources, runs.doubts
+    )
 
 
 def identify_gains_from_logs(
@@ -196,7 +225,11 @@ def identify_gains_from_logs(
     units = ("1",) * len(names)
     estimates = estimate_rows(names, units, drives.gains, drives.uncertainty)
     content = corrected_gains(columns, drives)
-    return RunsReport("gains", drives, estimates, content, runs.sources, runs.doubts)
+    ((key, values),) = content.items()
+    answer = gains_answer(drives, setup.robot, key, values)
+    # That forces seem to need gains is no doubt where gains are identified.
+    doubts = [text for text in runs.doubts if "`recording.force_gains`" not in text]
+    return RunsReport("gains", drives, answer, estimates, content, runs.sources, doubts)
 
 
 def corrected_gains(columns: Columns, drives: DriveGains) -> dict[str, list[float]]:
@@ -240,7 +273,12 @@ def identify_states_from_logs(
         )
     first_state, *other_states = groups
     comparisons = [states.compare(first_state, state) for state in other_states]
-    tables = [(x.group_summary(), x.summary()) for x in comparisons]
+    tables = [table for x in comparisons for table in (x.group_summary(), x.summary())]
+    progress("predicting torques", 0.0)
+    errors = {
+        state: errors_of(fit, states.fit(state).parameters, logs)
+        for state, fit, logs in zip(groups, runs.fits, runs.logs, strict=True)
+    }
     content = {
         "states": states.states,
         "shared": [states.base.names[k] for k in states.shared],
@@ -250,11 +288,12 @@ def identify_states_from_logs(
     return RunsReport(
         "states",
         states,
+        states_answer(states, errors),
         estimate_rows(
             states.names, states.units, states.parameters, states.uncertainty
         ),
         content,
         {"states": paths},
         doubts,
-        details=[table for pair in tables for table in pair],
+        details=tables,
     )

@@ -199,7 +199,7 @@ def test_a_load_in_a_wrong_frame_is_doubted(base, centre):
     noisy = pair(base, np.array([0.1, 0.1, 0.04]), 3, gains=GAINS)
     moved = jid.Tool(2, mass=3.0, centre_of_mass=centre, inertia=LOAD.inertia)
     found = jid.identify_drive_gains(*noisy, moved)
-    assert "the load does not fit" in str(found)
+    assert "The load does not fit" in str(found)
     cured = jid.identify_drive_gains(*noisy, LOAD)
     assert cured.remarks == []
     np.testing.assert_allclose(cured.gains, GAINS, rtol=0.02)

@@ -1,0 +1,184 @@
+"""What the pages of a payload, of gains and of states say and show."""
+
+import dataclasses
+import json
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from jaxid.identification.drive_gains import DriveGains
+from jaxid.identification.fit_result import Fit
+from jaxid.identification.operating_states import StatesFit
+from jaxid.identification.parameter_changes import Verdict
+from jaxid.identification.payload import Payload
+from jaxid.result_table import percent, significant
+from jaxid.robot.robot import Robot
+from jaxid.validation.torque_errors import TorqueErrors, relative_error
+
+from .comparison_figure import comparison_figure
+from .figure import Figure
+from .figure_elements import CYCLE, GREY, Curve, Panel
+from .forces_of_models import model_force_figure
+from .friction_and_gravity import friction_figure
+from .parameter_words import FRAMES_NOTE
+from .several_runs_report import Answer
+
+Errors = Sequence[TorqueErrors]
+"""Torque errors on some logs."""
+
+
+def payload_answer(
+    payload: Payload, robot: Robot, unloaded: Errors, loaded: Errors
+) -> Answer:
+    """Return what the page of a payload says and shows.
+
+    Args:
+        payload: The payload.
+        robot: Robot that carries it.
+        unloaded: Errors of the model without the payload on the loaded logs.
+        loaded: Errors of the model with it on the same logs.
+    """
+    joint = robot.body_names[payload.body]
+    residual, loaded_residual = map(percent, payload.residuals)
+    _, _, mass, half_width, _ = map(str.strip, payload.summary().rows[0])
+    figures = []
+    for errors, loaded_errors in zip(unloaded, loaded, strict=True):
+        title = (
+            f"{errors.name}: {percent(errors.relative)} % of the forces missed without "
+            f"the payload, {percent(loaded_errors.relative)} % with it"
+        )
+        predictions = {
+            "model without the payload": errors,
+            "model with the payload": loaded_errors,
+        }
+        figures.append(model_force_figure(predictions, robot, title))
+    return Answer(
+        f"{robot.name}: payload",
+        f"The payload on {joint} has {mass} ± {half_width} kg, and the model with it "
+        f"misses {loaded_residual} % of the forces",
+        [
+            (f"{mass} ± {half_width} kg", "mass, with its 95 % interval"),
+            (f"{loaded_residual} %", "of the forces missed with the payload"),
+            (f"{residual} %", "of the forces missed without it, by the same model"),
+        ],
+        figures,
+        f"The frame is that of the body that {joint} moves. A_c to F_c are about the "
+        "centre of mass, along the axes of this frame.",
+        tool_lines(payload, joint),
+    )
+
+
+def tool_lines(payload: Payload, joint: str) -> list[str]:
+    """Return the table of an experiment file that subtracts a payload."""
+    entries = []
+    for i, j in zip(*np.triu_indices(3), strict=True):
+        entries.append(f"{'xyz'[i]}{'xyz'[j]} = {payload.inertia[i, j]:.6g}")
+    centre = [f"{value:.6g}" for value in payload.centre_of_mass]
+    return [
+        "[robot.tool]",
+        # A text of JSON is one of TOML.
+        f"body = {json.dumps(joint, ensure_ascii=False)}",
+        f"mass = {payload.mass:.6g}",
+        f"centre_of_mass = [{', '.join(centre)}]",
+        f"inertia = {{ {', '.join(entries)} }}",
+    ]
+
+
+def gains_answer(
+    drives: DriveGains, robot: Robot, key: str, values: Sequence[float]
+) -> Answer:
+    """Return what the page of drive gains says and shows.
+
+    Args:
+        drives: The gains.
+        robot: Robot of the drives.
+        key: Key of the experiment file that corrects the forces.
+        values: Its values, one for each joint.
+    """
+    half_widths = drives.uncertainty.half_widths()
+    is_determined = np.isfinite(half_widths)
+    count = np.count_nonzero(is_determined)
+    misfit, min_misfit = map(percent, drives.misfits)
+    digits = ", ".join(significant(value, 5) for value in values)
+    # A gain that is not determined has no interval.
+    half_widths[~is_determined] = np.nan
+    curve = Curve(
+        drives.gains,
+        np.arange(robot.joints),
+        kind="intervals",
+        low=drives.gains - half_widths,
+        high=drives.gains + half_widths,
+        texts=[": ".join(row[:2]) for row in drives.summary().rows],
+    )
+    panel = Panel(
+        [curve],
+        x="gain: true force over force of the log",
+        y_names=robot.joint_names,
+        levels=[("x", 1.0, GREY)],
+    )
+    height = 0.8 + 0.3 * robot.joints
+    return Answer(
+        f"{robot.name}: gains of the drives",
+        f"The logs determine {count} of {robot.joints} gains, and the model with the "
+        f"load misses {misfit} % of the forces",
+        [
+            (f"{count} of {robot.joints}", "gains that the logs determine"),
+            (f"{misfit} %", "of the forces missed with the load as described"),
+            (f"{min_misfit} %", "of the forces missed with the best load of its mass"),
+        ],
+        [Figure("Gains with their 95 % intervals", [panel], height=height)],
+        "The true force of a joint is its gain times the force of the log. A gain that "
+        "the logs do not determine stays 1, and has no interval in the figure.",
+        ["[recording]", f"{key} = [{digits}]"],
+    )
+
+
+def states_answer(states: StatesFit, errors: Mapping[str, Errors]) -> Answer:
+    """Return what the page of several states says and shows.
+
+    Args:
+        states: The states.
+        errors: Torque errors of each state's model on its logs, as far as given.
+    """
+    first_state, *other_states = states.states
+    comparisons = [states.compare(first_state, state) for state in other_states]
+    changes = max(x.verdicts.count(Verdict.CHANGED) for x in comparisons)
+    count = f"{changes} of {len(states.varying)}"
+    _, chance = states.sharing
+    numbers = [
+        (count, "parameters of friction and offsets that have changed"),
+        (f"{percent(chance)} %", "chance that the states share everything else"),
+    ]
+    figures = [comparison_figure(x) for x in comparisons]
+    groups = {state: logs for state, logs in errors.items() if logs}
+    if groups:
+        missed_share = percent(
+            relative_error([x for logs in groups.values() for x in logs])
+        )
+        numbers.append((f"{missed_share} %", "of the forces missed, in all states"))
+        fits = {state: states.fit(state) for state in groups}
+        figures.insert(0, state_friction_figure(fits, errors))
+    return Answer(
+        f"{states.base.model.robot.name}: {len(states.states)} states",
+        f"{count} parameters of friction and offsets have changed from {first_state} "
+        f"to {', '.join(other_states)}",
+        numbers,
+        figures,
+        FRAMES_NOTE,
+    )
+
+
+def state_friction_figure(
+    fits: Mapping[str, Fit], errors: Mapping[str, Errors]
+) -> Figure:
+    """Return the friction of each joint against speed, of all states in one panel."""
+    panels: dict[str, Panel] = {}
+    for (state, fit), colour in zip(fits.items(), CYCLE, strict=False):
+        for panel in friction_figure(fit, errors[state]).panels:
+            curves = list(panels[panel.title].curves) if panel.title in panels else []
+            for curve, name in zip(
+                panel.curves[-2:], (state, f"{state}, measured"), strict=True
+            ):
+                curves.append(dataclasses.replace(curve, name=name, colour=colour))
+            panels[panel.title] = dataclasses.replace(panel, curves=curves, value="")
+    return Figure("Friction of the states", list(panels.values()), min(3, len(panels)))
