@@ -395,10 +395,34 @@ def test_what_has_changed_between_two_runs_is_told(folder, first, run):
     )
     rows = {r["name"]: r for r in content["parameters"]}
     assert abs(rows["fv1"]["difference"] + 0.25) < 0.02
-    assert content["sources"] == ["first", "warm"]
+    assert (content["first"], content["second"]) == ("first", "warm")
     assert run("compare", "warm", "first")[0] == 0, "an earlier comparison may go"
+    shutil.copytree("first", "again")
+    code, out, _ = run("compare", "first", "again")
+    assert "were made of one log, `a.csv`, or parts of it" in " ".join(out.split())
     assert refused(run("compare", "first", "first/"), "`first` is given twice")
     assert refused(run("compare", "first", "none"), "`none` is no file or folder")
+
+
+def test_two_models_are_laid_over_one_log(folder, first, run):
+    (folder / "own.toml").write_text(EXPERIMENT + "[model]\noffset = false\n")
+    assert run("identify", "own.toml", "a.csv", "-o", "own")[0] == 0
+    asked = "different base parameters"
+    assert refused(run("compare", "first", "own"), asked, "Or add `--log`")
+    code, out, err = run("compare", "first", "own", "--log", "a.csv")
+    assert (code, err) == (0, "")
+    said = " ".join(out.split())
+    for name in ("first", "own"):
+        assert f"`{name}` was fitted to `a.csv`, or to a part of it" in said
+    path = folder / "comparison" / "comparison.json"
+    errors = json.loads(path.read_text(encoding="utf-8"))["errors"]
+    for name in ("first", "own"):
+        (expected,) = result(folder, name)["errors"]["identification"]
+        assert errors[name]["relative"] == pytest.approx(expected["relative"], rel=1e-9)
+    page = (folder / "comparison" / "report.html").read_text(encoding="utf-8")
+    assert "predicts a better than the other model" in page
+    assert "Both models over one log" in page
+    assert "parameters have changed" not in page
 
 
 SLOW = EXPERIMENT.replace("step = 4", "step = 4\nmin_speed = 0.05")

@@ -1,5 +1,6 @@
 """Several runs on the command line: added, with a payload, a known load, a delay."""
 
+import csv
 import dataclasses
 import html
 import json
@@ -205,7 +206,15 @@ def test_a_load_that_does_not_fit_is_refused(shop, run):  # noqa: F811
 
 
 def test_a_delay_is_seen_and_removed(shop, run):  # noqa: F811
-    _, out, _ = run("inspect", "experiment.toml", "late.csv")
+    _, out, _ = run("inspect", "experiment.toml", "late.csv", "-o", "look")
+    page = page_text("look")
+    assert "! Look at what is marked ! before you identify with late" in page
+    assert "positions and forces (dashed: limits)" in page
+    with open("look/inspection.csv", encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    speeds = np.abs(np.diff(np.loadtxt("late.csv", delimiter=",", skiprows=1), axis=0))
+    speeds = speeds[:, 1:4].max(axis=0) / 0.005
+    np.testing.assert_allclose([float(x["speed"]) for x in rows], speeds, rtol=0.05)
     found = re.search(r"force_delay = ([0-9.]+)`", " ".join(out.split()))
     assert found, out
     assert abs(float(found[1]) - 0.012) < 3e-4

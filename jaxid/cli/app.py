@@ -175,26 +175,32 @@ def inspect(
     logs: Annotated[
         options.Paths | None, typer.Argument(help="Logs to examine.", metavar="LOG")
     ] = None,
+    output: options.OutputFolder = Path("inspection"),
+    force: options.Force = False,
     detail: options.Detail = None,
 ) -> None:
     """Show what can be identified, and check logs for mistakes.
 
     Joints, motors and limits; base parameters and what becomes of each standard
     parameter; ranges, speeds and forces of each log beside the limits, and what the log
-    does not determine.
+    does not determine. Of logs there is a page, too.
     """
     logs = logs or []
-    console = options.start(*logs, experiment=experiment)
+    folder = output if logs else None
+    console = options.start(*logs, experiment=experiment, output=folder, force=force)
     content = jid.experiment.load_experiment(experiment)
     with terminal.progress_bar() as progress:
         progress("finding base parameters", 0.0)
         inspection = jid.workflow.Inspection(content.setup)
+        files = []
         if logs:
             columns = content.require_columns(logs)
             inspection = jid.workflow.inspect_logs(
                 content.setup, logs, columns, progress
             )
-    terminal.show_result(console, detail, inspection, Path())
+            progress("writing the report", 0.0)
+            files = inspection.save(output, options.report_origin(content.text))
+    terminal.show_result(console, detail, inspection, output, files)
 
 
 def identify(

@@ -141,26 +141,30 @@ def compare(
     second: Annotated[
         Path,
         typer.Argument(
-            help="Report of another run of the same robot.", metavar="SECOND"
+            help="Report of another run or model of it.", metavar="SECOND"
         ),
     ],
+    log: Annotated[
+        Path | None,
+        typer.Option(
+            "--log", metavar="LOG", help="A log that both models predict, side by side."
+        ),
+    ] = None,
     output: options.OutputFolder = Path("comparison"),
     force: options.Force = False,
     detail: options.Detail = None,
 ) -> None:
-    """Decide which parameters have changed between two runs.
+    """Decide which parameters have changed, or which model predicts a log better.
 
-    Each argument is a folder that `jaxid identify` has written.
+    Each report is a folder that `jaxid identify` has written. With `--log`, the models
+    may have different effects; the log is read as the first report's was.
     """
     if first.resolve() == second.resolve():
         raise InputError(f"`{first}` is given twice: compare two different runs.")
-    console = options.start(first, second, output=output, force=force)
-    from jaxid.report.result_files import read_fit, write_comparison
-
-    paths = (first, second)
-    cold_fit, warm_fit = (
-        dataclasses.replace(read_fit(path), name=str(path)) for path in paths
-    )
-    comparison = jid.compare(cold_fit, warm_fit)
-    files = write_comparison(output, comparison, paths)
-    terminal.show_result(console, detail, comparison, output, files)
+    logs = [] if log is None else [log]
+    console = options.start(first, second, *logs, output=output, force=force)
+    with terminal.progress_bar() as progress:
+        report = jid.experiment.compare_reports((first, second), log, progress)
+        settings = {"command": options.command_line()}
+        files = dataclasses.replace(report, settings=settings).save(output)
+    terminal.show_result(console, detail, report, output, files)

@@ -7,4 +7,5 @@ from .experiment import (
     parse_experiment as parse_experiment,
 )
 from .model_choice import choose_model as choose_model
+from .report_comparison import compare_reports as compare_reports
 from .template import write_template as write_template

@@ -10,13 +10,13 @@ from jaxid.identification.model_selection import (
     relative_error,
 )
 from jaxid.io import write_text
-from jaxid.result_table import percent
+from jaxid.result_table import Status, Table, percent
 from jaxid.robot.robot import Robot
 
 from .figure import Figure
 from .figure_elements import GREY, PREDICTION_COLOUR, Curve, Panel
 from .forces_of_models import model_force_figure
-from .page import Settings, provenance, render_page
+from .page import Settings, provenance, render_page, tiles
 
 FIRST_MODEL = "file as it is"
 CHOSEN_MODEL = "chosen model"
@@ -26,10 +26,25 @@ def write_model_choice(
     file: Path, choice: ModelChoice, robot: Robot, settings: Settings
 ) -> None:
     """Write the page of a choice of models."""
+    table = choice.summary()
+    verdict, *remarks = choice.remarks
+    error = percent(choice.promise)
+    first_error = percent(relative_error(choice.first_predictions))
+    sizes = f"{choice.path[0].size} → {choice.chosen.size}"
+    numbers = tiles(
+        (f"{error} %", "of the forces missed by the chosen model", Status.NEUTRAL),
+        (
+            f"{first_error} %",
+            "of the forces missed by the file as it is",
+            Status.NEUTRAL,
+        ),
+        (sizes, "parameters of the file, and of the chosen model", Status.NEUTRAL),
+    )
     sections = [
-        ("Result", [choice.summary()]),
+        ("At a glance", [verdict, numbers, remarks]),
+        ("Both models over one log", [force_figure(choice, robot)]),
         ("Error against size", [size_figure(choice)]),
-        ("Forces", [force_figure(choice, robot)]),
+        ("All models", [Table("", *table.columns, status=table.status)]),
         provenance(settings),
     ]
     write_text(file, render_page(f"{robot.name}: choice of a model", sections))

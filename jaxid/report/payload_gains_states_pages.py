@@ -54,8 +54,8 @@ def payload_answer(
         figures.append(model_force_figure(predictions, robot, title))
     return Answer(
         f"{robot.name}: payload",
-        f"The payload on {joint} has {mass} ± {half_width} kg, and the model with it "
-        f"misses {loaded_residual} % of the forces",
+        f"The payload on {joint} has a mass of {mass} ± {half_width} kg, and the model "
+        f"with it misses {loaded_residual} % of the forces",
         [
             (f"{mass} ± {half_width} kg", "mass, with its 95 % interval"),
             (f"{loaded_residual} %", "of the forces missed with the payload"),

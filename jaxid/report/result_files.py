@@ -6,27 +6,22 @@ Each result is written atomically.
 import csv
 import re
 import unicodedata
-from collections.abc import Sequence
 from pathlib import Path
 
 from jaxid.errors import InputError
 from jaxid.identification.fit_result import Fit
 from jaxid.identification.model_file import load_fit
-from jaxid.identification.parameter_changes import LEVEL, Comparison, Verdict
 from jaxid.io import atomic_folder, json_text, read_json
-from jaxid.result_table import Remark, Status
+from jaxid.result_table import Status
 from jaxid.validation.judgement import Report
 
-from .comparison_figure import comparison_figure
 from .figure import Figure
 from .friction_and_gravity import error_scene, friction_figure
 from .identification_page import identification_page
-from .page import render_page
 from .residual_spectra import residual_figure
 from .result_records import (
     SCHEMAS,
     Record,
-    comparison_rows,
     header,
     plain,
     result_record,
@@ -137,43 +132,18 @@ def read_fit(report: Path) -> Fit:
 
 def read_faults(report: Path) -> list[str]:
     """Return why a report's model must not be used, by its verdict; else nothing."""
-    path = (report if report.is_dir() else report.parent) / "result.json"
-    if schema_of(path) != SCHEMAS["result.json"]:
-        return []
     try:
         # The first remark of a verdict sums the others up.
-        remarks = read_json(path).get("verdict", ())[1:]
+        remarks = read_result(report).get("verdict", ())[1:]
         return [r["text"] for r in remarks if r["status"] == Status.BAD.name.lower()]
     except (KeyError, TypeError) as error:
-        raise InputError(f"`{path}` is damaged: identify again.") from error
+        raise InputError(f"`{report}` is damaged: identify again.") from error
 
 
-def write_comparison(
-    folder: Path, comparison: Comparison, sources: Sequence[Path] = ()
-) -> list[Path]:
-    """Write `report.html`, `comparison.json` and `comparison.csv`; return the files."""
-    first_fit = comparison.first
-    second_fit = comparison.second
-    rows = comparison_rows(comparison)
-    content = {
-        "first": first_fit.name,
-        "second": second_fit.name,
-        "sources": [str(source) for source in sources],
-        "level": LEVEL,
-        "parameters": rows,
-        "covariance_of_differences": comparison.uncertainty.covariance,
-        "groups": comparison.groups,
-    }
-    changes = comparison.verdicts.count(Verdict.CHANGED)
-    count = Remark(f"{changes} of {len(rows)} parameters have changed")
-    sections = [
-        ("Result", [count, comparison.group_summary()]),
-        ("Estimates side by side", [comparison_figure(comparison)]),
-        ("All parameters", [comparison.summary()]),
-    ]
-    title = f"{first_fit.base.model.robot.name}: two runs compared"
-    page = render_page(title, sections, f"{first_fit.name} and {second_fit.name}")
-    return write_page_and_table(folder, "comparison", page, content, rows)
+def read_result(report: Path) -> Record:
+    """Return the content of a report's `result.json`; nothing of a model alone."""
+    path = (report if report.is_dir() else report.parent) / "result.json"
+    return read_json(path) if schema_of(path) == SCHEMAS["result.json"] else {}
 
 
 def write_page_and_table(

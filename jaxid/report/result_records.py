@@ -19,7 +19,16 @@ from jaxid.validation.torque_errors import TorqueErrors
 
 Record = dict[str, Any]
 """Object of a JSON file, or row of a CSV file."""
-KINDS = ("result", "comparison", "payload", "gains", "states", "demo", "rollout")
+KINDS = (
+    "result",
+    "comparison",
+    "inspection",
+    "payload",
+    "gains",
+    "states",
+    "demo",
+    "rollout",
+)
 SCHEMAS = {f"{kind}.json": f"jaxid-{kind}/1" for kind in KINDS}
 """Files that hold results, and the schemas in them."""
 
@@ -83,8 +92,8 @@ def result_record(report: Report) -> Record:
         },
         "consistency": consistency_record(fit),
         "errors": {
-            "identification": [_error_record(e, robot) for e in report.identification],
-            "verification": [_error_record(e, robot) for e in report.verification],
+            "identification": [error_record(e, robot) for e in report.identification],
+            "verification": [error_record(e, robot) for e in report.verification],
         },
         "mass_matrix": {
             "positive_definite": report.definiteness.positive_definite,
@@ -113,7 +122,7 @@ def consistency_record(fit: Fit) -> Record | None:
     return {**vars(fit.consistency), "standard_parameters": parameters}
 
 
-def _error_record(errors: TorqueErrors, robot: Robot) -> Record:
+def error_record(errors: TorqueErrors, robot: Robot) -> Record:
     """Return the torque errors of one recording, joint by joint."""
     rows = table_rows(
         name=robot.joint_names,

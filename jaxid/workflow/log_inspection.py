@@ -8,8 +8,11 @@ from typing import NamedTuple
 
 from jaxid.identification.fit_result import Fit
 from jaxid.identification.identify import identify
+from jaxid.io import FilePath
 from jaxid.measurement.columns import Columns
 from jaxid.report.identification_page import motor_tables
+from jaxid.report.inspection_page import write_inspection
+from jaxid.report.page import Settings
 from jaxid.result_table import Remark, Status, Summarised, Table
 from jaxid.validation.diagnosis import Diagnosis
 
@@ -64,6 +67,13 @@ class Inspection(Summarised):
             table.remarks = tuple(log.doubts)
             tables.append(table)
         return tables
+
+    def save(self, folder: FilePath, settings: Settings) -> list[Path]:
+        """Write a page on the logs, and their statistics; return the files."""
+        details = Inspection(self.setup).tables()
+        return write_inspection(
+            Path(folder), self.verdict, self.logs, details, settings
+        )
 
     def tables(self) -> list[Table]:
         """Return robot and parameters, findings on each log, and what it determines."""

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from browser import CHROMIUM, Browser
 
+from jaxid.report.comparison_page import ComparisonReport
 from jaxid.report.motion_figures import pose_figure
 from jaxid.robot import library
 from jaxid.robot.collision import Capsule, CollisionModel, HalfSpace
@@ -25,10 +26,9 @@ def browser():
 @pytest.fixture(scope="module")
 def pages(written, changed, tmp_path_factory):
     """An identification, and a comparison."""
-    from jaxid.report.result_files import write_comparison
-
     folder = tmp_path_factory.mktemp("comparison") / "out"
-    page, *_ = write_comparison(folder, changed)
+    robot = changed.first.base.model.robot
+    page, *_ = ComparisonReport(robot, changed, {}, ()).save(folder)
     return {"identification": written / "report.html", "comparison": page}
 
 

@@ -9,13 +9,13 @@ import pytest
 
 from jaxid.identification.parameter_changes import Verdict, compare
 from jaxid.report import result_files
+from jaxid.report.comparison_page import ComparisonReport
 from jaxid.report.figure import Figure
 from jaxid.report.result_files import (
     _earlier_figures,
     read_faults,
     read_fit,
     safe_name,
-    write_comparison,
     write_report,
 )
 from jaxid.report.result_records import SCHEMAS, consistency_record, plain
@@ -152,7 +152,9 @@ def test_recordings_of_one_name_keep_their_figures_apart(
 
 
 def test_comparisons_hold_the_numbers_exactly(tmp_path, changed):
-    files = write_comparison(tmp_path / "out", changed)
+    robot = changed.first.base.model.robot
+    report = ComparisonReport(robot, changed, {}, ())
+    files = report.save(tmp_path / "out")
     assert [p.name for p in files] == [
         "report.html",
         "comparison.json",
