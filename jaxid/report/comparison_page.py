@@ -43,7 +43,7 @@ class ComparisonReport(Summarised):
     @property
     def verdict(self) -> Remark:
         """Which model predicts the log better; without a log, what has changed."""
-        status = Status.DOUBTFUL if self.doubts else Status.GOOD
+        status = Status.DOUBTFUL if self.doubts else Status.NEUTRAL
         if not self.errors:
             return Remark(" ".join(self.numbers[0]), status)
         best = min(self.errors, key=lambda name: self.errors[name].relative)
@@ -54,7 +54,10 @@ class ComparisonReport(Summarised):
     def numbers(self) -> list[tuple[str, str]]:
         """Numbers in large letters, and what they are."""
         numbers = [
-            (f"{percent(x.relative)} %", f"torque error of {name}{x.band_words}")
+            (
+                f"{percent(x.relative)} %",
+                f"torque error of {name} on {x.name}{x.band_words}",
+            )
             for name, x in self.errors.items()
         ]
         if self.comparison is not None:
@@ -76,7 +79,7 @@ class ComparisonReport(Summarised):
             for name, errors in self.errors.items()
         ]
         if columns:
-            title = "RMS torque errors, relative to the RMS torques"
+            title = "torque errors"
             joints = Column("joint", self.robot.joint_names)
             tables.insert(0, Table(title, joints, *columns))
         return tables
@@ -101,7 +104,7 @@ class ComparisonReport(Summarised):
         if records:
             title = next(iter(self.errors.values())).name
             figure = model_force_figure(self.errors, self.robot, title)
-            sections.append(("Both models over one log", [table, figure]))
+            sections.append(("Both models over one log", [figure, table]))
         if comparison is not None:
             rows = comparison_rows(comparison)
             content |= {

@@ -147,7 +147,10 @@ def states_answer(states: StatesFit, errors: Mapping[str, Errors]) -> Answer:
     _, chance = states.sharing
     numbers = [
         (count, "parameters of friction and offsets that have changed"),
-        (f"{percent(chance)} %", "chance that the states share everything else"),
+        (
+            f"{percent(chance)} %",
+            "chance of such differences if the states share all else",
+        ),
     ]
     figures = [comparison_figure(x) for x in comparisons]
     groups = {state: logs for state, logs in errors.items() if logs}

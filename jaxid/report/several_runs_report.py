@@ -10,7 +10,7 @@ from jaxid.io import FilePath
 from jaxid.result_table import Remark, Status, Summarised, Table
 
 from .figure import Figure
-from .page import Section, Settings, code, provenance, render_page, tiles
+from .page import Section, Settings, code, folded, provenance, render_page, tiles
 from .result_files import write_page_and_table
 from .result_records import Record
 
@@ -96,7 +96,9 @@ class RunsReport(Summarised):
             Table("", facts=facts),
             [remark for remark in remarks if remark != self.verdict],
         ]
-        estimates = Table("", *self.result.summary().columns)
+        estimates: Any = Table("", *self.result.summary().columns)
+        if self.details:
+            estimates = folded("All estimates", estimates)
         sections: list[Section] = [
             ("At a glance", glance),
             ("Figures", self.answer.figures),
