@@ -140,9 +140,7 @@ def compare(
     ],
     second: Annotated[
         Path,
-        typer.Argument(
-            help="Report of another run or model of it.", metavar="SECOND"
-        ),
+        typer.Argument(help="Report of another run or model of it.", metavar="SECOND"),
     ],
     log: Annotated[
         Path | None,

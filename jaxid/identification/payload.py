@@ -86,8 +86,8 @@ class Payload(Summarised, eqx.Module):
             robot is lighter with the load.
         base_parameters: Base parameters of the robot without the load and with it; they
             differ by the load, friction and offsets alone.
-        residuals: Residuals of these parameters without the load and with it, relative
-            to the forces.
+        residuals: Residual of the fit without the load, and of the model with the load,
+            relative to the forces.
     """
 
     body: int = eqx.field(static=True)
@@ -239,7 +239,7 @@ def identify_payload(
         estimate, uncertainty = _weigh(estimate, uncertainty, mass)
     parameters, distance = _possible_body(estimate, uncertainty, base.model.robot)
     base_parameters = _robot_with_load(fits, columns @ parameters)
-    residuals = map(relative_residual, fits, base_parameters)
+    loaded_residual = relative_residual(fits[1], base_parameters[1])
     return Payload(
         body=body,
         parameters=parameters,
@@ -247,7 +247,7 @@ def identify_payload(
         uncertainty=uncertainty,
         distance=distance,
         base_parameters=base_parameters,
-        residuals=(next(residuals), next(residuals)),
+        residuals=(fits[0].residual, loaded_residual),
     )
 
 

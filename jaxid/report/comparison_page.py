@@ -71,18 +71,28 @@ class ComparisonReport(Summarised):
         """Doubts, as remarks."""
         return [Remark(text, Status.DOUBTFUL) for text in self.doubts]
 
-    def tables(self) -> list[Table]:
-        """Return the errors on the log, joint by joint, then parameters and kinds."""
-        tables = [] if self.comparison is None else list(self.comparison.tables())
+    def error_table(self) -> Table:
+        """Return the errors on the log, joint by joint."""
         columns = [
             Column(name, errors.rms_relative, "%", percent)
             for name, errors in self.errors.items()
         ]
-        if columns:
-            title = "torque errors"
-            joints = Column("joint", self.robot.joint_names)
-            tables.insert(0, Table(title, joints, *columns))
-        return tables
+        joints = Column("joint", self.robot.joint_names)
+        return Table("torque errors (RMS over RMS)", joints, *columns)
+
+    def overview(self) -> list[Table]:
+        """Return errors on the log, what has changed, doubts and verdict."""
+        changes = [] if self.comparison is None else self.comparison.overview()[1:]
+        return self._with_errors(changes)
+
+    def tables(self) -> list[Table]:
+        """Return errors on the log, all parameters, doubts and verdict."""
+        return self._with_errors(self.comparison.tables() if self.comparison else [])
+
+    def _with_errors(self, tables: Sequence[Table]) -> list[Table]:
+        """Return tables with the errors before them, doubts and verdict behind."""
+        errors = [self.error_table()] if self.errors else []
+        return [*errors, *tables, Table("", remarks=[*self.remarks, self.verdict])]
 
     def save(self, folder: FilePath) -> list[Path]:
         """Write a page, and the numbers as JSON and CSV; return the files."""
@@ -100,11 +110,10 @@ class ComparisonReport(Summarised):
             self.remarks,
         ]
         sections: list[Section] = [("At a glance", glance)]
-        table, *_ = self.tables()
         if records:
             title = next(iter(self.errors.values())).name
             figure = model_force_figure(self.errors, self.robot, title)
-            sections.append(("Both models over one log", [figure, table]))
+            sections.append(("Both models over one log", [figure, self.error_table()]))
         if comparison is not None:
             rows = comparison_rows(comparison)
             content |= {

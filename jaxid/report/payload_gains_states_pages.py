@@ -59,7 +59,7 @@ def payload_answer(
         [
             (f"{mass} ± {half_width} kg", "mass, with its 95 % interval"),
             (f"{loaded_residual} %", "of the forces missed with the payload"),
-            (f"{residual} %", "of the forces missed without it, by the same model"),
+            (f"{residual} %", "of the forces missed without it, by the robot's fit"),
         ],
         figures,
         f"The frame is that of the body that {joint} moves. A_c to F_c are about the "
