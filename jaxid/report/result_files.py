@@ -137,7 +137,9 @@ def read_faults(report: Path) -> list[str]:
         remarks = read_result(report).get("verdict", ())[1:]
         return [r["text"] for r in remarks if r["status"] == Status.BAD.name.lower()]
     except (KeyError, TypeError) as error:
-        raise InputError(f"`{report}` is damaged: identify again.") from error
+        raise InputError(
+            f"`{report}`: `result.json` is damaged: identify again."
+        ) from error
 
 
 def read_result(report: Path) -> Record:
