@@ -23,7 +23,7 @@ MODEL_COLOURS = (BLUE, PREDICTION_COLOUR)
 
 
 Predictions = Mapping[str, HeldOutPrediction | TorqueErrors]
-"""What two models predict of one log, by their names."""
+"""Predictions of two models for one log, by their names."""
 
 
 def model_force_figure(predictions: Predictions, robot: Robot, title: str) -> Figure:

@@ -1,4 +1,4 @@
-"""What the pages of a payload, of gains and of states say and show."""
+"""Contents of the pages of a payload, of gains and of states: numbers and figures."""
 
 import dataclasses
 import json

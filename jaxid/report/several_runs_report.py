@@ -16,7 +16,7 @@ from .result_records import Record
 
 
 class Answer(NamedTuple):
-    """What a page says first of a result, and how it shows it."""
+    """Content of the page of a result: numbers, figures, and how to read them."""
 
     title: str  # title of the page
     sentence: str  # the result in one sentence, if nothing speaks against it
