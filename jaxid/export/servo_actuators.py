@@ -1,7 +1,7 @@
 """Identified servos for simulators: MJCF files, and numbers for Isaac Lab."""
 
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
@@ -37,6 +37,8 @@ UNITS = {
 """Units of `simulator_values` at joints that turn, and at joints that slide."""
 GAIN_SYMBOLS = {"stiffness": "a", "damping": "B", "feed_forward": "f"}
 """Parameters of joints that tell the gains of their servos."""
+DIFFERENCE = "differs"
+"""Result of a given gain that the logs contradict."""
 OPTIONAL_VALUES = ("integral_gain", "feed_forward")
 """Values of `simulator_values` that most servos lack."""
 FEED_FORWARD_CURE = (
@@ -168,56 +170,45 @@ def _stiffness_sources(fit: ServoFit) -> list[str]:
     return sources.tolist()
 
 
-class GainEstimate(NamedTuple):
-    """Gain by the logs, its deviation, and whether it agrees with the one given."""
-
-    value: float
-    deviation: float
-    agrees: bool
-
-
 def gain_finding(fit: ServoFit) -> Remark | None:
     """Return whether the logs agree with gains that were given; None without any."""
-    if not fit.gains:
-        return None
     combinations = {(c.joint, c.name): c for c in (*fit.combinations, *fit.compliances)}
     texts = []
     status = Status.GOOD
-    for name, values in fit.gains.items():
-        for joint in np.flatnonzero(np.isfinite(values)).tolist():
-            gain = float(values[joint])
-            text = f"{name.replace('_', ' ')} of {fit.joint_names[joint]} {gain:g}"
-            text = f"{text} {_units(fit, name)[joint]}"
+    for name, gains in fit.gains.items():
+        for joint in np.flatnonzero(np.isfinite(gains)).tolist():
+            gain = float(gains[joint])
+            unit = _units(fit, name)[joint]
+            text = (
+                f"{name.replace('_', ' ')} of {fit.joint_names[joint]} {gain:g} {unit}"
+            )
             combination = combinations.get((joint, GAIN_SYMBOLS[name]))
-            if combination is None:
-                texts.append(f"{text}, which the logs do not tell")
-                continue
-            stiffness = float(servo_stiffness(fit)[joint])
-            estimate = _estimate_gain(name, gain, combination, stiffness)
-            value, deviation = with_deviation(estimate.value, estimate.deviation)
-            result = "agrees" if estimate.agrees else "differs"
-            texts.append(f"{text}, estimated {value} ± {deviation}: {result}")
-            if not estimate.agrees:
+            result = "which the logs do not tell"
+            if combination is not None:
+                stiffness = float(servo_stiffness(fit)[joint])
+                result = _compare_gain(name, gain, stiffness, combination)
+            if result.endswith(DIFFERENCE):
                 status = Status.DOUBTFUL
-    return Remark(f"Given gains: {'; '.join(texts)}", status)
+            texts.append(f"{text}, {result}")
+    return Remark(f"Given gains: {'; '.join(texts)}", status) if texts else None
 
 
-def _estimate_gain(
-    name: str, gain: float, combination: Combination, stiffness: float
-) -> GainEstimate:
-    """Return a gain by the logs; parameters are ratios to the stiffness."""
+def _compare_gain(
+    name: str, gain: float, stiffness: float, combination: Combination
+) -> str:
+    """Return what the logs tell of a gain, and whether it differs."""
+    # Parameters are ratios to the stiffness, and that of the stiffness is its inverse.
+    is_stiffness = name == "stiffness"
+    ratio = 1.0 / gain if is_stiffness else gain / stiffness
+    size = combination.value / ratio
+    estimate = gain / size if is_stiffness else gain * size
+    deviation = estimate * combination.deviation / combination.value
     low, high = combination.interval()
-    relative_deviation = combination.deviation / abs(combination.value)
-    if name == "stiffness":
-        value = 1.0 / combination.value
-        agrees = low <= 1.0 / gain <= high
-    else:
-        value = stiffness * combination.value
-        agrees = stiffness * low <= gain <= stiffness * high
-    if name == "damping":
-        # Viscous friction of the joint adds to the servo's damping.
-        agrees = gain <= stiffness * high
-    return GainEstimate(value, relative_deviation * abs(value), agrees)
+    # Viscous friction of the joint adds to the servo's damping.
+    agrees = ratio <= high and (low <= ratio or name == "damping")
+    value_text, deviation_text = with_deviation(estimate, deviation)
+    result = "agrees" if agrees else DIFFERENCE
+    return f"estimated {value_text} ± {deviation_text}: {result}"
 
 
 def export_servo_mjcf(

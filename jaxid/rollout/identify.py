@@ -152,16 +152,17 @@ def identify_rollout(
     if fine_fit is not fit:
         fine_step = fine_fit.simulator.time_step
         fit, hold_is_told = _with_better_commands(fine_fit, fine_step)
+    heavy_joints = choice.loaded_joints & (known_compliance > 0.0)
     return ServoFit.of(
         fit,
-        linear_parameters,
         names,
         groups,
         possible_effects,
-        hold_is_told,
-        gains,
-        _told_compliances(fit, groups, choice.loaded_joints & (known_compliance > 0.0)),
-        contacts,
+        linear=linear_parameters,
+        hold_is_told=hold_is_told,
+        gains=gains,
+        compliances=_told_compliances(fit, groups, heavy_joints),
+        contacts=contacts,
     )
 
 

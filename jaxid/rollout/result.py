@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Mapping, Sequence
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from scipy import special
@@ -88,43 +89,36 @@ class ServoFit(Summarised):
     def of(
         cls,
         fit: JointFit,
-        linear: JointParameters,
         joint_names: tuple[str, ...],
         groups: Sequence[Sequence[int]],
         undetermined: FreeParameters,
-        hold_is_told: bool,
-        gains: Mapping[str, Vector],
-        compliances: tuple[Combination, ...],
-        contacts: Contacts,
+        **fields: Any,
     ) -> "ServoFit":
-        """Return the fit of all joints, with its uncertainty."""
+        """Return the fit of all joints, with its uncertainty, and further fields."""
         simulator = fit.simulator
         motion = simulator.motion
         determination = determined_combinations(fit, groups)
+        notes = (
+            *_notes_on_effects(undetermined, joint_names),
+            *_notes_on_limits(fit, joint_names),
+            *_notes_on_errors(fit, joint_names),
+        )
         return cls(
-            joint_names,
-            fit.parameters,
-            fit.free,
-            determination.covariance,
-            determination.dof,
-            determination.combinations,
-            linear,
-            simulator.hold,
-            simulator.time_step,
-            np.sqrt(fit.mean_squares),
-            motion.names,
-            simulator.bodies,
-            np.abs(simulator.loads[0]).mean(axis=(0, 2)),
-            (
-                *_notes_on_effects(undetermined, joint_names),
-                *_notes_on_limits(fit, joint_names),
-                *_notes_on_errors(fit, joint_names),
-            ),
-            hold_is_told,
-            gains,
-            compliances,
-            contacts,
-            motion.left_out,
+            joint_names=joint_names,
+            parameters=fit.parameters,
+            free=fit.free,
+            covariance=determination.covariance,
+            dof=determination.dof,
+            combinations=determination.combinations,
+            hold=simulator.hold,
+            time_step=simulator.time_step,
+            rms=np.sqrt(fit.mean_squares),
+            motions=motion.names,
+            bodies=simulator.bodies,
+            load=np.abs(simulator.loads[0]).mean(axis=(0, 2)),
+            notes=notes,
+            left_out=motion.left_out,
+            **fields,
         )
 
     @cached_property

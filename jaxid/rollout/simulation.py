@@ -158,27 +158,19 @@ def _interpolated_command(commands: Array, ends: Array) -> DelayedCommand:
 
     Rates are means over the step, so that the impulse of a jump is exact.
     """
-    last_index = len(commands) - 1.0
-    length = jnp.diff(ends)
-    first_ends = ends[:-1] + GAMMA * length
-    stage_ends = jnp.stack([first_ends, ends[1:]], axis=1).ravel()
-    slopes = jnp.append(jnp.diff(commands), 0.0)
 
-    def slope_at(instants: Array) -> Array:
-        places = jnp.clip(instants, 0.0, last_index)
-        return jnp.where(places == instants, slopes[places.astype(int)], 0.0)
+    def command_and_rate(ends: Array) -> tuple[Array, Array]:
+        length = jnp.diff(ends)
+        first_ends = ends[:-1] + GAMMA * length
+        stage_ends = jnp.stack([first_ends, ends[1:]], axis=1).ravel()
+        rate = jnp.diff(_interpolate(commands, ends)) / length
+        return _interpolate(commands, stage_ends), jnp.repeat(rate, 2)
 
-    rate = jnp.diff(_interpolate(commands, ends)) / length
-    bend = jnp.diff(slope_at(ends)) / length
-    command = _interpolate(commands, stage_ends)
-    return DelayedCommand(
-        command,
-        command,
-        jnp.ones_like(command),
-        slope_at(stage_ends),
-        jnp.repeat(rate, 2),
-        jnp.repeat(bend, 2),
-    )
+    later = jnp.ones_like(ends)
+    values, slopes = jax.jvp(command_and_rate, (ends,), (later,))
+    command, rate = values
+    slope, bend = slopes
+    return DelayedCommand(command, command, jnp.ones_like(command), slope, rate, bend)
 
 
 def _interpolate(values: Array, instants: Array) -> Array:
@@ -243,10 +235,11 @@ def _states(unknowns: Array, channels: Channels, hold: AnyArray, steps: int) -> 
     return _path(unknowns, unknowns[INDEX["d"]], channels, steps, hold)
 
 
-def _errors_and_derivatives(
+@functools.partial(jax.jit, static_argnums=3)
+def _sensitivities(
     unknowns: Array, channels: Channels, hold: AnyArray, steps: int
 ) -> tuple[Array, Array]:
-    """Return errors [samples, channels] and derivatives [unknowns, samples, channels].
+    """Return errors [channels, samples] and derivatives [channels, unknowns, samples].
 
     Both are zero where a sample does not count.
     """
@@ -261,15 +254,7 @@ def _errors_and_derivatives(
         return jax.jvp(errors, (unknowns,), (change,))
 
     directions = jnp.eye(len(unknowns))
-    return jax.vmap(differentiate, out_axes=(None, 0))(directions)
-
-
-@functools.partial(jax.jit, static_argnums=3)
-def _sensitivities(
-    unknowns: Array, channels: Channels, hold: AnyArray, steps: int
-) -> tuple[Array, Array]:
-    """Return errors and derivatives with the channels first and the samples last."""
-    r, S = _errors_and_derivatives(unknowns, channels, hold, steps)
+    r, S = jax.vmap(differentiate, out_axes=(None, 0))(directions)
     return r.T, jnp.moveaxis(S, 2, 0)
 
 
@@ -320,13 +305,9 @@ class ServoSimulator:
             return zeros, zeros
         if self.path is not None:
             return self.bodies.loads(self.path, motion.sample_time / self.steps)
-        torques, inertias = self.bodies.measured_loads(
-            motion.positions, motion.sample_time
-        )
-        return (
-            np.repeat(torques, self.steps, axis=-1),
-            np.repeat(inertias, self.steps, axis=-1),
-        )
+        loads = self.bodies.measured_loads(motion.positions, motion.sample_time)
+        torques, inertias = (np.repeat(x, self.steps, axis=-1) for x in loads)
+        return torques, inertias
 
     @functools.cached_property
     def _channels(self) -> Channels:

@@ -8,8 +8,9 @@ horizon count.
 
 import dataclasses
 import functools
+import math
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +18,7 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Array, Vector, double_precision
 from jaxid.dynamics.base import BaseParameters
+from jaxid.dynamics.projection_equation import solve_symmetric
 from jaxid.dynamics.sample_methods import program_of
 from jaxid.dynamics.terms import HardSign
 from jaxid.errors import InputError
@@ -36,6 +38,12 @@ MAX_DELAY = 0.8 * MARGIN
 """Largest delay of the torques, either way [s]."""
 COUNTED_STEP = 5
 """Samples of a window from one that counts to the next."""
+SHARES = (0.0, 0.5, 0.5, 1.0)
+"""Part of a step at whose end each stage of the Runge-Kutta method is evaluated."""
+WEIGHTS = (1.0 / 6.0, 1.0 / 3.0, 1.0 / 3.0, 1.0 / 6.0)
+"""Weights of the stages in a step."""
+MAX_DERIVATIVES = 4_000_000
+"""Largest number of derivatives of positions; they take 32 MB."""
 BLOCKS = 40
 """Contiguous parts of the logs whose scatter gives the uncertainty."""
 
@@ -116,16 +124,26 @@ class TorqueRollout:
         forces = jnp.asarray(windows.forces)
         margin = round(MARGIN / self.sample_time)
         steps = jnp.arange(len(forces) - 2.0 * margin)
-        instants = margin + steps - unknowns[-1] / self.sample_time
+        # Torques of a constant delay, so that only their rates have derivatives.
+        delay = jax.lax.stop_gradient(unknowns[-1])
+        instants = margin + steps - delay / self.sample_time
         floors = jnp.floor(instants)
-        shares = (instants - floors)[:, None, None]
         k = floors.astype(int)
-        delayed_forces = (1.0 - shares) * forces[k] + shares * forces[k + 1]
-        positions = self._positions(unknowns[:-1], windows, delayed_forces)
+        rates = (forces[k + 1] - forces[k]) / self.sample_time
+        shares = (instants - floors)[:, None, None]
+        delayed_forces = forces[k] + shares * self.sample_time * rates
+        lateness = unknowns[-1] - delay
+        positions = self._positions(
+            unknowns[:-1], windows, (delayed_forces, rates), lateness
+        )
         return positions - windows.measured
 
     def _positions(
-        self, base_parameters: Array, windows: Windows, forces: Array
+        self,
+        base_parameters: Array,
+        windows: Windows,
+        forces_and_rates: tuple[Array, Array],
+        lateness: Array,
     ) -> Array:
         """Return simulated positions, by the Runge-Kutta method of order four.
 
@@ -137,30 +155,61 @@ class TorqueRollout:
 
         def rate(state: Array, torques: Array) -> Array:
             q, qd = state
-            return jnp.stack([qd, jnp.stack(acceleration(p, q, qd, torques))])
+            return jnp.stack([qd, acceleration(p, q, qd, torques)])
 
-        def step(state: Array, end_forces: tuple[Array, Array]) -> tuple[Array, Array]:
-            first_forces, last_forces = end_forces
+        def step(state: Array, ends: Any) -> tuple[Array, Array]:
+            first_forces, last_forces = (x - lateness * y for x, y in ends)
             middle_forces = 0.5 * (first_forces + last_forces)
-            k1 = rate(state, first_forces)
-            k2 = rate(state + 0.5 * h * k1, middle_forces)
-            k3 = rate(state + 0.5 * h * k2, middle_forces)
-            k4 = rate(state + h * k3, last_forces)
-            state = state + h * (k1 + 2.0 * k2 + 2.0 * k3 + k4) / 6.0
+            stage_forces = (first_forces, middle_forces, middle_forces, last_forces)
+
+            # A loop: the dynamics of a robot are long, and are compiled once.
+            def advance(carry: tuple[Array, Array], inputs: Any) -> Any:
+                slope, change = carry
+                torques, share, weight = inputs
+                slope = rate(state + share * h * slope, torques)
+                return (slope, change + weight * h * slope), None
+
+            start = jnp.zeros_like(state), jnp.zeros_like(state)
+            inputs = jnp.stack(stage_forces), jnp.array(SHARES), jnp.array(WEIGHTS)
+            (_, change), _ = jax.lax.scan(advance, start, inputs)
+            state = state + change
             return state, state[0]
 
         start = jnp.stack([windows.q, windows.qd])
-        _, positions = jax.lax.scan(step, start, (forces[:-1], forces[1:]))
+        forces, rates = forces_and_rates
+        ends = (forces[:-1], rates[:-1]), (forces[1:], rates[1:])
+        _, positions = jax.lax.scan(step, start, ends)
         return positions
 
     @functools.cached_property
     def _acceleration(self) -> Callable:
-        """Accelerations of samples by scalar operations; JAX differentiates them."""
+        """Accelerations of samples that forces cause, by scalar operations.
+
+        A change of the acceleration is that of the forces which the motion needs, over
+        the mass matrix: so the matrix and its factors need no derivatives.
+        """
         model = self.base.model
+        size = (model.size,)
         joints = (model.robot.joints,)
-        return lower(
-            program_of(model, model.acceleration, (model.size,), *[joints] * 3), False
-        )
+        forces = program_of(model, model.forces, size, *[joints] * 3)
+        forces_of = lower(forces, False).dense
+        inertia_of = lower(program_of(model, model.inertia, size, joints), False).dense
+
+        @jax.custom_jvp
+        def acceleration(p: Array, q: Array, qd: Array, torques: Array) -> Array:
+            bias = forces_of(p, q, qd, jnp.zeros_like(q))
+            return solve_symmetric(inertia_of(p, q), torques - bias)
+
+        @acceleration.defjvp
+        def derivative(primals: Any, tangents: Any) -> Any:
+            p, q, qd, _ = primals
+            qdd = acceleration(*primals)
+            _, change = jax.jvp(
+                lambda *x: forces_of(*x, qdd), (p, q, qd), tuple(tangents[:3])
+            )
+            return qdd, solve_symmetric(inertia_of(p, q), tangents[3] - change)
+
+        return acceleration
 
 
 @dataclasses.dataclass(frozen=True)
@@ -274,7 +323,8 @@ def identify_torque_rollout(
 ) -> TorqueRolloutFit:
     """Identify a robot whose simulation under recorded torques follows the positions.
 
-    The search starts from the fit of torques. Windows overlap by four fifths. A gain
+    The search starts from the fit of torques. Windows overlap, by four fifths if the
+    robot is small. A gain
     common to all torques scales all parameters, and no log tells it.
 
     Args:
@@ -292,6 +342,9 @@ def identify_torque_rollout(
     windows = Windows.of(logs, horizon, 0.2 * horizon)
     torque_fit = np.asarray(identify(base, logs).parameters)
     start = np.append(torque_fit, 0.0)
+    # Large robots are simulated in fewer windows.
+    stride = math.ceil(windows.measured.size * len(start) / MAX_DERIVATIVES)
+    windows = Windows(*(np.asarray(x)[..., ::stride] for x in windows))
     limits = np.full(len(start), np.inf)
     limits[-1] = MAX_DELAY
 
