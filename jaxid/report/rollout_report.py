@@ -157,6 +157,17 @@ class RolloutReport:
         """Return errors of other simulations with the same parameters."""
         return []
 
+    @property
+    def verdict(self) -> Remark:
+        """Whether the simulation may be used, in one sentence."""
+        return self.judgement.verdict
+
+    def overview(self) -> list[Table]:
+        """Return the verdict, the findings and the errors, in few lines."""
+        title = f"{self.robot.name}: simulated motion"
+        findings = Table(title, remarks=self.judgement.overview())
+        return [findings, self.error_tables()[0]]
+
     def tables(self) -> list[Table]:
         """Return estimates and errors, then all findings and the verdict."""
         judgement = self.judgement

@@ -196,7 +196,7 @@ class TorqueRollout:
         inertia_of = lower(program_of(model, model.inertia, size, joints), False).dense
 
         @jax.custom_jvp
-        def acceleration(p: Array, q: Array, qd: Array, torques: Array) -> Array:
+        def acceleration(p: Array, q: Array, qd: Array, torques: Array) -> Any:
             bias = forces_of(p, q, qd, jnp.zeros_like(q))
             return solve_symmetric(inertia_of(p, q), torques - bias)
 
