@@ -44,11 +44,6 @@ BASELINES = {
     "fit_of_torques": "fit of\ntorques",
 }
 """Headers of the errors of baselines."""
-RATIOS = (
-    "Positions tell torques only in units of the servo's stiffness. Parameters that "
-    "the logs tell only together are merged"
-)
-"""How the table of parameters is read."""
 NOT_VALIDATED = Remark(
     "The simulation was not validated on an unseen log: use `--verify`",
     Status.DOUBTFUL,
@@ -263,7 +258,7 @@ class ServoRolloutReport(RolloutReport):
         """Return what the logs determine, and the numbers for simulators."""
         parameters = self.fit.summary()
         # Its notes are findings.
-        parameters.remarks = (Remark(RATIOS),)
+        parameters.remarks = parameters.remarks[:1]
         if not self.has_stiffness:
             text = "No weight tells a stiffness: name it by `rollout.stiffness`."
             return [parameters, Table("", remarks=[text])]

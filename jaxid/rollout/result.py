@@ -377,14 +377,16 @@ def systematic_errors(residuals: np.ndarray, motion: ServoMotion) -> Vector:
     places = (0, 2)
     counted = motion.counted
     r = residuals * counted
-    mean_squares = np.sum(r**2, axis=places) / counted.sum(axis=places)
-    rms = np.sqrt(mean_squares)
-    pair_counts = np.sum(counted[..., 1:] * counted[..., :-1], axis=places)
-    products = np.sum(r[..., 1:] * r[..., :-1], axis=places) / pair_counts
+    sample_counts = counted.sum(axis=places)
+    mean_squares = np.sum(r**2, axis=places) / sample_counts
+    pairs = counted[..., 1:] * counted[..., :-1]
+    products = np.sum(r[..., 1:] * r[..., :-1], axis=places)
+    mean_products = products / pairs.sum(axis=places)
     steps = np.abs(np.diff(motion.positions))
     # Most steps of a slow joint are the smallest one; interpolated logs have smaller
     # ones, too.
     steps = np.where(steps > 1e-6, steps, np.nan)
     rounding = np.nanquantile(steps, 0.1, axis=places) / np.sqrt(12.0)
-    is_slow = products > 0.5 * mean_squares
+    is_slow = mean_products > 0.5 * mean_squares
+    rms = np.sqrt(mean_squares)
     return np.where(is_slow & (rms > MIN_ROUNDING_RATIO * rounding), rms, 0.0)
