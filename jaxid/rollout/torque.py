@@ -124,26 +124,16 @@ class TorqueRollout:
         forces = jnp.asarray(windows.forces)
         margin = round(MARGIN / self.sample_time)
         steps = jnp.arange(len(forces) - 2.0 * margin)
-        # Torques of a constant delay, so that only their rates have derivatives.
-        delay = jax.lax.stop_gradient(unknowns[-1])
-        instants = margin + steps - delay / self.sample_time
+        instants = margin + steps - unknowns[-1] / self.sample_time
         floors = jnp.floor(instants)
-        k = floors.astype(int)
-        rates = (forces[k + 1] - forces[k]) / self.sample_time
         shares = (instants - floors)[:, None, None]
-        delayed_forces = forces[k] + shares * self.sample_time * rates
-        lateness = unknowns[-1] - delay
-        positions = self._positions(
-            unknowns[:-1], windows, (delayed_forces, rates), lateness
-        )
+        k = floors.astype(int)
+        delayed_forces = (1.0 - shares) * forces[k] + shares * forces[k + 1]
+        positions = self._positions(unknowns[:-1], windows, delayed_forces)
         return positions - windows.measured
 
     def _positions(
-        self,
-        base_parameters: Array,
-        windows: Windows,
-        forces_and_rates: tuple[Array, Array],
-        lateness: Array,
+        self, base_parameters: Array, windows: Windows, forces: Array
     ) -> Array:
         """Return simulated positions, by the Runge-Kutta method of order four.
 
@@ -157,8 +147,8 @@ class TorqueRollout:
             q, qd = state
             return jnp.stack([qd, acceleration(p, q, qd, torques)])
 
-        def step(state: Array, ends: Any) -> tuple[Array, Array]:
-            first_forces, last_forces = (x - lateness * y for x, y in ends)
+        def step(state: Array, ends: tuple[Array, Array]) -> tuple[Array, Array]:
+            first_forces, last_forces = ends
             middle_forces = 0.5 * (first_forces + last_forces)
             stage_forces = (first_forces, middle_forces, middle_forces, last_forces)
 
@@ -176,9 +166,7 @@ class TorqueRollout:
             return state, state[0]
 
         start = jnp.stack([windows.q, windows.qd])
-        forces, rates = forces_and_rates
-        ends = (forces[:-1], rates[:-1]), (forces[1:], rates[1:])
-        _, positions = jax.lax.scan(step, start, ends)
+        _, positions = jax.lax.scan(step, start, (forces[:-1], forces[1:]))
         return positions
 
     @functools.cached_property
@@ -221,7 +209,6 @@ class TorqueRolloutFit(Summarised):
         unknowns: Base parameters, and the delay of the torques [s].
         uncertainty: Uncertainty of these, from the scatter of parts of the logs.
         horizon: Horizon of the windows [s].
-        rms: Errors of the identification over the windows [rad or m].
         start: Base parameters of the fit of torques from which the search started.
     """
 
@@ -229,7 +216,6 @@ class TorqueRolloutFit(Summarised):
     unknowns: Vector
     uncertainty: Uncertainty
     horizon: float
-    rms: Vector
     start: Vector
 
     @property
@@ -309,12 +295,10 @@ class TorqueRolloutFit(Summarised):
         half_widths = self.uncertainty.half_widths()
         ends = [self.unknowns - half_widths, self.unknowns + half_widths]
         deviations = self.uncertainty.standard_deviations
-        errors = "  ".join(f"{1e3 * x:.3g}" for x in self.rms)
         return Table(
             "open-loop rollouts",
             Column("parameter", self.names),
             *estimate_columns(self.unknowns, deviations, ends, self.units),
-            facts=[(f"errors within {self.horizon:g} s", f"{errors} mrad or mm RMS")],
         )
 
 
@@ -357,8 +341,7 @@ def identify_torque_rollout(
             residuals, start, -limits, limits, args=windows, rtol=1e-5, max_steps=50
         )
     errors = np.asarray(minimum.residuals).reshape(-1, *windows.q.shape)
-    rms = np.sqrt(np.mean(errors**2, axis=(0, 2)))
-    if not np.isfinite(rms).all():
+    if not np.isfinite(errors).all():
         raise InputError(
             "`observations`: the simulation diverges from the fit of torques: shorten "
             "`horizon`, or choose terms of the model that these logs determine."
@@ -366,7 +349,7 @@ def identify_torque_rollout(
     blocks = windows.starts * BLOCKS // (windows.starts.max() + 1)
     uncertainty = _uncertainty(minimum, np.broadcast_to(blocks, errors.shape).ravel())
     unknowns = np.asarray(minimum.x)
-    return TorqueRolloutFit(rollout, unknowns, uncertainty, horizon, rms, torque_fit)
+    return TorqueRolloutFit(rollout, unknowns, uncertainty, horizon, torque_fit)
 
 
 def _listed(logs: Logs) -> list[Observations]:
