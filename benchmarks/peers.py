@@ -1,7 +1,6 @@
 """Regressor and inverse dynamics of a seven-joint arm against other packages.
 
     python benchmarks/peers.py [--quick] [--json FILE]
-    python benchmarks/peers.py --gpu            # on the first GPU of JAX, without peers
 
 The script starts itself twice: on one core, then on two. What is compared runs in turn
 in one process, on the same motion, and is compared number by number before it is timed.
@@ -9,7 +8,6 @@ Peers that are not installed are skipped by name.
 """
 
 import json
-import os
 import subprocess
 import sys
 import tempfile
@@ -257,59 +255,13 @@ def frax_forces(state):
     return compiled(each, *state)
 
 
-def on_gpu(quick):
-    """Measure regressor, inverse dynamics and the criterion of a design on a GPU."""
-    os.environ["JAX_ENABLE_X64"] = "1"
-    import jax
-    from compile import design_function
-    from pinocchio_loop import Bodies
-
-    import jaxid as jid
-
-    if jax.default_backend() != "gpu":
-        return [Row("G", "figures of a GPU", "-", "-", "no GPU at hand")]
-    samples, turns = (2**12, 5) if quick else (2**20, 15)
-    robot = jid.robots.panda()
-    model, state = jid.Model(robot, (jid.RigidBodies(),)), motion(robot.joints, samples)
-    regressor, compiling = timing.elapsed(lambda: compiled_regressor(model, state))
-    function, x = design_function()
-    times = interleaved(
-        {
-            "regressor": regressor,
-            "inverse dynamics": inverse_dynamics(
-                model, Bodies(robot.joints).parameters.ravel(), state
-            ),
-            "criterion of a design and its gradient": compiled(function, x),
-        },
-        turns,
-    )
-    recipe = (
-        f"{jax.devices()[0].device_kind}, jax {jax.__version__}, Panda, float64, N = "
-        f"{samples}, median of {turns} turns, "
-        f"compile of the regressor {compiling:.1f} s"
-    )
-    *dynamics, (name, design) = times.items()
-    rows = [
-        Row("G", f"{key}, GPU", recipe, "-", f"{1e3 * t.median:.2f} ms")
-        for key, t in dynamics
-    ]
-    return [
-        *rows,
-        Row("G", f"{name}, GPU", recipe, "-", f"{1e3 * design.median:.2f} ms"),
-    ]
-
-
 def main():
     """Measure on one core and on two, each in a process of its own."""
     parser = timing.parser(__doc__, "fewer samples and turns")
     parser.add_argument(
         "--cores", type=int, choices=(1, 2), help="only the rows of so many cores"
     )
-    parser.add_argument("--gpu", action="store_true", help="only the figures of a GPU")
     options = parser.parse_args()
-    if options.gpu:
-        hand_over(on_gpu(options.quick), options.json)
-        return
     if options.cores is not None:
         timing.pin_to(options.cores)
         samples, turns = (1024, 5) if options.quick else (16384, 25)

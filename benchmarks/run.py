@@ -61,6 +61,7 @@ SPEED = (
     Script("streaming", 6),
     Script("batches", 2),
     Script("scaling", 8),
+    Script("gpu", 2),
 )
 METHODS = (
     Script("consistency", 25),
@@ -75,6 +76,8 @@ METHODS = (
     Script("export", 10),
     Script("virtual_robot", 5),
     Script("demo", 10),
+    Script("measured_robots", 4),
+    Script("other_tools", 2),
     Script("faults", 25),
     Script("mutated_files", 6),
     Script("mutated_commands", 3),
