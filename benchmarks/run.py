@@ -138,7 +138,7 @@ def stored(name):
 
 def write(path, text):
     """Write a file as a whole."""
-    path.parent.mkdir(exist_ok=True)
+    path.parent.mkdir(parents=True, exist_ok=True)
     draft = path.with_suffix(".part")
     draft.write_text(text, encoding="utf-8")
     draft.replace(path)
@@ -163,7 +163,8 @@ def table(head, rows):
 def section(name, found):
     """Return a script's section: facts of the machine, and its rows or text."""
     facts = "; ".join(f"{key}: {value}" for key, value in found["facts"].items())
-    lines = f"## {name}\n\n{facts}; took {found['seconds']} s.\n\n"
+    duration = f"; took {found['seconds']} s" if found["seconds"] else ""
+    lines = f"## {name}\n\n{facts}{duration}.\n\n"
     if "text" in found:
         return f"{lines}```\n{found['text'].strip()}\n```\n"
     holds = {True: "yes", False: "**no**", None: ""}

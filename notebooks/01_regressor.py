@@ -203,3 +203,15 @@ print(
 #   respect to everything, geometry included.
 #
 # Which of these 91 parameters can forces determine at all? Next: [base parameters](02_base_parameters.ipynb).
+#
+# ## Exercise
+#
+# How many entries of the columns of bodies can be non-zero at all? $\Theta$ has 7 rows, and 70 such columns. Count by hand first; then count with
+# `np.count_nonzero(model.regressor(motion[100])[:, :70])`.
+#
+# <details markdown="1"><summary>Answer</summary>
+#
+# Row $j$ sees the bodies $j$ to 7: that is 7 + 6 + … + 1 = 28 blocks of ten, so 280 of 490 entries at most. The count is smaller, because some
+# entries vanish for a reason of their own: a rail, for instance, feels no moment of inertia of the body that it pushes without turning it.
+#
+# </details>

@@ -160,3 +160,14 @@ plt.show()
 # * Base parameters carry everything that dynamics need: forces and mass matrix follow from them exactly.
 #
 # Which of them *your* motion reveals is another question. Next: [excitation](03_excitation.ipynb).
+#
+# ## Exercise
+#
+# Take gravity away: `robot.replace(gravity=(0.0, 0.0, 0.0))`. Can the number of base parameters grow? Decide first, then count.
+#
+# <details markdown="1"><summary>Answer</summary>
+#
+# It cannot. A combination of parameters is invisible if it changes no force in any motion. With gravity it must be invisible in the poses at rest *and* in
+# motion; without gravity the second alone is enough. So without gravity at least as many combinations are invisible, and the number stays or falls.
+#
+# </details>

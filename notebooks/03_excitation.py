@@ -211,3 +211,15 @@ for k, (name, plan) in enumerate(plans.items()):
 # * All criteria are one line each: exchange them, or write your own ([how to choose](../docs/how_to_choose.md)).
 #
 # With seven joints, collisions and limits of forces it is the same call: [the guide](../docs/excitation.md). Next: [a real robot](04_real_robot.ipynb).
+#
+# ## Exercise
+#
+# Play the same motion twice as fast, with the same number of samples. By which factors do the standard deviations of moments of inertia, viscous friction,
+# dry friction and first moments change? And what do four recordings of the slow motion give?
+#
+# <details markdown="1"><summary>Answer</summary>
+#
+# Accelerations grow by 4, so deviations of moments of inertia become 4 times smaller. Speeds grow by 2: viscous friction 2 times. Dry friction and gravity do
+# not depend on the speed: their deviations stay. Four recordings halve *all* deviations.
+#
+# </details>

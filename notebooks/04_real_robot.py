@@ -237,3 +237,14 @@ plt.show()
 #   `jaxid identify experiment.toml log.csv --split 0.6 -o report/`.
 #
 # Next: [bodies that could exist](05_consistency_payload.ipynb).
+#
+# ## Exercise
+#
+# Keep twice as many rows of the same log (half the step of the decimation). Do the standard deviations become smaller by $\sqrt 2$?
+#
+# <details markdown="1"><summary>Answer</summary>
+#
+# The naive ones do, the reported ones hardly change. Neighbouring rows behind a low-pass hold the same noise, so more rows are no more information. The
+# spectral deviations know that, which is why they are larger than the naive ones.
+#
+# </details>

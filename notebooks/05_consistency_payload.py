@@ -215,3 +215,14 @@ print(f"\nthe robot with its tool: {float(heavier.tool.mass):.3f} kg")
 # * A payload is identified as a difference between two runs, with intervals, and goes back into the robot as a known tool.
 #
 # Details: [consistency](../docs/consistency.md), [several runs](../docs/uncertainty.md). Next: [batches](06_batches.ipynb).
+#
+# ## Exercise
+#
+# Multiply all forces of the log by 1.1 and identify by least squares again. Which estimates change, and by how much? Can this log reveal the mistake?
+#
+# <details markdown="1"><summary>Answer</summary>
+#
+# Least squares are linear in the forces: every estimate becomes 1.1 times as large, and so do all errors. Their ratio stays, so nothing in the log reveals it. A
+# known mass does: the payload of this notebook would come out 10 % too heavy. That is how `jid.identify_drive_gains` finds the factor.
+#
+# </details>

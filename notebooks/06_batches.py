@@ -259,3 +259,13 @@ print(
 # * What differs between robots of one type can be an input: each gets its own geometry, and outliers of a fleet stand out in units of their own uncertainty.
 #
 # Next: [what temperature does](07_temperature.ipynb).
+#
+# ## Exercise
+#
+# You want to know the coverage of 95 % intervals to ± 1 % (two standard deviations). How many independent data sets do you need for one parameter?
+#
+# <details markdown="1"><summary>Answer</summary>
+#
+# The share that is counted scatters with $\sqrt{0.95 \cdot 0.05 / n}$. Twice that is 0.01 for $n$ = 1900. The batches of this notebook make such numbers cheap.
+#
+# </details>

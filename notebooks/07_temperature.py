@@ -176,3 +176,14 @@ for j, name in enumerate(robot.joint_names):
 # * A few logs at known temperatures give a law with intervals, and models that follow the temperature. Details: [several runs](../docs/uncertainty.md).
 #
 # Next: [your own robot](08_your_robot.ipynb).
+#
+# ## Exercise
+#
+# Viscous friction falls by 2 % for each degree. At which temperature is it half of its value at 20 °C? And how large is the error of a model of 20 °C there?
+#
+# <details markdown="1"><summary>Answer</summary>
+#
+# $e^{-0.02\,\Delta T} = 1/2$ gives $\Delta T$ = 34.7 °C, so at 54.7 °C. The model of 20 °C then promises twice the viscous friction: an error as large as
+# the friction itself.
+#
+# </details>

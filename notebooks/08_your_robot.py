@@ -224,3 +224,15 @@ with tempfile.TemporaryDirectory() as folder:
 # * The same on the command line: `jaxid init`, `excite`, `inspect`, `identify`, `export` ([README](../README.md#the-same-in-the-shell)).
 #
 # Where to go on: [how to choose](../docs/how_to_choose.md), [is my fit good?](../docs/is_my_fit_good.md). Next: [your own solver](09_solvers.ipynb).
+#
+# ## Exercise
+#
+# The file of the robot claims a link 30 % too heavy. Which of these change: the base parameters' expressions, the estimates by `jid.identify` without a prior, the
+# estimates by `jaxid identify`?
+#
+# <details markdown="1"><summary>Answer</summary>
+#
+# Expressions depend on the geometry alone: no change. `jid.identify` without a prior never sees the claimed masses, since a `Robot` holds none: no change.
+# `jaxid identify` takes them as a prior where the log is silent: masses that forces cannot separate move, the forces hardly do.
+#
+# </details>

@@ -252,3 +252,14 @@ print("shape of the Hessian:", jax.jit(jax.hessian(problem.value))(x).shape)
 # * From four starts, SLSQP and BFGS come within some percent of ours; the generations make the rest.
 #
 # The guide: [excitation](../docs/excitation.md). Next: [no torque in the log](10_no_torque.ipynb).
+#
+# ## Exercise
+#
+# Your optimiser knows no constraints. Write one line that makes the problem free of them, and say how you know that its result keeps the limits.
+#
+# <details markdown="1"><summary>Answer</summary>
+#
+# `lambda x: problem.value(x) + weight * problem.violation(x)` is such a line. If `weight` is larger than every multiplier of the constraints, the minimum keeps
+# all of them. You do not know the multipliers, so double `weight` until `problem.violation` of the result is zero.
+#
+# </details>
