@@ -306,7 +306,7 @@ def test_the_limits_of_mistakes_are_the_codes():
     assert f"less than {GAINS.named_rest:g} of what it missed" in page
     assert f"or less than {100 * MAX_CURED_MISFIT:g} % of the forces" in page
     assert f"and less than {GAINS.possible_rest:g} of what it missed" in page
-    assert f"From {GAINS.possible:g} on it is a note" in page
+    assert f"From {GAINS.possible:g} on it is marked" in page
     assert f"that explains {GAINS.contact:g} is a contact" in page
     assert f"if more than {100 * MAX_MISFIT:g} % of the forces are missed" in page
 
