@@ -74,7 +74,7 @@ def _comparison_panel(comparison: Comparison, shown: np.ndarray) -> Panel:
     is_changed = [comparison.verdicts[k] is Verdict.CHANGED for k in shown]
     return Panel(
         curves,
-        x="estimate, scaled: the outermost end of its intervals is at 1 or -1",
+        x="estimate, scaled to the end of its intervals",
         x_range=(-1.08, 1.08),
         y_names=[
             name + " *" * mark for name, mark in zip(names, is_changed, strict=True)

@@ -123,7 +123,8 @@ class ComparisonReport(Summarised):
                 "covariance_of_differences": comparison.uncertainty.covariance,
                 "groups": comparison.groups,
             }
-            blocks = [comparison_figure(comparison), *comparison.tables(), ONE_MOTION]
+            tables = reversed(comparison.tables())
+            blocks = [comparison_figure(comparison), *tables, ONE_MOTION]
             sections.append(("Estimates side by side", blocks))
         sections.append(provenance(self.settings))
         page = render_page(f"{self.robot.name}: two models compared", sections)

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -98,5 +99,5 @@ def log_figure(robot: Robot, log: Recording) -> Figure:
     return Figure(title, panels, min(2, robot.joints), height=2.6)
 
 
-def _lines(*values: float) -> list[tuple[str, float, str]]:
+def _lines(*values: Any) -> list[tuple[str, float, str]]:
     return [("y", float(value), VERMILION) for value in values if np.isfinite(value)]

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxid.arrays import BaseVector
+from jaxid.arrays import AnyArray
 from jaxid.errors import InputError
 from jaxid.identification.combination import combine_fits
 from jaxid.identification.drive_gains import DriveGains, identify_drive_gains
@@ -127,7 +127,7 @@ def add_run(
 
 
 def errors_of(
-    fit: Fit, parameters: BaseVector, logs: Sequence[Observations]
+    fit: Fit, parameters: AnyArray, logs: Sequence[Observations]
 ) -> list[TorqueErrors]:
     """Return the torque errors of parameters on the logs of a run."""
     model = dataclasses.replace(fit, parameters=parameters)
