@@ -152,7 +152,7 @@ def compare(
     force: options.Force = False,
     detail: options.Detail = None,
 ) -> None:
-    """Decide which parameters have changed, or which model predicts a log better.
+    """Compare two reports: what has changed, or errors on one log.
 
     Each report is a folder that `jaxid identify` has written. With `--log`, the models
     may have different effects; the log is read as the first report's was.

@@ -105,8 +105,8 @@ class Payload(Summarised, eqx.Module):
 
     @property
     def centre_of_mass(self) -> Vector3:
-        """Centre of mass in the frame of the body [m]."""
-        return np.asarray(self.parameters[1:4] / self.mass)
+        """Centre of mass in the frame of the body [m]; NaN without a mass."""
+        return np.asarray(self.parameters[1:4] / (self.mass or np.nan))
 
     @property
     def inertia(self) -> Matrix3:
