@@ -210,7 +210,7 @@ def test_a_load_that_does_not_fit_is_refused(shop, run):  # noqa: F811
 def test_a_delay_is_seen_and_removed(shop, run):  # noqa: F811
     _, out, _ = run("inspect", "experiment.toml", "late.csv", "-o", "look")
     page = page_text("look")
-    assert "! Look at what is marked ! before you identify with late" in page
+    assert "! Look at what is marked before you identify" in page
     assert "positions and forces (dashed: limits)" in page
     with open("look/inspection.csv", encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))

@@ -51,7 +51,7 @@ class Inspection(Summarised):
             )
         count = sum(len(log.doubts) for log in self.logs)
         if count:
-            text = f"Look at what is marked before you identify: {count} findings"
+            text = f"Look at what is marked before you identify; findings: {count}"
             return Remark(text, Status.DOUBTFUL)
         text = "Nothing suspicious was found, and all base parameters are determined"
         return Remark(text, Status.GOOD)
