@@ -48,7 +48,8 @@ def photograph(page: Path, target: Path, height: int) -> None:
     size = f"--window-size=1180,{height}"
     options = ("--headless", "--no-sandbox", "--hide-scrollbars", size)
     waits = ("--virtual-time-budget=15000", f"--screenshot={target}")
-    subprocess.run(["chromium", *options, *waits, page.as_uri()], check=True)
+    command = ["chromium", *options, *waits, page.as_uri()]
+    subprocess.run(command, check=True, capture_output=True)
 
 
 def draw_report() -> None:
