@@ -20,6 +20,7 @@ from typing import NamedTuple
 
 import latex2mathml.converter
 import lxml.html
+import nbformat
 from mkdocs.commands.build import build
 from mkdocs.config import load_config
 from nbconvert import MarkdownExporter
@@ -72,7 +73,9 @@ def convert_notebooks() -> list[str]:
     exporter, places = MarkdownExporter(), []
     (PAGES / "notebooks").mkdir()
     for source in sorted(ROOT.glob("notebooks/*.ipynb")):
-        text, resources = exporter.from_filename(str(source))
+        notebook = nbformat.read(source, nbformat.NO_CONVERT)
+        notebook.metadata["language_info"] = {"name": "python"}  # colours of the code
+        text, resources = exporter.from_notebook_node(notebook)
         for name, picture in resources["outputs"].items():
             unique = f"{source.stem}_{name}"
             (PAGES / "notebooks" / unique).write_bytes(picture)
