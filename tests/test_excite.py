@@ -197,12 +197,12 @@ def test_writes_the_motion_and_says_what_to_expect(written, run):
     assert np.abs(qdd).max() <= 4
     assert t[-1] > 2 * np.pi / 0.8
     for said in (
-        "criteria: smaller is better",
+        "criteria, of which this motion was designed for",
         "expected standard deviations",
         "use of the limits",
         "is in the designed motion from",
-        "of 100 samples in 7.854 s (12.73 Hz), of one run",
-        "standard deviation 0.120 N m",
+        "for one run of 7.854 s (100 samples at 12.73 Hz)",
+        "standard deviation of 0.120 N m",
         "give `noise` if it is known",
         "forces by the nominal parameters: 1 quantities keep their limits",
         "not checked: floor, self-collision",
@@ -518,7 +518,10 @@ def test_limits_that_nobody_gave_are_named(written, excited):
     limits = JointLimits(robot, excited.plan.limits.basis)
     plan = dataclasses.replace(excited.plan, limits=limits)
     said = [remark.text for remark in plan_remarks(plan)]
-    assert "Assumed, because not given: acceleration of `hinge` (8 rad/s²)." in said
+    assert (
+        "The robot's description lacks these limits, so they are assumed: acceleration "
+        "of `hinge` (8 rad/s²)."
+    ) in said
     assert not any("ssumed" in remark.text for remark in plan_remarks(excited.plan))
 
 

@@ -165,8 +165,7 @@ class ExcitationPlan(Summarised, eqx.Module):
         """Return the table of criteria."""
         names, reference_values, values = zip(*self.criteria, strict=True)
         return Table(
-            "criteria: smaller is better; "
-            f"this motion was designed by the {self.criterion.name}",
+            f"criteria, of which this motion was designed for: {self.criterion.name}",
             Column("criterion", names),
             Column("random motion", reference_values),
             Column("this motion", values),
@@ -187,7 +186,7 @@ class ExcitationPlan(Summarised, eqx.Module):
     def _limits_table(self):
         """Return the table of the use of the limits that are finite."""
         columns = [Column("joint", self.base.model.robot.joint_names)]
-        kinds = ("range", "speed", "acceleration", "jerk")
+        kinds = ("position", "speed", "acceleration", "jerk")
         for kind, use in zip(kinds, self.use, strict=True):
             if (use > 0).any():
                 columns.append(Column(kind, 100 * use, "%", "{:.1f}".format))
@@ -247,12 +246,14 @@ def _findings_table(findings: tuple[Finding, ...]):
         limits.append(f"{sign} {finding.limit:.4g} {finding.unit}")
         is_number = math.isfinite(fraction)
         fractions.append(f"{100 * fraction:.1f}" if is_number else MISSING)
+    notes = [finding.note for finding in findings]
+    note_columns = [Column("made of", notes)] if any(notes) else []
     return Table(
         "use of the other limits, at the instants that were checked",
         Column("quantity", quantities),
         Column("reaches", values),
         Column("limit", limits),
         Column("use", fractions, "%", kind="number"),
-        Column("made of", [finding.note for finding in findings]),
+        *note_columns,
         status=[Status.BAD if x.value > 0 else Status.GOOD for x in findings],
     )

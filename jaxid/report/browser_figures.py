@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 
 from .figure_elements import Curve, Drawing, Panel, Scene, Solids, decimate
 
@@ -21,10 +22,10 @@ PIXELS_PER_INCH = 96
 """Pixels of an inch on a page."""
 SCENE_HEIGHT = 560
 """Height of a robot in space [px]."""
-SCENE_MARGIN = 0.06
-"""Room around a robot in space, relative to its largest extent."""
 COLOUR_PERCENTILE = 98.0
 """Share of the values of a scene that are within its scale of colours [%]."""
+GAP_COUNT = 65535
+"""Largest count of two bytes, which marks a gap."""
 LENGTH_DIGITS = 4
 """Decimals of vertices and origins of solids [m]."""
 
@@ -43,7 +44,7 @@ def pack(content: bytes) -> str:
 
 
 def charts(drawing: Drawing) -> list[Content]:
-    """Return the charts of a figure: titles, values, heights [px], packed contents."""
+    """Return the charts of a figure: titles, values, heights [px], contents."""
     if drawing.scene is not None:
         return [_chart("", "", SCENE_HEIGHT, scene_content(drawing.scene))]
     height = drawing.height * PIXELS_PER_INCH
@@ -55,12 +56,15 @@ def charts(drawing: Drawing) -> list[Content]:
 
 def _chart(title: str, value: str, height: float, content: Any) -> Content:
     """Return a chart as the template takes it."""
-    text = json.dumps(content, separators=(",", ":"), ensure_ascii=False)
+    text = json.dumps(content, separators=(",", ":"))
+    # A page takes these characters for its own, or spells them out.
+    for character in "<\x7f":
+        text = text.replace(character, f"\\u{ord(character):04x}")
     return {
         "title": title,
         "value": value,
         "height": height,
-        "content": pack(text.encode()),
+        "content": Markup(text),
     }
 
 
@@ -74,7 +78,7 @@ def panel_content(panel: Panel) -> Content:
     # Abscissas that several curves have are there once; the others name that curve.
     first_curves: dict[str, int] = {}
     for number, curve in enumerate(curves):
-        first_number = first_curves.setdefault(curve["x"]["floats"], number)
+        first_number = first_curves.setdefault(str(curve["x"]), number)
         if first_number < number:
             curve["x"] = first_number
     panels = [
@@ -88,9 +92,11 @@ def _curve_content(curve: Curve, panel: Panel) -> Content:
     """Return a curve with its points packed; a line in time is decimated."""
     x = curve.x
     y = curve.y
+    packed = _floats
     if panel.in_time and curve.kind == "line":
         x, y = decimate(x, y)
-    content = {**vars(curve), "x": _floats(x), "y": _floats(y)}
+        packed = _steps
+    content = {**vars(curve), "x": packed(x), "y": packed(y)}
     if curve.low is not None:
         content["low"] = _floats(curve.low)
         content["high"] = _floats(curve.high)
@@ -105,7 +111,6 @@ def scene_content(scene: Scene) -> Content:
     lines = np.concatenate([bones, gaps], axis=2).reshape(len(bones), -1, 3)
     content: Content = {
         "label": scene.label,
-        "ranges": _axis_ranges(scene),
         "path": _coordinates(scene.points[:, -1]),
         "mean": _floats(scene.mean),
         "largest": None,
@@ -128,32 +133,39 @@ def scene_content(scene: Scene) -> Content:
     return content
 
 
-def _axis_ranges(scene: Scene) -> list[list[float]]:
-    """Return ends of the three axes that hold all poses and shapes [m]."""
-    corners = scene.bones.reshape(-1, 3)
-    if scene.solids is not None:
-        corners = np.concatenate([corners, scene.solids.placed.reshape(-1, 3)])
-    low = corners.min(axis=0)
-    high = corners.max(axis=0)
-    margin = SCENE_MARGIN * float(np.max(high - low))
-    return np.stack([low - margin, high + margin], axis=1).tolist()
-
-
 def _solids_content(solids: Solids) -> Content:
     """Return shapes, which the browser moves with the bodies."""
     frames, bodies = solids.places.shape[:2]
-    places = solids.places.round(LENGTH_DIGITS).reshape(frames, bodies, 12)
+    places = solids.places.reshape(frames, bodies * 12)
     return {
         "vertices": solids.vertices.round(LENGTH_DIGITS).tolist(),
         "bodies": solids.bodies.tolist(),
         "faces": solids.faces.tolist(),
-        "places": places.tolist(),
+        "places": [_steps(place) for place in places],
     }
 
 
 def _coordinates(points: np.ndarray) -> Content:
     """Return the coordinates of points by their axes, as plotly takes them."""
-    return {axis: _floats(points[:, k]) for k, axis in enumerate("xyz")}
+    return {axis: _steps(points[:, k]) for k, axis in enumerate("xyz")}
+
+
+def _steps(values: Any) -> Content:
+    """Return numbers as counts of steps of their range, packed; a gap is the last."""
+    array = np.asarray(values, np.float64)
+    finite_values = array[np.isfinite(array)]
+    if not len(finite_values):
+        finite_values = np.zeros(1)
+    low = float(finite_values.min())
+    span = float(finite_values.max()) - low
+    step = span / (GAP_COUNT - 1) or 1.0
+    counts = np.where(np.isfinite(array), (array - low) / step, GAP_COUNT)
+    packed_counts = counts.round().astype("<u2").tobytes()
+    return {
+        "low": low,
+        "step": step,
+        "counts": base64.b64encode(packed_counts).decode(),
+    }
 
 
 def _floats(values: Any) -> dict[str, str]:

@@ -27,18 +27,24 @@ def plan_remarks(plan: ExcitationPlan) -> list[Remark]:
         for j, deviation in enumerate(plan.noise)
     )
     deviations = Remark(
-        f"Expected deviations are those of {plan.samples} samples in "
-        f"{plan.samples * step:.4g} s ({1 / step:.4g} Hz), of one run, with white "
-        f"noise of the forces: standard deviation {noise}; of n runs they are √n times "
-        "smaller."
+        f"The expected deviations hold for one run of {plan.samples * step:.4g} s "
+        f"({plan.samples} samples at {1 / step:.4g} Hz), if the measured forces have "
+        f"random noise with a standard deviation of {noise}. With four runs they are "
+        "half as large."
     )
 
     doubts = []
     unpublished_limits = ", ".join(plan.limits.limits.assumed)
     if unpublished_limits:
-        doubts.append(f"Limits that nobody published, assumed: {unpublished_limits}")
+        doubts.append(
+            f"The maker has not published these limits, so they are assumed: "
+            f"{unpublished_limits}"
+        )
     if plan.limits.assumed:
-        doubts.append(f"Assumed, because not given: {_assumed_limits(plan)}")
+        doubts.append(
+            "The robot's description lacks these limits, so they are assumed: "
+            f"{_assumed_limits(plan)}"
+        )
     if plan.interrupted:
         doubts.append("The search was stopped: `--resume` may find a better motion")
     remarks = [Remark(text, Status.DOUBTFUL) for text in doubts]
@@ -79,8 +85,8 @@ def write_excitation(
     """
     robot = plan.base.model.robot
     caption = (
-        "Links are coloured by the speed of their joint. Pale shapes are those that "
-        "were checked for collision; grey ones stand still."
+        "The colour of a link is the speed of its joint. The pale shapes were checked "
+        "for collisions; grey ones do not move. Drag the picture to turn it."
     )
     with double_precision():
         time = np.linspace(0.0, float(played.duration), 801)
@@ -89,7 +95,10 @@ def write_excitation(
     scene = speed_figure(robot, limits, time, motion, shapes)
     all_remarks = sort_remarks((*plan_remarks(plan), *remarks))
     criteria, deviations, *use = plan.tables()
-    gain = "A random motion that fills the same limits is shown beside this one."
+    gain = (
+        "Both motions use the same limits. Each criterion measures how well a motion "
+        "determines the parameters: smaller is better."
+    )
     sections = [
         ("Verdict", [motion_verdict(plan, remarks), all_remarks]),
         (
@@ -137,7 +146,8 @@ def motion_verdict(plan: ExcitationPlan, remarks: Sequence[Remark]) -> Remark:
         status = Status.DOUBTFUL
         text = (
             "This motion keeps all limits, but determines the parameters "
-            f"{1.0 / plan.mean_gain:.3g} times worse than a random motion."
+            f"{1.0 / plan.mean_gain:.3g} times worse than a random motion: search "
+            "longer."
         )
     else:
         status = Status.GOOD

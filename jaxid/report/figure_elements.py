@@ -12,22 +12,23 @@ import numpy as np
 
 from jaxid.arrays import AnyArray
 
-# The palette of Okabe and Ito, which colour-blind readers can tell apart.
+# The palette of Okabe and Ito, which colour-blind readers can tell apart. Orange and
+# sky are darker than theirs, so that lines have a contrast of 3 to 1 on white.
 BLUE = "#0072B2"
-ORANGE = "#E69F00"
+ORANGE = "#C27D00"
 VERMILION = "#D55E00"
 GREEN = "#009E73"
 PURPLE = "#CC79A7"
-SKY = "#56B4E9"
+SKY = "#3D9BD6"
 INK = "#22262b"
 GREY = "#7b8794"
 PALE_GREY = "#d5dae0"
-MEASUREMENT_COLOUR = "#9aa6b2"
+MEASUREMENT_COLOUR = GREY
 PREDICTION_COLOUR = VERMILION
 ERROR = BLUE
 CYCLE = (BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY, GREY)
 """Colours of joints in one panel."""
-MAX_BINS = 1000
+MAX_BINS = 600
 """Pixel columns of a line, of which each keeps its extremes if the line is longer."""
 GAP_RATIO = 1.5
 """Time between two samples, relative to the median, from which a line has a gap."""
@@ -99,15 +100,6 @@ class Solids(NamedTuple):
     faces: np.ndarray  # (faces, 3): vertices of each triangle
     # (frames, bodies, 3, 4): rotation and origin of each body as [R r]
     places: np.ndarray
-
-    @property
-    def placed(self) -> np.ndarray:
-        """Vertices in the frame of the ground [m], (frames, vertices, 3)."""
-        ground = np.broadcast_to(np.eye(3, 4), (len(self.places), 1, 3, 4))
-        # Body -1, the ground, is the last one.
-        places = np.concatenate([self.places, ground], axis=1)[:, self.bodies]
-        rotated_vertices = np.einsum("fvij,vj->fvi", places[..., :3], self.vertices)
-        return rotated_vertices + places[..., 3]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

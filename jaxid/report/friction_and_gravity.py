@@ -9,11 +9,12 @@ from jaxid.dynamics.motion import Motion
 from jaxid.dynamics.sample_methods import in_numpy
 from jaxid.identification.fit_result import Fit
 from jaxid.result_table import Column, Table, percent, significant
+from jaxid.robot.collision_geometry import BodyShape
 from jaxid.validation.torque_errors import TorqueErrors
 
 from .figure import Figure
 from .figure_elements import BLUE, GREY, MEASUREMENT_COLOUR, Curve, Panel
-from .motion_figures import even_indices, pose_figure
+from .motion_figures import even_indices, pose_figure, surface_points
 
 MAX_POSES = 2000
 """Largest number of poses whose gravity torques are computed."""
@@ -167,7 +168,9 @@ def _steady_columns(base: BaseParameters, q: np.ndarray, qd: np.ndarray) -> np.n
     return in_numpy(base, base.columns, *base.model.arguments(motion))
 
 
-def error_scene(fit: Fit, log: TorqueErrors) -> Figure:
+def error_scene(
+    fit: Fit, log: TorqueErrors, shapes: Sequence[BodyShape] = ()
+) -> Figure:
     """Return the robot along a recording, coloured by its joints' torque errors."""
     robot = fit.base.model.robot
     scale = np.asarray(log.max_forces)
@@ -175,6 +178,7 @@ def error_scene(fit: Fit, log: TorqueErrors) -> Figure:
     if not np.isfinite(scale).all():
         scale = np.maximum(log.force_rms, np.finfo(float).tiny)
         reference = "RMS torque"
+    clouds = [(body, surface_points(shape)) for body, shape in shapes]
     return pose_figure(
         robot,
         np.asarray(log.positions),
@@ -182,4 +186,6 @@ def error_scene(fit: Fit, log: TorqueErrors) -> Figure:
         time=np.asarray(log.time),
         values=100.0 * log.errors / scale,
         label=f"torque error [% of {reference}]",
+        # A hull needs four points.
+        clouds=[cloud for cloud in clouds if len(cloud[1]) > 3],
     )

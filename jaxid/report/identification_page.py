@@ -1,7 +1,6 @@
 """Page of an identification: verdict, task, estimates, errors; tables of results."""
 
 import dataclasses
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -29,6 +28,7 @@ from jaxid.validation.torque_errors import (
 
 from .figure import Figure
 from .friction_and_gravity import gravity_table
+from .joint_estimates import correlation_blocks, joint_table
 from .page import Section, folded, picture, provenance, render_page, tiles
 from .parameter_words import FRAMES_NOTE, word_columns
 
@@ -36,7 +36,7 @@ Figures = Mapping[str, Figure]
 """Figures by the names of their files."""
 Sections = Iterator[Section]
 """Sections of the page, from the top."""
-MAX_PANELS = 42
+MAX_PANELS = 28
 """Largest number of joints, of all recordings together, whose forces the page shows."""
 
 
@@ -47,9 +47,9 @@ def identification_page(report: Report, figures: Figures) -> str:
     robot = base.model.robot
     sections = [
         ("At a glance", _glance(report)),
+        ("Estimates", _estimates(report)),
         *_physics(report, figures),
         ("Measured and predicted forces", _torques(figures, robot)),
-        ("Parameters in words", _parameters(fit)),
         (
             "Details",
             [folded(name, *blocks) for name, blocks in _details(report, figures)],
@@ -63,14 +63,14 @@ def identification_page(report: Report, figures: Figures) -> str:
         sections,
         f"{base.size} base parameters of {robot.joints} joints, from {logs} "
         f"log{ending}.",
-        "All numbers: result.json and parameters.csv beside this page. Lines of long "
-        "logs show the least and the largest value of each pixel column, so that no "
-        "peak is lost.",
+        "All numbers are in result.json and parameters.csv beside this page. Curves "
+        "of long logs keep the smallest and largest value of each pixel column, so "
+        "that no peak is lost.",
     )
 
 
 def _glance(report: Report) -> list[Any]:
-    """Return verdict, three numbers, the data, and what deserves attention."""
+    """Return verdict, three numbers, the logs, and what deserves attention."""
     judgement = judge(report)
     faults = judgement.faults
     other_findings = [x for x in judgement.findings if x not in faults]
@@ -110,37 +110,18 @@ def _three_numbers(report: Report) -> Markup:
         (
             f"{fit.base.size - undetermined} of {fit.base.size}",
             "combinations of parameters that the logs determine",
-            fit.determination[0].status,
+            # The logs of the fit praise no model.
+            Status.DOUBTFUL if undetermined else Status.NEUTRAL,
         ),
     )
 
 
 def _data(report: Report) -> Iterator[tuple[str, str]]:
-    """Yield robot, logs, estimator and total mass, each with its word."""
-    fit = report.fit
-    robot = fit.base.model.robot
-    yield "robot", f"{robot.name}, {robot.joints} joints"
+    """Yield the logs, each with its word."""
     for log in report.identification:
         yield "identified with", _log_size(log)
     for log in report.verification:
         yield "verified with", _log_size(log)
-    # A class `LeastSquares` is shown as "least squares".
-    words = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", type(fit.estimator).__name__)
-    yield "estimator", words.lower()
-    if fit.consistency is None:
-        yield (
-            "total mass",
-            "forces tell combinations of masses only; physically consistent bodies "
-            "have masses",
-        )
-    else:
-        mass = significant(float(np.asarray(fit.consistency.bodies)[:, 0].sum()))
-        bodies = len(fit.consistency.masses_from_bounds)
-        origin = f", of which {bodies} bodies follow from bounds too" if bodies else ""
-        yield "total mass of the moving bodies", f"{mass} kg{origin}"
-    if report.claimed_bodies is not None:
-        mass = significant(float(report.claimed_bodies[:, 0].sum()))
-        yield "total mass by the robot's file", f"{mass} kg"
 
 
 def _log_size(log: TorqueErrors) -> str:
@@ -155,21 +136,22 @@ def _physics(report: Report, figures: Figures) -> Sections:
     They show the robot in motion, its torques before and after, friction and gravity.
     """
     text = (
-        "Each link has the colour of the torque error of the joint that moves it, the "
-        "path of the end-effector that of the mean. Turn it, and move the slider."
+        "The colour of a link is the torque error of the joint that moves it; the "
+        "colour of the path is the mean error of all joints. Drag the picture to turn "
+        "it, and move the slider to follow the motion."
     )
     yield "The robot along the motion", [picture(figures["robot"], text)]
     if "before_and_after" in figures:
         text = (
-            "Torque errors with the parameters that the robot's file claims (friction "
-            "and rotors count as zero where it claims none), and with those that were "
-            "identified."
+            "Torque errors with the parameters in the robot's file (friction and "
+            "rotors count as zero if it has none), and with the identified ones."
         )
         yield "Before and after", [text, figures["before_and_after"]]
     text = (
-        "Lines: the model. Points: means over classes of speed of the measured "
-        "forces, less all that the model explains otherwise. Points far from their "
-        "line ask for another shape."
+        "The line is the model. Each point is the measured friction in a range of "
+        "speeds: the mean force there, minus gravity and inertia of the model. If the "
+        "points leave the line, friction has another shape: `jaxid choose` tries "
+        "further laws."
     )
     yield "Friction", [text, figures["friction"]]
     log = report.verification[0] if report.verification else report.identification[0]
@@ -192,15 +174,25 @@ def _torques(figures: Figures, robot: Robot) -> list[Any]:
     return blocks
 
 
-def _parameters(fit: Fit) -> list[Any]:
-    """Return the table of the estimates, and how to read it."""
+def _estimates(report: Report) -> list[Any]:
+    """Return friction, rotors and gravity of each joint; all parameters folded."""
+    fit = report.fit
+    text = (
+        "Each estimate has half the width of its 95 % interval. Masses times distances "
+        "belong to the body that the joint moves, and include what forces cannot tell "
+        "apart from it."
+    )
     note = (
         "* together with what forces cannot tell apart from it: see its combination. "
         "Open: the share of the torques of random motions that its interval leaves "
         "open. A small parameter matters little, however wide its interval."
     )
     doubts = [fit.determination] if fit.undetermined else []
-    return [*doubts, parameter_table(fit), note, FRAMES_NOTE]
+    all_parameters = folded(
+        f"All {fit.base.size} base parameters", parameter_table(fit), note, FRAMES_NOTE
+    )
+    correlations = folded("Correlated parameters", *correlation_blocks(fit))
+    return [*doubts, text, joint_table(report), all_parameters, correlations]
 
 
 def _details(report: Report, figures: Figures) -> Sections:
@@ -219,8 +211,8 @@ def _details(report: Report, figures: Figures) -> Sections:
 
     band = report.every_error[0].band_words
     text = (
-        "RMS of the differences over the RMS of the measured forces of each joint"
-        f"{band}. Errors of other bands cannot be compared with these."
+        "RMS of the errors of each joint over the RMS of its measured forces"
+        f"{band}. Errors in another band of frequencies are not comparable."
     )
     tables = report.validation.tables()
     yield "Torque errors", [text, figures["errors"], *tables]
@@ -230,9 +222,9 @@ def _details(report: Report, figures: Figures) -> Sections:
         yield "Bodies", [table]
     if fit.residual_spectra is not None:
         text = (
-            "The residuals of a good model are noise. More power at low frequencies "
-            "than white noise has behind the filters (dashed) means that an effect is "
-            "missing."
+            "The errors of a complete model are random. If a curve rises above the "
+            "dashed line at low frequencies, the model lacks an effect there, such as "
+            "friction of another shape: `jaxid choose` tries some."
         )
         yield "Residuals", [text, figures["residuals"]]
 
@@ -255,7 +247,6 @@ def parameter_table(fit: Fit) -> Table:
     ends = fit.intervals().T
     return Table(
         "",
-        Column("#", list(range(1, base.size + 1))),
         Column("parameter", base.names),
         *word_columns(base),
         *estimate_columns(fit.parameters, fit.standard_deviations, ends, base.units),

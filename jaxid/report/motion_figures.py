@@ -2,7 +2,7 @@
 
 import dataclasses
 import itertools
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import jax.numpy as jnp
@@ -12,7 +12,8 @@ from scipy.spatial import ConvexHull
 from jaxid.arrays import AnyArray, Float, double_precision
 from jaxid.dynamics.motion import Motion
 from jaxid.dynamics.sample_methods import in_numpy
-from jaxid.robot.collision import GROUND, Box, Capsule, CollisionModel, HalfSpace
+from jaxid.robot.collision import GROUND, Box, CollisionModel, HalfSpace
+from jaxid.robot.collision_geometry import Shape
 from jaxid.robot.forward_kinematics import placements, tip_placement
 from jaxid.robot.limits_and_drives import Limits
 from jaxid.robot.robot import Robot
@@ -29,15 +30,17 @@ from .figure_elements import (
 
 Times = Float[AnyArray, " samples"]
 """Instants of the samples of a motion."""
+Cloud = tuple[int, np.ndarray]
+"""Body, and points in its frame [m]; body -1 is the ground."""
 JointSamples = Float[AnyArray, "samples joints"]
 """A value of each joint at each sample."""
-BALL_POINTS = 40
-"""Points on the ball at each end of a capsule."""
+BALL_POINTS = 60
+"""Points on the ball at each end of a capsule, and on the hull of a mesh at most."""
 GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
 """Angle between neighbouring points of a ball that spreads them evenly [rad]."""
-MAX_PATH_POINTS = 1500
+MAX_PATH_POINTS = 1000
 """Largest number of points of the path of an end-effector."""
-MAX_FRAMES = 150
+MAX_FRAMES = 120
 """Largest number of poses of a robot on a page."""
 PLANE_SIZE = 0.7
 """Half the side of the square that shows a plane, relative to the robot's reach."""
@@ -98,6 +101,7 @@ def pose_figure(
     poses: int = 6,
     title: str | None = None,
     shapes: CollisionModel | None = None,
+    clouds: Sequence[Cloud] = (),
 ) -> Figure:
     """Return the robot along a motion: moving on a page, poses on paper (Figs. 3, 8).
 
@@ -111,6 +115,7 @@ def pose_figure(
         poses: Number of poses on paper, evenly spaced from the first to the last.
         title: Title of the figure; the robot's name if None.
         shapes: Shapes of robot and surroundings that the page shows.
+        clouds: Points of bodies whose convex hulls the page shows.
     """
     q = np.atleast_2d(np.asarray(q, np.float64))
     time = np.arange(len(q)) if time is None else np.asarray(time)
@@ -123,15 +128,23 @@ def pose_figure(
         # A follower's link has the colour of its leader's.
         leaders = [follower.leader for follower in robot.followers]
         values = np.concatenate([values, values[:, leaders]], axis=1)
+    points = _points(robot, q[rows])
+    solid_clouds = list(clouds)
+    if shapes is not None:
+        reach = float(np.linalg.norm(points, axis=2).max())
+        solid_clouds += _collision_clouds(shapes, PLANE_SIZE * reach)
+    solids = None
+    if solid_clouds:
+        solids = _solids(solid_clouds, _body_places(robot, q[rows[frames]]))
     scene = Scene(
         time=time[rows],
-        points=_points(robot, q[rows]),
+        points=points,
         links=(*robot.parent, robot.tip_body),
         frames=frames,
         poses=poses,
         values=values,
         label=label,
-        solids=None if shapes is None else _solids(robot, shapes, q[rows[frames]]),
+        solids=solids,
     )
     title = robot.name if title is None else title
     return Figure(title, height=2.6, width=7.5, scene=scene)
@@ -200,26 +213,41 @@ def _points(robot: Robot, q: np.ndarray) -> np.ndarray:
         return in_numpy(robot, points, q)
 
 
-def _solids(robot: Robot, shapes: CollisionModel, q: np.ndarray) -> Solids:
-    """Return the surfaces of all shapes, and the places of the bodies in some poses."""
+def _body_places(robot: Robot, q: np.ndarray) -> np.ndarray:
+    """Return rotation and origin of each body as [R r], (samples, bodies, 3, 4)."""
 
     def body_places(sample):
         rotations, origins = placements(robot, sample)
         return jnp.concatenate([rotations, origins[:, :, None]], axis=2)
 
     with double_precision():
-        places = in_numpy(robot, body_places, q)
-    reach = float(np.linalg.norm(places[..., 3], axis=2).max())
-    clouds = [(capsule.body, _capsule_points(capsule)) for capsule in shapes.capsules]
-    for obstacle in shapes.obstacles:
-        clouds.append((GROUND, _obstacle_points(obstacle, PLANE_SIZE * reach)))
+        return in_numpy(robot, body_places, q)
 
+
+def _collision_clouds(shapes: CollisionModel, size: float) -> list[Cloud]:
+    """Return points on all shapes; planes are shown as squares, as large as `size`."""
+    clouds: list[Cloud] = []
+    for capsule in shapes.capsules:
+        # A ball is a capsule whose ends are one.
+        ends = np.unique(np.stack([capsule.start, capsule.end]), axis=0)
+        shape = Shape(ends, float(capsule.radius))
+        clouds.append((capsule.body, surface_points(shape)))
+    for obstacle in shapes.obstacles:
+        clouds.append((GROUND, _obstacle_points(obstacle, size)))
+    return clouds
+
+
+def _solids(clouds: Sequence[Cloud], places: np.ndarray) -> Solids:
+    """Return the convex hulls of points, and the places of the bodies in some poses."""
     faces = []
     first_vertex = 0
     for _, points in clouds:
         is_square = len(points) == 4
-        hull_faces = SQUARE_FACES if is_square else ConvexHull(points).simplices
-        faces.append(hull_faces + first_vertex)
+        hull = SQUARE_FACES
+        if not is_square:
+            # Joggled input: the points of a mesh may lie in a plane.
+            hull = ConvexHull(points, qhull_options="QJ").simplices
+        faces.append(hull + first_vertex)
         first_vertex += len(points)
     return Solids(
         vertices=np.concatenate([points for _, points in clouds]),
@@ -229,16 +257,21 @@ def _solids(robot: Robot, shapes: CollisionModel, q: np.ndarray) -> Solids:
     )
 
 
-def _capsule_points(capsule: Capsule) -> np.ndarray:
-    """Return points on two spheres at a capsule's ends, spread by the golden angle."""
+def surface_points(shape: Shape) -> np.ndarray:
+    """Return points on the hull of a shape: few, so that the page stays small.
+
+    They are those that lie farthest in directions spread by the golden angle.
+    """
     number = np.arange(BALL_POINTS)
     angle = GOLDEN_ANGLE * number
     z = 1.0 - (2.0 * number + 1.0) / BALL_POINTS
     ring = np.sqrt(1.0 - z**2)
-    sphere = np.stack([ring * np.cos(angle), ring * np.sin(angle), z], axis=1)
-    # A ball is a capsule whose ends are one.
-    ends = np.unique(np.stack([capsule.start, capsule.end]), axis=0)
-    return (ends[:, None] + float(capsule.radius) * sphere).reshape(-1, 3)
+    directions = np.stack([ring * np.cos(angle), ring * np.sin(angle), z], axis=1)
+    if shape.radius > 0.0:
+        points = shape.points[:, None] + shape.radius * directions
+        return points.reshape(-1, 3)
+    farthest_points = np.argmax(shape.points @ directions.T, axis=0)
+    return shape.points[np.unique(farthest_points)]
 
 
 def _obstacle_points(obstacle: HalfSpace | Box, size: float) -> np.ndarray:

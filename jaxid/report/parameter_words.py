@@ -25,7 +25,7 @@ def in_words(name: str, model: Model) -> tuple[str, str]:
     joint = _joint(model.robot, number)
     for term in model.terms:
         if symbol in term.meanings:
-            body = f"body {number}, moved by {joint}"
+            body = f"body of {joint}"
             return term.meanings[symbol], body if term.body_parameters else joint
     return "effect of a model of your own", joint
 

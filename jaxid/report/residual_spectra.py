@@ -25,7 +25,7 @@ def residual_figure(spectra: ResidualSpectra, robot: Robot) -> Figure:
     """
     panels = [_spectrum_panel(spectra, robot, j) for j in range(robot.joints)]
     count = sum(spectra.white)
-    title = f"{robot.name}: residuals of {count} of {robot.joints} joints are white"
+    title = f"{robot.name}: errors of {count} of {robot.joints} joints are random"
     columns = min(2, len(panels))
     return Figure(title, panels, columns, width=5.5 * columns)
 
@@ -40,8 +40,8 @@ def _spectrum_panel(spectra: ResidualSpectra, robot: Robot, j: int) -> Panel:
     density = np.asarray(spectra.density)[j, is_shown]
     white_level = np.sum(density) / np.sum(white_density)
 
-    white_name = "white noise behind the filters (10 % of its power there)"
-    verdict = "white" if spectra.white[j] else "not white"
+    white_name = "random errors behind the filters"
+    verdict = "random" if spectra.white[j] else "not random"
     low_share = percent(float(spectra.low_frequency[j]))
     low_band = f"below {0.1 * spectra.band:.2g} Hz"
     return Panel(
@@ -52,7 +52,7 @@ def _spectrum_panel(spectra: ResidualSpectra, robot: Robot, j: int) -> Panel:
             ),
         ],
         title=robot.joint_names[j],
-        value=f"{verdict}: {low_share} % of the power {low_band}",
+        value=f"{verdict}: {low_share} % of power {low_band}",
         x="frequency [Hz]",
         unit="(N m)²/Hz" if robot.force_unit(j) == "N m" else "N²/Hz",
         log="xy" if np.any(density > 0) else "x",

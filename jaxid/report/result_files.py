@@ -69,7 +69,7 @@ def report_figures(report: Report) -> dict[str, Figure]:
     figures = {
         "errors": bar_figure(roles, robot),
         "friction": friction_figure(fit, report.identification),
-        "robot": error_scene(fit, shown_logs[0]),
+        "robot": error_scene(fit, shown_logs[0], report.shapes),
     }
     if report.claimed:
         groups = {

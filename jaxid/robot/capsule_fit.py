@@ -1,6 +1,6 @@
 """Capsules around the links of a robot, from their geometry or from its joints."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -66,26 +66,11 @@ def fit_capsules(
     tree = UrdfTree(path, base=base, tip=tip, xacro_arguments=xacro_arguments)
     mount = np.eye(3) if base_rotation is None else np.array(base_rotation, np.float64)
     place = np.array(base_position, np.float64)
-    # MuJoCo has read the shapes of an MJCF file; those of a URDF are read here.
-    compiled_shapes = mjcf_shapes(path) if tree.compiled else {}
 
     capsules: list[Capsule] = []
-    for link, (body, rotation, position) in tree.placed_links().items():
-        if body == GROUND:
-            rotation = mount @ rotation
-            position = place + mount @ position
-        shapes = compiled_shapes.get(link, [])
-        try:
-            if not tree.compiled:
-                # Numbers that overflow make a shape that is too large.
-                with np.errstate(over="ignore", invalid="ignore"):
-                    shapes = list(link_shapes(tree, packages, link))
-            _refuse_huge_shapes(path, link, shapes)
-        except (OSError, InputError) as error:
-            if faults is None:
-                raise
-            faults[link] = str(error)
-            shapes = []
+    for link, body, rotation, position, shapes in placed_shapes(
+        tree, mount, place, packages, faults
+    ):
         for number, shape in enumerate(shapes, 1):
             label = link if number == 1 else f"{link} {number}"
             axis = Segment(shape.points[0], shape.points[-1], shape.radius)
@@ -104,6 +89,58 @@ def fit_capsules(
             f"`{path}` has no collision geometry for the links that were asked for."
         )
     return tuple(capsules)
+
+
+class LinkShapes(NamedTuple):
+    """Shapes of a link, and the place of its frame.
+
+    Attributes:
+        link: Name of the link.
+        body: Body that the link belongs to; -1 is the ground.
+        rotation: Orientation of the link's frame in that of the body.
+        position: Origin of the link's frame in that of the body [m].
+        shapes: Shapes in the link's frame.
+    """
+
+    link: str
+    body: int
+    rotation: np.ndarray
+    position: np.ndarray
+    shapes: list[Shape]
+
+
+def placed_shapes(
+    tree: UrdfTree,
+    mount: np.ndarray,
+    place: np.ndarray,
+    packages: str | Path | None = None,
+    faults: dict[str, str] | None = None,
+) -> Iterator[LinkShapes]:
+    """Yield the shapes of each link of a file whose base is mounted on the ground.
+
+    For `packages`, `faults` and errors see `fit_capsules`.
+    """
+    path = tree.path
+    # MuJoCo has read the shapes of an MJCF file; those of a URDF are read here.
+    compiled_shapes = mjcf_shapes(path) if tree.compiled else {}
+
+    for link, (body, rotation, position) in tree.placed_links().items():
+        if body == GROUND:
+            rotation = mount @ rotation
+            position = place + mount @ position
+        shapes = compiled_shapes.get(link, [])
+        try:
+            if not tree.compiled:
+                # Numbers that overflow make a shape that is too large.
+                with np.errstate(over="ignore", invalid="ignore"):
+                    shapes = list(link_shapes(tree, packages, link))
+            _refuse_huge_shapes(path, link, shapes)
+        except (OSError, InputError) as error:
+            if faults is None:
+                raise
+            faults[link] = str(error)
+            shapes = []
+        yield LinkShapes(link, body, rotation, position, shapes)
 
 
 def _refuse_huge_shapes(path: str | Path, link: str, shapes: list[Shape]):

@@ -43,6 +43,10 @@ class Shape(NamedTuple):
         return Shape(position + self.points @ rotation.T, self.radius)
 
 
+BodyShape = tuple[int, Shape]
+"""Body, and a shape in its frame; body -1 is the ground."""
+
+
 def link_shapes(
     tree: UrdfTree,
     packages: str | Path | None,

@@ -9,6 +9,7 @@ import numpy as np
 from jaxid.dynamics.terms import ConstantOffset
 from jaxid.identification.fit_result import Fit
 from jaxid.result_table import Remark, Status, percent, significant
+from jaxid.robot.collision_geometry import BodyShape
 
 from .torque_errors import (
     Definiteness,
@@ -93,8 +94,15 @@ class Report:
     mistakes: Sequence[str] = ()
     # errors on all logs of the parameters that the robot's file claims; empty without
     claimed: Sequence[TorqueErrors] = ()
+    # base parameters that it claims, NaN where it claims none; None without
+    claimed_parameters: np.ndarray | None = None
     # inertial parameters of the bodies that it claims [bodies, 10]; None without
     claimed_bodies: np.ndarray | None = None
+
+    @property
+    def shapes(self) -> list[BodyShape]:
+        """Shapes of the robot's bodies, for pictures; none without its file."""
+        return []
 
     @property
     def validation(self) -> Validation:
@@ -344,11 +352,12 @@ def _remarks_on_fit(report: Report) -> Iterator[Remark]:
     if spectra is not None:
         white_count = int(np.count_nonzero(spectra.white))
         yield Remark(
-            f"What the fit leaves is white noise for {white_count} of "
-            f"{len(spectra.white)} joints",
-            detail="Bartlett's test compares the cumulative spectrum with a straight "
-            "line. The intervals account for correlated residuals, not for what the "
-            "model lacks.",
+            f"The errors of {white_count} of {len(spectra.white)} joints are random "
+            "(white noise)",
+            detail="Where they are not, the model lacks a small effect. If the torque "
+            "errors matter to you, `jaxid choose` tries further effects; otherwise "
+            "nothing needs to be done: the intervals account for correlated errors. "
+            "Bartlett's test compares the cumulative spectrum with a straight line.",
         )
     yield Remark(
         f"Estimates: {dict(fit.facts)['estimates']}",
@@ -360,5 +369,5 @@ def _remarks_on_fit(report: Report) -> Iterator[Remark]:
     yield Remark(
         f"The condition number with columns of length one is {condition}",
         detail=f"Above {MAX_CONDITION_NUMBER:g}, some parameters are hard to tell "
-        "apart, and their intervals are wide.",
+        "apart, and their intervals are wide: record a motion of `jaxid excite`.",
     )

@@ -31,6 +31,7 @@ from jaxid.measurement.recording import Recording
 from jaxid.report.identification_page import body_table, motor_tables
 from jaxid.report.result_files import read_fit, write_report
 from jaxid.result_table import Remark, Summarised, Table
+from jaxid.robot.collision_geometry import BodyShape
 from jaxid.validation.diagnosis import mistakes_in_logs
 from jaxid.validation.judgement import Judgement, Report, judge
 from jaxid.validation.torque_errors import (
@@ -41,6 +42,7 @@ from jaxid.validation.torque_errors import (
 )
 
 from .log_loading import LoadedLog, fitted_share, is_report, load_logs, select_filter
+from .robot_file import RobotFile
 from .setup import Paths, Progress, Setup, ignore_progress
 
 MAX_COLUMNS = 5
@@ -49,7 +51,18 @@ MAX_COLUMNS = 5
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class IdentificationReport(Summarised, Report):
-    """Identified model, its validation, and the judgement, which notebooks show."""
+    """Identified model, its validation, and the judgement, which notebooks show.
+
+    Attributes:
+        robot_file: Description whose shapes the page shows; None without a file.
+    """
+
+    robot_file: RobotFile | None = None
+
+    @property
+    def shapes(self) -> list[BodyShape]:
+        """Shapes of the robot's bodies in its file, as far as they can be read."""
+        return [] if self.robot_file is None else self.robot_file.shapes()
 
     @functools.cached_property
     def judgement(self) -> Judgement:
@@ -199,7 +212,9 @@ def identify_logs(
         doubts=[*doubts, *mistakes.doubts],
         mistakes=mistakes.certain,
         claimed=claims.errors,
+        claimed_parameters=claims.parameters,
         claimed_bodies=claims.bodies,
+        robot_file=setup.robot_file,
     )
 
 
@@ -262,6 +277,7 @@ class Claims(NamedTuple):
     """Parameters that the robot's file claims, compared with logs."""
 
     errors: tuple[TorqueErrors, ...] = ()  # torque errors on each log
+    parameters: np.ndarray | None = None  # base parameters; NaN without a claim
     bodies: np.ndarray | None = None  # their inertial parameters [bodies, 10]
 
 
@@ -273,10 +289,13 @@ def errors_of_claims(setup: Setup, fit: Fit, logs: Sequence[Observations]) -> Cl
     if not values:
         return Claims()
     names = fit.base.model.parameter_names
-    parameters = fit.base.from_standard([values.get(name, 0.0) for name in names])
-    claimed_fit = dataclasses.replace(fit, parameters=np.asarray(parameters))
+    standard_parameters = [values.get(name, 0.0) for name in names]
+    parameters = np.asarray(fit.base.from_standard(standard_parameters))
+    claimed_fit = dataclasses.replace(fit, parameters=parameters)
     errors = tuple(torque_errors(claimed_fit, log) for log in logs)
-    return Claims(errors, setup.robot_file.bodies())
+    is_claimed = [names[k] in values for k in fit.base.indices]
+    claimed_parameters = np.where(is_claimed, parameters, np.nan)
+    return Claims(errors, claimed_parameters, setup.robot_file.bodies())
 
 
 def read_earlier_fit(setup: Setup, folder: Path) -> Fit:

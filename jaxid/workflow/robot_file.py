@@ -10,6 +10,8 @@ from jaxid.arrays import Float, Numbers
 from jaxid.errors import InputError
 from jaxid.identification.consistency import consistency_margin
 from jaxid.io import FilePath
+from jaxid.robot.capsule_fit import placed_shapes
+from jaxid.robot.collision_geometry import BodyShape
 from jaxid.robot.inertia import INERTIAL_NAMES
 from jaxid.robot.robot import Robot
 from jaxid.robot.urdf import joint_parameters, load_urdf
@@ -57,6 +59,20 @@ class RobotFile:
     def load(self, gravity: Numbers | None = None) -> Robot:
         """Load the robot; gravity in the frame of the ground is the file's if None."""
         return load_urdf(self.path, gravity=gravity, **self.chain, **self.placement)
+
+    def shapes(self) -> list[BodyShape]:
+        """Return the shapes that can be read, each with its body, in the body's frame.
+
+        Without capsules around them: this is how the robot looks.
+        """
+        tree = UrdfTree(self.path, **self.chain)
+        mount = np.eye(3) if self.base_rotation is None else self.base_rotation
+        place = np.asarray(self.base_position)
+        shapes = []
+        for link in placed_shapes(tree, mount, place, faults={}):
+            for shape in link.shapes:
+                shapes.append((link.body, shape.placed(link.rotation, link.position)))
+        return shapes
 
     def bodies(self) -> Float[np.ndarray, "bodies 10"]:
         """Return the inertial parameters of the bodies.

@@ -40,6 +40,20 @@ function faults() {
   return faults;
 }
 
+// Tables and figures on paper: no column is cut or narrower than its words.
+function paperFaults() {
+  dispatchEvent(new Event("beforeprint"));
+  const faults = [], width = document.documentElement.clientWidth;
+  for (const table of document.querySelectorAll("table"))
+    if (table.getBoundingClientRect().right > width + 1) faults.push(`wider than the paper: ${table.textContent.trim().slice(0, 40)}`);
+  for (const cell of document.querySelectorAll("td.code, th.code"))
+    if (cell.clientWidth < 100) faults.push(`narrow: ${cell.textContent}`);
+  for (const chart of document.querySelectorAll(".chart"))
+    if (!(chart.querySelector(":scope > .sketch").getBoundingClientRect().height > 50)) faults.push(`empty: ${chart.ariaLabel}`);
+  dispatchEvent(new Event("afterprint"));
+  return faults;
+}
+
 const figures = () => [...document.querySelectorAll("figure")];
 const torques = () => figures().find((f) => f.querySelector("[data-curve=measured]"));
 const charts = () => [...torques().querySelectorAll(".chart")];
@@ -59,4 +73,24 @@ function slide(frame) {
   slider.value = String(frame);
   slider.dispatchEvent(new Event("input"));
   return JSON.stringify(robot().data[1].x);
+}
+
+function frameOfTheRobot() {
+  robot().scrollIntoView({ behavior: "instant", block: "center" });
+  const { x, y, width, height } = robot().getBoundingClientRect();
+  return [x, y, width, height];
+}
+
+// Pixels that are drawn within 2 px of the left, right, top and bottom of the view.
+async function colouredBorderPixels() {
+  const scene = robot()._fullLayout.scene._scene;
+  const picture = new Image();
+  picture.src = scene.toImage("png");
+  await picture.decode();
+  const canvas = document.createElement("canvas"), { width, height } = picture;
+  Object.assign(canvas, { width, height });
+  const pen = canvas.getContext("2d");
+  pen.drawImage(picture, 0, 0);
+  const strips = [[0, 0, 2, height], [width - 2, 0, 2, height], [0, 0, width, 2], [0, height - 2, width, 2]];
+  return strips.map((strip) => pen.getImageData(...strip).data.filter((value, k) => k % 4 === 3 && value > 30).length);
 }

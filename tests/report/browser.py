@@ -11,6 +11,7 @@ import time
 import urllib.request
 from pathlib import Path
 
+import numpy as np
 import patience
 
 CHROMIUM = next(
@@ -30,6 +31,15 @@ FLAGS = [
     "availablePointerTypes=4",
 ]
 FUNCTIONS = Path(__file__).with_name("browser.js").read_text(encoding="utf-8")
+
+
+def placed_vertices(solids) -> np.ndarray:
+    """Vertices in the frame of the ground [m], (frames, vertices, 3)."""
+    ground = np.broadcast_to(np.eye(3, 4), (len(solids.places), 1, 3, 4))
+    # Body -1, the ground, is the last one.
+    places = np.concatenate([solids.places, ground], axis=1)[:, solids.bodies]
+    rotated = np.einsum("fvij,vj->fvi", places[..., :3], solids.vertices)
+    return rotated + places[..., 3]
 
 
 class Browser:

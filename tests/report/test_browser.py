@@ -1,16 +1,21 @@
 """Pages in a real browser: nothing is cut off or overlaps; zoom and legends work."""
 
+import dataclasses
+import re
 import shutil
 import subprocess
 
 import numpy as np
 import pytest
-from browser import CHROMIUM, Browser
+from browser import CHROMIUM, Browser, placed_vertices
 
+import jaxid as jid
 from jaxid.report.comparison_page import ComparisonReport
 from jaxid.report.motion_figures import pose_figure
+from jaxid.report.result_files import write_report
 from jaxid.robot import library
 from jaxid.robot.collision import Capsule, CollisionModel, HalfSpace
+from jaxid.validation.judgement import Report
 
 pytest.importorskip("websockets.sync.client")
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here")
@@ -61,7 +66,9 @@ def test_shapes_move_with_the_robot(browser, tmp_path):
         "(document.querySelector('.chart').data[2])"
     )
     found = np.transpose(browser.evaluate(shown))
-    np.testing.assert_allclose(found, figure.scene.solids.placed[12], atol=4e-4)
+    np.testing.assert_allclose(
+        found, placed_vertices(figure.scene.solids)[12], atol=4e-4
+    )
     assert browser.evaluate("faults()") == []
     assert browser.errors == []
 
@@ -136,13 +143,14 @@ def test_paper_has_every_figure_and_what_was_folded(browser, pages, tmp_path):
     folded = browser.evaluate("document.querySelectorAll('details:not([open])').length")
     assert folded > 3
     browser.pdf(tmp_path / "page.pdf")
-    browser.wait("document.querySelectorAll('.chart:not(.drawn)').length === 0")
     assert browser.errors == []
     # After printing the page is as it was.
     assert (
         browser.evaluate("document.querySelectorAll('details:not([open])').length")
         == folded
     )
+    browser.look(690, media="print")
+    assert browser.evaluate("paperFaults()") == []
     if shutil.which("pdftotext"):
         command = ["pdftotext", "-layout", tmp_path / "page.pdf", "-"]
         text = subprocess.run(
@@ -150,3 +158,60 @@ def test_paper_has_every_figure_and_what_was_folded(browser, pages, tmp_path):
         ).stdout
         assert "Residuals" in text
         assert "frequency [Hz]" in text
+
+
+@pytest.fixture(scope="module")
+def arm_page(tmp_path_factory):
+    """The report of an arm with seven joints, two logs and 69 parameters."""
+    robot = library.panda()
+    terms = (jid.RigidBodies(), jid.ViscousFriction(), jid.CoulombFriction())
+    model = jid.Model(robot, (*terms, jid.RotorInertia(), jid.ConstantOffset()))
+    base = jid.base_parameters(model)
+    random = np.random.default_rng(0)
+    observations = []
+    for seed in (1, 2):
+        times = np.arange(0.0, 10.0, 0.01)
+        path = jid.trajectories.random_fourier_series(robot, omega=0.6, seed=seed)
+        motion = path.motion(times)
+        torques = np.asarray(model.inverse_dynamics(np.full(model.size, 0.1), motion))
+        torques = torques + random.normal(0.0, 0.1, torques.shape)
+        log = jid.Recording.of(np.asarray(motion.q), torques, time=times)
+        log = dataclasses.replace(log, name=f"log {seed}")
+        observations.append(jid.observe(log, robot, jid.ZeroPhaseButterworth(10.0)))
+    fit = jid.identify(base, observations[0], jid.estimators.LeastSquares())
+    validation = jid.validate(fit, observations)
+    errors = validation.errors
+    report = Report(fit, errors[:1], errors[1:], validation.definiteness)
+    folder = tmp_path_factory.mktemp("arm") / "report"
+    return write_report(folder, report)[0]
+
+
+def test_a_report_printed_at_once_has_few_pages_and_all_figures(
+    browser, arm_page, tmp_path
+):
+    browser.look(1280)
+    browser.call("Page.navigate", url=arm_page.as_uri())
+    # Before the library is unpacked.
+    browser.wait(
+        "location.protocol === 'file:' && document.readyState !== 'loading'"
+        " && document.body.dataset.sketched === ''"
+    )
+    browser.pdf(tmp_path / "early.pdf")
+    content = (tmp_path / "early.pdf").read_bytes()
+    assert 4 <= len(re.findall(rb"/Type\s*/Page\b", content)) <= 8
+    browser.open(arm_page)
+    browser.look(690, media="print")
+    assert browser.evaluate("paperFaults()") == []
+    assert browser.errors == []
+
+
+def test_the_page_scrolls_under_the_robot_which_is_inside_its_frame(browser, arm_page):
+    browser.look(1280)
+    browser.open(arm_page)
+    browser.evaluate("drawAll()")
+    x, y, width, height = browser.evaluate("frameOfTheRobot()")
+    wheel = {"type": "mouseWheel", "x": x + width / 2, "y": y + height / 2}
+    top = browser.evaluate("scrollY")
+    browser.call("Input.dispatchMouseEvent", **wheel, deltaX=0, deltaY=300)
+    browser.wait(f"scrollY >= {top} + 250")
+    assert browser.evaluate("colouredBorderPixels()") == [0, 0, 0, 0]

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import jaxid as jid
+from jaxid.report.joint_estimates import correlation_blocks, joint_table
 from jaxid.report.page import code, folded, picture, render_page
 from jaxid.result_table import Column, Remark, Status, Table
 from jaxid.validation.judgement import (
@@ -47,7 +48,7 @@ class Reader(HTMLParser):
             self.tables[-1][-1].append("")
 
     def handle_startendtag(self, tag, attrs):
-        self.scripts += tag == "script"
+        self.scripts += tag == "script" and ("type", "application/json") not in attrs
         for key, value in attrs:
             self.ids += [value] if key == "id" else []
             self.links += [value] if key.endswith("href") or key == "src" else []
@@ -79,8 +80,8 @@ def read(page_text: str) -> Reader:
 def test_the_page_is_whole_and_needs_nothing_else(written):
     text = (written / "report.html").read_text("utf-8")
     found = read(text)
-    assert found.scripts == 2
-    assert len(text) < 4_000_000
+    assert found.scripts == 4
+    assert len(text) < 2_500_000
     assert "urdf = 'a<b'" in found.text
     assert f"a note {EVIL}" in found.text
     assert "the log looks odd." in found.text
@@ -103,6 +104,24 @@ def test_every_parameter_stands_there_with_the_numbers_of_the_result(written, fi
             )
 
 
+def test_estimates_of_each_joint_stand_beside_those_of_the_file(fit, validation):
+    names = list(fit.base.names)
+    claims = np.full(len(names), np.nan)
+    claims[names.index("fv2")] = 0.3
+    report = Report(fit, validation.errors[:1], (), validation.definiteness)
+    report = dataclasses.replace(report, claimed_parameters=claims)
+    table = joint_table(report)
+    columns = {column.name: column.values for column in table.columns}
+    assert columns["joint"][1::2] == ("in the robot's file",) * 2
+    friction = columns["viscous friction"]
+    assert friction[1::2] == ("–", "0.300")  # noqa: RUF001
+    value, width = map(float, friction[2].split(" ± "))
+    low, high = fit.intervals()[names.index("fv2")]
+    assert (value - width, value + width) == pytest.approx((low, high), abs=width / 10)
+    for pairs in correlation_blocks(fit)[1:]:
+        assert min(map(abs, pairs.columns[2].values)) >= 0.8
+
+
 def test_every_block_is_written_and_escaped(errors_of):
     table = Table(EVIL, Column(EVIL, [EVIL]), Column("n", [1.5]), status=[Status.BAD])
     errors, robot = errors_of(2, name=EVIL), jid.robots.planar_arm(2)
@@ -119,7 +138,7 @@ def test_every_block_is_written_and_escaped(errors_of):
         jid.plot.torques(errors, robot, "another"),
     ]
     found = read(render_page(EVIL, [(EVIL, blocks), ("b", [])], EVIL, EVIL))
-    assert found.scripts == 2
+    assert found.scripts == 4
     assert found.text.count(EVIL) == 23
     assert found.tables[-1] == [["", EVIL, "n"], ["", EVIL, "1.50"]]
     for word in ("joint2", "measured"):

@@ -7,9 +7,11 @@ from forward_kinematics import body_transforms
 from scipy.spatial.transform import Rotation
 from urdf_text import joint, link, robot
 
+from jaxid.report.motion_figures import surface_points
 from jaxid.robot.capsule_fit import enclose, fit_capsules
 from jaxid.robot.collision import CollisionModel
 from jaxid.robot.urdf import load_urdf
+from jaxid.workflow.robot_file import RobotFile
 
 
 def collision(geometry, origin=""):
@@ -129,6 +131,19 @@ def test_a_mesh_is_held_whole(tmp_path):
     (meshes / "tool.stl").rename(meshes / "other.stl")
     with pytest.raises(FileNotFoundError, match=r"line 6: the mesh .* `packages`"):
         fit_capsules(path)
+
+
+def test_a_picture_has_the_shapes_of_the_file_on_their_bodies(tmp_path):
+    file = RobotFile(written(tmp_path), base_position=(0.0, 0.0, 1.0))
+    clouds = [(body, surface_points(shape)) for body, shape in file.shapes()]
+    assert sorted(body for body, _ in clouds) == [-1, 0, 0, 0, 1]
+    ((_, base),) = [cloud for cloud in clouds if cloud[0] == -1]
+    np.testing.assert_allclose(base[:, 2].mean(), 1.0, atol=0.02)
+    assert np.linalg.norm(base[:, :2], axis=1).max() == pytest.approx(0.2, rel=0.01)
+    # The plate, a box, has its corners on the body that it is fixed to.
+    plate = next(points for _, points in clouds if len(points) == 8)
+    turned = Rotation.from_euler("z", 0.3).inv().apply(plate - [0.6, 0.0, 0.0])
+    np.testing.assert_allclose(np.abs(turned), np.tile([0.05, 0.15, 0.01], (8, 1)))
 
 
 def test_grippers_that_the_chain_leaves_out_count_as_bodies_that_collide(tmp_path):

@@ -1,10 +1,12 @@
 "use strict";
 // Draws the figures of this page with plotly, which the page holds in packed form.
+// Until it is unpacked, and on paper, `sketches` shows them.
 (async () => {
   const charts = [...document.querySelectorAll(".chart")];
   const coarse = matchMedia("(hover: none)").matches;
-  const grey = "#7b8794", pale = "#d5dae0", sky = "#56B4E9", faint = "rgba(123, 135, 148, 0.28)";
-  const fromSmallToLarge = [[0, sky], [0.5, "#E69F00"], [1, "#D55E00"]];
+  const grey = "#7b8794", pale = "#d5dae0", sky = "#3d9bd6", faint = "rgba(123, 135, 148, 0.28)";
+  const fromSmallToLarge = [[0, sky], [0.5, "#c27d00"], [1, "#d55e00"]];
+  const labelRoom = [0.78, 0.88]; // share of width and height that the axes fill, labels beside them
   const gap = 0.05; // between panels with one abscissa, relative to their height
   const options = {
     displaylogo: false, responsive: false, scrollZoom: false,
@@ -13,7 +15,7 @@
     toImageButtonOptions: { format: "svg" },
   };
 
-  const optionsOf = (chart) => (chart.content.frames ? { ...options, modeBarButtons: [["toImage", "resetCameraDefault3d"]] } : options);
+  const optionsOf = (chart) => (chart.content.frames ? { ...options, modeBarButtons: [["toImage", "zoom3d", "pan3d", "tableRotation", "resetCameraLastSave3d"]] } : options);
   const escaped = (text) => text.replace(/[&<>"']/g, (letter) => `&#${letter.charCodeAt(0)};`);
 
   async function unpack(text) {
@@ -22,10 +24,13 @@
     return new Response(stream).text();
   }
 
-  // Numbers come in single precision, as bytes.
+  const bytesOf = (text) => Uint8Array.from(atob(text), (c) => c.charCodeAt(0)).buffer;
+
+  // Numbers come in single precision, or as counts of steps; the largest count is a gap.
   function numbers(key, value) {
-    if (!value || value.floats === undefined) return value;
-    return new Float32Array(Uint8Array.from(atob(value.floats), (c) => c.charCodeAt(0)).buffer);
+    if (value?.floats !== undefined) return new Float32Array(bytesOf(value.floats));
+    if (value?.counts === undefined) return value;
+    return Float64Array.from(new Uint16Array(bytesOf(value.counts)), (count) => (count === 65535 ? NaN : value.low + value.step * count));
   }
 
   const looks = {
@@ -53,8 +58,7 @@
 
   const axisNumber = (panel) => (panel ? String(panel + 1) : "");
 
-  function traceOf(curve, { panels, curves }) {
-    if (Number.isInteger(curve.x)) curve.x = curves[curve.x].x;
+  function traceOf(curve, { panels }) {
     const panel = panels[curve.panel], label = escaped(curve.name || panel.y || panel.title);
     const hover = curve.texts.length ? "%{text}" : `${label}: %{y:.4~g} ${escaped(panel.unit)}`;
     return {
@@ -64,7 +68,9 @@
   }
 
   function axis(label, range, logarithmic, names) {
-    const title = { text: escaped(label), font: { size: 12 }, standoff: 6 };
+    // A phone has room for about fifty letters.
+    const text = escaped(label).replace(/(.{36,}?) /g, "$1<br>");
+    const title = { text, font: { size: 12 }, standoff: 6 };
     const look = { gridcolor: faint, zeroline: false, linecolor: grey, automargin: true };
     return {
       ticks: "outside", ticklen: 3, tickcolor: grey, ...look, title,
@@ -105,7 +111,7 @@
   // Vertices of the shapes at a frame, one list for each axis; the ground has no place.
   function placed({ vertices, bodies, places }, frame) {
     return [0, 1, 2].map((i) => vertices.map((v, n) => {
-      const at = places[frame][bodies[n]];
+      const at = bodies[n] < 0 ? null : places[frame].subarray(12 * bodies[n]);
       return at ? at[4 * i] * v[0] + at[4 * i + 1] * v[1] + at[4 * i + 2] * v[2] + at[4 * i + 3] : v[i];
     }));
   }
@@ -131,12 +137,31 @@
     return traces;
   }
 
+  // The camera looks from `eye`, as near as all corners of the axes and their labels allow.
+  function cameraOf(ranges, aspect) {
+    const sizes = ranges.map(([low, high]) => high - low), mean = Math.cbrt(sizes[0] * sizes[1] * sizes[2]);
+    const half = sizes.map((size) => size / mean / 2), direction = [0.58, -0.73, 0.36];
+    const flat = Math.hypot(direction[0], direction[1]), [a, b, c] = direction;
+    const side = [-b / flat, a / flat, 0], upward = [(-c * a) / flat, (-c * b) / flat, flat];
+    const dot = (u, v) => u[0] * v[0] + u[1] * v[1] + u[2] * v[2];
+    const opening = Math.tan(Math.PI / 8); // of plotly's camera, half its height
+    const distances = [0, 1, 2, 3, 4, 5, 6, 7].map((number) => {
+      const corner = half.map((length, k) => (number & (1 << k) ? length : -length));
+      const tangent = Math.max(Math.abs(dot(corner, upward)) / labelRoom[1], Math.abs(dot(corner, side)) / aspect / labelRoom[0]);
+      return dot(corner, direction) + tangent / opening;
+    });
+    const [x, y, z] = direction.map((part) => part * Math.max(...distances));
+    // The nearest corner is low: the middle of the picture is below that of the axes.
+    return { eye: { x, y, z: z - 0.12 }, center: { x: 0, y: 0, z: -0.12 } };
+  }
+
   function sceneOf(chart) {
     const plane = { gridcolor: grey, zerolinecolor: grey, backgroundcolor: "rgba(0,0,0,0)" };
-    const away = widthOf(chart) < 500 ? 1.35 : 1, eye = { x: away * 1.2, y: away * -1.5, z: away * 0.7 };
-    const scene = { aspectmode: "data", camera: { eye }, domain: { x: [0, 1], y: [0.12, 1] }, dragmode: "turntable" };
+    const { ranges } = chart.content, bottom = 0.14;
+    const camera = cameraOf(ranges, widthOf(chart) / (parseFloat(chart.style.height) * (1 - bottom)));
+    const scene = { aspectmode: "data", camera, domain: { x: [0, 1], y: [bottom, 1] }, dragmode: "turntable" };
     ["x", "y", "z"].forEach((name, k) => {
-      scene[`${name}axis`] = { ...plane, title: { text: `${name} [m]` }, range: chart.content.ranges[k] };
+      scene[`${name}axis`] = { ...plane, title: { text: `${name} [m]` }, range: ranges[k], nticks: 5 };
     });
     return scene;
   }
@@ -148,25 +173,20 @@
     return {
       ...layout, margin, showlegend: false, dragmode: inSpace ? undefined : coarse ? false : "zoom",
       paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)", modebar: { bgcolor: "rgba(0,0,0,0)" }, bargap: 0.2, barmode: "overlay",
-      font: { family: getComputedStyle(document.body).fontFamily, size: 12, color: grey },
+      font: { family: getComputedStyle(document.body).fontFamily, size: 12, color: getComputedStyle(chart).color },
       width: widthOf(chart), height: parseFloat(chart.style.height),
     };
   }
 
-  // On paper the width of a chart is not known before it is drawn.
-  let paper = 0;
-  function widthOf(chart) {
-    if (!paper) return Math.max(chart.clientWidth, 200);
-    const columns = Number(getComputedStyle(chart.closest(".panels")).getPropertyValue("--columns"));
-    return columns > 1 ? paper / 2 - 12 : paper;
-  }
-
+  const widthOf = (chart) => Math.max(chart.clientWidth, 200);
   const same = (chart) => [...chart.closest("figure").querySelectorAll(".chart")];
   const drawn = (chart) => chart.classList.contains("drawn");
 
   function draw(chart) {
     if (drawn(chart)) return;
     chart.classList.add("drawn");
+    // The page scrolls where plotly would take the wheel.
+    chart.addEventListener("wheel", (event) => event.stopPropagation(), { capture: true });
     const { content } = chart, { frames } = content;
     const data = frames ? bodiesOf(content) : content.curves.map((curve) => traceOf(curve, content));
     Plotly.newPlot(chart, data, layoutOf(chart), optionsOf(chart));
@@ -178,10 +198,9 @@
 
   function resize(chart) {
     const width = widthOf(chart);
-    if (drawn(chart) && (paper || chart.clientWidth) && Math.abs(width - chart.layout.width) > 1)
-      Plotly.relayout(chart, { width });
+    if (drawn(chart) && chart.clientWidth && Math.abs(width - chart.layout.width) > 1) Plotly.relayout(chart, { width });
   }
-  const sizes = new ResizeObserver((seen) => seen.forEach((entry) => paper || resize(entry.target)));
+  const sizes = new ResizeObserver((seen) => seen.forEach((entry) => resize(entry.target)));
 
   // Panels of a figure have one abscissa: zooming one zooms all.
   let following = false;
@@ -212,7 +231,7 @@
   function animate(chart, frames) {
     const bar = document.createElement("div");
     bar.className = "player";
-    bar.innerHTML = '<button type="button">play</button><input type="range" min="0" aria-label="time"><output></output>';
+    bar.innerHTML = '<button type="button">play</button><input type="range" min="0" aria-label="time along the motion"><output></output>';
     const [button, slider, clock] = bar.children;
     slider.max = String(frames.time.length - 1);
     slider.value = "0";
@@ -223,6 +242,7 @@
       const change = { x: [x], y: [y], z: [z] };
       if (frames.colours) change["line.color"] = [frames.colours[k]];
       clock.textContent = `${frames.time[k].toFixed(1)} s`;
+      slider.setAttribute("aria-valuetext", `${frames.time[k].toFixed(1)} seconds of ${frames.time.at(-1).toFixed(1)}`);
       if (frames.solids) {
         const solid = placed(frames.solids, k);
         ["x", "y", "z"].forEach((axis, i) => change[axis].push(solid[i]));
@@ -244,29 +264,66 @@
     pose(0);
   }
 
+  // Pictures without interaction: on the screen as wide as there is room, on paper by columns.
+  function sketchAll(isPaper) {
+    for (const chart of charts) {
+      const columns = Number(chart.closest(".panels").style.getPropertyValue("--columns")), height = parseFloat(chart.style.height);
+      const [width, share] = isPaper ? [columns > 1 ? 224 : 690, 0.55] : [chart.clientWidth || 600, 1];
+      chart.querySelector(":scope > .sketch")?.remove();
+      chart.insertAdjacentHTML("afterbegin", sketches.draw(chart.content, width, Math.round(height * share)));
+    }
+  }
+
   function toPaper() {
     for (const part of document.querySelectorAll("details:not([open])")) { part.open = true; part.dataset.closed = ""; }
-    paper = 690;
-    charts.forEach((chart) => (drawn(chart) ? resize(chart) : draw(chart)));
+    sketchAll(true);
   }
   function toScreen() {
-    paper = 0;
     for (const part of document.querySelectorAll("details[data-closed]")) { part.open = false; delete part.dataset.closed; }
-    charts.forEach(resize);
+    sketchAll(false);
   }
+
+  // Ends of the axes in space, which hold all poses and shapes.
+  function rangesOf({ path, frames }) {
+    const clouds = [path, ...frames.points].map(({ x, y, z }) => [x, y, z]);
+    if (frames.solids) for (let k = 0; k < frames.time.length; k += 5) clouds.push(placed(frames.solids, k));
+    const ends = [0, 1, 2].map((axis) => sketches.extent(clouds.flatMap((cloud) => sketches.extent(cloud[axis]))));
+    const margin = 0.06 * Math.max(...ends.map(([low, high]) => high - low));
+    return ends.map(([low, high]) => [low - margin, high + margin]);
+  }
+
+  // What a chart shows, for readers who hear the page.
+  function describe(chart) {
+    if (chart.content.frames) return `${chart.ariaLabel}: the robot in space; drag to turn it`;
+    const [{ title, value, y_label, x }] = chart.content.panels;
+    return [title, value, `${y_label} against ${x || "names"}`].filter(Boolean).join(", ");
+  }
+
+  for (const chart of charts) {
+    chart.content = JSON.parse(chart.querySelector("script").textContent, numbers);
+    // Abscissas of an earlier curve are named by its number.
+    for (const curve of chart.content.curves ?? []) if (Number.isInteger(curve.x)) curve.x = chart.content.curves[curve.x].x;
+    if (chart.content.frames) chart.content.ranges = rangesOf(chart.content);
+    chart.ariaLabel = describe(chart);
+  }
+  sketchAll(false);
+  document.body.dataset.sketched = "";
+  addEventListener("beforeprint", toPaper);
+  addEventListener("afterprint", toScreen);
 
   try {
     const code = document.createElement("script");
     code.textContent = await unpack(document.getElementById("library").textContent);
     document.head.append(code);
-    await Promise.all(charts.map(async (chart) => { chart.content = JSON.parse(await unpack(chart.dataset.chart), numbers); }));
   } catch (error) {
-    charts.forEach((chart) => { chart.textContent = "This figure needs a browser of 2023 or later."; });
+    charts.forEach((chart) => { chart.title = "To zoom into this figure takes a browser of 2023 or later."; });
     throw error;
   }
   const near = new IntersectionObserver((seen) => seen.forEach((entry) => entry.isIntersecting && draw(entry.target)), { rootMargin: "600px" });
   charts.forEach((chart) => near.observe(chart));
-  addEventListener("beforeprint", toPaper);
-  addEventListener("afterprint", toScreen);
+  // The letters of the axes in space are no part of the page, and do not follow its colours.
+  const recolour = () => charts.filter(drawn).forEach((chart) => Plotly.relayout(chart, { "font.color": getComputedStyle(chart).color }));
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", recolour);
+  document.querySelector(".theme").addEventListener("change", recolour);
   document.documentElement.dataset.ready = "";
 })();

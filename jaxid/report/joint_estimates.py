@@ -1,0 +1,104 @@
+"""Estimates of each joint: friction, rotor, gravity; and parameters that correlate."""
+
+import math
+import textwrap
+from typing import Any
+
+import numpy as np
+
+from jaxid.dynamics.model import Model
+from jaxid.identification.fit_result import Fit
+from jaxid.result_table import MISSING, Column, Table, significant, with_deviations
+from jaxid.validation.judgement import Report
+
+GRAVITY_MEANINGS = {
+    "m": "mass",
+    "mx": "mass\ntimes x",
+    "my": "mass\ntimes y",
+    "mz": "mass\ntimes z",
+}
+"""Parameters of bodies that gravity acts on, as headers."""
+HEADER_WIDTH = 18
+"""Largest number of letters in a line of a header."""
+MIN_CORRELATION = 0.8
+"""Correlation from which a pair of parameters is shown."""
+MAX_PAIRS = 20
+"""Largest number of pairs of correlated parameters that are shown."""
+
+
+def joint_table(report: Report) -> Table:
+    """Return the estimates of each joint, and below them those of the robot's file."""
+    fit = report.fit
+    robot = fit.base.model.robot
+    units = dict(zip(fit.base.names, fit.base.units, strict=True))
+    # The row of a joint, and below it that of the robot's file, if it has values.
+    sources = [_estimate_texts(fit), *_claim_texts(report)]
+    heads = ("", "in the robot's file")[: len(sources)]
+    columns = [Column("joint", [x or name for name in robot.body_names for x in heads])]
+    for symbol, meaning in _meanings(fit.base.model).items():
+        names = [f"{symbol}{number}" for number in range(1, robot.bodies + 1)]
+        texts = [source.get(name, MISSING) for name in names for source in sources]
+        column_units = dict.fromkeys(units[name] for name in names if name in units)
+        if column_units:
+            columns.append(Column(meaning, texts, " or ".join(column_units)))
+    rows = len(columns[0].values)
+    return Table("", *columns, rules=range(2, rows, 2) if len(sources) > 1 else ())
+
+
+def _meanings(model: Model) -> dict[str, str]:
+    """Return friction, rotors and springs, then gravity, in words by their symbols."""
+    meanings = {}
+    for term in model.terms:
+        for parameter in term.joint_parameters:
+            # The words behind a colon explain the name.
+            name = parameter.meaning.split(":")[0]
+            meanings[parameter.name] = textwrap.fill(name, HEADER_WIDTH)
+    return meanings | GRAVITY_MEANINGS
+
+
+def _estimate_texts(fit: Fit) -> dict[str, str]:
+    """Return each estimate with half its 95 % interval, by the parameter's name."""
+    half_widths = fit.uncertainty.half_widths()
+    values, widths = with_deviations(fit.parameters, half_widths)
+    texts = {}
+    for k, name in enumerate(fit.base.names):
+        is_determined = math.isfinite(half_widths[k])
+        interval = f"{values[k]} ± {widths[k]}"
+        texts[name] = interval if is_determined else "not determined"
+    return texts
+
+
+def _claim_texts(report: Report) -> list[dict[str, str]]:
+    """Return the values in the robot's file by the parameters' names, if it has any."""
+    values = report.claimed_parameters
+    if values is None:
+        return []
+    texts = [significant(float(value)) for value in values]
+    return [dict(zip(report.fit.base.names, texts, strict=True))]
+
+
+def correlation_blocks(fit: Fit) -> list[Any]:
+    """Return the pairs of parameters that logs hardly tell apart, and what that means.
+
+    The strongest come first.
+    """
+    covariance = np.asarray(fit.covariance)
+    deviations = np.sqrt(np.diag(covariance))
+    correlations = np.triu(covariance / np.outer(deviations, deviations), 1)
+    # Undetermined parameters have no correlation, and are in no pair.
+    first, second = np.nonzero(np.abs(correlations) >= MIN_CORRELATION)
+    values = correlations[first, second]
+    order = np.argsort(-np.abs(values))[:MAX_PAIRS]
+    names = np.asarray(fit.base.names)
+    text = (
+        f"{len(values)} pairs have a correlation of {MIN_CORRELATION} or more: the "
+        "logs tell their combination better than each of them. A motion in which these "
+        f"joints move differently tells them apart. At most {MAX_PAIRS} are shown."
+    )
+    table = Table(
+        "",
+        Column("parameter", names[first[order]]),
+        Column("and", names[second[order]]),
+        Column("correlation", values[order], kind="number"),
+    )
+    return [text, table] if len(values) else [text]
