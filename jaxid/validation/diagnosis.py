@@ -1,7 +1,7 @@
 """Diagnosis of a log: sentences on wrong units, signs, channels, sensors and delays."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -293,11 +293,16 @@ def mistakes_in_logs(
     mistakes = _mistakes(diagnoses, fit, bodies)
     if len(diagnoses) > 1:
         return mistakes
-    name = diagnoses[0].log.name
-    certain = tuple(f"{name}: {text}" for text in mistakes.certain)
-    doubts = tuple(f"{name}: {text}" for text in mistakes.doubts)
-    remarks = tuple(f"{name}: {text}" for text in mistakes.remarks)
-    return LogMistakes(certain, doubts, remarks, mistakes.delay)
+
+    def named(texts: Iterable[str]) -> tuple[str, ...]:
+        return tuple(f"{diagnoses[0].log.name}: {text}" for text in texts)
+
+    return LogMistakes(
+        named(mistakes.certain),
+        named(mistakes.doubts),
+        named(mistakes.remarks),
+        mistakes.delay,
+    )
 
 
 def _mistakes(

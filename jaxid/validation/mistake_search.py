@@ -1,6 +1,6 @@
 """Search for the mistake that explains most of what a model misses."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -193,9 +193,8 @@ def _mistakes_of_all(
     """Look for the mistake in all logs together."""
     suspected = SuspectedMistakes(described_log, recordings[0], bodies)
     suspects = [*suspected.of_columns(), *suspected.of_robot()]
-    quantities = list(suspected.quantities())
     is_one_log = len(recordings) == 1
-    return _search(described_log, suspects, quantities, is_one_log)
+    return _search(described_log, suspects, suspected.quantities(), is_one_log)
 
 
 def _mistakes_by_log(
@@ -236,15 +235,14 @@ def _mistakes_in_columns(model: Model, recording: Recording) -> Mistakes:
         return Mistakes()
     described_log = DescribedLog(model, log)
     suspected = SuspectedMistakes(described_log, recording)
-    suspects = list(suspected.of_columns())
-    quantities = list(suspected.quantities())
-    return _search(described_log, suspects, quantities, is_one_log=True)
+    suspects = suspected.of_columns()
+    return _search(described_log, suspects, suspected.quantities(), is_one_log=True)
 
 
 def _search(
     described_log: DescribedLog,
-    suspects: Sequence[Suspect],
-    quantities: Sequence[Quantity],
+    suspects: Iterable[Suspect],
+    quantities: Iterable[Quantity],
     is_one_log: bool,
 ) -> Mistakes:
     """Return what explains most: a mistake, in one log also a contact, or nothing."""
@@ -330,20 +328,15 @@ def _driving_text(described_log: DescribedLog, powers: np.ndarray) -> str:
     )
 
 
-def _joint_misfits(fit: RowFit, rows: Rows) -> np.ndarray:
-    """Return the RMS errors of the joints over their RMS forces."""
-    return np.sqrt(fit.squares / (np.mean(rows.forces**2, axis=0) + 1e-300))
-
-
 def _misfit(fit: RowFit, rows: Rows) -> float:
     """Return the fraction (0 to 1) of the forces that is missed; joints count alike."""
-    return float(np.sqrt(np.mean(_joint_misfits(fit, rows) ** 2)))
+    return float(np.sqrt(np.mean(rows.relative_errors(fit.squares) ** 2)))
 
 
 def _misfit_text(described_log: DescribedLog, fit: RowFit) -> str:
     """Return a sentence about where a model does not fit."""
     rows = described_log.rows
-    joint = int(np.argmax(_joint_misfits(fit, rows)))
+    joint = int(np.argmax(rows.relative_errors(fit.squares)))
     share = significant(100 * _misfit(fit, rows), 2)
     return (
         f"the model does not fit: it misses {share} % of the forces, most of all those "
@@ -362,8 +355,8 @@ class _Trial(NamedTuple):
 
 def explanations(
     described_log: DescribedLog,
-    suspects: Sequence[Suspect],
-    quantities: Sequence[Quantity],
+    suspects: Iterable[Suspect],
+    quantities: Iterable[Quantity],
 ) -> list[Explanation]:
     """Return the mistakes that explain something, the best first."""
     judge = described_log.judge
@@ -374,7 +367,7 @@ def explanations(
         suspect_rows = suspect.rows()
         gain = score - judge.fit(suspect_rows).score
         trials.append(_Trial(gain, suspect.sentence, suspect_rows))
-    trials += _searched_quantities(described_log, quantities)
+    trials += _searched_quantities(described_log, list(quantities))
     trials.sort(key=lambda trial: -trial.gain)
 
     unseen_squares = judge.unseen_squares(rows)

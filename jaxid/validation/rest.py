@@ -21,8 +21,9 @@ def rest_remarks(described_log: DescribedLog) -> tuple[str, ...]:
     """Return a sentence if the rows at rest are most of what a model misses."""
     moving_judge = described_log.judge
     judge = Judge(np.ones_like(moving_judge.mask), moving_judge.folds)
-    errors = _unseen_errors(judge, described_log)
-    moving_errors = _unseen_errors(moving_judge, described_log)
+    rows = described_log.rows
+    errors = rows.relative_errors(judge.unseen_squares(rows))
+    moving_errors = rows.relative_errors(moving_judge.unseen_squares(rows))
     is_halved = moving_errors < MAX_REMAINDER * errors
     is_told = (errors > MIN_ERROR) & is_halved & moving_judge.is_judged
     if not is_told.any():
@@ -38,10 +39,3 @@ def rest_remarks(described_log: DescribedLog) -> tuple[str, ...]:
         f"{significant(100 * moving_errors[worst_joint], 2)} % without rows at rest, "
         f"which `min_speed = [{texts}]` in `[rows]` leaves out.",
     )
-
-
-def _unseen_errors(judge: Judge, described_log: DescribedLog) -> np.ndarray:
-    """Return the RMS errors of the joints over their RMS forces, on unseen parts."""
-    rows = described_log.rows
-    squares = judge.unseen_squares(rows)
-    return np.sqrt(squares / (np.mean(rows.forces**2, axis=0) + 1e-300))

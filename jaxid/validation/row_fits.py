@@ -26,6 +26,10 @@ class Rows(NamedTuple):
     columns: np.ndarray
     forces: np.ndarray
 
+    def relative_errors(self, squares: np.ndarray) -> np.ndarray:
+        """Return the RMS errors of the joints over their RMS forces."""
+        return np.sqrt(squares / (np.mean(self.forces**2, axis=0) + 1e-300))
+
 
 class RowFit(NamedTuple):
     """Least-squares fit of rows.

@@ -350,26 +350,19 @@ class SuspectedMistakes:
     def _filters(self) -> Iterator[Suspect]:
         every_joint = tuple(self._joints)
         for cutoff in (*LOW_PASSES, 15.0):
-            sentence = f"a low-pass of about {cutoff:g} Hz seems to delay all forces"
-            yield Suspect(
-                sentence,
-                lambda cutoff=cutoff: self._log.with_low_pass(every_joint, cutoff),
-            )
+            yield self._low_pass(every_joint, cutoff, "all forces")
         for j, cutoff in itertools.product(self._joints, LOW_PASSES):
-            sentence = (
-                f"a low-pass of about {cutoff:g} Hz seems to delay the force of joint "
-                f"{self._names[j]}"
-            )
-            yield Suspect(
-                sentence,
-                lambda j=j, cutoff=cutoff: self._log.with_low_pass((j,), cutoff),
-            )
+            yield self._low_pass((j,), cutoff, f"the force of joint {self._names[j]}")
+
+    def _low_pass(self, joints: tuple[int, ...], cutoff: float, forces: str) -> Suspect:
+        sentence = f"a low-pass of about {cutoff:g} Hz seems to delay {forces}"
+        return Suspect(sentence, lambda: self._log.with_low_pass(joints, cutoff))
 
     def quantities(self) -> Iterator[Quantity]:
         """Yield the mistakes of any amount."""
-        yield self._delay_of_all()
+        yield self._delay(tuple(self._joints))
         for j in self._joints:
-            yield self._delay(j)
+            yield self._delay((j,))
             yield self._gain(j)
             yield self._ratio(j)
             yield self._offset(j)
@@ -377,27 +370,20 @@ class SuspectedMistakes:
                 yield self._twist(j, direction)
                 yield self._length(j, direction)
 
-    def _delay_of_all(self) -> Quantity:
+    def _delay(self, joints: tuple[int, ...]) -> Quantity:
         def sentence(seconds: float) -> str:
+            if joints == tuple(self._joints):
+                return (
+                    f"the forces of the log seem to be {1e3 * seconds:.2g} ms late "
+                    f"(`recording.force_delay = {seconds:.3g}`)"
+                )
             return (
-                f"the forces of the log seem to be {1e3 * seconds:.2g} ms late "
-                f"(`recording.force_delay = {seconds:.3g}`)"
-            )
-
-        def rows(seconds: float) -> Rows:
-            return self._log.with_earlier_forces(tuple(self._joints), seconds)
-
-        return Quantity(sentence, rows, 2e-3, (-0.011, 0.1), 1e-3)
-
-    def _delay(self, joint: int) -> Quantity:
-        def sentence(seconds: float) -> str:
-            return (
-                f"the force of joint {self._names[joint]} seems to stand "
+                f"the force of joint {self._names[joints[0]]} seems to stand "
                 f"{1e3 * seconds:.2g} ms later in the log than the angles"
             )
 
         def rows(seconds: float) -> Rows:
-            return self._log.with_earlier_forces((joint,), seconds)
+            return self._log.with_earlier_forces(joints, seconds)
 
         return Quantity(sentence, rows, 2e-3, (-0.011, 0.1), 1e-3)
 
