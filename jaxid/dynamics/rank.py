@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import scipy.linalg
+import scipy
 
 from jaxid.arrays import AnyArray, Float
 from jaxid.units.dimensions import length_power

@@ -4,7 +4,7 @@ import dataclasses
 from typing import NamedTuple
 
 import numpy as np
-from scipy import special
+import scipy
 
 from jaxid.arrays import BaseVector
 from jaxid.measurement.observations import ObservedLogs
@@ -55,7 +55,7 @@ class Delay(NamedTuple):
         Args:
             level: Probability (0 to 1) that the interval contains the true delay.
         """
-        half_width = self.deviation * special.stdtrit(self.dof, 0.5 + 0.5 * level)
+        half_width = self.deviation * scipy.special.stdtrit(self.dof, 0.5 + 0.5 * level)
         return self.seconds - float(half_width), self.seconds + float(half_width)
 
     @property

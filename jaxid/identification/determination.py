@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
-from scipy import special
+import scipy
 
 from jaxid.arrays import AnyArray, Indices, Joints, Matrix
 from jaxid.dynamics.base import BaseParameters
@@ -188,5 +188,7 @@ def _half_widths(
     deviations = np.sqrt(squares * count / freedom) * inverse
     force_norm = np.hypot(np.linalg.norm(decomposition.forces), decomposition.rest)
     rounding = np.finfo(float).eps * force_norm
-    half_widths = special.stdtrit(freedom, 0.975) * np.maximum(deviations, rounding)
+    half_widths = scipy.special.stdtrit(freedom, 0.975) * np.maximum(
+        deviations, rounding
+    )
     return np.where(inverse == 0, np.inf, half_widths)

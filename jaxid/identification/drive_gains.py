@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
-from scipy import optimize
+import scipy
 
 from jaxid.arrays import AnyArray, Float, Joints, Texts
 from jaxid.dynamics.base import BaseParameters
@@ -177,7 +177,7 @@ def _solve(fits, maps, offsets) -> tuple["Rows", np.ndarray]:
         total = fit.time_blocks.total
         totals.append(_rows(total, fit.weights, parameter_map, offset))
     rows = _stack(totals)
-    solution = optimize.least_squares(
+    solution = scipy.optimize.least_squares(
         lambda u: rows.linearise(u)[0],
         np.append(start_parameters, np.ones(rows.joints.shape[1])),
         lambda u: rows.linearise(u)[1],  # pyright: ignore[reportArgumentType]

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import numpy as np
-from scipy import signal
+import scipy
 
 from jaxid.arrays import AnyArray, Float, Joints
 from jaxid.dynamics.base import BaseParameters
@@ -276,7 +276,7 @@ def _usual_candidate(cutoffs: Sequence[float]) -> int:
 def _highest_frequency(log: Observations) -> float:
     """Return the highest frequency of a motion [Hz], all joints taken together."""
     velocities = np.asarray(log.motion.qd)
-    frequency, power = signal.periodogram(
+    frequency, power = scipy.signal.periodogram(
         velocities, 1.0 / log.sample_time, "hann", axis=0
     )
     joint_shares = power / np.maximum(power.sum(axis=0), 1e-300)

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import equinox as eqx
 import numpy as np
-from scipy import linalg
+import scipy
 
 from jaxid.arrays import AnyArray, Float, Indices, Matrix, Texts
 from jaxid.dynamics.base import BaseParameters
@@ -115,7 +115,7 @@ class StatesFit(Summarised, eqx.Module):
         dof = [fit.uncertainty.dof[k].min(initial=np.inf) for fit in self.fits]
         return equality_test(
             np.array([fit.parameters[k] for fit in self.fits]),
-            np.asarray(linalg.block_diag(*covariances)),
+            np.asarray(scipy.linalg.block_diag(*covariances)),
             float(min(dof)),
         )
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import equinox as eqx
 import numpy as np
-from scipy import special
+import scipy
 
 from jaxid.arrays import AnyArray, Float, Indices, Matrix, Texts, Vector
 from jaxid.result_table import (
@@ -99,7 +99,7 @@ class Comparison(Summarised, eqx.Module):
     def p_values(self) -> Vector:
         """Probability of so large a difference without any change, each for itself."""
         size = np.abs(self.difference) / self.standard_deviations
-        return 2.0 * special.stdtr(self.uncertainty.dof, -size)
+        return 2.0 * scipy.special.stdtr(self.uncertainty.dof, -size)
 
     @property
     def adjusted_p_values(self) -> Vector:
@@ -315,13 +315,13 @@ def joint_test(
     projections = directions.T @ (difference / deviations)
     statistic = float(np.sum(projections[is_sound] ** 2 / values[is_sound]))
     if not np.isfinite(dof):
-        return statistic, float(special.chdtrc(size, statistic))
+        return statistic, float(scipy.special.chdtrc(size, statistic))
     f_dof = dof - size + 1.0
     # With fewer degrees of freedom than differences nothing can be said.
     if f_dof <= 0:
         return statistic, 1.0
     f_ratio = statistic * f_dof / (dof * size)
-    return statistic, float(special.fdtrc(size, f_dof, f_ratio))
+    return statistic, float(scipy.special.fdtrc(size, f_dof, f_ratio))
 
 
 def equality_test(

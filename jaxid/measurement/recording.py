@@ -9,9 +9,8 @@ from typing import Any
 import equinox as eqx
 import jax
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy.integrate import cumulative_trapezoid
-from scipy.interpolate import CubicSpline
 
 from jaxid.arrays import AnyArray, Float, JointSamples, Texts, Vector
 from jaxid.errors import InputError
@@ -268,7 +267,7 @@ def unlike_derivatives(recording: Recording) -> dict[int, float]:
     for a, b in recording.segments:
         q = np.asarray(recording.angles)[a:b]
         qd = np.asarray(recording.velocities)[a:b]
-        integral = cumulative_trapezoid(qd, dx=dt, axis=0, initial=0.0)
+        integral = scipy.integrate.cumulative_trapezoid(qd, dx=dt, axis=0, initial=0.0)
         way = q[steps:] - q[:-steps]
         expected_way = integral[steps:] - integral[:-steps]
         error = way - expected_way
@@ -327,7 +326,7 @@ def _without_delay(segment: Recording, seconds: float, lost_samples: int) -> dic
     time = np.asarray(segment.time)
 
     def shift(values):
-        return CubicSpline(time, values)(time[samples] - seconds)
+        return scipy.interpolate.CubicSpline(time, values)(time[samples] - seconds)
 
     qd = segment.velocities
     return {

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 import numpy as np
-from scipy.interpolate import CubicSpline
+import scipy
 
 from jaxid.arrays import Texts, Vector
 from jaxid.errors import InputError
@@ -288,7 +288,7 @@ class Resampling(NamedTuple):
             if self.grid.is_exact:
                 segments.append(x[a:b])
             else:
-                spline = CubicSpline(self.stamps[a:b], x[a:b])
+                spline = scipy.interpolate.CubicSpline(self.stamps[a:b], x[a:b])
                 segments.append(spline(times))
         return np.concatenate(segments)
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from scipy.spatial import ConvexHull
+import scipy
 
 from jaxid.arrays import AnyArray, Float, double_precision
 from jaxid.dynamics.motion import Motion
@@ -246,7 +246,7 @@ def _solids(clouds: Sequence[Cloud], places: np.ndarray) -> Solids:
         hull = SQUARE_FACES
         if not is_square:
             # Joggled input: the points of a mesh may lie in a plane.
-            hull = ConvexHull(points, qhull_options="QJ").simplices
+            hull = scipy.spatial.ConvexHull(points, qhull_options="QJ").simplices
         faces.append(hull + first_vertex)
         first_vertex += len(points)
     return Solids(

@@ -5,8 +5,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import minimize
-from scipy.spatial import ConvexHull, QhullError
+import scipy
 
 from jaxid.arrays import AnyArray, Numbers, Vector3
 from jaxid.errors import InputError
@@ -230,7 +229,9 @@ def enclose(points: AnyArray) -> Segment:
         "xatol": 1e-4 * size,
         "fatol": 1e-5 * size**3,
     }
-    optimum = minimize(volume, start, method="Nelder-Mead", options=options)
+    optimum = scipy.optimize.minimize(
+        volume, start, method="Nelder-Mead", options=options
+    )
     return _capsule_about(hull, optimum.x)
 
 
@@ -254,6 +255,6 @@ def _hull_points(points: np.ndarray):
     if len(points) <= 4:
         return points
     try:
-        return points[ConvexHull(points).vertices]
-    except QhullError:
+        return points[scipy.spatial.ConvexHull(points).vertices]
+    except scipy.spatial.QhullError:
         return points

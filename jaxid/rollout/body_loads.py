@@ -3,7 +3,7 @@
 import dataclasses
 
 import numpy as np
-from scipy.signal import butter, sosfiltfilt
+import scipy
 
 from jaxid.arrays import AnyArray
 from jaxid.dynamics.model import Model
@@ -86,5 +86,5 @@ def _filter_positions(positions: np.ndarray, dt: float) -> np.ndarray:
     """Return positions below `CUTOFF`."""
     if 0.4 / dt < CUTOFF:
         return positions
-    sections = butter(2, 2.0 * CUTOFF * dt, output="sos")
-    return sosfiltfilt(sections, positions, axis=-1)
+    sections = scipy.signal.butter(2, 2.0 * CUTOFF * dt, output="sos")
+    return scipy.signal.sosfiltfilt(sections, positions, axis=-1)

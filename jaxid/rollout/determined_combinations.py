@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy import special, stats
+import scipy
 
 from jaxid.identification.uncertainty.spectral import sandwich_of_columns
 
@@ -51,7 +51,7 @@ class Combination:
 
     def interval(self, level: float = 0.95) -> tuple[float, float]:
         """Return the confidence interval."""
-        quantile = special.stdtrit(max(self.dof, 1.0), 0.5 + 0.5 * level)
+        quantile = scipy.special.stdtrit(max(self.dof, 1.0), 0.5 + 0.5 * level)
         half_width = self.deviation * float(quantile)
         return self.value - half_width, self.value + half_width
 
@@ -125,7 +125,7 @@ class JointRows(NamedTuple):
         changes = self.gradients @ B
         motion_dof = max(motions - 1, 1)
         scatter = motions / motion_dof * (changes**2).sum(axis=0)
-        limit = stats.f.ppf(0.95, motion_dof, dof)
+        limit = scipy.stats.f.ppf(0.95, motion_dof, dof)
         is_scattered = (motions > 1) & (scatter > limit * variance)
         dof = np.where(is_scattered, motion_dof, dof)
         deviation = np.sqrt(np.where(is_scattered, scatter, variance))
@@ -248,8 +248,8 @@ class _Joint(NamedTuple):
         x = self.fit.parameters[self.number]
         sizes = np.maximum(np.abs(x), 0.1 * SCALE)[symbols]
         place = np.ix_(symbols, symbols)
-        quantiles = special.stdtrit(deviations.dof[symbols], 0.975)
-        factors = quantiles / special.ndtri(0.975) / sizes
+        quantiles = scipy.special.stdtrit(deviations.dof[symbols], 0.975)
+        factors = quantiles / scipy.special.ndtri(0.975) / sizes
         reach = np.maximum(np.abs(x[symbols]), SCALE[symbols]) / sizes
         indices, kappa = _merge(
             deviations.covariance[place] * np.outer(factors, factors), reach

@@ -6,7 +6,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from scipy import special
+import scipy
 
 from jaxid.arrays import Matrix, Vector
 from jaxid.measurement.recording import Recording
@@ -263,9 +263,11 @@ class ServoFit(Summarised):
         normal_draws = random.multivariate_normal(
             zeros, correlation, count, check_valid="ignore", method="eigh"
         )
-        probabilities = special.ndtr(np.clip(normal_draws, -7.0, 7.0))
+        probabilities = scipy.special.ndtr(np.clip(normal_draws, -7.0, 7.0))
         draws = np.tile(self.parameters, (count, 1, 1))
-        draws[:, self.free] += deviation * special.stdtrit(self.dof, probabilities)
+        draws[:, self.free] += deviation * scipy.special.stdtrit(
+            self.dof, probabilities
+        )
         return np.clip(draws, LOWER, UPPER)
 
     def summary(self) -> Table:

@@ -7,7 +7,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import numpy as np
-from scipy import signal
+import scipy
 
 from jaxid.arrays import AnyArray, Float, Hashable, Joints, require_float64
 from jaxid.dynamics.model import Model
@@ -117,7 +117,7 @@ class Sensors(eqx.Module):
         # Each sample remembers a part of the one before; the variance stays one.
         share = np.exp(-sample_time / self.memory)
         gain = np.sqrt(1.0 - share**2)
-        coloured_part, _ = signal.lfilter(
+        coloured_part, _ = scipy.signal.lfilter(
             [gain], [1.0, -share], drive, axis=0, zi=share * initial_states
         )
         forces = forces + white_part * np.asarray(self.white_noise)

@@ -4,7 +4,7 @@ import math
 
 import equinox as eqx
 import numpy as np
-from scipy.linalg import block_diag, null_space
+import scipy
 
 from jaxid.arrays import AnyArray, is_traced, namespace
 from jaxid.errors import InputError
@@ -136,9 +136,9 @@ class RestToRestBasis(PeriodsBasis):
     def directions(self) -> np.ndarray:
         """Orthonormal coefficients of the series that rest at both ends."""
         orders = np.arange(1.0, self.harmonics + 1.0)
-        a = null_space(np.ones((1, self.harmonics)))
-        b = null_space(orders[None])
-        return np.asarray(block_diag(np.ones((1, 1)), a, b))
+        a = scipy.linalg.null_space(np.ones((1, self.harmonics)))
+        b = scipy.linalg.null_space(orders[None])
+        return np.asarray(scipy.linalg.block_diag(np.ones((1, 1)), a, b))
 
     def rows(self, t):
         """Return sines and cosines in the directions that rest at both ends."""

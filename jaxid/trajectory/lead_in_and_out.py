@@ -6,7 +6,7 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from scipy.special import comb
+import scipy
 
 from jaxid.arrays import AnyArray, Joints, double_precision, is_traced, namespace
 from jaxid.errors import InputError
@@ -151,7 +151,7 @@ def _to_control_points():
     orders = np.arange(LEAD_DEGREE + 1)
     u = np.linspace(0.0, 1.0, LEAD_DEGREE + 1)[:, None]
     powers = u**orders * (1 - u) ** orders[::-1]
-    bernstein = comb(LEAD_DEGREE, orders) * powers
+    bernstein = scipy.special.comb(LEAD_DEGREE, orders) * powers
     return np.linalg.inv(bernstein)
 
 

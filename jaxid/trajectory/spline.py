@@ -5,7 +5,7 @@ import math
 
 import equinox as eqx
 import numpy as np
-from scipy.interpolate import BSpline, make_interp_spline
+import scipy
 
 from jaxid.arrays import AnyArray, Float, is_traced, namespace
 from jaxid.errors import InputError
@@ -131,19 +131,23 @@ class RestToRestSplineBasis(AbstractBasis):
             # means of `degree` knots, the system is well conditioned.
             windows = np.lib.stride_tricks.sliding_window_view(knots[1:-1], degree)
             abscissae = windows.mean(axis=1)
-            matrix = BSpline.design_matrix(abscissae, knots, degree).toarray()
+            matrix = scipy.interpolate.BSpline.design_matrix(
+                abscissae, knots, degree
+            ).toarray()
             values = np.asarray(self.rows(abscissae * self.duration)[order])
             control_points.append(np.linalg.solve(matrix, values))
         return tuple(control_points), 1.0
 
 
-def interpolate_at_rest(t: Times, points: np.ndarray) -> BSpline:
+def interpolate_at_rest(t: Times, points: np.ndarray) -> "scipy.interpolate.BSpline":
     """Return the quintic spline through points at times, at rest at both ends."""
     conditions = [(order, np.zeros(points.shape[1])) for order in (1, 2)]
-    return make_interp_spline(t, points, DEGREE, bc_type=(conditions, conditions))
+    return scipy.interpolate.make_interp_spline(
+        t, points, DEGREE, bc_type=(conditions, conditions)
+    )
 
 
-def spline_polynomials(spline: BSpline) -> PolynomialCoefficients:
+def spline_polynomials(spline: "scipy.interpolate.BSpline") -> PolynomialCoefficients:
     """Return the pieces of a clamped spline in powers of time since their start."""
     knots = spline.t[DEGREE:-DEGREE]
     starts = knots[:-1]
@@ -164,7 +168,7 @@ def _unit_polynomials(points: int):
     control_points = np.concatenate([unit[:1], unit[:1], unit, unit[-1:], unit[-1:]])
     knots = _clamped_knots(points + 4 - DEGREE, DEGREE)
     return knots[DEGREE:-DEGREE], spline_polynomials(
-        BSpline(knots, control_points, DEGREE)
+        scipy.interpolate.BSpline(knots, control_points, DEGREE)
     )
 
 

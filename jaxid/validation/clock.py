@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
-from scipy import signal
+import scipy
 
 from jaxid.measurement.recording import Recording
 from jaxid.measurement.time_grid import MAX_JITTER
@@ -105,8 +105,8 @@ class _StepRatios(NamedTuple):
 
 def _step_ratios(angles: np.ndarray, dt: float) -> _StepRatios:
     """Return the ratios of all joints together, in which fast ones count most."""
-    sections = signal.butter(2, SMOOTH_CUTOFF, fs=1 / dt, output="sos")
-    smooth_angles = signal.sosfiltfilt(sections, angles, axis=0)
+    sections = scipy.signal.butter(2, SMOOTH_CUTOFF, fs=1 / dt, output="sos")
+    smooth_angles = scipy.signal.sosfiltfilt(sections, angles, axis=0)
     max_steps = np.abs(np.diff(smooth_angles, axis=0)).max(axis=0)
     is_moving = max_steps > 0.0
     scales = max_steps[is_moving]

@@ -5,8 +5,7 @@ from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
-from scipy import signal
-from scipy.interpolate import CubicSpline
+import scipy
 
 from jaxid.arrays import Matrix3
 from jaxid.dynamics import projection_equation
@@ -216,10 +215,10 @@ class DescribedLog:
     def with_low_pass(self, joints: tuple[int, ...], cutoff: float) -> Rows:
         """Return the rows if a filter made the forces of some joints late."""
         order = 2 if len(joints) == 1 else 1
-        sections = signal.butter(order, cutoff, fs=GRID_RATE, output="sos")
+        sections = scipy.signal.butter(order, cutoff, fs=GRID_RATE, output="sos")
 
         def filtered(x: np.ndarray) -> np.ndarray:
-            return np.asarray(signal.sosfilt(sections, x, axis=0))
+            return np.asarray(scipy.signal.sosfilt(sections, x, axis=0))
 
         columns = self.rows.columns.copy()
         body_count = self._body_rows.shape[2]
@@ -238,7 +237,7 @@ class DescribedLog:
         def earlier(x: np.ndarray) -> np.ndarray:
             times = np.arange(len(x)) / GRID_RATE
             instants = np.clip(times + delay, times[0], times[-1])
-            return CubicSpline(times, x)(instants)
+            return scipy.interpolate.CubicSpline(times, x)(instants)
 
         forces = self.log.forces.copy()
         columns = list(joints)

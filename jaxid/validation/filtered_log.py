@@ -6,7 +6,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from scipy import signal, sparse
+import scipy
 
 from jaxid.measurement.recording import Recording
 from jaxid.measurement.samples import joint_side
@@ -86,7 +86,7 @@ class FilteredLog:
         self.motion = Motion(q, qd, qdd)
         self.forces = np.concatenate([segment.forces for segment in segments])
         thinnings = [_thinning(length) for length in self._lengths]
-        self._thinning = sparse.block_diag(thinnings, format="csr")
+        self._thinning = scipy.sparse.block_diag(thinnings, format="csr")
 
         row_counts = [len(_centres(length)) for length in self._lengths]
         self.blocks = self._block_numbers(row_counts)
@@ -213,9 +213,9 @@ def _low_pass(x: np.ndarray, rate: float) -> np.ndarray:
     """Return a channel after the first filter; slow logs stay as they are."""
     if rate <= 2.2 * FIRST_CUTOFF:
         return np.asarray(x)
-    sections = signal.butter(2, FIRST_CUTOFF, fs=rate, output="sos")
+    sections = scipy.signal.butter(2, FIRST_CUTOFF, fs=rate, output="sos")
     padding = min(len(x) - 1, int(rate))
-    return signal.sosfiltfilt(sections, x, axis=0, padlen=padding)
+    return scipy.signal.sosfiltfilt(sections, x, axis=0, padlen=padding)
 
 
 def _half_window() -> int:
@@ -236,7 +236,7 @@ def _centres(length: int) -> np.ndarray:
     return np.arange(half, length - half, step)
 
 
-def _thinning(length: int) -> sparse.csr_matrix:
+def _thinning(length: int) -> scipy.sparse.csr_matrix:
     """Return the second filter of a segment as a matrix [rows, samples]."""
     offsets = np.arange(-_half_window(), _half_window() + 1)
     weights = np.exp(-0.5 * (offsets / _width()) ** 2)
@@ -246,4 +246,4 @@ def _thinning(length: int) -> sparse.csr_matrix:
     row_starts = len(offsets) * np.arange(len(centres) + 1)
     values = np.tile(weights, len(centres))
     shape = (len(centres), length)
-    return sparse.csr_matrix((values, columns.ravel(), row_starts), shape)
+    return scipy.sparse.csr_matrix((values, columns.ravel(), row_starts), shape)

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy import optimize
+import scipy
 
 from jaxid.dynamics.model import Model
 from jaxid.identification.delay import Delay
@@ -449,7 +449,7 @@ def _best_amount(described_log: DescribedLog, quantity: Quantity) -> float:
     best = int(np.argmin(scores))
     bracket = grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]
     options = {"maxiter": 12, "xatol": 0.02 * quantity.step}
-    result: Any = optimize.minimize_scalar(
+    result: Any = scipy.optimize.minimize_scalar(
         score, bounds=bracket, method="bounded", options=options
     )
     return float(result.x) if result.fun < scores[best] else float(grid[best])

@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
-from scipy import linalg
+import scipy
 
 from .filtered_log import FOLDS
 
@@ -119,8 +119,10 @@ def _solution(
     products = products / scales[:, None] / scales
     diagonal = np.diag_indices(len(scales))
     products[diagonal] += RIDGE + ~np.isfinite(scales)
-    factor = linalg.cho_factor(products, check_finite=False)
-    scaled = linalg.cho_solve(factor, matrix.T @ vector / scales, check_finite=False)
+    factor = scipy.linalg.cho_factor(products, check_finite=False)
+    scaled = scipy.linalg.cho_solve(
+        factor, matrix.T @ vector / scales, check_finite=False
+    )
     return scaled / scales, factor, scales
 
 
@@ -148,7 +150,7 @@ def _imitations(
     matrix = _flat(rows.columns * weights[..., None])
     scales = fit.scales[:, None]
     products = matrix.T @ vectors / scales
-    multiples = linalg.cho_solve(fit.factor, products, check_finite=False)
+    multiples = scipy.linalg.cho_solve(fit.factor, products, check_finite=False)
     return matrix @ (multiples / scales)
 
 

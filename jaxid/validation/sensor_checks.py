@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from scipy import ndimage
+import scipy
 
 from jaxid.measurement.recording import Recording, unlike_derivatives
 from jaxid.robot.robot import Robot
@@ -116,7 +116,7 @@ def _spike_text(
     places = []
     sizes = []
     for a, b in segments:
-        median = ndimage.median_filter(x[a:b], 7, mode="nearest")
+        median = scipy.ndimage.median_filter(x[a:b], 7, mode="nearest")
         gap = np.abs(x[a:b] - median)
         max_step = np.abs(np.diff(median)).max(initial=0.0)
         usual_gap = float(np.quantile(gap, 0.99))

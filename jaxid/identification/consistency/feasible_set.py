@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-from scipy.sparse.csgraph import connected_components
+import scipy
 
 from jaxid.arrays import Indices, namespace
 from jaxid.dynamics.model import Model
@@ -192,7 +192,9 @@ def _couplings(model: Model) -> Iterator[Coupling]:
     matrices = [term.drive_matrices(robot) for term in model.terms]
     inertia, friction = np.concatenate(matrices, axis=-1)
     for kind, matrix in (("RotorInertia", inertia), ("ViscousFriction", friction)):
-        count, labels = connected_components((matrix != 0).any(axis=-1), directed=False)
+        count, labels = scipy.sparse.csgraph.connected_components(
+            (matrix != 0).any(axis=-1), directed=False
+        )
         for label in range(count):
             axes = np.flatnonzero(labels == label)
             if len(axes) > MAX_COUPLED_AXES:

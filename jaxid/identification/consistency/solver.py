@@ -26,7 +26,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.linalg
+import scipy
 
 from jaxid.arrays import AnyArray, Bool, Float, Int, namespace
 

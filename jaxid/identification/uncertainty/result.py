@@ -4,7 +4,7 @@ from abc import abstractmethod
 
 import equinox as eqx
 import numpy as np
-from scipy import special
+import scipy
 
 from jaxid.arrays import AnyArray, BaseMatrix, BaseVector, Float, Joints, Texts
 from jaxid.errors import InputError
@@ -67,7 +67,7 @@ class Uncertainty(eqx.Module):
                 f"`level` must lie between 0 and 1, like 0.95, but is {level:g}."
             )
         dof = np.clip(self.dof, 1.0, 1e6)
-        return self.standard_deviations * special.stdtrit(dof, 0.5 + 0.5 * level)
+        return self.standard_deviations * scipy.special.stdtrit(dof, 0.5 + 0.5 * level)
 
     def random_errors(self, count: int, seed: int) -> Float[AnyArray, "draws base"]:
         """Return errors with these correlations, and t distributed each.
@@ -87,9 +87,9 @@ class Uncertainty(eqx.Module):
         root = axes * np.sqrt(np.clip(variances, 0.0, None))
         normals = np.random.default_rng(seed).normal(size=(count, len(deviations)))
         # The t distribution of a parameter has its own degrees of freedom.
-        probabilities = special.ndtr(normals @ root.T)
+        probabilities = scipy.special.ndtr(normals @ root.T)
         dof = np.clip(self.dof, 1.0, 1e6)
-        return deviations * special.stdtrit(dof, probabilities)
+        return deviations * scipy.special.stdtrit(dof, probabilities)
 
 
 def dof_of_sum(a, b, dof_a, dof_b) -> BaseVector:

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy import fft
+import scipy
 
 from jaxid.arrays import BaseMatrix, Matrices, Matrix, Vector, on_cores
 from jaxid.measurement.observations import Observations
@@ -98,7 +98,7 @@ class Lines:
 
     def transform(self, rows: np.ndarray) -> np.ndarray:
         """Return the Fourier transform of the rows of a stretch, on the last axis."""
-        return np.asarray(fft.rfft(rows, self.length))[..., : len(self.frequency)]
+        return np.asarray(scipy.fft.rfft(rows, self.length))[..., : len(self.frequency)]
 
     def add_residuals(self, residuals: Matrix) -> None:
         """Add the residuals of a stretch [rows, joints]."""
@@ -290,7 +290,7 @@ def _rows_of_stretches(
 
 def _visible_lines(recording: Observations, length: int):
     """Return frequencies [Hz] and gains of lines that filter and decimation pass."""
-    frequency = fft.rfftfreq(length, recording.row_time)
+    frequency = scipy.fft.rfftfreq(length, recording.row_time)
     sample_time = recording.sample_time
     decimation = recording.decimation
     low_pass = recording.filter.low_pass(sample_time)

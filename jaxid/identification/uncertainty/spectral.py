@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from scipy import fft, stats
+import scipy
 
 from jaxid.arrays import (
     AnyArray,
@@ -86,7 +86,7 @@ def _widen_by_jackknife(errors: Uncertainty, estimate: Estimate) -> Uncertainty:
     total = np.sum(shares, axis=0)
     squares = np.sum(np.square(shares), axis=0)
     deciding_blocks = total**2 / np.maximum(squares, 1e-300)
-    max_ratios = stats.f.ppf(0.9999, np.maximum(deciding_blocks, 1.0), errors.dof)
+    max_ratios = scipy.stats.f.ppf(0.9999, np.maximum(deciding_blocks, 1.0), errors.dof)
 
     deviations = errors.standard_deviations
     has_deviation = np.isfinite(deviations) & (deviations > 0)
@@ -336,7 +336,7 @@ def sandwich_of_columns(
     leverage = xp.stack(leverage)
     table = SpectralTable(
         xp,
-        fft.rfftfreq(length, row_time),
+        scipy.fft.rfftfreq(length, row_time),
         times,
         xp.stack(energy, axis=1),
         leverage,

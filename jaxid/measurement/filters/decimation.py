@@ -7,7 +7,7 @@ from typing import Any
 
 import equinox as eqx
 import numpy as np
-from scipy import signal
+import scipy
 
 from jaxid.arrays import AnyArray, Float
 from jaxid.errors import InputError
@@ -130,5 +130,5 @@ class Decimation(AbstractDecimation):
         factor = self.factors[stage]
         if factor == 1:
             return ALL_PASS
-        sos = signal.cheby1(8, 0.05, 0.8 / factor, output="sos")
+        sos = scipy.signal.cheby1(8, 0.05, 0.8 / factor, output="sos")
         return recursive(np.asarray(sos, np.float64), 0.4 / factor)

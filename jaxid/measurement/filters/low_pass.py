@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy import ndimage, signal
+import scipy
 
 from jaxid.arrays import AnyArray, Array, Float, Matrix, Vector, namespace
 from jaxid.errors import InputError
@@ -79,7 +79,7 @@ def correlate(x: Any, kernel: Vector) -> Any:
     half = len(kernel) // 2
     extended_samples = odd_extension(x, half)
     if not isinstance(x, jax.Array):
-        sums = ndimage.correlate1d(extended_samples, kernel, axis=0)
+        sums = scipy.ndimage.correlate1d(extended_samples, kernel, axis=0)
         return sums[half : half + len(x)]
 
     def correlate_column(column: Array) -> Array:
@@ -143,13 +143,15 @@ class RecursiveLowPass(AbstractLowPass):
         for start in range(0, columns.shape[1], width):
             block = slice(start, start + width)
             rows = np.ascontiguousarray(columns[:, block].T)
-            smooth_rows = signal.sosfiltfilt(sos, rows, padtype="odd", padlen=padding)
+            smooth_rows = scipy.signal.sosfiltfilt(
+                sos, rows, padtype="odd", padlen=padding
+            )
             result[:, block] = smooth_rows.T
         return result.reshape(x.shape)
 
     def gain(self, frequency, sample_time):  # noqa: D102
         angular_frequency = 2 * math.pi * np.asarray(frequency) * sample_time
-        _, response = signal.sosfreqz(np.array(self.sections), angular_frequency)
+        _, response = scipy.signal.sosfreqz(np.array(self.sections), angular_frequency)
         return np.abs(response) ** 2
 
     def memory(self, tolerance=1e-14):  # noqa: D102
@@ -178,8 +180,8 @@ def _impulse_memory(sos: Matrix, radius: float, tolerance: float) -> int:
     samples = math.ceil(duration) + start_samples
     impulse = np.zeros(samples)
     impulse[0] = 1.0
-    forward_response = signal.sosfilt(sos, impulse)
-    response = signal.correlate(forward_response, forward_response, method="fft")
+    forward_response = scipy.signal.sosfilt(sos, impulse)
+    response = scipy.signal.correlate(forward_response, forward_response, method="fft")
     tail = np.abs(response[samples - 1 :])
     is_clear = tail > tolerance * tail[0]
     last_sample = np.flatnonzero(is_clear)[-1]
@@ -188,7 +190,7 @@ def _impulse_memory(sos: Matrix, radius: float, tolerance: float) -> int:
 
 def _filter_both_ways(sos: Matrix, x: Array, padding: int) -> Array:
     """Filter forward and backward with odd extensions, like scipy's `sosfiltfilt`."""
-    steady_states = signal.sosfilt_zi(sos)
+    steady_states = scipy.signal.sosfilt_zi(sos)
 
     def step(states, x):
         next_states = []
@@ -235,7 +237,7 @@ def butterworth(
     if math.isinf(cutoff):
         return ALL_PASS
     require_cutoff(name, cutoff, sample_time)
-    sos = signal.butter(order, cutoff, output="sos", fs=1.0 / sample_time)
+    sos = scipy.signal.butter(order, cutoff, output="sos", fs=1.0 / sample_time)
     return recursive(np.asarray(sos, np.float64), cutoff)
 
 

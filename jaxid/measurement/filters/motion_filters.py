@@ -5,8 +5,8 @@ from typing import ClassVar
 
 import equinox as eqx
 import numpy as np
+import scipy
 from numpy.polynomial import legendre
-from scipy import signal
 
 from jaxid.arrays import AnyArray, Matrix, Vector, optional
 from jaxid.dynamics.motion import Motion
@@ -195,12 +195,12 @@ class PaperFilter(AbstractFilter):
     def motion(self, angles, velocities, sample_time):  # noqa: D102
         path = angles - angles[0]
         b, a = _bilinear("velocity", [1.0, 0.0], self.velocity, sample_time)
-        qd = np.asarray(signal.lfilter(b, a, path, axis=0))
+        qd = np.asarray(scipy.signal.lfilter(b, a, path, axis=0))
         b, a = _bilinear("acceleration", [1.0, 0.0], self.acceleration, sample_time)
         padding = min(
             len(angles) - 1, self.low_pass(sample_time).memory(SETTLING_TOLERANCE)
         )
-        negative_acceleration = signal.filtfilt(
+        negative_acceleration = scipy.signal.filtfilt(
             b, a, path, axis=0, padtype="odd", padlen=padding
         )
         return Motion(angles, qd, -negative_acceleration)
@@ -305,13 +305,13 @@ def _bilinear(
     It is returned as coefficients.
     """
     require_cutoff(name, omega / (2 * math.pi), sample_time)
-    b, a = signal.bilinear(numerator, [1 / omega, 1.0], 1 / sample_time)
+    b, a = scipy.signal.bilinear(numerator, [1 / omega, 1.0], 1 / sample_time)
     return np.asarray(b), np.asarray(a)
 
 
 def _first_order(name: str, omega: float, sample_time: float) -> AbstractLowPass:
     r"""Return $1 / (s / \omega + 1)$, forward and backward."""
-    sos = signal.tf2sos(*_bilinear(name, [1.0], omega, sample_time))
+    sos = scipy.signal.tf2sos(*_bilinear(name, [1.0], omega, sample_time))
     return recursive(np.asarray(sos), omega / (2 * math.pi))
 
 
