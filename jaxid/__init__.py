@@ -19,11 +19,13 @@ if _typing.TYPE_CHECKING:
     from jaxid.api import *  # noqa: F403
     from jaxid.report import plot  # noqa: F401
 else:
+    # These load without the others: commands start sooner, and JAX without matplotlib.
+    _ALONE = {"plot": "report.plot", "experiment": "experiment", "workflow": "workflow"}
 
     def __getattr__(name):
-        """Load the public names when one is first used, and matplotlib for `plot`."""
-        if name == "plot":
-            return _importlib.import_module("jaxid.report.plot")
+        """Load the public names when one is first used."""
+        if name in _ALONE:
+            return _importlib.import_module(f"jaxid.{_ALONE[name]}")
         if not name.startswith("_"):
             api = vars(_importlib.import_module("jaxid.api"))
             globals().update({k: v for k, v in api.items() if not k.startswith("_")})

@@ -199,6 +199,28 @@ def test_refusals_come_before_jax_is_loaded(folder):  # noqa: F811
     assert found == ends, done.stderr
 
 
+HEAVY = {"scipy.signal", "scipy.stats", "optimistix", "plotly", "matplotlib"}
+"""Parts of the package's libraries that an `inspect` without logs does not need."""
+
+
+def test_inspect_without_logs_loads_only_what_it_needs(folder):  # noqa: F811
+    script = (
+        "import sys; from jaxid.cli import app\n"
+        "try: app.main()\n"
+        "except SystemExit: print(*sys.modules, file=sys.stderr)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script, "inspect", "experiment.toml"],
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    modules = set(done.stderr.split())
+    assert "jax" in modules
+    assert not modules & {*HEAVY, "jaxid.rollout", "jaxid.demo"}
+
+
 def test_damaged_results(folder, first, run):  # noqa: F811
     path = first / "model.json"
     whole = path.read_text(encoding="utf-8")

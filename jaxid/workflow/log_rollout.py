@@ -3,29 +3,22 @@
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.terms import RigidBodies
 from jaxid.errors import InputError
 from jaxid.measurement.columns import Columns
-from jaxid.report.rollout_report import (
-    RolloutReport,
-    ServoRolloutReport,
-    TorqueRolloutReport,
-    servo_findings,
-)
 from jaxid.result_table import Remark, Status
-from jaxid.rollout import (
-    Bodies,
-    identify_rollout,
-    identify_torque_rollout,
-)
 
 from .allowed_values import Bounds, Positive
 from .log_identification import require_separate_logs
 from .log_loading import load_logs, read_commands, select_filter
 from .setup import Paths, Progress, Setup, ignore_progress
+
+if TYPE_CHECKING:
+    from jaxid.report.rollout_report import RolloutReport
+    from jaxid.rollout import Bodies
 
 Span = tuple[float, float]
 """Start and end of a stretch of time [s]."""
@@ -80,7 +73,7 @@ def identify_rollout_from_logs(
     settings: ServoSettings | TorqueSettings,
     verify: Paths = (),
     progress: Progress = ignore_progress,
-) -> RolloutReport:
+) -> "RolloutReport":
     """Identify a robot so that simulations follow its positions, and simulate.
 
     Args:
@@ -107,8 +100,12 @@ def _follow_commands(
     settings: ServoSettings,
     verify: Sequence[Path],
     progress: Progress,
-) -> RolloutReport:
+) -> "RolloutReport":
     """Identify joints behind position servos."""
+    # Other commands do not wait for rollouts, which take a third of a second to load.
+    from jaxid.report.rollout_report import ServoRolloutReport, servo_findings
+    from jaxid.rollout import identify_rollout
+
     recordings = []
     for log in (*logs, *verify):
         progress(f"reading {log.name}", 0.0)
@@ -140,7 +137,7 @@ def _follow_commands(
     )
 
 
-def bodies_of_file(setup: Setup, settings: ServoSettings) -> Bodies | None:
+def bodies_of_file(setup: Setup, settings: ServoSettings) -> "Bodies | None":
     """Return the bodies that the robot's file describes, as loads of its joints."""
     if settings.bodies is False:
         return None
@@ -152,6 +149,8 @@ def bodies_of_file(setup: Setup, settings: ServoSettings) -> Bodies | None:
     has_mass = bool((bodies[:, 0] > 0).any())
     if not has_mass:
         return None
+    from jaxid.rollout import Bodies
+
     return Bodies(Model(setup.robot, (RigidBodies(),)), bodies.ravel())
 
 
@@ -162,8 +161,11 @@ def _follow_torques(
     settings: TorqueSettings,
     verify: Sequence[Path],
     progress: Progress,
-) -> RolloutReport:
+) -> "RolloutReport":
     """Identify the model of `identify_logs`, beside the fit of torques."""
+    from jaxid.report.rollout_report import TorqueRolloutReport
+    from jaxid.rollout import identify_torque_rollout
+
     if setup.load_friction:
         raise InputError(
             "`model.load` is for `jaxid identify`: simulations know no friction that "
