@@ -125,7 +125,7 @@ def words(run):
     """Runs a command, returns all it prints in one line; code 3: an unusable model."""
 
     def words(*args, ends=0):
-        detail = ("-v",) if args[0] in ("identify", "inspect") else ()
+        detail = () if args[0] == "export" else ("-v",)
         code, out, err = run(*args, *detail)
         assert (code, err) == (ends, "")
         return " ".join(out.split())

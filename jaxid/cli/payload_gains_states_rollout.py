@@ -9,10 +9,8 @@ from rich.console import Console
 
 import jaxid as jid
 from jaxid.errors import InputError
-from jaxid.result_table import Status
 
 from . import options, terminal
-from .command_help import UNUSABLE_CODE
 
 if TYPE_CHECKING:
     from jaxid.report.several_runs_report import RunsReport
@@ -34,6 +32,7 @@ def payload(
     ] = None,
     output: options.OutputFolder = Path("payload"),
     force: options.Force = False,
+    detail: options.Detail = None,
 ) -> None:
     """Find a payload's mass, centre of mass and moments of inertia.
 
@@ -52,7 +51,7 @@ def payload(
         report = jid.workflow.identify_payload_from_logs(
             content.setup, logs, loaded, columns, carrier, mass, progress
         )
-    show_runs(console, report, output, content.text)
+    show_runs(console, detail, report, output, content.text)
 
 
 def gains(
@@ -61,6 +60,7 @@ def gains(
     loaded: options.Loaded,
     output: options.OutputFolder = Path("gains"),
     force: options.Force = False,
+    detail: options.Detail = None,
 ) -> None:
     """Find the drives' true forces with a load that is known.
 
@@ -81,7 +81,7 @@ def gains(
         report = jid.workflow.identify_gains_from_logs(
             content.setup, logs, loaded, columns, content.load, progress
         )
-    show_runs(console, report, output, content.text)
+    show_runs(console, detail, report, output, content.text)
 
 
 def states(
@@ -89,6 +89,7 @@ def states(
     logs: options.Logs,
     output: options.OutputFolder = Path("states"),
     force: options.Force = False,
+    detail: options.Detail = None,
 ) -> None:
     """Fit several states at once: one inertia, friction for each.
 
@@ -102,32 +103,23 @@ def states(
         report = jid.workflow.identify_states_from_logs(
             content.setup, logs, columns, progress
         )
-    show_runs(console, report, output, content.text)
+    show_runs(console, detail, report, output, content.text)
 
 
 def show_runs(
     console: Console,
+    detail: bool | None,
     report: "RunsReport",
     output: Path,
     experiment_text: str,
 ) -> None:
-    """Write and print the result of several runs, and lines for the experiment file.
-
-    Of a result that cannot be used there are no such lines.
-    """
+    """Write and print the result of several runs, and lines for the experiment file."""
     origin = options.report_origin(experiment_text)
     files = dataclasses.replace(report, settings=origin).save(output)
-    table, *details = report.tables()
-    terminal.show(console, table)
-    terminal.show_remarks(console, report.remarks)
-    terminal.show(console, *details)
-    is_usable = report.status is not Status.BAD
     lines = report.answer.experiment_lines
-    if lines and is_usable:
-        terminal.show_text(console, "\n".join(["", TITLE_OF_LINES, *lines]))
-    terminal.show_files(console, output, files)
-    if not is_usable:
-        raise typer.Exit(UNUSABLE_CODE)
+    if lines:
+        lines = [TITLE_OF_LINES, *lines]
+    terminal.show_result(console, detail, report, output, files, lines)
 
 
 def rollout(
@@ -136,6 +128,7 @@ def rollout(
     verify: options.Verified = None,
     output: options.OutputFolder = Path("rollout"),
     force: options.Force = False,
+    detail: options.Detail = None,
 ) -> None:
     """Identify so that a simulation moves like the robot.
 
@@ -157,5 +150,4 @@ def rollout(
         report = dataclasses.replace(report, settings=settings)
         progress("writing the report", 0.0)
         files = report.write(output)
-    terminal.show(console, *report.tables())
-    terminal.show_files(console, output, files)
+    terminal.show_result(console, detail, report, output, files)

@@ -75,8 +75,15 @@ class RunsReport(Summarised):
         return self.verdict.status
 
     def tables(self) -> list[Table]:
-        """Return all tables of the result."""
-        return [self.result.summary(), *self.details]
+        """Return all tables of the result, then the doubts and the verdict."""
+        findings = Table("", remarks=dict.fromkeys([*self.remarks, self.verdict]))
+        return [self.result.summary(), *self.details, findings]
+
+    def overview(self) -> list[Table]:
+        """Return the verdict, the doubts, and the one table of the answer."""
+        findings = Table("", remarks=dict.fromkeys([self.verdict, *self.remarks]))
+        # Each change of a state has a table of kinds, then one of parameters.
+        return [findings, *(self.details[::2] or [self.result.summary()])]
 
     def save(self, folder: FilePath) -> list[Path]:
         """Write a page, and the numbers as JSON and CSV; return the files."""
