@@ -6,7 +6,6 @@ decimal points. Estimates and their deviations are rounded together: `values, de
 = with_deviations(p, s)` are texts for two columns of `kind="number"`.
 """
 
-import copy
 import dataclasses
 import enum
 import functools
@@ -311,16 +310,6 @@ class Table:
         self.remarks = tuple(Remark(x) if isinstance(x, str) else x for x in remarks)
         self.status = tuple(status)
         self.rules = frozenset(rules)
-
-    def select(self, rows: Sequence[int]) -> "Table":
-        """Return title and columns with some of the rows."""
-        columns = []
-        for column in self.columns:
-            selected_column = copy.copy(column)
-            selected_column.values = tuple(column.values[k] for k in rows)
-            columns.append(selected_column)
-        status = [self.status[k] for k in rows] if self.status else ()
-        return Table(self.title, *columns, status=status)
 
     @property
     def rows(self) -> list[tuple[str, ...]]:

@@ -1,6 +1,7 @@
 """The terminal of the commands: tables, remarks, names of files, progress, errors."""
 
 import errno
+import re
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -18,6 +19,14 @@ from .command_help import UNUSABLE_CODE
 LINE_INTERVAL = 10.0
 """Time between two lines of progress where there is no terminal [s]."""
 
+LONG_STAGES = re.compile("best so far|round|effects|factorising|measuring")
+"""Words in the names of stages that take most of the time of their commands."""
+LONG_PART = 0.8
+"""Part of what is left that such a stage takes."""
+SHORT_PART = 0.15
+"""Part of what is left that another stage takes."""
+MIN_SHARE = 0.02
+"""Completed share from which on a time left is believed."""
 Progress = Callable[[str, float], None]
 """Function that shows the completed fraction (0 to 1) of a stage."""
 
@@ -102,48 +111,37 @@ def show_text(console: Console, text: str) -> None:
     console.print(Text(text), soft_wrap=True)
 
 
-class ProgressLines:
-    """Progress where there is no terminal: a line now and then, with the time left."""
-
-    def __init__(self, console: Console):
-        self._console = console
-        self._stage_start = time.monotonic()
-        self._line_time = self._stage_start
-
-    def __call__(self, stage: str, fraction: float) -> None:
-        """Print a line if the last one is old enough."""
-        now = time.monotonic()
-        if fraction == 0.0:
-            self._stage_start = now
-        if now - self._line_time < LINE_INTERVAL:
-            return
-        self._line_time = now
-        words = f"{stage}: {100 * fraction:.0f} %"
-        if fraction > 0.0:
-            elapsed_time = now - self._stage_start
-            time_left = elapsed_time * (1.0 / fraction - 1.0)
-            words = f"{words}, about {time_left:.0f} s left"
-        self._console.print(Text(words))
-
-
 @contextmanager
 def progress_bar() -> Iterator[Progress]:
-    """Show a progress bar in a terminal, and a line each ten seconds elsewhere."""
+    """Show one bar over all stages, and a line each ten seconds without a terminal.
+
+    Each stage takes a part of what is left, so that the bar only grows.
+    """
     # Not needed by `--help`, which must answer at once.
-    from rich.progress import Progress as Bar, TimeElapsedColumn
+    from rich.progress import Progress as Bar, SpinnerColumn, TimeElapsedColumn
 
     console = open_console(stderr=True)
-    columns = (*Bar.get_default_columns(), TimeElapsedColumn())
-    if not console.is_terminal:
-        yield ProgressLines(console)
-        return
-    with Bar(*columns, console=console, transient=True) as bar:
-        task = bar.add_task("starting", total=1.0)
+    columns = (SpinnerColumn(), *Bar.get_default_columns(), TimeElapsedColumn())
+    is_silent = not console.is_terminal
+    with Bar(*columns, console=console, transient=True, disable=is_silent) as bar:
+        task = bar.tasks[bar.add_task("starting", total=1.0)]
+        stage_start = stage_fraction = 0.0
+        line_time = time.monotonic()
 
         def show_stage(stage: str, fraction: float) -> None:
-            if fraction == 0.0:
-                bar.reset(task)  # the clock starts again
-            bar.update(task, description=stage, completed=fraction)
+            nonlocal stage_start, stage_fraction, line_time
+            if fraction < stage_fraction or fraction == 0.0:
+                stage_start = task.completed
+            stage_fraction = fraction
+            part = LONG_PART if LONG_STAGES.search(stage) else SHORT_PART
+            share = stage_start + part * (1.0 - stage_start) * fraction
+            bar.update(task.id, description=stage, completed=share)
+            if is_silent and time.monotonic() - line_time >= LINE_INTERVAL:
+                line_time = time.monotonic()
+                elapsed_time = task.elapsed or 0.0
+                time_left = elapsed_time * (1.0 / max(share, MIN_SHARE) - 1.0)
+                words = f"{stage}: {100 * share:.0f} %, about {time_left:.0f} s left"
+                console.print(Text(words))
 
         yield show_stage
 

@@ -329,12 +329,6 @@ class ModelChoice(Summarised):
             ],
         )
 
-    def overview(self) -> list[Table]:
-        """Return the choice, and the models on the way to it."""
-        notes = [self.verdict, *self.remarks[2:]]
-        path = self.summary().select(range(len(self.path)))
-        return [Table("", remarks=notes), path]
-
     @property
     def remarks(self) -> list[Remark]:
         """Choice, and the error to expect of it, as sentences."""

@@ -11,6 +11,7 @@ import scipy
 from jaxid.arrays import AnyArray, Float, Indices, Matrix, Texts, Vector
 from jaxid.result_table import (
     Column,
+    Remark,
     Status,
     Summarised,
     Table,
@@ -210,13 +211,13 @@ class Comparison(Summarised, eqx.Module):
         )
 
     def overview(self) -> list[Table]:
-        """Return the verdict, the kinds, and the parameters that have changed."""
-        changes = (Verdict.CHANGED, Verdict.PERHAPS)
-        rows = [k for k, verdict in enumerate(self.verdicts) if verdict in changes]
-        tables = [Table("", remarks=[self.verdict]), self.group_summary()]
-        if rows:
-            tables.append(self.summary().select(rows))
-        return tables
+        """Return the verdict, the parameters that have changed, and the kinds."""
+        pairs = zip(self.names, self.verdicts, strict=True)
+        names = [name for name, verdict in pairs if verdict is Verdict.CHANGED]
+        remarks = [self.verdict]
+        if names:
+            remarks.append(Remark(f"Changed: {', '.join(names)}"))
+        return [Table("", remarks=remarks), self.group_summary()]
 
     def tables(self) -> list[Table]:
         """Return the tables of the parameters, and of their kinds."""
