@@ -1,10 +1,10 @@
 """The terminal of the commands: tables, remarks, names of files, progress, errors."""
 
+import contextlib
 import errno
 import re
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -111,7 +111,7 @@ def show_text(console: Console, text: str) -> None:
     console.print(Text(text), soft_wrap=True)
 
 
-@contextmanager
+@contextlib.contextmanager
 def progress_bar() -> Iterator[Progress]:
     """Show one bar over all stages, and a line each ten seconds without a terminal.
 
@@ -122,9 +122,11 @@ def progress_bar() -> Iterator[Progress]:
 
     console = open_console(stderr=True)
     columns = (SpinnerColumn(), *Bar.get_default_columns(), TimeElapsedColumn())
+    bar = Bar(*columns, console=console, transient=True)
+    bar.add_task("starting", total=1.0)
+    (task,) = bar.tasks
     is_silent = not console.is_terminal
-    with Bar(*columns, console=console, transient=True, disable=is_silent) as bar:
-        task = bar.tasks[bar.add_task("starting", total=1.0)]
+    with contextlib.nullcontext() if is_silent else bar:
         stage_start = stage_fraction = 0.0
         line_time = time.monotonic()
 
