@@ -185,7 +185,7 @@ def with_keys(folder, name, *keys, text=EXPERIMENT):
 
 
 def test_writes_the_motion_and_says_what_to_expect(written, run):
-    code, out, err = run("excite", "experiment.toml", "-o", "plan/motion.csv")
+    code, out, err = run("excite", "experiment.toml", "-v", "-o", "plan/motion.csv")
     assert code == 0, err
     files = ["motion", "motion.csv", "motion.json", "motion.ros.yaml"]
     assert listing(written / "plan") == [*files, "motion/report.html"]
