@@ -1,7 +1,7 @@
 "use strict";
 // First pictures of the figures, for paper too: SVG without interaction, drawn at once.
 const sketches = (() => {
-  const fontSize = 11, tickRoom = 50, labelRoom = 34, margin = 8, gap = 10;
+  const fontSize = 11, tickRoom = 57, labelRoom = 34, margin = 8, gap = 10;
   const colours = ["#3d9bd6", "#c27d00", "#d55e00"]; // from small to large, as `scale` in figures.js
   const eye = [1.2, -1.5, 0.7];
 
