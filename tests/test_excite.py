@@ -210,8 +210,8 @@ def test_writes_the_motion_and_says_what_to_expect(written, run):
         assert said in " ".join(out.split())
     page = html.unescape((written / "plan" / "motion" / "report.html").read_text())
     for said in (
-        "100 samples in 7.854 s",
-        "jaxid excite experiment.toml -o plan/motion.csv",
+        "100 samples at 12.73 Hz",
+        "jaxid excite experiment.toml -v -o plan/motion.csv",
         "generations = 0",
         "he robot starts at rest and is in the designed motion from",
     ):
