@@ -9,6 +9,7 @@ from jaxid.dynamics.model import Model
 from jaxid.dynamics.terms import RigidBodies
 from jaxid.errors import InputError
 from jaxid.measurement.columns import Columns
+from jaxid.measurement.recording import Recording
 from jaxid.result_table import Remark, Status
 
 from .allowed_values import Bounds, Positive
@@ -110,6 +111,7 @@ def _follow_commands(
     for log in (*logs, *verify):
         progress(f"reading {log.name}", 0.0)
         recordings.append(read_commands(setup, log, columns))
+    _require_logs_of_contacts(settings, recordings)
     training_recordings = recordings[: len(logs)]
     unseen_recordings = recordings[len(logs) :]
     fit = identify_rollout(
@@ -135,6 +137,21 @@ def _follow_commands(
         fit.window_errors(test_recordings),
         settings.samples,
     )
+
+
+def _require_logs_of_contacts(
+    settings: ServoSettings, recordings: Sequence[Recording]
+) -> None:
+    """Reject contacts of a log that is not there."""
+    if not isinstance(settings.contacts, dict):
+        return
+    names = [recording.name for recording in recordings]
+    for name in settings.contacts:
+        if name not in names:
+            raise InputError(
+                "`rollout.contacts` must name logs of this command "
+                f"(`{'`, `'.join(names)}`), but names `{name}`."
+            )
 
 
 def bodies_of_file(setup: Setup, settings: ServoSettings) -> "Bodies | None":

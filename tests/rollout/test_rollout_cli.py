@@ -117,6 +117,15 @@ contacts = { short_1 = [[4.0, 6.0]] }"""
     assert others[3].endswith("which the logs do not tell.")
 
 
+def test_contacts_of_a_log_that_is_not_there_are_refused(folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    text = FILE.replace("samples = 2", "contacts = { short_9 = [[4.0, 6.0]] }")
+    (folder / "wrong.toml").write_text(text)
+    words = ["rollout", "wrong.toml", "short_1.csv", "-o", "none"]
+    done = CliRunner().invoke(app, words)
+    assert "(`short_1`), but names `short_9`" in str(done.exception)
+
+
 def test_a_missing_column_of_commands_is_named(folder, monkeypatch):
     monkeypatch.chdir(folder)
     (folder / "wrong.toml").write_text(FILE.replace("command{}", "cmd{}"))
