@@ -59,7 +59,7 @@ def draw_report() -> None:
         log = str(DATA / "ur10" / "exciting_measured.csv")
         report = str(Path(folder) / "ur10")
         run("identify", experiment, log, "--split", "0.6", "-o", report)
-        photograph(Path(report) / "report.html", DOCS / "report.png", 1000)
+        photograph(Path(report) / "report.html", DOCS / "report.png", 800)
 
 
 def draw_example() -> None:
