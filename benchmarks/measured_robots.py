@@ -31,6 +31,11 @@ COMMANDS = {
 """Arguments of each command by its output folder, logs below the data folder."""
 
 
+def percent(share):
+    """Return a share in percent, with two digits."""
+    return f"{100.0 * share:#.2g}".removesuffix(".") + " %"
+
+
 def run(name, arguments):
     """Run a command; return its row."""
     arguments = [str(DATA / x) if x.endswith(".csv") else x for x in arguments]
@@ -49,7 +54,7 @@ def run(name, arguments):
         result = json.loads((output / "result.json").read_text(encoding="utf-8"))
     errors = result["errors"]
     logs = [*errors["identification"], *errors["verification"]]
-    said = ", ".join(f"{100 * log['relative']:.2g} %" for log in logs)
+    said = ", ".join(percent(log["relative"]) for log in logs)
     verdict = result["verdict"][0]["text"]
     measured = f"{said}; exit code {done.returncode}; {verdict}"
     recipe = f"jaxid identify of the README, {seconds:.0f} s"
