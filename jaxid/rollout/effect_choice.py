@@ -151,10 +151,12 @@ class EffectChoice:
         for effects in candidates:
             self.advance()
             trial = self.with_effects(effects)
+            groups = self.groups
+            if effects == ("b",):
+                # Biases are of the assembly: equal joints have different ones.
+                groups = tuple((j,) for j in range(len(self.known_compliance)))
             # Two effects compete with each one of them, and with none.
-            choice = is_lower(
-                trial.held_out_scores, best_fit.held_out_scores, self.groups
-            )
+            choice = is_lower(trial.held_out_scores, best_fit.held_out_scores, groups)
             best_fit = best_fit.mixed_with(trial, choice)
         self.fit = best_fit.weighed_by_errors()
 
