@@ -129,7 +129,7 @@ def identify_rollout(
     choice = EffectChoice.start(simulator, groups, known_compliance, advance)
     linear_parameters = _linear_baseline(choice.fit)
     # Held commands that count as interpolated ones would imitate a feed-forward.
-    fine_fit, _ = _with_better_commands(choice.with_effects(("f",)), TIME_STEP)
+    fine_fit, _ = _with_better_commands(choice.with_effects(("f",)), search_step)
     if fine_fit.simulator.hold:
         held_simulator = dataclasses.replace(simulator, hold=True)
         held_fit = _with_simulator(choice.fit, held_simulator, choice.fit.parameters)
@@ -210,8 +210,11 @@ def _with_better_bodies(fit: JointFit, bodies: Bodies) -> JointFit:
 
 
 def _in_steps(fit: JointFit, time_step: float) -> JointFit:
-    """Return the fit with other steps, along the loads of measured positions."""
-    simulator = dataclasses.replace(fit.simulator, time_step=time_step, path=None)
+    """Return the fit with other steps; its loads are then those of measured positions."""
+    simulator = dataclasses.replace(fit.simulator, time_step=time_step)
+    if simulator.steps == fit.simulator.steps:
+        return fit
+    simulator = dataclasses.replace(simulator, path=None)
     return _with_simulator(fit, simulator, fit.parameters)
 
 
