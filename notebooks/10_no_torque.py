@@ -114,8 +114,9 @@ left.set_xlim(8, 16)
 left.set_xlabel("time [s]")
 left.set_ylabel("angle [rad]")
 left.legend()
-for kind in ("linear", "simulated"):
-    right.plot(t, 1e3 * (getattr(errors, kind)[0][0] - unseen.angles[:, 0]), label=kind)
+paths = {"linear": errors.baselines["linear"], "simulated": errors.simulated}
+for kind, path in paths.items():
+    right.plot(t, 1e3 * (path[0][0] - unseen.angles[:, 0]), label=kind)
 right.set_xlabel("time [s]")
 right.set_ylabel("error [mrad]")
 right.legend()
@@ -147,3 +148,15 @@ print(slow_fit)
 # * `jid.export.export_servo_mjcf` writes the robot for MuJoCo, with as many draws from the estimates' distribution as you wish.
 #
 # The guide: [my robot logs no torque](../docs/rollout.md).
+#
+# ## Exercise
+#
+# Suppose that the weight of the body is unknown: identify the three logs with `bodies=None`. Which row of the table goes, and which values stay the same?
+#
+# <details markdown="1"><summary>Answer</summary>
+#
+# `jid.identify_rollout(logs, joint_names=["lift"])` has no row of `1 / stiffness`, and the stiffness is not determined: nothing of known weight acts on the
+# joint any more, and a bias takes the place of its weight. Damping, dry friction and delay stay the same, since they are ratios to the stiffness, or times. The inertia is then that of the rotor and
+# the body together.
+#
+# </details>
