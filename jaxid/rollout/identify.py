@@ -210,11 +210,8 @@ def _with_better_bodies(fit: JointFit, bodies: Bodies) -> JointFit:
 
 
 def _in_steps(fit: JointFit, time_step: float) -> JointFit:
-    """Return the fit with other steps; its loads are then those of measured positions."""
-    simulator = dataclasses.replace(fit.simulator, time_step=time_step)
-    if simulator.steps == fit.simulator.steps:
-        return fit
-    simulator = dataclasses.replace(simulator, path=None)
+    """Return the fit with other steps, along the loads of measured positions."""
+    simulator = dataclasses.replace(fit.simulator, time_step=time_step, path=None)
     return _with_simulator(fit, simulator, fit.parameters)
 
 
