@@ -210,6 +210,12 @@ class Column:
         return [*lines, f"[{self.unit}]"] if self.unit else lines
 
     @property
+    def min_width(self) -> int:
+        """Characters of a line that the column needs; texts are folded, not numbers."""
+        width = max(map(len, (*self.header, *self.texts)))
+        return width if self.kind == "number" else min(width, MIN_TEXT_WIDTH)
+
+    @property
     def texts(self) -> list[str]:
         """Formatted values; blanks behind numbers align their decimal points."""
         texts = [
@@ -347,7 +353,8 @@ class Table:
             facts = [(Text(word, "dim"), text) for word, text in self.facts]
             parts.append(_two_columns(facts))
         if self.columns:
-            parts.append(self._grid(options.max_width))
+            blocks = self._blocks(options.max_width)
+            parts += [self._grid(columns, options.max_width) for columns in blocks]
         if self.remarks:
             remarks = [(_mark(remark.status), remark.line) for remark in self.remarks]
             parts.append(_two_columns(remarks))
@@ -359,7 +366,21 @@ class Table:
                 yield Text()
             yield part
 
-    def _grid(self, max_width: int) -> Any:
+    def _blocks(self, max_width: int) -> list[list[Column]]:
+        """Return columns in groups that fit a width, each begins with the first one."""
+        first_column, *columns = self.columns
+        blocks = [[first_column]]
+        for column in columns:
+            block = [*blocks[-1], column]
+            width = 1 + PADDING if self.status else 0
+            width += sum(x.min_width + PADDING for x in block) - PADDING
+            if width > max_width and len(block) > 2:
+                blocks.append([first_column, column])
+            else:
+                blocks[-1] = block
+        return blocks
+
+    def _grid(self, columns: Sequence[Column], max_width: int) -> Any:
         """Return marks and columns as a table of `rich`, which folds texts to fit."""
         from rich.rule import Rule
         from rich.table import Table as Grid
@@ -369,27 +390,22 @@ class Table:
         if self.status:
             grid.add_column(min_width=1)
         cells = []
-        for column in self.columns:
+        for column in columns:
             texts = column.texts
-            width = max(map(len, (*column.header, *texts)))
             header = Text("\n".join(column.header), "bold")
             if column.kind == "number":
                 header.justify = "right"
                 # Blanks before a number, not its justification, which would take
                 # those behind it away.
-                texts = [text.rjust(width) for text in texts]
-                grid.add_column(header, min_width=width, no_wrap=True)
+                texts = [text.rjust(column.min_width) for text in texts]
+                grid.add_column(header, min_width=column.min_width, no_wrap=True)
             else:
-                min_width = min(width, MIN_TEXT_WIDTH)
-                grid.add_column(header, min_width=min_width, overflow="fold")
+                grid.add_column(header, min_width=column.min_width, overflow="fold")
             cells.append(map(Text, texts))
 
-        # Where the terminal is too narrow, lines go on beyond it: `rich` would leave
-        # columns out.
+        # Even these few columns may be wider than the terminal: nothing is cut then.
         widths = [(column.min_width or 0) + PADDING for column in grid.columns]
-        if sum(widths) - PADDING > max_width:
-            grid.width = sum(widths) - PADDING
-
+        grid.width = max(sum(widths) - PADDING, max_width)
         for k, row in enumerate(zip(*cells, strict=True)):
             if k in self.rules:
                 grid.add_row(*[Rule(style="dim")] * len(grid.columns))

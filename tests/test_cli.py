@@ -388,6 +388,7 @@ def test_what_has_changed_between_two_runs_is_told(folder, first, run):
     assert (code, err) == (0, "")
     changed = [line for line in out.splitlines() if line.rstrip().endswith("  changed")]
     assert len(changed) == 1
+    assert "Changed: fv1." in out
     assert "viscous friction" in changed[0]
     content = json.loads(
         (folder / "comparison" / "comparison.json").read_text(encoding="utf-8")

@@ -214,10 +214,10 @@ class Comparison(Summarised, eqx.Module):
         """Return the verdict, the parameters that have changed, and the kinds."""
         pairs = zip(self.names, self.verdicts, strict=True)
         names = [name for name, verdict in pairs if verdict is Verdict.CHANGED]
-        remarks = [self.verdict]
+        kinds = self.group_summary()
         if names:
-            remarks.append(Remark(f"Changed: {', '.join(names)}"))
-        return [Table("", remarks=remarks), self.group_summary()]
+            kinds.remarks = (Remark(f"Changed: {', '.join(names)}"),)
+        return [Table("", remarks=[self.verdict]), kinds]
 
     def tables(self) -> list[Table]:
         """Return the tables of the parameters, and of their kinds."""

@@ -87,7 +87,9 @@ def test_text_is_aligned_marked_and_no_wider_than_asked():
 def test_numbers_are_never_cut():
     numbers = [f"{k}.0123456789" for k in range(10)]
     wide = Table("", *(Column("n", [x], kind="number") for x in numbers))
-    assert wide.text(30).split() == ["n"] * 10 + numbers
+    assert [x for x in wide.text(40).split() if x in numbers[1:]] == numbers[1:]
+    assert max(map(len, wide.text(40).splitlines())) <= 40
+    assert wide.text(8).split().count(numbers[0]) == 9, "once in each block"
 
 
 EXPRESSION = "A2 - B2 - (l2x^2 - l2y^2)*(m3 + m4 + m5) + 0.0825*(m4 + m5 - mz6)"
@@ -107,10 +109,13 @@ def test_names_are_folded_and_never_cut(width):
         status=[Status.GOOD, Status.BAD],
     )
     assert "…" not in folded.text(width)
-    lines = folded.text(width).splitlines()
+    blocks = [block.splitlines() for block in folded.text(width).split("\n\n")]
+    lines = next(block for block in blocks if "parameter" in " ".join(block))
     header = next(line for line in lines if line.split()[:1] == ["joint"])
     first, last = header.index("joint"), header.index("parameter")
-    end = max(header.index("[N m]"), last + 12)
+    end = None
+    if "[N m]" in header:
+        end = max(header.index("[N m]"), last + 12)
     starts = [k for k, line in enumerate(lines) if line[:1] in ("✓", "✗")]
     for k, start in enumerate(starts):
         rows = lines[start : [*starts, None][k + 1]]
