@@ -222,7 +222,7 @@ def test_a_delay_is_seen_and_removed(shop, run):  # noqa: F811
     assert abs(float(found[1]) - 0.012) < 3e-4
     cured = SPATIAL.replace('time = "t"', f'time = "t"\nforce_delay = {found[1]}')
     (shop / "cured.toml").write_text(cured)
-    code, out, _ = run("inspect", "cured.toml", "late.csv")
+    code, out, _ = run("inspect", "cured.toml", "late.csv", "-v")
     assert code == 0
     assert "a delay of the forces of 12" in " ".join(out.split())
     assert "force_delay" not in out
@@ -319,7 +319,7 @@ def test_states_share_inertia(folder, words):  # noqa: F811
 
 
 def test_a_model_is_chosen_and_its_file_identifies(shop, run):  # noqa: F811
-    code, out, _ = run("choose", "experiment.toml", "empty.csv")
+    code, out, _ = run("choose", "experiment.toml", "empty.csv", "-v")
     assert code == 0
     assert "Chosen: " in out
     assert "is kept if it lowers the error" in out
