@@ -125,9 +125,11 @@ def _data(report: Report) -> Iterator[tuple[str, str]]:
 
 
 def _log_size(log: TorqueErrors) -> str:
-    """Return name, duration and rows of a log."""
-    duration = significant(float(log.time[-1] - log.time[0]))
-    return f"{log.name}: {duration} s, {len(log.time)} rows of each joint"
+    """Return the name of a log, and duration and number of the rows that count."""
+    counts_for_a_joint = np.asarray(log.counted).any(axis=1)
+    times = np.asarray(log.time)[counts_for_a_joint]
+    duration = significant(float(times[-1] - times[0]))
+    return f"{log.name}: {duration} s, {len(times)} rows"
 
 
 def _physics(report: Report, figures: Figures) -> Sections:
