@@ -334,13 +334,20 @@ class ModelChoice(Summarised):
         """Choice, and the error to expect of it, as sentences."""
         first_error = relative_error(self.first_predictions)
         promise = percent(self.promise)
+        summary = (
+            f"Chosen: {self.chosen.name}. On further data of this kind expect errors "
+            f"of {promise} % of the forces (RMS {self.band}); with the file as it is, "
+            f"{percent(first_error)} %."
+        )
+        status = Status.GOOD
+        if self.promise > first_error:
+            # The promise leaves out longer parts than the search does.
+            status = Status.DOUBTFUL
+            summary += (
+                " Where longer parts are left out it is no better: record longer."
+            )
         remarks = [
-            Remark(
-                f"Chosen: {self.chosen.name}. On further data of this kind expect "
-                f"errors of {promise} % of the forces (RMS {self.band}); with the "
-                f"file as it is, {percent(first_error)} %.",
-                Status.GOOD,
-            ),
+            Remark(summary, status),
             Remark(
                 f"In the table all models have the same rows, {self.band}; "
                 f"{self.parts} were left out in turn. A change is kept if it lowers "

@@ -6,6 +6,8 @@ import virtual
 
 import jaxid as jid
 from jaxid.identification.model_selection import (
+    HeldOutPrediction,
+    ModelChoice,
     Trial,
     UnseenParts,
     column_products,
@@ -14,6 +16,7 @@ from jaxid.identification.model_selection import (
     predict_held_out,
     relative_error,
 )
+from jaxid.result_table import Status
 
 ROBOT = jid.robots.planar_arm(2, 0.5).replace(limits=jid.Limits(force=[50.0, 8.0]))
 MODEL = jid.Model(ROBOT, (jid.RigidBodies(), jid.ViscousFriction()))
@@ -123,6 +126,29 @@ def test_a_part_with_large_errors_does_not_hide_a_fall_of_all():
 
 def test_parts_without_rows_do_not_count():
     assert next_model(trial(8, 0.0, 5.0, 5.1), [trial(9, 0.0, 3.0, 3.1)]) is not None
+
+
+@pytest.mark.parametrize(
+    ("promise", "status"), [(0.1, Status.GOOD), (0.3, Status.DOUBTFUL)]
+)
+def test_a_choice_that_promises_more_error_than_the_file_is_no_tick(promise, status):
+    def prediction(error):
+        ones = np.ones((1, 1))
+        return [HeldOutPrediction("log", np.zeros(1), ones, error * ones)]
+
+    choice = ModelChoice(
+        path=[trial(8, 5.0, 5.1), trial(9, 1.0, 1.1)],
+        others=[],
+        changes={},
+        text="",
+        predictions=prediction(promise),
+        first_predictions=prediction(0.2),
+        band="below 10 Hz",
+        parts="10 parts of time",
+        is_complete=True,
+    )
+    assert choice.remarks[0].status is status
+    assert ("record longer" in choice.remarks[0].text) == (promise > 0.2)
 
 
 def test_short_logs_are_refused():
