@@ -405,7 +405,8 @@ class Table:
 
         # Even these few columns may be wider than the terminal: nothing is cut then.
         widths = [(column.min_width or 0) + PADDING for column in grid.columns]
-        grid.width = max(sum(widths) - PADDING, max_width)
+        if sum(widths) - PADDING > max_width:
+            grid.width = sum(widths) - PADDING
         for k, row in enumerate(zip(*cells, strict=True)):
             if k in self.rules:
                 grid.add_row(*[Rule(style="dim")] * len(grid.columns))

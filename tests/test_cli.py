@@ -16,7 +16,7 @@ import patience
 import polars as pl
 import pytest
 
-from jaxid.cli import app as cli
+from jaxid.cli import app as cli, terminal
 from jaxid.experiment.experiment import load_experiment
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -80,6 +80,8 @@ def call(*args):
     """Run a command line in this process; return its exit code."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "argv", ["jaxid", *map(str, args)])
+        # Busy machines would print progress.
+        patch.setattr("jaxid.cli.terminal.LINE_INTERVAL", 600.0)
         with pytest.raises(SystemExit) as stopped:
             cli.main()
     return stopped.value.code
@@ -312,6 +314,21 @@ def test_help_names_arguments_for_people_and_exit_codes(run):
     _, out, _ = run("--help")
     assert "--install-completion" in out
     assert "..." not in out.replace("[ARGS]...", "")
+
+
+def test_progress_of_all_stages_only_grows(capsys, monkeypatch):
+    stages = [("reading", 0.0), ("factorising", 0.5), ("factorising", 1.0)]
+    stages += [("predicting", 0.0), ("predicting", 1.0), ("writing", 0.0)]
+    for interval, count in ((0.0, len(stages)), (600.0, 0)):
+        monkeypatch.setattr(terminal, "LINE_INTERVAL", interval)
+        with terminal.progress_bar() as progress:
+            for stage, fraction in stages:
+                progress(stage, fraction)
+        lines = capsys.readouterr().err.splitlines()
+        assert len(lines) == count
+        shares = [int(re.search(r": (\d+) %, about", line)[1]) for line in lines]
+        assert shares == sorted(shares)
+        assert max(shares, default=50) < 100
 
 
 def test_a_shell_completes_commands_and_options(monkeypatch, run):

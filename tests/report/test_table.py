@@ -89,6 +89,8 @@ def test_numbers_are_never_cut():
     wide = Table("", *(Column("n", [x], kind="number") for x in numbers))
     assert [x for x in wide.text(40).split() if x in numbers[1:]] == numbers[1:]
     assert max(map(len, wide.text(40).splitlines())) <= 40
+    small = Table("", Column("n", [1.5]), Column("n", [2.5]))
+    assert small.text(40).splitlines()[-1] == "1.50  2.50"
     assert wide.text(8).split().count(numbers[0]) == 9, "once in each block"
 
 
