@@ -181,7 +181,7 @@ def read_experiment_text(path: Path) -> str:
     """Return the text of an experiment file."""
     if not path.is_file():
         raise InputError(
-            f"`{path}` is no file: check its path, "
+            f"`{path}` is not a file: check its path, "
             "or write one with `jaxid init arm.urdf`."
         )
     try:
@@ -189,8 +189,8 @@ def read_experiment_text(path: Path) -> str:
     except UnicodeDecodeError as error:
         line = 1 + error.object.count(b"\n", 0, error.start)
         raise InputError(
-            f"{path.name}: the file is no TOML in UTF-8: line {line} holds bytes that "
-            "are no text."
+            f"{path.name}: the file is not TOML in UTF-8: line {line} holds bytes that "
+            "are not text."
         ) from error
 
 
@@ -201,7 +201,7 @@ def parse_tables(text: str, path: Path) -> TomlTable:
     except (ValueError, RecursionError) as error:
         fault = str(error).rstrip(".")
         raise InputError(
-            f"{path.name}: the file is no TOML in UTF-8: {fault}."
+            f"{path.name}: the file is not TOML in UTF-8: {fault}."
         ) from error
     _drop_former_keys(tables)
     try:
@@ -270,7 +270,7 @@ def _require_robot(table: TomlTable, folder: Path) -> None:
         path = folder / table[source]
         if not path.is_file():
             raise InputError(
-                f"`{source}`: `{path}` is no file: paths are relative to this file."
+                f"`{source}`: `{path}` is not a file: paths are relative to this file."
             )
         read_xml(path)
 
@@ -319,11 +319,11 @@ def check_names(
         similar_names = difflib.get_close_matches(name, known_names, n=1, cutoff=0.6)
         if similar_names:
             raise InputError(
-                f"`{path}` is no known key: did you mean `{similar_names[0]}`?"
+                f"`{path}` is not a known key: did you mean `{similar_names[0]}`?"
             )
         owner = place if is_file else f"the table `[{place}]`"
         raise InputError(
-            f"`{path}` is no known key: {owner} has {', '.join(known_names)}."
+            f"`{path}` is not a known key: {owner} has {', '.join(known_names)}."
         )
 
 

@@ -135,7 +135,7 @@ def read_json(path: FilePath) -> Any:
     try:
         return json.loads(Path(path).read_text(encoding="utf-8"))
     except UnicodeDecodeError as error:
-        raise InputError("it is no text in UTF-8") from error
+        raise InputError("it is not text in UTF-8") from error
     except json.JSONDecodeError as error:
         raise InputError(f"{error.msg} in line {error.lineno}") from error
     except ValueError as error:
@@ -275,7 +275,7 @@ def _object_from_json(value: dict[str, Any], options: Sequence[Any], place: str)
         array = None
     # NumPy reads more than `to_json` writes, such as `true` as 1.
     if array is None or to_json(array) != value:
-        raise InputError(f"`{place}` is no array of {name}")
+        raise InputError(f"`{place}` is not an array of {name}")
     return array
 
 

@@ -157,7 +157,7 @@ plt.show()
 #
 # * Forces determine combinations, never single masses of proximal bodies; `base.expressions` says which, `base.identifiability` for each parameter.
 # * The count is decided in scaled columns and twice; a small gap is reported in `base.notes` ([base parameters](../docs/base_parameters.md)).
-# * Base parameters carry everything that dynamics need: forces and mass matrix follow from them exactly.
+# * Base parameters contain everything that the dynamics need: forces and mass matrix follow from them exactly.
 #
 # Which of them *your* motion reveals is another question. Next: [excitation](03_excitation.ipynb).
 #

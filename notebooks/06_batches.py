@@ -50,8 +50,8 @@ print(f"{base.size} base parameters: {', '.join(base.names)}")
 # %% [markdown]
 # ## Monte-Carlo: are 95 % intervals right 95 times in a hundred?
 #
-# One motion, 2000 draws of noise with 30 ms of memory, as torques behind a drive's filter have it. Standard deviations from the textbook take every row
-# for independent; those of the spectral sandwich look at the residuals' spectrum (`row_time`). Columns are evaluated once for all draws.
+# One motion, 2000 draws of noise with 30 ms of memory, as after the filter of a drive. Standard deviations from the textbook assume that every row
+# is independent; those of the spectral sandwich look at the residuals' spectrum (`row_time`). Columns are evaluated once for all draws.
 
 # %%
 step = 0.01
@@ -78,7 +78,7 @@ for label, deviations, quantile in (
     deviations = np.asarray(deviations)[0]
     covered[label] = 100 * np.mean(error <= quantile * deviations, axis=0)
     print(
-        f"{label:18} intervals of 95 % hold the truth in {covered[label].mean():.1f} % of all cases; "
+        f"{label:18} 95 % intervals contain the true value in {covered[label].mean():.1f} % of all cases; "
         f"median deviation {np.median(deviations / scatter):.2f} of the scatter"
     )
 
@@ -88,7 +88,7 @@ panels[0].axhline(95, color="#22262b", lw=1)
 for marker, (label, percent) in zip("os", covered.items()):
     panels[0].plot(place, percent, marker, label=label)
 panels[0].set_xticks(place, base.names, rotation=90)
-panels[0].set_ylabel("intervals that hold the truth [%]")
+panels[0].set_ylabel("intervals with the true value [%]")
 panels[0].set_ylim(0, 105)
 panels[0].legend(loc="lower left", ncols=2)
 k = base.names.index("fc2")
@@ -248,8 +248,8 @@ print(
 )
 
 # %% [markdown]
-# The amount of work decides: a single log of a few seconds leaves a GPU idle, thousands of data sets do not. All is in double precision, of which
-# graphics cards for games have little. This notebook was executed on a CPU; `benchmarks/gpu.py` says what your GPU does. Several devices and several hosts
+# The amount of work decides: a single log of a few seconds leaves a GPU idle, thousands of data sets do not. All computations are in double precision,
+# which is slow on consumer graphics cards. This notebook was executed on a CPU; `benchmarks/gpu.py` says what your GPU does. Several devices and several hosts
 # share the work on long logs by factors: [many devices and processes](../docs/cluster.md).
 #
 # ## What you learned

@@ -1,7 +1,7 @@
 # %% [markdown]
 # # 10 · No torque in the log
 #
-# Many robots log what they were told and where they went, and no torque. Such logs still tell a simulation that moves like the robot: the parameters for which the
+# Many robots log what they were told and where they went, and no torque. Such logs still suffice for a simulation that moves like the robot: the parameters for which the
 # simulated joint, given the recorded commands, stays on the recorded positions. Here a joint with a position servo is simulated on MuJoCo, which shares no code with
 # `jaxid`, with dry friction, delay and a 12-bit encoder.
 
@@ -71,7 +71,7 @@ plt.show()
 #
 # ## Identify
 #
-# The weight of the body is known, from a URDF file or a scale. Gravity makes the joint sag, and the sag tells the stiffness; all else are ratios to it. The
+# The mass of the body is known, from a URDF file or a scale. Gravity makes the joint sag, and the sag determines the stiffness; all other parameters are ratios to it. The
 # simulation decides by motions left out which effects it needs.
 
 # %%
@@ -126,10 +126,10 @@ plt.show()
 # Behind the first half second the error is the rounding of the encoder, 0.44 mrad: every sample counts, also those in which the arm sags from a state that no
 # log tells. A linear joint cannot stick and does not sag.
 #
-# ## What a log does not tell
+# ## What a log cannot determine
 #
 # A slow ramp in one direction leaves the joint behind its command by delay and by dry friction, and no one can say which. The fit does not split them
-# arbitrarily: it reports what the log tells only together. Inertia and damping hardly show: the arm never accelerates.
+# arbitrarily: it reports the sum that the log determines. Inertia and damping hardly show: the arm never accelerates.
 
 # %%
 slow = 0.03 * t
@@ -142,9 +142,9 @@ print(slow_fit)
 # %% [markdown]
 # ## What you learned
 #
-# * Commands and encoders tell a simulation, in units of the servo's stiffness.
-# * A known weight tells the stiffness itself.
-# * Parameters that a log tells only together are reported together.
+# * Commands and encoders determine a simulation, in units of the servo's stiffness.
+# * A known gravity torque determines the stiffness itself.
+# * Parameters that a log determines only in combination are reported in combination.
 # * `jid.export.export_servo_mjcf` writes the robot for MuJoCo, with as many draws from the estimates' distribution as you wish.
 #
 # The guide: [my robot logs no torque](../docs/rollout.md).
@@ -155,8 +155,8 @@ print(slow_fit)
 #
 # <details markdown="1"><summary>Answer</summary>
 #
-# `jid.identify_rollout(logs, joint_names=["lift"])` has no row of `1 / stiffness`, and the stiffness is not determined: nothing of known weight acts on the
-# joint any more, and a bias takes the place of its weight. Damping, dry friction and delay stay the same, since they are ratios to the stiffness, or times. The inertia is then that of
-# the rotor and the body together. Errors grow from 0.4 to 2 mrad, and a remark says that an effect is missing: a bias is the same at every angle, a weight is not.
+# `jid.identify_rollout(logs, joint_names=["lift"])` has no row of `1 / stiffness`, and the stiffness is not determined: no known gravity torque acts on the
+# joint any more, and a bias replaces it. Damping, dry friction and delay stay the same, since they are ratios to the stiffness, or times. The inertia is then that of
+# the rotor and the body together. Errors grow from 0.4 to 2 mrad, and a remark says that an effect is missing: a bias is the same at every angle, gravity is not.
 #
 # </details>

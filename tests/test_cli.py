@@ -204,7 +204,7 @@ def test_what_is_not_determined_is_said_with_a_cure(folder, words):
     said = words("identify", "experiment.toml", "still.csv", ends=3)
     for text in (
         "NOT DETERMINED by these logs",
-        "mean nothing one by one",
+        "must not be used individually",
         "Record a motion",
     ):
         assert text in said
@@ -418,7 +418,7 @@ def test_what_has_changed_between_two_runs_is_told(folder, first, run):
     code, out, _ = run("compare", "first", "again")
     assert "were made of one log, `a.csv`, or parts of it" in " ".join(out.split())
     assert refused(run("compare", "first", "first/"), "`first` is given twice")
-    assert refused(run("compare", "first", "none"), "`none` is no file or folder")
+    assert refused(run("compare", "first", "none"), "`none` does not exist")
 
 
 def test_two_models_are_laid_over_one_log(folder, first, run):

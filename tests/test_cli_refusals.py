@@ -40,7 +40,7 @@ KEYS = [
     (
         'builtin = "planar_arm"',
         'urdf = "lost.urdf"',
-        "`lost.urdf` is no file: paths are relative",
+        "`lost.urdf` is not a file: paths are relative",
     ),
 ]
 
@@ -53,11 +53,11 @@ def test_keys(folder, run, key, wrong, sentence):  # noqa: F811
 
 
 COMMANDS = [
-    ("inspect none.toml", "`none.toml` is no file"),
-    ("identify experiment.toml none.csv", "`none.csv` is no file"),
+    ("inspect none.toml", "`none.toml` is not a file"),
+    ("identify experiment.toml none.csv", "`none.csv` does not exist"),
     (
         "identify no.toml none.csv --verify x.csv",
-        "`no.toml`, `none.csv`, `x.csv` are no files",
+        "`no.toml`, `none.csv`, `x.csv` do not exist",
     ),
     ("identify experiment.toml a.csv --verify b.csv c.csv", "repeat it before `c.csv`"),
     ("identify experiment.toml a.csv --verify=b.csv c.csv", "repeat it before `c.csv`"),
@@ -70,10 +70,10 @@ COMMANDS = [
         "identify experiment.toml a.csv --verify ./a.csv",
         "`a.csv` is given both to identify and",
     ),
-    ("identify experiment.toml loop.csv", "`loop.csv` is no file"),
+    ("identify experiment.toml loop.csv", "`loop.csv` does not exist"),
     (
         "identify experiment.toml image.csv",
-        "`image.csv` is no text",
+        "`image.csv` is not text",
     ),
     (
         "identify experiment.toml long.csv",
@@ -86,7 +86,7 @@ COMMANDS = [
     ("init none.urdf", "none.urdf"),
     (
         "excite experiment.toml -o a.csv",
-        "`a.csv` is there already, and no motion of `jaxid exc",
+        "`a.csv` already exists, and is not a motion of `jaxid exc",
     ),
     (
         "identify a.csv experiment.toml",
@@ -97,7 +97,7 @@ COMMANDS = [
     ("excite experiment.toml -o motion", "`motion` must end in .csv"),
     ("excite experiment.toml -o truth.csv", "`truth.json` is there al"),
     ("excite experiment.toml -o mine.csv", "`mine.ros.yaml` is there al"),
-    ("excite experiment.toml -o pictures.csv", "report.html` is there already"),
+    ("excite experiment.toml -o pictures.csv", "report.html` already exists"),
 ]
 
 

@@ -141,7 +141,7 @@ def test_a_payload_is_found_and_can_be_subtracted(shop, run):  # noqa: F811
     assert abs(found["mass"] / 3.0 - 1.0) < 0.01
     np.testing.assert_allclose(found["centre_of_mass"], [0.02, -0.03, 0.12], atol=3e-3)
     assert [row["name"] for row in found["parameters"]][10:13] == ["m", "x", "y"]
-    assert "could exist" in out
+    assert "possible body" in out
     page = page_text("payload")
     assert "✓ The payload on joint3 has" in page
     assert "moment of inertia about x" in page
@@ -246,11 +246,11 @@ def test_a_report_takes_later_logs(folder, first, run):  # noqa: F811
     assert added["fit"]["rows"] == together["fit"]["rows"]
     assert added["settings"]["identification"] == ["given", "b.csv"]
     assert [e["recording"] for e in added["errors"]["identification"]] == ["b"]
-    said = "have seen the same data"
+    said = "were identified from the same data"
     assert refused(
         run("identify", "experiment.toml", "first", "a.csv", "-o", "twice"), said
     )
-    said = "a report that was given has seen the data of `a`"
+    said = "a report that was given already contains the data of `a`"
     seen = ("first", "b.csv", "--verify", "a.csv", "-o", "twice")
     assert refused(run("identify", "experiment.toml", *seen), said)
     assert not (folder / "twice").exists()
@@ -332,9 +332,9 @@ def test_a_model_is_chosen_and_its_file_identifies(shop, run):  # noqa: F811
     assert "chosen model" in page
     assert run("identify", "chosen.toml", "empty.csv", "-o", "c")[0] in (0, 3)
     again = run("choose", "experiment.toml", "empty.csv")
-    assert refused(again, "`chosen.toml` is there already")
+    assert refused(again, "`chosen.toml` already exists")
     same = run("choose", "experiment.toml", "empty.csv", "-o", "experiment.toml")
-    assert refused(same, "`experiment.toml` is there already")
+    assert refused(same, "`experiment.toml` already exists")
 
 
 PRESLIDING = SPATIAL.replace(

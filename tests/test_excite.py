@@ -200,7 +200,7 @@ def test_writes_the_motion_and_says_what_to_expect(written, run):
         "criteria, of which this motion was designed for",
         "expected standard deviations",
         "use of the limits",
-        "is in the designed motion from",
+        "follows the designed motion from",
         "for one run of 7.854 s (100 samples at 12.73 Hz)",
         "standard deviation of 0.120 N m",
         "give `noise` if it is known",
@@ -213,7 +213,7 @@ def test_writes_the_motion_and_says_what_to_expect(written, run):
         "100 samples at 12.73 Hz",
         "jaxid excite experiment.toml -v -o plan/motion.csv",
         "generations = 0",
-        "he robot starts at rest and is in the designed motion from",
+        "he robot starts at rest and follows the designed motion from",
     ):
         assert said in page
 
@@ -250,7 +250,7 @@ def test_a_stopped_search_leaves_its_best_motion_and_another_goes_on(tmp_path, n
         assert err.startswith(
             "jaxid: stopped: `run/motion.csv` and the files beside it hold the"
         )
-        assert "`--resume` goes on" in err
+        assert "`--resume` continues from" in err
         found, rows = load_trajectory(motion), table(tmp_path / "run" / "motion.csv")
         expected = np.concatenate(
             [getattr(found.motion(rows[:, 0]), x) for x in ("q", "qd")], 1
@@ -373,16 +373,16 @@ def test_what_was_not_checked_is_said_first_and_ends_in_a_code(tmp_path, run):
     before = " ".join(err.split())
     for text in (before, said):
         assert "the shape of" in text
-        assert "stout capsules" in text
+        assert "thick capsules" in text
         assert re.search(
-            r"gravity needs more .* at best the force of joint `j[12]` needs", text
+            r"gravity exceeds a .* best pose the force of joint `j[12]` must be", text
         )
     keys = f"force_margin = 0.1\n{ahead}"
     code, out, err = run(
         "excite", arm(tmp_path, effort=1.0, keys=keys), "-o", tmp_path / "x.csv"
     )
     assert (code, out) == (2, "")
-    assert "`force_margin`: in every one of" in err
+    assert "`force_margin`: in each of" in err
 
 
 def test_limits_forces_by_nominal_parameters(designed, run, no_pictures, monkeypatch):
@@ -407,7 +407,9 @@ def test_limits_forces_by_nominal_parameters(designed, run, no_pictures, monkeyp
     use = r"[45]\.\d+ N m +≤ 6 N m +[89]\d\.\d +12 less a margin of"
     assert re.search(rf"force of joint `hinge` +{use}", out)
     assert "counted as zero in the forces: fv1" in " ".join(out.split())
-    assert "the robot starts at rest and is in the designed motion from 0.500 to" in out
+    assert (
+        "the robot starts at rest and follows the designed motion from 0.500 to" in out
+    )
 
 
 @pytest.mark.parametrize(
@@ -499,7 +501,7 @@ def test_tables_are_sampled_as_a_controller_wants_them(
         "motion.ros.yaml",
     ]
     said = [remark.text for remark in found.remarks]
-    assert "the motion runs through 2 periods; the deviations are of one." in said
+    assert "the motion runs through 2 periods; the deviations are for one." in said
 
 
 def test_the_guide_shows_every_key():
@@ -564,13 +566,13 @@ def test_a_search_that_was_not_begun_cannot_go_on(run):
         "excite", "experiment.toml", "-o", "never/motion.csv", "--resume"
     )
     assert (code, out) == (2, "")
-    assert "`never/motion.json` is not there: `--resume` needs" in err
+    assert "`never/motion.json` does not exist: `--resume` needs" in err
 
 
 @pytest.mark.parametrize(
     ("key", "said"),
     [
-        ("rests = true", "`excitation.rests` is no known key: did you mean `rest`"),
+        ("rests = true", "`excitation.rests` is not a known key: did you mean `rest`"),
         ("leads = false\nsample_time = 0.01", "choose `omega` = 0.79"),
         (
             'controller = "franka"',
@@ -580,7 +582,7 @@ def test_a_search_that_was_not_begun_cannot_go_on(run):
         ("rest = true\nspline = {}", "a `spline` rests at its ends"),
         (
             "spline = { point = 9 }",
-            "`excitation.spline.point` is no known key: did you mean `po",
+            "`excitation.spline.point` is not a known key: did you mean `po",
         ),
         ("noise = [1, 2]", "`noise` must hold one positive number for each joint"),
         ('nominal = "nowhere"', "holds no `model.json`"),

@@ -113,7 +113,7 @@ def test_files_of_earlier_templates_are_read(load):
     former = "[model.coulomb]\ndead_zone = 0.0\n[excitation]\npolish = 4\n"
     load(f"{ARM}{former}")
     with pytest.raises(
-        InputError, match=r"`model\.coulomb\.dead_zone` is no known key"
+        InputError, match=r"`model\.coulomb\.dead_zone` is not a known key"
     ):
         load(f"{ARM}[model.coulomb]\ndead_zone = 0.1\n")
 
@@ -700,7 +700,7 @@ def test_shapes_come_from_the_file(load):
     assert load(named).surroundings.clearance.model.pair_names == ("hand and table",)
     # Without shapes the lines between the joints stand in.
     found = load(ARM).surroundings
-    assert "stout capsules" in found.faults[0]
+    assert "thick capsules" in found.faults[0]
 
 
 GEARED = """<robot name="arm"><link name="l0"/><link name="l1"/><link name="l2"/>

@@ -132,7 +132,8 @@ def excite(
     ] = Path("trajectory.csv"),
     time: options.Time = None,
     resume: Annotated[
-        bool, typer.Option("--resume", help="Go on with the motion that was written.")
+        bool,
+        typer.Option("--resume", help="Continue from the motion in the output file."),
     ] = False,
     detail: options.Detail = None,
 ) -> None:
@@ -148,7 +149,7 @@ def excite(
     earlier_design = output.with_suffix(".json") if resume else None
     if earlier_design is not None and not earlier_design.is_file():
         raise InputError(
-            f"`{earlier_design}` is not there: `--resume` needs a motion to go on with."
+            f"`{earlier_design}` does not exist: `--resume` needs it to continue."
         )
     console = options.start(experiment=experiment)
     from .best_motion import BestMotion

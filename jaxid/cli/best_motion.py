@@ -36,5 +36,5 @@ class BestMotion(Farewell):
         return (
             f"stopped: `{self._output}` and the files beside it hold "
             "the best motion so far, which keeps all limits that "
-            f"were checked{note}; `--resume` goes on with it"
+            f"were checked{note}; `--resume` continues from it"
         )

@@ -46,7 +46,7 @@ Time = Annotated[
 ]
 Seed = Annotated[
     int,
-    typer.Option("--seed", metavar="NUMBER", min=0, help="Seed of all that is random."),
+    typer.Option("--seed", metavar="NUMBER", min=0, help="Seed of the random numbers."),
 ]
 Tip = Annotated[
     str | None,
@@ -70,7 +70,7 @@ Paths = list[Path]
 Logs = Annotated[
     Paths,
     typer.Argument(
-        help="Logs; the folder of an earlier report stands for those it was made of.",
+        help="Logs, or the folder of an earlier report to add its logs.",
         metavar="LOG",
     ),
 ]
@@ -158,7 +158,7 @@ def file_beside(experiment: Path, output: Path | None, name: str, force: bool) -
     output = experiment.parent / name if output is None else output
     if output.exists() and not force:
         raise InputError(
-            f"`{output}` is there already: choose another `--output`, or `--force`."
+            f"`{output}` already exists: choose another `--output`, or `--force`."
         )
     if output.parent.resolve() != experiment.parent.resolve():
         raise InputError(
@@ -171,9 +171,9 @@ def require_paths(paths: Sequence[Path]) -> None:
     """Reject paths of files that are not there."""
     missing_paths = [f"`{path}`" for path in paths if not path.exists()]
     if missing_paths:
-        verb = "is no file or folder"
+        verb = "does not exist"
         if len(missing_paths) > 1:
-            verb = "are no files or folders"
+            verb = "do not exist"
         raise InputError(f"{', '.join(missing_paths)} {verb}: check the path.")
 
 
@@ -228,7 +228,7 @@ def refuse_foreign_table(target: Path) -> None:
         foreign_files = [path for path in paths if path.exists()]
         if foreign_files:
             raise InputError(
-                f"`{foreign_files[0]}` is there already, "
-                "and no motion of `jaxid excite`: choose another -o."
+                f"`{foreign_files[0]}` already exists, and is not "
+                "a motion of `jaxid excite`: choose another -o."
             ) from None
         require_writable(target.parent)

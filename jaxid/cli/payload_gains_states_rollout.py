@@ -28,7 +28,7 @@ def payload(
     ] = None,
     mass: Annotated[
         float | None,
-        typer.Option(metavar="KG", min=1e-6, help="Its mass, if a scale told it."),
+        typer.Option(metavar="KG", min=1e-6, help="Its mass, if you have weighed it."),
     ] = None,
     output: options.OutputFolder = Path("payload"),
     force: options.Force = False,

@@ -66,7 +66,7 @@ def export(
     if faults and not force:
         raise InputError(
             f"the verdict of `{report}` is that its model must not be used: "
-            f"{faults[0]} Mend that first, or write it nonetheless with `--force`."
+            f"{faults[0]} Correct that first, or write it anyway with `--force`."
         )
     fit = read_fit(report)
     match to:
@@ -117,7 +117,7 @@ def require_no_files(files: Sequence[Path], to: str, force: bool) -> None:
             raise InputError(f"`{file}` is a folder: choose another `--output`.")
         if file.exists() and not force:
             raise InputError(
-                f"`{file}` is there already: choose another `--output`, or `--force`."
+                f"`{file}` already exists: choose another `--output`, or `--force`."
             )
 
 

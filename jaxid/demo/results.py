@@ -96,8 +96,8 @@ def remarks(study: Study) -> list[Remark]:
             f"{true_verification:.2g} %.",
         ),
         Remark(
-            f"Without weights the last axis errs by {error:.2g} %, with weights by "
-            f"{weighted_error:.2g} % of its largest torque.",
+            f"Without weights the error of the last axis is {error:.2g} %, with "
+            f"weights {weighted_error:.2g} % of its largest torque.",
             Status.GOOD if weighted_error < error else Status.BAD,
         ),
     ]
@@ -224,8 +224,8 @@ def _temperature(study: Study) -> list[Any]:
     """Return what has changed as the robot became warm."""
     comparison = study.temperature
     return [
-        "Inertial parameters stay, friction falls as the lubricant warms. A parameter "
-        "has changed if its difference is more than chance.",
+        "Inertial parameters do not change; friction falls as the lubricant warms. A "
+        "parameter has changed if its difference is statistically significant.",
         comparison.group_summary(),
         folded("All base parameters, cold and warm", jid.plot.comparison(comparison)),
     ]
@@ -240,8 +240,8 @@ def _excitation(study: Study) -> Section:
     speed, acceleration = study.tip_maxima
     designs = [] if study.plan is None else study.plan.tables()[:1]
     return "Base parameters, and the motion that excites them", [
-        f"Of {base.model.size} columns the QR decomposition without pivoting leaves "
-        f"{base.size}; the first two are those of Eq. 24.",
+        f"The QR decomposition without pivoting keeps {base.size} of "
+        f"{base.model.size} columns; the first two are those of Eq. 24.",
         folded(
             f"All {base.size} base parameters, weighted",
             parameter_table(study.weighted_model.fit),
@@ -297,7 +297,7 @@ def _verification(study: Study) -> Section:
     return "Verification on another path", [
         f"The path after ISO 9283 in a cube of {settings.EDGE:g} m, with rests at its "
         f"corners, up to {settings.SPEED:g} m/s and {settings.ACCELERATION:g} m/s². Of "
-        "the redundant joint angles the nearest to a posture are taken.",
+        "all joint angles that reach a pose, those nearest to a posture are taken.",
         picture(
             speed_figure(robot, robot.limits, times, path.motion(times)),
             "Fig. 8: path of the end-effector.",

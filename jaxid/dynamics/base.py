@@ -338,18 +338,19 @@ def _doubts(
         column = dependence.independent[int(np.argmin(regrouped_columns.shares))]
         yield (
             f"`{model.parameter_names[column]}` is barely a base parameter: only "
-            f"{dependence.smallest_independent:.1e} of its column is new, because of a "
-            "length near zero or an angle like 1.571 instead of pi/2, which "
+            f"{dependence.smallest_independent:.1e} of its column is independent, due "
+            "to a length near zero or an angle like 1.571 instead of pi/2, which "
             "`robot.snapped(1e-3)` (`snap_tolerance`) makes exact."
         )
     if dependence.dependent and dependence.gap < MIN_GAP:
         yield (
-            "independent and dependent columns are not clearly apart: their new parts "
-            f"are {dependence.smallest_independent:.1e} and "
+            "independent and dependent columns are not clearly separated: their "
+            "independent parts are "
+            f" {dependence.smallest_independent:.1e} and "
             f"{dependence.largest_dependent:.1e}."
         )
     if regrouped_columns.max_residual > MAX_UNEXPLAINED:
         yield (
-            "a dependent column is explained only "
-            f"to {regrouped_columns.max_residual:.1e} of its size."
+            "a dependent column is reproduced with an error of "
+            f"{regrouped_columns.max_residual:.1e} of its size."
         )

@@ -88,7 +88,7 @@ def data_doubts(
         if comparison is not None:
             doubts.append(
                 f"Both reports were made of one log, `{path.name}`, or parts of it: a "
-                "difference between their parameters is no change of the robot"
+                "difference of their parameters does not show a change of the robot"
             )
     for fit, paths in zip(fits, places, strict=True):
         if log is not None and log.resolve() in paths:

@@ -144,7 +144,8 @@ def feasible_bodies(fit: Fit, target: str) -> BodyParameters:
     if not is_feasible.all():
         body = int(np.argmin(is_feasible)) + 1
         raise InputError(
-            f"{target} needs bodies that can exist, but body {body} cannot: {cure}."
+            f"{target} needs physically possible bodies, but body {body} is not: "
+            f"{cure}."
         )
     for quantity, values in joint_dynamics(fit).values.items():
         if (values < 0).any():

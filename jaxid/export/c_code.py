@@ -156,7 +156,7 @@ def _definitions(fit: Fit) -> dict[str, tuple[str, str, Callable]]:
         ),
     }
     if model.memory is not None:
-        summary = "State of dry friction behind a step of the joints"
+        summary = "State of dry friction after a step of the joints"
         functions["advance"] = (summary, "s_next", model.memory.advance)
     return functions
 

@@ -205,8 +205,8 @@ def _require_same_robot(robot: Robot, file_robot: Robot, source: FilePath) -> No
             deviations = deviations[is_on_body]
         if deviations.max(initial=0.0) > MAX_DEVIATION:
             raise InputError(
-                f"`{source}` has another `{quantity}` than the robot of the fit: give "
-                "its own file."
+                f"`{source}` has a different `{quantity}` from the robot of the fit: "
+                "give its own file."
             )
 
 

@@ -58,9 +58,9 @@ def servo_stiffness(fit: ServoFit) -> Joints:
     is_known = np.isfinite(values)
     if not is_known.any():
         raise InputError(
-            "`stiffness` [N m/rad] of `identify_rollout` is needed: no known weight "
-            "tells it, and positions tell ratios to it only. Any number gives the same "
-            "motion of a robot without bodies."
+            "`stiffness` [N m/rad] of `identify_rollout` is needed: no known load "
+            "determines it, and positions determine only ratios to it. Any number "
+            "gives the same motion of a robot without bodies."
         )
     return np.where(is_known, values, np.median(values[is_known]))
 
@@ -140,8 +140,8 @@ def simulator_table(fit: ServoFit) -> Table:
         remarks.append(Remark(FEED_FORWARD_CURE, Status.DOUBTFUL))
     if not fit.hold:
         remarks.append(
-            "the delay counts for interpolated commands: held ones are later by half a "
-            "step"
+            "the delay is that of interpolated commands: commands that are held act "
+            "half a step later"
         )
     return Table(
         "actuators of simulators",
@@ -183,7 +183,7 @@ def gain_finding(fit: ServoFit) -> Remark | None:
                 f"{name.replace('_', ' ')} of {fit.joint_names[joint]} {gain:g} {unit}"
             )
             combination = combinations.get((joint, GAIN_SYMBOLS[name]))
-            result = "which the logs do not tell"
+            result = "which cannot be determined from the logs"
             if combination is not None:
                 stiffness = float(servo_stiffness(fit)[joint])
                 result = _compare_gain(name, gain, stiffness, combination)

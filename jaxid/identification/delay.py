@@ -116,7 +116,7 @@ def with_unknown_delay(
         note = (
             f"intervals include a delay of the forces of {delay}: they are up to "
             f"{significant(ratios.max(), 2)} times as wide as without it, most that of "
-            f"`{parameter}`; faster motion tells the delay better."
+            f"`{parameter}`; faster motion determines the delay better."
         )
         notes = (*notes, note)
     return dataclasses.replace(fit, uncertainty=wider_uncertainty, notes=notes)

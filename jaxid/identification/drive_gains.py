@@ -30,7 +30,7 @@ from .uncertainty.blocks import block_covariance
 MAX_GAIN = 100.0
 """Ratio of a true to an assumed force beyond which something else is wrong."""
 MAX_DEVIATION = 0.25
-"""Relative standard deviation of a gain beyond which the logs do not tell it."""
+"""Relative standard deviation of a gain beyond which the logs do not determine it."""
 MAX_MISFIT_RATIO = 1.1
 """Residual of a known load, relative to that of any load, that chance explains."""
 MIN_MISFIT = 1e-3
@@ -67,8 +67,9 @@ class DriveGains(Summarised, eqx.Module):
             is_wrong = misfit > MAX_RESIDUAL_RATIO * min_misfit
             text = (
                 f"The load does not fit: it leaves {percent(misfit)} % of the forces "
-                f"unexplained, another one of its mass only {percent(min_misfit)} %. "
-                "Give its centre of mass in the frame of the body that carries it"
+                f"unexplained, another load of the same mass only "
+                f"{percent(min_misfit)} %. Give its centre of mass in the frame of the "
+                "body that carries it"
             )
             remarks.append(Remark(text, Status.BAD if is_wrong else Status.DOUBTFUL))
         variances = np.diag(self.uncertainty.covariance)
@@ -79,8 +80,8 @@ class DriveGains(Summarised, eqx.Module):
         ]
         if names:
             text = (
-                f"These logs do not tell the gain of {', '.join(names)}, which stays 1:"
-                " take a heavier load, or move faster and in more poses"
+                f"These logs do not determine the gain of {', '.join(names)}, which "
+                "stays 1: take a heavier load, or move faster and in more poses"
             )
             remarks.append(Remark(text, Status.DOUBTFUL))
         return remarks
@@ -152,7 +153,7 @@ def identify_drive_gains(
     is_determined &= relative_deviations < MAX_DEVIATION
     if not is_determined.any():
         raise InputError(
-            "the load does not tell any gain: describe its centre of mass and inertia, "
+            "the load determines no gain: describe its centre of mass and inertia, "
             "too, take a heavier one, or move every joint faster."
         )
     # The gain 1 / c changes by -1 / c² times a small change of c.

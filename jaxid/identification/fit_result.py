@@ -311,7 +311,9 @@ class Fit(Summarised, eqx.Module):
         consequence = "some of which were not moved at all"
         if np.isfinite(worst_share):
             share = percent(worst_share)
-            consequence = f"up to {share} % of the forces of other motions are open"
+            consequence = (
+                f"up to {share} % of the forces of other motions are uncertain"
+            )
         headline = (
             "NOT DETERMINED by these logs: "
             f"{combinations} of the {size} base parameters, {consequence}."
@@ -329,15 +331,15 @@ class Fit(Summarised, eqx.Module):
         advice = (
             "A combination counts as not determined if its 95 % interval leaves more "
             f"than {100 * OPEN_SHARES.doubtful:g} % of the forces of random motions "
-            "within the robot's limits open. Estimates of these parameters mean "
-            "nothing one by one, and the model may fail on other motions. Record a "
-            "motion that moves these joints in more poses, faster and in both "
+            "within the robot's limits open. The estimates of these parameters "
+            "must not be used individually, and the model may fail on other motions. "
+            "Record a motion that moves these joints in more poses, faster and in both "
             "directions, or leave effects out in `[model]`"
         )
         if isinstance(self.solution, Complete):
             advice += (
                 '; `ridge = "cross_validated"` in `[estimator]` '
-                "keeps small what is left open"
+                "keeps undetermined combinations small"
             )
         return [*remarks, Remark(advice)]
 

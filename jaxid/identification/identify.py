@@ -222,5 +222,5 @@ def _shrinkage_notes(values: BaseVector, solution: AbstractSpectralSolution) -> 
     return (
         f"the solution pulls {count} of {len(values)} directions "
         "of the parameters to less than half of what the data say: "
-        "standard deviations do not tell how far from the truth this is.",
+        "standard deviations do not include the bias that results.",
     )

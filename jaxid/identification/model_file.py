@@ -23,17 +23,17 @@ def load_fit(path: str | Path) -> Fit:
 
     Raises:
         OSError: If the file cannot be read.
-        InputError: If it is no model file, of another version, or not as it was
+        InputError: If it is not a model file, of another version, or not as it was
             written.
     """
     try:
         document = read_json(path)
     except ValueError as error:
         raise InputError(
-            f"`{path}` is no model file: it cannot be read as JSON."
+            f"`{path}` is not a model file: it cannot be read as JSON."
         ) from error
     if not isinstance(document, dict) or document.get("format") != FORMAT:
-        raise InputError(f"`{path}` is no model file, as `save` writes it.")
+        raise InputError(f"`{path}` is not a model file, as `save` writes it.")
     if document.get("version") != VERSION:
         raise InputError(
             f"`{path}` is a model file of version {document.get('version')!r:.20}, "

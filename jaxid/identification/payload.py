@@ -194,12 +194,12 @@ class Payload(Summarised, eqx.Module):
         if self.distance > 0:
             is_usual = self.distance < MAX_DISTANCE
             return Remark(
-                "The estimate itself belongs to no body: these are the parameters of "
-                "the nearest one that could exist, "
+                "The estimate itself is not physically possible: these are the "
+                "parameters of the nearest possible body, "
                 f"{self.distance:.2g} standard deviations away.",
                 Status.NEUTRAL if is_usual else Status.DOUBTFUL,
             )
-        return Remark("The payload is a body that could exist.", Status.GOOD)
+        return Remark("The payload is a physically possible body.", Status.GOOD)
 
 
 def identify_payload(

@@ -275,7 +275,7 @@ def _as_unit(name: str, unit: Unit | float, quantity: Quantity) -> Unit:
         return unit
     if not np.isfinite(unit) or unit == 0:
         raise InputError(
-            f"`{name}` must be a unit, or the size of a one in the log, which is "
+            f"`{name}` must be a unit, or the value of 1 in the log, which is "
             f"finite and not zero, but is {unit}."
         )
     return Unit(f"{unit:g}", float(unit), quantity)
@@ -335,8 +335,8 @@ class Log:
         if not begins_again.any():
             return array
         self.notes.append(
-            f"`{channel}` jump by {size}, as counters do, or numbers without their "
-            "sign: this was undone"
+            f"`{channel}` jump by {size}, as if a counter had overflowed: the jumps "
+            "were removed"
         )
         counts = np.unwrap(array, period=size, axis=0)
         turns = np.round(np.median(counts, axis=0) / size)
@@ -367,7 +367,7 @@ def _require_values(source: str, channel: str, blocks: dict[str, Matrix]) -> Non
     if empty_columns:
         cure = "name other columns"
         if channel == "velocities":
-            cure = "leave `velocities` out, which the angles tell"
+            cure = "leave `velocities` out: the angles suffice"
         raise InputError(
             f"all values of `{'`, `'.join(empty_columns)}` of `{source}` are empty or "
             f"NaN: the driver reports no `{channel}`; {cure}."

@@ -94,7 +94,7 @@ def detect_format(source: str, head: bytes, selections: Selections) -> TextForma
         raise InputError(f"`{source}` is text in UTF-16: save it again in UTF-8.")
     if b"\0" in head:
         raise InputError(
-            f"`{source}` is no text, as its suffix says, or text in UTF-16: give it "
+            f"`{source}` is not text, as its suffix says, or is in UTF-16: give it "
             "the suffix of its format, or save it again in UTF-8."
         )
     text = decoded(head)

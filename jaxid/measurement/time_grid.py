@@ -149,8 +149,9 @@ def find_grid(
     grid = TimeGrid(sample_time, segments, notes, deviation)
     if in_parts and not grid.is_exact:
         raise NeedsMemory(
-            f"time stamps of `{source}` leave a uniform grid of {sample_time:.6g} s by "
-            f"{deviation:.6g} s: give `sample_time` if only the stamps are late."
+            f"time stamps of `{source}` deviate from a uniform grid of "
+            f"{sample_time:.6g} s by {deviation:.6g} s: give `sample_time` if "
+            "only the stamps are late."
         )
     return grid
 

@@ -125,18 +125,18 @@ def even_stamps(stamps: Vector, source: str) -> tuple[Vector, Texts]:
         burst_steps = np.diff(times) / np.median(np.diff(times))
         if np.abs(burst_steps - np.round(burst_steps)).max() < BURSTS.unevenness:
             raise InputError(
-                f"{text}, but some rows of `{source}` are lost, so that the stamps do "
-                "not tell when the others were measured: keep only the last row of "
-                "each burst, or record again."
+                f"{text}, but some rows of `{source}` are lost, so that the times of "
+                "the others cannot be determined: keep only the last row of each "
+                "burst, or record again."
             )
         raise InputError(
-            f"{text}, but not evenly, so that the stamps of `{source}` do not tell "
-            "when they were measured: give `sample_time` instead of the stamps, here "
-            f"about {sample_time:.4g} s."
+            f"{text}, but not evenly, so that the times of the measurements cannot be "
+            f"determined from the stamps of `{source}`: give `sample_time` instead, "
+            f"here about {sample_time:.4g} s."
         )
     sample_time = float(f"{sample_time:.4g}")
     note = (
-        f"{text}: they got even stamps, {sample_time:.4g} s apart; give `sample_time` "
-        "if you know a better one"
+        f"{text}: evenly spaced stamps were assigned, {sample_time:.4g} s apart; "
+        "give `sample_time` if you know a better one"
     )
     return stamps[0] + sample_time * np.arange(len(stamps)), (note,)

@@ -17,8 +17,9 @@ from .result_files import write_page_and_table
 from .result_records import comparison_rows, error_record
 
 ONE_MOTION = (
-    "Runs of different motions differ by what the model lacks, too. Of two runs of one "
-    "motion, `jaxid states` tells more: it fits both at once, with one inertia."
+    "Effects that the model lacks also cause differences between runs of different "
+    "motions. For two runs of one motion, `jaxid states` is more sensitive: it fits "
+    "both at once, with the same inertial parameters."
 )
 
 

@@ -137,7 +137,7 @@ def motion_verdict(plan: ExcitationPlan, remarks: Sequence[Remark]) -> Remark:
     elif not plan.feasible:
         text = "This motion does not keep all limits."
     elif any(remark.status is Status.BAD for remark in remarks):
-        text = "Do not record this motion yet: what is marked ✗ comes first."
+        text = "Do not record this motion yet: first correct what is marked ✗."
     elif unchecked_names:
         status = Status.DOUBTFUL
         names = ", ".join(unchecked_names)

@@ -141,7 +141,7 @@ def gravity_table(fit: Fit, log: TorqueErrors) -> Table:
     ]
     shares = max_torques / np.asarray(log.max_forces)
     if np.isfinite(shares).all():
-        columns.append(Column("of the largest\nthe drive has", shares, "%", percent))
+        columns.append(Column("share of the\ndrive's largest", shares, "%", percent))
     return Table("", *columns)
 
 

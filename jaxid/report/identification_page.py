@@ -152,8 +152,8 @@ def _physics(report: Report, figures: Figures) -> Sections:
     text = (
         "The line is the model. Each point is the measured friction in a range of "
         "speeds: the mean force there, minus gravity and inertia of the model. If the "
-        "points leave the line, friction has another shape: `jaxid choose` tries "
-        "further laws."
+        "points do not follow the line, friction has a different shape: `jaxid choose` "
+        "tries further laws."
     )
     yield "Friction", [text, figures["friction"]]
     log = report.verification[0] if report.verification else report.identification[0]
@@ -185,9 +185,10 @@ def _estimates(report: Report) -> list[Any]:
         "apart from it."
     )
     note = (
-        "* together with what forces cannot tell apart from it: see its combination. "
-        "Open: the share of the torques of random motions that its interval leaves "
-        "open. A small parameter matters little, however wide its interval."
+        "* together with what forces cannot separate from it: see its combination. "
+        "Open: the uncertainty of the torques of random motions that follows from its "
+        "interval, in percent. A small parameter matters little, however wide its "
+        "interval."
     )
     doubts = [fit.determination] if fit.undetermined else []
     all_parameters = folded(

@@ -46,7 +46,11 @@ def write_inspection(
     residual = percent(max(fit.residual for _, fit in logs))
     numbers = tiles(
         (str(len(findings)), "findings that deserve a look", Status.NEUTRAL),
-        (f"{residual} %", "of the forces missed by a fit to the log", Status.NEUTRAL),
+        (
+            f"{residual} %",
+            "of the forces not explained by a fit to the log",
+            Status.NEUTRAL,
+        ),
         (
             f"{size - undetermined} of {size}",
             "combinations of parameters that the log determines",

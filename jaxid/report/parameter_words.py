@@ -10,10 +10,10 @@ from jaxid.result_table import Column
 from jaxid.robot.robot import Robot
 
 FRAMES_NOTE = (
-    "Numbers count joints and bodies from the base. Masses times distances, and "
+    "Joints and bodies are numbered from the base. Masses times distances, and "
     "moments of inertia, are about the origin of the body's frame, which lies on the "
-    "axis of its joint, and along the frame's axes. Friction and rotors are seen from "
-    "the joint, behind the gear."
+    "axis of its joint, and along the frame's axes. Friction and rotor inertia are "
+    "given at the joint, on the output side of the gear."
 )
 """Frames and sides in which parameters are given."""
 

@@ -59,7 +59,7 @@ def payload_answer(
         [
             (f"{mass} ± {half_width} kg", "mass, with its 95 % interval"),
             (f"{loaded_residual} %", "of the forces missed with the payload"),
-            (f"{residual} %", "of the forces missed without it, by the robot's fit"),
+            (f"{residual} %", "of the forces missed without the payload"),
         ],
         figures,
         f"The frame is that of the body that {joint} moves. A_c to F_c are about the "
@@ -124,7 +124,10 @@ def gains_answer(
         [
             (f"{count} of {robot.joints}", "gains that the logs determine"),
             (f"{misfit} %", "of the forces missed with the load as described"),
-            (f"{min_misfit} %", "of the forces missed with the best load of its mass"),
+            (
+                f"{min_misfit} %",
+                "of the forces missed with the best load of the same mass",
+            ),
         ],
         [Figure("Gains with their 95 % intervals", [panel], height=height)],
         "The true force of a joint is its gain times the force of the log. A gain that "
@@ -149,7 +152,7 @@ def states_answer(states: StatesFit, errors: Mapping[str, Errors]) -> Answer:
         (count, "parameters of friction and offsets that have changed"),
         (
             f"{percent(chance)} %",
-            "chance of such differences if the states share all else",
+            "probability that the other differences are chance",
         ),
     ]
     figures = [comparison_figure(x) for x in comparisons]
@@ -158,7 +161,7 @@ def states_answer(states: StatesFit, errors: Mapping[str, Errors]) -> Answer:
         missed_share = percent(
             relative_error([x for logs in groups.values() for x in logs])
         )
-        numbers.append((f"{missed_share} %", "of the forces missed, in all states"))
+        numbers.append((f"{missed_share} %", "of the forces missed, over all states"))
         fits = {state: states.fit(state) for state in groups}
         figures.insert(0, state_friction_figure(fits, errors))
     return Answer(

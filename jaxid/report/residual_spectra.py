@@ -40,7 +40,7 @@ def _spectrum_panel(spectra: ResidualSpectra, robot: Robot, j: int) -> Panel:
     density = np.asarray(spectra.density)[j, is_shown]
     white_level = np.sum(density) / np.sum(white_density)
 
-    white_name = "random errors behind the filters"
+    white_name = "random errors after the filters"
     verdict = "random" if spectra.white[j] else "not random"
     low_share = percent(float(spectra.low_frequency[j]))
     low_band = f"below {0.1 * spectra.band:.2g} Hz"

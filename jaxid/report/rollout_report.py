@@ -111,7 +111,8 @@ class RolloutReport:
             joints = ", ".join(np.array(self.errors.joint_names)[~is_good])
             comparison = f"hardly closer to the robot than a baseline ({joints})"
         yield Remark(
-            f"The simulation is {comparison}; it errs most at {joint_name}, by {error}",
+            f"The simulation is {comparison}; the largest error, {error}, is at "
+            f"{joint_name}",
             Status.GOOD if is_good.all() else Status.DOUBTFUL,
         )
         contact = contact_finding(self.robot, self.errors)
@@ -260,7 +261,7 @@ class ServoRolloutReport(RolloutReport):
         # Its notes are findings.
         parameters.remarks = parameters.remarks[:1]
         if not self.has_stiffness:
-            text = "No weight tells a stiffness: name it by `rollout.stiffness`."
+            text = "No known load determines a stiffness: set `rollout.stiffness`."
             return [parameters, Table("", remarks=[text])]
         return [parameters, simulator_table(self.fit)]
 

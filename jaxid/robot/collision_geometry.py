@@ -96,7 +96,7 @@ def _read_shape(tree: UrdfTree, packages: str | Path | None, element: Any):
         case "cylinder" | "capsule":
             return Shape.about_axis(number("length"), number("radius"))
     raise InputError(
-        f"{tree.place(element)}: `{element.tag}` is no box, "
+        f"{tree.place(element)}: `{element.tag}` is not a box, "
         "cylinder, sphere, capsule or mesh."
     )
 
@@ -122,9 +122,9 @@ def _mesh_vertices(
         vertices = np.asarray(mesh.vertices, np.float64)
     except Exception as error:  # readers of many formats raise many exceptions
         reason = MESH_ERROR_PARTS.sub("", " ".join(str(error).split())).rstrip(".")
-        raise InputError(f"`{file}` is no mesh that can be read: {reason}.") from error
+        raise InputError(f"`{file}` is not a readable mesh: {reason}.") from error
     if len(vertices) == 0:
-        raise InputError(f"`{file}` is no mesh that can be read: it has no vertices.")
+        raise InputError(f"`{file}` is not a readable mesh: it has no vertices.")
     return vertices
 
 

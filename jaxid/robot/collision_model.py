@@ -243,7 +243,7 @@ class CollisionModel(Hashable):
         names = self._names
         words = ", ".join(f"{names[i]} and {names[k]}" for i, k in pairs)
         return (
-            f"not watched, for they overlap in every pose that was tried: {words}.",
+            f"not checked, since they overlap in every pose that was tried: {words}.",
         )
 
     def _indices(self, pair: Sequence[str]):

@@ -18,7 +18,7 @@ def read_description(
     robot = read_xml(path)
     if xacro_arguments and not has_xacro(robot):
         raise InputError(
-            f"`{path}` is no xacro file, which alone has arguments: "
+            f"`{path}` is not a xacro file, but only these have arguments: "
             "remove `xacro_arguments` (`--xacro`)."
         )
     if robot.tag == "mujoco":

@@ -215,7 +215,7 @@ def _require_followed(task: _TipTask, positions: np.ndarray, q: np.ndarray):
         joint = int(excess[k].argmax())
         reason = f"joint `{robot.joint_names[joint]}` leaves its range"
     else:
-        reason = "the joints would have to jump, for the pose is singular"
+        reason = "the joints would have to jump: the pose is singular"
     place = ", ".join(f"{x:.3f}" for x in positions[k])
     raise InputError(
         f"`{robot.name}` cannot follow the path: "

@@ -323,8 +323,8 @@ def _mount_notes(tree: UrdfTree, base: str | None):
     vector = ", ".join(f"{x:.4g}" for x in g)
     return [
         f"link `{base}` is tilted by {angle:.3g} degrees by {joints} above it (moving "
-        f"ones are held near zero): gravity in its frame is [{vector}] m/s²; if it "
-        "stands otherwise, give `gravity` or `base_rotation`."
+        f"joints are held near zero): gravity in its frame is [{vector}] m/s²; if the "
+        "link is mounted differently, give `gravity` or `base_rotation`."
     ]
 
 
@@ -356,7 +356,7 @@ def _follower_notes(tree: UrdfTree):
         yield (
             f"joint `{follower.name}`: follows another one, at {follower.factor:.4g} * "
             f"`{leader_name}` + {follower.offset:.4g}; its body is number {number} "
-            f"(`m{number}`), its friction counts as that of `{leader_name}`."
+            f"(`m{number}`), its friction is included in that of `{leader_name}`."
         )
 
 

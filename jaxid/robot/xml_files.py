@@ -33,7 +33,7 @@ def require_urdf(path: str | Path, root: Any) -> None:
     """Reject a file whose root is none of URDF."""
     if root.tag != "robot":
         raise InputError(
-            f"`{path}` is no URDF: its root is `<{root.tag}>`, not `<robot>`."
+            f"`{path}` is not a URDF file: its root is `<{root.tag}>`, not `<robot>`."
         )
 
 

@@ -91,7 +91,7 @@ def contact_finding(robot: Robot, errors: RolloutErrors) -> str | None:
         f"Something seems to hold {table.point} at a height of {table.height:.3f} m: "
         f"the simulation goes {1e3 * table.depth:.0f} mm below it, most often in "
         f"{errors.motions[motion]} between {span[0]:.1f} and {span[-1]:.1f} s. These "
-        "samples count in all errors: leave them out of the logs"
+        "samples are included in all errors: leave them out of the logs"
     )
 
 

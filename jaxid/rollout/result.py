@@ -142,7 +142,7 @@ class ServoFit(Summarised):
         rival = "interpolated, delays are half a sample time longer"
         if not self.hold:
             rival = "held until the next one, delays are half a sample time shorter"
-        return f"{description}; the logs do not tell: if they are {rival}"
+        return f"{description}; the logs fit equally well if they are {rival}"
 
     @property
     def contact_words(self) -> str:
@@ -364,8 +364,8 @@ def _notes_on_errors(fit: JointFit, joint_names: tuple[str, ...]) -> list[str]:
     return [
         "Errors are larger than an encoder's rounding and change slowly "
         f"({', '.join(joint_errors)} mrad or mm RMS): an effect is missing, such as "
-        "other friction, play, elasticity or load, and the parameters are those that "
-        "imitate it best"
+        "other friction, play, elasticity or load, and the parameters "
+        "compensate for it"
     ]
 
 

@@ -64,7 +64,7 @@ def virtual_tx90l_on_rail(
         ),
         notes=(
             *robot.notes[:2],
-            "assumed, since they are not published: the gear ratios, but for those of "
+            "assumed, since they are not published: the gear ratios, except those of "
             "the rail and the last axis, which follow from motor torques in the paper.",
         ),
     )

@@ -80,7 +80,7 @@ def load_trajectory(path: str | Path) -> AbstractTrajectory:
         return from_json(content.get("trajectory"), AbstractTrajectory, "trajectory")
     except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
         reason = " ".join(map(str, error.args))
-        raise InputError(f"`{path}` is no trajectory file: {reason}.") from error
+        raise InputError(f"`{path}` is not a trajectory file: {reason}.") from error
 
 
 def write_csv(

@@ -87,6 +87,6 @@ def unit(symbol: str) -> Unit:
     """
     if symbol not in UNITS:
         raise InputError(
-            f"`{symbol}` is no known unit: write one of {', '.join(UNITS)}."
+            f"`{symbol}` is not a known unit: write one of {', '.join(UNITS)}."
         )
     return UNITS[symbol]

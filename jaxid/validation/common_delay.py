@@ -52,7 +52,7 @@ def estimate_delay(model: Model, recordings: Recording | Sequence[Recording]) ->
     if not log.is_long_enough:
         raise InputError(
             "`recordings` must hold a log of more than a second without gaps, "
-            "to tell a delay: record longer."
+            "to determine a delay: record longer."
         )
     return common_delay(DescribedLog(model, log))
 

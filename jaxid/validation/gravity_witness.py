@@ -30,7 +30,7 @@ class WitnessLimits(NamedTuple):
 LIMITS = WitnessLimits()
 CAUSES = (
     "the drive or the log has subtracted it (gravity alone or a model's prediction), "
-    "`robot.gravity` does not suit the mount, or a link, an axis or a zero of the "
+    "`robot.gravity` does not match the mount, or a link, an axis or a zero of the "
     "angles is wrong"
 )
 """Usual causes of another gravity."""

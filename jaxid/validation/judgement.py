@@ -182,7 +182,7 @@ def _verdict(report: Report, findings: Sequence[Remark]) -> Remark:
     """Return the sentence for all findings, which follows the most severe one."""
     statuses = [finding.status for finding in findings]
     if Status.BAD in statuses:
-        text = "Do not rely on this model yet: what is marked ✗ comes first."
+        text = "Do not rely on this model yet: first correct what is marked ✗."
         return Remark(text, Status.BAD)
     if Status.DOUBTFUL in statuses:
         text = "A usable model; look at what is marked ! before you rely on it."
@@ -236,8 +236,8 @@ def _error_remark(report: Report, logs: Sequence[TorqueErrors], motion: str) -> 
         status,
         f"Good: up to {100 * ERRORS.good:g} %; ! above {100 * ERRORS.doubtful:g} % "
         f"({100 * ERRORS.doubtful_joint:g} % of a joint), ✗ above "
-        f"{100 * ERRORS.bad:g} % ({100 * ERRORS.bad_joint:g} %). A joint that hardly "
-        "works is judged by a fifth of its largest torque.",
+        f"{100 * ERRORS.bad:g} % ({100 * ERRORS.bad_joint:g} %). A joint under "
+        "little load is judged by a fifth of its largest torque.",
     )
 
 
@@ -263,7 +263,7 @@ def _judge_mass_matrix(definiteness: Definiteness) -> Remark:
         f"Smallest eigenvalue over random poses: {eigenvalue} in SI units (Sec. 5). If "
         "it is negative, do not simulate or control with this model where joints were "
         'not moved: `kind = "consistent"` in `[estimator]` finds bodies that can '
-        "exist.",
+        "exist physically.",
     )
 
 
@@ -362,7 +362,7 @@ def _remarks_on_fit(report: Report) -> Iterator[Remark]:
     yield Remark(
         f"Estimates: {dict(fit.facts)['estimates']}",
         detail="Forces of random motions within the robot's limits, and 95 % intervals "
-        "of the parameters one by one. A small parameter matters little, however wide "
+        "of the single parameters. A small parameter matters little, however wide "
         "its interval.",
     )
     condition = significant(fit.condition_numbers.scaled, 3)

@@ -119,8 +119,9 @@ class Mistakes(NamedTuple):
         if self.explained or self.unexplained or not delay.is_certain:
             return mistakes
         sentence = (
-            f"the forces of the log seem to be {delay} late, which changes friction "
-            f"most: `force_delay = {delay.seconds:.3g}` in `[recording]` removes that."
+            f"the forces of the log seem to be {delay} late, which mainly affects "
+            f"friction: `force_delay = {delay.seconds:.3g}` in `[recording]` "
+            "removes that."
         )
         return mistakes._replace(doubts=(*self.doubts, sentence), possible=())
 
@@ -339,7 +340,7 @@ def _misfit_text(described_log: DescribedLog, fit: RowFit) -> str:
     joint = int(np.argmax(rows.relative_errors(fit.squares)))
     share = significant(100 * _misfit(fit, rows), 2)
     return (
-        f"the model does not fit: it misses {share} % of the forces, most of all those "
+        f"the model does not fit: it misses {share} % of the forces, mainly those "
         f"of joint `{described_log.robot.joint_names[joint]}`, and no single mistake "
         "in signs, order, units, offsets, axes or gravity explains that."
     )

@@ -75,7 +75,7 @@ def _velocity_findings(
         if joints:
             delay = 1e3 * np.median(delays[joints])
             text = (
-                f"stand {delay:.2g} ms {direction} in the log than the derivatives of "
+                f"are {delay:.2g} ms {direction} in the log than the derivatives of "
                 "the angles: leave `recording.velocities` out."
             )
             causes[text] = joints

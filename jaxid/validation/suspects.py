@@ -378,7 +378,7 @@ class SuspectedMistakes:
                     f"(`recording.force_delay = {seconds:.3g}`)"
                 )
             return (
-                f"the force of joint {self._names[joints[0]]} seems to stand "
+                f"the force of joint {self._names[joints[0]]} seems to be "
                 f"{1e3 * seconds:.2g} ms later in the log than the angles"
             )
 

@@ -334,8 +334,8 @@ def add_reports(
         rows = RegressionProblem(setup.base, [log])
         if fit.blocks is not None and has_common_rows(fit.blocks, rows.blocks):
             raise InputError(
-                "a report that was given has seen the data "
-                f"of `{log.name}`: verify with another."
+                "a report that was given already contains the data "
+                f"of `{log.name}`: verify with another log."
             )
     return fit
 

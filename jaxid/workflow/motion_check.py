@@ -71,8 +71,8 @@ def check_floor(
     if has_floor:
         return Remark("floor: no shape of the robot can come near it", Status.GOOD)
     if surroundings.collision.floor is False:
-        return Remark("floor: not checked, as `floor = false` asks", Status.DOUBTFUL)
-    return Remark("floor: not checked, for no shape of the robot is known", Status.BAD)
+        return Remark("floor: not checked, because of `floor = false`", Status.DOUBTFUL)
+    return Remark("floor: not checked, no shape of the robot is known", Status.BAD)
 
 
 def check_self_collision(
@@ -87,7 +87,7 @@ def check_self_collision(
     if findings:
         yield judge("self-collision", findings)
     elif not surroundings.collision.fit:
-        text = "self-collision: not checked, as `fit = false` asks"
+        text = "self-collision: not checked, because of `fit = false`"
         yield Remark(text, Status.DOUBTFUL)
     elif not surroundings.faults:
         yield Remark("self-collision: no two bodies can meet", Status.GOOD)

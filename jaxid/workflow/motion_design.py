@@ -340,18 +340,18 @@ def describe_motion(
     begin, end = playable.window
     if begin > 0:
         yield Remark(
-            "the robot starts at rest and is in the designed motion from "
+            "the robot starts at rest and follows the designed motion from "
             f"{begin:.3f} to {end:.3f} s of {float(playable.motion.duration):.3f} s"
         )
     if excitation.noise is None:
         yield Remark(
-            "the noise is assumed as 1 % of the largest forces: "
+            "the noise is assumed to be 1 % of the largest forces: "
             "give `noise` if it is known"
         )
     leads = excitation.chosen_leads
     if leads is not None and leads.periods > 1:
         yield Remark(
-            f"the motion runs through {leads.periods} periods; the deviations are of "
+            f"the motion runs through {leads.periods} periods; the deviations are for "
             "one"
         )
     yield from check_motion(task.surroundings, plan, task.force_fault)
@@ -379,6 +379,6 @@ def describe_nominal(task: MotionTask, nominal: Nominal) -> Iterator[Remark]:
     if nominal.undetermined:
         text = (
             f"`{task.excitation.nominal}` does not determine "
-            f"{', '.join(nominal.undetermined)}: their uncertainty counts as zero"
+            f"{', '.join(nominal.undetermined)}: their uncertainty is taken as zero"
         )
         yield Remark(text, Status.DOUBTFUL)

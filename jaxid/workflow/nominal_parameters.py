@@ -23,7 +23,7 @@ RANDOM_POSES = 2000
 """Number of random poses in which the forces of gravity are computed."""
 
 NO_INERTIAS = (
-    "not checked: no inertias are known; say in `excitation.nominal` where a report is"
+    "not checked: no inertias are known; give a report as `excitation.nominal`"
 )
 NO_MAX_FORCES = "not checked: no largest forces are known; give `limits.force`"
 
@@ -122,8 +122,8 @@ def gravity_fault(robot: Robot, limits: ForceLimits) -> str:
     finding = limits.entries(robot)[int(excess[best_pose].argmax())]
     force = finding.limit * (1.0 + largest_excess[best_pose])
     return (
-        f"in every one of {RANDOM_POSES} poses gravity needs more than the limits of "
-        f"the forces allow; at best {finding.name} needs {force:.3g} of "
+        f"in each of {RANDOM_POSES} random poses, gravity exceeds a force limit; in "
+        f"the best pose {finding.name} must be {force:.3g}, but the limit is "
         f"{finding.limit:.3g} {finding.unit}: check efforts and inertias of the "
         "robot's file, or give `limits.force`"
     )

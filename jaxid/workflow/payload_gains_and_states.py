@@ -77,7 +77,7 @@ def fit_runs(
     if not has_plain_estimator(setup):
         doubts.append(
             "all runs are weighted least squares here: "
-            "the rest of `[estimator]` does not count"
+            "the rest of `[estimator]` is ignored"
         )
     progress("finding base parameters", 0.0)
     paths = [path for group in groups.values() for path in group]
@@ -268,8 +268,8 @@ def identify_states_from_logs(
     _, chance = states.sharing
     if chance < MIN_CHANCE_OF_SHARING:
         doubts.append(
-            "the states do not agree on what they share (chance "
-            f"{100 * chance:.2g} %): something else than friction and offsets differs"
+            "the states differ in more than friction and offsets (the probability of "
+            f"such differences by chance is {100 * chance:.2g} %)"
         )
     first_state, *other_states = groups
     comparisons = [states.compare(first_state, state) for state in other_states]

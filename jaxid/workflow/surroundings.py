@@ -111,8 +111,8 @@ class Collision:
             if substitutes:
                 names = ", ".join(f"`{capsule.name}`" for capsule in substitutes)
                 faults.append(
-                    f"the shape of {names} is unknown: stout capsules along the lines "
-                    "between the joints stand in for it; give `capsules` in "
+                    f"the shape of {names} is unknown: thick capsules along the lines "
+                    "between the joints are used instead; give `capsules` in "
                     "`[collision]`, or a file with collision geometry"
                 )
         clearance = None

@@ -63,7 +63,7 @@ def test_every_target_is_written_from_a_report(report, run, tmp_path, target, fi
     assert ("!  `arm.urdf` cannot hold Ia1: " in out) == (target == "urdf")
     code, _, err = run("report", "--to", target)
     assert code == 2
-    assert "is there already" in err
+    assert "already exists" in err
     assert run("report/model.json", "--to", target, "--force")[0] == 0
     if target == "json":
         assert jid.load_fit("arm.json").checksum == report.checksum
@@ -83,12 +83,15 @@ def test_files_hold_the_model(report, run, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("nowhere", "--to", "c"), "`nowhere` is no file or folder"),
+        (("nowhere", "--to", "c"), "`nowhere` does not exist"),
         (("empty", "--to", "c"), "`empty` must be a folder"),
         (("report", "--to", "c", "-o", "arm.h"), "must be a C file like arm.c"),
         (("report", "--to", "c", "-o", "7arm.c"), "names in C code"),
         (("report", "--to", "json", "-o", "empty"), "`empty` is a folder"),
-        (("report", "--to", "urdf", "--urdf", "other.urdf"), "`other.urdf` is no file"),
+        (
+            ("report", "--to", "urdf", "--urdf", "other.urdf"),
+            "`other.urdf` does not exist",
+        ),
         (("built_in.json", "--to", "urdf"), "name it with `--urdf`"),
         (("built_in.json", "--to", "mjcf"), 'kind = "consistent"'),
     ],

@@ -112,7 +112,7 @@ def test_an_estimator_with_functions_is_kept_in_words(fit, tmp_path):
     ("change", "message"),
     [
         (lambda d: d.update(version=2), "version 2, but this jaxid reads version 1"),
-        (lambda d: d.update(format="arm"), "is no model file"),
+        (lambda d: d.update(format="arm"), "is not a model file"),
         (lambda d: d.pop("model"), "damaged"),
         (lambda d: d.update(checksum="sha256:0"), "changed by hand"),
         (lambda d: d["model"]["parameters"]["float64"].append(1.0), "shape"),
@@ -126,7 +126,7 @@ def test_an_estimator_with_functions_is_kept_in_words(fit, tmp_path):
         (lambda d: d["model"].update(weights=None), "`weights` holds None"),
         (
             lambda d: d["model"].update(weights={"float64": ["one", 1.0]}),
-            "`weights` is no array",
+            "`weights` is not an array",
         ),
         (lambda d: d["model"].update(weights={"object": []}), "has the keys object"),
         (lambda d: d["model"].update(rows=[1.5, 2]), r"`rows\[0\]` holds 1.5"),
@@ -152,5 +152,5 @@ def test_a_wrong_model_file_is_refused_in_one_sentence(path, change, message):
 def test_other_documents_are_refused(tmp_path, text):
     path = tmp_path / "arm.json"
     path.write_text(text, encoding="utf-8")
-    with pytest.raises(ValueError, match="is no model file"):
+    with pytest.raises(ValueError, match="is not a model file"):
         jid.load_fit(path)

@@ -187,7 +187,7 @@ def test_a_gain_that_the_load_does_not_tell_stays_one(base, joint):
     found = jid.identify_drive_gains(*fits, LOAD)
     others = np.arange(3) != joint
     assert found.gains[joint] == 1.0
-    assert f"do not tell the gain of `joint{joint + 1}`" in found.remarks[0].text
+    assert f"do not determine the gain of `joint{joint + 1}`" in found.remarks[0].text
     np.testing.assert_allclose(found.gains[others], GAINS[others], rtol=0.02)
 
 

@@ -169,7 +169,8 @@ def test_fits_with_weights_of_their_own_keep_them(base, truths, logs):
         lambda: jid.identify_payload(one, one),
     ):
         with pytest.raises(
-            ValueError, match="have seen the same data, which would count twice"
+            ValueError,
+            match="were identified from the same data, which would count twice",
         ):
             twice()
 

@@ -153,7 +153,10 @@ def test_text_of_any_kind(base, numbers, tmp_path, separator, header, end, point
         ("15,0,,0,0,0", "is empty"),
         ("15,0,nan,0,0,0", "is not finite"),
         ('15,0,",0,0,0', "an open quotation"),
-        ("1,2,3,4,5,6,7", "line 15001 of `log.csv` is no row .7 cells, but 6 columns"),
+        (
+            "1,2,3,4,5,6,7",
+            "line 15001 of `log.csv` is not a row .7 cells, but 6 columns",
+        ),
     ],
 )
 def test_bad_rows_of_long_texts_are_named(base, text, row, complaint):
@@ -194,7 +197,7 @@ def test_gaps_slow_rows_and_limits_as_in_memory(base, numbers, tmp_path):
 
 def test_refusals(base, numbers, parquet, tmp_path):
     robot, (time, angles, forces) = base.model.robot, numbers
-    with pytest.raises(ValueError, match="is no file"):
+    with pytest.raises(ValueError, match="is not a file"):
         scan_log(tmp_path / "none.parquet", COLUMNS, robot, SMOOTH)
     with pytest.raises(NeedsMemory, match="PeriodicFourier"):
         scan_log(parquet, COLUMNS, robot, jid.filters.PeriodicFourier(2.0, 3))

@@ -265,7 +265,7 @@ def periodic(periods, harmonics):
         (lambda: ZeroPhaseButterworth(5.0, margin=-1.0), "`margin`"),
         (lambda: PaperFilter(velocity=-1), "`velocity` of `PaperFilter`"),
         (lambda: PeriodicFourier(0, 5), "`period`"),
-        (lambda: periodic(0.9, 5), "joint 1 leave a Fourier series .* `period`"),
+        (lambda: periodic(0.9, 5), "joint 1 deviate from a Fourier series .* `period`"),
         (lambda: periodic(2.1, 5), "record whole periods"),
         (lambda: PaperFilter().edge(1 / 380), r"`velocity` .* faster than 381\.972 Hz"),
         (lambda: PaperFilter().motion(np.zeros((99, 1)), None, 1 / 380), "`velocity`"),

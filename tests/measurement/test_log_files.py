@@ -402,7 +402,7 @@ def test_lengths_and_shapes_must_agree(tmp_path):
     )
     lying = Columns(angles="q", forces="tau", time="t")
     refused(tmp_path / "lying.npz", lying, "50 samples")
-    refused(tmp_path / "none.csv", COLUMNS, "is no file")
+    refused(tmp_path / "none.csv", COLUMNS, "is not a file")
 
 
 @pytest.mark.parametrize(

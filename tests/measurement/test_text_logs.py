@@ -278,5 +278,5 @@ def test_a_text_that_is_no_table_is_refused_at_once(tmp_path):
     rows = "\n".join(f"0.0{k},0.{k},0.{k}" for k in range(20))
     path = tmp_path / "log.csv"
     path.write_text(f"t,q1,tau1\n{rows}\n" + '"\n' * 110_000)
-    with pytest.raises(InputError, match=r"110000 lines of `log\.csv` are no rows"):
+    with pytest.raises(InputError, match=r"110000 lines of `log\.csv` are not rows"):
         read_recording(path, Columns("q{}", "tau{}", time="t"))

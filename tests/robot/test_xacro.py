@@ -124,7 +124,7 @@ def test_a_missing_argument_is_named_with_its_cure(install, tmp_path):
 def test_only_xacro_files_have_arguments(tmp_path):
     path = tmp_path / "arm.urdf"
     path.write_text("<robot/>")
-    with pytest.raises(InputError, match=r"no xacro file.*remove `xacro_arguments`"):
+    with pytest.raises(InputError, match=r"not a xacro file.*remove `xacro_arguments`"):
         jid.load_urdf(path, xacro_arguments={"dof": "6"})
 
 

@@ -106,7 +106,10 @@ contacts = { short_1 = [[4.0, 6.0]] }"""
     assert findings[text] == "doubtful"
     stiffness, *others = text.removeprefix("Given gains: ").split("; ")
     # No weight acts on the first joint.
-    assert stiffness == "stiffness of turn 12 N m/rad, which the logs do not tell"
+    assert (
+        stiffness
+        == "stiffness of turn 12 N m/rad, which cannot be determined from the logs"
+    )
     # The second joint has 15.
     assert re.match(
         r"stiffness of lift 11 N m/rad, estimated 1[45]\.\d+ ± 0\.\d+: differs",
@@ -114,7 +117,7 @@ contacts = { short_1 = [[4.0, 6.0]] }"""
     )
     assert re.match(r"damping of turn 0.5 N m s/rad, .*: agrees", others[1])
     assert re.match(r"damping of lift 1.3 N m s/rad, .*: differs", others[2])
-    assert others[3].endswith("which the logs do not tell.")
+    assert others[3].endswith("which cannot be determined from the logs.")
 
 
 def test_contacts_of_a_log_that_is_not_there_are_refused(folder, monkeypatch):
@@ -214,7 +217,7 @@ def test_keys_of_effects_that_are_always_tried_are_unknown(folder, monkeypatch, 
     monkeypatch.chdir(folder)
     (folder / "former.toml").write_text(f"{FILE}{key}\n")
     done = CliRunner().invoke(app, ["rollout", "former.toml", "a.csv", "-o", "none"])
-    assert f"`rollout.{key.split()[0]}` is no known key" in str(done.exception)
+    assert f"`rollout.{key.split()[0]}` is not a known key" in str(done.exception)
 
 
 def test_dry_friction_with_torques_must_be_smooth(driven, monkeypatch):

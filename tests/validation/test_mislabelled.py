@@ -338,7 +338,7 @@ def test_a_late_force_of_one_joint_and_a_wrong_ratio_are_named(motors, said):
     late = forces.copy()
     late[12:, 1] = forces[:-12, 1]
     (sentence,) = said(angles, late)
-    assert sentence.startswith("the force of joint `joint2` seems to stand 6")
+    assert sentence.startswith("the force of joint `joint2` seems to be 6")
     q = np.asarray(ROBOT.drives.joint_angles(angles)) * [1.0, 1.0, 1.25, 1.0]
     (sentence,) = said(np.asarray(ROBOT.drives.motor_angles(q)), forces)
     assert "the gear ratio of joint `joint3` seems to be wrong" in sentence

@@ -18,7 +18,7 @@ class RotorInertia(AbstractTerm):
     joint_parameters = (
         JointParameter(
             "Ia",
-            "inertia of the motor's rotor, seen from the joint",
+            "inertia of the motor's rotor, reflected to the joint",
             ("kg m²", "kg"),
             "inertia",
         ),

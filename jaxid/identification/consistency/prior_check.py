@@ -69,7 +69,7 @@ def choose_pull(
     ball_square, *squares = _unseen_squares(rows, weights, solve, [balls, *pulls])
     if min(squares) > MAX_GROWTH * ball_square:
         note = (
-            "the bodies of the robot's file are no prior: "
+            "the bodies of the robot's file are not used as a prior: "
             "with them the model predicts unseen parts of the logs worse."
         )
         return ChosenPull(balls, (note,))

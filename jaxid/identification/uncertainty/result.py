@@ -80,7 +80,7 @@ class Uncertainty(eqx.Module):
             number = int(np.argmax(~np.isfinite(deviations))) + 1
             raise InputError(
                 "draws need parameters that the logs determine, "
-                f"but number {number} is open."
+                f"but number {number} is not."
             )
         correlation = self.covariance / np.outer(deviations, deviations)
         variances, axes = np.linalg.eigh(correlation)

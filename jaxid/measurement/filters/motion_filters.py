@@ -291,7 +291,7 @@ def _require_series(angles: AnyArray, q: AnyArray) -> None:
     if wrong_joints:
         j = wrong_joints[0]
         raise InputError(
-            f"the angles of joint {j + 1} leave a Fourier series by "
+            f"the angles of joint {j + 1} deviate from a Fourier series by "
             f"{error[j] / motion[j]:.0%} of their motion (RMS): correct `period` or "
             "`harmonics`, or crop the log."
         )

@@ -55,10 +55,8 @@ def readable(source: str, kind: str) -> Iterator[None]:
         if isinstance(error, MemoryError):
             reason = "it declares more data than the memory can hold"
         elif isinstance(error, UnicodeDecodeError):
-            reason = "it holds bytes that are no text"
-        raise InputError(
-            f"`{source}` is no {kind}, or is damaged: {reason}."
-        ) from error
+            reason = "it holds bytes that are not text"
+        raise InputError(f"`{source}` cannot be read as {kind}: {reason}.") from error
 
 
 def refuse_inflation(path: Path, sizes: Mapping[str, int]) -> None:
@@ -186,7 +184,7 @@ class LogTable:
             )
         array = np.array(array.reshape(len(array), -1), np.float64)
         size = np.abs(array).max(axis=1)
-        complaint = "is not finite, or larger than any sensor tells ({:.2g} in size)"
+        complaint = "is not finite, or too large for a sensor ({:.2g} in size)"
         self.refuse_first(name, ~(size <= MAX_NUMBER), size, complaint)
         return array
 

@@ -121,7 +121,7 @@ class TextFile(TextColumns, AbstractLogFile):
         complaints = bad_lines(self.format, block)
         if len(complaints) > MAX_BAD_LINES:
             raise InputError(
-                f"{len(complaints)} lines of `{self.path.name}` are no rows, such as "
+                f"{len(complaints)} lines of `{self.path.name}` are not rows, such as "
                 f"line {first_line + min(complaints)}: export the log again."
             )
         if complaints:
@@ -130,8 +130,8 @@ class TextFile(TextColumns, AbstractLogFile):
                 number = first_line + k
                 if bad_rows is None:
                     raise NeedsMemory(
-                        f"line {number} of `{self.path.name}` is no row ({complaint}): "
-                        "repair or remove that line."
+                        f"line {number} of `{self.path.name}` is not a row "
+                        f"({complaint}): repair or remove that line."
                     )
                 bad_rows[number] = f"line {number} ({complaint})"
                 lines[k] = blank_row(self.format)
@@ -255,7 +255,7 @@ def calendar_stamps(part: LogTable, name: str) -> pl.Series:
     for pattern, text in STAMP_PARTS.items():
         texts = texts.str.replace_all(pattern, text)
     dates = texts.str.to_datetime("%Y-%m-%d %T%.f", time_unit="ns", strict=False)
-    complaint = "is `{}`, no number and no time"
+    complaint = "is `{}`, neither a number nor a time"
     is_bad = dates.is_null().to_numpy()
     part.refuse_first(name, is_bad, part.columns[name], complaint)
 

@@ -55,7 +55,7 @@ def test_bodies_that_predict_worse_are_dropped_with_a_line(case, monkeypatch):
     monkeypatch.setattr(prior_check, "MAX_GROWTH", 0.0)
     result = fit(case, true_bodies(case[1]))
     assert result.consistency.pull.bodies is None
-    assert any("no prior" in note for note in result.notes)
+    assert any("not used as a prior" in note for note in result.notes)
     np.testing.assert_array_equal(result.parameters, fit(case, None).parameters)
 
 
