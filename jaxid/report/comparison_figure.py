@@ -51,6 +51,9 @@ def _comparison_panel(comparison: Comparison, shown: np.ndarray) -> Panel:
     ends = np.max(np.where(np.isfinite(sizes), sizes, 0.0), axis=0)
     scale = np.where(ends > 0, ends, 1.0)
 
+    # Without negative values half of the axis would be empty.
+    min_value = -1.08 if np.any(estimates < half_widths) else -0.08
+
     names = [comparison.names[k] for k in shown]
     curves = []
     for fit, estimate, half_width, colour, offset in zip(
@@ -75,7 +78,7 @@ def _comparison_panel(comparison: Comparison, shown: np.ndarray) -> Panel:
     return Panel(
         curves,
         x="estimate, scaled to the end of its intervals",
-        x_range=(-1.08, 1.08),
+        x_range=(min_value, 1.08),
         y_names=[
             name + " *" * mark for name, mark in zip(names, is_changed, strict=True)
         ],

@@ -359,7 +359,14 @@ def motion_figure(errors: RolloutErrors, motion: int, units: Sequence[str]) -> F
     panels = []
     for j, name in enumerate(errors.joint_names):
         curves = [
-            Curve(time, path[motion][j], label, colour, width=width)
+            Curve(
+                time,
+                path[motion][j],
+                label,
+                colour,
+                width=width,
+                dashed=label == "commanded",
+            )
             for label, (path, colour, width) in paths.items()
         ]
         rms = significant(errors.rms()[motion, j] * 1e3)

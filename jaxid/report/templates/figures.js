@@ -268,7 +268,9 @@
   function sketchAll(isPaper) {
     for (const chart of charts) {
       const columns = Number(chart.closest(".panels").style.getPropertyValue("--columns")), height = parseFloat(chart.style.height);
-      const [width, share] = isPaper ? [columns > 1 ? 224 : 690, 0.55] : [chart.clientWidth || 600, 1];
+      // Names need all of the height.
+      const paperShare = chart.content.panels?.[0].y_names.length ? 1 : 0.55;
+      const [width, share] = isPaper ? [columns > 1 ? 224 : 690, paperShare] : [chart.clientWidth || 600, 1];
       chart.querySelector(":scope > .sketch")?.remove();
       chart.insertAdjacentHTML("afterbegin", sketches.draw(chart.content, width, Math.round(height * share)));
     }
@@ -288,7 +290,8 @@
     const clouds = [path, ...frames.points].map(({ x, y, z }) => [x, y, z]);
     if (frames.solids) for (let k = 0; k < frames.time.length; k += 5) clouds.push(placed(frames.solids, k));
     const ends = [0, 1, 2].map((axis) => sketches.extent(clouds.flatMap((cloud) => sketches.extent(cloud[axis]))));
-    const margin = 0.06 * Math.max(...ends.map(([low, high]) => high - low));
+    // The axes of all joints of a robot may meet in one point.
+    const margin = Math.max(0.05, 0.06 * Math.max(...ends.map(([low, high]) => high - low)));
     return ends.map(([low, high]) => [low - margin, high + margin]);
   }
 

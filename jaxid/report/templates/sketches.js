@@ -98,7 +98,9 @@ const sketches = (() => {
     if (names.length) return axisBetween([-0.6, names.length - 0.4], top, bottom, { names });
     const keys = curves.some((curve) => curve.kind === "band") ? ["y", "low", "high"] : ["y"];
     const zero = curves.some((curve) => curve.kind === "bars") ? [{ y: [0] }] : [];
-    const range = panel.y_range || rangeOf([...curves, ...zero], keys, logarithmic);
+    // The axis holds its limits, too, as that of plotly does.
+    const limits = { y: panel.levels.filter(([which]) => which === "y").map(([, value]) => value) };
+    const range = panel.y_range || rangeOf([...curves, ...zero, limits], keys, logarithmic);
     return axisBetween(range, bottom, top, { logarithmic, count: panel.share < 1 ? 2 : 4 });
   }
 
@@ -127,7 +129,7 @@ const sketches = (() => {
     const levels = panel.levels.map((level) => levelOf(level, across, up, box)).join("");
     const turn = `transform="rotate(-90 ${fontSize} ${rounded(middle)})"`;
     const label = panel.y_names.length ? "" : text(panel.y_label, fontSize, middle, "middle", turn);
-    return `${gridOf(across, up, box)}${levels}${cut}${drawn}</svg>${line(left, top, left, bottom, 'class="axis"')}${label}`;
+    return `${gridOf(across, up, box)}${cut}${levels}${drawn}</svg>${line(left, top, left, bottom, 'class="axis"')}${label}`;
   }
 
   function panelsOf({ panels, curves }, width, height) {
