@@ -236,7 +236,7 @@ plt.show()
 # * [Is my fit good?](../docs/is_my_fit_good.md) lists the questions in order, with thresholds. On the command line all of this is
 #   `jaxid identify experiment.toml log.csv --split 0.6 -o report/`.
 #
-# Next: [bodies that could exist](05_consistency_payload.ipynb).
+# Next: [physically possible bodies](05_consistency_payload.ipynb).
 #
 # ## Exercise
 #

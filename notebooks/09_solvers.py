@@ -66,7 +66,7 @@ print(
 # ## Five solvers
 #
 # A solver is a function of the problem and of random motions, and returns better ones. SciPy's SLSQP and trust-constr take the inequalities as they are, with
-# Jacobians from JAX. The others know no inequalities: they minimise the value with a penalty for the excess, which grows from round to round.
+# Jacobians from JAX. The others do not support inequalities: they minimise the value with a penalty for the excess, which grows from round to round.
 
 
 # %%
@@ -255,7 +255,7 @@ print("shape of the Hessian:", jax.jit(jax.hessian(problem.value))(x).shape)
 #
 # ## Exercise
 #
-# Your optimiser knows no constraints. Write one line that makes the problem free of them, and say how you know that its result keeps the limits.
+# Your optimiser does not support constraints. Write one line that makes the problem free of them, and say how you know that its result keeps the limits.
 #
 # <details markdown="1"><summary>Answer</summary>
 #

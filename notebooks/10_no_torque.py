@@ -123,8 +123,8 @@ right.legend()
 plt.show()
 
 # %% [markdown]
-# Behind the first half second the error is the rounding of the encoder, 0.44 mrad: every sample counts, also those in which the arm sags from a state that no
-# log tells. A linear joint cannot stick and does not sag.
+# After the first half second the error is the rounding of the encoder, 0.44 mrad: every sample counts, also those in which the arm sags from an unknown
+# state. A linear joint cannot stick and does not sag.
 #
 # ## What a log cannot determine
 #

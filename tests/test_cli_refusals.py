@@ -53,7 +53,7 @@ def test_keys(folder, run, key, wrong, sentence):  # noqa: F811
 
 
 COMMANDS = [
-    ("inspect none.toml", "`none.toml` is not a file"),
+    ("inspect none.toml", "`none.toml` does not exist"),
     ("identify experiment.toml none.csv", "`none.csv` does not exist"),
     (
         "identify no.toml none.csv --verify x.csv",
@@ -68,7 +68,7 @@ COMMANDS = [
     ),
     (
         "identify experiment.toml a.csv --verify ./a.csv",
-        "`a.csv` is given both to identify and",
+        "`a.csv` is given both for the fit and",
     ),
     ("identify experiment.toml loop.csv", "`loop.csv` does not exist"),
     (
@@ -95,8 +95,8 @@ COMMANDS = [
     ("inspect a.csv", "`a.csv` is a log; the experiment file comes first"),
     ("inspect arm.urdf", "`jaxid init arm.urdf > experiment.toml` writes one"),
     ("excite experiment.toml -o motion", "`motion` must end in .csv"),
-    ("excite experiment.toml -o truth.csv", "`truth.json` is there al"),
-    ("excite experiment.toml -o mine.csv", "`mine.ros.yaml` is there al"),
+    ("excite experiment.toml -o truth.csv", "`truth.json` already exi"),
+    ("excite experiment.toml -o mine.csv", "`mine.ros.yaml` already exi"),
     ("excite experiment.toml -o pictures.csv", "report.html` already exists"),
 ]
 

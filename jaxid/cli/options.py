@@ -162,7 +162,8 @@ def file_beside(experiment: Path, output: Path | None, name: str, force: bool) -
         )
     if output.parent.resolve() != experiment.parent.resolve():
         raise InputError(
-            "`--output` must lie beside the experiment file: its paths count from it."
+            "`--output` must be in the folder of the experiment file, from which its "
+            "paths are given."
         )
     return output
 

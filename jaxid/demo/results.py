@@ -91,8 +91,8 @@ def remarks(study: Study) -> list[Remark]:
             f"{identification:.2g} % of the largest torque, and to "
             f"{verification:.2g} % on an unseen path.",
             Status.GOOD if is_good else Status.DOUBTFUL,
-            "Mean error of the worst axis; below 1 % in the paper. The true parameters "
-            f"leave {max(study.true_model.mean_errors(0)):.2g} % and "
+            "Mean error of the worst axis; below 1 % in the paper. With the true "
+            f"parameters: {max(study.true_model.mean_errors(0)):.2g} % and "
             f"{true_verification:.2g} %.",
         ),
         Remark(

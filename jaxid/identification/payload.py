@@ -170,7 +170,7 @@ class Payload(Summarised, eqx.Module):
             return Remark(
                 f"With the load the robot is lighter by {significant(-self.mass, 2)} kg"
                 f" (± {significant(half_width, 2)} kg, 95 %): are the logs exchanged, "
-                "or was a tool taken off? Exchange them, which gives what was taken "
+                "or was a tool taken off? Exchange them to identify what was taken "
                 "off.",
                 Status.BAD,
             )

@@ -77,7 +77,7 @@ def _comparison_panel(comparison: Comparison, shown: np.ndarray) -> Panel:
     is_changed = [comparison.verdicts[k] is Verdict.CHANGED for k in shown]
     return Panel(
         curves,
-        x="estimate, scaled to the end of its intervals",
+        x="estimate / largest end of its intervals",
         x_range=(min_value, 1.08),
         y_names=[
             name + " *" * mark for name, mark in zip(names, is_changed, strict=True)

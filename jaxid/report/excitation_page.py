@@ -85,8 +85,8 @@ def write_excitation(
     """
     robot = plan.base.model.robot
     caption = (
-        "The colour of a link is the speed of its joint. The pale shapes were checked "
-        "for collisions; grey ones do not move. Drag the picture to turn it."
+        "The colour of a link shows the speed of its joint. The pale shapes were "
+        "checked for collisions; grey ones do not move. Drag the picture to turn it."
     )
     with double_precision():
         time = np.linspace(0.0, float(played.duration), 801)

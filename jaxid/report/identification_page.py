@@ -104,7 +104,7 @@ def _three_numbers(report: Report) -> Markup:
         ),
         (
             f"{percent(float(errors[worst_joint]))} %",
-            f"the same of the worst joint, {joint_name}",
+            f"the same for the worst joint, {joint_name}",
             Status.NEUTRAL,
         ),
         (
@@ -138,9 +138,9 @@ def _physics(report: Report, figures: Figures) -> Sections:
     They show the robot in motion, its torques before and after, friction and gravity.
     """
     text = (
-        "The colour of a link is the torque error of the joint that moves it; the "
-        "colour of the path is the mean error of all joints. Drag the picture to turn "
-        "it, and move the slider to follow the motion."
+        "The colour of a link shows the torque error of the joint that moves it; the "
+        "colour of the path shows the mean error of all joints. Drag the picture to "
+        "turn it, and move the slider to follow the motion."
     )
     yield "The robot along the motion", [picture(figures["robot"], text)]
     if "before_and_after" in figures:
@@ -180,9 +180,9 @@ def _estimates(report: Report) -> list[Any]:
     """Return friction, rotors and gravity of each joint; all parameters folded."""
     fit = report.fit
     text = (
-        "Each estimate has half the width of its 95 % interval. Masses times distances "
-        "belong to the body that the joint moves, and include what forces cannot tell "
-        "apart from it."
+        "Each estimate is given ± half the width of its 95 % interval. Masses times "
+        "distances belong to the body that the joint moves, together with all that "
+        "forces cannot separate from them."
     )
     note = (
         "* together with what forces cannot separate from it: see its combination. "

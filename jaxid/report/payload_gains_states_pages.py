@@ -152,7 +152,7 @@ def states_answer(states: StatesFit, errors: Mapping[str, Errors]) -> Answer:
         (count, "parameters of friction and offsets that have changed"),
         (
             f"{percent(chance)} %",
-            "probability that the other differences are chance",
+            "probability of the other differences by chance",
         ),
     ]
     figures = [comparison_figure(x) for x in comparisons]

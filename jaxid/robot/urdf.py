@@ -270,7 +270,7 @@ def _limit_by_followers(
         if low[leader] >= high[leader]:
             raise tree.error(
                 joint,
-                "has a range that it leaves wherever the joint that it follows may be: "
+                "is outside its range at all positions of the joint that it follows: "
                 "correct the `<limit>` of both, or `multiplier` and `offset`",
             )
 

@@ -280,7 +280,7 @@ def _judge_bounds(fit: Fit) -> Iterator[Remark]:
         f"residuals; active bounds: {active_bounds}",
         status,
         f"Good: up to {100 * PRICES.doubtful:g} %; tolerable: up to "
-        f"{100 * PRICES.bad:g} %. Above, the logs contradict the bounds: check "
+        f"{100 * PRICES.bad:g} %. Above that, the logs contradict the bounds: check "
         "`total_mass`, `mass_max`, units and signs.",
     )
 

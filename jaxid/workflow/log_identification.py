@@ -233,8 +233,8 @@ def require_separate_logs(
     shared_places = set(places) & {os.path.realpath(log) for log in verify}
     if shared_places:
         raise InputError(
-            f"`{Path(min(shared_places)).name}` is given both to identify and to "
-            "verify with: use `--split`, or `held_out` in Python."
+            f"`{Path(min(shared_places)).name}` is given both for the fit and "
+            "for verification: use `--split`, or `held_out` in Python."
         )
     if all(map(is_report, logs)):
         raise InputError(

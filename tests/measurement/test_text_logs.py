@@ -227,7 +227,9 @@ def test_lines_are_numbered_as_in_the_file(tmp_path):
     stamps = [*CLOCK]
     stamps[7] = "noon"
     (tmp_path / "log.csv").write_text(stamped(stamps))
-    with pytest.raises(ValueError, match=r"line 9 \(`time` is `noon`, no number"):
+    with pytest.raises(
+        ValueError, match=r"line 9 \(`time` is `noon`, neither a number"
+    ):
         read_recording(tmp_path / "log.csv", COLUMNS)
     recording = read_recording(tmp_path / "log.csv", COLUMNS, bad_rows=0.1)
     assert recording.samples == SAMPLES - 1

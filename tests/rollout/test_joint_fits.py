@@ -154,7 +154,7 @@ def test_names_tell_joints_of_one_kind():
     ("alike", "message"),
     [
         ([["elbow"]], "no joint has elbow"),
-        ([["hip"], ["left"]], "`left_hip` is in two"),
+        ([["hip"], ["left"]], "`left_hip` belongs to two"),
     ],
 )
 def test_kinds_that_do_not_fit_the_joints_are_rejected(alike, message):

@@ -206,7 +206,7 @@ def transition_note(base: BaseParameters) -> str:
         )
     ]
     return (
-        "dry friction changes its direction within about these speeds, found from the "
+        "dry friction changes sign within about these speeds, found from the "
         f"logs (`epsilon`): {', '.join(words)}."
     )
 

@@ -56,7 +56,9 @@ def readable(source: str, kind: str) -> Iterator[None]:
             reason = "it declares more data than the memory can hold"
         elif isinstance(error, UnicodeDecodeError):
             reason = "it holds bytes that are not text"
-        raise InputError(f"`{source}` cannot be read as {kind}: {reason}.") from error
+        raise InputError(
+            f"`{source}` is damaged or not a valid {kind}: {reason}."
+        ) from error
 
 
 def refuse_inflation(path: Path, sizes: Mapping[str, int]) -> None:
