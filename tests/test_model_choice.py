@@ -119,7 +119,8 @@ def test_progress_without_a_terminal_is_a_line_now_and_then(monkeypatch, capsys)
     monkeypatch.setattr(terminal.time, "monotonic", lambda: now[0])
     with terminal.progress_bar() as progress:
         for step in range(5):
-            progress("searching", step / 10)
+            progress("measuring errors", step / 10)
             now[0] += 4.0
     lines = capsys.readouterr().err.splitlines()
-    assert lines == ["searching: 30 %, about 28 s left"]
+    # Other stages follow: this one is four fifths of the whole.
+    assert lines == ["measuring errors: 24 %, about 38 s left"]

@@ -128,7 +128,7 @@ def progress_bar() -> Iterator[Progress]:
     is_silent = not console.is_terminal
     with contextlib.nullcontext() if is_silent else bar:
         stage_start = stage_fraction = 0.0
-        line_time = time.monotonic()
+        start_time = line_time = time.monotonic()
 
         def show_stage(stage: str, fraction: float) -> None:
             nonlocal stage_start, stage_fraction, line_time
@@ -138,10 +138,10 @@ def progress_bar() -> Iterator[Progress]:
             part = LONG_PART if LONG_STAGES.search(stage) else SHORT_PART
             share = stage_start + part * (1.0 - stage_start) * fraction
             bar.update(task.id, description=stage, completed=share)
-            if is_silent and time.monotonic() - line_time >= LINE_INTERVAL:
-                line_time = time.monotonic()
-                elapsed_time = task.elapsed or 0.0
-                time_left = elapsed_time * (1.0 / max(share, MIN_SHARE) - 1.0)
+            now = time.monotonic()
+            if is_silent and now - line_time >= LINE_INTERVAL:
+                line_time = now
+                time_left = (now - start_time) * (1.0 / max(share, MIN_SHARE) - 1.0)
                 words = f"{stage}: {100 * share:.0f} %, about {time_left:.0f} s left"
                 console.print(Text(words))
 

@@ -84,8 +84,13 @@ def correlation_blocks(fit: Fit) -> list[Any]:
     """
     covariance = np.asarray(fit.covariance)
     deviations = np.sqrt(np.diag(covariance))
-    correlations = np.triu(covariance / np.outer(deviations, deviations), 1)
+    scale = np.outer(deviations, deviations)
     # Undetermined parameters have no correlation, and are in no pair.
+    is_known = np.isfinite(scale) & (scale > 0.0)
+    every_correlation = np.divide(
+        covariance, scale, out=np.zeros_like(scale), where=is_known
+    )
+    correlations = np.triu(every_correlation, 1)
     first, second = np.nonzero(np.abs(correlations) >= MIN_CORRELATION)
     values = correlations[first, second]
     order = np.argsort(-np.abs(values))[:MAX_PAIRS]

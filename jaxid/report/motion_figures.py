@@ -267,11 +267,12 @@ def surface_points(shape: Shape) -> np.ndarray:
     z = 1.0 - (2.0 * number + 1.0) / BALL_POINTS
     ring = np.sqrt(1.0 - z**2)
     directions = np.stack([ring * np.cos(angle), ring * np.sin(angle), z], axis=1)
+    corners = np.asarray(shape.points)
     if shape.radius > 0.0:
-        points = shape.points[:, None] + shape.radius * directions
+        points = corners[:, None] + shape.radius * directions
         return points.reshape(-1, 3)
-    farthest_points = np.argmax(shape.points @ directions.T, axis=0)
-    return shape.points[np.unique(farthest_points)]
+    farthest_points = np.argmax(corners @ directions.T, axis=0)
+    return corners[np.unique(farthest_points)]
 
 
 def _obstacle_points(obstacle: HalfSpace | Box, size: float) -> np.ndarray:

@@ -14,7 +14,14 @@ from jaxid.export.servo_actuators import (
     simulator_table,
     simulator_values,
 )
-from jaxid.result_table import Column, Remark, Status, Table, significant
+from jaxid.result_table import (
+    Column,
+    Remark,
+    Status,
+    Summarised,
+    Table,
+    significant,
+)
 from jaxid.robot.robot import Robot
 from jaxid.rollout import RolloutErrors, ServoFit, TorqueRolloutFit
 from jaxid.rollout.contact_evidence import contact_finding
@@ -52,7 +59,7 @@ NOT_VALIDATED = Remark(
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class RolloutReport:
+class RolloutReport(Summarised):
     """Content of a report.
 
     Attributes:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
-from jaxid.arrays import AnyArray, Numbers, Vector3
+from jaxid.arrays import AnyArray, Matrix3, Numbers, Vector3
 from jaxid.errors import InputError
 
 from .collision_geometry import Shape, link_shapes, mjcf_shapes
@@ -103,8 +103,8 @@ class LinkShapes(NamedTuple):
 
     link: str
     body: int
-    rotation: np.ndarray
-    position: np.ndarray
+    rotation: Matrix3
+    position: Vector3
     shapes: list[Shape]
 
 

@@ -64,7 +64,8 @@ def commands():
 def errors_of(measured, simulated):
     """Return errors of one motion."""
     names = ("turn", "lift", "elbow")
-    columns = [(x,) for x in (TIME, measured, simulated)]
+    counted = np.ones_like(measured)
+    columns = [(x,) for x in (TIME, measured, simulated, counted)]
     baselines = {"command": (commands(),)}
     return jid.rollout.RolloutErrors(names, ("log",), *columns, baselines)
 
