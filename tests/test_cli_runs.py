@@ -246,7 +246,7 @@ def test_a_report_takes_later_logs(folder, first, run):  # noqa: F811
     assert added["fit"]["rows"] == together["fit"]["rows"]
     assert added["settings"]["identification"] == ["given", "b.csv"]
     assert [e["recording"] for e in added["errors"]["identification"]] == ["b"]
-    said = "were identified from the same data"
+    said = "have seen the same data"
     assert refused(
         run("identify", "experiment.toml", "first", "a.csv", "-o", "twice"), said
     )

@@ -17,19 +17,20 @@ class BestMotion(Farewell):
     def __init__(self, task: MotionTask, output: Path):
         self._task = task
         self._output = output
-        self._is_written = False
+        self._is_writing = False
 
     def keep(self, motion: LinearTrajectory) -> None:
         """Write a better motion."""
         robot = self._task.setup.robot
         excitation = self._task.excitation
         playable = make_playable(robot, excitation, motion)
+        # Ctrl-C may come between the last file and the next line.
+        self._is_writing = True
         write_motion(robot, excitation, playable, self._output)
-        self._is_written = True
 
     def farewell(self) -> str:
         """Return the sentence with which Ctrl-C ends the search."""
-        if not self._is_written:
+        if not (self._is_writing and self._output.exists()):
             return "stopped before a motion kept all limits, and nothing was written"
         faults = self._task.faults
         note = f"; NOT CHECKED: {'; '.join(faults)}" if faults else ""

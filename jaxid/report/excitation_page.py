@@ -130,7 +130,7 @@ def motion_verdict(plan: ExcitationPlan, remarks: Sequence[Remark]) -> Remark:
     unchecked_names = [
         remark.text.split(":")[0]
         for remark in remarks
-        if ": not checked, as" in remark.text
+        if ": not checked, because of" in remark.text
     ]
     if plan.undetermined:
         text = "This motion does not determine all base parameters."
