@@ -149,7 +149,7 @@ def test_text_of_any_kind(base, numbers, tmp_path, separator, header, end, point
 @pytest.mark.parametrize(
     ("row", "complaint"),
     [
-        ("15,x,0,0,0,0", "is `x`, neither a number"),
+        ("15,x,0,0,0,0", "is `x`, not a number"),
         ("15,0,,0,0,0", "is empty"),
         ("15,0,nan,0,0,0", "is not finite"),
         ('15,0,",0,0,0', "an open quotation"),

@@ -31,7 +31,7 @@ MAX_INFLATION = 20
 """Memory of a log, relative to the size of its file; measurements compress less."""
 MIN_REFUSED_MEMORY = 2**26
 """Memory that any file may need [bytes]."""
-NO_NUMBER = "no number"
+NO_NUMBER = "not a number"
 """Words of the complaint about a cell with another text."""
 NUMBER_PARTS = {
     r"(?i)(\d\.?)d([+-]?\d+)$": "${1}e$2",
