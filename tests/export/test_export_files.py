@@ -427,7 +427,7 @@ def test_what_could_not_exist_is_refused_with_the_way_out(fit, tmp_path, write, 
     fit = dataclasses.replace(fit, full_parameters=None if case == "base" else p)
     said = {
         "base": "only base parameters",
-        "body": "body 2 cannot",
+        "body": "body 2 is not",
         "friction": "`damping`",
     }
     with pytest.raises(ValueError, match=f"{said[case]}.*`jid.PhysicallyConsistent"):
