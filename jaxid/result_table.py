@@ -69,11 +69,13 @@ class Remark:
         text: The sentence; a missing full stop is added.
         status: Judgement that the sentence expresses.
         detail: Explanation that is shown smaller.
+        unchecked: Name of a check that was not made, if the sentence says so.
     """
 
     text: str
     status: Status = Status.NEUTRAL
     detail: str = ""
+    unchecked: str = ""
 
     def __post_init__(self) -> None:
         stop = "" if self.text.endswith((".", "?", "!")) else "."

@@ -127,11 +127,7 @@ def write_excitation(
 def motion_verdict(plan: ExcitationPlan, remarks: Sequence[Remark]) -> Remark:
     """Return the verdict on a motion in one sentence; `remarks` has one per check."""
     status = Status.BAD
-    unchecked_names = [
-        remark.text.split(":")[0]
-        for remark in remarks
-        if ": not checked, because of" in remark.text
-    ]
+    unchecked_names = [remark.unchecked for remark in remarks if remark.unchecked]
     if plan.undetermined:
         text = "This motion does not determine all base parameters."
     elif not plan.feasible:

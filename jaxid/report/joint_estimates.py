@@ -31,18 +31,25 @@ def joint_table(report: Report) -> Table:
     fit = report.fit
     robot = fit.base.model.robot
     units = dict(zip(fit.base.names, fit.base.units, strict=True))
-    # The row of a joint, and below it that of the robot's file, if it has values.
     sources = [_estimate_texts(fit), *_claim_texts(report)]
-    heads = ("", "in the robot's file")[: len(sources)]
-    columns = [Column("joint", [x or name for name in robot.body_names for x in heads])]
+    has_claims = len(sources) > 1
+    heads = []
+    for name in robot.body_names:
+        heads.append(name)
+        if has_claims:
+            heads.append("in the robot's file")
+    columns = [Column("joint", heads)]
     for symbol, meaning in _meanings(fit.base.model).items():
         names = [f"{symbol}{number}" for number in range(1, robot.bodies + 1)]
+        known_names = [name for name in names if name in units]
+        if not known_names:
+            continue
         texts = [source.get(name, MISSING) for name in names for source in sources]
-        column_units = dict.fromkeys(units[name] for name in names if name in units)
-        if column_units:
-            columns.append(Column(meaning, texts, " or ".join(column_units)))
-    rows = len(columns[0].values)
-    return Table("", *columns, rules=range(2, rows, 2) if len(sources) > 1 else ())
+        unit = " or ".join(dict.fromkeys(units[name] for name in known_names))
+        columns.append(Column(meaning, texts, unit))
+    # A line separates the pairs of rows.
+    rules = range(2, len(heads), 2) if has_claims else ()
+    return Table("", *columns, rules=rules)
 
 
 def _meanings(model: Model) -> dict[str, str]:

@@ -71,7 +71,8 @@ def check_floor(
     if has_floor:
         return Remark("floor: no shape of the robot can come near it", Status.GOOD)
     if surroundings.collision.floor is False:
-        return Remark("floor: not checked, because of `floor = false`", Status.DOUBTFUL)
+        text = "floor: not checked, because of `floor = false`"
+        return Remark(text, Status.DOUBTFUL, unchecked="floor")
     return Remark("floor: not checked, no shape of the robot is known", Status.BAD)
 
 
@@ -88,7 +89,7 @@ def check_self_collision(
         yield judge("self-collision", findings)
     elif not surroundings.collision.fit:
         text = "self-collision: not checked, because of `fit = false`"
-        yield Remark(text, Status.DOUBTFUL)
+        yield Remark(text, Status.DOUBTFUL, unchecked="self-collision")
     elif not surroundings.faults:
         yield Remark("self-collision: no two bodies can meet", Status.GOOD)
 
