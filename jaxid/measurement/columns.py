@@ -63,8 +63,8 @@ class Columns:
         forces: Joint forces, motor torques or motor currents.
         velocities: Measured velocities, on the same side as the angles, like `"dq{}"`;
             None if there are none.
-        time: Time stamps, or a list of two columns with seconds and nanoseconds; None
-            for `sample_time`, or the clock of bags and LeRobot data sets.
+        time: Time stamps, or a list of two columns with seconds and nanoseconds;
+            `sample_time`, or the clock of bags and LeRobot data sets, if None.
         sample_time: Time between two rows [s], instead of time stamps, like `0.001`.
         time_unit: Unit of the stamps.
         angle_unit: Unit of the angles; or the angle of a one in the log [rad or m], as
