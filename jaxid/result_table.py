@@ -45,6 +45,8 @@ class Status(enum.Enum):
     NEUTRAL = "·"
 
 
+SEVERITIES = (Status.BAD, Status.DOUBTFUL, Status.GOOD, Status.NEUTRAL)
+"""Order of remarks."""
 STYLES = {
     Status.GOOD: "green",
     Status.DOUBTFUL: "yellow",
@@ -151,6 +153,11 @@ def percent(fraction: float, digits: int = 2) -> str:
     if not math.isfinite(value) or abs(value) < 100:
         return significant(value, digits)
     return f"{value:.0f}" if abs(value) < 1e4 else f"{value:.0e}"
+
+
+def sort_remarks(remarks: Iterable[Remark]) -> list[Remark]:
+    """Return remarks with the most severe first; those of one status in their order."""
+    return sorted(remarks, key=lambda remark: SEVERITIES.index(remark.status))
 
 
 def with_deviation(value: float, deviation: float) -> tuple[str, str]:

@@ -1,6 +1,6 @@
 """Page and remarks of a designed excitation motion."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -8,10 +8,9 @@ import numpy as np
 from jaxid.arrays import double_precision
 from jaxid.excitation.design_result import ExcitationPlan
 from jaxid.io import write_text
-from jaxid.result_table import Remark, Status, significant
+from jaxid.result_table import Remark, Status, significant, sort_remarks
 from jaxid.robot.collision import CollisionModel
 from jaxid.trajectory.trajectory import AbstractTrajectory
-from jaxid.validation.judgement import SEVERITIES
 
 from .motion_figures import joint_figure, speed_figure
 from .page import Settings, picture, provenance, render_page
@@ -63,11 +62,6 @@ def _assumed_limits(plan: ExcitationPlan) -> str:
         joint = robot.joint_names[j]
         texts.append(f"{name} of `{joint}` ({value:.4g} {unit})")
     return ", ".join(texts)
-
-
-def sort_remarks(remarks: Iterable[Remark]) -> list[Remark]:
-    """Return remarks sorted by status: bad ones first, neutral ones last."""
-    return sorted(remarks, key=lambda remark: SEVERITIES.index(remark.status))
 
 
 def write_excitation(

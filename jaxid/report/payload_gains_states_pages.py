@@ -11,7 +11,7 @@ from jaxid.identification.fit_result import Fit
 from jaxid.identification.operating_states import StatesFit
 from jaxid.identification.parameter_changes import Verdict
 from jaxid.identification.payload import Payload
-from jaxid.result_table import percent, significant
+from jaxid.result_table import percent, significant, with_deviation
 from jaxid.robot.robot import Robot
 from jaxid.validation.torque_errors import TorqueErrors, relative_error
 
@@ -40,7 +40,9 @@ def payload_answer(
     """
     joint = robot.body_names[payload.body]
     residual, loaded_residual = map(percent, payload.residuals)
-    _, _, mass, half_width, _ = map(str.strip, payload.summary().rows[0])
+    mass, half_width = with_deviation(
+        payload.mass, float(payload.uncertainty.half_widths()[0])
+    )
     figures = []
     for errors, loaded_errors in zip(unloaded, loaded, strict=True):
         title = (

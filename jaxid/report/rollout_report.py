@@ -21,11 +21,12 @@ from jaxid.result_table import (
     Summarised,
     Table,
     significant,
+    sort_remarks,
 )
 from jaxid.robot.robot import Robot
 from jaxid.rollout import RolloutErrors, ServoFit, TorqueRolloutFit
 from jaxid.rollout.contact_evidence import contact_finding
-from jaxid.validation.judgement import SEVERITIES, Judgement
+from jaxid.validation.judgement import Judgement
 
 from .figure import Figure
 from .figure_elements import (
@@ -95,9 +96,7 @@ class RolloutReport(Summarised):
     @property
     def judgement(self) -> Judgement:
         """Findings, the most severe first, and the verdict that sums them up."""
-        findings = [*self._judge_errors(), *self.findings]
-        # Sorting keeps the order of findings with one severity.
-        findings.sort(key=lambda x: SEVERITIES.index(x.status))
+        findings = sort_remarks([*self._judge_errors(), *self.findings])
         verdict = Remark("A good simulation: nothing speaks against it", Status.GOOD)
         if findings[0].status is Status.DOUBTFUL:
             text = "A usable simulation; look at what is marked ! before you rely on it"
@@ -122,9 +121,6 @@ class RolloutReport(Summarised):
             f"{joint_name}",
             Status.GOOD if is_good.all() else Status.DOUBTFUL,
         )
-        contact = contact_finding(self.robot, self.errors)
-        if contact is not None:
-            yield Remark(contact, Status.DOUBTFUL)
 
     @property
     def _is_good(self) -> np.ndarray:
@@ -252,6 +248,14 @@ class ServoRolloutReport(RolloutReport):
     fit: ServoFit
     windows: Vector
     samples: int
+
+    def _judge_errors(self) -> Iterator[Remark]:
+        """Judge the errors, and name a contact that the geometry shows."""
+        yield from super()._judge_errors()
+        # Windows that start from measured states cannot show a contact.
+        contact = contact_finding(self.robot, self.errors)
+        if contact is not None:
+            yield Remark(contact, Status.DOUBTFUL)
 
     @property
     def has_stiffness(self) -> bool:

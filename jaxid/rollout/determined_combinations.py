@@ -69,13 +69,6 @@ class Deviations(NamedTuple):
     dof: np.ndarray
     agrees: np.ndarray
 
-    def widened(self, deviations: np.ndarray, dof: np.ndarray) -> "Deviations":
-        """Return the uncertainty with larger deviations."""
-        sizes = np.sqrt(np.maximum(np.diag(self.covariance), 1e-300))
-        factor = deviations / sizes
-        covariance = self.covariance * np.outer(factor, factor)
-        return Deviations(covariance, dof, self.agrees)
-
 
 class JointRows(NamedTuple):
     """Sensitivities of one joint, less what initial states can imitate.

@@ -329,6 +329,7 @@ def identify_torque_rollout(
     # Large robots are simulated in fewer windows.
     stride = math.ceil(windows.measured.size * len(start) / MAX_DERIVATIVES)
     windows = Windows(*(np.asarray(x)[..., ::stride] for x in windows))
+    _require_stable_simulation(rollout, start, windows, horizon)
     limits = np.full(len(start), np.inf)
     limits[-1] = MAX_DELAY
 
@@ -341,15 +342,35 @@ def identify_torque_rollout(
             residuals, start, -limits, limits, args=windows, rtol=1e-5, max_steps=50
         )
     errors = np.asarray(minimum.residuals).reshape(-1, *windows.q.shape)
-    if not np.isfinite(errors).all():
-        raise InputError(
-            "`observations`: the simulation diverges from the fit of torques: shorten "
-            "`horizon`, or choose terms of the model that these logs determine."
-        )
     blocks = windows.starts * BLOCKS // (windows.starts.max() + 1)
     uncertainty = _uncertainty(minimum, np.broadcast_to(blocks, errors.shape).ravel())
     unknowns = np.asarray(minimum.x)
     return TorqueRolloutFit(rollout, unknowns, uncertainty, horizon, torque_fit)
+
+
+def _require_stable_simulation(
+    rollout: TorqueRollout, start: Vector, windows: Windows, horizon: float
+) -> None:
+    """Check that the search can start: the simulation is closer than standing still.
+
+    Light links whose inertia the logs leave open make it diverge; a search from there
+    takes minutes and ends nowhere.
+    """
+    with double_precision():
+        errors = np.asarray(jax.jit(rollout.errors)(start, windows))
+    motion = np.asarray(windows.measured) - windows.q
+    excess = np.mean(errors**2 - motion**2, axis=(0, 2))
+    # A simulation that diverges may end without numbers.
+    is_close = excess < 0
+    if not is_close.all():
+        names = np.array(rollout.base.model.robot.joint_names)[~is_close]
+        raise InputError(
+            f"`observations`: under the recorded torques a simulation of "
+            f"{', '.join(names)} misses more within {horizon:g} s than a joint at "
+            "rest would: these logs determine torques (`jaxid identify`), but no "
+            "simulation. Robots whose logs hold commanded positions need "
+            "`recording.commands`."
+        )
 
 
 def _listed(logs: Logs) -> list[Observations]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxid.dynamics.terms import ConstantOffset
 from jaxid.identification.fit_result import Fit
-from jaxid.result_table import Remark, Status, percent, significant
+from jaxid.result_table import Remark, Status, percent, significant, sort_remarks
 from jaxid.robot.collision_geometry import BodyShape
 
 from .torque_errors import (
@@ -71,8 +71,6 @@ MAX_CLAIM_RATIO = 4.0
 
 MAX_FINDINGS = 8
 """Number of findings in a short form of the judgement."""
-SEVERITIES = (Status.BAD, Status.DOUBTFUL, Status.GOOD, Status.NEUTRAL)
-"""Order of the findings."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -171,8 +169,8 @@ def judge(report: Report) -> Judgement:
         *_remarks_on_fit(report),
         *(Remark(note) for note in report.every_note if note not in bound_notes),
     ]
-    # Sorting keeps the order of findings with one severity.
-    findings.sort(key=lambda finding: SEVERITIES.index(finding.status))
+    findings = sort_remarks(findings)
+    # Of a sentence that stands there twice, the most severe one counts.
     unique_findings = {finding.text: finding for finding in reversed(findings)}
     findings = list(reversed(unique_findings.values()))
     return Judgement(tuple(findings), _verdict(report, findings))

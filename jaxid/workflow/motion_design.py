@@ -17,10 +17,9 @@ from jaxid.io import atomic_folder, import_extra
 from jaxid.report.excitation_page import (
     motion_verdict,
     plan_remarks,
-    sort_remarks,
     write_excitation,
 )
-from jaxid.result_table import Remark, Status, Summarised, Table
+from jaxid.result_table import Remark, Status, Summarised, Table, sort_remarks
 from jaxid.robot.robot import Robot, complete_limits
 from jaxid.trajectory.controllers import CONTROLLER_SUFFIXES, CONTROLLERS
 from jaxid.trajectory.files import (

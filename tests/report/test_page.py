@@ -12,9 +12,8 @@ import pytest
 import jaxid as jid
 from jaxid.report.joint_estimates import correlation_blocks, joint_table
 from jaxid.report.page import code, folded, picture, render_page
-from jaxid.result_table import Column, Remark, Status, Table
+from jaxid.result_table import SEVERITIES, Column, Remark, Status, Table
 from jaxid.validation.judgement import (
-    SEVERITIES,
     Report,
     _judge_bounds,
     _judge_offsets,

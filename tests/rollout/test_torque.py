@@ -56,6 +56,16 @@ def test_late_torques_are_found_and_the_simulation_is_closer(base, logs, fit):
     assert "delay" in str(found)
 
 
+def test_torques_that_determine_no_simulation_are_refused(base):
+    log = driven_pendulum.log(0)
+    # The torques of both joints are exchanged.
+    forces = np.asarray(log.forces)[:, ::-1]
+    wrong = jid.Recording.of(log.angles, forces, sample_time=log.sample_time)
+    seen = jid.observe(wrong, base.model.robot, jid.ZeroPhaseButterworth(30.0))
+    with pytest.raises(jid.InputError, match=r"misses more within 0\.1 s than a joint"):
+        jid.rollout.identify_torque_rollout(base, seen, horizon=0.1)
+
+
 def test_consecutive_windows_start_from_measured_states(logs, fit):
     errors = fit.validate(logs[1])
     (time,), (measured,), (simulated,) = errors.time, errors.measured, errors.simulated
