@@ -81,8 +81,7 @@ def as_pinocchio(fit: Fit) -> Any:
     model.upperDryFrictionLimit = dynamics["friction"][order]
     model.lowerDryFrictionLimit = -dynamics["friction"][order]
     tip = pin.SE3(np.asarray(robot.tip_rotation), np.asarray(robot.tip_offset))
-    carrier = ids[robot.tip_body]
-    model.addFrame(pin.Frame("tip", carrier, tip, pin.FrameType.OP_FRAME))
+    model.addFrame(pin.Frame("tip", ids[robot.tip_body], tip, pin.FrameType.OP_FRAME))
     return model
 
 

@@ -2,7 +2,6 @@
 
 import dataclasses
 import hashlib
-import importlib
 import json
 from pathlib import Path
 from typing import Any
@@ -197,7 +196,8 @@ class Fit(Summarised, eqx.Module):
 
     def to_polars(self) -> Any:
         """Return `columns` as a `polars.DataFrame`: one row for each parameter."""
-        polars = importlib.import_module("polars")
+        import polars  # loaded by those who want a frame
+
         return polars.DataFrame(self.columns())
 
     def to_pandas(self) -> Any:

@@ -42,11 +42,10 @@ def joint_table(report: Report) -> Table:
     for symbol, meaning in _meanings(fit.base.model).items():
         names = [f"{symbol}{number}" for number in range(1, robot.bodies + 1)]
         known_names = [name for name in names if name in units]
-        if not known_names:
-            continue
-        texts = [source.get(name, MISSING) for name in names for source in sources]
-        unit = " or ".join(dict.fromkeys(units[name] for name in known_names))
-        columns.append(Column(meaning, texts, unit))
+        if known_names:
+            texts = [source.get(name, MISSING) for name in names for source in sources]
+            unit = " or ".join(dict.fromkeys(units[name] for name in known_names))
+            columns.append(Column(meaning, texts, unit))
     # A line separates the pairs of rows.
     rules = range(2, len(heads), 2) if has_claims else ()
     return Table("", *columns, rules=rules)

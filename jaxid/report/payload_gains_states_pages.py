@@ -40,9 +40,8 @@ def payload_answer(
     """
     joint = robot.body_names[payload.body]
     residual, loaded_residual = map(percent, payload.residuals)
-    mass, half_width = with_deviation(
-        payload.mass, float(payload.uncertainty.half_widths()[0])
-    )
+    half_widths = payload.uncertainty.half_widths()
+    mass, half_width = with_deviation(payload.mass, half_widths[0])
     figures = []
     for errors, loaded_errors in zip(unloaded, loaded, strict=True):
         title = (
