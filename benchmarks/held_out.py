@@ -11,6 +11,7 @@ TX40 and UR10, log A of the KR300, four logs of the double pendulum; the rest is
 the machine's own effect alone, and the three next to the chosen one. "Comes": what
 `identify` prints on the unseen logs, over the promise.
 
+    export OPENBLAS_NUM_THREADS=1                 # NumPy's threads share one core
     python benchmarks/held_out.py                 # everything, 20 minutes
     python benchmarks/held_out.py ur10 crane      # only these
     python benchmarks/held_out.py --quick         # five machines
