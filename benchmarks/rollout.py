@@ -328,7 +328,9 @@ def truth(gain: float, stribeck: bool = False) -> np.ndarray:
 
 
 def inside(fit, x: np.ndarray) -> list[bool]:
-    ends = [(c.interval(), float(np.sum(c.coefficients * x))) for c in fit.combinations]
+    ends = [
+        (c.interval(), float(c.coefficients @ x[c.joint])) for c in fit.combinations
+    ]
     return [low <= value <= high for (low, high), value in ends]
 
 
@@ -480,7 +482,7 @@ def confounded(quick: bool) -> None:
             )
             both = [INDEX[first], INDEX[second]]
             for c, holds in zip(fit.combinations, inside(fit, x), strict=True):
-                if (c.coefficients[0, both] != 0.0).all():
+                if (c.coefficients[both] != 0.0).all():
                     named, hits = named + 1, hits + holds
                     break
         print(
@@ -551,7 +553,7 @@ def go2(quick: bool) -> None:
     kinds: dict[tuple, list] = {}
     for c in fit.combinations:
         kind = fit.joint_names[c.joint].split("_", 1)[1]
-        symbols = tuple(np.flatnonzero(c.coefficients[c.joint]))
+        symbols = tuple(np.flatnonzero(c.coefficients))
         if c.name.split()[0] != "b":
             kinds.setdefault((kind, *symbols), []).append(c)
     agree = []
@@ -559,7 +561,7 @@ def go2(quick: bool) -> None:
         for one, other in itertools.combinations(rows, 2):
             half = [0.5 * float(np.ptp(c.interval())) for c in (one, other)]
             change = fit.parameters[one.joint] - fit.parameters[other.joint]
-            difference = one.coefficients[one.joint] @ change
+            difference = one.coefficients @ change
             agree.append(abs(difference) <= np.hypot(*half))
     print(f"legs agree in {100 * np.mean(agree):.0f} % of {len(agree)} pairs")
 

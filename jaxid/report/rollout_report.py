@@ -303,7 +303,7 @@ class ServoRolloutReport(RolloutReport):
         return {
             "kind": "commands",
             "windows": self.windows,
-            "covariance": self.fit.covariance,
+            "covariance": self.fit.uncertainty.covariance,
             "simulators": simulator_values(self.fit) if self.has_stiffness else None,
         }
 
@@ -314,8 +314,6 @@ def servo_findings(fit: ServoFit) -> list[Remark]:
     gains = gain_finding(fit)
     if gains is not None:
         findings.append(gains)
-    if fit.contacts:
-        findings.append(Remark(f"Contacts were given: {fit.contact_words}"))
     disagreements = sum(not c.agrees for c in fit.combinations)
     if disagreements:
         text = (

@@ -12,10 +12,11 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
+from jaxid.identification.uncertainty import Uncertainty
 from jaxid.identification.uncertainty.spectral import sandwich_of_columns
 
+from .body_loads import Bodies
 from .joint_fits import SIZE, JointFit, Pull
-from .motion import JointParameters
 from .servo import INDEX, PARAMETERS, SCALE
 
 MAX_RELATIVE_DEVIATION = 0.25
@@ -31,7 +32,7 @@ class Combination:
         name: Parameter, with those that are merged into it.
         meaning: Description in words.
         unit: Unit.
-        coefficients: Factor of each parameter of all joints.
+        coefficients: Factor of each parameter of the joint.
         value: Estimate.
         deviation: Standard deviation.
         dof: Degrees of freedom of the deviation.
@@ -43,121 +44,22 @@ class Combination:
     name: str
     meaning: str
     unit: str
-    coefficients: JointParameters
+    coefficients: np.ndarray
     value: float
     deviation: float
     dof: float
     agrees: bool
 
+    @property
+    def is_determined(self) -> bool:
+        """Whether its deviation is a small part of it."""
+        return self.deviation < MAX_RELATIVE_DEVIATION * abs(self.value)
+
     def interval(self, level: float = 0.95) -> tuple[float, float]:
         """Return the confidence interval."""
-        quantile = scipy.special.stdtrit(max(self.dof, 1.0), 0.5 + 0.5 * level)
-        half_width = self.deviation * float(quantile)
+        quantile = float(scipy.special.stdtrit(self.dof, 0.5 + 0.5 * level))
+        half_width = self.deviation * quantile
         return self.value - half_width, self.value + half_width
-
-
-class Deviations(NamedTuple):
-    """Uncertainty of some parameters of a joint.
-
-    Attributes:
-        covariance: Covariance; zero for parameters that count as known.
-        dof: Degrees of freedom of the deviations.
-        agrees: Whether motions agree on each as far as noise lets them.
-    """
-
-    covariance: np.ndarray
-    dof: np.ndarray
-    agrees: np.ndarray
-
-
-class JointRows(NamedTuple):
-    """Sensitivities of one joint, less what initial states can imitate.
-
-    Attributes:
-        columns: Sensitivities of each motion [parameters, samples].
-        residuals: Errors of each motion [samples].
-        roots: Roots of the motions' weights.
-        gradients: Half the gradient of each motion [motions, parameters].
-        information: Gauss-Newton matrix, with the pull between equal joints.
-        counted: Share of the samples of each motion that counts.
-        sample_time: Mean time between two samples [s].
-    """
-
-    columns: list[np.ndarray]
-    residuals: list[np.ndarray]
-    roots: np.ndarray
-    gradients: np.ndarray
-    information: np.ndarray
-    counted: np.ndarray
-    sample_time: float
-
-    def deviations(self, indices: np.ndarray) -> Deviations:
-        """Return the uncertainty if only some parameters are unknown."""
-        motions = len(self.columns)
-        B = np.zeros_like(self.information)
-        place = np.ix_(indices, indices)
-        B[place] = _inverse(self.information[place])
-        squares = np.diag(B)
-        sandwich = sandwich_of_columns(
-            np,
-            [range(len(B))] * motions,
-            self.roots,
-            B,
-            np.zeros((1, len(B))),
-            self.columns,
-            [residuals[None] for residuals in self.residuals],
-            self.counted,
-            self.sample_time,
-        )
-        variance, dof = (x[0] for x in sandwich)
-        # The sandwich is blind where no error can show: there the information alone
-        # tells.
-        sample_count = max(len(self.residuals[0]) * float(self.counted.max()), 1.0)
-        variance = np.maximum(variance, squares / sample_count)
-
-        changes = self.gradients @ B
-        motion_dof = max(motions - 1, 1)
-        scatter = motions / motion_dof * (changes**2).sum(axis=0)
-        limit = scipy.stats.f.ppf(0.95, motion_dof, dof)
-        is_scattered = (motions > 1) & (scatter > limit * variance)
-        dof = np.where(is_scattered, motion_dof, dof)
-        deviation = np.sqrt(np.where(is_scattered, scatter, variance))
-        factor = deviation / np.sqrt(np.maximum(squares, 1e-300))
-        return Deviations(B * np.outer(factor, factor), dof, ~is_scattered)
-
-
-def rows_of_joints(fit: JointFit) -> list[JointRows]:
-    """Return the sensitivities of all joints to all parameters."""
-    r, S = fit.simulator.sensitivities(fit.parameters, fit.start)
-    equations = fit.equations
-    response = equations.response
-    by_parameters = S[..., :SIZE, :] + np.einsum(
-        "mjst,mjsp->mjpt", S[..., SIZE:, :], response
-    )
-    pull = fit.pull.precision(fit.parameters)
-    information = equations.information.sum(axis=0) + pull[..., None] * np.eye(SIZE)
-    motion = fit.simulator.motion
-    counted = motion.counted.mean(axis=-1)
-    return [
-        JointRows(
-            list(by_parameters[:, j]),
-            list(r[:, j]),
-            np.sqrt(fit.weights[:, j]),
-            equations.gradient[:, j],
-            information[j],
-            counted[:, j],
-            float(motion.sample_time.mean()),
-        )
-        for j in range(r.shape[1])
-    ]
-
-
-def _inverse(H: np.ndarray) -> np.ndarray:
-    """Return the inverse of an information matrix, finite where nothing is known."""
-    size = np.sqrt(np.maximum(np.diag(H), 1e-30))
-    values, vectors = np.linalg.eigh(H / np.outer(size, size))
-    scaled_inverse = vectors / np.maximum(values, 1e-12) @ vectors.T
-    return scaled_inverse / np.outer(size, size)
 
 
 class Determination(NamedTuple):
@@ -165,13 +67,11 @@ class Determination(NamedTuple):
 
     Attributes:
         combinations: Parameters and combinations that the logs determine.
-        covariance: Covariance of all free parameters, joint by joint.
-        dof: Degrees of freedom of their deviations.
+        uncertainty: Uncertainty of all free parameters, joint by joint.
     """
 
     combinations: tuple[Combination, ...]
-    covariance: np.ndarray
-    dof: np.ndarray
+    uncertainty: Uncertainty
 
 
 def determined_combinations(
@@ -183,26 +83,28 @@ def determined_combinations(
         fit: Fit.
         groups: Joints of each kind.
     """
-    rows = rows_of_joints(fit)
+    errors, sensitivities = fit.simulator.sensitivities(fit.parameters, fit.start)
+    # Initial states follow the parameters.
+    by_start = np.einsum(
+        "mjst,mjsp->mjpt", sensitivities[..., SIZE:, :], fit.equations.response
+    )
+    columns = sensitivities[..., :SIZE, :] + by_start
     scatter = _scatter_of_equal_joints(fit, groups)
-    kind_sizes = np.ones(len(rows))
-    for group in groups:
-        kind_sizes[list(group)] = len(group)
+    kind_sizes = {j: len(group) for group in groups for j in group}
     combinations = []
-    size = int(fit.free.sum())
-    covariance = np.zeros((size, size))
-    all_dof = np.zeros(size)
-    end = 0
-    for j, joint_rows in enumerate(rows):
-        symbols = np.flatnonzero(fit.free[j])
-        deviations = joint_rows.deviations(symbols)
-        place = slice(end, end + len(symbols))
-        end += len(symbols)
-        covariance[place, place] = deviations.covariance[np.ix_(symbols, symbols)]
-        all_dof[place] = deviations.dof[symbols]
-        joint = _Joint(fit, j, joint_rows, scatter[j], max(kind_sizes[j] - 1.0, 1.0))
-        combinations += joint.combinations(deviations, symbols)
-    return Determination(tuple(combinations), covariance, all_dof)
+    covariances = []
+    dof = []
+    for j, mask in enumerate(fit.free):
+        scatter_dof = max(kind_sizes[j] - 1, 1)
+        joint = _Joint(fit, j, errors[:, j], columns[:, j], scatter[j], scatter_dof)
+        symbols = np.flatnonzero(mask)
+        deviations = joint.deviations(symbols)
+        covariances.append(deviations.covariance)
+        dof.append(deviations.dof)
+        combinations += joint.combinations(symbols, deviations)
+    covariance = scipy.linalg.block_diag(*covariances)
+    uncertainty = Uncertainty(covariance, np.concatenate(dof), covariance)
+    return Determination(tuple(combinations), uncertainty)
 
 
 def _scatter_of_equal_joints(
@@ -225,103 +127,168 @@ def _scatter_of_equal_joints(
     return np.where(fit.free, scatter, 0.0)
 
 
+class Deviations(NamedTuple):
+    """Uncertainty of some parameters of a joint, if the others are known.
+
+    Attributes:
+        covariance: Covariance.
+        dof: Degrees of freedom of the deviations.
+        agrees: Whether motions agree on each as far as noise lets them.
+    """
+
+    covariance: np.ndarray
+    dof: np.ndarray
+    agrees: np.ndarray
+
+
 class _Joint(NamedTuple):
-    """One joint of a fit, with the scatter of joints of its kind and its dof."""
+    """One joint of a fit.
+
+    Attributes:
+        fit: Fit of all joints.
+        number: Index of the joint.
+        errors: Errors [motions, samples].
+        columns: Sensitivities to the parameters, which initial states follow [motions,
+            parameters, samples].
+        scatter: Deviations of the parameters between joints of its kind.
+        scatter_dof: Their degrees of freedom.
+    """
 
     fit: JointFit
     number: int
-    rows: JointRows
+    errors: np.ndarray
+    columns: np.ndarray
     scatter: np.ndarray
-    scatter_dof: float
+    scatter_dof: int
+
+    def deviations(self, symbols: np.ndarray) -> Deviations:
+        """Return the uncertainty if only some parameters are unknown."""
+        fit = self.fit
+        j = self.number
+        pull = fit.pull.precision(fit.parameters)[j]
+        information = fit.equations.information[:, j].sum(axis=0) + np.diag(pull)
+        B = _inverse(information[np.ix_(symbols, symbols)])
+        squares = np.diag(B)
+        motion = fit.simulator.motion
+        motions = motion.motions
+        counted = motion.counted[:, j].mean(axis=-1)
+        variances, dofs = sandwich_of_columns(
+            np,
+            [range(len(B))] * motions,
+            np.sqrt(fit.weights[:, j]),
+            B,
+            np.zeros((1, len(B))),
+            self.columns[:, symbols],
+            self.errors[:, None],
+            counted,
+            float(motion.sample_time.mean()),
+        )
+        # The sandwich is blind where no error can show: there the information alone
+        # tells.
+        sample_count = max(self.errors.shape[-1] * float(counted.max()), 1.0)
+        variance = np.maximum(variances[0], squares / sample_count)
+
+        changes = fit.equations.gradient[:, j, symbols] @ B
+        motion_dof = max(motions - 1, 1)
+        scatter = motions / motion_dof * (changes**2).sum(axis=0)
+        limit = scipy.stats.f.ppf(0.95, motion_dof, dofs[0])
+        is_scattered = (motions > 1) & (scatter > limit * variance)
+        dof = np.where(is_scattered, motion_dof, dofs[0])
+        deviation = np.sqrt(np.where(is_scattered, scatter, variance))
+        factor = deviation / np.sqrt(np.maximum(squares, 1e-300))
+        return Deviations(B * np.outer(factor, factor), dof, ~is_scattered)
 
     def combinations(
-        self, deviations: Deviations, symbols: np.ndarray
+        self, symbols: np.ndarray, deviations: Deviations
     ) -> list[Combination]:
-        """Return what the logs determine of the joint."""
-        x = self.fit.parameters[self.number]
-        sizes = np.maximum(np.abs(x), 0.1 * SCALE)[symbols]
-        place = np.ix_(symbols, symbols)
-        quantiles = scipy.special.stdtrit(deviations.dof[symbols], 0.975)
+        """Return what the logs determine of the joint.
+
+        Args:
+            symbols: Indices of its free parameters.
+            deviations: Their uncertainty.
+        """
+        values = self.fit.parameters[self.number, symbols]
+        sizes = np.maximum(np.abs(values), 0.1 * SCALE[symbols])
+        quantiles = scipy.special.stdtrit(deviations.dof, 0.975)
         factors = quantiles / scipy.special.ndtri(0.975) / sizes
-        reach = np.maximum(np.abs(x[symbols]), SCALE[symbols]) / sizes
+        reach = np.maximum(np.abs(values), SCALE[symbols]) / sizes
         indices, kappa = _merge(
-            deviations.covariance[place] * np.outer(factors, factors), reach
+            deviations.covariance * np.outer(factors, factors), reach
         )
-        kappa = kappa * sizes[indices][:, None] / sizes[None, :]
-        remaining = self.rows.deviations(symbols[indices])
+        kappa = kappa * sizes[indices][:, None] / sizes
+        remaining = self.deviations(symbols[indices])
         combinations = []
-        for k, i in enumerate(symbols[indices]):
+        for k, symbol in enumerate(symbols[indices].tolist()):
             coefficients = np.zeros(SIZE)
             coefficients[symbols] = kappa[k]
-            combinations.append(self._combination(int(i), coefficients, remaining))
+            scatter = float(np.sum((coefficients * self.scatter) ** 2))
+            noise = float(remaining.covariance[k, k])
+            difference = max(scatter - noise, 0.0)
+            # Wider where equal joints differ.
+            is_different = difference > noise
+            dof = float(remaining.dof[k])
+            combination = Combination(
+                self.number,
+                *_description(symbol, coefficients),
+                _unit(symbol, self.number, self.fit.simulator.bodies),
+                coefficients,
+                float(coefficients @ self.fit.parameters[self.number]),
+                float(np.sqrt(noise + difference)),
+                min(dof, self.scatter_dof) if is_different else dof,
+                bool(remaining.agrees[k]) and not is_different,
+            )
+            combinations.append(combination)
         return combinations
 
-    def _combination(
-        self, symbol: int, coefficients: np.ndarray, deviations: Deviations
-    ) -> Combination:
-        """Return a combination, wider where equal joints differ."""
-        merged = [m for m in np.flatnonzero(coefficients) if m != symbol]
-        name = PARAMETERS[symbol].symbol
-        meaning = PARAMETERS[symbol].meaning
-        if merged:
-            terms = (f"{coefficients[m]:+.3g} {PARAMETERS[m].symbol}" for m in merged)
-            meanings = (PARAMETERS[m].meaning for m in merged)
-            name = " ".join((name, *terms))
-            meaning = f"{meaning} and {', '.join(meanings)} only together"
-        noise = float(deviations.covariance[symbol, symbol])
-        scatter = float(np.sum((coefficients * self.scatter) ** 2))
-        difference = max(scatter - noise, 0.0)
-        dof = float(deviations.dof[symbol])
-        agrees = bool(deviations.agrees[symbol])
-        if difference > noise:
-            dof = min(dof, self.scatter_dof)
-            agrees = False
-        all_coefficients = np.zeros_like(self.fit.parameters)
-        all_coefficients[self.number] = coefficients
-        return Combination(
-            self.number,
-            name,
-            meaning,
-            PARAMETERS[symbol].unit,
-            all_coefficients,
-            float(coefficients @ self.fit.parameters[self.number]),
-            float(np.sqrt(noise + difference)),
-            dof,
-            agrees,
-        )
+
+def _description(symbol: int, coefficients: np.ndarray) -> tuple[str, str]:
+    """Return name and meaning of a parameter and those that are merged into it."""
+    name, meaning, *_ = PARAMETERS[symbol]
+    merged = [m for m in np.flatnonzero(coefficients) if m != symbol]
+    if not merged:
+        return name, meaning
+    terms = (f"{coefficients[m]:+.3g} {PARAMETERS[m].symbol}" for m in merged)
+    meanings = ", ".join(PARAMETERS[m].meaning for m in merged)
+    return " ".join((name, *terms)), f"{meaning} and {meanings} only together"
+
+
+def _unit(symbol: int, joint: int, bodies: Bodies | None) -> str:
+    """Return the unit of a parameter of a revolute or linear joint."""
+    unit = PARAMETERS[symbol].unit
+    if bodies is None or bodies.model.robot.revolute[joint]:
+        return unit.replace("u", "rad")
+    return unit.replace("u", "m").replace("(N m)", "N")
+
+
+def _inverse(H: np.ndarray) -> np.ndarray:
+    """Return the inverse of an information matrix, finite where nothing is known."""
+    size = np.sqrt(np.maximum(np.diag(H), 1e-30))
+    values, vectors = np.linalg.eigh(H / np.outer(size, size))
+    scaled_inverse = vectors / np.maximum(values, 1e-12) @ vectors.T
+    return scaled_inverse / np.outer(size, size)
 
 
 def _merge(covariance: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return which relative parameters are determined, and how others merge into them.
 
+    A parameter is determined if its deviation is at most `MAX_RELATIVE_DEVIATION` when
+    only those before it are unknown, too.
+
     Args:
         covariance: Covariance of the relative parameters.
         reach: Usual size of each, to which it may change if it is not determined.
-
-    A parameter is not determined if, with those before it known only by the logs, its
-    deviation exceeds `MAX_RELATIVE_DEVIATION`: its column of the information's root
-    adds almost nothing.
     """
-    n = len(covariance)
     information = _inverse(covariance)
-    values, vectors = np.linalg.eigh(information)
-    W = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
     indices: list[int] = []
-    Q = np.zeros((n, 0))
-    for k in range(n):
-        column = W[:, k]
-        remainder = column - Q @ (Q.T @ column)
-        length = np.linalg.norm(remainder)
-        if length > 1.0 / MAX_RELATIVE_DEVIATION:
+    for k in range(len(covariance)):
+        unknowns = [*indices, k]
+        inverse = _inverse(information[np.ix_(unknowns, unknowns)])
+        if inverse[-1, -1] < MAX_RELATIVE_DEVIATION**2:
             indices.append(k)
-            Q = np.column_stack([Q, remainder / length])
-    kappa = np.zeros((len(indices), n))
-    if indices:
-        columns = W[:, indices]
-        kappa = np.linalg.lstsq(columns, W, rcond=None)[0]
-        kappa[:, indices] = np.eye(len(indices))
-        # What changes a combination by less than its deviation is left out.
-        deviation = np.sqrt(np.diag(np.linalg.inv(columns.T @ columns)))
-        min_change = np.minimum(0.02, deviation)[:, None]
-        kappa[np.abs(kappa) * reach < min_change] = 0.0
+    inverse = _inverse(information[np.ix_(indices, indices)])
+    kappa = inverse @ information[indices]
+    kappa[:, indices] = np.eye(len(indices))
+    # What changes a combination by less than its deviation is left out.
+    min_change = np.minimum(0.02, np.sqrt(np.diag(inverse)))
+    kappa[np.abs(kappa) * reach < min_change[:, None]] = 0.0
     return np.array(indices, int), kappa

@@ -6,9 +6,9 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-import scipy
 
-from jaxid.arrays import Matrix, Vector
+from jaxid.arrays import Vector
+from jaxid.identification.uncertainty import Uncertainty
 from jaxid.measurement.recording import Recording
 from jaxid.result_table import (
     Column,
@@ -21,11 +21,7 @@ from jaxid.result_table import (
 )
 
 from .body_loads import Bodies
-from .determined_combinations import (
-    MAX_RELATIVE_DEVIATION,
-    Combination,
-    determined_combinations,
-)
+from .determined_combinations import Combination, determined_combinations
 from .errors import RolloutErrors
 from .joint_fits import JointFit
 from .motion import Contacts, FreeParameters, JointParameters, ServoMotion
@@ -34,8 +30,6 @@ from .simulation import ServoSimulator
 
 LIMITED_PARAMETERS = [INDEX[x] for x in ("B", "d", "b", "um", "g", "ki")]
 """Parameters that are not at a limit of the search unless something is wrong."""
-MIN_ROUNDING_RATIO = 1.5
-"""Multiple of the encoder's rounding above which slow errors show a missing effect."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,13 +40,12 @@ class ServoFit(Summarised):
         joint_names: Names of the joints.
         parameters: Parameters of each joint, in the order of `jid.rollout.PARAMETERS`.
         free: Parameters that were estimated.
-        covariance: Covariance of the estimated parameters, joint by joint.
-        dof: Degrees of freedom of their deviations.
+        uncertainty: Uncertainty of the estimated parameters, joint by joint.
         combinations: Parameters and combinations that the logs determine.
         linear: Parameters of the linear baseline.
         hold: Whether commands are held until the next one, instead of interpolated.
         time_step: Longest step of the simulation [s].
-        rms: Errors of the identification [motions, joints] [rad or m].
+        rms: Errors of the identification of each joint [rad or m].
         motions: Names of the logs.
         bodies: Bodies whose weight loads the joints; None without.
         load: Mean absolute load of each joint in the logs [N m or N].
@@ -68,13 +61,12 @@ class ServoFit(Summarised):
     joint_names: tuple[str, ...]
     parameters: JointParameters
     free: FreeParameters
-    covariance: Matrix
-    dof: Vector
+    uncertainty: Uncertainty
     combinations: tuple[Combination, ...]
     linear: JointParameters
     hold: bool
     time_step: float
-    rms: Matrix
+    rms: Vector
     motions: tuple[str, ...]
     bodies: Bodies | None
     load: Vector
@@ -101,18 +93,16 @@ class ServoFit(Summarised):
         notes = (
             *_notes_on_effects(undetermined, joint_names),
             *_notes_on_limits(fit, joint_names),
-            *_notes_on_errors(fit, joint_names),
         )
         return cls(
             joint_names=joint_names,
             parameters=fit.parameters,
             free=fit.free,
-            covariance=determination.covariance,
-            dof=determination.dof,
+            uncertainty=determination.uncertainty,
             combinations=determination.combinations,
             hold=simulator.hold,
             time_step=simulator.time_step,
-            rms=np.sqrt(fit.mean_squares),
+            rms=np.sqrt(fit.mean_squares.mean(axis=0)),
             motions=motion.names,
             bodies=simulator.bodies,
             load=np.abs(simulator.loads[0]).mean(axis=(0, 2)),
@@ -130,7 +120,7 @@ class ServoFit(Summarised):
         unknown = np.full(len(self.joint_names), np.nan)
         values = self.gains.get("stiffness", unknown).copy()
         for c in self.combinations:
-            if c.name == "a" and c.deviation < MAX_RELATIVE_DEVIATION * abs(c.value):
+            if c.name == "a" and c.is_determined:
                 values[c.joint] = 1.0 / c.value
         return values
 
@@ -139,21 +129,10 @@ class ServoFit(Summarised):
         description = "held until the next one" if self.hold else "interpolated"
         if self.hold_is_told:
             return description
-        rival = "interpolated, delays are half a sample time longer"
-        if not self.hold:
-            rival = "held until the next one, delays are half a sample time shorter"
-        return f"{description}; the logs fit equally well if they are {rival}"
-
-    @property
-    def contact_words(self) -> str:
-        """Effect of the contacts that were given on the fit, in words."""
-        return f"{self.left_out} samples within them are left out of the fit"
-
-    def _unit(self, c: Combination) -> str:
-        """Return the unit of a parameter of a revolute or linear joint."""
-        if self.bodies is None or self.bodies.model.robot.revolute[c.joint]:
-            return c.unit.replace("u", "rad")
-        return c.unit.replace("u", "m").replace("(N m)", "N")
+        return (
+            f"{description}; the logs fit equally well if they are not, with delays "
+            f"half a sample time {'shorter' if self.hold else 'longer'}"
+        )
 
     def simulate(self, log: Recording) -> list[np.ndarray]:
         """Simulate the segments of a log from their first positions, free-running.
@@ -256,49 +235,26 @@ class ServoFit(Summarised):
             count: Number of draws.
             seed: Seed of the draws.
         """
-        random = np.random.default_rng(seed)
-        deviation = np.sqrt(np.diag(self.covariance))
-        correlation = self.covariance / deviation / deviation[:, None]
-        zeros = np.zeros_like(deviation)
-        normal_draws = random.multivariate_normal(
-            zeros, correlation, count, check_valid="ignore", method="eigh"
-        )
-        probabilities = scipy.special.ndtr(np.clip(normal_draws, -7.0, 7.0))
         draws = np.tile(self.parameters, (count, 1, 1))
-        draws[:, self.free] += deviation * scipy.special.stdtrit(
-            self.dof, probabilities
-        )
+        draws[:, self.free] += self.uncertainty.random_errors(count, seed)
         return np.clip(draws, LOWER, UPPER)
 
     def summary(self) -> Table:
         """Return a table of what the logs determine, with 95 % intervals."""
         rows = self.combinations
-        estimates = np.array([c.value for c in rows])
-        deviations = np.array([c.deviation for c in rows])
         ends = np.array([c.interval() for c in rows]).reshape(-1, 2).T
-        sizes = np.maximum(np.abs(estimates), 1e-12)
-        is_clear = deviations < MAX_RELATIVE_DEVIATION * sizes
-        is_clear &= np.array([c.agrees for c in rows], bool)
         joints = [c.joint for c in rows]
-        joint_rows = (np.flatnonzero(np.diff(joints)) + 1).tolist()
-        rms = np.sqrt((self.rms**2).mean(axis=0))
-        error_texts = ", ".join(
-            f"{name} {significant(1e3 * x)}"
-            for name, x in zip(self.joint_names, rms, strict=True)
-        )
-        K = ", ".join(
-            f"{name} {significant(k)}"
-            for name, k in zip(self.joint_names, self.stiffness, strict=True)
-            if np.isfinite(k)
-        )
+        K = self._by_joint(self.stiffness)
         facts = [
             ("logs", ", ".join(dict.fromkeys(self.motions))),
-            ("errors of the fit", f"{error_texts} mrad or mm RMS"),
+            ("errors of the fit", f"{self._by_joint(1e3 * self.rms)} mrad or mm RMS"),
             ("commands", self._commands),
             ("stiffness", K or "not determined: all parameters are ratios to it"),
         ]
         if self.contacts:
-            facts.append(("contacts given", self.contact_words))
+            text = f"{self.left_out} samples within them are left out of the fit"
+            facts.append(("contacts given", text))
+        is_clear = [c.is_determined and c.agrees for c in rows]
         remarks: list[Remark | str] = [
             "positions determine inertias, friction, load and motor gain only in their "
             "ratios to the stiffness",
@@ -309,11 +265,23 @@ class ServoFit(Summarised):
             Column("joint", [self.joint_names[j] for j in joints]),
             Column("parameter", [c.name for c in rows]),
             Column("meaning", [c.meaning for c in rows]),
-            *estimate_columns(estimates, deviations, ends, [*map(self._unit, rows)]),
+            *estimate_columns(
+                [c.value for c in rows],
+                [c.deviation for c in rows],
+                ends,
+                [c.unit for c in rows],
+            ),
             facts=facts,
             remarks=remarks,
             status=[Status.GOOD if x else Status.DOUBTFUL for x in is_clear],
-            rules=joint_rows,
+            rules=(np.flatnonzero(np.diff(joints)) + 1).tolist(),
+        )
+
+    def _by_joint(self, values: Vector) -> str:
+        """Return the values that are known, each behind the name of its joint."""
+        pairs = zip(self.joint_names, values, strict=True)
+        return ", ".join(
+            f"{name} {significant(x)}" for name, x in pairs if np.isfinite(x)
         )
 
 
@@ -347,48 +315,3 @@ def _notes_on_limits(fit: JointFit, joint_names: tuple[str, ...]) -> list[str]:
                 f"search, {value:.3g}: check signs, units and offsets of the commands"
             )
     return notes
-
-
-def _notes_on_errors(fit: JointFit, joint_names: tuple[str, ...]) -> list[str]:
-    """Return a note if errors show that an effect is missing."""
-    motion = fit.simulator.motion
-    path = fit.simulator.positions(fit.parameters, fit.start)
-    rms = systematic_errors(path - motion.positions, motion)
-    joint_errors = [
-        f"{name} {1e3 * error:.2g}"
-        for name, error in zip(joint_names, rms, strict=True)
-        if error > 0.0
-    ]
-    if not joint_errors:
-        return []
-    return [
-        "Errors are larger than an encoder's rounding and change slowly "
-        f"({', '.join(joint_errors)} mrad or mm RMS): an effect is missing, such as "
-        "other friction, play, elasticity or load, and the parameters "
-        "compensate for it"
-    ]
-
-
-def systematic_errors(residuals: np.ndarray, motion: ServoMotion) -> Vector:
-    """Return RMS errors [rad or m] of joints where an effect seems missing, else 0.
-
-    Args:
-        residuals: Errors of the positions [motions, joints, samples].
-        motion: Measured positions.
-    """
-    places = (0, 2)
-    counted = motion.counted
-    r = residuals * counted
-    sample_counts = counted.sum(axis=places)
-    mean_squares = np.sum(r**2, axis=places) / sample_counts
-    pairs = counted[..., 1:] * counted[..., :-1]
-    products = np.sum(r[..., 1:] * r[..., :-1], axis=places)
-    mean_products = products / pairs.sum(axis=places)
-    steps = np.abs(np.diff(motion.positions))
-    # Most steps of a slow joint are the smallest one; interpolated logs have smaller
-    # ones, too.
-    steps = np.where(steps > 1e-6, steps, np.nan)
-    rounding = np.nanquantile(steps, 0.1, axis=places) / np.sqrt(12.0)
-    is_slow = mean_products > 0.5 * mean_squares
-    rms = np.sqrt(mean_squares)
-    return np.where(is_slow & (rms > MIN_ROUNDING_RATIO * rounding), rms, 0.0)

@@ -98,7 +98,7 @@ def test_deviations_are_at_least_those_of_independent_errors(logs):
         ServoSimulator(motion), fit.parameters, fit.free, start=fit.start
     ).weighed_by_errors()
     _, S = fit.simulator.sensitivities(fit.parameters, fit.start)
-    covariance = determined_combinations(fit, ((0,), (1,))).covariance
+    covariance = determined_combinations(fit, ((0,), (1,))).uncertainty.covariance
     for j in range(2):
         columns = np.concatenate(S[:, j, PLACES], axis=-1)
         independent = error**2 * np.linalg.inv(columns @ columns.T)

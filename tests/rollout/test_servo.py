@@ -93,11 +93,13 @@ def test_windows_do_not_smooth_a_fast_motion_away(fit, horizon):
 
 
 def test_samples_have_the_deviations_and_degrees_of_freedom_of_the_fit(fit):
-    few = dataclasses.replace(fit, dof=np.full_like(fit.dof, 3.0))
+    few_dof = np.full_like(fit.uncertainty.dof, 3.0)
+    uncertainty = dataclasses.replace(fit.uncertainty, dof=few_dof)
+    few = dataclasses.replace(fit, uncertainty=uncertainty)
     draws = few.samples(4000, seed=1)[:, fit.free] - fit.parameters[fit.free]
     lower, upper = np.quantile(draws, [0.025, 0.975], axis=0)
     # 97.5 % of Student's t with three degrees of freedom.
-    half_width = 3.182 * np.sqrt(np.diag(fit.covariance))
+    half_width = 3.182 * fit.uncertainty.standard_deviations
     limits = LOWER[np.nonzero(fit.free)[1]]
     is_inside = fit.parameters[fit.free] - 20 * half_width > limits
     half_range = 0.5 * (upper - lower)
@@ -198,7 +200,7 @@ def test_damping_and_delay_of_a_slow_ramp_are_merged():
     (lag,) = [c for c in fit.combinations if c.name.startswith("B ")]
     assert " d" in lag.name
     lower, upper = lag.interval(0.999)
-    B, d = lag.coefficients[0, [INDEX["B"], INDEX["d"]]]
+    B, d = lag.coefficients[[INDEX["B"], INDEX["d"]]]
     # Delays of held commands are half a sample shorter.
     delay = 0.01 if fit.hold else 0.02
     assert lower < B * 0.06 + d * delay < upper
