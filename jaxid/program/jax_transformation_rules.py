@@ -78,7 +78,10 @@ def divided(function: Callable) -> Callable:
             structure = jax.tree.structure(shapes)
             return jax.tree.unflatten(structure, results)
 
-        divisible_function = _divisible(function, without_constants, count)
+        def on_part(*arguments):
+            return function(*arguments[count:])
+
+        divisible_function = divisible(on_part, without_constants, count)
         return divisible_function(*program.consts, *arrays)
 
     @run.def_vmap
@@ -90,12 +93,12 @@ def divided(function: Callable) -> Callable:
     return with_derivatives_of(function, lambda *arrays: run(*differing_alike(arrays)))
 
 
-def _divisible(function: Callable, on_all: Callable, constants: int):
+def divisible(on_part: Callable, on_all: Callable, constants: int) -> Callable:
     """Return a function whose arguments behind some constants have one leading axis.
 
     Args:
-        function: Function of the arrays, for one device.
-        on_all: The same as a function of constants and arrays.
+        on_part: Function of constants and arrays, for the part of one device.
+        on_all: The same for all devices.
         constants: Number of constants.
     """
     divisible_function = custom_partitioning(on_all)
@@ -108,9 +111,6 @@ def _divisible(function: Callable, on_all: Callable, constants: int):
         divided_sharding = NamedSharding(mesh, PartitionSpec(*leading_axis))
         common_sharding = NamedSharding(mesh, PartitionSpec())
         shardings = (common_sharding,) * constants + (divided_sharding,) * len(arrays)
-
-        def on_part(*arguments):
-            return function(*arguments[constants:])
 
         result_shardings = jax.tree.map(lambda _: divided_sharding, results)
         return mesh, on_part, result_shardings, shardings

@@ -140,7 +140,7 @@ class Lowered(eqx.Module):
                     circular_pairs[angle] = _circular(values[angle], one)
                 value = circular_pairs[angle][CIRCULAR_FUNCTIONS.index(node.operation)]
             else:
-                value = _apply(node, values, reference.dtype)
+                value = apply_node(node, values, reference.dtype)
                 if position in fences:
                     value = fenced(value, one)
             values.append(value)
@@ -174,7 +174,7 @@ def _reference(entries: Entries):
     return jnp.zeros((), rows[0].dtype if rows else float)
 
 
-def _apply(node: Node, values: list[Array], dtype: Any):
+def apply_node(node: Node, values: list[Array], dtype: Any):
     """Compute a node from the values of those before it."""
     operands = [values[x] if isinstance(x, int) else x for x in node.operands]
     if node.operation is Operation.SELECT:

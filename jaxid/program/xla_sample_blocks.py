@@ -17,6 +17,7 @@ from jax.custom_batching import custom_vmap
 
 from jaxid.arrays import Array, Float
 
+from .gpu_kernel import in_kernel, suits_kernel
 from .jax_transformation_rules import TRUE, differing_alike
 from .program import Program
 from .xla import Results, fenced, hidden_one, lower
@@ -126,9 +127,10 @@ def on_rows(program: Program, *arrays: Array) -> Rows:
     def run(*arrays):
         block_run = functools.partial(_in_blocks, program)
         vectorised_run = functools.partial(_pack, _stored_results, program)
-        return jax.lax.platform_dependent(
-            *arrays, cpu=block_run, default=vectorised_run
-        )
+        runs = {"cpu": block_run, "default": vectorised_run}
+        if suits_kernel(program, arrays[-1].dtype):
+            runs["cuda"] = functools.partial(in_kernel, program)
+        return jax.lax.platform_dependent(*arrays, **runs)
 
     @run.def_vmap
     def batch(size, is_batched, *arrays):
