@@ -146,8 +146,4 @@ def rollout(
         report = jid.workflow.identify_rollout_from_logs(
             content.setup, logs, columns, content.rollout, unseen_logs, progress
         )
-        settings = options.report_origin(content.text)
-        report = dataclasses.replace(report, settings=settings)
-        progress("writing the report", 0.0)
-        files = report.write(output)
-    terminal.show_result(console, detail, report, output, files)
+    show_runs(console, detail, report, output, content.text)

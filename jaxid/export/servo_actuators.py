@@ -10,10 +10,17 @@ from lxml.builder import E  # pyright: ignore[reportMissingModuleSource]
 from jaxid.arrays import AnyArray, Joints
 from jaxid.errors import InputError
 from jaxid.io import FilePath, write_text
-from jaxid.result_table import Column, Remark, Status, Table, with_deviation
+from jaxid.result_table import (
+    Column,
+    Remark,
+    Status,
+    Table,
+    sort_remarks,
+    with_deviation,
+)
 from jaxid.robot.mjcf import exact_text
 from jaxid.rollout.body_loads import Bodies
-from jaxid.rollout.determined_combinations import Combination
+from jaxid.rollout.determined_combinations import unit_of_joint
 from jaxid.rollout.result import ServoFit
 from jaxid.rollout.servo import INDEX, START
 
@@ -24,21 +31,19 @@ from .mujoco_model import mjcf_text
 STICKING_IMPEDANCE = "0.99 0.9999 0.001"
 """Impedance with which MuJoCo's dry friction holds a joint almost without creep."""
 UNITS = {
-    "stiffness": ("N m/rad", "N/m"),
-    "damping": ("N m s/rad", "N s/m"),
-    "armature": ("kg m²", "kg"),
-    "friction": ("N m", "N"),
-    "effort_limit": ("N m", "N"),
-    "delay": ("s", "s"),
-    "offset": ("rad", "m"),
-    "integral_gain": ("N m/(rad s)", "N/(m s)"),
-    "feed_forward": ("N m s/rad", "N s/m"),
+    "stiffness": "N m/rad",
+    "damping": "N m s/rad",
+    "armature": "kg m²",
+    "friction": "N m",
+    "effort_limit": "N m",
+    "delay": "s",
+    "offset": "rad",
+    "integral_gain": "N m/(rad s)",
+    "feed_forward": "N m s/rad",
 }
-"""Units of `simulator_values` at joints that turn, and at joints that slide."""
+"""Units of `simulator_values` at joints that turn."""
 GAIN_SYMBOLS = {"stiffness": "a", "damping": "B", "feed_forward": "f"}
 """Parameters of joints that tell the gains of their servos."""
-DIFFERENCE = "differs"
-"""Result of a given gain that the logs contradict."""
 OPTIONAL_VALUES = ("integral_gain", "feed_forward")
 """Values of `simulator_values` that most servos lack."""
 FEED_FORWARD_CURE = (
@@ -130,10 +135,12 @@ def simulator_table(fit: ServoFit) -> Table:
         fit: Identified servos.
     """
     values = simulator_values(fit)
+    joints = range(len(fit.joint_names))
     columns = []
     for name, value in values.items():
         if name not in OPTIONAL_VALUES or value.any():
-            unit = " or ".join(dict.fromkeys(_units(fit, name)))
+            units = [unit_of_joint(UNITS[name], j, fit.bodies) for j in joints]
+            unit = " or ".join(dict.fromkeys(units))
             columns.append(Column(name.replace("_", " "), value, unit))
     remarks: list[Remark | str] = []
     if values["feed_forward"].any():
@@ -152,16 +159,6 @@ def simulator_table(fit: ServoFit) -> Table:
     )
 
 
-def _units(fit: ServoFit, name: str) -> list[str]:
-    """Return the unit of a value of each joint."""
-    bodies = fit.bodies
-    turns = [True] * len(fit.joint_names)
-    if bodies is not None:
-        turns = bodies.model.robot.revolute
-    turning_unit, sliding_unit = UNITS[name]
-    return [turning_unit if is_turning else sliding_unit for is_turning in turns]
-
-
 def _stiffness_sources(fit: ServoFit) -> list[str]:
     """Return where the stiffness of each joint is from."""
     sources = np.where(np.isfinite(fit.stiffness), "weight", "other joints")
@@ -170,45 +167,43 @@ def _stiffness_sources(fit: ServoFit) -> list[str]:
     return sources.tolist()
 
 
-def gain_finding(fit: ServoFit) -> Remark | None:
-    """Return whether the logs agree with gains that were given; None without any."""
-    combinations = {(c.joint, c.name): c for c in (*fit.combinations, *fit.compliances)}
-    texts = []
-    status = Status.GOOD
-    for name, gains in fit.gains.items():
-        for joint in np.flatnonzero(np.isfinite(gains)).tolist():
-            gain = float(gains[joint])
-            unit = _units(fit, name)[joint]
-            text = (
-                f"{name.replace('_', ' ')} of {fit.joint_names[joint]} {gain:g} {unit}"
-            )
-            combination = combinations.get((joint, GAIN_SYMBOLS[name]))
-            result = "which cannot be determined from the logs"
-            if combination is not None:
-                stiffness = float(servo_stiffness(fit)[joint])
-                result = _compare_gain(name, gain, stiffness, combination)
-            if result.endswith(DIFFERENCE):
-                status = Status.DOUBTFUL
-            texts.append(f"{text}, {result}")
-    return Remark(f"Given gains: {'; '.join(texts)}", status) if texts else None
+def gain_findings(fit: ServoFit) -> list[Remark]:
+    """Return whether the logs agree with gains that were given; nothing without any."""
+    comparisons = [
+        _compare_gain(fit, name, joint)
+        for name, gains in fit.gains.items()
+        for joint in np.flatnonzero(np.isfinite(gains)).tolist()
+    ]
+    if not comparisons:
+        return []
+    texts = " ".join(comparison.text for comparison in comparisons)
+    return [Remark(f"Given gains: {texts}", sort_remarks(comparisons)[0].status)]
 
 
-def _compare_gain(
-    name: str, gain: float, stiffness: float, combination: Combination
-) -> str:
-    """Return what the logs tell of a gain, and whether it differs."""
+def _compare_gain(fit: ServoFit, name: str, joint: int) -> Remark:
+    """Return what the logs tell of a given gain, and whether it differs."""
+    gain = float(fit.gains[name][joint])
+    unit = unit_of_joint(UNITS[name], joint, fit.bodies)
+    text = f"{name.replace('_', ' ')} of {fit.joint_names[joint]} {gain:g} {unit}"
+    combinations = (*fit.combinations, *fit.compliances)
+    estimates = {(c.joint, c.name): c for c in combinations}
+    combination = estimates.get((joint, GAIN_SYMBOLS[name]))
+    if combination is None:
+        return Remark(f"{text}, which cannot be determined from the logs")
     # Parameters are ratios to the stiffness, and that of the stiffness is its inverse.
+    stiffness = float(servo_stiffness(fit)[joint])
     is_stiffness = name == "stiffness"
     ratio = 1.0 / gain if is_stiffness else gain / stiffness
-    size = combination.value / ratio
-    estimate = gain / size if is_stiffness else gain * size
-    deviation = estimate * combination.deviation / combination.value
+    value = combination.value
+    estimate = 1.0 / value if is_stiffness else stiffness * value
+    deviation = estimate * combination.deviation / value
     low, high = combination.interval()
     # Viscous friction of the joint adds to the servo's damping.
     agrees = ratio <= high and (low <= ratio or name == "damping")
-    value_text, deviation_text = with_deviation(estimate, deviation)
-    result = "agrees" if agrees else DIFFERENCE
-    return f"estimated {value_text} ± {deviation_text}: {result}"
+    texts = with_deviation(estimate, deviation)
+    result = "agrees" if agrees else "differs"
+    status = Status.GOOD if agrees else Status.DOUBTFUL
+    return Remark(f"{text}, estimated {' ± '.join(texts)}: {result}", status)
 
 
 def export_servo_mjcf(

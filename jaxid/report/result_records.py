@@ -2,7 +2,7 @@
 
 import datetime
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -12,9 +12,9 @@ from jaxid.arrays import AnyArray
 from jaxid.identification.fit_result import Fit
 from jaxid.identification.parameter_changes import Comparison
 from jaxid.identification.uncertainty import Uncertainty
-from jaxid.result_table import versions
+from jaxid.result_table import Remark, versions
 from jaxid.robot.robot import Robot
-from jaxid.validation.judgement import Judgement, Report, judge
+from jaxid.validation.judgement import Report, judge
 from jaxid.validation.torque_errors import TorqueErrors
 
 Record = dict[str, Any]
@@ -67,6 +67,7 @@ def result_record(report: Report) -> Record:
     """Return the content of `result.json`; `model.json` holds robot, model and fit."""
     fit = report.fit
     robot = fit.base.model.robot
+    judgement = judge(report)
     undetermined_records = []
     for direction in fit.undetermined:
         names = [fit.base.names[k] for k in direction.parts]
@@ -76,7 +77,7 @@ def result_record(report: Report) -> Record:
         )
     return {
         **header("result.json"),
-        "verdict": verdict_rows(judge(report)),
+        "verdict": verdict_rows([judgement.verdict, *judgement.findings]),
         "robot": robot.name,
         "base_parameters": table_rows(**fit.columns()),
         "fit": {
@@ -104,9 +105,8 @@ def result_record(report: Report) -> Record:
     }
 
 
-def verdict_rows(judgement: Judgement) -> list[Record]:
-    """Return the verdict and all findings, one row for each."""
-    remarks = (judgement.verdict, *judgement.findings)
+def verdict_rows(remarks: Iterable[Remark]) -> list[Record]:
+    """Return a verdict and findings, one row for each."""
     return [{"status": x.status.name.lower(), "text": x.text} for x in remarks]
 
 

@@ -12,7 +12,7 @@ from jaxid.result_table import Remark, Status, Summarised, Table
 from .figure import Figure
 from .page import Section, Settings, code, folded, provenance, render_page, tiles
 from .result_files import write_page_and_table
-from .result_records import Record
+from .result_records import Record, verdict_rows
 
 
 class Answer(NamedTuple):
@@ -28,16 +28,16 @@ class Answer(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class RunsReport(Summarised):
-    """Result of several runs, and doubts about their logs.
+    """Result of several runs, and findings on their logs.
 
     Attributes:
-        kind: Kind of the result: "payload", "gains" or "states".
+        kind: Kind of the result: "payload", "gains", "states" or "rollout".
         result: The result.
         answer: What the page says and shows.
         estimates: Estimates in the files, one row each.
         content: Further content of the JSON file.
         sources: Logs and reports of each run.
-        doubts: Doubts about the logs, as sentences.
+        findings: Findings on the logs, mostly doubts.
         details: Tables beside that of the result.
         settings: Origin of the result, as `provenance` takes it.
     """
@@ -48,19 +48,14 @@ class RunsReport(Summarised):
     estimates: list[Record]
     content: Record
     sources: Mapping[str, Sequence[Path]]
-    doubts: Sequence[str]
+    findings: Sequence[Remark]
     details: Sequence[Table] = ()
     settings: Settings = dataclasses.field(default_factory=dict)
 
     @property
-    def remarks(self) -> list[Remark]:
-        """Doubts, as remarks."""
-        return [Remark(text, Status.DOUBTFUL) for text in self.doubts]
-
-    @property
     def verdict(self) -> Remark:
         """Whether the result can be used, in one sentence."""
-        remarks = [*self.result.summary().remarks, *self.remarks]
+        remarks = [*self.result.summary().remarks, *self.findings]
         faults = [remark for remark in remarks if remark.status is Status.BAD]
         if faults:
             return faults[0]
@@ -75,13 +70,13 @@ class RunsReport(Summarised):
         return self.verdict.status
 
     def tables(self) -> list[Table]:
-        """Return all tables of the result, then the doubts and the verdict."""
-        findings = Table("", remarks=dict.fromkeys([*self.remarks, self.verdict]))
+        """Return all tables of the result, then the findings and the verdict."""
+        findings = Table("", remarks=dict.fromkeys([*self.findings, self.verdict]))
         return [self.result.summary(), *self.details, findings]
 
     def overview(self) -> list[Table]:
-        """Return the verdict, the doubts, and the one table of the answer."""
-        findings = Table("", remarks=dict.fromkeys([self.verdict, *self.remarks]))
+        """Return the verdict, the findings, and the one table of the answer."""
+        findings = Table("", remarks=dict.fromkeys([self.verdict, *self.findings]))
         # Each change of a state has a table of kinds, then one of parameters.
         return [findings, *(self.details[::2] or [self.result.summary()])]
 
@@ -96,7 +91,8 @@ class RunsReport(Summarised):
             **self.content,
         }
         facts = [(run, ", ".join(names)) for run, names in paths.items()]
-        remarks = [*self.result.summary().remarks, *self.remarks]
+        remarks = [*self.result.summary().remarks, *self.findings]
+        record["verdict"] = verdict_rows([self.verdict, *remarks])
         glance = [
             self.verdict,
             tiles(*((*x, Status.NEUTRAL) for x in self.answer.numbers)),

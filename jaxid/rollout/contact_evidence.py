@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxid.arrays import Vector
+from jaxid.result_table import Remark, Status
 from jaxid.robot.forward_kinematics import tip_jacobian
 from jaxid.robot.robot import Robot
 
@@ -72,8 +73,8 @@ class TableContact(NamedTuple):
     unexplained: float
 
 
-def contact_finding(robot: Robot, errors: RolloutErrors) -> str | None:
-    """Return where something held the robot, as a sentence; None without evidence.
+def contact_findings(robot: Robot, errors: RolloutErrors) -> list[Remark]:
+    """Return where something held the robot; nothing without evidence.
 
     Args:
         robot: The robot, whose coordinates are the joints of the errors.
@@ -81,18 +82,19 @@ def contact_finding(robot: Robot, errors: RolloutErrors) -> str | None:
     """
     table = find_table(robot, errors)
     if table is None:
-        return None
+        return []
     sizes = [len(time) for time in errors.time]
     motions = np.repeat(np.arange(len(sizes)), sizes)[errors.is_counted]
     times = np.concatenate(errors.time)[errors.is_counted]
     motion = np.bincount(motions[table.below]).argmax()
     span = times[table.below & (motions == motion)]
-    return (
+    text = (
         f"Something seems to hold {table.point} at a height of {table.height:.3f} m: "
         f"the simulation goes {1e3 * table.depth:.0f} mm below it, most often in "
         f"{errors.motions[motion]} between {span[0]:.1f} and {span[-1]:.1f} s. These "
         "samples are included in all errors: leave them out of the logs"
     )
+    return [Remark(text, Status.DOUBTFUL)]
 
 
 def find_table(robot: Robot, errors: RolloutErrors) -> TableContact | None:

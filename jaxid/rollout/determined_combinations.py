@@ -217,6 +217,7 @@ class _Joint(NamedTuple):
         )
         kappa = kappa * sizes[indices][:, None] / sizes
         remaining = self.deviations(symbols[indices])
+        bodies = self.fit.simulator.bodies
         combinations = []
         for k, symbol in enumerate(symbols[indices].tolist()):
             coefficients = np.zeros(SIZE)
@@ -230,7 +231,7 @@ class _Joint(NamedTuple):
             combination = Combination(
                 self.number,
                 *_description(symbol, coefficients),
-                _unit(symbol, self.number, self.fit.simulator.bodies),
+                unit_of_joint(PARAMETERS[symbol].unit, self.number, bodies),
                 coefficients,
                 float(coefficients @ self.fit.parameters[self.number]),
                 float(np.sqrt(noise + difference)),
@@ -252,12 +253,12 @@ def _description(symbol: int, coefficients: np.ndarray) -> tuple[str, str]:
     return " ".join((name, *terms)), f"{meaning} and {meanings} only together"
 
 
-def _unit(symbol: int, joint: int, bodies: Bodies | None) -> str:
-    """Return the unit of a parameter of a revolute or linear joint."""
-    unit = PARAMETERS[symbol].unit
+def unit_of_joint(unit: str, joint: int, bodies: Bodies | None) -> str:
+    """Return the unit of a value of a joint that turns, or that of one that slides."""
     if bodies is None or bodies.model.robot.revolute[joint]:
-        return unit.replace("u", "rad")
-    return unit.replace("u", "m").replace("(N m)", "N")
+        return unit
+    linear_unit = unit.replace("(N m)", "N").replace("N m", "N").replace("kg m²", "kg")
+    return linear_unit.replace("rad", "m")
 
 
 def _inverse(H: np.ndarray) -> np.ndarray:

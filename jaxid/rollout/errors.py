@@ -1,6 +1,8 @@
 """Errors of simulations, beside those of simple baselines."""
 
 import dataclasses
+from collections.abc import Sequence
+from itertools import cycle
 
 import numpy as np
 
@@ -66,9 +68,12 @@ class RolloutErrors(Summarised):
             return "every sample"
         return f"every sample but {left_out} within contacts that were given"
 
-    def summary(self) -> Table:
-        """Return a table of the errors of all motions."""
-        rms = 1e3 * self.rms()
-        columns = [Column(name, rms[:, j]) for j, name in enumerate(self.joint_names)]
-        title = f"errors {self.manner}, {self.sample_words} [mrad or mm]"
+    def summary(self, units: Sequence[str] = ("mrad or mm",)) -> Table:
+        """Return a table of the errors of all motions.
+
+        Args:
+            units: Units of the joints' errors, or one for all.
+        """
+        columns = map(Column, self.joint_names, 1e3 * self.rms().T, cycle(units))
+        title = f"errors {self.manner}, {self.sample_words} (RMS)"
         return Table(title, Column("motion", self.motions), *columns)

@@ -125,6 +125,11 @@ class ServoFit(Summarised):
         return values
 
     @property
+    def has_stiffness(self) -> bool:
+        """Whether simulators can be given absolute numbers."""
+        return bool(np.isfinite(self.stiffness).any())
+
+    @property
     def _commands(self) -> str:
         description = "held until the next one" if self.hold else "interpolated"
         if self.hold_is_told:

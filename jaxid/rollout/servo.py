@@ -35,7 +35,7 @@ MAX_DELAY = 0.3
 class ServoParameter(NamedTuple):
     """Parameter of a joint: symbol, meaning, unit, start, limits, scale.
 
-    In the unit, `u` is rad or m.
+    The unit is that of a joint that turns.
     """
 
     symbol: str
@@ -53,13 +53,13 @@ PARAMETERS = (
     # holds.
     ServoParameter("B", "damping / stiffness", "s", 0.05, 1e-3, 5.0, 0.03),
     ServoParameter("d", "delay", "s", 0.01, 0.0, MAX_DELAY, 0.01),
-    ServoParameter("b", "bias / stiffness", "u", 0.0, -1.0, 1.0, 0.01),
-    ServoParameter("a", "1 / stiffness", "u/(N m)", 0.0, 0.0, 100.0, 0.05),
-    ServoParameter("F", "dry friction / stiffness", "u", 0.01, 0.0, 1.0, 0.01),
+    ServoParameter("b", "bias / stiffness", "rad", 0.0, -1.0, 1.0, 0.01),
+    ServoParameter("a", "1 / stiffness", "rad/(N m)", 0.0, 0.0, 100.0, 0.05),
+    ServoParameter("F", "dry friction / stiffness", "rad", 0.01, 0.0, 1.0, 0.01),
     ServoParameter("mu", "friction per load", "1", 0.0, 0.0, 2.0, 0.3),
-    ServoParameter("Fs", "Stribeck friction / stiffness", "u", 0.0, 0.0, 1.0, 0.01),
-    ServoParameter("vs", "Stribeck speed", "u/s", 0.05, 3e-3, 2.0, 0.05),
-    ServoParameter("um", "largest torque / stiffness", "u", 1e3, 0.01, 1e4, 0.2),
+    ServoParameter("Fs", "Stribeck friction / stiffness", "rad", 0.0, 0.0, 1.0, 0.01),
+    ServoParameter("vs", "Stribeck speed", "rad/s", 0.05, 3e-3, 2.0, 0.05),
+    ServoParameter("um", "largest torque / stiffness", "rad", 1e3, 0.01, 1e4, 0.2),
     ServoParameter("g", "gain of the command", "1", 1.0, 0.5, 2.0, 0.1),
     ServoParameter("ki", "integral gain / stiffness", "1/s", 0.0, 0.0, 100.0, 1.0),
     ServoParameter("f", "velocity feed-forward / stiffness", "s", 0.0, 0.0, 1.0, 0.03),

@@ -18,7 +18,7 @@ from .log_loading import load_logs, read_commands, select_filter
 from .setup import Paths, Progress, Setup, ignore_progress
 
 if TYPE_CHECKING:
-    from jaxid.report.rollout_report import RolloutReport
+    from jaxid.report.rollout_report import RolloutReport, Sources
     from jaxid.rollout import Bodies
 
 Span = tuple[float, float]
@@ -86,36 +86,36 @@ def identify_rollout_from_logs(
         verify: Paths of logs for the validation; by default those of the fit.
         progress: Callback, called with a stage and its completed fraction (0 to 1).
     """
-    logs = [Path(log) for log in logs]
-    verify = [Path(log) for log in verify]
-    require_separate_logs(logs, verify)
+    sources = {"fit": [Path(log) for log in logs]}
+    unseen_logs = [Path(log) for log in verify]
+    require_separate_logs(sources["fit"], unseen_logs)
+    if unseen_logs:
+        sources["validation"] = unseen_logs
     if isinstance(settings, TorqueSettings):
-        return _follow_torques(setup, logs, columns, settings, verify, progress)
-    return _follow_commands(setup, logs, columns, settings, verify, progress)
+        return _follow_torques(setup, sources, columns, settings, progress)
+    return _follow_commands(setup, sources, columns, settings, progress)
 
 
 def _follow_commands(
     setup: Setup,
-    logs: Sequence[Path],
+    sources: "Sources",
     columns: Columns,
     settings: ServoSettings,
-    verify: Sequence[Path],
     progress: Progress,
 ) -> "RolloutReport":
     """Identify joints behind position servos."""
     # Other commands do not wait for rollouts, which take a third of a second to load.
-    from jaxid.report.rollout_report import ServoRolloutReport, servo_findings
+    from jaxid.report.rollout_report import servo_report
     from jaxid.rollout import identify_rollout
 
-    recordings = []
-    for log in (*logs, *verify):
-        progress(f"reading {log.name}", 0.0)
-        recordings.append(read_commands(setup, log, columns))
-    _require_logs_of_contacts(settings, recordings)
-    training_recordings = recordings[: len(logs)]
-    unseen_recordings = recordings[len(logs) :]
+    recordings: dict[str, list[Recording]] = {}
+    for name, logs in sources.items():
+        progress(f"reading the logs of the {name}", 0.0)
+        recordings[name] = [read_commands(setup, log, columns) for log in logs]
+    every_recording = [x for group in recordings.values() for x in group]
+    _require_logs_of_contacts(settings, every_recording)
     fit = identify_rollout(
-        training_recordings,
+        recordings["fit"],
         bodies_of_file(setup, settings),
         joint_names=setup.robot.joint_names,
         stiffness=settings.stiffness,
@@ -126,17 +126,10 @@ def _follow_commands(
         progress=progress,
     )
     progress("simulating", 0.0)
-    test_recordings = unseen_recordings or training_recordings
-    return ServoRolloutReport(
-        setup.robot,
-        fit.validate(test_recordings),
-        bool(unseen_recordings),
-        servo_findings(fit),
-        {},
-        fit,
-        fit.window_errors(test_recordings),
-        settings.samples,
-    )
+    test_recordings = recordings.get("validation", recordings["fit"])
+    errors = fit.validate(test_recordings)
+    windows = fit.window_errors(test_recordings)
+    return servo_report(setup.robot, fit, errors, windows, sources, settings.samples)
 
 
 def _require_logs_of_contacts(
@@ -173,14 +166,13 @@ def bodies_of_file(setup: Setup, settings: ServoSettings) -> "Bodies | None":
 
 def _follow_torques(
     setup: Setup,
-    logs: Sequence[Path],
+    sources: "Sources",
     columns: Columns,
     settings: TorqueSettings,
-    verify: Sequence[Path],
     progress: Progress,
 ) -> "RolloutReport":
     """Identify the model of `identify_logs`, beside the fit of torques."""
-    from jaxid.report.rollout_report import TorqueRolloutReport
+    from jaxid.report.rollout_report import torque_report
     from jaxid.rollout import identify_torque_rollout
 
     if setup.load_friction:
@@ -190,11 +182,12 @@ def _follow_torques(
         )
     progress("finding base parameters", 0.0)
     base = setup.base
-    setup = select_filter(setup, logs, columns, progress)
-    loaded_logs = load_logs(setup, [*logs, *verify], columns, progress)
+    every_log = [log for logs in sources.values() for log in logs]
+    setup = select_filter(setup, sources["fit"], columns, progress)
+    loaded_logs = load_logs(setup, every_log, columns, progress)
     observations = [log.observations for log in loaded_logs]
-    training_logs = observations[: len(logs)]
-    unseen_logs = observations[len(logs) :]
+    training_logs = observations[: len(sources["fit"])]
+    unseen_logs = observations[len(training_logs) :]
     progress("identifying", 0.0)
     fit = identify_torque_rollout(base, training_logs, horizon=settings.horizon)
     progress("simulating", 0.0)
@@ -203,6 +196,4 @@ def _follow_torques(
     for log in loaded_logs:
         findings += [Remark(text, Status.DOUBTFUL) for text in log.findings]
         findings += [Remark(note) for note in log.observations.notes]
-    return TorqueRolloutReport(
-        setup.robot, errors, bool(unseen_logs), findings, {}, fit
-    )
+    return torque_report(setup.robot, fit, errors, sources, findings)

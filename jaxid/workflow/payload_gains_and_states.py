@@ -35,6 +35,7 @@ from jaxid.report.payload_gains_states_pages import (
 )
 from jaxid.report.result_records import estimate_rows
 from jaxid.report.several_runs_report import RunsReport
+from jaxid.result_table import Remark, Status
 from jaxid.robot.inertia import INERTIAL_NAMES, INERTIAL_UNITS
 from jaxid.robot.robot import Tool
 from jaxid.validation.diagnosis import mistakes_in_logs
@@ -196,7 +197,13 @@ def identify_payload_from_logs(
         errors_of(loaded_fit, parameters, logs),
     )
     return RunsReport(
-        "payload", payload, answer, estimates, content, runs.sources, runs.doubts
+        "payload",
+        payload,
+        answer,
+        estimates,
+        content,
+        runs.sources,
+        _as_doubts(runs.doubts),
     )
 
 
@@ -229,7 +236,14 @@ def identify_gains_from_logs(
     answer = gains_answer(drives, setup.robot, key, values)
     # That forces seem to need gains is no doubt where gains are identified.
     doubts = [text for text in runs.doubts if "`recording.force_gains`" not in text]
-    return RunsReport("gains", drives, answer, estimates, content, runs.sources, doubts)
+    return RunsReport(
+        "gains", drives, answer, estimates, content, runs.sources, _as_doubts(doubts)
+    )
+
+
+def _as_doubts(texts: Sequence[str]) -> list[Remark]:
+    """Return sentences as remarks that deserve attention."""
+    return [Remark(text, Status.DOUBTFUL) for text in texts]
 
 
 def corrected_gains(columns: Columns, drives: DriveGains) -> dict[str, list[float]]:
@@ -294,6 +308,6 @@ def identify_states_from_logs(
         ),
         content,
         {"states": paths},
-        doubts,
+        _as_doubts(doubts),
         details=tables,
     )

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jaxid as jid
-from jaxid.rollout.contact_evidence import contact_finding, find_table
+from jaxid.rollout.contact_evidence import contact_findings, find_table
 
 LENGTHS = (0.16, 0.14)
 TABLE_HEIGHT = 0.08
@@ -79,9 +79,8 @@ def test_a_table_is_found_at_its_height():
     # The error begins where the simulation passes the table.
     size = np.abs(errors.simulated[0] - errors.measured[0]).max(axis=0)
     assert np.median(size[table.below]) > 5 * np.median(size[~table.below])
-    finding = contact_finding(ROBOT, errors)
-    assert finding is not None
-    assert "hold the end-effector at a height of 0.09" in finding
+    (finding,) = contact_findings(ROBOT, errors)
+    assert "hold the end-effector at a height of 0.09" in finding.text
 
 
 @pytest.mark.parametrize(
@@ -92,7 +91,7 @@ def test_a_table_is_found_at_its_height():
 def test_errors_of_the_model_are_no_contact(measured):
     errors = errors_of(motion(**measured), motion())
     assert errors.total().max() > 0.01
-    assert contact_finding(ROBOT, errors) is None
+    assert contact_findings(ROBOT, errors) == []
     assert find_table(ROBOT, errors) is None
 
 
@@ -106,4 +105,4 @@ def test_without_gravity_there_is_no_table():
         gravity=(0.0, 0.0, 0.0),
     )
     errors = errors_of(motion(TABLE_HEIGHT), motion())
-    assert contact_finding(robot, errors) is None
+    assert contact_findings(robot, errors) == []

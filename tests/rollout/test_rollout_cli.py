@@ -104,7 +104,7 @@ contacts = { short_1 = [[4.0, 6.0]] }"""
     findings = {x["text"]: x["status"] for x in found["verdict"]}
     (text,) = [x for x in findings if x.startswith("Given gains: ")]
     assert findings[text] == "doubtful"
-    stiffness, *others = text.removeprefix("Given gains: ").split("; ")
+    stiffness, *others = text.removeprefix("Given gains: ").split(". ")
     # No weight acts on the first joint.
     assert (
         stiffness
