@@ -15,15 +15,16 @@ class BestFile(Farewell):
 
     def __init__(self, output: Path):
         self._output = output
-        self._is_written = False
+        self._is_writing = False
 
     def keep(self, text: str) -> None:
         """Write a better file."""
+        # Ctrl-C may come between the file and the next line.
+        self._is_writing = True
         write_text(self._output, text)
-        self._is_written = True
 
     def farewell(self) -> str:
         """Return the sentence with which Ctrl-C ends the search."""
-        if not self._is_written:
+        if not (self._is_writing and self._output.exists()):
             return "stopped before a change lowered the errors: nothing was written"
         return f"stopped: `{self._output}` holds the best model so far"

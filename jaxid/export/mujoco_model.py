@@ -4,9 +4,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy
 from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
 from lxml.builder import E  # pyright: ignore[reportMissingModuleSource]
-from scipy.spatial.transform import Rotation
 
 from jaxid.arrays import AnyArray, Vector
 from jaxid.identification.fit_result import Fit
@@ -161,5 +161,7 @@ def _motor(robot: Robot, i: int) -> Any:
 
 def placement_attributes(offset: AnyArray, rotation: AnyArray) -> dict[str, str]:
     """Return the attributes of a placement; MuJoCo's quaternions are (w, x, y, z)."""
-    quaternion = Rotation.from_matrix(np.asarray(rotation)).as_quat(canonical=True)
+    quaternion = scipy.spatial.transform.Rotation.from_matrix(
+        np.asarray(rotation)
+    ).as_quat(canonical=True)
     return {"pos": exact_text(offset), "quat": exact_text(np.roll(quaternion, 1))}

@@ -11,7 +11,7 @@ steps where Newton's method doubles the digits.)
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy
 
 from jaxid.arrays import Joints, Matrix3, Numbers, as_array
 from jaxid.errors import InputError
@@ -184,8 +184,9 @@ def _saddle_point_matrix(hessian: np.ndarray, jacobian: np.ndarray):
 
 def _pose_errors(task: _TipTask, positions: np.ndarray, tip: TipJacobian):
     """Return the differences of positions [m] and of attitudes [rad] from poses."""
-    turn = Rotation.from_matrix(tip.rotation @ task.rotation.T).as_rotvec()
-    return np.concatenate([tip.position - positions, turn], axis=1)
+    turn = tip.rotation @ task.rotation.T
+    vector = scipy.spatial.transform.Rotation.from_matrix(turn).as_rotvec()
+    return np.concatenate([tip.position - positions, vector], axis=1)
 
 
 def _require_followed(task: _TipTask, positions: np.ndarray, q: np.ndarray):

@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy
 from lxml.builder import E  # pyright: ignore[reportMissingModuleSource]
-from scipy.spatial.transform import Rotation
 
 from jaxid.arrays import Matrix3, Numbers, Vector3
 from jaxid.errors import InputError
@@ -145,7 +145,8 @@ def body_name(model: Any, body: int) -> str:
 
 def rotation_of_quaternion(quaternion: np.ndarray) -> Matrix3:
     """Return the rotation of MuJoCo's quaternion (w, x, y, z)."""
-    return Rotation.from_quat(np.roll(quaternion, -1)).as_matrix()
+    turn = scipy.spatial.transform.Rotation.from_quat(np.roll(quaternion, -1))
+    return turn.as_matrix()
 
 
 def exact_text(values: Numbers | float) -> str:

@@ -10,7 +10,6 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from jaxid.arrays import AnyArray, Float, Matrix3, Numbers, Vector3, namespace
 from jaxid.errors import InputError
@@ -33,7 +32,7 @@ def skew(a: Vector3) -> Matrix3:
     return namespace(a).array(rows)
 
 
-def rotation_about(axis: Vector3, angle: AnyArray) -> Rotations:
+def rotation_about(axis: Vector3, angle: Numbers) -> Rotations:
     """Return the rotation about a unit vector by an angle [rad].
 
     The part of a vector along the axis stays and the rest turns: in this form a
@@ -49,13 +48,13 @@ def rotation_about(axis: Vector3, angle: AnyArray) -> Rotations:
 
 def axis_rotation(axis: Numbers, angle: float) -> Matrix3:
     """Return the rotation about a unit vector [rad], exact for quarter turns."""
-    turn = Rotation.from_rotvec(angle * np.asarray(axis, np.float64))
-    return without_rounding(turn.as_matrix())
+    return without_rounding(rotation_about(np.asarray(axis, np.float64), angle))
 
 
 def rpy_rotation(rpy: Numbers) -> Matrix3:
     """Return the rotation by roll, pitch and yaw [rad] about x, y, z, as in URDF."""
-    return without_rounding(Rotation.from_euler("xyz", rpy).as_matrix())
+    roll, pitch, yaw = map(axis_rotation, np.eye(3), rpy)
+    return without_rounding(yaw @ pitch @ roll)
 
 
 def rpy_angles(rotation: Matrix3) -> Vector3:

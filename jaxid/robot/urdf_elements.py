@@ -3,7 +3,7 @@
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy
 
 from jaxid.arrays import Matrix3
 from jaxid.errors import InputError
@@ -91,4 +91,5 @@ class UrdfElements:
                 f"{self.place(origin)}: `quat_xyzw` must not be zero: "
                 'for no rotation give "0 0 0 1".'
             )
-        return Rotation.from_quat(quaternion / size).as_matrix()
+        turn = scipy.spatial.transform.Rotation.from_quat(quaternion / size)
+        return turn.as_matrix()

@@ -51,6 +51,7 @@ class Diagnosis(Summarised):
         excerpt: Samples of single channels, of a long log a part.
         notes: Remarks on how the log was examined, as sentences.
         commands: Excerpt with the commanded angles as angles; None if not known.
+        is_mistaken: Whether a mistake in log or robot spoils any fit.
     """
 
     log: Recording | Observations
@@ -62,6 +63,7 @@ class Diagnosis(Summarised):
     excerpt: Recording
     notes: tuple[str, ...] = ()
     commands: Recording | None = None
+    is_mistaken: bool = False
 
     def with_fit(self, fit: Fit, bodies: np.ndarray | None = None) -> "Diagnosis":
         """Return the diagnosis with findings of a fit to this log alone.
@@ -72,7 +74,9 @@ class Diagnosis(Summarised):
         fit_findings = (*mistakes.certain, *mistakes.doubts)
         notes = (*self.notes, *mistakes.remarks)
         findings = (*fit_findings, *self.findings)
-        return dataclasses.replace(self, findings=findings, notes=notes)
+        return dataclasses.replace(
+            self, findings=findings, notes=notes, is_mistaken=bool(mistakes.certain)
+        )
 
     def summary(self) -> Table:
         """Return a table: motion and forces beside their limits, and the findings."""
@@ -275,12 +279,14 @@ class LogMistakes(NamedTuple):
             fits, but needs a look.
         remarks: That most of what the model misses is missed at rest.
         delay: Delay of all forces; None where no mistakes were looked for.
+        are_gains: Whether the certain mistakes are gains of forces.
     """
 
     certain: tuple[str, ...] = ()
     doubts: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
     delay: Delay | None = None
+    are_gains: bool = False
 
 
 def mistakes_in_logs(
@@ -302,6 +308,7 @@ def mistakes_in_logs(
         named(mistakes.doubts),
         named(mistakes.remarks),
         mistakes.delay,
+        mistakes.are_gains,
     )
 
 
@@ -341,4 +348,4 @@ def _mistakes(
     # Otherwise, rows at rest have been left out.
     has_all_rows = all(np.all(log.mask) for log in logs)
     remarks = mistakes.rest if has_all_rows else ()
-    return LogMistakes(certain, doubts, remarks, mistakes.delay)
+    return LogMistakes(certain, doubts, remarks, mistakes.delay, mistakes.are_gains)

@@ -105,9 +105,7 @@ def limit_findings(
     findings = _common_force_findings(robot, statistics) if not faulty_joints else []
     if not findings:
         findings += _force_findings(robot, statistics, faulty_joints)
-    for j in range(robot.joints):
-        if j not in faulty_joints:
-            findings += _joint_findings(robot, j, statistics)
+    findings += _motion_findings(robot, statistics, faulty_joints)
     share = float(statistics.stands.all(axis=1).mean())
     if share > 0.5:
         findings.append(
@@ -117,38 +115,55 @@ def limit_findings(
     return findings
 
 
-def _joint_findings(robot: Robot, j: int, statistics: LogStatistics) -> Iterator[str]:
-    """Compare the range and speed of a joint with its limits."""
-    name = robot.joint_names[j]
-    unit = robot.joint_unit(j)
+def _motion_findings(
+    robot: Robot, statistics: LogStatistics, faulty_joints: Collection[int]
+) -> Iterator[str]:
+    """Report joints that leave their ranges, are too fast, or hardly move."""
     limits = robot.limits
-    lower_limit = float(limits.position_min[j])
-    upper_limit = float(limits.position_max[j])
-    minimum = statistics.lowest[j]
-    maximum = statistics.highest[j]
+    lowest = statistics.lowest
+    highest = statistics.highest
+    lower_limits = np.asarray(limits.position_min)
+    upper_limits = np.asarray(limits.position_max)
+    ranges = upper_limits - lower_limits
     # Joints without limits have no range.
-    slack = 0.02 * (upper_limit - lower_limit)
-    if not np.isfinite(slack):
-        slack = 0.0
-    if not lower_limit - slack <= minimum <= maximum <= upper_limit + slack:
+    slack = np.where(np.isfinite(ranges), 0.02 * ranges, 0.0)
+    is_above = lowest >= lower_limits - slack
+    is_inside = is_above & (highest <= upper_limits + slack)
+    is_fast = statistics.speed > MAX_LIMIT_RATIO * np.asarray(limits.velocity)
+    spans = highest - lowest
+    excursions = []
+    speeds = []
+    rests = []
+    for j, name in enumerate(robot.joint_names):
+        unit = robot.joint_unit(j)
+        if j in faulty_joints:
+            continue
+        if not is_inside[j]:
+            excursions.append(
+                f"`{name}` from {lowest[j]:.3g} to {highest[j]:.3g} in place of "
+                f"{lower_limits[j]:.3g} to {upper_limits[j]:.3g} {unit}"
+            )
+        if is_fast[j]:
+            limit = float(limits.velocity[j])
+            speeds.append(f"`{name}` {statistics.speed[j]:.3g} of {limit:.3g} {unit}/s")
+        if spans[j] < MIN_SPAN:
+            rests.append(f"`{name}` by {spans[j]:.2g} {unit}")
+    if excursions:
         yield (
-            f"joint `{name}` moves from {minimum:.3g} to {maximum:.3g}, its range is "
-            f"{lower_limit:.3g} to {upper_limit:.3g} {unit}: check "
+            f"joints leave their ranges: {', '.join(excursions)}: check "
             "`recording.angle_unit`, `side` (with `drives.gear_ratios`), "
-            "`angle_signs` and `angle_offsets`, or correct the range "
+            "`angle_signs` and `angle_offsets`, or correct the ranges "
             "(`limits.position_min`, `position_max`)."
         )
-    if statistics.speed[j] > MAX_LIMIT_RATIO * limits.velocity[j]:
+    if speeds:
         yield (
-            f"joint `{name}` reaches {statistics.speed[j]:.3g} {unit}/s, but its limit "
-            f"is {float(limits.velocity[j]):.3g} {unit}/s: check the units, or lower "
-            "the cut-off."
+            f"joints are faster than their limits: {', '.join(speeds)}: check the "
+            "units, or lower the cut-off."
         )
-    span = maximum - minimum
-    if span < MIN_SPAN:
+    if rests:
         yield (
-            f"joint `{name}` moves by {span:.2g} {unit} only: is it the right column "
-            "and unit?"
+            f"joints hardly move: {', '.join(rests)}: are these the right columns and "
+            "units?"
         )
 
 

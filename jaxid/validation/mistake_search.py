@@ -101,6 +101,7 @@ class Mistakes(NamedTuple):
         rest: That the model misses most where joints rest.
         delay: Delay of all forces, also one that is no mistake; None if the logs are
             too short.
+        are_gains: Whether gains of forces explain what the model misses.
     """
 
     explained: tuple[str, ...] = ()
@@ -109,6 +110,7 @@ class Mistakes(NamedTuple):
     doubts: tuple[str, ...] = ()
     rest: tuple[str, ...] = ()
     delay: Delay | None = None
+    are_gains: bool = False
 
     def with_delay(self, delay: Delay) -> "Mistakes":
         """Return the mistakes with the delay, a doubt if nothing else is wrong.
@@ -136,6 +138,7 @@ class Explanation(NamedTuple):
             parts that the fit has not seen.
         power: Least power of a joint's friction, over RMS force and RMS speed.
         sentence: What seems to be wrong.
+        is_gain: Whether it is the gain of a joint's force.
     """
 
     gain: float
@@ -143,6 +146,7 @@ class Explanation(NamedTuple):
     remainder: float
     power: float
     sentence: str
+    is_gain: bool
 
 
 def find_mistakes(
@@ -174,9 +178,9 @@ def find_mistakes(
     if log.friction_shares.max() > MAX_FRICTION_SHARE and not mistakes.explained:
         # Friction by load may hide mistakes, or stand for effects that are missing.
         described_log = DescribedLog(model, log, is_strict=True)
-        explained = _mistakes_of_all(described_log, recordings, bodies).explained
-        possible = () if explained else mistakes.possible
-        mistakes = mistakes._replace(explained=explained, possible=possible)
+        strict_mistakes = _mistakes_of_all(described_log, recordings, bodies)
+        if strict_mistakes.explained:
+            mistakes = strict_mistakes
     if not mistakes.explained and len(recordings) > 1:
         mistakes = _mistakes_by_log(model, recordings, mistakes)
     if not mistakes.explained and bodies is not None:
@@ -204,13 +208,16 @@ def _mistakes_by_log(
     """Return the mistakes of single logs in place of those of all together."""
     explained = []
     unexplained = []
+    are_gains = []
     for recording in recordings:
         log_mistakes = _mistakes_in_columns(model, recording)
+        are_gains += [log_mistakes.are_gains for _ in log_mistakes.explained]
         explained += [f"{recording.name}: {x}" for x in log_mistakes.explained]
         unexplained += [f"{recording.name}: {x}" for x in log_mistakes.unexplained]
     return mistakes._replace(
         explained=tuple(explained),
         unexplained=tuple(unexplained) or mistakes.unexplained,
+        are_gains=all(are_gains or [False]),
     )
 
 
@@ -267,7 +274,8 @@ def _search(
             f"the model then misses {100 * remaining_misfit:.2g} % of the forces "
             f"instead of {100 * misfit:.2g} %."
         )
-        return Mistakes(explained=(f"{texts}: {effect}",))
+        are_gains = all(x.is_gain for x in equal_results)
+        return Mistakes(explained=(f"{texts}: {effect}",), are_gains=are_gains)
     if misfit > MAX_MISFIT:
         return Mistakes(unexplained=(_misfit_text(described_log, fit),))
     powers = described_log.friction_powers(described_log.rows, fit)
@@ -352,6 +360,7 @@ class _Trial(NamedTuple):
     gain: float
     sentence: str
     rows: Rows
+    is_gain: bool = False
 
 
 def explanations(
@@ -385,6 +394,7 @@ def explanations(
                 remainder=float(remainders.min()),
                 power=float(described_log.friction_powers(trial.rows, fit).min()),
                 sentence=trial.sentence,
+                is_gain=trial.is_gain,
             )
             results.append(explanation)
     return sorted(results, key=lambda result: -result.gain)
@@ -410,7 +420,8 @@ def _searched_quantities(
             if _is_plausible(quantity, amount):
                 trial_rows = quantity.rows(amount)
                 gain = fit.score - judge.fit(trial_rows).score
-                trials.append(_Trial(gain, quantity.sentence(amount), trial_rows))
+                sentence = quantity.sentence(amount)
+                trials.append(_Trial(gain, sentence, trial_rows, quantity.is_gain))
     return trials
 
 

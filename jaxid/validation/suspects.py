@@ -63,6 +63,7 @@ class Quantity(NamedTuple):
         step: Amount that changes the forces a little.
         bounds: Smallest and largest amount that somebody can have missed.
         min_amount: Amount below which it does not matter.
+        is_gain: Whether it is the gain of a joint's force.
     """
 
     sentence: Callable[[float], str]
@@ -70,6 +71,7 @@ class Quantity(NamedTuple):
     step: float
     bounds: tuple[float, float]
     min_amount: float
+    is_gain: bool = False
 
 
 class SuspectedMistakes:
@@ -390,8 +392,9 @@ class SuspectedMistakes:
     def _gain(self, joint: int) -> Quantity:
         def sentence(logarithm: float) -> str:
             return (
-                f"the gain of the force of joint {self._names[joint]} seems to be "
-                f"{math.exp(logarithm):.2g} (`recording.force_gains`)"
+                f"the force of joint {self._names[joint]} in the log seems to be "
+                f"{math.exp(logarithm):.2g} times the true one "
+                f"(`recording.force_gains` of {math.exp(-logarithm):.2g})"
             )
 
         def rows(logarithm: float) -> Rows:
@@ -399,7 +402,7 @@ class SuspectedMistakes:
             columns[:, joint] *= math.exp(logarithm)
             return self._log.rows._replace(columns=columns)
 
-        return Quantity(sentence, rows, 0.02, (-0.8, 0.8), 0.02)
+        return Quantity(sentence, rows, 0.02, (-0.8, 0.8), 0.02, is_gain=True)
 
     def _ratio(self, joint: int) -> Quantity:
         motion = self._log.log.motion

@@ -29,7 +29,10 @@ class ExaminedLog(NamedTuple):
     @property
     def doubts(self) -> list[Remark]:
         """Findings, and what the log does not determine."""
-        remarks = [*self.diagnosis.summary().remarks, *self.fit.determination]
+        remarks = list(self.diagnosis.summary().remarks)
+        # Of a log with a mistake, much is not determined because of it.
+        if not self.diagnosis.is_mistaken:
+            remarks += self.fit.determination
         return [x for x in remarks if x.status in (Status.BAD, Status.DOUBTFUL)]
 
 

@@ -58,6 +58,7 @@ class Runs(NamedTuple):
     logs: list[list[Observations]]  # logs of each run that were given as files
     doubts: list[str]
     sources: Mapping[str, Sequence[Path]]  # logs and reports of each run
+    gain_doubts: list[str]  # doubts about the gains of the forces
 
 
 def fit_runs(
@@ -87,7 +88,7 @@ def fit_runs(
     if reports:
         setup = setup.with_transition_speeds_of(read_earlier_fit(setup, reports[0]))
     setup = select_filter(setup, files, columns, progress)
-    runs = Runs([], [], doubts, groups)
+    runs = Runs([], [], doubts, groups, [])
     for name in groups:
         fit = add_run(runs, setup, name, columns, progress)
         # The columns of all runs must be the same.
@@ -118,9 +119,10 @@ def add_run(
         rows = RegressionProblem(base, observations, row_progress)
         fit = fit_problem(rows, setup.least_squares)
         fits.append(fit)
-        mistakes = mistakes_in_logs([log.diagnosis for log in logs], fit).certain
+        mistakes = mistakes_in_logs([log.diagnosis for log in logs], fit)
         runs.doubts.extend(text for log in logs for text in log.findings)
-        runs.doubts.extend(mistakes)
+        doubts = runs.gain_doubts if mistakes.are_gains else runs.doubts
+        doubts.extend(mistakes.certain)
     fit = dataclasses.replace(functools.reduce(combine_fits, fits), name=name)
     runs.fits.append(fit)
     runs.logs.append(observations)
@@ -203,7 +205,7 @@ def identify_payload_from_logs(
         estimates,
         content,
         runs.sources,
-        _as_doubts(runs.doubts),
+        _as_doubts([*runs.doubts, *runs.gain_doubts]),
     )
 
 
@@ -235,9 +237,14 @@ def identify_gains_from_logs(
     ((key, values),) = content.items()
     answer = gains_answer(drives, setup.robot, key, values)
     # That forces seem to need gains is no doubt where gains are identified.
-    doubts = [text for text in runs.doubts if "`recording.force_gains`" not in text]
     return RunsReport(
-        "gains", drives, answer, estimates, content, runs.sources, _as_doubts(doubts)
+        "gains",
+        drives,
+        answer,
+        estimates,
+        content,
+        runs.sources,
+        _as_doubts(runs.doubts),
     )
 
 
@@ -278,7 +285,7 @@ def identify_states_from_logs(
         )
     runs = fit_runs(setup, groups, columns, progress)
     states = identify_states(runs.fits)
-    doubts = list(runs.doubts)
+    doubts = [*runs.doubts, *runs.gain_doubts]
     _, chance = states.sharing
     if chance < MIN_CHANCE_OF_SHARING:
         doubts.append(
